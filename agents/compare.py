@@ -1,0 +1,380 @@
+"""Everybody in the same worlds: `python -m agents.compare` plays all tasks with all players and says who won by what.
+
+Writes results.json, table.md, comparison.png and replay.html. Needs no torch: learned policies run in numpy.
+"""
+
+from __future__ import annotations
+
+import os
+import platform
+import re
+import subprocess
+import tempfile
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from importlib import metadata
+from itertools import product
+from pathlib import Path
+from time import perf_counter
+from typing import Annotated, Any
+
+import typer
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+
+import flockenv
+from agents import report
+from agents.experiment import CONFIGS, WEIGHTS, Experiment, load_experiment
+from flockenv.evaluation import WORLDS_PER_SEED, Episodes, rollout, task_digest, worlds_for
+from flockenv.outputs import checked_path
+from flockenv.policy import MlpPolicy, Policy, RandomPolicy, load_player
+from flockenv.refusals import nearest, shown
+from flockenv.tasks import TASKS, Task
+
+__all__ = ["Player", "app", "compare", "deliver", "known_players"]
+
+ROOT = Path(__file__).resolve().parent.parent
+PLAYERS = ("random", "textbook", "reynolds", "ppo")
+"""From the least to the most that is claimed: a pair is always the later minus the earlier, "ppo - reynolds"."""
+
+WORLDS, SMOKE_WORLDS = 256, 16
+RESAMPLES, SMOKE_RESAMPLES = 10_000, 1_000
+RECORDED = 0  # the world in the replay: the first, not one that somebody picked
+PACKAGES = ("numpy", "scipy", "numba", "gymnasium", "pettingzoo")
+FILES = ("results.json", "table.md", "comparison.png", "replay.html")
+NAME = re.compile(r"\w[\w.+-]{0,39}")
+"""A player's name becomes a key, a table cell, a label and a piece of HTML."""
+
+Plays = Mapping[str, Mapping[str, Policy]]  # task -> player -> policy
+Advance = Callable[[str, str, int, int], None]  # task, player, steps done, steps at most
+
+app = typer.Typer(add_completion=False, rich_markup_mode=None, pretty_exceptions_enable=False)
+
+
+@dataclass(frozen=True)
+class Player:
+    """Who plays: what was asked for (a known name or a file), and the name in the tables."""
+
+    spec: str
+    name: str
+
+    @classmethod
+    def of(cls, spec: str) -> Player:
+        """Name a file by its stem; ValueError for a stem that is fit for no table."""
+        name = Path(spec).stem if Path(spec).suffix in (".py", ".safetensors", ".zip") else spec
+        if not NAME.fullmatch(name):
+            raise ValueError(f"--players {shown(spec)}: a name is up to 40 letters, digits and _ . + -")
+        return cls(spec, name)
+
+
+def known_players(seed: int) -> dict[str, Callable[[Task], Policy]]:
+    """Return the players that have a name, each as task -> policy."""
+    return {
+        "random": lambda task: RandomPolicy(task.action_layout.size, seed),
+        "textbook": lambda task: _reynolds(task, textbook=True),
+        "reynolds": lambda task: _reynolds(task, textbook=False),
+        "ppo": lambda task: _learned(task, seed),
+    }
+
+
+def _reynolds(task: Task, textbook: bool) -> Policy:
+    from agents.reynolds import player
+
+    policy: Policy = player(task, textbook=textbook)
+    return policy
+
+
+def _learned(task: Task, seed: int) -> Policy:
+    path = WEIGHTS / f"{task.name}.safetensors"
+    if not path.is_file():
+        command = f"python -m agents.ppo configs/{task.name}.yaml"
+        raise ValueError(f"player 'ppo' has no weights for task {task.name!r}; this trains them: {command}")
+    return MlpPolicy.load(path, task, seed)
+
+
+def compare(
+    tasks: Sequence[Task],
+    players: Sequence[Player],
+    worlds: int = WORLDS,
+    seed: int = 0,
+    resamples: int = RESAMPLES,
+    trust_pickle: bool = False,
+    advance: Advance = lambda task, player, done, most: None,
+) -> tuple[report.Results, dict[str, dict[str, Episodes]]]:
+    """Play every task with every player in the same worlds; return the results as plain data, and the episodes.
+
+    Raises:
+        ValueError: one line: a player that cannot be had (before anything is played), or that fails while playing.
+    """
+    began = perf_counter()
+    first = worlds_for("evaluation", seed, worlds)
+    known = known_players(seed)
+    plays: dict[str, dict[str, Policy]] = {task.name: {} for task in tasks}
+    for task, player in product(tasks, players):
+        with _blaming(player.name, task, ValueError):  # those of load_player name the player themselves
+            plays[task.name][player.name] = load_player(player.spec, task, known, trust_pickle)
+    episodes = {task.name: _play(task, plays[task.name], worlds, first, advance) for task in tasks}
+    results: report.Results = {
+        "seed": seed,
+        "worlds": worlds,
+        "world_seeds": {"block": "evaluation", "first": first, "last": first + worlds - 1},
+        "bootstrap": {"resamples": resamples, "seed": seed, "interval": "95 % percentile; proportions: 95 % Wilson"},
+        "players": {player.name: player.spec for player in players},
+        "tasks": {
+            task.name: report.task_results(
+                task_digest(task), episodes[task.name], _costs(task, plays[task.name]), resamples, seed
+            )
+            for task in tasks
+        },
+        **_provenance(),
+    }
+    results["wall_time_s"] = perf_counter() - began
+    return results, episodes
+
+
+def _play(task: Task, policies: Mapping[str, Policy], worlds: int, first: int, advance: Advance) -> dict[str, Episodes]:
+    """Let every player play the same worlds of one task."""
+    episodes = {}
+    for name, policy in policies.items():
+
+        def progress(done: int, most: int, name: str = name) -> None:
+            advance(task.name, name, done, most)
+
+        with _blaming(name, task):
+            episodes[name] = rollout(task, policy, worlds, first, record=RECORDED, progress=progress)
+    return episodes
+
+
+@contextmanager
+def _blaming(player: str, task: Task, *clear: type[Exception]) -> Iterator[None]:
+    """Say of an error in somebody's player whose it is and in which task, unless it is one of the clear ones."""
+    try:
+        yield
+    except Exception as error:
+        if isinstance(error, clear):
+            raise
+        raise ValueError(f"player {player!r}, task {task.name!r}: {type(error).__name__}: {error}") from error
+
+
+def _costs(task: Task, policies: Mapping[str, Policy]) -> dict[str, report.Results]:
+    """Return what each player cost before it could play, as far as known: what for, wall time in s, agent-steps."""
+    costs = {}
+    for name, policy in policies.items():
+        card = getattr(policy, "card", None) or {}
+        costs[name] = {key: card[key] for key in ("wall_time_s", "steps") if key in card}
+    steps = _experiment(task.name).reynolds.found.get("agent_steps")
+    if steps and "reynolds" in policies:
+        costs["reynolds"] = {"of": "tuning", "steps": round(steps)}
+    return costs
+
+
+def _experiment(name: str) -> Experiment:
+    """Return what the config says of a task: with which settings its players were trained and tuned."""
+    path = CONFIGS / f"{name}.yaml"
+    return load_experiment(path) if path.is_file() else Experiment(task=name)
+
+
+def _provenance() -> report.Results:
+    """Return what somebody needs who wants the same numbers again."""
+    changes = _git("status", "--porcelain")
+    versions = {"flockenv": flockenv.__version__, "python": platform.python_version()}
+    return {
+        "versions": {**versions, **{name: _version(name) for name in PACKAGES}},
+        "git": {"commit": _git("rev-parse", "HEAD"), "changed": None if changes is None else bool(changes)},
+        "machine": {"system": platform.platform(), "cores": os.cpu_count()},
+    }
+
+
+def _version(package: str) -> str | None:
+    try:
+        return metadata.version(package)
+    except metadata.PackageNotFoundError:
+        return None
+
+
+def _git(*command: str) -> str | None:
+    """Ask git about this checkout; None where there is no git or no commit."""
+    try:
+        answer = subprocess.run(["git", "-C", str(ROOT), *command], capture_output=True, text=True, timeout=10)
+    except (OSError, subprocess.TimeoutExpired):
+        return None
+    return answer.stdout.strip() if answer.returncode == 0 else None
+
+
+@app.command()
+def main(
+    tasks: Annotated[list[str] | None, typer.Option(help="Tasks, by comma or repeated; all if left out.")] = None,
+    players: Annotated[
+        list[str] | None,
+        typer.Option(help="Players: random, textbook, reynolds, ppo, a .py file with a predict, or a .safetensors."),
+    ] = None,
+    worlds: Annotated[int | None, typer.Option(help=f"Worlds per task, the same for everyone. [{WORLDS}]")] = None,
+    seed: Annotated[int, typer.Option(help="Which evaluation worlds, 0 to 999.")] = 0,
+    out: Annotated[str, typer.Option(help=f"Folder for {', '.join(FILES)}.")] = "results",
+    smoke: Annotated[bool, typer.Option("--smoke", help=f"A quick look: {SMOKE_WORLDS} worlds.")] = False,
+    trust_pickle: Annotated[
+        bool, typer.Option("--trust-pickle", help="Load Stable-Baselines3 zips too: executes the code in them.")
+    ] = False,
+    debug: Annotated[bool, typer.Option("--debug", help="Show where an error came from.")] = False,
+) -> None:
+    """Play all tasks with all players in the same worlds, and say who won by what."""
+    try:
+        folder = _folder(out)
+        chosen = [_experiment(name).build() for name in _pick("--tasks", _split(tasks) or list(TASKS), TASKS)]
+        field = _field(_split(players) or list(PLAYERS))
+        count = worlds if worlds is not None else SMOKE_WORLDS if smoke else WORLDS
+        if not 2 <= count <= WORLDS_PER_SEED:
+            raise ValueError(f"--worlds {count}: must be from 2 to {WORLDS_PER_SEED}")
+        resamples = SMOKE_RESAMPLES if smoke else RESAMPLES
+        with _bars(chosen, len(field)) as advance:
+            results, episodes = compare(chosen, field, count, seed, resamples, trust_pickle, advance)
+        results["smoke"] = smoke
+        deliver(folder, _files(results, episodes))
+    except (ValueError, TypeError, OSError) as error:
+        if debug:
+            raise
+        typer.echo(f"compare: {' '.join(str(error).split())}", err=True)
+        raise typer.Exit(2) from None
+    except KeyboardInterrupt:
+        typer.echo("compare: interrupted, nothing written", err=True)
+        raise typer.Exit(130) from None
+    _show(results, folder)
+
+
+def _folder(text: str) -> Path:
+    folder = checked_path(text)
+    if folder.exists() and not folder.is_dir():
+        raise ValueError(f"--out {shown(text)}: is a file, must be a folder")
+    return folder
+
+
+def _split(values: Sequence[str] | None) -> list[str]:
+    return [part.strip() for value in values or () for part in value.split(",") if part.strip()]
+
+
+def _pick(option: str, names: Sequence[str], allowed: Mapping[str, object]) -> list[str]:
+    """Return the names without repeats; ValueError for one that is not allowed."""
+    for name in names:
+        if name not in allowed:
+            hint = nearest(name[:200], allowed)
+            raise ValueError(f"{option} {shown(name)}: unknown{hint}; allowed: {', '.join(allowed)}")
+    return list(dict.fromkeys(names))
+
+
+def _field(specs: Sequence[str]) -> list[Player]:
+    """Return the players in the order of the tables: the known ones from the least, then files as they were given."""
+    field = [Player.of(spec) for spec in dict.fromkeys(specs)]
+    names = [player.name for player in field]
+    twice = next((name for name in names if names.count(name) > 1), None)
+    if twice:
+        raise ValueError(f"--players: two players are called {twice!r}; rename a file")
+    return sorted(field, key=lambda player: PLAYERS.index(player.spec) if player.spec in PLAYERS else len(PLAYERS))
+
+
+@contextmanager
+def _bars(tasks: Sequence[Task], players: int) -> Iterator[Advance]:
+    """Show a bar per task on a terminal, and a line per player and task anywhere else."""
+    console = Console(stderr=True)
+    columns = (TextColumn("{task.description:<24}"), BarColumn(40), TimeElapsedColumn())
+    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as progress:
+        bars = {task.name: progress.add_task(task.name, total=players * task.horizon, start=False) for task in tasks}
+        played: dict[str, list[str]] = {task.name: [] for task in tasks}
+
+        def advance(task: str, player: str, done: int, most: int) -> None:
+            before = played[task]
+            if player not in before:
+                before.append(player)
+                progress.start_task(bars[task])
+                if not console.is_terminal:
+                    console.print(f"{task}: {player} plays", highlight=False)
+            progress.update(bars[task], completed=(len(before) - 1) * most + done, description=f"{task}: {player}")
+
+        yield advance
+        for task in tasks:
+            progress.update(bars[task.name], completed=players * task.horizon)
+
+
+def _files(
+    results: report.Results, episodes: Mapping[str, Mapping[str, Episodes]]
+) -> dict[str, Callable[[Path], None]]:
+    """Return who writes which file."""
+    writers: tuple[Callable[[Path], None], ...] = (
+        lambda path: _write(path, report.json_text(results)),
+        lambda path: _write(path, report.markdown(results)),
+        lambda path: _draw(path, results, episodes),
+        lambda path: _replay(path, results, episodes),
+    )
+    return dict(zip(FILES, writers, strict=True))
+
+
+def deliver(folder: Path, writers: Mapping[str, Callable[[Path], None]]) -> None:
+    """Have every file written beside its place, and when all are whole put them there, each in one move.
+
+    Args:
+        folder: made if it is not there.
+        writers: file name -> writes that file to the path it is given.
+
+    Raises:
+        OSError, or what a writer raises: then the folder is as it was.
+    """
+    made = [path for path in (folder, *folder.parents) if not path.exists()]
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(dir=folder, prefix=".partial-") as partial:
+            for name, write in writers.items():
+                write(Path(partial, name))
+            for name in writers:
+                Path(partial, name).replace(folder / name)
+    except BaseException:
+        for path in made:
+            if path.is_dir() and not any(path.iterdir()):
+                path.rmdir()
+        raise
+
+
+def _write(path: Path, text: str) -> None:
+    path.write_text(text, encoding="utf-8", newline="\n")
+
+
+def _draw(path: Path, results: report.Results, episodes: Mapping[str, Mapping[str, Episodes]]) -> None:
+    from flockenv.render.chart import write_chart
+
+    columns = [report.column(task, about, episodes[task]) for task, about in results["tasks"].items()]
+    note = f"{results['worlds']} worlds per task, the same for every player; level differences are grey"
+    write_chart(path, columns, "Hand-written steering against learning", note)
+
+
+def _replay(path: Path, results: report.Results, episodes: Mapping[str, Mapping[str, Episodes]]) -> None:
+    from flockenv.render.replay import Group, Panel, write_replay
+
+    groups = [
+        Group(task, [Panel(name, *_film(played)) for name, played in players.items()])
+        for task, players in episodes.items()
+    ]
+    first = results["world_seeds"]["first"] + RECORDED
+    write_replay(path, groups, f"The same world under each player (seed {first})")
+
+
+def _film(played: Episodes) -> tuple[Any, ...]:
+    """Return what a replay shows of an episode: instants, return so far, and how it ended."""
+    recording = played.recording
+    assert recording is not None  # every rollout here is recorded
+    outcome = "success" if played.success[recording.world] else "no success"
+    return recording.snapshots, recording.returns, f"{outcome} after {recording.snapshots[-1].time:.1f} s"
+
+
+def _show(results: report.Results, folder: Path) -> None:
+    """Print the tables and, last and in full, what they come to."""
+    console = Console(highlight=False)
+    if not console.is_terminal:
+        console = Console(highlight=False, width=160)  # a pipe has no width; 80 would break every cell
+    for task, about in results["tasks"].items():
+        console.print(*report.player_tables(task, about))
+    for about in results["tasks"].values():
+        console.print(about["verdict"], markup=False)
+    console.print(f"\n{results['wall_time_s']:.0f} s; {', '.join(FILES)} are in {folder}", markup=False)
+
+
+if __name__ == "__main__":
+    app()

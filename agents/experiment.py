@@ -1,0 +1,80 @@
+"""An experiment: what configs/<task>.yaml says: how PPO trains on a task, and what the search found for the rules."""
+
+from __future__ import annotations
+
+import difflib
+from pathlib import Path
+from typing import Any
+
+from pydantic import Field
+
+from flockenv.config import load
+from flockenv.records import Record
+from flockenv.tasks import TASKS, Task
+
+__all__ = ["CONFIGS", "WEIGHTS", "Experiment", "PpoSettings", "ReynoldsSettings", "load_experiment"]
+
+CONFIGS = Path(__file__).resolve().parent.parent / "configs"
+WEIGHTS = Path(__file__).resolve().parent / "weights"
+
+
+class PpoSettings(Record):
+    """How PPO learns; the defaults are what two cores like: many rows per step, large minibatches, few epochs."""
+
+    steps: int = Field(default=20_000_000, ge=1, description="agent-steps in all")
+    worlds: int = Field(default=1024, ge=1, description="worlds stepped together; rows = worlds x learners")
+    rollout: int = Field(default=32, ge=1, description="decisions per update")
+    minibatch: int = Field(default=8192, ge=1, description="rows")
+    epochs: int = Field(default=4, ge=1, description="passes over a rollout")
+    learning_rate: float = Field(default=1e-3, gt=0, description="at the start; falls linearly to a tenth")
+    gamma: float = Field(default=0.99, gt=0, le=1, description="discount per decision")
+    gae_lambda: float = Field(default=0.95, ge=0, le=1, description="of the advantage estimate")
+    clip: float = Field(default=0.2, gt=0, description="PPO's clip range")
+    entropy: float = Field(default=0.0, ge=0, description="weight of the entropy bonus")
+    log_std: float = Field(default=-0.5, description="logarithm of the first standard deviation of actions")
+    reward_scale: float = Field(default=0.1, gt=0, description="rewards are multiplied by this while learning")
+    hidden: tuple[int, ...] = Field(default=(64, 64), min_length=1, description="units per layer")
+    activation: str = Field(default="relu", pattern="^(relu|tanh)$", description="relu or tanh")
+    threads: int = Field(default=2, ge=1, le=64, description="of torch; 1 where other work shares the cores")
+    seed: int = Field(default=0, ge=0, lt=1000, description="of the weights and of the training worlds")
+    evaluate_every: int = Field(default=1_000_000, ge=1, description="agent-steps between points of the curve")
+    evaluate_worlds: int = Field(default=256, ge=1, description="tuning worlds per point of the curve")
+
+
+class SearchSettings(Record):
+    """The budget of the search over the rules' parameters, and what it came to."""
+
+    candidates: int = Field(default=256, ge=2, description="parameter sets drawn at random in the first round")
+    worlds: int = Field(default=96, ge=2, description="tuning worlds per candidate, doubled each round")
+    rounds: int = Field(default=5, ge=1, description="successive halvings, each with refinements around the best")
+    seed: int = Field(default=0, ge=0, lt=1000, description="of the search")
+
+
+class ReynoldsSettings(Record):
+    """The hand-written player's tuned parameters, and the search that found them."""
+
+    search: SearchSettings = Field(default_factory=SearchSettings)
+    rules: dict[str, float] = Field(default_factory=dict, description="what the search found; written by agents.tune")
+    found: dict[str, float] = Field(default_factory=dict, description="budget spent and scores; written by agents.tune")
+
+
+class Experiment(Record):
+    """One task with its learners."""
+
+    task: str = Field(description="name of the task")
+    arguments: dict[str, Any] = Field(default_factory=dict, description="keyword arguments of the task")
+    ppo: PpoSettings = Field(default_factory=PpoSettings)
+    reynolds: ReynoldsSettings = Field(default_factory=ReynoldsSettings)
+
+    def build(self) -> Task:
+        """Return the task; ValueError with the nearest name for an unknown one."""
+        if self.task not in TASKS:
+            near = difflib.get_close_matches(self.task, TASKS, n=1)
+            hint = f", did you mean {near[0]!r}?" if near else ""
+            raise ValueError(f"task = {self.task!r}: unknown{hint} allowed: {', '.join(TASKS)}")
+        return TASKS[self.task](**self.arguments)
+
+
+def load_experiment(path: str | Path) -> Experiment:
+    """Read an experiment from YAML; errors are one line with the key path."""
+    return load(Path(path), Experiment)

@@ -1,0 +1,254 @@
+"""Train a policy with Stable-Baselines3's PPO: `python -m agents.ppo configs/pursuit.yaml`.
+
+Reads top to bottom: settings -> worlds -> model -> learn -> export. Every so often the policy of the moment plays the
+tuning worlds in numpy; that is the learning curve, and the best one is what is exported, as safetensors with a card
+that holds the recipe. Ctrl-C keeps a checkpoint, `--resume` goes on from it.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import platform
+import time
+from dataclasses import dataclass, field
+from importlib.metadata import version
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import torch
+import typer
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from stable_baselines3 import PPO
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.vec_env import VecEnvWrapper
+
+from agents.experiment import WEIGHTS, Experiment, PpoSettings, load_experiment
+from flockenv.evaluation import rollout, worlds_for
+from flockenv.policy import MlpPolicy, save_policy
+from flockenv.sb3 import WorldVecEnv
+from flockenv.tasks import Task
+
+__all__ = ["app", "tensors_of", "train"]
+
+app = typer.Typer(add_completion=False, rich_markup_mode=None, pretty_exceptions_enable=False)
+console = Console(stderr=True)
+
+
+class ScaledReward(VecEnvWrapper):
+    """Rewards times a constant: keeps the value loss near 1, so that clipping gradients does not starve the policy."""
+
+    def __init__(self, venv: WorldVecEnv, scale: float) -> None:
+        super().__init__(venv)
+        self.scale = scale
+
+    def reset(self) -> np.ndarray:
+        """Begin."""
+        return self.venv.reset()
+
+    def step_wait(self) -> Any:
+        """Scale what is paid."""
+        observation, reward, done, infos = self.venv.step_wait()
+        return observation, reward * self.scale, done, infos
+
+
+@dataclass
+class Run:
+    """What training has come to so far; all that a checkpoint holds beside the network."""
+
+    steps: int = 0
+    wall: float = 0.0  # s
+    curve: list[dict[str, float]] = field(default_factory=list)
+    best: float = -np.inf
+    tensors: dict[str, np.ndarray] = field(default_factory=dict)
+
+
+def tensors_of(model: PPO) -> dict[str, np.ndarray]:
+    """Return the actor's weights under the names that flockenv.policy reads; the critic stays behind."""
+    tensors = model.policy.state_dict().items()
+    state = {name: tensor.detach().cpu().numpy().astype(np.float32) for name, tensor in tensors}
+    out = {"log_std": state["log_std"]}
+    for part in ("weight", "bias"):
+        out[f"action.{part}"] = state[f"action_net.{part}"]
+    layers = sorted({int(name.split(".")[2]) for name in state if name.startswith("mlp_extractor.policy_net.")})
+    for k, layer in enumerate(layers):
+        for part in ("weight", "bias"):
+            out[f"policy.{k}.{part}"] = state[f"mlp_extractor.policy_net.{layer}.{part}"]
+    return {name: tensor.copy() for name, tensor in out.items()}
+
+
+def build(task: Task, p: PpoSettings, tensorboard: str | None) -> PPO:
+    """Make the worlds and the model."""
+    torch.set_num_threads(p.threads)
+    torch.manual_seed(p.seed)
+    worlds = ScaledReward(WorldVecEnv(task, p.worlds), p.reward_scale)
+    model = PPO(
+        "MlpPolicy",
+        worlds,
+        n_steps=p.rollout,
+        batch_size=p.minibatch,
+        n_epochs=p.epochs,
+        learning_rate=lambda left: p.learning_rate * (0.1 + 0.9 * left),
+        gamma=p.gamma,
+        gae_lambda=p.gae_lambda,
+        clip_range=p.clip,
+        ent_coef=p.entropy,
+        seed=p.seed,
+        device="cpu",
+        tensorboard_log=tensorboard,
+        policy_kwargs={
+            "net_arch": {"pi": list(p.hidden), "vf": list(p.hidden)},
+            "activation_fn": {"relu": torch.nn.ReLU, "tanh": torch.nn.Tanh}[p.activation],
+            "log_std_init": p.log_std,
+        },
+    )
+    worlds.seed(worlds_for("training", p.seed, p.worlds))
+    return model
+
+
+def score(task: Task, p: PpoSettings, tensors: dict[str, np.ndarray]) -> tuple[float, float]:
+    """Return the mean return and the success rate of a policy, without noise, on the tuning worlds."""
+    policy = MlpPolicy(tensors, {"activation": p.activation})
+    episodes = rollout(task, policy, p.evaluate_worlds, worlds_for("tuning", p.seed, p.evaluate_worlds))
+    return float(np.mean(episodes.returns)), float(np.mean(episodes.success))
+
+
+class Watch(BaseCallback):
+    """After each rollout: the progress bar; every so often: a point of the learning curve, and a checkpoint."""
+
+    def __init__(self, task: Task, p: PpoSettings, run: Run, folder: Path, progress: Progress) -> None:
+        super().__init__()
+        self.task, self.p, self.run, self.folder, self.progress = task, p, run, folder, progress
+        self.bar = progress.add_task(task.name, total=p.steps, completed=run.steps, score="")
+        self.since, self.before = time.perf_counter(), run.wall
+
+    def _on_step(self) -> bool:
+        return True
+
+    def _on_rollout_end(self) -> None:
+        self.run.steps = self.num_timesteps
+        self.progress.update(self.bar, completed=min(self.num_timesteps, self.p.steps))
+        due = len(self.run.curve) * self.p.evaluate_every
+        if self.num_timesteps >= due:
+            self.point()
+
+    def point(self) -> None:
+        """Measure the policy of the moment, keep it if it is the best so far, and write a checkpoint."""
+        self.run.wall = self.before + time.perf_counter() - self.since
+        self.run.steps = self.num_timesteps
+        tensors = tensors_of(self.model)
+        result, success = score(self.task, self.p, tensors)
+        seconds = round(self.run.wall, 1)
+        self.run.curve.append({"steps": self.run.steps, "seconds": seconds, "mean": result, "success": success})
+        if result > self.run.best:
+            self.run.best, self.run.tensors = result, tensors
+        self.progress.update(self.bar, score=f"{result:.2f}, success {success:.0%}, best {self.run.best:.2f}")
+        line = f"{self.run.steps:>12,} steps {seconds:7.1f} s  mean {result:8.3f}  success {success:.3f}"
+        self.progress.console.print(line)
+        checkpoint(self.folder, self.model, self.run)
+
+
+def checkpoint(folder: Path, model: PPO, run: Run) -> None:
+    """Write the run so far; each file is either the old one or the whole new one."""
+    folder.mkdir(parents=True, exist_ok=True)
+    torch.save(model.policy.state_dict(), folder / "policy.tmp")
+    torch.save(model.policy.optimizer.state_dict(), folder / "optimizer.tmp")
+    np.savez(folder / "best.tmp.npz", **run.tensors)
+    notes = {"steps": run.steps, "wall": run.wall, "best": run.best, "curve": run.curve}
+    (folder / "run.tmp").write_text(json.dumps(notes), encoding="utf-8")
+    finals = {
+        "policy.tmp": "policy.pt",
+        "optimizer.tmp": "optimizer.pt",
+        "best.tmp.npz": "best.npz",
+        "run.tmp": "run.json",
+    }
+    for name, final in finals.items():
+        os.replace(folder / name, folder / final)
+
+
+def resume(folder: Path, model: PPO) -> Run:
+    """Read a checkpoint back into the model; no file of it can execute code."""
+    notes = json.loads((folder / "run.json").read_text(encoding="utf-8"))
+    model.policy.load_state_dict(torch.load(folder / "policy.pt", weights_only=True))
+    model.policy.optimizer.load_state_dict(torch.load(folder / "optimizer.pt", weights_only=True))
+    with np.load(folder / "best.npz", allow_pickle=False) as best:
+        tensors = {name: best[name] for name in best.files}
+    model.num_timesteps = int(notes["steps"])
+    return Run(model.num_timesteps, notes["wall"], notes["curve"], notes["best"], tensors)
+
+
+def train(experiment: Experiment, folder: Path, go_on: bool = False, tensorboard: str | None = None) -> Run:
+    """Train to the end of the budget, or until Ctrl-C; return what came of it."""
+    task, p = experiment.build(), experiment.ppo
+    model = build(task, p, tensorboard)
+    run = resume(folder, model) if go_on and (folder / "run.json").exists() else Run()
+    columns = (
+        TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TimeRemainingColumn(),
+        TextColumn("{task.fields[score]}"),
+    )  # fmt: skip
+    with Progress(*columns, console=console) as progress:
+        watch = Watch(task, p, run, folder, progress)
+        try:
+            model.learn(p.steps - run.steps, callback=watch, reset_num_timesteps=run.steps == 0, log_interval=None)
+            watch.point()
+        except KeyboardInterrupt:
+            watch.point()
+            raise
+    return run
+
+
+def export(experiment: Experiment, run: Run, path: Path) -> None:
+    """Write the best policy with its recipe: everything that is needed to make it again."""
+    task, p = experiment.build(), experiment.ppo
+    card = {
+        "task": task.name,
+        "arguments": experiment.arguments,
+        "layout": task.layout.digest,
+        "activation": p.activation,
+        "algorithm": "PPO (stable-baselines3)",
+        "recipe": {"command": f"python -m agents.ppo configs/{task.name}.yaml", "ppo": p.model_dump(mode="json")},
+        "seed": p.seed,
+        "steps": run.steps,
+        "wall_time_s": round(run.wall, 1),
+        "tuning_mean": run.best,
+        "curve": run.curve,
+        "machine": f"{platform.machine()}, {os.cpu_count()} cores",
+        "versions": {name: version(name) for name in ("stable-baselines3", "torch", "numpy", "gymnasium")},
+    }
+    save_policy(path, run.tensors, card)
+
+
+@app.command()
+def main(
+    config: Annotated[Path, typer.Argument(help="an experiment, such as configs/pursuit.yaml")],
+    out: Annotated[Path | None, typer.Option(help="default: agents/weights/TASK.safetensors")] = None,
+    runs: Annotated[Path, typer.Option(help="folder of checkpoints")] = Path("runs"),
+    go_on: Annotated[bool, typer.Option("--resume", help="go on from the last checkpoint")] = False,
+    tensorboard: Annotated[str | None, typer.Option(help="folder of TensorBoard logs")] = None,
+    steps: Annotated[int | None, typer.Option(help="agent-steps in all, instead of the config's")] = None,
+    seed: Annotated[int | None, typer.Option(help="instead of the config's")] = None,
+) -> None:
+    """Train a policy with PPO and export its weights."""
+    try:
+        experiment = load_experiment(config)
+        changes = {k: v for k, v in (("steps", steps), ("seed", seed)) if v is not None}
+        experiment = experiment.model_copy(update={"ppo": PpoSettings(**{**experiment.ppo.model_dump(), **changes})})
+        task = experiment.build()
+    except (ValueError, OSError) as error:
+        console.print(f"error: {error}", style="red", markup=False, highlight=False)
+        raise typer.Exit(2) from None
+    target = out or WEIGHTS / f"{task.name}.safetensors"
+    try:
+        run = train(experiment, runs / task.name, go_on, tensorboard)
+    except KeyboardInterrupt:
+        console.print(f"interrupted; checkpoint in {runs / task.name}, go on with --resume")
+        raise typer.Exit(130) from None
+    export(experiment, run, target)
+    best = f"mean return {run.best:.3f} on the tuning worlds"
+    console.print(f"{target}: {best} after {run.steps:,} steps, {run.wall:.0f} s")
+
+
+if __name__ == "__main__":
+    app()

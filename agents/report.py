@@ -1,0 +1,246 @@
+"""What the comparison says: one dictionary of results, and its tables, sentences and Markdown, all read from it."""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from itertools import combinations
+from typing import Any
+
+from rich import box
+from rich.markup import escape
+from rich.table import Table
+
+from flockenv.evaluation import Comparison, Episodes, Interval, compare, summarise
+from flockenv.render.chart import Column, Row
+
+__all__ = ["column", "json_text", "markdown", "player_tables", "task_results", "verdict"]
+
+Results = dict[str, Any]
+
+NOTES = """\
+Return: the mean reward of a world's learners, summed over its episode; higher is better. Every player met the same
+worlds, and no player was trained or tuned on one of them. IQM (the mean without the best and the worst quarter of the
+worlds), mean and differences: 95 % percentile bootstrap over worlds; success and "scores higher" (ties count half):
+95 % Wilson. A difference is the mean over worlds, so rare disasters count in it, unlike in the IQM. There is one
+trained policy per task: the intervals speak of the luck of worlds, not of the luck of training, which hand-written
+players have none of. µs: per decision, all worlds at once / one row alone (median)."""
+
+
+def task_results(
+    digest: str, episodes: Mapping[str, Episodes], costs: Mapping[str, Results], resamples: int, seed: int
+) -> Results:
+    """Return everything about one task as plain data: players in order, and each pair, the later minus the earlier."""
+    pairs = {
+        f"{later} - {earlier}": _pair(compare(episodes[later], episodes[earlier], resamples, seed))
+        for earlier, later in reversed(list(combinations(episodes, 2)))
+    }
+    players = {name: _player(played, costs.get(name, {}), resamples, seed) for name, played in episodes.items()}
+    first = next(iter(episodes.values()))
+    results = {"digest": digest, "horizon": first.horizon, "players": players, "pairs": pairs}
+    return {**results, "verdict": verdict(first.task, results)}
+
+
+def _player(played: Episodes, cost: Results, resamples: int, seed: int) -> Results:
+    summary = summarise(played, resamples, seed)
+    return {
+        **_interval("iqm", "ci", summary.iqm),
+        **_interval("mean", "mean", summary.mean),
+        **_interval("success_rate", "success", summary.success),
+        "worlds": played.worlds,
+        "episode_length": float(played.lengths.mean()),
+        "metrics": {name: {"mean": _number(mean), "worlds": n} for name, (mean, n) in summary.metrics.items()},
+        "terms": {name: float(values.mean()) for name, values in played.terms.items()},
+        "microseconds_per_decision": played.microseconds,
+        "microseconds_single": played.latency,
+        "cost": cost,
+        "returns": [float(x) for x in played.returns],
+    }
+
+
+def _pair(pair: Comparison) -> Results:
+    return {
+        **_interval("difference", "ci", pair.difference),
+        **_interval("iqm_difference", "iqm", pair.iqm_difference),
+        **_interval("probability_better", "better", pair.better),
+        "worlds": pair.worlds,
+        "separated": pair.separated,
+    }
+
+
+def _interval(name: str, prefix: str, interval: Interval) -> Results:
+    return {name: interval.value, f"{prefix}_low": interval.low, f"{prefix}_high": interval.high}
+
+
+def _number(value: float) -> float | None:
+    return value if math.isfinite(value) else None  # JSON has no NaN
+
+
+def verdict(task: str, results: Results) -> str:
+    """Return a sentence: who is ahead by how much in the same worlds, and what each of the two cost.
+
+    It is about ppo and reynolds where both played, else about the two players with the best means.
+    """
+    players = results["players"]
+    if len(players) < 2:
+        return f"{task}: one player alone, nobody to compare with."
+    names = ("ppo", "reynolds")
+    if not players.keys() >= set(names):
+        names = tuple(sorted(players, key=lambda name: -players[name]["mean"])[:2])
+    key = next(key for key in results["pairs"] if set(key.split(" - ")) == set(names))
+    pair, (first, second) = results["pairs"][key], key.split(" - ")
+    if pair["difference"] < 0:
+        pair, first, second = _reversed(pair), second, first
+    gap = interval_text(pair, "difference", "ci")
+    wins = f"{percent_text(pair, 'probability_better', 'better')} of the same {pair['worlds']} worlds"
+    rates = f"success {players[first]['success_rate']:.0%} against {players[second]['success_rate']:.0%}"
+    if pair["separated"]:
+        claim = f"{first} beats {second} by {gap} per world and scores higher in {wins}; {rates}."
+    else:
+        claim = f"{first} and {second} are level: difference {gap} per world, {first} scores higher in {wins}; {rates}."
+    return f"{task}: {claim} {_costs(first, players[first])}; {_costs(second, players[second])}."
+
+
+def _reversed(pair: Results) -> Results:
+    turned = {"difference": -pair["difference"], "ci_low": -pair["ci_high"], "ci_high": -pair["ci_low"]}
+    better = {"probability_better": 1 - pair["probability_better"]}
+    return {**pair, **turned, **better, "better_low": 1 - pair["better_high"], "better_high": 1 - pair["better_low"]}
+
+
+def _costs(name: str, player: Results) -> str:
+    cost, spent = player["cost"], []
+    if "wall_time_s" in cost:
+        spent.append(duration_text(cost["wall_time_s"]))
+    if "steps" in cost:
+        spent.append(f"{steps_text(cost['steps'])} agent-steps")
+    once = f"{' and '.join(spent)} of {cost.get('of', 'training')}, then " if spent else ""
+    return f"{name} cost {once}{micro_text(player['microseconds_per_decision'])} µs per decision"
+
+
+def player_tables(task: str, results: Results) -> Iterator[Table]:
+    """Yield what a terminal of 80 columns shows of a task: scores, then what happened, then the pairs."""
+    header, rows = player_cells(results)
+    yield _table(task, header[:4], [row[:4] for row in rows])
+    yield _table(None, [header[0], *header[4:]], [[row[0], *row[4:]] for row in rows])
+    if results["pairs"]:
+        yield _table(None, *pair_cells(results))
+
+
+def _table(title: str | None, header: Sequence[str], rows: Sequence[Sequence[str]]) -> Table:
+    table = Table(
+        title=title and escape(title), title_style="bold", title_justify="left", box=box.SIMPLE_HEAD, padding=(0, 1)
+    )
+    for k, name in enumerate(header):
+        table.add_column(escape(name), justify="left" if k == 0 else "right", no_wrap=k == 0)
+    for row in rows:
+        table.add_row(*map(escape, row))
+    return table
+
+
+def player_cells(results: Results) -> tuple[list[str], list[list[str]]]:
+    """Return header and rows: one row per player."""
+    players = results["players"]
+    metrics = list(next(iter(players.values()))["metrics"])
+    header = ["player", "IQM [95 %]", "mean [95 %]", "success [95 %]", *(m.replace("_", " ") for m in metrics), "µs"]
+    rows = [
+        [
+            name,
+            interval_text(player, "iqm", "ci"),
+            interval_text(player, "mean", "mean"),
+            percent_text(player, "success_rate", "success"),
+            *(number_text(player["metrics"][metric]["mean"]) for metric in metrics),
+            f"{micro_text(player['microseconds_per_decision'])} / {micro_text(player['microseconds_single'])}",
+        ]
+        for name, player in players.items()
+    ]
+    return header, rows
+
+
+def pair_cells(results: Results) -> tuple[list[str], list[list[str]]]:
+    """Return header and rows: one row per pair."""
+    header = ["same worlds", "difference [95 %]", "IQM of it [95 %]", "higher in [95 %]"]
+    rows = [
+        [
+            name,
+            interval_text(pair, "difference", "ci") + ("" if pair["separated"] else " (level)"),
+            interval_text(pair, "iqm_difference", "iqm"),
+            percent_text(pair, "probability_better", "better"),
+        ]
+        for name, pair in results["pairs"].items()
+    ]
+    return header, rows
+
+
+def column(task: str, results: Results, episodes: Mapping[str, Episodes]) -> Column:
+    """Return what the picture shows of one task: all players, and the pairs of those who steer at all."""
+
+    def interval(about: Results, name: str, prefix: str) -> Interval:
+        return Interval(about[name], about[f"{prefix}_low"], about[f"{prefix}_high"])
+
+    rows = [
+        Row(name, interval(player, "iqm", "ci"), interval(player, "success_rate", "success"), episodes[name].returns)
+        for name, player in results["players"].items()
+    ]
+    pairs = {name: interval(pair, "difference", "ci") for name, pair in results["pairs"].items()}
+    steering = {name: pair for name, pair in pairs.items() if "random" not in name.split(" - ")}
+    return Column(task, rows, steering or pairs)
+
+
+def json_text(results: Results) -> str:
+    """Return the results as strict JSON, lists of numbers on one line each."""
+    text = json.dumps(results, indent=2, allow_nan=False, ensure_ascii=False)
+    return re.sub(r"\[\s+([-+.\deE,\s]*?)\s+\]", lambda m: f"[{' '.join(m[1].split())}]", text) + "\n"
+
+
+def markdown(results: Results) -> str:
+    """Return the whole comparison as a Markdown page."""
+    seeds = f"{results['world_seeds']['first']} to {results['world_seeds']['last']}"
+    parts = ["# Hand-written steering against learning", f"{results['worlds']} worlds per task, seeds {seeds}."]
+    for task, about in results["tasks"].items():
+        parts += [f"## {task}", about["verdict"], _grid(*player_cells(about))]
+        parts += [_grid(*pair_cells(about))] if about["pairs"] else []
+    versions = ", ".join(f"{name} {version}" for name, version in results["versions"].items())
+    return "\n\n".join([*parts, "---", NOTES, f"Made with {versions}.\n"])
+
+
+def _grid(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    lines = [header, ["---", *("---:" for _ in header[1:])], *rows]
+    return "\n".join("| " + " | ".join(cell.replace("|", "\\|") for cell in line) + " |" for line in lines)
+
+
+def interval_text(about: Results, name: str, prefix: str) -> str:
+    """Return 'value [low, high]' with digits down to a twentieth of the interval's width."""
+    value, low, high = about[name], about[f"{prefix}_low"], about[f"{prefix}_high"]
+    width = high - low
+    digits = min(6, max(0, math.ceil(1.3 - math.log10(width)))) if width > 0 else 3
+    return f"{value:.{digits}f} [{low:.{digits}f}, {high:.{digits}f}]"
+
+
+def percent_text(about: Results, name: str, prefix: str) -> str:
+    """Return '78 % [73, 83]'."""
+    value, low, high = (100 * about[key] for key in (name, f"{prefix}_low", f"{prefix}_high"))
+    return f"{value:.0f} % [{low:.0f}, {high:.0f}]"
+
+
+def number_text(value: float | None) -> str:
+    """Return three significant digits, or a dash where nothing applies."""
+    if value is None:
+        return "–"
+    return f"{value:,.0f}" if abs(value) >= 1000 else f"{value + 0.0:.3g}"  # + 0.0: no "-0"
+
+
+def steps_text(steps: float) -> str:
+    """Return '950' or '10.7 M'."""
+    return f"{steps / 1e6:.1f} M" if steps >= 1e5 else f"{steps:,.0f}"
+
+
+def micro_text(microseconds: float) -> str:
+    """Return two digits, or whole µs."""
+    return f"{microseconds:.0f}" if microseconds >= 10 else f"{microseconds:.2g}"
+
+
+def duration_text(seconds: float) -> str:
+    """Return '45 s' or '4.2 min'."""
+    return f"{seconds:.0f} s" if seconds < 90 else f"{seconds / 60:.1f} min"

@@ -1,0 +1,196 @@
+"""The hand-written players: one page of Reynolds per task, from the laws that the simulator itself steers by.
+
+Each sees exactly the learner's observation and nothing else, and asks for a force within the same limits. It is shown
+twice: with textbook parameters (the defaults below), and tuned by a plain search that had the budget noted in
+configs/<task>.yaml (`python -m agents.tune`).
+
+    from agents.reynolds import player
+    action, _ = player(task).predict(observation)
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+from flockenv import arbitration, steering
+from flockenv.rows import rows
+from flockenv.tasks import Flock, Obstacles, Pursuit, Task
+
+__all__ = ["RULES", "Reynolds", "player", "tuned"]
+
+CONFIGS = Path(__file__).parent.parent / "configs"
+
+seek, arrive, contain = rows(steering.seek), rows(steering.arrive), rows(steering.contain)
+interception_time, pursue = rows(steering.interception_time), rows(steering.pursue)
+threat, avoid = rows(steering.threat), rows(steering.avoid)
+separate, align = rows(steering.separate), rows(steering.align)
+allocate = rows(arbitration.allocate)
+
+
+# --- Pursuit: seek where the quarry will be, but never beyond the walls it cannot pass ------------------------------
+
+
+@dataclass(frozen=True)
+class PursuitRules:
+    """Textbook: exact interception, full force."""
+
+    factor: float = 1.0  # share of the interception time that is looked ahead
+    horizon: float = 10.0  # s, never look further ahead than this
+    margin: float = 0.3  # m, the quarry will not be nearer to a wall than this
+    gain: float = 5.0  # kg/s, a change of velocity is asked for within 1/gain seconds
+    slow_radius: float = 0.01  # m, arrive instead of seek: brake within this distance of the predicted place
+
+
+def pursuit(see: Any, task: Pursuit, p: PursuitRules) -> np.ndarray:
+    """Pursue the nearest opponent (Reynolds 1999) with a bounded exact predictor."""
+    offset, quarry = see.opponents[:, 0], see.opponent_velocity[:, 0]
+    top = task.pursuer_speed
+    time = np.minimum(p.factor * interception_time(offset, quarry, top), p.horizon)
+    ahead = offset + quarry * time[:, None]
+    ahead = np.clip(ahead, p.margin - see.to_low, see.to_high - p.margin)
+    return p.gain * arrive(ahead, see.velocity, top, p.slow_radius)
+
+
+# --- Obstacles: arrive at the goal, around what is in the way --------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class ObstaclesRules:
+    """Textbook: look two seconds ahead, evade with all the force there is, seek with the rest."""
+
+    horizon: float = 2.0  # s, how far ahead a threat counts at the present speed
+    margin: float = 0.2  # m, clearance beyond the touching distance
+    evade: float = 5.0  # kg/s, strength of an evasion
+    urgency: float = 0.0  # 0: evade with full strength at any distance; 1: in proportion to nearness
+    brake: float = 0.0  # kg/s against the speed, in proportion to nearness
+    gain: float = 2.0  # kg/s towards the goal
+    speed: float = 1.0  # share of the top speed that is wanted
+    push: float = 0.0  # N m, repulsion from the nearest surfaces (1/gap), a force field for close quarters
+
+
+def obstacles(see: Any, task: Obstacles, p: ObstaclesRules) -> np.ndarray:
+    """Steer to avoid what the straight path touches first (Reynolds 1999), then seek; allocation as in 1987."""
+    speed = np.linalg.norm(see.velocity, axis=-1)
+    goal_way = see.goal / np.maximum(np.linalg.norm(see.goal, axis=-1), 1e-9)[:, None]
+    forward = np.where(speed[:, None] > 0.05, see.velocity / np.maximum(speed, 1e-9)[:, None], goal_way)
+    reach = np.maximum(speed, 0.5) * p.horizon
+    clearance = see.obstacle_radius + 0.3 + p.margin
+    distance = threat(forward[:, None], see.obstacles, clearance, reach[:, None])
+    distance = np.where(see.obstacle_radius > 0, distance, np.inf)
+    first = np.argmin(distance, axis=1)
+    row = np.arange(len(first))
+    nearest = distance[row, first]
+    danger = np.isfinite(nearest)
+    nearness = 1.0 - np.where(danger, nearest / np.maximum(reach, 1e-9), 1.0)
+    strength = p.evade * (1.0 - p.urgency * (1.0 - nearness)) * danger
+    aside = avoid(forward, see.obstacles[row, first], clearance[row, first], task.max_speed)
+    evasion = aside * strength[:, None] - p.brake * see.velocity * nearness[:, None]
+    away = -see.obstacles / np.maximum(np.linalg.norm(see.obstacles, axis=-1), 1e-9)[..., None]
+    seen = (see.obstacle_radius > 0) & (see.clearance < 1.0)
+    field = p.push * np.sum(away * (seen / np.maximum(see.clearance, 0.05))[..., None], axis=1)
+    course = p.gain * seek(see.goal, see.velocity, p.speed * task.max_speed)
+    return allocate(np.stack([evasion, field, course], axis=1), task.max_force)
+
+
+# --- Flock: avoid, keep apart, fly as the others do, stay with them, and on course -----------------------------------
+
+
+@dataclass(frozen=True)
+class FlockRules:
+    """Textbook: Reynolds' order of 1987, collision avoidance first, then matching velocity, then centring."""
+
+    horizon: float = 2.0  # s, look-ahead for obstacles
+    margin: float = 0.3  # m, clearance from obstacles
+    evade: float = 5.0  # kg/s, strength of an evasion
+    radius: float = 1.5  # m, neighbours nearer than this push
+    apart: float = 2.0  # N m, separation
+    match: float = 1.5  # kg/s, alignment
+    centre: float = 0.3  # N/m, cohesion
+    course: float = 2.0  # kg/s, towards the cruising velocity
+    blend: float = 0.0  # 0: allocate in order; 1: sum up
+
+
+def flock(see: Any, task: Flock, p: FlockRules) -> np.ndarray:
+    """Avoid, separate, align, cohere, follow the heading; vectors are (along the heading, to its left)."""
+    speed = np.linalg.norm(see.velocity, axis=-1)
+    forward = see.velocity / np.maximum(speed, 1e-9)[:, None]
+    clearance = see.obstacle_radius + 0.3 + p.margin
+    distance = threat(forward[:, None], see.obstacles, clearance, (speed * p.horizon)[:, None])
+    distance = np.where(see.obstacle_radius > 0, distance, np.inf)
+    first, row = np.argmin(distance, axis=1), np.arange(len(speed))
+    around = avoid(forward, see.obstacles[row, first], clearance[row, first], task.max_speed)
+    evasion = p.evade * around * np.isfinite(distance[row, first])[:, None]
+
+    here = see.neighbour_present
+    count = np.maximum(here.sum(axis=1), 1.0)[:, None]
+    near = here * (np.linalg.norm(see.neighbours, axis=-1) < p.radius)
+    push = p.apart * np.sum(separate(see.neighbours, np.array([1.0, 0.0])) * near[..., None], axis=1)
+    mean_velocity = see.velocity + np.sum(see.neighbour_velocity * here[..., None], axis=1) / count
+    match = p.match * align(see.velocity, mean_velocity)
+    centre = p.centre * np.sum(see.neighbours * here[..., None], axis=1) / count
+    course = p.course * (np.array([task.cruise, 0.0]) - see.velocity)
+    ordered = allocate(np.stack([evasion, push, match, centre, course], axis=1), task.max_force)
+    summed = evasion + push + match + centre + course
+    return (1.0 - p.blend) * ordered + p.blend * summed
+
+
+# --- the player ------------------------------------------------------------------------------------------------------
+
+RULES: dict[str, tuple[Callable[..., np.ndarray], type]] = {
+    "pursuit": (pursuit, PursuitRules),
+    "obstacles": (obstacles, ObstaclesRules),
+    "flock": (flock, FlockRules),
+}
+
+
+@dataclass(frozen=True)
+class Reynolds:
+    """A hand-written player: SB3's `predict` around one of the functions above."""
+
+    task: Task
+    rules: Any
+
+    def predict(
+        self, observation: Any, state: Any = None, episode_start: Any = None, deterministic: bool = True
+    ) -> tuple[np.ndarray, Any]:
+        """Return actions (R, A) float32 for observation rows (R, O), or (A,) for one row (O,)."""
+        seen = np.asarray(observation)
+        steer = RULES[self.task.name][0]
+        force = steer(self.task.layout.unpack(np.atleast_2d(seen)), self.task, self.rules)
+        strongest = self.task.action_layout.slots[0].scale
+        wish = force / strongest
+        length = np.maximum(np.linalg.norm(wish, axis=-1, keepdims=True), 1.0)
+        action = (wish / length).astype(np.float32)
+        return (action[0] if seen.ndim == 1 else action), state
+
+    def with_rules(self, values: Mapping[str, float]) -> Reynolds:
+        """Return the same player with other parameters."""
+        return replace(self, rules=replace(self.rules, **values))
+
+
+def tuned(name: str) -> dict[str, float]:
+    """Return the parameters that the search found for a task, from configs/<name>.yaml; {} if there are none yet."""
+    path = CONFIGS / f"{name}.yaml"
+    if not path.exists():
+        return {}
+    config = yaml.safe_load(path.read_text(encoding="utf-8"))
+    return dict((config.get("reynolds") or {}).get("rules") or {})
+
+
+def player(task: Task, textbook: bool = False) -> Reynolds:
+    """Return the hand-written player of a task, tuned unless the textbook's parameters are asked for."""
+    if task.name not in RULES:
+        raise ValueError(f"there is no hand-written player for {task.name!r}; there is one for: {', '.join(RULES)}")
+    rules = RULES[task.name][1]()
+    return Reynolds(task, replace(rules, **({} if textbook else tuned(task.name))))
+
+
+def as_dict(rules: Any) -> dict[str, float]:
+    """Return parameters by name."""
+    return {name: float(value) for name, value in asdict(rules).items()}

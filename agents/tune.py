@@ -1,0 +1,128 @@
+"""Make the rules as good as they can be: `python -m agents.tune configs/pursuit.yaml`.
+
+A plain search: random parameter sets and the textbook's, played on tuning worlds; the best quarter goes on to twice
+as many worlds, each joined by a small change of itself, for a few rounds. What it found, and the agent-steps that it
+spent, go into the config; the default budget is of the order of what learning has.
+"""
+
+from __future__ import annotations
+
+import os
+from dataclasses import fields
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import typer
+import yaml
+from rich.console import Console
+from rich.progress import Progress
+
+from agents.experiment import Experiment, load_experiment
+from agents.reynolds import RULES, Reynolds, as_dict
+from flockenv.evaluation import rollout, worlds_for
+from flockenv.tasks import Task
+
+__all__ = ["RANGES", "app", "search"]
+
+app = typer.Typer(add_completion=False, rich_markup_mode=None, pretty_exceptions_enable=False)
+console = Console(stderr=True)
+
+RANGES: dict[str, dict[str, tuple[float, float]]] = {
+    "pursuit": {
+        "factor": (0.0, 1.5), "horizon": (0.2, 6.0), "margin": (0.0, 2.5), "gain": (1.0, 12.0),
+        "slow_radius": (0.01, 2.0),
+    },
+    "obstacles": {
+        "horizon": (0.4, 3.0), "margin": (0.0, 0.6), "evade": (0.5, 8.0), "urgency": (0.0, 1.0), "brake": (0.0, 3.0),
+        "gain": (0.5, 6.0), "speed": (0.6, 1.0), "push": (0.0, 2.0),
+    },
+    "flock": {
+        "horizon": (0.5, 4.0), "margin": (0.0, 1.0), "evade": (0.5, 8.0), "radius": (1.0, 3.0), "apart": (0.0, 8.0),
+        "match": (0.0, 5.0), "centre": (0.0, 2.0), "course": (0.2, 6.0), "blend": (0.0, 1.0),
+    },
+}  # fmt: skip
+"""Where each parameter is looked for."""
+
+
+def search(experiment: Experiment, advance: Any = lambda steps: None) -> tuple[dict[str, float], dict[str, float]]:
+    """Return the best parameters, and what was spent and scored."""
+    task, s = experiment.build(), experiment.reynolds.search
+    rng = np.random.default_rng(s.seed)
+    ranges, textbook = RANGES[task.name], as_dict(RULES[task.name][1]())
+    assert set(ranges) == {f.name for f in fields(RULES[task.name][1])}, "every parameter has a range"
+    pool = [textbook, *({k: float(rng.uniform(*r)) for k, r in ranges.items()} for _ in range(s.candidates - 1))]
+    worlds, spent, best_score = s.worlds, 0, -np.inf
+    for round_ in range(s.rounds):
+        scored = []
+        for candidate in pool:
+            score, steps = _score(task, candidate, worlds, s.seed)
+            spent += steps
+            scored.append((score, candidate))
+            advance(1)
+        scored.sort(key=lambda pair: -pair[0])
+        best_score = scored[0][0]
+        keep = [candidate for _, candidate in scored[: max(2, len(scored) // 4)]]
+        spread = 0.25 / (round_ + 1)
+        pool = [*keep, *(_near(keep[k % len(keep)], ranges, spread, rng) for k in range(len(keep)))]
+        worlds *= 2
+    found = {"agent_steps": float(spent), "tuning_mean": best_score, "tuning_worlds": float(worlds // 2)}
+    found["textbook_mean"] = _score(task, textbook, worlds // 2, s.seed)[0]
+    return {k: float(np.round(v, 4)) for k, v in scored[0][1].items()}, found
+
+
+def _plays(candidates: int, rounds: int) -> int:
+    """Return how many parameter sets are played in all rounds."""
+    pool, total = candidates, 0
+    for _ in range(rounds):
+        total += pool
+        pool = 2 * max(2, pool // 4)
+    return total
+
+
+def _near(base: dict[str, float], ranges: dict[str, tuple[float, float]], spread: float, rng: Any) -> dict[str, float]:
+    """Return a set of parameters near another: each moved by a share of its range."""
+    return {k: float(np.clip(base[k] + spread * (hi - lo) * rng.normal(), lo, hi)) for k, (lo, hi) in ranges.items()}
+
+
+def _score(task: Task, values: dict[str, float], worlds: int, seed: int) -> tuple[float, int]:
+    """Return the mean return on tuning worlds, and the agent-steps it took.
+
+    The mean, as in the paired differences of the comparison: a disaster in one world out of ten must count.
+    """
+    episodes = rollout(task, Reynolds(task, RULES[task.name][1](**values)), worlds, worlds_for("tuning", seed, worlds))
+    return float(np.mean(episodes.returns)), int(np.sum(episodes.lengths) * task.learners)
+
+
+def write(path: Path, rules: dict[str, float], found: dict[str, float]) -> None:
+    """Put the result into the config, keeping every other line and comment as it is."""
+    text = path.read_text(encoding="utf-8")
+    config = yaml.safe_load(text)
+    budget = {k: v for k, v in (config.get("reynolds") or {}).items() if k == "search"}
+    block = {"reynolds": {**budget, "rules": rules, "found": found}}
+    head = text.split("\nreynolds:")[0].rstrip("\n")
+    temporary = path.with_suffix(".tmp")
+    temporary.write_text(f"{head}\n{yaml.safe_dump(block, sort_keys=False)}", encoding="utf-8")
+    os.replace(temporary, path)
+
+
+@app.command()
+def main(config: Annotated[Path, typer.Argument(help="an experiment, such as configs/pursuit.yaml")]) -> None:
+    """Search the rules' parameters and write what was found into the config."""
+    try:
+        experiment = load_experiment(config)
+        task = experiment.build()
+    except (ValueError, OSError) as error:
+        console.print(f"error: {error}", style="red", markup=False, highlight=False)
+        raise typer.Exit(2) from None
+    s = experiment.reynolds.search
+    with Progress(console=console) as progress:
+        bar = progress.add_task(f"{task.name}: parameter sets", total=_plays(s.candidates, s.rounds))
+        rules, found = search(experiment, lambda n: progress.advance(bar, n))
+    write(config, rules, found)
+    gained = f"mean return {found['textbook_mean']:.3f} (textbook) -> {found['tuning_mean']:.3f}"
+    console.print(f"{task.name}: {gained}, {found['agent_steps']:,.0f} agent-steps")
+
+
+if __name__ == "__main__":
+    app()

@@ -1,0 +1,70 @@
+"""flockenv: steering agents, hand-written and learned, behind one interface and in one table.
+
+Importing it registers the environments with Gymnasium and PettingZoo::
+
+    gymnasium.make("flockenv/Pursuit-v0")
+    gymnasium.make_vec("flockenv/Obstacles-v0", num_envs=64)
+    pettingzoo.make("parallel", "flockenv/Flock-v0")
+
+The rest loads when it is asked for: neither torch nor matplotlib nor numba is imported before.
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+from flockenv.envs.registration import register_all
+
+if TYPE_CHECKING:
+    from flockenv.scene import Scene
+    from flockenv.snapshot import Snapshot
+    from flockenv.state import Body, State
+    from flockenv.tasks import TASKS, Flock, Obstacles, Pursuit, Task
+    from flockenv.world import Step, World
+
+__version__ = "0.1.0"
+
+__all__ = [
+    "TASKS",
+    "Body",
+    "Flock",
+    "Obstacles",
+    "Pursuit",
+    "Scene",
+    "Snapshot",
+    "State",
+    "Step",
+    "Task",
+    "World",
+    "__version__",
+]
+
+_HOME = {
+    "Scene": "scene",
+    "Snapshot": "snapshot",
+    "Body": "state",
+    "State": "state",
+    "TASKS": "tasks",
+    "Flock": "tasks",
+    "Obstacles": "tasks",
+    "Pursuit": "tasks",
+    "Task": "tasks",
+    "Step": "world",
+    "World": "world",
+}
+"""Which module each public name lives in: it is imported on first use (PEP 562)."""
+
+register_all()
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOME:
+        raise AttributeError(f"module 'flockenv' has no attribute {name!r}")
+    value = getattr(importlib.import_module(f"flockenv.{_HOME[name]}"), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *_HOME})

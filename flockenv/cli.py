@@ -1,0 +1,357 @@
+"""flockenv on the command line: list | run | render | explain | schema. Errors are one line on stderr, exit code 2."""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+import sys
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, get_args
+
+import typer
+
+import flockenv
+from flockenv.refusals import nearest, shown
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from flockenv.render import Panel
+    from flockenv.scene import Scene
+    from flockenv.snapshot import Snapshot
+    from flockenv.tasks import Task
+    from flockenv.trajectory import Trajectory
+
+# Nothing that simulates, draws or learns is imported up here: `flockenv --help` answers in a fifth of a second.
+
+__all__ = ["app", "main"]
+
+OK, DIVERGED, BAD_INPUT, INTERRUPTED = 0, 1, 2, 130
+MOST_SEED = 2**63 - 1
+PICTURES = (".gif", ".png", ".html")
+FPS, MOST_FPS = 25.0, 50.0  # of a scene's GIF; viewers slow down beyond 50
+TRAIL = 25  # instants that a PNG shows behind everybody
+RECORDED_EVERY = 0.1  # s, rounded to whole steps
+
+app = typer.Typer(
+    help="Steering agents: hand-written rules and learned policies in the same worlds.",
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+
+SceneFile = Annotated[str, typer.Argument(metavar="SCENE.yaml", help="A scene; see `flockenv schema` and configs/.")]
+Seed = Annotated[int, typer.Option(min=0, max=MOST_SEED, help="Which world: the same seed is the same run.")]
+Duration = Annotated[float, typer.Option(metavar="S", help="Simulated time in seconds, a whole multiple of dt.")]
+Force = Annotated[bool, typer.Option("--force", help="Overwrite files that exist.")]
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run a command line and return its exit code: 0, 1 (a run went wrong), 2 (bad input), 130 (interrupted).
+
+    `--debug`, anywhere, shows tracebacks instead of one line.
+    """
+    words = list(sys.argv[1:] if arguments is None else arguments)
+    debug = "--debug" in words
+    try:
+        code = app([w for w in words if w != "--debug"], prog_name="flockenv", standalone_mode=False)
+        # typer turns a KeyboardInterrupt into this code without a word
+        return _complain("interrupted", INTERRUPTED) if code == INTERRUPTED else int(code or OK)
+    except (typer.Abort, KeyboardInterrupt):
+        return _complain("interrupted", INTERRUPTED)
+    except _EarlyEnd as end:
+        return _complain(str(end), end.code)
+    except Exception as error:
+        if debug:
+            raise
+        return _complain(*_verdict(error))
+
+
+class _EarlyEnd(Exception):  # noqa: N818  # not an error: what was done is kept and shown
+    """A run that ended before its time, and the exit code that says so."""
+
+    def __init__(self, text: str, code: int) -> None:
+        super().__init__(text)
+        self.code = code
+
+
+def _verdict(error: Exception) -> tuple[str, int]:
+    """Return what to say about an error, and the exit code."""
+    usage = getattr(error, "format_message", None)  # typer's own complaints about the command line
+    if usage is not None:
+        return usage() or "no command given; see flockenv --help", BAD_INPUT
+    if isinstance(error, (ValueError, OSError, ImportError)):
+        return str(error), BAD_INPUT
+    return f"{type(error).__name__}: {error} (a fault of flockenv's; --debug shows where)", DIVERGED
+
+
+def _complain(text: str, code: int) -> int:
+    for line in text.splitlines():
+        print(f"flockenv: {_printable(line)}", file=sys.stderr)
+    return code
+
+
+def _printable(text: str) -> str:
+    """Return text without the control characters that would drive a terminal."""
+    return "".join(c if c.isprintable() else repr(c)[1:-1] for c in text)
+
+
+def _show_version(asked: bool) -> None:
+    if asked:
+        print(flockenv.__version__)
+        raise typer.Exit
+
+
+@app.callback()
+def _options(
+    debug: Annotated[bool, typer.Option("--debug", help="Show a traceback where something goes wrong.")] = False,
+    version: Annotated[
+        bool, typer.Option("--version", help="Show the version and exit.", is_eager=True, callback=_show_version)
+    ] = False,
+) -> None:
+    """Read the options that every command has; `main` has taken --debug out already."""
+
+
+@app.command("list")
+def listing() -> None:
+    """Show the tasks and their ids, effects, integrators and spaces, each in one sentence."""
+    import gymnasium
+    import pettingzoo
+
+    from flockenv.effects import EFFECTS
+    from flockenv.integrators import INTEGRATORS
+    from flockenv.space import AnySpace
+    from flockenv.tasks import TASKS
+
+    console = _console()
+    single = [env_id for env_id in gymnasium.registry if env_id.startswith("flockenv/")]
+    many = [env_id for env_id in pettingzoo.parallel_registry if env_id.startswith("flockenv/")]
+    _table(console, "Tasks", ((name, _sentence(task)) for name, task in TASKS.items()))
+    _table(console, "gymnasium.make, gymnasium.make_vec", ((env_id, "one learner") for env_id in single))
+    _table(console, 'pettingzoo.make("parallel" or "aec", ...)', ((env_id, "many learners") for env_id in many))
+    _table(console, "Effects", ((kind, _sentence(effect)) for kind, effect in sorted(EFFECTS.items())))
+    _table(console, "Integrators", ((kind, _sentence(method)) for kind, method in sorted(INTEGRATORS.items())))
+    spaces = get_args(get_args(AnySpace)[0])
+    _table(console, "Spaces", ((space.model_fields["kind"].default, _sentence(space)) for space in spaces))
+
+
+@app.command()
+def run(
+    scene: SceneFile,
+    seed: Seed = 0,
+    duration: Duration = 10.0,
+    out: Annotated[
+        str | None, typer.Option(metavar="X.npz", help="Write the trajectory there, and a summary to X.json.")
+    ] = None,
+    every: Annotated[
+        float | None, typer.Option(metavar="S", help="Time between recorded instants in seconds [default: about 0.1]")
+    ] = None,
+    force: Force = False,
+) -> None:
+    """Run a scene, show what a biologist would measure, and keep the trajectory if asked to."""
+    from flockenv.config import load_scene
+    from flockenv.outputs import checked_file
+    from flockenv.trajectory import whole_steps
+
+    loaded = load_scene(Path(scene))
+    path = checked_file(out, [".npz"], force) if out is not None else None
+    if path is not None:
+        checked_file(str(path.with_suffix(".json")), [".json"], force)
+    steps = whole_steps("--duration", duration, loaded.dt)
+    usual = max(1, round(RECORDED_EVERY / loaded.dt))
+    stride = usual if every is None else whole_steps("--every", every, loaded.dt, 1)
+    trajectory = _recorded(loaded, seed, steps, stride if path is not None else max(1, steps))
+    console = _console()
+    _show_measures(console, trajectory)
+    if path is not None:
+        beside = trajectory.save(path)
+        console.print(f"{len(trajectory.step)} instants in {_relative(path)}, summary in {_relative(beside)}")
+    if trajectory.stopped:
+        text = f"{trajectory.stopped}; what was done until {trajectory.last.time[0]:g} s is shown"
+        raise _EarlyEnd(text, INTERRUPTED if trajectory.stopped == "interrupted" else DIVERGED)
+
+
+@app.command()
+def render(
+    what: Annotated[
+        str, typer.Argument(metavar="SCENE.yaml|TASK", help="A scene file, or a task from `flockenv list`.")
+    ],
+    out: Annotated[str, typer.Option(metavar="X.gif|X.png|X.html", help="What to write; a PNG shows the end.")],
+    player: Annotated[
+        str, typer.Option(metavar="FILE", help="Who plays a task: `random`, a .safetensors file or a .py file.")
+    ] = "random",
+    seed: Seed = 0,
+    duration: Annotated[
+        float | None, typer.Option(metavar="S", help="Simulated seconds of a scene [default: 10]; a task plays on.")
+    ] = None,
+    size: Annotated[int, typer.Option(min=64, max=4096, help="Width of a picture in pixels.")] = 600,
+    force: Force = False,
+) -> None:
+    """Draw a scene, or an episode of a task under some player, as GIF, PNG or HTML replay."""
+    from flockenv.outputs import checked_file
+    from flockenv.tasks import TASKS
+
+    path = checked_file(out, PICTURES, force)
+    if what in TASKS:
+        if duration is not None:
+            raise ValueError(f"--duration = {duration:g}: goes with a scene; an episode of a task ends by itself")
+        panel, fps = _episode(TASKS[what](), player, seed)
+    elif what.endswith((".yaml", ".yml")) or Path(what).exists():
+        panel, fps = _film(what, 10.0 if duration is None else duration, seed)
+    else:
+        raise ValueError(f"{shown(what)}: no such task{nearest(what, TASKS)} ({', '.join(TASKS)}), nor a .yaml file")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    _write_picture(path, panel, what, fps, size)
+    _console().print(f"{_relative(path)}: {path.stat().st_size:,} bytes, {panel.snapshots[-1].time:g} s")
+
+
+@app.command()
+def explain(scene: SceneFile) -> None:
+    """Show the effects of a scene: what each calls for, what it costs per step, and what nobody asked for."""
+    from flockenv import explanation
+    from flockenv.config import load_scene
+
+    loaded = load_scene(Path(scene))
+    with _progress("compiling and timing", len(loaded.effects) + 2, "variants") as progress:
+        found = explanation.explain(loaded, progress=progress)
+    console = _console()
+    rows = [(str(row.effect), ", ".join(row.calls_for) or "nothing", f"{row.cost:.3g}") for row in found.rows]
+    rows.append(("what several of them share", "", f"{found.shared:.3g}"))
+    rows.append((f"{loaded.integrator.kind}, limits, {loaded.space.kind}", "", f"{found.rest:.3g}"))
+    title = f"One step of {loaded.agents:,} agents: {found.step:.3g} us"
+    _table(console, title, rows, ("effect", "calls for", "costs us/step"))
+    counted = (f"{number:g} {name.replace('_', ' ')}" for name, number in found.work.items())
+    console.print(f"Per step: {', '.join(counted)}")
+    _table(console, "Left out, because nobody asked for it", ([line] for line in found.left_out), [""])
+
+
+@app.command()
+def schema() -> None:
+    """Print the JSON Schema of a scene, for editors that complete and check YAML."""
+    from flockenv.config import schema as json_schema
+
+    print(json.dumps(json_schema(), indent=2, allow_nan=False))
+
+
+def _console() -> Console:
+    """Return where tables go; what is piped is not folded to the 80 columns of a terminal that is not there."""
+    from rich.console import Console
+
+    console = Console(highlight=False, markup=False)
+    return console if console.is_terminal else Console(highlight=False, markup=False, width=160)
+
+
+def _table(console: Console, title: str, rows: Iterable[Sequence[str]], columns: Sequence[str] = ("", "")) -> None:
+    from rich.table import Table
+
+    console.print(title, style="bold")
+    table = Table(box=None, show_header=any(columns), pad_edge=False)
+    for k, column in enumerate(columns):
+        table.add_column(column, no_wrap=k == 0, style="cyan" if k == 0 else None, overflow="fold")
+    for row in rows:
+        table.add_row(*map(_printable, row))
+    console.print(table)
+    console.print()
+
+
+def _sentence(kind: type) -> str:
+    """Return the first sentence of a class's docstring."""
+    text = " ".join((kind.__doc__ or "").split("\n\n")[0].split())
+    found = re.match(r".*?\.(?=\s+[A-Z]|$)", text)
+    return found[0] if found else text
+
+
+def _relative(path: Path) -> str:
+    here = Path.cwd().resolve()
+    return str(path.relative_to(here) if path.is_relative_to(here) else path)
+
+
+@contextmanager
+def _progress(title: str, total: int, unit: str) -> Iterator[Callable[[int], None]]:
+    """Show a bar on stderr while a command works; only where somebody watches."""
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+
+    console = Console(stderr=True)
+    columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.completed}/{task.total} " + unit))
+    with Progress(
+        *columns, TimeRemainingColumn(), console=console, transient=True, disable=not console.is_terminal
+    ) as bar:
+        task = bar.add_task("compiling", total=total)
+        yield lambda done: bar.update(task, completed=done, description=title)
+
+
+def _recorded(scene: Scene, seed: int, steps: int, every: int) -> Trajectory:
+    from flockenv.trajectory import record
+
+    with _progress("simulating", steps, "steps") as progress:
+        return record(scene, seed, steps, every, progress)
+
+
+def _show_measures(console: Console, trajectory: Trajectory) -> None:
+    from flockenv.measures import MEASURES
+
+    def text(value: float) -> str:
+        return f"{value:.4g}" if value == value else "-"
+
+    scene, time = trajectory.scene, float(trajectory.last.time[0])
+    rows = [(name, text(a), text(b), MEASURES[name]) for name, (a, b) in trajectory.measures().items()]
+    title = f"{scene.agents:,} agents, {int(trajectory.step[-1]):,} steps of {scene.dt:g} s, seed {trajectory.seed}"
+    _table(console, title, rows, ("measure", "t = 0 s", f"t = {time:g} s", "unit"))
+    work = {"neighbour queries": "neighbour_queries", "candidate pairs": "pairs", "obstacle tests": "obstacle_tests"}
+    counted = ", ".join(f"{trajectory.last.counted(name):,} {words}" for words, name in work.items())
+    console.print(f"{text(trajectory.rate / 1e6)} million agent-steps/s ({trajectory.wall:.3g} s); {counted}")
+
+
+def _film(file: str, duration: float, seed: int) -> tuple[Panel, float]:
+    """Return a scene's run as something to draw, and its frames per second."""
+    from flockenv.config import load_scene
+    from flockenv.render import Panel
+    from flockenv.trajectory import whole_steps
+
+    scene = load_scene(Path(file))
+    every = max(1, round(1.0 / (FPS * scene.dt)))
+    trajectory = _recorded(scene, seed, whole_steps("--duration", duration, scene.dt), every)
+    if trajectory.stopped == "interrupted":
+        raise KeyboardInterrupt
+    snapshots = list(trajectory.snapshots(title=Path(file).stem))
+    return Panel("", snapshots, [0.0] * len(snapshots), trajectory.stopped), 1.0 / (every * scene.dt)
+
+
+def _episode(task: Task, player: str, seed: int) -> tuple[Panel, float]:
+    """Return one episode as something to draw, and its frames per second."""
+    from flockenv.evaluation import rollout
+    from flockenv.policy import RandomPolicy, load_player
+    from flockenv.render import Panel
+
+    policy = load_player(player, task, {"random": lambda task: RandomPolicy(task.action_layout.size, seed)})
+    with _progress("playing", task.horizon, "decisions") as progress:
+        episode = rollout(task, policy, 1, seed, record=0, progress=lambda done, most: progress(done))
+    assert episode.recording is not None  # asked for with record=0
+    outcome = "success" if episode.success[0] else "no success"
+    film = episode.recording
+    return Panel(Path(player).stem, film.snapshots, film.returns.tolist(), outcome), 1.0 / task.control_dt
+
+
+def _write_picture(path: Path, panel: Panel, title: str, fps: float, size: int) -> None:
+    from flockenv.render import Group, draw, write_gif, write_png, write_replay
+
+    if path.suffix.lower() == ".html":
+        write_replay(path, [Group(title, [panel])], title)
+    elif path.suffix.lower() == ".png":
+        write_png(path, draw(panel.snapshots[-1], size=size, trails=panel.snapshots[-TRAIL:-1]))
+    else:
+        stride = math.ceil(fps / MOST_FPS)
+        write_gif(path, _frames(panel.snapshots[::stride], size), fps / stride)
+
+
+def _frames(snapshots: Sequence[Snapshot], size: int) -> Iterator[Any]:
+    from flockenv.render import draw
+
+    with _progress("drawing", len(snapshots), "frames") as progress:
+        for k, snapshot in enumerate(snapshots):
+            progress(k)
+            yield draw(snapshot, size=size)

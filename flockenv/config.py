@@ -1,0 +1,278 @@
+"""YAML <-> Scene: a strict reader that says in one line what is wrong and where, and a writer whose text reads back.
+
+The reader takes YAML 1.2's plain words, not 1.1's: `1e-3` is a number, `no` is a word, `010` and `.nan` are refused.
+It builds numbers, words, lists and blocks, and never an object, whatever tag a file carries.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+from collections.abc import Iterator
+from decimal import Decimal
+from pathlib import Path
+from typing import Any, TypeVar
+
+import yaml
+from pydantic import BaseModel, ValidationError
+
+from flockenv.refusals import KeyPath, key_path, nearest, refusals, shown, steps_of
+from flockenv.scene import Scene
+
+__all__ = ["MAX_BYTES", "ConfigError", "dump", "dump_scene", "load", "load_scene", "schema"]
+
+MAX_BYTES = 1_000_000
+MAX_DEPTH = 32
+MAX_LINES = 5  # of one error message: who has more mistakes than this mends these first
+
+M = TypeVar("M", bound=BaseModel)
+
+_LOADER: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # libyaml where there is one: ten times faster
+
+
+class ConfigError(ValueError):
+    """A configuration that cannot be used: one line per mistake, with file, line, key, value and what is allowed."""
+
+
+def load_scene(source: str | Path) -> Scene:
+    """Return the scene that a YAML file, or YAML text, describes; see `load`."""
+    return load(source, Scene)
+
+
+def dump_scene(scene: Scene) -> str:
+    """Return the scene as YAML text that reads back as an equal scene."""
+    return dump(scene)
+
+
+def schema(model: type[BaseModel] = Scene) -> dict[str, Any]:
+    """Return the JSON Schema of a model, for editors that complete and check YAML."""
+    return {"$schema": "https://json-schema.org/draft/2020-12/schema", **model.model_json_schema()}
+
+
+def load(source: str | Path, model: type[M]) -> M:
+    """Return the `model` that a YAML file or text describes.
+
+    A Path names a file; so does a str, unless it holds a line break, a `: ` or a `{`: then it is the text itself.
+    Raises ConfigError, one line per mistake, before anything is built.
+    """
+    name, text = _read(source)
+    reader = _Reader(name, text)
+    data = reader.document()
+    try:
+        # Through JSON, because strict then takes a list for a tuple and 1 for 1.0, and still no "1" for 1.
+        return model.model_validate_json(json.dumps(data), strict=True)
+    except ValidationError as error:
+        wrong = sorted((reader.line(r.path or steps_of(str(r))), str(r)) for r in refusals(error, model, data))
+    lines = [f"{name}:{line}: {text}" for line, text in wrong[:MAX_LINES]]
+    more = [f"{name}: and more mistakes"] if len(wrong) > MAX_LINES else []
+    raise ConfigError("\n".join(lines + more))
+
+
+def dump(record: BaseModel) -> str:
+    """Return the record as YAML text; raises ConfigError if that text would not read back as an equal record.
+
+    Every field is written, defaults too, so that a file keeps its meaning when a default changes. The exception is a
+    field without limit (infinity), which YAML readers disagree about: it is left out where that is the default.
+    """
+    text: str = yaml.dump(
+        _finite(record.model_dump()),
+        Dumper=_Dumper,
+        sort_keys=False,
+        default_flow_style=None,
+        allow_unicode=True,
+        width=120,
+    )
+    try:
+        same = load(text, type(record)) == record
+    except ConfigError as error:
+        raise ConfigError(f"{type(record).__name__} cannot be written as YAML: {error}") from None
+    if not same:
+        raise ConfigError(f"{type(record).__name__} cannot be written as YAML: its text reads back as another record")
+    return text
+
+
+def _finite(value: Any) -> Any:
+    """Return the value in lists and dicts, without infinite values: `dump` checks that those were defaults."""
+    if isinstance(value, dict):
+        return {key: _finite(v) for key, v in value.items() if not (isinstance(v, float) and math.isinf(v))}
+    return [_finite(v) for v in value] if isinstance(value, (list, tuple)) else value
+
+
+class _Dumper(yaml.SafeDumper):
+    """Writes what `_Reader` reads: quotes every word that `_Reader` would take for something else."""
+
+    def ignore_aliases(self, data: Any) -> bool:
+        return True
+
+
+def _represent_text(dumper: yaml.SafeDumper, text: str) -> yaml.ScalarNode:
+    try:
+        plain = _scalar(text) == text
+    except ValueError:
+        plain = False
+    return dumper.represent_scalar("tag:yaml.org,2002:str", text, style=None if plain else "'")
+
+
+_Dumper.add_representer(str, _represent_text)
+
+
+def _read(source: str | Path) -> tuple[str, str]:
+    """Return a name for messages, and the text."""
+    if isinstance(source, str) and re.search(r"\n|: |\{|:$", source):
+        return "text", source.removeprefix("\ufeff")
+    path = Path(source)
+    name = repr(str(source))[1:-1]
+    try:
+        if not path.is_file():
+            raise ConfigError(f"{name}: no such file{_nearest_file(path)}")
+        with path.open("rb") as file:
+            content = file.read(MAX_BYTES + 1)
+    except (OSError, ValueError) as error:
+        if isinstance(error, ConfigError):
+            raise
+        raise ConfigError(f"{name}: cannot be read: {getattr(error, 'strerror', None) or error}") from None
+    return name, _decode(name, content)
+
+
+def _nearest_file(path: Path) -> str:
+    if path.exists():
+        return " (it is a folder)" if path.is_dir() else " (it is a device)"
+    siblings = [p.name for p in path.parent.iterdir()] if path.parent.is_dir() else []
+    return nearest(path.name, [s for s in siblings if s.endswith((".yaml", ".yml"))])
+
+
+def _decode(name: str, content: bytes) -> str:
+    if len(content) > MAX_BYTES:
+        raise ConfigError(f"{name}: larger than {MAX_BYTES} bytes, the most that is read")
+    if content.startswith((b"\xff\xfe", b"\xfe\xff")):
+        raise ConfigError(f"{name}: UTF-16 text; save it as UTF-8")
+    if b"\0" in content:
+        raise ConfigError(f"{name}: binary data, not YAML text")
+    try:
+        return content.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise ConfigError(f"{name}: not UTF-8 text: byte {error.start} is {content[error.start]:#04x}") from None
+
+
+_NUMBER = re.compile(r"[-+]?(?=\.?[0-9])(?P<whole>[0-9]+(?:_[0-9]+)*)?(?P<point>\.[0-9]*)?(?P<power>[eE][-+]?[0-9]+)?")
+_WORDS: dict[str, bool | None] = {"": None, "~": None, "null": None, "true": True, "false": False}
+
+
+def _scalar(text: str) -> str | int | float | bool | None:
+    """Return what an unquoted word means; raises ValueError for one that people and YAML readers disagree about."""
+    if text.lower() in _WORDS:
+        return _WORDS[text.lower()]
+    if re.fullmatch(r"[-+]?\.(inf|nan)", text, re.IGNORECASE):
+        raise ValueError(f"{text} is not a number that can be used: write a finite one")
+    found = _NUMBER.fullmatch(text)
+    if not found:
+        return text
+    whole, digits = found["whole"] or "", text.replace("_", "")
+    if found["point"] is None and found["power"] is None and re.match("0[0-9]", whole):
+        raise ValueError(
+            f"{shown(text)[1:-1]} begins with 0, which some read as octal: write {digits.lstrip('+-0') or 0}"
+        )
+    if len(text) > 400 or math.isinf(float(digits)):
+        raise ValueError(f"{shown(text)} is too large or too long for a number")
+    if found["point"] is None and (found["power"] is None or float(digits).is_integer()):
+        return int(Decimal(digits))
+    return float(digits)
+
+
+def _line(event: yaml.Event) -> int:
+    return int(event.start_mark.line) + 1 if event.start_mark else 1
+
+
+class _Reader:
+    """Builds the plain data of one YAML document from the parser's events, and remembers the line of every key."""
+
+    def __init__(self, name: str, text: str) -> None:
+        self._name = name
+        self._lines: dict[KeyPath, int] = {(): 1}
+        if len(text) > MAX_BYTES:
+            raise ConfigError(f"{name}: larger than {MAX_BYTES} bytes, the most that is read")
+        self._events = self._parse(text)
+
+    def line(self, path: KeyPath) -> int:
+        """Return the line of a key, or of the nearest block around it."""
+        while path not in self._lines:
+            path = path[:-1]
+        return self._lines[path]
+
+    def document(self) -> dict[str, Any]:
+        """Return the document; raises ConfigError unless there is exactly one and it is a block of keys."""
+        next(self._events)  # start of the stream
+        first = next(self._events)
+        if isinstance(first, yaml.StreamEndEvent):
+            raise ConfigError(f"{self._name}: empty")
+        data = self._value(next(self._events), ())
+        next(self._events)  # end of the document
+        if not isinstance(next(self._events), yaml.StreamEndEvent):
+            raise ConfigError(f"{self._name}: holds more than one document (---)")
+        if not isinstance(data, dict):
+            raise ConfigError(
+                f"{self._name}: {'empty' if data is None else 'a list or a word'}, not a block of `key: value`"
+            )
+        return data
+
+    def _parse(self, text: str) -> Iterator[yaml.Event]:
+        try:
+            yield from yaml.parse(text, Loader=_LOADER)
+        except yaml.MarkedYAMLError as error:
+            mark = error.problem_mark or error.context_mark
+            problem = " ".join(f"{error.problem or error.context}".split())
+            raise ConfigError(f"{self._name}:{mark.line + 1 if mark else 1}: not YAML: {problem}") from None
+        except (yaml.YAMLError, UnicodeEncodeError) as error:
+            reason = getattr(error, "reason", "a character that YAML does not allow")
+            before = text[: getattr(error, "position", None) or getattr(error, "start", 0)]
+            raise ConfigError(f"{self._name}:{before.count(chr(10)) + 1}: not YAML text: {reason}") from None
+
+    def _refuse(self, event: Any, reason: str) -> ConfigError:
+        return ConfigError(f"{self._name}:{_line(event)}: {reason}")
+
+    def _value(self, event: Any, path: KeyPath) -> Any:
+        if isinstance(event, yaml.AliasEvent) or event.anchor is not None:
+            raise self._refuse(event, f"{key_path(path)}: anchors and aliases are not read: write the value out")
+        if event.tag is not None:
+            raise self._refuse(
+                event, f"{key_path(path)}: the tag {shown(event.tag)[1:-1]} is not read: write a plain value"
+            )
+        if len(path) > MAX_DEPTH:
+            raise self._refuse(event, f"nested more than {MAX_DEPTH} deep")
+        if isinstance(event, yaml.MappingStartEvent):
+            return self._mapping(path)
+        if isinstance(event, yaml.SequenceStartEvent):
+            return self._sequence(path)
+        if event.style:  # quoted, or a block of text
+            return event.value
+        try:
+            return _scalar(event.value)
+        except ValueError as error:
+            raise self._refuse(event, f"{key_path(path)}: {error}") from None
+
+    def _sequence(self, path: KeyPath) -> list[Any]:
+        items: list[Any] = []
+        while not isinstance(event := next(self._events), yaml.SequenceEndEvent):
+            place = (*path, len(items))
+            self._lines[place] = _line(event)
+            items.append(self._value(event, place))
+        return items
+
+    def _mapping(self, path: KeyPath) -> dict[str, Any]:
+        block: dict[str, Any] = {}
+        while not isinstance(event := next(self._events), yaml.MappingEndEvent):
+            place = (*path, self._key(event, path))
+            if place in self._lines:
+                first = self._lines[place]
+                raise self._refuse(event, f"{key_path(place)}: given twice, first on line {first}")
+            self._lines[place] = _line(event)
+            block[str(place[-1])] = self._value(next(self._events), place)
+        return block
+
+    def _key(self, event: Any, path: KeyPath) -> str:
+        if not isinstance(event, yaml.ScalarEvent) or event.tag is not None or event.anchor is not None:
+            raise self._refuse(event, f"{key_path(path) or 'the document'}: a key must be a plain word")
+        if event.value == "<<":
+            raise self._refuse(event, f"{key_path((*path, '<<'))}: merge keys (<<) are not read: write the values out")
+        return str(event.value)

@@ -1,0 +1,34 @@
+"""PettingZoo's turn-based form (AEC) of a parallel environment: agents hand in actions one by one, then all act."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from pettingzoo import AECEnv
+from pettingzoo.utils.conversions import parallel_to_aec_wrapper
+from pettingzoo.utils.wrappers import BaseWrapper, OrderEnforcingWrapper
+
+from flockenv.envs.face import Rows
+from flockenv.envs.parallel import WorldParallelEnv
+
+__all__ = ["by_turns"]
+
+
+class _Checked(BaseWrapper):  # type: ignore[misc]  # pettingzoo ships no types
+    """Refuses a bad action on its agent's turn, and not when the last agent of the round moves."""
+
+    def step(self, action: Rows | None) -> None:
+        if action is not None:
+            self.env.unwrapped.checked_action(self.agent_selection, action)
+        self.env.step(action)
+
+    def __str__(self) -> str:
+        return str(self.env)
+
+
+def by_turns(env: WorldParallelEnv) -> AECEnv[str, Any, Any]:
+    """Return the AEC form, with order enforced (no step before reset, one per turn) and actions checked.
+
+    Actions out of [-1, 1] are clipped by the world, as in every other face, and not by a wrapper that warns.
+    """
+    return OrderEnforcingWrapper(_Checked(parallel_to_aec_wrapper(env)))

@@ -1,0 +1,149 @@
+"""What every face shares: its spaces, its seeds, its options and its pictures."""
+
+from __future__ import annotations
+
+import operator
+from collections.abc import Iterable, Mapping
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from gymnasium.error import ResetNeeded
+from gymnasium.spaces import Box
+from numpy.typing import NDArray
+
+from flockenv.refusals import nearest
+from flockenv.tasks import Task
+
+if TYPE_CHECKING:
+    from flockenv.render import Window
+    from flockenv.snapshot import Snapshot
+
+__all__ = [
+    "RENDER_MODES",
+    "Rows",
+    "Screen",
+    "action_space",
+    "begun",
+    "build",
+    "checked_options",
+    "checked_seed",
+    "metrics_of",
+    "observation_space",
+    "render_fps",
+]
+
+Rows = NDArray[Any]
+RENDER_MODES = ("human", "rgb_array")
+SEEDS = 2**63
+"""Seeds are 0 ... 2**63 - 1, so that they fit the int64 arrays of a vector env's infos."""
+
+
+def build(task_type: type[Task], parameters: Mapping[str, Any], limit: str) -> Task:
+    """Make a task from the keyword arguments of a face.
+
+    limit: what this face calls its time limit. The task's own `horizon` is refused: two limits could disagree.
+    """
+    if "horizon" in parameters:
+        raise ValueError(
+            f"{task_type.__name__}: horizon = {parameters['horizon']!r}: the time limit is called `{limit}` here"
+        )
+    return task_type(**parameters)
+
+
+def observation_space(task: Task) -> Box:
+    """Return the space of one learner's observation, (O,) float32."""
+    return Box(np.asarray(task.layout.low, np.float32), np.asarray(task.layout.high, np.float32), dtype=np.float32)
+
+
+def action_space(task: Task) -> Box:
+    """Return the space of one learner's action, (A,) float32 in [-1, 1]."""
+    return Box(-1.0, 1.0, (task.action_layout.size,), np.float32)
+
+
+def render_fps(task: Task) -> int:
+    """Return the frames per second at which a replay runs in real time: one frame per decision."""
+    return max(1, round(1.0 / task.control_dt))
+
+
+def checked_seed(seed: Any) -> int | None:
+    """Return the seed as an int, or None; TypeError for what is no whole number, ValueError outside 0 ... 2**63 - 1."""
+    if seed is None:
+        return None
+    try:
+        number = operator.index(seed)
+    except TypeError:
+        number = None
+    if number is None or isinstance(seed, bool | np.bool_):
+        raise TypeError(f"seed: {seed!r} is no whole number; allowed: 0 to 2**63 - 1, or None for a random one")
+    if not 0 <= number < SEEDS:
+        raise ValueError(f"seed: {number} is out of range; allowed: 0 to 2**63 - 1, or None for a random one")
+    return number
+
+
+def checked_options(options: Mapping[str, Any] | None, known: Iterable[str] = ()) -> Mapping[str, Any]:
+    """Return the options of a reset; ValueError for a name not in `known`, with what may have been meant."""
+    if options is None:
+        return {}
+    if not isinstance(options, Mapping):
+        raise TypeError(f"options: {options!r}, must be a dictionary or None")
+    known = list(known)
+    unknown = [name for name in options if name not in known]
+    if unknown:
+        meant = nearest(str(unknown[0]), known)
+        raise ValueError(f"options: {unknown[0]!r} is unknown{meant}; allowed: {', '.join(known) or 'none'}")
+    return options
+
+
+def begun(running: bool, call: str) -> None:
+    """Refuse a step or a picture of a face that was not reset, or was closed; ResetNeeded."""
+    if not running:
+        raise ResetNeeded(f"{call}: there is no episode; call reset() first")
+
+
+def metrics_of(columns: Mapping[str, Rows], k: int) -> dict[str, float]:
+    """Return the metrics of world k, out of World.measure(); what has no value yet is left out.
+
+    NaN would not do: two equal infos would then differ.
+    """
+    values = {name: float(column[k]) for name, column in columns.items()}
+    return {name: value for name, value in values.items() if value == value}
+
+
+class Screen:
+    """Shows a world in one render mode; a window opens with the first frame and not before.
+
+    Args:
+        mode: "human" (a window), "rgb_array" ((H, W, 3) uint8, headless) or None.
+        fps: frames per second of the window.
+        modes: what this face can do.
+    """
+
+    def __init__(self, mode: str | None, fps: int, modes: tuple[str, ...] = RENDER_MODES) -> None:
+        if mode is not None and mode not in modes:
+            raise ValueError(
+                f"render_mode: {mode!r} is unknown{nearest(str(mode), modes)}; allowed: {', '.join(modes)}"
+            )
+        self.mode, self.fps = mode, fps
+        self._window: Window | None = None
+
+    def show(self, snapshot: Snapshot, mode: str | None = None) -> NDArray[np.uint8] | None:
+        """Draw one instant, in another mode than usual if told so: return the picture, or show it and return None."""
+        from flockenv.render import Window, draw
+
+        mode = mode or self.mode
+        if mode == "rgb_array":
+            return draw(snapshot)
+        if mode == "human":
+            self._window = self._window or Window()
+            self._window.show(draw(snapshot), self.fps)
+        return None
+
+    def close(self) -> None:
+        """Close the window, if there is one; may be called twice."""
+        if self._window is not None:
+            self._window.close()
+            self._window = None
+
+    def __getstate__(self) -> dict[str, Any]:
+        # A window belongs to its process: a copy opens its own.
+        return {**self.__dict__, "_window": None}

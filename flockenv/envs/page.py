@@ -1,0 +1,89 @@
+"""The documentation page of an environment, written from its task, so that text and code cannot drift apart."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Iterable, Sequence
+
+import numpy as np
+
+from flockenv.tasks import Layout, Task
+
+__all__ = ["page"]
+
+
+def page(summary: str, task: Task, name: str, history: str) -> str:
+    """Return the page of an environment in Markdown: what it is about, its tables, its arguments, its history.
+
+    The description is the docstring of the task's class; everything else is read from the task.
+    """
+    parts = [
+        inspect.cleandoc(summary),
+        _facts(task, f"flockenv/{name}-v0"),
+        "## Description\n\n" + inspect.cleandoc(type(task).__doc__ or ""),
+        "## Action space\n\n" + _layout(task.action_layout),
+        "## Observation space\n\n" + _layout(task.layout),
+        "## Rewards\n\n" + _rewards(task),
+        "## Episode end\n\n" + _end(task),
+        "## Arguments\n\n" + _arguments(task),
+        "## Version history\n\n" + history,
+    ]
+    return "\n\n".join(parts) + "\n"
+
+
+def _rewards(task: Task) -> str:
+    terms, metrics = (", ".join(f"`{name}`" for name in names) for names in (task.terms, task.metric_names))
+    return (
+        f"The reward is the sum of these terms, and `info['terms']` holds each of them: {terms}. `info['is_success']` "
+        f"says whether the aim is reached so far; metrics of the episode so far, where they have a value: {metrics}."
+    )
+
+
+def _end(task: Task) -> str:
+    return (
+        f"Termination: see the description. Truncation: after {task.horizon} decisions "
+        f"({task.horizon * task.control_dt:g} s), unless `max_episode_steps` says otherwise."
+    )
+
+
+def _facts(task: Task, env_id: str) -> str:
+    rows = [
+        ("Make", f'`gymnasium.make("{env_id}")`'),
+        ("Action space", f"`Box(-1, 1, ({task.action_layout.size},), float32)`"),
+        ("Observation space", f"`Box({_range(task.layout)}, ({task.layout.size},), float32)`"),
+        ("One decision", f"{task.control_dt:g} s"),
+        ("Agents", f"{task.agents}, of which {task.learners} learns"),
+    ]
+    return _table(("", ""), rows)
+
+
+def _range(layout: Layout) -> str:
+    return f"{np.min(layout.low):g}, {np.max(layout.high):g}"
+
+
+def _layout(layout: Layout) -> str:
+    """Return the table of a row of numbers: where each quantity stands, what it means, in which unit, between what."""
+    rows, start = [], 0
+    slots = (slot for slot in layout.slots if slot.size)
+    for (index, name, unit, meaning), slot in zip(layout.table(), slots, strict=True):
+        stop = start + slot.size
+        low, high = np.min(layout.low[start:stop]), np.max(layout.high[start:stop])
+        rows.append((index, f"`{name}`", meaning, unit, f"{low:g}", f"{high:g}"))
+        start = stop
+    return _table(("index", "name", "meaning", "unit", "min", "max"), rows)
+
+
+def _arguments(task: Task) -> str:
+    fields = type(task).model_fields.items()
+    rows = [
+        (f"`{name}`", f"`{getattr(task, name)!r}`", field.description or "")
+        for name, field in fields
+        if name != "horizon"  # the time limit has another name in every face
+    ]
+    rows.append(("`render_mode`", "`None`", "`rgb_array` (headless picture), `human` (window, extra `render`) or None"))
+    return _table(("argument", "default", "meaning"), rows)
+
+
+def _table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    lines = [head, ["---"] * len(head), *rows]
+    return "\n".join("| " + " | ".join(cell.replace("|", "\\|") for cell in line) + " |" for line in lines)

@@ -1,0 +1,248 @@
+"""PettingZoo's parallel environments: every learner of one world is an agent with a name."""
+
+from __future__ import annotations
+
+import functools
+import warnings
+from collections.abc import Mapping
+from typing import Any, ClassVar
+
+import numpy as np
+from gymnasium.spaces import Box
+from numpy.typing import NDArray
+from pettingzoo import ParallelEnv
+
+from flockenv.envs.face import (
+    RENDER_MODES,
+    Rows,
+    Screen,
+    action_space,
+    begun,
+    build,
+    checked_options,
+    checked_seed,
+    metrics_of,
+    observation_space,
+    render_fps,
+)
+from flockenv.refusals import nearest
+from flockenv.tasks import Flock, Pursuit, Task
+from flockenv.world import Step, World
+
+__all__ = ["FlockParallelEnv", "PursuitParallelEnv", "WorldParallelEnv"]
+
+Named = dict[str, Any]
+
+
+class WorldParallelEnv(ParallelEnv[str, Rows, Rows]):  # type: ignore[misc]  # pettingzoo ships no types
+    """One world whose learners are PettingZoo agents; `task` and `world` give access to the arrays inside.
+
+    An agent that ends (captured, say) appears in the dictionaries of that step and then leaves `agents`. At the time
+    limit everybody who is still there is truncated, also who terminates in the same step. Seeds are as in SingleEnv.
+
+    Args:
+        max_cycles: steps after which the world is truncated; None = the task's own horizon.
+        render_mode: "rgb_array", "human" or None.
+        parameters: those of the task.
+    """
+
+    task_type: ClassVar[type[Task]]
+    fixed: ClassVar[dict[str, Any]] = {}
+    """Parameters with another default than the task's own."""
+
+    def __init__(self, max_cycles: int | None = None, render_mode: str | None = None, **parameters: Any) -> None:
+        self.task = build(self.task_type, {**self.fixed, **parameters}, limit="max_cycles")
+        self.metadata = {
+            "name": f"{self.task.name}_v0",
+            "render_modes": list(RENDER_MODES),
+            "render_fps": render_fps(self.task),
+            "is_parallelizable": True,
+        }
+        self.render_mode = render_mode
+        self.possible_agents = list(self.task.agent_names)
+        self.world = World(self.task, time_limit=self.task.horizon if max_cycles is None else max_cycles)
+        self._screen = Screen(render_mode, render_fps(self.task))
+        self._observation_spaces = {name: observation_space(self.task) for name in self.possible_agents}
+        self._action_spaces = {name: action_space(self.task) for name in self.possible_agents}
+        self._live: dict[str, int] = {}
+
+    @property
+    def max_cycles(self) -> int:
+        """Steps after which the world is truncated; PettingZoo's tests set it on an environment that exists."""
+        return self.world.time_limit or self.task.horizon
+
+    @max_cycles.setter
+    def max_cycles(self, limit: int) -> None:
+        if limit < 1:
+            raise ValueError(f"max_cycles: {limit}, must be at least 1")
+        self.world.time_limit = limit
+
+    @property
+    def agents(self) -> list[str]:
+        """The agents that still act, as a list of the caller's own."""
+        return list(self._live)
+
+    def observation_space(self, agent: str) -> Box:
+        """Return the space of an agent's observations, the same object each time."""
+        return self._observation_spaces[self._known(agent)]
+
+    def action_space(self, agent: str) -> Box:
+        """Return the space of an agent's actions, the same object each time."""
+        return self._action_spaces[self._known(agent)]
+
+    def _known(self, agent: str) -> str:
+        if agent not in self._action_spaces:
+            raise ValueError(f"agent: {agent!r} is unknown{nearest(str(agent), self.possible_agents)}")
+        return agent
+
+    def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Named, dict[str, Named]]:
+        """Begin an episode; return observations, (O,) float32 each, and infos with the seed, by agent."""
+        seed = checked_seed(seed)
+        # PettingZoo's own test suite resets every environment with {"options": 1}; nothing else is let through.
+        checked_options(options, ("options",))
+        observation = self.world.reset(seeds=seed)[0]
+        self._live = {name: i for i, name in enumerate(self.possible_agents)}
+        self._show()
+        return self._named(observation), {name: {"seed": self.world.seeds[0]} for name in self._live}
+
+    def step(
+        self, actions: Mapping[str, Rows]
+    ) -> tuple[Named, dict[str, float], dict[str, bool], dict[str, bool], dict[str, Named]]:
+        """Act for one control_dt; needs an action, (A,), clipped to [-1, 1], from every agent in `agents`.
+
+        Raises ValueError, before anything moves, that names the agent whose action is missing, is not asked for, has
+        another shape or holds NaN; ResetNeeded when nobody is left.
+        """
+        begun(bool(self._live), "step")
+        result = self.world.step(self._rows(actions))
+        truncated = bool(result.truncated[0])
+        present, terminated = self._live, result.terminated[0].tolist()
+        outcome = (
+            self._named(result.observation[0]),
+            {name: float(result.reward[0, i]) for name, i in present.items()},
+            {name: terminated[i] for name, i in present.items()},
+            dict.fromkeys(present, truncated),
+            self._infos(result, over=bool(result.ended[0])),
+        )
+        self._live = {} if truncated else {name: i for name, i in present.items() if not terminated[i]}
+        self._show()
+        return outcome
+
+    def _named(self, observation: NDArray[np.float32]) -> Named:
+        return {name: observation[i].copy() for name, i in self._live.items()}
+
+    def _rows(self, actions: Mapping[str, Rows]) -> Rows:
+        """Return the actions as (1, L, A), zeros for who has left; ValueError names the agent that is at fault."""
+        if not isinstance(actions, Mapping):
+            raise TypeError(f"actions: {type(actions).__name__}, must be a dictionary from agent to action")
+        if actions.keys() != self._live.keys():
+            self._refuse_names(actions)
+        rows = np.zeros((1, len(self.possible_agents), self.task.action_layout.size))
+        rows[0, list(self._live.values())] = self._block(actions)
+        return rows
+
+    def _refuse_names(self, actions: Mapping[str, Rows]) -> None:
+        for name in actions:
+            if name not in self._live:
+                reason = "has left the game" if name in self.possible_agents else "is unknown"
+                raise ValueError(f"actions: agent {name!r} {reason}{nearest(str(name), self._live)}")
+        lacking = next(name for name in self._live if name not in actions)
+        raise ValueError(f"actions: agent {lacking!r} has none")
+
+    def _block(self, actions: Mapping[str, Rows]) -> Rows:
+        """Return the actions of all who live, (agents, A), checked together; one by one only to name whose is bad."""
+        try:
+            block = np.asarray([actions[name] for name in self._live], np.float64)
+        except (TypeError, ValueError):
+            block = np.empty(0)
+        if block.shape == (len(self._live), self.task.action_layout.size) and np.isfinite(block).all():
+            return block
+        return np.stack([self.checked_action(name, actions[name]) for name in self._live])
+
+    def checked_action(self, agent: str, action: Rows) -> Rows:
+        """Return an action as an array, (A,); ValueError that names the agent on NaN, infinity or another shape."""
+        size = self.task.action_layout.size
+        try:
+            row = np.asarray(action, np.float64)
+        except (TypeError, ValueError):
+            raise ValueError(f"actions: agent {agent!r} has {action!r}, must be {size} numbers") from None
+        if row.shape != (size,):
+            raise ValueError(f"actions: agent {agent!r} has shape {row.shape}, must be ({size},)")
+        if not np.isfinite(row).all():
+            raise ValueError(f"actions: agent {agent!r} has {row.tolist()}; allowed: numbers, clipped to [-1, 1]")
+        return row
+
+    def _infos(self, result: Step, over: bool) -> dict[str, Named]:
+        """Return reward terms and success by agent, with the metrics of the world when its episode is over."""
+        success, terms = bool(result.success[0]), result.terms[0].tolist()
+        metrics = metrics_of(self.world.measure(), 0) if over else {}
+        return {
+            name: {"terms": dict(zip(self.task.terms, terms[i], strict=True)), "is_success": success, **metrics}
+            for name, i in self._live.items()
+        }
+
+    @functools.cached_property
+    def state_space(self) -> Box:
+        """The space of state(), (S,) float32 in [-1, 1]."""
+        begun_elsewhere = World(self.task)
+        begun_elsewhere.reset(seeds=0)
+        return Box(-1.0, 1.0, _everything(begun_elsewhere, 1).shape, np.float32)
+
+    def state(self) -> NDArray[np.float32]:
+        """Return the whole world as one row, for critics that see everything; (S,) float32 in [-1, 1].
+
+        Positions (N, D) in the region shown, velocities (N, D) over the largest speed, alive (N,), obstacles
+        (M, D + 1), goals and headings (K, 2 D), and the share of the time limit that has passed; all clipped.
+        """
+        begun(bool(self.world.seeds), "state")
+        return _everything(self.world, self.max_cycles)
+
+    def _show(self) -> None:
+        if self.render_mode == "human":
+            self._screen.show(self.world.snapshot())
+
+    def render(self) -> NDArray[np.uint8] | None:
+        """Return the present picture, (H, W, 3) uint8, or show it in the window and return None."""
+        if self.render_mode is None:
+            warnings.warn(
+                "render() shows nothing without a render mode: make(..., render_mode='rgb_array')", stacklevel=2
+            )
+            return None
+        begun(bool(self.world.seeds), "render")
+        return self._screen.show(self.world.snapshot())
+
+    def close(self) -> None:
+        """Close the window and end the episode; may be called twice, and reset() begins anew."""
+        self._live = {}
+        self._screen.close()
+
+
+def _everything(world: World, limit: int) -> NDArray[np.float32]:
+    now = world.snapshot()
+    middle, half = (now.low + now.high) / 2, (now.high - now.low) / 2
+    speed = world.task.scene.body.max_speed.max()
+    marks = [((mark.at - middle) / half, mark.vector / (np.linalg.norm(mark.vector) or 1.0)) for mark in now.marks]
+    parts = (
+        (now.pos - middle) / half,
+        now.vel / (speed if np.isfinite(speed) else 1.0),
+        now.alive,
+        (now.obstacle_centre - middle) / half,
+        now.obstacle_radius / half.max(),
+        *(part for mark in marks for part in mark),
+        world.steps / limit,
+    )
+    row = np.concatenate([np.ravel(part) for part in parts])
+    return np.asarray(np.clip(row, -1.0, 1.0), np.float32)
+
+
+class FlockParallelEnv(WorldParallelEnv):
+    """A flock in which every boid is an agent (learners=k: only the first k are, the rest are scripted)."""
+
+    task_type = Flock
+
+
+class PursuitParallelEnv(WorldParallelEnv):
+    """Pursuit as a game of two sides: three pursuers and two evaders, all of them agents; who is captured leaves."""
+
+    task_type = Pursuit
+    fixed: ClassVar[dict[str, Any]] = {"pursuers": 3, "evaders": 2, "sides": "both"}

@@ -1,0 +1,146 @@
+"""Gymnasium environments: one learner in one world; the page of each is its docstring."""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar
+
+import gymnasium
+import numpy as np
+from gymnasium import logger
+from numpy.typing import NDArray
+
+from flockenv.envs.face import (
+    RENDER_MODES,
+    SEEDS,
+    Rows,
+    Screen,
+    action_space,
+    begun,
+    build,
+    checked_options,
+    checked_seed,
+    metrics_of,
+    observation_space,
+    render_fps,
+)
+from flockenv.envs.page import page
+from flockenv.tasks import Flock, Obstacles, Pursuit, Task
+from flockenv.world import Step, World
+
+__all__ = ["FlockEnv", "ObstaclesEnv", "PursuitEnv", "SingleEnv", "one_learner"]
+
+
+def one_learner(task_type: type[Task], parameters: dict[str, Any]) -> Task:
+    """Make the task of a face that has one action per world; ValueError if several agents would learn."""
+    task = build(task_type, parameters, limit="max_episode_steps")
+    if task.learners != 1:
+        raise ValueError(
+            f"{task_type.__name__}: {task.learners} learners; a Gymnasium environment has 1: for more use "
+            "pettingzoo.make('parallel', ...) or flockenv.sb3.WorldVecEnv"
+        )
+    return task
+
+
+class SingleEnv(gymnasium.Env[Rows, Rows]):
+    """One world with one learner, as Gymnasium wants it; `task` and `world` give access to the arrays inside.
+
+    Seeds: `reset(seed=s)` begins episode 0 of seed s; each later `reset()` begins the next episode of that seed, and a
+    first `reset()` without a seed draws one. `info["seed"]` of a reset says which it was.
+    """
+
+    task_type: ClassVar[type[Task]]
+    fixed: ClassVar[dict[str, Any]] = {}
+    """Parameters with another default than the task's own."""
+    history: ClassVar[str]
+
+    def __init_subclass__(cls, **kwargs: Any) -> None:
+        super().__init_subclass__(**kwargs)
+        if "task_type" in vars(cls):
+            task = cls.task_type(**cls.fixed)
+            cls.metadata = {"render_modes": list(RENDER_MODES), "render_fps": render_fps(task)}
+            cls.__doc__ = page(cls.__doc__ or "", task, cls.__name__.removesuffix("Env"), cls.history)
+
+    def __init__(self, render_mode: str | None = None, **parameters: Any) -> None:
+        self.task = one_learner(self.task_type, {**self.fixed, **parameters})
+        self.metadata = {**self.metadata, "render_fps": render_fps(self.task)}
+        self._screen = Screen(render_mode, render_fps(self.task))
+        self.render_mode = render_mode
+        self.observation_space = observation_space(self.task)
+        self.action_space = action_space(self.task)
+        self.world = World(self.task)
+        self._running = False
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[NDArray[np.float32], dict[str, Any]]:
+        """Begin an episode; return (O,) float32 and info with the seed. Takes no options: any is refused by name."""
+        seed = checked_seed(seed)
+        checked_options(options)
+        super().reset(seed=seed)
+        if seed is None and not self.world.seeds:
+            seed = int(self.np_random.integers(SEEDS))
+        observation = self.world.reset(seeds=seed)[0, 0]
+        self._running = True
+        self._show()
+        return observation, {"seed": self.world.seeds[0]}
+
+    def step(self, action: Rows) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]:
+        """Act for one control_dt; the action is (A,), clipped to [-1, 1]. Raises ValueError on NaN or another shape.
+
+        `truncated` is always False here: the time limit is the wrapper that gymnasium.make puts around.
+        """
+        begun(self._running, "step")
+        result = self.world.step(self._row(action))
+        terminated = bool(result.terminated[0, 0])
+        self._running = not terminated
+        self._show()
+        return result.observation[0, 0], float(result.reward[0, 0]), terminated, False, self._info(result)
+
+    def _row(self, action: Rows) -> Rows:
+        row = np.asarray(action)
+        if row.shape != self.action_space.shape:
+            raise ValueError(f"action: shape {row.shape}, must be {self.action_space.shape}")
+        return row[None, None]
+
+    def _info(self, result: Step) -> dict[str, Any]:
+        terms = dict(zip(self.task.terms, result.terms[0, 0].tolist(), strict=True))
+        return {"terms": terms, "is_success": bool(result.success[0]), **metrics_of(self.world.measure(), 0)}
+
+    def _show(self) -> None:
+        if self.render_mode == "human":
+            self._screen.show(self.world.snapshot())
+
+    def render(self) -> NDArray[np.uint8] | None:
+        """Return the present picture, (H, W, 3) uint8, or show it in the window and return None."""
+        if self.render_mode is None:
+            logger.warn("render() shows nothing without a render mode: gymnasium.make(..., render_mode='rgb_array')")
+            return None
+        begun(bool(self.world.seeds), "render")
+        return self._screen.show(self.world.snapshot())
+
+    def close(self) -> None:
+        """Close the window and end the episode; may be called twice, and reset() begins anew."""
+        self._running = False
+        self._screen.close()
+
+
+class PursuitEnv(SingleEnv):
+    """A pursuer chases a scripted evader."""
+
+    task_type = Pursuit
+    history = "v0: first version (flockenv 0.1.0)."
+
+
+class ObstaclesEnv(SingleEnv):
+    """A walker goes to its goal through a random field of obstacles."""
+
+    task_type = Obstacles
+    history = "v0: first version (flockenv 0.1.0)."
+
+
+class FlockEnv(SingleEnv):
+    """A learner flies in a flock of scripted flockmates."""
+
+    task_type = Flock
+    fixed: ClassVar[dict[str, Any]] = {"learners": 1}
+    history = "v0: first version (flockenv 0.1.0)."

@@ -1,0 +1,17 @@
+"""How a law is advanced in time, one method per file. To add one: write its file, and a row in tests/catalogue.py."""
+
+from __future__ import annotations
+
+import importlib
+import pkgutil
+
+from flockenv.integrators.base import INTEGRATORS, Integrator
+
+for _module in pkgutil.iter_modules(__path__):
+    importlib.import_module(f"{__name__}.{_module.name}")
+
+from flockenv.integrators.explicit_euler import ExplicitEuler  # noqa: E402  # after the folder has been walked
+from flockenv.integrators.rk4 import RK4  # noqa: E402
+from flockenv.integrators.semi_implicit_euler import SemiImplicitEuler  # noqa: E402
+
+__all__ = ["INTEGRATORS", "RK4", "ExplicitEuler", "Integrator", "SemiImplicitEuler"]

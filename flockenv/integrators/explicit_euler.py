@@ -1,0 +1,31 @@
+"""Explicit (forward) Euler, shown for what it is."""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar, Literal
+
+from flockenv.integrators.base import Integrator
+from flockenv.kernels import kernel
+
+__all__ = ["ExplicitEuler"]
+
+
+@kernel
+def advance(acceleration: Any, context: Any, pos: Any, vel: Any, dt: float, stages: Any) -> None:
+    """x += h v; v += h a: both from the present."""
+    a = stages[0]
+    acceleration(context, pos, vel, a)
+    for k in range(pos.shape[0]):
+        for i in range(pos.shape[1]):
+            pos[k, i] += dt * vel[k, i]
+            vel[k, i] += dt * a[k, i]
+
+
+class ExplicitEuler(Integrator):
+    """Explicit Euler, order 1, one evaluation; unstable for every undamped oscillation at every step size."""
+
+    kind: Literal["explicit_euler"] = "explicit_euler"
+    order: ClassVar[int] = 1
+    order_with_drag: ClassVar[int] = 1
+    stages: ClassVar[int] = 1
+    evaluations: ClassVar[int] = 1

@@ -1,0 +1,32 @@
+"""Semi-implicit (symplectic) Euler: the velocity first, then the position with the new velocity."""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar, Literal
+
+from flockenv.integrators.base import Integrator
+from flockenv.kernels import kernel
+
+__all__ = ["SemiImplicitEuler"]
+
+
+@kernel
+def advance(acceleration: Any, context: Any, pos: Any, vel: Any, dt: float, stages: Any) -> None:
+    """v += h a; x += h v, with the new v."""
+    a = stages[0]
+    acceleration(context, pos, vel, a)
+    for k in range(pos.shape[0]):
+        for i in range(pos.shape[1]):
+            v = vel[k, i] + dt * a[k, i]
+            vel[k, i] = v
+            pos[k, i] += dt * v
+
+
+class SemiImplicitEuler(Integrator):
+    """Semi-implicit Euler, order 1, one evaluation; bounded energy while h omega < 2 (Reynolds' own step, 1999)."""
+
+    kind: Literal["semi_implicit_euler"] = "semi_implicit_euler"
+    order: ClassVar[int] = 1
+    order_with_drag: ClassVar[int] = 1
+    stages: ClassVar[int] = 1
+    evaluations: ClassVar[int] = 1

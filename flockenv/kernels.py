@@ -1,0 +1,134 @@
+"""The one door to compiled code: laws are marked here, and every entry point is a small generated file.
+
+Closures over compiled functions never hit numba's disk cache, and a cached function does not notice when a law it calls
+has changed. So nothing is cached but generated files: one readable source per combination of laws, in the cache folder,
+whose name is a digest of its own text and of flockenv's sources. A second process compiles nothing; an edited law
+compiles anew, always.
+"""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+import importlib.util
+import os
+import re
+import sys
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+from types import ModuleType
+from typing import Any, TypeVar, cast
+
+import numba
+from numba.core import types
+from numba.extending import overload
+
+__all__ = ["FAST", "Vec", "cache_folder", "entry", "kernel", "law", "like", "load"]
+
+F = TypeVar("F", bound=Callable[..., Any])
+
+Vec = tuple[float, ...]
+"""A vector inside a law: a tuple of D floats, D = 2 or 3."""
+
+# No nnan/ninf: a NaN must stay visible to the checks that look for it.
+FAST = frozenset({"nsz", "arcp", "contract", "afn", "reassoc"})
+_OPTIONS: dict[str, Any] = {"fastmath": set(FAST), "error_model": "numpy", "nogil": True}
+
+
+def law(function: F) -> F:
+    """Mark a scalar law: branch-free if it can be, inlined into whatever loop calls it, never called on its own."""
+    return cast(F, numba.njit(forceinline=True, **_OPTIONS)(function))
+
+
+def kernel(function: F) -> F:
+    """Mark a function over the arrays of one world; compiled as a part of the generated file that calls it."""
+    return cast(F, numba.njit(forceinline=True, **_OPTIONS)(function))
+
+
+def like(x: float, constant: float) -> float:
+    """Return `constant` in the precision of `x`: a bare 0.5 would turn a float32 law into a float64 one."""
+    return type(x)(constant)
+
+
+@overload(like, jit_options={"forceinline": True})
+def _like(x, constant):  # type: ignore[no-untyped-def]  # numba compares signatures, annotations included
+    to = types.float32 if x == types.float32 else types.float64
+    return lambda x, constant: to(constant)
+
+
+def cache_folder() -> Path:
+    """Return the folder of generated sources and their machine code; FLOCKENV_CACHE names another one.
+
+    Falls back to a folder under the system's temporary one where the home folder cannot be written.
+    """
+    named = os.environ.get("FLOCKENV_CACHE")
+    home = os.environ.get("XDG_CACHE_HOME") or os.environ.get("LOCALAPPDATA") or os.path.expanduser("~/.cache")
+    fallback = Path(tempfile.gettempdir()) / f"flockenv-{os.getuid() if hasattr(os, 'getuid') else 'cache'}"
+    for folder in [Path(named)] if named else [Path(home) / "flockenv", fallback]:
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            if os.access(folder, os.W_OK):
+                return folder
+        except OSError:
+            continue
+    raise OSError(f"no folder for compiled kernels can be written (tried {named or home}); set FLOCKENV_CACHE")
+
+
+@functools.cache
+def _laws_digest() -> str:
+    """Digest every source of the package that holds laws: an edit to one means new files, never stale machine code."""
+    digest = hashlib.sha256(f"{numba.__version__} {sys.version_info[:2]}".encode())
+    for path in sorted(Path(__file__).parent.rglob("*.py")):
+        text = path.read_bytes()
+        if b"from flockenv.kernels import" in text or path == Path(__file__):
+            digest.update(text)
+    return digest.hexdigest()
+
+
+def _other_laws(source: str) -> str:
+    """Return the text of the modules outside flockenv that a generated source takes laws from."""
+    names = set(re.findall(r"^from ([\w.]+) import", source, re.MULTILINE))
+    files = (getattr(sys.modules.get(name), "__file__", None) for name in sorted(names) if "flockenv" not in name)
+    own = (f for f in files if f and f.endswith(".py") and "site-packages" not in f)
+    return "".join(Path(f).read_text(encoding="utf-8") for f in own)
+
+
+@functools.lru_cache(maxsize=512)
+def load(name: str, source: str) -> ModuleType:
+    """Import a generated source, writing it first if this text was never seen; `name` is a readable prefix.
+
+    The file is written beside its final place and renamed, so that two processes may race.
+    """
+    digest = hashlib.sha256((source + _laws_digest() + _other_laws(source)).encode()).hexdigest()[:20]
+    folder = cache_folder()
+    path = folder / f"{name}_{digest}.py"
+    if not path.exists():
+        handle, temporary = tempfile.mkstemp(dir=folder, suffix=".tmp")
+        with os.fdopen(handle, "w", encoding="utf-8") as stream:
+            stream.write(source)
+        os.replace(temporary, path)
+    qualified = f"flockenv_generated.{path.stem}"
+    spec = importlib.util.spec_from_file_location(qualified, path)
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[qualified] = module
+    spec.loader.exec_module(module)
+    return module
+
+
+@functools.cache
+def entry(function: Any) -> Callable[..., Any]:
+    """Return a kernel as an entry point of its own: a generated file that only calls it, cached like the others."""
+    python = function.py_func
+    names = ", ".join(python.__code__.co_varnames[: python.__code__.co_argcount])
+    source = f'''"""{python.__module__}.{python.__name__} as an entry point, generated by flockenv; safe to delete."""
+from numba import njit
+from {python.__module__} import {python.__name__} as inner
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def outer({names}):
+    return inner({names})
+'''
+    return load(f"entry_{python.__name__}", source).outer  # type: ignore[no-any-return]

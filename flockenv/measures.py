@@ -1,0 +1,81 @@
+"""What people who study flocks and crowds measure on one world at one instant: order, spacing, speed, contact."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from flockenv.scene import Scene
+from flockenv.space import Space, Torus
+from flockenv.state import State
+
+__all__ = ["MEASURES", "measure", "nearest_distances", "polarisation"]
+
+Floats = NDArray[np.float64]
+
+FARTHEST = 1e150
+"""m: the square of a longer way is no number any more."""
+
+MEASURES = {
+    "agents": "alive",
+    "speed": "m/s, mean",
+    "polarisation": "0 to 1: length of the mean heading",
+    "nearest_neighbour": "m, mean distance of centres",
+    "contacts": "agents that overlap their nearest neighbour or an obstacle",
+}
+"""Names and units of what `measure` returns."""
+
+
+def measure(scene: Scene, state: State, world: int = 0) -> dict[str, float]:
+    """Return the measures of one world by name; NaN where one has no meaning (spacing of a single agent)."""
+    with np.errstate(over="ignore", invalid="ignore"):  # a run that is about to diverge may be looked at, too
+        return _measure(scene, state, world)
+
+
+def _measure(scene: Scene, state: State, world: int) -> dict[str, float]:
+    alive = state.alive[world]
+    pos, vel = (np.asarray(a[world][alive], np.float64) for a in (state.pos, state.vel))
+    radius = np.asarray(scene.body.radius, np.float64)[alive]
+    speed = np.linalg.norm(vel, axis=1)
+    nearest, who = nearest_distances(pos, scene.space)
+    touching = nearest < radius + radius[who]
+    for centre, size in zip(state.obstacles.centre[world], state.obstacles.radius[world], strict=True):
+        touching |= (size > 0) & (np.linalg.norm(scene.space.displacement(pos, centre), axis=1) < radius + size)
+    return {
+        "agents": float(alive.sum()),
+        "speed": float(speed.mean()) if len(speed) else np.nan,
+        "polarisation": polarisation(vel),
+        "nearest_neighbour": float(nearest.mean()) if len(pos) > 1 else np.nan,
+        "contacts": float(touching.sum()),
+    }
+
+
+def polarisation(vel: Floats) -> float:
+    """Return |mean of v_i / |v_i|| over velocities (N, D): 1 if all head the same way; NaN if nobody moves.
+
+    Source: Vicsek et al. 1995, Phys. Rev. Lett. 75, 1226.
+    """
+    speed = np.linalg.norm(vel, axis=1)
+    moving = speed > 0
+    if not moving.any():
+        return np.nan
+    return float(np.linalg.norm((vel[moving] / speed[moving, None]).mean(axis=0)))
+
+
+def nearest_distances(pos: Floats, space: Space) -> tuple[Floats, NDArray[np.intp]]:
+    """Return for each of (N, D) points, m, the distance to its nearest neighbour, m, and who that is.
+
+    A lone point, or one further out than squares can be taken, is infinitely far from its nearest neighbour, itself.
+    """
+    distance, nearest = np.full(len(pos), np.inf), np.arange(len(pos))
+    here = np.flatnonzero((np.abs(pos) < FARTHEST).all(axis=1))
+    if len(here) < 2:
+        return distance, nearest
+    inside = space.wrap(pos[here])
+    found, who = cKDTree(inside, boxsize=space.size if isinstance(space, Torus) else None).query(inside, k=2)
+    # Of two points in one place each may be found first: whoever is not me is my neighbour.
+    rows = np.arange(len(here))
+    column = np.where(who[:, 0] == rows, 1, 0)
+    distance[here], nearest[here] = found[rows, column], here[who[rows, column]]
+    return distance, nearest

@@ -1,0 +1,81 @@
+"""Where a file may be written: checked before the work begins, so that an hour's run does not end at a bad name."""
+
+from __future__ import annotations
+
+import os
+import re
+import tempfile
+import unicodedata
+from collections.abc import Sequence
+from pathlib import Path
+
+from flockenv.refusals import nearest
+
+__all__ = ["checked_file", "checked_path"]
+
+LONGEST_NAME, LONGEST_PATH = 200, 1000
+
+_RESERVED = re.compile(r"(con|prn|aux|nul|com\d|lpt\d)(\..*)?", re.IGNORECASE)
+"""Names that Windows keeps for devices: what is called so cannot be copied there."""
+
+
+def checked_path(text: str, option: str = "--out") -> Path:
+    """Return the absolute path of a file or folder that may be written; nothing is made or touched.
+
+    It lies below the current folder or the system's folder for temporary files, links followed, so that a mistyped or
+    foreign path does not land among other people's files.
+
+    Raises:
+        ValueError: one line: the option, the path, and what is wrong with it.
+    """
+    fault = _fault(text) or _place(Path(text))
+    if fault:
+        raise ValueError(f"{option} {_shown(text)}: {fault}")
+    return Path(text).resolve()
+
+
+def checked_file(text: str, suffixes: Sequence[str], force: bool = False, option: str = "--out") -> Path:
+    """Return the absolute path of a file that may be written, and whose name ends in one of `suffixes`.
+
+    Raises:
+        ValueError: as `checked_path`; or another suffix; or the file is there already and `force` is not given.
+    """
+    path = checked_path(text, option)
+    suffix = path.suffix.lower()
+    if suffix not in suffixes:
+        raise ValueError(f"{option} {_shown(text)}: must end in {' or '.join(suffixes)}{nearest(suffix, suffixes)}")
+    if path.is_dir():
+        raise ValueError(f"{option} {_shown(text)}: is a folder")
+    if path.exists() and not force:
+        raise ValueError(f"{option} {_shown(text)}: exists already; --force overwrites it")
+    return path
+
+
+def _fault(text: str) -> str:
+    """Return what is wrong with a path as text, '' if nothing."""
+    if not text.strip() or any(unicodedata.category(c) in ("Cc", "Cf", "Cs") for c in text):
+        return "must be a name without control characters"
+    parts = Path(text).parts
+    if len(text) > LONGEST_PATH or any(len(os.fsencode(part)) > LONGEST_NAME for part in parts):
+        return f"too long: at most {LONGEST_NAME} bytes per name and {LONGEST_PATH} characters in all"
+    if ".." in parts:
+        return "must not go up with '..'"
+    reserved = [part for part in parts if _RESERVED.fullmatch(part)]
+    return f"{reserved[0]!r} is a reserved name" if reserved else ""
+
+
+def _place(path: Path) -> str:
+    """Return why nothing may be written there, '' if it may."""
+    target = path.resolve()
+    allowed = [Path.cwd().resolve(), Path(tempfile.gettempdir()).resolve()]
+    if not any(target.is_relative_to(base) for base in allowed):
+        return f"must lie below {allowed[0]} or {allowed[1]}"
+    around = target.parents if target.is_file() else (target, *target.parents)
+    folder = next(place for place in around if place.exists())
+    if not folder.is_dir():
+        return f"{_shown(str(folder))} is not a folder"
+    return "" if os.access(folder, os.W_OK | os.X_OK) else f"{_shown(str(folder))} cannot be written to"
+
+
+def _shown(text: str) -> str:
+    return repr(text) if len(text) <= 200 else f"{text[:80]!r}... ({len(text)} characters)"

@@ -1,0 +1,423 @@
+"""Policies: whatever turns rows of observations into rows of actions, hand-written or learned, behind SB3's predict().
+
+A learned policy is two files that hold no code: `X.safetensors` (the actor's weights) and `X.json` beside it (the card:
+activation, sizes, digest of the observation layout, SHA-256 of the weights, and how the weights came about). It runs in
+numpy alone.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import importlib
+import importlib.util
+import inspect
+import json
+import os
+import secrets
+import sys
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flockenv.refusals import nearest
+
+if TYPE_CHECKING:
+    from flockenv.tasks import Task
+
+__all__ = ["ACTIVATIONS", "MlpPolicy", "Policy", "RandomPolicy", "load_player", "save_policy", "write_atomically"]
+
+Observation = NDArray[Any] | dict[str, NDArray[Any]]
+State = tuple[NDArray[Any], ...]
+Floats = NDArray[np.float32]
+Layer = tuple[Floats, Floats]
+
+CARD_VERSION = 1
+LARGEST_CARD, LARGEST_WEIGHTS = 8 << 20, 256 << 20
+"""Bytes: what is bigger is no policy of ours, and is not read."""
+
+
+@runtime_checkable
+class Policy(Protocol):
+    """Letter for letter Stable-Baselines3's predict(), so that a Reynolds player and a PPO model are used alike."""
+
+    def predict(
+        self,
+        observation: Observation,
+        state: State | None = None,
+        episode_start: NDArray[Any] | None = None,
+        deterministic: bool = False,
+    ) -> tuple[NDArray[Any], State | None]:
+        """Return actions for observations, (R, O) float32 -> (R, A) float32 (or one row, (O,) -> (A,)), and a state."""
+        ...
+
+
+class RandomPolicy:
+    """Actions uniform in [-1, 1]: the floor of every table.
+
+    Args:
+        action_size: A, how many numbers an action has.
+        seed: of its own generator; None draws one. `seed` records which it was.
+    """
+
+    def __init__(self, action_size: int, seed: int | None = None) -> None:
+        if action_size < 1:
+            raise ValueError(f"action_size: {action_size!r}, must be at least 1")
+        self.action_size = action_size
+        self.seed, self._generator = _seeded(seed)
+
+    def __repr__(self) -> str:
+        return f"RandomPolicy({self.action_size}, seed={self.seed})"
+
+    def predict(
+        self,
+        observation: Observation,
+        state: State | None = None,
+        episode_start: NDArray[Any] | None = None,
+        deterministic: bool = False,
+    ) -> tuple[Floats, State | None]:
+        """Return a fresh draw per row; `deterministic` changes nothing, for the mean of it would be to do nothing."""
+        shape = (*np.asarray(observation).shape[:-1], self.action_size)
+        return self._generator.uniform(-1.0, 1.0, shape).astype(np.float32), state
+
+
+ACTIVATIONS: Mapping[str, Callable[..., Floats]] = {
+    "tanh": np.tanh,
+    "relu": lambda x, out: np.maximum(x, np.float32(0), out=out),
+}
+
+
+class MlpPolicy:
+    """The actor of an MLP policy in plain numpy: float32 throughout, equal to SB3's to 1e-6 and needing no torch.
+
+    Args:
+        tensors: `policy.0.weight`, `policy.0.bias`, `policy.1.weight`, ... (hidden layers), `action.weight`,
+            `action.bias`, `log_std`; weights are (out, in) as in torch.
+        card: needs `activation`, "tanh" or "relu"; the rest is for people.
+        seed: of the generator that samples when not deterministic; None draws one.
+
+    Raises:
+        ValueError: a tensor is missing, unknown, of another shape or type than its neighbours call for, or not finite.
+    """
+
+    def __init__(self, tensors: Mapping[str, NDArray[Any]], card: Mapping[str, Any], seed: int | None = 0) -> None:
+        self.card = dict(card)
+        self._activation = ACTIVATIONS[_known(card.get("activation"), ACTIVATIONS, "activation")]
+        self._hidden, self._head = _layers(tensors)
+        self._deviation = np.exp(tensors["log_std"])
+        self.observation_size = int([*self._hidden, self._head][0][0].shape[0])
+        self.action_size = int(self._head[1].shape[0])
+        self.seed, self._generator = _seeded(seed)
+
+    def __repr__(self) -> str:
+        sizes = [self.observation_size, *(len(bias) for _, bias in self._hidden), self.action_size]
+        return f"MlpPolicy({' -> '.join(map(str, sizes))}, {self.card['activation']}, seed={self.seed})"
+
+    @classmethod
+    def load(cls, path: str | os.PathLike[str], task: Task | None = None, seed: int | None = 0) -> MlpPolicy:
+        """Read `X.safetensors` and the card beside it; with a task, check that the policy sees what the task shows.
+
+        Raises:
+            ValueError: one line, for a missing, truncated, altered or foreign file or one made for another layout.
+        """
+        path = Path(path)
+        try:
+            card = _read_card(path.with_suffix(".json"))
+            policy = cls(_read_tensors(path, card), card, seed)
+            _check_sizes(policy, task)
+        except ValueError as error:
+            raise ValueError(f"policy {_shown(path)}: {error}") from None
+        return policy
+
+    def predict(
+        self,
+        observation: Observation,
+        state: State | None = None,
+        episode_start: NDArray[Any] | None = None,
+        deterministic: bool = False,
+    ) -> tuple[Floats, State | None]:
+        """Return the mean action, or a Gaussian sample, clipped to [-1, 1]: (O,) -> (A,), (R, O) -> (R, A)."""
+        rows = np.asarray(observation, dtype=np.float32)
+        if rows.ndim not in (1, 2) or rows.shape[-1] != self.observation_size:
+            size = self.observation_size
+            raise ValueError(f"observation: shape {rows.shape}, must be ({size},) or (rows, {size})")
+        for weight, bias in self._hidden:
+            rows = rows @ weight
+            rows += bias
+            self._activation(rows, out=rows)
+        action = rows @ self._head[0] + self._head[1]
+        if not deterministic:
+            action += self._deviation * self._generator.standard_normal(action.shape, dtype=np.float32)
+        return np.clip(action, -1.0, 1.0), state
+
+
+def save_policy(path: str | os.PathLike[str], tensors: Mapping[str, NDArray[Any]], card: Mapping[str, Any]) -> None:
+    """Write the weights and the card beside them, each atomically; the card receives what can be derived.
+
+    Args:
+        path: ends in .safetensors; the card gets the same name ending in .json.
+        tensors: as MlpPolicy takes them, float32.
+        card: `activation` is needed; `layout` (the digest of the task's observation layout) is what a later load checks
+            against the task; `task`, `steps`, `wall_time_s` and all else is for people. `version`, `sha256`,
+            `observation_size` and `action_size` are filled in.
+
+    Raises:
+        ValueError: for anything that MlpPolicy.load would refuse; nothing is written then.
+    """
+    from safetensors.numpy import save
+
+    path = Path(path)
+    if path.suffix != ".safetensors":
+        raise ValueError(f"policy {_shown(path)}: the file name must end in .safetensors")
+    tensors = {name: np.ascontiguousarray(tensor) for name, tensor in tensors.items()}
+    policy = MlpPolicy(tensors, card)
+    data = save(tensors)
+    derived = {
+        "version": CARD_VERSION,
+        "sha256": hashlib.sha256(data).hexdigest(),
+        "observation_size": policy.observation_size,
+        "action_size": policy.action_size,
+    }
+    for key in derived.keys() & card.keys() - {"sha256"}:
+        if card[key] != derived[key]:
+            raise ValueError(f"policy {_shown(path)}: card: {key} = {card[key]!r}, the weights say {derived[key]!r}")
+    text = json.dumps({**card, **derived}, indent=2, allow_nan=False) + "\n"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_atomically(path, data)
+    write_atomically(path.with_suffix(".json"), text.encode())
+
+
+def write_atomically(path: Path, data: bytes) -> None:
+    """Put the bytes into a file that either is the old one or the whole new one, whatever happens in between."""
+    temporary = path.with_name(f".{secrets.token_hex(8)}.tmp")  # beside it: a rename does not cross file systems
+    try:
+        with temporary.open("xb") as file:
+            file.write(data)
+            file.flush()
+            os.fsync(file.fileno())
+        temporary.replace(path)
+    except BaseException:
+        temporary.unlink(missing_ok=True)
+        raise
+
+
+def load_player(
+    spec: str | os.PathLike[str],
+    task: Task,
+    known: Mapping[str, Callable[[Task], Policy]] | None = None,
+    trust_pickle: bool = False,
+) -> Policy:
+    """Return the policy that a name or a file stands for, ready to play this task.
+
+    Args:
+        spec: a name out of `known`; or a `.safetensors` file with its card; or a `.py` file, which is executed and
+            offers `player(task)`, a class `Player` or a function `predict` (SB3's four arguments, or the observation
+            alone); or, with `trust_pickle`, a Stable-Baselines3 `.zip`.
+        task: whom it will play.
+        known: name -> how to make that player.
+        trust_pickle: read zips too. Loading one executes whatever code is stored in it.
+
+    Raises:
+        ValueError: one line: no such player (with the nearest name), a file that cannot be used, or one not trusted.
+    """
+    known = known or {}
+    name = os.fspath(spec)
+    if name in known:
+        return known[name](task)
+    loader = {".safetensors": MlpPolicy.load, ".py": _load_python, ".zip": _load_zip}.get(Path(name).suffix.lower())
+    if loader is None:
+        hint = f"unknown{nearest(name[:200], known)}; allowed: {_listed(known)}, or a .safetensors or .py file"
+        raise ValueError(f"player {_shown(name)}: {hint}")
+    if loader is _load_zip and not trust_pickle:
+        raise ValueError(
+            f"player {_shown(name)}: loading a Stable-Baselines3 zip executes the code stored in it; "
+            "if the file is your own, pass --trust-pickle (trust_pickle=True)"
+        )
+    if not os.path.isfile(name):  # Path.is_file raises for a name that no file can have
+        raise ValueError(f"player {_shown(name)}: no such file")
+    return loader(Path(name), task)
+
+
+def _load_zip(path: Path, task: Task) -> Policy:
+    # by name: stable-baselines3 and torch are looked for only here, and sb3.py is a layer above this file
+    policy: Policy = importlib.import_module("flockenv.sb3").load_sb3_zip(path)
+    return policy
+
+
+def _load_python(path: Path, task: Task) -> Policy:
+    """Execute a player file and take what it offers, the most specific first."""
+    module = _execute(path)
+    player: Any
+    if hasattr(module, "player"):
+        player = module.player(task)
+    elif hasattr(module, "Player"):
+        player = module.Player(task) if _takes(module.Player, 1) else module.Player()
+    elif hasattr(module, "predict"):
+        player = _FunctionPolicy(module.predict)
+    else:
+        raise ValueError(f"player {_shown(path)}: needs a function predict or player(task), or a class Player")
+    if not callable(getattr(player, "predict", None)):
+        raise ValueError(f"player {_shown(path)}: what it made, a {type(player).__name__}, has no predict()")
+    return player  # type: ignore[no-any-return]
+
+
+def _execute(path: Path) -> Any:
+    """Import a file under a name of its own, so that two players of the same file name do not meet."""
+    name = f"flockenv_player_{hashlib.sha256(str(path.resolve()).encode()).hexdigest()[:16]}"
+    spec = importlib.util.spec_from_file_location(name, path)
+    if spec is None or spec.loader is None:
+        raise ValueError(f"player {_shown(path)}: not a Python file")
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[name] = module  # dataclasses and pickle look a class's module up there
+    try:
+        spec.loader.exec_module(module)
+    except Exception as error:
+        del sys.modules[name]
+        raise ValueError(f"player {_shown(path)}: {type(error).__name__} while loading it: {error}") from error
+    return module
+
+
+class _FunctionPolicy:
+    """A bare function as a policy: SB3's four arguments and a pair back, or the observation in and the action out."""
+
+    def __init__(self, function: Callable[..., Any]) -> None:
+        self._function, self._whole = function, _takes(function, 4)
+
+    def predict(
+        self,
+        observation: Observation,
+        state: State | None = None,
+        episode_start: NDArray[Any] | None = None,
+        deterministic: bool = False,
+    ) -> tuple[NDArray[Any], State | None]:
+        arguments = (observation, state, episode_start, deterministic) if self._whole else (observation,)
+        answer = self._function(*arguments)
+        return answer if isinstance(answer, tuple) else (np.asarray(answer, np.float32), state)
+
+
+def _takes(function: Callable[..., Any], count: int) -> bool:
+    try:
+        inspect.signature(function).bind(*[None] * count)
+    except (TypeError, ValueError):
+        return False
+    return True
+
+
+def _read_card(path: Path) -> dict[str, Any]:
+    """Read a card strictly: no duplicate keys, no NaN, of a version we know."""
+    try:
+        card = json.loads(_read(path, LARGEST_CARD), object_pairs_hook=_unique, parse_constant=_no_constant)
+    except (UnicodeDecodeError, json.JSONDecodeError, RecursionError) as error:
+        raise ValueError(f"the card {path.name!r} is not JSON: {error}") from None
+    if not isinstance(card, dict):
+        raise ValueError(f"the card {path.name!r} holds a {type(card).__name__}, must be an object")
+    missing = [key for key in ("version", "sha256", "activation", "observation_size", "action_size") if key not in card]
+    if missing:
+        raise ValueError(f"the card {path.name!r} lacks {missing[0]!r}")
+    if card["version"] != CARD_VERSION:
+        raise ValueError(f"the card {path.name!r} has version {card['version']!r}; this flockenv reads {CARD_VERSION}")
+    return card
+
+
+def _read_tensors(path: Path, card: Mapping[str, Any]) -> dict[str, NDArray[Any]]:
+    from safetensors import SafetensorError
+    from safetensors.numpy import load
+
+    data = _read(path, LARGEST_WEIGHTS)
+    if hashlib.sha256(data).hexdigest() != card["sha256"]:
+        raise ValueError(f"the weights ({len(data)} bytes) are not those of the card: their SHA-256 differs")
+    try:
+        return dict(load(data))
+    except (SafetensorError, KeyError) as error:
+        raise ValueError(f"not a safetensors file: {error}") from None
+
+
+def _read(path: Path, largest: int) -> bytes:
+    try:
+        if path.stat().st_size > largest:
+            raise ValueError(f"{path.name!r} has {path.stat().st_size} bytes, at most {largest} are read")
+        return path.read_bytes()
+    except OSError as error:
+        raise ValueError(f"{path.name!r} cannot be read: {error.strerror}") from None
+
+
+def _check_sizes(policy: MlpPolicy, task: Task | None) -> None:
+    """Compare what the weights are with what the card says and what the task shows."""
+    sizes = {"observation_size": policy.observation_size, "action_size": policy.action_size}
+    for key, size in sizes.items():
+        if policy.card[key] != size:
+            raise ValueError(f"the card says {key} = {policy.card[key]!r}, the weights are for {size}")
+    if task is None:
+        return
+    wanted = {"observation_size": task.layout.size, "action_size": task.action_layout.size}
+    for key, size in sizes.items():
+        if wanted[key] != size:
+            raise ValueError(f"made for {key} = {size}, task {task.name!r} has {wanted[key]}")
+    if policy.card.get("layout") != task.layout.digest:
+        raise ValueError(
+            f"made for observation layout {policy.card.get('layout')!r}, task {task.name!r} has {task.layout.digest!r}"
+        )
+
+
+def _layers(tensors: Mapping[str, NDArray[Any]]) -> tuple[list[Layer], Layer]:
+    """Check every tensor and return the layers as (in, out) weights and biases: the hidden ones, and the last."""
+    depth = sum(name.startswith("policy.") and name.endswith(".weight") for name in tensors)
+    names = [f"policy.{i}" for i in range(depth)] + ["action"]
+    wanted = {f"{name}.{part}" for name in names for part in ("weight", "bias")} | {"log_std"}
+    if wanted != tensors.keys():
+        name = sorted(wanted ^ tensors.keys())[0]
+        raise ValueError(f"tensor {name!r} is {'missing' if name in wanted else 'not one of an MLP actor'}")
+    for name, tensor in tensors.items():
+        if tensor.dtype != np.float32:
+            raise ValueError(f"tensor {name!r} is {tensor.dtype}, must be float32")
+        if not np.isfinite(tensor).all():
+            raise ValueError(f"tensor {name!r} holds NaN or infinity")
+    layers: list[Layer] = []
+    for name in names:
+        weight, bias = tensors[f"{name}.weight"], tensors[f"{name}.bias"]
+        inputs = layers[-1][1].shape[0] if layers else weight.shape[-1] if weight.ndim else 0
+        _expect(f"{name}.weight", weight, (weight.shape[0] if weight.ndim else 0, inputs))
+        _expect(f"{name}.bias", bias, weight.shape[:1])
+        layers.append((np.ascontiguousarray(weight.T), bias))
+    _expect("log_std", tensors["log_std"], layers[-1][1].shape)
+    return layers[:-1], layers[-1]
+
+
+def _expect(name: str, tensor: NDArray[Any], shape: tuple[int, ...]) -> None:
+    if tensor.shape != shape or 0 in shape:
+        raise ValueError(f"tensor {name!r} has shape {tensor.shape}, its neighbours call for {shape}")
+
+
+def _known(value: Any, allowed: Mapping[str, Any], what: str) -> str:
+    if not isinstance(value, str) or value not in allowed:
+        raise ValueError(f"{what}: {value!r}{nearest(str(value)[:200], allowed)}; allowed: {_listed(allowed)}")
+    return value
+
+
+def _listed(names: Mapping[str, Any]) -> str:
+    return ", ".join(map(repr, names)) or "no name"
+
+
+def _seeded(seed: int | None) -> tuple[int, np.random.Generator]:
+    if seed is None:
+        seed = int(np.random.SeedSequence().generate_state(1, np.uint64)[0])
+    return seed, np.random.default_rng(seed)
+
+
+def _shown(path: str | os.PathLike[str]) -> str:
+    """Return a path fit for one line of a terminal: quoted, control characters escaped, not too long."""
+    text = repr(os.fspath(path))
+    return text if len(text) <= 300 else f"{text[:150]}...{text[-100:]}"
+
+
+def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    keys = [key for key, _ in pairs]
+    if len(set(keys)) < len(keys):
+        raise ValueError(f"the card names {next(k for k in keys if keys.count(k) > 1)!r} twice")
+    return dict(pairs)
+
+
+def _no_constant(text: str) -> Any:
+    raise ValueError(f"the card holds {text}, which is not JSON")

@@ -1,0 +1,38 @@
+"""Record: the frozen, validated, self-describing value that effects, integrators, spaces, scenes and tasks are."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic._internal._model_construction import ModelMetaclass  # it has no public name
+
+from flockenv.refusals import refusals
+
+__all__ = ["Record"]
+
+
+class _OneLine(ModelMetaclass):
+    """Turns pydantic's report into one line where a record is built by hand; files go through config.py."""
+
+    def __call__(cls, *args: Any, **data: Any) -> Any:  # noqa: N805  # the class of a class
+        try:
+            return super().__call__(*args, **data)
+        except ValidationError as error:
+            model: Any = cls
+            wrong = refusals(error, model, data)
+            more = f" (and {len(wrong) - 1} more)" if len(wrong) > 1 else ""
+            text = str(wrong[0]) if wrong else str(error)
+        raise ValueError(f"{cls.__name__}: {text}{more}")
+
+
+class Record(BaseModel, metaclass=_OneLine):
+    """A frozen record: prints as its own constructor, compares, hashes, pickles, and becomes a YAML block by itself.
+
+    An unknown or invalid field is refused at construction with a ValueError of one line that names it.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, use_attribute_docstrings=True)
+
+    def __str__(self) -> str:
+        return repr(self)

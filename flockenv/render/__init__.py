@@ -1,0 +1,39 @@
+"""Pictures of snapshots: pixels, PNG, GIF, a window, an HTML replay; a backend is imported when first asked for.
+
+Nothing here opens a display except Window, and `import flockenv.render` imports neither Pillow nor pygame.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Final
+
+if TYPE_CHECKING:
+    from flockenv.render.gif import write_gif, write_png
+    from flockenv.render.picture import draw
+    from flockenv.render.replay import Group, Panel, write_replay
+    from flockenv.render.window import Window
+
+__all__ = ["Group", "Panel", "Window", "draw", "write_gif", "write_png", "write_replay"]
+
+_HOMES: Final = {
+    "Group": "replay",
+    "Panel": "replay",
+    "Window": "window",
+    "draw": "picture",
+    "write_gif": "gif",
+    "write_png": "gif",
+    "write_replay": "replay",
+}
+
+
+def __getattr__(name: str) -> object:
+    if name not in _HOMES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}; it has {', '.join(__all__)}")
+    value = getattr(import_module(f"{__name__}.{_HOMES[name]}"), name)
+    globals()[name] = value  # the next look-up no longer comes here
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

@@ -1,0 +1,161 @@
+"""Interval plots: what players scored, how often they succeeded and how far they are apart, one column per task."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flockenv.render.atomic import replacing
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+    from flockenv.evaluation import Interval
+
+__all__ = ["Column", "Row", "draw_chart", "write_chart"]
+
+INK, FAINT, GRID = "#22272e", "#6b7480", "#e4e7eb"
+COLOURS = ("#D55E00", "#0072B2", "#E69F00", "#009E73", "#CC79A7", "#56B4E9")
+"""Okabe and Ito's palette, which readers with any colour vision tell apart."""
+FIXED = {"random": "#8a929c", "textbook": "#E69F00", "reynolds": "#0072B2", "ppo": "#D55E00"}
+
+
+@dataclass(frozen=True, eq=False)
+class Row:
+    """One player: an interval for its score and one for its success rate, and the scores of single worlds behind."""
+
+    name: str
+    score: Interval
+    success: Interval
+    scores: NDArray[np.float64]  # (worlds,)
+
+
+@dataclass(frozen=True, eq=False)
+class Column:
+    """One task: its players from top to bottom, and the pairs to show, name -> interval of the difference."""
+
+    title: str
+    rows: Sequence[Row]
+    pairs: Mapping[str, Interval] = field(default_factory=dict)
+
+
+def write_chart(path: str | Path, columns: Sequence[Column], title: str, note: str = "") -> None:
+    """Write the plot as a PNG file, whole or not at all; needs no display, and the same numbers give the same bytes."""
+    figure = draw_chart(columns, title, note)
+    with replacing(path) as file:
+        figure.savefig(file, format="png", dpi=150, metadata={"Software": "flockenv"})
+
+
+def draw_chart(columns: Sequence[Column], title: str, note: str = "") -> Figure:
+    """Return the plot: per task scores over their worlds, success rates, and differences against a line at zero.
+
+    Raises:
+        ValueError: nothing to draw.
+    """
+    if not columns or not all(column.rows for column in columns):
+        raise ValueError("chart: needs at least one task, and at least one player in each")
+    # Figure and not pyplot: no global state, no window, nothing to close
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+    from matplotlib.layout_engine import ConstrainedLayoutEngine
+
+    players, pairs = max(len(c.rows) for c in columns), max(len(c.pairs) for c in columns)
+    heights = [0.62 * players + 0.5, 0.34 * players + 0.4] + [0.34 * pairs + 0.4] * (pairs > 0)
+    size = (1.2 + 4.2 * len(columns), sum(heights) + 0.85 * len(heights) + 1.0)
+    figure = Figure(figsize=size, facecolor="white", layout=ConstrainedLayoutEngine(w_pad=0.12, h_pad=0.08))
+    FigureCanvasAgg(figure)
+    grid = figure.subplots(len(heights), len(columns), squeeze=False, height_ratios=heights)
+    colours = _colours([row.name for column in columns for row in column.rows])
+    for k, column in enumerate(columns):
+        _scores(grid[0, k], column, colours)
+        _success(grid[1, k], column, colours)
+        if pairs:
+            _differences(grid[2, k], column)
+        for axes in grid[:, k]:
+            _plain(axes)
+    figure.suptitle(title, x=0.01, ha="left", fontsize=15, fontweight="bold", color=INK)
+    figure.supxlabel(note, x=0.01, ha="left", fontsize=8.5, color=FAINT)
+    return figure
+
+
+def _colours(names: Sequence[str]) -> dict[str, str]:
+    names = list(dict.fromkeys(names))
+    free = [c for c in COLOURS if c not in {FIXED.get(name) for name in names}] or list(COLOURS)
+    others = [name for name in names if name not in FIXED]
+    return {**FIXED, **{name: free[k % len(free)] for k, name in enumerate(others)}}
+
+
+def _scores(axes: Axes, column: Column, colours: Mapping[str, str]) -> None:
+    """Draw every world as a faint dot and the interval over them."""
+    axes.set_title(column.title, loc="left", fontsize=12.5, fontweight="bold", color=INK, pad=10)
+    axes.set_xlabel("return: interquartile mean, 95 % (dots: worlds)")
+    for y, row in enumerate(column.rows):
+        # a fixed comb of heights instead of random ones: neighbours in score do not hide each other, bytes repeat
+        heights = y + 0.30 * (np.argsort(np.argsort(row.scores)) * 0.618034 % 1.0 * 2 - 1)
+        axes.scatter(row.scores, heights, s=7, color=colours[row.name], alpha=0.22, linewidths=0, zorder=2)
+        _interval(axes, y, row.score, colours[row.name], f"{row.score.value:.3g}")
+    _rows(axes, [row.name for row in column.rows])
+    scores = np.concatenate([row.scores for row in column.rows])
+    low, high = np.quantile(scores, (0.005, 0.995))  # one freak world must not press all intervals together
+    low, high = min([low, *(r.score.low for r in column.rows)]), max([high, *(r.score.high for r in column.rows)])
+    margin = 0.05 * (high - low) or 0.5
+    axes.set_xlim(low - margin, high + margin)
+
+
+def _success(axes: Axes, column: Column, colours: Mapping[str, str]) -> None:
+    axes.set_xlabel("success rate, 95 %")
+    for y, row in enumerate(column.rows):
+        axes.barh(y, row.success.value, height=0.56, color=colours[row.name], alpha=0.25, zorder=2)
+        _interval(axes, y, row.success, colours[row.name], f"{100 * row.success.value:.0f} %")
+    _rows(axes, [row.name for row in column.rows])
+    axes.set_xlim(0.0, 1.19)
+    axes.set_xticks([0, 0.25, 0.5, 0.75, 1], ["0", "25", "50", "75", "100 %"])
+
+
+def _differences(axes: Axes, column: Column) -> None:
+    axes.set_xlabel("difference in the same world: mean, 95 %")
+    axes.axvline(0.0, color=FAINT, linewidth=1, linestyle=(0, (4, 3)), zorder=1)
+    for y, interval in enumerate(column.pairs.values()):
+        clear = interval.low > 0 or interval.high < 0
+        _interval(axes, y, interval, INK if clear else FAINT, f"{interval.value:+.3g}")
+    _rows(axes, list(column.pairs))
+    axes.margins(x=0.12)
+
+
+def _interval(axes: Axes, y: float, interval: Interval, colour: str, text: str) -> None:
+    """Draw a bar from low to high, a dot at the value, and the number above it."""
+    from matplotlib.patheffects import withStroke
+
+    ends: dict[str, Any] = {"linewidth": 4.5, "solid_capstyle": "round", "zorder": 3, "clip_on": False}
+    dot: dict[str, Any] = {"markeredgecolor": colour, "markeredgewidth": 2, "markersize": 7, "zorder": 4}
+    axes.plot((interval.low, interval.high), (y, y), color=colour, **ends)
+    axes.plot(interval.value, y, "o", color="white", clip_on=False, **dot)  # a rate of 0 lies on the frame's edge
+    axes.annotate(
+        text, (interval.value, y), (0, 7), textcoords="offset points", ha="center", va="bottom",
+        fontsize=8.5, fontweight="bold", color=colour, zorder=5, parse_math=False,
+        path_effects=[withStroke(linewidth=2.5, foreground="white")],
+    )  # fmt: skip
+
+
+def _rows(axes: Axes, names: Sequence[str]) -> None:
+    axes.set_yticks(range(len(names)), names, parse_math=False)
+    axes.set_ylim(max(len(names), 1) - 0.45, -0.62)
+
+
+def _plain(axes: Axes) -> None:
+    """Leave of the frame what carries information."""
+    for side in ("top", "right", "left"):
+        axes.spines[side].set_visible(False)
+    axes.spines["bottom"].set_color(GRID)
+    axes.grid(axis="x", color=GRID, linewidth=0.8, zorder=0)
+    axes.set_axisbelow(True)
+    style: dict[str, Any] = {"length": 0, "labelcolor": INK}
+    axes.tick_params(axis="y", labelsize=10, pad=8, **style)
+    axes.tick_params(axis="x", labelsize=8.5, **style)
+    axes.xaxis.label.set(fontsize=8.5, color=FAINT, x=0.0, ha="left")

@@ -1,0 +1,203 @@
+"""write_replay(): one HTML file that plays the same world under several players, side by side, and needs nothing else.
+
+The page is replay.html beside this file. Its data is one JSON object in which the numbers per frame are base64 of
+little-endian arrays: positions uint16 over the shown region widened by half of itself on each side, headings uint8.
+24 agents take 160 bytes a frame.
+"""
+
+from __future__ import annotations
+
+import html
+import json
+import math
+import os
+import re
+from base64 import b64encode
+from collections.abc import Sequence
+from dataclasses import dataclass
+from importlib.resources import files
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flockenv.render.atomic import replacing
+from flockenv.render.palette import ARROW, BODY_DISC, DART, DART_REACH, JUMP, PAPER, ROLE_COLOURS
+from flockenv.snapshot import Floats, Mark, Snapshot
+
+__all__ = ["Group", "Panel", "write_replay"]
+
+#: Bytes that stand for no direction; the directions are 0..253, counter-clockwise from +x.
+_DIRECTIONS: Final = 254
+_RESTING: Final = 254
+_ABSENT: Final = 255
+#: The packed region: [low, high] and this share of its extent beyond it on each side; what is further out stays there.
+_BEYOND: Final = 0.5
+_LEVELS: Final = 65535
+
+
+@dataclass(frozen=True, eq=False)
+class Panel:
+    """What one player did: a picture of the replay.
+
+    player: its name. snapshots: one per frame, times strictly increasing, the same agents, obstacles may move.
+    reward: the return accumulated up to each snapshot. outcome: what to say when it has ended, "captured at 6.2 s".
+    Raises ValueError or TypeError, in one line that names the player, on anything else.
+    """
+
+    player: str
+    snapshots: Sequence[Snapshot]
+    reward: Sequence[float]
+    outcome: str
+
+    def __post_init__(self) -> None:
+        for name in ("player", "outcome"):
+            if not isinstance(getattr(self, name), str):
+                raise TypeError(f"Panel.{name}: must be a str, got {type(getattr(self, name)).__name__}")
+        object.__setattr__(self, "snapshots", tuple(self.snapshots))
+        object.__setattr__(self, "reward", tuple(float(r) for r in self.reward))
+        shots, who = self.snapshots, f"panel {self.player!r}"
+        if not shots:
+            raise ValueError(f"{who}: must have at least one snapshot, got none")
+        if len(self.reward) != len(shots):
+            raise ValueError(f"{who}: must have one reward per snapshot ({len(shots)}), got {len(self.reward)}")
+        if not all(map(math.isfinite, self.reward)):
+            raise ValueError(
+                f"{who}: rewards must be finite, got {next(r for r in self.reward if not math.isfinite(r))}"
+            )
+        for k, (shot, last) in enumerate(zip(shots[1:], shots[:-1], strict=True), 1):
+            if shot.time <= last.time:
+                raise ValueError(
+                    f"{who}: times must increase, got {last.time:g} s then {shot.time:g} s at snapshot {k}"
+                )
+            if not _alike(shot, shots[0]):
+                raise ValueError(f"{who}: snapshot {k} must have the agents, roles and region of snapshot 0")
+
+
+@dataclass(frozen=True, eq=False)
+class Group:
+    """One task: a title and the panels that are played side by side, in lockstep."""
+
+    title: str
+    panels: Sequence[Panel]
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "panels", tuple(self.panels))
+        if not self.panels:
+            raise ValueError(f"group {self.title!r}: must have at least one panel, got none")
+
+
+def write_replay(path: str | os.PathLike[str], groups: Sequence[Group], title: str) -> None:
+    """Write the replay of one or several tasks as one self-contained HTML file; it appears whole or not at all.
+
+    The page loads nothing and forbids itself to (Content-Security-Policy); names are shown as text, whatever they are.
+    Its address takes #task=1, t=4.2 (s) and play or pause, joined by &. Raises ValueError if there is no group.
+    """
+    if not groups:
+        raise ValueError("groups: there must be at least one, got none")
+    data = {
+        "title": title,
+        "groups": [{"title": group.title, "panels": [_panel(panel) for panel in group.panels]} for group in groups],
+        "roles": ROLE_COLOURS,
+        "paper": PAPER,
+        "dart": DART,
+        "arrow": ARROW,
+        "reach": DART_REACH,
+        "disc": BODY_DISC,
+        "jump": JUMP,
+        "beyond": _BEYOND,
+        "directions": _DIRECTIONS,
+    }
+    fills = {"TITLE": html.escape(title), "DATA": _embed(data)}
+    page = files("flockenv.render").joinpath("replay.html").read_text(encoding="utf-8")
+    # One pass: a title that reads like a slot is not filled in again.
+    page = re.sub(r"__(TITLE|DATA)__", lambda slot: fills[slot[1]], page)
+    with replacing(path) as file:
+        file.write(page.encode("utf-8", "replace"))
+
+
+def _embed(data: object) -> str:
+    """Return JSON that no HTML parser can leave: <, > and & only as escapes."""
+    text = json.dumps(data, separators=(",", ":"), allow_nan=False)
+    return text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
+
+
+def _alike(one: Snapshot, other: Snapshot) -> bool:
+    return (
+        one.pos.shape == other.pos.shape
+        and one.roles == other.roles
+        and one.periodic == other.periodic
+        and np.array_equal(one.low, other.low)
+        and np.array_equal(one.high, other.high)
+    )
+
+
+def _panel(panel: Panel) -> dict[str, Any]:
+    shots = panel.snapshots
+    first = shots[0]
+    return {
+        "player": panel.player,
+        "outcome": panel.outcome,
+        "time": [_short(shot.time, 9) for shot in shots],
+        "reward": [_short(r, 6) for r in panel.reward],
+        "low": first.low.tolist(),
+        "high": first.high.tolist(),
+        "periodic": first.periodic,
+        "roles": first.roles,
+        "radius": [_short(r, 6) for r in first.radius],
+        "pos": _packed(np.stack([_positions(shot) for shot in shots])),
+        "heading": _packed(np.stack([_headings(shot) for shot in shots])),
+        "scenery": _scenery(shots),
+    }
+
+
+def _short(value: float, digits: int) -> float:
+    """Return the number with so many significant digits, which is how much of it is written."""
+    return float(f"{value:.{digits}g}")
+
+
+def _packed(array: NDArray[np.uint8] | NDArray[np.uint16]) -> str:
+    return b64encode(array.astype(array.dtype.newbyteorder("<")).tobytes()).decode("ascii")
+
+
+def _positions(shot: Snapshot) -> NDArray[np.uint16]:
+    extent = shot.high - shot.low
+    low = shot.low - _BEYOND * extent
+    high = shot.high + _BEYOND * extent
+    pos: Floats = np.where(shot.visible[:, None], shot.pos, low)
+    level = (np.clip(pos, low, high) - low) / (high - low) * _LEVELS
+    return np.rint(level).astype(np.uint16)
+
+
+def _headings(shot: Snapshot) -> NDArray[np.uint8]:
+    """Return (N,) uint8: the direction of the velocity in x and y, or that the body rests or is not there."""
+    vel = np.where(shot.visible[:, None], shot.vel, 0.0)[:, :2]
+    turn = np.arctan2(vel[:, 1], vel[:, 0]) / (2.0 * np.pi)
+    heading = np.rint(turn * _DIRECTIONS).astype(np.int64) % _DIRECTIONS
+    heading[~vel.any(axis=1)] = _RESTING
+    heading[~(shot.alive & shot.visible)] = _ABSENT
+    return heading.astype(np.uint8)
+
+
+def _scenery(shots: Sequence[Snapshot]) -> list[dict[str, Any]]:
+    """Return the obstacles and marks, once for every frame from which on they are others than before."""
+    scenes: list[dict[str, Any]] = []
+    for k, shot in enumerate(shots):
+        stones = np.column_stack([shot.obstacle_centre[:, :2], shot.obstacle_radius]).tolist()
+        scene = {
+            "stones": [[_short(x, 6) for x in stone] for stone in stones],
+            "marks": [_mark(mark) for mark in shot.marks],
+        }
+        if not scenes or scene != {name: scenes[-1][name] for name in scene}:
+            scenes.append({"from": k, **scene})
+    return scenes
+
+
+def _mark(mark: Mark) -> dict[str, Any]:
+    norm = float(np.linalg.norm(mark.vector)) or 1.0
+    return {
+        "kind": mark.kind,
+        "at": [_short(x, 6) for x in mark.at[:2]],
+        "vector": [_short(x, 6) for x in mark.vector[:2] / norm],
+        "radius": _short(mark.radius, 6),
+    }

@@ -1,0 +1,200 @@
+"""Stable-Baselines3's face: every learner of every world is one row of a VecEnv, without subprocesses or SuperSuit."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from gymnasium import Wrapper
+from gymnasium.error import ResetNeeded
+from numpy.typing import NDArray
+from stable_baselines3 import PPO
+from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices
+
+from flockenv.envs.face import (
+    Screen,
+    action_space,
+    begun,
+    checked_options,
+    checked_seed,
+    metrics_of,
+    observation_space,
+    render_fps,
+)
+from flockenv.world import Step, World
+
+if TYPE_CHECKING:
+    from stable_baselines3.common.base_class import BaseAlgorithm
+
+    from flockenv.tasks import Task
+
+__all__ = ["WorldVecEnv", "load_sb3_zip"]
+
+Info = dict[str, Any]
+
+
+class WorldVecEnv(VecEnv):
+    """B worlds with L learners each as B * L rows of one shared policy; row i is learner i % L of world i // L.
+
+    A world that ended begins anew in the same step. The infos of its rows then hold `terminal_observation`,
+    `TimeLimit.truncated` (so that PPO bootstraps time limits and not deaths), `is_success`, `terms` (sums over the
+    episode), and the metrics of the world; all other infos are empty.
+
+    Seeds: `seed(s)` gives world k the seed s + k at the next reset; a world goes on with the next episodes of its seed.
+
+    Args:
+        task: of which all learners of a world end together.
+        worlds: B.
+        time_limit: decisions after which a world is truncated; None = the task's own horizon.
+        render_mode: "rgb_array" (world 0) or None.
+
+    Raises:
+        ValueError: the task's learners end one by one, for which a row has no meaning after its end.
+    """
+
+    def __init__(
+        self, task: Task, worlds: int = 1, time_limit: int | None = None, render_mode: str | None = None
+    ) -> None:
+        if not task.ends_together:
+            raise ValueError(
+                f"{task.name}: its learners leave one by one, and a row of a VecEnv cannot; "
+                "use pettingzoo.make('parallel', ...), or a task in which all learners end together"
+            )
+        self.task = task
+        self.world = World(task, worlds, time_limit=task.horizon if time_limit is None else time_limit)
+        self.render_mode = render_mode
+        self._screen = Screen(render_mode, render_fps(task), modes=("rgb_array",))
+        self._sums = np.zeros((worlds, task.learners, len(task.terms)))
+        self._actions: NDArray[Any] | None = None
+        self._running = False
+        super().__init__(worlds * task.learners, observation_space(task), action_space(task))
+
+    def seed(self, seed: int | None = None) -> Sequence[int | None]:
+        """Give world k the seed s + k at the next reset; None draws s. Returns the seed of every row."""
+        first = checked_seed(seed)
+        first = int(np.random.default_rng().integers(2**32)) if first is None else first
+        self._seeds = [first + i // self.task.learners for i in range(self.num_envs)]
+        return self._seeds
+
+    def reset(self) -> NDArray[np.float32]:
+        """Begin an episode in every world; return (B L, O) float32. `reset_infos` says which seed each row has."""
+        for options in self._options:
+            checked_options(options)
+        seeds = [seed for seed in self._seeds[:: self.task.learners] if seed is not None]
+        observation = self.world.reset(seeds=seeds if len(seeds) == self.world.worlds else None)
+        self.reset_infos = [{"seed": seed} for seed in self.world.seeds for _ in range(self.task.learners)]
+        self._running = True
+        self._reset_seeds()
+        self._reset_options()
+        self._sums[:] = 0.0
+        return self._rows(observation)
+
+    def step_async(self, actions: NDArray[Any]) -> None:
+        """Take the actions of all rows, (B L, A), clipped to [-1, 1]; ValueError on another shape."""
+        begun(self._running, "step")
+        rows = np.asarray(actions)
+        expected = (self.num_envs, self.task.action_layout.size)
+        if rows.shape != expected:
+            raise ValueError(f"actions: shape {rows.shape}, must be {expected}, a row per learner of every world")
+        self._actions = rows.reshape(self.world.worlds, self.task.learners, -1)
+
+    def step_wait(self) -> tuple[NDArray[np.float32], NDArray[np.float64], NDArray[np.bool_], list[Info]]:
+        """Act for one control_dt; return observations (B L, O), rewards (B L,), dones (B L,) and a fresh info per row.
+
+        Raises ValueError that names world and agent on NaN.
+        """
+        actions, self._actions = self._actions, None
+        if actions is None:
+            raise ResetNeeded("step_wait: there are no actions; call step_async(actions) first")
+        result = self.world.step(actions)
+        self._sums += result.terms
+        infos: list[Info] = [{} for _ in range(self.num_envs)]
+        observation, ended = result.observation, result.ended
+        if ended.any():
+            self._tell(infos, result, ended)
+            observation = self.world.reset(mask=ended)
+            self._sums[ended] = 0.0
+        return self._rows(observation), result.reward.reshape(-1), np.repeat(ended, self.task.learners), infos
+
+    def _tell(self, infos: list[Info], result: Step, ended: NDArray[np.bool_]) -> None:
+        """Write how the episodes that end in this step ended; the only loop over rows."""
+        columns = self.world.measure()
+        for world in np.flatnonzero(ended).tolist():
+            success, truncated = bool(result.success[world]), bool(result.truncated[world])
+            metrics = metrics_of(columns, world)
+            for learner in range(self.task.learners):
+                infos[world * self.task.learners + learner].update(
+                    metrics,
+                    terms=dict(zip(self.task.terms, self._sums[world, learner].tolist(), strict=True)),
+                    is_success=success,
+                    terminal_observation=result.observation[world, learner].copy(),
+                    **{"TimeLimit.truncated": truncated and not bool(result.terminated[world, learner])},
+                )
+
+    def _rows(self, observation: NDArray[np.float32]) -> NDArray[np.float32]:
+        return observation.reshape(self.num_envs, -1)
+
+    def close(self) -> None:
+        """End the episodes and close the window; may be called twice, and reset() begins anew."""
+        self._running, self._actions = False, None
+        self._screen.close()
+
+    def get_images(self) -> Sequence[NDArray[np.uint8] | None]:
+        """Return the picture of world 0: a picture per row would show every world as often as it has learners."""
+        begun(self._running, "render")
+        return [self._screen.show(self.world.snapshot(), "rgb_array")]
+
+    def render(self, mode: str | None = None) -> NDArray[np.uint8] | None:
+        """Return the picture of world 0, (H, W, 3) uint8, or show it ("human") in our window, which needs no OpenCV."""
+        begun(self._running, "render")
+        return self._screen.show(self.world.snapshot(), mode)
+
+    def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
+        """Return an attribute of this face (`task`, `world`, ...) for each of the rows."""
+        return [getattr(self, attr_name)] * len(self._picked(indices))
+
+    def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
+        """Set an attribute of this face; ValueError for some rows only, since all rows share one simulator."""
+        if len(self._picked(indices)) != self.num_envs:
+            raise ValueError(f"set_attr({attr_name!r}): the rows share one simulator; leave out indices")
+        setattr(self, attr_name, value)
+
+    def env_method(
+        self, method_name: str, *method_args: Any, indices: VecEnvIndices = None, **method_kwargs: Any
+    ) -> list[Any]:
+        """Call a method of this face once, and return its result for each of the rows."""
+        picked = self._picked(indices)
+        return [getattr(self, method_name)(*method_args, **method_kwargs)] * len(picked)
+
+    def env_is_wrapped(
+        self, wrapper_class: type[Wrapper[Any, Any, Any, Any]], indices: VecEnvIndices = None
+    ) -> list[bool]:
+        """Return False for each of the rows: there is no gymnasium environment inside that could be wrapped."""
+        return [False] * len(self._picked(indices))
+
+    def _picked(self, indices: VecEnvIndices) -> list[int]:
+        return list(self._get_indices(indices))
+
+
+def load_sb3_zip(
+    path: str | os.PathLike[str], trust_pickle: bool = False, algorithm: type[BaseAlgorithm] = PPO
+) -> BaseAlgorithm:
+    """Read a model that Stable-Baselines3 saved, which RUNS CODE from the file (cloudpickle, SB3 #2281).
+
+    Our own policies are safetensors and need none of this: flockenv.policy.MlpPolicy.load.
+
+    Raises:
+        ValueError: trust_pickle is not True, or there is no such file.
+    """
+    file = Path(path)
+    if trust_pickle is not True:
+        raise ValueError(
+            f"{file}: a Stable-Baselines3 zip runs code when it is read; if you made it, say trust_pickle=True"
+        )
+    if not file.is_file():
+        raise ValueError(f"{file}: no such file")
+    return algorithm.load(file, device="cpu")

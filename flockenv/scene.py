@@ -1,0 +1,309 @@
+"""Scene: what is simulated, as one frozen record; and the step, which reads like a table of contents.
+
+scene = Scene(space=Torus(size=(40, 40)), groups=(Group(count=300, max_speed=2),), effects=(Separation(...), ...))
+state = scene.start(seed=1)
+state = scene.step(state)
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+import operator
+import threading
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from pydantic import Field, WrapValidator, model_validator
+
+from flockenv import state as states
+from flockenv.effects import EFFECTS, Effect
+from flockenv.integrators import INTEGRATORS, Integrator, SemiImplicitEuler
+from flockenv.kernels import entry, load
+from flockenv.neighbours import LANES, MAX_RANGES
+from flockenv.noise import key_of
+from flockenv.records import Record
+from flockenv.shapes import Circle
+from flockenv.snapshot import Snapshot
+from flockenv.space import AnySpace, Box, Plane, Torus
+from flockenv.spawn import Spawn, scatter
+from flockenv.state import Body, Floats, State
+from flockenv.sweep import Parts, scene_source
+
+__all__ = ["Group", "Scene", "Workspace"]
+
+MEMORY_LIMIT = 8 * 2**30
+"""Bytes that a state and its scratch may take before a scene is refused."""
+
+
+def _keep(value: Any, handler: Any) -> Any:
+    """Let a record through as it is: an effect of somebody else's is as good as ours, only files need the list."""
+    return value if isinstance(value, (Effect, Integrator)) else handler(value)
+
+
+if TYPE_CHECKING:
+    AnyEffect = Effect
+    AnyIntegrator = Integrator
+else:
+    AnyEffect = Annotated[
+        Annotated[functools.reduce(operator.or_, EFFECTS.values()), Field(discriminator="kind")], WrapValidator(_keep)
+    ]
+    AnyIntegrator = Annotated[
+        Annotated[functools.reduce(operator.or_, INTEGRATORS.values()), Field(discriminator="kind")],
+        WrapValidator(_keep),
+    ]
+
+
+class Group(Record):
+    """Some agents of a kind."""
+
+    count: int = Field(ge=1, description="how many")
+    mass: float = Field(default=1.0, gt=0, description="kg")
+    radius: float = Field(default=0.1, ge=0, description="m")
+    max_speed: float | None = Field(default=None, gt=0, description="m/s; none = no limit")
+    max_force: float | None = Field(default=None, ge=0, description="N, what it may ask for; none = no limit")
+    spawn: Spawn = Field(default_factory=Spawn)
+    role: Literal["agent", "learner", "pursuer", "evader", "flockmate"] = Field(
+        default="agent", description="what it is in pictures"
+    )
+
+
+@dataclass(frozen=True)
+class Workspace:
+    """Scratch of one thread, sized for N agents: what a step writes and nobody reads afterwards."""
+
+    arrays: tuple[NDArray[Any], ...]
+
+    @classmethod
+    def allocate(cls, parts: Parts, agents: int, dtype: Any) -> Workspace:
+        """Return scratch for the sweep, the query and the integrator, in the order in which `step` takes them."""
+        d = parts.dimension
+        sweeps = agents if parts.pairs else 1
+        return cls(
+            (
+                np.zeros(parts.lanes() * LANES, dtype),
+                np.zeros((d, agents), dtype),  # what agents want
+                np.zeros((d, agents), dtype),  # what acts on them
+                np.zeros((2 * d + 2, sweeps), dtype),  # positions, velocities, radii, indices, sorted
+                np.zeros(sweeps, np.int64),
+                np.zeros(2 * sweeps, np.int64),
+                np.zeros(sweeps + 2, np.int64),
+                np.zeros(3, np.int64),
+                np.zeros((MAX_RANGES, 2), np.int64),
+                np.zeros((parts.integrator.stages, d, agents), dtype),
+            )
+        )
+
+
+class Scene(Record):
+    """What is simulated: who, where, under which effects, advanced how. Prints, compares, hashes, pickles, is YAML."""
+
+    dimension: Literal[2, 3] = Field(default=2, description="2 or 3")
+    space: AnySpace = Field(default_factory=Plane)
+    groups: tuple[Group, ...] = Field(min_length=1, description="agents, group after group")
+    effects: tuple[AnyEffect, ...] = Field(default=(), description="what acts on them; nothing else is computed")
+    obstacles: tuple[Circle, ...] = Field(default=(), description="the same in every world")
+    integrator: AnyIntegrator = Field(default_factory=SemiImplicitEuler)
+    dt: float = Field(default=0.02, gt=0, description="s, one physics step")
+    dtype: Literal["float64", "float32"] = Field(default="float64", description="precision of everything")
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Scene:
+        """Refuse what no single field can know: dimensions that differ, a reach around the torus, too much memory."""
+        self._check_dimensions()
+        size = getattr(self.space, "size", None)
+        if isinstance(self.space, Torus):
+            for k, effect in enumerate(self.effects):
+                if effect.reach > min(self.space.size) / 2:
+                    raise ValueError(
+                        f"effects[{k}].radius = {effect.reach:g} reaches around the torus; at most half its shortest "
+                        f"edge, {min(self.space.size) / 2:g} m, is allowed"
+                    )
+        if isinstance(self.space, Box):
+            for k, group in enumerate(self.groups):
+                if 2 * group.radius > min(self.space.size):
+                    raise ValueError(f"groups[{k}].radius = {group.radius:g} does not fit into a box of size {size}")
+        needed = self.bytes_per_world()
+        if needed > MEMORY_LIMIT:
+            each = needed / self.agents
+            raise ValueError(
+                f"groups: {self.agents:,} agents need about {needed / 2**30:.3g} GiB; at most {MEMORY_LIMIT / 2**30:g} "
+                f"GiB, {int(MEMORY_LIMIT / each):,} agents, are allowed"
+            )
+        return self
+
+    def _check_dimensions(self) -> None:
+        size = getattr(self.space, "size", None)
+        if size is not None and len(size) != self.dimension:
+            raise ValueError(f"space.size = {size} has {len(size)} edges, but dimension = {self.dimension}")
+        for k, obstacle in enumerate(self.obstacles):
+            if len(obstacle.centre) != self.dimension:
+                raise ValueError(f"obstacles[{k}].centre = {obstacle.centre}: dimension = {self.dimension}")
+        for k, group in enumerate(self.groups):
+            for name in ("low", "high", "heading"):
+                value = getattr(group.spawn, name)
+                if value is not None and len(value) != self.dimension:
+                    raise ValueError(f"groups[{k}].spawn.{name} = {value}: dimension = {self.dimension}")
+            if size is None and group.spawn.low is None:
+                raise ValueError(f"groups[{k}].spawn.low: missing; a plane has no size to spread agents over")
+
+    # --- what follows from the fields -------------------------------------------------------------------------------
+
+    @property
+    def agents(self) -> int:
+        """N."""
+        return sum(group.count for group in self.groups)
+
+    @property
+    def roles(self) -> tuple[str, ...]:
+        """What each agent is called, (N,)."""
+        return tuple(group.role for group in self.groups for _ in range(group.count))
+
+    def bytes_per_world(self) -> int:
+        """Memory of a state and its scratch, in bytes, counted before anything is allocated."""
+        real = 8 if self.dtype == "float64" else 4
+        d = self.dimension
+        reals = 2 * d + 4 + 2 * d + d + self.integrator.stages * d  # state, body, scratch, drive, stages
+        pairs = any(effect.pair_law for effect in self.effects)
+        return self.agents * (reals * real + 1 + ((2 * d + 2) * real + 4 * 8 if pairs else 0))
+
+    @functools.cached_property
+    def body(self) -> Body:
+        """The bodies of all groups."""
+
+        def per_agent(name: str) -> Floats:
+            values = [math.inf if getattr(g, name) is None else getattr(g, name) for g in self.groups]
+            return np.repeat(np.array(values, self.dtype), [g.count for g in self.groups])
+
+        return Body(*(per_agent(name) for name in ("mass", "radius", "max_speed", "max_force")))
+
+    @functools.cached_property
+    def parts(self) -> Parts:
+        """What the kernel is made of."""
+        return Parts(self.dimension, self.space, self.effects, self.integrator)
+
+    @functools.cached_property
+    def _params(self) -> Floats:
+        return np.array(self.parts.parameters(), self.dtype)
+
+    def __getstate__(self) -> dict[Any, Any]:
+        """Pickle the fields alone: what follows from them is made anew where it is needed."""
+        kept = super().__getstate__()
+        kept["__dict__"] = {k: v for k, v in kept["__dict__"].items() if k in type(self).model_fields}
+        return kept
+
+    # --- running ----------------------------------------------------------------------------------------------------
+
+    def start(self, seed: int, worlds: int = 1) -> State:
+        """Return the first state: world k is drawn from seed + k, whichever batch it is in."""
+        if worlds < 1:
+            raise ValueError(f"worlds is {worlds}, must be at least 1")
+        if self.bytes_per_world() * worlds > MEMORY_LIMIT:
+            need = self.bytes_per_world() * worlds / 2**30
+            most = MEMORY_LIMIT / 2**30
+            raise ValueError(f"worlds is {worlds}: needs about {need:.3g} GiB, at most {most:g} allowed")
+        state = states.blank(worlds, self.agents, self.dimension, len(self.obstacles), self.dt, self.dtype)
+        state.key[:] = [key_of(seed + k, 0) for k in range(worlds)]
+        for m, obstacle in enumerate(self.obstacles):
+            state.obstacles.centre[:, m] = obstacle.centre
+            state.obstacle_radius[:, m] = obstacle.radius
+        for b in range(worlds):
+            self._scatter(state, b)
+        return state
+
+    def _scatter(self, state: State, b: int) -> None:
+        place, first, d = entry(scatter), 0, self.dimension
+        for group in self.groups:
+            spawn = group.spawn
+            low = np.array(spawn.low if spawn.low is not None else (0.0,) * d, float)
+            high = np.array(spawn.high if spawn.high is not None else self.space.extent(d), float)
+            heading = np.array(spawn.heading if spawn.heading is not None else (0.0,) * d, float)
+            place(
+                state.key[b], state.x[:, b], state.v[:, b], self.body.radius, first, first + group.count, low, high,
+                *spawn.speed, heading, state.obstacle_x[:, b], state.obstacle_radius[b], np.zeros(d),
+            )  # fmt: skip
+            first += group.count
+
+    def step(self, state: State, drive: ArrayLike | None = None, out: State | None = None, steps: int = 1) -> State:
+        """Advance every world by `steps` physics steps under a constant drive.
+
+        drive: forces asked for, (B, N, D) N, clipped to max_force together with steering effects; none = nobody asks.
+        out: the state to write into (it may be `state` itself: nothing is allocated then); none = a new one.
+        Raises FloatingPointError, naming world and agent, if a position or velocity is no longer finite.
+        """
+        if out is None:
+            out = state.copy()
+        elif out is not state:
+            out.copy_from(state)
+        world, agent = self._kernel(
+            out.x, out.v, out.alive, out.tick, out.obstacle_x, out.obstacle_radius, out.work,
+            self._drive(drive, state), *self.body.arrays(), self._params, self._dt, steps, *self._workspace().arrays,
+        )  # fmt: skip
+        if world >= 0:
+            raise FloatingPointError(
+                f"world {world}, agent {agent}: position or velocity is not finite at t = {out.time[world]:g} s; "
+                f"dt = {self.dt:g} s may be too large for {self.integrator.kind}"
+            )
+        return out
+
+    def run(self, state: State, steps: int) -> State:
+        """Return the state `steps` steps later."""
+        return self.step(state, steps=steps)
+
+    def _drive(self, drive: ArrayLike | None, state: State) -> Floats:
+        if drive is None:
+            return np.zeros_like(state.x)
+        given = np.asarray(drive, self.dtype)
+        if given.shape != state.shape:
+            raise ValueError(f"drive has shape {given.shape}, but the state has (B, N, D) = {state.shape}")
+        if not np.isfinite(given).all():
+            world, agent, axis = (int(k) for k in np.argwhere(~np.isfinite(given))[0])
+            raise ValueError(f"drive of world {world}, agent {agent}, axis {axis} is {given[world, agent, axis]}")
+        return np.ascontiguousarray(given.transpose(2, 0, 1))
+
+    @property
+    def _dt(self) -> Any:
+        return np.dtype(self.dtype).type(self.dt)
+
+    @functools.cached_property
+    def _kernel(self) -> Any:
+        return load("scene", scene_source(self.parts)).step
+
+    def _workspace(self) -> Workspace:
+        """Return this thread's scratch: two threads may step one scene at the same time."""
+        found: Workspace | None = getattr(self._threads, "workspace", None)
+        if found is None:
+            found = self._threads.workspace = Workspace.allocate(self.parts, self.agents, self.dtype)
+        return found
+
+    @functools.cached_property
+    def _threads(self) -> threading.local:
+        return threading.local()
+
+    # --- looking at it ----------------------------------------------------------------------------------------------
+
+    def snapshot(self, state: State, world: int = 0, title: str = "") -> Snapshot:
+        """Return one world at one instant, for pictures."""
+        low, high = self._view(state, world)
+        return Snapshot(
+            time=float(state.time[world]), pos=state.pos[world], vel=state.vel[world], alive=state.alive[world],
+            radius=np.asarray(self.body.radius, np.float64), roles=self.roles,
+            obstacle_centre=state.obstacles.centre[world], obstacle_radius=state.obstacle_radius[world], marks=(),
+            low=np.array(low, np.float64), high=np.array(high, np.float64),
+            periodic=self.space.periodic, title=title,
+        )  # fmt: skip
+
+    def _view(self, state: State, world: int) -> tuple[Sequence[float], Sequence[float]]:
+        """Return the region to show: the space, or where everybody is."""
+        if not isinstance(self.space, Plane):
+            return (0.0,) * self.dimension, self.space.extent(self.dimension)
+        pos = state.pos[world]
+        margin = 1.0 + 0.05 * float(np.ptp(pos, axis=0).max())
+        return tuple(pos.min(axis=0) - margin), tuple(pos.max(axis=0) + margin)
+
+    def with_effects(self, *effects: Effect) -> Scene:
+        """Return the same scene under other effects."""
+        return self.model_copy(update={"effects": effects})

@@ -1,0 +1,183 @@
+"""Snapshot: one world at one instant, as plain arrays; all that a picture, a GIF or a replay ever sees."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from difflib import get_close_matches
+from typing import Final
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+__all__ = ["KINDS", "ROLES", "Floats", "Mark", "Snapshot"]
+
+Floats = NDArray[np.float64]
+
+ROLES: Final = ("pursuer", "evader", "learner", "flockmate", "agent")
+KINDS: Final = ("goal", "heading")
+
+
+@dataclass(frozen=True, eq=False)
+class Mark:
+    """Something to see that is no body: a goal, or a heading that is asked for.
+
+    kind: "goal" (a disc of `radius` around `at`; `vector` is not read) or "heading" (an arrow that starts at `at` and
+    points along `vector`; only its direction counts, and a zero vector draws nothing; `radius` is not read).
+    at, vector: (D,) with D = 2 or 3, at in m. radius: m, >= 0. Arrays are copied and read-only.
+    Raises ValueError or TypeError, in one line, on an unknown kind, a wrong shape or a number that is not finite.
+    """
+
+    kind: str
+    at: Floats
+    vector: Floats
+    radius: float
+
+    def __post_init__(self) -> None:
+        _known("Mark.kind", self.kind, KINDS)
+        at = _array("Mark.at", self.at, (None,))
+        _dimension("Mark.at", len(at))
+        radius = float(_array("Mark.radius", self.radius, ()))
+        _demand(radius >= 0.0, "Mark.radius", "must be >= 0 m", radius)
+        _fix(self, at=at, vector=_array("Mark.vector", self.vector, at.shape), radius=radius)
+
+
+@dataclass(frozen=True, eq=False)
+class Snapshot:
+    """One world at one instant.
+
+    time: s. pos (N, D): m. vel (N, D): m/s. alive (N,): bool. radius (N,): m. roles: N names out of ROLES.
+    obstacle_centre (M, D), obstacle_radius (M,): m. marks: goals and headings. low, high (D,): the region to show, m.
+    periodic: whether what leaves the region enters it on the far side. title: one line. D = 2 or 3; N and M may be 0.
+    Arrays are private copies and read-only; positions and velocities may hold NaN or inf (a run that diverged can be
+    looked at: such bodies are left out), everything else is finite.
+    Raises ValueError or TypeError, in one line that names the field, on anything else.
+    """
+
+    time: float
+    pos: Floats
+    vel: Floats
+    alive: NDArray[np.bool_]
+    radius: Floats
+    roles: tuple[str, ...]
+    obstacle_centre: Floats
+    obstacle_radius: Floats
+    marks: tuple[Mark, ...]
+    low: Floats
+    high: Floats
+    periodic: bool
+    title: str
+
+    def __post_init__(self) -> None:
+        pos = _array("Snapshot.pos", self.pos, (None, None), finite=False)
+        agents, dimension = pos.shape
+        _dimension("Snapshot.pos", dimension)
+        obstacle_centre = _array("Snapshot.obstacle_centre", self.obstacle_centre, (None, dimension))
+        _fix(
+            self,
+            time=float(_array("Snapshot.time", self.time, ())),
+            pos=pos,
+            vel=_array("Snapshot.vel", self.vel, (agents, dimension), finite=False),
+            alive=_switches("Snapshot.alive", self.alive, agents),
+            radius=_lengths("Snapshot.radius", self.radius, agents),
+            roles=_names("Snapshot.roles", self.roles, agents),
+            obstacle_centre=obstacle_centre,
+            obstacle_radius=_lengths("Snapshot.obstacle_radius", self.obstacle_radius, len(obstacle_centre)),
+            marks=_marks(self.marks, dimension),
+            low=_array("Snapshot.low", self.low, (dimension,)),
+            high=_array("Snapshot.high", self.high, (dimension,)),
+            periodic=bool(self.periodic),
+        )
+        if not isinstance(self.title, str):
+            raise TypeError(f"Snapshot.title: must be a str, got {type(self.title).__name__}")
+        if not (self.low < self.high).all():
+            raise ValueError(f"Snapshot.low: must be below high on every axis, got {self.low} and {self.high}")
+
+    @property
+    def agents(self) -> int:
+        """N, the number of rows, alive or not."""
+        return len(self.pos)
+
+    @property
+    def dimension(self) -> int:
+        """D: 2 or 3."""
+        return int(self.pos.shape[1])
+
+    @property
+    def visible(self) -> NDArray[np.bool_]:
+        """Which bodies have a place that can be drawn, (N,) bool: the finite ones."""
+        return np.asarray(np.isfinite(self.pos).all(axis=1) & np.isfinite(self.vel).all(axis=1))
+
+
+def _fix(record: Mark | Snapshot, **fields: object) -> None:
+    for name, value in fields.items():
+        object.__setattr__(record, name, value)
+
+
+def _demand(good: bool | np.bool_, field: str, rule: str, value: object) -> None:
+    if not good:
+        raise ValueError(f"{field}: {rule}, got {value}")
+
+
+def _known(field: str, name: object, names: tuple[str, ...]) -> None:
+    if name in names:
+        return
+    near = get_close_matches(str(name), names, n=1)
+    raise ValueError(
+        f"{field}: unknown {name!r}; one of {', '.join(names)}" + (f" (did you mean {near[0]!r}?)" if near else "")
+    )
+
+
+def _dimension(field: str, dimension: int) -> None:
+    _demand(dimension in (2, 3), field, "must have 2 or 3 coordinates", dimension)
+
+
+def _array(field: str, value: ArrayLike, shape: tuple[int | None, ...], *, finite: bool = True) -> Floats:
+    """Return a read-only float64 copy of `value`; None in `shape` stands for any length."""
+    try:
+        array = np.array(value, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise TypeError(f"{field}: must be numbers, got {type(value).__name__} ({error})") from None
+    fits = array.ndim == len(shape) and all(want in (None, have) for want, have in zip(shape, array.shape, strict=True))
+    wanted = "(" + ", ".join("any" if n is None else str(n) for n in shape) + ("," if len(shape) == 1 else "") + ")"
+    _demand(fits, field, f"must have shape {wanted}", f"shape {array.shape}")
+    if finite and not np.isfinite(array).all():
+        raise ValueError(f"{field}: must be finite, got {array[~np.isfinite(array)][0]}")
+    array.flags.writeable = False
+    return array
+
+
+def _lengths(field: str, value: ArrayLike, count: int) -> Floats:
+    lengths = _array(field, value, (count,))
+    _demand((lengths >= 0.0).all(), field, "must be >= 0 m", lengths.min(initial=0.0))
+    return lengths
+
+
+def _switches(field: str, value: ArrayLike, count: int) -> NDArray[np.bool_]:
+    switches = np.array(value)
+    # An empty list is float64 to numpy; a world without agents is still a world.
+    if switches.dtype != np.bool_ and switches.size:
+        raise TypeError(f"{field}: must be bool, got {switches.dtype}")
+    _demand(switches.shape == (count,), field, f"must have shape ({count},)", f"shape {switches.shape}")
+    switches = switches.astype(np.bool_)
+    switches.flags.writeable = False
+    return switches
+
+
+def _names(field: str, value: Iterable[str], count: int) -> tuple[str, ...]:
+    if isinstance(value, str):
+        raise TypeError(f"{field}: must be a tuple of {count} names, got the one str {value!r}")
+    names = tuple(value)
+    _demand(len(names) == count, field, f"must have {count} names, one per agent", len(names))
+    for name in dict.fromkeys(names):
+        _known(field, name, ROLES)
+    return names
+
+
+def _marks(value: Iterable[Mark], dimension: int) -> tuple[Mark, ...]:
+    marks = tuple(value)
+    for mark in marks:
+        if not isinstance(mark, Mark):
+            raise TypeError(f"Snapshot.marks: must hold Mark, got {type(mark).__name__}")
+        _demand(len(mark.at) == dimension, "Snapshot.marks", f"must have {dimension} coordinates", len(mark.at))
+    return marks

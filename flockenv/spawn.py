@@ -1,0 +1,85 @@
+"""Where agents begin: drawn from the world's key, clear of the obstacles, the same whichever batch the world is in."""
+
+from __future__ import annotations
+
+import math
+from typing import Annotated, Any, Literal
+
+from pydantic import Field
+
+from flockenv.kernels import kernel
+from flockenv.noise import uniform
+from flockenv.records import Record
+
+__all__ = ["Spawn", "direction", "scatter"]
+
+TRIES = 64
+"""Places tried per agent before it is put where it overlaps least."""
+
+
+class Spawn(Record):
+    """Uniform in a box (default: the whole space), at a speed drawn from a range, in a random or a given direction."""
+
+    kind: Literal["uniform"] = "uniform"
+    low: tuple[float, ...] | None = Field(default=None, description="m, lower corner")
+    high: tuple[float, ...] | None = Field(default=None, description="m, upper corner")
+    speed: tuple[Annotated[float, Field(ge=0)], Annotated[float, Field(ge=0)]] = Field(
+        default=(0.0, 0.0), description="m/s, least and most"
+    )
+    heading: tuple[float, ...] | None = Field(default=None, description="direction of the velocity; none = random")
+
+
+@kernel
+def direction(key: Any, step: int, agent: int, channel: int, out: Any) -> None:
+    """Write a uniformly distributed unit vector (2-D or 3-D) into `out` (D,)."""
+    turn = 2.0 * math.pi * uniform(key, step, agent, channel)
+    if out.shape[0] == 2:
+        out[0], out[1] = math.cos(turn), math.sin(turn)
+    else:
+        z = 2.0 * uniform(key, step, agent, channel + 1) - 1.0
+        ring = math.sqrt(max(0.0, 1.0 - z * z))
+        out[0], out[1], out[2] = ring * math.cos(turn), ring * math.sin(turn), z
+
+
+@kernel
+def _overlap(pos: Any, i: int, radius: float, centre: Any, obstacle_radius: Any) -> float:
+    """Return the deepest overlap of agent i with an obstacle, m; 0 if it is clear."""
+    worst = 0.0
+    for m in range(obstacle_radius.shape[0]):
+        if obstacle_radius[m] > 0:
+            square = 0.0
+            for k in range(pos.shape[0]):
+                square += (pos[k, i] - centre[k, m]) ** 2
+            worst = max(worst, obstacle_radius[m] + radius - math.sqrt(square))
+    return worst
+
+
+@kernel
+def scatter(
+    key: Any, pos: Any, vel: Any, radius: Any, first: int, end: int, low: Any, high: Any, slow: float, fast: float,
+    heading: Any, centre: Any, obstacle_radius: Any, unit: Any,
+) -> None:  # fmt: skip
+    """Place agents [first, end) of one world: uniform in [low, high), clear of obstacles if 64 tries find room.
+
+    pos, vel (D, N); low, high, heading, unit (D,); a heading of zeros means a random one; `unit` is scratch.
+    """
+    dimension = pos.shape[0]
+    for i in range(first, end):
+        best, kept = 1e300, 0
+        for t in range(TRIES):
+            for k in range(dimension):
+                pos[k, i] = low[k] + (high[k] - low[k]) * uniform(key, t, i, k)
+            overlap = _overlap(pos, i, radius[i], centre, obstacle_radius)
+            if overlap < best:
+                best, kept = overlap, t
+            if overlap <= 0.0:
+                break
+        for k in range(dimension):
+            pos[k, i] = low[k] + (high[k] - low[k]) * uniform(key, kept, i, k)
+        speed = slow + (fast - slow) * uniform(key, 0, i, 3)
+        direction(key, 0, i, 4, unit)
+        length = 0.0
+        for k in range(dimension):
+            length += heading[k] * heading[k]
+        for k in range(dimension):
+            vel[k, i] = speed * (heading[k] / math.sqrt(length) if length > 0.0 else unit[k])

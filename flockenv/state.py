@@ -1,0 +1,150 @@
+"""State and Body: every array of a simulation, its shape and its unit, written here once.
+
+B worlds, N agents, D = 2 or 3 dimensions, M obstacles. Memory is one contiguous array per coordinate, (D, B, N);
+people see (B, N, D) through a transposed view that costs nothing.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+__all__ = ["WORK", "Body", "Floats", "Obstacles", "State"]
+
+Floats = NDArray[np.floating[Any]]
+
+WORK = ("evaluations", "neighbour_queries", "pairs", "obstacle_tests")
+"""What is counted in State.work: force evaluations, neighbour queries, candidate pairs met, agent-obstacle tests."""
+
+
+@dataclass(frozen=True, eq=False)
+class Obstacles:
+    """Round obstacles of every world, as views: they may differ from world to world, and do not move yet."""
+
+    centre: Floats  # (B, M, D) m
+    radius: Floats  # (B, M) m; 0 = no obstacle in this slot
+
+
+@dataclass(frozen=True, eq=False)
+class Body:
+    """What does not change about agents, the same in every world."""
+
+    mass: Floats  # (N,) kg
+    radius: Floats  # (N,) m
+    max_speed: Floats  # (N,) m/s, may be inf
+    max_force: Floats  # (N,) N, bounds what an agent asks for (drive and steering), not what acts on it; may be inf
+
+    def astype(self, dtype: Any) -> Body:
+        """Return the same bodies in another precision."""
+        return Body(*(np.ascontiguousarray(a, dtype) for a in self.arrays()))
+
+    def arrays(self) -> tuple[Floats, Floats, Floats, Floats]:
+        """Return the four arrays in the order in which kernels take them."""
+        return (self.mass, self.radius, self.max_speed, self.max_force)
+
+
+@dataclass(frozen=True, eq=False)
+class State:
+    """What changes: where everybody is, how fast, who is alive, and how many steps have passed.
+
+    The obstacles are here because a random field differs from world to world and from episode to episode.
+    """
+
+    x: Floats  # (D, B, N) m, positions, per coordinate
+    v: Floats  # (D, B, N) m/s, velocities, per coordinate
+    alive: NDArray[np.bool_]  # (B, N)
+    tick: NDArray[np.int64]  # (B,) physics steps since the start
+    key: NDArray[np.uint64]  # (B,) the world's random key, see noise.py
+    obstacle_x: Floats  # (D, B, M) m
+    obstacle_radius: Floats  # (B, M) m
+    work: NDArray[np.int64]  # (B, 4) counters, see WORK
+    dt: float  # s, one physics step: time = tick dt
+
+    @property
+    def pos(self) -> Floats:
+        """Positions as a view, (B, N, D) m."""
+        return self.x.transpose(1, 2, 0)
+
+    @property
+    def vel(self) -> Floats:
+        """Velocities as a view, (B, N, D) m/s."""
+        return self.v.transpose(1, 2, 0)
+
+    @property
+    def time(self) -> NDArray[np.float64]:
+        """Time of each world, (B,) s: a whole number of steps times dt, so that it never drifts."""
+        return np.asarray(self.tick * self.dt, np.float64)
+
+    @property
+    def obstacles(self) -> Obstacles:
+        """The obstacles as views."""
+        return Obstacles(self.obstacle_x.transpose(1, 2, 0), self.obstacle_radius)
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """(B, N, D)."""
+        d, b, n = self.x.shape
+        return b, n, d
+
+    def counted(self, what: str) -> int:
+        """Return one work counter summed over the worlds; `what` is a name in WORK."""
+        return int(self.work[:, WORK.index(what)].sum())
+
+    def copy(self) -> State:
+        """Return a state that shares no memory with this one."""
+        return replace(self, **{name: getattr(self, name).copy() for name in _ARRAYS})
+
+    def copy_from(self, other: State) -> None:
+        """Overwrite the arrays of this state with another's of the same shape."""
+        for name in _ARRAYS:
+            getattr(self, name)[...] = getattr(other, name)
+
+    def with_motion(self, pos: ArrayLike, vel: ArrayLike) -> State:
+        """Return a copy with other positions and velocities, each (B, N, D); refuses other shapes and NaN."""
+        new = self.copy()
+        for name, given, target in (("pos", pos, new.pos), ("vel", vel, new.vel)):
+            array = np.asarray(given, float)
+            if array.shape != self.shape:
+                raise ValueError(f"{name} has shape {array.shape}, but the state has (B, N, D) = {self.shape}")
+            if not np.isfinite(array).all():
+                raise ValueError(f"{name} holds NaN or infinity at (world, agent, axis) {tuple(_first_bad(array))}")
+            target[...] = array
+        return new
+
+    def worlds(self, rows: Sequence[int] | slice) -> State:
+        """Return a copy of some of the worlds."""
+        rows = rows if isinstance(rows, slice) else list(rows)
+        arrays: dict[str, Any] = {
+            name: np.ascontiguousarray(
+                getattr(self, name)[:, rows] if name in _PER_COORDINATE else getattr(self, name)[rows]
+            ).copy()
+            for name in _ARRAYS
+        }
+        return replace(self, **arrays)
+
+
+_PER_COORDINATE = ("x", "v", "obstacle_x")
+_ARRAYS = ("x", "v", "alive", "tick", "key", "obstacle_x", "obstacle_radius", "work")
+
+
+def _first_bad(array: Floats) -> list[int]:
+    return [int(k) for k in np.argwhere(~np.isfinite(array))[0]]
+
+
+def blank(worlds: int, agents: int, dimension: int, obstacles: int, dt: float, dtype: Any = np.float64) -> State:
+    """Return a state of zeros, everybody alive: what a spawn writes into."""
+    return State(
+        x=np.zeros((dimension, worlds, agents), dtype),
+        v=np.zeros((dimension, worlds, agents), dtype),
+        alive=np.ones((worlds, agents), np.bool_),
+        tick=np.zeros(worlds, np.int64),
+        key=np.zeros(worlds, np.uint64),
+        obstacle_x=np.zeros((dimension, worlds, obstacles), dtype),
+        obstacle_radius=np.zeros((worlds, obstacles), dtype),
+        work=np.zeros((worlds, len(WORK)), np.int64),
+        dt=dt,
+    )

@@ -1,0 +1,18 @@
+"""Tasks, one file each: the scene, what is seen, what is paid, when it ends."""
+
+from __future__ import annotations
+
+import importlib
+import pkgutil
+
+from flockenv.tasks.base import TASKS, Frame, Task
+from flockenv.tasks.layout import Layout, Slot
+
+for _module in pkgutil.iter_modules(__path__):
+    importlib.import_module(f"{__name__}.{_module.name}")
+
+from flockenv.tasks.flock import Flock  # noqa: E402  # after the folder has been walked
+from flockenv.tasks.obstacles import Obstacles  # noqa: E402
+from flockenv.tasks.pursuit import Pursuit  # noqa: E402
+
+__all__ = ["TASKS", "Flock", "Frame", "Layout", "Obstacles", "Pursuit", "Slot", "Task"]

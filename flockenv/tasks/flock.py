@@ -1,0 +1,373 @@
+"""Flock: travel together along a given heading, spaced and aligned, without collisions, past obstacles."""
+
+from __future__ import annotations
+
+import functools
+import math
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, model_validator
+
+from flockenv import arbitration, steering
+from flockenv.kernels import kernel
+from flockenv.noise import uniform
+from flockenv.scene import Group, Scene
+from flockenv.snapshot import Mark
+from flockenv.space import Torus
+from flockenv.state import State
+from flockenv.tasks.base import Frame, Measured, Task
+from flockenv.tasks.layout import Layout, Slot
+from flockenv.tasks.sight import clip, nearest_agents, nearest_obstacles, offset
+from flockenv.vec import norm, scale, unit
+
+__all__ = ["Flock"]
+
+
+@kernel
+def _size(p: Any) -> Any:
+    return np.full(2, p.size)
+
+
+@kernel
+def spawn(p: Any, frame: Frame) -> None:
+    """A loose crowd in the middle, moving anyhow; a heading; obstacles elsewhere, with gaps between them."""
+    turn = 2.0 * math.pi * uniform(frame.key, 0, 9999, 0)
+    frame.memory[0, :], frame.memory[1, :] = math.cos(turn), math.sin(turn)
+    n = frame.pos.shape[1]
+    radius = p.spacing * math.sqrt(n) * 0.8
+    for i in range(n):
+        for t in range(64):
+            r = radius * math.sqrt(uniform(frame.key, t, i, 0))
+            a = 2.0 * math.pi * uniform(frame.key, t, i, 1)
+            frame.pos[0, i] = p.size / 2 + r * math.cos(a)
+            frame.pos[1, i] = p.size / 2 + r * math.sin(a)
+            if _clear(frame, i, 4.0 * frame.radius[i]):
+                break
+        course = 2.0 * math.pi * uniform(frame.key, 0, i, 2)
+        speed = p.cruise * uniform(frame.key, 0, i, 3)
+        frame.vel[0, i], frame.vel[1, i] = speed * math.cos(course), speed * math.sin(course)
+    for m in range(frame.rho.shape[0]):
+        frame.rho[m] = 0.0
+        for t in range(64):
+            rho = p.least_radius + (p.greatest_radius - p.least_radius) * uniform(frame.key, t, 20000 + m, 0)
+            x = p.size * uniform(frame.key, t, 20000 + m, 1)
+            y = p.size * uniform(frame.key, t, 20000 + m, 2)
+            away = math.hypot(x - p.size / 2, y - p.size / 2) > radius + rho + 2.0
+            if away and _fits(p, frame, m, x, y, rho):
+                frame.centre[0, m], frame.centre[1, m], frame.rho[m] = x, y, rho
+                break
+
+
+@kernel
+def _clear(frame: Frame, i: int, distance: float) -> bool:
+    """Is agent i at least this far from those placed before it?"""
+    for j in range(i):
+        if math.hypot(frame.pos[0, j] - frame.pos[0, i], frame.pos[1, j] - frame.pos[1, i]) < distance:
+            return False
+    return True
+
+
+@kernel
+def _fits(p: Any, frame: Frame, m: int, x: float, y: float, rho: float) -> bool:
+    """Does an obstacle here leave a gap of 3 m to those before it?"""
+    for k in range(m):
+        if frame.rho[k] > 0.0:
+            dx, dy = offset(frame.centre[0, k], x, p.size), offset(frame.centre[1, k], y, p.size)
+            if math.sqrt(dx * dx + dy * dy) < frame.rho[k] + rho + 3.0:
+                return False
+    return True
+
+
+@kernel
+def drive(p: Any, frame: Frame, action: Any, force: Any) -> None:
+    """Learners push where their action says, in the frame of the heading; flockmates follow `_flockmate`."""
+    for i in range(frame.pos.shape[1]):
+        hx, hy = frame.memory[0, i], frame.memory[1, i]
+        if i < action.shape[0]:
+            along, left = action[i, 0] * frame.max_force[i], action[i, 1] * frame.max_force[i]
+            force[0, i] = along * hx - left * hy
+            force[1, i] = along * hy + left * hx
+        else:
+            _flockmate(p, frame, i, force)
+
+
+@kernel
+def _flockmate(p: Any, frame: Frame, i: int, force: Any) -> None:
+    """A scripted member: avoid obstacles, separate, align, cohere, follow the heading, by prioritised allocation."""
+    x, y = frame.pos[0, i], frame.pos[1, i]
+    v = (frame.vel[0, i], frame.vel[1, i])
+    slots = int(p.neighbours)
+    distances, chosen = np.empty(slots), np.empty(slots, np.int64)
+    found = nearest_agents(frame, i, 0, frame.pos.shape[1], p.sight, _size(p), slots, distances, chosen)
+    push, mean_v, centre = (0.0, 0.0), (0.0, 0.0), (0.0, 0.0)
+    for s in range(found):
+        j = chosen[s]
+        d = (offset(x, frame.pos[0, j], p.size), offset(y, frame.pos[1, j], p.size))
+        one = steering.separate(d, (1.0, 0.0))
+        near = 1.0 if math.sqrt(distances[s]) < p.spacing else 0.0
+        push = (push[0] + near * one[0], push[1] + near * one[1])
+        mean_v = (mean_v[0] + frame.vel[0, j] / found, mean_v[1] + frame.vel[1, j] / found)
+        centre = (centre[0] + d[0] / found, centre[1] + d[1] / found)
+    agree = steering.align(v, mean_v) if found > 0 else (0.0, 0.0)
+    course = (p.cruise * frame.memory[0, i] - v[0], p.cruise * frame.memory[1, i] - v[1])
+    wishes = (_around(p, frame, i, v), scale(push, 2.0), scale(agree, 1.5), scale(centre, 0.3), scale(course, 2.0))
+    wish = arbitration.allocate(wishes, frame.max_force[i])
+    force[0, i], force[1, i] = wish[0], wish[1]
+
+
+@kernel
+def _around(p: Any, frame: Frame, i: int, v: Any) -> Any:
+    """Steer around the obstacle that is touched first within 2 s, with all the force there is."""
+    forward = unit(v)
+    nearest, where, room = np.inf, (0.0, 0.0), 0.0
+    for m in range(frame.rho.shape[0]):
+        if frame.rho[m] > 0.0:
+            dx = offset(frame.pos[0, i], frame.centre[0, m], p.size)
+            dy = offset(frame.pos[1, i], frame.centre[1, m], p.size)
+            d = (dx, dy)
+            clearance = frame.rho[m] + frame.radius[i] + 0.3
+            t = steering.threat(forward, d, clearance, 2.0 * norm(v))
+            if t < nearest:
+                nearest, where, room = t, d, clearance
+    if nearest < np.inf:
+        return steering.avoid(forward, where, room, frame.max_force[i])
+    else:
+        return (0.0, 0.0)
+
+
+@kernel
+def reward(p: Any, before: Frame, after: Frame, action: Any, terms: Any) -> None:
+    """Terms: progress, alignment, spacing, together, touch, obstacle; each judged of the world after the step."""
+    slots = int(p.neighbours)
+    distances, chosen = np.empty(slots), np.empty(slots, np.int64)
+    size = _size(p)
+    for i in range(terms.shape[0]):
+        vx, vy = after.vel[0, i], after.vel[1, i]
+        along = vx * after.memory[0, i] + vy * after.memory[1, i]
+        found = nearest_agents(after, i, 0, after.pos.shape[1], p.sight, size, slots, distances, chosen)
+        mx, my, touches = 0.0, 0.0, 0.0
+        for s in range(found):
+            j = chosen[s]
+            mx += after.vel[0, j] / found
+            my += after.vel[1, j] / found
+            touches += 1.0 if distances[s] < (after.radius[i] + after.radius[j]) ** 2 else 0.0
+        disagree = math.hypot(vx - mx, vy - my) / p.cruise if found > 0 else 1.0
+        gap = math.sqrt(distances[0]) if found > 0 else p.sight
+        terms[i, 0] = p.progress_reward * (1.0 - min(abs(along - p.cruise) / p.cruise, 1.0)) * p.control_dt
+        terms[i, 1] = -p.alignment_cost * min(disagree, 1.0) * p.control_dt
+        terms[i, 2] = -p.spacing_cost * min(abs(gap - p.spacing) / p.spacing, 1.0) * p.control_dt
+        terms[i, 3] = -p.loneliness_cost * (1.0 - found / slots) * p.control_dt
+        terms[i, 4] = -p.touch_cost * touches * p.control_dt
+        terms[i, 5] = -p.obstacle_cost * _inside(p, after, i) * p.control_dt
+
+
+@kernel
+def _inside(p: Any, frame: Frame, i: int) -> float:
+    """Return how many obstacles agent i touches."""
+    touches = 0.0
+    for m in range(frame.rho.shape[0]):
+        if frame.rho[m] > 0.0:
+            dx = offset(frame.pos[0, i], frame.centre[0, m], p.size)
+            dy = offset(frame.pos[1, i], frame.centre[1, m], p.size)
+            touches += 1.0 if math.sqrt(dx * dx + dy * dy) < frame.rho[m] + frame.radius[i] else 0.0
+    return touches
+
+
+@kernel
+def ended(p: Any, before: Frame, after: Frame, over: Any) -> bool:
+    """Never over before the time limit. The aim holds now if the flock is aligned, under way, and nobody touches."""
+    over[:] = False
+    polarisation, _, touching, along = _state_of(p, after)
+    return polarisation > 0.9 and touching == 0.0 and along > 0.8 * p.cruise
+
+
+@kernel
+def _state_of(p: Any, frame: Frame) -> tuple[float, float, float, float]:
+    """Return polarisation, mean nearest-neighbour distance [m], touches (a pair counts once), mean speed along."""
+    n = frame.pos.shape[1]
+    ux, uy, along = 0.0, 0.0, 0.0
+    for i in range(n):
+        vx, vy = frame.vel[0, i], frame.vel[1, i]
+        speed = math.sqrt(vx * vx + vy * vy)
+        if speed > 1e-12:
+            ux += vx / speed / n
+            uy += vy / speed / n
+        along += (vx * frame.memory[0, i] + vy * frame.memory[1, i]) / n
+    nearest, touching = _nearness(p, frame)
+    return math.sqrt(ux * ux + uy * uy), nearest, touching, along
+
+
+@kernel
+def _nearness(p: Any, frame: Frame) -> tuple[float, float]:
+    """Return the mean distance of the nearest neighbour, m, and how many touch: pairs, and agents with obstacles."""
+    n = frame.pos.shape[1]
+    nearest, touching = 0.0, 0.0
+    for i in range(n):
+        best = p.size * p.size
+        for j in range(n):
+            if j != i:
+                dx = offset(frame.pos[0, i], frame.pos[0, j], p.size)
+                dy = offset(frame.pos[1, i], frame.pos[1, j], p.size)
+                square = dx * dx + dy * dy
+                best = min(best, square)
+                contact = frame.radius[i] + frame.radius[j]
+                touching += 0.5 if square < contact * contact else 0.0
+        nearest += math.sqrt(best) / n
+        touching += _inside(p, frame, i)
+    return nearest, touching
+
+
+@kernel
+def measure(p: Any, before: Frame, after: Frame, numbers: Any) -> None:
+    """Polarisation; mean nearest-neighbour distance, m; touches that began in this step; mean speed along, m/s."""
+    polarisation, nearest, touching, along = _state_of(p, after)
+    touched = 0.0
+    if touching > 0.0:
+        _, touched = _nearness(p, before)
+    numbers[0], numbers[1] = polarisation, nearest
+    numbers[2], numbers[3] = max(touching - touched, 0.0), along
+
+
+@kernel
+def observe(p: Any, frame: Frame, rows: Any) -> None:
+    """Everything in the frame of the heading: (along, left). Own velocity, nearest neighbours, nearest obstacles."""
+    slots, seen = int(p.neighbours), int(p.obstacles_seen)
+    distances, chosen = np.empty(max(slots, seen)), np.empty(max(slots, seen), np.int64)
+    size = _size(p)
+    for i in range(rows.shape[0]):
+        row = rows[i]
+        row[:] = 0.0
+        hx, hy = frame.memory[0, i], frame.memory[1, i]
+        row[0], row[1] = _turned(frame.vel[0, i], frame.vel[1, i], hx, hy, p.max_speed)
+        found = nearest_agents(frame, i, 0, frame.pos.shape[1], p.sight, size, slots, distances, chosen)
+        at = 2
+        for s in range(found):
+            j = chosen[s]
+            dx = offset(frame.pos[0, i], frame.pos[0, j], p.size)
+            dy = offset(frame.pos[1, i], frame.pos[1, j], p.size)
+            row[at + 2 * s], row[at + 2 * s + 1] = _turned(dx, dy, hx, hy, p.sight)
+            ux, uy = frame.vel[0, j] - frame.vel[0, i], frame.vel[1, j] - frame.vel[1, i]
+            k = at + 2 * slots + 2 * s
+            row[k], row[k + 1] = _turned(ux, uy, hx, hy, 2.0 * p.max_speed)
+            row[at + 4 * slots + s] = 1.0
+        at += 5 * slots
+        found = nearest_obstacles(frame, i, p.sight, size, seen, distances, chosen)
+        for s in range(found):
+            m = chosen[s]
+            dx = offset(frame.pos[0, i], frame.centre[0, m], p.size)
+            dy = offset(frame.pos[1, i], frame.centre[1, m], p.size)
+            row[at + 2 * s], row[at + 2 * s + 1] = _turned(dx, dy, hx, hy, p.sight + p.greatest_radius)
+            row[at + 2 * seen + s] = frame.rho[m] / p.greatest_radius
+
+
+@kernel
+def _turned(x: float, y: float, hx: float, hy: float, scale_: float) -> tuple[float, float]:
+    """Return a vector's parts along the heading and to its left, scaled and clipped."""
+    return clip((x * hx + y * hy) / scale_), clip((y * hx - x * hy) / scale_)
+
+
+class Flock(Task):
+    """N learners with one shared policy (or one among scripted flockmates) travel along a heading as a flock.
+
+    They start as a loose crowd moving anyhow in a periodic field with round obstacles. Everything an agent sees is
+    relative to itself and turned into the frame of the heading. Nobody dies; what is bad costs as long as it lasts.
+    """
+
+    name: ClassVar[str] = "flock"
+    terms: ClassVar[tuple[str, ...]] = ("progress", "alignment", "spacing", "together", "touch", "obstacle")
+    metric_names: ClassVar[tuple[str, ...]] = ("polarisation", "nearest_neighbour", "collisions", "speed_along")
+    measures: ClassVar[tuple[str, ...]] = ("polarisation", "nearest", "touches", "along")
+    memory: ClassVar[int] = 2
+
+    agents: int = Field(default=24, ge=1, le=100_000, description="how many fly")
+    learners: int = Field(
+        default_factory=lambda given: given.get("agents", 24), ge=1,
+        description="how many of them learn (default: all); the others follow a script",
+    )  # fmt: skip
+    horizon: int = Field(default=300, ge=1, description="decisions until the time limit (truncation)")
+    size: float = Field(default=40.0, gt=14, description="m, edge of the periodic field")
+    obstacle_count: int = Field(default=6, ge=0, le=200, description="obstacles drawn")
+    least_radius: float = Field(default=0.8, gt=0, description="m")
+    greatest_radius: float = Field(default=2.0, gt=0, description="m")
+    cruise: float = Field(default=2.0, gt=0, description="m/s, wanted along the heading")
+    max_speed: float = Field(default=3.0, gt=0, description="m/s")
+    max_force: float = Field(default=4.0, gt=0, description="N; the mass is 1 kg")
+    spacing: float = Field(default=1.5, gt=0, description="m, wanted distance of the nearest neighbour")
+    sight: float = Field(default=6.0, gt=0, description="m, neighbours and obstacles are seen within this")
+    neighbours: int = Field(default=6, ge=1, le=32, description="how many neighbours are seen, nearest first")
+    obstacles_seen: int = Field(default=2, ge=1, le=32, description="how many are seen, nearest surface first")
+    progress_reward: float = Field(default=1.0, ge=0, description="per s at cruising speed along the heading")
+    alignment_cost: float = Field(
+        default=0.5, ge=0, description="per s at a velocity off the neighbours' mean by cruise"
+    )
+    spacing_cost: float = Field(
+        default=0.5, ge=0, description="per s with the nearest neighbour off its place by 100 %"
+    )
+    loneliness_cost: float = Field(default=0.5, ge=0, description="per s without any neighbour in sight")
+    touch_cost: float = Field(default=10.0, ge=0, description="per s and agent touched")
+    obstacle_cost: float = Field(default=10.0, ge=0, description="per s in an obstacle")
+
+    @model_validator(mode="after")
+    def _enough(self) -> Flock:
+        """Refuse more learners than agents."""
+        if self.learners > self.agents:
+            raise ValueError(f"learners = {self.learners}: there are only {self.agents} agents")
+        if self.sight > self.size / 2:
+            raise ValueError(f"sight = {self.sight:g} m reaches around the field; at most size / 2 = {self.size / 2:g}")
+        return self
+
+    @property
+    def agent_names(self) -> tuple[str, ...]:
+        """boid_0 ..."""
+        return tuple(f"boid_{i}" for i in range(self.learners))
+
+    @property
+    def obstacle_slots(self) -> int:
+        """As many as are drawn."""
+        return self.obstacle_count
+
+    @functools.cached_property
+    def scene(self) -> Scene:
+        """A periodic square; nothing acts but what agents want."""
+        limits: dict[str, Any] = {"radius": 0.3, "max_speed": self.max_speed, "max_force": self.max_force}
+        groups = [Group(count=self.learners, role="learner", **limits)]
+        if self.agents > self.learners:
+            groups.append(Group(count=self.agents - self.learners, role="flockmate", **limits))
+        return Scene(space=Torus(size=(self.size, self.size)), groups=tuple(groups), dt=self.dt)
+
+    @functools.cached_property
+    def layout(self) -> Layout:
+        """Every vector is (along the heading, to its left)."""
+        n, m = self.neighbours, self.obstacles_seen
+        seen = "offsets of the centres of the nearest obstacles, nearest surface first; zeros = none"
+        return Layout((
+            Slot("velocity", (2,), self.max_speed, "m/s", "own velocity (along the heading, to its left)"),
+            Slot("neighbours", (n, 2), self.sight, "m", "offsets of the nearest neighbours, nearest first"),
+            Slot("neighbour_velocity", (n, 2), 2 * self.max_speed, "m/s", "their velocities minus one's own"),
+            Slot("neighbour_present", (n,), 1.0, "1", "1 where there is one, else 0 (and zeros before)", low=0.0),
+            Slot("obstacles", (m, 2), self.sight + self.greatest_radius, "m", seen),
+            Slot("obstacle_radius", (m,), self.greatest_radius, "m", "their radii; 0 = none", low=0.0),
+        ))  # fmt: skip
+
+    @functools.cached_property
+    def action_layout(self) -> Layout:
+        """A force in the frame of the heading."""
+        meaning = "force (along the heading, to its left) / max_force, shortened to length 1"
+        return Layout((Slot("force", (2,), self.max_force, "N", meaning),))
+
+    def metrics(self, sums: Measured, last: Measured, steps: NDArray[np.int64]) -> dict[str, NDArray[np.float64]]:
+        """Means over the episode: polarisation, nearest neighbour [m], speed along [m/s]; touches that began."""
+        n = np.maximum(steps, 1)
+        return {
+            "polarisation": sums["polarisation"] / n,
+            "nearest_neighbour": sums["nearest"] / n,
+            "collisions": sums["touches"],
+            "speed_along": sums["along"] / n,
+        }
+
+    def marks(self, state: State, memory: NDArray[np.float64], world: int) -> tuple[Mark, ...]:
+        """The heading."""
+        at = np.array([0.12, 0.88]) * self.size
+        return (Mark("heading", at, memory[:2, world, 0], 0.0),)

@@ -1,0 +1,80 @@
+"""Layout: what each number of an observation or action row is, by name, so that nobody ever reads one by index."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+__all__ = ["Layout", "Slot"]
+
+
+@dataclass(frozen=True)
+class Slot:
+    """Some neighbouring numbers of a row: `shape` of them, each the quantity divided by `scale`."""
+
+    name: str
+    shape: tuple[int, ...]  # (2,) a vector, (6, 2) six vectors, () a number
+    scale: float  # row value = quantity / scale, clipped to [low, 1]
+    unit: str
+    meaning: str
+    low: float = -1.0
+
+    @property
+    def size(self) -> int:
+        """How many numbers it takes."""
+        return int(np.prod(self.shape, dtype=int))
+
+
+@dataclass(frozen=True)
+class Layout:
+    """The slots of a row, in order."""
+
+    slots: tuple[Slot, ...]
+
+    @property
+    def size(self) -> int:
+        """Length of a row."""
+        return sum(slot.size for slot in self.slots)
+
+    @property
+    def low(self) -> NDArray[np.float32]:
+        """Least values of a row, (size,)."""
+        return np.concatenate([np.full(slot.size, slot.low, np.float32) for slot in self.slots])
+
+    @property
+    def high(self) -> NDArray[np.float32]:
+        """Greatest values of a row, (size,)."""
+        return np.ones(self.size, np.float32)
+
+    def unpack(self, rows: ArrayLike) -> SimpleNamespace:
+        """Return the quantities of rows (..., size) by name, in SI units: arrays (..., *shape), float64."""
+        array = np.asarray(rows, np.float64)
+        if array.shape[-1:] != (self.size,):
+            raise ValueError(f"rows have {array.shape[-1:]} numbers, this layout has {self.size}")
+        named: dict[str, Any] = {}
+        at = 0
+        for slot in self.slots:
+            part = array[..., at : at + slot.size] * slot.scale
+            named[slot.name] = part.reshape(array.shape[:-1] + slot.shape)
+            at += slot.size
+        return SimpleNamespace(**named)
+
+    def table(self) -> list[tuple[str, str, str, str]]:
+        """Return a line per slot: (indices, name, unit and scale, meaning)."""
+        lines, at = [], 0
+        for slot in self.slots:
+            where = f"{at}" if slot.size == 1 else f"{at}-{at + slot.size - 1}"
+            if slot.size:
+                lines.append((where, slot.name, f"{slot.unit} / {slot.scale:g}", slot.meaning))
+            at += slot.size
+        return lines
+
+    @property
+    def digest(self) -> str:
+        """A short name of this layout: two rows of the same digest mean the same."""
+        return hashlib.sha256(repr(self.slots).encode()).hexdigest()[:16]

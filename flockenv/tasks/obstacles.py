@@ -1,0 +1,215 @@
+"""Obstacles: reach a goal through a random field of round obstacles without touching one."""
+
+from __future__ import annotations
+
+import functools
+import math
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from flockenv.kernels import kernel
+from flockenv.noise import uniform
+from flockenv.scene import Group, Scene
+from flockenv.snapshot import Mark
+from flockenv.space import Box
+from flockenv.state import State
+from flockenv.tasks.base import Frame, Measured, Task
+from flockenv.tasks.layout import Layout, Slot
+from flockenv.tasks.sight import clip, nearest_obstacles
+
+__all__ = ["Obstacles"]
+
+
+@kernel
+def spawn(p: Any, frame: Frame) -> None:
+    """Start on the left, goal on the right; obstacles between, with a way of at least `min_gap` around each."""
+    frame.pos[0, 0] = 1.5
+    frame.pos[1, 0] = 2.0 + (p.size - 4.0) * uniform(frame.key, 0, 0, 0)
+    frame.vel[:, 0] = 0.0
+    frame.memory[0, 0] = p.size - 1.5
+    frame.memory[1, 0] = 2.0 + (p.size - 4.0) * uniform(frame.key, 0, 0, 1)
+    frame.memory[2, 0] = math.hypot(frame.memory[0, 0] - frame.pos[0, 0], frame.memory[1, 0] - frame.pos[1, 0])
+    for m in range(frame.rho.shape[0]):
+        frame.rho[m] = 0.0
+        for t in range(32):
+            rho = p.least_radius + (p.greatest_radius - p.least_radius) * uniform(frame.key, t, 100 + m, 0)
+            x = 4.0 + (p.size - 8.0) * uniform(frame.key, t, 100 + m, 1)
+            y = p.size * uniform(frame.key, t, 100 + m, 2)
+            if _fits(p, frame, m, x, y, rho):
+                frame.centre[0, m], frame.centre[1, m], frame.rho[m] = x, y, rho
+                break
+
+
+@kernel
+def _fits(p: Any, frame: Frame, m: int, x: float, y: float, rho: float) -> bool:
+    """Does an obstacle here leave a gap to those before it?"""
+    for k in range(m):
+        distance = math.hypot(frame.centre[0, k] - x, frame.centre[1, k] - y)
+        if frame.rho[k] > 0.0 and distance < frame.rho[k] + rho + p.min_gap:
+            return False
+    return True
+
+
+@kernel
+def drive(p: Any, frame: Frame, action: Any, force: Any) -> None:
+    """The learner pushes where its action says."""
+    for k in range(2):
+        force[k, 0] = action[0, k] * frame.max_force[0]
+
+
+@kernel
+def _to_goal(frame: Frame) -> float:
+    return math.hypot(frame.memory[0, 0] - frame.pos[0, 0], frame.memory[1, 0] - frame.pos[1, 0])
+
+
+@kernel
+def _touches(frame: Frame) -> bool:
+    """Is the agent in contact with an obstacle?"""
+    for m in range(frame.rho.shape[0]):
+        if frame.rho[m] > 0.0:
+            gap = math.hypot(frame.centre[0, m] - frame.pos[0, 0], frame.centre[1, m] - frame.pos[1, 0])
+            if gap < frame.rho[m] + frame.radius[0]:
+                return True
+    return False
+
+
+@kernel
+def reward(p: Any, before: Frame, after: Frame, action: Any, terms: Any) -> None:
+    """Terms: progress, goal, touch, time."""
+    touch = _touches(after)
+    there = not touch and _to_goal(after) <= p.goal_radius
+    terms[0, 0] = p.progress_reward * (_to_goal(before) - _to_goal(after))
+    terms[0, 1] = p.goal_reward if there else 0.0
+    terms[0, 2] = -p.touch_cost if touch else 0.0
+    terms[0, 3] = -p.time_cost * p.control_dt
+
+
+@kernel
+def ended(p: Any, before: Frame, after: Frame, over: Any) -> bool:
+    """A touch ends it, and so does the goal, which is success."""
+    touch = _touches(after)
+    there = not touch and _to_goal(after) <= p.goal_radius
+    over[0] = touch or there
+    return there
+
+
+@kernel
+def measure(p: Any, before: Frame, after: Frame, numbers: Any) -> None:
+    """Path, m; touches; distance left, m; straight distance at the start, m."""
+    numbers[0] = math.hypot(after.pos[0, 0] - before.pos[0, 0], after.pos[1, 0] - before.pos[1, 0])
+    numbers[1] = 1.0 if _touches(after) else 0.0
+    numbers[2] = _to_goal(after)
+    numbers[3] = after.memory[2, 0]
+
+
+@kernel
+def observe(p: Any, frame: Frame, rows: Any) -> None:
+    """Own velocity, goal, walls, the nearest obstacles."""
+    row = rows[0]
+    row[:] = 0.0
+    for k in range(2):
+        row[k] = clip(frame.vel[k, 0] / p.max_speed)
+        row[2 + k] = clip((frame.memory[k, 0] - frame.pos[k, 0]) / p.size)
+        row[4 + k] = clip(frame.pos[k, 0] / p.size)
+        row[6 + k] = clip((p.size - frame.pos[k, 0]) / p.size)
+    slots = int(p.slots)
+    distances, chosen = np.empty(slots), np.empty(slots, np.int64)
+    found = nearest_obstacles(frame, 0, p.sight, np.zeros(2), slots, distances, chosen)
+    for s in range(found):
+        m = chosen[s]
+        for k in range(2):
+            row[8 + 2 * s + k] = clip((frame.centre[k, m] - frame.pos[k, 0]) / (p.sight + p.greatest_radius))
+        row[8 + 2 * slots + s] = frame.rho[m] / p.greatest_radius
+        row[8 + 3 * slots + s] = clip(distances[s] - frame.radius[0]) if distances[s] < 1.0 + frame.radius[0] else 1.0
+
+
+class Obstacles(Task):
+    """One learner crosses a walled square full of round obstacles to a goal; to touch an obstacle ends it.
+
+    Start and goal are drawn on opposite sides, obstacles between them with gaps that the agent fits through. The walls
+    of the square stop the agent and do not count as a touch.
+    """
+
+    name: ClassVar[str] = "obstacles"
+    terms: ClassVar[tuple[str, ...]] = ("progress", "goal", "touch", "time")
+    metric_names: ClassVar[tuple[str, ...]] = ("time_to_goal", "collisions", "path_efficiency")
+    measures: ClassVar[tuple[str, ...]] = ("path", "touch", "left", "straight")
+    memory: ClassVar[int] = 3
+
+    horizon: int = Field(default=250, ge=1, description="decisions until the time limit (truncation)")
+    size: float = Field(default=24.0, gt=10, description="m, edge of the square")
+    count: int = Field(default=26, ge=0, le=200, description="obstacles drawn; those that find no room are left out")
+    least_radius: float = Field(default=0.6, gt=0, description="m")
+    greatest_radius: float = Field(default=2.0, gt=0, description="m")
+    min_gap: float = Field(default=1.0, ge=0, description="m between obstacles; the agent's diameter is 0.6 m")
+    max_speed: float = Field(default=3.0, gt=0, description="m/s")
+    max_force: float = Field(default=5.0, gt=0, description="N; the mass is 1 kg")
+    goal_radius: float = Field(default=0.8, gt=0, description="m, the goal is reached within this")
+    sight: float = Field(default=8.0, gt=0, description="m, obstacles are seen whose surface is nearer than this")
+    slots: int = Field(default=6, ge=1, le=32, description="how many obstacles are seen, nearest first")
+    progress_reward: float = Field(default=0.5, ge=0, description="per m nearer to the goal")
+    goal_reward: float = Field(default=10.0, ge=0, description="once")
+    touch_cost: float = Field(default=10.0, ge=0, description="once")
+    time_cost: float = Field(default=0.5, ge=0, description="per s")
+
+    @property
+    def learners(self) -> int:
+        """One."""
+        return 1
+
+    @property
+    def agents(self) -> int:
+        """One."""
+        return 1
+
+    @property
+    def agent_names(self) -> tuple[str, ...]:
+        """walker_0."""
+        return ("walker_0",)
+
+    @property
+    def obstacle_slots(self) -> int:
+        """As many as are drawn."""
+        return self.count
+
+    @functools.cached_property
+    def scene(self) -> Scene:
+        """A walled square; nothing acts but what the agent wants."""
+        walker = Group(count=1, radius=0.3, max_speed=self.max_speed, max_force=self.max_force, role="learner")
+        return Scene(space=Box(size=(self.size, self.size)), groups=(walker,), dt=self.dt)
+
+    @functools.cached_property
+    def layout(self) -> Layout:
+        """Axes are the field's; offsets are relative to the agent."""
+        seen = "offsets of the centres of the nearest obstacles, nearest surface first; zeros = none"
+        return Layout((
+            Slot("velocity", (2,), self.max_speed, "m/s", "own velocity (x, y)"),
+            Slot("goal", (2,), self.size, "m", "offset of the goal"),
+            Slot("to_low", (2,), self.size, "m", "distance to the walls at x = 0 and y = 0", low=0.0),
+            Slot("to_high", (2,), self.size, "m", "distance to the walls at x = size and y = size", low=0.0),
+            Slot("obstacles", (self.slots, 2), self.sight + self.greatest_radius, "m", seen),
+            Slot("obstacle_radius", (self.slots,), self.greatest_radius, "m", "their radii; 0 = none", low=0.0),
+            Slot("clearance", (self.slots,), 1.0, "m", "gap between own body and theirs, cut at 1 m; 0 = none"),
+        ))  # fmt: skip
+
+    @functools.cached_property
+    def action_layout(self) -> Layout:
+        """A force, in the field's axes."""
+        return Layout((Slot("force", (2,), self.max_force, "N", "force (x, y) / max_force, shortened to length 1"),))
+
+    def metrics(self, sums: Measured, last: Measured, steps: NDArray[np.int64]) -> dict[str, NDArray[np.float64]]:
+        """Seconds to the goal (NaN if not reached), touches, and metres gained towards the goal per metre run."""
+        there = (last["left"] <= self.goal_radius) & (sums["touch"] == 0) & (steps > 0)
+        gained = np.maximum(last["straight"] - last["left"], 0.0)
+        return {
+            "time_to_goal": np.where(there, steps * self.control_dt, np.nan),
+            "collisions": sums["touch"],
+            "path_efficiency": gained / np.maximum(sums["path"], 1e-9),
+        }
+
+    def marks(self, state: State, memory: NDArray[np.float64], world: int) -> tuple[Mark, ...]:
+        """The goal."""
+        return (Mark("goal", memory[:2, world, 0], np.zeros(2), self.goal_radius),)

@@ -1,0 +1,324 @@
+"""Pursuit: catch somebody who is slower but turns faster, in a walled field."""
+
+from __future__ import annotations
+
+import functools
+import math
+from typing import Any, ClassVar, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from flockenv import arbitration, steering
+from flockenv.kernels import Vec, kernel
+from flockenv.noise import uniform
+from flockenv.scene import Group, Scene
+from flockenv.space import Box
+from flockenv.spawn import direction
+from flockenv.tasks.base import Frame, Measured, Task
+from flockenv.tasks.layout import Layout, Slot
+from flockenv.vec import scale
+
+__all__ = ["Pursuit"]
+
+_FAR = 1e30
+
+
+@kernel
+def spawn(p: Any, frame: Frame) -> None:
+    """Everybody somewhere in the field, at rest; nobody begins within 4 m of an opponent (64 tries)."""
+    pursuers, n = int(p.pursuers), frame.pos.shape[1]
+    for i in range(n):
+        for t in range(64):
+            for k in range(2):
+                frame.pos[k, i] = 1.0 + (p.size - 2.0) * uniform(frame.key, t, i, k)
+            nearest = _FAR
+            for j in range(min(i, pursuers)):
+                if i >= pursuers:
+                    nearest = min(nearest, _distance(frame, i, j))
+            if nearest >= 4.0:
+                break
+        frame.vel[:, i] = 0.0
+        direction(frame.key, 0, i, 4, frame.memory[:, i])
+
+
+@kernel
+def _distance(frame: Frame, i: int, j: int) -> float:
+    return math.hypot(frame.pos[0, j] - frame.pos[0, i], frame.pos[1, j] - frame.pos[1, i])
+
+
+@kernel
+def drive(p: Any, frame: Frame, action: Any, force: Any) -> None:
+    """Learners push where their action says; scripted evaders follow `_escape`."""
+    for i in range(frame.pos.shape[1]):
+        if i < action.shape[0]:
+            for k in range(2):
+                force[k, i] = action[i, k] * frame.max_force[i]
+        else:
+            _escape(p, frame, i, force)
+
+
+@kernel
+def _escape(p: Any, frame: Frame, i: int, force: Any) -> None:
+    """The scripted evader: contain, then evade the nearest pursuer, then wander, by prioritised allocation."""
+    velocity, top = (frame.vel[0, i], frame.vel[1, i]), frame.max_speed[i]
+    noise = (2.0 * uniform(frame.key, frame.step, i, 11) - 1.0, 2.0 * uniform(frame.key, frame.step, i, 12) - 1.0)
+    target = steering.wander_turn((frame.memory[0, i], frame.memory[1, i]), noise, 2.0, p.control_dt)
+    frame.memory[0, i], frame.memory[1, i] = target[0], target[1]
+    roam = steering.wander(target, velocity, top, 1.5)
+    threat, distance = _nearest(frame, i, 0, int(p.pursuers))
+    away: Vec = (0.0, 0.0)
+    if threat >= 0 and distance < p.alarm_distance:
+        offset = (frame.pos[0, threat] - frame.pos[0, i], frame.pos[1, threat] - frame.pos[1, i])
+        coming = (frame.vel[0, threat], frame.vel[1, threat])
+        away = steering.evade(offset, velocity, coming, top, min(0.5, distance / frame.max_speed[threat]))
+    margin = 1.0
+    low = (frame.pos[0, i] - margin, frame.pos[1, i] - margin)
+    high = (p.size - margin - frame.pos[0, i], p.size - margin - frame.pos[1, i])
+    inside = steering.contain(low, high, velocity, top, 0.5)
+    gain = 1.0 / 0.2  # kg/s: a wish is granted within 0.2 s
+    wishes = (scale(inside, gain), scale(away, gain), scale(roam, gain))
+    wish = arbitration.allocate(wishes, frame.max_force[i])
+    force[0, i], force[1, i] = wish[0], wish[1]
+
+
+@kernel
+def _nearest(frame: Frame, i: int, first: int, end: int) -> tuple[int, float]:
+    """Return the nearest living agent in [first, end) other than i, and its distance; -1 if there is none."""
+    best, who = _FAR, -1
+    for j in range(first, end):
+        if j != i and frame.alive[j]:
+            d = _distance(frame, i, j)
+            if d < best:
+                best, who = d, j
+    return who, best
+
+
+@kernel
+def _sides(p: Any, frame: Frame, i: int) -> tuple[int, int, int, int, float]:
+    """Return the ranges of opponents and of team mates of agent i, and +1 for a pursuer, -1 for an evader."""
+    pursuers, n = int(p.pursuers), frame.pos.shape[1]
+    if i < pursuers:
+        return pursuers, n, 0, pursuers, 1.0
+    else:
+        return 0, pursuers, pursuers, n, -1.0
+
+
+@kernel
+def _caught(p: Any, before: Frame, after: Frame, j: int) -> bool:
+    """Was evader j alive before, and is a pursuer within reach of it now?"""
+    _, distance = _nearest(after, j, 0, int(p.pursuers))
+    return bool(before.alive[j]) and distance <= p.capture_distance
+
+
+@kernel
+def reward(p: Any, before: Frame, after: Frame, action: Any, terms: Any) -> None:
+    """Terms: closing, capture, time; evaders are paid the opposite."""
+    terms[:, :] = 0.0
+    caught = 0
+    for j in range(int(p.pursuers), after.pos.shape[1]):
+        caught += 1 if _caught(p, before, after, j) else 0
+    for i in range(terms.shape[0]):
+        if not before.alive[i]:
+            continue
+        first, end, _, _, side = _sides(p, after, i)
+        opponent, d0 = _nearest(before, i, first, end)
+        if opponent >= 0:
+            terms[i, 0] = side * p.closing_reward * (d0 - _distance(after, i, opponent))
+        prey = caught if side > 0 else (1 if _caught(p, before, after, i) else 0)
+        terms[i, 1] = side * p.capture_reward * prey
+        terms[i, 2] = -side * p.time_cost * p.control_dt
+
+
+@kernel
+def ended(p: Any, before: Frame, after: Frame, over: Any) -> bool:
+    """A caught evader is out; when none is left, everything ends: that is success."""
+    pursuers, n = int(p.pursuers), after.pos.shape[1]
+    left = 0
+    for j in range(pursuers, n):
+        out = not before.alive[j] or _caught(p, before, after, j)
+        if j < over.shape[0]:
+            over[j] = out
+        after.alive[j] = not out
+        left += 0 if out else 1
+    for i in range(min(pursuers, over.shape[0])):
+        over[i] = left == 0
+    return left == 0
+
+
+@kernel
+def measure(p: Any, before: Frame, after: Frame, numbers: Any) -> None:
+    """Path of the first pursuer, m; nearest distance between the sides, m; evaders caught; time until the last, s."""
+    numbers[0] = math.hypot(after.pos[0, 0] - before.pos[0, 0], after.pos[1, 0] - before.pos[1, 0])
+    n, pursuers = after.pos.shape[1], int(p.pursuers)
+    best, caught = _FAR, 0
+    for j in range(pursuers, n):
+        caught += 0 if after.alive[j] else 1
+        for i in range(pursuers):
+            best = min(best, _distance(after, i, j))
+    numbers[1] = best
+    numbers[2] = caught
+    numbers[3] = 0.0 if caught == n - pursuers and caught > 0 and before.alive[pursuers:n].sum() == 0 else p.control_dt
+
+
+@kernel
+def observe(p: Any, frame: Frame, rows: Any) -> None:
+    """Own velocity, walls, the nearest opponents and team mates, nearest first."""
+    for i in range(rows.shape[0]):
+        row = rows[i]
+        row[:] = 0.0
+        first, end, mate, mates_end, _ = _sides(p, frame, i)
+        for k in range(2):
+            row[k] = _clip(frame.vel[k, i] / p.speed_scale)
+            row[2 + k] = _clip(frame.pos[k, i] / p.size)
+            row[4 + k] = _clip((p.size - frame.pos[k, i]) / p.size)
+        at = _others(p, frame, i, first, end, int(p.opponent_slots), row, 6)
+        _others(p, frame, i, mate, mates_end, int(p.mate_slots), row, at)
+
+
+@kernel
+def _others(p: Any, frame: Frame, i: int, first: int, end: int, slots: int, row: Any, at: int) -> int:
+    """Write the nearest living agents of [first, end) into `slots` blocks of offsets, velocities, presence."""
+    closest = -1.0
+    chosen = -1
+    for s in range(slots):
+        best, who = _FAR, -1
+        for j in range(first, end):
+            d = _distance(frame, i, j)
+            after_last = d > closest or (d == closest and j > chosen)
+            if j != i and frame.alive[j] and after_last and d < best:
+                best, who = d, j
+        if who < 0:
+            break
+        for k in range(2):
+            row[at + 2 * s + k] = _clip((frame.pos[k, who] - frame.pos[k, i]) / p.size)
+            row[at + 2 * slots + 2 * s + k] = _clip(frame.vel[k, who] / p.speed_scale)
+        row[at + 4 * slots + s] = 1.0
+        closest, chosen = best, who
+    return at + 5 * slots
+
+
+@kernel
+def _clip(x: float) -> float:
+    return min(max(x, -1.0), 1.0)
+
+
+class Pursuit(Task):
+    """One learner chases a scripted evader that is slower, turns faster, knows the walls and wanders when left alone.
+
+    The evader evades the nearest pursuer within `alarm_distance`, stays in the field, and wanders otherwise, by
+    prioritised acceleration allocation in the order contain, evade, wander. With sides="both" the evaders are agents
+    too, paid the opposite of the pursuers; who is caught is out, and the game ends with the last evader.
+    """
+
+    name: ClassVar[str] = "pursuit"
+    terms: ClassVar[tuple[str, ...]] = ("closing", "capture", "time")
+    metric_names: ClassVar[tuple[str, ...]] = ("time_to_capture", "path_length", "least_distance", "captured")
+    measures: ClassVar[tuple[str, ...]] = ("path", "distance", "captured", "time")
+    memory: ClassVar[int] = 2
+
+    pursuers: int = Field(default=1, ge=1, le=64, description="how many chase")
+    evaders: int = Field(default=1, ge=1, le=64, description="how many are chased")
+    sides: Literal["pursuers", "both"] = Field(default="pursuers", description="who learns")
+    size: float = Field(default=20.0, gt=6, description="m, edge of the field")
+    pursuer_speed: float = Field(default=3.0, gt=0, description="m/s")
+    pursuer_force: float = Field(default=5.0, gt=0, description="N; the mass is 1 kg")
+    evader_speed: float = Field(default=2.4, gt=0, description="m/s")
+    evader_force: float = Field(default=12.0, gt=0, description="N; the mass is 1 kg")
+    alarm_distance: float = Field(default=8.0, ge=0, description="m, within which a scripted evader flees")
+    capture_distance: float = Field(default=0.6, gt=0, description="m between centres")
+    closing_reward: float = Field(default=0.1, ge=0, description="per m that the nearest evader came nearer")
+    capture_reward: float = Field(default=10.0, ge=0, description="for each capture, to every pursuer")
+    time_cost: float = Field(default=0.5, ge=0, description="per s")
+
+    @property
+    def learners(self) -> int:
+        """The pursuers, or everybody."""
+        return self.pursuers + (self.evaders if self.sides == "both" else 0)
+
+    @property
+    def agents(self) -> int:
+        """Both sides."""
+        return self.pursuers + self.evaders
+
+    @property
+    def agent_names(self) -> tuple[str, ...]:
+        """pursuer_0 ..., evader_0 ..."""
+        names = [f"pursuer_{i}" for i in range(self.pursuers)] + [f"evader_{j}" for j in range(self.evaders)]
+        return tuple(names[: self.learners])
+
+    @property
+    def ends_together(self) -> bool:
+        """In the game of both sides, caught evaders leave before the others."""
+        return self.sides == "pursuers"
+
+    @functools.cached_property
+    def scene(self) -> Scene:
+        """A walled square; nothing acts but what agents want."""
+        return Scene(
+            space=Box(size=(self.size, self.size)),
+            groups=(
+                Group(
+                    count=self.pursuers,
+                    radius=0.3,
+                    max_speed=self.pursuer_speed,
+                    max_force=self.pursuer_force,
+                    role="pursuer",
+                ),
+                Group(
+                    count=self.evaders,
+                    radius=0.3,
+                    max_speed=self.evader_speed,
+                    max_force=self.evader_force,
+                    role="evader",
+                ),
+            ),
+            dt=self.dt,
+        )
+
+    @property
+    def _slots(self) -> tuple[int, int]:
+        """How many opponents and team mates an observation shows: rows of both sides have one length."""
+        teams = (self.pursuers, self.evaders) if self.sides == "both" else (self.pursuers,)
+        opponents = max(self.pursuers, self.evaders) if self.sides == "both" else self.evaders
+        return min(opponents, 3), min(max(teams) - 1, 2)
+
+    def parameters(self) -> dict[str, float]:
+        """The fields, and what follows from them."""
+        opponents, mates = self._slots
+        fastest = max(self.pursuer_speed, self.evader_speed)
+        return super().parameters() | {"opponent_slots": opponents, "mate_slots": mates, "speed_scale": fastest}
+
+    @functools.cached_property
+    def layout(self) -> Layout:
+        """Axes are the field's; offsets are relative to the agent."""
+        opponents, mates = self._slots
+        fastest = max(self.pursuer_speed, self.evader_speed)
+        there = "1 where there is one, else 0 (and zeros before)"
+        return Layout((
+            Slot("velocity", (2,), fastest, "m/s", "own velocity (x, y)"),
+            Slot("to_low", (2,), self.size, "m", "distance to the walls at x = 0 and y = 0", low=0.0),
+            Slot("to_high", (2,), self.size, "m", "distance to the walls at x = size and y = size", low=0.0),
+            Slot("opponents", (opponents, 2), self.size, "m", "offsets of the nearest opponents, nearest first"),
+            Slot("opponent_velocity", (opponents, 2), fastest, "m/s", "their velocities"),
+            Slot("opponent_present", (opponents,), 1.0, "1", there, low=0.0),
+            Slot("mates", (mates, 2), self.size, "m", "offsets of the nearest team mates, nearest first"),
+            Slot("mate_velocity", (mates, 2), fastest, "m/s", "their velocities"),
+            Slot("mate_present", (mates,), 1.0, "1", there, low=0.0),
+        ))  # fmt: skip
+
+    @functools.cached_property
+    def action_layout(self) -> Layout:
+        """A force, in the field's axes."""
+        meaning = "force (x, y) / own max_force, shortened to length 1"
+        return Layout((Slot("force", (2,), self.pursuer_force, "N", meaning),))
+
+    def metrics(self, sums: Measured, last: Measured, steps: NDArray[np.int64]) -> dict[str, NDArray[np.float64]]:
+        """Time of the last capture, s (NaN if somebody is free); path of pursuer 0, m; distance now, m; caught."""
+        return {
+            "time_to_capture": np.where(last["captured"] >= self.evaders, sums["time"], np.nan),
+            "path_length": sums["path"],
+            "least_distance": last["distance"],
+            "captured": last["captured"],
+        }

@@ -1,0 +1,196 @@
+"""A scene run and kept: instants of one world in memory, and on disk as plain arrays with a summary beside them."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from itertools import chain
+from pathlib import Path
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flockenv.config import dump_scene
+from flockenv.measures import measure
+from flockenv.policy import write_atomically
+from flockenv.render.atomic import replacing
+from flockenv.scene import Scene
+from flockenv.snapshot import Snapshot
+from flockenv.space import Plane
+from flockenv.state import WORK, Floats, State
+
+__all__ = ["MEMORY_LIMIT", "Trajectory", "record", "whole_steps"]
+
+MEMORY_LIMIT = 2 * 2**30
+"""Bytes of instants that are kept before a run is refused."""
+
+PATIENCE = 1_000_000
+"""Agent-steps between two looks at the clock and the keyboard: some hundredths of a second."""
+
+FORMAT = 1
+
+
+@dataclass(frozen=True, eq=False)
+class Trajectory:
+    """T instants of one world, the first at the start and the last where the run ended."""
+
+    scene: Scene
+    seed: int
+    step: NDArray[np.int64]  # (T,) physics steps since the start; time = step dt
+    pos: Floats  # (T, N, D) m
+    vel: Floats  # (T, N, D) m/s
+    alive: NDArray[np.bool_]  # (T, N)
+    first: State
+    last: State
+    wall: float  # s, without compiling
+    stopped: str  # why it ended before its time; "" if it did not
+
+    @property
+    def rate(self) -> float:
+        """Agent-steps per second of wall time; NaN for a run without steps."""
+        return self.scene.agents * int(self.step[-1]) / self.wall if self.step[-1] and self.wall > 0 else math.nan
+
+    def measures(self) -> dict[str, tuple[float, float]]:
+        """Return every domain measure at the start and at the end."""
+        start, end = measure(self.scene, self.first), measure(self.scene, self.last)
+        return {name: (start[name], end[name]) for name in start}
+
+    def snapshots(self, title: str = "") -> Iterator[Snapshot]:
+        """Return every instant, ready to be drawn, all in one frame: the space, or where anybody ever was."""
+        low, high = _region(self.scene, self.pos)
+        start = self.scene.snapshot(self.first, title=title)
+        for step, pos, vel, alive in zip(self.step, self.pos, self.vel, self.alive, strict=True):
+            yield replace(start, time=step * self.scene.dt, pos=pos, vel=vel, alive=alive, low=low, high=high)
+
+    def summary(self) -> dict[str, Any]:
+        """Return what is worth knowing without the arrays, ready for JSON: what has no meaning is null, never NaN."""
+        return {
+            "format": FORMAT,
+            "scene": self.scene.model_dump(mode="json"),
+            "seed": self.seed,
+            "steps": int(self.step[-1]),
+            "time_s": float(self.last.time[0]),
+            "instants": len(self.step),
+            "stopped": self.stopped,
+            "measures": {name: {"start": _json(a), "end": _json(b)} for name, (a, b) in self.measures().items()},
+            "work": {what: self.last.counted(what) for what in WORK},
+            "wall_s": self.wall,
+            "agent_steps_per_s": _json(self.rate),
+        }
+
+    def save(self, path: Path) -> Path:
+        """Write X.npz and X.json beside it, each whole or not at all; return the path of the latter.
+
+        Arrays: time (T,) s, pos (T, N, D) m, vel (T, N, D) m/s, alive (T, N), radius (N,) m, seed, and `scene`, the
+        YAML text that `load_scene` reads; none needs pickle. Missing folders are made.
+        """
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with replacing(path) as file:
+            np.savez(
+                file, time=self.step * self.scene.dt, pos=self.pos, vel=self.vel, alive=self.alive,
+                radius=self.scene.body.radius, seed=np.uint64(self.seed), scene=np.array(dump_scene(self.scene)),
+            )  # fmt: skip
+        beside = path.with_suffix(".json")
+        write_atomically(beside, (json.dumps(self.summary(), indent=2, allow_nan=False) + os.linesep).encode())
+        return beside
+
+
+def record(
+    scene: Scene, seed: int, steps: int, every: int, progress: Callable[[int], None] = lambda done: None
+) -> Trajectory:
+    """Run a scene for `steps` physics steps and keep an instant every `every` steps, and the last one.
+
+    progress is called with the steps done, first with 0 once the scene is compiled. A KeyboardInterrupt, or a position
+    that is no longer finite, ends the run early: what was done until then is returned, and `stopped` says why.
+    Raises ValueError, before anything is computed, if the instants would take more than MEMORY_LIMIT.
+    """
+    film = _Film.of(scene, _checked_instants(scene, steps, every))
+    first = last = scene.start(seed)
+    piece = max(1, PATIENCE // scene.agents)
+    stopped, began = "", perf_counter()
+    try:
+        last = scene.run(first, 0)  # compiles what is not in the cache
+        began = perf_counter()
+        progress(0)
+        for until in chain(range(0, steps, every), [steps]):
+            while (done := int(last.tick[0])) < until:
+                last = scene.run(last, min(piece, until - done))
+                progress(int(last.tick[0]))
+            film.keep(last)
+    except KeyboardInterrupt:
+        stopped = "interrupted"
+    except FloatingPointError as error:
+        stopped = str(error)
+    wall = perf_counter() - began
+    film.keep(last)
+    n = len(film.step)
+    step = np.array(film.step, np.int64)
+    return Trajectory(scene, seed, step, film.pos[:n], film.vel[:n], film.alive[:n], first, last, wall, stopped)
+
+
+@dataclass(frozen=True, eq=False)
+class _Film:
+    """Room for instants, and those that are there."""
+
+    pos: Floats
+    vel: Floats
+    alive: NDArray[np.bool_]
+    step: list[int]
+
+    @classmethod
+    def of(cls, scene: Scene, instants: int) -> _Film:
+        shape = (instants, scene.agents, scene.dimension)
+        return cls(np.empty(shape, scene.dtype), np.empty(shape, scene.dtype), np.empty(shape[:2], np.bool_), [])
+
+    def keep(self, state: State) -> None:
+        """Add an instant, unless it is there already."""
+        k, step = len(self.step), int(state.tick[0])
+        if not k or step > self.step[-1]:
+            self.pos[k], self.vel[k], self.alive[k] = state.pos[0], state.vel[0], state.alive[0]
+            self.step.append(step)
+
+
+def _checked_instants(scene: Scene, steps: int, every: int) -> int:
+    if steps < 0 or every < 1:
+        raise ValueError(f"steps = {steps} must be at least 0 and every = {every} at least 1")
+    instants = 1 + -(-steps // every)
+    each = scene.agents * (2 * scene.dimension * np.dtype(scene.dtype).itemsize + 1)
+    needed = instants * (each + 40)  # the step is a Python number in a list
+    if needed > MEMORY_LIMIT:
+        rarer = every * math.ceil(needed / MEMORY_LIMIT) * scene.dt
+        raise ValueError(
+            f"{instants:,} instants of {scene.agents:,} agents need about {needed / 2**30:.3g} GiB, at most "
+            f"{MEMORY_LIMIT / 2**30:g} are kept: keep one every {rarer:g} s, or shorten the run"
+        )
+    return instants
+
+
+def whole_steps(name: str, seconds: float, dt: float, least: int = 0) -> int:
+    """Return how many steps of dt a time takes; raises ValueError, with the nearest, if that is no whole number."""
+    if not (math.isfinite(seconds) and seconds >= 0):
+        raise ValueError(f"{name} = {seconds:g}: must be a finite number of seconds >= {least * dt:g}")
+    if seconds / dt > 2**53:
+        raise ValueError(f"{name} = {seconds:g} s: too many steps of dt = {dt:g} s")
+    steps = round(seconds / dt)
+    if steps < least or abs(steps * dt - seconds) > 1e-9 * max(seconds, dt):
+        near = max(least, math.floor(seconds / dt))
+        allowed = f"must be a whole multiple of dt = {dt:g} s, say {near * dt:g} or {(near + 1) * dt:g}"
+        raise ValueError(f"{name} = {seconds:g} s: {allowed}")
+    return steps
+
+
+def _region(scene: Scene, pos: Floats) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    if not isinstance(scene.space, Plane):
+        return np.zeros(scene.dimension), np.array(scene.space.extent(scene.dimension))
+    low, high = (np.asarray(end(pos, axis=(0, 1)), np.float64) for end in (np.min, np.max))
+    margin = 1.0 + 0.05 * float((high - low).max())
+    return low - margin, high + margin
+
+
+def _json(value: float) -> float | None:
+    return value if math.isfinite(value) else None

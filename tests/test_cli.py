@@ -1,0 +1,387 @@
+"""The command line: what it prints and writes, and that every mistake is one line on stderr with exit code 2."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+from typer.testing import CliRunner
+
+import flockenv
+from flockenv.cli import app, main
+from flockenv.config import load_scene, schema
+from flockenv.effects import EFFECTS
+from flockenv.integrators import INTEGRATORS
+from flockenv.tasks import TASKS
+
+ROOT = Path(__file__).resolve().parent.parent
+PARTICLES = str(ROOT / "configs" / "particles.yaml")
+BOIDS = str(ROOT / "configs" / "boids.yaml")
+
+TINY = """\
+space: {kind: torus, size: [9, 9]}
+groups: [{count: 4, spawn: {speed: [1, 2]}}]
+effects: [{kind: drag, rate: 0.5}]
+dt: 0.01
+"""
+
+
+@pytest.fixture(autouse=True)
+def in_a_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "tiny.yaml").write_text(TINY)
+
+
+def process(*arguments: str) -> list[str]:
+    return [sys.executable, "-c", "import sys; from flockenv.cli import main; sys.exit(main())", *arguments]
+
+
+ENVIRONMENT = {**os.environ, "PYTHONPATH": str(ROOT)}
+
+
+# --- list, schema, help -----------------------------------------------------------------------------------------------
+
+
+def test_list_names_everything_there_is_with_its_sentence() -> None:
+    done = CliRunner().invoke(app, ["list"])
+    assert done.exit_code == 0
+    names = [*TASKS, *EFFECTS, *INTEGRATORS, "plane", "torus", "box", "flockenv/Flock-v0", "flockenv/Pursuit-v0"]
+    for name in names:
+        assert re.search(rf"^{re.escape(name)} +\S+", done.stdout, re.MULTILINE), name
+    assert "F = -c v" in done.stdout
+
+
+def test_schema_is_json_and_the_one_of_scenes(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["schema"]) == 0
+    assert json.loads(capsys.readouterr().out) == schema()
+
+
+@pytest.mark.parametrize("command", ["list", "run", "render", "explain", "schema"])
+def test_every_command_has_a_page_of_help(command: str) -> None:
+    done = CliRunner().invoke(app, [command, "--help"])
+    assert done.exit_code == 0
+    assert "Usage:" in done.stdout
+
+
+def test_the_version(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["--version"]) == 0
+    assert capsys.readouterr().out == f"{flockenv.__version__}\n"
+
+
+# --- run --------------------------------------------------------------------------------------------------------------
+
+
+def test_run_shows_measures_and_writes_a_trajectory(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["run", "tiny.yaml", "--seed", "7", "--duration", "1", "--out", "results/deep/t.npz"]) == 0
+    out = capsys.readouterr().out
+    assert "4 agents, 100 steps of 0.01 s, seed 7" in out
+    assert re.search(r"^speed +1\.\d+ +0\.\d+ +m/s, mean", out, re.MULTILINE)
+    assert "0 neighbour queries" in out
+    assert sorted(p.name for p in (tmp_path / "results" / "deep").iterdir()) == ["t.json", "t.npz"]
+
+    with np.load("results/deep/t.npz", allow_pickle=False) as file:
+        assert load_scene(str(file["scene"])) == load_scene(TINY)
+        assert file["pos"].shape == file["vel"].shape == (11, 4, 2)
+        assert file["time"] == pytest.approx(np.arange(11) * 0.1)
+        assert int(file["seed"]) == 7
+        # F = -c v from rest mass 1: v(t) = v(0) exp(-c t), to the accuracy of the first-order method
+        assert file["vel"][-1] == pytest.approx(file["vel"][0] * np.exp(-0.5), rel=0.01)
+        start = load_scene(TINY).start(7)
+        assert np.array_equal(file["pos"][0], start.pos[0])
+
+    summary = json.loads(Path("results/deep/t.json").read_text())
+    assert summary["seed"] == 7 and summary["steps"] == 100 and summary["stopped"] == ""
+    assert summary["measures"]["agents"] == {"start": 4.0, "end": 4.0}
+    assert summary["work"]["neighbour_queries"] == 0
+
+
+def test_the_same_seed_is_the_same_run(capsys: pytest.CaptureFixture[str]) -> None:
+    for name, seed in (("a", "1"), ("b", "1"), ("c", "2")):
+        assert main(["run", "tiny.yaml", "--seed", seed, "--duration", "0.5", "--out", f"{name}.npz"]) == 0
+    a, b, c = (np.load(f"{name}.npz")["pos"] for name in "abc")
+    assert np.array_equal(a, b)
+    assert not np.array_equal(a, c)
+
+
+def test_nothing_is_written_unless_asked_for(tmp_path: Path) -> None:
+    assert main(["run", "tiny.yaml", "--duration", "0.1"]) == 0
+    assert [p.name for p in tmp_path.iterdir()] == ["tiny.yaml"]
+
+
+def test_no_time_is_a_run_of_no_steps(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["run", "tiny.yaml", "--duration", "0", "--out", "t.npz"]) == 0
+    assert np.load("t.npz")["pos"].shape == (1, 4, 2)
+    assert json.loads(Path("t.json").read_text())["agent_steps_per_s"] is None  # no NaN in JSON
+
+
+def test_every_says_how_often_an_instant_is_kept_and_the_last_always_is() -> None:
+    assert main(["run", "tiny.yaml", "--duration", "0.5", "--every", "0.2", "--out", "t.npz"]) == 0
+    assert np.load("t.npz")["time"] == pytest.approx([0, 0.2, 0.4, 0.5])
+
+
+def test_a_scene_without_neighbour_effects_makes_no_query_and_one_with_them_one_per_step(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    assert main(["run", PARTICLES, "--duration", "0.2"]) == 0
+    assert "; 0 neighbour queries, 0 candidate pairs" in capsys.readouterr().out
+    assert main(["run", BOIDS, "--duration", "1"]) == 0
+    assert "; 20 neighbour queries, " in capsys.readouterr().out
+
+
+def test_a_run_that_diverges_says_so_and_keeps_what_was_done(capsys: pytest.CaptureFixture[str]) -> None:
+    wild = TINY.replace("rate: 0.5", "rate: 1e6").replace("torus, size: [9, 9]", "plane")
+    wild = wild.replace("spawn: {", "spawn: {low: [0, 0], high: [9, 9], ")
+    Path("wild.yaml").write_text(wild)
+    assert main(["run", "wild.yaml", "--duration", "10", "--every", "0.01", "--out", "t.npz"]) == 1
+    captured = capsys.readouterr()
+    assert re.match(r"flockenv: world 0, agent \d: position or velocity is not finite at t = ", captured.err)
+    assert len(captured.err.splitlines()) == 1
+    assert json.loads(Path("t.json").read_text())["stopped"].startswith("world 0, agent ")
+    assert 1 <= len(np.load("t.npz")["time"]) < 1000
+
+
+# --- interrupting -----------------------------------------------------------------------------------------------------
+
+
+def interrupted(moment: str, *arguments: str) -> subprocess.CompletedProcess[str]:
+    """Run a command in a process that gets a real SIGINT once the bar of that name has moved on a little."""
+    code = f"""
+import contextlib, os, signal, sys
+from flockenv import cli
+
+@contextlib.contextmanager
+def progress(title, total, unit):
+    def show(done):
+        if title == {moment!r} and done > 2:
+            os.kill(os.getpid(), signal.SIGINT)
+    yield show
+
+cli._progress = progress
+sys.exit(cli.main())
+"""
+    return subprocess.run(
+        [sys.executable, "-c", code, *arguments],
+        env=ENVIRONMENT,
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=120,
+    )
+
+
+def test_an_interrupted_run_keeps_what_was_done_and_leaves_with_130(tmp_path: Path) -> None:
+    done = interrupted("simulating", "run", "tiny.yaml", "--duration", "1e6", "--every", "1000", "--out", "t.npz")
+    assert done.returncode == 130, done.stderr
+    assert re.fullmatch(r"flockenv: interrupted; what was done until \S+ s is shown\n", done.stderr)
+    summary = json.loads(Path("t.json").read_text())
+    assert summary["stopped"] == "interrupted"
+    assert 0 < summary["steps"] < 1e8
+    assert np.load("t.npz")["time"][-1] == pytest.approx(summary["time_s"])
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["t.json", "t.npz", "tiny.yaml"]
+
+
+@pytest.mark.parametrize("moment", ["simulating", "drawing"])
+def test_an_interrupted_picture_is_not_written(moment: str, tmp_path: Path) -> None:
+    done = interrupted(moment, "render", "tiny.yaml", "--duration", "10", "--out", "t.gif")
+    assert (done.returncode, done.stderr) == (130, "flockenv: interrupted\n")
+    assert [p.name for p in tmp_path.iterdir()] == ["tiny.yaml"]
+
+
+# --- render -----------------------------------------------------------------------------------------------------------
+
+
+def test_a_scene_as_gif_png_and_html(capsys: pytest.CaptureFixture[str]) -> None:
+    for name in ("s.gif", "s.PNG", "s.html"):
+        assert main(["render", "tiny.yaml", "--duration", "0.4", "--size", "128", "--out", name]) == 0
+    assert capsys.readouterr().out.startswith("s.gif: ")
+    with Image.open("s.gif") as gif:
+        assert getattr(gif, "n_frames", 1) == 11  # 25 a second
+        assert gif.size[0] == 128
+    with Image.open("s.PNG") as png:
+        assert png.format == "PNG"
+    assert '"player":' in Path("s.html").read_text()
+
+
+def test_a_plane_is_shown_in_one_frame() -> None:
+    Path("plane.yaml").write_text(
+        "groups: [{count: 3, spawn: {low: [0, 0], high: [1, 1], speed: [9, 9]}}]\neffects: [{kind: drag, rate: 0}]\n"
+    )
+    assert main(["render", "plane.yaml", "--duration", "1", "--size", "128", "--out", "p.html"]) == 0
+
+
+def test_a_task_under_a_player_of_ones_own() -> None:
+    Path("still.py").write_text(
+        "import numpy as np\n\n\ndef player(task):\n    class Still:\n"
+        "        def predict(self, observation, state=None, episode_start=None, deterministic=False):\n"
+        "            return np.zeros((len(np.atleast_2d(observation)), task.action_layout.size), np.float32), state\n"
+        "    return Still()\n"
+    )
+    assert main(["render", "pursuit", "--player", "still.py", "--size", "96", "--out", "p.png"]) == 0
+    assert main(["render", "pursuit", "--seed", "3", "--out", "p.html"]) == 0
+    with Image.open("p.png") as png:
+        assert png.size[0] == 96
+
+
+# --- explain ----------------------------------------------------------------------------------------------------------
+
+
+def test_explain_says_what_is_called_for_and_what_was_left_out(capsys: pytest.CaptureFixture[str]) -> None:
+    Path("one.yaml").write_text(TINY.replace("{kind: drag, rate: 0.5}", "{kind: separation, weight: 1, radius: 2}"))
+    assert main(["explain", "one.yaml"]) == 0
+    asked = capsys.readouterr().out
+    assert re.search(r"^Separation\(.*\) +neighbour query within 2 m +[\d.]+ *$", asked, re.MULTILINE)
+    assert "Per step: 1 evaluations, 1 neighbour queries" in asked
+    assert "neighbour query: no effect" not in asked
+
+    assert main(["explain", "tiny.yaml"]) == 0
+    unasked = capsys.readouterr().out
+    assert re.search(r"^Drag\(kind='drag', rate=0.5\) +nothing +[\d.]+ *$", unasked, re.MULTILINE)
+    assert "1 evaluations, 0 neighbour queries, 0 pairs, 0 obstacle tests" in unasked
+    assert "neighbour query: no effect asks who is near whom" in unasked
+    assert "pass over obstacles (0): no effect asks for them" in unasked
+    assert re.search(r"effects that are not listed: alignment, avoid_obstacles, cohesion, separation\b", unasked)
+
+
+# --- mistakes ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        ("run", "Missing argument 'SCENE.yaml'"),
+        ("rnu tiny.yaml", "No such command 'rnu'. Did you mean 'run'?"),
+        ("run tiny.yaml --sede 1", "No such option: --sede"),
+        ("run tinny.yaml", "tinny.yaml: no such file, did you mean `tiny.yaml`?"),
+        ("run .", ".: no such file (it is a folder)"),
+        ("run tiny.yaml --seed -1", "Invalid value for '--seed'"),
+        ("run tiny.yaml --seed 18446744073709551616", "Invalid value for '--seed'"),
+        ("run tiny.yaml --seed 1.5", "Invalid value for '--seed'"),
+        ("run tiny.yaml --seed abc", "Invalid value for '--seed'"),
+        ("run tiny.yaml --duration -1", "--duration = -1: must be a finite number of seconds >= 0"),
+        ("run tiny.yaml --duration nan", "--duration = nan: must be a finite number"),
+        ("run tiny.yaml --duration inf", "--duration = inf: must be a finite number"),
+        ("run tiny.yaml --duration 1e300", "--duration = 1e+300 s: too many steps"),
+        (
+            "run tiny.yaml --duration 0.015",
+            "--duration = 0.015 s: must be a whole multiple of dt = 0.01 s, say 0.01 or 0.02",
+        ),
+        (
+            "run tiny.yaml --every 0 --out x.npz",
+            "--every = 0 s: must be a whole multiple of dt = 0.01 s, say 0.01 or 0.02",
+        ),
+        ("run tiny.yaml --duration 1e9 --every 0.1 --out x.npz", "10,000,000,001 instants of 4 agents need about"),
+        ("run tiny.yaml --out x.gif", "--out 'x.gif': must end in .npz"),
+        ("run tiny.yaml --out ../x.npz", "--out '../x.npz': must not go up with '..'"),
+        ("run tiny.yaml --out /etc/x.npz", "--out '/etc/x.npz': must lie below "),
+        ("run tiny.yaml --out a\0b.npz", "--out 'a\\x00b.npz': must be a name without control characters"),
+        ("run tiny.yaml --out tiny.yaml/x.npz", "--out 'tiny.yaml/x.npz': '"),
+        (f"run tiny.yaml --out {'x' * 300}.npz", "--out '"),
+        ("run tiny.yaml --out con.npz", "--out 'con.npz': 'con.npz' is a reserved name"),
+        ("render tiny.yaml", "Missing option '--out'"),
+        ("render tiny.yaml --out x.mp4", "--out 'x.mp4': must end in .gif or .png or .html"),
+        ("render tiny.yaml --out x.gfi", "--out 'x.gfi': must end in .gif or .png or .html, did you mean `.gif`?"),
+        ("render pursiut --out x.gif", "'pursiut': no such task, did you mean `pursuit`? ("),
+        ("render pursuit --out x.gif --player nobody", "player 'nobody': unknown"),
+        ("render pursuit --out x.gif --player no.safetensors", "player 'no.safetensors': no such file"),
+        ("render pursuit --out x.gif --duration 3", "--duration = 3: goes with a scene"),
+        ("render tiny.yaml --out x.gif --size 1", "Invalid value for '--size'"),
+        ("explain nothing.yaml", "nothing.yaml: no such file"),
+    ],
+)
+def test_a_mistake_is_one_line_with_exit_code_2_and_writes_nothing(
+    arguments: str, said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(arguments.split(" ")) == 2
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    assert captured.err.startswith(f"flockenv: {said}"), captured.err
+    assert len(captured.err.splitlines()) == 1 and len(captured.err) < 600
+    assert [p.name for p in tmp_path.iterdir()] == ["tiny.yaml"]
+
+
+def test_a_mistake_in_a_scene_is_one_line(capsys: pytest.CaptureFixture[str]) -> None:
+    Path("bad.yaml").write_text(TINY.replace("rate: 0.5", "rte: 0.5"))
+    assert main(["run", "bad.yaml", "--out", "x.npz"]) == 2
+    assert capsys.readouterr().err == (
+        "flockenv: bad.yaml:3: effects[0].rte = 0.5: unknown key, did you mean `rate`? allowed here: kind, rate\n"
+    )
+
+
+def test_names_do_not_drive_the_terminal(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["run", "\x1b[2Jx.yaml"]) == 2
+    assert main(["render", "\x1b[2Jx", "--out", "x.gif"]) == 2
+    assert main(["\x1b[2J"]) == 2
+    assert "\x1b" not in capsys.readouterr().err
+
+
+def test_a_file_is_overwritten_only_by_force(capsys: pytest.CaptureFixture[str]) -> None:
+    Path("t.json").write_text("mine")
+    assert main(["run", "tiny.yaml", "--duration", "0", "--out", "t.npz"]) == 2
+    assert re.match(r"flockenv: --out '.*t\.json': exists already; --force overwrites it", capsys.readouterr().err)
+    assert Path("t.json").read_text() == "mine"
+    assert not Path("t.npz").exists()
+    assert main(["run", "tiny.yaml", "--duration", "0", "--out", "t.npz", "--force"]) == 0
+    assert json.loads(Path("t.json").read_text())["steps"] == 0
+
+
+def test_a_link_to_the_outside_is_not_followed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "out").symlink_to("/usr/share")
+    assert main(["run", "tiny.yaml", "--duration", "0", "--out", "out/x.npz"]) == 2
+    assert "must lie below" in capsys.readouterr().err
+
+
+def test_debug_shows_the_traceback(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(ValueError, match="no such file"):
+        main(["run", "nothing.yaml", "--debug"])
+    with pytest.raises(ValueError, match="no such file"):
+        main(["--debug", "run", "nothing.yaml"])
+
+
+def test_a_fault_of_ours_is_called_one(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    def broken(source: object) -> None:
+        raise KeyError("pos")
+
+    monkeypatch.setattr("flockenv.config.load_scene", broken)
+    assert main(["run", "tiny.yaml"]) == 1
+    assert capsys.readouterr().err == "flockenv: KeyError: 'pos' (a fault of flockenv's; --debug shows where)\n"
+
+
+def test_nothing_at_all_shows_the_help(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main([]) == 2
+    assert "Usage:" in capsys.readouterr().out
+
+
+# --- as a program -----------------------------------------------------------------------------------------------------
+
+
+def test_as_a_program_errors_go_to_stderr_and_the_exit_code_says_so() -> None:
+    done = subprocess.run(
+        process("run", "tiny.yaml", "--duration", "-1"), env=ENVIRONMENT, capture_output=True, text=True, check=False
+    )
+    assert (done.returncode, done.stdout) == (2, "")
+    assert done.stderr == "flockenv: --duration = -1: must be a finite number of seconds >= 0\n"
+
+
+def test_a_reader_that_goes_away_is_no_error() -> None:
+    """`flockenv list | head -1`."""
+    command = f"{sys.executable} -c 'import sys; from flockenv.cli import main; sys.exit(main())' list | head -1"
+    done = subprocess.run(command, shell=True, env=ENVIRONMENT, capture_output=True, text=True, check=True)
+    assert (done.stdout, done.stderr) == ("Tasks\n", "")
+
+
+def test_it_works_without_a_home_a_display_or_a_locale(tmp_path: Path) -> None:
+    bare = {"PATH": os.environ["PATH"], "PYTHONPATH": str(ROOT), "LANG": "C", "LC_ALL": "C", "TZ": "Mars/Phobos"}
+    bare["FLOCKENV_CACHE"] = str(tmp_path)
+    done = subprocess.run(
+        process("run", "tiny.yaml", "--duration", "0.1"), env=bare, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    assert "4 agents, 10 steps" in done.stdout

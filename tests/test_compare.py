@@ -1,0 +1,414 @@
+"""The comparison: command line, files and sentences, on real tasks and on scores made up for the case."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import subprocess
+import sys
+from io import StringIO
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+from rich.console import Console
+from typer.testing import CliRunner
+
+from agents import compare as comparison
+from agents import report
+from flockenv.evaluation import EVALUATION, Episodes
+from flockenv.policy import save_policy
+from flockenv.render.chart import Column, draw_chart, write_chart
+from flockenv.tasks import TASKS
+
+ROOT = Path(__file__).resolve().parent.parent
+FILES = ["comparison.png", "replay.html", "results.json", "table.md"]
+STILL = "def predict(observation):\n    return 0 * observation[:, :2]\n"
+
+
+@pytest.fixture(autouse=True)
+def elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def run(*arguments: str, code: int = 0) -> Any:
+    result = CliRunner().invoke(comparison.app, arguments)
+    assert result.exit_code == code, (result.output, result.exception)
+    return result
+
+
+def refused(*arguments: str) -> str:
+    """Run what must be refused: one line, exit code 2, nothing written and nothing played."""
+    before = sorted(Path.cwd().rglob("*"))
+    result = run(*arguments, code=2)
+    assert result.stdout == ""
+    lines = result.stderr.splitlines()
+    assert len(lines) == 1, lines
+    assert lines[0].startswith("compare: ")
+    assert lines[0].isprintable()
+    assert sorted(Path.cwd().rglob("*")) == before
+    return str(lines[0])
+
+
+def made_up(returns: Any, task: str = "toy", **change: Any) -> Episodes:
+    returns = np.asarray(returns, np.float64)
+    fields: dict[str, Any] = {
+        "task": task,
+        "digest": "d",
+        "seed": EVALUATION,
+        "horizon": 9,
+        "returns": returns,
+        "success": returns > 0,
+        "lengths": np.full(len(returns), 4),
+        "terms": {"effort": returns},
+        "metrics": {"time_to_goal": np.where(returns > 0, 2.0, np.nan)},
+        "microseconds": 1.5,
+        "latency": 20.0,
+    }
+    return Episodes(**{**fields, **change})
+
+
+def made_up_results(scores: dict[str, Any], costs: dict[str, Any] | None = None) -> report.Results:
+    return report.task_results("d", {name: made_up(x) for name, x in scores.items()}, costs or {}, 300, 0)
+
+
+# --- what is said
+
+
+def test_results_hold_what_the_issue_names() -> None:
+    luck = np.random.default_rng(0).normal(size=40)
+    results = made_up_results({"random": luck - 5, "reynolds": luck, "ppo": luck + 1})
+    assert list(results["players"]) == ["random", "reynolds", "ppo"]
+    assert list(results["pairs"]) == ["ppo - reynolds", "ppo - random", "reynolds - random"]
+    assert {"iqm", "ci_low", "ci_high", "success_rate", "worlds"} <= results["players"]["ppo"].keys()
+    pair = results["pairs"]["ppo - reynolds"]
+    assert {"difference", "ci_low", "ci_high"} <= pair.keys()
+    assert (pair["difference"], pair["ci_low"], pair["ci_high"]) == pytest.approx((1, 1, 1))
+    assert pair["probability_better"] == 1
+    assert pair["better_low"] < 1
+    assert pair["separated"] is True
+    assert results["players"]["ppo"]["worlds"] == 40
+    assert results["players"]["ppo"]["metrics"]["time_to_goal"] == {"mean": 2.0, "worlds": int((luck + 1 > 0).sum())}
+    assert results["players"]["random"]["metrics"]["time_to_goal"] == {"mean": None, "worlds": 0}
+    assert results["players"]["reynolds"]["returns"] == pytest.approx(list(luck))
+
+
+def test_results_are_strict_json_with_a_line_per_list() -> None:
+    results = made_up_results({"a": [1.0, -2.5e-7, 3.0], "b": [0.0, 1e9, -1.0]})
+    text = report.json_text(results)
+    assert json.loads(text, parse_constant=pytest.fail) == json.loads(json.dumps(results))
+    assert '"returns": [1.0, -2.5e-07, 3.0]' in text
+    assert "NaN" not in text
+
+
+def test_the_sentence_says_who_won_by_what_and_what_it_cost() -> None:
+    luck = np.linspace(-1, 1, 101)
+    costs = {"ppo": {"wall_time_s": 252, "steps": 1_000_000}, "reynolds": {"of": "tuning", "steps": 950}}
+    ahead = made_up_results({"random": luck - 9, "reynolds": luck, "ppo": luck + 0.5}, costs)["verdict"]
+    assert ahead.startswith(
+        "toy: ppo beats reynolds by 0.500 [0.500, 0.500] per world and scores higher in 100 % [96, 100]"
+    )
+    assert "success 75% against 50%" in ahead.replace("74%", "75%")
+    assert "ppo cost 4.2 min and 1.0 M agent-steps of training, then 1.5 µs per decision; " in ahead
+    assert "; reynolds cost 950 agent-steps of tuning, then 1.5 µs per decision." in ahead
+
+
+def test_the_sentence_does_not_hide_that_rules_win_or_that_nobody_does() -> None:
+    rng = np.random.default_rng(0)
+    luck, noise = np.linspace(-1, 1, 101), 0.1 * rng.normal(size=101)
+    behind = made_up_results({"reynolds": luck, "ppo": luck - 0.5 + noise})
+    assert behind["pairs"]["ppo - reynolds"]["difference"] < 0
+    found = re.match(r"toy: reynolds beats ppo by (\S+) \[(\S+), (\S+)\] per world", behind["verdict"])
+    assert found
+    value, low, high = map(float, found.groups())
+    assert 0 < low < value < high
+    assert value == pytest.approx(-behind["pairs"]["ppo - reynolds"]["difference"], abs=0.005)
+    assert low == pytest.approx(-behind["pairs"]["ppo - reynolds"]["ci_high"], abs=0.005)
+    level = made_up_results({"reynolds": luck, "ppo": luck + noise - noise.mean() + 1e-4})["verdict"]
+    assert level.startswith("toy: ppo and reynolds are level: difference 0.000")
+
+
+def test_without_ppo_the_two_best_are_compared_and_one_alone_is_not() -> None:
+    luck = np.linspace(-1, 1, 101)
+    three = made_up_results({"random": luck, "textbook": luck + 3, "reynolds": luck + 2})["verdict"]
+    assert three.startswith("toy: textbook beats reynolds by 1.000")
+    assert made_up_results({"ppo": luck})["verdict"] == "toy: one player alone, nobody to compare with."
+
+
+def test_numbers_are_shown_to_the_accuracy_they_have() -> None:
+    def shown(value: float, low: float, high: float) -> str:
+        return report.interval_text({"x": value, "ci_low": low, "ci_high": high}, "x", "ci")
+
+    assert shown(12.3456, 11.9876, 12.7654) == "12.35 [11.99, 12.77]"
+    assert shown(1234.567, 1200.1, 1300.2) == "1235 [1200, 1300]"
+    assert shown(0.0123412, 0.0119, 0.0139) == "0.0123 [0.0119, 0.0139]"
+    assert shown(12.54, 7.1, 18.0) == "12.5 [7.1, 18.0]"
+    assert shown(2.0, 2.0, 2.0) == "2.000 [2.000, 2.000]"
+    assert [report.number_text(x) for x in (None, 0.123456, 12345.6, -0.0)] == ["–", "0.123", "12,346", "0"]
+    assert [report.duration_text(x) for x in (4.2, 252)] == ["4 s", "4.2 min"]
+
+
+def test_tables_fit_a_terminal_and_show_no_markup() -> None:
+    luck = np.linspace(-1, 1, 101)
+    episodes = {name: made_up(x, metrics={"[b]_m": x}) for name, x in {"[red]": luck, "a|b": luck + 0.5}.items()}
+    results = report.task_results("d", episodes, {}, 100, 0)
+    console = Console(width=80, file=StringIO(), force_terminal=False)
+    console.print(*report.player_tables("toy [bold]", results))
+    text = console.file.getvalue()  # type: ignore[attr-defined]
+    assert all(
+        word in text for word in ("toy [bold]", "[red]", "[b] m", "a|b", "0.500 [0.500, 0.500]", "100 % [96, 100]")
+    )
+    assert max(map(len, text.splitlines())) <= 80
+    about = {"worlds": 101, "world_seeds": {"first": 1, "last": 2}, "versions": {}}
+    page = report.markdown({"tasks": {"toy": results}, **about})
+    rows = [line for line in page.splitlines() if line.startswith("| ")]
+    assert len(rows) == 4 + 3
+    assert {len(re.findall(r"(?<!\\)\|", row)) for row in rows} == {6 + 1, 4 + 1}
+
+
+# --- the picture
+
+
+def columns() -> list[Column]:
+    luck = np.random.default_rng(0).normal(size=50)
+    scores = {"random": luck - 5, "reynolds": luck, "$mine_": luck + 0.5}
+    episodes = {name: made_up(x) for name, x in scores.items()}
+    return [report.column("toy", report.task_results("d", episodes, {}, 200, 0), episodes)]
+
+
+def test_the_picture_shows_the_intervals_where_they_are() -> None:
+    [column] = columns()
+    figure = draw_chart([column], "Title", "note")
+    scores, success, pairs = figure.axes
+    assert [label.get_text() for label in scores.get_yticklabels()] == ["random", "reynolds", "$mine_"]
+    assert [label.get_text() for label in pairs.get_yticklabels()] == ["$mine_ - reynolds"]
+    drawn = {tuple(line.get_xdata()) for axes in (scores, success, pairs) for line in axes.lines}
+    for row in column.rows:
+        for interval in (row.score, row.success):
+            assert (interval.low, interval.high) in drawn
+            assert (interval.value,) in drawn
+    interval = column.pairs["$mine_ - reynolds"]
+    assert (interval.low, interval.high) in drawn
+    low, high = scores.get_xlim()
+    assert all(low < row.score.low <= row.score.high < high for row in column.rows)
+
+
+def test_the_picture_is_a_png_and_the_same_every_time(elsewhere: Path) -> None:
+    for name in ("a.png", "b.png"):
+        write_chart(elsewhere / name, columns(), "Title")
+    data = Path("a.png").read_bytes()
+    assert data == Path("b.png").read_bytes()
+    assert data[:8] == b"\x89PNG\r\n\x1a\n"
+    pixels = np.asarray(Image.open("a.png").convert("L"))
+    assert min(pixels.shape) > 600
+    assert (pixels < 128).mean() > 0.002
+
+
+def test_an_empty_picture_is_refused() -> None:
+    with pytest.raises(ValueError, match="at least one task"):
+        draw_chart([], "nothing")
+    with pytest.raises(ValueError, match="at least one player"):
+        draw_chart([Column("toy", [])], "nothing")
+
+
+# --- the command line
+
+
+def test_all_four_files_come_out_of_one_run(elsewhere: Path) -> None:
+    Path("still.py").write_text(STILL)
+    result = run("--players", "still.py,random", "--worlds", "6", "--smoke", "--out", "here/results")
+    assert sorted(path.name for path in Path("here/results").iterdir()) == FILES
+    results = json.loads(Path("here/results/results.json").read_text(), parse_constant=pytest.fail)
+    assert list(results["tasks"]) == list(TASKS)
+    for name, about in results["tasks"].items():
+        assert list(about["players"]) == ["random", "still"]
+        assert list(about["pairs"]) == ["still - random"]
+        assert about["players"]["still"]["worlds"] == 6
+        assert len(about["players"]["still"]["returns"]) == 6
+        assert about["players"]["still"]["ci_low"] <= about["players"]["still"]["iqm"]
+        assert about["verdict"] in " ".join(result.stdout.split())
+        assert f"## {name}" in Path("here/results/table.md").read_text()
+    assert results["world_seeds"] == {"block": "evaluation", "first": EVALUATION, "last": EVALUATION + 5}
+    assert results["players"] == {"random": "random", "still": "still.py"}
+    assert results["smoke"] is True
+    assert results["versions"]["numpy"] == np.__version__
+    assert re.fullmatch(r"[0-9a-f]{40}", results["git"]["commit"] or "0" * 40)
+    assert Path("here/results/comparison.png").read_bytes()[:8] == b"\x89PNG\r\n\x1a\n"
+    page = Path("here/results/replay.html").read_text()
+    assert all(name in page for name in ("still", "random", *TASKS))
+
+
+def test_the_same_seed_gives_the_same_scores_and_another_one_others() -> None:
+    def scores(out: str, seed: str) -> Any:
+        run("--tasks", "obstacles", "--players", "random", "--worlds", "4", "--seed", seed, "--out", out)
+        return json.loads(Path(out, "results.json").read_text())["tasks"]["obstacles"]["players"]["random"]["returns"]
+
+    first = scores("a", "0")
+    assert scores("a", "0") == first  # and an older result is replaced
+    assert scores("b", "1") != first
+
+
+def test_players_are_ordered_by_what_they_claim_however_they_are_given() -> None:
+    Path("mine.py").write_text(STILL)
+    field = comparison._field(["mine.py", "ppo", "random", "reynolds", "textbook", "ppo"])
+    assert [player.name for player in field] == ["random", "textbook", "reynolds", "ppo", "mine"]
+
+
+def test_weights_of_ones_own_play_under_the_name_of_their_file() -> None:
+    task = TASKS["obstacles"]()
+    inputs, outputs = task.layout.size, task.action_layout.size
+    tensors = {"action.weight": np.zeros((outputs, inputs), np.float32), "action.bias": np.zeros(outputs, np.float32)}
+    card = {"activation": "tanh", "layout": task.layout.digest, "steps": 5, "wall_time_s": 3.0}
+    save_policy("own.safetensors", {**tensors, "log_std": np.zeros(outputs, np.float32)}, card)
+    run("--tasks", "obstacles", "--players", "random", "--players", "own.safetensors", "--worlds", "2", "--smoke")
+    players = json.loads(Path("results/results.json").read_text())["tasks"]["obstacles"]["players"]
+    assert players["own"]["cost"] == {"wall_time_s": 3.0, "steps": 5}
+    assert players["random"]["cost"] == {}
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("--tasks", "pursiut"), f"--tasks 'pursiut': unknown, did you mean `pursuit`?; allowed: {', '.join(TASKS)}"),
+        (("--players", "reynold"), "player 'reynold': unknown, did you mean `reynolds`?"),
+        (("--players", "no.py"), "player 'no.py': no such file"),
+        (("--players", "<script>.py"), "--players '<script>.py': a name is up to 40"),
+        (("--players", "a - b.py"), "a name is up to 40"),
+        (("--players", "\x1b[2J"), "a name is up to 40"),
+        (("--players", "still.py,sub/still.py"), "two players are called 'still'"),
+        (("--players", "model.zip"), "executes the code stored in it"),
+        (("--players", "broken.py"), "player 'broken.py': ZeroDivisionError while loading it"),
+        (("--players", "late.py"), "player 'late', task 'flock': KeyError: 'no'"),
+        (("--worlds", "1"), "--worlds 1: must be from 2"),
+        (("--worlds", "0"), "--worlds 0: must be from 2"),
+        (("--worlds", "1000000000"), "--worlds 1000000000: must be from 2 to 1000000"),
+        (("--seed", "-1"), "seed: -1, must be a whole number from 0 to 999"),
+        (("--seed", "1000"), "seed: 1000, must be"),
+        (("--out", "../../x"), "--out '../../x': must not go up"),
+        (("--out", "/etc/x"), "--out '/etc/x': must lie below"),
+        (("--out", "a\0b"), "control characters"),
+        (("--out", "x" * 300), "too long"),
+        (("--out", ""), "--out ''"),
+        (("--out", "CON"), "reserved"),
+        (("--out", "still.py"), "--out 'still.py': is a file, must be a folder"),
+        (("--out", "still.py/x"), "is not a folder"),
+        (("--out", "link"), "--out 'link': must lie below"),
+    ],
+)
+def test_bad_requests_are_refused_in_one_line(
+    arguments: tuple[str, ...], message: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(comparison, "rollout", lambda *_, **__: pytest.fail("something was played"))
+    Path("sub").mkdir()
+    late = "def player(task):\n    return {}['no']"
+    files = {"still.py": STILL, "sub/still.py": STILL, "broken.py": "1 / 0", "late.py": late, "model.zip": "PK"}
+    for path, source in files.items():
+        Path(path).write_text(source)
+    monkeypatch.setattr(sys, "dont_write_bytecode", True)
+    os.symlink("/etc", "link")
+    assert message in refused(*arguments)
+
+
+def test_missing_weights_name_the_command_that_trains_them(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(comparison, "WEIGHTS", Path("nowhere"))
+    line = refused("--players", "random,ppo", "--tasks", "flock")
+    assert "no weights for task 'flock'" in line
+    assert line.endswith("python -m agents.ppo configs/flock.yaml")
+
+
+def test_a_player_that_fails_is_named_and_nothing_is_written() -> None:
+    for name, source, message in (
+        ("bad", "def predict(o):\n    return o[:, 10**6]", "IndexError"),
+        ("wide", "def predict(o):\n    return o", "ValueError: policy: actions of shape"),
+        ("nan", "def predict(o):\n    return float('nan') * o[:, :2]", "ValueError"),
+    ):
+        Path(f"{name}.py").write_text(source)
+        result = run("--tasks", "pursuit", "--players", f"{name}.py", "--worlds", "2", code=2)
+        assert f"player '{name}', task 'pursuit': {message}" in result.stderr
+        assert not Path("results").exists()
+
+
+def test_debug_shows_where_an_error_came_from() -> None:
+    result = CliRunner().invoke(comparison.app, ["--tasks", "no", "--debug"])
+    assert isinstance(result.exception, ValueError)
+
+
+def test_an_interrupt_leaves_nothing_and_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    def interrupted(*_: Any, **__: Any) -> Any:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(comparison, "rollout", interrupted)
+    result = run("--players", "random", code=130)
+    assert "interrupted, nothing written" in result.stderr
+    assert not Path("results").exists()
+
+
+def test_files_arrive_all_together_or_not_at_all() -> None:
+    Path("out").mkdir()
+    Path("out/a").write_text("old")
+
+    def fail(_: Path) -> None:
+        raise OSError(28, "No space left on device")
+
+    with pytest.raises(OSError, match="No space"):
+        comparison.deliver(Path("out"), {"a": lambda path: path.write_text("new") and None, "b": fail})
+    assert [(path.name, path.read_text()) for path in Path("out").iterdir()] == [("a", "old")]
+    with pytest.raises(OSError, match="No space"):
+        comparison.deliver(Path("fresh/out"), {"b": fail})
+    assert not Path("fresh").exists()
+    comparison.deliver(Path("fresh/out"), {"a": lambda path: path.write_text("new") and None})
+    assert [(path.name, path.read_text()) for path in Path("fresh/out").iterdir()] == [("a", "new")]
+
+
+def test_what_a_player_cost_comes_from_its_card_or_from_the_search_that_tuned_it(
+    elsewhere: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    task = TASKS["pursuit"]()
+    policies: dict[str, Any] = {
+        "reynolds": SimpleNamespace(),
+        "ppo": SimpleNamespace(card={"wall_time_s": 2.5, "steps": 3, "secret": 1}),
+        "mine": SimpleNamespace(),
+    }
+    monkeypatch.setattr(comparison, "CONFIGS", elsewhere)
+    ppo = {"wall_time_s": 2.5, "steps": 3}
+    assert comparison._costs(task, policies) == {"reynolds": {}, "ppo": ppo, "mine": {}}
+    Path("pursuit.yaml").write_text("task: pursuit\nreynolds: {found: {agent_steps: 1200.0}}")
+    tuned = {"of": "tuning", "steps": 1200}
+    assert comparison._costs(task, policies) == {"reynolds": tuned, "ppo": ppo, "mine": {}}
+
+
+def test_the_task_is_the_one_that_its_config_describes(elsewhere: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(comparison, "CONFIGS", elsewhere)
+    Path("pursuit.yaml").write_text("task: pursuit\narguments: {horizon: 7}")
+    run("--tasks", "pursuit", "--players", "random", "--worlds", "2", "--smoke")
+    about = json.loads(Path("results/results.json").read_text())["tasks"]["pursuit"]
+    assert about["horizon"] == 7
+    assert about["players"]["random"]["episode_length"] <= 7
+    Path("pursuit.yaml").write_text("task: pursuit\nargument: {horizon: 7}")
+    assert "argument" in refused("--tasks", "pursuit")
+
+
+NO_TORCH = """
+import sys
+
+class Refuse:  # not sys.modules["torch"] = None, which scipy takes for a torch
+    def find_spec(self, name, path=None, target=None):
+        if name.split(".")[0] in ("torch", "stable_baselines3"):
+            raise ImportError(f"{name} is not for this")
+
+sys.meta_path.insert(0, Refuse())
+from typer.testing import CliRunner
+from agents.compare import app
+result = CliRunner().invoke(app, sys.argv[1:])
+assert result.exit_code == 0, result.output
+"""
+
+
+def test_comparing_needs_no_torch() -> None:
+    arguments = ["--players", "random,textbook,reynolds", "--worlds", "2", "--smoke", "--out", str(Path.cwd() / "out")]
+    subprocess.run([sys.executable, "-c", NO_TORCH, *arguments], check=True, cwd=ROOT)

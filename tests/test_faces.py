@@ -1,0 +1,153 @@
+"""All faces are views of one World: one sequence of actions through each of them gives the same numbers."""
+
+import gymnasium
+import numpy as np
+import pettingzoo
+import pytest
+
+from flockenv.sb3 import WorldVecEnv
+from flockenv.tasks import Flock, Obstacles, Pursuit
+from flockenv.world import World
+
+SEED, LIMIT, STEPS = 21, 15, 40
+ALONE = {
+    "Pursuit": (Pursuit(), {}),
+    "Obstacles": (Obstacles(), {}),
+    "Flock": (Flock(agents=8, learners=1), {"agents": 8}),
+}
+"""Per id: a task with one learner, and the parameters with which make() gives just that task."""
+
+
+def sequence(task, seed=0):
+    shape = (STEPS, task.learners, task.action_layout.size)
+    return np.random.default_rng(seed).uniform(-1.2, 1.2, shape).astype(np.float32)
+
+
+def record(observation, reward, terminated, truncated):
+    return observation.tobytes(), np.float64(reward).tobytes(), bool(terminated), bool(truncated)
+
+
+# Each of these plays the sequence in one face, beginning anew at every end, and returns one list per learner: the
+# first observation, then records, and after each end the first observation of the next episode.
+
+
+def through_world(task, actions):
+    world = World(task, time_limit=LIMIT)
+    logs = [[row.tobytes()] for row in world.reset(seeds=SEED)[0]]
+    for action in actions:
+        step = world.step(action[None])
+        for i, log in enumerate(logs):
+            log.append(record(step.observation[0, i], step.reward[0, i], step.terminated[0, i], step.truncated[0]))
+        if step.ended[0]:
+            for log, row in zip(logs, world.reset()[0], strict=True):
+                log.append(row.tobytes())
+    return logs
+
+
+def through_gymnasium(env_id, parameters, actions):
+    env = gymnasium.make(env_id, max_episode_steps=LIMIT, **parameters)
+    log = [env.reset(seed=SEED)[0].tobytes()]
+    for action in actions:
+        observation, reward, terminated, truncated, _ = env.step(action[0])
+        log.append(record(observation, reward, terminated, truncated))
+        if terminated or truncated:
+            log.append(env.reset()[0].tobytes())
+    return [log]
+
+
+def through_vector(env_id, parameters, actions):
+    envs = gymnasium.make_vec(env_id, 3, max_episode_steps=LIMIT, **parameters)
+    log = [envs.reset(seed=SEED - 1)[0][1].tobytes()]
+    for action in actions:
+        rows = np.stack([-action[0], action[0], action[0] / 2])
+        observation, reward, terminated, truncated, info = envs.step(rows)
+        ended = terminated[1] or truncated[1]
+        last = info["final_obs"][1] if ended else observation[1]
+        log.append(record(last, reward[1], terminated[1], truncated[1]))
+        if ended:
+            log.append(observation[1].tobytes())
+    return [log]
+
+
+def through_sb3(task, actions):
+    env = WorldVecEnv(task, 3, time_limit=LIMIT)
+    env.seed(SEED - 1)
+    mine = slice(task.learners, 2 * task.learners)
+    logs = [[row.tobytes()] for row in env.reset()[mine]]
+    for action in actions:
+        observation, reward, done, infos = env.step(np.concatenate([-action, action, action / 2]))
+        for row, log, info, r, over in zip(observation[mine], logs, infos[mine], reward[mine], done[mine], strict=True):
+            truncated = info.get("TimeLimit.truncated", False)
+            log.append(record(info.get("terminal_observation", row), r, over and not truncated, truncated))
+            if over:
+                log.append(row.tobytes())
+    return logs
+
+
+def through_parallel(env_id, parameters, actions):
+    env = pettingzoo.make("parallel", env_id, max_cycles=LIMIT, **parameters)
+    logs = {name: [row.tobytes()] for name, row in env.reset(seed=SEED)[0].items()}
+    index = {name: i for i, name in enumerate(env.possible_agents)}
+    for action in actions:
+        outcome = env.step({name: action[index[name]] for name in env.agents})
+        for name in outcome[0]:
+            logs[name].append(record(*(part[name] for part in outcome[:4])))
+        if not env.agents:
+            for name, row in env.reset()[0].items():
+                logs[name].append(row.tobytes())
+    return list(logs.values())
+
+
+def through_turns(env_id, parameters, actions):
+    env = pettingzoo.make("aec", env_id, max_cycles=LIMIT, **parameters)
+    env.reset(seed=SEED)
+    index = {name: i for i, name in enumerate(env.possible_agents)}
+    logs = {name: [env.observe(name).tobytes()] for name in env.agents}
+    for action in actions:
+        for name in list(env.agents):
+            assert env.agent_selection == name
+            env.step(action[index[name]])
+        for name in list(env.agents):
+            over = env.terminations[name], env.truncations[name]
+            logs[name].append(record(env.observe(name), env.rewards[name], *over))
+        while env.agents and (env.terminations[env.agent_selection] or env.truncations[env.agent_selection]):
+            env.step(None)
+        if not env.agents:
+            env.reset()
+            for name in env.agents:
+                logs[name].append(env.observe(name).tobytes())
+    return list(logs.values())
+
+
+@pytest.mark.parametrize("name", ALONE)
+def test_one_learner_through_every_face(name):
+    task, parameters = ALONE[name]
+    env_id, actions = f"flockenv/{name}-v0", sequence(task)
+    expected = through_world(task, actions)
+    assert sum(isinstance(entry, bytes) for entry in expected[0]) >= 3  # several episodes
+    assert through_gymnasium(env_id, parameters, actions) == expected
+    assert through_vector(env_id, parameters, actions) == expected
+    assert through_sb3(task, actions) == expected
+    if name != "Obstacles":
+        alone = {"Pursuit": {"pursuers": 1, "evaders": 1, "sides": "pursuers"}, "Flock": {"agents": 8, "learners": 1}}
+        assert through_parallel(env_id, alone[name], actions) == expected
+        assert through_turns(env_id, alone[name], actions) == expected
+
+
+def test_many_learners_through_every_face_that_takes_them():
+    task = Flock(agents=7, learners=5)
+    parameters, actions = {"agents": 7, "learners": 5}, sequence(task)
+    expected = through_world(task, actions)
+    assert through_sb3(task, actions) == expected
+    assert through_parallel("flockenv/Flock-v0", parameters, actions) == expected
+    assert through_turns("flockenv/Flock-v0", parameters, actions) == expected
+
+
+def test_a_game_in_which_agents_leave():
+    task = Pursuit(pursuers=3, evaders=2, sides="both")
+    actions = sequence(task)
+    parallel = through_parallel("flockenv/Pursuit-v0", {}, actions)
+    assert parallel == through_turns("flockenv/Pursuit-v0", {}, actions)
+    for log, whole in zip(parallel, through_world(task, actions), strict=True):
+        # The World goes on to write about an agent that left; the others say nothing about it.
+        assert [e for e in whole if e in log] == log

@@ -1,0 +1,195 @@
+"""Who may import whom: data flows one way through the house, and heavy packages stay behind their doors."""
+
+from __future__ import annotations
+
+import ast
+import shutil
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+import pytest
+
+ROOT = Path(__file__).resolve().parent.parent
+
+LAYERS = (
+    {"refusals", "outputs"},
+    {"records", "vec", "noise", "kernels"},
+    {"state", "space", "steering", "arbitration"},
+    {"neighbours", "shapes", "rows"},
+    {"effects", "integrators", "collisions", "population", "spawn", "sweep"},
+    {"snapshot", "scene", "config", "measures", "explanation"},
+    {"tasks", "world", "policy"},
+    {"envs", "sb3", "evaluation", "accuracy", "render", "trajectory"},
+    {"cli"},
+    {"agents"},
+    {"tests"},
+)
+"""A module may import its own layer and those above it in this list (shared/DESIGN.md, "Who may import whom")."""
+
+ONLY_IN = {
+    "torch": {"sb3", "agents", "tests"},
+    "stable_baselines3": {"sb3", "agents", "tests"},
+    "matplotlib": {"render", "agents", "tests"},
+    "pygame": {"render", "tests"},
+}
+"""Packages that only these parts may import at all."""
+
+INSIDE_FUNCTIONS = {"matplotlib", "pygame"}
+"""Packages whose import costs so much that it waits until somebody calls."""
+
+
+class Import(NamedTuple):
+    file: str
+    line: int
+    module: str
+    lazy: bool  # inside a function
+    typing: bool  # under `if TYPE_CHECKING`
+
+
+def imports(root: Path) -> Iterator[Import]:
+    """Every import statement of flockenv/, agents/ and tests/."""
+    for folder in ("flockenv", "agents", "tests"):
+        for path in sorted((root / folder).rglob("*.py")):
+            yield from _walk(ast.parse(path.read_text()), path.relative_to(root).as_posix(), False, False)
+
+
+def _walk(node: ast.AST, file: str, lazy: bool, typing: bool) -> Iterator[Import]:
+    for child in ast.iter_child_nodes(node):
+        if isinstance(child, ast.Import):
+            yield from (Import(file, child.lineno, alias.name, lazy, typing) for alias in child.names)
+        elif isinstance(child, ast.ImportFrom) and child.module:
+            names = [f"{child.module}.{alias.name}" for alias in child.names]
+            yield from (Import(file, child.lineno, name, lazy, typing) for name in names)
+        elif isinstance(child, ast.If) and "TYPE_CHECKING" in ast.unparse(child.test):
+            yield from _walk(ast.Module(child.body, []), file, lazy, True)
+            yield from _walk(ast.Module(child.orelse, []), file, lazy, typing)
+        else:
+            function = isinstance(child, (ast.FunctionDef, ast.AsyncFunctionDef, ast.Lambda))
+            yield from _walk(child, file, lazy or function, typing)
+
+
+def part(module: str) -> str:
+    """flockenv.effects.drag -> effects; flockenv/effects/drag.py -> effects; agents.ppo -> agents."""
+    steps = module.removesuffix(".py").replace("/", ".").split(".")
+    return steps[1] if steps[0] == "flockenv" and len(steps) > 1 else steps[0]
+
+
+def rank(name: str) -> int:
+    return next((k for k, layer in enumerate(LAYERS) if name in layer), -1)
+
+
+def faults(root: Path) -> list[str]:
+    """What breaks the order of the house, one line each."""
+    parts = {part(path.relative_to(root).as_posix()) for path in (root / "flockenv").rglob("*.py")}
+    found = [f"{name}: stands in no layer" for name in sorted(parts - {"__init__"}) if rank(name) < 0]
+    for entry in imports(root):
+        found += [f"{entry.file}:{entry.line}: {fault}" for fault in (_upward(entry), _misplaced(entry)) if fault]
+    return found + [f"a circle of imports: {' -> '.join(circle)}" for circle in circles(root)]
+
+
+def _upward(entry: Import) -> str:
+    here, there = part(entry.file), part(entry.module)
+    if entry.module.split(".")[0] not in ("flockenv", "agents", "tests") or here == "__init__" or entry.typing:
+        return ""
+    if rank(there) < 0:  # the package itself: `from flockenv import Scene`
+        return "" if rank(here) >= rank("cli") else f"imports {entry.module} through the package, not from its module"
+    return f"{here} imports {there}, which stands above it" if rank(there) > rank(here) else ""
+
+
+def _misplaced(entry: Import) -> str:
+    package, here = entry.module.split(".")[0], part(entry.file)
+    if entry.typing:
+        return ""
+    if here not in ONLY_IN.get(package, {here}):
+        return f"{package} belongs in {' and '.join(sorted(ONLY_IN[package]))}"
+    if package in INSIDE_FUNCTIONS and not entry.lazy and here != "tests":
+        return f"{package} must be imported inside the function that needs it"
+    return ""
+
+
+def circles(root: Path) -> list[list[str]]:
+    """Circles among the imports that run when a module is loaded."""
+    modules = {
+        path.relative_to(root).with_suffix("").as_posix().replace("/", ".").removesuffix(".__init__")
+        for path in (root / "flockenv").rglob("*.py")
+    }
+    edges: dict[str, set[str]] = {module: set() for module in modules}
+    for entry in imports(root):
+        here = entry.file.removesuffix(".py").replace("/", ".").removesuffix(".__init__")
+        there = entry.module if entry.module in modules else entry.module.rpartition(".")[0]
+        if here in modules and there in modules - {here} and not entry.lazy and not entry.typing:
+            edges[here].add(there)
+    while free := {module for module in edges if not edges[module]}:  # what imports nothing is in no circle
+        edges = {module: targets - free for module, targets in edges.items() if module not in free}
+    return [_follow(edges, min(edges))] if edges else []
+
+
+def _follow(edges: dict[str, set[str]], module: str) -> list[str]:
+    way = [module]
+    while min(edges[way[-1]]) not in way:
+        way.append(min(edges[way[-1]]))
+    return [*way[way.index(min(edges[way[-1]])) :], min(edges[way[-1]])]
+
+
+def test_nothing_imports_upwards_and_heavy_packages_stay_in_their_place() -> None:
+    assert faults(ROOT) == []
+
+
+@pytest.mark.parametrize(
+    ("file", "planted", "fault"),
+    [
+        ("flockenv/state.py", "from flockenv.scene import Scene", "state imports scene, which stands above it"),
+        ("flockenv/scene.py", "from agents import reynolds", "scene imports agents, which stands above it"),
+        ("flockenv/policy.py", "import torch.nn", "torch belongs in agents and sb3 and tests"),
+        ("flockenv/policy.py", "def f():\n    import torch", "torch belongs in agents and sb3 and tests"),
+        (
+            "flockenv/cli.py",
+            "from stable_baselines3 import PPO",
+            "stable_baselines3 belongs in agents and sb3 and tests",
+        ),
+        ("flockenv/render/chart.py", "import matplotlib.pyplot", "matplotlib must be imported inside the function"),
+        ("flockenv/vec.py", "import flockenv.noise\nimport flockenv", "imports flockenv through the package"),
+        ("flockenv/scene.py", "import flockenv.config", "a circle of imports: flockenv.config -> flockenv.scene"),
+        ("flockenv/helpers.py", "", "helpers: stands in no layer"),
+    ],
+)
+def test_a_planted_fault_is_found(tmp_path: Path, file: str, planted: str, fault: str) -> None:
+    for folder in ("flockenv", "agents"):
+        shutil.copytree(ROOT / folder, tmp_path / folder, ignore=shutil.ignore_patterns("__pycache__", "weights"))
+    with (tmp_path / file).open("a") as source:
+        source.write(f"\n{planted}\n")
+    assert any(fault in line for line in faults(tmp_path)), faults(tmp_path)
+
+
+@pytest.mark.parametrize(
+    "statement",
+    [
+        "import flockenv",
+        "import gymnasium, flockenv; gymnasium.spec('flockenv/Pursuit-v0')",
+        "from flockenv.cli import main; assert main(['--help']) == 0",
+        "from flockenv.cli import main; assert main(['run', '--help']) == 0",
+    ],
+)
+def test_a_glance_at_the_library_loads_nothing_heavy(statement: str) -> None:
+    heavy = ["torch", "stable_baselines3", "matplotlib", "numba", "scipy", "pygame"]
+    code = f"{statement}\nimport sys; print(sorted(set({heavy}) & set(sys.modules)))"
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
+    assert done.stdout.splitlines()[-1] == "[]"
+
+
+def test_the_simulator_needs_no_torch() -> None:
+    """With torch and stable-baselines3 made impossible to import, everything but sb3.py still loads."""
+    modules = [
+        path.relative_to(ROOT).with_suffix("").as_posix().replace("/", ".")
+        for path in sorted((ROOT / "flockenv").rglob("*.py"))
+        if path.name not in ("__init__.py", "sb3.py")
+    ]
+    code = (
+        "import sys, importlib; sys.modules['torch'] = sys.modules['stable_baselines3'] = None\n"
+        f"for name in {modules}: importlib.import_module(name)\nprint('loaded')"
+    )
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=False)
+    assert done.stdout == "loaded\n", done.stderr

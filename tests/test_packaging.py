@@ -1,0 +1,134 @@
+"""What is shipped: the wheel holds flockenv and nothing else, and works without the repository around it."""
+
+from __future__ import annotations
+
+import email
+import os
+import re
+import shutil
+import subprocess
+import sys
+import tomllib
+import zipfile
+from email.message import Message
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parent.parent
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+README_TEST = (
+    "python3 -m venv .venv && .venv/bin/pip install -q -c configs/constraints.txt -e '.[train,test]' "
+    "&& .venv/bin/python -m pytest -q"
+)
+
+
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The wheel, built from a copy so that no build/ or egg-info is left in the repository; needs no network."""
+    source, target = tmp_path_factory.mktemp("source"), tmp_path_factory.mktemp("wheel")
+    for name in ("pyproject.toml", "README.md", "LICENSE"):
+        shutil.copy(ROOT / name, source)
+    for name in ("flockenv", "agents", "configs", "tests"):
+        shutil.copytree(ROOT / name, source / name, ignore=shutil.ignore_patterns("__pycache__"))
+    build = f"from setuptools import build_meta; build_meta.build_wheel({str(target)!r})"
+    done = subprocess.run([sys.executable, "-c", build], cwd=source, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    (built,) = target.glob("*.whl")
+    return built
+
+
+@pytest.fixture(scope="module")
+def metadata(wheel: Path) -> Message:
+    with zipfile.ZipFile(wheel) as archive:
+        (name,) = (name for name in archive.namelist() if name.endswith(".dist-info/METADATA"))
+        return email.message_from_bytes(archive.read(name))
+
+
+def test_the_wheel_ships_flockenv_alone(wheel: Path) -> None:
+    names = zipfile.ZipFile(wheel).namelist()
+    tops = {name.split("/")[0] for name in names}
+    assert tops == {"flockenv", f"flockenv-{PROJECT['version']}.dist-info"}
+    sources = {path.relative_to(ROOT).as_posix() for path in (ROOT / "flockenv").rglob("*.py")}
+    data = {"flockenv/py.typed", "flockenv/render/replay.html"}
+    assert {name for name in names if name.startswith("flockenv/")} == sources | data
+    assert any(name.endswith("licenses/LICENSE") for name in names)
+
+
+def test_the_environment_needs_no_torch(metadata: Message) -> None:
+    needed = metadata.get_all("Requires-Dist") or []
+    base = {re.split(r"[\s<>=!~;\[]", line)[0].lower() for line in needed if "extra ==" not in line}
+    assert base == {
+        *("numpy", "scipy", "numba", "gymnasium", "pettingzoo", "pydantic", "pyyaml", "typer", "rich"),
+        *("matplotlib", "pillow", "safetensors"),
+    }
+    assert set(metadata.get_all("Provides-Extra") or []) == {"train", "test", "render", "docs"}
+    assert "gymnasium<2,>=1.2" in needed
+
+
+def test_the_wheel_works_alone(wheel: Path, tmp_path: Path) -> None:
+    """Unpacked elsewhere, with nothing of the checkout in sight: the pieces that are no Python code are found."""
+    with zipfile.ZipFile(wheel) as archive:
+        archive.extractall(tmp_path / "site")
+    code = (
+        "import flockenv, gymnasium, pettingzoo, importlib.resources as r; from flockenv.cli import main;"
+        "assert gymnasium.spec('flockenv/Pursuit-v0') and 'flockenv/Flock-v0' in pettingzoo.parallel_registry;"
+        "assert '__DATA__' in (r.files('flockenv.render') / 'replay.html').read_text();"
+        "assert main(['list']) == 0; print(flockenv.__file__)"
+    )
+    env = {**os.environ, "PYTHONPATH": str(tmp_path / "site"), "PYTHONSAFEPATH": "1"}
+    done = subprocess.run(
+        [sys.executable, "-c", code], cwd=tmp_path, env=env, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.splitlines()[-1].startswith(str(tmp_path / "site"))
+
+
+def test_one_version_everywhere(metadata: Message) -> None:
+    import flockenv
+
+    citation = (ROOT / "CITATION.cff").read_text()
+    assert metadata["Version"] == PROJECT["version"] == flockenv.__version__
+    assert f"\nversion: {flockenv.__version__}\n" in citation
+    assert f"[{flockenv.__version__}]" in (ROOT / "CHANGELOG.md").read_text()
+
+
+def test_ci_runs_the_command_that_the_readme_gives() -> None:
+    assert README_TEST in (ROOT / ".ci" / "run").read_text()
+    assert README_TEST in (ROOT / "README.md").read_text()
+
+
+def test_what_is_installed_here_is_what_the_constraints_say() -> None:
+    """Otherwise the tests that pass here say nothing about a fresh clone."""
+    from importlib.metadata import PackageNotFoundError, version
+
+    pins = dict(line.split("==") for line in (ROOT / "configs" / "constraints.txt").read_text().split())
+    wrong = {}
+    for name, pin in pins.items():
+        try:
+            if version(name).split("+")[0] != pin:
+                wrong[name] = (version(name), pin)
+        except PackageNotFoundError:
+            continue  # a pin of something that only another extra wants
+    assert not wrong
+
+
+def test_every_dependency_is_pinned() -> None:
+    pins = {line.split("==")[0].lower() for line in (ROOT / "configs" / "constraints.txt").read_text().split()}
+    pins = {name.replace("_", "-") for name in pins}
+    extras = PROJECT["optional-dependencies"]
+    wanted = {
+        re.split(r"[<>=]", line)[0].lower() for line in PROJECT["dependencies"] + extras["train"] + extras["test"]
+    }
+    assert wanted - pins == {"pillow"}  # left free: other packages that people install beside it pin it
+
+
+def test_the_top_level_is_what_contributors_are_told() -> None:
+    """A checkout's tracked files; skipped where there is no git."""
+    done = subprocess.run(["git", "ls-files"], cwd=ROOT, capture_output=True, text=True, check=False)
+    tops = {line.split("/")[0] for line in done.stdout.splitlines()}
+    allowed = {
+        *("pyproject.toml", "README.md", "LICENSE", "CHANGELOG.md", "CONTRIBUTING.md", "CITATION.cff"),
+        *("flockenv", "agents", "configs", "tests", "docs", "benchmarks"),
+    }
+    assert {top for top in tops if not top.startswith(".")} <= allowed

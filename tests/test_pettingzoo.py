@@ -1,0 +1,376 @@
+"""The multi-agent faces, all at once and by turns: PettingZoo's own tests, then what they leave out."""
+
+import copy
+import functools
+import itertools
+import pickle
+import warnings
+
+import numpy as np
+import pettingzoo
+import pytest
+from gymnasium.error import ResetNeeded
+from gymnasium.utils.env_checker import data_equivalence
+
+from flockenv.envs import flock_v0, pursuit_v0
+
+with warnings.catch_warnings():
+    warnings.simplefilter("ignore", DeprecationWarning)  # on import it loads its own example the deprecated way
+    from pettingzoo.test import (
+        api_test,
+        max_cycles_test,
+        parallel_api_test,
+        parallel_seed_test,
+        render_test,
+        seed_test,
+        state_test,
+    )
+
+MODULES = (flock_v0, pursuit_v0)
+FLOCK, PURSUIT = "flockenv/Flock-v0", "flockenv/Pursuit-v0"
+IDS = (FLOCK, PURSUIT)
+SMALL = {FLOCK: {"agents": 6}, PURSUIT: {}}
+
+
+@pytest.fixture(autouse=True)
+def no_display(monkeypatch):
+    """SDL draws nowhere, and a window's clock does not wait."""
+    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
+    monkeypatch.setattr("pygame.time.Clock", Clock)
+
+
+class Clock:
+    def tick(self, fps):
+        assert fps > 0
+
+
+def make(env_id, kind="parallel", **options):
+    return pettingzoo.make(kind, env_id, **{**SMALL[env_id], **options})
+
+
+def some(env, rng):
+    return {name: rng.uniform(-1, 1, env.action_space(name).shape).astype(np.float32) for name in env.agents}
+
+
+def play(env, steps, seed):
+    """Everything that comes back in `steps` steps of random actions, begun anew at every end."""
+    rng = np.random.default_rng(seed)
+    log = [env.reset(seed=seed)]
+    for _ in range(steps):
+        log.append(env.step(some(env, rng)))
+        if not env.agents:
+            log.append(env.reset())
+    return log
+
+
+# --- the library's own tests ---------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("env_id", IDS)
+def test_parallel_api(env_id):
+    parallel_api_test(make(env_id), num_cycles=300)
+
+
+@pytest.mark.parametrize("env_id", IDS)
+def test_aec_api(env_id):
+    api_test(make(env_id, "aec"), num_cycles=200)
+
+
+@pytest.mark.parametrize("env_id", IDS)
+def test_library_seed_tests(env_id):
+    seed_test(functools.partial(make, env_id, "aec", max_cycles=40), num_cycles=60)
+    parallel_seed_test(functools.partial(make, env_id))
+
+
+@pytest.mark.parametrize("module", MODULES)
+def test_max_cycles(module):
+    max_cycles_test(module)
+
+
+@pytest.mark.parametrize("env_id", IDS)
+def test_render(env_id):
+    render_test(functools.partial(make, env_id, "aec"))
+
+
+@pytest.mark.parametrize("env_id", IDS)
+def test_state(env_id):
+    state_test(make(env_id, "aec"), make(env_id))
+
+
+# --- what they leave out -------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("env_id", IDS)
+def test_whole_episodes_replay_bit_for_bit(env_id):
+    """The library's parallel_seed_test compares one step, since it asks whether any *name* is true."""
+    one, other = (play(make(env_id, max_cycles=60), 150, seed=8) for _ in range(2))
+    assert data_equivalence(one, other, exact=True)
+    assert not data_equivalence(one, play(make(env_id, max_cycles=60), 150, seed=9))
+
+
+@pytest.mark.parametrize("env_id", IDS)
+def test_every_observation_and_every_state_is_in_its_space(env_id):
+    env, rng = make(env_id, max_cycles=80), np.random.default_rng(0)
+    env.reset(seed=0)
+    states = []
+    for _ in range(200):
+        actions = {name: np.sign(action) for name, action in some(env, rng).items()}
+        observations, rewards, terminated, truncated, infos = env.step(actions)
+        assert set(observations) == set(rewards) == set(terminated) == set(truncated) == set(infos) == set(actions)
+        assert all(observations[name] in env.observation_space(name) for name in observations)
+        assert all(type(value) is float for value in rewards.values())
+        assert all(type(value) is bool for value in (*terminated.values(), *truncated.values()))
+        for name, info in infos.items():
+            assert tuple(info["terms"]) == env.task.terms
+            assert sum(info["terms"].values()) == pytest.approx(rewards[name], abs=1e-12)
+        assert env.state() in env.state_space
+        states.append(env.state())
+        if not env.agents:
+            env.reset()
+    assert np.ptp(states, axis=0).max() > 0.1
+
+
+@pytest.mark.parametrize("env_id", IDS)
+def test_nothing_that_came_back_is_written_again(env_id):
+    env, rng = make(env_id), np.random.default_rng(0)
+    outcomes = [env.reset(seed=0)]
+    copies = [copy.deepcopy(outcomes[0])]
+    for _ in range(10):
+        outcomes.append(env.step(some(env, rng)))
+        copies.append(copy.deepcopy(outcomes[-1]))
+    assert data_equivalence(outcomes, copies, exact=True)
+    for before, after in itertools.pairwise(outcomes):
+        assert not {id(d) for d in before} & {id(d) for d in after}
+    for name in outcomes[-1][0]:
+        outcomes[-1][0][name][:] = 9.0  # and what a user writes into it changes nothing
+    outcomes[-1][3]["__all__"] = True  # as RLlib does
+    actions = some(env, rng)
+    twin, twin_rng = make(env_id), np.random.default_rng(0)
+    twin.reset(seed=0)
+    for _ in range(10):
+        twin.step(some(twin, twin_rng))
+    assert data_equivalence(env.step(actions), twin.step(actions), exact=True)
+
+
+@pytest.mark.parametrize("env_id", IDS)
+def test_names_and_spaces_stay_the_same_objects(env_id):
+    env = make(env_id)
+    env.reset(seed=0)
+    assert env.agents == env.possible_agents
+    assert env.metadata["name"] == str(env) == env_id.split("/")[1].lower().replace("-", "_")
+    for name in env.possible_agents:
+        assert env.observation_space(name) is env.observation_space(name)
+        assert env.action_space(name) is env.action_space(name)
+    with pytest.raises(ValueError, match=f"`{env.possible_agents[1]}`"):
+        env.action_space(env.possible_agents[1] + "x")
+
+
+def still(env):
+    return dict.fromkeys(env.agents, np.zeros(2))
+
+
+def test_who_is_captured_leaves_and_the_others_play_on():
+    env = make(PURSUIT, capture_distance=6.0)
+    for seed in range(50):  # until in a first step just one of the two is within reach
+        env.reset(seed=seed)
+        outcome = env.step(still(env))
+        gone = [name for name, over in outcome[2].items() if over]
+        if len(gone) == 1:
+            break
+    assert gone[0].startswith("evader")
+    assert all(set(part) == set(env.possible_agents) for part in outcome)
+    assert not any(outcome[3].values())
+    assert not any(info["is_success"] for info in outcome[4].values())
+    assert env.agents == [name for name in env.possible_agents if name not in gone]
+    with pytest.raises(ValueError, match=rf"{gone[0]}.*has left"):
+        env.step({**still(env), gone[0]: np.zeros(2)})
+    outcome = env.step(still(env))
+    assert all(set(part) == set(env.possible_agents) - set(gone) for part in outcome)
+
+
+def test_everybody_may_end_in_the_same_step():
+    env = make(PURSUIT, capture_distance=100.0)
+    env.reset(seed=0)
+    _, _, terminated, truncated, infos = env.step(still(env))
+    assert set(terminated) == set(env.possible_agents)
+    assert all(terminated.values())
+    assert not any(truncated.values())
+    assert all(info["is_success"] for info in infos.values())
+    assert all(set(info) & set(env.task.metric_names) for info in infos.values())
+    assert env.agents == []
+
+
+def test_who_ends_at_the_time_limit_is_truncated_too():
+    """RLlib calls an episode over when all are terminated or all are truncated, never for a mixture."""
+    env = make(PURSUIT, capture_distance=100.0, max_cycles=1)
+    env.reset(seed=0)
+    _, _, terminated, truncated, _ = env.step(still(env))
+    assert all(terminated.values())
+    assert all(truncated.values())
+
+
+def test_at_the_time_limit_everybody_is_truncated():
+    env = make(FLOCK, max_cycles=1)
+    env.reset(seed=0)
+    _, _, terminated, truncated, infos = env.step(still(env))
+    assert all(truncated.values())
+    assert not any(terminated.values())
+    assert env.agents == []
+    assert all(set(info) & set(env.task.metric_names) for info in infos.values())
+    with pytest.raises(ResetNeeded, match="reset"):
+        env.step({})
+    env.reset()
+    assert env.agents == env.possible_agents
+
+
+def test_a_user_who_writes_into_agents_changes_nothing():
+    env = make(FLOCK)
+    env.reset(seed=0)
+    env.agents.clear()
+    assert env.agents == env.possible_agents
+    env.step(still(env))
+
+
+@pytest.mark.parametrize("kind", ["parallel", "aec"])
+@pytest.mark.parametrize("clone", [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))])
+def test_a_copy_goes_on_as_the_original_would(kind, clone):
+    env = make(PURSUIT, kind, max_cycles=30, render_mode="human")
+    env.reset(seed=2)
+    for _ in range(7):
+        env.step(some(env, np.random.default_rng(0)) if kind == "parallel" else np.full(2, 0.5))
+    twin = clone(env)
+    for _ in range(20):
+        if kind == "parallel":
+            actions = some(env, np.random.default_rng(1))
+            assert data_equivalence(env.step(actions), twin.step(actions), exact=True)
+        else:
+            env.step(np.full(2, -0.5)), twin.step(np.full(2, -0.5))
+            assert data_equivalence(env.last(), twin.last(), exact=True)
+    env.close()
+    twin.close()
+
+
+def test_fewer_learners_than_boids_fly_among_scripted_ones():
+    env = make(FLOCK, learners=2)
+    assert len(env.possible_agents) == 2
+    assert env.task.agents == 6
+    assert len(make(FLOCK).possible_agents) == 6
+    assert len(pettingzoo.make("parallel", PURSUIT).possible_agents) == 5
+
+
+# --- bad input -----------------------------------------------------------------------------------------------------
+
+
+def refused(env, actions, *words):
+    """The refusal is one line with these words, and nothing has moved."""
+    before = env.state()
+    with pytest.raises(ValueError, match=r"^[^\n]*$") as error:
+        env.step(actions)
+    assert all(word in str(error.value) for word in words), str(error.value)
+    np.testing.assert_array_equal(env.state(), before)
+
+
+def test_bad_action_dictionaries_are_refused_by_name():
+    env = make(FLOCK)
+    env.reset(seed=0)
+    good = some(env, np.random.default_rng(0))
+    lacking = {name: good[name] for name in env.agents if name != "boid_3"}
+    refused(env, lacking, "'boid_3'")
+    refused(env, {**good, "boid_33": np.zeros(2)}, "'boid_33'", "did you mean `boid_3`")
+    for bad in (np.array([np.nan, 0]), np.array([0, np.inf]), np.zeros(3), 0.0, None, "left", {"x": 1}):
+        refused(env, {**good, "boid_4": bad}, "'boid_4'")
+    with pytest.raises(TypeError, match="dictionary"):
+        env.step(list(good.values()))
+    env.step(good)
+
+
+def test_by_turns_a_bad_action_is_refused_on_its_own_turn():
+    env = make(FLOCK, "aec")
+    env.reset(seed=0)
+    env.step(np.zeros(2))
+    assert env.agent_selection == "boid_1"
+    with pytest.raises(ValueError, match="'boid_1'"):
+        env.step(np.array([0.0, np.nan]))
+    assert env.agent_selection == "boid_1"
+    env.step(np.zeros(2))
+
+
+def test_actions_beyond_the_box_are_clipped_without_a_word():
+    observations = []
+    for big in (1.0, 5.0, 1e300):
+        env = make(FLOCK, "aec")
+        env.reset(seed=0)
+        for _ in env.agents:
+            env.step(np.array([big, -big]))
+        observations.append(env.observe("boid_0"))
+    np.testing.assert_array_equal(observations, [observations[0]] * 3)
+
+
+@pytest.mark.parametrize(
+    ("seed", "kind"), [(-1, ValueError), (2**64, ValueError), (1.5, TypeError), ("abc", TypeError)]
+)
+def test_bad_seeds_are_refused(seed, kind):
+    env = make(FLOCK)
+    with pytest.raises(kind, match="seed"):
+        env.reset(seed=seed)
+
+
+def test_an_unseeded_reset_tells_its_seed():
+    env = make(FLOCK)
+    observations, infos = env.reset()
+    again, _ = make(FLOCK).reset(seed=infos["boid_0"]["seed"])
+    assert data_equivalence(observations, again, exact=True)
+    assert make(FLOCK).reset()[1]["boid_0"]["seed"] != infos["boid_0"]["seed"]
+
+
+def test_bad_options_parameters_and_limits_are_refused():
+    env = make(FLOCK)
+    with pytest.raises(ValueError, match="'bogus'"):
+        env.reset(options={"bogus": 1})
+    with pytest.raises(ValueError, match="`agents`"):
+        pettingzoo.make("parallel", FLOCK, agnets=3)
+    with pytest.raises(ValueError, match="max_cycles"):
+        make(FLOCK, horizon=9)
+    for limit in (0, -5):
+        with pytest.raises(ValueError, match="time_limit"):
+            make(FLOCK, max_cycles=limit)
+        with pytest.raises(ValueError, match="max_cycles"):
+            env.max_cycles = limit
+    with pytest.raises(ValueError, match="`human`"):
+        make(FLOCK, render_mode="humann")
+
+
+def test_step_render_and_state_want_an_episode():
+    env = make(FLOCK, render_mode="rgb_array")
+    for call in (lambda: env.step({}), env.render, env.state):
+        with pytest.raises(ResetNeeded, match="reset"):
+            call()
+    env.reset(seed=0)
+    assert env.render().dtype == np.uint8
+    env.close()
+    env.close()
+    with pytest.raises(ResetNeeded, match="reset"):
+        env.step(dict.fromkeys(env.possible_agents, np.zeros(2)))
+
+
+def test_rendering_without_a_mode_warns():
+    env = make(FLOCK)
+    env.reset(seed=0)
+    with pytest.warns(UserWarning, match="render mode"):
+        assert env.render() is None
+
+
+def test_the_library_s_copies_warn_about_nothing():
+    """Conversions there and back, as other libraries do them."""
+    from pettingzoo.utils.conversions import aec_to_parallel
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        there_and_back = aec_to_parallel(make(PURSUIT, "aec"))
+        here = make(PURSUIT)
+        there_and_back.reset(seed=1), here.reset(seed=1)
+        for _ in range(5):
+            actions = some(here, np.random.default_rng(3))
+            ours, theirs = here.step(actions), there_and_back.step(actions)
+            assert data_equivalence(ours[0], theirs[0], exact=True)
+            assert ours[1] == dict(theirs[1])

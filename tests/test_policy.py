@@ -1,0 +1,440 @@
+"""Policies: SB3's actor in numpy, files refused when anything about them is wrong, players from names and files."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import subprocess
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from safetensors.numpy import save
+
+from flockenv.policy import MlpPolicy, Policy, RandomPolicy, load_player, save_policy
+
+TASK: Any = SimpleNamespace(
+    name="toy", layout=SimpleNamespace(size=5, digest="abc"), action_layout=SimpleNamespace(size=2)
+)
+CARD = {"activation": "tanh", "layout": "abc", "task": "toy", "steps": 1000, "wall_time_s": 1.5}
+
+
+def tensors(sizes: tuple[int, ...] = (5, 7, 6, 2), seed: int = 0) -> dict[str, np.ndarray]:
+    rng = np.random.default_rng(seed)
+    names = [f"policy.{k}" for k in range(len(sizes) - 2)] + ["action"]
+    made = {"log_std": rng.normal(-1, 0.1, sizes[-1])}
+    for name, inputs, outputs in zip(names, sizes, sizes[1:], strict=False):
+        made[f"{name}.weight"], made[f"{name}.bias"] = rng.normal(size=(outputs, inputs)), rng.normal(size=outputs)
+    return {name: tensor.astype(np.float32) for name, tensor in made.items()}
+
+
+@pytest.fixture
+def saved(tmp_path: Path) -> Path:
+    path = tmp_path / "toy.safetensors"
+    save_policy(path, tensors(), CARD)
+    return path
+
+
+def rewrite(path: Path, **changes: Any) -> None:
+    card = json.loads(path.with_suffix(".json").read_text())
+    card = {key: value for key, value in {**card, **changes}.items() if value is not None}
+    path.with_suffix(".json").write_text(json.dumps(card))
+
+
+def replace_weights(path: Path, data: bytes) -> None:
+    """Swap the weights for others that the card vouches for."""
+    path.write_bytes(data)
+    rewrite(path, sha256=hashlib.sha256(data).hexdigest())
+
+
+# --- the random player
+
+
+def test_random_player_is_uniform_reproducible_and_records_its_seed() -> None:
+    a, b = RandomPolicy(3, seed=7), RandomPolicy(3, seed=7)
+    rows = np.zeros((20_000, 9), np.float32)
+    first, state = a.predict(rows, deterministic=True)
+    assert first.dtype == np.float32
+    assert first.shape == (20_000, 3)
+    assert state is None
+    np.testing.assert_array_equal(first, b.predict(rows)[0])
+    assert not np.array_equal(first, a.predict(rows)[0])
+    assert np.abs(first).max() <= 1
+    np.testing.assert_allclose(np.quantile(first, [0.1, 0.5, 0.9]), [-0.8, 0.0, 0.8], atol=0.02)
+    unseeded = RandomPolicy(3)
+    again = RandomPolicy(3, unseeded.seed)
+    np.testing.assert_array_equal(unseeded.predict(rows)[0], again.predict(rows)[0])
+    assert RandomPolicy(3, 0).predict(rows[0])[0].shape == (3,)
+    with pytest.raises(ValueError, match="action_size: 0"):
+        RandomPolicy(0)
+
+
+# --- the actor in numpy
+
+
+def test_actor_is_the_formula_on_paper() -> None:
+    t = {
+        "policy.0.weight": np.array([[1, -2], [0.5, 0]], np.float32),
+        "policy.0.bias": np.array([0.1, -1], np.float32),
+        "action.weight": np.array([[2, 3]], np.float32),
+        "action.bias": np.array([0.25], np.float32),
+        "log_std": np.array([-2], np.float32),
+    }
+    x = np.array([0.3, 0.1], np.float32)
+    hidden = np.array([0.3 - 0.2 + 0.1, 0.15 - 1])
+    tanh = 2 * np.tanh(hidden[0]) + 3 * np.tanh(hidden[1]) + 0.25
+    relu = 2 * 0.2 + 0.25
+    assert MlpPolicy(t, {"activation": "tanh"}).predict(x, deterministic=True)[0] == pytest.approx(max(tanh, -1))
+    assert MlpPolicy(t, {"activation": "relu"}).predict(x, deterministic=True)[0] == pytest.approx(relu, rel=1e-6)
+
+
+def test_actor_takes_one_row_or_many_clips_and_leaves_its_input_alone() -> None:
+    policy = MlpPolicy(tensors(), CARD)
+    rows = np.random.default_rng(1).normal(size=(50, 5)).astype(np.float32)
+    before = rows.copy()
+    actions, state = policy.predict(rows, ("kept",), None, True)  # type: ignore[arg-type]
+    assert actions.shape == (50, 2)
+    assert actions.dtype == np.float32
+    assert state == ("kept",)
+    np.testing.assert_array_equal(rows, before)
+    np.testing.assert_allclose(policy.predict(rows[3], deterministic=True)[0], actions[3], atol=1e-6)
+    assert actions.max() == 1  # some are beyond
+    assert actions.min() == -1
+    with pytest.raises(ValueError, match=r"observation: shape \(50, 4\), must be \(5,\) or \(rows, 5\)"):
+        policy.predict(rows[:, :4])
+    with pytest.raises(ValueError, match="observation: shape"):
+        policy.predict(rows[None])
+
+
+def test_actor_samples_the_gaussian_of_its_log_std_from_its_own_generator() -> None:
+    t = tensors((5, 2))
+    t = {
+        **t,
+        "action.weight": 0 * t["action.weight"],
+        "action.bias": np.float32([0.1, -0.2]),
+        "log_std": np.float32([-3, -2]),
+    }
+    rows = np.zeros((40_000, 5), np.float32)
+    np.random.seed(0)  # noqa: NPY002 - the global generator must not matter
+    actions = MlpPolicy(t, CARD, seed=3).predict(rows)[0]
+    np.testing.assert_array_equal(actions, MlpPolicy(t, CARD, seed=3).predict(rows)[0])
+    assert not np.array_equal(actions, MlpPolicy(t, CARD, seed=4).predict(rows)[0])
+    np.testing.assert_allclose(actions.mean(axis=0), [0.1, -0.2], atol=4 * np.exp(-2) / 200)
+    np.testing.assert_allclose(actions.std(axis=0), np.exp([-3, -2]), rtol=0.02)
+    assert np.abs(MlpPolicy({**t, "log_std": np.float32([3, 3])}, CARD).predict(rows)[0]).max() == 1
+
+
+@pytest.mark.parametrize("activation", ["tanh", "relu"])
+def test_actor_equals_stable_baselines3(activation: str) -> None:
+    torch = pytest.importorskip("torch")
+    policies = pytest.importorskip("stable_baselines3.common.policies")
+    from gymnasium.spaces import Box
+
+    kind = {"tanh": torch.nn.Tanh, "relu": torch.nn.ReLU}[activation]
+    torch.manual_seed(0)
+    theirs = policies.ActorCriticPolicy(
+        Box(-1, 1, (11,), np.float32),
+        Box(-1, 1, (2,), np.float32),
+        lambda _: 1e-3,
+        net_arch={"pi": [64, 48], "vf": [8]},
+        activation_fn=kind,
+        ortho_init=False,
+    )
+    given = theirs.state_dict()
+    names = {
+        "policy.0": "mlp_extractor.policy_net.0",
+        "policy.1": "mlp_extractor.policy_net.2",
+        "action": "action_net",
+    }
+    t = {f"{a}.{part}": given[f"{b}.{part}"].numpy() for a, b in names.items() for part in ("weight", "bias")}
+    ours = MlpPolicy({**t, "log_std": given["log_std"].numpy()}, {"activation": activation})
+    rows = np.random.default_rng(0).uniform(-1, 1, (500, 11)).astype(np.float32)
+    expected, _ = theirs.predict(rows, deterministic=True)
+    np.testing.assert_allclose(ours.predict(rows, deterministic=True)[0], expected, atol=1e-6)
+    np.testing.assert_allclose(ours.predict(rows[0], deterministic=True)[0], expected[0], atol=1e-6)
+
+
+def test_importing_and_using_a_policy_needs_no_torch() -> None:
+    code = (
+        "import sys, numpy as np; from flockenv.policy import MlpPolicy, RandomPolicy;"
+        "RandomPolicy(2).predict(np.zeros((3, 4)));"
+        "bad = {'torch', 'matplotlib', 'stable_baselines3'} & set(sys.modules); assert not bad, bad"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True, cwd=Path(__file__).parent.parent)
+
+
+# --- files
+
+
+def test_what_was_saved_is_loaded(saved: Path) -> None:
+    policy = MlpPolicy.load(saved, TASK)
+    rows = np.random.default_rng(0).normal(size=(9, 5)).astype(np.float32)
+    expected = MlpPolicy(tensors(), CARD).predict(rows, deterministic=True)[0]
+    np.testing.assert_array_equal(policy.predict(rows, deterministic=True)[0], expected)
+    assert isinstance(policy, Policy)
+    assert policy.card["steps"] == 1000
+    assert policy.card["sha256"] == hashlib.sha256(saved.read_bytes()).hexdigest()
+    assert (policy.card["observation_size"], policy.card["action_size"]) == (5, 2)
+    assert sorted(path.name for path in saved.parent.iterdir()) == ["toy.json", "toy.safetensors"]
+    assert repr(policy) == "MlpPolicy(5 -> 7 -> 6 -> 2, tanh, seed=0)"
+    save_policy(saved, tensors(), policy.card)  # a card that was read can be written again
+
+
+def test_a_network_without_hidden_layers_is_a_network(tmp_path: Path) -> None:
+    save_policy(tmp_path / "linear.safetensors", tensors((5, 2)), CARD)
+    assert MlpPolicy.load(tmp_path / "linear.safetensors", TASK).predict(np.ones(5))[0].shape == (2,)
+
+
+@pytest.mark.parametrize("kept", [0.0, 0.1, 0.5, 0.99])
+def test_truncated_weights_are_refused_in_one_line(saved: Path, kept: float) -> None:
+    data = saved.read_bytes()
+    saved.write_bytes(data[: int(kept * len(data))])
+    refused(saved, "not those of the card")
+    replace_weights(saved, data[: int(kept * len(data))])
+    refused(saved, "not a safetensors file")
+
+
+def test_one_flipped_bit_is_noticed(saved: Path) -> None:
+    data = bytearray(saved.read_bytes())
+    data[len(data) // 2] ^= 1
+    saved.write_bytes(data)
+    refused(saved, "not those of the card")
+
+
+@pytest.mark.parametrize(
+    ("name", "change", "message"),
+    [
+        ("action.bias", None, "tensor 'action.bias' is missing"),
+        ("log_std", None, "tensor 'log_std' is missing"),
+        ("policy.0.weight", None, "tensor 'policy."),
+        ("value.bias", np.zeros(2, np.float32), "tensor 'value.bias' is not one of an MLP actor"),
+        ("policy.9.weight", np.zeros((2, 2), np.float32), "tensor 'policy."),
+        ("policy.1.bias", np.zeros(5, np.float32), r"tensor 'policy.1.bias' has shape \(5,\), .* \(6,\)"),
+        ("policy.1.weight", np.zeros((6, 6), np.float32), r"tensor 'policy.1.weight' has shape \(6, 6\), .* \(6, 7\)"),
+        ("policy.1.weight", np.zeros(6, np.float32), r"tensor 'policy.1.weight' has shape \(6,\)"),
+        ("policy.0.weight", np.zeros((7, 0), np.float32), r"tensor 'policy.0.weight' has shape \(7, 0\)"),
+        ("policy.0.weight", np.float32(1), "tensor 'policy.0.weight' has shape"),
+        ("log_std", np.zeros(3, np.float32), r"tensor 'log_std' has shape \(3,\)"),
+        ("log_std", np.zeros(2), "tensor 'log_std' is float64, must be float32"),
+        ("action.bias", np.float32([np.nan, 0]), "tensor 'action.bias' holds NaN or infinity"),
+        ("action.bias", np.float32([np.inf, 0]), "tensor 'action.bias' holds NaN or infinity"),
+    ],
+)
+def test_foreign_tensors_are_refused_at_load_and_at_save(saved: Path, name: str, change: Any, message: str) -> None:
+    wrong = {key: value for key, value in {**tensors(), name: change}.items() if value is not None}
+    target = saved.parent / "new" / "wrong.safetensors"
+    with pytest.raises(ValueError, match=message):
+        save_policy(target, wrong, CARD)
+    assert not target.parent.exists()
+    replace_weights(saved, save({key: np.ascontiguousarray(value) for key, value in wrong.items()}))
+    refused(saved, message)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"activation": "tahn"}, "activation: 'tahn', did you mean `tanh`\\?; allowed: 'tanh', 'relu'"),
+        ({"activation": "__import__('os')"}, "allowed: 'tanh', 'relu'"),
+        ({"activation": ["tanh"]}, "allowed: 'tanh', 'relu'"),
+        ({"activation": None}, "lacks 'activation'"),
+        ({"sha256": None}, "lacks 'sha256'"),
+        ({"version": 2}, "has version 2; this flockenv reads 1"),
+        ({"observation_size": 6}, "the card says observation_size = 6, the weights are for 5"),
+        ({"action_size": 3}, "the card says action_size = 3, the weights are for 2"),
+        ({"layout": "abd"}, "made for observation layout 'abd', task 'toy' has 'abc'"),
+        ({"layout": None}, "made for observation layout None, task 'toy' has 'abc'"),
+    ],
+)
+def test_cards_that_do_not_fit_are_refused(saved: Path, change: dict[str, Any], message: str) -> None:
+    rewrite(saved, **change)
+    refused(saved, message)
+
+
+def test_another_tasks_sizes_are_refused(saved: Path) -> None:
+    wider = SimpleNamespace(**{**vars(TASK), "layout": SimpleNamespace(size=9, digest="abc")})
+    with pytest.raises(ValueError, match="made for observation_size = 5, task 'toy' has 9"):
+        MlpPolicy.load(saved, wider)
+    stronger = SimpleNamespace(**{**vars(TASK), "action_layout": SimpleNamespace(size=3)})
+    with pytest.raises(ValueError, match="made for action_size = 2, task 'toy' has 3"):
+        MlpPolicy.load(saved, stronger)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (b"", "is not JSON"),
+        (b"{", "is not JSON"),
+        (b"\xff\xfe{}", "is not JSON"),
+        (b"[" * 100_000, "is not JSON"),
+        (b"[]", "holds a list, must be an object"),
+        (b'{"version": 1, "version": 1}', "names 'version' twice"),
+        (b'{"version": NaN}', "holds NaN"),
+        (b" " * (9 << 20), "at most 8388608 are read"),
+    ],
+)
+def test_broken_cards_are_refused(saved: Path, text: bytes, message: str) -> None:
+    saved.with_suffix(".json").write_bytes(text)
+    refused(saved, message)
+
+
+def test_missing_files_are_refused(saved: Path) -> None:
+    saved.with_suffix(".json").rename(saved.parent / "elsewhere.json")
+    refused(saved, "'toy.json' cannot be read: No such file")
+    (saved.parent / "elsewhere.json").rename(saved.with_suffix(".json"))
+    saved.unlink()
+    refused(saved, "'toy.safetensors' cannot be read: No such file")
+
+
+def refused(path: Path, message: str) -> None:
+    with pytest.raises(ValueError, match=message) as caught:
+        MlpPolicy.load(path, TASK)
+    assert "\n" not in str(caught.value)
+    assert str(caught.value).startswith("policy '")
+    assert len(str(caught.value)) < 600
+
+
+def test_a_card_may_not_contradict_its_weights(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="card: observation_size = 6, the weights say 5"):
+        save_policy(tmp_path / "x.safetensors", tensors(), {**CARD, "observation_size": 6})
+    with pytest.raises(ValueError, match=r"must end in \.safetensors"):
+        save_policy(tmp_path / "x.npz", tensors(), CARD)
+    with pytest.raises(ValueError, match="not JSON compliant"):
+        save_policy(tmp_path / "x.safetensors", tensors(), {**CARD, "score": float("nan")})
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_failed_save_leaves_the_old_policy(saved: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    before = {path.name: path.read_bytes() for path in saved.parent.iterdir()}
+
+    def full(_: int) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("os.fsync", full)
+    with pytest.raises(OSError, match="No space left"):
+        save_policy(saved, tensors(seed=1), CARD)
+    assert {path.name: path.read_bytes() for path in saved.parent.iterdir()} == before
+
+
+# --- players by name and by file
+
+
+class Still:
+    def __init__(self, task: Any) -> None:
+        self.size = task.action_layout.size
+
+    def predict(
+        self, observation: Any, state: Any = None, episode_start: Any = None, deterministic: Any = False
+    ) -> Any:
+        return np.zeros((len(observation), self.size), np.float32), state
+
+
+def test_known_names_come_first_and_unknown_ones_get_a_suggestion(tmp_path: Path) -> None:
+    assert isinstance(load_player("still", TASK, {"still": Still}), Still)
+    with pytest.raises(ValueError, match=r"player 'stil': unknown, did you mean `still`\?; allowed: 'still', or a"):
+        load_player("stil", TASK, {"still": Still})
+    with pytest.raises(ValueError, match="allowed: no name"):
+        load_player("x", TASK)
+
+
+@pytest.mark.parametrize("name", ["a\0b.py", "a\0b.safetensors", "x" * 300 + ".py", "no/such.py", ".", "", "\x1b[2Jx"])
+def test_hostile_names_are_refused_in_one_printable_line(name: str) -> None:
+    with pytest.raises(ValueError, match="player ") as caught:
+        load_player(name, TASK, {"still": Still})
+    assert str(caught.value).isprintable()
+    assert len(str(caught.value)) < 500
+
+
+def test_weights_are_a_player(saved: Path) -> None:
+    assert isinstance(load_player(str(saved), TASK), MlpPolicy)
+    assert isinstance(load_player(saved, TASK), MlpPolicy)
+
+
+HALF = "0.5 + 0 * observation[:, :2]"
+FILES = {
+    "short": f"""
+def predict(observation):
+    return {HALF}""",
+    "whole": f"""
+def predict(observation, state, episode_start, deterministic):
+    return {HALF}, state""",
+    "sb3": f"""
+def predict(observation, state=None, episode_start=None, deterministic=False):
+    return {HALF}, state""",
+    "class": f"""
+class Player:
+    def predict(self, observation, *rest, **more):
+        return {HALF}, None""",
+    "class of a task": f"""
+class Player:
+    def __init__(self, task):
+        assert task.name == "toy"
+    def predict(self, observation, *rest, **more):
+        return {HALF}, None""",
+    "factory": f"""
+import dataclasses
+
+@dataclasses.dataclass
+class Half:
+    name: str
+    def predict(self, observation, *rest, **more):
+        return {HALF}, None
+
+def player(task):
+    return Half(task.name)""",
+}
+
+
+@pytest.mark.parametrize("source", FILES.values(), ids=FILES)
+def test_a_python_file_is_a_player(tmp_path: Path, source: str) -> None:
+    path = tmp_path / "half.py"
+    path.write_text(source)
+    action, state = load_player(str(path), TASK).predict(np.zeros((3, 5), np.float32), None, None, True)
+    np.testing.assert_array_equal(action, np.full((3, 2), 0.5))
+    assert state is None
+
+
+@pytest.mark.parametrize(
+    ("source", "message"),
+    [
+        ("x = 1", "needs a function predict or player"),
+        ("def predict(:", "SyntaxError while loading it"),
+        ("import no_such_module_xyz", "ModuleNotFoundError while loading it: No module named 'no_such_module_xyz'"),
+        ("def player(task):\n    return 3", "what it made, a int, has no predict"),
+        ("\0", "while loading it"),
+    ],
+)
+def test_a_python_file_that_is_no_player_is_refused(tmp_path: Path, source: str, message: str) -> None:
+    path = tmp_path / "half.py"
+    path.write_text(source)
+    with pytest.raises(ValueError, match=message):
+        load_player(path, TASK)
+
+
+def test_two_files_of_one_name_stay_two_players(tmp_path: Path) -> None:
+    for folder, value in (("a", 0.25), ("b", 0.75)):
+        (tmp_path / folder).mkdir()
+        (tmp_path / folder / "p.py").write_text(f"def predict(o):\n    return {value} + 0 * o[:, :2]")
+    a, b = (load_player(tmp_path / folder / "p.py", TASK) for folder in "ab")
+    rows = np.zeros((1, 5), np.float32)
+    assert a.predict(rows)[0][0, 0] == 0.25
+    assert b.predict(rows)[0][0, 0] == 0.75
+
+
+def test_a_zip_is_opened_only_when_trusted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "model.zip"
+    path.write_bytes(b"PK")
+    opened: list[Path] = []
+
+    def load_sb3_zip(path: Path) -> Still:
+        opened.append(path)
+        return Still(TASK)
+
+    monkeypatch.setitem(sys.modules, "flockenv.sb3", SimpleNamespace(load_sb3_zip=load_sb3_zip))
+    with pytest.raises(ValueError, match=r"executes the code stored in it; .* --trust-pickle"):
+        load_player(path, TASK)
+    assert opened == []
+    assert isinstance(load_player(path, TASK, trust_pickle=True), Still)
+    assert opened == [path]

@@ -1,0 +1,589 @@
+from __future__ import annotations
+
+import base64
+import json
+import os
+import pickle
+import re
+import subprocess
+import sys
+import weakref
+from collections.abc import Iterator
+from dataclasses import replace
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from flockenv.render import Group, Panel, Window, draw, write_gif, write_png, write_replay
+from flockenv.render.palette import ROLE_COLOURS, rgb
+from flockenv.snapshot import ROLES, Mark, Snapshot
+
+
+def shot(pos: Any = ((5.0, 5.0),), vel: Any = None, **fields: Any) -> Snapshot:
+    pos = np.array(pos, dtype=float)
+    n, d = pos.shape
+    given = {
+        "time": 0.0,
+        "vel": np.zeros((n, d)) if vel is None else vel,
+        "alive": np.ones(n, dtype=bool),
+        "radius": np.full(n, 0.5),
+        "roles": ("evader",) * n,
+        "obstacle_centre": np.empty((0, d)),
+        "obstacle_radius": np.empty(0),
+        "marks": (),
+        "low": np.zeros(d),
+        "high": np.full(d, 10.0),
+        "periodic": False,
+        "title": "",
+    }
+    return Snapshot(pos=pos, **{**given, **fields})
+
+
+def close_to(image: np.ndarray, colour: tuple[int, int, int], within: int = 12) -> np.ndarray:
+    return np.abs(image.astype(int) - colour).max(axis=2) <= within
+
+
+def blob(image: np.ndarray, role: str) -> tuple[float, float]:
+    # The caption, which shows the roles' colours too, lies above the world.
+    rows, columns = np.nonzero(close_to(image, rgb(ROLE_COLOURS[role][0])) & (np.arange(len(image)) > 50)[:, None])
+    assert len(rows)
+    return columns.mean(), rows.mean()
+
+
+def difference(one: np.ndarray, other: np.ndarray) -> np.ndarray:
+    return np.abs(one.astype(int) - other).max(axis=2)
+
+
+# ---- snapshot
+
+
+def test_snapshot_copies_and_is_read_only() -> None:
+    vel = np.ones((1, 2))
+    made = shot(vel=vel)
+    vel[:] = 7.0
+    assert (made.vel == 1.0).all()
+    for name in ("pos", "vel", "alive", "radius", "obstacle_centre", "obstacle_radius", "low", "high"):
+        with pytest.raises(ValueError, match="read-only"):
+            getattr(made, name)[...] = 0
+    with pytest.raises(AttributeError):
+        made.time = 1.0  # type: ignore[misc]
+
+
+def test_snapshot_survives_pickling() -> None:
+    made = shot(marks=(Mark("goal", [1.0, 2.0], [0.0, 0.0], 1.0),))
+    again = pickle.loads(pickle.dumps(made))
+    assert (draw(again) == draw(made)).all()
+
+
+@pytest.mark.parametrize(
+    ("fields", "says"),
+    [
+        ({"pos": [[1.0, 2.0, 3.0, 4.0]]}, "Snapshot.pos: must have 2 or 3 coordinates, got 4"),
+        ({"vel": np.zeros((2, 2))}, r"Snapshot.vel: must have shape \(1, 2\), got shape \(2, 2\)"),
+        ({"vel": "fast"}, "Snapshot.vel: must be numbers, got str"),
+        ({"alive": [1.0]}, "Snapshot.alive: must be bool, got float64"),
+        ({"radius": [-1.0]}, "Snapshot.radius: must be >= 0 m, got -1.0"),
+        ({"radius": [np.nan]}, "Snapshot.radius: must be finite, got nan"),
+        ({"roles": ("evdaer",)}, "Snapshot.roles: unknown 'evdaer'.*did you mean 'evader'"),
+        ({"roles": "evader"}, "Snapshot.roles: must be a tuple of 1 names"),
+        ({"roles": ("evader", "evader")}, "Snapshot.roles: must have 1 names"),
+        ({"obstacle_radius": [1.0]}, r"Snapshot.obstacle_radius: must have shape \(0,\)"),
+        ({"high": [10.0, 0.0]}, "Snapshot.low: must be below high"),
+        ({"time": np.inf}, "Snapshot.time: must be finite"),
+        ({"title": 3}, "Snapshot.title: must be a str, got int"),
+        ({"marks": ("goal",)}, "Snapshot.marks: must hold Mark, got str"),
+        ({"marks": (Mark("goal", np.ones(3), np.ones(3), 0.0),)}, "Snapshot.marks: must have 2 coordinates, got 3"),
+    ],
+)
+def test_snapshot_refuses_in_one_line(fields: dict[str, Any], says: str) -> None:
+    with pytest.raises((ValueError, TypeError), match=says) as caught:
+        shot(**fields)
+    assert "\n" not in str(caught.value)
+
+
+def test_mark_refuses_an_unknown_kind_and_a_negative_radius() -> None:
+    with pytest.raises(ValueError, match="did you mean 'goal'"):
+        Mark("gaol", np.zeros(2), np.zeros(2), 1.0)
+    with pytest.raises(ValueError, match=r"Mark.radius: must be >= 0 m, got -1.0"):
+        Mark("goal", np.zeros(2), np.zeros(2), -1.0)
+
+
+# ---- draw
+
+
+@pytest.mark.parametrize("role", ROLES)
+def test_an_agent_shows_its_roles_colour_where_it_is(role: str) -> None:
+    x0, y0 = blob(draw(shot([(5.0, 5.0)], roles=(role,))), role)
+    x1, y1 = blob(draw(shot([(7.0, 6.0)], roles=(role,))), role)
+    metre = (x1 - x0) / 2.0
+    assert 45.0 < metre < 60.0  # ten metres over the most of 600 px
+    assert y0 - y1 == pytest.approx(metre, abs=0.6)  # y points up
+    assert x0 == pytest.approx(299.5, abs=0.6)  # the world's middle is the picture's
+
+
+@pytest.mark.parametrize("degrees", range(0, 360, 30))
+def test_a_dart_points_along_the_velocity(degrees: int) -> None:
+    way = np.array([np.cos(np.radians(degrees)), np.sin(np.radians(degrees))])
+    image = draw(shot(vel=[3.0 * way], radius=[1.0]))
+    x, y = blob(draw(shot(radius=[1.0])), "evader")
+    solid = close_to(image, rgb(ROLE_COLOURS["evader"][0]), 30)
+    ahead, behind = (tuple(np.rint((y - r * way[1], x + r * way[0])).astype(int)) for r in (36.0, -36.0))
+    assert solid[ahead]
+    assert not solid[behind]
+
+
+def test_an_agent_shows_its_body_radius() -> None:
+    image = draw(shot([(5.0, 5.0)], [(1.0, 0.0)], radius=[1.5]))
+    rows = np.flatnonzero(difference(image, draw(shot(np.empty((0, 2))))).max(axis=1)[60:])
+    metre = np.diff([blob(draw(shot([(x, 5.0)])), "evader")[0] for x in (2.0, 8.0)])[0] / 6.0
+    assert rows[-1] - rows[0] == pytest.approx(2.0 * 1.5 * metre, abs=2.5)
+
+
+def test_nobody_is_drawn_where_nobody_is() -> None:
+    empty = draw(shot(np.empty((0, 2))))
+    assert (difference(draw(shot([(2.0, 2.0)])), empty)[60:].max()) > 100
+    for hidden in (
+        shot([(2.0, 2.0)], alive=[False], roles=("agent",)),  # an unused row of the table
+        shot([(np.nan, 2.0)]),
+        shot([(2.0, 2.0)], [(np.inf, 0.0)]),
+        shot([(1e300, -1e300)], [(1e300, 1e300)]),
+    ):
+        assert difference(draw(hidden), empty)[60:].max() == 0
+
+
+def test_who_was_caught_leaves_a_cross() -> None:
+    image = draw(shot(alive=[False], radius=[1.0]))
+    x, y = np.rint(blob(draw(shot(radius=[1.0])), "evader")).astype(int)
+    marked = difference(image, draw(shot(np.empty((0, 2))))) > 60
+    assert marked[y + 25, x + 25]
+    assert marked[y - 25, x + 25]
+    assert not marked[y, x + 25]
+
+
+def test_a_body_on_the_seam_is_seen_on_both_sides_and_only_inside() -> None:
+    here = {"pos": [(0.1, 5.0)], "radius": [0.8]}
+    box, torus = draw(shot(**here)), draw(shot(**here, periodic=True))
+    empty = draw(shot(np.empty((0, 2)), periodic=True))
+    seen = difference(torus, empty) > 20
+    assert not (difference(box, draw(shot(np.empty((0, 2))))) > 20)[60:, 400:].any()
+    assert seen[60:, 540:572].any()
+    assert not seen[60:, :28].any()
+    assert not seen[60:, 574:].any()
+
+
+def test_no_body_covers_the_caption() -> None:
+    plain = draw(shot(np.empty((0, 2)), title="x"))
+    covered = draw(shot([(5.0, 10.3)], title="x", radius=[2.0], roles=("agent",)))
+    assert (covered[:38, :100] == plain[:38, :100]).all()
+
+
+def test_obstacles_goals_and_headings_are_seen() -> None:
+    empty = draw(shot(np.empty((0, 2))))
+
+    def change(**fields: Any) -> np.ndarray:
+        return difference(draw(shot(np.empty((0, 2)), **fields)), empty) > 20
+
+    stone = change(obstacle_centre=[(5.0, 5.0)], obstacle_radius=[2.0])
+    goal = change(marks=(Mark("goal", [5.0, 5.0], [0.0, 0.0], 2.0),))
+    assert stone.sum() == pytest.approx(np.pi * (2.0 * 54.0) ** 2, rel=0.05)
+    assert goal.sum() == pytest.approx(stone.sum(), rel=0.02)
+    ring = close_to(draw(shot(np.empty((0, 2)), marks=(Mark("goal", [5.0, 5.0], [0.0, 0.0], 2.0),))), (0, 158, 115))
+    assert 0 < ring.sum() < 0.1 * goal.sum()  # a ring: one can see who is inside
+    x, y = 300, np.nonzero(stone)[0].mean()
+    east = change(marks=(Mark("heading", [5.0, 5.0], [9.0, 0.0], 0.0),))
+    north = change(marks=(Mark("heading", [5.0, 5.0], [0.0, 0.01], 0.0),))
+    assert np.nonzero(east)[1].mean() > x + 30
+    assert np.nonzero(north)[0].mean() < y - 30
+    assert east.sum() == pytest.approx(north.sum(), rel=0.1)  # only the direction counts
+    assert not change(marks=(Mark("heading", [5.0, 5.0], [0.0, 0.0], 0.0),)).any()
+
+
+def test_what_is_nearer_in_three_dimensions_is_larger_and_on_top() -> None:
+    empty = draw(shot(np.empty((0, 3))))
+    area = [(difference(draw(shot([(5.0, 5.0, z)])), empty)[60:] > 8).sum() for z in (0.0, 5.0, 10.0)]
+    assert area[0] < area[1] < area[2]
+    two = {"roles": ("evader", "pursuer"), "radius": [1.0, 1.0]}
+    image = draw(shot([(5.0, 5.0, 10.0), (5.0, 5.0, 2.0)], **two))
+    x, y = np.rint(blob(image, "evader")).astype(int)
+    assert close_to(image, rgb(ROLE_COLOURS["evader"][0]), 20)[y, x]
+
+
+def test_trails_show_the_way_and_do_not_streak_across_the_seam() -> None:
+    way = [shot([((8.0 + 0.5 * k) % 10.0, 5.0)], [(1.0, 0.0)], radius=[0.2], periodic=True) for k in range(8)]
+    trail = difference(draw(way[-1], trails=way[:-1]), draw(way[-1])) > 8
+    columns = np.flatnonzero(trail.any(axis=0))
+    assert columns[-1] > 520  # before the seam
+    assert columns[0] < 40  # behind it
+    assert not trail[:, 120:420].any()
+    with pytest.raises(ValueError, match="trails: must have positions of shape"):
+        draw(way[0], trails=[shot(np.zeros((3, 2)))])
+
+
+@pytest.mark.parametrize("high", [(10.0, 10.0), (40.0, 10.0), (3.0, 30.0), (1000.0, 1.0)])
+def test_pictures_are_even_and_fit(high: tuple[float, float]) -> None:
+    image = draw(shot(np.empty((0, 2)), high=high), size=301)
+    assert image.dtype == np.uint8
+    assert image.shape[1:] == (300, 3)
+    assert image.shape[0] % 2 == 0
+    assert image.shape[0] <= 302
+
+
+def test_drawing_twice_gives_the_same_and_leaves_the_kept_backdrop_alone() -> None:
+    one = shot(np.random.default_rng(0).uniform(0, 10, (9, 2)), title="same")
+    first = draw(one)
+    draw(shot(title="same"))
+    assert (draw(one) == first).all()
+    first[:] = 0
+    assert draw(one).any()
+
+
+@pytest.mark.parametrize("title", ["\x1b[2J", "a\nb", "\ud800", "🐟" * 500, "", "<script>"])
+def test_any_title_can_be_drawn(title: str) -> None:
+    assert draw(shot(title=title), size=200).shape == (200, 200, 3)
+
+
+@pytest.mark.parametrize(
+    ("options", "error"),
+    [
+        ({"size": 0}, ValueError),
+        ({"size": 10**9}, ValueError),
+        ({"size": 3.5}, TypeError),
+        ({"scale": 0}, ValueError),
+        ({"scale": True}, TypeError),
+    ],
+)
+def test_draw_refuses_a_bad_size(options: dict[str, Any], error: type[Exception]) -> None:
+    with pytest.raises(error, match=f"^{next(iter(options))}: must be"):
+        draw(shot(), **options)
+
+
+# ---- backends
+
+
+def test_importing_the_package_imports_no_backend_and_drawing_needs_no_display() -> None:
+    program = (
+        "import sys, flockenv.render; loaded = lambda *names: [n for n in names if n in sys.modules];"
+        "assert not loaded('PIL', 'matplotlib', 'pygame'), loaded('PIL', 'matplotlib', 'pygame');"
+        "from flockenv.render import draw, write_gif, write_replay; from flockenv.snapshot import Snapshot;"
+        "draw(Snapshot(0, [[1, 1]], [[1, 0]], [True], [1], ['agent'], [[2, 2]], [1], (), [0, 0], [3, 3], True, 'x'));"
+        "assert not loaded('matplotlib', 'pygame', 'torch'), loaded('matplotlib', 'pygame', 'torch')"
+    )
+    env = {k: v for k, v in os.environ.items() if k not in ("DISPLAY", "WAYLAND_DISPLAY", "SDL_VIDEODRIVER")}
+    done = subprocess.run(
+        [sys.executable, "-c", program], cwd=Path(__file__).parents[1], env=env, capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stderr
+
+
+def test_an_unknown_name_is_an_attribute_error_that_lists_the_known() -> None:
+    import flockenv.render
+
+    with pytest.raises(AttributeError, match="write_replay"):
+        _ = flockenv.render.write_mp4  # type: ignore[attr-defined]
+    assert "draw" in dir(flockenv.render)
+
+
+def test_window_shows_the_frame_and_closes_twice(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
+    pygame = pytest.importorskip("pygame")
+    window = Window("test")
+    frame = draw(shot(), size=100)
+    window.show(frame, fps=1000.0)
+    assert (pygame.surfarray.array3d(pygame.display.get_surface()).swapaxes(0, 1) == frame).all()
+    assert not pygame.mixer.get_init()  # display alone, not pygame.init()
+    assert not pygame.font.get_init()
+    window.show(draw(shot(), size=80), fps=1000.0)
+    assert pygame.display.get_surface().get_size() == (80, 80)
+    with pytest.raises(ValueError, match="fps: must be above 0"):
+        window.show(frame, fps=0.0)
+    window.close()
+    window.close()
+    window.show(frame, fps=1000.0)
+    assert not pygame.display.get_init()
+
+
+def test_closing_the_window_by_hand_lets_the_run_go_on(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
+    pygame = pytest.importorskip("pygame")
+    window, frame = Window(), draw(shot(), size=64)
+    window.show(frame, fps=1000.0)
+    pygame.event.post(pygame.event.Event(pygame.QUIT))
+    window.show(frame, fps=1000.0)
+    assert not window.is_open
+    window.show(frame, fps=1000.0)
+
+
+def test_two_windows_outlive_each_other(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
+    pytest.importorskip("pygame")
+    one, two, frame = Window(), Window(), draw(shot(), size=64)
+    one.show(frame, fps=1000.0)
+    two.show(frame, fps=1000.0)
+    one.close()
+    two.show(frame, fps=1000.0)
+    assert two.is_open
+    two.close()
+
+
+def test_without_pygame_the_remedy_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "pygame", None)
+    with pytest.raises(ImportError, match=r"pip install 'flockenv\[render\]'") as caught:
+        Window()
+    assert "\n" not in str(caught.value)
+
+
+# ---- files
+
+
+def noise(n: int, height: int = 40, width: int = 60) -> Iterator[np.ndarray]:
+    # Few colours a frame, other ones each time, black among them: palettes must change and stay right.
+    draws = np.random.default_rng(0)
+    for _ in range(n):
+        colours = np.vstack([draws.integers(0, 256, (20, 3)), np.zeros((1, 3))]).astype(np.uint8)
+        yield colours[draws.integers(0, 21, (height, width))]
+
+
+def test_a_gif_holds_every_frame_at_its_time(tmp_path: Path) -> None:
+    path = tmp_path / "run.gif"
+    frames = list(noise(7))
+    frames[0] = np.full((40, 60, 3), 255, np.uint8)  # a palette of one colour, which lacks the next one's black
+    frames[1] = frames[0].copy()
+    frames[1][:9] = 0
+    frames[3:5] = [frames[2], frames[2].copy()]  # nothing new is a frame too
+    frames[4][5:9, 5:9] = 0
+    assert write_gif(path, iter(frames), fps=30) == 7
+    with Image.open(path) as gif:
+        assert gif.n_frames == 7
+        assert gif.info["loop"] == 0
+        total = 0
+        for k, frame in enumerate(frames):
+            gif.seek(k)
+            total += gif.info["duration"]
+            assert np.abs(np.asarray(gif.convert("RGB")).astype(int) - frame).max() <= 40
+    assert total == 230  # 7/30 s in hundredths
+
+
+def test_a_gif_of_a_run_looks_like_the_run(tmp_path: Path) -> None:
+    run = [shot([(1.0 + k, 5.0)], [(1.0, 0.0)], time=0.1 * k) for k in range(6)]
+    write_gif(tmp_path / "run.gif", (draw(s, size=200) for s in run), fps=10)
+    with Image.open(tmp_path / "run.gif") as gif:
+        for k, one in enumerate(run):
+            gif.seek(k)
+            assert np.abs(np.asarray(gif.convert("RGB")).astype(int) - draw(one, size=200)).max() <= 40
+
+
+def test_a_gif_is_written_with_few_frames_in_memory(tmp_path: Path) -> None:
+    alive: list[weakref.ref[np.ndarray]] = []
+    most = 0
+
+    def frames() -> Iterator[np.ndarray]:
+        nonlocal most
+        for frame in noise(40):
+            alive.append(weakref.ref(frame))
+            most = max(most, sum(ref() is not None for ref in alive))
+            yield frame
+            del frame
+
+    write_gif(tmp_path / "long.gif", frames(), fps=20)
+    assert most <= 2
+
+
+@pytest.mark.parametrize("fps", [0, -1, 51, float("nan"), float("inf"), "10", True])
+def test_a_gif_refuses_a_bad_rate_before_it_writes(tmp_path: Path, fps: Any) -> None:
+    with pytest.raises((ValueError, TypeError), match=r"^fps: must be"):
+        write_gif(tmp_path / "x.gif", noise(2), fps)
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_gif_that_fails_leaves_what_was_there(tmp_path: Path) -> None:
+    path = tmp_path / "x.gif"
+    with pytest.raises(ValueError, match="at least one"):
+        write_gif(path, [], 10)
+    assert not list(tmp_path.iterdir())
+    path.write_bytes(b"old")
+    for frames, says in (
+        ([np.zeros((4, 4, 3), np.uint8), np.zeros((4, 5, 3), np.uint8)], r"frame 1: must have the shape of frame 0"),
+        ([np.zeros((4, 4, 3))], "frame 0: must be a uint8 array .* got float64 array"),
+        ([np.zeros((4, 4), np.uint8)], r"frame 0: must have shape \(height, width, 3\)"),
+    ):
+        with pytest.raises((ValueError, TypeError), match=says):
+            write_gif(path, frames, 10)
+        assert path.read_bytes() == b"old"
+        assert list(tmp_path.iterdir()) == [path]
+
+
+def test_a_png_is_the_frame(tmp_path: Path) -> None:
+    frame = draw(shot(title="x"), size=120)
+    write_png(tmp_path / "x.png", frame)
+    assert (np.asarray(Image.open(tmp_path / "x.png")) == frame).all()
+
+
+@pytest.mark.parametrize(
+    ("name", "error"),
+    [
+        ("no/such/x.png", FileNotFoundError),
+        (".", IsADirectoryError),
+        ("a\0b.png", ValueError),
+        ("x" * 300 + ".png", OSError),
+    ],
+)
+def test_a_path_that_cannot_be_is_one_clear_line(tmp_path: Path, name: str, error: type[Exception]) -> None:
+    with pytest.raises(error) as caught:
+        write_png(tmp_path / name, draw(shot(), size=64))
+    assert "\n" not in str(caught.value)
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_link_is_replaced_and_not_followed(tmp_path: Path) -> None:
+    (tmp_path / "outside").write_bytes(b"old")
+    (tmp_path / "x.png").symlink_to(tmp_path / "outside")
+    write_png(tmp_path / "x.png", draw(shot(), size=64))
+    assert (tmp_path / "outside").read_bytes() == b"old"
+
+
+# ---- replay
+
+
+class Page(HTMLParser):
+    """What a browser would make of the file: its tags, and the texts of title and scripts."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.tags: list[tuple[str, dict[str, str | None]]] = []
+        self.texts: list[tuple[str, str]] = []
+        self.feed(text)
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.append((tag, dict(attrs)))
+
+    def handle_data(self, data: str) -> None:
+        if self.tags:
+            self.texts.append((self.tags[-1][0], data))
+
+    @property
+    def data(self) -> dict[str, Any]:
+        (raw,) = (text for tag, text in self.texts if tag == "script" and text.startswith("{"))
+        return dict(json.loads(raw))
+
+
+def run(frames: int = 5, agents: int = 3, dimension: int = 2, **fields: Any) -> list[Snapshot]:
+    draws = np.random.default_rng(1)
+    pos, vel = (draws.uniform(-5, 5, (frames, agents, dimension)) for _ in range(2))
+    given = {"low": np.full(dimension, -5.0), "high": np.full(dimension, 5.0), **fields}
+    return [shot(pos[k], vel[k], time=0.1 * k, **given) for k in range(frames)]
+
+
+def panel(snapshots: list[Snapshot], player: str = "reynolds") -> Panel:
+    return Panel(player, snapshots, np.linspace(0.0, 1.0, len(snapshots)), "captured at 6.2 s")
+
+
+def written(path: Path, groups: list[Group], title: str = "replay") -> Page:
+    write_replay(path, groups, title)
+    return Page(path.read_text(encoding="utf-8"))
+
+
+def decoded(packed: dict[str, Any]) -> np.ndarray:
+    low, high = np.array(packed["low"]), np.array(packed["high"])
+    level = np.frombuffer(base64.b64decode(packed["pos"]), dtype="<u2")
+    level = level.reshape(len(packed["time"]), len(packed["roles"]), len(low))
+    return low - 0.5 * (high - low) + level / 65535 * 2.0 * (high - low)
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_a_replay_decodes_to_the_run(tmp_path: Path, dimension: int) -> None:
+    snapshots = run(frames=40, agents=7, dimension=dimension)
+    (packed,) = written(tmp_path / "r.html", [Group("g", [panel(snapshots)])]).data["groups"][0]["panels"]
+    pos = np.stack([s.pos for s in snapshots])
+    assert np.abs(decoded(packed) - pos).max() <= 0.5 * 20.0 / 65535 + 1e-12
+    heading = np.frombuffer(base64.b64decode(packed["heading"]), dtype=np.uint8).reshape(40, 7) / 254 * 2 * np.pi
+    vel = np.stack([s.vel for s in snapshots])
+    off = heading - np.arctan2(vel[..., 1], vel[..., 0])
+    assert np.abs(np.arctan2(np.sin(off), np.cos(off))).max() <= np.pi / 254 + 1e-12
+    assert packed["time"] == pytest.approx([s.time for s in snapshots])
+    assert packed["reward"] == pytest.approx(np.linspace(0, 1, 40), abs=1e-5)
+    assert packed["outcome"] == "captured at 6.2 s"
+    assert packed["radius"] == [0.5] * 7
+
+
+def test_a_replay_tells_the_dead_the_resting_and_the_lost(tmp_path: Path) -> None:
+    pos = [(1.0, 1.0), (2.0, 2.0), (np.nan, 3.0), (1e300, -1e300)]
+    one = shot(pos, [(1.0, 0.0), (0.0, 0.0), (1.0, 0.0), (0.0, 1.0)], alive=[False, True, True, True])
+    (packed,) = written(tmp_path / "r.html", [Group("g", [panel([one])])]).data["groups"][0]["panels"]
+    assert list(base64.b64decode(packed["heading"])) == [255, 254, 255, 64]
+    assert (decoded(packed)[0, 2:] == [(-5.0, -5.0), (15.0, -5.0)]).all()  # outside, where nobody looks
+
+
+def test_a_replay_keeps_scenery_only_when_it_changes(tmp_path: Path) -> None:
+    there = (Mark("goal", [1.0, 2.0], [0.0, 0.0], 0.5),)
+    here = (Mark("heading", [0.0, 0.0], [3.0, 4.0], 0.0),)
+    stone = {"obstacle_centre": [(1.0, 1.0)], "obstacle_radius": [0.25]}
+    snapshots = run(6, **stone)
+    snapshots = [replace(s, marks=there if k < 4 else here) for k, s in enumerate(snapshots)]
+    scenery = written(tmp_path / "r.html", [Group("g", [panel(snapshots)])]).data["groups"][0]["panels"][0]["scenery"]
+    assert [scene["from"] for scene in scenery] == [0, 4]
+    assert scenery[0]["stones"] == [[1.0, 1.0, 0.25]]
+    assert scenery[0]["marks"] == [{"kind": "goal", "at": [1.0, 2.0], "vector": [0.0, 0.0], "radius": 0.5}]
+    assert scenery[1]["marks"][0]["vector"] == [0.6, 0.8]
+
+
+HOSTILE = [
+    "<script>alert(1)</script>",
+    "</script><img src=x onerror=alert(1)>",
+    "<!--<script>",
+    "__DATA__",
+    "\x1b[2J\u2028",
+]
+
+
+@pytest.mark.parametrize("name", [*HOSTILE, "\ud800", "=cmd()", '"&amp;', "🐟", "x" * 5000])
+def test_a_hostile_name_is_only_a_name(tmp_path: Path, name: str) -> None:
+    harmless = written(tmp_path / "a.html", [Group("g", [panel(run())])])
+    hostile = written(tmp_path / "b.html", [Group(name, [panel(run(), name)])], title=name)
+    assert hostile.tags == harmless.tags
+    # Browsers end a script at "</script" and a space too, which Python's parser lets pass.
+    assert (tmp_path / "b.html").read_text(encoding="utf-8").count("<") == (tmp_path / "a.html").read_text(
+        encoding="utf-8"
+    ).count("<")
+    assert hostile.data["groups"][0]["panels"][0]["player"] == name
+    assert hostile.data["groups"][0]["title"] == hostile.data["title"] == name
+    assert ("title", name.replace("\ud800", "?")) in hostile.texts
+
+
+def test_a_replay_is_one_file_that_loads_nothing(tmp_path: Path) -> None:
+    page = written(tmp_path / "r.html", [Group("g", [panel(run())])])
+    assert [path.name for path in tmp_path.iterdir()] == ["r.html"]
+    assert not [attrs for _, attrs in page.tags if {"src", "href", "srcset"} & attrs.keys()]
+    assert ("meta", "default-src 'none'") in [(tag, (a.get("content") or "").split(";")[0]) for tag, a in page.tags]
+    program = "".join(text for tag, text in page.texts if tag in ("script", "style"))
+    assert not re.search(r"https?:|url\(|@import|fetch\(|XMLHttpRequest|innerHTML|eval\(", program)
+
+
+def test_a_replay_of_three_tasks_stays_small(tmp_path: Path) -> None:
+    groups = [Group(f"task {g}", [panel(run(300, 24), f"player {p}") for p in range(3)]) for g in range(3)]
+    page = written(tmp_path / "r.html", groups)
+    assert [len(group["panels"]) for group in page.data["groups"]] == [3, 3, 3]
+    assert (tmp_path / "r.html").stat().st_size < 750_000
+
+
+@pytest.mark.parametrize(
+    ("make", "says"),
+    [
+        (lambda: Panel("p", [], [], ""), "panel 'p': must have at least one snapshot"),
+        (lambda: Panel("p", run(3), [0.0], ""), r"panel 'p': must have one reward per snapshot \(3\), got 1"),
+        (lambda: Panel("p", run(2), [0.0, np.nan], ""), "panel 'p': rewards must be finite, got nan"),
+        (lambda: Panel("p", run(2)[::-1], [0, 0], ""), "panel 'p': times must increase, got 0.1 s then 0 s"),
+        (lambda: Panel("p", [run(2)[0], run(2, 4)[1]], [0, 0], ""), "panel 'p': snapshot 1 must have the agents"),
+        (lambda: Panel(3, run(1), [0], ""), "Panel.player: must be a str, got int"),  # type: ignore[arg-type]
+        (lambda: Group("g", []), "group 'g': must have at least one panel"),
+        (lambda: write_replay("never.html", [], "t"), "groups: there must be at least one"),
+    ],
+)
+def test_a_replay_refuses_in_one_line(make: Any, says: str) -> None:
+    with pytest.raises((ValueError, TypeError), match=says) as caught:
+        make()
+    assert "\n" not in str(caught.value)
+    assert not Path("never.html").exists()

@@ -1,0 +1,320 @@
+"""Stable-Baselines3: strangers' use unchanged, and our own VecEnv by the letter of its contract."""
+
+import base64
+import copy
+import json
+import pickle
+import zipfile
+from pathlib import Path
+
+import gymnasium
+import numpy as np
+import pytest
+import torch
+from gymnasium.error import ResetNeeded
+from stable_baselines3 import PPO
+from stable_baselines3.common.env_checker import check_env
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.evaluation import evaluate_policy
+from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.vec_env import DummyVecEnv, VecCheckNan, VecMonitor
+
+from agents import reynolds
+from flockenv.envs.registration import SINGLE
+from flockenv.sb3 import WorldVecEnv, load_sb3_zip
+from flockenv.tasks import TASKS, Flock, Pursuit
+from flockenv.world import World
+
+torch.set_num_threads(1)
+
+
+@pytest.fixture(autouse=True)
+def no_display(monkeypatch):
+    """SDL draws nowhere, and a window's clock does not wait."""
+    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
+    monkeypatch.setattr("pygame.time.Clock", Clock)
+
+
+class Clock:
+    def tick(self, fps):
+        assert fps > 0
+
+
+def flock(worlds=3, **options):
+    return WorldVecEnv(Flock(agents=5, learners=4), worlds, **{"time_limit": 10, **options})
+
+
+def rows(env, steps, seed=0):
+    return np.random.default_rng(seed).uniform(-1, 1, (steps, env.num_envs, *env.action_space.shape)).astype(np.float32)
+
+
+# --- strangers' use ------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("mode", [None, "rgb_array", "human"])
+@pytest.mark.parametrize("env_id", SINGLE)
+def test_sb3_check_env_has_nothing_to_say(env_id, mode):
+    check_env(gymnasium.make(env_id, render_mode=mode), skip_render_check=False)
+
+
+def test_ppo_trains_on_the_id():
+    model = PPO("MlpPolicy", "flockenv/Pursuit-v0", n_steps=128, batch_size=64, n_epochs=2, seed=0)
+    before = [p.detach().clone() for p in model.policy.parameters()]
+    model.learn(384)
+    assert any(not torch.equal(a, b) for a, b in zip(before, model.policy.parameters(), strict=True))
+    mean, deviation = evaluate_policy(model, Monitor(gymnasium.make("flockenv/Pursuit-v0")), n_eval_episodes=2)
+    assert np.isfinite([mean, deviation]).all()
+
+
+@pytest.mark.parametrize("env_id", SINGLE)
+def test_evaluate_policy_takes_the_reynolds_player(env_id):
+    env = make_vec_env(env_id, 2, seed=1, env_kwargs={})
+    task = env.get_attr("task")[0]
+    returns, lengths = evaluate_policy(reynolds.player(task), env, n_eval_episodes=4, return_episode_rewards=True)
+    assert len(returns) == len(lengths) == 4
+    again, _ = evaluate_policy(
+        reynolds.player(task), make_vec_env(env_id, 2, seed=1), n_eval_episodes=4, return_episode_rewards=True
+    )
+    assert returns == again
+    native = VecMonitor(WorldVecEnv(task, 2))
+    native.seed(1)
+    ours, our_lengths = evaluate_policy(reynolds.player(task), native, n_eval_episodes=4, return_episode_rewards=True)
+    assert sorted(our_lengths) == sorted(lengths)
+    np.testing.assert_allclose(sorted(ours), sorted(returns), rtol=1e-4)
+
+
+# --- our VecEnv ----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", sorted(TASKS))
+def test_it_is_sb3_s_own_vecenv_of_singles(name):
+    """Rows, dones and infos of DummyVecEnv over gymnasium.make, across ends, wherever both speak of the same thing."""
+    env_id = next(i for i in SINGLE if name in i.lower())
+    dummy = DummyVecEnv([lambda: gymnasium.make(env_id, max_episode_steps=25)] * 3)
+    native = WorldVecEnv(dummy.get_attr("task")[0], 3, time_limit=25)
+    native.seed(6), dummy.seed(6)
+    np.testing.assert_array_equal(native.reset(), dummy.reset())
+    for row in rows(native, 80):
+        ours, theirs = native.step(row), dummy.step(row)
+        np.testing.assert_array_equal(ours[0], theirs[0])
+        np.testing.assert_array_equal(ours[1].astype(np.float32), theirs[1])
+        np.testing.assert_array_equal(ours[2], theirs[2])
+        for k in np.flatnonzero(ours[2]):
+            mine, other = ours[3][k], theirs[3][k]
+            np.testing.assert_array_equal(mine["terminal_observation"], other["terminal_observation"])
+            for key in set(mine) & set(other) - {"terms", "terminal_observation"}:
+                assert mine[key] == other[key], key
+            assert {"TimeLimit.truncated", "is_success"} <= set(mine) & set(other)
+
+
+def test_rows_are_worlds_times_learners():
+    env = flock()
+    world = World(env.task, 3, time_limit=10)
+    env.seed(40)
+    np.testing.assert_array_equal(env.reset(), world.reset(seeds=40).reshape(12, -1))
+    for row in rows(env, 9):
+        observation, reward, done, infos = env.step(row)
+        step = world.step(row.reshape(3, 4, -1))
+        np.testing.assert_array_equal(observation, step.observation.reshape(12, -1))
+        np.testing.assert_array_equal(reward, step.reward.reshape(12))
+        assert not done.any()
+        assert infos == [{}] * 12
+
+
+def test_the_end_of_an_episode():
+    env = flock()
+    world = World(env.task, 3, time_limit=10)
+    env.seed(40)
+    env.reset(), world.reset(seeds=40)
+    for _ in range(2):
+        sums = np.zeros((3, 4))
+        for row in rows(env, 10):
+            observation, _, done, infos = env.step(row)
+            step = world.step(row.reshape(3, 4, -1))
+            sums += step.reward
+        assert done.all()
+        check_end(infos, step, world.measure(), sums)
+        np.testing.assert_array_equal(observation, world.reset().reshape(12, -1))
+
+
+def check_end(infos, step, metrics, sums):
+    for k, info in enumerate(infos):
+        np.testing.assert_array_equal(info["terminal_observation"], step.observation[k // 4, k % 4])
+        assert info["TimeLimit.truncated"] is True
+        assert info["is_success"] is bool(step.success[k // 4])
+        assert sum(info["terms"].values()) == pytest.approx(sums[k // 4, k % 4])
+        assert all(info[name] == column[k // 4] for name, column in metrics.items() if not np.isnan(column[k // 4]))
+
+
+def test_an_end_at_the_time_limit_is_a_death_if_it_is_one():
+    env = WorldVecEnv(Pursuit(capture_distance=100.0), 2, time_limit=1)
+    env.reset()
+    _, _, done, infos = env.step(np.zeros((2, 2)))
+    assert done.all()
+    assert [info["TimeLimit.truncated"] for info in infos] == [False, False]
+    assert [info["is_success"] for info in infos] == [True, True]
+
+
+def test_infos_are_never_shared():
+    env = flock()
+    env.seed(0)
+    env.reset()
+    seen = [env.step(row)[3] for row in rows(env, 25)]
+    dicts = [info for infos in seen for info in infos]
+    assert len({id(info) for info in dicts}) == len(dicts)
+    assert len({id(infos) for infos in seen}) == len(seen)
+    terms = [info["terms"] for info in dicts if info]
+    assert len({id(term) for term in terms}) == len(terms) == 2 * env.num_envs
+
+
+def test_no_buffer_is_shared():
+    env = flock()
+    env.seed(0)
+    kept = [env.reset()]
+    copies = [kept[0].copy()]
+    for row in rows(env, 25):
+        kept.append(env.step(row)[0])
+        copies.append(kept[-1].copy())
+        kept[-2][:] = 3.0
+    env.seed(0)
+    np.testing.assert_array_equal([env.reset(), *(env.step(row)[0] for row in rows(env, 25))], copies)
+
+
+def test_seeds_belong_to_worlds():
+    env = flock()
+    assert env.seed(7) == [7] * 4 + [8] * 4 + [9] * 4
+    first = env.reset()
+    second = env.reset()
+    assert not np.array_equal(first, second)
+    env.seed(7)
+    np.testing.assert_array_equal(env.reset(), first)
+    np.testing.assert_array_equal(env.reset(), second)
+    assert not np.array_equal(flock().reset(), flock().reset())
+    with pytest.raises(ValueError, match="seed"):
+        env.seed(-1)
+
+
+def test_ppo_trains_on_worlds_and_meets_monitor_and_nan_check():
+    def train():
+        env = VecMonitor(VecCheckNan(flock(worlds=4), raise_exception=True), info_keywords=("is_success",))
+        return PPO("MlpPolicy", env, n_steps=16, batch_size=64, n_epochs=2, seed=3).learn(512)
+
+    one, other = train(), train()
+    assert [int(info["l"]) for info in one.ep_info_buffer][:4] == [10] * 4
+    for a, b in zip(one.policy.parameters(), other.policy.parameters(), strict=True):
+        assert torch.equal(a, b)
+
+
+def test_time_limits_are_bootstrapped():
+    """PPO adds gamma V(terminal_observation) to the reward of a truncated row; it needs both keys for that."""
+    env = flock(worlds=1)
+    model = PPO("MlpPolicy", env, n_steps=10, batch_size=40, n_epochs=1, gamma=0.5, seed=0)
+    raised = []
+    predict_values = model.policy.predict_values
+    model.policy.predict_values = lambda obs: raised.append(obs) or predict_values(obs)
+    model.learn(40)
+    assert sum(obs.shape[0] == 1 for obs in raised) == 4
+
+
+def test_who_leaves_one_by_one_is_refused():
+    with pytest.raises(ValueError, match=r"^[^\n]*pettingzoo[^\n]*$"):
+        WorldVecEnv(Pursuit(pursuers=3, evaders=2, sides="both"))
+
+
+@pytest.mark.parametrize("clone", [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))])
+def test_a_copy_goes_on_as_the_original_would(clone):
+    env = flock()
+    env.seed(1)
+    env.reset()
+    actions = rows(env, 30)
+    for row in actions[:7]:
+        env.step(row)
+    twin = clone(env)
+    for row in actions[7:]:
+        for a, b in zip(env.step(row)[:3], twin.step(row)[:3], strict=True):
+            np.testing.assert_array_equal(a, b)
+
+
+def test_attributes_and_methods():
+    env = flock()
+    assert env.get_attr("task") == [env.task] * 12
+    assert env.get_attr("task", indices=[1, 2]) == [env.task] * 2
+    assert env.has_attr("world")
+    assert not env.has_attr("wrold")
+    env.set_attr("note", 5)
+    assert env.get_attr("note", indices=3) == [5]
+    with pytest.raises(ValueError, match="share one simulator"):
+        env.set_attr("note", 6, indices=0)
+    assert env.env_method("seed", 3, indices=[0])[0][:5] == [3] * 4 + [4]
+    assert env.env_is_wrapped(Monitor) == [False] * 12
+    env.reset()
+    assert env.reset_infos == [{"seed": 3 + k // 4} for k in range(12)]
+
+
+def test_bad_input():
+    env = flock()
+    with pytest.raises(ResetNeeded, match="reset"):
+        env.step(np.zeros((12, 2)))
+    env.reset()
+    with pytest.raises(ValueError, match="shape"):
+        env.step(np.zeros((3, 2)))
+    with pytest.raises(ResetNeeded):
+        env.step_wait()
+    bad = np.zeros((12, 2))
+    bad[6, 1] = np.nan
+    with pytest.raises(ValueError, match=r"world 1"):
+        env.step(bad)
+    env.set_options({"bogus": 1})
+    with pytest.raises(ValueError, match="'bogus'"):
+        env.reset()
+    for wrong in ({"worlds": 0}, {"time_limit": 0}, {"render_mode": "ansi"}):
+        with pytest.raises(ValueError, match=next(iter(wrong))):
+            flock(**wrong)
+    env.close()
+    env.close()
+    with pytest.raises(ResetNeeded, match="reset"):
+        env.step(np.zeros((12, 2)))
+
+
+def test_pictures_and_the_window():
+    env = flock(render_mode="rgb_array")
+    env.reset()
+    picture = env.render()
+    assert picture.dtype == np.uint8
+    np.testing.assert_array_equal(env.get_images()[0], picture)
+    assert env.render("human") is None
+    env.close()
+
+
+# --- zips ----------------------------------------------------------------------------------------------------------
+
+
+class Canary:
+    def __init__(self, path):
+        self.path = path
+
+    def __reduce__(self):
+        return Path.touch, (self.path,)
+
+
+def test_a_zip_is_not_opened_on_trust(tmp_path):
+    good, bad, marker = tmp_path / "good.zip", tmp_path / "bad.zip", tmp_path / "ran"
+    model = PPO("MlpPolicy", "flockenv/Pursuit-v0", n_steps=64, batch_size=64, seed=0)
+    model.save(good)
+    with zipfile.ZipFile(good) as source, zipfile.ZipFile(bad, "w") as target:
+        for name in source.namelist():
+            content = source.read(name)
+            if name == "data":
+                data = json.loads(content)
+                data["policy_class"][":serialized:"] = base64.b64encode(pickle.dumps(Canary(marker))).decode()
+                content = json.dumps(data).encode()
+            target.writestr(name, content)
+    for file in (good, bad):
+        with pytest.raises(ValueError, match=r"^[^\n]*trust_pickle[^\n]*$"):
+            load_sb3_zip(file)
+    assert not marker.exists()
+    again = load_sb3_zip(good, trust_pickle=True)
+    row = np.zeros(model.observation_space.shape, np.float32)
+    np.testing.assert_array_equal(again.predict(row, deterministic=True)[0], model.predict(row, deterministic=True)[0])
+    with pytest.raises(ValueError, match="no such file"):
+        load_sb3_zip(tmp_path / "none.zip", trust_pickle=True)
