@@ -295,7 +295,7 @@ def _show_measures(console: Console, trajectory: Trajectory) -> None:
     from flockenv.measures import MEASURES
 
     def text(value: float) -> str:
-        return f"{value:.4g}" if value == value else "-"
+        return f"{value:.4g}" if math.isfinite(value) else "-"
 
     scene, time = trajectory.scene, float(trajectory.last.time[0])
     rows = [(name, text(a), text(b), MEASURES[name]) for name, (a, b) in trajectory.measures().items()]

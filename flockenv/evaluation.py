@@ -98,7 +98,7 @@ class Episodes:
     lengths: NDArray[np.int64]  # control steps
     terms: Mapping[str, Floats]  # reward term -> its share of the return
     metrics: Mapping[str, Floats]  # NaN where a metric does not apply (the time to a capture that never came)
-    microseconds: float  # per decision, all worlds and learners asked at once
+    microseconds: float  # per decision, all worlds and learners asked at once, median over steps
     latency: float  # us for one row asked alone, median
     recording: Recording | None = None
 
@@ -176,7 +176,7 @@ def rollout(
         lengths=ledger.lengths,
         terms=dict(zip(task.terms, ledger.terms.T.copy(), strict=True)),
         metrics=ledger.metrics,
-        microseconds=1e6 * pilot.seconds / pilot.rows,
+        microseconds=pilot.microseconds,
         latency=latency,
         recording=film.recording,
     )
@@ -188,20 +188,24 @@ class _Pilot:
     def __init__(self, policy: Policy, deterministic: bool) -> None:
         self._policy, self._deterministic = policy, deterministic
         self._state: Any = None
-        self.seconds, self.rows = 0.0, 0
+        self._times: list[float] = []  # us per row, one entry per call
 
     def act(self, observation: NDArray[np.float32], action_size: int) -> NDArray[Any]:
         """(B, L, O) -> (B, L, A)."""
         rows = observation.reshape(-1, observation.shape[-1])
-        starts = np.full(len(rows), self.rows == 0)
+        starts = np.full(len(rows), not self._times)
         began = perf_counter()
         action, self._state = self._policy.predict(rows, self._state, starts, self._deterministic)
-        self.seconds += perf_counter() - began
-        self.rows += len(rows)
+        self._times.append(1e6 * (perf_counter() - began) / len(rows))
         action = np.asarray(action)
         if action.shape != (len(rows), action_size):
             raise ValueError(f"policy: actions of shape {action.shape}, must be {(len(rows), action_size)}")
         return action.reshape(*observation.shape[:-1], action_size)
+
+    @property
+    def microseconds(self) -> float:
+        """Median over calls: what else the machine did in between belongs to nobody's decisions."""
+        return float(np.median(self._times))
 
 
 class _Ledger:

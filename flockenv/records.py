@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Mapping
+from typing import Any, Self
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 from pydantic._internal._model_construction import ModelMetaclass  # it has no public name
@@ -36,3 +37,22 @@ class Record(BaseModel, metaclass=_OneLine):
 
     def __str__(self) -> str:
         return repr(self)
+
+    def model_copy(self, *, update: Mapping[str, Any] | None = None, deep: bool = False) -> Self:
+        """Return the record with some fields changed, validated like a new one; nothing that was derived comes along."""
+        fields = {name: getattr(self, name) for name in type(self).model_fields}
+        return type(self)(**{**fields, **(update or {})})
+
+    def __copy__(self) -> Self:
+        """Return itself: nothing about it can change."""
+        return self
+
+    def __deepcopy__(self, memo: dict[int, Any] | None = None) -> Self:
+        """Return itself: nothing about it can change."""
+        return self
+
+    def __getstate__(self) -> dict[Any, Any]:
+        """Pickle the fields alone: what follows from them is made anew where it is needed."""
+        kept = super().__getstate__()
+        kept["__dict__"] = {k: v for k, v in kept["__dict__"].items() if k in type(self).model_fields}
+        return kept

@@ -189,12 +189,6 @@ class Scene(Record):
     def _params(self) -> Floats:
         return np.array(self.parts.parameters(), self.dtype)
 
-    def __getstate__(self) -> dict[Any, Any]:
-        """Pickle the fields alone: what follows from them is made anew where it is needed."""
-        kept = super().__getstate__()
-        kept["__dict__"] = {k: v for k, v in kept["__dict__"].items() if k in type(self).model_fields}
-        return kept
-
     # --- running ----------------------------------------------------------------------------------------------------
 
     def start(self, seed: int, worlds: int = 1) -> State:

@@ -76,16 +76,22 @@ def zero(a: Vec) -> Vec:
 
 
 @law
+def _pair(condition: bool, a: float, b: float, c: float, d: float) -> Vec:
+    return (a if condition else c, b if condition else d)
+
+
+@law
 def select(condition: bool, a: Vec, b: Vec) -> Vec:
     """Return a where the condition holds, else b, without a branch; for tuples of 2 to 5."""
     if len(a) == 2:
         return (a[0] if condition else b[0], a[1] if condition else b[1])
     elif len(a) == 3:
         return (a[0] if condition else b[0], a[1] if condition else b[1], a[2] if condition else b[2])
-    elif len(a) == 4:
-        return select(condition, (a[0], a[1]), (b[0], b[1])) + select(condition, (a[2], a[3]), (b[2], b[3]))
+    elif len(a) == 4:  # spelt out: a law that calls itself is a dangling call once it comes out of numba's disk cache
+        return _pair(condition, a[0], a[1], b[0], b[1]) + _pair(condition, a[2], a[3], b[2], b[3])
     else:
-        return select(condition, (a[0], a[1]), (b[0], b[1])) + select(condition, (a[2], a[3], a[4]), (b[2], b[3], b[4]))
+        first = (a[0] if condition else b[0], a[1] if condition else b[1], a[2] if condition else b[2])
+        return first + _pair(condition, a[3], a[4], b[3], b[4])
 
 
 @law

@@ -30,6 +30,8 @@ from flockenv.evaluation import (
     task_digest,
     worlds_for,
 )
+from flockenv.policy import RandomPolicy
+from flockenv.tasks import TASKS
 
 
 class Toy(BaseModel):
@@ -183,6 +185,7 @@ def test_time_is_taken_inside_predict_alone(monkeypatch: pytest.MonkeyPatch) -> 
     class Slow(Constant):
         def predict(self, observation: Any, *rest: Any) -> Any:
             now[0] += 3e-6 if len(observation) == 1 else 24e-6
+            now[0] += 1.0 if len(self.calls) in (7, evaluation.LATENCY_CALLS + 1) else 0.0  # the machine was elsewhere
             return super().predict(observation, *rest)
 
     class SlowWorld(ToyWorld):
@@ -432,3 +435,42 @@ def test_the_digest_knows_every_setting() -> None:
     assert task_digest(Toy()) == task_digest(Toy())  # type: ignore[arg-type]
     digests = {task_digest(task) for task in (Toy(), Toy(note="x"), Toy(horizon=5), Other())}  # type: ignore[arg-type]
     assert len(digests) == 4
+
+
+# --- the real worlds
+
+
+class Forward:
+    """Asks for full force along the first axis: stateless, so that a world does not care who plays beside it."""
+
+    def predict(self, observation: Any, state: Any = None, *_: Any) -> Any:
+        return np.broadcast_to(np.float32([1, 0]), (len(observation), 2)), state
+
+
+@pytest.mark.parametrize("name", TASKS)
+def test_a_world_scores_the_same_in_company_and_alone(name: str) -> None:
+    task, first = TASKS[name](horizon=40), worlds_for("evaluation", 3, 4)
+    together = rollout(task, Forward(), 4, first)  # type: ignore[arg-type]
+    for k in range(4):
+        alone = rollout(task, Forward(), 1, first + k)  # type: ignore[arg-type]
+        assert alone.returns[0] == together.returns[k]
+        assert alone.lengths[0] == together.lengths[k]
+        for key, values in together.metrics.items():
+            np.testing.assert_array_equal(values[k], alone.metrics[key][0])
+    np.testing.assert_allclose(sum(together.terms.values()), together.returns, rtol=1e-9, atol=1e-9)
+    assert set(together.metrics) == set(task.metric_names)
+
+
+@pytest.mark.parametrize("name", TASKS)
+def test_every_player_begins_in_the_same_world(name: str) -> None:
+    task = TASKS[name](horizon=20)
+    players: list[Any] = [Forward(), RandomPolicy(task.action_layout.size, 0)]
+    films = [rollout(task, player, 3, 77, record=1).recording for player in players]
+    assert films[0] is not None
+    assert films[1] is not None
+    a, b = films[0].snapshots, films[1].snapshots
+    np.testing.assert_array_equal(a[0].pos, b[0].pos)
+    np.testing.assert_array_equal(a[0].obstacle_centre, b[0].obstacle_centre)
+    assert not np.array_equal(a[-1].pos, b[-1].pos)
+    assert len(a) == len(films[0].returns) <= 21
+    assert np.all(np.diff([shot.time for shot in a]) > 0)

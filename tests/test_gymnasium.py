@@ -5,6 +5,7 @@ import hashlib
 import importlib
 import itertools
 import json
+import os
 import pickle
 import subprocess
 import sys
@@ -232,7 +233,11 @@ def test_a_thousand_steps_replay_in_another_process():
         f"print([module.digest(env_id) for env_id in {SINGLE!r}])"
     )
     done = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, check=False, env={"PYTHONHASHSEED": "77"}
+        [sys.executable, "-c", code],
+        capture_output=True,
+        text=True,
+        check=False,
+        env={**os.environ, "PYTHONHASHSEED": "77"},
     )
     assert done.returncode == 0, done.stderr
     assert done.stdout.strip() == str([digest(env_id) for env_id in SINGLE])

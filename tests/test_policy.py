@@ -95,6 +95,7 @@ def test_actor_takes_one_row_or_many_clips_and_leaves_its_input_alone() -> None:
     policy = MlpPolicy(tensors(), CARD)
     rows = np.random.default_rng(1).normal(size=(50, 5)).astype(np.float32)
     before = rows.copy()
+    rows.flags.writeable = False
     actions, state = policy.predict(rows, ("kept",), None, True)  # type: ignore[arg-type]
     assert actions.shape == (50, 2)
     assert actions.dtype == np.float32
@@ -107,6 +108,7 @@ def test_actor_takes_one_row_or_many_clips_and_leaves_its_input_alone() -> None:
         policy.predict(rows[:, :4])
     with pytest.raises(ValueError, match="observation: shape"):
         policy.predict(rows[None])
+    assert policy.predict(rows[:0])[0].shape == (0, 2)
 
 
 def test_actor_samples_the_gaussian_of_its_log_std_from_its_own_generator() -> None:
@@ -151,7 +153,7 @@ def test_actor_equals_stable_baselines3(activation: str) -> None:
     }
     t = {f"{a}.{part}": given[f"{b}.{part}"].numpy() for a, b in names.items() for part in ("weight", "bias")}
     ours = MlpPolicy({**t, "log_std": given["log_std"].numpy()}, {"activation": activation})
-    rows = np.random.default_rng(0).uniform(-1, 1, (500, 11)).astype(np.float32)
+    rows = np.random.default_rng(0).uniform(-1, 1, (501, 11)).astype(np.float32)  # several blocks and a bit
     expected, _ = theirs.predict(rows, deterministic=True)
     np.testing.assert_allclose(ours.predict(rows, deterministic=True)[0], expected, atol=1e-6)
     np.testing.assert_allclose(ours.predict(rows[0], deterministic=True)[0], expected[0], atol=1e-6)

@@ -147,13 +147,6 @@ class Task(Record):
         d = self.scene.dimension
         return (0.0,) * d, self.scene.space.extent(d)
 
-    def __getstate__(self) -> dict[Any, Any]:
-        """Pickle the fields alone."""
-        kept = super().__getstate__()
-        kept["__dict__"] = {k: v for k, v in kept["__dict__"].items() if k in type(self).model_fields}
-        return kept
-
-
 _KERNELS = ("spawn", "drive", "reward", "ended", "measure", "observe")
 
 

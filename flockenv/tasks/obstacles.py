@@ -13,6 +13,7 @@ from pydantic import Field
 from flockenv.kernels import kernel
 from flockenv.noise import uniform
 from flockenv.scene import Group, Scene
+from flockenv.shapes import ray_hit
 from flockenv.snapshot import Mark
 from flockenv.space import Box
 from flockenv.state import State
@@ -107,7 +108,7 @@ def measure(p: Any, before: Frame, after: Frame, numbers: Any) -> None:
 
 @kernel
 def observe(p: Any, frame: Frame, rows: Any) -> None:
-    """Own velocity, goal, walls, the nearest obstacles."""
+    """Own velocity, goal, walls, the nearest obstacles, free ways all around."""
     row = rows[0]
     row[:] = 0.0
     for k in range(2):
@@ -124,6 +125,20 @@ def observe(p: Any, frame: Frame, rows: Any) -> None:
             row[8 + 2 * s + k] = clip((frame.centre[k, m] - frame.pos[k, 0]) / (p.sight + p.greatest_radius))
         row[8 + 2 * slots + s] = frame.rho[m] / p.greatest_radius
         row[8 + 3 * slots + s] = clip(distances[s] - frame.radius[0]) if distances[s] < 1.0 + frame.radius[0] else 1.0
+    for r in range(int(p.rays)):
+        angle = 2.0 * math.pi * r / p.rays
+        row[8 + 4 * slots + r] = _free_way(frame, math.cos(angle), math.sin(angle), p.sight) / p.sight
+
+
+@kernel
+def _free_way(frame: Frame, dx: float, dy: float, sight: float) -> float:
+    """Return how far the agent's body can go in a direction before it touches an obstacle, m, at most `sight`."""
+    way = sight
+    for m in range(frame.rho.shape[0]):
+        if frame.rho[m] > 0.0:
+            offset = (frame.centre[0, m] - frame.pos[0, 0], frame.centre[1, m] - frame.pos[1, 0])
+            way = min(way, ray_hit(offset, (dx, dy), frame.rho[m] + frame.radius[0]))
+    return way
 
 
 class Obstacles(Task):
@@ -150,6 +165,7 @@ class Obstacles(Task):
     goal_radius: float = Field(default=0.8, gt=0, description="m, the goal is reached within this")
     sight: float = Field(default=8.0, gt=0, description="m, obstacles are seen whose surface is nearer than this")
     slots: int = Field(default=6, ge=1, le=32, description="how many obstacles are seen, nearest first")
+    rays: int = Field(default=16, ge=1, le=128, description="directions in which the free way is seen")
     progress_reward: float = Field(default=0.5, ge=0, description="per m nearer to the goal")
     goal_reward: float = Field(default=10.0, ge=0, description="once")
     touch_cost: float = Field(default=10.0, ge=0, description="once")
@@ -184,6 +200,7 @@ class Obstacles(Task):
     @functools.cached_property
     def layout(self) -> Layout:
         """Axes are the field's; offsets are relative to the agent."""
+        ways = "how far the body can go before it touches an obstacle, anticlockwise from the x axis"
         seen = "offsets of the centres of the nearest obstacles, nearest surface first; zeros = none"
         return Layout((
             Slot("velocity", (2,), self.max_speed, "m/s", "own velocity (x, y)"),
@@ -193,6 +210,7 @@ class Obstacles(Task):
             Slot("obstacles", (self.slots, 2), self.sight + self.greatest_radius, "m", seen),
             Slot("obstacle_radius", (self.slots,), self.greatest_radius, "m", "their radii; 0 = none", low=0.0),
             Slot("clearance", (self.slots,), 1.0, "m", "gap between own body and theirs, cut at 1 m; 0 = none"),
+            Slot("free_way", (self.rays,), self.sight, "m", ways, low=0.0),
         ))  # fmt: skip
 
     @functools.cached_property

@@ -1,0 +1,184 @@
+"""One list of everything that is a law here: a row added to it inherits every test that was ever written for its kind.
+
+A new effect, integrator, behaviour, task or space is one row below; `test_catalogue.py` fails while a row is missing.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flockenv import arbitration, steering
+from flockenv.effects import Alignment, AvoidObstacles, Cohesion, Drag, Effect, Separation
+from flockenv.integrators import RK4, ExplicitEuler, Integrator, SemiImplicitEuler
+from flockenv.scene import Group, Scene
+from flockenv.space import Box, Plane, Space, Torus
+from flockenv.spawn import Spawn
+from flockenv.tasks import Flock, Obstacles, Pursuit, Task
+
+Array = NDArray[np.float64]
+
+
+# --- steering and arbitration -----------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Law:
+    """A steering law and what its arguments are, so that a test can make some and can turn them.
+
+    Kinds of vectors: "vector" (any), "heading" (unit), both turned with the world; "own" (unit, in the agent's frame,
+    not turned); "noise" (uniform in [-1, 1]); "walls" (distances to walls per axis, not turned).
+    Numbers: "positive" (around 1), "length" (m, around 3).
+    """
+
+    law: Any
+    takes: tuple[str, ...]
+    gives: str  # "vector", "positive" or "own"
+    turns: str = "any"  # "any" rotation; "upright": about the vertical only in 3-D; "none": tied to the axes
+    mirrors: bool = True
+
+    @property
+    def name(self) -> str:
+        return str(self.law.py_func.__name__)
+
+
+STEERING = (
+    Law(steering.seek, ("vector", "vector", "positive"), "vector"),
+    Law(steering.flee, ("vector", "vector", "positive"), "vector"),
+    Law(steering.arrive, ("vector", "vector", "positive", "length"), "vector"),
+    Law(steering.distance_time, ("vector", "positive", "positive"), "positive"),
+    Law(steering.interception_time, ("vector", "vector", "positive"), "positive"),
+    Law(steering.pursue, ("vector", "vector", "vector", "positive", "positive"), "vector"),
+    Law(steering.evade, ("vector", "vector", "vector", "positive", "positive"), "vector"),
+    Law(steering.wander_turn, ("vector", "noise", "positive", "positive"), "vector"),
+    # its left hand is the right hand of its mirror image
+    Law(steering.wander, ("own", "vector", "positive", "positive"), "vector", turns="upright", mirrors=False),
+    Law(steering.separate, ("vector", "heading"), "vector"),
+    Law(steering.align, ("vector", "vector"), "vector"),
+    Law(steering.cohere, ("vector", "vector", "positive"), "vector"),
+    Law(steering.threat, ("heading", "vector", "positive", "length"), "positive"),
+    Law(steering.avoid, ("heading", "vector", "positive", "positive"), "vector"),
+    Law(steering.contain, ("walls", "walls", "vector", "positive", "positive"), "vector", turns="none", mirrors=False),
+)
+
+ARBITRATION = (arbitration.blend, arbitration.prioritise, arbitration.allocate)
+
+
+# --- effects ----------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class EffectRow:
+    """An effect with parameters under which it acts, the same one at rest, and what it must obey."""
+
+    effect: Effect
+    idle: Effect | None = None  # with this one a scene must move exactly as without any
+    obeys: frozenset[str] = field(default=frozenset({"translation", "rotation", "mirror"}))
+
+    @property
+    def name(self) -> str:
+        fov = getattr(self.effect, "fov", 360.0)
+        return self.effect.kind + ("" if fov == 360.0 else "_cone")
+
+
+EFFECTS = (
+    EffectRow(Drag(rate=0.4), Drag(rate=0)),
+    EffectRow(Separation(weight=1.3, radius=2.5), Separation(weight=0, radius=2.5)),
+    EffectRow(Separation(weight=1.3, radius=2.5, fov=200)),
+    EffectRow(Alignment(weight=0.7, radius=3, fov=270), Alignment(weight=0, radius=3)),
+    EffectRow(Cohesion(weight=0.9, radius=3, fov=270), Cohesion(weight=0, radius=3)),
+    EffectRow(AvoidObstacles(weight=5, horizon=3, margin=0.1), AvoidObstacles(weight=0, horizon=3)),
+)
+
+
+# --- integrators, spaces, tasks ---------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class IntegratorRow:
+    """A method, and what 100 grows to with x' = v, v' = v / 10 in ten steps of 1 s (numerics.md, E16)."""
+
+    method: Integrator
+    grown: float
+
+    @property
+    def name(self) -> str:
+        return self.method.kind
+
+
+INTEGRATORS = (
+    IntegratorRow(ExplicitEuler(), 259.37425),
+    IntegratorRow(SemiImplicitEuler(), 275.31167),
+    IntegratorRow(RK4(), 271.82797),
+)
+
+SPACES = {
+    "plane": {2: Plane(), 3: Plane()},
+    "torus": {2: Torus(size=(9.0, 7.0)), 3: Torus(size=(9.0, 7.0, 8.0))},
+    "box": {2: Box(size=(9.0, 7.0)), 3: Box(size=(9.0, 7.0, 8.0))},
+}
+
+
+@dataclass(frozen=True)
+class TaskRow:
+    """A task as people use it; `variant` names the rows that share a task."""
+
+    task: Task
+    variant: str = ""
+
+    @property
+    def name(self) -> str:
+        return self.task.name + self.variant
+
+
+TASKS = (
+    TaskRow(Pursuit()),
+    TaskRow(Pursuit(pursuers=3, evaders=2, sides="both"), "_both"),
+    TaskRow(Obstacles()),
+    TaskRow(Flock()),
+    TaskRow(Flock(learners=1), "_single"),
+)
+
+
+# --- scenes that many tests share: each set of laws, dimension, space, method and precision is compiled once ----------
+
+EDGE = 6.0
+"""m: agents of `scene_of` begin in a square or cube of this edge."""
+
+
+def scene_of(*effects: Effect, dimension: int = 2, space: Space | None = None, **fields: Any) -> Scene:
+    """Return two kinds of agents under some effects, among two obstacles if one of them asks for obstacles."""
+    low, high = (0.0,) * dimension, (EDGE,) * dimension
+    spawn = Spawn(low=low, high=high, speed=(0.2, 1.5))
+    groups = (Group(count=14, mass=0.7, radius=0.1, spawn=spawn), Group(count=10, mass=2, radius=0.25, spawn=spawn))
+    asked = any(effect.obstacle_law for effect in effects)
+    centres = ((1.5, 2.0, 2.5)[:dimension], (4.5, 3.5, 3.0)[:dimension]) if asked else ()
+    obstacles = tuple({"centre": centre, "radius": 0.6} for centre in centres)
+    given: dict[str, Any] = {"groups": groups, "obstacles": obstacles, "dt": 0.05} | fields
+    return Scene(dimension=dimension, space=space or Plane(), effects=effects, **given)
+
+
+def everything(dimension: int, **fields: Any) -> Scene:
+    """Return all effects of the catalogue at once, on a torus."""
+    kinds = {row.effect.kind: row.effect for row in EFFECTS}
+    return scene_of(*kinds.values(), dimension=dimension, space=SPACES["torus"][dimension], **fields)
+
+
+def rotation(dimension: int, seed: int, upright: bool = False) -> Array:
+    """Return a random rotation matrix; `upright` keeps the z axis."""
+    rng = np.random.default_rng(seed)
+    flat = 2 if upright else dimension
+    q, r = np.linalg.qr(rng.normal(size=(flat, flat)))
+    q = q * np.sign(np.diag(r))
+    q[:, 0] *= np.sign(np.linalg.det(q))
+    full = np.eye(dimension)
+    full[:flat, :flat] = q
+    return full
+
+
+def mirror(dimension: int) -> Array:
+    """Return the reflection that exchanges the two ends of the x axis."""
+    return np.diag([-1.0] + [1.0] * (dimension - 1))

@@ -1,0 +1,83 @@
+"""The lists of tests/catalogue.py are complete: whoever adds a law and forgets its row is told so."""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Iterator
+from pathlib import Path
+
+from flockenv import arbitration, steering
+from flockenv.effects import EFFECTS
+from flockenv.integrators import INTEGRATORS
+from flockenv.space import Space
+from flockenv.tasks import TASKS
+from tests import catalogue
+
+ROOT = Path(__file__).resolve().parent.parent
+
+
+def kinds_in(folder: str, attribute: str) -> set[str]:
+    """The kinds or names that the classes in a folder's files state in their own text."""
+    return {
+        ast.literal_eval(node.value)
+        for path in (ROOT / "flockenv" / folder).glob("*.py")
+        for node in ast.walk(ast.parse(path.read_text()))
+        if isinstance(node, ast.AnnAssign) and node.value and ast.unparse(node.target) == attribute
+        if isinstance(node.value, ast.Constant)
+    }
+
+
+def test_every_effect_has_a_row() -> None:
+    rows = {row.effect.kind for row in catalogue.EFFECTS}
+    assert rows == kinds_in("effects", "kind") == {k for k, e in EFFECTS.items() if e.__module__.startswith("flockenv.")}
+
+
+def test_every_effect_that_can_be_idle_has_an_idle_row() -> None:
+    assert {row.effect.kind for row in catalogue.EFFECTS if row.idle} == {row.effect.kind for row in catalogue.EFFECTS}
+
+
+def test_every_integrator_has_a_row() -> None:
+    rows = {row.method.kind for row in catalogue.INTEGRATORS}
+    assert rows == kinds_in("integrators", "kind") == set(INTEGRATORS)
+
+
+def test_every_task_has_a_row() -> None:
+    assert {row.task.name for row in catalogue.TASKS} == kinds_in("tasks", "name") == set(TASKS)
+
+
+def test_every_behaviour_has_a_row() -> None:
+    assert [row.name for row in sorted(catalogue.STEERING, key=lambda row: row.name)] == sorted(steering.__all__)
+
+
+def test_every_arbitration_has_a_row() -> None:
+    assert {law.py_func.__name__ for law in catalogue.ARBITRATION} == set(arbitration.__all__)
+
+
+def test_every_space_has_a_row() -> None:
+    kinds = {space.model_fields["kind"].default for space in Space.__subclasses__()}
+    assert set(catalogue.SPACES) == kinds
+    assert all(spaces[d].kind == kind for kind, spaces in catalogue.SPACES.items() for d in (2, 3))
+
+
+def test_names_are_told_apart() -> None:
+    for rows in (catalogue.EFFECTS, catalogue.INTEGRATORS, catalogue.TASKS, catalogue.STEERING):
+        names = [row.name for row in rows]
+        assert len(set(names)) == len(names)
+
+
+def compiled_functions() -> Iterator[tuple[str, ast.FunctionDef]]:
+    for path in sorted((ROOT / "flockenv").rglob("*.py")):
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.FunctionDef) and {"law", "kernel"} & {ast.unparse(d) for d in node.decorator_list}:
+                yield f"{path.stem}.{node.name}", node
+
+
+def test_no_compiled_law_calls_itself() -> None:
+    """numba's disk cache keeps such a call without its target: the second process that runs it dies."""
+    laws = dict(compiled_functions())
+    assert len(laws) > 100
+    calls = {
+        name: {ast.unparse(node.func) for node in ast.walk(body) if isinstance(node, ast.Call)}
+        for name, body in laws.items()
+    }
+    assert [name for name, body in laws.items() if body.name in calls[name]] == []

@@ -1,0 +1,111 @@
+"""Domain measures against arrangements whose answer is known."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from flockenv.measures import MEASURES, measure, nearest_distances, polarisation
+from flockenv.scene import Group, Scene
+from flockenv.shapes import Circle
+from flockenv.space import Box, Plane, Space, Torus
+from flockenv.spawn import Spawn
+from flockenv.trajectory import whole_steps
+
+
+@pytest.mark.parametrize(
+    ("vel", "expected"),
+    [
+        ([[1, 0], [3, 0], [0.1, 0]], 1.0),  # speed does not count
+        ([[1, 0], [-2, 0]], 0.0),
+        ([[1, 0], [0, 1]], math.sqrt(0.5)),
+        ([[1, 0], [0, 0]], 1.0),  # who stands still has no heading
+        ([[1, 0, 0], [0, 1, 0], [0, 0, 1]], 1 / math.sqrt(3)),
+        ([[0, 0]], math.nan),
+        (np.zeros((0, 2)), math.nan),
+    ],
+)
+def test_polarisation(vel: list[list[float]], expected: float) -> None:
+    assert polarisation(np.array(vel, float)) == pytest.approx(expected, nan_ok=True)
+
+
+SPACES: list[Space] = [Torus(size=(10, 12)), Box(size=(10, 12)), Plane()]
+
+
+@given(
+    points=st.lists(st.tuples(st.floats(0, 9.99), st.floats(0, 11.99)), min_size=2, max_size=12),
+    space=st.sampled_from(SPACES),
+)
+def test_the_nearest_is_the_nearest_of_all_pairs(points: list[tuple[float, float]], space: Space) -> None:
+    pos = np.array(points)
+    ways = np.linalg.norm(space.displacement(pos[:, None], pos[None]), axis=-1)
+    np.fill_diagonal(ways, np.inf)
+    distance, who = nearest_distances(pos, space)
+    assert distance == pytest.approx(ways.min(axis=1), abs=1e-12)
+    assert (who != np.arange(len(pos))).all()
+    assert ways[np.arange(len(pos)), who] == pytest.approx(distance, abs=1e-12)
+
+
+def test_the_nearest_around_the_corner_of_a_torus() -> None:
+    pos = np.array([[0.5, 0.5], [9.5, 11.5], [5.0, 6.0], [10.0, -1e-17]])
+    distance, who = nearest_distances(pos, Torus(size=(10, 12)))
+    assert distance[0] == pytest.approx(math.sqrt(0.5))
+    assert who[0] == 3  # at (10, -1e-17), which is the origin
+
+
+@pytest.mark.parametrize("pos", [np.zeros((0, 2)), np.zeros((1, 2)), np.array([[0.0, 0.0], [1e200, 0.0]])])
+def test_without_a_neighbour_the_nearest_is_infinitely_far(pos: np.ndarray) -> None:
+    distance, who = nearest_distances(pos, Plane())
+    assert np.isinf(distance).all()
+    assert (who == np.arange(len(pos))).all()
+
+
+def test_measure_of_a_world_laid_out_by_hand() -> None:
+    scene = Scene(
+        groups=(Group(count=4, radius=0.5, spawn=Spawn(low=(0, 0), high=(1, 1))),),
+        obstacles=(Circle(centre=(20, 0), radius=2),),
+    )
+    pos = [[[0, 0], [0.9, 0], [10, 0], [17.6, 0]]]  # two overlap; the last is 0.1 m inside the obstacle's reach
+    vel = [[[3, 4], [3, 4], [3, 4], [3, 4]]]
+    found = measure(scene, scene.start(0).with_motion(pos, vel))
+    assert found == pytest.approx(
+        {"agents": 4, "speed": 5, "polarisation": 1, "nearest_neighbour": (0.9 + 0.9 + 7.6 + 7.6) / 4, "contacts": 3}
+    )
+    assert found.keys() == MEASURES.keys()
+
+
+def test_the_dead_are_not_measured() -> None:
+    scene = Scene(space=Torus(size=(9, 9)), groups=(Group(count=3),))
+    state = scene.start(0).with_motion([[[1, 1], [1, 1.01], [5, 5]]], [[[1, 0], [-1, 0], [1, 0]]])
+    state.alive[0, 1] = False
+    found = measure(scene, state)
+    assert (found["agents"], found["polarisation"], found["contacts"]) == (2, 1, 0)
+    state.alive[:] = False
+    assert math.isnan(measure(scene, state)["speed"])
+
+
+@pytest.mark.parametrize(
+    ("seconds", "dt", "steps"), [(0, 0.1, 0), (1, 0.1, 10), (0.3, 0.1, 3), (1e6, 0.02, 50_000_000)]
+)
+def test_whole_steps(seconds: float, dt: float, steps: int) -> None:
+    assert whole_steps("t", seconds, dt) == steps
+
+
+@pytest.mark.parametrize(
+    ("seconds", "said"),
+    [
+        (1.0, "t = 1 s: must be a whole multiple of dt = 0.3 s, say 0.9 or 1.2"),
+        (0.1, "t = 0.1 s: must be a whole multiple of dt = 0.3 s, say 0 or 0.3"),
+        (-0.3, "t = -0.3: must be a finite number of seconds >= 0"),
+        (math.inf, "t = inf: must be a finite number of seconds >= 0"),
+        (math.nan, "t = nan: must be a finite number of seconds >= 0"),
+    ],
+)
+def test_time_that_is_no_whole_number_of_steps_is_refused_with_the_nearest(seconds: float, said: str) -> None:
+    with pytest.raises(ValueError) as caught:  # noqa: PT011  # the whole text is compared
+        whole_steps("t", seconds, 0.3)
+    assert str(caught.value) == said

@@ -1,0 +1,102 @@
+"""Where files may be written, and every place where they may not."""
+
+from __future__ import annotations
+
+import os
+import tempfile
+from pathlib import Path
+
+import pytest
+
+from flockenv.outputs import checked_file, checked_path
+
+
+@pytest.fixture(autouse=True)
+def in_a_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Work in one folder; the one for temporary files is elsewhere."""
+    (tmp_path / "here").mkdir()
+    (tmp_path / "temporary").mkdir()
+    monkeypatch.chdir(tmp_path / "here")
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "temporary"))
+
+
+@pytest.mark.parametrize("name", ["x.gif", "a/b/c/x.gif", "./x.gif", "ü 鳥.gif", "..x.gif", "a..b/x.gif", "conx.gif"])
+def test_below_the_current_folder_is_fine_and_nothing_is_made(name: str) -> None:
+    assert checked_file(name, [".gif"]) == (Path.cwd() / name).resolve()
+    assert list(Path.cwd().iterdir()) == []
+
+
+def test_below_the_temporary_folder_is_fine() -> None:
+    path = Path(tempfile.gettempdir()) / "deep" / "x.gif"
+    assert checked_file(str(path), [".gif"]) == path
+
+
+@pytest.mark.parametrize(
+    ("name", "said"),
+    [
+        ("", "must be a name without control characters"),
+        ("  ", "must be a name without control characters"),
+        ("a\0b", "must be a name without control characters"),
+        ("a\x1b[2J", "must be a name without control characters"),
+        ("a\u202eb", "must be a name without control characters"),
+        ("../x", "must not go up with '..'"),
+        ("a/../../x", "must not go up with '..'"),
+        ("/etc/x", "must lie below"),
+        ("/", "must lie below"),
+        ("~/x/" + "y" * 201, "too long: at most 200 bytes per name"),
+        ("ü" * 101, "too long: at most 200 bytes per name"),
+        ("a/" * 600, "too long: at most 200 bytes per name and 1000 characters in all"),
+        ("CON", "'CON' is a reserved name"),
+        ("a/lpt1.txt/b", "'lpt1.txt' is a reserved name"),
+    ],
+)
+def test_a_bad_name_is_refused_in_one_line(name: str, said: str) -> None:
+    with pytest.raises(ValueError, match="--out") as caught:
+        checked_path(name)
+    assert said in str(caught.value)
+    assert str(caught.value).isprintable() and len(str(caught.value)) < 500
+
+
+def test_a_link_is_followed_before_it_is_judged(tmp_path: Path) -> None:
+    Path("outside").symlink_to("/usr")
+    Path("inside").symlink_to(tmp_path / "here")
+    with pytest.raises(ValueError, match="must lie below"):
+        checked_path("outside/x")
+    assert checked_path("inside/x") == tmp_path / "here" / "x"
+
+
+def test_a_file_in_the_way_is_refused() -> None:
+    Path("file").write_text("")
+    with pytest.raises(ValueError, match=r"--out 'file/x\.gif': '.*file' is not a folder"):
+        checked_file("file/x.gif", [".gif"])
+
+
+@pytest.mark.skipif(os.name == "nt" or os.geteuid() == 0, reason="root may write anywhere")
+def test_a_folder_that_cannot_be_written_is_refused() -> None:
+    Path("closed").mkdir(mode=0o500)
+    with pytest.raises(ValueError, match="cannot be written to"):
+        checked_path("closed/x")
+
+
+def test_a_folder_that_cannot_be_written_is_refused_even_to_root(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(os, "access", lambda path, mode: False)
+    with pytest.raises(ValueError, match="cannot be written to"):
+        checked_path("x")
+
+
+def test_what_is_there_is_overwritten_only_by_force() -> None:
+    Path("x.gif").write_text("mine")
+    Path("folder.gif").mkdir()
+    with pytest.raises(ValueError, match=r"--out 'x\.gif': exists already; --force overwrites it"):
+        checked_file("x.gif", [".gif"])
+    assert checked_file("x.gif", [".gif"], force=True).read_text() == "mine"
+    with pytest.raises(ValueError, match="is a folder"):
+        checked_file("folder.gif", [".gif"], force=True)
+
+
+def test_the_suffix_is_one_of_those_that_are_written() -> None:
+    assert checked_file("x.GIF", [".gif", ".png"]).name == "x.GIF"
+    with pytest.raises(ValueError, match=r"--to 'x\.gfi': must end in \.gif or \.png, did you mean `\.gif`\?"):
+        checked_file("x.gfi", [".gif", ".png"], option="--to")
+    with pytest.raises(ValueError, match=r"--out 'x': must end in \.gif$"):
+        checked_file("x", [".gif"])

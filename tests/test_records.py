@@ -1,0 +1,55 @@
+"""Records are values: what is derived from them never outlives a change, and copying one is free."""
+
+from __future__ import annotations
+
+import copy
+import pickle
+
+import pytest
+
+from flockenv.effects import Drag, Separation
+from flockenv.scene import Group, Scene
+from flockenv.space import Box
+from flockenv.tasks import Pursuit
+
+SCENE = Scene(space=Box(size=(10, 10)), groups=(Group(count=3),), effects=(Drag(rate=0.5),))
+
+
+def test_a_changed_copy_derives_everything_anew() -> None:
+    assert len(SCENE.parts.effects) == 1  # cached on the original
+    other = SCENE.with_effects(Drag(rate=0.5), Separation(weight=1, radius=1))
+    assert len(other.parts.effects) == 2
+    assert len(other.parts.parameters()) > len(SCENE.parts.parameters())
+
+
+def test_a_changed_copy_is_checked_like_a_new_one() -> None:
+    with pytest.raises(ValueError, match=r"dt = -1"):
+        SCENE.model_copy(update={"dt": -1})
+
+
+def test_copies_are_the_record_itself_even_after_use() -> None:
+    SCENE.step(SCENE.start(0))
+    assert copy.copy(SCENE) is SCENE
+    assert copy.deepcopy(SCENE) is SCENE
+
+
+def test_pickles_hold_fields_alone_and_compare_equal() -> None:
+    SCENE.step(SCENE.start(0))
+    again = pickle.loads(pickle.dumps(SCENE))
+    assert again == SCENE
+    assert hash(again) == hash(SCENE)
+    assert "_kernel" not in vars(again)
+
+
+@pytest.mark.parametrize(("call", "line"), [
+    (lambda: Drag(rate=-1), "Drag: rate = -1"),
+    (lambda: Drag(rat=1), "did you mean `rate`"),
+    (lambda: Pursuit(pursuer=2), "did you mean `pursuers`"),
+    (lambda: Pursuit(control_dt=0.1, dt=0.03), "whole multiple"),
+    (lambda: Scene(groups=(Group(count=10**9),), space=Box(size=(1, 1))), "GiB"),
+])  # fmt: skip
+def test_a_refusal_is_one_line_that_says_what_and_what_else(call, line) -> None:  # type: ignore[no-untyped-def]
+    with pytest.raises(ValueError, match=r".") as caught:
+        call()
+    assert line in str(caught.value)
+    assert "\n" not in str(caught.value)

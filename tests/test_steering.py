@@ -1,0 +1,490 @@
+"""Reynolds' behaviours: what holds for every one of them, and what each must do when it steers somebody."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from flockenv import arbitration, steering
+from flockenv.kernels import load
+from flockenv.rows import rows
+from tests.catalogue import STEERING, Array, Law, mirror, rotation
+
+LAWS = pytest.mark.parametrize("row", STEERING, ids=lambda row: row.name)
+DIMENSIONS = pytest.mark.parametrize("dimension", [2, 3])
+VECTORS = ("vector", "heading", "own", "noise", "walls")
+TURNED = ("vector", "heading", "noise")
+
+
+def arguments(row: Law, dimension: int, count: int, seed: int = 1) -> list[Array]:
+    """Random arguments of a law, `count` rows."""
+    rng = np.random.default_rng(seed)
+
+    def unit() -> Array:
+        directions = rng.normal(size=(count, dimension))
+        return directions / np.linalg.norm(directions, axis=1, keepdims=True)
+
+    make = {
+        "vector": lambda: 3 * rng.normal(size=(count, dimension)),
+        "heading": unit,
+        "own": unit,
+        "noise": lambda: rng.uniform(-1, 1, (count, dimension)),
+        "walls": lambda: rng.uniform(-1, 4, (count, dimension)),
+        "positive": lambda: rng.uniform(0.5, 2, count),
+        "length": lambda: rng.uniform(2, 4, count),
+    }
+    return [make[kind]() for kind in row.takes]
+
+
+def turned(row: Law, given_: list[Array], matrix: Array) -> list[Array]:
+    return [a @ matrix.T if kind in TURNED else a for kind, a in zip(row.takes, given_, strict=True)]
+
+
+# --- what holds for all ------------------------------------------------------------------------------------------------
+
+
+@DIMENSIONS
+@LAWS
+def test_it_turns_with_the_world(row: Law, dimension: int) -> None:
+    if row.turns == "none":
+        pytest.skip("tied to the axes of its walls")
+    given_ = arguments(row, dimension, 200)
+    answer = rows(row.law)(*given_)
+    for seed in range(3):
+        matrix = rotation(dimension, seed, upright=row.turns == "upright")
+        expected = answer @ matrix.T if row.gives == "vector" else answer
+        np.testing.assert_allclose(rows(row.law)(*turned(row, given_, matrix)), expected, rtol=1e-10, atol=1e-10)
+
+
+@DIMENSIONS
+@LAWS
+def test_its_mirror_image_does_the_mirrored_thing(row: Law, dimension: int) -> None:
+    if not row.mirrors:
+        pytest.skip("it tells left from right, or is tied to its walls")
+    given_ = arguments(row, dimension, 200)
+    answer = rows(row.law)(*given_)
+    expected = answer @ mirror(dimension) if row.gives == "vector" else answer
+    np.testing.assert_allclose(rows(row.law)(*turned(row, given_, mirror(dimension))), expected, rtol=1e-12, atol=1e-12)
+
+
+def extremes(row: Law, dimension: int) -> list[Array]:
+    """Every combination of vanishing, tiny, common and huge vectors that the law can meet."""
+    rng = np.random.default_rng(3)
+    sizes = {"vector": (0.0, 1e-12, 1.0, 1e6), "walls": (-1e6, 0.0, 1e6), "noise": (0.0, 1.0)}
+    headings = (0.0, 1.0) if row.law is not steering.separate else (1.0,)  # at standstill there is no heading
+    choices = [sizes.get(kind, headings if kind == "heading" else (1.0,)) for kind in row.takes]
+    grid = np.stack([g.ravel() for g in np.meshgrid(*choices, indexing="ij")], axis=1)
+    grid = np.repeat(grid, 8, axis=0)
+    made = []
+    for k, kind in enumerate(row.takes):
+        directions = rng.normal(size=(len(grid), dimension))
+        directions[::4] = np.eye(dimension)[0]  # aligned with each other and with an axis
+        directions[1::4] = np.eye(dimension)[-1]  # vertical in 3-D
+        directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+        made.append(grid[:, k, None] * directions if kind in VECTORS else grid[:, k])
+    return made
+
+
+@DIMENSIONS
+@LAWS
+def test_it_is_finite_wherever_it_may_be_asked(row: Law, dimension: int) -> None:
+    answer = rows(row.law)(*extremes(row, dimension))
+    assert not np.isnan(answer).any()
+    if row.law is not steering.threat:  # its infinity says that nothing is in the way
+        assert np.isfinite(answer).all()
+        assert np.abs(answer).max() <= 1e13  # what is divided by is never the 1e-12 itself, squared
+
+
+def single(row: Law, dimension: int) -> Any:
+    """The law over float32 rows, its answer stored in float64 so that a promotion shows."""
+    taken = [f"a{k}" for k in range(len(row.takes))]
+    values = [
+        "(" + ", ".join(f"{a}[r, {k}]" for k in range(dimension)) + ")" if kind in VECTORS else f"{a}[r]"
+        for a, kind in zip(taken, row.takes, strict=True)
+    ]
+    store = "; ".join(f"out[r, {k}] = s[{k}]" for k in range(dimension)) if row.gives == "vector" else "out[r] = s"
+    source = f"""from numba import njit
+from flockenv.steering import {row.name}
+
+
+@njit(cache=True, error_model="numpy")
+def over({", ".join(taken)}, out):
+    for r in range(out.shape[0]):
+        s = {row.name}({", ".join(values)})
+        {store}
+"""
+    return load(f"single_{row.name}", source).over
+
+
+@DIMENSIONS
+@LAWS
+def test_in_single_precision_it_stays_there_and_stays_accurate(row: Law, dimension: int) -> None:
+    given_ = [a.astype(np.float32) for a in arguments(row, dimension, 200)]
+    exact = rows(row.law)(*given_)
+    answer = np.full_like(exact, np.nan)
+    single(row, dimension)(*given_, answer)
+    assert (answer.astype(np.float32) == answer).all(), "a constant has made it float64"
+    far = np.isfinite(exact)
+    assert (far == np.isfinite(answer)).all()
+    np.testing.assert_allclose(answer[far], exact[far], rtol=2e-5, atol=2e-5)
+
+
+# --- seek, flee, arrive ------------------------------------------------------------------------------------------------
+
+
+def steer(behaviour: Any, x: Array, v: Array, *, dt: float, seconds: float, top: float = 2.0, strength: float = 8.0):
+    """Move agents of 1 kg as Reynolds 1999 does: force cut to strength [N], speed to top [m/s], velocity first."""
+    x, v = x.copy(), v.copy()
+    for step in range(round(seconds / dt)):
+        force = 5.0 * behaviour(step * dt, x, v)
+        size = np.linalg.norm(force, axis=1, keepdims=True)
+        v = v + dt * force * np.minimum(1, strength / np.maximum(size, 1e-300))
+        speed = np.linalg.norm(v, axis=1, keepdims=True)
+        v = v * np.minimum(1, top / np.maximum(speed, 1e-300))
+        x = x + dt * v
+        yield step * dt + dt, x, v
+
+
+def crowd(dimension: int, count: int = 40) -> tuple[Array, Array]:
+    rng = np.random.default_rng(5)
+    x = rng.normal(size=(count, dimension))
+    return x * (4 + 4 * rng.random((count, 1))) / np.linalg.norm(x, axis=1, keepdims=True), rng.normal(size=x.shape)
+
+
+@DIMENSIONS
+def test_seek_comes_nearer_and_flee_gets_away(dimension: int) -> None:
+    x, v = crowd(dimension)
+    start = np.linalg.norm(x, axis=1)
+    *_, (_, near, _) = steer(lambda t, x, v: rows(steering.seek)(-x, v, 2.0), x, v, dt=0.05, seconds=1.5)
+    *_, (_, far, _) = steer(lambda t, x, v: rows(steering.flee)(-x, v, 2.0), x, v, dt=0.05, seconds=1.5)
+    assert (np.linalg.norm(near, axis=1) < start - 1).all()
+    assert (np.linalg.norm(far, axis=1) > start + 1).all()
+
+
+def test_seek_asks_for_full_speed_towards_the_point() -> None:
+    np.testing.assert_allclose(rows(steering.seek)([3.0, 4.0], [0.5, 0.25], 2.0), [1.2 - 0.5, 1.6 - 0.25])
+
+
+def test_flee_is_the_opposite_of_seek_and_goes_on_where_there_is_no_away() -> None:
+    np.testing.assert_allclose(rows(steering.flee)([3.0, 4.0], [0.5, 0.25], 2.0), [-1.2 - 0.5, -1.6 - 0.25])
+    np.testing.assert_allclose(rows(steering.flee)([0.0, 0.0], [0.0, 0.5], 2.0), [0.0, 1.5])
+
+
+@DIMENSIONS
+@pytest.mark.parametrize("dt", [0.1, 0.05, 0.01])
+def test_arrive_stops_on_the_point_without_chatter(dt: float, dimension: int) -> None:
+    """numerics.md, P07: below 0.01 m/s and 0.02 m after 20 s, at every step size up to 0.1 s."""
+    x, v = crowd(dimension)
+    *_, (_, x, v) = steer(lambda t, x, v: rows(steering.arrive)(-x, v, 2.0, 1.5), x, v, dt=dt, seconds=20)
+    assert np.linalg.norm(v, axis=1).max() < 0.01
+    assert np.linalg.norm(x, axis=1).max() < 0.02
+
+
+def test_arrive_is_seek_outside_and_a_ramp_inside() -> None:
+    arrive = rows(steering.arrive)
+    np.testing.assert_allclose(arrive([5.0, 0.0], [1.0, 0.0], 2.0, 4.0), [1.0, 0.0])
+    np.testing.assert_allclose(arrive([1.0, 0.0], [1.0, 0.0], 2.0, 4.0), [-0.5, 0.0])
+    np.testing.assert_allclose(arrive([0.0, 0.0], [1.0, 0.0], 2.0, 4.0), [-1.0, 0.0])
+
+
+# --- pursue, evade -----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("offset", "quarry", "speed", "seconds"),
+    [
+        ((10, 0), (0, 0), 2, 5),
+        ((10, 0), (0, 1), 2, 10 / math.sqrt(3)),  # crossing
+        ((10, 0), (-1, 0), 2, 10 / 3),  # head-on
+        ((10, 0), (1, 0), 2, 10),  # running away, slower
+        ((10, 0), (-1, 0), 1, 5),  # as fast: the quadratic term vanishes
+        ((10, 0), (-3, 0), 2, 2),  # faster, but it comes
+        ((10, 0), (-3, 1), 2, 2.0),  # faster, two meetings: the first, (9 + 1 - 4) t^2 - 60 t + 100 = 0 ...
+        ((10, 0), (3, 0), 2, 5),  # faster and away: never; |p| / V instead
+        ((10, 0), (0, 3), 2, 5),  # faster and across: never
+        ((10, 0), (0, 2), 2, 5),  # as fast and across: never, at the edge of the formula
+        ((0, 0), (1, 0), 2, 0),  # there already
+    ],
+)
+def test_interception_time_is_the_closed_form(offset: Any, quarry: Any, speed: float, seconds: float) -> None:
+    if quarry == (-3, 1):
+        seconds = (60 - math.sqrt(3600 - 4 * 6 * 100)) / 12
+    assert rows(steering.interception_time)(offset, quarry, speed) == pytest.approx(seconds, rel=1e-12)
+
+
+def test_interception_time_does_not_cancel() -> None:
+    """Far away and almost as fast, the textbook form loses all digits of the small root."""
+    time = float(rows(steering.interception_time)([1e4, 0.0], [-1.0, 0.0], 1.0 + 1e-9))
+    assert time == pytest.approx(1e4 / (2 + 1e-9), rel=1e-12)
+
+
+@DIMENSIONS
+def test_pursue_with_the_exact_predictor_meets_its_quarry_on_a_straight_way(dimension: int) -> None:
+    x, _ = crowd(dimension)
+    w = np.random.default_rng(8).normal(size=x.shape)
+    w *= 1.5 / np.linalg.norm(w, axis=1, keepdims=True)  # the quarry is slower
+    meeting = rows(steering.interception_time)(-x, w, 2.0)
+    aim = rows(steering.pursue)(-x, np.zeros_like(x), w, 2.0, meeting)
+    np.testing.assert_allclose(x + aim * meeting[:, None], w * meeting[:, None], atol=1e-9)
+
+    def chase(t: float, x: Array, v: Array) -> Array:
+        p = w * t - x
+        return rows(steering.pursue)(p, v, w, 2.0, rows(steering.interception_time)(p, w, 2.0))
+
+    met = np.full(len(x), np.inf)
+    for t, now, _ in steer(chase, x, 2 * aim / 2, dt=0.02, seconds=20, strength=1e9):
+        near = np.linalg.norm(w * t - now, axis=1) < 0.1
+        met[near] = np.minimum(met[near], t)
+    np.testing.assert_allclose(met, meeting, atol=0.15)
+
+
+@DIMENSIONS
+def test_pursue_looks_ahead_by_the_distance_predictor(dimension: int) -> None:
+    x, v = crowd(dimension)
+    time = rows(steering.distance_time)(x, 2.0, 0.5)
+    np.testing.assert_allclose(time, 0.25 * np.linalg.norm(x, axis=1))
+    ahead = rows(steering.pursue)(x, v, np.ones_like(x), 2.0, time)
+    np.testing.assert_allclose(ahead, rows(steering.seek)(x + time[:, None], v, 2.0))
+
+
+@DIMENSIONS
+def test_evade_keeps_a_pursuer_off_longer_than_standing_still(dimension: int) -> None:
+    """A pursuer that is faster and heads straight for its victim; the time until it is within 0.5 m."""
+    start, _ = crowd(dimension)
+    hunter = np.zeros_like(start)
+    held = []
+    for alert in (True, False):
+        x, v, h = start.copy(), np.zeros_like(start), hunter.copy()
+        caught = np.full(len(x), np.inf)
+        for step in range(400):
+            hv = 3.0 * (x - h) / np.linalg.norm(x - h, axis=1, keepdims=True)
+            if alert:
+                time = np.linalg.norm(h - x, axis=1) / 3.0
+                v = v + 0.05 * 5 * rows(steering.evade)(h - x, v, hv, 2.0, 0.3 * time)
+            x, h = x + 0.05 * v, h + 0.05 * hv
+            near = np.linalg.norm(x - h, axis=1) < 0.5
+            caught[near] = np.minimum(caught[near], step * 0.05)
+        held.append(caught)
+    assert (held[0] > 1.5 * held[1]).all()
+
+
+# --- wander ------------------------------------------------------------------------------------------------------------
+
+
+def headings_after(seconds: float, dt: float, count: int = 20_000) -> Array:
+    """How far wanderers have turned, rad, each from its own way straight ahead."""
+    rng = np.random.default_rng(round(1000 * dt))
+    target, v = np.tile([1.0, 0.0], (count, 1)), np.tile([1.0, 0.0], (count, 1))
+    turned_by = np.zeros(count)
+    for _ in range(round(seconds / dt)):
+        target = rows(steering.wander_turn)(target, rng.uniform(-1, 1, (count, 2)), 1.0, dt)
+        new = v + dt * 2.0 * rows(steering.wander)(target, v, 1.0, 1.5)
+        turned_by += np.arctan2(v[:, 0] * new[:, 1] - v[:, 1] * new[:, 0], (v * new).sum(axis=1))
+        v = new
+    return turned_by
+
+
+def test_wander_does_not_depend_on_the_step_size() -> None:
+    variances = [headings_after(3.0, dt).var() for dt in (0.1, 0.05, 0.025)]
+    assert max(variances) < 1.1 * min(variances)
+    assert min(variances) > 0.02  # it does turn
+
+
+def test_wander_keeps_its_target_on_the_sphere_and_goes_straight_without_noise() -> None:
+    rng = np.random.default_rng(2)
+    for dimension in (2, 3):
+        target = np.tile(np.eye(dimension)[0], (500, 1))
+        for _ in range(50):
+            target = rows(steering.wander_turn)(target, rng.uniform(-1, 1, target.shape), 3.0, 0.1)
+            np.testing.assert_allclose(np.linalg.norm(target, axis=1), 1, rtol=1e-12)
+        v = rng.normal(size=(500, dimension))
+        ahead = np.tile(np.eye(dimension)[0], (500, 1))
+        wish = rows(steering.wander)(ahead, v, 2.0, 1.5) + v
+        np.testing.assert_allclose(wish, 2 * v / np.linalg.norm(v, axis=1, keepdims=True), atol=1e-12)
+        assert abs(target.mean(axis=0)).max() < 0.15  # by now anywhere
+
+
+def test_a_wander_target_survives_a_step_that_lands_on_the_centre() -> None:
+    np.testing.assert_array_equal(rows(steering.wander_turn)([1.0, 0.0], [-1.0, 0.0], 1.0, 1.0), [1.0, 0.0])
+
+
+def test_wander_s_own_frame_is_forward_left_up() -> None:
+    wander = rows(steering.wander)
+    np.testing.assert_allclose(wander([0.0, 1.0], [3.0, 0.0], 1.0, 0.0) + [3.0, 0.0], [0.0, 1.0], atol=1e-12)
+    v = np.array([3.0, 0.0, 0.0])
+    np.testing.assert_allclose(wander([0.0, 1.0, 0.0], v, 1.0, 0.0) + v, [0, 1, 0], atol=1e-12)
+    np.testing.assert_allclose(wander([0.0, 0.0, 1.0], v, 1.0, 0.0) + v, [0, 0, 1], atol=1e-12)
+
+
+# --- separate, align, cohere -------------------------------------------------------------------------------------------
+
+
+@DIMENSIONS
+def test_a_push_weighs_one_over_the_distance_and_is_mutual(dimension: int) -> None:
+    x, tie = crowd(dimension)
+    tie /= np.linalg.norm(tie, axis=1, keepdims=True)
+    square = (x**2).sum(axis=1, keepdims=True)
+    np.testing.assert_allclose(rows(steering.separate)(x, tie), -x / square)
+    np.testing.assert_allclose(rows(steering.separate)(-x, -tie), x / square)
+    np.testing.assert_array_equal(rows(steering.separate)(0 * x, tie), tie)
+
+
+def test_align_takes_the_mean_and_cohere_seeks_the_centre() -> None:
+    np.testing.assert_allclose(rows(steering.align)([1.0, 2.0], [0.5, 4.0]), [-0.5, 2.0])
+    np.testing.assert_allclose(rows(steering.cohere)([3.0, 4.0], [0.5, 0.25], 2.0), [0.7, 1.35])
+    np.testing.assert_array_equal(rows(steering.cohere)([0.0, 0.0], [0.5, 0.25], 2.0), [0.0, 0.0])
+
+
+# --- avoid -------------------------------------------------------------------------------------------------------------
+
+
+@DIMENSIONS
+def test_nothing_is_in_the_way_of_who_passes_by(dimension: int) -> None:
+    """A force field would push here; steer-to-avoid must ask for exactly nothing (numerics.md, section 0)."""
+    ahead, side = np.eye(dimension)[0], np.eye(dimension)[1]
+    far = rows(steering.threat)(ahead, [3 * ahead + 1.001 * side, 3 * ahead + side, -3 * ahead], 1.0, 10.0)
+    np.testing.assert_array_equal(far, np.inf)
+
+
+@DIMENSIONS
+def test_a_threat_is_where_the_straight_path_first_touches(dimension: int) -> None:
+    ahead, side = np.eye(dimension)[0], np.eye(dimension)[1]
+    offsets = [5 * ahead, 5 * ahead + 0.6 * side, 5 * ahead, 0.3 * ahead, -0.3 * ahead, 5 * ahead]
+    reach = [10, 10, 3.9, 10, 10, 4.0]  # the last one touches just at the end of what is looked at
+    expected = [4, 5 - 0.8, np.inf, 0, 0, 4]
+    np.testing.assert_allclose(rows(steering.threat)(ahead, offsets, 1.0, reach), expected)
+
+
+@DIMENSIONS
+def test_avoid_is_sideways_away_from_the_centre(dimension: int) -> None:
+    """S = -V unit(lateral offset), formulas.md 1.2: no part along the way, whatever the distance."""
+    x, heading = crowd(dimension)
+    heading /= np.linalg.norm(heading, axis=1, keepdims=True)
+    lateral = x - (x * heading).sum(axis=1, keepdims=True) * heading
+    expected = -3 * lateral / np.linalg.norm(lateral, axis=1, keepdims=True)
+    np.testing.assert_allclose(rows(steering.avoid)(heading, x, 0.5, 3.0), expected, atol=1e-12)
+
+
+def test_dead_ahead_everybody_keeps_right() -> None:
+    avoid = rows(steering.avoid)
+    np.testing.assert_allclose(avoid([1.0, 0.0], [5.0, 0.0], 1.0, 3.0), [0, -3])
+    np.testing.assert_allclose(avoid([0.0, 1.0], [0.0, 5.0], 1.0, 3.0), [3, 0])
+    np.testing.assert_allclose(avoid([1.0, 0.0, 0.0], [5.0, 0.0, 0.0], 1.0, 3.0), [0, -3, 0])
+    np.testing.assert_allclose(avoid([0.6, 0.8], [5 * 0.6, 5 * 0.8], 1.0, 3.0), [3 * 0.8, -3 * 0.6], atol=1e-12)
+    up = avoid([0.0, 0.0, 1.0], [0.0, 0.0, 5.0], 1.0, 3.0)
+    assert np.linalg.norm(up) == pytest.approx(3)
+    assert up[2] == 0
+
+
+@DIMENSIONS
+def test_inside_an_obstacle_the_way_is_straight_out(dimension: int) -> None:
+    x, heading = crowd(dimension)
+    heading /= np.linalg.norm(heading, axis=1, keepdims=True)
+    out = -3 * x / np.linalg.norm(x, axis=1, keepdims=True)
+    np.testing.assert_allclose(rows(steering.avoid)(heading, x, 100.0, 3.0), out, atol=1e-12)
+    np.testing.assert_allclose(rows(steering.avoid)(heading, 0 * x, 1.0, 3.0), 3 * heading, atol=1e-12)
+
+
+# --- contain -----------------------------------------------------------------------------------------------------------
+
+
+@DIMENSIONS
+def test_contain_asks_for_nothing_inside_and_for_the_way_in_outside(dimension: int) -> None:
+    rng = np.random.default_rng(4)
+    x, v = rng.uniform(-3, 13, (500, dimension)), rng.normal(size=(500, dimension))
+    wish = rows(steering.contain)(x, 10 - x, v, 2.0, 1.5)
+    soon = x + 1.5 * v
+    inside = ((soon >= 0) & (soon <= 10)).all(axis=1)
+    assert 50 < inside.sum() < 450
+    np.testing.assert_array_equal(wish[inside], 0)
+    goal = np.clip(soon, 0, 10) - x
+    expected = 2 * goal / np.linalg.norm(goal, axis=1, keepdims=True) - v
+    np.testing.assert_allclose(wish[~inside], expected[~inside], atol=1e-9)
+    outside = ((x < 0) | (x > 10)).any(axis=1) & ~inside
+    nearest = np.clip(x, 0, 10) - x
+    assert (((wish + v) * nearest).sum(axis=1)[outside] > 0).all()
+
+
+# --- arbitration -------------------------------------------------------------------------------------------------------
+
+REYNOLDS = [(8.0, 0.0), (-8.0, 0.0), (0.0, 5.0)]
+
+
+def test_allocate_serves_the_most_pressing_and_drops_the_rest() -> None:
+    """formulas.md 1.3: lengths add up as scalars; (6, 4) would be Buckland's running sum."""
+    np.testing.assert_allclose(rows(arbitration.allocate)(REYNOLDS, 10.0), [6, 0])
+    np.testing.assert_allclose(rows(arbitration.allocate)(REYNOLDS, 21.0), [0, 5])
+    np.testing.assert_allclose(rows(arbitration.allocate)(REYNOLDS, 0.0), [0, 0])
+    np.testing.assert_allclose(rows(arbitration.allocate)(np.zeros((3, 2)), 10.0), [0, 0])
+
+
+def test_blend_can_cancel() -> None:
+    np.testing.assert_allclose(rows(arbitration.blend)(REYNOLDS, [1.0, 1.0, 0.0], 10.0), [0, 0])
+    np.testing.assert_allclose(rows(arbitration.blend)(REYNOLDS, [1.0, 0.5, 0.6], 10.0), [4, 3])
+    np.testing.assert_allclose(rows(arbitration.blend)(REYNOLDS, [1.0, 0.5, 0.6], 2.5), [2, 1.5])
+
+
+def test_prioritise_takes_the_first_that_matters() -> None:
+    prioritise = rows(arbitration.prioritise)
+    np.testing.assert_allclose(prioritise(REYNOLDS, 0.1, 10.0), [8, 0])
+    np.testing.assert_allclose(prioritise([(0.05, 0.0), (0.0, 3.0), (9.0, 9.0)], 0.1, 2.0), [0, 2])
+    np.testing.assert_allclose(prioritise([(0.05, 0.0), (0.0, 0.1), (0.0, 0.0)], 0.1, 2.0), [0, 0])
+
+
+NUMBERS = st.one_of(st.just(0.0), st.floats(-1e6, 1e6), st.floats(-1e-9, 1e-9))
+
+
+@given(st.lists(st.tuples(NUMBERS, NUMBERS), min_size=3, max_size=3), st.floats(0, 1e6))
+def test_allocate_never_exceeds_the_budget_and_is_the_sum_if_that_fits(wishes: Any, budget: float) -> None:
+    granted = rows(arbitration.allocate)(wishes, budget)
+    lengths = np.linalg.norm(wishes, axis=1)
+    assert np.isfinite(granted).all()
+    assert np.linalg.norm(granted) <= budget * (1 + 1e-12) + 1e-300
+    if lengths.sum() <= budget * (1 - 1e-12):
+        np.testing.assert_allclose(granted, np.sum(wishes, axis=0), rtol=1e-12, atol=1e-9 * max(1.0, lengths.max()))
+
+
+@given(st.lists(st.tuples(NUMBERS, NUMBERS), min_size=3, max_size=3), st.floats(0, 1e6))
+def test_no_arbiter_exceeds_the_budget(wishes: Any, budget: float) -> None:
+    for answer in (
+        rows(arbitration.blend)(wishes, [1.0, 2.0, 0.5], budget),
+        rows(arbitration.prioritise)(wishes, 0.0, budget),
+    ):
+        assert np.linalg.norm(answer) <= budget * (1 + 1e-12) + 1e-300
+
+
+# --- the wrapper over rows ---------------------------------------------------------------------------------------------
+
+
+def test_rows_broadcast_and_keep_the_leading_shape() -> None:
+    offset = np.random.default_rng(0).normal(size=(4, 1, 5, 2))
+    answer = rows(steering.seek)(offset, np.zeros((3, 5, 2)), 2.0)
+    assert answer.shape == (4, 3, 5, 2)
+    np.testing.assert_array_equal(answer[2, 1, 3], rows(steering.seek)(offset[2, 0, 3], np.zeros(2), 2.0))
+    assert rows(steering.distance_time)(offset, 2.0, 1.0).shape == (4, 1, 5)
+    assert rows(steering.seek)(np.zeros((0, 2)), np.zeros((0, 2)), 2.0).shape == (0, 2)
+
+
+@pytest.mark.parametrize(
+    ("given_", "said"),
+    [
+        (([1.0, 2.0], [0.0, 0.0]), "seek takes 3 arguments (offset, velocity, max_speed)"),
+        (([1.0, 2.0, 3.0, 4.0], [0.0, 0.0], 1.0), "offset has shape (4,)"),
+        ((1.0, [0.0, 0.0], 1.0), "offset has shape ()"),
+    ],
+)
+def test_rows_say_which_argument_does_not_fit(given_: Any, said: str) -> None:
+    with pytest.raises((TypeError, ValueError)) as caught:
+        rows(steering.seek)(*given_)
+    assert said in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_rows_refuse_a_mixture_of_dimensions() -> None:
+    with pytest.raises(ValueError, match="velocity"):
+        rows(steering.seek)([1.0, 2.0, 3.0], [0.0, 0.0], 1.0)
