@@ -13,7 +13,6 @@ import importlib.util
 import inspect
 import json
 import os
-import secrets
 import sys
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -22,12 +21,13 @@ from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
+from flockenv.outputs import replacing
 from flockenv.refusals import nearest
 
 if TYPE_CHECKING:
     from flockenv.tasks import Task
 
-__all__ = ["ACTIVATIONS", "MlpPolicy", "Policy", "RandomPolicy", "load_player", "save_policy", "write_atomically"]
+__all__ = ["ACTIVATIONS", "MlpPolicy", "Policy", "RandomPolicy", "load_player", "save_policy"]
 
 Observation = NDArray[Any] | dict[str, NDArray[Any]]
 State = tuple[NDArray[Any], ...]
@@ -199,22 +199,9 @@ def save_policy(path: str | os.PathLike[str], tensors: Mapping[str, NDArray[Any]
             raise ValueError(f"policy {_shown(path)}: card: {key} = {card[key]!r}, the weights say {derived[key]!r}")
     text = json.dumps({**card, **derived}, indent=2, allow_nan=False) + "\n"
     path.parent.mkdir(parents=True, exist_ok=True)
-    write_atomically(path, data)
-    write_atomically(path.with_suffix(".json"), text.encode())
-
-
-def write_atomically(path: Path, data: bytes) -> None:
-    """Put the bytes into a file that either is the old one or the whole new one, whatever happens in between."""
-    temporary = path.with_name(f".{secrets.token_hex(8)}.tmp")  # beside it: a rename does not cross file systems
-    try:
-        with temporary.open("xb") as file:
-            file.write(data)
-            file.flush()
-            os.fsync(file.fileno())
-        temporary.replace(path)
-    except BaseException:
-        temporary.unlink(missing_ok=True)
-        raise
+    for target, content in ((path, data), (path.with_suffix(".json"), text.encode())):
+        with replacing(target) as file:
+            file.write(content)
 
 
 def load_player(

@@ -39,7 +39,7 @@ class Record(BaseModel, metaclass=_OneLine):
         return repr(self)
 
     def model_copy(self, *, update: Mapping[str, Any] | None = None, deep: bool = False) -> Self:
-        """Return the record with some fields changed, validated like a new one; nothing that was derived comes along."""
+        """Return the record with some fields changed, checked like a new one; nothing that was derived comes along."""
         fields = {name: getattr(self, name) for name in type(self).model_fields}
         return type(self)(**{**fields, **(update or {})})
 

@@ -17,8 +17,7 @@ from numpy.typing import NDArray
 
 from flockenv.config import dump_scene
 from flockenv.measures import measure
-from flockenv.policy import write_atomically
-from flockenv.render.atomic import replacing
+from flockenv.outputs import replacing
 from flockenv.scene import Scene
 from flockenv.snapshot import Snapshot
 from flockenv.space import Plane
@@ -96,7 +95,8 @@ class Trajectory:
                 radius=self.scene.body.radius, seed=np.uint64(self.seed), scene=np.array(dump_scene(self.scene)),
             )  # fmt: skip
         beside = path.with_suffix(".json")
-        write_atomically(beside, (json.dumps(self.summary(), indent=2, allow_nan=False) + os.linesep).encode())
+        with replacing(beside) as file:
+            file.write((json.dumps(self.summary(), indent=2, allow_nan=False) + os.linesep).encode())
         return beside
 
 

@@ -54,8 +54,8 @@ class World:
         """worlds: B >= 1. time_limit: decisions until truncation, none = never."""
         if not _whole(worlds) or worlds < 1:
             raise ValueError(f"worlds is {worlds!r}, must be a whole number of at least 1")
-        if time_limit is not None and time_limit < 1:
-            raise ValueError(f"time_limit is {time_limit}, must be at least 1 decision, or None for no limit")
+        if time_limit is not None and (not _whole(time_limit) or time_limit < 1):
+            raise ValueError(f"time_limit is {time_limit}, must be a whole number of decisions, at least 1, or None")
         scene = task.scene
         bytes_ = worlds * (scene.bytes_per_world() + task.learners * 8 * task.layout.size)
         if bytes_ > MEMORY_LIMIT:
@@ -186,16 +186,15 @@ class World:
         expected = (self.worlds, self.learners, self.action_size)
         if given.shape != expected:
             raise ValueError(f"actions have shape {given.shape}, expected (worlds, learners, numbers) = {expected}")
-        if given.dtype != np.float32:
-            try:
-                given = given.astype(np.float64)
-            except (TypeError, ValueError):
-                raise TypeError(f"actions are of type {given.dtype}, expected numbers in [-1, 1]") from None
+        try:
+            given = np.ascontiguousarray(given, np.float64)  # one type, one compilation; exact for float32
+        except (TypeError, ValueError):
+            raise TypeError(f"actions are of type {given.dtype}, expected numbers in [-1, 1]") from None
         b, i, k = self._kernel.first_bad(given)
         if b >= 0:
             name = self.task.agent_names[i]
             raise ValueError(f"action {k} of {name} in world {b} is {given[b, i, k]}, must be a number in [-1, 1]")
-        return np.ascontiguousarray(given)
+        return given
 
     # --- looking at it ----------------------------------------------------------------------------------------------
 

@@ -23,7 +23,6 @@ from flockenv.tasks import TASKS
 
 ROOT = Path(__file__).resolve().parent.parent
 PARTICLES = str(ROOT / "configs" / "particles.yaml")
-BOIDS = str(ROOT / "configs" / "boids.yaml")
 
 TINY = """\
 space: {kind: torus, size: [9, 9]}
@@ -31,6 +30,8 @@ groups: [{count: 4, spawn: {speed: [1, 2]}}]
 effects: [{kind: drag, rate: 0.5}]
 dt: 0.01
 """
+
+FLOCK = TINY.replace("{kind: drag, rate: 0.5}", "{kind: separation, weight: 1, radius: 2}")
 
 
 @pytest.fixture(autouse=True)
@@ -131,7 +132,8 @@ def test_a_scene_without_neighbour_effects_makes_no_query_and_one_with_them_one_
 ) -> None:
     assert main(["run", PARTICLES, "--duration", "0.2"]) == 0
     assert "; 0 neighbour queries, 0 candidate pairs" in capsys.readouterr().out
-    assert main(["run", BOIDS, "--duration", "1"]) == 0
+    Path("flock.yaml").write_text(FLOCK)
+    assert main(["run", "flock.yaml", "--duration", "0.2"]) == 0
     assert "; 20 neighbour queries, " in capsys.readouterr().out
 
 
@@ -233,8 +235,8 @@ def test_a_task_under_a_player_of_ones_own() -> None:
 
 
 def test_explain_says_what_is_called_for_and_what_was_left_out(capsys: pytest.CaptureFixture[str]) -> None:
-    Path("one.yaml").write_text(TINY.replace("{kind: drag, rate: 0.5}", "{kind: separation, weight: 1, radius: 2}"))
-    assert main(["explain", "one.yaml"]) == 0
+    Path("flock.yaml").write_text(FLOCK)
+    assert main(["explain", "flock.yaml"]) == 0
     asked = capsys.readouterr().out
     assert re.search(r"^Separation\(.*\) +neighbour query within 2 m +[\d.]+ *$", asked, re.MULTILINE)
     assert "Per step: 1 evaluations, 1 neighbour queries" in asked
@@ -376,9 +378,8 @@ def test_a_reader_that_goes_away_is_no_error() -> None:
     assert (done.stdout, done.stderr) == ("Tasks\n", "")
 
 
-def test_it_works_without_a_home_a_display_or_a_locale(tmp_path: Path) -> None:
+def test_it_works_without_a_home_a_display_or_a_locale() -> None:
     bare = {"PATH": os.environ["PATH"], "PYTHONPATH": str(ROOT), "LANG": "C", "LC_ALL": "C", "TZ": "Mars/Phobos"}
-    bare["FLOCKENV_CACHE"] = str(tmp_path)
     done = subprocess.run(
         process("run", "tiny.yaml", "--duration", "0.1"), env=bare, capture_output=True, text=True, check=False
     )

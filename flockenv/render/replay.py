@@ -21,7 +21,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from flockenv.render.atomic import replacing
+from flockenv.outputs import replacing
 from flockenv.render.palette import ARROW, BODY_DISC, DART, DART_REACH, JUMP, PAPER, ROLE_COLOURS
 from flockenv.snapshot import Floats, Mark, Snapshot
 

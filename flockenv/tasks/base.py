@@ -147,6 +147,7 @@ class Task(Record):
         d = self.scene.dimension
         return (0.0,) * d, self.scene.space.extent(d)
 
+
 _KERNELS = ("spawn", "drive", "reward", "ended", "measure", "observe")
 
 
