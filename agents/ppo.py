@@ -30,6 +30,7 @@ from flockenv.evaluation import rollout, worlds_for
 from flockenv.policy import MlpPolicy, save_policy
 from flockenv.sb3 import WorldVecEnv
 from flockenv.tasks import Task
+from flockenv.world import World
 
 __all__ = ["app", "tensors_of", "train"]
 
@@ -37,16 +38,25 @@ app = typer.Typer(add_completion=False, rich_markup_mode=None, pretty_exceptions
 console = Console(stderr=True)
 
 
-class ScaledReward(VecEnvWrapper):
-    """Rewards times a constant: keeps the value loss near 1, so that clipping gradients does not starve the policy."""
+class ForLearning(VecEnvWrapper):
+    """What learning likes: small rewards, and worlds that are not all in the same phase of their episodes.
 
-    def __init__(self, venv: WorldVecEnv, scale: float) -> None:
+    Rewards times a constant keep the value loss near 1, so that clipping gradients does not starve the policy. And where
+    only the time limit ends an episode, worlds that began together would show every update one phase alone; staggered,
+    their first episodes end one after another.
+    """
+
+    def __init__(self, venv: WorldVecEnv, scale: float, stagger: bool) -> None:
         super().__init__(venv)
-        self.scale = scale
+        self.scale, self.stagger = scale, stagger
 
     def reset(self) -> np.ndarray:
-        """Begin."""
-        return self.venv.reset()
+        """Begin; staggered, each world with another part of its first episode behind it."""
+        observation = self.venv.reset()
+        if self.stagger:
+            world: World = self.venv.world
+            world.steps[:] = np.arange(world.worlds) * world.task.horizon // world.worlds
+        return observation
 
     def step_wait(self) -> Any:
         """Scale what is paid."""
@@ -83,7 +93,7 @@ def build(task: Task, p: PpoSettings, tensorboard: str | None) -> PPO:
     """Make the worlds and the model."""
     torch.set_num_threads(p.threads)
     torch.manual_seed(p.seed)
-    worlds = ScaledReward(WorldVecEnv(task, p.worlds), p.reward_scale)
+    worlds = ForLearning(WorldVecEnv(task, p.worlds), p.reward_scale, p.stagger)
     model = PPO(
         "MlpPolicy",
         worlds,

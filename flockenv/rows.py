@@ -45,7 +45,10 @@ def rows(law: Callable[..., Any]) -> Callable[..., NDArray[np.float64]]:
             np.ascontiguousarray(np.broadcast_to(a, lead + t)).reshape((-1, *t))
             for a, t in zip(arrays, tails, strict=True)
         ]
-        dimension = next((t[-1] for t, r in zip(tails, ranks, strict=True) if r and t), 0)
+        dimensions = {t[-1] for t, r, name in zip(tails, ranks, parameters, strict=True) if r and name != "weights"}
+        if len(dimensions) > 1:
+            raise ValueError(f"{python.__name__}: vectors of {' and of '.join(map(str, sorted(dimensions)))} numbers")
+        dimension = max(dimensions, default=0)
         out = np.empty((flat[0].shape[0], dimension) if answer else flat[0].shape[0])
         _compiled(python.__module__, python.__name__, tails, dimension if answer else 0)(*flat, out)
         return out.reshape((*lead, dimension) if answer else lead)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from typing import Annotated, Any, Literal
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from flockenv.kernels import kernel
 from flockenv.noise import uniform
@@ -27,6 +27,18 @@ class Spawn(Record):
         default=(0.0, 0.0), description="m/s, least and most"
     )
     heading: tuple[float, ...] | None = Field(default=None, description="direction of the velocity; none = random")
+
+    @model_validator(mode="after")
+    def _ordered(self) -> Spawn:
+        """Refuse ranges that run backwards."""
+        if self.speed[0] > self.speed[1]:
+            raise ValueError(f"speed = {self.speed}: the least comes first")
+        if (self.low is None) != (self.high is None):
+            raise ValueError("low and high go together: give both or neither")
+        corners = tuple(zip(self.low or (), self.high or (), strict=False))
+        if len(self.low or ()) != len(self.high or ()) or any(a > b for a, b in corners):
+            raise ValueError(f"low = {self.low}, high = {self.high}: the lower corner comes first")
+        return self
 
 
 @kernel

@@ -87,7 +87,7 @@ def _imports(parts: Parts) -> str:
         "import numpy as np",
         "from numba import njit",
         "from flockenv.effects.base import Me, Other",
-        "from flockenv.kernels import like",
+        "from flockenv.kernels import finite, like",
         "from flockenv.neighbours import block_end, candidates, sort_agents",
         f"from flockenv.space import {parts.space.offset_law} as offset_to, {parts.space.confine_law} as confine",
         "from flockenv.vec import add, dot, limit, scale, unit, zero",
@@ -283,7 +283,7 @@ def step_world(context, pos, vel, dt, count, stages):
             x, v = confine(
                 size, radius[i], {_vector("pos[#, i]", d)}, limit({_vector("vel[#, i]", d)}, max_speed[i])
             )
-            if bad < 0 and not np.isfinite(dot(x, x) + dot(v, v)):
+            if bad < 0 and not finite(dot(x, x) + dot(v, v)):
                 bad = i
 {_each("pos[#, i] = x[#]; vel[#, i] = v[#]", d, 12)}
     return bad

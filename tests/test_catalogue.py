@@ -29,7 +29,8 @@ def kinds_in(folder: str, attribute: str) -> set[str]:
 
 def test_every_effect_has_a_row() -> None:
     rows = {row.effect.kind for row in catalogue.EFFECTS}
-    assert rows == kinds_in("effects", "kind") == {k for k, e in EFFECTS.items() if e.__module__.startswith("flockenv.")}
+    ours = {kind for kind, effect in EFFECTS.items() if effect.__module__.startswith("flockenv.")}
+    assert rows == kinds_in("effects", "kind") == ours
 
 
 def test_every_effect_that_can_be_idle_has_an_idle_row() -> None:

@@ -15,7 +15,11 @@ from flockenv.kernels import load
 from flockenv.rows import rows
 from tests.catalogue import STEERING, Array, Law, mirror, rotation
 
-LAWS = pytest.mark.parametrize("row", STEERING, ids=lambda row: row.name)
+
+def laws(*chosen: Law) -> Any:
+    return pytest.mark.parametrize("row", chosen, ids=lambda row: row.name)
+
+
 DIMENSIONS = pytest.mark.parametrize("dimension", [2, 3])
 VECTORS = ("vector", "heading", "own", "noise", "walls")
 TURNED = ("vector", "heading", "noise")
@@ -45,14 +49,12 @@ def turned(row: Law, given_: list[Array], matrix: Array) -> list[Array]:
     return [a @ matrix.T if kind in TURNED else a for kind, a in zip(row.takes, given_, strict=True)]
 
 
-# --- what holds for all ------------------------------------------------------------------------------------------------
+# --- what holds for all -----------------------------------------------------------------------------------------------
 
 
 @DIMENSIONS
-@LAWS
+@laws(*(row for row in STEERING if row.turns != "none"))
 def test_it_turns_with_the_world(row: Law, dimension: int) -> None:
-    if row.turns == "none":
-        pytest.skip("tied to the axes of its walls")
     given_ = arguments(row, dimension, 200)
     answer = rows(row.law)(*given_)
     for seed in range(3):
@@ -62,10 +64,8 @@ def test_it_turns_with_the_world(row: Law, dimension: int) -> None:
 
 
 @DIMENSIONS
-@LAWS
+@laws(*(row for row in STEERING if row.mirrors))
 def test_its_mirror_image_does_the_mirrored_thing(row: Law, dimension: int) -> None:
-    if not row.mirrors:
-        pytest.skip("it tells left from right, or is tied to its walls")
     given_ = arguments(row, dimension, 200)
     answer = rows(row.law)(*given_)
     expected = answer @ mirror(dimension) if row.gives == "vector" else answer
@@ -91,50 +91,58 @@ def extremes(row: Law, dimension: int) -> list[Array]:
 
 
 @DIMENSIONS
-@LAWS
+@laws(*STEERING)
 def test_it_is_finite_wherever_it_may_be_asked(row: Law, dimension: int) -> None:
     answer = rows(row.law)(*extremes(row, dimension))
     assert not np.isnan(answer).any()
     if row.law is not steering.threat:  # its infinity says that nothing is in the way
         assert np.isfinite(answer).all()
-        assert np.abs(answer).max() <= 1e13  # what is divided by is never the 1e-12 itself, squared
+    if row.law is not steering.interception_time:  # equally fast, straight away: 1e22 s is the answer to the rounding
+        assert np.abs(answer[np.isfinite(answer)]).max() <= 1e13  # a distance of 1e-12 m is never divided by twice
 
 
-def single(row: Law, dimension: int) -> Any:
-    """The law over float32 rows, its answer stored in float64 so that a promotion shows."""
-    taken = [f"a{k}" for k in range(len(row.takes))]
-    values = [
-        "(" + ", ".join(f"{a}[r, {k}]" for k in range(dimension)) + ")" if kind in VECTORS else f"{a}[r]"
-        for a, kind in zip(taken, row.takes, strict=True)
-    ]
-    store = "; ".join(f"out[r, {k}] = s[{k}]" for k in range(dimension)) if row.gives == "vector" else "out[r] = s"
+def in_single_precision(dimension: int, given_: list[list[Array]], answers: list[Array]) -> None:
+    """Call all laws over float32 rows, in one compiled loop; answers are stored in float64, so a promotion shows."""
+    lines = []
+    for n, row in enumerate(STEERING):
+        values = [
+            "(" + ", ".join(f"given[{n}][{a}][r, {k}]" for k in range(dimension)) + ")"
+            if kind in VECTORS
+            else f"given[{n}][{a}][r]"
+            for a, kind in enumerate(row.takes)
+        ]
+        lines.append(f"s{n} = steering.{row.name}({', '.join(values)})")
+        if row.gives == "vector":
+            lines += [f"answers[{n}][r, {k}] = s{n}[{k}]" for k in range(dimension)]
+        else:
+            lines.append(f"answers[{n}][r] = s{n}")
+    body = "\n        ".join(lines)
     source = f"""from numba import njit
-from flockenv.steering import {row.name}
+from flockenv import steering
 
 
 @njit(cache=True, error_model="numpy")
-def over({", ".join(taken)}, out):
-    for r in range(out.shape[0]):
-        s = {row.name}({", ".join(values)})
-        {store}
+def over(given, answers):
+    for r in range(answers[0].shape[0]):
+        {body}
 """
-    return load(f"single_{row.name}", source).over
+    load("single_precision", source).over(tuple(map(tuple, given_)), tuple(answers))
 
 
 @DIMENSIONS
-@LAWS
-def test_in_single_precision_it_stays_there_and_stays_accurate(row: Law, dimension: int) -> None:
-    given_ = [a.astype(np.float32) for a in arguments(row, dimension, 200)]
-    exact = rows(row.law)(*given_)
-    answer = np.full_like(exact, np.nan)
-    single(row, dimension)(*given_, answer)
-    assert (answer.astype(np.float32) == answer).all(), "a constant has made it float64"
-    far = np.isfinite(exact)
-    assert (far == np.isfinite(answer)).all()
-    np.testing.assert_allclose(answer[far], exact[far], rtol=2e-5, atol=2e-5)
+def test_in_single_precision_they_stay_there_and_stay_accurate(dimension: int) -> None:
+    given_ = [[a.astype(np.float32) for a in arguments(row, dimension, 200)] for row in STEERING]
+    exact = [rows(row.law)(*g) for row, g in zip(STEERING, given_, strict=True)]
+    answers = [np.full_like(e, np.nan) for e in exact]
+    in_single_precision(dimension, given_, answers)
+    for row, answer, expected in zip(STEERING, answers, exact, strict=True):
+        assert (answer.astype(np.float32) == answer).all(), f"a constant has made {row.name} float64"
+        here = np.isfinite(expected)
+        assert (here == np.isfinite(answer)).all()
+        np.testing.assert_allclose(answer[here], expected[here], rtol=2e-5, atol=2e-5, err_msg=row.name)
 
 
-# --- seek, flee, arrive ------------------------------------------------------------------------------------------------
+# --- seek, flee, arrive -----------------------------------------------------------------------------------------------
 
 
 def steer(behaviour: Any, x: Array, v: Array, *, dt: float, seconds: float, top: float = 2.0, strength: float = 8.0):
@@ -192,7 +200,7 @@ def test_arrive_is_seek_outside_and_a_ramp_inside() -> None:
     np.testing.assert_allclose(arrive([0.0, 0.0], [1.0, 0.0], 2.0, 4.0), [-1.0, 0.0])
 
 
-# --- pursue, evade -----------------------------------------------------------------------------------------------------
+# --- pursue, evade ----------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -240,7 +248,9 @@ def test_pursue_with_the_exact_predictor_meets_its_quarry_on_a_straight_way(dime
     for t, now, _ in steer(chase, x, 2 * aim / 2, dt=0.02, seconds=20, strength=1e9):
         near = np.linalg.norm(w * t - now, axis=1) < 0.1
         met[near] = np.minimum(met[near], t)
-    np.testing.assert_allclose(met, meeting, atol=0.15)
+    early = meeting - met  # 0.1 m are closed at 0.5 to 3.5 m/s
+    assert early.min() > 0
+    assert early.max() < 0.1 / 0.5 + 0.02
 
 
 @DIMENSIONS
@@ -273,7 +283,7 @@ def test_evade_keeps_a_pursuer_off_longer_than_standing_still(dimension: int) ->
     assert (held[0] > 1.5 * held[1]).all()
 
 
-# --- wander ------------------------------------------------------------------------------------------------------------
+# --- wander -----------------------------------------------------------------------------------------------------------
 
 
 def headings_after(seconds: float, dt: float, count: int = 20_000) -> Array:
@@ -315,13 +325,14 @@ def test_a_wander_target_survives_a_step_that_lands_on_the_centre() -> None:
 
 def test_wander_s_own_frame_is_forward_left_up() -> None:
     wander = rows(steering.wander)
-    np.testing.assert_allclose(wander([0.0, 1.0], [3.0, 0.0], 1.0, 0.0) + [3.0, 0.0], [0.0, 1.0], atol=1e-12)
+    v = np.array([3.0, 0.0])
+    np.testing.assert_allclose(wander([0.0, 1.0], v, 1.0, 0.0) + v, [0, 1], atol=1e-12)
     v = np.array([3.0, 0.0, 0.0])
     np.testing.assert_allclose(wander([0.0, 1.0, 0.0], v, 1.0, 0.0) + v, [0, 1, 0], atol=1e-12)
     np.testing.assert_allclose(wander([0.0, 0.0, 1.0], v, 1.0, 0.0) + v, [0, 0, 1], atol=1e-12)
 
 
-# --- separate, align, cohere -------------------------------------------------------------------------------------------
+# --- separate, align, cohere ------------------------------------------------------------------------------------------
 
 
 @DIMENSIONS
@@ -340,7 +351,7 @@ def test_align_takes_the_mean_and_cohere_seeks_the_centre() -> None:
     np.testing.assert_array_equal(rows(steering.cohere)([0.0, 0.0], [0.5, 0.25], 2.0), [0.0, 0.0])
 
 
-# --- avoid -------------------------------------------------------------------------------------------------------------
+# --- avoid ------------------------------------------------------------------------------------------------------------
 
 
 @DIMENSIONS
@@ -390,7 +401,7 @@ def test_inside_an_obstacle_the_way_is_straight_out(dimension: int) -> None:
     np.testing.assert_allclose(rows(steering.avoid)(heading, 0 * x, 1.0, 3.0), 3 * heading, atol=1e-12)
 
 
-# --- contain -----------------------------------------------------------------------------------------------------------
+# --- contain ----------------------------------------------------------------------------------------------------------
 
 
 @DIMENSIONS
@@ -410,7 +421,7 @@ def test_contain_asks_for_nothing_inside_and_for_the_way_in_outside(dimension: i
     assert (((wish + v) * nearest).sum(axis=1)[outside] > 0).all()
 
 
-# --- arbitration -------------------------------------------------------------------------------------------------------
+# --- arbitration ------------------------------------------------------------------------------------------------------
 
 REYNOLDS = [(8.0, 0.0), (-8.0, 0.0), (0.0, 5.0)]
 
@@ -458,7 +469,7 @@ def test_no_arbiter_exceeds_the_budget(wishes: Any, budget: float) -> None:
         assert np.linalg.norm(answer) <= budget * (1 + 1e-12) + 1e-300
 
 
-# --- the wrapper over rows ---------------------------------------------------------------------------------------------
+# --- the wrapper over rows --------------------------------------------------------------------------------------------
 
 
 def test_rows_broadcast_and_keep_the_leading_shape() -> None:
@@ -486,5 +497,6 @@ def test_rows_say_which_argument_does_not_fit(given_: Any, said: str) -> None:
 
 
 def test_rows_refuse_a_mixture_of_dimensions() -> None:
-    with pytest.raises(ValueError, match="velocity"):
-        rows(steering.seek)([1.0, 2.0, 3.0], [0.0, 0.0], 1.0)
+    for offset, velocity in (([1.0, 2.0, 3.0], [0.0, 0.0]), ([1.0, 2.0], [0.0, 0.0, 5.0])):
+        with pytest.raises(ValueError, match=r"seek: .*\b2\b.*\b3\b"):
+            rows(steering.seek)(offset, velocity, 1.0)

@@ -194,7 +194,7 @@ def first_bad(actions):
     for b in range(actions.shape[0]):
         for i in range(actions.shape[1]):
             for k in range(actions.shape[2]):
-                if not np.isfinite(actions[b, i, k]):
+                if not finite(actions[b, i, k]):
                     return b, i, k
     return -1, -1, -1
 

@@ -14,6 +14,7 @@ from flockenv import arbitration, steering
 from flockenv.kernels import kernel
 from flockenv.noise import uniform
 from flockenv.scene import Group, Scene
+from flockenv.shapes import ray_hit
 from flockenv.snapshot import Mark
 from flockenv.space import Torus
 from flockenv.state import State
@@ -232,7 +233,7 @@ def measure(p: Any, before: Frame, after: Frame, numbers: Any) -> None:
 
 @kernel
 def observe(p: Any, frame: Frame, rows: Any) -> None:
-    """Everything in the frame of the heading: (along, left). Own velocity, nearest neighbours, nearest obstacles."""
+    """All in the frame of the heading: (along, left). Own velocity, nearest neighbours and obstacles, free ways."""
     slots, seen = int(p.neighbours), int(p.obstacles_seen)
     distances, chosen = np.empty(max(slots, seen)), np.empty(max(slots, seen), np.int64)
     size = _size(p)
@@ -252,7 +253,9 @@ def observe(p: Any, frame: Frame, rows: Any) -> None:
             k = at + 2 * slots + 2 * s
             row[k], row[k + 1] = _turned(ux, uy, hx, hy, 2.0 * p.max_speed)
             row[at + 4 * slots + s] = 1.0
-        at += 5 * slots
+            k = at + 5 * slots + 2 * s
+            row[k], row[k + 1] = _turned(dx, dy, hx, hy, p.spacing)
+        at += 7 * slots
         found = nearest_obstacles(frame, i, p.sight, size, seen, distances, chosen)
         for s in range(found):
             m = chosen[s]
@@ -260,6 +263,22 @@ def observe(p: Any, frame: Frame, rows: Any) -> None:
             dy = offset(frame.pos[1, i], frame.centre[1, m], p.size)
             row[at + 2 * s], row[at + 2 * s + 1] = _turned(dx, dy, hx, hy, p.sight + p.greatest_radius)
             row[at + 2 * seen + s] = frame.rho[m] / p.greatest_radius
+        at += 3 * seen
+        for r in range(int(p.rays)):
+            angle = 2.0 * math.pi * r / p.rays
+            dx, dy = math.cos(angle) * hx - math.sin(angle) * hy, math.cos(angle) * hy + math.sin(angle) * hx
+            row[at + r] = _free_way(p, frame, i, dx, dy, chosen[:found]) / p.sight
+
+
+@kernel
+def _free_way(p: Any, frame: Frame, i: int, dx: float, dy: float, seen: Any) -> float:
+    """Return how far agent i can go in a direction before it touches an obstacle that it sees, m, at most `sight`."""
+    way: float = p.sight
+    for m in seen:
+        x = offset(frame.pos[0, i], frame.centre[0, m], p.size)
+        y = offset(frame.pos[1, i], frame.centre[1, m], p.size)
+        way = min(way, ray_hit((x, y), (dx, dy), frame.rho[m] + frame.radius[i]))
+    return way
 
 
 @kernel
@@ -298,6 +317,7 @@ class Flock(Task):
     sight: float = Field(default=6.0, gt=0, description="m, neighbours and obstacles are seen within this")
     neighbours: int = Field(default=6, ge=1, le=32, description="how many neighbours are seen, nearest first")
     obstacles_seen: int = Field(default=2, ge=1, le=32, description="how many are seen, nearest surface first")
+    rays: int = Field(default=12, ge=1, le=128, description="directions in which the way clear of obstacles is seen")
     progress_reward: float = Field(default=1.0, ge=0, description="per s at cruising speed along the heading")
     alignment_cost: float = Field(
         default=0.5, ge=0, description="per s at a velocity off the neighbours' mean by cruise"
@@ -341,14 +361,17 @@ class Flock(Task):
     def layout(self) -> Layout:
         """Every vector is (along the heading, to its left)."""
         n, m = self.neighbours, self.obstacles_seen
+        ways = "how far the body can go before it touches one of them, anticlockwise from the heading"
         seen = "offsets of the centres of the nearest obstacles, nearest surface first; zeros = none"
         return Layout((
             Slot("velocity", (2,), self.max_speed, "m/s", "own velocity (along the heading, to its left)"),
             Slot("neighbours", (n, 2), self.sight, "m", "offsets of the nearest neighbours, nearest first"),
             Slot("neighbour_velocity", (n, 2), 2 * self.max_speed, "m/s", "their velocities minus one's own"),
-            Slot("neighbour_present", (n,), 1.0, "1", "1 where there is one, else 0 (and zeros before)", low=0.0),
+            Slot("neighbour_present", (n,), 1.0, "1", "1 where there is one, else 0 (and zeros elsewhere)", low=0.0),
+            Slot("near", (n, 2), self.spacing, "m", "the same offsets on a finer scale, each part cut at the spacing"),
             Slot("obstacles", (m, 2), self.sight + self.greatest_radius, "m", seen),
             Slot("obstacle_radius", (m,), self.greatest_radius, "m", "their radii; 0 = none", low=0.0),
+            Slot("free_way", (self.rays,), self.sight, "m", ways, low=0.0),
         ))  # fmt: skip
 
     @functools.cached_property

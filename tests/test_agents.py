@@ -1,0 +1,121 @@
+"""The workbench: rules are far above random, training is repeatable and resumes, the search writes what it found."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+from agents import tune
+from agents.experiment import CONFIGS, WEIGHTS, Experiment, PpoSettings, load_experiment
+from agents.reynolds import RULES, player, tuned
+from flockenv.evaluation import compare, rollout, worlds_for
+from flockenv.policy import MlpPolicy, RandomPolicy
+from flockenv.tasks import TASKS
+
+TINY = {"worlds": 16, "rollout": 16, "minibatch": 64, "epochs": 1, "evaluate_every": 512, "evaluate_worlds": 4}
+
+
+@pytest.mark.parametrize("name", sorted(TASKS))
+def test_both_hand_written_players_are_far_above_random(name: str) -> None:
+    task = load_experiment(CONFIGS / f"{name}.yaml").build()
+    first = worlds_for("tuning", 7, 24)
+    random = rollout(task, RandomPolicy(task.action_layout.size, 0), 24, first)
+    for textbook in (True, False):
+        rules = rollout(task, player(task, textbook=textbook), 24, first)
+        assert compare(rules, random).difference.low > 10
+
+
+@pytest.mark.parametrize("name", sorted(TASKS))
+def test_the_shipped_policy_is_far_above_random_and_its_card_is_complete(name: str) -> None:
+    task = load_experiment(CONFIGS / f"{name}.yaml").build()
+    policy = MlpPolicy.load(WEIGHTS / f"{name}.safetensors", task)
+    first = worlds_for("tuning", 7, 24)
+    random = rollout(task, RandomPolicy(task.action_layout.size, 0), 24, first)
+    assert compare(rollout(task, policy, 24, first), random).difference.low > 10
+    card = json.loads((WEIGHTS / f"{name}.json").read_text(encoding="utf-8"))
+    recipe = load_experiment(CONFIGS / f"{name}.yaml").ppo.model_dump(mode="json")
+    assert card["recipe"]["ppo"] == recipe, "the config beside the weights is the one that made them"
+    assert card["recipe"]["command"] == f"python -m agents.ppo configs/{name}.yaml"
+    assert card["wall_time_s"] < 600 and card["curve"][-1]["mean"] > card["curve"][0]["mean"]
+
+
+@pytest.mark.parametrize("name", sorted(TASKS))
+def test_a_player_answers_one_row_as_it_answers_many(name: str) -> None:
+    task = TASKS[name]()
+    rows = np.random.default_rng(0).uniform(-1, 1, (5, task.layout.size)).astype(np.float32)
+    rows = np.clip(rows, task.layout.low, task.layout.high)
+    together, _ = player(task).predict(rows)
+    alone = np.stack([player(task).predict(row)[0] for row in rows])
+    np.testing.assert_array_equal(together, alone)
+    assert together.dtype == np.float32 and np.all(np.linalg.norm(together, axis=1) <= 1 + 1e-6)
+
+
+@pytest.mark.parametrize("name", sorted(TASKS))
+def test_a_player_is_finite_where_there_is_nothing_to_see(name: str) -> None:
+    task = TASKS[name]()
+    action, _ = player(task).predict(np.zeros((1, task.layout.size), np.float32))
+    assert np.isfinite(action).all()
+
+
+def test_every_parameter_of_the_rules_has_a_range_around_its_textbook_value() -> None:
+    for name, (_, rules) in RULES.items():
+        for parameter, (low, high) in tune.RANGES[name].items():
+            assert low <= getattr(rules(), parameter) <= high or parameter == "horizon", (name, parameter)
+
+
+def test_the_tuned_parameters_are_those_of_the_config_and_beat_the_textbook_there() -> None:
+    for name in TASKS:
+        found = load_experiment(CONFIGS / f"{name}.yaml").reynolds
+        assert tuned(name) == found.rules
+        assert found.found["tuning_mean"] > found.found["textbook_mean"]
+
+
+def test_the_search_writes_its_result_and_keeps_the_rest_of_the_file(tmp_path: Path) -> None:
+    config = tmp_path / "pursuit.yaml"
+    config.write_text("# a comment\ntask: pursuit\nppo:\n  steps: 5  # few\n", encoding="utf-8")
+    experiment = Experiment(task="pursuit", reynolds={"search": {"candidates": 4, "worlds": 2, "rounds": 2}})
+    rules, found = tune.search(experiment)
+    tune.write(config, rules, found)
+    text = config.read_text(encoding="utf-8")
+    assert text.startswith("# a comment\ntask: pursuit\nppo:\n  steps: 5  # few\n")
+    assert yaml.safe_load(text)["reynolds"]["rules"] == rules
+    assert found["agent_steps"] > 0 and found["tuning_mean"] >= found["textbook_mean"]
+    assert tune.search(experiment) == (rules, found), "the same seed finds the same"
+
+
+def _train(folder: Path, steps: int, go_on: bool = False) -> dict[str, np.ndarray]:
+    from agents import ppo
+
+    experiment = Experiment(task="pursuit", ppo={**TINY, "steps": steps})
+    return ppo.train(experiment, folder, go_on).tensors
+
+
+def test_training_is_repeatable_resumes_and_exports(tmp_path: Path) -> None:
+    from agents import ppo
+
+    once, twice = _train(tmp_path / "a", 1024), _train(tmp_path / "b", 1024)
+    assert once.keys() == twice.keys()
+    for name in once:
+        np.testing.assert_array_equal(once[name], twice[name])
+    longer = Experiment(task="pursuit", ppo={**TINY, "steps": 2048})
+    run = ppo.train(longer, tmp_path / "a", go_on=True)
+    assert run.steps >= 2048 and run.curve[0]["steps"] < 1024 < run.curve[-1]["steps"]
+    ppo.export(longer, run, tmp_path / "p.safetensors")
+    policy = MlpPolicy.load(tmp_path / "p.safetensors", longer.build())
+    assert policy.observation_size == longer.build().layout.size
+
+
+def test_bad_settings_are_one_line(tmp_path: Path) -> None:
+    path = tmp_path / "x.yaml"
+    path.write_text("task: pursuit\nppo: {stpes: 3}\n", encoding="utf-8")
+    with pytest.raises(ValueError, match=r"ppo\.stpes.*did you mean `steps`") as caught:
+        load_experiment(path)
+    assert "\n" not in str(caught.value)
+    with pytest.raises(ValueError, match=r"task = 'pursiut': unknown, did you mean 'pursuit'"):
+        Experiment(task="pursiut").build()
+    with pytest.raises(ValueError, match="PpoSettings: steps = 0"):
+        PpoSettings(steps=0)

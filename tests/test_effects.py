@@ -1,0 +1,353 @@
+"""What acts on a body: laws that hold for every effect of the catalogue, in 2-D and 3-D, and closed forms."""
+
+from __future__ import annotations
+
+import copy
+import json
+import pickle
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import flockenv
+from flockenv import effects as effects_module
+from flockenv.effects import Drag, Separation
+from flockenv.integrators import RK4
+from flockenv.kernels import cache_folder
+from flockenv.scene import Group, Scene
+from flockenv.space import Plane
+from flockenv.spawn import Spawn
+from flockenv.state import State
+from tests.catalogue import EDGE, EFFECTS, Array, EffectRow, everything, mirror, rotation, scene_of
+
+ROWS = pytest.mark.parametrize("row", EFFECTS, ids=lambda row: row.name)
+DIMENSIONS = pytest.mark.parametrize("dimension", [2, 3])
+STEPS = 12
+
+
+def scene_under(row: EffectRow, dimension: int) -> Scene:
+    return scene_of(row.effect, dimension=dimension)
+
+
+def moved(state: State, matrix: Array, shift: Array) -> State:
+    """The same state turned about the middle of the agents' region and shifted; obstacles too."""
+    new, middle = state.copy(), EDGE / 2
+    for points in (new.pos, new.obstacles.centre):
+        points[...] = (points - middle) @ matrix.T + middle + shift
+    new.vel[...] = new.vel @ matrix.T
+    return new
+
+
+def assert_moves_alike(scene: Scene, matrix: Array, shift: Array) -> None:
+    """Turned and shifted, the scene ends where the turned and shifted end is."""
+    start = scene.start(3, worlds=2)
+    end = scene.run(start, STEPS)
+    assert not np.allclose(end.vel, start.vel)
+    expected, found = moved(end, matrix, shift), scene.run(moved(start, matrix, shift), STEPS)
+    np.testing.assert_allclose(scene.space.displacement(found.pos, expected.pos), 0, atol=1e-9)
+    np.testing.assert_allclose(found.vel, expected.vel, atol=1e-9)
+
+
+# --- symmetries -------------------------------------------------------------------------------------------------------
+
+
+@DIMENSIONS
+@ROWS
+def test_it_turns_with_the_world(row: EffectRow, dimension: int) -> None:
+    assert "rotation" in row.obeys
+    assert_moves_alike(scene_under(row, dimension), rotation(dimension, 7), np.zeros(dimension))
+
+
+@DIMENSIONS
+@ROWS
+def test_its_mirror_image_does_the_mirrored_thing(row: EffectRow, dimension: int) -> None:
+    assert "mirror" in row.obeys
+    assert_moves_alike(scene_under(row, dimension), mirror(dimension), np.zeros(dimension))
+
+
+@DIMENSIONS
+@ROWS
+def test_it_does_not_know_where_it_is(row: EffectRow, dimension: int) -> None:
+    assert "translation" in row.obeys
+    assert_moves_alike(scene_under(row, dimension), np.eye(dimension), np.arange(1, dimension + 1) * 37.25)
+
+
+@DIMENSIONS
+def test_a_torus_has_no_origin(dimension: int) -> None:
+    """All effects at once; the shift carries agents and obstacles across every edge."""
+    shift = np.random.default_rng(2).uniform(5, 50, dimension)
+    assert_moves_alike(everything(dimension), np.eye(dimension), shift)
+
+
+@DIMENSIONS
+@ROWS
+def test_the_order_of_the_agents_does_not_matter(row: EffectRow, dimension: int) -> None:
+    """Agents are relabelled within their groups: a body that is looked up in another agent's place shows."""
+    scene = scene_under(row, dimension)
+    start = scene.start(3)
+    rng, order, first = np.random.default_rng(0), [], 0
+    for group in scene.groups:
+        order += list(first + rng.permutation(group.count))
+        first += group.count
+    other = start.copy()
+    other.x[...], other.v[...] = start.x[:, :, order], start.v[:, :, order]
+    end, found = scene.run(start, 40), scene.run(other, 40)
+    np.testing.assert_allclose(found.x, end.x[:, :, order], atol=1e-9)
+    np.testing.assert_allclose(found.v, end.v[:, :, order], atol=1e-9)
+
+
+@DIMENSIONS
+@ROWS
+def test_a_world_of_a_batch_is_that_world_alone(row: EffectRow, dimension: int) -> None:
+    scene = scene_under(row, dimension)
+    batch = scene.run(scene.start(20, worlds=5), 30)
+    for k in range(5):
+        alone = scene.run(scene.start(20 + k), 30)
+        np.testing.assert_array_equal(batch.x[:, k], alone.x[:, 0])
+        np.testing.assert_array_equal(batch.v[:, k], alone.v[:, 0])
+        np.testing.assert_array_equal(batch.work[k], alone.work[0])
+
+
+@DIMENSIONS
+@ROWS
+def test_it_conserves_momentum_if_it_says_so(row: EffectRow, dimension: int) -> None:
+    scene = scene_under(row, dimension)
+    start = scene.start(3)
+    end = scene.run(start, 50)
+    mass = scene.body.mass[None, :, None]
+    gained = np.abs(((end.vel - start.vel) * mass).sum(axis=1)).max()
+    assert (gained < 1e-10) == row.effect.conserves_momentum
+
+
+@DIMENSIONS
+@ROWS
+def test_somebody_out_of_reach_changes_nothing(row: EffectRow, dimension: int) -> None:
+    scene = scene_under(row, dimension)
+    start = scene.start(3)
+    last = scene.groups[-1]
+    more = scene.model_copy(update={"groups": (scene.groups[0], last.model_copy(update={"count": last.count + 1}))})
+    other = more.start(3)
+    other.pos[0, -1] = 1000.0
+    np.testing.assert_array_equal(scene.run(start, 20).pos, more.run(other, 20).pos[:, :-1])
+
+
+@DIMENSIONS
+@ROWS
+def test_the_dead_are_not_there(row: EffectRow, dimension: int) -> None:
+    """They push nobody, and nothing pushes them."""
+    scene = scene_under(row, dimension)
+    start = scene.start(3)
+    start.alive[:, 18:] = False
+    groups = (scene.groups[0], scene.groups[1].model_copy(update={"count": 4}))
+    few = scene_of(row.effect, dimension=dimension, groups=groups)
+    living = few.start(3)
+    living.x[...], living.v[...] = start.x[:, :, :18], start.v[:, :, :18]
+    end, expected = scene.run(start, 20), few.run(living, 20)
+    np.testing.assert_array_equal(end.x[:, :, :18], expected.x)
+    np.testing.assert_array_equal(end.v[:, :, 18:], start.v[:, :, 18:])
+
+
+# --- degenerate input -------------------------------------------------------------------------------------------------
+
+
+@DIMENSIONS
+@ROWS
+@pytest.mark.parametrize("count", [1, 50])
+def test_it_is_finite_where_everybody_is_in_one_place_at_rest(row: EffectRow, dimension: int, count: int) -> None:
+    """In an obstacle's very centre, if there are obstacles: nothing has a direction there."""
+    spawn = Spawn(low=(0,) * dimension, high=(1,) * dimension)
+    scene = scene_of(row.effect, dimension=dimension, groups=(Group(count=count, spawn=spawn),))
+    state = scene.start(0)
+    state.pos[...] = scene.obstacles[0].centre if scene.obstacles else 2.5
+    state.vel[...] = 0
+    end = scene.run(state, 50)
+    assert np.isfinite(end.pos).all()
+    assert np.isfinite(end.vel).all()
+    if row.effect.conserves_momentum:
+        np.testing.assert_allclose(end.vel.sum(axis=1), 0, atol=1e-11 * count)
+
+
+@DIMENSIONS
+def test_whoever_is_in_one_place_separates_in_different_directions(dimension: int) -> None:
+    """numerics.md, P28: finite, momentum unchanged, apart after 1 s, and not all to the same side."""
+    scene = scene_of(Separation(weight=1, radius=2), dimension=dimension, groups=(
+        Group(count=50, max_speed=3, spawn=Spawn(low=(0,) * dimension, high=(1,) * dimension)),))  # fmt: skip
+    state = scene.start(0)
+    state.pos[...], state.vel[...] = 0.0, 0.0
+    first, end = scene.run(state, 1), scene.run(state, 20)
+    assert np.abs(first.vel.sum(axis=1)).max() < 1e-12
+    directions = first.vel[0] / np.linalg.norm(first.vel[0], axis=1, keepdims=True)
+    assert len(np.unique(directions.round(6), axis=0)) == 50
+    gaps = np.linalg.norm(end.pos[0, :, None] - end.pos[0, None], axis=2)[~np.eye(50, dtype=bool)]
+    assert gaps.min() > 0.01
+    np.testing.assert_array_equal(end.pos, scene.run(state, 20).pos)
+
+
+# --- nothing is computed that nobody asks for -------------------------------------------------------------------------
+
+
+@DIMENSIONS
+@ROWS
+def test_an_idle_effect_is_an_absent_one(row: EffectRow, dimension: int) -> None:
+    if row.idle is None:  # another row of the same kind has one, see test_catalogue.py
+        return
+    idle, absent = scene_of(row.idle, dimension=dimension), scene_of(dimension=dimension)
+    start = idle.start(3)
+    ends = [scene.run(start, 20) for scene in (idle, absent)]
+    np.testing.assert_array_equal(ends[0].x, ends[1].x)
+    np.testing.assert_array_equal(ends[0].v, ends[1].v)
+
+
+@DIMENSIONS
+@ROWS
+def test_it_calls_for_what_it_says_and_for_nothing_else(row: EffectRow, dimension: int) -> None:
+    scene = scene_under(row, dimension)
+    end = scene.run(scene.start(3, worlds=2), 10)
+    agents, asks = scene.agents, row.effect.calls_for()
+    assert end.counted("evaluations") == 2 * 10
+    assert end.counted("neighbour_queries") == (2 * 10 if "neighbour query" in asks else 0)
+    assert end.counted("pairs") == (2 * 10 * agents * agents if "neighbour query" in asks else 0)
+    assert end.counted("obstacle_tests") == (2 * 10 * agents * 2 if "obstacles" in asks else 0)
+
+
+def test_a_scene_without_effects_computes_nothing() -> None:
+    scene = scene_of(obstacles=({"centre": (1, 1), "radius": 0.5},))
+    end = scene.run(scene.start(3, worlds=2), 10)
+    assert [end.counted(what) for what in ("neighbour_queries", "pairs", "obstacle_tests")] == [0, 0, 0]
+
+
+def test_several_pair_effects_share_one_query() -> None:
+    scene = everything(2)
+    assert sum(effect.pair_law is not None for effect in scene.effects) > 1
+    end = scene.run(scene.start(3, worlds=2), 10)
+    assert end.counted("neighbour_queries") == end.counted("evaluations") == 2 * 10
+    assert end.counted("pairs") == 2 * 10 * scene.agents**2
+
+
+# --- an effect is a value ---------------------------------------------------------------------------------------------
+
+
+@ROWS
+def test_it_prints_as_its_own_constructor(row: EffectRow) -> None:
+    assert eval(repr(row.effect), vars(effects_module)) == row.effect  # noqa: S307  # that is what is promised
+    assert str(row.effect) == repr(row.effect)
+
+
+@ROWS
+def test_it_is_a_value(row: EffectRow) -> None:
+    again = pickle.loads(pickle.dumps(row.effect))
+    assert again == row.effect == copy.deepcopy(row.effect)
+    assert hash(again) == hash(row.effect)
+    assert type(row.effect).model_validate(row.effect.model_dump()) == row.effect
+    assert type(row.effect).model_validate_json(row.effect.model_dump_json()) == row.effect
+    for name in row.effect.parameters().keys() & type(row.effect).model_fields.keys():
+        assert getattr(row.effect, name) == row.effect.parameters()[name]
+        with pytest.raises(ValueError, match="frozen"):
+            setattr(row.effect, name, 1.0)
+
+
+@DIMENSIONS
+@ROWS
+def test_a_scene_under_it_is_a_value(row: EffectRow, dimension: int) -> None:
+    scene = scene_under(row, dimension)
+    end = scene.run(scene.start(3), 5)
+    again = pickle.loads(pickle.dumps(scene))
+    assert again == scene
+    assert Scene.model_validate(scene.model_dump()) == scene
+    names = vars(effects_module) | {"Scene": Scene, "Group": Group, "Spawn": Spawn, "Plane": Plane}
+    names |= {type(o).__name__: type(o) for o in (*scene.obstacles, scene.integrator)}
+    assert eval(repr(scene), names) == scene  # noqa: S307
+    np.testing.assert_array_equal(again.run(again.start(3), 5).x, end.x)
+
+
+def test_bad_parameters_are_refused_in_one_line() -> None:
+    for row in EFFECTS:
+        for name in type(row.effect).model_fields:
+            if name == "kind":
+                continue
+            for value in (-1.0, float("nan"), float("inf"), "much", None):
+                with pytest.raises(ValueError, match=name) as caught:
+                    type(row.effect)(**{**row.effect.model_dump(), name: value})
+                assert "\n" not in str(caught.value)
+
+
+# --- a second process -------------------------------------------------------------------------------------------------
+
+SECOND = """
+import json, sys
+from tests.catalogue import EFFECTS, scene_of
+found = {}
+for row in EFFECTS:
+    for dimension in (2, 3):
+        scene = scene_of(row.effect, dimension=dimension)
+        end = scene.run(scene.start(3), 5)
+        found[f"{row.name} {dimension}"] = end.x.tobytes().hex()
+        assert sum(scene._kernel.stats.cache_misses.values()) == 0, f"{row.name} was compiled again"
+json.dump(found, sys.stdout)
+"""
+
+
+def test_a_second_process_compiles_nothing_and_finds_the_same() -> None:
+    here = {}
+    for row in EFFECTS:
+        for dimension in (2, 3):
+            scene = scene_under(row, dimension)
+            here[f"{row.name} {dimension}"] = scene.run(scene.start(3), 5).x.tobytes().hex()
+    done = subprocess.run(
+        [sys.executable, "-c", SECOND],
+        cwd=Path(__file__).resolve().parent.parent,
+        env={"FLOCKENV_CACHE": str(cache_folder()), "PYTHONPATH": str(Path(flockenv.__file__).parent.parent)},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    assert json.loads(done.stdout) == here
+
+
+# --- closed forms and limits ------------------------------------------------------------------------------------------
+
+
+def test_drag_slows_down_exponentially() -> None:
+    """v = v0 exp(-c t / m), x = x0 + v0 (1 - exp(-c t / m)) m / c (numerics.md 3.3), for each body's own mass."""
+    scene = scene_of(Drag(rate=0.4), integrator=RK4(), dt=0.02)
+    start = scene.start(1)
+    end = scene.run(start, 150)
+    decay = 0.4 / scene.body.mass[None, :, None]
+    np.testing.assert_allclose(end.vel, start.vel * np.exp(-decay * 3), rtol=1e-8)
+    np.testing.assert_allclose(end.pos - start.pos, start.vel * (1 - np.exp(-decay * 3)) / decay, rtol=1e-8)
+
+
+@DIMENSIONS
+def test_the_speed_limit_holds_along_the_diagonal(dimension: int) -> None:
+    """A clip per axis would let sqrt(D) times the limit through."""
+    spawn = Spawn(low=(0,) * dimension, high=(1,) * dimension)
+    scene = scene_of(dimension=dimension, groups=(Group(count=3, max_speed=2, spawn=spawn),))
+    end = scene.step(scene.start(0), drive=np.full((1, 3, dimension), 50.0), steps=100)
+    np.testing.assert_allclose(np.linalg.norm(end.vel, axis=2), 2, rtol=1e-12)
+    np.testing.assert_allclose(end.vel, 2 / np.sqrt(dimension))
+
+
+def forces(scene: Scene, state: State, drive: Array) -> Array:
+    return (scene.step(state, drive=drive).vel - state.vel) / scene.dt * scene.body.mass[None, :, None]
+
+
+@DIMENSIONS
+def test_max_force_bounds_what_agents_ask_for_and_not_what_acts_on_them(dimension: int) -> None:
+    spawn = Spawn(low=(0,) * dimension, high=(0.5,) * dimension, speed=(1, 2))
+    groups = (Group(count=9, mass=2, max_force=3, spawn=spawn),)
+    drive = np.zeros((1, 9, dimension))
+    drive[0, :, 0] = 100.0
+    steered = scene_of(Separation(weight=1.3, radius=2.5), dimension=dimension, groups=groups)
+    state = steered.start(1)
+    wanted, weak = forces(steered, state, drive), forces(steered, state, drive * 0)
+    np.testing.assert_allclose(np.linalg.norm(wanted, axis=2), 3, rtol=1e-12)
+    np.testing.assert_allclose(np.linalg.norm(weak, axis=2), 3, rtol=1e-12)  # nine in half a metre: it pushes hard
+    assert not np.allclose(wanted, weak)  # drive and steering are cut together
+    pushed = scene_of(Drag(rate=5), dimension=dimension, groups=groups)
+    expected = -5 * state.vel
+    expected[..., 0] += 3
+    np.testing.assert_allclose(forces(pushed, state, drive), expected, rtol=1e-10)
