@@ -41,9 +41,9 @@ console = Console(stderr=True)
 class ForLearning(VecEnvWrapper):
     """What learning likes: small rewards, and worlds that are not all in the same phase of their episodes.
 
-    Rewards times a constant keep the value loss near 1, so that clipping gradients does not starve the policy. And where
-    only the time limit ends an episode, worlds that began together would show every update one phase alone; staggered,
-    their first episodes end one after another.
+    Rewards times a constant keep the value loss near 1, so that clipping gradients does not starve the policy. And
+    where only the time limit ends an episode, worlds that began together would show every update one phase alone;
+    staggered, their first episodes end one after another.
     """
 
     def __init__(self, venv: WorldVecEnv, scale: float, stagger: bool) -> None:

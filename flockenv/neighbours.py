@@ -44,6 +44,13 @@ def _grid(lengths: Any, count: int, reach: float, periodic: bool, shape: Ints) -
         for k in range(dimension):
             shape[k] = max(1, int(shape[k] * shrink))
             cells *= shape[k]
+    while cells > count:  # an axis of one cell could not shrink (a queue of people): the longest gives way for it
+        longest = 0
+        for k in range(1, dimension):
+            longest = k if shape[k] > shape[longest] else longest
+        cells /= shape[longest]
+        shape[longest] = max(1, int(count / cells))
+        cells = round(cells) * float(shape[longest])
     for k in range(dimension):
         if periodic and shape[k] < 3:  # a row and its image would be the same row
             return False

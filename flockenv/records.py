@@ -5,12 +5,15 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, Self
 
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel, ConfigDict, ValidationError, model_validator
 from pydantic._internal._model_construction import ModelMetaclass  # it has no public name
+from pydantic_core import PydanticCustomError
 
 from flockenv.refusals import refusals
 
 __all__ = ["Record"]
+
+_NUMBERS = (float, int, float | None, int | None)
 
 
 class _OneLine(ModelMetaclass):
@@ -34,6 +37,17 @@ class Record(BaseModel, metaclass=_OneLine):
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, use_attribute_docstrings=True)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _no_lookalikes(cls, data: Any) -> Any:
+        """Refuse "1e-3" and True where a number is wanted: pydantic would take both for one."""
+        for name, field in cls.model_fields.items():
+            value = data.get(name) if isinstance(data, dict) else None
+            if isinstance(value, (str, bool)) and field.annotation in _NUMBERS:
+                line = {"type": PydanticCustomError("float_type", "must be a number"), "loc": (name,), "input": value}
+                raise ValidationError.from_exception_data(cls.__name__, [line])  # type: ignore[list-item]
+        return data
 
     def __str__(self) -> str:
         return repr(self)

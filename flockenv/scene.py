@@ -24,7 +24,7 @@ from flockenv.effects import EFFECTS, Effect
 from flockenv.integrators import INTEGRATORS, Integrator, SemiImplicitEuler
 from flockenv.kernels import entry, load
 from flockenv.neighbours import LANES, MAX_RANGES
-from flockenv.noise import key_of
+from flockenv.noise import MASK, key_of
 from flockenv.records import Record
 from flockenv.shapes import Circle
 from flockenv.snapshot import Snapshot
@@ -55,6 +55,14 @@ else:
         Annotated[functools.reduce(operator.or_, INTEGRATORS.values()), Field(discriminator="kind")],
         WrapValidator(_keep),
     ]
+
+
+def _demand_whole(name: str, value: object, least: int, most: int | None = None) -> None:
+    """Refuse what is no whole number from `least` to `most`, True included."""
+    whole = isinstance(value, (int, np.integer)) and not isinstance(value, bool)
+    if not whole or value < least or (most is not None and value > most):  # type: ignore[operator]  # whole is an int
+        allowed = f"from {least} to {most}" if most is not None else f"of at least {least}"
+        raise ValueError(f"{name} is {value!r}, must be a whole number {allowed}")
 
 
 class Group(Record):
@@ -193,8 +201,8 @@ class Scene(Record):
 
     def start(self, seed: int, worlds: int = 1) -> State:
         """Return the first state: world k is drawn from seed + k, whichever batch it is in."""
-        if worlds < 1:
-            raise ValueError(f"worlds is {worlds}, must be at least 1")
+        _demand_whole("seed", seed, 0, MASK)
+        _demand_whole("worlds", worlds, 1)
         if self.bytes_per_world() * worlds > MEMORY_LIMIT:
             need = self.bytes_per_world() * worlds / 2**30
             most = MEMORY_LIMIT / 2**30
@@ -228,6 +236,7 @@ class Scene(Record):
         out: the state to write into (it may be `state` itself: nothing is allocated then); none = a new one.
         Raises FloatingPointError, naming world and agent, if a position or velocity is no longer finite.
         """
+        self._check(state, steps)
         if out is None:
             out = state.copy()
         elif out is not state:
@@ -242,6 +251,16 @@ class Scene(Record):
                 f"dt = {self.dt:g} s may be too large for {self.integrator.kind}"
             )
         return out
+
+    def _check(self, state: State, steps: int) -> None:
+        """Refuse what the kernel would not notice: it trusts the sizes of its arrays."""
+        expected = (self.agents, self.dimension, np.dtype(self.dtype))
+        if (*state.shape[1:], state.x.dtype) != expected:
+            raise ValueError(
+                f"the state holds (N, D) = {state.shape[1:]} of {state.x.dtype}, "
+                f"but this scene has {expected[:2]} of {expected[2]}"
+            )
+        _demand_whole("steps", steps, 0)
 
     def run(self, state: State, steps: int) -> State:
         """Return the state `steps` steps later."""

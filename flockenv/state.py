@@ -99,7 +99,14 @@ class State:
         return replace(self, **{name: getattr(self, name).copy() for name in _ARRAYS})
 
     def copy_from(self, other: State) -> None:
-        """Overwrite the arrays of this state with another's of the same shape."""
+        """Overwrite the arrays of this state with another's; refuses one of another shape or precision."""
+        for name in _ARRAYS:
+            mine, theirs = getattr(self, name), getattr(other, name)
+            if (mine.shape, mine.dtype) != (theirs.shape, theirs.dtype):
+                raise ValueError(
+                    f"a state whose {name} is {theirs.shape} of {theirs.dtype} does not fit into one whose {name} is "
+                    f"{mine.shape} of {mine.dtype}"
+                )
         for name in _ARRAYS:
             getattr(self, name)[...] = getattr(other, name)
 

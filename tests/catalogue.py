@@ -5,13 +5,20 @@ A new effect, integrator, behaviour, task or space is one row below; `test_catal
 
 from __future__ import annotations
 
+import importlib
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
+from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from flockenv import arbitration, steering
+from flockenv.effects import EFFECTS as EFFECT_KINDS
 from flockenv.effects import Alignment, AvoidObstacles, Cohesion, Drag, Effect, Separation
 from flockenv.integrators import RK4, ExplicitEuler, Integrator, SemiImplicitEuler
 from flockenv.scene import Group, Scene
@@ -182,3 +189,49 @@ def rotation(dimension: int, seed: int, upright: bool = False) -> Array:
 def mirror(dimension: int) -> Array:
     """Return the reflection that exchanges the two ends of the x axis."""
     return np.diag([-1.0] + [1.0] * (dimension - 1))
+
+
+# --- a law of somebody else's -----------------------------------------------------------------------------------------
+
+TETHER = """
+from __future__ import annotations
+
+from typing import Any, ClassVar, Literal
+
+from pydantic import Field
+
+from flockenv.effects import Effect, Me
+from flockenv.kernels import Vec, law
+from flockenv.vec import add, scale
+
+
+@law
+def tether(p: Any, me: Me) -> Vec:
+    return add(scale(me.pos, -p.stiffness), scale(me.vel, -p.damping))
+
+
+class Tether(Effect):
+    \"\"\"A damped spring to the origin: with m = 1 kg, x'' = -stiffness x - damping x'.\"\"\"
+
+    kind: Literal["tether"] = "tether"
+    stiffness: float = Field(ge=0, description="N/m")
+    damping: float = Field(default=0.0, ge=0, description="kg/s")
+    own_law: ClassVar[str | None] = "tether"
+"""
+"""An effect as a user of the library would write it, in a file of their own."""
+
+
+@contextmanager
+def users_module(folder: Path, text: str, name: str = "users_laws") -> Iterator[ModuleType]:
+    """Import a module that lies outside the library, and forget it and its effects afterwards."""
+    (folder / f"{name}.py").write_text(text)
+    sys.path.insert(0, str(folder))
+    known = dict(EFFECT_KINDS)
+    try:
+        importlib.invalidate_caches()
+        yield importlib.import_module(name)
+    finally:
+        sys.path.remove(str(folder))
+        sys.modules.pop(name, None)
+        EFFECT_KINDS.clear()
+        EFFECT_KINDS.update(known)

@@ -173,6 +173,23 @@ def test_awkward_toruses_in_space(size: Any) -> None:
     assert_as_expected(rules(1.0, fov=200), uniform(300, size), Torus(size=size))
 
 
+@pytest.mark.parametrize("dimension", [2, 3])
+@pytest.mark.parametrize("size", [(1e3, 1e-3, 1e-3), (1e-3, 1e4, 1e-3), (1e6, 1e6, 1.0), (50.0, 50.0, 50.0), (1, 1, 1)])
+def test_a_query_writes_into_its_own_arrays_only(size: Any, dimension: int) -> None:
+    """With guards behind every array: more cells than there is room for would show there."""
+    n, guard = 200, 100_000
+    x = np.ascontiguousarray(uniform(n, size[:dimension]).T)
+    arrays = {"order": n, "cell": 2 * n, "start": n + 2, "shape": 3}
+    whole = {name: np.full(length + guard, -7) for name, length in arrays.items()}
+    views = [whole[name][:length] for name, length in arrays.items()]
+    box = tuple(float(s) for s in size[:dimension])
+    for periodic in (False, True):
+        assert entry(sort_agents)(x, np.ones(n, bool), 0.4, box, periodic, *views) == n
+        assert sorted(views[0]) == list(range(n))
+        for name, length in arrays.items():
+            assert (whole[name][length:] == -7).all(), f"{name} is too short for {views[3]} cells"
+
+
 @pytest.mark.parametrize(
     "size",
     [
@@ -193,23 +210,6 @@ def test_elongated_crowds_in_space(size: Any) -> None:
     assert_as_expected((rules(1.0)[0],), uniform(300, size), None)
 
 
-@pytest.mark.parametrize("dimension", [2, 3])
-@pytest.mark.parametrize("size", [(1e3, 1e-3, 1e-3), (1e-3, 1e4, 1e-3), (1e6, 1e6, 1.0), (50.0, 50.0, 50.0), (1, 1, 1)])
-def test_a_query_writes_into_its_own_arrays_only(size: Any, dimension: int) -> None:
-    """With guards behind every array: more cells than there is room for would show there."""
-    n, guard = 200, 100_000
-    x = np.ascontiguousarray(uniform(n, size[:dimension]).T)
-    arrays = {"order": n, "cell": 2 * n, "start": n + 2, "shape": 3}
-    whole = {name: np.full(length + guard, -7) for name, length in arrays.items()}
-    views = [whole[name][:length] for name, length in arrays.items()]
-    box = tuple(float(s) for s in size[:dimension])
-    for periodic in (False, True):
-        assert entry(sort_agents)(x, np.ones(n, bool), 0.4, box, periodic, *views) == n
-        assert sorted(views[0]) == list(range(n))
-        for name, length in arrays.items():
-            assert (whole[name][length:] == -7).all(), f"{name} is too short for {views[3]} cells"
-
-
 def test_a_lone_runaway_does_not_spoil_the_grid() -> None:
     x = uniform(500, (10.0, 10.0))
     x[7] = 1e12, -1e12
@@ -227,7 +227,7 @@ def on_edges(space: Torus, reach: float) -> Array:
     return np.concatenate([corners, [np.nextafter(space.size, 0)]])
 
 
-@pytest.mark.parametrize("size", [(5.005, 6.0), (3.1, 9.3), (4.0, 4.0)])
+@pytest.mark.parametrize("size", [(5.005, 6.0), (8.009, 9.0), (3.1, 20.0)])
 def test_agents_on_the_edges_of_cells(size: Any) -> None:
     """numerics.md, P34. They are ulps apart: cohesion and alignment, because pushes of 1e15 N would hide the others."""
     space = Torus(size=size)
@@ -238,11 +238,10 @@ def test_agents_on_the_edges_of_cells(size: Any) -> None:
 
 
 def test_exactly_at_the_radius_is_outside() -> None:
-    x = np.array([[0.0, 0.0], [1.0, 0.0], [1.0 + np.nextafter(1.0, 0.0), 0.0]])
-    scene = scene_with((rules(1.0)[0],), None, 2, 3)
-    found = forces(scene, placed(scene, x, np.zeros((3, 2))))
-    assert found[0, 0] == 0
-    assert found[1, 0] < -1.29
+    scene = scene_with((rules(1.0)[0],), None, 2, 2)
+    for distance, push in ((1.0, 0.0), (np.nextafter(1.0, 0.0), -1.3)):
+        found = forces(scene, placed(scene, np.array([[0.0, 0.0], [distance, 0.0]]), np.zeros((2, 2))))
+        np.testing.assert_allclose(found, [[push, 0], [-push, 0]])
 
 
 @pytest.mark.parametrize("count", [50, 200])
@@ -293,7 +292,7 @@ def test_the_grid_finds_what_brute_force_finds(dimension: int) -> None:
         met.append(scene.step(state).counted("pairs"))
     np.testing.assert_allclose(found[0], found[1], atol=1e-9)
     assert met[1] == 1000**2
-    assert met[0] < met[1] / (4 if dimension == 2 else 10)
+    assert met[0] < met[1] / (4 if dimension == 2 else 8)
 
 
 def test_worlds_of_a_batch_are_searched_apart() -> None:

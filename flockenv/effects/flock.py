@@ -23,7 +23,8 @@ __all__ = ["Alignment", "Cohesion", "Separation"]
 def sees(p: Any, me: Me, other: Other) -> bool:
     """Within the radius, and inside the field of view: offset . heading >= cos(fov / 2) |offset|."""
     ahead = dot(other.offset, me.heading)
-    still = dot(me.heading, me.heading) <= like(ahead, 0.0)
+    # an offset below 1e-162 m has a negative `ahead` and no square: who sees all around must see it too
+    still = (dot(me.heading, me.heading) <= like(ahead, 0.0)) | (p.cos_half_fov < like(ahead, -1.0))
     seen = (ahead >= p.cos_half_fov * np.sqrt(other.square)) | still
     return (other.square < p.radius * p.radius) & seen  # type: ignore[no-any-return]
 

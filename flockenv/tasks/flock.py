@@ -254,7 +254,10 @@ def observe(p: Any, frame: Frame, rows: Any) -> None:
             row[k], row[k + 1] = _turned(ux, uy, hx, hy, 2.0 * p.max_speed)
             row[at + 4 * slots + s] = 1.0
             k = at + 5 * slots + 2 * s
-            row[k], row[k + 1] = _turned(dx, dy, hx, hy, p.spacing)
+            distance = math.sqrt(distances[s])
+            closeness = max(1.0 - distance / p.spacing, 0.0)
+            if closeness > 0.0 and distance > 0.0:
+                row[k], row[k + 1] = _turned(dx, dy, hx, hy, distance / closeness)
         at += 7 * slots
         found = nearest_obstacles(frame, i, p.sight, size, seen, distances, chosen)
         for s in range(found):
@@ -317,7 +320,7 @@ class Flock(Task):
     sight: float = Field(default=6.0, gt=0, description="m, neighbours and obstacles are seen within this")
     neighbours: int = Field(default=6, ge=1, le=32, description="how many neighbours are seen, nearest first")
     obstacles_seen: int = Field(default=2, ge=1, le=32, description="how many are seen, nearest surface first")
-    rays: int = Field(default=12, ge=1, le=128, description="directions in which the way clear of obstacles is seen")
+    rays: int = Field(default=16, ge=1, le=128, description="directions in which the way clear of obstacles is seen")
     progress_reward: float = Field(default=1.0, ge=0, description="per s at cruising speed along the heading")
     alignment_cost: float = Field(
         default=0.5, ge=0, description="per s at a velocity off the neighbours' mean by cruise"
@@ -362,13 +365,14 @@ class Flock(Task):
         """Every vector is (along the heading, to its left)."""
         n, m = self.neighbours, self.obstacles_seen
         ways = "how far the body can go before it touches one of them, anticlockwise from the heading"
+        crowding = "their directions times 1 - distance / spacing; 0 beyond the spacing"
         seen = "offsets of the centres of the nearest obstacles, nearest surface first; zeros = none"
         return Layout((
             Slot("velocity", (2,), self.max_speed, "m/s", "own velocity (along the heading, to its left)"),
             Slot("neighbours", (n, 2), self.sight, "m", "offsets of the nearest neighbours, nearest first"),
             Slot("neighbour_velocity", (n, 2), 2 * self.max_speed, "m/s", "their velocities minus one's own"),
             Slot("neighbour_present", (n,), 1.0, "1", "1 where there is one, else 0 (and zeros elsewhere)", low=0.0),
-            Slot("near", (n, 2), self.spacing, "m", "the same offsets on a finer scale, each part cut at the spacing"),
+            Slot("crowding", (n, 2), 1.0, "1", crowding),
             Slot("obstacles", (m, 2), self.sight + self.greatest_radius, "m", seen),
             Slot("obstacle_radius", (m,), self.greatest_radius, "m", "their radii; 0 = none", low=0.0),
             Slot("free_way", (self.rays,), self.sight, "m", ways, low=0.0),

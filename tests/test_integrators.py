@@ -1,0 +1,253 @@
+"""How a law is advanced in time: measured orders, exact discrete invariants, and what each method says of itself.
+
+Every law here is taken through both ways that a method can be used: `Integrator.__call__` with an acceleration in
+Python, and the compiled step of a scene.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import pytest
+
+from flockenv.integrators import RK4, ExplicitEuler, Integrator, SemiImplicitEuler
+from flockenv.scene import Group, Scene
+from flockenv.spawn import Spawn
+from flockenv.state import State, blank
+from tests.catalogue import INTEGRATORS, TETHER, Array, IntegratorRow, users_module
+
+METHODS = pytest.mark.parametrize("row", INTEGRATORS, ids=lambda row: row.name)
+WAYS = pytest.mark.parametrize("way", ["python", "compiled"])
+
+Advance = Callable[[Integrator, float, int], tuple[float, float]]
+"""(method, dt, steps) -> position and velocity at the end."""
+
+W, ZETA, X0, V0 = 2.0, 0.1, 1.0, 0.3
+PERIOD = 2 * math.pi / W
+
+
+@pytest.fixture(scope="module")
+def tether(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
+    with users_module(tmp_path_factory.mktemp("laws"), TETHER) as module:
+        yield module.Tether
+
+
+def oscillator(tether: Any, way: str, w: float = W, zeta: float = ZETA, **limits: Any) -> Advance:
+    """x'' = -w^2 x - 2 zeta w x', from (X0, V0), one way or the other."""
+
+    def in_python(method: Integrator, dt: float, steps: int) -> tuple[float, float]:
+        state = at_start(blank(1, 1, 2, 0, dt))
+        for _ in range(steps):
+            state = method(lambda x, v: -w * w * x - 2 * zeta * w * v, state, dt)
+        return float(state.pos[0, 0, 0]), float(state.vel[0, 0, 0])
+
+    def compiled(method: Integrator, dt: float, steps: int) -> tuple[float, float]:
+        group = Group(count=1, spawn=Spawn(low=(0, 0), high=(1, 1)), **limits)
+        effects = (tether(stiffness=w * w, damping=2 * zeta * w),)
+        scene = Scene(groups=(group,), effects=effects, integrator=method, dt=dt)
+        state = scene.run(at_start(scene.start(0)), steps)
+        return float(state.pos[0, 0, 0]), float(state.vel[0, 0, 0])
+
+    return in_python if way == "python" else compiled
+
+
+def at_start(state: State) -> State:
+    state.x[...], state.v[...] = X0, V0
+    return state
+
+
+def exact(t: float) -> tuple[float, float]:
+    """The damped oscillator at time t (numerics.md 3.3)."""
+    decay, wd = math.exp(-ZETA * W * t), W * math.sqrt(1 - ZETA**2)
+    a, b = X0, (V0 + ZETA * W * X0) / wd
+    x = decay * (a * math.cos(wd * t) + b * math.sin(wd * t))
+    v = -ZETA * W * x + decay * wd * (b * math.cos(wd * t) - a * math.sin(wd * t))
+    return x, v
+
+
+def slopes(end: Advance, method: Integrator, target: tuple[float, float], seconds: float, first: int) -> Array:
+    """The measured orders of position and velocity over at least five halvings of the step above rounding."""
+    counts = [first * 2**k for k in range(7)]
+    errors = np.array([np.abs(np.subtract(end(method, seconds / n, n), target)) for n in counts])
+    kept = errors.min(axis=1) > 1e-12
+    assert kept.sum() >= 6, errors
+    steps = np.log([seconds / n for n in counts])[kept]
+    return np.polyfit(steps, np.log(errors[kept]), 1)[0]
+
+
+# --- order ------------------------------------------------------------------------------------------------------------
+
+
+@WAYS
+@METHODS
+def test_the_order_is_the_declared_one(row: IntegratorRow, way: str, tether: Any) -> None:
+    """On a damped oscillator, over 0.7 periods: over a whole one semi-implicit Euler would pass for order 2 (P06)."""
+    seconds = 0.7 * PERIOD
+    measured = slopes(oscillator(tether, way), row.method, exact(seconds), seconds, first=10)
+    np.testing.assert_allclose(measured, row.method.order_with_drag, atol=0.2)
+
+
+@METHODS
+def test_the_order_without_damping_is_the_declared_one(row: IntegratorRow, tether: Any) -> None:
+    seconds = 0.7 * PERIOD
+    target = X0 * math.cos(W * seconds) + V0 / W * math.sin(W * seconds)
+    speed = -X0 * W * math.sin(W * seconds) + V0 * math.cos(W * seconds)
+    measured = slopes(oscillator(tether, "compiled", zeta=0), row.method, (target, speed), seconds, first=10)
+    np.testing.assert_allclose(measured, row.method.order, atol=0.2)
+
+
+def test_the_orders_are_1_1_4() -> None:
+    """What the issue promises, so that a method cannot declare its way out."""
+    orders = {row.name: (row.method.order, row.method.order_with_drag) for row in INTEGRATORS}
+    promised = {"explicit_euler": (1, 1), "semi_implicit_euler": (1, 1), "rk4": (4, 4)}
+    assert {name: orders[name] for name in promised} == promised
+
+
+def test_a_speed_limit_takes_every_method_down_to_order_1(tether: Any) -> None:
+    """numerics.md, P09: nobody may read "order 4" off a scene with a clamp."""
+    end = oscillator(tether, "compiled", max_speed=0.9)
+    seconds = 0.7 * PERIOD
+    measured = slopes(end, RK4(), end(RK4(), seconds / 2**17, 2**17), seconds, first=40)
+    assert measured.max() < 1.3
+
+
+@METHODS
+def test_both_ways_take_the_same_steps(row: IntegratorRow, tether: Any) -> None:
+    ends = [oscillator(tether, way)(row.method, 0.05, 100) for way in ("python", "compiled")]
+    np.testing.assert_allclose(ends[0], ends[1], rtol=1e-12)
+
+
+@METHODS
+def test_growth_is_the_worked_example_s(row: IntegratorRow) -> None:
+    """numerics.md, E16: x = 100 exp(t / 10) as x'' = x' / 10, ten steps of 1 s."""
+    state = blank(1, 1, 2, 0, 1.0)
+    state.x[...], state.v[...] = 100.0, 10.0
+    for _ in range(10):
+        state = row.method(lambda x, v: 0.1 * v, state, 1.0)
+    np.testing.assert_allclose(state.pos, row.grown, atol=5e-6)
+
+
+# --- exact discrete invariants ----------------------------------------------------------------------------------------
+
+
+def energies(end: Advance, method: Integrator, w: float, dt: float, counts: Any) -> Array:
+    """v^2 + w^2 x^2 after some numbers of steps."""
+    return np.array([v * v + w * w * x * x for x, v in (end(method, dt, n) for n in counts)])
+
+
+@WAYS
+def test_explicit_euler_pumps_energy_by_the_book(way: str, tether: Any) -> None:
+    """numerics.md, P01: E_n = (1 + h^2 w^2)^n E_0. An Euler that moves with the new velocity is found out here."""
+    w, h, counts = 2 * math.pi, 0.01, (1, 10, 1000)
+    found = energies(oscillator(tether, way, w, zeta=0), ExplicitEuler(), w, h, counts)
+    expected = (V0**2 + w * w * X0**2) * (1 + h * h * w * w) ** np.array(counts)
+    np.testing.assert_allclose(found, expected, rtol=1e-9)
+
+
+@WAYS
+def test_rk4_loses_energy_by_the_book(way: str, tether: Any) -> None:
+    """Per step 1 - y^6/72 + y^8/576 with y = h w (numerics.md 3.1)."""
+    w, h, counts = 2 * math.pi, 0.05, (1, 10, 1000)
+    found = energies(oscillator(tether, way, w, zeta=0), RK4(), w, h, counts)
+    y = h * w
+    expected = (V0**2 + w * w * X0**2) * (1 - y**6 / 72 + y**8 / 576) ** np.array(counts)
+    np.testing.assert_allclose(found, expected, rtol=1e-9)
+
+
+@pytest.mark.parametrize(("way", "steps"), [("python", 3000), ("compiled", 100_000)])
+def test_semi_implicit_euler_keeps_its_invariant(way: str, steps: int, tether: Any) -> None:
+    """v^2 + w^2 x^2 - h w^2 x v does not change at all (numerics.md 3.2)."""
+    w, h = 2 * math.pi, 0.01
+    end = oscillator(tether, way, w, zeta=0)
+    start = V0**2 + w * w * X0**2 - h * w * w * X0 * V0
+    for n in (1, 7, steps):
+        x, v = end(SemiImplicitEuler(), h, n)
+        assert v * v + w * w * x * x - h * w * w * x * v == pytest.approx(start, rel=1e-12)
+
+
+def test_energy_after_a_hundred_periods_is_the_table_s(tether: Any) -> None:
+    """100 steps per period (numerics.md 3.1): 1.29272e17 explicit, 0.9999915 RK4, within 3.3 % semi-implicit."""
+    w = 2 * math.pi
+    end = oscillator(tether, "compiled", w, zeta=0)
+    start = V0**2 + w * w * X0**2
+    assert energies(end, ExplicitEuler(), w, 0.01, [10_000])[0] / start == pytest.approx(1.29272e17, rel=1e-5)
+    assert energies(end, RK4(), w, 0.01, [10_000])[0] / start == pytest.approx(0.9999915, abs=1e-7)
+    bounded = energies(end, SemiImplicitEuler(), w, 0.01, range(9_900, 10_000)) / start
+    assert 0.969 < bounded.min() < bounded.max() < 1.033
+
+
+# --- what a method says of itself -------------------------------------------------------------------------------------
+
+
+@METHODS
+def test_it_evaluates_the_force_as_often_as_it_says(row: IntegratorRow, tether: Any) -> None:
+    calls = []
+    row.method(lambda x, v: calls.append(1) or -x, blank(1, 3, 2, 0, 0.1), 0.1)
+    assert len(calls) == row.method.evaluations
+    spawn = Spawn(low=(0, 0), high=(1, 1))
+    scene = Scene(groups=(Group(count=1, spawn=spawn),), effects=(tether(stiffness=1),), integrator=row.method)
+    assert scene.run(scene.start(0), 10).counted("evaluations") == 10 * row.method.evaluations
+
+
+@METHODS
+@pytest.mark.parametrize("dt", [0.0, -0.1, math.nan, math.inf])
+def test_a_step_that_leads_nowhere_is_refused(row: IntegratorRow, dt: float) -> None:
+    state = blank(1, 1, 2, 0, 0.1)
+    with pytest.raises(ValueError, match="dt is") as caught:
+        row.method(lambda x, v: -x, state, dt)
+    assert "\n" not in str(caught.value)
+    assert state.tick[0] == 0
+
+
+@METHODS
+def test_a_step_leaves_its_state_alone_and_agents_apart(row: IntegratorRow) -> None:
+    rng = np.random.default_rng(0)
+    state = blank(2, 5, 3, 0, 0.1)
+    state.x[...], state.v[...] = rng.normal(size=(3, 2, 5)), rng.normal(size=(3, 2, 5))
+    before = state.copy()
+    stiffness = np.arange(1.0, 6.0)[:, None]
+    after = row.method(lambda x, v: -stiffness * x, state, 0.1)
+    np.testing.assert_array_equal(state.x, before.x)
+    np.testing.assert_array_equal(state.v, before.v)
+    np.testing.assert_array_equal(after.tick, 1)
+    for b, i in ((0, 0), (1, 3)):
+        one = blank(1, 1, 3, 0, 0.1)
+        one.x[:, 0, 0], one.v[:, 0, 0] = before.x[:, b, i], before.v[:, b, i]
+        alone = row.method(lambda x, v, k=i + 1.0: -k * x, one, 0.1)
+        np.testing.assert_array_equal(alone.pos[0, 0], after.pos[b, i])
+
+
+@METHODS
+def test_a_law_never_knows_which_method_integrates_it(row: IntegratorRow) -> None:
+    """A force of nothing is a straight line for all of them; a constant one is a parabola, to their order."""
+    state = at_start(blank(1, 1, 2, 0, 0.25))
+    for _ in range(8):
+        state = row.method(lambda x, v: 0 * x, state, 0.25)
+    np.testing.assert_allclose(state.pos, X0 + 2 * V0, rtol=1e-15)
+    np.testing.assert_array_equal(state.vel, V0)
+
+
+def test_stage_arrays_are_as_many_as_are_used() -> None:
+    """With fewer than it declares a method would write into another's scratch: a guard behind them stays untouched."""
+    for row in INTEGRATORS:
+        stages = np.full((row.method.stages + 2, 2, 3), 7.0)
+        x, v = np.ones((2, 3)), np.ones((2, 3))
+
+        def law(context: Any, pos: Array, vel: Array, out: Array) -> None:
+            out[...] = -pos
+
+        row.method.advance().py_func(law, (), x, v, 0.1, stages)
+        assert (stages[row.method.stages :] == 7).all()
+
+
+def test_halving_the_step_brings_the_methods_together(tether: Any) -> None:
+    seconds = 0.7 * PERIOD
+    end, gaps = oscillator(tether, "compiled"), []
+    for n in (100, 200, 400):
+        ends = [end(row.method, seconds / n, n) for row in INTEGRATORS]
+        gaps.append(np.ptp(ends, axis=0).max())
+    assert all(1.7 < a / b < 2.3 for a, b in pairwise(gaps))

@@ -1,0 +1,408 @@
+"""Scene: starts, steps, refusals, threads, and an effect that somebody else wrote."""
+
+from __future__ import annotations
+
+import pickle
+import subprocess
+import sys
+import tracemalloc
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import flockenv
+from flockenv.effects import EFFECTS, Alignment, Cohesion, Drag, Separation
+from flockenv.integrators import RK4
+from flockenv.kernels import cache_folder
+from flockenv.scene import Group, Scene
+from flockenv.shapes import Circle
+from flockenv.space import Box, Torus
+from flockenv.spawn import Spawn
+from flockenv.state import State
+from tests.catalogue import TETHER, everything, scene_of, users_module
+
+SPAWN = Spawn(low=(0, 0), high=(10, 10))
+ARRAYS = ("x", "v", "alive", "tick", "key", "obstacle_x", "obstacle_radius", "work")
+
+
+def crowd(count: int = 150, **fields: Any) -> Scene:
+    """Every effect at once, enough agents for a grid."""
+    group = Group(count=count, max_speed=3, max_force=8, spawn=Spawn(speed=(0.5, 2)))
+    return everything(2, groups=(group,), **fields)
+
+
+def assert_same(a: State, b: State) -> None:
+    for name in ARRAYS:
+        np.testing.assert_array_equal(getattr(a, name), getattr(b, name), err_msg=name)
+
+
+# --- starts -----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_a_world_starts_the_same_in_every_batch(dimension: int) -> None:
+    scene = everything(dimension)
+    batch = scene.start(40, worlds=6)
+    for k in range(6):
+        assert_same(scene.start(40 + k), batch.worlds([k]))
+    assert_same(scene.start(43, worlds=3), batch.worlds([3, 4, 5]))
+    assert len({batch.x[:, k].tobytes() for k in range(6)}) == 6
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_agents_start_where_and_as_fast_as_they_should(dimension: int) -> None:
+    low, high = (1.0, 2.0, 3.0)[:dimension], (4.0, 6.0, 8.0)[:dimension]
+    spawn = Spawn(low=low, high=high, speed=(0.5, 1.5))
+    led = Spawn(low=low, high=high, speed=(2, 2), heading=(3, 4, 0)[:dimension])
+    scene = scene_of(dimension=dimension, groups=(Group(count=4000, spawn=spawn), Group(count=50, spawn=led)))
+    state = scene.start(1)
+    assert (state.pos >= low).all()
+    assert (state.pos < high).all()
+    assert np.abs(state.pos[0].mean(axis=0) - (np.array(low) + high) / 2).max() < 0.15
+    speed = np.linalg.norm(state.vel[0], axis=1)
+    assert 0.5 <= speed[:4000].min() < 0.52
+    assert 1.48 < speed[:4000].max() <= 1.5
+    assert np.abs(state.vel[0, :4000].mean(axis=0)).max() < 0.05  # no favourite direction
+    np.testing.assert_allclose(state.vel[0, 4000:], np.tile((1.2, 1.6, 0)[:dimension], (50, 1)))
+
+
+def test_nobody_starts_in_an_obstacle() -> None:
+    obstacles = (Circle(centre=(3, 3), radius=2), Circle(centre=(7, 7), radius=1.5))
+    scene = scene_of(obstacles=obstacles, groups=(Group(count=500, radius=0.2, spawn=SPAWN),))
+    state = scene.start(0, worlds=3)
+    for obstacle in obstacles:
+        assert np.linalg.norm(state.pos - obstacle.centre, axis=2).min() >= obstacle.radius + 0.2
+
+
+# --- steps ------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("scene", [crowd(), scene_of(Drag(rate=0.4), integrator=RK4(), dt=0.02)], ids=["crowd", "rk4"])
+def test_a_run_split_in_two_is_the_same_run(scene: Scene) -> None:
+    start = scene.start(1, worlds=2)
+    together = scene.run(start, 30)
+    split = scene.run(pickle.loads(pickle.dumps(scene.run(start, 11))), 19)
+    one_by_one = start
+    for _ in range(30):
+        one_by_one = scene.step(one_by_one)
+    assert_same(together, split)
+    assert_same(together, one_by_one)
+    assert not np.array_equal(together.x, start.x)
+
+
+def test_a_step_into_a_given_state_is_the_same_step_without_a_copy() -> None:
+    scene = crowd()
+    start = scene.start(1, worlds=2)
+    kept, fresh = start.copy(), scene.run(start, 5)
+    assert_same(start, kept)  # the present is not touched
+    other = scene.start(9, worlds=2)
+    assert scene.step(start, out=other, steps=5) is other
+    assert_same(other, fresh)
+    assert scene.step(start, out=start, steps=5) is start
+    assert_same(start, fresh)
+
+
+def test_no_steps_lead_nowhere() -> None:
+    scene = crowd()
+    start = scene.start(1)
+    assert_same(scene.run(start, 0), start)
+
+
+@pytest.mark.parametrize("steps", [-1, 1.5, True, "3", None])
+def test_a_number_of_steps_that_is_none_is_refused(steps: Any) -> None:
+    scene = crowd()
+    start = scene.start(1)
+    kept = start.copy()
+    with pytest.raises((TypeError, ValueError), match="steps is"):
+        scene.step(start, out=start, steps=steps)
+    assert_same(start, kept)
+
+
+def test_the_clock_does_not_drift() -> None:
+    """numerics.md, P13: a million times 0.1 s is 100000 s, not 100000.00000133."""
+    scene = scene_of(dt=0.1, groups=(Group(count=1, spawn=SPAWN),))
+    assert scene.run(scene.start(0), 1_000_000).time[0] == 1_000_000 * 0.1
+
+
+def test_a_drive_is_a_force_and_lasts_for_the_whole_step() -> None:
+    scene = scene_of(groups=(Group(count=2, mass=4, spawn=SPAWN),), dt=0.5)
+    drive = np.array([[[2.0, 0.0], [0.0, -8.0]]])
+    end = scene.step(scene.start(0), drive=drive, steps=4)
+    np.testing.assert_allclose(end.vel, drive / 4 * 2, rtol=1e-15)
+
+
+@pytest.mark.parametrize("far", [0.0, 1e4, 1e7])
+def test_motion_far_from_the_origin_is_the_same_motion(far: float) -> None:
+    """numerics.md, P36: relative trajectories agree to 1e-6 in float64."""
+    scene = scene_of(Separation(weight=1.3, radius=2.5))
+    start = scene.start(2)
+    away = start.with_motion(start.pos + far, start.vel)
+    np.testing.assert_allclose(scene.run(away, 40).pos - far, scene.run(start, 40).pos, atol=1e-6)
+
+
+def test_single_precision_is_the_same_scene_in_single_precision() -> None:
+    single, double = everything(2, dtype="float32"), everything(2)
+    start = single.start(3, worlds=2)
+    assert start.x.dtype == start.v.dtype == np.float32
+    end, exact = single.run(start, 20), double.run(double.start(3, worlds=2), 20)
+    assert end.x.dtype == end.v.dtype == np.float32
+    np.testing.assert_allclose(single.space.displacement(end.pos, exact.pos), 0, atol=2e-4)
+    np.testing.assert_allclose(end.vel, exact.vel, atol=5e-4)
+
+
+def test_two_threads_may_step_one_scene() -> None:
+    scene = crowd(400)
+    starts = [scene.start(seed, worlds=2) for seed in range(6)]
+    serial = [scene.run(start, 60) for start in starts]
+    with ThreadPoolExecutor(3) as pool:
+        together = list(pool.map(lambda start: scene.run(start, 60), starts))
+    for a, b in zip(serial, together, strict=True):
+        assert_same(a, b)
+
+
+def test_a_toggled_effect_acts_from_the_next_step_on() -> None:
+    scene, bare = scene_of(Drag(rate=0.4)), scene_of()
+    start = scene.start(1)
+    under_way = scene.run(start, 3)
+    assert_same(scene.with_effects().run(under_way, 5), bare.run(under_way, 5))
+    assert_same(bare.with_effects(Drag(rate=0.4)).run(under_way, 5), scene.run(under_way, 5))
+
+
+# --- what goes wrong during a run -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+def test_a_drive_that_is_no_number_is_refused_by_name(value: float) -> None:
+    scene = crowd(20)
+    start = scene.start(0, worlds=2)
+    kept, drive = start.copy(), np.zeros(start.shape)
+    drive[1, 7, 0] = value
+    with pytest.raises(ValueError, match="drive of world 1, agent 7") as caught:
+        scene.step(start, drive=drive, out=start)
+    assert "\n" not in str(caught.value)
+    assert_same(start, kept)
+
+
+@pytest.mark.parametrize("shape", [(1, 20), (1, 19, 2), (2, 20, 2), (1, 20, 3), (20, 2), ()])
+def test_a_drive_of_another_shape_is_refused(shape: Any) -> None:
+    scene = crowd(20)
+    start = scene.start(0)
+    kept = start.copy()
+    with pytest.raises(ValueError, match="drive has shape") as caught:
+        scene.step(start, drive=np.zeros(shape), out=start)
+    assert str(shape) in str(caught.value)
+    assert_same(start, kept)
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, 1e200])
+@pytest.mark.parametrize("array", ["x", "v"])
+def test_a_run_that_diverged_is_stopped_by_name(array: str, value: float) -> None:
+    scene = scene_of(Drag(rate=0.4))
+    start = scene.start(0, worlds=3)
+    getattr(start, array)[0, 1, 5] = value
+    kept = start.copy()
+    with pytest.raises(FloatingPointError, match="world 1, agent 5") as caught:
+        scene.step(start)
+    assert "\n" not in str(caught.value)
+    assert_same(start, kept)
+
+
+def test_a_step_far_too_large_does_not_end_in_silence() -> None:
+    scene = scene_of(Drag(rate=1e6), dt=0.01)
+    with pytest.raises(FloatingPointError, match=r"dt = 0\.01 s"):
+        scene.run(scene.start(0), 1000)
+
+
+@pytest.mark.parametrize("other", [crowd(21), crowd(19), everything(3), crowd(20, dtype="float32")])
+def test_the_state_of_another_scene_is_refused(other: Scene) -> None:
+    """A kernel trusts its arrays: it would read and write beyond them."""
+    scene = crowd(20)
+    state, theirs = scene.start(0), other.start(0)
+    for call in (lambda: scene.step(theirs), lambda: scene.step(state, out=theirs)):
+        with pytest.raises(ValueError, match="state") as caught:
+            call()
+        assert "\n" not in str(caught.value)
+
+
+def test_a_result_for_another_number_of_worlds_is_refused() -> None:
+    scene = crowd(20)
+    with pytest.raises(ValueError, match="state"):
+        scene.step(scene.start(0), out=scene.start(0, worlds=3))
+
+
+def test_with_motion_refuses_what_is_no_motion() -> None:
+    state = crowd(20).start(0)
+    bad = np.zeros(state.shape)
+    bad[0, 3, 1] = np.nan
+    for pos, said in ((bad, "(0, 3, 1)"), (np.zeros((1, 19, 2)), "(1, 19, 2)"), (np.zeros((1, 20, 3)), "(1, 20, 3)")):
+        with pytest.raises(ValueError, match="pos") as caught:
+            state.with_motion(pos, np.zeros(state.shape))
+        assert said in str(caught.value)
+
+
+# --- what is refused when a scene is made (numerics.md 6.1) -----------------------------------------------------------
+
+GROUPS = (Group(count=3, spawn=SPAWN),)
+BAD_SCENES = [
+    ({"dt": 0}, ["dt = 0", "> 0"]),
+    ({"dt": -0.01}, ["dt = -0.01", "> 0"]),
+    ({"dt": float("nan")}, ["dt = nan"]),
+    ({"dt": float("inf")}, ["dt = inf"]),
+    ({"dt": "1e-3"}, ["dt = '1e-3'"]),
+    ({"dt": True}, ["dt = True"]),
+    ({"dt": None}, ["dt = None"]),
+    ({"dtt": 0.01}, ["dtt", "did you mean `dt`"]),
+    ({"dtype": "float16"}, ["float16", "float32"]),
+    ({"dimension": 4}, ["dimension = 4", "2, 3"]),
+    ({"groups": ()}, ["groups", "at least 1"]),
+    ({"effects": ({"kind": "dragg", "rate": 1},)}, ["effects[0].kind = 'dragg'", "did you mean `drag`"]),
+    ({"effects": ({"kind": "drag", "rat": 1},)}, ["effects[0].rat", "did you mean `rate`"]),
+    ({"effects": ({"rate": 1},)}, ["effects[0].kind", "missing"]),
+    ({"effects": (3,)}, ["effects[0]"]),
+    ({"integrator": {"kind": "rk44"}}, ["integrator.kind = 'rk44'", "did you mean `rk4`"]),
+    ({"space": {"kind": "tours", "size": (5, 5)}}, ["space.kind = 'tours'", "did you mean `torus`"]),
+    ({"space": Torus(size=(5, 5, 5))}, ["space.size", "dimension = 2"]),
+    ({"dimension": 3, "space": Torus(size=(5, 5))}, ["space.size", "dimension = 3"]),
+    ({"obstacles": ({"centre": (1, 1, 1), "radius": 1},)}, ["obstacles[0].centre", "dimension = 2"]),
+    ({"obstacles": ({"centre": (1, 1), "radius": 0},)}, ["obstacles[0].radius = 0", "> 0"]),
+    ({"obstacles": ({"centre": (1, float("nan")), "radius": 1},)}, ["obstacles[0].centre[1] = nan"]),
+    ({"space": Torus(size=(9, 5)), "effects": (Separation(weight=1, radius=2.6),)}, ["radius = 2.6", "2.5 m"]),
+    ({"space": Torus(size=(9, 5)), "effects": (Drag(rate=1), Cohesion(weight=1, radius=3))}, ["effects[1].radius = 3"]),
+    ({"groups": (Group(count=3),)}, ["groups[0].spawn.low", "missing"]),
+    ({"groups": (Group(count=3, spawn=Spawn(low=(0, 0, 0), high=(1, 1, 1))),)}, ["groups[0].spawn.low", "dimension"]),
+    ({"groups": (Group(count=3, spawn=SPAWN), {"count": 2, "mas": 1})}, ["groups[1].mas", "did you mean `mass`"]),
+    ({"space": Box(size=(1, 1)), "groups": (Group(count=3, radius=2),)}, ["groups[0].radius = 2", "does not fit"]),
+    ({"groups": (Group(count=10**9, spawn=SPAWN),)}, ["1,000,000,000 agents", "GiB", "are allowed"]),
+    ({"groups": (Group(count=10**30, spawn=SPAWN),)}, ["GiB"]),
+]
+
+
+@pytest.mark.parametrize(("fields", "said"), BAD_SCENES, ids=lambda value: str(value)[:40])
+def test_a_bad_scene_is_refused_in_one_line_before_anything_is_allocated(fields: Any, said: list[str]) -> None:
+    tracemalloc.start()
+    try:
+        with pytest.raises((ValueError, TypeError)) as caught:
+            Scene(**{"groups": GROUPS, **fields})
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    line = str(caught.value)
+    assert "\n" not in line
+    for part in said:
+        assert part in line, line
+    assert peak < 20e6
+
+
+@pytest.mark.parametrize(
+    ("fields", "said"),
+    [
+        ({"count": 0}, "count = 0"),
+        ({"count": -1}, "count = -1"),
+        ({"count": 2.5}, "count = 2.5"),
+        ({"count": "ten"}, "count = 'ten'"),
+        ({"count": True}, "count = True"),
+        ({"mass": 0}, "mass = 0"),
+        ({"mass": -1}, "mass = -1"),
+        ({"mass": float("nan")}, "mass = nan"),
+        ({"radius": -1}, "radius = -1"),
+        ({"max_speed": 0}, "max_speed = 0"),
+        ({"max_force": -1}, "max_force = -1"),
+        ({"max_force": float("inf")}, "max_force = inf"),
+        ({"role": "bird"}, "role = 'bird'"),
+        ({"mas": 1}, "did you mean `mass`"),
+        ({"spawn": {"speed": (2, 1)}}, "speed = (2.0, 1.0)"),
+        ({"spawn": {"low": (1, 1), "high": (0, 2)}}, "low = (1.0, 1.0)"),
+        ({"spawn": {"low": (1, 1)}}, "low and high"),
+    ],
+    ids=str,
+)
+def test_a_bad_group_is_refused_in_one_line(fields: Any, said: str) -> None:
+    with pytest.raises(ValueError, match=r".") as caught:
+        Group(**{"count": 3, **fields})
+    assert said in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("call", "said"),
+    [
+        (lambda scene: scene.start(0, worlds=0), "worlds is 0"),
+        (lambda scene: scene.start(0, worlds=10**9), "GiB"),
+        (lambda scene: scene.start(0, worlds=2.5), "worlds is 2.5"),
+        (lambda scene: scene.start(-1), "seed"),
+        (lambda scene: scene.start(2**64), "seed"),
+        (lambda scene: scene.start(1.5), "seed"),
+        (lambda scene: scene.start("abc"), "seed"),
+    ],
+)
+def test_a_bad_start_is_refused_in_one_line(call: Any, said: str) -> None:
+    with pytest.raises((ValueError, TypeError)) as caught:
+        call(crowd(20))
+    assert said in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+# --- somebody else's effect -------------------------------------------------------------------------------------------
+
+
+def test_an_effect_of_a_user_s_own_works_like_ours(tmp_path: Path) -> None:
+    with users_module(tmp_path, TETHER) as laws:
+        effect = laws.Tether(stiffness=4.0, damping=0.5)
+        scene = scene_of(effect, Drag(rate=0.1))
+        start = scene.start(0, worlds=2)
+        end = scene.step(start)
+        force = -4.0 * start.pos - 0.6 * start.vel
+        np.testing.assert_allclose((end.vel - start.vel) / scene.dt * scene.body.mass[:, None], force, rtol=1e-9)
+        assert eval(repr(effect), vars(laws)) == effect  # noqa: S307
+        assert pickle.loads(pickle.dumps(scene)) == scene
+        with pytest.raises(ValueError, match="did you mean `stiffness`"):
+            laws.Tether(stifness=1)
+    assert "tether" not in EFFECTS
+
+
+SECOND = """
+import sys
+sys.path.insert(0, sys.argv[1])
+import users_laws
+from tests.catalogue import scene_of
+scene = scene_of(users_laws.Tether(stiffness=4.0, damping=0.5))
+start = scene.start(0)
+print((scene.step(start).vel - start.vel)[0, 0, 0] / start.pos[0, 0, 0])
+"""
+
+
+def test_an_edited_law_is_compiled_anew_in_the_next_process(tmp_path: Path) -> None:
+    """numba alone would go on with the machine code of the old law: it watches the file that calls, not the law."""
+    found = []
+    for text in (TETHER, TETHER.replace("-p.stiffness", "-3 * p.stiffness").replace("-p.damping", "-3 * p.damping")):
+        (tmp_path / "users_laws.py").write_text(text)
+        done = subprocess.run(
+            [sys.executable, "-B", "-c", SECOND, str(tmp_path)],
+            cwd=Path(__file__).resolve().parent.parent,
+            env={"FLOCKENV_CACHE": str(cache_folder()), "PYTHONPATH": str(Path(flockenv.__file__).parent.parent)},
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+        assert done.returncode == 0, done.stderr
+        found.append(float(done.stdout))
+    assert found[1] == pytest.approx(3 * found[0], rel=1e-12)
+
+
+def test_a_scene_written_by_hand_runs() -> None:
+    scene = Scene(
+        space=Torus(size=(9, 7)),
+        groups=(Group(count=30, max_speed=2, spawn=Spawn(speed=(1, 2))),),
+        effects=everything(2).effects,
+        dt=0.05,
+    )
+    assert any(isinstance(effect, Alignment) for effect in scene.effects)
+    end = scene.run(scene.start(seed=1), 20)
+    assert end.time[0] == 20 * 0.05
+    assert (np.linalg.norm(end.vel, axis=2) <= 2 * (1 + 1e-12)).all()
+    snapshot = scene.snapshot(end)
+    assert snapshot.periodic
+    np.testing.assert_array_equal(snapshot.pos, end.pos[0])

@@ -1,0 +1,147 @@
+"""Where agents live: wrapping, minimum images and walls, as arrays see them and as compiled steps see them."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import example, given
+from hypothesis import strategies as st
+
+from flockenv import space as space_module
+from flockenv.effects import Separation
+from flockenv.rows import rows
+from flockenv.scene import Group, Scene
+from flockenv.space import Box, Plane, Space, Torus
+from flockenv.spawn import Spawn
+from tests.catalogue import SPACES, everything, scene_of
+
+ROWS = pytest.mark.parametrize("kind", SPACES)
+DIMENSIONS = pytest.mark.parametrize("dimension", [2, 3])
+
+ANYWHERE = st.floats(-1e6, 1e6) | st.floats(-1e-300, 1e-300) | st.sampled_from([-1e-17, -5e-324, 5e-324, 0.0, -0.0])
+
+
+def alone(scene: Scene) -> Scene:
+    group = Group(count=1, radius=0.5, spawn=Spawn(low=(0,) * scene.dimension, high=(1,) * scene.dimension))
+    return scene.model_copy(update={"groups": (group,), "obstacles": ()})
+
+
+@pytest.fixture(scope="module", params=["float64", "float32"])
+def torus(request: pytest.FixtureRequest) -> Scene:
+    return alone(everything(2, dtype=request.param))
+
+
+@given(ANYWHERE, ANYWHERE)
+@example(-1e-17, -1e-9)
+@example(9.0, 7.0)
+@example(np.nextafter(9.0, 0), np.nextafter(7.0, 8))
+def test_a_torus_keeps_everybody_in_its_half_open_box(torus: Scene, x: float, y: float) -> None:
+    """numerics.md, P32: (-1e-17) % 10 is 10, an index beyond the last cell."""
+    state = torus.start(0)
+    state.pos[0, 0], state.vel[...] = (x, y), 0.0
+    found = torus.step(state).pos[0, 0]
+    size = np.asarray(SPACES["torus"][2].size, found.dtype)  # type: ignore[union-attr]
+    assert (found >= 0).all()
+    assert (found < size).all()
+    place = state.pos[0, 0].astype(float)
+    away = (found - place) / size
+    np.testing.assert_allclose(away, np.rint(away), atol=1e-3 if found.dtype == np.float32 else 1e-9)
+
+
+@given(ANYWHERE, ANYWHERE)
+@example(-1e-17, -1e-9)
+def test_wrap_over_arrays_does_the_same(x: float, y: float) -> None:
+    space = SPACES["torus"][2]
+    found = space.wrap([[x, y]])
+    assert (found >= 0).all()
+    assert (found < np.asarray(space.size)).all()  # type: ignore[attr-defined]
+    np.testing.assert_allclose(space.displacement(found, [x, y]), 0, atol=1e-9)
+
+
+@pytest.mark.parametrize("times", [0.3, 0.7, 1.6, 2.4, 7.7, -1.7, 1000.2])
+def test_the_shortest_way_is_shortest_from_any_distance(times: float) -> None:
+    """numerics.md, P33: adding or subtracting one box is not enough beyond 1.5 boxes."""
+    space = Torus(size=(10.0, 4.0))
+    a, b = np.array([9.0, 3.5]), np.array([9.0, 3.5]) + times * np.array([10.0, 4.0])
+    images = np.stack(np.meshgrid([-1, 0, 1], [-1, 0, 1]), axis=-1).reshape(-1, 2) * [10.0, 4.0]
+    expected = ((b - a) % np.array([10.0, 4.0]) + images)[:, None]
+    shortest = np.take_along_axis(expected[:, 0], np.abs(expected[:, 0]).argmin(axis=0)[None], axis=0)[0]
+    np.testing.assert_allclose(space.displacement(a, b), shortest, atol=1e-9)
+    np.testing.assert_allclose(rows(space_module.torus_offset)(space.size, a, b), shortest, atol=1e-9)
+
+
+@DIMENSIONS
+@ROWS
+def test_the_law_and_the_method_agree_on_the_way(kind: str, dimension: int) -> None:
+    space: Space = SPACES[kind][dimension]
+    rng = np.random.default_rng(0)
+    a, b = rng.uniform(-30, 30, (500, dimension)), rng.uniform(-30, 30, (500, dimension))
+    law = rows(getattr(space_module, space.offset_law))
+    found = law(space.extent(dimension), a, b)
+    np.testing.assert_allclose(found, space.displacement(a, b), atol=1e-12)
+    np.testing.assert_allclose(found, -law(space.extent(dimension), b, a), atol=1e-12)
+    assert space.periodic == (np.linalg.norm(found, axis=1).max() < 10)
+
+
+def test_the_edge_of_the_box_is_on_one_side_only() -> None:
+    space = Torus(size=(10.0, 10.0))
+    np.testing.assert_allclose(np.abs(space.displacement([0, 0], [[5, 5], [-5, 15]])), 5)
+    np.testing.assert_allclose(space.displacement([0, 0], [[4.999, 5.001]]), [[4.999, -4.999]])
+
+
+# --- walls ------------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def box() -> Scene:
+    """One agent of radius 0.5 m in a box of 9 m by 7 m; the kernel is test_neighbours.py's."""
+    return alone(scene_of(Separation(weight=0, radius=1), space=Box(size=(9.0, 7.0)), dt=0.1))
+
+
+@pytest.mark.parametrize(
+    ("at", "velocity", "then", "left"),
+    [
+        ((8.45, 3.0), (2.0, 1.0), (8.5, 3.1), (0.0, 1.0)),  # into the wall: the part along it stays
+        ((0.55, 3.0), (-2.0, 1.0), (0.5, 3.1), (0.0, 1.0)),
+        ((4.0, 6.45), (1.0, 2.0), (4.1, 6.5), (1.0, 0.0)),
+        ((8.45, 6.45), (2.0, 2.0), (8.5, 6.5), (0.0, 0.0)),  # a corner stops both
+        ((8.5, 3.0), (-2.0, 1.0), (8.3, 3.1), (-2.0, 1.0)),  # away from the wall: nothing happens
+        ((8.5, 3.0), (0.0, 1.0), (8.5, 3.1), (0.0, 1.0)),  # along the wall
+        ((12.0, 3.0), (-2.0, 1.0), (8.5, 3.1), (-2.0, 1.0)),  # put outside, on its way in: only put back
+        ((-1.0, -1.0), (3.0, -3.0), (0.5, 0.5), (3.0, 0.0)),
+        ((4.0, 3.0), (1.0, -1.0), (4.1, 2.9), (1.0, -1.0)),
+    ],
+)
+def test_walls_stop_the_outward_part_only(box: Scene, at: Any, velocity: Any, then: Any, left: Any) -> None:
+    state = box.start(0).with_motion([[at]], [[velocity]])
+    after = box.step(state)
+    np.testing.assert_allclose(after.pos[0, 0], then, atol=1e-12)
+    np.testing.assert_allclose(after.vel[0, 0], left, atol=1e-12)
+
+
+def test_nobody_leaves_a_box(box: Scene) -> None:
+    state = box.start(3, worlds=50)
+    rng = np.random.default_rng(0)
+    for _ in range(300):
+        state = box.step(state, drive=rng.normal(size=(50, 1, 2)) * 40)
+        assert (state.pos >= 0.5).all()
+        assert (state.pos <= [8.5, 6.5]).all()
+
+
+def test_a_plane_has_no_walls() -> None:
+    space = Plane()
+    np.testing.assert_array_equal(space.wrap([[1e9, -1e9]]), [[1e9, -1e9]])
+    np.testing.assert_array_equal(space.displacement([1e9, 0], [-1e9, 0]), [-2e9, 0])
+    np.testing.assert_array_equal(Box(size=(9, 7)).wrap([[12, -1], [3, 3]]), [[9, 0], [3, 3]])
+
+
+@pytest.mark.parametrize(
+    "size", [(0.0, 1.0), (-1.0, 1.0), (1.0,), (1.0,) * 4, (float("nan"), 1.0), (1.0, float("inf"))]
+)
+@pytest.mark.parametrize("kind", [Torus, Box])
+def test_a_size_that_is_none_is_refused_in_one_line(kind: Any, size: Any) -> None:
+    with pytest.raises(ValueError, match="size") as caught:
+        kind(size=size)
+    assert "\n" not in str(caught.value)

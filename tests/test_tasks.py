@@ -1,0 +1,624 @@
+"""What the tasks see and pay: exact questions to hand-made states, and what holds for every task of the catalogue."""
+
+from __future__ import annotations
+
+import os
+import pickle
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import flockenv
+from flockenv.tasks import TASKS, Flock, Obstacles, Pursuit, Task
+from flockenv.world import Step, World
+from tests.catalogue import TASKS as ROWS
+from tests.catalogue import TaskRow
+
+EVERY = pytest.mark.parametrize("row", ROWS, ids=lambda row: row.name)
+
+
+def world_of(task: Task, seed: int = 3, worlds: int = 1) -> World:
+    world = World(task, worlds)
+    world.reset(seed)
+    return world
+
+
+def place(world: World, pos: Any, vel: Any = 0.0) -> None:
+    world.state.pos[0], world.state.vel[0] = pos, vel
+
+
+def act(world: World, action: Any = 0.0) -> Step:
+    """One step of the only world, the same action for all."""
+    return world.step(np.broadcast_to(np.asarray(action, float), (1, world.learners, world.action_size)))
+
+
+def paid(world: World, step: Step, learner: int = 0) -> dict[str, float]:
+    return dict(zip(world.task.terms, step.terms[0, learner].tolist(), strict=True))
+
+
+def random_actions(world: World, steps: int, seed: int = 0) -> Any:
+    rng = np.random.default_rng(seed)
+    wanted = rng.uniform(-1, 1, (steps // 10 + 1, world.worlds, world.learners, world.action_size))
+    return np.repeat(wanted, 10, axis=0)[:steps]  # the same for a while, so that everybody gets somewhere
+
+
+# --- what holds for every task ----------------------------------------------------------------------------------------
+
+
+@EVERY
+def test_reward_is_the_sum_of_its_named_terms(row: TaskRow) -> None:
+    world = world_of(row.task, worlds=4)
+    seen = np.zeros(len(row.task.terms), bool)
+    for actions in random_actions(world, 200):
+        step = world.step(actions)
+        assert step.terms.shape == (4, row.task.learners, len(row.task.terms))
+        np.testing.assert_array_equal(step.reward, step.terms.sum(axis=2))
+        assert np.isfinite(step.terms).all()
+        seen |= (step.terms != 0).any(axis=(0, 1))
+    assert seen.any()
+
+
+@EVERY
+def test_an_observation_stays_in_its_space(row: TaskRow) -> None:
+    world = world_of(row.task, worlds=4)
+    low, high = row.task.layout.low, row.task.layout.high
+    assert low.shape == high.shape == (world.observation_size,)
+    for actions in random_actions(world, 1000):
+        step = world.step(2 * actions)  # beyond the bounds, so that corners are asked for too
+        assert step.observation.dtype == np.float32
+        assert step.observation.shape == (4, row.task.learners, world.observation_size)
+        assert np.isfinite(step.observation).all()
+        assert (step.observation >= low).all()
+        assert (step.observation <= high).all()
+        if step.ended.any():
+            world.reset(mask=step.ended)
+
+
+@EVERY
+def test_a_task_is_a_value_and_names_what_it_has(row: TaskRow) -> None:
+    task = row.task
+    assert pickle.loads(pickle.dumps(task)) == task
+    assert type(task).model_validate(task.model_dump()) == task
+    assert eval(repr(task), {type(task).__name__: type(task)}) == task  # noqa: S307
+    assert TASKS[task.name] is type(task)
+    assert len(task.agent_names) == len(set(task.agent_names)) == task.learners <= task.agents == task.scene.agents
+    assert len(task.scene.roles) == task.agents
+    world = world_of(task)
+    assert set(world.measure()) == set(task.metric_names)
+    slots = [slot.name for slot in task.layout.slots]
+    assert len(slots) == len(set(slots))
+    assert task.layout.size == sum(slot.size for slot in task.layout.slots)
+    assert all(slot.meaning and slot.unit for slot in (*task.layout.slots, *task.action_layout.slots))
+
+
+@EVERY
+@pytest.mark.parametrize("kind", ["typo", "clock", "backwards"])
+def test_bad_arguments_of_a_task_are_refused_in_one_line(row: TaskRow, kind: str) -> None:
+    given, said = {
+        "typo": ({"horizn": 5}, "did you mean `horizon`"),
+        "clock": ({"control_dt": 0.1, "dt": 0.03}, "control_dt = 0.1 s is not a whole multiple of dt = 0.03 s"),
+        "backwards": ({"dt": 0.2}, "whole multiple"),
+    }[kind]
+    with pytest.raises(ValueError, match=r".") as caught:
+        type(row.task)(**given)
+    assert said in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("make", "said"),
+    [
+        (lambda: Pursuit(pursuer_sped=2), "did you mean `pursuer_speed`"),
+        (lambda: Pursuit(pursuers=0), "pursuers = 0"),
+        (lambda: Pursuit(sides="neither"), "sides = 'neither'"),
+        (lambda: Obstacles(size=5), "size = 5"),
+        (lambda: Flock(agents=0), "agents = 0"),
+        (lambda: Flock(agents=10**9), "agents = 1000000000"),
+        (lambda: Flock(agents=4, learners=5), "learners = 5"),
+        (lambda: Flock(sight=25), "sight = 25"),
+        (lambda: Flock(cruise=float("nan")), "cruise = nan"),
+        (lambda: Flock(dt=0), "dt = 0"),
+    ],
+)
+def test_what_a_task_cannot_be_is_refused_in_one_line(make: Any, said: str) -> None:
+    with pytest.raises(ValueError, match=r".") as caught:
+        make()
+    assert said in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+FROZEN = """
+import importlib, pickle, sys
+from collections import namedtuple
+import numpy as np
+from flockenv.tasks.base import Frame
+
+for name, task, before, after, action, terms, observation in pickle.load(open(sys.argv[1], "rb")):
+    module = importlib.import_module(type(task).__module__)
+    assert not hasattr(module.reward, "py_func"), "the point is to run the laws in Python"
+    numbers = task.parameters()
+    p = namedtuple("P", numbers)(**numbers)
+    for array in (*before, *after, action):
+        if isinstance(array, np.ndarray):
+            array.flags.writeable = False
+    before, after = Frame(*before), Frame(*after)
+    found, rows = np.full(terms.shape, np.nan), np.full(observation.shape, np.nan, np.float32)
+    module.reward(p, before, after._replace(alive=before.alive), action, found)
+    module.measure(p, before, after, np.zeros(len(task.measures)))
+    module.observe(p, after, rows)
+    np.testing.assert_allclose(found, terms, rtol=1e-9, atol=1e-9, err_msg=name)
+    np.testing.assert_allclose(rows, observation, atol=2e-6, err_msg=name)
+print("untouched")
+"""
+
+
+def frame(world: World) -> list[Any]:
+    """World 0 as its kernels see it; arrays copied."""
+    s, scene = world.state, world.task.scene
+    arrays = [s.x[:, 0], s.v[:, 0], s.alive[0], s.obstacle_x[:, 0], s.obstacle_radius[0], world._memory[:, 0]]
+    body = [scene.body.radius, scene.body.max_speed, scene.body.max_force]
+    return [*(a.copy() for a in arrays), int(s.key[0]), int(world.steps[0]), *body]
+
+
+def test_reward_and_observation_touch_nothing(tmp_path: Path) -> None:
+    """They run in plain Python, every array of both frames locked against writing, and find what was compiled."""
+    questions = []
+    for row in ROWS:
+        world = world_of(row.task)
+        for actions in random_actions(world, 30):
+            before = frame(world)
+            step = world.step(actions)
+            question = (row.name, row.task, before, frame(world), actions[0], step.terms[0], step.observation[0])
+        questions.append(question)
+    (tmp_path / "frames").write_bytes(pickle.dumps(questions))
+    source = str(Path(flockenv.__file__).parent.parent)
+    done = subprocess.run(
+        [sys.executable, "-c", FROZEN, str(tmp_path / "frames")],
+        env={**os.environ, "NUMBA_DISABLE_JIT": "1", "PYTHONPATH": source},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.stdout == "untouched\n", done.stderr
+
+
+@EVERY
+def test_looking_changes_nothing(row: TaskRow) -> None:
+    world = world_of(row.task, worlds=3)
+    for actions in random_actions(world, 20):
+        step = world.step(actions)
+    kept, memory = world.state.copy(), world._memory.copy()
+    again = world.reset(mask=np.zeros(3, bool))  # nobody begins anew: everybody is only looked at
+    world.measure()
+    world.snapshot(1)
+    np.testing.assert_array_equal(again, step.observation)
+    for name in ("x", "v", "alive", "tick", "obstacle_x", "obstacle_radius"):
+        np.testing.assert_array_equal(getattr(world.state, name), getattr(kept, name))
+    np.testing.assert_array_equal(world._memory, memory)
+
+
+# --- Pursuit ----------------------------------------------------------------------------------------------------------
+
+
+def test_a_capture_pays_once_and_ends_it() -> None:
+    world = world_of(Pursuit())
+    place(world, [[10, 10], [10.4, 10]])
+    step = act(world)
+    assert paid(world, step)["capture"] == 10
+    assert step.terminated.all()
+    assert step.success.all()
+    assert step.ended.all()
+    assert not step.truncated.any()
+    assert world.measure()["captured"] == 1
+    after = act(world)
+    assert paid(world, after)["capture"] == 0
+    assert after.terminated.all()
+
+
+def test_no_capture_beyond_the_capture_distance() -> None:
+    world = world_of(Pursuit())
+    place(world, [[10, 10], [10.61, 10]])
+    step = act(world)  # the evader runs
+    assert paid(world, step)["capture"] == 0
+    assert not step.terminated.any()
+    assert not step.success.any()
+
+
+def test_coming_nearer_pays_by_the_metre_and_time_costs() -> None:
+    world = world_of(Pursuit())
+    place(world, [[10, 10], [13, 10]], [[3, 0], [0, 0]])
+    step = act(world, [1, 0])
+    distance = np.linalg.norm(world.state.pos[0, 1] - world.state.pos[0, 0])
+    terms = paid(world, step)
+    assert terms["closing"] == pytest.approx(0.1 * (3 - distance), rel=1e-9)
+    assert terms["closing"] > 0.015  # 0.3 m at full speed, less what the evader made
+    assert terms["time"] == pytest.approx(-0.5 * 0.1)
+    assert terms["capture"] == 0
+
+
+@pytest.mark.parametrize("steps", [1, 4])
+def test_time_to_capture_counts_every_step_up_to_the_capture(steps: int) -> None:
+    world = world_of(Pursuit())
+    place(world, [[3, 3], [17, 17]])
+    for _ in range(steps - 1):
+        act(world)
+        assert world.measure()["captured"] == 0
+    place(world, [[10, 10], [10.3, 10]])
+    assert act(world).success.all()
+    assert world.measure()["time_to_capture"] == pytest.approx(steps * 0.1)
+    act(world)
+    assert world.measure()["time_to_capture"] == pytest.approx(steps * 0.1)
+
+
+def test_the_scripted_evader_flees_within_its_alarm_distance() -> None:
+    for distance in (1.5, 4, 7):
+        for turn in np.linspace(0, 2 * np.pi, 7)[:-1]:
+            ahead = np.array([np.cos(turn), np.sin(turn)])
+            world = world_of(Pursuit(size=60))
+            place(world, [30 - distance / 2 * ahead, 30 + distance / 2 * ahead], [3 * ahead, 0 * ahead])
+            for _ in range(5):
+                act(world, ahead)
+            assert world.state.vel[0, 1] @ ahead > 1.2  # it can reach 2.4 m/s in 0.2 s
+
+
+def test_the_scripted_evader_wanders_when_it_is_left_alone() -> None:
+    world = world_of(Pursuit(size=60, alarm_distance=5))
+    place(world, [[5, 5], [40, 40]])
+    courses = []
+    for _ in range(60):
+        act(world)
+        courses.append(np.arctan2(*world.state.vel[0, 1]))
+    turned = np.abs(np.diff(np.unwrap(courses[5:])))
+    assert np.linalg.norm(world.state.vel[0, 1]) > 2
+    assert 0.01 < turned.mean() < 0.5
+    other = world_of(Pursuit(size=60, alarm_distance=5), seed=4)
+    place(other, [[5, 5], [40, 40]])
+    for _ in range(60):
+        act(other)
+    assert not np.allclose(other.state.vel[0, 1], world.state.vel[0, 1])
+
+
+def test_the_scripted_evader_stays_off_the_walls_and_within_its_speed() -> None:
+    world = world_of(Pursuit(), worlds=16)
+    fastest, off = 0.0, []
+    for actions in random_actions(world, 400):
+        world.step(actions)
+        evader = world.state.pos[:, 1]
+        off.append(np.minimum(evader, 20 - evader).min(axis=1))
+        fastest = max(fastest, np.linalg.norm(world.state.vel[:, 1], axis=1).max())
+    assert 2.39 < fastest <= 2.4 * (1 + 1e-12)
+    assert np.mean(np.array(off) > 0.5) > 0.95
+
+
+def both(**more: Any) -> World:
+    return world_of(Pursuit(pursuers=3, evaders=2, sides="both", **more))
+
+
+def test_in_the_game_of_two_sides_who_is_caught_is_out() -> None:
+    world = both()
+    place(world, [[3, 3], [3, 10], [3, 17], [17, 3], [17, 17]])
+    act(world)
+    place(world, [[3, 3], [3, 10], [3, 17], [3.2, 3], [17, 17]])
+    first = act(world)
+    np.testing.assert_array_equal(first.terminated[0], [False, False, False, True, False])
+    np.testing.assert_array_equal(first.alive[0], [True, True, True, False, True])
+    np.testing.assert_array_equal(first.terms[0, :, 1], [10, 10, 10, -10, 0])
+    assert not first.success.any()
+    assert not first.ended.any()
+    later = act(world)
+    np.testing.assert_array_equal(later.terminated[0], [False, False, False, True, False])
+    np.testing.assert_array_equal(later.terms[0, :, 1], 0)
+    np.testing.assert_array_equal(later.terms[0, 3], 0)  # who is out is paid nothing
+    assert world.measure()["captured"] == 1
+    place(world, [[3, 3], [3, 10], [3, 17], [3.2, 3], [3.2, 17]])
+    last = act(world)
+    assert last.terminated.all()
+    assert last.success.all()
+    assert last.ended.all()
+    np.testing.assert_array_equal(last.terms[0, :, 1], [10, 10, 10, 0, -10])
+    assert world.measure()["captured"] == 2
+
+
+def test_evaders_are_paid_the_opposite() -> None:
+    world = world_of(Pursuit(sides="both"))
+    place(world, [[10, 10], [13, 10]], [[3, 0], [0, 0]])
+    step = act(world)
+    np.testing.assert_allclose(step.terms[0, 0], -step.terms[0, 1])
+    assert step.terms[0, 0, 0] > 0
+
+
+def test_a_dead_evader_is_not_seen() -> None:
+    world = both()
+    place(world, [[3, 3], [3, 10], [3, 17], [3.2, 3], [17, 17]])
+    seen = world.task.layout.unpack(act(world).observation)
+    np.testing.assert_array_equal(seen.opponent_present[0, :3].sum(axis=-1), 1)
+    offset = world.state.pos[0, 4] - world.state.pos[0, 0]
+    np.testing.assert_allclose(seen.opponents[0, 0, 0], offset, atol=1e-5)
+
+
+def test_a_pursuer_sees_what_is_there() -> None:
+    world = both()
+    for actions in random_actions(world, 25):
+        step = world.step(actions)
+    seen, s = world.task.layout.unpack(step.observation), world.state
+    for i in range(5):
+        x, v = s.pos[0], s.vel[0]
+        others, mates = ([3, 4], [0, 1, 2]) if i < 3 else ([0, 1, 2], [3, 4])
+        others = sorted(others, key=lambda j: np.linalg.norm(x[j] - x[i]))
+        mates = sorted((j for j in mates if j != i), key=lambda j: np.linalg.norm(x[j] - x[i]))
+        np.testing.assert_allclose(seen.velocity[0, i], v[i], atol=1e-5)
+        np.testing.assert_allclose(seen.to_low[0, i], x[i], atol=1e-5)
+        np.testing.assert_allclose(seen.to_high[0, i], 20 - x[i], atol=1e-5)
+        np.testing.assert_allclose(seen.opponents[0, i, : len(others)], x[others] - x[i], atol=1e-5)
+        np.testing.assert_allclose(seen.opponent_velocity[0, i, : len(others)], v[others], atol=1e-5)
+        np.testing.assert_allclose(seen.mates[0, i, : len(mates)], x[mates] - x[i], atol=1e-5)
+        assert seen.opponent_present[0, i].sum() == len(others)
+        assert seen.mate_present[0, i].sum() == len(mates)
+        np.testing.assert_array_equal(seen.opponents[0, i, len(others) :], 0)
+
+
+def test_pursuit_begins_apart_and_at_rest() -> None:
+    world = world_of(Pursuit(), worlds=200)
+    assert np.linalg.norm(world.state.pos[:, 1] - world.state.pos[:, 0], axis=1).min() >= 4
+    np.testing.assert_array_equal(world.state.vel, 0)
+
+
+# --- Obstacles --------------------------------------------------------------------------------------------------------
+
+
+def goal_of(world: World) -> Any:
+    (mark,) = [m for m in world.snapshot().marks if m.kind == "goal"]
+    return mark.at
+
+
+def test_a_touch_costs_and_ends_it() -> None:
+    world = world_of(Obstacles())
+    s = world.state
+    centre, radius = s.obstacles.centre[0, 0], s.obstacle_radius[0, 0]
+    place(world, centre + [0, radius + 0.29])
+    step = act(world)
+    assert paid(world, step)["touch"] == -10
+    assert paid(world, step)["goal"] == 0
+    assert step.terminated.all()
+    assert not step.success.any()
+    assert world.measure()["collisions"] == 1
+
+
+def test_just_beside_is_no_touch() -> None:
+    world = world_of(Obstacles(count=1))
+    s = world.state
+    place(world, s.obstacles.centre[0, 0] + [s.obstacle_radius[0, 0] + 0.31, 0])
+    step = act(world)
+    assert paid(world, step)["touch"] == 0
+    assert not step.terminated.any()
+
+
+def test_the_goal_pays_and_ends_it() -> None:
+    world = world_of(Obstacles())
+    place(world, goal_of(world) + [-0.9, 0], [2.0, 0])
+    step = act(world)
+    terms = paid(world, step)
+    assert terms["goal"] == 10
+    assert terms["progress"] == pytest.approx(0.5 * 0.2)
+    assert terms["time"] == pytest.approx(-0.5 * 0.1)
+    assert step.terminated.all()
+    assert step.success.all()
+
+
+def test_progress_is_the_way_gained_and_adds_up() -> None:
+    world = world_of(Obstacles(count=0))
+    goal, start = goal_of(world), world.state.pos[0, 0].copy()
+    total = sum(paid(world, act(world, actions[0]))["progress"] for actions in random_actions(world, 50))
+    gained = np.linalg.norm(goal - start) - np.linalg.norm(goal - world.state.pos[0, 0])
+    assert total == pytest.approx(0.5 * gained, abs=1e-9)
+
+
+def test_a_goal_in_an_obstacle_is_a_touch() -> None:
+    world = world_of(Obstacles(count=1))
+    world.state.obstacles.centre[0, 0] = goal_of(world)
+    place(world, goal_of(world))
+    step = act(world)
+    assert paid(world, step)["goal"] == 0
+    assert paid(world, step)["touch"] == -10
+    assert not step.success.any()
+
+
+def test_a_wall_is_no_touch_and_stops() -> None:
+    world = world_of(Obstacles(count=0))
+    for _ in range(60):
+        step = act(world, [-1, 0])
+    assert not step.terminated.any()
+    assert world.state.pos[0, 0, 0] == 0.3
+    assert world.state.vel[0, 0, 0] == 0
+
+
+def test_a_straight_way_is_fully_efficient() -> None:
+    world = world_of(Obstacles(count=0))
+    place(world, [1.5, goal_of(world)[1]])
+    world._memory[2, 0, 0] = goal_of(world)[0] - 1.5
+    while not (step := act(world, [1, 0])).success.any():
+        assert not step.ended.any()
+    measured = world.measure()
+    assert measured["path_efficiency"] == pytest.approx(1, rel=1e-9)
+    assert measured["time_to_goal"] == pytest.approx(world.steps[0] * 0.1)
+
+
+def test_a_walker_sees_what_is_there() -> None:
+    world = world_of(Obstacles())
+    for actions in random_actions(world, 12):
+        step = world.step(actions)
+    seen, s, task = world.task.layout.unpack(step.observation[0, 0]), world.state, world.task
+    x, centres, radii = s.pos[0, 0], s.obstacles.centre[0], s.obstacle_radius[0]
+    np.testing.assert_allclose(seen.goal, goal_of(world) - x, atol=1e-5)
+    np.testing.assert_allclose(seen.velocity, s.vel[0, 0], atol=1e-5)
+    gap = np.linalg.norm(centres - x, axis=1) - radii
+    gap[radii == 0] = np.inf
+    order = np.argsort(gap)[: task.slots]  # type: ignore[attr-defined]
+    order = order[gap[order] < task.sight]  # type: ignore[attr-defined]
+    n = len(order)
+    assert n > 0
+    np.testing.assert_allclose(seen.obstacles[:n], (centres - x)[order], atol=1e-5)
+    np.testing.assert_allclose(seen.obstacle_radius[:n], radii[order], atol=1e-5)
+    np.testing.assert_array_equal(seen.obstacle_radius[n:], 0)
+
+
+def test_a_field_can_be_crossed_from_where_it_begins() -> None:
+    world = world_of(Obstacles(), worlds=100)
+    s = world.state
+    assert (s.obstacle_radius > 0).sum(axis=1).min() > 10
+    for b in range(100):
+        there = s.obstacle_radius[b] > 0
+        centre, radius = s.obstacles.centre[b][there], s.obstacle_radius[b][there]
+        for point in (s.pos[b, 0], world._memory[:2, b, 0]):
+            assert (np.linalg.norm(centre - point, axis=1) - radius).min() > 0.3
+        gaps = np.linalg.norm(centre[:, None] - centre, axis=2) - radius[:, None] - radius + 1e9 * np.eye(len(centre))
+        assert gaps.min() >= 1.0 - 1e-12
+
+
+# --- Flock ------------------------------------------------------------------------------------------------------------
+
+
+def pair(gap: float, first: Any, second: Any, **more: Any) -> tuple[World, dict[str, float], dict[str, float]]:
+    """Two boids `gap` m apart along the heading after one step of 0.1 s; velocities (along, left), no action."""
+    world = world_of(Flock(agents=2, obstacle_count=0, **more))
+    (mark,) = world.snapshot().marks
+    along = mark.vector / np.linalg.norm(mark.vector)
+    axes = np.array([along, [-along[1], along[0]]])
+    velocities = np.array([first, second], float) @ axes
+    ends = np.array([20.0, 20.0]) + np.array([[0.0], [gap]]) * along
+    place(world, ends - 0.1 * velocities, velocities)
+    step = act(world)
+    return world, paid(world, step, 0), paid(world, step, 1)
+
+
+def test_two_boids_in_step_are_paid_as_on_paper() -> None:
+    """Both at cruising speed along the heading, 1.5 m apart: nothing to complain of but four empty places."""
+    world, a, b = pair(1.5, (2, 0), (2, 0))
+    for terms in (a, b):
+        expected = [0.1, 0, 0, -0.5 * (1 - 1 / 6) * 0.1, 0, 0]
+        np.testing.assert_allclose([terms[name] for name in Flock.terms], expected, atol=1e-9)
+    measured = world.measure()
+    assert measured["polarisation"] == pytest.approx(1)
+    assert measured["nearest_neighbour"] == pytest.approx(1.5)
+    assert measured["speed_along"] == pytest.approx(2)
+    assert measured["collisions"] == 0
+
+
+def test_two_boids_out_of_step_are_paid_as_on_paper() -> None:
+    """One stands, one flies across at 1 m/s, 2 m apart."""
+    world, a, b = pair(2.0, (0, 0), (0, 1))
+    assert a["progress"] == b["progress"] == pytest.approx(0)  # 2 m/s short of 2 m/s
+    assert a["alignment"] == b["alignment"] == pytest.approx(-0.5 * (1 / 2) * 0.1)
+    assert a["spacing"] == b["spacing"] == pytest.approx(-0.5 * (0.5 / 1.5) * 0.1)
+    assert a["touch"] == b["touch"] == 0
+    assert world.measure()["speed_along"] == pytest.approx(0)
+
+
+def test_two_boids_that_touch_pay_as_long_as_it_lasts_and_count_once() -> None:
+    world, a, b = pair(0.5, (1, 0), (1, 0))
+    assert a["touch"] == b["touch"] == pytest.approx(-10 * 0.1)
+    assert a["spacing"] == pytest.approx(-0.5 * (1.0 / 1.5) * 0.1)
+    assert a["progress"] == pytest.approx(0.5 * 0.1)
+    touching = world.measure()["collisions"]
+    assert paid(world, act(world))["touch"] == pytest.approx(-10 * 0.1)
+    assert world.measure()["collisions"] == touching  # it is still the same touch
+
+
+def test_polarisation_is_the_length_of_the_mean_heading() -> None:
+    world, _, _ = pair(3.0, (2, 0), (0, 0.5))
+    assert world.measure()["polarisation"] == pytest.approx(np.sqrt(0.5))
+
+
+def test_a_boid_alone_pays_for_it() -> None:
+    _, a, _ = pair(15.0, (2, 0), (2, 0))
+    assert a["together"] == pytest.approx(-0.5 * 0.1)
+    assert a["alignment"] == pytest.approx(-0.5 * 0.1)
+
+
+def test_a_boid_in_an_obstacle_pays() -> None:
+    world = world_of(Flock(agents=2, obstacle_count=1))
+    s = world.state
+    place(world, s.obstacles.centre[0, 0] + [[s.obstacle_radius[0, 0] + 0.2, 0], [9, 9]])
+    step = act(world)
+    assert paid(world, step, 0)["obstacle"] == pytest.approx(-10 * 0.1)
+    assert paid(world, step, 1)["obstacle"] == 0
+    assert not step.terminated.any()
+
+
+def test_neighbours_are_found_across_the_edge() -> None:
+    world = world_of(Flock(agents=2, obstacle_count=0))
+    place(world, [[39.5, 20], [0.5, 20]])
+    step = act(world)
+    assert paid(world, step)["together"] == pytest.approx(-0.5 * (1 - 1 / 6) * 0.1)
+    seen = world.task.layout.unpack(step.observation)
+    assert np.linalg.norm(seen.neighbours[0, 0, 0]) == pytest.approx(1.0, rel=1e-5)
+
+
+def test_a_boid_sees_what_is_there_in_the_frame_of_the_heading() -> None:
+    world = world_of(Flock())
+    for actions in random_actions(world, 15):
+        step = world.step(actions)
+    seen, s, task = world.task.layout.unpack(step.observation[0]), world.state, world.task
+    (mark,) = world.snapshot().marks
+    along = mark.vector / np.linalg.norm(mark.vector)
+    axes = np.array([along, [-along[1], along[0]]]).T
+    for i in range(24):
+        offset = task.scene.space.displacement(s.pos[0, i], s.pos[0])
+        distance = np.linalg.norm(offset, axis=1)
+        distance[i] = np.inf
+        order = np.argsort(distance)[: task.neighbours]  # type: ignore[attr-defined]
+        order = order[distance[order] < task.sight]  # type: ignore[attr-defined]
+        n = len(order)
+        np.testing.assert_allclose(seen.velocity[i], s.vel[0, i] @ axes, atol=1e-5)
+        np.testing.assert_allclose(seen.neighbours[i, :n], offset[order] @ axes, atol=1e-5)
+        relative = (s.vel[0, order] - s.vel[0, i]) @ axes
+        np.testing.assert_allclose(seen.neighbour_velocity[i, :n], relative, atol=1e-5)
+        np.testing.assert_array_equal(seen.neighbour_present[i], [1] * n + [0] * (task.neighbours - n))  # type: ignore[attr-defined]
+
+
+def test_a_flock_turned_by_a_quarter_sees_and_is_paid_the_same() -> None:
+    """Field, obstacles and heading turned about the middle: nothing in a row may say where north is."""
+    world = world_of(Flock(), worlds=2)
+    for actions in random_actions(world, 10):
+        world.step(actions)
+    turned, s = world_of(Flock(), worlds=2), world.state
+    middle, quarter = 20.0, np.array([[0.0, -1.0], [1.0, 0.0]])
+    t = turned.state
+    for theirs, ours in ((s.pos, t.pos), (s.obstacles.centre, t.obstacles.centre)):
+        ours[...] = (theirs - middle) @ quarter.T + middle
+    t.vel[...], t.obstacle_radius[...] = s.vel @ quarter.T, s.obstacle_radius
+    turned._memory[...] = np.einsum("ij,jbn->ibn", quarter, world._memory)
+    nobody = np.zeros(2, bool)
+    np.testing.assert_allclose(turned.reset(mask=nobody), world.reset(mask=nobody), atol=1e-6)
+    for actions in random_actions(world, 20, seed=1):
+        ours, theirs = turned.step(actions), world.step(actions)
+        np.testing.assert_allclose(ours.observation, theirs.observation, atol=1e-5)
+        np.testing.assert_allclose(ours.terms, theirs.terms, atol=1e-6)
+
+
+def test_scripted_flockmates_flock() -> None:
+    """The learner among them does nothing; the others find together and fly as they should."""
+    world = world_of(Flock(learners=1), worlds=4)
+    for _ in range(250):
+        world.step(np.zeros((4, 1, 2)))
+    v = world.state.vel[:, 1:]
+    heading = world._memory[:2, :, 0].T
+    along = (v * heading[:, None]).sum(axis=2)
+    assert along.mean() > 1.4
+    polarisation = np.linalg.norm((v / np.linalg.norm(v, axis=2, keepdims=True)).mean(axis=1), axis=1)
+    assert polarisation.mean() > 0.8
+
+
+def test_a_flock_begins_untouched() -> None:
+    world = world_of(Flock(), worlds=50)
+    s, space = world.state, world.task.scene.space
+    for b in range(50):
+        gaps = np.linalg.norm(space.displacement(s.pos[b, :, None], s.pos[b, None]), axis=2) + 1e9 * np.eye(24)
+        assert gaps.min() > 0.6
+        there = s.obstacle_radius[b] > 0
+        offset = space.displacement(s.pos[b, :, None], s.obstacles.centre[b, there][None])
+        assert (np.linalg.norm(offset, axis=2) - s.obstacle_radius[b, there]).min() > 0.3
