@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, Self
 
-from pydantic import BaseModel, ConfigDict, ValidationError, model_validator
+from pydantic import BaseModel, ConfigDict, ValidationError
 from pydantic._internal._model_construction import ModelMetaclass  # it has no public name
 from pydantic_core import PydanticCustomError
 
@@ -21,6 +21,7 @@ class _OneLine(ModelMetaclass):
 
     def __call__(cls, *args: Any, **data: Any) -> Any:  # noqa: N805  # the class of a class
         try:
+            cls._refuse_lookalikes(data)
             return super().__call__(*args, **data)
         except ValidationError as error:
             model: Any = cls
@@ -28,6 +29,15 @@ class _OneLine(ModelMetaclass):
             more = f" (and {len(wrong) - 1} more)" if len(wrong) > 1 else ""
             text = str(wrong[0]) if wrong else str(error)
         raise ValueError(f"{cls.__name__}: {text}{more}")
+
+    def _refuse_lookalikes(cls, data: dict[str, Any]) -> None:  # noqa: N805
+        """Refuse "1e-3" and True where a number is wanted: pydantic takes both for one. Files are read strictly."""
+        model: Any = cls
+        for name, field in model.model_fields.items():
+            value = data.get(name)
+            if isinstance(value, (str, bool)) and field.annotation in _NUMBERS:
+                line = {"type": PydanticCustomError("float_type", "must be a number"), "loc": (name,), "input": value}
+                raise ValidationError.from_exception_data(cls.__name__, [line])  # type: ignore[list-item]
 
 
 class Record(BaseModel, metaclass=_OneLine):
@@ -37,17 +47,6 @@ class Record(BaseModel, metaclass=_OneLine):
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, use_attribute_docstrings=True)
-
-    @model_validator(mode="before")
-    @classmethod
-    def _no_lookalikes(cls, data: Any) -> Any:
-        """Refuse "1e-3" and True where a number is wanted: pydantic would take both for one."""
-        for name, field in cls.model_fields.items():
-            value = data.get(name) if isinstance(data, dict) else None
-            if isinstance(value, (str, bool)) and field.annotation in _NUMBERS:
-                line = {"type": PydanticCustomError("float_type", "must be a number"), "loc": (name,), "input": value}
-                raise ValidationError.from_exception_data(cls.__name__, [line])  # type: ignore[list-item]
-        return data
 
     def __str__(self) -> str:
         return repr(self)

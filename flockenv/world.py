@@ -85,6 +85,7 @@ class World:
         d, n = scene.dimension, self.agents
         self._scratch = (
             *(np.zeros((d, n), scene.dtype) for _ in range(3)),
+            np.zeros(n, np.bool_),
             np.zeros((self.learners, self.action_size)),
             *Workspace.allocate(scene.parts, n, scene.dtype).arrays,
         )
@@ -145,6 +146,8 @@ class World:
 
     def _checked(self, seeds: int | Sequence[int]) -> list[int]:
         """Return one seed per world, or refuse."""
+        if not (_whole(seeds) or (isinstance(seeds, (Sequence, np.ndarray)) and not isinstance(seeds, (str, bytes)))):
+            raise ValueError(f"seeds is {seeds!r}, must be a whole number, or a sequence of them, one for each world")
         several = [seeds + k for k in range(self.worlds)] if isinstance(seeds, (int, np.integer)) else list(seeds)
         if len(several) != self.worlds:
             raise ValueError(f"{len(several)} seeds for {self.worlds} worlds")
@@ -168,11 +171,10 @@ class World:
         terms = np.empty((b, n, len(task.terms)))
         over = np.zeros((b, n), np.bool_)
         success = np.zeros(b, np.bool_)
-        force, x0, v0, action, *work = self._scratch
         broken, who = self._kernel.advance_worlds(
             given, s.x, s.v, s.alive, s.tick, s.obstacle_x, s.obstacle_radius, s.work, s.key, self._memory, self.steps,
             *self._body, self._params, self._dt, task.substeps, self._numbers, not task.ends_together,
-            observation, terms, over, success, self._last, force, x0, v0, action, *work,
+            observation, terms, over, success, self._last, *self._scratch,
         )  # fmt: skip
         if broken >= 0:
             raise FloatingPointError(f"world {broken}, agent {who}: not finite at t = {s.time[broken]:g} s")

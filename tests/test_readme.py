@@ -17,7 +17,7 @@ def test_the_ten_lines_run_and_the_player_scores_what_a_player_scores(capsys: py
     assert len(code.strip().splitlines()) <= 12
     exec(compile(code, "README.md", "exec"), {})  # noqa: S102  # that is the point
     mean, _ = (float(x) for x in re.findall(r"-?\d+\.\d+", capsys.readouterr().out)[:2])
-    assert mean > 5, "the hand-written pursuer catches nearly everybody: 10 for a capture, minus half a point per second"
+    assert mean > 5, "the hand-written pursuer catches nearly all: 10 for a capture, minus half a point per second"
 
 
 def test_every_file_it_points_to_exists() -> None:

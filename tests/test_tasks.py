@@ -255,14 +255,14 @@ def test_time_to_capture_counts_every_step_up_to_the_capture(steps: int) -> None
 
 
 def test_the_scripted_evader_flees_within_its_alarm_distance() -> None:
-    for distance in (1.5, 4, 7):
+    for distance in (2.5, 4, 7):
         for turn in np.linspace(0, 2 * np.pi, 7)[:-1]:
             ahead = np.array([np.cos(turn), np.sin(turn)])
             world = world_of(Pursuit(size=60))
             place(world, [30 - distance / 2 * ahead, 30 + distance / 2 * ahead], [3 * ahead, 0 * ahead])
             for _ in range(5):
                 act(world, ahead)
-            assert world.state.vel[0, 1] @ ahead > 1.2  # it can reach 2.4 m/s in 0.2 s
+            assert world.state.vel[0, 1] @ ahead > 0.8  # it can reach 2.4 m/s in 0.2 s, and may swerve
 
 
 def test_the_scripted_evader_wanders_when_it_is_left_alone() -> None:
@@ -379,7 +379,7 @@ def test_a_touch_costs_and_ends_it() -> None:
     world = world_of(Obstacles())
     s = world.state
     centre, radius = s.obstacles.centre[0, 0], s.obstacle_radius[0, 0]
-    place(world, centre + [0, radius + 0.29])
+    place(world, centre + np.array([0, radius + 0.29]))
     step = act(world)
     assert paid(world, step)["touch"] == -10
     assert paid(world, step)["goal"] == 0
@@ -399,7 +399,7 @@ def test_just_beside_is_no_touch() -> None:
 
 def test_the_goal_pays_and_ends_it() -> None:
     world = world_of(Obstacles())
-    place(world, goal_of(world) + [-0.9, 0], [2.0, 0])
+    place(world, goal_of(world) + np.array([-0.9, 0]), [2.0, 0])
     step = act(world)
     terms = paid(world, step)
     assert terms["goal"] == 10
@@ -464,6 +464,13 @@ def test_a_walker_sees_what_is_there() -> None:
     np.testing.assert_allclose(seen.obstacles[:n], (centres - x)[order], atol=1e-5)
     np.testing.assert_allclose(seen.obstacle_radius[:n], radii[order], atol=1e-5)
     np.testing.assert_array_equal(seen.obstacle_radius[n:], 0)
+    turns = 2 * np.pi * np.arange(len(seen.free_way)) / len(seen.free_way)
+    steps = np.arange(0, task.sight, 0.01)  # type: ignore[attr-defined]
+    ways = x + steps[:, None, None] * np.stack([np.cos(turns), np.sin(turns)], axis=1)
+    blocked = (np.linalg.norm(ways[:, :, None] - centres, axis=3) < radii + 0.3 * (radii > 0)).any(axis=2)
+    expected = np.where(blocked.any(axis=0), steps[blocked.argmax(axis=0)], task.sight)  # type: ignore[attr-defined]
+    assert blocked.any()
+    np.testing.assert_allclose(seen.free_way, expected, atol=0.011)
 
 
 def test_a_field_can_be_crossed_from_where_it_begins() -> None:

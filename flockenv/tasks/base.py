@@ -157,11 +157,11 @@ def task_source(task: Task) -> str:
     names = list(task.parameters())
     values = ", ".join(f"numbers[{k}]" for k in range(len(names)))
     frame = (
-        "Frame({x}, {v}, alive[b], obstacle_x[:, b], obstacle_radius[b], memory[:, b], key[b], steps[b], "
+        "Frame({x}, {v}, {alive}, obstacle_x[:, b], obstacle_radius[b], memory[:, b], key[b], steps[b], "
         "radius, max_speed, max_force)"
     )
-    now = frame.format(x="x[:, b]", v="v[:, b]")
-    then = frame.format(x="x0", v="v0")
+    now = frame.format(x="x[:, b]", v="v[:, b]", alive="alive[b]")
+    then = frame.format(x="x0", v="v0", alive="alive0")
     return (
         scene_source(task.scene.parts)
         + f'''
@@ -203,7 +203,7 @@ def first_bad(actions):
 def advance_worlds(
     actions, x, v, alive, tick, obstacle_x, obstacle_radius, work_, key, memory, steps,
     mass, radius, max_speed, max_force, params, dt, count, numbers, mortal,
-    rows, terms, over, success, measured, force, x0, v0, action,
+    rows, terms, over, success, measured, force, x0, v0, alive0, action,
     lanes, steer, push, sorted_, order, cell, start, shape, ranges, stages,
 ):
     """One decision in every world: drive, step, reward, judge, measure, observe."""
@@ -215,6 +215,8 @@ def advance_worlds(
             for i in range(x.shape[2]):
                 x0[k, i] = x[k, b, i]
                 v0[k, i] = v[k, b, i]
+        for i in range(x.shape[2]):
+            alive0[i] = alive[b, i]
         for i in range(actions.shape[1]):
             for k in range(actions.shape[2]):
                 action[i, k] = min(max(np.float64(actions[b, i, k]), -1.0), 1.0)

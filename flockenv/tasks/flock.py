@@ -396,5 +396,5 @@ class Flock(Task):
 
     def marks(self, state: State, memory: NDArray[np.float64], world: int) -> tuple[Mark, ...]:
         """The heading."""
-        at = np.array([0.12, 0.88]) * self.size
+        at = np.array([0.13, 0.82]) * self.size
         return (Mark("heading", at, memory[:2, world, 0], 0.0),)

@@ -1,0 +1,387 @@
+"""World: batches, seeds, episodes, copies, threads, and what it refuses; for every task of the catalogue."""
+
+from __future__ import annotations
+
+import copy
+import pickle
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+import numpy as np
+import pytest
+
+from flockenv.tasks import Flock, Obstacles, Pursuit
+from flockenv.world import Step, World
+from tests.catalogue import TASKS, TaskRow
+
+EVERY = pytest.mark.parametrize("row", TASKS, ids=lambda row: row.name)
+ARRAYS = ("x", "v", "alive", "tick", "key", "obstacle_x", "obstacle_radius", "work")
+
+
+def actions_for(world: World, steps: int, seed: int = 0) -> Any:
+    shape = (steps, world.worlds, world.learners, world.action_size)
+    return np.random.default_rng(seed).uniform(-1, 1, shape).astype(np.float32)
+
+
+def everything(world: World) -> dict[str, Any]:
+    """All that a world holds, as copies."""
+    kept = {name: getattr(world.state, name).copy() for name in ARRAYS}
+    return kept | {"memory": world._memory.copy(), "steps": world.steps.copy(), **world.measure()}
+
+
+def assert_same(a: dict[str, Any], b: dict[str, Any], but: tuple[str, ...] = ()) -> None:
+    assert a.keys() == b.keys()
+    for name in a.keys() - set(but):
+        np.testing.assert_array_equal(a[name], b[name], err_msg=name)
+
+
+def fields(step: Step) -> dict[str, Any]:
+    names = ("observation", "reward", "terms", "terminated", "truncated", "success", "alive", "ended")
+    return {name: getattr(step, name) for name in names}
+
+
+# --- batches ----------------------------------------------------------------------------------------------------------
+
+
+@EVERY
+def test_a_row_of_a_batch_is_that_world_alone_bit_for_bit(row: TaskRow) -> None:
+    batch = World(row.task, 16, time_limit=250)
+    first = batch.reset(100)
+    actions = actions_for(batch, 300)
+    steps = [fields(batch.step(a)) for a in actions]
+    measured = batch.measure()
+    for k in range(16):
+        alone = World(row.task, time_limit=250)
+        np.testing.assert_array_equal(alone.reset(100 + k)[0], first[k])
+        for t in range(300):
+            found = fields(alone.step(actions[t, k : k + 1]))
+            for name in found:
+                np.testing.assert_array_equal(found[name][0], steps[t][name][k], err_msg=f"{name}, world {k}, step {t}")
+        for name, value in alone.measure().items():
+            np.testing.assert_array_equal(value[0], measured[name][k])
+
+
+@EVERY
+def test_two_worlds_in_one_process_and_in_threads_do_not_mix(row: TaskRow) -> None:
+    def run(seed: int) -> list[Any]:
+        world = World(row.task, 2)
+        world.reset(seed)
+        return [world.step(a).observation for a in actions_for(world, 60, seed)]
+
+    serial = [run(seed) for seed in range(6)]
+    with ThreadPoolExecutor(3) as pool:
+        for ours, theirs in zip(serial, pool.map(run, range(6)), strict=True):
+            np.testing.assert_array_equal(ours, theirs)
+    worlds = [World(row.task, 2) for _ in range(2)]
+    for seed, world in enumerate(worlds):
+        world.reset(seed)
+    plans = [actions_for(world, 60, seed) for seed, world in enumerate(worlds)]
+    for t in range(60):  # in turn
+        for seed, world in enumerate(worlds):
+            np.testing.assert_array_equal(world.step(plans[seed][t]).observation, serial[seed][t])
+
+
+@EVERY
+def test_nothing_handed_out_is_shared(row: TaskRow) -> None:
+    world, other = World(row.task, 2), World(row.task, 2)
+    held = [world.reset(5)]
+    other.reset(5)
+    actions = actions_for(world, 20)
+    given = actions.copy()
+    for t in range(20):
+        step = world.step(given[t])
+        held += [step.observation, step.reward, step.terms, step.terminated, step.success, step.alive, step.truncated]
+        for array in held:
+            array[...] = 1  # a stranger scribbles over it
+        for array in world.measure().values():
+            array[...] = 77
+        reference = other.step(actions[t])
+    np.testing.assert_array_equal(given, actions)
+    assert_same(everything(world), everything(other))
+    assert not np.array_equal(reference.observation, step.observation)
+
+
+# --- episodes ---------------------------------------------------------------------------------------------------------
+
+
+@EVERY
+def test_episodes_differ_and_the_same_seed_gives_the_same_ones(row: TaskRow) -> None:
+    world, other = World(row.task, 3), World(row.task, 3)
+    ours = [world.reset(7), world.reset(), world.reset()]
+    theirs = [other.reset([7, 8, 9]), other.reset(), other.reset()]
+    np.testing.assert_array_equal(ours, theirs)
+    rows = np.concatenate(ours)
+    assert len({r.tobytes() for r in rows}) == 9
+    np.testing.assert_array_equal(world.reset(7), ours[0])
+    np.testing.assert_array_equal(world.reset(), ours[1])
+    assert world.seeds == (7, 8, 9)
+
+
+def test_a_world_without_a_seed_draws_one_and_says_which() -> None:
+    world, other = World(Pursuit()), World(Pursuit())
+    first = world.reset()
+    assert not np.array_equal(first, other.reset())
+    again = World(Pursuit())
+    np.testing.assert_array_equal(again.reset(list(world.seeds)), first)
+
+
+@EVERY
+def test_scripted_agents_do_not_depend_on_when_they_are_looked_at(row: TaskRow) -> None:
+    """Two resets to one seed in a row, and observations in between, change nothing that follows."""
+    world, other = World(row.task, 2), World(row.task, 2)
+    world.reset(1)
+    other.reset(9)
+    for a in actions_for(other, 17):
+        other.step(a)
+    other.reset(1)
+    for a in actions_for(world, 40):
+        np.testing.assert_array_equal(world.step(a).observation, other.step(a).observation)
+        other.reset(mask=np.zeros(2, bool))
+        other.snapshot()
+
+
+@EVERY
+def test_a_masked_reset_touches_the_masked_worlds_only(row: TaskRow) -> None:
+    world = World(row.task, 4)
+    world.reset(20)
+    for a in actions_for(world, 15):
+        step = world.step(a)
+    kept = everything(world)
+    mask = np.array([False, True, False, True])
+    seen = world.reset(mask=mask)
+    now = everything(world)
+    np.testing.assert_array_equal(seen[~mask], step.observation[~mask])
+    for name, value in now.items():
+        axis = 1 if name in ("x", "v", "obstacle_x", "memory") else 0
+        np.testing.assert_array_equal(
+            np.compress(~mask, value, axis), np.compress(~mask, kept[name], axis), err_msg=name
+        )
+    np.testing.assert_array_equal(world.steps, [15, 0, 15, 0])
+    fresh = World(row.task, 4)
+    fresh.reset(20)
+    np.testing.assert_array_equal(fresh.reset()[mask], seen[mask])  # the second episode of the same seeds
+    seen = world.reset([1, 2, 3, 4], mask=~mask)
+    assert world.seeds == (1, 21, 3, 23)
+    np.testing.assert_array_equal(seen[0], World(row.task).reset(1)[0])
+
+
+@EVERY
+def test_time_limits_truncate_and_never_terminate(row: TaskRow) -> None:
+    world = World(row.task, 2, time_limit=5)
+    world.reset(3)
+    for t in range(7):
+        step = world.step(np.zeros((2, world.learners, world.action_size)))
+        np.testing.assert_array_equal(step.truncated, t >= 4)
+        np.testing.assert_array_equal(step.ended, step.truncated | step.terminated.all(axis=1))
+    assert not step.terminated.any()
+    endless = World(row.task)
+    endless.reset(3)
+    assert not any(endless.step(a).truncated.any() for a in actions_for(endless, 50))
+
+
+# --- copies -----------------------------------------------------------------------------------------------------------
+
+
+@EVERY
+@pytest.mark.parametrize(
+    "copied", [copy.deepcopy, lambda world: pickle.loads(pickle.dumps(world))], ids=["deep", "pickle"]
+)
+def test_a_copy_goes_on_as_the_original_would(row: TaskRow, copied: Any) -> None:
+    world = World(row.task, 3, time_limit=90)
+    world.reset(11)
+    actions = actions_for(world, 120)
+    for a in actions[:40]:
+        world.step(a)
+    other = copied(world)
+    ours = [fields(world.step(a)) for a in actions[40:]] + [{"reset": world.reset()}]  # moved on first
+    theirs = [fields(other.step(a)) for a in actions[40:]] + [{"reset": other.reset()}]
+    for a, b in zip(ours, theirs, strict=True):
+        assert_same(a, b)
+    assert_same(everything(world), everything(other))
+    assert world.seeds == other.seeds
+
+
+def test_a_copy_of_a_world_that_was_never_reset_is_one_too() -> None:
+    other = copy.deepcopy(World(Pursuit(), 2))
+    with pytest.raises(RuntimeError, match="reset"):
+        other.step(np.zeros((2, 1, 2)))
+    other.reset(1)
+
+
+# --- actions ----------------------------------------------------------------------------------------------------------
+
+
+@EVERY
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_an_action_that_is_no_number_is_refused_by_name_and_moves_nobody(
+    row: TaskRow, value: float, dtype: Any
+) -> None:
+    world, other = World(row.task, 3), World(row.task, 3)
+    world.reset(2)
+    other.reset(2)
+    actions = actions_for(world, 3).astype(dtype)
+    for w in (world, other):
+        w.step(actions[0])
+    kept, bad = everything(world), actions[1].copy()
+    bad[1, -1, 1] = value
+    with pytest.raises(ValueError, match="action 1 of") as caught:
+        world.step(bad)
+    line = str(caught.value)
+    assert row.task.agent_names[-1] in line
+    assert "world 1" in line
+    assert "\n" not in line
+    assert_same(everything(world), kept)
+    for a in actions[1:]:  # and it goes on as if nothing had been asked
+        np.testing.assert_array_equal(world.step(a).observation, other.step(a).observation)
+
+
+@EVERY
+def test_actions_of_another_shape_are_refused(row: TaskRow) -> None:
+    world = World(row.task, 2)
+    world.reset(2)
+    kept, right = everything(world), (2, world.learners, 2)
+    for shape in ((2, world.learners), (2, world.learners, 3), (1, world.learners, 2), (2, world.learners + 1, 2), ()):
+        with pytest.raises(ValueError, match="actions have shape") as caught:
+            world.step(np.zeros(shape))
+        assert str(shape) in str(caught.value)
+        assert str(right) in str(caught.value)
+    assert_same(everything(world), kept)
+
+
+@pytest.mark.parametrize("actions", [[[["left", "up"]]], [[[None, 0]]], [[[{}, 0]]]])
+def test_actions_that_are_no_numbers_are_refused(actions: Any) -> None:
+    world = World(Pursuit())
+    world.reset(2)
+    kept = everything(world)
+    with pytest.raises((TypeError, ValueError), match="action") as caught:
+        world.step(actions)
+    assert "\n" not in str(caught.value)
+    assert_same(everything(world), kept)
+
+
+@EVERY
+def test_actions_beyond_the_bounds_are_the_bounds(row: TaskRow) -> None:
+    signs = np.sign(actions_for(World(row.task, 2), 30))
+    ends = []
+    for factor in (1.0, np.nextafter(np.float32(1), np.float32(2)), 1.7, 1e30, 1e300):
+        world = World(row.task, 2)
+        world.reset(4)
+        for s in signs:
+            step = world.step(s.astype(float) * factor)
+        ends.append(everything(world) | fields(step))
+    for end in ends[1:]:
+        assert_same(end, ends[0])
+
+
+def test_whatever_holds_the_numbers_they_are_the_same_numbers() -> None:
+    values = np.array([[[0.5, -0.25]], [[-1.0, 1.0]]])
+    wide = np.zeros((2, 1, 4))
+    wide[..., ::2] = values
+    forms = [values, values.astype(np.float32), values.astype(np.float16), values.tolist(), wide[..., ::2]]
+    forms += [np.asfortranarray(values), values.astype(object)]
+    ends = []
+    for form in forms:
+        world = World(Pursuit(), 2)
+        world.reset(4)
+        world.step(form)
+        ends.append(everything(world))
+    for end in ends[1:]:
+        assert_same(end, ends[0])
+    world.step(np.ones((2, 1, 2), np.int64))
+    world.step(np.ones((2, 1, 2), bool))
+
+
+# --- what a world cannot be -------------------------------------------------------------------------------------------
+
+
+def test_a_step_before_the_first_reset_is_refused() -> None:
+    world = World(Pursuit())
+    with pytest.raises(RuntimeError, match="reset"):
+        world.step(np.zeros((1, 1, 2)))
+    with pytest.raises(RuntimeError, match="first reset"):
+        World(Pursuit(), 2).reset(mask=np.array([True, False]))
+
+
+@pytest.mark.parametrize(
+    ("make", "said"),
+    [
+        (lambda: World(Pursuit(), 0), "worlds is 0"),
+        (lambda: World(Pursuit(), -3), "worlds is -3"),
+        (lambda: World(Pursuit(), 2.5), "worlds is 2.5"),
+        (lambda: World(Pursuit(), True), "worlds is True"),
+        (lambda: World(Pursuit(), "two"), "worlds is 'two'"),
+        (lambda: World(Pursuit(), 10**9), "GiB"),
+        (lambda: World(Flock(agents=100_000), 10_000), "GiB"),
+        (lambda: World(Pursuit(), time_limit=0), "time_limit is 0"),
+        (lambda: World(Pursuit(), time_limit=2.5), "time_limit is 2.5"),
+        (lambda: World(Pursuit(), time_limit=True), "time_limit is True"),
+    ],
+)
+def test_a_bad_world_is_refused_in_one_line(make: Any, said: str) -> None:
+    with pytest.raises((ValueError, TypeError)) as caught:
+        make()
+    assert said in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("seeds", "said"),
+    [
+        (-1, "-1"),
+        (2**64, "18446744073709551616"),
+        ([1, 2, 3], "3 seeds for 2 worlds"),
+        ([1, 1.5], "seed of world 1 is 1.5"),
+        ([1, -4], "seed of world 1 is -4"),
+        (1.5, "1.5"),
+        ("abc", "abc"),
+        (True, "True"),
+    ],
+)
+def test_bad_seeds_are_refused_in_one_line_and_change_nothing(seeds: Any, said: str) -> None:
+    world = World(Obstacles(), 2)
+    world.reset(3)
+    kept = everything(world)
+    with pytest.raises((ValueError, TypeError)) as caught:
+        world.reset(seeds)
+    assert said in str(caught.value)
+    assert "\n" not in str(caught.value)
+    assert_same(everything(world), kept)
+    assert world.seeds == (3, 4)
+
+
+@pytest.mark.parametrize("mask", [[True], [True, False, True], [1, 0], np.zeros((2, 1), bool), "yes"])
+def test_a_bad_mask_is_refused(mask: Any) -> None:
+    world = World(Obstacles(), 2)
+    world.reset(3)
+    kept = everything(world)
+    with pytest.raises(ValueError, match="mask has shape") as caught:
+        world.reset(mask=mask)
+    assert "\n" not in str(caught.value)
+    assert_same(everything(world), kept)
+
+
+@EVERY
+def test_a_world_that_diverged_says_which(row: TaskRow) -> None:
+    world = World(row.task, 3)
+    world.reset(2)
+    world.state.vel[1, 0] = np.nan
+    with pytest.raises(FloatingPointError, match="world 1, agent 0") as caught:
+        world.step(np.zeros((3, world.learners, 2)))
+    assert "\n" not in str(caught.value)
+
+
+@EVERY
+def test_a_snapshot_is_a_picture_of_one_world(row: TaskRow) -> None:
+    world = World(row.task, 3)
+    world.reset(2)
+    for a in actions_for(world, 7):
+        world.step(a)
+    picture = world.snapshot(2)
+    np.testing.assert_array_equal(picture.pos, world.state.pos[2])
+    np.testing.assert_array_equal(picture.vel, world.state.vel[2])
+    assert picture.time == pytest.approx(0.7)
+    assert len(picture.roles) == row.task.agents
+    kept = picture.pos.copy()
+    world.step(actions_for(world, 1)[0])
+    np.testing.assert_array_equal(picture.pos, kept)
