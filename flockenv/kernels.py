@@ -101,11 +101,20 @@ def _laws_digest() -> str:
 
 
 def _other_laws(source: str) -> str:
-    """Return the text of the modules outside flockenv that a generated source takes laws from."""
-    names = set(re.findall(r"^from ([\w.]+) import", source, re.MULTILINE))
-    files = (getattr(sys.modules.get(name), "__file__", None) for name in sorted(names) if "flockenv" not in name)
-    own = (f for f in files if f and f.endswith(".py") and "site-packages" not in f)
-    return "".join(Path(f).read_text(encoding="utf-8") for f in own)
+    """Return the text of the modules outside flockenv whose laws a source uses, directly or through others."""
+    todo = set(re.findall(r"^from ([\w.]+) import", source, re.MULTILINE))
+    done: set[str] = set()
+    texts = []
+    while todo - done:
+        name = min(todo - done)
+        done.add(name)
+        module = sys.modules.get(name)
+        if module is None or name.split(".")[0] in ("flockenv", "numpy", "numba", "collections", "math"):
+            continue
+        path = Path(getattr(module, "__file__", None) or "")
+        texts.append(path.read_text(encoding="utf-8") if path.suffix == ".py" else "")
+        todo |= {v.py_func.__module__ for v in vars(module).values() if hasattr(v, "py_func")}
+    return "".join(texts)
 
 
 @functools.lru_cache(maxsize=512)

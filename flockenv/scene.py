@@ -95,6 +95,7 @@ class Workspace:
                 np.zeros(parts.lanes() * LANES, dtype),
                 np.zeros((d, agents), dtype),  # what agents want
                 np.zeros((d, agents), dtype),  # what acts on them
+                np.zeros((d, agents), dtype),  # where they were before the step
                 np.zeros((2 * d + 2, sweeps), dtype),  # positions, velocities, radii, indices, sorted
                 np.zeros(sweeps, np.int64),
                 np.zeros(2 * sweeps, np.int64),
@@ -218,6 +219,7 @@ class Scene(Record):
 
     def _scatter(self, state: State, b: int) -> None:
         place, first, d = entry(scatter), 0, self.dimension
+        period = np.array(self.space.extent(d) if self.space.periodic else (0.0,) * d, float)
         for group in self.groups:
             spawn = group.spawn
             low = np.array(spawn.low if spawn.low is not None else (0.0,) * d, float)
@@ -225,7 +227,8 @@ class Scene(Record):
             heading = np.array(spawn.heading if spawn.heading is not None else (0.0,) * d, float)
             place(
                 state.key[b], state.x[:, b], state.v[:, b], self.body.radius, first, first + group.count, low, high,
-                *spawn.speed, heading, state.obstacle_x[:, b], state.obstacle_radius[b], np.zeros(d),
+                *spawn.speed, heading, state.obstacle_x[:, b], state.obstacle_radius[b],
+                period, np.zeros(d),
             )  # fmt: skip
             first += group.count
 

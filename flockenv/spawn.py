@@ -54,14 +54,16 @@ def direction(key: Any, step: int, agent: int, channel: int, out: Any) -> None:
 
 
 @kernel
-def _overlap(pos: Any, i: int, radius: float, centre: Any, obstacle_radius: Any) -> float:
+def _overlap(pos: Any, i: int, radius: float, centre: Any, obstacle_radius: Any, period: Any) -> float:
     """Return the deepest overlap of agent i with an obstacle, m; 0 if it is clear."""
     worst = 0.0
     for m in range(obstacle_radius.shape[0]):
         if obstacle_radius[m] > 0:
             square = 0.0
             for k in range(pos.shape[0]):
-                square += (pos[k, i] - centre[k, m]) ** 2
+                d = pos[k, i] - centre[k, m]
+                d -= period[k] * math.floor(d / period[k] + 0.5) if period[k] > 0.0 else 0.0
+                square += d * d
             worst = max(worst, obstacle_radius[m] + radius - math.sqrt(square))
     return worst
 
@@ -69,11 +71,12 @@ def _overlap(pos: Any, i: int, radius: float, centre: Any, obstacle_radius: Any)
 @kernel
 def scatter(
     key: Any, pos: Any, vel: Any, radius: Any, first: int, end: int, low: Any, high: Any, slow: float, fast: float,
-    heading: Any, centre: Any, obstacle_radius: Any, unit: Any,
+    heading: Any, centre: Any, obstacle_radius: Any, period: Any, unit: Any,
 ) -> None:  # fmt: skip
     """Place agents [first, end) of one world: uniform in [low, high), clear of obstacles if 64 tries find room.
 
-    pos, vel (D, N); low, high, heading, unit (D,); a heading of zeros means a random one; `unit` is scratch.
+    pos, vel (D, N); low, high, heading, period, unit (D,); a heading of zeros means a random one; `period` is the
+    size of a periodic box, zeros for none; `unit` is scratch.
     """
     dimension = pos.shape[0]
     for i in range(first, end):
@@ -81,7 +84,7 @@ def scatter(
         for t in range(TRIES):
             for k in range(dimension):
                 pos[k, i] = low[k] + (high[k] - low[k]) * uniform(key, t, i, k)
-            overlap = _overlap(pos, i, radius[i], centre, obstacle_radius)
+            overlap = _overlap(pos, i, radius[i], centre, obstacle_radius, period)
             if overlap < best:
                 best, kept = overlap, t
             if overlap <= 0.0:

@@ -139,7 +139,7 @@ def separate(offset: Vec, tie: Vec) -> Vec:
     `tie` is the direction to take where the two coincide, a unit vector that is opposite for the other one.
     """
     square = dot(offset, offset)
-    apart = square > like(square, 0.0)
+    apart = square > like(square, 1e-30)  # nearer than 1e-15 m is one place: 1/square must not overflow, in float32 too
     return select(apart, scale(offset, like(square, -1.0) / square), tie)
 
 

@@ -61,7 +61,7 @@ def context_names() -> str:
     """The names of what an acceleration is given beside positions and velocities, in order."""
     return (
         "drive, mass, radius, max_speed, max_force, alive, obstacle_x, obstacle_radius, params, "
-        "lanes, steer, push, sorted_, order, cell, start, shape, ranges, work"
+        "lanes, steer, push, origin, sorted_, order, cell, start, shape, ranges, work"
     )
 
 
@@ -90,7 +90,7 @@ def _imports(parts: Parts) -> str:
         "from flockenv.kernels import finite, like",
         "from flockenv.neighbours import block_end, candidates, sort_agents",
         f"from flockenv.space import {parts.space.offset_law} as offset_to, {parts.space.confine_law} as confine",
-        "from flockenv.vec import add, dot, limit, scale, unit, zero",
+        "from flockenv.vec import add, dot, limit, scale, sub, unit, zero",
         _method_imports(parts.integrator),
     ]
     for k, effect in enumerate(parts.effects):
@@ -278,13 +278,18 @@ def step_world(context, pos, vel, dt, count, stages):
     size = {_vector("params[#]", d)}
     bad = -1
     for _ in range(count):
+        for k in range(pos.shape[0]):
+            for i in range(pos.shape[1]):
+                origin[k, i] = pos[k, i]
         advance(context, pos, vel, dt, stages)
         for i in range(pos.shape[1]):
-            x, v = confine(
-                size, radius[i], {_vector("pos[#, i]", d)}, limit({_vector("vel[#, i]", d)}, max_speed[i])
-            )
+            was, x, v = {_vector("origin[#, i]", d)}, {_vector("pos[#, i]", d)}, {_vector("vel[#, i]", d)}
             if bad < 0 and not finite(dot(x, x) + dot(v, v)):
                 bad = i
+            # nobody moves faster than max_speed, whatever a method makes of the velocity within the step
+            step_made = limit(sub(x, was), max_speed[i] * dt)
+            x = add(was, step_made if alive[i] else zero(x))
+            x, v = confine(size, radius[i], x, limit(v, max_speed[i]) if alive[i] else zero(v))
 {_each("pos[#, i] = x[#]; vel[#, i] = v[#]", d, 12)}
     return bad
 '''
@@ -295,14 +300,14 @@ def _step() -> str:
 @njit(cache=True, **FAST)
 def step(
     x, v, alive, tick, obstacle_x, obstacle_radius, work_, drive_, mass, radius, max_speed, max_force, params,
-    dt, count, lanes, steer, push, sorted_, order, cell, start, shape, ranges, stages,
+    dt, count, lanes, steer, push, origin, sorted_, order, cell, start, shape, ranges, stages,
 ):
     """Advance every world by `count` steps in place; return (world, agent) of the first that is not finite, or -1s."""
     for b in range(x.shape[1]):
         drive, work = drive_[:, b], work_[b]
         context = (
             drive, mass, radius, max_speed, max_force, alive[b], obstacle_x[:, b], obstacle_radius[b], params,
-            lanes, steer, push, sorted_, order, cell, start, shape, ranges, work,
+            lanes, steer, push, origin, sorted_, order, cell, start, shape, ranges, work,
         )
         bad = step_world(context, x[:, b], v[:, b], dt, count, stages)
         tick[b] += count

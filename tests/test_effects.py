@@ -137,7 +137,7 @@ def test_somebody_out_of_reach_changes_nothing(row: EffectRow, dimension: int) -
 @DIMENSIONS
 @ROWS
 def test_the_dead_are_not_there(row: EffectRow, dimension: int) -> None:
-    """They push nobody, and nothing pushes them."""
+    """They push nobody, nothing pushes them, and they stay where they are."""
     scene = scene_under(row, dimension)
     start = scene.start(3)
     start.alive[:, 18:] = False
@@ -147,7 +147,8 @@ def test_the_dead_are_not_there(row: EffectRow, dimension: int) -> None:
     living.x[...], living.v[...] = start.x[:, :, :18], start.v[:, :, :18]
     end, expected = scene.run(start, 20), few.run(living, 20)
     np.testing.assert_array_equal(end.x[:, :, :18], expected.x)
-    np.testing.assert_array_equal(end.v[:, :, 18:], start.v[:, :, 18:])
+    np.testing.assert_array_equal(end.x[:, :, 18:], start.x[:, :, 18:])
+    np.testing.assert_array_equal(end.v[:, :, 18:], 0)
 
 
 # --- degenerate input -------------------------------------------------------------------------------------------------

@@ -19,7 +19,7 @@ from flockenv.integrators import RK4
 from flockenv.kernels import cache_folder
 from flockenv.scene import Group, Scene
 from flockenv.shapes import Circle
-from flockenv.space import Box, Torus
+from flockenv.space import Box, Plane, Space, Torus
 from flockenv.spawn import Spawn
 from flockenv.state import State
 from tests.catalogue import TETHER, everything, scene_of, users_module
@@ -69,12 +69,15 @@ def test_agents_start_where_and_as_fast_as_they_should(dimension: int) -> None:
     np.testing.assert_allclose(state.vel[0, 4000:], np.tile((1.2, 1.6, 0)[:dimension], (50, 1)))
 
 
-def test_nobody_starts_in_an_obstacle() -> None:
-    obstacles = (Circle(centre=(3, 3), radius=2), Circle(centre=(7, 7), radius=1.5))
-    scene = scene_of(obstacles=obstacles, groups=(Group(count=500, radius=0.2, spawn=SPAWN),))
+@pytest.mark.parametrize("space", [Plane(), Torus(size=(10, 10))])
+def test_nobody_starts_in_an_obstacle(space: Space) -> None:
+    """Nor in the part of one that reaches across the edge of a torus."""
+    obstacles = (Circle(centre=(0.5, 3), radius=2), Circle(centre=(7, 7), radius=1.5))
+    scene = scene_of(obstacles=obstacles, space=space, groups=(Group(count=500, radius=0.2, spawn=SPAWN),))
     state = scene.start(0, worlds=3)
     for obstacle in obstacles:
-        assert np.linalg.norm(state.pos - obstacle.centre, axis=2).min() >= obstacle.radius + 0.2
+        gap = np.linalg.norm(space.displacement(state.pos, obstacle.centre), axis=2) - obstacle.radius
+        assert gap.min() >= 0.2
 
 
 # --- steps ------------------------------------------------------------------------------------------------------------

@@ -116,6 +116,9 @@ def test_bad_arguments_of_a_task_are_refused_in_one_line(row: TaskRow, kind: str
         (lambda: Pursuit(pursuers=0), "pursuers = 0"),
         (lambda: Pursuit(sides="neither"), "sides = 'neither'"),
         (lambda: Obstacles(size=5), "size = 5"),
+        (lambda: Obstacles(least_radius=2, greatest_radius=1), "least_radius = 2"),
+        (lambda: Obstacles(greatest_radius=4), "greatest_radius = 4"),  # it could cover the start
+        (lambda: Flock(least_radius=3, greatest_radius=1), "least_radius = 3"),
         (lambda: Flock(agents=0), "agents = 0"),
         (lambda: Flock(agents=10**9), "agents = 1000000000"),
         (lambda: Flock(agents=4, learners=5), "learners = 5"),

@@ -1,11 +1,12 @@
-"""Task: what is seen, what is paid, when it ends; pure functions of frames, over a scene that knows nothing of them.
+"""Task: what is seen, what is paid, when it ends; functions of frames, over a scene that knows nothing of them.
 
 A task is one file: a frozen record whose fields are the keyword arguments of `make`, and six kernels over one world:
 
 * `spawn(p, frame)` writes the first positions, velocities, obstacles and memory from the world's key;
 * `drive(p, frame, action, force)` turns actions (L, A) into forces asked for (D, N) N, of scripted agents too;
-* `reward(p, before, after, action, terms)` writes the named terms (L, K); it is handed copies and moves nothing;
-* `ended(p, before, after, over) -> success` writes which learners are over (L,), and says whether the aim is reached;
+* `reward(p, before, after, action, terms)` writes the named terms (L, K) and nothing else, as a test checks;
+* `ended(p, before, after, over) -> success` writes which learners are over (L,), may take agents out of `after.alive`,
+  and says whether the aim is reached;
 * `measure(p, before, after, numbers)` writes what this step adds to the domain metrics (Q,);
 * `observe(p, frame, rows)` writes the observation rows (L, O).
 
@@ -204,7 +205,7 @@ def advance_worlds(
     actions, x, v, alive, tick, obstacle_x, obstacle_radius, work_, key, memory, steps,
     mass, radius, max_speed, max_force, params, dt, count, numbers, mortal,
     rows, terms, over, success, measured, force, x0, v0, alive0, action,
-    lanes, steer, push, sorted_, order, cell, start, shape, ranges, stages,
+    lanes, steer, push, origin, sorted_, order, cell, start, shape, ranges, stages,
 ):
     """One decision in every world: drive, step, reward, judge, measure, observe."""
     p = P({values})
@@ -223,7 +224,7 @@ def advance_worlds(
         drive(p, now, action, force)
         context = (
             force, mass, radius, max_speed, max_force, alive[b], obstacle_x[:, b], obstacle_radius[b], params,
-            lanes, steer, push, sorted_, order, cell, start, shape, ranges, work_[b],
+            lanes, steer, push, origin, sorted_, order, cell, start, shape, ranges, work_[b],
         )
         bad = step_world(context, x[:, b], v[:, b], dt, count, stages)
         if bad >= 0 and broken < 0:

@@ -337,6 +337,10 @@ class Flock(Task):
         """Refuse more learners than agents."""
         if self.learners > self.agents:
             raise ValueError(f"learners = {self.learners}: there are only {self.agents} agents")
+        if self.least_radius > self.greatest_radius:
+            raise ValueError(
+                f"least_radius = {self.least_radius:g} is above greatest_radius = {self.greatest_radius:g}"
+            )
         if self.sight > self.size / 2:
             raise ValueError(f"sight = {self.sight:g} m reaches around the field; at most size / 2 = {self.size / 2:g}")
         return self

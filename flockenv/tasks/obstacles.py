@@ -8,7 +8,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from flockenv.kernels import kernel
 from flockenv.noise import uniform
@@ -67,12 +67,16 @@ def _to_goal(frame: Frame) -> float:
 
 
 @kernel
-def _touches(frame: Frame) -> bool:
-    """Is the agent in contact with an obstacle?"""
-    for m in range(frame.rho.shape[0]):
-        if frame.rho[m] > 0.0:
-            gap = math.hypot(frame.centre[0, m] - frame.pos[0, 0], frame.centre[1, m] - frame.pos[1, 0])
-            if gap < frame.rho[m] + frame.radius[0]:
+def _touches(before: Frame, after: Frame) -> bool:
+    """Did the agent touch an obstacle on its way, taken as straight from one decision to the next?"""
+    x, y = before.pos[0, 0], before.pos[1, 0]
+    dx, dy = after.pos[0, 0] - x, after.pos[1, 0] - y
+    way = dx * dx + dy * dy
+    for m in range(after.rho.shape[0]):
+        if after.rho[m] > 0.0:
+            cx, cy = after.centre[0, m] - x, after.centre[1, m] - y
+            share = min(max((cx * dx + cy * dy) / way, 0.0), 1.0) if way > 0.0 else 0.0
+            if math.hypot(cx - share * dx, cy - share * dy) < after.rho[m] + after.radius[0]:
                 return True
     return False
 
@@ -80,7 +84,7 @@ def _touches(frame: Frame) -> bool:
 @kernel
 def reward(p: Any, before: Frame, after: Frame, action: Any, terms: Any) -> None:
     """Terms: progress, goal, touch, time."""
-    touch = _touches(after)
+    touch = _touches(before, after)
     there = not touch and _to_goal(after) <= p.goal_radius
     terms[0, 0] = p.progress_reward * (_to_goal(before) - _to_goal(after))
     terms[0, 1] = p.goal_reward if there else 0.0
@@ -91,7 +95,7 @@ def reward(p: Any, before: Frame, after: Frame, action: Any, terms: Any) -> None
 @kernel
 def ended(p: Any, before: Frame, after: Frame, over: Any) -> bool:
     """A touch ends it, and so does the goal, which is success."""
-    touch = _touches(after)
+    touch = _touches(before, after)
     there = not touch and _to_goal(after) <= p.goal_radius
     over[0] = touch or there
     return there
@@ -101,7 +105,7 @@ def ended(p: Any, before: Frame, after: Frame, over: Any) -> bool:
 def measure(p: Any, before: Frame, after: Frame, numbers: Any) -> None:
     """Path, m; touches; distance left, m; straight distance at the start, m."""
     numbers[0] = math.hypot(after.pos[0, 0] - before.pos[0, 0], after.pos[1, 0] - before.pos[1, 0])
-    numbers[1] = 1.0 if _touches(after) else 0.0
+    numbers[1] = 1.0 if _touches(before, after) else 0.0
     numbers[2] = _to_goal(after)
     numbers[3] = after.memory[2, 0]
 
@@ -170,6 +174,16 @@ class Obstacles(Task):
     goal_reward: float = Field(default=10.0, ge=0, description="once")
     touch_cost: float = Field(default=10.0, ge=0, description="once")
     time_cost: float = Field(default=0.5, ge=0, description="per s")
+
+    @model_validator(mode="after")
+    def _fitting(self) -> Obstacles:
+        """Refuse radii that run backwards or reach the start and the goal."""
+        if not self.least_radius <= self.greatest_radius <= 2.0:
+            raise ValueError(
+                f"least_radius = {self.least_radius:g}, greatest_radius = {self.greatest_radius:g}: "
+                "the least comes first, and above 2 m an obstacle could cover the start"
+            )
+        return self
 
     @property
     def learners(self) -> int:

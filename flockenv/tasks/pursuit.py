@@ -155,7 +155,7 @@ def measure(p: Any, before: Frame, after: Frame, numbers: Any) -> None:
     best, caught = _FAR, 0
     for j in range(pursuers, n):
         caught += 0 if after.alive[j] else 1
-        for i in range(pursuers):
+        for i in range(pursuers if before.alive[j] else 0):
             best = min(best, _distance(after, i, j))
     numbers[1] = best
     numbers[2] = caught
