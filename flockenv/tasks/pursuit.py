@@ -173,8 +173,15 @@ def observe(p: Any, frame: Frame, rows: Any) -> None:
             row[k] = _clip(frame.vel[k, i] / p.speed_scale)
             row[2 + k] = _clip(frame.pos[k, i] / p.size)
             row[4 + k] = _clip((p.size - frame.pos[k, i]) / p.size)
-        at = _others(p, frame, i, first, end, int(p.opponent_slots), row, 6)
-        _others(p, frame, i, mate, mates_end, int(p.mate_slots), row, at)
+        slots = int(p.opponent_slots)
+        at = _others(p, frame, i, first, end, slots, row, 6)
+        at = _others(p, frame, i, mate, mates_end, int(p.mate_slots), row, at)
+        for s in range(slots):
+            dx, dy = row[6 + 2 * s] * p.size, row[7 + 2 * s] * p.size
+            distance = math.sqrt(dx * dx + dy * dy)
+            if distance > 0.0:
+                row[at + 2 * s], row[at + 2 * s + 1] = dx / distance, dy / distance
+            row[at + 2 * slots + s] = max(1.0 - distance / p.near, 0.0) * row[6 + 4 * slots + s]
 
 
 @kernel
@@ -227,6 +234,7 @@ class Pursuit(Task):
     evader_speed: float = Field(default=2.4, gt=0, description="m/s")
     evader_force: float = Field(default=12.0, gt=0, description="N; the mass is 1 kg")
     alarm_distance: float = Field(default=8.0, ge=0, description="m, within which a scripted evader flees")
+    near: float = Field(default=4.0, gt=0, description="m, within which the closeness of opponents is seen")
     capture_distance: float = Field(default=0.6, gt=0, description="m between centres")
     closing_reward: float = Field(default=0.1, ge=0, description="per m that the nearest evader came nearer")
     capture_reward: float = Field(default=10.0, ge=0, description="for each capture, to every pursuer")
@@ -306,6 +314,8 @@ class Pursuit(Task):
             Slot("mates", (mates, 2), self.size, "m", "offsets of the nearest team mates, nearest first"),
             Slot("mate_velocity", (mates, 2), fastest, "m/s", "their velocities"),
             Slot("mate_present", (mates,), 1.0, "1", there, low=0.0),
+            Slot("bearing", (opponents, 2), 1.0, "1", "unit vectors towards the opponents; zeros = none"),
+            Slot("closeness", (opponents,), 1.0, "1", "1 - distance / near; 0 beyond near, or none", low=0.0),
         ))  # fmt: skip
 
     @functools.cached_property
