@@ -22,24 +22,49 @@ from types import ModuleType
 from typing import Any, TypeVar, cast
 
 import numba
+from llvmlite import ir  # type: ignore[import-untyped]
 from numba.core import types
-from numba.extending import overload
+from numba.extending import intrinsic, overload
+from numba.np import arrayobj
 
-__all__ = ["FAST", "Vec", "cache_folder", "entry", "finite", "kernel", "law", "like", "load"]
+__all__ = [
+    "FAST",
+    "Vec",
+    "cache_folder",
+    "entry",
+    "finite",
+    "kernel",
+    "law",
+    "like",
+    "load",
+    "unaliased",
+    "unfused",
+    "wait_for_team",
+]
 
 F = TypeVar("F", bound=Callable[..., Any])
 
 Vec = tuple[float, ...]
 """A vector inside a law: a tuple of D floats, D = 2 or 3."""
 
-# No nnan/ninf: a NaN must stay visible to the checks that look for it.
-FAST = frozenset({"nsz", "arcp", "contract", "afn", "reassoc"})
-_OPTIONS: dict[str, Any] = {"fastmath": set(FAST), "error_model": "numpy", "nogil": True}
+# Fused multiply-add and nothing else. The rest of fastmath gave no speed here and took much: with `arcp` and `afn` a
+# division in a vector register is an estimate and a scalar one is exact, so that results depend on how agents are
+# divided among threads; with `reassoc` and `nsz` a NaN check (x - x == 0) folds to True.
+FAST = frozenset({"contract"})
+# _nrt=False: no reference counts. Arrays belong to whoever called the entry point, for as long as it runs; counting
+# every view of them with a locked instruction took nine tenths of the time of a world of 32 agents. So nothing compiled
+# here may allocate (numba says so when it compiles): scratch is an argument.
+_OPTIONS: dict[str, Any] = {"fastmath": set(FAST), "error_model": "numpy", "nogil": True, "_nrt": False}
 
 
 def law(function: F) -> F:
     """Mark a scalar law: branch-free if it can be, inlined into whatever loop calls it, never called on its own."""
     return cast(F, numba.njit(forceinline=True, **_OPTIONS)(function))
+
+
+def unfused(function: F) -> F:
+    """Mark a law that must give the same bits in every loop it is inlined into: no multiply is fused with an add."""
+    return cast(F, numba.njit(forceinline=True, **{**_OPTIONS, "fastmath": False})(function))
 
 
 def kernel(function: F) -> F:
@@ -52,23 +77,65 @@ def like(x: float, constant: float) -> float:
     return type(x)(constant)
 
 
-def _exact(function: F) -> F:
-    return cast(F, numba.njit(forceinline=True, error_model="numpy")(function))
-
-
-@_exact
+@law
 def finite(x: float) -> bool:
-    """Is x a number, neither NaN nor infinite?
-
-    np.isfinite is x - x == 0 inside, which `reassoc` with `nsz` folds to True: in a fast kernel it sees nothing.
-    """
-    return abs(x) < math.inf
+    """Is x a number, neither NaN nor infinite?"""
+    return abs(x) < like(x, math.inf)
 
 
-@overload(like, jit_options={"forceinline": True})
+@overload(like, jit_options={"forceinline": True, **_OPTIONS})
 def _like(x, constant):  # type: ignore[no-untyped-def]  # numba compares signatures, annotations included
     to = types.float32 if x == types.float32 else types.float64
     return lambda x, constant: to(constant)
+
+
+@intrinsic
+def unaliased(typing_context: Any) -> Any:
+    """Promise, at the top of an entry point, that its array arguments do not overlap (C's `restrict`).
+
+    Without it LLVM must assume that a sum it writes may be an input it reads, and keeps both out of registers: a factor
+    of three in a sweep. Whoever calls such an entry point keeps the promise; Scene and World do, by allocating.
+    """
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        for argument in builder.function.args:
+            if isinstance(argument.type, ir.PointerType) and argument.name.startswith("arg."):
+                argument.add_attribute("noalias")
+        return context.get_dummy_value()
+
+    return types.void(), generate
+
+
+@intrinsic
+def _fetch_add(typing_context: Any, array: Any, amount: Any) -> Any:
+    """Add to array[0] in one indivisible step; return what was there before."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        make: Any = arrayobj.make_array
+        place = make(signature.args[0])(context, builder, arguments[0]).data
+        return builder.atomic_rmw("add", place, arguments[1], "seq_cst")
+
+    return types.int64(array, types.int64), generate
+
+
+_PATIENCE = 2000  # rounds of waiting before the core is offered to somebody else
+
+_give_way: Any = numba.njit(lambda: 0)
+if os.name == "posix":
+    _give_way = types.ExternalFunction("sched_yield", types.int32())
+
+
+@kernel
+def wait_for_team(sync: Any, team: int) -> None:
+    """Wait until all `team` threads that work on one world have come here; sync: one int64, 0 at the start."""
+    if team > 1:
+        arrived = _fetch_add(sync, 1) + 1  # type: ignore[call-arg,operator]  # an intrinsic's signature is its typing
+        all_here = (arrived + team - 1) // team * team
+        rounds = 0
+        while _fetch_add(sync, 0) < all_here:  # type: ignore[call-arg,operator]
+            rounds += 1
+            if rounds > _PATIENCE:
+                _give_way()
 
 
 def cache_folder() -> Path:
@@ -150,7 +217,7 @@ from numba import njit
 from {python.__module__} import {python.__name__} as inner
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@njit(cache=True, error_model="numpy", nogil=True, _nrt=False)
 def outer({names}):
     return inner({names})
 '''

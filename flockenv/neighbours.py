@@ -1,8 +1,9 @@
 """Who is near whom: one query per instant, at the largest reach, shared by every law that asks.
 
-A query puts the living agents in order (by cell where that pays, else by index) and answers with contiguous ranges of
-candidates. No neighbour list is ever built: a sweep meets every candidate of a range, and each law keeps those within
-its own radius. Brute force is the query with one range.
+A query sorts the living agents by cell where that pays, and answers with contiguous ranges of sorted candidates. No
+neighbour list is ever built: a sweep meets every candidate of a range, and keeps those in sight. Brute force is the
+query with one range. Several threads may share one query: each counts and places its own agents, and the order that
+results (by cell, then by number) does not depend on how many they are.
 """
 
 from __future__ import annotations
@@ -13,182 +14,229 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from flockenv.kernels import kernel
+from flockenv.kernels import kernel, wait_for_team
+from flockenv.space import torus_confine
 
-__all__ = ["LANES", "MAX_RANGES", "block_end", "candidates", "sort_agents"]
-
-LANES = 16
-"""Agents that a sweep handles side by side."""
+__all__ = ["FEWEST_AGENTS", "MAX_RANGES", "candidates", "count_cells", "grid_of", "place_of", "row_of"]
 
 MAX_RANGES = 27
 """Ranges of one query: 9 rows of cells in 3-D, each in three pieces where it wraps around twice."""
 
-_FEWEST_AGENTS = 96  # below this, sorting costs more than it saves
+FEWEST_AGENTS = 96
+"""Below this, sorting costs more than it saves."""
+
 _MARGIN = 1.001  # cells are this much wider than the reach, so that rounding never hides a neighbour
 
-Ints = NDArray[np.int64]
+Ints = NDArray[np.int32]
 
 
 @kernel
-def _grid(lengths: Any, count: int, reach: float, periodic: bool, shape: Ints) -> bool:
-    """Choose how many cells each axis gets; False if cells would not pay."""
-    dimension = len(lengths)
-    cells = 1.0
-    for k in range(dimension):
-        per_axis = min(max(1.0, math.floor(lengths[k] / (reach * _MARGIN))), 2.0**20)
-        shape[k] = int(per_axis)
-        cells *= per_axis
-    if cells > count:  # no more cells than agents: wider cells are still right
-        shrink = (count / cells) ** (1.0 / dimension)
-        cells = 1.0
-        for k in range(dimension):
-            shape[k] = max(1, int(shape[k] * shrink))
-            cells *= shape[k]
-    while cells > count:  # an axis of one cell could not shrink (a queue of people): the longest gives way for it
-        longest = 0
-        for k in range(1, dimension):
-            longest = k if shape[k] > shape[longest] else longest
-        cells /= shape[longest]
-        shape[longest] = max(1, int(count / cells))
-        cells = round(cells) * float(shape[longest])
-    for k in range(dimension):
-        if periodic and shape[k] < 3:  # a row and its image would be the same row
-            return False
-    for k in range(dimension, 3):
-        shape[k] = 1
-    return bool(cells >= 4 * 3**dimension)
+def place_of(i: int, dimension: int, lanes: int) -> int:
+    """Return where the first coordinate of agent i lies in an array of blocks; the next is `lanes` further."""
+    return (i // lanes) * lanes * dimension + i % lanes
 
 
 @kernel
-def _cell(pos: Any, i: int, low: Any, lengths: Any, periodic: bool, shape: Ints) -> int:
+def _fit(cells: Any, count: int) -> tuple[int, int, int]:
+    """Return cells per axis, at most `count` in all; wider cells are right too."""
+    nx, ny, nz = cells
+    total = float(nx) * float(ny) * float(nz)
+    if total > count:
+        dimension = 1.0 + (1.0 if ny > 1 else 0.0) + (1.0 if nz > 1 else 0.0)
+        shrink = (count / total) ** (1.0 / dimension)
+        nx, ny, nz = max(1, int(nx * shrink)), max(1, int(ny * shrink)), max(1, int(nz * shrink))
+    while nx * ny * nz > count:  # an axis of one cell could not shrink (a queue of people): the longest gives way
+        if nx >= ny and nx >= nz:
+            nx = max(1, count // (ny * nz))
+        elif ny >= nz:
+            ny = max(1, count // (nx * nz))
+        else:
+            nz = max(1, count // (nx * ny))
+    return nx, ny, nz
+
+
+@kernel
+def _along(length: float, reach: float) -> int:
+    return int(min(max(1.0, math.floor(length / (reach * _MARGIN))), 2.0**20))
+
+
+@kernel
+def grid_of(lengths: Any, count: int, reach: float, periodic: bool) -> tuple[int, int, int]:
+    """Choose how many cells each axis gets, at most `count` in all; (0, 0, 0) where brute force is as good."""
+    if len(lengths) == 2:
+        nx, ny, nz = _fit((_along(lengths[0], reach), _along(lengths[1], reach), 1), count)
+        few = periodic and min(nx, ny) < 3  # a row and its image would be the same row
+        return (0, 0, 0) if few or nx * ny < 36 else (nx, ny, 1)
+    else:
+        cells = (_along(lengths[0], reach), _along(lengths[1], reach), _along(lengths[2], reach))
+        nx, ny, nz = _fit(cells, count)
+        few = periodic and min(nx, ny, nz) < 3
+        return (0, 0, 0) if few or nx * ny * nz < 108 else (nx, ny, nz)
+
+
+@kernel
+def _spread(pos: Any, living: Any, first: int, end: int, lanes: int, d: int, k: int, bounds: Any, rank: int) -> None:
+    """Write the least and the greatest coordinate k of this thread's living agents."""
+    low, high = np.inf, -np.inf
+    for b in range(first, end):
+        for lane in range(lanes):
+            x = np.float64(pos[(b * d + k) * lanes + lane])
+            here = living[b * lanes + lane] > 0
+            low = x if here and x < low else low
+            high = x if here and x > high else high
+    bounds[rank, 2 * k], bounds[rank, 2 * k + 1] = low, high
+
+
+@kernel
+def _edge(k: int, team: int, bounds: Any) -> tuple[float, float]:
+    """Return where the agents of all threads begin on an axis, and how far they are spread; (0, 1) if nobody lives."""
+    low, high = np.inf, -np.inf
+    for r in range(team):
+        low, high = min(low, bounds[r, 2 * k]), max(high, bounds[r, 2 * k + 1])
+    return (low, max(high - low, 1e-300)) if low <= high else (0.0, 1.0)
+
+
+@kernel
+def region(
+    pos: Any, living: Any, first: int, end: int, lanes: int, rank: int, team: int, sync: Any, bounds: Any, size: Any,
+    periodic: bool,
+) -> Any:  # fmt: skip
+    """Return the corner and the edges of the region to divide: the box, or where the living agents are.
+
+    Each of a team looks at its own blocks [first, end); bounds (team, 6) is how they tell each other.
+    """
+    d = len(size)
+    if not periodic:
+        for k in range(d):
+            _spread(pos, living, first, end, lanes, d, k, bounds, rank)
+        wait_for_team(sync, team)
+    if len(size) == 2:
+        x, y = _edge(0, team, bounds), _edge(1, team, bounds)
+        if periodic:
+            x, y = (0.0, np.float64(size[0])), (0.0, np.float64(size[1]))
+        return (x[0], y[0]), (x[1], y[1])
+    else:
+        x, y, z = _edge(0, team, bounds), _edge(1, team, bounds), _edge(2, team, bounds)
+        if periodic:
+            x, y, z = (0.0, np.float64(size[0])), (0.0, np.float64(size[1])), (0.0, np.float64(size[2]))
+        return (x[0], y[0], z[0]), (x[1], y[1], z[1])
+
+
+@kernel
+def _cell(
+    pos: Any, at: int, lanes: int, low: Any, lengths: Any, size: Any, periodic: bool, shape: tuple[int, int, int]
+) -> int:
+    if len(lengths) == 2:
+        x: Any = (pos[at], pos[at + lanes])
+    else:
+        x = (pos[at], pos[at + lanes], pos[at + 2 * lanes])
+    if periodic:  # as it is sorted: -1e-17 is 0 there, and with a cell at the other end it would miss its neighbours
+        x, _ = torus_confine(size, size[0], x, x)
     index = 0
     for k in range(len(lengths) - 1, -1, -1):
-        part = (pos[k, i] - low[k]) / lengths[k]
-        if periodic:
-            part -= math.floor(part)
+        part = (np.float64(x[k]) - low[k]) / lengths[k]
         index = index * shape[k] + min(max(int(part * shape[k]), 0), shape[k] - 1)
     return index
 
 
 @kernel
-def sort_agents(
-    pos: Any, alive: Any, reach: float, size: Any, periodic: bool, order: Ints, cell: Ints, start: Ints, shape: Ints
-) -> int:
-    """Write into `order` the living agents, by cell if that pays; return how many there are.
+def count_cells(
+    pos: Any, living: Any, first: int, end: int, lanes: int, rank: int, team: int, sync: Any, bounds: Any, size: Any,
+    reach: float, periodic: bool, capacity: int, cell: Ints, start: Ints, offset: Ints,
+) -> tuple[int, int, int]:  # fmt: skip
+    """Find the cell of every agent, and where in sorted order each cell begins; return the cells per axis.
 
-    pos (D, N) m; order (N,); cell (2N,): of agents in index order, then in sorted order; start (N + 2,): first sorted
-    agent of each cell; shape (3,): cells per axis, shape[0] = 0 for brute force. `size` is the box of a periodic space.
+    pos: blocks of (D, lanes) m; living (agents, padded) 0 or 1; [first, end): this thread's blocks; capacity: most
+    cells. Writes cell (agents, padded), -1 for the dead; start (capacity + 1,): first sorted agent of each cell;
+    offset (team, capacity): where this thread puts its next agent of each cell. Returns zeros for brute force.
     """
-    n = pos.shape[1]
-    count = 0
-    for i in range(n):
-        if alive[i]:
-            order[count] = i
-            count += 1
-    shape[0] = 0
-    if count < _FEWEST_AGENTS:
-        return count
-    low, lengths = _bounds(pos, order[:count], size, periodic)
-    if not _grid(lengths, count, reach, periodic, shape):
-        shape[0] = 0
-        return count
+    low, lengths = region(pos, living, first, end, lanes, rank, team, sync, bounds, size, periodic)
+    shape = grid_of(lengths, capacity, reach, periodic)
     cells = shape[0] * shape[1] * shape[2]
-    for c in range(cells + 1):
-        start[c] = 0
-    for k in range(count):
-        c = _cell(pos, order[k], low, lengths, periodic, shape)
-        cell[k] = c
-        start[c + 1] += 1
+    if cells == 0:
+        return shape
     for c in range(cells):
-        start[c + 1] += start[c]
-    for k in range(count):  # a stable counting sort; `start` ends up shifted by one cell and is put back below
-        c = cell[k]
-        cell[n + start[c]] = k
-        start[c] += 1
-    for c in range(cells, 0, -1):
-        start[c] = start[c - 1]
-    start[0] = 0
-    for k in range(count):  # sorted position -> (agent, its cell)
-        from_ = cell[n + k]
-        cell[n + k] = order[from_] * (cells + 1) + cell[from_]
-    for k in range(count):
-        order[k] = cell[n + k] // (cells + 1)
-        cell[n + k] = cell[n + k] % (cells + 1)
-    return count
+        offset[rank, c] = 0
+    for i in range(first * lanes, end * lanes):
+        c = -1
+        if living[i] > 0:
+            c = _cell(pos, place_of(i, len(size), lanes), lanes, low, lengths, size, periodic, shape)
+        cell[i] = c
+        if c >= 0:
+            offset[rank, c] += 1
+    wait_for_team(sync, team)
+    if rank == 0:
+        total = 0
+        for c in range(cells):
+            start[c] = total
+            for r in range(team):
+                here = offset[r, c]
+                offset[r, c] = total
+                total += here
+        start[cells] = total
+    wait_for_team(sync, team)
+    return shape
 
 
 @kernel
-def _bounds(pos: Any, agents: Ints, size: Any, periodic: bool) -> Any:
-    """Return the corner and the edges of the region to divide: the box, or where the agents are."""
-    low = np.zeros(3)
-    lengths = np.ones(3)
-    for k in range(pos.shape[0]):
-        if periodic:
-            lengths[k] = size[k]
-        else:
-            least, most = pos[k, agents[0]], pos[k, agents[0]]
-            for i in agents:
-                least = min(least, pos[k, i])
-                most = max(most, pos[k, i])
-            low[k] = least
-            lengths[k] = max(most - least, 1e-300)
-    if len(size) == 2:
-        return (low[0], low[1]), (lengths[0], lengths[1])
-    else:
-        return (low[0], low[1], low[2]), (lengths[0], lengths[1], lengths[2])
-
-
-@kernel
-def block_end(first: int, count: int, n: int, cell: Ints, start: Ints, shape: Ints) -> int:
-    """Return where the block of lanes that begins at sorted agent `first` ends: after 16, or with its row of cells."""
-    end = min(first + LANES, count)
-    if shape[0] > 0:
-        row = cell[n + first] // shape[0]
-        end = min(end, start[(row + 1) * shape[0]])
-    return end
+def row_of(first: int, start: Ints, row: int, nx: int) -> int:
+    """Return the row of cells that holds sorted agent `first`, searching from `row` on."""
+    while start[(row + 1) * nx] <= first:
+        row += 1
+    return row
 
 
 @kernel
 def candidates(
-    first: int, end: int, count: int, n: int, cell: Ints, start: Ints, shape: Ints, periodic: bool, ranges: Ints
-) -> int:
-    """Write the ranges [from, to) of sorted agents that may be near the block [first, end); return how many."""
-    if shape[0] == 0:
-        ranges[0, 0], ranges[0, 1] = 0, count
-        return 1
-    nx, ny, nz = shape[0], shape[1], shape[2]
-    row = cell[n + first] // nx
+    first: int, end: int, row: int, at: int, shape: tuple[int, int, int], start: Ints, periodic: bool, ranges: Any
+) -> tuple[int, int]:
+    """Write the ranges (from, to, wrapped) of sorted agents that may be near the block [first, end) of one row.
+
+    `at` is a cell at or before that of `first`, from where the search begins. Returns how many ranges there are, and
+    the cell of `first`. A range is `wrapped` if it lies around the edge of a periodic box.
+    """
+    nx, ny, nz = shape
+    while start[at + 1] <= first:
+        at += 1
+    last = at
+    while start[last + 1] < end:
+        last += 1
+    west, east = at - row * nx - 1, last - row * nx + 1
     y, z = row % ny, row // ny
-    west, east = cell[n + first] % nx - 1, cell[n + end - 1] % nx + 1
     found = 0
     for dz in range(-1 if nz > 1 else 0, 2 if nz > 1 else 1):
         for dy in range(-1, 2):
             yy, zz = y + dy, z + dz
+            around = yy < 0 or yy >= ny or zz < 0 or zz >= nz
             if periodic:
                 yy, zz = (yy + ny) % ny, (zz + nz) % nz
-            elif yy < 0 or yy >= ny or zz < 0 or zz >= nz:
+            elif around:
                 continue
-            found = _row_ranges((zz * ny + yy) * nx, west, east, nx, start, periodic, ranges, found)
-    return found
+            found = _row_ranges((zz * ny + yy) * nx, west, east, nx, start, periodic, around, ranges, found)
+    return found, at
 
 
 @kernel
-def _row_ranges(base: int, west: int, east: int, nx: int, start: Ints, periodic: bool, ranges: Ints, found: int) -> int:
+def _row_ranges(
+    base: int, west: int, east: int, nx: int, start: Ints, periodic: bool, around: bool, ranges: Any, found: int
+) -> int:
     """Add the pieces of one row of cells between west and east."""
-    if not periodic or east - west + 1 >= nx:
-        west, east = (0, nx - 1) if periodic else (max(west, 0), min(east, nx - 1))
+    if not periodic:
+        return _add(start[base + max(west, 0)], start[base + min(east, nx - 1) + 1], False, ranges, found)
+    if east - west + 1 >= nx:
+        return _add(start[base], start[base + nx], True, ranges, found)
     if west < 0:
-        found = _add(start[base + nx + west], start[base + nx], ranges, found)
+        found = _add(start[base + nx + west], start[base + nx], True, ranges, found)
         west = 0
     if east >= nx:
-        found = _add(start[base], start[base + east - nx + 1], ranges, found)
+        found = _add(start[base], start[base + east - nx + 1], True, ranges, found)
         east = nx - 1
-    return _add(start[base + west], start[base + east + 1], ranges, found)
+    return _add(start[base + west], start[base + east + 1], around, ranges, found)
 
 
 @kernel
-def _add(first: int, end: int, ranges: Ints, found: int) -> int:
+def _add(first: int, end: int, wrapped: bool, ranges: Any, found: int) -> int:
     if end > first:
-        ranges[found, 0], ranges[found, 1] = first, end
+        ranges[found, 0], ranges[found, 1], ranges[found, 2] = first, end, 1 if wrapped else 0
         return found + 1
     return found

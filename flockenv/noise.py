@@ -10,15 +10,17 @@ from __future__ import annotations
 import math
 
 import numpy as np
+from numpy.typing import NDArray
 
 from flockenv.kernels import kernel
 
-__all__ = ["key_of", "normal", "uniform"]
+__all__ = ["key_of", "keys_of", "normal", "uniform"]
 
 _GOLDEN = np.uint64(0x9E3779B97F4A7C15)
 _M1 = np.uint64(0xBF58476D1CE4E5B9)
 _M2 = np.uint64(0x94D049BB133111EB)
 _30, _27, _31, _11 = np.uint64(30), np.uint64(27), np.uint64(31), np.uint64(11)
+_START = np.uint64(0x5EED)
 _TO_UNIT = 2.0**-53
 MASK = (1 << 64) - 1
 
@@ -48,7 +50,13 @@ def normal(key: np.uint64, step: int, agent: int, channel: int) -> float:
 
 def key_of(seed: int, episode: int) -> np.uint64:
     """Return the key of a world: plain Python, the same mixing as in the kernels."""
-    return np.uint64(_mix(_mix(0x5EED, seed & MASK), episode & MASK))
+    return np.uint64(_mix(_mix(int(_START), seed & MASK), episode & MASK))
+
+
+def keys_of(seeds: NDArray[np.uint64], episodes: NDArray[np.uint64]) -> NDArray[np.uint64]:
+    """Return the keys of many worlds at once."""
+    plain = mix.py_func  # type: ignore[attr-defined]  # numba's; on arrays, whose whole numbers wrap as in a kernel
+    return np.asarray(plain(plain(_START, seeds), episodes))
 
 
 def _mix(a: int, b: int) -> int:

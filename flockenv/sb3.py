@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NoReturn
 
 import numpy as np
 from gymnasium import Wrapper
@@ -21,9 +21,10 @@ from flockenv.envs.face import (
     begun,
     checked_options,
     checked_seed,
-    metrics_of,
+    named,
     observation_space,
     render_fps,
+    together,
 )
 from flockenv.world import Step, World
 
@@ -37,12 +38,30 @@ __all__ = ["WorldVecEnv", "load_sb3_zip"]
 Info = dict[str, Any]
 
 
+class _Nothing(Info):
+    """The info of a row of which there is nothing to tell: one for all of them, so it cannot be written.
+
+    `info.copy()` gives a dictionary of one's own; pickled or deeply copied it is still this one.
+    """
+
+    def _refuse(self, *args: Any, **kwargs: Any) -> NoReturn:
+        raise TypeError("this info is empty and shared by many rows: write into a copy, info = info.copy()")
+
+    __setitem__ = setdefault = update = __ior__ = _refuse
+
+    def __reduce__(self) -> str:
+        return "NOTHING"
+
+
+NOTHING = _Nothing()
+
+
 class WorldVecEnv(VecEnv):
     """B worlds with L learners each as B * L rows of one shared policy; row i is learner i % L of world i // L.
 
     A world that ended begins anew in the same step. The infos of its rows then hold `terminal_observation`,
     `TimeLimit.truncated` (so that PPO bootstraps time limits and not deaths), `is_success`, `terms` (sums over the
-    episode), and the metrics of the world; all other infos are empty.
+    episode), and the metrics of the world; all other infos are one empty dictionary that refuses to be written.
 
     Seeds: `seed(s)` gives world k the seed s + k at the next reset; a world goes on with the next episodes of its seed.
 
@@ -59,16 +78,10 @@ class WorldVecEnv(VecEnv):
     def __init__(
         self, task: Task, worlds: int = 1, time_limit: int | None = None, render_mode: str | None = None
     ) -> None:
-        if not task.ends_together:
-            raise ValueError(
-                f"{task.name}: its learners leave one by one, and a row of a VecEnv cannot; "
-                "use pettingzoo.make('parallel', ...), or a task in which all learners end together"
-            )
-        self.task = task
+        self.task = together(task)
         self.world = World(task, worlds, time_limit=task.horizon if time_limit is None else time_limit)
         self.render_mode = render_mode
         self._screen = Screen(render_mode, render_fps(task), modes=("rgb_array",))
-        self._sums = np.zeros((worlds, task.learners, len(task.terms)))
         self._actions: NDArray[Any] | None = None
         self._running = False
         super().__init__(worlds * task.learners, observation_space(task), action_space(task))
@@ -90,7 +103,6 @@ class WorldVecEnv(VecEnv):
         self._running = True
         self._reset_seeds()
         self._reset_options()
-        self._sums[:] = 0.0
         return self._rows(observation)
 
     def step_async(self, actions: NDArray[Any]) -> None:
@@ -103,7 +115,7 @@ class WorldVecEnv(VecEnv):
         self._actions = rows.reshape(self.world.worlds, self.task.learners, -1)
 
     def step_wait(self) -> tuple[NDArray[np.float32], NDArray[np.float64], NDArray[np.bool_], list[Info]]:
-        """Act for one control_dt; return observations (B L, O), rewards (B L,), dones (B L,) and a fresh info per row.
+        """Act for one control_dt; return observations (B L, O), rewards (B L,), dones (B L,) and an info per row.
 
         Raises ValueError that names world and agent on NaN.
         """
@@ -111,32 +123,33 @@ class WorldVecEnv(VecEnv):
         if actions is None:
             raise ResetNeeded("step_wait: there are no actions; call step_async(actions) first")
         result = self.world.step(actions)
-        self._sums += result.terms
-        infos: list[Info] = [{} for _ in range(self.num_envs)]
-        observation, ended = result.observation, result.ended
+        ended = result.truncated | result.terminated[:, 0]  # all learners of a world end together
+        infos: list[Info] = [NOTHING] * self.num_envs
         if ended.any():
-            self._tell(infos, result, ended)
-            observation = self.world.reset(mask=ended)
-            self._sums[ended] = 0.0
-        return self._rows(observation), result.reward.reshape(-1), np.repeat(ended, self.task.learners), infos
+            self._tell(infos, result, np.flatnonzero(ended))
+            self.world.reset(mask=ended, into=result.observation)
+        return self._rows(result.observation), result.reward.reshape(-1), np.repeat(ended, self.task.learners), infos
 
-    def _tell(self, infos: list[Info], result: Step, ended: NDArray[np.bool_]) -> None:
+    def _tell(self, infos: list[Info], result: Step, worlds: NDArray[np.intp]) -> None:
         """Write how the episodes that end in this step ended; the only loop over rows."""
-        columns = self.world.measure()
-        for world in np.flatnonzero(ended).tolist():
-            success, truncated = bool(result.success[world]), bool(result.truncated[world])
-            metrics = metrics_of(columns, world)
-            for learner in range(self.task.learners):
-                infos[world * self.task.learners + learner].update(
-                    metrics,
-                    terms=dict(zip(self.task.terms, self._sums[world, learner].tolist(), strict=True)),
-                    is_success=success,
-                    terminal_observation=result.observation[world, learner].copy(),
-                    **{"TimeLimit.truncated": truncated and not bool(result.terminated[world, learner])},
-                )
+        learners, of_world = self.task.learners, self._ends(result, worlds)
+        rows = (worlds[:, None] * learners + np.arange(learners)).ravel().tolist()
+        paid = named(self.task.terms, self.world.paid[worlds].reshape(len(rows), -1))
+        seen = self._rows(result.observation[worlds])
+        for k, (row, terms, last) in enumerate(zip(rows, paid, seen, strict=True)):
+            infos[row] = info = of_world[k // learners].copy()
+            info["terms"], info["terminal_observation"] = terms, last
+
+    def _ends(self, result: Step, worlds: NDArray[np.intp]) -> list[Info]:
+        """Return what all rows of a world are told of its end, for each of these worlds."""
+        columns = {name: column[worlds].tolist() for name, column in self.world.measure().items()}
+        columns["is_success"] = result.success[worlds].tolist()
+        columns["TimeLimit.truncated"] = (result.truncated & ~result.terminated[:, 0])[worlds].tolist()
+        ends = (dict(zip(columns, values, strict=True)) for values in zip(*columns.values(), strict=True))
+        return [{name: value for name, value in end.items() if value == value} for end in ends]  # NaN: no value
 
     def _rows(self, observation: NDArray[np.float32]) -> NDArray[np.float32]:
-        return observation.reshape(self.num_envs, -1)
+        return observation.reshape(-1, self.task.layout.size)
 
     def close(self) -> None:
         """End the episodes and close the window; may be called twice, and reset() begins anew."""

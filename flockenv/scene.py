@@ -20,10 +20,12 @@ from numpy.typing import ArrayLike, NDArray
 from pydantic import Field, WrapValidator, model_validator
 
 from flockenv import state as states
+from flockenv.crew import share, threads
 from flockenv.effects import EFFECTS, Effect
+from flockenv.effects.base import ties
 from flockenv.integrators import INTEGRATORS, Integrator, SemiImplicitEuler
 from flockenv.kernels import entry, load
-from flockenv.neighbours import LANES, MAX_RANGES
+from flockenv.neighbours import FEWEST_AGENTS, MAX_RANGES
 from flockenv.noise import MASK, key_of
 from flockenv.records import Record
 from flockenv.shapes import Circle
@@ -31,9 +33,14 @@ from flockenv.snapshot import Snapshot
 from flockenv.space import AnySpace, Box, Plane, Torus
 from flockenv.spawn import Spawn, scatter
 from flockenv.state import Body, Floats, State
-from flockenv.sweep import Parts, scene_source
+from flockenv.sweep import SHARED, Parts, scene_source
 
 __all__ = ["Group", "Scene", "Workspace"]
+
+WORTH_SHARING = 4096
+"""Agent-steps below which a second thread costs more than it brings: handing work over takes about 20 us."""
+
+SYNC = SHARED.split(", ").index("sync")
 
 MEMORY_LIMIT = 8 * 2**30
 """Bytes that a state and its scratch may take before a scene is refused."""
@@ -81,30 +88,54 @@ class Group(Record):
 
 @dataclass(frozen=True)
 class Workspace:
-    """Scratch of one thread, sized for N agents: what a step writes and nobody reads afterwards."""
+    """Scratch of a team of threads that step one world: what a step writes and nobody reads afterwards."""
 
-    arrays: tuple[NDArray[Any], ...]
+    shared: tuple[NDArray[Any], ...]
+    own: tuple[tuple[NDArray[Any], NDArray[Any]], ...]  # lanes and ranges of each thread
 
     @classmethod
-    def allocate(cls, parts: Parts, agents: int, dtype: Any) -> Workspace:
-        """Return scratch for the sweep, the query and the integrator, in the order in which `step` takes them."""
-        d = parts.dimension
-        sweeps = agents if parts.pairs else 1
-        return cls(
-            (
-                np.zeros(parts.lanes() * LANES, dtype),
-                np.zeros((d, agents), dtype),  # what agents want
-                np.zeros((d, agents), dtype),  # what acts on them
-                np.zeros((d, agents), dtype),  # where they were before the step
-                np.zeros((2 * d + 2, sweeps), dtype),  # positions, velocities, radii, indices, sorted
-                np.zeros(sweeps, np.int64),
-                np.zeros(2 * sweeps, np.int64),
-                np.zeros(sweeps + 2, np.int64),
-                np.zeros(3, np.int64),
-                np.zeros((MAX_RANGES, 2), np.int64),
-                np.zeros((parts.integrator.stages, d, agents), dtype),
-            )
-        )
+    def allocate(cls, parts: Parts, body: Body, team: int = 1) -> Workspace:
+        """Return scratch for the sweep, the query and the integrator, in the order of sweep.SHARED."""
+        d, agents, dtype = parts.dimension, len(body.mass), body.mass.dtype
+        width = parts.width
+        padded = -(-agents // width) * width
+        sorts = parts.sweeps and agents >= FEWEST_AGENTS
+        swept, cells = padded if parts.sweeps else 1, agents if sorts else 1
+        real = {
+            **{name: padded * d for name in ("pos", "vel", "origin")},
+            "stages": (max(parts.integrator.stages, 1), padded * d),
+            **{name: padded for name in ("mass", "radius", "max_speed", "max_force", "living")},
+            "want": padded * d,
+            "tie": padded * d if "t0" in parts.fields else 1,
+            "felt": max(swept * d * len(parts.targets), 1),
+            "sorted_": (parts.rows, swept + width),
+            "records": (padded if sorts else 1, parts.numbers),
+        }
+        arrays = {name: _aligned(shape, dtype) for name, shape in real.items()}
+        whole = {"order": swept, "cell": padded if sorts else 1, "start": cells + 1, "offset": (team, cells)}
+        arrays |= {name: np.zeros(shape, np.int32) for name, shape in whole.items()}
+        arrays |= {"bounds": np.zeros((team, 6)), "tally": np.zeros(team, np.int64), "sync": np.zeros(8, np.int64)}
+        for name, pad in (("mass", 1), ("radius", 0), ("max_speed", 1), ("max_force", 1)):
+            arrays[name][:] = pad
+            arrays[name][:agents] = getattr(body, name)
+        if "t0" in parts.fields:
+            blocks = ties(padded, d).reshape(-1, width, d).transpose(0, 2, 1)
+            arrays["tie"][:] = blocks.reshape(-1)
+        arrays["number"] = np.arange(width, dtype=np.int32)
+        own = tuple((_aligned(len(parts.slots) * width, dtype), np.zeros((MAX_RANGES, 3), np.int64)) for _ in range(team))
+        return cls(tuple(arrays[name] for name in SHARED.split(", ")[:-2]), own)
+
+    def of(self, rank: int) -> tuple[NDArray[Any], ...]:
+        """Return the arrays that one of the team is given."""
+        return (*self.shared, *self.own[rank])
+
+
+def _aligned(shape: int | tuple[int, ...], dtype: Any) -> NDArray[Any]:
+    """Return zeros that begin on a cache line, so that no vector register is loaded from two."""
+    size = int(np.prod(shape)) * np.dtype(dtype).itemsize
+    raw = np.zeros(size + 64, np.uint8)
+    skip = -raw.ctypes.data % 64
+    return raw[skip : skip + size].view(dtype).reshape(shape)
 
 
 class Scene(Record):
@@ -172,12 +203,16 @@ class Scene(Record):
         return tuple(group.role for group in self.groups for _ in range(group.count))
 
     def bytes_per_world(self) -> int:
-        """Memory of a state and its scratch, in bytes, counted before anything is allocated."""
+        """Memory of a state and its scratch, in bytes, counted before anything is allocated (docs/performance.md)."""
         real = 8 if self.dtype == "float64" else 4
-        d = self.dimension
-        reals = 2 * d + 4 + 2 * d + d + self.integrator.stages * d  # state, body, scratch, drive, stages
-        pairs = any(effect.pair_law for effect in self.effects)
-        return self.agents * (reals * real + 1 + ((2 * d + 2) * real + 4 * 8 if pairs else 0))
+        d, parts = self.dimension, self.parts
+        reals = 2 * d + 4  # positions, velocities, bodies
+        reals += 4 * d + max(parts.integrator.stages, 1) * d + 5  # blocks of them, the drive, the stages
+        whole = 1
+        if parts.sweeps:
+            reals += d * (len(parts.targets) + 1) + parts.rows + parts.numbers
+            whole += 4 * 4
+        return self.agents * (reals * real + whole)
 
     @functools.cached_property
     def body(self) -> Body:
@@ -192,7 +227,7 @@ class Scene(Record):
     @functools.cached_property
     def parts(self) -> Parts:
         """What the kernel is made of."""
-        return Parts(self.dimension, self.space, self.effects, self.integrator)
+        return Parts(self.dimension, self.space, self.effects, self.integrator, self.dtype)
 
     @functools.cached_property
     def _params(self) -> Floats:
@@ -244,16 +279,40 @@ class Scene(Record):
             out = state.copy()
         elif out is not state:
             out.copy_from(state)
-        world, agent = self._kernel(
-            out.x, out.v, out.alive, out.tick, out.obstacle_x, out.obstacle_radius, out.work,
-            self._drive(drive, state), *self.body.arrays(), self._params, self._dt, steps, *self._workspace().arrays,
-        )  # fmt: skip
+        world, agent = self._advance(out, self._drive(drive, state), steps)
         if world >= 0:
             raise FloatingPointError(
                 f"world {world}, agent {agent}: position or velocity is not finite at t = {out.time[world]:g} s; "
                 f"dt = {self.dt:g} s may be too large for {self.integrator.kind}"
             )
         return out
+
+    def _advance(self, state: State, drive: Floats, steps: int) -> tuple[int, int]:
+        """Step in place, by as many threads as are in use; return the first (world, agent) not finite, or (-1, -1).
+
+        Threads take worlds apart, or, of a large world, its agents.
+        """
+        worlds, agents, _ = state.shape
+        crew = threads() if worlds * agents * steps >= WORTH_SHARING else 1
+        team = crew if worlds < crew and agents >= WORTH_SHARING else 1
+        crew = crew if team > 1 else min(crew, worlds)
+        arrays = (
+            state.x, state.v, state.alive, state.tick, state.obstacle_x, state.obstacle_radius, state.work, drive,
+            self._params, self._dt, steps,
+        )  # fmt: skip
+        if crew == 1:
+            return self._kernel(*arrays, 0, worlds, 0, 1, *self._workspaces(1, 1)[0].of(0))  # type: ignore[no-any-return]
+        spaces = self._workspaces(crew // team, team)
+        spaces[0].shared[SYNC][:] = 0
+        found = share([
+            functools.partial(
+                self._kernel, *arrays, *((0, worlds) if team > 1 else (worlds * k // crew, worlds * (k + 1) // crew)),
+                k % team, team, *spaces[k // team].of(k % team),
+            )
+            for k in range(crew)
+        ])  # fmt: skip
+        bad = [(world, agent) for world, agent in found if world >= 0]
+        return min(bad, default=(-1, -1))
 
     def _check(self, state: State, steps: int) -> None:
         """Refuse what the kernel would not notice: it trusts the sizes of its arrays."""
@@ -271,7 +330,7 @@ class Scene(Record):
 
     def _drive(self, drive: ArrayLike | None, state: State) -> Floats:
         if drive is None:
-            return np.zeros_like(state.x)
+            return np.zeros((self.dimension, 0, 0), self.dtype)
         given = np.asarray(drive, self.dtype)
         if given.shape != state.shape:
             raise ValueError(f"drive has shape {given.shape}, but the state has (B, N, D) = {state.shape}")
@@ -288,11 +347,12 @@ class Scene(Record):
     def _kernel(self) -> Any:
         return load("scene", scene_source(self.parts)).step
 
-    def _workspace(self) -> Workspace:
-        """Return this thread's scratch: two threads may step one scene at the same time."""
-        found: Workspace | None = getattr(self._threads, "workspace", None)
-        if found is None:
-            found = self._threads.workspace = Workspace.allocate(self.parts, self.agents, self.dtype)
+    def _workspaces(self, count: int, team: int) -> list[Workspace]:
+        """Return scratch of this thread's own: two threads may step one scene at the same time."""
+        kept: dict[int, list[Workspace]] = vars(self._threads).setdefault("workspaces", {})
+        found = kept.setdefault(team, [])
+        while len(found) < count:
+            found.append(Workspace.allocate(self.parts, self.body, team))
         return found
 
     @functools.cached_property

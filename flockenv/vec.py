@@ -10,12 +10,13 @@ import math
 
 import numpy as np
 
-from flockenv.kernels import Vec, law, like
+from flockenv.kernels import Vec, law, like, unfused
 
 __all__ = [
     "add",
     "axis",
     "dot",
+    "exact_dot",
     "lateral",
     "limit",
     "norm",
@@ -101,6 +102,15 @@ def planar(a: Vec, x: float, y: float) -> Vec:
         return (x, y)
     else:
         return (x, y, like(x, 0.0))
+
+
+@unfused
+def exact_dot(a: Vec, b: Vec) -> float:
+    """Return a . b, each operation rounded: the same number wherever it is computed, to compare distances by."""
+    if len(a) == 2:
+        return a[0] * b[0] + a[1] * b[1]
+    else:
+        return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
 @law

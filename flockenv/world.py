@@ -3,30 +3,38 @@
 from __future__ import annotations
 
 import copy
+import functools
+import math
 import secrets
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, Final, NamedTuple, NoReturn
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from flockenv import state as states
+from flockenv.crew import share, threads
 from flockenv.kernels import load
-from flockenv.noise import MASK, key_of
-from flockenv.scene import MEMORY_LIMIT, Workspace
+from flockenv.noise import MASK, keys_of
+from flockenv.recycle import Recycler
+from flockenv.scene import MEMORY_LIMIT, WORTH_SHARING, Workspace
 from flockenv.snapshot import Snapshot
 from flockenv.state import State
+from flockenv.sweep import Look
 from flockenv.tasks import Task
-from flockenv.tasks.base import task_source
+from flockenv.tasks.base import REFUSED, task_source
 
 __all__ = ["Step", "World"]
 
 Rows = NDArray[np.float32]
 
+RECYCLE = 2**18
+"""Bytes of observations from which on the memory of results is used again; below, new memory costs less."""
 
-@dataclass(frozen=True, eq=False)
-class Step:
+_NEVER = 2**63 - 1
+
+
+class Step(NamedTuple):
     """What one decision brought; every array is fresh, nobody else holds it. B worlds, L learners."""
 
     observation: Rows  # (B, L, O)
@@ -64,35 +72,65 @@ class World:
         self.task, self.worlds, self.time_limit = task, int(worlds), time_limit
         self.learners, self.agents = task.learners, scene.agents
         self.observation_size, self.action_size = task.layout.size, task.action_layout.size
-        self.state = states.blank(self.worlds, self.agents, scene.dimension, task.obstacle_slots, scene.dt, scene.dtype)
-        self.steps = np.zeros(self.worlds, np.int64)
-        self._memory = np.zeros((task.memory, self.worlds, self.agents))
-        self._seeds: list[int] | None = None
-        self._episodes = np.zeros(self.worlds, np.int64)
-        self._success = np.zeros(self.worlds, np.bool_)
-        self._sums = np.zeros((self.worlds, len(task.measures)))
-        self._last = np.zeros((self.worlds, len(task.measures)))
+        # The kernel is handed these arrays once and for all: write into them, never put others in their place.
+        self.state: Final = states.blank(
+            self.worlds, self.agents, scene.dimension, task.obstacle_slots, scene.dt, scene.dtype
+        )
+        self.steps: Final = np.zeros(self.worlds, np.int64)
+        self.paid: Final = np.zeros((self.worlds, self.learners, len(task.terms)))  # terms, summed over the episode
+        self._memory: Final = np.zeros((task.memory, self.worlds, self.agents), scene.dtype)
+        self._sums: Final = np.zeros((self.worlds, len(task.measures)))
+        self._last: Final = np.zeros((self.worlds, len(task.measures)))
+        self._seeds: NDArray[np.uint64] | None = None
+        self._episodes = np.zeros(self.worlds, np.uint64)
         self._prepare()
 
     def _prepare(self) -> None:
-        """Make what follows from the task: kernel, parameters, scratch."""
-        scene, task = self.task.scene, self.task
+        """Make what follows from the task: kernel, scratch, and what every step is given."""
+        scene, task, s = self.task.scene, self.task, self.state
         self._kernel = load(f"task_{task.name}", task_source(task))
-        self._numbers = np.array(list(task.parameters().values()), np.float64)
-        self._params = np.array(scene.parts.parameters(), scene.dtype)
-        self._body = scene.body.arrays()
-        self._dt = np.dtype(scene.dtype).type(scene.dt)
-        d, n = scene.dimension, self.agents
-        self._scratch = (
-            *(np.zeros((d, n), scene.dtype) for _ in range(3)),
-            np.zeros(n, np.bool_),
+        b, i, real = self.worlds, self.learners, scene.dtype
+        self._actions = np.zeros((b, i, self.action_size))
+        numbers = (task.parts.parameters(), list(task.parameters().values()), task.table() or (0.0,))
+        self._worlds = (
+            s.x, s.v, s.alive, s.tick, s.obstacle_x, s.obstacle_radius, s.work, s.key, self._memory, self.steps,
+            *(np.array(values, real) for values in numbers),
+        )  # fmt: skip
+        self._clock = (np.dtype(real).type(scene.dt), task.substeps, not task.ends_together)
+        self._scratch = [self._allocate()]
+        self._kept = (self._last, self._sums, self.paid)
+        self._measured = [dict(zip(task.measures, a.T, strict=True)) for a in (self._sums, self._last)]
+        fields = (
+            ((b, i, self.observation_size), np.float32), ((b, i), float), ((b, i, len(task.terms)), float),
+            ((b, i), bool), ((b,), bool), ((b,), bool), ((b, i), bool),
+        )  # fmt: skip
+        self._shapes = tuple(shape for shape, _ in fields)  # of a Step
+        self._dtypes = tuple(np.dtype(kind) for _, kind in fields)
+        large = 4 * math.prod(self._shapes[0]) >= RECYCLE
+        self._empty = Recycler().empty if large else np.empty
+
+    def _allocate(self) -> tuple[tuple[NDArray[Any], ...], tuple[NDArray[Any], ...]]:
+        """Return the scratch of one thread: of a decision, and of looking around and stepping."""
+        task, scene, n = self.task, self.task.scene, self.agents
+        d, real, look = scene.dimension, scene.dtype, task.look or Look(0.0)
+        padded = -(-n // task.parts.width) * task.parts.width
+        decision = (
+            np.zeros((d, 1, n), real), np.zeros((d, n), real), np.zeros((d, n), real), np.zeros(n, np.bool_),
             np.zeros((self.learners, self.action_size)),
-            *Workspace.allocate(scene.parts, n, scene.dtype).arrays,
-        )
+        )  # fmt: skip
+        near = [
+            np.zeros(shape, kind)
+            for many in (look.agents, look.obstacles)
+            for shape, kind in (((many, padded), real), ((many, padded), np.int32), ((padded,), np.int32))
+        ]
+        return decision, (*near, *Workspace.allocate(task.parts, scene.body).of(0))
 
     def __getstate__(self) -> dict[str, Any]:
         """Pickle what cannot be made anew."""
-        made = ("_kernel", "_numbers", "_params", "_body", "_dt", "_scratch")
+        made = (
+            "_kernel", "_actions", "_worlds", "_clock", "_scratch", "_kept", "_measured", "_shapes", "_dtypes",
+            "_empty",
+        )  # fmt: skip
         return {name: value for name, value in vars(self).items() if name not in made}
 
     def __setstate__(self, kept: dict[str, Any]) -> None:
@@ -108,41 +146,40 @@ class World:
 
     # --- episodes ---------------------------------------------------------------------------------------------------
 
-    def reset(self, seeds: int | Sequence[int] | None = None, mask: ArrayLike | None = None) -> Rows:
+    def reset(
+        self, seeds: int | Sequence[int] | None = None, mask: ArrayLike | None = None, into: Rows | None = None
+    ) -> Rows:
         """Begin episodes and return observations (B, L, O).
 
         seeds: an int s gives world k the seed s + k; a sequence gives each its own; none begins the next episode of the
         same seeds (a first one without seeds draws them from the system). mask (B,): only these worlds begin anew.
+        into: the observations of the step before, in which the worlds that begin are to be written; none = a new array.
         """
         rows = np.ones(self.worlds, np.bool_) if mask is None else np.asarray(mask)
         if rows.shape != (self.worlds,) or rows.dtype != np.bool_:
             raise ValueError(f"mask has shape {rows.shape} and type {rows.dtype}, expected ({self.worlds},) bool")
         if self._seeds is None and not rows.all():
             raise RuntimeError("the first reset must begin every world: no mask yet")
+        if into is not None and (into.shape, into.dtype) != (self._shapes[0], self._dtypes[0]):
+            raise ValueError(f"into has shape {into.shape} and type {into.dtype}, expected {self._shapes[0]} float32")
         self._seed(seeds, rows)
-        observation = np.empty((self.worlds, self.learners, self.observation_size), np.float32)
-        s = self.state
-        self._kernel.begin(
-            rows, s.x, s.v, s.alive, s.tick, s.obstacle_x, s.obstacle_radius, s.key, self._memory, self.steps,
-            *self._body[1:], self._numbers, observation,
-        )  # fmt: skip
-        for numbers in (self._sums, self._last, self._success):
+        observation: Rows = self._empty(self._shapes[0], self._dtypes[0]) if into is None else into
+        self._kernel.begin(rows, into is None, *self._worlds, *self._scratch[0][1], observation)
+        for numbers in (self._sums, self._last, self.paid):
             numbers[rows] = 0
         return observation
 
     def _seed(self, seeds: int | Sequence[int] | None, rows: NDArray[np.bool_]) -> None:
         if seeds is None and self._seeds is None:
             seeds = secrets.randbits(31)
-        if seeds is None:
-            self._episodes[rows] += 1
-        else:
-            given = self._checked(seeds)
-            old = self._seeds or given
-            self._seeds = [g if r else o for g, o, r in zip(given, old, rows, strict=True)]
+        if seeds is not None:
+            given = np.array(self._checked(seeds), np.uint64)
+            self._seeds = given if self._seeds is None else np.where(rows, given, self._seeds)
             self._episodes[rows] = 0
+        else:
+            self._episodes[rows] += np.uint64(1)
         assert self._seeds is not None
-        for b in np.flatnonzero(rows):
-            self.state.key[b] = key_of(self._seeds[b], int(self._episodes[b]))
+        self.state.key[rows] = keys_of(self._seeds[rows], self._episodes[rows])
 
     def _checked(self, seeds: int | Sequence[int]) -> list[int]:
         """Return one seed per world, or refuse."""
@@ -159,53 +196,77 @@ class World:
     @property
     def seeds(self) -> tuple[int, ...]:
         """The seed of each world; empty before the first reset."""
-        return tuple(self._seeds or ())
+        return () if self._seeds is None else tuple(self._seeds.tolist())
 
     def step(self, actions: ArrayLike) -> Step:
         """Let everybody act for control_dt; actions (B, L, A), clipped to [-1, 1]."""
         if self._seeds is None:
             raise RuntimeError("step before the first reset: call reset() first")
-        given = self._actions(actions)
-        b, n, s, task = self.worlds, self.learners, self.state, self.task
-        observation = np.empty((b, n, self.observation_size), np.float32)
-        terms = np.empty((b, n, len(task.terms)))
-        over = np.zeros((b, n), np.bool_)
-        success = np.zeros(b, np.bool_)
-        broken, who = self._kernel.advance_worlds(
-            given, s.x, s.v, s.alive, s.tick, s.obstacle_x, s.obstacle_radius, s.work, s.key, self._memory, self.steps,
-            *self._body, self._params, self._dt, task.substeps, self._numbers, not task.ends_together,
-            observation, terms, over, success, self._last, *self._scratch,
-        )  # fmt: skip
-        if broken >= 0:
-            raise FloatingPointError(f"world {broken}, agent {who}: not finite at t = {s.time[broken]:g} s")
-        self._sums += self._last
-        self._success = success
-        late = self.steps >= self.time_limit if self.time_limit is not None else np.zeros(b, np.bool_)
-        return Step(observation, terms.sum(axis=2), terms, over, late, success.copy(), s.alive[:, :n].copy())
+        self._take(actions)
+        step = Step(*map(self._empty, self._shapes, self._dtypes))
+        limit = _NEVER if self.time_limit is None else min(int(self.time_limit), _NEVER)
+        world, who = self._decide(limit, step)
+        if world == REFUSED:
+            self._refuse()
+        if world >= 0:
+            raise FloatingPointError(f"world {world}, agent {who}: not finite at t = {self.state.time[world]:g} s")
+        return step
 
-    def _actions(self, actions: ArrayLike) -> NDArray[Any]:
+    def _decide(self, limit: int, step: Step) -> tuple[int, int]:
+        """Let all worlds take one decision, by several threads if that pays; return who is not finite, or (-1, -1)."""
+        crew = min(threads(), self.worlds) if self.worlds * self.agents * self.task.substeps >= WORTH_SHARING else 1
+        while len(self._scratch) < crew:
+            self._scratch.append(self._allocate())
+
+        def part(k: int) -> tuple[int, int]:
+            own = (crew == 1, self.worlds * k // crew, self.worlds * (k + 1) // crew)
+            decision, rest = self._scratch[k]
+            return self._kernel.decide(  # type: ignore[no-any-return]
+                *own, self._actions, *self._worlds, *self._clock, limit, *decision, *rest, *self._kept, *step
+            )
+
+        if crew == 1:
+            return part(0)
+        if not np.isfinite(self._actions).all():  # nobody moves before all were looked at
+            return REFUSED, 0
+        bad = [found for found in share([functools.partial(part, k) for k in range(crew)]) if found[0] >= 0]
+        return min(bad, default=(-1, -1))
+
+    def _take(self, actions: ArrayLike) -> None:
+        """Copy the actions to where the kernel reads them: one type, one compilation; exact for float32."""
         given = np.asarray(actions)
-        expected = (self.worlds, self.learners, self.action_size)
-        if given.shape != expected:
-            raise ValueError(f"actions have shape {given.shape}, expected (worlds, learners, numbers) = {expected}")
+        if given.shape != self._actions.shape:
+            expected = f"(worlds, learners, numbers) = {self._actions.shape}"
+            raise ValueError(f"actions have shape {given.shape}, expected {expected}")
         try:
-            given = np.ascontiguousarray(given, np.float64)  # one type, one compilation; exact for float32
+            self._actions[...] = given
         except (TypeError, ValueError):
             raise TypeError(f"actions are of type {given.dtype}, expected numbers in [-1, 1]") from None
-        b, i, k = self._kernel.first_bad(given)
-        if b >= 0:
-            name = self.task.agent_names[i]
-            raise ValueError(f"action {k} of {name} in world {b} is {given[b, i, k]}, must be a number in [-1, 1]")
-        return given
+
+    def _refuse(self) -> NoReturn:
+        """Say which of the actions taken is no number."""
+        b, i, k = np.argwhere(~np.isfinite(self._actions))[0]
+        name, value = self.task.agent_names[i], self._actions[b, i, k]
+        raise ValueError(f"action {k} of {name} in world {b} is {value}, must be a number in [-1, 1]")
 
     # --- looking at it ----------------------------------------------------------------------------------------------
 
     def measure(self) -> dict[str, NDArray[np.float64]]:
         """Domain metrics of the episodes so far, each (B,), by name."""
-        names = self.task.measures
-        sums = {name: self._sums[:, k].copy() for k, name in enumerate(names)}
-        last = {name: self._last[:, k].copy() for k, name in enumerate(names)}
-        return {k: np.asarray(v, float) for k, v in self.task.metrics(sums, last, self.steps).items()}
+        return {name: np.array(column, float) for name, column in self._metrics().items()}
+
+    def metrics(self, world: int = 0) -> dict[str, float]:
+        """Domain metrics of one world's episode so far, by name; what has no value yet is left out.
+
+        NaN would not do: two equal infos would then differ.
+        """
+        values = {name: float(column[world]) for name, column in self._metrics().items()}
+        return {name: value for name, value in values.items() if value == value}
+
+    def _metrics(self) -> dict[str, NDArray[np.float64]]:
+        """Return metrics by name, each (B,), which may be views of what is still counted."""
+        sums, last = self._measured
+        return self.task.metrics(sums, last, self.steps)
 
     def snapshot(self, world: int = 0) -> Snapshot:
         """Return one world at this instant, for pictures."""

@@ -56,17 +56,20 @@ def through_gymnasium(env_id, parameters, actions):
 
 
 def through_vector(env_id, parameters, actions):
-    envs = gymnasium.make_vec(env_id, 3, max_episode_steps=LIMIT, **parameters)
-    log = [envs.reset(seed=SEED - 1)[0][1].tobytes()]
+    learners = actions.shape[1]
+    envs = gymnasium.make_vec(env_id, 3 * learners, max_episode_steps=LIMIT, **parameters)
+    mine = range(learners, 2 * learners)
+    first = envs.reset(seed=SEED - 1)[0]
+    logs = [[first[k].tobytes()] for k in mine]
     for action in actions:
-        rows = np.stack([-action[0], action[0], action[0] / 2])
-        observation, reward, terminated, truncated, info = envs.step(rows)
-        ended = terminated[1] or truncated[1]
-        last = info["final_obs"][1] if ended else observation[1]
-        log.append(record(last, reward[1], terminated[1], truncated[1]))
-        if ended:
-            log.append(observation[1].tobytes())
-    return [log]
+        observation, reward, terminated, truncated, info = envs.step(np.concatenate([-action, action, action / 2]))
+        for k, log in zip(mine, logs, strict=True):
+            ended = terminated[k] or truncated[k]
+            last = info["final_obs"][k] if ended else observation[k]
+            log.append(record(last, reward[k], terminated[k], truncated[k]))
+            if ended:
+                log.append(observation[k].tobytes())
+    return logs
 
 
 def through_sb3(task, actions):
@@ -139,6 +142,7 @@ def test_many_learners_through_every_face_that_takes_them():
     parameters, actions = {"agents": 7, "learners": 5}, sequence(task)
     expected = through_world(task, actions)
     assert through_sb3(task, actions) == expected
+    assert through_vector("flockenv/Flock-v0", parameters, actions) == expected
     assert through_parallel("flockenv/Flock-v0", parameters, actions) == expected
     assert through_turns("flockenv/Flock-v0", parameters, actions) == expected
 

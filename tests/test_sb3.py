@@ -2,7 +2,9 @@
 
 import base64
 import copy
+import itertools
 import json
+import operator
 import pickle
 import zipfile
 from pathlib import Path
@@ -21,7 +23,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecCheckNan, VecMonito
 
 from agents import reynolds
 from flockenv.envs.registration import SINGLE
-from flockenv.sb3 import WorldVecEnv, load_sb3_zip
+from flockenv.sb3 import NOTHING, WorldVecEnv, load_sb3_zip
 from flockenv.tasks import TASKS, Flock, Pursuit
 from flockenv.world import World
 
@@ -155,19 +157,56 @@ def test_an_end_at_the_time_limit_is_a_death_if_it_is_one():
     assert [info["is_success"] for info in infos] == [True, True]
 
 
-def test_infos_are_never_shared():
+def test_infos_that_tell_something_are_never_shared():
     env = flock()
     env.seed(0)
     env.reset()
     seen = [env.step(row)[3] for row in rows(env, 25)]
-    dicts = [info for infos in seen for info in infos]
+    dicts = [info for infos in seen for info in infos if info]
     assert len({id(info) for info in dicts}) == len(dicts)
     assert len({id(infos) for infos in seen}) == len(seen)
+    last = [info["terminal_observation"] for info in dicts]
+    assert not any(np.shares_memory(a, b) for a, b in itertools.pairwise(last))
     terms = [info["terms"] for info in dicts if info]
     assert len({id(term) for term in terms}) == len(terms) == 2 * env.num_envs
 
 
-def test_no_buffer_is_shared():
+WRITES = {
+    "[]": lambda info: info.__setitem__("episode", 1),
+    "update": lambda info: info.update(episode=1),
+    "setdefault": lambda info: info.setdefault("episode", 1),
+    "|=": lambda info: operator.ior(info, {"episode": 1}),
+}
+
+
+@pytest.mark.parametrize("write", WRITES.values(), ids=WRITES)
+def test_the_empty_info_is_one_and_cannot_be_written(write):
+    env = flock()
+    env.reset()
+    infos = env.step(rows(env, 1)[0])[3]
+    assert len(infos) == 12
+    assert len({id(info) for info in infos}) == 1
+    with pytest.raises(TypeError, match=r"^[^\n]*info\.copy\(\)[^\n]*$"):
+        write(infos[3])
+    assert isinstance(infos[3], dict)
+    assert infos[3] == {}
+    assert infos[3].get("episode") is None
+    assert json.dumps(infos[3]) == "{}"
+
+
+def test_copies_of_the_empty_info():
+    own = NOTHING.copy()
+    assert type(own) is dict
+    own["episode"] = 1
+    assert type({**NOTHING}) is type(NOTHING | {}) is type(dict(NOTHING)) is dict
+    # A deep copy of a list of infos would otherwise be full of one dictionary that can be written.
+    assert copy.deepcopy([NOTHING] * 2)[1] is copy.copy(NOTHING) is pickle.loads(pickle.dumps(NOTHING)) is NOTHING
+    assert NOTHING == {}
+
+
+@pytest.mark.parametrize("recycle", [0, 2**62], ids=["recycled", "fresh"])
+def test_no_buffer_is_shared(monkeypatch, recycle):
+    monkeypatch.setattr("flockenv.world.RECYCLE", recycle)
     env = flock()
     env.seed(0)
     kept = [env.reset()]

@@ -14,6 +14,7 @@ import pytest
 
 import flockenv
 from flockenv.tasks import TASKS, Flock, Obstacles, Pursuit, Task
+from flockenv.tasks.base import NEAR
 from flockenv.world import Step, World
 from tests.catalogue import TASKS as ROWS
 from tests.catalogue import TaskRow
@@ -164,7 +165,9 @@ def frame(world: World) -> list[Any]:
     s, scene = world.state, world.task.scene
     arrays = [s.x[:, 0], s.v[:, 0], s.alive[0], s.obstacle_x[:, 0], s.obstacle_radius[0], world._memory[:, 0]]
     body = [scene.body.radius, scene.body.max_speed, scene.body.max_force]
-    return [*(a.copy() for a in arrays), int(s.key[0]), int(world.steps[0]), *body]
+    near = [array.copy() for array in world._scratch[0][1][: len(NEAR.split(", "))]]  # of the last world looked at
+    table = np.array(world.task.table())
+    return [*(a.copy() for a in arrays), int(s.key[0]), int(world.steps[0]), *body, *near, table]
 
 
 def test_reward_and_observation_touch_nothing(tmp_path: Path) -> None:

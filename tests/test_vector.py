@@ -13,7 +13,8 @@ from gymnasium.vector import AutoresetMode
 from gymnasium.wrappers.vector import DictInfoToList, RecordEpisodeStatistics
 
 from flockenv.envs.registration import HORIZONS, SINGLE
-from flockenv.tasks import Pursuit
+from flockenv.tasks import Flock, Pursuit
+from flockenv.world import World
 
 MODES = list(AutoresetMode)
 EASY = {
@@ -157,7 +158,9 @@ def test_gymnasium_s_wrappers_work_on_it(mode):
     assert seen == [10] * 9
 
 
-def test_no_buffer_is_shared():
+@pytest.mark.parametrize("recycle", [0, 2**62], ids=["recycled", "fresh"])
+def test_no_buffer_is_shared(monkeypatch, recycle):
+    monkeypatch.setattr("flockenv.world.RECYCLE", recycle)
     envs = gymnasium.make_vec("flockenv/Obstacles-v0", 4, max_episode_steps=7)
     kept = [envs.reset(seed=0)[0]]
     copies = [kept[0].copy()]
@@ -184,6 +187,155 @@ def test_a_copy_goes_on_as_the_original_would(clone):
     twin = clone(envs)
     for row in actions[13:]:
         assert data_equivalence(envs.step(row), twin.step(row), exact=True)
+
+
+# --- several learners in each world -----------------------------------------------------------------------------------
+
+
+def crowd(worlds=3, learners=4, **options):
+    return gymnasium.make_vec("flockenv/Flock-v0", worlds * learners, agents=5, learners=learners, **options)
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_rows_are_learners_of_worlds(mode):
+    """Everything that is told of row i is what a World says of learner i % L of world i // L, over several episodes."""
+    envs, world = crowd(max_episode_steps=12, autoreset_mode=mode), World(Flock(agents=5, learners=4), 3, time_limit=12)
+    assert envs.num_envs == 12
+    np.testing.assert_array_equal(envs.reset(seed=9)[0], world.reset(9).reshape(12, -1))
+    # Worlds that end one after another.
+    world.steps[:] = envs.world.steps[:] = [0, 5, 9]
+    resting, ends = np.zeros(3, bool), 0
+    for row in rows(envs, 40):
+        observation, reward, terminated, truncated, info = envs.step(row)
+        step = world.step(np.where(np.repeat(resting, 4)[:, None], 0, row).reshape(3, 4, -1))
+        ended = step.truncated & ~resting
+        told, keys = world.measure(), ("terms", "is_success", *world.task.metric_names)
+        last = step.observation.copy()
+        ends += ended.sum()
+        anew = ended if mode is AutoresetMode.SAME_STEP else resting
+        if anew.any():
+            world.reset(mask=anew, into=step.observation)
+        np.testing.assert_array_equal(observation, step.observation.reshape(12, -1))
+        np.testing.assert_array_equal(reward, np.where(resting[:, None], 0, step.reward).reshape(12))
+        np.testing.assert_array_equal(truncated, np.repeat(ended, 4))
+        assert not terminated.any()
+        if mode is AutoresetMode.SAME_STEP and ended.any():
+            check_rows(info["final_info"], keys, step, told, ended)
+            np.testing.assert_array_equal(info["_final_obs"], np.repeat(ended, 4))
+            for k in range(12):
+                if ended[k // 4]:
+                    np.testing.assert_array_equal(info["final_obs"][k], last[k // 4, k % 4])
+                else:
+                    assert info["final_obs"][k] is None
+        check_rows(info, keys, step, told, ~anew)
+        np.testing.assert_array_equal(info.get("_seed", np.zeros(12)), np.repeat(anew, 4))
+        if anew.any():
+            np.testing.assert_array_equal(info["seed"], np.repeat(np.where(anew, [9, 10, 11], 0), 4))
+        resting = ended if mode is AutoresetMode.NEXT_STEP else np.zeros(3, bool)
+        if mode is AutoresetMode.DISABLED and ended.any():
+            seen, info = envs.reset(options={"reset_mask": np.repeat(ended, 4)})
+            np.testing.assert_array_equal(seen, world.reset(mask=ended).reshape(12, -1))
+            np.testing.assert_array_equal(info["seed"], np.repeat(np.where(ended, [9, 10, 11], 0), 4))
+    assert ends >= 8
+
+
+def check_rows(info, keys, step, told, worlds):
+    """These worlds are told of as the step and the metrics have it, and the others with zeros."""
+    here = np.repeat(worlds, 4)
+    assert [key for key in keys if key in info] == (list(keys) if worlds.any() else [])
+    for key in keys if worlds.any() else ():
+        np.testing.assert_array_equal(info[f"_{key}"], here)
+        if key == "terms":
+            for j, name in enumerate(Flock.terms):
+                np.testing.assert_array_equal(info[key][name], np.where(here, step.terms[..., j].reshape(12), 0))
+                np.testing.assert_array_equal(info[key][f"_{name}"], here)
+        else:
+            column = step.success if key == "is_success" else told[key]
+            np.testing.assert_array_equal(info[key], np.where(here, np.repeat(column, 4), 0))
+
+
+def test_a_capture_ends_all_rows_of_its_world():
+    envs = gymnasium.make_vec("flockenv/Pursuit-v0", 16, pursuers=2, capture_distance=3.0)
+    envs.reset(seed=0)
+    ends = 0
+    for row in rows(envs, 60):
+        _, _, terminated, _, info = envs.step(row)
+        pairs = terminated.reshape(8, 2)
+        np.testing.assert_array_equal(pairs[:, 0], pairs[:, 1])
+        if terminated.any():
+            np.testing.assert_array_equal(info["final_info"]["is_success"], terminated)
+            ends += 1
+    assert ends
+
+
+def test_numbers_of_rows_that_do_not_fill_worlds_are_refused():
+    for count, said in ((100, "96 or 128"), (5, "the nearest: 32$"), (33, "32 or 64"), (-5, "the nearest: 32$")):
+        with pytest.raises(ValueError, match=rf"^num_envs: {count} rows [^\n]*{said}"):
+            gymnasium.make_vec("flockenv/Flock-v0", count, agents=32, learners=32)
+    for count in (0, -32, 2.5, "many"):
+        with pytest.raises(ValueError, match=r"^worlds is [^\n]*$"):
+            gymnasium.make_vec("flockenv/Flock-v0", count, agents=32, learners=32)
+    assert gymnasium.make_vec("flockenv/Flock-v0", 64, agents=32, learners=32).world.worlds == 2
+
+
+def test_learners_that_leave_one_by_one_are_sent_elsewhere():
+    with pytest.raises(ValueError, match=r"^[^\n]*pettingzoo[^\n]*$"):
+        gymnasium.make_vec("flockenv/Pursuit-v0", 5, pursuers=3, evaders=2, sides="both")
+
+
+def test_rows_of_one_world_share_its_seed():
+    envs = crowd()
+    first, info = envs.reset(seed=5)
+    np.testing.assert_array_equal(info["seed"], np.repeat([5, 6, 7], 4))
+    again, _ = envs.reset(seed=[5] * 4 + [6] * 4 + [7] * 4)
+    np.testing.assert_array_equal(again, first)
+    second, _ = envs.reset()
+    envs.reset(seed=5)
+    mixed, _ = envs.reset(seed=[None] * 4 + [6] * 4 + [None] * 4)
+    np.testing.assert_array_equal(mixed[[*range(4), *range(8, 12)]], second[[*range(4), *range(8, 12)]])
+    np.testing.assert_array_equal(mixed[4:8], first[4:8])
+    for seeds in ([5] * 4 + [6, 6, 7, 6] + [7] * 4, [5] * 4 + [6, 6, None, 6] + [7] * 4):
+        with pytest.raises(ValueError, match=r"^seed: rows 4 and 6 are one world, number 1, and must agree$"):
+            envs.reset(seed=seeds)
+    with pytest.raises(ValueError, match="3 seeds for 12 rows"):
+        envs.reset(seed=[5, 6, 7])
+
+
+def test_rows_of_one_world_begin_together_or_not_at_all():
+    envs = crowd(autoreset_mode=AutoresetMode.DISABLED)
+    envs.reset(seed=5)
+    kept = envs.step(rows(envs, 1)[0])[0]
+    mask = np.repeat([False, True, False], 4)
+    seen, info = envs.reset(options={"reset_mask": mask})
+    np.testing.assert_array_equal(seen[~mask], kept[~mask])
+    assert not np.array_equal(seen[mask], kept[mask])
+    np.testing.assert_array_equal(info["_seed"], mask)
+    mask[11] = True
+    with pytest.raises(ValueError, match=r"^options\['reset_mask'\]: rows 8 and 11 are one world, number 2[^\n]*$"):
+        envs.reset(options={"reset_mask": mask})
+
+
+def test_a_bad_action_of_one_of_several_is_named():
+    envs = crowd()
+    envs.reset(seed=5)
+    bad = rows(envs, 1)[0]
+    bad[6, 1] = np.nan
+    with pytest.raises(ValueError, match="boid_2 in world 1"):
+        envs.step(bad)
+    assert not envs.world.steps.any()
+    with pytest.raises(ValueError, match="a row per learner"):
+        envs.step(bad.reshape(3, 4, 2))
+
+
+def test_gymnasium_s_wrappers_work_on_several_learners():
+    envs = DictInfoToList(RecordEpisodeStatistics(crowd(max_episode_steps=10, autoreset_mode=AutoresetMode.NEXT_STEP)))
+    envs.reset(seed=0)
+    total = np.zeros(12)
+    for row in rows(envs, 10):
+        _, reward, _, truncated, infos = envs.step(row)
+        total += reward
+    assert truncated.all()
+    np.testing.assert_allclose([info["episode"]["r"] for info in infos], total)
 
 
 # --- resets --------------------------------------------------------------------------------------------------------
@@ -309,3 +461,6 @@ def test_one_picture_per_world():
     assert first.shape == second.shape
     assert first.dtype == np.uint8
     assert not np.array_equal(first, second)
+    several = crowd(worlds=2, render_mode="rgb_array")
+    several.reset(seed=0)
+    assert len(several.render()) == 2

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from flockenv.noise import key_of, keys_of
 from flockenv.tasks import Flock, Obstacles, Pursuit
 from flockenv.world import Step, World
 from tests.catalogue import TASKS, TaskRow
@@ -40,6 +41,13 @@ def fields(step: Step) -> dict[str, Any]:
     return {name: getattr(step, name) for name in names}
 
 
+@pytest.fixture(params=[False, True], ids=["fresh", "recycled"])
+def recycled(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> bool:
+    """Small worlds hand out new memory, large ones use it again; here every size does what the parameter says."""
+    monkeypatch.setattr("flockenv.world.RECYCLE", 0 if request.param else 2**62)
+    return bool(request.param)
+
+
 # --- batches ----------------------------------------------------------------------------------------------------------
 
 
@@ -62,11 +70,15 @@ def test_a_row_of_a_batch_is_that_world_alone_bit_for_bit(row: TaskRow) -> None:
 
 
 @EVERY
-def test_two_worlds_in_one_process_and_in_threads_do_not_mix(row: TaskRow) -> None:
+def test_two_worlds_in_one_process_and_in_threads_do_not_mix(row: TaskRow, recycled: bool) -> None:
     def run(seed: int) -> list[Any]:
         world = World(row.task, 2)
         world.reset(seed)
-        return [world.step(a).observation for a in actions_for(world, 60, seed)]
+        # what is kept, and what is let go of at once, so that its memory is used again
+        return [world.step(a).observation.copy() if t % 2 else world.step(a).observation for t, a in plan(world, seed)]
+
+    def plan(world: World, seed: int) -> Any:
+        return enumerate(actions_for(world, 60, seed))
 
     serial = [run(seed) for seed in range(6)]
     with ThreadPoolExecutor(3) as pool:
@@ -82,7 +94,7 @@ def test_two_worlds_in_one_process_and_in_threads_do_not_mix(row: TaskRow) -> No
 
 
 @EVERY
-def test_nothing_handed_out_is_shared(row: TaskRow) -> None:
+def test_nothing_handed_out_is_shared(row: TaskRow, recycled: bool) -> None:
     world, other = World(row.task, 2), World(row.task, 2)
     held = [world.reset(5)]
     other.reset(5)
@@ -99,6 +111,34 @@ def test_nothing_handed_out_is_shared(row: TaskRow) -> None:
     np.testing.assert_array_equal(given, actions)
     assert_same(everything(world), everything(other))
     assert not np.array_equal(reference.observation, step.observation)
+
+
+@EVERY
+def test_what_is_held_stays_as_it_was(row: TaskRow, recycled: bool) -> None:
+    """Whole results, single arrays and views of them, some let go of at once and some later."""
+    world, held, was = World(row.task, 3, time_limit=20), [], []
+    held.append(world.reset(5))
+    was.append(held[-1].copy())
+    for t, a in enumerate(actions_for(world, 60)):
+        step = world.step(a)
+        held += [step.observation[1:], step.terms[..., 0], step.reward, step.terminated, step.alive.T][: t % 6]
+        was += [array.copy() for array in held[len(was) :]]
+        if step.ended.any():
+            held.append(world.reset(mask=step.ended))
+            was.append(held[-1].copy())
+        if t % 9 == 8:  # somebody tidies up
+            del held[::2], was[::2]
+    for array, copied in zip(held, was, strict=True):
+        np.testing.assert_array_equal(array, copied)
+
+
+def test_a_large_world_uses_its_memory_again() -> None:
+    world = World(Flock(agents=32), 64)
+    world.reset(0)
+    actions = actions_for(world, 12)
+    blocks = {id(step.observation.base) for step in map(world.step, actions)}
+    assert len(blocks) == 2  # the one in hand, and the one being written
+    assert id(None) not in blocks
 
 
 # --- episodes ---------------------------------------------------------------------------------------------------------
@@ -166,6 +206,62 @@ def test_a_masked_reset_touches_the_masked_worlds_only(row: TaskRow) -> None:
 
 
 @EVERY
+def test_a_reset_into_given_observations_writes_the_masked_worlds_only(row: TaskRow) -> None:
+    world, other = World(row.task, 4), World(row.task, 4)
+    for w in (world, other):
+        w.reset(20)
+    for a in actions_for(world, 9):
+        step, _ = world.step(a), other.step(a)
+    mask = np.array([True, False, False, True])
+    given = step.observation.copy()
+    given[~mask] = 7.0
+    assert world.reset(mask=mask, into=given) is given
+    seen = other.reset(mask=mask)
+    np.testing.assert_array_equal(given[mask], seen[mask])
+    np.testing.assert_array_equal(given[~mask], 7.0)
+    assert_same(everything(world), everything(other))
+    for bad in (given[:2], given.astype(np.float64), given[:, :, 1:]):
+        with pytest.raises(ValueError, match=r"^into has shape [^\n]*$"):
+            world.reset(mask=mask, into=bad)
+    assert_same(everything(world), everything(other))
+
+
+@EVERY
+def test_what_was_paid_is_the_sum_of_the_terms(row: TaskRow) -> None:
+    world = World(row.task, 3)
+    world.reset(6)
+    steps = [world.step(a) for a in actions_for(world, 15)]
+    for step in steps:
+        np.testing.assert_array_equal(step.reward, step.terms.sum(axis=2))
+    np.testing.assert_array_equal(world.paid, np.cumsum([step.terms for step in steps], axis=0)[-1])
+    kept = world.paid.copy()
+    world.reset(mask=np.array([False, True, False]))
+    assert not world.paid[1].any()
+    np.testing.assert_array_equal(world.paid[[0, 2]], kept[[0, 2]])
+
+
+@EVERY
+def test_metrics_of_one_world_are_those_of_all(row: TaskRow) -> None:
+    world = World(row.task, 3)
+    world.reset(6)
+    for a in actions_for(world, 15):
+        world.step(a)
+    columns = world.measure()
+    for k in range(3):
+        found = world.metrics(k)
+        assert found == {name: column[k] for name, column in columns.items() if not np.isnan(column[k])}
+        assert all(type(value) is float for value in found.values())
+
+
+def test_keys_of_many_worlds_are_the_keys_of_each() -> None:
+    seeds = [0, 1, 77, 2**31, 2**63 - 1, 2**64 - 1]
+    for episode in (0, 1, 2**40):
+        found = keys_of(np.array(seeds, np.uint64), np.full(len(seeds), episode, np.uint64))
+        assert found.dtype == np.uint64
+        assert found.tolist() == [int(key_of(seed, episode)) for seed in seeds]
+
+
+@EVERY
 def test_time_limits_truncate_and_never_terminate(row: TaskRow) -> None:
     world = World(row.task, 2, time_limit=5)
     world.reset(3)
@@ -177,6 +273,11 @@ def test_time_limits_truncate_and_never_terminate(row: TaskRow) -> None:
     endless = World(row.task)
     endless.reset(3)
     assert not any(endless.step(a).truncated.any() for a in actions_for(endless, 50))
+    compiled = len(endless._kernel.decide.overloads)
+    for limit in (np.int32(51), 2**70):  # neither compiles anew
+        endless.time_limit = limit
+        np.testing.assert_array_equal(endless.step(actions_for(endless, 1)[0]).truncated, limit == 51)
+    assert len(endless._kernel.decide.overloads) == compiled
 
 
 # --- copies -----------------------------------------------------------------------------------------------------------
@@ -199,6 +300,23 @@ def test_a_copy_goes_on_as_the_original_would(row: TaskRow, copied: Any) -> None
         assert_same(a, b)
     assert_same(everything(world), everything(other))
     assert world.seeds == other.seeds
+
+
+@pytest.mark.parametrize(
+    "copied", [copy.deepcopy, lambda world: pickle.loads(pickle.dumps(world))], ids=["deep", "pickle"]
+)
+def test_a_copy_has_memory_of_its_own(copied: Any) -> None:
+    world = World(Flock(agents=32), 64)
+    world.reset(0)
+    a, b = actions_for(world, 2)
+    world.step(a)
+    held = [world.step(b).observation]
+    other = copied(world)
+    assert other._empty.__self__ is not world._empty.__self__
+    assert len(pickle.dumps(world)) < 2 * len(pickle.dumps(World(Flock(agents=32), 64)))  # no results in it
+    held += [other.step(a).observation, world.step(a).observation]
+    assert not any(np.shares_memory(held[i], held[k]) for i, k in ((0, 1), (0, 2), (1, 2)))
+    np.testing.assert_array_equal(held[1], held[2])
 
 
 def test_a_copy_of_a_world_that_was_never_reset_is_one_too() -> None:
@@ -290,6 +408,8 @@ def test_whatever_holds_the_numbers_they_are_the_same_numbers() -> None:
         assert_same(end, ends[0])
     world.step(np.ones((2, 1, 2), np.int64))
     world.step(np.ones((2, 1, 2), bool))
+    world.step(np.broadcast_to(0.5, (2, 1, 2)))  # cannot be written
+    assert len(world._kernel.decide.overloads) == 1  # and none of them was compiled for
 
 
 # --- what a world cannot be -------------------------------------------------------------------------------------------

@@ -53,3 +53,7 @@ class AvoidObstacles(Effect):
     obstacle_start: ClassVar[str | None] = "nothing"
     obstacle_law: ClassVar[str | None] = "nearest_threat"
     obstacle_finish: ClassVar[str | None] = "around"
+
+    def folded(self, dimension: int) -> int:
+        """Distance, clearance and offset of the nearest threat."""
+        return 2 + dimension

@@ -9,16 +9,22 @@ An effect is of one or more of three forms, each a law for one agent:
   the obstacles.
 
 `p` holds the effect's `parameters()` by name, `me` and `other` are the records below. Laws live in the effect's module.
+A pair law says nothing of who is seen: it is evaluated for every candidate, and what it says of those outside the
+effect's `sight` (of agents themselves too) is dropped.
 """
 
 from __future__ import annotations
 
 from typing import Any, ClassVar, NamedTuple
 
-from flockenv.kernels import Vec
-from flockenv.records import Record
+import numpy as np
+from numpy.typing import NDArray
 
-__all__ = ["EFFECTS", "Effect", "Me", "Other"]
+from flockenv.kernels import Vec, law, like
+from flockenv.records import Record
+from flockenv.vec import dot
+
+__all__ = ["EFFECTS", "Effect", "Me", "Other", "Sight", "in_view", "ties"]
 
 EFFECTS: dict[str, type[Effect]] = {}
 """Every effect by its kind; a class registers itself when it is defined."""
@@ -35,6 +41,7 @@ class Me(NamedTuple):
     radius: float  # m
     max_speed: float  # m/s
     max_force: float  # N
+    tie: Vec  # a unit vector of its own, see ties(); only in pair laws
 
 
 class Other(NamedTuple):
@@ -45,6 +52,38 @@ class Other(NamedTuple):
     square: float  # m^2, |offset|^2
     vel: Vec  # m/s
     radius: float  # m
+    tie: Vec
+
+
+class Sight(NamedTuple):
+    """Whom an effect sees: who is nearer than radius, ahead of it, and (topological) among the nearest of those."""
+
+    radius: float  # m
+    fov: float = 360.0  # degrees, full angle; somebody at standstill has no heading and sees all around
+    nearest: int | None = None  # at most so many (and whoever is exactly as far as the last); None = all
+
+
+@law
+def in_view(view: float, heading: Vec, offset: Vec, square: float) -> bool:
+    """Is `offset` within a cone around `heading` of half angle a? view = cos a |cos a|; no root is taken.
+
+    offset . heading >= cos a |offset|, both sides squared with their signs. A heading of 0 sees all around.
+    """
+    ahead = dot(offset, heading)
+    still = dot(heading, heading) <= like(ahead, 0.0)
+    return (ahead * abs(ahead) >= view * square) | still
+
+
+def ties(count: int, dimension: int) -> NDArray[np.float64]:
+    """Return a unit vector for each agent, (count, D), all different, in no preferred direction.
+
+    me.tie - other.tie is where two agents in one place should part to: opposite for the two, another for every pair.
+    Directions in golden-ratio steps (heights too, in space).
+    """
+    who = np.arange(count)
+    turn, height = 2 * np.pi * (who * 0.6180339887498949 % 1), 2 * (who * 0.7548776662466927 % 1) - 1
+    ring = np.sqrt(1 - height**2) if dimension == 3 else np.ones(count)
+    return np.stack([ring * np.cos(turn), ring * np.sin(turn), height][:dimension], axis=1)
 
 
 class Effect(Record):
@@ -70,12 +109,21 @@ class Effect(Record):
             EFFECTS[kind] = cls
 
     @property
+    def sight(self) -> Sight | None:
+        """Whom its pair law is about; None if it has none."""
+        return None
+
+    @property
     def reach(self) -> float:
         """How far it looks for neighbours, m; 0 if it does not."""
-        return 0.0
+        return self.sight.radius if self.sight else 0.0
 
     def sums(self, dimension: int) -> int:
         """How many running sums its pair law fills."""
+        return 0
+
+    def folded(self, dimension: int) -> int:
+        """How many numbers its fold over the obstacles carries from one to the next."""
         return 0
 
     def parameters(self) -> dict[str, float]:

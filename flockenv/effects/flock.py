@@ -1,54 +1,28 @@
 """The three rules of a flock (Reynolds 1987), each an effect of its own; together they share one sweep.
 
-Each looks within its own radius and field of view. Someone at standstill has no heading and sees all around.
+Each looks within its own radius and field of view, at everybody there (metric) or at the nearest few (topological;
+Ballerini et al. 2008, doi 10.1073/pnas.0711437105: starlings heed six or seven). Someone at standstill has no heading
+and sees all around.
 """
 
 from __future__ import annotations
 
-import math
 from typing import Any, ClassVar, Literal
 
-import numpy as np
 from pydantic import Field
 
 from flockenv import steering
-from flockenv.effects.base import Effect, Me, Other
+from flockenv.effects.base import Effect, Me, Other, Sight
 from flockenv.kernels import Vec, law, like
-from flockenv.vec import dot, planar, scale, select, zero
+from flockenv.vec import scale, select, sub, zero
 
 __all__ = ["Alignment", "Cohesion", "Separation"]
 
 
 @law
-def sees(p: Any, me: Me, other: Other) -> bool:
-    """Within the radius, and inside the field of view: offset . heading >= cos(fov / 2) |offset|."""
-    ahead = dot(other.offset, me.heading)
-    # an offset below 1e-162 m has a negative `ahead` and no square: who sees all around must see it too
-    still = (dot(me.heading, me.heading) <= like(ahead, 0.0)) | (p.cos_half_fov < like(ahead, -1.0))
-    seen = (ahead >= p.cos_half_fov * np.sqrt(other.square)) | still
-    return (other.square < p.radius * p.radius) & seen  # type: ignore[no-any-return]
-
-
-@law
-def tie(me: Me, other: Other) -> Vec:
-    """A unit vector for two agents in one place: differs from pair to pair, opposite for the two of a pair.
-
-    A rational point of the half circle, t -> ((1 - t^2), 2t) / (1 + t^2), with t from the golden ratio of both indices.
-    """
-    e = like(me.who, 1.0)
-    a, b = (me.who, other.who) if me.who < other.who else (other.who, me.who)
-    turn = a * like(e, 0.6180339887) + b * like(e, 0.7548776662)
-    t = turn - np.floor(turn)
-    t = t + t - e
-    sign = e if me.who < other.who else -e
-    share = sign / (e + t * t)
-    return planar(me.pos, (e - t * t) * share, (t + t) * share)
-
-
-@law
 def separation_pair(p: Any, me: Me, other: Other) -> Vec:
     """One push."""
-    return select(sees(p, me, other), steering.separate(other.offset, tie(me, other)), zero(me.pos))
+    return steering.separate(other.offset, sub(me.tie, other.tie))
 
 
 @law
@@ -60,10 +34,7 @@ def separation(p: Any, me: Me, sums: Vec) -> Vec:
 @law
 def alignment_pair(p: Any, me: Me, other: Other) -> Vec:
     """One velocity, and one more neighbour."""
-    here = sees(p, me, other)
-    v = select(here, other.vel, zero(me.pos))
-    one = like(me.who, 1.0) if here else like(me.who, 0.0)
-    return v + (one,)  # noqa: RUF005  # numba joins tuples, but does not unpack them
+    return other.vel + (like(other.square, 1.0),)  # noqa: RUF005  # numba joins tuples, but does not unpack them
 
 
 @law
@@ -89,10 +60,7 @@ def alignment(p: Any, me: Me, sums: Vec) -> Vec:
 @law
 def cohesion_pair(p: Any, me: Me, other: Other) -> Vec:
     """One offset, and one more neighbour."""
-    here = sees(p, me, other)
-    d = select(here, other.offset, zero(me.pos))
-    one = like(me.who, 1.0) if here else like(me.who, 0.0)
-    return d + (one,)  # noqa: RUF005
+    return other.offset + (like(other.square, 1.0),)  # noqa: RUF005
 
 
 @law
@@ -105,20 +73,23 @@ def cohesion(p: Any, me: Me, sums: Vec) -> Vec:
 class _FlockRule(Effect):
     """What the three rules have in common."""
 
+    steering: ClassVar[bool] = True
+
     weight: float
     radius: float = Field(gt=0, description="m, neighbours are nearer than this")
     fov: float = Field(default=360.0, gt=0, le=360, description="degrees, full angle of the field of view")
-    steering: ClassVar[bool] = True
+    nearest: int | None = Field(
+        default=None, ge=1, le=32, description="topological: only so many nearest ones of those count; none = all"
+    )
 
     @property
-    def reach(self) -> float:
-        """The radius."""
-        return self.radius
+    def sight(self) -> Sight:
+        """Radius, field of view, how many."""
+        return Sight(self.radius, self.fov, self.nearest)
 
     def parameters(self) -> dict[str, float]:
-        """Weight, radius, and the cosine of half the field of view (-2 for all around: no rounding can hide anyone)."""
-        half = -2.0 if self.fov >= 360.0 else math.cos(math.radians(self.fov) / 2.0)
-        return {"weight": self.weight, "radius": self.radius, "cos_half_fov": half}
+        """The weight: who is seen is the sweep's business."""
+        return {"weight": self.weight}
 
 
 class Separation(_FlockRule):
@@ -131,8 +102,8 @@ class Separation(_FlockRule):
 
     @property
     def conserves_momentum(self) -> bool:  # type: ignore[override]  # a rule with a view cone is not mutual
-        """True with eyes all around: then everybody pushes back as he is pushed."""
-        return self.fov >= 360.0
+        """True with eyes all around and for everybody near: then everybody pushes back as he is pushed."""
+        return self.fov >= 360.0 and self.nearest is None
 
     def sums(self, dimension: int) -> int:
         """A vector."""

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import operator
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from itertools import repeat
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -27,9 +28,10 @@ __all__ = [
     "build",
     "checked_options",
     "checked_seed",
-    "metrics_of",
+    "named",
     "observation_space",
     "render_fps",
+    "together",
 ]
 
 Rows = NDArray[Any]
@@ -50,6 +52,16 @@ def build(task_type: type[Task], parameters: Mapping[str, Any], limit: str) -> T
     return task_type(**parameters)
 
 
+def together(task: Task) -> Task:
+    """Return the task; ValueError if its learners end one by one, for which a row has no meaning after its end."""
+    if not task.ends_together:
+        raise ValueError(
+            f"{task.name}: its learners leave one by one, and a row of a vector env cannot; "
+            "use pettingzoo.make('parallel', ...), or a task in which all learners end together"
+        )
+    return task
+
+
 def observation_space(task: Task) -> Box:
     """Return the space of one learner's observation, (O,) float32."""
     return Box(np.asarray(task.layout.low, np.float32), np.asarray(task.layout.high, np.float32), dtype=np.float32)
@@ -58,6 +70,14 @@ def observation_space(task: Task) -> Box:
 def action_space(task: Task) -> Box:
     """Return the space of one learner's action, (A,) float32 in [-1, 1]."""
     return Box(-1.0, 1.0, (task.action_layout.size,), np.float32)
+
+
+def named(names: Sequence[str], rows: Rows) -> Iterator[dict[str, float]]:
+    """Make a dictionary of each row of numbers, (R, K), by name.
+
+    Column by column, and one row at a time: a list for every row would wake the garbage collector.
+    """
+    return map(dict, map(zip, repeat(names), zip(*rows.T.tolist(), strict=True)))
 
 
 def render_fps(task: Task) -> int:
@@ -98,15 +118,6 @@ def begun(running: bool, call: str) -> None:
     """Refuse a step or a picture of a face that was not reset, or was closed; ResetNeeded."""
     if not running:
         raise ResetNeeded(f"{call}: there is no episode; call reset() first")
-
-
-def metrics_of(columns: Mapping[str, Rows], k: int) -> dict[str, float]:
-    """Return the metrics of world k, out of World.measure(); what has no value yet is left out.
-
-    NaN would not do: two equal infos would then differ.
-    """
-    values = {name: float(column[k]) for name, column in columns.items()}
-    return {name: value for name, value in values.items() if value == value}
 
 
 class Screen:

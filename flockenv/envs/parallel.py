@@ -21,7 +21,7 @@ from flockenv.envs.face import (
     build,
     checked_options,
     checked_seed,
-    metrics_of,
+    named,
     observation_space,
     render_fps,
 )
@@ -114,31 +114,44 @@ class WorldParallelEnv(ParallelEnv[str, Rows, Rows]):  # type: ignore[misc]  # p
         another shape or holds NaN; ResetNeeded when nobody is left.
         """
         begun(bool(self._live), "step")
-        result = self.world.step(self._rows(actions))
-        truncated = bool(result.truncated[0])
-        present, terminated = self._live, result.terminated[0].tolist()
+        result = self._step(actions)
+        present, truncated, terminated = self._live, result.truncated.item(), result.terminated[0].tolist()
+        reward = result.reward[0].tolist()
         outcome = (
             self._named(result.observation[0]),
-            {name: float(result.reward[0, i]) for name, i in present.items()},
+            {name: reward[i] for name, i in present.items()},
             {name: terminated[i] for name, i in present.items()},
             dict.fromkeys(present, truncated),
-            self._infos(result, over=bool(result.ended[0])),
+            self._infos(result, over=truncated or all(terminated)),
         )
-        self._live = {} if truncated else {name: i for name, i in present.items() if not terminated[i]}
+        if truncated or any(terminated):
+            self._live = {} if truncated else {name: i for name, i in present.items() if not terminated[i]}
         self._show()
         return outcome
 
     def _named(self, observation: NDArray[np.float32]) -> Named:
-        return {name: observation[i].copy() for name, i in self._live.items()}
+        return {name: observation[i] for name, i in self._live.items()}
 
-    def _rows(self, actions: Mapping[str, Rows]) -> Rows:
-        """Return the actions as (1, L, A), zeros for who has left; ValueError names the agent that is at fault."""
+    def _step(self, actions: Mapping[str, Rows]) -> Step:
+        """Let the world act; ValueError names the agent that is at fault, asking one by one only if somebody is."""
         if not isinstance(actions, Mapping):
             raise TypeError(f"actions: {type(actions).__name__}, must be a dictionary from agent to action")
         if actions.keys() != self._live.keys():
             self._refuse_names(actions)
-        rows = np.zeros((1, len(self.possible_agents), self.task.action_layout.size))
-        rows[0, list(self._live.values())] = self._block(actions)
+        try:
+            return self.world.step(self._rows([actions[name] for name in self._live]))
+        except (TypeError, ValueError):
+            for name in self._live:
+                self.checked_action(name, actions[name])
+            raise
+
+    def _rows(self, given: list[Rows]) -> Rows:
+        """Return the actions of all who live as (1, L, A), zeros for who has left."""
+        block, everybody = np.asarray(given), len(self.possible_agents)
+        if len(given) == everybody:
+            return block[None]
+        rows = np.zeros((1, everybody, *block.shape[1:]))
+        rows[0, list(self._live.values())] = block
         return rows
 
     def _refuse_names(self, actions: Mapping[str, Rows]) -> None:
@@ -148,16 +161,6 @@ class WorldParallelEnv(ParallelEnv[str, Rows, Rows]):  # type: ignore[misc]  # p
                 raise ValueError(f"actions: agent {name!r} {reason}{nearest(str(name), self._live)}")
         lacking = next(name for name in self._live if name not in actions)
         raise ValueError(f"actions: agent {lacking!r} has none")
-
-    def _block(self, actions: Mapping[str, Rows]) -> Rows:
-        """Return the actions of all who live, (agents, A), checked together; one by one only to name whose is bad."""
-        try:
-            block = np.asarray([actions[name] for name in self._live], np.float64)
-        except (TypeError, ValueError):
-            block = np.empty(0)
-        if block.shape == (len(self._live), self.task.action_layout.size) and np.isfinite(block).all():
-            return block
-        return np.stack([self.checked_action(name, actions[name]) for name in self._live])
 
     def checked_action(self, agent: str, action: Rows) -> Rows:
         """Return an action as an array, (A,); ValueError that names the agent on NaN, infinity or another shape."""
@@ -174,12 +177,9 @@ class WorldParallelEnv(ParallelEnv[str, Rows, Rows]):  # type: ignore[misc]  # p
 
     def _infos(self, result: Step, over: bool) -> dict[str, Named]:
         """Return reward terms and success by agent, with the metrics of the world when its episode is over."""
-        success, terms = bool(result.success[0]), result.terms[0].tolist()
-        metrics = metrics_of(self.world.measure(), 0) if over else {}
-        return {
-            name: {"terms": dict(zip(self.task.terms, terms[i], strict=True)), "is_success": success, **metrics}
-            for name, i in self._live.items()
-        }
+        success, terms = result.success.item(), list(named(self.task.terms, result.terms[0]))
+        metrics = self.world.metrics() if over else {}
+        return {name: {"terms": terms[i], "is_success": success, **metrics} for name, i in self._live.items()}
 
     @functools.cached_property
     def state_space(self) -> Box:

@@ -19,7 +19,6 @@ from flockenv.envs.face import (
     build,
     checked_options,
     checked_seed,
-    metrics_of,
     observation_space,
     render_fps,
 )
@@ -36,7 +35,7 @@ def one_learner(task_type: type[Task], parameters: dict[str, Any]) -> Task:
     if task.learners != 1:
         raise ValueError(
             f"{task_type.__name__}: {task.learners} learners; a Gymnasium environment has 1: for more use "
-            "pettingzoo.make('parallel', ...) or flockenv.sb3.WorldVecEnv"
+            "gymnasium.make_vec(...), pettingzoo.make('parallel', ...) or flockenv.sb3.WorldVecEnv"
         )
     return task
 
@@ -91,10 +90,10 @@ class SingleEnv(gymnasium.Env[Rows, Rows]):
         """
         begun(self._running, "step")
         result = self.world.step(self._row(action))
-        terminated = bool(result.terminated[0, 0])
+        terminated = result.terminated.item()
         self._running = not terminated
         self._show()
-        return result.observation[0, 0], float(result.reward[0, 0]), terminated, False, self._info(result)
+        return result.observation[0, 0], result.reward.item(), terminated, False, self._info(result)
 
     def _row(self, action: Rows) -> Rows:
         row = np.asarray(action)
@@ -104,7 +103,7 @@ class SingleEnv(gymnasium.Env[Rows, Rows]):
 
     def _info(self, result: Step) -> dict[str, Any]:
         terms = dict(zip(self.task.terms, result.terms[0, 0].tolist(), strict=True))
-        return {"terms": terms, "is_success": bool(result.success[0]), **metrics_of(self.world.measure(), 0)}
+        return {"terms": terms, "is_success": result.success.item(), **self.world.metrics()}
 
     def _show(self) -> None:
         if self.render_mode == "human":

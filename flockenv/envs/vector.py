@@ -7,6 +7,7 @@ compares the two), in each of the three ways to begin anew.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from types import MappingProxyType
 from typing import Any, ClassVar
 
 import numpy as np
@@ -22,12 +23,13 @@ from flockenv.envs.face import (
     Screen,
     action_space,
     begun,
+    build,
     checked_options,
     checked_seed,
     observation_space,
     render_fps,
+    together,
 )
-from flockenv.envs.single import one_learner
 from flockenv.refusals import nearest
 from flockenv.tasks import Flock, Obstacles, Pursuit, Task
 from flockenv.world import Step, World
@@ -41,10 +43,13 @@ NONE = -1
 
 
 class WorldsEnv(VectorEnv[Rows, Rows, Rows]):
-    """B independent worlds with one learner each; row k with seed s is the single environment with seed s + k.
+    """B independent worlds with L learners each as B L rows; row i is learner i % L of world i // L.
+
+    With one learner a world, row k of seed s is the single environment of seed s + k. With several, which must all end
+    together, rows of one world share its seed, its metrics, its success, and when it ends and begins anew.
 
     Args:
-        num_envs: B.
+        num_envs: B L, how many rows; a whole number of worlds.
         max_episode_steps: decisions after which a world is truncated; None = never (make_vec passes the id's own).
         autoreset_mode: when a world that ended begins anew: in the same step (default; `info["final_obs"]` and
             `info["final_info"]` hold the end), in the next step, or never (`reset(options={"reset_mask": mask})`).
@@ -63,7 +68,7 @@ class WorldsEnv(VectorEnv[Rows, Rows, Rows]):
         render_mode: str | None = None,
         **parameters: Any,
     ) -> None:
-        self.task = one_learner(self.task_type, {**self.fixed, **parameters})
+        self.task = together(build(self.task_type, {**self.fixed, **parameters}, limit="max_episode_steps"))
         self.autoreset_mode = _autoreset(autoreset_mode)
         self._screen = Screen(render_mode, render_fps(self.task), modes=("rgb_array",))
         self.render_mode = render_mode
@@ -72,14 +77,14 @@ class WorldsEnv(VectorEnv[Rows, Rows, Rows]):
             "render_fps": render_fps(self.task),
             "autoreset_mode": self.autoreset_mode,
         }
-        self.world = World(self.task, num_envs, time_limit=max_episode_steps)
-        self.num_envs = num_envs = self.world.worlds
+        self.world = World(self.task, _worlds(num_envs, self.task.learners), time_limit=max_episode_steps)
+        self.num_envs = num_envs = self.world.worlds * self.task.learners
         self.single_observation_space = observation_space(self.task)
         self.single_action_space = action_space(self.task)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
-        self._seeds = np.full(num_envs, NONE, np.int64)
-        self._ended = np.zeros(num_envs, np.bool_)
+        self._seeds = np.full(self.world.worlds, NONE, np.int64)
+        self._ended = np.zeros(self.world.worlds, np.bool_)
         self._running = False
 
     def reset(
@@ -88,35 +93,42 @@ class WorldsEnv(VectorEnv[Rows, Rows, Rows]):
         seed: int | Sequence[int | None] | None = None,
         options: dict[str, Any] | None = None,
     ) -> tuple[NDArray[np.float32], Info]:
-        """Begin an episode in every world, or in those of options["reset_mask"], (B,) bool; return (B, O) float32.
+        """Begin an episode in every world, or in those of options["reset_mask"], (B L,) bool; return (B L, O) float32.
 
-        seed: s for s, s + 1, ...; or one per world, None meaning the next episode of the seed that the world has.
+        seed: s for worlds s, s + 1, ...; or one per row, None meaning the next episode of the seed that its world has.
         """
         seeds = self._seed_column(seed)
         mask = self._reset_mask(checked_options(options, ("reset_mask",)))
         super().reset(seed=int(seeds[0]) if seeds[0] != NONE else None)
         if (self._seeds == NONE).any():
-            drawn = self.np_random.integers(SEEDS - self.num_envs) + np.arange(self.num_envs)
+            drawn = self.np_random.integers(SEEDS - len(seeds)) + np.arange(len(seeds))
             seeds = np.where(seeds == NONE, drawn, seeds)
-        info: Info = {}
         observation = self._begin(mask, seeds)
         self._running = True
-        _put(info, {"seed": self._seeds}, mask)
-        return observation, info
+        return observation.reshape(self.num_envs, -1), self._begun(mask)
+
+    def _rows(self, column: NDArray[Any]) -> NDArray[Any]:
+        """Return what is so for a world, (B, ...), for each of its rows; always a copy."""
+        return np.repeat(column, self.task.learners, axis=0)
 
     def _seed_column(self, seed: int | Sequence[int | None] | None) -> NDArray[np.int64]:
-        if seed is None or isinstance(seed, list | tuple):
-            given = [None] * self.num_envs if seed is None else [checked_seed(s) for s in seed]
-        else:
+        """Return a seed per world, (B,); refuses one seed too many, and rows of one world that disagree."""
+        worlds = self.world.worlds
+        if seed is None:
+            return np.full(worlds, NONE, np.int64)
+        if not isinstance(seed, list | tuple):
             first = checked_seed(seed) or 0
-            given = [checked_seed(first + k) for k in range(self.num_envs)]
+            checked_seed(first + worlds - 1)
+            return np.arange(first, first + worlds)
+        given = [checked_seed(s) for s in seed]
         if len(given) != self.num_envs:
-            raise ValueError(f"seed: {len(given)} seeds for {self.num_envs} worlds")
-        return np.array([NONE if s is None else s for s in given], np.int64)
+            raise ValueError(f"seed: {len(given)} seeds for {self.num_envs} rows")
+        return self._one_per_world("seed", np.array([NONE if s is None else s for s in given], np.int64))
 
     def _reset_mask(self, options: Mapping[str, Any]) -> Mask:
+        """Return which worlds to begin, (B,)."""
         if "reset_mask" not in options:
-            return np.ones(self.num_envs, np.bool_)
+            return np.ones(self.world.worlds, np.bool_)
         mask = options["reset_mask"]
         if not isinstance(mask, np.ndarray) or mask.dtype != np.bool_ or mask.shape != (self.num_envs,):
             what = f"{mask.dtype} of shape {mask.shape}" if isinstance(mask, np.ndarray) else type(mask).__name__
@@ -125,45 +137,74 @@ class WorldsEnv(VectorEnv[Rows, Rows, Rows]):
             raise ValueError("options['reset_mask']: names no world")
         if not self._running and not mask.all():
             raise ValueError("options['reset_mask']: the first reset must begin every world")
-        return mask
+        return self._one_per_world("options['reset_mask']", mask)
 
-    def _begin(self, mask: Mask, seeds: NDArray[np.int64] | None = None) -> NDArray[np.float32]:
+    def _one_per_world(self, what: str, column: NDArray[Any]) -> NDArray[Any]:
+        """Return the first of each world's rows; ValueError where another row of that world says something else."""
+        several = column.reshape(self.world.worlds, self.task.learners)
+        differ = several != several[:, :1]
+        if differ.any():
+            world, learner = (int(k) for k in np.argwhere(differ)[0])
+            row = world * self.task.learners
+            raise ValueError(f"{what}: rows {row} and {row + learner} are one world, number {world}, and must agree")
+        return several[:, 0]
+
+    def _begin(
+        self, mask: Mask, seeds: NDArray[np.int64] | None = None, into: NDArray[np.float32] | None = None
+    ) -> NDArray[np.float32]:
         """Begin the masked worlds, with a new seed where there is one, else with the next episode of their seed."""
         self._ended = self._ended & ~mask
         if seeds is None:
-            return self.world.reset(mask=mask)[:, 0]
+            return self.world.reset(mask=mask, into=into)
         fresh = mask & (seeds != NONE)
         self._seeds[fresh] = seeds[fresh]
         if (mask & ~fresh).any():
             observation = self.world.reset(mask=mask & ~fresh)
         if fresh.any():
             observation = self.world.reset(seeds=self._seeds.tolist(), mask=fresh)
-        return observation[:, 0]
+        return observation
 
     def step(self, actions: Rows) -> tuple[NDArray[np.float32], Rows, Mask, Mask, Info]:
-        """Act for one control_dt in every world; actions are (B, A), clipped to [-1, 1].
+        """Act for one control_dt in every world; actions are (B L, A), clipped to [-1, 1].
 
         Raises ValueError that names the world on NaN or another shape; ResetNeeded for a world that ended, if worlds
         do not begin anew by themselves.
         """
         begun(self._running, "step")
         resting = self._resting()
-        result = self.world.step(self._rows(actions, resting))
-        acting = ~resting
-        terminated, truncated = result.terminated[:, 0] & acting, result.truncated & acting
-        self._ended = terminated | truncated
+        result = self.world.step(self._blocks(actions, resting))
+        terminated, truncated = result.terminated, result.truncated
+        if resting.any():
+            terminated[resting], truncated[resting], result.reward[resting] = False, False, 0.0
+        self._ended = terminated[:, 0] | truncated
         same_step = self.autoreset_mode is AutoresetMode.SAME_STEP
-        ended, anew = self._ended, self._ended if same_step else resting
+        info = self._infos(result, self._ended if same_step else resting, final=same_step)
+        observation, reward = result.observation.reshape(self.num_envs, -1), result.reward.reshape(-1)
+        return observation, reward, terminated.reshape(-1), self._rows(truncated), info
+
+    def _infos(self, result: Step, anew: Mask, final: bool) -> Info:
+        """Tell of every row, and begin the worlds that begin anew, in the result's observations.
+
+        final: they have just ended, so tell first how.
+        """
         info: Info = {}
-        columns = self._columns(result)
-        observation = result.observation[:, 0]
+        columns, lacks = self._columns(result)
+        mask = self._rows(anew)
         if anew.any():
-            if same_step:
-                _put_final(info, observation, columns, ended)
-            observation = self._begin(anew)
-        _put(info, columns, ~anew)
-        _put(info, {"seed": self._seeds}, anew)
-        return observation, np.where(acting, result.reward[:, 0], 0.0), terminated, truncated, info
+            if final:
+                _put_final(info, result.observation[anew], columns, mask, lacks)
+            self._begin(anew, into=result.observation)
+            info |= self._begun(anew)
+            _blank(columns, np.flatnonzero(mask))
+        _put(info, columns, ~mask, lacks)
+        return info
+
+    def _begun(self, worlds: Mask) -> Info:
+        """Return the seeds of the worlds that have begun."""
+        info: Info = {}
+        mask = self._rows(worlds)
+        _put(info, _only({"seed": self._rows(self._seeds)}, np.flatnonzero(mask)), mask)
+        return info
 
     def _resting(self) -> Mask:
         """Return the worlds for which this step is their reset; refuse to step one that ended and stays so."""
@@ -173,19 +214,28 @@ class WorldsEnv(VectorEnv[Rows, Rows, Rows]):
             raise ResetNeeded(
                 f"step: world {int(self._ended.argmax())} has ended; call reset(options={{'reset_mask': ended}}) first"
             )
-        return np.zeros(self.num_envs, np.bool_)
+        return np.zeros(self.world.worlds, np.bool_)
 
-    def _rows(self, actions: Rows, resting: Mask) -> Rows:
-        rows = np.asarray(actions)
-        if rows.shape != self.action_space.shape:
-            raise ValueError(f"actions: shape {rows.shape}, must be {self.action_space.shape}, a row per world")
-        if resting.any():
-            rows = np.where(resting[:, None], 0.0, rows)
-        return rows[:, None]
+    def _blocks(self, actions: Rows, resting: Mask) -> Rows:
+        """Return the actions by world and learner, (B, L, A), with zeros for who rests."""
+        given = np.asarray(actions)
+        if given.shape != self.action_space.shape:
+            raise ValueError(f"actions: shape {given.shape}, must be {self.action_space.shape}, a row per learner")
+        blocks = given.reshape(self.world.worlds, self.task.learners, -1)
+        return np.where(resting[:, None, None], 0.0, blocks) if resting.any() else blocks
 
-    def _columns(self, result: Step) -> Info:
-        terms = {name: result.terms[:, 0, k] for k, name in enumerate(self.task.terms)}
-        return {"terms": terms, "is_success": result.success, **self.world.measure()}
+    def _columns(self, result: Step) -> tuple[Info, dict[str, Mask]]:
+        """Return what is told of every row, and of which rows a metric has no value yet (and zero in its place)."""
+        terms = result.terms.reshape(self.num_envs, -1)
+        columns: Info = {"terms": {name: terms[:, k] for k, name in enumerate(self.task.terms)}}
+        columns["is_success"] = self._rows(result.success)
+        lacks = {}
+        for name, column in self.world.measure().items():
+            lacking = np.isnan(column)
+            if lacking.any():
+                column[lacking], lacks[name] = 0.0, self._rows(lacking)
+            columns[name] = self._rows(column)
+        return columns, lacks
 
     def render(self) -> tuple[NDArray[np.uint8], ...] | None:
         """Return one picture per world, each (H, W, 3) uint8."""
@@ -193,7 +243,7 @@ class WorldsEnv(VectorEnv[Rows, Rows, Rows]):
             logger.warn("render() shows nothing without a render mode: make_vec(..., render_mode='rgb_array')")
             return None
         begun(self._running, "render")
-        frames = (self._screen.show(self.world.snapshot(k)) for k in range(self.num_envs))
+        frames = (self._screen.show(self.world.snapshot(k)) for k in range(self.world.worlds))
         return tuple(frame for frame in frames if frame is not None)
 
     def close_extras(self, **kwargs: Any) -> None:
@@ -211,34 +261,71 @@ def _autoreset(mode: str | AutoresetMode) -> AutoresetMode:
         ) from None
 
 
-def _put(info: Info, columns: Mapping[str, Any], mask: Mask) -> None:
-    """Enter columns over worlds as gymnasium's vector envs do: zeros and a False in `_name` where there is no value."""
+def _worlds(rows: Any, learners: int) -> int:
+    """Return how many worlds so many rows are; ValueError if their learners do not fill whole worlds."""
+    if learners == 1 or not isinstance(rows, int | np.integer):
+        return rows  # type: ignore[no-any-return]  # World refuses what is no number of worlds
+    worlds, over = divmod(int(rows), learners)
+    if over:
+        near = sorted({max(k, 1) * learners for k in (worlds, worlds + 1)})
+        raise ValueError(
+            f"num_envs: {rows} rows are no whole number of worlds with {learners} learners each; "
+            f"the nearest: {' or '.join(map(str, near))}"
+        )
+    return worlds
+
+
+# Infos are columns over rows, as gymnasium's vector envs make them: zeros, and a False in `_name`, where there is no
+# value. Those that come from a result are the step's own arrays, so they are handed on and not copied.
+
+
+def _put(info: Info, columns: Mapping[str, Any], mask: Mask, lacks: Mapping[str, Mask] = MappingProxyType({})) -> None:
+    """Enter columns, with the rows that they speak of; a column that speaks of none is left out."""
     for name, column in columns.items():
-        here = mask
+        here = mask & ~lacks[name] if name in lacks else mask.copy()
+        value: Any = column
         if isinstance(column, Mapping):
-            value: Any = {}
+            value = {}
             _put(value, column, mask)
-        else:
-            if column.dtype.kind == "f":
-                here = mask & ~np.isnan(column)  # a metric that has no value yet
-            value = np.where(here, column, np.zeros((), column.dtype))
         if here.any():
-            info[name], info[f"_{name}"] = value, here.copy()
+            info[name], info[f"_{name}"] = value, here
 
 
-def _put_final(info: Info, observation: NDArray[np.float32], columns: Info, ended: Mask) -> None:
-    """Enter how the worlds that ended ended: their last observations as objects, their infos as columns."""
-    last = np.full(len(ended), None, object)
-    for k in np.flatnonzero(ended):
-        last[k] = observation[k].copy()
+def _put_final(info: Info, seen: NDArray[np.float32], columns: Info, mask: Mask, lacks: Mapping[str, Mask]) -> None:
+    """Enter how the rows that ended ended: what they saw last as objects, what is told of them as columns."""
+    rows = np.flatnonzero(mask)
+    last = np.full(len(mask), None, object)
+    for row, own in zip(rows.tolist(), seen.reshape(len(rows), -1), strict=True):
+        last[row] = own
     final: Info = {}
-    _put(final, columns, ended)
-    info["final_obs"], info["_final_obs"] = last, ended.copy()
-    info["final_info"], info["_final_info"] = final, ended.copy()
+    _put(final, _only(columns, rows), mask, lacks)
+    info["final_obs"], info["_final_obs"] = last, mask.copy()
+    info["final_info"], info["_final_info"] = final, mask.copy()
+
+
+def _only(columns: Mapping[str, Any], rows: NDArray[np.intp]) -> Info:
+    """Return new columns: zeros but in these rows."""
+    new: Info = {}
+    for name, column in columns.items():
+        if isinstance(column, Mapping):
+            new[name] = _only(column, rows)
+        else:
+            new[name] = np.zeros_like(column)
+            new[name][rows] = column[rows]
+    return new
+
+
+def _blank(columns: Mapping[str, Any], rows: NDArray[np.intp]) -> None:
+    """Write zeros into these rows."""
+    for column in columns.values():
+        if isinstance(column, Mapping):
+            _blank(column, rows)
+        else:
+            column[rows] = 0
 
 
 class PursuitVectorEnv(WorldsEnv):
-    """Pursuers, one per world; the page is that of flockenv.envs.single.PursuitEnv."""
+    """Pursuers, one per world or `pursuers=` several; the page is that of flockenv.envs.single.PursuitEnv."""
 
     task_type = Pursuit
 
@@ -250,7 +337,7 @@ class ObstaclesVectorEnv(WorldsEnv):
 
 
 class FlockVectorEnv(WorldsEnv):
-    """Learners in scripted flocks, one per world; the page is that of flockenv.envs.single.FlockEnv."""
+    """Learners in flocks, one per world or `learners=` several; the page is that of flockenv.envs.single.FlockEnv."""
 
     task_type = Flock
     fixed: ClassVar[dict[str, Any]] = {"learners": 1}

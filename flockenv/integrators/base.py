@@ -1,8 +1,10 @@
 """Integrator: (acceleration, state, dt) -> state. A law never knows which method integrates it.
 
-Each method is one file with `advance(acceleration, context, pos, vel, dt, stages)`: over the arrays (D, N) of one
-world, in place. Compiled, it is a part of a scene's kernel; with a Python function for the acceleration the very same
-source runs in Python, which is how its order is measured.
+Each method is one file with `advance(acceleration, context, pos, vel, dt, stages, first, end)`: over the coordinates
+of one world in one row, in place. Of these it writes [first, end) alone, because several threads may share a world,
+each with a part of its own; `acceleration(context, pos, vel, out)` reads everybody's positions, and waits until all
+threads have come so far. Compiled, `advance` is a part of a scene's kernel; with a Python function for the acceleration
+the very same source runs in Python, which is how its order is measured.
 """
 
 from __future__ import annotations
@@ -31,7 +33,7 @@ class Integrator(Record):
     order_with_drag: ClassVar[int]
     """Order of accuracy for forces that depend on velocity too."""
     stages: ClassVar[int]
-    """Arrays of (D, N) it needs as scratch."""
+    """Rows of coordinates it needs as scratch."""
     evaluations: ClassVar[int]
     """Evaluations of the force per step."""
 
@@ -58,9 +60,11 @@ class Integrator(Record):
         b, n, d = state.shape
 
         def law(context: Any, pos: Floats, vel: Floats, out: Floats) -> None:
-            out[...] = np.asarray(acceleration(pos.T, vel.T)).T
+            out[...] = np.asarray(acceleration(pos.reshape(d, n).T, vel.reshape(d, n).T)).T.reshape(-1)
 
         for k in range(b):
-            stages = np.zeros((max(self.stages, 1), d, n), state.x.dtype)
-            self.advance().py_func(law, (), new.x[:, k], new.v[:, k], dt, stages)
+            x, v = new.x[:, k].ravel(), new.v[:, k].ravel()
+            stages = np.zeros((max(self.stages, 1), d * n), state.x.dtype)
+            self.advance().py_func(law, (), x, v, dt, stages, 0, d * n)
+            new.x[:, k], new.v[:, k] = x.reshape(d, n), v.reshape(d, n)
         return replace(new, tick=new.tick + 1)

@@ -11,14 +11,13 @@ __all__ = ["ExplicitEuler"]
 
 
 @kernel
-def advance(acceleration: Any, context: Any, pos: Any, vel: Any, dt: float, stages: Any) -> None:
+def advance(acceleration: Any, context: Any, pos: Any, vel: Any, dt: float, stages: Any, first: int, end: int) -> None:
     """x += h v; v += h a: both from the present."""
     a = stages[0]
     acceleration(context, pos, vel, a)
-    for k in range(pos.shape[0]):
-        for i in range(pos.shape[1]):
-            pos[k, i] += dt * vel[k, i]
-            vel[k, i] += dt * a[k, i]
+    for i in range(first, end):
+        pos[i] += dt * vel[i]
+        vel[i] += dt * a[i]
 
 
 class ExplicitEuler(Integrator):

@@ -11,15 +11,14 @@ __all__ = ["SemiImplicitEuler"]
 
 
 @kernel
-def advance(acceleration: Any, context: Any, pos: Any, vel: Any, dt: float, stages: Any) -> None:
+def advance(acceleration: Any, context: Any, pos: Any, vel: Any, dt: float, stages: Any, first: int, end: int) -> None:
     """v += h a; x += h v, with the new v."""
     a = stages[0]
     acceleration(context, pos, vel, a)
-    for k in range(pos.shape[0]):
-        for i in range(pos.shape[1]):
-            v = vel[k, i] + dt * a[k, i]
-            vel[k, i] = v
-            pos[k, i] += dt * v
+    for i in range(first, end):
+        v = vel[i] + dt * a[i]
+        vel[i] = v
+        pos[i] += dt * v
 
 
 class SemiImplicitEuler(Integrator):

@@ -10,14 +10,16 @@ A task is one file: a frozen record whose fields are the keyword arguments of `m
 * `measure(p, before, after, numbers)` writes what this step adds to the domain metrics (Q,);
 * `observe(p, frame, rows)` writes the observation rows (L, O).
 
-`p` holds the task's `parameters()` by name. Learners are the first L agents of a world.
+`p` holds the task's `parameters()` by name. Learners are the first L agents of a world. Who is near whom is found once
+for all of them, by the same query as a scene's effects, if the task says what it wants to know: its `look`.
 """
 
 from __future__ import annotations
 
 import functools
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,10 +29,10 @@ from flockenv.records import Record
 from flockenv.scene import Scene
 from flockenv.snapshot import Mark
 from flockenv.state import State
-from flockenv.sweep import scene_source
+from flockenv.sweep import SHARED, Look, Parts, look_source, scene_source
 from flockenv.tasks.layout import Layout
 
-__all__ = ["TASKS", "Frame", "Measured", "Task", "task_source"]
+__all__ = ["NEAR", "REFUSED", "TASKS", "Frame", "Measured", "Task", "task_source"]
 
 Measured = Mapping[str, NDArray[np.float64]]
 """Numbers of `measure` by name, each (B,)."""
@@ -53,6 +55,14 @@ class Frame(NamedTuple):
     radius: Any  # (N,) m
     max_speed: Any  # (N,) m/s
     max_force: Any  # (N,) N
+    # What is near, as the task's `look` asks for it; not in the frame of `before`, whose arrays are empty.
+    near_square: Any  # (K, N) m^2, distances to the nearest agents squared, nearest first
+    near_who: Any  # (K, N) which they are
+    near_count: Any  # (N,) how many there are within sight
+    obstacle_gap: Any  # (J, N) m, distances to the surfaces of the nearest obstacles, nearest first
+    obstacle_who: Any  # (J, N)
+    obstacle_count: Any  # (N,)
+    table: Any  # (T,) the task's table()
 
 
 class Task(Record):
@@ -70,6 +80,7 @@ class Task(Record):
     control_dt: float = Field(default=0.1, gt=0, description="s, one decision; a whole multiple of dt")
     dt: float = Field(default=0.05, gt=0, description="s, one physics step")
     horizon: int = Field(default=300, ge=1, description="decisions until the time limit (truncation)")
+    dtype: Literal["float64", "float32"] = Field(default="float64", description="precision of the simulation")
 
     @classmethod
     def __pydantic_init_subclass__(cls, **kwargs: Any) -> None:
@@ -130,6 +141,20 @@ class Task(Record):
         """True if all learners of a world end at the same step."""
         return True
 
+    @property
+    def look(self) -> Look | None:
+        """What its frames say of who is near, if its observations and rewards need it."""
+        return None
+
+    def table(self) -> tuple[float, ...]:
+        """Numbers that its kernels look up: directions of rays, say."""
+        return ()
+
+    @functools.cached_property
+    def parts(self) -> Parts:
+        """What its kernel is made of: the scene's parts, and the look."""
+        return replace(self.scene.parts, look=self.look)
+
     def parameters(self) -> dict[str, float]:
         """The numbers that its kernels are given, by name."""
         numbers = {n: getattr(self, n) for n in type(self).model_fields}
@@ -151,20 +176,30 @@ class Task(Record):
 
 _KERNELS = ("spawn", "drive", "reward", "ended", "measure", "observe")
 
+NEAR = "near_square, near_who, near_count, obstacle_gap, obstacle_who, obstacle_count"
+"""What `look` writes, in order."""
+
+REFUSED = -2
+"""The world that `decide` names if an action is no number."""
+
 
 def task_source(task: Task) -> str:
-    """Return the source of a task's kernel: its scene's, and two entry points, `begin` and `advance_worlds`."""
+    """Return the source of a task's kernel: its scene's, and two entry points, `begin` and `decide`."""
     d = task.scene.dimension
     names = list(task.parameters())
     values = ", ".join(f"numbers[{k}]" for k in range(len(names)))
     frame = (
         "Frame({x}, {v}, {alive}, obstacle_x[:, b], obstacle_radius[b], memory[:, b], key[b], steps[b], "
-        "radius, max_speed, max_force)"
+        "radius, max_speed, max_force, {near}, table)"
     )
-    now = frame.format(x="x[:, b]", v="v[:, b]", alive="alive[b]")
-    then = frame.format(x="x0", v="v0", alive="alive0")
+    now = frame.format(x="x[:, b]", v="v[:, b]", alive="alive[b]", near=NEAR)
+    empty = ", ".join(f"{name}[:0]" for name in NEAR.split(", "))
+    then = frame.format(x="x0", v="v0", alive="alive0", near=empty)
+    look = f"look(x, alive, obstacle_x, obstacle_radius, b, params, {NEAR}, {SHARED})" if task.look else "pass"
+    worlds = "x, v, alive, tick, obstacle_x, obstacle_radius, work, key, memory, steps, params, numbers, table"
     return (
-        scene_source(task.scene.parts)
+        scene_source(task.parts)
+        + look_source(task.parts)
         + f'''
 
 from flockenv.tasks.base import Frame
@@ -174,11 +209,8 @@ P = namedtuple("P", {" ".join(names)!r})
 
 
 @njit(cache=True, **FAST)
-def begin(
-    mask, x, v, alive, tick, obstacle_x, obstacle_radius, key, memory, steps,
-    radius, max_speed, max_force, numbers, rows,
-):
-    """Begin an episode in the masked worlds, and observe all of them."""
+def begin(mask, everyone, {worlds}, {NEAR}, {SHARED}, rows):
+    """Begin an episode in the masked worlds, and observe those, or everyone."""
     p = P({values})
     for b in range(x.shape[1]):
         if mask[b]:
@@ -186,61 +218,72 @@ def begin(
             steps[b] = 0
             alive[b, :] = True
             spawn(p, {now})
-        observe(p, {now}, rows[b])
+        if mask[b] or everyone:
+            {look}
+            observe(p, {now}, rows[b])
 
 
 @njit(cache=True, **FAST)
-def first_bad(actions):
-    """Return the (world, learner, axis) of the first action that is not finite, or -1s."""
-    for b in range(actions.shape[0]):
+def decide(
+    check, from_world, to_world, actions, {worlds}, dt, count, mortal, limit,
+    force, x0, v0, alive0, action, {NEAR}, {SHARED},
+    measured, sums, paid, rows, payment, terms, over, late, success, present,
+):
+    """One decision in worlds [from_world, to_world), with what is told of it; return (world, agent) not finite, or -1s.
+
+    Nothing moves if an action is no number and `check` asks for that: then the world is {REFUSED}.
+    """
+    unaliased()
+    good = True
+    for b in range(from_world, to_world if check else from_world):
         for i in range(actions.shape[1]):
             for k in range(actions.shape[2]):
-                if not finite(actions[b, i, k]):
-                    return b, i, k
-    return -1, -1, -1
-
-
-@njit(cache=True, **FAST)
-def advance_worlds(
-    actions, x, v, alive, tick, obstacle_x, obstacle_radius, work_, key, memory, steps,
-    mass, radius, max_speed, max_force, params, dt, count, numbers, mortal,
-    rows, terms, over, success, measured, force, x0, v0, alive0, action,
-    lanes, steer, push, origin, sorted_, order, cell, start, shape, ranges, stages,
-):
-    """One decision in every world: drive, step, reward, judge, measure, observe."""
+                good &= finite(actions[b, i, k])
+    if not good:
+        return {REFUSED}, 0
     p = P({values})
+    n = x.shape[2]
+    blocks = (n + {task.parts.width - 1}) // {task.parts.width}
     broken, who = -1, -1
-    for b in range(x.shape[1]):
+    for b in range(from_world, to_world):
         now = {now}
         for k in range({d}):
-            for i in range(x.shape[2]):
+            for i in range(n):
                 x0[k, i] = x[k, b, i]
                 v0[k, i] = v[k, b, i]
-        for i in range(x.shape[2]):
+        for i in range(n):
             alive0[i] = alive[b, i]
         for i in range(actions.shape[1]):
+            over[b, i] = False
             for k in range(actions.shape[2]):
-                action[i, k] = min(max(np.float64(actions[b, i, k]), -1.0), 1.0)
-        drive(p, now, action, force)
-        context = (
-            force, mass, radius, max_speed, max_force, alive[b], obstacle_x[:, b], obstacle_radius[b], params,
-            lanes, steer, push, origin, sorted_, order, cell, start, shape, ranges, work_[b],
+                action[i, k] = min(max(actions[b, i, k], -1.0), 1.0)
+        drive(p, now, action, force[:, 0])
+        into_blocks(want, force, 0, n, 0, blocks)
+        bad = step_world(
+            x, v, alive, obstacle_x, obstacle_radius, work, params, dt, count, b, 0, 1, {SHARED},
         )
-        bad = step_world(context, x[:, b], v[:, b], dt, count, stages)
         if bad >= 0 and broken < 0:
             broken, who = b, bad
         tick[b] += count
-        before = {then}
         steps[b] += 1
-        now = {now}
+        before, now = {then}, {now}
+        {look}
         reward(p, before, now, action, terms[b])
         success[b] = ended(p, before, now, over[b])
         measure(p, before, now, measured[b])
-        if mortal:
-            for i in range(over.shape[1]):
-                if over[b, i]:
-                    alive[b, i] = False
-        observe(p, {now}, rows[b])
+        late[b] = steps[b] >= limit
+        for k in range(sums.shape[1]):
+            sums[b, k] += measured[b, k]
+        for i in range(over.shape[1]):
+            if mortal and over[b, i]:
+                alive[b, i] = False
+            present[b, i] = alive[b, i]
+            total = 0.0
+            for k in range(terms.shape[2]):
+                total += terms[b, i, k]
+                paid[b, i, k] += terms[b, i, k]
+            payment[b, i] = total
+        observe(p, now, rows[b])
     return broken, who
 '''
     )

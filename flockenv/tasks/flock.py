@@ -11,24 +11,19 @@ from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from flockenv import arbitration, steering
-from flockenv.kernels import kernel
+from flockenv.kernels import kernel, like
 from flockenv.noise import uniform
 from flockenv.scene import Group, Scene
-from flockenv.shapes import ray_hit
 from flockenv.snapshot import Mark
 from flockenv.space import Torus
 from flockenv.state import State
+from flockenv.sweep import Look
 from flockenv.tasks.base import Frame, Measured, Task
 from flockenv.tasks.layout import Layout, Slot
-from flockenv.tasks.sight import clip, nearest_agents, nearest_obstacles, offset
-from flockenv.vec import norm, scale, unit
+from flockenv.tasks.sight import block_ways, clip, compass, offset, put
+from flockenv.vec import norm, scale, sub, unit
 
 __all__ = ["Flock"]
-
-
-@kernel
-def _size(p: Any) -> Any:
-    return np.full(2, p.size)
 
 
 @kernel
@@ -96,26 +91,46 @@ def drive(p: Any, frame: Frame, action: Any, force: Any) -> None:
 
 @kernel
 def _flockmate(p: Any, frame: Frame, i: int, force: Any) -> None:
-    """A scripted member: avoid obstacles, separate, align, cohere, follow the heading, by prioritised allocation."""
+    """A scripted member: avoid obstacles, separate, align, cohere, follow the heading, by prioritised allocation.
+
+    It heeds the `neighbours` nearest within sight; who is nearest is searched for it alone, one after another.
+    """
     x, y = frame.pos[0, i], frame.pos[1, i]
-    v = (frame.vel[0, i], frame.vel[1, i])
-    slots = int(p.neighbours)
-    distances, chosen = np.empty(slots), np.empty(slots, np.int64)
-    found = nearest_agents(frame, i, 0, frame.pos.shape[1], p.sight, _size(p), slots, distances, chosen)
-    push, mean_v, centre = (0.0, 0.0), (0.0, 0.0), (0.0, 0.0)
-    for s in range(found):
-        j = chosen[s]
-        d = (offset(x, frame.pos[0, j], p.size), offset(y, frame.pos[1, j], p.size))
+    v = (np.float64(frame.vel[0, i]), np.float64(frame.vel[1, i]))
+    push, sum_v, centre = (0.0, 0.0), (0.0, 0.0), (0.0, 0.0)
+    found, last, last_square = 0, -1, -1.0
+    for _ in range(int(p.neighbours)):
+        j, square = _next_nearest(p, frame, i, last, last_square)
+        if j < 0:
+            break
+        found, last, last_square = found + 1, j, square
+        d = (np.float64(offset(x, frame.pos[0, j], p.size)), np.float64(offset(y, frame.pos[1, j], p.size)))
         one = steering.separate(d, (1.0, 0.0))
-        near = 1.0 if math.sqrt(distances[s]) < p.spacing else 0.0
+        near = 1.0 if math.sqrt(square) < p.spacing else 0.0
         push = (push[0] + near * one[0], push[1] + near * one[1])
-        mean_v = (mean_v[0] + frame.vel[0, j] / found, mean_v[1] + frame.vel[1, j] / found)
-        centre = (centre[0] + d[0] / found, centre[1] + d[1] / found)
-    agree = steering.align(v, mean_v) if found > 0 else (0.0, 0.0)
+        sum_v = (sum_v[0] + frame.vel[0, j], sum_v[1] + frame.vel[1, j])
+        centre = (centre[0] + d[0], centre[1] + d[1])
+    share = 1.0 / max(found, 1)
+    agree = steering.align(v, scale(sum_v, share)) if found > 0 else (0.0, 0.0)
     course = (p.cruise * frame.memory[0, i] - v[0], p.cruise * frame.memory[1, i] - v[1])
-    wishes = (_around(p, frame, i, v), scale(push, 2.0), scale(agree, 1.5), scale(centre, 0.3), scale(course, 2.0))
-    wish = arbitration.allocate(wishes, frame.max_force[i])
+    around = _around(p, frame, i, v)
+    wishes = (around, scale(push, 2.0), scale(agree, 1.5), scale(centre, 0.3 * share), scale(course, 2.0))
+    wish = arbitration.allocate(wishes, np.float64(frame.max_force[i]))
     force[0, i], force[1, i] = wish[0], wish[1]
+
+
+@kernel
+def _next_nearest(p: Any, frame: Frame, i: int, last: int, last_square: float) -> tuple[int, float]:
+    """Return who is nearest to agent i within sight after `last`, equal distances by number, and the square; or -1."""
+    best, who = np.float64(p.sight * p.sight), -1
+    for j in range(frame.pos.shape[1]):
+        dx = offset(frame.pos[0, i], frame.pos[0, j], p.size)
+        dy = offset(frame.pos[1, i], frame.pos[1, j], p.size)
+        square = np.float64(dx * dx + dy * dy)
+        beyond = square > last_square or (square == last_square and j > last)
+        if j != i and frame.alive[j] and beyond and square < best:
+            best, who = square, j
+    return who, best
 
 
 @kernel
@@ -127,13 +142,13 @@ def _around(p: Any, frame: Frame, i: int, v: Any) -> Any:
         if frame.rho[m] > 0.0:
             dx = offset(frame.pos[0, i], frame.centre[0, m], p.size)
             dy = offset(frame.pos[1, i], frame.centre[1, m], p.size)
-            d = (dx, dy)
-            clearance = frame.rho[m] + frame.radius[i] + 0.3
+            d = (np.float64(dx), np.float64(dy))
+            clearance = np.float64(frame.rho[m] + frame.radius[i]) + 0.3
             t = steering.threat(forward, d, clearance, 2.0 * norm(v))
             if t < nearest:
                 nearest, where, room = t, d, clearance
     if nearest < np.inf:
-        return steering.avoid(forward, where, room, frame.max_force[i])
+        return steering.avoid(forward, where, room, np.float64(frame.max_force[i]))
     else:
         return (0.0, 0.0)
 
@@ -141,153 +156,152 @@ def _around(p: Any, frame: Frame, i: int, v: Any) -> Any:
 @kernel
 def reward(p: Any, before: Frame, after: Frame, action: Any, terms: Any) -> None:
     """Terms: progress, alignment, spacing, together, touch, obstacle; each judged of the world after the step."""
-    slots = int(p.neighbours)
-    distances, chosen = np.empty(slots), np.empty(slots, np.int64)
-    size = _size(p)
+    one, o = like(p.sight, 1.0), like(p.sight, 0.0)
+    per_cruise, per_spacing, per_slot = one / p.cruise, one / p.spacing, one / p.neighbours
     for i in range(terms.shape[0]):
-        vx, vy = after.vel[0, i], after.vel[1, i]
-        along = vx * after.memory[0, i] + vy * after.memory[1, i]
-        found = nearest_agents(after, i, 0, after.pos.shape[1], p.sight, size, slots, distances, chosen)
-        mx, my, touches = 0.0, 0.0, 0.0
+        v = (after.vel[0, i], after.vel[1, i])
+        along = v[0] * after.memory[0, i] + v[1] * after.memory[1, i]
+        found = after.near_count[i]
+        mean, touches = (o, o), o
         for s in range(found):
-            j = chosen[s]
-            mx += after.vel[0, j] / found
-            my += after.vel[1, j] / found
-            touches += 1.0 if distances[s] < (after.radius[i] + after.radius[j]) ** 2 else 0.0
-        disagree = math.hypot(vx - mx, vy - my) / p.cruise if found > 0 else 1.0
-        gap = math.sqrt(distances[0]) if found > 0 else p.sight
-        terms[i, 0] = p.progress_reward * (1.0 - min(abs(along - p.cruise) / p.cruise, 1.0)) * p.control_dt
-        terms[i, 1] = -p.alignment_cost * min(disagree, 1.0) * p.control_dt
-        terms[i, 2] = -p.spacing_cost * min(abs(gap - p.spacing) / p.spacing, 1.0) * p.control_dt
-        terms[i, 3] = -p.loneliness_cost * (1.0 - found / slots) * p.control_dt
+            j = np.uint64(after.near_who[s, i])
+            mean = (mean[0] + after.vel[0, j], mean[1] + after.vel[1, j])
+            contact = after.radius[i] + after.radius[j]
+            touches += one if after.near_square[s, i] < contact * contact else o
+        disagree = norm(sub(v, scale(mean, one / max(found, 1)))) * per_cruise if found > 0 else one
+        gap = np.sqrt(after.near_square[0, i]) if found > 0 else p.sight
+        off_speed, off_place = abs(along - p.cruise) * per_cruise, abs(gap - p.spacing) * per_spacing
+        terms[i, 0] = p.progress_reward * (one - min(off_speed, one)) * p.control_dt
+        terms[i, 1] = -p.alignment_cost * min(disagree, one) * p.control_dt
+        terms[i, 2] = -p.spacing_cost * min(off_place, one) * p.control_dt
+        terms[i, 3] = -p.loneliness_cost * (one - like(one, found) * per_slot) * p.control_dt
         terms[i, 4] = -p.touch_cost * touches * p.control_dt
-        terms[i, 5] = -p.obstacle_cost * _inside(p, after, i) * p.control_dt
+        terms[i, 5] = -p.obstacle_cost * _inside(after, i) * p.control_dt
 
 
 @kernel
-def _inside(p: Any, frame: Frame, i: int) -> float:
-    """Return how many obstacles agent i touches."""
+def _inside(frame: Frame, i: int) -> float:
+    """Return how many obstacles agent i touches, of the nearest ones."""
     touches = 0.0
-    for m in range(frame.rho.shape[0]):
-        if frame.rho[m] > 0.0:
-            dx = offset(frame.pos[0, i], frame.centre[0, m], p.size)
-            dy = offset(frame.pos[1, i], frame.centre[1, m], p.size)
-            touches += 1.0 if math.sqrt(dx * dx + dy * dy) < frame.rho[m] + frame.radius[i] else 0.0
+    for s in range(frame.obstacle_count[i]):
+        touches += 1.0 if frame.obstacle_gap[s, i] < frame.radius[i] else 0.0
     return touches
 
 
 @kernel
 def ended(p: Any, before: Frame, after: Frame, over: Any) -> bool:
     """Never over before the time limit. The aim holds now if the flock is aligned, under way, and nobody touches."""
-    over[:] = False
-    polarisation, _, touching, along = _state_of(p, after)
-    return polarisation > 0.9 and touching == 0.0 and along > 0.8 * p.cruise
+    polarisation, along = _order(after)
+    return polarisation > 0.9 and along > 0.8 * p.cruise and not _anybody_touches(after)
 
 
 @kernel
-def _state_of(p: Any, frame: Frame) -> tuple[float, float, float, float]:
-    """Return polarisation, mean nearest-neighbour distance [m], touches (a pair counts once), mean speed along."""
+def _order(frame: Frame) -> tuple[float, float]:
+    """Return the polarisation, and the mean speed along the heading, m/s."""
     n = frame.pos.shape[1]
     ux, uy, along = 0.0, 0.0, 0.0
     for i in range(n):
-        vx, vy = frame.vel[0, i], frame.vel[1, i]
+        vx, vy = np.float64(frame.vel[0, i]), np.float64(frame.vel[1, i])
         speed = math.sqrt(vx * vx + vy * vy)
-        if speed > 1e-12:
-            ux += vx / speed / n
-            uy += vy / speed / n
-        along += (vx * frame.memory[0, i] + vy * frame.memory[1, i]) / n
-    nearest, touching = _nearness(p, frame)
-    return math.sqrt(ux * ux + uy * uy), nearest, touching, along
+        share = 1.0 / speed if speed > 1e-12 else 0.0
+        ux += vx * share
+        uy += vy * share
+        along += vx * frame.memory[0, i] + vy * frame.memory[1, i]
+    return math.sqrt(ux * ux + uy * uy) / n, along / n
 
 
 @kernel
-def _nearness(p: Any, frame: Frame) -> tuple[float, float]:
-    """Return the mean distance of the nearest neighbour, m, and how many touch: pairs, and agents with obstacles."""
-    n = frame.pos.shape[1]
-    nearest, touching = 0.0, 0.0
-    for i in range(n):
-        best = p.size * p.size
-        for j in range(n):
-            if j != i:
-                dx = offset(frame.pos[0, i], frame.pos[0, j], p.size)
-                dy = offset(frame.pos[1, i], frame.pos[1, j], p.size)
-                square = dx * dx + dy * dy
-                best = min(best, square)
-                contact = frame.radius[i] + frame.radius[j]
-                touching += 0.5 if square < contact * contact else 0.0
-        nearest += math.sqrt(best) / n
-        touching += _inside(p, frame, i)
-    return nearest, touching
+def _anybody_touches(frame: Frame) -> bool:
+    """Is anybody's nearest neighbour, or nearest obstacle, so near that they touch?"""
+    touching = False
+    for i in range(frame.pos.shape[1]):
+        if frame.near_count[i] > 0:
+            contact = frame.radius[i] + frame.radius[frame.near_who[0, i]]
+            touching |= frame.near_square[0, i] < contact * contact
+        if frame.obstacle_count[i] > 0:
+            touching |= frame.obstacle_gap[0, i] < frame.radius[i]
+    return touching
 
 
 @kernel
 def measure(p: Any, before: Frame, after: Frame, numbers: Any) -> None:
-    """Polarisation; mean nearest-neighbour distance, m; touches that began in this step; mean speed along, m/s."""
-    polarisation, nearest, touching, along = _state_of(p, after)
-    touched = 0.0
-    if touching > 0.0:
-        _, touched = _nearness(p, before)
-    numbers[0], numbers[1] = polarisation, nearest
-    numbers[2], numbers[3] = max(touching - touched, 0.0), along
+    """Polarisation; mean distance of the nearest in sight, m; touches that began in this step; mean speed along, m/s."""
+    numbers[0], numbers[3] = _order(after)
+    n = after.pos.shape[1]
+    nearest, began = 0.0, 0.0
+    for i in range(n):
+        nearest += math.sqrt(after.near_square[0, i]) if after.near_count[i] > 0 else p.sight
+        for s in range(after.near_count[i]):
+            j = after.near_who[s, i]
+            contact = after.radius[i] + after.radius[j]
+            if after.near_square[s, i] >= contact * contact:
+                break
+            began += 0.0 if _touched(p, before, i, before.pos[0, j], before.pos[1, j], contact) else 0.5
+        for s in range(after.obstacle_count[i]):
+            m = after.obstacle_who[s, i]
+            if after.obstacle_gap[s, i] < after.radius[i]:
+                clearance = after.rho[m] + after.radius[i]
+                began += 0.0 if _touched(p, before, i, after.centre[0, m], after.centre[1, m], clearance) else 1.0
+    numbers[1], numbers[2] = nearest / n, began
+
+
+@kernel
+def _touched(p: Any, frame: Frame, i: int, x: float, y: float, contact: float) -> bool:
+    """Was agent i nearer than `contact` m to a place?"""
+    dx, dy = offset(frame.pos[0, i], x, p.size), offset(frame.pos[1, i], y, p.size)
+    return dx * dx + dy * dy < contact * contact
 
 
 @kernel
 def observe(p: Any, frame: Frame, rows: Any) -> None:
     """All in the frame of the heading: (along, left). Own velocity, nearest neighbours and obstacles, free ways."""
     slots, seen = int(p.neighbours), int(p.obstacles_seen)
-    distances, chosen = np.empty(max(slots, seen)), np.empty(max(slots, seen), np.int64)
-    size = _size(p)
+    obstacles, ways = 2 + 7 * slots, 2 + 7 * slots + 3 * seen
+    one = like(p.sight, 1.0)
+    scales = (one / p.sight, like(one, 0.5) / p.max_speed, one / p.spacing)
     for i in range(rows.shape[0]):
         row = rows[i]
-        row[:] = 0.0
-        hx, hy = frame.memory[0, i], frame.memory[1, i]
-        row[0], row[1] = _turned(frame.vel[0, i], frame.vel[1, i], hx, hy, p.max_speed)
-        found = nearest_agents(frame, i, 0, frame.pos.shape[1], p.sight, size, slots, distances, chosen)
-        at = 2
-        for s in range(found):
-            j = chosen[s]
-            dx = offset(frame.pos[0, i], frame.pos[0, j], p.size)
-            dy = offset(frame.pos[1, i], frame.pos[1, j], p.size)
-            row[at + 2 * s], row[at + 2 * s + 1] = _turned(dx, dy, hx, hy, p.sight)
-            ux, uy = frame.vel[0, j] - frame.vel[0, i], frame.vel[1, j] - frame.vel[1, i]
-            k = at + 2 * slots + 2 * s
-            row[k], row[k + 1] = _turned(ux, uy, hx, hy, 2.0 * p.max_speed)
-            row[at + 4 * slots + s] = 1.0
-            k = at + 5 * slots + 2 * s
-            distance = math.sqrt(distances[s])
-            closeness = max(1.0 - distance / p.spacing, 0.0)
-            if closeness > 0.0 and distance > 0.0:
-                row[k], row[k + 1] = _turned(dx, dy, hx, hy, distance / closeness)
-        at += 7 * slots
-        found = nearest_obstacles(frame, i, p.sight, size, seen, distances, chosen)
-        for s in range(found):
-            m = chosen[s]
+        heading = (frame.memory[0, i], frame.memory[1, i])
+        put(row, 0, _turned((frame.vel[0, i], frame.vel[1, i]), heading, like(one, 2.0) * scales[1]))
+        for c in range(2, ways):
+            row[np.uint64(c)] = 0.0
+        for c in range(ways, rows.shape[1]):
+            row[np.uint64(c)] = 1.0
+        for s in range(frame.near_count[i]):
+            _show_neighbour(p, frame, i, s, slots, heading, scales, row)
+        for s in range(frame.obstacle_count[i]):
+            m = np.uint64(frame.obstacle_who[s, i])
             dx = offset(frame.pos[0, i], frame.centre[0, m], p.size)
             dy = offset(frame.pos[1, i], frame.centre[1, m], p.size)
-            row[at + 2 * s], row[at + 2 * s + 1] = _turned(dx, dy, hx, hy, p.sight + p.greatest_radius)
-            row[at + 2 * seen + s] = frame.rho[m] / p.greatest_radius
-        at += 3 * seen
-        for r in range(int(p.rays)):
-            angle = 2.0 * math.pi * r / p.rays
-            dx, dy = math.cos(angle) * hx - math.sin(angle) * hy, math.cos(angle) * hy + math.sin(angle) * hx
-            row[at + r] = _free_way(p, frame, i, dx, dy, chosen[:found]) / p.sight
+            put(row, obstacles + 2 * s, _turned((dx, dy), heading, one / (p.sight + p.greatest_radius)))
+            row[obstacles + 2 * seen + s] = frame.rho[m] / p.greatest_radius
+            clearance = frame.rho[m] + frame.radius[i]
+            block_ways(row, ways, int(p.rays), frame.table, (dx, dy), heading, clearance, p.sight)
 
 
 @kernel
-def _free_way(p: Any, frame: Frame, i: int, dx: float, dy: float, seen: Any) -> float:
-    """Return how far agent i can go in a direction before it touches an obstacle that it sees, m, at most `sight`."""
-    way: float = p.sight
-    for m in seen:
-        x = offset(frame.pos[0, i], frame.centre[0, m], p.size)
-        y = offset(frame.pos[1, i], frame.centre[1, m], p.size)
-        way = min(way, ray_hit((x, y), (dx, dy), frame.rho[m] + frame.radius[i]))
-    return way
+def _show_neighbour(
+    p: Any, frame: Frame, i: int, s: int, slots: int, heading: Any, scales: Any, row: Any
+) -> None:
+    """Write what agent i sees of its s-th nearest neighbour: offset, relative velocity, presence, crowding."""
+    j = np.uint64(frame.near_who[s, i])
+    to = (offset(frame.pos[0, i], frame.pos[0, j], p.size), offset(frame.pos[1, i], frame.pos[1, j], p.size))
+    put(row, 2 + 2 * s, _turned(to, heading, scales[0]))
+    relative = (frame.vel[0, j] - frame.vel[0, i], frame.vel[1, j] - frame.vel[1, i])
+    put(row, 2 + 2 * slots + 2 * s, _turned(relative, heading, scales[1]))
+    row[np.uint64(2 + 4 * slots + s)] = 1.0
+    o, one = like(scales[0], 0.0), like(scales[0], 1.0)
+    distance = np.sqrt(frame.near_square[s, i])
+    closeness = one - distance * scales[2]
+    crowded = (closeness > o) & (distance > o)
+    put(row, 2 + 5 * slots + 2 * s, _turned(to, heading, closeness / distance if crowded else o))
 
 
 @kernel
-def _turned(x: float, y: float, hx: float, hy: float, scale_: float) -> tuple[float, float]:
+def _turned(vector: Any, heading: Any, factor: float) -> Any:
     """Return a vector's parts along the heading and to its left, scaled and clipped."""
-    return clip((x * hx + y * hy) / scale_), clip((y * hx - x * hy) / scale_)
+    along, left = vector[0] * heading[0] + vector[1] * heading[1], vector[1] * heading[0] - vector[0] * heading[1]
+    return clip(along * factor), clip(left * factor)
 
 
 class Flock(Task):
@@ -362,7 +376,16 @@ class Flock(Task):
         groups = [Group(count=self.learners, role="learner", **limits)]
         if self.agents > self.learners:
             groups.append(Group(count=self.agents - self.learners, role="flockmate", **limits))
-        return Scene(space=Torus(size=(self.size, self.size)), groups=tuple(groups), dt=self.dt)
+        return Scene(space=Torus(size=(self.size, self.size)), groups=tuple(groups), dt=self.dt, dtype=self.dtype)
+
+    @property
+    def look(self) -> Look:
+        """The nearest flockmates and obstacles."""
+        return Look(self.sight, self.neighbours, self.obstacles_seen)
+
+    def table(self) -> tuple[float, ...]:
+        """The directions of the rays."""
+        return compass(self.rays)
 
     @functools.cached_property
     def layout(self) -> Layout:

@@ -10,16 +10,16 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
-from flockenv.kernels import kernel
+from flockenv.kernels import kernel, like
 from flockenv.noise import uniform
 from flockenv.scene import Group, Scene
-from flockenv.shapes import ray_hit
 from flockenv.snapshot import Mark
 from flockenv.space import Box
 from flockenv.state import State
+from flockenv.sweep import Look
 from flockenv.tasks.base import Frame, Measured, Task
 from flockenv.tasks.layout import Layout, Slot
-from flockenv.tasks.sight import clip, nearest_obstacles
+from flockenv.tasks.sight import block_ways, clip, compass
 
 __all__ = ["Obstacles"]
 
@@ -114,35 +114,28 @@ def measure(p: Any, before: Frame, after: Frame, numbers: Any) -> None:
 def observe(p: Any, frame: Frame, rows: Any) -> None:
     """Own velocity, goal, walls, the nearest obstacles, free ways all around."""
     row = rows[0]
-    row[:] = 0.0
     for k in range(2):
         row[k] = clip(frame.vel[k, 0] / p.max_speed)
         row[2 + k] = clip((frame.memory[k, 0] - frame.pos[k, 0]) / p.size)
         row[4 + k] = clip(frame.pos[k, 0] / p.size)
         row[6 + k] = clip((p.size - frame.pos[k, 0]) / p.size)
-    slots = int(p.slots)
-    distances, chosen = np.empty(slots), np.empty(slots, np.int64)
-    found = nearest_obstacles(frame, 0, p.sight, np.zeros(2), slots, distances, chosen)
-    for s in range(found):
-        m = chosen[s]
+    slots, rays = int(p.slots), int(p.rays)
+    ways = 8 + 4 * slots
+    for c in range(8, ways):
+        row[c] = 0.0
+    for s in range(frame.obstacle_count[0]):
+        m, gap = frame.obstacle_who[s, 0], frame.obstacle_gap[s, 0] - frame.radius[0]
         for k in range(2):
             row[8 + 2 * s + k] = clip((frame.centre[k, m] - frame.pos[k, 0]) / (p.sight + p.greatest_radius))
         row[8 + 2 * slots + s] = frame.rho[m] / p.greatest_radius
-        row[8 + 3 * slots + s] = clip(distances[s] - frame.radius[0]) if distances[s] < 1.0 + frame.radius[0] else 1.0
-    for r in range(int(p.rays)):
-        angle = 2.0 * math.pi * r / p.rays
-        row[8 + 4 * slots + r] = _free_way(frame, math.cos(angle), math.sin(angle), p.sight) / p.sight
-
-
-@kernel
-def _free_way(frame: Frame, dx: float, dy: float, sight: float) -> float:
-    """Return how far the agent's body can go in a direction before it touches an obstacle, m, at most `sight`."""
-    way = sight
+        row[8 + 3 * slots + s] = clip(gap) if gap < 1.0 else 1.0
+    for r in range(rays):
+        row[ways + r] = 1.0
     for m in range(frame.rho.shape[0]):
         if frame.rho[m] > 0.0:
-            offset = (frame.centre[0, m] - frame.pos[0, 0], frame.centre[1, m] - frame.pos[1, 0])
-            way = min(way, ray_hit(offset, (dx, dy), frame.rho[m] + frame.radius[0]))
-    return way
+            to = (frame.centre[0, m] - frame.pos[0, 0], frame.centre[1, m] - frame.pos[1, 0])
+            ahead = (like(to[0], 1.0), like(to[0], 0.0))
+            block_ways(row, ways, rays, frame.table, to, ahead, frame.rho[m] + frame.radius[0], p.sight)
 
 
 class Obstacles(Task):
@@ -209,7 +202,16 @@ class Obstacles(Task):
     def scene(self) -> Scene:
         """A walled square; nothing acts but what the agent wants."""
         walker = Group(count=1, radius=0.3, max_speed=self.max_speed, max_force=self.max_force, role="learner")
-        return Scene(space=Box(size=(self.size, self.size)), groups=(walker,), dt=self.dt)
+        return Scene(space=Box(size=(self.size, self.size)), groups=(walker,), dt=self.dt, dtype=self.dtype)
+
+    @property
+    def look(self) -> Look:
+        """The nearest obstacles."""
+        return Look(self.sight, obstacles=self.slots)
+
+    def table(self) -> tuple[float, ...]:
+        """The directions of the rays."""
+        return compass(self.rays)
 
     @functools.cached_property
     def layout(self) -> Layout:

@@ -115,11 +115,12 @@ def _caught(p: Any, before: Frame, after: Frame, j: int) -> bool:
 @kernel
 def reward(p: Any, before: Frame, after: Frame, action: Any, terms: Any) -> None:
     """Terms: closing, capture, time; evaders are paid the opposite."""
-    terms[:, :] = 0.0
     caught = 0
     for j in range(int(p.pursuers), after.pos.shape[1]):
         caught += 1 if _caught(p, before, after, j) else 0
     for i in range(terms.shape[0]):
+        for k in range(3):
+            terms[i, k] = 0.0
         if not before.alive[i]:
             continue
         first, end, _, _, side = _sides(p, after, i)
@@ -152,14 +153,15 @@ def measure(p: Any, before: Frame, after: Frame, numbers: Any) -> None:
     """Path of the first pursuer, m; nearest distance between the sides, m; evaders caught; time until the last, s."""
     numbers[0] = math.hypot(after.pos[0, 0] - before.pos[0, 0], after.pos[1, 0] - before.pos[1, 0])
     n, pursuers = after.pos.shape[1], int(p.pursuers)
-    best, caught = _FAR, 0
+    best, caught, free = _FAR, 0, 0
     for j in range(pursuers, n):
         caught += 0 if after.alive[j] else 1
+        free += 1 if before.alive[j] else 0
         for i in range(pursuers if before.alive[j] else 0):
             best = min(best, _distance(after, i, j))
     numbers[1] = best
     numbers[2] = caught
-    numbers[3] = 0.0 if caught == n - pursuers and caught > 0 and before.alive[pursuers:n].sum() == 0 else p.control_dt
+    numbers[3] = p.control_dt if free > 0 else 0.0
 
 
 @kernel
@@ -167,7 +169,8 @@ def observe(p: Any, frame: Frame, rows: Any) -> None:
     """Own velocity, walls, the nearest opponents and team mates, nearest first."""
     for i in range(rows.shape[0]):
         row = rows[i]
-        row[:] = 0.0
+        for c in range(row.shape[0]):
+            row[c] = 0.0
         first, end, mate, mates_end, _ = _sides(p, frame, i)
         for k in range(2):
             row[k] = _clip(frame.vel[k, i] / p.speed_scale)
@@ -283,6 +286,7 @@ class Pursuit(Task):
                 ),
             ),
             dt=self.dt,
+            dtype=self.dtype,
         )
 
     @property

@@ -1,78 +1,55 @@
-"""What agents see of each other and of obstacles: the nearest few, written into slots of an observation row."""
+"""What several tasks write into their observation rows."""
 
 from __future__ import annotations
 
 import math
 from typing import Any
 
-from flockenv.kernels import kernel
-from flockenv.tasks.base import Frame
+import numpy as np
 
-__all__ = ["clip", "nearest_agents", "nearest_obstacles"]
+from flockenv.kernels import kernel, like
+from flockenv.shapes import ray_hit
 
-_FAR = 1e30
+__all__ = ["block_ways", "clip", "compass", "offset", "put"]
 
 
 @kernel
 def clip(x: float) -> float:
     """Bound to [-1, 1]."""
-    return min(max(x, -1.0), 1.0)
-
-
-@kernel
-def _keep_nearest(who: int, distance: float, found: int, slots: int, distances: Any, chosen: Any) -> int:
-    """Insert one candidate into the sorted list of the nearest; return how many it holds now."""
-    at = found
-    while at > 0 and distances[at - 1] > distance:
-        at -= 1
-    if at >= slots:
-        return found
-    last = min(found, slots - 1)
-    for k in range(last, at, -1):
-        distances[k], chosen[k] = distances[k - 1], chosen[k - 1]
-    distances[at], chosen[at] = distance, who
-    return min(found + 1, slots)
-
-
-@kernel
-def nearest_agents(
-    frame: Frame, i: int, first: int, end: int, reach: float, size: Any, slots: int, distances: Any, chosen: Any
-) -> int:
-    """Write the nearest living agents of [first, end) within `reach` m of agent i, nearest first; return how many.
-
-    Equal distances keep the order of the indices. `size` (D,): edges of a periodic box, 0 = not periodic.
-    """
-    found = 0
-    x, y = frame.pos[0, i], frame.pos[1, i]
-    bound = reach * reach
-    for j in range(first, end):
-        if j != i and frame.alive[j]:
-            dx = offset(x, frame.pos[0, j], size[0])
-            dy = offset(y, frame.pos[1, j], size[1])
-            square = dx * dx + dy * dy
-            if square < bound:
-                found = _keep_nearest(j, square, found, slots, distances, chosen)
-                if found == slots:
-                    bound = min(bound, distances[slots - 1])
-    return found
+    return min(max(x, like(x, -1.0)), like(x, 1.0))
 
 
 @kernel
 def offset(a: float, b: float, size: float) -> float:
     """Return b - a, the shortest way around a periodic axis of this size (0 = not periodic)."""
     d = b - a
-    return d - size * math.floor(d / size + 0.5) if size > 0.0 else d
+    around = 1.0 / size if size > 0.0 else 0.0  # the same for all pairs: the division leaves the loop
+    return d - size * np.floor(d * around + 0.5)
 
 
 @kernel
-def nearest_obstacles(frame: Frame, i: int, reach: float, size: Any, slots: int, distances: Any, chosen: Any) -> int:
-    """Write the obstacles whose surface is nearest to agent i and within `reach` m; return how many."""
-    found = 0
-    for m in range(frame.rho.shape[0]):
-        if frame.rho[m] > 0.0:
-            dx = offset(frame.pos[0, i], frame.centre[0, m], size[0])
-            dy = offset(frame.pos[1, i], frame.centre[1, m], size[1])
-            gap = math.sqrt(dx * dx + dy * dy) - frame.rho[m]
-            if gap < reach:
-                found = _keep_nearest(m, gap, found, slots, distances, chosen)
-    return found
+def put(row: Any, at: int, vector: Any) -> None:
+    """Write two numbers into a row from place `at` on (counted without a sign, see block_ways)."""
+    row[np.uint64(at)] = vector[0]
+    row[np.uint64(at + 1)] = vector[1]
+
+
+def compass(rays: int) -> tuple[float, ...]:
+    """Return the cosines, then the sines, of so many directions, anticlockwise from the first axis."""
+    angles = [2.0 * math.pi * r / rays for r in range(rays)]
+    return (*map(math.cos, angles), *map(math.sin, angles))
+
+
+@kernel
+def block_ways(row: Any, at: int, rays: int, table: Any, to: Any, ahead: Any, clearance: float, sight: float) -> None:
+    """Shorten the free ways in row[at : at + rays], in units of `sight` m, by an obstacle at `to` m.
+
+    Ways lead in the directions of `compass`, turned so that the first is `ahead`, a unit vector; `table` is the compass.
+    """
+    here = (to[0] * ahead[0] + to[1] * ahead[1], to[1] * ahead[0] - to[0] * ahead[1])
+    share = like(sight, 1.0) / sight
+    sines, row_at = np.uint64(rays), np.uint64(at)
+    # Counted without a sign: of a signed index numba asks whether it counts from the end, and the loop stays scalar.
+    for r in range(np.uint64(rays)):
+        hit = np.float32(ray_hit(here, (table[r], table[sines + r]), clearance) * share)
+        row[row_at + r] = min(row[row_at + r], hit)

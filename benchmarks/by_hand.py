@@ -1,0 +1,276 @@
+"""Kernels as one writes them by hand for one mix of rules: what a composed scene is measured against.
+
+2-D, torus, semi-implicit Euler, brute force; the arguments, the checks and the limits are those of a scene. They have
+the form that is fast (agents side by side in the lanes of a vector register, sums in a small scratch array, unsigned
+indices, no aliasing), and each knows nothing but its own mix.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from numba import njit
+
+from flockenv.kernels import like, unaliased
+from flockenv.scene import Scene
+from flockenv.state import State
+
+__all__ = ["MIXES", "by_hand"]
+
+FAST: dict[str, Any] = {"fastmath": {"contract"}, "error_model": "numpy", "nogil": True, "_nrt": False}
+PARTS: dict[str, Any] = {"forceinline": True, **FAST}
+ROWS = 7  # of scratch: x, y, vx, vy, the wish, and who lives
+
+
+@njit(**PARTS)
+def _image(d, size, inverse):
+    return d - size * np.floor(d * inverse + like(d, 0.5))
+
+
+@njit(**PARTS)
+def _load(now, x, v, alive, b, n):
+    for i in range(np.uint64(n)):
+        now[0, i], now[1, i] = x[0, b, i], x[1, b, i]
+        now[2, i], now[3, i] = v[0, b, i], v[1, b, i]
+        now[6, i] = alive[b, i]
+
+
+@njit(**PARTS)
+def _store(now, x, v, b, n):
+    for i in range(np.uint64(n)):
+        x[0, b, i], x[1, b, i] = now[0, i], now[1, i]
+        v[0, b, i], v[1, b, i] = now[2, i], now[3, i]
+
+
+@njit(**PARTS)
+def _shortened(longest, square):
+    one = like(square, 1.0)
+    return longest / np.sqrt(square) if square > longest * longest else one
+
+
+@njit(**PARTS)
+def _into(x, size, inverse):
+    inside = x - size * np.floor(x * inverse)
+    zero = like(x, 0.0)
+    return zero if inside >= size or inside < zero else inside
+
+
+def _move(width):
+    """Wish and drive -> new velocities and positions of a world; says whether everything is finite."""
+
+    @njit(**PARTS)
+    def move(now, want, body, blocks, size, dt):
+        inverse, far = like(size, 1.0) / size, like(size, np.inf)
+        good = True
+        for block in range(blocks):
+            first = np.uint64(block * width)
+            for lane in range(np.uint64(width)):
+                i = first + lane
+                mass, fastest, strongest, living = body[0, i], body[1, i], body[2, i], now[6, i]
+                fx, fy = now[4, i] + want[0, i], now[5, i] + want[1, i]
+                share = _shortened(strongest, fx * fx + fy * fy) * living / mass
+                vx, vy = now[2, i] + dt * (fx * share), now[3, i] + dt * (fy * share)
+                dx, dy = dt * vx, dt * vy
+                good &= abs(dx * dx + dy * dy + vx * vx + vy * vy) < far
+                brake = _shortened(fastest * dt, dx * dx + dy * dy) * living
+                slow = _shortened(fastest, vx * vx + vy * vy) * living
+                now[0, i] = _into(now[0, i] + dx * brake, size, inverse)
+                now[1, i] = _into(now[1, i] + dy * brake, size, inverse)
+                now[2, i], now[3, i] = vx * slow, vy * slow
+        return good
+
+    return move
+
+
+# --- what neighbours come to, by mix --------------------------------------------------------------------------------
+
+
+def _three(width):
+    """Separation, alignment and cohesion."""
+
+    @njit(**PARTS)
+    def wish(now, sums, n, blocks, p):
+        size, apart, agree, near, w_apart, w_agree, w_near = p[0], p[1], p[2], p[3], p[4], p[5], p[6]
+        zero, one, inverse = like(size, 0.0), like(size, 1.0), like(size, 1.0) / size
+        for block in range(blocks):
+            first = np.uint64(block * width)
+            for lane in range(np.uint64(width)):
+                for k in range(np.uint64(8)):
+                    sums[k, lane] = zero
+            for j in range(np.uint64(n)):
+                xj, yj, ux, uy = now[0, j], now[1, j], now[2, j], now[3, j]
+                own = np.int32(j - first)
+                for lane in range(np.uint64(width)):
+                    dx = _image(xj - now[0, first + lane], size, inverse)
+                    dy = _image(yj - now[1, first + lane], size, inverse)
+                    square = dx * dx + dy * dy
+                    other = own != np.int32(lane)
+                    pushed = other & (square < apart) & (square > like(square, 1e-30))
+                    share = one / square if pushed else zero
+                    with_me, by_me = other & (square < agree), other & (square < near)
+                    sums[0, lane] -= dx * share
+                    sums[1, lane] -= dy * share
+                    sums[2, lane] += ux if with_me else zero
+                    sums[3, lane] += uy if with_me else zero
+                    sums[4, lane] += one if with_me else zero
+                    sums[5, lane] += dx if by_me else zero
+                    sums[6, lane] += dy if by_me else zero
+                    sums[7, lane] += one if by_me else zero
+            for lane in range(np.uint64(width)):
+                i = first + lane
+                some = sums[4, lane] > zero
+                mates = one / sums[4, lane] if some else zero
+                company = one / sums[7, lane] if sums[7, lane] > zero else zero
+                agree_x = sums[2, lane] * mates - now[2, i] if some else zero
+                agree_y = sums[3, lane] * mates - now[3, i] if some else zero
+                now[4, i] = w_apart * sums[0, lane] + w_agree * agree_x + w_near * (sums[5, lane] * company)
+                now[5, i] = w_apart * sums[1, lane] + w_agree * agree_y + w_near * (sums[6, lane] * company)
+
+    return wish
+
+
+def _two(width):
+    """Separation and cohesion."""
+
+    @njit(**PARTS)
+    def wish(now, sums, n, blocks, p):
+        size, apart, near, w_apart, w_near = p[0], p[1], p[3], p[4], p[6]
+        zero, one, inverse = like(size, 0.0), like(size, 1.0), like(size, 1.0) / size
+        for block in range(blocks):
+            first = np.uint64(block * width)
+            for lane in range(np.uint64(width)):
+                for k in range(np.uint64(5)):
+                    sums[k, lane] = zero
+            for j in range(np.uint64(n)):
+                xj, yj = now[0, j], now[1, j]
+                own = np.int32(j - first)
+                for lane in range(np.uint64(width)):
+                    dx = _image(xj - now[0, first + lane], size, inverse)
+                    dy = _image(yj - now[1, first + lane], size, inverse)
+                    square = dx * dx + dy * dy
+                    other = own != np.int32(lane)
+                    pushed = other & (square < apart) & (square > like(square, 1e-30))
+                    share = one / square if pushed else zero
+                    by_me = other & (square < near)
+                    sums[0, lane] -= dx * share
+                    sums[1, lane] -= dy * share
+                    sums[2, lane] += dx if by_me else zero
+                    sums[3, lane] += dy if by_me else zero
+                    sums[4, lane] += one if by_me else zero
+            for lane in range(np.uint64(width)):
+                i = first + lane
+                company = one / sums[4, lane] if sums[4, lane] > zero else zero
+                now[4, i] = w_apart * sums[0, lane] + w_near * (sums[2, lane] * company)
+                now[5, i] = w_apart * sums[1, lane] + w_near * (sums[3, lane] * company)
+
+    return wish
+
+
+def _seeing(width):
+    """Separation, alignment and cohesion, of whom is within a field of view."""
+
+    @njit(**PARTS)
+    def wish(now, sums, n, blocks, p):
+        size, apart, agree, near, w_apart, w_agree, w_near, view = p[0], p[1], p[2], p[3], p[4], p[5], p[6], p[7]
+        zero, one, inverse = like(size, 0.0), like(size, 1.0), like(size, 1.0) / size
+        for block in range(blocks):
+            first = np.uint64(block * width)
+            for lane in range(np.uint64(width)):
+                for k in range(np.uint64(8)):
+                    sums[k, lane] = zero
+                speed = np.sqrt(
+                    now[2, first + lane] * now[2, first + lane] + now[3, first + lane] * now[3, first + lane]
+                )
+                share = one / speed if speed > zero else zero
+                sums[8, lane], sums[9, lane] = now[2, first + lane] * share, now[3, first + lane] * share
+            for j in range(np.uint64(n)):
+                xj, yj, ux, uy = now[0, j], now[1, j], now[2, j], now[3, j]
+                own = np.int32(j - first)
+                for lane in range(np.uint64(width)):
+                    dx = _image(xj - now[0, first + lane], size, inverse)
+                    dy = _image(yj - now[1, first + lane], size, inverse)
+                    square = dx * dx + dy * dy
+                    ahead = dx * sums[8, lane] + dy * sums[9, lane]
+                    still = sums[8, lane] * sums[8, lane] + sums[9, lane] * sums[9, lane] <= zero
+                    seen = (own != np.int32(lane)) & ((ahead * abs(ahead) >= view * square) | still)
+                    pushed = seen & (square < apart) & (square > like(square, 1e-30))
+                    share = one / square if pushed else zero
+                    with_me, by_me = seen & (square < agree), seen & (square < near)
+                    sums[0, lane] -= dx * share
+                    sums[1, lane] -= dy * share
+                    sums[2, lane] += ux if with_me else zero
+                    sums[3, lane] += uy if with_me else zero
+                    sums[4, lane] += one if with_me else zero
+                    sums[5, lane] += dx if by_me else zero
+                    sums[6, lane] += dy if by_me else zero
+                    sums[7, lane] += one if by_me else zero
+            for lane in range(np.uint64(width)):
+                i = first + lane
+                some = sums[4, lane] > zero
+                mates = one / sums[4, lane] if some else zero
+                company = one / sums[7, lane] if sums[7, lane] > zero else zero
+                agree_x = sums[2, lane] * mates - now[2, i] if some else zero
+                agree_y = sums[3, lane] * mates - now[3, i] if some else zero
+                now[4, i] = w_apart * sums[0, lane] + w_agree * agree_x + w_near * (sums[5, lane] * company)
+                now[5, i] = w_apart * sums[1, lane] + w_agree * agree_y + w_near * (sums[6, lane] * company)
+
+    return wish
+
+
+# --- all worlds -----------------------------------------------------------------------------------------------------
+
+MIXES: dict[str, Callable[[int], Any]] = {"three": _three, "two": _two, "seeing": _seeing}
+
+
+@functools.cache
+def _kernel(mix: str, width: int) -> Any:
+    """Return the compiled step of a mix."""
+    wish, move = MIXES[mix](width), _move(width)
+
+    @njit(**FAST)
+    def step(x, v, alive, drive, body, work, p, dt, steps, now, want, sums):
+        unaliased()
+        n = x.shape[2]
+        blocks = (n + width - 1) // width
+        for b in range(x.shape[1]):
+            for i in range(np.uint64(n)):
+                want[0, i] = drive[0, b, i] if drive.shape[1] > 0 else like(dt, 0.0)
+                want[1, i] = drive[1, b, i] if drive.shape[1] > 0 else like(dt, 0.0)
+            _load(now, x, v, alive, b, n)
+            for _ in range(steps):
+                wish(now, sums, n, blocks, p)
+                if not move(now, want, body, blocks, p[0], dt):
+                    return b
+                work[b, 0] += 1
+                work[b, 2] += n * n
+            _store(now, x, v, b, n)
+        return -1
+
+    return step
+
+
+def by_hand(mix: str, scene: Scene, state: State, steps: int) -> Callable[[], object]:
+    """Return a call that advances the arrays of `state` by so many steps; the scene must be of that mix.
+
+    Its parameters: size, the squares of the radii, the weights, and cos(fov / 2) |cos(fov / 2)|.
+    """
+    real, width = np.dtype(scene.dtype), 64 // np.dtype(scene.dtype).itemsize
+    padded = -(-scene.agents // width) * width
+    rules = {effect.kind: effect for effect in scene.effects}
+    found = [rules.get(kind) for kind in ("separation", "alignment", "cohesion")]
+    cosine = math.cos(math.radians(scene.effects[0].sight.fov) / 2)
+    numbers = [scene.space.extent(2)[0], *(r.radius**2 if r else 0 for r in found)]
+    numbers += [*(r.weight if r else 0 for r in found), cosine * abs(cosine)]
+    body = np.ones((3, padded), real)
+    body[:, : scene.agents] = scene.body.mass, scene.body.max_speed, scene.body.max_force
+    now, want, sums = (np.zeros(shape, real) for shape in ((ROWS, padded), (2, padded), (10, width)))
+    arguments = (
+        state.x, state.v, state.alive, np.zeros((2, 0, 0), real), body, state.work, np.array(numbers, real),
+        real.type(scene.dt), steps, now, want, sums,
+    )  # fmt: skip
+    kernel = _kernel(mix, width)
+    return lambda: kernel(*arguments)

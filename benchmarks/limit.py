@@ -1,0 +1,248 @@
+"""flockenv beside C written by hand for this one purpose: `python -m benchmarks.limit`.
+
+The C (limit.c, limit_kernel.h) knows three rules, a torus and semi-implicit Euler, and nothing else; it is compiled
+here, by gcc -O3 -march=native. Every call of either side begins in the same state and does the same number of steps.
+Before a race both do a few, and where they then disagree there is no race. One thread.
+
+A floor says what no program gets below on this machine: counted vector operations at the pace, and counted bytes at the
+bandwidth, that were measured just before.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import shutil
+import subprocess
+import tempfile
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from time import perf_counter
+from typing import Annotated, Any
+
+import numpy as np
+import typer
+
+from benchmarks.measure import Bench, Contestant, Floor, Out, Quick, Rounds, command_line, number
+from benchmarks.scenes import crowd, restarting, stepping, world
+from flockenv.crew import use_threads
+from flockenv.effects import Alignment, Cohesion, Separation
+from flockenv.scene import Scene
+from flockenv.state import State
+
+__all__ = ["ROWS", "Machine", "Reference", "Row", "disagreement", "reference"]
+
+FLAGS = ("-O3", "-march=native", "-shared", "-fPIC")
+FEW = 5  # steps after which both sides are compared
+CLOSE = {"float64": 1e-9, "float32": 1e-4}  # m, nearly all agents; a single neighbour more or less moves one by 1e-3
+FAR = {"float64": 1e-9, "float32": 2e-2}  # m, everybody
+NEARLY_ALL = 0.99
+
+
+@dataclass(frozen=True)
+class Row:
+    """What both sides step."""
+
+    title: str
+    scene: Callable[[], Scene]
+    steps: int  # per call
+    worlds: int = 1
+
+
+def _rows() -> Iterator[Row]:
+    for dtype in ("float32", "float64"):
+        for d in (2, 3):
+            yield Row(f"1024 worlds x 32, {d}-D, {dtype}", lambda t=dtype, d=d: world(t, d), 10, 1024)
+        for agents, d in ((10_000, 2), (100_000, 2), (1_000_000, 2), (100_000, 3)):
+            yield Row(f"one world of {agents:,}, {d}-D, {dtype}", lambda n=agents, t=dtype, d=d: crowd(n, t, d), 10)
+    yield Row("one world of 1,000,000, 2-D, float32, a step per call", lambda: crowd(1_000_000, "float32"), 1)
+
+
+ROWS = tuple(_rows())
+
+
+# --- the C side -----------------------------------------------------------------------------------------------------
+
+
+class Reference:
+    """The compiled reference and what it is given."""
+
+    def __init__(self, folder: Path) -> None:
+        self.limit, self.pace = (_compiled(name, folder) for name in ("limit", "pace"))
+
+    def stepper(self, scene: Scene, state: State, steps: int) -> Callable[[], object]:
+        """Return a call that advances the arrays of `state` by so many steps, in place."""
+        kind = "worlds" if state.shape[0] > 1 else "crowd"
+        step = getattr(self.limit, f"{kind}_{'f32' if scene.dtype == 'float32' else 'f64'}_{scene.dimension}d")
+        numbers = np.array(_numbers(scene), scene.dtype)
+        sizes = (*state.shape[:2], steps) if kind == "worlds" else (state.shape[1], steps)
+        arguments = (*map(_pointer, (state.x, state.v)), *map(ctypes.c_long, sizes), _pointer(numbers))
+        return lambda numbers=numbers: step(*arguments)  # it keeps the memory of its numbers
+
+    def operations_per_second(self, dtype: str) -> float:
+        """Return how many independent operations this machine does at best, each lane of a vector counted."""
+        run = getattr(self.pace, f"operations_{dtype}")
+        run.restype = ctypes.c_long
+        return max(_rate(lambda: run(ctypes.c_long(1_000_000))) for _ in range(10))
+
+
+def _numbers(scene: Scene) -> list[float]:
+    """Return what limit_kernel.h calls `rules`, in its order."""
+    effects = [e for e in scene.effects if isinstance(e, (Separation, Alignment, Cohesion))]
+    group = scene.groups[0]
+    radii, weights = [e.radius for e in effects], [e.weight for e in effects]
+    assert len(effects) == 3 and group.max_force is not None and group.max_speed is not None
+    return [scene.space.extent(scene.dimension)[0], *radii, *weights, group.max_force, group.max_speed, scene.dt]
+
+
+def _compiled(name: str, folder: Path) -> ctypes.CDLL:
+    """Compile a source of this folder; subprocess.CalledProcessError or OSError where that fails."""
+    library = folder / f"{name}.so"
+    source = Path(__file__).with_name(f"{name}.c")
+    subprocess.run(["gcc", *FLAGS, "-o", str(library), str(source), "-lm"], check=True, capture_output=True, text=True)
+    return ctypes.CDLL(str(library))
+
+
+def _pointer(array: np.ndarray[Any, Any]) -> ctypes.c_void_p:
+    return ctypes.c_void_p(array.ctypes.data)
+
+
+@contextmanager
+def reference(bench: Bench) -> Iterator[Reference | None]:
+    """Compile the reference into a temporary folder; say so in one line where that is not possible, and give none."""
+    with tempfile.TemporaryDirectory() as folder:
+        found = None
+        try:
+            if shutil.which("gcc") is None:
+                raise OSError("there is no gcc")
+            found = Reference(Path(folder))
+        except (OSError, subprocess.CalledProcessError) as error:
+            bench.note(f"no C beside flockenv: {(getattr(error, 'stderr', '') or str(error)).strip().splitlines()[-1]}")
+        yield found
+
+
+# --- floors ---------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Machine:
+    """What this machine does at most, on one core."""
+
+    pace: dict[str, float]  # operations/s by dtype
+    bandwidth: float  # bytes/s, to and from memory
+
+    @classmethod
+    def measured(cls, by: Reference) -> Machine:
+        """Measure it: operations in C, bandwidth by adding to 128 MB in place."""
+        array = np.zeros(2**25, np.float32)
+        bandwidth = max(_rate(lambda: (np.add(array, 1.0, out=array), 2 * array.nbytes)[1]) for _ in range(10))
+        return cls({dtype: by.operations_per_second(dtype) for dtype in ("float32", "float64")}, bandwidth)
+
+    def floor(self, scene: Scene, state: State, candidates: float, steps: int) -> Floor:
+        """Return the floor of three rules, per agent-step."""
+        d, real, images = scene.dimension, np.dtype(scene.dtype).itemsize, state.shape[0] > 1
+        # A candidate: offset, |offset|^2, images (a multiply-add, floor, a multiply-add), 4 comparisons (three radii,
+        # not in one place), a division, and the sums: push, velocity and offset, and two counts.
+        operations = candidates * (2 * d + 3 * d * images + 4 + 1 + 3 * d + 2)
+        passes = 1 / steps if images else 1.0
+        bytes_ = 2 * 2 * d * real * passes
+        pace = self.pace[scene.dtype]
+        why = (
+            f"{operations / candidates:.0f} vector operations for each of {candidates:.1f} candidates at "
+            f"{pace / 1e9:.0f} G lanes/s; x and v read and written once a {'call' if images else 'step'}, "
+            f"{bytes_:.1f} bytes, at {self.bandwidth / 1e9:.0f} GB/s"
+        )
+        return Floor.counted(operations, bytes_, pace, self.bandwidth, why)
+
+
+def _rate(call: Callable[[], float]) -> float:
+    """Return what a call says it did per second."""
+    began = perf_counter()
+    return call() / (perf_counter() - began)
+
+
+# --- the races ------------------------------------------------------------------------------------------------------
+
+
+def disagreement(scene: Scene, mine: State, theirs: State) -> tuple[float, float]:
+    """Return how far apart the same agents are, m: nearly all of them, and the farthest."""
+    apart = np.linalg.norm(scene.space.displacement(mine.pos, theirs.pos), axis=-1)
+    return float(np.quantile(apart, NEARLY_ALL)), float(apart.max())
+
+
+def _agree(bench: Bench, row: Row, scene: Scene, start: State, by: Reference) -> bool:
+    """Let both do a few steps from one state; say it where they are not in the same places then."""
+    mine, theirs = start.copy(), start.copy()
+    scene.step(mine, out=mine, steps=FEW)
+    by.stepper(scene, theirs, FEW)()
+    nearly, worst = disagreement(scene, mine, theirs)
+    bench.extra.setdefault("disagreement_m", {})[row.title] = {"nearly_all": nearly, "worst": worst}
+    if nearly <= CLOSE[scene.dtype] and worst <= FAR[scene.dtype]:
+        return True
+    bench.note(
+        f"{row.title}: NOT RACED. After {FEW} steps both sides differ by {number(worst)} m "
+        f"({NEARLY_ALL:.0%} of agents by up to {number(nearly)} m)"
+    )
+    return False
+
+
+def _race(bench: Bench, row: Row, by: Reference | None, machine: Machine | None) -> bool:
+    """Race one row; False if both sides do not do the same."""
+    scene = row.scene()
+    start = scene.start(0, worlds=row.worlds)
+    if by is not None and not _agree(bench, row, scene, start, by):
+        return False
+    candidates = scene.step(start).counted("pairs") / (row.worlds * scene.agents)
+    floor = machine.floor(scene, start, candidates, row.steps) if machine else None
+    work = row.worlds * scene.agents * row.steps
+    contestants = [Contestant("flockenv", stepping(scene, start, row.steps), work, floor)]
+    if by is not None:
+        theirs = start.copy()
+        step = restarting(start, theirs, by.stepper(scene, theirs, row.steps))
+        contestants.insert(0, Contestant("C", step, work, floor))
+    bench.race(row.title, contestants, baseline=contestants[0].name)
+    return True
+
+
+def main(
+    only: Annotated[str, typer.Option(help="Rows whose title contains this, such as float32 or 1,000,000.")] = "",
+    quick: Quick = False,
+    rounds: Rounds = None,
+    out: Out = None,
+) -> None:
+    """Measure flockenv beside hand-written C, and both beside a floor; refuse where they do not do the same."""
+    use_threads(1)
+    rows = [row for row in ROWS if only in row.title]
+    if not rows:
+        raise typer.BadParameter(f"--only {only!r}: in no title; titles: {'; '.join(row.title for row in ROWS)}")
+    with Bench("limit", quick, rounds, out) as bench, reference(bench) as by:
+        machine = Machine.measured(by) if by else None
+        same = [_race(bench, row, by, machine) for row in rows]
+        _remarks(bench, machine)
+    if not all(same):
+        raise typer.Exit(1)
+
+
+def _remarks(bench: Bench, machine: Machine | None) -> None:
+    """Say what was counted, and all ratios in one line."""
+    bench.note(
+        "One thread. Every call begins in the same state; 10 steps a call unless a row says otherwise. C keeps the "
+        "agents of a large world sorted from step to step of a call."
+    )
+    if machine:
+        bench.extra["machine_at_most"] = {"operations_per_second": machine.pace, "bytes_per_second": machine.bandwidth}
+        bench.note(
+            "Floors: 17 vector operations for each candidate that flockenv meets in 2-D (22 in 3-D; 23 and 31 where "
+            "the nearest image is sought) at the pace of independent operations, "
+            + ", ".join(f"{pace / 1e9:.0f} G lanes/s in {dtype}" for dtype, pace in machine.pace.items())
+            + f"; positions and velocities read and written once a step (small worlds: a call) at "
+            f"{machine.bandwidth / 1e9:.0f} GB/s; the slower of the two. No sorting, no overhead."
+        )
+    ratios = [f"{r.race} {number(r.ratio)}" for r in bench.results if r.name == "flockenv" and r.ratio and machine]
+    if ratios:
+        bench.note(f"flockenv's rate over that of C: {'; '.join(ratios)}.")
+
+
+if __name__ == "__main__":
+    command_line(main)()

@@ -1,0 +1,147 @@
+"""flockenv's side of every comparison: run by the Python that flockenv is installed in."""
+
+import math
+from itertools import cycle
+from typing import Any
+
+from turns import DRAWS, Case, run
+
+WORLDS, HORIZON = 1024, 300  # decisions until the time limit
+
+
+def flock_batch(agents: int) -> Case:
+    """The Flock task in 1024 worlds, every agent a learner, through World.step."""
+    import numpy as np
+
+    from flockenv.tasks import Flock
+    from flockenv.world import World
+
+    task = Flock(agents=agents, obstacle_count=5)
+    does = (
+        f"Flock, {WORLDS} worlds x {agents} learners, 5 obstacles, {task.scene.dtype}: drives in {task.substeps} "
+        f"substeps; {task.layout.size} observations each (6 neighbours, 16 free ways), 6 reward terms, metrics"
+    )
+    return _batch(World(task, WORLDS, HORIZON), np.random.default_rng(0), does)
+
+
+def pursuit_batch(threads: int) -> Case:
+    """The Pursuit task in 1024 worlds: three chase one, all four learn, through World.step."""
+    import numpy as np
+
+    from flockenv.tasks import Pursuit
+    from flockenv.world import World
+
+    task = Pursuit(pursuers=3, evaders=1, sides="both")
+    does = (
+        f"Pursuit, {WORLDS} worlds x 4 learners, {task.scene.dtype}: drives in {task.substeps} substeps, walls; "
+        f"{task.layout.size} observations each, 3 reward terms, captures, metrics"
+    )
+    return _batch(World(task, WORLDS, HORIZON), np.random.default_rng(0), does)
+
+
+def _batch(world: Any, rng: Any, does: str) -> Case:
+    """Step under random actions drawn before, and reset the worlds that are over (that is timed too)."""
+    world.reset(0)
+    actions = cycle(rng.uniform(-1, 1, (DRAWS, world.worlds, world.learners, world.action_size)))
+
+    def step() -> None:
+        ended = world.step(next(actions)).ended
+        if ended.any():
+            world.reset(mask=ended)
+
+    return Case(step, world.worlds * world.learners, does)
+
+
+def flock_parallel(threads: int) -> Case:
+    """The Flock task as a PettingZoo parallel environment."""
+    from flockenv.envs.flock_v0 import parallel_env
+
+    env = parallel_env(max_cycles=HORIZON, agents=3, obstacle_count=3)
+    size = env.task.layout.size
+    return _parallel(
+        env, 3, f"Flock, one world x 3 agents, 3 obstacles: drives in {env.task.substeps} substeps; {size} "
+        "observations each, rewards, metrics"
+    )  # fmt: skip
+
+
+def pursuit_parallel(pursuers: int, evaders: int) -> Case:
+    """The Pursuit task as a PettingZoo parallel environment; both sides are agents."""
+    from flockenv.envs.pursuit_v0 import parallel_env
+
+    env = parallel_env(max_cycles=HORIZON, pursuers=pursuers, evaders=evaders)
+    size = env.task.layout.size
+    return _parallel(
+        env, pursuers + evaders,
+        f"Pursuit, one world x {pursuers} + {evaders} agents (pursuers, evaders; all counted): drives in "
+        f"{env.task.substeps} substeps, walls; {size} observations each, rewards, metrics",
+    )  # fmt: skip
+
+
+def _parallel(env: Any, agents: int, does: str) -> Case:
+    """Step with actions drawn before, and reset where an episode is over (that is timed too)."""
+    env.reset(seed=0)
+    spaces = {name: env.action_space(name) for name in env.possible_agents}
+    actions = cycle([{name: space.sample() for name, space in spaces.items()} for _ in range(DRAWS)])
+
+    def step() -> None:
+        action = next(actions)
+        env.step({name: action[name] for name in env.agents})
+        if not env.agents:
+            env.reset()
+
+    return Case(step, agents, does)
+
+
+def boids(agents: int, edge: float, reach: float, apart: float, about: str) -> Case:
+    """One world of boids on a torus, all three rules, through Scene.step in place."""
+    from flockenv.effects.flock import Alignment, Cohesion, Separation
+    from flockenv.scene import Group, Scene
+    from flockenv.space import Torus
+    from flockenv.spawn import Spawn
+
+    scene = Scene(
+        space=Torus(size=(edge, edge)),
+        groups=(Group(count=agents, max_speed=1.0, max_force=2.0, spawn=Spawn(speed=(0.5, 1.0))),),
+        effects=(
+            Separation(weight=1.0, radius=apart),
+            Alignment(weight=0.5, radius=reach),
+            Cohesion(weight=0.03, radius=reach),
+        ),
+        dt=0.05,
+    )
+    state = scene.start(seed=0)
+    does = (
+        f"boids, one world x {agents} on a torus {edge:.3g} m wide, {scene.dtype}: separation (radius {apart:g}), "
+        f"alignment and cohesion (radius {reach:.3g}), everybody at once; no observations, no rewards{about}"
+    )
+    return Case(lambda: scene.step(state, out=state), agents, does)
+
+
+def like_mesa(agents: int) -> Case:
+    """Mesa's box and radii."""
+    return boids(agents, 100 * math.sqrt(agents / 100), 10.0, 2.0, "")
+
+
+def like_crowd(agents: int, reach: float) -> Case:
+    """A person per square metre."""
+    about = ". ANOTHER LAW: flockenv has no social force yet; same number and density"
+    return boids(agents, math.sqrt(agents), reach, min(1.0, reach), about)
+
+
+CASES = {
+    "flock_4": lambda threads: flock_batch(4),
+    "flock_3": lambda threads: flock_batch(3),
+    "flock_32": lambda threads: flock_batch(32),
+    "pursuit": pursuit_batch,
+    "parallel_flock": flock_parallel,
+    "parallel_tag": lambda threads: pursuit_parallel(3, 1),
+    "parallel_pursuit": lambda threads: pursuit_parallel(8, 30),
+    "boids_100": lambda threads: like_mesa(100),
+    "boids_300": lambda threads: like_mesa(300),
+    "crowd_1000": lambda threads: like_crowd(1000, 2.5),
+    "crowd_100": lambda threads: like_crowd(100, 0.4999 * math.sqrt(100)),
+    "crowd_500": lambda threads: like_crowd(500, 0.4999 * math.sqrt(500)),
+}
+
+if __name__ == "__main__":
+    run(CASES, "flockenv", "numba", "numpy")

@@ -1,0 +1,93 @@
+"""Threads for compiled code: how many there are, and how a piece of work is given to all of them.
+
+One thread unless asked for more: waiting threads spin, and where another process has the second core that costs more
+than it brings. `use_threads(2)`, or FLOCKENV_THREADS=2 in the environment. Results do not depend on the number.
+"""
+
+from __future__ import annotations
+
+import os
+import queue
+import threading
+from collections.abc import Callable, Sequence
+from typing import Any
+
+__all__ = ["share", "threads", "use_threads"]
+
+_MOST = 256
+
+
+class _Crew:
+    """Threads that wait for work; made when first needed, and anew in a forked process, which has none of them."""
+
+    def __init__(self, count: int) -> None:
+        self.pid = os.getpid()
+        self.desks: list[queue.SimpleQueue[Any]] = [queue.SimpleQueue() for _ in range(count - 1)]
+        self.lock = threading.Lock()
+        for k, desk in enumerate(self.desks):
+            threading.Thread(target=_work, args=(desk,), daemon=True, name=f"flockenv-{k + 1}").start()
+
+
+def _work(desk: queue.SimpleQueue[Any]) -> None:
+    while True:
+        job, done = desk.get()
+        try:
+            done.put((job(), None))
+        except BaseException as error:
+            done.put((None, error))
+
+
+_count = 1
+_crew: _Crew | None = None
+
+
+def threads() -> int:
+    """Return how many threads a step may use."""
+    return _count
+
+
+def use_threads(count: int) -> None:
+    """Let every step from now on use up to `count` threads; ValueError unless it is a whole number from 1 to 256."""
+    global _count
+    if type(count) is not int or not 1 <= count <= _MOST:  # True is no number of threads
+        raise ValueError(f"threads is {count!r}, must be a whole number from 1 to {_MOST}")
+    _count = count
+
+
+def _crew_of(count: int) -> _Crew:
+    """Return a crew with work for `count` threads; two callers at once may make two, and each keeps to its own."""
+    global _crew
+    crew = _crew
+    if crew is None or crew.pid != os.getpid() or len(crew.desks) < count - 1:
+        crew = _crew = _Crew(max(count, _count))
+    return crew
+
+
+def share(jobs: Sequence[Callable[[], Any]]) -> list[Any]:
+    """Run some jobs at the same time, the first in this thread; return what each returned, or raise what one raised.
+
+    All of them run at once, so they may wait for each other. Returns when all have ended, whatever happens.
+    """
+    crew = _crew_of(len(jobs))
+    done: list[queue.SimpleQueue[Any]] = [queue.SimpleQueue() for _ in jobs[1:]]
+    with crew.lock:  # all desks in one go: two callers whose jobs wait for each other never get in each other's way
+        for desk, job, answer in zip(crew.desks, jobs[1:], done, strict=False):
+            desk.put((job, answer))
+    try:
+        first = jobs[0]()
+    finally:
+        rest = [answer.get() for answer in done]
+    for _, error in rest:
+        if error is not None:
+            raise error
+    return [first, *(result for result, _ in rest)]
+
+
+def _from_environment() -> None:
+    text = os.environ.get("FLOCKENV_THREADS", "1")
+    if not text.isdecimal() or not 1 <= int(text) <= _MOST:
+        raise ValueError(f"FLOCKENV_THREADS is {text!r}, must be a whole number from 1 to {_MOST}")
+    use_threads(int(text))
+
+
+_from_environment()

@@ -1,0 +1,97 @@
+"""Recycler: memory is used again when nobody can see it any more, and never before."""
+
+import itertools
+import pickle
+
+import numpy as np
+import pytest
+import torch
+
+from flockenv.recycle import Recycler
+
+F4 = np.dtype(np.float32)
+
+
+def address(array):
+    return array.__array_interface__["data"][0]
+
+
+def test_what_was_let_go_of_is_used_again():
+    make = Recycler().empty
+    first = make((3, 4), F4)
+    second = make((3, 4), F4)
+    places = {address(first), address(second)}
+    assert len(places) == 2
+    del first
+    for _ in range(10):
+        first = None
+        first = make((3, 4), F4)
+        assert {address(first), address(second)} == places
+
+
+HOLDERS = {
+    "array": lambda array: array,
+    "view": lambda array: array.reshape(-1)[3:5],
+    "view of a view": lambda array: array.T[::-1][1:][:, 2],
+    "memoryview": memoryview,
+    "from a buffer": lambda array: np.frombuffer(memoryview(array.reshape(-1)), F4),
+    "torch": torch.from_numpy,
+    "torch view": lambda array: torch.from_numpy(array).view(-1)[2:],
+    "dlpack": torch.from_dlpack,
+    "strided": lambda array: np.lib.stride_tricks.as_strided(array, (2, 2), (8, 4)),
+    "iterator": lambda array: iter(array.reshape(-1)),
+    "broadcast": lambda array: np.broadcast_to(array, (5, *array.shape)),
+}
+
+
+@pytest.mark.parametrize("hold", HOLDERS.values(), ids=HOLDERS)
+def test_whoever_holds_any_of_it_keeps_it(hold):
+    make = Recycler(keep=2).empty
+    array = make((3, 4), F4)
+    place = address(array)
+    held = hold(array)
+    del array
+    others = [make((3, 4), F4) for _ in range(5)]
+    assert place not in map(address, others)
+    assert not any(np.shares_memory(a, b) for a, b in itertools.combinations(others, 2))
+    del held
+    assert place in [address(other) for other in [make((3, 4), F4)]]
+
+
+def test_only_so_many_are_kept():
+    recycler = Recycler(keep=3)
+    many = [recycler.empty((2,), F4) for _ in range(8)]
+    places = [address(array) for array in many]
+    assert len(set(places)) == 8
+    assert [len(kept) for kept in recycler._kept.values()] == [3]
+    del many
+    again = [recycler.empty((2,), F4) for _ in range(3)]
+    assert {address(array) for array in again} == set(places[:3])
+
+
+def test_shapes_and_types_are_apart():
+    make = Recycler().empty
+    shapes = [((6,), F4), ((2, 3), F4), ((6,), np.dtype(np.int32)), ((6,), np.dtype(bool))]
+    for shape, dtype in [*shapes, *shapes[::-1]]:
+        array = make(shape, dtype)
+        assert (array.shape, array.dtype) == (shape, dtype)
+        assert array.flags.c_contiguous
+        del array
+
+
+def test_what_a_user_makes_of_an_array_does_not_outlive_it():
+    make = Recycler(keep=1).empty
+    places = set()
+    for _ in range(3):
+        array = make((6,), F4)
+        places.add(address(array))
+        assert array.flags.writeable
+        array.setflags(write=False)
+        del array
+    assert len(places) == 1
+
+
+def test_an_array_pickles_as_any_other():
+    array = Recycler().empty((2, 3), F4)
+    array[:] = 4
+    np.testing.assert_array_equal(pickle.loads(pickle.dumps(array)), array)
