@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from numba import njit
 
+from flockenv.effects.base import ties
 from flockenv.kernels import like, unaliased
 from flockenv.scene import Scene
 from flockenv.state import State
@@ -23,7 +24,8 @@ __all__ = ["MIXES", "by_hand"]
 
 FAST: dict[str, Any] = {"fastmath": {"contract"}, "error_model": "numpy", "nogil": True, "_nrt": False}
 PARTS: dict[str, Any] = {"forceinline": True, **FAST}
-ROWS = 7  # of scratch: x, y, vx, vy, the wish, and who lives
+WIDTH = 16  # lanes
+ROWS = 9  # of scratch: x, y, vx, vy, the wish, who lives, and where to from somebody in the same place
 
 
 @njit(**PARTS)
@@ -86,137 +88,154 @@ def _move(width):
     return move
 
 
+def _rows(width):
+    """Where each sum lies in a flat array: at constant distances the compiler sees that none of them is another."""
+    return tuple(np.uint64(k * width) for k in range(10))
+
+
 # --- what neighbours come to, by mix --------------------------------------------------------------------------------
 
 
 def _three(width):
     """Separation, alignment and cohesion."""
+    at = _rows(width)
 
     @njit(**PARTS)
-    def wish(now, sums, n, blocks, p):
+    def wish(now, sums, number, n, blocks, p):
         size, apart, agree, near, w_apart, w_agree, w_near = p[0], p[1], p[2], p[3], p[4], p[5], p[6]
         zero, one, inverse = like(size, 0.0), like(size, 1.0), like(size, 1.0) / size
         for block in range(blocks):
             first = np.uint64(block * width)
             for lane in range(np.uint64(width)):
-                for k in range(np.uint64(8)):
-                    sums[k, lane] = zero
+                for k in range(8):
+                    sums[at[k] + lane] = zero
             for j in range(np.uint64(n)):
-                xj, yj, ux, uy = now[0, j], now[1, j], now[2, j], now[3, j]
+                xj, yj, ux, uy, tx, ty = now[0, j], now[1, j], now[2, j], now[3, j], now[7, j], now[8, j]
                 own = np.int32(j - first)
                 for lane in range(np.uint64(width)):
                     dx = _image(xj - now[0, first + lane], size, inverse)
                     dy = _image(yj - now[1, first + lane], size, inverse)
                     square = dx * dx + dy * dy
-                    other = own != np.int32(lane)
-                    pushed = other & (square < apart) & (square > like(square, 1e-30))
-                    share = one / square if pushed else zero
+                    other = own != number[lane]
+                    alone = square > like(square, 1e-30)
+                    pushed = other & (square < apart)
+                    share = one / square if alone else zero
+                    push_x = dx * share if alone else tx - now[7, first + lane]
+                    push_y = dy * share if alone else ty - now[8, first + lane]
                     with_me, by_me = other & (square < agree), other & (square < near)
-                    sums[0, lane] -= dx * share
-                    sums[1, lane] -= dy * share
-                    sums[2, lane] += ux if with_me else zero
-                    sums[3, lane] += uy if with_me else zero
-                    sums[4, lane] += one if with_me else zero
-                    sums[5, lane] += dx if by_me else zero
-                    sums[6, lane] += dy if by_me else zero
-                    sums[7, lane] += one if by_me else zero
+                    sums[at[0] + lane] -= push_x if pushed else zero
+                    sums[at[1] + lane] -= push_y if pushed else zero
+                    sums[at[2] + lane] += ux if with_me else zero
+                    sums[at[3] + lane] += uy if with_me else zero
+                    sums[at[4] + lane] += one if with_me else zero
+                    sums[at[5] + lane] += dx if by_me else zero
+                    sums[at[6] + lane] += dy if by_me else zero
+                    sums[at[7] + lane] += one if by_me else zero
             for lane in range(np.uint64(width)):
                 i = first + lane
-                some = sums[4, lane] > zero
-                mates = one / sums[4, lane] if some else zero
-                company = one / sums[7, lane] if sums[7, lane] > zero else zero
-                agree_x = sums[2, lane] * mates - now[2, i] if some else zero
-                agree_y = sums[3, lane] * mates - now[3, i] if some else zero
-                now[4, i] = w_apart * sums[0, lane] + w_agree * agree_x + w_near * (sums[5, lane] * company)
-                now[5, i] = w_apart * sums[1, lane] + w_agree * agree_y + w_near * (sums[6, lane] * company)
+                some = sums[at[4] + lane] > zero
+                mates = one / sums[at[4] + lane] if some else zero
+                company = one / sums[at[7] + lane] if sums[at[7] + lane] > zero else zero
+                agree_x = sums[at[2] + lane] * mates - now[2, i] if some else zero
+                agree_y = sums[at[3] + lane] * mates - now[3, i] if some else zero
+                now[4, i] = w_apart * sums[at[0] + lane] + w_agree * agree_x + w_near * (sums[at[5] + lane] * company)
+                now[5, i] = w_apart * sums[at[1] + lane] + w_agree * agree_y + w_near * (sums[at[6] + lane] * company)
 
     return wish
 
 
 def _two(width):
     """Separation and cohesion."""
+    at = _rows(width)
 
     @njit(**PARTS)
-    def wish(now, sums, n, blocks, p):
+    def wish(now, sums, number, n, blocks, p):
         size, apart, near, w_apart, w_near = p[0], p[1], p[3], p[4], p[6]
         zero, one, inverse = like(size, 0.0), like(size, 1.0), like(size, 1.0) / size
         for block in range(blocks):
             first = np.uint64(block * width)
             for lane in range(np.uint64(width)):
-                for k in range(np.uint64(5)):
-                    sums[k, lane] = zero
+                for k in range(5):
+                    sums[at[k] + lane] = zero
             for j in range(np.uint64(n)):
-                xj, yj = now[0, j], now[1, j]
+                xj, yj, tx, ty = now[0, j], now[1, j], now[7, j], now[8, j]
                 own = np.int32(j - first)
                 for lane in range(np.uint64(width)):
                     dx = _image(xj - now[0, first + lane], size, inverse)
                     dy = _image(yj - now[1, first + lane], size, inverse)
                     square = dx * dx + dy * dy
-                    other = own != np.int32(lane)
-                    pushed = other & (square < apart) & (square > like(square, 1e-30))
-                    share = one / square if pushed else zero
+                    other = own != number[lane]
+                    alone = square > like(square, 1e-30)
+                    pushed = other & (square < apart)
+                    share = one / square if alone else zero
+                    push_x = dx * share if alone else tx - now[7, first + lane]
+                    push_y = dy * share if alone else ty - now[8, first + lane]
                     by_me = other & (square < near)
-                    sums[0, lane] -= dx * share
-                    sums[1, lane] -= dy * share
-                    sums[2, lane] += dx if by_me else zero
-                    sums[3, lane] += dy if by_me else zero
-                    sums[4, lane] += one if by_me else zero
+                    sums[at[0] + lane] -= push_x if pushed else zero
+                    sums[at[1] + lane] -= push_y if pushed else zero
+                    sums[at[2] + lane] += dx if by_me else zero
+                    sums[at[3] + lane] += dy if by_me else zero
+                    sums[at[4] + lane] += one if by_me else zero
             for lane in range(np.uint64(width)):
                 i = first + lane
-                company = one / sums[4, lane] if sums[4, lane] > zero else zero
-                now[4, i] = w_apart * sums[0, lane] + w_near * (sums[2, lane] * company)
-                now[5, i] = w_apart * sums[1, lane] + w_near * (sums[3, lane] * company)
+                company = one / sums[at[4] + lane] if sums[at[4] + lane] > zero else zero
+                now[4, i] = w_apart * sums[at[0] + lane] + w_near * (sums[at[2] + lane] * company)
+                now[5, i] = w_apart * sums[at[1] + lane] + w_near * (sums[at[3] + lane] * company)
 
     return wish
 
 
 def _seeing(width):
     """Separation, alignment and cohesion, of whom is within a field of view."""
+    at = _rows(width)
 
     @njit(**PARTS)
-    def wish(now, sums, n, blocks, p):
+    def wish(now, sums, number, n, blocks, p):
         size, apart, agree, near, w_apart, w_agree, w_near, view = p[0], p[1], p[2], p[3], p[4], p[5], p[6], p[7]
         zero, one, inverse = like(size, 0.0), like(size, 1.0), like(size, 1.0) / size
         for block in range(blocks):
             first = np.uint64(block * width)
             for lane in range(np.uint64(width)):
-                for k in range(np.uint64(8)):
-                    sums[k, lane] = zero
+                for k in range(8):
+                    sums[at[k] + lane] = zero
                 speed = np.sqrt(
                     now[2, first + lane] * now[2, first + lane] + now[3, first + lane] * now[3, first + lane]
                 )
                 share = one / speed if speed > zero else zero
-                sums[8, lane], sums[9, lane] = now[2, first + lane] * share, now[3, first + lane] * share
+                sums[at[8] + lane], sums[at[9] + lane] = now[2, first + lane] * share, now[3, first + lane] * share
             for j in range(np.uint64(n)):
-                xj, yj, ux, uy = now[0, j], now[1, j], now[2, j], now[3, j]
+                xj, yj, ux, uy, tx, ty = now[0, j], now[1, j], now[2, j], now[3, j], now[7, j], now[8, j]
                 own = np.int32(j - first)
                 for lane in range(np.uint64(width)):
                     dx = _image(xj - now[0, first + lane], size, inverse)
                     dy = _image(yj - now[1, first + lane], size, inverse)
                     square = dx * dx + dy * dy
-                    ahead = dx * sums[8, lane] + dy * sums[9, lane]
-                    still = sums[8, lane] * sums[8, lane] + sums[9, lane] * sums[9, lane] <= zero
-                    seen = (own != np.int32(lane)) & ((ahead * abs(ahead) >= view * square) | still)
-                    pushed = seen & (square < apart) & (square > like(square, 1e-30))
-                    share = one / square if pushed else zero
+                    ahead = dx * sums[at[8] + lane] + dy * sums[at[9] + lane]
+                    still = sums[at[8] + lane] * sums[at[8] + lane] + sums[at[9] + lane] * sums[at[9] + lane] <= zero
+                    seen = (own != number[lane]) & ((ahead * abs(ahead) >= view * square) | still)
+                    alone = square > like(square, 1e-30)
+                    pushed = seen & (square < apart)
+                    share = one / square if alone else zero
+                    push_x = dx * share if alone else tx - now[7, first + lane]
+                    push_y = dy * share if alone else ty - now[8, first + lane]
                     with_me, by_me = seen & (square < agree), seen & (square < near)
-                    sums[0, lane] -= dx * share
-                    sums[1, lane] -= dy * share
-                    sums[2, lane] += ux if with_me else zero
-                    sums[3, lane] += uy if with_me else zero
-                    sums[4, lane] += one if with_me else zero
-                    sums[5, lane] += dx if by_me else zero
-                    sums[6, lane] += dy if by_me else zero
-                    sums[7, lane] += one if by_me else zero
+                    sums[at[0] + lane] -= push_x if pushed else zero
+                    sums[at[1] + lane] -= push_y if pushed else zero
+                    sums[at[2] + lane] += ux if with_me else zero
+                    sums[at[3] + lane] += uy if with_me else zero
+                    sums[at[4] + lane] += one if with_me else zero
+                    sums[at[5] + lane] += dx if by_me else zero
+                    sums[at[6] + lane] += dy if by_me else zero
+                    sums[at[7] + lane] += one if by_me else zero
             for lane in range(np.uint64(width)):
                 i = first + lane
-                some = sums[4, lane] > zero
-                mates = one / sums[4, lane] if some else zero
-                company = one / sums[7, lane] if sums[7, lane] > zero else zero
-                agree_x = sums[2, lane] * mates - now[2, i] if some else zero
-                agree_y = sums[3, lane] * mates - now[3, i] if some else zero
-                now[4, i] = w_apart * sums[0, lane] + w_agree * agree_x + w_near * (sums[5, lane] * company)
-                now[5, i] = w_apart * sums[1, lane] + w_agree * agree_y + w_near * (sums[6, lane] * company)
+                some = sums[at[4] + lane] > zero
+                mates = one / sums[at[4] + lane] if some else zero
+                company = one / sums[at[7] + lane] if sums[at[7] + lane] > zero else zero
+                agree_x = sums[at[2] + lane] * mates - now[2, i] if some else zero
+                agree_y = sums[at[3] + lane] * mates - now[3, i] if some else zero
+                now[4, i] = w_apart * sums[at[0] + lane] + w_agree * agree_x + w_near * (sums[at[5] + lane] * company)
+                now[5, i] = w_apart * sums[at[1] + lane] + w_agree * agree_y + w_near * (sums[at[6] + lane] * company)
 
     return wish
 
@@ -232,7 +251,7 @@ def _kernel(mix: str, width: int) -> Any:
     wish, move = MIXES[mix](width), _move(width)
 
     @njit(**FAST)
-    def step(x, v, alive, drive, body, work, p, dt, steps, now, want, sums):
+    def step(x, v, alive, drive, body, work, p, dt, steps, now, want, sums, number):
         unaliased()
         n = x.shape[2]
         blocks = (n + width - 1) // width
@@ -242,7 +261,7 @@ def _kernel(mix: str, width: int) -> Any:
                 want[1, i] = drive[1, b, i] if drive.shape[1] > 0 else like(dt, 0.0)
             _load(now, x, v, alive, b, n)
             for _ in range(steps):
-                wish(now, sums, n, blocks, p)
+                wish(now, sums, number, n, blocks, p)
                 if not move(now, want, body, blocks, p[0], dt):
                     return b
                 work[b, 0] += 1
@@ -258,7 +277,7 @@ def by_hand(mix: str, scene: Scene, state: State, steps: int) -> Callable[[], ob
 
     Its parameters: size, the squares of the radii, the weights, and cos(fov / 2) |cos(fov / 2)|.
     """
-    real, width = np.dtype(scene.dtype), 64 // np.dtype(scene.dtype).itemsize
+    real, width = np.dtype(scene.dtype), WIDTH
     padded = -(-scene.agents // width) * width
     rules = {effect.kind: effect for effect in scene.effects}
     found = [rules.get(kind) for kind in ("separation", "alignment", "cohesion")]
@@ -267,10 +286,11 @@ def by_hand(mix: str, scene: Scene, state: State, steps: int) -> Callable[[], ob
     numbers += [*(r.weight if r else 0 for r in found), cosine * abs(cosine)]
     body = np.ones((3, padded), real)
     body[:, : scene.agents] = scene.body.mass, scene.body.max_speed, scene.body.max_force
-    now, want, sums = (np.zeros(shape, real) for shape in ((ROWS, padded), (2, padded), (10, width)))
+    now, want, sums = (np.zeros(shape, real) for shape in ((ROWS, padded), (2, padded), (10 * width,)))
+    now[7:, : scene.agents] = ties(scene.agents, 2).T
     arguments = (
         state.x, state.v, state.alive, np.zeros((2, 0, 0), real), body, state.work, np.array(numbers, real),
-        real.type(scene.dt), steps, now, want, sums,
+        real.type(scene.dt), steps, now, want, sums, np.arange(width, dtype=np.int32),
     )  # fmt: skip
     kernel = _kernel(mix, width)
     return lambda: kernel(*arguments)

@@ -1,7 +1,11 @@
-"""flockenv on the command line: list | run | render | explain | schema. Errors are one line on stderr, exit code 2."""
+"""flockenv on the command line: list | run | render | explain | warmup | schema.
+
+Errors are one line on stderr, exit code 2.
+"""
 
 from __future__ import annotations
 
+import functools
 import json
 import math
 import re
@@ -9,6 +13,7 @@ import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from time import perf_counter
 from typing import TYPE_CHECKING, Annotated, Any, get_args
 
 import typer
@@ -226,6 +231,60 @@ def explain(scene: SceneFile) -> None:
     counted = (f"{number:g} {name.replace('_', ' ')}" for name, number in found.work.items())
     console.print(f"Per step: {', '.join(counted)}")
     _table(console, "Left out, because nobody asked for it", ([line] for line in found.left_out), [""])
+
+
+@app.command()
+def warmup(
+    what: Annotated[
+        list[str] | None, typer.Argument(metavar="[TASK|SCENE.yaml]...", help="What to compile [default: every task].")
+    ] = None,
+    dtype: Annotated[
+        str | None, typer.Option(metavar="float32|float64", help="Precision instead of their own.")
+    ] = None,
+) -> None:
+    """Compile ahead what tasks and scenes need, so that no first step has to wait; show how long each took."""
+    from flockenv.compilation import compiled
+    from flockenv.config import load_scene
+    from flockenv.tasks import TASKS
+
+    names = what or sorted(TASKS)
+    if dtype not in (None, "float32", "float64"):
+        raise ValueError(f"--dtype = {shown(dtype)}: allowed: float32, float64{nearest(dtype, ('float32', 'float64'))}")
+    change = {} if dtype is None else {"dtype": dtype}
+    jobs: list[tuple[str, Callable[[], None]]] = []
+    for name in names:
+        if name in TASKS:
+            jobs.append((name, functools.partial(_first_step_of_task, TASKS[name](**change))))
+        elif name.endswith((".yaml", ".yml")) or Path(name).exists():
+            scene = load_scene(Path(name)).model_copy(update=change)
+            jobs.append((name, functools.partial(_first_step_of_scene, scene)))
+        else:
+            tasks = f"{nearest(name, TASKS)} ({', '.join(TASKS)})"
+            raise ValueError(f"{shown(name)}: no such task{tasks}, nor a .yaml file")
+    rows = []
+    with _progress("compiling", len(jobs), "kernels") as progress:
+        for done, (name, job) in enumerate(jobs):
+            progress(done)
+            before, began = len(compiled()), perf_counter()
+            job()
+            took, new = perf_counter() - began, compiled()[before:]
+            note = f"compiled in {sum(k.seconds for k in new):.1f} s" if new else "was in the cache"
+            rows.append((name, note, f"{took:.1f}"))
+    _table(_console(), "First steps", rows, ("of", "", "s"))
+
+
+def _first_step_of_task(task: Task) -> None:
+    import numpy as np
+
+    from flockenv.world import World
+
+    world = World(task)
+    world.reset(0)
+    world.step(np.zeros((1, task.learners, task.action_layout.size)))
+
+
+def _first_step_of_scene(scene: Scene) -> None:
+    scene.step(scene.start(0))
 
 
 @app.command()

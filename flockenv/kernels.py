@@ -27,6 +27,8 @@ from numba.core import types
 from numba.extending import intrinsic, overload
 from numba.np import arrayobj
 
+from flockenv import compilation  # noqa: F401  # tells how long compiling takes
+
 __all__ = [
     "FAST",
     "Vec",
@@ -54,22 +56,25 @@ FAST = frozenset({"contract"})
 # _nrt=False: no reference counts. Arrays belong to whoever called the entry point, for as long as it runs; counting
 # every view of them with a locked instruction took nine tenths of the time of a world of 32 agents. So nothing compiled
 # here may allocate (numba says so when it compiles): scratch is an argument.
-_OPTIONS: dict[str, Any] = {"fastmath": set(FAST), "error_model": "numpy", "nogil": True, "_nrt": False}
+_OPTIONS: Any = {
+    "forceinline": True, "fastmath": set(FAST), "error_model": "numpy", "nogil": True, "_nrt": False,
+}  # fmt: skip
+_njit: Any = numba.njit  # numba's stubs do not know `_nrt`
 
 
 def law(function: F) -> F:
     """Mark a scalar law: branch-free if it can be, inlined into whatever loop calls it, never called on its own."""
-    return cast(F, numba.njit(forceinline=True, **_OPTIONS)(function))
+    return cast(F, _njit(**_OPTIONS)(function))
 
 
 def unfused(function: F) -> F:
     """Mark a law that must give the same bits in every loop it is inlined into: no multiply is fused with an add."""
-    return cast(F, numba.njit(forceinline=True, **{**_OPTIONS, "fastmath": False})(function))
+    return cast(F, _njit(**{**_OPTIONS, "fastmath": False})(function))
 
 
 def kernel(function: F) -> F:
     """Mark a function over the arrays of one world; compiled as a part of the generated file that calls it."""
-    return cast(F, numba.njit(forceinline=True, **_OPTIONS)(function))
+    return cast(F, _njit(**_OPTIONS)(function))
 
 
 def like(x: float, constant: float) -> float:
@@ -83,7 +88,7 @@ def finite(x: float) -> bool:
     return abs(x) < like(x, math.inf)
 
 
-@overload(like, jit_options={"forceinline": True, **_OPTIONS})
+@overload(like, jit_options=_OPTIONS)
 def _like(x, constant):  # type: ignore[no-untyped-def]  # numba compares signatures, annotations included
     to = types.float32 if x == types.float32 else types.float64
     return lambda x, constant: to(constant)
@@ -106,8 +111,7 @@ def unaliased(typing_context: Any) -> Any:
     return types.void(), generate
 
 
-@intrinsic
-def _fetch_add(typing_context: Any, array: Any, amount: Any) -> Any:
+def _add_at_once(typing_context: Any, array: Any, amount: Any) -> Any:
     """Add to array[0] in one indivisible step; return what was there before."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
@@ -117,6 +121,8 @@ def _fetch_add(typing_context: Any, array: Any, amount: Any) -> Any:
 
     return types.int64(array, types.int64), generate
 
+
+_fetch_add: Any = intrinsic(_add_at_once)  # Any: to numba's stubs an intrinsic that is called never returns
 
 _PATIENCE = 2000  # rounds of waiting before the core is offered to somebody else
 
@@ -129,10 +135,10 @@ if os.name == "posix":
 def wait_for_team(sync: Any, team: int) -> None:
     """Wait until all `team` threads that work on one world have come here; sync: one int64, 0 at the start."""
     if team > 1:
-        arrived = _fetch_add(sync, 1) + 1  # type: ignore[call-arg,operator]  # an intrinsic's signature is its typing
+        arrived = _fetch_add(sync, 1) + 1
         all_here = (arrived + team - 1) // team * team
         rounds = 0
-        while _fetch_add(sync, 0) < all_here:  # type: ignore[call-arg,operator]
+        while _fetch_add(sync, 0) < all_here:
             rounds += 1
             if rounds > _PATIENCE:
                 _give_way()

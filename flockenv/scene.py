@@ -42,6 +42,9 @@ WORTH_SHARING = 4096
 
 SYNC = SHARED.split(", ").index("sync")
 
+EXACT = 2**24
+"""Whole numbers, and so numbers of agents, that float32 tells apart."""
+
 MEMORY_LIMIT = 8 * 2**30
 """Bytes that a state and its scratch may take before a scene is refused."""
 
@@ -101,18 +104,17 @@ class Workspace:
         padded = -(-agents // width) * width
         sorts = parts.sweeps and agents >= FEWEST_AGENTS
         swept, cells = padded if parts.sweeps else 1, agents if sorts else 1
-        real = {
-            **{name: padded * d for name in ("pos", "vel", "origin")},
+        real: dict[str, int | tuple[int, ...]] = {
+            **dict.fromkeys(("pos", "vel", "origin", "want"), padded * d),
             "stages": (max(parts.integrator.stages, 1), padded * d),
-            **{name: padded for name in ("mass", "radius", "max_speed", "max_force", "living")},
-            "want": padded * d,
+            **dict.fromkeys(("mass", "radius", "max_speed", "max_force", "living"), padded),
             "tie": padded * d if "t0" in parts.fields else 1,
             "felt": max(swept * d * len(parts.targets), 1),
             "sorted_": (parts.rows, swept + width),
             "records": (padded if sorts else 1, parts.numbers),
         }
         arrays = {name: _aligned(shape, dtype) for name, shape in real.items()}
-        whole = {"order": swept, "cell": padded if sorts else 1, "start": cells + 1, "offset": (team, cells)}
+        whole = {"order": (swept,), "cell": (padded if sorts else 1,), "start": (cells + 1,), "offset": (team, cells)}
         arrays |= {name: np.zeros(shape, np.int32) for name, shape in whole.items()}
         arrays |= {"bounds": np.zeros((team, 6)), "tally": np.zeros(team, np.int64), "sync": np.zeros(8, np.int64)}
         for name, pad in (("mass", 1), ("radius", 0), ("max_speed", 1), ("max_force", 1)):
@@ -122,7 +124,8 @@ class Workspace:
             blocks = ties(padded, d).reshape(-1, width, d).transpose(0, 2, 1)
             arrays["tie"][:] = blocks.reshape(-1)
         arrays["number"] = np.arange(width, dtype=np.int32)
-        own = tuple((_aligned(len(parts.slots) * width, dtype), np.zeros((MAX_RANGES, 3), np.int64)) for _ in range(team))
+        lanes = len(parts.slots) * width
+        own = tuple((_aligned(lanes, dtype), np.zeros((MAX_RANGES, 3), np.int64)) for _ in range(team))
         return cls(tuple(arrays[name] for name in SHARED.split(", ")[:-2]), own)
 
     def of(self, rank: int) -> tuple[NDArray[Any], ...]:
@@ -135,7 +138,8 @@ def _aligned(shape: int | tuple[int, ...], dtype: Any) -> NDArray[Any]:
     size = int(np.prod(shape)) * np.dtype(dtype).itemsize
     raw = np.zeros(size + 64, np.uint8)
     skip = -raw.ctypes.data % 64
-    return raw[skip : skip + size].view(dtype).reshape(shape)
+    aligned: NDArray[Any] = raw[skip : skip + size].view(dtype).reshape(shape)
+    return aligned
 
 
 class Scene(Record):
@@ -166,6 +170,10 @@ class Scene(Record):
             for k, group in enumerate(self.groups):
                 if 2 * group.radius > min(self.space.size):
                     raise ValueError(f"groups[{k}].radius = {group.radius:g} does not fit into a box of size {size}")
+        if self.dtype == "float32" and self.agents > EXACT:
+            raise ValueError(
+                f"groups: {self.agents:,} agents: float32 counts exactly up to {EXACT:,}; use dtype = float64"
+            )
         needed = self.bytes_per_world()
         if needed > MEMORY_LIMIT:
             each = needed / self.agents
@@ -203,7 +211,7 @@ class Scene(Record):
         return tuple(group.role for group in self.groups for _ in range(group.count))
 
     def bytes_per_world(self) -> int:
-        """Memory of a state and its scratch, in bytes, counted before anything is allocated (docs/performance.md)."""
+        """Memory of a state and its scratch, in bytes, counted before anything is allocated."""
         real = 8 if self.dtype == "float64" else 4
         d, parts = self.dimension, self.parts
         reals = 2 * d + 4  # positions, velocities, bodies

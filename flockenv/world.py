@@ -106,6 +106,8 @@ class World:
         )  # fmt: skip
         self._shapes = tuple(shape for shape, _ in fields)  # of a Step
         self._dtypes = tuple(np.dtype(kind) for _, kind in fields)
+        self._everywhere = np.ones(b, np.bool_)
+        self._untold = tuple(np.empty(shape, kind) for shape, kind in fields[1:])  # what a reset says nothing of
         large = 4 * math.prod(self._shapes[0]) >= RECYCLE
         self._empty = Recycler().empty if large else np.empty
 
@@ -129,7 +131,7 @@ class World:
         """Pickle what cannot be made anew."""
         made = (
             "_kernel", "_actions", "_worlds", "_clock", "_scratch", "_kept", "_measured", "_shapes", "_dtypes",
-            "_empty",
+            "_everywhere", "_untold", "_empty",
         )  # fmt: skip
         return {name: value for name, value in vars(self).items() if name not in made}
 
@@ -164,7 +166,11 @@ class World:
             raise ValueError(f"into has shape {into.shape} and type {into.dtype}, expected {self._shapes[0]} float32")
         self._seed(seeds, rows)
         observation: Rows = self._empty(self._shapes[0], self._dtypes[0]) if into is None else into
-        self._kernel.begin(rows, into is None, *self._worlds, *self._scratch[0][1], observation)
+        decision, rest = self._scratch[0]
+        self._kernel.play(
+            False, rows, into is None, False, 0, self.worlds, self._actions, *self._worlds, *self._clock, 0,
+            *decision, *rest, *self._kept, observation, *self._untold,
+        )  # fmt: skip
         for numbers in (self._sums, self._last, self.paid):
             numbers[rows] = 0
         return observation
@@ -221,9 +227,10 @@ class World:
         def part(k: int) -> tuple[int, int]:
             own = (crew == 1, self.worlds * k // crew, self.worlds * (k + 1) // crew)
             decision, rest = self._scratch[k]
-            return self._kernel.decide(  # type: ignore[no-any-return]
-                *own, self._actions, *self._worlds, *self._clock, limit, *decision, *rest, *self._kept, *step
-            )
+            return self._kernel.play(  # type: ignore[no-any-return]
+                True, self._everywhere, True, *own, self._actions, *self._worlds, *self._clock, limit,
+                *decision, *rest, *self._kept, *step,
+            )  # fmt: skip
 
         if crew == 1:
             return part(0)

@@ -87,16 +87,17 @@ class EffectRow:
 
     @property
     def name(self) -> str:
-        fov = getattr(self.effect, "fov", 360.0)
-        return self.effect.kind + ("" if fov == 360.0 else "_cone")
+        fov, nearest = getattr(self.effect, "fov", 360.0), getattr(self.effect, "nearest", None)
+        return self.effect.kind + ("" if fov == 360.0 else "_cone") + (f"_nearest_{nearest}" if nearest else "")
 
 
+# An idle effect sees as the acting one does, so that both are one compiled kernel.
 EFFECTS = (
     EffectRow(Drag(rate=0.4), Drag(rate=0)),
     EffectRow(Separation(weight=1.3, radius=2.5), Separation(weight=0, radius=2.5)),
-    EffectRow(Separation(weight=1.3, radius=2.5, fov=200)),
-    EffectRow(Alignment(weight=0.7, radius=3, fov=270), Alignment(weight=0, radius=3)),
-    EffectRow(Cohesion(weight=0.9, radius=3, fov=270), Cohesion(weight=0, radius=3)),
+    EffectRow(Separation(weight=1.3, radius=2.5, fov=200, nearest=3)),
+    EffectRow(Alignment(weight=0.7, radius=3, fov=270), Alignment(weight=0, radius=3, fov=270)),
+    EffectRow(Cohesion(weight=0.9, radius=2.8, fov=240), Cohesion(weight=0, radius=2.8, fov=240)),
     EffectRow(AvoidObstacles(weight=5, horizon=3, margin=0.1), AvoidObstacles(weight=0, horizon=3)),
 )
 
@@ -168,10 +169,94 @@ def scene_of(*effects: Effect, dimension: int = 2, space: Space | None = None, *
     return Scene(dimension=dimension, space=space or Plane(), effects=effects, **given)
 
 
-def everything(dimension: int, **fields: Any) -> Scene:
-    """Return all effects of the catalogue at once, on a torus."""
-    kinds = {row.effect.kind: row.effect for row in EFFECTS}
-    return scene_of(*kinds.values(), dimension=dimension, space=SPACES["torus"][dimension], **fields)
+FIRST = tuple({row.effect.kind: row for row in reversed(EFFECTS)}.values())[::-1]
+"""The first row of each kind of effect."""
+
+
+def everything(dimension: int, *chosen: Effect, **fields: Any) -> Scene:
+    """Return all kinds of effects at once, on a torus unless another space is given.
+
+    With some chosen, the others are there and idle: one kernel serves for tests of each of them, as long as they look
+    around in the same ways (sweep.Parts.sights: who shares a radius, and who has a view cone at all).
+    """
+    own = {effect.kind: effect for effect in chosen}
+    rest = {row.effect.kind: row.idle if chosen else row.effect for row in FIRST}
+    given = {"space": SPACES["torus"][dimension]} | fields
+    return scene_of(*(rest | own).values(), dimension=dimension, **given)
+
+
+@dataclass(frozen=True)
+class Variant:
+    """A kernel that tests of batches, steps and threads share: laws, space, dimension, method and precision.
+
+    `make(count, edge)` returns a scene of so many agents spread over a region of that edge, m; no number of it is
+    compiled in.
+    """
+
+    name: str
+    effects: tuple[Effect, ...]  # none = all kinds
+    space: str
+    dimension: int
+    dtype: str = "float64"
+    method: Integrator = field(default_factory=SemiImplicitEuler)
+
+    def make(self, count: int, edge: float, **fields: Any) -> Scene:
+        corner = (edge,) * self.dimension
+        space = Plane() if self.space == "plane" else {"torus": Torus, "box": Box}[self.space](size=corner)
+        spawn = Spawn(low=(0.0,) * self.dimension, high=corner, speed=(0.2, 1.5))
+        given: dict[str, Any] = {
+            "space": space, "dtype": self.dtype, "integrator": self.method, "dt": 0.05,
+            "groups": (Group(count=count, max_speed=3, max_force=8, radius=0.05, spawn=spawn),),
+        } | fields  # fmt: skip
+        if self.effects:
+            return scene_of(*self.effects, dimension=self.dimension, **given)
+        return everything(self.dimension, **given)
+
+
+NEAREST = (
+    # both sights of two laws are one here
+    Variant("nearest_plane", (
+        Separation(weight=1.3, radius=2.5, nearest=1),
+        Alignment(weight=0.7, radius=3, nearest=6),
+        Cohesion(weight=0.9, radius=3, nearest=6),
+    ), "plane", 2),
+    # and here one law sees everybody near
+    Variant("nearest_plane_3", (
+        Separation(weight=1.3, radius=2.5, fov=300, nearest=6),
+        Alignment(weight=0.7, radius=3, nearest=32),
+        Cohesion(weight=0.9, radius=2, fov=240),
+    ), "plane", 3, method=ExplicitEuler()),
+    Variant("nearest_torus_single", (
+        Separation(weight=1.3, radius=2.5, nearest=6),
+        Alignment(weight=0.7, radius=3, fov=270, nearest=1),
+        Cohesion(weight=0.9, radius=2, nearest=7),
+    ), "torus", 2, "float32"),
+    Variant("nearest_torus_3", (
+        Separation(weight=1.3, radius=2.5, fov=300, nearest=1),
+        Alignment(weight=0.7, radius=3, fov=270, nearest=6),
+        Cohesion(weight=0.9, radius=2),
+    ), "torus", 3, method=ExplicitEuler()),
+)  # fmt: skip
+"""Rules for the nearest few: 1, 6 and 32 of them, with and without a view cone, in planes and on toruses."""
+
+NEAREST_MANY = Variant("nearest_torus_many", (
+    Separation(weight=1.3, radius=2.5),
+    Alignment(weight=0.7, radius=3, fov=270, nearest=30),  # at whole distances up to 2 there are 32
+    Cohesion(weight=0.9, radius=2),
+), "torus", 3)  # fmt: skip
+"""About the most that a rule may heed, in a view cone and around the edges of a torus; half a minute to compile."""
+
+VARIANTS = (
+    Variant("torus", (), "torus", 2),
+    Variant("torus_3", (), "torus", 3),
+    Variant("torus_single", (), "torus", 2, "float32"),
+    Variant("torus_single_rk4", (), "torus", 2, "float32", RK4()),
+    Variant("plane_single", (), "plane", 2, "float32"),
+    Variant("plane_3_single", (), "plane", 3, "float32"),
+    Variant("box", (Separation(weight=1.3, radius=1.0),), "box", 2),
+    *NEAREST,
+)
+"""Every space, dimension, precision and method; their combinations are tried when slow tests run (test_scene.py)."""
 
 
 def rotation(dimension: int, seed: int, upright: bool = False) -> Array:

@@ -55,6 +55,11 @@ def oscillator(tether: Any, way: str, w: float = W, zeta: float = ZETA, **limits
     return in_python if way == "python" else compiled
 
 
+def spring(context: Any, pos: Array, vel: Array, out: Array) -> None:
+    """An acceleration as `advance` calls it, over flat rows."""
+    out[...] = -pos
+
+
 def at_start(state: State) -> State:
     state.x[...], state.v[...] = X0, V0
     return state
@@ -232,21 +237,39 @@ def test_a_law_never_knows_which_method_integrates_it(row: IntegratorRow) -> Non
     state = at_start(blank(1, 1, 2, 0, 0.25))
     for _ in range(8):
         state = row.method(lambda x, v: 0 * x, state, 0.25)
-    np.testing.assert_allclose(state.pos, X0 + 2 * V0, rtol=1e-15)
+    np.testing.assert_allclose(state.pos, X0 + 2 * V0, rtol=4e-15)  # RK4 rounds four times per step
     np.testing.assert_array_equal(state.vel, V0)
 
 
 def test_stage_arrays_are_as_many_as_are_used() -> None:
     """With fewer than it declares a method would write into another's scratch: a guard behind them stays untouched."""
     for row in INTEGRATORS:
-        stages = np.full((row.method.stages + 2, 2, 3), 7.0)
-        x, v = np.ones((2, 3)), np.ones((2, 3))
-
-        def law(context: Any, pos: Array, vel: Array, out: Array) -> None:
-            out[...] = -pos
-
-        row.method.advance().py_func(law, (), x, v, 0.1, stages)
+        stages = np.full((row.method.stages + 2, 6), 7.0)
+        row.method.advance().py_func(spring, (), np.ones(6), np.ones(6), 0.1, stages, 0, 6)
         assert (stages[row.method.stages :] == 7).all()
+
+
+@METHODS
+def test_of_a_team_each_writes_his_own_part_alone(row: IntegratorRow) -> None:
+    """Threads that share a world share its rows: what one leaves of [first, end) or writes beyond it is a race."""
+    rng = np.random.default_rng(0)
+    start = (*rng.normal(size=(2, 12)), np.full((row.method.stages, 12), 7.0))
+    together, apart = [array.copy() for array in start], [array.copy() for array in start]
+    row.method.advance().py_func(spring, (), *together[:2], 0.1, together[2], 0, 12)
+    for first, end in ((0, 5), (5, 5), (5, 12)):
+
+        def law(context: Any, pos: Array, vel: Array, out: Array, mine: slice = slice(first, end)) -> None:
+            out[mine] = -pos[mine]
+
+        mine = [array.copy() for array in start]
+        row.method.advance().py_func(law, (), *mine[:2], 0.1, mine[2], first, end)
+        for before, after, whole in zip(start, mine, apart, strict=True):
+            np.testing.assert_array_equal(
+                np.delete(after, slice(first, end), -1), np.delete(before, slice(first, end), -1)
+            )
+            whole[..., first:end] = after[..., first:end]
+    for whole, once in zip(apart, together, strict=True):
+        np.testing.assert_array_equal(whole, once)
 
 
 def test_halving_the_step_brings_the_methods_together(tether: Any) -> None:

@@ -15,7 +15,7 @@ import pytest
 ROOT = Path(__file__).resolve().parent.parent
 
 LAYERS = (
-    {"refusals", "outputs", "recycle"},
+    {"refusals", "outputs", "recycle", "crew", "compilation"},
     {"records", "vec", "noise", "kernels"},
     {"state", "space", "steering", "arbitration"},
     {"neighbours", "shapes", "rows"},

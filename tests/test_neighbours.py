@@ -11,12 +11,12 @@ from scipy.spatial import cKDTree
 
 from flockenv.effects import Alignment, Cohesion, Separation
 from flockenv.kernels import entry
-from flockenv.neighbours import sort_agents
+from flockenv.neighbours import count_cells, place_of
 from flockenv.scene import Group, Scene
 from flockenv.space import Box, Space, Torus
 from flockenv.spawn import Spawn
 from flockenv.state import State
-from tests.catalogue import Array, everything, scene_of
+from tests.catalogue import NEAREST, NEAREST_MANY, VARIANTS, Array, Variant, everything, scene_of
 
 DT = 2.0**-10
 """s: one short step, whose change of velocity is the acceleration; a power of two divides exactly."""
@@ -26,16 +26,43 @@ DT = 2.0**-10
 
 
 def pairs(x: Array, radius: float, space: Space) -> tuple[Array, Array, Array]:
-    """Who (i) meets whom (j) and the offset between them, for all ordered pairs nearer than the radius."""
-    box = np.asarray(space.size) if isinstance(space, Torus) else None
-    tree = cKDTree(x, boxsize=box)
-    found = tree.query_pairs(radius * (1 + 1e-9), output_type="ndarray")
+    """Who (i) meets whom (j) and the offset between them, for all ordered pairs nearer than the radius.
+
+    In the precision of x, operation for operation: who is exactly as far as somebody else is so here too.
+    """
+    box = np.asarray(space.size, x.dtype) if isinstance(space, Torus) else None
+    tree = cKDTree(np.asarray(x, float), boxsize=box)
+    found = tree.query_pairs(radius * (1 + 1e-6), output_type="ndarray")
     i, j = np.concatenate([found, found[:, ::-1]]).T
     offset = x[j] - x[i]
     if box is not None:
         offset -= box * np.rint(offset / box)
     near = (offset**2).sum(axis=1) < radius**2
     return i[near], j[near], offset[near]
+
+
+def nearest_few(i: Array, square: Array, count: int) -> Array:
+    """Which of the pairs (i, .) are among the `count` with the smallest squares of their i, or as near as the last."""
+    order = np.lexsort((square, i))
+    who, first, how_many = np.unique(i[order], return_index=True, return_counts=True)
+    farthest = np.zeros(i.max() + 1, square.dtype)
+    farthest[who] = square[order][first + np.minimum(how_many, count) - 1]
+    return square <= farthest[i]
+
+
+def in_sight(effect: Any, x: Array, v: Array, space: Space) -> tuple[Array, Array, Array]:
+    """Whom everybody heeds under a rule: who is near, ahead, and among the nearest of those."""
+    i, j, offset = pairs(x, effect.radius, space)
+    if effect.fov < 360:
+        speed = np.linalg.norm(v, axis=1)
+        ahead = (offset * v[i]).sum(axis=1)
+        limit = math.cos(math.radians(effect.fov / 2)) * np.linalg.norm(offset, axis=1) * speed[i]
+        seen = (ahead >= limit) | (speed[i] == 0)
+        i, j, offset = i[seen], j[seen], offset[seen]
+    if effect.nearest and len(i):
+        few = nearest_few(i, (offset**2).sum(axis=1), effect.nearest)
+        i, j, offset = i[few], j[few], offset[few]
+    return i, j, offset
 
 
 def total(values: Array, i: Array, count: int) -> Array:
@@ -45,13 +72,9 @@ def total(values: Array, i: Array, count: int) -> Array:
 def expected(effect: Any, x: Array, v: Array, space: Space) -> Array:
     """The forces (N, D) of one of the three rules, written from formulas.md 1.2."""
     n = len(x)
-    i, j, offset = pairs(x, effect.radius, space)
-    if effect.fov < 360:
-        speed = np.linalg.norm(v, axis=1)
-        ahead = (offset * v[i]).sum(axis=1)
-        limit = math.cos(math.radians(effect.fov / 2)) * np.linalg.norm(offset, axis=1) * speed[i]
-        seen = (ahead >= limit) | (speed[i] == 0)
-        i, j, offset = i[seen], j[seen], offset[seen]
+    if effect.weight == 0:
+        return np.zeros_like(x)
+    i, j, offset = in_sight(effect, x, v, space)
     count = np.maximum(np.bincount(i, minlength=n), 1)[:, None]
     if isinstance(effect, Separation):
         return -effect.weight * total(offset / (offset**2).sum(axis=1, keepdims=True), i, n)
@@ -65,27 +88,22 @@ def expected(effect: Any, x: Array, v: Array, space: Space) -> Array:
 
 
 def rules(radius: float, fov: float = 270, chosen: int = -1) -> tuple[Separation, Alignment, Cohesion]:
-    """The three rules; with one chosen the others weigh nothing."""
+    """The three rules, each with a sight of its own; with one chosen the others weigh nothing."""
     weights = [1.0 if chosen in (-1, k) else 0.0 for k in range(3)]
     return (
         Separation(weight=1.3 * weights[0], radius=radius),
         Alignment(weight=0.7 * weights[1], radius=radius, fov=fov),
-        Cohesion(weight=0.9 * weights[2], radius=radius, fov=fov),
+        Cohesion(weight=0.9 * weights[2], radius=radius, fov=fov - 30),
     )
 
 
 def scene_with(effects: Any, space: Space | None, dimension: int, count: int) -> Scene:
-    """A scene of one rule in a plane; on a torus, of the kernel that the other tests use too."""
+    """A scene of the rules alone in a plane; on a torus (all three of them) of the kernel that other tests use too."""
     groups = (Group(count=count, spawn=Spawn(low=(0,) * dimension, high=(1,) * dimension)),)
-    if not isinstance(space, Torus):
-        return scene_of(*effects, dimension=dimension, space=space, groups=groups, dt=DT)
-    given = {e.kind: e for e in effects}
-    idle = {"drag": {"rate": 0.0}, "avoid_obstacles": {"weight": 0.0}}
-    others = [
-        given.get(e.kind) or type(e)(**e.model_dump() | idle.get(e.kind, {"weight": 0, "radius": 1e-3}))
-        for e in everything(dimension).effects
-    ]
-    return scene_of(*others, dimension=dimension, space=space, groups=groups, obstacles=(), dt=DT)
+    given = {"groups": groups, "obstacles": (), "dt": DT}
+    if isinstance(space, Torus):
+        return everything(dimension, *effects, space=space, **given)
+    return scene_of(*effects, dimension=dimension, space=space, **given)
 
 
 def placed(scene: Scene, x: Array, v: Array) -> State:
@@ -97,14 +115,18 @@ def forces(scene: Scene, state: State) -> Array:
     return (scene.step(state).vel - state.vel)[0] / DT
 
 
-def assert_as_expected(effects: Any, x: Array, space: Space | None, v: Array | None = None) -> State:
-    """Compare all forces of all agents; return the state after the step, for its counters."""
+def assert_as_expected(effects: Any, x: Array, space: Space | None, wrapped: bool = False) -> State:
+    """Compare all forces of all agents; return the state after the step, for its counters.
+
+    wrapped: some of them are outside of the box, which the oracle does not know how to search.
+    """
     count, dimension = x.shape
-    v = np.random.default_rng(1).normal(size=x.shape) if v is None else v
+    v = np.random.default_rng(1).normal(size=x.shape)
     scene = scene_with(effects, space, dimension, count)
     state = placed(scene, x, v)
     found = forces(scene, state)
-    exact = sum(expected(effect, x, v, scene.space) for effect in effects)
+    where = scene.space.wrap(x) if wrapped else x
+    exact = sum(expected(effect, where, v, scene.space) for effect in effects)
     scale = max(1.0, np.abs(exact).max())
     np.testing.assert_allclose(found, exact, atol=1e-9 * scale, rtol=1e-9)
     return scene.step(state)
@@ -138,10 +160,39 @@ def test_on_a_torus_all_rules_share_one_sweep(count: int, dimension: int) -> Non
     assert after.counted("neighbour_queries") == 1
 
 
+MIXED = (
+    Separation(weight=1, radius=0.4),
+    Alignment(weight=1, radius=1.7, fov=120),
+    Cohesion(weight=1, radius=1.1, fov=300),
+)
+"""Three rules that see differently."""
+
+
 def test_rules_of_different_radii_share_the_widest_query() -> None:
     space = Torus(size=(14.0, 11.0))
-    mixed = (Separation(weight=1, radius=0.4), Alignment(weight=1, radius=1.7, fov=120), Cohesion(weight=1, radius=1.1))
-    assert_as_expected(mixed, uniform(700, space.size), space)
+    after = assert_as_expected(MIXED, uniform(700, space.size), space)
+    assert after.counted("neighbour_queries") == 1
+    _, widest, _ = MIXED
+    narrow = [effect.model_copy(update={"radius": 1e-3}) for effect in MIXED]
+    alone = assert_as_expected((narrow[0], widest, narrow[2]), uniform(700, space.size), space)
+    assert alone.counted("pairs") == after.counted("pairs")  # a law that looks less far adds nothing to the query
+
+
+@pytest.mark.parametrize("count", [50, 700])
+def test_an_effect_that_is_not_listed_changes_no_bits_and_no_counters(count: int) -> None:
+    """The three rules alone are what they are among two others that weigh nothing."""
+    space = Torus(size=(14.0, 11.0))
+    among = scene_with(MIXED, space, 2, count)
+    alone = among.with_effects(*MIXED)
+    assert len(among.effects) == 5
+    start = placed(among, uniform(count, space.size), np.random.default_rng(1).normal(size=(count, 2)))
+    ends = [scene.run(start, 10) for scene in (among, alone)]
+    np.testing.assert_array_equal(ends[0].x, ends[1].x)
+    np.testing.assert_array_equal(ends[0].v, ends[1].v)
+    np.testing.assert_array_equal(ends[0].work, ends[1].work)
+    listed = scene_of(*MIXED, space=space, obstacles=({"centre": (7, 5), "radius": 1},), groups=alone.groups, dt=DT)
+    under = listed.run(listed.start(0), 3)
+    assert under.counted("obstacle_tests") == 0  # nobody asked for the obstacle
 
 
 def test_in_a_box_too() -> None:
@@ -177,17 +228,31 @@ def test_awkward_toruses_in_space(size: Any) -> None:
 @pytest.mark.parametrize("size", [(1e3, 1e-3, 1e-3), (1e-3, 1e4, 1e-3), (1e6, 1e6, 1.0), (50.0, 50.0, 50.0), (1, 1, 1)])
 def test_a_query_writes_into_its_own_arrays_only(size: Any, dimension: int) -> None:
     """With guards behind every array: more cells than there is room for would show there."""
-    n, guard = 200, 100_000
-    x = np.ascontiguousarray(uniform(n, size[:dimension]).T)
-    arrays = {"order": n, "cell": 2 * n, "start": n + 2, "shape": 3}
-    whole = {name: np.full(length + guard, -7) for name, length in arrays.items()}
-    views = [whole[name][:length] for name, length in arrays.items()]
-    box = tuple(float(s) for s in size[:dimension])
+    n, lanes, guard = 200, 16, 100_000
+    blocks = -(-n // lanes)
+    pos, living = np.zeros(blocks * lanes * dimension), np.r_[np.ones(n), np.zeros(blocks * lanes - n)]
+    x = uniform(n, size[:dimension])
+    for i in range(n):
+        at = entry(place_of)(i, dimension, lanes)
+        pos[at : at + dimension * lanes : lanes] = x[i]
+    lengths = {"cell": blocks * lanes, "start": n + 1, "offset": n}
     for periodic in (False, True):
-        assert entry(sort_agents)(x, np.ones(n, bool), 0.4, box, periodic, *views) == n
-        assert sorted(views[0]) == list(range(n))
-        for name, length in arrays.items():
-            assert (whole[name][length:] == -7).all(), f"{name} is too short for {views[3]} cells"
+        whole = {name: np.full(length + guard, -7, np.int32) for name, length in lengths.items()}
+        cell, start, offset = (whole[name][:length] for name, length in lengths.items())
+        box = tuple(float(edge) for edge in size[:dimension])
+        shape = entry(count_cells)(
+            pos, living, 0, blocks, lanes, 0, 1, np.zeros(8, np.int64), np.zeros((1, 6)), box, 0.4, periodic, n,
+            cell, start, offset[None],
+        )  # fmt: skip
+        for name, length in lengths.items():
+            assert (whole[name][length:] == -7).all(), f"{name} is too short for {shape} cells"
+        cells = math.prod(shape)
+        assert cells <= n
+        if cells:
+            np.testing.assert_array_equal(np.diff(start[: cells + 1]), np.bincount(cell[:n], minlength=cells))
+            np.testing.assert_array_equal(offset[:cells], start[:cells])
+            assert (cell[n:] == -1).all()
+            assert start[cells] == n
 
 
 @pytest.mark.parametrize(
@@ -221,7 +286,8 @@ def on_edges(space: Torus, reach: float) -> Array:
     axes = []
     for length in space.size:
         edges = np.arange(int(length / (reach * 1.001))) * (length / int(length / (reach * 1.001)))
-        edges = np.concatenate([edges, np.nextafter(edges, 1e9), np.nextafter(edges, -1e9)])
+        after = np.maximum(np.nextafter(edges, 1e9), 1e-16)  # after 0 comes a number whose square is 0
+        edges = np.concatenate([edges, after, np.nextafter(edges, -1e9)])
         axes.append(edges[(edges >= 0) & (edges < length)])
     corners = np.stack([g.ravel() for g in np.meshgrid(*axes)], axis=1)
     return np.concatenate([corners, [np.nextafter(space.size, 0)]])
@@ -233,8 +299,19 @@ def test_agents_on_the_edges_of_cells(size: Any) -> None:
     space = Torus(size=size)
     x = on_edges(space, 1.0)
     assert len(x) > 96
-    _, alignment, cohesion = rules(1.0, fov=360)
-    assert_as_expected((alignment, cohesion), x, space)
+    _, alignment, cohesion = rules(1.0, fov=359)
+    assert_as_expected((Separation(weight=0, radius=1e-3), alignment, cohesion), x, space)
+
+
+@pytest.mark.parametrize("nudge", [-1e-17, 0.0, 5e-324, 1e-17])
+@pytest.mark.parametrize("axis", [0, 1])
+def test_agents_a_hair_beyond_the_edge_of_the_box(nudge: float, axis: int) -> None:
+    """-1e-17 is brought to 0: sorted into the last cell it would not be met by its neighbours beyond the edge."""
+    space = Torus(size=(10.0, 10.0))
+    x = uniform(1500, space.size)
+    x[:15, axis], x[15:30, axis] = nudge, 10.0 + nudge
+    after = assert_as_expected(rules(1.0), x, space, wrapped=True)
+    assert after.counted("pairs") < 0.5 * 1500**2
 
 
 def test_exactly_at_the_radius_is_outside() -> None:
@@ -249,7 +326,7 @@ def test_everybody_in_one_place(count: int) -> None:
     """Two velocities, one place: everybody's neighbours are all the others."""
     x, v = np.full((count, 2), 4.0), np.zeros((count, 2))
     v[: count // 2, 0] = 1.0
-    scene = scene_with((rules(1.0, fov=360)[1],), None, 2, count)
+    scene = scene_with((rules(1.0)[1],), None, 2, count)  # one place is in everybody's view
     found = forces(scene, placed(scene, x, v))
     mean = (v.sum(axis=0) - v) / (count - 1)
     np.testing.assert_allclose(found, 0.7 * (mean - v), atol=1e-12)
@@ -284,8 +361,8 @@ def test_the_grid_finds_what_brute_force_finds(dimension: int) -> None:
     x, v = uniform(1000, size), np.zeros((1000, dimension))
     found, met = [], []
     for far in (1e-3, 4.0):
-        separation, alignment = Separation(weight=1, radius=1), Alignment(weight=1, radius=1)
-        effects = (separation, alignment, Cohesion(weight=0, radius=far))
+        separation, alignment = Separation(weight=1, radius=1), Alignment(weight=1, radius=1, fov=270)
+        effects = (separation, alignment, Cohesion(weight=0, radius=far, fov=240))
         scene = scene_with(effects, Torus(size=size), dimension, 1000)
         state = placed(scene, x, v)
         found.append(forces(scene, state))
@@ -303,3 +380,129 @@ def test_worlds_of_a_batch_are_searched_apart() -> None:
     for b in range(3):
         alone = state.worlds([b])
         np.testing.assert_array_equal(scene.step(alone).vel[0], after.vel[b])
+
+
+# --- the nearest few --------------------------------------------------------------------------------------------------
+
+FEW = pytest.mark.parametrize(
+    "variant", [*NEAREST, pytest.param(NEAREST_MANY, marks=pytest.mark.slow)], ids=lambda variant: variant.name
+)
+
+
+def one_at_a_time(variant: Variant, count: int, edge: float) -> list[tuple[Any, Scene]]:
+    """Every rule of a variant, and a scene in which the others are there and weigh nothing; a step of 1 s, no limits.
+
+    One step of any first-order method changes velocities by dt times the acceleration at the start.
+    """
+    scenes = []
+    for rule in variant.effects:
+        effects = [e if e == rule else e.model_copy(update={"weight": 0}) for e in variant.effects]
+        spawn = Spawn(low=(0,) * variant.dimension, high=(edge,) * variant.dimension)
+        groups = (Group(count=count, spawn=spawn),)
+        scenes.append((rule, variant.make(count, edge, groups=groups, dt=1.0).with_effects(*effects)))
+    return scenes
+
+
+def doubtful(rule: Any, x: Array, v: Array, space: Space, hair: float) -> Array:
+    """Who has somebody within a hair of where sight ends, (N,): there the last bit of a distance decides."""
+    found = []
+    for wide in (1 - hair, 1 + hair):
+        changed = rule.model_copy(update={"radius": rule.radius * wide, "fov": min(rule.fov * wide, 360.0)})
+        found.append(in_sight(changed, x, v, space))
+    counts = [np.bincount(i, minlength=len(x)) for i, _, _ in found]
+    return np.asarray(counts[0] != counts[1])
+
+
+def assert_few_as_expected(variant: Variant, x: Array, edge: float, hair: float = 1e-6) -> State:
+    """Compare every rule of a variant by itself, at positions that are numbers of its precision; return the last."""
+    v = np.random.default_rng(1).normal(size=x.shape).astype(variant.dtype)
+    x = x.astype(variant.dtype)
+    for rule, scene in one_at_a_time(variant, len(x), edge):
+        state = placed(scene, x, v)
+        after = scene.step(state)
+        exact = expected(rule, x, v, scene.space)
+        sure = ~doubtful(rule, x, v, scene.space, hair)
+        assert sure.mean() > 0.98
+        error = np.abs((after.vel - state.vel)[0] - exact)[sure].max(initial=0.0)
+        terms = np.abs(exact).max() + np.abs(v).max()
+        assert error <= 200 * np.finfo(variant.dtype).eps * terms, f"{rule.kind}: {error}"
+    assert after.counted("neighbour_queries") == 1
+    return after
+
+
+@pytest.mark.parametrize("count", [1, 2, 5, 40, 95, 96, 1500])
+@FEW
+def test_the_nearest_few_are_the_oracle_s(variant: Variant, count: int) -> None:
+    """From fewer than anybody asks for to far more; through sorted cells too."""
+    edge = max(7.0, (count / 1.5) ** 0.5) if variant.dimension == 2 else max(7.0, (count / 0.3) ** (1 / 3))
+    x = uniform(count, (edge,) * variant.dimension) * 0.999
+    after = assert_few_as_expected(variant, x, edge)
+    if count == 1500:
+        assert after.counted("pairs") < 0.8 * count**2
+
+
+@FEW
+@pytest.mark.parametrize("share", [0.4, 1.0])
+def test_whoever_is_exactly_as_far_as_the_last_counts_too(variant: Variant, share: float) -> None:
+    """On a grid of points, whole or with holes, all distances are exact and most of them tie."""
+    side = 16 if variant.dimension == 2 else 8
+    points = np.stack(np.meshgrid(*[np.arange(side)] * variant.dimension, indexing="ij"), axis=-1)
+    x = points.reshape(-1, variant.dimension) + 0.25
+    x = x[np.random.default_rng(4).random(len(x)) < share]
+    tied = 0
+    for rule in variant.effects:
+        if rule.nearest:
+            i, _, _ = in_sight(rule, x, np.zeros_like(x), variant.make(1, float(side)).space)
+            tied += int((np.bincount(i) > rule.nearest).sum())
+    assert tied > 40
+    assert_few_as_expected(variant, x, float(side), hair=0.0)
+
+
+@FEW
+def test_the_nearest_few_are_found_among_the_living(variant: Variant) -> None:
+    living = np.random.default_rng(3).random(500) < 0.6
+    edge = 18.0 if variant.dimension == 2 else 9.0
+    x = (uniform(500, (edge,) * variant.dimension) * 0.999).astype(variant.dtype)
+    v = np.zeros_like(x)
+    for rule, scene in one_at_a_time(variant, 500, edge):
+        state = placed(scene, x, v)
+        state.alive[0] = living
+        found = scene.step(state).vel[0]
+        exact = expected(rule, x[living], v[living], scene.space)
+        assert np.abs(found[living] - exact).max() <= 200 * np.finfo(variant.dtype).eps * np.abs(exact).max()
+        np.testing.assert_array_equal(found[~living], 0)
+
+
+@pytest.mark.parametrize("nearest", [0, 33, -1, 2.5, True, "6"])
+def test_a_number_of_nearest_ones_that_is_none_is_refused(nearest: Any) -> None:
+    with pytest.raises(ValueError, match="nearest") as caught:
+        Cohesion(weight=1, radius=1, nearest=nearest)
+    assert "\n" not in str(caught.value)
+
+
+# --- in single precision ----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("count", [60, 1500])
+@pytest.mark.parametrize("name", ["torus_single", "plane_single", "plane_3_single"])
+@pytest.mark.parametrize("rule", [0, 1, 2])
+def test_single_precision_meets_exactly_its_neighbours_too(name: str, rule: int, count: int) -> None:
+    variant = next(v for v in VARIANTS if v.name == name)
+    d, eps = variant.dimension, np.finfo(np.float32).eps
+    edge = max(7.0, (count / 2) ** (1 / d))
+    chosen = rules(1.0, chosen=rule)
+    x = (uniform(count, (edge,) * d) * 0.999).astype(np.float32)
+    v = np.random.default_rng(1).normal(size=x.shape).astype(np.float32)
+    space = variant.make(1, edge).space
+    groups = (Group(count=count, spawn=Spawn(low=(0,) * d, high=(1,) * d)),)
+    scene = everything(d, *chosen, space=space, groups=groups, obstacles=(), dt=1.0, dtype="float32")
+    state = placed(scene, x, v)
+    after = scene.step(state)
+    assert after.counted("pairs") == count**2 if count < 96 else after.counted("pairs") < 0.8 * count**2
+    exact = expected(chosen[rule], x.astype(float), v.astype(float), space)
+    sure = ~doubtful(chosen[rule], x.astype(float), v.astype(float), space, 1e-6)
+    assert sure.mean() > 0.98
+    # a force is a sum of terms, each right to some bits; a push by somebody at 1 mm is 1000 N, and its bits are coarse
+    assert np.abs((after.vel - state.vel)[0] - exact)[sure].max() <= 50 * eps * max(
+        np.abs(exact).max(), np.abs(v).max()
+    )

@@ -17,21 +17,21 @@ import flockenv
 from flockenv.effects import EFFECTS, Alignment, Cohesion, Drag, Separation
 from flockenv.integrators import RK4
 from flockenv.kernels import cache_folder
-from flockenv.scene import Group, Scene
+from flockenv.scene import Group, Scene, Workspace
 from flockenv.shapes import Circle
 from flockenv.space import Box, Plane, Space, Torus
 from flockenv.spawn import Spawn
 from flockenv.state import State
-from tests.catalogue import TETHER, everything, scene_of, users_module
+from tests.catalogue import INTEGRATORS, TETHER, VARIANTS, Variant, everything, scene_of, users_module
 
 SPAWN = Spawn(low=(0, 0), high=(10, 10))
 ARRAYS = ("x", "v", "alive", "tick", "key", "obstacle_x", "obstacle_radius", "work")
 
 
 def crowd(count: int = 150, **fields: Any) -> Scene:
-    """Every effect at once, enough agents for a grid."""
+    """Every effect at once, enough agents and space for a grid."""
     group = Group(count=count, max_speed=3, max_force=8, spawn=Spawn(speed=(0.5, 2)))
-    return everything(2, groups=(group,), **fields)
+    return everything(2, groups=(group,), space=Torus(size=(24, 20)), **fields)
 
 
 def assert_same(a: State, b: State) -> None:
@@ -94,6 +94,72 @@ def test_a_run_split_in_two_is_the_same_run(scene: Scene) -> None:
     assert_same(together, split)
     assert_same(together, one_by_one)
     assert not np.array_equal(together.x, start.x)
+
+
+ALL = [
+    *VARIANTS,
+    *(
+        pytest.param(
+            Variant(f"torus_{d}_{dtype}_{row.name}", (), "torus", d, dtype, row.method), marks=pytest.mark.slow
+        )
+        for d in (2, 3)
+        for dtype in ("float64", "float32")
+        for row in INTEGRATORS
+    ),
+]
+"""Every dimension, precision and method; where slow tests run, every combination of them."""
+
+EVERY = pytest.mark.parametrize("variant", ALL, ids=lambda variant: variant.name)
+
+
+def roomy(variant: Variant, count: int) -> Scene:
+    """Room for a grid as soon as there are agents for one."""
+    return variant.make(count, 24.0 if variant.dimension == 2 else 18.0)
+
+
+@EVERY
+@pytest.mark.parametrize("count", [1, 7, 16, 17, 32, 95, 96, 97, 300])
+def test_a_world_of_a_batch_is_that_world_alone_to_the_last_bit(variant: Variant, count: int) -> None:
+    scene = roomy(variant, count)
+    start = scene.start(20, worlds=3)
+    start.alive[1, count // 2 :] = False
+    batch = scene.run(start, 4)
+    assert count < 300 or batch.work[0, 2] < 0.7 * batch.work[0, 1] * count**2  # through sorted cells
+    for k in range(3):
+        assert_same(scene.run(start.worlds([k]), 4), batch.worlds([k]))
+
+
+@EVERY
+@pytest.mark.parametrize("count", [17, 150])
+def test_ten_steps_at_once_are_ten_steps(variant: Variant, count: int) -> None:
+    scene = roomy(variant, count)
+    start = scene.start(5, worlds=2)
+    drive = np.random.default_rng(0).normal(size=start.shape)
+    one_by_one = start
+    for _ in range(10):
+        one_by_one = scene.step(one_by_one, drive=drive)
+    assert_same(scene.step(start, drive=drive, steps=10), one_by_one)
+    assert not np.array_equal(one_by_one.x, start.x)
+
+
+def test_what_is_left_of_one_world_does_not_reach_the_next() -> None:
+    """Scratch is kept: a scene that has just stepped a crowd steps two survivors as a fresh one does."""
+    scene, fresh = crowd(), crowd()
+    for seed in range(3):
+        full = scene.start(seed)
+        full.pos[...] *= 0.1
+        scene.run(full, 3)
+        few = scene.start(9, worlds=2)
+        few.alive[0, 2:], few.alive[1, :-2] = False, False
+        assert_same(scene.run(few, 5), fresh.run(few, 5))
+
+
+def test_a_drive_may_be_a_view_of_the_state_it_drives() -> None:
+    scene = crowd(100)
+    start = scene.start(2, worlds=2)
+    expected = scene.step(start, drive=start.vel.copy(), steps=3)
+    assert scene.step(start, drive=start.vel, out=start, steps=3) is start
+    assert_same(start, expected)
 
 
 def test_a_step_into_a_given_state_is_the_same_step_without_a_copy() -> None:
@@ -346,6 +412,37 @@ def test_a_bad_start_is_refused_in_one_line(call: Any, said: str) -> None:
         call(crowd(20))
     assert said in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+# --- memory -----------------------------------------------------------------------------------------------------------
+
+
+def taken(scene: Scene) -> int:
+    """Bytes of a state of one world, the bodies, and the scratch of one thread."""
+    state, scratch = scene.start(0), Workspace.allocate(scene.parts, scene.body)
+    own = [array for arrays in scratch.own for array in arrays]
+    arrays = [*(getattr(state, name) for name in ARRAYS), *scene.body.arrays(), *scratch.shared, *own]
+    return sum(array.nbytes for array in arrays)
+
+
+@pytest.mark.parametrize("variant", ALL[: len(VARIANTS)], ids=lambda variant: variant.name)
+@pytest.mark.parametrize("count", [1, 97, 3000])
+def test_memory_is_what_a_scene_says_before_it_takes_any(variant: Variant, count: int) -> None:
+    """But for a few tables that are the same for any number of agents, and lanes beyond the last one."""
+    scene = variant.make(count, 9.0)
+    said, fixed = scene.bytes_per_world(), 24 * 1024
+    assert said <= 1.25 * taken(scene)
+    assert taken(scene) <= said + fixed
+
+
+def test_a_million_agents_fit_into_a_gigabyte() -> None:
+    million = Group(count=1_000_000, spawn=Spawn(low=(0, 0), high=(900, 900)))
+    rules = (Separation(weight=1, radius=1), Alignment(weight=1, radius=2), Cohesion(weight=1, radius=2))
+    scene = scene_of(*rules, dtype="float32", groups=(million,))
+    assert scene.bytes_per_world() < 1e9
+    few = scene.model_copy(update={"groups": (million.model_copy(update={"count": 10_000}),)})
+    assert scene.bytes_per_world() == 100 * few.bytes_per_world()  # so that what holds for them holds for a million
+    assert few.bytes_per_world() == pytest.approx(taken(few), rel=0.01)
 
 
 # --- somebody else's effect -------------------------------------------------------------------------------------------

@@ -151,7 +151,7 @@ def steer(behaviour: Any, x: Array, v: Array, *, dt: float, seconds: float, top:
     for step in range(round(seconds / dt)):
         force = 5.0 * behaviour(step * dt, x, v)
         size = np.linalg.norm(force, axis=1, keepdims=True)
-        v = v + dt * force * np.minimum(1, strength / np.maximum(size, 1e-300))
+        v = v + dt * force * np.minimum(1, strength / np.maximum(size, 1e-200))
         speed = np.linalg.norm(v, axis=1, keepdims=True)
         v = v * np.minimum(1, top / np.maximum(speed, 1e-300))
         x = x + dt * v

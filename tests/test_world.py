@@ -273,11 +273,11 @@ def test_time_limits_truncate_and_never_terminate(row: TaskRow) -> None:
     endless = World(row.task)
     endless.reset(3)
     assert not any(endless.step(a).truncated.any() for a in actions_for(endless, 50))
-    compiled = len(endless._kernel.decide.overloads)
+    compiled = len(endless._kernel.play.overloads)
     for limit in (np.int32(51), 2**70):  # neither compiles anew
         endless.time_limit = limit
         np.testing.assert_array_equal(endless.step(actions_for(endless, 1)[0]).truncated, limit == 51)
-    assert len(endless._kernel.decide.overloads) == compiled
+    assert len(endless._kernel.play.overloads) == compiled
 
 
 # --- copies -----------------------------------------------------------------------------------------------------------
@@ -409,7 +409,7 @@ def test_whatever_holds_the_numbers_they_are_the_same_numbers() -> None:
     world.step(np.ones((2, 1, 2), np.int64))
     world.step(np.ones((2, 1, 2), bool))
     world.step(np.broadcast_to(0.5, (2, 1, 2)))  # cannot be written
-    assert len(world._kernel.decide.overloads) == 1  # and none of them was compiled for
+    assert len(world._kernel.play.overloads) == 1  # and none of them was compiled for
 
 
 # --- what a world cannot be -------------------------------------------------------------------------------------------

@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib
 import pkgutil
 
-from flockenv.effects.base import EFFECTS, Effect, Me, Other
+from flockenv.effects.base import EFFECTS, Effect, Me, Other, Sight
 
 for _module in pkgutil.iter_modules(__path__):
     importlib.import_module(f"{__name__}.{_module.name}")
@@ -14,4 +14,4 @@ from flockenv.effects.avoid import AvoidObstacles  # noqa: E402  # after the fol
 from flockenv.effects.drag import Drag  # noqa: E402
 from flockenv.effects.flock import Alignment, Cohesion, Separation  # noqa: E402
 
-__all__ = ["EFFECTS", "Alignment", "AvoidObstacles", "Cohesion", "Drag", "Effect", "Me", "Other", "Separation"]
+__all__ = ["EFFECTS", "Alignment", "AvoidObstacles", "Cohesion", "Drag", "Effect", "Me", "Other", "Separation", "Sight"]

@@ -11,6 +11,9 @@ An effect is of one or more of three forms, each a law for one agent:
 `p` holds the effect's `parameters()` by name, `me` and `other` are the records below. Laws live in the effect's module.
 A pair law says nothing of who is seen: it is evaluated for every candidate, and what it says of those outside the
 effect's `sight` (of agents themselves too) is dropped.
+
+Pair laws read the fields of `me` and `other` by name (`me.vel`), never by place (`me[2]`): the sweep sorts what some
+law names, itself or in a law that it calls, and every other field is a stand-in without meaning.
 """
 
 from __future__ import annotations
@@ -41,7 +44,7 @@ class Me(NamedTuple):
     radius: float  # m
     max_speed: float  # m/s
     max_force: float  # N
-    tie: Vec  # a unit vector of its own, see ties(); only in pair laws
+    tie: Vec  # a unit vector of its own, see ties(); 0 outside pair laws
 
 
 class Other(NamedTuple):
@@ -50,9 +53,9 @@ class Other(NamedTuple):
     who: float
     offset: Vec  # m, other minus me, the shortest way
     square: float  # m^2, |offset|^2
-    vel: Vec  # m/s
+    vel: Vec  # m/s; 0 for an obstacle
     radius: float  # m
-    tie: Vec
+    tie: Vec  # a unit vector of its own; 0 for an obstacle
 
 
 class Sight(NamedTuple):
@@ -110,7 +113,7 @@ class Effect(Record):
 
     @property
     def sight(self) -> Sight | None:
-        """Whom its pair law is about; None if it has none."""
+        """Whom its pair law is about; None if it has none. Effects of equal sight share the test of who is seen."""
         return None
 
     @property

@@ -180,11 +180,11 @@ NEAR = "near_square, near_who, near_count, obstacle_gap, obstacle_who, obstacle_
 """What `look` writes, in order."""
 
 REFUSED = -2
-"""The world that `decide` names if an action is no number."""
+"""The world that `play` names if an action is no number."""
 
 
 def task_source(task: Task) -> str:
-    """Return the source of a task's kernel: its scene's, and two entry points, `begin` and `decide`."""
+    """Return the source of a task's kernel: its scene's, and one entry point, `play`."""
     d = task.scene.dimension
     names = list(task.parameters())
     values = ", ".join(f"numbers[{k}]" for k in range(len(names)))
@@ -209,33 +209,20 @@ P = namedtuple("P", {" ".join(names)!r})
 
 
 @njit(cache=True, **FAST)
-def begin(mask, everyone, {worlds}, {NEAR}, {SHARED}, rows):
-    """Begin an episode in the masked worlds, and observe those, or everyone."""
-    p = P({values})
-    for b in range(x.shape[1]):
-        if mask[b]:
-            tick[b] = 0
-            steps[b] = 0
-            alive[b, :] = True
-            spawn(p, {now})
-        if mask[b] or everyone:
-            {look}
-            observe(p, {now}, rows[b])
-
-
-@njit(cache=True, **FAST)
-def decide(
-    check, from_world, to_world, actions, {worlds}, dt, count, mortal, limit,
+def play(
+    acting, mask, everyone, check, from_world, to_world, actions, {worlds}, dt, count, mortal, limit,
     force, x0, v0, alive0, action, {NEAR}, {SHARED},
     measured, sums, paid, rows, payment, terms, over, late, success, present,
 ):
-    """One decision in worlds [from_world, to_world), with what is told of it; return (world, agent) not finite, or -1s.
+    """Let worlds [from_world, to_world) take a decision, or begin an episode where `mask` says so; and observe them.
 
-    Nothing moves if an action is no number and `check` asks for that: then the world is {REFUSED}.
+    One entry point for both: what looks around is the larger part of it, and is compiled once. Acting, it returns the
+    (world, agent) that is not finite first, or -1s; the world is {REFUSED}, and nothing moves, if `check` is asked for
+    and an action is no number. Beginning, it observes the worlds that begin, or everyone.
     """
     unaliased()
     good = True
-    for b in range(from_world, to_world if check else from_world):
+    for b in range(from_world, to_world if acting and check else from_world):
         for i in range(actions.shape[1]):
             for k in range(actions.shape[2]):
                 good &= finite(actions[b, i, k])
@@ -246,43 +233,53 @@ def decide(
     blocks = (n + {task.parts.width - 1}) // {task.parts.width}
     broken, who = -1, -1
     for b in range(from_world, to_world):
-        now = {now}
-        for k in range({d}):
+        if not acting and not mask[b] and not everyone:
+            continue
+        if not acting and mask[b]:
+            tick[b] = 0
+            steps[b] = 0
             for i in range(n):
-                x0[k, i] = x[k, b, i]
-                v0[k, i] = v[k, b, i]
-        for i in range(n):
-            alive0[i] = alive[b, i]
-        for i in range(actions.shape[1]):
-            over[b, i] = False
-            for k in range(actions.shape[2]):
-                action[i, k] = min(max(actions[b, i, k], -1.0), 1.0)
-        drive(p, now, action, force[:, 0])
-        into_blocks(want, force, 0, n, 0, blocks)
-        bad = step_world(
-            x, v, alive, obstacle_x, obstacle_radius, work, params, dt, count, b, 0, 1, {SHARED},
-        )
-        if bad >= 0 and broken < 0:
-            broken, who = b, bad
-        tick[b] += count
-        steps[b] += 1
-        before, now = {then}, {now}
+                alive[b, i] = True
+            spawn(p, {now})
+        if acting:
+            for k in range({d}):
+                for i in range(n):
+                    x0[k, i] = x[k, b, i]
+                    v0[k, i] = v[k, b, i]
+            for i in range(n):
+                alive0[i] = alive[b, i]
+            for i in range(actions.shape[1]):
+                over[b, i] = False
+                for k in range(actions.shape[2]):
+                    action[i, k] = min(max(actions[b, i, k], -1.0), 1.0)
+            drive(p, {now}, action, force[:, 0])
+            into_blocks(want, force, 0, n, 0, blocks)
+            bad = step_world(
+                x, v, alive, obstacle_x, obstacle_radius, work, params, dt, count, b, 0, 1, {SHARED},
+            )
+            if bad >= 0 and broken < 0:
+                broken, who = b, bad
+            tick[b] += count
+            steps[b] += 1
         {look}
-        reward(p, before, now, action, terms[b])
-        success[b] = ended(p, before, now, over[b])
-        measure(p, before, now, measured[b])
-        late[b] = steps[b] >= limit
-        for k in range(sums.shape[1]):
-            sums[b, k] += measured[b, k]
-        for i in range(over.shape[1]):
-            if mortal and over[b, i]:
-                alive[b, i] = False
-            present[b, i] = alive[b, i]
-            total = 0.0
-            for k in range(terms.shape[2]):
-                total += terms[b, i, k]
-                paid[b, i, k] += terms[b, i, k]
-            payment[b, i] = total
+        now = {now}
+        if acting:
+            before = {then}
+            reward(p, before, now, action, terms[b])
+            success[b] = ended(p, before, now, over[b])
+            measure(p, before, now, measured[b])
+            late[b] = steps[b] >= limit
+            for k in range(sums.shape[1]):
+                sums[b, k] += measured[b, k]
+            for i in range(over.shape[1]):
+                if mortal and over[b, i]:
+                    alive[b, i] = False
+                present[b, i] = alive[b, i]
+                total = 0.0
+                for k in range(terms.shape[2]):
+                    total += terms[b, i, k]
+                    paid[b, i, k] += terms[b, i, k]
+                payment[b, i] = total
         observe(p, now, rows[b])
     return broken, who
 '''

@@ -225,7 +225,7 @@ def _anybody_touches(frame: Frame) -> bool:
 
 @kernel
 def measure(p: Any, before: Frame, after: Frame, numbers: Any) -> None:
-    """Polarisation; mean distance of the nearest in sight, m; touches that began in this step; mean speed along, m/s."""
+    """Polarisation; mean distance of the nearest in sight, m; touches that began just now; mean speed along, m/s."""
     numbers[0], numbers[3] = _order(after)
     n = after.pos.shape[1]
     nearest, began = 0.0, 0.0
@@ -280,9 +280,7 @@ def observe(p: Any, frame: Frame, rows: Any) -> None:
 
 
 @kernel
-def _show_neighbour(
-    p: Any, frame: Frame, i: int, s: int, slots: int, heading: Any, scales: Any, row: Any
-) -> None:
+def _show_neighbour(p: Any, frame: Frame, i: int, s: int, slots: int, heading: Any, scales: Any, row: Any) -> None:
     """Write what agent i sees of its s-th nearest neighbour: offset, relative velocity, presence, crowding."""
     j = np.uint64(frame.near_who[s, i])
     to = (offset(frame.pos[0, i], frame.pos[0, j], p.size), offset(frame.pos[1, i], frame.pos[1, j], p.size))

@@ -24,7 +24,7 @@ def offset(a: float, b: float, size: float) -> float:
     """Return b - a, the shortest way around a periodic axis of this size (0 = not periodic)."""
     d = b - a
     around = 1.0 / size if size > 0.0 else 0.0  # the same for all pairs: the division leaves the loop
-    return d - size * np.floor(d * around + 0.5)
+    return d - size * np.floor(d * around + 0.5)  # type: ignore[no-any-return]  # numpy's floor of a float is one
 
 
 @kernel
@@ -44,7 +44,7 @@ def compass(rays: int) -> tuple[float, ...]:
 def block_ways(row: Any, at: int, rays: int, table: Any, to: Any, ahead: Any, clearance: float, sight: float) -> None:
     """Shorten the free ways in row[at : at + rays], in units of `sight` m, by an obstacle at `to` m.
 
-    Ways lead in the directions of `compass`, turned so that the first is `ahead`, a unit vector; `table` is the compass.
+    Ways lead in the directions of `compass`, turned so that the first is `ahead`, a unit vector; `table` is it.
     """
     here = (to[0] * ahead[0] + to[1] * ahead[1], to[1] * ahead[0] - to[0] * ahead[1])
     share = like(sight, 1.0) / sight

@@ -1,0 +1,241 @@
+"""What a step costs through every face of every task: `python -m benchmarks.envs`.
+
+World.step, gymnasium.make (and the environment inside its wrappers), make_vec, PettingZoo's parallel and AEC forms, and
+flockenv.sb3.WorldVecEnv: one world, 1024 worlds, and 1024 flocks of 32 learners on one thread and on two. Actions are
+drawn before; worlds that are over begin anew, and that is timed too. World.step is what all the others wrap.
+"""
+
+from __future__ import annotations
+
+import statistics
+from collections.abc import Callable, Iterator, Sequence
+from itertools import cycle
+from typing import Annotated, Any
+
+import gymnasium
+import numpy as np
+import pettingzoo
+import typer
+
+import flockenv  # noqa: F401  # registers the environments
+from benchmarks.measure import Bench, Contestant, Out, Quick, Result, Rounds, command_line, number
+from flockenv.crew import use_threads
+from flockenv.tasks import TASKS, Flock, Task
+from flockenv.world import World
+
+__all__ = ["TASK_IDS"]
+
+TASK_IDS = {name: f"flockenv/{name.capitalize()}-v0" for name in ("pursuit", "obstacles", "flock")}
+DRAWS = 16  # sets of random actions, used in turn
+WORLDS = 1024
+LEARNERS = 32  # of a flock, in the largest race
+
+Step = Callable[[], object]
+
+
+def _draws(*shape: int) -> Iterator[Any]:
+    """Yield random actions in [-1, 1], so many sets in turn, float32 as agents act."""
+    return cycle(np.random.default_rng(0).uniform(-1, 1, (DRAWS, *shape)).astype(np.float32))
+
+
+# --- a step through each face ---------------------------------------------------------------------------------------
+
+
+def _world(task: Task, worlds: int = 1) -> Step:
+    world = World(task, worlds, task.horizon)
+    world.reset(0)
+    actions = _draws(worlds, world.learners, world.action_size)
+
+    def step() -> None:
+        ended = world.step(next(actions)).ended
+        if ended.any():
+            world.reset(mask=ended)
+
+    return step
+
+
+def _single(env: gymnasium.Env[Any, Any]) -> Step:
+    assert env.action_space.shape is not None
+    env.reset(seed=0)
+    actions = _draws(*env.action_space.shape)
+
+    def step() -> None:
+        _, _, terminated, truncated, _ = env.step(next(actions))
+        if terminated or truncated:
+            env.reset()
+
+    return step
+
+
+def _rows(env: Any, rows: int) -> Step:
+    """Step gymnasium's and Stable-Baselines3's vector environments alike: both begin anew by themselves."""
+    env.reset()
+    actions = _draws(rows, env.action_space.shape[-1])
+    return lambda: env.step(next(actions))
+
+
+def _parallel(env: Any) -> Step:
+    env.reset(seed=0)
+    names = env.possible_agents
+    drawn = _draws(len(names), *env.action_space(names[0]).shape)
+    actions = cycle([dict(zip(names, next(drawn), strict=True)) for _ in range(DRAWS)])
+
+    def step() -> None:
+        action = next(actions)
+        env.step({name: action[name] for name in env.agents})
+        if not env.agents:
+            env.reset()
+
+    return step
+
+
+def _by_turns(env: Any) -> Step:
+    """Step everybody once, one after another, as PettingZoo's own example does."""
+    env.reset(seed=0)
+    names = env.possible_agents
+    drawn = _draws(len(names), *env.action_space(names[0]).shape)
+    actions = cycle([dict(zip(names, next(drawn), strict=True)) for _ in range(DRAWS)])
+
+    def step() -> None:
+        action = next(actions)
+        for _ in range(len(env.agents)):
+            _, _, terminated, truncated, _ = env.last()
+            env.step(None if terminated or truncated else action[env.agent_selection])
+        if not env.agents:
+            env.reset()
+
+    return step
+
+
+def _sb3(bench: Bench, task: Task, worlds: int) -> list[Contestant]:
+    """Return the face for Stable-Baselines3, if that is installed."""
+    try:
+        from flockenv.sb3 import WorldVecEnv
+    except ImportError as error:
+        note = f"no WorldVecEnv: {error}"
+        if note not in bench.notes:
+            bench.note(note)
+        return []
+    rows = worlds * task.learners
+    return [Contestant("WorldVecEnv", _rows(WorldVecEnv(task, worlds), rows), rows)]
+
+
+# --- the races ------------------------------------------------------------------------------------------------------
+
+
+def _one_learner(bench: Bench, env_id: str) -> None:
+    """Race the faces of one world with one learner."""
+    made = gymnasium.make(env_id)
+    task: Task = made.unwrapped.task  # type: ignore[attr-defined]  # our own environment
+    contestants = [
+        Contestant("World.step", _world(task), 1),
+        Contestant("gymnasium.make", _single(made), 1),
+        Contestant("the same, unwrapped", _single(gymnasium.make(env_id).unwrapped), 1),
+        Contestant("make_vec of 1", _rows(gymnasium.make_vec(env_id, num_envs=1), 1), 1),
+        *_sb3(bench, task, 1),
+    ]
+    _microseconds(bench, bench.race(_title(env_id, task, 1), contestants, baseline="World.step"), 1)
+
+
+def _many_learners(bench: Bench, env_id: str) -> None:
+    """Race the faces of one world whose learners all have names."""
+    env = pettingzoo.make("parallel", env_id)
+    task: Task = env.unwrapped.task
+    work = task.learners
+    contestants = [
+        Contestant("World.step", _world(task), work),
+        Contestant("PettingZoo parallel", _parallel(env), work),
+        Contestant("PettingZoo AEC", _by_turns(pettingzoo.make("aec", env_id)), work),
+        *(_sb3(bench, task, 1) if task.ends_together else []),
+    ]
+    _microseconds(bench, bench.race(_title(env_id, task, 1), contestants, baseline="World.step"), work)
+
+
+def _batched(bench: Bench, env_id: str) -> None:
+    """Race the faces of many worlds with one learner each."""
+    vector: Any = gymnasium.make_vec(env_id, num_envs=WORLDS)
+    task: Task = vector.unwrapped.task
+    single = task.model_copy(update={"dtype": "float32"})
+    contestants = [
+        Contestant("World.step", _world(task, WORLDS), WORLDS),
+        Contestant("World.step, float32", _world(single, WORLDS), WORLDS),
+        Contestant("make_vec", _rows(vector, WORLDS), WORLDS),
+        *_sb3(bench, task, WORLDS),
+    ]
+    bench.race(_title(env_id, task, WORLDS), contestants, baseline="World.step")
+
+
+def _flocks(bench: Bench, threads: Sequence[int]) -> None:
+    """Race 1024 flocks of learners as a vector environment, on one thread and on several."""
+    from flockenv.envs.vector import FlockVectorEnv
+
+    rows = WORLDS * LEARNERS
+    contestants = []
+    for dtype in ("float64", "float32"):
+        env = FlockVectorEnv(rows, Flock().horizon, agents=LEARNERS, learners=LEARNERS, dtype=dtype)
+        step = _rows(env, rows)
+        names = {count: f"{dtype}, {count} thread{'s' * (count > 1)}" for count in threads}
+        contestants += [Contestant(name, _on(count, step), rows) for count, name in names.items()]
+    title = f"Flock as a VectorEnv, {WORLDS} worlds x {LEARNERS} learners"
+    bench.race(title, contestants, baseline="float64, 1 thread")
+    use_threads(1)
+
+
+def _on(threads: int, step: Step) -> Step:
+    """Return a step on so many threads."""
+
+    def call() -> None:
+        use_threads(threads)
+        step()
+
+    return call
+
+
+def _title(env_id: str, task: Task, worlds: int) -> str:
+    many = "one world" if worlds == 1 else f"{worlds} worlds"
+    return (
+        f"{env_id.split('/')[1]}, {many}: {task.learners} of {task.agents} learn, {task.layout.size} observations, "
+        f"{task.substeps} substeps, {task.dtype}"
+    )
+
+
+def _microseconds(bench: Bench, results: Sequence[Result], work: int) -> None:
+    """Say what a step of one world takes, and what each face adds to World.step."""
+    if not results or not results[0].rates:
+        return
+    inside = results[0]
+    said = []
+    for r in results:
+        took = 1e6 * work / r.rate
+        more = statistics.median(1e6 * work * (1 / a - 1 / b) for a, b in zip(r.rates, inside.rates, strict=False))
+        said.append(f"{r.name} {number(took)}" + (f" (+{number(more)})" if r is not inside else ""))
+    bench.note(f"{inside.race.split(':')[0]}, microseconds per step of the world: {'; '.join(said)}.")
+
+
+def main(
+    only: Annotated[str, typer.Option(help=f"One task: {', '.join(TASK_IDS)}.")] = "",
+    threads: Annotated[int, typer.Option(min=1, help="The most threads; 1 is always measured.")] = 2,
+    quick: Quick = False,
+    rounds: Rounds = None,
+    out: Out = None,
+) -> None:
+    """Measure a step through every face of every task, alone and batched."""
+    if only and only not in TASK_IDS:
+        raise typer.BadParameter(f"--only {only!r}: unknown; allowed: {', '.join(TASK_IDS)}")
+    use_threads(1)
+    ids = [env_id for name, env_id in TASK_IDS.items() if only in ("", name) and name in TASKS]
+    with Bench("envs", quick, rounds, out, unit="k agent-steps/s", scale=1e3) as bench:
+        for env_id in ids:
+            _one_learner(bench, env_id)
+        for env_id in ids:
+            if env_id in pettingzoo.parallel_registry:
+                _many_learners(bench, env_id)
+        for env_id in ids:
+            _batched(bench, env_id)
+        if only in ("", "flock"):
+            _flocks(bench, (1,) if threads == 1 else (1, threads))
+        bench.note("Agent-steps are decisions of learners: physics steps within one are not counted. One thread.")
+
+
+if __name__ == "__main__":
+    command_line(main)()

@@ -1,0 +1,86 @@
+"""Compilation, seen: how long each kernel took, and a line on the terminal while somebody waits for one.
+
+A kernel is compiled at its first call, once per machine: its code lies in the cache folder from then on (kernels.load).
+On a terminal a line says what is being compiled and, when it is done, how long that took; FLOCKENV_QUIET=1 silences it.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+from time import perf_counter
+from typing import Any, NamedTuple
+
+from numba.core import event
+
+__all__ = ["Compiled", "compiled"]
+
+
+class Compiled(NamedTuple):
+    """One kernel that this process had to compile."""
+
+    kernel: str  # the generated file's prefix and the function, such as "scene: step"
+    what: str  # first line of the generated file: dimension, space, method, effects
+    seconds: float
+
+
+_done: list[Compiled] = []
+
+
+def compiled() -> tuple[Compiled, ...]:
+    """Return what this process has compiled so far; empty if all of it came from the cache."""
+    return tuple(_done)
+
+
+class _Watch(event.Listener):
+    """Notes when numba begins and ends to compile an entry point of ours; the laws inside it are part of it."""
+
+    def __init__(self) -> None:
+        self.began: dict[int, float] = {}
+
+    def on_start(self, event: Any) -> None:
+        """Say that a wait begins."""
+        function = _entry_point(event)
+        if function is not None:
+            self.began[id(event.data["dispatcher"])] = perf_counter()
+            _say(f"flockenv: compiling {_described(function)} (once; kept in {_folder(function)}) ...")
+
+    def on_end(self, event: Any) -> None:
+        """Say how long it was."""
+        function = _entry_point(event)
+        began = self.began.pop(id(event.data["dispatcher"]), None)
+        if function is not None and began is not None:
+            seconds = perf_counter() - began
+            module = sys.modules.get(function.__module__)
+            what = ((module and module.__doc__) or "").split(". Generated")[0]
+            prefix = function.__module__.rsplit(".", 1)[-1].rsplit("_", 1)[0]
+            _done.append(Compiled(f"{prefix}: {function.__name__}", what, seconds))
+            _say(f" {seconds:.1f} s\n")
+
+
+def _entry_point(event: Any) -> Any:
+    """Return the function that an event is about, if it is an entry point of a generated file; else None."""
+    dispatcher = event.data["dispatcher"]
+    function = getattr(dispatcher, "py_func", None)
+    ours = getattr(function, "__module__", "").startswith("flockenv_generated.")
+    kept = getattr(getattr(dispatcher, "_cache", None), "cache_path", None) is not None
+    return function if ours and kept else None
+
+
+def _described(function: Any) -> str:
+    module = sys.modules.get(function.__module__)
+    return ((module and module.__doc__) or function.__name__).split(". Generated")[0]
+
+
+def _folder(function: Any) -> str:
+    folder: str = os.path.dirname(function.__code__.co_filename)
+    return folder.replace(os.path.expanduser("~"), "~", 1)
+
+
+def _say(text: str) -> None:
+    if sys.stderr is not None and sys.stderr.isatty() and not os.environ.get("FLOCKENV_QUIET"):
+        sys.stderr.write(text)
+        sys.stderr.flush()
+
+
+event.register("numba:compile", _Watch())  # type: ignore[no-untyped-call]  # numba has no types here

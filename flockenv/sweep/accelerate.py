@@ -1,0 +1,115 @@
+"""The acceleration of every agent of a world: what all laws say, summed and divided by mass.
+
+Pair laws come first, in one sweep (`pairs`), and leave what they came to in `felt`, by agent. Then each block adds what
+an agent wants or feels by itself, and a fold over the obstacles; what it wants is bounded by max_force.
+"""
+
+from __future__ import annotations
+
+from flockenv.sweep.pairs import pairs
+from flockenv.sweep.parts import Parts
+from flockenv.sweep.text import CONTEXT, Slots, indented, lane, lanes_of, tuple_of
+
+__all__ = ["accelerate"]
+
+
+def accelerate(parts: Parts) -> str:
+    """Return the source of `accelerate`: pair laws first, then each agent by itself, block after block."""
+    d = parts.dimension
+    me = ["i = row + l", f"x, v = {lanes_of(parts, 'pos')}, {lanes_of(parts, 'vel')}", _me_alone()]
+    return f'''
+
+@njit(forceinline=True, **FAST)
+def accelerate(context, pos, vel, acc):
+    """Acceleration of this thread's agents of one world, m/s^2, from the frozen present."""
+    {CONTEXT} = context
+{indented(_parameters(parts), 4)}
+    if rank == 0:
+        work[b, 0] += 1
+{indented(pairs(parts), 4)}
+    for block in range(first, end):
+        base, row = np.uint64(block * {d * parts.width}), np.uint64(block * {parts.width})
+{indented(_obstacles(parts, me), 8)}
+        for l in range(np.uint64({parts.width})):
+{indented(me, 12)}
+            o = zero(x)
+            s, f = {lanes_of(parts, "want")}, o
+{indented(_own(parts), 12)}
+{indented(_felt(parts), 12)}
+            s = limit(s, max_force[i])
+            # a choice, not a factor of 0: a law may be infinite where the dead and the lanes beyond the last agent lie
+            here, share = living[i] > o[0], like(o[0], 1.0) / mass[i]
+{indented([f"{lane(parts, 'acc', k)} = (s[{k}] + f[{k}]) * share if here else o[{k}]" for k in range(d)], 12)}
+'''
+
+
+def _parameters(parts: Parts) -> list[str]:
+    """Write how the numbers are read, in the order of `Parts.parameters`."""
+    d = parts.dimension
+    lines = [f"size = {tuple_of('params[#]', d)}", f"reach = params[{d}]"]
+    at = d + 1
+    for q in range(len(parts.sights)):
+        lines.append(f"within{q}, view{q} = params[{at}], params[{at + 1}]")
+        at += 2
+    for k, effect in enumerate(parts.effects):
+        count = len(effect.parameters())
+        values = ", ".join(f"params[{at + j}]" for j in range(count)) or "params[0]"
+        lines.append(f"p{k} = P{k}({values})")
+        at += count
+    return lines
+
+
+def _me_alone() -> str:
+    """Write agent i as the laws of one agent see it: no tie, there is nobody to part from."""
+    return "me = Me(like(mass[i], i), x, v, unit(v), mass[i], radius[i], max_speed[i], max_force[i], zero(x))"
+
+
+def _own(parts: Parts) -> list[str]:
+    """Write the laws of one agent by itself, and what the folds over the obstacles came to."""
+    lines, slot = [], Slots(parts)
+    for k, effect in enumerate(parts.effects):
+        to = "s" if effect.steering else "f"
+        if effect.own_law is not None:
+            lines.append(f"{to} = add({to}, own_law_{k}(p{k}, me))")
+        if effect.obstacle_law is not None:
+            lines.append(f"{to} = add({to}, obstacle_finish_{k}(p{k}, me, ({', '.join(slot.all(f'o{k}_'))},)))")
+    return lines
+
+
+def _felt(parts: Parts) -> list[str]:
+    """Write how what the pair laws came to is added."""
+    d, lines = parts.dimension, []
+    for t, name in enumerate(parts.targets):
+        place = f"felt[i * np.uint64({d * len(parts.targets)}) + np.uint64({d * t}) + np.uint64(#)]"
+        lines.append(f"{name} = add({name}, {tuple_of(place, d)})")
+    return lines
+
+
+def _obstacles(parts: Parts, me: list[str]) -> list[str]:
+    """Write the folds over the obstacles, all of them in one pass; nothing if no law asks for obstacles."""
+    slot = Slots(parts)
+    asking = [(k, slot.all(f"o{k}_")) for k, e in enumerate(parts.effects) if e.obstacle_law is not None]
+    if not asking:
+        return []
+    starts, meets = [], []
+    for k, slots in asking:
+        starts.append(f"found = obstacle_start_{k}(p{k}, me)")
+        starts += [f"{s} = found[{j}]" for j, s in enumerate(slots)]
+        meets.append(f"found = obstacle_law_{k}(p{k}, me, it, ({', '.join(slots)},))")
+        meets += [f"{s} = found[{j}]" for j, s in enumerate(slots)]
+    d = parts.dimension
+    return [
+        "if rank == 0 and block == first:",
+        "    work[b, 3] += n * obstacle_radius.shape[1]",
+        f"for l in range(np.uint64({parts.width})):",
+        indented(me + starts, 4),
+        "for m in range(obstacle_radius.shape[1]):",
+        "    rho = obstacle_radius[b, m]",
+        "    if rho > 0:",
+        f"        place = {tuple_of('obstacle_x[#, b, m]', d)}",
+        f"        for l in range(np.uint64({parts.width})):",
+        indented(me, 12),
+        "            to = offset_to(size, x, place)",
+        "            it = Other(like(rho, m), to, dot(to, to), zero(x), rho, zero(x))",
+        indented(meets, 12),
+    ]

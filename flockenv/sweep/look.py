@@ -1,0 +1,119 @@
+"""What tasks add: `look` finds who is near every agent of a world, for observations and rewards.
+
+It asks the same query as the pair laws, and keeps, for each lane, sorted lists of the nearest few.
+"""
+
+from __future__ import annotations
+
+from flockenv.sweep.pairs import meet_range
+from flockenv.sweep.parts import Parts
+from flockenv.sweep.query import query, walk
+from flockenv.sweep.text import SHARED, Slots, indented, indented_lines, lanes_of, tuple_of
+
+__all__ = ["look_source"]
+
+
+def look_source(parts: Parts) -> str:
+    """Return the source of `look`: what is near every agent of a world, by the query that pair laws use."""
+    if parts.look is None:
+        return ""
+    at = len(parts.parameters()) - 2
+    return f'''
+@njit(forceinline=True, **FAST)
+def look(
+    x_, alive, obstacle_x, obstacle_radius, b, params,
+    near_square, near_who, near_count, obstacle_gap, obstacle_who, obstacle_count, {SHARED},
+):
+    """Write, for every agent of world b, the nearest agents (K, N) and obstacles (J, N), and how many (N,)."""
+    n, rank, team = x_.shape[2], 0, 1
+    first, end = 0, (n + {parts.width - 1}) // {parts.width}
+    size, reach, within = {tuple_of("params[#]", parts.dimension)}, params[{at}], params[{at + 1}]
+    present = 0
+    for i in range(n):
+        present += alive[b, i]
+        living[i] = alive[b, i]
+        near_count[i] = 0
+        obstacle_count[i] = 0
+    into_blocks(pos, x_, b, n, first, end)
+{indented([*_look_at_agents(parts), *_look_at_obstacles(parts)], 4)}
+'''
+
+
+def _look_at_agents(parts: Parts) -> list[str]:
+    """Write the query, and how every block keeps lists of its nearest agents."""
+    assert parts.look is not None
+    slot, many = Slots(parts), parts.look.agents
+    if not many:
+        return []
+    candidate = "far, place = square if other & (square < within) else like(square, np.inf), like(square, j)"
+    keep = [candidate, *_insert(slot, "square", "place", many)]
+    lanes = f"np.uint64({parts.width})"
+    block = [
+        f"for l in range({lanes}):",
+        *(f"    {slot(f'square{k}')} = np.inf; {slot(f'place{k}')} = 0" for k in range(many)),
+        "for r in range(found):",
+        *indented_lines(meet_range(parts, parts.seen_fields, keep), 4),
+        "if nx == 0 and present == n:  # sorted by number: the lists lie as the lanes do",
+        *_tell(slot, many, lanes, agent="block + l", who="np.int32(#)"),
+        "else:",
+        *_tell(slot, many, "np.uint64(upto - at)", agent="np.uint64(order[block + l])", who="order[np.uint64(#)]"),
+    ]
+    return [*query(parts, parts.seen_fields), *walk(parts, block)]
+
+
+def _tell(slot: Slots, many: int, lanes: str, agent: str, who: str) -> list[str]:
+    """Write how the lists of so many lanes are told; `who` is the agent at sorted place `#`."""
+    lists = [(k, slot(f"square{k}"), who.replace("#", slot(f"place{k}"))) for k in range(many)]
+    return [
+        f"    for l in range({lanes}):",
+        f"        i, count = {agent}, np.int32(0)",
+        *(f"        near_square[{k}, i] = {square}; near_who[{k}, i] = {name}" for k, square, name in lists),
+        *(f"        count += 1 if {square} < np.inf else 0" for _, square, _ in lists),
+        "        near_count[i] = count",
+    ]
+
+
+def _look_at_obstacles(parts: Parts) -> list[str]:
+    """Write how every block keeps lists of the obstacles whose surfaces are nearest."""
+    assert parts.look is not None
+    slot, many, d = Slots(parts), parts.look.obstacles, parts.dimension
+    if not many:
+        return []
+    return [
+        "for block in range(first, end):",
+        f"    base = np.uint64(block * {d * parts.width})",
+        f"    for l in range(np.uint64({parts.width})):",
+        *(f"        {slot(f'gap{k}')} = np.inf; {slot(f'which{k}')} = 0" for k in range(many)),
+        "    for m in range(obstacle_radius.shape[1]):",
+        "        rho = obstacle_radius[b, m]",
+        "        if rho > 0:",
+        f"            centre = {tuple_of('obstacle_x[#, b, m]', d)}",
+        f"            for l in range(np.uint64({parts.width})):",
+        f"                to = offset_to(size, {lanes_of(parts, 'pos')}, centre)",
+        "                far, place = norm(to) - rho, like(rho, m)",
+        "                far = far if far < reach else like(rho, np.inf)",
+        *indented_lines(_insert(slot, "gap", "which", many), 16),
+        f"    for l in range(np.uint64({parts.width})):",
+        f"        i, count = np.uint64(block * {parts.width}) + l, np.int32(0)",
+        *(
+            f"        obstacle_gap[{k}, i] = {slot(f'gap{k}')}; obstacle_who[{k}, i] = np.int32({slot(f'which{k}')}); "
+            f"count += 1 if {slot(f'gap{k}')} < np.inf else 0"
+            for k in range(many)
+        ),
+        "        obstacle_count[i] = count",
+    ]
+
+
+def _insert(slot: Slots, near: str, where: str, many: int) -> list[str]:
+    """Write how (far, place) is put into the lanes' lists of the nearest, kept in order."""
+    lines = []
+    for k in range(many):
+        a, b = slot(f"{near}{k}"), slot(f"{where}{k}")
+        lines += [
+            f"near, there = {a}, {b}",
+            "closer = far < near",
+            f"{a} = far if closer else near",
+            f"{b} = place if closer else there",
+            "far, place = near if closer else far, there if closer else place",
+        ]
+    return lines

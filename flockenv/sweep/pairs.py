@@ -1,0 +1,155 @@
+"""The one sweep that all pair laws share: a block of sorted agents meets its candidates, lane beside lane.
+
+Every pair law is evaluated for every candidate, and its sums keep what it says of those in sight. A topological sight
+needs a pass before that one, which finds how far its k nearest are. `look` meets its candidates in the same way.
+"""
+
+from __future__ import annotations
+
+from flockenv.sweep.parts import Parts, sight_of
+from flockenv.sweep.query import query, walk
+from flockenv.sweep.text import Slots, indented, indented_lines
+
+__all__ = ["meet_range", "pairs"]
+
+
+def pairs(parts: Parts) -> list[str]:
+    """Write the query and the one sweep that all pair laws share; nothing at all if there is none."""
+    if not parts.pairs:
+        return []
+    return [
+        "# one query per instant, one sweep for all pair laws",
+        "if rank == 0:",
+        "    work[b, 1] += 1",
+        *query(parts, parts.fields),
+        *walk(parts, [*_clear(parts), *_select_nearest(parts), *_sum_up(parts)]),
+        "tally[rank] = met",
+        "wait_for_team(sync, team)  # what is felt was written by others",
+        "if rank == 0:",
+        "    for r in range(team):",
+        "        work[b, 2] += tally[r]",
+    ]
+
+
+def _clear(parts: Parts) -> list[str]:
+    """Write how a block's running numbers begin."""
+    slot = Slots(parts)
+    zeros = [f"{s} = 0" for k, _ in parts.pairs for s in slot.all(f"c{k}_")]
+    far = [f"{s} = np.inf" for q in range(len(parts.sights)) for s in slot.all(f"near{q}_")]
+    return [f"for l in range(np.uint64({parts.width})):", indented(zeros + far, 4)]
+
+
+def _select_nearest(parts: Parts) -> list[str]:
+    """Write the pass that finds how far each topological sight reaches: its k smallest squares, kept in order."""
+    topological = [(q, s.nearest) for q, s in enumerate(parts.sights) if s.nearest is not None]
+    if not topological:
+        return []
+    slot, keep = Slots(parts), []
+    for q, count in topological:
+        keep.append(f"far = square if {_seen(parts, q)} else like(square, np.inf)")
+        for j in range(count):
+            place = slot(f"near{q}_{j}")
+            keep += [f"near = {place}", f"{place} = far if far < near else near", "far = near if far < near else far"]
+    return ["for r in range(found):", *indented_lines(meet_range(parts, parts.fields, keep), 4)]
+
+
+def _sum_up(parts: Parts) -> list[str]:
+    """Write how a block meets its candidates, and what its sums come to."""
+    d, slot = parts.dimension, Slots(parts)
+    results = [f"g{name}{j}" for name in parts.targets for j in range(d)]
+    return [
+        "for r in range(found):",
+        "    met += (ranges[r, 1] - ranges[r, 0]) * (upto - at)",
+        *indented_lines(meet_range(parts, parts.fields, _meet(parts)), 4),
+        f"for l in range(np.uint64({parts.width})):",
+        indented(_finish(parts), 4),
+        "for l in range(np.uint64(upto - at)):",
+        f"    i = np.int64(order[block + l]) * {len(results)}",
+        indented([f"felt[i + {j}] = {slot(name)}" for j, name in enumerate(results)], 4),
+    ]
+
+
+def _meet(parts: Parts) -> list[str]:
+    """Write what one candidate adds to the sums of the lanes that see it."""
+    slot, lines = Slots(parts), []
+    for q, sight in enumerate(parts.sights):
+        cut = f" & (square <= {slot(f'near{q}_{sight.nearest - 1}')})" if sight.nearest else ""
+        lines.append(f"seen{q} = {_seen(parts, q)}{cut}")
+    for k, effect in parts.pairs:
+        q = parts.sights.index(sight_of(effect))
+        lines.append(f"says = pair_law_{k}(p{k}, me, it)")
+        # A sum of a choice: of a choice between sums LLVM makes a masked store, and the sum stays in memory. The other
+        # choice is -0, which x + -0 leaves as it is for every x: so this becomes one masked addition.
+        lines += [f"{s} += says[{j}] if seen{q} else o" for j, s in enumerate(slot.all(f"c{k}_"))]
+    return lines
+
+
+def _finish(parts: Parts) -> list[str]:
+    """Write what a block's sums come to."""
+    slot, d = Slots(parts), parts.dimension
+    lines = [_me(parts, parts.fields)] + [f"{name} = zero(me.pos)" for name in parts.targets]
+    for k, effect in parts.pairs:
+        to = "s" if effect.steering else "f"
+        lines.append(f"{to} = add({to}, finish_law_{k}(p{k}, me, ({', '.join(slot.all(f'c{k}_'))},)))")
+    return lines + [f"{slot(f'g{name}{j}')} = {name}[{j}]" for name in parts.targets for j in range(d)]
+
+
+def _seen(parts: Parts, q: int) -> str:
+    """Write whether candidate `it` is in sight q: near enough, ahead, and somebody else."""
+    sight = parts.sights[q]
+    text = f"other & (square < within{q})"
+    return text + (f" & in_view(view{q}, me.heading, to, square)" if sight.fov < 360 else "")
+
+
+def meet_range(parts: Parts, fields: list[str], lines: list[str]) -> list[str]:
+    """Write the loop over the candidates of range r. Only around the edge of a periodic box are images sought."""
+    square = "exact_dot(to, to)" if any(s.nearest for s in parts.sights) else "dot(to, to)"
+    wrapped, plain = "offset_to(size, me.pos, xj)", "sub(xj, me.pos)"
+
+    def loop(offset: str) -> list[str]:
+        return [
+            "for j in range(np.uint64(ranges[r, 0]), np.uint64(ranges[r, 1])):",
+            *indented_lines(_candidate(parts, fields), 4),
+            "    own, o = np.int32(j - block), like(reach, -0.0)",
+            f"    for l in range(np.uint64({parts.width})):",
+            indented([_me(parts, fields), "other = own != number[l]", f"to = {offset}", f"square = {square}"], 8),
+            "        it = Other(aj, to, square, vj, rj, tj)",
+            indented(lines, 8),
+        ]
+
+    if not parts.space.periodic:
+        return loop(plain)
+    return ["if ranges[r, 2] > 0:", *indented_lines(loop(wrapped), 4), "else:", *indented_lines(loop(plain), 4)]
+
+
+def _candidate(parts: Parts, fields: list[str]) -> list[str]:
+    """Write candidate j as the laws see it."""
+    row = {f: k for k, f in enumerate(fields)}
+    d = parts.dimension
+
+    def vector(letter: str) -> str:
+        if f"{letter}0" not in row:
+            return "xj"
+        return "(" + ", ".join(f"sorted_[{row[f'{letter}{k}']}, j]" for k in range(d)) + ")"
+
+    scalar = {name: f"sorted_[{row[name]}, j]" if name in row else "reach" for name in ("who", "radius")}
+    return [
+        f"xj = {vector('x')}",
+        f"vj, tj, aj, rj = {vector('v')}, {vector('t')}, {scalar['who']}, {scalar['radius']}",
+    ]
+
+
+def _me(parts: Parts, fields: list[str]) -> str:
+    """Write the agent in lane l of a block as the laws see it; what no law reads is left out."""
+    row = {f: k for k, f in enumerate(fields)}
+
+    def vector(letter: str) -> str:
+        if f"{letter}0" not in row:
+            letter = "x"
+        return "(" + ", ".join(f"sorted_[{row[f'{letter}{k}']}, block + l]" for k in range(parts.dimension)) + ")"
+
+    def scalar(name: str) -> str:
+        return f"sorted_[{row[name]}, block + l]" if name in row else "reach"
+
+    numbers = ", ".join(scalar(name) for name in ("mass", "radius", "max_speed", "max_force"))
+    return f"me = Me({scalar('who')}, {vector('x')}, {vector('v')}, {vector('h')}, {numbers}, {vector('t')})"

@@ -1,0 +1,159 @@
+"""Parts: which laws make up a scene, and what follows from that for its source.
+
+Which effects meet neighbours, in how many different ways they look around (`sights`), what is sorted of each agent
+(`fields`: only what some law reads), where each running number lies in the scratch of lanes (`slots`), and the numbers
+that the kernel is given (`parameters`). Everything that writes text asks here, and so does whoever allocates scratch.
+"""
+
+from __future__ import annotations
+
+import functools
+import inspect
+import math
+import sys
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from flockenv.effects.base import Effect, Sight
+from flockenv.integrators.base import Integrator
+from flockenv.space import Space
+
+__all__ = ["Look", "Parts", "record_of", "sight_of", "view_of"]
+
+
+class Look(NamedTuple):
+    """What is near every agent, for observations and rewards: the nearest few, all around."""
+
+    radius: float  # m
+    agents: int = 0  # so many of the nearest agents
+    obstacles: int = 0  # so many of the obstacles whose surface is nearest
+
+
+@dataclass(frozen=True)
+class Parts:
+    """Which laws make up a scene: all that the source depends on."""
+
+    dimension: int
+    space: Space
+    effects: tuple[Effect, ...]
+    integrator: Integrator
+    dtype: str = "float64"
+    look: Look | None = None
+    """What a task shows its agents, found by the same query."""
+
+    @property
+    def width(self) -> int:
+        """Lanes of a block: agents that one vector register of 64 bytes holds."""
+        return 64 // np.dtype(self.dtype).itemsize
+
+    @functools.cached_property
+    def pairs(self) -> list[tuple[int, Effect]]:
+        """The effects with a pair law, and their numbers."""
+        return [(k, e) for k, e in enumerate(self.effects) if e.pair_law is not None]
+
+    @functools.cached_property
+    def sights(self) -> list[Sight]:
+        """The different ways in which pair laws look around; laws that see the same share the test."""
+        return list(dict.fromkeys(sight_of(e) for _, e in self.pairs))
+
+    @property
+    def reach(self) -> float:
+        """The largest distance at which any law looks for neighbours, m."""
+        return max((sight.radius for sight in self.sights), default=0.0)
+
+    def parameters(self) -> list[float]:
+        """Every number that the kernel is given, in the order in which the source reads them."""
+        values = [*self.space.extent(self.dimension), self.reach]
+        for sight in self.sights:
+            values += [sight.radius**2, view_of(sight.fov)]
+        for effect in self.effects:
+            values.extend(effect.parameters().values())
+        return values + ([self.look.radius, self.look.radius**2] if self.look else [])
+
+    @property
+    def sweeps(self) -> bool:
+        """Does anybody ask who is near whom?"""
+        return bool(self.pairs) or (self.look is not None and self.look.agents > 0)
+
+    @functools.cached_property
+    def targets(self) -> list[str]:
+        """What pair laws add to: what agents want, what acts on them, or both."""
+        steering = {e.steering for _, e in self.pairs}
+        return ["s"] * (True in steering) + ["f"] * (False in steering)
+
+    @functools.cached_property
+    def fields(self) -> list[str]:
+        """What is sorted of each agent, a row each: what the pair laws read, found from the names in their code."""
+        names = set().union(*(_names(e) for _, e in self.pairs)) if self.pairs else set()
+        if any(sight.fov < 360 for sight in self.sights):
+            names.add("heading")
+        needed = {"x": True, "v": bool({"vel", "heading"} & names), "h": "heading" in names, "t": "tie" in names}
+        rows = [f"{letter}{k}" for letter, need in needed.items() if need for k in range(self.dimension)]
+        return rows + [name for name in ("who", "radius", "mass", "max_speed", "max_force") if name in names]
+
+    @property
+    def seen_fields(self) -> list[str]:
+        """What is sorted of each agent to find the nearest."""
+        return [f"x{k}" for k in range(self.dimension)]
+
+    @property
+    def rows(self) -> int:
+        """Rows of sorted agents that scratch must have."""
+        return max(len(self.fields) if self.pairs else 0, self.dimension if self.look else 0, 1)
+
+    @property
+    def numbers(self) -> int:
+        """Numbers of a record that scratch must have."""
+        kinds = [self.fields] * bool(self.pairs) + [self.seen_fields] * bool(self.look)
+        return max((len(record_of(fields)) for fields in kinds), default=1)
+
+    @functools.cached_property
+    def slots(self) -> dict[str, int]:
+        """Where in the scratch of lanes each running number lies."""
+        d, look = self.dimension, self.look or Look(0.0)
+        runs = [(f"c{k}_", e.sums(d)) for k, e in self.pairs]
+        runs += [(f"near{q}_", sight.nearest or 0) for q, sight in enumerate(self.sights)]
+        runs += [(f"o{k}_", e.folded(d) if e.obstacle_law else 0) for k, e in enumerate(self.effects)]
+        runs += [(f"g{name}", d) for name in self.targets]
+        runs += [("square", look.agents), ("place", look.agents), ("gap", look.obstacles), ("which", look.obstacles)]
+        names = [f"{name}{j}" for name, many in runs for j in range(many)]
+        return {name: place for place, name in enumerate([*names, "bad"])}
+
+
+def record_of(fields: list[str]) -> list[str]:
+    """Return what is written of an agent when it is put into its cell; headings follow from velocities."""
+    return [f for f in fields if f[0] != "h" and f != "who"] + ["who"]
+
+
+def sight_of(effect: Effect) -> Sight:
+    """Return whom the pair law of an effect sees."""
+    sight = effect.sight
+    assert sight is not None, f"{type(effect).__name__} has a pair law and no sight"
+    return sight
+
+
+def view_of(fov: float) -> float:
+    """Return cos(fov / 2) |cos(fov / 2)|, what `in_view` compares; fov in degrees."""
+    cosine = math.cos(math.radians(fov) / 2.0)
+    return cosine * abs(cosine)
+
+
+def _names(effect: Effect) -> set[str]:
+    """Return every name in the code of an effect's pair laws and of the laws that they call."""
+    module = vars(sys.modules[type(effect).__module__])
+    todo = [module[law] for law in (effect.pair_law, effect.finish_law) if law]
+    seen: set[int] = set()
+    names: set[str] = set()
+    while todo:
+        python = todo.pop().py_func
+        if id(python) in seen:
+            continue
+        seen.add(id(python))
+        names |= set(python.__code__.co_names)
+        called: list[Any] = [python.__globals__.get(name) for name in python.__code__.co_names]
+        modules = [m for m in called if inspect.ismodule(m)]
+        called += [getattr(m, name, None) for m in modules for name in python.__code__.co_names]
+        todo += [f for f in called if hasattr(f, "py_func")]
+    return names

@@ -1,0 +1,130 @@
+"""A step: worlds are brought into blocks, advanced by the integrator's method, bounded, and written back.
+
+`step_world` is called by scenes through `step`, and by tasks through their `play`. Several threads may advance one
+world together, each the agents of its own blocks.
+"""
+
+from __future__ import annotations
+
+from flockenv.sweep.parts import Parts
+from flockenv.sweep.text import CONTEXT, SHARED, Slots, indented, lane, lanes_of, tuple_of
+
+__all__ = ["copies", "step", "step_world"]
+
+
+def copies(parts: Parts) -> str:
+    """Return the source of `into_blocks` and `out_of_blocks`: from arrays of all worlds to blocks of one, and back."""
+    w = parts.width
+    block = "blocks[base + l]"
+    world = f"array[np.uint64(k), np.uint64(b), np.uint64(block * {w}) + l]"
+    into = f"blocks = array[:, b], agents in blocks of {w}; those beyond n are left as they are."
+    return (
+        "\n"
+        + _copy(parts, "into_blocks", into, block, world)
+        + _copy(parts, "out_of_blocks", "array[:, b] = blocks.", world, block)
+    )
+
+
+def _copy(parts: Parts, name: str, title: str, to: str, source: str) -> str:
+    """Write one of the two: full blocks with a constant number of lanes, then the last."""
+    w = parts.width
+    return f'''@njit(forceinline=True, **FAST)
+def {name}(blocks, array, b, n, first, end):
+    """{title}"""
+    for block in range(first, end):
+        for k in range({parts.dimension}):
+            base = np.uint64(block * {parts.dimension * w} + k * {w})
+            if (block + 1) * {w} <= n:
+                for l in range(np.uint64({w})):
+                    {to} = {source}
+            else:
+                for l in range(np.uint64(n - block * {w})):
+                    {to} = {source}
+
+
+'''
+
+
+def step_world(parts: Parts) -> str:
+    """Return the source of `step_world`: steps of one world, or of one thread's part of it."""
+    d = parts.dimension
+    bad = Slots(parts)("bad")
+    stored = (("pos", "x"), ("vel", "v"), ("origin", "x"))
+    store = ["; ".join(f"{lane(parts, array, k)} = {now}[{k}]" for array, now in stored) for k in range(d)]
+    return f'''@njit(forceinline=True, **FAST)
+def step_world(
+    x_, v_, alive, obstacle_x, obstacle_radius, work, params, dt, count, b, rank, team, {SHARED},
+):
+    """Advance this thread's part of world b by `count` steps; return its first agent that is not finite, or -1."""
+    n = x_.shape[2]
+    blocks = (n + {parts.width - 1}) // {parts.width}
+    first, end = blocks * rank // team, blocks * (rank + 1) // team
+    size = {tuple_of("params[#]", d)}
+    present = 0
+    for i in range(n):
+        present += alive[b, i]
+    for i in range(first * {parts.width}, min(end * {parts.width}, n)):
+        living[i] = alive[b, i]
+    into_blocks(pos, x_, b, n, first, end)
+    into_blocks(vel, v_, b, n, first, end)
+    for i in range(first * {d * parts.width}, end * {d * parts.width}):
+        origin[i] = pos[i]
+    context = ({CONTEXT})
+    far = like(dt, np.inf)
+    for l in range(np.uint64({parts.width})):
+        {bad} = far
+    for _ in range(count):
+        advance(context, pos, vel, dt, stages, first * {d * parts.width}, end * {d * parts.width})
+        for block in range(first, end):
+            base, row = np.uint64(block * {d * parts.width}), np.uint64(block * {parts.width})
+            for l in range(np.uint64({parts.width})):
+                i = row + l
+                was, x, v = {lanes_of(parts, "origin")}, {lanes_of(parts, "pos")}, {lanes_of(parts, "vel")}
+                where = far if finite(dot(x, x) + dot(v, v)) else like(dt, i)
+                {bad} = where if where < {bad} else {bad}
+                # nobody moves faster than max_speed, whatever a method makes of the velocity within the step
+                x = add(was, scale(limit(sub(x, was), max_speed[i] * dt), living[i]))
+                x, v = confine(size, radius[i], x, scale(limit(v, max_speed[i]), living[i]))
+{indented(store, 16)}
+    out_of_blocks(pos, x_, b, n, first, end)
+    out_of_blocks(vel, v_, b, n, first, end)
+    worst = far
+    for l in range(np.uint64({parts.width})):
+        worst = min(worst, {bad})
+    return np.int64(worst) if worst < far else -1
+'''
+
+
+def step(parts: Parts) -> str:
+    """Return the source of `step`, the entry point: some worlds, one after another."""
+    d = parts.dimension
+    return f'''
+@njit(cache=True, **FAST)
+def step(
+    x, v, alive, tick, obstacle_x, obstacle_radius, work, drive, params, dt, count, from_world, to_world, rank, team,
+    {SHARED},
+):
+    """Advance worlds [from_world, to_world) by `count` steps; return (world, agent) not finite first, or -1s.
+
+    drive (D, B, N), or (D, 0, N) for none. A team of several threads calls this with the same worlds, each with its
+    rank.
+    """
+    unaliased()
+    n = x.shape[2]
+    blocks = (n + {parts.width - 1}) // {parts.width}
+    first, end = blocks * rank // team, blocks * (rank + 1) // team
+    broken, who = -1, -1
+    for b in range(from_world, to_world):
+        if drive.shape[1] > 0:
+            into_blocks(want, drive, b, n, first, end)
+        else:
+            want[first * {d * parts.width} : end * {d * parts.width}] = 0
+        bad = step_world(
+            x, v, alive, obstacle_x, obstacle_radius, work, params, dt, count, b, rank, team, {SHARED},
+        )
+        if rank == 0:
+            tick[b] += count
+        if bad >= 0 and broken < 0:
+            broken, who = b, bad
+    return broken, who
+'''

@@ -1,0 +1,61 @@
+"""Small pieces of text that every part of a source is made of, and the names of what its functions are handed.
+
+Indices are counted without a sign: of a signed one numba asks whether it counts from the end, and the loop over the
+lanes would stay scalar.
+"""
+
+from __future__ import annotations
+
+from flockenv.sweep.parts import Parts
+
+__all__ = ["CONTEXT", "SHARED", "Slots", "indented", "indented_lines", "lane", "lanes_of", "tuple_of"]
+
+_READ = (
+    "mass, radius, max_speed, max_force, living, want, felt, sorted_, records, order, cell, start, offset, bounds, "
+    "tally, sync, tie, number, lanes, ranges"
+)
+SHARED = f"pos, vel, origin, stages, {_READ}"
+"""Scratch of one world in progress, in order; see scene.Workspace. The last two belong to one thread."""
+
+CONTEXT = f"obstacle_x, obstacle_radius, work, params, b, n, present, first, end, rank, team, {_READ}"
+"""What an acceleration is given beside positions and velocities, in order."""
+
+
+def tuple_of(template: str, dimension: int) -> str:
+    """Write a tuple: `#` stands for the axis number."""
+    return "(" + ", ".join(template.replace("#", str(k)) for k in range(dimension)) + ",)"
+
+
+def lane(parts: Parts, array: str, k: int) -> str:
+    """Write coordinate k of lane l of the block that begins at `base`."""
+    return f"{array}[base + np.uint64({k * parts.width}) + l]"
+
+
+def lanes_of(parts: Parts, array: str) -> str:
+    """Write all coordinates of lane l of the block that begins at `base`, as a tuple."""
+    return "(" + ", ".join(lane(parts, array, k) for k in range(parts.dimension)) + ")"
+
+
+def indented(lines: list[str], indent: int) -> str:
+    """Write lines below each other, as one text; what has several lines is indented as a whole."""
+    return "\n".join(indented_lines(lines, indent))
+
+
+def indented_lines(lines: list[str], indent: int) -> list[str]:
+    """Write lines below each other, one by one."""
+    return [" " * indent + line for block in lines for line in block.splitlines()]
+
+
+class Slots:
+    """Writes places in the scratch of lanes by name."""
+
+    def __init__(self, parts: Parts) -> None:
+        self.slots, self.width = parts.slots, parts.width
+
+    def __call__(self, name: str) -> str:
+        """Write the place of one number, in lane l."""
+        return f"lanes[np.uint64({self.slots[name] * self.width}) + l]"
+
+    def all(self, prefix: str) -> list[str]:
+        """Write every place whose name begins so, in order."""
+        return [self(name) for name in self.slots if name.startswith(prefix)]

@@ -1,0 +1,372 @@
+"""Threads: results and counters to the last bit the same for any number of them, and nobody waits for ever.
+
+Worlds are divided among threads, or, of a large world, its agents: a team that waits for each other several times in
+every evaluation of the forces.
+"""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import flockenv
+import flockenv.scene as scenes
+from flockenv import crew
+from flockenv.crew import share, threads, use_threads
+from flockenv.kernels import cache_folder
+from flockenv.scene import Scene
+from flockenv.state import State
+from tests.catalogue import VARIANTS, Variant
+
+ROOT = Path(__file__).resolve().parent.parent
+NAMED = {variant.name: variant for variant in VARIANTS}
+ARRAYS = ("x", "v", "alive", "tick", "work")
+PATIENCE = 120.0
+"""s: far more than anything here takes; whoever waits longer waits for ever."""
+
+
+@pytest.fixture(autouse=True)
+def one_thread_afterwards() -> Iterator[None]:
+    before = threads()
+    yield
+    use_threads(before)
+
+
+@pytest.fixture
+def shared(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """Among how many threads each step was shared."""
+    seen: list[int] = []
+
+    def spy(jobs: Any) -> list[Any]:
+        seen.append(len(jobs))
+        return share(jobs)
+
+    monkeypatch.setattr(scenes, "share", spy)
+    return seen
+
+
+def assert_same(a: State, b: State) -> None:
+    for name in ARRAYS:
+        np.testing.assert_array_equal(getattr(a, name), getattr(b, name), err_msg=name)
+
+
+def started(scene: Scene, worlds: int = 1, dead: float = 0.1) -> State:
+    """A start of which some are dead, and of the first quarter almost all: the parts of a team are not alike."""
+    state = scene.start(7, worlds)
+    chance = np.random.default_rng(0).random((worlds, scene.agents))
+    quarter = scene.agents // 4
+    state.alive[...] = chance > dead
+    state.alive[:, :quarter] = chance[:, :quarter] > min(1.0, 8 * dead)
+    return state
+
+
+# --- one large world --------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Large:
+    variant: str
+    count: int
+    edge: float  # m
+    sorts: bool = True  # False: a reach too wide for a grid
+
+    def __str__(self) -> str:
+        return f"{self.variant}-{self.count}-{'grid' if self.sorts else 'brute'}"
+
+    @property
+    def scene(self) -> Scene:
+        return NAMED[self.variant].make(self.count, self.edge)
+
+
+LARGE = [
+    Large("torus", 4096, 60.0),
+    Large("torus_3", 5000, 24.0),
+    Large("torus_single", 20_000, 140.0),
+    Large("torus_single_rk4", 6000, 70.0),
+    Large("box", 4500, 45.0),
+    Large("plane_single", 4097, 60.0),
+    Large("plane_3_single", 5003, 24.0),
+    Large("nearest_plane", 4111, 60.0),
+    Large("nearest_plane_3", 4096, 24.0),
+    Large("nearest_torus_single", 4999, 60.0),
+    Large("nearest_torus_3", 4096, 24.0),
+    Large("torus", 4099, 9.0, sorts=False),
+    Large("plane_3_single", 4096, 3.0, sorts=False),
+    Large("nearest_torus_single", 4096, 9.0, sorts=False),
+]
+
+
+@pytest.mark.parametrize("large", LARGE, ids=str)
+@pytest.mark.parametrize("dead", [0.0, 0.1])
+def test_a_team_takes_the_very_step_that_one_thread_takes(large: Large, dead: float, shared: list[int]) -> None:
+    scene = large.scene
+    start = started(scene, dead=dead)
+    expected = scene.run(start, 2)
+    assert shared == []
+    met, alive = int(expected.work[0, 2]), int(start.alive.sum())
+    everybody = int(expected.work[0, 1]) * alive**2
+    assert met < 0.5 * everybody if large.sorts else met == everybody
+    for count in (2, 3):
+        use_threads(count)
+        for _ in range(3):  # a race need not show every time
+            assert_same(scene.run(start, 2), expected)
+    assert shared == [2] * 3 + [3] * 3
+    assert not np.array_equal(expected.x, start.x)
+
+
+def test_a_team_goes_through_the_worlds_of_a_small_batch_of_large_ones(shared: list[int]) -> None:
+    scene = NAMED["torus_single"].make(4200, 60.0)
+    start = started(scene, worlds=2)
+    drive = np.random.default_rng(0).normal(size=start.shape)
+    expected = scene.step(start, drive=drive, steps=3)
+    for count, parts in ((2, 2), (3, 3)):  # two worlds apart, or a team of three for one after the other
+        use_threads(count)
+        shared.clear()
+        assert_same(scene.step(start, drive=drive, steps=3), expected)
+        assert shared == [parts]
+
+
+def test_more_threads_than_there_is_work_for_do_no_harm() -> None:
+    """Five of them, some without a row of cells of their own, on fewer cores."""
+    scene = NAMED["box"].make(4500, 45.0)
+    start = scene.start(1)
+    start.pos[0, :4400] = np.random.default_rng(0).uniform(20.0, 21.0, (4400, 2))  # nearly all in one row of cells
+    expected = scene.run(start, 1)
+    use_threads(5)
+    assert_same(scene.run(start, 1), expected)
+    start.alive[...] = False
+    few = start.copy()
+    few.alive[0, :3] = True
+    use_threads(1)
+    expected = scene.run(few, 2)
+    use_threads(5)
+    assert_same(scene.run(few, 2), expected)
+
+
+# --- batches ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("variant", VARIANTS, ids=lambda variant: variant.name)
+@pytest.mark.parametrize("count", [33, 300])
+def test_worlds_divided_among_threads_are_the_same_worlds(variant: Variant, count: int, shared: list[int]) -> None:
+    scene = variant.make(count, 20.0)
+    steps = 1 + scenes.WORTH_SHARING // (7 * count)
+    start = started(scene, worlds=7)
+    expected = scene.run(start, steps)
+    for threads_used in (2, 3, 8):
+        use_threads(threads_used)
+        assert_same(scene.run(start, steps), expected)
+    assert shared == [2, 3, 7]
+
+
+def test_little_work_is_not_shared(shared: list[int]) -> None:
+    use_threads(2)
+    scene = NAMED["torus_single"].make(64, 20.0)
+    scene.run(scene.start(0, worlds=8), 1)
+    assert shared == []
+    scene.run(scene.start(0, worlds=8), 8)
+    assert shared == [2]
+
+
+# --- a number that is none, found by any thread -----------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("count", [1, 2, 3])
+@pytest.mark.parametrize("agent", [0, 1, 1700, 3333, 4998])
+def test_whichever_thread_meets_nan_names_the_agent(agent: int, count: int) -> None:
+    scene = NAMED["plane_single"].make(4999, 60.0)
+    start = scene.start(0)
+    start.pos[0, agent, 1] = np.nan
+    kept = start.copy()
+    use_threads(count)
+    with pytest.raises(FloatingPointError, match=f"world 0, agent {agent}:"):
+        scene.step(start)
+    start.pos[0, 4998, 0] = np.inf
+    with pytest.raises(FloatingPointError, match=f"world 0, agent {agent}:"):  # the first of two
+        scene.step(start)
+    np.testing.assert_array_equal(kept.tick, start.tick)
+
+
+@pytest.mark.parametrize("count", [1, 2, 3])
+def test_nan_in_a_batch_is_found_in_its_first_world(count: int) -> None:
+    scene = NAMED["plane_single"].make(33, 20.0)
+    start = scene.start(0, worlds=40)
+    for world, agent in ((39, 2), (17, 30), (18, 0)):
+        start.pos[world, agent] = np.nan
+    use_threads(count)
+    with pytest.raises(FloatingPointError, match="world 17, agent 30:"):
+        scene.run(start, 5)
+
+
+# --- threads of the caller's own --------------------------------------------------------------------------------------
+
+
+def at_the_same_time(calls: list[Callable[[], Any]]) -> list[Any]:
+    """Call all of them, each in a thread; fail, instead of waiting for ever, if one does not come back."""
+    pool = ThreadPoolExecutor(len(calls))
+    try:
+        return [future.result(PATIENCE) for future in [pool.submit(call) for call in calls]]
+    finally:
+        pool.shutdown(wait=False)
+
+
+@pytest.mark.parametrize(
+    ("name", "count", "edge", "worlds", "steps"),
+    [("torus_single", 5000, 70.0, 1, 3), ("torus_single", 150, 20.0, 7, 10), ("nearest_plane", 4111, 60.0, 1, 2)],
+)
+def test_two_callers_may_step_one_scene_with_two_threads_each(
+    name: str, count: int, edge: float, worlds: int, steps: int
+) -> None:
+    scene = NAMED[name].make(count, edge)
+    starts = [scene.start(seed, worlds) for seed in range(2)]
+    expected = [scene.run(start, steps * 4) for start in starts]
+    use_threads(2)
+
+    def run(state: State) -> State:
+        for _ in range(4):
+            state = scene.run(state, steps)
+        return state
+
+    found = at_the_same_time([lambda start=start: run(start) for start in starts])
+    for a, b in zip(found, expected, strict=True):
+        assert_same(a, b)
+
+
+def test_callers_whose_jobs_wait_for_each_other_never_wait_for_ever(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nine at once hire a crew, which takes a while: none is left with fewer threads than it has jobs."""
+
+    class Slow(crew._Crew):
+        def __init__(self, count: int) -> None:
+            super().__init__(count)
+            time.sleep(0.02 * (6 - count))  # the smallest comes last, and stays
+
+    monkeypatch.setattr(crew, "_Crew", Slow)
+    monkeypatch.setattr(crew, "_crew", None)
+
+    def call(size: int) -> list[int]:
+        meeting = threading.Barrier(size)
+
+        def job(k: int) -> int:
+            meeting.wait(20)
+            return k
+
+        return [sum(share([lambda k=k: job(k) for k in range(size)])) for _ in range(20)]
+
+    sizes = (2, 5, 3) * 3
+    answers: dict[int, list[int]] = {}
+    callers = [
+        threading.Thread(target=lambda n=n, size=size: answers.update({n: call(size)}), daemon=True)
+        for n, size in enumerate(sizes)
+    ]
+    for caller in callers:
+        caller.start()
+    for caller in callers:
+        caller.join(30)
+    assert answers == {n: [size * (size - 1) // 2] * 20 for n, size in enumerate(sizes)}
+
+
+def test_a_job_that_fails_fails_the_call_when_all_have_ended() -> None:
+    ended = []
+
+    def good() -> None:
+        time.sleep(0.05)
+        ended.append(1)
+
+    def bad() -> None:
+        raise OverflowError("too much")
+
+    for jobs in ([bad, good, good], [good, bad, good]):
+        ended.clear()
+        with pytest.raises(OverflowError, match="too much"):
+            share(jobs)
+        assert ended == [1, 1]
+    assert share([lambda: 1, lambda: 2, lambda: 3]) == [1, 2, 3]  # the crew is as good as before
+
+
+# --- a process that forks ---------------------------------------------------------------------------------------------
+
+FORK = """
+import os, sys
+import numpy as np
+from flockenv.crew import use_threads
+from tests.catalogue import VARIANTS
+variant = next(v for v in VARIANTS if v.name == "torus_single")
+use_threads(2)
+large, small = variant.make(5000, 70.0), variant.make(150, 20.0)
+starts = large.start(0), small.start(0, worlds=7)
+step = lambda: [large.run(starts[0], 2), small.run(starts[1], 10)]
+expected = step()  # now there are threads, which a child does not inherit
+children = []
+for _ in range(2):
+    child = os.fork()
+    if child == 0:
+        same = all(np.array_equal(a.x, b.x) for a, b in zip(step(), expected))
+        os._exit(7 if same else 3)
+    children.append(child)
+again = step()
+assert all(np.array_equal(a.x, b.x) for a, b in zip(again, expected))
+print([os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) for child in children])
+"""
+
+
+def in_another_process(code: str, **environment: str) -> subprocess.CompletedProcess[str]:
+    own = {"FLOCKENV_CACHE": str(cache_folder()), "PYTHONPATH": str(Path(flockenv.__file__).parent.parent)}
+    return subprocess.run(
+        [sys.executable, "-c", code],
+        cwd=ROOT,
+        env=own | environment,
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=PATIENCE,
+    )
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="there is no fork here")
+def test_a_forked_child_steps_with_threads_of_its_own() -> None:
+    done = in_another_process(FORK)
+    assert done.stdout == "[7, 7]\n", done.stderr
+
+
+# --- how many ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("count", [0, -1, 257, 2.0, True, "2", None, float("nan")])
+def test_a_number_of_threads_that_is_none_is_refused(count: Any) -> None:
+    with pytest.raises(ValueError, match="threads is") as caught:
+        use_threads(count)
+    assert repr(count) in str(caught.value)
+    assert "\n" not in str(caught.value)
+    assert threads() == 1
+
+
+@pytest.mark.parametrize("text", ["0", "-1", "257", "2.0", "two", "", " ", "1e3", "²", "99999999999999999999"])
+def test_an_environment_that_asks_for_no_number_of_threads_is_refused(
+    text: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("FLOCKENV_THREADS", text)
+    with pytest.raises(ValueError, match="FLOCKENV_THREADS is") as caught:
+        crew._from_environment()
+    assert repr(text) in str(caught.value)
+    assert "\n" not in str(caught.value)
+    assert threads() == 1
+
+
+def test_the_environment_says_how_many_threads() -> None:
+    code = "import flockenv.crew as c; print(c.threads())"
+    assert in_another_process(code).stdout == "1\n"
+    assert in_another_process(code, FLOCKENV_THREADS="3").stdout == "3\n"
+    refused = in_another_process(code, FLOCKENV_THREADS="many")
+    assert refused.returncode != 0
+    assert refused.stderr.splitlines()[-1].startswith("ValueError: FLOCKENV_THREADS is 'many'")
