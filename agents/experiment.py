@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import difflib
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from pydantic import Field
 
@@ -22,11 +22,11 @@ class PpoSettings(Record):
     """How PPO learns; the defaults are what two cores like: many rows per step, large minibatches, few epochs."""
 
     steps: int = Field(default=20_000_000, ge=1, description="agent-steps in all")
-    worlds: int = Field(default=1024, ge=1, description="worlds stepped together; rows = worlds x learners")
+    worlds: int = Field(default=2048, ge=1, description="worlds stepped together; rows = worlds x learners")
     rollout: int = Field(default=32, ge=1, description="decisions per update")
     minibatch: int = Field(default=8192, ge=1, description="rows")
     epochs: int = Field(default=4, ge=1, description="passes over a rollout")
-    learning_rate: float = Field(default=1e-3, gt=0, description="at the start; falls linearly to a tenth")
+    learning_rate: float = Field(default=2e-3, gt=0, description="at the start; falls linearly to a tenth")
     gamma: float = Field(default=0.99, gt=0, le=1, description="discount per decision")
     gae_lambda: float = Field(default=0.95, ge=0, le=1, description="of the advantage estimate")
     clip: float = Field(default=0.2, gt=0, description="PPO's clip range")
@@ -36,7 +36,8 @@ class PpoSettings(Record):
     stagger: bool = Field(default=False, description="begin worlds at different times of their first episode")
     hidden: tuple[int, ...] = Field(default=(64, 64), min_length=1, description="units per layer")
     activation: str = Field(default="relu", pattern="^(relu|tanh)$", description="relu or tanh")
-    threads: int = Field(default=2, ge=1, le=64, description="of torch; 1 where other work shares the cores")
+    threads: int = Field(default=2, ge=1, le=64, description="of torch and of the worlds; 1 where cores are shared")
+    dtype: Literal["float32", "float64"] = Field(default="float32", description="precision of the worlds it learns in")
     seed: int = Field(default=0, ge=0, lt=1000, description="of the weights and of the training worlds")
     evaluate_every: int = Field(default=1_000_000, ge=1, description="agent-steps between points of the curve")
     evaluate_worlds: int = Field(default=256, ge=1, description="tuning worlds per point of the curve")
@@ -65,6 +66,9 @@ class Experiment(Record):
     task: str = Field(description="name of the task")
     arguments: dict[str, Any] = Field(default_factory=dict, description="keyword arguments of the task")
     ppo: PpoSettings = Field(default_factory=PpoSettings)
+    curves: dict[str, dict[str, Any]] = Field(
+        default_factory=dict, description="other settings of PPO to compare it with, by name: what differs"
+    )
     reynolds: ReynoldsSettings = Field(default_factory=ReynoldsSettings)
 
     def build(self) -> Task:

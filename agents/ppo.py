@@ -26,6 +26,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import VecEnvWrapper
 
 from agents.experiment import WEIGHTS, Experiment, PpoSettings, load_experiment
+from flockenv.crew import use_threads
 from flockenv.evaluation import rollout, worlds_for
 from flockenv.policy import MlpPolicy, save_policy
 from flockenv.sb3 import WorldVecEnv
@@ -93,7 +94,9 @@ def build(task: Task, p: PpoSettings, tensorboard: str | None) -> PPO:
     """Make the worlds and the model."""
     torch.set_num_threads(p.threads)
     torch.manual_seed(p.seed)
-    worlds = ForLearning(WorldVecEnv(task, p.worlds), p.reward_scale, p.stagger)
+    use_threads(p.threads)
+    learned = task.model_copy(update={"dtype": p.dtype})
+    worlds = ForLearning(WorldVecEnv(learned, p.worlds), p.reward_scale, p.stagger)
     model = PPO(
         "MlpPolicy",
         worlds,

@@ -28,6 +28,7 @@ from benchmarks.measure import Bench, Contestant, Floor, Out, Quick, Rounds, com
 from benchmarks.scenes import crowd, restarting, stepping, world
 from flockenv.crew import use_threads
 from flockenv.effects import Alignment, Cohesion, Separation
+from flockenv.effects.base import ties
 from flockenv.scene import Scene
 from flockenv.state import State
 
@@ -77,8 +78,9 @@ class Reference:
         step = getattr(self.limit, f"{kind}_{'f32' if scene.dtype == 'float32' else 'f64'}_{scene.dimension}d")
         numbers = np.array(_numbers(scene), scene.dtype)
         sizes = (*state.shape[:2], steps) if kind == "worlds" else (state.shape[1], steps)
-        arguments = (*map(_pointer, (state.x, state.v)), *map(ctypes.c_long, sizes), _pointer(numbers))
-        return lambda numbers=numbers: step(*arguments)  # it keeps the memory of its numbers
+        apart = np.ascontiguousarray(ties(state.shape[1], scene.dimension).T, scene.dtype)
+        arguments = (*map(_pointer, (state.x, state.v, apart)), *map(ctypes.c_long, sizes), _pointer(numbers))
+        return lambda numbers=numbers, apart=apart: step(*arguments)  # it keeps the memory of these
 
     def operations_per_second(self, dtype: str) -> float:
         """Return how many independent operations this machine does at best, each lane of a vector counted."""

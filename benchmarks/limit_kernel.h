@@ -9,6 +9,7 @@
 #define LESS NAME(less)
 #define KEEP NAME(keep)
 #define ADD NAME(add)
+#define TAKE NAME(take)
 #define W ((long)(sizeof(VEC) / sizeof(REAL)))
 #ifdef __AVX512F__
 typedef VECTOR VEC;
@@ -16,6 +17,7 @@ typedef MASK NAME(mask);
 static inline VEC ALL(REAL a) { return JOINED(_mm512_set1_, SUFFIX)(a); }
 static inline VEC KEEP(NAME(mask) m, VEC v) { return JOINED(_mm512_maskz_mov_, SUFFIX)(m, v); }
 static inline VEC ADD(NAME(mask) m, VEC a, VEC b) { return JOINED(_mm512_mask_add_, SUFFIX)(a, m, a, b); }
+static inline VEC TAKE(NAME(mask) m, VEC a, VEC b) { return JOINED(_mm512_mask_blend_, SUFFIX)(m, b, a); }
 static inline VEC NAME(inverse)(NAME(mask) m, VEC a) { return JOINED(_mm512_maskz_div_, SUFFIX)(m, ALL(1), a); }
 static inline NAME(mask) LESS(VEC a, VEC b) { return JOINED(JOINED(_mm512_cmp_, SUFFIX), _mask)(a, b, _CMP_LT_OQ); }
 static inline VEC NAME(root)(VEC v) { return JOINED(_mm512_sqrt_, SUFFIX)(v); }
@@ -26,6 +28,7 @@ typedef INTEGER NAME(mask) __attribute__((vector_size(64)));
 static inline VEC ALL(REAL a) { VEC v = {0}; return v + a; }
 static inline VEC KEEP(NAME(mask) m, VEC v) { return (VEC)((NAME(mask))v & m); }
 static inline VEC ADD(NAME(mask) m, VEC a, VEC b) { return a + KEEP(m, b); }
+static inline VEC TAKE(NAME(mask) m, VEC a, VEC b) { return KEEP(m, a) + KEEP(~m, b); }
 static inline VEC NAME(inverse)(NAME(mask) m, VEC a) { return KEEP(m, 1 / a); }
 static inline NAME(mask) LESS(VEC a, VEC b) { return a < b; }
 static inline VEC NAME(root)(VEC v) { for (int l = 0; l < W; l++) v[l] = SQRT(v[l]); return v; }
@@ -33,12 +36,13 @@ static inline VEC NAME(whole)(VEC v) { for (int l = 0; l < W; l++) v[l] = FLOOR(
 #endif
 
 typedef struct { VEC push[D], speed[D], centre[D], mates, company; } NAME(sums);
-typedef struct { VEC x[D], v[D]; } NAME(block);
+typedef struct { VEC x[D], v[D], t[D]; } NAME(block);
 typedef struct { REAL size, apart, agree, near, w_apart, w_agree, w_near, force, speed, dt; } NAME(rules);
 
-/* One candidate against a block, that meets itself too: `image` asks for the nearest periodic image. */
-static inline void NAME(meet)(NAME(sums) *s, const NAME(block) *me, const REAL *xj, const REAL *vj, int image,
-                              const NAME(rules) *p) {
+/* One candidate against a block, that meets itself too: `image` asks for the nearest periodic image. Agents in one
+   place part along the difference of their ties; oneself has none. */
+static inline void NAME(meet)(NAME(sums) *s, const NAME(block) *me, const REAL *xj, const REAL *vj,
+                              const REAL *tj, int image, const NAME(rules) *p) {
     VEC d[D], square, one = ALL(1);
     for (int k = 0; k < D; k++) {
         d[k] = ALL(xj[k]) - me->x[k];
@@ -46,10 +50,10 @@ static inline void NAME(meet)(NAME(sums) *s, const NAME(block) *me, const REAL *
         square = k ? square + d[k] * d[k] : d[k] * d[k];
     }
     NAME(mask) agree = LESS(square, ALL(p->agree * p->agree)), near = LESS(square, ALL(p->near * p->near));
-    NAME(mask) apart = LESS(square, ALL(p->apart * p->apart)) & LESS(ALL((REAL)1e-30), square);
-    VEC share = NAME(inverse)(apart, square);
+    NAME(mask) close = LESS(square, ALL(p->apart * p->apart)), apart = LESS(ALL((REAL)1e-30), square);
+    VEC share = -1 / square;
     for (int k = 0; k < D; k++) {
-        s->push[k] -= d[k] * share;
+        s->push[k] = ADD(close, s->push[k], TAKE(apart, d[k] * share, me->t[k] - ALL(tj[k])));
         s->speed[k] = ADD(agree, s->speed[k], ALL(vj[k]));
         s->centre[k] = ADD(near, s->centre[k], d[k]);
     }
@@ -70,6 +74,7 @@ static inline NAME(block) NAME(begin)(const REAL *now, long padded, long first, 
     for (int k = 0; k < D; k++) {
         memcpy(&me.x[k], now + k * padded + first, sizeof(VEC));
         memcpy(&me.v[k], now + (D + k) * padded + first, sizeof(VEC));
+        memcpy(&me.t[k], now + (2 * D + k) * padded + first, sizeof(VEC));
     }
     return me;
 }
@@ -102,13 +107,19 @@ static inline void NAME(move)(const NAME(sums) *s, const NAME(block) *me, const 
     }
 }
 
-/* B worlds of N agents, brute force; x and v are (D, B, N) and updated in place. A world does all its steps at once. */
-void NAME(worlds)(REAL *restrict x, REAL *restrict v, long worlds, long n, long steps, const REAL *numbers) {
+/* B worlds of N agents, brute force; x and v are (D, B, N) and updated in place, ties (D, N) are directions of all
+   worlds. A world does all its steps at once. */
+void NAME(worlds)(REAL *restrict x, REAL *restrict v, const REAL *restrict ties, long worlds, long n, long steps,
+                  const REAL *numbers) {
     const NAME(rules) p = *(const NAME(rules) *)numbers;
-    long plane = worlds * n, padded = (n + W - 1) / W * W, all = 2 * D * padded;
+    long plane = worlds * n, padded = (n + W - 1) / W * W, all = 3 * D * padded;
     REAL *now = scratch(0, all * sizeof(REAL)), *next = scratch(1, all * sizeof(REAL));
     memset(now, 0, all * sizeof(REAL));
     memset(next, 0, all * sizeof(REAL));
+    for (int k = 0; k < D; k++) {
+        memcpy(now + (2 * D + k) * padded, ties + k * n, n * sizeof(REAL));
+        memcpy(next + (2 * D + k) * padded, ties + k * n, n * sizeof(REAL));
+    }
     for (long b = 0; b < worlds; b++) {
         for (int k = 0; k < D; k++) {
             memcpy(now + k * padded, x + k * plane + b * n, n * sizeof(REAL));
@@ -119,9 +130,12 @@ void NAME(worlds)(REAL *restrict x, REAL *restrict v, long worlds, long n, long 
                 NAME(sums) s;
                 NAME(block) me = NAME(begin)(now, padded, first, &s);
                 for (long j = 0; j < n; j++) {
-                    REAL xj[D], vj[D];
-                    for (int k = 0; k < D; k++) xj[k] = now[k * padded + j], vj[k] = now[(D + k) * padded + j];
-                    NAME(meet)(&s, &me, xj, vj, 1, &p);
+                    REAL xj[D], vj[D], tj[D];
+                    for (int k = 0; k < D; k++) {
+                        xj[k] = now[k * padded + j], vj[k] = now[(D + k) * padded + j];
+                        tj[k] = now[(2 * D + k) * padded + j];
+                    }
+                    NAME(meet)(&s, &me, xj, vj, tj, 1, &p);
                 }
                 NAME(move)(&s, &me, &p, next, padded, first);
             }
@@ -135,14 +149,14 @@ void NAME(worlds)(REAL *restrict x, REAL *restrict v, long worlds, long n, long 
     }
 }
 
-/* One large world: agents sorted by cell, (2 D, padded) each in `now` and `next`, and where each cell begins. Rows of
+/* One large world: agents sorted by cell, (3 D, padded) each in `now` and `next`, and where each cell begins. Rows of
    cells are a reach high; a cell is a third of a reach long, so that a block meets few agents out of its reach. */
 #define FINE 3
 typedef struct {
     long n, padded, nx, ny, rows;
     REAL *now, *next;
     int *who, *whose, *cell, *start; /* whose agents those of now and next are */
-    struct NAME(record) { REAL numbers[2 * D]; int who; } *records;
+    struct NAME(record) { REAL numbers[3 * D]; int who; } *records;
 } NAME(grid);
 
 /* Find the cell of each agent of `next`, and how many there are in those before it: at start[c + 1] for cell c. */
@@ -166,11 +180,11 @@ static void NAME(count)(NAME(grid) *g, REAL size) {
 static void NAME(gather)(NAME(grid) *g) {
     for (long i = 0; i < g->n; i++) {
         struct NAME(record) r = {.who = (int)i};
-        for (int k = 0; k < 2 * D; k++) r.numbers[k] = g->next[k * g->padded + i];
+        for (int k = 0; k < 3 * D; k++) r.numbers[k] = g->next[k * g->padded + i];
         g->records[g->start[g->cell[i] + 1]++] = r;
     }
     for (long i = 0; i < g->n; i++) {
-        for (int k = 0; k < 2 * D; k++) g->now[k * g->padded + i] = g->records[i].numbers[k];
+        for (int k = 0; k < 3 * D; k++) g->now[k * g->padded + i] = g->records[i].numbers[k];
         g->who[i] = g->records[i].who;
     }
 }
@@ -180,7 +194,7 @@ static void NAME(settle)(NAME(grid) *g) {
     for (long i = 0; i < g->n; i++) {
         long to = g->start[g->cell[i] + 1]++;
         g->who[to] = g->whose[i];
-        for (int k = 0; k < 2 * D; k++) g->now[k * g->padded + to] = g->next[k * g->padded + i];
+        for (int k = 0; k < 3 * D; k++) g->now[k * g->padded + to] = g->next[k * g->padded + i];
     }
 }
 
@@ -226,29 +240,35 @@ static __attribute__((noinline)) void NAME(row)(const NAME(grid) *g, long row, c
                 REAL near[D] = {piece * p.size};
                 for (int k = 1; k < D; k++) near[k] = shift[r][k];
                 for (long j = begin[r][from], last = begin[r][to]; j < last; j++) {
-                    REAL xj[D], vj[D];
-                    for (int k = 0; k < D; k++)
+                    REAL xj[D], vj[D], tj[D];
+                    for (int k = 0; k < D; k++) {
                         xj[k] = now[k * padded + j] + near[k], vj[k] = now[(D + k) * padded + j];
-                    NAME(meet)(&s, &me, xj, vj, 0, &p);
+                        tj[k] = now[(2 * D + k) * padded + j];
+                    }
+                    NAME(meet)(&s, &me, xj, vj, tj, 0, &p);
                 }
             }
         NAME(move)(&s, &me, &p, g->next, padded, first);
+        for (int k = 0; k < D; k++) /* whoever comes after `stop` is written by the next row */
+            memcpy(g->next + (2 * D + k) * padded + first, &me.t[k], sizeof(VEC));
     }
 }
 
 /* One world of N agents; x and v are (D, N) and updated in place. Agents stay sorted by cell from step to step. */
-void NAME(crowd)(REAL *restrict x, REAL *restrict v, long n, long steps, const REAL *numbers) {
+void NAME(crowd)(REAL *restrict x, REAL *restrict v, const REAL *restrict ties, long n, long steps,
+                 const REAL *numbers) {
     const NAME(rules) p = *(const NAME(rules) *)numbers;
     REAL reach = p.near > p.agree ? p.near : p.agree;
     if (p.apart > reach) reach = p.apart;
     NAME(grid) g = {.n = n, .padded = n + W, .ny = (long)(p.size / (reach * (REAL)1.001))};
     g.nx = FINE * g.ny, g.rows = D == 3 ? g.ny * g.ny : g.ny;
-    g.now = scratch(0, 2 * D * g.padded * sizeof(REAL)), g.next = scratch(1, 2 * D * g.padded * sizeof(REAL));
+    g.now = scratch(0, 3 * D * g.padded * sizeof(REAL)), g.next = scratch(1, 3 * D * g.padded * sizeof(REAL));
     g.who = scratch(2, n * sizeof(int)), g.whose = scratch(3, n * sizeof(int)), g.cell = scratch(4, n * sizeof(int));
     g.start = scratch(5, (g.nx * g.rows + 2) * sizeof(int)), g.records = scratch(6, n * sizeof(struct NAME(record)));
     for (int k = 0; k < D; k++) {
         memcpy(g.next + k * g.padded, x + k * n, n * sizeof(REAL));
         memcpy(g.next + (D + k) * g.padded, v + k * n, n * sizeof(REAL));
+        memcpy(g.next + (2 * D + k) * g.padded, ties + k * n, n * sizeof(REAL));
     }
     for (long t = 0; t < steps; t++) {
         int *swap = g.who;
@@ -267,3 +287,4 @@ void NAME(crowd)(REAL *restrict x, REAL *restrict v, long n, long steps, const R
 #undef LESS
 #undef KEEP
 #undef ADD
+#undef TAKE

@@ -28,6 +28,7 @@ from numba.extending import intrinsic, overload
 from numba.np import arrayobj
 
 from flockenv import compilation  # noqa: F401  # tells how long compiling takes
+from flockenv.inlining import Inlined
 
 __all__ = [
     "FAST",
@@ -58,6 +59,7 @@ FAST = frozenset({"contract"})
 # here may allocate (numba says so when it compiles): scratch is an argument.
 _OPTIONS: Any = {
     "forceinline": True, "fastmath": set(FAST), "error_model": "numpy", "nogil": True, "_nrt": False,
+    "pipeline_class": Inlined,
 }  # fmt: skip
 _njit: Any = numba.njit  # numba's stubs do not know `_nrt`
 

@@ -17,13 +17,22 @@ from numpy.typing import NDArray
 from flockenv.kernels import kernel, wait_for_team
 from flockenv.space import torus_confine
 
-__all__ = ["FEWEST_AGENTS", "MAX_RANGES", "candidates", "count_cells", "grid_of", "place_of", "row_of"]
+__all__ = [
+    "FEWEST_AGENTS", "FINEST", "MAX_RANGES", "WORTH_ARRANGING", "candidates", "count_cells", "grid_of", "order_records",
+    "place_of", "row_of",
+]  # fmt: skip
 
 MAX_RANGES = 27
 """Ranges of one query: 9 rows of cells in 3-D, each in three pieces where it wraps around twice."""
 
 FEWEST_AGENTS = 96
 """Below this, sorting costs more than it saves."""
+
+WORTH_ARRANGING = 2**14
+"""Agents from which on a call of several steps puts them in order first: fewer lie in the nearest caches anyway."""
+
+FINEST = 3
+"""Cells along x that a reach spans at most: a row is cut finely, so that a block meets few agents out of its reach."""
 
 _MARGIN = 1.001  # cells are this much wider than the reach, so that rounding never hides a neighbour
 
@@ -61,17 +70,24 @@ def _along(length: float, reach: float) -> int:
 
 
 @kernel
-def grid_of(lengths: Any, count: int, reach: float, periodic: bool) -> tuple[int, int, int]:
-    """Choose how many cells each axis gets, at most `count` in all; (0, 0, 0) where brute force is as good."""
-    if len(lengths) == 2:
-        nx, ny, nz = _fit((_along(lengths[0], reach), _along(lengths[1], reach), 1), count)
-        few = periodic and min(nx, ny) < 3  # a row and its image would be the same row
-        return (0, 0, 0) if few or nx * ny < 36 else (nx, ny, 1)
-    else:
-        cells = (_along(lengths[0], reach), _along(lengths[1], reach), _along(lengths[2], reach))
-        nx, ny, nz = _fit(cells, count)
-        few = periodic and min(nx, ny, nz) < 3
-        return (0, 0, 0) if few or nx * ny * nz < 108 else (nx, ny, nz)
+def grid_of(lengths: Any, count: int, reach: float, periodic: bool) -> tuple[int, int, int, int]:
+    """Choose how many cells each axis gets, at most `count` in all, and how many of them a reach spans along x.
+
+    Zeros where brute force is as good.
+    """
+    fine, nx, ny, nz = FINEST, _along(lengths[0], reach / FINEST), _along(lengths[1], reach), 1
+    if len(lengths) == 3:
+        nz = _along(lengths[len(lengths) - 1], reach)
+    while fine > 1 and float(nx) * float(ny) * float(nz) > count:
+        fine -= 1
+        nx = _along(lengths[0], reach / fine)
+    nx, ny, nz = _fit((nx, ny, nz), count)
+    wide = nx // fine
+    few = periodic and (
+        min(wide, ny) < 3 or (len(lengths) == 3 and nz < 3)
+    )  # a row and its image would be the same row
+    least = 36 if len(lengths) == 2 else 108
+    return (0, 0, 0, 0) if few or wide * ny * nz < least else (nx, ny, nz, fine)
 
 
 @kernel
@@ -123,28 +139,42 @@ def region(
 
 
 @kernel
-def _cell(
-    pos: Any, at: int, lanes: int, low: Any, lengths: Any, size: Any, periodic: bool, shape: tuple[int, int, int]
-) -> int:
-    if len(lengths) == 2:
-        x: Any = (pos[at], pos[at + lanes])
-    else:
-        x = (pos[at], pos[at + lanes], pos[at + 2 * lanes])
-    if periodic:  # as it is sorted: -1e-17 is 0 there, and with a cell at the other end it would miss its neighbours
-        x, _ = torus_confine(size, size[0], x, x)
-    index = 0
-    for k in range(len(lengths) - 1, -1, -1):
-        part = (np.float64(x[k]) - low[k]) / lengths[k]
-        index = index * shape[k] + min(max(int(part * shape[k]), 0), shape[k] - 1)
-    return index
+def _part(x: float, low: float, pace: float, count: int) -> Any:
+    """Return which of `count` cells along an axis x is in, a NaN in the first; cells per metre are its pace."""
+    return min(max(np.int64((np.float64(x) - low) * pace), np.int64(0)), np.int64(count - 1))
+
+
+@kernel
+def _find_cells(
+    pos: Any, living: Any, first: int, end: int, lanes: int, low: Any, pace: Any, size: Any, periodic: bool, shape: Any,
+    cell: Ints,
+) -> None:  # fmt: skip
+    """Write the cell of every agent of these blocks, lane beside lane; -1 for the dead."""
+    d, w = np.uint64(len(size)), np.uint64(lanes)
+    for block in range(np.uint64(first), np.uint64(end)):
+        for l in range(w):  # noqa: E741  # a lane
+            at = block * d * w + l
+            if len(size) == 2:
+                x: Any = (pos[at], pos[at + w])
+            else:
+                x = (pos[at], pos[at + w], pos[at + w + w])
+            if periodic:  # as it is sorted: -1e-17 is 0 there, and with a cell at the other end would miss neighbours
+                x, _ = torus_confine(size, size[0], x, x)
+            if len(size) == 2:
+                index: Any = np.int64(0)
+            else:
+                index = _part(x[len(size) - 1], low[len(size) - 1], pace[len(size) - 1], shape[2])
+            index = index * shape[1] + _part(x[1], low[1], pace[1], shape[1])
+            index = index * shape[0] + _part(x[0], low[0], pace[0], shape[0])
+            cell[block * w + l] = np.int32(index) if living[block * w + l] > 0 else np.int32(-1)
 
 
 @kernel
 def count_cells(
     pos: Any, living: Any, first: int, end: int, lanes: int, rank: int, team: int, sync: Any, bounds: Any, size: Any,
     reach: float, periodic: bool, capacity: int, cell: Ints, start: Ints, offset: Ints,
-) -> tuple[int, int, int]:  # fmt: skip
-    """Find the cell of every agent, and where in sorted order each cell begins; return the cells per axis.
+) -> tuple[int, int, int, int]:  # fmt: skip
+    """Find the cell of every agent, and where in sorted order each cell begins; return the cells as grid_of does.
 
     pos: blocks of (D, lanes) m; living (agents, padded) 0 or 1; [first, end): this thread's blocks; capacity: most
     cells. Writes cell (agents, padded), -1 for the dead; start (capacity + 1,): first sorted agent of each cell;
@@ -157,11 +187,13 @@ def count_cells(
         return shape
     for c in range(cells):
         offset[rank, c] = 0
+    if len(size) == 2:
+        pace: Any = (shape[0] / lengths[0], shape[1] / lengths[1])
+    else:
+        pace = (shape[0] / lengths[0], shape[1] / lengths[1], shape[2] / lengths[len(size) - 1])
+    _find_cells(pos, living, first, end, lanes, low, pace, size, periodic, shape, cell)
     for i in range(first * lanes, end * lanes):
-        c = -1
-        if living[i] > 0:
-            c = _cell(pos, place_of(i, len(size), lanes), lanes, low, lengths, size, periodic, shape)
-        cell[i] = c
+        c = cell[i]
         if c >= 0:
             offset[rank, c] += 1
     wait_for_team(sync, team)
@@ -179,6 +211,35 @@ def count_cells(
 
 
 @kernel
+def _key(records: Any, ident: Any, at: Any) -> Any:
+    """Return cell and number of the agent whose record begins at `at`, in one whole number that is in their order."""
+    return np.int64(records[at]) * np.int64(2**32) + np.int64(ident[np.uint64(records[at + np.uint64(1)])])
+
+
+@kernel
+def order_records(records: Any, ident: Any, length: int, first: int, end: int) -> None:
+    """Put the records [first, end), so long and in the order of their cells, in the order of numbers within each.
+
+    Records begin with their cell and their place, and ident has the numbers by place. Most are where they belong: one
+    comparison each.
+    """
+    if first >= end:
+        return
+    size = np.uint64(length)
+    before = _key(records, ident, np.uint64(first) * size)
+    for k in range(np.uint64(first) + np.uint64(1), np.uint64(end)):
+        at = k * size
+        key = _key(records, ident, at)
+        if key >= before:
+            before = key
+            continue
+        while at > np.uint64(first) * size and _key(records, ident, at - size) > _key(records, ident, at):
+            for m in range(at, at + size):
+                records[m - size], records[m] = records[m], records[m - size]
+            at -= size
+
+
+@kernel
 def row_of(first: int, start: Ints, row: int, nx: int) -> int:
     """Return the row of cells that holds sorted agent `first`, searching from `row` on."""
     while start[(row + 1) * nx] <= first:
@@ -188,20 +249,20 @@ def row_of(first: int, start: Ints, row: int, nx: int) -> int:
 
 @kernel
 def candidates(
-    first: int, end: int, row: int, at: int, shape: tuple[int, int, int], start: Ints, periodic: bool, ranges: Any
+    first: int, end: int, row: int, at: int, shape: Any, start: Ints, periodic: bool, ranges: Any
 ) -> tuple[int, int]:
     """Write the ranges (from, to, wrapped) of sorted agents that may be near the block [first, end) of one row.
 
     `at` is a cell at or before that of `first`, from where the search begins. Returns how many ranges there are, and
     the cell of `first`. A range is `wrapped` if it lies around the edge of a periodic box.
     """
-    nx, ny, nz = shape
+    nx, ny, nz, fine = shape
     while start[at + 1] <= first:
         at += 1
     last = at
     while start[last + 1] < end:
         last += 1
-    west, east = at - row * nx - 1, last - row * nx + 1
+    west, east = at - row * nx - fine, last - row * nx + fine
     y, z = row % ny, row // ny
     found = 0
     for dz in range(-1 if nz > 1 else 0, 2 if nz > 1 else 1):

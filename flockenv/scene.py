@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import functools
 import math
+import mmap
 import operator
 import threading
 from collections.abc import Sequence
@@ -25,7 +26,7 @@ from flockenv.effects import EFFECTS, Effect
 from flockenv.effects.base import ties
 from flockenv.integrators import INTEGRATORS, Integrator, SemiImplicitEuler
 from flockenv.kernels import entry, load
-from flockenv.neighbours import FEWEST_AGENTS, MAX_RANGES
+from flockenv.neighbours import FEWEST_AGENTS, MAX_RANGES, WORTH_ARRANGING
 from flockenv.noise import MASK, key_of
 from flockenv.records import Record
 from flockenv.shapes import Circle
@@ -33,7 +34,7 @@ from flockenv.snapshot import Snapshot
 from flockenv.space import AnySpace, Box, Plane, Torus
 from flockenv.spawn import Spawn, scatter
 from flockenv.state import Body, Floats, State
-from flockenv.sweep import SHARED, Parts, scene_source
+from flockenv.sweep import SHARED, SMALL_STRIDE, Parts, scene_source
 
 __all__ = ["Group", "Scene", "Workspace"]
 
@@ -44,6 +45,9 @@ SYNC = SHARED.split(", ").index("sync")
 
 EXACT = 2**24
 """Whole numbers, and so numbers of agents, that float32 tells apart."""
+
+HUGE = 2**21
+"""Bytes of a large page."""
 
 MEMORY_LIMIT = 8 * 2**30
 """Bytes that a state and its scratch may take before a scene is refused."""
@@ -102,24 +106,32 @@ class Workspace:
         d, agents, dtype = parts.dimension, len(body.mass), body.mass.dtype
         width = parts.width
         padded = -(-agents // width) * width
-        sorts = parts.sweeps and agents >= FEWEST_AGENTS
+        sorts = parts.sweeps and parts.sorts
+        carried = agents if parts.arranges and agents >= WORTH_ARRANGING else 1
         swept, cells = padded if parts.sweeps else 1, agents if sorts else 1
         real: dict[str, int | tuple[int, ...]] = {
             **dict.fromkeys(("pos", "vel", "origin", "want"), padded * d),
             "stages": (max(parts.integrator.stages, 1), padded * d),
-            **dict.fromkeys(("mass", "radius", "max_speed", "max_force", "living"), padded),
+            **dict.fromkeys(("mass", "radius", "max_speed", "max_force", "living", "ident"), padded),
             "tie": padded * d if "t0" in parts.fields else 1,
             "felt": max(swept * d * len(parts.targets), 1),
-            "sorted_": (parts.rows, swept + width),
-            "records": (padded if sorts else 1, parts.numbers),
+            "sorted_": parts.rows * (swept + width if parts.sorts else SMALL_STRIDE),
+            "records": (swept if sorts else 1) * parts.numbers,
+            "luggage": carried * parts.luggage_size,
         }
         arrays = {name: _aligned(shape, dtype) for name, shape in real.items()}
-        whole = {"order": (swept,), "cell": (padded if sorts else 1,), "start": (cells + 1,), "offset": (team, cells)}
+        whole = {
+            "order": (swept + width,),
+            "cell": (padded if sorts else 1,),
+            "start": (cells + 1,),
+            "offset": (team, cells),
+        }
         arrays |= {name: np.zeros(shape, np.int32) for name, shape in whole.items()}
         arrays |= {"bounds": np.zeros((team, 6)), "tally": np.zeros(team, np.int64), "sync": np.zeros(8, np.int64)}
         for name, pad in (("mass", 1), ("radius", 0), ("max_speed", 1), ("max_force", 1)):
             arrays[name][:] = pad
             arrays[name][:agents] = getattr(body, name)
+        arrays["ident"][:] = np.arange(padded)
         if "t0" in parts.fields:
             blocks = ties(padded, d).reshape(-1, width, d).transpose(0, 2, 1)
             arrays["tie"][:] = blocks.reshape(-1)
@@ -136,10 +148,20 @@ class Workspace:
 def _aligned(shape: int | tuple[int, ...], dtype: Any) -> NDArray[Any]:
     """Return zeros that begin on a cache line, so that no vector register is loaded from two."""
     size = int(np.prod(shape)) * np.dtype(dtype).itemsize
-    raw = np.zeros(size + 64, np.uint8)
+    raw = _huge(size + 64) if size >= HUGE else np.zeros(size + 64, np.uint8)
     skip = -raw.ctypes.data % 64
     aligned: NDArray[Any] = raw[skip : skip + size].view(dtype).reshape(shape)
     return aligned
+
+
+def _huge(size: int) -> NDArray[np.uint8]:
+    """Return zeros on large pages, where the system has them: fewer addresses to look up in a large world."""
+    if not hasattr(mmap, "MADV_HUGEPAGE"):
+        return np.zeros(size, np.uint8)
+    memory = mmap.mmap(-1, size + HUGE, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)
+    memory.madvise(mmap.MADV_HUGEPAGE)
+    raw = np.frombuffer(memory, np.uint8)
+    return raw[-raw.ctypes.data % HUGE :]
 
 
 class Scene(Record):
@@ -215,11 +237,16 @@ class Scene(Record):
         real = 8 if self.dtype == "float64" else 4
         d, parts = self.dimension, self.parts
         reals = 2 * d + 4  # positions, velocities, bodies
-        reals += 4 * d + max(parts.integrator.stages, 1) * d + 5  # blocks of them, the drive, the stages
+        reals += 4 * d + max(parts.integrator.stages, 1) * d + 6  # blocks of them, the drive, the stages
         whole = 1
         if parts.sweeps:
-            reals += d * (len(parts.targets) + 1) + parts.rows + parts.numbers
-            whole += 4 * 4
+            reals += d * (len(parts.targets) + 1)
+            whole += 4
+        if parts.sweeps and parts.sorts:
+            reals += parts.rows + parts.numbers
+            whole += 3 * 4
+        if parts.arranges and self.agents >= WORTH_ARRANGING:
+            reals += parts.luggage_size
         return self.agents * (reals * real + whole)
 
     @functools.cached_property
@@ -235,7 +262,8 @@ class Scene(Record):
     @functools.cached_property
     def parts(self) -> Parts:
         """What the kernel is made of."""
-        return Parts(self.dimension, self.space, self.effects, self.integrator, self.dtype)
+        sorts = self.agents >= FEWEST_AGENTS
+        return Parts(self.dimension, self.space, self.effects, self.integrator, self.dtype, sorts)
 
     @functools.cached_property
     def _params(self) -> Floats:

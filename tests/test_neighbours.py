@@ -246,7 +246,7 @@ def test_a_query_writes_into_its_own_arrays_only(size: Any, dimension: int) -> N
         )  # fmt: skip
         for name, length in lengths.items():
             assert (whole[name][length:] == -7).all(), f"{name} is too short for {shape} cells"
-        cells = math.prod(shape)
+        cells = math.prod(shape[:3])
         assert cells <= n
         if cells:
             np.testing.assert_array_equal(np.diff(start[: cells + 1]), np.bincount(cell[:n], minlength=cells))

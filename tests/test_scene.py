@@ -440,8 +440,8 @@ def test_a_million_agents_fit_into_a_gigabyte() -> None:
     rules = (Separation(weight=1, radius=1), Alignment(weight=1, radius=2), Cohesion(weight=1, radius=2))
     scene = scene_of(*rules, dtype="float32", groups=(million,))
     assert scene.bytes_per_world() < 1e9
-    few = scene.model_copy(update={"groups": (million.model_copy(update={"count": 10_000}),)})
-    assert scene.bytes_per_world() == 100 * few.bytes_per_world()  # so that what holds for them holds for a million
+    few = scene.model_copy(update={"groups": (million.model_copy(update={"count": 20_000}),)})
+    assert scene.bytes_per_world() == 50 * few.bytes_per_world()  # so that what holds for them holds for a million
     assert few.bytes_per_world() == pytest.approx(taken(few), rel=0.01)
 
 

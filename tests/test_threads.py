@@ -25,6 +25,7 @@ import flockenv.scene as scenes
 from flockenv import crew
 from flockenv.crew import share, threads, use_threads
 from flockenv.kernels import cache_folder
+from flockenv.neighbours import WORTH_ARRANGING
 from flockenv.scene import Scene
 from flockenv.state import State
 from tests.catalogue import VARIANTS, Variant
@@ -135,6 +136,44 @@ def test_a_team_goes_through_the_worlds_of_a_small_batch_of_large_ones(shared: l
         shared.clear()
         assert_same(scene.step(start, drive=drive, steps=3), expected)
         assert shared == [parts]
+
+
+def crowded(scene: Scene) -> tuple[Scene, State]:
+    """The same with bodies of two kinds, mixed up in space, large enough to be put in order during a call."""
+    half = scene.groups[0].model_copy(update={"count": WORTH_ARRANGING // 2 + 3})
+    heavy = half.model_copy(update={"mass": 3.0, "max_speed": 1.0, "max_force": 2.0, "radius": 0.05})
+    scene = scene.model_copy(update={"groups": (half, heavy)})
+    state = scene.start(3)
+    state.x[...] = np.random.default_rng(1).permuted(state.x, axis=2)
+    return scene, state
+
+
+@pytest.mark.parametrize("name", ["torus_single", "torus_3", "box", "nearest_torus_single", "torus_single_rk4"])
+def test_a_call_of_many_steps_is_many_calls_of_one(name: str) -> None:
+    """Only in a call of several steps agents of a large world are put in order; nobody can tell from the bits."""
+    scene, start = crowded(NAMED[name].make(WORTH_ARRANGING, 140.0 if scene_is_flat(name) else 40.0))
+    drive = np.random.default_rng(2).normal(size=start.shape)
+    expected = start
+    for _ in range(4):
+        expected = scene.step(expected, drive=drive)
+    assert_same(scene.step(start, drive=drive, steps=4), expected)
+    use_threads(2)
+    assert_same(scene.step(start, drive=drive, steps=4), expected)
+    assert not np.array_equal(np.argsort(start.x[0, 0]), np.argsort(expected.x[0, 0]))  # they changed places
+
+
+def scene_is_flat(name: str) -> bool:
+    return NAMED[name].dimension == 2
+
+
+def test_nan_in_a_world_that_was_put_in_order_names_the_agent_by_its_number() -> None:
+    scene, start = crowded(NAMED["torus_single"].make(WORTH_ARRANGING, 140.0))
+    start.v[1, 0, 12_345] = np.inf
+    with pytest.raises(FloatingPointError) as error:
+        scene.step(start, out=start, steps=3)
+    bad = np.flatnonzero(~np.isfinite(start.x + start.v).all(axis=(0, 1)))
+    assert 12_345 in bad and bad[0] < 12_345  # its neighbours caught it
+    assert f"world 0, agent {bad[0]}:" in str(error.value)
 
 
 def test_more_threads_than_there_is_work_for_do_no_harm() -> None:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import Any, ClassVar, Literal
 
+import numpy as np
+
 from flockenv.integrators.base import Integrator
 from flockenv.kernels import kernel
 
@@ -15,7 +17,7 @@ def advance(acceleration: Any, context: Any, pos: Any, vel: Any, dt: float, stag
     """x += h v; v += h a: both from the present."""
     a = stages[0]
     acceleration(context, pos, vel, a)
-    for i in range(first, end):
+    for i in range(np.uint64(first), np.uint64(end)):
         pos[i] += dt * vel[i]
         vel[i] += dt * a[i]
 

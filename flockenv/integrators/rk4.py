@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import Any, ClassVar, Literal
 
+import numpy as np
+
 from flockenv.integrators.base import Integrator
 from flockenv.kernels import kernel
 
@@ -17,13 +19,13 @@ def advance(acceleration: Any, context: Any, pos: Any, vel: Any, dt: float, stag
     The acceleration is asked for in one place, so that the whole sweep is compiled once and not four times.
     """
     a, x, v, x0, v0 = stages[0], stages[1], stages[2], stages[3], stages[4]
-    for i in range(first, end):
+    for i in range(np.uint64(first), np.uint64(end)):
         x0[i], v0[i], x[i], v[i] = pos[i], vel[i], pos[i], vel[i]
     for stage in range(4):
         weight = dt / 6 if stage == 0 or stage == 3 else dt / 3
         ahead = dt if stage == 2 else dt / 2
         acceleration(context, x, v, a)
-        for i in range(first, end):
+        for i in range(np.uint64(first), np.uint64(end)):
             slope = v[i]
             pos[i] += weight * slope
             vel[i] += weight * a[i]

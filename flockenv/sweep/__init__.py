@@ -16,8 +16,8 @@ all laws, `step` advances worlds by it, `source` is the whole file; `look` is wh
 from __future__ import annotations
 
 from flockenv.sweep.look import look_source
-from flockenv.sweep.parts import Look, Parts
+from flockenv.sweep.parts import SMALL_STRIDE, Look, Parts
 from flockenv.sweep.source import scene_source
 from flockenv.sweep.text import SHARED
 
-__all__ = ["SHARED", "Look", "Parts", "look_source", "scene_source"]
+__all__ = ["SHARED", "SMALL_STRIDE", "Look", "Parts", "look_source", "scene_source"]

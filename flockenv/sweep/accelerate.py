@@ -1,7 +1,7 @@
 """The acceleration of every agent of a world: what all laws say, summed and divided by mass.
 
-Pair laws come first, in one sweep (`pairs`), and leave what they came to in `felt`, by agent. Then each block adds what
-an agent wants or feels by itself, and a fold over the obstacles; what it wants is bounded by max_force.
+Pair laws come first, in one sweep (`sense`), and leave what they came to in `felt`, by agent. Then each block adds what
+an agent wants or feels by itself, and a fold over the obstacles (`respond`); what it wants is bounded by max_force.
 """
 
 from __future__ import annotations
@@ -19,16 +19,24 @@ def accelerate(parts: Parts) -> str:
     me = ["i = row + l", f"x, v = {lanes_of(parts, 'pos')}, {lanes_of(parts, 'vel')}", _me_alone()]
     return f'''
 
-@njit(forceinline=True, **FAST)
-def accelerate(context, pos, vel, acc):
-    """Acceleration of this thread's agents of one world, m/s^2, from the frozen present."""
+@kernel
+def sense(context, pos, vel):
+    """Write what this thread's agents of one world feel from others, by the pair laws, from the frozen present."""
     {CONTEXT} = context
 {indented(_parameters(parts), 4)}
     if rank == 0:
         work[b, 0] += 1
 {indented(pairs(parts), 4)}
-    for block in range(first, end):
-        base, row = np.uint64(block * {d * parts.width}), np.uint64(block * {parts.width})
+
+
+@kernel
+def respond(around, pos, vel, acc):
+    """Acceleration of the agents of some of this thread's blocks, m/s^2, once all is sensed."""
+    context, first_, end_ = around
+    {CONTEXT} = context
+{indented(_parameters(parts), 4)}
+    for block in range(np.uint64(first_), np.uint64(end_)):
+        base, row = block * np.uint64({d * parts.width}), block * np.uint64({parts.width})
 {indented(_obstacles(parts, me), 8)}
         for l in range(np.uint64({parts.width})):
 {indented(me, 12)}
@@ -40,6 +48,13 @@ def accelerate(context, pos, vel, acc):
             # a choice, not a factor of 0: a law may be infinite where the dead and the lanes beyond the last agent lie
             here, share = living[i] > o[0], like(o[0], 1.0) / mass[i]
 {indented([f"{lane(parts, 'acc', k)} = (s[{k}] + f[{k}]) * share if here else o[{k}]" for k in range(d)], 12)}
+
+
+@kernel
+def accelerate(around, pos, vel, acc):
+    """Sense and respond."""
+    sense(around[0], pos, vel)
+    respond(around, pos, vel, acc)
 '''
 
 
@@ -61,7 +76,7 @@ def _parameters(parts: Parts) -> list[str]:
 
 def _me_alone() -> str:
     """Write agent i as the laws of one agent see it: no tie, there is nobody to part from."""
-    return "me = Me(like(mass[i], i), x, v, unit(v), mass[i], radius[i], max_speed[i], max_force[i], zero(x))"
+    return "me = Me(ident[i], x, v, unit(v), mass[i], radius[i], max_speed[i], max_force[i], zero(x))"
 
 
 def _own(parts: Parts) -> list[str]:
@@ -79,9 +94,10 @@ def _own(parts: Parts) -> list[str]:
 def _felt(parts: Parts) -> list[str]:
     """Write how what the pair laws came to is added."""
     d, lines = parts.dimension, []
+    each = d * len(parts.targets)
     for t, name in enumerate(parts.targets):
-        place = f"felt[i * np.uint64({d * len(parts.targets)}) + np.uint64({d * t}) + np.uint64(#)]"
-        lines.append(f"{name} = add({name}, {tuple_of(place, d)})")
+        places = [f"felt[row * np.uint64({each}) + np.uint64({(d * t + k) * parts.width}) + l]" for k in range(d)]
+        lines.append(f"{name} = add({name}, ({', '.join(places)},))")
     return lines
 
 
@@ -99,7 +115,7 @@ def _obstacles(parts: Parts, me: list[str]) -> list[str]:
         meets += [f"{s} = found[{j}]" for j, s in enumerate(slots)]
     d = parts.dimension
     return [
-        "if rank == 0 and block == first:",
+        "if block == 0:",
         "    work[b, 3] += n * obstacle_radius.shape[1]",
         f"for l in range(np.uint64({parts.width})):",
         indented(me + starts, 4),

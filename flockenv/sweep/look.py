@@ -19,7 +19,7 @@ def look_source(parts: Parts) -> str:
         return ""
     at = len(parts.parameters()) - 2
     return f'''
-@njit(forceinline=True, **FAST)
+@kernel
 def look(
     x_, alive, obstacle_x, obstacle_radius, b, params,
     near_square, near_who, near_count, obstacle_gap, obstacle_who, obstacle_count, {SHARED},

@@ -6,7 +6,7 @@ needs a pass before that one, which finds how far its k nearest are. `look` meet
 
 from __future__ import annotations
 
-from flockenv.sweep.parts import Parts, sight_of
+from flockenv.sweep.parts import Parts, record_of, sight_of, sorted_at
 from flockenv.sweep.query import query, walk
 from flockenv.sweep.text import Slots, indented, indented_lines
 
@@ -56,16 +56,21 @@ def _select_nearest(parts: Parts) -> list[str]:
 def _sum_up(parts: Parts) -> list[str]:
     """Write how a block meets its candidates, and what its sums come to."""
     d, slot = parts.dimension, Slots(parts)
-    results = [f"g{name}{j}" for name in parts.targets for j in range(d)]
+    sums = [slot(f"g{name}{j}") for name in parts.targets for j in range(d)]
+    r, w = len(sums), parts.width
     return [
         "for r in range(found):",
         "    met += (ranges[r, 1] - ranges[r, 0]) * (upto - at)",
         *indented_lines(meet_range(parts, parts.fields, _meet(parts)), 4),
         f"for l in range(np.uint64({parts.width})):",
         indented(_finish(parts), 4),
-        "for l in range(np.uint64(upto - at)):",
-        f"    i = np.int64(order[block + l]) * {len(results)}",
-        indented([f"felt[i + {j}] = {slot(name)}" for j, name in enumerate(results)], 4),
+        "if nx == 0 and present == n:  # sorted by number: they are felt as the lanes lie",
+        f"    for l in range(np.uint64({w})):",
+        indented([f"felt[block * np.uint64({r}) + np.uint64({j * w}) + l] = {s}" for j, s in enumerate(sums)], 8),
+        "else:",
+        "    for l in range(np.uint64(upto - at)):",
+        f"        place = np.uint64(place_of(np.int64(order[block + l]), {r}, {w}))",
+        indented([f"felt[place + np.uint64({j * w})] = {s}" for j, s in enumerate(sums)], 8),
     ]
 
 
@@ -108,31 +113,39 @@ def meet_range(parts: Parts, fields: list[str], lines: list[str]) -> list[str]:
 
     def loop(offset: str) -> list[str]:
         return [
-            "for j in range(np.uint64(ranges[r, 0]), np.uint64(ranges[r, 1])):",
+            "j, last = np.uint64(ranges[r, 0]), np.uint64(ranges[r, 1])",
+            "while j < last:",
             *indented_lines(_candidate(parts, fields), 4),
             "    own, o = np.int32(j - block), like(reach, -0.0)",
             f"    for l in range(np.uint64({parts.width})):",
             indented([_me(parts, fields), "other = own != number[l]", f"to = {offset}", f"square = {square}"], 8),
             "        it = Other(aj, to, square, vj, rj, tj)",
             indented(lines, 8),
+            "    j += np.uint64(1)",
         ]
 
     if not parts.space.periodic:
         return loop(plain)
+    if not parts.sorts:
+        return loop(wrapped)
     return ["if ranges[r, 2] > 0:", *indented_lines(loop(wrapped), 4), "else:", *indented_lines(loop(plain), 4)]
 
 
 def _candidate(parts: Parts, fields: list[str]) -> list[str]:
-    """Write candidate j as the laws see it."""
-    row = {f: k for k, f in enumerate(fields)}
-    d = parts.dimension
+    """Write candidate j as the laws see it: from its record, or in a small scene from the rows that blocks read too."""
+    row, record = {f: k for k, f in enumerate(fields)}, record_of(fields)
+
+    def number(name: str) -> str:
+        if not parts.sorts:
+            return sorted_at(parts, row[name], "j")
+        return f"records[j * np.uint64({len(record)}) + np.uint64({record.index(name)})]"
 
     def vector(letter: str) -> str:
         if f"{letter}0" not in row:
             return "xj"
-        return "(" + ", ".join(f"sorted_[{row[f'{letter}{k}']}, j]" for k in range(d)) + ")"
+        return "(" + ", ".join(number(f"{letter}{k}") for k in range(parts.dimension)) + ")"
 
-    scalar = {name: f"sorted_[{row[name]}, j]" if name in row else "reach" for name in ("who", "radius")}
+    scalar = {name: number(name) if name in row else "reach" for name in ("who", "radius")}
     return [
         f"xj = {vector('x')}",
         f"vj, tj, aj, rj = {vector('v')}, {vector('t')}, {scalar['who']}, {scalar['radius']}",
@@ -143,13 +156,13 @@ def _me(parts: Parts, fields: list[str]) -> str:
     """Write the agent in lane l of a block as the laws see it; what no law reads is left out."""
     row = {f: k for k, f in enumerate(fields)}
 
+    def number(name: str) -> str:
+        return sorted_at(parts, row[name], "block + l") if name in row else "reach"
+
     def vector(letter: str) -> str:
         if f"{letter}0" not in row:
             letter = "x"
-        return "(" + ", ".join(f"sorted_[{row[f'{letter}{k}']}, block + l]" for k in range(parts.dimension)) + ")"
+        return "(" + ", ".join(number(f"{letter}{k}") for k in range(parts.dimension)) + ")"
 
-    def scalar(name: str) -> str:
-        return f"sorted_[{row[name]}, block + l]" if name in row else "reach"
-
-    numbers = ", ".join(scalar(name) for name in ("mass", "radius", "max_speed", "max_force"))
-    return f"me = Me({scalar('who')}, {vector('x')}, {vector('v')}, {vector('h')}, {numbers}, {vector('t')})"
+    numbers = ", ".join(number(name) for name in ("mass", "radius", "max_speed", "max_force"))
+    return f"me = Me({number('who')}, {vector('x')}, {vector('v')}, {vector('h')}, {numbers}, {vector('t')})"

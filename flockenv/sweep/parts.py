@@ -20,7 +20,10 @@ from flockenv.effects.base import Effect, Sight
 from flockenv.integrators.base import Integrator
 from flockenv.space import Space
 
-__all__ = ["Look", "Parts", "record_of", "sight_of", "view_of"]
+__all__ = ["SMALL_STRIDE", "Look", "Parts", "record_of", "sight_of", "sorted_at", "view_of"]
+
+SMALL_STRIDE = 128
+"""Places in a row of sorted agents where there are too few to be sorted by cell: their blocks, and one more."""
 
 
 class Look(NamedTuple):
@@ -40,6 +43,8 @@ class Parts:
     effects: tuple[Effect, ...]
     integrator: Integrator
     dtype: str = "float64"
+    sorts: bool = True
+    """Are there enough agents to sort them by cell? If not, nothing of that is written."""
     look: Look | None = None
     """What a task shows its agents, found by the same query."""
 
@@ -109,6 +114,23 @@ class Parts:
         kinds = [self.fields] * bool(self.pairs) + [self.seen_fields] * bool(self.look)
         return max((len(record_of(fields)) for fields in kinds), default=1)
 
+    @property
+    def arranges(self) -> bool:
+        """May agents of a large world be put in order for a while?"""
+        return self.sorts and bool(self.pairs)
+
+    @property
+    def luggage(self) -> list[str]:
+        """What an agent carries along then: an array, and the axis of a vector."""
+        vectors = ["pos", "vel", "want", *(["tie"] if "t0" in self.fields else [])]
+        vector = [f"{name} {k}" for name in vectors for k in range(self.dimension)]
+        return [*vector, "mass", "radius", "max_speed", "max_force", "ident"]
+
+    @property
+    def luggage_size(self) -> int:
+        """How many numbers that takes, in whole cache lines."""
+        return -(-len(self.luggage) // self.width) * self.width
+
     @functools.cached_property
     def slots(self) -> dict[str, int]:
         """Where in the scratch of lanes each running number lies."""
@@ -122,9 +144,19 @@ class Parts:
         return {name: place for place, name in enumerate([*names, "bad"])}
 
 
+def sorted_at(parts: Parts, row: int, place: str) -> str:
+    """Write a number of the sorted agent at `place`, which is counted without a sign.
+
+    Rows of a small scene are a constant distance apart, so that a candidate is one address and not one per number.
+    """
+    if parts.sorts:
+        return f"sorted_[np.uint64({row}) * stride + {place}]"
+    return f"sorted_[np.uint64({row * SMALL_STRIDE}) + {place}]"
+
+
 def record_of(fields: list[str]) -> list[str]:
     """Return what is written of an agent when it is put into its cell; headings follow from velocities."""
-    return [f for f in fields if f[0] != "h" and f != "who"] + ["who"]
+    return ["cell", "place"] + [f for f in fields if f[0] != "h"]
 
 
 def sight_of(effect: Effect) -> Sight:

@@ -1,17 +1,16 @@
 """The query: how the living agents are sorted, once per instant, and how their blocks are walked through.
 
-Below FEWEST_AGENTS, and where a grid would have too few cells, they are listed by number and everybody is a candidate;
+In a small scene, and where a grid would have too few cells, they are listed by number and everybody is a candidate;
 else they are sorted by cell. What is sorted of each agent are its `fields`, a row each. A team of threads sorts
 together, each its own agents, and each then walks through its own share of the sorted blocks.
 """
 
 from __future__ import annotations
 
-from flockenv.neighbours import FEWEST_AGENTS
-from flockenv.sweep.parts import Parts, record_of
+from flockenv.sweep.parts import Parts, record_of, sorted_at
 from flockenv.sweep.text import indented, indented_lines, lane, tuple_of
 
-__all__ = ["query", "walk"]
+__all__ = ["counted", "query", "walk"]
 
 _ARRAYS = {"x": "pos", "v": "vel", "t": "tie"}
 
@@ -19,28 +18,31 @@ _ARRAYS = {"x": "pos", "v": "vel", "t": "tie"}
 def query(parts: Parts, fields: list[str]) -> list[str]:
     """Write how the living are sorted, with these fields of each."""
     return [
-        f"periodic, shape = {parts.space.periodic}, (0, 0, 0)",
+        f"periodic, shape = {parts.space.periodic}, (0, 0, 0, 0)",
         "wait_for_team(sync, team)  # positions are everybody's",
-        f"if n >= {FEWEST_AGENTS}:",
-        "    shape = count_cells(",
-        f"        pos, living, first, end, {parts.width}, rank, team, sync, bounds, size, reach, periodic, n,",
-        "        cell, start, offset,",
-        "    )",
+        *(["stride = np.uint64(order.shape[0])", f"shape = {counted(parts)}"] if parts.sorts else []),
         "nx = shape[0]",
         "if nx == 0:",
         indented(_fill(parts, fields), 4),
-        "else:",
-        indented(_sort(parts, fields), 4),
+        *(["else:", indented(_sort(parts, fields), 4)] if parts.sorts else []),
         "wait_for_team(sync, team)",
     ]
+
+
+def counted(parts: Parts) -> str:
+    """Write how many cells there are per axis, once every agent's has been found."""
+    return (
+        f"count_cells(pos, living, first, end, {parts.width}, rank, team, sync, bounds, size, reach, "
+        f"{parts.space.periodic}, n, cell, start, offset)"
+    )
 
 
 def _value(parts: Parts, field: str, place: str) -> str:
     """Write what a field of agent i is; `place` is where its first coordinate lies."""
     if field[1:].isdigit():
         array = _ARRAYS[field[0]]
-        return f"{array}[{place} + {int(field[1:]) * parts.width}]"
-    return "like(mass[0], i)" if field == "who" else f"{field}[i]"
+        return f"{array}[{place} + np.uint64({int(field[1:]) * parts.width})]"
+    return {"who": "ident[i]", "place": "like(mass[0], i)", "cell": "like(mass[0], cell[i])"}.get(field, f"{field}[i]")
 
 
 def _derived(parts: Parts, fields: list[str], at: str) -> list[str]:
@@ -48,75 +50,106 @@ def _derived(parts: Parts, fields: list[str], at: str) -> list[str]:
     d, row = parts.dimension, {f: k for k, f in enumerate(fields)}
     lines = []
     if "h0" in row:
-        lines.append("h = unit((" + ", ".join(f"sorted_[{row[f'v{k}']}, {at}]" for k in range(d)) + "))")
-        lines += [f"sorted_[{row[f'h{k}']}, {at}] = h[{k}]" for k in range(d)]
+        lines.append("h = unit((" + ", ".join(sorted_at(parts, row[f"v{k}"], at) for k in range(d)) + "))")
+        lines += [f"{sorted_at(parts, row[f'h{k}'], at)} = h[{k}]" for k in range(d)]
     return lines
 
 
 def _fill(parts: Parts, fields: list[str]) -> list[str]:
     """Write how the living are listed by number, for brute force: by one of a team."""
-    d, row = parts.dimension, {f: k for k, f in enumerate(fields)}
-    direct = [f"sorted_[{r}, at] = {_value(parts, f, 'place')}" for f, r in row.items() if f[0] != "h"]
+    d, w, record = parts.dimension, parts.width, record_of(fields)
+    rows = [(sorted_at(parts, r, "#"), f) for r, f in enumerate(fields) if f[0] != "h"]
+    direct = [f"{to.replace('#', 'at')} = {_value(parts, f, 'place')}" for to, f in rows]
     lanes = [
-        f"sorted_[{r}, i] = " + (lane(parts, _ARRAYS[f[0]], int(f[1:])) if f[1:].isdigit() else _value(parts, f, ""))
-        for f, r in row.items()
-        if f[0] != "h"
+        f"{to.replace('#', 'i')} = "
+        + (lane(parts, _ARRAYS[f[0]], int(f[1:])) if f[1:].isdigit() else _value(parts, f, ""))
+        for to, f in rows
     ]
+    if parts.sorts:  # candidates are read from records; places and cells of theirs are not
+        kept = [(j, f) for j, f in enumerate(record) if f in fields]
+        direct += [
+            f"records[at * np.uint64({len(record)}) + np.uint64({j})] = {_value(parts, f, 'place')}" for j, f in kept
+        ]
+        return ["if rank == 0:", *indented_lines(_one_by_one(parts, [*direct, *_derived(parts, fields, "at")]), 4)]
     return [
         "if rank == 0:",
         "    if present == n:",
-        f"        for block in range((n + {parts.width - 1}) // {parts.width}):",
-        f"            base, row = np.uint64(block * {d * parts.width}), np.uint64(block * {parts.width})",
-        f"            for l in range(np.uint64({parts.width})):",
+        f"        for block in range((n + {w - 1}) // {w}):",
+        f"            base, row = np.uint64(block * {d * w}), np.uint64(block * {w})",
+        f"            for l in range(np.uint64({w})):",
         "                i = row + l",
         "                order[i] = i",
         indented(lanes + _derived(parts, fields, "i"), 16),
         "    else:",
-        "        at = 0",
-        "        for i in range(n):",
-        "            if living[i] > 0:",
-        f"                place = place_of(i, {d}, {parts.width})",
-        "                order[at] = i",
-        indented(direct + _derived(parts, fields, "at"), 16),
-        "                at += 1",
+        *indented_lines(_one_by_one(parts, [*direct, *_derived(parts, fields, "at")]), 8),
+    ]
+
+
+def _one_by_one(parts: Parts, lines: list[str]) -> list[str]:
+    """Write how the living are listed one after another."""
+    return [
+        "at = np.uint64(0)",
+        "for i in range(np.uint64(n)):",
+        "    if living[i] > 0:",
+        f"        place = np.uint64(place_of(np.int64(i), {parts.dimension}, {parts.width}))",
+        "        order[at] = i",
+        indented(lines, 8),
+        "        at += np.uint64(1)",
     ]
 
 
 def _sort(parts: Parts, fields: list[str]) -> list[str]:
     """Write how agents are put into their cells: whole records first, so that each is one distant place in memory."""
-    d, record = parts.dimension, record_of(fields)
+    d, w, record = parts.dimension, parts.width, record_of(fields)
     row = {f: k for k, f in enumerate(fields)}
     place = []
     if parts.space.periodic:
-        inside = tuple_of(f"pos[place + # * {parts.width}]", d)
+        inside = tuple_of(f"pos[place + np.uint64(# * {w})]", d)
         place.append(f"inside, _ = confine(size, radius[i], {inside}, {inside})")
     for j, f in enumerate(record):
         wrapped = parts.space.periodic and f[0] == "x" and f[1:].isdigit()
-        place.append(f"records[to, {j}] = " + (f"inside[{f[1:]}]" if wrapped else _value(parts, f, "place")))
-    spread = [f"sorted_[{row[f]}, at] = records[at, {j}]" for j, f in enumerate(record) if f in row]
+        value = f"inside[{f[1:]}]" if wrapped else _value(parts, f, "place")
+        place.append(f"records[to + np.uint64({j})] = {value}")
+    spread = [
+        f"{sorted_at(parts, row[f], 'at')} = records[base + np.uint64({j})]" for j, f in enumerate(record) if f in row
+    ]
     return [
-        f"for i in range(first * {parts.width}, min(end * {parts.width}, n)):",
+        f"for i in range(np.uint64(first * {w}), np.uint64(min(end * {w}, n))):",
         "    c = cell[i]",
         "    if c >= 0:",
-        f"        to, place = np.int64(offset[rank, c]), place_of(i, {d}, {parts.width})",
-        "        offset[rank, c] = to + 1",
+        f"        place = (i // np.uint64({w})) * np.uint64({d * w}) + i % np.uint64({w})",
+        "        to = offset[rank, np.uint64(c)]",
+        "        offset[rank, np.uint64(c)] = to + 1",
+        f"        to = np.uint64(to) * np.uint64({len(record)})",
         indented(place, 8),
         "wait_for_team(sync, team)",
-        "for at in range(present * rank // team, present * (rank + 1) // team):",
-        f"    i = np.int64(records[at, {record.index('who')}])",
-        "    order[at] = i",
-        indented(spread + _derived(parts, fields, "at"), 4),
+        "rows = shape[1] * shape[2]",
+        "for line in range(rows * rank // team, rows * (rank + 1) // team):  # a row at a time stays in the cache",
+        "    mine, beyond = np.int64(start[line * nx]), np.int64(start[(line + 1) * nx])",
+        "    if arranged:  # agents come in the order of their places, and are to be in the order of their numbers",
+        f"        order_records(records, ident, {len(record)}, mine, beyond)",
+        "    for at in range(np.uint64(mine), np.uint64(beyond)):",
+        f"        base = at * np.uint64({len(record)})",
+        f"        order[at] = np.int32(records[base + np.uint64({record.index('place')})])",
+        indented(spread + _derived(parts, fields, "at"), 8),
     ]
 
 
 def walk(parts: Parts, lines: list[str]) -> list[str]:
     """Write the loop over this thread's blocks of sorted agents: [at, upto) is one, `found` ranges may be near it."""
     w = parts.width
+    by_number = [
+        f"blocks = (present + {w - 1}) // {w}",
+        f"at, stop = blocks * rank // team * {w}, min(blocks * (rank + 1) // team * {w}, present)",
+    ]
+    everybody = [f"upto = min(at + {w}, present)", "ranges[0, 0], ranges[0, 1], ranges[0, 2] = 0, present, 1"]
+    if not parts.sorts:
+        block = ["found = 1", *everybody, "block = np.uint64(at)", *lines, "at = upto"]
+        return ["met = 0", *by_number, "while at < stop:", *indented_lines(block, 4)]
     return [
         "met, line, spot = 0, 0, 0",
         "if nx == 0:",
-        f"    blocks = (present + {w - 1}) // {w}",
-        f"    at, stop = blocks * rank // team * {w}, min(blocks * (rank + 1) // team * {w}, present)",
+        *indented_lines(by_number, 4),
         "else:  # whole rows of cells, so that blocks are the same for any number of threads",
         "    rows = shape[1] * shape[2]",
         "    while line < rows and start[line * nx] * team < present * rank:",
@@ -128,8 +161,7 @@ def walk(parts: Parts, lines: list[str]) -> list[str]:
         "while at < stop:",
         "    found = 1",
         "    if nx == 0:",
-        f"        upto = min(at + {w}, present)",
-        "        ranges[0, 0], ranges[0, 1], ranges[0, 2] = 0, present, 1",
+        *indented_lines(everybody, 8),
         "    else:",
         "        line = row_of(at, start, line, nx)",
         f"        upto = min(at + {w}, np.int64(start[(line + 1) * nx]))",

@@ -40,8 +40,8 @@ def _imports(parts: Parts) -> str:
         "import numpy as np",
         "from numba import njit",
         "from flockenv.effects.base import Me, Other, in_view",
-        "from flockenv.kernels import finite, like, unaliased, wait_for_team",
-        "from flockenv.neighbours import candidates, count_cells, place_of, row_of",
+        "from flockenv.kernels import finite, kernel, like, unaliased, wait_for_team",
+        "from flockenv.neighbours import candidates, count_cells, order_records, place_of, row_of",
         f"from flockenv.space import {parts.space.offset_law} as offset_to, {parts.space.confine_law} as confine",
         "from flockenv.vec import add, dot, exact_dot, limit, norm, scale, sub, unit, zero",
         _method_imports(parts.integrator),
@@ -63,17 +63,21 @@ def _parameter_tuple(k: int, effect: Effect) -> str:
 def _method_imports(integrator: Integrator) -> str:
     """Import what the integrator's `advance` calls in its own module."""
     python = integrator.advance().py_func
-    names = [name for name in python.__code__.co_names if name in python.__globals__ and name not in dir(builtins)]
+    names = [
+        name for name in python.__code__.co_names if name in python.__globals__ and name not in (*dir(builtins), "np")
+    ]
     return f"from {python.__module__} import {', '.join(names)}" if names else "# the method needs nothing else"
 
 
 def _method(integrator: Integrator) -> str:
     """Return the text of the integrator's `advance` with this scene's `accelerate` in the place of its argument.
 
-    (numba can pass a compiled function as an argument, but does not cache a function that does.)
+    A method that asks once begins with the frozen present: `step_world` has had it sensed, and it needs the response
+    alone. (numba can pass a compiled function as an argument, but does not cache a function that does.)
     """
     text = inspect.getsource(integrator.advance().py_func)
     text = text[text.index("def advance(") :].replace("def advance(acceleration: Any, ", "def advance(", 1)
     for annotation in (": Any", ": float", ": int"):
         text = text.replace(annotation, "")
-    return "\n@njit(forceinline=True, **FAST)\n" + text.replace("acceleration(", "accelerate(")
+    law = "accelerate" if integrator.evaluations > 1 else "respond"
+    return "\n@kernel\n" + text.replace("acceleration(", f"{law}(")

@@ -6,10 +6,14 @@ world together, each the agents of its own blocks.
 
 from __future__ import annotations
 
+from flockenv.sweep.arrange import go_home, move_in
 from flockenv.sweep.parts import Parts
-from flockenv.sweep.text import CONTEXT, SHARED, Slots, indented, lane, lanes_of, tuple_of
+from flockenv.sweep.text import CONTEXT, SHARED, Slots, indented, indented_lines, lane, lanes_of, tuple_of
 
 __all__ = ["copies", "step", "step_world"]
+
+PART = 64
+"""Blocks that are advanced together: what they take fits into the nearest caches."""
 
 
 def copies(parts: Parts) -> str:
@@ -28,7 +32,7 @@ def copies(parts: Parts) -> str:
 def _copy(parts: Parts, name: str, title: str, to: str, source: str) -> str:
     """Write one of the two: full blocks with a constant number of lanes, then the last."""
     w = parts.width
-    return f'''@njit(forceinline=True, **FAST)
+    return f'''@kernel
 def {name}(blocks, array, b, n, first, end):
     """{title}"""
     for block in range(first, end):
@@ -49,9 +53,7 @@ def step_world(parts: Parts) -> str:
     """Return the source of `step_world`: steps of one world, or of one thread's part of it."""
     d = parts.dimension
     bad = Slots(parts)("bad")
-    stored = (("pos", "x"), ("vel", "v"), ("origin", "x"))
-    store = ["; ".join(f"{lane(parts, array, k)} = {now}[{k}]" for array, now in stored) for k in range(d)]
-    return f'''@njit(forceinline=True, **FAST)
+    return f'''@kernel
 def step_world(
     x_, v_, alive, obstacle_x, obstacle_radius, work, params, dt, count, b, rank, team, {SHARED},
 ):
@@ -59,7 +61,7 @@ def step_world(
     n = x_.shape[2]
     blocks = (n + {parts.width - 1}) // {parts.width}
     first, end = blocks * rank // team, blocks * (rank + 1) // team
-    size = {tuple_of("params[#]", d)}
+    size, reach = {tuple_of("params[#]", d)}, params[{d}]
     present = 0
     for i in range(n):
         present += alive[b, i]
@@ -67,25 +69,16 @@ def step_world(
         living[i] = alive[b, i]
     into_blocks(pos, x_, b, n, first, end)
     into_blocks(vel, v_, b, n, first, end)
-    for i in range(first * {d * parts.width}, end * {d * parts.width}):
+{indented(move_in(parts), 4)}
+    for i in range(np.uint64(first * {d * parts.width}), np.uint64(end * {d * parts.width})):
         origin[i] = pos[i]
     context = ({CONTEXT})
     far = like(dt, np.inf)
     for l in range(np.uint64({parts.width})):
         {bad} = far
     for _ in range(count):
-        advance(context, pos, vel, dt, stages, first * {d * parts.width}, end * {d * parts.width})
-        for block in range(first, end):
-            base, row = np.uint64(block * {d * parts.width}), np.uint64(block * {parts.width})
-            for l in range(np.uint64({parts.width})):
-                i = row + l
-                was, x, v = {lanes_of(parts, "origin")}, {lanes_of(parts, "pos")}, {lanes_of(parts, "vel")}
-                where = far if finite(dot(x, x) + dot(v, v)) else like(dt, i)
-                {bad} = where if where < {bad} else {bad}
-                # nobody moves faster than max_speed, whatever a method makes of the velocity within the step
-                x = add(was, scale(limit(sub(x, was), max_speed[i] * dt), living[i]))
-                x, v = confine(size, radius[i], x, scale(limit(v, max_speed[i]), living[i]))
-{indented(store, 16)}
+{indented(_advance(parts), 8)}
+{indented(go_home(parts), 4)}
     out_of_blocks(pos, x_, b, n, first, end)
     out_of_blocks(vel, v_, b, n, first, end)
     worst = far
@@ -93,6 +86,47 @@ def step_world(
         worst = min(worst, {bad})
     return np.int64(worst) if worst < far else -1
 '''
+
+
+def _advance(parts: Parts) -> list[str]:
+    """Write one step of this thread's agents.
+
+    A method that asks for accelerations once runs through them part after part, each of which stays in the cache from
+    what it feels to where it comes: after `sense`, nobody reads what others write.
+    """
+    size = parts.dimension * parts.width
+    if parts.integrator.evaluations > 1:
+        advance = f"advance((context, first, end), pos, vel, dt, stages, first * {size}, end * {size})"
+        return [advance, *_bound(parts, "first", "end")]
+    return [
+        "sense(context, pos, vel)",
+        f"for begin in range(first, end, {PART}):",
+        f"    until = min(begin + {PART}, end)",
+        f"    advance((context, begin, until), pos, vel, dt, stages, begin * {size}, until * {size})",
+        *indented_lines(_bound(parts, "begin", "until"), 4),
+    ]
+
+
+def _bound(parts: Parts, first: str, end: str) -> list[str]:
+    """Write what happens to the agents of some blocks after the method: limits, the space, and who is not finite."""
+    bad = Slots(parts)("bad")
+    stored = (("pos", "x"), ("vel", "v"), ("origin", "x"))
+    return [
+        f"for block in range(np.uint64({first}), np.uint64({end})):",
+        f"    base, row = block * np.uint64({parts.dimension * parts.width}), block * np.uint64({parts.width})",
+        f"    for l in range(np.uint64({parts.width})):",
+        "        i = row + l",
+        f"        was, x, v = {lanes_of(parts, 'origin')}, {lanes_of(parts, 'pos')}, {lanes_of(parts, 'vel')}",
+        "        where = far if finite(dot(x, x) + dot(v, v)) else ident[i]",
+        f"        {bad} = where if where < {bad} else {bad}",
+        "        # nobody moves faster than max_speed, whatever a method makes of the velocity within the step",
+        "        x = add(was, scale(limit(sub(x, was), max_speed[i] * dt), living[i]))",
+        "        x, v = confine(size, radius[i], x, scale(limit(v, max_speed[i]), living[i]))",
+        *(
+            "        " + "; ".join(f"{lane(parts, array, k)} = {now}[{k}]" for array, now in stored)
+            for k in range(parts.dimension)
+        ),
+    ]
 
 
 def step(parts: Parts) -> str:

@@ -11,13 +11,14 @@ from flockenv.sweep.parts import Parts
 __all__ = ["CONTEXT", "SHARED", "Slots", "indented", "indented_lines", "lane", "lanes_of", "tuple_of"]
 
 _READ = (
-    "mass, radius, max_speed, max_force, living, want, felt, sorted_, records, order, cell, start, offset, bounds, "
+    "mass, radius, max_speed, max_force, living, ident, want, felt, sorted_, records, luggage, order, cell, start, "
+    "offset, bounds, "
     "tally, sync, tie, number, lanes, ranges"
 )
 SHARED = f"pos, vel, origin, stages, {_READ}"
 """Scratch of one world in progress, in order; see scene.Workspace. The last two belong to one thread."""
 
-CONTEXT = f"obstacle_x, obstacle_radius, work, params, b, n, present, first, end, rank, team, {_READ}"
+CONTEXT = f"obstacle_x, obstacle_radius, work, params, b, n, present, arranged, first, end, rank, team, {_READ}"
 """What an acceleration is given beside positions and velocities, in order."""
 
 
