@@ -32,8 +32,10 @@ from flockenv.inlining import Inlined
 
 __all__ = [
     "FAST",
+    "LINE",
     "Vec",
     "cache_folder",
+    "copy_line",
     "entry",
     "finite",
     "kernel",
@@ -125,6 +127,36 @@ def _add_at_once(typing_context: Any, array: Any, amount: Any) -> Any:
 
 
 _fetch_add: Any = intrinsic(_add_at_once)  # Any: to numba's stubs an intrinsic that is called never returns
+
+LINE = 64
+"""Bytes of a vector register, and of a line of the cache."""
+
+
+def _copy_line(typing_context: Any, to: Any, at: Any, source: Any, place: Any) -> Any:
+    """Copy 64 bytes of numbers, from `place` on, to where `at` is: as one vector, whatever becomes of loops.
+
+    Both arrays have one axis and lie in one piece; places are counted without a sign.
+    """
+    if to.dtype != source.dtype:
+        raise numba.TypingError(f"copy_line: {source.dtype} into {to.dtype}")
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        make: Any = arrayobj.make_array
+        number = context.get_data_type(signature.args[0].dtype)
+        size = context.get_abi_sizeof(number)
+        vector = ir.VectorType(number, LINE // size).as_pointer()
+
+        def pointer(k: int) -> Any:
+            data = make(signature.args[k])(context, builder, arguments[k]).data
+            return builder.bitcast(builder.gep(data, [arguments[k + 1]]), vector)
+
+        builder.store(builder.load(pointer(2), align=size), pointer(0), align=size)
+        return context.get_dummy_value()
+
+    return types.void(to, types.uint64, source, types.uint64), generate
+
+
+copy_line: Any = intrinsic(_copy_line)
 
 _PATIENCE = 2000  # rounds of waiting before the core is offered to somebody else
 

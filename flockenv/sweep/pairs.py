@@ -44,7 +44,7 @@ def _select_nearest(parts: Parts) -> list[str]:
     topological = [(q, s.nearest) for q, s in enumerate(parts.sights) if s.nearest is not None]
     if not topological:
         return []
-    slot, keep = Slots(parts), []
+    slot, keep = Slots(parts), _ahead(parts)
     for q, count in topological:
         keep.append(f"far = square if {_seen(parts, q)} else like(square, np.inf)")
         for j in range(count):
@@ -76,7 +76,7 @@ def _sum_up(parts: Parts) -> list[str]:
 
 def _meet(parts: Parts) -> list[str]:
     """Write what one candidate adds to the sums of the lanes that see it."""
-    slot, lines = Slots(parts), []
+    slot, lines = Slots(parts), _ahead(parts)
     for q, sight in enumerate(parts.sights):
         cut = f" & (square <= {slot(f'near{q}_{sight.nearest - 1}')})" if sight.nearest else ""
         lines.append(f"seen{q} = {_seen(parts, q)}{cut}")
@@ -101,9 +101,21 @@ def _finish(parts: Parts) -> list[str]:
 
 def _seen(parts: Parts, q: int) -> str:
     """Write whether candidate `it` is in sight q: near enough, ahead, and somebody else."""
-    sight = parts.sights[q]
-    text = f"other & (square < within{q})"
-    return text + (f" & in_view(view{q}, me.heading, to, square)" if sight.fov < 360 else "")
+    fov = parts.sights[q].fov
+    return f"other & (square < within{q})" if fov >= 360 else f"ahead{_fovs(parts).index(fov)} & (square < within{q})"
+
+
+def _fovs(parts: Parts) -> list[float]:
+    """Return the fields of view that are not all around, each once."""
+    return list(dict.fromkeys(sight.fov for sight in parts.sights if sight.fov < 360))
+
+
+def _ahead(parts: Parts) -> list[str]:
+    """Write whether the candidate is ahead, once for each field of view."""
+    first = {sight.fov: q for q, sight in reversed(list(enumerate(parts.sights)))}
+    return [
+        f"ahead{k} = other & in_view(view{first[fov]}, me.heading, to, square)" for k, fov in enumerate(_fovs(parts))
+    ]
 
 
 def meet_range(parts: Parts, fields: list[str], lines: list[str]) -> list[str]:

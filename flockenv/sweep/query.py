@@ -7,8 +7,8 @@ together, each its own agents, and each then walks through its own share of the 
 
 from __future__ import annotations
 
-from flockenv.sweep.parts import Parts, record_of, sorted_at
-from flockenv.sweep.text import indented, indented_lines, lane, tuple_of
+from flockenv.sweep.parts import SMALL_STRIDE, Parts, record_of, sorted_at
+from flockenv.sweep.text import copied, indented, indented_lines, tuple_of
 
 __all__ = ["counted", "query", "walk"]
 
@@ -60,11 +60,6 @@ def _fill(parts: Parts, fields: list[str]) -> list[str]:
     d, w, record = parts.dimension, parts.width, record_of(fields)
     rows = [(sorted_at(parts, r, "#"), f) for r, f in enumerate(fields) if f[0] != "h"]
     direct = [f"{to.replace('#', 'at')} = {_value(parts, f, 'place')}" for to, f in rows]
-    lanes = [
-        f"{to.replace('#', 'i')} = "
-        + (lane(parts, _ARRAYS[f[0]], int(f[1:])) if f[1:].isdigit() else _value(parts, f, ""))
-        for to, f in rows
-    ]
     if parts.sorts:  # candidates are read from records; places and cells of theirs are not
         kept = [(j, f) for j, f in enumerate(record) if f in fields]
         direct += [
@@ -76,13 +71,30 @@ def _fill(parts: Parts, fields: list[str]) -> list[str]:
         "    if present == n:",
         f"        for block in range((n + {w - 1}) // {w}):",
         f"            base, row = np.uint64(block * {d * w}), np.uint64(block * {w})",
-        f"            for l in range(np.uint64({w})):",
-        "                i = row + l",
-        "                order[i] = i",
-        indented(lanes + _derived(parts, fields, "i"), 16),
+        indented(_lines(parts, fields), 12),
+        *indented_lines(_headings(parts, fields), 12),
         "    else:",
         *indented_lines(_one_by_one(parts, [*direct, *_derived(parts, fields, "at")]), 8),
     ]
+
+
+def _lines(parts: Parts, fields: list[str]) -> list[str]:
+    """Write how a block is copied, a vector at a time."""
+    out = []
+    for r, f in enumerate(fields):
+        to = f"np.uint64({r * SMALL_STRIDE}) + row"
+        if f[1:].isdigit() and f[0] != "h":
+            out += copied(parts, "sorted_", to, _ARRAYS[f[0]], f"base + np.uint64({int(f[1:]) * parts.width})")
+        elif f[0] != "h":
+            out += copied(parts, "sorted_", to, "ident" if f == "who" else f, "row")
+    return out
+
+
+def _headings(parts: Parts, fields: list[str]) -> list[str]:
+    """Write the headings of a block, if any law asks for them."""
+    if "h0" not in fields:
+        return []
+    return [f"for l in range(np.uint64({parts.width})):", indented(_derived(parts, fields, "row + l"), 4)]
 
 
 def _one_by_one(parts: Parts, lines: list[str]) -> list[str]:

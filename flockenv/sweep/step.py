@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from flockenv.sweep.arrange import go_home, move_in
 from flockenv.sweep.parts import Parts
-from flockenv.sweep.text import CONTEXT, SHARED, Slots, indented, indented_lines, lane, lanes_of, tuple_of
+from flockenv.sweep.text import CONTEXT, SHARED, Slots, copied, indented, indented_lines, lane, lanes_of, tuple_of
 
 __all__ = ["copies", "step", "step_world"]
 
@@ -19,8 +19,7 @@ PART = 64
 def copies(parts: Parts) -> str:
     """Return the source of `into_blocks` and `out_of_blocks`: from arrays of all worlds to blocks of one, and back."""
     w = parts.width
-    block = "blocks[base + l]"
-    world = f"array[np.uint64(k), np.uint64(b), np.uint64(block * {w}) + l]"
+    block, world = ("blocks", "base"), ("array[k, b]", f"np.uint64(block * {w})")
     into = f"blocks = array[:, b], agents in blocks of {w}; those beyond n are left as they are."
     return (
         "\n"
@@ -29,8 +28,8 @@ def copies(parts: Parts) -> str:
     )
 
 
-def _copy(parts: Parts, name: str, title: str, to: str, source: str) -> str:
-    """Write one of the two: full blocks with a constant number of lanes, then the last."""
+def _copy(parts: Parts, name: str, title: str, to: tuple[str, str], source: tuple[str, str]) -> str:
+    """Write one of the two: full blocks a vector at a time, then the last."""
     w = parts.width
     return f'''@kernel
 def {name}(blocks, array, b, n, first, end):
@@ -39,11 +38,10 @@ def {name}(blocks, array, b, n, first, end):
         for k in range({parts.dimension}):
             base = np.uint64(block * {parts.dimension * w} + k * {w})
             if (block + 1) * {w} <= n:
-                for l in range(np.uint64({w})):
-                    {to} = {source}
+{indented(copied(parts, *to, *source), 16)}
             else:
                 for l in range(np.uint64(n - block * {w})):
-                    {to} = {source}
+                    {to[0]}[{to[1]} + l] = {source[0]}[{source[1]} + l]
 
 
 '''

@@ -6,9 +6,10 @@ lanes would stay scalar.
 
 from __future__ import annotations
 
+from flockenv.kernels import LINE
 from flockenv.sweep.parts import Parts
 
-__all__ = ["CONTEXT", "SHARED", "Slots", "indented", "indented_lines", "lane", "lanes_of", "tuple_of"]
+__all__ = ["CONTEXT", "SHARED", "Slots", "copied", "indented", "indented_lines", "lane", "lanes_of", "tuple_of"]
 
 _READ = (
     "mass, radius, max_speed, max_force, living, ident, want, felt, sorted_, records, luggage, order, cell, start, "
@@ -35,6 +36,13 @@ def lane(parts: Parts, array: str, k: int) -> str:
 def lanes_of(parts: Parts, array: str) -> str:
     """Write all coordinates of lane l of the block that begins at `base`, as a tuple."""
     return "(" + ", ".join(lane(parts, array, k) for k in range(parts.dimension)) + ")"
+
+
+def copied(parts: Parts, to: str, at: str, source: str, place: str) -> list[str]:
+    """Write how the numbers of a block are copied, a vector at a time."""
+    each = LINE // parts.itemsize
+    more = [""] + [f" + np.uint64({k})" for k in range(each, parts.width, each)]
+    return [f"copy_line({to}, {at}{k}, {source}, {place}{k})" for k in more]
 
 
 def indented(lines: list[str], indent: int) -> str:

@@ -160,7 +160,7 @@ def reward(p: Any, before: Frame, after: Frame, action: Any, terms: Any) -> None
     per_cruise, per_spacing, per_slot = one / p.cruise, one / p.spacing, one / p.neighbours
     for i in range(terms.shape[0]):
         v = (after.vel[0, i], after.vel[1, i])
-        along = v[0] * after.memory[0, i] + v[1] * after.memory[1, i]
+        along = v[0] * like(one, after.memory[0, i]) + v[1] * like(one, after.memory[1, i])
         found = after.near_count[i]
         mean, touches = (o, o), o
         for s in range(found):
@@ -261,7 +261,7 @@ def observe(p: Any, frame: Frame, rows: Any) -> None:
     scales = (one / p.sight, like(one, 0.5) / p.max_speed, one / p.spacing)
     for i in range(rows.shape[0]):
         row = rows[i]
-        heading = (frame.memory[0, i], frame.memory[1, i])
+        heading = (like(one, frame.memory[0, i]), like(one, frame.memory[1, i]))
         put(row, 0, _turned((frame.vel[0, i], frame.vel[1, i]), heading, like(one, 2.0) * scales[1]))
         for c in range(2, ways):
             row[np.uint64(c)] = 0.0

@@ -23,8 +23,9 @@ def clip(x: float) -> float:
 def offset(a: float, b: float, size: float) -> float:
     """Return b - a, the shortest way around a periodic axis of this size (0 = not periodic)."""
     d = b - a
-    around = 1.0 / size if size > 0.0 else 0.0  # the same for all pairs: the division leaves the loop
-    return d - size * np.floor(d * around + 0.5)  # type: ignore[no-any-return]  # numpy's floor of a float is one
+    o, one, half = like(d, 0.0), like(d, 1.0), like(d, 0.5)
+    around = one / like(d, size) if size > o else o  # the same for all pairs: the division leaves the loop
+    return d - like(d, size) * np.floor(d * around + half)  # type: ignore[no-any-return]  # numpy's floor of a float is one
 
 
 @kernel
