@@ -146,7 +146,7 @@ def _part(x: float, low: float, pace: float, count: int) -> Any:
 
 @kernel
 def _find_cells(
-    pos: Any, living: Any, first: int, end: int, lanes: int, low: Any, pace: Any, size: Any, periodic: bool, shape: Any,
+    pos: Any, living: Any, first: int, end: int, lanes: int, low: Any, pace: Any, size: Any, wraps: bool, shape: Any,
     cell: Ints,
 ) -> None:  # fmt: skip
     """Write the cell of every agent of these blocks, lane beside lane; -1 for the dead."""
@@ -158,7 +158,7 @@ def _find_cells(
                 x: Any = (pos[at], pos[at + w])
             else:
                 x = (pos[at], pos[at + w], pos[at + w + w])
-            if periodic:  # as it is sorted: -1e-17 is 0 there, and with a cell at the other end would miss neighbours
+            if wraps:  # as it is sorted: -1e-17 is 0 there, and with a cell at the other end would miss neighbours
                 x, _ = torus_confine(size, size[0], x, x)
             if len(size) == 2:
                 index: Any = np.int64(0)
@@ -172,11 +172,12 @@ def _find_cells(
 @kernel
 def count_cells(
     pos: Any, living: Any, first: int, end: int, lanes: int, rank: int, team: int, sync: Any, bounds: Any, size: Any,
-    reach: float, periodic: bool, capacity: int, cell: Ints, start: Ints, offset: Ints,
+    reach: float, periodic: bool, wraps: bool, capacity: int, cell: Ints, start: Ints, offset: Ints,
 ) -> tuple[int, int, int, int]:  # fmt: skip
     """Find the cell of every agent, and where in sorted order each cell begins; return the cells as grid_of does.
 
-    pos: blocks of (D, lanes) m; living (agents, padded) 0 or 1; [first, end): this thread's blocks; capacity: most
+    pos: blocks of (D, lanes) m, to be brought into a periodic box first if it `wraps`; living (agents, padded) 0 or 1;
+    [first, end): this thread's blocks; capacity: most
     cells. Writes cell (agents, padded), -1 for the dead; start (capacity + 1,): first sorted agent of each cell;
     offset (team, capacity): where this thread puts its next agent of each cell. Returns zeros for brute force.
     """
@@ -191,7 +192,7 @@ def count_cells(
         pace: Any = (shape[0] / lengths[0], shape[1] / lengths[1])
     else:
         pace = (shape[0] / lengths[0], shape[1] / lengths[1], shape[2] / lengths[len(size) - 1])
-    _find_cells(pos, living, first, end, lanes, low, pace, size, periodic, shape, cell)
+    _find_cells(pos, living, first, end, lanes, low, pace, size, wraps, shape, cell)
     for i in range(first * lanes, end * lanes):
         c = cell[i]
         if c >= 0:

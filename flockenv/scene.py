@@ -12,7 +12,7 @@ import math
 import mmap
 import operator
 import threading
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -25,7 +25,7 @@ from flockenv.crew import share, threads
 from flockenv.effects import EFFECTS, Effect
 from flockenv.effects.base import ties
 from flockenv.integrators import INTEGRATORS, Integrator, SemiImplicitEuler
-from flockenv.kernels import entry, load
+from flockenv.kernels import LINE, entry, load
 from flockenv.neighbours import FEWEST_AGENTS, MAX_RANGES, WORTH_ARRANGING
 from flockenv.noise import MASK, key_of
 from flockenv.records import Record
@@ -48,6 +48,9 @@ EXACT = 2**24
 
 HUGE = 2**21
 """Bytes of a large page."""
+
+GAP = 5 * LINE
+"""Bytes between two arrays of scratch."""
 
 MEMORY_LIMIT = 8 * 2**30
 """Bytes that a state and its scratch may take before a scene is refused."""
@@ -119,14 +122,15 @@ class Workspace:
             "records": (swept if sorts else 1) * parts.numbers,
             "luggage": carried * parts.luggage_size,
         }
-        arrays = {name: _aligned(shape, dtype) for name, shape in real.items()}
         whole = {
             "order": (swept + width,),
             "cell": (padded if sorts else 1,),
             "start": (cells + 1,),
             "offset": (team, cells),
         }
-        arrays |= {name: np.zeros(shape, np.int32) for name, shape in whole.items()}
+        wanted: dict[str, Any] = {name: (shape, np.dtype(dtype)) for name, shape in real.items()}
+        wanted |= {name: (shape, np.dtype(np.int32)) for name, shape in whole.items()}
+        arrays = _zeros(wanted)
         arrays |= {"bounds": np.zeros((team, 6)), "tally": np.zeros(team, np.int64), "sync": np.zeros(8, np.int64)}
         for name, pad in (("mass", 1), ("radius", 0), ("max_speed", 1), ("max_force", 1)):
             arrays[name][:] = pad
@@ -136,8 +140,8 @@ class Workspace:
             blocks = ties(padded, d).reshape(-1, width, d).transpose(0, 2, 1)
             arrays["tie"][:] = blocks.reshape(-1)
         arrays["number"] = np.arange(width, dtype=np.int32)
-        lanes = len(parts.slots) * width
-        own = tuple((_aligned(lanes, dtype), np.zeros((MAX_RANGES, 3), np.int64)) for _ in range(team))
+        lanes = {"lanes": (len(parts.slots) * width, np.dtype(dtype))}
+        own = tuple((_zeros(lanes)["lanes"], np.zeros((MAX_RANGES, 3), np.int64)) for _ in range(team))
         return cls(tuple(arrays[name] for name in SHARED.split(", ")[:-2]), own)
 
     def of(self, rank: int) -> tuple[NDArray[Any], ...]:
@@ -145,18 +149,23 @@ class Workspace:
         return (*self.shared, *self.own[rank])
 
 
-def _aligned(shape: int | tuple[int, ...], dtype: Any) -> NDArray[Any]:
-    """Return zeros that begin on a cache line, so that no vector register is loaded from two."""
-    size = int(np.prod(shape)) * np.dtype(dtype).itemsize
-    raw = _huge(size + 64) if size >= HUGE else np.zeros(size + 64, np.uint8)
-    skip = -raw.ctypes.data % 64
-    aligned: NDArray[Any] = raw[skip : skip + size].view(dtype).reshape(shape)
-    return aligned
+def _zeros(wanted: Mapping[str, tuple[int | tuple[int, ...], np.dtype[Any]]]) -> dict[str, NDArray[Any]]:
+    """Return arrays of zeros in one piece of memory, each beginning on a cache line: no vector is loaded from two.
+
+    Between two there is a gap, or places that are used together would compete for the same few lines of the cache.
+    """
+    sizes = {name: int(np.prod(shape)) * kind.itemsize for name, (shape, kind) in wanted.items()}
+    raw = _memory(sum(sizes.values()) + (len(sizes) + 1) * (LINE + GAP))
+    at, out = -raw.ctypes.data % LINE, {}
+    for name, (shape, kind) in wanted.items():
+        out[name] = raw[at : at + sizes[name]].view(kind).reshape(shape)
+        at += -(-sizes[name] // LINE) * LINE + GAP
+    return out
 
 
-def _huge(size: int) -> NDArray[np.uint8]:
-    """Return zeros on large pages, where the system has them: fewer addresses to look up in a large world."""
-    if not hasattr(mmap, "MADV_HUGEPAGE"):
+def _memory(size: int) -> NDArray[np.uint8]:
+    """Return zeros; where there are many, and the system has them, on large pages: fewer addresses to look up."""
+    if size < HUGE or not hasattr(mmap, "MADV_HUGEPAGE"):
         return np.zeros(size, np.uint8)
     memory = mmap.mmap(-1, size + HUGE, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)
     memory.madvise(mmap.MADV_HUGEPAGE)

@@ -241,8 +241,8 @@ def test_a_query_writes_into_its_own_arrays_only(size: Any, dimension: int) -> N
         cell, start, offset = (whole[name][:length] for name, length in lengths.items())
         box = tuple(float(edge) for edge in size[:dimension])
         shape = entry(count_cells)(
-            pos, living, 0, blocks, lanes, 0, 1, np.zeros(8, np.int64), np.zeros((1, 6)), box, 0.4, periodic, n,
-            cell, start, offset[None],
+            pos, living, 0, blocks, lanes, 0, 1, np.zeros(8, np.int64), np.zeros((1, 6)), box, 0.4, periodic,
+            periodic, n, cell, start, offset[None],
         )  # fmt: skip
         for name, length in lengths.items():
             assert (whole[name][length:] == -7).all(), f"{name} is too short for {shape} cells"

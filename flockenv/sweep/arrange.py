@@ -24,7 +24,7 @@ def move_in(parts: Parts) -> list[str]:
     return [
         "arranged = False",
         f"if count > 1 and n >= {WORTH_ARRANGING} and present == n:",
-        f"    shape = {counted(parts)}",
+        f"    shape = {counted(parts, parts.confines)}",
         "    arranged = shape[0] > 0",
         "if arranged:",
         indented(_carry(parts, cell), 4),

@@ -21,7 +21,7 @@ def pairs(parts: Parts) -> list[str]:
         "# one query per instant, one sweep for all pair laws",
         "if rank == 0:",
         "    work[b, 1] += 1",
-        *query(parts, parts.fields),
+        *query(parts, parts.fields, parts.confines),
         *walk(parts, [*_clear(parts), *_select_nearest(parts), *_sum_up(parts)]),
         "tally[rank] = met",
         "wait_for_team(sync, team)  # what is felt was written by others",

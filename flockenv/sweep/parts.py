@@ -129,6 +129,14 @@ class Parts:
         return max((len(record_of(fields)) for fields in kinds), default=1)
 
     @property
+    def confines(self) -> bool:
+        """Is everybody brought into a periodic box when a call begins, so that no query has to look after it?
+
+        Only where accelerations are asked for at the frozen present: a stage of a method may lie outside.
+        """
+        return self.space.periodic and self.arranges and self.integrator.evaluations == 1
+
+    @property
     def arranges(self) -> bool:
         """May agents of a large world be put in order for a while?"""
         return self.sorts and bool(self.pairs)

@@ -15,25 +15,25 @@ __all__ = ["counted", "query", "walk"]
 _ARRAYS = {"x": "pos", "v": "vel", "t": "tie"}
 
 
-def query(parts: Parts, fields: list[str]) -> list[str]:
-    """Write how the living are sorted, with these fields of each."""
+def query(parts: Parts, fields: list[str], inside: bool = False) -> list[str]:
+    """Write how the living are sorted, with these fields of each; `inside`: nobody is outside of a periodic box."""
     return [
         f"periodic, shape = {parts.space.periodic}, (0, 0, 0, 0)",
         "wait_for_team(sync, team)  # positions are everybody's",
-        *(["stride = np.uint64(order.shape[0])", f"shape = {counted(parts)}"] if parts.sorts else []),
+        *(["stride = np.uint64(order.shape[0])", f"shape = {counted(parts, inside)}"] if parts.sorts else []),
         "nx = shape[0]",
         "if nx == 0:",
         indented(_fill(parts, fields), 4),
-        *(["else:", indented(_sort(parts, fields), 4)] if parts.sorts else []),
+        *(["else:", indented(_sort(parts, fields, inside), 4)] if parts.sorts else []),
         "wait_for_team(sync, team)",
     ]
 
 
-def counted(parts: Parts) -> str:
+def counted(parts: Parts, inside: bool) -> str:
     """Write how many cells there are per axis, once every agent's has been found."""
     return (
         f"count_cells(pos, living, first, end, {parts.width}, rank, team, sync, bounds, size, reach, "
-        f"{parts.space.periodic}, n, cell, start, offset)"
+        f"{parts.space.periodic}, {parts.space.periodic and not inside}, n, cell, start, offset)"
     )
 
 
@@ -110,17 +110,17 @@ def _one_by_one(parts: Parts, lines: list[str]) -> list[str]:
     ]
 
 
-def _sort(parts: Parts, fields: list[str]) -> list[str]:
+def _sort(parts: Parts, fields: list[str], inside: bool) -> list[str]:
     """Write how agents are put into their cells: whole records first, so that each is one distant place in memory."""
     d, w, record = parts.dimension, parts.width, record_of(fields)
     row = {f: k for k, f in enumerate(fields)}
     place = []
-    if parts.space.periodic:
-        inside = tuple_of(f"pos[place + np.uint64(# * {w})]", d)
-        place.append(f"inside, _ = confine(size, radius[i], {inside}, {inside})")
+    wraps = parts.space.periodic and not inside
+    if wraps:
+        x = tuple_of(f"pos[place + np.uint64(# * {w})]", d)
+        place.append(f"inside, _ = confine(size, radius[i], {x}, {x})")
     for j, f in enumerate(record):
-        wrapped = parts.space.periodic and f[0] == "x" and f[1:].isdigit()
-        value = f"inside[{f[1:]}]" if wrapped else _value(parts, f, "place")
+        value = f"inside[{f[1:]}]" if wraps and f[0] == "x" and f[1:].isdigit() else _value(parts, f, "place")
         place.append(f"records[to + np.uint64({j})] = {value}")
     spread = [
         f"{sorted_at(parts, row[f], 'at')} = records[base + np.uint64({j})]" for j, f in enumerate(record) if f in row

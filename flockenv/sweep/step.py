@@ -67,6 +67,7 @@ def step_world(
         living[i] = alive[b, i]
     into_blocks(pos, x_, b, n, first, end)
     into_blocks(vel, v_, b, n, first, end)
+{indented(_confine(parts), 4)}
 {indented(move_in(parts), 4)}
     for i in range(np.uint64(first * {d * parts.width}), np.uint64(end * {d * parts.width})):
         origin[i] = pos[i]
@@ -84,6 +85,20 @@ def step_world(
         worst = min(worst, {bad})
     return np.int64(worst) if worst < far else -1
 '''
+
+
+def _confine(parts: Parts) -> list[str]:
+    """Write how everybody is brought into a periodic box, where steps rely on it."""
+    if not parts.confines:
+        return []
+    return [
+        "for block in range(np.uint64(first), np.uint64(end)):",
+        f"    base, row = block * np.uint64({parts.dimension * parts.width}), block * np.uint64({parts.width})",
+        f"    for l in range(np.uint64({parts.width})):",
+        f"        x, v = {lanes_of(parts, 'pos')}, {lanes_of(parts, 'vel')}",
+        "        x, v = confine(size, radius[row + l], x, v)",
+        indented([f"{lane(parts, 'pos', k)} = x[{k}]" for k in range(parts.dimension)], 8),
+    ]
 
 
 def _advance(parts: Parts) -> list[str]:
