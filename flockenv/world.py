@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import functools
+import itertools
 import math
 import secrets
 from collections.abc import Sequence
@@ -27,6 +28,9 @@ from flockenv.tasks.base import REFUSED, task_source
 __all__ = ["Step", "World"]
 
 Rows = NDArray[np.float32]
+
+PORTIONS = 6
+"""Portions per thread in which the worlds of a batch are handed out."""
 
 RECYCLE = 2**18
 """Bytes of observations from which on the memory of results is used again; below, new memory costs less."""
@@ -224,19 +228,27 @@ class World:
         while len(self._scratch) < crew:
             self._scratch.append(self._allocate())
 
-        def part(k: int) -> tuple[int, int]:
-            own = (crew == 1, self.worlds * k // crew, self.worlds * (k + 1) // crew)
+        def part(k: int, check: bool, first: int, end: int) -> tuple[int, int]:
             decision, rest = self._scratch[k]
             return self._kernel.play(  # type: ignore[no-any-return]
-                True, self._everywhere, True, *own, self._actions, *self._worlds, *self._clock, limit,
+                True, self._everywhere, True, check, first, end, self._actions, *self._worlds, *self._clock, limit,
                 *decision, *rest, *self._kept, *step,
             )  # fmt: skip
 
         if crew == 1:
-            return part(0)
+            return part(0, True, 0, self.worlds)
         if not np.isfinite(self._actions).all():  # nobody moves before all were looked at
             return REFUSED, 0
-        bad = [found for found in share([functools.partial(part, k) for k in range(crew)]) if found[0] >= 0]
+        portions = min(crew * PORTIONS, self.worlds)
+        turn = itertools.count()  # whoever is done takes the next: threads do not begin at the same time
+
+        def several(k: int) -> tuple[int, int]:
+            found = []
+            while (n := next(turn)) < portions:
+                found.append(part(k, False, self.worlds * n // portions, self.worlds * (n + 1) // portions))
+            return min((bad for bad in found if bad[0] >= 0), default=(-1, -1))
+
+        bad = [found for found in share([functools.partial(several, k) for k in range(crew)]) if found[0] >= 0]
         return min(bad, default=(-1, -1))
 
     def _take(self, actions: ArrayLike) -> None:
