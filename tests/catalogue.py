@@ -20,7 +20,16 @@ from numpy.typing import NDArray
 from flockenv import arbitration, steering
 from flockenv.effects import EFFECTS as EFFECT_KINDS
 from flockenv.effects import Alignment, AvoidObstacles, Cohesion, Drag, Effect, Separation
-from flockenv.integrators import RK4, ExplicitEuler, Integrator, SemiImplicitEuler
+from flockenv.integrators import (
+    RK4,
+    AveragedVelocity,
+    ExplicitEuler,
+    Heun,
+    Integrator,
+    Midpoint,
+    SemiImplicitEuler,
+    VelocityVerlet,
+)
 from flockenv.scene import Group, Scene
 from flockenv.space import Box, Plane, Space, Torus
 from flockenv.spawn import Spawn
@@ -120,6 +129,10 @@ class IntegratorRow:
 INTEGRATORS = (
     IntegratorRow(ExplicitEuler(), 259.37425),
     IntegratorRow(SemiImplicitEuler(), 275.31167),
+    IntegratorRow(AveragedVelocity(), 267.34296),
+    IntegratorRow(Midpoint(), 271.40808),
+    IntegratorRow(Heun(), 271.40808),
+    IntegratorRow(VelocityVerlet(), 271.40808),
     IntegratorRow(RK4(), 271.82797),
 )
 

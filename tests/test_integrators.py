@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from flockenv.integrators import RK4, ExplicitEuler, Integrator, SemiImplicitEuler
+from flockenv.integrators import RK4, ExplicitEuler, Heun, Integrator, Midpoint, SemiImplicitEuler, VelocityVerlet
 from flockenv.scene import Group, Scene
 from flockenv.spawn import Spawn
 from flockenv.state import State, blank
@@ -108,10 +108,11 @@ def test_the_order_without_damping_is_the_declared_one(row: IntegratorRow, tethe
     assert measured == pytest.approx(row.method.order, abs=0.2)
 
 
-def test_the_orders_are_1_1_4() -> None:
+def test_the_orders_are_those_of_the_table() -> None:
     """What the issue promises, so that a method cannot declare its way out."""
     orders = {row.name: (row.method.order, row.method.order_with_drag) for row in INTEGRATORS}
-    promised = {"explicit_euler": (1, 1), "semi_implicit_euler": (1, 1), "rk4": (4, 4)}
+    promised = {"explicit_euler": (1, 1), "semi_implicit_euler": (1, 1), "averaged_velocity": (1, 1), "rk4": (4, 4)}
+    promised |= {"midpoint": (2, 2), "heun": (2, 2), "velocity_verlet": (2, 2)}
     assert {name: orders[name] for name in promised} == promised
 
 
@@ -177,6 +178,38 @@ def test_semi_implicit_euler_keeps_its_invariant(way: str, steps: int, tether: A
         assert v * v + w * w * x * x - h * w * w * x * v == pytest.approx(start, rel=1e-12)
 
 
+@pytest.mark.parametrize(("way", "steps"), [("python", 3000), ("compiled", 100_000)])
+def test_velocity_verlet_keeps_its_invariant(way: str, steps: int, tether: Any) -> None:
+    """v^2 + w^2 x^2 (1 - h^2 w^2 / 4) does not change at all (numerics.md 3.2)."""
+    w, h = 2 * math.pi, 0.01
+    end, share = oscillator(tether, way, w, zeta=0), 1 - h * h * w * w / 4
+    start = V0**2 + w * w * X0**2 * share
+    for n in (1, 7, steps):
+        x, v = end(VelocityVerlet(), h, n)
+        assert v * v + w * w * x * x * share == pytest.approx(start, rel=1e-12)
+
+
+@WAYS
+@pytest.mark.parametrize("method", [Midpoint(), Heun()], ids=lambda method: method.kind)
+def test_methods_of_order_2_pump_energy_by_the_book(method: Integrator, way: str, tether: Any) -> None:
+    """Per step 1 + y^4/4 with y = h w (numerics.md 3.1)."""
+    w, h, counts = 2 * math.pi, 0.05, (1, 10, 1000)
+    found = energies(oscillator(tether, way, w, zeta=0), method, w, h, counts)
+    expected = (V0**2 + w * w * X0**2) * (1 + (h * w) ** 4 / 4) ** np.array(counts)
+    np.testing.assert_allclose(found, expected, rtol=1e-9)
+
+
+@METHODS
+def test_a_constant_force_leads_along_a_parabola(row: IntegratorRow) -> None:
+    """Exactly, but for the two Eulers, which lag or lead by h g t / 2."""
+    state, g = at_start(blank(1, 1, 2, 0, 0.25)), -9.81
+    for _ in range(8):
+        state = row.method(lambda x, v: g + 0 * x, state, 0.25)
+    off = {"explicit_euler": -1, "semi_implicit_euler": 1}.get(row.name, 0) * 0.25 * g * 2.0 / 2
+    np.testing.assert_allclose(state.pos, X0 + 2 * V0 + g * 2 + off, rtol=1e-13)
+    np.testing.assert_allclose(state.vel, V0 + g * 2, rtol=1e-13)
+
+
 def test_energy_after_a_hundred_periods_is_the_table_s(tether: Any) -> None:
     """100 steps per period (numerics.md 3.1): 1.29272e17 explicit, 0.9999915 RK4, within 3.3 % semi-implicit."""
     w = 2 * math.pi
@@ -184,6 +217,8 @@ def test_energy_after_a_hundred_periods_is_the_table_s(tether: Any) -> None:
     start = V0**2 + w * w * X0**2
     assert energies(end, ExplicitEuler(), w, 0.01, [10_000])[0] / start == pytest.approx(1.29272e17, rel=1e-5)
     assert energies(end, RK4(), w, 0.01, [10_000])[0] / start == pytest.approx(0.9999915, abs=1e-7)
+    for method in (Midpoint(), Heun()):
+        assert energies(end, method, w, 0.01, [10_000])[0] / start == pytest.approx(1.039733, abs=1e-6)
     kept = start - 0.01 * w * w * X0 * V0  # its own invariant, around which the energy swings
     swing = energies(end, SemiImplicitEuler(), w, 0.01, range(9_900, 10_000)) / kept
     assert swing.min() == pytest.approx(1 / (1 + 0.01 * w / 2), abs=1e-4)  # 0.969541

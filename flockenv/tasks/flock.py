@@ -168,7 +168,7 @@ def reward(p: Any, before: Frame, after: Frame, action: Any, terms: Any) -> None
             mean = (mean[0] + after.vel[0, j], mean[1] + after.vel[1, j])
             contact = after.radius[i] + after.radius[j]
             touches += one if after.near_square[s, i] < contact * contact else o
-        disagree = norm(sub(v, scale(mean, one / max(found, 1)))) * per_cruise if found > 0 else one
+        disagree = norm(sub(v, scale(mean, one / like(one, max(found, 1))))) * per_cruise if found > 0 else one
         gap = np.sqrt(after.near_square[0, i]) if found > 0 else p.sight
         off_speed, off_place = abs(along - p.cruise) * per_cruise, abs(gap - p.spacing) * per_spacing
         terms[i, 0] = p.progress_reward * (one - min(off_speed, one)) * p.control_dt
