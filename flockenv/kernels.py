@@ -137,8 +137,8 @@ def _copy_line(typing_context: Any, to: Any, at: Any, source: Any, place: Any) -
 
     Both arrays have one axis and lie in one piece; places are counted without a sign.
     """
-    if to.dtype != source.dtype:
-        raise numba.TypingError(f"copy_line: {source.dtype} into {to.dtype}")
+    if to.dtype != source.dtype or (to.layout, source.layout, to.ndim, source.ndim) != ("C", "C", 1, 1):
+        raise numba.TypingError(f"copy_line: {source} into {to}, must be one row of the same numbers, in one piece")
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         make: Any = arrayobj.make_array

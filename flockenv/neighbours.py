@@ -82,7 +82,7 @@ def grid_of(lengths: Any, count: int, reach: float, periodic: bool) -> tuple[int
         fine -= 1
         nx = _along(lengths[0], reach / fine)
     nx, ny, nz = _fit((nx, ny, nz), count)
-    wide = nx // fine
+    wide = max(1, nx // fine)
     few = periodic and (
         min(wide, ny) < 3 or (len(lengths) == 3 and nz < 3)
     )  # a row and its image would be the same row

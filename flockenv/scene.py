@@ -324,6 +324,9 @@ class Scene(Record):
             out = state.copy()
         elif out is not state:
             out.copy_from(state)
+        for name, array in (("x", out.x), ("v", out.v)):
+            if not array.flags.c_contiguous:
+                raise ValueError(f"out.{name} does not lie in one piece (its strides are {array.strides}); use copy()")
         world, agent = self._advance(out, self._drive(drive, state), steps)
         if world >= 0:
             raise FloatingPointError(
@@ -338,6 +341,8 @@ class Scene(Record):
         Threads take worlds apart, or, of a large world, its agents.
         """
         worlds, agents, _ = state.shape
+        if steps == 0:
+            return -1, -1
         crew = threads() if worlds * agents * steps >= WORTH_SHARING else 1
         team = crew if worlds < crew and agents >= WORTH_SHARING else 1
         crew = crew if team > 1 else min(crew, worlds)

@@ -54,9 +54,12 @@ def plane_confine(size: Vec, radius: float, x: Vec, v: Vec) -> tuple[Vec, Vec]:
 
 @law
 def _into(x: float, length: float) -> float:
+    o = like(x, 0.0)
     inside = x - length * np.floor(x * (like(x, 1.0) / length))
     # (-1e-17) wraps to exactly `length` in floating point: that is 0
-    return like(x, 0.0) if inside >= length or inside < like(x, 0.0) else inside
+    inside = o if inside >= length or inside < o else inside
+    # the last number below `length`, times 1 / length, may round to 1: who is inside stays where he is
+    return x if (x >= o) & (x < length) else inside
 
 
 @law

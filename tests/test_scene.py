@@ -445,6 +445,47 @@ def test_a_million_agents_fit_into_a_gigabyte() -> None:
     assert few.bytes_per_world() == pytest.approx(taken(few), rel=0.01)
 
 
+# --- who stands where ---------------------------------------------------------------------------------------------
+
+
+def crowd_of(count: int, **fields: Any) -> Scene:
+    spawn = Spawn(low=(0, 0), high=(50, 50))
+    return scene_of(Separation(weight=1, radius=1), groups=(Group(count=count, max_speed=3, spawn=spawn),), **fields)
+
+
+def test_who_is_inside_a_torus_stays_where_he_is() -> None:
+    """59.999996 / 60 rounds to 1 in single precision: an agent there must not be carried round at each call."""
+    scene = crowd_of(200, space=Torus(size=(60, 60)), dtype="float32")
+    state = scene.start(0)
+    state.v[...] = 0
+    state.x[:, 0, 0] = np.nextafter(np.float32(60), np.float32(0)), 55
+    np.testing.assert_array_equal(scene.step(state).x[:, 0, 0], state.x[:, 0, 0])
+
+
+@pytest.mark.parametrize("axis", [0, 1])
+def test_agents_on_a_line_do_not_all_meet(axis: int) -> None:
+    scene = crowd_of(2000, space=Plane())
+    state = scene.start(0)
+    state.x[axis], state.x[1 - axis] = np.linspace(0, 2000, 2000), 1.0
+    assert scene.step(state).counted("pairs") < 100 * 2000
+
+
+def test_no_steps_move_nobody() -> None:
+    scene = crowd_of(200, space=Torus(size=(60, 60)))
+    state = scene.start(0)
+    state.x[0, 0, 0] = -3.0
+    np.testing.assert_array_equal(scene.step(state, steps=0).x, state.x)
+
+
+def test_a_state_in_pieces_is_refused_in_place_and_copied_otherwise() -> None:
+    scene = crowd_of(64, space=Plane())
+    state = scene.start(0)
+    pieces = State(**{**vars(state), "x": np.asfortranarray(state.x)})
+    np.testing.assert_array_equal(scene.step(pieces).x, scene.step(state).x)
+    with pytest.raises(ValueError, match=r"out\.x does not lie in one piece"):
+        scene.step(pieces, out=pieces)
+
+
 # --- somebody else's effect -------------------------------------------------------------------------------------------
 
 

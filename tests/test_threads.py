@@ -24,9 +24,11 @@ import flockenv
 import flockenv.scene as scenes
 from flockenv import crew
 from flockenv.crew import share, threads, use_threads
+from flockenv.effects import Separation
 from flockenv.kernels import cache_folder
 from flockenv.neighbours import WORTH_ARRANGING
-from flockenv.scene import Scene
+from flockenv.scene import Group, Scene
+from flockenv.spawn import Spawn
 from flockenv.state import State
 from tests.catalogue import VARIANTS, Variant
 
@@ -164,6 +166,17 @@ def test_a_call_of_many_steps_is_many_calls_of_one(name: str) -> None:
 
 def scene_is_flat(name: str) -> bool:
     return NAMED[name].dimension == 2
+
+
+def test_a_world_that_was_put_in_order_may_shrink_until_there_is_no_grid() -> None:
+    """From then on everybody is met in the order of numbers, not of places."""
+    spawn = Spawn(low=(0, 0), high=(6.1, 6.1))
+    scene = Scene(
+        groups=(Group(count=WORTH_ARRANGING, spawn=spawn),), effects=(Separation(weight=1e-3, radius=1.0),), dt=0.02
+    )
+    start = scene.start(1)
+    start.v[...] = -1.5 * (start.x - 3.05)
+    assert_same(scene.step(start, steps=2), scene.step(scene.step(start)))
 
 
 def test_nan_in_a_world_that_was_put_in_order_names_the_agent_by_its_number() -> None:

@@ -505,3 +505,16 @@ def test_a_snapshot_is_a_picture_of_one_world(row: TaskRow) -> None:
     kept = picture.pos.copy()
     world.step(actions_for(world, 1)[0])
     np.testing.assert_array_equal(picture.pos, kept)
+
+
+def test_a_large_flock_looks_around_through_cells() -> None:
+    """Its nearest are those that everybody against everybody finds."""
+    task = Flock(agents=130, learners=130, size=60.0)
+    world = World(task, 2)
+    world.reset(0)
+    before = world.step(np.zeros((2, 130, 2)))
+    assert np.isfinite(before.observation).all()
+    d = task.scene.space.displacement(world.state.pos[:, :, None], world.state.pos[:, None])
+    gaps = np.sqrt((d**2).sum(-1)) + 1e9 * np.eye(130)
+    nearest = np.minimum(gaps.min(-1), task.sight).mean(-1)
+    np.testing.assert_allclose(world.measure()["nearest_neighbour"], nearest, rtol=1e-9)

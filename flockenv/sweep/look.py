@@ -28,7 +28,7 @@ def look(
     n, rank, team = x_.shape[2], 0, 1
     first, end = 0, (n + {parts.width - 1}) // {parts.width}
     size, reach, within = {tuple_of("params[#]", parts.dimension)}, params[{at}], params[{at + 1}]
-    present = 0
+    present, arranged = 0, False
     for i in range(n):
         present += alive[b, i]
         living[i] = alive[b, i]

@@ -64,7 +64,7 @@ def _sum_up(parts: Parts) -> list[str]:
         *indented_lines(meet_range(parts, parts.fields, _meet(parts)), 4),
         f"for l in range(np.uint64({parts.width})):",
         indented(_finish(parts), 4),
-        "if nx == 0 and present == n:  # sorted by number: they are felt as the lanes lie",
+        f"if nx == 0 and present == n{' and not arranged' * parts.sorts}:  # they are felt as the lanes lie",
         f"    for l in range(np.uint64({w})):",
         indented([f"felt[block * np.uint64({r}) + np.uint64({j * w}) + l] = {s}" for j, s in enumerate(sums)], 8),
         "else:",

@@ -99,9 +99,16 @@ def _headings(parts: Parts, fields: list[str]) -> list[str]:
 
 def _one_by_one(parts: Parts, lines: list[str]) -> list[str]:
     """Write how the living are listed one after another."""
+    by_number = [
+        "if arranged:  # everybody lives, and is not where his number says",
+        "    for i in range(np.uint64(n)):",
+        "        order[np.uint64(ident[i])] = i",
+    ]
     return [
+        *(by_number if parts.sorts else []),
         "at = np.uint64(0)",
-        "for i in range(np.uint64(n)):",
+        "for number_ in range(np.uint64(n)):",
+        "    i = np.uint64(order[number_]) if arranged else number_" if parts.sorts else "    i = number_",
         "    if living[i] > 0:",
         f"        place = np.uint64(place_of(np.int64(i), {parts.dimension}, {parts.width}))",
         "        order[at] = i",
