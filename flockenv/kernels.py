@@ -33,6 +33,7 @@ from flockenv.inlining import Inlined
 __all__ = [
     "FAST",
     "LINE",
+    "OPTIONS",
     "Vec",
     "cache_folder",
     "copy_line",
@@ -59,7 +60,7 @@ FAST = frozenset({"contract"})
 # _nrt=False: no reference counts. Arrays belong to whoever called the entry point, for as long as it runs; counting
 # every view of them with a locked instruction took nine tenths of the time of a world of 32 agents. So nothing compiled
 # here may allocate (numba says so when it compiles): scratch is an argument.
-_OPTIONS: Any = {
+OPTIONS: Any = {
     "forceinline": True, "fastmath": set(FAST), "error_model": "numpy", "nogil": True, "_nrt": False,
     "pipeline_class": Inlined,
 }  # fmt: skip
@@ -68,17 +69,17 @@ _njit: Any = numba.njit  # numba's stubs do not know `_nrt`
 
 def law(function: F) -> F:
     """Mark a scalar law: branch-free if it can be, inlined into whatever loop calls it, never called on its own."""
-    return cast(F, _njit(**_OPTIONS)(function))
+    return cast(F, _njit(**OPTIONS)(function))
 
 
 def unfused(function: F) -> F:
     """Mark a law that must give the same bits in every loop it is inlined into: no multiply is fused with an add."""
-    return cast(F, _njit(**{**_OPTIONS, "fastmath": False})(function))
+    return cast(F, _njit(**{**OPTIONS, "fastmath": False})(function))
 
 
 def kernel(function: F) -> F:
     """Mark a function over the arrays of one world; compiled as a part of the generated file that calls it."""
-    return cast(F, _njit(**_OPTIONS)(function))
+    return cast(F, _njit(**OPTIONS)(function))
 
 
 def like(x: float, constant: float) -> float:
@@ -92,7 +93,7 @@ def finite(x: float) -> bool:
     return abs(x) < like(x, math.inf)
 
 
-@overload(like, jit_options=_OPTIONS)
+@overload(like, jit_options=OPTIONS)
 def _like(x, constant):  # type: ignore[no-untyped-def]  # numba compares signatures, annotations included
     to = types.float32 if x == types.float32 else types.float64
     return lambda x, constant: to(constant)

@@ -7,6 +7,7 @@ state = scene.step(state)
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import math
 import mmap
@@ -22,6 +23,7 @@ from pydantic import Field, WrapValidator, model_validator
 
 from flockenv import state as states
 from flockenv.crew import share, threads
+from flockenv.divergence import SimulationDiverged
 from flockenv.effects import EFFECTS, Effect
 from flockenv.effects.base import ties
 from flockenv.integrators import INTEGRATORS, Integrator, SemiImplicitEuler
@@ -34,7 +36,7 @@ from flockenv.snapshot import Snapshot
 from flockenv.space import AnySpace, Box, Plane, Torus
 from flockenv.spawn import Spawn, scatter
 from flockenv.state import Body, Floats, State
-from flockenv.sweep import SHARED, SMALL_STRIDE, Parts, scene_source
+from flockenv.sweep import SHARED, SMALL_STRIDE, Parts, Table, field_source, pack, scene_source
 
 __all__ = ["Group", "Scene", "Workspace"]
 
@@ -104,7 +106,7 @@ class Workspace:
     own: tuple[tuple[NDArray[Any], NDArray[Any]], ...]  # lanes and ranges of each thread
 
     @classmethod
-    def allocate(cls, parts: Parts, body: Body, team: int = 1) -> Workspace:
+    def allocate(cls, parts: Parts, body: Body, table: Table, team: int = 1) -> Workspace:
         """Return scratch for the sweep, the query and the integrator, in the order of sweep.SHARED."""
         d, agents, dtype = parts.dimension, len(body.mass), body.mass.dtype
         width = parts.width
@@ -117,6 +119,8 @@ class Workspace:
             "stages": (max(parts.integrator.stages, 1), padded * d),
             **dict.fromkeys(("mass", "radius", "max_speed", "max_force", "living", "ident"), padded),
             "tie": padded * d if "t0" in parts.fields else 1,
+            "pulled": padded * d if parts.bonded else 1,
+            "carrying": padded * d if parts.flows else 1,
             "felt": max(swept * d * len(parts.targets), 1),
             "sorted_": parts.rows * (swept + width if parts.sorts else SMALL_STRIDE),
             "records": (swept if sorts else 1) * parts.numbers,
@@ -140,6 +144,7 @@ class Workspace:
             blocks = ties(padded, d).reshape(-1, width, d).transpose(0, 2, 1)
             arrays["tie"][:] = blocks.reshape(-1)
         arrays["number"] = np.arange(width, dtype=np.int32)
+        arrays |= {"bond_place": table.place, "bond_number": table.number, "bond_start": table.start}
         lanes = {"lanes": (len(parts.slots) * width, np.dtype(dtype))}
         own = tuple((_zeros(lanes)["lanes"], np.zeros((MAX_RANGES, 3), np.int64)) for _ in range(team))
         return cls(tuple(arrays[name] for name in SHARED.split(", ")[:-2]), own)
@@ -189,10 +194,15 @@ class Scene(Record):
     def _consistent(self) -> Scene:
         """Refuse what no single field can know: dimensions that differ, a reach around the torus, too much memory."""
         self._check_dimensions()
+        for k, effect in enumerate(self.effects):
+            try:
+                effect.check(self)
+            except ValueError as error:
+                raise ValueError(f"effects[{k}].{error}") from None
         size = getattr(self.space, "size", None)
         if isinstance(self.space, Torus):
             for k, effect in enumerate(self.effects):
-                if effect.reach > min(self.space.size) / 2:
+                if effect.pair_law and effect.reach > min(self.space.size) / 2:
                     raise ValueError(
                         f"effects[{k}].radius = {effect.reach:g} reaches around the torus; at most half its shortest "
                         f"edge, {min(self.space.size) / 2:g} m, is allowed"
@@ -254,6 +264,7 @@ class Scene(Record):
         if parts.sweeps and parts.sorts:
             reals += parts.rows + parts.numbers
             whole += 3 * 4
+        reals += d * (bool(parts.bonded) + parts.flows)
         if parts.arranges and self.agents >= WORTH_ARRANGING:
             reals += parts.luggage_size
         return self.agents * (reals * real + whole)
@@ -273,6 +284,11 @@ class Scene(Record):
         """What the kernel is made of."""
         sorts = self.agents >= FEWEST_AGENTS
         return Parts(self.dimension, self.space, self.effects, self.integrator, self.dtype, sorts)
+
+    @functools.cached_property
+    def table(self) -> Table:
+        """The bonds of all effects, as the kernel reads them."""
+        return pack(self.parts, self.agents, self.groups)
 
     @functools.cached_property
     def _params(self) -> Floats:
@@ -317,7 +333,8 @@ class Scene(Record):
 
         drive: forces asked for, (B, N, D) N, clipped to max_force together with steering effects; none = nobody asks.
         out: the state to write into (it may be `state` itself: nothing is allocated then); none = a new one.
-        Raises FloatingPointError, naming world and agent, if a position or velocity is no longer finite.
+        Raises SimulationDiverged, naming world, agent, step and effect, if a position or velocity is no longer finite;
+        that world is left as it was, the others have made their steps.
         """
         self._check(state, steps)
         if out is None:
@@ -327,13 +344,57 @@ class Scene(Record):
         for name, array in (("x", out.x), ("v", out.v)):
             if not array.flags.c_contiguous:
                 raise ValueError(f"out.{name} does not lie in one piece (its strides are {array.strides}); use copy()")
-        world, agent = self._advance(out, self._drive(drive, state), steps)
+        given = self._drive(drive, state)
+        world, agent = self._advance(out, given, steps)
         if world >= 0:
-            raise FloatingPointError(
-                f"world {world}, agent {agent}: position or velocity is not finite at t = {out.time[world]:g} s; "
-                f"dt = {self.dt:g} s may be too large for {self.integrator.kind}"
-            )
+            raise self._diverged(out, given, world, agent, steps)
         return out
+
+    def _diverged(self, state: State, drive: Floats, world: int, agent: int, steps: int) -> SimulationDiverged:
+        """Return what to say about a world that could not make its steps: its last finite instant is found again."""
+        alone = state.worlds([world])
+        push = drive[:, world : world + 1].copy() if drive.shape[1] else drive
+        done = 0
+        while done < steps and (bad := self._advance(alone, push, 1))[0] < 0:
+            done += 1
+        agent = bad[1] if done < steps else agent
+        last, time = int(alone.tick[0]) + 1, (int(alone.tick[0]) + 1) * self.dt
+        effect = self._blamed(alone, agent)
+        return SimulationDiverged(world, agent, last, time, effect, self.dt, self.integrator.kind)
+
+    def _blamed(self, state: State, agent: int) -> str | None:
+        """Return the kind of the effect that accelerates an agent most, or to no number at all."""
+        found: list[tuple[float, str]] = []
+        for k, effect in enumerate(self.effects):
+            alone = self.with_effects(*(e if j == k else e.idle() for j, e in enumerate(self.effects)))
+            size = float(np.abs(alone.acceleration(state)[0, agent]).max())
+            found.append((size if math.isfinite(size) else math.inf, effect.kind))
+        return max(found)[1] if found and max(found)[0] > 0 else None
+
+    def acceleration(self, state: State, drive: ArrayLike | None = None) -> Floats:
+        """Return the acceleration of everybody at this instant, (B, N, D) m/s^2; nothing moves.
+
+        Drag included, whichever method the scene has; forces asked for are bounded as in a step, speeds are not.
+        """
+        return self.rates(state, drive)[0]
+
+    def rates(
+        self, state: State, drive: ArrayLike | None = None, times: ArrayLike | None = None
+    ) -> tuple[Floats, Floats | None]:
+        """Return the acceleration, (B, N, D) m/s^2, and the velocity of a medium that carries everybody, m/s, or none.
+
+        times: of each world, (B,) s; none = those of the state.
+        """
+        self._check(state, 0)
+        b, n, d = state.shape
+        acc = np.empty((d, b, n), self.dtype)
+        flow = np.empty((d, b, n) if self.parts.flows else (d, 0, 0), self.dtype)
+        when = np.ascontiguousarray(np.broadcast_to(state.time if times is None else np.asarray(times), b), self.dtype)
+        self._field(
+            state.x, state.v, state.alive, state.obstacle_x, state.obstacle_radius, state.work,
+            self._drive(drive, state), self._params, when, acc, flow, *self._workspaces(1, 1)[0].of(0),
+        )  # fmt: skip
+        return acc.transpose(1, 2, 0), flow.transpose(1, 2, 0) if self.parts.flows else None
 
     def _advance(self, state: State, drive: Floats, steps: int) -> tuple[int, int]:
         """Step in place, by as many threads as are in use; return the first (world, agent) not finite, or (-1, -1).
@@ -344,10 +405,10 @@ class Scene(Record):
         if steps == 0:
             return -1, -1
         crew = threads() if worlds * agents * steps >= WORTH_SHARING else 1
-        team = crew if worlds < crew and agents >= WORTH_SHARING else 1
+        team = crew if worlds < crew and agents >= WORTH_SHARING and not self.integrator.adaptive else 1
         crew = crew if team > 1 else min(crew, worlds)
         arrays = (
-            state.x, state.v, state.alive, state.tick, state.obstacle_x, state.obstacle_radius, state.work, drive,
+            state.x, state.v, state.alive, state.tick, state.key, state.obstacle_x, state.obstacle_radius, state.work, drive,
             self._params, self._dt, steps,
         )  # fmt: skip
         if crew == 1:
@@ -394,6 +455,13 @@ class Scene(Record):
         return np.dtype(self.dtype).type(self.dt)
 
     @functools.cached_property
+    def _field(self) -> Any:
+        plain = dataclasses.replace(
+            self.parts, integrator=SemiImplicitEuler()
+        )  # which method it is makes no difference
+        return load("field", field_source(plain)).field
+
+    @functools.cached_property
     def _kernel(self) -> Any:
         return load("scene", scene_source(self.parts)).step
 
@@ -402,7 +470,7 @@ class Scene(Record):
         kept: dict[int, list[Workspace]] = vars(self._threads).setdefault("workspaces", {})
         found = kept.setdefault(team, [])
         while len(found) < count:
-            found.append(Workspace.allocate(self.parts, self.body, team))
+            found.append(Workspace.allocate(self.parts, self.body, self.table, team))
         return found
 
     @functools.cached_property

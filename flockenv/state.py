@@ -17,8 +17,12 @@ __all__ = ["WORK", "Body", "Floats", "Obstacles", "State"]
 
 Floats = NDArray[np.floating[Any]]
 
-WORK = ("evaluations", "neighbour_queries", "pairs", "obstacle_tests")
-"""What is counted in State.work: force evaluations, neighbour queries, candidate pairs met, agent-obstacle tests."""
+WORK = (
+    "evaluations", "neighbour_queries", "pairs", "obstacle_tests", "substeps", "rejected_steps", "newton_iterations",
+    "linear_iterations",
+)  # fmt: skip
+"""What is counted in State.work: force evaluations, neighbour queries, candidate pairs met, agent-obstacle tests; and,
+by methods that choose their own steps, those accepted and rejected; by methods that solve, their iterations."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,7 +65,7 @@ class State:
     key: NDArray[np.uint64]  # (B,) the world's random key, see noise.py
     obstacle_x: Floats  # (D, B, M) m
     obstacle_radius: Floats  # (B, M) m
-    work: NDArray[np.int64]  # (B, 4) counters, see WORK
+    work: NDArray[np.int64]  # (B, 8) counters, see WORK
     dt: float  # s, one physics step: time = tick dt
 
     @property

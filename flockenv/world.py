@@ -21,7 +21,7 @@ from flockenv.recycle import Recycler
 from flockenv.scene import MEMORY_LIMIT, WORTH_SHARING, Workspace
 from flockenv.snapshot import Snapshot
 from flockenv.state import State
-from flockenv.sweep import Look
+from flockenv.sweep import Look, pack
 from flockenv.tasks import Task
 from flockenv.tasks.base import REFUSED, task_source
 
@@ -129,7 +129,7 @@ class World:
             for many in (look.agents, look.obstacles)
             for shape, kind in (((many, padded), real), ((many, padded), np.int32), ((padded,), np.int32))
         ]
-        return decision, (*near, *Workspace.allocate(task.parts, scene.body).of(0))
+        return decision, (*near, *Workspace.allocate(task.parts, scene.body, pack(task.parts, n, scene.groups)).of(0))
 
     def __getstate__(self) -> dict[str, Any]:
         """Pickle what cannot be made anew."""

@@ -42,7 +42,7 @@ def oscillator(tether: Any, way: str, w: float = W, zeta: float = ZETA, **limits
     def in_python(method: Integrator, dt: float, steps: int) -> tuple[float, float]:
         state = at_start(blank(1, 1, 2, 0, dt))
         for _ in range(steps):
-            state = method(lambda x, v: -w * w * x - 2 * zeta * w * v, state, dt)
+            state = method(lambda x, v, t: -w * w * x - 2 * zeta * w * v, state, dt)
         return float(state.pos[0, 0, 0]), float(state.vel[0, 0, 0])
 
     def compiled(method: Integrator, dt: float, steps: int) -> tuple[float, float]:
@@ -55,7 +55,7 @@ def oscillator(tether: Any, way: str, w: float = W, zeta: float = ZETA, **limits
     return in_python if way == "python" else compiled
 
 
-def spring(context: Any, pos: Array, vel: Array, out: Array) -> None:
+def spring(context: Any, pos: Array, vel: Array, time: float, out: Array) -> None:
     """An acceleration as `advance` calls it, over flat rows."""
     out[...] = -pos
 
@@ -136,7 +136,7 @@ def test_growth_is_the_worked_example_s(row: IntegratorRow) -> None:
     state = blank(1, 1, 2, 0, 1.0)
     state.x[...], state.v[...] = 100.0, 10.0
     for _ in range(10):
-        state = row.method(lambda x, v: 0.1 * v, state, 1.0)
+        state = row.method(lambda x, v, t: 0.1 * v, state, 1.0)
     np.testing.assert_allclose(state.pos, row.grown, atol=5e-6)
 
 
@@ -204,7 +204,7 @@ def test_a_constant_force_leads_along_a_parabola(row: IntegratorRow) -> None:
     """Exactly, but for the two Eulers, which lag or lead by h g t / 2."""
     state, g = at_start(blank(1, 1, 2, 0, 0.25)), -9.81
     for _ in range(8):
-        state = row.method(lambda x, v: g + 0 * x, state, 0.25)
+        state = row.method(lambda x, v, t: g + 0 * x, state, 0.25)
     off = {"explicit_euler": -1, "semi_implicit_euler": 1}.get(row.name, 0) * 0.25 * g * 2.0 / 2
     np.testing.assert_allclose(state.pos, X0 + 2 * V0 + g * 2 + off, rtol=1e-13)
     np.testing.assert_allclose(state.vel, V0 + g * 2, rtol=1e-13)
@@ -231,7 +231,7 @@ def test_energy_after_a_hundred_periods_is_the_table_s(tether: Any) -> None:
 @METHODS
 def test_it_evaluates_the_force_as_often_as_it_says(row: IntegratorRow, tether: Any) -> None:
     calls = []
-    row.method(lambda x, v: calls.append(1) or -x, blank(1, 3, 2, 0, 0.1), 0.1)
+    row.method(lambda x, v, t: calls.append(1) or -x, blank(1, 3, 2, 0, 0.1), 0.1)
     assert len(calls) == row.method.evaluations
     spawn = Spawn(low=(0, 0), high=(1, 1))
     scene = Scene(groups=(Group(count=1, spawn=spawn),), effects=(tether(stiffness=1),), integrator=row.method)
@@ -243,7 +243,7 @@ def test_it_evaluates_the_force_as_often_as_it_says(row: IntegratorRow, tether: 
 def test_a_step_that_leads_nowhere_is_refused(row: IntegratorRow, dt: float) -> None:
     state = blank(1, 1, 2, 0, 0.1)
     with pytest.raises(ValueError, match="dt is") as caught:
-        row.method(lambda x, v: -x, state, dt)
+        row.method(lambda x, v, t: -x, state, dt)
     assert "\n" not in str(caught.value)
     assert state.tick[0] == 0
 
@@ -255,14 +255,14 @@ def test_a_step_leaves_its_state_alone_and_agents_apart(row: IntegratorRow) -> N
     state.x[...], state.v[...] = rng.normal(size=(3, 2, 5)), rng.normal(size=(3, 2, 5))
     before = state.copy()
     stiffness = np.arange(1.0, 6.0)[:, None]
-    after = row.method(lambda x, v: -stiffness * x, state, 0.1)
+    after = row.method(lambda x, v, t: -stiffness * x, state, 0.1)
     np.testing.assert_array_equal(state.x, before.x)
     np.testing.assert_array_equal(state.v, before.v)
     np.testing.assert_array_equal(after.tick, 1)
     for b, i in ((0, 0), (1, 3)):
         one = blank(1, 1, 3, 0, 0.1)
         one.x[:, 0, 0], one.v[:, 0, 0] = before.x[:, b, i], before.v[:, b, i]
-        alone = row.method(lambda x, v, k=i + 1.0: -k * x, one, 0.1)
+        alone = row.method(lambda x, v, t, k=i + 1.0: -k * x, one, 0.1)
         np.testing.assert_array_equal(alone.pos[0, 0], after.pos[b, i])
 
 
@@ -271,7 +271,7 @@ def test_a_law_never_knows_which_method_integrates_it(row: IntegratorRow) -> Non
     """A force of nothing is a straight line for all of them; a constant one is a parabola, to their order."""
     state = at_start(blank(1, 1, 2, 0, 0.25))
     for _ in range(8):
-        state = row.method(lambda x, v: 0 * x, state, 0.25)
+        state = row.method(lambda x, v, t: 0 * x, state, 0.25)
     np.testing.assert_allclose(state.pos, X0 + 2 * V0, rtol=4e-15)  # RK4 rounds four times per step
     np.testing.assert_array_equal(state.vel, V0)
 
@@ -280,7 +280,7 @@ def test_stage_arrays_are_as_many_as_are_used() -> None:
     """With fewer than it declares a method would write into another's scratch: a guard behind them stays untouched."""
     for row in INTEGRATORS:
         stages = np.full((row.method.stages + 2, 6), 7.0)
-        row.method.advance().py_func(spring, (), np.ones(6), np.ones(6), 0.1, stages, 0, 6)
+        row.method.advance().py_func(spring, (), np.ones(6), np.ones(6), (), 0.0, 0.1, stages, 0, 6)
         assert (stages[row.method.stages :] == 7).all()
 
 
@@ -290,14 +290,14 @@ def test_of_a_team_each_writes_his_own_part_alone(row: IntegratorRow) -> None:
     rng = np.random.default_rng(0)
     start = (*rng.normal(size=(2, 12)), np.full((row.method.stages, 12), 7.0))
     together, apart = [array.copy() for array in start], [array.copy() for array in start]
-    row.method.advance().py_func(spring, (), *together[:2], 0.1, together[2], 0, 12)
+    row.method.advance().py_func(spring, (), *together[:2], (), 0.0, 0.1, together[2], 0, 12)
     for first, end in ((0, 5), (5, 5), (5, 12)):
 
-        def law(context: Any, pos: Array, vel: Array, out: Array, mine: slice = slice(first, end)) -> None:
+        def law(context: Any, pos: Array, vel: Array, time: float, out: Array, mine: slice = slice(first, end)) -> None:
             out[mine] = -pos[mine]
 
         mine = [array.copy() for array in start]
-        row.method.advance().py_func(law, (), *mine[:2], 0.1, mine[2], first, end)
+        row.method.advance().py_func(law, (), *mine[:2], (), 0.0, 0.1, mine[2], first, end)
         for before, after, whole in zip(start, mine, apart, strict=True):
             np.testing.assert_array_equal(
                 np.delete(after, slice(first, end), -1), np.delete(before, slice(first, end), -1)

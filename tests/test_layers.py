@@ -15,7 +15,7 @@ import pytest
 ROOT = Path(__file__).resolve().parent.parent
 
 LAYERS = (
-    {"refusals", "outputs", "recycle", "crew", "compilation", "inlining"},
+    {"divergence", "refusals", "outputs", "recycle", "crew", "compilation", "inlining"},
     {"records", "vec", "noise", "kernels"},
     {"state", "space", "steering", "arbitration"},
     {"neighbours", "shapes", "rows"},

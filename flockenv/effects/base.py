@@ -3,8 +3,14 @@
 An effect is of one or more of three forms, each a law for one agent:
 
 * `own_law(p, me) -> force`: by itself (drag, gravity, a field);
+* `medium_law(p, me) -> velocity` of the medium where it is: all of them sum up to `me.medium` of the other laws of one
+  agent; and `flow_law(p, me) -> velocity` with which the medium carries it, beside its own velocity;
 * `pair_law(p, me, other) -> sums`, `finish_law(p, me, sums) -> force`: what one neighbour adds to K running sums, and
   the force they make; all pair laws of a scene share one sweep;
+* `bond_law(p, me, others, numbers) -> force`: of one of the bonds that the effect's `bonds` lists, each between an
+  agent and one or more partners (springs, hinges, finite elements);
+* `kick_law(p, me, seconds, gauss) -> velocity`: added once per step, however often a method asks for forces, with one
+  standard normal number per axis (fluctuations);
 * `obstacle_start(p, me)`, `obstacle_law(p, me, other, acc) -> acc`, `obstacle_finish(p, me, acc) -> force`: a fold over
   the obstacles.
 
@@ -18,6 +24,7 @@ law names, itself or in a law that it calls, and every other field is a stand-in
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
@@ -27,7 +34,7 @@ from flockenv.kernels import Vec, law, like
 from flockenv.records import Record
 from flockenv.vec import dot
 
-__all__ = ["EFFECTS", "Effect", "Me", "Other", "Sight", "in_view", "ties"]
+__all__ = ["EFFECTS", "Bonds", "Effect", "Me", "Other", "Sight", "in_view", "ties"]
 
 EFFECTS: dict[str, type[Effect]] = {}
 """Every effect by its kind; a class registers itself when it is defined."""
@@ -45,6 +52,8 @@ class Me(NamedTuple):
     max_speed: float  # m/s
     max_force: float  # N
     tie: Vec  # a unit vector of its own, see ties(); 0 outside pair laws
+    time: float  # s, of the stage that is asked for
+    medium: Vec  # m/s, velocity of the medium here; 0 in pair laws and bonds
 
 
 class Other(NamedTuple):
@@ -64,6 +73,19 @@ class Sight(NamedTuple):
     radius: float  # m
     fov: float = 360.0  # degrees, full angle; somebody at standstill has no heading and sees all around
     nearest: int | None = None  # at most so many (and whoever is exactly as far as the last); None = all
+
+
+class Bonds(NamedTuple):
+    """Who is tied to whom: one row for each agent that a bond acts on, so that everybody gathers what acts on him."""
+
+    agent: NDArray[np.int32]  # (R,)
+    partner: NDArray[np.int32]  # (R, P)
+    number: NDArray[np.float64]  # (R, C) what a law is given: stiffness, rest length, ...
+
+    @classmethod
+    def none(cls, partners: int, numbers: int) -> Bonds:
+        """Return no bonds at all."""
+        return cls(np.zeros(0, np.int32), np.zeros((0, partners), np.int32), np.zeros((0, numbers)))
 
 
 @law
@@ -96,11 +118,19 @@ class Effect(Record):
     steering: ClassVar[bool] = False
     """True if it is something the agent wants (bounded by max_force together with its drive), False for physics."""
     own_law: ClassVar[str | None] = None
+    medium_law: ClassVar[str | None] = None
+    flow_law: ClassVar[str | None] = None
+    bond_law: ClassVar[str | None] = None
+    kick_law: ClassVar[str | None] = None
     pair_law: ClassVar[str | None] = None
     finish_law: ClassVar[str | None] = None
     obstacle_start: ClassVar[str | None] = None
     obstacle_law: ClassVar[str | None] = None
     obstacle_finish: ClassVar[str | None] = None
+    linear_drag: ClassVar[str | None] = None
+    """Name of the parameter c, kg/s, of an own_law that is -c (v - medium): a method may treat it by itself."""
+    partners: ClassVar[int] = 1
+    """How many partners a bond has beside the agent it acts on."""
     conserves_momentum: ClassVar[bool] = False
     """True if what i does to j is the opposite of what j does to i."""
 
@@ -129,14 +159,40 @@ class Effect(Record):
         """How many numbers its fold over the obstacles carries from one to the next."""
         return 0
 
-    def parameters(self) -> dict[str, float]:
-        """The numbers its laws are given, by name."""
-        return {name: float(getattr(self, name)) for name in type(self).model_fields if name != "kind"}
+    def numbers(self, dimension: int) -> int:
+        """How many numbers describe one of its bonds."""
+        return 0
+
+    def bonds(self, groups: Sequence[Any], dimension: int) -> Bonds:
+        """Return its bonds in a scene of these groups; ValueError, of one line, if they do not suit it."""
+        return Bonds.none(self.partners, self.numbers(dimension))
+
+    strengths: ClassVar[tuple[str, ...]] = ("weight",)
+    """Names of the fields that make it nothing when they are 0."""
+
+    def idle(self) -> Effect:
+        """Return the same effect, looking around in the same way and compiled the same, that does nothing."""
+        fields = type(self).model_fields
+        return self.model_copy(update={name: 0.0 for name in self.strengths if name in fields})
+
+    def check(self, scene: Any) -> None:
+        """Refuse, with a ValueError that begins with the name of a field, a scene that does not suit it."""
+
+    def parameters(self) -> dict[str, float | Vec]:
+        """The numbers and vectors its laws are given, by name."""
+        fields = {name: getattr(self, name) for name in type(self).model_fields if name != "kind"}
+        return {
+            name: tuple(map(float, value)) if isinstance(value, tuple) else float(value)
+            for name, value in fields.items()
+        }
 
     def calls_for(self) -> tuple[str, ...]:
         """What must be computed for it, in words: nothing, a neighbour query, a pass over the obstacles."""
         return tuple(
             text
-            for text, law in (("neighbour query", self.pair_law), ("obstacles", self.obstacle_law))
+            for text, law in (
+                ("neighbour query", self.pair_law), ("bonds", self.bond_law), ("obstacles", self.obstacle_law),
+                ("random numbers", self.kick_law),
+            )
             if law is not None
-        )
+        )  # fmt: skip

@@ -1,4 +1,4 @@
-"""Linear drag: the medium is at rest and takes speed away."""
+"""Linear drag: the medium takes away speed relative to it."""
 
 from __future__ import annotations
 
@@ -8,20 +8,22 @@ from pydantic import Field
 
 from flockenv.effects.base import Effect, Me
 from flockenv.kernels import Vec, law
-from flockenv.vec import scale
+from flockenv.vec import scale, sub
 
 __all__ = ["Drag"]
 
 
 @law
 def drag(p: Any, me: Me) -> Vec:
-    """F = -c v."""
-    return scale(me.vel, -p.rate)
+    """F = -c (v - u)."""
+    return scale(sub(me.vel, me.medium), -p.rate)
 
 
 class Drag(Effect):
-    """Linear drag, F = -c v: without other forces v = v0 exp(-c t / m)."""
+    """Linear drag, F = -c (v - u) in a medium that moves with u: without other forces v = v0 exp(-c t / m)."""
 
     kind: Literal["drag"] = "drag"
     rate: float = Field(ge=0, description="c, kg/s")
     own_law: ClassVar[str | None] = "drag"
+    strengths: ClassVar[tuple[str, ...]] = ("rate",)
+    linear_drag: ClassVar[str | None] = "rate"

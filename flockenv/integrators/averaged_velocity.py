@@ -6,21 +6,24 @@ from typing import Any, ClassVar, Literal
 
 import numpy as np
 
-from flockenv.integrators.base import Integrator
+from flockenv.integrators.base import Integrator, carried
 from flockenv.kernels import kernel, like
 
 __all__ = ["AveragedVelocity"]
 
 
 @kernel
-def advance(acceleration: Any, context: Any, pos: Any, vel: Any, dt: float, stages: Any, first: int, end: int) -> None:
+def advance(
+    acceleration: Any, context: Any, pos: Any, vel: Any, flow: Any, time: float, dt: float, stages: Any, first: int,
+    end: int,
+) -> None:  # fmt: skip
     """x += h (v + v')/2 with v' = v + h a: exact under a constant force."""
     a, half = stages[0], like(dt, 0.5)
-    acceleration(context, pos, vel, a)
+    acceleration(context, pos, vel, time, a)
     for i in range(np.uint64(first), np.uint64(end)):
         old = vel[i]
         vel[i] = old + dt * a[i]
-        pos[i] += dt * half * (old + vel[i])
+        pos[i] = carried(pos[i] + dt * half * (old + vel[i]), dt, flow, i)
 
 
 class AveragedVelocity(Integrator):

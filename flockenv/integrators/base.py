@@ -1,10 +1,11 @@
 """Integrator: (acceleration, state, dt) -> state. A law never knows which method integrates it.
 
-Each method is one file with `advance(acceleration, context, pos, vel, dt, stages, first, end)`: over the coordinates
-of one world in one row, in place. Of these it writes [first, end) alone, because several threads may share a world,
-each with a part of its own; `acceleration(context, pos, vel, out)` reads everybody's positions, and waits until all
-threads have come so far. Compiled, `advance` is a part of a scene's kernel; with a Python function for the acceleration
-the very same source runs in Python, which is how its order is measured.
+Each method is one file with `advance(acceleration, context, pos, vel, flow, time, dt, stages, first, end)`: over the
+coordinates of one world in one row, in place. Of these it writes [first, end) alone, because several threads may share
+a world, each with a part of its own; `acceleration(context, pos, vel, time, out)` reads everybody's positions, and
+waits until all threads have come so far. `flow` holds the velocity with which the medium carries everybody, as of the
+last acceleration; it is empty, and costs nothing, where nothing flows. Compiled, `advance` is a part of a scene's
+kernel; with Python functions for the laws the very same source runs in Python, which is how its order is measured.
 """
 
 from __future__ import annotations
@@ -14,14 +15,37 @@ from dataclasses import replace
 from typing import Any, ClassVar
 
 import numpy as np
+from numba.core import types
+from numba.extending import overload
 
+from flockenv.kernels import OPTIONS
 from flockenv.records import Record
 from flockenv.state import Floats, State
 
-__all__ = ["INTEGRATORS", "Integrator"]
+__all__ = ["INTEGRATORS", "Integrator", "carried", "damping"]
 
 INTEGRATORS: dict[str, type[Integrator]] = {}
 """Every integrator by its kind; a class registers itself when it is defined."""
+
+
+def carried(x: float, seconds: float, flow: Any, i: int) -> float:
+    """Return a coordinate x, carried for some seconds by the medium; x itself where `flow` is empty."""
+    return float(x + seconds * flow[i]) if len(flow) else x
+
+
+@overload(carried, jit_options=OPTIONS)
+def _carried(x, seconds, flow, i):  # type: ignore[no-untyped-def]  # numba compares signatures, annotations included
+    if isinstance(flow, types.BaseTuple):
+        return lambda x, seconds, flow, i: x
+    return lambda x, seconds, flow, i: x + seconds * flow[i]
+
+
+def damping(context: Any, rate: Any) -> None:
+    """Write c / m, 1/s, of every coordinate: the linear drag that a method with `splits_drag` treats by itself.
+
+    Of the context only; in a scene's kernel a function of that name, which sums the scene's own drags, takes its place.
+    """
+    rate[...] = context[0] if context else 0.0
 
 
 class Integrator(Record):
@@ -35,7 +59,13 @@ class Integrator(Record):
     stages: ClassVar[int]
     """Rows of coordinates it needs as scratch."""
     evaluations: ClassVar[int]
-    """Evaluations of the force per step."""
+    """Evaluations of the force per step; at least so many where a method chooses steps of its own."""
+    adaptive: ClassVar[bool] = False
+    """Does it choose steps of its own within dt? It looks at a whole world then, and threads do not share one."""
+    splits_drag: ClassVar[bool] = False
+    """Does it treat linear drag by itself, exactly? It is left out of the acceleration then, see `damping`."""
+    solves: ClassVar[bool] = False
+    """Does it solve equations (scipy, in Python)? `advance` then only takes over what was found."""
 
     @classmethod
     def __pydantic_init_subclass__(cls, **kwargs: Any) -> None:
@@ -49,22 +79,41 @@ class Integrator(Record):
 
         return vars(sys.modules[cls.__module__])["advance"]
 
-    def __call__(self, acceleration: Callable[[Floats, Floats], Floats], state: State, dt: float) -> State:
-        """Return the state one step later under an acceleration given as a Python function.
+    def __call__(
+        self,
+        acceleration: Callable[[Floats, Floats, float], Floats],
+        state: State,
+        dt: float,
+        flow: Callable[[Floats, float], Floats] | None = None,
+        drag: float = 0.0,
+    ) -> State:
+        """Return the state one step later under laws given as Python functions.
 
-        `acceleration(pos, vel)` takes and returns (N, D), m, m/s, m/s^2. Scenes go through Scene.step: this is Python.
+        `acceleration(pos, vel, time)` takes and returns (N, D), m, m/s, s, m/s^2; `flow(pos, time)` is the velocity of
+        a medium that carries everybody, (N, D) m/s; `drag` is c / m, 1/s, for a method that treats linear drag by
+        itself. Scenes go through Scene.step: this is Python.
         """
         if not (dt > 0 and np.isfinite(dt)):
             raise ValueError(f"dt is {dt}, must be a positive number of seconds")
         new = state.copy()
         b, n, d = state.shape
+        carrying: Any = np.zeros(d * n, state.x.dtype) if flow is not None else ()
 
-        def law(context: Any, pos: Floats, vel: Floats, out: Floats) -> None:
-            out[...] = np.asarray(acceleration(pos.reshape(d, n).T, vel.reshape(d, n).T)).T.reshape(-1)
+        def law(context: Any, pos: Floats, vel: Floats, time: float, out: Floats) -> None:
+            x, v = pos.reshape(d, n).T, vel.reshape(d, n).T
+            out[...] = np.asarray(acceleration(x, v, time)).T.reshape(-1)
+            if flow is not None:
+                carrying[...] = np.asarray(flow(x, time)).T.reshape(-1)
 
         for k in range(b):
             x, v = new.x[:, k].ravel(), new.v[:, k].ravel()
             stages = np.zeros((max(self.stages, 1), d * n), state.x.dtype)
-            self.advance().py_func(law, (), x, v, dt, stages, 0, d * n)
+            self._step(law, (drag,), x, v, carrying, float(state.time[k]), dt, stages)
             new.x[:, k], new.v[:, k] = x.reshape(d, n), v.reshape(d, n)
         return replace(new, tick=new.tick + 1)
+
+    def _step(
+        self, law: Any, context: Any, x: Floats, v: Floats, flow: Any, time: float, dt: float, stages: Floats
+    ) -> None:
+        """Advance one world by `advance`, in Python."""
+        self.advance().py_func(law, context, x, v, flow, time, dt, stages, 0, len(x))

@@ -6,19 +6,22 @@ from typing import Any, ClassVar, Literal
 
 import numpy as np
 
-from flockenv.integrators.base import Integrator
+from flockenv.integrators.base import Integrator, carried
 from flockenv.kernels import kernel
 
 __all__ = ["ExplicitEuler"]
 
 
 @kernel
-def advance(acceleration: Any, context: Any, pos: Any, vel: Any, dt: float, stages: Any, first: int, end: int) -> None:
+def advance(
+    acceleration: Any, context: Any, pos: Any, vel: Any, flow: Any, time: float, dt: float, stages: Any, first: int,
+    end: int,
+) -> None:  # fmt: skip
     """x += h v; v += h a: both from the present."""
     a = stages[0]
-    acceleration(context, pos, vel, a)
+    acceleration(context, pos, vel, time, a)
     for i in range(np.uint64(first), np.uint64(end)):
-        pos[i] += dt * vel[i]
+        pos[i] = carried(pos[i] + dt * vel[i], dt, flow, i)
         vel[i] += dt * a[i]
 
 

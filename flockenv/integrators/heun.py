@@ -6,25 +6,28 @@ from typing import Any, ClassVar, Literal
 
 import numpy as np
 
-from flockenv.integrators.base import Integrator
+from flockenv.integrators.base import Integrator, carried
 from flockenv.kernels import kernel, like
 
 __all__ = ["Heun"]
 
 
 @kernel
-def advance(acceleration: Any, context: Any, pos: Any, vel: Any, dt: float, stages: Any, first: int, end: int) -> None:
+def advance(
+    acceleration: Any, context: Any, pos: Any, vel: Any, flow: Any, time: float, dt: float, stages: Any, first: int,
+    end: int,
+) -> None:  # fmt: skip
     """The mean of the slope here and the slope where Euler would get; asked for in one place, see rk4."""
     a, x, v, half = stages[0], stages[1], stages[2], like(dt, 0.5) * dt
     for i in range(np.uint64(first), np.uint64(end)):
         x[i], v[i] = pos[i], vel[i]
-    for _ in range(2):
-        acceleration(context, x, v, a)
+    for stage in range(2):
+        acceleration(context, x, v, time if stage == 0 else time + dt, a)
         for i in range(np.uint64(first), np.uint64(end)):
             slope = v[i]
-            pos[i] += half * slope
+            pos[i] = carried(pos[i] + half * slope, half, flow, i)
             vel[i] += half * a[i]
-            x[i] += dt * slope
+            x[i] = carried(x[i] + dt * slope, dt, flow, i)
             v[i] += dt * a[i]
 
 

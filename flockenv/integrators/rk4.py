@@ -6,14 +6,17 @@ from typing import Any, ClassVar, Literal
 
 import numpy as np
 
-from flockenv.integrators.base import Integrator
-from flockenv.kernels import kernel
+from flockenv.integrators.base import Integrator, carried
+from flockenv.kernels import kernel, like
 
 __all__ = ["RK4"]
 
 
 @kernel
-def advance(acceleration: Any, context: Any, pos: Any, vel: Any, dt: float, stages: Any, first: int, end: int) -> None:
+def advance(
+    acceleration: Any, context: Any, pos: Any, vel: Any, flow: Any, time: float, dt: float, stages: Any, first: int,
+    end: int,
+) -> None:  # fmt: skip
     """Four slopes, weighted 1, 2, 2, 1, each taken at a stage that the slope before led to.
 
     The acceleration is asked for in one place, so that the whole sweep is compiled once and not four times.
@@ -24,12 +27,13 @@ def advance(acceleration: Any, context: Any, pos: Any, vel: Any, dt: float, stag
     for stage in range(4):
         weight = dt / 6 if stage == 0 or stage == 3 else dt / 3
         ahead = dt if stage == 2 else dt / 2
-        acceleration(context, x, v, a)
+        when = time + (like(dt, 0.0) if stage == 0 else (dt if stage == 3 else dt / 2))
+        acceleration(context, x, v, when, a)
         for i in range(np.uint64(first), np.uint64(end)):
             slope = v[i]
-            pos[i] += weight * slope
+            pos[i] = carried(pos[i] + weight * slope, weight, flow, i)
             vel[i] += weight * a[i]
-            x[i] = x0[i] + ahead * slope
+            x[i] = carried(x0[i] + ahead * slope, ahead, flow, i)
             v[i] = v0[i] + ahead * a[i]
 
 

@@ -6,21 +6,24 @@ from typing import Any, ClassVar, Literal
 
 import numpy as np
 
-from flockenv.integrators.base import Integrator
+from flockenv.integrators.base import Integrator, carried
 from flockenv.kernels import kernel
 
 __all__ = ["SemiImplicitEuler"]
 
 
 @kernel
-def advance(acceleration: Any, context: Any, pos: Any, vel: Any, dt: float, stages: Any, first: int, end: int) -> None:
+def advance(
+    acceleration: Any, context: Any, pos: Any, vel: Any, flow: Any, time: float, dt: float, stages: Any, first: int,
+    end: int,
+) -> None:  # fmt: skip
     """v += h a; x += h v, with the new v."""
     a = stages[0]
-    acceleration(context, pos, vel, a)
+    acceleration(context, pos, vel, time, a)
     for i in range(np.uint64(first), np.uint64(end)):
         v = vel[i] + dt * a[i]
         vel[i] = v
-        pos[i] += dt * v
+        pos[i] = carried(pos[i] + dt * v, dt, flow, i)
 
 
 class SemiImplicitEuler(Integrator):

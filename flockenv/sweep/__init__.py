@@ -9,15 +9,16 @@ constant length and constant offsets, and the compiler makes it straight vector 
 scratch array and stay in vector registers.
 
 The files, as a source is put together: `parts` says what it depends on, `text` holds the smallest pieces of it;
-`query` sorts the agents and walks their blocks, `pairs` lets a block meet its candidates; `accelerate` is the sum of
+`query` sorts the agents and walks their blocks, `pairs` lets a block meet its candidates, `bonds` its partners; `accelerate` is the sum of
 all laws, `step` advances worlds by it, `source` is the whole file; `look` is what tasks add to it.
 """
 
 from __future__ import annotations
 
+from flockenv.sweep.bonds import Table, pack
 from flockenv.sweep.look import look_source
 from flockenv.sweep.parts import SMALL_STRIDE, Look, Parts
-from flockenv.sweep.source import scene_source
+from flockenv.sweep.source import field_source, scene_source
 from flockenv.sweep.text import SHARED
 
-__all__ = ["SHARED", "SMALL_STRIDE", "Look", "Parts", "look_source", "scene_source"]
+__all__ = ["SHARED", "SMALL_STRIDE", "Look", "Parts", "Table", "field_source", "look_source", "pack", "scene_source"]

@@ -1,16 +1,17 @@
 """The acceleration of every agent of a world: what all laws say, summed and divided by mass.
 
-Pair laws come first, in one sweep (`sense`), and leave what they came to in `felt`, by agent. Then each block adds what
+Pair laws come first, in one sweep (`sense`), and leave what they came to in `felt`, by agent; bonds in `pulled`. Then each block adds what
 an agent wants or feels by itself, and a fold over the obstacles (`respond`); what it wants is bounded by max_force.
 """
 
 from __future__ import annotations
 
+from flockenv.sweep.bonds import bonds
 from flockenv.sweep.pairs import pairs
 from flockenv.sweep.parts import Parts
 from flockenv.sweep.text import CONTEXT, Slots, indented, lane, lanes_of, tuple_of
 
-__all__ = ["accelerate"]
+__all__ = ["accelerate", "damping", "parameters"]
 
 
 def accelerate(parts: Parts) -> str:
@@ -20,21 +21,22 @@ def accelerate(parts: Parts) -> str:
     return f'''
 
 @kernel
-def sense(context, pos, vel):
-    """Write what this thread's agents of one world feel from others, by the pair laws, from the frozen present."""
+def sense(context, pos, vel, time):
+    """Write what this thread's agents of one world feel from others, by pair laws and bonds, from the frozen present."""
     {CONTEXT} = context
-{indented(_parameters(parts), 4)}
+{indented(parameters(parts), 4)}
     if rank == 0:
         work[b, 0] += 1
 {indented(pairs(parts), 4)}
+{indented(bonds(parts), 4)}
 
 
 @kernel
-def respond(around, pos, vel, acc):
+def respond(around, pos, vel, time, acc):
     """Acceleration of the agents of some of this thread's blocks, m/s^2, once all is sensed."""
     context, first_, end_ = around
     {CONTEXT} = context
-{indented(_parameters(parts), 4)}
+{indented(parameters(parts), 4)}
     for block in range(np.uint64(first_), np.uint64(end_)):
         base, row = block * np.uint64({d * parts.width}), block * np.uint64({parts.width})
 {indented(_obstacles(parts, me), 8)}
@@ -42,23 +44,48 @@ def respond(around, pos, vel, acc):
 {indented(me, 12)}
             o = zero(x)
             s, f = {lanes_of(parts, "want")}, o
+{indented(_medium(parts), 12)}
 {indented(_own(parts), 12)}
 {indented(_felt(parts), 12)}
             s = limit(s, max_force[i])
-            # a choice, not a factor of 0: a law may be infinite where the dead and the lanes beyond the last agent lie
-            here, share = living[i] > o[0], like(o[0], 1.0) / mass[i]
+            # a choice, not a factor of 0: a law may be infinite where the dead, what is held in place (by an infinite
+            # mass) and the lanes beyond the last agent lie
+            here, share = (living[i] > o[0]) & (mass[i] < like(o[0], np.inf)), like(o[0], 1.0) / mass[i]
 {indented([f"{lane(parts, 'acc', k)} = (s[{k}] + f[{k}]) * share if here else o[{k}]" for k in range(d)], 12)}
+{indented(_carry(parts), 12)}
 
 
 @kernel
-def accelerate(around, pos, vel, acc):
+def accelerate(around, pos, vel, time, acc):
     """Sense and respond."""
-    sense(around[0], pos, vel)
-    respond(around, pos, vel, acc)
+    sense(around[0], pos, vel, time)
+    respond(around, pos, vel, time, acc)
 '''
 
 
-def _parameters(parts: Parts) -> list[str]:
+def damping(parts: Parts) -> str:
+    """Return the source of `damping`, for a method that treats linear drag by itself; nothing for others."""
+    if not parts.integrator.splits_drag:
+        return ""
+    rates = [f"p{k}.{e.linear_drag}" for k, e in enumerate(parts.effects) if e.linear_drag]
+    d = parts.dimension
+    return f'''
+
+@kernel
+def damping(around, rate):
+    """The sum of all linear drags of every coordinate, 1/s."""
+    context, first_, end_ = around
+    {CONTEXT} = context
+{indented(parameters(parts), 4)}
+    for block in range(np.uint64(first_), np.uint64(end_)):
+        base, row = block * np.uint64({d * parts.width}), block * np.uint64({parts.width})
+        for l in range(np.uint64({parts.width})):
+            c = {" + ".join(rates) or "like(mass[0], 0.0)"}
+{indented([f"{lane(parts, 'rate', k)} = c / mass[row + l]" for k in range(d)], 12)}
+'''
+
+
+def parameters(parts: Parts) -> list[str]:
     """Write how the numbers are read, in the order of `Parts.parameters`."""
     d = parts.dimension
     lines = [f"size = {tuple_of('params[#]', d)}", f"reach = params[{d}]"]
@@ -67,16 +94,43 @@ def _parameters(parts: Parts) -> list[str]:
         lines.append(f"within{q}, view{q} = params[{at}], params[{at + 1}]")
         at += 2
     for k, effect in enumerate(parts.effects):
-        count = len(effect.parameters())
-        values = ", ".join(f"params[{at + j}]" for j in range(count)) or "params[0]"
-        lines.append(f"p{k} = P{k}({values})")
-        at += count
+        values = []
+        for value in effect.parameters().values():
+            count = len(value) if isinstance(value, tuple) else 1
+            each = ", ".join(f"params[{at + j}]" for j in range(count))
+            values.append(f"({each},)" if isinstance(value, tuple) else each)
+            at += count
+        lines.append(f"p{k} = P{k}({', '.join(values) or 'params[0]'})")
     return lines
 
 
 def _me_alone() -> str:
     """Write agent i as the laws of one agent see it: no tie, there is nobody to part from."""
-    return "me = Me(ident[i], x, v, unit(v), mass[i], radius[i], max_speed[i], max_force[i], zero(x))"
+    return "me = Me(ident[i], x, v, unit(v), mass[i], radius[i], max_speed[i], max_force[i], zero(x), time, zero(x))"
+
+
+def _medium(parts: Parts) -> list[str]:
+    """Write how fast the medium is where agent i is, if any effect says so."""
+    media = [f"m = add(m, medium_law_{k}(p{k}, me))" for k, e in enumerate(parts.effects) if e.medium_law]
+    if not media:
+        return []
+    return [
+        "m = o",
+        *media,
+        "me = Me(ident[i], x, v, me.heading, mass[i], radius[i], max_speed[i], max_force[i], o, time, m)",
+    ]
+
+
+def _carry(parts: Parts) -> list[str]:
+    """Write with which velocity the medium carries agent i, if it does."""
+    if not parts.flows:
+        return []
+    laws = [f"u = add(u, flow_law_{k}(p{k}, me))" for k, e in enumerate(parts.effects) if e.flow_law]
+    return [
+        "u = o",
+        *laws,
+        *(f"{lane(parts, 'carrying', k)} = u[{k}] if here else o[{k}]" for k in range(parts.dimension)),
+    ]
 
 
 def _own(parts: Parts) -> list[str]:
@@ -85,7 +139,12 @@ def _own(parts: Parts) -> list[str]:
     for k, effect in enumerate(parts.effects):
         to = "s" if effect.steering else "f"
         if effect.own_law is not None:
-            lines.append(f"{to} = add({to}, own_law_{k}(p{k}, me))")
+            still = effect.linear_drag is not None and parts.integrator.splits_drag
+            if still:  # what is left of -c (v - u): the method adds -c v
+                lines.append(
+                    "rest = Me(ident[i], x, o, o, mass[i], radius[i], max_speed[i], max_force[i], o, time, me.medium)"
+                )
+            lines.append(f"{to} = add({to}, own_law_{k}(p{k}, {'rest' if still else 'me'}))")
         if effect.obstacle_law is not None:
             lines.append(f"{to} = add({to}, obstacle_finish_{k}(p{k}, me, ({', '.join(slot.all(f'o{k}_'))},)))")
     return lines
@@ -98,6 +157,8 @@ def _felt(parts: Parts) -> list[str]:
     for t, name in enumerate(parts.targets):
         places = [f"felt[row * np.uint64({each}) + np.uint64({(d * t + k) * parts.width}) + l]" for k in range(d)]
         lines.append(f"{name} = add({name}, ({', '.join(places)},))")
+    if parts.bonded:
+        lines.append(f"f = add(f, {lanes_of(parts, 'pulled')})")
     return lines
 
 

@@ -73,6 +73,16 @@ class Parts:
         return [(k, e) for k, e in enumerate(self.effects) if e.pair_law is not None]
 
     @functools.cached_property
+    def bonded(self) -> list[tuple[int, Effect]]:
+        """The effects with a law of bonds, and their numbers."""
+        return [(k, e) for k, e in enumerate(self.effects) if e.bond_law is not None]
+
+    @property
+    def flows(self) -> bool:
+        """Does a medium carry anybody?"""
+        return any(e.flow_law is not None for e in self.effects)
+
+    @functools.cached_property
     def sights(self) -> list[Sight]:
         """The different ways in which pair laws look around; laws that see the same share the test."""
         return list(dict.fromkeys(sight_of(e) for _, e in self.pairs))
@@ -88,7 +98,8 @@ class Parts:
         for sight in self.sights:
             values += [sight.radius**2, view_of(sight.fov)]
         for effect in self.effects:
-            values.extend(effect.parameters().values())
+            for value in effect.parameters().values():
+                values.extend(value if isinstance(value, tuple) else (value,))
         return values + ([self.look.radius, self.look.radius**2] if self.look else [])
 
     @property
@@ -139,7 +150,7 @@ class Parts:
     @property
     def arranges(self) -> bool:
         """May agents of a large world be put in order for a while?"""
-        return self.sorts and bool(self.pairs)
+        return self.sorts and bool(self.pairs) and not self.bonded  # bonds know their partners by place
 
     @property
     def luggage(self) -> list[str]:
@@ -160,7 +171,7 @@ class Parts:
         runs = [(f"c{k}_", e.sums(d)) for k, e in self.pairs]
         runs += [(f"near{q}_", sight.nearest or 0) for q, sight in enumerate(self.sights)]
         runs += [(f"o{k}_", e.folded(d) if e.obstacle_law else 0) for k, e in enumerate(self.effects)]
-        runs += [(f"g{name}", d) for name in self.targets]
+        runs += [(f"g{name}", d) for name in self.targets] + [("bond", d if self.bonded else 0)]
         runs += [("square", look.agents), ("place", look.agents), ("gap", look.obstacles), ("which", look.obstacles)]
         names = [f"{name}{j}" for name, many in runs for j in range(many)]
         return {name: place for place, name in enumerate([*names, "bad"])}

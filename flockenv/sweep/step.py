@@ -6,6 +6,7 @@ world together, each the agents of its own blocks.
 
 from __future__ import annotations
 
+from flockenv.sweep.accelerate import parameters
 from flockenv.sweep.arrange import go_home, move_in
 from flockenv.sweep.parts import Parts
 from flockenv.sweep.text import CONTEXT, SHARED, Slots, copied, indented, indented_lines, lane, lanes_of, tuple_of
@@ -53,9 +54,12 @@ def step_world(parts: Parts) -> str:
     bad = Slots(parts)("bad")
     return f'''@kernel
 def step_world(
-    x_, v_, alive, obstacle_x, obstacle_radius, work, params, dt, count, b, rank, team, {SHARED},
+    x_, v_, alive, tick, key, obstacle_x, obstacle_radius, work, params, dt, count, b, rank, team, {SHARED},
 ):
-    """Advance this thread's part of world b by `count` steps; return its first agent that is not finite, or -1."""
+    """Advance this thread's part of world b by `count` steps; return the first agent that is not finite, or -1.
+
+    A world in which somebody is not stays as it was, whole.
+    """
     n = x_.shape[2]
     blocks = (n + {parts.width - 1}) // {parts.width}
     first, end = blocks * rank // team, blocks * (rank + 1) // team
@@ -72,18 +76,28 @@ def step_world(
     for i in range(np.uint64(first * {d * parts.width}), np.uint64(end * {d * parts.width})):
         origin[i] = pos[i]
     context = ({CONTEXT})
-    far = like(dt, np.inf)
+    far, begun = like(dt, np.inf), tick[b]
+{indented(_kick_parameters(parts), 4)}
     for l in range(np.uint64({parts.width})):
         {bad} = far
-    for _ in range(count):
+    for step_ in range(count):
+        time = like(dt, (begun + step_) * np.float64(dt))
 {indented(_advance(parts), 8)}
 {indented(go_home(parts), 4)}
-    out_of_blocks(pos, x_, b, n, first, end)
-    out_of_blocks(vel, v_, b, n, first, end)
     worst = far
     for l in range(np.uint64({parts.width})):
         worst = min(worst, {bad})
-    return np.int64(worst) if worst < far else -1
+    tally[rank] = np.int64(worst) if worst < far else n
+    wait_for_team(sync, team)
+    first_bad = n
+    for r in range(team):
+        first_bad = min(first_bad, tally[r])
+    wait_for_team(sync, team)  # before anybody counts again
+    if first_bad < n:
+        return first_bad
+    out_of_blocks(pos, x_, b, n, first, end)
+    out_of_blocks(vel, v_, b, n, first, end)
+    return -1
 '''
 
 
@@ -107,15 +121,15 @@ def _advance(parts: Parts) -> list[str]:
     A method that asks for accelerations once runs through them part after part, each of which stays in the cache from
     what it feels to where it comes: after `sense`, nobody reads what others write.
     """
-    size = parts.dimension * parts.width
-    if parts.integrator.evaluations > 1:
-        advance = f"advance((context, first, end), pos, vel, dt, stages, first * {size}, end * {size})"
+    size, flow = parts.dimension * parts.width, "carrying" if parts.flows else "()"
+    if parts.integrator.evaluations != 1:
+        advance = f"advance((context, first, end), pos, vel, {flow}, time, dt, stages, first * {size}, end * {size})"
         return [advance, *_bound(parts, "first", "end")]
     return [
-        "sense(context, pos, vel)",
+        "sense(context, pos, vel, time)",
         f"for begin in range(first, end, {PART}):",
         f"    until = min(begin + {PART}, end)",
-        f"    advance((context, begin, until), pos, vel, dt, stages, begin * {size}, until * {size})",
+        f"    advance((context, begin, until), pos, vel, {flow}, time, dt, stages, begin * {size}, until * {size})",
         *indented_lines(_bound(parts, "begin", "until"), 4),
     ]
 
@@ -130,6 +144,7 @@ def _bound(parts: Parts, first: str, end: str) -> list[str]:
         f"    for l in range(np.uint64({parts.width})):",
         "        i = row + l",
         f"        was, x, v = {lanes_of(parts, 'origin')}, {lanes_of(parts, 'pos')}, {lanes_of(parts, 'vel')}",
+        *indented_lines(_kick(parts), 8),
         "        where = far if finite(dot(x, x) + dot(v, v)) else ident[i]",
         f"        {bad} = where if where < {bad} else {bad}",
         "        # nobody moves faster than max_speed, whatever a method makes of the velocity within the step",
@@ -142,14 +157,38 @@ def _bound(parts: Parts, first: str, end: str) -> list[str]:
     ]
 
 
+def _kick_parameters(parts: Parts) -> list[str]:
+    """Write how the numbers are read where laws kick."""
+    return parameters(parts) if any(e.kick_law for e in parts.effects) else []
+
+
+def _kick(parts: Parts) -> list[str]:
+    """Write what is added to the velocity of agent i once per step: random numbers of (world, step, agent, effect)."""
+    lines = []
+    for k, effect in enumerate(parts.effects):
+        if effect.kick_law is None:
+            continue
+        gauss = ", ".join(
+            f"like(dt, normal(key[b], begun + step_, np.int64(ident[i]), {8 * k + j}))" for j in range(parts.dimension)
+        )
+        lines += [
+            f"says = kick_law_{k}(p{k}, me, dt, ({gauss},))",
+            "free = (living[i] > like(dt, 0.0)) & (mass[i] < like(dt, np.inf))",
+            "kick = (" + ", ".join(f"says[{j}] if free else like(dt, 0.0)" for j in range(parts.dimension)) + ",)",
+            "x, v = add(x, scale(kick, like(dt, 0.5) * dt)), add(v, kick)  # as if it came in the middle of the step",
+        ]
+    me = "me = Me(ident[i], x, v, unit(v), mass[i], radius[i], max_speed[i], max_force[i], zero(x), time, zero(x))"
+    return [me, *lines] if lines else []
+
+
 def step(parts: Parts) -> str:
     """Return the source of `step`, the entry point: some worlds, one after another."""
     d = parts.dimension
     return f'''
 @njit(cache=True, **FAST)
 def step(
-    x, v, alive, tick, obstacle_x, obstacle_radius, work, drive, params, dt, count, from_world, to_world, rank, team,
-    {SHARED},
+    x, v, alive, tick, key, obstacle_x, obstacle_radius, work, drive, params, dt, count, from_world, to_world, rank,
+    team, {SHARED},
 ):
     """Advance worlds [from_world, to_world) by `count` steps; return (world, agent) not finite first, or -1s.
 
@@ -167,9 +206,9 @@ def step(
         else:
             want[first * {d * parts.width} : end * {d * parts.width}] = 0
         bad = step_world(
-            x, v, alive, obstacle_x, obstacle_radius, work, params, dt, count, b, rank, team, {SHARED},
+            x, v, alive, tick, key, obstacle_x, obstacle_radius, work, params, dt, count, b, rank, team, {SHARED},
         )
-        if rank == 0:
+        if rank == 0 and bad < 0:
             tick[b] += count
         if bad >= 0 and broken < 0:
             broken, who = b, bad

@@ -255,7 +255,7 @@ def play(
             drive(p, {now}, action, force[:, 0])
             into_blocks(want, force, 0, n, 0, blocks)
             bad = step_world(
-                x, v, alive, obstacle_x, obstacle_radius, work, params, dt, count, b, 0, 1, {SHARED},
+                x, v, alive, tick, key, obstacle_x, obstacle_radius, work, params, dt, count, b, 0, 1, {SHARED},
             )
             if bad >= 0 and broken < 0:
                 broken, who = b, bad

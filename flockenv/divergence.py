@@ -1,0 +1,27 @@
+"""What a simulation says when it diverges: which world, whom, when, and which effect drove it there."""
+
+from __future__ import annotations
+
+__all__ = ["SimulationDiverged"]
+
+
+class SimulationDiverged(FloatingPointError):
+    """A position or velocity is no longer finite; the worlds that stayed finite have made all their steps.
+
+    The world that did not is as it was before the call, and everything else is told here.
+    """
+
+    def __init__(
+        self, world: int, agent: int, step: int, time: float, effect: str | None, dt: float, method: str
+    ) -> None:
+        """world, agent, step (since the start): where; time: s; effect: what accelerated it most, none = not known."""
+        self.world, self.agent, self.step, self.time, self.effect = world, agent, step, time, effect
+        self.dt, self.method = dt, method
+        super().__init__(world, agent, step, time, effect, dt, method)  # so that it can be pickled
+
+    def __str__(self) -> str:
+        by = f", accelerated by {self.effect}" if self.effect else ""
+        return (
+            f"world {self.world}, agent {self.agent}: position or velocity is not finite after step {self.step}, "
+            f"t = {self.time:g} s{by}; dt = {self.dt:g} s may be too large for {self.method}"
+        )
