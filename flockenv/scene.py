@@ -26,7 +26,9 @@ from flockenv.crew import share, threads
 from flockenv.divergence import SimulationDiverged
 from flockenv.effects import EFFECTS, Effect
 from flockenv.effects.base import ties
+from flockenv.implicit import coupling_of, solve_steps
 from flockenv.integrators import INTEGRATORS, Integrator, SemiImplicitEuler
+from flockenv.integrators.newton import Coupling
 from flockenv.kernels import LINE, entry, load
 from flockenv.neighbours import FEWEST_AGENTS, MAX_RANGES, WORTH_ARRANGING
 from flockenv.noise import MASK, key_of
@@ -43,7 +45,7 @@ __all__ = ["Group", "Scene", "Workspace"]
 WORTH_SHARING = 4096
 """Agent-steps below which a second thread costs more than it brings: handing work over takes about 20 us."""
 
-SYNC = SHARED.split(", ").index("sync")
+SYNC, STAGES = SHARED.split(", ").index("sync"), SHARED.split(", ").index("stages")
 
 EXACT = 2**24
 """Whole numbers, and so numbers of agents, that float32 tells apart."""
@@ -291,6 +293,11 @@ class Scene(Record):
         return pack(self.parts, self.agents, self.groups)
 
     @functools.cached_property
+    def coupling(self) -> Coupling | None:
+        """Who depends on whom, for methods that solve equations; none if that changes from step to step."""
+        return coupling_of(self)
+
+    @functools.cached_property
     def _params(self) -> Floats:
         return np.array(self.parts.parameters(), self.dtype)
 
@@ -404,6 +411,23 @@ class Scene(Record):
         worlds, agents, _ = state.shape
         if steps == 0:
             return -1, -1
+        if self.integrator.solves:
+            return solve_steps(self, state, drive, steps, self._take_over)
+        return self._stepped(state, drive, steps)
+
+    def _take_over(self, state: State, world: int, x: Floats, v: Floats) -> tuple[int, int]:
+        """Let the kernel end a step whose positions and velocities, (D, N), were solved: limits, space, finite, time."""
+        width, (_, n) = self.parts.width, x.shape
+        stages = self._workspaces(1, 1)[0].shared[STAGES]
+        for row, solved in zip(stages, (x, v), strict=True):
+            padded = np.zeros((self.dimension, -(-n // width) * width), self.dtype)
+            padded[:, :n] = solved
+            row[:] = padded.reshape(self.dimension, -1, width).transpose(1, 0, 2).ravel()
+        return self._stepped(state, np.zeros((self.dimension, 0, 0), self.dtype), 1)
+
+    def _stepped(self, state: State, drive: Floats, steps: int) -> tuple[int, int]:
+        """Step in place by the kernel alone."""
+        worlds, agents, _ = state.shape
         crew = threads() if worlds * agents * steps >= WORTH_SHARING else 1
         team = crew if worlds < crew and agents >= WORTH_SHARING and not self.integrator.adaptive else 1
         crew = crew if team > 1 else min(crew, worlds)
@@ -432,6 +456,11 @@ class Scene(Record):
             raise ValueError(
                 f"the state holds (N, D) = {state.shape[1:]} of {state.x.dtype}, "
                 f"but this scene has {expected[:2]} of {expected[2]}"
+            )
+        if state.dt != self.dt:
+            raise ValueError(
+                f"the state counts steps of {state.dt:g} s, but this scene makes steps of {self.dt:g} s; "
+                "state.with_dt(scene.dt) changes its clock"
             )
         _demand_whole("steps", steps, 0)
 

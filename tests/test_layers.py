@@ -20,7 +20,7 @@ LAYERS = (
     {"state", "space", "steering", "arbitration"},
     {"neighbours", "shapes", "rows"},
     {"effects", "integrators", "collisions", "population", "spawn", "sweep"},
-    {"snapshot", "scene", "config", "measures", "explanation"},
+    {"snapshot", "implicit", "scene", "config", "measures", "explanation"},
     {"tasks", "world", "policy"},
     {"envs", "sb3", "evaluation", "accuracy", "render", "trajectory"},
     {"cli"},

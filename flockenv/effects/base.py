@@ -122,6 +122,7 @@ class Effect(Record):
     flow_law: ClassVar[str | None] = None
     bond_law: ClassVar[str | None] = None
     kick_law: ClassVar[str | None] = None
+    far_law: ClassVar[str | None] = None
     pair_law: ClassVar[str | None] = None
     finish_law: ClassVar[str | None] = None
     obstacle_start: ClassVar[str | None] = None

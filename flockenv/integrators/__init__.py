@@ -13,12 +13,15 @@ for _module in pkgutil.iter_modules(__path__):
 from flockenv.integrators.averaged_velocity import AveragedVelocity  # noqa: E402  # after the folder has been walked
 from flockenv.integrators.explicit_euler import ExplicitEuler  # noqa: E402
 from flockenv.integrators.heun import Heun  # noqa: E402
+from flockenv.integrators.implicit import Implicit  # noqa: E402
+from flockenv.integrators.implicit_euler import ImplicitEuler  # noqa: E402
+from flockenv.integrators.implicit_midpoint import ImplicitMidpoint  # noqa: E402
 from flockenv.integrators.midpoint import Midpoint  # noqa: E402
 from flockenv.integrators.rk4 import RK4  # noqa: E402
 from flockenv.integrators.semi_implicit_euler import SemiImplicitEuler  # noqa: E402
 from flockenv.integrators.velocity_verlet import VelocityVerlet  # noqa: E402
 
 __all__ = [
-    "INTEGRATORS", "RK4", "AveragedVelocity", "ExplicitEuler", "Heun", "Integrator", "Midpoint", "SemiImplicitEuler",
+    "INTEGRATORS", "RK4", "AveragedVelocity", "ExplicitEuler", "Heun", "Implicit", "ImplicitEuler", "ImplicitMidpoint", "Integrator", "Midpoint", "SemiImplicitEuler",
     "VelocityVerlet",
 ]  # fmt: skip

@@ -70,7 +70,9 @@ class Integrator(Record):
     @classmethod
     def __pydantic_init_subclass__(cls, **kwargs: Any) -> None:
         """Register the class under its kind."""
-        INTEGRATORS[cls.model_fields["kind"].default] = cls
+        kind = cls.model_fields["kind"].default
+        if isinstance(kind, str):
+            INTEGRATORS[kind] = cls
 
     @classmethod
     def advance(cls) -> Any:
