@@ -82,6 +82,13 @@ def _demand_whole(name: str, value: object, least: int, most: int | None = None)
         raise ValueError(f"{name} is {value!r}, must be a whole number {allowed}")
 
 
+def _demand_one_piece(out: State) -> None:
+    """Refuse positions and velocities that a kernel cannot write: it counts places from the first."""
+    for name, array in (("x", out.x), ("v", out.v)):
+        if not array.flags.c_contiguous:
+            raise ValueError(f"out.{name} does not lie in one piece (its strides are {array.strides}); use copy()")
+
+
 class Group(Record):
     """Some agents of a kind."""
 
@@ -320,14 +327,14 @@ class Scene(Record):
         Raises FloatingPointError, naming world and agent, if a position or velocity is no longer finite.
         """
         self._check(state, steps)
+        forces = self._drive(drive, state)
         if out is None:
             out = state.copy()
-        elif out is not state:
-            out.copy_from(state)
-        for name, array in (("x", out.x), ("v", out.v)):
-            if not array.flags.c_contiguous:
-                raise ValueError(f"out.{name} does not lie in one piece (its strides are {array.strides}); use copy()")
-        world, agent = self._advance(out, self._drive(drive, state), steps)
+        else:
+            _demand_one_piece(out)
+            if out is not state:
+                out.copy_from(state)
+        world, agent = self._advance(out, forces, steps)
         if world >= 0:
             raise FloatingPointError(
                 f"world {world}, agent {agent}: position or velocity is not finite at t = {out.time[world]:g} s; "
