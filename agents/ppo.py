@@ -11,6 +11,8 @@ import json
 import os
 import platform
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from importlib.metadata import version
 from pathlib import Path
@@ -26,14 +28,14 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import VecEnvWrapper
 
 from agents.experiment import WEIGHTS, Experiment, PpoSettings, load_experiment
-from flockenv.crew import use_threads
+from flockenv.crew import threads, use_threads
 from flockenv.evaluation import rollout, worlds_for
 from flockenv.policy import MlpPolicy, save_policy
 from flockenv.sb3 import WorldVecEnv
 from flockenv.tasks import Task
 from flockenv.world import World
 
-__all__ = ["app", "tensors_of", "train"]
+__all__ = ["app", "on_threads", "tensors_of", "train"]
 
 app = typer.Typer(add_completion=False, rich_markup_mode=None, pretty_exceptions_enable=False)
 console = Console(stderr=True)
@@ -90,11 +92,22 @@ def tensors_of(model: PPO) -> dict[str, np.ndarray]:
     return {name: tensor.copy() for name, tensor in out.items()}
 
 
+@contextmanager
+def on_threads(count: int) -> Iterator[None]:
+    """Let torch and the worlds use so many threads; afterwards each uses as many as before."""
+    before = torch.get_num_threads(), threads()
+    torch.set_num_threads(count)
+    use_threads(count)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before[0])
+        use_threads(before[1])
+
+
 def build(task: Task, p: PpoSettings, tensorboard: str | None) -> PPO:
-    """Make the worlds and the model."""
-    torch.set_num_threads(p.threads)
+    """Make the worlds and the model; how many threads they use is for `on_threads` to say."""
     torch.manual_seed(p.seed)
-    use_threads(p.threads)
     learned = task.model_copy(update={"dtype": p.dtype})
     worlds = ForLearning(WorldVecEnv(learned, p.worlds), p.reward_scale, p.stagger)
     model = PPO(
@@ -201,7 +214,7 @@ def train(experiment: Experiment, folder: Path, go_on: bool = False, tensorboard
         TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TimeRemainingColumn(),
         TextColumn("{task.fields[score]}"),
     )  # fmt: skip
-    with Progress(*columns, console=console) as progress:
+    with on_threads(p.threads), Progress(*columns, console=console) as progress:
         watch = Watch(task, p, run, folder, progress)
         try:
             model.learn(p.steps - run.steps, callback=watch, reset_num_timesteps=run.steps == 0, log_interval=None)

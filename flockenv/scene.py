@@ -86,6 +86,13 @@ def _demand_whole(name: str, value: object, least: int, most: int | None = None)
         raise ValueError(f"{name} is {value!r}, must be a whole number {allowed}")
 
 
+def _demand_one_piece(out: State) -> None:
+    """Refuse positions and velocities that a kernel cannot write: it counts places from the first."""
+    for name, array in (("x", out.x), ("v", out.v)):
+        if not array.flags.c_contiguous:
+            raise ValueError(f"out.{name} does not lie in one piece (its strides are {array.strides}); use copy()")
+
+
 class Group(Record):
     """Some agents of a kind."""
 
@@ -344,17 +351,16 @@ class Scene(Record):
         that world is left as it was, the others have made their steps.
         """
         self._check(state, steps)
+        forces = self._drive(drive, state)
         if out is None:
             out = state.copy()
-        elif out is not state:
-            out.copy_from(state)
-        for name, array in (("x", out.x), ("v", out.v)):
-            if not array.flags.c_contiguous:
-                raise ValueError(f"out.{name} does not lie in one piece (its strides are {array.strides}); use copy()")
-        given = self._drive(drive, state)
-        world, agent = self._advance(out, given, steps)
+        else:
+            _demand_one_piece(out)
+            if out is not state:
+                out.copy_from(state)
+        world, agent = self._advance(out, forces, steps)
         if world >= 0:
-            raise self._diverged(out, given, world, agent, steps)
+            raise self._diverged(out, forces, world, agent, steps)
         return out
 
     def _diverged(self, state: State, drive: Floats, world: int, agent: int, steps: int) -> SimulationDiverged:
@@ -367,7 +373,9 @@ class Scene(Record):
         agent = bad[1] if done < steps else agent
         last, time = int(alone.tick[0]) + 1, (int(alone.tick[0]) + 1) * self.dt
         effect = self._blamed(alone, agent)
-        return SimulationDiverged(world, agent, last, time, effect, self.dt, self.integrator.kind)
+        error = SimulationDiverged(world, agent, last, time, effect, self.dt, self.integrator.kind)
+        error.state = state
+        return error
 
     def _blamed(self, state: State, agent: int) -> str | None:
         """Return the kind of the effect that accelerates an agent most, or to no number at all."""

@@ -12,6 +12,7 @@ import yaml
 from agents import tune
 from agents.experiment import CONFIGS, WEIGHTS, Experiment, PpoSettings, load_experiment
 from agents.reynolds import RULES, player, tuned
+from flockenv.crew import threads
 from flockenv.evaluation import compare, rollout, worlds_for
 from flockenv.policy import MlpPolicy, RandomPolicy
 from flockenv.tasks import TASKS
@@ -107,6 +108,25 @@ def test_training_is_repeatable_resumes_and_exports(tmp_path: Path) -> None:
     ppo.export(longer, run, tmp_path / "p.safetensors")
     policy = MlpPolicy.load(tmp_path / "p.safetensors", longer.build())
     assert policy.observation_size == longer.build().layout.size
+
+
+def test_training_leaves_the_number_of_threads_as_it_was(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    import torch
+
+    from agents import ppo
+
+    inside = []
+
+    def interrupted(*_: object) -> None:
+        inside.append((torch.get_num_threads(), threads()))
+        raise KeyboardInterrupt
+
+    before = torch.get_num_threads(), threads()
+    monkeypatch.setattr(ppo, "checkpoint", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        ppo.train(Experiment(task="pursuit", ppo={**TINY, "threads": 3}), tmp_path)
+    assert inside[0] == (3, 3)
+    assert (torch.get_num_threads(), threads()) == before
 
 
 def test_bad_settings_are_one_line(tmp_path: Path) -> None:
