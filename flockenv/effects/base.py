@@ -34,7 +34,7 @@ from flockenv.kernels import Vec, law, like
 from flockenv.records import Record
 from flockenv.vec import dot
 
-__all__ = ["EFFECTS", "Bonds", "Effect", "Me", "Other", "Sight", "in_view", "ties"]
+__all__ = ["EFFECTS", "Bonds", "Effect", "Me", "Other", "Sight", "all_masses", "in_view", "network_of", "ties"]
 
 EFFECTS: dict[str, type[Effect]] = {}
 """Every effect by its kind; a class registers itself when it is defined."""
@@ -111,6 +111,21 @@ def ties(count: int, dimension: int) -> NDArray[np.float64]:
     return np.stack([ring * np.cos(turn), ring * np.sin(turn), height][:dimension], axis=1)
 
 
+def all_masses(groups: Sequence[Any], dimension: int) -> NDArray[np.float64]:
+    """Return the masses of all agents of some groups, (N,) kg; infinite where one is held in place."""
+    return np.concatenate([group.masses(dimension) for group in groups])
+
+
+def network_of(groups: Sequence[Any], which: int, dimension: int) -> tuple[int, Any, NDArray[np.float64]]:
+    """Return the first agent of a group, its network, and the masses of its particles, kg; refuses one without."""
+    if which >= len(groups):
+        raise ValueError(f"group = {which}: there are {len(groups)} groups, counted from 0")
+    if groups[which].network is None:
+        raise ValueError(f"group = {which}: has no network; give groups[{which}].network")
+    first = sum(group.size for group in groups[:which])
+    return first, groups[which].network, groups[which].masses(dimension)
+
+
 class Effect(Record):
     """What acts on a body; see the module for the forms of its laws."""
 
@@ -175,6 +190,19 @@ class Effect(Record):
         """Return the same effect, looking around in the same way and compiled the same, that does nothing."""
         fields = type(self).model_fields
         return self.model_copy(update={name: 0.0 for name in self.strengths if name in fields})
+
+    def rates(
+        self, groups: Sequence[Any], dimension: int
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
+        """Return bounds of w^2, 1/s^2, and of damping, 1/s, of every agent, (N,) each: how stiff it is, whatever happens.
+
+        None if that depends on the state, or it is not stiff at all.
+        """
+        return None
+
+    def potential(self, groups: Sequence[Any], state: Any, offset: Any) -> NDArray[np.float64] | None:
+        """Return its potential energy in each world, (B,) J; none if it has none. `offset(a, b)` is the space's."""
+        return None
 
     def check(self, scene: Any) -> None:
         """Refuse, with a ValueError that begins with the name of a field, a scene that does not suit it."""

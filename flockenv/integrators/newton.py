@@ -130,21 +130,30 @@ def solve_stage(
         if small or (change <= 1e6 * rounding * scale and change >= 0.5 * before):
             return residual.stage(w + correction if small else w, iteration, linear)
         before = change
-        w, r = _searched(residual, w, r, correction, size)
+        w, r, more = _searched(residual, w, correction, solve)
+        linear += more
     raise NotSolved(f"Newton's method has not converged in {MOST_ITERATIONS} iterations")
 
 
-def _searched(residual: _Residual, w: Rows, r: Rows, correction: Rows, size: float) -> tuple[Rows, Rows]:
-    """Return the next w and R: the correction, halved until the residual shrinks."""
-    share = 1.0
+def _searched(
+    residual: _Residual, w: Rows, correction: Rows, solve: Callable[[Rows], tuple[Rows, int]]
+) -> tuple[Rows, Rows, int]:
+    """Return the next w and R: the correction, halved until what is left to correct shrinks.
+
+    Corrections are what is compared, by the same derivatives, and not residuals: those of stiff springs say little of
+    how far the solution is (the natural monotonicity test of Deuflhard 2004, section 3.3).
+    """
+    share, took, size = 1.0, 0, float(np.linalg.norm(correction))
     for _ in range(MOST_HALVINGS):
         new = w + share * correction
         r_new = residual(new[None])[0]
-        found = float(np.linalg.norm(r_new))
-        if np.isfinite(found) and found <= (1 - 1e-4 * share) * size:
-            return new, r_new
+        if np.isfinite(r_new).all():
+            left, more = solve(-r_new)
+            took += more
+            if float(np.linalg.norm(left)) <= (1 - share / 4) * size:
+                break
         share /= 2
-    return new, r_new  # as good as it gets; whether that was enough the next correction tells
+    return new, r_new, took  # at the least as good as it gets; whether that was enough the next correction tells
 
 
 def _step_of(w: Rows) -> float:
