@@ -19,7 +19,7 @@ LAYERS = (
     {"records", "vec", "noise", "kernels"},
     {"state", "space", "steering", "arbitration"},
     {"neighbours", "shapes", "rows"},
-    {"effects", "integrators", "collisions", "population", "spawn", "sweep"},
+    {"effects", "integrators", "collisions", "population", "spawn", "sweep", "networks", "elements"},
     {"snapshot", "scene", "config", "measures", "explanation"},
     {"tasks", "world", "policy"},
     {"envs", "sb3", "evaluation", "accuracy", "render", "trajectory"},
