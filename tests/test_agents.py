@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import yaml
+from typer.testing import CliRunner
 
 from agents import tune
 from agents.experiment import CONFIGS, WEIGHTS, Experiment, PpoSettings, load_experiment
@@ -88,26 +90,76 @@ def test_the_search_writes_its_result_and_keeps_the_rest_of_the_file(tmp_path: P
     assert tune.search(experiment) == (rules, found), "the same seed finds the same"
 
 
-def _train(folder: Path, steps: int, go_on: bool = False) -> dict[str, np.ndarray]:
+PURSUIT = Experiment(task="pursuit", ppo={**TINY, "steps": 1024})
+
+
+def test_training_is_repeatable_and_exports(tmp_path: Path) -> None:
     from agents import ppo
 
-    experiment = Experiment(task="pursuit", ppo={**TINY, "steps": steps})
-    return ppo.train(experiment, folder, go_on).tensors
+    once, twice = (ppo.train(PURSUIT, tmp_path / name) for name in "ab")
+    assert once.tensors.keys() == twice.tensors.keys()
+    for name, tensor in once.tensors.items():
+        np.testing.assert_array_equal(tensor, twice.tensors[name])
+    ppo.export(once, tmp_path / "p.safetensors")
+    policy = MlpPolicy.load(tmp_path / "p.safetensors", PURSUIT.build())
+    assert policy.observation_size == PURSUIT.build().layout.size
+    assert policy.card["recipe"]["ppo"] == PURSUIT.ppo.model_dump(mode="json")
 
 
-def test_training_is_repeatable_resumes_and_exports(tmp_path: Path) -> None:
+def _interrupt(experiment: Experiment, folder: Path) -> None:
+    """Train, and press Ctrl-C at the first point of the curve."""
     from agents import ppo
 
-    once, twice = _train(tmp_path / "a", 1024), _train(tmp_path / "b", 1024)
-    assert once.keys() == twice.keys()
-    for name in once:
-        np.testing.assert_array_equal(once[name], twice[name])
-    longer = Experiment(task="pursuit", ppo={**TINY, "steps": 2048})
-    run = ppo.train(longer, tmp_path / "a", go_on=True)
-    assert run.steps >= 2048 and run.curve[0]["steps"] < 1024 < run.curve[-1]["steps"]
-    ppo.export(longer, run, tmp_path / "p.safetensors")
-    policy = MlpPolicy.load(tmp_path / "p.safetensors", longer.build())
-    assert policy.observation_size == longer.build().layout.size
+    write = ppo.checkpoint
+
+    def interrupted(*given: Any) -> None:
+        write(*given)
+        raise KeyboardInterrupt
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(ppo, "checkpoint", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            ppo.train(experiment, folder)
+
+
+def _fail(*_: object, **__: object) -> None:
+    raise AssertionError("nothing is to be trained")
+
+
+def test_training_that_was_interrupted_goes_on_and_a_finished_one_is_left_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from agents import ppo
+
+    _interrupt(PURSUIT, tmp_path)
+    begun = ppo.checkpointed(PURSUIT, tmp_path)
+    assert begun is not None and 0 < begun.steps < 1024
+    run = ppo.train(PURSUIT, tmp_path, go_on=True)
+    assert run.steps >= 1024 and run.curve[: len(begun.curve)] == begun.curve
+    monkeypatch.setattr(ppo, "build", _fail)
+    assert ppo.train(PURSUIT, tmp_path, go_on=True).curve == run.curve
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"ppo": {**TINY, "steps": 1024, "gamma": 0.9}}, "ppo.gamma = 0.9: {}, with 0.99"),
+        ({"ppo": {**TINY, "steps": 2048}}, "ppo.steps = 2048: {}, with 1024"),
+        ({"arguments": {"pursuer_speed": 2.5}}, "arguments.pursuer_speed = 2.5: {}, with nothing"),
+    ],
+)
+def test_training_does_not_go_on_with_another_recipe(tmp_path: Path, change: dict[str, Any], said: str) -> None:
+    from agents import ppo
+
+    folder = tmp_path / "runs" / "pursuit"
+    _interrupt(PURSUIT, folder)
+    config = tmp_path / "pursuit.yaml"
+    config.write_text(yaml.safe_dump({"task": "pursuit", "ppo": {**TINY, "steps": 1024}, **change}), encoding="utf-8")
+    given = [str(config), "--runs", str(tmp_path / "runs"), "--resume", "--out", str(tmp_path / "p.safetensors")]
+    result = CliRunner().invoke(ppo.app, given)
+    assert result.exit_code == 2
+    assert result.stderr == f"error: {said.format(f'the checkpoint in {folder} is of another recipe')}\n"
+    assert not (tmp_path / "p.safetensors").exists()
 
 
 def test_training_leaves_the_number_of_threads_as_it_was(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -124,7 +176,7 @@ def test_training_leaves_the_number_of_threads_as_it_was(tmp_path: Path, monkeyp
     before = torch.get_num_threads(), threads()
     monkeypatch.setattr(ppo, "checkpoint", interrupted)
     with pytest.raises(KeyboardInterrupt):
-        ppo.train(Experiment(task="pursuit", ppo={**TINY, "threads": 3}), tmp_path)
+        ppo.train(PURSUIT.model_copy(update={"ppo": PpoSettings(**TINY, threads=3)}), tmp_path)
     assert inside[0] == (3, 3)
     assert (torch.get_num_threads(), threads()) == before
 
