@@ -11,7 +11,7 @@ from flockenv.sweep.pairs import pairs
 from flockenv.sweep.parts import Parts
 from flockenv.sweep.text import CONTEXT, Slots, indented, lane, lanes_of, tuple_of
 
-__all__ = ["accelerate", "damping", "parameters"]
+__all__ = ["accelerate", "parameters"]
 
 
 def accelerate(parts: Parts) -> str:
@@ -60,28 +60,6 @@ def accelerate(around, pos, vel, time, acc):
     """Sense and respond."""
     sense(around[0], pos, vel, time)
     respond(around, pos, vel, time, acc)
-'''
-
-
-def damping(parts: Parts) -> str:
-    """Return the source of `damping`, for a method that treats linear drag by itself; nothing for others."""
-    if not parts.integrator.splits_drag:
-        return ""
-    rates = [f"p{k}.{e.linear_drag}" for k, e in enumerate(parts.effects) if e.linear_drag]
-    d = parts.dimension
-    return f'''
-
-@kernel
-def damping(around, rate):
-    """The sum of all linear drags of every coordinate, 1/s."""
-    context, first_, end_ = around
-    {CONTEXT} = context
-{indented(parameters(parts), 4)}
-    for block in range(np.uint64(first_), np.uint64(end_)):
-        base, row = block * np.uint64({d * parts.width}), block * np.uint64({parts.width})
-        for l in range(np.uint64({parts.width})):
-            c = {" + ".join(rates) or "like(mass[0], 0.0)"}
-{indented([f"{lane(parts, 'rate', k)} = c / mass[row + l]" for k in range(d)], 12)}
 '''
 
 
