@@ -44,6 +44,7 @@ def respond(around, pos, vel, time, acc):
 {indented(me, 12)}
             o = zero(x)
             s, f = {lanes_of(parts, "want")}, o
+{indented(_nearest_images(parts), 12)}
 {indented(_medium(parts), 12)}
 {indented(_own(parts), 12)}
 {indented(_felt(parts), 12)}
@@ -87,9 +88,27 @@ def _me_alone() -> str:
     return "me = Me(ident[i], x, v, unit(v), mass[i], radius[i], max_speed[i], max_force[i], zero(x), time, zero(x))"
 
 
+def _nearest_images(parts: Parts) -> list[str]:
+    """Write the numbers of those effects that know places anew: on a torus, with the images nearest to agent i."""
+    lines = []
+    for k, effect in enumerate(parts.effects):
+        if _given(parts, k) == f"near{k}":
+            values = [
+                f"add(x, offset_to(size, x, p{k}.{name}))" if name in effect.places else f"p{k}.{name}"
+                for name in effect.parameters()
+            ]
+            lines.append(f"near{k} = P{k}({', '.join(values)})")
+    return lines
+
+
+def _given(parts: Parts, k: int) -> str:
+    """Write by which name the numbers of effect k are given to a law of one agent."""
+    return f"near{k}" if parts.space.periodic and parts.effects[k].places else f"p{k}"
+
+
 def _medium(parts: Parts) -> list[str]:
     """Write how fast the medium is where agent i is, if any effect says so."""
-    media = [f"m = add(m, medium_law_{k}(p{k}, me))" for k, e in enumerate(parts.effects) if e.medium_law]
+    media = [f"m = add(m, medium_law_{k}({_given(parts, k)}, me))" for k, e in enumerate(parts.effects) if e.medium_law]
     if not media:
         return []
     return [
@@ -103,7 +122,7 @@ def _carry(parts: Parts) -> list[str]:
     """Write with which velocity the medium carries agent i, if it does."""
     if not parts.flows:
         return []
-    laws = [f"u = add(u, flow_law_{k}(p{k}, me))" for k, e in enumerate(parts.effects) if e.flow_law]
+    laws = [f"u = add(u, flow_law_{k}({_given(parts, k)}, me))" for k, e in enumerate(parts.effects) if e.flow_law]
     return [
         "u = o",
         *laws,
@@ -122,7 +141,7 @@ def _own(parts: Parts) -> list[str]:
                 lines.append(
                     "rest = Me(ident[i], x, o, o, mass[i], radius[i], max_speed[i], max_force[i], o, time, me.medium)"
                 )
-            lines.append(f"{to} = add({to}, own_law_{k}(p{k}, {'rest' if still else 'me'}))")
+            lines.append(f"{to} = add({to}, own_law_{k}({_given(parts, k)}, {'rest' if still else 'me'}))")
         if effect.obstacle_law is not None:
             lines.append(f"{to} = add({to}, obstacle_finish_{k}(p{k}, me, ({', '.join(slot.all(f'o{k}_'))},)))")
     return lines
