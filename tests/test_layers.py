@@ -18,7 +18,7 @@ LAYERS = (
     {"divergence", "refusals", "outputs", "recycle", "crew", "compilation", "inlining"},
     {"records", "vec", "noise", "kernels"},
     {"state", "space", "steering", "arbitration"},
-    {"neighbours", "shapes", "rows"},
+    {"neighbours", "shapes", "rows", "tree"},
     {"effects", "integrators", "collisions", "population", "spawn", "sweep"},
     {"snapshot", "scene", "config", "measures", "explanation"},
     {"tasks", "world", "policy"},

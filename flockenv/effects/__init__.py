@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib
 import pkgutil
 
-from flockenv.effects.base import EFFECTS, Effect, Me, Other, Sight
+from flockenv.effects.base import EFFECTS, Effect, Far, Me, Other, Sight
 
 for _module in pkgutil.iter_modules(__path__):
     importlib.import_module(f"{__name__}.{_module.name}")
@@ -13,5 +13,9 @@ for _module in pkgutil.iter_modules(__path__):
 from flockenv.effects.avoid import AvoidObstacles  # noqa: E402  # after the folder has been walked
 from flockenv.effects.drag import Drag  # noqa: E402
 from flockenv.effects.flock import Alignment, Cohesion, Separation  # noqa: E402
+from flockenv.effects.gravitation import Gravitation, InverseSquare  # noqa: E402
 
-__all__ = ["EFFECTS", "Alignment", "AvoidObstacles", "Cohesion", "Drag", "Effect", "Me", "Other", "Separation", "Sight"]
+__all__ = [
+    "EFFECTS", "Alignment", "AvoidObstacles", "Cohesion", "Drag", "Effect", "Far", "Gravitation", "InverseSquare", "Me",
+    "Other", "Separation", "Sight",
+]  # fmt: skip
