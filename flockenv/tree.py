@@ -37,6 +37,9 @@ TURNS = 6
 
 BUCKETS = 2**DIGIT
 
+TOGETHER = 512
+"""Cells that are found along the curve side by side."""
+
 LEVELS = 32
 """More than any tree has."""
 
@@ -59,31 +62,40 @@ def tree_sizes(agents: int, lanes: int, dimension: int, team: int) -> dict[str, 
 
 
 @kernel
-def _hilbert(x: int, y: int, z: int, flat: bool, bits: int) -> int:
-    """Return how far along a Hilbert curve a cell lies (Skilling 2004, AIP Conf. Proc. 707:381)."""
+def _exchange(x: int, other: int, k: int) -> tuple[int, int]:
+    """Where bit k of the other axis is set, invert the bits of x below it; else exchange those of both."""
+    below, here = (np.int64(1) << k) - 1, (other >> k) & 1
+    swap = (x ^ other) & below & (here - 1)
+    return x ^ (swap | (below & -here)), other ^ swap
+
+
+@kernel
+def _along_curve(cells: Any, flat: bool, bits: int) -> None:
+    """Turn cells into how far along a Hilbert curve they lie (Skilling 2004, AIP Conf. Proc. 707:381).
+
+    cells: the x of TOGETHER of them, their y, their z; in the place of x comes what is asked for.
+    """
+    one, two = np.uint64(TOGETHER), np.uint64(2 * TOGETHER)
     for k in range(bits - 1, 0, -1):
-        below = (np.int64(1) << k) - 1
-        x ^= below & -((x >> k) & 1)
-        here = (y >> k) & 1
-        swap = (x ^ y) & below & (here - 1)
-        x ^= swap | (below & -here)
-        y ^= swap
-        if not flat:
-            here = (z >> k) & 1
-            swap = (x ^ z) & below & (here - 1)
-            x ^= swap | (below & -here)
-            z ^= swap
-    y ^= x
-    z ^= y
-    last, turned = y if flat else z, np.int64(0)
-    for k in range(bits - 1, 0, -1):
-        turned ^= ((np.int64(1) << k) - 1) & -((last >> k) & 1)
-    x, y, z, key = x ^ turned, y ^ turned, z ^ turned, np.int64(0)
-    for k in range(bits - 1, -1, -1):
-        key = (key << 2) | (((x >> k) & 1) << 1) | ((y >> k) & 1)
-        if not flat:
-            key = (key << 1) | ((z >> k) & 1)
-    return key
+        for i in range(one):
+            x, _ = _exchange(cells[i], cells[i], k)
+            x, cells[one + i] = _exchange(x, cells[one + i], k)
+            if not flat:
+                x, cells[two + i] = _exchange(x, cells[two + i], k)
+            cells[i] = x
+    for i in range(one):
+        cells[one + i] ^= cells[i]
+        cells[two + i] = np.int64(0) if flat else cells[two + i] ^ cells[one + i]
+    for i in range(one):
+        last, turned = cells[one + i] if flat else cells[two + i], np.int64(0)
+        for k in range(1, bits):
+            turned ^= ((np.int64(1) << k) - 1) & -((last >> k) & 1)
+        x, y, z, key = cells[i] ^ turned, cells[one + i] ^ turned, cells[two + i] ^ turned, np.int64(0)
+        for k in range(bits - 1, -1, -1):
+            key = (key << 2) | (((x >> k) & 1) << 1) | ((y >> k) & 1)
+            if not flat:
+                key = (key << 1) | ((z >> k) & 1)
+        cells[i] = key
 
 
 @kernel
@@ -92,6 +104,14 @@ def _cell(x: float, low: float, pace: float, cells: int) -> int:
     at = (np.float64(x) - low) * pace
     at = at if at > 0.0 else 0.0
     return np.int64(min(at, np.float64(cells - 1)))
+
+
+@kernel
+def _place(keys: Any, first: int, end: int, cells: Any, flat: bool, bits: int) -> None:
+    """Write the keys of some agents, at most TOGETHER."""
+    _along_curve(cells, flat, bits)
+    for i in range(first, end):
+        keys[i] = cells[i - first]
 
 
 @kernel
@@ -134,11 +154,15 @@ def line_up(
     room, count = len(keys) // 2, 0
     for i in range(n):
         if living[i] > 0:
-            at = place_of(i, d, lanes)
-            x, y = _cell(pos[at], low[0], pace, cells), _cell(pos[at + lanes], low[1], pace, cells)
-            z = np.int64(0) if d == 2 else _cell(pos[at + (d - 1) * lanes], low[d - 1], pace, cells)
-            keys[count], places[count] = _hilbert(x, y, z, d == 2, bits), i
+            at, k = place_of(i, d, lanes), count % TOGETHER
+            digits[k] = _cell(pos[at], low[0], pace, cells)
+            digits[TOGETHER + k] = _cell(pos[at + lanes], low[1], pace, cells)
+            digits[2 * TOGETHER + k] = _cell(pos[at + (d - 1) * lanes], low[d - 1], pace, cells)
+            places[count] = i
             count += 1
+            if count % TOGETHER == 0:
+                _place(keys, count - TOGETHER, count, digits, d == 2, bits)
+    _place(keys, count // TOGETHER * TOGETHER, count, digits, d == 2, bits)
     _sort(keys, places, digits, count, room)
     for i in range((count + lanes - 1) // lanes * lanes):
         who = np.int64(places[min(i, count - 1)])
