@@ -1,12 +1,14 @@
 """The acceleration of every agent of a world: what all laws say, summed and divided by mass.
 
-Pair laws come first, in one sweep (`sense`), and leave what they came to in `felt`, by agent; bonds in `pulled`. Then each block adds what
+Pair laws come first, in one sweep (`sense`), and leave what they came to in `felt`, by agent; laws about everybody, and
+bonds, in `pulled`. Then each block adds what
 an agent wants or feels by itself, and a fold over the obstacles (`respond`); what it wants is bounded by max_force.
 """
 
 from __future__ import annotations
 
 from flockenv.sweep.bonds import bonds
+from flockenv.sweep.far import far
 from flockenv.sweep.pairs import pairs
 from flockenv.sweep.parts import Parts
 from flockenv.sweep.text import CONTEXT, Slots, indented, lane, lanes_of, tuple_of
@@ -22,12 +24,13 @@ def accelerate(parts: Parts) -> str:
 
 @kernel
 def sense(context, pos, vel, time):
-    """Write what this thread's agents of one world feel from others, by pair laws and bonds, from the frozen present."""
+    """Write what this thread's agents of one world feel from others, at this instant, whatever law it is by."""
     {CONTEXT} = context
 {indented(parameters(parts), 4)}
     if rank == 0:
         work[b, 0] += 1
 {indented(pairs(parts), 4)}
+{indented(far(parts), 4)}
 {indented(bonds(parts), 4)}
 
 
@@ -154,7 +157,7 @@ def _felt(parts: Parts) -> list[str]:
     for t, name in enumerate(parts.targets):
         places = [f"felt[row * np.uint64({each}) + np.uint64({(d * t + k) * parts.width}) + l]" for k in range(d)]
         lines.append(f"{name} = add({name}, ({', '.join(places)},))")
-    if parts.bonded:
+    if parts.pulls:
         lines.append(f"f = add(f, {lanes_of(parts, 'pulled')})")
     return lines
 

@@ -84,12 +84,12 @@ def bonds(parts: Parts) -> list[str]:
     d, w, slot = parts.dimension, parts.width, Slots(parts)
     sums = slot.all("bond")
     lines = [
-        *([] if parts.pairs else ["wait_for_team(sync, team)  # positions are everybody's"]),
+        *([] if parts.pairs or parts.far else ["wait_for_team(sync, team)  # positions are everybody's"]),
         f"size_ = (n + {w - 1}) // {w} + 1",
         "for block in range(np.uint64(first), np.uint64(end)):",
         f"    base, row = block * np.uint64({d * w}), block * np.uint64({w})",
         f"    for l in range(np.uint64({w})):",
-        indented([f"{s} = 0" for s in sums], 8),
+        indented([f"{s} = {lane(parts, 'pulled', j) if parts.far else 0}" for j, s in enumerate(sums)], 8),
     ]
     for e, (k, effect) in enumerate(parts.bonded):
         lines += indented_lines(_meet(parts, e, k, effect, sums), 4)

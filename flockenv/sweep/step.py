@@ -87,11 +87,11 @@ def step_world(
     worst = far
     for l in range(np.uint64({parts.width})):
         worst = min(worst, {bad})
-    tally[rank] = np.int64(worst) if worst < far else n
+    tally[team + rank] = np.int64(worst) if worst < far else n  # who counts may still be reading the first half
     wait_for_team(sync, team)
     first_bad = n
     for r in range(team):
-        first_bad = min(first_bad, tally[r])
+        first_bad = min(first_bad, tally[team + r])
     wait_for_team(sync, team)  # before anybody counts again
     if first_bad < n:
         return first_bad
