@@ -115,7 +115,9 @@ class Group(Record):
         """Refuse a count beside a network, and neither; and a network that nobody knows how to place."""
         if (self.count is None) == (self.network is None):
             raise ValueError("count: give either a count or a network")
-        if self.network is not None and (self.spawn.low is not None or (any(self.spawn.speed) and not self.spawn.heading)):
+        if self.network is not None and (
+            self.spawn.low is not None or (any(self.spawn.speed) and not self.spawn.heading)
+        ):
             raise ValueError("spawn: a network is where it says; all it may be given is a speed, with a heading")
         return self
 

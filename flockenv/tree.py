@@ -252,8 +252,7 @@ def weigh(leaves: Any, count: int, lanes: int, size: Any, by_mass: bool, digits:
 def _onward(level: int, node: int, top: int, digits: Any) -> tuple[int, int]:
     """Return the node after this one and all that it holds; on a level above the highest there is none."""
     while level < top and (
-        node % CHILDREN == CHILDREN - 1
-        or digits[BUCKETS + level] + node + 1 == digits[BUCKETS + level + 1]
+        node % CHILDREN == CHILDREN - 1 or digits[BUCKETS + level] + node + 1 == digits[BUCKETS + level + 1]
     ):
         level, node = level + 1, node // CHILDREN
     return (level, node + 1) if level < top else (top + 1, node)

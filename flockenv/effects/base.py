@@ -217,9 +217,7 @@ class Effect(Record):
             }
         )
 
-    def rates(
-        self, groups: Sequence[Any], dimension: int
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
+    def rates(self, groups: Sequence[Any], dimension: int) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
         """Return bounds of w^2, 1/s^2, and of damping, 1/s, of every agent, (N,) each: how stiff it is, whatever happens.
 
         None if that depends on the state, or it is not stiff at all.

@@ -27,7 +27,11 @@ def far(parts: Parts) -> list[str]:
         "wait_for_team(sync, team)  # positions are everybody's",
         *(_direct(parts, direct) if direct else []),
         *(_line_up(parts) if parts.treed else []),
-        *(line for k, effect in parts.treed for line in _walk(parts, k, effect, bool(direct) or k != parts.treed[0][0])),
+        *(
+            line
+            for k, effect in parts.treed
+            for line in _walk(parts, k, effect, bool(direct) or k != parts.treed[0][0])
+        ),
         *([] if parts.treed else ["wait_for_team(sync, team)  # nobody moves before all have looked"]),
     ]
 
