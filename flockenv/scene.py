@@ -30,8 +30,8 @@ from flockenv.implicit import coupling_of, solve_steps
 from flockenv.integrators import INTEGRATORS, Integrator, SemiImplicitEuler
 from flockenv.integrators.newton import Coupling
 from flockenv.kernels import LINE, entry, load
-from flockenv.networks import AnyNetwork
 from flockenv.neighbours import FEWEST_AGENTS, MAX_RANGES, WORTH_ARRANGING
+from flockenv.networks import AnyNetwork
 from flockenv.noise import MASK, key_of
 from flockenv.records import Record
 from flockenv.shapes import Circle
@@ -479,7 +479,6 @@ class Scene(Record):
 
         Threads take worlds apart, or, of a large world, its agents.
         """
-        worlds, agents, _ = state.shape
         if steps == 0:
             return -1, -1
         if self.integrator.solves:
@@ -487,7 +486,7 @@ class Scene(Record):
         return self._stepped(state, drive, steps)
 
     def _take_over(self, state: State, world: int, x: Floats, v: Floats) -> tuple[int, int]:
-        """Let the kernel end a step whose positions and velocities, (D, N), were solved: limits, space, finite, time."""
+        """Let the kernel end a step whose positions and velocities, (D, N), were solved for: limits, space, time."""
         width, (_, n) = self.parts.width, x.shape
         stages = self._workspaces(1, 1)[0].shared[STAGES]
         for row, solved in zip(stages, (x, v), strict=True):
@@ -503,8 +502,8 @@ class Scene(Record):
         team = crew if worlds < crew and agents >= WORTH_SHARING and not self.integrator.adaptive else 1
         crew = crew if team > 1 else min(crew, worlds)
         arrays = (
-            state.x, state.v, state.alive, state.tick, state.key, state.obstacle_x, state.obstacle_radius, state.work, drive,
-            self._params, self._dt, steps,
+            state.x, state.v, state.alive, state.tick, state.key, state.obstacle_x, state.obstacle_radius, state.work,
+            drive, self._params, self._dt, steps,
         )  # fmt: skip
         if crew == 1:
             return self._kernel(*arrays, 0, worlds, 0, 1, *self._workspaces(1, 1)[0].of(0))  # type: ignore[no-any-return]

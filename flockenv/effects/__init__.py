@@ -13,12 +13,12 @@ for _module in pkgutil.iter_modules(__path__):
 from flockenv.effects.attraction import Attraction  # noqa: E402  # after the folder has been walked
 from flockenv.effects.avoid import AvoidObstacles  # noqa: E402
 from flockenv.effects.drag import Drag, QuadraticDrag  # noqa: E402
+from flockenv.effects.elastic import Elastic  # noqa: E402
 from flockenv.effects.fields import Carried, Sink, Source, Uniform, Vortex, Wind  # noqa: E402
 from flockenv.effects.flock import Alignment, Cohesion, Separation  # noqa: E402
 from flockenv.effects.fluctuation import Fluctuation  # noqa: E402
 from flockenv.effects.gravitation import Gravitation, InverseSquare  # noqa: E402
 from flockenv.effects.gravity import Gravity  # noqa: E402
-from flockenv.effects.elastic import Elastic  # noqa: E402
 from flockenv.effects.springs import AngularSprings, Springs  # noqa: E402
 
 __all__ = [

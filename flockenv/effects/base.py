@@ -38,7 +38,8 @@ from flockenv.records import Record
 from flockenv.vec import dot
 
 __all__ = [
-    "EFFECTS", "Bonds", "Effect", "Far", "Me", "Other", "Sight", "Vector", "all_masses", "in_view", "network_of", "ties",
+    "EFFECTS", "Bonds", "Effect", "Far", "Me", "Other", "Sight", "Vector", "all_masses", "in_view", "network_of",
+    "ties",
 ]  # fmt: skip
 
 Vector = Annotated[tuple[Annotated[float, Field(strict=True)], ...], Field(min_length=2, max_length=3)]
@@ -218,7 +219,7 @@ class Effect(Record):
         )
 
     def rates(self, groups: Sequence[Any], dimension: int) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
-        """Return bounds of w^2, 1/s^2, and of damping, 1/s, of every agent, (N,) each: how stiff it is, whatever happens.
+        """Return bounds of w^2, 1/s^2, and of damping, 1/s, of every agent, (N,): how stiff it is, whatever happens.
 
         None if that depends on the state, or it is not stiff at all.
         """

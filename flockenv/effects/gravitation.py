@@ -46,7 +46,7 @@ class _Softened(Effect):
     softening: float = Field(ge=0, description="eps, m; 0 = point masses, which nothing keeps apart")
     opening: float = Field(
         default=0.5, ge=0, le=1,
-        description="theta: many agents are met as one whose group is narrower than theta times its distance; 0 = never",
+        description="theta: agents are met as one if their group is narrower than theta times its distance; 0 = never",
     )  # fmt: skip
     conserves_momentum: ClassVar[bool] = True
 

@@ -16,7 +16,7 @@ from pydantic import Field
 from flockenv.effects.base import Bonds, Effect, Me, all_masses, network_of
 from flockenv.kernels import Vec, law, like
 from flockenv.networks import BEND, SHEAR
-from flockenv.vec import add, axis, dot, norm, scale, select, sub, zero
+from flockenv.vec import add, axis, dot, norm, scale, select, sub
 
 if TYPE_CHECKING:
     from flockenv.state import State

@@ -1,8 +1,8 @@
 """The acceleration of every agent of a world: what all laws say, summed and divided by mass.
 
 Pair laws come first, in one sweep (`sense`), and leave what they came to in `felt`, by agent; laws about everybody, and
-bonds, in `pulled`. Then each block adds what
-an agent wants or feels by itself, and a fold over the obstacles (`respond`); what it wants is bounded by max_force.
+bonds, in `pulled`. Then each block adds what an agent wants or feels by itself, and a fold over the obstacles
+(`respond`); what it wants is bounded by max_force.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from flockenv.sweep.bonds import bonds
 from flockenv.sweep.far import far
 from flockenv.sweep.pairs import pairs
 from flockenv.sweep.parts import Parts
-from flockenv.sweep.text import CONTEXT, Slots, indented, lane, lanes_of, tuple_of
+from flockenv.sweep.text import CONTEXT, Slots, alone, indented, lane, lanes_of, tuple_of
 
 __all__ = ["accelerate", "parameters"]
 
@@ -19,7 +19,7 @@ __all__ = ["accelerate", "parameters"]
 def accelerate(parts: Parts) -> str:
     """Return the source of `accelerate`: pair laws first, then each agent by itself, block after block."""
     d = parts.dimension
-    me = ["i = row + l", f"x, v = {lanes_of(parts, 'pos')}, {lanes_of(parts, 'vel')}", _me_alone()]
+    me = ["i = row + l", f"x, v = {lanes_of(parts, 'pos')}, {lanes_of(parts, 'vel')}", f"me = {alone()}"]
     return f'''
 
 @kernel
@@ -86,11 +86,6 @@ def parameters(parts: Parts) -> list[str]:
     return lines
 
 
-def _me_alone() -> str:
-    """Write agent i as the laws of one agent see it: no tie, there is nobody to part from."""
-    return "me = Me(ident[i], x, v, unit(v), mass[i], radius[i], max_speed[i], max_force[i], zero(x), time, zero(x))"
-
-
 def _nearest_images(parts: Parts) -> list[str]:
     """Write the numbers of those effects that know places anew: on a torus, with the images nearest to agent i."""
     lines = []
@@ -117,7 +112,7 @@ def _medium(parts: Parts) -> list[str]:
     return [
         "m = o",
         *media,
-        "me = Me(ident[i], x, v, me.heading, mass[i], radius[i], max_speed[i], max_force[i], o, time, m)",
+        f"me = {alone(medium='m')}",
     ]
 
 
@@ -141,9 +136,7 @@ def _own(parts: Parts) -> list[str]:
         if effect.own_law is not None:
             still = effect.linear_drag is not None and parts.integrator.splits_drag
             if still:  # what is left of -c (v - u): the method adds -c v
-                lines.append(
-                    "rest = Me(ident[i], x, o, o, mass[i], radius[i], max_speed[i], max_force[i], o, time, me.medium)"
-                )
+                lines.append(f"rest = {alone(medium='me.medium', vel='o', heading='o')}")
             lines.append(f"{to} = add({to}, own_law_{k}({_given(parts, k)}, {'rest' if still else 'me'}))")
         if effect.obstacle_law is not None:
             lines.append(f"{to} = add({to}, obstacle_finish_{k}(p{k}, me, ({', '.join(slot.all(f'o{k}_'))},)))")

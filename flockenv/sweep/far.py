@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from flockenv.effects.base import Effect
 from flockenv.sweep.parts import Parts
-from flockenv.sweep.text import Slots, indented, lanes_of, tuple_of
+from flockenv.sweep.text import Slots, indented, lanes_of, place_of, tuple_of
 from flockenv.tree import BUCKETS, LEVELS, LISTED
 
 __all__ = ["far", "tree_imports"]
@@ -89,8 +89,8 @@ def _line_up(parts: Parts) -> list[str]:
     """Write how one thread sorts the living for a tree."""
     return [
         "if rank == 0:",
-        f"    line_up(pos, living, mass, n, {parts.width}, sync, bounds, size, tree_key, tree_place, tree_digit, "
-        "tree_leaf)",
+        "    tree = (tree_key, tree_place, tree_digit, tree_leaf)",
+        f"    line_up(pos, living, mass, n, {parts.width}, sync, bounds, size, *tree)",
     ]
 
 
@@ -100,8 +100,8 @@ def _walk(parts: Parts, k: int, effect: Effect, adds: bool) -> list[str]:
     sums = slot.all("far")
     by_mass = str(effect.weighs_mass)
     gathered = (
-        f"gather(tree_leaf, tree_node, tree_digit, present, {w}, size, {by_mass}, p{k}.opening, np.int64(block), level, "
-        "node, tree_near, begin)"
+        f"gather(tree_leaf, tree_node, tree_digit, present, {w}, size, {by_mass}, p{k}.opening, np.int64(block), "
+        "level, node, tree_near, begin)"
     )
     return [
         "if rank == 0:",
@@ -122,7 +122,8 @@ def _walk(parts: Parts, k: int, effect: Effect, adds: bool) -> list[str]:
         f"                x, m = {lanes_of(parts, 'tree_leaf')}, tree_leaf[base + np.uint64({d * w}) + l]",
         indented(_meet([(k, effect)], sums, "heavy"), 16),
         "    for l in range(np.uint64(held)):",
-        f"        place = np.uint64(place_of(np.int64(tree_place[block * np.uint64({w}) + l]), {d}, {w}))",
+        f"        i = np.uint64(tree_place[block * np.uint64({w}) + l])",
+        f"        place = {place_of(parts, d)}",
         indented([f"pulled[place + np.uint64({j * w})] {'+' * adds}= {s}" for j, s in enumerate(sums)], 8),
         "tally[rank] = met",
         "wait_for_team(sync, team)  # what is pulled was written by others",
