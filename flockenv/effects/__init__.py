@@ -13,5 +13,9 @@ for _module in pkgutil.iter_modules(__path__):
 from flockenv.effects.avoid import AvoidObstacles  # noqa: E402  # after the folder has been walked
 from flockenv.effects.drag import Drag  # noqa: E402
 from flockenv.effects.flock import Alignment, Cohesion, Separation  # noqa: E402
+from flockenv.effects.tether import Swing, Tether  # noqa: E402
 
-__all__ = ["EFFECTS", "Alignment", "AvoidObstacles", "Cohesion", "Drag", "Effect", "Me", "Other", "Separation", "Sight"]
+__all__ = [
+    "EFFECTS", "Alignment", "AvoidObstacles", "Cohesion", "Drag", "Effect", "Me", "Other", "Separation", "Sight",
+    "Swing", "Tether",
+]  # fmt: skip

@@ -186,6 +186,10 @@ class Effect(Record):
             for name, value in fields.items()
         }
 
+    def potential(self, pos: NDArray[Any], mass: NDArray[Any]) -> NDArray[Any] | None:
+        """Return the potential energy of bodies, (..., N) J, at positions (..., N, D); none where nobody has one."""
+        return None
+
     def calls_for(self) -> tuple[str, ...]:
         """What must be computed for it, in words: nothing, a neighbour query, a pass over the obstacles."""
         return tuple(
