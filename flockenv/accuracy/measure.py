@@ -8,6 +8,7 @@ import platform
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path as File
 from statistics import median
 from time import perf_counter
@@ -43,21 +44,14 @@ class _Trial:
     method: Integrator
     steps: int
     tolerance: float | None
-    scene: Scene = field(init=False)
-    start: State = field(init=False)
-    out: State = field(init=False)
     times: list[float] = field(default_factory=list)
     point: Point | None = None
-
-    def __post_init__(self) -> None:
-        self.scene, self.start = self.problem.ready(self.method, self.steps)
-        self.out = self.start.copy()
 
     def compare(self, reference: Reference) -> None:
         """Run from instant to instant, and find out how far from the reference."""
         try:
             path = self.problem.path(self.method, self.steps)
-        except FloatingPointError:
+        except ArithmeticError:  # it diverges, or equations were not solved
             self.point = self._point(self.steps * self.method.evaluations, {})
             return
         off = self.problem.apart(path.pos, reference.pos)
@@ -73,16 +67,22 @@ class _Trial:
     def _point(self, evaluations: int, errors: dict[str, float]) -> Point:
         names = ("error", "rms", "along", "energy", "momentum")
         return Point(
-            steps=self.steps, dt=self.scene.dt, tolerance=self.tolerance, evaluations=evaluations, seconds=None,
-            **{name: errors.get(name) for name in names},
+            steps=self.steps, dt=self.problem.seconds / self.steps, tolerance=self.tolerance,
+            evaluations=evaluations, seconds=None, **{name: errors.get(name) for name in names},
         )  # fmt: skip
 
     def clock(self) -> None:
         """Run as one call, and keep how long it took; one step before it brings the code back into the caches."""
-        self.scene.step(self.start, out=self.out)
+        scene, start, out = self._ready
+        scene.step(start, out=out)
         began = perf_counter()
-        self.scene.step(self.start, out=self.out, steps=self.steps)
+        scene.step(start, out=out, steps=self.steps)
         self.times.append(perf_counter() - began)
+
+    @cached_property
+    def _ready(self) -> tuple[Scene, State, State]:
+        scene, start = self.problem.ready(self.method, self.steps)
+        return scene, start, start.copy()
 
     @property
     def good(self) -> bool:
@@ -130,7 +130,7 @@ def measure(
         name=problem.name, title=problem.title or problem.name, agents=problem.scene.agents, seconds=problem.seconds,
         dtype=problem.scene.dtype, reference=reference.kind, reference_error=reference.error, note=reference.note,
         growth=sensitivity.growth, floor=floor, reach=reach,
-        energy="kinetic and potential" if problem.potentials else "kinetic", repetitions=repetitions,
+        energy=problem.energies, repetitions=repetitions,
         machine=machine(), curves=tuple(_curves(trials, floor, COARSE * reach)), stopped=stopped,
     )  # fmt: skip
 
@@ -173,9 +173,8 @@ def _curves(trials: Sequence[_Trial], least: float, most: float) -> list[Curve]:
 
 def _energy_off(problem: Problem, pos: Floats, vel: Floats, reference: Reference) -> float:
     """Return by how much the energy is off at worst, in parts of the largest kinetic energy of the reference."""
-    kinetic = 0.5 * (problem.mass * (reference.vel**2).sum(axis=-1)).sum(axis=-1)
     off = largest(np.abs(problem.energy(pos, vel) - problem.energy(reference.pos, reference.vel)))
-    scale = largest(kinetic)
+    scale = largest(problem.kinetic(reference.vel))
     return off / scale if scale > 0 else float("nan")
 
 
@@ -184,7 +183,7 @@ def _momentum_off(problem: Problem, vel: Floats, reference: Reference) -> float:
     if not problem.conserves_momentum:
         return float("nan")
     before = problem.momentum(problem.start.vel[0].astype(np.float64))
-    carried = largest((problem.mass * np.linalg.norm(reference.vel, axis=-1)).sum(axis=-1))
+    carried = largest(problem.impulse(reference.vel))
     off = largest(np.linalg.norm(problem.momentum(vel) - before, axis=-1))
     return off / carried if carried > 0 else float("nan")
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -10,9 +11,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from flockenv.effects import Effect
 from flockenv.integrators import Integrator
 from flockenv.scene import Scene
-from flockenv.state import State
+from flockenv.stability import UnstableStepWarning
+from flockenv.state import State, blank
 
 __all__ = ["Exact", "Floats", "Path", "Problem", "largest"]
 
@@ -86,18 +89,27 @@ class Problem:
         return self.seconds * np.arange(1, many + 1) / many
 
     @property
-    def mass(self) -> Floats:
-        """(N,) kg."""
-        return self.scene.body.mass.astype(np.float64)
+    def _moving(self) -> Floats:
+        """The masses of those who are not held in place, (N,) kg; 0 for them."""
+        mass = self.scene.body.mass.astype(np.float64)
+        return np.where(np.isfinite(mass), mass, 0.0)
 
     def ready(self, method: Integrator, steps: int) -> tuple[Scene, State]:
-        """Return the scene advanced by a method in so many steps, and its start."""
+        """Return the scene advanced by a method in so many steps, and its start.
+
+        Raises ValueError where the scene refuses such steps because they blow up; of less it does not warn.
+        """
         dt = self.seconds / steps
-        return self.scene.model_copy(update={"integrator": method, "dt": dt}), replace(self.start, dt=dt)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", UnstableStepWarning)
+            return self.scene.model_copy(update={"integrator": method, "dt": dt}), replace(self.start, dt=dt)
 
     def path(self, method: Integrator, steps: int, start: State | None = None) -> Path:
         """Run, and return where everybody was at the instants; raises FloatingPointError where it diverges."""
-        scene, state = self.ready(method, steps)
+        try:
+            scene, state = self.ready(method, steps)
+        except ValueError as error:  # it would
+            raise FloatingPointError(str(error)) from None
         state = replace(start, dt=scene.dt) if start is not None else state
         before, each = state.counted("evaluations"), steps // len(self.times)
         pos, vel = [], []
@@ -112,28 +124,47 @@ class Problem:
         return np.asarray(np.linalg.norm(self.scene.space.displacement(pos, other), axis=-1))
 
     def energy(self, pos: Floats, vel: Floats) -> Floats:
-        """Return kinetic energy, and what potential energy the effects know of, summed over all agents, (...) J."""
-        total = 0.5 * self.mass * (vel**2).sum(axis=-1)
-        for effect in self.scene.effects:
-            potential = effect.potential(pos, self.mass)
-            total = total if potential is None else total + potential
-        return np.asarray(total.sum(axis=-1))
+        """Return kinetic energy, and what potential energy the effects know of, at instants (K, N, D), (K,) J."""
+        instants, agents, dimension = pos.shape  # a world for every instant
+        state = blank(instants, agents, dimension, 0, self.start.dt).with_motion(pos, vel)
+        total = self.kinetic(vel)
+        for effect in self._with_potential:
+            total = total + self._potential(effect, state)
+        return total
+
+    def _potential(self, effect: Effect, state: State) -> Floats | None:
+        return effect.potential(self.scene.groups, state, self.scene.space.displacement)
 
     def momentum(self, vel: Floats) -> Floats:
         """Return the total momentum, (..., D) kg m/s."""
-        return np.asarray((self.mass[:, None] * vel).sum(axis=-2))
+        return np.asarray((self._moving[:, None] * vel).sum(axis=-2))
 
     @property
-    def potentials(self) -> bool:
-        """Does any effect know its potential energy?"""
-        pos: Any = self.start.pos[0]
-        return any(effect.potential(pos, self.mass) is not None for effect in self.scene.effects)
+    def _with_potential(self) -> list[Effect]:
+        """The effects that know their potential energy; none on a torus, where it jumps from image to image."""
+        known = [] if self.scene.space.periodic else self.scene.effects
+        return [effect for effect in known if self._potential(effect, self.start) is not None]
+
+    def impulse(self, vel: Floats) -> Floats:
+        """Return the sum of the sizes of all momenta, (...) kg m/s."""
+        return np.asarray((self._moving * np.linalg.norm(vel, axis=-1)).sum(axis=-1))
+
+    def kinetic(self, vel: Floats) -> Floats:
+        """Return the kinetic energy, (...) J."""
+        return np.asarray(0.5 * (self._moving * (vel**2).sum(axis=-1)).sum(axis=-1))
+
+    @property
+    def energies(self) -> str:
+        """What `energy` sums up, in words."""
+        kinds = [effect.kind for effect in self._with_potential]
+        return f"kinetic and potential ({', '.join(kinds)})" if kinds else "kinetic"
 
     @property
     def conserves_momentum(self) -> bool:
         """Is momentum kept, but for errors: do all effects keep it, and neither a wall nor a limit takes it?"""
         body = self.scene.body
-        free = not np.isfinite(body.max_speed).any() and self.scene.space.kind != "box"
+        held = np.isinf(body.mass).any() or np.isfinite(body.max_speed).any()
+        free = not held and self.scene.space.kind != "box"
         asks = any(effect.steering for effect in self.scene.effects)
         free = free and not (asks and np.isfinite(body.max_force).any())
         return free and all(effect.conserves_momentum for effect in self.scene.effects)

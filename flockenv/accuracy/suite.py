@@ -11,7 +11,21 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from flockenv.accuracy.problem import Exact, Floats, Problem
-from flockenv.effects import Alignment, Cohesion, Effect, Separation, Swing, Tether
+from flockenv.effects import (
+    Alignment,
+    Attraction,
+    Carried,
+    Cohesion,
+    Drag,
+    Effect,
+    Gravity,
+    QuadraticDrag,
+    Separation,
+    Swing,
+    Tether,
+    Uniform,
+    Vortex,
+)
 from flockenv.refusals import nearest, shown
 from flockenv.scene import Group, Scene
 from flockenv.space import Torus
@@ -79,6 +93,88 @@ def pendulum() -> Problem:
     return _one_body("pendulum", "Pendulum from 120\u00b0", [swing], 5.0, powers(7, 17), None, start)
 
 
+def forced_oscillator() -> Problem:
+    """x'' = -x + cos 2t from rest at 0: forces are asked for in the middle of a step too."""
+
+    def exact(t: float) -> tuple[Floats, Floats]:
+        x, v = (math.cos(t) - math.cos(2 * t)) / 3, (2 * math.sin(2 * t) - math.sin(t)) / 3
+        return _rows(x, 0.0), _rows(v, 0.0)
+
+    effects = (Tether(centre=ORIGIN, stiffness=1.0), Uniform(strength=(1.0, 0.0), period=math.pi))
+    return _one_body("forced", "Oscillator forced by cos 2t", effects, 0.7 * 2 * math.pi, powers(4, 12), exact)
+
+
+# --- orbits -----------------------------------------------------------------------------------------------------------
+
+
+def _kepler(name: str, eccentricity: float, periods: float, steps: Sequence[int]) -> Problem:
+    """Return a body about a fixed sun, mu = 1 and a = 1, from where it is nearest."""
+
+    def exact(t: float) -> tuple[Floats, Floats]:
+        angle, e = t, eccentricity  # the eccentric anomaly solves t = E - e sin E
+        for _ in range(60):
+            angle -= (angle - e * math.sin(angle) - t) / (1 - e * math.cos(angle))
+        flat, rate = math.sqrt(1 - e * e), 1 / (1 - e * math.cos(angle))
+        pos = _rows(math.cos(angle) - e, flat * math.sin(angle))
+        return pos, _rows(-math.sin(angle) * rate, flat * math.cos(angle) * rate)
+
+    sun = Attraction(centre=ORIGIN, strength=1.0)
+    title = f"Kepler orbit, e = {eccentricity:g}, {periods:g} periods"
+    return _one_body(name, title, [sun], periods * 2 * math.pi, steps, exact)
+
+
+def kepler() -> Problem:
+    """An orbit that is not far from round."""
+    return _kepler("kepler", 0.5, 3.3, powers(7, 17))
+
+
+def kepler_close() -> Problem:
+    """An orbit that passes close to the sun, where short steps are needed and nowhere else."""
+    return _kepler("kepler_close", 0.9, 1.3, powers(8, 18))
+
+
+# --- drag and media ---------------------------------------------------------------------------------------------------
+
+GRAVITY = 9.81
+
+
+def projectile() -> Problem:
+    """A throw of (10, 15) m/s with linear drag."""
+    rate, vx, vy = 0.2, 10.0, 15.0
+
+    def exact(t: float) -> tuple[Floats, Floats]:
+        left, fall = math.exp(-rate * t), GRAVITY / rate
+        pos = _rows(vx * (1 - left) / rate, (vy + fall) * (1 - left) / rate - fall * t)
+        return pos, _rows(vx * left, (vy + fall) * left - fall)
+
+    effects = (Gravity(acceleration=(0.0, -GRAVITY)), Drag(rate=rate))
+    return _one_body("projectile", "Throw with linear drag", effects, 2.5, powers(3, 11), exact)
+
+
+def quadratic_fall() -> Problem:
+    """A fall from rest with quadratic drag, towards 20 m/s."""
+    limit = 20.0
+
+    def exact(t: float) -> tuple[Floats, Floats]:
+        fallen = limit**2 / GRAVITY * math.log(math.cosh(GRAVITY * t / limit))
+        return _rows(0.0, -fallen), _rows(0.0, -limit * math.tanh(GRAVITY * t / limit))
+
+    effects = (Gravity(acceleration=(0.0, -GRAVITY)), QuadraticDrag(rate=GRAVITY / limit**2))
+    return _one_body("quadratic_fall", "Fall with quadratic drag", effects, 3.0, powers(3, 11), exact)
+
+
+def tracer() -> Problem:
+    """A speck that a vortex carries around in circles, once in 6.94 s."""
+    flow, most, radius = 2.0, 5.0, 1.2
+    turn = flow / (flow / most + radius**2) / radius
+
+    def exact(t: float) -> tuple[Floats, Floats]:
+        return _rows(radius * math.cos(turn * t), radius * math.sin(turn * t)), _rows(0.0, 0.0)
+
+    effects = (Vortex(centre=ORIGIN, strength=flow, maximum=most, acts="medium"), Carried())
+    return _one_body("tracer", "Tracer in a vortex, 1.7 turns", effects, 1.7 * 2 * math.pi / turn, powers(4, 13), exact)
+
+
 # --- flocks -----------------------------------------------------------------------------------------------------------
 
 
@@ -113,7 +209,13 @@ def boids_limit() -> Problem:
 SUITE: dict[str, Callable[[], Problem]] = {
     "oscillator": oscillator,
     "damped": damped_oscillator,
+    "forced": forced_oscillator,
     "pendulum": pendulum,
+    "kepler": kepler,
+    "kepler_close": kepler_close,
+    "projectile": projectile,
+    "quadratic_fall": quadratic_fall,
+    "tracer": tracer,
     "boids": boids,
     "boids_cone": boids_cone,
     "boids_limit": boids_limit,

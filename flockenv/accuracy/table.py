@@ -19,7 +19,8 @@ def headlines(report: Report) -> list[str]:
     lines = [
         f"{report.agents:,} agents, {report.seconds:g} s, {report.dtype}; the farthest goes {report.reach:.3g} m",
         f"errors against: {report.reference}" + (f" ({report.note})" if report.note else ""),
-        f"a tiny difference at the start grows {report.growth:.2g}-fold; errors below {report.floor:.1e} m tell nothing",
+        f"a tiny difference at the start grows {report.growth:.2g}-fold: errors below {report.floor:.1e} m say nothing",
+        f"energy: {report.energy}",
         f"times: {times} on {report.machine.cpu}, {report.machine.cores} cores{load}",
     ]
     return lines + ([f"{report.stopped}: what was done until then is shown"] if report.stopped else [])

@@ -2,20 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from flockenv.effects.base import Effect, Me
+from flockenv.effects.base import Effect, Me, Vector, all_masses
 from flockenv.kernels import Vec, law, like
-from flockenv.space import Torus
+from flockenv.state import State
 from flockenv.vec import add, scale, sub, unit
 
 __all__ = ["Swing", "Tether"]
 
-Floats = NDArray[np.floating[Any]]
+Floats = NDArray[np.float64]
 
 
 @law
@@ -42,16 +43,10 @@ def swing(p: Any, me: Me) -> Vec:
 
 
 class _Centred(Effect):
-    """What forces about a fixed point have in common."""
+    """What forces about a fixed point have in common; on a torus the nearest image of the centre counts."""
 
-    centre: tuple[float, ...] = Field(min_length=2, max_length=3, description="m")
-
-    def check(self, scene: Any) -> None:
-        """Refuse a centre of another dimension, and a torus, on which there is no single way to a point."""
-        if len(self.centre) != scene.dimension:
-            raise ValueError(f"centre = {self.centre}: dimension = {scene.dimension}")
-        if isinstance(scene.space, Torus):
-            raise ValueError(f"centre = {self.centre}: there is no single way to a point on a torus; use plane or box")
+    centre: Vector = Field(description="m")
+    places: ClassVar[tuple[str, ...]] = ("centre",)
 
 
 class Tether(_Centred):
@@ -64,10 +59,15 @@ class Tether(_Centred):
     own_law: ClassVar[str | None] = "tether"
     strengths: ClassVar[tuple[str, ...]] = ("stiffness", "damping")
 
-    def potential(self, pos: Floats, mass: Floats) -> Floats:
-        """k (|d| - L)^2 / 2, J; what the damper takes is not in it."""
-        stretch = np.linalg.norm(pos - np.array(self.centre), axis=-1) - self.rest
-        return np.asarray(0.5 * self.stiffness * stretch**2)
+    def rates(self, groups: Sequence[Any], dimension: int) -> tuple[Floats, Floats]:
+        """w^2 = k / m, and c / m."""
+        mass = all_masses(groups, dimension)
+        return self.stiffness / mass, self.damping / mass
+
+    def potential(self, groups: Sequence[Any], state: State, offset: Any) -> Floats:
+        """Sum of k (|d| - L)^2 / 2 of all agents, (B,) J; what the damper takes is not in it."""
+        stretch = np.linalg.norm(offset(self.centre, state.pos), axis=-1) - self.rest
+        return np.asarray((0.5 * self.stiffness * stretch**2).sum(axis=1))
 
 
 class Swing(_Centred):
@@ -79,7 +79,7 @@ class Swing(_Centred):
     own_law: ClassVar[str | None] = "swing"
     strengths: ClassVar[tuple[str, ...]] = ("strength",)
 
-    def potential(self, pos: Floats, mass: Floats) -> Floats:
-        """s l sum over the axes of 1 - cos((x - c) / l), J."""
-        angles = (pos - np.array(self.centre)) / self.length
-        return np.asarray(self.strength * self.length * (1 - np.cos(angles)).sum(axis=-1))
+    def potential(self, groups: Sequence[Any], state: State, offset: Any) -> Floats:
+        """Sum of s l (1 - cos((x - c) / l)) over all agents and axes, (B,) J."""
+        angles = offset(self.centre, state.pos) / self.length
+        return np.asarray(self.strength * self.length * (1 - np.cos(angles)).sum(axis=(1, 2)))
