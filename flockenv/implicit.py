@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from flockenv.integrators.implicit import Implicit
-from flockenv.integrators.newton import Coupling, Evaluate, NotSolved, coupled
+from flockenv.integrators.newton import Coupling, Evaluate, NotSolvedError, coupled
 from flockenv.state import WORK, Floats, State
 
 if TYPE_CHECKING:
@@ -42,8 +42,8 @@ def solve_steps(
 ) -> tuple[int, int]:
     """Advance every world of a state in place; return the first (world, agent) not finite or not found, or (-1, -1).
 
-    `step(state, world, x, v)` lets the kernel take over positions and velocities (D, N): limits, the space, time. A world
-    that fails stays as it was.
+    `step(state, world, x, v)` lets the kernel take over positions and velocities (D, N): limits, the space, time. A
+    world that fails stays as it was.
     """
     method = scene.integrator
     assert isinstance(method, Implicit)
@@ -72,7 +72,7 @@ def _solved(
     x, v = alone.x[:, 0].ravel(), alone.v[:, 0].ravel()
     try:
         found = method.solve(evaluate, x, v, float(alone.time[0]), scene.dt, scene.dimension, scene.coupling)
-    except NotSolved:
+    except NotSolvedError:
         return _fastest(alone)
     alone.work[0, WORK.index("newton_iterations")] += found.newton
     alone.work[0, WORK.index("linear_iterations")] += found.linear

@@ -30,8 +30,8 @@ from flockenv.implicit import coupling_of, solve_steps
 from flockenv.integrators import INTEGRATORS, Integrator, SemiImplicitEuler
 from flockenv.integrators.newton import Coupling
 from flockenv.kernels import LINE, entry, load
-from flockenv.networks import AnyNetwork
 from flockenv.neighbours import FEWEST_AGENTS, MAX_RANGES, WORTH_ARRANGING
+from flockenv.networks import AnyNetwork
 from flockenv.noise import MASK, key_of
 from flockenv.records import Record
 from flockenv.shapes import Circle
@@ -41,6 +41,7 @@ from flockenv.spawn import Spawn, scatter
 from flockenv.stability import check_dt
 from flockenv.state import Body, Floats, State
 from flockenv.sweep import SHARED, SMALL_STRIDE, Parts, Table, field_source, pack, scene_source
+from flockenv.tree import BUCKETS, LEVELS, MOST_DIRECT, tree_sizes
 
 __all__ = ["Group", "Scene", "Workspace"]
 
@@ -114,7 +115,9 @@ class Group(Record):
         """Refuse a count beside a network, and neither; and a network that nobody knows how to place."""
         if (self.count is None) == (self.network is None):
             raise ValueError("count: give either a count or a network")
-        if self.network is not None and (self.spawn.low is not None or (any(self.spawn.speed) and not self.spawn.heading)):
+        if self.network is not None and (
+            self.spawn.low is not None or (any(self.spawn.speed) and not self.spawn.heading)
+        ):
             raise ValueError("spawn: a network is where it says; all it may be given is a speed, with a heading")
         return self
 
@@ -153,23 +156,27 @@ class Workspace:
             "stages": (max(parts.integrator.stages, 1), padded * d),
             **dict.fromkeys(("mass", "radius", "max_speed", "max_force", "living", "ident"), padded),
             "tie": padded * d if "t0" in parts.fields else 1,
-            "pulled": padded * d if parts.bonded else 1,
+            "pulled": padded * d if parts.pulls else 1,
             "carrying": padded * d if parts.flows else 1,
             "felt": max(swept * d * len(parts.targets), 1),
             "sorted_": parts.rows * (swept + width if parts.sorts else SMALL_STRIDE),
             "records": (swept if sorts else 1) * parts.numbers,
             "luggage": carried * parts.luggage_size,
         }
+        real |= {name: size if parts.treed else 1 for name, size in tree_sizes(agents, width, d, team).items()}
         whole = {
             "order": (swept + width,),
             "cell": (padded if sorts else 1,),
             "start": (cells + 1,),
             "offset": (team, cells),
+            "tree_place": (2 * padded if parts.treed else 1,),
         }
         wanted: dict[str, Any] = {name: (shape, np.dtype(dtype)) for name, shape in real.items()}
         wanted |= {name: (shape, np.dtype(np.int32)) for name, shape in whole.items()}
         arrays = _zeros(wanted)
-        arrays |= {"bounds": np.zeros((team, 6)), "tally": np.zeros(team, np.int64), "sync": np.zeros(8, np.int64)}
+        arrays |= {"bounds": np.zeros((team, 6)), "tally": np.zeros(2 * team, np.int64), "sync": np.zeros(8, np.int64)}
+        keys, digits = (2 * padded, BUCKETS + LEVELS + 1) if parts.treed else (1, 1)
+        arrays |= {"tree_key": np.zeros(keys, np.int64), "tree_digit": np.zeros(digits, np.int64)}
         for name, pad in (("mass", 1), ("radius", 0), ("max_speed", 1), ("max_force", 1)):
             arrays[name][:] = pad
             arrays[name][:agents] = getattr(body, name)
@@ -236,6 +243,11 @@ class Scene(Record):
         size = getattr(self.space, "size", None)
         if isinstance(self.space, Torus):
             for k, effect in enumerate(self.effects):
+                if effect.far_law:
+                    raise ValueError(
+                        f"effects[{k}].kind = {effect.kind} reaches everybody, and on a torus everybody is there "
+                        "infinitely many times; only a plane or a box is allowed"
+                    )
                 if effect.pair_law and effect.reach > min(self.space.size) / 2:
                     raise ValueError(
                         f"effects[{k}].radius = {effect.reach:g} reaches around the torus; at most half its shortest "
@@ -304,7 +316,11 @@ class Scene(Record):
         if parts.sweeps and parts.sorts:
             reals += parts.rows + parts.numbers
             whole += 3 * 4
-        reals += d * (bool(parts.bonded) + parts.flows)
+        reals += d * (parts.pulls + parts.flows)
+        if parts.treed:
+            numbers = tree_sizes(self.agents, parts.width, d, 1)
+            reals += -(-sum(numbers.values()) // self.agents)
+            whole += 24
         if parts.arranges and self.agents >= WORTH_ARRANGING:
             reals += parts.luggage_size
         return self.agents * (reals * real + whole)
@@ -324,7 +340,8 @@ class Scene(Record):
     def parts(self) -> Parts:
         """What the kernel is made of."""
         sorts = self.agents >= FEWEST_AGENTS
-        return Parts(self.dimension, self.space, self.effects, self.integrator, self.dtype, sorts)
+        crowded = self.agents > MOST_DIRECT
+        return Parts(self.dimension, self.space, self.effects, self.integrator, self.dtype, sorts, crowded=crowded)
 
     @functools.cached_property
     def table(self) -> Table:
@@ -462,7 +479,6 @@ class Scene(Record):
 
         Threads take worlds apart, or, of a large world, its agents.
         """
-        worlds, agents, _ = state.shape
         if steps == 0:
             return -1, -1
         if self.integrator.solves:
@@ -470,7 +486,7 @@ class Scene(Record):
         return self._stepped(state, drive, steps)
 
     def _take_over(self, state: State, world: int, x: Floats, v: Floats) -> tuple[int, int]:
-        """Let the kernel end a step whose positions and velocities, (D, N), were solved: limits, space, finite, time."""
+        """Let the kernel end a step whose positions and velocities, (D, N), were solved for: limits, space, time."""
         width, (_, n) = self.parts.width, x.shape
         stages = self._workspaces(1, 1)[0].shared[STAGES]
         for row, solved in zip(stages, (x, v), strict=True):
@@ -486,8 +502,8 @@ class Scene(Record):
         team = crew if worlds < crew and agents >= WORTH_SHARING and not self.integrator.adaptive else 1
         crew = crew if team > 1 else min(crew, worlds)
         arrays = (
-            state.x, state.v, state.alive, state.tick, state.key, state.obstacle_x, state.obstacle_radius, state.work, drive,
-            self._params, self._dt, steps,
+            state.x, state.v, state.alive, state.tick, state.key, state.obstacle_x, state.obstacle_radius, state.work,
+            drive, self._params, self._dt, steps,
         )  # fmt: skip
         if crew == 1:
             return self._kernel(*arrays, 0, worlds, 0, 1, *self._workspaces(1, 1)[0].of(0))  # type: ignore[no-any-return]

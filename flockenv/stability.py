@@ -94,8 +94,8 @@ def limit(method: Integrator, zeta: float) -> float:
 def suggest_dt(scene: Scene) -> Suggestion:
     """Return the largest stable step of a scene, from its effects' own stiffness, and the effect that sets it.
 
-    Stiffness is a bound (Gershgorin's circles for springs), so the limit is on the safe side; what is only stiff in some
-    states (agents that touch) is not in it. Source: numerics.md 2.2 P02, 3.1, 3.3.
+    Stiffness is a bound (Gershgorin's circles for springs), so the limit is on the safe side; what is only stiff in
+    some states (agents that touch) is not in it. Source: numerics.md 2.2 P02, 3.1, 3.3.
     """
     square, damping = np.zeros(scene.agents), np.zeros(scene.agents)
     alone: list[tuple[float, str]] = []
@@ -154,7 +154,7 @@ def _drag_limit(method: Integrator) -> float:
 
 
 def check_dt(scene: Scene) -> None:
-    """Warn where dt is beyond the largest stable step, naming the limit and who sets it; refuse where it must blow up."""
+    """Warn where dt is beyond the largest stable step, naming limit and effect; refuse where it must blow up."""
     found = suggest_dt(scene)
     if scene.dt <= found.dt:
         return

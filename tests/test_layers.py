@@ -18,7 +18,7 @@ LAYERS = (
     {"divergence", "refusals", "outputs", "recycle", "crew", "compilation", "inlining"},
     {"records", "vec", "noise", "kernels"},
     {"state", "space", "steering", "arbitration"},
-    {"neighbours", "shapes", "rows", "networks", "elements"},
+    {"neighbours", "shapes", "rows", "networks", "elements", "tree"},
     {"effects", "integrators", "collisions", "population", "spawn", "sweep", "stability"},
     {"snapshot", "implicit", "scene", "config", "measures", "explanation"},
     {"tasks", "world", "policy"},

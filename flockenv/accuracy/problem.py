@@ -129,7 +129,8 @@ class Problem:
         state = blank(instants, agents, dimension, 0, self.start.dt).with_motion(pos, vel)
         total = self.kinetic(vel)
         for effect in self._with_potential:
-            total = total + self._potential(effect, state)
+            potential = self._potential(effect, state)
+            total = total if potential is None else total + potential
         return total
 
     def _potential(self, effect: Effect, state: State) -> Floats | None:

@@ -7,6 +7,8 @@ An effect is of one or more of three forms, each a law for one agent:
   agent; and `flow_law(p, me) -> velocity` with which the medium carries it, beside its own velocity;
 * `pair_law(p, me, other) -> sums`, `finish_law(p, me, sums) -> force`: what one neighbour adds to K running sums, and
   the force they make; all pair laws of a scene share one sweep;
+* `far_law(p, me, other) -> force`: of everybody else, however far, of whom groups far away are met as one; `other` is
+  a `Far`, and of `me` it may read pos and mass alone; `p.opening` says how large such a group may look;
 * `bond_law(p, me, others, numbers) -> force`: of one of the bonds that the effect's `bonds` lists, each between an
   agent and one or more partners (springs, hinges, finite elements);
 * `kick_law(p, me, seconds, gauss) -> velocity`: added once per step, however often a method asks for forces, with one
@@ -36,7 +38,8 @@ from flockenv.records import Record
 from flockenv.vec import dot
 
 __all__ = [
-    "EFFECTS", "Bonds", "Effect", "Me", "Other", "Sight", "Vector", "all_masses", "in_view", "network_of", "ties",
+    "EFFECTS", "Bonds", "Effect", "Far", "Me", "Other", "Sight", "Vector", "all_masses", "in_view", "network_of",
+    "ties",
 ]  # fmt: skip
 
 Vector = Annotated[tuple[Annotated[float, Field(strict=True)], ...], Field(min_length=2, max_length=3)]
@@ -71,6 +74,14 @@ class Other(NamedTuple):
     vel: Vec  # m/s; 0 for an obstacle
     radius: float  # m
     tie: Vec  # a unit vector of its own; 0 for an obstacle
+
+
+class Far(NamedTuple):
+    """Whom a far law meets: an agent, or several who are far away, at their centre."""
+
+    offset: Vec  # m, from me; never 0
+    square: float  # m^2, |offset|^2
+    weight: float  # kg, their mass; or how many they are, see Effect.weighs_mass
 
 
 class Sight(NamedTuple):
@@ -141,9 +152,9 @@ class Effect(Record):
     own_law: ClassVar[str | None] = None
     medium_law: ClassVar[str | None] = None
     flow_law: ClassVar[str | None] = None
+    far_law: ClassVar[str | None] = None
     bond_law: ClassVar[str | None] = None
     kick_law: ClassVar[str | None] = None
-    far_law: ClassVar[str | None] = None
     pair_law: ClassVar[str | None] = None
     finish_law: ClassVar[str | None] = None
     obstacle_start: ClassVar[str | None] = None
@@ -151,6 +162,8 @@ class Effect(Record):
     obstacle_finish: ClassVar[str | None] = None
     linear_drag: ClassVar[str | None] = None
     """Name of the parameter c, kg/s, of an own_law that is -c (v - medium): a method may treat it by itself."""
+    weighs_mass: ClassVar[bool] = True
+    """Is the weight of whom a far law meets their mass? Else it is their number."""
     partners: ClassVar[int] = 1
     """How many partners a bond has beside the agent it acts on."""
     places: ClassVar[tuple[str, ...]] = ()
@@ -205,10 +218,8 @@ class Effect(Record):
             }
         )
 
-    def rates(
-        self, groups: Sequence[Any], dimension: int
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
-        """Return bounds of w^2, 1/s^2, and of damping, 1/s, of every agent, (N,) each: how stiff it is, whatever happens.
+    def rates(self, groups: Sequence[Any], dimension: int) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
+        """Return bounds of w^2, 1/s^2, and of damping, 1/s, of every agent, (N,): how stiff it is, whatever happens.
 
         None if that depends on the state, or it is not stiff at all.
         """
@@ -241,8 +252,8 @@ class Effect(Record):
         return tuple(
             text
             for text, law in (
-                ("neighbour query", self.pair_law), ("bonds", self.bond_law), ("obstacles", self.obstacle_law),
-                ("random numbers", self.kick_law),
+                ("neighbour query", self.pair_law), ("all others", self.far_law), ("bonds", self.bond_law),
+                ("obstacles", self.obstacle_law), ("random numbers", self.kick_law),
             )
             if law is not None
         )  # fmt: skip

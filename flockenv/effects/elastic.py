@@ -88,9 +88,7 @@ class Elastic(Effect):
 
     def matrix(self, network: Any, dimension: int) -> Any:
         """Return K of a network, sparse, (D n, D n) N/m, particle after particle."""
-        material = Material(
-            young=self.young or 1.0, poisson=self.poisson, area=self.area, thickness=self.thickness
-        )
+        material = Material(young=self.young or 1.0, poisson=self.poisson, area=self.area, thickness=self.thickness)
         found = stiffness(network.rest_points(dimension), network.elements(dimension), material)
         return found if self.young else 0 * found
 

@@ -16,7 +16,7 @@ from pydantic import Field
 from flockenv.effects.base import Bonds, Effect, Me, all_masses, network_of
 from flockenv.kernels import Vec, law, like
 from flockenv.networks import BEND, SHEAR
-from flockenv.vec import add, axis, dot, norm, scale, select, sub, zero
+from flockenv.vec import add, axis, dot, norm, scale, select, sub
 
 if TYPE_CHECKING:
     from flockenv.state import State
@@ -187,9 +187,7 @@ class AngularSprings(Effect):
         """Of the undeformed shape: row sums of the second derivatives k |d angle/dx| |d angle/dy| of each hinge."""
         first, network, _ = network_of(groups, self.group, dimension)
         hinges, points, mass = network.hinges(dimension), network.rest_points(dimension), all_masses(groups, dimension)
-        per_a, per_b = (
-            1 / np.linalg.norm(points[hinges[:, end]] - points[hinges[:, 1]], axis=1) for end in (0, 2)
-        )
+        per_a, per_b = (1 / np.linalg.norm(points[hinges[:, end]] - points[hinges[:, 1]], axis=1) for end in (0, 2))
         whole = np.stack([per_a, per_a + per_b, per_b]) * 2 * (per_a + per_b)
         rows = np.bincount((hinges + first).T.ravel(), whole.ravel(), len(mass)) / mass
         return self.stiffness * rows, self.damping * rows
@@ -199,9 +197,7 @@ class AngularSprings(Effect):
         bonds = self.bonds(groups, state.shape[2])
         third = len(bonds.agent) // 3
         i, apex, k = bonds.agent[:third], bonds.agent[third : 2 * third], bonds.agent[2 * third :]
-        angle = _angles(
-            offset(state.pos[:, apex], state.pos[:, i]), offset(state.pos[:, apex], state.pos[:, k])
-        )
+        angle = _angles(offset(state.pos[:, apex], state.pos[:, i]), offset(state.pos[:, apex], state.pos[:, k]))
         off = angle - bonds.number[:third, 2]
         off -= 2 * np.pi * np.floor(off / (2 * np.pi) + 0.5)
         return np.asarray((0.5 * bonds.number[:third, 0] * off**2).sum(axis=1))

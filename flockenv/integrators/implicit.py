@@ -26,7 +26,7 @@ class Implicit(Integrator):
         self, evaluate: Evaluate, x: Floats, v: Floats, time: float, dt: float, dimension: int,
         coupling: Coupling | None,
     ) -> Stage:  # fmt: skip
-        """Return positions and velocities one step later, (D N,); newton.NotSolved if they are not found."""
+        """Return positions and velocities one step later, (D N,); newton.NotSolvedError if they are not found."""
         h = self.share * dt
         found = solve_stage(evaluate, x, v, time + h, h, dimension, coupling)
         if self.share == 1.0:

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from scipy import sparse
 from scipy.sparse import linalg
 
-__all__ = ["Coupling", "NotSolved", "Stage", "coupled", "solve_stage"]
+__all__ = ["Coupling", "NotSolvedError", "Stage", "coupled", "solve_stage"]
 
 Rows = NDArray[np.floating[Any]]
 
@@ -30,7 +30,7 @@ GMRES_TOLERANCE = 1e-4
 """Of one linear solve, relative: Newton's method makes good what is left."""
 
 
-class NotSolved(ArithmeticError):
+class NotSolvedError(ArithmeticError):
     """Newton's method has not come to an end."""
 
 
@@ -105,7 +105,7 @@ class _Residual:
 def solve_stage(
     evaluate: Evaluate, x0: Rows, v0: Rows, time: float, h: float, dimension: int, coupling: Coupling | None
 ) -> Stage:
-    """Return the stage at `time` of an implicit method with step h; NotSolved if Newton's method does not converge.
+    """Return the stage at `time` of an implicit method with step h; NotSolvedError if Newton's method does not end.
 
     x0, v0: (D N,), one coordinate of all agents after another. It ends when a correction is at rounding, relative to
     the velocities, or stops to shrink there; a correction that does not bring the residual down is halved.
@@ -118,7 +118,7 @@ def solve_stage(
     for iteration in range(1, MOST_ITERATIONS + 1):
         size = float(np.linalg.norm(r))
         if not np.isfinite(size):
-            raise NotSolved("the acceleration is not finite")
+            raise NotSolvedError("the acceleration is not finite")
         if size == 0.0:
             return residual.stage(w, iteration - 1, linear)
         solve = _matrix(residual, w, r, dimension, coupling) if coupling is not None else _free(residual, w, r)
@@ -132,7 +132,7 @@ def solve_stage(
         before = change
         w, r, more = _searched(residual, w, correction, solve)
         linear += more
-    raise NotSolved(f"Newton's method has not converged in {MOST_ITERATIONS} iterations")
+    raise NotSolvedError(f"Newton's method has not converged in {MOST_ITERATIONS} iterations")
 
 
 def _searched(
@@ -184,7 +184,7 @@ def _matrix(
     try:
         factors = linalg.splu(jacobian)
     except RuntimeError:
-        raise NotSolved("the equations are singular") from None
+        raise NotSolvedError("the equations are singular") from None
     return lambda b: (factors.solve(b.astype(float)).astype(w.dtype), 1)
 
 
