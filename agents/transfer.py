@@ -35,7 +35,17 @@ from agents.compare import (
     split,
     write_text,
 )
-from agents.transfer_cells import KEPT, Advance, Plan, clocked, jobs, play_missing, played, played_again
+from agents.transfer_cells import (
+    KEPT,
+    Plan,
+    clocked,
+    jobs,
+    play_missing,
+    played,
+    played_again,
+    rounds_missing,
+    run_round,
+)
 from agents.transfer_report import Setting
 from flockenv.evaluation import WORLDS_PER_SEED, worlds_for
 from flockenv.integrators import INTEGRATORS
@@ -49,6 +59,9 @@ METHODS = ("semi_implicit_euler", "explicit_euler", "midpoint", "velocity_verlet
 SUBSTEPS = (1, 2, 4, 8)
 MOST_SUBSTEPS = 1000
 FILES = ("transfer.json", "transfer.md", "transfer.png")
+
+Advance = Callable[[str, int], None]
+"""Told what has been done, and how many cells or clocks that was."""
 
 app = typer.Typer(add_completion=False, rich_markup_mode=None, pretty_exceptions_enable=False)
 
@@ -69,7 +82,9 @@ def main(
     worlds: Annotated[int, typer.Option(help="Worlds per task, the same for everyone.")] = WORLDS,
     rounds: Annotated[int, typer.Option(help="Rounds by the clock.")] = ROUNDS,
     seed: Annotated[int, typer.Option(help="Which evaluation worlds, 0 to 999.")] = 0,
-    workers: Annotated[int, typer.Option(help="Processes that compile and play.")] = min(2, os.cpu_count() or 1),
+    workers: Annotated[int, typer.Option(help="Processes that compile and play; 1 = none but this one.")] = min(
+        2, os.cpu_count() or 1
+    ),
     out: Annotated[str, typer.Option(help=f"Folder for {', '.join(FILES)}.")] = "results",
     trust_pickle: Annotated[bool, typer.Option("--trust-pickle", help="Load zips too: executes code in them.")] = False,
     debug: Annotated[bool, typer.Option("--debug", help="Show where an error came from.")] = False,
@@ -144,18 +159,19 @@ def _measured(plans: Sequence[Plan], workers: int) -> report.Results:
     for plan, player in product(plans, plans[0].players):
         with blaming(player.name, plan.task, ValueError):
             plan.policy(player, plan.task)  # whoever cannot be had is refused before anybody plays
-    missing = [job for plan in plans for job in jobs(plan)]
-    steps = sum(len(settings) * len(plan.players) for plan, settings in missing) + sum(plan.rounds for plan in plans)
-    about = {}
+    missing, rounds = [job for plan in plans for job in jobs(plan)], rounds_missing(plans)
+    steps = sum(len(settings) * len(plan.players) for plan, settings in missing) + len(rounds) * len(plans)
     with _bar(steps) as advance:
-        with _crew(workers, len(missing)) as over:
-            for what, done in over(play_missing, missing):
-                advance(what, done)
-        for plan in plans:
-            clock = clocked(plan, advance)
-            about[plan.task.name] = transfer_report.task_results(
-                plan.task, plan.settings, played(plan), clock, played_again(plan), RESAMPLES, plan.seed
-            )
+        for doing, work, crew in ((play_missing, missing, workers), (run_round, rounds, 1)):
+            with _crew(crew if workers > 1 else 0, work) as over:
+                for what, done in over(doing, work):
+                    advance(what, done)
+    about = {
+        plan.task.name: transfer_report.task_results(
+            plan.task, plan.settings, played(plan), clocked(plan, plan.rounds), played_again(plan), RESAMPLES, plan.seed
+        )
+        for plan in plans
+    }
     first, worlds, seed = plans[0].first, plans[0].worlds, plans[0].seed
     return {
         "seed": seed,
@@ -170,12 +186,16 @@ def _measured(plans: Sequence[Plan], workers: int) -> report.Results:
 
 
 @contextmanager
-def _crew(workers: int, jobs: int) -> Iterator[Callable[[Any, Iterable[Any]], Iterable[Any]]]:
-    """Offer a map over jobs: in this process, or over several of their own, which end with this one."""
-    if min(workers, jobs) < 2:
+def _crew(processes: int, work: Sequence[Any]) -> Iterator[Callable[[Any, Iterable[Any]], Iterable[Any]]]:
+    """Offer a map over some work: by so many processes, which end with this one; by none, in this one.
+
+    A single process does one piece of work and makes room for a fresh one.
+    """
+    if not (processes and work):
         yield map
         return
-    with get_context("spawn").Pool(min(workers, jobs), _quietly) as pool:
+    count = min(processes, len(work))
+    with get_context("spawn").Pool(count, _quietly, maxtasksperchild=1 if processes == 1 else None) as pool:
         yield pool.imap_unordered
 
 

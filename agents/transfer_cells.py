@@ -6,7 +6,7 @@ import functools
 import hashlib
 import inspect
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
@@ -27,7 +27,10 @@ from flockenv.tasks import Task
 from flockenv.tasks.base import task_source
 from flockenv.world import World
 
-__all__ = ["KEPT", "Job", "Plan", "cell_path", "clocked", "jobs", "play", "play_missing", "played", "played_again"]
+__all__ = [
+    "KEPT", "Job", "Plan", "Round", "cell_path", "clocked", "jobs", "play", "play_missing", "played", "played_again",
+    "rounds_missing", "run_round",
+]  # fmt: skip
 
 DECISIONS = 30
 """So many are replayed by the clock, from the start of the episodes."""
@@ -36,8 +39,6 @@ REFERENCE = 64
 KEPT = Path("runs/transfer")
 
 Actions = list[NDArray[Any]]
-Advance = Callable[[str, int], None]
-"""Told what has been done, and how many cells or rounds that was."""
 
 
 @dataclass(frozen=True)
@@ -74,6 +75,8 @@ class Plan:
 
 Job = tuple[Plan, tuple[Setting, ...]]
 """Settings of one plan that share a kernel."""
+Round = tuple[tuple[Plan, ...], int]
+"""Plans that are clocked, and the number of the round, from 1."""
 
 
 # --- playing ----------------------------------------------------------------------------------------------------------
@@ -162,25 +165,51 @@ def played_again(plan: Plan) -> dict[str, Cell]:
 # --- the clock --------------------------------------------------------------------------------------------------------
 
 
-def clocked(plan: Plan, advance: Advance = lambda what, done: None) -> Clock:
-    """Replay the same actions under every setting: where they lead, and round after round how long a step takes.
+def clocked(plan: Plan, rounds: int) -> Clock:
+    """Replay the same actions under every setting: where they lead, and in each round how long a step takes.
 
-    A round goes through all settings, so that whatever else the machine does meets each of them alike; the rounds that
-    an earlier run has kept are not run again.
+    A round goes through all settings, so that whatever else the machine does meets each of them alike; rounds that are
+    kept are not run again.
     """
-    about = [[task_digest(s.of(plan.task)), _kernel(s.of(plan.task))] for s in plan.settings]
-    path = _place(plan.task, "clock", [about, _print(plan.pilot, plan), plan.worlds, plan.first, DECISIONS])
-    kept = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
-    clock = Clock(rounds=kept.get("rounds", []), error_mm=kept.get("error_mm", {}))
+    path, clock = _clock_path(plan), _kept_clock(plan)
+    if len(clock.rounds) >= rounds:
+        return clock
     actions = _actions(plan)
     if not clock.error_mm:
         clock.error_mm.update(_errors(plan, actions))
-    for number in range(len(clock.rounds), plan.rounds):
+    for number in range(len(clock.rounds), rounds):
         order = plan.settings if number % 2 == 0 else plan.settings[::-1]
         clock.rounds.append({setting.name: _seconds(plan, setting, actions) for setting in order})
         _keep(path, {"rounds": clock.rounds, "error_mm": clock.error_mm})
-        advance(f"{plan.task.name}: by the clock", 1)
     return clock
+
+
+def rounds_missing(plans: Sequence[Plan]) -> list[Round]:
+    """Return the rounds that are not kept for all plans yet."""
+    done = min(len(_kept_clock(plan).rounds) for plan in plans)
+    return [(tuple(plans), number) for number in range(done + 1, max(plan.rounds for plan in plans) + 1)]
+
+
+def run_round(job: Round) -> tuple[str, int]:
+    """Run one round for every plan; return what was done, and how many.
+
+    Each round wants a process of its own: where its arrays happen to lie moves the time of a small world by up to two
+    fifths, and stays as it is until the process ends.
+    """
+    plans, number = job
+    for plan in plans:
+        clocked(plan, number)
+    return f"by the clock: round {number}", len(plans)
+
+
+def _clock_path(plan: Plan) -> Path:
+    about = [[task_digest(s.of(plan.task)), _kernel(s.of(plan.task))] for s in plan.settings]
+    return _place(plan.task, "clock", [about, _print(plan.pilot, plan), plan.worlds, plan.first, DECISIONS])
+
+
+def _kept_clock(plan: Plan) -> Clock:
+    path = _clock_path(plan)
+    return Clock(**json.loads(path.read_text(encoding="utf-8"))) if path.is_file() else Clock()
 
 
 def _actions(plan: Plan) -> Actions:
