@@ -22,6 +22,6 @@ from flockenv.integrators.semi_implicit_euler import SemiImplicitEuler  # noqa: 
 from flockenv.integrators.velocity_verlet import VelocityVerlet  # noqa: E402
 
 __all__ = [
-    "INTEGRATORS", "RK4", "AdaptiveRK4", "AveragedVelocity", "DormandPrince", "ExplicitEuler", "ExponentialDrag", "Heun",
-    "Integrator", "Midpoint", "SemiImplicitEuler", "VelocityVerlet",
+    "INTEGRATORS", "RK4", "AdaptiveRK4", "AveragedVelocity", "DormandPrince", "ExplicitEuler", "ExponentialDrag",
+    "Heun", "Integrator", "Midpoint", "SemiImplicitEuler", "VelocityVerlet",
 ]  # fmt: skip
