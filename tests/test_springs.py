@@ -1,4 +1,4 @@
-"""Springs, hinges and finite elements as effects: forces are gradients, modes have their frequencies, nobody is lost."""
+"""Springs, hinges and finite elements as effects: forces are gradients, modes have their frequencies."""
 
 from __future__ import annotations
 
@@ -12,14 +12,13 @@ import scipy.linalg
 from flockenv.crew import use_threads
 from flockenv.effects import AngularSprings, Elastic, Gravity, Springs
 from flockenv.effects.base import all_masses
-from flockenv.elements import Material, frequencies, freedoms, mass, solve_static, stiffness
-from flockenv.integrators import ImplicitEuler, ImplicitMidpoint, RK4
+from flockenv.elements import Material, freedoms, frequencies, mass, solve_static, stiffness
+from flockenv.integrators import RK4, ImplicitEuler, ImplicitMidpoint
 from flockenv.networks import Cloth, Mesh, Rope
 from flockenv.scene import Group, Scene
 from flockenv.space import Torus
 from flockenv.spawn import Spawn
 from flockenv.state import State
-from tests.catalogue import Array
 
 DIMENSIONS = pytest.mark.parametrize("dimension", [2, 3])
 
@@ -332,9 +331,7 @@ def test_other_groups_are_not_touched() -> None:
 REFUSED = [
     (lambda: scene(Rope(links=2, length=1.0), Springs(group=1, stiffness=1)), "group = 1: there are 1 groups"),
     (
-        lambda: Scene(
-            groups=(Group(count=3, spawn=Spawn(low=(0, 0), high=(1, 1))),), effects=(Springs(stiffness=1),)
-        ),
+        lambda: Scene(groups=(Group(count=3, spawn=Spawn(low=(0, 0), high=(1, 1))),), effects=(Springs(stiffness=1),)),
         "effects[0].group = 0: has no network",
     ),
     (lambda: scene(cloth(3), Elastic(young=1), dimension=3), "effects[0]"),
@@ -362,4 +359,3 @@ def test_a_free_body_slows_down_by_alpha() -> None:
     state.vel[..., 0] = 2.0
     end = world.run(state, 1000)
     np.testing.assert_allclose(end.vel[..., 0], 2 * math.exp(-0.5), rtol=1e-9)
-
