@@ -17,6 +17,7 @@ from flockenv.effects.fields import Carried, Sink, Source, Uniform, Vortex, Wind
 from flockenv.effects.flock import Alignment, Cohesion, Separation  # noqa: E402
 from flockenv.effects.fluctuation import Fluctuation  # noqa: E402
 from flockenv.effects.gravity import Gravity  # noqa: E402
+from flockenv.effects.pressure import Pressure  # noqa: E402
 
 __all__ = [
     "EFFECTS",
@@ -31,6 +32,7 @@ __all__ = [
     "Gravity",
     "Me",
     "Other",
+    "Pressure",
     "QuadraticDrag",
     "Separation",
     "Sight",
