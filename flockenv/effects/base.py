@@ -37,8 +37,12 @@ from flockenv.vec import dot
 
 __all__ = ["EFFECTS", "Bonds", "Effect", "Me", "Other", "Sight", "Vector", "in_view", "ties"]
 
-Vector = Annotated[tuple[Annotated[float, Field(strict=True)], ...], Field(min_length=2, max_length=3)]
-"""A parameter with a direction, or a place: as many numbers as the scene has dimensions."""
+Vector = Annotated[tuple[Annotated[float, Field(strict=True)], ...], Field(strict=False, min_length=2, max_length=3)]
+"""A parameter with a direction, or a place: as many numbers as the scene has dimensions.
+
+Its numbers are checked strictly, and it may be a list: a scene file is read strictly, and its effects come as Python's
+lists.
+"""
 
 EFFECTS: dict[str, type[Effect]] = {}
 """Every effect by its kind; a class registers itself when it is defined."""
