@@ -1,33 +1,36 @@
 """The acceleration of every agent of a world: what all laws say, summed and divided by mass.
 
-Pair laws come first, in one sweep (`sense`), and leave what they came to in `felt`, by agent; bonds in `pulled`. Then each block adds what
-an agent wants or feels by itself, and a fold over the obstacles (`respond`); what it wants is bounded by max_force.
+Pair laws come first, in one sweep (`sense`), and leave what they came to in `felt`, by agent; laws about everybody, and
+bonds, in `pulled`. Then each block adds what an agent wants or feels by itself, and a fold over the obstacles
+(`respond`); what it wants is bounded by max_force.
 """
 
 from __future__ import annotations
 
 from flockenv.sweep.bonds import bonds
+from flockenv.sweep.far import far
 from flockenv.sweep.pairs import pairs
 from flockenv.sweep.parts import Parts
-from flockenv.sweep.text import CONTEXT, Slots, indented, lane, lanes_of, tuple_of
+from flockenv.sweep.text import CONTEXT, Slots, alone, indented, lane, lanes_of, tuple_of
 
-__all__ = ["accelerate", "damping", "parameters"]
+__all__ = ["accelerate", "parameters"]
 
 
 def accelerate(parts: Parts) -> str:
     """Return the source of `accelerate`: pair laws first, then each agent by itself, block after block."""
     d = parts.dimension
-    me = ["i = row + l", f"x, v = {lanes_of(parts, 'pos')}, {lanes_of(parts, 'vel')}", _me_alone()]
+    me = ["i = row + l", f"x, v = {lanes_of(parts, 'pos')}, {lanes_of(parts, 'vel')}", f"me = {alone()}"]
     return f'''
 
 @kernel
 def sense(context, pos, vel, time):
-    """Write what this thread's agents of one world feel from others, by pair laws and bonds, from the frozen present."""
+    """Write what this thread's agents of one world feel from others, at this instant, whatever law it is by."""
     {CONTEXT} = context
 {indented(parameters(parts), 4)}
     if rank == 0:
         work[b, 0] += 1
 {indented(pairs(parts), 4)}
+{indented(far(parts), 4)}
 {indented(bonds(parts), 4)}
 
 
@@ -64,28 +67,6 @@ def accelerate(around, pos, vel, time, acc):
 '''
 
 
-def damping(parts: Parts) -> str:
-    """Return the source of `damping`, for a method that treats linear drag by itself; nothing for others."""
-    if not parts.integrator.splits_drag:
-        return ""
-    rates = [f"p{k}.{e.linear_drag}" for k, e in enumerate(parts.effects) if e.linear_drag]
-    d = parts.dimension
-    return f'''
-
-@kernel
-def damping(around, rate):
-    """The sum of all linear drags of every coordinate, 1/s."""
-    context, first_, end_ = around
-    {CONTEXT} = context
-{indented(parameters(parts), 4)}
-    for block in range(np.uint64(first_), np.uint64(end_)):
-        base, row = block * np.uint64({d * parts.width}), block * np.uint64({parts.width})
-        for l in range(np.uint64({parts.width})):
-            c = {" + ".join(rates) or "like(mass[0], 0.0)"}
-{indented([f"{lane(parts, 'rate', k)} = c / mass[row + l]" for k in range(d)], 12)}
-'''
-
-
 def parameters(parts: Parts) -> list[str]:
     """Write how the numbers are read, in the order of `Parts.parameters`."""
     d = parts.dimension
@@ -103,11 +84,6 @@ def parameters(parts: Parts) -> list[str]:
             at += count
         lines.append(f"p{k} = P{k}({', '.join(values) or 'params[0]'})")
     return lines
-
-
-def _me_alone() -> str:
-    """Write agent i as the laws of one agent see it: no tie, there is nobody to part from."""
-    return "me = Me(ident[i], x, v, unit(v), mass[i], radius[i], max_speed[i], max_force[i], zero(x), time, zero(x))"
 
 
 def _nearest_images(parts: Parts) -> list[str]:
@@ -136,7 +112,7 @@ def _medium(parts: Parts) -> list[str]:
     return [
         "m = o",
         *media,
-        "me = Me(ident[i], x, v, me.heading, mass[i], radius[i], max_speed[i], max_force[i], o, time, m)",
+        f"me = {alone(medium='m')}",
     ]
 
 
@@ -160,9 +136,7 @@ def _own(parts: Parts) -> list[str]:
         if effect.own_law is not None:
             still = effect.linear_drag is not None and parts.integrator.splits_drag
             if still:  # what is left of -c (v - u): the method adds -c v
-                lines.append(
-                    "rest = Me(ident[i], x, o, o, mass[i], radius[i], max_speed[i], max_force[i], o, time, me.medium)"
-                )
+                lines.append(f"rest = {alone(medium='me.medium', vel='o', heading='o')}")
             lines.append(f"{to} = add({to}, own_law_{k}({_given(parts, k)}, {'rest' if still else 'me'}))")
         if effect.obstacle_law is not None:
             lines.append(f"{to} = add({to}, obstacle_finish_{k}(p{k}, me, ({', '.join(slot.all(f'o{k}_'))},)))")
@@ -176,7 +150,7 @@ def _felt(parts: Parts) -> list[str]:
     for t, name in enumerate(parts.targets):
         places = [f"felt[row * np.uint64({each}) + np.uint64({(d * t + k) * parts.width}) + l]" for k in range(d)]
         lines.append(f"{name} = add({name}, ({', '.join(places)},))")
-    if parts.bonded:
+    if parts.pulls:
         lines.append(f"f = add(f, {lanes_of(parts, 'pulled')})")
     return lines
 
