@@ -34,6 +34,8 @@ from flockenv.effects import (
     Separation,
     Sink,
     Source,
+    Swing,
+    Tether,
     Uniform,
     Vortex,
     Wind,
@@ -180,6 +182,8 @@ EFFECTS = (
     EffectRow(WIND, beside=(DRAG,), signed=("phase",)),
     EffectRow(Carried(share=0.9), beside=(WIND, DRAG)),
     EffectRow(Attraction(strength=2, centre=CENTRE, softening=0.5), signed=("strength",)),
+    EffectRow(Tether(centre=CENTRE, stiffness=0.8, damping=0.1, rest=0.5)),
+    EffectRow(Swing(centre=CENTRE, strength=0.8, length=0.7), obeys=frozenset({"translation", "mirror", "relabelling"})),
     EffectRow(Fluctuation(strength=0.8), obeys=frozenset({"translation"})),  # to each his own, along the axes
     EffectRow(Pressure(strength=1.5, density=1, radius=1.35)),
     EffectRow(Separation(weight=1.3, radius=2.5)),

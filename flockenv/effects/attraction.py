@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, ClassVar, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field
 
 from flockenv.effects.base import Effect, Me, Vector
 from flockenv.kernels import Vec, law, like
+from flockenv.state import State
 from flockenv.vec import dot, scale, sub
 
 __all__ = ["Attraction"]
@@ -37,3 +40,8 @@ class Attraction(Effect):
     own_law: ClassVar[str | None] = "attraction"
     places: ClassVar[tuple[str, ...]] = ("centre",)
     strengths: ClassVar[tuple[str, ...]] = ("strength",)
+
+    def potential(self, groups: Sequence[Any], state: State, offset: Any) -> NDArray[np.float64]:
+        """Sum of -k / sqrt(r^2 + s^2) of all agents, (B,) J."""
+        square = (offset(self.centre, state.pos) ** 2).sum(axis=-1)
+        return np.asarray((-self.strength / np.sqrt(square + self.softening**2)).sum(axis=1))

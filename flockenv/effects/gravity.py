@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, ClassVar, Literal
 
+import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field
 
-from flockenv.effects.base import Effect, Me, Vector
+from flockenv.effects.base import Effect, Me, Vector, all_masses
 from flockenv.kernels import Vec, law
+from flockenv.state import State
 from flockenv.vec import scale
 
 __all__ = ["Gravity"]
@@ -26,3 +30,9 @@ class Gravity(Effect):
     acceleration: Vector = Field(default=(0.0, -9.81), description="m/s^2, which is N per kg; as many as dimensions")
     own_law: ClassVar[str | None] = "gravity"
     strengths: ClassVar[tuple[str, ...]] = ("acceleration",)
+
+    def potential(self, groups: Sequence[Any], state: State, offset: Any) -> NDArray[np.float64]:
+        """Sum of -m g . x of all agents that can fall, (B,) J."""
+        mass = all_masses(groups, state.shape[2])
+        fall = np.where(np.isfinite(mass), mass, 0.0)
+        return np.asarray(-(state.pos @ np.array(self.acceleration) * fall).sum(axis=1))
