@@ -65,7 +65,17 @@ MEMORY_LIMIT = 8 * 2**30
 
 def _keep(value: Any, handler: Any) -> Any:
     """Let a record through as it is: an effect of somebody else's is as good as ours, only files need the list."""
-    return value if isinstance(value, (Effect, Integrator)) else handler(value)
+    return value if isinstance(value, (Effect, Integrator)) else handler(_in_tuples(value))
+
+
+def _in_tuples(value: Any) -> Any:
+    """Return what a file says with tuples in the place of lists: strictly read, only JSON's lists are taken for tuples.
+
+    (And here they are Python's already: pydantic hands them over so to a function like `_keep`.)
+    """
+    if isinstance(value, Mapping):
+        return {key: _in_tuples(inner) for key, inner in value.items()}
+    return tuple(map(_in_tuples, value)) if isinstance(value, list) else value
 
 
 if TYPE_CHECKING:

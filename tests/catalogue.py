@@ -29,6 +29,7 @@ from flockenv.effects import (
     Effect,
     Fluctuation,
     Gravity,
+    Pressure,
     QuadraticDrag,
     Separation,
     Sink,
@@ -186,6 +187,7 @@ EFFECTS = (
         Swing(centre=CENTRE, strength=0.8, length=0.7), obeys=frozenset({"translation", "mirror", "relabelling"})
     ),
     EffectRow(Fluctuation(strength=0.8), obeys=frozenset({"translation"})),  # to each his own, along the axes
+    EffectRow(Pressure(strength=1.5, density=1, radius=1.35)),
     EffectRow(Separation(weight=1.3, radius=2.5)),
     EffectRow(Separation(weight=1.3, radius=2.5, fov=200, nearest=3)),
     EffectRow(Alignment(weight=0.7, radius=3, fov=270)),
