@@ -19,7 +19,26 @@ from numpy.typing import NDArray
 
 from flockenv import arbitration, steering
 from flockenv.effects import EFFECTS as EFFECT_KINDS
-from flockenv.effects import Alignment, AvoidObstacles, Cohesion, Drag, Effect, Separation
+from flockenv.effects import (
+    Alignment,
+    Attraction,
+    AvoidObstacles,
+    Carried,
+    Cohesion,
+    Drag,
+    Effect,
+    Fluctuation,
+    Gravity,
+    QuadraticDrag,
+    Separation,
+    Sink,
+    Source,
+    Swing,
+    Tether,
+    Uniform,
+    Vortex,
+    Wind,
+)
 from flockenv.integrators import (
     RK4,
     AdaptiveRK4,
@@ -91,27 +110,88 @@ ARBITRATION = (arbitration.blend, arbitration.prioritise, arbitration.allocate)
 
 @dataclass(frozen=True)
 class EffectRow:
-    """An effect with parameters under which it acts, the same one at rest, and what it must obey."""
+    """An effect with parameters under which it acts, and what it must obey.
+
+    Vectors are given in 3-D; in 2-D their first two numbers are taken, and an axis is left out.
+    """
 
     effect: Effect
-    idle: Effect | None = None  # with this one a scene must move exactly as without any
-    obeys: frozenset[str] = field(default=frozenset({"translation", "rotation", "mirror"}))
+    beside: tuple[Effect, ...] = ()  # without which it moves nobody: what a medium drags or carries
+    obeys: frozenset[str] = frozenset({"translation", "rotation", "mirror", "relabelling"})
+    signed: tuple[str, ...] = ()  # parameters that may be negative
 
     @property
     def name(self) -> str:
         fov, nearest = getattr(self.effect, "fov", 360.0), getattr(self.effect, "nearest", None)
-        return self.effect.kind + ("" if fov == 360.0 else "_cone") + (f"_nearest_{nearest}" if nearest else "")
+        words = ["cone"] * (fov < 360.0) + ([f"nearest_{nearest}"] if nearest else [])
+        words += ["medium"] * (getattr(self.effect, "acts", "") == "medium")
+        return "_".join([self.effect.kind, *words])
+
+    def at(self, dimension: int) -> tuple[Effect, ...]:
+        """The effect in so many dimensions, and those beside it."""
+        return tuple(in_dimension(effect, dimension) for effect in (self.effect, *self.beside))
 
 
-# An idle effect sees as the acting one does, so that both are one compiled kernel.
+def vectors(effect: Effect) -> dict[str, tuple[float, ...]]:
+    """What of an effect's parameters are directions and places."""
+    return {name: value for name, value in effect.parameters().items() if isinstance(value, tuple)}
+
+
+def in_dimension(effect: Effect, dimension: int) -> Effect:
+    """The same effect with the first numbers of its vectors; in the plane nobody turns about an axis."""
+    flat = {
+        name: None if name == "axis" and dimension == 2 else value[:dimension]
+        for name, value in vectors(effect).items()
+    }
+    return effect.model_copy(update=flat)
+
+
+def turned(effect: Effect, matrix: Array, shift: Array) -> Effect:
+    """The same effect with its directions turned, and its places turned about the middle of EDGE and shifted."""
+    middle = EDGE / 2
+    change = {
+        name: tuple(
+            (np.array(value) - middle) @ matrix.T + middle + shift if name in effect.places else value @ matrix.T
+        )
+        for name, value in vectors(effect).items()
+    }
+    return effect.model_copy(update={name: tuple(map(float, value)) for name, value in change.items()})
+
+
+DRAG = Drag(rate=0.4)
+WIND = Wind(velocity=(1.5, -0.7, 0.4), gust=(0.5, 1.0, -0.3), period=0.8)
+CENTRE = (2.5, 2.5, 2.5)
+
 EFFECTS = (
-    EffectRow(Drag(rate=0.4), Drag(rate=0)),
-    EffectRow(Separation(weight=1.3, radius=2.5), Separation(weight=0, radius=2.5)),
+    EffectRow(DRAG),
+    EffectRow(QuadraticDrag(rate=0.3)),
+    EffectRow(Gravity(acceleration=(0.5, -3, 1))),
+    EffectRow(Uniform(strength=(0.8, -0.5, 0.3), period=2, phase=0.3), signed=("phase",)),
+    EffectRow(Source(strength=2, centre=CENTRE, maximum=3), signed=("phase",)),
+    EffectRow(Sink(strength=2, centre=CENTRE, maximum=3, acts="medium"), beside=(DRAG,), signed=("phase",)),
+    EffectRow(
+        Vortex(strength=-2, centre=CENTRE, maximum=3, axis=(0.6, 0, 0.8), acts="medium", period=3), beside=(DRAG,),
+        obeys=frozenset({"translation", "rotation", "relabelling"}),  # its mirror image turns the other way
+        signed=("strength", "phase"),
+    ),
+    EffectRow(
+        Vortex(strength=2, centre=CENTRE, maximum=3, axis=(0.6, 0, 0.8)),
+        obeys=frozenset({"translation", "rotation", "relabelling"}), signed=("strength", "phase"),
+    ),
+    EffectRow(WIND, beside=(DRAG,), signed=("phase",)),
+    EffectRow(Carried(share=0.9), beside=(WIND, DRAG)),
+    EffectRow(Attraction(strength=2, centre=CENTRE, softening=0.5), signed=("strength",)),
+    EffectRow(Tether(centre=CENTRE, stiffness=0.8, damping=0.1, rest=0.5)),
+    EffectRow(
+        Swing(centre=CENTRE, strength=0.8, length=0.7), obeys=frozenset({"translation", "mirror", "relabelling"})
+    ),
+    EffectRow(Fluctuation(strength=0.8), obeys=frozenset({"translation"})),  # to each his own, along the axes
+    EffectRow(Separation(weight=1.3, radius=2.5)),
     EffectRow(Separation(weight=1.3, radius=2.5, fov=200, nearest=3)),
-    EffectRow(Alignment(weight=0.7, radius=3, fov=270), Alignment(weight=0, radius=3, fov=270)),
-    EffectRow(Cohesion(weight=0.9, radius=2.8, fov=240), Cohesion(weight=0, radius=2.8, fov=240)),
-    EffectRow(AvoidObstacles(weight=5, horizon=3, margin=0.1), AvoidObstacles(weight=0, horizon=3)),
-)
+    EffectRow(Alignment(weight=0.7, radius=3, fov=270)),
+    EffectRow(Cohesion(weight=0.9, radius=2.8, fov=240)),
+    EffectRow(AvoidObstacles(weight=5, horizon=3, margin=0.1)),
+)  # fmt: skip
 
 
 # --- integrators, spaces, tasks ---------------------------------------------------------------------------------------
@@ -197,6 +277,11 @@ def scene_of(*effects: Effect, dimension: int = 2, space: Space | None = None, *
     return Scene(dimension=dimension, space=space or Plane(), effects=effects, **given)
 
 
+def scene_under(row: EffectRow, dimension: int) -> Scene:
+    """Return the scene in which tests try a row."""
+    return scene_of(*row.at(dimension), dimension=dimension)
+
+
 FIRST = tuple({row.effect.kind: row for row in reversed(EFFECTS)}.values())[::-1]
 """The first row of each kind of effect."""
 
@@ -208,9 +293,10 @@ def everything(dimension: int, *chosen: Effect, **fields: Any) -> Scene:
     around in the same ways (sweep.Parts.sights: who shares a radius, and who has a view cone at all).
     """
     own = {effect.kind: effect for effect in chosen}
-    rest = {row.effect.kind: row.idle if chosen else row.effect for row in FIRST}
+    rest = {effect.kind: effect for effect in (in_dimension(row.effect, dimension) for row in FIRST)}
     given = {"space": SPACES["torus"][dimension]} | fields
-    return scene_of(*(rest | own).values(), dimension=dimension, **given)
+    effects = ({kind: effect.idle() for kind, effect in rest.items()} if chosen else rest) | own
+    return scene_of(*effects.values(), dimension=dimension, **given)
 
 
 @dataclass(frozen=True)

@@ -16,6 +16,9 @@ from flockenv.integrators.dormand_prince import DormandPrince  # noqa: E402
 from flockenv.integrators.explicit_euler import ExplicitEuler  # noqa: E402
 from flockenv.integrators.exponential_drag import ExponentialDrag  # noqa: E402
 from flockenv.integrators.heun import Heun  # noqa: E402
+from flockenv.integrators.implicit import Implicit  # noqa: E402
+from flockenv.integrators.implicit_euler import ImplicitEuler  # noqa: E402
+from flockenv.integrators.implicit_midpoint import ImplicitMidpoint  # noqa: E402
 from flockenv.integrators.midpoint import Midpoint  # noqa: E402
 from flockenv.integrators.rk4 import RK4  # noqa: E402
 from flockenv.integrators.semi_implicit_euler import SemiImplicitEuler  # noqa: E402
@@ -23,5 +26,6 @@ from flockenv.integrators.velocity_verlet import VelocityVerlet  # noqa: E402
 
 __all__ = [
     "INTEGRATORS", "RK4", "AdaptiveRK4", "AveragedVelocity", "DormandPrince", "ExplicitEuler", "ExponentialDrag",
-    "Heun", "Integrator", "Midpoint", "SemiImplicitEuler", "VelocityVerlet",
+    "Heun", "Implicit", "ImplicitEuler", "ImplicitMidpoint", "Integrator", "Midpoint", "SemiImplicitEuler",
+    "VelocityVerlet",
 ]  # fmt: skip

@@ -106,7 +106,9 @@ class Integrator(Record):
     @classmethod
     def __pydantic_init_subclass__(cls, **kwargs: Any) -> None:
         """Register the class under its kind."""
-        INTEGRATORS[cls.model_fields["kind"].default] = cls
+        kind = cls.model_fields["kind"].default
+        if isinstance(kind, str):
+            INTEGRATORS[kind] = cls
 
     def settings(self) -> tuple[float, ...]:
         """The numbers that `advance` is given: its fields, in order."""
@@ -125,13 +127,13 @@ class Integrator(Record):
         state: State,
         dt: float,
         flow: Callable[[Floats, float], Floats] | None = None,
-        drag: float = 0.0,
+        drag: float | Floats = 0.0,
     ) -> State:
         """Return the state one step later under laws given as Python functions.
 
         `acceleration(pos, vel, time)` takes and returns (N, D), m, m/s, s, m/s^2; `flow(pos, time)` is the velocity of
-        a medium that carries everybody, (N, D) m/s; `drag` is c / m, 1/s, for a method that treats linear drag by
-        itself. Scenes go through Scene.step: this is Python.
+        a medium that carries everybody, (N, D) m/s; `drag` is c / m, 1/s, of all or of each coordinate (D N,), for a
+        method that treats linear drag by itself. Scenes go through Scene.step: this is Python.
         """
         if not (dt > 0 and np.isfinite(dt)):
             raise ValueError(f"dt is {dt}, must be a positive number of seconds")

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from flockenv.effects.base import Effect
 from flockenv.sweep.accelerate import accelerate
+from flockenv.sweep.far import tree_imports
 from flockenv.sweep.method import method, method_imports
 from flockenv.sweep.parts import Parts
 from flockenv.sweep.step import copies, step, step_world
@@ -15,7 +16,7 @@ from flockenv.sweep.text import CONTEXT, SHARED
 __all__ = ["field_source", "scene_source"]
 
 LAWS = (
-    "own_law", "medium_law", "flow_law", "bond_law", "kick_law", "pair_law", "finish_law",
+    "own_law", "medium_law", "flow_law", "far_law", "bond_law", "kick_law", "pair_law", "finish_law",
     "obstacle_start", "obstacle_law", "obstacle_finish",
 )  # fmt: skip
 """The slots that an effect may fill with the name of a law."""
@@ -79,12 +80,13 @@ def _imports(parts: Parts) -> str:
         "from collections import namedtuple",
         "import numpy as np",
         "from numba import njit",
-        "from flockenv.effects.base import Me, Other, in_view",
+        "from flockenv.effects.base import Far, Me, Other, in_view",
         "from flockenv.kernels import copy_line, finite, kernel, like, unaliased, wait_for_team",
-        "from flockenv.neighbours import candidates, count_cells, order_records, place_of, row_of",
+        "from flockenv.neighbours import candidates, count_cells, order_records, row_of",
         f"from flockenv.space import {parts.space.offset_law} as offset_to, {parts.space.confine_law} as confine",
         "from flockenv.noise import normal",
         "from flockenv.vec import add, dot, exact_dot, limit, norm, scale, sub, unit, zero",
+        *tree_imports(parts),
         method_imports(parts),
     ]
     for k, effect in enumerate(parts.effects):
