@@ -62,7 +62,7 @@ def tree_sizes(agents: int, lanes: int, dimension: int, team: int) -> dict[str, 
 
 
 @kernel
-def _exchange(x: int, other: int, k: int) -> tuple[int, int]:
+def _exchange(x: Any, other: Any, k: int) -> Any:
     """Where bit k of the other axis is set, invert the bits of x below it; else exchange those of both."""
     below, here = (np.int64(1) << k) - 1, (other >> k) & 1
     swap = (x ^ other) & below & (here - 1)
@@ -99,11 +99,10 @@ def _along_curve(cells: Any, flat: bool, bits: int) -> None:
 
 
 @kernel
-def _cell(x: float, low: float, pace: float, cells: int) -> int:
+def _cell(x: float, low: float, pace: float, cells: Any) -> Any:
     """Return which of so many cells of an axis x is in; a NaN in the first."""
     at = (np.float64(x) - low) * pace
-    at = at if at > 0.0 else 0.0
-    return np.int64(min(at, np.float64(cells - 1)))
+    return np.int64(min(at, np.float64(cells - 1)) if at > 0.0 else 0.0)
 
 
 @kernel
@@ -165,7 +164,7 @@ def line_up(
     _place(keys, count // TOGETHER * TOGETHER, count, digits, d == 2, bits)
     _sort(keys, places, digits, count, room)
     for i in range((count + lanes - 1) // lanes * lanes):
-        who = np.int64(places[min(i, count - 1)])
+        who: Any = np.int64(places[min(i, count - 1)])
         source, to = place_of(who, d, lanes), place_of(i, d + 1, lanes)
         for k in range(d):
             leaves[to + k * lanes] = pos[source + k * lanes]
@@ -252,8 +251,7 @@ def weigh(leaves: Any, count: int, lanes: int, size: Any, by_mass: bool, digits:
 def _onward(level: int, node: int, top: int, digits: Any) -> tuple[int, int]:
     """Return the node after this one and all that it holds; on a level above the highest there is none."""
     while level < top and (
-        node % CHILDREN == CHILDREN - 1
-        or digits[BUCKETS + level] + node + 1 == digits[BUCKETS + level + 1]
+        node % CHILDREN == CHILDREN - 1 or digits[BUCKETS + level] + node + 1 == digits[BUCKETS + level + 1]
     ):
         level, node = level + 1, node // CHILDREN
     return (level, node + 1) if level < top else (top + 1, node)
@@ -265,13 +263,13 @@ def _is_far(nodes: Any, own: int, at: int, slack: float, d: int) -> bool:
 
     For angles up to 1 that never holds of a node that the block itself is in.
     """
-    square = np.float64(0.0)
+    square = 0.0
     for k in range(d):
         x = nodes[at + k]
         gap = np.float64(max(nodes[own + d + k] - x, x - nodes[own + 2 * d + k]))
         square += gap * gap if gap > 0.0 else 0.0
     bound = nodes[at + 3 * d + 1] * slack + nodes[at + 3 * d + 2]
-    return square > bound * bound
+    return bool(square > bound * bound)
 
 
 @kernel

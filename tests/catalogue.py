@@ -19,7 +19,16 @@ from numpy.typing import NDArray
 
 from flockenv import arbitration, steering
 from flockenv.effects import EFFECTS as EFFECT_KINDS
-from flockenv.effects import Alignment, AvoidObstacles, Cohesion, Drag, Effect, Separation
+from flockenv.effects import (
+    Alignment,
+    AvoidObstacles,
+    Cohesion,
+    Drag,
+    Effect,
+    Gravitation,
+    InverseSquare,
+    Separation,
+)
 from flockenv.integrators import (
     RK4,
     AveragedVelocity,
@@ -108,6 +117,9 @@ EFFECTS = (
     EffectRow(Alignment(weight=0.7, radius=3, fov=270), Alignment(weight=0, radius=3, fov=270)),
     EffectRow(Cohesion(weight=0.9, radius=2.8, fov=240), Cohesion(weight=0, radius=2.8, fov=240)),
     EffectRow(AvoidObstacles(weight=5, horizon=3, margin=0.1), AvoidObstacles(weight=0, horizon=3)),
+    # few agents: here the sum is exact; of many, see test_gravitation.py
+    EffectRow(Gravitation(constant=0.3, softening=0.5), Gravitation(constant=0, softening=0.5)),
+    EffectRow(InverseSquare(strength=-0.4, softening=0.3), InverseSquare(strength=0, softening=0.3)),
 )
 
 
@@ -187,13 +199,15 @@ FIRST = tuple({row.effect.kind: row for row in reversed(EFFECTS)}.values())[::-1
 
 
 def everything(dimension: int, *chosen: Effect, **fields: Any) -> Scene:
-    """Return all kinds of effects at once, on a torus unless another space is given.
+    """Return all kinds of effects at once, on a torus unless another space is given; but who acts on everybody.
+
+    They are refused on a torus, and would make every scene of many agents here one with a tree.
 
     With some chosen, the others are there and idle: one kernel serves for tests of each of them, as long as they look
     around in the same ways (sweep.Parts.sights: who shares a radius, and who has a view cone at all).
     """
     own = {effect.kind: effect for effect in chosen}
-    rest = {row.effect.kind: row.idle if chosen else row.effect for row in FIRST}
+    rest = {row.effect.kind: row.idle if chosen else row.effect for row in FIRST if not row.effect.far_law}
     given = {"space": SPACES["torus"][dimension]} | fields
     return scene_of(*(rest | own).values(), dimension=dimension, **given)
 

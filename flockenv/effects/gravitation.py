@@ -25,7 +25,7 @@ __all__ = ["Gravitation", "InverseSquare"]
 def _per_cube(p: Any, other: Far) -> float:
     """Return 1 / (d^2 + eps^2)^(3/2), 1/m^3, times the weight."""
     square = other.square + p.softening * p.softening
-    return other.weight / (square * np.sqrt(square))
+    return other.weight / (square * np.sqrt(square))  # type: ignore[no-any-return]  # np.sqrt keeps float32
 
 
 @law
@@ -46,7 +46,7 @@ class _Softened(Effect):
     softening: float = Field(ge=0, description="eps, m; 0 = point masses, which nothing keeps apart")
     opening: float = Field(
         default=0.5, ge=0, le=1,
-        description="theta: many agents are met as one whose group is narrower than theta times its distance; 0 = never",
+        description="theta: a group is met as one if it is narrower than theta times its distance; 0 = never",
     )  # fmt: skip
     conserves_momentum: ClassVar[bool] = True
 

@@ -27,7 +27,11 @@ def far(parts: Parts) -> list[str]:
         "wait_for_team(sync, team)  # positions are everybody's",
         *(_direct(parts, direct) if direct else []),
         *(_line_up(parts) if parts.treed else []),
-        *(line for k, effect in parts.treed for line in _walk(parts, k, effect, bool(direct) or k != parts.treed[0][0])),
+        *(
+            line
+            for k, effect in parts.treed
+            for line in _walk(parts, k, effect, bool(direct) or k != parts.treed[0][0])
+        ),
         *([] if parts.treed else ["wait_for_team(sync, team)  # nobody moves before all have looked"]),
     ]
 
@@ -83,11 +87,8 @@ def _meet(effects: list[tuple[int, Effect]], sums: list[str], count: str) -> lis
 
 def _line_up(parts: Parts) -> list[str]:
     """Write how one thread sorts the living for a tree."""
-    return [
-        "if rank == 0:",
-        f"    line_up(pos, living, mass, n, {parts.width}, sync, bounds, size, tree_key, tree_place, tree_digit, "
-        "tree_leaf)",
-    ]
+    scratch = "sync, bounds, size, tree_key, tree_place, tree_digit, tree_leaf"
+    return ["if rank == 0:", f"    line_up(pos, living, mass, n, {parts.width}, {scratch})"]
 
 
 def _walk(parts: Parts, k: int, effect: Effect, adds: bool) -> list[str]:
@@ -95,22 +96,20 @@ def _walk(parts: Parts, k: int, effect: Effect, adds: bool) -> list[str]:
     d, w, slot = parts.dimension, parts.width, Slots(parts)
     sums = slot.all("far")
     by_mass = str(effect.weighs_mass)
-    gathered = (
-        f"gather(tree_leaf, tree_node, tree_digit, present, {w}, size, {by_mass}, p{k}.opening, np.int64(block), level, "
-        "node, tree_near, begin)"
-    )
+    tree = f"tree_leaf, tree_node, tree_digit, present, {w}, size, {by_mass}"
     return [
         "if rank == 0:",
         f"    weigh(tree_leaf, present, {w}, size, {by_mass}, tree_digit, tree_node)",
         "wait_for_team(sync, team)  # the tree is everybody's",
         f"met, blocks, begin = 0, (present + {w - 1}) // {w}, rank * {LISTED * (d + 1)}",
-        "for block in range(np.uint64(blocks * rank // team), np.uint64(blocks * (rank + 1) // team)):",
-        f"    base, held = block * np.uint64({(d + 1) * w}), min({w}, present - np.int64(block) * {w})",
+        "for block in range(blocks * rank // team, blocks * (rank + 1) // team):",
+        f"    base, row = np.uint64(block * {(d + 1) * w}), np.uint64(block * {w})",
+        f"    held = min({w}, present - block * {w})",
         f"    for l in range(np.uint64({w})):",
         indented([f"{s} = 0" for s in sums], 8),
         f"    level, node = np.int64(tree_digit[{BUCKETS + LEVELS}]), 0",
         f"    while level <= tree_digit[{BUCKETS + LEVELS}]:",
-        f"        many, level, node = {gathered}",
+        f"        many, level, node = gather({tree}, p{k}.opening, block, level, node, tree_near, begin)",
         "        met += many * held",
         f"        for j in range(np.uint64(begin), np.uint64(begin + many * {d + 1}), np.uint64({d + 1})):",
         f"            xj, heavy = {tuple_of('tree_near[j + np.uint64(#)]', d)}, tree_near[j + np.uint64({d})]",
@@ -118,7 +117,7 @@ def _walk(parts: Parts, k: int, effect: Effect, adds: bool) -> list[str]:
         f"                x, m = {lanes_of(parts, 'tree_leaf')}, tree_leaf[base + np.uint64({d * w}) + l]",
         indented(_meet([(k, effect)], sums, "heavy"), 16),
         "    for l in range(np.uint64(held)):",
-        f"        place = np.uint64(place_of(np.int64(tree_place[block * np.uint64({w}) + l]), {d}, {w}))",
+        f"        place = np.uint64(place_of(np.int64(tree_place[row + l]), {d}, {w}))",
         indented([f"pulled[place + np.uint64({j * w})] {'+' * adds}= {s}" for j, s in enumerate(sums)], 8),
         "tally[rank] = met",
         "wait_for_team(sync, team)  # what is pulled was written by others",

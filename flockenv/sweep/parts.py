@@ -194,7 +194,10 @@ class Parts:
         runs = [(f"c{k}_", e.sums(d)) for k, e in self.pairs]
         runs += [(f"near{q}_", sight.nearest or 0) for q, sight in enumerate(self.sights)]
         runs += [(f"o{k}_", e.folded(d) if e.obstacle_law else 0) for k, e in enumerate(self.effects)]
-        runs += [(f"g{name}", d) for name in self.targets] + [("bond", d * bool(self.bonded)), ("far", d * bool(self.far))]
+        runs += [(f"g{name}", d) for name in self.targets] + [
+            ("bond", d * bool(self.bonded)),
+            ("far", d * bool(self.far)),
+        ]
         runs += [("square", look.agents), ("place", look.agents), ("gap", look.obstacles), ("which", look.obstacles)]
         names = [f"{name}{j}" for name, many in runs for j in range(many)]
         return {name: place for place, name in enumerate([*names, "bad"])}

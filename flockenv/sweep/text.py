@@ -12,9 +12,9 @@ from flockenv.sweep.parts import Parts
 __all__ = ["CONTEXT", "SHARED", "Slots", "copied", "indented", "indented_lines", "lane", "lanes_of", "tuple_of"]
 
 _READ = (
-    "mass, radius, max_speed, max_force, living, ident, want, felt, pulled, carrying, sorted_, records, luggage, order, "
-    "cell, start, offset, bounds, tally, sync, tie, bond_place, bond_number, bond_start, tree_key, tree_place, tree_digit, "
-    "tree_leaf, tree_node, tree_near, number, lanes, ranges"
+    "mass, radius, max_speed, max_force, living, ident, want, felt, pulled, carrying, sorted_, records, luggage, "
+    "order, cell, start, offset, bounds, tally, sync, tie, bond_place, bond_number, bond_start, tree_key, tree_place, "
+    "tree_digit, tree_leaf, tree_node, tree_near, number, lanes, ranges"
 )
 SHARED = f"pos, vel, origin, stages, {_READ}"
 """Scratch of one world in progress, in order; see scene.Workspace. The last two belong to one thread."""
