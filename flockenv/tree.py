@@ -21,7 +21,11 @@ from flockenv.neighbours import place_of, region
 __all__ = ["BUCKETS", "LEVELS", "LISTED", "MOST_DIRECT", "gather", "line_up", "tree_sizes", "weigh"]
 
 MOST_DIRECT = 2000
-"""Agents up to whom everybody is met one by one: a tree would be slower."""
+"""Agents up to whom everybody is met one by one, exactly.
+
+In space a tree is slower up to there; in a plane it would be 1.6 times faster from 1,000 on (benchmarks.gravitation),
+and the exact sum of 2,000 takes 1.7 ms.
+"""
 
 CHILDREN = 4
 """Nodes that a node holds. In space too: with 8, levels are so far apart that many nodes are opened in vain."""
