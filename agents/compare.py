@@ -32,7 +32,10 @@ from flockenv.policy import MlpPolicy, Policy, RandomPolicy, load_player
 from flockenv.refusals import nearest, shown
 from flockenv.tasks import TASKS, Task
 
-__all__ = ["Player", "app", "compare", "deliver", "known_players"]
+__all__ = [
+    "Player", "app", "blaming", "compare", "deliver", "experiment_of", "field_of", "folder_of", "known_players", "pick",
+    "provenance", "split", "write_text",
+]  # fmt: skip
 
 ROOT = Path(__file__).resolve().parent.parent
 PLAYERS = ("random", "textbook", "reynolds", "ppo")
@@ -112,7 +115,7 @@ def compare(
     known = known_players(seed)
     plays: dict[str, dict[str, Policy]] = {task.name: {} for task in tasks}
     for task, player in product(tasks, players):
-        with _blaming(player.name, task, ValueError):  # those of load_player name the player themselves
+        with blaming(player.name, task, ValueError):  # those of load_player name the player themselves
             plays[task.name][player.name] = load_player(player.spec, task, known, trust_pickle)
     episodes = {task.name: _play(task, plays[task.name], worlds, first, advance) for task in tasks}
     results: report.Results = {
@@ -127,7 +130,7 @@ def compare(
             )
             for task in tasks
         },
-        **_provenance(),
+        **provenance(),
     }
     results["wall_time_s"] = perf_counter() - began
     return results, episodes
@@ -141,13 +144,13 @@ def _play(task: Task, policies: Mapping[str, Policy], worlds: int, first: int, a
         def progress(done: int, most: int, name: str = name) -> None:
             advance(task.name, name, done, most)
 
-        with _blaming(name, task):
+        with blaming(name, task):
             episodes[name] = rollout(task, policy, worlds, first, record=RECORDED, progress=progress)
     return episodes
 
 
 @contextmanager
-def _blaming(player: str, task: Task, *clear: type[Exception]) -> Iterator[None]:
+def blaming(player: str, task: Task, *clear: type[Exception]) -> Iterator[None]:
     """Say of an error in somebody's player whose it is and in which task, unless it is one of the clear ones."""
     try:
         yield
@@ -163,19 +166,19 @@ def _costs(task: Task, policies: Mapping[str, Policy]) -> dict[str, report.Resul
     for name, policy in policies.items():
         card = getattr(policy, "card", None) or {}
         costs[name] = {key: card[key] for key in ("wall_time_s", "steps") if key in card}
-    steps = _experiment(task.name).reynolds.found.get("agent_steps")
+    steps = experiment_of(task.name).reynolds.found.get("agent_steps")
     if steps and "reynolds" in policies:
         costs["reynolds"] = {"of": "tuning", "steps": round(steps)}
     return costs
 
 
-def _experiment(name: str) -> Experiment:
+def experiment_of(name: str) -> Experiment:
     """Return what the config says of a task: with which settings its players were trained and tuned."""
     path = CONFIGS / f"{name}.yaml"
     return load_experiment(path) if path.is_file() else Experiment(task=name)
 
 
-def _provenance() -> report.Results:
+def provenance() -> report.Results:
     """Return what somebody needs who wants the same numbers again."""
     changes = _git("status", "--porcelain")
     versions = {"flockenv": flockenv.__version__, "python": platform.python_version()}
@@ -220,9 +223,9 @@ def main(
 ) -> None:
     """Play all tasks with all players in the same worlds, and say who won by what."""
     try:
-        folder = _folder(out)
-        chosen = [_experiment(name).build() for name in _pick("--tasks", _split(tasks) or list(TASKS), TASKS)]
-        field = _field(_split(players) or list(PLAYERS))
+        folder = folder_of(out)
+        chosen = [experiment_of(name).build() for name in pick("--tasks", split(tasks) or list(TASKS), TASKS)]
+        field = field_of(split(players) or list(PLAYERS))
         count = worlds if worlds is not None else SMOKE_WORLDS if smoke else WORLDS
         if not 2 <= count <= WORLDS_PER_SEED:
             raise ValueError(f"--worlds {count}: must be from 2 to {WORLDS_PER_SEED}")
@@ -242,18 +245,20 @@ def main(
     _show(results, folder)
 
 
-def _folder(text: str) -> Path:
+def folder_of(text: str) -> Path:
+    """Return the folder that --out names; ValueError if nothing may be written there."""
     folder = checked_path(text)
     if folder.exists() and not folder.is_dir():
         raise ValueError(f"--out {shown(text)}: is a file, must be a folder")
     return folder
 
 
-def _split(values: Sequence[str] | None) -> list[str]:
+def split(values: Sequence[str] | None) -> list[str]:
+    """Return what an option was given, by comma or repeated."""
     return [part.strip() for value in values or () for part in value.split(",") if part.strip()]
 
 
-def _pick(option: str, names: Sequence[str], allowed: Mapping[str, object]) -> list[str]:
+def pick(option: str, names: Sequence[str], allowed: Mapping[str, object]) -> list[str]:
     """Return the names without repeats; ValueError for one that is not allowed."""
     for name in names:
         if name not in allowed:
@@ -262,7 +267,7 @@ def _pick(option: str, names: Sequence[str], allowed: Mapping[str, object]) -> l
     return list(dict.fromkeys(names))
 
 
-def _field(specs: Sequence[str]) -> list[Player]:
+def field_of(specs: Sequence[str]) -> list[Player]:
     """Return the players in the order of the tables: the known ones from the least, then files as they were given."""
     field = [Player.of(spec) for spec in dict.fromkeys(specs)]
     names = [player.name for player in field]
@@ -300,8 +305,8 @@ def _files(
 ) -> dict[str, Callable[[Path], None]]:
     """Return who writes which file."""
     writers: tuple[Callable[[Path], None], ...] = (
-        lambda path: _write(path, report.json_text(results)),
-        lambda path: _write(path, report.markdown(results)),
+        lambda path: write_text(path, report.json_text(results)),
+        lambda path: write_text(path, report.markdown(results)),
         lambda path: _draw(path, results, episodes),
         lambda path: _replay(path, results, episodes),
     )
@@ -333,7 +338,8 @@ def deliver(folder: Path, writers: Mapping[str, Callable[[Path], None]]) -> None
         raise
 
 
-def _write(path: Path, text: str) -> None:
+def write_text(path: Path, text: str) -> None:
+    """Write text with the same bytes on every system."""
     path.write_text(text, encoding="utf-8", newline="\n")
 
 

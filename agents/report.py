@@ -16,7 +16,10 @@ from rich.table import Table
 from flockenv.evaluation import Comparison, Episodes, Interval, compare, summarise
 from flockenv.render.chart import Column, Row
 
-__all__ = ["column", "json_text", "markdown", "player_tables", "task_results", "verdict"]
+__all__ = [
+    "column", "grid", "interval_fields", "interval_text", "json_text", "markdown", "number_text", "player_tables",
+    "table_of", "task_results", "verdict",
+]  # fmt: skip
 
 Results = dict[str, Any]
 
@@ -46,9 +49,9 @@ def task_results(
 def _player(played: Episodes, cost: Results, resamples: int, seed: int) -> Results:
     summary = summarise(played, resamples, seed)
     return {
-        **_interval("iqm", "ci", summary.iqm),
-        **_interval("mean", "mean", summary.mean),
-        **_interval("success_rate", "success", summary.success),
+        **interval_fields("iqm", "ci", summary.iqm),
+        **interval_fields("mean", "mean", summary.mean),
+        **interval_fields("success_rate", "success", summary.success),
         "worlds": played.worlds,
         "episode_length": float(played.lengths.mean()),
         "metrics": {name: {"mean": _number(mean), "worlds": n} for name, (mean, n) in summary.metrics.items()},
@@ -62,15 +65,16 @@ def _player(played: Episodes, cost: Results, resamples: int, seed: int) -> Resul
 
 def _pair(pair: Comparison) -> Results:
     return {
-        **_interval("difference", "ci", pair.difference),
-        **_interval("iqm_difference", "iqm", pair.iqm_difference),
-        **_interval("probability_better", "better", pair.better),
+        **interval_fields("difference", "ci", pair.difference),
+        **interval_fields("iqm_difference", "iqm", pair.iqm_difference),
+        **interval_fields("probability_better", "better", pair.better),
         "worlds": pair.worlds,
         "separated": pair.separated,
     }
 
 
-def _interval(name: str, prefix: str, interval: Interval) -> Results:
+def interval_fields(name: str, prefix: str, interval: Interval) -> Results:
+    """Return an interval as three plain numbers, which interval_text reads."""
     return {name: interval.value, f"{prefix}_low": interval.low, f"{prefix}_high": interval.high}
 
 
@@ -122,13 +126,14 @@ def _costs(name: str, player: Results) -> str:
 def player_tables(task: str, results: Results) -> Iterator[Table]:
     """Yield what a terminal of 80 columns shows of a task: scores, then what happened, then the pairs."""
     header, rows = player_cells(results)
-    yield _table(task, header[:4], [row[:4] for row in rows])
-    yield _table(None, [header[0], *header[4:]], [[row[0], *row[4:]] for row in rows])
+    yield table_of(task, header[:4], [row[:4] for row in rows])
+    yield table_of(None, [header[0], *header[4:]], [[row[0], *row[4:]] for row in rows])
     if results["pairs"]:
-        yield _table(None, *pair_cells(results))
+        yield table_of(None, *pair_cells(results))
 
 
-def _table(title: str | None, header: Sequence[str], rows: Sequence[Sequence[str]]) -> Table:
+def table_of(title: str | None, header: Sequence[str], rows: Sequence[Sequence[str]]) -> Table:
+    """Return a table for a terminal; nothing in it is markup."""
     table = Table(
         title=title and escape(title), title_style="bold", title_justify="left", box=box.SIMPLE_HEAD, padding=(0, 1)
     )
@@ -199,13 +204,14 @@ def markdown(results: Results) -> str:
     seeds = f"{results['world_seeds']['first']} to {results['world_seeds']['last']}"
     parts = ["# Hand-written steering against learning", f"{results['worlds']} worlds per task, seeds {seeds}."]
     for task, about in results["tasks"].items():
-        parts += [f"## {task}", about["verdict"], _grid(*player_cells(about))]
-        parts += [_grid(*pair_cells(about))] if about["pairs"] else []
+        parts += [f"## {task}", about["verdict"], grid(*player_cells(about))]
+        parts += [grid(*pair_cells(about))] if about["pairs"] else []
     versions = ", ".join(f"{name} {version}" for name, version in results["versions"].items())
     return "\n\n".join([*parts, "---", NOTES, f"Made with {versions}.\n"])
 
 
-def _grid(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+def grid(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """Return a table in Markdown."""
     lines = [header, ["---", *("---:" for _ in header[1:])], *rows]
     return "\n".join("| " + " | ".join(cell.replace("|", "\\|") for cell in line) + " |" for line in lines)
 

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from flockenv.kernels import kernel
-from flockenv.neighbours import place_of, region
+from flockenv.neighbours import region
 
 __all__ = ["BUCKETS", "LEVELS", "LISTED", "MOST_DIRECT", "gather", "line_up", "tree_sizes", "weigh"]
 
@@ -63,6 +63,12 @@ def tree_sizes(agents: int, lanes: int, dimension: int, team: int) -> dict[str, 
         "tree_node": nodes * (3 * dimension + 3),
         "tree_near": team * LISTED * (dimension + 1),
     }
+
+
+@kernel
+def place_of(i: int, rows: int, lanes: int) -> int:
+    """Return where the first number of agent i lies, in blocks of lanes with so many rows."""
+    return i // lanes * (rows * lanes) + i % lanes
 
 
 @kernel

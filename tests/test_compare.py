@@ -255,7 +255,7 @@ def test_the_same_seed_gives_the_same_scores_and_another_one_others() -> None:
 
 def test_players_are_ordered_by_what_they_claim_however_they_are_given() -> None:
     Path("mine.py").write_text(STILL)
-    field = comparison._field(["mine.py", "ppo", "random", "reynolds", "textbook", "ppo"])
+    field = comparison.field_of(["mine.py", "ppo", "random", "reynolds", "textbook", "ppo"])
     assert [player.name for player in field] == ["random", "textbook", "reynolds", "ppo", "mine"]
 
 

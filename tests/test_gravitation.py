@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -16,6 +15,7 @@ from flockenv.effects import Effect, Gravitation, InverseSquare, Separation
 from flockenv.explanation import explain
 from flockenv.integrators import RK4
 from flockenv.neighbours import WORTH_ARRANGING
+from flockenv.networks import Rope
 from flockenv.scene import Group, Scene
 from flockenv.space import Torus
 from flockenv.spawn import Spawn
@@ -135,6 +135,24 @@ def test_momentum_is_kept_exactly_by_few_and_to_the_accuracy_of_the_tree_by_many
         assert least <= lost < most
 
 
+@DIMENSIONS
+@KINDS
+def test_the_force_is_the_slope_of_the_potential(kind: str, dimension: int) -> None:
+    effect = acting(kind)
+    scene = cloud(effect, dimension, 40)
+    state = scene.start(9)
+    state.alive[0, 3] = False
+    found = forces(scene, state)
+    for axis in range(dimension):
+        energy = []
+        for shift in (-1e-5, 1e-5):
+            other = state.copy()
+            other.pos[0, 7, axis] += shift
+            energy.append(effect.potential(scene.groups, other, None))
+        slope = (energy[1] - energy[0]) / 2e-5
+        np.testing.assert_allclose(found[7, axis], -slope[0], rtol=1e-5)
+
+
 # --- orbits -----------------------------------------------------------------------------------------------------------
 
 
@@ -250,7 +268,7 @@ class Leash(Effect):
         return 1
 
     def bonds(self, groups: Sequence[Any], dimension: int) -> Bonds:
-        first = np.arange(sum(group.count for group in groups) - 1, dtype=np.int32)
+        first = np.arange(sum(group.size for group in groups) - 1, dtype=np.int32)
         agent, partner = np.concatenate([first, first + 1]), np.concatenate([first + 1, first])
         return Bonds(agent, partner[:, None], np.full((len(agent), 1), 0.01))
 """
@@ -304,11 +322,12 @@ def test_what_does_not_suit_it_is_refused_in_one_line(kind: str) -> None:
         assert "\n" not in str(caught.value)
 
 
-def test_an_infinite_mass_would_pull_infinitely() -> None:
-    scene = SimpleNamespace(groups=(SimpleNamespace(mass=1.0), SimpleNamespace(mass=np.inf)))
-    acting("inverse_square").check(scene)
-    with pytest.raises(ValueError, match=r"constant: groups\[1\].mass is inf"):
-        acting("gravitation").check(scene)
+def test_who_is_pinned_would_pull_infinitely() -> None:
+    free = Group(count=3, spawn=Spawn(low=(0, 0), high=(1, 1)))
+    pinned = Group(network=Rope(links=3, length=3, pinned=(0,)))
+    assert scene_of(acting("inverse_square"), groups=(free, pinned)).agents == 7
+    with pytest.raises(ValueError, match=r"effects\[0\].constant: groups\[1\] has particles that are pinned"):
+        scene_of(acting("gravitation"), groups=(free, pinned))
 
 
 def test_memory_of_a_tree_is_counted_before_it_is_taken() -> None:

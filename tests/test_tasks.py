@@ -13,8 +13,9 @@ import numpy as np
 import pytest
 
 import flockenv
+from flockenv.integrators import RK4, Midpoint, SemiImplicitEuler
 from flockenv.tasks import TASKS, Flock, Obstacles, Pursuit, Task
-from flockenv.tasks.base import NEAR
+from flockenv.tasks.base import NEAR, task_source
 from flockenv.world import Step, World
 from tests.catalogue import TASKS as ROWS
 from tests.catalogue import TaskRow
@@ -84,7 +85,8 @@ def test_a_task_is_a_value_and_names_what_it_has(row: TaskRow) -> None:
     task = row.task
     assert pickle.loads(pickle.dumps(task)) == task
     assert type(task).model_validate(task.model_dump()) == task
-    assert eval(repr(task), {type(task).__name__: type(task)}) == task  # noqa: S307
+    names = {type(record).__name__: type(record) for record in (task, task.integrator)}
+    assert eval(repr(task), names) == task  # noqa: S307
     assert TASKS[task.name] is type(task)
     assert len(task.agent_names) == len(set(task.agent_names)) == task.learners <= task.agents == task.scene.agents
     assert len(task.scene.roles) == task.agents
@@ -97,12 +99,49 @@ def test_a_task_is_a_value_and_names_what_it_has(row: TaskRow) -> None:
 
 
 @EVERY
-@pytest.mark.parametrize("kind", ["typo", "clock", "backwards"])
+def test_a_task_plays_with_the_method_it_is_given_and_shows_the_same_to_policies(row: TaskRow) -> None:
+    task = row.task.model_copy(update={"integrator": {"kind": "midpoint"}})
+    assert task.integrator == task.scene.integrator == Midpoint()
+    assert row.task.integrator == row.task.scene.integrator == SemiImplicitEuler()
+    assert task.layout.digest == row.task.layout.digest
+    assert task.action_layout.digest == row.task.action_layout.digest
+    assert task.parameters() == row.task.parameters()
+    assert task_source(task) != task_source(row.task)
+
+
+def test_a_method_of_second_order_takes_a_constant_force_exactly_and_the_default_one_does_not() -> None:
+    moved = {}
+    for task in (Pursuit(), Pursuit(integrator=Midpoint())):
+        world = world_of(task)
+        place(world, [[5.0, 5.0], [15.0, 15.0]])
+        act(world, (0.5, 0.0))
+        moved[task.integrator.kind] = world.state.pos[0, 0, 0] - 5.0
+    exact = 0.5 * (0.5 * task.pursuer_force) * task.control_dt**2
+    assert moved["midpoint"] == pytest.approx(exact, rel=1e-12)
+    assert moved["semi_implicit_euler"] == pytest.approx(exact * (1 + 1 / task.substeps), rel=1e-12)
+
+
+@EVERY
+def test_methods_that_leave_the_kernel_are_refused_in_one_line(row: TaskRow, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(RK4, "solves", True)
+    with pytest.raises(ValueError, match=r".") as caught:
+        type(row.task)(integrator=RK4())
+    said = str(caught.value)
+    assert "integrator.kind = 'rk4': solves equations in Python" in said
+    allowed = said.split("allowed: ")[1].split(", ")
+    assert "midpoint" in allowed
+    assert "rk4" not in allowed
+    assert "\n" not in said
+
+
+@EVERY
+@pytest.mark.parametrize("kind", ["typo", "clock", "backwards", "method"])
 def test_bad_arguments_of_a_task_are_refused_in_one_line(row: TaskRow, kind: str) -> None:
     given, said = {
         "typo": ({"horizn": 5}, "did you mean `horizon`"),
         "clock": ({"control_dt": 0.1, "dt": 0.03}, "control_dt = 0.1 s is not a whole multiple of dt = 0.03 s"),
         "backwards": ({"dt": 0.2}, "whole multiple"),
+        "method": ({"integrator": {"kind": "rk44"}}, "integrator.kind = 'rk44': unknown, did you mean `rk4`?"),
     }[kind]
     with pytest.raises(ValueError, match=r".") as caught:
         type(row.task)(**given)

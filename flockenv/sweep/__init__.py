@@ -10,8 +10,8 @@ scratch array and stay in vector registers.
 
 The files, as a source is put together: `parts` says what it depends on, `text` holds the smallest pieces of it;
 `query` sorts the agents and walks their blocks, `pairs` lets a block meet its candidates, `far` everybody, `bonds` its
-partners; `accelerate` is the sum of all laws, `step` advances worlds by it, `source` is the whole file; `look` is what
-tasks add to it.
+partners; `accelerate` is the sum of all laws, `method` the integrator, `step` advances worlds by it, `source` is the
+whole file; `look` is what tasks add to it.
 """
 
 from __future__ import annotations

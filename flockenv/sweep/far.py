@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from flockenv.effects.base import Effect
 from flockenv.sweep.parts import Parts
-from flockenv.sweep.text import Slots, indented, lanes_of, tuple_of
+from flockenv.sweep.text import Slots, indented, lanes_of, place_of, tuple_of
 from flockenv.tree import BUCKETS, LEVELS, LISTED
 
 __all__ = ["far", "tree_imports"]
@@ -87,8 +87,11 @@ def _meet(effects: list[tuple[int, Effect]], sums: list[str], count: str) -> lis
 
 def _line_up(parts: Parts) -> list[str]:
     """Write how one thread sorts the living for a tree."""
-    scratch = "sync, bounds, size, tree_key, tree_place, tree_digit, tree_leaf"
-    return ["if rank == 0:", f"    line_up(pos, living, mass, n, {parts.width}, {scratch})"]
+    return [
+        "if rank == 0:",
+        "    tree = (tree_key, tree_place, tree_digit, tree_leaf)",
+        f"    line_up(pos, living, mass, n, {parts.width}, sync, bounds, size, *tree)",
+    ]
 
 
 def _walk(parts: Parts, k: int, effect: Effect, adds: bool) -> list[str]:
@@ -96,20 +99,22 @@ def _walk(parts: Parts, k: int, effect: Effect, adds: bool) -> list[str]:
     d, w, slot = parts.dimension, parts.width, Slots(parts)
     sums = slot.all("far")
     by_mass = str(effect.weighs_mass)
-    tree = f"tree_leaf, tree_node, tree_digit, present, {w}, size, {by_mass}"
+    gathered = (
+        f"gather(tree_leaf, tree_node, tree_digit, present, {w}, size, {by_mass}, p{k}.opening, np.int64(block), "
+        "level, node, tree_near, begin)"
+    )
     return [
         "if rank == 0:",
         f"    weigh(tree_leaf, present, {w}, size, {by_mass}, tree_digit, tree_node)",
         "wait_for_team(sync, team)  # the tree is everybody's",
         f"met, blocks, begin = 0, (present + {w - 1}) // {w}, rank * {LISTED * (d + 1)}",
-        "for block in range(blocks * rank // team, blocks * (rank + 1) // team):",
-        f"    base, row = np.uint64(block * {(d + 1) * w}), np.uint64(block * {w})",
-        f"    held = min({w}, present - block * {w})",
+        "for block in range(np.uint64(blocks * rank // team), np.uint64(blocks * (rank + 1) // team)):",
+        f"    base, held = block * np.uint64({(d + 1) * w}), min({w}, present - np.int64(block) * {w})",
         f"    for l in range(np.uint64({w})):",
         indented([f"{s} = 0" for s in sums], 8),
         f"    level, node = np.int64(tree_digit[{BUCKETS + LEVELS}]), 0",
         f"    while level <= tree_digit[{BUCKETS + LEVELS}]:",
-        f"        many, level, node = gather({tree}, p{k}.opening, block, level, node, tree_near, begin)",
+        f"        many, level, node = {gathered}",
         "        met += many * held",
         f"        for j in range(np.uint64(begin), np.uint64(begin + many * {d + 1}), np.uint64({d + 1})):",
         f"            xj, heavy = {tuple_of('tree_near[j + np.uint64(#)]', d)}, tree_near[j + np.uint64({d})]",
@@ -117,7 +122,8 @@ def _walk(parts: Parts, k: int, effect: Effect, adds: bool) -> list[str]:
         f"                x, m = {lanes_of(parts, 'tree_leaf')}, tree_leaf[base + np.uint64({d * w}) + l]",
         indented(_meet([(k, effect)], sums, "heavy"), 16),
         "    for l in range(np.uint64(held)):",
-        f"        place = np.uint64(place_of(np.int64(tree_place[row + l]), {d}, {w}))",
+        f"        i = np.uint64(tree_place[block * np.uint64({w}) + l])",
+        f"        place = {place_of(parts, d)}",
         indented([f"pulled[place + np.uint64({j * w})] {'+' * adds}= {s}" for j, s in enumerate(sums)], 8),
         "tally[rank] = met",
         "wait_for_team(sync, team)  # what is pulled was written by others",

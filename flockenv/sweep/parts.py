@@ -120,6 +120,7 @@ class Parts:
         for effect in self.effects:
             for value in effect.parameters().values():
                 values.extend(value if isinstance(value, tuple) else (value,))
+        values += self.integrator.settings()
         return values + ([self.look.radius, self.look.radius**2] if self.look else [])
 
     @property

@@ -25,8 +25,9 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
+from flockenv.integrators import INTEGRATORS, SemiImplicitEuler
 from flockenv.records import Record
-from flockenv.scene import Scene
+from flockenv.scene import AnyIntegrator, Scene
 from flockenv.snapshot import Mark
 from flockenv.state import State
 from flockenv.sweep import SHARED, Look, Parts, look_source, scene_source
@@ -79,6 +80,7 @@ class Task(Record):
 
     control_dt: float = Field(default=0.1, gt=0, description="s, one decision; a whole multiple of dt")
     dt: float = Field(default=0.05, gt=0, description="s, one physics step")
+    integrator: AnyIntegrator = Field(default_factory=SemiImplicitEuler, description="how a physics step is taken")
     horizon: int = Field(default=300, ge=1, description="decisions until the time limit (truncation)")
     dtype: Literal["float64", "float32"] = Field(default="float64", description="precision of the simulation")
 
@@ -89,7 +91,11 @@ class Task(Record):
             TASKS[cls.name] = cls
 
     def model_post_init(self, context: Any) -> None:
-        """Refuse clocks that do not fit."""
+        """Refuse clocks that do not fit, and methods that leave the kernel."""
+        if self.integrator.solves:
+            allowed = ", ".join(kind for kind, method in INTEGRATORS.items() if not method.solves)
+            solves = "solves equations in Python, while a task plays in one kernel"
+            raise ValueError(f"integrator.kind = {self.integrator.kind!r}: {solves}; allowed: {allowed}")
         ratio = self.control_dt / self.dt
         if abs(ratio - round(ratio)) > 1e-9 or round(ratio) < 1:
             raise ValueError(f"control_dt = {self.control_dt:g} s is not a whole multiple of dt = {self.dt:g} s")

@@ -374,7 +374,13 @@ class Flock(Task):
         groups = [Group(count=self.learners, role="learner", **limits)]
         if self.agents > self.learners:
             groups.append(Group(count=self.agents - self.learners, role="flockmate", **limits))
-        return Scene(space=Torus(size=(self.size, self.size)), groups=tuple(groups), dt=self.dt, dtype=self.dtype)
+        return Scene(
+            space=Torus(size=(self.size, self.size)),
+            groups=tuple(groups),
+            integrator=self.integrator,
+            dt=self.dt,
+            dtype=self.dtype,
+        )
 
     @property
     def look(self) -> Look:

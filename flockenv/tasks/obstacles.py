@@ -202,7 +202,13 @@ class Obstacles(Task):
     def scene(self) -> Scene:
         """A walled square; nothing acts but what the agent wants."""
         walker = Group(count=1, radius=0.3, max_speed=self.max_speed, max_force=self.max_force, role="learner")
-        return Scene(space=Box(size=(self.size, self.size)), groups=(walker,), dt=self.dt, dtype=self.dtype)
+        return Scene(
+            space=Box(size=(self.size, self.size)),
+            groups=(walker,),
+            integrator=self.integrator,
+            dt=self.dt,
+            dtype=self.dtype,
+        )
 
     @property
     def look(self) -> Look:

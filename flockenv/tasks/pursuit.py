@@ -285,6 +285,7 @@ class Pursuit(Task):
                     role="evader",
                 ),
             ),
+            integrator=self.integrator,
             dt=self.dt,
             dtype=self.dtype,
         )
