@@ -182,7 +182,10 @@ EFFECTS = (
     EffectRow(Carried(share=0.9), beside=(WIND, DRAG)),
     EffectRow(Attraction(strength=2, centre=CENTRE, softening=0.5), signed=("strength",)),
     EffectRow(Tether(centre=CENTRE, stiffness=0.8, damping=0.1, rest=0.5)),
-    EffectRow(Swing(centre=CENTRE, strength=0.8, length=0.7), obeys=frozenset({"translation", "mirror", "relabelling"})),
+    EffectRow(
+        Swing(centre=CENTRE, strength=0.8, length=0.7),
+        obeys=frozenset({"translation", "mirror", "relabelling"}),  # along the axes
+    ),
     EffectRow(Fluctuation(strength=0.8), obeys=frozenset({"translation"})),  # to each his own, along the axes
     EffectRow(Separation(weight=1.3, radius=2.5)),
     EffectRow(Separation(weight=1.3, radius=2.5, fov=200, nearest=3)),
