@@ -99,8 +99,11 @@ def suggest_dt(scene: Scene) -> Suggestion:
     """
     square, damping = np.zeros(scene.agents), np.zeros(scene.agents)
     alone: list[tuple[float, str]] = []
-    for effect in scene.effects:
-        found = effect.rates(scene.groups, scene.dimension)
+    for k, effect in enumerate(scene.effects):
+        try:
+            found = effect.rates(scene.groups, scene.dimension)
+        except ValueError as error:
+            raise ValueError(f"effects[{k}].{error}") from None
         if found is not None:
             alone.append((_tightest(scene.integrator, *found)[0], effect.kind))
             square += found[0]

@@ -183,8 +183,7 @@ EFFECTS = (
     EffectRow(Attraction(strength=2, centre=CENTRE, softening=0.5), signed=("strength",)),
     EffectRow(Tether(centre=CENTRE, stiffness=0.8, damping=0.1, rest=0.5)),
     EffectRow(
-        Swing(centre=CENTRE, strength=0.8, length=0.7),
-        obeys=frozenset({"translation", "mirror", "relabelling"}),  # along the axes
+        Swing(centre=CENTRE, strength=0.8, length=0.7), obeys=frozenset({"translation", "mirror", "relabelling"})
     ),
     EffectRow(Fluctuation(strength=0.8), obeys=frozenset({"translation"})),  # to each his own, along the axes
     EffectRow(Separation(weight=1.3, radius=2.5)),

@@ -63,18 +63,18 @@ def motion(state: State) -> tuple[float, float]:
 
 
 def order(end: Advance, method: Integrator, target: tuple[float, float], seconds: float, first: int) -> float:
-    """The measured order over at least five halvings of the step above rounding.
+    """The measured order over five halvings of the step, the last ones above rounding.
 
     Of the error of position and velocity together: either alone may vanish by chance at one instant.
     """
-    counts = [first * 2**k for k in range(8)]
-    errors = np.array([math.dist(motion(end(method, seconds / n, n)), target) for n in counts])
-    kept = errors > 1e-12
-    assert kept.sum() >= 6, errors
-    slope, _ = np.polyfit(np.log([seconds / n for n in counts])[kept], np.log(errors[kept]), 1)
+    steps = [first * 2**k for k in range(8)]
+    errors = np.array([math.dist(motion(end(method, seconds / n, n)), target) for n in steps])
+    last = np.flatnonzero(errors > 1e-13)[-6:]
+    assert len(last) == 6, errors
+    slope, _ = np.polyfit(np.log(seconds / np.array(steps)[last]), np.log(errors[last]), 1)
     return float(slope)
 
 
 def first_of(method: Integrator) -> int:
-    """How many steps to begin with, so that five halvings stay above rounding."""
-    return 10 if method.order < 5 else 5
+    """How many steps to begin with, so that five halvings lie between what is too coarse and rounding."""
+    return 16 if not method.adaptive else 8 if method.order < 5 else 4

@@ -86,7 +86,7 @@ class Curve(Record):
     """The order it has where forces are smooth."""
     points: tuple[Point, ...]
     order: float | None
-    """The measured one; none where too few points are left."""
+    """The measured one; none where too few points are left, and of adaptive methods: what they halve is no step."""
     used: int
     """Points that the order was measured over."""
 
@@ -186,8 +186,7 @@ def measured_order(points: Iterable[Point], least: float, most: float) -> tuple[
     """Return the slope of the logarithm of the error over that of the evaluations, and how many points it is of.
 
     Of the finest HALVINGS + 1 points whose errors lie between `least` (rounding) and `most` (no approximation) m; none
-    of fewer than FEWEST. Over evaluations and not over dt: an adaptive method has an order too. Of the error at any
-    instant: at one of them alone it may pass through zero.
+    of fewer than FEWEST. Of the error at any instant: at one of them alone it may pass through zero.
     """
     usable = [p for p in points if p.along is not None and least < p.along < most]
     kept = usable[-HALVINGS - 1 :]

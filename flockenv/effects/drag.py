@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, ClassVar, Literal
 
+import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field
 
-from flockenv.effects.base import Effect, Me
+from flockenv.effects.base import Effect, Me, all_masses
 from flockenv.kernels import Vec, law
 from flockenv.vec import norm, scale, sub
 
@@ -34,6 +37,11 @@ class Drag(Effect):
     own_law: ClassVar[str | None] = "drag"
     strengths: ClassVar[tuple[str, ...]] = ("rate",)
     linear_drag: ClassVar[str | None] = "rate"
+
+    def rates(self, groups: Sequence[Any], dimension: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Nothing swings; c / m."""
+        damping = self.rate / all_masses(groups, dimension)
+        return np.zeros(len(damping)), damping
 
 
 class QuadraticDrag(Effect):

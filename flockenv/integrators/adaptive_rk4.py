@@ -7,8 +7,8 @@ from typing import Any, ClassVar, Literal
 import numpy as np
 from pydantic import Field
 
-from flockenv.integrators.base import Integrator, carried, counted, largest, settings
-from flockenv.integrators.control import begun, excess, judged
+from flockenv.integrators.base import Integrator, counted, largest, settings
+from flockenv.integrators.control import add_slopes, begun, copy, judged, misfit, slope_of
 from flockenv.kernels import kernel, like
 
 __all__ = ["AdaptiveRK4"]
@@ -23,47 +23,38 @@ def advance(
 
     The whole step and its first half begin with the same slope, and so does the next try if this one is rejected.
     """
-    x, v, x0, v0, new_x, new_v, whole_x, whole_v = (
-        stages[0], stages[1], stages[2], stages[3], stages[4], stages[5], stages[6], stages[7],
-    )  # fmt: skip
+    x, v, x0, v0, new_x, new_v = stages[0], stages[1], stages[2], stages[3], stages[4], stages[5]
+    whole_x, whole_v = stages[6], stages[7]
     tolerance, least = settings(context)
-    rounding = like(dt, 8 * np.finfo(pos.dtype).eps)
     clock, known = begun(dt), False
     while clock.done < dt:
         for part in range(3):  # the whole, its first half, its second half
             h = clock.step if part == 0 else clock.step / 2
             since = time + clock.done + (h if part == 2 else like(dt, 0.0))
-            for i in range(np.uint64(first), np.uint64(end)):
-                if part == 1:
-                    whole_x[i], whole_v[i] = new_x[i], new_v[i]
-                x0[i], v0[i] = (new_x[i], new_v[i]) if part == 2 else (pos[i], vel[i])
-                x[i], v[i], new_x[i], new_v[i] = x0[i], v0[i], x0[i], v0[i]
+            if part == 1:
+                copy(whole_x, whole_v, new_x, new_v, first, end)
+            if part < 2:
+                copy(new_x, new_v, pos, vel, first, end)
+            copy(x0, v0, new_x, new_v, first, end)
             for stage in range(4):
                 begins = stage == 0 and part < 2
                 slope, a = (stages[8], stages[9]) if begins else (stages[10], stages[11])
-                weight = h / 6 if stage == 0 or stage == 3 else h / 3
-                ahead = h if stage == 2 else h / 2
                 if not (begins and known):
-                    when = since + (like(dt, 0.0) if stage == 0 else (h if stage == 3 else h / 2))
-                    acceleration(context, x, v, when, a)
-                    for i in range(np.uint64(first), np.uint64(end)):
-                        slope[i] = carried(v[i], like(dt, 1.0), flow, i)
+                    ahead = like(dt, 0.0) if stage == 0 else (h if stage == 3 else h / 2)
+                    copy(x, v, x0, v0, first, end)
+                    if stage > 0:  # by the slope of the stage before
+                        before = 8 if stage == 1 and part < 2 else 10
+                        add_slopes(x, v, ahead, stages[before], stages[before + 1], first, end)
+                    acceleration(context, x, v, since + ahead, a)
+                    slope_of(slope, v, flow, first, end)
                     known = True
-                for i in range(np.uint64(first), np.uint64(end)):
-                    new_x[i] += weight * slope[i]
-                    new_v[i] += weight * a[i]
-                    x[i] = x0[i] + ahead * slope[i]
-                    v[i] = v0[i] + ahead * a[i]
-        squares = stages[11]
-        for i in range(np.uint64(first), np.uint64(end)):
-            squares[i] = excess(new_x[i] - whole_x[i], new_x[i], rounding)
-            squares[i] += excess(new_v[i] - whole_v[i], new_v[i], rounding)
-        square, where = largest(context, squares, first, end)
+                add_slopes(new_x, new_v, h / 6 if stage == 0 or stage == 3 else h / 3, slope, a, first, end)
+        misfit(whole_x, new_x, new_v, whole_x, whole_v, first, end)
+        square, where = largest(context, whole_x, first, end)
         error = np.sqrt(square)
         if error <= tolerance:
             known = False
-            for i in range(np.uint64(first), np.uint64(end)):
-                pos[i], vel[i] = new_x[i], new_v[i]
+            copy(pos, vel, new_x, new_v, first, end)
         clock = judged(clock, error, tolerance, least, dt, 4)
         if clock.lost:
             pos[where] = like(dt, np.nan)

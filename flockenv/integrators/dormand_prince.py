@@ -7,8 +7,8 @@ from typing import Any, ClassVar, Literal
 import numpy as np
 from pydantic import Field
 
-from flockenv.integrators.base import Integrator, carried, counted, largest, settings
-from flockenv.integrators.control import begun, excess, judged
+from flockenv.integrators.base import Integrator, counted, largest, settings
+from flockenv.integrators.control import add_slopes, begun, copy, judged, misfit, slope_of
 from flockenv.kernels import kernel, like
 
 __all__ = ["DormandPrince"]
@@ -37,39 +37,29 @@ def advance(
     end: int,
 ) -> None:  # fmt: skip
     """Seven slopes, of which the last is the first of the next step: rows 2 to 8 of velocities, 9 to 15 of forces."""
-    x, v, squares = stages[0], stages[1], stages[3]  # the second slope counts neither in the result nor in its error
+    x, v = stages[0], stages[1]
+    other_x, other_v = stages[3], stages[10]  # the second slope counts neither in the result nor in its error
     tolerance, least = settings(context)
-    rounding = like(dt, 8 * np.finfo(pos.dtype).eps)
     clock, known = begun(dt), False
     while clock.done < dt:
         h = clock.step
         for stage in range(7):
-            for i in range(np.uint64(first), np.uint64(end)):
-                x[i], v[i] = pos[i], vel[i]
+            copy(x, v, pos, vel, first, end)
             for k in range(stage):
-                slope, a, weight = stages[2 + k], stages[9 + k], h * like(h, WEIGHTS[stage][k])
-                for i in range(np.uint64(first), np.uint64(end)):
-                    x[i] += weight * slope[i]
-                    v[i] += weight * a[i]
-            if not (stage == 0 and known):
+                add_slopes(x, v, h * like(h, WEIGHTS[stage][k]), stages[2 + k], stages[9 + k], first, end)
+            if stage > 0 or not known:
                 acceleration(context, x, v, time + clock.done + h * like(h, NODES[stage]), stages[9 + stage])
-                slope = stages[2 + stage]
-                for i in range(np.uint64(first), np.uint64(end)):
-                    slope[i] = carried(v[i], like(h, 1.0), flow, i)
-        known = True
-        for i in range(np.uint64(first), np.uint64(end)):
-            off_x, off_v = like(h, 0.0), like(h, 0.0)
-            for k in range(7):
-                if k != 1:
-                    off_x += like(h, ERRORS[k]) * stages[2 + k, i]
-                    off_v += like(h, ERRORS[k]) * stages[9 + k, i]
-            squares[i] = excess(h * off_x, x[i], rounding) + excess(h * off_v, v[i], rounding)
-        square, where = largest(context, squares, first, end)
-        error = np.sqrt(square)
+                slope_of(stages[2 + stage], v, flow, first, end)
+        copy(other_x, other_v, x, v, first, end)
+        for k in range(7):
+            if k != 1:
+                add_slopes(other_x, other_v, -h * like(h, ERRORS[k]), stages[2 + k], stages[9 + k], first, end)
+        misfit(other_x, x, v, other_x, other_v, first, end)
+        square, where = largest(context, other_x, first, end)
+        error, known = np.sqrt(square), True
         if error <= tolerance:
-            for i in range(np.uint64(first), np.uint64(end)):
-                pos[i], vel[i] = x[i], v[i]
-                stages[2, i], stages[9, i] = stages[8, i], stages[15, i]
+            copy(pos, vel, x, v, first, end)
+            copy(stages[2], stages[9], stages[8], stages[15], first, end)
         clock = judged(clock, error, tolerance, least, dt, 4)
         if clock.lost:
             pos[where] = like(dt, np.nan)

@@ -121,7 +121,8 @@ def solve_stage(
             raise NotSolvedError("the acceleration is not finite")
         if size == 0.0:
             return residual.stage(w, iteration - 1, linear)
-        solve = _matrix(residual, w, r, dimension, coupling) if coupling is not None else _free(residual, w, r)
+        solve = _free(residual, w, r) if coupling is None else _matrix(residual, w, r, dimension, coupling)
+        linear += coupling is not None
         correction, took = solve(-r)
         linear += took
         scale = max(1.0, float(np.abs(w).max()), float(np.abs(v0).max()))
@@ -185,7 +186,7 @@ def _matrix(
         factors = linalg.splu(jacobian)
     except RuntimeError:
         raise NotSolvedError("the equations are singular") from None
-    return lambda b: (factors.solve(b.astype(float)).astype(w.dtype), 1)
+    return lambda b: (factors.solve(b.astype(float)).astype(w.dtype), 0)
 
 
 def _free(residual: _Residual, w: Rows, r: Rows) -> Callable[[Rows], tuple[Rows, int]]:

@@ -130,5 +130,6 @@ def _meet(parts: Parts, e: int, k: int, effect: Effect, sums: list[str]) -> list
         f"        me = {alone()}",
         indented(others, 8),
         f"        says = bond_law_{k}(p{k}, me, ({', '.join(f'it{q}' for q in range(p))},), ({numbers},))",
-        indented([f"{s} += says[{j}]" for j, s in enumerate(sums)], 8),
+        f"        whole = {' & '.join(f'(living[who{q}] > zero(x)[0])' for q in range(p))}  # the dead hold nobody",
+        indented([f"{s} += says[{j}] if whole else like(x[0], -0.0)" for j, s in enumerate(sums)], 8),
     ]

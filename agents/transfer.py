@@ -1,0 +1,231 @@
+"""What accuracy buys a policy: `python -m agents.transfer [TASK...]` has the same worlds solved better and worse.
+
+Every player meets the same held-out worlds as in agents.compare, under each method of integration, step and precision,
+and decides as often as before: what differs is how motion is solved between two decisions. Then the same actions are
+replayed under each setting by the clock. Returns and times are kept in runs/transfer as they come, so that the same
+command goes on after an interruption and plays nothing twice. Writes transfer.json, transfer.md and transfer.png.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from itertools import product
+from multiprocessing import get_context
+from pathlib import Path
+from time import perf_counter
+from typing import Annotated, Any
+
+import typer
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+
+from agents import report, transfer_report
+from agents.compare import (
+    PLAYERS,
+    blaming,
+    deliver,
+    experiment_of,
+    field_of,
+    folder_of,
+    pick,
+    provenance,
+    split,
+    write_text,
+)
+from agents.transfer_cells import (
+    KEPT,
+    Plan,
+    clocked,
+    jobs,
+    play_missing,
+    played,
+    played_again,
+    rounds_missing,
+    run_round,
+)
+from agents.transfer_report import Setting
+from flockenv.evaluation import WORLDS_PER_SEED, worlds_for
+from flockenv.integrators import INTEGRATORS
+from flockenv.refusals import nearest, shown
+from flockenv.tasks import TASKS, Task
+
+__all__ = ["app"]
+
+WORLDS, ROUNDS, RESAMPLES = 128, 5, 10_000
+METHODS = ("semi_implicit_euler", "explicit_euler", "midpoint", "velocity_verlet", "rk4", "semi_implicit_euler:float32")
+SUBSTEPS = (1, 2, 4, 8)
+MOST_SUBSTEPS = 1000
+FILES = ("transfer.json", "transfer.md", "transfer.png")
+
+Advance = Callable[[str, int], None]
+"""Told what has been done, and how many cells or clocks that was."""
+
+app = typer.Typer(add_completion=False, rich_markup_mode=None, pretty_exceptions_enable=False)
+
+
+# --- the command line -------------------------------------------------------------------------------------------------
+
+
+@app.command()
+def main(
+    tasks: Annotated[list[str] | None, typer.Argument(metavar="[TASK...]", help="Tasks; all if left out.")] = None,
+    players: Annotated[list[str] | None, typer.Option(help="Players, as in agents.compare.")] = None,
+    methods: Annotated[
+        list[str] | None, typer.Option(help="Kinds of integrators, with :float32 if so. [" + ",".join(METHODS) + "]")
+    ] = None,
+    substeps: Annotated[
+        list[str] | None, typer.Option(help="Physics steps per decision. [" + ",".join(map(str, SUBSTEPS)) + "]")
+    ] = None,
+    worlds: Annotated[int, typer.Option(help="Worlds per task, the same for everyone.")] = WORLDS,
+    rounds: Annotated[int, typer.Option(help="Rounds by the clock.")] = ROUNDS,
+    seed: Annotated[int, typer.Option(help="Which evaluation worlds, 0 to 999.")] = 0,
+    workers: Annotated[int, typer.Option(help="Processes that compile and play; 1 = none but this one.")] = min(
+        2, os.cpu_count() or 1
+    ),
+    out: Annotated[str, typer.Option(help=f"Folder for {', '.join(FILES)}.")] = "results",
+    trust_pickle: Annotated[bool, typer.Option("--trust-pickle", help="Load zips too: executes code in them.")] = False,
+    debug: Annotated[bool, typer.Option("--debug", help="Show where an error came from.")] = False,
+) -> None:
+    """Play the same worlds solved better and worse, and say what that does to each policy and what it costs."""
+    try:
+        folder = folder_of(out)
+        _check("--worlds", worlds, 2, WORLDS_PER_SEED)
+        _check("--rounds", rounds, 1, 1000)
+        _check("--workers", workers, 1, 64)
+        worlds_for("evaluation", seed, worlds)
+        chosen = [experiment_of(name).build() for name in pick("TASK", split(tasks) or list(TASKS), TASKS)]
+        field = tuple(field_of(split(players) or list(PLAYERS)))
+        solvers, steps = _solvers(split(methods) or list(METHODS)), _substeps(split(substeps), SUBSTEPS)
+        plans = [
+            Plan(task, _settings(task, solvers, steps), field, worlds, seed, rounds, trust_pickle) for task in chosen
+        ]
+        results = _measured(plans, workers)
+        deliver(folder, {
+            "transfer.json": lambda path: write_text(path, report.json_text(results)),
+            "transfer.md": lambda path: write_text(path, transfer_report.markdown(results)),
+            "transfer.png": lambda path: _draw(path, results),
+        })  # fmt: skip
+    except (ValueError, TypeError, OSError) as error:
+        if debug:
+            raise
+        typer.echo(f"transfer: {' '.join(str(error).split())}", err=True)
+        raise typer.Exit(2) from None
+    except KeyboardInterrupt:
+        typer.echo(f"transfer: interrupted; what was played is in {KEPT}, and the same command goes on", err=True)
+        raise typer.Exit(130) from None
+    transfer_report.show(results)
+    typer.echo(f"{results['wall_time_s']:.0f} s; {', '.join(FILES)} are in {folder}")
+
+
+def _check(option: str, value: int, least: int, most: int) -> None:
+    if not least <= value <= most:
+        raise ValueError(f"{option} {value}: must be from {least} to {most}")
+
+
+def _solvers(names: Sequence[str]) -> list[tuple[str, str]]:
+    """Return kinds of integrators with their precision; ValueError for one that is not known, or cannot play a task."""
+    allowed = [kind for kind, method in INTEGRATORS.items() if not method.solves]
+    found = []
+    for name in names:
+        kind, _, dtype = name.partition(":")
+        if kind not in allowed:
+            hint = nearest(kind[:200], allowed)
+            raise ValueError(f"--methods {shown(name)}: no method of a task{hint}; allowed: {', '.join(allowed)}")
+        if dtype not in ("", "float64", "float32"):
+            raise ValueError(f"--methods {shown(name)}: the precision must be float64 or float32")
+        found.append((kind, dtype or "float64"))
+    return list(dict.fromkeys(found))
+
+
+def _substeps(texts: Sequence[str], usual: Sequence[int]) -> list[int]:
+    for text in texts:
+        if not (text.isascii() and text.isdigit() and 1 <= int(text[:9]) <= MOST_SUBSTEPS):
+            raise ValueError(f"--substeps {shown(text)}: must be a whole number from 1 to {MOST_SUBSTEPS}")
+    return sorted({int(text) for text in texts} or usual)
+
+
+def _settings(task: Task, solvers: Sequence[tuple[str, str]], substeps: Sequence[int]) -> tuple[Setting, ...]:
+    """Return the settings to play, the one that players were made for first, whether it was asked for or not."""
+    asked = [Setting(method, dtype, steps) for method, dtype in solvers for steps in substeps]
+    return tuple(dict.fromkeys([Setting.trained(task), *asked]))
+
+
+def _measured(plans: Sequence[Plan], workers: int) -> report.Results:
+    """Play what is missing, run the clock, and return everything as plain data."""
+    began = perf_counter()
+    for plan, player in product(plans, plans[0].players):
+        with blaming(player.name, plan.task, ValueError):
+            plan.policy(player, plan.task)  # whoever cannot be had is refused before anybody plays
+    missing, rounds = [job for plan in plans for job in jobs(plan)], rounds_missing(plans)
+    steps = sum(len(settings) * len(plan.players) for plan, settings in missing) + len(rounds) * len(plans)
+    with _bar(steps) as advance:
+        for doing, work, crew in ((play_missing, missing, workers), (run_round, rounds, 1)):
+            with _crew(crew if workers > 1 else 0, work) as over:
+                for what, done in over(doing, work):
+                    advance(what, done)
+    about = {
+        plan.task.name: transfer_report.task_results(
+            plan.task, plan.settings, played(plan), clocked(plan, plan.rounds), played_again(plan), RESAMPLES, plan.seed
+        )
+        for plan in plans
+    }
+    first, worlds, seed = plans[0].first, plans[0].worlds, plans[0].seed
+    return {
+        "seed": seed,
+        "worlds": worlds,
+        "world_seeds": {"block": "evaluation", "first": first, "last": first + worlds - 1},
+        "bootstrap": {"resamples": RESAMPLES, "seed": seed, "interval": "95 % percentile"},
+        "players": {player.name: player.spec for player in plans[0].players},
+        "tasks": about,
+        **provenance(),
+        "wall_time_s": perf_counter() - began,
+    }
+
+
+@contextmanager
+def _crew(processes: int, work: Sequence[Any]) -> Iterator[Callable[[Any, Iterable[Any]], Iterable[Any]]]:
+    """Offer a map over some work: by so many processes, which end with this one; by none, in this one.
+
+    A single process does one piece of work and makes room for a fresh one.
+    """
+    if not (processes and work):
+        yield map
+        return
+    count = min(processes, len(work))
+    with get_context("spawn").Pool(count, _quietly, maxtasksperchild=1 if processes == 1 else None) as pool:
+        yield pool.imap_unordered
+
+
+def _quietly() -> None:
+    """Leave Ctrl-C, and what is said about compiling, to the process that people talk to."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    os.environ["FLOCKENV_QUIET"] = "1"
+
+
+@contextmanager
+def _bar(steps: int) -> Iterator[Advance]:
+    """Show one bar on a terminal, and a line per kernel and per round anywhere else."""
+    console = Console(stderr=True)
+    columns = (TextColumn("{task.description:<44}"), BarColumn(30), TimeElapsedColumn())
+    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as progress:
+        bar = progress.add_task("compiling and playing", total=steps)
+
+        def advance(what: str, done: int) -> None:
+            progress.update(bar, advance=done, description=what)
+            if not console.is_terminal:
+                console.print(f"{what}: done", highlight=False)
+
+        yield advance
+
+
+def _draw(path: Path, results: report.Results) -> None:
+    from agents.transfer_chart import write_chart
+
+    write_chart(path, results)
+
+
+if __name__ == "__main__":
+    app()

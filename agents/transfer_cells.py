@@ -1,0 +1,260 @@
+"""What agents.transfer plays and times, cell by cell, and keeps: nothing that is kept is played twice."""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+import inspect
+import json
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from itertools import product
+from pathlib import Path
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from agents.compare import Player, blaming, known_players
+from agents.transfer_report import Cell, Clock, Setting
+from flockenv.evaluation import rollout, task_digest, worlds_for
+from flockenv.integrators import RK4
+from flockenv.kernels import load
+from flockenv.outputs import replacing
+from flockenv.policy import Policy, load_player
+from flockenv.tasks import Task
+from flockenv.tasks.base import task_source
+from flockenv.world import World
+
+__all__ = [
+    "KEPT", "Job", "Plan", "Round", "cell_path", "clocked", "jobs", "play", "play_missing", "played", "played_again",
+    "rounds_missing", "run_round",
+]  # fmt: skip
+
+DECISIONS = 30
+"""So many are replayed by the clock, from the start of the episodes."""
+REFERENCE = 64
+"""RK4 with so many steps per decision says where everybody should be."""
+KEPT = Path("runs/transfer")
+
+Actions = list[NDArray[Any]]
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What is asked of one task: which players meet which worlds under which settings, the trained one first."""
+
+    task: Task
+    settings: tuple[Setting, ...]
+    players: tuple[Player, ...]
+    worlds: int
+    seed: int
+    rounds: int
+    trust_pickle: bool = False
+
+    @property
+    def first(self) -> int:
+        """Seed of the first world."""
+        return worlds_for("evaluation", self.seed, self.worlds)
+
+    @property
+    def trained(self) -> Setting:
+        """The setting that players were made for."""
+        return self.settings[0]
+
+    @property
+    def pilot(self) -> Player:
+        """Whose actions the clock replays, and whom the sentence is about: the player that claims most."""
+        return self.players[-1]
+
+    def policy(self, player: Player, task: Task) -> Policy:
+        """Return a player that has decided nothing yet."""
+        return load_player(player.spec, task, known_players(self.seed), self.trust_pickle)
+
+
+Job = tuple[Plan, tuple[Setting, ...]]
+"""Settings of one plan that share a kernel."""
+Round = tuple[tuple[Plan, ...], int]
+"""Plans that are clocked, and the number of the round, from 1."""
+
+
+# --- playing ----------------------------------------------------------------------------------------------------------
+
+
+def play(plan: Plan, setting: Setting, player: Player) -> Cell:
+    """Let one player play all worlds under one setting."""
+    task = setting.of(plan.task)
+    with blaming(player.name, task):
+        episodes = rollout(task, plan.policy(player, task), plan.worlds, plan.first)
+    return Cell(episodes.returns, episodes.success)
+
+
+def cell_path(plan: Plan, setting: Setting, player: Player, prefix: str = "") -> Path:
+    """Return where a cell is kept: the name tells apart all that its scores depend on."""
+    task = setting.of(plan.task)
+    about = [task_digest(task), _kernel(task), _print(player, plan), plan.worlds, plan.first]
+    return _place(plan.task, f"{prefix}{player.name}-{setting.method}-{setting.dtype}-{setting.substeps}", about)
+
+
+def _place(task: Task, name: str, about: list[Any]) -> Path:
+    digest = hashlib.sha256(json.dumps(about).encode()).hexdigest()[:16]
+    return KEPT / task.name / f"{name}-{digest}.json"
+
+
+@functools.lru_cache(maxsize=512)
+def _kernel(task: Task) -> str:
+    """Return the name of a task's compiled code, which holds a digest of every law in it."""
+    return load(f"task_{task.name}", task_source(task)).__name__
+
+
+def _print(player: Player, plan: Plan) -> str:
+    """Return what tells a player from itself after a change: its file, or its code, parameters and weights."""
+    known = player.spec in known_players(plan.seed)
+    return _print_of_known(player, plan) if known else hashlib.sha256(Path(player.spec).read_bytes()).hexdigest()
+
+
+@functools.lru_cache(maxsize=512)
+def _print_of_known(player: Player, plan: Plan) -> str:
+    policy = plan.policy(player, plan.task)
+    weights = (getattr(policy, "card", None) or {}).get("sha256", "")
+    code = Path(inspect.getfile(type(policy))).read_text(encoding="utf-8")
+    return hashlib.sha256(f"{policy!r} {weights} {code}".encode()).hexdigest()
+
+
+def _keep(path: Path, content: Any) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with replacing(path) as file:
+        file.write(json.dumps(content, allow_nan=False).encode())
+
+
+def _cell(plan: Plan, setting: Setting, player: Player, prefix: str = "") -> Cell:
+    """Return a cell as it is kept, played first if it is not."""
+    path = cell_path(plan, setting, player, prefix)
+    if not path.is_file():
+        _keep(path, play(plan, setting, player).to_json())
+    return Cell.of_json(json.loads(path.read_text(encoding="utf-8")))
+
+
+def play_missing(job: Job) -> tuple[str, int]:
+    """Play those cells of some settings that are not kept yet, and keep each; return what was done, and how many."""
+    plan, settings = job
+    for setting, player in product(settings, plan.players):
+        _cell(plan, setting, player)
+    return f"{plan.task.name}: {settings[0].solver}", len(settings) * len(plan.players)
+
+
+def jobs(plan: Plan) -> Iterator[Job]:
+    """Yield settings that share a kernel together, so that it is compiled once, if any of their cells is missing."""
+    for solver in dict.fromkeys(setting.solver for setting in plan.settings):
+        settings = tuple(s for s in plan.settings if s.solver == solver)
+        if not all(cell_path(plan, *which).is_file() for which in product(settings, plan.players)):
+            yield plan, settings
+
+
+def played(plan: Plan) -> dict[tuple[Setting, str], Cell]:
+    """Return all cells of a plan."""
+    return {(s, player.name): _cell(plan, s, player) for s, player in product(plan.settings, plan.players)}
+
+
+def played_again(plan: Plan) -> dict[str, Cell]:
+    """Return by player what the trained setting gives a second time: the same, to the last bit."""
+    return {player.name: _cell(plan, plan.trained, player, "again-") for player in plan.players}
+
+
+# --- the clock --------------------------------------------------------------------------------------------------------
+
+
+def clocked(plan: Plan, rounds: int) -> Clock:
+    """Replay the same actions under every setting: where they lead, and in each round how long a step takes.
+
+    A round goes through all settings, so that whatever else the machine does meets each of them alike; rounds that are
+    kept are not run again.
+    """
+    path, clock = _clock_path(plan), _kept_clock(plan)
+    if len(clock.rounds) >= rounds:
+        return clock
+    actions = _actions(plan)
+    if not clock.error_mm:
+        clock.error_mm.update(_errors(plan, actions))
+    for number in range(len(clock.rounds), rounds):
+        order = plan.settings if number % 2 == 0 else plan.settings[::-1]
+        clock.rounds.append({setting.name: _seconds(plan, setting, actions) for setting in order})
+        _keep(path, {"rounds": clock.rounds, "error_mm": clock.error_mm})
+    return clock
+
+
+def rounds_missing(plans: Sequence[Plan]) -> list[Round]:
+    """Return the rounds that are not kept for all plans yet."""
+    done = min(len(_kept_clock(plan).rounds) for plan in plans)
+    return [(tuple(plans), number) for number in range(done + 1, max(plan.rounds for plan in plans) + 1)]
+
+
+def run_round(job: Round) -> tuple[str, int]:
+    """Run one round for every plan; return what was done, and how many.
+
+    Each round wants a process of its own: where its arrays happen to lie moves the time of a small world by up to two
+    fifths, and stays as it is until the process ends.
+    """
+    plans, number = job
+    for plan in plans:
+        clocked(plan, number)
+    return f"by the clock: round {number}", len(plans)
+
+
+def _clock_path(plan: Plan) -> Path:
+    about = [[task_digest(s.of(plan.task)), _kernel(s.of(plan.task))] for s in plan.settings]
+    return _place(plan.task, "clock", [about, _print(plan.pilot, plan), plan.worlds, plan.first, DECISIONS])
+
+
+def _kept_clock(plan: Plan) -> Clock:
+    path = _clock_path(plan)
+    return Clock(**json.loads(path.read_text(encoding="utf-8"))) if path.is_file() else Clock()
+
+
+def _actions(plan: Plan) -> Actions:
+    """Return what the pilot decides in the first decisions of every world, under the trained setting."""
+    task = plan.task
+    world, policy = World(task, plan.worlds), plan.policy(plan.pilot, task)
+    observation, taken, state = world.reset(plan.first), [], None
+    for number in range(min(DECISIONS, task.horizon)):
+        rows = observation.reshape(-1, observation.shape[-1])
+        action, state = policy.predict(rows, state, np.full(len(rows), number == 0), True)
+        taken.append(np.asarray(action).reshape(*observation.shape[:-1], -1))
+        observation = world.step(taken[-1]).observation
+    return taken
+
+
+def _seconds(plan: Plan, setting: Setting, actions: Actions) -> float:
+    """Return the median time of one decision's physics, observations and rewards, s for all worlds together."""
+    world, times = World(setting.of(plan.task), plan.worlds), []
+    world.reset(plan.first)
+    for action in actions:
+        began = perf_counter()
+        world.step(action)
+        times.append(perf_counter() - began)
+    return float(np.median(times))
+
+
+def _errors(plan: Plan, actions: Actions) -> dict[str, float]:
+    """Return by setting how far learners are from where they should be after one second, mm, median of all."""
+    task = plan.task
+    count = max(1, min(len(actions), round(1.0 / task.control_dt)))
+    exact = {"integrator": RK4(), "dtype": "float64", "dt": task.control_dt / REFERENCE}
+    right = _end(task.model_copy(update=exact), plan, actions[:count])
+    errors = {}
+    for setting in plan.settings:
+        off = right - _end(setting.of(task), plan, actions[:count])
+        box = np.array(task.scene.space.extent(task.scene.dimension))
+        off -= box * np.round(off / box) if task.scene.space.periodic else 0.0
+        errors[setting.name] = 1e3 * float(np.median(np.linalg.norm(off, axis=-1)))
+    return errors
+
+
+def _end(task: Task, plan: Plan, actions: Actions) -> NDArray[np.float64]:
+    """Return where the learners are after some actions, (B, L, D) m."""
+    world = World(task, plan.worlds)
+    world.reset(plan.first)
+    for action in actions:
+        world.step(action)
+    return np.asarray(world.state.pos[:, : task.learners], np.float64)

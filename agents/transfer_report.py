@@ -1,0 +1,321 @@
+"""What agents.transfer says: settings, cells and clocks as plain data, and the tables and sentences read from it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from rich.console import Console
+
+from agents.report import Results, grid, interval_fields, interval_text, number_text, table_of
+from flockenv.evaluation import bootstrap, task_digest
+from flockenv.integrators import INTEGRATORS
+from flockenv.tasks import Task
+
+__all__ = ["Cell", "Clock", "Setting", "finest", "frugal", "markdown", "show", "task_results", "verdict"]
+
+SURVIVES = 0.95
+"""Share of its lead over random that a policy must keep in its worst setting to be said to survive."""
+NOTHING = 1e-6
+"""mm: an error below this is rounding."""
+
+ASKED = """\
+Policies were trained, and rules tuned, in worlds solved by one method with one step. Do they survive when the same
+worlds are solved better, or worse, and what does accuracy cost? Everybody decides as often as before: what differs is
+how motion is solved between two decisions."""
+
+READING = """\
+Between two decisions nothing but the force that agents ask for acts in these tasks, and it is constant. So every method
+of second order solves a decision exactly, in one step, until a limit of speed or a wall is met: midpoint, velocity
+Verlet and RK4 play the same game to rounding, what is left of their error comes from the limit and falls with dt alone,
+and RK4's other evaluations buy nothing. The two Euler methods are off by half a step: after a decision of n steps under
+a constant force, a body that began at rest has gone (1 + 1/n) times as far as it should under semi-implicit Euler, as
+if it had been pushed earlier, and (1 - 1/n) times under explicit Euler, as if later. That is what players notice."""
+
+NOTES = """\
+Return: the mean reward of a world's learners, summed over its episode. A difference is the mean over the same worlds
+against the same player under the setting that it was made for, with a 95 % percentile bootstrap interval over worlds;
+"(level)": the interval holds 0. Many intervals are shown, and one in twenty misses 0 by luck where nothing differs.
+Error: how far learners are, after one second of the same actions, from where RK4 with 64 steps per decision has them
+(median over worlds and learners). Evaluations: of the force, per simulated second. Time: physics, observations and
+rewards of one world for one simulated second, in a batch on one thread, without compiling and without the policy: the
+median of interleaved rounds, each the median of its steps in a process of its own, and (least-most) of them; rounds
+overlap where those do. The machine was shared with other work. A policy is said to survive if it keeps
+95 % of its lead over random in its worst setting."""
+
+
+@dataclass(frozen=True)
+class Setting:
+    """How motion is solved: by which method, in which precision, in how many steps per decision."""
+
+    method: str
+    dtype: str
+    substeps: int
+
+    @classmethod
+    def trained(cls, task: Task) -> Setting:
+        """Return the setting of a task as its config has it, for which its players were made."""
+        return cls(task.integrator.kind, task.dtype, task.substeps)
+
+    def of(self, task: Task) -> Task:
+        """Return the task solved so: itself, to the last bit of dt, if it is."""
+        changes: dict[str, Any] = {"dtype": self.dtype}
+        if self.method != task.integrator.kind:
+            changes["integrator"] = INTEGRATORS[self.method]()
+        if self.substeps != task.substeps:
+            changes["dt"] = task.control_dt / self.substeps
+        return task.model_copy(update=changes)
+
+    @property
+    def solver(self) -> str:
+        """Method and precision: what is compiled."""
+        return f"{self.method}{' float32' if self.dtype == 'float32' else ''}"
+
+    @property
+    def name(self) -> str:
+        """'rk4 /4': four steps per decision."""
+        return f"{self.solver} /{self.substeps}"
+
+
+@dataclass(frozen=True, eq=False)
+class Cell:
+    """What one player scored under one setting, by world, (B,)."""
+
+    returns: NDArray[np.float64]
+    success: NDArray[np.bool_]
+
+    def to_json(self) -> Results:
+        """Return lists, from which the same bits are read again."""
+        return {"returns": self.returns.tolist(), "success": self.success.tolist()}
+
+    @classmethod
+    def of_json(cls, content: Results) -> Cell:
+        """Return what to_json was given."""
+        return cls(np.array(content["returns"], np.float64), np.array(content["success"], np.bool_))
+
+
+@dataclass
+class Clock:
+    """What replaying the same actions showed, by name of the setting."""
+
+    rounds: list[dict[str, float]] = field(default_factory=list)  # s per step of all worlds
+    error_mm: dict[str, float] = field(default_factory=dict)
+
+
+def task_results(
+    task: Task,
+    settings: Sequence[Setting],
+    cells: Mapping[tuple[Setting, str], Cell],
+    clock: Clock,
+    again: Mapping[str, Cell],
+    resamples: int,
+    seed: int,
+) -> Results:
+    """Return everything about one task as plain data; the first setting is the one that players were made for."""
+    names = list(again)
+    found: Results = {}
+    for setting in settings:
+        dt, method = setting.of(task).dt, INTEGRATORS[setting.method]
+        each = next(len(cells[setting, name].returns) for name in names) * task.control_dt
+        times = [1e6 * times[setting.name] / each for times in clock.rounds]
+        found[setting.name] = {
+            "method": setting.method,
+            "dtype": setting.dtype,
+            "substeps": setting.substeps,
+            "dt": dt,
+            "evaluations_per_s": method.evaluations / dt,
+            "adaptive": method.adaptive,
+            "us_per_s": float(np.median(times)),
+            "us_low": min(times),
+            "us_high": max(times),
+            "error_mm": clock.error_mm[setting.name],
+            "players": {
+                name: _player(cells[setting, name], cells[settings[0], name], resamples, seed) for name in names
+            },
+            "leads": {
+                f"{names[-1]} - {other}": _difference(cells[setting, names[-1]], cells[setting, other], resamples, seed)
+                for other in names[:-1]
+            },
+        }
+    results = {
+        "digest": task_digest(task),
+        "control_dt": task.control_dt,
+        "trained": settings[0].name,
+        "settings": found,
+        "again": {
+            name: float(np.abs(cell.returns - cells[settings[0], name].returns).max()) for name, cell in again.items()
+        },
+    }
+    return {**results, "verdict": verdict(task.name, results)}
+
+
+def _player(cell: Cell, trained: Cell, resamples: int, seed: int) -> Results:
+    return {
+        **interval_fields("mean", "mean", bootstrap(cell.returns, "mean", resamples, seed)),
+        "success_rate": float(cell.success.mean()),
+        **_difference(cell, trained, resamples, seed),
+    }
+
+
+def _difference(first: Cell, second: Cell, resamples: int, seed: int) -> Results:
+    gain = bootstrap(first.returns - second.returns, "mean", resamples, seed)
+    return {**interval_fields("difference", "ci", gain), "separated": gain.low > 0 or gain.high < 0}
+
+
+# --- what it comes to -------------------------------------------------------------------------------------------------
+
+
+def finest(results: Results) -> str:
+    """Return the setting of the least error; of those within a tenth of it, or of rounding, the cheapest."""
+    settings = results["settings"]
+    least = max(NOTHING, 1.1 * min(about["error_mm"] for about in settings.values()))
+    return _cheapest(settings, least)
+
+
+def frugal(results: Results) -> str:
+    """Return the cheapest setting that has at most a tenth of the error of the trained one."""
+    settings = results["settings"]
+    least = min(about["error_mm"] for about in settings.values())
+    return _cheapest(settings, max(NOTHING, least, settings[results["trained"]]["error_mm"] / 10))
+
+
+def _cheapest(settings: Results, error_mm: float) -> str:
+    enough = [name for name, about in settings.items() if about["error_mm"] <= error_mm]
+    return min(enough, key=lambda name: settings[name]["us_per_s"])
+
+
+def verdict(task: str, results: Results) -> str:
+    """Return a sentence about the last player: does it survive, and what does accuracy cost?"""
+    settings, trained = results["settings"], results["settings"][results["trained"]]
+    pilot = list(trained["players"])[-1]
+    best, cheap = finest(results), frugal(results)
+    fine, saving = settings[best], settings[cheap]
+    claims = [_survival(results, pilot)]
+    told = f"solved to {length_text(fine['error_mm'])} ({title(fine)}; trained: {length_text(trained['error_mm'])})"
+    rates = [about["players"][pilot]["success_rate"] for about in (fine, trained)]
+    change = f"{_change(fine['players'][pilot])}, success {rates[0]:.0%} against {rates[1]:.0%}"
+    claims.append(f"{told} it {change}, and {_standing(fine, pilot)}")
+    claims.append(
+        f"at most a tenth of the trained error ({title(saving)}: {length_text(saving['error_mm'])}) costs "
+        + _times(saving, trained)
+        + (f"; the least error costs {_times(fine, trained)}" if best != cheap else "; no other has less error")
+    )
+    return f"{task}: " + "; ".join(claims) + "."
+
+
+def _survival(results: Results, pilot: str) -> str:
+    """Say what a policy keeps in its worst setting, measured by its lead over random where that played."""
+    settings = results["settings"]
+    name = min(settings, key=lambda s: settings[s]["players"][pilot]["difference"])
+    worst, trained = settings[name]["players"], settings[results["trained"]]["players"]
+    if name == results["trained"]:
+        return f"{pilot} does nowhere worse than where it was made"
+    told = f"in its worst setting ({title(settings[name])}) it {_change(worst[pilot])}"
+    if "random" not in worst or pilot == "random":
+        return f"{pilot}: {told}"
+    kept = (worst[pilot]["mean"] - worst["random"]["mean"]) / (trained[pilot]["mean"] - trained["random"]["mean"])
+    says = "survives every setting" if kept >= SURVIVES else "does not survive every setting"
+    return f"{pilot} {says}: {told} and keeps {100 * kept:.0f} % of its lead over random"
+
+
+def _change(player: Results) -> str:
+    if not player["separated"]:
+        return f"is level with itself, {interval_text(player, 'difference', 'ci')}"
+    verb = "gains" if player["difference"] > 0 else "loses"
+    sign = 1.0 if player["difference"] > 0 else -1.0
+    low, high = sorted((sign * player["ci_low"], sign * player["ci_high"]))
+    size = {"difference": sign * player["difference"], "ci_low": low, "ci_high": high}
+    return f"{verb} {interval_text(size, 'difference', 'ci')}"
+
+
+def _standing(about: Results, pilot: str) -> str:
+    """Say where the policy stands beside the player that claims most of the others."""
+    if not about["leads"]:
+        return "nobody else played"
+    pair, lead = list(about["leads"].items())[-1]
+    place = "level with" if not lead["separated"] else "ahead of" if lead["difference"] > 0 else "behind"
+    return f"is {place} {pair.removeprefix(f'{pilot} - ')} ({interval_text(lead, 'difference', 'ci')})"
+
+
+def _times(about: Results, trained: Results) -> str:
+    alike = about["us_low"] <= trained["us_high"] and trained["us_low"] <= about["us_high"]
+    ratio = about["us_per_s"] / trained["us_per_s"]
+    return f"{ratio:.2f} times the time" + (" (rounds overlap)" if alike else "")
+
+
+def title(about: Results) -> str:
+    """Return 'rk4, dt 0.0125 s'."""
+    precision = " float32" if about["dtype"] == "float32" else ""
+    return f"{about['method']}{precision}, dt {about['dt']:.4g} s"
+
+
+def length_text(millimetres: float) -> str:
+    """Return '74 mm', '0.66 mm' or 'rounding'."""
+    return (
+        "rounding"
+        if millimetres < NOTHING
+        else f"{millimetres:.2g} mm"
+        if millimetres < 100
+        else f"{millimetres:.0f} mm"
+    )
+
+
+# --- tables -----------------------------------------------------------------------------------------------------------
+
+
+def _costs(about: Results) -> list[str]:
+    calls = number_text(about["evaluations_per_s"])
+    return [
+        about["method"] + (" float32" if about["dtype"] == "float32" else ""),
+        f"{about['dt']:.4g}",
+        f"≥ {calls}" if about["adaptive"] else calls,
+        f"{number_text(about['us_per_s'])} ({number_text(about['us_low'])}-{number_text(about['us_high'])})",
+        length_text(about["error_mm"]),
+    ]
+
+
+def _scores(results: Results, name: str, players: Sequence[str]) -> list[str]:
+    found = results["settings"][name]["players"]
+    if name == results["trained"]:
+        return [f"{interval_text(found[p], 'mean', 'mean')} (trained)" for p in players]
+    return [
+        interval_text(found[p], "difference", "ci") + ("" if found[p]["separated"] else " (level)") for p in players
+    ]
+
+
+def cells_of(results: Results, players: Sequence[str]) -> tuple[list[str], list[list[str]]]:
+    """Return header and rows: one row per setting, the trained one first with the returns themselves, then it again."""
+    header = ["method", "dt, s", "evaluations", "µs", "error", *players]
+    rows = [[*_costs(about), *_scores(results, name, players)] for name, about in results["settings"].items()]
+    again = [f"{results['again'][p]:.3f}" for p in players]
+    rows.insert(1, ["the same, played again", *rows[0][1:3], "", "", *again])
+    return header, rows
+
+
+def show(results: Results) -> None:
+    """Print a table per task about the last player, and last, in full, what they come to."""
+    console = Console(highlight=False)
+    if not console.is_terminal:
+        console = Console(highlight=False, width=160)
+    for task, about in results["tasks"].items():
+        header, rows = cells_of(about, list(about["again"])[-1:])
+        console.print(table_of(task, header, rows))
+    for about in results["tasks"].values():
+        console.print(about["verdict"], markup=False)
+
+
+def markdown(results: Results) -> str:
+    """Return the whole as a Markdown page."""
+    seeds = f"{results['world_seeds']['first']} to {results['world_seeds']['last']}"
+    held_out = f"{results['worlds']} worlds per task, seeds {seeds}: held out, those of the comparison."
+    about = [ASKED, f"{held_out} `python -m agents.transfer` makes this page anew."]
+    parts = ["# What accuracy buys a policy", *about, "![Differences and times](transfer.png)"]
+    parts += [f"* **{task}**{about['verdict'].removeprefix(task)}" for task, about in results["tasks"].items()]
+    for task, about in results["tasks"].items():
+        parts += [f"## {task}", grid(*cells_of(about, list(about["again"])))]
+    versions = ", ".join(f"{name} {version}" for name, version in results["versions"].items())
+    machine = f"{results['machine']['system']}, {results['machine']['cores']} cores"
+    return "\n\n".join([*parts, "## What it says", READING, "---", NOTES, f"Made with {versions} on {machine}.\n"])
