@@ -101,8 +101,8 @@ def test_view_cones_and_speed_limits_of_flocks_leave_order_1(name: str) -> None:
 
 
 def test_the_order_is_of_the_finest_points_between_rounding_and_nonsense() -> None:
-    """Order 2, but for a point that is no approximation, and two that are rounding."""
-    errors = [5.0, *(1e-1 * 0.25**k for k in range(9)), 1e-12, 3e-12]
+    """Order 2 in the end: not yet in the coarse steps, no approximation in the first, no more than rounding last."""
+    errors = [5.0, 0.9, 0.7, 0.5, *(1e-1 * 0.25**k for k in range(6)), 1e-12, 3e-12]
     points = [_point(2**k, error) for k, error in enumerate(errors)]
     order, used = measured_order(points, 1e-9, 1.0)
     assert order == pytest.approx(2)
