@@ -187,7 +187,7 @@ KINDS = pytest.mark.parametrize("row", FIRST, ids=lambda row: row.name)
 
 def single(row: EffectRow, dimension: int) -> Scene:
     """One effect in float32, the others idle: one kernel for all of them, but for those that are never among others."""
-    if row.effect.far_law:
+    if row.effect.far_law or row.effect.bond_law:
         return scene_of(row.effect, dimension=dimension, dtype="float32")
     return everything(dimension, *row.at(dimension), space=Plane(), dtype="float32")
 
