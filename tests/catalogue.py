@@ -37,6 +37,7 @@ from flockenv.effects import (
     Tether,
     Uniform,
     Vortex,
+    WallRepulsion,
     Wind,
 )
 from flockenv.integrators import (
@@ -119,6 +120,7 @@ class EffectRow:
     beside: tuple[Effect, ...] = ()  # without which it moves nobody: what a medium drags or carries
     obeys: frozenset[str] = frozenset({"translation", "rotation", "mirror", "relabelling"})
     signed: tuple[str, ...] = ()  # parameters that may be negative
+    torus: bool = True  # may it act there?
 
     @property
     def name(self) -> str:
@@ -185,6 +187,7 @@ EFFECTS = (
     EffectRow(
         Swing(centre=CENTRE, strength=0.8, length=0.7), obeys=frozenset({"translation", "mirror", "relabelling"})
     ),
+    EffectRow(WallRepulsion(point=CENTRE, normal=(1.2, -0.7, 0.9), strength=2, decay=1.5), torus=False),
     EffectRow(Fluctuation(strength=0.8), obeys=frozenset({"translation"})),  # to each his own, along the axes
     EffectRow(Separation(weight=1.3, radius=2.5)),
     EffectRow(Separation(weight=1.3, radius=2.5, fov=200, nearest=3)),
@@ -287,13 +290,13 @@ FIRST = tuple({row.effect.kind: row for row in reversed(EFFECTS)}.values())[::-1
 
 
 def everything(dimension: int, *chosen: Effect, **fields: Any) -> Scene:
-    """Return all kinds of effects at once, on a torus unless another space is given.
+    """Return all kinds of effects at once, but those that no torus allows; on a torus unless another space is given.
 
     With some chosen, the others are there and idle: one kernel serves for tests of each of them, as long as they look
     around in the same ways (sweep.Parts.sights: who shares a radius, and who has a view cone at all).
     """
     own = {effect.kind: effect for effect in chosen}
-    rest = {effect.kind: effect for effect in (in_dimension(row.effect, dimension) for row in FIRST)}
+    rest = {effect.kind: effect for effect in (in_dimension(row.effect, dimension) for row in FIRST if row.torus)}
     given = {"space": SPACES["torus"][dimension]} | fields
     effects = ({kind: effect.idle() for kind, effect in rest.items()} if chosen else rest) | own
     return scene_of(*effects.values(), dimension=dimension, **given)
