@@ -34,6 +34,7 @@ from flockenv.neighbours import FEWEST_AGENTS, MAX_RANGES, WORTH_ARRANGING
 from flockenv.networks import AnyNetwork
 from flockenv.noise import MASK, key_of
 from flockenv.records import Record
+from flockenv.rounding import check_places
 from flockenv.shapes import Circle
 from flockenv.snapshot import Snapshot
 from flockenv.space import AnySpace, Box, Plane, Torus
@@ -269,6 +270,7 @@ class Scene(Record):
                 f"groups: {self.agents:,} agents need about {needed / 2**30:.3g} GiB; at most {MEMORY_LIMIT / 2**30:g} "
                 f"GiB, {int(MEMORY_LIMIT / each):,} agents, are allowed"
             )
+        check_places(self)
         check_dt(self)
         return self
 

@@ -260,7 +260,9 @@ class Box(Space):
 
     kind: Literal["box"] = "box"
     size: Size = Field(description="m per axis")
-    restitution: float = Field(default=0.0, ge=0, le=1, description="e: 0 = bodies stop at a wall, 1 = they lose nothing")
+    restitution: float = Field(
+        default=0.0, ge=0, le=1, description="e: 0 = bodies stop at a wall, 1 = they lose nothing"
+    )
     offset_law: ClassVar[str] = "plane_offset"
     confine_law: ClassVar[str] = "box_confine"
 

@@ -59,7 +59,9 @@ class WallRepulsion(Effect):
         """Refuse a torus too: there the way ahead of a wall leads to where it pushes hardest, behind it."""
         super().check(scene)
         if isinstance(scene.space, Torus):
-            raise ValueError(f"kind = {self.kind}: on a torus a wall has no two sides; only a plane or a box is allowed")
+            raise ValueError(
+                f"kind = {self.kind}: on a torus a wall has no two sides; only a plane or a box is allowed"
+            )
 
     def potential(self, groups: Sequence[Any], state: State, offset: Any) -> NDArray[np.float64]:
         """Sum of A B exp(-d / B) of all agents, (B,) J."""
