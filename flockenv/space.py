@@ -134,7 +134,8 @@ def _bounced(
 ) -> tuple[float, float]:
     """Along one axis: fly, meet a wall, turn around with the restitution's share of the speed, fly on.
 
-    Where all further bounces (a geometric series) end within the step, the body is at rest at their end.
+    Where all further bounces (a geometric series) end within the step, the body is at rest at their end; so who lies at
+    a wall costs one round, and not BOUNCES.
     """
     o, half = like(x, 0.0), like(x, 0.5)
     low, high = radius, length - radius

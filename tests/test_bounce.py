@@ -171,10 +171,9 @@ def test_billiards_by_unfolding(row: IntegratorRow, dt: float) -> None:
 def test_in_single_precision_nobody_gains_speed_by_rounding() -> None:
     """Far from the origin a way is known less well than a velocity."""
     scene = hall((0.0, 0.0), size=9000.0, dt=1e-3, dtype="float32", integrator=SemiImplicitEuler())
-    state = at(scene, (8999.5, 3.0), (100.0, 0))
-    for _ in range(100):
-        state = scene.run(state.with_motion([[(8999.5, 3.0)]], np.abs(state.vel)), 10)
-    assert state.vel[0, 0, 0] == -100
+    for speed in np.linspace(100, 130, 20):
+        end = scene.run(at(scene, (8999.5, 3.0), (speed, 0)), 10)
+        assert end.vel[0, 0, 0] == -np.float32(speed)
 
 
 def test_a_corner_turns_around_and_a_radius_keeps_off() -> None:
@@ -247,6 +246,24 @@ def test_nobody_leaves_and_nothing_becomes_no_number(dtype: str, widest: int, dt
         assert (state.pos <= 3).all()
 
 
+def test_a_force_too_large_for_its_square_leaves_somebody_at_a_wall() -> None:
+    scene = hall((0.0, -1e308), dt=1e-160)
+    end = scene.step(at(scene, (1.5, 2.0), (0, -1)))
+    assert end.pos[0, 0, 1] in (0, 3)
+    np.testing.assert_array_equal(end.vel[0, 0], (0, 0))
+
+
+def test_who_comes_back_to_the_wall_at_the_end_of_a_step_is_not_rounded_out_of_the_box() -> None:
+    rng = np.random.default_rng(2)
+    scene = hall(count=2000)
+    speed = G * scene.dt / 2 / rng.integers(1, 12, 2000) * (1 + rng.integers(-3, 4, 2000) * 2.2e-16)
+    state = at(scene, np.tile((1.5, 0.0), (2000, 1)), np.stack([speed * 0, speed], axis=1))
+    for _ in range(50):
+        state = scene.step(state)
+        assert (state.pos >= 0).all()
+    np.testing.assert_allclose(np.hypot(state.vel[0, :, 1], np.sqrt(2 * G * state.pos[0, :, 1])), speed, rtol=1e-9)
+
+
 def test_who_is_outside_is_put_at_the_wall() -> None:
     scene = hall((0.0, 0.0), dt=0.1, radius=0.5)
     end = scene.step(at(scene, (4.0, -1.0), (-2.0, -3.0)))
@@ -265,11 +282,11 @@ def test_the_speed_limit_holds_after_an_impact_too() -> None:
 
 def test_the_dead_stay_where_they_are() -> None:
     scene = hall(count=2)
-    state = at(scene, (1.0, 0.01), (0, -5.0))
+    state = at(scene, (1.0, 0.003), (0, -5.0))
     state.alive[0, 1] = False
     end = scene.run(state, 3)
-    np.testing.assert_array_equal(end.pos[0, 1], (1, 0.01))
-    assert end.pos[0, 0, 1] > 0.01
+    np.testing.assert_array_equal(end.pos[0, 1], (1, 0.003))
+    assert end.pos[0, 0, 1] > 0.003
 
 
 # --- restitution is a number, and 0 is the wall that stops ------------------------------------------------------------
