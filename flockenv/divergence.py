@@ -17,16 +17,21 @@ class SimulationDiverged(FloatingPointError):  # noqa: N818  # the issue and its
     """The state of all worlds when the call ended."""
 
     def __init__(
-        self, world: int, agent: int, step: int, time: float, effect: str | None, dt: float, method: str
-    ) -> None:
-        """world, agent, step (since the start): where; time: s; effect: what accelerated it most, none = not known."""
+        self, world: int, agent: int, step: int, time: float, effect: str | None, dt: float, method: str,
+        reason: str = "",
+    ) -> None:  # fmt: skip
+        """world, agent, step (since the start): where; time: s; effect: what accelerated it most, none = not known.
+
+        reason: what happened, if it is not that a number is no longer finite.
+        """
         self.world, self.agent, self.step, self.time, self.effect = world, agent, step, time, effect
-        self.dt, self.method = dt, method
-        super().__init__(world, agent, step, time, effect, dt, method)  # so that it can be pickled
+        self.dt, self.method, self.reason = dt, method, reason
+        super().__init__(world, agent, step, time, effect, dt, method, reason)  # so that it can be pickled
 
     def __str__(self) -> str:
         by = f", accelerated by {self.effect}" if self.effect else ""
+        what = self.reason or "position or velocity is not finite"
         return (
-            f"world {self.world}, agent {self.agent}: position or velocity is not finite after step {self.step}, "
+            f"world {self.world}, agent {self.agent}: {what} in step {self.step}, "
             f"t = {self.time:g} s{by}; dt = {self.dt:g} s may be too large for {self.method}"
         )

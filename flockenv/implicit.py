@@ -24,10 +24,17 @@ MOST_NUMBERS = 2**22
 """Coordinates that are evaluated together; columns of a large matrix are taken in portions."""
 
 
+MOST_DENSE = 512
+"""Coordinates up to which a full matrix of derivatives costs less than GMRES's differences along directions."""
+
+
 def coupling_of(scene: Scene) -> Coupling | None:
-    """Return who depends on whom, if that does not change from step to step; none if agents look around."""
+    """Return who depends on whom; none if agents look around, and are too many for everybody to depend on everybody."""
     if any(e.pair_law or e.far_law for e in scene.effects):
-        return None
+        if scene.agents * scene.dimension > MOST_DENSE:
+            return None
+        pairs = np.indices((scene.agents, scene.agents)).reshape(2, -1)
+        return coupled(scene.agents, *pairs)
     first, second = [np.zeros(0, np.int64)], [np.zeros(0, np.int64)]
     for _, effect in scene.parts.bonded:
         bonds = effect.bonds(scene.groups, scene.dimension)
@@ -39,45 +46,47 @@ def coupling_of(scene: Scene) -> Coupling | None:
 
 def solve_steps(
     scene: Scene, state: State, drive: Floats, steps: int, step: Callable[[State, int, Floats, Floats], tuple[int, int]]
-) -> tuple[int, int]:
-    """Advance every world of a state in place; return the first (world, agent) not finite or not found, or (-1, -1).
+) -> tuple[int, int, str]:
+    """Advance every world of a state in place; return the first (world, agent) not finite or not found, and why.
 
     `step(state, world, x, v)` lets the kernel take over positions and velocities (D, N): limits, the space, time. A
     world that fails stays as it was.
     """
     method = scene.integrator
     assert isinstance(method, Implicit)
-    broken = (-1, -1)
+    broken = (-1, -1, "")
     for b in range(state.shape[0]):
         alone = state.worlds([b])
         push = drive[:, b : b + 1] if drive.shape[1] else drive
         evaluate = _evaluation(scene, alone, push)
-        bad = -1
+        bad, reason = -1, ""
         for _ in range(steps):
-            bad = _solved(scene, method, alone, evaluate, step)
+            bad, reason = _solved(scene, method, alone, evaluate, step)
             if bad >= 0:
                 break
         if bad < 0:
             _put(state, b, alone)
         elif broken[0] < 0:
-            broken = (b, bad)
+            broken = (b, bad, reason)
     return broken
 
 
 def _solved(
     scene: Scene, method: Implicit, alone: State, evaluate: Evaluate,
     step: Callable[[State, int, Floats, Floats], tuple[int, int]],
-) -> int:  # fmt: skip
-    """Advance one world by one step; return the agent that is not finite or was not found, or -1."""
+) -> tuple[int, str]:  # fmt: skip
+    """Advance one world by one step; return the agent that is not finite or was not found, or -1, and what happened."""
     x, v = alone.x[:, 0].ravel(), alone.v[:, 0].ravel()
     try:
         found = method.solve(evaluate, x, v, float(alone.time[0]), scene.dt, scene.dimension, scene.coupling)
-    except NotSolvedError:
-        return _fastest(alone)
+    except NotSolvedError as error:
+        return _fastest(alone), str(error)
     alone.work[0, WORK.index("newton_iterations")] += found.newton
     alone.work[0, WORK.index("linear_iterations")] += found.linear
+    alone.work[0, WORK.index("substeps")] += found.substeps
+    alone.work[0, WORK.index("rejected_steps")] += found.rejected
     shape = alone.x[:, 0].shape
-    return step(alone, 0, found.x.reshape(shape), found.v.reshape(shape))[1]
+    return step(alone, 0, found.x.reshape(shape), found.v.reshape(shape))[1], ""
 
 
 def _fastest(alone: State) -> int:

@@ -66,7 +66,17 @@ MEMORY_LIMIT = 8 * 2**30
 
 def _keep(value: Any, handler: Any) -> Any:
     """Let a record through as it is: an effect of somebody else's is as good as ours, only files need the list."""
-    return value if isinstance(value, (Effect, Integrator)) else handler(value)
+    return value if isinstance(value, (Effect, Integrator)) else handler(_in_tuples(value))
+
+
+def _in_tuples(value: Any) -> Any:
+    """Return what a file says with tuples in the place of lists: strictly read, only JSON's lists are taken for tuples.
+
+    (And here they are Python's already: pydantic hands them over so to a function like `_keep`.)
+    """
+    if isinstance(value, Mapping):
+        return {key: _in_tuples(inner) for key, inner in value.items()}
+    return tuple(map(_in_tuples, value)) if isinstance(value, list) else value
 
 
 if TYPE_CHECKING:
@@ -424,12 +434,14 @@ class Scene(Record):
             _demand_one_piece(out)
             if out is not state:
                 out.copy_from(state)
-        world, agent = self._advance(out, forces, steps)
+        world, agent, reason = self._advance(out, forces, steps)
         if world >= 0:
-            raise self._diverged(out, forces, world, agent, steps)
+            raise self._diverged(out, forces, world, agent, steps, reason)
         return out
 
-    def _diverged(self, state: State, drive: Floats, world: int, agent: int, steps: int) -> SimulationDiverged:
+    def _diverged(
+        self, state: State, drive: Floats, world: int, agent: int, steps: int, reason: str
+    ) -> SimulationDiverged:
         """Return what to say about a world that could not make its steps: its last finite instant is found again."""
         alone = state.worlds([world])
         push = drive[:, world : world + 1].copy() if drive.shape[1] else drive
@@ -439,7 +451,7 @@ class Scene(Record):
         agent = bad[1] if done < steps else agent
         last, time = int(alone.tick[0]) + 1, (int(alone.tick[0]) + 1) * self.dt
         effect = self._blamed(alone, agent)
-        error = SimulationDiverged(world, agent, last, time, effect, self.dt, self.integrator.kind)
+        error = SimulationDiverged(world, agent, last, time, effect, self.dt, self.integrator.kind, reason)
         error.state = state
         return error
 
@@ -477,16 +489,13 @@ class Scene(Record):
         )  # fmt: skip
         return acc.transpose(1, 2, 0), flow.transpose(1, 2, 0) if self.parts.flows else None
 
-    def _advance(self, state: State, drive: Floats, steps: int) -> tuple[int, int]:
-        """Step in place, by as many threads as are in use; return the first (world, agent) not finite, or (-1, -1).
-
-        Threads take worlds apart, or, of a large world, its agents.
-        """
+    def _advance(self, state: State, drive: Floats, steps: int) -> tuple[int, int, str]:
+        """Step in place; return the first (world, agent) that could not, or (-1, -1), and why if numbers are finite."""
         if steps == 0:
-            return -1, -1
+            return -1, -1, ""
         if self.integrator.solves:
             return solve_steps(self, state, drive, steps, self._take_over)
-        return self._stepped(state, drive, steps)
+        return *self._stepped(state, drive, steps), ""
 
     def _take_over(self, state: State, world: int, x: Floats, v: Floats) -> tuple[int, int]:
         """Let the kernel end a step whose positions and velocities, (D, N), were solved for: limits, space, time."""
@@ -499,7 +508,10 @@ class Scene(Record):
         return self._stepped(state, np.zeros((self.dimension, 0, 0), self.dtype), 1)
 
     def _stepped(self, state: State, drive: Floats, steps: int) -> tuple[int, int]:
-        """Step in place by the kernel alone."""
+        """Step in place by the kernel alone, by as many threads as are in use.
+
+        Threads take worlds apart, or, of a large world, its agents.
+        """
         worlds, agents, _ = state.shape
         crew = threads() if worlds * agents * steps >= WORTH_SHARING else 1
         team = crew if worlds < crew and agents >= WORTH_SHARING and not self.integrator.adaptive else 1

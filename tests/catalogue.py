@@ -28,7 +28,10 @@ from flockenv.effects import (
     Drag,
     Effect,
     Fluctuation,
+    Gravitation,
     Gravity,
+    InverseSquare,
+    Pressure,
     QuadraticDrag,
     Separation,
     Sink,
@@ -189,11 +192,14 @@ EFFECTS = (
     ),
     EffectRow(WallRepulsion(point=CENTRE, normal=(1.2, -0.7, 0.9), strength=2, decay=1.5), torus=False),
     EffectRow(Fluctuation(strength=0.8), obeys=frozenset({"translation"})),  # to each his own, along the axes
+    EffectRow(Pressure(strength=1.5, density=1, radius=1.35)),
     EffectRow(Separation(weight=1.3, radius=2.5)),
     EffectRow(Separation(weight=1.3, radius=2.5, fov=200, nearest=3)),
     EffectRow(Alignment(weight=0.7, radius=3, fov=270)),
     EffectRow(Cohesion(weight=0.9, radius=2.8, fov=240)),
     EffectRow(AvoidObstacles(weight=5, horizon=3, margin=0.1)),
+    EffectRow(Gravitation(constant=0.3, softening=0.5)),  # of few the sum is exact; of many, see test_gravitation.py
+    EffectRow(InverseSquare(strength=-0.4, softening=0.3), signed=("strength",)),
 )  # fmt: skip
 
 
@@ -290,13 +296,15 @@ FIRST = tuple({row.effect.kind: row for row in reversed(EFFECTS)}.values())[::-1
 
 
 def everything(dimension: int, *chosen: Effect, **fields: Any) -> Scene:
-    """Return all kinds of effects at once, but those that no torus allows; on a torus unless another space is given.
+    """Return all kinds of effects at once, on a torus unless another space is given; but those on everybody.
 
+    They are refused on a torus, like walls, and would make every scene of many agents here one with a tree.
     With some chosen, the others are there and idle: one kernel serves for tests of each of them, as long as they look
     around in the same ways (sweep.Parts.sights: who shares a radius, and who has a view cone at all).
     """
     own = {effect.kind: effect for effect in chosen}
-    rest = {effect.kind: effect for effect in (in_dimension(row.effect, dimension) for row in FIRST if row.torus)}
+    others = [row.effect for row in FIRST if row.torus and not row.effect.far_law]
+    rest = {effect.kind: in_dimension(effect, dimension) for effect in others}
     given = {"space": SPACES["torus"][dimension]} | fields
     effects = ({kind: effect.idle() for kind, effect in rest.items()} if chosen else rest) | own
     return scene_of(*effects.values(), dimension=dimension, **given)

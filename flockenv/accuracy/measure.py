@@ -165,7 +165,7 @@ def _curves(trials: Sequence[_Trial], least: float, most: float) -> list[Curve]:
         if not mine:
             continue
         points = tuple(trial.timed for trial in mine)
-        order, used = measured_order(points, least, most)
+        order, used = (None, 0) if mine[0].method.adaptive else measured_order(points, least, most)
         declared = min(mine[0].method.order, mine[0].method.order_with_drag)
         curves.append(Curve(method=kind, declared=declared, points=points, order=order, used=used))
     return curves

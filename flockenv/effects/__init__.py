@@ -19,13 +19,14 @@ from flockenv.effects.flock import Alignment, Cohesion, Separation  # noqa: E402
 from flockenv.effects.fluctuation import Fluctuation  # noqa: E402
 from flockenv.effects.gravitation import Gravitation, InverseSquare  # noqa: E402
 from flockenv.effects.gravity import Gravity  # noqa: E402
+from flockenv.effects.pressure import Pressure  # noqa: E402
 from flockenv.effects.springs import AngularSprings, Springs  # noqa: E402
 from flockenv.effects.tether import Swing, Tether  # noqa: E402
 from flockenv.effects.wall import WallRepulsion  # noqa: E402
 
 __all__ = [
     "EFFECTS", "Alignment", "AngularSprings", "Attraction", "AvoidObstacles", "Carried", "Cohesion", "Drag", "Effect",
-    "Elastic", "Far", "Fluctuation", "Gravitation", "Gravity", "InverseSquare", "Me", "Other", "QuadraticDrag",
-    "Separation", "Sight", "Sink", "Source", "Springs", "Swing", "Tether", "Uniform", "Vortex",
+    "Elastic", "Far", "Fluctuation", "Gravitation", "Gravity", "InverseSquare", "Me", "Other", "Pressure",
+    "QuadraticDrag", "Separation", "Sight", "Sink", "Source", "Springs", "Swing", "Tether", "Uniform", "Vortex",
     "WallRepulsion", "Wind",
 ]  # fmt: skip

@@ -23,7 +23,8 @@ def attraction(p: Any, me: Me) -> Vec:
     towards = sub(p.centre, me.pos)
     square = dot(towards, towards)
     o, soft = like(square, 0.0), square + p.softening * p.softening
-    return scale(towards, p.strength / (soft * np.sqrt(soft)) if square > o else o)
+    cube = soft * np.sqrt(soft)
+    return scale(towards, p.strength / cube if cube > o else o)  # a square may underflow before a distance does
 
 
 class Attraction(Effect):

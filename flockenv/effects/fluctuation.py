@@ -25,7 +25,8 @@ class Fluctuation(Effect):
 
     Grows with the root of the step, so that what is seen after a time T does not depend on dt: alone, var v = (s/m)^2 T
     and var x = (s/m)^2 T^3 / 3 per direction; with Drag of rate c, var v = s^2 / (2 c m) in the long run (Langevin
-    1908), which is k T / m at s^2 = 2 c k T. A kick is a function of (seed, world, step, agent, place of the effect in
+    1908), which is k T / m at s^2 = 2 c k T; at the end of a step, just after the kick, var v is larger by a share of
+    c dt / m. A kick is a function of (seed, world, step, agent, place of the effect in
     the scene's list), drawn once per step however often a method asks for forces.
     """
 

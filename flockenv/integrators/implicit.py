@@ -7,10 +7,13 @@ from typing import Any, ClassVar
 import numpy as np
 
 from flockenv.integrators.base import Integrator
-from flockenv.integrators.newton import Coupling, Evaluate, Stage, solve_stage
+from flockenv.integrators.newton import Coupling, Evaluate, NotSolvedError, Stage, solve_stage
 from flockenv.state import Floats
 
 __all__ = ["Implicit"]
+
+MOST_HALVED = 3
+"""Times that a step may be halved before its world is given up."""
 
 
 class Implicit(Integrator):
@@ -26,7 +29,33 @@ class Implicit(Integrator):
         self, evaluate: Evaluate, x: Floats, v: Floats, time: float, dt: float, dimension: int,
         coupling: Coupling | None,
     ) -> Stage:  # fmt: skip
-        """Return positions and velocities one step later, (D N,); newton.NotSolvedError if they are not found."""
+        """Return positions and velocities one step later, (D N,); newton.NotSolvedError if they are not found.
+
+        A step whose equations Newton's method does not solve is made in two halves, and each of those again if need be:
+        where forces jump there may be no solution for one length of step and one for another.
+        """
+        total, left = Stage(x, v, 0, 0, 0), [(time, dt, 0)]
+        while left:
+            begins, length, halved = left.pop()
+            try:
+                found = self._stage(evaluate, total.x, total.v, begins, length, dimension, coupling)
+            except NotSolvedError:
+                if halved == MOST_HALVED:
+                    raise
+                left += [(begins + length / 2, length / 2, halved + 1), (begins, length / 2, halved + 1)]
+                total = total._replace(rejected=total.rejected + 1)
+                continue
+            total = Stage(
+                found.x, found.v, total.newton + found.newton, total.linear + found.linear, total.substeps + 1,
+                total.rejected,
+            )  # fmt: skip
+        return total
+
+    def _stage(
+        self, evaluate: Evaluate, x: Floats, v: Floats, time: float, dt: float, dimension: int,
+        coupling: Coupling | None,
+    ) -> Stage:  # fmt: skip
+        """Return positions and velocities one step of this length later, by one stage."""
         h = self.share * dt
         found = solve_stage(evaluate, x, v, time + h, h, dimension, coupling)
         if self.share == 1.0:

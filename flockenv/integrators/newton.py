@@ -8,7 +8,7 @@ Both solvers are scipy's.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -24,7 +24,7 @@ Rows = NDArray[np.floating[Any]]
 Evaluate = Callable[[Rows, Rows, float], tuple[Rows, Rows | None]]
 """(x, v, time) -> acceleration, and flow or none: of K instants at once, each a row of all coordinates, (K, D N)."""
 
-MOST_ITERATIONS = 60
+MOST_ITERATIONS = 50
 MOST_HALVINGS = 12
 GMRES_TOLERANCE = 1e-4
 """Of one linear solve, relative: Newton's method makes good what is left."""
@@ -41,6 +41,8 @@ class Stage(NamedTuple):
     v: Rows  # (D N,)
     newton: int
     linear: int  # iterations of GMRES, or factorisations
+    substeps: int = 1
+    rejected: int = 0  # steps that were halved
 
 
 @dataclass(frozen=True)
@@ -94,12 +96,14 @@ class _Residual:
         x, v = self.motion(w[None])
         return Stage(x[0], v[0], newton, linear)
 
-    def begin(self) -> Rows:
-        """Return the first guess: everybody goes on as he does."""
+    def guesses(self) -> Iterator[Rows]:
+        """Return where to begin: everybody goes on as he does; or as the force says that he will."""
         self.flows = False
-        _, flow = self.evaluate(self.x0[None], self.v0[None], self.time)
+        acc, flow = self.evaluate(self.x0[None], self.v0[None], self.time)
         self.flows = flow is not None
-        return self.v0.copy() if flow is None else np.asarray(self.v0 + flow[0])
+        goes_on = self.v0.copy() if flow is None else np.asarray(self.v0 + flow[0])
+        yield goes_on
+        yield goes_on + self.h * acc[0]
 
 
 def solve_stage(
@@ -107,28 +111,49 @@ def solve_stage(
 ) -> Stage:
     """Return the stage at `time` of an implicit method with step h; NotSolvedError if Newton's method does not end.
 
-    x0, v0: (D N,), one coordinate of all agents after another. It ends when a correction is at rounding, relative to
-    the velocities, or stops to shrink there; a correction that does not bring the residual down is halved.
+    x0, v0: (D N,), one coordinate of all agents after another. Where it begins forces may have no derivative (agents in
+    one place); then it begins anew from where an explicit step leads.
     """
     residual = _Residual(evaluate, x0, v0, time, h)
-    w, linear = residual.begin(), 0
-    rounding = float(np.finfo(x0.dtype).eps)
+    for w in residual.guesses():
+        try:
+            return _solved(residual, w, dimension, coupling)
+        except _SingularError:
+            continue
+    raise NotSolvedError("forces have no derivative where Newton's method begins")
+
+
+class _SingularError(ArithmeticError):
+    """Corrections are nothing although the equations do not hold: derivatives are without bound."""
+
+
+def _solved(residual: _Residual, w: Rows, dimension: int, coupling: Coupling | None) -> Stage:
+    """Return what Newton's method comes to from a first guess.
+
+    It ends when a correction is at rounding, relative to the velocities, or stops to shrink there; a correction that
+    does not bring those after it down is halved.
+    """
+    rounding, linear = float(np.finfo(w.dtype).eps), 0
     r = residual(w[None])[0]
+    first = float(np.abs(r).max())
+    # what the rounding of positions makes of velocities: far from the origin corrections come to rest there
+    noise = rounding * float(np.abs(residual.x0).max()) / residual.h
     before = np.inf
     for iteration in range(1, MOST_ITERATIONS + 1):
-        size = float(np.linalg.norm(r))
+        size = float(np.abs(r).max())
         if not np.isfinite(size):
             raise NotSolvedError("the acceleration is not finite")
         if size == 0.0:
             return residual.stage(w, iteration - 1, linear)
         solve = _free(residual, w, r) if coupling is None else _matrix(residual, w, r, dimension, coupling)
-        linear += coupling is not None
         correction, took = solve(-r)
-        linear += took
-        scale = max(1.0, float(np.abs(w).max()), float(np.abs(v0).max()))
+        linear += took + (coupling is not None)
+        scale = max(1.0, float(np.abs(w).max()), float(np.abs(residual.v0).max()))
         change = float(np.abs(correction).max())
         small = change <= 100 * rounding * scale
-        if small or (change <= 1e6 * rounding * scale and change >= 0.5 * before):
+        if small or (change <= max(1e6 * rounding * scale, 100 * noise) and change >= 0.5 * before):
+            if size > max(1e-2 * first, 1e-5 * scale):
+                raise _SingularError
             return residual.stage(w + correction if small else w, iteration, linear)
         before = change
         w, r, more = _searched(residual, w, correction, solve)

@@ -1,0 +1,25 @@
+"""Hard cases: scenes that break naive simulators, under every method, each with a bound, a value and a verdict.
+
+from flockenv.stress import CASES, run
+results = run(CASES, methods)
+
+Cases are functions from a method to a `Value`; see `bodies`, `bonded`, `crowds`. What a case raises is a verdict too: a
+scene that is refused because its step must blow up, a simulation that diverges and says so. Nothing ends in NaN without
+a word.
+"""
+
+from __future__ import annotations
+
+from flockenv.stress.bodies import BODIES
+from flockenv.stress.bonded import BONDED
+from flockenv.stress.case import Case, Value
+from flockenv.stress.crowds import CROWDS
+from flockenv.stress.results import Finding, Results
+from flockenv.stress.run import cases_named, methods_named, run, usual_methods
+
+__all__ = [
+    "CASES", "Case", "Finding", "Results", "Value", "cases_named", "methods_named", "run", "usual_methods",
+]  # fmt: skip
+
+CASES: tuple[Case, ...] = (*BODIES, *BONDED, *CROWDS)
+"""Every hard case, in the order of shared/reference/numerics.md, section 6.2, within each kind of scene."""

@@ -1,0 +1,258 @@
+"""What the textbook says in a formula: drag, gravity, central fields, vortices, Kepler's orbits (numerics.md 3.3, 6.2).
+
+Several effects share one kernel per method: those that a test does not speak of are there and idle.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+
+from flockenv.effects import Attraction, Carried, Drag, Effect, Gravity, QuadraticDrag, Sink, Source, Vortex
+from flockenv.integrators import RK4, ExplicitEuler, Integrator, SemiImplicitEuler, VelocityVerlet
+from flockenv.scene import Group, Scene
+from flockenv.spawn import Spawn
+from flockenv.state import State
+from tests.catalogue import Array
+
+G = 9.81
+PHI, MOST = 2.0, 5.0
+SOFT = math.sqrt(PHI / MOST)  # sqrt(a), m
+
+
+def body(effects: tuple[Effect, ...], method: Integrator, dt: float, mass: float = 1.0, **fields: Any) -> Scene:
+    """One body of some mass under some effects."""
+    dimension = fields.get("dimension", 2)
+    group = Group(count=1, mass=mass, spawn=Spawn(low=(0,) * dimension, high=(1,) * dimension))
+    return Scene(groups=(group,), effects=effects, integrator=method, dt=dt, **fields)
+
+
+def begin(scene: Scene, x: tuple[float, ...], v: tuple[float, ...]) -> State:
+    start = scene.start(0)
+    start.pos[...], start.vel[...] = x, v
+    return start
+
+
+def path(scene: Scene, start: State, rows: int, every: int) -> tuple[Array, Array]:
+    """Position and velocity of the first body at the start and each so many steps, (rows + 1, D)."""
+    found, state = [(start.pos[0, 0].copy(), start.vel[0, 0].copy())], start.copy()
+    for _ in range(rows):
+        scene.step(state, out=state, steps=every)
+        found.append((state.pos[0, 0].copy(), state.vel[0, 0].copy()))
+    x, v = (np.array(column) for column in zip(*found, strict=True))
+    return x, v
+
+
+# --- gravity and drag -------------------------------------------------------------------------------------------------
+
+
+def falling(method: Integrator, dt: float, linear: float = 0.0, quadratic: float = 0.0, mass: float = 1.0) -> Scene:
+    return body((Gravity(), Drag(rate=linear), QuadraticDrag(rate=quadratic)), method, dt, mass)
+
+
+METHODS = pytest.mark.parametrize(
+    ("method", "precision"), [(SemiImplicitEuler(), 0.13), (VelocityVerlet(), 1e-4), (RK4(), 1e-9)],
+    ids=lambda value: getattr(value, "kind", ""),
+)  # fmt: skip
+"""A method of order 1, 2 and 4, and its error in a few hundred steps."""
+
+
+@METHODS
+def test_a_projectile_in_linear_drag_flies_as_far_as_it_should(method: Integrator, precision: float) -> None:
+    """Rate c/m = 0.2 / s, v = (10, 15) m/s: it lands after 2.798418 s at 21.43051 m."""
+    seconds, rate, mass = 2.798418, 0.2, 2.5
+    scene = falling(method, seconds / 400, linear=rate * mass, mass=mass)
+    end = scene.run(begin(scene, (0, 0), (10, 15)), 400).pos[0, 0]
+    left = 1 - math.exp(-rate * seconds)
+    height = (15 + G / rate) * left / rate - G * seconds / rate
+    assert height == pytest.approx(0, abs=2e-5)
+    np.testing.assert_allclose(end, (10 * left / rate, height), atol=precision)
+    assert end[0] == pytest.approx(21.43051, abs=precision + 1e-5)
+
+
+@METHODS
+def test_a_fall_in_quadratic_drag_is_the_hyperbolic_one(method: Integrator, precision: float) -> None:
+    """Terminal speed 20 m/s: after 3 s 17.997264 m/s, 33.831523 m deep (g 9.81)."""
+    mass, terminal = 2.5, 20.0
+    scene = falling(method, 3 / 400, quadratic=mass * G / terminal**2, mass=mass)
+    end = scene.run(begin(scene, (0, 0), (0, 0)), 400)
+    assert -end.vel[0, 0, 1] == pytest.approx(17.997264, abs=precision + 5e-7)
+    assert -end.pos[0, 0, 1] == pytest.approx(33.831523, abs=precision + 5e-7)
+
+
+def test_quadratic_drag_is_along_the_velocity_and_not_per_axis() -> None:
+    scene = falling(RK4(), 0.01, quadratic=0.5).with_effects(
+        Gravity(acceleration=(0, 0)), Drag(rate=0), QuadraticDrag(rate=0.5)
+    )
+    end = scene.run(begin(scene, (0, 0), (3, 4)), 100)
+    # dv/dt = -c v^2 / m along a straight line: v = v0 / (1 + c v0 t / m), x = m / c ln(1 + c v0 t / m)
+    np.testing.assert_allclose(end.vel[0, 0], np.array([3, 4]) / (1 + 0.5 * 5), rtol=1e-6)
+    np.testing.assert_allclose(end.pos[0, 0], np.array([0.6, 0.8]) * math.log(1 + 0.5 * 5) / 0.5, rtol=1e-6)
+
+
+def test_semi_implicit_euler_keeps_its_own_energy_in_a_fall() -> None:
+    """numerics.md 3.2: v^2 / 2 + g y - h v g / 2 is what it conserves, to rounding; the plain energy drifts."""
+    scene = falling(SemiImplicitEuler(), 0.01)
+    x, v = path(scene, begin(scene, (0, 0), (1, 2)), 100, 10)
+    plain = (v**2).sum(axis=1) / 2 + G * x[:, 1]
+    np.testing.assert_allclose(plain - 0.01 * G * v[:, 1] / 2, plain[0] - 0.01 * G, atol=1e-9)
+    assert plain[-1] - plain[0] == pytest.approx(-4.8, abs=0.05)
+
+
+def test_everybody_falls_alike_and_who_is_held_in_place_does_not() -> None:
+    groups = tuple(Group(count=1, mass=mass, spawn=Spawn(low=(0, 0), high=(1, 1))) for mass in (0.1, 1, 70))
+    scene = falling(RK4(), 0.01).model_copy(update={"groups": groups})
+    scene.body.mass[1] = np.inf
+    start = scene.start(1)
+    end = scene.run(start, 100)
+    np.testing.assert_allclose((end.pos - start.pos)[0, :, 1], [-G / 2, 0, -G / 2], atol=1e-12)
+    np.testing.assert_array_equal(end.vel[0, 1], 0)
+
+
+# --- central forces ---------------------------------------------------------------------------------------------------
+
+
+def central(method: Integrator, dt: float, chosen: Effect, mass: float = 1.0) -> Scene:
+    """Forces from (or around) the origin: the chosen one, and the others idle."""
+    given = {"centre": (0, 0), "maximum": MOST}
+    every = (
+        Source(strength=0, **given), Sink(strength=0, **given), Vortex(strength=0, **given),
+        Attraction(strength=0, centre=(0, 0)),
+    )  # fmt: skip
+    return body(tuple(chosen if e.kind == chosen.kind else e for e in every), method, dt, mass)
+
+
+def potential(r: Array) -> Array:
+    """Of a sink, J, which is that of a source backwards: Phi / sqrt(a) arctan(r / sqrt(a))."""
+    return PHI / SOFT * np.arctan(r / SOFT)
+
+
+@pytest.mark.parametrize(("field", "sign"), [(Source, -1), (Sink, 1)])
+def test_a_source_or_sink_conserves_energy(field: Any, sign: int) -> None:
+    """m v^2 / 2 -+ Phi / sqrt(a) arctan(r / sqrt(a)), on a path that is no straight line."""
+    scene = central(RK4(), 0.002, field(strength=PHI, centre=(0, 0), maximum=MOST), mass=1.5)
+    x, v = path(scene, begin(scene, (0.2, 0.1), (-0.4, 2.0)), 200, 10)
+    r = np.linalg.norm(x, axis=1)
+    energy = 0.75 * (v**2).sum(axis=1) + sign * potential(r)
+    assert np.ptp(r) > 0.2
+    np.testing.assert_allclose(energy, energy[0], rtol=1e-9)
+
+
+def test_from_rest_a_source_drives_to_the_speed_of_the_formula() -> None:
+    """m = 1.5 kg, from 0.2 m: 2.309043 m/s at infinity; here at 2000 m, where Phi / r is left to gain."""
+    scene = central(RK4(), 0.01, Source(strength=PHI, centre=(0, 0), maximum=MOST), mass=1.5)
+    end = scene.run(begin(scene, (0.2, 0), (0, 0)), 100_000)
+    left = math.pi / 2 * PHI / SOFT - float(potential(end.pos[0, 0, 0]))
+    assert end.vel[0, 0, 0] == pytest.approx(math.sqrt(2.309043**2 - left / 0.75), abs=1e-6)
+    assert left < 0.001
+
+
+@pytest.mark.parametrize(("field", "turn"), [(Vortex, 1), (Source, 0), (Sink, 0)])
+@pytest.mark.parametrize("r", [0.3, 1.2, 4.0])
+def test_a_vortex_does_work_in_every_turn_and_the_others_none(field: Any, turn: int, r: float) -> None:
+    """The sum of F . dx around a circle is 2 pi r W(r): a vortex of forces has no potential."""
+    scene = central(RK4(), 0.01, field(strength=PHI, centre=(0, 0), maximum=MOST), mass=1.5)
+    scene = scene.model_copy(update={"groups": (scene.groups[0].model_copy(update={"count": 64}),)})
+    angle = np.arange(64) * 2 * np.pi / 64
+    start = scene.start(0)
+    start.pos[0], start.vel[0] = r * np.stack([np.cos(angle), np.sin(angle)], axis=1), 0
+    force = 1.5 * scene.acceleration(start)[0]
+    along = force @ np.array([[0, 1], [-1, 0]]).T  # turned back by a quarter, so that ahead becomes outwards
+    work = (along * start.pos[0]).sum() * 2 * np.pi / 64
+    assert work == pytest.approx(turn * 2 * np.pi * r * PHI / (PHI / MOST + r**2), abs=1e-12)
+
+
+KEPLER = {  # numerics.md, N04: 1000 steps a turn, 100 turns; energy and angular momentum to within so much
+    "velocity_verlet": (VelocityVerlet(), 4e-4, 1e-12, -1.466),
+    "rk4": (RK4(), 3e-7, 5e-8, 0.0),
+    "semi_implicit_euler": (SemiImplicitEuler(), 2e-2, 1e-12, None),
+}
+ECCENTRICITY = 0.6
+
+
+def orbit(method: Integrator, turns: int) -> tuple[Array, Array, Array]:
+    """Energy, angular momentum and direction of the perihelion (degrees) along Kepler's orbit with mu = a = 1."""
+    scene = central(method, 2 * math.pi / 1000, Attraction(strength=1, centre=(0, 0)))
+    e = ECCENTRICITY
+    x, v = path(scene, begin(scene, (1 - e, 0), (0, math.sqrt((1 + e) / (1 - e)))), turns * 200, 5)
+    r, spin = np.linalg.norm(x, axis=1), x[:, 0] * v[:, 1] - x[:, 1] * v[:, 0]
+    vector = spin[:, None] * np.stack([v[:, 1], -v[:, 0]], axis=1) - x / r[:, None]  # Laplace, Runge and Lenz's
+    return (v**2).sum(axis=1) / 2 - 1 / r, spin, np.degrees(np.arctan2(vector[:, 1], vector[:, 0]))
+
+
+@pytest.mark.parametrize("name", KEPLER)
+def test_kepler_s_orbit_keeps_what_the_method_should(name: str) -> None:
+    method, energy_bound, spin_bound, shift = KEPLER[name]
+    energy, spin, perihelion = orbit(method, 100)
+    worst = np.abs(energy / energy[0] - 1).max()
+    assert energy_bound / 3 < worst < energy_bound
+    assert np.abs(spin / spin[0] - 1).max() < spin_bound
+    if shift is not None:
+        assert perihelion[-1] == pytest.approx(shift, abs=5e-3)
+    if name != "rk4":  # symplectic: as good in the last turns as in the first
+        assert np.abs(energy[-2000:] / energy[0] - 1).max() < 1.05 * np.abs(energy[:2001] / energy[0] - 1).max()
+
+
+def test_explicit_euler_fails_on_kepler_s_orbit() -> None:
+    energy, _, _ = orbit(ExplicitEuler(), 10)
+    assert np.abs(energy / energy[0] - 1).max() == pytest.approx(0.64, abs=0.01)
+
+
+@pytest.mark.parametrize("strength", [3.0, -3.0])
+def test_softened_attraction_and_repulsion_conserve_their_energy(strength: float) -> None:
+    """Straight through the centre, if it attracts: with a softening nothing is infinite there."""
+    scene = central(RK4(), 0.002, Attraction(strength=strength, centre=(0, 0), softening=0.3), mass=1.5)
+    x, v = path(scene, begin(scene, (1, 0), (-0.5, 0)), 200, 10)
+    energy = 0.75 * (v**2).sum(axis=1) - strength / np.sqrt((x**2).sum(axis=1) + 0.09)
+    np.testing.assert_allclose(energy, energy[0], rtol=1e-7)
+    assert (x[:, 0].min() < -0.5) == (strength > 0)
+
+
+# --- carried by a vortex ----------------------------------------------------------------------------------------------
+
+R = 1.2
+SPEED = PHI / (PHI / MOST + R**2)
+TURN = 2 * math.pi * R / SPEED
+
+
+def tracer(method: Integrator, dt: float, **fields: Any) -> Scene:
+    vortex = {"centre": (0.5, -0.3), "maximum": MOST, "acts": "medium"} | fields
+    dimension = len(vortex["centre"])
+    return body((Vortex(strength=PHI, **vortex), Carried()), method, dt, dimension=dimension)
+
+
+def test_a_tracer_goes_around_a_vortex_in_the_time_of_the_formula() -> None:
+    """numerics.md, N16: RK4, ten turns of 200 steps, |dr / r| <= 1e-6; a turn takes 6.936637 s."""
+    assert pytest.approx(6.936637, abs=5e-7) == TURN
+    scene = tracer(RK4(), TURN / 200)
+    x, v = path(scene, begin(scene, (0.5 + R, -0.3), (0, 0)), 2000, 1)
+    away = x - (0.5, -0.3)
+    np.testing.assert_allclose(np.linalg.norm(away, axis=1), R, rtol=1e-6)
+    np.testing.assert_allclose(away[50], (0, R), atol=1e-6)  # a quarter, counterclockwise
+    np.testing.assert_allclose(away[-1], (R, 0), atol=1e-5)
+    np.testing.assert_array_equal(v, 0)
+
+
+def test_explicit_euler_spirals_out_of_a_vortex_as_the_recursion_says() -> None:
+    """r^2 <- r^2 + h^2 W(r)^2, to 1e-10: after 1000 steps of 0.05 s r = 1.7057155 m."""
+    scene = tracer(ExplicitEuler(), 0.05)
+    x, _ = path(scene, begin(scene, (0.5 + R, -0.3), (0, 0)), 1000, 1)
+    square = [R**2]
+    for _ in range(1000):
+        square.append(square[-1] + (0.05 * PHI / (PHI / MOST + square[-1])) ** 2)
+    np.testing.assert_allclose(((x - (0.5, -0.3)) ** 2).sum(axis=1), square, rtol=1e-10)
+    assert math.sqrt(square[-1]) == pytest.approx(1.7057155, abs=5e-8)
+
+
+def test_in_space_a_vortex_turns_about_its_axis() -> None:
+    """Right-handed, at the distance from the axis, whatever the height; an axis is a direction of any length."""
+    axis, centre = np.array([0.6, 0, 0.8]), np.array([0.5, -0.3, 1.0])
+    scene = tracer(RK4(), TURN / 200, centre=tuple(centre), axis=(3.0, 0.0, 4.0))
+    out, height = np.array([0.8, 0, -0.6]), 0.7
+    start = begin(scene, tuple(centre + height * axis + R * out), (0, 0, 0))
+    quarter = scene.run(start, 50).pos[0, 0] - centre
+    np.testing.assert_allclose(quarter, height * axis + R * np.cross(axis, out), atol=1e-6)
+    np.testing.assert_allclose(scene.run(start, 200).pos, start.pos, atol=1e-6)
