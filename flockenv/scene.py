@@ -34,6 +34,7 @@ from flockenv.neighbours import FEWEST_AGENTS, MAX_RANGES, WORTH_ARRANGING
 from flockenv.networks import AnyNetwork
 from flockenv.noise import MASK, key_of
 from flockenv.records import Record
+from flockenv.rounding import check_places
 from flockenv.shapes import Circle
 from flockenv.snapshot import Snapshot
 from flockenv.space import AnySpace, Box, Plane, Torus
@@ -162,7 +163,8 @@ class Workspace:
         carried = agents if parts.arranges and agents >= WORTH_ARRANGING else 1
         swept, cells = padded if parts.sweeps else 1, agents if sorts else 1
         real: dict[str, int | tuple[int, ...]] = {
-            **dict.fromkeys(("pos", "vel", "origin", "want"), padded * d),
+            **dict.fromkeys(("pos", "vel", "want"), padded * d),
+            "origin": padded * d * (2 if parts.bounces else 1),
             "stages": (max(parts.integrator.stages, 1), padded * d),
             **dict.fromkeys(("mass", "radius", "max_speed", "max_force", "living", "ident"), padded),
             "tie": padded * d if "t0" in parts.fields else 1,
@@ -278,6 +280,7 @@ class Scene(Record):
                 f"groups: {self.agents:,} agents need about {needed / 2**30:.3g} GiB; at most {MEMORY_LIMIT / 2**30:g} "
                 f"GiB, {int(MEMORY_LIMIT / each):,} agents, are allowed"
             )
+        check_places(self)
         check_dt(self)
         return self
 
@@ -326,7 +329,7 @@ class Scene(Record):
         if parts.sweeps and parts.sorts:
             reals += parts.rows + parts.numbers
             whole += 3 * 4
-        reals += d * (parts.pulls + parts.flows)
+        reals += d * (parts.pulls + parts.flows + parts.bounces)
         if parts.treed:
             numbers = tree_sizes(self.agents, parts.width, d, 1)
             reals += -(-sum(numbers.values()) // self.agents)

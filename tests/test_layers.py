@@ -19,7 +19,7 @@ LAYERS = (
     {"records", "vec", "noise", "kernels"},
     {"state", "space", "steering", "arbitration"},
     {"neighbours", "shapes", "rows", "networks", "elements", "tree"},
-    {"effects", "integrators", "collisions", "population", "spawn", "sweep", "stability"},
+    {"effects", "integrators", "collisions", "population", "spawn", "sweep", "stability", "rounding"},
     {"snapshot", "implicit", "scene", "config", "measures", "explanation"},
     {"tasks", "world", "policy"},
     {"envs", "sb3", "evaluation", "accuracy", "stress", "render", "trajectory"},
