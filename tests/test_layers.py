@@ -20,7 +20,7 @@ LAYERS = (
     {"state", "space", "steering", "arbitration"},
     {"neighbours", "shapes", "rows", "networks", "elements", "tree"},
     {"effects", "integrators", "collisions", "population", "spawn", "sweep", "stability", "rounding"},
-    {"snapshot", "implicit", "scene", "config", "measures", "explanation"},
+    {"snapshot", "implicit", "workspace", "scene", "config", "measures", "explanation"},
     {"tasks", "world", "policy"},
     {"envs", "sb3", "evaluation", "accuracy", "stress", "render", "trajectory"},
     {"cli"},
