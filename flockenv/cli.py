@@ -231,6 +231,7 @@ def explain(scene: SceneFile) -> None:
     _table(console, title, rows, ("effect", "calls for", "costs us/step"))
     counted = (f"{number:g} {name.replace('_', ' ')}" for name, number in found.work.items())
     console.print(f"Per step: {', '.join(counted)}")
+    console.print(f"Largest stable step: {found.largest_step}")
     _table(console, "Left out, because nobody asked for it", ([line] for line in found.left_out), [""])
 
 
@@ -426,7 +427,7 @@ def _table(console: Console, title: str, rows: Iterable[Sequence[str]], columns:
     console.print(title, style="bold")
     table = Table(box=None, show_header=any(columns), pad_edge=False)
     for k, column in enumerate(columns):
-        table.add_column(column, no_wrap=k == 0, style="cyan" if k == 0 else None, overflow="fold")
+        table.add_column(column, no_wrap=k == 0 and len(columns) > 1, style="cyan" if k == 0 else None, overflow="fold")
     for row in rows:
         table.add_row(*map(_printable, row))
     console.print(table)
