@@ -30,6 +30,7 @@ from flockenv.terminal import (
     Seed,
     new_console,
     printable,
+    progress_bar,
     relative,
     show_table,
 )  # fmt: skip
@@ -270,7 +271,7 @@ def warmup(
             took, new = perf_counter() - began, compiled()[before:]
             note = f"compiled in {sum(k.seconds for k in new):.1f} s" if new else "was in the cache"
             rows.append((name, note, f"{took:.1f}"))
-    table(new_console(), "First steps", rows, ("of", "", "s"))
+    show_table(new_console(), "First steps", rows, ("of", "", "s"))
 
 
 def _first_step_of_task(task: Task) -> None:
