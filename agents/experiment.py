@@ -3,19 +3,34 @@
 from __future__ import annotations
 
 import difflib
+import json
+import re
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Literal
 
-from pydantic import Field
+import typer
+from pydantic import Field, ValidationError, model_validator
 
 from flockenv.config import load
 from flockenv.records import Record
+from flockenv.refusals import key_path, refusals
 from flockenv.tasks import TASKS, Task
 
-__all__ = ["CONFIGS", "WEIGHTS", "Experiment", "PpoSettings", "ReynoldsSettings", "load_experiment"]
+__all__ = [
+    "AS_CONFIGURED", "CONFIGS", "WEIGHTS", "Experiment", "PpoSettings", "ReynoldsSettings", "load_experiment",
+    "one_line_errors",
+]  # fmt: skip
 
 CONFIGS = Path(__file__).resolve().parent.parent / "configs"
 WEIGHTS = Path(__file__).resolve().parent / "weights"
+
+AS_CONFIGURED = "as configured"
+"""What a config's own settings are called beside others."""
+
+_NAME = re.compile(r"\w[\w ,-]{0,39}")
+"""A setting's name is a folder of checkpoints and part of a picture's legend."""
 
 
 class PpoSettings(Record):
@@ -71,6 +86,29 @@ class Experiment(Record):
     )
     reynolds: ReynoldsSettings = Field(default_factory=ReynoldsSettings)
 
+    @model_validator(mode="after")
+    def _curves_are_settings(self) -> Experiment:
+        """Refuse settings that cannot be trained when they are read, not hours later."""
+        self.settings()
+        return self
+
+    def settings(self) -> dict[str, PpoSettings]:
+        """Return all settings of PPO by name: the config's own, and those to compare it with."""
+        others = {name: self._other(name, changes) for name, changes in self.curves.items()}
+        return {AS_CONFIGURED: self.ppo, **others}
+
+    def _other(self, name: str, changes: dict[str, Any]) -> PpoSettings:
+        place = key_path(("curves", name))
+        if name == AS_CONFIGURED:
+            raise ValueError(f"{place}: that is what the settings under ppo are called; choose another name")
+        if not _NAME.fullmatch(name):
+            raise ValueError(f"{place}: a name is up to 40 letters, digits, spaces and , _ -")
+        data = {**self.ppo.model_dump(mode="json"), **changes}
+        try:
+            return PpoSettings.model_validate_json(json.dumps(data), strict=True)  # as strict as files are read
+        except ValidationError as error:
+            raise ValueError(f"{place}.{refusals(error, PpoSettings, data)[0]}") from None
+
     def build(self) -> Task:
         """Return the task; ValueError with the nearest name for an unknown one."""
         if self.task not in TASKS:
@@ -83,3 +121,13 @@ class Experiment(Record):
 def load_experiment(path: str | Path) -> Experiment:
     """Read an experiment from YAML; errors are one line with the key path."""
     return load(Path(path), Experiment)
+
+
+@contextmanager
+def one_line_errors() -> Iterator[None]:
+    """End a command with status 2 and one line, however narrow the terminal, where its input is refused."""
+    try:
+        yield
+    except (ValueError, OSError) as error:
+        typer.echo(f"error: {error}", err=True)
+        raise typer.Exit(2) from None

@@ -2,7 +2,7 @@
 
 Reads top to bottom: settings -> worlds -> model -> learn -> export. Every so often the policy of the moment plays the
 tuning worlds in numpy; that is the learning curve, and the best one is what is exported, as safetensors with a card
-that holds the recipe. Ctrl-C keeps a checkpoint, `--resume` goes on from it.
+that holds the recipe. Ctrl-C keeps a checkpoint, `--resume` goes on from it, if the recipe is still the same.
 """
 
 from __future__ import annotations
@@ -11,6 +11,8 @@ import json
 import os
 import platform
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from importlib.metadata import version
 from pathlib import Path
@@ -25,15 +27,16 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import VecEnvWrapper
 
-from agents.experiment import WEIGHTS, Experiment, PpoSettings, load_experiment
-from flockenv.crew import use_threads
+from agents.experiment import WEIGHTS, Experiment, PpoSettings, load_experiment, one_line_errors
+from flockenv.crew import threads, use_threads
 from flockenv.evaluation import rollout, worlds_for
 from flockenv.policy import MlpPolicy, save_policy
+from flockenv.refusals import KeyPath, key_path, shown
 from flockenv.sb3 import WorldVecEnv
 from flockenv.tasks import Task
 from flockenv.world import World
 
-__all__ = ["app", "tensors_of", "train"]
+__all__ = ["OtherRecipe", "app", "checkpointed", "on_threads", "tensors_of", "train"]
 
 app = typer.Typer(add_completion=False, rich_markup_mode=None, pretty_exceptions_enable=False)
 console = Console(stderr=True)
@@ -65,10 +68,21 @@ class ForLearning(VecEnvWrapper):
         return observation, reward * self.scale, done, infos
 
 
+class OtherRecipe(ValueError):  # noqa: N818  # whoever begins anew then has seen no error
+    """A checkpoint is of another recipe than the one to train by."""
+
+
+def recipe_of(experiment: Experiment) -> dict[str, Any]:
+    """Return all that training depends on: with another value anywhere it is another training."""
+    told = experiment.model_dump(mode="json", include={"task", "arguments", "ppo"})
+    return {**told, "layout": experiment.build().layout.digest}
+
+
 @dataclass
 class Run:
     """What training has come to so far; all that a checkpoint holds beside the network."""
 
+    recipe: dict[str, Any]
     steps: int = 0
     wall: float = 0.0  # s
     curve: list[dict[str, float]] = field(default_factory=list)
@@ -90,11 +104,22 @@ def tensors_of(model: PPO) -> dict[str, np.ndarray]:
     return {name: tensor.copy() for name, tensor in out.items()}
 
 
+@contextmanager
+def on_threads(count: int) -> Iterator[None]:
+    """Let torch and the worlds use so many threads; afterwards each uses as many as before."""
+    before = torch.get_num_threads(), threads()
+    torch.set_num_threads(count)
+    use_threads(count)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before[0])
+        use_threads(before[1])
+
+
 def build(task: Task, p: PpoSettings, tensorboard: str | None) -> PPO:
-    """Make the worlds and the model."""
-    torch.set_num_threads(p.threads)
+    """Make the worlds and the model; how many threads they use is for `on_threads` to say."""
     torch.manual_seed(p.seed)
-    use_threads(p.threads)
     learned = task.model_copy(update={"dtype": p.dtype})
     worlds = ForLearning(WorldVecEnv(learned, p.worlds), p.reward_scale, p.stagger)
     model = PPO(
@@ -169,7 +194,7 @@ def checkpoint(folder: Path, model: PPO, run: Run) -> None:
     torch.save(model.policy.state_dict(), folder / "policy.tmp")
     torch.save(model.policy.optimizer.state_dict(), folder / "optimizer.tmp")
     np.savez(folder / "best.tmp.npz", **run.tensors)
-    notes = {"steps": run.steps, "wall": run.wall, "best": run.best, "curve": run.curve}
+    notes = {name: value for name, value in vars(run).items() if name != "tensors"}
     (folder / "run.tmp").write_text(json.dumps(notes), encoding="utf-8")
     finals = {
         "policy.tmp": "policy.pt",
@@ -181,27 +206,61 @@ def checkpoint(folder: Path, model: PPO, run: Run) -> None:
         os.replace(folder / name, folder / final)
 
 
-def resume(folder: Path, model: PPO) -> Run:
-    """Read a checkpoint back into the model; no file of it can execute code."""
-    notes = json.loads((folder / "run.json").read_text(encoding="utf-8"))
+def checkpointed(experiment: Experiment, folder: Path) -> Run | None:
+    """Return the run whose checkpoint lies in a folder, if there is one; OtherRecipe if it is not of this experiment.
+
+    No file of a checkpoint can execute code.
+    """
+    path = folder / "run.json"
+    if not path.exists():
+        return None
+    notes = json.loads(path.read_text(encoding="utf-8"))
+    kept, wanted = dict(_numbers(notes.get("recipe", {}))), dict(_numbers(recipe_of(experiment)))
+    for key in {**wanted, **kept}:
+        if kept.get(key) != wanted.get(key):
+            has, asked = (shown(of[key]) if key in of else "nothing" for of in (kept, wanted))
+            raise OtherRecipe(f"{key} = {asked}: the checkpoint in {folder} is of another recipe, with {has}")
+    with np.load(folder / "best.npz", allow_pickle=False) as best:
+        return Run(**notes, tensors={name: best[name] for name in best.files})
+
+
+def _numbers(block: dict[str, Any], path: KeyPath = ()) -> Iterator[tuple[str, Any]]:
+    """Yield every value of nested blocks by its key path."""
+    for key, value in block.items():
+        if isinstance(value, dict):
+            yield from _numbers(value, (*path, key))
+        else:
+            yield key_path((*path, key)), value
+
+
+def resume(folder: Path, model: PPO, run: Run) -> None:
+    """Read a checkpoint's networks back into the model."""
     model.policy.load_state_dict(torch.load(folder / "policy.pt", weights_only=True))
     model.policy.optimizer.load_state_dict(torch.load(folder / "optimizer.pt", weights_only=True))
-    with np.load(folder / "best.npz", allow_pickle=False) as best:
-        tensors = {name: best[name] for name in best.files}
-    model.num_timesteps = int(notes["steps"])
-    return Run(model.num_timesteps, notes["wall"], notes["curve"], notes["best"], tensors)
+    model.num_timesteps = run.steps
 
 
 def train(experiment: Experiment, folder: Path, go_on: bool = False, tensorboard: str | None = None) -> Run:
-    """Train to the end of the budget, or until Ctrl-C; return what came of it."""
+    """Train to the end of the budget, or until Ctrl-C; return what came of it.
+
+    go_on: from the folder's checkpoint, if there is one; a finished one is returned as it is. OtherRecipe if it is not
+    of this experiment: weights that two recipes made have none.
+    """
     task, p = experiment.build(), experiment.ppo
+    run = checkpointed(experiment, folder) if go_on else None
+    if run is not None and run.steps >= p.steps:
+        return run
     model = build(task, p, tensorboard)
-    run = resume(folder, model) if go_on and (folder / "run.json").exists() else Run()
+    if run is not None:
+        resume(folder, model, run)
+    else:
+        run = Run(recipe_of(experiment))
+        (folder / "run.json").unlink(missing_ok=True)  # what is there is overwritten file by file
     columns = (
         TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TimeRemainingColumn(),
         TextColumn("{task.fields[score]}"),
     )  # fmt: skip
-    with Progress(*columns, console=console) as progress:
+    with on_threads(p.threads), Progress(*columns, console=console) as progress:
         watch = Watch(task, p, run, folder, progress)
         try:
             model.learn(p.steps - run.steps, callback=watch, reset_num_timesteps=run.steps == 0, log_interval=None)
@@ -212,17 +271,15 @@ def train(experiment: Experiment, folder: Path, go_on: bool = False, tensorboard
     return run
 
 
-def export(experiment: Experiment, run: Run, path: Path) -> None:
+def export(run: Run, path: Path) -> None:
     """Write the best policy with its recipe: everything that is needed to make it again."""
-    task, p = experiment.build(), experiment.ppo
+    recipe = run.recipe
     card = {
-        "task": task.name,
-        "arguments": experiment.arguments,
-        "layout": task.layout.digest,
-        "activation": p.activation,
+        **{key: recipe[key] for key in ("task", "arguments", "layout")},
+        "activation": recipe["ppo"]["activation"],
         "algorithm": "PPO (stable-baselines3)",
-        "recipe": {"command": f"python -m agents.ppo configs/{task.name}.yaml", "ppo": p.model_dump(mode="json")},
-        "seed": p.seed,
+        "recipe": {"command": f"python -m agents.ppo configs/{recipe['task']}.yaml", "ppo": recipe["ppo"]},
+        "seed": recipe["ppo"]["seed"],
         "steps": run.steps,
         "wall_time_s": round(run.wall, 1),
         "tuning_mean": run.best,
@@ -244,21 +301,20 @@ def main(
     seed: Annotated[int | None, typer.Option(help="instead of the config's")] = None,
 ) -> None:
     """Train a policy with PPO and export its weights."""
-    try:
+    with one_line_errors():
         experiment = load_experiment(config)
         changes = {k: v for k, v in (("steps", steps), ("seed", seed)) if v is not None}
         experiment = experiment.model_copy(update={"ppo": PpoSettings(**{**experiment.ppo.model_dump(), **changes})})
         task = experiment.build()
-    except (ValueError, OSError) as error:
-        console.print(f"error: {error}", style="red", markup=False, highlight=False)
-        raise typer.Exit(2) from None
+        if go_on:
+            checkpointed(experiment, runs / task.name)  # of another recipe: refused before anything is built
     target = out or WEIGHTS / f"{task.name}.safetensors"
     try:
         run = train(experiment, runs / task.name, go_on, tensorboard)
     except KeyboardInterrupt:
         console.print(f"interrupted; checkpoint in {runs / task.name}, go on with --resume")
         raise typer.Exit(130) from None
-    export(experiment, run, target)
+    export(run, target)
     best = f"mean return {run.best:.3f} on the tuning worlds"
     console.print(f"{target}: {best} after {run.steps:,} steps, {run.wall:.0f} s")
 

@@ -18,7 +18,7 @@ import yaml
 from rich.console import Console
 from rich.progress import Progress
 
-from agents.experiment import Experiment, load_experiment
+from agents.experiment import Experiment, load_experiment, one_line_errors
 from agents.reynolds import RULES, Reynolds, as_dict
 from flockenv.evaluation import rollout, worlds_for
 from flockenv.tasks import Task
@@ -109,12 +109,9 @@ def write(path: Path, rules: dict[str, float], found: dict[str, float]) -> None:
 @app.command()
 def main(config: Annotated[Path, typer.Argument(help="an experiment, such as configs/pursuit.yaml")]) -> None:
     """Search the rules' parameters and write what was found into the config."""
-    try:
+    with one_line_errors():
         experiment = load_experiment(config)
         task = experiment.build()
-    except (ValueError, OSError) as error:
-        console.print(f"error: {error}", style="red", markup=False, highlight=False)
-        raise typer.Exit(2) from None
     s = experiment.reynolds.search
     with Progress(console=console) as progress:
         bar = progress.add_task(f"{task.name}: parameter sets", total=_plays(s.candidates, s.rounds))

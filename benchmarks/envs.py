@@ -38,6 +38,13 @@ def _draws(*shape: int) -> Iterator[Any]:
     return cycle(np.random.default_rng(0).uniform(-1, 1, (DRAWS, *shape)).astype(np.float32))
 
 
+def _named_draws(env: Any) -> Iterator[dict[str, Any]]:
+    """Yield random actions of every agent by its name, as PettingZoo takes them."""
+    names = env.possible_agents
+    drawn = _draws(len(names), *env.action_space(names[0]).shape)
+    return cycle([dict(zip(names, next(drawn), strict=True)) for _ in range(DRAWS)])
+
+
 # --- a step through each face ---------------------------------------------------------------------------------------
 
 
@@ -75,10 +82,8 @@ def _rows(env: Any, rows: int) -> Step:
 
 
 def _parallel(env: Any) -> Step:
+    actions = _named_draws(env)
     env.reset(seed=0)
-    names = env.possible_agents
-    drawn = _draws(len(names), *env.action_space(names[0]).shape)
-    actions = cycle([dict(zip(names, next(drawn), strict=True)) for _ in range(DRAWS)])
 
     def step() -> None:
         action = next(actions)
@@ -91,10 +96,8 @@ def _parallel(env: Any) -> Step:
 
 def _by_turns(env: Any) -> Step:
     """Step everybody once, one after another, as PettingZoo's own example does."""
+    actions = _named_draws(env)
     env.reset(seed=0)
-    names = env.possible_agents
-    drawn = _draws(len(names), *env.action_space(names[0]).shape)
-    actions = cycle([dict(zip(names, next(drawn), strict=True)) for _ in range(DRAWS)])
 
     def step() -> None:
         action = next(actions)

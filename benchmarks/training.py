@@ -21,7 +21,6 @@ import typer
 
 from agents.experiment import CONFIGS, PpoSettings, load_experiment
 from benchmarks.measure import Bench, Contestant, Numbers, Out, Quick, Result, Rounds, Sample, command_line, number
-from flockenv.crew import use_threads
 from flockenv.tasks import Task
 
 __all__ = ["EXPERIMENTS", "Learning", "settings"]
@@ -40,7 +39,8 @@ def settings(p: PpoSettings, learners: int) -> Iterator[tuple[str, PpoSettings]]
     yield "4 epochs", p.model_copy(update=four)
     other = "tanh" if p.activation == "relu" else "relu"
     yield f"4 epochs, {other}", p.model_copy(update={**four, "activation": other})
-    yield "4 epochs, 2 torch threads", p.model_copy(update={**four, "threads": 2})
+    count = 1 if p.threads > 1 else 2
+    yield f"4 epochs, {_on(count)}", p.model_copy(update={**four, "threads": count})
     yield "4 epochs, minibatch x 4", p.model_copy(update={**four, "minibatch": 4 * p.minibatch})
     wide = {"worlds": 2 * p.worlds, "rollout": max(1, p.rollout // 2)}
     yield "4 epochs, rows x 2, rollout / 2", p.model_copy(update={**four, **wide})
@@ -48,6 +48,11 @@ def settings(p: PpoSettings, learners: int) -> Iterator[tuple[str, PpoSettings]]
         worlds=max(1, SB3_ROWS // learners), rollout=2048, minibatch=64, epochs=10, learning_rate=3e-4,
         activation="tanh", log_std=0.0, threads=p.threads,
     )  # fmt: skip
+
+
+def _on(threads: int) -> str:
+    """Return a number of threads in words."""
+    return "one thread" if threads == 1 else f"{threads} threads"
 
 
 # --- one model, with a clock --------------------------------------------------------------------------------------
@@ -58,7 +63,7 @@ class Learning(Contestant):
     """A model that rolls out and updates, again and again, when it is its turn."""
 
     model: Any = None
-    threads: int = 1  # of torch
+    threads: int = 1  # of torch and of the worlds
     seconds: float = SECONDS
     spent: dict[str, float] = field(default_factory=lambda: defaultdict(float))  # s, by what
 
@@ -77,12 +82,11 @@ class Learning(Contestant):
         return Sample(steps, took, process_time() - cpu)
 
     def _once(self) -> float:
-        import torch
+        from agents.ppo import on_threads
 
-        torch.set_num_threads(self.threads)
         before = self.model.num_timesteps
         steps = self.model.n_steps * self.model.n_envs
-        with _watched(self.model, self.spent):
+        with on_threads(self.threads), _watched(self.model, self.spent):
             self.model.learn(steps, reset_num_timesteps=not before, log_interval=None)
         return float(steps)
 
@@ -145,7 +149,7 @@ def _said(p: PpoSettings, task: Task) -> str:
     rows = p.worlds * task.learners
     return (
         f"{rows} rows x {p.rollout}, minibatch {p.minibatch}, {p.epochs} epochs, {p.activation} "
-        f"{'x'.join(map(str, p.hidden))}, torch on {p.threads}"
+        f"{'x'.join(map(str, p.hidden))}, torch and worlds on {_on(p.threads)}"
     )
 
 
@@ -190,14 +194,13 @@ def main(
     """Measure PPO on real tasks: rates end to end, and where the time goes."""
     if only and only not in EXPERIMENTS:
         raise typer.BadParameter(f"--only {only!r}: unknown; allowed: {', '.join(EXPERIMENTS)}")
-    use_threads(1)
     turns = rounds or (QUICK_ROUNDS if quick else ROUNDS)
     with Bench("training", quick, turns, out, unit="k agent-steps/s", scale=1e3) as bench:
         for name in EXPERIMENTS:
             if only in ("", name) and Path(CONFIGS / f"{name}.yaml").exists():
                 _race(bench, name, seconds or (QUICK_SECONDS if quick else SECONDS))
         _summary(bench)
-        bench.note("End to end: rollouts and updates. The worlds are stepped on one thread.")
+        bench.note("End to end: rollouts and updates. Torch and the worlds use as many threads as the setting says.")
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""flockenv on the command line: list | run | render | explain | warmup | schema.
+"""flockenv on the command line: list | run | render | explain | accuracy | warmup | schema.
 
 Errors are one line on stderr, exit code 2.
 """
@@ -24,6 +24,7 @@ from flockenv.refusals import nearest, shown
 if TYPE_CHECKING:
     from rich.console import Console
 
+    from flockenv.accuracy import Problem, Report
     from flockenv.render import Panel
     from flockenv.scene import Scene
     from flockenv.snapshot import Snapshot
@@ -231,6 +232,122 @@ def explain(scene: SceneFile) -> None:
     counted = (f"{number:g} {name.replace('_', ' ')}" for name, number in found.work.items())
     console.print(f"Per step: {', '.join(counted)}")
     _table(console, "Left out, because nobody asked for it", ([line] for line in found.left_out), [""])
+
+
+@app.command()
+def accuracy(
+    scene: Annotated[str | None, typer.Argument(metavar="[SCENE.yaml]", help="A scene; none with --suite.")] = None,
+    suite: Annotated[bool, typer.Option("--suite", help="Measure the built-in problems instead.")] = False,
+    problems: Annotated[str, typer.Option(metavar="A,B", help="Of the suite these alone [default: all of them].")] = "",
+    seconds: Annotated[
+        float | None, typer.Option(metavar="S", help="Simulated time of a scene in seconds [default: 1].")
+    ] = None,
+    methods: Annotated[str, typer.Option(metavar="A,B", help="Integrators [default: all explicit ones].")] = "",
+    steps: Annotated[
+        str, typer.Option(metavar="N,M", help="In how many steps a scene is taken to its end [default: around its dt].")
+    ] = "",
+    dts: Annotated[str, typer.Option(metavar="S,S", help="The same, by the length of a step in seconds.")] = "",
+    tolerance: Annotated[
+        str, typer.Option(metavar="M,M", help="Errors in metres to find the cheapest way to.")
+    ] = "1e-2,1e-4,1e-6",
+    repetitions: Annotated[int, typer.Option(min=0, max=1000, help="Runs whose median is the wall time.")] = 20,
+    seed: Seed = 0,
+    out: Annotated[
+        str | None, typer.Option(metavar="X.json|X.png", help="Write the numbers; a picture has X.json beside it.")
+    ] = None,
+    force: Force = False,
+) -> None:
+    """Show what accuracy costs: how far each integrator ends from the truth in which steps, beside its time."""
+    from flockenv.accuracy import methods_named, problems_named, table, usual_methods
+    from flockenv.outputs import checked_file
+
+    if suite == (scene is not None):
+        raise ValueError("accuracy: needs a SCENE.yaml or --suite, one of them")
+    aimed = _numbers("--tolerance", tolerance)
+    if suite and (seconds is not None or steps or dts):
+        raise ValueError("--suite: has horizons and steps of its own; --seconds, --steps and --dts go with a scene")
+    if problems and not suite:
+        raise ValueError("--problems: goes with --suite")
+    path = checked_file(out, [".json", ".png"], force) if out is not None else None
+    if path is not None and path.suffix.lower() == ".png":
+        checked_file(str(path.with_suffix(".json")), [".json"], force)
+    chosen = methods_named(_words(methods)) if methods else usual_methods()
+    todo = problems_named(_words(problems)) if suite else [_problem(str(scene), seconds, steps, dts, seed)]
+    console, reports = _console(), []
+    try:
+        for problem in todo:
+            with _progress(f"measuring {problem.name}", 100, "%") as progress:
+                reports.append(_measured(problem, chosen, repetitions, progress))
+            _table(console, reports[-1].title, ([line] for line in table.headlines(reports[-1])), [""])
+            _table(console, "", table.rows(reports[-1], aimed), table.columns(aimed))
+            _table(console, "The cheapest", ([line] for line in table.best(reports[-1], aimed)), [""])
+            if reports[-1].stopped:
+                break
+    except KeyboardInterrupt:
+        if not reports:
+            raise
+    if path is not None and reports:
+        _keep(path, reports)
+        console.print(f"{len(reports)} problems in {_relative(path)}")
+    if len(reports) < len(todo) or reports[-1].stopped:
+        raise _EarlyEnd("interrupted; what was done is shown", INTERRUPTED)
+
+
+def _problem(file: str, seconds: float | None, steps: str, dts: str, seed: int) -> Problem:
+    """Return what is to be measured on a scene: by default in steps 4 times as long as its own to 32 times shorter."""
+    from flockenv.accuracy import Problem
+    from flockenv.config import load_scene
+    from flockenv.trajectory import whole_steps
+
+    loaded, horizon = load_scene(Path(file)), 1.0 if seconds is None else seconds
+    if steps and dts:
+        raise ValueError("--steps and --dts: say the same in two ways; give one of them")
+    if steps:
+        counts = [int(n) if n == int(n) else n for n in _numbers("--steps", steps)]
+    elif dts:
+        counts = [whole_steps("--seconds", horizon, dt, 1) for dt in _numbers("--dts", dts)]
+    else:
+        usual = whole_steps("--seconds", horizon, loaded.dt, 1)
+        coarsest = max(d for d in (1, 2, 4) if usual % d == 0)
+        counts = [usual * 2**k // coarsest for k in range(8)]
+    return Problem.of(loaded, horizon, counts, seed, name=Path(file).stem, title=Path(file).name)
+
+
+def _measured(
+    problem: Problem, methods: Sequence[Any], repetitions: int, progress: Callable[[int], None]
+) -> Report:  # fmt: skip
+    from flockenv.accuracy import measure
+
+    return measure(problem, methods, repetitions, progress=progress)
+
+
+def _keep(path: Path, reports: Sequence[Report]) -> None:
+    """Write the numbers, and a picture of them if that was asked for."""
+    from flockenv.accuracy import Results
+    from flockenv.outputs import replacing
+
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with replacing(path.with_suffix(".json")) as file:
+        file.write((Results(reports=tuple(reports)).model_dump_json(indent=1) + "\n").encode())
+    if path.suffix.lower() == ".png":
+        from flockenv.render.precision import write_precision
+
+        write_precision(path, reports)
+
+
+def _words(text: str) -> list[str]:
+    return [word.strip() for word in text.split(",") if word.strip()]
+
+
+def _numbers(option: str, text: str) -> list[float]:
+    """Return positive numbers written with commas between them."""
+    try:
+        numbers = [float(word) for word in _words(text)]
+    except ValueError:
+        numbers = []
+    if not numbers or not all(math.isfinite(x) and x > 0 for x in numbers):
+        raise ValueError(f"{option} = {shown(text)}: must be positive numbers with commas between them")
+    return numbers
 
 
 @app.command()

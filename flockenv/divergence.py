@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 __all__ = ["SimulationDiverged"]
 
 
-class SimulationDiverged(FloatingPointError):
+class SimulationDiverged(FloatingPointError):  # noqa: N818  # the issue and its users call it so
     """A position or velocity is no longer finite; the worlds that stayed finite have made all their steps.
 
     The world that did not is as it was before the call, and everything else is told here.
     """
+
+    state: Any = None
+    """The state of all worlds when the call ended."""
 
     def __init__(
         self, world: int, agent: int, step: int, time: float, effect: str | None, dt: float, method: str

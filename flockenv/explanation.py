@@ -63,7 +63,8 @@ def explain(
             timer.measure()
     whole, *without, bare = (timer.best for timer in timers)
     rows = tuple(
-        Row(effect, _calls(effect), max(0.0, whole - less)) for effect, less in zip(effects, without, strict=True)
+        Row(effect, _calls(scene, k), max(0.0, whole - less))
+        for k, (effect, less) in enumerate(zip(effects, without, strict=True))
     )
     return Explanation(scene, rows, whole, bare, _work(scene, state), _left_out(scene))
 
@@ -90,9 +91,11 @@ class _Timer:
         return took
 
 
-def _calls(effect: Effect) -> tuple[str, ...]:
-    within = f" within {effect.reach:g} m"
-    return tuple(what + within if what.startswith("neighbour") else what for what in effect.calls_for())
+def _calls(scene: Scene, k: int) -> tuple[str, ...]:
+    effect = scene.effects[k]
+    how = "tree" if (k, effect) in scene.parts.treed else "direct"
+    more = {"neighbour query": f" within {effect.reach:g} m", "all others": f" ({how})"}
+    return tuple(what + more.get(what, "") for what in effect.calls_for())
 
 
 def _work(scene: Scene, state: State) -> dict[str, float]:

@@ -24,7 +24,7 @@ from typing import Any, TypeVar, cast
 import numba
 from llvmlite import ir  # type: ignore[import-untyped]
 from numba.core import types
-from numba.extending import intrinsic, overload
+from numba.extending import intrinsic, overload, register_jitable
 from numba.np import arrayobj
 
 from flockenv import compilation  # noqa: F401  # tells how long compiling takes
@@ -43,6 +43,7 @@ __all__ = [
     "law",
     "like",
     "load",
+    "shared",
     "unaliased",
     "unfused",
     "wait_for_team",
@@ -80,6 +81,12 @@ def unfused(function: F) -> F:
 def kernel(function: F) -> F:
     """Mark a function over the arrays of one world; compiled as a part of the generated file that calls it."""
     return cast(F, _njit(**OPTIONS)(function))
+
+
+def shared(function: F) -> F:
+    """Mark a law that Python calls too, as it stands: what a method's `advance` needs, which runs in both."""
+    mark: Any = register_jitable
+    return cast(F, mark(**OPTIONS)(function))
 
 
 def like(x: float, constant: float) -> float:

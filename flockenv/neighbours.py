@@ -19,7 +19,7 @@ from flockenv.space import torus_confine
 
 __all__ = [
     "FEWEST_AGENTS", "FINEST", "MAX_RANGES", "WORTH_ARRANGING", "candidates", "count_cells", "grid_of", "order_records",
-    "place_of", "row_of",
+    "row_of",
 ]  # fmt: skip
 
 MAX_RANGES = 27
@@ -37,12 +37,6 @@ FINEST = 3
 _MARGIN = 1.001  # cells are this much wider than the reach, so that rounding never hides a neighbour
 
 Ints = NDArray[np.int32]
-
-
-@kernel
-def place_of(i: int, dimension: int, lanes: int) -> int:
-    """Return where the first coordinate of agent i lies in an array of blocks; the next is `lanes` further."""
-    return (i // lanes) * lanes * dimension + i % lanes
 
 
 @kernel

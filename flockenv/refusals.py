@@ -84,9 +84,9 @@ def key_path(path: KeyPath) -> str:
 
 def steps_of(text: str) -> KeyPath:
     """Return the key path that a message begins with, () if it begins with none: the inverse of `key_path`."""
-    start = re.match(r"[A-Za-z_]\w*(\.\w+|\[\d+\])*", text)
-    steps = re.findall(r"(\w+)|\[(\d+)\]", start[0]) if start else []
-    return tuple(int(index) if index else name for name, index in steps)
+    start = re.match(r"[A-Za-z_]\w*(\.[\w-]+|\.'[^']+'|\[\d+\])*", text)
+    steps = re.findall(r"([\w-]+)|'([^']+)'|\[(\d+)\]", start[0]) if start else []
+    return tuple(int(index) if index else name or quoted for name, quoted, index in steps)
 
 
 def shown(value: object) -> str:

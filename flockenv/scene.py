@@ -25,25 +25,30 @@ from flockenv import state as states
 from flockenv.crew import share, threads
 from flockenv.divergence import SimulationDiverged
 from flockenv.effects import EFFECTS, Effect
-from flockenv.effects.base import ties
+from flockenv.effects.base import all_masses, ties
+from flockenv.implicit import coupling_of, solve_steps
 from flockenv.integrators import INTEGRATORS, Integrator, SemiImplicitEuler
+from flockenv.integrators.newton import Coupling
 from flockenv.kernels import LINE, entry, load
 from flockenv.neighbours import FEWEST_AGENTS, MAX_RANGES, WORTH_ARRANGING
+from flockenv.networks import AnyNetwork
 from flockenv.noise import MASK, key_of
 from flockenv.records import Record
 from flockenv.shapes import Circle
 from flockenv.snapshot import Snapshot
 from flockenv.space import AnySpace, Box, Plane, Torus
 from flockenv.spawn import Spawn, scatter
+from flockenv.stability import check_dt
 from flockenv.state import Body, Floats, State
 from flockenv.sweep import SHARED, SMALL_STRIDE, Parts, Table, field_source, pack, scene_source
+from flockenv.tree import BUCKETS, LEVELS, MOST_DIRECT, tree_sizes
 
 __all__ = ["Group", "Scene", "Workspace"]
 
 WORTH_SHARING = 4096
 """Agent-steps below which a second thread costs more than it brings: handing work over takes about 20 us."""
 
-SYNC = SHARED.split(", ").index("sync")
+SYNC, STAGES = SHARED.split(", ").index("sync"), SHARED.split(", ").index("stages")
 
 EXACT = 2**24
 """Whole numbers, and so numbers of agents, that float32 tells apart."""
@@ -84,11 +89,19 @@ def _demand_whole(name: str, value: object, least: int, most: int | None = None)
         raise ValueError(f"{name} is {value!r}, must be a whole number {allowed}")
 
 
+def _demand_one_piece(out: State) -> None:
+    """Refuse positions and velocities that a kernel cannot write: it counts places from the first."""
+    for name, array in (("x", out.x), ("v", out.v)):
+        if not array.flags.c_contiguous:
+            raise ValueError(f"out.{name} does not lie in one piece (its strides are {array.strides}); use copy()")
+
+
 class Group(Record):
     """Some agents of a kind."""
 
-    count: int = Field(ge=1, description="how many")
-    mass: float = Field(default=1.0, gt=0, description="kg")
+    count: int | None = Field(default=None, ge=1, description="how many; or give a network")
+    network: AnyNetwork | None = Field(default=None, description="particles that are tied to each other, and where")
+    mass: float = Field(default=1.0, gt=0, description="kg, of each; in a network on average")
     radius: float = Field(default=0.1, ge=0, description="m")
     max_speed: float | None = Field(default=None, gt=0, description="m/s; none = no limit")
     max_force: float | None = Field(default=None, ge=0, description="N, what it may ask for; none = no limit")
@@ -96,6 +109,30 @@ class Group(Record):
     role: Literal["agent", "learner", "pursuer", "evader", "flockmate"] = Field(
         default="agent", description="what it is in pictures"
     )
+
+    @model_validator(mode="after")
+    def _one_or_the_other(self) -> Group:
+        """Refuse a count beside a network, and neither; and a network that nobody knows how to place."""
+        if (self.count is None) == (self.network is None):
+            raise ValueError("count: give either a count or a network")
+        if self.network is not None and (
+            self.spawn.low is not None or (any(self.spawn.speed) and not self.spawn.heading)
+        ):
+            raise ValueError("spawn: a network is where it says; all it may be given is a speed, with a heading")
+        return self
+
+    @property
+    def size(self) -> int:
+        """How many agents it has."""
+        return self.network.size if self.network is not None else int(self.count or 0)
+
+    def masses(self, dimension: int) -> NDArray[np.float64]:
+        """Return the mass of each agent, (size,) kg; infinite where a network pins one."""
+        if self.network is None:
+            return np.full(self.size, self.mass)
+        out = self.network.masses(self.mass * self.size, dimension)
+        out[self.network.pins()] = np.inf
+        return out
 
 
 @dataclass(frozen=True)
@@ -119,23 +156,27 @@ class Workspace:
             "stages": (max(parts.integrator.stages, 1), padded * d),
             **dict.fromkeys(("mass", "radius", "max_speed", "max_force", "living", "ident"), padded),
             "tie": padded * d if "t0" in parts.fields else 1,
-            "pulled": padded * d if parts.bonded else 1,
+            "pulled": padded * d if parts.pulls else 1,
             "carrying": padded * d if parts.flows else 1,
             "felt": max(swept * d * len(parts.targets), 1),
             "sorted_": parts.rows * (swept + width if parts.sorts else SMALL_STRIDE),
             "records": (swept if sorts else 1) * parts.numbers,
             "luggage": carried * parts.luggage_size,
         }
+        real |= {name: size if parts.treed else 1 for name, size in tree_sizes(agents, width, d, team).items()}
         whole = {
             "order": (swept + width,),
             "cell": (padded if sorts else 1,),
             "start": (cells + 1,),
             "offset": (team, cells),
+            "tree_place": (2 * padded if parts.treed else 1,),
         }
         wanted: dict[str, Any] = {name: (shape, np.dtype(dtype)) for name, shape in real.items()}
         wanted |= {name: (shape, np.dtype(np.int32)) for name, shape in whole.items()}
         arrays = _zeros(wanted)
-        arrays |= {"bounds": np.zeros((team, 6)), "tally": np.zeros(team, np.int64), "sync": np.zeros(8, np.int64)}
+        arrays |= {"bounds": np.zeros((team, 6)), "tally": np.zeros(2 * team, np.int64), "sync": np.zeros(8, np.int64)}
+        keys, digits = (2 * padded, BUCKETS + LEVELS + 1) if parts.treed else (1, 1)
+        arrays |= {"tree_key": np.zeros(keys, np.int64), "tree_digit": np.zeros(digits, np.int64)}
         for name, pad in (("mass", 1), ("radius", 0), ("max_speed", 1), ("max_force", 1)):
             arrays[name][:] = pad
             arrays[name][:agents] = getattr(body, name)
@@ -202,6 +243,11 @@ class Scene(Record):
         size = getattr(self.space, "size", None)
         if isinstance(self.space, Torus):
             for k, effect in enumerate(self.effects):
+                if effect.far_law:
+                    raise ValueError(
+                        f"effects[{k}].kind = {effect.kind} reaches everybody, and on a torus everybody is there "
+                        "infinitely many times; only a plane or a box is allowed"
+                    )
                 if effect.pair_law and effect.reach > min(self.space.size) / 2:
                     raise ValueError(
                         f"effects[{k}].radius = {effect.reach:g} reaches around the torus; at most half its shortest "
@@ -222,6 +268,7 @@ class Scene(Record):
                 f"groups: {self.agents:,} agents need about {needed / 2**30:.3g} GiB; at most {MEMORY_LIMIT / 2**30:g} "
                 f"GiB, {int(MEMORY_LIMIT / each):,} agents, are allowed"
             )
+        check_dt(self)
         return self
 
     def _check_dimensions(self) -> None:
@@ -236,7 +283,12 @@ class Scene(Record):
                 value = getattr(group.spawn, name)
                 if value is not None and len(value) != self.dimension:
                     raise ValueError(f"groups[{k}].spawn.{name} = {value}: dimension = {self.dimension}")
-            if size is None and group.spawn.low is None:
+            if group.network is not None:
+                try:
+                    group.network.rest_points(self.dimension)
+                except ValueError as error:
+                    raise ValueError(f"groups[{k}].network.{error}") from None
+            elif size is None and group.spawn.low is None:
                 raise ValueError(f"groups[{k}].spawn.low: missing; a plane has no size to spread agents over")
 
     # --- what follows from the fields -------------------------------------------------------------------------------
@@ -244,12 +296,12 @@ class Scene(Record):
     @property
     def agents(self) -> int:
         """N."""
-        return sum(group.count for group in self.groups)
+        return sum(group.size for group in self.groups)
 
     @property
     def roles(self) -> tuple[str, ...]:
         """What each agent is called, (N,)."""
-        return tuple(group.role for group in self.groups for _ in range(group.count))
+        return tuple(group.role for group in self.groups for _ in range(group.size))
 
     def bytes_per_world(self) -> int:
         """Memory of a state and its scratch, in bytes, counted before anything is allocated."""
@@ -264,7 +316,11 @@ class Scene(Record):
         if parts.sweeps and parts.sorts:
             reals += parts.rows + parts.numbers
             whole += 3 * 4
-        reals += d * (bool(parts.bonded) + parts.flows)
+        reals += d * (parts.pulls + parts.flows)
+        if parts.treed:
+            numbers = tree_sizes(self.agents, parts.width, d, 1)
+            reals += -(-sum(numbers.values()) // self.agents)
+            whole += 24
         if parts.arranges and self.agents >= WORTH_ARRANGING:
             reals += parts.luggage_size
         return self.agents * (reals * real + whole)
@@ -275,20 +331,27 @@ class Scene(Record):
 
         def per_agent(name: str) -> Floats:
             values = [math.inf if getattr(g, name) is None else getattr(g, name) for g in self.groups]
-            return np.repeat(np.array(values, self.dtype), [g.count for g in self.groups])
+            return np.repeat(np.array(values, self.dtype), [g.size for g in self.groups])
 
-        return Body(*(per_agent(name) for name in ("mass", "radius", "max_speed", "max_force")))
+        mass = all_masses(self.groups, self.dimension).astype(self.dtype)
+        return Body(mass, *(per_agent(name) for name in ("radius", "max_speed", "max_force")))
 
     @functools.cached_property
     def parts(self) -> Parts:
         """What the kernel is made of."""
         sorts = self.agents >= FEWEST_AGENTS
-        return Parts(self.dimension, self.space, self.effects, self.integrator, self.dtype, sorts)
+        crowded = self.agents > MOST_DIRECT
+        return Parts(self.dimension, self.space, self.effects, self.integrator, self.dtype, sorts, crowded=crowded)
 
     @functools.cached_property
     def table(self) -> Table:
         """The bonds of all effects, as the kernel reads them."""
         return pack(self.parts, self.agents, self.groups)
+
+    @functools.cached_property
+    def coupling(self) -> Coupling | None:
+        """Who depends on whom, for methods that solve equations; none if that changes from step to step."""
+        return coupling_of(self)
 
     @functools.cached_property
     def _params(self) -> Floats:
@@ -318,15 +381,29 @@ class Scene(Record):
         period = np.array(self.space.extent(d) if self.space.periodic else (0.0,) * d, float)
         for group in self.groups:
             spawn = group.spawn
+            if group.network is not None:
+                self._place(state, b, first, group)
+                first += group.size
+                continue
             low = np.array(spawn.low if spawn.low is not None else (0.0,) * d, float)
             high = np.array(spawn.high if spawn.high is not None else self.space.extent(d), float)
             heading = np.array(spawn.heading if spawn.heading is not None else (0.0,) * d, float)
             place(
-                state.key[b], state.x[:, b], state.v[:, b], self.body.radius, first, first + group.count, low, high,
+                state.key[b], state.x[:, b], state.v[:, b], self.body.radius, first, first + group.size, low, high,
                 *spawn.speed, heading, state.obstacle_x[:, b], state.obstacle_radius[b],
                 period, np.zeros(d),
             )  # fmt: skip
-            first += group.count
+            first += group.size
+
+    def _place(self, state: State, b: int, first: int, group: Group) -> None:
+        """Write where the particles of a network begin, and how fast they all fly."""
+        assert group.network is not None
+        mine = slice(first, first + group.size)
+        state.pos[b, mine] = group.network.points(self.dimension)
+        if group.spawn.heading is not None:
+            heading = np.asarray(group.spawn.heading, float)
+            state.vel[b, mine] = group.spawn.speed[0] * heading / np.linalg.norm(heading)
+            state.vel[b, first + group.network.pins()] = 0
 
     def step(self, state: State, drive: ArrayLike | None = None, out: State | None = None, steps: int = 1) -> State:
         """Advance every world by `steps` physics steps under a constant drive.
@@ -337,17 +414,16 @@ class Scene(Record):
         that world is left as it was, the others have made their steps.
         """
         self._check(state, steps)
+        forces = self._drive(drive, state)
         if out is None:
             out = state.copy()
-        elif out is not state:
-            out.copy_from(state)
-        for name, array in (("x", out.x), ("v", out.v)):
-            if not array.flags.c_contiguous:
-                raise ValueError(f"out.{name} does not lie in one piece (its strides are {array.strides}); use copy()")
-        given = self._drive(drive, state)
-        world, agent = self._advance(out, given, steps)
+        else:
+            _demand_one_piece(out)
+            if out is not state:
+                out.copy_from(state)
+        world, agent = self._advance(out, forces, steps)
         if world >= 0:
-            raise self._diverged(out, given, world, agent, steps)
+            raise self._diverged(out, forces, world, agent, steps)
         return out
 
     def _diverged(self, state: State, drive: Floats, world: int, agent: int, steps: int) -> SimulationDiverged:
@@ -360,7 +436,9 @@ class Scene(Record):
         agent = bad[1] if done < steps else agent
         last, time = int(alone.tick[0]) + 1, (int(alone.tick[0]) + 1) * self.dt
         effect = self._blamed(alone, agent)
-        return SimulationDiverged(world, agent, last, time, effect, self.dt, self.integrator.kind)
+        error = SimulationDiverged(world, agent, last, time, effect, self.dt, self.integrator.kind)
+        error.state = state
+        return error
 
     def _blamed(self, state: State, agent: int) -> str | None:
         """Return the kind of the effect that accelerates an agent most, or to no number at all."""
@@ -401,15 +479,31 @@ class Scene(Record):
 
         Threads take worlds apart, or, of a large world, its agents.
         """
-        worlds, agents, _ = state.shape
         if steps == 0:
             return -1, -1
+        if self.integrator.solves:
+            return solve_steps(self, state, drive, steps, self._take_over)
+        return self._stepped(state, drive, steps)
+
+    def _take_over(self, state: State, world: int, x: Floats, v: Floats) -> tuple[int, int]:
+        """Let the kernel end a step whose positions and velocities, (D, N), were solved for: limits, space, time."""
+        width, (_, n) = self.parts.width, x.shape
+        stages = self._workspaces(1, 1)[0].shared[STAGES]
+        for row, solved in zip(stages, (x, v), strict=True):
+            padded = np.zeros((self.dimension, -(-n // width) * width), self.dtype)
+            padded[:, :n] = solved
+            row[:] = padded.reshape(self.dimension, -1, width).transpose(1, 0, 2).ravel()
+        return self._stepped(state, np.zeros((self.dimension, 0, 0), self.dtype), 1)
+
+    def _stepped(self, state: State, drive: Floats, steps: int) -> tuple[int, int]:
+        """Step in place by the kernel alone."""
+        worlds, agents, _ = state.shape
         crew = threads() if worlds * agents * steps >= WORTH_SHARING else 1
         team = crew if worlds < crew and agents >= WORTH_SHARING and not self.integrator.adaptive else 1
         crew = crew if team > 1 else min(crew, worlds)
         arrays = (
-            state.x, state.v, state.alive, state.tick, state.key, state.obstacle_x, state.obstacle_radius, state.work, drive,
-            self._params, self._dt, steps,
+            state.x, state.v, state.alive, state.tick, state.key, state.obstacle_x, state.obstacle_radius, state.work,
+            drive, self._params, self._dt, steps,
         )  # fmt: skip
         if crew == 1:
             return self._kernel(*arrays, 0, worlds, 0, 1, *self._workspaces(1, 1)[0].of(0))  # type: ignore[no-any-return]
@@ -432,6 +526,11 @@ class Scene(Record):
             raise ValueError(
                 f"the state holds (N, D) = {state.shape[1:]} of {state.x.dtype}, "
                 f"but this scene has {expected[:2]} of {expected[2]}"
+            )
+        if state.dt != self.dt:
+            raise ValueError(
+                f"the state counts steps of {state.dt:g} s, but this scene makes steps of {self.dt:g} s; "
+                "state.with_dt(scene.dt) changes its clock"
             )
         _demand_whole("steps", steps, 0)
 

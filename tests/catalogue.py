@@ -19,11 +19,33 @@ from numpy.typing import NDArray
 
 from flockenv import arbitration, steering
 from flockenv.effects import EFFECTS as EFFECT_KINDS
-from flockenv.effects import Alignment, AvoidObstacles, Cohesion, Drag, Effect, Separation
+from flockenv.effects import (
+    Alignment,
+    Attraction,
+    AvoidObstacles,
+    Carried,
+    Cohesion,
+    Drag,
+    Effect,
+    Fluctuation,
+    Gravity,
+    QuadraticDrag,
+    Separation,
+    Sink,
+    Source,
+    Swing,
+    Tether,
+    Uniform,
+    Vortex,
+    Wind,
+)
 from flockenv.integrators import (
     RK4,
+    AdaptiveRK4,
     AveragedVelocity,
+    DormandPrince,
     ExplicitEuler,
+    ExponentialDrag,
     Heun,
     Integrator,
     Midpoint,
@@ -88,27 +110,88 @@ ARBITRATION = (arbitration.blend, arbitration.prioritise, arbitration.allocate)
 
 @dataclass(frozen=True)
 class EffectRow:
-    """An effect with parameters under which it acts, the same one at rest, and what it must obey."""
+    """An effect with parameters under which it acts, and what it must obey.
+
+    Vectors are given in 3-D; in 2-D their first two numbers are taken, and an axis is left out.
+    """
 
     effect: Effect
-    idle: Effect | None = None  # with this one a scene must move exactly as without any
-    obeys: frozenset[str] = field(default=frozenset({"translation", "rotation", "mirror"}))
+    beside: tuple[Effect, ...] = ()  # without which it moves nobody: what a medium drags or carries
+    obeys: frozenset[str] = frozenset({"translation", "rotation", "mirror", "relabelling"})
+    signed: tuple[str, ...] = ()  # parameters that may be negative
 
     @property
     def name(self) -> str:
         fov, nearest = getattr(self.effect, "fov", 360.0), getattr(self.effect, "nearest", None)
-        return self.effect.kind + ("" if fov == 360.0 else "_cone") + (f"_nearest_{nearest}" if nearest else "")
+        words = ["cone"] * (fov < 360.0) + ([f"nearest_{nearest}"] if nearest else [])
+        words += ["medium"] * (getattr(self.effect, "acts", "") == "medium")
+        return "_".join([self.effect.kind, *words])
+
+    def at(self, dimension: int) -> tuple[Effect, ...]:
+        """The effect in so many dimensions, and those beside it."""
+        return tuple(in_dimension(effect, dimension) for effect in (self.effect, *self.beside))
 
 
-# An idle effect sees as the acting one does, so that both are one compiled kernel.
+def vectors(effect: Effect) -> dict[str, tuple[float, ...]]:
+    """What of an effect's parameters are directions and places."""
+    return {name: value for name, value in effect.parameters().items() if isinstance(value, tuple)}
+
+
+def in_dimension(effect: Effect, dimension: int) -> Effect:
+    """The same effect with the first numbers of its vectors; in the plane nobody turns about an axis."""
+    flat = {
+        name: None if name == "axis" and dimension == 2 else value[:dimension]
+        for name, value in vectors(effect).items()
+    }
+    return effect.model_copy(update=flat)
+
+
+def turned(effect: Effect, matrix: Array, shift: Array) -> Effect:
+    """The same effect with its directions turned, and its places turned about the middle of EDGE and shifted."""
+    middle = EDGE / 2
+    change = {
+        name: tuple(
+            (np.array(value) - middle) @ matrix.T + middle + shift if name in effect.places else value @ matrix.T
+        )
+        for name, value in vectors(effect).items()
+    }
+    return effect.model_copy(update={name: tuple(map(float, value)) for name, value in change.items()})
+
+
+DRAG = Drag(rate=0.4)
+WIND = Wind(velocity=(1.5, -0.7, 0.4), gust=(0.5, 1.0, -0.3), period=0.8)
+CENTRE = (2.5, 2.5, 2.5)
+
 EFFECTS = (
-    EffectRow(Drag(rate=0.4), Drag(rate=0)),
-    EffectRow(Separation(weight=1.3, radius=2.5), Separation(weight=0, radius=2.5)),
+    EffectRow(DRAG),
+    EffectRow(QuadraticDrag(rate=0.3)),
+    EffectRow(Gravity(acceleration=(0.5, -3, 1))),
+    EffectRow(Uniform(strength=(0.8, -0.5, 0.3), period=2, phase=0.3), signed=("phase",)),
+    EffectRow(Source(strength=2, centre=CENTRE, maximum=3), signed=("phase",)),
+    EffectRow(Sink(strength=2, centre=CENTRE, maximum=3, acts="medium"), beside=(DRAG,), signed=("phase",)),
+    EffectRow(
+        Vortex(strength=-2, centre=CENTRE, maximum=3, axis=(0.6, 0, 0.8), acts="medium", period=3), beside=(DRAG,),
+        obeys=frozenset({"translation", "rotation", "relabelling"}),  # its mirror image turns the other way
+        signed=("strength", "phase"),
+    ),
+    EffectRow(
+        Vortex(strength=2, centre=CENTRE, maximum=3, axis=(0.6, 0, 0.8)),
+        obeys=frozenset({"translation", "rotation", "relabelling"}), signed=("strength", "phase"),
+    ),
+    EffectRow(WIND, beside=(DRAG,), signed=("phase",)),
+    EffectRow(Carried(share=0.9), beside=(WIND, DRAG)),
+    EffectRow(Attraction(strength=2, centre=CENTRE, softening=0.5), signed=("strength",)),
+    EffectRow(Tether(centre=CENTRE, stiffness=0.8, damping=0.1, rest=0.5)),
+    EffectRow(
+        Swing(centre=CENTRE, strength=0.8, length=0.7), obeys=frozenset({"translation", "mirror", "relabelling"})
+    ),
+    EffectRow(Fluctuation(strength=0.8), obeys=frozenset({"translation"})),  # to each his own, along the axes
+    EffectRow(Separation(weight=1.3, radius=2.5)),
     EffectRow(Separation(weight=1.3, radius=2.5, fov=200, nearest=3)),
-    EffectRow(Alignment(weight=0.7, radius=3, fov=270), Alignment(weight=0, radius=3, fov=270)),
-    EffectRow(Cohesion(weight=0.9, radius=2.8, fov=240), Cohesion(weight=0, radius=2.8, fov=240)),
-    EffectRow(AvoidObstacles(weight=5, horizon=3, margin=0.1), AvoidObstacles(weight=0, horizon=3)),
-)
+    EffectRow(Alignment(weight=0.7, radius=3, fov=270)),
+    EffectRow(Cohesion(weight=0.9, radius=2.8, fov=240)),
+    EffectRow(AvoidObstacles(weight=5, horizon=3, margin=0.1)),
+)  # fmt: skip
 
 
 # --- integrators, spaces, tasks ---------------------------------------------------------------------------------------
@@ -116,24 +199,36 @@ EFFECTS = (
 
 @dataclass(frozen=True)
 class IntegratorRow:
-    """A method, and what 100 grows to with x' = v, v' = v / 10 in ten steps of 1 s (numerics.md, E16)."""
+    """A method, and what numerics.md says of it."""
 
     method: Integrator
-    grown: float
+    grown: float  # what 100 grows to with x' = v, v' = v / 10 in ten steps of 1 s (E16)
+    real: float  # largest h |lambda| at which v' = lambda v, lambda < 0, does not grow (3.1)
+    imaginary: float  # largest h omega at which x'' = -omega^2 x does not grow (3.1)
 
     @property
     def name(self) -> str:
         return self.method.kind
 
+    @property
+    def fixed(self) -> Integrator:
+        """The method at the steps that it is given: one that chooses its own takes them whole if any error will do."""
+        return self.method.model_copy(update={"tolerance": 1e30}) if self.method.adaptive else self.method
+
 
 INTEGRATORS = (
-    IntegratorRow(ExplicitEuler(), 259.37425),
-    IntegratorRow(SemiImplicitEuler(), 275.31167),
-    IntegratorRow(AveragedVelocity(), 267.34296),
-    IntegratorRow(Midpoint(), 271.40808),
-    IntegratorRow(Heun(), 271.40808),
-    IntegratorRow(VelocityVerlet(), 271.40808),
-    IntegratorRow(RK4(), 271.82797),
+    IntegratorRow(ExplicitEuler(), 259.37425, 2, 0),
+    IntegratorRow(SemiImplicitEuler(), 275.31167, 2, 2),
+    IntegratorRow(AveragedVelocity(), 267.34296, 2, 0),
+    IntegratorRow(Midpoint(), 271.40808, 2, 0),
+    IntegratorRow(Heun(), 271.40808, 2, 0),
+    IntegratorRow(VelocityVerlet(), 271.40808, 2, 2),
+    IntegratorRow(RK4(), 271.82797, 2.7853, 2.8284),
+    IntegratorRow(AdaptiveRK4(), 271.828169, 5.5705, 5.657),
+    IntegratorRow(DormandPrince(), 271.828183, 3.3065, 0.997),
+    IntegratorRow(
+        ExponentialDrag(), 271.68016, 2, 2
+    ),  # of drag that it is not told of; of other drag there is no limit
 )
 
 SPACES = {
@@ -182,6 +277,11 @@ def scene_of(*effects: Effect, dimension: int = 2, space: Space | None = None, *
     return Scene(dimension=dimension, space=space or Plane(), effects=effects, **given)
 
 
+def scene_under(row: EffectRow, dimension: int) -> Scene:
+    """Return the scene in which tests try a row."""
+    return scene_of(*row.at(dimension), dimension=dimension)
+
+
 FIRST = tuple({row.effect.kind: row for row in reversed(EFFECTS)}.values())[::-1]
 """The first row of each kind of effect."""
 
@@ -193,9 +293,10 @@ def everything(dimension: int, *chosen: Effect, **fields: Any) -> Scene:
     around in the same ways (sweep.Parts.sights: who shares a radius, and who has a view cone at all).
     """
     own = {effect.kind: effect for effect in chosen}
-    rest = {row.effect.kind: row.idle if chosen else row.effect for row in FIRST}
+    rest = {effect.kind: effect for effect in (in_dimension(row.effect, dimension) for row in FIRST)}
     given = {"space": SPACES["torus"][dimension]} | fields
-    return scene_of(*(rest | own).values(), dimension=dimension, **given)
+    effects = ({kind: effect.idle() for kind, effect in rest.items()} if chosen else rest) | own
+    return scene_of(*effects.values(), dimension=dimension, **given)
 
 
 @dataclass(frozen=True)
@@ -296,24 +397,42 @@ from __future__ import annotations
 
 from typing import Any, ClassVar, Literal
 
+import numpy as np
 from pydantic import Field
 
 from flockenv.effects import Effect, Me
-from flockenv.kernels import Vec, law
-from flockenv.vec import add, scale
+from flockenv.kernels import Vec, law, like
+from flockenv.vec import add, dot, scale
+
+
+@law
+def swing(x: Vec, sine: float, rest: float) -> Vec:
+    if len(x) == 2:
+        return (rest - sine * np.sin(x[0]), rest - sine * np.sin(x[1]))
+    else:
+        return (rest - sine * np.sin(x[0]), rest - sine * np.sin(x[1]), rest - sine * np.sin(x[2]))
 
 
 @law
 def tether(p: Any, me: Me) -> Vec:
-    return add(scale(me.pos, -p.stiffness), scale(me.vel, -p.damping))
+    square = max(dot(me.pos, me.pos), like(p.sun, 1e-12))
+    pull = add(scale(me.pos, -p.stiffness - p.sun / (square * np.sqrt(square))), scale(me.vel, -p.damping))
+    return add(pull, swing(me.pos, p.sine, p.weight + p.push * np.cos(me.time + me.time)))
 
 
 class Tether(Effect):
-    \"\"\"A damped spring to the origin: with m = 1 kg, x'' = -stiffness x - damping x'.\"\"\"
+    \"\"\"A damped spring to the origin and the forces of other textbook problems, so that one kernel serves them all.
+
+    With m = 1 kg, x'' = -stiffness x - damping x' - sine sin x - sun x / |x|^3 + push cos 2t + weight.
+    \"\"\"
 
     kind: Literal["tether"] = "tether"
-    stiffness: float = Field(ge=0, description="N/m")
+    stiffness: float = Field(default=0.0, ge=0, description="N/m")
     damping: float = Field(default=0.0, ge=0, description="kg/s")
+    sine: float = Field(default=0.0, ge=0, description="N, a pendulum along each axis")
+    sun: float = Field(default=0.0, ge=0, description="N m^2")
+    push: float = Field(default=0.0, description="N along each axis, with time")
+    weight: float = Field(default=0.0, description="N along each axis")
     own_law: ClassVar[str | None] = "tether"
 """
 """An effect as a user of the library would write it, in a file of their own."""

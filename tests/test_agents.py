@@ -4,18 +4,22 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import yaml
+from typer.testing import CliRunner
 
 from agents import tune
-from agents.experiment import CONFIGS, WEIGHTS, Experiment, PpoSettings, load_experiment
+from agents.experiment import AS_CONFIGURED, CONFIGS, WEIGHTS, Experiment, PpoSettings, load_experiment
 from agents.reynolds import RULES, player, tuned
+from flockenv.crew import threads
 from flockenv.evaluation import compare, rollout, worlds_for
 from flockenv.policy import MlpPolicy, RandomPolicy
 from flockenv.tasks import TASKS
 
+ROOT = CONFIGS.parent
 TINY = {"worlds": 16, "rollout": 16, "minibatch": 64, "epochs": 1, "evaluate_every": 512, "evaluate_worlds": 4}
 
 
@@ -87,26 +91,190 @@ def test_the_search_writes_its_result_and_keeps_the_rest_of_the_file(tmp_path: P
     assert tune.search(experiment) == (rules, found), "the same seed finds the same"
 
 
-def _train(folder: Path, steps: int, go_on: bool = False) -> dict[str, np.ndarray]:
+PURSUIT = Experiment(task="pursuit", ppo={**TINY, "steps": 1024})
+
+
+def test_training_is_repeatable_and_exports(tmp_path: Path) -> None:
     from agents import ppo
 
-    experiment = Experiment(task="pursuit", ppo={**TINY, "steps": steps})
-    return ppo.train(experiment, folder, go_on).tensors
+    once, twice = (ppo.train(PURSUIT, tmp_path / name) for name in "ab")
+    assert once.tensors.keys() == twice.tensors.keys()
+    for name, tensor in once.tensors.items():
+        np.testing.assert_array_equal(tensor, twice.tensors[name])
+    ppo.export(once, tmp_path / "p.safetensors")
+    policy = MlpPolicy.load(tmp_path / "p.safetensors", PURSUIT.build())
+    assert policy.observation_size == PURSUIT.build().layout.size
+    assert policy.card["recipe"]["ppo"] == PURSUIT.ppo.model_dump(mode="json")
 
 
-def test_training_is_repeatable_resumes_and_exports(tmp_path: Path) -> None:
+def _interrupt(experiment: Experiment, folder: Path) -> None:
+    """Train, and press Ctrl-C at the first point of the curve."""
     from agents import ppo
 
-    once, twice = _train(tmp_path / "a", 1024), _train(tmp_path / "b", 1024)
-    assert once.keys() == twice.keys()
-    for name in once:
-        np.testing.assert_array_equal(once[name], twice[name])
-    longer = Experiment(task="pursuit", ppo={**TINY, "steps": 2048})
-    run = ppo.train(longer, tmp_path / "a", go_on=True)
-    assert run.steps >= 2048 and run.curve[0]["steps"] < 1024 < run.curve[-1]["steps"]
-    ppo.export(longer, run, tmp_path / "p.safetensors")
-    policy = MlpPolicy.load(tmp_path / "p.safetensors", longer.build())
-    assert policy.observation_size == longer.build().layout.size
+    write = ppo.checkpoint
+
+    def interrupted(*given: Any) -> None:
+        write(*given)
+        raise KeyboardInterrupt
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(ppo, "checkpoint", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            ppo.train(experiment, folder)
+
+
+def _fail(*_: object, **__: object) -> None:
+    raise AssertionError("nothing is to be trained")
+
+
+def test_training_that_was_interrupted_goes_on_and_a_finished_one_is_left_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from agents import ppo
+
+    _interrupt(PURSUIT, tmp_path)
+    begun = ppo.checkpointed(PURSUIT, tmp_path)
+    assert begun is not None and 0 < begun.steps < 1024
+    run = ppo.train(PURSUIT, tmp_path, go_on=True)
+    assert run.steps >= 1024 and run.curve[: len(begun.curve)] == begun.curve
+    monkeypatch.setattr(ppo, "build", _fail)
+    assert ppo.train(PURSUIT, tmp_path, go_on=True).curve == run.curve
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"ppo": {**TINY, "steps": 1024, "gamma": 0.9}}, "ppo.gamma = 0.9: {}, with 0.99"),
+        ({"ppo": {**TINY, "steps": 2048}}, "ppo.steps = 2048: {}, with 1024"),
+        ({"arguments": {"pursuer_speed": 2.5}}, "arguments.pursuer_speed = 2.5: {}, with nothing"),
+    ],
+)
+def test_training_does_not_go_on_with_another_recipe(tmp_path: Path, change: dict[str, Any], said: str) -> None:
+    from agents import ppo
+
+    folder = tmp_path / "runs" / "pursuit"
+    _interrupt(PURSUIT, folder)
+    config = tmp_path / "pursuit.yaml"
+    config.write_text(yaml.safe_dump({"task": "pursuit", "ppo": {**TINY, "steps": 1024}, **change}), encoding="utf-8")
+    given = [str(config), "--runs", str(tmp_path / "runs"), "--resume", "--out", str(tmp_path / "p.safetensors")]
+    result = CliRunner().invoke(ppo.app, given)
+    assert result.exit_code == 2
+    assert result.stderr == f"error: {said.format(f'the checkpoint in {folder} is of another recipe')}\n"
+    assert not (tmp_path / "p.safetensors").exists()
+
+
+# --- learning curves --------------------------------------------------------------------------------------------------
+
+
+def _curves(folder: Path, code: int = 0, **changes: Any) -> str:
+    """Compare two settings of Pursuit from a config with some changes; return what the command said."""
+    from agents import curves
+
+    settings = {
+        "task": "pursuit",
+        "ppo": {**TINY, "steps": 512},
+        "curves": {"two epochs": {"epochs": 2}},
+        "reynolds": {"found": {"tuning_mean": -100.0}},
+    }
+    config = folder / "pursuit.yaml"
+    config.write_text(yaml.safe_dump({**settings, **changes}), encoding="utf-8")
+    given = [str(config), "--out", str(folder / "new" / "learning.png"), "--runs", str(folder / "runs")]
+    result = CliRunner().invoke(curves.app, given)
+    assert result.exit_code == code, (result.output, result.exception)
+    return result.stderr
+
+
+def test_curves_train_every_setting_once_and_draw_them(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from agents import ppo
+    from agents.curves import draw
+
+    experiment = Experiment(task="pursuit", ppo={**TINY, "steps": 512}, curves={"two epochs": {"epochs": 2}})
+    _interrupt(experiment, tmp_path / "runs" / "pursuit" / AS_CONFIGURED)
+    said = _curves(tmp_path)
+    assert "pursuit, as configured: 1 epoch, minibatch 64, rate 0.002: goes on after 256 steps\n" in said
+    assert "pursuit, two epochs: 2 epochs, minibatch 64, rate 0.002: begins\n" in said
+    picture, file = tmp_path / "new" / "learning.png", tmp_path / "new" / "learning.json"
+    numbers = json.loads(file.read_text(encoding="utf-8"))
+    rows = numbers["pursuit"]["settings"]
+    assert {name: row["ppo"]["epochs"] for name, row in rows.items()} == {AS_CONFIGURED: 1, "two epochs": 2}
+    for row in rows.values():
+        assert row["curve"][-1]["steps"] >= 512
+        assert row["past_the_rules_s"] == row["curve"][0]["seconds"]
+    draw(tmp_path / "again.png", numbers)
+    assert picture.read_bytes() == (tmp_path / "again.png").read_bytes()
+    with monkeypatch.context() as patch:
+        patch.setattr(ppo, "train", _fail)
+        assert ": begins" not in _curves(tmp_path)
+        assert json.loads(file.read_text(encoding="utf-8")) == numbers
+    said = _curves(tmp_path, curves={"two epochs": {"epochs": 2, "gamma": 0.9}})
+    assert "two epochs: 2 epochs, minibatch 64, rate 0.002: begins anew (ppo.gamma = 0.9: " in said
+    assert "as configured: 1 epoch, minibatch 64" not in said
+    again = json.loads(file.read_text(encoding="utf-8"))["pursuit"]["settings"]
+    assert again[AS_CONFIGURED] == rows[AS_CONFIGURED] and again["two epochs"]["curve"] != rows["two epochs"]["curve"]
+
+
+@pytest.mark.parametrize(
+    ("curves", "said"),
+    [
+        ({"two epochs": {"epocs": 2}}, "curves.'two epochs'.epocs = 2: unknown key, did you mean `epochs`? allowed"),
+        ({"none": {"epochs": 0}}, "curves.none.epochs = 0: must be a whole number >= 1 (passes over a rollout)"),
+        ({"text": {"epochs": "2"}}, "curves.text.epochs = '2': must be a whole number >= 1, not text"),
+        ({"../up": {"epochs": 2}}, "curves.'../up': a name is up to 40 letters, digits"),
+        ({AS_CONFIGURED: {"epochs": 2}}, "curves.'as configured': that is what the settings under ppo are called"),
+    ],
+)
+def test_curves_that_cannot_be_trained_are_one_line(tmp_path: Path, curves: dict[str, Any], said: str) -> None:
+    error = _curves(tmp_path, code=2, curves=curves)
+    assert error.startswith("error: ") and error.count("\n") == 1
+    assert f": {said}" in error
+    (name,) = curves
+    lines = (tmp_path / "pursuit.yaml").read_text(encoding="utf-8").splitlines()
+    at = int(error.split("pursuit.yaml:")[1].split(":")[0]) - 1
+    assert name in lines[at] or next(iter(curves[name])) in lines[at]
+    assert not (tmp_path / "runs").exists() and not (tmp_path / "new").exists()
+
+
+def test_curves_are_of_one_config_a_task_and_a_picture_is_a_png(tmp_path: Path) -> None:
+    from agents import curves
+
+    config = str(CONFIGS / "pursuit.yaml")
+    for given, said in (
+        ([config, config], "another config is of that task"),
+        ([config, "--out", str(tmp_path / "x.json")], "must end in .png"),
+        ([str(CONFIGS / "boids.yaml")], "unknown key"),
+    ):
+        result = CliRunner().invoke(curves.app, given)
+        assert result.exit_code == 2 and said in result.stderr
+
+
+def test_the_stored_curves_are_of_the_settings_in_the_configs() -> None:
+    """Threads aside, which change how long it took. If this fails: docs/players.md says how they are made."""
+    stored = json.loads((ROOT / "docs" / "learning.json").read_text(encoding="utf-8"))
+    assert stored.keys() == TASKS.keys()
+    for name, numbers in stored.items():
+        experiment = load_experiment(CONFIGS / f"{name}.yaml")
+        assert numbers["rules"] == experiment.reynolds.found["tuning_mean"]
+        kept = {setting: PpoSettings(**{**row["ppo"], "threads": 2}) for setting, row in numbers["settings"].items()}
+        assert kept == experiment.settings()
+
+
+def test_training_leaves_the_number_of_threads_as_it_was(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    import torch
+
+    from agents import ppo
+
+    inside = []
+
+    def interrupted(*_: object) -> None:
+        inside.append((torch.get_num_threads(), threads()))
+        raise KeyboardInterrupt
+
+    before = torch.get_num_threads(), threads()
+    monkeypatch.setattr(ppo, "checkpoint", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        ppo.train(PURSUIT.model_copy(update={"ppo": PpoSettings(**TINY, threads=3)}), tmp_path)
+    assert inside[0] == (3, 3)
+    assert (torch.get_num_threads(), threads()) == before
 
 
 def test_bad_settings_are_one_line(tmp_path: Path) -> None:

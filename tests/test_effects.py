@@ -21,15 +21,32 @@ from flockenv.scene import Group, Scene
 from flockenv.space import Plane
 from flockenv.spawn import Spawn
 from flockenv.state import State
-from tests.catalogue import EDGE, EFFECTS, FIRST, Array, EffectRow, everything, mirror, rotation, scene_of, users_module
+from tests.catalogue import (
+    EDGE,
+    EFFECTS,
+    FIRST,
+    Array,
+    EffectRow,
+    everything,
+    mirror,
+    rotation,
+    scene_of,
+    scene_under,
+    turned,
+    users_module,
+)
 
 ROWS = pytest.mark.parametrize("row", EFFECTS, ids=lambda row: row.name)
+
+
+def obeying(symmetry: str) -> pytest.MarkDecorator:
+    """The rows that declare a symmetry."""
+    rows = [row for row in EFFECTS if symmetry in row.obeys]
+    return pytest.mark.parametrize("row", rows, ids=lambda row: row.name)
+
+
 DIMENSIONS = pytest.mark.parametrize("dimension", [2, 3])
 STEPS = 12
-
-
-def scene_under(row: EffectRow, dimension: int) -> Scene:
-    return scene_of(row.effect, dimension=dimension)
 
 
 def moved(state: State, matrix: Array, shift: Array) -> State:
@@ -42,7 +59,7 @@ def moved(state: State, matrix: Array, shift: Array) -> State:
 
 
 def assert_moves_alike(scene: Scene, matrix: Array, shift: Array) -> None:
-    """Turned and shifted, the scene ends where the turned and shifted end is.
+    """Turned and shifted, the scene ends where the turned and shifted end is; directions and places turn with it.
 
     In single precision to 40 roundings of the largest coordinate: a few in each of the steps, the first when agents are
     turned. Five times what was measured.
@@ -50,7 +67,8 @@ def assert_moves_alike(scene: Scene, matrix: Array, shift: Array) -> None:
     start = scene.start(3, worlds=2)
     end = scene.run(start, STEPS)
     assert not np.allclose(end.vel, start.vel)
-    expected, found = moved(end, matrix, shift), scene.run(moved(start, matrix, shift), STEPS)
+    other = scene.with_effects(*(turned(effect, matrix, shift) for effect in scene.effects))
+    expected, found = moved(end, matrix, shift), other.run(moved(start, matrix, shift), STEPS)
     single = end.pos.dtype == np.float32
     tolerance = 40 * np.finfo(np.float32).eps * float(np.abs(expected.pos).max()) if single else 1e-9
     np.testing.assert_allclose(scene.space.displacement(found.pos, expected.pos), 0, atol=tolerance)
@@ -72,23 +90,20 @@ def relabelled(scene: Scene, start: State) -> tuple[State, list[int]]:
 
 
 @DIMENSIONS
-@ROWS
+@obeying("rotation")
 def test_it_turns_with_the_world(row: EffectRow, dimension: int) -> None:
-    assert "rotation" in row.obeys
     assert_moves_alike(scene_under(row, dimension), rotation(dimension, 7), np.zeros(dimension))
 
 
 @DIMENSIONS
-@ROWS
+@obeying("mirror")
 def test_its_mirror_image_does_the_mirrored_thing(row: EffectRow, dimension: int) -> None:
-    assert "mirror" in row.obeys
     assert_moves_alike(scene_under(row, dimension), mirror(dimension), np.zeros(dimension))
 
 
 @DIMENSIONS
-@ROWS
+@obeying("translation")
 def test_it_does_not_know_where_it_is(row: EffectRow, dimension: int) -> None:
-    assert "translation" in row.obeys
     assert_moves_alike(scene_under(row, dimension), np.eye(dimension), np.arange(1, dimension + 1) * 37.25)
 
 
@@ -100,7 +115,7 @@ def test_a_torus_has_no_origin(dimension: int) -> None:
 
 
 @DIMENSIONS
-@ROWS
+@obeying("relabelling")
 def test_the_order_of_the_agents_does_not_matter(row: EffectRow, dimension: int) -> None:
     """Agents are relabelled within their groups: a body that is looked up in another agent's place shows."""
     scene = scene_under(row, dimension)
@@ -154,7 +169,7 @@ def test_the_dead_are_not_there(row: EffectRow, dimension: int) -> None:
     start = scene.start(3)
     start.alive[:, 18:] = False
     groups = (scene.groups[0], scene.groups[1].model_copy(update={"count": 4}))
-    few = scene_of(row.effect, dimension=dimension, groups=groups)
+    few = scene_of(*row.at(dimension), dimension=dimension, groups=groups)
     living = few.start(3)
     living.x[...], living.v[...] = start.x[:, :, :18], start.v[:, :, :18]
     end, expected = scene.run(start, 20), few.run(living, 20)
@@ -170,12 +185,15 @@ KINDS = pytest.mark.parametrize("row", FIRST, ids=lambda row: row.name)
 
 def single(row: EffectRow, dimension: int) -> Scene:
     """One effect in float32, the others idle: one kernel for all of them."""
-    return everything(dimension, row.effect, space=Plane(), dtype="float32")
+    return everything(dimension, *row.at(dimension), space=Plane(), dtype="float32")
 
 
 @DIMENSIONS
-@KINDS
-@pytest.mark.parametrize("change", ["rotation", "mirror", "translation"])
+@pytest.mark.parametrize(
+    ("row", "change"),
+    [(row, change) for row in FIRST for change in ("rotation", "mirror", "translation") if change in row.obeys],
+    ids=lambda value: getattr(value, "name", value),
+)
 def test_in_single_precision_it_obeys_the_same_symmetries(row: EffectRow, dimension: int, change: str) -> None:
     matrix = {"rotation": rotation(dimension, 7), "mirror": mirror(dimension)}.get(change, np.eye(dimension))
     shift = np.arange(1, dimension + 1) * (37.25 if change == "translation" else 0.0)
@@ -183,7 +201,7 @@ def test_in_single_precision_it_obeys_the_same_symmetries(row: EffectRow, dimens
 
 
 @DIMENSIONS
-@KINDS
+@pytest.mark.parametrize("row", [row for row in FIRST if "relabelling" in row.obeys], ids=lambda row: row.name)
 def test_in_single_precision_too_the_order_of_the_agents_does_not_matter(row: EffectRow, dimension: int) -> None:
     scene = single(row, dimension)
     start = scene.start(3)
@@ -216,7 +234,7 @@ def test_in_single_precision_it_conserves_momentum_if_it_says_so(row: EffectRow,
 def test_it_is_finite_where_everybody_is_in_one_place_at_rest(row: EffectRow, dimension: int, count: int) -> None:
     """In an obstacle's very centre, if there are obstacles: nothing has a direction there."""
     spawn = Spawn(low=(0,) * dimension, high=(1,) * dimension)
-    scene = scene_of(row.effect, dimension=dimension, groups=(Group(count=count, spawn=spawn),))
+    scene = scene_of(*row.at(dimension), dimension=dimension, groups=(Group(count=count, spawn=spawn),))
     state = scene.start(0)
     state.pos[...] = scene.obstacles[0].centre if scene.obstacles else 2.5
     state.vel[...] = 0
@@ -377,9 +395,8 @@ def test_a_pair_law_may_read_bodies_in_another_module_of_the_user_s(tmp_path: Pa
 @DIMENSIONS
 @ROWS
 def test_an_idle_effect_is_an_absent_one(row: EffectRow, dimension: int) -> None:
-    if row.idle is None:  # another row of the same kind has one, see test_catalogue.py
-        return
-    idle, absent = scene_of(row.idle, dimension=dimension), scene_of(dimension=dimension)
+    effect, *beside = row.at(dimension)
+    idle, absent = (scene_of(*some, *beside, dimension=dimension) for some in ((effect.idle(),), ()))
     start = idle.start(3)
     ends = [scene.run(start, 20) for scene in (idle, absent)]
     np.testing.assert_array_equal(ends[0].x, ends[1].x)
@@ -450,11 +467,13 @@ def test_a_scene_under_it_is_a_value(row: EffectRow, dimension: int) -> None:
 
 def test_bad_parameters_are_refused_in_one_line() -> None:
     for row in EFFECTS:
-        for name in type(row.effect).model_fields:
+        for name, field in type(row.effect).model_fields.items():
             if name == "kind":
                 continue
-            some = (None,) if name != "nearest" else (0, 33, 2.5, True)  # of the nearest few, none means all
-            for value in (-1.0, float("nan"), float("inf"), "much", *some):
+            # of what may be left out none is a value: all of the nearest few, a field that is steady
+            some = (None,) if field.default is not None else (0, 33, 2.5, True) if name == "nearest" else ()
+            negative = () if name in row.signed else (-1.0,)
+            for value in (*negative, float("nan"), float("inf"), "much", *some):
                 with pytest.raises(ValueError, match=name) as caught:
                     type(row.effect)(**{**row.effect.model_dump(), name: value})
                 assert "\n" not in str(caught.value)
@@ -464,11 +483,11 @@ def test_bad_parameters_are_refused_in_one_line() -> None:
 
 SECOND = """
 import json, sys
-from tests.catalogue import EFFECTS, scene_of
+from tests.catalogue import EFFECTS, scene_under
 found = {}
 for row in EFFECTS:
     for dimension in (2, 3):
-        scene = scene_of(row.effect, dimension=dimension)
+        scene = scene_under(row, dimension)
         end = scene.run(scene.start(3), 5)
         found[f"{row.name} {dimension}"] = end.x.tobytes().hex()
         assert sum(scene._kernel.stats.cache_misses.values()) == 0, f"{row.name} was compiled again"

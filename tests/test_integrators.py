@@ -7,7 +7,6 @@ Python, and the compiled step of a scene.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
 from itertools import pairwise
 from typing import Any
 
@@ -15,44 +14,20 @@ import numpy as np
 import pytest
 
 from flockenv.integrators import RK4, ExplicitEuler, Heun, Integrator, Midpoint, SemiImplicitEuler, VelocityVerlet
+from flockenv.integrators.base import Alone
 from flockenv.scene import Group, Scene
 from flockenv.spawn import Spawn
-from flockenv.state import State, blank
-from tests.catalogue import INTEGRATORS, TETHER, Array, IntegratorRow, users_module
+from flockenv.state import blank
+from tests.catalogue import INTEGRATORS, Array, IntegratorRow
+from tests.motion import METHODS, V0, WAYS, X0, Advance, at_start, first_of, motion, order, tethered
 
-METHODS = pytest.mark.parametrize("row", INTEGRATORS, ids=lambda row: row.name)
-WAYS = pytest.mark.parametrize("way", ["python", "compiled"])
-
-Advance = Callable[[Integrator, float, int], tuple[float, float]]
-"""(method, dt, steps) -> position and velocity at the end."""
-
-W, ZETA, X0, V0 = 2.0, 0.1, 1.0, 0.3
+W, ZETA = 2.0, 0.1
 PERIOD = 2 * math.pi / W
-
-
-@pytest.fixture(scope="module")
-def tether(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
-    with users_module(tmp_path_factory.mktemp("laws"), TETHER) as module:
-        yield module.Tether
 
 
 def oscillator(tether: Any, way: str, w: float = W, zeta: float = ZETA, **limits: Any) -> Advance:
     """x'' = -w^2 x - 2 zeta w x', from (X0, V0), one way or the other."""
-
-    def in_python(method: Integrator, dt: float, steps: int) -> tuple[float, float]:
-        state = at_start(blank(1, 1, 2, 0, dt))
-        for _ in range(steps):
-            state = method(lambda x, v, t: -w * w * x - 2 * zeta * w * v, state, dt)
-        return float(state.pos[0, 0, 0]), float(state.vel[0, 0, 0])
-
-    def compiled(method: Integrator, dt: float, steps: int) -> tuple[float, float]:
-        group = Group(count=1, spawn=Spawn(low=(0, 0), high=(1, 1)), **limits)
-        effects = (tether(stiffness=w * w, damping=2 * zeta * w),)
-        scene = Scene(groups=(group,), effects=effects, integrator=method, dt=dt)
-        state = scene.run(at_start(scene.start(0)), steps)
-        return float(state.pos[0, 0, 0]), float(state.vel[0, 0, 0])
-
-    return in_python if way == "python" else compiled
+    return tethered(tether, way, stiffness=w * w, damping=2 * zeta * w, **limits)
 
 
 def spring(context: Any, pos: Array, vel: Array, time: float, out: Array) -> None:
@@ -60,9 +35,9 @@ def spring(context: Any, pos: Array, vel: Array, time: float, out: Array) -> Non
     out[...] = -pos
 
 
-def at_start(state: State) -> State:
-    state.x[...], state.v[...] = X0, V0
-    return state
+def alone(row: IntegratorRow) -> Alone:
+    """The context of a world whose laws are Python functions."""
+    return Alone(settings=row.fixed.settings())
 
 
 def exact(t: float) -> tuple[float, float]:
@@ -74,19 +49,6 @@ def exact(t: float) -> tuple[float, float]:
     return x, v
 
 
-def order(end: Advance, method: Integrator, target: tuple[float, float], seconds: float, first: int) -> float:
-    """The measured order over at least five halvings of the step above rounding.
-
-    Of the error of position and velocity together: either alone may vanish by chance at one instant.
-    """
-    counts = [first * 2**k for k in range(8)]
-    errors = np.array([math.dist(end(method, seconds / n, n), target) for n in counts])
-    kept = errors > 1e-12
-    assert kept.sum() >= 6, errors
-    slope, _ = np.polyfit(np.log([seconds / n for n in counts])[kept], np.log(errors[kept]), 1)
-    return float(slope)
-
-
 # --- order ------------------------------------------------------------------------------------------------------------
 
 
@@ -95,7 +57,7 @@ def order(end: Advance, method: Integrator, target: tuple[float, float], seconds
 def test_the_order_is_the_declared_one(row: IntegratorRow, way: str, tether: Any) -> None:
     """On a damped oscillator, over 0.7 periods: over a whole one semi-implicit Euler would pass for order 2 (P06)."""
     seconds = 0.7 * PERIOD
-    measured = order(oscillator(tether, way), row.method, exact(seconds), seconds, first=10)
+    measured = order(oscillator(tether, way), row.fixed, exact(seconds), seconds, first_of(row.method))
     assert measured == pytest.approx(row.method.order_with_drag, abs=0.2)
 
 
@@ -104,7 +66,7 @@ def test_the_order_without_damping_is_the_declared_one(row: IntegratorRow, tethe
     seconds = 0.7 * PERIOD
     target = X0 * math.cos(W * seconds) + V0 / W * math.sin(W * seconds)
     speed = -X0 * W * math.sin(W * seconds) + V0 * math.cos(W * seconds)
-    measured = order(oscillator(tether, "compiled", zeta=0), row.method, (target, speed), seconds, first=10)
+    measured = order(oscillator(tether, "compiled", zeta=0), row.fixed, (target, speed), seconds, first_of(row.method))
     assert measured == pytest.approx(row.method.order, abs=0.2)
 
 
@@ -112,7 +74,8 @@ def test_the_orders_are_those_of_the_table() -> None:
     """What the issue promises, so that a method cannot declare its way out."""
     orders = {row.name: (row.method.order, row.method.order_with_drag) for row in INTEGRATORS}
     promised = {"explicit_euler": (1, 1), "semi_implicit_euler": (1, 1), "averaged_velocity": (1, 1), "rk4": (4, 4)}
-    promised |= {"midpoint": (2, 2), "heun": (2, 2), "velocity_verlet": (2, 2)}
+    promised |= {"midpoint": (2, 2), "heun": (2, 2), "velocity_verlet": (2, 2), "exponential_drag": (2, 2)}
+    promised |= {"adaptive_rk4": (4, 4), "dormand_prince": (5, 5)}
     assert {name: orders[name] for name in promised} == promised
 
 
@@ -120,13 +83,13 @@ def test_a_speed_limit_takes_the_order_away(tether: Any) -> None:
     """numerics.md, P09: nobody may read "order 4" off a scene with a clamp after each step."""
     end = oscillator(tether, "compiled", max_speed=0.9)
     seconds = 0.7 * PERIOD
-    measured = order(end, RK4(), end(RK4(), seconds / 2**17, 2**17), seconds, first=40)
+    measured = order(end, RK4(), motion(end(RK4(), seconds / 2**17, 2**17)), seconds, first=40)
     assert 0.7 < measured < 2.5
 
 
 @METHODS
 def test_both_ways_take_the_same_steps(row: IntegratorRow, tether: Any) -> None:
-    ends = [oscillator(tether, way)(row.method, 0.05, 100) for way in ("python", "compiled")]
+    ends = [motion(oscillator(tether, way)(row.method, 0.05, 100)) for way in ("python", "compiled")]
     np.testing.assert_allclose(ends[0], ends[1], rtol=1e-12)
 
 
@@ -136,7 +99,7 @@ def test_growth_is_the_worked_example_s(row: IntegratorRow) -> None:
     state = blank(1, 1, 2, 0, 1.0)
     state.x[...], state.v[...] = 100.0, 10.0
     for _ in range(10):
-        state = row.method(lambda x, v, t: 0.1 * v, state, 1.0)
+        state = row.fixed(lambda x, v, t: 0.1 * v, state, 1.0)
     np.testing.assert_allclose(state.pos, row.grown, atol=5e-6)
 
 
@@ -145,7 +108,7 @@ def test_growth_is_the_worked_example_s(row: IntegratorRow) -> None:
 
 def energies(end: Advance, method: Integrator, w: float, dt: float, counts: Any) -> Array:
     """v^2 + w^2 x^2 after some numbers of steps."""
-    return np.array([v * v + w * w * x * x for x, v in (end(method, dt, n) for n in counts)])
+    return np.array([v * v + w * w * x * x for x, v in (motion(end(method, dt, n)) for n in counts)])
 
 
 @WAYS
@@ -174,7 +137,7 @@ def test_semi_implicit_euler_keeps_its_invariant(way: str, steps: int, tether: A
     end = oscillator(tether, way, w, zeta=0)
     start = V0**2 + w * w * X0**2 - h * w * w * X0 * V0
     for n in (1, 7, steps):
-        x, v = end(SemiImplicitEuler(), h, n)
+        x, v = motion(end(SemiImplicitEuler(), h, n))
         assert v * v + w * w * x * x - h * w * w * x * v == pytest.approx(start, rel=1e-12)
 
 
@@ -185,7 +148,7 @@ def test_velocity_verlet_keeps_its_invariant(way: str, steps: int, tether: Any) 
     end, share = oscillator(tether, way, w, zeta=0), 1 - h * h * w * w / 4
     start = V0**2 + w * w * X0**2 * share
     for n in (1, 7, steps):
-        x, v = end(VelocityVerlet(), h, n)
+        x, v = motion(end(VelocityVerlet(), h, n))
         assert v * v + w * w * x * x * share == pytest.approx(start, rel=1e-12)
 
 
@@ -255,14 +218,14 @@ def test_a_step_leaves_its_state_alone_and_agents_apart(row: IntegratorRow) -> N
     state.x[...], state.v[...] = rng.normal(size=(3, 2, 5)), rng.normal(size=(3, 2, 5))
     before = state.copy()
     stiffness = np.arange(1.0, 6.0)[:, None]
-    after = row.method(lambda x, v, t: -stiffness * x, state, 0.1)
+    after = row.fixed(lambda x, v, t: -stiffness * x, state, 0.1)
     np.testing.assert_array_equal(state.x, before.x)
     np.testing.assert_array_equal(state.v, before.v)
     np.testing.assert_array_equal(after.tick, 1)
     for b, i in ((0, 0), (1, 3)):
         one = blank(1, 1, 3, 0, 0.1)
         one.x[:, 0, 0], one.v[:, 0, 0] = before.x[:, b, i], before.v[:, b, i]
-        alone = row.method(lambda x, v, t, k=i + 1.0: -k * x, one, 0.1)
+        alone = row.fixed(lambda x, v, t, k=i + 1.0: -k * x, one, 0.1)
         np.testing.assert_array_equal(alone.pos[0, 0], after.pos[b, i])
 
 
@@ -280,7 +243,7 @@ def test_stage_arrays_are_as_many_as_are_used() -> None:
     """With fewer than it declares a method would write into another's scratch: a guard behind them stays untouched."""
     for row in INTEGRATORS:
         stages = np.full((row.method.stages + 2, 6), 7.0)
-        row.method.advance().py_func(spring, (), np.ones(6), np.ones(6), (), 0.0, 0.1, stages, 0, 6)
+        row.method.advance().py_func(spring, alone(row), np.ones(6), np.ones(6), (), 0.0, 0.1, stages, 0, 6)
         assert (stages[row.method.stages :] == 7).all()
 
 
@@ -290,14 +253,16 @@ def test_of_a_team_each_writes_his_own_part_alone(row: IntegratorRow) -> None:
     rng = np.random.default_rng(0)
     start = (*rng.normal(size=(2, 12)), np.full((row.method.stages, 12), 7.0))
     together, apart = [array.copy() for array in start], [array.copy() for array in start]
-    row.method.advance().py_func(spring, (), *together[:2], (), 0.0, 0.1, together[2], 0, 12)
+    row.method.advance().py_func(spring, alone(row), *together[:2], (), 0.0, 0.1, together[2], 0, 12)
     for first, end in ((0, 5), (5, 5), (5, 12)):
+        if first == end and row.method.adaptive:
+            continue  # nobody helps with a world of its: there is no empty part
 
         def law(context: Any, pos: Array, vel: Array, time: float, out: Array, mine: slice = slice(first, end)) -> None:
             out[mine] = -pos[mine]
 
         mine = [array.copy() for array in start]
-        row.method.advance().py_func(law, (), *mine[:2], (), 0.0, 0.1, mine[2], first, end)
+        row.method.advance().py_func(law, alone(row), *mine[:2], (), 0.0, 0.1, mine[2], first, end)
         for before, after, whole in zip(start, mine, apart, strict=True):
             np.testing.assert_array_equal(
                 np.delete(after, slice(first, end), -1), np.delete(before, slice(first, end), -1)
@@ -311,6 +276,6 @@ def test_halving_the_step_brings_the_methods_together(tether: Any) -> None:
     seconds = 0.7 * PERIOD
     end, gaps = oscillator(tether, "compiled"), []
     for n in (100, 200, 400):
-        ends = [end(row.method, seconds / n, n) for row in INTEGRATORS]
+        ends = [motion(end(row.method, seconds / n, n)) for row in INTEGRATORS]
         gaps.append(np.ptp(ends, axis=0).max())
     assert all(1.7 < a / b < 2.3 for a, b in pairwise(gaps))

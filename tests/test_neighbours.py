@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 
 from flockenv.effects import Alignment, Cohesion, Separation
 from flockenv.kernels import entry
-from flockenv.neighbours import count_cells, place_of
+from flockenv.neighbours import count_cells
 from flockenv.scene import Group, Scene
 from flockenv.space import Box, Space, Torus
 from flockenv.spawn import Spawn
@@ -233,7 +233,7 @@ def test_a_query_writes_into_its_own_arrays_only(size: Any, dimension: int) -> N
     pos, living = np.zeros(blocks * lanes * dimension), np.r_[np.ones(n), np.zeros(blocks * lanes - n)]
     x = uniform(n, size[:dimension])
     for i in range(n):
-        at = entry(place_of)(i, dimension, lanes)
+        at = i // lanes * lanes * dimension + i % lanes
         pos[at : at + dimension * lanes : lanes] = x[i]
     lengths = {"cell": blocks * lanes, "start": n + 1, "offset": n}
     for periodic in (False, True):

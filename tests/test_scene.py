@@ -6,6 +6,7 @@ import pickle
 import subprocess
 import sys
 import tracemalloc
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -22,7 +23,7 @@ from flockenv.shapes import Circle
 from flockenv.space import Box, Plane, Space, Torus
 from flockenv.spawn import Spawn
 from flockenv.state import State
-from tests.catalogue import INTEGRATORS, TETHER, VARIANTS, Variant, everything, scene_of, users_module
+from tests.catalogue import INTEGRATORS, TETHER, VARIANTS, Array, Variant, everything, scene_of, users_module
 
 SPAWN = Spawn(low=(0, 0), high=(10, 10))
 ARRAYS = ("x", "v", "alive", "tick", "key", "obstacle_x", "obstacle_radius", "work")
@@ -484,6 +485,24 @@ def test_a_state_in_pieces_is_refused_in_place_and_copied_otherwise() -> None:
     np.testing.assert_array_equal(scene.step(pieces).x, scene.step(state).x)
     with pytest.raises(ValueError, match=r"out\.x does not lie in one piece"):
         scene.step(pieces, out=pieces)
+
+
+@pytest.mark.parametrize(
+    ("fault", "drive", "x"),
+    [
+        (r"out\.x does not lie in one piece", None, np.asfortranarray),
+        (r"drive has shape", np.zeros(3), np.copy),
+        (r"drive of world 0, agent 0, axis 0 is nan", np.full((1, 64, 2), np.nan), np.copy),
+    ],
+)
+def test_a_refused_step_writes_nothing(fault: str, drive: Any, x: Callable[[Array], Array]) -> None:
+    scene = crowd_of(64, space=Plane())
+    other = scene.start(7)
+    out = State(**{**vars(other), "x": x(other.x)})
+    before = out.copy()
+    with pytest.raises(ValueError, match=fault):
+        scene.step(scene.start(0), drive, out=out)
+    assert_same(out, before)
 
 
 # --- somebody else's effect -------------------------------------------------------------------------------------------

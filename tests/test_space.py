@@ -10,7 +10,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from flockenv import space as space_module
-from flockenv.effects import Separation
+from flockenv.effects import Drag, Separation
 from flockenv.rows import rows
 from flockenv.scene import Group, Scene
 from flockenv.space import Box, Plane, Space, Torus
@@ -30,7 +30,7 @@ def alone(scene: Scene) -> Scene:
 
 @pytest.fixture(scope="module", params=["float64", "float32"])
 def torus(request: pytest.FixtureRequest) -> Scene:
-    return alone(everything(2, dtype=request.param))
+    return alone(everything(2, Drag(rate=0), dtype=request.param))  # all effects, and nothing acts
 
 
 @given(ANYWHERE, ANYWHERE)

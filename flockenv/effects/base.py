@@ -7,6 +7,8 @@ An effect is of one or more of three forms, each a law for one agent:
   agent; and `flow_law(p, me) -> velocity` with which the medium carries it, beside its own velocity;
 * `pair_law(p, me, other) -> sums`, `finish_law(p, me, sums) -> force`: what one neighbour adds to K running sums, and
   the force they make; all pair laws of a scene share one sweep;
+* `far_law(p, me, other) -> force`: of everybody else, however far, of whom groups far away are met as one; `other` is
+  a `Far`, and of `me` it may read pos and mass alone; `p.opening` says how large such a group may look;
 * `bond_law(p, me, others, numbers) -> force`: of one of the bonds that the effect's `bonds` lists, each between an
   agent and one or more partners (springs, hinges, finite elements);
 * `kick_law(p, me, seconds, gauss) -> velocity`: added once per step, however often a method asks for forces, with one
@@ -25,16 +27,23 @@ law names, itself or in a law that it calls, and every other field is a stand-in
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, ClassVar, NamedTuple
+from typing import Annotated, Any, ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field
 
 from flockenv.kernels import Vec, law, like
 from flockenv.records import Record
 from flockenv.vec import dot
 
-__all__ = ["EFFECTS", "Bonds", "Effect", "Me", "Other", "Sight", "in_view", "ties"]
+__all__ = [
+    "EFFECTS", "Bonds", "Effect", "Far", "Me", "Other", "Sight", "Vector", "all_masses", "in_view", "network_of",
+    "ties",
+]  # fmt: skip
+
+Vector = Annotated[tuple[Annotated[float, Field(strict=True)], ...], Field(min_length=2, max_length=3)]
+"""A parameter with a direction, or a place: as many numbers as the scene has dimensions."""
 
 EFFECTS: dict[str, type[Effect]] = {}
 """Every effect by its kind; a class registers itself when it is defined."""
@@ -65,6 +74,14 @@ class Other(NamedTuple):
     vel: Vec  # m/s; 0 for an obstacle
     radius: float  # m
     tie: Vec  # a unit vector of its own; 0 for an obstacle
+
+
+class Far(NamedTuple):
+    """Whom a far law meets: an agent, or several who are far away, at their centre."""
+
+    offset: Vec  # m, from me; never 0
+    square: float  # m^2, |offset|^2
+    weight: float  # kg, their mass; or how many they are, see Effect.weighs_mass
 
 
 class Sight(NamedTuple):
@@ -111,6 +128,21 @@ def ties(count: int, dimension: int) -> NDArray[np.float64]:
     return np.stack([ring * np.cos(turn), ring * np.sin(turn), height][:dimension], axis=1)
 
 
+def all_masses(groups: Sequence[Any], dimension: int) -> NDArray[np.float64]:
+    """Return the masses of all agents of some groups, (N,) kg; infinite where one is held in place."""
+    return np.concatenate([group.masses(dimension) for group in groups])
+
+
+def network_of(groups: Sequence[Any], which: int, dimension: int) -> tuple[int, Any, NDArray[np.float64]]:
+    """Return the first agent of a group, its network, and the masses of its particles, kg; refuses one without."""
+    if which >= len(groups):
+        raise ValueError(f"group = {which}: there are {len(groups)} groups, counted from 0")
+    if groups[which].network is None:
+        raise ValueError(f"group = {which}: has no network; give groups[{which}].network")
+    first = sum(group.size for group in groups[:which])
+    return first, groups[which].network, groups[which].masses(dimension)
+
+
 class Effect(Record):
     """What acts on a body; see the module for the forms of its laws."""
 
@@ -120,6 +152,7 @@ class Effect(Record):
     own_law: ClassVar[str | None] = None
     medium_law: ClassVar[str | None] = None
     flow_law: ClassVar[str | None] = None
+    far_law: ClassVar[str | None] = None
     bond_law: ClassVar[str | None] = None
     kick_law: ClassVar[str | None] = None
     pair_law: ClassVar[str | None] = None
@@ -129,8 +162,12 @@ class Effect(Record):
     obstacle_finish: ClassVar[str | None] = None
     linear_drag: ClassVar[str | None] = None
     """Name of the parameter c, kg/s, of an own_law that is -c (v - medium): a method may treat it by itself."""
+    weighs_mass: ClassVar[bool] = True
+    """Is the weight of whom a far law meets their mass? Else it is their number."""
     partners: ClassVar[int] = 1
     """How many partners a bond has beside the agent it acts on."""
+    places: ClassVar[tuple[str, ...]] = ()
+    """Names of the parameters that are points: on a torus own, medium and flow laws are given the nearest images."""
     conserves_momentum: ClassVar[bool] = False
     """True if what i does to j is the opposite of what j does to i."""
 
@@ -172,18 +209,42 @@ class Effect(Record):
 
     def idle(self) -> Effect:
         """Return the same effect, looking around in the same way and compiled the same, that does nothing."""
-        fields = type(self).model_fields
-        return self.model_copy(update={name: 0.0 for name in self.strengths if name in fields})
+        fields = {name: getattr(self, name) for name in self.strengths if name in type(self).model_fields}
+        return self.model_copy(
+            update={
+                name: (0.0,) * len(value) if isinstance(value, tuple) else 0.0
+                for name, value in fields.items()
+                if value is not None
+            }
+        )
+
+    def rates(self, groups: Sequence[Any], dimension: int) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
+        """Return bounds of w^2, 1/s^2, and of damping, 1/s, of every agent, (N,): how stiff it is, whatever happens.
+
+        None if that depends on the state, or it is not stiff at all.
+        """
+        return None
+
+    def potential(self, groups: Sequence[Any], state: Any, offset: Any) -> NDArray[np.float64] | None:
+        """Return its potential energy in each world, (B,) J; none if it has none. `offset(a, b)` is the space's."""
+        return None
 
     def check(self, scene: Any) -> None:
-        """Refuse, with a ValueError that begins with the name of a field, a scene that does not suit it."""
+        """Refuse, with a ValueError that begins with the name of a field, a scene that does not suit it.
+
+        Vectors have the dimension of the scene: whoever overrides this asks for that too.
+        """
+        for name, value in self.parameters().items():
+            if isinstance(value, tuple) and len(value) != scene.dimension:
+                raise ValueError(f"{name} = {value}: dimension = {scene.dimension}")
 
     def parameters(self) -> dict[str, float | Vec]:
-        """The numbers and vectors its laws are given, by name."""
+        """The numbers and vectors its laws are given, by name; what is none, or a word, is no number."""
         fields = {name: getattr(self, name) for name in type(self).model_fields if name != "kind"}
         return {
             name: tuple(map(float, value)) if isinstance(value, tuple) else float(value)
             for name, value in fields.items()
+            if value is not None and not isinstance(value, str)
         }
 
     def calls_for(self) -> tuple[str, ...]:
@@ -191,8 +252,8 @@ class Effect(Record):
         return tuple(
             text
             for text, law in (
-                ("neighbour query", self.pair_law), ("bonds", self.bond_law), ("obstacles", self.obstacle_law),
-                ("random numbers", self.kick_law),
+                ("neighbour query", self.pair_law), ("all others", self.far_law), ("bonds", self.bond_law),
+                ("obstacles", self.obstacle_law), ("random numbers", self.kick_law),
             )
             if law is not None
         )  # fmt: skip

@@ -1,22 +1,32 @@
-"""Linear drag: the medium takes away speed relative to it."""
+"""Drag, linear and quadratic: the medium takes away speed relative to it."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, ClassVar, Literal
 
+import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field
 
-from flockenv.effects.base import Effect, Me
+from flockenv.effects.base import Effect, Me, all_masses
 from flockenv.kernels import Vec, law
-from flockenv.vec import scale, sub
+from flockenv.vec import norm, scale, sub
 
-__all__ = ["Drag"]
+__all__ = ["Drag", "QuadraticDrag"]
 
 
 @law
 def drag(p: Any, me: Me) -> Vec:
     """F = -c (v - u)."""
     return scale(sub(me.vel, me.medium), -p.rate)
+
+
+@law
+def quadratic_drag(p: Any, me: Me) -> Vec:
+    """F = -c |v - u| (v - u)."""
+    relative = sub(me.vel, me.medium)
+    return scale(relative, -p.rate * norm(relative))
 
 
 class Drag(Effect):
@@ -27,3 +37,20 @@ class Drag(Effect):
     own_law: ClassVar[str | None] = "drag"
     strengths: ClassVar[tuple[str, ...]] = ("rate",)
     linear_drag: ClassVar[str | None] = "rate"
+
+    def rates(self, groups: Sequence[Any], dimension: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Nothing swings; c / m."""
+        damping = self.rate / all_masses(groups, dimension)
+        return np.zeros(len(damping)), damping
+
+
+class QuadraticDrag(Effect):
+    """Drag of a body that leaves a wake, F = -c |v - u| (v - u) in a medium that moves with u.
+
+    Under gravity g it falls no faster than v = sqrt(m g / c), which it approaches as v tanh(g t / v).
+    """
+
+    kind: Literal["quadratic_drag"] = "quadratic_drag"
+    rate: float = Field(ge=0, description="c, kg/m: half of density x cross-section x drag coefficient")
+    own_law: ClassVar[str | None] = "quadratic_drag"
+    strengths: ClassVar[tuple[str, ...]] = ("rate",)

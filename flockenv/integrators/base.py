@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 from numba.core import types
@@ -20,9 +20,9 @@ from numba.extending import overload
 
 from flockenv.kernels import OPTIONS
 from flockenv.records import Record
-from flockenv.state import Floats, State
+from flockenv.state import WORK, Floats, State
 
-__all__ = ["INTEGRATORS", "Integrator", "carried", "damping"]
+__all__ = ["INTEGRATORS", "PROVIDED", "Alone", "Integrator", "carried", "counted", "damping", "largest", "settings"]
 
 INTEGRATORS: dict[str, type[Integrator]] = {}
 """Every integrator by its kind; a class registers itself when it is defined."""
@@ -40,12 +40,48 @@ def _carried(x, seconds, flow, i):  # type: ignore[no-untyped-def]  # numba comp
     return lambda x, seconds, flow, i: x + seconds * flow[i]
 
 
-def damping(context: Any, rate: Any) -> None:
-    """Write c / m, 1/s, of every coordinate: the linear drag that a method with `splits_drag` treats by itself.
+class Alone(NamedTuple):
+    """The context of a world whose laws are Python functions."""
 
-    Of the context only; in a scene's kernel a function of that name, which sums the scene's own drags, takes its place.
-    """
-    rate[...] = context[0] if context else 0.0
+    drag: float = 0.0  # c / m, 1/s
+    settings: tuple[float, ...] = ()  # of the method, see Integrator.settings
+    dimension: int = 1
+    work: Any = None  # (8,), the world's row of State.work
+
+
+# What follows asks the world that `advance` is called for. In a scene's kernel functions of these names, which know how
+# its agents lie in memory, take their place (sweep/method.py).
+
+
+def damping(context: Any, rate: Any, first: int, end: int) -> None:
+    """Write c / m, 1/s, of coordinates [first, end): the linear drag that a method with `splits_drag` treats itself."""
+    rate[first:end] = context.drag
+
+
+def settings(context: Any) -> tuple[float, ...]:
+    """Return the numbers of the method, in the order of its fields."""
+    return tuple(context.settings)
+
+
+def largest(context: Any, squares: Any, first: int, end: int) -> tuple[float, int]:
+    """Return the largest sum of an agent's coordinates, NaN if one is, and where the first of that agent lies."""
+    sums = squares[first:end].reshape(context.dimension, -1).sum(axis=0)
+    agent = int(np.argmax(sums))
+    return sums[agent], first + agent
+
+
+def counted(context: Any, accepted: int, rejected: int) -> None:
+    """Count steps of the method's own in State.work."""
+    if context.work is not None:
+        context.work[SUBSTEPS] += accepted
+        context.work[SUBSTEPS + 1] += rejected
+
+
+PROVIDED = frozenset({"damping", "settings", "largest", "counted"})
+"""What a scene's kernel has of its own."""
+
+SUBSTEPS = WORK.index("substeps")
+"""Column of State.work; steps that were rejected are in the next."""
 
 
 class Integrator(Record):
@@ -70,7 +106,13 @@ class Integrator(Record):
     @classmethod
     def __pydantic_init_subclass__(cls, **kwargs: Any) -> None:
         """Register the class under its kind."""
-        INTEGRATORS[cls.model_fields["kind"].default] = cls
+        kind = cls.model_fields["kind"].default
+        if isinstance(kind, str):
+            INTEGRATORS[kind] = cls
+
+    def settings(self) -> tuple[float, ...]:
+        """The numbers that `advance` is given: its fields, in order."""
+        return tuple(float(getattr(self, name)) for name in type(self).model_fields if name != "kind")
 
     @classmethod
     def advance(cls) -> Any:
@@ -85,13 +127,13 @@ class Integrator(Record):
         state: State,
         dt: float,
         flow: Callable[[Floats, float], Floats] | None = None,
-        drag: float = 0.0,
+        drag: float | Floats = 0.0,
     ) -> State:
         """Return the state one step later under laws given as Python functions.
 
         `acceleration(pos, vel, time)` takes and returns (N, D), m, m/s, s, m/s^2; `flow(pos, time)` is the velocity of
-        a medium that carries everybody, (N, D) m/s; `drag` is c / m, 1/s, for a method that treats linear drag by
-        itself. Scenes go through Scene.step: this is Python.
+        a medium that carries everybody, (N, D) m/s; `drag` is c / m, 1/s, of all or of each coordinate (D N,), for a
+        method that treats linear drag by itself. Scenes go through Scene.step: this is Python.
         """
         if not (dt > 0 and np.isfinite(dt)):
             raise ValueError(f"dt is {dt}, must be a positive number of seconds")
@@ -108,7 +150,8 @@ class Integrator(Record):
         for k in range(b):
             x, v = new.x[:, k].ravel(), new.v[:, k].ravel()
             stages = np.zeros((max(self.stages, 1), d * n), state.x.dtype)
-            self._step(law, (drag,), x, v, carrying, float(state.time[k]), dt, stages)
+            context = Alone(drag, self.settings(), d, new.work[k])
+            self._step(law, context, x, v, carrying, float(state.time[k]), dt, stages)
             new.x[:, k], new.v[:, k] = x.reshape(d, n), v.reshape(d, n)
         return replace(new, tick=new.tick + 1)
 

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
     from flockenv.evaluation import Interval
 
-__all__ = ["Column", "Row", "draw_chart", "write_chart"]
+__all__ = ["COLOURS", "FAINT", "GRID", "INK", "Column", "Row", "draw_chart", "write_chart"]
 
 INK, FAINT, GRID = "#22272e", "#6b7480", "#e4e7eb"
 COLOURS = ("#D55E00", "#0072B2", "#E69F00", "#009E73", "#CC79A7", "#56B4E9")

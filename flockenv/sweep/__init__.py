@@ -9,8 +9,9 @@ constant length and constant offsets, and the compiler makes it straight vector 
 scratch array and stay in vector registers.
 
 The files, as a source is put together: `parts` says what it depends on, `text` holds the smallest pieces of it;
-`query` sorts the agents and walks their blocks, `pairs` lets a block meet its candidates, `bonds` its partners; `accelerate` is the sum of
-all laws, `step` advances worlds by it, `source` is the whole file; `look` is what tasks add to it.
+`query` sorts the agents and walks their blocks, `pairs` lets a block meet its candidates, `far` everybody, `bonds` its
+partners; `accelerate` is the sum of all laws, `method` the integrator, `step` advances worlds by it, `source` is the
+whole file; `look` is what tasks add to it.
 """
 
 from __future__ import annotations

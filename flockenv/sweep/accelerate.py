@@ -1,33 +1,36 @@
 """The acceleration of every agent of a world: what all laws say, summed and divided by mass.
 
-Pair laws come first, in one sweep (`sense`), and leave what they came to in `felt`, by agent; bonds in `pulled`. Then each block adds what
-an agent wants or feels by itself, and a fold over the obstacles (`respond`); what it wants is bounded by max_force.
+Pair laws come first, in one sweep (`sense`), and leave what they came to in `felt`, by agent; laws about everybody, and
+bonds, in `pulled`. Then each block adds what an agent wants or feels by itself, and a fold over the obstacles
+(`respond`); what it wants is bounded by max_force.
 """
 
 from __future__ import annotations
 
 from flockenv.sweep.bonds import bonds
+from flockenv.sweep.far import far
 from flockenv.sweep.pairs import pairs
 from flockenv.sweep.parts import Parts
-from flockenv.sweep.text import CONTEXT, Slots, indented, lane, lanes_of, tuple_of
+from flockenv.sweep.text import CONTEXT, Slots, alone, indented, lane, lanes_of, tuple_of
 
-__all__ = ["accelerate", "damping", "parameters"]
+__all__ = ["accelerate", "parameters"]
 
 
 def accelerate(parts: Parts) -> str:
     """Return the source of `accelerate`: pair laws first, then each agent by itself, block after block."""
     d = parts.dimension
-    me = ["i = row + l", f"x, v = {lanes_of(parts, 'pos')}, {lanes_of(parts, 'vel')}", _me_alone()]
+    me = ["i = row + l", f"x, v = {lanes_of(parts, 'pos')}, {lanes_of(parts, 'vel')}", f"me = {alone()}"]
     return f'''
 
 @kernel
 def sense(context, pos, vel, time):
-    """Write what this thread's agents of one world feel from others, by pair laws and bonds, from the frozen present."""
+    """Write what this thread's agents of one world feel from others, at this instant, whatever law it is by."""
     {CONTEXT} = context
 {indented(parameters(parts), 4)}
     if rank == 0:
         work[b, 0] += 1
 {indented(pairs(parts), 4)}
+{indented(far(parts), 4)}
 {indented(bonds(parts), 4)}
 
 
@@ -44,6 +47,7 @@ def respond(around, pos, vel, time, acc):
 {indented(me, 12)}
             o = zero(x)
             s, f = {lanes_of(parts, "want")}, o
+{indented(_nearest_images(parts), 12)}
 {indented(_medium(parts), 12)}
 {indented(_own(parts), 12)}
 {indented(_felt(parts), 12)}
@@ -60,28 +64,6 @@ def accelerate(around, pos, vel, time, acc):
     """Sense and respond."""
     sense(around[0], pos, vel, time)
     respond(around, pos, vel, time, acc)
-'''
-
-
-def damping(parts: Parts) -> str:
-    """Return the source of `damping`, for a method that treats linear drag by itself; nothing for others."""
-    if not parts.integrator.splits_drag:
-        return ""
-    rates = [f"p{k}.{e.linear_drag}" for k, e in enumerate(parts.effects) if e.linear_drag]
-    d = parts.dimension
-    return f'''
-
-@kernel
-def damping(around, rate):
-    """The sum of all linear drags of every coordinate, 1/s."""
-    context, first_, end_ = around
-    {CONTEXT} = context
-{indented(parameters(parts), 4)}
-    for block in range(np.uint64(first_), np.uint64(end_)):
-        base, row = block * np.uint64({d * parts.width}), block * np.uint64({parts.width})
-        for l in range(np.uint64({parts.width})):
-            c = {" + ".join(rates) or "like(mass[0], 0.0)"}
-{indented([f"{lane(parts, 'rate', k)} = c / mass[row + l]" for k in range(d)], 12)}
 '''
 
 
@@ -104,20 +86,33 @@ def parameters(parts: Parts) -> list[str]:
     return lines
 
 
-def _me_alone() -> str:
-    """Write agent i as the laws of one agent see it: no tie, there is nobody to part from."""
-    return "me = Me(ident[i], x, v, unit(v), mass[i], radius[i], max_speed[i], max_force[i], zero(x), time, zero(x))"
+def _nearest_images(parts: Parts) -> list[str]:
+    """Write the numbers of those effects that know places anew: on a torus, with the images nearest to agent i."""
+    lines = []
+    for k, effect in enumerate(parts.effects):
+        if _given(parts, k) == f"near{k}":
+            values = [
+                f"add(x, offset_to(size, x, p{k}.{name}))" if name in effect.places else f"p{k}.{name}"
+                for name in effect.parameters()
+            ]
+            lines.append(f"near{k} = P{k}({', '.join(values)})")
+    return lines
+
+
+def _given(parts: Parts, k: int) -> str:
+    """Write by which name the numbers of effect k are given to a law of one agent."""
+    return f"near{k}" if parts.space.periodic and parts.effects[k].places else f"p{k}"
 
 
 def _medium(parts: Parts) -> list[str]:
     """Write how fast the medium is where agent i is, if any effect says so."""
-    media = [f"m = add(m, medium_law_{k}(p{k}, me))" for k, e in enumerate(parts.effects) if e.medium_law]
+    media = [f"m = add(m, medium_law_{k}({_given(parts, k)}, me))" for k, e in enumerate(parts.effects) if e.medium_law]
     if not media:
         return []
     return [
         "m = o",
         *media,
-        "me = Me(ident[i], x, v, me.heading, mass[i], radius[i], max_speed[i], max_force[i], o, time, m)",
+        f"me = {alone(medium='m')}",
     ]
 
 
@@ -125,7 +120,7 @@ def _carry(parts: Parts) -> list[str]:
     """Write with which velocity the medium carries agent i, if it does."""
     if not parts.flows:
         return []
-    laws = [f"u = add(u, flow_law_{k}(p{k}, me))" for k, e in enumerate(parts.effects) if e.flow_law]
+    laws = [f"u = add(u, flow_law_{k}({_given(parts, k)}, me))" for k, e in enumerate(parts.effects) if e.flow_law]
     return [
         "u = o",
         *laws,
@@ -141,10 +136,8 @@ def _own(parts: Parts) -> list[str]:
         if effect.own_law is not None:
             still = effect.linear_drag is not None and parts.integrator.splits_drag
             if still:  # what is left of -c (v - u): the method adds -c v
-                lines.append(
-                    "rest = Me(ident[i], x, o, o, mass[i], radius[i], max_speed[i], max_force[i], o, time, me.medium)"
-                )
-            lines.append(f"{to} = add({to}, own_law_{k}(p{k}, {'rest' if still else 'me'}))")
+                lines.append(f"rest = {alone(medium='me.medium', vel='o', heading='o')}")
+            lines.append(f"{to} = add({to}, own_law_{k}({_given(parts, k)}, {'rest' if still else 'me'}))")
         if effect.obstacle_law is not None:
             lines.append(f"{to} = add({to}, obstacle_finish_{k}(p{k}, me, ({', '.join(slot.all(f'o{k}_'))},)))")
     return lines
@@ -157,7 +150,7 @@ def _felt(parts: Parts) -> list[str]:
     for t, name in enumerate(parts.targets):
         places = [f"felt[row * np.uint64({each}) + np.uint64({(d * t + k) * parts.width}) + l]" for k in range(d)]
         lines.append(f"{name} = add({name}, ({', '.join(places)},))")
-    if parts.bonded:
+    if parts.pulls:
         lines.append(f"f = add(f, {lanes_of(parts, 'pulled')})")
     return lines
 

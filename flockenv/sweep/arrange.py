@@ -11,7 +11,7 @@ from __future__ import annotations
 from flockenv.neighbours import WORTH_ARRANGING
 from flockenv.sweep.parts import Parts
 from flockenv.sweep.query import counted
-from flockenv.sweep.text import indented
+from flockenv.sweep.text import indented, place_of
 
 __all__ = ["go_home", "move_in"]
 
@@ -40,10 +40,10 @@ def go_home(parts: Parts) -> list[str]:
 
 def _carry(parts: Parts, to: list[str]) -> list[str]:
     """Write how this thread's agents pack, all of them are carried, and its new ones unpack."""
-    d, w, count = parts.dimension, parts.width, parts.luggage_size
+    w, count = parts.width, parts.luggage_size
     packed = [_place(parts, field) for field in parts.luggage]
     each = f"for i in range(np.uint64(first * {w}), np.uint64(min(end * {w}, n))):"
-    place = f"    place = (i // np.uint64({w})) * np.uint64({d * w}) + i % np.uint64({w})"
+    place = f"    place = {place_of(parts, parts.dimension)}"
     return [
         each,
         place,

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from flockenv.effects.base import Bonds, Effect
 from flockenv.sweep.parts import Parts
-from flockenv.sweep.text import Slots, indented, indented_lines, lane, lanes_of
+from flockenv.sweep.text import Slots, alone, indented, indented_lines, lane, lanes_of
 
 __all__ = ["Table", "bonds", "pack"]
 
@@ -84,12 +84,12 @@ def bonds(parts: Parts) -> list[str]:
     d, w, slot = parts.dimension, parts.width, Slots(parts)
     sums = slot.all("bond")
     lines = [
-        *([] if parts.pairs else ["wait_for_team(sync, team)  # positions are everybody's"]),
+        *([] if parts.pairs or parts.far else ["wait_for_team(sync, team)  # positions are everybody's"]),
         f"size_ = (n + {w - 1}) // {w} + 1",
         "for block in range(np.uint64(first), np.uint64(end)):",
         f"    base, row = block * np.uint64({d * w}), block * np.uint64({w})",
         f"    for l in range(np.uint64({w})):",
-        indented([f"{s} = 0" for s in sums], 8),
+        indented([f"{s} = {lane(parts, 'pulled', j) if parts.far else 0}" for j, s in enumerate(sums)], 8),
     ]
     for e, (k, effect) in enumerate(parts.bonded):
         lines += indented_lines(_meet(parts, e, k, effect, sums), 4)
@@ -115,8 +115,8 @@ def _meet(parts: Parts, e: int, k: int, effect: Effect, sums: list[str]) -> list
             f"at{q} = np.uint64(bond_place[places + np.uint64({q * w}) + l])",
             f"to{q} = offset_to(size, x, {vector('pos', f'at{q}')})",
             f"who{q} = at{q} // np.uint64({d * w}) * np.uint64({w}) + at{q} % np.uint64({w})",
-            f"it{q} = Other(like(x[0], who{q}), to{q}, dot(to{q}, to{q}), {vector('vel', f'at{q}')}, radius[who{q}], "
-            "zero(x))",
+            f"fast{q} = {vector('vel', f'at{q}')}",
+            f"it{q} = Other(like(x[0], who{q}), to{q}, dot(to{q}, to{q}), fast{q}, radius[who{q}], zero(x))",
         ]
     numbers = ", ".join(f"bond_number[numbers + np.uint64({j * w}) + l]" for j in range(c))
     return [
@@ -127,8 +127,9 @@ def _meet(parts: Parts, e: int, k: int, effect: Effect, sums: list[str]) -> list
         f"    for l in range(np.uint64({w})):",
         "        i = row + l",
         f"        x, v = {lanes_of(parts, 'pos')}, {lanes_of(parts, 'vel')}",
-        "        me = Me(ident[i], x, v, zero(x), mass[i], radius[i], max_speed[i], max_force[i], zero(x), time, zero(x))",
+        f"        me = {alone()}",
         indented(others, 8),
         f"        says = bond_law_{k}(p{k}, me, ({', '.join(f'it{q}' for q in range(p))},), ({numbers},))",
-        indented([f"{s} += says[{j}]" for j, s in enumerate(sums)], 8),
+        f"        whole = {' & '.join(f'(living[who{q}] > zero(x)[0])' for q in range(p))}  # the dead hold nobody",
+        indented([f"{s} += says[{j}] if whole else like(x[0], -0.0)" for j, s in enumerate(sums)], 8),
     ]

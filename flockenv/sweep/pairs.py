@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from flockenv.sweep.parts import Parts, record_of, sight_of, sorted_at
 from flockenv.sweep.query import query, walk
-from flockenv.sweep.text import Slots, indented, indented_lines
+from flockenv.sweep.text import Slots, indented, indented_lines, place_of
 
 __all__ = ["meet_range", "pairs"]
 
@@ -69,7 +69,8 @@ def _sum_up(parts: Parts) -> list[str]:
         indented([f"felt[block * np.uint64({r}) + np.uint64({j * w}) + l] = {s}" for j, s in enumerate(sums)], 8),
         "else:",
         "    for l in range(np.uint64(upto - at)):",
-        f"        place = np.uint64(place_of(np.int64(order[block + l]), {r}, {w}))",
+        "        i = np.uint64(order[block + l])",
+        f"        place = {place_of(parts, r)}",
         indented([f"felt[place + np.uint64({j * w})] = {s}" for j, s in enumerate(sums)], 8),
     ]
 
@@ -177,4 +178,5 @@ def _me(parts: Parts, fields: list[str]) -> str:
         return "(" + ", ".join(number(f"{letter}{k}") for k in range(parts.dimension)) + ")"
 
     numbers = ", ".join(number(name) for name in ("mass", "radius", "max_speed", "max_force"))
-    return f"me = Me({number('who')}, {vector('x')}, {vector('v')}, {vector('h')}, {numbers}, {vector('t')}, time, zero({vector('x')}))"
+    vectors = f"{vector('x')}, {vector('v')}, {vector('h')}"
+    return f"me = Me({number('who')}, {vectors}, {numbers}, {vector('t')}, time, zero({vector('x')}))"

@@ -48,15 +48,20 @@ class Parts:
     """Are there enough agents to sort them by cell? If not, nothing of that is written."""
     look: Look | None = None
     """What a task shows its agents, found by the same query."""
+    crowded: bool = False
+    """Are there enough agents for groups of them to be met as one, where they are far away?"""
 
     @functools.cached_property
     def width(self) -> int:
         """Lanes of a block: agents that one vector register holds.
 
         Two registers in float64, where that was measured to be faster (benchmarks.composition): a few sums of a flat,
-        small scene, or a view cone, leave enough of the 32.
+        small scene, or a view cone, leave enough of the 32. And where everybody meets everybody: of a law as short as
+        those, LLVM unrolls a loop over 8 lanes before it comes to make vectors, and then makes none.
         """
         one = LINE // self.itemsize
+        if self.itemsize == 8 and self.far:
+            return 2 * one
         several = self.itemsize == 8 and self.dimension == 2 and not self.sorts and bool(self.pairs) and not self.look
         sums = sum(effect.sums(self.dimension) for _, effect in self.pairs)
         cone = any(sight.fov < 360 for sight in self.sights) and not any(sight.nearest for sight in self.sights)
@@ -76,6 +81,21 @@ class Parts:
     def bonded(self) -> list[tuple[int, Effect]]:
         """The effects with a law of bonds, and their numbers."""
         return [(k, e) for k, e in enumerate(self.effects) if e.bond_law is not None]
+
+    @functools.cached_property
+    def far(self) -> list[tuple[int, Effect]]:
+        """The effects with a law about everybody, and their numbers."""
+        return [(k, e) for k, e in enumerate(self.effects) if e.far_law is not None]
+
+    @functools.cached_property
+    def treed(self) -> list[tuple[int, Effect]]:
+        """Those of them that meet groups as one."""
+        return [(k, e) for k, e in self.far if self.crowded and e.parameters()["opening"] != 0]
+
+    @property
+    def pulls(self) -> bool:
+        """Is anything left in `pulled`?"""
+        return bool(self.far or self.bonded)
 
     @property
     def flows(self) -> bool:
@@ -100,6 +120,7 @@ class Parts:
         for effect in self.effects:
             for value in effect.parameters().values():
                 values.extend(value if isinstance(value, tuple) else (value,))
+        values += self.integrator.settings()
         return values + ([self.look.radius, self.look.radius**2] if self.look else [])
 
     @property
@@ -149,8 +170,11 @@ class Parts:
 
     @property
     def arranges(self) -> bool:
-        """May agents of a large world be put in order for a while?"""
-        return self.sorts and bool(self.pairs) and not self.bonded  # bonds know their partners by place
+        """May agents of a large world be put in order for a while?
+
+        Not where places matter: bonds know their partners by them, and everybody is met in their order.
+        """
+        return self.sorts and bool(self.pairs) and not self.pulls
 
     @property
     def luggage(self) -> list[str]:
@@ -171,7 +195,10 @@ class Parts:
         runs = [(f"c{k}_", e.sums(d)) for k, e in self.pairs]
         runs += [(f"near{q}_", sight.nearest or 0) for q, sight in enumerate(self.sights)]
         runs += [(f"o{k}_", e.folded(d) if e.obstacle_law else 0) for k, e in enumerate(self.effects)]
-        runs += [(f"g{name}", d) for name in self.targets] + [("bond", d if self.bonded else 0)]
+        runs += [(f"g{name}", d) for name in self.targets] + [
+            ("bond", d * bool(self.bonded)),
+            ("far", d * bool(self.far)),
+        ]
         runs += [("square", look.agents), ("place", look.agents), ("gap", look.obstacles), ("which", look.obstacles)]
         names = [f"{name}{j}" for name, many in runs for j in range(many)]
         return {name: place for place, name in enumerate([*names, "bad"])}

@@ -8,7 +8,7 @@ together, each its own agents, and each then walks through its own share of the 
 from __future__ import annotations
 
 from flockenv.sweep.parts import SMALL_STRIDE, Parts, record_of, sorted_at
-from flockenv.sweep.text import copied, indented, indented_lines, tuple_of
+from flockenv.sweep.text import copied, indented, indented_lines, place_of, tuple_of
 
 __all__ = ["counted", "query", "walk"]
 
@@ -110,7 +110,7 @@ def _one_by_one(parts: Parts, lines: list[str]) -> list[str]:
         "for number_ in range(np.uint64(n)):",
         "    i = np.uint64(order[number_]) if arranged else number_" if parts.sorts else "    i = number_",
         "    if living[i] > 0:",
-        f"        place = np.uint64(place_of(np.int64(i), {parts.dimension}, {parts.width}))",
+        f"        place = {place_of(parts, parts.dimension)}",
         "        order[at] = i",
         indented(lines, 8),
         "        at += np.uint64(1)",
@@ -136,7 +136,7 @@ def _sort(parts: Parts, fields: list[str], inside: bool) -> list[str]:
         f"for i in range(np.uint64(first * {w}), np.uint64(min(end * {w}, n))):",
         "    c = cell[i]",
         "    if c >= 0:",
-        f"        place = (i // np.uint64({w})) * np.uint64({d * w}) + i % np.uint64({w})",
+        f"        place = {place_of(parts, d)}",
         "        to = offset[rank, np.uint64(c)]",
         "        offset[rank, np.uint64(c)] = to + 1",
         f"        to = np.uint64(to) * np.uint64({len(record)})",

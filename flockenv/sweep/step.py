@@ -9,7 +9,18 @@ from __future__ import annotations
 from flockenv.sweep.accelerate import parameters
 from flockenv.sweep.arrange import go_home, move_in
 from flockenv.sweep.parts import Parts
-from flockenv.sweep.text import CONTEXT, SHARED, Slots, copied, indented, indented_lines, lane, lanes_of, tuple_of
+from flockenv.sweep.text import (
+    CONTEXT,
+    SHARED,
+    Slots,
+    alone,
+    copied,
+    indented,
+    indented_lines,
+    lane,
+    lanes_of,
+    tuple_of,
+)
 
 __all__ = ["copies", "step", "step_world"]
 
@@ -87,11 +98,11 @@ def step_world(
     worst = far
     for l in range(np.uint64({parts.width})):
         worst = min(worst, {bad})
-    tally[rank] = np.int64(worst) if worst < far else n
+    tally[team + rank] = np.int64(worst) if worst < far else n  # who counts may still be reading the first half
     wait_for_team(sync, team)
     first_bad = n
     for r in range(team):
-        first_bad = min(first_bad, tally[r])
+        first_bad = min(first_bad, tally[team + r])
     wait_for_team(sync, team)  # before anybody counts again
     if first_bad < n:
         return first_bad
@@ -177,8 +188,7 @@ def _kick(parts: Parts) -> list[str]:
             "kick = (" + ", ".join(f"says[{j}] if free else like(dt, 0.0)" for j in range(parts.dimension)) + ",)",
             "x, v = add(x, scale(kick, like(dt, 0.5) * dt)), add(v, kick)  # as if it came in the middle of the step",
         ]
-    me = "me = Me(ident[i], x, v, unit(v), mass[i], radius[i], max_speed[i], max_force[i], zero(x), time, zero(x))"
-    return [me, *lines] if lines else []
+    return [f"me = {alone()}", *lines] if lines else []
 
 
 def step(parts: Parts) -> str:

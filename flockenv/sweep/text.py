@@ -9,11 +9,15 @@ from __future__ import annotations
 from flockenv.kernels import LINE
 from flockenv.sweep.parts import Parts
 
-__all__ = ["CONTEXT", "SHARED", "Slots", "copied", "indented", "indented_lines", "lane", "lanes_of", "tuple_of"]
+__all__ = [
+    "CONTEXT", "SHARED", "Slots", "alone", "copied", "indented", "indented_lines", "lane", "lanes_of", "place_of",
+    "tuple_of",
+]  # fmt: skip
 
 _READ = (
-    "mass, radius, max_speed, max_force, living, ident, want, felt, pulled, carrying, sorted_, records, luggage, order, "
-    "cell, start, offset, bounds, tally, sync, tie, bond_place, bond_number, bond_start, number, lanes, ranges"
+    "mass, radius, max_speed, max_force, living, ident, want, felt, pulled, carrying, sorted_, records, luggage, "
+    "order, cell, start, offset, bounds, tally, sync, tie, bond_place, bond_number, bond_start, tree_key, tree_place, "
+    "tree_digit, tree_leaf, tree_node, tree_near, number, lanes, ranges"
 )
 SHARED = f"pos, vel, origin, stages, {_READ}"
 """Scratch of one world in progress, in order; see scene.Workspace. The last two belong to one thread."""
@@ -35,6 +39,17 @@ def lane(parts: Parts, array: str, k: int) -> str:
 def lanes_of(parts: Parts, array: str) -> str:
     """Write all coordinates of lane l of the block that begins at `base`, as a tuple."""
     return "(" + ", ".join(lane(parts, array, k) for k in range(parts.dimension)) + ")"
+
+
+def place_of(parts: Parts, rows: int) -> str:
+    """Write where the first of `rows` numbers of agent i lies in an array of blocks; the next is a width further."""
+    w = parts.width
+    return f"(i // np.uint64({w})) * np.uint64({rows * w}) + i % np.uint64({w})"
+
+
+def alone(medium: str = "zero(x)", vel: str = "v", heading: str = "unit(v)") -> str:
+    """Write agent i, at x, as the laws of one agent see it: no tie, there is nobody to part from."""
+    return f"Me(ident[i], x, {vel}, {heading}, mass[i], radius[i], max_speed[i], max_force[i], zero(x), time, {medium})"
 
 
 def copied(parts: Parts, to: str, at: str, source: str, place: str) -> list[str]:

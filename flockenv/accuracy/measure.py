@@ -1,0 +1,212 @@
+"""Every method in every setting on one problem: errors first, then wall times, in rounds over all of them."""
+
+from __future__ import annotations
+
+import gc
+import os
+import platform
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path as File
+from statistics import median
+from time import perf_counter
+
+import numpy as np
+
+from flockenv.accuracy.problem import Floats, Problem, largest
+from flockenv.accuracy.reference import FINER, Reference, find_reference, find_sensitivity
+from flockenv.accuracy.results import Curve, Machine, Point, Report, measured_order
+from flockenv.integrators import INTEGRATORS, Integrator
+from flockenv.refusals import nearest, shown
+from flockenv.scene import Scene
+from flockenv.state import State
+
+__all__ = ["REPETITIONS", "TOLERANCES", "machine", "measure", "methods_named", "usual_methods"]
+
+REPETITIONS = 20
+TOLERANCES = tuple(10.0**-k for k in range(3, 13))
+"""What an adaptive method is asked for: it chooses its steps itself."""
+
+TRUSTED = 4.0
+"""Errors of fewer times the reference's own are not trusted."""
+
+COARSE = 0.1
+"""Errors of more than this share of how far agents go are no approximation."""
+
+
+@dataclass(eq=False)
+class _Trial:
+    """A method in a setting: a scene to run, and what came of it."""
+
+    problem: Problem
+    method: Integrator
+    steps: int
+    tolerance: float | None
+    times: list[float] = field(default_factory=list)
+    point: Point | None = None
+
+    def compare(self, reference: Reference) -> None:
+        """Run from instant to instant, and find out how far from the reference."""
+        try:
+            path = self.problem.path(self.method, self.steps)
+        except ArithmeticError:  # it diverges, or equations were not solved
+            self.point = self._point(self.steps * self.method.evaluations, {})
+            return
+        off = self.problem.apart(path.pos, reference.pos)
+        errors = {
+            "error": largest(off[-1]),
+            "rms": float(np.sqrt((off[-1] ** 2).mean())),
+            "along": largest(off),
+            "energy": _energy_off(self.problem, path.pos, path.vel, reference),
+            "momentum": _momentum_off(self.problem, path.vel, reference),
+        }
+        self.point = self._point(path.evaluations, {k: v for k, v in errors.items() if np.isfinite(v)})
+
+    def _point(self, evaluations: int, errors: dict[str, float]) -> Point:
+        names = ("error", "rms", "along", "energy", "momentum")
+        return Point(
+            steps=self.steps, dt=self.problem.seconds / self.steps, tolerance=self.tolerance,
+            evaluations=evaluations, seconds=None, **{name: errors.get(name) for name in names},
+        )  # fmt: skip
+
+    def clock(self) -> None:
+        """Run as one call, and keep how long it took; one step before it brings the code back into the caches."""
+        scene, start, out = self._ready
+        scene.step(start, out=out)
+        began = perf_counter()
+        scene.step(start, out=out, steps=self.steps)
+        self.times.append(perf_counter() - began)
+
+    @cached_property
+    def _ready(self) -> tuple[Scene, State, State]:
+        scene, start = self.problem.ready(self.method, self.steps)
+        return scene, start, start.copy()
+
+    @property
+    def good(self) -> bool:
+        """Did it arrive?"""
+        return self.point is not None and self.point.error is not None
+
+    @property
+    def timed(self) -> Point:
+        """The point with the median of its times."""
+        assert self.point is not None
+        return self.point.model_copy(update={"seconds": median(self.times)}) if self.times else self.point
+
+
+def measure(
+    problem: Problem,
+    methods: Sequence[Integrator] | None = None,
+    repetitions: int = REPETITIONS,
+    finer: int = FINER,
+    progress: Callable[[int], None] = lambda percent: None,
+) -> Report:
+    """Return how far off each method ends in each number of steps, and what it costs.
+
+    methods: instances, none = all that `usual_methods` names. repetitions: how often the wall time of each point is
+    taken, all of them in turn; compiling is over by then; 0 = not at all. finer: how much finer than the finest steps
+    those of a reference of our own are. progress is called with percents. A KeyboardInterrupt ends it early: what was
+    done is returned, and `stopped` says so.
+    Raises ValueError, in one line, for a horizon so long that nobody could tell (see find_sensitivity).
+    """
+    chosen = usual_methods() if methods is None else tuple(methods)
+    if repetitions < 0 or finer < 2:
+        raise ValueError(f"repetitions = {repetitions} must be at least 0, finer = {finer} at least 2")
+    sensitivity, reference = find_sensitivity(problem), find_reference(problem, finer)
+    trials = [_Trial(problem, *setting) for method in chosen for setting in _settings(problem, method)]
+    stopped, all_ = "", max(1, len(trials) * (1 + repetitions))
+    try:
+        for done, trial in enumerate(trials):
+            progress(100 * done // all_)
+            trial.compare(reference)
+        _clock([trial for trial in trials if trial.good], repetitions, progress)
+    except KeyboardInterrupt:
+        stopped = "interrupted"
+    reach = largest(problem.apart(reference.pos, problem.start.pos[0].astype(np.float64)))
+    floor = max(TRUSTED * reference.error, sensitivity.error)
+    return Report(
+        name=problem.name, title=problem.title or problem.name, agents=problem.scene.agents, seconds=problem.seconds,
+        dtype=problem.scene.dtype, reference=reference.kind, reference_error=reference.error, note=reference.note,
+        growth=sensitivity.growth, floor=floor, reach=reach,
+        energy=problem.energies, repetitions=repetitions,
+        machine=machine(), curves=tuple(_curves(trials, floor, COARSE * reach)), stopped=stopped,
+    )  # fmt: skip
+
+
+def _settings(problem: Problem, method: Integrator) -> list[tuple[Integrator, int, float | None]]:
+    """Return the settings of a method: numbers of steps, or tolerances of one that chooses its steps itself."""
+    if not method.adaptive:
+        return [(method, steps, None) for steps in problem.steps]
+    few = len(problem.times)
+    return [(method.model_copy(update={"tolerance": t}), few, t) for t in TOLERANCES]
+
+
+def _clock(trials: Sequence[_Trial], repetitions: int, progress: Callable[[int], None]) -> None:
+    """Take the time of every trial, round after round: a disturbance of the machine hits all of them."""
+    collecting = gc.isenabled()
+    gc.disable()
+    try:
+        for done in range(repetitions):
+            progress(100 * (1 + done) // (1 + repetitions))
+            for trial in trials:
+                trial.clock()
+    finally:
+        if collecting:
+            gc.enable()
+
+
+def _curves(trials: Sequence[_Trial], least: float, most: float) -> list[Curve]:
+    kinds = dict.fromkeys(trial.method.kind for trial in trials)
+    curves = []
+    for kind in kinds:
+        mine = [trial for trial in trials if trial.method.kind == kind and trial.point is not None]
+        if not mine:
+            continue
+        points = tuple(trial.timed for trial in mine)
+        order, used = measured_order(points, least, most)
+        declared = min(mine[0].method.order, mine[0].method.order_with_drag)
+        curves.append(Curve(method=kind, declared=declared, points=points, order=order, used=used))
+    return curves
+
+
+def _energy_off(problem: Problem, pos: Floats, vel: Floats, reference: Reference) -> float:
+    """Return by how much the energy is off at worst, in parts of the largest kinetic energy of the reference."""
+    off = largest(np.abs(problem.energy(pos, vel) - problem.energy(reference.pos, reference.vel)))
+    scale = largest(problem.kinetic(reference.vel))
+    return off / scale if scale > 0 else float("nan")
+
+
+def _momentum_off(problem: Problem, vel: Floats, reference: Reference) -> float:
+    """Return by how much a momentum that is kept has changed at worst, in parts of the sum of its sizes."""
+    if not problem.conserves_momentum:
+        return float("nan")
+    before = problem.momentum(problem.start.vel[0].astype(np.float64))
+    carried = largest(problem.impulse(reference.vel))
+    off = largest(np.linalg.norm(problem.momentum(vel) - before, axis=-1))
+    return off / carried if carried > 0 else float("nan")
+
+
+def usual_methods() -> tuple[Integrator, ...]:
+    """Return every method that takes explicit steps, in its usual setting, those of low order first."""
+    kinds = [kind for kind in INTEGRATORS.values() if not kind.solves]
+    return tuple(kind() for kind in sorted(kinds, key=lambda kind: (kind.order, kind.evaluations)))
+
+
+def methods_named(names: Sequence[str]) -> tuple[Integrator, ...]:
+    """Return methods by their kinds; raises ValueError, with the nearest name, for one that is not there."""
+    for name in names:
+        if name not in INTEGRATORS:
+            raise ValueError(f"methods: {shown(name)} is none{nearest(name, INTEGRATORS)} ({', '.join(INTEGRATORS)})")
+    return tuple(INTEGRATORS[name]() for name in dict.fromkeys(names))
+
+
+def machine() -> Machine:
+    """Return what times depend on."""
+    cpu = platform.processor()
+    with suppress(OSError):
+        lines = File("/proc/cpuinfo").read_text().splitlines()
+        cpu = next((line.partition(":")[2].strip() for line in lines if line.startswith("model name")), cpu)
+    load = os.getloadavg()[0] if hasattr(os, "getloadavg") else None
+    return Machine(cpu=cpu or platform.machine(), cores=os.cpu_count() or 1, load=load)

@@ -1,0 +1,76 @@
+"""A report as lines and rows of text."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from flockenv.accuracy.results import Choice, Cost, Curve, Report
+
+__all__ = ["COLUMNS", "best", "columns", "headlines", "rows"]
+
+COLUMNS = ("method", "order", "declared")
+DRIFTS = ("energy off", "momentum off")
+
+
+def headlines(report: Report) -> list[str]:
+    """Return what a reader must know before the table, a line each."""
+    times = f"median of {report.repetitions} runs" if report.repetitions else "not taken"
+    load = "" if report.machine.load is None else f", load {report.machine.load:.1f}"
+    lines = [
+        f"{report.agents:,} agents, {report.seconds:g} s, {report.dtype}; the farthest goes {report.reach:.3g} m",
+        f"errors against: {report.reference}" + (f" ({report.note})" if report.note else ""),
+        f"a tiny difference at the start grows {report.growth:.2g}-fold: errors below {report.floor:.1e} m say nothing",
+        f"energy: {report.energy}",
+        f"times: {times} on {report.machine.cpu}, {report.machine.cores} cores{load}",
+    ]
+    return lines + ([f"{report.stopped}: what was done until then is shown"] if report.stopped else [])
+
+
+def columns(tolerances: Sequence[float]) -> tuple[str, ...]:
+    """Return the heads of the table."""
+    return (*COLUMNS, *(f"{what} to {t:g} m" for t in tolerances for what in ("evals", "ms")), *DRIFTS)
+
+
+def rows(report: Report, tolerances: Sequence[float]) -> list[list[str]]:
+    """Return a row per method: its order, what each tolerance costs with it, and what it does to energy and momentum.
+
+    ~ before a number: it lies between two measured points. Energy and momentum are those of the finest steps.
+    """
+    return [_row(curve, report, tolerances) for curve in report.curves]
+
+
+def _row(curve: Curve, report: Report, tolerances: Sequence[float]) -> list[str]:
+    costs = [_cost(curve, t, by, report.floor) for t in tolerances for by in ("evaluations", "seconds")]
+    last = next((p for p in reversed(curve.points) if p.error is not None), None)
+    drifts = [None, None] if last is None else [last.energy, last.momentum]
+    order = "-" if curve.order is None else f"{curve.order:.2f} ({curve.used} points)"
+    return [curve.method, order, str(curve.declared), *costs, *("-" if d is None else f"{d:.1e}" for d in drifts)]
+
+
+def _cost(curve: Curve, tolerance: float, by: Cost, floor: float) -> str:
+    choice = curve.needed(tolerance, by) if tolerance >= floor else None
+    return "-" if choice is None else _amount(choice, by)
+
+
+def _amount(choice: Choice, by: Cost) -> str:
+    number = f"{choice.cost:,.0f}" if by == "evaluations" else f"{1e3 * choice.cost:.3g}"
+    return ("~" if choice.interpolated else "") + number
+
+
+def best(report: Report, tolerances: Sequence[float]) -> list[str]:
+    """Return, a line per tolerance, which method is the cheapest by time and by evaluations."""
+    lines = []
+    for tolerance in tolerances:
+        if tolerance < report.floor:
+            lines.append(f"to {tolerance:g} m: below {report.floor:.1e} m nothing can be told")
+            continue
+        parts = []
+        for by, unit in (("seconds", "ms"), ("evaluations", "evaluations")):
+            choice = report.cheapest(tolerance, by)  # type: ignore[arg-type]  # mypy widens the tuple's words
+            if choice is not None:
+                setting = (
+                    f"dt = {choice.dt:.3g} s" if choice.tolerance is None else f"tolerance = {choice.tolerance:.1e}"
+                )
+                parts.append(f"{choice.method} at {setting}, {_amount(choice, by)} {unit}")  # type: ignore[arg-type]
+        lines.append(f"to {tolerance:g} m: " + ("; ".join(parts) if parts else "nothing that was measured is so good"))
+    return lines

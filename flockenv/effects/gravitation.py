@@ -1,0 +1,78 @@
+"""Forces between all agents that fall with the square of the distance: by mass (Newton), and by the pair.
+
+Both are softened (Plummer 1911): a body is not a point but a cloud of radius `softening`, and nobody is flung away who
+happens to pass through another. Up to a few thousand agents the sum is exact; of more, groups that are far away are met
+as one (Barnes & Hut 1986), unless `opening` is 0. Forces are opposite in every pair; what groups are met as one for is
+momentum, which many then keep to the accuracy of the tree alone.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, ClassVar, Literal
+
+import numpy as np
+from pydantic import Field
+
+from flockenv.effects.base import Effect, Far, Me
+from flockenv.kernels import Vec, law
+from flockenv.vec import scale
+
+__all__ = ["Gravitation", "InverseSquare"]
+
+
+@law
+def _per_cube(p: Any, other: Far) -> float:
+    """Return 1 / (d^2 + eps^2)^(3/2), 1/m^3, times the weight."""
+    square = other.square + p.softening * p.softening
+    return other.weight / (square * np.sqrt(square))
+
+
+@law
+def gravitation(p: Any, me: Me, other: Far) -> Vec:
+    """F = G m m_j d / (d^2 + eps^2)^(3/2)."""
+    return scale(other.offset, p.constant * me.mass * _per_cube(p, other))
+
+
+@law
+def inverse_square(p: Any, me: Me, other: Far) -> Vec:
+    """F = k d / (d^2 + eps^2)^(3/2)."""
+    return scale(other.offset, p.strength * _per_cube(p, other))
+
+
+class _Softened(Effect):
+    """What the two have in common."""
+
+    softening: float = Field(ge=0, description="eps, m; 0 = point masses, which nothing keeps apart")
+    opening: float = Field(
+        default=0.5, ge=0, le=1,
+        description="theta: agents are met as one if their group is narrower than theta times its distance; 0 = never",
+    )  # fmt: skip
+    conserves_momentum: ClassVar[bool] = True
+
+
+class Gravitation(_Softened):
+    """Newton's gravitation, softened: F_i = sum of G m_i m_j d / (d^2 + eps^2)^(3/2), d from i to j."""
+
+    kind: Literal["gravitation"] = "gravitation"
+    constant: float = Field(ge=0, description="G, N m^2/kg^2; in nature 6.674e-11")
+    far_law: ClassVar[str | None] = "gravitation"
+    strengths: ClassVar[tuple[str, ...]] = ("constant",)
+
+    def check(self, scene: Any) -> None:
+        """Refuse who would pull infinitely: whoever is held in place by an infinite mass."""
+        for k, group in enumerate(scene.groups):
+            if not math.isfinite(group.mass):
+                raise ValueError(
+                    f"constant: groups[{k}].mass is {group.mass}, which would pull infinitely; give it a finite mass"
+                )
+
+
+class InverseSquare(_Softened):
+    """Attraction or repulsion of every pair, whatever its masses: F_i = sum of k d / (d^2 + eps^2)^(3/2)."""
+
+    kind: Literal["inverse_square"] = "inverse_square"
+    strength: float = Field(description="k, N m^2; positive attracts, negative repels")
+    far_law: ClassVar[str | None] = "inverse_square"
+    weighs_mass: ClassVar[bool] = False
+    strengths: ClassVar[tuple[str, ...]] = ("strength",)

@@ -1,0 +1,126 @@
+"""Steps of a scene by a method that solves equations: who depends on whom, and how the kernel takes over what is found.
+
+The method itself, and Newton's method, know nothing of scenes (flockenv.integrators.implicit and newton).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from flockenv.integrators.implicit import Implicit
+from flockenv.integrators.newton import Coupling, Evaluate, NotSolvedError, coupled
+from flockenv.state import WORK, Floats, State
+
+if TYPE_CHECKING:
+    from flockenv.scene import Scene
+
+__all__ = ["coupling_of", "solve_steps"]
+
+MOST_NUMBERS = 2**22
+"""Coordinates that are evaluated together; columns of a large matrix are taken in portions."""
+
+
+def coupling_of(scene: Scene) -> Coupling | None:
+    """Return who depends on whom, if that does not change from step to step; none if agents look around."""
+    if any(e.pair_law or e.far_law for e in scene.effects):
+        return None
+    first, second = [np.zeros(0, np.int64)], [np.zeros(0, np.int64)]
+    for _, effect in scene.parts.bonded:
+        bonds = effect.bonds(scene.groups, scene.dimension)
+        for column in bonds.partner.T:
+            first.append(bonds.agent.astype(np.int64))
+            second.append(column.astype(np.int64))
+    return coupled(scene.agents, np.concatenate(first), np.concatenate(second))
+
+
+def solve_steps(
+    scene: Scene, state: State, drive: Floats, steps: int, step: Callable[[State, int, Floats, Floats], tuple[int, int]]
+) -> tuple[int, int]:
+    """Advance every world of a state in place; return the first (world, agent) not finite or not found, or (-1, -1).
+
+    `step(state, world, x, v)` lets the kernel take over positions and velocities (D, N): limits, the space, time. A
+    world that fails stays as it was.
+    """
+    method = scene.integrator
+    assert isinstance(method, Implicit)
+    broken = (-1, -1)
+    for b in range(state.shape[0]):
+        alone = state.worlds([b])
+        push = drive[:, b : b + 1] if drive.shape[1] else drive
+        evaluate = _evaluation(scene, alone, push)
+        bad = -1
+        for _ in range(steps):
+            bad = _solved(scene, method, alone, evaluate, step)
+            if bad >= 0:
+                break
+        if bad < 0:
+            _put(state, b, alone)
+        elif broken[0] < 0:
+            broken = (b, bad)
+    return broken
+
+
+def _solved(
+    scene: Scene, method: Implicit, alone: State, evaluate: Evaluate,
+    step: Callable[[State, int, Floats, Floats], tuple[int, int]],
+) -> int:  # fmt: skip
+    """Advance one world by one step; return the agent that is not finite or was not found, or -1."""
+    x, v = alone.x[:, 0].ravel(), alone.v[:, 0].ravel()
+    try:
+        found = method.solve(evaluate, x, v, float(alone.time[0]), scene.dt, scene.dimension, scene.coupling)
+    except NotSolvedError:
+        return _fastest(alone)
+    alone.work[0, WORK.index("newton_iterations")] += found.newton
+    alone.work[0, WORK.index("linear_iterations")] += found.linear
+    shape = alone.x[:, 0].shape
+    return step(alone, 0, found.x.reshape(shape), found.v.reshape(shape))[1]
+
+
+def _fastest(alone: State) -> int:
+    """Return the agent whose equations are the least likely to have a solution nearby: the fastest."""
+    return int(np.argmax((alone.v[:, 0] ** 2).sum(axis=0)))
+
+
+def _put(state: State, b: int, alone: State) -> None:
+    """Write a world back to its place in the batch."""
+    state.x[:, b], state.v[:, b] = alone.x[:, 0], alone.v[:, 0]
+    state.tick[b], state.work[b] = alone.tick[0], alone.work[0]
+
+
+def _evaluation(scene: Scene, alone: State, drive: Floats) -> Evaluate:
+    """Return the scene's law as Newton's method asks for it: many instants of one world are so many worlds."""
+    d, n = scene.dimension, scene.agents
+    portion = max(1, MOST_NUMBERS // (d * n))
+
+    def some(x: Floats, v: Floats, time: float) -> tuple[Floats, Floats | None]:
+        many = len(x)
+
+        def axes_first(rows: Floats) -> Floats:
+            return np.ascontiguousarray(rows.reshape(many, d, n).transpose(1, 0, 2))
+
+        def copies(array: Any, axis: int = 0) -> Any:
+            return np.ascontiguousarray(np.repeat(array, many, axis=axis))
+
+        worlds = replace(
+            alone, x=axes_first(x), v=axes_first(v), alive=copies(alone.alive), tick=copies(alone.tick),
+            key=copies(alone.key), obstacle_x=copies(alone.obstacle_x, 1),
+            obstacle_radius=copies(alone.obstacle_radius), work=np.zeros((many, len(WORK)), np.int64),
+        )  # fmt: skip
+        push = copies(drive, 1).transpose(1, 2, 0) if drive.shape[1] else None
+        acc, flow = scene.rates(worlds, push, np.full(many, time))
+        alone.work[0] += worlds.work.sum(axis=0)
+        rows = acc.transpose(0, 2, 1).reshape(many, d * n)
+        return rows, None if flow is None else flow.transpose(0, 2, 1).reshape(many, d * n)
+
+    def evaluate(x: Floats, v: Floats, time: float) -> tuple[Floats, Floats | None]:
+        parts = [some(x[k : k + portion], v[k : k + portion], time) for k in range(0, len(x), portion)]
+        if len(parts) == 1:
+            return parts[0]
+        flows = [flow for _, flow in parts if flow is not None]
+        return np.concatenate([acc for acc, _ in parts]), np.concatenate(flows) if flows else None
+
+    return evaluate

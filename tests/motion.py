@@ -1,0 +1,80 @@
+"""The two ways that a method can be used, taken alike: its `__call__` with forces in Python, and a scene's kernel."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+
+from flockenv.effects import Drag
+from flockenv.integrators import Integrator
+from flockenv.scene import Group, Scene
+from flockenv.spawn import Spawn
+from flockenv.state import State, blank
+from tests.catalogue import INTEGRATORS, Array
+
+METHODS = pytest.mark.parametrize("row", INTEGRATORS, ids=lambda row: row.name)
+WAYS = pytest.mark.parametrize("way", ["python", "compiled"])
+
+Advance = Callable[[Integrator, float, int], State]
+"""(method, dt, steps) -> the state at the end."""
+
+X0, V0 = 1.0, 0.3
+
+
+def at_start(state: State, pos: Any = X0, vel: Any = V0) -> State:
+    state.pos[...], state.vel[...] = pos, vel
+    return state
+
+
+def tethered(tether: Any, way: str, pos: Any = X0, vel: Any = V0, drag: float = 0.0, **given: Any) -> Advance:
+    """A point of 1 kg under the forces of catalogue.TETHER, and a drag that methods may treat by themselves.
+
+    What is given and is no force is a field of the point's group.
+    """
+    forces = {name: given.pop(name) for name in tuple(given) if name in tether.model_fields}
+    it = tether(**forces)
+
+    def law(x: Array, v: Array, t: float) -> Array:
+        pull = it.stiffness + it.sun / np.maximum(np.sum(x * x, axis=1, keepdims=True), 1e-12) ** 1.5
+        return -pull * x - it.damping * v - it.sine * np.sin(x) + it.push * math.cos(2 * t) + it.weight
+
+    def in_python(method: Integrator, dt: float, steps: int) -> State:
+        state, own = at_start(blank(1, 1, 2, 0, dt), pos, vel), drag if method.splits_drag else 0.0
+        for _ in range(steps):
+            state = method(lambda x, v, t: law(x, v, t) - (drag - own) * v, state, dt, drag=own)
+        return state
+
+    def compiled(method: Integrator, dt: float, steps: int) -> State:
+        group = Group(count=1, spawn=Spawn(low=(0, 0), high=(1, 1)), **given)
+        effects = (it, Drag(rate=drag)) if drag else (it,)
+        scene = Scene(groups=(group,), effects=effects, integrator=method, dt=dt)
+        return scene.run(at_start(scene.start(0), pos, vel), steps)
+
+    return in_python if way == "python" else compiled
+
+
+def motion(state: State) -> tuple[float, float]:
+    """Position and velocity along the first axis."""
+    return float(state.pos[0, 0, 0]), float(state.vel[0, 0, 0])
+
+
+def order(end: Advance, method: Integrator, target: tuple[float, float], seconds: float, first: int) -> float:
+    """The measured order over five halvings of the step, the last ones above rounding.
+
+    Of the error of position and velocity together: either alone may vanish by chance at one instant.
+    """
+    steps = [first * 2**k for k in range(8)]
+    errors = np.array([math.dist(motion(end(method, seconds / n, n)), target) for n in steps])
+    last = np.flatnonzero(errors > 1e-13)[-6:]
+    assert len(last) == 6, errors
+    slope, _ = np.polyfit(np.log(seconds / np.array(steps)[last]), np.log(errors[last]), 1)
+    return float(slope)
+
+
+def first_of(method: Integrator) -> int:
+    """How many steps to begin with, so that five halvings lie between what is too coarse and rounding."""
+    return 16 if not method.adaptive else 8 if method.order < 5 else 4
