@@ -310,7 +310,7 @@ def approach(speed: float, tau: float, decay: float) -> Callable[[Integrator], V
 
 
 def bounces(method: Integrator) -> Value:
-    """A ball with e = .8 at 16 phases of the step: total time, 4.0637 s from 1 m; then at rest; never below the floor."""
+    """A ball with e = .8 at 16 phases of the step: total time, 4.0637 s from 1 m; then at rest, never below."""
     worst, low, moving = 0.0, 0.0, 0.0
     for dt in (0.005, 0.02):
         for phase in range(16):
