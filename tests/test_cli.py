@@ -170,7 +170,7 @@ def progress(title, total, unit):
             os.kill(os.getpid(), signal.SIGINT)
     yield show
 
-cli._progress = progress
+cli.progress_bar = progress
 sys.exit(cli.main())
 """
     return subprocess.run(

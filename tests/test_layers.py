@@ -15,7 +15,7 @@ import pytest
 ROOT = Path(__file__).resolve().parent.parent
 
 LAYERS = (
-    {"divergence", "refusals", "outputs", "recycle", "crew", "compilation", "inlining"},
+    {"divergence", "terminal", "refusals", "outputs", "recycle", "crew", "compilation", "inlining"},
     {"records", "vec", "noise", "kernels"},
     {"state", "space", "steering", "arbitration"},
     {"neighbours", "shapes", "rows", "networks", "elements", "tree"},
@@ -23,6 +23,7 @@ LAYERS = (
     {"snapshot", "implicit", "workspace", "scene", "config", "measures", "explanation"},
     {"tasks", "world", "policy"},
     {"envs", "sb3", "evaluation", "accuracy", "stress", "render", "trajectory"},
+    {"studies"},
     {"cli"},
     {"agents"},
     {"tests"},
