@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flockenv.integrators.base import Integrator
+from flockenv.state import Floats as States
 from flockenv.state import blank
 
 if TYPE_CHECKING:
@@ -55,8 +56,8 @@ def amplification(method: Integrator, y: Floats, zeta: float) -> Floats:
     state.x[0], state.v[1] = 1.0, 1.0  # two beginnings side by side: the axes do not know of each other
     square, drag = (y * y)[:, None], (2 * zeta * y)[:, None]
 
-    def law(x: Floats, v: Floats, time: float) -> Floats:
-        return -square * x - (0.0 if method.splits_drag else drag * v)
+    def law(x: States, v: States, time: float) -> States:
+        return np.asarray(-square * x - (0.0 if method.splits_drag else drag * v))
 
     after = method(law, state, 1.0, drag=np.tile(drag[:, 0], 2))
     return np.stack([after.pos[0], after.vel[0]], axis=1)  # (K, what comes out, what went in)

@@ -18,11 +18,12 @@ import flockenv
 from flockenv.effects import EFFECTS, Alignment, Cohesion, Drag, Separation
 from flockenv.integrators import RK4
 from flockenv.kernels import cache_folder
-from flockenv.scene import Group, Scene, Workspace
+from flockenv.scene import Group, Scene
 from flockenv.shapes import Circle
 from flockenv.space import Box, Plane, Space, Torus
 from flockenv.spawn import Spawn
 from flockenv.state import State
+from flockenv.workspace import Workspace
 from tests.catalogue import INTEGRATORS, TETHER, VARIANTS, Array, Variant, everything, scene_of, users_module
 
 SPAWN = Spawn(low=(0, 0), high=(10, 10))
@@ -420,7 +421,7 @@ def test_a_bad_start_is_refused_in_one_line(call: Any, said: str) -> None:
 
 def taken(scene: Scene) -> int:
     """Bytes of a state of one world, the bodies, and the scratch of one thread."""
-    state, scratch = scene.start(0), Workspace.allocate(scene.parts, scene.body)
+    state, scratch = scene.start(0), Workspace.allocate(scene.parts, scene.body, scene.table)
     own = [array for arrays in scratch.own for array in arrays]
     arrays = [*(getattr(state, name) for name in ARRAYS), *scene.body.arrays(), *scratch.shared, *own]
     return sum(array.nbytes for array in arrays)

@@ -85,7 +85,8 @@ class Problem:
     @property
     def times(self) -> Floats:
         """The instants, (K,) s: as many as every number of steps can be divided into."""
-        many = math.gcd(*self.steps, INSTANTS)
+        common = math.gcd(*self.steps)
+        many = max(k for k in range(1, INSTANTS + 1) if common % k == 0)
         return self.seconds * np.arange(1, many + 1) / many
 
     @property

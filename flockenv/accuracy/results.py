@@ -86,7 +86,7 @@ class Curve(Record):
     """The order it has where forces are smooth."""
     points: tuple[Point, ...]
     order: float | None
-    """The measured one; none where too few points are left."""
+    """The measured one; none where too few points are left, and of adaptive methods: what they halve is no step."""
     used: int
     """Points that the order was measured over."""
 
@@ -95,35 +95,35 @@ class Curve(Record):
 
         All points that are finer must be as good: a coarse one that is right by chance is not taken. Between the last
         one that is too coarse and the first that is not, errors and costs are taken for straight lines over their
-        logarithms, unless `interpolate` is False.
+        logarithms, unless `interpolate` is False. Times are noisy: a finer point may be the cheaper one.
         """
         known = [p for p in self.points if p.cost(by) is not None]
         good = list(takewhile(lambda p: p.error is not None and p.error <= tolerance, reversed(known)))
-        if not good:
-            return None
-        best = good[-1]
-        before = known[len(known) - len(good) - 1] if len(good) < len(known) else None
-        if not interpolate or before is None or before.error is None or not best.error:
-            cost = best.cost(by)
-            assert cost is not None and best.error is not None
-            return Choice(
-                method=self.method,
-                dt=best.dt,
-                tolerance=best.tolerance,
-                cost=cost,
-                error=best.error,
-                interpolated=False,
-            )
-        share = math.log(before.error / tolerance) / math.log(before.error / best.error)
-        tolerances = (before.tolerance, best.tolerance)
+        found = [self._at(point, by) for point in good]
+        coarser = known[: len(known) - len(good)]
+        if interpolate and good and coarser and coarser[-1].error and good[-1].error:
+            found.append(self._between(coarser[-1], good[-1], tolerance, by))
+        return min(found, key=lambda choice: choice.cost, default=None)
+
+    def _at(self, point: Point, by: Cost) -> Choice:
+        """Return a point as a choice."""
+        cost, error = point.cost(by), point.error
+        assert cost is not None and error is not None
         return Choice(
-            method=self.method,
-            dt=_between(before.dt, best.dt, share),
-            tolerance=None if None in tolerances else _between(*tolerances, share),  # type: ignore[arg-type]
-            cost=_between(before.cost(by), best.cost(by), share),  # type: ignore[arg-type]
-            error=tolerance,
-            interpolated=True,
+            method=self.method, dt=point.dt, tolerance=point.tolerance, cost=cost, error=error, interpolated=False
         )
+
+    def _between(self, worse: Point, better: Point, error: float, by: Cost) -> Choice:
+        """Return the choice of a certain error between two points of larger and of smaller error."""
+        a, b = self._at(worse, by), self._at(better, by)
+        share = math.log(a.error / error) / math.log(a.error / b.error)
+        tolerances = None
+        if a.tolerance is not None and b.tolerance is not None:
+            tolerances = _between(a.tolerance, b.tolerance, share)
+        return Choice(
+            method=self.method, dt=_between(a.dt, b.dt, share), tolerance=tolerances,
+            cost=_between(a.cost, b.cost, share), error=error, interpolated=True,
+        )  # fmt: skip
 
 
 class Report(Record):
@@ -186,8 +186,7 @@ def measured_order(points: Iterable[Point], least: float, most: float) -> tuple[
     """Return the slope of the logarithm of the error over that of the evaluations, and how many points it is of.
 
     Of the finest HALVINGS + 1 points whose errors lie between `least` (rounding) and `most` (no approximation) m; none
-    of fewer than FEWEST. Over evaluations and not over dt: an adaptive method has an order too. Of the error at any
-    instant: at one of them alone it may pass through zero.
+    of fewer than FEWEST. Of the error at any instant: at one of them alone it may pass through zero.
     """
     usable = [p for p in points if p.along is not None and least < p.along < most]
     kept = usable[-HALVINGS - 1 :]

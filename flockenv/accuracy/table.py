@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from flockenv.accuracy.results import Choice, Cost, Curve, Report
+from flockenv.accuracy.results import HALVINGS, Choice, Cost, Curve, Report
 
 __all__ = ["COLUMNS", "best", "columns", "headlines", "rows"]
 
@@ -43,8 +43,23 @@ def _row(curve: Curve, report: Report, tolerances: Sequence[float]) -> list[str]
     costs = [_cost(curve, t, by, report.floor) for t in tolerances for by in ("evaluations", "seconds")]
     last = next((p for p in reversed(curve.points) if p.error is not None), None)
     drifts = [None, None] if last is None else [last.energy, last.momentum]
-    order = "-" if curve.order is None else f"{curve.order:.2f} ({curve.used} points)"
-    return [curve.method, order, str(curve.declared), *costs, *("-" if d is None else f"{d:.1e}" for d in drifts)]
+    return [
+        curve.method,
+        _order(curve, report.floor),
+        str(curve.declared),
+        *costs,
+        *("-" if d is None else f"{d:.1e}" for d in drifts),
+    ]
+
+
+def _order(curve: Curve, floor: float) -> str:
+    """Return the measured order, and of how many points if those are fewer than it should be."""
+    if curve.order is not None:
+        return f"{curve.order:.2f}" + (f" ({curve.used} points)" if curve.used <= HALVINGS else "")
+    errors = [p.along for p in curve.points]
+    if errors and all(e is not None and e <= floor for e in errors):
+        return "exact"
+    return "own steps" if any(p.tolerance is not None for p in curve.points) else "-"
 
 
 def _cost(curve: Curve, tolerance: float, by: Cost, floor: float) -> str:

@@ -146,7 +146,7 @@ class _Field(_Timed):
     def potential(self, groups: Sequence[Any], state: State, offset: Any) -> Floats | None:
         """Sum over all agents, (B,) J; none for a medium, for what swings in time, and for what has no potential."""
         steady = self.acts == "force" and self.period is None
-        each = self._energy(np.asarray(state.pos, float), offset) if steady else None
+        each = self._energy(np.asarray(state.pos, np.float64), offset) if steady else None
         return None if each is None else np.asarray(each.sum(axis=1))
 
     def _energy(self, pos: Floats, offset: Any) -> Floats | None:

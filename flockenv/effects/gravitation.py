@@ -8,14 +8,16 @@ momentum, which many then keep to the accuracy of the tree alone.
 
 from __future__ import annotations
 
-import math
+from collections.abc import Sequence
 from typing import Any, ClassVar, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field
 
-from flockenv.effects.base import Effect, Far, Me
+from flockenv.effects.base import Effect, Far, Me, all_masses
 from flockenv.kernels import Vec, law
+from flockenv.state import State
 from flockenv.vec import scale
 
 __all__ = ["Gravitation", "InverseSquare"]
@@ -25,7 +27,7 @@ __all__ = ["Gravitation", "InverseSquare"]
 def _per_cube(p: Any, other: Far) -> float:
     """Return 1 / (d^2 + eps^2)^(3/2), 1/m^3, times the weight."""
     square = other.square + p.softening * p.softening
-    return other.weight / (square * np.sqrt(square))
+    return other.weight / (square * np.sqrt(square))  # type: ignore[no-any-return]  # np.sqrt keeps float32
 
 
 @law
@@ -50,6 +52,16 @@ class _Softened(Effect):
     )  # fmt: skip
     conserves_momentum: ClassVar[bool] = True
 
+    def _inverse_distances(self, state: State, weight: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Sum of w_i w_j / sqrt(d^2 + eps^2) over all pairs of the living, (B,); who are in one place are no pair."""
+        pos, weights = state.pos.astype(np.float64), weight * state.alive
+        found = np.zeros(len(pos))
+        for i in range(pos.shape[1] - 1):
+            square = ((pos[:, i + 1 :] - pos[:, i, None]) ** 2).sum(axis=-1)
+            distance = np.sqrt(np.where(square > 0, square + self.softening**2, np.inf))
+            found += weights[:, i] * (weights[:, i + 1 :] / distance).sum(axis=1)
+        return found
+
 
 class Gravitation(_Softened):
     """Newton's gravitation, softened: F_i = sum of G m_i m_j d / (d^2 + eps^2)^(3/2), d from i to j."""
@@ -62,10 +74,15 @@ class Gravitation(_Softened):
     def check(self, scene: Any) -> None:
         """Refuse who would pull infinitely: whoever is held in place by an infinite mass."""
         for k, group in enumerate(scene.groups):
-            if not math.isfinite(group.mass):
+            if not np.isfinite(group.masses(scene.dimension)).all():
                 raise ValueError(
-                    f"constant: groups[{k}].mass is {group.mass}, which would pull infinitely; give it a finite mass"
+                    f"constant: groups[{k}] has particles that are pinned, by an infinite mass, which would pull "
+                    "infinitely; unpin them"
                 )
+
+    def potential(self, groups: Sequence[Any], state: State, offset: Any) -> NDArray[np.float64]:
+        """Sum of -G m_i m_j / sqrt(d^2 + eps^2) over all pairs, (B,) J."""
+        return -self.constant * self._inverse_distances(state, all_masses(groups, state.shape[2]))
 
 
 class InverseSquare(_Softened):
@@ -76,3 +93,7 @@ class InverseSquare(_Softened):
     far_law: ClassVar[str | None] = "inverse_square"
     weighs_mass: ClassVar[bool] = False
     strengths: ClassVar[tuple[str, ...]] = ("strength",)
+
+    def potential(self, groups: Sequence[Any], state: State, offset: Any) -> NDArray[np.float64]:
+        """Sum of -k / sqrt(d^2 + eps^2) over all pairs, (B,) J."""
+        return -self.strength * self._inverse_distances(state, np.ones(state.shape[1]))

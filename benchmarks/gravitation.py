@@ -1,0 +1,77 @@
+"""Everybody meets everybody, or groups that are far away: `python -m benchmarks.gravitation`.
+
+The exact sum over all pairs against the tree, at an opening of 0.5, over the number of agents, in flat space and in
+three dimensions. Both run in turns. From the crossover follows flockenv.tree.MOST_DIRECT, up to which a scene sums
+exactly; here the tree is grown for fewer too.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Annotated
+
+import typer
+
+from benchmarks.measure import Bench, Contestant, Out, Quick, Rounds, command_line, number
+from benchmarks.scenes import stepping
+from flockenv.effects import Gravitation
+from flockenv.scene import Group, Scene
+from flockenv.spawn import Spawn
+from flockenv.tree import MOST_DIRECT
+
+__all__ = ["AGENTS", "cloud"]
+
+AGENTS = (500, 1_000, 2_000, 4_000, 8_000, 16_000)
+OPENING = 0.5
+
+
+def cloud(agents: int, dimension: int, dtype: str, opening: float) -> Scene:
+    """Agents in a unit square or cube, under a gravitation too weak to change their places while one looks."""
+    spawn = Spawn(low=(0.0,) * dimension, high=(1.0,) * dimension)
+    scene = Scene(
+        dimension=dimension, groups=(Group(count=agents, spawn=spawn),), dt=1e-3, dtype=dtype,
+        effects=(Gravitation(constant=1e-9, softening=0.01, opening=opening),),
+    )  # fmt: skip
+    vars(scene)["parts"] = dataclasses.replace(scene.parts, crowded=True)  # a tree whatever their number
+    return scene
+
+
+def _contestant(agents: int, dimension: int, dtype: str, opening: float) -> Contestant:
+    """Return a scene stepped once a call."""
+    scene = cloud(agents, dimension, dtype, opening)
+    start = scene.start(0)
+    met = scene.step(start).counted("pairs") / agents
+    note = f"each meets {number(met)} of {agents:,}"
+    name = f"{agents:,}, {'tree' if opening else 'direct'}"
+    return Contestant(name, stepping(scene, start, 1), agents, note=note)
+
+
+def _compare(bench: Bench, dimension: int, dtype: str, largest: int) -> None:
+    """Race the two at every size, and say where they cross."""
+    ratios = {}
+    for agents in (n for n in AGENTS if n <= largest):
+        pair = [_contestant(agents, dimension, dtype, opening) for opening in (0.0, OPENING)]
+        results = bench.race(f"{agents:,} agents, {dimension}-D, {dtype}", pair, baseline=pair[0].name)
+        ratios[agents] = results[1].ratio
+    said = "; ".join(f"{agents:,} {number(ratio)}" for agents, ratio in ratios.items() if ratio)
+    bench.extra.setdefault("tree_over_direct", {})[f"{dimension}-D {dtype}"] = ratios
+    bench.note(f"{dimension}-D, {dtype}, how many times faster the tree is than the exact sum: {said}.")
+
+
+def main(
+    single: Annotated[bool, typer.Option("--single", help="float32 too, not only float64.")] = False,
+    largest: Annotated[int, typer.Option(min=AGENTS[0], help="No world with more agents than this.")] = AGENTS[-1],
+    quick: Quick = False,
+    rounds: Rounds = None,
+    out: Out = None,
+) -> None:
+    """Measure the exact sum and the tree side by side."""
+    with Bench("gravitation", quick, rounds, out) as bench:
+        for dtype in ("float64", "float32") if single else ("float64",):
+            for dimension in (2, 3):
+                _compare(bench, dimension, dtype, largest)
+        bench.note(f"Opening {OPENING:g}. A scene sums exactly up to {MOST_DIRECT:,} agents.")
+
+
+if __name__ == "__main__":
+    command_line(main)()

@@ -1,0 +1,496 @@
+"""What accuracy costs: measured orders, references, the cheapest way to a tolerance, and what is refused."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from flockenv.accuracy import SUITE, Problem, Report, Results, measure, methods_named, problems_named, usual_methods
+from flockenv.accuracy import problem as problems
+from flockenv.accuracy import reference as references
+from flockenv.accuracy.results import Curve, Point, measured_order
+from flockenv.accuracy.table import best, columns, headlines, rows
+from flockenv.cli import main
+from flockenv.effects import Effect, Fluctuation, Separation, Swing, Tether
+from flockenv.integrators import RK4, Integrator
+from flockenv.render.precision import draw_precision, write_precision
+from flockenv.scene import Group, Scene
+from flockenv.spawn import Spawn
+
+ORIGIN = (0.0, 0.0)
+TINY = """\
+groups: [{count: 3, spawn: {low: [0, 0], high: [1, 1], speed: [1, 2]}}]
+effects: [{kind: drag, rate: 0.4}]
+dt: 0.02
+"""
+
+
+def one(name: str) -> Problem:
+    return problems_named([name])[0]
+
+
+def body(effect: Effect, **group: Any) -> Scene:
+    return Scene(groups=(Group(count=1, spawn=Spawn(low=ORIGIN, high=ORIGIN), **group),), effects=(effect,))
+
+
+def sprung(
+    stiffness: float, seconds: float, steps: tuple[int, ...] = (512, 1024), across: float = 0.0, **group: Any
+) -> Problem:
+    """A body of 1 kg on a spring, from 1 m."""
+    scene = body(Tether(centre=ORIGIN, stiffness=stiffness), **group)
+    return Problem.of(scene, seconds, steps, motion=([[1.0, 0.0]], [[0.0, across]]))
+
+
+def swinging(angle: float, seconds: float, steps: tuple[int, ...] = (512, 1024)) -> Problem:
+    """A pendulum let go, whose small swings take 1 s."""
+    scene = body(Swing(centre=ORIGIN, strength=4 * math.pi**2))
+    return Problem.of(scene, seconds, steps, motion=([[angle, 0.0]], [[0.0, 0.0]]))
+
+
+@pytest.fixture(scope="module")
+def damped() -> Report:
+    """All methods on a damped oscillator; timed once, so that there are times."""
+    return measure(one("damped"), repetitions=1)
+
+
+# --- orders -----------------------------------------------------------------------------------------------------------
+
+
+def test_orders_are_the_declared_ones_where_forces_are_smooth(damped: Report) -> None:
+    steady = {method.kind for method in usual_methods() if not method.adaptive}
+    assert len(steady) >= 8
+    for kind in steady:
+        curve = damped.curve(kind)
+        assert curve.used == 6, kind
+        assert curve.order == pytest.approx(curve.declared, abs=0.2), kind
+    assert {curve.declared for curve in damped.curves} == {1, 2, 4, 5}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["forced", "kepler", "projectile", "quadratic_fall", "tracer", "boids"])
+def test_orders_are_the_declared_ones_on_every_smooth_problem(name: str) -> None:
+    """But for tracers: a medium that carries alone has no velocity that a method could be half-implicit about."""
+    report = measure(one(name), [m for m in usual_methods() if not m.adaptive], repetitions=0)
+    told = [curve for curve in report.curves if curve.order is not None]
+    assert {curve.declared for curve in told} == {1, 2, 4}
+    for curve in told:
+        assert curve.order == pytest.approx(curve.declared, abs=0.25), curve.method
+
+
+METHODS = methods_named(["semi_implicit_euler", "velocity_verlet", "rk4"])
+
+
+def test_a_speed_limit_makes_every_method_one_of_order_1() -> None:
+    """numerics.md, P09: what a scene does after each step, no method knows of.
+
+    In two dimensions: along a line the speed is just held, and who is held a step too late is O(h^2) off.
+    """
+    problem = sprung(40.0, 0.7, tuple(2**k for k in range(6, 13)), across=1.9, max_speed=2.0)
+    report = measure(problem, METHODS, repetitions=0)
+    assert report.reference == "own steps"
+    assert "speed limit is reached at t = " in report.note
+    for curve in report.curves:
+        assert curve.order == pytest.approx(1, abs=0.3), curve.method
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["boids_cone", "boids_limit"])
+def test_view_cones_and_speed_limits_of_flocks_leave_order_1(name: str) -> None:
+    report = measure(one(name), METHODS, repetitions=0)
+    assert report.reference == "own steps"
+    for curve in report.curves:
+        assert curve.order == pytest.approx(1, abs=0.3), curve.method
+
+
+def test_the_order_is_of_the_finest_points_between_rounding_and_nonsense() -> None:
+    """Order 2 in the end: not yet in the coarse steps, no approximation in the first, no more than rounding last."""
+    errors = [5.0, 0.9, 0.7, 0.5, *(1e-1 * 0.25**k for k in range(6)), 1e-12, 3e-12]
+    points = [_point(2**k, error) for k, error in enumerate(errors)]
+    order, used = measured_order(points, 1e-9, 1.0)
+    assert order == pytest.approx(2)
+    assert used == 6
+    assert measured_order(points[:4], 1e-9, 1.0) == (None, 3)
+
+
+def _point(evaluations: int, error: float | None, seconds: float | None = None) -> Point:
+    return Point(
+        steps=evaluations, dt=1 / evaluations, tolerance=None, evaluations=evaluations, error=error, rms=error,
+        along=error, energy=None, momentum=None, seconds=seconds,
+    )  # fmt: skip
+
+
+# --- references -------------------------------------------------------------------------------------------------------
+
+
+def test_references_agree_with_each_other() -> None:
+    """A closed form, DOP853 on the compiled laws, and finer steps of the scene's own: three ways to one end."""
+    known = one("damped")
+    exact = references.find_reference(known)
+    scipy = references.find_reference(replace(known, exact=None))
+    own = references._by_own_steps(known, 64, "asked for")
+    assert [r.kind for r in (exact, scipy, own)] == ["closed form", "DOP853", "own steps"]
+    for other in (scipy, own):
+        assert np.abs(exact.pos - other.pos).max() < 1e-11
+        assert np.abs(exact.vel - other.vel).max() < 1e-11
+        assert other.error < 1e-10
+
+
+def test_scipy_sees_the_time_and_the_flow() -> None:
+    for name in ("forced", "tracer"):
+        known = one(name)
+        scipy = references.find_reference(replace(known, exact=None))
+        assert scipy.kind == "DOP853"
+        assert np.abs(references.find_reference(known).pos - scipy.pos).max() < 1e-10
+
+
+def test_a_limit_that_does_not_act_leaves_the_better_reference() -> None:
+    assert references.find_reference(sprung(40.0, 0.7, max_speed=2.0)).kind == "own steps"
+    assert references.find_reference(sprung(40.0, 0.7, max_speed=20.0)).kind == "DOP853"
+
+
+def test_growth_is_that_of_the_law() -> None:
+    """Near the top a pendulum falls as exp(2 pi t), and so does a difference."""
+    found = references.find_sensitivity(swinging(math.pi, 1.5))
+    half = math.exp(2 * math.pi * 1.5) / math.sqrt(8)  # of cosh, and of a change along one of two axes
+    assert found.growth == pytest.approx(
+        half, rel=1.01 / (2 * math.pi)
+    )  # sinh / 2 pi of the velocity's, of either sign
+    assert references.find_sensitivity(one("damped")).growth < 2
+
+
+def test_a_horizon_beyond_what_anybody_can_tell_is_refused() -> None:
+    with pytest.raises(ValueError, match=r"seconds = 5: too long a horizon, .* try [\d.]+ s") as caught:
+        measure(swinging(math.pi - 1e-9, 5.0), METHODS)
+    assert "\n" not in str(caught.value)
+    shorter = float(str(caught.value).split("try ")[1].split(" s")[0])
+    measure(swinging(math.pi - 1e-9, shorter), methods_named(["rk4"]), repetitions=0)
+
+
+# --- what is counted --------------------------------------------------------------------------------------------------
+
+
+def test_evaluations_are_those_of_the_method(damped: Report) -> None:
+    for method in usual_methods():
+        points = damped.curve(method.kind).points
+        if method.adaptive:
+            assert [p.tolerance for p in points] == sorted((p.tolerance for p in points), reverse=True)  # type: ignore[type-var]
+            assert all(p.evaluations > p.steps for p in points)
+        else:
+            assert [p.evaluations for p in points] == [n * method.evaluations for n in one("damped").steps]
+
+
+def test_no_tolerance_is_asked_for_that_costs_more_than_the_finest_fixed_steps() -> None:
+    """Where forces jump to and fro, a tenth of the tolerance is ten times the steps: there would be no end of it."""
+    few = replace(one("damped"), steps=(8,))
+    (curve,) = measure(few, methods_named(["dormand_prince"]), repetitions=0).curves
+    costs = [point.evaluations for point in curve.points]
+    assert 1 <= len(costs) < 10
+    assert costs[-1] > 4 * 8 and all(cost <= 4 * 8 for cost in costs[:-1])
+
+
+def test_energy_is_off_by_the_book() -> None:
+    """numerics.md 3.1: RK4 keeps 1 - y^6/72 + y^8/576 of it per step, y = h w; half of it at most is kinetic."""
+    oscillator = one("oscillator")
+    report = measure(oscillator, methods_named(["rk4"]), repetitions=0)
+    assert report.energy == "kinetic and potential (tether)"
+    for point in report.curve("rk4").points[:6]:
+        y = oscillator.seconds / point.steps
+        assert point.energy == pytest.approx(1 - (1 - y**6 / 72 + y**8 / 576) ** point.steps, rel=1e-2)
+        assert point.momentum is None  # a spring to a fixed point takes it
+
+
+def test_what_diverges_has_no_errors_and_spoils_nothing() -> None:
+    """Steps of h w = 15, which the scene itself refuses, beside good ones."""
+    problem = sprung(900.0, 20.0, (40, 20480))
+    report = measure(problem, methods_named(["explicit_euler", "semi_implicit_euler"]), repetitions=1)
+    coarse, fine = report.curve("semi_implicit_euler").points
+    assert coarse.error is None and coarse.seconds is None
+    assert fine.error is not None and fine.seconds is not None
+    assert report.curve("semi_implicit_euler").order is None
+
+
+@pytest.mark.slow
+def test_momentum_is_kept_where_everybody_pushes_back() -> None:
+    spawn = Spawn(low=ORIGIN, high=(4.0, 4.0), speed=(0.5, 1.0))
+    scene = Scene(groups=(Group(count=8, spawn=spawn),), effects=(Separation(weight=0.3, radius=50),))
+    report = measure(Problem.of(scene, 1.0, (64, 128)), methods_named(["rk4"]), repetitions=0)
+    assert all(point.momentum is not None and point.momentum < 1e-13 for point in report.curve("rk4").points)
+    assert report.energy == "kinetic"
+
+
+# --- the cheapest -----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("tolerance", [1e-1, 1e-3, 1e-5, 1e-8])
+def test_the_cheapest_is_the_cheapest_of_the_table(damped: Report, tolerance: float) -> None:
+    for by in ("evaluations", "seconds"):
+        good = [
+            getattr(point, by)
+            for curve in damped.curves
+            for k, point in enumerate(curve.points)
+            if all(p.error is not None and p.error <= tolerance for p in curve.points[k:])
+        ]
+        measured = damped.cheapest(tolerance, by, interpolate=False)  # type: ignore[arg-type]
+        assert measured is not None
+        assert measured.cost == min(good) and measured.error <= tolerance and not measured.interpolated
+    between = damped.cheapest(tolerance)
+    assert between is not None
+    assert between.cost <= min(p.evaluations for c in damped.curves for p in c.points if (p.error or 1) <= tolerance)
+
+
+def test_what_lies_between_two_points_keeps_its_promise(damped: Report) -> None:
+    choice = damped.curve("rk4").needed(3e-5)
+    assert choice is not None and choice.interpolated
+    problem = one("damped")
+    steps = math.ceil(problem.seconds / choice.dt)
+    found = measure(replace(problem, steps=(steps,)), methods_named(["rk4"]), repetitions=0).curves[0].points[0]
+    assert found.error is not None and found.error < 1.1 * 3e-5
+    assert choice.cost == pytest.approx(found.evaluations, rel=0.1)
+
+
+def test_a_coarse_point_that_is_right_by_chance_is_not_taken() -> None:
+    errors = (1e-9, 1e-2, None, 1e-3, 1e-4)
+    curve = Curve(
+        method="rk4", declared=4, order=None, used=0, points=tuple(_point(2**k, e, 1.0) for k, e in enumerate(errors))
+    )
+    choice = curve.needed(1e-3, interpolate=False)
+    assert choice is not None and choice.cost == 8
+    assert curve.needed(1e-5) is None
+    unknown = curve.needed(1e-2)
+    assert unknown is not None and not unknown.interpolated  # what diverged is no end of a line
+
+
+def test_nothing_is_said_below_the_floor(damped: Report) -> None:
+    with pytest.raises(ValueError, match="tolerance = 1e-14 m: must be a finite number of at least"):
+        damped.cheapest(1e-14)
+    assert best(damped, [1e-14])[0].startswith("to 1e-14 m: below")
+    assert rows(damped, [1e-14])[0][3:5] == ["-", "-"]
+
+
+NUMERICS_3_4: dict[str, dict[float, tuple[int | None, ...]]] = {
+    "oscillator": {
+        1e-1: (8192, 512, 512, 2048, 512),
+        1e-3: (None, 32768, 4096, 16384, 2048),
+        1e-6: (None, None, 131072, None, 8192),
+    },
+    "pendulum": {1e-2: (None, 2048, 256, 1024, 512), 1e-6: (None, None, 32768, 65536, 2048)},
+    "kepler": {1e-2: (None, 8192, 2048, 4096, 1024), 1e-6: (None, None, 262144, 262144, 8192)},
+}
+"""numerics.md 3.4 as printed, but for one number: of the Kepler orbit's 1e-6 m by velocity Verlet it says "> 4e5",
+while 262144 steps, 4.5e-7 m, are enough. None = not with 2^18 = 262144; the next power is more than 4e5."""
+
+OF_3_4 = ("explicit_euler", "semi_implicit_euler", "velocity_verlet", "midpoint", "rk4")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", NUMERICS_3_4)
+def test_accuracy_costs_what_the_table_says(name: str) -> None:
+    """Velocity Verlet asks twice per step here, so that drag does not make it order 1; the table counts once."""
+    problem = replace(one(name), steps=tuple(2**k for k in range(2, 19)))
+    report = measure(problem, methods_named(OF_3_4), repetitions=0)
+    for tolerance, expected in NUMERICS_3_4[name].items():
+        for kind, evaluations in zip(OF_3_4, expected, strict=True):
+            twice = 2 if kind == "velocity_verlet" else 1
+            points = [p for p in report.curve(kind).points if p.evaluations <= twice * 2**18]
+            good = [p.evaluations for p in points if p.error is not None and p.error < tolerance]
+            assert min(good, default=None) == (evaluations and twice * evaluations), (kind, tolerance)
+
+
+# --- reports ----------------------------------------------------------------------------------------------------------
+
+
+def test_a_report_is_the_same_after_json(damped: Report) -> None:
+    results = Results(reports=(damped,))
+    text = results.model_dump_json()
+    assert Results.model_validate_json(text) == results
+    assert json.loads(text)["reports"][0]["machine"]["cpu"]
+    with pytest.raises(ValueError, match="format"):
+        Results.model_validate_json(text.replace('"format":1', '"format":2'))
+
+
+def test_a_report_as_text(damped: Report) -> None:
+    lines = " ".join(headlines(damped))
+    assert "closed form" in lines and "median of 1 runs" in lines and "kinetic and potential (tether)" in lines
+    table = rows(damped, [1e-2, 1e-4])
+    assert all(len(row) == len(columns([1e-2, 1e-4])) for row in table)
+    assert [row[0] for row in table] == [curve.method for curve in damped.curves]
+    assert len(best(damped, [1e-2, 1e-4])) == 2
+    with pytest.raises(ValueError, match="'rk44': was not measured, did you mean `rk4`"):
+        damped.curve("rk44")
+
+
+class _Stop:
+    """A progress bar under which somebody presses Ctrl-C."""
+
+    def __init__(self, at: int) -> None:
+        self.at = at
+
+    def __call__(self, percent: int) -> None:
+        if percent >= self.at:
+            raise KeyboardInterrupt
+
+
+def test_an_interrupted_run_keeps_what_was_done() -> None:
+    whole = measure(one("damped"), METHODS, repetitions=0)
+    early = measure(one("damped"), METHODS, repetitions=0, progress=_Stop(50))
+    assert early.stopped == "interrupted"
+    done = [point for curve in early.curves for point in curve.points]
+    assert 0 < len(done) < sum(len(curve.points) for curve in whole.curves)
+    assert early.curves[0] == whole.curves[0]
+    late = measure(one("damped"), METHODS, repetitions=4, progress=_Stop(60))
+    assert late.stopped == "interrupted"
+    assert all(point.seconds is not None for curve in late.curves for point in curve.points)
+    assert any("interrupted" in line for line in headlines(late))
+
+
+def test_a_picture_has_both_costs_of_every_problem_and_the_same_bytes(damped: Report, tmp_path: Path) -> None:
+    reports = [damped, damped.model_copy(update={"title": "again", "reach": 0.0})]
+    figure = draw_precision(reports)
+    labels = [axes.get_xlabel() for axes in figure.axes]
+    assert labels == ["wall time of the whole run, s"] * 2 + ["force evaluations"] * 2
+    assert len(figure.axes[0].lines) == len(damped.curves)
+    for name in ("a.png", "b.png"):
+        write_precision(tmp_path / name, [damped])
+    assert (tmp_path / "a.png").read_bytes() == (tmp_path / "b.png").read_bytes()
+    with pytest.raises(ValueError, match="precision: needs at least one problem"):
+        draw_precision([damped.model_copy(update={"curves": ()})])
+
+
+# --- refusals ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("change", "text"),
+    [
+        ({"seconds": 0.0}, "seconds = 0.0: must be a finite number"),
+        ({"seconds": math.nan}, "seconds = nan: must be"),
+        ({"steps": ()}, r"steps = \(\): must be whole numbers"),
+        ({"steps": (8, 0)}, r"steps = \(8, 0\): must be whole numbers"),
+        ({"steps": (8.5,)}, r"steps = \(8.5,\): must be whole numbers"),
+        ({"dtype": "float32"}, "dtype = float32: its rounding"),
+        ({"effects": (Fluctuation(strength=1.0),)}, r"effects\[0\] fluctuation: kicks at random"),
+    ],
+)
+def test_what_cannot_be_measured_is_refused(change: dict[str, Any], text: str) -> None:
+    scene = sprung(1.0, 1.0).scene
+    fields = {name: change.pop(name) for name in ("dtype", "effects") if name in change}
+    given: dict[str, Any] = {"seconds": 1.0, "steps": (8, 16)} | change
+    with pytest.raises(ValueError, match=text) as caught:
+        Problem.of(scene.model_copy(update=fields), **given)
+    assert "\n" not in str(caught.value)
+
+
+def test_wrong_names_are_refused_with_the_nearest() -> None:
+    with pytest.raises(ValueError, match="methods: 'rk44' is none, did you mean `rk4`"):
+        methods_named(["rk44"])
+    with pytest.raises(ValueError, match="problems: 'keppler' is none, did you mean `kepler`"):
+        problems_named(["keppler"])
+    with pytest.raises(ValueError, match="repetitions = -1"):
+        measure(one("damped"), METHODS, repetitions=-1)
+
+
+def test_every_problem_of_the_suite_can_be_built_and_begins_where_its_closed_form_does() -> None:
+    for name, problem in zip(SUITE, problems_named(), strict=True):
+        assert problem.name == name
+        assert problem.steps == tuple(sorted(problem.steps)) and len(problem.steps) >= 9
+        assert len(problem.times) >= 8
+        if problem.exact is not None:
+            np.testing.assert_allclose(problem.start.pos[0], problem.exact(0.0)[0], atol=1e-15)
+            # and moves with the velocity that it says: by differences
+            h = 1e-5
+            moved = (np.subtract(problem.exact(1 + h)[0], problem.exact(1 - h)[0])) / (2 * h)
+            drift = moved - problem.exact(1.0)[1]
+            if name != "tracer":
+                np.testing.assert_allclose(drift, 0.0, atol=1e-6)
+
+
+# --- the command line -------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def in_a_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "tiny.yaml").write_text(TINY)
+    return tmp_path
+
+
+def test_accuracy_of_a_scene_on_the_command_line(in_a_folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    asked = ["accuracy", "tiny.yaml", "--methods", "rk4,heun", "--repetitions", "1", "--out", "deep/a.png"]
+    assert main(asked) == 0
+    out = capsys.readouterr().out
+    assert "tiny.yaml" in out and "errors against: DOP853" in out and "to 0.0001 m: " in out
+    results = Results.model_validate_json((in_a_folder / "deep" / "a.json").read_text())
+    (report,) = results.reports
+    assert [curve.method for curve in report.curves] == ["rk4", "heun"]
+    assert [p.dt for p in report.curves[0].points] == pytest.approx([0.04 / 2**k for k in range(8)])  # 50 = 2 x 25
+    assert (in_a_folder / "deep" / "a.png").read_bytes().startswith(b"\x89PNG")
+    assert main(asked) == 2  # they are there already
+    assert main([*asked, "--force", "--dts", "0.1,0.05,0.025,0.0125"]) == 0
+    (report,) = Results.model_validate_json((in_a_folder / "deep" / "a.json").read_text()).reports
+    assert [p.steps for p in report.curves[0].points] == [10, 20, 40, 80]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "text"),
+    [
+        ("accuracy", "needs a SCENE.yaml or --suite"),
+        ("accuracy tiny.yaml --suite", "one of them"),
+        ("accuracy --suite --seconds 2", "--suite: has horizons"),
+        ("accuracy --suite --problems keppler", "did you mean `kepler`"),
+        ("accuracy tiny.yaml --problems kepler", "--problems: goes with --suite"),
+        ("accuracy tiny.yaml --methods rk44", "did you mean `rk4`"),
+        ("accuracy tiny.yaml --steps 8,x", "--steps = '8,x': must be positive numbers"),
+        ("accuracy tiny.yaml --steps 8.5", "must be whole numbers"),
+        ("accuracy tiny.yaml --steps 8 --dts 0.1", "--steps and --dts"),
+        ("accuracy tiny.yaml --dts 0.3", "must be a whole multiple of dt = 0.3 s"),
+        ("accuracy tiny.yaml --tolerance 0", "--tolerance = '0': must be positive"),
+        ("accuracy tiny.yaml --seconds 0.013", "--seconds = 0.013 s: must be a whole multiple"),
+        ("accuracy tiny.yaml --out a.gif", "must end in .json or .png"),
+    ],
+)
+def test_mistakes_on_the_command_line_are_one_line(
+    in_a_folder: Path, capsys: pytest.CaptureFixture[str], arguments: str, text: str
+) -> None:
+    assert main(arguments.split()) == 2
+    complaint = capsys.readouterr().err
+    assert complaint.count("\n") == 1 and text in complaint
+
+
+def test_ctrl_c_on_the_command_line_keeps_the_problems_that_are_done(
+    in_a_folder: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def impatient(problem: Problem, methods: Any, repetitions: int, **more: Any) -> Report:
+        if problem.name != "damped":
+            raise KeyboardInterrupt
+        return measure(problem, methods, repetitions)
+
+    monkeypatch.setattr("flockenv.accuracy.measure", impatient)
+    asked = ["accuracy", "--suite", "--problems", "damped,oscillator", "--methods", "rk4", "--repetitions", "0"]
+    assert main([*asked, "--out", "a.json"]) == 130
+    text = capsys.readouterr()
+    assert "Damped oscillator" in text.out and "interrupted" in text.err
+    (report,) = Results.model_validate_json(Path("a.json").read_text()).reports
+    assert report.name == "damped"
+
+
+def test_times_are_whole_parts_of_every_run() -> None:
+    scene = sprung(1.0, 1.0).scene
+    for steps, instants in (((8, 16), 8), ((10, 25), 5), ((7,), 7), ((34,), 2), ((256, 512), 16)):
+        assert len(Problem.of(scene, 2.0, steps).times) == instants
+    assert Problem.of(scene, 2.0, (8,)).times[-1] == 2.0
+    assert problems.INSTANTS == 16
+
+
+def test_methods_that_solve_equations_are_measured_when_asked_for() -> None:
+    usual: tuple[Integrator, ...] = usual_methods()
+    assert not any(method.solves for method in usual) and RK4() in usual
+    report = measure(
+        replace(one("damped"), steps=(16, 32, 64, 128)), methods_named(["implicit_midpoint"]), repetitions=1
+    )
+    assert report.curves[0].order == pytest.approx(2, abs=0.2)
