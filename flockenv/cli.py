@@ -227,6 +227,7 @@ def explain(scene: SceneFile) -> None:
     show_table(console, title, rows, ("effect", "calls for", "costs us/step"))
     counted = (f"{number:g} {name.replace('_', ' ')}" for name, number in found.work.items())
     console.print(f"Per step: {', '.join(counted)}")
+    console.print(f"Largest stable step: {found.largest_step}")
     show_table(console, "Left out, because nobody asked for it", ([line] for line in found.left_out), [""])
 
 
@@ -296,6 +297,7 @@ def schema() -> None:
     print(json.dumps(json_schema(), indent=2, allow_nan=False))
 
 
+    console.print(f"Largest stable step: {found.largest_step}")
 def _sentence(kind: type) -> str:
     """Return the first sentence of a class's docstring."""
     text = " ".join((kind.__doc__ or "").split("\n\n")[0].split())

@@ -29,7 +29,7 @@ from flockenv.integrators import INTEGRATORS, Integrator, SemiImplicitEuler
 from flockenv.integrators.newton import Coupling
 from flockenv.kernels import entry, load
 from flockenv.neighbours import FEWEST_AGENTS, WORTH_ARRANGING
-from flockenv.networks import AnyNetwork
+from flockenv.networks import EDGE, AnyNetwork
 from flockenv.noise import MASK, key_of
 from flockenv.records import Record
 from flockenv.rounding import check_places
@@ -268,6 +268,17 @@ class Scene(Record):
     def table(self) -> Table:
         """The bonds of all effects, as the kernel reads them."""
         return pack(self.parts, self.agents, self.groups)
+
+    @functools.cached_property
+    def edges(self) -> NDArray[np.int32]:
+        """Which agents are tied along the edges of networks, (E, 2): what of them is drawn."""
+        found, first = [np.zeros((0, 2), np.int32)], 0
+        for group in self.groups:
+            if group.network is not None:
+                springs = group.network.springs(self.dimension)
+                found.append(first + np.stack([springs.i, springs.j], axis=1)[springs.role == EDGE])
+            first += group.size
+        return np.concatenate(found)
 
     @functools.cached_property
     def coupling(self) -> Coupling | None:
@@ -509,7 +520,7 @@ class Scene(Record):
             radius=np.asarray(self.body.radius, np.float64), roles=self.roles,
             obstacle_centre=state.obstacles.centre[world], obstacle_radius=state.obstacle_radius[world], marks=(),
             low=np.array(low, np.float64), high=np.array(high, np.float64),
-            periodic=self.space.periodic, title=title,
+            periodic=self.space.periodic, title=title, bonds=self.edges,
         )  # fmt: skip
 
     def _view(self, state: State, world: int) -> tuple[Sequence[float], Sequence[float]]:
