@@ -297,7 +297,6 @@ def schema() -> None:
     print(json.dumps(json_schema(), indent=2, allow_nan=False))
 
 
-    console.print(f"Largest stable step: {found.largest_step}")
 def _sentence(kind: type) -> str:
     """Return the first sentence of a class's docstring."""
     text = " ".join((kind.__doc__ or "").split("\n\n")[0].split())
