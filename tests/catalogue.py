@@ -462,7 +462,7 @@ class Tether(Effect):
     With m = 1 kg, x'' = -stiffness x - damping x' - sine sin x - sun x / |x|^3 + push cos 2t + weight.
     \"\"\"
 
-    kind: Literal["tether"] = "tether"
+    kind: Literal["users_tether"] = "users_tether"
     stiffness: float = Field(default=0.0, ge=0, description="N/m")
     damping: float = Field(default=0.0, ge=0, description="kg/s")
     sine: float = Field(default=0.0, ge=0, description="N, a pendulum along each axis")

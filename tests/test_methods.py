@@ -450,7 +450,7 @@ def test_who_has_no_finite_force_is_named_and_the_world_stays(kind: type[Integra
     start.x[0, 1, 17] = 1e3  # its force is infinite
     with pytest.raises(SimulationDiverged) as caught:
         scene.step(start, out=start)
-    assert (caught.value.world, caught.value.agent, caught.value.effect) == (1, 17, "tether")
+    assert (caught.value.world, caught.value.agent, caught.value.effect) == (1, 17, "users_tether")
     assert start.x[0, 1, 17] == 1e3
     np.testing.assert_array_equal(start.tick, [1, 0])
     assert start.work[1, 5] == TRIES

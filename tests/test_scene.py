@@ -521,7 +521,7 @@ def test_an_effect_of_a_user_s_own_works_like_ours(tmp_path: Path) -> None:
         assert pickle.loads(pickle.dumps(scene)) == scene
         with pytest.raises(ValueError, match="did you mean `stiffness`"):
             laws.Tether(stifness=1)
-    assert "tether" not in EFFECTS
+    assert "users_tether" not in EFFECTS
 
 
 SECOND = """
