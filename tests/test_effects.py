@@ -45,7 +45,9 @@ def obeying(symmetry: str) -> pytest.MarkDecorator:
     return pytest.mark.parametrize("row", rows, ids=lambda row: row.name)
 
 
-DIMENSIONS = pytest.mark.parametrize("dimension", [2, 3])
+DIMENSIONS = pytest.mark.parametrize("dimension", [2, pytest.param(3, marks=pytest.mark.slow)])
+"""Each effect is a kernel in each dimension; laws are written once for both, and tests that run quickly try the plane."""
+
 STEPS = 12
 
 
