@@ -101,11 +101,11 @@ def _demand_one_piece(out: State) -> None:
 
 
 class Group(Record):
-    """Some agents of a kind."""
+    """Some agents of a kind: so many that are on their own, or a network of them; there `mass` is the mean."""
 
-    count: int | None = Field(default=None, ge=1, description="how many; or give a network")
+    count: int | None = Field(default=None, ge=1, description="how many")
     network: AnyNetwork | None = Field(default=None, description="particles that are tied to each other, and where")
-    mass: float = Field(default=1.0, gt=0, description="kg, of each; in a network on average")
+    mass: float = Field(default=1.0, gt=0, description="kg")
     radius: float = Field(default=0.1, ge=0, description="m")
     max_speed: float | None = Field(default=None, gt=0, description="m/s; none = no limit")
     max_force: float | None = Field(default=None, ge=0, description="N, what it may ask for; none = no limit")

@@ -141,6 +141,8 @@ def suggest_dt(scene: Scene) -> Suggestion:
     Source: numerics.md 2.2 P02, 3.1, 3.3.
     """
     found = _found(scene)
+    if not found:
+        return Suggestion(math.inf, None, None, 0.0, 0.0)
     whole = _Rates(*(sum(rates[k] for _, rates in found) + np.zeros(scene.agents) for k in range(3)))
     dt, agent = _tightest(scene.integrator, whole)
     if not math.isfinite(dt):
@@ -169,7 +171,10 @@ def _found(scene: Scene) -> list[tuple[str, _Rates]]:
 
 def _tightest(method: Integrator, rates: _Rates) -> tuple[float, int]:
     """Return the least of all agents' limits, s, and whose it is; of very many different ones, among the fastest."""
-    kinds, first = np.unique(np.stack(rates, axis=1), axis=0, return_index=True)
+    table = np.stack(rates, axis=1)
+    begins = np.flatnonzero(np.r_[True, (table[1:] != table[:-1]).any(axis=1)])  # of agents in a row who are alike
+    kinds, among = np.unique(table[begins], axis=0, return_index=True)
+    first = begins[among]
     fastest = np.argsort(np.maximum(np.sqrt(kinds[:, 0]), kinds[:, 1]), kind="stable")[-FASTEST:]
     return min((_limit_of(method, *map(float, kinds[k])), int(first[k])) for k in fastest)
 
