@@ -84,7 +84,7 @@ def _number(axes: Axes, x: int, y: int, player: Results, bound: float, trained: 
     light = abs(value) > 0.62 * bound
     size = f"{value:+.2g}" if abs(value) >= 5e-5 else "0"
     text = "trained" if trained else size if player["separated"] else f"{size}\n(level)"
-    colour = "white" if light else INK if player["separated"] or trained else FAINT
+    colour = "white" if light else INK
     axes.text(x, y, text, ha="center", va="center", fontsize=9, color=colour, linespacing=1.1)
     if trained:
         axes.add_patch(Rectangle((x - 0.48, y - 0.47), 0.96, 0.94, fill=False, edgecolor=INK, linewidth=1.6))

@@ -33,7 +33,10 @@ of second order solves a decision exactly, in one step, until a limit of speed o
 Verlet and RK4 play the same game to rounding, what is left of their error comes from the limit and falls with dt alone,
 and RK4's other evaluations buy nothing. The two Euler methods are off by half a step: after a decision of n steps under
 a constant force, a body that began at rest has gone (1 + 1/n) times as far as it should under semi-implicit Euler, as
-if it had been pushed earlier, and (1 - 1/n) times under explicit Euler, as if later. That is what players notice."""
+if it had been pushed earlier, and (1 - 1/n) times under explicit Euler, as if later. That is what players notice.
+
+"Trained" is the setting of the comparison, in float64. The shipped policies learned in float32 with the same method and
+step: their very own setting is the float32 row of that step, and it makes no difference worth the name."""
 
 NOTES = """\
 Return: the mean reward of a world's learners, summed over its episode. A difference is the mean over the same worlds

@@ -1,4 +1,4 @@
-"""flockenv on the command line: list | run | render | explain | accuracy | warmup | schema.
+"""flockenv on the command line: list | run | render | explain | accuracy | stress | warmup | schema.
 
 Errors are one line on stderr, exit code 2.
 """
@@ -10,8 +10,7 @@ import json
 import math
 import re
 import sys
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from time import perf_counter
 from typing import TYPE_CHECKING, Annotated, Any, get_args
@@ -20,11 +19,25 @@ import typer
 
 import flockenv
 from flockenv.refusals import nearest, shown
+from flockenv.studies import accuracy, stress
+from flockenv.terminal import (
+    BAD_INPUT,
+    DIVERGED,
+    INTERRUPTED,
+    OK,
+    EarlyEnd,
+    Force,
+    Seed,
+    new_console,
+    printable,
+    progress_bar,
+    relative,
+    show_table,
+)  # fmt: skip
 
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from flockenv.accuracy import Problem, Report
     from flockenv.render import Panel
     from flockenv.scene import Scene
     from flockenv.snapshot import Snapshot
@@ -35,8 +48,6 @@ if TYPE_CHECKING:
 
 __all__ = ["app", "main"]
 
-OK, DIVERGED, BAD_INPUT, INTERRUPTED = 0, 1, 2, 130
-MOST_SEED = 2**63 - 1
 PICTURES = (".gif", ".png", ".html")
 FPS, MOST_FPS = 25.0, 50.0  # of a scene's GIF; viewers slow down beyond 50
 TRAIL = 25  # instants that a PNG shows behind everybody
@@ -50,9 +61,7 @@ app = typer.Typer(
 )
 
 SceneFile = Annotated[str, typer.Argument(metavar="SCENE.yaml", help="A scene; see `flockenv schema` and configs/.")]
-Seed = Annotated[int, typer.Option(min=0, max=MOST_SEED, help="Which world: the same seed is the same run.")]
 Duration = Annotated[float, typer.Option(metavar="S", help="Simulated time in seconds, a whole multiple of dt.")]
-Force = Annotated[bool, typer.Option("--force", help="Overwrite files that exist.")]
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -68,20 +77,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return _complain("interrupted", INTERRUPTED) if code == INTERRUPTED else int(code or OK)
     except (typer.Abort, KeyboardInterrupt):
         return _complain("interrupted", INTERRUPTED)
-    except _EarlyEnd as end:
+    except EarlyEnd as end:
         return _complain(str(end), end.code)
     except Exception as error:
         if debug:
             raise
         return _complain(*_verdict(error))
-
-
-class _EarlyEnd(Exception):  # noqa: N818  # not an error: what was done is kept and shown
-    """A run that ended before its time, and the exit code that says so."""
-
-    def __init__(self, text: str, code: int) -> None:
-        super().__init__(text)
-        self.code = code
 
 
 def _verdict(error: Exception) -> tuple[str, int]:
@@ -96,13 +97,8 @@ def _verdict(error: Exception) -> tuple[str, int]:
 
 def _complain(text: str, code: int) -> int:
     for line in text.splitlines():
-        print(f"flockenv: {_printable(line)}", file=sys.stderr)
+        print(f"flockenv: {printable(line)}", file=sys.stderr)
     return code
-
-
-def _printable(text: str) -> str:
-    """Return text without the control characters that would drive a terminal."""
-    return "".join(c if c.isprintable() else repr(c)[1:-1] for c in text)
 
 
 def _show_version(asked: bool) -> None:
@@ -132,16 +128,16 @@ def listing() -> None:
     from flockenv.space import AnySpace
     from flockenv.tasks import TASKS
 
-    console = _console()
+    console = new_console()
     single = [env_id for env_id in gymnasium.registry if env_id.startswith("flockenv/")]
     many = [env_id for env_id in pettingzoo.parallel_registry if env_id.startswith("flockenv/")]
-    _table(console, "Tasks", ((name, _sentence(task)) for name, task in TASKS.items()))
-    _table(console, "gymnasium.make, gymnasium.make_vec", ((env_id, "one learner") for env_id in single))
-    _table(console, 'pettingzoo.make("parallel" or "aec", ...)', ((env_id, "many learners") for env_id in many))
-    _table(console, "Effects", ((kind, _sentence(effect)) for kind, effect in sorted(EFFECTS.items())))
-    _table(console, "Integrators", ((kind, _sentence(method)) for kind, method in sorted(INTEGRATORS.items())))
+    show_table(console, "Tasks", ((name, _sentence(task)) for name, task in TASKS.items()))
+    show_table(console, "gymnasium.make, gymnasium.make_vec", ((env_id, "one learner") for env_id in single))
+    show_table(console, 'pettingzoo.make("parallel" or "aec", ...)', ((env_id, "many learners") for env_id in many))
+    show_table(console, "Effects", ((kind, _sentence(effect)) for kind, effect in sorted(EFFECTS.items())))
+    show_table(console, "Integrators", ((kind, _sentence(method)) for kind, method in sorted(INTEGRATORS.items())))
     spaces = get_args(get_args(AnySpace)[0])
-    _table(console, "Spaces", ((space.model_fields["kind"].default, _sentence(space)) for space in spaces))
+    show_table(console, "Spaces", ((space.model_fields["kind"].default, _sentence(space)) for space in spaces))
 
 
 @app.command()
@@ -170,14 +166,14 @@ def run(
     usual = max(1, round(RECORDED_EVERY / loaded.dt))
     stride = usual if every is None else whole_steps("--every", every, loaded.dt, 1)
     trajectory = _recorded(loaded, seed, steps, stride if path is not None else max(1, steps))
-    console = _console()
+    console = new_console()
     _show_measures(console, trajectory)
     if path is not None:
         beside = trajectory.save(path)
-        console.print(f"{len(trajectory.step)} instants in {_relative(path)}, summary in {_relative(beside)}")
+        console.print(f"{len(trajectory.step)} instants in {relative(path)}, summary in {relative(beside)}")
     if trajectory.stopped:
         text = f"{trajectory.stopped}; what was done until {trajectory.last.time[0]:g} s is shown"
-        raise _EarlyEnd(text, INTERRUPTED if trajectory.stopped == "interrupted" else DIVERGED)
+        raise EarlyEnd(text, INTERRUPTED if trajectory.stopped == "interrupted" else DIVERGED)
 
 
 @app.command()
@@ -211,7 +207,7 @@ def render(
         raise ValueError(f"{shown(what)}: no such task{nearest(what, TASKS)} ({', '.join(TASKS)}), nor a .yaml file")
     path.parent.mkdir(parents=True, exist_ok=True)
     _write_picture(path, panel, what, fps, size)
-    _console().print(f"{_relative(path)}: {path.stat().st_size:,} bytes, {panel.snapshots[-1].time:g} s")
+    new_console().print(f"{relative(path)}: {path.stat().st_size:,} bytes, {panel.snapshots[-1].time:g} s")
 
 
 @app.command()
@@ -221,133 +217,22 @@ def explain(scene: SceneFile) -> None:
     from flockenv.config import load_scene
 
     loaded = load_scene(Path(scene))
-    with _progress("compiling and timing", len(loaded.effects) + 2, "variants") as progress:
+    with progress_bar("compiling and timing", len(loaded.effects) + 2, "variants") as progress:
         found = explanation.explain(loaded, progress=progress)
-    console = _console()
+    console = new_console()
     rows = [(str(row.effect), ", ".join(row.calls_for) or "nothing", f"{row.cost:.3g}") for row in found.rows]
     rows.append(("what several of them share", "", f"{found.shared:.3g}"))
     rows.append((f"{loaded.integrator.kind}, limits, {loaded.space.kind}", "", f"{found.rest:.3g}"))
     title = f"One step of {loaded.agents:,} agents: {found.step:.3g} us"
-    _table(console, title, rows, ("effect", "calls for", "costs us/step"))
+    show_table(console, title, rows, ("effect", "calls for", "costs us/step"))
     counted = (f"{number:g} {name.replace('_', ' ')}" for name, number in found.work.items())
     console.print(f"Per step: {', '.join(counted)}")
-    _table(console, "Left out, because nobody asked for it", ([line] for line in found.left_out), [""])
+    console.print(f"Largest stable step: {found.largest_step}")
+    show_table(console, "Left out, because nobody asked for it", ([line] for line in found.left_out), [""])
 
 
-@app.command()
-def accuracy(
-    scene: Annotated[str | None, typer.Argument(metavar="[SCENE.yaml]", help="A scene; none with --suite.")] = None,
-    suite: Annotated[bool, typer.Option("--suite", help="Measure the built-in problems instead.")] = False,
-    problems: Annotated[str, typer.Option(metavar="A,B", help="Of the suite these alone [default: all of them].")] = "",
-    seconds: Annotated[
-        float | None, typer.Option(metavar="S", help="Simulated time of a scene in seconds [default: 1].")
-    ] = None,
-    methods: Annotated[str, typer.Option(metavar="A,B", help="Integrators [default: all explicit ones].")] = "",
-    steps: Annotated[
-        str, typer.Option(metavar="N,M", help="In how many steps a scene is taken to its end [default: around its dt].")
-    ] = "",
-    dts: Annotated[str, typer.Option(metavar="S,S", help="The same, by the length of a step in seconds.")] = "",
-    tolerance: Annotated[
-        str, typer.Option(metavar="M,M", help="Errors in metres to find the cheapest way to.")
-    ] = "1e-2,1e-4,1e-6",
-    repetitions: Annotated[int, typer.Option(min=0, max=1000, help="Runs whose median is the wall time.")] = 20,
-    seed: Seed = 0,
-    out: Annotated[
-        str | None, typer.Option(metavar="X.json|X.png", help="Write the numbers; a picture has X.json beside it.")
-    ] = None,
-    force: Force = False,
-) -> None:
-    """Show what accuracy costs: how far each integrator ends from the truth in which steps, beside its time."""
-    from flockenv.accuracy import methods_named, problems_named, table, usual_methods
-    from flockenv.outputs import checked_file
-
-    if suite == (scene is not None):
-        raise ValueError("accuracy: needs a SCENE.yaml or --suite, one of them")
-    aimed = _numbers("--tolerance", tolerance)
-    if suite and (seconds is not None or steps or dts):
-        raise ValueError("--suite: has horizons and steps of its own; --seconds, --steps and --dts go with a scene")
-    if problems and not suite:
-        raise ValueError("--problems: goes with --suite")
-    path = checked_file(out, [".json", ".png"], force) if out is not None else None
-    if path is not None and path.suffix.lower() == ".png":
-        checked_file(str(path.with_suffix(".json")), [".json"], force)
-    chosen = methods_named(_words(methods)) if methods else usual_methods()
-    todo = problems_named(_words(problems)) if suite else [_problem(str(scene), seconds, steps, dts, seed)]
-    console, reports = _console(), []
-    try:
-        for problem in todo:
-            with _progress(f"measuring {problem.name}", 100, "%") as progress:
-                reports.append(_measured(problem, chosen, repetitions, progress))
-            _table(console, reports[-1].title, ([line] for line in table.headlines(reports[-1])), [""])
-            _table(console, "", table.rows(reports[-1], aimed), table.columns(aimed))
-            _table(console, "The cheapest", ([line] for line in table.best(reports[-1], aimed)), [""])
-            if reports[-1].stopped:
-                break
-    except KeyboardInterrupt:
-        if not reports:
-            raise
-    if path is not None and reports:
-        _keep(path, reports)
-        console.print(f"{len(reports)} problems in {_relative(path)}")
-    if len(reports) < len(todo) or reports[-1].stopped:
-        raise _EarlyEnd("interrupted; what was done is shown", INTERRUPTED)
-
-
-def _problem(file: str, seconds: float | None, steps: str, dts: str, seed: int) -> Problem:
-    """Return what is to be measured on a scene: by default in steps 4 times as long as its own to 32 times shorter."""
-    from flockenv.accuracy import Problem
-    from flockenv.config import load_scene
-    from flockenv.trajectory import whole_steps
-
-    loaded, horizon = load_scene(Path(file)), 1.0 if seconds is None else seconds
-    if steps and dts:
-        raise ValueError("--steps and --dts: say the same in two ways; give one of them")
-    if steps:
-        counts = [int(n) if n == int(n) else n for n in _numbers("--steps", steps)]
-    elif dts:
-        counts = [whole_steps("--seconds", horizon, dt, 1) for dt in _numbers("--dts", dts)]
-    else:
-        usual = whole_steps("--seconds", horizon, loaded.dt, 1)
-        coarsest = max(d for d in (1, 2, 4) if usual % d == 0)
-        counts = [usual * 2**k // coarsest for k in range(8)]
-    return Problem.of(loaded, horizon, counts, seed, name=Path(file).stem, title=Path(file).name)
-
-
-def _measured(
-    problem: Problem, methods: Sequence[Any], repetitions: int, progress: Callable[[int], None]
-) -> Report:  # fmt: skip
-    from flockenv.accuracy import measure
-
-    return measure(problem, methods, repetitions, progress=progress)
-
-
-def _keep(path: Path, reports: Sequence[Report]) -> None:
-    """Write the numbers, and a picture of them if that was asked for."""
-    from flockenv.accuracy import Results
-    from flockenv.outputs import replacing
-
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with replacing(path.with_suffix(".json")) as file:
-        file.write((Results(reports=tuple(reports)).model_dump_json(indent=1) + "\n").encode())
-    if path.suffix.lower() == ".png":
-        from flockenv.render.precision import write_precision
-
-        write_precision(path, reports)
-
-
-def _words(text: str) -> list[str]:
-    return [word.strip() for word in text.split(",") if word.strip()]
-
-
-def _numbers(option: str, text: str) -> list[float]:
-    """Return positive numbers written with commas between them."""
-    try:
-        numbers = [float(word) for word in _words(text)]
-    except ValueError:
-        numbers = []
-    if not numbers or not all(math.isfinite(x) and x > 0 for x in numbers):
-        raise ValueError(f"{option} = {shown(text)}: must be positive numbers with commas between them")
-    return numbers
+app.command()(accuracy)
+app.command()(stress)
 
 
 @app.command()
@@ -379,7 +264,7 @@ def warmup(
             tasks = f"{nearest(name, TASKS)} ({', '.join(TASKS)})"
             raise ValueError(f"{shown(name)}: no such task{tasks}, nor a .yaml file")
     rows = []
-    with _progress("compiling", len(jobs), "kernels") as progress:
+    with progress_bar("compiling", len(jobs), "kernels") as progress:
         for done, (name, job) in enumerate(jobs):
             progress(done)
             before, began = len(compiled()), perf_counter()
@@ -387,7 +272,7 @@ def warmup(
             took, new = perf_counter() - began, compiled()[before:]
             note = f"compiled in {sum(k.seconds for k in new):.1f} s" if new else "was in the cache"
             rows.append((name, note, f"{took:.1f}"))
-    _table(_console(), "First steps", rows, ("of", "", "s"))
+    show_table(new_console(), "First steps", rows, ("of", "", "s"))
 
 
 def _first_step_of_task(task: Task) -> None:
@@ -412,27 +297,6 @@ def schema() -> None:
     print(json.dumps(json_schema(), indent=2, allow_nan=False))
 
 
-def _console() -> Console:
-    """Return where tables go; what is piped is not folded to the 80 columns of a terminal that is not there."""
-    from rich.console import Console
-
-    console = Console(highlight=False, markup=False)
-    return console if console.is_terminal else Console(highlight=False, markup=False, width=160)
-
-
-def _table(console: Console, title: str, rows: Iterable[Sequence[str]], columns: Sequence[str] = ("", "")) -> None:
-    from rich.table import Table
-
-    console.print(title, style="bold")
-    table = Table(box=None, show_header=any(columns), pad_edge=False)
-    for k, column in enumerate(columns):
-        table.add_column(column, no_wrap=k == 0, style="cyan" if k == 0 else None, overflow="fold")
-    for row in rows:
-        table.add_row(*map(_printable, row))
-    console.print(table)
-    console.print()
-
-
 def _sentence(kind: type) -> str:
     """Return the first sentence of a class's docstring."""
     text = " ".join((kind.__doc__ or "").split("\n\n")[0].split())
@@ -440,30 +304,10 @@ def _sentence(kind: type) -> str:
     return found[0] if found else text
 
 
-def _relative(path: Path) -> str:
-    here = Path.cwd().resolve()
-    return str(path.relative_to(here) if path.is_relative_to(here) else path)
-
-
-@contextmanager
-def _progress(title: str, total: int, unit: str) -> Iterator[Callable[[int], None]]:
-    """Show a bar on stderr while a command works; only where somebody watches."""
-    from rich.console import Console
-    from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
-
-    console = Console(stderr=True)
-    columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.completed}/{task.total} " + unit))
-    with Progress(
-        *columns, TimeRemainingColumn(), console=console, transient=True, disable=not console.is_terminal
-    ) as bar:
-        task = bar.add_task("compiling", total=total)
-        yield lambda done: bar.update(task, completed=done, description=title)
-
-
 def _recorded(scene: Scene, seed: int, steps: int, every: int) -> Trajectory:
     from flockenv.trajectory import record
 
-    with _progress("simulating", steps, "steps") as progress:
+    with progress_bar("simulating", steps, "steps") as progress:
         return record(scene, seed, steps, every, progress)
 
 
@@ -476,7 +320,7 @@ def _show_measures(console: Console, trajectory: Trajectory) -> None:
     scene, time = trajectory.scene, float(trajectory.last.time[0])
     rows = [(name, text(a), text(b), MEASURES[name]) for name, (a, b) in trajectory.measures().items()]
     title = f"{scene.agents:,} agents, {int(trajectory.step[-1]):,} steps of {scene.dt:g} s, seed {trajectory.seed}"
-    _table(console, title, rows, ("measure", "t = 0 s", f"t = {time:g} s", "unit"))
+    show_table(console, title, rows, ("measure", "t = 0 s", f"t = {time:g} s", "unit"))
     work = {"neighbour queries": "neighbour_queries", "candidate pairs": "pairs", "obstacle tests": "obstacle_tests"}
     counted = ", ".join(f"{trajectory.last.counted(name):,} {words}" for words, name in work.items())
     console.print(f"{text(trajectory.rate / 1e6)} million agent-steps/s ({trajectory.wall:.3g} s); {counted}")
@@ -504,7 +348,7 @@ def _episode(task: Task, player: str, seed: int) -> tuple[Panel, float]:
     from flockenv.render import Panel
 
     policy = load_player(player, task, {"random": lambda task: RandomPolicy(task.action_layout.size, seed)})
-    with _progress("playing", task.horizon, "decisions") as progress:
+    with progress_bar("playing", task.horizon, "decisions") as progress:
         episode = rollout(task, policy, 1, seed, record=0, progress=lambda done, most: progress(done))
     assert episode.recording is not None  # asked for with record=0
     outcome = "success" if episode.success[0] else "no success"
@@ -527,7 +371,7 @@ def _write_picture(path: Path, panel: Panel, title: str, fps: float, size: int) 
 def _frames(snapshots: Sequence[Snapshot], size: int) -> Iterator[Any]:
     from flockenv.render import draw
 
-    with _progress("drawing", len(snapshots), "frames") as progress:
+    with progress_bar("drawing", len(snapshots), "frames") as progress:
         for k, snapshot in enumerate(snapshots):
             progress(k)
             yield draw(snapshot, size=size)

@@ -9,6 +9,7 @@ from time import perf_counter
 
 from flockenv.effects import EFFECTS, Effect
 from flockenv.scene import Scene
+from flockenv.stability import Suggestion, suggest_dt
 from flockenv.state import WORK, State
 
 __all__ = ["Explanation", "Row", "explain"]
@@ -36,11 +37,22 @@ class Explanation:
     rest: float  # us, a step without any effect: integrator, limits, confinement
     work: dict[str, float]  # per step, see state.WORK
     left_out: tuple[str, ...]  # one line each
+    stable: Suggestion  # the largest stable step
 
     @property
     def shared(self) -> float:
         """Us per step that no single effect could save: the query and the sweep that several share."""
         return max(0.0, self.step - self.rest - sum(row.cost for row in self.rows))
+
+    @property
+    def largest_step(self) -> str:
+        """The largest stable step in words, beside the step that is made."""
+        found, made = self.stable, f"dt = {self.scene.dt:g} s"
+        if math.isfinite(found.dt):
+            return f"{found.dt:.3g} s ({found.effect}, agent {found.agent}), {made}"
+        if found.frequency or found.damping:
+            return f"any is stable with {self.scene.integrator.kind}, {made}"
+        return f"nothing in it sets a limit, unless agents that meet do; {made}"
 
 
 def explain(
@@ -66,7 +78,7 @@ def explain(
         Row(effect, _calls(scene, k), max(0.0, whole - less))
         for k, (effect, less) in enumerate(zip(effects, without, strict=True))
     )
-    return Explanation(scene, rows, whole, bare, _work(scene, state), _left_out(scene))
+    return Explanation(scene, rows, whole, bare, _work(scene, state), _left_out(scene), suggest_dt(scene))
 
 
 class _Timer:

@@ -10,11 +10,9 @@ from __future__ import annotations
 import dataclasses
 import functools
 import math
-import mmap
 import operator
 import threading
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
@@ -25,25 +23,27 @@ from flockenv import state as states
 from flockenv.crew import share, threads
 from flockenv.divergence import SimulationDiverged
 from flockenv.effects import EFFECTS, Effect
-from flockenv.effects.base import all_masses, ties
+from flockenv.effects.base import all_masses
 from flockenv.implicit import coupling_of, solve_steps
-from flockenv.integrators import INTEGRATORS, Integrator, SemiImplicitEuler
+from flockenv.integrators import INTEGRATORS, ImplicitEuler, Integrator, SemiImplicitEuler
 from flockenv.integrators.newton import Coupling
-from flockenv.kernels import LINE, entry, load
-from flockenv.neighbours import FEWEST_AGENTS, MAX_RANGES, WORTH_ARRANGING
-from flockenv.networks import AnyNetwork
+from flockenv.kernels import entry, load
+from flockenv.neighbours import FEWEST_AGENTS, WORTH_ARRANGING
+from flockenv.networks import EDGE, AnyNetwork
 from flockenv.noise import MASK, key_of
 from flockenv.records import Record
+from flockenv.rounding import check_places
 from flockenv.shapes import Circle
 from flockenv.snapshot import Snapshot
 from flockenv.space import AnySpace, Box, Plane, Torus
 from flockenv.spawn import Spawn, scatter
 from flockenv.stability import check_dt
 from flockenv.state import Body, Floats, State
-from flockenv.sweep import SHARED, SMALL_STRIDE, Parts, Table, field_source, pack, scene_source
-from flockenv.tree import BUCKETS, LEVELS, MOST_DIRECT, tree_sizes
+from flockenv.sweep import SHARED, Parts, Table, field_source, pack, scene_source
+from flockenv.tree import MOST_DIRECT, tree_sizes
+from flockenv.workspace import Workspace
 
-__all__ = ["Group", "Scene", "Workspace"]
+__all__ = ["Group", "Scene"]
 
 WORTH_SHARING = 4096
 """Agent-steps below which a second thread costs more than it brings: handing work over takes about 20 us."""
@@ -52,12 +52,6 @@ SYNC, STAGES = SHARED.split(", ").index("sync"), SHARED.split(", ").index("stage
 
 EXACT = 2**24
 """Whole numbers, and so numbers of agents, that float32 tells apart."""
-
-HUGE = 2**21
-"""Bytes of a large page."""
-
-GAP = 5 * LINE
-"""Bytes between two arrays of scratch."""
 
 MEMORY_LIMIT = 8 * 2**30
 """Bytes that a state and its scratch may take before a scene is refused."""
@@ -145,90 +139,6 @@ class Group(Record):
         return out
 
 
-@dataclass(frozen=True)
-class Workspace:
-    """Scratch of a team of threads that step one world: what a step writes and nobody reads afterwards."""
-
-    shared: tuple[NDArray[Any], ...]
-    own: tuple[tuple[NDArray[Any], NDArray[Any]], ...]  # lanes and ranges of each thread
-
-    @classmethod
-    def allocate(cls, parts: Parts, body: Body, table: Table, team: int = 1) -> Workspace:
-        """Return scratch for the sweep, the query and the integrator, in the order of sweep.SHARED."""
-        d, agents, dtype = parts.dimension, len(body.mass), body.mass.dtype
-        width = parts.width
-        padded = -(-agents // width) * width
-        sorts = parts.sweeps and parts.sorts
-        carried = agents if parts.arranges and agents >= WORTH_ARRANGING else 1
-        swept, cells = padded if parts.sweeps else 1, agents if sorts else 1
-        real: dict[str, int | tuple[int, ...]] = {
-            **dict.fromkeys(("pos", "vel", "origin", "want"), padded * d),
-            "stages": (max(parts.integrator.stages, 1), padded * d),
-            **dict.fromkeys(("mass", "radius", "max_speed", "max_force", "living", "ident"), padded),
-            "tie": padded * d if "t0" in parts.fields else 1,
-            "pulled": padded * d if parts.pulls else 1,
-            "carrying": padded * d if parts.flows else 1,
-            "felt": max(swept * d * len(parts.targets), 1),
-            "sorted_": parts.rows * (swept + width if parts.sorts else SMALL_STRIDE),
-            "records": (swept if sorts else 1) * parts.numbers,
-            "luggage": carried * parts.luggage_size,
-        }
-        real |= {name: size if parts.treed else 1 for name, size in tree_sizes(agents, width, d, team).items()}
-        whole = {
-            "order": (swept + width,),
-            "cell": (padded if sorts else 1,),
-            "start": (cells + 1,),
-            "offset": (team, cells),
-            "tree_place": (2 * padded if parts.treed else 1,),
-        }
-        wanted: dict[str, Any] = {name: (shape, np.dtype(dtype)) for name, shape in real.items()}
-        wanted |= {name: (shape, np.dtype(np.int32)) for name, shape in whole.items()}
-        arrays = _zeros(wanted)
-        arrays |= {"bounds": np.zeros((team, 6)), "tally": np.zeros(2 * team, np.int64), "sync": np.zeros(8, np.int64)}
-        keys, digits = (2 * padded, BUCKETS + LEVELS + 1) if parts.treed else (1, 1)
-        arrays |= {"tree_key": np.zeros(keys, np.int64), "tree_digit": np.zeros(digits, np.int64)}
-        for name, pad in (("mass", 1), ("radius", 0), ("max_speed", 1), ("max_force", 1)):
-            arrays[name][:] = pad
-            arrays[name][:agents] = getattr(body, name)
-        arrays["ident"][:] = np.arange(padded)
-        if "t0" in parts.fields:
-            blocks = ties(padded, d).reshape(-1, width, d).transpose(0, 2, 1)
-            arrays["tie"][:] = blocks.reshape(-1)
-        arrays["number"] = np.arange(width, dtype=np.int32)
-        arrays |= {"bond_place": table.place, "bond_number": table.number, "bond_start": table.start}
-        lanes = {"lanes": (len(parts.slots) * width, np.dtype(dtype))}
-        own = tuple((_zeros(lanes)["lanes"], np.zeros((MAX_RANGES, 3), np.int64)) for _ in range(team))
-        return cls(tuple(arrays[name] for name in SHARED.split(", ")[:-2]), own)
-
-    def of(self, rank: int) -> tuple[NDArray[Any], ...]:
-        """Return the arrays that one of the team is given."""
-        return (*self.shared, *self.own[rank])
-
-
-def _zeros(wanted: Mapping[str, tuple[int | tuple[int, ...], np.dtype[Any]]]) -> dict[str, NDArray[Any]]:
-    """Return arrays of zeros in one piece of memory, each beginning on a cache line: no vector is loaded from two.
-
-    Between two there is a gap, or places that are used together would compete for the same few lines of the cache.
-    """
-    sizes = {name: int(np.prod(shape)) * kind.itemsize for name, (shape, kind) in wanted.items()}
-    raw = _memory(sum(sizes.values()) + (len(sizes) + 1) * (LINE + GAP))
-    at, out = -raw.ctypes.data % LINE, {}
-    for name, (shape, kind) in wanted.items():
-        out[name] = raw[at : at + sizes[name]].view(kind).reshape(shape)
-        at += -(-sizes[name] // LINE) * LINE + GAP
-    return out
-
-
-def _memory(size: int) -> NDArray[np.uint8]:
-    """Return zeros; where there are many, and the system has them, on large pages: fewer addresses to look up."""
-    if size < HUGE or not hasattr(mmap, "MADV_HUGEPAGE"):
-        return np.zeros(size, np.uint8)
-    memory = mmap.mmap(-1, size + HUGE, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)
-    memory.madvise(mmap.MADV_HUGEPAGE)
-    raw = np.frombuffer(memory, np.uint8)
-    return raw[-raw.ctypes.data % HUGE :]
-
-
 class Scene(Record):
     """What is simulated: who, where, under which effects, advanced how. Prints, compares, hashes, pickles, is YAML."""
 
@@ -278,6 +188,7 @@ class Scene(Record):
                 f"groups: {self.agents:,} agents need about {needed / 2**30:.3g} GiB; at most {MEMORY_LIMIT / 2**30:g} "
                 f"GiB, {int(MEMORY_LIMIT / each):,} agents, are allowed"
             )
+        check_places(self)
         check_dt(self)
         return self
 
@@ -326,7 +237,7 @@ class Scene(Record):
         if parts.sweeps and parts.sorts:
             reals += parts.rows + parts.numbers
             whole += 3 * 4
-        reals += d * (parts.pulls + parts.flows)
+        reals += d * (parts.pulls + parts.flows + parts.bounces)
         if parts.treed:
             numbers = tree_sizes(self.agents, parts.width, d, 1)
             reals += -(-sum(numbers.values()) // self.agents)
@@ -357,6 +268,17 @@ class Scene(Record):
     def table(self) -> Table:
         """The bonds of all effects, as the kernel reads them."""
         return pack(self.parts, self.agents, self.groups)
+
+    @functools.cached_property
+    def edges(self) -> NDArray[np.int32]:
+        """Which agents are tied along the edges of networks, (E, 2): what of them is drawn."""
+        found, first = [np.zeros((0, 2), np.int32)], 0
+        for group in self.groups:
+            if group.network is not None:
+                springs = group.network.springs(self.dimension)
+                found.append(first + np.stack([springs.i, springs.j], axis=1)[springs.role == EDGE])
+            first += group.size
+        return np.concatenate(found)
 
     @functools.cached_property
     def coupling(self) -> Coupling | None:
@@ -456,7 +378,9 @@ class Scene(Record):
         """Return the kind of the effect that accelerates an agent most, or to no number at all."""
         found: list[tuple[float, str]] = []
         for k, effect in enumerate(self.effects):
-            alone = self.with_effects(*(e if j == k else e.idle() for j, e in enumerate(self.effects)))
+            others = tuple(e if j == k else e.idle() for j, e in enumerate(self.effects))
+            # nothing is stepped: under a method without a limit no dt is warned of or refused
+            alone = self.model_copy(update={"effects": others, "integrator": ImplicitEuler()})
             size = float(np.abs(alone.acceleration(state)[0, agent]).max())
             found.append((size if math.isfinite(size) else math.inf, effect.kind))
         return max(found)[1] if found and max(found)[0] > 0 else None
@@ -598,7 +522,7 @@ class Scene(Record):
             radius=np.asarray(self.body.radius, np.float64), roles=self.roles,
             obstacle_centre=state.obstacles.centre[world], obstacle_radius=state.obstacle_radius[world], marks=(),
             low=np.array(low, np.float64), high=np.array(high, np.float64),
-            periodic=self.space.periodic, title=title,
+            periodic=self.space.periodic, title=title, bonds=self.edges,
         )  # fmt: skip
 
     def _view(self, state: State, world: int) -> tuple[Sequence[float], Sequence[float]]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from difflib import get_close_matches
 from typing import Final
 
@@ -49,6 +49,7 @@ class Snapshot:
     time: s. pos (N, D): m. vel (N, D): m/s. alive (N,): bool. radius (N,): m. roles: N names out of ROLES.
     obstacle_centre (M, D), obstacle_radius (M,): m. marks: goals and headings. low, high (D,): the region to show, m.
     periodic: whether what leaves the region enters it on the far side. title: one line. D = 2 or 3; N and M may be 0.
+    bonds (E, 2): int, pairs of agents that a line is drawn between, the shortest way; none by default.
     Arrays are private copies and read-only; positions and velocities may hold NaN or inf (a run that diverged can be
     looked at: such bodies are left out), everything else is finite.
     Raises ValueError or TypeError, in one line that names the field, on anything else.
@@ -67,6 +68,7 @@ class Snapshot:
     high: Floats
     periodic: bool
     title: str
+    bonds: NDArray[np.int32] = field(default_factory=lambda: np.zeros((0, 2), np.int32))
 
     def __post_init__(self) -> None:
         pos = _array("Snapshot.pos", self.pos, (None, None), finite=False)
@@ -87,6 +89,7 @@ class Snapshot:
             low=_array("Snapshot.low", self.low, (dimension,)),
             high=_array("Snapshot.high", self.high, (dimension,)),
             periodic=bool(self.periodic),
+            bonds=_pairs("Snapshot.bonds", self.bonds, agents),
         )
         if not isinstance(self.title, str):
             raise TypeError(f"Snapshot.title: must be a str, got {type(self.title).__name__}")
@@ -102,6 +105,13 @@ class Snapshot:
     def dimension(self) -> int:
         """D: 2 or 3."""
         return int(self.pos.shape[1])
+
+    @property
+    def tied(self) -> NDArray[np.bool_]:
+        """Who has bonds, (N,) bool: particles of something larger, which are drawn as dots."""
+        tied = np.zeros(self.agents, np.bool_)
+        tied[self.bonds] = True
+        return tied
 
     @property
     def visible(self) -> NDArray[np.bool_]:
@@ -162,6 +172,18 @@ def _switches(field: str, value: ArrayLike, count: int) -> NDArray[np.bool_]:
     switches = switches.astype(np.bool_)
     switches.flags.writeable = False
     return switches
+
+
+def _pairs(field: str, value: ArrayLike, count: int) -> NDArray[np.int32]:
+    pairs = np.array(value)
+    if pairs.size and pairs.dtype.kind not in "iu":
+        raise TypeError(f"{field}: must be whole numbers, got {pairs.dtype}")
+    _demand(pairs.ndim == 2 and pairs.shape[1] == 2, field, "must have shape (any, 2)", f"shape {pairs.shape}")
+    outside = pairs[(pairs < 0) | (pairs >= count)]
+    _demand(not len(outside), field, f"must be agents from 0 to {count - 1}", outside[:1])
+    pairs = pairs.astype(np.int32)
+    pairs.flags.writeable = False
+    return pairs
 
 
 def _names(field: str, value: Iterable[str], count: int) -> tuple[str, ...]:

@@ -1,5 +1,7 @@
 """Space as two functions: offset(a, b), the way from a to b, and confine(x, v), where a body that left is put.
 
+Where bodies bounce, a third one: bounce(...), where a step really led that led beyond a wall.
+
 The shape of the world enters a simulation here and nowhere else; no other file takes a remainder.
 """
 
@@ -11,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydantic import Field
 
-from flockenv.kernels import Vec, law, like
+from flockenv.kernels import Vec, finite, law, like
 from flockenv.records import Record
 from flockenv.vec import sub
 
@@ -19,6 +21,9 @@ __all__ = ["AnySpace", "Box", "Plane", "Space", "Torus"]
 
 Floats = NDArray[np.float64]
 Size = Annotated[tuple[Annotated[float, Field(gt=0, allow_inf_nan=False)], ...], Field(min_length=2, max_length=3)]
+
+BOUNCES = 100
+"""Impacts on the walls across one axis that one step follows; a body that has more lies still at the wall."""
 
 
 @law
@@ -92,18 +97,119 @@ def box_confine(size: Vec, radius: float, x: Vec, v: Vec) -> tuple[Vec, Vec]:
         return (x0, x1, x2), (v0, v1, v2)
 
 
+@law
+def _meets(gap: float, away: float, push: float) -> tuple[float, float]:
+    """Return after what time a body comes to a wall (inf = never), and how fast it then is.
+
+    Its distance is gap + away t + push t^2 / 2. Of each root the form that does not cancel.
+    """
+    o, never = like(gap, 0.0), like(gap, np.inf)
+    square = away * away - like(gap, 2.0) * push * gap
+    speed = np.sqrt(max(square, o))
+    comes = like(gap, 2.0) * gap / (speed - away)
+    returns = (away + speed) / -push
+    later = returns if push < o else never
+    return (comes if square >= o else never) if away < o else later, speed
+
+
+@law
+def _flight(dt: float, was: float, before: float, x: float, v: float) -> tuple[float, float, float]:
+    """Return velocity at the beginning, acceleration, and what the method calls velocity beyond that of the parabola.
+
+    The parabola goes from `was` to x in a step over which velocity changed from `before` to v. A method of first order
+    is half a step ahead or behind with its velocity: under a constant force its points lie on a parabola all the same.
+    """
+    half = like(x, 0.5)
+    a = (v - before) / dt
+    moved = x - was
+    excess = v - moved / dt - half * a * dt
+    rounding = like(x, 4.0) * np.spacing(max(abs(x), abs(was)))
+    excess = like(x, 0.0) if abs(excess) * dt <= rounding else excess
+    return before - excess, a, excess
+
+
+@law
+def _bounced(
+    radius: float, length: float, restitution: float, dt: float, was: float, before: float, x: float, v: float
+) -> tuple[float, float]:
+    """Along one axis: fly, meet a wall, turn around with the restitution's share of the speed, fly on.
+
+    Where all further bounces (a geometric series) end within the step, the body is at rest at their end; so who lies at
+    a wall costs one round, and not BOUNCES.
+    """
+    o, half = like(x, 0.0), like(x, 0.5)
+    low, high = radius, length - radius
+    speed, a, excess = _flight(dt, was, before, x, v)
+    # who lies at a wall begins at rest, whatever the velocity of a method of first order means
+    speed = o if (before == o) & ((was == low) | (was == high)) else speed
+    at, left, hit = was, dt, False
+    for bounce in range(BOUNCES):
+        fall, down = _meets(at - low, speed, a)
+        rise, up = _meets(high - at, -speed, -a)
+        below = fall <= rise
+        seconds = fall if below else rise
+        if not seconds < left:
+            break
+        hit = True
+        left -= seconds
+        at, into = low if below else high, -a if below else a
+        away = restitution * (down if below else up)
+        ends = like(x, 2.0) * away <= into * (like(x, 1.0) - restitution) * left
+        rests = (bounce == BOUNCES - 1) | ((into > o) & ends)
+        speed = o if rests else (away if below else -away)
+        a, excess = o if rests else a, o if rests else excess
+    end = at + (speed + half * a * left) * left if hit else x
+    # not a number, where numbers are too large for their squares: at a wall, and still
+    inside = low if not end >= low else (high if end > high else end)
+    then = speed + a * left + excess if hit else v
+    return inside, then if finite(then) else o
+
+
+@law
+def _hop(
+    size: float, radius: float, restitution: float, dt: float, was: float, before: float, x: float, v: float
+) -> tuple[float, float]:
+    """One axis of `box_bounce`."""
+    if was < radius or was > size - radius:
+        return _wall(x, v, radius, size)
+    else:
+        return _bounced(radius, size, restitution, dt, was, before, x, v)
+
+
+@law
+def box_bounce(
+    size: Vec, radius: float, restitution: float, dt: float, was: Vec, before: Vec, x: Vec, v: Vec
+) -> tuple[Vec, Vec]:
+    """Return where a step from `was` to x really led, if velocity changed from `before` to v, and how fast.
+
+    Exact under a constant force, axis by axis. Somebody who was outside is put at the wall.
+    """
+    x0, v0 = _hop(size[0], radius, restitution, dt, was[0], before[0], x[0], v[0])
+    x1, v1 = _hop(size[1], radius, restitution, dt, was[1], before[1], x[1], v[1])
+    if len(x) == 2:
+        return (x0, x1), (v0, v1)
+    else:
+        x2, v2 = _hop(size[2], radius, restitution, dt, was[2], before[2], x[2], v[2])
+        return (x0, x1, x2), (v0, v1, v2)
+
+
 class Space(Record):
     """Where agents live."""
 
     kind: str
     offset_law: ClassVar[str]
     confine_law: ClassVar[str]
+    bounce_law: ClassVar[str | None] = None
     periodic: ClassVar[bool] = False
 
     def extent(self, dimension: int) -> tuple[float, ...]:
         """Return the size that the laws are given, m per axis; 1 where there is none."""
         size: tuple[float, ...] | None = getattr(self, "size", None)
         return size if size is not None else (1.0,) * dimension
+
+    def numbers(self) -> tuple[float, ...]:
+        """Return what its bounce law is given beside the size."""
+        return ()
 
     def displacement(self, a: ArrayLike, b: ArrayLike) -> Floats:
         """Return the way from a to b, (..., D) m, over arrays: for code that is not in a kernel."""
@@ -145,12 +251,30 @@ class Torus(Space):
 
 
 class Box(Space):
-    """A box [0, size] with walls: bodies stop at them."""
+    """A box [0, size] with walls, at which bodies stop, or which they bounce off.
+
+    Restitution e is speed after over speed before an impact, across the wall; along it nothing changes. Impacts are
+    found where they happen within a step: exactly under a constant force, for every method; otherwise as if the force
+    of a step were its mean. A ball dropped from height h rises to e^(2n) h after n bounces, and lies still after
+    sqrt(2 h / g) (1 + e) / (1 - e). Who would bounce more than 100 times in one step stops.
+    """
 
     kind: Literal["box"] = "box"
     size: Size = Field(description="m per axis")
+    restitution: float = Field(
+        default=0.0, ge=0, le=1, description="e: 0 = bodies stop at a wall, 1 = they lose nothing"
+    )
     offset_law: ClassVar[str] = "plane_offset"
     confine_law: ClassVar[str] = "box_confine"
+
+    @property
+    def bounce_law(self) -> str | None:  # type: ignore[override]  # nothing of it is compiled where nobody bounces
+        """The law of walls that give something back."""
+        return "box_bounce" if self.restitution > 0 else None
+
+    def numbers(self) -> tuple[float, ...]:
+        """The restitution, if there is one."""
+        return (self.restitution,) if self.bounce_law else ()
 
     def wrap(self, x: ArrayLike) -> Floats:
         """Return positions moved to the nearest point inside."""

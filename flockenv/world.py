@@ -18,12 +18,13 @@ from flockenv.crew import share, threads
 from flockenv.kernels import load
 from flockenv.noise import MASK, keys_of
 from flockenv.recycle import Recycler
-from flockenv.scene import MEMORY_LIMIT, WORTH_SHARING, Workspace
+from flockenv.scene import MEMORY_LIMIT, WORTH_SHARING
 from flockenv.snapshot import Snapshot
 from flockenv.state import State
 from flockenv.sweep import Look, pack
 from flockenv.tasks import Task
 from flockenv.tasks.base import REFUSED, task_source
+from flockenv.workspace import Workspace
 
 __all__ = ["Step", "World"]
 

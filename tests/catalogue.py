@@ -6,6 +6,7 @@ A new effect, integrator, behaviour, task or space is one row below; `test_catal
 from __future__ import annotations
 
 import importlib
+import math
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -21,12 +22,14 @@ from flockenv import arbitration, steering
 from flockenv.effects import EFFECTS as EFFECT_KINDS
 from flockenv.effects import (
     Alignment,
+    AngularSprings,
     Attraction,
     AvoidObstacles,
     Carried,
     Cohesion,
     Drag,
     Effect,
+    Elastic,
     Fluctuation,
     Gravitation,
     Gravity,
@@ -36,10 +39,12 @@ from flockenv.effects import (
     Separation,
     Sink,
     Source,
+    Springs,
     Swing,
     Tether,
     Uniform,
     Vortex,
+    WallRepulsion,
     Wind,
 )
 from flockenv.integrators import (
@@ -50,11 +55,14 @@ from flockenv.integrators import (
     ExplicitEuler,
     ExponentialDrag,
     Heun,
+    ImplicitEuler,
+    ImplicitMidpoint,
     Integrator,
     Midpoint,
     SemiImplicitEuler,
     VelocityVerlet,
 )
+from flockenv.networks import Mesh
 from flockenv.scene import Group, Scene
 from flockenv.space import Box, Plane, Space, Torus
 from flockenv.spawn import Spawn
@@ -122,6 +130,7 @@ class EffectRow:
     beside: tuple[Effect, ...] = ()  # without which it moves nobody: what a medium drags or carries
     obeys: frozenset[str] = frozenset({"translation", "rotation", "mirror", "relabelling"})
     signed: tuple[str, ...] = ()  # parameters that may be negative
+    torus: bool = True  # may it act there?
 
     @property
     def name(self) -> str:
@@ -188,6 +197,7 @@ EFFECTS = (
     EffectRow(
         Swing(centre=CENTRE, strength=0.8, length=0.7), obeys=frozenset({"translation", "mirror", "relabelling"})
     ),
+    EffectRow(WallRepulsion(point=CENTRE, normal=(1.2, -0.7, 0.9), strength=2, decay=1.5), torus=False),
     EffectRow(Fluctuation(strength=0.8), obeys=frozenset({"translation"})),  # to each his own, along the axes
     EffectRow(Pressure(strength=1.5, density=1, radius=1.35)),
     EffectRow(Separation(weight=1.3, radius=2.5)),
@@ -197,6 +207,10 @@ EFFECTS = (
     EffectRow(AvoidObstacles(weight=5, horizon=3, margin=0.1)),
     EffectRow(Gravitation(constant=0.3, softening=0.5)),  # of few the sum is exact; of many, see test_gravitation.py
     EffectRow(InverseSquare(strength=-0.4, softening=0.3), signed=("strength",)),
+    # everybody is tied to somebody else; see `tied`
+    EffectRow(Springs(stiffness=3, damping=0.2), obeys=frozenset({"translation", "rotation", "mirror"})),
+    EffectRow(AngularSprings(stiffness=1.5, damping=0.1), obeys=frozenset({"translation", "rotation", "mirror"})),
+    EffectRow(Elastic(young=3, beta=0.1), obeys=frozenset({"translation"})),  # linear: it knows where it has turned to
 )  # fmt: skip
 
 
@@ -232,9 +246,9 @@ INTEGRATORS = (
     IntegratorRow(RK4(), 271.82797, 2.7853, 2.8284),
     IntegratorRow(AdaptiveRK4(), 271.828169, 5.5705, 5.657),
     IntegratorRow(DormandPrince(), 271.828183, 3.3065, 0.997),
-    IntegratorRow(
-        ExponentialDrag(), 271.68016, 2, 2
-    ),  # of drag that it is not told of; of other drag there is no limit
+    IntegratorRow(ExponentialDrag(), 271.68016, 2, 2),  # of drag that it is not told of; of other there is no limit
+    IntegratorRow(ImplicitEuler(), 286.79720, math.inf, math.inf),
+    IntegratorRow(ImplicitMidpoint(), 272.055141, math.inf, math.inf),
 )
 
 SPACES = {
@@ -271,11 +285,25 @@ EDGE = 6.0
 """m: agents of `scene_of` begin in a square or cube of this edge."""
 
 
+def tied(group: Group, dimension: int) -> Group:
+    """Return the same group as a network: one after another, wherever they are, and stretched."""
+    count = group.size
+    vertices = np.random.default_rng(5).uniform(0.2 * EDGE, 0.8 * EDGE, (count, dimension))
+    mesh = Mesh(
+        vertices=tuple(map(tuple, vertices.tolist())), bars=tuple((i, i + 1) for i in range(count - 1)),
+        angles=tuple((i, i + 1, i + 2) for i in range(count - 2)), stretch=1.2,
+    )  # fmt: skip
+    return Group(network=mesh, mass=group.mass, radius=group.radius)
+
+
 def scene_of(*effects: Effect, dimension: int = 2, space: Space | None = None, **fields: Any) -> Scene:
     """Return two kinds of agents under some effects, among two obstacles if one of them asks for obstacles."""
     low, high = (0.0,) * dimension, (EDGE,) * dimension
     spawn = Spawn(low=low, high=high, speed=(0.2, 1.5))
     groups = (Group(count=14, mass=0.7, radius=0.1, spawn=spawn), Group(count=10, mass=2, radius=0.25, spawn=spawn))
+    groups = fields.pop("groups", groups)
+    if any(effect.bond_law for effect in effects):
+        groups = (tied(groups[0], dimension), *groups[1:])
     asked = any(effect.obstacle_law for effect in effects)
     centres = ((1.5, 2.0, 2.5)[:dimension], (4.5, 3.5, 3.0)[:dimension]) if asked else ()
     obstacles = tuple({"centre": centre, "radius": 0.6} for centre in centres)
@@ -295,12 +323,12 @@ FIRST = tuple({row.effect.kind: row for row in reversed(EFFECTS)}.values())[::-1
 def everything(dimension: int, *chosen: Effect, **fields: Any) -> Scene:
     """Return all kinds of effects at once, on a torus unless another space is given; but those on everybody.
 
-    They are refused on a torus, and would make every scene of many agents here one with a tree.
+    They are refused on a torus, like walls, and would make every scene of many agents here one with a tree.
     With some chosen, the others are there and idle: one kernel serves for tests of each of them, as long as they look
     around in the same ways (sweep.Parts.sights: who shares a radius, and who has a view cone at all).
     """
     own = {effect.kind: effect for effect in chosen}
-    others = [row.effect for row in FIRST if not row.effect.far_law]
+    others = [row.effect for row in FIRST if row.torus and not (row.effect.far_law or row.effect.bond_law)]
     rest = {effect.kind: in_dimension(effect, dimension) for effect in others}
     given = {"space": SPACES["torus"][dimension]} | fields
     effects = ({kind: effect.idle() for kind, effect in rest.items()} if chosen else rest) | own
@@ -434,7 +462,7 @@ class Tether(Effect):
     With m = 1 kg, x'' = -stiffness x - damping x' - sine sin x - sun x / |x|^3 + push cos 2t + weight.
     \"\"\"
 
-    kind: Literal["tether"] = "tether"
+    kind: Literal["users_tether"] = "users_tether"
     stiffness: float = Field(default=0.0, ge=0, description="N/m")
     damping: float = Field(default=0.0, ge=0, description="kg/s")
     sine: float = Field(default=0.0, ge=0, description="N, a pendulum along each axis")

@@ -20,7 +20,7 @@ hypothesis.settings.register_profile("flockenv", derandomize=True, deadline=None
 hypothesis.settings.load_profile("flockenv")
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="module")  # and forgotten afterwards: other files count the effects there are
 def tether(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
     """The effect of catalogue.TETHER."""
     with users_module(tmp_path_factory.mktemp("laws"), TETHER, "tethers") as module:

@@ -18,7 +18,12 @@ import flockenv
 from flockenv.cli import app, main
 from flockenv.config import load_scene, schema
 from flockenv.effects import EFFECTS
-from flockenv.integrators import INTEGRATORS
+from flockenv.effects.springs import Springs
+from flockenv.explanation import Explanation
+from flockenv.integrators import INTEGRATORS, ImplicitEuler
+from flockenv.networks import Rope
+from flockenv.scene import Group, Scene
+from flockenv.stability import suggest_dt
 from flockenv.tasks import TASKS
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -165,7 +170,7 @@ def progress(title, total, unit):
             os.kill(os.getpid(), signal.SIGINT)
     yield show
 
-cli._progress = progress
+cli.progress_bar = progress
 sys.exit(cli.main())
 """
     return subprocess.run(
@@ -249,6 +254,21 @@ def test_explain_says_what_is_called_for_and_what_was_left_out(capsys: pytest.Ca
     assert "neighbour query: no effect asks who is near whom" in unasked
     assert "pass over obstacles (0): no effect asks for them" in unasked
     assert f"effects that are not listed: {', '.join(sorted(EFFECTS.keys() - {'drag'}))}" in " ".join(unasked.split())
+    assert "Largest stable step: 4 s (drag, agent 0), dt = 0.01 s" in unasked  # |1 - h c / m| = 1
+    assert "Largest stable step: nothing in it sets a limit, unless agents that meet do; dt = 0.01 s" in asked
+
+
+def test_explain_says_who_sets_the_largest_step() -> None:
+    def said(scene: Scene) -> str:
+        return Explanation(scene, (), 0.0, 0.0, {}, (), suggest_dt(scene)).largest_step
+
+    rope = Rope(links=4, length=4, pinned=("start",))
+    scene = Scene(groups=(Group(network=rope),), effects=(Springs(stiffness=100),), dt=0.02)
+    # three free particles between two springs: w^2 <= 2 (100 + 100) N/m / kg, and h w = 2 at the most
+    assert said(scene) == "0.1 s (springs, agent 1), dt = 0.02 s"
+    assert said(scene.model_copy(update={"integrator": ImplicitEuler()})) == (
+        "any is stable with implicit_euler, dt = 0.02 s"
+    )
 
 
 # --- mistakes ---------------------------------------------------------------------------------------------------------

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from flockenv.effects import Attraction, Carried, Drag, Effect, Gravity, QuadraticDrag, Sink, Source, Vortex
+from flockenv.effects import Attraction, Carried, Drag, Effect, Gravity, QuadraticDrag, Sink, Source, Uniform, Vortex
 from flockenv.integrators import RK4, ExplicitEuler, Integrator, SemiImplicitEuler, VelocityVerlet
 from flockenv.scene import Group, Scene
 from flockenv.spawn import Spawn
@@ -163,6 +163,32 @@ def test_a_vortex_does_work_in_every_turn_and_the_others_none(field: Any, turn: 
     along = force @ np.array([[0, 1], [-1, 0]]).T  # turned back by a quarter, so that ahead becomes outwards
     work = (along * start.pos[0]).sum() * 2 * np.pi / 64
     assert work == pytest.approx(turn * 2 * np.pi * r * PHI / (PHI / MOST + r**2), abs=1e-12)
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_forces_are_the_slopes_of_the_potentials_that_effects_state(dimension: int) -> None:
+    """All that have one, together: F . dx = -dU for any small way; a medium, a vortex and what swings state none."""
+    centre = (0.3, -0.2, 0.5)[:dimension]
+    given: dict[str, Any] = {"strength": PHI, "maximum": MOST, "centre": centre}
+    down, aside = (0.3, -G, 1.0)[:dimension], (1.0, 0.5, -2.0)[:dimension]
+    effects = (
+        Gravity(acceleration=down), Uniform(strength=aside), Source(**given), Sink(**{**given, "strength": 0.7}),
+        Attraction(centre=centre, strength=-1.5, softening=0.2),
+    )  # fmt: skip
+    scene = body(effects, RK4(), 0.01, mass=1.5, dimension=dimension)
+    rng, start = np.random.default_rng(0), scene.start(0)
+
+    def potential_at(x: Array) -> float:
+        start.pos[0, 0] = x
+        found = [effect.potential(scene.groups, start, scene.space.displacement) for effect in effects]
+        return float(sum(one[0] for one in found if one is not None))
+
+    for x, way in zip(rng.normal(size=(10, dimension)), 1e-5 * rng.normal(size=(10, dimension)), strict=True):
+        change = potential_at(x + way) - potential_at(x - way)
+        start.pos[0, 0] = x
+        assert 1.5 * scene.acceleration(start)[0, 0] @ (2 * way) == pytest.approx(-change, rel=1e-5, abs=1e-10)
+    silent = (Vortex(**given), Source(**given, acts="medium"), Sink(**given, period=1.0))
+    assert [effect.potential(scene.groups, start, scene.space.displacement) for effect in silent] == [None] * 3
 
 
 KEPLER = {  # numerics.md, N04: 1000 steps a turn, 100 turns; energy and angular momentum to within so much

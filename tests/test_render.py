@@ -18,9 +18,13 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from flockenv.networks import Cloth
 from flockenv.render import Group, Panel, Window, draw, write_gif, write_png, write_replay
 from flockenv.render.palette import ROLE_COLOURS, rgb
+from flockenv.scene import Group as SceneGroup
+from flockenv.scene import Scene
 from flockenv.snapshot import ROLES, Mark, Snapshot
+from flockenv.spawn import Spawn
 
 
 def shot(pos: Any = ((5.0, 5.0),), vel: Any = None, **fields: Any) -> Snapshot:
@@ -66,7 +70,7 @@ def test_snapshot_copies_and_is_read_only() -> None:
     made = shot(vel=vel)
     vel[:] = 7.0
     assert (made.vel == 1.0).all()
-    for name in ("pos", "vel", "alive", "radius", "obstacle_centre", "obstacle_radius", "low", "high"):
+    for name in ("pos", "vel", "alive", "radius", "obstacle_centre", "obstacle_radius", "low", "high", "bonds"):
         with pytest.raises(ValueError, match="read-only"):
             getattr(made, name)[...] = 0
     with pytest.raises(AttributeError):
@@ -96,6 +100,10 @@ def test_snapshot_survives_pickling() -> None:
         ({"time": np.inf}, "Snapshot.time: must be finite"),
         ({"title": 3}, "Snapshot.title: must be a str, got int"),
         ({"marks": ("goal",)}, "Snapshot.marks: must hold Mark, got str"),
+        ({"bonds": [(0, 1)]}, r"Snapshot.bonds: must be agents from 0 to 0, got \[1\]"),
+        ({"bonds": [(0, -1)]}, r"Snapshot.bonds: must be agents from 0 to 0, got \[-1\]"),
+        ({"bonds": [0, 0]}, r"Snapshot.bonds: must have shape \(any, 2\), got shape \(2,\)"),
+        ({"bonds": [(0.0, 0.0)]}, "Snapshot.bonds: must be whole numbers, got float64"),
         ({"marks": (Mark("goal", np.ones(3), np.ones(3), 0.0),)}, "Snapshot.marks: must have 2 coordinates, got 3"),
     ],
 )
@@ -210,6 +218,35 @@ def test_what_is_nearer_in_three_dimensions_is_larger_and_on_top() -> None:
     image = draw(shot([(5.0, 5.0, 10.0), (5.0, 5.0, 2.0)], **two))
     x, y = np.rint(blob(image, "evader")).astype(int)
     assert close_to(image, rgb(ROLE_COLOURS["evader"][0]), 20)[y, x]
+
+
+def test_bonds_are_lines_between_dots() -> None:
+    pair = {"pos": [(2.0, 5.0), (8.0, 5.0)], "vel": [(1.0, 0.0), (1.0, 0.0)], "radius": [0.1, 0.1]}
+    empty = draw(shot(np.empty((0, 2))))
+    free, tied = (
+        difference(draw(shot(**pair, bonds=bonds)), empty) > 20 for bonds in (np.zeros((0, 2), int), [(1, 0)])
+    )
+    assert not free[60:, 200:400].any()
+    assert tied[60:, 200:400].any(axis=0).all()
+    assert 1 <= tied[60:, 300].sum() <= 3  # a thin one
+    dot = np.flatnonzero(tied[60:, :].any(axis=0))[0], np.flatnonzero(free[60:, :].any(axis=0))[0]
+    assert dot[0] > dot[1]  # no dart stands out behind it
+    for gone in ({"alive": [True, False], "roles": ("agent",) * 2}, {"vel": [(1.0, 0.0), (np.nan, 0.0)]}):
+        alone = difference(draw(shot(**{**pair, **gone}, bonds=[(0, 1)])), empty) > 20
+        assert not alone[60:, 200:400].any()
+
+
+def test_a_bond_across_the_seam_takes_the_shortest_way() -> None:
+    pair = {"pos": [(1.0, 5.0), (9.0, 5.0)], "radius": [0.1, 0.1], "periodic": True}
+    seen = difference(draw(shot(**pair, bonds=[(0, 1)])), draw(shot(np.empty((0, 2)), periodic=True))) > 20
+    assert not seen[60:, 100:500].any()
+    assert seen[60:, 30:60].any(axis=0).all()
+    assert seen[60:, 540:570].any(axis=0).all()
+
+
+def test_what_is_tied_leaves_no_trail() -> None:
+    way = [shot([(3.0 + k, 5.0), (3.0 + k, 6.0)], bonds=[(0, 1)]) for k in range(4)]
+    assert (draw(way[-1], trails=way[:-1]) == draw(way[-1])).all()
 
 
 def test_trails_show_the_way_and_do_not_streak_across_the_seam() -> None:
@@ -515,6 +552,25 @@ def test_a_replay_tells_the_dead_the_resting_and_the_lost(tmp_path: Path) -> Non
     (packed,) = written(tmp_path / "r.html", [Group("g", [panel([one])])]).data["groups"][0]["panels"]
     assert list(base64.b64decode(packed["heading"])) == [255, 254, 255, 64]
     assert (decoded(packed)[0, 2:] == [(-5.0, -5.0), (15.0, -5.0)]).all()  # outside, where nobody looks
+
+
+def test_a_replay_keeps_bonds_once(tmp_path: Path) -> None:
+    (packed,) = written(tmp_path / "r.html", [Group("g", [panel(run(bonds=[(0, 2), (2, 1)]))])]).data["groups"][0][
+        "panels"
+    ]
+    assert packed["bonds"] == [[0, 2], [2, 1]]
+    with pytest.raises(ValueError, match="snapshot 1 must have the agents, roles, bonds"):
+        panel([run(2)[0], run(2, bonds=[(0, 1)])[1]])
+
+
+def test_a_scene_shows_the_edges_of_its_networks() -> None:
+    cloth = Cloth(cells=(2, 1), sides=(2, 1))
+    scene = Scene(
+        groups=(SceneGroup(count=3, spawn=Spawn(low=(0, 0), high=(1, 1))), SceneGroup(network=cloth)), effects=()
+    )
+    seen = scene.snapshot(scene.start(0))
+    assert {tuple(bond) for bond in seen.bonds.tolist()} == {(3, 4), (4, 5), (6, 7), (7, 8), (3, 6), (4, 7), (5, 8)}
+    assert seen.tied.tolist() == [False] * 3 + [True] * 6
 
 
 def test_a_replay_keeps_scenery_only_when_it_changes(tmp_path: Path) -> None:

@@ -162,6 +162,7 @@ def test_a_player_that_has_changed_plays_anew(monkeypatch: pytest.MonkeyPatch) -
     assert counted.calls == 4
 
 
+@pytest.mark.slow
 def test_two_processes_find_what_one_finds() -> None:
     asked = ("--players", "random,reynolds", "--methods", "semi_implicit_euler,midpoint", "--substeps", "2")
     run(*TINY, *asked)

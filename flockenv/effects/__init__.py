@@ -22,10 +22,11 @@ from flockenv.effects.gravity import Gravity  # noqa: E402
 from flockenv.effects.pressure import Pressure  # noqa: E402
 from flockenv.effects.springs import AngularSprings, Springs  # noqa: E402
 from flockenv.effects.tether import Swing, Tether  # noqa: E402
+from flockenv.effects.wall import WallRepulsion  # noqa: E402
 
 __all__ = [
     "EFFECTS", "Alignment", "AngularSprings", "Attraction", "AvoidObstacles", "Carried", "Cohesion", "Drag", "Effect",
     "Elastic", "Far", "Fluctuation", "Gravitation", "Gravity", "InverseSquare", "Me", "Other", "Pressure",
     "QuadraticDrag", "Separation", "Sight", "Sink", "Source", "Springs", "Swing", "Tether", "Uniform", "Vortex",
-    "Wind",
+    "WallRepulsion", "Wind",
 ]  # fmt: skip

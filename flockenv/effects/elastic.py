@@ -78,6 +78,11 @@ class Elastic(Effect):
     bond_law: ClassVar[str | None] = "elastic"
     strengths: ClassVar[tuple[str, ...]] = ("young", "alpha", "beta")
 
+    @property
+    def conserves_momentum(self) -> bool:  # type: ignore[override]  # damping that goes with the mass does not
+        """True unless it is held back by something outside."""
+        return self.alpha == 0
+
     def numbers(self, dimension: int) -> int:
         """A block of K, and the way to the neighbour when nothing is deformed."""
         return dimension * dimension + dimension

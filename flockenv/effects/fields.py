@@ -13,17 +13,22 @@ rarely what is meant.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, ClassVar, Literal, Self
 
 import numpy as np
 from numba.extending import overload
+from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from flockenv.effects.base import Effect, Me, Vector
 from flockenv.kernels import OPTIONS, Vec, law, like
+from flockenv.state import State
 from flockenv.vec import add, dot, lateral, scale, sub, unit
 
 __all__ = ["Carried", "Sink", "Source", "Uniform", "Vortex", "Wind"]
+
+Floats = NDArray[np.float64]
 
 
 def swing(p: Any, me: Me) -> float:
@@ -138,6 +143,16 @@ class _Field(_Timed):
         """The law, if it moves the medium."""
         return self.formula if self.acts == "medium" else None
 
+    def potential(self, groups: Sequence[Any], state: State, offset: Any) -> Floats | None:
+        """Sum over all agents, (B,) J; none for a medium, for what swings in time, and for what has no potential."""
+        steady = self.acts == "force" and self.period is None
+        each = self._energy(np.asarray(state.pos, np.float64), offset) if steady else None
+        return None if each is None else np.asarray(each.sum(axis=1))
+
+    def _energy(self, pos: Floats, offset: Any) -> Floats | None:
+        """Return the potential energy of the steady force, of agents at (B, N, D) m, (B, N) J."""
+        return None
+
 
 class _Central(_Field):
     """Fields whose magnitude falls with the distance from a centre, on a torus from its nearest image."""
@@ -146,6 +161,12 @@ class _Central(_Field):
     maximum: float = Field(gt=0, description="Phi_max, N as a force, m/s as a medium: what it is near the centre")
     places: ClassVar[tuple[str, ...]] = ("centre",)
 
+    def _arctan(self, pos: Floats, offset: Any) -> Floats:
+        """Return Phi / sqrt(a) arctan(r / sqrt(a)), a = Phi / Phi_max, J: the potential energy in a sink."""
+        soft = np.sqrt(self.strength / self.maximum)  # type: ignore[attr-defined]  # whoever has it calls this
+        r = np.linalg.norm(offset(self.centre, pos), axis=-1)
+        return np.asarray(self.maximum * soft * np.arctan2(r, soft))
+
 
 class Uniform(_Field):
     """The same everywhere. As a force it does work F . (x - x0), whatever the mass: for gravity see `Gravity`."""
@@ -153,6 +174,10 @@ class Uniform(_Field):
     kind: Literal["uniform"] = "uniform"
     strength: Vector = Field(description="N as a force, m/s as a medium, per axis")
     formula: ClassVar[str] = "uniform"
+
+    def _energy(self, pos: Floats, offset: Any) -> Floats:
+        """-F . x."""
+        return np.asarray(-pos @ np.array(self.strength))
 
 
 class Source(_Central):
@@ -165,6 +190,10 @@ class Source(_Central):
     strength: float = Field(ge=0, description="Phi, N m^2 as a force, m^3/s as a medium")
     formula: ClassVar[str] = "source"
 
+    def _energy(self, pos: Floats, offset: Any) -> Floats:
+        """What a sink has, and the other sign."""
+        return -self._arctan(pos, offset)
+
 
 class Sink(_Central):
     """Towards a centre, W = Phi / (Phi / Phi_max + r^2): a source backwards.
@@ -175,6 +204,10 @@ class Sink(_Central):
     kind: Literal["sink"] = "sink"
     strength: float = Field(ge=0, description="Phi, N m^2 as a force, m^3/s as a medium")
     formula: ClassVar[str] = "sink"
+
+    def _energy(self, pos: Floats, offset: Any) -> Floats:
+        """0 in the centre, and at most pi / 2 Phi / sqrt(a)."""
+        return self._arctan(pos, offset)
 
 
 class Vortex(_Central):

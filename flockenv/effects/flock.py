@@ -87,7 +87,7 @@ class _FlockRule(Effect):
         """Radius, field of view, how many."""
         return Sight(self.radius, self.fov, self.nearest)
 
-    def parameters(self) -> dict[str, float]:
+    def parameters(self) -> dict[str, float | Vec]:
         """The weight: who is seen is the sweep's business."""
         return {"weight": self.weight}
 

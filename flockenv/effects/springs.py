@@ -207,5 +207,5 @@ def _angles(a: Floats, b: Floats) -> Floats:
     """Return the angle from a to b, (..., D): with a sign in the plane, between 0 and pi in space."""
     along = (a * b).sum(axis=-1)
     if a.shape[-1] == 2:
-        return np.arctan2(a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0], along)
-    return np.arctan2(np.linalg.norm(np.cross(a, b), axis=-1), along)
+        return np.asarray(np.arctan2(a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0], along))
+    return np.asarray(np.arctan2(np.linalg.norm(np.cross(a, b), axis=-1), along))

@@ -65,7 +65,7 @@ class AdaptiveRK4(Integrator):
     """Runge-Kutta of order 4 with steps of its own within dt, 11 evaluations each; costs most where forces jump."""
 
     kind: Literal["adaptive_rk4"] = "adaptive_rk4"
-    tolerance: float = Field(default=1e-6, gt=0, description="error of one step, m and m/s, of the worst agent")
+    tolerance: float = Field(default=1e-4, gt=0, description="error of one step, m and m/s, of the worst agent")
     least: float = Field(
         default=0.0, ge=0, description="s, smallest step; a world that needs a smaller one is given up"
     )

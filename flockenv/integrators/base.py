@@ -43,7 +43,7 @@ def _carried(x, seconds, flow, i):  # type: ignore[no-untyped-def]  # numba comp
 class Alone(NamedTuple):
     """The context of a world whose laws are Python functions."""
 
-    drag: float = 0.0  # c / m, 1/s
+    drag: float | Floats = 0.0  # c / m, 1/s, of all or of each coordinate (D N,)
     settings: tuple[float, ...] = ()  # of the method, see Integrator.settings
     dimension: int = 1
     work: Any = None  # (8,), the world's row of State.work

@@ -70,7 +70,7 @@ class DormandPrince(Integrator):
     """Dormand-Prince 5(4) with steps of its own within dt, 6 evaluations each and one more; for smooth forces."""
 
     kind: Literal["dormand_prince"] = "dormand_prince"
-    tolerance: float = Field(default=1e-6, gt=0, description="error of one step, m and m/s, of the worst agent")
+    tolerance: float = Field(default=1e-4, gt=0, description="error of one step, m and m/s, of the worst agent")
     least: float = Field(
         default=0.0, ge=0, description="s, smallest step; a world that needs a smaller one is given up"
     )

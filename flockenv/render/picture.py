@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
-from flockenv.render.palette import ARROW, BODY_DISC, DART, DART_REACH, JUMP, PAPER, ROLE_COLOURS, mix, rgb
+from flockenv.render.palette import ARROW, BODY_DISC, BOND, DART, DART_REACH, JUMP, PAPER, ROLE_COLOURS, mix, rgb
 from flockenv.render.view import View, look
 from flockenv.snapshot import Floats, Mark, Snapshot
 
@@ -34,8 +34,9 @@ def draw(snapshot: Snapshot, size: int = 600, scale: int = 2, trails: Sequence[S
     """Return the picture of a snapshot, (height, width, 3) uint8, width = size and height <= size px, both even.
 
     Agents are darts that point along their velocity, over a disc of their body radius, coloured by role (Okabe-Ito);
-    one at rest is a dot. 3-D is seen from above: what is higher is larger and drawn last.
-    trails: earlier snapshots of the same world, oldest first; every agent then draws its way behind it.
+    one at rest is a dot. Those with bonds are dots of their radius, behind which bonds are thin lines. 3-D is seen from
+    above: what is higher is larger and drawn last.
+    trails: earlier snapshots of the same world, oldest first; agents without bonds then draw their way behind them.
     scale: supersampling, 1 (fast, jagged) to 4. Raises ValueError or TypeError on a size or scale out of range.
     """
     _whole("size", size, _SIZES)
@@ -49,6 +50,7 @@ def draw(snapshot: Snapshot, size: int = 600, scale: int = 2, trails: Sequence[S
         _trails(pen, view, [*trails, snapshot])
     for mark in snapshot.marks:
         _mark(pen, view, mark)
+    _bonds(pen, view, snapshot)
     _bodies(pen, view, snapshot)
     _trim(canvas, backdrop, view, view.spill)
     _clock(pen, view, snapshot.time)
@@ -217,12 +219,35 @@ def _darts(spots: Floats, aim: Floats, reach: Floats) -> Floats:
     return np.asarray(spots[:, None] + reach[:, None, None] * corners * np.array([1.0, -1.0]))
 
 
+def _bonds(pen: ImageDraw.ImageDraw, view: View, snapshot: Snapshot) -> None:
+    """Draw a line for every bond of which both ends are there, the lowest first; across a seam from either side."""
+    there = snapshot.alive & snapshot.visible
+    bonds = snapshot.bonds[there[snapshot.bonds].all(axis=1)]
+    if not len(bonds):
+        return
+    way = snapshot.pos[bonds[:, 1]] - snapshot.pos[bonds[:, 0]]
+    if snapshot.periodic:
+        extent = snapshot.high - snapshot.low
+        way -= extent * np.rint(way / extent)
+    ends = [snapshot.pos[bonds[:, 0]], snapshot.pos[bonds[:, 1]]]
+    lines = np.concatenate([view.place(ends[0]), view.place(ends[0] + way)], axis=1)
+    copies = np.concatenate([view.place(ends[1] - way), view.place(ends[1])], axis=1)
+    twice = np.abs(copies - lines).max(axis=1) > 1.0
+    depth, thick = _depth(snapshot)[bonds].mean(axis=1), max(1, round(view.width * BOND))
+    for k in np.argsort(depth, kind="stable").tolist():
+        share = 0.6 * (0.45 + 0.55 * float(depth[k]))
+        fill = mix(ROLE_COLOURS[snapshot.roles[bonds[k, 0]]][0], _PAPER, share)
+        for line in (lines[k], copies[k]) if twice[k] else (lines[k],):
+            pen.line(line.tolist(), fill=fill, width=thick)
+
+
 def _bodies(pen: ImageDraw.ImageDraw, view: View, snapshot: Snapshot) -> None:
     seen = np.flatnonzero(snapshot.visible)
     depth = _depth(snapshot)
     swell = 0.7 + 0.5 * depth if snapshot.dimension == 3 else depth
     body = snapshot.radius * view.metre * swell
     reach = np.maximum(body, DART_REACH * view.width * swell)
+    tied, dot = snapshot.tied, view.width * BOND
     spots = view.place(snapshot.pos)
     aim = _aim(np.where(snapshot.visible[:, None], snapshot.vel, 0.0))
     darts = _darts(spots, aim, 0.94 * reach)
@@ -232,6 +257,10 @@ def _bodies(pen: ImageDraw.ImageDraw, view: View, snapshot: Snapshot) -> None:
         for a, b in view.sightings(x, y, 1.1 * float(reach[i])):
             if not snapshot.alive[i]:
                 _cross(pen, a, b, float(reach[i]), role)
+                continue
+            if tied[i]:
+                shade = mix(ROLE_COLOURS[role][0], _PAPER, 0.45 + 0.55 * float(depth[i]))
+                _disc(pen, a, b, max(float(body[i]), dot), shade)
                 continue
             corners = (darts[i] + (a - x, b - y)).ravel().tolist() if aim[i].any() else []
             _agent(pen, a, b, corners, float(body[i]), float(reach[i]), role, float(depth[i]))
@@ -269,7 +298,7 @@ def _trails(pen: ImageDraw.ImageDraw, view: View, path: Sequence[Snapshot]) -> N
         if old.pos.shape != now.pos.shape:
             raise ValueError(f"trails: must have positions of shape {now.pos.shape}, got {old.pos.shape}")
     spots = view.place(np.stack([old.pos for old in path]))
-    there = np.stack([old.alive & old.visible for old in path])
+    there = np.stack([old.alive & old.visible & ~now.tied for old in path])
     jump = np.abs(np.diff(spots, axis=0)) < JUMP * np.array([view.right - view.left, view.bottom - view.top])
     linked = there[1:] & there[:-1] & jump.all(axis=2)
     lines = np.concatenate([spots[:-1], spots[1:]], axis=2)

@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flockenv.outputs import replacing
-from flockenv.render.palette import ARROW, BODY_DISC, DART, DART_REACH, JUMP, PAPER, ROLE_COLOURS
+from flockenv.render.palette import ARROW, BODY_DISC, BOND, DART, DART_REACH, JUMP, PAPER, ROLE_COLOURS
 from flockenv.snapshot import Floats, Mark, Snapshot
 
 __all__ = ["Group", "Panel", "write_replay"]
@@ -71,7 +71,7 @@ class Panel:
                     f"{who}: times must increase, got {last.time:g} s then {shot.time:g} s at snapshot {k}"
                 )
             if not _alike(shot, shots[0]):
-                raise ValueError(f"{who}: snapshot {k} must have the agents, roles and region of snapshot 0")
+                raise ValueError(f"{who}: snapshot {k} must have the agents, roles, bonds and region of snapshot 0")
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,6 +104,7 @@ def write_replay(path: str | os.PathLike[str], groups: Sequence[Group], title: s
         "arrow": ARROW,
         "reach": DART_REACH,
         "disc": BODY_DISC,
+        "bond": BOND,
         "jump": JUMP,
         "beyond": _BEYOND,
         "directions": _DIRECTIONS,
@@ -127,6 +128,7 @@ def _alike(one: Snapshot, other: Snapshot) -> bool:
         one.pos.shape == other.pos.shape
         and one.roles == other.roles
         and one.periodic == other.periodic
+        and np.array_equal(one.bonds, other.bonds)
         and np.array_equal(one.low, other.low)
         and np.array_equal(one.high, other.high)
     )
@@ -147,6 +149,7 @@ def _panel(panel: Panel) -> dict[str, Any]:
         "radius": [_short(r, 6) for r in first.radius],
         "pos": _packed(np.stack([_positions(shot) for shot in shots])),
         "heading": _packed(np.stack([_headings(shot) for shot in shots])),
+        "bonds": first.bonds.tolist(),
         "scenery": _scenery(shots),
     }
 

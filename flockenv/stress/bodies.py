@@ -14,9 +14,10 @@ from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
 
 from flockenv.divergence import SimulationDiverged
-from flockenv.effects import Attraction, Carried, Drag, Gravity, Swing, Tether, Uniform, Vortex
+from flockenv.effects import Attraction, Carried, Drag, Gravity, Swing, Tether, Uniform, Vortex, WallRepulsion
 from flockenv.integrators import Integrator
 from flockenv.scene import Group, Scene
+from flockenv.space import Box
 from flockenv.spawn import Spawn
 from flockenv.stability import amplification, limit
 from flockenv.state import State
@@ -50,7 +51,7 @@ def ended(scene: Scene, pos: Any, vel: Any, steps: int) -> tuple[Floats, Floats]
     return np.asarray(end.pos[0, 0]), np.asarray(end.vel[0, 0])
 
 
-# --- N01: energy ------------------------------------------------------------------------------------------------------
+# --- N01: energy -----------------------------------------------------------------------------------------------------
 
 PRINTED: dict[str, Callable[[float, int], tuple[float, float]]] = {
     "explicit_euler": lambda y, n: ((1 + y * y) ** n,) * 2,
@@ -85,7 +86,7 @@ def _range(low: float, high: float) -> str:
     return f"{low:.6g}" if low == high else f"{low:.6g} to {high:.6g}"
 
 
-# --- N02: orders ------------------------------------------------------------------------------------------------------
+# --- N02: orders -----------------------------------------------------------------------------------------------------
 
 
 def _slope(make: Callable[[float], Scene], end: Floats, begin: tuple[Any, Any], seconds: float) -> float:
@@ -154,7 +155,7 @@ def _projectile(t: float, k: float) -> Floats:
     ])  # fmt: skip
 
 
-# --- N03: the edge of stability ---------------------------------------------------------------------------------------
+# --- N03: the edge of stability --------------------------------------------------------------------------------------
 
 
 def threshold(method: Integrator) -> Value:
@@ -185,7 +186,7 @@ def threshold(method: Integrator) -> Value:
     return Value(limit(method, 0.0), True, "largest h w: " + "; ".join(told))
 
 
-# --- N04: an orbit ----------------------------------------------------------------------------------------------------
+# --- N04: an orbit ---------------------------------------------------------------------------------------------------
 
 ORBIT = {
     "velocity_verlet": 4e-4, "rk4": 3e-7, "semi_implicit_euler": 2e-2, "midpoint": 3e-3, "dormand_prince": 1e-4,
@@ -216,7 +217,7 @@ def _constants(state: State) -> tuple[float, float]:
     return float(0.5 * v @ v - 1 / np.linalg.norm(x)), float(x[0] * v[1] - x[1] * v[0])
 
 
-# --- N16: a tracer in a vortex ----------------------------------------------------------------------------------------
+# --- N16: a tracer in a vortex ---------------------------------------------------------------------------------------
 
 PHI, MOST, R = 2.0, 5.0, 1.2
 
@@ -240,7 +241,7 @@ def tracer(method: Integrator) -> Value:
     return Value(off, off <= most, f"r = {radius:.9g} m of {R} m")
 
 
-# --- N20: stiff drag --------------------------------------------------------------------------------------------------
+# --- N20: stiff drag -------------------------------------------------------------------------------------------------
 
 
 def stiff_drag(share: float) -> Callable[[Integrator], Value]:
@@ -264,7 +265,7 @@ def stiff_drag(share: float) -> Callable[[Integrator], Value]:
     return trial
 
 
-# --- N09: exactly in the centre ---------------------------------------------------------------------------------------
+# --- N09: exactly in the centre --------------------------------------------------------------------------------------
 
 
 def in_the_centre(method: Integrator) -> Value:
@@ -277,12 +278,72 @@ def in_the_centre(method: Integrator) -> Value:
     return Value(far, far == 0.0, "stays where it is")
 
 
+# --- N13: a pedestrian and a wall -------------------------------------------------------------------------------------
+
+
+def approach(speed: float, tau: float, decay: float) -> Callable[[Integrator], Value]:
+    """Return the trial of Kretz: somebody of 1 kg who wants to walk at `speed` comes to rest before a wall, A = 100 N.
+
+    He oscillates if and only if v0 tau / B > 1/4, whatever the step (numerics.md 2.1, P11).
+    """
+
+    def trial(method: Integrator) -> Value:
+        effects = (
+            WallRepulsion(point=O2, normal=(-1.0, 0.0), strength=100.0, decay=decay),
+            Uniform(strength=(speed / tau, 0.0)), Drag(rate=1 / tau),
+        )  # fmt: skip
+        scene = Scene(groups=ONE, effects=effects, integrator=method, dt=0.01)
+        state, speeds = started(scene, [(-4.0, 0.0)], [(speed, 0.0)]), []
+        for _ in range(500):
+            state = scene.run(state, 4)
+            speeds.append(float(state.vel[0, 0, 0]))
+        turns = int((np.diff(np.sign([v for v in speeds if abs(v) > 1e-6])) != 0).sum())
+        gap, rest = float(-state.pos[0, 0, 0]), decay * math.log(100.0 * tau / speed)
+        swings = speed * tau / decay > 0.25
+        holds = (turns >= 2) == swings and (swings or turns == 0) and abs(gap - rest) <= 1e-3
+        return Value(abs(gap - rest), holds, f"{turns} turns, rests {gap:.5f} m before the wall of {rest:.5f}")
+
+    return trial
+
+
+# --- N05: a ball that bounces -----------------------------------------------------------------------------------------
+
+
+def bounces(method: Integrator) -> Value:
+    """A ball with e = .8 at 16 phases of the step: total time, 4.0637 s from 1 m; then at rest, never below."""
+    worst, low, moving = 0.0, 0.0, 0.0
+    for dt in (0.005, 0.02):
+        for phase in range(16):
+            worst_here, low_here, moving_here = _bounce(method, dt, 1.0 + phase / 16 * 9.81 * dt * 0.45)
+            worst, low, moving = max(worst, worst_here), min(low, low_here), max(moving, moving_here)
+    note = f"total time off by {worst:.2%} at worst, lowest {low:.1g} m, then {moving:.1g} m/s"
+    return Value(worst, worst <= 0.02 and low >= -1e-9 and moving == 0.0, note)
+
+
+def _bounce(method: Integrator, dt: float, height: float) -> tuple[float, float, float]:
+    """Return how far off the total time is, the lowest point and the speed afterwards."""
+    group = (Group(count=1, radius=0.0, spawn=Spawn(low=(0, 0), high=(1, 1))),)
+    room = Box(size=(2.0, 50.0), restitution=0.8)
+    scene = Scene(space=room, groups=group, effects=(Gravity(),), integrator=method, dt=dt)
+    state, low, rest = started(scene, [(1.0, height)], [O2]), 0.0, math.inf
+    expected = math.sqrt(2 * height / 9.81) * (1 + 0.8) / (1 - 0.8)
+    for k in range(math.ceil(1.1 * expected / dt)):
+        state = scene.step(state)
+        low = min(low, float(state.pos[0, 0, 1]))
+        still = state.vel[0, 0, 1] == 0 and state.pos[0, 0, 1] <= 1e-9
+        rest = min(rest, (k + 1) * dt) if still else math.inf
+    return abs(rest / expected - 1), low, float(np.abs(state.vel[0, 0, 1]))
+
+
 BODIES = (
     Case("N01", "oscillator, 100 periods at 100 steps", "energy of the formula, 1e-3", oscillator),
     Case("N02", "order on four problems", "declared +- .2", orders),
     Case("N03", "edge of stability", "bounded at .99, reported at 1.01", threshold),
     Case("N04", "Kepler e = .6, 1,000 steps a period", "|dE/E|: Verlet 4e-4, RK4 3e-7, SE 2e-2, else 1e-2", orbit),
+    Case("N05", "ball, e = .8, 16 phases", "4.064 s +- 2 %, then at rest, y >= 0", bounces),
     Case("N09 centre", "exactly in a centre of force", "stays", in_the_centre),
+    Case("N13 swings", "wall, v0 tau / B = 5", ">= 2 turns, gap 1e-3 m", approach(0.8, 0.5, 0.08)),
+    Case("N13 comes", "wall, v0 tau / B = .13", "no turn, gap 1e-3 m", approach(1.34, 0.05, 0.5)),
     Case("N16", "tracer in a vortex, 10 turns", "order 4: 1e-6; 2: 1e-2; Euler: its recursion, 1e-10", tracer),
     Case("N20 1.9", "drag, h c/m = 1.9", "explicit bounded, others never reverse", stiff_drag(1.9)),
     Case("N20 2.1", "drag, h c/m = 2.1", "explicit warned, others never reverse", stiff_drag(2.1)),

@@ -120,8 +120,14 @@ class Parts:
         for effect in self.effects:
             for value in effect.parameters().values():
                 values.extend(value if isinstance(value, tuple) else (value,))
+        values += self.space.numbers()
         values += self.integrator.settings()
         return values + ([self.look.radius, self.look.radius**2] if self.look else [])
+
+    @property
+    def bounces(self) -> bool:
+        """Do bodies come back from walls?"""
+        return self.space.bounce_law is not None
 
     @property
     def sweeps(self) -> bool:

@@ -84,6 +84,7 @@ def _imports(parts: Parts) -> str:
         "from flockenv.kernels import copy_line, finite, kernel, like, unaliased, wait_for_team",
         "from flockenv.neighbours import candidates, count_cells, order_records, row_of",
         f"from flockenv.space import {parts.space.offset_law} as offset_to, {parts.space.confine_law} as confine",
+        *([f"from flockenv.space import {parts.space.bounce_law} as bounce"] if parts.bounces else []),
         "from flockenv.noise import normal",
         "from flockenv.vec import add, dot, exact_dot, limit, norm, scale, sub, unit, zero",
         *tree_imports(parts),

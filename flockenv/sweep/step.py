@@ -84,8 +84,7 @@ def step_world(
     into_blocks(vel, v_, b, n, first, end)
 {indented(_confine(parts), 4)}
 {indented(move_in(parts), 4)}
-    for i in range(np.uint64(first * {d * parts.width}), np.uint64(end * {d * parts.width})):
-        origin[i] = pos[i]
+{indented(_remember(parts), 4)}
     context = ({CONTEXT})
     far, begun = like(dt, np.inf), tick[b]
 {indented(_kick_parameters(parts), 4)}
@@ -148,7 +147,7 @@ def _advance(parts: Parts) -> list[str]:
 def _bound(parts: Parts, first: str, end: str) -> list[str]:
     """Write what happens to the agents of some blocks after the method: limits, the space, and who is not finite."""
     bad = Slots(parts)("bad")
-    stored = (("pos", "x"), ("vel", "v"), ("origin", "x"))
+    stored = (("pos", "x"), ("vel", "v"), ("origin", "x"), *([("earlier", "v")] if parts.bounces else []))
     return [
         f"for block in range(np.uint64({first}), np.uint64({end})):",
         f"    base, row = block * np.uint64({parts.dimension * parts.width}), block * np.uint64({parts.width})",
@@ -160,11 +159,36 @@ def _bound(parts: Parts, first: str, end: str) -> list[str]:
         f"        {bad} = where if where < {bad} else {bad}",
         "        # nobody moves faster than max_speed, whatever a method makes of the velocity within the step",
         "        x = add(was, scale(limit(sub(x, was), max_speed[i] * dt), living[i]))",
-        "        x, v = confine(size, radius[i], x, scale(limit(v, max_speed[i]), living[i]))",
+        *indented_lines(_stay_inside(parts), 8),
         *(
             "        " + "; ".join(f"{lane(parts, array, k)} = {now}[{k}]" for array, now in stored)
             for k in range(parts.dimension)
         ),
+    ]
+
+
+def _remember(parts: Parts) -> list[str]:
+    """Write how positions before the step are kept; behind them, where bodies bounce, velocities."""
+    size = parts.dimension * parts.width
+    return [
+        *(["earlier = origin[len(pos):]"] if parts.bounces else []),
+        f"for i in range(np.uint64(first * {size}), np.uint64(end * {size})):",
+        "    origin[i] = pos[i]",
+        *(["    earlier[i] = vel[i]"] if parts.bounces else []),
+    ]
+
+
+def _stay_inside(parts: Parts) -> list[str]:
+    """Write how agent i is kept to the space: put back into it, or bounced off its walls."""
+    limited = "scale(limit(v, max_speed[i]), living[i])"
+    if not parts.bounces:
+        return [f"x, v = confine(size, radius[i], x, {limited})"]
+    settings = len(parts.integrator.settings()) + (2 if parts.look else 0)
+    restitution = f"params[{len(parts.parameters()) - settings - len(parts.space.numbers())}]"
+    before = f"scale({lanes_of(parts, 'earlier')}, living[i])"
+    return [
+        f"x, v = bounce(size, radius[i], {restitution}, dt, was, {before}, x, {limited})",
+        "v = limit(v, max_speed[i])",
     ]
 
 

@@ -20,7 +20,7 @@ _READ = (
     "tree_digit, tree_leaf, tree_node, tree_near, number, lanes, ranges"
 )
 SHARED = f"pos, vel, origin, stages, {_READ}"
-"""Scratch of one world in progress, in order; see scene.Workspace. The last two belong to one thread."""
+"""Scratch of one world in progress, in order; see workspace.Workspace. The last two belong to one thread."""
 
 CONTEXT = f"obstacle_x, obstacle_radius, work, params, b, n, present, arranged, first, end, rank, team, {_READ}"
 """What an acceleration is given beside positions and velocities, in order."""

@@ -1,0 +1,46 @@
+"""How far from the origin single precision tells places apart well enough to move."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+
+__all__ = ["FARTHEST", "check_places"]
+
+FARTHEST = 10_000.0
+"""m from the origin, along any axis, within which a float32 scene must lie: beyond, places are 1 mm apart and more.
+
+At 32,768 m somebody with 1 m/s does not move at all in steps of 1 ms (numerics.md P36).
+"""
+
+
+def check_places(scene: Any) -> None:
+    """Refuse a float32 scene with a place beyond FARTHEST; what moves there later is not looked after."""
+    if scene.dtype != "float32":
+        return
+    for name, value in _places(scene):
+        farthest = np.abs(np.asarray(value, float)).max(initial=0.0)
+        if farthest > FARTHEST:
+            what = value if isinstance(value, tuple) else f"{farthest:g} m"
+            raise ValueError(
+                f"{name} = {what}: float32 tells places apart up to {FARTHEST:,.0f} m from the origin; "
+                "use dtype = float64"
+            )
+
+
+def _places(scene: Any) -> Iterator[tuple[str, Any]]:
+    """Every place that a scene names, and its key."""
+    yield "space.size", getattr(scene.space, "size", ())
+    for k, group in enumerate(scene.groups):
+        if group.network is not None:
+            yield f"groups[{k}].network: its farthest coordinate", group.network.points(scene.dimension)
+        else:
+            yield f"groups[{k}].spawn.low", group.spawn.low or ()
+            yield f"groups[{k}].spawn.high", group.spawn.high or ()
+    for k, obstacle in enumerate(scene.obstacles):
+        yield f"obstacles[{k}].centre", obstacle.centre
+    for k, effect in enumerate(scene.effects):
+        for name in effect.places:
+            yield f"effects[{k}].{name}", getattr(effect, name)

@@ -1,0 +1,195 @@
+"""Commands that measure: what accuracy costs, and which methods survive hard cases."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from flockenv.refusals import shown
+from flockenv.terminal import INTERRUPTED, EarlyEnd, Force, Seed, new_console, progress_bar, relative, show_table
+
+if TYPE_CHECKING:
+    from flockenv.accuracy import Problem, Report
+    from flockenv.stress import Results
+
+__all__ = ["accuracy", "stress"]
+
+
+def accuracy(
+    scene: Annotated[str | None, typer.Argument(metavar="[SCENE.yaml]", help="A scene; none with --suite.")] = None,
+    suite: Annotated[bool, typer.Option("--suite", help="Measure the built-in problems instead.")] = False,
+    problems: Annotated[str, typer.Option(metavar="A,B", help="Of the suite these alone [default: all of them].")] = "",
+    seconds: Annotated[
+        float | None, typer.Option(metavar="S", help="Simulated time of a scene in seconds [default: 1].")
+    ] = None,
+    methods: Annotated[str, typer.Option(metavar="A,B", help="Integrators [default: all explicit ones].")] = "",
+    steps: Annotated[
+        str, typer.Option(metavar="N,M", help="In how many steps a scene is taken to its end [default: around its dt].")
+    ] = "",
+    dts: Annotated[str, typer.Option(metavar="S,S", help="The same, by the length of a step in seconds.")] = "",
+    tolerance: Annotated[
+        str, typer.Option(metavar="M,M", help="Errors in metres to find the cheapest way to.")
+    ] = "1e-2,1e-4,1e-6",
+    repetitions: Annotated[int, typer.Option(min=0, max=1000, help="Runs whose median is the wall time.")] = 20,
+    seed: Seed = 0,
+    out: Annotated[
+        str | None, typer.Option(metavar="X.json|X.png", help="Write the numbers; a picture has X.json beside it.")
+    ] = None,
+    force: Force = False,
+) -> None:
+    """Show what accuracy costs: how far each integrator ends from the truth in which steps, beside its time."""
+    from flockenv.accuracy import methods_named, problems_named, table, usual_methods
+    from flockenv.outputs import checked_file
+
+    if suite == (scene is not None):
+        raise ValueError("accuracy: needs a SCENE.yaml or --suite, one of them")
+    aimed = _numbers("--tolerance", tolerance)
+    if suite and (seconds is not None or steps or dts):
+        raise ValueError("--suite: has horizons and steps of its own; --seconds, --steps and --dts go with a scene")
+    if problems and not suite:
+        raise ValueError("--problems: goes with --suite")
+    path = checked_file(out, [".json", ".png"], force) if out is not None else None
+    if path is not None and path.suffix.lower() == ".png":
+        checked_file(str(path.with_suffix(".json")), [".json"], force)
+    chosen = methods_named(_words(methods)) if methods else usual_methods()
+    todo = problems_named(_words(problems)) if suite else [_problem(str(scene), seconds, steps, dts, seed)]
+    console, reports = new_console(), []
+    try:
+        for problem in todo:
+            with progress_bar(f"measuring {problem.name}", 100, "%") as progress:
+                reports.append(_measured(problem, chosen, repetitions, progress))
+            show_table(console, reports[-1].title, ([line] for line in table.headlines(reports[-1])), [""])
+            show_table(console, "", table.rows(reports[-1], aimed), table.columns(aimed))
+            show_table(console, "The cheapest", ([line] for line in table.best(reports[-1], aimed)), [""])
+            if reports[-1].stopped:
+                break
+    except KeyboardInterrupt:
+        if not reports:
+            raise
+    if path is not None and reports:
+        _keep(path, reports)
+        console.print(f"{len(reports)} problems in {relative(path)}")
+    if len(reports) < len(todo) or reports[-1].stopped:
+        raise EarlyEnd("interrupted; what was done is shown", INTERRUPTED)
+
+
+def _problem(file: str, seconds: float | None, steps: str, dts: str, seed: int) -> Problem:
+    """Return what is to be measured on a scene: by default in steps 4 times as long as its own to 32 times shorter."""
+    from flockenv.accuracy import Problem
+    from flockenv.config import load_scene
+    from flockenv.trajectory import whole_steps
+
+    loaded, horizon = load_scene(Path(file)), 1.0 if seconds is None else seconds
+    if steps and dts:
+        raise ValueError("--steps and --dts: say the same in two ways; give one of them")
+    if steps:
+        counts = [int(n) if n == int(n) else n for n in _numbers("--steps", steps)]
+    elif dts:
+        counts = [whole_steps("--seconds", horizon, dt, 1) for dt in _numbers("--dts", dts)]
+    else:
+        usual = whole_steps("--seconds", horizon, loaded.dt, 1)
+        coarsest = max(d for d in (1, 2, 4) if usual % d == 0)
+        counts = [usual * 2**k // coarsest for k in range(8)]
+    return Problem.of(loaded, horizon, counts, seed, name=Path(file).stem, title=Path(file).name)
+
+
+def _measured(
+    problem: Problem, methods: Sequence[Any], repetitions: int, progress: Callable[[int], None]
+) -> Report:  # fmt: skip
+    from flockenv.accuracy import measure
+
+    return measure(problem, methods, repetitions, progress=progress)
+
+
+def _keep(path: Path, reports: Sequence[Report]) -> None:
+    """Write the numbers, and a picture of them if that was asked for."""
+    from flockenv.accuracy import Results
+    from flockenv.outputs import replacing
+
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with replacing(path.with_suffix(".json")) as file:
+        file.write((Results(reports=tuple(reports)).model_dump_json(indent=1) + "\n").encode())
+    if path.suffix.lower() == ".png":
+        from flockenv.render.precision import write_precision
+
+        write_precision(path, reports)
+
+
+def _words(text: str) -> list[str]:
+    return [word.strip() for word in text.split(",") if word.strip()]
+
+
+def _numbers(option: str, text: str) -> list[float]:
+    """Return positive numbers written with commas between them."""
+    try:
+        numbers = [float(word) for word in _words(text)]
+    except ValueError:
+        numbers = []
+    if not numbers or not all(math.isfinite(x) and x > 0 for x in numbers):
+        raise ValueError(f"{option} = {shown(text)}: must be positive numbers with commas between them")
+    return numbers
+
+
+def stress(
+    cases: Annotated[str, typer.Option(metavar="A,B", help="Of the hard cases these alone, such as N14.")] = "",
+    methods: Annotated[str, typer.Option(metavar="A,B", help="Integrators [default: all].")] = "",
+    out: Annotated[
+        str | None,
+        typer.Option(
+            metavar="X.json|X.png",
+            help="Write the findings; a picture has X.json beside it. "
+            "What stands in X.json already is not tried again.",
+        ),
+    ] = None,
+    force: Force = False,
+) -> None:
+    """Try every hard case under every integrator, and show value, bound and verdict of each."""
+    from flockenv.outputs import checked_file
+    from flockenv.stress import CASES, Results, cases_named, methods_named, run
+
+    path = checked_file(out, [".json", ".png"], True) if out is not None else None
+    numbers = path.with_suffix(".json") if path is not None else None
+    todo, under = cases_named(CASES, _words(cases)), methods_named(_words(methods))
+    known: tuple[Any, ...] = ()
+    if numbers is not None and numbers.exists() and not force:
+        known = Results.model_validate_json(numbers.read_text(encoding="utf-8")).findings
+    so_far = Results(findings=())
+
+    def keep(results: Results) -> None:
+        nonlocal so_far
+        so_far = results
+
+    stopped = False
+    try:
+        with progress_bar("hard cases", len(todo) * len(under), "trials") as advance:
+            run(todo, under, known, lambda done, text: advance(done), keep)
+    except KeyboardInterrupt:
+        if not so_far.findings:
+            raise
+        stopped = True
+    console = new_console()
+    show_table(console, "Hard cases", so_far.rows(), ("case", "scene", "bound", *so_far.methods))
+    notes = ((f.case, f.method, f.verdict, f.note) for f in so_far.findings if f.verdict != "pass")
+    show_table(console, "What is not simply within its bound", notes, ("case", "method", "", ""))
+    if path is not None and numbers is not None:
+        _keep_findings(path, numbers, so_far)
+        console.print(f"{len(so_far.findings)} findings in {relative(path)}")
+    if stopped:
+        raise EarlyEnd("interrupted; what was done is shown, the same command goes on", INTERRUPTED)
+
+
+def _keep_findings(path: Path, numbers: Path, results: Results) -> None:
+    """Write the findings, and a picture of them if that was asked for."""
+    from flockenv.outputs import replacing
+
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with replacing(numbers) as file:
+        file.write((results.model_dump_json(indent=1) + "\n").encode())
+    if path.suffix.lower() == ".png":
+        from flockenv.render.verdicts import write_verdicts
+
+        write_verdicts(path, results)

@@ -1,0 +1,111 @@
+"""Workspace: scratch of those who step one world, counted and allocated before anything moves."""
+
+from __future__ import annotations
+
+import mmap
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flockenv.effects.base import ties
+from flockenv.kernels import LINE
+from flockenv.neighbours import MAX_RANGES, WORTH_ARRANGING
+from flockenv.state import Body
+from flockenv.sweep import SHARED, SMALL_STRIDE, Parts, Table
+from flockenv.tree import BUCKETS, LEVELS, tree_sizes
+
+__all__ = ["Workspace"]
+
+HUGE = 2**21
+"""Bytes of a large page."""
+
+GAP = 5 * LINE
+"""Bytes between two arrays of scratch."""
+
+
+@dataclass(frozen=True)
+class Workspace:
+    """Scratch of a team of threads that step one world: what a step writes and nobody reads afterwards."""
+
+    shared: tuple[NDArray[Any], ...]
+    own: tuple[tuple[NDArray[Any], NDArray[Any]], ...]  # lanes and ranges of each thread
+
+    @classmethod
+    def allocate(cls, parts: Parts, body: Body, table: Table, team: int = 1) -> Workspace:
+        """Return scratch for the sweep, the query and the integrator, in the order of sweep.SHARED."""
+        d, agents, dtype = parts.dimension, len(body.mass), body.mass.dtype
+        width = parts.width
+        padded = -(-agents // width) * width
+        sorts = parts.sweeps and parts.sorts
+        carried = agents if parts.arranges and agents >= WORTH_ARRANGING else 1
+        swept, cells = padded if parts.sweeps else 1, agents if sorts else 1
+        real: dict[str, int | tuple[int, ...]] = {
+            **dict.fromkeys(("pos", "vel", "want"), padded * d),
+            "origin": padded * d * (2 if parts.bounces else 1),
+            "stages": (max(parts.integrator.stages, 1), padded * d),
+            **dict.fromkeys(("mass", "radius", "max_speed", "max_force", "living", "ident"), padded),
+            "tie": padded * d if "t0" in parts.fields else 1,
+            "pulled": padded * d if parts.pulls else 1,
+            "carrying": padded * d if parts.flows else 1,
+            "felt": max(swept * d * len(parts.targets), 1),
+            "sorted_": parts.rows * (swept + width if parts.sorts else SMALL_STRIDE),
+            "records": (swept if sorts else 1) * parts.numbers,
+            "luggage": carried * parts.luggage_size,
+        }
+        real |= {name: size if parts.treed else 1 for name, size in tree_sizes(agents, width, d, team).items()}
+        whole = {
+            "order": (swept + width,),
+            "cell": (padded if sorts else 1,),
+            "start": (cells + 1,),
+            "offset": (team, cells),
+            "tree_place": (2 * padded if parts.treed else 1,),
+        }
+        wanted: dict[str, Any] = {name: (shape, np.dtype(dtype)) for name, shape in real.items()}
+        wanted |= {name: (shape, np.dtype(np.int32)) for name, shape in whole.items()}
+        arrays = _zeros(wanted)
+        arrays |= {"bounds": np.zeros((team, 6)), "tally": np.zeros(2 * team, np.int64), "sync": np.zeros(8, np.int64)}
+        keys, digits = (2 * padded, BUCKETS + LEVELS + 1) if parts.treed else (1, 1)
+        arrays |= {"tree_key": np.zeros(keys, np.int64), "tree_digit": np.zeros(digits, np.int64)}
+        for name, pad in (("mass", 1), ("radius", 0), ("max_speed", 1), ("max_force", 1)):
+            arrays[name][:] = pad
+            arrays[name][:agents] = getattr(body, name)
+        arrays["ident"][:] = np.arange(padded)
+        if "t0" in parts.fields:
+            blocks = ties(padded, d).reshape(-1, width, d).transpose(0, 2, 1)
+            arrays["tie"][:] = blocks.reshape(-1)
+        arrays["number"] = np.arange(width, dtype=np.int32)
+        arrays |= {"bond_place": table.place, "bond_number": table.number, "bond_start": table.start}
+        lanes = {"lanes": (len(parts.slots) * width, np.dtype(dtype))}
+        own = tuple((_zeros(lanes)["lanes"], np.zeros((MAX_RANGES, 3), np.int64)) for _ in range(team))
+        return cls(tuple(arrays[name] for name in SHARED.split(", ")[:-2]), own)
+
+    def of(self, rank: int) -> tuple[NDArray[Any], ...]:
+        """Return the arrays that one of the team is given."""
+        return (*self.shared, *self.own[rank])
+
+
+def _zeros(wanted: Mapping[str, tuple[int | tuple[int, ...], np.dtype[Any]]]) -> dict[str, NDArray[Any]]:
+    """Return arrays of zeros in one piece of memory, each beginning on a cache line: no vector is loaded from two.
+
+    Between two there is a gap, or places that are used together would compete for the same few lines of the cache.
+    """
+    sizes = {name: int(np.prod(shape)) * kind.itemsize for name, (shape, kind) in wanted.items()}
+    raw = _memory(sum(sizes.values()) + (len(sizes) + 1) * (LINE + GAP))
+    at, out = -raw.ctypes.data % LINE, {}
+    for name, (shape, kind) in wanted.items():
+        out[name] = raw[at : at + sizes[name]].view(kind).reshape(shape)
+        at += -(-sizes[name] // LINE) * LINE + GAP
+    return out
+
+
+def _memory(size: int) -> NDArray[np.uint8]:
+    """Return zeros; where there are many, and the system has them, on large pages: fewer addresses to look up."""
+    if size < HUGE or not hasattr(mmap, "MADV_HUGEPAGE"):
+        return np.zeros(size, np.uint8)
+    memory = mmap.mmap(-1, size + HUGE, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)
+    memory.madvise(mmap.MADV_HUGEPAGE)
+    raw = np.frombuffer(memory, np.uint8)
+    return raw[-raw.ctypes.data % HUGE :]

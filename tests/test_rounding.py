@@ -1,0 +1,85 @@
+"""Far from the origin: the same motion in double precision, one clear line in single (numerics.md P36, N17)."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from flockenv.effects import Alignment, Attraction, Cohesion, Drag, Separation, Springs, Tether
+from flockenv.networks import Mesh, Rope
+from flockenv.rounding import FARTHEST
+from flockenv.scene import Group, Scene
+from flockenv.space import Box, Torus
+from flockenv.spawn import Spawn
+from flockenv.state import State
+
+HERE = (Group(count=3, spawn=Spawn(low=(0, 0), high=(1, 1))),)
+FAR = 3e4
+
+FAR_AWAY = [
+    ({"space": Torus(size=(FAR, 5))}, "space.size = (30000.0, 5.0)"),
+    ({"space": Box(size=(5, 1.0001e4))}, "space.size = (5.0, 10001.0)"),
+    ({"groups": (*HERE, Group(count=3, spawn=Spawn(low=(-FAR, 0), high=(1, 1))))}, "groups[1].spawn.low = (-30000.0"),
+    ({"groups": (Group(count=3, spawn=Spawn(low=(0, 0), high=(1, FAR))),)}, "groups[0].spawn.high = (1.0, 30000.0)"),
+    ({"groups": (Group(network=Rope(links=3, start=(FAR, 0), length=1)),)}, "groups[0].network: its farthest"),
+    ({"groups": (Group(network=Mesh(vertices=((0, 0), (1, -FAR)))),)}, "its farthest coordinate = 30000 m"),
+    ({"obstacles": ({"centre": (1, FAR), "radius": 1},)}, "obstacles[0].centre = (1.0, 30000.0)"),
+    ({"effects": (Drag(rate=1), Tether(centre=(FAR, 1), stiffness=1))}, "effects[1].centre = (30000.0, 1.0)"),
+    ({"effects": (Attraction(strength=1, centre=(0, -1e30)),)}, "effects[0].centre = (0.0, -1e+30)"),
+]
+
+
+@pytest.mark.parametrize(("fields", "said"), FAR_AWAY, ids=lambda value: str(value)[:40])
+def test_single_precision_is_refused_in_one_line_far_from_the_origin(fields: Any, said: str) -> None:
+    given = {"groups": HERE, **fields}
+    with pytest.raises(ValueError, match="use dtype = float64") as caught:
+        Scene(dtype="float32", **given)
+    line = str(caught.value)
+    assert said in line
+    assert f"{FARTHEST:,.0f} m" in line
+    assert "\n" not in line
+    Scene(dtype="float64", **given)
+
+
+def test_up_to_the_limit_single_precision_is_taken() -> None:
+    scene = Scene(groups=HERE, space=Box(size=(FARTHEST, 5)), dtype="float32")
+    assert scene.dtype == "float32"
+
+
+def test_at_the_limit_somebody_still_gets_where_he_walks() -> None:
+    """1 m/s for 1 s in steps of 20 ms; at 30 km he would be 2 % off, at 300 km stand still."""
+    scene = Scene(groups=(Group(count=1, spawn=HERE[0].spawn),), dtype="float32")
+    end = scene.run(scene.start(0).with_motion([[(FARTHEST - 2, 0)]], [[(1.0, 0)]]), 50)
+    assert end.pos[0, 0, 0] - (FARTHEST - 2) == pytest.approx(1, rel=0.03)
+
+
+def flock(offset: float) -> Scene:
+    effects = (Separation(weight=1.3, radius=2), Alignment(weight=0.7, radius=3), Cohesion(weight=0.9, radius=3))
+    spawn = Spawn(low=(0, 0), high=(6, 6), speed=(0.5, 1.5))
+    return Scene(groups=(Group(count=40, max_speed=2, spawn=spawn),), effects=effects, dt=0.02)
+
+
+def chain(offset: float) -> Scene:
+    rope = Rope(links=12, start=(offset, -offset), length=6, stretch=1.1, pinned=("start",))
+    return Scene(groups=(Group(network=rope, mass=0.1),), effects=(Springs(stiffness=60, damping=0.05),), dt=0.005)
+
+
+def moved(state: State, offset: float) -> State:
+    return state.with_motion(np.add(state.pos, (offset, -offset)), state.vel)
+
+
+@pytest.mark.parametrize("offset", [1e4, 1e7])
+@pytest.mark.parametrize("scene", [flock, chain])
+def test_a_scene_far_from_the_origin_does_the_same_in_double_precision(scene: Any, offset: float) -> None:
+    """N17: within 1e-6 of its own size after 100 steps."""
+    start = scene(0.0).start(3)
+    if scene is chain:
+        start.vel[0, 1:, 1] = np.sin(np.arange(1, start.shape[1]))
+    there = moved(start, offset)
+    near, far = scene(0.0).run(start, 100), scene(offset).run(there, 100)
+    size = np.ptp(near.pos[0], axis=0).max()
+    assert np.abs(near.pos - start.pos).max() > 0.05 * size
+    np.testing.assert_allclose(far.pos - (offset, -offset), near.pos, atol=1e-6 * size)
+    np.testing.assert_allclose(far.vel, near.vel, atol=1e-6 * np.abs(near.vel).max())
