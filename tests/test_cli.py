@@ -143,8 +143,8 @@ def test_a_scene_without_neighbour_effects_makes_no_query_and_one_with_them_one_
 
 
 def test_a_run_that_diverges_says_so_and_keeps_what_was_done(capsys: pytest.CaptureFixture[str]) -> None:
-    wild = TINY.replace("kind: drag, rate: 0.5", "kind: quadratic_drag, rate: 1e6").replace("torus, size: [9, 9]", "plane")
-    wild = wild.replace("spawn: {", "spawn: {low: [0, 0], high: [9, 9], ")
+    wild = TINY.replace("kind: drag, rate: 0.5", "kind: quadratic_drag, rate: 1e6")
+    wild = wild.replace("torus, size: [9, 9]", "plane").replace("spawn: {", "spawn: {low: [0, 0], high: [9, 9], ")
     Path("wild.yaml").write_text(wild)
     assert main(["run", "wild.yaml", "--duration", "10", "--every", "0.01", "--out", "t.npz"]) == 1
     captured = capsys.readouterr()
