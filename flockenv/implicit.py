@@ -85,8 +85,13 @@ def _solved(
     alone.work[0, WORK.index("linear_iterations")] += found.linear
     alone.work[0, WORK.index("substeps")] += found.substeps
     alone.work[0, WORK.index("rejected_steps")] += found.rejected
-    shape = alone.x[:, 0].shape
-    return step(alone, 0, found.x.reshape(shape), found.v.reshape(shape))[1], ""
+    was = alone.x[:, 0], alone.v[:, 0]
+    pos, vel = found.x.reshape(was[0].shape), found.v.reshape(was[0].shape)
+    held = np.isinf(scene.body.mass)  # who is held is that exactly, and not but for the rounding of a factorisation
+    vel[:, held] = was[1][:, held]
+    if not scene.parts.flows:
+        pos[:, held] = was[0][:, held] + scene.dt * vel[:, held]
+    return step(alone, 0, pos, vel)[1], ""
 
 
 def _fastest(alone: State) -> int:

@@ -25,7 +25,7 @@ from flockenv.divergence import SimulationDiverged
 from flockenv.effects import EFFECTS, Effect
 from flockenv.effects.base import all_masses
 from flockenv.implicit import coupling_of, solve_steps
-from flockenv.integrators import INTEGRATORS, Integrator, SemiImplicitEuler
+from flockenv.integrators import INTEGRATORS, ImplicitEuler, Integrator, SemiImplicitEuler
 from flockenv.integrators.newton import Coupling
 from flockenv.kernels import entry, load
 from flockenv.neighbours import FEWEST_AGENTS, WORTH_ARRANGING
@@ -101,11 +101,11 @@ def _demand_one_piece(out: State) -> None:
 
 
 class Group(Record):
-    """Some agents of a kind."""
+    """Some agents of a kind: so many that are on their own, or a network of them; there `mass` is the mean."""
 
-    count: int | None = Field(default=None, ge=1, description="how many; or give a network")
+    count: int | None = Field(default=None, ge=1, description="how many")
     network: AnyNetwork | None = Field(default=None, description="particles that are tied to each other, and where")
-    mass: float = Field(default=1.0, gt=0, description="kg, of each; in a network on average")
+    mass: float = Field(default=1.0, gt=0, description="kg")
     radius: float = Field(default=0.1, ge=0, description="m")
     max_speed: float | None = Field(default=None, gt=0, description="m/s; none = no limit")
     max_force: float | None = Field(default=None, ge=0, description="N, what it may ask for; none = no limit")
@@ -378,7 +378,9 @@ class Scene(Record):
         """Return the kind of the effect that accelerates an agent most, or to no number at all."""
         found: list[tuple[float, str]] = []
         for k, effect in enumerate(self.effects):
-            alone = self.with_effects(*(e if j == k else e.idle() for j, e in enumerate(self.effects)))
+            others = tuple(e if j == k else e.idle() for j, e in enumerate(self.effects))
+            # nothing is stepped: under a method without a limit no dt is warned of or refused
+            alone = self.model_copy(update={"effects": others, "integrator": ImplicitEuler()})
             size = float(np.abs(alone.acceleration(state)[0, agent]).max())
             found.append((size if math.isfinite(size) else math.inf, effect.kind))
         return max(found)[1] if found and max(found)[0] > 0 else None

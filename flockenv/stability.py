@@ -9,13 +9,13 @@ from __future__ import annotations
 import functools
 import math
 import warnings
+from collections.abc import Callable
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from flockenv.integrators.base import Integrator
-from flockenv.state import Floats as States
 from flockenv.state import blank
 
 if TYPE_CHECKING:
@@ -28,11 +28,20 @@ Floats = NDArray[np.float64]
 GROWTH = 1e-6
 """Of the amplitude in one step that still counts as stable: it takes a million steps to be seen."""
 
-CERTAIN = 2.0
-"""Times the limit beyond which a scene is refused: bounds of stiffness are less than that above the truth."""
+CERTAIN = 2.5
+"""Times the limit beyond which a scene is refused: bounds of frequency are less than that above the truth.
 
-SMALLEST, LARGEST, POINTS = 1e-4, 1e3, 400  # h w that are looked at
-ROUNDS = 6  # of closing in on where it becomes unstable
+The fastest oscillation is at least as fast as anybody's while all others rest: by the mean over D axes, w^2 is at least
+sum k / (D m), of a bound of 2 sum k / m; and sqrt(2 D) <= 2.45.
+"""
+
+WEAK = 0.1
+"""The h w and h c below which a limit is no use: under such a method oscillations grow at every step, but slowly."""
+
+SMALLEST, LARGEST, POINTS = 1e-4, 1e3, 200  # h w that are looked at
+ROUNDS = 3  # of closing in on where it becomes unstable
+FASTEST = 32
+"""Different oscillators of a scene that are looked at."""
 
 
 class UnstableStepWarning(UserWarning):
@@ -49,24 +58,24 @@ class Suggestion(NamedTuple):
     damping: float  # 1/s, of velocity, there
 
 
-def amplification(method: Integrator, y: Floats, zeta: float) -> Floats:
-    """Return what one step of h = 1 s makes of (x, v), (K, 2, 2), of oscillators with h w = y, (K,)."""
+def amplification(method: Integrator, y: Floats, zeta: float, told: float = 0.0) -> Floats:
+    """Return what one step of h = 1 s makes of (x, v), (K, 2, 2), of oscillators with h w = y, (K,).
+
+    zeta, told: damping as shares of what is critical; of the second the method is told, if it treats drag by itself.
+    """
     y = np.asarray(y, float)
     state = blank(1, len(y), 2, 0, 1.0)
     state.x[0], state.v[1] = 1.0, 1.0  # two beginnings side by side: the axes do not know of each other
-    square, drag = (y * y)[:, None], (2 * zeta * y)[:, None]
-
-    def law(x: States, v: States, time: float) -> States:
-        return np.asarray(-square * x - (0.0 if method.splits_drag else drag * v))
-
-    after = method(law, state, 1.0, drag=np.tile(drag[:, 0], 2))
+    own = told if method.splits_drag else 0.0
+    square, drag = (y * y)[:, None], (2 * (zeta + told - own) * y)[:, None]
+    after = method(lambda x, v, t: -square * x - drag * v, state, 1.0, drag=np.tile(2 * own * y, 2))
     return np.stack([after.pos[0], after.vel[0]], axis=1)  # (K, what comes out, what went in)
 
 
-def growth(method: Integrator, y: Floats, zeta: float) -> Floats:
+def growth(method: Integrator, y: Floats, zeta: float, told: float = 0.0) -> Floats:
     """Return by what the amplitude is multiplied in one step at worst, (K,): the spectral radius."""
     with np.errstate(all="ignore"):
-        matrices = amplification(method, y, zeta)
+        matrices = amplification(method, y, zeta, told)
         matrices[~np.isfinite(matrices)] = 1e300
         # in units in which position and velocity weigh the same
         scaled = matrices * np.stack(
@@ -76,13 +85,32 @@ def growth(method: Integrator, y: Floats, zeta: float) -> Floats:
 
 
 @functools.lru_cache(maxsize=1024)
-def limit(method: Integrator, zeta: float) -> float:
-    """Return the largest stable h w, for a damping of `zeta`, as a share of what is critical; inf = any."""
+def limit(method: Integrator, zeta: float, told: float = 0.0) -> float:
+    """Return the largest stable h w, for damping as shares of what is critical (see amplification); inf = any."""
     if method.solves or method.adaptive:
         return math.inf
+    return _first_unstable(lambda y: growth(method, y, zeta, told))
+
+
+@functools.lru_cache(maxsize=64)
+def drag_limit(method: Integrator) -> float:
+    """Return the largest stable h c of x'' = -c x', of which the method is not told; inf = any."""
+    if method.solves or method.adaptive:
+        return math.inf
+
+    def slowed(z: Floats) -> Floats:
+        state = blank(1, len(z), 2, 0, 1.0)
+        state.v[...] = 1.0
+        return np.asarray(np.abs(method(lambda x, v, t: -z[:, None] * v, state, 1.0).vel[0, :, 0]))
+
+    return _first_unstable(slowed)
+
+
+def _first_unstable(grown: Callable[[Floats], Floats]) -> float:
+    """Return the least number at which an amplitude is more after a step than before it."""
     y = np.geomspace(SMALLEST, LARGEST, POINTS)
     for _ in range(ROUNDS):
-        grows = growth(method, y, zeta) > 1 + GROWTH
+        grows = grown(y) > 1 + GROWTH
         if not grows.any():
             return math.inf
         first = int(np.argmax(grows))
@@ -92,69 +120,75 @@ def limit(method: Integrator, zeta: float) -> float:
     return float(y[0])
 
 
+class _Rates(NamedTuple):
+    """How stiff everybody is, (N,) each."""
+
+    square: Floats  # w^2, 1/s^2
+    damping: Floats  # 1/s
+    told: Floats  # 1/s, damping that the method is told of
+
+    def of(self, agent: int) -> tuple[float, float, float]:
+        """Return one agent's."""
+        return float(self.square[agent]), float(self.damping[agent]), float(self.told[agent])
+
+
 def suggest_dt(scene: Scene) -> Suggestion:
     """Return the largest stable step of a scene, from its effects' own stiffness, and the effect that sets it.
 
     Stiffness is a bound (Gershgorin's circles for springs), so the limit is on the safe side; what is only stiff in
-    some states (agents that touch) is not in it. Source: numerics.md 2.2 P02, 3.1, 3.3.
+    some states (agents that touch) is not in it. Damping is a bound too: a method that needs damping to be stable
+    (explicit Euler, Heun, midpoint) may find motions that are damped less, springs across their length for one.
+    Source: numerics.md 2.2 P02, 3.1, 3.3.
     """
-    square, damping = np.zeros(scene.agents), np.zeros(scene.agents)
-    alone: list[tuple[float, str]] = []
+    found = _found(scene)
+    if not found:
+        return Suggestion(math.inf, None, None, 0.0, 0.0)
+    whole = _Rates(*(sum(rates[k] for _, rates in found) + np.zeros(scene.agents) for k in range(3)))
+    dt, agent = _tightest(scene.integrator, whole)
+    if not math.isfinite(dt):
+        most = (float(np.sqrt(whole.square.max())), float((whole.damping + whole.told).max()))
+        return Suggestion(math.inf, None, None, *most)
+    alone = [(_limit_of(scene.integrator, *rates.of(agent)), kind) for kind, rates in found]
+    square, damping, told = whole.of(agent)
+    return Suggestion(dt, min(alone)[1], agent, math.sqrt(square), damping + told)
+
+
+def _found(scene: Scene) -> list[tuple[str, _Rates]]:
+    """Return the kinds of those effects that know how stiff they are, and how stiff that is."""
+    out = []
     for k, effect in enumerate(scene.effects):
         try:
             found = effect.rates(scene.groups, scene.dimension)
         except ValueError as error:
             raise ValueError(f"effects[{k}].{error}") from None
         if found is not None:
-            alone.append((_tightest(scene.integrator, *found)[0], effect.kind))
-            square += found[0]
-            damping += found[1]
-    dt, agent = _tightest(scene.integrator, square, damping)
-    if not math.isfinite(dt):
-        return Suggestion(math.inf, None, None, float(np.sqrt(square.max())), float(damping.max()))
-    return Suggestion(dt, min(alone)[1], agent, math.sqrt(square[agent]), float(damping[agent]))
+            square, damping = found
+            none = np.zeros(len(damping))
+            own = scene.integrator.splits_drag and effect.linear_drag is not None
+            out.append((effect.kind, _Rates(square, none, damping) if own else _Rates(square, damping, none)))
+    return out
 
 
-def _tightest(method: Integrator, square: Floats, damping: Floats) -> tuple[float, int]:
-    """Return the least of all agents' limits, s, and whose it is."""
-    dts = np.full(len(square), math.inf)
-    kinds, which = np.unique(np.stack([square, damping], axis=1), axis=0, return_inverse=True)
-    kept = kinds if len(kinds) <= POINTS else kinds[np.argsort(kinds.max(axis=1))[-POINTS:]]
-    limits = {tuple(kind): _limit_of(method, *map(float, kind)) for kind in kept}
-    for k, kind in enumerate(kinds):
-        if tuple(kind) in limits:
-            dts[which.ravel() == k] = limits[tuple(kind)]
-    agent = int(np.argmin(dts))
-    return float(dts[agent]), agent
+def _tightest(method: Integrator, rates: _Rates) -> tuple[float, int]:
+    """Return the least of all agents' limits, s, and whose it is; of very many different ones, among the fastest."""
+    table = np.stack(rates, axis=1)
+    begins = np.flatnonzero(np.r_[True, (table[1:] != table[:-1]).any(axis=1)])  # of agents in a row who are alike
+    kinds, among = np.unique(table[begins], axis=0, return_index=True)
+    first = begins[among]
+    fastest = np.argsort(np.maximum(np.sqrt(kinds[:, 0]), kinds[:, 1]), kind="stable")[-FASTEST:]
+    return min((_limit_of(method, *map(float, kinds[k])), int(first[k])) for k in fastest)
 
 
-def _limit_of(method: Integrator, square: float, damping: float) -> float:
+def _limit_of(method: Integrator, square: float, damping: float, told: float) -> float:
     """Return the largest stable step of one oscillator, s."""
     if square <= 0 and damping <= 0:
         return math.inf
     if damping > 1e4 * math.sqrt(square):  # nothing but drag: x'' = -c x'
-        return _drag_limit(method) / damping
+        return drag_limit(method) / damping
     frequency = math.sqrt(square)
-    return limit(method, round(damping / (2 * frequency), 6)) / frequency
-
-
-@functools.lru_cache(maxsize=64)
-def _drag_limit(method: Integrator) -> float:
-    """Return the largest stable h c of x'' = -c x'."""
-    if method.solves or method.adaptive or method.splits_drag:
-        return math.inf
-    z = np.geomspace(SMALLEST, LARGEST, POINTS)
-    for _ in range(ROUNDS):
-        state = blank(1, len(z), 2, 0, 1.0)
-        state.v[...] = 1.0
-        rate = z[:, None]
-        after = method(lambda x, v, t, rate=rate: -rate * v, state, 1.0)  # type: ignore[misc]
-        grows = np.abs(after.vel[0, :, 0]) > 1 + GROWTH
-        if not grows.any():
-            return math.inf
-        first = int(np.argmax(grows))
-        z = np.linspace(z[max(0, first - 1)], z[first], POINTS)
-    return float(z[0])
+    # to a few digits, so that agents of nearly the same damping are looked at once
+    zeta, own = (float(f"{rate / (2 * frequency):.4g}") for rate in (damping, told))
+    return limit(method, zeta, own) / frequency
 
 
 def check_dt(scene: Scene) -> None:
@@ -163,7 +197,8 @@ def check_dt(scene: Scene) -> None:
     if scene.dt <= found.dt:
         return
     kind, text = scene.integrator.kind, f"{found.frequency:.4g} rad/s, {found.damping:.4g} 1/s at agent {found.agent}"
-    if found.dt < 1e-2 * scene.dt:
+    weak = found.dt * max(found.frequency, found.damping) < WEAK
+    if weak or found.dt < 1e-2 * scene.dt:
         limit_text = f"at most {found.dt:.3g} s is stable, so take another integrator"
     else:
         limit_text = f"at most {found.dt:.4g} s is stable"
@@ -174,9 +209,10 @@ def check_dt(scene: Scene) -> None:
 
 
 def _blows_up(scene: Scene, found: Suggestion) -> bool:
-    """Would an amplitude grow a hundredfold within a hundred steps, even if stiffness is half of its bound?"""
+    """Would an amplitude grow a hundredfold within a hundred steps, even if all rates are far below their bounds?"""
     y = np.array([scene.dt * found.frequency / CERTAIN])
-    if y[0] <= 0:
-        return scene.dt * found.damping > CERTAIN * _drag_limit(scene.integrator)
+    if found.damping > 1e4 * found.frequency:
+        return True  # nothing but drag, of which nothing is a bound
     zeta = found.damping / (2 * found.frequency)
-    return bool(growth(scene.integrator, y, zeta)[0] > 100 ** (1 / 100))
+    slowest = min(growth(scene.integrator, y, *shares)[0] for shares in ((zeta, 0.0), (0.0, zeta)))
+    return bool(slowest > 100 ** (1 / 100))

@@ -156,7 +156,7 @@ def test_what_is_written_reads_back_exactly(record: Anything) -> None:
 
 @given(
     dt=st.floats(1e-9, 10),
-    rates=st.lists(st.floats(0, 1e300), max_size=3),
+    rates=st.lists(st.floats(0, 0.03), max_size=3),  # stable at every dt here, whatever the method
     count=st.integers(1, 10**6),
     max_speed=st.none() | st.floats(1e-300, 1e300),
     wall=st.floats(1, 1e4),  # float32 goes no further
@@ -234,37 +234,13 @@ def test_other_yaml_readers_read_the_same_numbers() -> None:
         ("dt: 0.01", "dt: 1e999", "text:10: dt: '1e999' is too large or too long for a number"),
         ("dt: 0.01", "dt: 010", "text:10: dt: 010 begins with 0, which some read as octal: write 10"),
         ("dt: 0.01", "dt: [1]", "text:10: dt: must be a number > 0 (s, "),
-        (
-            "count: 5",
-            "count: 0",
-            "text:4: groups[0].count = 0: must be a whole number >= 1 (how many; or give a network)",
-        ),
-        (
-            "count: 5",
-            "count: -1",
-            "text:4: groups[0].count = -1: must be a whole number >= 1 (how many; or give a network)",
-        ),
-        (
-            "count: 5",
-            "count: 2.5",
-            "text:4: groups[0].count = 2.5: must be a whole number >= 1 (how many; or give a network)",
-        ),
-        (
-            "count: 5",
-            "count: 5.0",
-            "text:4: groups[0].count = 5.0: must be a whole number >= 1: write 5 (how many; or give a network)",
-        ),
-        (
-            "count: 5",
-            "count: ten",
-            "text:4: groups[0].count = 'ten': must be a whole number >= 1, not text (how many; or give a network)",
-        ),
+        ("count: 5", "count: 0", "text:4: groups[0].count = 0: must be a whole number >= 1 (how many)"),
+        ("count: 5", "count: -1", "text:4: groups[0].count = -1: must be a whole number >= 1 (how many)"),
+        ("count: 5", "count: 2.5", "text:4: groups[0].count = 2.5: must be a whole number >= 1 (how many)"),
+        ("count: 5", "count: 5.0", "text:4: groups[0].count = 5.0: must be a whole number >= 1: write 5 (how many)"),
+        ("count: 5", "count: ten", "text:4: groups[0].count = 'ten': must be a whole number >= 1, not text (how many)"),
         ("count: 5", "mass: 1", "text:4: groups[0]: count: give either a count or a network"),
-        (
-            "count: 5",
-            "count: 5\n    mass: 0",
-            "text:5: groups[0].mass = 0: must be a number > 0 (kg, of each; in a network on average)",
-        ),
+        ("count: 5", "count: 5\n    mass: 0", "text:5: groups[0].mass = 0: must be a number > 0 (kg)"),
         ("count: 5", "count: 5\n    radius: -1", "text:5: groups[0].radius = -1: must be a number >= 0 (m)"),
         ("rate: 0.3", "rate: -1", "text:6: effects[0].rate = -1: must be a number >= 0 (c, kg/s)"),
         ("12.5]", "0]", "text:2: space.size[1] = 0: must be a number > 0"),

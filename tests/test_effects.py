@@ -46,7 +46,7 @@ def obeying(symmetry: str) -> pytest.MarkDecorator:
 
 
 DIMENSIONS = pytest.mark.parametrize("dimension", [2, pytest.param(3, marks=pytest.mark.slow)])
-"""Each effect is a kernel in each dimension; laws are written once for both: tests that run quickly try the plane."""
+"""Each effect is a kernel in each dimension; laws are written once for both, and quick tests try the plane."""
 
 STEPS = 12
 

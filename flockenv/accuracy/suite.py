@@ -172,7 +172,7 @@ def tracer() -> Problem:
         return _rows(radius * math.cos(turn * t), radius * math.sin(turn * t)), _rows(0.0, 0.0)
 
     effects = (Vortex(centre=ORIGIN, strength=flow, maximum=most, acts="medium"), Carried())
-    return _one_body("tracer", "Tracer in a vortex, 1.7 turns", effects, 1.7 * 2 * math.pi / turn, powers(4, 13), exact)
+    return _one_body("tracer", "Tracer in a vortex, 1.7 turns", effects, 1.7 * 2 * math.pi / turn, powers(5, 16), exact)
 
 
 # --- flocks -----------------------------------------------------------------------------------------------------------

@@ -36,7 +36,9 @@ def write_precision(path: str | Path, reports: Sequence[Report]) -> None:
     """Write the picture as a PNG file, whole or not at all; the same numbers give the same bytes."""
     figure = draw_precision(reports)
     with replacing(path) as file:
-        figure.savefig(file, format="png", dpi=150, metadata={"Software": "flockenv"})
+        figure.savefig(
+            file, format="png", dpi=150 if len(reports) <= COLUMNS else 100, metadata={"Software": "flockenv"}
+        )
 
 
 def draw_precision(reports: Sequence[Report]) -> Figure:

@@ -83,7 +83,8 @@ def _tried(case: Case, method: Integrator) -> Finding:
             verdict, note = "refused", str(error)
         else:
             number = value.number if math.isfinite(value.number) else None
-            verdict, note = ("pass" if value.holds else "fails"), value.note
+            # a bound that is asked the other way round holds for what is no number
+            verdict, note = ("pass" if value.holds and not math.isnan(value.number) else "fails"), value.note
     told = next((str(w.message) for w in caught if issubclass(w.category, UnstableStepWarning)), "")
     if told and verdict == "pass":
         verdict = "warned"

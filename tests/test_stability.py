@@ -1,0 +1,393 @@
+"""The largest stable step: of methods against their formulas, of scenes against their own linearised equations."""
+
+from __future__ import annotations
+
+import math
+import warnings
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from flockenv.config import load_scene
+from flockenv.divergence import SimulationDiverged
+from flockenv.effects import AngularSprings, Cohesion, Drag, Effect, Elastic, Gravity, Separation, Springs, Tether
+from flockenv.integrators import (
+    RK4,
+    AdaptiveRK4,
+    AveragedVelocity,
+    DormandPrince,
+    ExplicitEuler,
+    ExponentialDrag,
+    Heun,
+    ImplicitEuler,
+    ImplicitMidpoint,
+    Integrator,
+    Midpoint,
+    SemiImplicitEuler,
+    VelocityVerlet,
+)
+from flockenv.networks import Cloth, Jelly, Mesh, Network, Rope
+from flockenv.scene import Group, Scene
+from flockenv.spawn import Spawn
+from flockenv.stability import UnstableStepWarning, amplification, drag_limit, limit, suggest_dt
+from flockenv.state import blank
+from tests.catalogue import INTEGRATORS, Array
+
+CHAIN = Rope(links=21, length=2.1, pinned=("ends",))  # 20 free masses
+TRUE = 2 / (2 * math.sqrt(400 / 0.1) * math.sin(20 * math.pi / 42))
+"""s, of numerics.md 3.3: .0158557."""
+
+HERE = Spawn(low=(0, 0), high=(1, 1))
+O2 = (0.0, 0.0)
+
+
+def network(net: Network, *effects: Effect, method: Integrator | None = None, **fields: Any) -> Scene:
+    given: dict[str, Any] = {"dt": 1e-6, "integrator": method or SemiImplicitEuler()} | fields
+    return Scene(groups=(Group(network=net, mass=given.pop("each", 0.1)),), effects=effects, **given)
+
+
+def body(*effects: Effect, method: Integrator | None = None, dt: float = 1e-6, **fields: Any) -> Scene:
+    group = Group(**({"count": 1, "spawn": HERE} | fields))
+    return Scene(groups=(group,), effects=effects, integrator=method or SemiImplicitEuler(), dt=dt)
+
+
+# --- methods ----------------------------------------------------------------------------------------------------------
+
+
+def powers(*coefficients: float) -> Any:
+    """R(A) = sum of c_k A^k, A = [[0, 1], [-y^2, -z]]: what a method of Runge and Kutta makes of (x, v)."""
+
+    def matrix(y: float, z: float) -> Array:
+        a = np.array([[0.0, 1.0], [-y * y, -z]])
+        return np.asarray(sum(c * np.linalg.matrix_power(a, k) for k, c in enumerate(coefficients)))
+
+    return matrix
+
+
+MAPS: dict[str, Any] = {
+    "explicit_euler": powers(1, 1),
+    "midpoint": powers(1, 1, 1 / 2),
+    "heun": powers(1, 1, 1 / 2),
+    "rk4": powers(1, 1, 1 / 2, 1 / 6, 1 / 24),
+    "semi_implicit_euler": lambda y, z: np.array([[1 - y * y, 1 - z], [-y * y, 1 - z]]),
+    "averaged_velocity": lambda y, z: np.array([[1 - y * y / 2, 1 - z / 2], [-y * y, 1 - z]]),
+    # its second force is that of the predicted velocity (1 - z) v - y^2 x
+    "velocity_verlet": lambda y, z: np.array([
+        [1 - y * y / 2, 1 - z / 2],
+        [-y * y / 2 * (2 - z - y * y / 2), (1 - y * y / 2) * (1 - z / 2) - z / 2 * (1 - z)],
+    ]),
+}  # fmt: skip
+"""What one step makes of (x, v) with x'' = -y^2 x - z v, h = 1."""
+
+FIXED = tuple(row.method for row in INTEGRATORS if not row.method.adaptive and not row.method.solves)
+ZETAS = (0.0, 0.1, 0.5, 1.0, 2.0, 20.0)
+
+
+@pytest.mark.parametrize("kind", MAPS)
+def test_one_step_of_an_oscillator_is_the_map_of_the_book(kind: str) -> None:
+    method = next(method for method in FIXED if method.kind == kind)
+    for y, zeta in ((0.3, 0.0), (1.7, 0.4), (2.5, 3.0)):
+        found = amplification(method, np.array([9.0, y]), zeta)[1]
+        np.testing.assert_allclose(found, MAPS[kind](y, 2 * zeta * y), rtol=1e-13, atol=1e-12)
+
+
+@pytest.mark.parametrize("kind", MAPS)
+def test_the_limit_is_where_the_map_begins_to_grow(kind: str) -> None:
+    method = next(method for method in FIXED if method.kind == kind)
+    for zeta in ZETAS:
+        most = limit(method, zeta)
+        for share, stable in ((0.5, True), (0.9999, True), (1.0001, False)):
+            y = share * most
+            grown = float(np.abs(np.linalg.eigvals(MAPS[kind](y, 2 * zeta * y))).max())
+            # who grows at every step is given 1e-6 a step, and just beyond little more
+            assert (grown < 1 + 1e-6) if stable else (grown > 1 + 0.9e-6), (zeta, share)
+
+
+@pytest.mark.parametrize("zeta", ZETAS[1:])
+def test_limits_are_those_of_the_table(zeta: float) -> None:
+    """numerics.md P02, 3.1."""
+    root = math.sqrt(max(zeta * zeta - 1, 0.0))
+    euler = 2 * zeta if zeta <= 1 else 2 / (zeta + root)
+    assert limit(ExplicitEuler(), zeta) == pytest.approx(euler, rel=1e-4)
+    assert limit(SemiImplicitEuler(), zeta) == pytest.approx(2 * (math.sqrt(1 + zeta * zeta) - zeta), rel=1e-5)
+    if zeta >= 1:  # the faster of two real rates
+        assert limit(RK4(), zeta) == pytest.approx(2.785294 / (zeta + root), rel=1e-5)
+        assert limit(Heun(), zeta) == pytest.approx(2 / (zeta + root), rel=1e-5)
+
+
+def test_without_damping_limits_are_those_of_the_table() -> None:
+    for row in INTEGRATORS:
+        if row.method.adaptive or row.method.solves:
+            assert limit(row.method, 0.0) == limit(row.method, 3.0) == drag_limit(row.method) == math.inf
+            continue
+        assert drag_limit(row.method) == pytest.approx(row.real, rel=1e-4)
+        if row.imaginary:
+            assert limit(row.method, 0.0) == pytest.approx(row.imaginary, rel=1e-5)
+        else:
+            assert limit(row.method, 0.0) < 0.06
+
+
+def test_drag_that_a_method_treats_itself_sets_no_limit() -> None:
+    """And drag that it is not told of does."""
+    method = ExponentialDrag()
+    for told in (0.1, 1.0, 10.0):
+        assert limit(method, 0.0, told) > 2.0
+        assert limit(method, told) < 2.0
+        assert limit(SemiImplicitEuler(), 0.0, told) == limit(SemiImplicitEuler(), told)
+    assert suggest_dt(body(Drag(rate=100), method=method)).dt == math.inf
+    tether = Tether(centre=O2, stiffness=0.0, damping=100)
+    assert suggest_dt(body(tether, Drag(rate=100), method=method)).dt == pytest.approx(0.02, rel=1e-4)
+
+
+# --- scenes -----------------------------------------------------------------------------------------------------------
+
+
+def derivatives(scene: Scene) -> tuple[Array, Array]:
+    """K and C of the free agents, linearised where they begin: a = -K x - C v."""
+    state, free, step = scene.start(0), np.flatnonzero(np.isfinite(scene.body.mass)), 1e-6
+    stiffness, damping = [], []
+    for i in free:
+        for k in range(scene.dimension):
+            move = np.zeros(state.shape)
+            move[0, i, k] = 1.0
+            for out, far, moved in (
+                (stiffness, step, lambda s, m=move: state.with_motion(state.pos + s * m, state.vel)),
+                (damping, 1.0, lambda s, m=move: state.with_motion(state.pos, state.vel + s * m)),
+            ):
+                ends = [scene.acceleration(moved(sign * far))[0, free].ravel() for sign in (1, -1)]
+                out.append((ends[1] - ends[0]) / (2 * far))
+    return np.array(stiffness).T, np.array(damping).T
+
+
+def linear_limit(method: Integrator, stiffness: Array, damping: Array, drag: float) -> float:
+    """The first h at which one step of the whole linear system grows, from the step itself."""
+    n = len(stiffness)
+    state = blank(1, n, 2 * n, 0, 1.0)  # as many beginnings as there are numbers, side by side
+    state.x[:n, 0], state.v[n:, 0] = np.eye(n), np.eye(n)
+    own = drag if method.splits_drag else 0.0
+    weight = np.concatenate([np.full(n, math.sqrt(np.abs(stiffness).sum(axis=1).max())), np.ones(n)])
+
+    def grows(h: float) -> bool:
+        after = method(lambda x, v, t: -stiffness @ x - damping @ v + own * v, state, h, drag=own)
+        matrix = np.concatenate([after.pos[0], after.vel[0]]) * weight[:, None] / weight
+        return bool(np.abs(np.linalg.eigvals(matrix)).max() > 1 + 1e-5)
+
+    steps = np.geomspace(1e-5, 1, 40)
+    first = next(k for k, h in enumerate(steps) if grows(h))
+    low, high = steps[first - 1], steps[first]
+    for _ in range(16):
+        middle = (low + high) / 2
+        low, high = (low, middle) if grows(middle) else (middle, high)
+    return float(low)
+
+
+SHEET = Cloth(cells=(3, 2), sides=(1.0, 0.8), pinned=("corners",))
+DAMPED = Rope(links=7, length=0.7, pinned=("ends",))
+LINEAR: dict[str, tuple[Network, tuple[Effect, ...], float]] = {
+    "chain": (DAMPED, (Springs(stiffness=400),), 0.95),
+    "damped chain": (DAMPED, (Springs(stiffness=400, ratio=0.3),), 0.85),
+    "damped sheet": (SHEET, (Springs(stiffness=400, ratio=0.3),), 0.3),  # damping is bounded as well
+    "hinges": (DAMPED, (AngularSprings(stiffness=2, damping=0.01),), 0.9),
+    "bars": (DAMPED, (Elastic(young=1e3, area=0.01, alpha=0.5, beta=1e-3),), 0.9),
+    "triangles": (SHEET, (Elastic(young=1e3, thickness=0.1, beta=1e-3),), 0.5),
+    "many": (
+        SHEET, (
+            Springs(stiffness=300, shear=100, bend=50, damping=0.02), Drag(rate=0.5),
+            Tether(centre=O2, stiffness=50, damping=0.1),
+        ), 0.5,
+    ),
+}  # fmt: skip
+"""A network of .1 kg each, effects, and which share of the true limit is suggested at least."""
+
+
+@pytest.mark.parametrize("name", LINEAR)
+def test_the_suggested_step_is_at_most_the_true_limit_and_not_far_below(name: str) -> None:
+    """P02: at most the limit, at least half of it; where damping is bounded as well, about a third."""
+    net, effects, least = LINEAR[name]
+    stiffness, damping = derivatives(network(net, *effects))
+    drag = sum(effect.rate for effect in effects if isinstance(effect, Drag)) / 0.1
+    for method in (SemiImplicitEuler(), VelocityVerlet(), RK4(), ExponentialDrag()):
+        true = linear_limit(method, stiffness, damping, drag)
+        found = suggest_dt(network(net, *effects, method=method))
+        assert least * true <= found.dt <= 1.0005 * true, method.kind
+        assert found.effect == effects[0].kind
+
+
+@pytest.mark.parametrize(("shear", "bend", "printed"), [(0.0, 0.0, 3.93), (1000.0, 0.0, 7.80), (1000.0, 1000.0, 9.75)])
+def test_a_cloth_is_as_stiff_as_the_table_says(shear: float, bend: float, printed: float) -> None:
+    """12 x 12, numerics.md 3.3: the greatest w^2 m / k, and a suggestion within .5 to 1 of 2 / w."""
+    sheet = Cloth(cells=(11, 11), sides=(1.1, 1.1))
+    bonds = Springs(stiffness=1000, shear=shear, bend=bend).bonds((Group(network=sheet, mass=0.1),), 2)
+    matrix, points = np.zeros((288, 288)), sheet.rest_points(2)
+    for i, (j,), (k, _, _) in zip(bonds.agent, bonds.partner, bonds.number, strict=True):
+        way = points[j] - points[i]
+        block = k * np.outer(way, way) / (way @ way) / 0.1
+        matrix[2 * i : 2 * i + 2, 2 * i : 2 * i + 2] += block
+        matrix[2 * i : 2 * i + 2, 2 * j : 2 * j + 2] -= block
+    square = float(np.linalg.eigvalsh(matrix)[-1])
+    assert square * 0.1 / 1000 == pytest.approx(printed, abs=0.01)
+    found = suggest_dt(network(sheet, Springs(stiffness=1000, shear=shear, bend=bend)))
+    assert 0.5 * 2 / math.sqrt(square) <= found.dt <= 2 / math.sqrt(square)
+    assert found.effect == "springs"
+
+
+@pytest.mark.parametrize("method", [SemiImplicitEuler(), RK4()], ids=lambda method: method.kind)
+def test_a_chain_is_bounded_just_below_its_limit_and_diverges_just_above(method: Integrator) -> None:
+    """P02, N03: k = 400 N/m, m = .1 kg, 20 masses between fixed ends."""
+    assert pytest.approx(0.0158557, abs=1e-7) == TRUE
+    springs = Springs(stiffness=400, rest=0)  # linear: with rest lengths other modes take up what grows
+    most = TRUE * limit(method, 0.0) / 2
+    suggested = suggest_dt(network(CHAIN, springs, method=method)).dt
+    assert 0.5 * most <= suggested <= most
+    fast = np.sin(np.arange(22) * 20 * np.pi / 21)  # the fastest mode
+    ends = []
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UnstableStepWarning)
+        scenes = [network(CHAIN, springs, method=method, dt=share * most) for share in (0.99, 1.01)]
+    for scene in scenes:
+        start = scene.start(0)
+        start.pos[0, :, 0] += 1e-4 * fast
+        ends.append(start)
+    held = scenes[0].run(ends[0], 10_000)
+    assert np.abs(held.pos[0] - CHAIN.points(2)).max() < 2e-3
+    with pytest.raises(SimulationDiverged, match="accelerated by springs"):
+        scenes[1].run(ends[1], 100_000)
+
+
+def test_agents_have_limits_of_their_own() -> None:
+    """By mass, by group, by effect: the tightest sets the step, and its own stiffest effect is named."""
+    light, heavy = Group(count=3, mass=0.1, spawn=HERE), Group(count=4, mass=5.0, spawn=HERE)
+    ropes = tuple(Group(network=Rope(links=4, length=0.4), mass=0.1) for _ in range(2))
+    masses = Scene(groups=(heavy, light), effects=(Tether(centre=O2, stiffness=40.0),), dt=1e-6)
+    found = suggest_dt(masses)
+    assert found.dt == pytest.approx(2 / math.sqrt(40 / 0.1), rel=1e-6)
+    assert (found.agent, found.frequency, found.effect) == (4, pytest.approx(20.0), "tether")
+    # the springs of the first group are the stiffest effect; both of the second group's are stiffer together
+    effects = Springs(stiffness=100, group=0), Springs(stiffness=90, group=1), AngularSprings(stiffness=0.05, group=1)
+    both = suggest_dt(Scene(groups=ropes, effects=effects, dt=1e-6))
+    alone = suggest_dt(Scene(groups=ropes, effects=effects[:1], dt=1e-6))
+    assert both.agent is not None
+    assert both.agent >= 5
+    assert both.dt < alone.dt
+    hinges = Elastic(young=150, area=0.01), Springs(stiffness=20, group=1), AngularSprings(stiffness=0.03, group=1)
+    mixed = suggest_dt(Scene(groups=ropes, effects=hinges, dt=1e-6))
+    assert mixed.agent is not None
+    assert mixed.agent >= 5
+    assert mixed.effect in ("springs", "angular_springs")
+
+
+def test_of_very_many_the_fastest_are_looked_at() -> None:
+    """Everybody's mass is another one."""
+    groups = tuple(Group(count=1, mass=10.0 ** (-k / 100), spawn=HERE) for k in range(300))
+    scene = Scene(groups=groups, effects=(Tether(centre=O2, stiffness=40.0, damping=2.0),), dt=1e-6)
+    mass = 10.0 ** (-299 / 100)
+    zeta = 2 / (2 * math.sqrt(40 * mass))
+    expected = 2 * (math.sqrt(1 + zeta * zeta) - zeta) / math.sqrt(40 / mass)
+    assert suggest_dt(scene).dt == pytest.approx(expected, rel=1e-3)
+
+
+def test_who_is_held_has_no_limit() -> None:
+    """Infinite masses: no NaN, no warning, nobody who is held is named."""
+    all_held = Cloth(cells=(1, 1), sides=(1.0, 1.0), pinned=("corners",))
+    for effect in (
+        Springs(stiffness=1e6, damping=1, ratio=0.5), AngularSprings(stiffness=1e3, damping=1),
+        Elastic(young=1e6, alpha=1, beta=0.1), Drag(rate=1e6), Tether(centre=O2, stiffness=1e6, damping=1),
+    ):  # fmt: skip
+        assert suggest_dt(network(all_held, effect, dt=0.1)) == (math.inf, None, None, 0.0, 0.0)
+    found = suggest_dt(network(CHAIN, Springs(stiffness=400, damping=1)))
+    assert found.agent not in (None, 0, 21)
+    assert 0 < found.dt < math.inf
+
+
+# --- when a scene is made ---------------------------------------------------------------------------------------------
+
+
+@pytest.mark.filterwarnings("ignore::flockenv.stability.UnstableStepWarning")
+def test_scenes_without_stiff_effects_have_no_limit() -> None:
+    scene = body(
+        Separation(weight=1.0, radius=1.0),
+        Cohesion(weight=1.0, radius=1.0),
+        Gravity(acceleration=(0, -9.81)),
+        count=5,
+        dt=100.0,
+    )
+    assert suggest_dt(scene).dt == math.inf
+    assert suggest_dt(body(dt=1e6)).dt == math.inf
+    assert suggest_dt(body(Tether(centre=O2, stiffness=0.0), Drag(rate=0.0), dt=1e6)).dt == math.inf
+
+
+@pytest.mark.parametrize("path", sorted(Path("configs").glob("*.yaml")), ids=lambda path: path.stem)
+def test_scenes_that_are_shipped_are_neither_refused_nor_warned_of(path: Path) -> None:
+    if path.read_text().startswith("# yaml-language-server") and "groups:" in path.read_text():
+        scene = load_scene(path)  # a warning is an error here
+        assert scene.dt <= suggest_dt(scene).dt
+
+
+def test_a_warning_names_step_method_effect_agent_and_limit() -> None:
+    effects = Gravity(acceleration=(0, -9.81)), Tether(centre=O2, stiffness=100.0), Drag(rate=0.1)
+    with pytest.warns(UnstableStepWarning) as caught:
+        body(*effects, dt=0.21)
+    assert len(caught) == 1
+    text = str(caught[0].message)
+    for part in ("dt = 0.21 s", "semi_implicit_euler", "tether", "10 rad/s", "0.1 1/s", "agent 0", "0.199 s"):
+        assert part in text
+    assert "another integrator" not in text
+    assert "\n" not in text
+    body(*effects, dt=0.19)  # a warning would be an error
+
+
+@pytest.mark.parametrize("method", [ExplicitEuler(), AveragedVelocity(), Midpoint(), Heun()], ids=lambda m: m.kind)
+def test_who_grows_at_every_step_is_told_to_take_another(method: Integrator) -> None:
+    tether = Tether(centre=O2, stiffness=1.0)
+    with pytest.warns(UnstableStepWarning, match="so take another integrator"):
+        body(tether, method=method, dt=0.1)
+    with pytest.raises(ValueError, match="so take another integrator"):
+        body(tether, method=method, dt=3.0)
+    with pytest.warns(UnstableStepWarning) as caught:  # enough damping, and there is an honest limit
+        body(Tether(centre=O2, stiffness=1.0, damping=1.0), method=method, dt=1.01 * limit(method, 0.5))
+    assert "another integrator" not in str(caught[0].message)
+
+
+@pytest.mark.parametrize("method", FIXED, ids=lambda method: method.kind)
+def test_a_step_that_must_blow_up_is_refused(method: Integrator) -> None:
+    """And one that a bound is enough to explain is not: 2.5 times the limit."""
+    tether = Tether(centre=O2, stiffness=100.0)
+    with pytest.raises(ValueError, match=f"dt = 1 s: {method.kind} with tether") as caught:
+        body(tether, method=method, dt=1.0)
+    assert "\n" not in str(caught.value)
+    if limit(method, 0.0) > 1:
+        with pytest.warns(UnstableStepWarning):
+            body(tether, method=method, dt=0.24 * limit(method, 0.0))
+        with pytest.raises(ValueError, match="is stable"):
+            body(tether, method=method, dt=0.26 * limit(method, 0.0))
+    if not method.splits_drag:
+        with pytest.warns(UnstableStepWarning, match="drag"):
+            body(Drag(rate=1.05 * drag_limit(method)), method=method, dt=1.0)
+        with pytest.raises(ValueError, match="drag"):
+            body(Drag(rate=10.0), method=method, dt=1.0)
+
+
+@pytest.mark.parametrize("method", [ImplicitEuler(), ImplicitMidpoint(), AdaptiveRK4(), DormandPrince()])
+def test_methods_without_a_limit_are_left_alone(method: Integrator) -> None:
+    scene = body(Tether(centre=O2, stiffness=1e8), Drag(rate=1e4), method=method, dt=1.0)
+    assert suggest_dt(scene).dt == math.inf
+
+
+@pytest.mark.parametrize("spokes", [6, 20])
+def test_what_is_stable_is_never_refused(spokes: int) -> None:
+    """Springs in all directions do not add up as their bound does: by sqrt(2 D) at most, in no scene by more."""
+    directions = np.random.default_rng(0).normal(size=(spokes, 3))
+    ends = directions / np.linalg.norm(directions, axis=1, keepdims=True)
+    star = Mesh(
+        vertices=((0.0, 0.0, 0.0), *map(tuple, ends.tolist())), pairs=tuple((0, k) for k in range(1, spokes + 1))
+    )
+    for net in (star, Jelly(cells=(2, 2, 2), sides=(1.0, 1.0, 1.0))):
+        make = lambda dt, net=net: network(net, Springs(stiffness=400), dimension=3, dt=dt)  # noqa: E731
+        stiffness, _ = derivatives(make(1e-6))
+        true = 2 / math.sqrt(float(np.linalg.eigvals(stiffness).real.max()))
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", UnstableStepWarning)
+            make(0.999 * true)  # warned of, maybe
+            assert suggest_dt(make(1e-6)).dt <= true

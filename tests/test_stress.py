@@ -1,0 +1,226 @@
+"""Hard cases: what they come to under three methods, and how findings are kept and told."""
+
+from __future__ import annotations
+
+import math
+import warnings
+from typing import Any
+
+import pytest
+
+from flockenv.divergence import SimulationDiverged
+from flockenv.integrators import (
+    INTEGRATORS,
+    RK4,
+    ExplicitEuler,
+    ExponentialDrag,
+    Heun,
+    ImplicitEuler,
+    ImplicitMidpoint,
+    Integrator,
+    SemiImplicitEuler,
+    VelocityVerlet,
+)
+from flockenv.stability import UnstableStepWarning
+from flockenv.stress import CASES, Case, Finding, Results, Value, cases_named, methods_named, run, usual_methods
+
+NAMES = tuple(case.name for case in CASES)
+
+
+def case(trial: Any, name: str = "X01") -> Case:
+    return Case(name, "made up", "none", trial)
+
+
+def tried(trial: Any, method: Integrator | None = None) -> Finding:
+    (finding,) = run((case(trial),), (method or SemiImplicitEuler(),)).findings
+    return finding
+
+
+def named(name: str) -> Case:
+    return next(case for case in CASES if case.name == name)
+
+
+# --- verdicts ---------------------------------------------------------------------------------------------------------
+
+
+def warned(value: Value) -> Any:
+    def trial(method: Integrator) -> Value:
+        warnings.warn("dt = 1 s: too long", UnstableStepWarning, stacklevel=1)
+        return value
+
+    return trial
+
+
+def raised(error: Exception) -> Any:
+    def trial(method: Integrator) -> Value:
+        raise error
+
+    return trial
+
+
+def test_what_a_trial_returns_or_raises_is_its_verdict() -> None:
+    diverged = SimulationDiverged(0, 3, 17, 0.34, "springs", 0.02, "rk4")
+    for trial, verdict, value, note in (
+        (lambda method: Value(0.5, True, "fine"), "pass", 0.5, "fine"),
+        (lambda method: Value(0.5, False, "too much"), "fails", 0.5, "too much"),
+        (warned(Value(0.5, True, "fine")), "warned", 0.5, "fine; dt = 1 s: too long"),
+        (warned(Value(0.5, False)), "fails", 0.5, "dt = 1 s: too long"),
+        (raised(ValueError("dt = 1 s: at most")), "refused", None, "dt = 1 s: at most"),
+        (raised(diverged), "diverges", None, str(diverged)),
+        (lambda method: Value(math.inf, True), "pass", None, ""),
+        (lambda method: Value(math.nan, False), "fails", None, ""),
+    ):
+        finding = tried(trial)
+        assert (finding.verdict, finding.value, finding.note) == (verdict, value, note)
+        assert (finding.case, finding.title, finding.bound, finding.method) == (
+            "X01", "made up", "none", "semi_implicit_euler",
+        )  # fmt: skip
+        assert finding.seconds >= 0
+
+
+def test_other_errors_and_warnings_are_not_verdicts() -> None:
+    def deprecated(method: Integrator) -> Value:
+        warnings.warn("old", DeprecationWarning, stacklevel=1)
+        return Value(0.0, True)
+
+    with pytest.raises(ZeroDivisionError):
+        tried(lambda method: Value(1 / 0, True))
+    with pytest.raises(DeprecationWarning):
+        tried(deprecated)
+
+
+def test_a_number_that_is_not_one_is_no_pass() -> None:
+    """nan <= bound is False, and a bound that is asked the other way round must not let it through."""
+    assert tried(lambda method: Value(math.nan, math.nan <= 1.0)).verdict == "fails"
+    assert tried(lambda method: Value(math.nan, True)).verdict == "fails"
+
+
+# --- what is kept -----------------------------------------------------------------------------------------------------
+
+
+def test_findings_that_are_known_are_not_tried_again() -> None:
+    calls: list[tuple[str, str]] = []
+
+    def trial(name: str) -> Any:
+        return lambda method: calls.append((name, method.kind)) or Value(1.0, True)
+
+    cases, methods = tuple(case(trial(name), name) for name in ("A", "B")), (SemiImplicitEuler(), RK4())
+    kept: list[Results] = []
+    told: list[tuple[int, str]] = []
+    whole = run(cases, methods, progress=lambda done, text: told.append((done, text)), keep=kept.append)
+    assert calls == [("A", "semi_implicit_euler"), ("B", "semi_implicit_euler"), ("A", "rk4"), ("B", "rk4")]
+    assert told == [(k, f"{name}, {kind}") for k, (name, kind) in enumerate(calls)]
+    assert [len(results.findings) for results in kept] == [1, 2, 3, 4]
+    assert kept[-1] == whole
+    assert [(f.case, f.method) for f in whole.findings] == [
+        ("A", "semi_implicit_euler"), ("A", "rk4"), ("B", "semi_implicit_euler"), ("B", "rk4"),
+    ]  # fmt: skip
+    calls.clear()
+    again = run(cases, methods, known=kept[2].findings)
+    assert calls == [("B", "rk4")]
+    assert [f.cell for f in again.findings] == [f.cell for f in whole.findings]
+    assert run(cases, methods, known=whole.findings) == whole
+
+
+def test_results_are_a_table_and_json() -> None:
+    results = Results(
+        findings=(
+            tried(lambda method: Value(0.123456, True, "so")), tried(raised(ValueError("no")), RK4()),
+            tried(lambda method: Value(math.inf, True), Heun()),
+        )
+    )  # fmt: skip
+    assert results.methods == ["semi_implicit_euler", "rk4", "heun"]
+    assert results.cases == ["X01"]
+    assert results.rows() == [["X01", "made up", "none", "0.12 ok", "refused", "ok"]]
+    assert results.at("X01", "rk4") is results.findings[1]
+    assert results.at("X01", "midpoint") is None
+    assert Results.model_validate_json(results.model_dump_json()) == results
+    gap = Results(findings=(results.findings[0], results.findings[1].model_copy(update={"case": "X02"})))
+    assert gap.rows() == [["X01", "made up", "none", "0.12 ok", ""], ["X02", "made up", "none", "", "refused"]]
+
+
+def test_names_are_known_and_unknown_ones_get_a_suggestion() -> None:
+    assert len(set(NAMES)) == len(NAMES)
+    assert cases_named(CASES, ()) == CASES
+    assert [case.name for case in cases_named(CASES, ("N14",))] == [f"N14 {power}" for power in range(3, 9)]
+    assert [case.name for case in cases_named(CASES, ("N20 10", "N04"))] == ["N04", "N20 10"]
+    assert methods_named(("rk4", "heun")) == (RK4(), Heun())
+    assert methods_named(()) == usual_methods()
+    assert {method.kind for method in usual_methods()} == set(INTEGRATORS)
+    solving = [method.solves for method in usual_methods()]
+    assert solving == sorted(solving)
+    for call, text in ((lambda: cases_named(CASES, ("N41",)), "N4"), (lambda: methods_named(("rk44",)), "rk4")):
+        with pytest.raises(ValueError, match="unknown") as caught:
+            call()
+        assert text in str(caught.value)
+        assert "\n" not in str(caught.value)
+
+
+# --- the cases --------------------------------------------------------------------------------------------------------
+
+BOUNDED = tuple(name for name in NAMES if not name.startswith(("N14", "N20")))
+HEAVY = ("N09 crowd", "N10", "N18", "N09 centre")  # a kernel each, of ten seconds
+LIGHT = tuple(name for name in BOUNDED if name not in HEAVY)
+
+
+def within(method: Integrator, name: str) -> None:
+    (finding,) = run((named(name),), (method,)).findings
+    assert finding.verdict == "pass", finding.note
+
+
+@pytest.mark.parametrize("name", LIGHT)
+def test_semi_implicit_euler_stays_within_the_bounds(name: str) -> None:
+    within(SemiImplicitEuler(), name)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", HEAVY)
+def test_semi_implicit_euler_stays_within_the_bounds_of_crowds(name: str) -> None:
+    within(SemiImplicitEuler(), name)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", BOUNDED)
+@pytest.mark.parametrize("method", [VelocityVerlet(), RK4()], ids=lambda method: method.kind)
+def test_velocity_verlet_and_rk4_stay_within_the_bounds(method: Integrator, name: str) -> None:
+    within(method, name)
+
+
+@pytest.mark.parametrize("name", [name for name in NAMES if name.startswith("N14")])
+@pytest.mark.parametrize("method", [SemiImplicitEuler(), VelocityVerlet(), RK4()], ids=lambda method: method.kind)
+def test_a_stiff_cloth_is_refused_before_anything_runs(method: Integrator, name: str) -> None:
+    """N14, P16: the message names step, method, effect and limit."""
+    (finding,) = run((named(name),), (method,)).findings
+    assert finding.verdict == "refused"
+    for part in ("dt = 0.0166667 s", f"{method.kind} with springs", "s is stable"):
+        assert part in finding.note
+
+
+@pytest.mark.parametrize(("name", "expected"), [("N20 1.9", "pass"), ("N20 2.1", "warned"), ("N20 10", "refused")])
+def test_stiff_drag_is_bounded_then_warned_of_then_refused(name: str, expected: str) -> None:
+    """`warned` is caught by the case itself, which passes for it; its note says so."""
+    (finding,) = run((named(name),), (SemiImplicitEuler(),)).findings
+    assert finding.verdict == ("pass" if expected == "warned" else expected)
+    assert ("warned" in finding.note) == (expected == "warned")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["N01", "N02", "N03", "N09 centre", "N16", "N20 1.9", "N20 2.1", "N20 10"])
+def test_exponential_drag_stays_within_the_bounds(name: str) -> None:
+    """Drag that it is told of has no limit, other damping has one."""
+    within(ExponentialDrag(), name)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["N03", "N15", "N20 10", "N14 3", "N14 8"])
+@pytest.mark.parametrize("method", [ImplicitEuler(), ImplicitMidpoint()], ids=lambda method: method.kind)
+def test_methods_that_solve_stay_within_the_bounds(method: Integrator, name: str) -> None:
+    within(method, name)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["N01", "N04"])
+def test_explicit_euler_does_what_it_is_known_for(name: str) -> None:
+    """Its energy is that of its formula, and its orbit fails (numerics.md 3.1, N04)."""
+    (finding,) = run((named(name),), (ExplicitEuler(),)).findings
+    assert finding.verdict == ("fails" if name == "N04" else "warned")
