@@ -60,10 +60,11 @@ def solve_steps(
         push = drive[:, b : b + 1] if drive.shape[1] else drive
         evaluate = _evaluation(scene, alone, push)
         bad, reason = -1, ""
-        for _ in range(steps):
-            bad, reason = _solved(scene, method, alone, evaluate, step)
-            if bad >= 0:
-                break
+        with np.errstate(over="ignore", invalid="ignore"):  # what is not finite is reported
+            for _ in range(steps):
+                bad, reason = _solved(scene, method, alone, evaluate, step)
+                if bad >= 0:
+                    break
         if bad < 0:
             _put(state, b, alone)
         elif broken[0] < 0:
@@ -80,7 +81,7 @@ def _solved(
     try:
         found = method.solve(evaluate, x, v, float(alone.time[0]), scene.dt, scene.dimension, scene.coupling)
     except NotSolvedError as error:
-        return _fastest(alone), str(error)
+        return (error.place or 0) % scene.agents, str(error)
     alone.work[0, WORK.index("newton_iterations")] += found.newton
     alone.work[0, WORK.index("linear_iterations")] += found.linear
     alone.work[0, WORK.index("substeps")] += found.substeps
@@ -92,11 +93,6 @@ def _solved(
     if not scene.parts.flows:
         pos[:, held] = was[0][:, held] + scene.dt * vel[:, held]
     return step(alone, 0, pos, vel)[1], ""
-
-
-def _fastest(alone: State) -> int:
-    """Return the agent whose equations are the least likely to have a solution nearby: the fastest."""
-    return int(np.argmax((alone.v[:, 0] ** 2).sum(axis=0)))
 
 
 def _put(state: State, b: int, alone: State) -> None:

@@ -375,13 +375,18 @@ class Scene(Record):
         return error
 
     def _blamed(self, state: State, agent: int) -> str | None:
-        """Return the kind of the effect that accelerates an agent most, or to no number at all."""
+        """Return the kind of the effect that accelerates an agent most, or to no number at all.
+
+        Who is very far or fast is taken to be less so: there an effect that is idle is no number either, 0 x infinity.
+        """
         found: list[tuple[float, str]] = []
+        most = float(np.finfo(self.dtype).max) ** 0.25
+        near = dataclasses.replace(state, x=np.clip(state.x, -most, most), v=np.clip(state.v, -most, most))
         for k, effect in enumerate(self.effects):
             others = tuple(e if j == k else e.idle() for j, e in enumerate(self.effects))
             # nothing is stepped: under a method without a limit no dt is warned of or refused
             alone = self.model_copy(update={"effects": others, "integrator": ImplicitEuler()})
-            size = float(np.abs(alone.acceleration(state)[0, agent]).max())
+            size = float(np.abs(alone.acceleration(near)[0, agent]).max())
             found.append((size if math.isfinite(size) else math.inf, effect.kind))
         return max(found)[1] if found and max(found)[0] > 0 else None
 
@@ -403,7 +408,10 @@ class Scene(Record):
         b, n, d = state.shape
         acc = np.empty((d, b, n), self.dtype)
         flow = np.empty((d, b, n) if self.parts.flows else (d, 0, 0), self.dtype)
-        when = np.ascontiguousarray(np.broadcast_to(state.time if times is None else np.asarray(times), b), self.dtype)
+        given = np.asarray(state.time if times is None else times, float)
+        if given.shape not in ((), (b,)) or not np.isfinite(given).all():
+            raise ValueError(f"times is {times!r}, must be a finite number for each of {b} worlds, or one for all")
+        when = np.ascontiguousarray(np.broadcast_to(given, b), self.dtype)
         self._field(
             state.x, state.v, state.alive, state.obstacle_x, state.obstacle_radius, state.work,
             self._drive(drive, state), self._params, when, acc, flow, *self._workspaces(1, 1)[0].of(0),

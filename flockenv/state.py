@@ -128,9 +128,11 @@ class State:
 
     def with_dt(self, dt: float) -> State:
         """Return a copy whose clock counts steps of another length, s; refuses one that does not divide its time."""
+        if not (dt > 0 and np.isfinite(dt)):
+            raise ValueError(f"dt is {dt}, must be a positive number of seconds")
         ticks = self.time / dt
         whole = np.round(ticks)
-        if not dt > 0 or (np.abs(ticks - whole) > 1e-9 * np.maximum(whole, 1)).any():
+        if (np.abs(ticks - whole) > 1e-9 * np.maximum(whole, 1)).any():
             world = int(np.argmax(np.abs(ticks - whole)))
             raise ValueError(f"dt is {dt:g} s: the time of world {world}, {self.time[world]:g} s, is no multiple of it")
         return replace(self.copy(), tick=whole.astype(np.int64), dt=float(dt))

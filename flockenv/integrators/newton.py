@@ -33,6 +33,11 @@ GMRES_TOLERANCE = 1e-4
 class NotSolvedError(ArithmeticError):
     """Newton's method has not come to an end."""
 
+    def __init__(self, reason: str, left: Rows | None = None) -> None:
+        """left: by how much the equations do not hold, (D N,); none = not known."""
+        super().__init__(reason)
+        self.place = None if left is None else int(np.argmax(np.abs(left)))  # the first that is no number, or the worst
+
 
 class Stage(NamedTuple):
     """What was found, and what it took."""
@@ -120,7 +125,7 @@ def solve_stage(
             return _solved(residual, w, dimension, coupling)
         except _SingularError:
             continue
-    raise NotSolvedError("forces have no derivative where Newton's method begins")
+    raise NotSolvedError("forces have no derivative where Newton's method begins", residual(w[None])[0])
 
 
 class _SingularError(ArithmeticError):
@@ -142,7 +147,7 @@ def _solved(residual: _Residual, w: Rows, dimension: int, coupling: Coupling | N
     for iteration in range(1, MOST_ITERATIONS + 1):
         size = float(np.abs(r).max())
         if not np.isfinite(size):
-            raise NotSolvedError("the acceleration is not finite")
+            raise NotSolvedError("the acceleration is not finite", r)
         if size == 0.0:
             return residual.stage(w, iteration - 1, linear)
         solve = _free(residual, w, r) if coupling is None else _matrix(residual, w, r, dimension, coupling)
@@ -158,7 +163,7 @@ def _solved(residual: _Residual, w: Rows, dimension: int, coupling: Coupling | N
         before = change
         w, r, more = _searched(residual, w, correction, solve)
         linear += more
-    raise NotSolvedError(f"Newton's method has not converged in {MOST_ITERATIONS} iterations")
+    raise NotSolvedError(f"Newton's method has not converged in {MOST_ITERATIONS} iterations", r)
 
 
 def _searched(
@@ -210,7 +215,7 @@ def _matrix(
     try:
         factors = linalg.splu(jacobian)
     except RuntimeError:
-        raise NotSolvedError("the equations are singular") from None
+        raise NotSolvedError("the equations are singular", r) from None
     return lambda b: (factors.solve(b.astype(float)).astype(w.dtype), 0)
 
 
