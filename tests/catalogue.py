@@ -130,7 +130,6 @@ class EffectRow:
     beside: tuple[Effect, ...] = ()  # without which it moves nobody: what a medium drags or carries
     obeys: frozenset[str] = frozenset({"translation", "rotation", "mirror", "relabelling"})
     signed: tuple[str, ...] = ()  # parameters that may be negative
-    torus: bool = True  # may it act there?
 
     @property
     def name(self) -> str:
@@ -197,7 +196,7 @@ EFFECTS = (
     EffectRow(
         Swing(centre=CENTRE, strength=0.8, length=0.7), obeys=frozenset({"translation", "mirror", "relabelling"})
     ),
-    EffectRow(WallRepulsion(point=CENTRE, normal=(1.2, -0.7, 0.9), strength=2, decay=1.5), torus=False),
+    EffectRow(WallRepulsion(point=CENTRE, normal=(1.2, -0.7, 0.9), strength=2, decay=1.5)),
     EffectRow(Fluctuation(strength=0.8), obeys=frozenset({"translation"})),  # to each his own, along the axes
     EffectRow(Pressure(strength=1.5, density=1, radius=1.35)),
     EffectRow(Separation(weight=1.3, radius=2.5)),
@@ -320,15 +319,20 @@ FIRST = tuple({row.effect.kind: row for row in reversed(EFFECTS)}.values())[::-1
 """The first row of each kind of effect."""
 
 
-def everything(dimension: int, *chosen: Effect, **fields: Any) -> Scene:
-    """Return all kinds of effects at once, on a torus unless another space is given; but those on everybody.
+AMONG_ALL = {
+    "drag", "wind", "carried", "fluctuation", "separation", "alignment", "cohesion", "avoid_obstacles",
+}  # fmt: skip
+"""An effect or more of each form that a torus and large worlds know: what else there is would only compile longer."""
 
-    They are refused on a torus, like walls, and would make every scene of many agents here one with a tree.
+
+def everything(dimension: int, *chosen: Effect, **fields: Any) -> Scene:
+    """Return effects of all forms at once (AMONG_ALL), on a torus unless another space is given.
+
     With some chosen, the others are there and idle: one kernel serves for tests of each of them, as long as they look
     around in the same ways (sweep.Parts.sights: who shares a radius, and who has a view cone at all).
     """
     own = {effect.kind: effect for effect in chosen}
-    others = [row.effect for row in FIRST if row.torus and not (row.effect.far_law or row.effect.bond_law)]
+    others = [row.effect for row in FIRST if row.effect.kind in AMONG_ALL]
     rest = {effect.kind: in_dimension(effect, dimension) for effect in others}
     given = {"space": SPACES["torus"][dimension]} | fields
     effects = ({kind: effect.idle() for kind, effect in rest.items()} if chosen else rest) | own

@@ -17,7 +17,7 @@ from flockenv.state import State, blank
 from tests.catalogue import INTEGRATORS, Array
 
 METHODS = pytest.mark.parametrize("row", INTEGRATORS, ids=lambda row: row.name)
-WAYS = pytest.mark.parametrize("way", ["python", "compiled"])
+WAYS = pytest.mark.parametrize("way", ["python", pytest.param("compiled", marks=pytest.mark.slow)])
 
 Advance = Callable[[Integrator, float, int], State]
 """(method, dt, steps) -> the state at the end."""

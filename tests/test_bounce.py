@@ -17,6 +17,9 @@ from flockenv.state import State
 from flockenv.sweep import scene_source
 from tests.catalogue import INTEGRATORS, Array, IntegratorRow
 
+pytestmark = pytest.mark.slow
+"""Many kernels: where slow tests run."""
+
 G = 9.81
 METHODS = pytest.mark.parametrize("row", INTEGRATORS, ids=lambda row: row.name)
 STEPS = pytest.mark.parametrize("dt", [0.001, 0.005, 0.02])

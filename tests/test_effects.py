@@ -22,6 +22,7 @@ from flockenv.space import Plane
 from flockenv.spawn import Spawn
 from flockenv.state import State
 from tests.catalogue import (
+    AMONG_ALL,
     EDGE,
     EFFECTS,
     FIRST,
@@ -189,8 +190,8 @@ KINDS = pytest.mark.parametrize("row", FIRST, ids=lambda row: row.name)
 
 def single(row: EffectRow, dimension: int) -> Scene:
     """One effect in float32, the others idle: one kernel for all of them, but for those that are never among others."""
-    if row.effect.far_law or row.effect.bond_law:
-        return scene_of(row.effect, dimension=dimension, dtype="float32")
+    if row.effect.kind not in AMONG_ALL:
+        return scene_of(*row.at(dimension), dimension=dimension, dtype="float32")
     return everything(dimension, *row.at(dimension), space=Plane(), dtype="float32")
 
 

@@ -23,6 +23,9 @@ from flockenv.state import State
 from flockenv.tree import MOST_DIRECT
 from tests.catalogue import Array, scene_of, users_module
 
+pytestmark = pytest.mark.slow
+"""Many kernels: where slow tests run."""
+
 DIMENSIONS = pytest.mark.parametrize("dimension", [2, 3])
 KINDS = pytest.mark.parametrize("kind", ["gravitation", "inverse_square"])
 MANY = 4200

@@ -24,6 +24,9 @@ from flockenv.integrators import (
 from flockenv.stability import UnstableStepWarning
 from flockenv.stress import CASES, Case, Finding, Results, Value, cases_named, methods_named, run, usual_methods
 
+pytestmark = pytest.mark.slow
+"""Many kernels: where slow tests run."""
+
 NAMES = tuple(case.name for case in CASES)
 
 
