@@ -208,7 +208,10 @@ EFFECTS = (
     EffectRow(InverseSquare(strength=-0.4, softening=0.3), signed=("strength",)),
     # everybody is tied to somebody else; see `tied`
     EffectRow(Springs(stiffness=3, damping=0.2), obeys=frozenset({"translation", "rotation", "mirror"})),
-    EffectRow(AngularSprings(stiffness=1.5, damping=0.1), obeys=frozenset({"translation", "rotation", "mirror"})),
+    EffectRow(
+        AngularSprings(stiffness=0.05, damping=0.005), beside=(Springs(stiffness=3),),  # stretched, angles are at rest
+        obeys=frozenset({"translation", "rotation"}),  # in the plane an angle has a sign
+    ),
     EffectRow(Elastic(young=3, beta=0.1), obeys=frozenset({"translation"})),  # linear: it knows where it has turned to
 )  # fmt: skip
 

@@ -17,6 +17,7 @@ from flockenv import effects as effects_module
 from flockenv.effects import Drag, Separation
 from flockenv.integrators import RK4
 from flockenv.kernels import cache_folder
+from flockenv.networks import Mesh
 from flockenv.scene import Group, Scene
 from flockenv.space import Plane
 from flockenv.spawn import Spawn
@@ -466,7 +467,7 @@ def test_a_scene_under_it_is_a_value(row: EffectRow, dimension: int) -> None:
     again = pickle.loads(pickle.dumps(scene))
     assert again == scene
     assert Scene.model_validate(scene.model_dump()) == scene
-    names = vars(effects_module) | {"Scene": Scene, "Group": Group, "Spawn": Spawn, "Plane": Plane}
+    names = vars(effects_module) | {"Scene": Scene, "Group": Group, "Spawn": Spawn, "Plane": Plane, "Mesh": Mesh}
     names |= {type(o).__name__: type(o) for o in (*scene.obstacles, scene.integrator)}
     assert eval(repr(scene), names) == scene  # noqa: S307
     np.testing.assert_array_equal(again.run(again.start(3), 5).x, end.x)

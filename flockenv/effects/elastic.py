@@ -102,7 +102,7 @@ class Elastic(Effect):
         first, network, _ = network_of(groups, self.group, dimension)
         near = blocks(self.matrix(network, dimension), network.rest_points(dimension))
         agent = np.repeat(np.arange(len(near.start) - 1), np.diff(near.start)) + first
-        number = np.concatenate([near.block.reshape(len(agent), -1), near.way], axis=1)
+        number = np.concatenate([near.block.reshape(len(agent), dimension**2), near.way], axis=1)
         return Bonds(agent.astype(np.int32), (near.partner[:, None] + first).astype(np.int32), number)
 
     def rates(self, groups: Sequence[Any], dimension: int) -> tuple[Floats, Floats] | None:
