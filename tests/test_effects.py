@@ -503,6 +503,7 @@ json.dump(found, sys.stdout)
 """
 
 
+@pytest.mark.slow  # the first process compiles all forms of laws
 def test_a_second_process_compiles_nothing_and_finds_the_same() -> None:
     here = {}
     for row in EFFECTS:

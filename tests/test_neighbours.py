@@ -180,11 +180,11 @@ def test_rules_of_different_radii_share_the_widest_query() -> None:
 
 @pytest.mark.parametrize("count", [50, 700])
 def test_an_effect_that_is_not_listed_changes_no_bits_and_no_counters(count: int) -> None:
-    """The three rules alone are what they are among two others that weigh nothing."""
+    """The three rules alone are what they are among others that weigh nothing."""
     space = Torus(size=(14.0, 11.0))
     among = scene_with(MIXED, space, 2, count)
     alone = among.with_effects(*MIXED)
-    assert len(among.effects) == 5
+    assert len(among.effects) > len(MIXED)
     start = placed(among, uniform(count, space.size), np.random.default_rng(1).normal(size=(count, 2)))
     ends = [scene.run(start, 10) for scene in (among, alone)]
     np.testing.assert_array_equal(ends[0].x, ends[1].x)

@@ -6,6 +6,7 @@ world together, each the agents of its own blocks.
 
 from __future__ import annotations
 
+from flockenv.state import WORK
 from flockenv.sweep.accelerate import parameters
 from flockenv.sweep.arrange import go_home, move_in
 from flockenv.sweep.parts import Parts
@@ -63,6 +64,8 @@ def step_world(parts: Parts) -> str:
     """Return the source of `step_world`: steps of one world, or of one thread's part of it."""
     d = parts.dimension
     bad = Slots(parts)("bad")
+    kept = "(" + ", ".join(f"work[b, {k}]" for k in range(len(WORK))) + ")"
+    restored = "; ".join(f"work[b, {k}] = counted_[{k}]" for k in range(len(WORK)))
     return f'''@kernel
 def step_world(
     x_, v_, alive, tick, key, obstacle_x, obstacle_radius, work, params, dt, count, b, rank, team, {SHARED},
@@ -87,6 +90,7 @@ def step_world(
 {indented(_remember(parts), 4)}
     context = ({CONTEXT})
     far, begun = like(dt, np.inf), tick[b]
+    counted_ = {kept}
 {indented(_kick_parameters(parts), 4)}
     for l in range(np.uint64({parts.width})):
         {bad} = far
@@ -104,6 +108,8 @@ def step_world(
         first_bad = min(first_bad, tally[team + r])
     wait_for_team(sync, team)  # before anybody counts again
     if first_bad < n:
+        if rank == 0:
+            {restored}
         return first_bad
     out_of_blocks(pos, x_, b, n, first, end)
     out_of_blocks(vel, v_, b, n, first, end)
