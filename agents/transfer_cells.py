@@ -244,9 +244,7 @@ def _errors(plan: Plan, actions: Actions) -> dict[str, float]:
     right = _end(task.model_copy(update=exact), plan, actions[:count])
     errors = {}
     for setting in plan.settings:
-        off = right - _end(setting.of(task), plan, actions[:count])
-        box = np.array(task.scene.space.extent(task.scene.dimension))
-        off -= box * np.round(off / box) if task.scene.space.periodic else 0.0
+        off = task.scene.space.displacement(_end(setting.of(task), plan, actions[:count]), right)
         errors[setting.name] = 1e3 * float(np.median(np.linalg.norm(off, axis=-1)))
     return errors
 

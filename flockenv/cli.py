@@ -10,6 +10,7 @@ import json
 import math
 import re
 import sys
+import warnings
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from time import perf_counter
@@ -72,7 +73,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     words = list(sys.argv[1:] if arguments is None else arguments)
     debug = "--debug" in words
     try:
-        code = app([w for w in words if w != "--debug"], prog_name="flockenv", standalone_mode=False)
+        with warnings.catch_warnings():
+            warnings.showwarning = _warn
+            code = app([w for w in words if w != "--debug"], prog_name="flockenv", standalone_mode=False)
         # typer turns a KeyboardInterrupt into this code without a word
         return _complain("interrupted", INTERRUPTED) if code == INTERRUPTED else int(code or OK)
     except (typer.Abort, KeyboardInterrupt):
@@ -93,6 +96,11 @@ def _verdict(error: Exception) -> tuple[str, int]:
     if isinstance(error, (ValueError, OSError, ImportError)):
         return str(error), BAD_INPUT
     return f"{type(error).__name__}: {error} (a fault of flockenv's; --debug shows where)", DIVERGED
+
+
+def _warn(message: Warning | str, *place: object, **more: object) -> None:
+    """Say a warning as errors are said, in one line, without the place in our sources."""
+    _complain(f"warning: {message}", OK)
 
 
 def _complain(text: str, code: int) -> int:

@@ -41,6 +41,7 @@ __all__ = [
     "finite",
     "kernel",
     "law",
+    "laws_digest",
     "like",
     "load",
     "shared",
@@ -205,7 +206,7 @@ def cache_folder() -> Path:
 
 
 @functools.cache
-def _laws_digest() -> str:
+def laws_digest() -> str:
     """Digest every source of the package that holds laws: an edit to one means new files, never stale machine code."""
     digest = hashlib.sha256(f"{numba.__version__} {sys.version_info[:2]}".encode())
     for path in sorted(Path(__file__).parent.rglob("*.py")):
@@ -238,7 +239,7 @@ def load(name: str, source: str) -> ModuleType:
 
     The file is written beside its final place and renamed, so that two processes may race.
     """
-    digest = hashlib.sha256((source + _laws_digest() + _other_laws(source)).encode()).hexdigest()[:20]
+    digest = hashlib.sha256((source + laws_digest() + _other_laws(source)).encode()).hexdigest()[:20]
     folder = cache_folder()
     path = folder / f"{name}_{digest}.py"
     if not path.exists():

@@ -368,9 +368,8 @@ class Scene(Record):
         while done < steps and (bad := self._advance(alone, push, 1))[0] < 0:
             done += 1
         agent = bad[1] if done < steps else agent
-        last, time = int(alone.tick[0]) + 1, (int(alone.tick[0]) + 1) * self.dt
-        effect = self._blamed(alone, agent)
-        error = SimulationDiverged(world, agent, last, time, effect, self.dt, self.integrator.kind, reason)
+        last, effect = int(alone.tick[0]) + 1, self._blamed(alone, agent)
+        error = SimulationDiverged(world, agent, last, last * self.dt, effect, self.dt, self.integrator.kind, reason)
         error.state = state
         return error
 
@@ -499,9 +498,7 @@ class Scene(Record):
 
     @functools.cached_property
     def _field(self) -> Any:
-        plain = dataclasses.replace(
-            self.parts, integrator=SemiImplicitEuler()
-        )  # which method it is makes no difference
+        plain = dataclasses.replace(self.parts, integrator=SemiImplicitEuler())  # the method makes no difference
         return load("field", field_source(plain)).field
 
     @functools.cached_property

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -14,6 +15,7 @@ from flockenv.terminal import INTERRUPTED, EarlyEnd, Force, Seed, new_console, p
 
 if TYPE_CHECKING:
     from flockenv.accuracy import Problem, Report
+    from flockenv.records import Record
     from flockenv.stress import Results
 
 __all__ = ["accuracy", "stress"]
@@ -42,7 +44,8 @@ def accuracy(
     force: Force = False,
 ) -> None:
     """Show what accuracy costs: how far each integrator ends from the truth in which steps, beside its time."""
-    from flockenv.accuracy import methods_named, problems_named, table, usual_methods
+    from flockenv.accuracy import Results, measure, problems_named, table, usual_methods
+    from flockenv.integrators import methods_named
     from flockenv.outputs import checked_file
 
     if suite == (scene is not None):
@@ -61,7 +64,7 @@ def accuracy(
     try:
         for problem in todo:
             with progress_bar(f"measuring {problem.name}", 100, "%") as progress:
-                reports.append(_measured(problem, chosen, repetitions, progress))
+                reports.append(measure(problem, chosen, repetitions, progress=progress))
             show_table(console, reports[-1].title, ([line] for line in table.headlines(reports[-1])), [""])
             show_table(console, "", table.rows(reports[-1], aimed), table.columns(aimed))
             show_table(console, "The cheapest", ([line] for line in table.best(reports[-1], aimed)), [""])
@@ -71,7 +74,7 @@ def accuracy(
         if not reports:
             raise
     if path is not None and reports:
-        _keep(path, reports)
+        _write(path, Results(reports=tuple(reports)), functools.partial(_draw_precision, reports))
         console.print(f"{len(reports)} problems in {relative(path)}")
     if len(reports) < len(todo) or reports[-1].stopped:
         raise EarlyEnd("interrupted; what was done is shown", INTERRUPTED)
@@ -97,26 +100,27 @@ def _problem(file: str, seconds: float | None, steps: str, dts: str, seed: int) 
     return Problem.of(loaded, horizon, counts, seed, name=Path(file).stem, title=Path(file).name)
 
 
-def _measured(
-    problem: Problem, methods: Sequence[Any], repetitions: int, progress: Callable[[int], None]
-) -> Report:  # fmt: skip
-    from flockenv.accuracy import measure
-
-    return measure(problem, methods, repetitions, progress=progress)
-
-
-def _keep(path: Path, reports: Sequence[Report]) -> None:
-    """Write the numbers, and a picture of them if that was asked for."""
-    from flockenv.accuracy import Results
+def _write(path: Path, numbers: Record, draw: Callable[[Path], None]) -> None:
+    """Write numbers as JSON, and a picture of them if that was asked for."""
     from flockenv.outputs import replacing
 
     path.parent.mkdir(parents=True, exist_ok=True)
     with replacing(path.with_suffix(".json")) as file:
-        file.write((Results(reports=tuple(reports)).model_dump_json(indent=1) + "\n").encode())
+        file.write((numbers.model_dump_json(indent=1) + "\n").encode())
     if path.suffix.lower() == ".png":
-        from flockenv.render.precision import write_precision
+        draw(path)
 
-        write_precision(path, reports)
+
+def _draw_precision(reports: Sequence[Report], path: Path) -> None:
+    from flockenv.render.precision import write_precision
+
+    write_precision(path, reports)
+
+
+def _draw_verdicts(results: Results, path: Path) -> None:
+    from flockenv.render.verdicts import write_verdicts
+
+    write_verdicts(path, results)
 
 
 def _words(text: str) -> list[str]:
@@ -141,55 +145,53 @@ def stress(
         str | None,
         typer.Option(
             metavar="X.json|X.png",
-            help="Write the findings; a picture has X.json beside it. "
-            "What stands in X.json already is not tried again.",
+            help="Keep the findings; a picture has X.json beside it. What X.json says already is not tried again.",
         ),
     ] = None,
-    force: Force = False,
+    force: Annotated[bool, typer.Option("--force", help="Begin anew, whatever X.json says.")] = False,
 ) -> None:
     """Try every hard case under every integrator, and show value, bound and verdict of each."""
+    from flockenv.integrators import INTEGRATORS, methods_named
     from flockenv.outputs import checked_file
-    from flockenv.stress import CASES, Results, cases_named, methods_named, run
+    from flockenv.stress import CASES, VERDICTS, cases_named, run, usual_methods
 
     path = checked_file(out, [".json", ".png"], True) if out is not None else None
-    numbers = path.with_suffix(".json") if path is not None else None
-    todo, under = cases_named(CASES, _words(cases)), methods_named(_words(methods))
-    known: tuple[Any, ...] = ()
-    if numbers is not None and numbers.exists() and not force:
-        known = Results.model_validate_json(numbers.read_text(encoding="utf-8")).findings
-    so_far = Results(findings=())
+    todo = cases_named(CASES, _words(cases))
+    under = methods_named(_words(methods)) if methods else usual_methods()
+    found = None if path is None or force else _known(path.with_suffix(".json"))
 
     def keep(results: Results) -> None:
-        nonlocal so_far
-        so_far = results
+        nonlocal found
+        found = results
+        if path is not None:
+            _write(path.with_suffix(".json"), results, lambda _: None)
 
     stopped = False
     try:
         with progress_bar("hard cases", len(todo) * len(under), "trials") as advance:
-            run(todo, under, known, lambda done, text: advance(done), keep)
+            found = run(todo, under, found, advance, keep)
     except KeyboardInterrupt:
-        if not so_far.findings:
+        if found is None:
             raise
         stopped = True
+    asked = found.only({case.name for case in todo}, {method.kind for method in under})
     console = new_console()
-    show_table(console, "Hard cases", so_far.rows(), ("case", "scene", "bound", *so_far.methods))
-    notes = ((f.case, f.method, f.verdict, f.note) for f in so_far.findings if f.verdict != "pass")
-    show_table(console, "What is not simply within its bound", notes, ("case", "method", "", ""))
-    if path is not None and numbers is not None:
-        _keep_findings(path, numbers, so_far)
-        console.print(f"{len(so_far.findings)} findings in {relative(path)}")
+    show_table(console, "Hard cases", asked.rows(), ("case", "scene", "bound", *asked.methods))
+    if notes := [(f.case, f.method, f.verdict, f.note) for f in asked.findings if f.verdict != "pass"]:
+        show_table(console, "What is not simply within its bound", notes, ("case", "method", "", ""))
+    show_table(console, "Verdicts", VERDICTS.items())
+    if path is not None:
+        _write(path, found, functools.partial(_draw_verdicts, found))
+        console.print(f"{relative(path)} holds {len(found.findings)} of {len(CASES) * len(INTEGRATORS)} findings")
     if stopped:
         raise EarlyEnd("interrupted; what was done is shown, the same command goes on", INTERRUPTED)
 
 
-def _keep_findings(path: Path, numbers: Path, results: Results) -> None:
-    """Write the findings, and a picture of them if that was asked for."""
-    from flockenv.outputs import replacing
+def _known(numbers: Path) -> Results | None:
+    """Return what a file says already, none if it is not there; ValueError if it says something else."""
+    from flockenv.stress import Results
 
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with replacing(numbers) as file:
-        file.write((results.model_dump_json(indent=1) + "\n").encode())
-    if path.suffix.lower() == ".png":
-        from flockenv.render.verdicts import write_verdicts
-
-        write_verdicts(path, results)
+    try:
+        return Results.model_validate_json(numbers.read_text(encoding="utf-8")) if numbers.exists() else None
+    except ValueError:
+        raise ValueError(f"--out: {numbers.name} holds no findings of hard cases; --force overwrites it") from None

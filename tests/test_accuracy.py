@@ -11,14 +11,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from flockenv.accuracy import SUITE, Problem, Report, Results, measure, methods_named, problems_named, usual_methods
+from flockenv.accuracy import SUITE, Problem, Report, Results, measure, problems_named, usual_methods
 from flockenv.accuracy import problem as problems
 from flockenv.accuracy import reference as references
 from flockenv.accuracy.results import Curve, Point, measured_order
 from flockenv.accuracy.table import best, columns, headlines, rows
 from flockenv.cli import main
 from flockenv.effects import Effect, Fluctuation, Separation, Swing, Tether
-from flockenv.integrators import RK4, Integrator
+from flockenv.integrators import RK4, Integrator, methods_named
 from flockenv.render.precision import draw_precision, write_precision
 from flockenv.scene import Group, Scene
 from flockenv.spawn import Spawn

@@ -14,16 +14,17 @@ import pytest
 from PIL import Image
 from typer.testing import CliRunner
 
-import flockenv
+import flockenv.stress
 from flockenv.cli import app, main
 from flockenv.config import load_scene, schema
 from flockenv.effects import EFFECTS
 from flockenv.effects.springs import Springs
 from flockenv.explanation import Explanation
-from flockenv.integrators import INTEGRATORS, ImplicitEuler
+from flockenv.integrators import INTEGRATORS, ImplicitEuler, Integrator
 from flockenv.networks import Rope
 from flockenv.scene import Group, Scene
 from flockenv.stability import suggest_dt
+from flockenv.stress import Case, Value
 from flockenv.tasks import TASKS
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -269,6 +270,80 @@ def test_explain_says_who_sets_the_largest_step() -> None:
     assert said(scene.model_copy(update={"integrator": ImplicitEuler()})) == (
         "any is stable with implicit_euler, dt = 0.02 s"
     )
+
+
+@pytest.mark.filterwarnings("default")
+def test_a_warning_is_one_line_without_a_place_in_our_sources(capsys: pytest.CaptureFixture[str]) -> None:
+    held = TINY.replace("{kind: drag, rate: 0.5}", "{kind: tether, centre: [0, 0], stiffness: 100}")
+    Path("stiff.yaml").write_text(held.replace("dt: 0.01", "dt: 0.21"))
+    assert main(["run", "stiff.yaml", "--duration", "0.21"]) == 0
+    assert re.fullmatch(r"flockenv: warning: dt = 0\.21 s.*tether.*0\.2 s.*\n", capsys.readouterr().err)
+
+
+# --- stress -----------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def tried(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """Two made-up hard cases instead of the real ones, and a list of what was tried."""
+    calls: list[str] = []
+
+    def case(name: str, within: bool) -> Case:
+        def trial(method: Integrator) -> Value:
+            calls.append(f"{name} {method.kind}")
+            return Value(0.5, within, "so it is")
+
+        return Case(name, f"the scene of {name}", "none", trial)
+
+    monkeypatch.setattr("flockenv.stress.CASES", (case("X01", True), case("X02", False)))
+    return calls
+
+
+def test_stress_shows_values_and_what_is_wrong(tried: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["stress", "--methods", "rk4,heun"]) == 0
+    assert tried == ["X01 rk4", "X02 rk4", "X01 heun", "X02 heun"]
+    shown = capsys.readouterr().out
+    for text in ("X01", "the scene of X02", "rk4", "heun", "0.5 ok", "0.5 FAILS", "so it is"):
+        assert text in shown
+    assert not list(Path().glob("*.json"))
+
+
+def test_stress_goes_on_where_it_was_and_loses_nothing(tried: list[str]) -> None:
+    assert main(["stress", "--methods", "rk4", "--out", "hard.png"]) == 0
+    with Image.open("hard.png") as picture:
+        assert picture.width > 100
+    assert main(["stress", "--methods", "rk4,heun", "--cases", "X02", "--out", "hard.json"]) == 0
+    assert tried == ["X01 rk4", "X02 rk4", "X02 heun"]
+    kept = json.loads(Path("hard.json").read_text())
+    assert sorted(f"{f['case']} {f['method']}" for f in kept["findings"]) == sorted(tried)
+    kept["sources"] = "those of yesterday"
+    Path("hard.json").write_text(json.dumps(kept))
+    tried.clear()
+    assert main(["stress", "--methods", "rk4", "--out", "hard.json"]) == 0
+    assert main(["stress", "--methods", "rk4", "--cases", "X01", "--out", "hard.json", "--force"]) == 0
+    assert tried == ["X01 rk4", "X02 rk4", "X01 rk4"]
+
+
+def test_stress_does_not_take_another_file_for_its_own(tried: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    Path("mine.json").write_text('{"life": "work"}')
+    assert main(["stress", "--out", "mine.json"]) == 2
+    assert capsys.readouterr().err == (
+        "flockenv: --out: mine.json holds no findings of hard cases; --force overwrites it\n"
+    )
+    assert not tried and Path("mine.json").read_text() == '{"life": "work"}'
+
+
+def test_an_interrupted_stress_keeps_what_was_found(
+    tried: list[str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def interrupted(method: Integrator) -> Value:
+        raise KeyboardInterrupt
+
+    first = flockenv.stress.CASES[0]
+    monkeypatch.setattr("flockenv.stress.CASES", (first, Case("X03", "stopped", "none", interrupted)))
+    assert main(["stress", "--methods", "rk4", "--out", "hard.json"]) == 130
+    assert "interrupted; what was done is shown, the same command goes on" in capsys.readouterr().err
+    assert [f["case"] for f in json.loads(Path("hard.json").read_text())["findings"]] == ["X01"]
 
 
 # --- mistakes ---------------------------------------------------------------------------------------------------------

@@ -20,9 +20,10 @@ from flockenv.integrators import (
     Integrator,
     SemiImplicitEuler,
     VelocityVerlet,
+    methods_named,
 )
 from flockenv.stability import UnstableStepWarning
-from flockenv.stress import CASES, Case, Finding, Results, Value, cases_named, methods_named, run, usual_methods
+from flockenv.stress import CASES, Case, Finding, Results, Value, cases_named, fingerprint, run, usual_methods
 
 pytestmark = pytest.mark.slow
 """Many kernels: where slow tests run."""
@@ -109,20 +110,38 @@ def test_findings_that_are_known_are_not_tried_again() -> None:
 
     cases, methods = tuple(case(trial(name), name) for name in ("A", "B")), (SemiImplicitEuler(), RK4())
     kept: list[Results] = []
-    told: list[tuple[int, str]] = []
-    whole = run(cases, methods, progress=lambda done, text: told.append((done, text)), keep=kept.append)
+    told: list[int] = []
+    whole = run(cases, methods, progress=told.append, keep=kept.append)
     assert calls == [("A", "semi_implicit_euler"), ("B", "semi_implicit_euler"), ("A", "rk4"), ("B", "rk4")]
-    assert told == [(k, f"{name}, {kind}") for k, (name, kind) in enumerate(calls)]
+    assert told == [0, 1, 2, 3]
     assert [len(results.findings) for results in kept] == [1, 2, 3, 4]
     assert kept[-1] == whole
     assert [(f.case, f.method) for f in whole.findings] == [
         ("A", "semi_implicit_euler"), ("A", "rk4"), ("B", "semi_implicit_euler"), ("B", "rk4"),
     ]  # fmt: skip
     calls.clear()
-    again = run(cases, methods, known=kept[2].findings)
+    again = run(cases, methods, known=kept[2])
     assert calls == [("B", "rk4")]
     assert [f.cell for f in again.findings] == [f.cell for f in whole.findings]
-    assert run(cases, methods, known=whole.findings) == whole
+    assert run(cases, methods, known=whole) == whole
+
+
+def test_what_is_known_of_other_cases_stays_and_of_other_sources_goes() -> None:
+    calls: list[str] = []
+
+    def trial(name: str) -> Case:
+        return case(lambda method: calls.append(name) or Value(1.0, True), name)
+
+    first = run((trial("A"),), (RK4(),))
+    assert first.sources == fingerprint()
+    both = run((trial("B"),), (RK4(),), known=first)
+    assert [f.case for f in both.findings] == ["B", "A"]
+    assert both.only({"B"}, {"rk4"}).cases == ["B"]
+    assert not both.only({"B"}, {"heun"}).findings
+    calls.clear()
+    old = both.model_copy(update={"sources": "those of yesterday"})
+    assert run((trial("A"),), (RK4(),), known=old).cases == ["A"]
+    assert calls == ["A"]
 
 
 def test_results_are_a_table_and_json() -> None:
@@ -147,16 +166,16 @@ def test_names_are_known_and_unknown_ones_get_a_suggestion() -> None:
     assert cases_named(CASES, ()) == CASES
     assert [case.name for case in cases_named(CASES, ("N14",))] == [f"N14 {power}" for power in range(3, 9)]
     assert [case.name for case in cases_named(CASES, ("N20 10", "N04"))] == ["N04", "N20 10"]
-    assert methods_named(("rk4", "heun")) == (RK4(), Heun())
-    assert methods_named(()) == usual_methods()
+    assert methods_named(("rk4", "heun", "rk4")) == (RK4(), Heun())
     assert {method.kind for method in usual_methods()} == set(INTEGRATORS)
     solving = [method.solves for method in usual_methods()]
     assert solving == sorted(solving)
-    for call, text in ((lambda: cases_named(CASES, ("N41",)), "N4"), (lambda: methods_named(("rk44",)), "rk4")):
-        with pytest.raises(ValueError, match="unknown") as caught:
-            call()
-        assert text in str(caught.value)
-        assert "\n" not in str(caught.value)
+    with pytest.raises(ValueError, match=r"^case 'N41': unknown.*N04") as caught:
+        cases_named(CASES, ("N41",))
+    assert "\n" not in str(caught.value)
+    with pytest.raises(ValueError, match=r"^methods: 'rk44' is none.*rk4") as caught:
+        methods_named(("rk44",))
+    assert "\n" not in str(caught.value)
 
 
 # --- the cases --------------------------------------------------------------------------------------------------------

@@ -19,11 +19,10 @@ from flockenv.accuracy.problem import Floats, Problem, largest
 from flockenv.accuracy.reference import FINER, Reference, find_reference, find_sensitivity
 from flockenv.accuracy.results import Curve, Machine, Point, Report, measured_order
 from flockenv.integrators import INTEGRATORS, Integrator
-from flockenv.refusals import nearest, shown
 from flockenv.scene import Scene
 from flockenv.state import State
 
-__all__ = ["REPETITIONS", "TOLERANCES", "machine", "measure", "methods_named", "usual_methods"]
+__all__ = ["REPETITIONS", "TOLERANCES", "machine", "measure", "usual_methods"]
 
 REPETITIONS = 20
 TOLERANCES = tuple(10.0**-k for k in range(3, 13))
@@ -206,14 +205,6 @@ def usual_methods() -> tuple[Integrator, ...]:
     """Return every method that takes explicit steps, in its usual setting, those of low order first."""
     kinds = [kind for kind in INTEGRATORS.values() if not kind.solves]
     return tuple(kind() for kind in sorted(kinds, key=lambda kind: (kind.order, kind.evaluations)))
-
-
-def methods_named(names: Sequence[str]) -> tuple[Integrator, ...]:
-    """Return methods by their kinds; raises ValueError, with the nearest name, for one that is not there."""
-    for name in names:
-        if name not in INTEGRATORS:
-            raise ValueError(f"methods: {shown(name)} is none{nearest(name, INTEGRATORS)} ({', '.join(INTEGRATORS)})")
-    return tuple(INTEGRATORS[name]() for name in dict.fromkeys(names))
 
 
 def machine() -> Machine:

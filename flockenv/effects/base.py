@@ -168,6 +168,8 @@ class Effect(Record):
     """How many partners a bond has beside the agent it acts on."""
     places: ClassVar[tuple[str, ...]] = ()
     """Names of the parameters that are points: on a torus own, medium and flow laws are given the nearest images."""
+    strengths: ClassVar[tuple[str, ...]] = ("weight",)
+    """Names of the fields that make it nothing when they are 0."""
     conserves_momentum: ClassVar[bool] = False
     """True if what i does to j is the opposite of what j does to i."""
 
@@ -203,9 +205,6 @@ class Effect(Record):
     def bonds(self, groups: Sequence[Any], dimension: int) -> Bonds:
         """Return its bonds in a scene of these groups; ValueError, of one line, if they do not suit it."""
         return Bonds.none(self.partners, self.numbers(dimension))
-
-    strengths: ClassVar[tuple[str, ...]] = ("weight",)
-    """Names of the fields that make it nothing when they are 0."""
 
     def idle(self) -> Effect:
         """Return the same effect, looking around in the same way and compiled the same, that does nothing."""

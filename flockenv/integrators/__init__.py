@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib
 import pkgutil
 
-from flockenv.integrators.base import INTEGRATORS, Integrator
+from flockenv.integrators.base import INTEGRATORS, Integrator, methods_named
 
 for _module in pkgutil.iter_modules(__path__):
     importlib.import_module(f"{__name__}.{_module.name}")
@@ -27,5 +27,5 @@ from flockenv.integrators.velocity_verlet import VelocityVerlet  # noqa: E402
 __all__ = [
     "INTEGRATORS", "RK4", "AdaptiveRK4", "AveragedVelocity", "DormandPrince", "ExplicitEuler", "ExponentialDrag",
     "Heun", "Implicit", "ImplicitEuler", "ImplicitMidpoint", "Integrator", "Midpoint", "SemiImplicitEuler",
-    "VelocityVerlet",
+    "VelocityVerlet", "methods_named",
 ]  # fmt: skip

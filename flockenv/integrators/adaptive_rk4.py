@@ -5,9 +5,9 @@ from __future__ import annotations
 from typing import Any, ClassVar, Literal
 
 import numpy as np
-from pydantic import Field
 
-from flockenv.integrators.base import Integrator, counted, largest, settings
+from flockenv.integrators.adaptive import Adaptive
+from flockenv.integrators.base import counted, largest, settings
 from flockenv.integrators.control import add_slopes, begun, copy, judged, misfit, slope_of
 from flockenv.kernels import kernel, like
 
@@ -61,16 +61,11 @@ def advance(
     counted(context, clock.accepted, clock.rejected)
 
 
-class AdaptiveRK4(Integrator):
+class AdaptiveRK4(Adaptive):
     """Runge-Kutta of order 4 with steps of its own within dt, 11 evaluations each; costs most where forces jump."""
 
     kind: Literal["adaptive_rk4"] = "adaptive_rk4"
-    tolerance: float = Field(default=1e-4, gt=0, description="error of one step, m and m/s, of the worst agent")
-    least: float = Field(
-        default=0.0, ge=0, description="s, smallest step; a world that needs a smaller one is given up"
-    )
     order: ClassVar[int] = 4
     order_with_drag: ClassVar[int] = 4
     stages: ClassVar[int] = 12
     evaluations: ClassVar[int] = 11
-    adaptive: ClassVar[bool] = True

@@ -10,7 +10,7 @@ kernel; with Python functions for the laws the very same source runs in Python, 
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any, ClassVar, NamedTuple
 
@@ -20,9 +20,13 @@ from numba.extending import overload
 
 from flockenv.kernels import OPTIONS
 from flockenv.records import Record
+from flockenv.refusals import nearest, shown
 from flockenv.state import WORK, Floats, State
 
-__all__ = ["INTEGRATORS", "PROVIDED", "Alone", "Integrator", "carried", "counted", "damping", "largest", "settings"]
+__all__ = [
+    "INTEGRATORS", "PROVIDED", "Alone", "Integrator", "carried", "counted", "damping", "largest", "methods_named",
+    "settings",
+]  # fmt: skip
 
 INTEGRATORS: dict[str, type[Integrator]] = {}
 """Every integrator by its kind; a class registers itself when it is defined."""
@@ -82,6 +86,14 @@ PROVIDED = frozenset({"damping", "settings", "largest", "counted"})
 
 SUBSTEPS = WORK.index("substeps")
 """Column of State.work; steps that were rejected are in the next."""
+
+
+def methods_named(names: Sequence[str]) -> tuple[Integrator, ...]:
+    """Return methods by their kinds, each once; ValueError, with the nearest name, for one that is not there."""
+    for name in names:
+        if name not in INTEGRATORS:
+            raise ValueError(f"methods: {shown(name)} is none{nearest(name, INTEGRATORS)} ({', '.join(INTEGRATORS)})")
+    return tuple(INTEGRATORS[name]() for name in dict.fromkeys(names))
 
 
 class Integrator(Record):

@@ -233,8 +233,9 @@ def _free(residual: _Residual, w: Rows, r: Rows) -> Callable[[Rows], tuple[Rows,
         return np.asarray((residual((w + step * direction)[None])[0] - r) / step)
 
     def solve(b: Rows) -> tuple[Rows, int]:
+        before = taken
         operator = linalg.LinearOperator((len(w), len(w)), matvec=along, dtype=float)
         found, _ = linalg.gmres(operator, b.astype(float), rtol=GMRES_TOLERANCE, restart=40, maxiter=5)
-        return found.astype(w.dtype), taken
+        return found.astype(w.dtype), taken - before
 
     return solve

@@ -14,11 +14,11 @@ from flockenv.stress.bodies import BODIES
 from flockenv.stress.bonded import BONDED
 from flockenv.stress.case import Case, Value
 from flockenv.stress.crowds import CROWDS
-from flockenv.stress.results import Finding, Results
-from flockenv.stress.run import cases_named, methods_named, run, usual_methods
+from flockenv.stress.results import VERDICTS, Finding, Results
+from flockenv.stress.run import cases_named, fingerprint, run, usual_methods
 
 __all__ = [
-    "CASES", "Case", "Finding", "Results", "Value", "cases_named", "methods_named", "run", "usual_methods",
+    "CASES", "VERDICTS", "Case", "Finding", "Results", "Value", "cases_named", "fingerprint", "run", "usual_methods",
 ]  # fmt: skip
 
 CASES: tuple[Case, ...] = (*BODIES, *BONDED, *CROWDS)

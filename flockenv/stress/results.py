@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Collection
 from typing import Literal
 
 from pydantic import Field
@@ -43,9 +44,10 @@ class Finding(Record):
 
 
 class Results(Record):
-    """All that was found."""
+    """All that was found, and by which sources."""
 
     findings: tuple[Finding, ...]
+    sources: str = Field(default="", description="fingerprint of the laws, methods and cases")
 
     @property
     def methods(self) -> list[str]:
@@ -56,6 +58,11 @@ class Results(Record):
     def cases(self) -> list[str]:
         """Names of cases, in order."""
         return list(dict.fromkeys(f.case for f in self.findings))
+
+    def only(self, cases: Collection[str], methods: Collection[str]) -> Results:
+        """Return what was found in some cases under some methods."""
+        found = tuple(f for f in self.findings if f.case in cases and f.method in methods)
+        return self.model_copy(update={"findings": found})
 
     def at(self, case: str, method: str) -> Finding | None:
         """Return one finding; none if that was not tried."""

@@ -2,32 +2,28 @@
 
 from __future__ import annotations
 
+import hashlib
 import math
 import warnings
 from collections.abc import Callable, Sequence
+from itertools import product
+from pathlib import Path
 from time import perf_counter
 
 from flockenv.divergence import SimulationDiverged
 from flockenv.integrators import INTEGRATORS, Integrator
+from flockenv.kernels import laws_digest
 from flockenv.refusals import nearest, shown
 from flockenv.stability import UnstableStepWarning
 from flockenv.stress.case import Case
 from flockenv.stress.results import Finding, Results, Verdict
 
-__all__ = ["cases_named", "methods_named", "run", "usual_methods"]
+__all__ = ["cases_named", "fingerprint", "run", "usual_methods"]
 
 
 def usual_methods() -> tuple[Integrator, ...]:
     """Return every method, explicit ones first."""
     return tuple(sorted((kind() for kind in INTEGRATORS.values()), key=lambda m: (m.solves, m.adaptive, m.order)))
-
-
-def methods_named(names: Sequence[str]) -> tuple[Integrator, ...]:
-    """Return the methods of these kinds, all for none; ValueError with the nearest name for an unknown one."""
-    for name in names:
-        if name not in INTEGRATORS:
-            raise ValueError(f"method {shown(name)}: unknown{nearest(name, INTEGRATORS)}; {', '.join(INTEGRATORS)}")
-    return tuple(INTEGRATORS[name]() for name in names) or usual_methods()
 
 
 def cases_named(cases: Sequence[Case], names: Sequence[str]) -> tuple[Case, ...]:
@@ -39,33 +35,43 @@ def cases_named(cases: Sequence[Case], names: Sequence[str]) -> tuple[Case, ...]
     return tuple(c for c in cases if not names or c.name in names or c.name.split()[0] in names)
 
 
+def fingerprint() -> str:
+    """Return what tells findings from those of other sources: laws, methods, and the cases themselves."""
+    here = Path(__file__).parent
+    paths = [*here.glob("*.py"), *(here.parent / "integrators").glob("*.py")]
+    paths += [here.parent / "implicit.py", here.parent / "stability.py"]
+    digest = hashlib.sha256(laws_digest().encode())
+    for path in sorted(paths):
+        digest.update(path.read_bytes())
+    return digest.hexdigest()[:20]
+
+
 def run(
     cases: Sequence[Case],
     methods: Sequence[Integrator],
-    known: Sequence[Finding] = (),
-    progress: Callable[[int, str], None] = lambda done, text: None,
+    known: Results | None = None,
+    progress: Callable[[int], None] = lambda done: None,
     keep: Callable[[Results], None] = lambda results: None,
 ) -> Results:
-    """Try every case under every method; findings that are `known` are not tried again.
+    """Try every case under every method, and return that beside what is known.
 
-    `progress` is called with how many are done and what is tried next, `keep` with what there is after each: whoever is
-    interrupted has that.
+    What is known from the same sources is not tried again, and not lost; of other sources nothing is taken over.
+    `progress` is called with how many are done, `keep` with all there is after each: whoever is interrupted has that.
     """
-    old = {(f.case, f.method): f for f in known}
-    found: list[Finding] = []
-    for method in methods:
-        for case in cases:
-            progress(len(found), f"{case.name}, {method.kind}")
-            finding = old.get((case.name, method.kind)) or _tried(case, method)
-            found.append(finding)
-            keep(_in_order(found, cases))
-    return _in_order(found, cases)
-
-
-def _in_order(found: Sequence[Finding], cases: Sequence[Case]) -> Results:
-    """Return findings case by case."""
+    sources = fingerprint()
+    found = {(f.case, f.method): f for f in known.findings} if known and known.sources == sources else {}
     place = {case.name: k for k, case in enumerate(cases)}
-    return Results(findings=tuple(sorted(found, key=lambda f: place[f.case])))
+
+    def all_() -> Results:
+        ordered = sorted(found.values(), key=lambda f: (place.get(f.case, len(place)), f.case))
+        return Results(findings=tuple(ordered), sources=sources)
+
+    for done, (method, case) in enumerate(product(methods, cases)):
+        progress(done)
+        if (case.name, method.kind) not in found:
+            found[case.name, method.kind] = _tried(case, method)
+            keep(all_())
+    return all_()
 
 
 def _tried(case: Case, method: Integrator) -> Finding:

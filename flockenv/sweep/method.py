@@ -40,8 +40,7 @@ def method(parts: Parts) -> str:
 
 def _settings(parts: Parts) -> str:
     """Write the method's own numbers: they lie behind those of the effects."""
-    count = len(parts.integrator.settings())
-    at = len(parts.parameters()) - count - (2 if parts.look else 0)
+    count, at = len(parts.integrator.settings()), parts.last_numbers("method")
     return f'''
 @kernel
 def settings(around):

@@ -124,6 +124,12 @@ class Parts:
         values += self.integrator.settings()
         return values + ([self.look.radius, self.look.radius**2] if self.look else [])
 
+    def last_numbers(self, kind: str) -> int:
+        """Return where in `parameters` the numbers of the "space" begin, or of the "method": they come last but one."""
+        look, method, space = 2 if self.look else 0, len(self.integrator.settings()), len(self.space.numbers())
+        behind = {"method": look + method, "space": look + method + space}
+        return len(self.parameters()) - behind[kind]
+
     @property
     def bounces(self) -> bool:
         """Do bodies come back from walls?"""

@@ -189,8 +189,7 @@ def _stay_inside(parts: Parts) -> list[str]:
     limited = "scale(limit(v, max_speed[i]), living[i])"
     if not parts.bounces:
         return [f"x, v = confine(size, radius[i], x, {limited})"]
-    settings = len(parts.integrator.settings()) + (2 if parts.look else 0)
-    restitution = f"params[{len(parts.parameters()) - settings - len(parts.space.numbers())}]"
+    restitution = f"params[{parts.last_numbers('space')}]"
     before = f"scale({lanes_of(parts, 'earlier')}, living[i])"
     return [
         f"x, v = bounce(size, radius[i], {restitution}, dt, was, {before}, x, {limited})",

@@ -265,7 +265,7 @@ def play(
             )
             if bad >= 0 and broken < 0:
                 broken, who = b, bad
-            tick[b] += count
+            tick[b] += count if bad < 0 else 0
             steps[b] += 1
         {look}
         now = {now}
