@@ -26,8 +26,8 @@ import typer
 
 from benchmarks.measure import Bench, Contestant, Floor, Out, Quick, Rounds, command_line, number
 from benchmarks.scenes import crowd, restarting, stepping, world
+from flockenv.behaviours import Alignment, Cohesion, Separation
 from flockenv.crew import use_threads
-from flockenv.effects import Alignment, Cohesion, Separation
 from flockenv.effects.base import ties
 from flockenv.scene import Scene
 from flockenv.state import State

@@ -5,7 +5,8 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 
-from flockenv.effects import Alignment, Cohesion, Effect, Separation
+from flockenv.behaviours import Alignment, Cohesion, Separation
+from flockenv.effects import Effect
 from flockenv.scene import Group, Scene
 from flockenv.space import Torus
 from flockenv.spawn import Spawn

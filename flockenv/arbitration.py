@@ -1,17 +1,114 @@
 """Many wishes, one wish: how behaviours that want different things are reconciled.
 
 `wishes` is a tuple of vectors in order of priority, all in one unit; a wish of zero asks for nothing. `budget` bounds
-the result, in the same unit.
+the result, in the same unit. The first laws are for whoever has wishes and no scene (players); each record below is
+one that a `Steer` effect may be given, with a law (p, me, wishes) -> (force, shares) in newtons: what is done, and what
+share of each wish was granted.
+
+Sources: Reynolds 1987 (prioritised acceleration allocation) and 1999 (blending, priority, dithering); Buckland,
+"Programming Game AI by Example" (2004; the running sum); Fray, "Context Steering" (Game AI Pro 2, 2015).
 """
 
 from __future__ import annotations
 
-from flockenv.kernels import Vec, law, like
-from flockenv.vec import add, limit, norm, scale, select, zero
+import functools
+import operator
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
-__all__ = ["allocate", "blend", "prioritise"]
+import numpy as np
+from numba.extending import overload
+from pydantic import Field
+
+from flockenv.kernels import OPTIONS, Vec, law, like, replaced
+from flockenv.noise import uniform
+from flockenv.records import Record
+from flockenv.vec import add, axis, cross, dot, limit, norm, perpendicular, scale, select, unit, zero
+
+__all__ = [
+    "ARBITRATIONS", "Allocation", "AnyArbitration", "Arbitration", "Blend", "ContextSteering", "Dithering", "Priority",
+    "RoundRobin", "RunningSum", "allocate", "allocate_running", "blend", "prioritise",
+]  # fmt: skip
 
 Wishes = tuple[Vec, ...]
+Shares = tuple[float, ...]
+
+ARBITRATIONS: dict[str, type[Arbitration]] = {}
+"""Every arbitration by its kind; a class registers itself when it is defined."""
+
+
+def no_shares(wishes: Wishes) -> Shares:
+    """Return a zero for each wish."""
+    return (0.0,) * len(wishes)
+
+
+@overload(no_shares, jit_options=OPTIONS)
+def _no_shares(wishes):  # type: ignore[no-untyped-def]  # numba compares signatures, annotations included
+    zeros = "".join("o, " for _ in range(len(wishes)))
+    made: dict[str, Any] = {"like": like}
+    exec(f"def zeros(wishes):\n    o = like(wishes[0][0], 0.0)\n    return ({zeros})", made)  # noqa: S102  # K is a type's
+    return made["zeros"]
+
+
+@law
+def granted(wishes: Wishes, shares: Shares) -> Vec:
+    """Return what the shares of all wishes come to."""
+    total = zero(wishes[0])
+    for k in range(len(wishes)):
+        total = add(total, scale(wishes[k], shares[k]))
+    return total
+
+
+# --- one law each -----------------------------------------------------------------------------------------------------
+
+
+@law
+def _blended(wishes: Wishes, budget: float) -> Shares:
+    total = zero(wishes[0])
+    for k in range(len(wishes)):
+        total = add(total, wishes[k])
+    length, shares = norm(total), no_shares(wishes)
+    share = budget / length if length > budget else like(length, 1.0)
+    for k in range(len(wishes)):
+        shares = replaced(shares, k, share)
+    return shares
+
+
+@law
+def _first(wishes: Wishes, threshold: float, budget: float) -> Shares:
+    """The first wish longer than the threshold, cut to the budget."""
+    shares, open_ = no_shares(wishes), True
+    for k in range(len(wishes)):
+        length = norm(wishes[k])
+        takes = open_ and length > threshold
+        cut = budget / length if length > budget else like(length, 1.0)
+        shares = replaced(shares, k, cut if takes else like(length, 0.0))
+        open_ = open_ and not takes
+    return shares
+
+
+@law
+def _allocated(wishes: Wishes, budget: float) -> Shares:
+    shares, left = no_shares(wishes), budget
+    o = like(budget, 0.0)
+    for k in range(len(wishes)):
+        length = norm(wishes[k])
+        whole = length <= left
+        shares = replaced(shares, k, like(length, 1.0) if whole else left / length)
+        left = left - length if whole else o
+    return shares
+
+
+@law
+def _run_up(wishes: Wishes, budget: float) -> Shares:
+    shares, total = no_shares(wishes), zero(wishes[0])
+    o = like(budget, 0.0)
+    for k in range(len(wishes)):
+        length, left = norm(wishes[k]), budget - norm(total)
+        left = left if left > o else o
+        share = like(length, 1.0) if length <= left else left / length
+        shares = replaced(shares, k, share)
+        total = add(total, scale(wishes[k], share))
+    return shares
 
 
 @law
@@ -26,13 +123,7 @@ def blend(wishes: Wishes, weights: Vec, budget: float) -> Vec:
 @law
 def prioritise(wishes: Wishes, threshold: float, budget: float) -> Vec:
     """Return the first wish longer than the threshold, shortened to the budget, and nothing of the others."""
-    chosen = zero(wishes[0])
-    open_ = True
-    for k in range(len(wishes)):
-        takes = open_ and norm(wishes[k]) > threshold
-        chosen = select(takes, wishes[k], chosen)
-        open_ = open_ and not takes
-    return limit(chosen, budget)
+    return granted(wishes, _first(wishes, threshold, budget))
 
 
 @law
@@ -42,12 +133,230 @@ def allocate(wishes: Wishes, budget: float) -> Vec:
     Prioritised acceleration allocation (Reynolds 1987): lengths add up as scalars, so the sum needs no shortening, and
     in an emergency the most pressing wish is served whole. (8,0), (-8,0), (0,5) within 10 give (6, 0).
     """
-    total = zero(wishes[0])
-    left = budget
-    o = like(budget, 0.0)
+    return granted(wishes, _allocated(wishes, budget))
+
+
+@law
+def allocate_running(wishes: Wishes, budget: float) -> Vec:
+    """Grant wishes in order, each as far as the length of the sum so far leaves room (Buckland 2004).
+
+    Unlike `allocate`, opposite wishes give room back: (8,0), (-8,0), (0,5) within 10 give (6, 4).
+    """
+    return granted(wishes, _run_up(wishes, budget))
+
+
+# --- records, for scenes ----------------------------------------------------------------------------------------------
+
+
+class Arbitration(Record):
+    """How wishes are reconciled; `law` names a law (p, me, wishes) -> (force, shares) of this record's module."""
+
+    kind: str
+    law: ClassVar[str]
+
+    @classmethod
+    def __pydantic_init_subclass__(cls, **kwargs: Any) -> None:
+        """Register the class under its kind."""
+        kind = cls.model_fields["kind"].default
+        if isinstance(kind, str):
+            ARBITRATIONS[kind] = cls
+
+    def parameters(self, wishes: int) -> dict[str, float | Vec]:
+        """Return the numbers its law is given, by name."""
+        return {name: float(getattr(self, name)) for name in type(self).model_fields if name != "kind"}
+
+
+@law
+def blend_wishes(p: Any, me: Any, wishes: Wishes) -> tuple[Vec, Shares]:
+    """Sum and cut."""
+    shares = _blended(wishes, me.max_force)
+    return granted(wishes, shares), shares
+
+
+class Blend(Arbitration):
+    """Everything at once, shortened to max_force: weights are those of the behaviours. Opposite wishes cancel."""
+
+    kind: Literal["blend"] = "blend"
+    law: ClassVar[str] = "blend_wishes"
+
+
+@law
+def first_wish(p: Any, me: Any, wishes: Wishes) -> tuple[Vec, Shares]:
+    """One of them."""
+    shares = _first(wishes, p.threshold, me.max_force)
+    return granted(wishes, shares), shares
+
+
+class Priority(Arbitration):
+    """The first behaviour that asks for more than the threshold has it all, the others nothing (Reynolds 1999)."""
+
+    kind: Literal["priority"] = "priority"
+    threshold: float = Field(default=1e-3, ge=0, description="N, a wish that is no longer asks for nothing")
+    law: ClassVar[str] = "first_wish"
+
+
+@law
+def dithered(p: Any, me: Any, wishes: Wishes) -> tuple[Vec, Shares]:
+    """One of them, by lot."""
+    shares, open_ = no_shares(wishes), True
+    frame, who = np.int64(np.floor(me.time / p.period)), np.int64(me.who)
     for k in range(len(wishes)):
         length = norm(wishes[k])
-        whole = length <= left
-        total = add(total, wishes[k] if whole else scale(wishes[k], left / length))
-        left = left - length if whole else o
-    return total
+        drawn = uniform(me.key, frame, who, 50_000 + k) < p.probability[k]
+        takes = open_ and drawn and length > p.threshold
+        cut = me.max_force / length if length > me.max_force else like(length, 1.0)
+        shares = replaced(shares, k, cut if takes else like(length, 0.0))
+        open_ = open_ and not takes
+    return granted(wishes, shares), shares
+
+
+class Dithering(Arbitration):
+    """Prioritised dithering: each behaviour in order is heard with a probability, the first that asks has it all.
+
+    Who is drawn is a function of (world, time, agent) and lasts for `period`: it does not depend on dt.
+    """
+
+    kind: Literal["dithering"] = "dithering"
+    probability: float | Annotated[tuple[Annotated[float, Field(ge=0, le=1)], ...], Field(min_length=1)] = Field(
+        default=0.9, description="to be heard: of all behaviours, or of each, 0 to 1 (Reynolds 1999: 0.9)"
+    )
+    period: float = Field(default=0.1, gt=0, description="s, how long a draw lasts")
+    threshold: float = Field(default=1e-3, ge=0, description="N, a wish that is no longer asks for nothing")
+    law: ClassVar[str] = "dithered"
+
+    def parameters(self, wishes: int) -> dict[str, float | Vec]:
+        """A probability for each wish."""
+        each = self.probability if isinstance(self.probability, tuple) else (self.probability,) * wishes
+        if len(each) != wishes or not all(0 <= x <= 1 for x in each):
+            raise ValueError(
+                f"arbitration.probability = {self.probability}: must be one number from 0 to 1, or one for each of "
+                f"{wishes} behaviours"
+            )
+        return {"period": self.period, "threshold": self.threshold, "probability": tuple(map(float, each))}
+
+
+@law
+def allocated(p: Any, me: Any, wishes: Wishes) -> tuple[Vec, Shares]:
+    """Lengths use up the budget."""
+    shares = _allocated(wishes, me.max_force)
+    return granted(wishes, shares), shares
+
+
+class Allocation(Arbitration):
+    """Prioritised acceleration allocation (Reynolds 1987): in order, until their lengths have used up max_force."""
+
+    kind: Literal["allocation"] = "allocation"
+    law: ClassVar[str] = "allocated"
+
+
+@law
+def run_up(p: Any, me: Any, wishes: Wishes) -> tuple[Vec, Shares]:
+    """The length of their sum uses up the budget."""
+    shares = _run_up(wishes, me.max_force)
+    return granted(wishes, shares), shares
+
+
+class RunningSum(Arbitration):
+    """As allocation, but it is the length of the sum so far that uses up max_force (Buckland 2004)."""
+
+    kind: Literal["running_sum"] = "running_sum"
+    law: ClassVar[str] = "run_up"
+
+
+@law
+def in_turn(p: Any, me: Any, wishes: Wishes) -> tuple[Vec, Shares]:
+    """Whose turn it is."""
+    shares = no_shares(wishes)
+    turn = np.int64(np.floor(me.time / p.period)) % len(wishes)
+    for k in range(len(wishes)):
+        length = norm(wishes[k])
+        cut = me.max_force / length if length > me.max_force else like(length, 1.0)
+        shares = replaced(shares, k, cut if k == turn else like(length, 0.0))
+    return granted(wishes, shares), shares
+
+
+class RoundRobin(Arbitration):
+    """One behaviour after another has its turn, whatever it asks for: cheap, and late by as many turns."""
+
+    kind: Literal["round_robin"] = "round_robin"
+    period: float = Field(default=0.05, gt=0, description="s, how long a turn lasts")
+    law: ClassVar[str] = "in_turn"
+
+
+@law
+def _direction(ahead: Vec, j: int, n: int) -> Vec:
+    """Return direction j of n, spread evenly about `ahead`, which is the first."""
+    e = like(ahead[0], 1.0)
+    if len(ahead) == 2:
+        angle = like(e, 2 * np.pi) * like(e, j) / like(e, n)
+        c, s = np.cos(angle), np.sin(angle)
+        return (ahead[0] * c - ahead[1] * s, ahead[0] * s + ahead[1] * c)
+    else:  # rings about it, in steps of the golden angle
+        height = e - like(e, 2.0) * like(e, j) / like(e, max(n - 1, 1))
+        ring = np.sqrt(max(e - height * height, like(e, 0.0)))
+        angle = like(e, 2.399963229728653) * like(e, j)
+        side = perpendicular(ahead)
+        around = add(scale(side, np.cos(angle)), scale(cross(ahead, side), np.sin(angle)))
+        return add(scale(ahead, height), scale(around, ring))
+
+
+@law
+def _maps(p: Any, wishes: Wishes, way: Vec) -> tuple[float, float]:
+    """Return how dangerous a direction is, and how much is to be said for it."""
+    o = like(way[0], 0.0)
+    danger, interest = o, o
+    for k in range(len(wishes)):
+        along = dot(wishes[k], way)
+        interest += along if along > o else o
+        danger -= along if (along < o) & (like(o, k) < p.dangers) else o
+    return danger, interest
+
+
+@law
+def by_context(p: Any, me: Any, wishes: Wishes) -> tuple[Vec, Shares]:
+    """The best of the least dangerous directions."""
+    o, e = like(wishes[0][0], 0.0), like(wishes[0][0], 1.0)
+    total = zero(wishes[0])
+    for k in range(len(wishes)):
+        total = add(total, wishes[k])
+    ahead = unit(total)
+    ahead = select(dot(ahead, ahead) > o, ahead, me.heading)
+    ahead = select(dot(ahead, ahead) > o, ahead, axis(total, 0))
+    least, most = like(o, np.inf), o
+    count = int(p.directions)
+    for j in range(count):
+        danger, _ = _maps(p, wishes, _direction(ahead, j, count))
+        least, most = min(least, danger), max(most, danger)
+    bound = least + like(o, 1e-3) * (most - least)  # as good as the least
+    best, chosen = -e, zero(total)
+    for j in range(count):
+        way = _direction(ahead, j, count)
+        danger, interest = _maps(p, wishes, way)
+        better = (danger <= bound) & (interest > best)
+        best, chosen = interest if better else best, select(better, way, chosen)
+    force = limit(scale(chosen, best if best > o else o), me.max_force)
+    shares = no_shares(wishes)
+    for k in range(len(wishes)):
+        square = dot(wishes[k], wishes[k])
+        share = dot(force, wishes[k]) / square if square > o else o
+        shares = replaced(shares, k, min(max(share, o), e))
+    return force, shares
+
+
+class ContextSteering(Arbitration):
+    """Directions are weighed, not wishes added: the best of those that are least dangerous (Fray 2015).
+
+    Of the first `dangers` behaviours the opposite of a wish is dangerous; what all of them wish for is interesting. The
+    share of a wish is how much of it lies in what is done.
+    """
+
+    kind: Literal["context"] = "context"
+    dangers: int = Field(default=1, ge=0, description="how many behaviours, from the first on, avert a danger")
+    directions: int = Field(default=24, ge=4, le=256, description="how many directions are weighed")
+    law: ClassVar[str] = "by_context"
+
+
+if TYPE_CHECKING:
+    AnyArbitration = Arbitration
+else:
+    AnyArbitration = Annotated[functools.reduce(operator.or_, ARBITRATIONS.values()), Field(discriminator="kind")]

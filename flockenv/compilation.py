@@ -62,7 +62,7 @@ def _entry_point(event: Any) -> Any:
     """Return the function that an event is about, if it is an entry point of a generated file; else None."""
     dispatcher = event.data["dispatcher"]
     function = getattr(dispatcher, "py_func", None)
-    ours = getattr(function, "__module__", "").startswith("flockenv_generated.")
+    ours = (getattr(function, "__module__", "") or "").startswith("flockenv_generated.")
     kept = getattr(getattr(dispatcher, "_cache", None), "cache_path", None) is not None
     return function if ours and kept else None
 

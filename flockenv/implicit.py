@@ -30,7 +30,7 @@ MOST_DENSE = 512
 
 def coupling_of(scene: Scene) -> Coupling | None:
     """Return who depends on whom; none if agents look around, and are too many for everybody to depend on everybody."""
-    if any(e.pair_law or e.far_law for e in scene.effects):
+    if any(e.pair_law or e.far_law for e in scene.parts.effects):
         if scene.agents * scene.dimension > MOST_DENSE:
             return None
         pairs = np.indices((scene.agents, scene.agents)).reshape(2, -1)

@@ -24,6 +24,7 @@ from typing import Any, TypeVar, cast
 import numba
 from llvmlite import ir  # type: ignore[import-untyped]
 from numba.core import types
+from numba.cpython.unsafe.tuple import tuple_setitem
 from numba.extending import intrinsic, overload, register_jitable
 from numba.np import arrayobj
 
@@ -44,6 +45,7 @@ __all__ = [
     "laws_digest",
     "like",
     "load",
+    "replaced",
     "shared",
     "unaliased",
     "unfused",
@@ -93,6 +95,16 @@ def shared(function: F) -> F:
 def like(x: float, constant: float) -> float:
     """Return `constant` in the precision of `x`: a bare 0.5 would turn a float32 law into a float64 one."""
     return type(x)(constant)
+
+
+def replaced(numbers: tuple[float, ...], k: int, x: float) -> tuple[float, ...]:
+    """Return the numbers with x in place k."""
+    return (*numbers[:k], x, *numbers[k + 1 :])
+
+
+@overload(replaced, jit_options=OPTIONS)
+def _replaced(numbers, k, x):  # type: ignore[no-untyped-def]
+    return lambda numbers, k, x: tuple_setitem(numbers, k, x)
 
 
 @law

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from flockenv.kernels import kernel
 
-__all__ = ["key_of", "keys_of", "normal", "uniform"]
+__all__ = ["key_of", "keys_of", "normal", "smooth", "uniform"]
 
 _GOLDEN = np.uint64(0x9E3779B97F4A7C15)
 _M1 = np.uint64(0xBF58476D1CE4E5B9)
@@ -46,6 +46,20 @@ def normal(key: np.uint64, step: int, agent: int, channel: int) -> float:
     """Draw from N(0, 1) (Box-Muller; uses channels 2c and 2c + 1 of a separate family)."""
     u = 1.0 - uniform(key, step, agent, 2 * channel + 1_000_003)
     return math.sqrt(-2.0 * math.log(u)) * math.cos(2.0 * math.pi * uniform(key, step, agent, 2 * channel + 1_000_004))
+
+
+@kernel
+def smooth(key: np.uint64, time: float, agent: int, channel: int) -> float:
+    """Draw a number in [-1, 1] that changes smoothly with time, of which a unit is as long as it remembers.
+
+    Coherent noise, after Perlin (1985): independent draws at whole times, and between them 6 s^5 - 15 s^4 + 10 s^3 of
+    the way. Of a function of time no step can be too long or too short: it is the same walk for every dt.
+    """
+    begin = math.floor(time)
+    s = time - begin
+    first = 2.0 * uniform(key, np.int64(begin), agent, channel) - 1.0
+    second = 2.0 * uniform(key, np.int64(begin) + 1, agent, channel) - 1.0
+    return first + (second - first) * s * s * s * (10.0 + s * (6.0 * s - 15.0))
 
 
 def key_of(seed: int, episode: int) -> np.uint64:

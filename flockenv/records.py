@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, Self
 
 from pydantic import BaseModel, ConfigDict, ValidationError
@@ -11,9 +11,31 @@ from pydantic_core import PydanticCustomError
 
 from flockenv.refusals import refusals
 
-__all__ = ["Record"]
+__all__ = ["Record", "keep"]
 
 _NUMBERS = (float, int, float | None, int | None)
+
+
+def keep(*kinds: type) -> Callable[[Any, Any], Any]:
+    """Return a validator that lets a record of these kinds through as it is: somebody else's is as good as ours.
+
+    Only files need the list of those that there are.
+    """
+
+    def kept(value: Any, handler: Any) -> Any:
+        return value if isinstance(value, kinds) else handler(_in_tuples(value))
+
+    return kept
+
+
+def _in_tuples(value: Any) -> Any:
+    """Return what a file says with tuples in the place of lists: strictly read, only JSON's lists are taken for tuples.
+
+    (And here they are Python's already: pydantic hands them over so to a function like `kept`.)
+    """
+    if isinstance(value, Mapping):
+        return {key: _in_tuples(inner) for key, inner in value.items()}
+    return tuple(map(_in_tuples, value)) if isinstance(value, list) else value
 
 
 class _OneLine(ModelMetaclass):

@@ -9,10 +9,11 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import itertools
 import math
 import operator
 import threading
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
@@ -31,7 +32,7 @@ from flockenv.kernels import entry, load
 from flockenv.neighbours import FEWEST_AGENTS, WORTH_ARRANGING
 from flockenv.networks import EDGE, AnyNetwork
 from flockenv.noise import MASK, key_of
-from flockenv.records import Record
+from flockenv.records import Record, keep
 from flockenv.rounding import check_places
 from flockenv.shapes import Circle
 from flockenv.snapshot import Snapshot
@@ -39,7 +40,7 @@ from flockenv.space import AnySpace, Box, Plane, Torus
 from flockenv.spawn import Spawn, scatter
 from flockenv.stability import check_dt
 from flockenv.state import Body, Floats, State
-from flockenv.sweep import SHARED, Parts, Table, field_source, pack, scene_source
+from flockenv.sweep import SHARED, Parts, Table, field_source, flattened, pack, scene_source
 from flockenv.tree import MOST_DIRECT, tree_sizes
 from flockenv.workspace import Workspace
 
@@ -57,31 +58,17 @@ MEMORY_LIMIT = 8 * 2**30
 """Bytes that a state and its scratch may take before a scene is refused."""
 
 
-def _keep(value: Any, handler: Any) -> Any:
-    """Let a record through as it is: an effect of somebody else's is as good as ours, only files need the list."""
-    return value if isinstance(value, (Effect, Integrator)) else handler(_in_tuples(value))
-
-
-def _in_tuples(value: Any) -> Any:
-    """Return what a file says with tuples in the place of lists: strictly read, only JSON's lists are taken for tuples.
-
-    (And here they are Python's already: pydantic hands them over so to a function like `_keep`.)
-    """
-    if isinstance(value, Mapping):
-        return {key: _in_tuples(inner) for key, inner in value.items()}
-    return tuple(map(_in_tuples, value)) if isinstance(value, list) else value
-
-
 if TYPE_CHECKING:
     AnyEffect = Effect
     AnyIntegrator = Integrator
 else:
     AnyEffect = Annotated[
-        Annotated[functools.reduce(operator.or_, EFFECTS.values()), Field(discriminator="kind")], WrapValidator(_keep)
+        Annotated[functools.reduce(operator.or_, EFFECTS.values()), Field(discriminator="kind")],
+        WrapValidator(keep(Effect)),
     ]
     AnyIntegrator = Annotated[
         Annotated[functools.reduce(operator.or_, INTEGRATORS.values()), Field(discriminator="kind")],
-        WrapValidator(_keep),
+        WrapValidator(keep(Integrator)),
     ]
 
 
@@ -168,7 +155,7 @@ class Scene(Record):
                         f"effects[{k}].kind = {effect.kind} reaches everybody, and on a torus everybody is there "
                         "infinitely many times; only a plane or a box is allowed"
                     )
-                if effect.pair_law and effect.reach > min(self.space.size) / 2:
+                if effect.reach > min(self.space.size) / 2:
                     raise ValueError(
                         f"effects[{k}].radius = {effect.reach:g} reaches around the torus; at most half its shortest "
                         f"edge, {min(self.space.size) / 2:g} m, is allowed"
@@ -220,6 +207,11 @@ class Scene(Record):
         return sum(group.size for group in self.groups)
 
     @property
+    def starts(self) -> tuple[int, ...]:
+        """The first agent of each group, and N."""
+        return (0, *itertools.accumulate(group.size for group in self.groups))
+
+    @property
     def roles(self) -> tuple[str, ...]:
         """What each agent is called, (N,)."""
         return tuple(group.role for group in self.groups for _ in range(group.size))
@@ -262,7 +254,10 @@ class Scene(Record):
         """What the kernel is made of."""
         sorts = self.agents >= FEWEST_AGENTS
         crowded = self.agents > MOST_DIRECT
-        return Parts(self.dimension, self.space, self.effects, self.integrator, self.dtype, sorts, crowded=crowded)
+        return Parts(
+            self.dimension, self.space, flattened(self.effects), self.integrator, self.dtype, sorts, crowded=crowded,
+            starts=self.starts,
+        )  # fmt: skip
 
     @functools.cached_property
     def table(self) -> Table:
@@ -412,7 +407,7 @@ class Scene(Record):
             raise ValueError(f"times is {times!r}, must be a finite number for each of {b} worlds, or one for all")
         when = np.ascontiguousarray(np.broadcast_to(given, b), self.dtype)
         self._field(
-            state.x, state.v, state.alive, state.obstacle_x, state.obstacle_radius, state.work,
+            state.x, state.v, state.alive, state.key, state.obstacle_x, state.obstacle_radius, state.work,
             self._drive(drive, state), self._params, when, acc, flow, *self._workspaces(1, 1)[0].of(0),
         )  # fmt: skip
         return acc.transpose(1, 2, 0), flow.transpose(1, 2, 0) if self.parts.flows else None

@@ -15,6 +15,7 @@ from flockenv.kernels import Vec, law, like, unfused
 __all__ = [
     "add",
     "axis",
+    "cross",
     "dot",
     "exact_dot",
     "lateral",
@@ -133,6 +134,12 @@ def limit(a: Vec, longest: float) -> Vec:
     square = dot(a, a)
     over = square > longest * longest
     return scale(a, longest / np.sqrt(square) if over else like(square, 1.0))
+
+
+@law
+def cross(a: Vec, b: Vec) -> Vec:
+    """Return a x b, in 3-D."""
+    return (a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])
 
 
 @law

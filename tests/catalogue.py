@@ -19,14 +19,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flockenv import arbitration, steering
+from flockenv.behaviours import Alignment, AvoidObstacles, Cohesion, Separation
 from flockenv.effects import EFFECTS as EFFECT_KINDS
 from flockenv.effects import (
-    Alignment,
     AngularSprings,
     Attraction,
-    AvoidObstacles,
     Carried,
-    Cohesion,
     Drag,
     Effect,
     Elastic,
@@ -36,7 +34,6 @@ from flockenv.effects import (
     InverseSquare,
     Pressure,
     QuadraticDrag,
-    Separation,
     Sink,
     Source,
     Springs,

@@ -16,8 +16,9 @@ from flockenv.accuracy import problem as problems
 from flockenv.accuracy import reference as references
 from flockenv.accuracy.results import Curve, Point, measured_order
 from flockenv.accuracy.table import best, columns, headlines, rows
+from flockenv.behaviours import Separation
 from flockenv.cli import main
-from flockenv.effects import Effect, Fluctuation, Separation, Swing, Tether
+from flockenv.effects import Effect, Fluctuation, Swing, Tether
 from flockenv.integrators import RK4, Integrator, methods_named
 from flockenv.render.precision import draw_precision, write_precision
 from flockenv.scene import Group, Scene

@@ -14,7 +14,8 @@ import pytest
 
 import flockenv
 from flockenv import effects as effects_module
-from flockenv.effects import Drag, Separation
+from flockenv.behaviours import Separation
+from flockenv.effects import Drag
 from flockenv.integrators import RK4
 from flockenv.kernels import cache_folder
 from flockenv.networks import Mesh

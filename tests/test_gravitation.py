@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
+from flockenv.behaviours import Separation
 from flockenv.crew import threads, use_threads
-from flockenv.effects import Effect, Gravitation, InverseSquare, Separation
+from flockenv.effects import Effect, Gravitation, InverseSquare
 from flockenv.explanation import explain
 from flockenv.integrators import RK4
 from flockenv.neighbours import WORTH_ARRANGING

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 from scipy.optimize import root
 
+from flockenv.behaviours import Cohesion, Separation
 from flockenv.divergence import SimulationDiverged
-from flockenv.effects import Carried, Cohesion, Drag, Effect, Gravity, Separation, Springs, Vortex
+from flockenv.effects import Carried, Drag, Effect, Gravity, Springs, Vortex
 from flockenv.integrators import INTEGRATORS, ImplicitEuler, ImplicitMidpoint
 from flockenv.integrators.newton import Coupling, NotSolvedError, coupled, solve_stage
 from flockenv.networks import Cloth, Rope

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from flockenv.effects import Alignment, Cohesion, Separation
+from flockenv.behaviours import Alignment, Cohesion, Separation
 from flockenv.kernels import entry
 from flockenv.neighbours import count_cells
 from flockenv.scene import Group, Scene

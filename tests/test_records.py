@@ -7,7 +7,8 @@ import pickle
 
 import pytest
 
-from flockenv.effects import Drag, Separation
+from flockenv.behaviours import Separation
+from flockenv.effects import Drag
 from flockenv.scene import Group, Scene
 from flockenv.space import Box
 from flockenv.tasks import Pursuit

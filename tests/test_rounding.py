@@ -7,7 +7,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from flockenv.effects import Alignment, Attraction, Cohesion, Drag, Separation, Springs, Tether
+from flockenv.behaviours import Alignment, Cohesion, Separation
+from flockenv.effects import Attraction, Drag, Springs, Tether
 from flockenv.networks import Mesh, Rope
 from flockenv.rounding import FARTHEST
 from flockenv.scene import Group, Scene

@@ -15,7 +15,8 @@ import numpy as np
 import pytest
 
 import flockenv
-from flockenv.effects import EFFECTS, Alignment, Cohesion, Drag, QuadraticDrag, Separation
+from flockenv.behaviours import Alignment, Cohesion, Separation
+from flockenv.effects import EFFECTS, Drag, QuadraticDrag
 from flockenv.integrators import RK4
 from flockenv.kernels import cache_folder
 from flockenv.scene import Group, Scene

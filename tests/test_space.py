@@ -10,7 +10,8 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from flockenv import space as space_module
-from flockenv.effects import Drag, Separation
+from flockenv.behaviours import Separation
+from flockenv.effects import Drag
 from flockenv.rows import rows
 from flockenv.scene import Group, Scene
 from flockenv.space import Box, Plane, Space, Torus

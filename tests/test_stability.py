@@ -10,9 +10,10 @@ from typing import Any
 import numpy as np
 import pytest
 
+from flockenv.behaviours import Cohesion, Separation
 from flockenv.config import load_scene
 from flockenv.divergence import SimulationDiverged
-from flockenv.effects import AngularSprings, Cohesion, Drag, Effect, Elastic, Gravity, Separation, Springs, Tether
+from flockenv.effects import AngularSprings, Drag, Effect, Elastic, Gravity, Springs, Tether
 from flockenv.integrators import (
     RK4,
     AdaptiveRK4,

@@ -23,8 +23,8 @@ import pytest
 import flockenv
 import flockenv.scene as scenes
 from flockenv import crew
+from flockenv.behaviours import Separation
 from flockenv.crew import share, threads, use_threads
-from flockenv.effects import Separation
 from flockenv.kernels import cache_folder
 from flockenv.neighbours import WORTH_ARRANGING
 from flockenv.scene import Group, Scene

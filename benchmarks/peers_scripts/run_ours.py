@@ -94,7 +94,7 @@ def _parallel(env: Any, agents: int, does: str) -> Case:
 
 def boids(agents: int, edge: float, reach: float, apart: float, about: str) -> Case:
     """One world of boids on a torus, all three rules, through Scene.step in place."""
-    from flockenv.effects.flock import Alignment, Cohesion, Separation
+    from flockenv.behaviours import Alignment, Cohesion, Separation
     from flockenv.scene import Group, Scene
     from flockenv.space import Torus
     from flockenv.spawn import Spawn

@@ -11,21 +11,8 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from flockenv.accuracy.problem import Exact, Floats, Problem
-from flockenv.effects import (
-    Alignment,
-    Attraction,
-    Carried,
-    Cohesion,
-    Drag,
-    Effect,
-    Gravity,
-    QuadraticDrag,
-    Separation,
-    Swing,
-    Tether,
-    Uniform,
-    Vortex,
-)
+from flockenv.behaviours import Alignment, Cohesion, Separation
+from flockenv.effects import Attraction, Carried, Drag, Effect, Gravity, QuadraticDrag, Swing, Tether, Uniform, Vortex
 from flockenv.refusals import nearest, shown
 from flockenv.scene import Group, Scene
 from flockenv.space import Torus

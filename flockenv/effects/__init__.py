@@ -11,11 +11,9 @@ for _module in pkgutil.iter_modules(__path__):
     importlib.import_module(f"{__name__}.{_module.name}")
 
 from flockenv.effects.attraction import Attraction  # noqa: E402  # after the folder has been walked
-from flockenv.effects.avoid import AvoidObstacles  # noqa: E402
 from flockenv.effects.drag import Drag, QuadraticDrag  # noqa: E402
 from flockenv.effects.elastic import Elastic  # noqa: E402
 from flockenv.effects.fields import Carried, Sink, Source, Uniform, Vortex, Wind  # noqa: E402
-from flockenv.effects.flock import Alignment, Cohesion, Separation  # noqa: E402
 from flockenv.effects.fluctuation import Fluctuation  # noqa: E402
 from flockenv.effects.gravitation import Gravitation, InverseSquare  # noqa: E402
 from flockenv.effects.gravity import Gravity  # noqa: E402
@@ -25,8 +23,8 @@ from flockenv.effects.tether import Swing, Tether  # noqa: E402
 from flockenv.effects.wall import WallRepulsion  # noqa: E402
 
 __all__ = [
-    "EFFECTS", "Alignment", "AngularSprings", "Attraction", "AvoidObstacles", "Carried", "Cohesion", "Drag", "Effect",
+    "EFFECTS", "AngularSprings", "Attraction", "Carried", "Drag", "Effect",
     "Elastic", "Far", "Fluctuation", "Gravitation", "Gravity", "InverseSquare", "Me", "Other", "Pressure",
-    "QuadraticDrag", "Separation", "Sight", "Sink", "Source", "Springs", "Swing", "Tether", "Uniform", "Vortex",
+    "QuadraticDrag", "Sight", "Sink", "Source", "Springs", "Swing", "Tether", "Uniform", "Vortex",
     "WallRepulsion", "Wind",
 ]  # fmt: skip

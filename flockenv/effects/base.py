@@ -6,7 +6,8 @@ An effect is of one or more of three forms, each a law for one agent:
 * `medium_law(p, me) -> velocity` of the medium where it is: all of them sum up to `me.medium` of the other laws of one
   agent; and `flow_law(p, me) -> velocity` with which the medium carries it, beside its own velocity;
 * `pair_law(p, me, other) -> sums`, `finish_law(p, me, sums) -> force`: what one neighbour adds to K running sums, and
-  the force they make; all pair laws of a scene share one sweep;
+  the force they make; all pair laws of a scene share one sweep. With a `pair_start(p, me) -> acc` it is a fold instead,
+  `pair_law(p, me, other, acc) -> acc`, over those in sight, in no order that it may rely on;
 * `far_law(p, me, other) -> force`: of everybody else, however far, of whom groups far away are met as one; `other` is
   a `Far`, and of `me` it may read pos and mass alone; `p.opening` says how large such a group may look;
 * `bond_law(p, me, others, numbers) -> force`: of one of the bonds that the effect's `bonds` lists, each between an
@@ -63,6 +64,7 @@ class Me(NamedTuple):
     tie: Vec  # a unit vector of its own, see ties(); 0 outside pair laws
     time: float  # s, of the stage that is asked for
     medium: Vec  # m/s, velocity of the medium here; 0 in pair laws and bonds
+    key: int  # of its world, for random numbers that are functions of time, see noise.py
 
 
 class Other(NamedTuple):
@@ -90,6 +92,7 @@ class Sight(NamedTuple):
     radius: float  # m
     fov: float = 360.0  # degrees, full angle; somebody at standstill has no heading and sees all around
     nearest: int | None = None  # at most so many (and whoever is exactly as far as the last); None = all
+    group: int | None = None  # of this group alone; None = of all
 
 
 class Bonds(NamedTuple):
@@ -155,6 +158,7 @@ class Effect(Record):
     far_law: ClassVar[str | None] = None
     bond_law: ClassVar[str | None] = None
     kick_law: ClassVar[str | None] = None
+    pair_start: ClassVar[str | None] = None
     pair_law: ClassVar[str | None] = None
     finish_law: ClassVar[str | None] = None
     obstacle_start: ClassVar[str | None] = None
@@ -172,6 +176,9 @@ class Effect(Record):
     """Names of the fields that make it nothing when they are 0."""
     conserves_momentum: ClassVar[bool] = False
     """True if what i does to j is the opposite of what j does to i."""
+    demo: ClassVar[str | None] = None
+    """A small scene that shows it, as YAML; docs/behaviours.md draws the trajectories of its first `demo_time` s."""
+    demo_time: ClassVar[float] = 8.0
 
     @classmethod
     def __pydantic_init_subclass__(cls, **kwargs: Any) -> None:
@@ -189,6 +196,20 @@ class Effect(Record):
     def reach(self) -> float:
         """How far it looks for neighbours, m; 0 if it does not."""
         return self.sight.radius if self.sight else 0.0
+
+    @property
+    def wishes(self) -> tuple[Effect, ...]:
+        """The effects whose wishes it reconciles, in order of priority; see Steer."""
+        return ()
+
+    @property
+    def steer_law(self) -> tuple[str, str]:
+        """Module and name of the law (p, me, wishes) -> force by which it reconciles them."""
+        raise TypeError(f"{type(self).__name__} reconciles no wishes")
+
+    def members(self, starts: Sequence[int]) -> dict[str, float]:
+        """More numbers for its laws: which agents it is about; starts[g] is the first agent of group g."""
+        return {}
 
     def sums(self, dimension: int) -> int:
         """How many running sums its pair law fills."""

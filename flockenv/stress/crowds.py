@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from flockenv.effects import Alignment, Cohesion, Separation
+from flockenv.behaviours import Alignment, Cohesion, Separation
 from flockenv.integrators import Integrator
 from flockenv.scene import Group, Scene
 from flockenv.space import Torus

@@ -47,10 +47,12 @@ def respond(around, pos, vel, time, acc):
 {indented(me, 12)}
             o = zero(x)
             s, f = {lanes_of(parts, "want")}, o
+{indented([f"{parts.target(k)} = o" for k in parts.wishes], 12)}
 {indented(_nearest_images(parts), 12)}
 {indented(_medium(parts), 12)}
 {indented(_own(parts), 12)}
 {indented(_felt(parts), 12)}
+{indented(_reconcile(parts), 12)}
             s = limit(s, max_force[i])
             # a choice, not a factor of 0: a law may be infinite where the dead, what is held in place (by an infinite
             # mass) and the lanes beyond the last agent lie
@@ -72,12 +74,15 @@ def parameters(parts: Parts) -> list[str]:
     d = parts.dimension
     lines = [f"size = {tuple_of('params[#]', d)}", f"reach = params[{d}]"]
     at = d + 1
-    for q in range(len(parts.sights)):
+    for q, sight in enumerate(parts.sights):
         lines.append(f"within{q}, view{q} = params[{at}], params[{at + 1}]")
         at += 2
+        if sight.group is not None:
+            lines.append(f"first{q}, end{q} = params[{at}], params[{at + 1}]")
+            at += 2
     for k, effect in enumerate(parts.effects):
         values = []
-        for value in effect.parameters().values():
+        for value in parts.numbers_of(effect).values():
             count = len(value) if isinstance(value, tuple) else 1
             each = ", ".join(f"params[{at + j}]" for j in range(count))
             values.append(f"({each},)" if isinstance(value, tuple) else each)
@@ -93,7 +98,7 @@ def _nearest_images(parts: Parts) -> list[str]:
         if _given(parts, k) == f"near{k}":
             values = [
                 f"add(x, offset_to(size, x, p{k}.{name}))" if name in effect.places else f"p{k}.{name}"
-                for name in effect.parameters()
+                for name in parts.numbers_of(effect)
             ]
             lines.append(f"near{k} = P{k}({', '.join(values)})")
     return lines
@@ -132,7 +137,7 @@ def _own(parts: Parts) -> list[str]:
     """Write the laws of one agent by itself, and what the folds over the obstacles came to."""
     lines, slot = [], Slots(parts)
     for k, effect in enumerate(parts.effects):
-        to = "s" if effect.steering else "f"
+        to = parts.target(k)
         if effect.own_law is not None:
             still = effect.linear_drag is not None and parts.integrator.splits_drag
             if still:  # what is left of -c (v - u): the method adds -c v
@@ -152,6 +157,19 @@ def _felt(parts: Parts) -> list[str]:
         lines.append(f"{name} = add({name}, ({', '.join(places)},))")
     if parts.pulls:
         lines.append(f"f = add(f, {lanes_of(parts, 'pulled')})")
+    return lines
+
+
+def _reconcile(parts: Parts) -> list[str]:
+    """Write how wishes become what agent i wants: for each effect that has behaviours, if it is about i."""
+    lines = []
+    for k, effect in enumerate(parts.effects):
+        if effect.wishes:
+            wishes = ", ".join(parts.target(j) for j, by in parts.wishes.items() if by == k)
+            lines += [
+                f"member = (ident[i] >= p{k}.first) & (ident[i] < p{k}.end)",
+                f"s = add(s, select(member, steer_law_{k}(p{k}, me, ({wishes},))[0], o))",
+            ]
     return lines
 
 

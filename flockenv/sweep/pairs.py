@@ -34,7 +34,12 @@ def pairs(parts: Parts) -> list[str]:
 def _clear(parts: Parts) -> list[str]:
     """Write how a block's running numbers begin."""
     slot = Slots(parts)
-    zeros = [f"{s} = 0" for k, _ in parts.pairs for s in slot.all(f"c{k}_")]
+    zeros = [f"{s} = 0" for k, e in parts.pairs if not e.pair_start for s in slot.all(f"c{k}_")]
+    folds = [(k, slot.all(f"c{k}_")) for k, e in parts.pairs if e.pair_start]
+    if folds:
+        zeros.append(_me(parts, parts.fields))
+    for k, slots in folds:
+        zeros += [f"found_ = pair_start_{k}(p{k}, me)", *(f"{s} = found_[{j}]" for j, s in enumerate(slots))]
     far = [f"{s} = np.inf" for q in range(len(parts.sights)) for s in slot.all(f"near{q}_")]
     return [f"for l in range(np.uint64({parts.width})):", indented(zeros + far, 4)]
 
@@ -82,11 +87,15 @@ def _meet(parts: Parts) -> list[str]:
         cut = f" & (square <= {slot(f'near{q}_{sight.nearest - 1}')})" if sight.nearest else ""
         lines.append(f"seen{q} = {_seen(parts, q)}{cut}")
     for k, effect in parts.pairs:
-        q = parts.sights.index(sight_of(effect))
+        q, slots = parts.sights.index(sight_of(effect)), slot.all(f"c{k}_")
+        if effect.pair_start:
+            lines.append(f"says = pair_law_{k}(p{k}, me, it, ({', '.join(slots)},))")
+            lines += [f"{s} = says[{j}] if seen{q} else {s}" for j, s in enumerate(slots)]
+            continue
         lines.append(f"says = pair_law_{k}(p{k}, me, it)")
         # A sum of a choice: of a choice between sums LLVM makes a masked store, and the sum stays in memory. The other
         # choice is -0, which x + -0 leaves as it is for every x: so this becomes one masked addition.
-        lines += [f"{s} += says[{j}] if seen{q} else o" for j, s in enumerate(slot.all(f"c{k}_"))]
+        lines += [f"{s} += says[{j}] if seen{q} else o" for j, s in enumerate(slots)]
     return lines
 
 
@@ -94,16 +103,18 @@ def _finish(parts: Parts) -> list[str]:
     """Write what a block's sums come to."""
     slot, d = Slots(parts), parts.dimension
     lines = [_me(parts, parts.fields)] + [f"{name} = zero(me.pos)" for name in parts.targets]
-    for k, effect in parts.pairs:
-        to = "s" if effect.steering else "f"
+    for k, _ in parts.pairs:
+        to = parts.target(k)
         lines.append(f"{to} = add({to}, finish_law_{k}(p{k}, me, ({', '.join(slot.all(f'c{k}_'))},)))")
     return lines + [f"{slot(f'g{name}{j}')} = {name}[{j}]" for name in parts.targets for j in range(d)]
 
 
 def _seen(parts: Parts, q: int) -> str:
     """Write whether candidate `it` is in sight q: near enough, ahead, and somebody else."""
-    fov = parts.sights[q].fov
-    return f"other & (square < within{q})" if fov >= 360 else f"ahead{_fovs(parts).index(fov)} & (square < within{q})"
+    sight = parts.sights[q]
+    ahead = "other" if sight.fov >= 360 else f"ahead{_fovs(parts).index(sight.fov)}"
+    member = f" & (aj >= first{q}) & (aj < end{q})" if sight.group is not None else ""
+    return f"{ahead} & (square < within{q}){member}"
 
 
 def _fovs(parts: Parts) -> list[float]:
@@ -179,4 +190,4 @@ def _me(parts: Parts, fields: list[str]) -> str:
 
     numbers = ", ".join(number(name) for name in ("mass", "radius", "max_speed", "max_force"))
     vectors = f"{vector('x')}, {vector('v')}, {vector('h')}"
-    return f"me = Me({number('who')}, {vectors}, {numbers}, {vector('t')}, time, zero({vector('x')}))"
+    return f"me = Me({number('who')}, {vectors}, {numbers}, {vector('t')}, time, zero({vector('x')}), key[b])"

@@ -11,6 +11,7 @@ import functools
 import inspect
 import math
 import sys
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -21,7 +22,7 @@ from flockenv.integrators.base import Integrator
 from flockenv.kernels import LINE
 from flockenv.space import Space
 
-__all__ = ["SMALL_STRIDE", "Look", "Parts", "record_of", "sight_of", "sorted_at", "view_of"]
+__all__ = ["SMALL_STRIDE", "Look", "Parts", "flattened", "record_of", "sight_of", "sorted_at", "view_of"]
 
 SMALL_STRIDE = 128
 """Places in a row of sorted agents where there are too few to be sorted by cell: their blocks, and one more."""
@@ -42,6 +43,7 @@ class Parts:
     dimension: int
     space: Space
     effects: tuple[Effect, ...]
+    """As `flattened` lists them: behaviours whose wishes are reconciled lie before the effect that does it."""
     integrator: Integrator
     dtype: str = "float64"
     sorts: bool = True
@@ -50,6 +52,8 @@ class Parts:
     """What a task shows its agents, found by the same query."""
     crowded: bool = False
     """Are there enough agents for groups of them to be met as one, where they are far away?"""
+    starts: tuple[int, ...] = ()
+    """The first agent of each group, and one more: numbers alone, the source does not depend on them."""
 
     @functools.cached_property
     def width(self) -> int:
@@ -117,12 +121,30 @@ class Parts:
         values = [*self.space.extent(self.dimension), self.reach]
         for sight in self.sights:
             values += [sight.radius**2, view_of(sight.fov)]
+            if sight.group is not None:
+                values += self.starts[sight.group : sight.group + 2]
         for effect in self.effects:
-            for value in effect.parameters().values():
+            for value in self.numbers_of(effect).values():
                 values.extend(value if isinstance(value, tuple) else (value,))
         values += self.space.numbers()
         values += self.integrator.settings()
         return values + ([self.look.radius, self.look.radius**2] if self.look else [])
+
+    def numbers_of(self, effect: Effect) -> dict[str, Any]:
+        """Return the numbers and vectors that the laws of an effect are given, by name."""
+        return {**effect.parameters(), **effect.members(self.starts)}
+
+    @functools.cached_property
+    def wishes(self) -> dict[int, int]:
+        """Which effects only wish, and the number of the one that reconciles their wishes."""
+        found: dict[int, int] = {}
+        for k, effect in enumerate(self.effects):
+            found |= dict.fromkeys(range(k - len(effect.wishes), k), k)
+        return found
+
+    def target(self, k: int) -> str:
+        """Write what effect k adds to: a wish of its own, what agents want, or what acts on them."""
+        return f"w{k}_" if k in self.wishes else "s" if self.effects[k].steering else "f"
 
     def last_numbers(self, kind: str) -> int:
         """Return where in `parameters` the numbers of the "space" begin, or of the "method": they come last but one."""
@@ -142,9 +164,9 @@ class Parts:
 
     @functools.cached_property
     def targets(self) -> list[str]:
-        """What pair laws add to: what agents want, what acts on them, or both."""
-        steering = {e.steering for _, e in self.pairs}
-        return ["s"] * (True in steering) + ["f"] * (False in steering)
+        """What pair laws add to: what agents want, what acts on them, wishes."""
+        found = {self.target(k) for k, _ in self.pairs}
+        return [name for name in ("s", "f", *(f"w{k}_" for k in self.wishes)) if name in found]
 
     @functools.cached_property
     def fields(self) -> list[str]:
@@ -152,6 +174,8 @@ class Parts:
         names = set().union(*(_names(e) for _, e in self.pairs)) if self.pairs else set()
         if any(sight.fov < 360 for sight in self.sights):
             names.add("heading")
+        if any(sight.group is not None for sight in self.sights):
+            names.add("who")
         needed = {"x": True, "v": bool({"vel", "heading"} & names), "h": "heading" in names, "t": "tie" in names}
         rows = [f"{letter}{k}" for letter, need in needed.items() if need for k in range(self.dimension)]
         return rows + [name for name in ("who", "radius", "mass", "max_speed", "max_force") if name in names]
@@ -216,6 +240,11 @@ class Parts:
         return {name: place for place, name in enumerate([*names, "bad"])}
 
 
+def flattened(effects: Sequence[Effect]) -> tuple[Effect, ...]:
+    """Return effects with their behaviours, if they have some, before them: each has laws and numbers of its own."""
+    return tuple(each for effect in effects for each in (*effect.wishes, effect))
+
+
 def sorted_at(parts: Parts, row: int, place: str) -> str:
     """Write a number of the sorted agent at `place`, which is counted without a sign.
 
@@ -247,7 +276,7 @@ def view_of(fov: float) -> float:
 def _names(effect: Effect) -> set[str]:
     """Return every name in the code of an effect's pair laws and of the laws that they call."""
     module = vars(sys.modules[type(effect).__module__])
-    todo = [module[law] for law in (effect.pair_law, effect.finish_law) if law]
+    todo = [module[law] for law in (effect.pair_start, effect.pair_law, effect.finish_law) if law]
     seen: set[int] = set()
     names: set[str] = set()
     while todo:

@@ -22,7 +22,7 @@ _READ = (
 SHARED = f"pos, vel, origin, stages, {_READ}"
 """Scratch of one world in progress, in order; see workspace.Workspace. The last two belong to one thread."""
 
-CONTEXT = f"obstacle_x, obstacle_radius, work, params, b, n, present, arranged, first, end, rank, team, {_READ}"
+CONTEXT = f"obstacle_x, obstacle_radius, work, params, key, b, n, present, arranged, first, end, rank, team, {_READ}"
 """What an acceleration is given beside positions and velocities, in order."""
 
 
@@ -49,7 +49,8 @@ def place_of(parts: Parts, rows: int) -> str:
 
 def alone(medium: str = "zero(x)", vel: str = "v", heading: str = "unit(v)") -> str:
     """Write agent i, at x, as the laws of one agent see it: no tie, there is nobody to part from."""
-    return f"Me(ident[i], x, {vel}, {heading}, mass[i], radius[i], max_speed[i], max_force[i], zero(x), time, {medium})"
+    body = "mass[i], radius[i], max_speed[i], max_force[i]"
+    return f"Me(ident[i], x, {vel}, {heading}, {body}, zero(x), time, {medium}, key[b])"
 
 
 def copied(parts: Parts, to: str, at: str, source: str, place: str) -> list[str]:

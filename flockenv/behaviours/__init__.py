@@ -1,0 +1,26 @@
+"""What an agent wants: Reynolds' behaviours, a family per file.
+
+To add one: write its file here, and a row in tests/catalogue.py.
+
+A behaviour is an effect (see effects/base.py for the forms of its laws) with `steering = True`: what its laws return is
+a wish, in newtons. Several in a scene's list of effects are summed up, and the sum is cut to max_force; under a `Steer`
+effect their wishes are reconciled by an arbitration.
+"""
+
+from __future__ import annotations
+
+import importlib
+import pkgutil
+
+from flockenv.effects.base import EFFECTS, Effect
+
+for _module in pkgutil.iter_modules(__path__):
+    importlib.import_module(f"{__name__}.{_module.name}")
+
+from flockenv.behaviours.avoid import AvoidObstacles  # noqa: E402  # after the folder has been walked
+from flockenv.behaviours.flock import Alignment, Cohesion, Separation  # noqa: E402
+
+__all__ = ["BEHAVIOURS", "Alignment", "AvoidObstacles", "Cohesion", "Separation"]
+
+BEHAVIOURS: dict[str, type[Effect]] = {kind: effect for kind, effect in EFFECTS.items() if effect.steering}
+"""Every behaviour by its kind."""

@@ -1,0 +1,92 @@
+"""Steer: the behaviours of a group, in order of priority, and how their wishes are reconciled.
+
+Steer(group=0, arbitration=Allocation(), behaviours=(AvoidObstacles(weight=8), Wander(weight=2)))
+"""
+
+from __future__ import annotations
+
+import functools
+import operator
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
+
+from pydantic import Field, WrapValidator, model_validator
+
+from flockenv.arbitration import Allocation, AnyArbitration, Arbitration
+from flockenv.behaviours import BEHAVIOURS
+from flockenv.effects.base import Effect
+from flockenv.kernels import Vec
+from flockenv.records import keep
+
+__all__ = ["Steer"]
+
+if TYPE_CHECKING:
+    AnyBehaviour = Effect
+    AnyReconciling = Arbitration
+else:
+    AnyBehaviour = Annotated[
+        Annotated[functools.reduce(operator.or_, BEHAVIOURS.values()), Field(discriminator="kind")],
+        WrapValidator(keep(Effect)),
+    ]
+    AnyReconciling = Annotated[AnyArbitration, WrapValidator(keep(Arbitration))]
+
+
+class Steer(Effect):
+    """What a group wants: its behaviours in order of priority, and the arbitration that makes one force of them."""
+
+    kind: Literal["steer"] = "steer"
+    behaviours: tuple[AnyBehaviour, ...] = Field(min_length=1, description="the most pressing one first")
+    arbitration: AnyReconciling = Field(default_factory=Allocation, description="how their wishes are reconciled")
+    group: int | None = Field(default=None, ge=0, description="whom it steers; none = everybody")
+    steering: ClassVar[bool] = True
+
+    @model_validator(mode="after")
+    def _wishes_alone(self) -> Steer:
+        """Refuse what is no behaviour, and numbers that do not go with so many of them."""
+        for k, behaviour in enumerate(self.behaviours):
+            if not behaviour.steering or behaviour.wishes:
+                raise ValueError(f"behaviours[{k}].kind = {behaviour.kind}: is no behaviour; {', '.join(BEHAVIOURS)}")
+        self.arbitration.parameters(len(self.behaviours))
+        return self
+
+    @property
+    def wishes(self) -> tuple[Effect, ...]:
+        """Its behaviours."""
+        return self.behaviours
+
+    @property
+    def steer_law(self) -> tuple[str, str]:
+        """The arbitration's law."""
+        return type(self.arbitration).__module__, self.arbitration.law
+
+    @property
+    def reach(self) -> float:
+        """How far any of its behaviours looks, m."""
+        return max(behaviour.reach for behaviour in self.behaviours)
+
+    def parameters(self) -> dict[str, float | Vec]:
+        """The numbers of the arbitration: behaviours have their own."""
+        return self.arbitration.parameters(len(self.behaviours))
+
+    def members(self, starts: Sequence[int]) -> dict[str, float]:
+        """Whom it steers: [first, end)."""
+        first, end = (0, starts[-1]) if self.group is None else starts[self.group : self.group + 2]
+        return {"first": float(first), "end": float(end)}
+
+    def idle(self) -> Effect:
+        """Return the same behaviours, all of them idle."""
+        return self.model_copy(update={"behaviours": tuple(behaviour.idle() for behaviour in self.behaviours)})
+
+    def check(self, scene: Any) -> None:
+        """Refuse a group that is not there, and behaviours that do not suit the scene."""
+        if self.group is not None and self.group >= len(scene.groups):
+            raise ValueError(f"group = {self.group}: there are {len(scene.groups)} groups, counted from 0")
+        for k, behaviour in enumerate(self.behaviours):
+            try:
+                behaviour.check(scene)
+            except ValueError as error:
+                raise ValueError(f"behaviours[{k}].{error}") from None
+
+    def calls_for(self) -> tuple[str, ...]:
+        """What any of its behaviours calls for."""
+        return tuple(dict.fromkeys(what for behaviour in self.behaviours for what in behaviour.calls_for()))
