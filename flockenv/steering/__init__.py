@@ -1,0 +1,34 @@
+"""Reynolds' verbs, one law each, for one agent: every sweep, scripted agent and hand-written player calls these.
+
+A steering law returns the change of velocity it asks for, S = v_desired - v, in m/s; the caller turns it into a force
+with a gain in kg/s (m/tau makes `seek` Helbing's driving force). `offset` is always other minus self. Laws take tuples
+of D = 2 or 3 floats and are finite for every finite input, at standstill and at zero distance too.
+Over arrays of rows they are called through `flockenv.rows.rows(law)`.
+
+Sources: Reynolds, "Flocks, Herds, and Schools" (SIGGRAPH 1987); "Steering Behaviors for Autonomous Characters"
+(GDC 1999). The sign of seek is the paper's figure, not its pseudo-code, which flees.
+"""
+
+from __future__ import annotations
+
+from flockenv.steering.around import avoid, contain, threat
+from flockenv.steering.goals import arrive, flee, seek, wander, wander_turn
+from flockenv.steering.others import align, cohere, distance_time, evade, interception_time, pursue, separate
+
+__all__ = [
+    "align",
+    "arrive",
+    "avoid",
+    "cohere",
+    "contain",
+    "distance_time",
+    "evade",
+    "flee",
+    "interception_time",
+    "pursue",
+    "seek",
+    "separate",
+    "threat",
+    "wander",
+    "wander_turn",
+]

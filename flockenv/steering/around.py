@@ -1,0 +1,74 @@
+"""What stands in an agent's way: what it would touch, how it passes, where it must stay."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from flockenv.kernels import Vec, law, like
+from flockenv.steering.goals import seek
+from flockenv.vec import dot, lateral, perpendicular, scale, select, sub, unit, zero
+
+__all__ = ["avoid", "contain", "threat"]
+
+
+@law
+def threat(forward: Vec, offset: Vec, clearance: float, lookahead: float) -> float:
+    """Return how far ahead [m] a straight path touches a circle or sphere, inf if not within `lookahead` [m].
+
+    `forward` is a unit vector, `offset` leads to the centre, `clearance` is the sum of both radii (Reynolds 1999: the
+    cylinder test). Inside the obstacle the threat is at 0.
+    """
+    along = dot(offset, forward)
+    aside = lateral(offset, forward)
+    room = clearance * clearance - dot(aside, aside)
+    o = like(room, 0.0)
+    entry = along - np.sqrt(room if room > o else o)
+    inside = dot(offset, offset) < clearance * clearance
+    hit = room > o and along > o and entry <= lookahead
+    far = like(room, np.inf)
+    return o if inside else (entry if hit else far)
+
+
+@law
+def avoid(forward: Vec, offset: Vec, clearance: float, max_speed: float) -> Vec:
+    """Steer around the circle or sphere that `threat` found: sideways, away from its centre, at V m/s (Reynolds 1999).
+
+    Dead ahead everybody keeps right; inside, the way is straight out. It never brakes.
+    """
+    o = like(max_speed, 0.0)
+    inside = dot(offset, offset) < clearance * clearance
+    aside = lateral(offset, forward)
+    # A lateral part of rounding noise has no side: treat it as dead ahead.
+    noise = like(max_speed, 1e-10) * dot(offset, offset)
+    sideways = select(dot(aside, aside) > noise, scale(unit(aside), like(max_speed, -1.0)), perpendicular(forward))
+    out = scale(unit(offset), like(max_speed, -1.0))
+    out = select(dot(offset, offset) > o, out, forward)
+    return scale(select(inside, out, sideways), max_speed)
+
+
+@law
+def _clamped(x: float, low: float, high: float) -> float:
+    return low if x < low else (high if x > high else x)
+
+
+@law
+def contain(to_low: Vec, to_high: Vec, velocity: Vec, max_speed: float, time: float) -> Vec:
+    """Stay in a box: if the place after `time` [s] is outside, seek the nearest place inside, else ask for nothing.
+
+    `to_low` and `to_high` are the distances to the lower and the upper wall per axis, m; negative beyond it
+    (Reynolds 1999, containment).
+    """
+    step = scale(velocity, time)
+    x = _clamped(step[0], -to_low[0], to_high[0])
+    y = _clamped(step[1], -to_low[1], to_high[1])
+    if len(velocity) == 2:
+        return _return(step, (x, y), velocity, max_speed)
+    else:
+        return _return(step, (x, y, _clamped(step[2], -to_low[2], to_high[2])), velocity, max_speed)
+
+
+@law
+def _return(step: Vec, goal: Vec, velocity: Vec, max_speed: float) -> Vec:
+    change = sub(goal, step)
+    leaving = dot(change, change) > like(max_speed, 0.0)
+    return select(leaving, seek(goal, velocity, max_speed), zero(velocity))
