@@ -15,7 +15,8 @@ An effect is of one or more of three forms, each a law for one agent:
 * `kick_law(p, me, seconds, gauss) -> velocity`: added once per step, however often a method asks for forces, with one
   standard normal number per axis (fluctuations);
 * `obstacle_start(p, me)`, `obstacle_law(p, me, other, acc) -> acc`, `obstacle_finish(p, me, acc) -> force`: a fold over
-  the obstacles.
+  the obstacles. Of an effect with a pair law too, `finish_law` gives no force but what it has found out about others, a
+  vector that is told to `obstacle_start(p, me, told)` (hide).
 
 `p` holds the effect's `parameters()` by name, `me` and `other` are the records below. Laws live in the effect's module.
 A pair law says nothing of who is seen: it is evaluated for every candidate, and what it says of those outside the

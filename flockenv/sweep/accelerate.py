@@ -148,13 +148,17 @@ def _own(parts: Parts) -> list[str]:
     return lines
 
 
+def _felt_as(parts: Parts, name: str) -> str:
+    """Write what the pair laws came to for one of their targets."""
+    d, t = parts.dimension, parts.targets.index(name)
+    each = d * len(parts.targets)
+    places = [f"felt[row * np.uint64({each}) + np.uint64({(d * t + k) * parts.width}) + l]" for k in range(d)]
+    return f"({', '.join(places)},)"
+
+
 def _felt(parts: Parts) -> list[str]:
     """Write how what the pair laws came to is added."""
-    d, lines = parts.dimension, []
-    each = d * len(parts.targets)
-    for t, name in enumerate(parts.targets):
-        places = [f"felt[row * np.uint64({each}) + np.uint64({(d * t + k) * parts.width}) + l]" for k in range(d)]
-        lines.append(f"{name} = add({name}, ({', '.join(places)},))")
+    lines = [f"{name} = add({name}, {_felt_as(parts, name)})" for name in parts.targets if name[0] != "n"]
     if parts.pulls:
         lines.append(f"f = add(f, {lanes_of(parts, 'pulled')})")
     return lines
@@ -181,7 +185,8 @@ def _obstacles(parts: Parts, me: list[str]) -> list[str]:
         return []
     starts, meets = [], []
     for k, slots in asking:
-        starts.append(f"found = obstacle_start_{k}(p{k}, me)")
+        told = f", {_felt_as(parts, f'n{k}_')}" if parts.effects[k].pair_law else ""
+        starts.append(f"found = obstacle_start_{k}(p{k}, me{told})")
         starts += [f"{s} = found[{j}]" for j, s in enumerate(slots)]
         meets.append(f"found = obstacle_law_{k}(p{k}, me, it, ({', '.join(slots)},))")
         meets += [f"{s} = found[{j}]" for j, s in enumerate(slots)]
