@@ -34,7 +34,7 @@ LAYERS = (
     {"snapshot", "implicit", "workspace", "scene", "config", "measures", "explanation"},
     {"tasks", "world", "policy"},
     {"envs", "sb3", "evaluation", "accuracy", "stress", "render", "trajectory"},
-    {"studies"},
+    {"gallery", "studies"},
     {"cli"},
     {"agents"},
     {"tests"},
