@@ -58,5 +58,5 @@ def test_a_gallery_is_a_page_and_its_pictures(
 
 def test_a_behaviour_without_a_scene_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(Separation, "demo", None)
-    with pytest.raises(ValueError, match="^separation: has no demo"):
+    with pytest.raises(ValueError, match=r"^separation: has no demo"):
         shown(Separation)
