@@ -165,10 +165,8 @@ class Scene(Record):
             for k, group in enumerate(self.groups):
                 if 2 * group.radius > min(self.space.size):
                     raise ValueError(f"groups[{k}].radius = {group.radius:g} does not fit into a box of size {size}")
-        if self.dtype == "float32" and self.agents > EXACT:
-            raise ValueError(
-                f"groups: {self.agents:,} agents: float32 counts exactly up to {EXACT:,}; use dtype = float64"
-            )
+        if self.dtype == "float32":
+            self._check_counts()
         needed = self.bytes_per_world()
         if needed > MEMORY_LIMIT:
             each = needed / self.agents
@@ -179,6 +177,12 @@ class Scene(Record):
         check_places(self)
         check_dt(self)
         return self
+
+    def _check_counts(self) -> None:
+        limit = f"float32 counts exactly up to {EXACT:,}; use dtype = float64"
+        for key, count, what in (("groups", self.agents, "agents"), ("effects", len(self._params), "numbers")):
+            if count > EXACT:
+                raise ValueError(f"{key}: {count:,} {what}: {limit}")
 
     def _check_dimensions(self) -> None:
         size = getattr(self.space, "size", None)
@@ -255,9 +259,10 @@ class Scene(Record):
         """What the kernel is made of."""
         sorts = self.agents >= FEWEST_AGENTS
         crowded = self.agents > MOST_DIRECT
+        effects = flattened(self.effects)
         return Parts(
-            self.dimension, self.space, flattened(self.effects), self.integrator, self.dtype, sorts, crowded=crowded,
-            starts=self.starts,
+            self.dimension, self.space, effects, self.integrator, self.dtype, sorts, crowded=crowded,
+            starts=self.starts, tables=tuple(effect.table(self) for effect in effects if effect.tabled),
         )  # fmt: skip
 
     @functools.cached_property
@@ -283,7 +288,7 @@ class Scene(Record):
 
     @functools.cached_property
     def _params(self) -> Floats:
-        return np.array(self.parts.parameters(), self.dtype)
+        return self.parts.given()
 
     # --- running ----------------------------------------------------------------------------------------------------
 
