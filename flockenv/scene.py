@@ -23,7 +23,7 @@ from pydantic import Field, WrapValidator, model_validator
 from flockenv import state as states
 from flockenv.crew import share, threads
 from flockenv.divergence import SimulationDiverged
-from flockenv.effects import EFFECTS, Effect
+from flockenv.effects import Effect
 from flockenv.effects.base import all_masses
 from flockenv.implicit import coupling_of, solve_steps
 from flockenv.integrators import INTEGRATORS, ImplicitEuler, Integrator, SemiImplicitEuler
@@ -40,6 +40,7 @@ from flockenv.space import AnySpace, Box, Plane, Torus
 from flockenv.spawn import Spawn, scatter
 from flockenv.stability import check_dt
 from flockenv.state import Body, Floats, State
+from flockenv.steer import EVERY_EFFECT
 from flockenv.sweep import SHARED, Parts, Table, field_source, flattened, pack, scene_source
 from flockenv.tree import MOST_DIRECT, tree_sizes
 from flockenv.workspace import Workspace
@@ -63,7 +64,7 @@ if TYPE_CHECKING:
     AnyIntegrator = Integrator
 else:
     AnyEffect = Annotated[
-        Annotated[functools.reduce(operator.or_, EFFECTS.values()), Field(discriminator="kind")],
+        Annotated[functools.reduce(operator.or_, EVERY_EFFECT), Field(discriminator="kind")],
         WrapValidator(keep(Effect)),
     ]
     AnyIntegrator = Annotated[
