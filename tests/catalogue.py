@@ -109,6 +109,9 @@ STEERING = (
     Law(steering.threat, ("heading", "vector", "positive", "length"), "positive"),
     Law(steering.avoid, ("heading", "vector", "positive", "positive"), "vector"),
     Law(steering.contain, ("walls", "walls", "vector", "positive", "positive"), "vector", turns="none", mirrors=False),
+    Law(steering.heed, ("vector",) * 5 + ("positive",) * 5, "vector"),
+    Law(steering.behind, ("vector", "vector", "length"), "vector"),
+    Law(steering.herd_from, ("vector", "vector", "vector", "length", "positive", "positive"), "vector"),
 )
 
 ARBITRATION = (arbitration.blend, arbitration.prioritise, arbitration.allocate, arbitration.allocate_running)

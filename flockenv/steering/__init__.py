@@ -13,17 +13,21 @@ from __future__ import annotations
 
 from flockenv.steering.around import avoid, contain, threat
 from flockenv.steering.goals import arrive, flee, seek, wander, wander_turn
+from flockenv.steering.herding import behind, heed, herd_from
 from flockenv.steering.others import align, cohere, distance_time, evade, interception_time, pursue, separate
 
 __all__ = [
     "align",
     "arrive",
     "avoid",
+    "behind",
     "cohere",
     "contain",
     "distance_time",
     "evade",
     "flee",
+    "heed",
+    "herd_from",
     "interception_time",
     "pursue",
     "seek",
