@@ -19,6 +19,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flockenv import arbitration, steering
+from flockenv.arbitration import (
+    Allocation,
+    Blend,
+    ContextSteering,
+    Dithering,
+    Priority,
+    RoundRobin,
+    RunningSum,
+)
 from flockenv.behaviours import Alignment, AvoidObstacles, Cohesion, Separation
 from flockenv.effects import EFFECTS as EFFECT_KINDS
 from flockenv.effects import (
@@ -63,6 +72,7 @@ from flockenv.networks import Mesh
 from flockenv.scene import Group, Scene
 from flockenv.space import Box, Plane, Space, Torus
 from flockenv.spawn import Spawn
+from flockenv.steer import Steer
 from flockenv.tasks import Flock, Obstacles, Pursuit, Task
 
 Array = NDArray[np.float64]
@@ -110,7 +120,11 @@ STEERING = (
     Law(steering.contain, ("walls", "walls", "vector", "positive", "positive"), "vector", turns="none", mirrors=False),
 )
 
-ARBITRATION = (arbitration.blend, arbitration.prioritise, arbitration.allocate)
+ARBITRATION = (arbitration.blend, arbitration.prioritise, arbitration.allocate, arbitration.allocate_running)
+"""Those for whoever has wishes and no scene."""
+
+ARBITRATIONS = (Blend(), Priority(), Dithering(), Allocation(), RunningSum(), RoundRobin(), ContextSteering())
+"""Those that a `Steer` effect may be given; tests/test_arbitration.py tries all of them."""
 
 
 # --- effects ----------------------------------------------------------------------------------------------------------
@@ -201,6 +215,12 @@ EFFECTS = (
     EffectRow(Alignment(weight=0.7, radius=3, fov=270)),
     EffectRow(Cohesion(weight=0.9, radius=2.8, fov=240)),
     EffectRow(AvoidObstacles(weight=5, horizon=3, margin=0.1)),
+    EffectRow(
+        Steer(
+            group=0, arbitration=Priority(),
+            behaviours=(AvoidObstacles(weight=5, horizon=3, margin=0.1), Separation(weight=1.3, radius=2.5)),
+        )
+    ),
     EffectRow(Gravitation(constant=0.3, softening=0.5)),  # of few the sum is exact; of many, see test_gravitation.py
     EffectRow(InverseSquare(strength=-0.4, softening=0.3), signed=("strength",)),
     # everybody is tied to somebody else; see `tied`
