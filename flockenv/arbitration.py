@@ -32,6 +32,8 @@ __all__ = [
 Wishes = tuple[Vec, ...]
 Shares = tuple[float, ...]
 
+Chance = Annotated[float, Field(ge=0, le=1)]
+
 ARBITRATIONS: dict[str, type[Arbitration]] = {}
 """Every arbitration by its kind; a class registers itself when it is defined."""
 
@@ -231,7 +233,7 @@ class Dithering(Arbitration):
     """
 
     kind: Literal["dithering"] = "dithering"
-    probability: float | Annotated[tuple[Annotated[float, Field(ge=0, le=1)], ...], Field(min_length=1)] = Field(
+    probability: Chance | Annotated[tuple[Chance, ...], Field(min_length=1)] = Field(
         default=0.9, description="to be heard: of all behaviours, or of each, 0 to 1 (Reynolds 1999: 0.9)"
     )
     period: float = Field(default=0.1, gt=0, description="s, how long a draw lasts")
@@ -241,10 +243,9 @@ class Dithering(Arbitration):
     def parameters(self, wishes: int) -> dict[str, float | Vec]:
         """A probability for each wish."""
         each = self.probability if isinstance(self.probability, tuple) else (self.probability,) * wishes
-        if len(each) != wishes or not all(0 <= x <= 1 for x in each):
+        if len(each) != wishes:
             raise ValueError(
-                f"arbitration.probability = {self.probability}: must be one number from 0 to 1, or one for each of "
-                f"{wishes} behaviours"
+                f"arbitration.probability = {self.probability}: must be one number, or one for each of {wishes} behaviours"
             )
         return {"period": self.period, "threshold": self.threshold, "probability": tuple(map(float, each))}
 

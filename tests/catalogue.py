@@ -217,8 +217,9 @@ EFFECTS = (
     EffectRow(AvoidObstacles(weight=5, horizon=3, margin=0.1)),
     EffectRow(
         Steer(
-            group=0, arbitration=Priority(),
-            behaviours=(AvoidObstacles(weight=5, horizon=3, margin=0.1), Separation(weight=1.3, radius=2.5)),
+            behaviours=(
+                AvoidObstacles(weight=5, horizon=3), Separation(weight=1.3, radius=2.5), Alignment(weight=0.7, radius=3)
+            )
         )
     ),
     EffectRow(Gravitation(constant=0.3, softening=0.5)),  # of few the sum is exact; of many, see test_gravitation.py
@@ -323,7 +324,7 @@ def scene_of(*effects: Effect, dimension: int = 2, space: Space | None = None, *
     groups = fields.pop("groups", groups)
     if any(effect.bond_law for effect in effects):
         groups = (tied(groups[0], dimension), *groups[1:])
-    asked = any(effect.obstacle_law for effect in effects)
+    asked = any("obstacles" in effect.calls_for() for effect in effects)
     centres = ((1.5, 2.0, 2.5)[:dimension], (4.5, 3.5, 3.0)[:dimension]) if asked else ()
     obstacles = tuple({"centre": centre, "radius": 0.6} for centre in centres)
     given: dict[str, Any] = {"groups": groups, "obstacles": obstacles, "dt": 0.05} | fields

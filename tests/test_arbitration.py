@@ -37,7 +37,7 @@ from tests import catalogue
 from tests.catalogue import Array
 
 ALL = pytest.mark.parametrize("arbitration", catalogue.ARBITRATIONS, ids=lambda a: a.kind)
-PRECISIONS = pytest.mark.parametrize("dtype", ["float64", "float32"])
+PRECISIONS = pytest.mark.parametrize("dtype", ["float64", pytest.param("float32", marks=pytest.mark.slow)])
 DIMENSIONS = pytest.mark.parametrize("dimension", [2, pytest.param(3, marks=pytest.mark.slow)])
 
 BUDGET = 10.0
