@@ -19,6 +19,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flockenv import arbitration, steering
+from flockenv.arbitration import (
+    Allocation,
+    Blend,
+    ContextSteering,
+    Dithering,
+    Priority,
+    RoundRobin,
+    RunningSum,
+)
 from flockenv.behaviours import Alignment, AvoidObstacles, Cohesion, Separation
 from flockenv.effects import EFFECTS as EFFECT_KINDS
 from flockenv.effects import (
@@ -115,6 +124,10 @@ STEERING = (
 )
 
 ARBITRATION = (arbitration.blend, arbitration.prioritise, arbitration.allocate, arbitration.allocate_running)
+"""Those for whoever has wishes and no scene."""
+
+ARBITRATIONS = (Blend(), Priority(), Dithering(), Allocation(), RunningSum(), RoundRobin(), ContextSteering())
+"""Those that a `Steer` effect may be given; tests/test_arbitration.py tries all of them."""
 
 
 # --- effects ----------------------------------------------------------------------------------------------------------

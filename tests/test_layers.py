@@ -20,10 +20,7 @@ LAYERS = (
     {"state", "space", "steering", "arbitration"},
     {"neighbours", "shapes", "rows", "networks", "elements", "tree", "grid"},
     {
-        "effects", "behaviours", "steer", "integrators", "collisions", "population",
-        "spawn", "sweep", "stability", "rounding",
-    },  # fmt: skip
-    {"snapshot", "implicit", "workspace", "scene", "config", "measures", "explanation"},
+    {"snapshot", "implicit", "workspace", "scene", "config", "measures", "explanation", "grants"},
     {"tasks", "world", "policy"},
     {"envs", "sb3", "evaluation", "accuracy", "stress", "render", "trajectory"},
     {"gallery", "studies"},
