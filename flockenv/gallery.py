@@ -54,9 +54,10 @@ def page(behaviours: Mapping[str, type[Effect]], pictures: str) -> str:
     lines = [
         "# Behaviours",
         "",
-        "What agents can want, each in a small scene of its own. This page was drawn and written, from the behaviours",
-        "themselves, by `flockenv gallery --out docs/behaviours.md --force`. A behaviour is listed under `effects` of a",
-        "scene, or under `behaviours` of a `steer` effect, whose arbitration reconciles several. Lines fade towards the past.",
+        "What agents can want, each in a small scene of its own. The behaviours themselves say what is here;",
+        "`flockenv gallery --out docs/behaviours.md --force` draws and writes it. A behaviour is listed under",
+        "`effects` of a scene, or under `behaviours` of a `steer` effect, whose arbitration reconciles several.",
+        "Lines fade towards the past.",
         "",
     ]
     for title, members in families(behaviours).items():

@@ -22,7 +22,7 @@ from flockenv.kernels import Vec, law, like, load
 from flockenv.scene import Scene
 from flockenv.state import State
 from flockenv.steer import Steer
-from flockenv.vec import scale, zero
+from flockenv.vec import zero
 
 __all__ = ["Granted", "granted", "reconcile"]
 

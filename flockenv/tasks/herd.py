@@ -309,7 +309,9 @@ class Herd(Task):
     error: float = Field(default=0.3, ge=0, description="e, weight of going anyhow")
     sheep_seen: int = Field(default=6, ge=1, le=32, description="how many sheep a dog tells apart, nearest first")
     progress_reward: float = Field(default=0.5, ge=0, description="per m that the flock's centre came nearer the pen")
-    gathering_reward: float = Field(default=0.5, ge=0, description="per m that sheep came nearer their centre, on average")
+    gathering_reward: float = Field(
+        default=0.5, ge=0, description="per m that sheep came nearer their centre, on average"
+    )
     success_reward: float = Field(default=10.0, ge=0, description="once, when all are in the pen")
     time_cost: float = Field(default=0.2, ge=0, description="per s")
 
@@ -317,7 +319,9 @@ class Herd(Task):
     def _room(self) -> Herd:
         """Refuse a start that the field has no room for."""
         if self.away > self.size - 10:
-            raise ValueError(f"away = {self.away:g} m: in a field of {self.size:g} m at most size - 10 is sure to be found")
+            raise ValueError(
+                f"away = {self.away:g} m: in a field of {self.size:g} m at most size - 10 is sure to be found"
+            )
         return self
 
     @property
