@@ -23,10 +23,10 @@ from pydantic import Field, WrapValidator, model_validator
 from flockenv import state as states
 from flockenv.crew import share, threads
 from flockenv.divergence import SimulationDiverged
-from flockenv.effects import EFFECTS, Effect
+from flockenv.effects import Effect
 from flockenv.effects.base import all_masses
 from flockenv.implicit import coupling_of, solve_steps
-from flockenv.integrators import INTEGRATORS, ImplicitEuler, Integrator, SemiImplicitEuler
+from flockenv.integrators import INTEGRATORS, Adaptive, ImplicitEuler, Integrator, SemiImplicitEuler
 from flockenv.integrators.newton import Coupling
 from flockenv.kernels import entry, load
 from flockenv.neighbours import FEWEST_AGENTS, WORTH_ARRANGING
@@ -40,6 +40,7 @@ from flockenv.space import AnySpace, Box, Plane, Torus
 from flockenv.spawn import Spawn, scatter
 from flockenv.stability import check_dt
 from flockenv.state import Body, Floats, State
+from flockenv.steer import EVERY_EFFECT
 from flockenv.sweep import SHARED, Parts, Table, field_source, flattened, pack, scene_source
 from flockenv.tree import MOST_DIRECT, tree_sizes
 from flockenv.workspace import Workspace
@@ -63,7 +64,7 @@ if TYPE_CHECKING:
     AnyIntegrator = Integrator
 else:
     AnyEffect = Annotated[
-        Annotated[functools.reduce(operator.or_, EFFECTS.values()), Field(discriminator="kind")],
+        Annotated[functools.reduce(operator.or_, EVERY_EFFECT), Field(discriminator="kind")],
         WrapValidator(keep(Effect)),
     ]
     AnyIntegrator = Annotated[
@@ -364,6 +365,9 @@ class Scene(Record):
             done += 1
         agent = bad[1] if done < steps else agent
         last, effect = int(alone.tick[0]) + 1, self._blamed(alone, agent)
+        if isinstance(self.integrator, Adaptive):
+            most, tolerance = self.integrator.most, self.integrator.tolerance
+            reason = f"not finite, or not within tolerance = {tolerance:g} by {most:,} steps of its own"
         error = SimulationDiverged(world, agent, last, last * self.dt, effect, self.dt, self.integrator.kind, reason)
         error.state = state
         return error

@@ -63,6 +63,7 @@ from flockenv.networks import Mesh
 from flockenv.scene import Group, Scene
 from flockenv.space import Box, Plane, Space, Torus
 from flockenv.spawn import Spawn
+from flockenv.steer import Steer
 from flockenv.tasks import Flock, Obstacles, Pursuit, Task
 
 Array = NDArray[np.float64]
@@ -110,7 +111,7 @@ STEERING = (
     Law(steering.contain, ("walls", "walls", "vector", "positive", "positive"), "vector", turns="none", mirrors=False),
 )
 
-ARBITRATION = (arbitration.blend, arbitration.prioritise, arbitration.allocate)
+ARBITRATION = (arbitration.blend, arbitration.prioritise, arbitration.allocate, arbitration.allocate_running)
 
 
 # --- effects ----------------------------------------------------------------------------------------------------------
@@ -201,6 +202,13 @@ EFFECTS = (
     EffectRow(Alignment(weight=0.7, radius=3, fov=270)),
     EffectRow(Cohesion(weight=0.9, radius=2.8, fov=240)),
     EffectRow(AvoidObstacles(weight=5, horizon=3, margin=0.1)),
+    EffectRow(
+        Steer(
+            behaviours=(
+                AvoidObstacles(weight=5, horizon=3), Separation(weight=1.3, radius=2.5), Alignment(weight=0.7, radius=3)
+            )
+        )
+    ),
     EffectRow(Gravitation(constant=0.3, softening=0.5)),  # of few the sum is exact; of many, see test_gravitation.py
     EffectRow(InverseSquare(strength=-0.4, softening=0.3), signed=("strength",)),
     # everybody is tied to somebody else; see `tied`
@@ -303,7 +311,7 @@ def scene_of(*effects: Effect, dimension: int = 2, space: Space | None = None, *
     groups = fields.pop("groups", groups)
     if any(effect.bond_law for effect in effects):
         groups = (tied(groups[0], dimension), *groups[1:])
-    asked = any(effect.obstacle_law for effect in effects)
+    asked = any("obstacles" in effect.calls_for() for effect in effects)
     centres = ((1.5, 2.0, 2.5)[:dimension], (4.5, 3.5, 3.0)[:dimension]) if asked else ()
     obstacles = tuple({"centre": centre, "radius": 0.6} for centre in centres)
     given: dict[str, Any] = {"groups": groups, "obstacles": obstacles, "dt": 0.05} | fields
