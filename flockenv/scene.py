@@ -180,7 +180,7 @@ class Scene(Record):
 
     def _check_counts(self) -> None:
         limit = f"float32 counts exactly up to {EXACT:,}; use dtype = float64"
-        for key, count, what in (("groups", self.agents, "agents"), ("effects", len(self._params), "numbers")):
+        for key, count, what in (("groups", self.agents, "agents"), ("effects", self.parts.count, "numbers")):
             if count > EXACT:
                 raise ValueError(f"{key}: {count:,} {what}: {limit}")
 
