@@ -8,12 +8,14 @@ import pickle
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 import flockenv
 from flockenv import effects as effects_module
+from flockenv.arbitration import ARBITRATIONS
 from flockenv.behaviours import Separation
 from flockenv.effects import Drag
 from flockenv.integrators import RK4
@@ -441,9 +443,15 @@ def test_several_pair_effects_share_one_query() -> None:
 # --- an effect is a value ---------------------------------------------------------------------------------------------
 
 
+def names_of_effects() -> dict[str, Any]:
+    """What a printed effect or scene is read with: effects, behaviours, arbitrations."""
+    kinds = (*effects_module.EFFECTS.values(), *ARBITRATIONS.values())
+    return {kind.__name__: kind for kind in kinds}
+
+
 @ROWS
 def test_it_prints_as_its_own_constructor(row: EffectRow) -> None:
-    assert eval(repr(row.effect), vars(effects_module)) == row.effect  # noqa: S307  # that is what is promised
+    assert eval(repr(row.effect), names_of_effects()) == row.effect  # noqa: S307  # that is what is promised
     assert str(row.effect) == repr(row.effect)
 
 
@@ -468,7 +476,7 @@ def test_a_scene_under_it_is_a_value(row: EffectRow, dimension: int) -> None:
     again = pickle.loads(pickle.dumps(scene))
     assert again == scene
     assert Scene.model_validate(scene.model_dump()) == scene
-    names = vars(effects_module) | {"Scene": Scene, "Group": Group, "Spawn": Spawn, "Plane": Plane, "Mesh": Mesh}
+    names = names_of_effects() | {"Scene": Scene, "Group": Group, "Spawn": Spawn, "Plane": Plane, "Mesh": Mesh}
     names |= {type(o).__name__: type(o) for o in (*scene.obstacles, scene.integrator)}
     assert eval(repr(scene), names) == scene  # noqa: S307
     np.testing.assert_array_equal(again.run(again.start(3), 5).x, end.x)

@@ -24,6 +24,7 @@ from flockenv.steering.goals import (
     wander,
     wander_turn,
 )
+from flockenv.steering.herding import behind, heed, herd_from
 from flockenv.steering.others import (
     align,
     approach_time,
@@ -47,6 +48,7 @@ __all__ = [
     "approach_time",
     "arrive",
     "avoid",
+    "behind",
     "cohere",
     "contain",
     "distance_time",
@@ -55,6 +57,8 @@ __all__ = [
     "face",
     "flee",
     "follow_leader",
+    "heed",
+    "herd_from",
     "hiding_place",
     "in_frame",
     "interception_time",

@@ -87,6 +87,9 @@ def parameters(parts: Parts) -> list[str]:
             each = ", ".join(f"params[{at + j}]" for j in range(count))
             values.append(f"({each},)" if isinstance(value, tuple) else each)
             at += count
+        if effect.tabled:
+            values.append(f"params[np.int64(params[{at}]) : np.int64(params[{at + 1}])]")
+            at += 2
         lines.append(f"p{k} = P{k}({', '.join(values) or 'params[0]'})")
     return lines
 
@@ -98,7 +101,7 @@ def _nearest_images(parts: Parts) -> list[str]:
         if _given(parts, k) == f"near{k}":
             values = [
                 f"add(x, offset_to(size, x, p{k}.{name}))" if name in effect.places else f"p{k}.{name}"
-                for name in parts.numbers_of(effect)
+                for name in parts.names_of(effect)
             ]
             lines.append(f"near{k} = P{k}({', '.join(values)})")
     return lines
@@ -169,10 +172,11 @@ def _reconcile(parts: Parts) -> list[str]:
     lines = []
     for k, effect in enumerate(parts.effects):
         if effect.wishes:
+            to = parts.target(k)
             wishes = ", ".join(parts.target(j) for j, by in parts.wishes.items() if by == k)
             lines += [
                 f"member = (ident[i] >= p{k}.first) & (ident[i] < p{k}.end)",
-                f"s = add(s, select(member, steer_law_{k}(p{k}, me, ({wishes},))[0], o))",
+                f"{to} = add({to}, select(member, steer_law_{k}(p{k}, me, ({wishes},))[0], o))",
             ]
     return lines
 
