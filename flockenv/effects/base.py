@@ -15,7 +15,8 @@ An effect is of one or more of three forms, each a law for one agent:
 * `kick_law(p, me, seconds, gauss) -> velocity`: added once per step, however often a method asks for forces, with one
   standard normal number per axis (fluctuations);
 * `obstacle_start(p, me)`, `obstacle_law(p, me, other, acc) -> acc`, `obstacle_finish(p, me, acc) -> force`: a fold over
-  the obstacles.
+  the obstacles; with no start of its own it goes before a fold over neighbours and hands over to it, so that both are
+  judged together.
 
 `p` holds the effect's `parameters()` by name, `me` and `other` are the records below. Laws live in the effect's module.
 A pair law says nothing of who is seen: it is evaluated for every candidate, and what it says of those outside the
@@ -171,7 +172,7 @@ class Effect(Record):
     partners: ClassVar[int] = 1
     """How many partners a bond has beside the agent it acts on."""
     places: ClassVar[tuple[str, ...]] = ()
-    """Names of the parameters that are points: on a torus own, medium and flow laws are given the nearest images."""
+    """Names of the parameters that are points: on a torus all laws but of bonds and obstacles are given the nearest images."""
     strengths: ClassVar[tuple[str, ...]] = ("weight",)
     """Names of the fields that make it nothing when they are 0."""
     conserves_momentum: ClassVar[bool] = False
@@ -196,6 +197,11 @@ class Effect(Record):
     def reach(self) -> float:
         """How far it looks for neighbours, m; 0 if it does not."""
         return self.sight.radius if self.sight else 0.0
+
+    @property
+    def joined(self) -> bool:
+        """Is it one fold over obstacles and neighbours?"""
+        return self.obstacle_law is not None and self.obstacle_start is None
 
     @property
     def wishes(self) -> tuple[Effect, ...]:
