@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from flockenv.scene import Scene
     from flockenv.snapshot import Snapshot
     from flockenv.state import Body, State
-    from flockenv.tasks import TASKS, Crossing, Flock, Obstacles, Pursuit, Task
+    from flockenv.tasks import TASKS, Crossing, Flock, Herd, Obstacles, Pursuit, Task
     from flockenv.world import Step, World
 
 __version__ = "0.1.0"
@@ -30,6 +30,7 @@ __all__ = [
     "Body",
     "Crossing",
     "Flock",
+    "Herd",
     "Obstacles",
     "Pursuit",
     "Scene",
@@ -49,6 +50,7 @@ _HOME = {
     "TASKS": "tasks",
     "Crossing": "tasks",
     "Flock": "tasks",
+    "Herd": "tasks",
     "Obstacles": "tasks",
     "Pursuit": "tasks",
     "Task": "tasks",

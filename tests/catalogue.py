@@ -19,6 +19,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flockenv import arbitration, steering
+from flockenv.arbitration import (
+    Allocation,
+    Blend,
+    ContextSteering,
+    Dithering,
+    Priority,
+    RoundRobin,
+    RunningSum,
+)
 from flockenv.behaviours import Alignment, AvoidObstacles, Cohesion, Separation
 from flockenv.effects import EFFECTS as EFFECT_KINDS
 from flockenv.effects import (
@@ -135,9 +144,16 @@ STEERING = (
     Law(steering.threat, ("heading", "vector", "positive", "length"), "positive"),
     Law(steering.avoid, ("heading", "vector", "positive", "positive"), "vector"),
     Law(steering.contain, ("walls", "walls", "vector", "positive", "positive"), "vector", turns="none", mirrors=False),
+    Law(steering.heed, ("vector",) * 5 + ("positive",) * 5, "vector"),
+    Law(steering.behind, ("vector", "vector", "length"), "vector"),
+    Law(steering.herd_from, ("vector", "vector", "vector", "length", "positive", "positive"), "vector"),
 )  # fmt: skip
 
 ARBITRATION = (arbitration.blend, arbitration.prioritise, arbitration.allocate, arbitration.allocate_running)
+"""Those for whoever has wishes and no scene."""
+
+ARBITRATIONS = (Blend(), Priority(), Dithering(), Allocation(), RunningSum(), RoundRobin(), ContextSteering())
+"""Those that a `Steer` effect may be given; tests/test_arbitration.py tries all of them."""
 
 
 # --- effects ----------------------------------------------------------------------------------------------------------

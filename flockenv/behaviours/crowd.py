@@ -298,4 +298,6 @@ effects:
         if scene.space.periodic:
             raise ValueError(f"low = {self.low}: a region has edges; space.kind = {scene.space.kind!r} has none")
         if any(b - a < 3 * self.track for a, b in zip(self.low[:2], self.high[:2], strict=True)):
-            raise ValueError(f"high = {self.high}: must be at least 3 tracks = {3 * self.track:g} m above low, per axis")
+            raise ValueError(
+                f"high = {self.high}: must be at least 3 tracks = {3 * self.track:g} m above low, per axis"
+            )

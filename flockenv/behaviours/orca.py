@@ -30,7 +30,9 @@ def _kept(slots, new):  # type: ignore[no-untyped-def]  # numba compares signatu
     kept_ = []
     for k in range(0, len(slots), size):
         old = [f"slots[{k + j}]" for j in range(size)]
-        lines.append(f"    near = c0 * c0 + c1 * c1 - c4 * c4 < {old[0]} * {old[0]} + {old[1]} * {old[1]} - {old[4]} * {old[4]}")
+        lines.append(
+            f"    near = c0 * c0 + c1 * c1 - c4 * c4 < {old[0]} * {old[0]} + {old[1]} * {old[1]} - {old[4]} * {old[4]}"
+        )
         for j in range(size):
             lines.append(f"    k{k + j}, c{j} = (c{j}, {old[j]}) if near else ({old[j]}, c{j})")
             kept_.append(f"k{k + j}")

@@ -14,7 +14,9 @@ __all__ = ["env", "parallel_env", "raw_env"]
 raw_env = CrossingParallelEnv
 
 
-def parallel_env(max_cycles: int | None = None, render_mode: str | None = None, **parameters: Any) -> CrossingParallelEnv:
+def parallel_env(
+    max_cycles: int | None = None, render_mode: str | None = None, **parameters: Any
+) -> CrossingParallelEnv:
     """Make the parallel environment; the parameters are those of flockenv.tasks.Crossing."""
     return CrossingParallelEnv(max_cycles, render_mode, **parameters)
 

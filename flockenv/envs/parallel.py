@@ -26,10 +26,10 @@ from flockenv.envs.face import (
     render_fps,
 )
 from flockenv.refusals import nearest
-from flockenv.tasks import Crossing, Flock, Pursuit, Task
+from flockenv.tasks import Crossing, Flock, Herd, Pursuit, Task
 from flockenv.world import Step, World
 
-__all__ = ["CrossingParallelEnv", "FlockParallelEnv", "PursuitParallelEnv", "WorldParallelEnv"]
+__all__ = ["CrossingParallelEnv", "FlockParallelEnv", "HerdParallelEnv", "PursuitParallelEnv", "WorldParallelEnv"]
 
 Named = dict[str, Any]
 
@@ -252,3 +252,10 @@ class CrossingParallelEnv(WorldParallelEnv):
     """Walkers swap places across a circle, all of them agents (learners=k: only the first k are)."""
 
     task_type = Crossing
+
+
+class HerdParallelEnv(WorldParallelEnv):
+    """Herding as a team: two dogs, both of them agents, with the same reward."""
+
+    task_type = Herd
+    fixed: ClassVar[dict[str, Any]] = {"dogs": 2}

@@ -31,10 +31,17 @@ from flockenv.envs.face import (
     together,
 )
 from flockenv.refusals import nearest
-from flockenv.tasks import Crossing, Flock, Obstacles, Pursuit, Task
+from flockenv.tasks import Crossing, Flock, Herd, Obstacles, Pursuit, Task
 from flockenv.world import Step, World
 
-__all__ = ["CrossingVectorEnv", "FlockVectorEnv", "ObstaclesVectorEnv", "PursuitVectorEnv", "WorldsEnv"]
+__all__ = [
+    "CrossingVectorEnv",
+    "FlockVectorEnv",
+    "HerdVectorEnv",
+    "ObstaclesVectorEnv",
+    "PursuitVectorEnv",
+    "WorldsEnv",
+]
 
 Mask = NDArray[np.bool_]
 Info = dict[str, Any]
@@ -348,3 +355,9 @@ class CrossingVectorEnv(WorldsEnv):
 
     task_type = Crossing
     fixed: ClassVar[dict[str, Any]] = {"learners": 1}
+
+
+class HerdVectorEnv(WorldsEnv):
+    """Dogs, one per world or `dogs=` several; the page is that of flockenv.envs.single.HerdEnv."""
+
+    task_type = Herd

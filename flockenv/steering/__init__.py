@@ -25,6 +25,7 @@ from flockenv.steering.goals import (
     wander,
     wander_turn,
 )
+from flockenv.steering.herding import behind, heed, herd_from
 from flockenv.steering.others import (
     align,
     approach_time,
@@ -48,6 +49,7 @@ __all__ = [
     "approach_time",
     "arrive",
     "avoid",
+    "behind",
     "cohere",
     "contain",
     "distance_time",
@@ -58,6 +60,8 @@ __all__ = [
     "flee",
     "follow_leader",
     "give_way",
+    "heed",
+    "herd_from",
     "hiding_place",
     "in_frame",
     "interception_time",

@@ -87,6 +87,9 @@ def parameters(parts: Parts) -> list[str]:
             each = ", ".join(f"params[{at + j}]" for j in range(count))
             values.append(f"({each},)" if isinstance(value, tuple) else each)
             at += count
+        if effect.tabled:
+            values.append(f"params[np.int64(params[{at}]) : np.int64(params[{at + 1}])]")
+            at += 2
         lines.append(f"p{k} = P{k}({', '.join(values) or 'params[0]'})")
     return lines
 
@@ -94,8 +97,8 @@ def parameters(parts: Parts) -> list[str]:
 def _nearest_images(parts: Parts) -> list[str]:
     """Write the numbers of those effects that know places anew: on a torus, with the images nearest to agent i."""
     lines = []
-    for k, effect in enumerate(parts.effects):
-        if effect.pair_law is None and given(parts, k) == f"near{k}":
+    for k in range(len(parts.effects)):
+        if given(parts, k) == f"near{k}":
             lines.append(nearest_image(parts, k, "x"))
     return lines
 
@@ -156,10 +159,11 @@ def _reconcile(parts: Parts) -> list[str]:
     lines = []
     for k, effect in enumerate(parts.effects):
         if effect.wishes:
+            to = parts.target(k)
             wishes = ", ".join(parts.target(j) for j, by in parts.wishes.items() if by == k)
             lines += [
                 f"member = (ident[i] >= p{k}.first) & (ident[i] < p{k}.end)",
-                f"s = add(s, select(member, steer_law_{k}(p{k}, me, ({wishes},))[0], o))",
+                f"{to} = add({to}, select(member, steer_law_{k}(p{k}, me, ({wishes},))[0], o))",
             ]
     return lines
 

@@ -19,6 +19,7 @@ def pairs(parts: Parts) -> list[str]:
         return []
     return [
         "# one query per instant, one sweep for all pair laws",
+        "drawn = key[b]",
         "if rank == 0:",
         "    work[b, 1] += 1",
         *["    work[b, 3] += n * obstacle_radius.shape[1]" for _, e in parts.pairs if e.joined],
@@ -210,4 +211,4 @@ def _me(parts: Parts, fields: list[str]) -> str:
 
     numbers = ", ".join(number(name) for name in ("mass", "radius", "max_speed", "max_force"))
     vectors = f"{vector('x')}, {vector('v')}, {vector('h')}"
-    return f"me = Me({number('who')}, {vectors}, {numbers}, {vector('t')}, time, zero({vector('x')}), key[b])"
+    return f"me = Me({number('who')}, {vectors}, {numbers}, {vector('t')}, time, zero({vector('x')}), drawn)"

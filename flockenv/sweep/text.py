@@ -63,7 +63,7 @@ def nearest_image(parts: Parts, k: int, here: str) -> str:
     effect = parts.effects[k]
     values = [
         f"add({here}, offset_to(size, {here}, p{k}.{name}))" if name in effect.places else f"p{k}.{name}"
-        for name in parts.numbers_of(effect)
+        for name in parts.names_of(effect)
     ]
     return f"near{k} = P{k}({', '.join(values)})"
 
