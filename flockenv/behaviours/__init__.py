@@ -21,15 +21,18 @@ from flockenv.behaviours.avoid import AvoidObstacles  # noqa: E402  # after the 
 from flockenv.behaviours.base import OvershootWarning  # noqa: E402
 from flockenv.behaviours.chase import Evade, MatchVelocity, OffsetPursue, Pursue, Shadow  # noqa: E402
 from flockenv.behaviours.company import FollowLeader, Formation, Interpose  # noqa: E402
+from flockenv.behaviours.crowd import Explore, Forage, Queue, UnalignedAvoidance  # noqa: E402
 from flockenv.behaviours.flock import Alignment, Cohesion, Separation  # noqa: E402
 from flockenv.behaviours.goals import Arrive, Dock, Face, Flee, Seek, TargetSpeed  # noqa: E402
 from flockenv.behaviours.hide import Hide  # noqa: E402
+from flockenv.behaviours.orca import Orca  # noqa: E402
 from flockenv.behaviours.wander import Wander  # noqa: E402
 
 __all__ = [
-    "BEHAVIOURS", "Alignment", "Arrive", "AvoidObstacles", "Cohesion", "Dock", "Evade", "Face", "Flee", "FollowLeader",
-    "Formation", "Hide", "Interpose", "MatchVelocity", "OffsetPursue", "OvershootWarning", "Pursue", "Seek",
-    "Separation", "Shadow", "TargetSpeed", "Wander",
+    "BEHAVIOURS", "Alignment", "Arrive", "AvoidObstacles", "Cohesion", "Dock", "Evade", "Explore", "Face", "Flee",
+    "FollowLeader", "Forage", "Formation", "Hide", "Interpose", "MatchVelocity", "OffsetPursue", "Orca",
+    "OvershootWarning", "Pursue", "Queue", "Seek", "Separation", "Shadow", "TargetSpeed", "UnalignedAvoidance",
+    "Wander",
 ]  # fmt: skip
 
 BEHAVIOURS: dict[str, type[Effect]] = {kind: effect for kind, effect in EFFECTS.items() if effect.steering}

@@ -17,6 +17,8 @@ An effect is of one or more of three forms, each a law for one agent:
 * `obstacle_start(p, me)`, `obstacle_law(p, me, other, acc) -> acc`, `obstacle_finish(p, me, acc) -> force`: a fold over
   the obstacles. Of an effect with a pair law too, `finish_law` gives no force but what it has found out about others, a
   vector that is told to `obstacle_start(p, me, told)` (hide).
+  the obstacles; with no start of its own it goes before a fold over neighbours and hands over to it, so that both are
+  judged together.
 
 `p` holds the effect's `parameters()` by name, and, if it is `tabled`, an array of numbers as `p.table`: the points of a
 path, the values of a grid. `me` and `other` are the records below. Laws live in the effect's module.
@@ -175,7 +177,7 @@ class Effect(Record):
     tabled: ClassVar[bool] = False
     """Do its laws look numbers up in its `table`?"""
     places: ClassVar[tuple[str, ...]] = ()
-    """Names of the parameters that are points: on a torus own, medium and flow laws are given the nearest images."""
+    """Names of the parameters that are points: on a torus all laws but of bonds and obstacles are given the nearest images."""
     strengths: ClassVar[tuple[str, ...]] = ("weight",)
     """Names of the fields that make it nothing when they are 0."""
     conserves_momentum: ClassVar[bool] = False
@@ -200,6 +202,11 @@ class Effect(Record):
     def reach(self) -> float:
         """How far it looks for neighbours, m; 0 if it does not."""
         return self.sight.radius if self.sight else 0.0
+
+    @property
+    def joined(self) -> bool:
+        """Is it one fold over obstacles and neighbours?"""
+        return self.obstacle_law is not None and self.obstacle_start is None
 
     @property
     def wishes(self) -> tuple[Effect, ...]:

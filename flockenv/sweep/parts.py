@@ -262,7 +262,7 @@ class Parts:
         d, look = self.dimension, self.look or Look(0.0)
         runs = [(f"c{k}_", e.sums(d)) for k, e in self.pairs]
         runs += [(f"near{q}_", sight.nearest or 0) for q, sight in enumerate(self.sights)]
-        runs += [(f"o{k}_", e.folded(d) if e.obstacle_law else 0) for k, e in enumerate(self.effects)]
+        runs += [(f"o{k}_", e.folded(d) if e.obstacle_start else 0) for k, e in enumerate(self.effects)]
         runs += [(f"g{name}", d) for name in self.targets] + [
             ("bond", d * bool(self.bonded)),
             ("far", d * bool(self.far)),
@@ -308,7 +308,11 @@ def view_of(fov: float) -> float:
 def _names(effect: Effect) -> set[str]:
     """Return every name in the code of an effect's pair laws and of the laws that they call."""
     module = vars(sys.modules[type(effect).__module__])
-    todo = [module[law] for law in (effect.pair_start, effect.pair_law, effect.finish_law) if law]
+    todo = [
+        module[law]
+        for law in (effect.pair_start, effect.pair_law, effect.finish_law, effect.joined and effect.obstacle_law)
+        if law
+    ]
     seen: set[int] = set()
     names: set[str] = set()
     while todo:
