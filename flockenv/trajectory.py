@@ -62,7 +62,7 @@ class Trajectory:
     def snapshots(self, title: str = "") -> Iterator[Snapshot]:
         """Return every instant, ready to be drawn, all in one frame: the space, or where anybody ever was."""
         low, high = _region(self.scene, self.pos)
-        start = self.scene.snapshot(self.first, title=title)
+        start = replace(self.scene.snapshot(self.first, title=title), outlines=self.scene.outlines(low, high))
         for step, pos, vel, alive in zip(self.step, self.pos, self.vel, self.alive, strict=True):
             yield replace(start, time=step * self.scene.dt, pos=pos, vel=vel, alive=alive, low=low, high=high)
 

@@ -17,10 +17,13 @@ from flockenv.effects.base import EFFECTS, Effect
 for _module in pkgutil.iter_modules(__path__):
     importlib.import_module(f"{__name__}.{_module.name}")
 
-from flockenv.behaviours.avoid import AvoidObstacles  # noqa: E402  # after the folder has been walked
+from flockenv.behaviours.avoid import AvoidObstacles, ForceField, Whiskers  # noqa: E402  # after the folder has been walked
 from flockenv.behaviours.flock import Alignment, Cohesion, Separation  # noqa: E402
+from flockenv.behaviours.walls import Contain, FollowWall  # noqa: E402
 
-__all__ = ["BEHAVIOURS", "Alignment", "AvoidObstacles", "Cohesion", "Separation"]
+__all__ = [
+    "BEHAVIOURS", "Alignment", "AvoidObstacles", "Cohesion", "Contain", "FollowWall", "ForceField", "Separation", "Whiskers",
+]  # fmt: skip
 
 BEHAVIOURS: dict[str, type[Effect]] = {kind: effect for kind, effect in EFFECTS.items() if effect.steering}
 """Every behaviour by its kind."""
