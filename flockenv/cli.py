@@ -1,4 +1,4 @@
-"""flockenv on the command line: list | run | render | explain | accuracy | stress | warmup | schema.
+"""flockenv on the command line: list | run | render | explain | accuracy | stress | gallery | warmup | schema.
 
 Errors are one line on stderr, exit code 2.
 """
@@ -20,7 +20,7 @@ import typer
 
 import flockenv
 from flockenv.refusals import nearest, shown
-from flockenv.studies import accuracy, stress
+from flockenv.studies import accuracy, gallery, stress
 from flockenv.terminal import (
     BAD_INPUT,
     DIVERGED,
@@ -127,10 +127,12 @@ def _options(
 
 @app.command("list")
 def listing() -> None:
-    """Show the tasks and their ids, effects, integrators and spaces, each in one sentence."""
+    """Show the tasks and their ids, effects, behaviours, integrators and spaces, each in one sentence."""
     import gymnasium
     import pettingzoo
 
+    from flockenv.arbitration import ARBITRATIONS
+    from flockenv.behaviours import BEHAVIOURS
     from flockenv.effects import EFFECTS
     from flockenv.integrators import INTEGRATORS
     from flockenv.space import AnySpace
@@ -142,7 +144,10 @@ def listing() -> None:
     show_table(console, "Tasks", ((name, _sentence(task)) for name, task in TASKS.items()))
     show_table(console, "gymnasium.make, gymnasium.make_vec", ((env_id, "one learner") for env_id in single))
     show_table(console, 'pettingzoo.make("parallel" or "aec", ...)', ((env_id, "many learners") for env_id in many))
-    show_table(console, "Effects", ((kind, _sentence(effect)) for kind, effect in sorted(EFFECTS.items())))
+    effects = {kind: effect for kind, effect in EFFECTS.items() if kind not in BEHAVIOURS}
+    show_table(console, "Effects", ((kind, _sentence(effect)) for kind, effect in sorted(effects.items())))
+    show_table(console, "Behaviours", ((kind, _sentence(effect)) for kind, effect in sorted(BEHAVIOURS.items())))
+    show_table(console, "Arbitrations", ((kind, _sentence(how)) for kind, how in sorted(ARBITRATIONS.items())))
     show_table(console, "Integrators", ((kind, _sentence(method)) for kind, method in sorted(INTEGRATORS.items())))
     spaces = get_args(get_args(AnySpace)[0])
     show_table(console, "Spaces", ((space.model_fields["kind"].default, _sentence(space)) for space in spaces))
@@ -241,6 +246,7 @@ def explain(scene: SceneFile) -> None:
 
 app.command()(accuracy)
 app.command()(stress)
+app.command()(gallery)
 
 
 @app.command()

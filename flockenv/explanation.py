@@ -117,7 +117,7 @@ def _work(scene: Scene, state: State) -> dict[str, float]:
 
 def _left_out(scene: Scene) -> tuple[str, ...]:
     asked = {what for effect in scene.effects for what in effect.calls_for()}
-    others = sorted(EFFECTS.keys() - {effect.kind for effect in scene.effects})
+    others = sorted(EFFECTS.keys() - {effect.kind for effect in scene.parts.effects})
     lines = []
     if "neighbour query" not in asked:
         lines.append("neighbour query: no effect asks who is near whom")

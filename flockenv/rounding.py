@@ -45,3 +45,6 @@ def _places(scene: Any) -> Iterator[tuple[str, Any]]:
     for k, effect in enumerate(scene.effects):
         for name in effect.places:
             yield f"effects[{k}].{name}", getattr(effect, name)
+        for j, wish in enumerate(effect.wishes):
+            for name in wish.places:
+                yield f"effects[{k}].behaviours[{j}].{name}", getattr(wish, name)

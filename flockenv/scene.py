@@ -23,10 +23,10 @@ from pydantic import Field, WrapValidator, model_validator
 from flockenv import state as states
 from flockenv.crew import share, threads
 from flockenv.divergence import SimulationDiverged
-from flockenv.effects import EFFECTS, Effect
+from flockenv.effects import Effect
 from flockenv.effects.base import all_masses
 from flockenv.implicit import coupling_of, solve_steps
-from flockenv.integrators import INTEGRATORS, ImplicitEuler, Integrator, SemiImplicitEuler
+from flockenv.integrators import INTEGRATORS, Adaptive, ImplicitEuler, Integrator, SemiImplicitEuler
 from flockenv.integrators.newton import Coupling
 from flockenv.kernels import entry, load
 from flockenv.neighbours import FEWEST_AGENTS, WORTH_ARRANGING
@@ -35,11 +35,12 @@ from flockenv.noise import MASK, key_of
 from flockenv.records import Record, keep
 from flockenv.rounding import check_places
 from flockenv.shapes import AnyShape, Circle, HalfSpace, Shape, clear_of
-from flockenv.snapshot import Snapshot
+from flockenv.snapshot import Mark, Snapshot
 from flockenv.space import AnySpace, Box, Plane, Torus
 from flockenv.spawn import Spawn, scatter
 from flockenv.stability import check_dt
 from flockenv.state import Body, Floats, State
+from flockenv.steer import EVERY_EFFECT
 from flockenv.sweep import SHARED, Parts, Table, field_source, flattened, pack, scene_source
 from flockenv.tree import MOST_DIRECT, tree_sizes
 from flockenv.workspace import Workspace
@@ -66,7 +67,7 @@ if TYPE_CHECKING:
     AnyIntegrator = Integrator
 else:
     AnyEffect = Annotated[
-        Annotated[functools.reduce(operator.or_, EFFECTS.values()), Field(discriminator="kind")],
+        Annotated[functools.reduce(operator.or_, EVERY_EFFECT), Field(discriminator="kind")],
         WrapValidator(keep(Effect)),
     ]
     AnyIntegrator = Annotated[
@@ -409,6 +410,9 @@ class Scene(Record):
             done += 1
         agent = bad[1] if done < steps else agent
         last, effect = int(alone.tick[0]) + 1, self._blamed(alone, agent)
+        if isinstance(self.integrator, Adaptive):
+            most, tolerance = self.integrator.most, self.integrator.tolerance
+            reason = f"not finite, or not within tolerance = {tolerance:g} by {most:,} steps of its own"
         error = SimulationDiverged(world, agent, last, last * self.dt, effect, self.dt, self.integrator.kind, reason)
         error.state = state
         return error
@@ -565,7 +569,8 @@ class Scene(Record):
         return Snapshot(
             time=float(state.time[world]), pos=state.pos[world], vel=state.vel[world], alive=state.alive[world],
             radius=np.asarray(self.body.radius, np.float64), roles=self.roles,
-            obstacle_centre=state.obstacles.centre[world], obstacle_radius=state.obstacle_radius[world], marks=(),
+            obstacle_centre=state.obstacles.centre[world], obstacle_radius=state.obstacle_radius[world],
+            marks=self.marks,
             low=np.array(low, np.float64), high=np.array(high, np.float64),
             periodic=self.space.periodic, title=title, bonds=self.edges, outlines=self.outlines(low, high),
         )  # fmt: skip
@@ -585,6 +590,18 @@ class Scene(Record):
         around = [np.asarray(shape.extremes) for shape in self.shapes]
         every = np.concatenate([low[None], high[None], *around])
         return tuple(every.min(axis=0)), tuple(every.max(axis=0))
+
+    @property
+    def marks(self) -> tuple[Mark, ...]:
+        """The places that behaviours are about."""
+        still = np.zeros(self.dimension)
+        return tuple(
+            Mark("goal", np.array(getattr(wish, name)), still, 2 * max(group.radius for group in self.groups))
+            for wish in self.parts.effects
+            if wish.steering
+            for name in wish.places
+            if getattr(wish, name) is not None
+        )
 
     def with_effects(self, *effects: Effect) -> Scene:
         """Return the same scene under other effects."""

@@ -14,11 +14,11 @@ from pydantic import Field, WrapValidator, model_validator
 
 from flockenv.arbitration import Allocation, AnyArbitration, Arbitration
 from flockenv.behaviours import BEHAVIOURS
-from flockenv.effects.base import Effect
+from flockenv.effects.base import EFFECTS, Effect
 from flockenv.kernels import Vec
 from flockenv.records import keep
 
-__all__ = ["Steer"]
+__all__ = ["EVERY_EFFECT", "Steer"]
 
 if TYPE_CHECKING:
     AnyBehaviour = Effect
@@ -90,3 +90,7 @@ class Steer(Effect):
     def calls_for(self) -> tuple[str, ...]:
         """What any of its behaviours calls for."""
         return tuple(dict.fromkeys(what for behaviour in self.behaviours for what in behaviour.calls_for()))
+
+
+EVERY_EFFECT: tuple[type[Effect], ...] = tuple(EFFECTS.values())
+"""What a scene's file may list: all effects, all behaviours, and what reconciles them."""

@@ -19,6 +19,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flockenv import arbitration, steering
+from flockenv.arbitration import (
+    Allocation,
+    Blend,
+    ContextSteering,
+    Dithering,
+    Priority,
+    RoundRobin,
+    RunningSum,
+)
 from flockenv.behaviours import Alignment, AvoidObstacles, Cohesion, Separation
 from flockenv.effects import EFFECTS as EFFECT_KINDS
 from flockenv.effects import (
@@ -63,6 +72,7 @@ from flockenv.networks import Mesh
 from flockenv.scene import Group, Scene
 from flockenv.space import Box, Plane, Space, Torus
 from flockenv.spawn import Spawn
+from flockenv.steer import Steer
 from flockenv.tasks import Flock, Obstacles, Pursuit, Task
 
 Array = NDArray[np.float64]
@@ -102,15 +112,48 @@ STEERING = (
     Law(steering.wander_turn, ("vector", "noise", "positive", "positive"), "vector"),
     # its left hand is the right hand of its mirror image
     Law(steering.wander, ("own", "vector", "positive", "positive"), "vector", turns="upright", mirrors=False),
+    Law(steering.in_frame, ("own", "vector"), "vector", turns="upright", mirrors=False),
+    Law(steering.match_velocity, ("vector", "vector"), "vector"),
+    Law(steering.target_speed, ("vector", "positive"), "vector"),
+    Law(steering.face, ("vector", "heading"), "vector"),
+    Law(steering.dock, ("vector", "vector", "heading", "positive", "length", "positive", "length"), "vector"),
+    Law(steering.approach_time, ("vector", "positive", "length"), "positive"),
+    Law(steering.opensteer_time, ("vector", "vector", "vector", "length"), "positive"),
+    Law(steering.offset_pursue, ("vector", "vector", "vector", "positive", "positive", "positive"), "vector"),
+    Law(
+        steering.keep_station, ("vector", "vector", "vector", "own", "positive", "length"), "vector", turns="upright",
+        mirrors=False,
+    ),
+    Law(
+        steering.follow_leader,
+        ("vector", "vector", "vector", "positive", "length", "positive", "positive", "length"),
+        "vector",
+    ),
+    Law(
+        steering.interpose,
+        ("vector", "vector", "vector", "vector", "vector", "positive", "positive", "length"),
+        "vector",
+    ),
+    Law(
+        steering.shadow, ("vector", "vector", "vector", "positive", "positive", "positive", "positive"), "vector"
+    ),
+    Law(steering.hiding_place, ("vector", "positive", "positive", "vector"), "vector"),
     Law(steering.separate, ("vector", "heading"), "vector"),
     Law(steering.align, ("vector", "vector"), "vector"),
     Law(steering.cohere, ("vector", "vector", "positive"), "vector"),
     Law(steering.threat, ("heading", "vector", "positive", "length"), "positive"),
     Law(steering.avoid, ("heading", "vector", "positive", "positive"), "vector"),
     Law(steering.contain, ("walls", "walls", "vector", "positive", "positive"), "vector", turns="none", mirrors=False),
-)
+    Law(steering.heed, ("vector",) * 5 + ("positive",) * 5, "vector"),
+    Law(steering.behind, ("vector", "vector", "length"), "vector"),
+    Law(steering.herd_from, ("vector", "vector", "vector", "length", "positive", "positive"), "vector"),
+)  # fmt: skip
 
-ARBITRATION = (arbitration.blend, arbitration.prioritise, arbitration.allocate)
+ARBITRATION = (arbitration.blend, arbitration.prioritise, arbitration.allocate, arbitration.allocate_running)
+"""Those for whoever has wishes and no scene."""
+
+ARBITRATIONS = (Blend(), Priority(), Dithering(), Allocation(), RunningSum(), RoundRobin(), ContextSteering())
+"""Those that a `Steer` effect may be given; tests/test_arbitration.py tries all of them."""
 
 
 # --- effects ----------------------------------------------------------------------------------------------------------
@@ -201,6 +244,13 @@ EFFECTS = (
     EffectRow(Alignment(weight=0.7, radius=3, fov=270)),
     EffectRow(Cohesion(weight=0.9, radius=2.8, fov=240)),
     EffectRow(AvoidObstacles(weight=5, horizon=3, margin=0.1)),
+    EffectRow(
+        Steer(
+            behaviours=(
+                AvoidObstacles(weight=5, horizon=3), Separation(weight=1.3, radius=2.5), Alignment(weight=0.7, radius=3)
+            )
+        )
+    ),
     EffectRow(Gravitation(constant=0.3, softening=0.5)),  # of few the sum is exact; of many, see test_gravitation.py
     EffectRow(InverseSquare(strength=-0.4, softening=0.3), signed=("strength",)),
     # everybody is tied to somebody else; see `tied`
@@ -303,7 +353,7 @@ def scene_of(*effects: Effect, dimension: int = 2, space: Space | None = None, *
     groups = fields.pop("groups", groups)
     if any(effect.bond_law for effect in effects):
         groups = (tied(groups[0], dimension), *groups[1:])
-    asked = any(effect.obstacle_law for effect in effects)
+    asked = any("obstacles" in effect.calls_for() for effect in effects)
     centres = ((1.5, 2.0, 2.5)[:dimension], (4.5, 3.5, 3.0)[:dimension]) if asked else ()
     obstacles = tuple({"centre": centre, "radius": 0.6} for centre in centres)
     given: dict[str, Any] = {"groups": groups, "obstacles": obstacles, "dt": 0.05} | fields

@@ -30,7 +30,8 @@ def kinds_in(folder: str, attribute: str) -> set[str]:
 def test_every_effect_has_a_row() -> None:
     rows = {row.effect.kind for row in catalogue.EFFECTS}
     ours = {kind for kind, effect in EFFECTS.items() if effect.__module__.startswith("flockenv.")}
-    assert rows == kinds_in("effects", "kind") == ours
+    files = kinds_in("effects", "kind") | kinds_in("behaviours", "kind") | {"steer"}
+    assert rows == files == ours
 
 
 def test_every_effect_can_be_idle() -> None:
@@ -51,7 +52,9 @@ def test_every_behaviour_has_a_row() -> None:
 
 
 def test_every_arbitration_has_a_row() -> None:
-    assert {law.py_func.__name__ for law in catalogue.ARBITRATION} == set(arbitration.__all__)
+    assert {law.py_func.__name__ for law in catalogue.ARBITRATION} == {n for n in arbitration.__all__ if n.islower()}
+    kinds = {kind for kind, row in arbitration.ARBITRATIONS.items() if row.__module__.startswith("flockenv.")}
+    assert {row.kind for row in catalogue.ARBITRATIONS} == kinds
 
 
 def test_every_space_has_a_row() -> None:

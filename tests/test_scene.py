@@ -16,7 +16,7 @@ import pytest
 
 import flockenv
 from flockenv.behaviours import Alignment, Cohesion, Separation
-from flockenv.effects import EFFECTS, Drag, QuadraticDrag
+from flockenv.effects import EFFECTS, Drag, Gravity, QuadraticDrag
 from flockenv.integrators import RK4
 from flockenv.kernels import cache_folder
 from flockenv.scene import Group, Scene
@@ -24,6 +24,7 @@ from flockenv.shapes import Circle
 from flockenv.space import Box, Plane, Space, Torus
 from flockenv.spawn import Spawn
 from flockenv.state import State
+from flockenv.sweep import SHARED
 from flockenv.workspace import Workspace
 from tests.catalogue import INTEGRATORS, TETHER, VARIANTS, Array, Variant, everything, scene_of, users_module
 
@@ -458,6 +459,29 @@ def test_a_million_agents_fit_into_a_gigabyte() -> None:
     few = scene.model_copy(update={"groups": (million.model_copy(update={"count": 20_000}),)})
     assert scene.bytes_per_world() == 50 * few.bytes_per_world()  # so that what holds for them holds for a million
     assert few.bytes_per_world() == pytest.approx(taken(few), rel=0.01)
+
+
+def test_a_scene_of_gravity_alone_takes_memory_for_nothing_else() -> None:
+    """No neighbours, bonds, tree, medium, walls: none of their arrays grows with the agents, and nothing is counted."""
+    gravity = Gravity(acceleration=(0, -9.81))
+    scenes = [scene_of(gravity, groups=(Group(count=n, spawn=Spawn(low=(0, 0), high=(9, 9))),)) for n in (160, 1600)]
+    few, many = (
+        dict(zip(SHARED.split(", "), Workspace.allocate(s.parts, s.body, s.table).of(0), strict=True)) for s in scenes
+    )
+    growing = {name for name in few if many[name].size > few[name].size}
+    body = {"mass", "radius", "max_speed", "max_force", "living", "ident"}
+    assert growing == {"pos", "vel", "origin", "stages", "want"} | body
+    start = scenes[0].start(0)
+    end = scenes[0].step(start, steps=3)
+    assert end.counted("evaluations") == 3
+    assert end.work.sum() == 3
+    tracemalloc.start()
+    try:
+        scenes[0].step(end, out=end, steps=100)
+        _, peak = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert peak < 8_000  # objects of Python, whatever the number of agents and steps: nothing per agent
 
 
 # --- who stands where ---------------------------------------------------------------------------------------------
