@@ -20,9 +20,10 @@ for _module in pkgutil.iter_modules(__path__):
 from flockenv.behaviours.avoid import AvoidObstacles, ForceField, Whiskers  # noqa: E402  # after the folder has been walked
 from flockenv.behaviours.flock import Alignment, Cohesion, Separation  # noqa: E402
 from flockenv.behaviours.walls import Contain, FollowWall  # noqa: E402
+from flockenv.behaviours.way import FollowWay  # noqa: E402
 
 __all__ = [
-    "BEHAVIOURS", "Alignment", "AvoidObstacles", "Cohesion", "Contain", "FollowWall", "ForceField", "Separation", "Whiskers",
+    "BEHAVIOURS", "Alignment", "AvoidObstacles", "Cohesion", "Contain", "FollowWall", "FollowWay", "ForceField", "Separation", "Whiskers",
 ]  # fmt: skip
 
 BEHAVIOURS: dict[str, type[Effect]] = {kind: effect for kind, effect in EFFECTS.items() if effect.steering}

@@ -102,11 +102,15 @@ def whisker(p: Any, me: Me, k: int) -> tuple[Vec, float]:
     turn = p.angle * like(me.who, np.pi / 180)
     c, s = e if k == 0 else np.cos(turn), o if k == 0 else np.sin(turn)
     s = s if k % 2 == 0 else -s
-    if len(me.pos) == 2:
-        return add(scale(me.heading, c), scale(right, s)), o
+    return add(scale(me.heading, c), scale(_across(me.heading, right, k), s)), o
+
+
+@law
+def _across(heading: Vec, right: Vec, k: int) -> Vec:
+    if len(heading) == 2:
+        return right
     else:
-        side = select(k > 2, cross(right, me.heading), right)
-        return add(scale(me.heading, c), scale(side, s)), o
+        return select(k > 2, cross(right, heading), right)
 
 
 @law
