@@ -1,7 +1,6 @@
 """How far every place is from a goal around obstacles: |grad u| = 1 on a grid, solved once by fast sweeping.
 
-The global controller of Reynolds 1999's "global path planning plus local steering": agents follow -grad u, local steering
-does the rest. Zhao, "A fast sweeping method for Eikonal equations" (Math. Comp. 2005); first order in the spacing.
+A global controller: agents follow -grad u, local steering does the rest. Zhao, "A fast sweeping method for Eikonal equations" (Math. Comp. 2005); first order in the spacing.
 """
 
 from __future__ import annotations
@@ -28,7 +27,7 @@ NEAR = 4.0
 
 @kernel
 def _updated(a: float, b: float, c: float, h: float) -> float:
-    """Return u where sum of ((u - neighbour) / h)^2 over the axes that count is 1; the smallest neighbour of each axis."""
+    """Return u where sum of ((u - neighbour) / h)^2 over the axes that count is 1; of each axis the smaller neighbour."""
     a, b = (a, b) if a < b else (b, a)
     b, c = (b, c) if b < c else (c, b)
     a, b = (a, b) if a < b else (b, a)
@@ -102,7 +101,9 @@ def way_table(
     sight = np.maximum(NEAR * spacing, 1.0001 * spacing * math.sqrt(len(goal)))
     goal_gap = min((float(shape.gap(goal)) for shape in shapes), default=math.inf)
     if goal_gap < clearance:
-        raise ValueError(f"goal = {tuple(goal)}: is {goal_gap:.3g} m from an obstacle, must be at least {clearance:g} m")
+        raise ValueError(
+            f"goal = {tuple(goal)}: is {goal_gap:.3g} m from an obstacle, must be at least {clearance:g} m"
+        )
     # straight lines count where nothing can be between: nearer than the nearest obstacle
     known = np.where(straight <= min(sight, goal_gap - clearance + spacing * math.sqrt(len(goal))), straight, np.inf)
     u = distances_around(free, spacing, np.where(free, known, np.inf))

@@ -6,8 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from flockenv.shapes import clear_of
 from flockenv.scene import Scene
+from flockenv.shapes import clear_of
 from flockenv.space import Space, Torus
 from flockenv.state import State
 

@@ -47,7 +47,9 @@ def half_plane(
     side = e if offset[0] * w[1] - offset[1] * w[0] > o else -e  # of the cone: 1 = its left
     leg = np.sqrt(square - contact if apart else o)
     per_square = e / square if apart else o
-    edge = scale((offset[0] * leg - side * offset[1] * clearance, offset[1] * leg + side * offset[0] * clearance), per_square)
+    edge = scale(
+        (offset[0] * leg - side * offset[1] * clearance, offset[1] * leg + side * offset[0] * clearance), per_square
+    )
     across = (-side * edge[1], side * edge[0])
     normal = select(at_end, out, across)
     lack = clearance / time - norm(w) if at_end else -dot(relative, across)

@@ -46,7 +46,9 @@ def rows(law: Callable[..., Any]) -> Callable[..., NDArray[np.float64]]:
             np.ascontiguousarray(np.broadcast_to(a, lead + t)).reshape((-1, *t))
             for a, t in zip(arrays, tails, strict=True)
         ]
-        dimensions = {t[-1] for t, r, name in zip(tails, ranks, parameters, strict=True) if r and name not in any_length}
+        dimensions = {
+            t[-1] for t, r, name in zip(tails, ranks, parameters, strict=True) if r and name not in any_length
+        }
         if len(dimensions) > 1:
             raise ValueError(f"{python.__name__}: vectors of {' and of '.join(map(str, sorted(dimensions)))} numbers")
         dimension = max(dimensions, default=0)

@@ -185,7 +185,7 @@ class Scene(Record):
 
     def _check_counts(self) -> None:
         limit = f"float32 counts exactly up to {EXACT:,}; use dtype = float64"
-        for key, count, what in (("groups", self.agents, "agents"), ("effects", len(self._params), "numbers")):
+        for key, count, what in (("groups", self.agents, "agents"), ("effects", self.parts.count, "numbers")):
             if count > EXACT:
                 raise ValueError(f"{key}: {count:,} {what}: {limit}")
 
@@ -218,7 +218,8 @@ class Scene(Record):
             return
         if isinstance(shape, HalfSpace):
             raise ValueError(
-                f"obstacles[{k}].kind = {shape.kind}: on a torus a plane has no two sides; only a plane or a box is allowed"
+                f"obstacles[{k}].kind = {shape.kind}: on a torus a plane has no two sides; only a plane or a box is "
+                "allowed"
             )
         edges = np.ptp(shape.extremes, axis=0)
         if (edges > np.array(self.space.size) / 2).any():
@@ -295,7 +296,8 @@ class Scene(Record):
         effects = flattened(self.effects)
         return Parts(
             self.dimension, self.space, effects, self.integrator, self.dtype, sorts, crowded=crowded,
-            starts=self.starts, shapes=self.shapes, circles=len(self.circles), tables=tuple(effect.table(self) for effect in effects if effect.tabled),
+            starts=self.starts, shapes=self.shapes, circles=len(self.circles),
+            tables=tuple(effect.table(self) for effect in effects if effect.tabled),
         )  # fmt: skip
 
     @functools.cached_property

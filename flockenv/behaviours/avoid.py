@@ -18,6 +18,21 @@ from flockenv.vec import add, cross, dot, lateral, norm, perpendicular, scale, s
 
 __all__ = ["AvoidObstacles", "ForceField", "Whiskers"]
 
+AVOIDING = """
+groups:
+- count: 7
+  radius: 0.2
+  max_speed: 2
+  max_force: 10
+  spawn: {low: [0, 0.5], high: [1, 8.5], speed: [1.8, 1.8], heading: [1, 0]}
+obstacles:
+- {centre: [5, 3], radius: 1.2}
+- {kind: polygon, vertices: [[4, 5.5], [6.5, 5], [7.5, 8], [5.5, 6.7]]}
+- {kind: capsule, start: [9, 1.5], end: [10, 4], radius: 0.3}
+effects:
+- {kind: avoid_obstacles, weight: 8}
+"""
+
 
 @law
 def nothing(p: Any, me: Me) -> Vec:
@@ -64,27 +79,12 @@ class AvoidObstacles(Effect):
     weight: float = Field(ge=0, description="N, the force of an evasion")
     horizon: float = Field(default=2.0, gt=0, description="s, how far ahead it looks at the present speed")
     margin: float = Field(default=0.0, ge=0, description="m, clearance beyond both radii")
-    demo: ClassVar[str | None] = """
-groups:
-  - {count: 7, radius: 0.2, max_speed: 2, spawn: {low: [0, -2.5], high: [1, 2.5], speed: [2, 2], heading: [1, 0]}}
-effects: [{kind: avoid_obstacles, weight: 5, horizon: 1.5, margin: 0.2}]
-obstacles: [{centre: [6, 0.5], radius: 1}, {centre: [9, -1.5], radius: 0.8}, {centre: [11, 2], radius: 1}]
-dt: 0.02
-"""
     steering: ClassVar[bool] = True
     obstacle_start: ClassVar[str | None] = "nothing"
     obstacle_ray: ClassVar[str | None] = "straight_on"
     obstacle_law: ClassVar[str | None] = "nearest_threat"
     obstacle_finish: ClassVar[str | None] = "around"
-    demo: ClassVar[str] = """
-groups:
-- {count: 6, radius: 0.2, max_speed: 2, max_force: 10, spawn: {low: [0, 1], high: [1, 9], speed: [1.5, 1.5], heading: [1, 0]}}
-obstacles:
-- {centre: [5, 3], radius: 1.2}
-- {kind: polygon, vertices: [[4, 6], [6.5, 5.5], [7, 8], [5.5, 7]]}
-effects:
-- {kind: steer, behaviours: [{kind: avoid_obstacles, weight: 8}]}
-"""
+    demo: ClassVar[str | None] = AVOIDING
 
     def folded(self, dimension: int) -> int:
         """Distance, clearance and offset of the nearest threat."""
@@ -158,7 +158,7 @@ class Whiskers(Effect):
     obstacle_ray: ClassVar[str | None] = "whisker"
     obstacle_law: ClassVar[str | None] = "deepest_whisker"
     obstacle_finish: ClassVar[str | None] = "along_normal"
-    demo: ClassVar[str] = AvoidObstacles.demo.replace("avoid_obstacles, weight: 8", "whiskers, weight: 20")
+    demo: ClassVar[str | None] = AVOIDING.replace("avoid_obstacles, weight: 8", "whiskers, weight: 20")
 
     def rays(self, dimension: int) -> int:
         """Ahead, and two for each other axis."""
@@ -209,7 +209,7 @@ class ForceField(Effect):
     obstacle_start: ClassVar[str | None] = "no_push"
     obstacle_law: ClassVar[str | None] = "field_push"
     obstacle_finish: ClassVar[str | None] = "field_force"
-    demo: ClassVar[str] = AvoidObstacles.demo.replace("avoid_obstacles, weight: 8", "force_field, weight: 3")
+    demo: ClassVar[str | None] = AVOIDING.replace("avoid_obstacles, weight: 8", "force_field, weight: 3")
 
     def folded(self, dimension: int) -> int:
         """A vector."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any, ClassVar, Literal, Self
 
 import numpy as np
@@ -9,13 +10,14 @@ from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from flockenv import steering
-from flockenv.effects.base import Effect, Me, Obstacle
+from flockenv.behaviours.base import Moving, top_speed
+from flockenv.effects.base import Me, Obstacle
 from flockenv.kernels import Vec, law, like
-from flockenv.shapes import AnyShape, Block, packed
+from flockenv.shapes import AnyShape, packed
 from flockenv.shapes.block import nearest_block
 from flockenv.shapes.chain import nearest_chain
 from flockenv.space import Torus
-from flockenv.vec import add, dot, lateral, norm, perpendicular, scale, select, sub, unit, zero
+from flockenv.vec import add, dot, lateral, perpendicular, scale, select, sub, unit, zero
 
 __all__ = ["Contain", "FollowWall"]
 
@@ -53,13 +55,13 @@ def along_wall(p: Any, me: Me, acc: Vec) -> Vec:
     crossed = gap - dot(step, normal) < o  # it will be through a thin wall: its own side counts
     normal, gap = scale(normal, -e if crossed else e), -gap if crossed else gap
     still = dot(step, step) <= o
-    onward = select(still, scale(perpendicular(normal), p.time * me.max_speed), step)
+    onward = select(still, scale(perpendicular(normal), p.time * top_speed(p, me)), step)
     goal = add(onward, scale(normal, p.distance - gap))
-    wish = scale(steering.seek(goal, me.vel, me.max_speed), p.weight)
+    wish = scale(steering.seek(goal, me.vel, top_speed(p, me)), p.weight)
     return select(near, wish, zero(wish))
 
 
-class FollowWall(Effect):
+class FollowWall(Moving):
     """Keep `distance` to the nearest surface and go on along it: seek the point off the wall beside the place ahead.
 
     On whichever side it comes by; at rest it sets out with the wall on its left. Around a corner it turns as sharply as
@@ -67,18 +69,20 @@ class FollowWall(Effect):
     """
 
     kind: Literal["follow_wall"] = "follow_wall"
-    weight: float = Field(ge=0, description="kg/s")
     distance: float = Field(gt=0, description="m, of its centre from the wall")
     time: float = Field(default=0.5, gt=0, description="s, how far ahead it looks")
     range: float = Field(default=5.0, gt=0, description="m, walls further away than this are not seen")
-    steering: ClassVar[bool] = True
     obstacle_from: ClassVar[str | None] = "soon"
     obstacle_start: ClassVar[str | None] = "no_wall"
     obstacle_law: ClassVar[str | None] = "nearest_wall"
     obstacle_finish: ClassVar[str | None] = "along_wall"
-    demo: ClassVar[str] = """
+    demo: ClassVar[str | None] = """
 groups:
-- {count: 2, radius: 0.15, max_speed: 2, max_force: 20, spawn: {low: [2, 0.8], high: [3, 1.2], speed: [1, 1], heading: [1, 0]}}
+- count: 2
+  radius: 0.15
+  max_speed: 2
+  max_force: 20
+  spawn: {low: [2, 0.8], high: [3, 1.2], speed: [1, 1], heading: [1, 0]}
 obstacles:
 - {kind: polygon, vertices: [[0, 2], [8, 2], [8, 7], [5, 7], [5, 4.5], [0, 4.5]]}
 effects:
@@ -88,17 +92,6 @@ effects:
     def folded(self, dimension: int) -> int:
         """A distance and a normal."""
         return 1 + dimension
-
-    def check(self, scene: Any) -> None:
-        """Refuse agents without a top speed: it is the speed at which they go along."""
-        super().check(scene)
-        _demand_speeds(scene)
-
-
-def _demand_speeds(scene: Any) -> None:
-    for k, group in enumerate(scene.groups):
-        if group.max_speed is None:
-            raise ValueError(f"kind: agents go at their top speed; groups[{k}].max_speed is missing")
 
 
 # --- containment ------------------------------------------------------------------------------------------------------
@@ -113,8 +106,8 @@ def back_inside(p: Any, me: Me, now: float, gap: float, out: Vec) -> Vec:
     side = select(straight, perpendicular(me.heading), unit(aside))
     ahead = dot(out, me.heading)
     brake = scale(me.vel, -(ahead * ahead if ahead > o else o))
-    turn = add(scale(side, me.max_speed), brake)
-    home = sub(scale(out, -me.max_speed), me.vel)
+    turn = add(scale(side, top_speed(p, me)), brake)
+    home = sub(scale(out, -top_speed(p, me)), me.vel)
     wish = scale(select(now + me.radius > o, home, turn), p.weight)
     return select(gap + me.radius > o, wish, zero(wish))
 
@@ -147,7 +140,7 @@ def _relative(table: Any, x: Vec) -> Vec:
         return (x[0] - table[2], x[1] - table[3], x[2] - table[4])
 
 
-class Contain(Effect):
+class Contain(Moving):
     """Stay within a shape: zero while the place `time` seconds ahead is inside it, else along the wall met there.
 
     The inward normal's part across the heading steers; head-on it has none, so it brakes and keeps right. Whoever is
@@ -155,12 +148,10 @@ class Contain(Effect):
     """
 
     kind: Literal["contain"] = "contain"
-    weight: float = Field(ge=0, description="kg/s")
     within: AnyShape = Field(description="a circle (or sphere), a block, a polygon; the body stays inside it whole")
     time: float = Field(default=1.0, gt=0, description="s, how far ahead it looks")
-    steering: ClassVar[bool] = True
     tabled: ClassVar[bool] = True
-    demo: ClassVar[str] = """
+    demo: ClassVar[str | None] = """
 groups:
 - {count: 8, radius: 0.15, max_speed: 2, max_force: 12, spawn: {low: [3, 3], high: [5, 5], speed: [1.5, 2]}}
 effects:
@@ -184,16 +175,16 @@ effects:
 
     def parameters(self) -> dict[str, float | Vec]:
         """The shape is a table."""
-        return {"weight": self.weight, "time": self.time}
+        return {"speed": math.inf if self.speed is None else self.speed, "weight": self.weight, "time": self.time}
 
     def table(self, scene: Any) -> NDArray[np.float64]:
         """The row of the shape."""
         return packed([self.within], scene.dimension)[0]
 
     def check(self, scene: Any) -> None:
-        """Refuse a torus, where there is no outside, another dimension, and agents without a top speed."""
+        """Refuse a torus, where there is no outside, and another dimension."""
+        super().check(scene)
         if isinstance(scene.space, Torus):
             raise ValueError("kind = contain: on a torus everybody is inside; only a plane or a box is allowed")
         if self.within.dimension != scene.dimension:
             raise ValueError(f"within: lies in {self.within.dimension} dimensions, but dimension = {scene.dimension}")
-        _demand_speeds(scene)

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from flockenv.effects.base import Effect, Me, Vector
+from flockenv.behaviours.base import Moving, top_speed
+from flockenv.effects.base import Me, Vector
 from flockenv.eikonal import way_table
 from flockenv.grid import covers, sample, sample_vector
 from flockenv.kernels import Vec, law, like
@@ -31,11 +33,11 @@ def follow_way(p: Any, me: Me) -> Vec:
     near = norm(straight)
     length = near if near < length else length
     ramp = length / p.slow_radius
-    speed = me.max_speed * (ramp if ramp < like(ramp, 1.0) else like(ramp, 1.0))
+    speed = top_speed(p, me) * (ramp if ramp < like(ramp, 1.0) else like(ramp, 1.0))
     return scale(sub(scale(direction, speed), me.vel), p.weight)
 
 
-class FollowWay(Effect):
+class FollowWay(Moving):
     """Go to a point by the shortest way around all obstacles: S = V e - v, e = -grad u, |grad u| = 1 (eikonal).
 
     The way is found once, on a grid, when the scene is built; between its points it is interpolated. It keeps
@@ -43,17 +45,15 @@ class FollowWay(Effect):
     """
 
     kind: Literal["follow_way"] = "follow_way"
-    weight: float = Field(ge=0, description="kg/s")
     target: Vector = Field(description="m, where to")
-    clearance: float = Field(default=0.3, ge=0, description="m, between its way and every obstacle: its radius and more")
+    clearance: float = Field(default=0.3, ge=0, description="m, from its way to every obstacle: its radius and more")
     spacing: float = Field(default=0.2, gt=0, description="m, between points of the grid")
     slow_radius: float = Field(default=1.0, gt=0, description="m before the target, over which it slows down to stop")
     margin: float = Field(default=3.0, gt=0, description="m of grid around obstacles, target and where agents begin")
-    steering: ClassVar[bool] = True
     tabled: ClassVar[bool] = True
     own_law: ClassVar[str | None] = "follow_way"
     places: ClassVar[tuple[str, ...]] = ("target",)
-    demo: ClassVar[str] = """
+    demo: ClassVar[str | None] = """
 groups:
 - {count: 3, radius: 0.15, max_speed: 2, max_force: 12, spawn: {low: [3, 3], high: [4, 5]}}
 obstacles:
@@ -67,7 +67,10 @@ effects:
 
     def parameters(self) -> dict[str, float | Vec]:
         """What the law reads beside the grid."""
-        return {"weight": self.weight, "target": self.target, "slow_radius": self.slow_radius}
+        return {
+            "speed": math.inf if self.speed is None else self.speed,
+            "weight": self.weight, "target": self.target, "slow_radius": self.slow_radius,
+        }  # fmt: skip
 
     def region(self, scene: Any) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return the corners of the grid: a box's own, or all that there is and a margin around it."""
@@ -89,13 +92,10 @@ effects:
         return way_table(shapes, self.target, low.tolist(), high.tolist(), self.spacing, self.clearance)
 
     def check(self, scene: Any) -> None:
-        """Refuse a torus, a grid too large, a target that is in an obstacle, and agents without a top speed."""
+        """Refuse a torus, a grid too large, and a target that is in an obstacle."""
         super().check(scene)
         if isinstance(scene.space, Torus):
             raise ValueError("kind = follow_way: on a torus ways lead around; only a plane or a box is allowed")
-        for k, group in enumerate(scene.groups):
-            if group.max_speed is None:
-                raise ValueError(f"kind = follow_way: goes at top speed; groups[{k}].max_speed is missing")
         low, high = self.region(scene)
         points = float(np.prod((high - low) / self.spacing + 1))
         if points > MOST_POINTS:

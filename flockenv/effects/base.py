@@ -17,8 +17,9 @@ An effect is of one or more of three forms, each a law for one agent:
 * `obstacle_start(p, me)`, `obstacle_law(p, me, other, acc) -> acc`, `obstacle_finish(p, me, acc) -> force`: a fold over
   the obstacles, of whatever shape: `other` is an `Obstacle`. With an `obstacle_ray(p, me, k) -> (direction, margin)` it
   meets each obstacle for each of its rays, k = 0, 1, ...: where the agent's body, `margin` wider, would touch it
-  first if it went along the unit vector `direction`. With an `obstacle_from(p, me) -> offset` it is
-  met as from that place, so far from the agent, instead of from where the agent is.
+  first if it went along the unit vector `direction`. With an `obstacle_from(p, me) -> offset` it is met as from that
+  place, so far from the agent, instead of from where the agent is. Of an effect with a pair law too, `finish_law` gives
+  no force but what it has found out about others, a vector that is told to `obstacle_start(p, me, told)` (hide).
 
 `p` holds the effect's `parameters()` by name, and, if it is `tabled`, an array of numbers as `p.table`: the points of a
 path, the values of a grid. `me` and `other` are the records below. Laws live in the effect's module.
@@ -43,8 +44,8 @@ from flockenv.records import Record
 from flockenv.vec import dot
 
 __all__ = [
-    "EFFECTS", "Bonds", "Effect", "Far", "Me", "Obstacle", "Other", "Sight", "Vector", "all_masses", "in_view", "network_of",
-    "ties",
+    "EFFECTS", "Bonds", "Effect", "Far", "Me", "Obstacle", "Other", "Sight", "Vector", "all_masses", "in_view",
+    "network_of", "ties",
 ]  # fmt: skip
 
 Vector = Annotated[tuple[Annotated[float, Field(strict=True)], ...], Field(min_length=2, max_length=3)]
@@ -313,7 +314,8 @@ class Effect(Record):
             text
             for text, law in (
                 ("neighbour query", self.pair_law), ("all others", self.far_law), ("bonds", self.bond_law),
-                ("obstacles", self.obstacle_law or (self.sight and self.sight.occluded)), ("random numbers", self.kick_law),
+                ("obstacles", self.obstacle_law or (self.sight and self.sight.occluded)),
+                ("random numbers", self.kick_law),
             )
             if law
         )  # fmt: skip

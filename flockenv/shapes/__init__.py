@@ -23,6 +23,6 @@ from flockenv.shapes.round import blocks, gap, normal, ray_hit, silhouette, touc
 from flockenv.shapes.table import FORMS, packed
 
 __all__ = [
-    "FORMS", "SHAPES", "AnyShape", "Block", "Capsule", "Circle", "DistanceField", "HalfSpace", "Polygon", "Shape", "Wall",
-    "blocks", "clear_of", "gap", "normal", "packed", "ray_hit", "silhouette", "touched_normal",
+    "FORMS", "SHAPES", "AnyShape", "Block", "Capsule", "Circle", "DistanceField", "HalfSpace", "Polygon", "Shape",
+    "Wall", "blocks", "clear_of", "gap", "normal", "packed", "ray_hit", "silhouette", "touched_normal",
 ]  # fmt: skip

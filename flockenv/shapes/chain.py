@@ -89,7 +89,7 @@ def nearest_chain(table: Any, at: int, x: Vec) -> tuple[float, Vec]:
     d = len(x)
     count, radius = np.int64(table[at + 2 + d]), table[at + 3 + d]
     closed = table[at + 4 + d] > like(radius, 0.0)
-    o, e = like(radius, 0.0), like(radius, 1.0)
+    e = like(radius, 1.0)
     best, away, side, inside = like(radius, np.inf), sub(x, x), axis(x, 0), False
     for j in range(max(count if closed else count - 1, 1)):
         a = _vertex(table, at, j, x)

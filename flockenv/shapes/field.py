@@ -1,7 +1,6 @@
 """Any shape as distances on a grid (a signed distance field): between its points they are interpolated.
 
-A field is a grid of the table of shapes (see flockenv/grid.py), relative to the anchor, whose points have 1 + D numbers:
-the distance to the surface (m, negative inside) and its direction, outward.
+A field is a grid (see flockenv/grid.py) relative to the anchor, whose points have 1 + D numbers: the distance to the surface (m, negative inside) and its direction, outward.
 """
 
 from __future__ import annotations
@@ -63,7 +62,7 @@ def hit_distance_field(table: Any, at: int, x: Vec, direction: Vec, clearance: f
     o, most = like(clearance, 0.0), like(clearance, 0.9)
     way, room = o, o
     limit = norm(x) + longest + longest + clearance
-    for step in range(STEPS):
+    for _ in range(STEPS):
         spot = add(x, scale(direction, way))
         y = _on_grid(grid, spot)
         beyond = norm(sub(spot, y))

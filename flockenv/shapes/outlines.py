@@ -46,7 +46,9 @@ def crossing(vertices: Floats) -> tuple[int, int] | None:
 
 def _turn(a: Floats, b: Floats, c: Floats) -> Floats:
     """Return on which side of the lines from a to b points c lie."""
-    return np.asarray((b[..., 0] - a[..., 0]) * (c[..., 1] - a[..., 1]) - (b[..., 1] - a[..., 1]) * (c[..., 0] - a[..., 0]))
+    return np.asarray(
+        (b[..., 0] - a[..., 0]) * (c[..., 1] - a[..., 1]) - (b[..., 1] - a[..., 1]) * (c[..., 0] - a[..., 0])
+    )
 
 
 def hull(points: Floats) -> Floats:

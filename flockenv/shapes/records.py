@@ -349,7 +349,9 @@ class DistanceField(Shape):
             raise ValueError("high: goes with shapes, and shapes with it")
         counts = self.counts
         if len(counts) != len(self.low) or min(counts) < 2:
-            raise ValueError(f"spacing: a grid of {counts} points, must be at least 2 along each of {len(self.low)} axes")
+            raise ValueError(
+                f"spacing: a grid of {counts} points, must be at least 2 along each of {len(self.low)} axes"
+            )
         if math.prod(counts) > MOST_POINTS:
             raise ValueError(f"spacing = {self.spacing:g}: {math.prod(counts):,} points, at most {MOST_POINTS:,}")
         for k, shape in enumerate(self.shapes):

@@ -30,7 +30,7 @@ FORMS = {
 
 
 def packed(shapes: Sequence[Any], dimension: int, first: int = 0) -> tuple[Floats, dict[str, tuple[int, int]]]:
-    """Return the table of some shapes, whose numbers begin at `first`, and for each form there is: (where, how many)."""
+    """Return the table of some shapes, numbered from `first`, and for each form there is: (where, how many)."""
     rows: list[Floats] = []
     where: dict[str, tuple[int, int]] = {}
     at = 0
@@ -88,7 +88,7 @@ def nearest(shape: Any, points: ArrayLike) -> tuple[Floats, Floats]:
 
 
 def hits(shape: Any, points: ArrayLike, directions: ArrayLike, clearance: ArrayLike) -> Floats:
-    """Return how far along unit directions (..., D) bodies of a radius touch it first, (...) m; inf if they never do."""
+    """Return how far along unit directions (..., D) bodies of a radius touch it first, (...) m; inf if never."""
     flat, lead = _flat(np.broadcast_arrays(points, directions)[0])
     ways, _ = _flat(np.broadcast_arrays(points, directions)[1])
     room = np.ascontiguousarray(np.broadcast_to(np.asarray(clearance, np.float64), lead)).reshape(-1)

@@ -43,7 +43,7 @@ def respond(around, pos, vel, time, acc):
 {indented(parameters(parts), 4)}
     for block in range(np.uint64(first_), np.uint64(end_)):
         base, row = block * np.uint64({d * parts.width}), block * np.uint64({parts.width})
-{indented(obstacles(parts, me), 8)}
+{indented(obstacles(parts, me, lambda k: _felt_as(parts, f"n{k}_")), 8)}
         for l in range(np.uint64({parts.width})):
 {indented(me, 12)}
             o = zero(x)
@@ -155,13 +155,17 @@ def _own(parts: Parts) -> list[str]:
     return lines
 
 
+def _felt_as(parts: Parts, name: str) -> str:
+    """Write what the pair laws came to for one of their targets."""
+    d, t = parts.dimension, parts.targets.index(name)
+    each = d * len(parts.targets)
+    places = [f"felt[row * np.uint64({each}) + np.uint64({(d * t + k) * parts.width}) + l]" for k in range(d)]
+    return f"({', '.join(places)},)"
+
+
 def _felt(parts: Parts) -> list[str]:
     """Write how what the pair laws came to is added."""
-    d, lines = parts.dimension, []
-    each = d * len(parts.targets)
-    for t, name in enumerate(parts.targets):
-        places = [f"felt[row * np.uint64({each}) + np.uint64({(d * t + k) * parts.width}) + l]" for k in range(d)]
-        lines.append(f"{name} = add({name}, ({', '.join(places)},))")
+    lines = [f"{name} = add({name}, {_felt_as(parts, name)})" for name in parts.targets if name[0] != "n"]
     if parts.pulls:
         lines.append(f"f = add(f, {lanes_of(parts, 'pulled')})")
     return lines

@@ -6,11 +6,15 @@ or, where the law casts a ray, the one that it touches first. Nothing is written
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 from flockenv.shapes import FORMS
 from flockenv.sweep.parts import Parts
 from flockenv.sweep.text import Slots, indented, indented_lines, tuple_of
 
 __all__ = ["blocked", "obstacle_imports", "obstacles"]
+
+CIRCLE = "circle"
 
 
 def obstacle_imports(parts: Parts) -> list[str]:
@@ -24,21 +28,23 @@ def obstacle_imports(parts: Parts) -> list[str]:
         "from flockenv.steering.around import threat",
     ]
     return lines + [
-        f"from {module} import hit_{form}, nearest_{form}"
-        for form, module in FORMS.items()
-        if form in parts.shaped[1]
+        f"from {module} import hit_{form}, nearest_{form}" for form, module in FORMS.items() if form in parts.shaped[1]
     ]
 
 
-def obstacles(parts: Parts, me: list[str]) -> list[str]:
-    """Write the folds over the obstacles; nothing if no law asks for obstacles."""
+def obstacles(parts: Parts, me: list[str], found_out: Callable[[int], str]) -> list[str]:
+    """Write the folds over the obstacles; nothing if no law asks for obstacles.
+
+    found_out(k): where what the pair law of effect k has found out about others is.
+    """
     slot = Slots(parts)
     asking = [(k, slot.all(f"o{k}_")) for k, e in enumerate(parts.effects) if e.obstacle_law is not None]
     if not asking:
         return []
     starts = []
     for k, slots in asking:
-        starts.append(f"found = obstacle_start_{k}(p{k}, me)")
+        told = f", {found_out(k)}" if parts.effects[k].pair_law else ""
+        starts.append(f"found = obstacle_start_{k}(p{k}, me{told})")
         starts += [f"{s} = found[{j}]" for j, s in enumerate(slots)]
     count = " + ".join(["obstacle_radius.shape[1]", *(f"{form}_count" for form in parts.shaped[1])])
     d, w = parts.dimension, parts.width
@@ -52,7 +58,7 @@ def obstacles(parts: Parts, me: list[str]) -> list[str]:
         "    if rho > 0:",
         f"        place = {tuple_of('obstacle_x[#, b, m]', d)}",
         f"        for l in range(np.uint64({w})):",
-        indented([*me, "to = offset_to(size, x, place)", *_meet(parts, asking, _circle)], 12),
+        indented([*me, "to = offset_to(size, x, place)", *_meet(parts, asking, CIRCLE)], 12),
     ]
     for form in parts.shaped[1]:
         met = [
@@ -72,9 +78,6 @@ def obstacles(parts: Parts, me: list[str]) -> list[str]:
     return lines
 
 
-_circle = "circle"
-
-
 def _meet(parts: Parts, asking: list[tuple[int, list[str]]], form: str) -> list[str]:
     """Write how every law that asks meets one obstacle."""
     lines = []
@@ -89,7 +92,7 @@ def _meet(parts: Parts, asking: list[tuple[int, list[str]]], form: str) -> list[
 
 def _near(form: str, k: int | None) -> list[str]:
     """Write an obstacle as a law sees it that casts no rays, from where it is or, for effect k, from elsewhere."""
-    if form == _circle:
+    if form == CIRCLE:
         way, from_ = ("to", []) if k is None else ("way", [f"way = sub(to, obstacle_from_{k}(p{k}, me))"])
         body = f"{way}, dot({way}, {way}), zero(x), rho, zero(x), norm({way}) - rho, normal({way})"
         return [*from_, f"it = Obstacle(like(rho, m), {body}, like(rho, np.inf), zero(x))"]
@@ -108,12 +111,12 @@ def _near(form: str, k: int | None) -> list[str]:
 def _touched(form: str, k: int, j: int) -> list[str]:
     """Write an obstacle as a law sees it that casts ray j."""
     ray = f"ray, margin = obstacle_ray_{k}(p{k}, me, {j})"
-    if form == _circle:
+    if form == CIRCLE:
+        body = "to, dot(to, to), zero(x), rho, zero(x)"
         return [
             ray,
             "hit = threat(ray, to, me.radius + rho + margin, like(rho, np.inf))",
-            "it = Obstacle(like(rho, m), to, dot(to, to), zero(x), rho, zero(x), norm(to) - rho, "
-            "touched_normal(to, ray, hit), hit, ray)",
+            f"it = Obstacle(like(rho, m), {body}, norm(to) - rho, touched_normal(to, ray, hit), hit, ray)",
         ]
     return [
         ray,
@@ -126,7 +129,7 @@ def _touched(form: str, k: int, j: int) -> list[str]:
 
 
 def blocked(parts: Parts) -> str:
-    """Return the source of `blocked`: does an obstacle hide what is at `to`, an offset, from x? Empty if nobody asks."""
+    """Return the source of `blocked`: does an obstacle hide what is at `to` from x? Empty if nobody asks."""
     if not parts.occludes:
         return ""
     d = parts.dimension

@@ -104,7 +104,7 @@ def _finish(parts: Parts) -> list[str]:
     slot, d = Slots(parts), parts.dimension
     lines = [_me(parts, parts.fields)] + [f"{name} = zero(me.pos)" for name in parts.targets]
     for k, _ in parts.pairs:
-        to = parts.target(k)
+        to = parts.pair_target(k)
         lines.append(f"{to} = add({to}, finish_law_{k}(p{k}, me, ({', '.join(slot.all(f'c{k}_'))},)))")
     return lines + [f"{slot(f'g{name}{j}')} = {name}[{j}]" for name in parts.targets for j in range(d)]
 

@@ -168,6 +168,11 @@ class Parts:
             values[place] = float(len(values) + bound)
         return values
 
+    @property
+    def count(self) -> int:
+        """How many numbers the kernel is handed."""
+        return len(self.parameters()) + sum(map(len, self.tables))
+
     def given(self) -> NDArray[Any]:
         """Return `parameters()` and the tables behind them, in the scene's precision: what the kernel is handed."""
         return np.concatenate([self.parameters(), self.shaped[0], *self.tables]).astype(self.dtype)
@@ -192,6 +197,10 @@ class Parts:
         """Write what effect k adds to: a wish of its own, what agents want, or what acts on them."""
         return f"w{k}_" if k in self.wishes else "s" if self.effects[k].steering else "f"
 
+    def pair_target(self, k: int) -> str:
+        """Write what the pair law of effect k adds to: the same, or what its fold over the obstacles is told."""
+        return f"n{k}_" if self.effects[k].obstacle_start is not None else self.target(k)
+
     def last_numbers(self, kind: str) -> int:
         """Return where in `parameters` the numbers of the "space" begin, or of the "method": they come last but one."""
         look, method, space = 2 if self.look else 0, len(self.integrator.settings()), len(self.space.numbers())
@@ -210,9 +219,10 @@ class Parts:
 
     @functools.cached_property
     def targets(self) -> list[str]:
-        """What pair laws add to: what agents want, what acts on them, wishes."""
-        found = {self.target(k) for k, _ in self.pairs}
-        return [name for name in ("s", "f", *(f"w{k}_" for k in self.wishes)) if name in found]
+        """What pair laws add to: what agents want, what acts on them, wishes, what folds over obstacles are told."""
+        found = {self.pair_target(k) for k, _ in self.pairs}
+        names = ("s", "f", *(f"w{k}_" for k in self.wishes), *(f"n{k}_" for k, _ in self.pairs))
+        return [name for name in names if name in found]
 
     @functools.cached_property
     def fields(self) -> list[str]:
