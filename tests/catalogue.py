@@ -33,11 +33,15 @@ from flockenv.behaviours import (
     Arrive,
     AvoidObstacles,
     Cohesion,
+    Contain,
     Dock,
     Evade,
     Face,
     Flee,
     FollowLeader,
+    FollowWall,
+    FollowWay,
+    ForceField,
     Formation,
     Hide,
     Interpose,
@@ -49,6 +53,7 @@ from flockenv.behaviours import (
     Shadow,
     TargetSpeed,
     Wander,
+    Whiskers,
 )
 from flockenv.effects import EFFECTS as EFFECT_KINDS
 from flockenv.effects import (
@@ -91,6 +96,7 @@ from flockenv.integrators import (
 )
 from flockenv.networks import Mesh
 from flockenv.scene import Group, Scene
+from flockenv.shapes import Circle
 from flockenv.space import Box, Plane, Space, Torus
 from flockenv.spawn import Spawn
 from flockenv.steer import Steer
@@ -225,6 +231,9 @@ def in_dimension(effect: Effect, dimension: int) -> Effect:
         name: None if name == "axis" and dimension == 2 else value[:dimension]
         for name, value in vectors(effect).items()
     }
+    within = getattr(effect, "within", None)
+    if isinstance(within, Circle) and dimension == 3:
+        flat["within"] = Circle(centre=(*within.centre[:2], 3.0), radius=within.radius)
     return effect.model_copy(update=flat)
 
 
@@ -312,6 +321,16 @@ EFFECTS = (
     ),
     EffectRow(Interpose(weight=2, speed=1.5, group=0, other=0, radius=2.5, slow_radius=1), family="others"),
     EffectRow(Hide(weight=2, speed=1.5, group=0, radius=2.5, slow_radius=1)),
+    EffectRow(Whiskers(weight=5, horizon=3), obeys=UPRIGHT, family="around"),  # in space they are horizontal and vertical
+    EffectRow(ForceField(weight=0.5, range=2), family="around"),
+    EffectRow(FollowWall(weight=2, speed=1.5, distance=0.7, range=4), family="around"),
+    EffectRow(  # its circle stays where it is
+        Contain(weight=2, speed=1.5, within=Circle(centre=(3, 3), radius=2.5)), obeys=frozenset({"relabelling"})
+    ),
+    EffectRow(  # its grid lies along the axes
+        FollowWay(weight=2, speed=1.5, target=(3.0, 5.5, 2.5), clearance=0.1, spacing=0.3, margin=1),
+        obeys=frozenset({"relabelling"}),
+    ),
     EffectRow(Gravitation(constant=0.3, softening=0.5)),  # of few the sum is exact; of many, see test_gravitation.py
     EffectRow(InverseSquare(strength=-0.4, softening=0.3), signed=("strength",)),
     # everybody is tied to somebody else; see `tied`

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from flockenv.sweep.bonds import bonds
 from flockenv.sweep.far import far
+from flockenv.sweep.obstacles import obstacles
 from flockenv.sweep.pairs import pairs
 from flockenv.sweep.parts import Parts
 from flockenv.sweep.text import CONTEXT, Slots, alone, given, indented, lane, lanes_of, nearest_image, tuple_of
@@ -42,7 +43,7 @@ def respond(around, pos, vel, time, acc):
 {indented(parameters(parts), 4)}
     for block in range(np.uint64(first_), np.uint64(end_)):
         base, row = block * np.uint64({d * parts.width}), block * np.uint64({parts.width})
-{indented(_obstacles(parts, me), 8)}
+{indented(obstacles(parts, me, lambda k: _felt_as(parts, f"n{k}_")), 8)}
         for l in range(np.uint64({parts.width})):
 {indented(me, 12)}
             o = zero(x)
@@ -74,6 +75,9 @@ def parameters(parts: Parts) -> list[str]:
     d = parts.dimension
     lines = [f"size = {tuple_of('params[#]', d)}", f"reach = params[{d}]"]
     at = d + 1
+    for form in parts.shaped[1]:
+        lines.append(f"{form}_at, {form}_count = np.int64(params[{at}]), np.int64(params[{at + 1}])")
+        at += 2
     for q, sight in enumerate(parts.sights):
         lines.append(f"within{q}, view{q} = params[{at}], params[{at + 1}]")
         at += 2
@@ -170,34 +174,3 @@ def _reconcile(parts: Parts) -> list[str]:
                 f"{to} = add({to}, select(member, steer_law_{k}(p{k}, me, ({wishes},))[0], o))",
             ]
     return lines
-
-
-def _obstacles(parts: Parts, me: list[str]) -> list[str]:
-    """Write the folds over the obstacles, all of them in one pass; nothing if no law asks for obstacles."""
-    slot = Slots(parts)
-    asking = [(k, slot.all(f"o{k}_")) for k, e in enumerate(parts.effects) if e.obstacle_start is not None]
-    if not asking:
-        return []
-    starts, meets = [], []
-    for k, slots in asking:
-        told = f", {_felt_as(parts, f'n{k}_')}" if parts.effects[k].pair_law else ""
-        starts.append(f"found = obstacle_start_{k}(p{k}, me{told})")
-        starts += [f"{s} = found[{j}]" for j, s in enumerate(slots)]
-        meets.append(f"found = obstacle_law_{k}(p{k}, me, it, ({', '.join(slots)},))")
-        meets += [f"{s} = found[{j}]" for j, s in enumerate(slots)]
-    d = parts.dimension
-    return [
-        "if block == 0:",
-        "    work[b, 3] += n * obstacle_radius.shape[1]",
-        f"for l in range(np.uint64({parts.width})):",
-        indented(me + starts, 4),
-        "for m in range(obstacle_radius.shape[1]):",
-        "    rho = obstacle_radius[b, m]",
-        "    if rho > 0:",
-        f"        place = {tuple_of('obstacle_x[#, b, m]', d)}",
-        f"        for l in range(np.uint64({parts.width})):",
-        indented(me, 12),
-        "            to = offset_to(size, x, place)",
-        "            it = Other(like(rho, m), to, dot(to, to), zero(x), rho, zero(x))",
-        indented(meets, 12),
-    ]

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from flockenv.effects.base import Effect, Sight
 from flockenv.integrators.base import Integrator
 from flockenv.kernels import LINE
+from flockenv.shapes import packed
 from flockenv.space import Space
 
 __all__ = ["SMALL_STRIDE", "Look", "Parts", "flattened", "record_of", "sight_of", "sorted_at", "view_of"]
@@ -55,6 +56,10 @@ class Parts:
     """Are there enough agents for groups of them to be met as one, where they are far away?"""
     starts: tuple[int, ...] = ()
     """The first agent of each group, and one more: numbers alone, the source does not depend on them."""
+    shapes: tuple[Any, ...] = field(default=(), compare=False)
+    """Obstacles that are no circles: the source depends on their forms."""
+    circles: int = 0
+    """How many obstacles come before them."""
     tables: tuple[NDArray[np.float64], ...] = field(default=(), compare=False)
     """What the laws of each tabled effect look up, in order: numbers alone, too."""
 
@@ -83,6 +88,21 @@ class Parts:
     def pairs(self) -> list[tuple[int, Effect]]:
         """The effects with a pair law, and their numbers."""
         return [(k, e) for k, e in enumerate(self.effects) if e.pair_law is not None]
+
+    @functools.cached_property
+    def shaped(self) -> tuple[NDArray[np.float64], dict[str, tuple[int, int]]]:
+        """The table of shapes that are no circles, and the forms that there are: where each begins, how many."""
+        return packed(self.shapes, self.dimension, self.circles) if self.meets_obstacles else (np.zeros(0), {})
+
+    @property
+    def meets_obstacles(self) -> bool:
+        """Does any law ask for obstacles, or what is hidden by them?"""
+        return any(e.obstacle_law is not None for e in self.effects) or self.occludes
+
+    @property
+    def occludes(self) -> bool:
+        """Is anybody hidden by obstacles?"""
+        return any(sight.occluded for sight in self.sights)
 
     @functools.cached_property
     def bonded(self) -> list[tuple[int, Effect]]:
@@ -124,9 +144,13 @@ class Parts:
 
         For each table there are two: where it begins, and where it ends.
         """
-        bounds, tables = [], iter(np.cumsum([0, *map(len, self.tables)]).tolist())
+        shapes, forms = self.shaped
+        bounds, tables = [], iter(np.cumsum([len(shapes), *map(len, self.tables)]).tolist())
         begin = next(tables)
         values = [*self.space.extent(self.dimension), self.reach]
+        for where, count in forms.values():
+            bounds.append((len(values), where))
+            values += [0.0, float(count)]
         for sight in self.sights:
             values += [sight.radius**2, view_of(sight.fov)]
             if sight.group is not None:
@@ -151,7 +175,7 @@ class Parts:
 
     def given(self) -> NDArray[Any]:
         """Return `parameters()` and the tables behind them, in the scene's precision: what the kernel is handed."""
-        return np.concatenate([self.parameters(), *self.tables]).astype(self.dtype)
+        return np.concatenate([self.parameters(), self.shaped[0], *self.tables]).astype(self.dtype)
 
     def numbers_of(self, effect: Effect) -> dict[str, Any]:
         """Return the numbers and vectors that the laws of an effect are given, by name."""
