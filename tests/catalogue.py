@@ -19,7 +19,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flockenv import arbitration, steering
-from flockenv.behaviours import Alignment, AvoidObstacles, Cohesion, Separation
+from flockenv.behaviours import (
+    Alignment,
+    AvoidObstacles,
+    Cohesion,
+    FollowFlow,
+    FollowPath,
+    Separation,
+    StayOnPath,
+)
 from flockenv.effects import EFFECTS as EFFECT_KINDS
 from flockenv.effects import (
     AngularSprings,
@@ -108,6 +116,9 @@ STEERING = (
     Law(steering.cohere, ("vector", "vector", "positive"), "vector"),
     Law(steering.threat, ("heading", "vector", "positive", "length"), "positive"),
     Law(steering.avoid, ("heading", "vector", "positive", "positive"), "vector"),
+    Law(steering.stay_on_path, ("positive", "vector", "vector", "positive"), "vector"),
+    Law(steering.follow_path, ("positive", "positive", "vector", "vector", "positive"), "vector"),
+    Law(steering.follow_flow, ("vector", "vector"), "vector"),
     Law(steering.contain, ("walls", "walls", "vector", "positive", "positive"), "vector", turns="none", mirrors=False),
 )
 
@@ -128,6 +139,7 @@ class EffectRow:
     beside: tuple[Effect, ...] = ()  # without which it moves nobody: what a medium drags or carries
     obeys: frozenset[str] = frozenset({"translation", "rotation", "mirror", "relabelling"})
     signed: tuple[str, ...] = ()  # parameters that may be negative
+    flat: Effect | None = None  # the effect in the plane, where it is not enough to leave an axis out
 
     @property
     def name(self) -> str:
@@ -138,19 +150,27 @@ class EffectRow:
 
     def at(self, dimension: int) -> tuple[Effect, ...]:
         """The effect in so many dimensions, and those beside it."""
-        return tuple(in_dimension(effect, dimension) for effect in (self.effect, *self.beside))
+        effect = self.flat if self.flat is not None and dimension == 2 else self.effect
+        return tuple(in_dimension(effect, dimension) for effect in (effect, *self.beside))
 
 
-def vectors(effect: Effect) -> dict[str, tuple[float, ...]]:
-    """What of an effect's parameters are directions and places."""
-    return {name: value for name, value in effect.parameters().items() if isinstance(value, tuple)}
+def vectors(effect: Effect) -> dict[str, tuple[Any, ...]]:
+    """What of an effect's parameters are directions and places, and lists of places."""
+    given = effect.parameters() | {name: getattr(effect, name) for name in effect.places}
+    return {name: value for name, value in given.items() if isinstance(value, tuple)}
 
 
 def in_dimension(effect: Effect, dimension: int) -> Effect:
     """The same effect with the first numbers of its vectors; in the plane nobody turns about an axis."""
-    flat = {
+    flat: dict[str, Any] = {
         name: None if name == "axis" and dimension == 2 else value[:dimension]
         for name, value in vectors(effect).items()
+        if not isinstance(value[0], tuple)
+    }
+    flat |= {
+        name: tuple(place[:dimension] for place in value)
+        for name, value in vectors(effect).items()
+        if isinstance(value[0], tuple)
     }
     return effect.model_copy(update=flat)
 
@@ -159,17 +179,22 @@ def turned(effect: Effect, matrix: Array, shift: Array) -> Effect:
     """The same effect with its directions turned, and its places turned about the middle of EDGE and shifted."""
     middle = EDGE / 2
     change = {
-        name: tuple(
-            (np.array(value) - middle) @ matrix.T + middle + shift if name in effect.places else value @ matrix.T
-        )
+        name: (np.array(value) - middle) @ matrix.T + middle + shift if name in effect.places else value @ matrix.T
         for name, value in vectors(effect).items()
     }
-    return effect.model_copy(update={name: tuple(map(float, value)) for name, value in change.items()})
+    return effect.model_copy(update={name: _tuples(value.tolist()) for name, value in change.items()})
+
+
+def _tuples(value: Any) -> Any:
+    """Lists, and lists in them, as tuples."""
+    return tuple(map(_tuples, value)) if isinstance(value, list) else value
 
 
 DRAG = Drag(rate=0.4)
 WIND = Wind(velocity=(1.5, -0.7, 0.4), gust=(0.5, 1.0, -0.3), period=0.8)
 CENTRE = (2.5, 2.5, 2.5)
+LOOP = ((1.0, 1.0, 2.5), (5.0, 1.5, 3.0), (4.5, 5.0, 2.0), (1.5, 4.0, 3.5))
+FLOWS = tuple((0.3 * k % 2 - 1, 0.7 * k % 2 - 1, 0.9 * k % 2 - 1) for k in range(24))
 
 EFFECTS = (
     EffectRow(DRAG),
@@ -208,6 +233,14 @@ EFFECTS = (
                 AvoidObstacles(weight=5, horizon=3), Separation(weight=1.3, radius=2.5), Alignment(weight=0.7, radius=3)
             )
         )
+    ),
+    EffectRow(FollowPath(weight=2, points=LOOP, closed=True, radius=0.3, speed=1.5), signed=("way",)),
+    EffectRow(StayOnPath(weight=2, points=LOOP[:3], radius=0.4, speed=1.5, time=1)),
+    EffectRow(
+        FollowFlow(weight=1.5, centre=CENTRE, spacing=1.5, counts=(4, 3, 2), velocities=FLOWS),
+        flat=FollowFlow(weight=1.5, centre=CENTRE[:2], spacing=1.5, counts=(4, 3),
+                        velocities=tuple(flow[:2] for flow in FLOWS[:12])),
+        obeys=frozenset({"translation", "relabelling"}),  # its grid lies along the axes
     ),
     EffectRow(Gravitation(constant=0.3, softening=0.5)),  # of few the sum is exact; of many, see test_gravitation.py
     EffectRow(InverseSquare(strength=-0.4, softening=0.3), signed=("strength",)),

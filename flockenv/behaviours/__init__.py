@@ -19,8 +19,11 @@ for _module in pkgutil.iter_modules(__path__):
 
 from flockenv.behaviours.avoid import AvoidObstacles  # noqa: E402  # after the folder has been walked
 from flockenv.behaviours.flock import Alignment, Cohesion, Separation  # noqa: E402
+from flockenv.behaviours.paths import FollowFlow, FollowPath, StayOnPath  # noqa: E402
 
-__all__ = ["BEHAVIOURS", "Alignment", "AvoidObstacles", "Cohesion", "Separation"]
+__all__ = [
+    "BEHAVIOURS", "Alignment", "AvoidObstacles", "Cohesion", "FollowFlow", "FollowPath", "Separation", "StayOnPath",
+]  # fmt: skip
 
 BEHAVIOURS: dict[str, type[Effect]] = {kind: effect for kind, effect in EFFECTS.items() if effect.steering}
 """Every behaviour by its kind."""

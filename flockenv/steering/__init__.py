@@ -14,6 +14,7 @@ from __future__ import annotations
 from flockenv.steering.around import avoid, contain, threat
 from flockenv.steering.goals import arrive, flee, seek, wander, wander_turn
 from flockenv.steering.others import align, cohere, distance_time, evade, interception_time, pursue, separate
+from flockenv.steering.paths import follow_flow, follow_path, stay_on_path
 
 __all__ = [
     "align",
@@ -24,10 +25,13 @@ __all__ = [
     "distance_time",
     "evade",
     "flee",
+    "follow_flow",
+    "follow_path",
     "interception_time",
     "pursue",
     "seek",
     "separate",
+    "stay_on_path",
     "threat",
     "wander",
     "wander_turn",
