@@ -35,7 +35,7 @@ from flockenv.noise import MASK, key_of
 from flockenv.records import Record, keep
 from flockenv.rounding import check_places
 from flockenv.shapes import Circle
-from flockenv.snapshot import Snapshot
+from flockenv.snapshot import Mark, Snapshot
 from flockenv.space import AnySpace, Box, Plane, Torus
 from flockenv.spawn import Spawn, scatter
 from flockenv.stability import check_dt
@@ -180,7 +180,7 @@ class Scene(Record):
 
     def _check_counts(self) -> None:
         limit = f"float32 counts exactly up to {EXACT:,}; use dtype = float64"
-        for key, count, what in (("groups", self.agents, "agents"), ("effects", len(self._params), "numbers")):
+        for key, count, what in (("groups", self.agents, "agents"), ("effects", self.parts.count, "numbers")):
             if count > EXACT:
                 raise ValueError(f"{key}: {count:,} {what}: {limit}")
 
@@ -529,7 +529,8 @@ class Scene(Record):
         return Snapshot(
             time=float(state.time[world]), pos=state.pos[world], vel=state.vel[world], alive=state.alive[world],
             radius=np.asarray(self.body.radius, np.float64), roles=self.roles,
-            obstacle_centre=state.obstacles.centre[world], obstacle_radius=state.obstacle_radius[world], marks=(),
+            obstacle_centre=state.obstacles.centre[world], obstacle_radius=state.obstacle_radius[world],
+            marks=self.marks,
             low=np.array(low, np.float64), high=np.array(high, np.float64),
             periodic=self.space.periodic, title=title, bonds=self.edges,
         )  # fmt: skip
@@ -541,6 +542,18 @@ class Scene(Record):
         pos = state.pos[world]
         margin = 1.0 + 0.05 * float(np.ptp(pos, axis=0).max())
         return tuple(pos.min(axis=0) - margin), tuple(pos.max(axis=0) + margin)
+
+    @property
+    def marks(self) -> tuple[Mark, ...]:
+        """The places that behaviours are about."""
+        still = np.zeros(self.dimension)
+        return tuple(
+            Mark("goal", np.array(getattr(wish, name)), still, 2 * max(group.radius for group in self.groups))
+            for wish in self.parts.effects
+            if wish.steering
+            for name in wish.places
+            if getattr(wish, name) is not None
+        )
 
     def with_effects(self, *effects: Effect) -> Scene:
         """Return the same scene under other effects."""

@@ -168,10 +168,11 @@ def _reconcile(parts: Parts) -> list[str]:
     lines = []
     for k, effect in enumerate(parts.effects):
         if effect.wishes:
+            to = parts.target(k)
             wishes = ", ".join(parts.target(j) for j, by in parts.wishes.items() if by == k)
             lines += [
                 f"member = (ident[i] >= p{k}.first) & (ident[i] < p{k}.end)",
-                f"s = add(s, select(member, steer_law_{k}(p{k}, me, ({wishes},))[0], o))",
+                f"{to} = add({to}, select(member, steer_law_{k}(p{k}, me, ({wishes},))[0], o))",
             ]
     return lines
 

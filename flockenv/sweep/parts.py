@@ -144,6 +144,11 @@ class Parts:
             values[place] = float(len(values) + bound)
         return values
 
+    @property
+    def count(self) -> int:
+        """How many numbers the kernel is handed."""
+        return len(self.parameters()) + sum(map(len, self.tables))
+
     def given(self) -> NDArray[Any]:
         """Return `parameters()` and the tables behind them, in the scene's precision: what the kernel is handed."""
         return np.concatenate([self.parameters(), *self.tables]).astype(self.dtype)
