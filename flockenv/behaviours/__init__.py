@@ -26,15 +26,17 @@ from flockenv.behaviours.flock import Alignment, Cohesion, Separation  # noqa: E
 from flockenv.behaviours.goals import Arrive, Dock, Face, Flee, Seek, TargetSpeed  # noqa: E402
 from flockenv.behaviours.hide import Hide  # noqa: E402
 from flockenv.behaviours.orca import Orca  # noqa: E402
+from flockenv.behaviours.paths import FollowFlow, FollowPath, StayOnPath  # noqa: E402
 from flockenv.behaviours.walls import Contain, FollowWall  # noqa: E402
 from flockenv.behaviours.wander import Wander  # noqa: E402
 from flockenv.behaviours.way import FollowWay  # noqa: E402
 
 __all__ = [
     "BEHAVIOURS", "Alignment", "Arrive", "AvoidObstacles", "Cohesion", "Contain", "Dock", "Evade", "Explore",
-    "Face", "Flee", "FollowLeader", "FollowWall", "FollowWay", "Forage", "ForceField", "Formation", "Hide",
-    "Interpose", "MatchVelocity", "OffsetPursue", "Orca", "OvershootWarning", "Pursue", "Queue", "Seek",
-    "Separation", "Shadow", "TargetSpeed", "UnalignedAvoidance", "Wander", "Whiskers",
+    "Face", "Flee", "FollowFlow", "FollowLeader", "FollowPath", "FollowWall", "FollowWay", "Forage", "ForceField",
+    "Formation", "Hide", "Interpose", "MatchVelocity", "OffsetPursue", "Orca", "OvershootWarning", "Pursue",
+    "Queue", "Seek", "Separation", "Shadow", "StayOnPath", "TargetSpeed", "UnalignedAvoidance", "Wander",
+    "Whiskers",
 ]  # fmt: skip
 
 BEHAVIOURS: dict[str, type[Effect]] = {kind: effect for kind, effect in EFFECTS.items() if effect.steering}

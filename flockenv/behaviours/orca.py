@@ -10,7 +10,7 @@ from pydantic import Field
 
 from flockenv import orca, steering
 from flockenv.effects.base import Effect, Me, Other, Sight, Vector
-from flockenv.kernels import OPTIONS, Vec, law, like, replaced
+from flockenv.kernels import OPTIONS, Vec, law, like
 from flockenv.vec import scale, select, sub, zero
 
 __all__ = ["Orca"]
