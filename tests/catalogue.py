@@ -32,6 +32,7 @@ from flockenv.effects import (
     Gravitation,
     Gravity,
     InverseSquare,
+    ObstacleContact,
     Pressure,
     QuadraticDrag,
     Sink,
@@ -198,6 +199,7 @@ EFFECTS = (
         Swing(centre=CENTRE, strength=0.8, length=0.7), obeys=frozenset({"translation", "mirror", "relabelling"})
     ),
     EffectRow(WallRepulsion(point=CENTRE, normal=(1.2, -0.7, 0.9), strength=2, decay=1.5)),
+    EffectRow(ObstacleContact(stiffness=30, damping=0.5)),
     EffectRow(Fluctuation(strength=0.8), obeys=frozenset({"translation"})),  # to each his own, along the axes
     EffectRow(Pressure(strength=1.5, density=1, radius=1.35)),
     EffectRow(Separation(weight=1.3, radius=2.5)),

@@ -31,10 +31,10 @@ from flockenv.envs.face import (
     together,
 )
 from flockenv.refusals import nearest
-from flockenv.tasks import Flock, Herd, Obstacles, Pursuit, Task
+from flockenv.tasks import Evade, Flock, Herd, Obstacles, Pursuit, Task
 from flockenv.world import Step, World
 
-__all__ = ["FlockVectorEnv", "HerdVectorEnv", "ObstaclesVectorEnv", "PursuitVectorEnv", "WorldsEnv"]
+__all__ = ["EvadeVectorEnv", "FlockVectorEnv", "HerdVectorEnv", "ObstaclesVectorEnv", "PursuitVectorEnv", "WorldsEnv"]
 
 Mask = NDArray[np.bool_]
 Info = dict[str, Any]
@@ -347,3 +347,9 @@ class HerdVectorEnv(WorldsEnv):
     """Dogs, one per world or `dogs=` several; the page is that of flockenv.envs.single.HerdEnv."""
 
     task_type = Herd
+
+
+class EvadeVectorEnv(WorldsEnv):
+    """Evaders, one per world; the page is that of flockenv.envs.single.EvadeEnv."""
+
+    task_type = Evade
