@@ -20,7 +20,7 @@ import yaml
 
 from flockenv import arbitration, steering
 from flockenv.rows import rows
-from flockenv.tasks import Flock, Herd, Obstacles, Pursuit, Task
+from flockenv.tasks import Evade, Flock, Herd, Obstacles, Pursuit, Task
 
 __all__ = ["RULES", "Reynolds", "player", "tuned"]
 
@@ -30,6 +30,7 @@ seek, arrive, contain = rows(steering.seek), rows(steering.arrive), rows(steerin
 interception_time, pursue = rows(steering.interception_time), rows(steering.pursue)
 threat, avoid = rows(steering.threat), rows(steering.avoid)
 separate, align = rows(steering.separate), rows(steering.align)
+evade_from, hiding_place = rows(steering.evade), rows(steering.hiding_place)
 herd_from = rows(steering.herd_from)
 allocate = rows(arbitration.allocate)
 
@@ -141,6 +142,55 @@ def flock(see: Any, task: Flock, p: FlockRules) -> np.ndarray:
     return (1.0 - p.blend) * ordered + p.blend * summed
 
 
+# --- Evade: around what is in the way, off the walls, away from pursuers, into cover ----------------------------------
+
+
+@dataclass(frozen=True)
+class EvadeRules:
+    """Textbook: evade whoever is near, hide from the nearest otherwise (Reynolds 1999), in order of priority."""
+
+    horizon: float = 1.0  # s, how far ahead cover counts that is in the way
+    avoid: float = 5.0  # kg/s, strength of steering around it
+    wall: float = 0.5  # s, how far ahead walls count
+    alarm: float = 6.0  # m, within which a pursuer is evaded
+    predict: float = 0.5  # s, how far ahead a pursuer is predicted at most
+    evade: float = 5.0  # kg/s, strength of an evasion
+    crowd: float = 1.0  # how much farther pursuers count beside the nearest; 0: he alone
+    middle: float = 0.0  # N/m towards the middle of the field while evading
+    margin: float = 1.0  # m, behind cover
+    danger: float = 0.0  # m added to the way to a hiding place per m that a pursuer is nearer to it than 10 m
+    hide: float = 3.0  # kg/s, towards the hiding place
+
+
+def evade(see: Any, task: Evade, p: EvadeRules) -> np.ndarray:
+    """Avoid, contain, evade, hide: allocation in that order (Reynolds 1987)."""
+    top, row = task.evader_speed, np.arange(len(see.velocity))
+    speed = np.linalg.norm(see.velocity, axis=-1)
+    forward = see.velocity / np.maximum(speed, 1e-9)[:, None]
+    there, clearance = see.cover_radius > 0, see.cover_radius + 0.4
+    hit = np.where(there, threat(forward[:, None], see.cover, clearance, (speed * p.horizon)[:, None]), np.inf)
+    first = np.argmin(hit, axis=1)
+    aside = p.avoid * avoid(forward, see.cover[row, first], clearance[row, first], top)
+    aside *= np.isfinite(hit[row, first])[:, None]
+    inside = 5.0 * contain(see.to_low - 0.5, see.to_high - 0.5, see.velocity, top, p.wall)
+
+    distance = np.linalg.norm(see.pursuers, axis=-1)
+    time = np.minimum(distance / task.pursuer_speed, p.predict)
+    flight = evade_from(see.pursuers, see.velocity[:, None], see.pursuer_velocity, top, time)
+    rank = np.where(np.arange(distance.shape[1]) == 0, 1.0, p.crowd)
+    weight = rank * (distance < p.alarm) / np.maximum(distance, 0.1) ** 2
+    away = p.evade * np.sum(flight * weight[..., None], axis=1) / np.maximum(weight.sum(axis=1), 1e-9)[:, None]
+    near = (weight.sum(axis=1) > 0)[:, None]
+    away += p.middle * (see.to_high - see.to_low) / 2 * near
+
+    places = hiding_place(see.cover, see.cover_radius, p.margin, see.pursuers[:, :1])
+    theirs = np.linalg.norm(places[:, :, None] - see.pursuers[:, None], axis=-1).min(axis=-1)
+    way = np.linalg.norm(places, axis=-1) + p.danger * np.maximum(10.0 - theirs, 0.0)
+    soonest = np.argmin(np.where(there, way, np.inf), axis=1)
+    hidden = p.hide * arrive(places[row, soonest], see.velocity, top, 0.5) * there.any(axis=1)[:, None]
+    return allocate(np.stack([aside, inside, away, hidden], axis=1), task.evader_force)
+
+
 # --- Herd: collect who strays, else drive them all from behind --------------------------------------------------------
 
 
@@ -182,6 +232,7 @@ def herd(see: Any, task: Herd, p: HerdRules) -> np.ndarray:
 RULES: dict[str, tuple[Callable[..., np.ndarray], type]] = {
     "pursuit": (pursuit, PursuitRules),
     "obstacles": (obstacles, ObstaclesRules),
+    "evade": (evade, EvadeRules),
     "flock": (flock, FlockRules),
     "herd": (herd, HerdRules),
 }

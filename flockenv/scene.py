@@ -26,7 +26,7 @@ from flockenv.divergence import SimulationDiverged
 from flockenv.effects import Effect
 from flockenv.effects.base import all_masses
 from flockenv.implicit import coupling_of, solve_steps
-from flockenv.integrators import INTEGRATORS, ImplicitEuler, Integrator, SemiImplicitEuler
+from flockenv.integrators import INTEGRATORS, Adaptive, ImplicitEuler, Integrator, SemiImplicitEuler
 from flockenv.integrators.newton import Coupling
 from flockenv.kernels import entry, load
 from flockenv.neighbours import FEWEST_AGENTS, WORTH_ARRANGING
@@ -365,6 +365,9 @@ class Scene(Record):
             done += 1
         agent = bad[1] if done < steps else agent
         last, effect = int(alone.tick[0]) + 1, self._blamed(alone, agent)
+        if isinstance(self.integrator, Adaptive):
+            most, tolerance = self.integrator.most, self.integrator.tolerance
+            reason = f"not finite, or not within tolerance = {tolerance:g} by {most:,} steps of its own"
         error = SimulationDiverged(world, agent, last, last * self.dt, effect, self.dt, self.integrator.kind, reason)
         error.state = state
         return error

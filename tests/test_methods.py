@@ -329,8 +329,10 @@ def test_drag_is_shared_among_agents_by_their_mass(tether: Any) -> None:
 # --- steps of their own -----------------------------------------------------------------------------------------------
 
 
-def judge(clock: Clock, error: float, tolerance: float = 1e-6, least: float = 0.0, dt: float = 1.0) -> Clock:
-    return judged(clock, error, tolerance, least, dt, 4)
+def judge(
+    clock: Clock, error: float, tolerance: float = 1e-6, least: float = 0.0, most: float = 1e5, dt: float = 1.0
+) -> Clock:
+    return judged(clock, error, (tolerance, least, most), dt, 4)
 
 
 def test_the_next_step_is_the_standard_controller_s() -> None:
@@ -380,6 +382,9 @@ def test_a_world_is_given_up_after_so_many_tries_and_where_steps_vanish() -> Non
     assert not judge(Clock(0.5, 0.01, 0.0, 0, 3, 0, False), 1.0, least=0.002).lost
     assert judge(Clock(0.5, 1e-16, 0.0, 0, 3, 0, False), 1.0).lost  # t + h == t
     assert not judge(Clock(0.5, 1e-16, 0.0, 0, 3, 0, False), 0.0).lost
+    assert not judge(Clock(0.5, 0.01, 0.0, 0, 3, 1, False), 0.0, most=6).lost
+    assert judge(Clock(0.5, 0.01, 0.0, 0, 3, 2, False), 0.0, most=6).lost
+    assert not judge(Clock(0.5, 0.5, 0.0, 0, 3, 2, False), 0.0, most=6).lost  # it is there
 
 
 def test_rounding_is_no_error() -> None:
@@ -461,6 +466,8 @@ def test_a_step_below_the_least_is_refused(kind: type[Integrator], tether: Any) 
     given = orbit(0.9)
     with pytest.raises(SimulationDiverged, match=kind.model_fields["kind"].default):
         tethered(tether, "compiled", **given)(kind(tolerance=1e-9, least=0.01), 2 * math.pi, 1)
+    with pytest.raises(SimulationDiverged, match=r"not within tolerance = 1e-09 by 7 steps of its own"):
+        tethered(tether, "compiled", **given)(kind(tolerance=1e-9, most=7), 2 * math.pi, 1)
     for name, value in (("tolerance", 0.0), ("tolerance", -1e-6), ("least", -1.0)):
         with pytest.raises(ValueError, match=rf"^{kind.__name__}: {name} = {value:g}"):
             kind(**{name: value})

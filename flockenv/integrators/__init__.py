@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib
 import pkgutil
 
+from flockenv.integrators.adaptive import Adaptive
 from flockenv.integrators.base import INTEGRATORS, Integrator, methods_named
 
 for _module in pkgutil.iter_modules(__path__):
@@ -25,7 +26,7 @@ from flockenv.integrators.semi_implicit_euler import SemiImplicitEuler  # noqa: 
 from flockenv.integrators.velocity_verlet import VelocityVerlet  # noqa: E402
 
 __all__ = [
-    "INTEGRATORS", "RK4", "AdaptiveRK4", "AveragedVelocity", "DormandPrince", "ExplicitEuler", "ExponentialDrag",
-    "Heun", "Implicit", "ImplicitEuler", "ImplicitMidpoint", "Integrator", "Midpoint", "SemiImplicitEuler",
-    "VelocityVerlet", "methods_named",
+    "INTEGRATORS", "RK4", "Adaptive", "AdaptiveRK4", "AveragedVelocity", "DormandPrince", "ExplicitEuler",
+    "ExponentialDrag", "Heun", "Implicit", "ImplicitEuler", "ImplicitMidpoint", "Integrator", "Midpoint",
+    "SemiImplicitEuler", "VelocityVerlet", "methods_named",
 ]  # fmt: skip

@@ -18,4 +18,7 @@ class Adaptive(Integrator):
     least: float = Field(
         default=0.0, ge=0, description="s, smallest step; a world that needs a smaller one is given up"
     )
+    most: int = Field(
+        default=100_000, ge=1, description="steps of its own within dt; a world that needs more is given up"
+    )
     adaptive: ClassVar[bool] = True

@@ -25,7 +25,7 @@ def advance(
     """
     x, v, x0, v0, new_x, new_v = stages[0], stages[1], stages[2], stages[3], stages[4], stages[5]
     whole_x, whole_v = stages[6], stages[7]
-    tolerance, least = settings(context)
+    limits = settings(context)
     clock, known = begun(dt), False
     while clock.done < dt:
         for part in range(3):  # the whole, its first half, its second half
@@ -52,10 +52,10 @@ def advance(
         misfit(whole_x, new_x, new_v, whole_x, whole_v, first, end)
         square, where = largest(context, whole_x, first, end)
         error = np.sqrt(square)
-        if error <= tolerance:
+        if error <= limits[0]:
             known = False
             copy(pos, vel, new_x, new_v, first, end)
-        clock = judged(clock, error, tolerance, least, dt, 4)
+        clock = judged(clock, error, limits, dt, 4)
         if clock.lost:
             pos[where] = like(dt, np.nan)
     counted(context, clock.accepted, clock.rejected)

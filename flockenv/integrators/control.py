@@ -9,7 +9,7 @@ fifth, and as long as the clock has not come to where a rejected step would have
 before. So a jump costs a rejected step for each factor of 5 between the steps before it and the one that meets it.
 
 A world is given up, by a coordinate that is not a number, where TRIES steps in a row are not accepted, where a step
-shorter than `least` is called for, or where one does not move the clock.
+shorter than `least` is called for, where one does not move the clock, and where `most` steps have not come to its end.
 """
 
 from __future__ import annotations
@@ -62,8 +62,12 @@ def _stretched(error: float, tolerance: float, dt: float, order: int) -> float:
 
 
 @shared
-def judged(clock: Clock, error: float, tolerance: float, least: float, dt: float, order: int) -> Clock:
-    """Return the clock after a step with that error, in the sense of the module's text, was tried."""
+def judged(clock: Clock, error: float, limits: tuple[float, ...], dt: float, order: int) -> Clock:
+    """Return the clock after a step with that error, in the sense of the module's text, was tried.
+
+    limits: tolerance, least, most.
+    """
+    tolerance, least, most = limits
     taken = error <= tolerance
     last = clock.step >= dt - clock.done
     done = (dt if last else clock.done + clock.step) if taken else clock.done
@@ -75,6 +79,7 @@ def judged(clock: Clock, error: float, tolerance: float, least: float, dt: float
     tries = 0 if taken else clock.tries + 1
     stuck = (not taken) & ((tries >= TRIES) | (step < least) | (done + step == done))
     accepted, rejected = clock.accepted + (1 if taken else 0), clock.rejected + (0 if taken else 1)
+    stuck = stuck | ((done < dt) & (like(dt, accepted + rejected) >= most))
     return Clock(dt if stuck else done, step, wary, tries, accepted, rejected, stuck)
 
 

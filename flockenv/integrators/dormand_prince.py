@@ -39,7 +39,7 @@ def advance(
     """Seven slopes, of which the last is the first of the next step: rows 2 to 8 of velocities, 9 to 15 of forces."""
     x, v = stages[0], stages[1]
     other_x, other_v = stages[3], stages[10]  # the second slope counts neither in the result nor in its error
-    tolerance, least = settings(context)
+    limits = settings(context)
     clock, known = begun(dt), False
     while clock.done < dt:
         h = clock.step
@@ -57,10 +57,10 @@ def advance(
         misfit(other_x, x, v, other_x, other_v, first, end)
         square, where = largest(context, other_x, first, end)
         error, known = np.sqrt(square), True
-        if error <= tolerance:
+        if error <= limits[0]:
             copy(pos, vel, x, v, first, end)
             copy(stages[2], stages[9], stages[8], stages[15], first, end)
-        clock = judged(clock, error, tolerance, least, dt, 4)
+        clock = judged(clock, error, limits, dt, 4)
         if clock.lost:
             pos[where] = like(dt, np.nan)
     counted(context, clock.accepted, clock.rejected)

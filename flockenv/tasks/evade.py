@@ -155,7 +155,7 @@ def _after(p: Any, frame: Frame, i: int, velocity: Vec, top: float) -> Vec:
         turn = int(frame.step * p.control_dt / _SEARCH)
         m = min(int(many * uniform(frame.key, turn, i, 7)), many - 1)
         if frame.rho[m] > 0.0:
-            aim = steering.behind(_to_cover(frame, i, m), (0.0, 0.0), np.float64(frame.rho[m] + 1.0))
+            aim = steering.hiding_place(_to_cover(frame, i, m), np.float64(frame.rho[m]), 1.0, (0.0, 0.0))
     return steering.arrive(aim, velocity, top, 1.0)
 
 
