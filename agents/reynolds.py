@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 import yaml
 
-from flockenv import arbitration, steering
+from flockenv import arbitration, shapes, steering
 from flockenv.rows import rows
 from flockenv.tasks import Evade, Flock, Herd, Obstacles, Pursuit, Task
 
@@ -31,6 +31,7 @@ interception_time, pursue = rows(steering.interception_time), rows(steering.purs
 threat, avoid = rows(steering.threat), rows(steering.avoid)
 separate, align = rows(steering.separate), rows(steering.align)
 evade_from, hiding_place = rows(steering.evade), rows(steering.hiding_place)
+ray_hit = rows(shapes.ray_hit)
 herd_from = rows(steering.herd_from)
 allocate = rows(arbitration.allocate)
 
@@ -156,9 +157,10 @@ class EvadeRules:
     predict: float = 0.5  # s, how far ahead a pursuer is predicted at most
     evade: float = 5.0  # kg/s, strength of an evasion
     crowd: float = 1.0  # how much farther pursuers count beside the nearest; 0: he alone
-    middle: float = 0.0  # N/m towards the middle of the field while evading
+    middle: float = 0.2  # N/m towards the middle of the field while evading
     margin: float = 1.0  # m, behind cover
     danger: float = 0.0  # m added to the way to a hiding place per m that a pursuer is nearer to it than 10 m
+    exposed: float = 0.0  # m added to it for each pursuer that sees that place
     hide: float = 3.0  # kg/s, towards the hiding place
 
 
@@ -186,9 +188,20 @@ def evade(see: Any, task: Evade, p: EvadeRules) -> np.ndarray:
     places = hiding_place(see.cover, see.cover_radius, p.margin, see.pursuers[:, :1])
     theirs = np.linalg.norm(places[:, :, None] - see.pursuers[:, None], axis=-1).min(axis=-1)
     way = np.linalg.norm(places, axis=-1) + p.danger * np.maximum(10.0 - theirs, 0.0)
+    way += p.exposed * _watchers(places, see)
     soonest = np.argmin(np.where(there, way, np.inf), axis=1)
     hidden = p.hide * arrive(places[row, soonest], see.velocity, top, 0.5) * there.any(axis=1)[:, None]
     return allocate(np.stack([aside, inside, away, hidden], axis=1), task.evader_force)
+
+
+def _watchers(places: np.ndarray, see: Any) -> np.ndarray:
+    """Return how many pursuers have no cover between themselves and each of the places (R, K)."""
+    ways = places[:, :, None] - see.pursuers[:, None]
+    length = np.linalg.norm(ways, axis=-1)
+    stones = (see.cover[:, None, :] - see.pursuers[:, :, None])[:, None]
+    hit = ray_hit(stones, (ways / np.maximum(length, 1e-9)[..., None])[..., None, :], see.cover_radius[:, None, None])
+    hit = np.where(see.cover_radius[:, None, None] > 0, hit, np.inf)
+    return np.sum(hit.min(axis=-1) > length, axis=-1)
 
 
 # --- Herd: collect who strays, else drive them all from behind --------------------------------------------------------

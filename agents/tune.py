@@ -44,7 +44,7 @@ RANGES: dict[str, dict[str, tuple[float, float]]] = {
     "evade": {
         "horizon": (0.2, 2.0), "avoid": (0.5, 8.0), "wall": (0.1, 1.5), "alarm": (2.0, 15.0), "predict": (0.0, 2.0),
         "evade": (0.5, 8.0), "crowd": (0.0, 2.0), "middle": (0.0, 1.5), "margin": (0.4, 2.5), "danger": (0.0, 3.0),
-        "hide": (0.0, 8.0),
+        "exposed": (0.0, 10.0), "hide": (0.0, 8.0),
     },
     "herd": {
         "together": (0.3, 2.0), "collecting": (0.0, 4.0), "driving": (0.3, 2.5), "near": (0.0, 5.0), "slow": (0.0, 1.0),
