@@ -65,7 +65,7 @@ from flockenv.scene import Group, Scene
 from flockenv.space import Box, Plane, Space, Torus
 from flockenv.spawn import Spawn
 from flockenv.steer import Steer
-from flockenv.tasks import Flock, Obstacles, Pursuit, Task
+from flockenv.tasks import Evade, Flock, Herd, Obstacles, Pursuit, Task
 
 Array = NDArray[np.float64]
 
@@ -314,6 +314,9 @@ TASKS = (
     TaskRow(Obstacles()),
     TaskRow(Flock()),
     TaskRow(Flock(learners=1), "_single"),
+    TaskRow(Evade()),
+    TaskRow(Herd()),
+    TaskRow(Herd(dogs=3), "_team"),
 )
 
 
