@@ -63,9 +63,7 @@ def reconciled(arbitration: Arbitration, wishes: Array, **more: Any) -> tuple[An
 @DIMENSIONS
 @PRECISIONS
 @ALL
-def test_shares_are_from_none_to_all_and_sum_to_the_force(
-    arbitration: Arbitration, dtype: str, dimension: int
-) -> None:
+def test_shares_are_from_none_to_all_and_sum_to_the_force(arbitration: Arbitration, dtype: str, dimension: int) -> None:
     """Of blend before the sum is bounded, of context steering not: that goes where nobody asked to go."""
     wishes = requests(dimension).astype(dtype)
     force, share = reconciled(arbitration, wishes, dtype=dtype)
@@ -105,7 +103,9 @@ def test_a_single_wish_within_the_budget_is_granted(arbitration: Arbitration) ->
     """By all who hear everybody at all times; by context steering exactly, for one of its directions is that one."""
     wishes = np.array([[(3.0, 4.0)], [(-6.0, 8.0)], [(0.0, 0.5)]])
     arbitration = arbitration.model_copy(update={"dangers": 0}) if arbitration.kind == "context" else arbitration
-    arbitration = arbitration.model_copy(update={"probability": 1.0}) if arbitration.kind == "dithering" else arbitration
+    arbitration = (
+        arbitration.model_copy(update={"probability": 1.0}) if arbitration.kind == "dithering" else arbitration
+    )
     force, share = reconciled(arbitration, wishes)
     np.testing.assert_allclose(force, wishes[:, 0], rtol=1e-12)
     np.testing.assert_allclose(share, 1, rtol=1e-12)
