@@ -6,6 +6,7 @@ import math
 import warnings
 from typing import Any, ClassVar
 
+import numpy as np
 from pydantic import Field
 
 from flockenv.effects.base import Effect, Me, Other, Sight
@@ -29,8 +30,12 @@ class OvershootWarning(UserWarning):
 
 @law
 def top_speed(p: Any, me: Me) -> float:
-    """Return how fast a behaviour goes at most, m/s."""
-    return p.speed if p.speed < me.max_speed else me.max_speed
+    """Return how fast a behaviour goes at most, m/s.
+
+    1 for those without any limit: they are not steered (see Moving), but their wish must be a number.
+    """
+    top = p.speed if p.speed < me.max_speed else me.max_speed
+    return top if top < like(top, np.inf) else like(top, 1.0)
 
 
 @law
