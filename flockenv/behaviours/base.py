@@ -125,12 +125,13 @@ class AboutNearest(Behaviour):
     group: int | None = Field(default=None, ge=0, description="whom it is about: the nearest of it; none = of all")
     radius: float = Field(gt=0, description="m, how far it sees")
     fov: float = Field(default=360.0, gt=0, le=360, description="degrees, full angle of the field of view")
+    occluded: bool = Field(default=False, description="whom an obstacle hides is not seen")
     pair_law: ClassVar[str | None] = "nearest_one"
 
     @property
     def sight(self) -> Sight:
         """The nearest one."""
-        return Sight(self.radius, self.fov, 1, self.group)
+        return Sight(self.radius, self.fov, 1, self.group, self.occluded)
 
     def sums(self, dimension: int) -> int:
         """Offset, velocity, count."""
