@@ -151,6 +151,7 @@ STEERING = (
     Law(steering.dock, ("vector", "vector", "heading", "positive", "length", "positive", "length"), "vector"),
     Law(steering.approach_time, ("vector", "positive", "length"), "positive"),
     Law(steering.opensteer_time, ("vector", "vector", "vector", "length"), "positive"),
+    Law(steering.passing_point, ("vector", "vector", "positive"), "vector"),
     Law(steering.offset_pursue, ("vector", "vector", "vector", "positive", "positive", "positive"), "vector"),
     Law(
         steering.keep_station, ("vector", "vector", "vector", "own", "positive", "length"), "vector", turns="upright",
@@ -329,9 +330,9 @@ EFFECTS = (
     ),
     EffectRow(Pursue(weight=2, speed=1.5, group=0, radius=2.5), family="others"),
     EffectRow(Evade(weight=2, speed=1.5, group=0, radius=2.5, predictor="exact", fov=300), family="others"),
-    EffectRow(OffsetPursue(weight=2, speed=1.5, radius=2.5, distance=0.5, predictor="opensteer"), family="others"),
+    EffectRow(OffsetPursue(weight=2, speed=1.5, radius=2.5, distance=0.3), family="others"),
     EffectRow(
-        Shadow(weight=2, speed=1.5, group=0, radius=2.5, distance=0.5, predictor="distance"), family="others"
+        Shadow(weight=2, speed=1.5, group=0, radius=2.5, distance=0.5, predictor="opensteer"), family="others"
     ),
     EffectRow(MatchVelocity(weight=2, radius=2.5), family="others"),
     EffectRow(
