@@ -16,6 +16,7 @@ from types import ModuleType
 from typing import Any
 
 import numpy as np
+import pytest
 from numpy.typing import NDArray
 
 from flockenv import arbitration, steering
@@ -28,7 +29,17 @@ from flockenv.arbitration import (
     RoundRobin,
     RunningSum,
 )
-from flockenv.behaviours import Alignment, AvoidObstacles, Cohesion, Separation
+from flockenv.behaviours import (
+    Alignment,
+    AvoidObstacles,
+    Cohesion,
+    Explore,
+    Forage,
+    Orca,
+    Queue,
+    Separation,
+    UnalignedAvoidance,
+)
 from flockenv.effects import EFFECTS as EFFECT_KINDS
 from flockenv.effects import (
     AngularSprings,
@@ -73,7 +84,7 @@ from flockenv.scene import Group, Scene
 from flockenv.space import Box, Plane, Space, Torus
 from flockenv.spawn import Spawn
 from flockenv.steer import Steer
-from flockenv.tasks import Flock, Obstacles, Pursuit, Task
+from flockenv.tasks import Crossing, Flock, Obstacles, Pursuit, Task
 
 Array = NDArray[np.float64]
 
@@ -143,6 +154,11 @@ STEERING = (
     Law(steering.cohere, ("vector", "vector", "positive"), "vector"),
     Law(steering.threat, ("heading", "vector", "positive", "length"), "positive"),
     Law(steering.avoid, ("heading", "vector", "positive", "positive"), "vector"),
+    Law(steering.unaligned_threat, ("vector", "vector", "vector", "positive", "length"), "positive"),
+    Law(steering.give_way, ("vector", "vector", "vector", "positive", "positive"), "vector"),
+    Law(steering.queue_gap, ("heading", "vector", "vector", "positive", "positive"), "positive"),
+    Law(steering.queue, ("heading", "vector", "positive", "positive", "positive"), "vector"),
+    Law(steering.explore, ("walls", "walls", "vector", "positive", "positive"), "vector", turns="none", mirrors=False),
     Law(steering.contain, ("walls", "walls", "vector", "positive", "positive"), "vector", turns="none", mirrors=False),
     Law(steering.heed, ("vector",) * 5 + ("positive",) * 5, "vector"),
     Law(steering.behind, ("vector", "vector", "length"), "vector"),
@@ -170,6 +186,7 @@ class EffectRow:
     beside: tuple[Effect, ...] = ()  # without which it moves nobody: what a medium drags or carries
     obeys: frozenset[str] = frozenset({"translation", "rotation", "mirror", "relabelling"})
     signed: tuple[str, ...] = ()  # parameters that may be negative
+    dimensions: tuple[int, ...] = (2, 3)  # where it is at home
 
     @property
     def name(self) -> str:
@@ -179,7 +196,9 @@ class EffectRow:
         return "_".join([self.effect.kind, *words])
 
     def at(self, dimension: int) -> tuple[Effect, ...]:
-        """The effect in so many dimensions, and those beside it."""
+        """The effect in so many dimensions, and those beside it; a test of others is skipped."""
+        if dimension not in self.dimensions:
+            pytest.skip(f"{self.name}: not in {dimension}-D")
         return tuple(in_dimension(effect, dimension) for effect in (self.effect, *self.beside))
 
 
@@ -244,6 +263,18 @@ EFFECTS = (
     EffectRow(Alignment(weight=0.7, radius=3, fov=270)),
     EffectRow(Cohesion(weight=0.9, radius=2.8, fov=240)),
     EffectRow(AvoidObstacles(weight=5, horizon=3, margin=0.1)),
+    EffectRow(UnalignedAvoidance(weight=3, radius=4, horizon=2, margin=0.2)),
+    EffectRow(Queue(weight=2, target=CENTRE, speed=1.2, margin=0.1)),
+    # to each his own way to look for food
+    EffectRow(Forage(weight=2, food=1, speed=1.2, radius=2.4), obeys=frozenset({"translation"})),
+    EffectRow(
+        Explore(weight=2, low=(-1, -1, -1), high=(7, 8, 7), speed=1.2, track=1.5),
+        obeys=frozenset({"translation", "relabelling"}), signed=("low", "high"),
+    ),
+    EffectRow(
+        Orca(weight=5, target=CENTRE, speed=1.2), obeys=frozenset({"translation", "rotation", "relabelling"}),
+        dimensions=(2,),  # in its mirror image everybody keeps left
+    ),
     EffectRow(
         Steer(
             behaviours=(
@@ -325,6 +356,8 @@ TASKS = (
     TaskRow(Obstacles()),
     TaskRow(Flock()),
     TaskRow(Flock(learners=1), "_single"),
+    TaskRow(Crossing()),
+    TaskRow(Crossing(agents=8, learners=1), "_single"),
 )
 
 

@@ -69,10 +69,14 @@ groups:
 effects:
   - kind: steer
     group: 0
-    behaviours: [{kind: unaligned_avoidance, weight: 4, margin: 0.2}, {kind: queue, weight: 2, target: [30, 0], speed: 1.2}]
+    behaviours:
+      - {kind: unaligned_avoidance, weight: 4, margin: 0.2}
+      - {kind: queue, weight: 2, target: [30, 0], speed: 1.2}
   - kind: steer
     group: 1
-    behaviours: [{kind: unaligned_avoidance, weight: 4, margin: 0.2}, {kind: queue, weight: 2, target: [0, 30], speed: 1.2}]
+    behaviours:
+      - {kind: unaligned_avoidance, weight: 4, margin: 0.2}
+      - {kind: queue, weight: 2, target: [0, 30], speed: 1.2}
 """
 
     @property
