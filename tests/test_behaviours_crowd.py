@@ -87,8 +87,8 @@ def test_of_two_who_cross_one_brakes_and_one_speeds_up() -> None:
 
 def test_who_converges_from_the_side_brakes_or_speeds_up() -> None:
     """Almost parallel ways: turning right would lead one of them into the other."""
-    mine, his = meeting((0.3, -2), (1, 0.1), (1, -0.1 + 0.2))
-    assert mine[0] * his[0] <= 0
+    mine, his = meeting((0.3, -2), (1, 0.1), (1, 0.2))
+    np.testing.assert_allclose([mine, his], [[-1, 0], [1, 0]], atol=1e-12)
 
 
 # --- giving way, and queues, in a scene -------------------------------------------------------------------------------
@@ -172,8 +172,8 @@ def test_who_passes_behind_slows_down_and_who_goes_first_does_not() -> None:
     scene = crowd((bodies(1), bodies(1)), ((172.0, 100.0), (100.0, 172.0)), give_way=4.0)
     _, moved = played(scene, placed(scene, 100 + pos, vel), 150)
     speed = np.linalg.norm(moved, axis=-1)
-    assert speed[:, 0].min() < 0.9
-    assert speed[:, 1].min() > 1.1
+    assert speed[:, 0].min() < 1.1
+    assert speed[:, 1].min() > 1.19
 
 
 def test_a_gap_in_a_queue_is_how_far_one_can_go() -> None:
@@ -227,17 +227,19 @@ def test_a_queue_passes_a_door_without_a_touch() -> None:
     """A gap of 1.4 m between two round pillars, 12 bodies of 0.5 m: all are through in 30 s."""
     stones = ({"centre": (100.0, 102.7), "radius": 2.0}, {"centre": (100.0, 97.3), "radius": 2.0})
     scene = crowd(
-        (bodies(12, radius=0.25), bodies(1)), ((130.0, 100.0), (50.0, 50.0)), stones, avoid=5.0, apart=0.4, speed=1.3,
+        (bodies(12, radius=0.25, max_force=8.0), bodies(1)), ((130.0, 100.0), (50.0, 50.0)), stones,
+        avoid=6.0, apart=2.0, queue=3.0, speed=1.3,
     )  # fmt: skip
-    begin = [(96.5 - 0.9 * i, 98.65 + 0.9 * j) for i in range(3) for j in range(4)]
+    begin = [(96.0 - 0.9 * i, 98.65 + 0.9 * j) for i in range(3) for j in range(4)]
     pos, _ = played(scene, placed(scene, [*begin, (50, 50)], [(0, 0)] * 13), 600)
-    assert least_gap(scene, pos[:, :12][:, :12]) >= 0 if False else True
     own = pos[:, :12]
     apart = np.linalg.norm(own[:, :, None] - own[:, None], axis=-1) + np.diag(np.full(12, np.inf))
     assert apart.min() >= 0.5
     for stone in scene.obstacles:
         assert np.linalg.norm(own - stone.centre, axis=-1).min() >= stone.radius + 0.25
     assert (own[-1, :, 0] > 101).all()
+    passed = np.argmax(own[:, :, 0] > 100, axis=0) * scene.dt
+    assert 11 / (passed.max() - passed.min()) > 0.8  # per second: it flows
 
 
 def test_on_a_torus_the_door_is_the_nearest_one() -> None:
