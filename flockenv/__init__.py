@@ -20,7 +20,16 @@ if TYPE_CHECKING:
     from flockenv.scene import Scene
     from flockenv.snapshot import Snapshot
     from flockenv.state import Body, State
-    from flockenv.tasks import TASKS, Crossing, Flock, Herd, Obstacles, Pursuit, Task
+    from flockenv.tasks import (
+        TASKS,
+        Crossing,
+        Evade,
+        Flock,
+        Herd,
+        Obstacles,
+        Pursuit,
+        Task,
+    )
     from flockenv.world import Step, World
 
 __version__ = "0.1.0"
@@ -29,6 +38,7 @@ __all__ = [
     "TASKS",
     "Body",
     "Crossing",
+    "Evade",
     "Flock",
     "Herd",
     "Obstacles",
@@ -49,6 +59,7 @@ _HOME = {
     "State": "state",
     "TASKS": "tasks",
     "Crossing": "tasks",
+    "Evade": "tasks",
     "Flock": "tasks",
     "Herd": "tasks",
     "Obstacles": "tasks",

@@ -18,7 +18,7 @@ __all__ = ["Orca"]
 
 def kept(slots: Vec, new: Vec) -> Vec:
     """Return the slots with a new one sorted in by its power distance, |offset|^2 - radius^2; the last drops out."""
-    raise NotImplementedError("a part of kernels")
+    raise TypeError("it is a part of kernels")
 
 
 @overload(kept, jit_options=OPTIONS)
@@ -126,6 +126,9 @@ effects:
         """Refuse space."""
         if scene.dimension != 2:
             raise ValueError(f"kind = orca: dimension = {scene.dimension}, must be 2")
+        for k, obstacle in enumerate(scene.obstacles):
+            if obstacle.kind != "circle":
+                raise ValueError(f"kind = orca: sees round obstacles alone, obstacles[{k}].kind = {obstacle.kind}")
         super().check(scene)
 
     def sums(self, dimension: int) -> int:

@@ -43,6 +43,7 @@ from flockenv.steering.others import (
     separate,
     shadow,
 )
+from flockenv.steering.paths import follow_flow, follow_path, stay_on_path
 
 __all__ = [
     "align",
@@ -58,7 +59,9 @@ __all__ = [
     "explore",
     "face",
     "flee",
+    "follow_flow",
     "follow_leader",
+    "follow_path",
     "give_way",
     "heed",
     "herd_from",
@@ -76,6 +79,7 @@ __all__ = [
     "seek",
     "separate",
     "shadow",
+    "stay_on_path",
     "target_speed",
     "threat",
     "unaligned_threat",
