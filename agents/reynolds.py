@@ -183,11 +183,11 @@ def crossing(see: Any, task: Crossing, p: CrossingRules) -> np.ndarray:
 
 @dataclass(frozen=True)
 class OrcaRules:
-    """As published: both take half, three seconds ahead."""
+    """As published, both take half; a wish that is not free is turned right, or twelve wait for each other."""
 
-    horizon: float = 3.0  # s, for so long the velocity must be free
+    horizon: float = 2.0  # s, for so long the velocity must be free
     margin: float = 0.1  # m, clearance for what inertia delays
-    turn: float = 0.1  # rad, a wish that is not free is turned right by this
+    turn: float = 0.3  # rad, a wish that is not free is turned right by this
     gain: float = 10.0  # kg/s: within a decision
     slow_radius: float = 1.0  # m, slow down within this of the goal
 
