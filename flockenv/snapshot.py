@@ -49,6 +49,7 @@ class Snapshot:
     time: s. pos (N, D): m. vel (N, D): m/s. alive (N,): bool. radius (N,): m. roles: N names out of ROLES.
     obstacle_centre (M, D), obstacle_radius (M,): m. marks: goals and headings. low, high (D,): the region to show, m.
     periodic: whether what leaves the region enters it on the far side. title: one line. D = 2 or 3; N and M may be 0.
+    outlines: polygons (n, 2), m, of obstacles that are not round, as seen from above.
     bonds (E, 2): int, pairs of agents that a line is drawn between, the shortest way; none by default.
     Arrays are private copies and read-only; positions and velocities may hold NaN or inf (a run that diverged can be
     looked at: such bodies are left out), everything else is finite.
@@ -69,6 +70,7 @@ class Snapshot:
     periodic: bool
     title: str
     bonds: NDArray[np.int32] = field(default_factory=lambda: np.zeros((0, 2), np.int32))
+    outlines: tuple[Floats, ...] = ()
 
     def __post_init__(self) -> None:
         pos = _array("Snapshot.pos", self.pos, (None, None), finite=False)
@@ -90,6 +92,7 @@ class Snapshot:
             high=_array("Snapshot.high", self.high, (dimension,)),
             periodic=bool(self.periodic),
             bonds=_pairs("Snapshot.bonds", self.bonds, agents),
+            outlines=tuple(_array("Snapshot.outlines", polygon, (None, 2)) for polygon in self.outlines),
         )
         if not isinstance(self.title, str):
             raise TypeError(f"Snapshot.title: must be a str, got {type(self.title).__name__}")

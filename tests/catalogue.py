@@ -30,12 +30,33 @@ from flockenv.arbitration import (
 )
 from flockenv.behaviours import (
     Alignment,
+    Arrive,
     AvoidObstacles,
     Cohesion,
+    Contain,
+    Dock,
+    Evade,
+    Face,
+    Flee,
     FollowFlow,
+    FollowLeader,
     FollowPath,
+    FollowWall,
+    FollowWay,
+    ForceField,
+    Formation,
+    Hide,
+    Interpose,
+    MatchVelocity,
+    OffsetPursue,
+    Pursue,
+    Seek,
     Separation,
+    Shadow,
     StayOnPath,
+    TargetSpeed,
+    Wander,
+    Whiskers,
 )
 from flockenv.effects import EFFECTS as EFFECT_KINDS
 from flockenv.effects import (
@@ -78,6 +99,7 @@ from flockenv.integrators import (
 )
 from flockenv.networks import Mesh
 from flockenv.scene import Group, Scene
+from flockenv.shapes import Circle
 from flockenv.space import Box, Plane, Space, Torus
 from flockenv.spawn import Spawn
 from flockenv.steer import Steer
@@ -181,6 +203,7 @@ class EffectRow:
     beside: tuple[Effect, ...] = ()  # without which it moves nobody: what a medium drags or carries
     obeys: frozenset[str] = frozenset({"translation", "rotation", "mirror", "relabelling"})
     signed: tuple[str, ...] = ()  # parameters that may be negative
+    family: str = ""  # rows of a family share a kernel: in its scene the others are there too, idle; see `company`
     flat: Effect | None = None  # the effect in the plane, where it is not enough to leave an axis out
 
     @property
@@ -194,6 +217,15 @@ class EffectRow:
         """The effect in so many dimensions, and those beside it."""
         effect = self.flat if self.flat is not None and dimension == 2 else self.effect
         return tuple(in_dimension(effect, dimension) for effect in (effect, *self.beside))
+
+    def company(self, dimension: int, idle: bool = False) -> tuple[Effect, ...]:
+        """The same among those of its family, which are idle; idle, it is so too."""
+        if not self.family:
+            effect, *beside = self.at(dimension)
+            return (effect.idle() if idle else effect, *beside)
+        family = [row for row in EFFECTS if row.family == self.family]
+        here = [(in_dimension(row.effect, dimension), row is self and not idle) for row in family]
+        return tuple(effect if acts else effect.idle() for effect, acts in here)
 
 
 def vectors(effect: Effect) -> dict[str, tuple[Any, ...]]:
@@ -214,6 +246,9 @@ def in_dimension(effect: Effect, dimension: int) -> Effect:
         for name, value in vectors(effect).items()
         if isinstance(value[0], tuple)
     }
+    within = getattr(effect, "within", None)
+    if isinstance(within, Circle) and dimension == 3:
+        flat["within"] = Circle(centre=(*within.centre[:2], 3.0), radius=within.radius)
     return effect.model_copy(update=flat)
 
 
@@ -235,6 +270,7 @@ def _tuples(value: Any) -> Any:
 DRAG = Drag(rate=0.4)
 WIND = Wind(velocity=(1.5, -0.7, 0.4), gust=(0.5, 1.0, -0.3), period=0.8)
 CENTRE = (2.5, 2.5, 2.5)
+UPRIGHT = frozenset({"translation", "relabelling"})
 LOOP = ((1.0, 1.0, 2.5), (5.0, 1.5, 3.0), (4.5, 5.0, 2.0), (1.5, 4.0, 3.5))
 FLOWS = tuple((0.3 * k % 2 - 1, 0.7 * k % 2 - 1, 0.9 * k % 2 - 1) for k in range(24))
 
@@ -275,6 +311,45 @@ EFFECTS = (
                 AvoidObstacles(weight=5, horizon=3), Separation(weight=1.3, radius=2.5), Alignment(weight=0.7, radius=3)
             )
         )
+    ),
+    EffectRow(Seek(weight=2, target=CENTRE, speed=1.5), family="goals"),
+    EffectRow(Flee(weight=2, target=CENTRE, speed=1.5, radius=4), family="goals"),
+    EffectRow(Arrive(weight=2, target=CENTRE, speed=1.5, slow_radius=2), family="goals"),
+    EffectRow(
+        Dock(weight=2, target=CENTRE, direction=(0.5, -1, 0.3), speed=1.5, gate=1, width=0.3, slow_radius=2),
+        family="goals",
+    ),
+    EffectRow(Face(weight=2, heading=(1, 2, -0.5)), family="goals"),
+    EffectRow(TargetSpeed(weight=2, speed=1.2), family="goals"),
+    EffectRow(  # to each his own, and his left is not his mirror image's
+        Wander(weight=2, speed=1.5, strength=0.8), obeys=frozenset({"translation"}), family="goals"
+    ),
+    EffectRow(Pursue(weight=2, speed=1.5, group=0, radius=2.5), family="others"),
+    EffectRow(Evade(weight=2, speed=1.5, group=0, radius=2.5, predictor="exact", fov=300), family="others"),
+    EffectRow(OffsetPursue(weight=2, speed=1.5, radius=2.5, distance=0.5, predictor="opensteer"), family="others"),
+    EffectRow(
+        Shadow(weight=2, speed=1.5, group=0, radius=2.5, distance=0.5, predictor="distance"), family="others"
+    ),
+    EffectRow(MatchVelocity(weight=2, radius=2.5), family="others"),
+    EffectRow(
+        Formation(weight=2, speed=1.5, group=0, radius=2.5, ahead=-0.5, left=0.7, up=0.2, slow_radius=1),
+        obeys=UPRIGHT, signed=("ahead", "left", "up"), family="others",  # left of it is right of its mirror image
+    ),
+    EffectRow(
+        FollowLeader(weight=2, speed=1.5, group=0, radius=2.5, distance=0.5, headway=0.3, slow_radius=1),
+        family="others",
+    ),
+    EffectRow(Interpose(weight=2, speed=1.5, group=0, other=0, radius=2.5, slow_radius=1), family="others"),
+    EffectRow(Hide(weight=2, speed=1.5, group=0, radius=2.5, slow_radius=1)),
+    EffectRow(Whiskers(weight=5, horizon=3), obeys=UPRIGHT, family="around"),  # in space they are horizontal and vertical
+    EffectRow(ForceField(weight=0.5, range=2), family="around"),
+    EffectRow(FollowWall(weight=2, speed=1.5, distance=0.7, range=4), family="around"),
+    EffectRow(  # its circle stays where it is
+        Contain(weight=2, speed=1.5, within=Circle(centre=(3, 3), radius=2.5)), obeys=frozenset({"relabelling"})
+    ),
+    EffectRow(  # its grid lies along the axes
+        FollowWay(weight=2, speed=1.5, target=(3.0, 5.5, 2.5), clearance=0.1, spacing=0.3, margin=1),
+        obeys=frozenset({"relabelling"}),
     ),
     EffectRow(FollowPath(weight=2, points=LOOP, closed=True, radius=0.3, speed=1.5), signed=("way",)),
     EffectRow(StayOnPath(weight=2, points=LOOP[:3], radius=0.4, speed=1.5, time=1)),
@@ -395,7 +470,7 @@ def scene_of(*effects: Effect, dimension: int = 2, space: Space | None = None, *
 
 def scene_under(row: EffectRow, dimension: int) -> Scene:
     """Return the scene in which tests try a row."""
-    return scene_of(*row.at(dimension), dimension=dimension)
+    return scene_of(*row.company(dimension), dimension=dimension)
 
 
 FIRST = tuple({row.effect.kind: row for row in reversed(EFFECTS)}.values())[::-1]
