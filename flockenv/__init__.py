@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from flockenv.scene import Scene
     from flockenv.snapshot import Snapshot
     from flockenv.state import Body, State
-    from flockenv.tasks import TASKS, Crossing, Flock, Herd, Obstacles, Pursuit, Task
+    from flockenv.tasks import TASKS, Crossing, Flock, Herd, Obstacles, PathFollow, Pursuit, Task
     from flockenv.world import Step, World
 
 __version__ = "0.1.0"
@@ -32,6 +32,7 @@ __all__ = [
     "Flock",
     "Herd",
     "Obstacles",
+    "PathFollow",
     "Pursuit",
     "Scene",
     "Snapshot",
@@ -52,6 +53,7 @@ _HOME = {
     "Flock": "tasks",
     "Herd": "tasks",
     "Obstacles": "tasks",
+    "PathFollow": "tasks",
     "Pursuit": "tasks",
     "Task": "tasks",
     "Step": "world",

@@ -103,7 +103,7 @@ from flockenv.shapes import Circle
 from flockenv.space import Box, Plane, Space, Torus
 from flockenv.spawn import Spawn
 from flockenv.steer import Steer
-from flockenv.tasks import Flock, Obstacles, Pursuit, Task
+from flockenv.tasks import Flock, Obstacles, PathFollow, Pursuit, Task
 
 Array = NDArray[np.float64]
 
@@ -433,6 +433,7 @@ TASKS = (
     TaskRow(Obstacles()),
     TaskRow(Flock()),
     TaskRow(Flock(learners=1), "_single"),
+    TaskRow(PathFollow()),
 )
 
 

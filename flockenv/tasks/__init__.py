@@ -15,6 +15,7 @@ from flockenv.tasks.crossing import Crossing  # noqa: E402  # after the folder h
 from flockenv.tasks.flock import Flock  # noqa: E402
 from flockenv.tasks.herd import Herd  # noqa: E402
 from flockenv.tasks.obstacles import Obstacles  # noqa: E402
+from flockenv.tasks.path_follow import PathFollow  # noqa: E402
 from flockenv.tasks.pursuit import Pursuit  # noqa: E402
 
-__all__ = ["TASKS", "Crossing", "Flock", "Frame", "Herd", "Layout", "Obstacles", "Pursuit", "Slot", "Task"]
+__all__ = ["TASKS", "Crossing", "Flock", "Frame", "Herd", "Layout", "Obstacles", "PathFollow", "Pursuit", "Slot", "Task"]

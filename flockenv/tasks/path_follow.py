@@ -73,7 +73,7 @@ def _nearest(p: Any, frame: Frame) -> tuple[int, float, float, Vec]:
     """
     x, y = frame.pos[0, 0], frame.pos[1, 0]
     angle = math.atan2(frame.memory[_TURN, 0] * (y - p.middle), x - p.middle) / (2.0 * math.pi)
-    here = int(math.floor(angle * POINTS)) + POINTS
+    here = math.floor(angle * POINTS) + POINTS
     best, piece, along, left, way = np.inf, 0, 0.0, 0.0, (1.0, 0.0)
     for k in range(-WINDOW, WINDOW + 1):
         i = (here + k) % POINTS
@@ -199,7 +199,7 @@ class PathFollow(Task):
     winding: float = Field(default=0.55, ge=0, le=0.8, description="bound of all its waves together, of the radius")
     half_width: float = Field(default=0.7, gt=0, description="m, of the track")
     lost_distance: float = Field(default=2.5, gt=0, description="m from its middle, from which on one is lost")
-    max_speed: float = Field(default=6.0, gt=0, description="m/s")
+    max_speed: float = Field(default=8.0, gt=0, description="m/s")
     max_force: float = Field(default=8.0, gt=0, description="N; the mass is 1 kg")
     ahead: int = Field(default=8, ge=1, le=64, description="how many points of the track are seen")
     spacing: float = Field(default=1.2, gt=0, description="m along the track from one to the next")
@@ -289,4 +289,4 @@ class PathFollow(Task):
     def marks(self, state: State, memory: NDArray[np.float64], world: int) -> tuple[Mark, ...]:
         """The track: a disc of its width at every corner."""
         corners = memory[: 2 * POINTS, world, 0].reshape(2, POINTS).T
-        return tuple(Mark("goal", corner, np.zeros(2), self.half_width) for corner in corners)
+        return tuple(Mark("way", corner, np.zeros(2), self.half_width) for corner in corners)
