@@ -18,10 +18,10 @@ from typing import Any
 import numpy as np
 import yaml
 
-from flockenv import arbitration, steering
+from flockenv import arbitration, shapes, steering
 from flockenv.orca import orca
 from flockenv.rows import rows
-from flockenv.tasks import Crossing, Flock, Herd, Obstacles, PathFollow, Pursuit, Task
+from flockenv.tasks import Crossing, Evade, Flock, Herd, Obstacles, PathFollow, Pursuit, Task
 
 __all__ = ["PLAYERS", "RULES", "Reynolds", "player", "tuned"]
 
@@ -33,6 +33,8 @@ threat, avoid = rows(steering.threat), rows(steering.avoid)
 separate, align = rows(steering.separate), rows(steering.align)
 unaligned_threat, give_way = rows(steering.unaligned_threat), rows(steering.give_way)
 allocate, keep_clear = rows(arbitration.allocate), rows(orca)
+evade_from, hiding_place = rows(steering.evade), rows(steering.hiding_place)
+ray_hit = rows(shapes.ray_hit)
 herd_from = rows(steering.herd_from)
 follow_path = rows(steering.follow_path)
 
@@ -203,6 +205,55 @@ def orca_crossing(see: Any, task: Crossing, p: OrcaRules) -> np.ndarray:
         see.velocity, wish, 0.3, task.max_speed, p.horizon, task.control_dt, p.turn, seen.reshape(len(seen), -1)
     )
     return p.gain * change
+# --- Evade: around what is in the way, off the walls, away from pursuers, into cover ----------------------------------
+class EvadeRules:
+    """Textbook: evade whoever is near, hide from the nearest otherwise (Reynolds 1999), in order of priority."""
+    horizon: float = 1.0  # s, how far ahead cover counts that is in the way
+    avoid: float = 5.0  # kg/s, strength of steering around it
+    wall: float = 0.5  # s, how far ahead walls count
+    alarm: float = 6.0  # m, within which a pursuer is evaded
+    predict: float = 0.5  # s, how far ahead a pursuer is predicted at most
+    evade: float = 5.0  # kg/s, strength of an evasion
+    crowd: float = 1.0  # how much farther pursuers count beside the nearest; 0: he alone
+    middle: float = 0.2  # N/m towards the middle of the field while evading
+    margin: float = 1.0  # m, behind cover
+    danger: float = 0.0  # m added to the way to a hiding place per m that a pursuer is nearer to it than 10 m
+    exposed: float = 0.0  # m added to it for each pursuer that sees that place
+    hide: float = 3.0  # kg/s, towards the hiding place
+def evade(see: Any, task: Evade, p: EvadeRules) -> np.ndarray:
+    """Avoid, contain, evade, hide: allocation in that order (Reynolds 1987)."""
+    top, row = task.evader_speed, np.arange(len(see.velocity))
+    speed = np.linalg.norm(see.velocity, axis=-1)
+    forward = see.velocity / np.maximum(speed, 1e-9)[:, None]
+    there, clearance = see.cover_radius > 0, see.cover_radius + 0.4
+    hit = np.where(there, threat(forward[:, None], see.cover, clearance, (speed * p.horizon)[:, None]), np.inf)
+    first = np.argmin(hit, axis=1)
+    aside = p.avoid * avoid(forward, see.cover[row, first], clearance[row, first], top)
+    aside *= np.isfinite(hit[row, first])[:, None]
+    inside = 5.0 * contain(see.to_low - 0.5, see.to_high - 0.5, see.velocity, top, p.wall)
+    distance = np.linalg.norm(see.pursuers, axis=-1)
+    time = np.minimum(distance / task.pursuer_speed, p.predict)
+    flight = evade_from(see.pursuers, see.velocity[:, None], see.pursuer_velocity, top, time)
+    rank = np.where(np.arange(distance.shape[1]) == 0, 1.0, p.crowd)
+    weight = rank * (distance < p.alarm) / np.maximum(distance, 0.1) ** 2
+    away = p.evade * np.sum(flight * weight[..., None], axis=1) / np.maximum(weight.sum(axis=1), 1e-9)[:, None]
+    near = (weight.sum(axis=1) > 0)[:, None]
+    away += p.middle * (see.to_high - see.to_low) / 2 * near
+    places = hiding_place(see.cover, see.cover_radius, p.margin, see.pursuers[:, :1])
+    theirs = np.linalg.norm(places[:, :, None] - see.pursuers[:, None], axis=-1).min(axis=-1)
+    way = np.linalg.norm(places, axis=-1) + p.danger * np.maximum(10.0 - theirs, 0.0)
+    way += p.exposed * _watchers(places, see)
+    soonest = np.argmin(np.where(there, way, np.inf), axis=1)
+    hidden = p.hide * arrive(places[row, soonest], see.velocity, top, 0.5) * there.any(axis=1)[:, None]
+    return allocate(np.stack([aside, inside, away, hidden], axis=1), task.evader_force)
+def _watchers(places: np.ndarray, see: Any) -> np.ndarray:
+    """Return how many pursuers have no cover between themselves and each of the places (R, K)."""
+    ways = places[:, :, None] - see.pursuers[:, None]
+    length = np.linalg.norm(ways, axis=-1)
+    stones = (see.cover[:, None, :] - see.pursuers[:, :, None])[:, None]
+    hit = ray_hit(stones, (ways / np.maximum(length, 1e-9)[..., None])[..., None, :], see.cover_radius[:, None, None])
+    hit = np.where(see.cover_radius[:, None, None] > 0, hit, np.inf)
+    return np.sum(hit.min(axis=-1) > length, axis=-1)
 
 
 # --- Herd: collect who strays, else drive them all from behind --------------------------------------------------------
@@ -290,6 +341,7 @@ _FINE = 5
 RULES: dict[str, tuple[Callable[..., np.ndarray], type]] = {
     "pursuit": (pursuit, PursuitRules),
     "obstacles": (obstacles, ObstaclesRules),
+    "evade": (evade, EvadeRules),
     "flock": (flock, FlockRules),
     "crossing": (crossing, CrossingRules),
     "herd": (herd, HerdRules),

@@ -20,7 +20,17 @@ if TYPE_CHECKING:
     from flockenv.scene import Scene
     from flockenv.snapshot import Snapshot
     from flockenv.state import Body, State
-    from flockenv.tasks import TASKS, Crossing, Flock, Herd, Obstacles, PathFollow, Pursuit, Task
+    from flockenv.tasks import (
+        TASKS,
+        Crossing,
+        Evade,
+        Flock,
+        Herd,
+        Obstacles,
+        PathFollow,
+        Pursuit,
+        Task,
+    )
     from flockenv.world import Step, World
 
 __version__ = "0.1.0"
@@ -29,6 +39,7 @@ __all__ = [
     "TASKS",
     "Body",
     "Crossing",
+    "Evade",
     "Flock",
     "Herd",
     "Obstacles",
@@ -50,6 +61,7 @@ _HOME = {
     "State": "state",
     "TASKS": "tasks",
     "Crossing": "tasks",
+    "Evade": "tasks",
     "Flock": "tasks",
     "Herd": "tasks",
     "Obstacles": "tasks",

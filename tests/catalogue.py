@@ -70,6 +70,7 @@ from flockenv.effects import (
     Gravitation,
     Gravity,
     InverseSquare,
+    ObstacleContact,
     Pressure,
     QuadraticDrag,
     Sink,
@@ -103,7 +104,8 @@ from flockenv.shapes import Circle
 from flockenv.space import Box, Plane, Space, Torus
 from flockenv.spawn import Spawn
 from flockenv.steer import Steer
-from flockenv.tasks import Flock, Obstacles, PathFollow, Pursuit, Task
+from flockenv.tasks import Evade as EvadeTask
+from flockenv.tasks import Flock, Herd, Obstacles, PathFollow, Pursuit, Task
 
 Array = NDArray[np.float64]
 
@@ -298,6 +300,7 @@ EFFECTS = (
         Swing(centre=CENTRE, strength=0.8, length=0.7), obeys=frozenset({"translation", "mirror", "relabelling"})
     ),
     EffectRow(WallRepulsion(point=CENTRE, normal=(1.2, -0.7, 0.9), strength=2, decay=1.5)),
+    EffectRow(ObstacleContact(stiffness=30, damping=0.5)),
     EffectRow(Fluctuation(strength=0.8), obeys=frozenset({"translation"})),  # to each his own, along the axes
     EffectRow(Pressure(strength=1.5, density=1, radius=1.35)),
     EffectRow(Separation(weight=1.3, radius=2.5)),
@@ -433,7 +436,10 @@ TASKS = (
     TaskRow(Obstacles()),
     TaskRow(Flock()),
     TaskRow(Flock(learners=1), "_single"),
+    TaskRow(EvadeTask()),
     TaskRow(PathFollow()),
+    TaskRow(Herd()),
+    TaskRow(Herd(dogs=3), "_team"),
 )
 
 

@@ -23,10 +23,20 @@ from flockenv.envs.face import (
     render_fps,
 )
 from flockenv.envs.page import page
-from flockenv.tasks import Crossing, Flock, Herd, Obstacles, PathFollow, Pursuit, Task
+from flockenv.tasks import Crossing, Evade, Flock, Herd, Obstacles, PathFollow, Pursuit, Task
 from flockenv.world import Step, World
 
-__all__ = ["CrossingEnv", "FlockEnv", "HerdEnv", "ObstaclesEnv", "PathFollowEnv", "PursuitEnv", "SingleEnv", "one_learner"]
+__all__ = [
+    "CrossingEnv",
+    "EvadeEnv",
+    "FlockEnv",
+    "HerdEnv",
+    "ObstaclesEnv",
+    "PathFollowEnv",
+    "PursuitEnv",
+    "SingleEnv",
+    "one_learner",
+]
 
 
 def one_learner(task_type: type[Task], parameters: dict[str, Any]) -> Task:
@@ -164,4 +174,11 @@ class HerdEnv(SingleEnv):
     """A dog gathers scripted sheep and drives them into a pen."""
 
     task_type = Herd
+    history = "v0: first version (flockenv 0.1.0)."
+
+
+class EvadeEnv(SingleEnv):
+    """An evader stays out of the hands of three scripted pursuers among cover."""
+
+    task_type = Evade
     history = "v0: first version (flockenv 0.1.0)."

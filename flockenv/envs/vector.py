@@ -31,11 +31,12 @@ from flockenv.envs.face import (
     together,
 )
 from flockenv.refusals import nearest
-from flockenv.tasks import Crossing, Flock, Herd, Obstacles, PathFollow, Pursuit, Task
+from flockenv.tasks import Crossing, Evade, Flock, Herd, Obstacles, PathFollow, Pursuit, Task
 from flockenv.world import Step, World
 
 __all__ = [
     "CrossingVectorEnv",
+    "EvadeVectorEnv",
     "FlockVectorEnv",
     "HerdVectorEnv",
     "ObstaclesVectorEnv",
@@ -368,3 +369,9 @@ class HerdVectorEnv(WorldsEnv):
     """Dogs, one per world or `dogs=` several; the page is that of flockenv.envs.single.HerdEnv."""
 
     task_type = Herd
+
+
+class EvadeVectorEnv(WorldsEnv):
+    """Evaders, one per world; the page is that of flockenv.envs.single.EvadeEnv."""
+
+    task_type = Evade

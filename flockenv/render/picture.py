@@ -270,7 +270,7 @@ def _bodies(pen: ImageDraw.ImageDraw, view: View, snapshot: Snapshot) -> None:
     reach = np.maximum(body, DART_REACH * view.width * swell)
     tied, dot = snapshot.tied, view.width * BOND
     spots = view.place(snapshot.pos)
-    aim = _aim(np.where(snapshot.visible[:, None], snapshot.vel, 0.0))
+    aim = _aim(np.where(snapshot.visible[:, None], snapshot.aim, 0.0))
     darts = _darts(spots, aim, 0.94 * reach)
     # The lowest first, and crosses over everything: an end must not hide under whoever brought it.
     for i in seen[np.argsort(np.where(snapshot.alive, depth, 2.0)[seen], kind="stable")].tolist():

@@ -12,7 +12,18 @@ from flockenv.sweep.far import far
 from flockenv.sweep.obstacles import obstacles
 from flockenv.sweep.pairs import pairs
 from flockenv.sweep.parts import Parts
-from flockenv.sweep.text import CONTEXT, Slots, alone, given, indented, lane, lanes_of, nearest_image, tuple_of
+from flockenv.sweep.text import (
+    CONTEXT,
+    Slots,
+    alone,
+    frame_views,
+    given,
+    indented,
+    lane,
+    lanes_of,
+    nearest_image,
+    tuple_of,
+)
 
 __all__ = ["accelerate", "parameters"]
 
@@ -20,13 +31,14 @@ __all__ = ["accelerate", "parameters"]
 def accelerate(parts: Parts) -> str:
     """Return the source of `accelerate`: pair laws first, then each agent by itself, block after block."""
     d = parts.dimension
-    me = ["i = row + l", f"x, v = {lanes_of(parts, 'pos')}, {lanes_of(parts, 'vel')}", f"me = {alone()}"]
+    me = ["i = row + l", f"x, v = {lanes_of(parts, 'pos')}, {lanes_of(parts, 'vel')}", f"me = {alone(parts)}"]
     return f'''
 
 @kernel
 def sense(context, pos, vel, time):
     """Write what this thread's agents of one world feel from others, at this instant, whatever law it is by."""
     {CONTEXT} = context
+{indented(frame_views(parts), 4)}
 {indented(parameters(parts), 4)}
     if rank == 0:
         work[b, 0] += 1
@@ -40,6 +52,7 @@ def respond(around, pos, vel, time, acc):
     """Acceleration of the agents of some of this thread's blocks, m/s^2, once all is sensed."""
     context, first_, end_ = around
     {CONTEXT} = context
+{indented(frame_views(parts), 4)}
 {indented(parameters(parts), 4)}
     for block in range(np.uint64(first_), np.uint64(end_)):
         base, row = block * np.uint64({d * parts.width}), block * np.uint64({parts.width})
@@ -115,7 +128,7 @@ def _medium(parts: Parts) -> list[str]:
     return [
         "m = o",
         *media,
-        f"me = {alone(medium='m')}",
+        f"me = {alone(parts, medium='m')}",
     ]
 
 
@@ -139,7 +152,7 @@ def _own(parts: Parts) -> list[str]:
         if effect.own_law is not None:
             still = effect.linear_drag is not None and parts.integrator.splits_drag
             if still:  # what is left of -c (v - u): the method adds -c v
-                lines.append(f"rest = {alone(medium='me.medium', vel='o', heading='o')}")
+                lines.append(f"rest = {alone(parts, medium='me.medium', vel='o', heading='o')}")
             lines.append(f"{to} = add({to}, own_law_{k}({given(parts, k)}, {'rest' if still else 'me'}))")
         if effect.obstacle_start is not None:
             lines.append(f"{to} = add({to}, obstacle_finish_{k}(p{k}, me, ({', '.join(slot.all(f'o{k}_'))},)))")

@@ -214,5 +214,5 @@ def _me(parts: Parts, fields: list[str]) -> str:
         return "(" + ", ".join(number(f"{letter}{k}") for k in range(parts.dimension)) + ")"
 
     numbers = ", ".join(number(name) for name in ("mass", "radius", "max_speed", "max_force"))
-    vectors = f"{vector('x')}, {vector('v')}, {vector('h')}"
+    vectors = f"{vector('x')}, {vector('v')}, {vector('d' if parts.oriented else 'h')}"
     return f"me = Me({number('who')}, {vectors}, {numbers}, {vector('t')}, time, zero({vector('x')}), drawn)"
