@@ -111,7 +111,7 @@ from flockenv.space import Box, Plane, Space, Torus
 from flockenv.spawn import Spawn
 from flockenv.steer import Steer
 from flockenv.tasks import Evade as EvadeTask
-from flockenv.tasks import Crossing, Flock, Herd, Obstacles, Pursuit, Task
+from flockenv.tasks import Crossing, Flock, Herd, Obstacles, PathFollow, Pursuit, Task
 
 Array = NDArray[np.float64]
 
@@ -466,6 +466,7 @@ TASKS = (
     TaskRow(Crossing()),
     TaskRow(Crossing(agents=8, learners=1), "_single"),
     TaskRow(EvadeTask()),
+    TaskRow(PathFollow()),
     TaskRow(Herd()),
     TaskRow(Herd(dogs=3), "_team"),
 )
