@@ -35,7 +35,7 @@ from flockenv.noise import MASK, key_of
 from flockenv.records import Record, keep
 from flockenv.rounding import check_places
 from flockenv.shapes import Circle
-from flockenv.snapshot import Snapshot
+from flockenv.snapshot import Mark, Snapshot
 from flockenv.space import AnySpace, Box, Plane, Torus
 from flockenv.spawn import Spawn, scatter
 from flockenv.stability import check_dt
@@ -165,10 +165,8 @@ class Scene(Record):
             for k, group in enumerate(self.groups):
                 if 2 * group.radius > min(self.space.size):
                     raise ValueError(f"groups[{k}].radius = {group.radius:g} does not fit into a box of size {size}")
-        if self.dtype == "float32" and self.agents > EXACT:
-            raise ValueError(
-                f"groups: {self.agents:,} agents: float32 counts exactly up to {EXACT:,}; use dtype = float64"
-            )
+        if self.dtype == "float32":
+            self._check_counts()
         needed = self.bytes_per_world()
         if needed > MEMORY_LIMIT:
             each = needed / self.agents
@@ -179,6 +177,12 @@ class Scene(Record):
         check_places(self)
         check_dt(self)
         return self
+
+    def _check_counts(self) -> None:
+        limit = f"float32 counts exactly up to {EXACT:,}; use dtype = float64"
+        for key, count, what in (("groups", self.agents, "agents"), ("effects", self.parts.count, "numbers")):
+            if count > EXACT:
+                raise ValueError(f"{key}: {count:,} {what}: {limit}")
 
     def _check_dimensions(self) -> None:
         size = getattr(self.space, "size", None)
@@ -255,9 +259,10 @@ class Scene(Record):
         """What the kernel is made of."""
         sorts = self.agents >= FEWEST_AGENTS
         crowded = self.agents > MOST_DIRECT
+        effects = flattened(self.effects)
         return Parts(
-            self.dimension, self.space, flattened(self.effects), self.integrator, self.dtype, sorts, crowded=crowded,
-            starts=self.starts,
+            self.dimension, self.space, effects, self.integrator, self.dtype, sorts, crowded=crowded,
+            starts=self.starts, tables=tuple(effect.table(self) for effect in effects if effect.tabled),
         )  # fmt: skip
 
     @functools.cached_property
@@ -283,7 +288,7 @@ class Scene(Record):
 
     @functools.cached_property
     def _params(self) -> Floats:
-        return np.array(self.parts.parameters(), self.dtype)
+        return self.parts.given()
 
     # --- running ----------------------------------------------------------------------------------------------------
 
@@ -524,7 +529,8 @@ class Scene(Record):
         return Snapshot(
             time=float(state.time[world]), pos=state.pos[world], vel=state.vel[world], alive=state.alive[world],
             radius=np.asarray(self.body.radius, np.float64), roles=self.roles,
-            obstacle_centre=state.obstacles.centre[world], obstacle_radius=state.obstacle_radius[world], marks=(),
+            obstacle_centre=state.obstacles.centre[world], obstacle_radius=state.obstacle_radius[world],
+            marks=self.marks,
             low=np.array(low, np.float64), high=np.array(high, np.float64),
             periodic=self.space.periodic, title=title, bonds=self.edges,
         )  # fmt: skip
@@ -536,6 +542,18 @@ class Scene(Record):
         pos = state.pos[world]
         margin = 1.0 + 0.05 * float(np.ptp(pos, axis=0).max())
         return tuple(pos.min(axis=0) - margin), tuple(pos.max(axis=0) + margin)
+
+    @property
+    def marks(self) -> tuple[Mark, ...]:
+        """The places that behaviours are about."""
+        still = np.zeros(self.dimension)
+        return tuple(
+            Mark("goal", np.array(getattr(wish, name)), still, 2 * max(group.radius for group in self.groups))
+            for wish in self.parts.effects
+            if wish.steering
+            for name in wish.places
+            if getattr(wish, name) is not None
+        )
 
     def with_effects(self, *effects: Effect) -> Scene:
         """Return the same scene under other effects."""

@@ -79,6 +79,12 @@ class State:
         return self.v.transpose(1, 2, 0)
 
     @property
+    def heading(self) -> Floats:
+        """Where everybody faces, unit vectors (B, N, D): along the velocity; 0 at standstill."""
+        speed = np.sqrt((self.vel**2).sum(axis=-1, keepdims=True))
+        return np.asarray(np.divide(self.vel, speed, out=np.zeros_like(self.vel), where=speed > 0))
+
+    @property
     def time(self) -> NDArray[np.float64]:
         """Time of each world, (B,) s: a whole number of steps times dt, so that it never drifts."""
         return np.asarray(self.tick * self.dt, np.float64)

@@ -96,7 +96,7 @@ class World:
         self._kernel = load(f"task_{task.name}", task_source(task))
         b, i, real = self.worlds, self.learners, scene.dtype
         self._actions = np.zeros((b, i, self.action_size))
-        numbers = (task.parts.parameters(), list(task.parameters().values()), task.table() or (0.0,))
+        numbers = (task.parts.given(), list(task.parameters().values()), task.table() or (0.0,))
         self._worlds = (
             s.x, s.v, s.alive, s.tick, s.obstacle_x, s.obstacle_radius, s.work, s.key, self._memory, self.steps,
             *(np.array(values, real) for values in numbers),

@@ -19,7 +19,37 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flockenv import arbitration, steering
-from flockenv.behaviours import Alignment, AvoidObstacles, Cohesion, Separation
+from flockenv.arbitration import (
+    Allocation,
+    Blend,
+    ContextSteering,
+    Dithering,
+    Priority,
+    RoundRobin,
+    RunningSum,
+)
+from flockenv.behaviours import (
+    Alignment,
+    Arrive,
+    AvoidObstacles,
+    Cohesion,
+    Dock,
+    Evade,
+    Face,
+    Flee,
+    FollowLeader,
+    Formation,
+    Hide,
+    Interpose,
+    MatchVelocity,
+    OffsetPursue,
+    Pursue,
+    Seek,
+    Separation,
+    Shadow,
+    TargetSpeed,
+    Wander,
+)
 from flockenv.effects import EFFECTS as EFFECT_KINDS
 from flockenv.effects import (
     AngularSprings,
@@ -65,7 +95,8 @@ from flockenv.scene import Group, Scene
 from flockenv.space import Box, Plane, Space, Torus
 from flockenv.spawn import Spawn
 from flockenv.steer import Steer
-from flockenv.tasks import Evade, Flock, Herd, Obstacles, Pursuit, Task
+from flockenv.tasks import Evade as EvadeTask
+from flockenv.tasks import Flock, Herd, Obstacles, Pursuit, Task
 
 Array = NDArray[np.float64]
 
@@ -142,6 +173,10 @@ STEERING = (
 )  # fmt: skip
 
 ARBITRATION = (arbitration.blend, arbitration.prioritise, arbitration.allocate, arbitration.allocate_running)
+"""Those for whoever has wishes and no scene."""
+
+ARBITRATIONS = (Blend(), Priority(), Dithering(), Allocation(), RunningSum(), RoundRobin(), ContextSteering())
+"""Those that a `Steer` effect may be given; tests/test_arbitration.py tries all of them."""
 
 
 # --- effects ----------------------------------------------------------------------------------------------------------
@@ -158,6 +193,7 @@ class EffectRow:
     beside: tuple[Effect, ...] = ()  # without which it moves nobody: what a medium drags or carries
     obeys: frozenset[str] = frozenset({"translation", "rotation", "mirror", "relabelling"})
     signed: tuple[str, ...] = ()  # parameters that may be negative
+    family: str = ""  # rows of a family share a kernel: in its scene the others are there too, idle; see `company`
 
     @property
     def name(self) -> str:
@@ -169,6 +205,15 @@ class EffectRow:
     def at(self, dimension: int) -> tuple[Effect, ...]:
         """The effect in so many dimensions, and those beside it."""
         return tuple(in_dimension(effect, dimension) for effect in (self.effect, *self.beside))
+
+    def company(self, dimension: int, idle: bool = False) -> tuple[Effect, ...]:
+        """The same among those of its family, which are idle; idle, it is so too."""
+        if not self.family:
+            effect, *beside = self.at(dimension)
+            return (effect.idle() if idle else effect, *beside)
+        family = [row for row in EFFECTS if row.family == self.family]
+        here = [(in_dimension(row.effect, dimension), row is self and not idle) for row in family]
+        return tuple(effect if acts else effect.idle() for effect, acts in here)
 
 
 def vectors(effect: Effect) -> dict[str, tuple[float, ...]]:
@@ -200,6 +245,7 @@ def turned(effect: Effect, matrix: Array, shift: Array) -> Effect:
 DRAG = Drag(rate=0.4)
 WIND = Wind(velocity=(1.5, -0.7, 0.4), gust=(0.5, 1.0, -0.3), period=0.8)
 CENTRE = (2.5, 2.5, 2.5)
+UPRIGHT = frozenset({"translation", "relabelling"})
 
 EFFECTS = (
     EffectRow(DRAG),
@@ -240,6 +286,35 @@ EFFECTS = (
             )
         )
     ),
+    EffectRow(Seek(weight=2, target=CENTRE, speed=1.5), family="goals"),
+    EffectRow(Flee(weight=2, target=CENTRE, speed=1.5, radius=4), family="goals"),
+    EffectRow(Arrive(weight=2, target=CENTRE, speed=1.5, slow_radius=2), family="goals"),
+    EffectRow(
+        Dock(weight=2, target=CENTRE, direction=(0.5, -1, 0.3), speed=1.5, gate=1, width=0.3, slow_radius=2),
+        family="goals",
+    ),
+    EffectRow(Face(weight=2, heading=(1, 2, -0.5)), family="goals"),
+    EffectRow(TargetSpeed(weight=2, speed=1.2), family="goals"),
+    EffectRow(  # to each his own, and his left is not his mirror image's
+        Wander(weight=2, speed=1.5, strength=0.8), obeys=frozenset({"translation"}), family="goals"
+    ),
+    EffectRow(Pursue(weight=2, speed=1.5, group=0, radius=2.5), family="others"),
+    EffectRow(Evade(weight=2, speed=1.5, group=0, radius=2.5, predictor="exact", fov=300), family="others"),
+    EffectRow(OffsetPursue(weight=2, speed=1.5, radius=2.5, distance=0.5, predictor="opensteer"), family="others"),
+    EffectRow(
+        Shadow(weight=2, speed=1.5, group=0, radius=2.5, distance=0.5, predictor="distance"), family="others"
+    ),
+    EffectRow(MatchVelocity(weight=2, radius=2.5), family="others"),
+    EffectRow(
+        Formation(weight=2, speed=1.5, group=0, radius=2.5, ahead=-0.5, left=0.7, up=0.2, slow_radius=1),
+        obeys=UPRIGHT, signed=("ahead", "left", "up"), family="others",  # left of it is right of its mirror image
+    ),
+    EffectRow(
+        FollowLeader(weight=2, speed=1.5, group=0, radius=2.5, distance=0.5, headway=0.3, slow_radius=1),
+        family="others",
+    ),
+    EffectRow(Interpose(weight=2, speed=1.5, group=0, other=0, radius=2.5, slow_radius=1), family="others"),
+    EffectRow(Hide(weight=2, speed=1.5, group=0, radius=2.5, slow_radius=1)),
     EffectRow(Gravitation(constant=0.3, softening=0.5)),  # of few the sum is exact; of many, see test_gravitation.py
     EffectRow(InverseSquare(strength=-0.4, softening=0.3), signed=("strength",)),
     # everybody is tied to somebody else; see `tied`
@@ -314,7 +389,7 @@ TASKS = (
     TaskRow(Obstacles()),
     TaskRow(Flock()),
     TaskRow(Flock(learners=1), "_single"),
-    TaskRow(Evade()),
+    TaskRow(EvadeTask()),
     TaskRow(Herd()),
     TaskRow(Herd(dogs=3), "_team"),
 )
@@ -354,7 +429,7 @@ def scene_of(*effects: Effect, dimension: int = 2, space: Space | None = None, *
 
 def scene_under(row: EffectRow, dimension: int) -> Scene:
     """Return the scene in which tests try a row."""
-    return scene_of(*row.at(dimension), dimension=dimension)
+    return scene_of(*row.company(dimension), dimension=dimension)
 
 
 FIRST = tuple({row.effect.kind: row for row in reversed(EFFECTS)}.values())[::-1]

@@ -15,9 +15,13 @@ An effect is of one or more of three forms, each a law for one agent:
 * `kick_law(p, me, seconds, gauss) -> velocity`: added once per step, however often a method asks for forces, with one
   standard normal number per axis (fluctuations);
 * `obstacle_start(p, me)`, `obstacle_law(p, me, other, acc) -> acc`, `obstacle_finish(p, me, acc) -> force`: a fold over
-  the obstacles.
+  the obstacles. Of an effect with a pair law too, `finish_law` gives no force but what it has found out about others, a
+  vector that is told to `obstacle_start(p, me, told)` (hide).
+  the obstacles; with no start of its own it goes before a fold over neighbours and hands over to it, so that both are
+  judged together.
 
-`p` holds the effect's `parameters()` by name, `me` and `other` are the records below. Laws live in the effect's module.
+`p` holds the effect's `parameters()` by name, and, if it is `tabled`, an array of numbers as `p.table`: the points of a
+path, the values of a grid. `me` and `other` are the records below. Laws live in the effect's module.
 A pair law says nothing of who is seen: it is evaluated for every candidate, and what it says of those outside the
 effect's `sight` (of agents themselves too) is dropped.
 
@@ -170,8 +174,10 @@ class Effect(Record):
     """Is the weight of whom a far law meets their mass? Else it is their number."""
     partners: ClassVar[int] = 1
     """How many partners a bond has beside the agent it acts on."""
+    tabled: ClassVar[bool] = False
+    """Do its laws look numbers up in its `table`?"""
     places: ClassVar[tuple[str, ...]] = ()
-    """Names of the parameters that are points: on a torus own, medium and flow laws are given the nearest images."""
+    """Names of the parameters that are points: on a torus all laws but of bonds and obstacles are given the nearest images."""
     strengths: ClassVar[tuple[str, ...]] = ("weight",)
     """Names of the fields that make it nothing when they are 0."""
     conserves_momentum: ClassVar[bool] = False
@@ -196,6 +202,11 @@ class Effect(Record):
     def reach(self) -> float:
         """How far it looks for neighbours, m; 0 if it does not."""
         return self.sight.radius if self.sight else 0.0
+
+    @property
+    def joined(self) -> bool:
+        """Is it one fold over obstacles and neighbours?"""
+        return self.obstacle_law is not None and self.obstacle_start is None
 
     @property
     def wishes(self) -> tuple[Effect, ...]:
@@ -237,6 +248,13 @@ class Effect(Record):
                 if value is not None
             }
         )
+
+    def table(self, scene: Any) -> NDArray[np.float64]:
+        """Return the numbers that its laws look up as `p.table`, (T,), T >= 1: as many as the scene calls for.
+
+        Asked for when a scene is built, after `check`; they are arguments, another table compiles nothing.
+        """
+        raise TypeError(f"{type(self).__name__} has no table")
 
     def rates(self, groups: Sequence[Any], dimension: int) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
         """Return bounds of w^2, 1/s^2, and of damping, 1/s, of every agent, (N,): how stiff it is, whatever happens.

@@ -31,10 +31,18 @@ from flockenv.envs.face import (
     together,
 )
 from flockenv.refusals import nearest
-from flockenv.tasks import Evade, Flock, Herd, Obstacles, Pursuit, Task
+from flockenv.tasks import Crossing, Evade, Flock, Herd, Obstacles, Pursuit, Task
 from flockenv.world import Step, World
 
-__all__ = ["EvadeVectorEnv", "FlockVectorEnv", "HerdVectorEnv", "ObstaclesVectorEnv", "PursuitVectorEnv", "WorldsEnv"]
+__all__ = [
+    "CrossingVectorEnv",
+    "EvadeVectorEnv",
+    "FlockVectorEnv",
+    "HerdVectorEnv",
+    "ObstaclesVectorEnv",
+    "PursuitVectorEnv",
+    "WorldsEnv",
+]
 
 Mask = NDArray[np.bool_]
 Info = dict[str, Any]
@@ -340,6 +348,13 @@ class FlockVectorEnv(WorldsEnv):
     """Learners in flocks, one per world or `learners=` several; the page is that of flockenv.envs.single.FlockEnv."""
 
     task_type = Flock
+    fixed: ClassVar[dict[str, Any]] = {"learners": 1}
+
+
+class CrossingVectorEnv(WorldsEnv):
+    """Walkers, one per world or `learners=` several; the page is that of flockenv.envs.single.CrossingEnv."""
+
+    task_type = Crossing
     fixed: ClassVar[dict[str, Any]] = {"learners": 1}
 
 

@@ -11,7 +11,7 @@ from flockenv.sweep.bonds import bonds
 from flockenv.sweep.far import far
 from flockenv.sweep.pairs import pairs
 from flockenv.sweep.parts import Parts
-from flockenv.sweep.text import CONTEXT, Slots, alone, indented, lane, lanes_of, tuple_of
+from flockenv.sweep.text import CONTEXT, Slots, alone, given, indented, lane, lanes_of, nearest_image, tuple_of
 
 __all__ = ["accelerate", "parameters"]
 
@@ -87,6 +87,9 @@ def parameters(parts: Parts) -> list[str]:
             each = ", ".join(f"params[{at + j}]" for j in range(count))
             values.append(f"({each},)" if isinstance(value, tuple) else each)
             at += count
+        if effect.tabled:
+            values.append(f"params[np.int64(params[{at}]) : np.int64(params[{at + 1}])]")
+            at += 2
         lines.append(f"p{k} = P{k}({', '.join(values) or 'params[0]'})")
     return lines
 
@@ -94,24 +97,15 @@ def parameters(parts: Parts) -> list[str]:
 def _nearest_images(parts: Parts) -> list[str]:
     """Write the numbers of those effects that know places anew: on a torus, with the images nearest to agent i."""
     lines = []
-    for k, effect in enumerate(parts.effects):
-        if _given(parts, k) == f"near{k}":
-            values = [
-                f"add(x, offset_to(size, x, p{k}.{name}))" if name in effect.places else f"p{k}.{name}"
-                for name in parts.numbers_of(effect)
-            ]
-            lines.append(f"near{k} = P{k}({', '.join(values)})")
+    for k in range(len(parts.effects)):
+        if given(parts, k) == f"near{k}":
+            lines.append(nearest_image(parts, k, "x"))
     return lines
-
-
-def _given(parts: Parts, k: int) -> str:
-    """Write by which name the numbers of effect k are given to a law of one agent."""
-    return f"near{k}" if parts.space.periodic and parts.effects[k].places else f"p{k}"
 
 
 def _medium(parts: Parts) -> list[str]:
     """Write how fast the medium is where agent i is, if any effect says so."""
-    media = [f"m = add(m, medium_law_{k}({_given(parts, k)}, me))" for k, e in enumerate(parts.effects) if e.medium_law]
+    media = [f"m = add(m, medium_law_{k}({given(parts, k)}, me))" for k, e in enumerate(parts.effects) if e.medium_law]
     if not media:
         return []
     return [
@@ -125,7 +119,7 @@ def _carry(parts: Parts) -> list[str]:
     """Write with which velocity the medium carries agent i, if it does."""
     if not parts.flows:
         return []
-    laws = [f"u = add(u, flow_law_{k}({_given(parts, k)}, me))" for k, e in enumerate(parts.effects) if e.flow_law]
+    laws = [f"u = add(u, flow_law_{k}({given(parts, k)}, me))" for k, e in enumerate(parts.effects) if e.flow_law]
     return [
         "u = o",
         *laws,
@@ -142,19 +136,23 @@ def _own(parts: Parts) -> list[str]:
             still = effect.linear_drag is not None and parts.integrator.splits_drag
             if still:  # what is left of -c (v - u): the method adds -c v
                 lines.append(f"rest = {alone(medium='me.medium', vel='o', heading='o')}")
-            lines.append(f"{to} = add({to}, own_law_{k}({_given(parts, k)}, {'rest' if still else 'me'}))")
-        if effect.obstacle_law is not None:
+            lines.append(f"{to} = add({to}, own_law_{k}({given(parts, k)}, {'rest' if still else 'me'}))")
+        if effect.obstacle_start is not None:
             lines.append(f"{to} = add({to}, obstacle_finish_{k}(p{k}, me, ({', '.join(slot.all(f'o{k}_'))},)))")
     return lines
 
 
+def _felt_as(parts: Parts, name: str) -> str:
+    """Write what the pair laws came to for one of their targets."""
+    d, t = parts.dimension, parts.targets.index(name)
+    each = d * len(parts.targets)
+    places = [f"felt[row * np.uint64({each}) + np.uint64({(d * t + k) * parts.width}) + l]" for k in range(d)]
+    return f"({', '.join(places)},)"
+
+
 def _felt(parts: Parts) -> list[str]:
     """Write how what the pair laws came to is added."""
-    d, lines = parts.dimension, []
-    each = d * len(parts.targets)
-    for t, name in enumerate(parts.targets):
-        places = [f"felt[row * np.uint64({each}) + np.uint64({(d * t + k) * parts.width}) + l]" for k in range(d)]
-        lines.append(f"{name} = add({name}, ({', '.join(places)},))")
+    lines = [f"{name} = add({name}, {_felt_as(parts, name)})" for name in parts.targets if name[0] != "n"]
     if parts.pulls:
         lines.append(f"f = add(f, {lanes_of(parts, 'pulled')})")
     return lines
@@ -165,10 +163,11 @@ def _reconcile(parts: Parts) -> list[str]:
     lines = []
     for k, effect in enumerate(parts.effects):
         if effect.wishes:
+            to = parts.target(k)
             wishes = ", ".join(parts.target(j) for j, by in parts.wishes.items() if by == k)
             lines += [
                 f"member = (ident[i] >= p{k}.first) & (ident[i] < p{k}.end)",
-                f"s = add(s, select(member, steer_law_{k}(p{k}, me, ({wishes},))[0], o))",
+                f"{to} = add({to}, select(member, steer_law_{k}(p{k}, me, ({wishes},))[0], o))",
             ]
     return lines
 
@@ -176,12 +175,13 @@ def _reconcile(parts: Parts) -> list[str]:
 def _obstacles(parts: Parts, me: list[str]) -> list[str]:
     """Write the folds over the obstacles, all of them in one pass; nothing if no law asks for obstacles."""
     slot = Slots(parts)
-    asking = [(k, slot.all(f"o{k}_")) for k, e in enumerate(parts.effects) if e.obstacle_law is not None]
+    asking = [(k, slot.all(f"o{k}_")) for k, e in enumerate(parts.effects) if e.obstacle_start is not None]
     if not asking:
         return []
     starts, meets = [], []
     for k, slots in asking:
-        starts.append(f"found = obstacle_start_{k}(p{k}, me)")
+        told = f", {_felt_as(parts, f'n{k}_')}" if parts.effects[k].pair_law else ""
+        starts.append(f"found = obstacle_start_{k}(p{k}, me{told})")
         starts += [f"{s} = found[{j}]" for j, s in enumerate(slots)]
         meets.append(f"found = obstacle_law_{k}(p{k}, me, it, ({', '.join(slots)},))")
         meets += [f"{s} = found[{j}]" for j, s in enumerate(slots)]

@@ -12,10 +12,11 @@ import inspect
 import math
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from flockenv.effects.base import Effect, Sight
 from flockenv.integrators.base import Integrator
@@ -54,6 +55,8 @@ class Parts:
     """Are there enough agents for groups of them to be met as one, where they are far away?"""
     starts: tuple[int, ...] = ()
     """The first agent of each group, and one more: numbers alone, the source does not depend on them."""
+    tables: tuple[NDArray[np.float64], ...] = field(default=(), compare=False)
+    """What the laws of each tabled effect look up, in order: numbers alone, too."""
 
     @functools.cached_property
     def width(self) -> int:
@@ -117,7 +120,12 @@ class Parts:
         return max((sight.radius for sight in self.sights), default=0.0)
 
     def parameters(self) -> list[float]:
-        """Every number that the kernel is given, in the order in which the source reads them."""
+        """Every number that the kernel is given, in the order in which the source reads them; tables come behind.
+
+        For each table there are two: where it begins, and where it ends.
+        """
+        bounds, tables = [], iter(np.cumsum([0, *map(len, self.tables)]).tolist())
+        begin = next(tables)
         values = [*self.space.extent(self.dimension), self.reach]
         for sight in self.sights:
             values += [sight.radius**2, view_of(sight.fov)]
@@ -126,13 +134,32 @@ class Parts:
         for effect in self.effects:
             for value in self.numbers_of(effect).values():
                 values.extend(value if isinstance(value, tuple) else (value,))
+            if effect.tabled:
+                bounds += [(len(values), begin), (len(values) + 1, begin := next(tables))]
+                values += [0.0, 0.0]
         values += self.space.numbers()
         values += self.integrator.settings()
-        return values + ([self.look.radius, self.look.radius**2] if self.look else [])
+        values += [self.look.radius, self.look.radius**2] if self.look else []
+        for place, bound in bounds:
+            values[place] = float(len(values) + bound)
+        return values
+
+    @property
+    def count(self) -> int:
+        """How many numbers the kernel is handed."""
+        return len(self.parameters()) + sum(map(len, self.tables))
+
+    def given(self) -> NDArray[Any]:
+        """Return `parameters()` and the tables behind them, in the scene's precision: what the kernel is handed."""
+        return np.concatenate([self.parameters(), *self.tables]).astype(self.dtype)
 
     def numbers_of(self, effect: Effect) -> dict[str, Any]:
         """Return the numbers and vectors that the laws of an effect are given, by name."""
         return {**effect.parameters(), **effect.members(self.starts)}
+
+    def names_of(self, effect: Effect) -> list[str]:
+        """Return the names under which the laws of an effect find what they are given."""
+        return [*self.numbers_of(effect), *(["table"] if effect.tabled else [])]
 
     @functools.cached_property
     def wishes(self) -> dict[int, int]:
@@ -145,6 +172,10 @@ class Parts:
     def target(self, k: int) -> str:
         """Write what effect k adds to: a wish of its own, what agents want, or what acts on them."""
         return f"w{k}_" if k in self.wishes else "s" if self.effects[k].steering else "f"
+
+    def pair_target(self, k: int) -> str:
+        """Write what the pair law of effect k adds to: the same, or what its fold over the obstacles is told."""
+        return f"n{k}_" if self.effects[k].obstacle_start is not None else self.target(k)
 
     def last_numbers(self, kind: str) -> int:
         """Return where in `parameters` the numbers of the "space" begin, or of the "method": they come last but one."""
@@ -164,9 +195,10 @@ class Parts:
 
     @functools.cached_property
     def targets(self) -> list[str]:
-        """What pair laws add to: what agents want, what acts on them, wishes."""
-        found = {self.target(k) for k, _ in self.pairs}
-        return [name for name in ("s", "f", *(f"w{k}_" for k in self.wishes)) if name in found]
+        """What pair laws add to: what agents want, what acts on them, wishes, what folds over obstacles are told."""
+        found = {self.pair_target(k) for k, _ in self.pairs}
+        names = ("s", "f", *(f"w{k}_" for k in self.wishes), *(f"n{k}_" for k, _ in self.pairs))
+        return [name for name in names if name in found]
 
     @functools.cached_property
     def fields(self) -> list[str]:
@@ -230,7 +262,7 @@ class Parts:
         d, look = self.dimension, self.look or Look(0.0)
         runs = [(f"c{k}_", e.sums(d)) for k, e in self.pairs]
         runs += [(f"near{q}_", sight.nearest or 0) for q, sight in enumerate(self.sights)]
-        runs += [(f"o{k}_", e.folded(d) if e.obstacle_law else 0) for k, e in enumerate(self.effects)]
+        runs += [(f"o{k}_", e.folded(d) if e.obstacle_start else 0) for k, e in enumerate(self.effects)]
         runs += [(f"g{name}", d) for name in self.targets] + [
             ("bond", d * bool(self.bonded)),
             ("far", d * bool(self.far)),
@@ -276,7 +308,11 @@ def view_of(fov: float) -> float:
 def _names(effect: Effect) -> set[str]:
     """Return every name in the code of an effect's pair laws and of the laws that they call."""
     module = vars(sys.modules[type(effect).__module__])
-    todo = [module[law] for law in (effect.pair_start, effect.pair_law, effect.finish_law) if law]
+    todo = [
+        module[law]
+        for law in (effect.pair_start, effect.pair_law, effect.finish_law, effect.joined and effect.obstacle_law)
+        if law
+    ]
     seen: set[int] = set()
     names: set[str] = set()
     while todo:

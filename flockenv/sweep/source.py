@@ -103,4 +103,4 @@ def _imports(parts: Parts) -> str:
 
 def _parameter_tuple(parts: Parts, k: int) -> str:
     """Declare the record by which effect k reads its numbers."""
-    return f'P{k} = namedtuple("P{k}", {" ".join(parts.numbers_of(parts.effects[k])) or "nothing"!r})'
+    return f'P{k} = namedtuple("P{k}", {" ".join(parts.names_of(parts.effects[k])) or "nothing"!r})'

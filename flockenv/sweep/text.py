@@ -10,8 +10,8 @@ from flockenv.kernels import LINE
 from flockenv.sweep.parts import Parts
 
 __all__ = [
-    "CONTEXT", "SHARED", "Slots", "alone", "copied", "indented", "indented_lines", "lane", "lanes_of", "place_of",
-    "tuple_of",
+    "CONTEXT", "SHARED", "Slots", "alone", "copied", "given", "indented", "indented_lines", "lane", "lanes_of",
+    "nearest_image", "place_of", "tuple_of",
 ]  # fmt: skip
 
 _READ = (
@@ -51,6 +51,21 @@ def alone(medium: str = "zero(x)", vel: str = "v", heading: str = "unit(v)") -> 
     """Write agent i, at x, as the laws of one agent see it: no tie, there is nobody to part from."""
     body = "mass[i], radius[i], max_speed[i], max_force[i]"
     return f"Me(ident[i], x, {vel}, {heading}, {body}, zero(x), time, {medium}, key[b])"
+
+
+def given(parts: Parts, k: int) -> str:
+    """Write by which name the numbers of effect k are given to its laws."""
+    return f"near{k}" if parts.space.periodic and parts.effects[k].places else f"p{k}"
+
+
+def nearest_image(parts: Parts, k: int, here: str) -> str:
+    """Write the numbers of effect k anew: with the images of its places that are nearest to `here`."""
+    effect = parts.effects[k]
+    values = [
+        f"add({here}, offset_to(size, {here}, p{k}.{name}))" if name in effect.places else f"p{k}.{name}"
+        for name in parts.names_of(effect)
+    ]
+    return f"near{k} = P{k}({', '.join(values)})"
 
 
 def copied(parts: Parts, to: str, at: str, source: str, place: str) -> list[str]:

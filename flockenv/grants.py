@@ -1,0 +1,190 @@
+"""What arbitration granted: for every `Steer` of a scene, what each behaviour wished for, and what it was given.
+
+found = granted(scene, state)[0]
+found.mean_share()  # {"avoid_obstacles": 1.0, "wander": 0.27}
+
+Wishes come from the scene's own kernel, in which one behaviour after another is heard alone; shares from the very law by
+which the scene reconciles them, in a loop over agents.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from flockenv.arbitration import Arbitration, Shares, Wishes
+from flockenv.kernels import Vec, law, like, load
+from flockenv.scene import Scene
+from flockenv.state import State
+from flockenv.steer import Steer
+from flockenv.vec import zero
+
+__all__ = ["Granted", "granted", "reconcile"]
+
+Reals = NDArray[np.floating[Any]]
+
+
+@dataclass(frozen=True, eq=False)
+class Granted:
+    """What one `Steer` effect granted at one instant. B worlds, N agents, K behaviours in order of priority."""
+
+    steer: Steer
+    effect: int  # its place in scene.effects
+    wish: Reals  # (B, N, K, D) N; 0 for whom it does not steer, and for the dead
+    share: Reals  # (B, N, K) of each wish, 0 to 1; 0 where nothing was wished for
+    force: Reals  # (B, N, D) N, what came of them, before it is bounded together with a drive
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """What the behaviours are called, (K,): their kinds, numbered where there are several of one."""
+        kinds = [behaviour.kind for behaviour in self.steer.behaviours]
+        return tuple(
+            kind if kinds.count(kind) == 1 else f"{kind} {kinds[: k + 1].count(kind)}" for k, kind in enumerate(kinds)
+        )
+
+    @property
+    def asked(self) -> NDArray[np.bool_]:
+        """Who wished for something, (B, N, K)."""
+        return np.asarray((self.wish != 0).any(axis=-1))
+
+    @property
+    def cut(self) -> NDArray[np.bool_]:
+        """Whose wish was not granted in full, (B, N, K)."""
+        return self.asked & (self.share < 1)
+
+    def mean_share(self) -> dict[str, float]:
+        """Return the mean share of each behaviour among those agents in whom it wished for something; NaN if nobody."""
+        asked = self.asked
+        return {
+            name: float(self.share[..., k][asked[..., k]].mean()) if asked[..., k].any() else float("nan")
+            for k, name in enumerate(self.names)
+        }
+
+
+class _Heard(Steer):
+    """The same behaviours, of whom one is heard; what it wishes for is not bounded by max_force."""
+
+    kind: str  # type: ignore[assignment]  # without a default it is not registered: no scene in YAML has it
+    which: int
+    steering: ClassVar[bool] = False
+
+    @property
+    def steer_law(self) -> tuple[str, str]:
+        """One of them."""
+        return __name__, "heard"
+
+    def parameters(self) -> dict[str, float | Vec]:
+        """Whom to hear."""
+        return {"which": float(self.which)}
+
+
+@law
+def heard(p: Any, me: Any, wishes: Wishes) -> tuple[Vec, Shares]:
+    """One wish and no other."""
+    total = zero(wishes[0])
+    for k in range(len(wishes)):
+        if like(p.which, k) == p.which:
+            total = wishes[k]
+    return total, (p.which,)
+
+
+def granted(scene: Scene, state: State) -> tuple[Granted, ...]:
+    """Return what each `Steer` of a scene grants at this instant, in the order of its effects; nothing moves.
+
+    The budget is max_force, whatever else the agents are driven to do.
+    """
+    return tuple(_granted(scene, state, k) for k, effect in enumerate(scene.effects) if isinstance(effect, Steer))
+
+
+def _granted(scene: Scene, state: State, which: int) -> Granted:
+    """Return what one of them grants."""
+    steer = scene.effects[which]
+    assert isinstance(steer, Steer)
+    wish = np.stack([_wishes(scene, state, steer, k) for k in range(len(steer.behaviours))], axis=2)
+    b, n, d = state.shape
+    many = np.arange(b * n)
+    force, share = reconcile(
+        steer.arbitration, wish.reshape(b * n, -1, d), max_force=np.tile(scene.body.max_force, b),
+        time=np.repeat(state.time, n), key=np.repeat(state.key, n), who=many % n,
+        heading=state.heading.reshape(b * n, d), dtype=scene.dtype,
+    )  # fmt: skip
+    share = share.reshape(wish.shape[:-1])
+    share = np.where((wish != 0).any(axis=-1), share, 0)
+    return Granted(steer, which, wish, share, force.reshape(state.shape))
+
+
+def _wishes(scene: Scene, state: State, steer: Steer, k: int) -> Reals:
+    """Return what one behaviour wishes for, (B, N, D) N."""
+    alone = _Heard(kind="heard", behaviours=steer.behaviours, arbitration=steer.arbitration, group=steer.group, which=k)
+    # a behaviour may read the medium; one that pushes, too, is no behaviour's business
+    media = tuple(effect for effect in scene.effects if effect.medium_law is not None and effect.own_law is None)
+    found = scene.with_effects(*media, alone).acceleration(state.copy())  # a copy: what is counted is the scene's
+    return np.asarray(found * np.where(np.isfinite(scene.body.mass), scene.body.mass, 0)[:, None])
+
+
+def reconcile(
+    arbitration: Arbitration, wishes: ArrayLike, max_force: ArrayLike, time: ArrayLike = 0.0, key: ArrayLike = 0,
+    who: ArrayLike = 0, heading: ArrayLike | None = None, dtype: Any = np.float64,
+) -> tuple[Reals, Reals]:  # fmt: skip
+    """Return the force, (R, D) N, and the share of each wish, (R, K), that an arbitration makes of wishes (R, K, D) N.
+
+    The other arguments are (R,), or one number for all: N, s, the key of the world, which agent; heading (R, D).
+    """
+    asked = np.ascontiguousarray(wishes, dtype)
+    if asked.ndim != 3 or asked.shape[1] < 1 or asked.shape[2] not in (2, 3):
+        raise ValueError(f"wishes has shape {asked.shape}, expected (R, K, D) with K >= 1 and D = 2 or 3")
+    rows, count, dimension = asked.shape
+    ahead = np.zeros((rows, dimension)) if heading is None else heading
+    numbers = arbitration.parameters(count)
+    flat = [x for value in numbers.values() for x in (value if isinstance(value, tuple) else (value,))]
+    force, share = np.empty((rows, dimension), dtype), np.empty((rows, count), dtype)
+    sizes = tuple(len(value) if isinstance(value, tuple) else 0 for value in numbers.values())
+    _loop(type(arbitration).__module__, arbitration.law, tuple(numbers), sizes, count, dimension)(
+        asked, *(np.ascontiguousarray(np.broadcast_to(x, rows), kind) for x, kind in
+                 ((max_force, dtype), (time, dtype), (key, np.uint64), (who, dtype))),
+        np.ascontiguousarray(np.broadcast_to(ahead, (rows, dimension)), dtype), np.array(flat or [0.0], dtype), force,
+        share,
+    )  # fmt: skip
+    return force, share
+
+
+@functools.lru_cache(maxsize=256)
+def _loop(
+    module: str, name: str, names: tuple[str, ...], sizes: tuple[int, ...], count: int, dimension: int
+) -> Callable[..., None]:
+    """Write and load the loop of one arbitration over rows."""
+    at, values = 0, []
+    for size in sizes:
+        each = ", ".join(f"numbers[{at + j}]" for j in range(size or 1))
+        values.append(f"({each},)" if size else each)
+        at += size or 1
+    wishes = ", ".join("(" + ", ".join(f"wishes[r, {k}, {j}]" for j in range(dimension)) + ")" for k in range(count))
+    ahead = "(" + ", ".join(f"heading[r, {j}]" for j in range(dimension)) + ")"
+    store = [f"force[r, {j}] = f[{j}]" for j in range(dimension)] + [f"share[r, {k}] = s[{k}]" for k in range(count)]
+    return load(
+        f"rows_{name}",
+        f'''"""{module}.{name} over rows, generated by flockenv.grants; safe to delete."""
+from collections import namedtuple
+from numba import njit
+from flockenv.effects.base import Me
+from {module} import {name} as steer_law
+
+P = namedtuple("P", {" ".join(names) or "nothing"!r})
+
+
+@njit(cache=True, fastmath={{"contract"}}, error_model="numpy", nogil=True)
+def over(wishes, max_force, time, key, who, heading, numbers, force, share):
+    p = P({", ".join(values) or "numbers[0]"})
+    o = max_force.dtype.type(0)
+    for r in range(wishes.shape[0]):
+        h = {ahead}
+        me = Me(who[r], h, h, h, o, o, o, max_force[r], h, time[r], h, key[r])
+        f, s = steer_law(p, me, ({wishes},))
+        {"; ".join(store)}
+''',
+    ).over  # type: ignore[no-any-return]

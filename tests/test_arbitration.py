@@ -1,0 +1,339 @@
+"""Many wishes, one force: what every arbitration must obey, what sets each apart, and what `Steer` makes of them."""
+
+from __future__ import annotations
+
+import math
+import re
+from typing import Any
+
+import numpy as np
+import pytest
+
+from flockenv.arbitration import (
+    ARBITRATIONS,
+    Allocation,
+    Arbitration,
+    Blend,
+    ContextSteering,
+    Dithering,
+    Priority,
+    RoundRobin,
+    RunningSum,
+    allocate,
+    allocate_running,
+)
+from flockenv.behaviours import AvoidObstacles, Separation
+from flockenv.config import dump_scene, load_scene
+from flockenv.effects import Drag, Effect
+from flockenv.grants import granted, reconcile
+from flockenv.noise import key_of
+from flockenv.rows import rows
+from flockenv.scene import Group, Scene
+from flockenv.space import Torus
+from flockenv.spawn import Spawn
+from flockenv.steer import Steer
+from flockenv.sweep import scene_source
+from tests import catalogue
+from tests.catalogue import Array
+
+ALL = pytest.mark.parametrize("arbitration", catalogue.ARBITRATIONS, ids=lambda a: a.kind)
+PRECISIONS = pytest.mark.parametrize("dtype", ["float64", pytest.param("float32", marks=pytest.mark.slow)])
+DIMENSIONS = pytest.mark.parametrize("dimension", [2, pytest.param(3, marks=pytest.mark.slow)])
+
+BUDGET = 10.0
+
+
+def requests(dimension: int, count: int = 3, many: int = 200) -> Array:
+    """Wishes of all sizes, some of them zero, (R, K, D) N."""
+    rng = np.random.default_rng(3)
+    wishes = rng.normal(size=(many, count, dimension)) * 10 ** rng.uniform(-3, 3, (many, count, 1))
+    return np.asarray(wishes * (rng.random((many, count, 1)) < 0.8))
+
+
+def reconciled(arbitration: Arbitration, wishes: Array, **more: Any) -> tuple[Any, Any]:
+    """Force and shares, agent by agent at different times."""
+    r = len(wishes)
+    given = {"max_force": BUDGET, "time": np.arange(r) * 0.05, "key": key_of(1, 0), "who": np.arange(r)} | more
+    return reconcile(arbitration, wishes, **given)
+
+
+# --- what all obey ----------------------------------------------------------------------------------------------------
+
+
+@DIMENSIONS
+@PRECISIONS
+@ALL
+def test_shares_are_from_none_to_all_and_sum_to_the_force(arbitration: Arbitration, dtype: str, dimension: int) -> None:
+    """Of blend before the sum is bounded, of context steering not: that goes where nobody asked to go."""
+    wishes = requests(dimension).astype(dtype)
+    force, share = reconciled(arbitration, wishes, dtype=dtype)
+    assert force.dtype == share.dtype == np.dtype(dtype)
+    assert ((share >= 0) & (share <= 1)).all()
+    length = np.linalg.norm(force, axis=-1, keepdims=True)
+    if isinstance(arbitration, Blend):
+        force = force * np.minimum(1, BUDGET / np.maximum(length, 1e-9))
+    else:
+        assert (length <= BUDGET * (1 + 8 * np.finfo(dtype).eps)).all()
+    if not isinstance(arbitration, ContextSteering):
+        atol = 64 * np.finfo(dtype).eps * BUDGET * max(1, np.abs(wishes).max() / BUDGET)
+        np.testing.assert_allclose((share[..., None] * wishes).sum(axis=1), force, atol=atol)
+
+
+@DIMENSIONS
+@PRECISIONS
+@ALL
+def test_it_is_finite_without_wishes_without_a_budget_and_without_a_bound(
+    arbitration: Arbitration, dtype: str, dimension: int
+) -> None:
+    """Without a bound every wish that is heard is heard in full."""
+    wishes = np.concatenate([requests(dimension), np.zeros((1, 3, dimension)), np.ones((1, 3, dimension))])
+    for budget in (0.0, math.inf, BUDGET):
+        force, share = reconciled(arbitration, wishes, max_force=budget, dtype=dtype)
+        assert np.isfinite(force).all()
+        assert np.isfinite(share).all()
+        np.testing.assert_array_equal(force[-2], 0)
+        if budget == 0 and not isinstance(arbitration, Blend):
+            np.testing.assert_array_equal(force, 0)
+        if math.isinf(budget) and not isinstance(arbitration, ContextSteering):
+            assert np.isin(share, (0, 1)).all()
+
+
+@ALL
+def test_a_single_wish_within_the_budget_is_granted(arbitration: Arbitration) -> None:
+    """By all who hear everybody at all times; by context steering exactly, for one of its directions is that one."""
+    wishes = np.array([[(3.0, 4.0)], [(-6.0, 8.0)], [(0.0, 0.5)]])
+    arbitration = arbitration.model_copy(update={"dangers": 0}) if arbitration.kind == "context" else arbitration
+    arbitration = (
+        arbitration.model_copy(update={"probability": 1.0}) if arbitration.kind == "dithering" else arbitration
+    )
+    force, share = reconciled(arbitration, wishes)
+    np.testing.assert_allclose(force, wishes[:, 0], rtol=1e-12)
+    np.testing.assert_allclose(share, 1, rtol=1e-12)
+
+
+# --- what sets each apart ---------------------------------------------------------------------------------------------
+
+CONFLICT = np.array([[(8.0, 0.0), (-8.0, 0.0), (0.0, 5.0)]])
+
+
+def test_reynolds_budget_and_the_running_sum_differ_on_opposite_wishes() -> None:
+    """(8, 0), (-8, 0), (0, 5) within 10: scalars add up, or the sum gives room back (formulas.md 1.3)."""
+    force, share = reconciled(Allocation(), CONFLICT)
+    np.testing.assert_allclose(force, [(6, 0)])
+    np.testing.assert_allclose(share, [(1, 0.25, 0)])
+    force, share = reconciled(RunningSum(), CONFLICT)
+    np.testing.assert_allclose(force, [(6, 4)])
+    np.testing.assert_allclose(share, [(1, 0.25, 0.8)])
+    np.testing.assert_allclose(rows(allocate)(CONFLICT, BUDGET), [(6, 0)])
+    np.testing.assert_allclose(rows(allocate_running)(CONFLICT, BUDGET), [(6, 4)])
+
+
+def test_a_blend_of_opposite_wishes_is_nothing() -> None:
+    force, share = reconciled(Blend(), CONFLICT[:, :2])
+    np.testing.assert_array_equal(force, [(0, 0)])
+    np.testing.assert_array_equal(share, [(1, 1)])
+
+
+def test_in_an_emergency_the_first_has_the_whole_budget() -> None:
+    emergency = np.array([[(0.0, 25.0), (4.0, 0.0), (1.0, 1.0)]])
+    for arbitration in (Allocation(), RunningSum(), Priority()):
+        force, share = reconciled(arbitration, emergency)
+        np.testing.assert_allclose(force, [(0, 10)])
+        np.testing.assert_allclose(share, [(0.4, 0, 0)], atol=1e-15)
+
+
+def test_priority_passes_on_what_is_not_longer_than_its_threshold() -> None:
+    for first, expected in ((0.5, (0, 5)), (0.51, (0.51, 0))):
+        force, _ = reconciled(Priority(threshold=0.5), np.array([[(first, 0.0), (0.0, 5.0)]]))
+        np.testing.assert_allclose(force, [expected])
+
+
+def test_dithering_hears_each_as_often_as_its_probability_says() -> None:
+    """p, (1 - p) q, the rest nobody: within four standard deviations of 20,000 worlds; and of 20,000 draws of one."""
+    many = 20_000
+    wishes = np.tile(CONFLICT[:, :2], (many, 1, 1))
+    keys = np.array([key_of(seed, 0) for seed in range(many)])
+    dithering = Dithering(probability=(0.7, 0.5), period=0.1)
+    for more in ({"key": keys, "time": 0.0, "who": 0}, {"time": 0.1 * np.arange(many), "who": 0}, {"time": 0.0}):
+        _, share = reconciled(dithering, wishes, **more)
+        heard = [share[:, 0].mean(), share[:, 1].mean(), (share == 0).all(axis=1).mean()]
+        np.testing.assert_allclose(heard, [0.7, 0.15, 0.15], atol=4 * 0.5 / math.sqrt(many))
+
+
+@pytest.mark.parametrize("arbitration", [Dithering(probability=0.5, period=0.1), RoundRobin(period=0.1)])
+@PRECISIONS
+def test_who_is_heard_does_not_depend_on_how_time_is_cut(arbitration: Arbitration, dtype: str) -> None:
+    """At times that are multiples of the period too, where floor(0.3 / 0.1) is 2 or 3 by rounding."""
+    whole = np.arange(600)  # times of 0.1 s
+    found = []
+    for dt in (0.1, 0.05, 0.02, 0.01):
+        time = (whole * round(0.1 / dt)) * dt
+        found.append(reconciled(arbitration, np.tile(CONFLICT, (600, 1, 1)), time=time, who=0, dtype=dtype)[1])
+    for other in found[1:]:
+        np.testing.assert_array_equal(other, found[0])
+    if isinstance(arbitration, RoundRobin):
+        np.testing.assert_array_equal(np.argmax(found[0] > 0, axis=1), whole % 3)
+
+
+def test_round_robin_gives_everybody_a_turn_of_a_period() -> None:
+    time = np.arange(60) * 0.01 + 0.005
+    _, share = reconciled(RoundRobin(period=0.1), np.tile(CONFLICT, (60, 1, 1)), time=time)
+    np.testing.assert_array_equal(np.argmax(share, axis=1), np.repeat([0, 1, 2, 0, 1, 2], 10))
+    assert (share.sum(axis=1) == 1).all()
+
+
+@DIMENSIONS
+def test_context_steering_never_goes_where_it_is_more_dangerous(dimension: int) -> None:
+    """Of any direction, not only of those that are weighed, up to what lies between two of them."""
+    context = ContextSteering(dangers=2, directions=256)
+    wishes = requests(dimension, count=4)
+    force, _ = reconciled(context, wishes, max_force=math.inf)
+    some = np.linalg.norm(force, axis=-1) > 1e-9
+    ways = np.random.default_rng(0).normal(size=(4000, dimension))
+    ways /= np.linalg.norm(ways, axis=-1, keepdims=True)
+
+    def danger(way: Array) -> Array:
+        return np.asarray(np.maximum(0, -np.einsum("rkd,rwd->rwk", wishes[some][:, :2], way)).sum(axis=-1))
+
+    gone = force[some] / np.linalg.norm(force[some], axis=-1, keepdims=True)
+    many = np.broadcast_to(ways, (int(some.sum()), *ways.shape))
+    apart = math.pi / 256 if dimension == 2 else 2 * math.sqrt(math.pi / 256)
+    least, most = danger(many).min(axis=1), danger(many).max(axis=1)
+    assert (danger(gone[:, None])[:, 0] <= least + 2 * (apart + 1e-3) * most).all()
+    assert some.mean() > 0.9
+
+
+def test_context_steering_goes_around_what_a_blend_runs_into() -> None:
+    """Danger ahead as strong as the goal behind it: the sum is nothing, the best of the safe directions is not."""
+    wishes = np.array([[(-8.0, 0.0), (8.0, 0.5)]])
+    force, _ = reconciled(ContextSteering(), wishes)
+    assert np.linalg.norm(force) > 0.4
+    assert force[0, 0] <= 0.1
+    np.testing.assert_allclose(reconciled(Blend(), wishes)[0], [(0, 0.5)])
+
+
+# --- Steer, in scenes -------------------------------------------------------------------------------------------------
+
+SEPARATION = Separation(weight=6.0, radius=2.5)
+AVOID = AvoidObstacles(weight=5.0, horizon=3.0, margin=0.1)
+
+
+def crowd(*effects: Effect, **more: Any) -> Scene:
+    """Two groups among two obstacles, who may ask for little."""
+    spawn = Spawn(speed=(0.5, 1.5))
+    groups = tuple(Group(count=n, max_force=4.0, max_speed=2.0, spawn=spawn) for n in (9, 7))
+    given: dict[str, Any] = {
+        "space": Torus(size=(9.0, 9.0)), "groups": groups, "effects": effects, "dt": 0.05,
+        "obstacles": ({"centre": (3.0, 3.0), "radius": 0.7}, {"centre": (6.5, 5.0), "radius": 0.5}),
+    }  # fmt: skip
+    return Scene(**given | more)
+
+
+def test_steer_of_one_behaviour_under_blend_is_the_behaviour() -> None:
+    """Bit for bit: neither the sum nor its bound is taken twice."""
+    alone, steered = crowd(SEPARATION), crowd(Steer(behaviours=(SEPARATION,), arbitration=Blend()))
+    ends = [scene.run(scene.start(2, worlds=3), 60) for scene in (alone, steered)]
+    np.testing.assert_array_equal(ends[0].x, ends[1].x)
+    np.testing.assert_array_equal(ends[0].v, ends[1].v)
+
+
+def test_steer_leaves_other_groups_alone_and_grants_what_it_says() -> None:
+    steer = Steer(group=1, behaviours=(AVOID, SEPARATION), arbitration=Allocation())
+    scene = crowd(steer)
+    state = scene.start(2, worlds=3)
+    end = scene.run(state, 40)
+    np.testing.assert_array_equal(end.vel[:, :9], state.vel[:, :9])
+    assert not np.allclose(end.vel[:, 9:], state.vel[:, 9:])
+
+    before = end.work.copy()
+    found = granted(scene, end)[0]
+    np.testing.assert_array_equal(end.work, before)  # looking costs the scene nothing
+    assert (found.names, found.effect) == (("avoid_obstacles", "separation"), 0)
+    np.testing.assert_array_equal(found.wish[:, :9], 0)
+    np.testing.assert_array_equal(found.share[:, :9], 0)
+    np.testing.assert_allclose(found.force, scene.acceleration(end), atol=1e-12)  # 1 kg
+    np.testing.assert_allclose((found.share[..., None] * found.wish).sum(axis=2), found.force, atol=1e-12)
+    assert np.linalg.norm(found.wish, axis=-1).max() > 4.0  # wishes are not bounded
+    assert found.cut.any()
+    assert set(found.mean_share()) == {"avoid_obstacles", "separation"}
+    where = found.asked[..., 1]
+    assert found.mean_share()["separation"] == pytest.approx(float(found.share[..., 1][where].mean()))
+    order = found.asked[..., 0] & found.asked[..., 1]
+    assert (found.share[order][:, 0] >= found.share[order][:, 1]).all()
+
+
+def test_what_no_behaviour_asks_for_costs_nothing() -> None:
+    """No query without a behaviour that looks around, and no line of Steer's in a scene without one."""
+    scene = crowd(Steer(behaviours=(AVOID,)))
+    source = scene_source(scene.parts)
+    assert "count_cells(" not in source
+    assert "pair_law" not in source
+    assert "steer_law" not in scene_source(crowd(AVOID, SEPARATION).parts)
+    assert scene_source(crowd(Drag(rate=1)).parts) == scene_source(crowd(Drag(rate=2)).parts)
+
+
+@ALL
+def test_steer_is_yaml_and_back(arbitration: Arbitration) -> None:
+    scene = crowd(Steer(group=1, behaviours=(AVOID, SEPARATION), arbitration=arbitration), Drag(rate=0.1))
+    again = load_scene(dump_scene(scene))
+    assert again == scene
+    assert again.effects[0].arbitration == arbitration  # type: ignore[attr-defined]  # a Steer's
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("dimension", [2, 3])
+@PRECISIONS
+@ALL
+def test_every_arbitration_steers_a_scene(arbitration: Arbitration, dtype: str, dimension: int) -> None:
+    """The kernel does what the law says, wherever agents are, on top of each other at rest too."""
+    change: dict[str, Any] = {"dtype": dtype, "dimension": dimension, "space": Torus(size=(9.0,) * dimension)}
+    change["obstacles"] = tuple({"centre": (x,) * dimension, "radius": 0.7} for x in (3.0, 6.5))
+    scene = crowd(Steer(behaviours=(AVOID, SEPARATION), arbitration=arbitration), **change)
+    end = scene.run(scene.start(4, worlds=2), 25)
+    found = granted(scene, end)[0].force
+    length = np.linalg.norm(found, axis=-1, keepdims=True)
+    bounded = found * np.minimum(1, 4 / np.maximum(length, 1e-9))
+    tolerance = 1e-11 if dtype == "float64" else 2e-3
+    np.testing.assert_allclose(bounded, scene.acceleration(end), atol=tolerance)
+    end.pos[...] = 3.0
+    end.vel[...] = 0
+    after = scene.run(end, 5)
+    assert np.isfinite(after.pos).all()
+
+
+# --- refusals ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (lambda: Steer(behaviours=(Drag(rate=1),)), ("behaviours[0].kind = drag", "is no behaviour")),
+        (lambda: Steer(behaviours=(Steer(behaviours=(AVOID,)),)), ("behaviours[0].kind = steer", "is no behaviour")),
+        (lambda: Steer(behaviours=()), ("behaviours",)),
+        (lambda: crowd(Steer(group=2, behaviours=(AVOID,))), ("effects[0].group = 2", "2 groups")),
+        (
+            lambda: Steer(behaviours=(AVOID, SEPARATION), arbitration=Dithering(probability=(0.5,))),
+            ("arbitration.probability = (0.5,)", "2 behaviours"),
+        ),
+        (lambda: Dithering(probability=1.5), ("probability",)),
+        (lambda: RoundRobin(period=0), ("period",)),
+        (lambda: ContextSteering(directions=3), ("directions",)),
+        (lambda: Steer(behaviours=(AVOID,), arbitration={"kind": "blnd"}), ("arbitration", "blend")),
+    ],
+)
+def test_what_does_not_fit_is_refused_in_one_line(make: Any, words: tuple[str, ...]) -> None:
+    with pytest.raises(ValueError, match=re.escape(words[0])) as refused:
+        make()
+    text = str(refused.value)
+    assert "\n" not in text
+    for word in words:
+        assert word in text
+
+
+def test_wishes_of_a_wrong_shape_are_refused() -> None:
+    with pytest.raises(ValueError, match=r"wishes has shape \(3, 2\), expected \(R, K, D\)"):
+        reconcile(Blend(), np.zeros((3, 2)), BUDGET)
+
+
+def test_every_kind_is_registered_once() -> None:
+    assert sorted(ARBITRATIONS) == sorted(a.kind for a in catalogue.ARBITRATIONS)
