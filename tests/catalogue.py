@@ -110,8 +110,8 @@ from flockenv.shapes import Circle
 from flockenv.space import Box, Plane, Space, Torus
 from flockenv.spawn import Spawn
 from flockenv.steer import Steer
-from flockenv.tasks import Evade as EvadeTask
 from flockenv.tasks import Crossing, Flock, Herd, Obstacles, PathFollow, Pursuit, Task
+from flockenv.tasks import Evade as EvadeTask
 
 Array = NDArray[np.float64]
 
