@@ -41,6 +41,10 @@ RANGES: dict[str, dict[str, tuple[float, float]]] = {
         "horizon": (0.5, 4.0), "margin": (0.0, 1.0), "evade": (0.5, 8.0), "radius": (1.0, 3.0), "apart": (0.0, 8.0),
         "match": (0.0, 5.0), "centre": (0.0, 2.0), "course": (0.2, 6.0), "blend": (0.0, 1.0),
     },
+    "herd": {
+        "together": (0.3, 2.0), "collecting": (0.0, 4.0), "driving": (0.3, 2.5), "near": (0.0, 5.0), "slow": (0.0, 1.0),
+        "gain": (1.0, 12.0), "around": (0.0, 6.0), "width": (0.5, 2.0), "apart": (0.0, 10.0),
+    },
 }  # fmt: skip
 """Where each parameter is looked for."""
 

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from flockenv.scene import Scene
     from flockenv.snapshot import Snapshot
     from flockenv.state import Body, State
-    from flockenv.tasks import TASKS, Flock, Obstacles, Pursuit, Task
+    from flockenv.tasks import TASKS, Flock, Herd, Obstacles, Pursuit, Task
     from flockenv.world import Step, World
 
 __version__ = "0.1.0"
@@ -29,6 +29,7 @@ __all__ = [
     "TASKS",
     "Body",
     "Flock",
+    "Herd",
     "Obstacles",
     "Pursuit",
     "Scene",
@@ -47,6 +48,7 @@ _HOME = {
     "State": "state",
     "TASKS": "tasks",
     "Flock": "tasks",
+    "Herd": "tasks",
     "Obstacles": "tasks",
     "Pursuit": "tasks",
     "Task": "tasks",

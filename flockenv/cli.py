@@ -1,4 +1,4 @@
-"""flockenv on the command line: list | run | render | explain | accuracy | stress | warmup | schema.
+"""flockenv on the command line: list | run | render | explain | accuracy | stress | gallery | warmup | schema.
 
 Errors are one line on stderr, exit code 2.
 """
@@ -20,7 +20,7 @@ import typer
 
 import flockenv
 from flockenv.refusals import nearest, shown
-from flockenv.studies import accuracy, stress
+from flockenv.studies import accuracy, gallery, stress
 from flockenv.terminal import (
     BAD_INPUT,
     DIVERGED,
@@ -246,6 +246,7 @@ def explain(scene: SceneFile) -> None:
 
 app.command()(accuracy)
 app.command()(stress)
+app.command()(gallery)
 
 
 @app.command()

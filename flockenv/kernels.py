@@ -23,7 +23,7 @@ from typing import Any, TypeVar, cast
 
 import numba
 from llvmlite import ir  # type: ignore[import-untyped]
-from numba.core import types
+from numba.core import cgutils, types
 from numba.cpython.unsafe.tuple import tuple_setitem
 from numba.extending import intrinsic, overload, register_jitable
 from numba.np import arrayobj
@@ -35,6 +35,7 @@ __all__ = [
     "FAST",
     "LINE",
     "OPTIONS",
+    "Numbers",
     "Vec",
     "cache_folder",
     "copy_line",
@@ -47,6 +48,7 @@ __all__ = [
     "load",
     "replaced",
     "shared",
+    "stacked",
     "unaliased",
     "unfused",
     "wait_for_team",
@@ -56,6 +58,9 @@ F = TypeVar("F", bound=Callable[..., Any])
 
 Vec = tuple[float, ...]
 """A vector inside a law: a tuple of D floats, D = 2 or 3."""
+
+Numbers = tuple[float, ...]
+"""As many numbers as there are: a tuple of floats of any length, the same for all agents."""
 
 # Fused multiply-add and nothing else. The rest of fastmath gave no speed here and took much: with `arcp` and `afn` a
 # division in a vector register is an estimate and a scalar one is exact, so that results depend on how agents are
@@ -178,6 +183,31 @@ def _copy_line(typing_context: Any, to: Any, at: Any, source: Any, place: Any) -
 
 
 copy_line: Any = intrinsic(_copy_line)
+
+
+def _stacked(typing_context: Any, numbers: Any) -> Any:
+    """Return the numbers of a tuple as an array that a law may write, for as long as whoever calls it runs.
+
+    It lies on the stack: laws allocate nothing. A law never returns it.
+    """
+    if not isinstance(numbers, types.UniTuple):
+        raise numba.TypingError(f"stacked: {numbers}, must be a tuple of numbers of one kind")
+    array = types.Array(numbers.dtype, 1, "C")
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        make: Any = arrayobj.make_array
+        number = context.get_data_type(numbers.dtype)
+        place = cgutils.alloca_once_value(builder, arguments[0])
+        made = make(array)(context, builder)
+        size, count = (context.get_constant(types.intp, n) for n in (context.get_abi_sizeof(number), numbers.count))
+        data = builder.bitcast(place, number.as_pointer())
+        arrayobj.populate_array(made, data=data, shape=[count], strides=[size], itemsize=size, meminfo=None)
+        return made._getvalue()
+
+    return array(numbers), generate
+
+
+stacked: Any = intrinsic(_stacked)
 
 _PATIENCE = 2000  # rounds of waiting before the core is offered to somebody else
 

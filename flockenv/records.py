@@ -73,6 +73,12 @@ class Record(BaseModel, metaclass=_OneLine):
     def __str__(self) -> str:
         return repr(self)
 
+    def __eq__(self, other: object) -> bool:
+        """Compare the fields alone: what follows from them may be arrays, and need not be there yet."""
+        return type(self) is type(other) and all(
+            getattr(self, name) == getattr(other, name) for name in type(self).model_fields
+        )
+
     def model_copy(self, *, update: Mapping[str, Any] | None = None, deep: bool = False) -> Self:
         """Return the record with some fields changed, checked like a new one; nothing that was derived comes along."""
         fields = {name: getattr(self, name) for name in type(self).model_fields}

@@ -19,7 +19,7 @@ from flockenv.kernels import load
 
 __all__ = ["rows"]
 
-_RANK = {"Vec": 1, "Wishes": 2, "float": 0}
+_RANK = {"Vec": 1, "Numbers": 1, "Wishes": 2, "float": 0}
 
 
 @functools.lru_cache(maxsize=256)
@@ -28,6 +28,7 @@ def rows(law: Callable[..., Any]) -> Callable[..., NDArray[np.float64]]:
     python: Any = getattr(law, "py_func", law)
     parameters = inspect.signature(python).parameters
     ranks = tuple(_RANK[str(p.annotation)] for p in parameters.values())
+    any_length = {name for name, p in parameters.items() if name == "weights" or str(p.annotation) == "Numbers"}
     answer = _RANK[str(inspect.signature(python).return_annotation)]
 
     @functools.wraps(python)
@@ -36,7 +37,7 @@ def rows(law: Callable[..., Any]) -> Callable[..., NDArray[np.float64]]:
             raise TypeError(f"{python.__name__} takes {len(ranks)} arguments ({', '.join(parameters)})")
         arrays = [np.asarray(a, np.float64) for a in arguments]
         for name, array, rank in zip(parameters, arrays, ranks, strict=True):
-            if array.ndim < rank or (rank and array.shape[-1] not in (2, 3) and str(name) != "weights"):
+            if array.ndim < rank or (rank and array.shape[-1] not in (2, 3) and name not in any_length):
                 expected = "(..., K, D)" if rank == 2 else "(..., D)"
                 raise ValueError(f"{python.__name__}: {name} has shape {array.shape}, expected {expected}")
         tails = tuple(a.shape[a.ndim - r :] for a, r in zip(arrays, ranks, strict=True))
@@ -45,7 +46,9 @@ def rows(law: Callable[..., Any]) -> Callable[..., NDArray[np.float64]]:
             np.ascontiguousarray(np.broadcast_to(a, lead + t)).reshape((-1, *t))
             for a, t in zip(arrays, tails, strict=True)
         ]
-        dimensions = {t[-1] for t, r, name in zip(tails, ranks, parameters, strict=True) if r and name != "weights"}
+        dimensions = {
+            t[-1] for t, r, name in zip(tails, ranks, parameters, strict=True) if r and name not in any_length
+        }
         if len(dimensions) > 1:
             raise ValueError(f"{python.__name__}: vectors of {' and of '.join(map(str, sorted(dimensions)))} numbers")
         dimension = max(dimensions, default=0)

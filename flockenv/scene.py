@@ -35,10 +35,10 @@ from flockenv.noise import MASK, key_of
 from flockenv.records import Record, keep
 from flockenv.rounding import check_places
 from flockenv.shapes import Circle
-from flockenv.snapshot import Snapshot
+from flockenv.snapshot import Mark, Snapshot
 from flockenv.space import AnySpace, Box, Plane, Torus
 from flockenv.spawn import Spawn, scatter
-from flockenv.stability import check_dt
+from flockenv.stability import check_dt, check_lookahead
 from flockenv.state import Body, Floats, State
 from flockenv.steer import EVERY_EFFECT
 from flockenv.sweep import SHARED, Parts, Table, field_source, flattened, pack, scene_source
@@ -105,8 +105,8 @@ class Group(Record):
     )
     banking: float | None = Field(
         default=None, gt=0,
-        description="s, in which it leans into its turns (3-D), as far as lateral acceleration against 9.81 m/s^2 says; "
-        "none = it does not; oriented if given",
+        description="s, in which it leans into its turns (3-D), as far as lateral acceleration against 9.81 m/s^2 "
+        "says; none = it does not; oriented if given",
     )  # fmt: skip
     spawn: Spawn = Field(default_factory=Spawn)
     role: Literal["agent", "learner", "pursuer", "evader", "flockmate"] = Field(
@@ -181,10 +181,8 @@ class Scene(Record):
             for k, group in enumerate(self.groups):
                 if 2 * group.radius > min(self.space.size):
                     raise ValueError(f"groups[{k}].radius = {group.radius:g} does not fit into a box of size {size}")
-        if self.dtype == "float32" and self.agents > EXACT:
-            raise ValueError(
-                f"groups: {self.agents:,} agents: float32 counts exactly up to {EXACT:,}; use dtype = float64"
-            )
+        if self.dtype == "float32":
+            self._check_counts()
         needed = self.bytes_per_world()
         if needed > MEMORY_LIMIT:
             each = needed / self.agents
@@ -194,7 +192,14 @@ class Scene(Record):
             )
         check_places(self)
         check_dt(self)
+        check_lookahead(self)
         return self
+
+    def _check_counts(self) -> None:
+        limit = f"float32 counts exactly up to {EXACT:,}; use dtype = float64"
+        for key, count, what in (("groups", self.agents, "agents"), ("effects", self.parts.count, "numbers")):
+            if count > EXACT:
+                raise ValueError(f"{key}: {count:,} {what}: {limit}")
 
     def _check_dimensions(self) -> None:
         size = getattr(self.space, "size", None)
@@ -275,11 +280,13 @@ class Scene(Record):
         """What the kernel is made of."""
         sorts = self.agents >= FEWEST_AGENTS
         crowded = self.agents > MOST_DIRECT
+        effects = flattened(self.effects)
         return Parts(
-            self.dimension, self.space, flattened(self.effects), self.integrator, self.dtype, sorts, crowded=crowded,
+            self.dimension, self.space, effects, self.integrator, self.dtype, sorts, crowded=crowded,
             oriented=any(group.keeps_heading for group in self.groups),
             turns=any(group.max_turn_rate is not None for group in self.groups),
             leans=any(group.banking is not None for group in self.groups), starts=self.starts,
+            tables=tuple(effect.table(self) for effect in effects if effect.tabled),
         )  # fmt: skip
 
     @functools.cached_property
@@ -305,7 +312,7 @@ class Scene(Record):
 
     @functools.cached_property
     def _params(self) -> Floats:
-        return np.array(self.parts.parameters(), self.dtype)
+        return self.parts.given()
 
     # --- running ----------------------------------------------------------------------------------------------------
 
@@ -444,8 +451,8 @@ class Scene(Record):
             raise ValueError(f"times is {times!r}, must be a finite number for each of {b} worlds, or one for all")
         when = np.ascontiguousarray(np.broadcast_to(given, b), self.dtype)
         self._field(
-            state.x, state.v, *state.frames, state.alive, state.key, state.obstacle_x, state.obstacle_radius, state.work,
-            self._drive(drive, state), self._params, when, acc, flow, *self._workspaces(1, 1)[0].of(0),
+            state.x, state.v, *state.frames, state.alive, state.key, state.obstacle_x, state.obstacle_radius,
+            state.work, self._drive(drive, state), self._params, when, acc, flow, *self._workspaces(1, 1)[0].of(0),
         )  # fmt: skip
         return acc.transpose(1, 2, 0), flow.transpose(1, 2, 0) if self.parts.flows else None
 
@@ -477,8 +484,8 @@ class Scene(Record):
         team = crew if worlds < crew and agents >= WORTH_SHARING and not self.integrator.adaptive else 1
         crew = crew if team > 1 else min(crew, worlds)
         arrays = (
-            state.x, state.v, *state.frames, state.alive, state.tick, state.key, state.obstacle_x, state.obstacle_radius, state.work,
-            drive, self._params, self._dt, steps,
+            state.x, state.v, *state.frames, state.alive, state.tick, state.key, state.obstacle_x,
+            state.obstacle_radius, state.work, drive, self._params, self._dt, steps,
         )  # fmt: skip
         if crew == 1:
             return self._kernel(*arrays, 0, worlds, 0, 1, *self._workspaces(1, 1)[0].of(0))  # type: ignore[no-any-return]
@@ -561,7 +568,8 @@ class Scene(Record):
             time=float(state.time[world]), pos=state.pos[world], vel=state.vel[world], alive=state.alive[world],
             heading=state.heading[world] if state.frames else None,
             radius=np.asarray(self.body.radius, np.float64), roles=self.roles,
-            obstacle_centre=state.obstacles.centre[world], obstacle_radius=state.obstacle_radius[world], marks=(),
+            obstacle_centre=state.obstacles.centre[world], obstacle_radius=state.obstacle_radius[world],
+            marks=self.marks,
             low=np.array(low, np.float64), high=np.array(high, np.float64),
             periodic=self.space.periodic, title=title, bonds=self.edges,
         )  # fmt: skip
@@ -573,6 +581,18 @@ class Scene(Record):
         pos = state.pos[world]
         margin = 1.0 + 0.05 * float(np.ptp(pos, axis=0).max())
         return tuple(pos.min(axis=0) - margin), tuple(pos.max(axis=0) + margin)
+
+    @property
+    def marks(self) -> tuple[Mark, ...]:
+        """The places that behaviours are about."""
+        still = np.zeros(self.dimension)
+        return tuple(
+            Mark("goal", np.array(getattr(wish, name)), still, 2 * max(group.radius for group in self.groups))
+            for wish in self.parts.effects
+            if wish.steering
+            for name in wish.places
+            if getattr(wish, name) is not None
+        )
 
     def with_effects(self, *effects: Effect) -> Scene:
         """Return the same scene under other effects."""

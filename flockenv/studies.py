@@ -1,4 +1,4 @@
-"""Commands that measure: what accuracy costs, and which methods survive hard cases."""
+"""Commands that measure and show: what accuracy costs, which methods survive hard cases, what behaviours do."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from flockenv.records import Record
     from flockenv.stress import Results
 
-__all__ = ["accuracy", "stress"]
+__all__ = ["accuracy", "gallery", "stress"]
 
 
 def accuracy(
@@ -195,3 +195,18 @@ def _known(numbers: Path) -> Results | None:
         return Results.model_validate_json(numbers.read_text(encoding="utf-8")) if numbers.exists() else None
     except ValueError:
         raise ValueError(f"--out: {numbers.name} holds no findings of hard cases; --force overwrites it") from None
+
+
+def gallery(
+    out: Annotated[str, typer.Option(metavar="X.md", help="The page; pictures go into a folder X beside it.")],
+    force: Force = False,
+) -> None:
+    """Draw every behaviour in a small scene of its own, and write a page about all of them."""
+    from flockenv.behaviours import BEHAVIOURS
+    from flockenv.gallery import write_gallery
+    from flockenv.outputs import checked_file
+
+    path = checked_file(out, [".md"], force)
+    with progress_bar("drawing", len(BEHAVIOURS), "behaviours") as advance:
+        many = write_gallery(path, progress=advance)
+    new_console().print(f"{many} behaviours in {relative(path)}")

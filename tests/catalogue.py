@@ -112,13 +112,42 @@ STEERING = (
     Law(steering.wander_turn, ("vector", "noise", "positive", "positive"), "vector"),
     # its left hand is the right hand of its mirror image
     Law(steering.wander, ("own", "vector", "positive", "positive"), "vector", turns="upright", mirrors=False),
+    Law(steering.in_frame, ("own", "vector"), "vector", turns="upright", mirrors=False),
+    Law(steering.match_velocity, ("vector", "vector"), "vector"),
+    Law(steering.target_speed, ("vector", "positive"), "vector"),
+    Law(steering.face, ("vector", "heading"), "vector"),
+    Law(steering.dock, ("vector", "vector", "heading", "positive", "length", "positive", "length"), "vector"),
+    Law(steering.approach_time, ("vector", "positive", "length"), "positive"),
+    Law(steering.opensteer_time, ("vector", "vector", "vector", "length"), "positive"),
+    Law(steering.offset_pursue, ("vector", "vector", "vector", "positive", "positive", "positive"), "vector"),
+    Law(
+        steering.keep_station, ("vector", "vector", "vector", "own", "positive", "length"), "vector", turns="upright",
+        mirrors=False,
+    ),
+    Law(
+        steering.follow_leader,
+        ("vector", "vector", "vector", "positive", "length", "positive", "positive", "length"),
+        "vector",
+    ),
+    Law(
+        steering.interpose,
+        ("vector", "vector", "vector", "vector", "vector", "positive", "positive", "length"),
+        "vector",
+    ),
+    Law(
+        steering.shadow, ("vector", "vector", "vector", "positive", "positive", "positive", "positive"), "vector"
+    ),
+    Law(steering.hiding_place, ("vector", "positive", "positive", "vector"), "vector"),
     Law(steering.separate, ("vector", "heading"), "vector"),
     Law(steering.align, ("vector", "vector"), "vector"),
     Law(steering.cohere, ("vector", "vector", "positive"), "vector"),
     Law(steering.threat, ("heading", "vector", "positive", "length"), "positive"),
     Law(steering.avoid, ("heading", "vector", "positive", "positive"), "vector"),
     Law(steering.contain, ("walls", "walls", "vector", "positive", "positive"), "vector", turns="none", mirrors=False),
-)
+    Law(steering.heed, ("vector",) * 5 + ("positive",) * 5, "vector"),
+    Law(steering.behind, ("vector", "vector", "length"), "vector"),
+    Law(steering.herd_from, ("vector", "vector", "vector", "length", "positive", "positive"), "vector"),
+)  # fmt: skip
 
 ARBITRATION = (arbitration.blend, arbitration.prioritise, arbitration.allocate, arbitration.allocate_running)
 """Those for whoever has wishes and no scene."""

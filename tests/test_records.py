@@ -11,6 +11,7 @@ from flockenv.behaviours import Separation
 from flockenv.effects import Drag
 from flockenv.scene import Group, Scene
 from flockenv.space import Box
+from flockenv.spawn import Spawn
 from flockenv.tasks import Pursuit
 
 SCENE = Scene(space=Box(size=(10, 10)), groups=(Group(count=3),), effects=(Drag(rate=0.5),))
@@ -54,3 +55,15 @@ def test_a_refusal_is_one_line_that_says_what_and_what_else(call, line) -> None:
         call()
     assert line in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+def test_scenes_that_have_run_can_be_compared() -> None:
+    """What follows from the fields is kept in the record, arrays too, and does not count."""
+    group = Group(count=3, spawn=Spawn(low=(0, 0), high=(1, 1)))
+    one, other = (Scene(groups=(group,), effects=(Drag(rate=0.5),), dt=0.1) for _ in range(2))
+    for scene in (one, other):
+        scene.step(scene.start(0))
+    assert one == other
+    assert hash(one) == hash(other)
+    assert one != other.model_copy(update={"dt": 0.2})
+    assert one != 1

@@ -49,10 +49,21 @@ class AvoidObstacles(Effect):
     weight: float = Field(ge=0, description="N, the force of an evasion")
     horizon: float = Field(default=2.0, gt=0, description="s, how far ahead it looks at the present speed")
     margin: float = Field(default=0.0, ge=0, description="m, clearance beyond both radii")
+    demo: ClassVar[str | None] = """
+groups:
+  - {count: 7, radius: 0.2, max_speed: 2, spawn: {low: [0, -2.5], high: [1, 2.5], speed: [2, 2], heading: [1, 0]}}
+effects: [{kind: avoid_obstacles, weight: 5, horizon: 1.5, margin: 0.2}]
+obstacles: [{centre: [6, 0.5], radius: 1}, {centre: [9, -1.5], radius: 0.8}, {centre: [11, 2], radius: 1}]
+dt: 0.02
+"""
     steering: ClassVar[bool] = True
     obstacle_start: ClassVar[str | None] = "nothing"
     obstacle_law: ClassVar[str | None] = "nearest_threat"
     obstacle_finish: ClassVar[str | None] = "around"
+
+    def lookahead(self, speed: float) -> float:
+        """As far as it comes within the horizon."""
+        return speed * self.horizon
 
     def folded(self, dimension: int) -> int:
         """Distance, clearance and offset of the nearest threat."""

@@ -97,6 +97,13 @@ class Separation(_FlockRule):
 
     kind: Literal["separation"] = "separation"
     weight: float = Field(ge=0, description="N m")
+    demo: ClassVar[str | None] = """
+groups: [{count: 14, radius: 0.15, spawn: {low: [0, 0], high: [3, 3]}}]
+effects:
+  - {kind: separation, weight: 0.5, radius: 2.5}
+  - {kind: drag, rate: 1}
+dt: 0.02
+"""
     pair_law: ClassVar[str | None] = "separation_pair"
     finish_law: ClassVar[str | None] = "separation"
 
@@ -115,6 +122,11 @@ class Alignment(_FlockRule):
 
     kind: Literal["alignment"] = "alignment"
     weight: float = Field(ge=0, description="kg/s")
+    demo: ClassVar[str | None] = """
+groups: [{count: 14, radius: 0.15, spawn: {low: [0, 0], high: [6, 6], speed: [0.5, 1.5]}}]
+effects: [{kind: alignment, weight: 0.7, radius: 5, fov: 300}]
+dt: 0.02
+"""
     pair_law: ClassVar[str | None] = "alignment_pair"
     finish_law: ClassVar[str | None] = "alignment"
 
@@ -128,6 +140,13 @@ class Cohesion(_FlockRule):
 
     kind: Literal["cohesion"] = "cohesion"
     weight: float = Field(ge=0, description="N/m")
+    demo: ClassVar[str | None] = """
+groups: [{count: 14, radius: 0.15, spawn: {low: [0, 0], high: [9, 9], speed: [0.2, 1]}}]
+effects:
+  - {kind: cohesion, weight: 0.6, radius: 5, fov: 300}
+  - {kind: drag, rate: 0.4}
+dt: 0.02
+"""
     pair_law: ClassVar[str | None] = "cohesion_pair"
     finish_law: ClassVar[str | None] = "cohesion"
 

@@ -17,7 +17,8 @@ An effect is of one or more of three forms, each a law for one agent:
 * `obstacle_start(p, me)`, `obstacle_law(p, me, other, acc) -> acc`, `obstacle_finish(p, me, acc) -> force`: a fold over
   the obstacles.
 
-`p` holds the effect's `parameters()` by name, `me` and `other` are the records below. Laws live in the effect's module.
+`p` holds the effect's `parameters()` by name, and, if it is `tabled`, an array of numbers as `p.table`: the points of a
+path, the values of a grid. `me` and `other` are the records below. Laws live in the effect's module.
 A pair law says nothing of who is seen: it is evaluated for every candidate, and what it says of those outside the
 effect's `sight` (of agents themselves too) is dropped.
 
@@ -170,6 +171,8 @@ class Effect(Record):
     """Is the weight of whom a far law meets their mass? Else it is their number."""
     partners: ClassVar[int] = 1
     """How many partners a bond has beside the agent it acts on."""
+    tabled: ClassVar[bool] = False
+    """Do its laws look numbers up in its `table`?"""
     places: ClassVar[tuple[str, ...]] = ()
     """Names of the parameters that are points: on a torus own, medium and flow laws are given the nearest images."""
     strengths: ClassVar[tuple[str, ...]] = ("weight",)
@@ -238,6 +241,13 @@ class Effect(Record):
             }
         )
 
+    def table(self, scene: Any) -> NDArray[np.float64]:
+        """Return the numbers that its laws look up as `p.table`, (T,), T >= 1: as many as the scene calls for.
+
+        Asked for when a scene is built, after `check`; they are arguments, another table compiles nothing.
+        """
+        raise TypeError(f"{type(self).__name__} has no table")
+
     def rates(self, groups: Sequence[Any], dimension: int) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
         """Return bounds of w^2, 1/s^2, and of damping, 1/s, of every agent, (N,): how stiff it is, whatever happens.
 
@@ -247,6 +257,13 @@ class Effect(Record):
 
     def potential(self, groups: Sequence[Any], state: Any, offset: Any) -> NDArray[np.float64] | None:
         """Return its potential energy in each world, (B,) J; none if it has none. `offset(a, b)` is the space's."""
+        return None
+
+    def lookahead(self, speed: float) -> float | None:
+        """Return how far ahead somebody at this speed notices what he must avoid, m; none if it avoids nothing.
+
+        What gives it is called `horizon`, s, in such an effect.
+        """
         return None
 
     def check(self, scene: Any) -> None:

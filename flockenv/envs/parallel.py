@@ -26,10 +26,10 @@ from flockenv.envs.face import (
     render_fps,
 )
 from flockenv.refusals import nearest
-from flockenv.tasks import Flock, Pursuit, Task
+from flockenv.tasks import Flock, Herd, Pursuit, Task
 from flockenv.world import Step, World
 
-__all__ = ["FlockParallelEnv", "PursuitParallelEnv", "WorldParallelEnv"]
+__all__ = ["FlockParallelEnv", "HerdParallelEnv", "PursuitParallelEnv", "WorldParallelEnv"]
 
 Named = dict[str, Any]
 
@@ -246,3 +246,10 @@ class PursuitParallelEnv(WorldParallelEnv):
 
     task_type = Pursuit
     fixed: ClassVar[dict[str, Any]] = {"pursuers": 3, "evaders": 2, "sides": "both"}
+
+
+class HerdParallelEnv(WorldParallelEnv):
+    """Herding as a team: two dogs, both of them agents, with the same reward."""
+
+    task_type = Herd
+    fixed: ClassVar[dict[str, Any]] = {"dogs": 2}

@@ -23,10 +23,10 @@ from flockenv.envs.face import (
     render_fps,
 )
 from flockenv.envs.page import page
-from flockenv.tasks import Flock, Obstacles, Pursuit, Task
+from flockenv.tasks import Flock, Herd, Obstacles, Pursuit, Task
 from flockenv.world import Step, World
 
-__all__ = ["FlockEnv", "ObstaclesEnv", "PursuitEnv", "SingleEnv", "one_learner"]
+__all__ = ["FlockEnv", "HerdEnv", "ObstaclesEnv", "PursuitEnv", "SingleEnv", "one_learner"]
 
 
 def one_learner(task_type: type[Task], parameters: dict[str, Any]) -> Task:
@@ -142,4 +142,11 @@ class FlockEnv(SingleEnv):
 
     task_type = Flock
     fixed: ClassVar[dict[str, Any]] = {"learners": 1}
+    history = "v0: first version (flockenv 0.1.0)."
+
+
+class HerdEnv(SingleEnv):
+    """A dog gathers scripted sheep and drives them into a pen."""
+
+    task_type = Herd
     history = "v0: first version (flockenv 0.1.0)."

@@ -31,10 +31,10 @@ from flockenv.envs.face import (
     together,
 )
 from flockenv.refusals import nearest
-from flockenv.tasks import Flock, Obstacles, Pursuit, Task
+from flockenv.tasks import Flock, Herd, Obstacles, Pursuit, Task
 from flockenv.world import Step, World
 
-__all__ = ["FlockVectorEnv", "ObstaclesVectorEnv", "PursuitVectorEnv", "WorldsEnv"]
+__all__ = ["FlockVectorEnv", "HerdVectorEnv", "ObstaclesVectorEnv", "PursuitVectorEnv", "WorldsEnv"]
 
 Mask = NDArray[np.bool_]
 Info = dict[str, Any]
@@ -341,3 +341,9 @@ class FlockVectorEnv(WorldsEnv):
 
     task_type = Flock
     fixed: ClassVar[dict[str, Any]] = {"learners": 1}
+
+
+class HerdVectorEnv(WorldsEnv):
+    """Dogs, one per world or `dogs=` several; the page is that of flockenv.envs.single.HerdEnv."""
+
+    task_type = Herd

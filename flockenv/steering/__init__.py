@@ -12,22 +12,66 @@ Sources: Reynolds, "Flocks, Herds, and Schools" (SIGGRAPH 1987); "Steering Behav
 from __future__ import annotations
 
 from flockenv.steering.around import avoid, contain, threat
-from flockenv.steering.goals import arrive, flee, seek, wander, wander_turn
-from flockenv.steering.others import align, cohere, distance_time, evade, interception_time, pursue, separate
+from flockenv.steering.goals import (
+    arrive,
+    dock,
+    face,
+    flee,
+    in_frame,
+    match_velocity,
+    seek,
+    target_speed,
+    wander,
+    wander_turn,
+)
+from flockenv.steering.herding import behind, heed, herd_from
+from flockenv.steering.others import (
+    align,
+    approach_time,
+    cohere,
+    distance_time,
+    evade,
+    follow_leader,
+    hiding_place,
+    interception_time,
+    interpose,
+    keep_station,
+    offset_pursue,
+    opensteer_time,
+    pursue,
+    separate,
+    shadow,
+)
 
 __all__ = [
     "align",
+    "approach_time",
     "arrive",
     "avoid",
+    "behind",
     "cohere",
     "contain",
     "distance_time",
+    "dock",
     "evade",
+    "face",
     "flee",
+    "follow_leader",
+    "heed",
+    "herd_from",
+    "hiding_place",
+    "in_frame",
     "interception_time",
+    "interpose",
+    "keep_station",
+    "match_velocity",
+    "offset_pursue",
+    "opensteer_time",
     "pursue",
     "seek",
     "separate",
+    "shadow",
+    "target_speed",
     "threat",
     "wander",
     "wander_turn",

@@ -5,9 +5,20 @@ from __future__ import annotations
 import numpy as np
 
 from flockenv.kernels import Vec, law, like
-from flockenv.vec import add, dot, norm, perpendicular, scale, select, sub, unit
+from flockenv.vec import add, axis, cross, dot, lateral, norm, perpendicular, scale, select, sub, unit
 
-__all__ = ["arrive", "flee", "seek", "wander", "wander_turn"]
+__all__ = [
+    "arrive",
+    "dock",
+    "face",
+    "flee",
+    "in_frame",
+    "match_velocity",
+    "seek",
+    "target_speed",
+    "wander",
+    "wander_turn",
+]
 
 
 @law
@@ -46,27 +57,77 @@ def wander_turn(target: Vec, noise: Vec, rate: float, dt: float) -> Vec:
 
 
 @law
+def in_frame(own: Vec, velocity: Vec) -> Vec:
+    """Return in the world's axes what is (forward, left) or (forward, left, up) of somebody at this velocity.
+
+    Left is level unless he flies straight up; at standstill forward is the x axis.
+    """
+    moving = unit(velocity)
+    forward = select(dot(moving, moving) > like(own[0], 0.0), moving, axis(moving, 0))
+    if len(own) == 2:
+        return add(scale(forward, own[0]), scale((-forward[1], forward[0]), own[1]))
+    else:
+        left = scale(perpendicular(forward), like(own[0], -1.0))
+        aside = add(scale(left, own[1]), scale(cross(forward, left), own[2]))
+        return add(scale(forward, own[0]), aside)
+
+
+@law
 def wander(target: Vec, velocity: Vec, max_speed: float, ahead: float) -> Vec:
     """Seek the target on a unit sphere carried `ahead` (in its radii) of the agent (Reynolds 1999).
 
     `target` is in the agent's own frame: (forward, left) or (forward, left, up). At standstill, forward is the x axis.
     """
-    moving = unit(velocity)
-    still = dot(moving, moving) <= like(max_speed, 0.0)
-    o, e = like(max_speed, 0.0), like(max_speed, 1.0)
-    forward: Vec
-    left: Vec
-    if len(target) == 2:
-        forward = select(still, (e, o), moving)
-        left = (-forward[1], forward[0])
-        goal = add(scale(forward, target[0] + ahead), scale(left, target[1]))
-    else:
-        forward = select(still, (e, o, o), moving)
-        left = scale(perpendicular(forward), -e)
-        up = (
-            forward[1] * left[2] - forward[2] * left[1],
-            forward[2] * left[0] - forward[0] * left[2],
-            forward[0] * left[1] - forward[1] * left[0],
-        )
-        goal = add(add(scale(forward, target[0] + ahead), scale(left, target[1])), scale(up, target[2]))
+    goal = add(in_frame(target, velocity), in_frame(scale(axis(target, 0), ahead), velocity))
     return sub(scale(unit(goal), max_speed), velocity)
+
+
+@law
+def match_velocity(velocity: Vec, target_velocity: Vec) -> Vec:
+    """Take on a velocity: S = v_t - v, m/s (Reynolds 1987)."""
+    return sub(target_velocity, velocity)
+
+
+@law
+def target_speed(velocity: Vec, speed: float) -> Vec:
+    """Take on a speed, on the way that one is on: S = (v_t - |v|) unit(v), m/s; at standstill there is no way."""
+    return scale(unit(velocity), speed - norm(velocity))
+
+
+@law
+def face(velocity: Vec, heading: Vec) -> Vec:
+    """Turn the velocity toward `heading` and leave the speed as it is: S = |v| n sin(a), m/s, across the way.
+
+    a is the angle between the two and n points to the heading's side; of a heading behind, S = |v| n, and of one
+    straight behind n is to the right. Under F = w S tan(a/2) falls as exp(-w t / m) from 90 degrees on.
+    """
+    forward, wanted = unit(velocity), unit(heading)
+    aside = lateral(wanted, forward)
+    behind = dot(wanted, forward) < like(aside[0], 0.0)
+    noise = like(aside[0], 1e-10)
+    sideways = select(dot(aside, aside) > noise, unit(aside), perpendicular(forward))
+    return scale(select(behind, sideways, aside), norm(velocity))
+
+
+@law
+def dock(
+    offset: Vec, velocity: Vec, direction: Vec, max_speed: float, gate: float, width: float, slow_radius: float
+) -> Vec:
+    """Arrive at a point while flying in a `direction`: through a gate `gate` [m] before it, then along its axis.
+
+    Within `width` [m] of the axis it aims at the axis half-way to the point, so that the distance from the axis falls
+    as the square of the distance to go, and the angle with it; outside twice that, at the gate (Reynolds 1999 describes
+    it in words; the construction is ours).
+    """
+    o, e, half = like(gate, 0.0), like(gate, 1.0), like(gate, 0.5)
+    forward = unit(direction)
+    to_go = dot(offset, forward)
+    aside = norm(lateral(offset, forward))
+    out = aside / width - e
+    out = e if to_go < -width else min(max(out, o), e)  # past the point: around again
+    near = min(half * max(to_go, o), gate)
+    before = near + (gate - near) * out
+    aim = sub(offset, scale(forward, before))
+    way = norm(aim) + before
+    ramped = max_speed * (way / slow_radius)
+    return sub(scale(unit(aim), ramped if ramped < max_speed else max_speed), velocity)

@@ -5,10 +5,26 @@ from __future__ import annotations
 import numpy as np
 
 from flockenv.kernels import Vec, law, like
-from flockenv.steering.goals import flee, seek
-from flockenv.vec import add, dot, norm, scale, select, sub, zero
+from flockenv.steering.goals import arrive, flee, in_frame, match_velocity, seek
+from flockenv.vec import add, axis, dot, lateral, limit, norm, perpendicular, scale, select, sub, unit, zero
 
-__all__ = ["align", "cohere", "distance_time", "evade", "interception_time", "pursue", "separate"]
+__all__ = [
+    "align",
+    "approach_time",
+    "cohere",
+    "distance_time",
+    "evade",
+    "follow_leader",
+    "hiding_place",
+    "interception_time",
+    "interpose",
+    "keep_station",
+    "offset_pursue",
+    "opensteer_time",
+    "pursue",
+    "separate",
+    "shadow",
+]
 
 
 @law
@@ -32,6 +48,40 @@ def interception_time(offset: Vec, quarry_velocity: Vec, max_speed: float) -> fl
     denominator = np.sqrt(discriminant if discriminant > o else o) - b
     exists = discriminant >= o and denominator > o
     return c / denominator if exists else np.sqrt(c) / max_speed  # type: ignore[no-any-return]
+
+
+@law
+def approach_time(offset: Vec, speed: float, longest: float) -> float:
+    """Return |offset| / speed, s: how long somebody at this speed needs to come here; at most `longest` [s].
+
+    The predictor of evasion (OpenSteer), which divides unguarded there.
+    """
+    distance = norm(offset)
+    return distance / speed if distance < longest * speed else longest
+
+
+@law
+def _third(x: float) -> float:
+    """Return 1, 0 or -1: within 45 degrees of straight on, across, opposite."""
+    edge = like(x, 0.707)
+    return like(x, 1.0) if x > edge else (like(x, -1.0) if x < -edge else like(x, 0.0))
+
+
+@law
+def opensteer_time(offset: Vec, velocity: Vec, quarry_velocity: Vec, longest: float) -> float:
+    """Predict as OpenSteer does: T = k |offset| / |v|, s, at most `longest` [s]; k by where the quarry is and heads.
+
+    Ahead, aside or behind; on a parallel way, across, or against: (4, 1.8, 0.85), (1, 0.8, 4), (0.5, 2, 2).
+    """
+    forward = unit(velocity)
+    place, way = _third(dot(forward, unit(offset))), _third(dot(forward, unit(quarry_velocity)))
+    o = like(place, 0.0)
+    parallel = like(o, 4.0) if place > o else (like(o, 0.5) if place < o else like(o, 1.0))
+    across = like(o, 1.8) if place > o else (like(o, 2.0) if place < o else like(o, 0.8))
+    against = like(o, 0.85) if place > o else (like(o, 2.0) if place < o else like(o, 4.0))
+    k = parallel if way > o else (against if way < o else across)
+    time, speed = k * norm(offset), norm(velocity)
+    return time / speed if time < longest * speed else longest
 
 
 @law
@@ -68,3 +118,105 @@ def cohere(mean_offset: Vec, velocity: Vec, max_speed: float) -> Vec:
     """Seek the neighbours' centre, at `mean_offset` [m] (Reynolds 1999). Without offset there is nothing to seek."""
     some = dot(mean_offset, mean_offset) > like(max_speed, 0.0)
     return select(some, seek(mean_offset, velocity, max_speed), zero(velocity))
+
+
+@law
+def offset_pursue(
+    offset: Vec, velocity: Vec, quarry_velocity: Vec, max_speed: float, distance: float, time: float
+) -> Vec:
+    """Pass the quarry at a distance [m]: seek a point so far beside where it will be, on this side (Reynolds 1999).
+
+    Beside is across one's own way, towards it; dead ahead it is passed on the right.
+    """
+    there = add(offset, scale(quarry_velocity, time))
+    forward = unit(velocity)
+    aside = lateral(there, forward)
+    noise = like(distance, 1e-10) * dot(there, there)
+    toward = select(dot(aside, aside) > noise, unit(aside), scale(perpendicular(forward), like(distance, -1.0)))
+    return seek(sub(there, scale(toward, distance)), velocity, max_speed)
+
+
+@law
+def keep_station(
+    offset: Vec, velocity: Vec, leader_velocity: Vec, place: Vec, max_speed: float, slow_radius: float
+) -> Vec:
+    """Arrive at a place in a leader's frame, (forward, left[, up]) of it [m], and fly with it: a formation.
+
+    v_d = v_L + V min(1, d / slow_radius) towards the place, at most V. Whoever arrives at where the place will be, as
+    in offset pursuit (Reynolds 1999), has v_d = 0 there and lags behind a leader that moves.
+    """
+    station = add(offset, in_frame(place, leader_velocity))
+    towards = arrive(station, zero(velocity), max_speed, slow_radius)
+    return sub(limit(add(leader_velocity, towards), max_speed), velocity)
+
+
+@law
+def follow_leader(
+    offset: Vec,
+    velocity: Vec,
+    leader_velocity: Vec,
+    behind: float,
+    ahead: float,
+    aside: float,
+    max_speed: float,
+    slow_radius: float,
+) -> Vec:
+    """Keep station `behind` a leader [m], and make way for it: who is in the box in front of it moves out sideways.
+
+    The box is `ahead` long and `aside` to each side [m]; in its axis everybody makes way to the leader's right
+    (Reynolds 1999). Neighbours are kept off by separation.
+    """
+    o = like(behind, 0.0)
+    forward = unit(leader_velocity)
+    here = scale(offset, like(behind, -1.0))
+    along, beside = dot(here, forward), lateral(here, forward)
+    square = dot(beside, beside)
+    in_the_way = (along > o) & (along < ahead) & (square < aside * aside)
+    out = select(square > like(behind, 1e-20), unit(beside), perpendicular(forward))
+    way = sub(scale(out, max_speed), lateral(velocity, forward))
+    place = scale(axis(offset, 0), -behind)
+    return select(in_the_way, way, keep_station(offset, velocity, leader_velocity, place, max_speed, slow_radius))
+
+
+@law
+def interpose(
+    offset_a: Vec,
+    velocity_a: Vec,
+    offset_b: Vec,
+    velocity_b: Vec,
+    velocity: Vec,
+    share: float,
+    max_speed: float,
+    slow_radius: float,
+) -> Vec:
+    """Arrive between two others, at `share` of the way from a to b, where that will be (Reynolds 1999).
+
+    Their ways are foreseen for as long as it takes to get between them at full speed.
+    """
+    now = add(offset_a, scale(sub(offset_b, offset_a), share))
+    moving = add(velocity_a, scale(sub(velocity_b, velocity_a), share))
+    time = norm(now) / max_speed
+    return arrive(add(now, scale(moving, time)), velocity, max_speed, slow_radius)
+
+
+@law
+def shadow(
+    offset: Vec, velocity: Vec, quarry_velocity: Vec, max_speed: float, distance: float, band: float, time: float
+) -> Vec:
+    """Pursue from beyond `distance` + `band` [m], match speed and heading within `distance`, and between them both.
+
+    The shares change linearly over the band. Reynolds 1999 switches; a switch with hysteresis would have to remember.
+    """
+    o, e = like(band, 0.0), like(band, 1.0)
+    share = min(max((norm(offset) - distance) / band, o), e)
+    nearer = scale(pursue(offset, velocity, quarry_velocity, max_speed, time), share)
+    return add(nearer, scale(match_velocity(velocity, quarry_velocity), e - share))
+
+
+@law
+def hiding_place(offset: Vec, radius: float, margin: float, threat: Vec) -> Vec:
+    """Return the offset [m] of the place behind a round obstacle, `margin` [m] from it, that `threat` cannot see.
+
+    h = c + (radius + margin) unit(c - x_threat); `offset` leads to the obstacle's centre c, `threat` to who seeks.
+    """
+    return add(offset, scale(unit(sub(offset, threat)), radius + margin))

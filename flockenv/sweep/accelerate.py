@@ -89,6 +89,9 @@ def parameters(parts: Parts) -> list[str]:
             each = ", ".join(f"params[{at + j}]" for j in range(count))
             values.append(f"({each},)" if isinstance(value, tuple) else each)
             at += count
+        if effect.tabled:
+            values.append(f"params[np.int64(params[{at}]) : np.int64(params[{at + 1}])]")
+            at += 2
         lines.append(f"p{k} = P{k}({', '.join(values) or 'params[0]'})")
     return lines
 
@@ -100,7 +103,7 @@ def _nearest_images(parts: Parts) -> list[str]:
         if _given(parts, k) == f"near{k}":
             values = [
                 f"add(x, offset_to(size, x, p{k}.{name}))" if name in effect.places else f"p{k}.{name}"
-                for name in parts.numbers_of(effect)
+                for name in parts.names_of(effect)
             ]
             lines.append(f"near{k} = P{k}({', '.join(values)})")
     return lines

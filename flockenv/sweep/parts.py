@@ -12,10 +12,11 @@ import inspect
 import math
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from flockenv.effects.base import Effect, Sight
 from flockenv.integrators.base import Integrator
@@ -60,6 +61,8 @@ class Parts:
     """Does anybody lean into his turns?"""
     starts: tuple[int, ...] = ()
     """The first agent of each group, and one more: numbers alone, the source does not depend on them."""
+    tables: tuple[NDArray[np.float64], ...] = field(default=(), compare=False)
+    """What the laws of each tabled effect look up, in order: numbers alone, too."""
 
     @functools.cached_property
     def width(self) -> int:
@@ -123,7 +126,12 @@ class Parts:
         return max((sight.radius for sight in self.sights), default=0.0)
 
     def parameters(self) -> list[float]:
-        """Every number that the kernel is given, in the order in which the source reads them."""
+        """Every number that the kernel is given, in the order in which the source reads them; tables come behind.
+
+        For each table there are two: where it begins, and where it ends.
+        """
+        bounds, tables = [], iter(np.cumsum([0, *map(len, self.tables)]).tolist())
+        begin = next(tables)
         values = [*self.space.extent(self.dimension), self.reach]
         for sight in self.sights:
             values += [sight.radius**2, view_of(sight.fov)]
@@ -132,13 +140,32 @@ class Parts:
         for effect in self.effects:
             for value in self.numbers_of(effect).values():
                 values.extend(value if isinstance(value, tuple) else (value,))
+            if effect.tabled:
+                bounds += [(len(values), begin), (len(values) + 1, begin := next(tables))]
+                values += [0.0, 0.0]
         values += self.space.numbers()
         values += self.integrator.settings()
-        return values + ([self.look.radius, self.look.radius**2] if self.look else [])
+        values += [self.look.radius, self.look.radius**2] if self.look else []
+        for place, bound in bounds:
+            values[place] = float(len(values) + bound)
+        return values
+
+    @property
+    def count(self) -> int:
+        """How many numbers the kernel is handed."""
+        return len(self.parameters()) + sum(map(len, self.tables))
+
+    def given(self) -> NDArray[Any]:
+        """Return `parameters()` and the tables behind them, in the scene's precision: what the kernel is handed."""
+        return np.concatenate([self.parameters(), *self.tables]).astype(self.dtype)
 
     def numbers_of(self, effect: Effect) -> dict[str, Any]:
         """Return the numbers and vectors that the laws of an effect are given, by name."""
         return {**effect.parameters(), **effect.members(self.starts)}
+
+    def names_of(self, effect: Effect) -> list[str]:
+        """Return the names under which the laws of an effect find what they are given."""
+        return [*self.numbers_of(effect), *(["table"] if effect.tabled else [])]
 
     @functools.cached_property
     def wishes(self) -> dict[int, int]:

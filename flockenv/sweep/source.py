@@ -49,7 +49,10 @@ def field_source(parts: Parts) -> str:
         copies(parts),
         f'''
 @njit(cache=True, **FAST)
-def field(x, v, {parts.frame_argument}alive, key, obstacle_x, obstacle_radius, work, drive, params, times, acc, flow, {SHARED}):
+def field(
+    x, v, {parts.frame_argument}alive, key, obstacle_x, obstacle_radius, work, drive, params, times, acc, flow,
+    {SHARED},
+):
     """Write acceleration, and the flow that carries everybody if there is one, of all worlds, (D, B, N)."""
     unaliased()
     n, rank, team, arranged = x.shape[2], 0, 1, False
@@ -105,4 +108,4 @@ def _imports(parts: Parts) -> str:
 
 def _parameter_tuple(parts: Parts, k: int) -> str:
     """Declare the record by which effect k reads its numbers."""
-    return f'P{k} = namedtuple("P{k}", {" ".join(parts.numbers_of(parts.effects[k])) or "nothing"!r})'
+    return f'P{k} = namedtuple("P{k}", {" ".join(parts.names_of(parts.effects[k])) or "nothing"!r})'

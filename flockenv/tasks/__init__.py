@@ -12,7 +12,8 @@ for _module in pkgutil.iter_modules(__path__):
     importlib.import_module(f"{__name__}.{_module.name}")
 
 from flockenv.tasks.flock import Flock  # noqa: E402  # after the folder has been walked
+from flockenv.tasks.herd import Herd  # noqa: E402
 from flockenv.tasks.obstacles import Obstacles  # noqa: E402
 from flockenv.tasks.pursuit import Pursuit  # noqa: E402
 
-__all__ = ["TASKS", "Flock", "Frame", "Layout", "Obstacles", "Pursuit", "Slot", "Task"]
+__all__ = ["TASKS", "Flock", "Frame", "Herd", "Layout", "Obstacles", "Pursuit", "Slot", "Task"]

@@ -1,0 +1,109 @@
+"""The gallery of behaviours: a page that says what each is, with the trajectories of its own small scene.
+
+Everything on it comes from the behaviours themselves: docstring, fields, `demo`.
+"""
+
+from __future__ import annotations
+
+import inspect
+import sys
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+from flockenv.behaviours import BEHAVIOURS
+from flockenv.config import load_scene
+from flockenv.effects.base import Effect
+from flockenv.outputs import replacing
+from flockenv.render.gif import write_png
+from flockenv.render.picture import draw
+from flockenv.trajectory import Trajectory, record
+
+__all__ = ["page", "shown", "write_gallery"]
+
+SIZE = 360
+"""Width of a picture, pixels."""
+
+INSTANTS = 160
+"""How many instants a trajectory is drawn through."""
+
+
+def shown(behaviour: type[Effect]) -> Trajectory:
+    """Return the run of a behaviour's own scene; ValueError if it has none, or it does not run to its end."""
+    kind = behaviour.model_fields["kind"].default
+    if behaviour.demo is None:
+        raise ValueError(f"{kind}: has no demo, a small scene that shows it, as YAML")
+    scene = load_scene(behaviour.demo)
+    steps = round(behaviour.demo_time / scene.dt)
+    run = record(scene, 0, steps, max(1, steps // INSTANTS))
+    if run.stopped:
+        raise ValueError(f"{kind}: its demo stops: {run.stopped}")
+    return run
+
+
+def families(behaviours: Mapping[str, type[Effect]]) -> dict[str, list[type[Effect]]]:
+    """Return behaviours by the file that they are in, under the first sentence of its text."""
+    found: dict[str, list[type[Effect]]] = {}
+    for behaviour in behaviours.values():
+        text = inspect.getdoc(sys.modules[behaviour.__module__]) or behaviour.__module__
+        found.setdefault(_first_paragraph(text), []).append(behaviour)
+    return found
+
+
+def page(behaviours: Mapping[str, type[Effect]], pictures: str) -> str:
+    """Return the page, as Markdown that shows `pictures`/KIND.png beside each behaviour."""
+    lines = [
+        "# Behaviours",
+        "",
+        "What agents can want, each in a small scene of its own. The behaviours themselves say what is here;",
+        "`flockenv gallery --out docs/behaviours.md --force` draws and writes it. A behaviour is listed under",
+        "`effects` of a scene, or under `behaviours` of a `steer` effect, whose arbitration reconciles several.",
+        "Lines fade towards the past.",
+        "",
+    ]
+    for title, members in families(behaviours).items():
+        lines += [f"## {title.rstrip('.')}", ""]
+        for behaviour in members:
+            lines += _entry(behaviour, pictures)
+    return "\n".join(lines)
+
+
+def write_gallery(
+    path: Path, behaviours: Mapping[str, type[Effect]] = BEHAVIOURS, progress: Callable[[int], None] = lambda done: None
+) -> int:
+    """Write the page, and a picture of each behaviour into a folder beside it; return how many there are."""
+    folder = path.with_suffix("")
+    folder.mkdir(parents=True, exist_ok=True)
+    for done, (kind, behaviour) in enumerate(behaviours.items()):
+        progress(done)
+        snapshots = list(shown(behaviour).snapshots())
+        write_png(folder / f"{kind}.png", draw(snapshots[-1], SIZE, 3, snapshots))
+    with replacing(path) as file:
+        file.write(page(behaviours, folder.name).encode())
+    return len(behaviours)
+
+
+def _entry(behaviour: type[Effect], pictures: str) -> list[str]:
+    """Return the lines about one behaviour."""
+    kind = behaviour.model_fields["kind"].default
+    fields = [
+        f"| `{name}` | {field.description or ''} | {'' if field.is_required() else _default(field.default)} |"
+        for name, field in behaviour.model_fields.items()
+        if name != "kind"
+    ]
+    return [
+        f"### {kind}", "",
+        f'<img src="{pictures}/{kind}.png" width="{SIZE}" alt="Trajectories under {kind}">', "",
+        inspect.getdoc(behaviour) or "", "",
+        "| | | default |", "| --- | --- | --- |", *fields, "",
+        "<details><summary>its scene</summary>", "",
+        "```yaml", (behaviour.demo or "").strip(), "```", "",
+        "</details>", "",
+    ]  # fmt: skip
+
+
+def _default(value: object) -> str:
+    return f"{value:g}" if isinstance(value, float) else "none" if value is None else str(value)
+
+
+def _first_paragraph(text: str) -> str:
+    return " ".join(text.split("\n\n")[0].split())

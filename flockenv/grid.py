@@ -1,0 +1,131 @@
+"""Numbers on a regular grid, and what they are in between: fields of velocities, distances and potentials.
+
+A grid is one array (a table), so that a law can be handed it: the lowest corner (D, m), the spacing (m), the count of
+points along each axis (D), how many numbers each point has (K), then these numbers, the last axis fastest. `packed`
+makes one of an array; the laws read it at any place. Where they say nothing else, outside the grid is the nearest
+place on its edge.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from flockenv.kernels import Vec, entry, kernel, law, like
+
+__all__ = ["Floats", "Table", "covers", "packed", "points_of", "sample", "sample_vector", "sampled"]
+
+Floats = NDArray[np.float64]
+Table = Any
+"""One axis of numbers, in the precision of the scene."""
+
+
+def packed(values: ArrayLike, low: Sequence[float], spacing: float) -> Floats:
+    """Return the table of `values` (nx, ny[, nz], K) at low + spacing (i, j[, k]); ValueError if that is no grid."""
+    array = np.asarray(values, np.float64)
+    d = len(low)
+    if array.ndim != d + 1:
+        raise ValueError(f"values: shape {array.shape}, must have {d} axes of points and one of numbers")
+    if min(array.shape[:d]) < 2 or array.shape[d] < 1:
+        raise ValueError(f"values: shape {array.shape}, must have at least 2 points along each axis, and a number each")
+    if not spacing > 0:
+        raise ValueError(f"spacing = {spacing:g}, must be positive")
+    if not np.isfinite(array).all():
+        raise ValueError("values: must be finite")
+    header = [*low, spacing, *array.shape[:d], array.shape[d]]
+    return np.concatenate([np.array(header, np.float64), array.ravel()])
+
+
+def points_of(low: Sequence[float], spacing: float, counts: Sequence[int]) -> Floats:
+    """Return the places of a grid's points, (nx, ny[, nz], D) m."""
+    axes = [low[k] + spacing * np.arange(counts[k]) for k in range(len(low))]
+    return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
+
+
+@law
+def _along(table: Table, x: float, d: int, k: int) -> tuple[int, float]:
+    """Return the cell along axis k that holds x, and where in it: 0 at its lower edge, 1 at its upper one."""
+    o, e = like(x, 0.0), like(x, 1.0)
+    last = table[d + 1 + k] - e
+    at = (x - table[k]) / table[d]
+    at = at if at > o else o  # what is no number too
+    at = at if at < last else last
+    cell = np.int64(at)
+    most = np.int64(last) - 1
+    cell = cell if cell < most else most
+    return cell, at - like(x, cell)  # type: ignore[arg-type]  # a whole number that it makes a float of
+
+
+@law
+def sample(table: Table, x: Vec, k: int) -> float:
+    """Return number k of a grid at x: linear in between along each axis (bilinear, trilinear)."""
+    e = like(x[0], 1.0)
+    if len(x) == 2:
+        i, a = _along(table, x[0], 2, 0)
+        j, b = _along(table, x[1], 2, 1)
+        step = np.int64(table[5])
+        row = np.int64(table[4]) * step
+        at = 6 + i * row + j * step + k
+        low = table[at] * (e - b) + table[at + step] * b
+        return low * (e - a) + (table[at + row] * (e - b) + table[at + row + step] * b) * a  # type: ignore[no-any-return]
+    else:
+        i, a = _along(table, x[0], 3, 0)
+        j, b = _along(table, x[1], 3, 1)
+        m, c = _along(table, x[2], 3, 2)
+        step = np.int64(table[7])
+        row = np.int64(table[6]) * step
+        slab = np.int64(table[5]) * row
+        at = 8 + i * slab + j * row + m * step + k
+        up = at + slab
+        low = (table[at] * (e - c) + table[at + step] * c) * (e - b)
+        low += (table[at + row] * (e - c) + table[at + row + step] * c) * b
+        high = (table[up] * (e - c) + table[up + step] * c) * (e - b)
+        high += (table[up + row] * (e - c) + table[up + row + step] * c) * b
+        return low * (e - a) + high * a  # type: ignore[no-any-return]
+
+
+@law
+def sample_vector(table: Table, x: Vec, k: int) -> Vec:
+    """Return the vector whose first coordinate is number k of a grid, at x."""
+    if len(x) == 2:
+        return (sample(table, x, k), sample(table, x, k + 1))
+    else:
+        return (sample(table, x, k), sample(table, x, k + 1), sample(table, x, k + 2))
+
+
+@law
+def _between(table: Table, x: float, d: int, k: int) -> bool:
+    return (x >= table[k]) & (x <= table[k] + table[d] * (table[d + 1 + k] - like(x, 1.0)))  # type: ignore[no-any-return]
+
+
+@law
+def covers(table: Table, x: Vec) -> bool:
+    """Is x within the grid, its edge included? Nowhere is, if x is no number."""
+    if len(x) == 2:
+        return _between(table, x[0], 2, 0) & _between(table, x[1], 2, 1)
+    else:
+        return _between(table, x[0], 3, 0) & _between(table, x[1], 3, 1) & _between(table, x[2], 3, 2)
+
+
+@kernel
+def _over_points(table: Any, points: Any, out: Any) -> None:
+    """Write every number of a grid at every point; points (R, D), out (R, K)."""
+    for r in range(points.shape[0]):
+        for k in range(out.shape[1]):
+            if points.shape[1] == 2:
+                out[r, k] = sample(table, (points[r, 0], points[r, 1]), k)
+            else:
+                out[r, k] = sample(table, (points[r, 0], points[r, 1], points[r, 2]), k)
+
+
+def sampled(table: Floats, points: ArrayLike) -> Floats:
+    """Return what a grid says at points (..., D), (..., K); for Python, not for laws."""
+    where = np.ascontiguousarray(points, np.float64)
+    d = where.shape[-1]
+    flat = where.reshape(-1, d)
+    out = np.empty((len(flat), int(table[2 * d + 1])))
+    entry(_over_points)(np.ascontiguousarray(table, np.float64), flat, out)
+    return out.reshape((*where.shape[:-1], -1))

@@ -1,0 +1,47 @@
+"""Sheep and shepherd: how a flock heeds a dog, and where the dog should be.
+
+Source: Strombom et al., "Solving the shepherding problem" (J. R. Soc. Interface 11:20140719, 2014,
+doi 10.1098/rsif.2014.0719), in continuous time: what is a direction there is one here, and the caller gives it a speed.
+"""
+
+from __future__ import annotations
+
+from flockenv.kernels import Vec, law
+from flockenv.vec import add, norm, scale, select, sub, unit
+
+__all__ = ["behind", "heed", "herd_from"]
+
+
+@law
+def heed(
+    velocity: Vec, centre: Vec, crowd: Vec, away: Vec, noise: Vec,
+    inertia: float, attraction: float, apart: float, fear: float, error: float,
+) -> Vec:  # fmt: skip
+    """Where a sheep goes that heeds a dog: unit(h unit(v) + c unit(C) + rho_a unit(R_a) + rho_s unit(R_s) + e noise).
+
+    C leads to the centre of those around it, R_a and R_s are sums of unit vectors away from sheep that are too near and
+    from dogs (Strombom et al. 2014, H'; there h = 0.5, c = 1.05, rho_a = 2, rho_s = 1, e = 0.3). 0 if all of it is.
+    """
+    wanted = add(scale(unit(velocity), inertia), scale(unit(centre), attraction))
+    wanted = add(wanted, add(scale(unit(crowd), apart), scale(unit(away), fear)))
+    return unit(add(wanted, scale(noise, error)))
+
+
+@law
+def behind(offset: Vec, goal: Vec, distance: float) -> Vec:
+    """Return the offset of the place `distance` m behind a thing, as seen from the goal that it shall be driven to."""
+    return add(offset, scale(unit(sub(offset, goal)), distance))
+
+
+@law
+def herd_from(
+    centre: Vec, farthest: Vec, goal: Vec, together: float, collecting: float, driving: float
+) -> Vec:  # fmt: skip
+    """Return the offset of where a dog should be: to collect who strays, else to drive all of them to the goal.
+
+    If the sheep farthest from the centre is more than `together` m from it, `collecting` m behind that sheep, seen from
+    the centre; else `driving` m behind the centre, seen from the goal (Strombom et al. 2014: r_a N^(2/3), r_a and
+    r_a sqrt(N) for N sheep that keep r_a m apart).
+    """
+    strays = norm(sub(farthest, centre)) > together
+    return select(strays, behind(farthest, centre, collecting), behind(centre, goal, driving))

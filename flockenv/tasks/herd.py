@@ -1,0 +1,411 @@
+"""Herd: dogs gather sheep that flock and flee from them, and drive them into a pen."""
+
+from __future__ import annotations
+
+import functools
+import math
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, model_validator
+
+from flockenv import steering
+from flockenv.kernels import Vec, kernel
+from flockenv.noise import smooth, uniform
+from flockenv.scene import Group, Scene
+from flockenv.snapshot import Mark
+from flockenv.space import Plane
+from flockenv.spawn import Spawn
+from flockenv.state import State
+from flockenv.tasks.base import Frame, Measured, Task
+from flockenv.tasks.layout import Layout, Slot
+from flockenv.tasks.sight import clip
+from flockenv.vec import add, norm, scale, sub, unit
+
+__all__ = ["Herd"]
+
+_TRIES = 64
+_GAIN = 5.0  # kg/s: a sheep has the velocity that it wants within 0.2 s
+
+
+@kernel
+def spawn(p: Any, frame: Frame) -> None:
+    """A pen, sheep about a place at least `away` m from it, dogs out of the sheep's sight; everybody at rest."""
+    frame.vel[:, :] = 0.0
+    middle = (0.0, 0.0)
+    for t in range(_TRIES):
+        pen, middle = _somewhere(p, frame, t, 0), _somewhere(p, frame, t, 1)
+        frame.memory[0, :], frame.memory[1, :] = pen[0], pen[1]
+        if norm(sub(pen, middle)) >= p.away:
+            break
+    dogs, n = int(p.dogs), frame.pos.shape[1]
+    for i in range(dogs, n):
+        for t in range(_TRIES):
+            r = p.scatter * math.sqrt(uniform(frame.key, t, i, 3))
+            a = 2.0 * math.pi * uniform(frame.key, t, i, 4)
+            frame.pos[0, i], frame.pos[1, i] = middle[0] + r * math.cos(a), middle[1] + r * math.sin(a)
+            if _clear(frame, i, dogs, i, p.apart_distance):
+                break
+    for i in range(dogs):
+        for t in range(_TRIES):
+            place = _somewhere(p, frame, t, 10 + i)
+            frame.pos[0, i], frame.pos[1, i] = place[0], place[1]
+            if _clear(frame, i, dogs, n, p.fear_distance) and _clear(frame, i, 0, i, 2.0):
+                break
+
+
+@kernel
+def _somewhere(p: Any, frame: Frame, t: int, channel: int) -> Vec:
+    """Return a random place in the field, 5 m or more from its edge."""
+    inner = p.size - 10.0
+    x = 5.0 + inner * uniform(frame.key, t, 500 + channel, 5)
+    return (np.float64(x), np.float64(5.0 + inner * uniform(frame.key, t, 500 + channel, 6)))
+
+
+@kernel
+def _clear(frame: Frame, i: int, first: int, end: int, distance: float) -> bool:
+    """Is agent i at least this far from those of [first, end)?"""
+    for j in range(first, end):
+        if norm(_to(frame, i, j)) < distance:
+            return False
+    return True
+
+
+@kernel
+def _to(frame: Frame, i: int, j: int) -> Vec:
+    """Return the offset of agent j from agent i, m."""
+    return sub(_place(frame, j), _place(frame, i))
+
+
+@kernel
+def _place(frame: Frame, i: int) -> Vec:
+    return (np.float64(frame.pos[0, i]), np.float64(frame.pos[1, i]))
+
+
+@kernel
+def _velocity(frame: Frame, i: int) -> Vec:
+    return (np.float64(frame.vel[0, i]), np.float64(frame.vel[1, i]))
+
+
+@kernel
+def _centre(p: Any, frame: Frame) -> Vec:
+    """Return the centre of the flock, m."""
+    x, y, dogs, n = 0.0, 0.0, int(p.dogs), frame.pos.shape[1]
+    for j in range(dogs, n):
+        x += frame.pos[0, j]
+        y += frame.pos[1, j]
+    return (x / (n - dogs), y / (n - dogs))
+
+
+@kernel
+def _pen(frame: Frame) -> Vec:
+    return (np.float64(frame.memory[0, 0]), np.float64(frame.memory[1, 0]))
+
+
+@kernel
+def _course(p: Any, frame: Frame) -> Vec:
+    """Return the unit vector from the flock's centre to the pen; the x axis if it is there."""
+    way = unit(sub(_pen(frame), _centre(p, frame)))
+    return way if way[0] != 0.0 or way[1] != 0.0 else (1.0, 0.0)
+
+
+@kernel
+def drive(p: Any, frame: Frame, action: Any, force: Any) -> None:
+    """Dogs push where their action says, in the frame of the course; sheep follow `_sheep`."""
+    course, dogs = _course(p, frame), int(p.dogs)
+    for i in range(dogs):
+        along, left = action[i, 0] * frame.max_force[i], action[i, 1] * frame.max_force[i]
+        force[0, i] = along * course[0] - left * course[1]
+        force[1, i] = along * course[1] + left * course[0]
+    for i in range(dogs, frame.pos.shape[1]):
+        _sheep(p, frame, i, force)
+
+
+@kernel
+def _sheep(p: Any, frame: Frame, i: int, force: Any) -> None:
+    """Heed dogs within `fear_distance` as in Strombom et al. 2014; graze otherwise, slowly, and not too near others."""
+    velocity, dogs = _velocity(frame, i), int(p.dogs)
+    crowd, centre, away, found = (0.0, 0.0), (0.0, 0.0), (0.0, 0.0), 0
+    for j in range(dogs, frame.pos.shape[1]):
+        to = _to(frame, i, j)
+        square = to[0] * to[0] + to[1] * to[1]
+        if j != i and square < p.flock_sight * p.flock_sight:
+            centre, found = add(centre, to), found + 1
+            if square < p.apart_distance * p.apart_distance:
+                crowd = sub(crowd, unit(to))
+    for j in range(dogs):
+        to = _to(frame, i, j)
+        if norm(to) < p.fear_distance:
+            away = sub(away, unit(to))
+    time = frame.step * p.control_dt
+    noise = (smooth(frame.key, time, i, 21), smooth(frame.key, time, i, 22))
+    if away[0] != 0.0 or away[1] != 0.0:
+        way = steering.heed(
+            velocity, centre, crowd, away, noise, p.inertia, p.attraction, p.apart, p.fear, p.error
+        )  # fmt: skip
+        wanted = scale(way, np.float64(frame.max_speed[i]))
+    else:
+        wanted = scale(add(unit(crowd), noise), np.float64(p.graze_speed))
+    wish = scale(sub(wanted, velocity), _GAIN)
+    force[0, i], force[1, i] = wish[0], wish[1]
+
+
+@kernel
+def _farthest(p: Any, frame: Frame, centre: Vec) -> tuple[int, float]:
+    """Return the sheep that is farthest from the centre, and the mean distance of all of them, m."""
+    who, most, total, dogs, n = 0, -1.0, 0.0, int(p.dogs), frame.pos.shape[1]
+    for j in range(dogs, n):
+        distance = norm(sub(_place(frame, j), centre))
+        total += distance
+        if distance > most:
+            who, most = j, distance
+    return who, total / (n - dogs)
+
+
+@kernel
+def _penned(p: Any, frame: Frame) -> int:
+    """Return how many sheep are in the pen."""
+    count, pen = 0, _pen(frame)
+    for j in range(int(p.dogs), frame.pos.shape[1]):
+        count += 1 if norm(sub(_place(frame, j), pen)) <= p.pen_radius else 0
+    return count
+
+
+@kernel
+def _all_in(p: Any, frame: Frame) -> bool:
+    return _penned(p, frame) == frame.pos.shape[1] - int(p.dogs)
+
+
+@kernel
+def reward(p: Any, before: Frame, after: Frame, action: Any, terms: Any) -> None:
+    """Terms: progress, gathering, success, time; the same for every dog."""
+    here, there = _centre(p, before), _centre(p, after)
+    nearer = norm(sub(_pen(before), here)) - norm(sub(_pen(after), there))
+    _, wide = _farthest(p, before, here)
+    _, now_wide = _farthest(p, after, there)
+    success = p.success_reward if _all_in(p, after) else 0.0
+    for i in range(terms.shape[0]):
+        terms[i, 0] = p.progress_reward * nearer
+        terms[i, 1] = p.gathering_reward * (wide - now_wide)
+        terms[i, 2] = success
+        terms[i, 3] = -p.time_cost * p.control_dt
+
+
+@kernel
+def ended(p: Any, before: Frame, after: Frame, over: Any) -> bool:
+    """All sheep in the pen end it: success."""
+    done = _all_in(p, after)
+    for i in range(over.shape[0]):
+        over[i] = done
+    return done
+
+
+@kernel
+def measure(p: Any, before: Frame, after: Frame, numbers: Any) -> None:
+    """Share of the sheep in the pen; time, s; mean distance of the sheep from their centre, m; path of the dogs, m."""
+    n, dogs = after.pos.shape[1], int(p.dogs)
+    numbers[0] = _penned(p, after) / (n - dogs)
+    numbers[1] = p.control_dt
+    _, numbers[2] = _farthest(p, after, _centre(p, after))
+    path = 0.0
+    for i in range(dogs):
+        path += norm(sub(_place(after, i), _place(before, i)))
+    numbers[3] = path / dogs
+
+
+@kernel
+def observe(p: Any, frame: Frame, rows: Any) -> None:
+    """All in the frame of the course: (along, left). Own velocity, pen, flock, who strays, nearest sheep, other dogs."""
+    centre, course, pen = _centre(p, frame), _course(p, frame), _pen(frame)
+    far, spread = _farthest(p, frame, centre)
+    slots, dogs = int(p.sheep_seen), int(p.dogs)
+    for i in range(rows.shape[0]):
+        row = rows[i]
+        here = _place(frame, i)
+        _put(row, 0, scale(_velocity(frame, i), 1.0 / p.dog_speed), course)
+        _put(row, 2, scale(sub(pen, here), 1.0 / p.size), course)
+        to_centre = sub(centre, here)
+        _put(row, 4, scale(to_centre, 1.0 / p.size), course)
+        _put(row, 6, unit(to_centre), course)
+        _put(row, 8, scale(_to(frame, i, far), 1.0 / p.size), course)
+        row[10] = min(spread / p.spread_scale, 1.0)
+        row[11] = min(norm(sub(_place(frame, far), centre)) / p.spread_scale, 1.0)
+        for c in range(12, rows.shape[1]):
+            row[c] = 0.0
+        _show_sheep(p, frame, i, slots, course, row)
+        at = 12 + 5 * slots + 3
+        for j in range(dogs):
+            if j != i:
+                _put(row, at, scale(_to(frame, i, j), 1.0 / p.size), course)
+                at += 2
+
+
+@kernel
+def _show_sheep(p: Any, frame: Frame, i: int, slots: int, course: Vec, row: Any) -> None:
+    """Write the nearest sheep of dog i, nearest first, and the direction and closeness of the very nearest."""
+    last, chosen = -1.0, -1
+    for s in range(slots):
+        best, who = np.inf, -1
+        for j in range(int(p.dogs), frame.pos.shape[1]):
+            to = _to(frame, i, j)
+            square = to[0] * to[0] + to[1] * to[1]
+            later = square > last or (square == last and j > chosen)
+            if later and square < best:
+                best, who = square, j
+        if who < 0:
+            break
+        to = _to(frame, i, who)
+        _put(row, 12 + 2 * s, scale(to, 1.0 / p.size), course)
+        _put(row, 12 + 2 * slots + 2 * s, scale(_velocity(frame, who), 1.0 / p.sheep_speed), course)
+        row[12 + 4 * slots + s] = 1.0
+        if s == 0:
+            _put(row, 12 + 5 * slots, unit(to), course)
+            row[12 + 5 * slots + 2] = max(1.0 - norm(to) / p.fear_distance, 0.0)
+        last, chosen = best, who
+
+
+@kernel
+def _put(row: Any, at: int, vector: Vec, course: Vec) -> None:
+    """Write a vector's parts along the course and to its left, clipped."""
+    row[at] = clip(vector[0] * course[0] + vector[1] * course[1])
+    row[at + 1] = clip(vector[1] * course[0] - vector[0] * course[1])
+
+
+class Herd(Task):
+    """Dogs with one shared policy gather sheep and drive them into a round pen, in an open field.
+
+    Sheep graze until a dog comes near. Then they go, at full speed, as in Strombom et al. 2014 (doi
+    10.1098/rsif.2014.0719): away from dogs, to the centre of the sheep around them, away from who is too near, on as
+    before, and a little anyhow. Everything a dog sees is relative to itself and turned into the frame of the course, which
+    leads from the flock's centre to the pen. All sheep in the pen at once end it.
+    """
+
+    name: ClassVar[str] = "herd"
+    terms: ClassVar[tuple[str, ...]] = ("progress", "gathering", "success", "time")
+    metric_names: ClassVar[tuple[str, ...]] = ("share_penned", "time_to_pen", "spread", "path_length")
+    measures: ClassVar[tuple[str, ...]] = ("penned", "time", "spread", "path")
+    memory: ClassVar[int] = 2
+
+    dogs: int = Field(default=1, ge=1, le=3, description="how many learn")
+    sheep: int = Field(default=12, ge=2, le=200, description="how many are driven")
+    horizon: int = Field(default=600, ge=1, description="decisions until the time limit (truncation)")
+    size: float = Field(default=40.0, ge=20, description="m, edge of the part of the field where everybody begins")
+    pen_radius: float = Field(default=4.0, gt=0, description="m")
+    away: float = Field(default=15.0, ge=0, description="m, between the pen and the middle of the sheep, at least")
+    scatter: float = Field(default=6.0, gt=0, description="m about that middle within which sheep begin")
+    dog_speed: float = Field(default=3.0, gt=0, description="m/s")
+    dog_force: float = Field(default=9.0, gt=0, description="N; the mass is 1 kg")
+    sheep_speed: float = Field(default=2.0, gt=0, description="m/s, of a sheep that flees")
+    sheep_force: float = Field(default=6.0, gt=0, description="N; the mass is 1 kg")
+    graze_speed: float = Field(default=0.2, ge=0, description="m/s, of a sheep that grazes")
+    fear_distance: float = Field(default=8.0, gt=0, description="r_s, m, within which a dog is heeded")
+    apart_distance: float = Field(default=1.0, gt=0, description="r_a, m, that sheep keep from each other")
+    flock_sight: float = Field(default=12.0, gt=0, description="m, within which sheep go to the centre of the others")
+    inertia: float = Field(default=0.5, ge=0, description="h, weight of going on as before")
+    attraction: float = Field(default=1.05, ge=0, description="c, weight of going to the centre of the others")
+    apart: float = Field(default=2.0, ge=0, description="rho_a, weight of going away from who is too near")
+    fear: float = Field(default=1.0, ge=0, description="rho_s, weight of going away from dogs")
+    error: float = Field(default=0.3, ge=0, description="e, weight of going anyhow")
+    sheep_seen: int = Field(default=6, ge=1, le=32, description="how many sheep a dog tells apart, nearest first")
+    progress_reward: float = Field(default=0.5, ge=0, description="per m that the flock's centre came nearer the pen")
+    gathering_reward: float = Field(
+        default=0.5, ge=0, description="per m that sheep came nearer their centre, on average"
+    )
+    success_reward: float = Field(default=10.0, ge=0, description="once, when all are in the pen")
+    time_cost: float = Field(default=0.2, ge=0, description="per s")
+
+    @model_validator(mode="after")
+    def _room(self) -> Herd:
+        """Refuse a start that the field has no room for."""
+        if self.away > self.size - 10:
+            raise ValueError(
+                f"away = {self.away:g} m: in a field of {self.size:g} m at most size - 10 is sure to be found"
+            )
+        return self
+
+    @property
+    def learners(self) -> int:
+        """The dogs."""
+        return self.dogs
+
+    @property
+    def agents(self) -> int:
+        """Dogs and sheep."""
+        return self.dogs + self.sheep
+
+    @property
+    def agent_names(self) -> tuple[str, ...]:
+        """dog_0 ..."""
+        return tuple(f"dog_{i}" for i in range(self.dogs))
+
+    @functools.cached_property
+    def scene(self) -> Scene:
+        """An open plane; nothing acts but what agents want."""
+        begin: dict[str, Any] = {"radius": 0.3, "spawn": Spawn(low=(0.0, 0.0), high=(self.size, self.size))}
+        dogs = Group(
+            count=self.dogs, max_speed=self.dog_speed, max_force=self.dog_force, role="learner", **begin
+        )  # fmt: skip
+        sheep = Group(
+            count=self.sheep, max_speed=self.sheep_speed, max_force=self.sheep_force, role="flockmate", **begin
+        )  # fmt: skip
+        return Scene(
+            space=Plane(),
+            groups=(dogs, sheep),
+            integrator=self.integrator,
+            dt=self.dt,
+            dtype=self.dtype,
+        )
+
+    @property
+    def spread_scale(self) -> float:
+        """Distances from the flock's centre are seen up to this, m."""
+        return 2.0 * self.scatter
+
+    def parameters(self) -> dict[str, float]:
+        """The fields, and what follows from them."""
+        return super().parameters() | {"spread_scale": self.spread_scale}
+
+    @functools.cached_property
+    def layout(self) -> Layout:
+        """Every vector is (along the course, to its left); the course leads from the flock's centre to the pen."""
+        k, mates, size = self.sheep_seen, self.dogs - 1, self.size
+        near = "1 - distance / fear_distance of the nearest sheep; 0 beyond"
+        return Layout((
+            Slot("velocity", (2,), self.dog_speed, "m/s", "own velocity (along the course, to its left)"),
+            Slot("goal", (2,), size, "m", "offset of the pen's centre"),
+            Slot("centre", (2,), size, "m", "offset of the flock's centre"),
+            Slot("centre_bearing", (2,), 1.0, "1", "unit vector towards it"),
+            Slot("farthest", (2,), size, "m", "offset of the sheep that is farthest from that centre"),
+            Slot("spread", (), self.spread_scale, "m", "mean distance of the sheep from their centre", low=0.0),
+            Slot("stray", (), self.spread_scale, "m", "distance of the farthest from it", low=0.0),
+            Slot("sheep", (k, 2), size, "m", "offsets of the nearest sheep, nearest first"),
+            Slot("sheep_velocity", (k, 2), self.sheep_speed, "m/s", "their velocities"),
+            Slot("sheep_present", (k,), 1.0, "1", "1 where there is one, else 0 (and zeros before)", low=0.0),
+            Slot("bearing", (2,), 1.0, "1", "unit vector towards the nearest sheep"),
+            Slot("closeness", (), 1.0, "1", near, low=0.0),
+            Slot("mates", (mates, 2), size, "m", "offsets of the other dogs"),
+        ))  # fmt: skip
+
+    @functools.cached_property
+    def action_layout(self) -> Layout:
+        """A force in the frame of the course."""
+        meaning = "force (along the course, to its left) / max_force, shortened to length 1"
+        return Layout((Slot("force", (2,), self.dog_force, "N", meaning),))
+
+    def metrics(self, sums: Measured, last: Measured, steps: NDArray[np.int64]) -> dict[str, NDArray[np.float64]]:
+        """Share of the sheep in the pen now; s until all were (NaN if they are not); spread now, m; path of a dog, m."""
+        return {
+            "share_penned": last["penned"],
+            "time_to_pen": np.where((last["penned"] >= 1.0) & (steps > 0), sums["time"], np.nan),
+            "spread": last["spread"],
+            "path_length": sums["path"],
+        }
+
+    def marks(self, state: State, memory: NDArray[np.float64], world: int) -> tuple[Mark, ...]:
+        """The pen."""
+        return (Mark("goal", memory[:2, world, 0], np.zeros(2), self.pen_radius),)
+
+    def view(self, state: State, world: int) -> tuple[tuple[float, ...], tuple[float, ...]]:
+        """Return the part of the field where everybody begins."""
+        return (0.0, 0.0), (self.size, self.size)
