@@ -20,7 +20,16 @@ if TYPE_CHECKING:
     from flockenv.scene import Scene
     from flockenv.snapshot import Snapshot
     from flockenv.state import Body, State
-    from flockenv.tasks import TASKS, Flock, Herd, Obstacles, Pursuit, Task
+    from flockenv.tasks import (
+        TASKS,
+        Crossing,
+        Evade,
+        Flock,
+        Herd,
+        Obstacles,
+        Pursuit,
+        Task,
+    )
     from flockenv.world import Step, World
 
 __version__ = "0.1.0"
@@ -28,6 +37,8 @@ __version__ = "0.1.0"
 __all__ = [
     "TASKS",
     "Body",
+    "Crossing",
+    "Evade",
     "Flock",
     "Herd",
     "Obstacles",
@@ -47,6 +58,8 @@ _HOME = {
     "Body": "state",
     "State": "state",
     "TASKS": "tasks",
+    "Crossing": "tasks",
+    "Evade": "tasks",
     "Flock": "tasks",
     "Herd": "tasks",
     "Obstacles": "tasks",

@@ -49,6 +49,7 @@ class Snapshot:
     time: s. pos (N, D): m. vel (N, D): m/s. alive (N,): bool. radius (N,): m. roles: N names out of ROLES.
     obstacle_centre (M, D), obstacle_radius (M,): m. marks: goals and headings. low, high (D,): the region to show, m.
     periodic: whether what leaves the region enters it on the far side. title: one line. D = 2 or 3; N and M may be 0.
+    outlines: polygons (n, 2), m, of obstacles that are not round, as seen from above.
     bonds (E, 2): int, pairs of agents that a line is drawn between, the shortest way; none by default.
     heading (N, D): where everybody faces; none by default, and then that is along the velocity.
     Arrays are private copies and read-only; positions and velocities may hold NaN or inf (a run that diverged can be
@@ -70,6 +71,7 @@ class Snapshot:
     periodic: bool
     title: str
     bonds: NDArray[np.int32] = field(default_factory=lambda: np.zeros((0, 2), np.int32))
+    outlines: tuple[Floats, ...] = ()
     heading: Floats | None = None
 
     def __post_init__(self) -> None:
@@ -93,6 +95,7 @@ class Snapshot:
             periodic=bool(self.periodic),
             heading=None if self.heading is None else _array("Snapshot.heading", self.heading, (agents, dimension)),
             bonds=_pairs("Snapshot.bonds", self.bonds, agents),
+            outlines=tuple(_array("Snapshot.outlines", polygon, (None, 2)) for polygon in self.outlines),
         )
         if not isinstance(self.title, str):
             raise TypeError(f"Snapshot.title: must be a str, got {type(self.title).__name__}")

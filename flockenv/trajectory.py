@@ -63,7 +63,7 @@ class Trajectory:
     def snapshots(self, title: str = "") -> Iterator[Snapshot]:
         """Return every instant, ready to be drawn, all in one frame: the space, or where anybody ever was."""
         low, high = _region(self.scene, self.pos)
-        start = self.scene.snapshot(self.first, title=title)
+        start = replace(self.scene.snapshot(self.first, title=title), outlines=self.scene.outlines(low, high))
         for k, step in enumerate(self.step):
             yield replace(
                 start, time=step * self.scene.dt, pos=self.pos[k], vel=self.vel[k], alive=self.alive[k], low=low,
@@ -203,7 +203,8 @@ def _region(scene: Scene, pos: Floats) -> tuple[NDArray[np.float64], NDArray[np.
         return np.zeros(scene.dimension), np.array(scene.space.extent(scene.dimension))
     low, high = (np.asarray(end(pos, axis=(0, 1)), np.float64) for end in (np.min, np.max))
     margin = 1.0 + 0.05 * float((high - low).max())
-    return low - margin, high + margin
+    every = np.concatenate([[low - margin], [high + margin], *(shape.extremes for shape in scene.shapes)])
+    return every.min(axis=0), every.max(axis=0)
 
 
 def _json(value: float) -> float | None:

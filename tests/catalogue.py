@@ -28,7 +28,36 @@ from flockenv.arbitration import (
     RoundRobin,
     RunningSum,
 )
-from flockenv.behaviours import Alignment, AvoidObstacles, Cohesion, Separation
+from flockenv.behaviours import (
+    Alignment,
+    Arrive,
+    AvoidObstacles,
+    Cohesion,
+    Contain,
+    Dock,
+    Evade,
+    Face,
+    Flee,
+    FollowFlow,
+    FollowLeader,
+    FollowPath,
+    FollowWall,
+    FollowWay,
+    ForceField,
+    Formation,
+    Hide,
+    Interpose,
+    MatchVelocity,
+    OffsetPursue,
+    Pursue,
+    Seek,
+    Separation,
+    Shadow,
+    StayOnPath,
+    TargetSpeed,
+    Wander,
+    Whiskers,
+)
 from flockenv.effects import EFFECTS as EFFECT_KINDS
 from flockenv.effects import (
     AngularSprings,
@@ -41,6 +70,7 @@ from flockenv.effects import (
     Gravitation,
     Gravity,
     InverseSquare,
+    ObstacleContact,
     Pressure,
     QuadraticDrag,
     Sink,
@@ -70,10 +100,12 @@ from flockenv.integrators import (
 )
 from flockenv.networks import Mesh
 from flockenv.scene import Group, Scene
+from flockenv.shapes import Circle
 from flockenv.space import Box, Plane, Space, Torus
 from flockenv.spawn import Spawn
 from flockenv.steer import Steer
-from flockenv.tasks import Flock, Obstacles, Pursuit, Task
+from flockenv.tasks import Evade as EvadeTask
+from flockenv.tasks import Flock, Herd, Obstacles, Pursuit, Task
 
 Array = NDArray[np.float64]
 
@@ -143,6 +175,9 @@ STEERING = (
     Law(steering.cohere, ("vector", "vector", "positive"), "vector"),
     Law(steering.threat, ("heading", "vector", "positive", "length"), "positive"),
     Law(steering.avoid, ("heading", "vector", "positive", "positive"), "vector"),
+    Law(steering.stay_on_path, ("positive", "vector", "vector", "positive"), "vector"),
+    Law(steering.follow_path, ("positive", "positive", "vector", "vector", "positive"), "vector"),
+    Law(steering.follow_flow, ("vector", "vector"), "vector"),
     Law(steering.contain, ("walls", "walls", "vector", "positive", "positive"), "vector", turns="none", mirrors=False),
     Law(steering.heed, ("vector",) * 5 + ("positive",) * 5, "vector"),
     Law(steering.behind, ("vector", "vector", "length"), "vector"),
@@ -170,6 +205,8 @@ class EffectRow:
     beside: tuple[Effect, ...] = ()  # without which it moves nobody: what a medium drags or carries
     obeys: frozenset[str] = frozenset({"translation", "rotation", "mirror", "relabelling"})
     signed: tuple[str, ...] = ()  # parameters that may be negative
+    family: str = ""  # rows of a family share a kernel: in its scene the others are there too, idle; see `company`
+    flat: Effect | None = None  # the effect in the plane, where it is not enough to leave an axis out
 
     @property
     def name(self) -> str:
@@ -180,20 +217,40 @@ class EffectRow:
 
     def at(self, dimension: int) -> tuple[Effect, ...]:
         """The effect in so many dimensions, and those beside it."""
-        return tuple(in_dimension(effect, dimension) for effect in (self.effect, *self.beside))
+        effect = self.flat if self.flat is not None and dimension == 2 else self.effect
+        return tuple(in_dimension(effect, dimension) for effect in (effect, *self.beside))
+
+    def company(self, dimension: int, idle: bool = False) -> tuple[Effect, ...]:
+        """The same among those of its family, which are idle; idle, it is so too."""
+        if not self.family:
+            effect, *beside = self.at(dimension)
+            return (effect.idle() if idle else effect, *beside)
+        family = [row for row in EFFECTS if row.family == self.family]
+        here = [(in_dimension(row.effect, dimension), row is self and not idle) for row in family]
+        return tuple(effect if acts else effect.idle() for effect, acts in here)
 
 
-def vectors(effect: Effect) -> dict[str, tuple[float, ...]]:
-    """What of an effect's parameters are directions and places."""
-    return {name: value for name, value in effect.parameters().items() if isinstance(value, tuple)}
+def vectors(effect: Effect) -> dict[str, tuple[Any, ...]]:
+    """What of an effect's parameters are directions and places, and lists of places."""
+    given = effect.parameters() | {name: getattr(effect, name) for name in effect.places}
+    return {name: value for name, value in given.items() if isinstance(value, tuple)}
 
 
 def in_dimension(effect: Effect, dimension: int) -> Effect:
     """The same effect with the first numbers of its vectors; in the plane nobody turns about an axis."""
-    flat = {
+    flat: dict[str, Any] = {
         name: None if name == "axis" and dimension == 2 else value[:dimension]
         for name, value in vectors(effect).items()
+        if not isinstance(value[0], tuple)
     }
+    flat |= {
+        name: tuple(place[:dimension] for place in value)
+        for name, value in vectors(effect).items()
+        if isinstance(value[0], tuple)
+    }
+    within = getattr(effect, "within", None)
+    if isinstance(within, Circle) and dimension == 3:
+        flat["within"] = Circle(centre=(*within.centre[:2], 3.0), radius=within.radius)
     return effect.model_copy(update=flat)
 
 
@@ -201,17 +258,23 @@ def turned(effect: Effect, matrix: Array, shift: Array) -> Effect:
     """The same effect with its directions turned, and its places turned about the middle of EDGE and shifted."""
     middle = EDGE / 2
     change = {
-        name: tuple(
-            (np.array(value) - middle) @ matrix.T + middle + shift if name in effect.places else value @ matrix.T
-        )
+        name: (np.array(value) - middle) @ matrix.T + middle + shift if name in effect.places else value @ matrix.T
         for name, value in vectors(effect).items()
     }
-    return effect.model_copy(update={name: tuple(map(float, value)) for name, value in change.items()})
+    return effect.model_copy(update={name: _tuples(value.tolist()) for name, value in change.items()})
+
+
+def _tuples(value: Any) -> Any:
+    """Lists, and lists in them, as tuples."""
+    return tuple(map(_tuples, value)) if isinstance(value, list) else value
 
 
 DRAG = Drag(rate=0.4)
 WIND = Wind(velocity=(1.5, -0.7, 0.4), gust=(0.5, 1.0, -0.3), period=0.8)
 CENTRE = (2.5, 2.5, 2.5)
+UPRIGHT = frozenset({"translation", "relabelling"})
+LOOP = ((1.0, 1.0, 2.5), (5.0, 1.5, 3.0), (4.5, 5.0, 2.0), (1.5, 4.0, 3.5))
+FLOWS = tuple((0.3 * k % 2 - 1, 0.7 * k % 2 - 1, 0.9 * k % 2 - 1) for k in range(24))
 
 EFFECTS = (
     EffectRow(DRAG),
@@ -237,6 +300,7 @@ EFFECTS = (
         Swing(centre=CENTRE, strength=0.8, length=0.7), obeys=frozenset({"translation", "mirror", "relabelling"})
     ),
     EffectRow(WallRepulsion(point=CENTRE, normal=(1.2, -0.7, 0.9), strength=2, decay=1.5)),
+    EffectRow(ObstacleContact(stiffness=30, damping=0.5)),
     EffectRow(Fluctuation(strength=0.8), obeys=frozenset({"translation"})),  # to each his own, along the axes
     EffectRow(Pressure(strength=1.5, density=1, radius=1.35)),
     EffectRow(Separation(weight=1.3, radius=2.5)),
@@ -250,6 +314,53 @@ EFFECTS = (
                 AvoidObstacles(weight=5, horizon=3), Separation(weight=1.3, radius=2.5), Alignment(weight=0.7, radius=3)
             )
         )
+    ),
+    EffectRow(Seek(weight=2, target=CENTRE, speed=1.5), family="goals"),
+    EffectRow(Flee(weight=2, target=CENTRE, speed=1.5, radius=4), family="goals"),
+    EffectRow(Arrive(weight=2, target=CENTRE, speed=1.5, slow_radius=2), family="goals"),
+    EffectRow(
+        Dock(weight=2, target=CENTRE, direction=(0.5, -1, 0.3), speed=1.5, gate=1, width=0.3, slow_radius=2),
+        family="goals",
+    ),
+    EffectRow(Face(weight=2, heading=(1, 2, -0.5)), family="goals"),
+    EffectRow(TargetSpeed(weight=2, speed=1.2), family="goals"),
+    EffectRow(  # to each his own, and his left is not his mirror image's
+        Wander(weight=2, speed=1.5, strength=0.8), obeys=frozenset({"translation"}), family="goals"
+    ),
+    EffectRow(Pursue(weight=2, speed=1.5, group=0, radius=2.5), family="others"),
+    EffectRow(Evade(weight=2, speed=1.5, group=0, radius=2.5, predictor="exact", fov=300), family="others"),
+    EffectRow(OffsetPursue(weight=2, speed=1.5, radius=2.5, distance=0.5, predictor="opensteer"), family="others"),
+    EffectRow(
+        Shadow(weight=2, speed=1.5, group=0, radius=2.5, distance=0.5, predictor="distance"), family="others"
+    ),
+    EffectRow(MatchVelocity(weight=2, radius=2.5), family="others"),
+    EffectRow(
+        Formation(weight=2, speed=1.5, group=0, radius=2.5, ahead=-0.5, left=0.7, up=0.2, slow_radius=1),
+        obeys=UPRIGHT, signed=("ahead", "left", "up"), family="others",  # left of it is right of its mirror image
+    ),
+    EffectRow(
+        FollowLeader(weight=2, speed=1.5, group=0, radius=2.5, distance=0.5, headway=0.3, slow_radius=1),
+        family="others",
+    ),
+    EffectRow(Interpose(weight=2, speed=1.5, group=0, other=0, radius=2.5, slow_radius=1), family="others"),
+    EffectRow(Hide(weight=2, speed=1.5, group=0, radius=2.5, slow_radius=1)),
+    EffectRow(Whiskers(weight=5, horizon=3), obeys=UPRIGHT, family="around"),  # in space they are horizontal and vertical
+    EffectRow(ForceField(weight=0.5, range=2), family="around"),
+    EffectRow(FollowWall(weight=2, speed=1.5, distance=0.7, range=4), family="around"),
+    EffectRow(  # its circle stays where it is
+        Contain(weight=2, speed=1.5, within=Circle(centre=(3, 3), radius=2.5)), obeys=frozenset({"relabelling"})
+    ),
+    EffectRow(  # its grid lies along the axes
+        FollowWay(weight=2, speed=1.5, target=(3.0, 5.5, 2.5), clearance=0.1, spacing=0.3, margin=1),
+        obeys=frozenset({"relabelling"}),
+    ),
+    EffectRow(FollowPath(weight=2, points=LOOP, closed=True, radius=0.3, speed=1.5), signed=("way",)),
+    EffectRow(StayOnPath(weight=2, points=LOOP[:3], radius=0.4, speed=1.5, time=1)),
+    EffectRow(
+        FollowFlow(weight=1.5, centre=CENTRE, spacing=1.5, counts=(4, 3, 2), velocities=FLOWS),
+        flat=FollowFlow(weight=1.5, centre=CENTRE[:2], spacing=1.5, counts=(4, 3),
+                        velocities=tuple(flow[:2] for flow in FLOWS[:12])),
+        obeys=frozenset({"translation", "relabelling"}),  # its grid lies along the axes
     ),
     EffectRow(Gravitation(constant=0.3, softening=0.5)),  # of few the sum is exact; of many, see test_gravitation.py
     EffectRow(InverseSquare(strength=-0.4, softening=0.3), signed=("strength",)),
@@ -325,6 +436,9 @@ TASKS = (
     TaskRow(Obstacles()),
     TaskRow(Flock()),
     TaskRow(Flock(learners=1), "_single"),
+    TaskRow(EvadeTask()),
+    TaskRow(Herd()),
+    TaskRow(Herd(dogs=3), "_team"),
 )
 
 
@@ -362,7 +476,7 @@ def scene_of(*effects: Effect, dimension: int = 2, space: Space | None = None, *
 
 def scene_under(row: EffectRow, dimension: int) -> Scene:
     """Return the scene in which tests try a row."""
-    return scene_of(*row.at(dimension), dimension=dimension)
+    return scene_of(*row.company(dimension), dimension=dimension)
 
 
 FIRST = tuple({row.effect.kind: row for row in reversed(EFFECTS)}.values())[::-1]

@@ -8,12 +8,14 @@ import pickle
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 import flockenv
 from flockenv import effects as effects_module
+from flockenv.arbitration import ARBITRATIONS
 from flockenv.behaviours import Separation
 from flockenv.effects import Drag
 from flockenv.integrators import RK4
@@ -176,7 +178,7 @@ def test_the_dead_are_not_there(row: EffectRow, dimension: int) -> None:
     start = scene.start(3)
     start.alive[:, 18:] = False
     groups = (scene.groups[0], scene.groups[1].model_copy(update={"count": 4}))
-    few = scene_of(*row.at(dimension), dimension=dimension, groups=groups)
+    few = scene_of(*row.company(dimension), dimension=dimension, groups=groups)
     living = few.start(3)
     living.x[...], living.v[...] = start.x[:, :, :18], start.v[:, :, :18]
     end, expected = scene.run(start, 20), few.run(living, 20)
@@ -193,7 +195,7 @@ KINDS = pytest.mark.parametrize("row", FIRST, ids=lambda row: row.name)
 def single(row: EffectRow, dimension: int) -> Scene:
     """One effect in float32, the others idle: one kernel for all of them, but for those that are never among others."""
     if row.effect.kind not in AMONG_ALL:
-        return scene_of(*row.at(dimension), dimension=dimension, dtype="float32")
+        return scene_of(*row.company(dimension), dimension=dimension, dtype="float32")
     return everything(dimension, *row.at(dimension), space=Plane(), dtype="float32")
 
 
@@ -243,7 +245,7 @@ def test_in_single_precision_it_conserves_momentum_if_it_says_so(row: EffectRow,
 def test_it_is_finite_where_everybody_is_in_one_place_at_rest(row: EffectRow, dimension: int, count: int) -> None:
     """In an obstacle's very centre, if there are obstacles: nothing has a direction there."""
     spawn = Spawn(low=(0,) * dimension, high=(1,) * dimension)
-    scene = scene_of(*row.at(dimension), dimension=dimension, groups=(Group(count=count, spawn=spawn),))
+    scene = scene_of(*row.company(dimension), dimension=dimension, groups=(Group(count=count, spawn=spawn),))
     state = scene.start(0)
     state.pos[...] = scene.obstacles[0].centre if scene.obstacles else 2.5
     state.vel[...] = 0
@@ -404,8 +406,8 @@ def test_a_pair_law_may_read_bodies_in_another_module_of_the_user_s(tmp_path: Pa
 @DIMENSIONS
 @ROWS
 def test_an_idle_effect_is_an_absent_one(row: EffectRow, dimension: int) -> None:
-    effect, *beside = row.at(dimension)
-    idle, absent = (scene_of(*some, *beside, dimension=dimension) for some in ((effect.idle(),), ()))
+    absent = () if row.family else row.at(dimension)[1:]
+    idle, absent = (scene_of(*some, dimension=dimension) for some in (row.company(dimension, idle=True), absent))
     start = idle.start(3)
     ends = [scene.run(start, 20) for scene in (idle, absent)]
     np.testing.assert_array_equal(ends[0].x, ends[1].x)
@@ -441,9 +443,15 @@ def test_several_pair_effects_share_one_query() -> None:
 # --- an effect is a value ---------------------------------------------------------------------------------------------
 
 
+def names_of_effects() -> dict[str, Any]:
+    """What a printed effect or scene is read with: effects, behaviours, arbitrations."""
+    kinds = (*effects_module.EFFECTS.values(), *ARBITRATIONS.values())
+    return {kind.__name__: kind for kind in kinds}
+
+
 @ROWS
 def test_it_prints_as_its_own_constructor(row: EffectRow) -> None:
-    assert eval(repr(row.effect), vars(effects_module)) == row.effect  # noqa: S307  # that is what is promised
+    assert eval(repr(row.effect), names_of_effects()) == row.effect  # noqa: S307  # that is what is promised
     assert str(row.effect) == repr(row.effect)
 
 
@@ -468,7 +476,7 @@ def test_a_scene_under_it_is_a_value(row: EffectRow, dimension: int) -> None:
     again = pickle.loads(pickle.dumps(scene))
     assert again == scene
     assert Scene.model_validate(scene.model_dump()) == scene
-    names = vars(effects_module) | {"Scene": Scene, "Group": Group, "Spawn": Spawn, "Plane": Plane, "Mesh": Mesh}
+    names = names_of_effects() | {"Scene": Scene, "Group": Group, "Spawn": Spawn, "Plane": Plane, "Mesh": Mesh}
     names |= {type(o).__name__: type(o) for o in (*scene.obstacles, scene.integrator)}
     assert eval(repr(scene), names) == scene  # noqa: S307
     np.testing.assert_array_equal(again.run(again.start(3), 5).x, end.x)

@@ -18,7 +18,7 @@ LAYERS = (
     {"divergence", "terminal", "refusals", "outputs", "recycle", "crew", "compilation", "inlining"},
     {"records", "vec", "noise", "kernels"},
     {"state", "space", "steering", "arbitration", "vehicle"},
-    {"neighbours", "shapes", "grid", "orca", "rows", "networks", "elements", "tree"},
+    {"neighbours", "shapes", "grid", "eikonal", "orca", "polyline", "rows", "networks", "elements", "tree"},
     {"effects", "integrators", "collisions", "population", "spawn", "sweep", "stability", "rounding"},
     {"behaviours"},
     {"steer"},

@@ -43,7 +43,8 @@ def draw(snapshot: Snapshot, size: int = 600, scale: int = 2, trails: Sequence[S
     _whole("scale", scale, _SCALES)
     view = look(snapshot, size, scale)
     stones = np.column_stack([snapshot.obstacle_centre[:, :2], snapshot.obstacle_radius])
-    backdrop = _backdrop(view, snapshot.title, tuple(dict.fromkeys(snapshot.roles)), stones.tobytes())
+    walls = tuple(polygon.tobytes() for polygon in snapshot.outlines)
+    backdrop = _backdrop(view, snapshot.title, tuple(dict.fromkeys(snapshot.roles)), stones.tobytes(), walls)
     canvas = backdrop.copy()
     pen = ImageDraw.Draw(canvas, "RGBA")
     if trails:
@@ -69,7 +70,7 @@ def _whole(name: str, value: int, limits: tuple[int, int]) -> None:
 
 
 @lru_cache(maxsize=4)
-def _backdrop(view: View, title: str, roles: tuple[str, ...], stones: bytes) -> Image.Image:
+def _backdrop(view: View, title: str, roles: tuple[str, ...], stones: bytes, walls: tuple[bytes, ...]) -> Image.Image:
     canvas = Image.new("RGB", (view.width, view.height), rgb(PAPER["page"][0]))
     pen = ImageDraw.Draw(canvas, "RGBA")
     world = (view.left, view.top, view.right, view.bottom)
@@ -77,6 +78,8 @@ def _backdrop(view: View, title: str, roles: tuple[str, ...], stones: bytes) -> 
     _grid(pen, view)
     for x, y, radius in np.frombuffer(stones).reshape(-1, 3).tolist():
         _stone(pen, view, x, y, radius)
+    for wall in walls:
+        _wall(pen, view, np.frombuffer(wall).reshape(-1, 2))
     _trim(canvas, Image.new("RGB", canvas.size, rgb(PAPER["page"][0])), view, spill=0.0)
     _edge(pen, view)
     _caption(pen, view, title, roles)
@@ -102,6 +105,16 @@ def _stone(pen: ImageDraw.ImageDraw, view: View, x: float, y: float, radius: flo
     for a, b in view.sightings(px, py, reach):
         _disc(pen, a, b, reach, PAPER["rim"][0])
         _disc(pen, a, b, reach - view.width / 400, PAPER["stone"][0])
+
+
+def _wall(pen: ImageDraw.ImageDraw, view: View, polygon: Floats) -> None:
+    """Draw an obstacle that is not round; on a torus, across every edge that its box overlaps."""
+    spots = view.place(polygon)
+    middle = (spots.min(axis=0) + spots.max(axis=0)) / 2
+    reach = float((spots.max(axis=0) - middle).max())
+    for a, b in view.sightings(*middle.tolist(), reach):
+        corners = (spots - middle + (a, b)).ravel().tolist()
+        pen.polygon(corners, fill=PAPER["stone"][0], outline=PAPER["rim"][0], width=max(1, round(view.width / 400)))
 
 
 def _edge(pen: ImageDraw.ImageDraw, view: View) -> None:

@@ -189,6 +189,7 @@ def _scenery(shots: Sequence[Snapshot]) -> list[dict[str, Any]]:
         stones = np.column_stack([shot.obstacle_centre[:, :2], shot.obstacle_radius]).tolist()
         scene = {
             "stones": [[_short(x, 6) for x in stone] for stone in stones],
+            "walls": [[[_short(x, 6) for x in corner] for corner in wall.tolist()] for wall in shot.outlines],
             "marks": [_mark(mark) for mark in shot.marks],
         }
         if not scenes or scene != {name: scenes[-1][name] for name in scene}:

@@ -12,6 +12,7 @@ Sources: Reynolds, "Flocks, Herds, and Schools" (SIGGRAPH 1987); "Steering Behav
 from __future__ import annotations
 
 from flockenv.steering.around import avoid, contain, threat
+from flockenv.steering.crowd import explore, give_way, queue, queue_gap, unaligned_threat
 from flockenv.steering.goals import (
     arrive,
     dock,
@@ -42,6 +43,7 @@ from flockenv.steering.others import (
     separate,
     shadow,
 )
+from flockenv.steering.paths import follow_flow, follow_path, stay_on_path
 
 __all__ = [
     "align",
@@ -54,9 +56,13 @@ __all__ = [
     "distance_time",
     "dock",
     "evade",
+    "explore",
     "face",
     "flee",
+    "follow_flow",
     "follow_leader",
+    "follow_path",
+    "give_way",
     "heed",
     "herd_from",
     "hiding_place",
@@ -68,11 +74,15 @@ __all__ = [
     "offset_pursue",
     "opensteer_time",
     "pursue",
+    "queue",
+    "queue_gap",
     "seek",
     "separate",
     "shadow",
+    "stay_on_path",
     "target_speed",
     "threat",
+    "unaligned_threat",
     "wander",
     "wander_turn",
 ]

@@ -9,9 +9,21 @@ from __future__ import annotations
 
 from flockenv.sweep.bonds import bonds
 from flockenv.sweep.far import far
+from flockenv.sweep.obstacles import obstacles
 from flockenv.sweep.pairs import pairs
 from flockenv.sweep.parts import Parts
-from flockenv.sweep.text import CONTEXT, Slots, alone, frame_views, indented, lane, lanes_of, tuple_of
+from flockenv.sweep.text import (
+    CONTEXT,
+    Slots,
+    alone,
+    frame_views,
+    given,
+    indented,
+    lane,
+    lanes_of,
+    nearest_image,
+    tuple_of,
+)
 
 __all__ = ["accelerate", "parameters"]
 
@@ -44,7 +56,7 @@ def respond(around, pos, vel, time, acc):
 {indented(parameters(parts), 4)}
     for block in range(np.uint64(first_), np.uint64(end_)):
         base, row = block * np.uint64({d * parts.width}), block * np.uint64({parts.width})
-{indented(_obstacles(parts, me), 8)}
+{indented(obstacles(parts, me, lambda k: _felt_as(parts, f"n{k}_")), 8)}
         for l in range(np.uint64({parts.width})):
 {indented(me, 12)}
             o = zero(x)
@@ -76,6 +88,9 @@ def parameters(parts: Parts) -> list[str]:
     d = parts.dimension
     lines = [f"size = {tuple_of('params[#]', d)}", f"reach = params[{d}]"]
     at = d + 1
+    for form in parts.shaped[1]:
+        lines.append(f"{form}_at, {form}_count = np.int64(params[{at}]), np.int64(params[{at + 1}])")
+        at += 2
     for q, sight in enumerate(parts.sights):
         lines.append(f"within{q}, view{q} = params[{at}], params[{at + 1}]")
         at += 2
@@ -99,24 +114,15 @@ def parameters(parts: Parts) -> list[str]:
 def _nearest_images(parts: Parts) -> list[str]:
     """Write the numbers of those effects that know places anew: on a torus, with the images nearest to agent i."""
     lines = []
-    for k, effect in enumerate(parts.effects):
-        if _given(parts, k) == f"near{k}":
-            values = [
-                f"add(x, offset_to(size, x, p{k}.{name}))" if name in effect.places else f"p{k}.{name}"
-                for name in parts.names_of(effect)
-            ]
-            lines.append(f"near{k} = P{k}({', '.join(values)})")
+    for k in range(len(parts.effects)):
+        if given(parts, k) == f"near{k}":
+            lines.append(nearest_image(parts, k, "x"))
     return lines
-
-
-def _given(parts: Parts, k: int) -> str:
-    """Write by which name the numbers of effect k are given to a law of one agent."""
-    return f"near{k}" if parts.space.periodic and parts.effects[k].places else f"p{k}"
 
 
 def _medium(parts: Parts) -> list[str]:
     """Write how fast the medium is where agent i is, if any effect says so."""
-    media = [f"m = add(m, medium_law_{k}({_given(parts, k)}, me))" for k, e in enumerate(parts.effects) if e.medium_law]
+    media = [f"m = add(m, medium_law_{k}({given(parts, k)}, me))" for k, e in enumerate(parts.effects) if e.medium_law]
     if not media:
         return []
     return [
@@ -130,7 +136,7 @@ def _carry(parts: Parts) -> list[str]:
     """Write with which velocity the medium carries agent i, if it does."""
     if not parts.flows:
         return []
-    laws = [f"u = add(u, flow_law_{k}({_given(parts, k)}, me))" for k, e in enumerate(parts.effects) if e.flow_law]
+    laws = [f"u = add(u, flow_law_{k}({given(parts, k)}, me))" for k, e in enumerate(parts.effects) if e.flow_law]
     return [
         "u = o",
         *laws,
@@ -147,19 +153,23 @@ def _own(parts: Parts) -> list[str]:
             still = effect.linear_drag is not None and parts.integrator.splits_drag
             if still:  # what is left of -c (v - u): the method adds -c v
                 lines.append(f"rest = {alone(parts, medium='me.medium', vel='o', heading='o')}")
-            lines.append(f"{to} = add({to}, own_law_{k}({_given(parts, k)}, {'rest' if still else 'me'}))")
-        if effect.obstacle_law is not None:
+            lines.append(f"{to} = add({to}, own_law_{k}({given(parts, k)}, {'rest' if still else 'me'}))")
+        if effect.obstacle_start is not None:
             lines.append(f"{to} = add({to}, obstacle_finish_{k}(p{k}, me, ({', '.join(slot.all(f'o{k}_'))},)))")
     return lines
 
 
+def _felt_as(parts: Parts, name: str) -> str:
+    """Write what the pair laws came to for one of their targets."""
+    d, t = parts.dimension, parts.targets.index(name)
+    each = d * len(parts.targets)
+    places = [f"felt[row * np.uint64({each}) + np.uint64({(d * t + k) * parts.width}) + l]" for k in range(d)]
+    return f"({', '.join(places)},)"
+
+
 def _felt(parts: Parts) -> list[str]:
     """Write how what the pair laws came to is added."""
-    d, lines = parts.dimension, []
-    each = d * len(parts.targets)
-    for t, name in enumerate(parts.targets):
-        places = [f"felt[row * np.uint64({each}) + np.uint64({(d * t + k) * parts.width}) + l]" for k in range(d)]
-        lines.append(f"{name} = add({name}, ({', '.join(places)},))")
+    lines = [f"{name} = add({name}, {_felt_as(parts, name)})" for name in parts.targets if name[0] != "n"]
     if parts.pulls:
         lines.append(f"f = add(f, {lanes_of(parts, 'pulled')})")
     return lines
@@ -177,33 +187,3 @@ def _reconcile(parts: Parts) -> list[str]:
                 f"{to} = add({to}, select(member, steer_law_{k}(p{k}, me, ({wishes},))[0], o))",
             ]
     return lines
-
-
-def _obstacles(parts: Parts, me: list[str]) -> list[str]:
-    """Write the folds over the obstacles, all of them in one pass; nothing if no law asks for obstacles."""
-    slot = Slots(parts)
-    asking = [(k, slot.all(f"o{k}_")) for k, e in enumerate(parts.effects) if e.obstacle_law is not None]
-    if not asking:
-        return []
-    starts, meets = [], []
-    for k, slots in asking:
-        starts.append(f"found = obstacle_start_{k}(p{k}, me)")
-        starts += [f"{s} = found[{j}]" for j, s in enumerate(slots)]
-        meets.append(f"found = obstacle_law_{k}(p{k}, me, it, ({', '.join(slots)},))")
-        meets += [f"{s} = found[{j}]" for j, s in enumerate(slots)]
-    d = parts.dimension
-    return [
-        "if block == 0:",
-        "    work[b, 3] += n * obstacle_radius.shape[1]",
-        f"for l in range(np.uint64({parts.width})):",
-        indented(me + starts, 4),
-        "for m in range(obstacle_radius.shape[1]):",
-        "    rho = obstacle_radius[b, m]",
-        "    if rho > 0:",
-        f"        place = {tuple_of('obstacle_x[#, b, m]', d)}",
-        f"        for l in range(np.uint64({parts.width})):",
-        indented(me, 12),
-        "            to = offset_to(size, x, place)",
-        "            it = Other(like(rho, m), to, dot(to, to), zero(x), rho, zero(x))",
-        indented(meets, 12),
-    ]

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from flockenv.effects.base import Effect, Sight
 from flockenv.integrators.base import Integrator
 from flockenv.kernels import LINE
+from flockenv.shapes import packed
 from flockenv.space import Space
 
 __all__ = ["SMALL_STRIDE", "Look", "Parts", "flattened", "record_of", "sight_of", "sorted_at", "view_of"]
@@ -61,6 +62,10 @@ class Parts:
     """Does anybody lean into his turns?"""
     starts: tuple[int, ...] = ()
     """The first agent of each group, and one more: numbers alone, the source does not depend on them."""
+    shapes: tuple[Any, ...] = field(default=(), compare=False)
+    """Obstacles that are no circles: the source depends on their forms."""
+    circles: int = 0
+    """How many obstacles come before them."""
     tables: tuple[NDArray[np.float64], ...] = field(default=(), compare=False)
     """What the laws of each tabled effect look up, in order: numbers alone, too."""
 
@@ -89,6 +94,21 @@ class Parts:
     def pairs(self) -> list[tuple[int, Effect]]:
         """The effects with a pair law, and their numbers."""
         return [(k, e) for k, e in enumerate(self.effects) if e.pair_law is not None]
+
+    @functools.cached_property
+    def shaped(self) -> tuple[NDArray[np.float64], dict[str, tuple[int, int]]]:
+        """The table of shapes that are no circles, and the forms that there are: where each begins, how many."""
+        return packed(self.shapes, self.dimension, self.circles) if self.meets_obstacles else (np.zeros(0), {})
+
+    @property
+    def meets_obstacles(self) -> bool:
+        """Does any law ask for obstacles, or what is hidden by them?"""
+        return any(e.obstacle_law is not None for e in self.effects) or self.occludes
+
+    @property
+    def occludes(self) -> bool:
+        """Is anybody hidden by obstacles?"""
+        return any(sight.occluded for sight in self.sights)
 
     @functools.cached_property
     def bonded(self) -> list[tuple[int, Effect]]:
@@ -130,9 +150,13 @@ class Parts:
 
         For each table there are two: where it begins, and where it ends.
         """
-        bounds, tables = [], iter(np.cumsum([0, *map(len, self.tables)]).tolist())
+        shapes, forms = self.shaped
+        bounds, tables = [], iter(np.cumsum([len(shapes), *map(len, self.tables)]).tolist())
         begin = next(tables)
         values = [*self.space.extent(self.dimension), self.reach]
+        for where, count in forms.values():
+            bounds.append((len(values), where))
+            values += [0.0, float(count)]
         for sight in self.sights:
             values += [sight.radius**2, view_of(sight.fov)]
             if sight.group is not None:
@@ -157,7 +181,7 @@ class Parts:
 
     def given(self) -> NDArray[Any]:
         """Return `parameters()` and the tables behind them, in the scene's precision: what the kernel is handed."""
-        return np.concatenate([self.parameters(), *self.tables]).astype(self.dtype)
+        return np.concatenate([self.parameters(), self.shaped[0], *self.tables]).astype(self.dtype)
 
     def numbers_of(self, effect: Effect) -> dict[str, Any]:
         """Return the numbers and vectors that the laws of an effect are given, by name."""
@@ -179,6 +203,10 @@ class Parts:
         """Write what effect k adds to: a wish of its own, what agents want, or what acts on them."""
         return f"w{k}_" if k in self.wishes else "s" if self.effects[k].steering else "f"
 
+    def pair_target(self, k: int) -> str:
+        """Write what the pair law of effect k adds to: the same, or what its fold over the obstacles is told."""
+        return f"n{k}_" if self.effects[k].obstacle_start is not None else self.target(k)
+
     def last_numbers(self, kind: str) -> int:
         """Return where in `parameters` the numbers of the "space" begin, or of the "method": they come last but one."""
         look, method, space = 2 if self.look else 0, len(self.integrator.settings()), len(self.space.numbers())
@@ -197,9 +225,10 @@ class Parts:
 
     @functools.cached_property
     def targets(self) -> list[str]:
-        """What pair laws add to: what agents want, what acts on them, wishes."""
-        found = {self.target(k) for k, _ in self.pairs}
-        return [name for name in ("s", "f", *(f"w{k}_" for k in self.wishes)) if name in found]
+        """What pair laws add to: what agents want, what acts on them, wishes, what folds over obstacles are told."""
+        found = {self.pair_target(k) for k, _ in self.pairs}
+        names = ("s", "f", *(f"w{k}_" for k in self.wishes), *(f"n{k}_" for k, _ in self.pairs))
+        return [name for name in names if name in found]
 
     @functools.cached_property
     def fields(self) -> list[str]:
@@ -286,7 +315,7 @@ class Parts:
         d, look = self.dimension, self.look or Look(0.0)
         runs = [(f"c{k}_", e.sums(d)) for k, e in self.pairs]
         runs += [(f"near{q}_", sight.nearest or 0) for q, sight in enumerate(self.sights)]
-        runs += [(f"o{k}_", e.folded(d) if e.obstacle_law else 0) for k, e in enumerate(self.effects)]
+        runs += [(f"o{k}_", e.folded(d) if e.obstacle_start else 0) for k, e in enumerate(self.effects)]
         runs += [(f"g{name}", d) for name in self.targets] + [
             ("bond", d * bool(self.bonded)),
             ("far", d * bool(self.far)),
@@ -332,7 +361,11 @@ def view_of(fov: float) -> float:
 def _names(effect: Effect) -> set[str]:
     """Return every name in the code of an effect's pair laws and of the laws that they call."""
     module = vars(sys.modules[type(effect).__module__])
-    todo = [module[law] for law in (effect.pair_start, effect.pair_law, effect.finish_law) if law]
+    todo = [
+        module[law]
+        for law in (effect.pair_start, effect.pair_law, effect.finish_law, effect.joined and effect.obstacle_law)
+        if law
+    ]
     seen: set[int] = set()
     names: set[str] = set()
     while todo:

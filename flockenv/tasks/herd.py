@@ -57,10 +57,9 @@ def spawn(p: Any, frame: Frame) -> None:
 
 @kernel
 def _somewhere(p: Any, frame: Frame, t: int, channel: int) -> Vec:
-    """Return a random place in the field, 5 m or more from its edge."""
-    inner = p.size - 10.0
-    x = 5.0 + inner * uniform(frame.key, t, 500 + channel, 5)
-    return (np.float64(x), np.float64(5.0 + inner * uniform(frame.key, t, 500 + channel, 6)))
+    """Return a random place in the middle of the field, a quarter of its edge or more from that."""
+    x = p.size * (0.25 + 0.5 * uniform(frame.key, t, 500 + channel, 5))
+    return (np.float64(x), np.float64(p.size * (0.25 + 0.5 * uniform(frame.key, t, 500 + channel, 6))))
 
 
 @kernel
@@ -224,11 +223,11 @@ def observe(p: Any, frame: Frame, rows: Any) -> None:
         row = rows[i]
         here = _place(frame, i)
         _put(row, 0, scale(_velocity(frame, i), 1.0 / p.dog_speed), course)
-        _put(row, 2, scale(sub(pen, here), 1.0 / p.size), course)
+        _put(row, 2, scale(sub(pen, here), 1.0 / p.sight), course)
         to_centre = sub(centre, here)
-        _put(row, 4, scale(to_centre, 1.0 / p.size), course)
+        _put(row, 4, scale(to_centre, 1.0 / p.sight), course)
         _put(row, 6, unit(to_centre), course)
-        _put(row, 8, scale(_to(frame, i, far), 1.0 / p.size), course)
+        _put(row, 8, scale(_to(frame, i, far), 1.0 / p.sight), course)
         row[10] = min(spread / p.spread_scale, 1.0)
         row[11] = min(norm(sub(_place(frame, far), centre)) / p.spread_scale, 1.0)
         for c in range(12, rows.shape[1]):
@@ -237,7 +236,7 @@ def observe(p: Any, frame: Frame, rows: Any) -> None:
         at = 12 + 5 * slots + 3
         for j in range(dogs):
             if j != i:
-                _put(row, at, scale(_to(frame, i, j), 1.0 / p.size), course)
+                _put(row, at, scale(_to(frame, i, j), 1.0 / p.sight), course)
                 at += 2
 
 
@@ -256,7 +255,7 @@ def _show_sheep(p: Any, frame: Frame, i: int, slots: int, course: Vec, row: Any)
         if who < 0:
             break
         to = _to(frame, i, who)
-        _put(row, 12 + 2 * s, scale(to, 1.0 / p.size), course)
+        _put(row, 12 + 2 * s, scale(to, 1.0 / p.sight), course)
         _put(row, 12 + 2 * slots + 2 * s, scale(_velocity(frame, who), 1.0 / p.sheep_speed), course)
         row[12 + 4 * slots + s] = 1.0
         if s == 0:
@@ -290,7 +289,7 @@ class Herd(Task):
     dogs: int = Field(default=1, ge=1, le=3, description="how many learn")
     sheep: int = Field(default=12, ge=2, le=200, description="how many are driven")
     horizon: int = Field(default=600, ge=1, description="decisions until the time limit (truncation)")
-    size: float = Field(default=40.0, ge=20, description="m, edge of the part of the field where everybody begins")
+    size: float = Field(default=60.0, gt=0, description="m, edge of the part that is shown; all begin in its middle half")
     pen_radius: float = Field(default=4.0, gt=0, description="m")
     away: float = Field(default=15.0, ge=0, description="m, between the pen and the middle of the sheep, at least")
     scatter: float = Field(default=6.0, gt=0, description="m about that middle within which sheep begin")
@@ -307,21 +306,18 @@ class Herd(Task):
     apart: float = Field(default=2.0, ge=0, description="rho_a, weight of going away from who is too near")
     fear: float = Field(default=1.0, ge=0, description="rho_s, weight of going away from dogs")
     error: float = Field(default=0.3, ge=0, description="e, weight of going anyhow")
+    sight: float = Field(default=40.0, gt=0, description="m, a dog sees offsets up to this per axis")
     sheep_seen: int = Field(default=6, ge=1, le=32, description="how many sheep a dog tells apart, nearest first")
     progress_reward: float = Field(default=0.5, ge=0, description="per m that the flock's centre came nearer the pen")
-    gathering_reward: float = Field(
-        default=0.5, ge=0, description="per m that sheep came nearer their centre, on average"
-    )
+    gathering_reward: float = Field(default=0.5, ge=0, description="per m that sheep came nearer their centre, on average")
     success_reward: float = Field(default=10.0, ge=0, description="once, when all are in the pen")
     time_cost: float = Field(default=0.2, ge=0, description="per s")
 
     @model_validator(mode="after")
     def _room(self) -> Herd:
         """Refuse a start that the field has no room for."""
-        if self.away > self.size - 10:
-            raise ValueError(
-                f"away = {self.away:g} m: in a field of {self.size:g} m at most size - 10 is sure to be found"
-            )
+        if self.away > self.size / 3:
+            raise ValueError(f"away = {self.away:g} m: in a field of {self.size:g} m at most {self.size / 3:g} is found")
         return self
 
     @property
@@ -369,22 +365,22 @@ class Herd(Task):
     @functools.cached_property
     def layout(self) -> Layout:
         """Every vector is (along the course, to its left); the course leads from the flock's centre to the pen."""
-        k, mates, size = self.sheep_seen, self.dogs - 1, self.size
+        k, mates, far = self.sheep_seen, self.dogs - 1, self.sight
         near = "1 - distance / fear_distance of the nearest sheep; 0 beyond"
         return Layout((
             Slot("velocity", (2,), self.dog_speed, "m/s", "own velocity (along the course, to its left)"),
-            Slot("goal", (2,), size, "m", "offset of the pen's centre"),
-            Slot("centre", (2,), size, "m", "offset of the flock's centre"),
+            Slot("goal", (2,), far, "m", "offset of the pen's centre"),
+            Slot("centre", (2,), far, "m", "offset of the flock's centre"),
             Slot("centre_bearing", (2,), 1.0, "1", "unit vector towards it"),
-            Slot("farthest", (2,), size, "m", "offset of the sheep that is farthest from that centre"),
+            Slot("farthest", (2,), far, "m", "offset of the sheep that is farthest from that centre"),
             Slot("spread", (), self.spread_scale, "m", "mean distance of the sheep from their centre", low=0.0),
             Slot("stray", (), self.spread_scale, "m", "distance of the farthest from it", low=0.0),
-            Slot("sheep", (k, 2), size, "m", "offsets of the nearest sheep, nearest first"),
+            Slot("sheep", (k, 2), far, "m", "offsets of the nearest sheep, nearest first"),
             Slot("sheep_velocity", (k, 2), self.sheep_speed, "m/s", "their velocities"),
             Slot("sheep_present", (k,), 1.0, "1", "1 where there is one, else 0 (and zeros before)", low=0.0),
             Slot("bearing", (2,), 1.0, "1", "unit vector towards the nearest sheep"),
             Slot("closeness", (), 1.0, "1", near, low=0.0),
-            Slot("mates", (mates, 2), size, "m", "offsets of the other dogs"),
+            Slot("mates", (mates, 2), far, "m", "offsets of the other dogs"),
         ))  # fmt: skip
 
     @functools.cached_property
@@ -407,5 +403,5 @@ class Herd(Task):
         return (Mark("goal", memory[:2, world, 0], np.zeros(2), self.pen_radius),)
 
     def view(self, state: State, world: int) -> tuple[tuple[float, ...], tuple[float, ...]]:
-        """Return the part of the field where everybody begins."""
+        """Return the middle of the field."""
         return (0.0, 0.0), (self.size, self.size)

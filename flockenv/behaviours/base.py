@@ -1,0 +1,132 @@
+"""What behaviours share: how fast they go, whom they are about, and the nearest one of those as laws see him."""
+
+from __future__ import annotations
+
+import math
+import warnings
+from typing import Any, ClassVar
+
+from pydantic import Field
+
+from flockenv.effects.base import Effect, Me, Other, Sight
+from flockenv.kernels import Vec, law, like
+
+__all__ = [
+    "AboutNearest",
+    "Behaviour",
+    "Moving",
+    "OvershootWarning",
+    "nearest_one",
+    "seen_one",
+    "steered_groups",
+    "top_speed",
+]
+
+
+class OvershootWarning(UserWarning):
+    """What an agent looks ahead is shorter than the way on which it can stop: it cannot but overshoot."""
+
+
+@law
+def top_speed(p: Any, me: Me) -> float:
+    """Return how fast a behaviour goes at most, m/s."""
+    return p.speed if p.speed < me.max_speed else me.max_speed
+
+
+@law
+def nearest_one(p: Any, me: Me, other: Other) -> Vec:
+    """Where, how fast, and that it is one: of the nearest alone, or of some that are as near."""
+    return other.offset + other.vel + (like(other.square, 1.0),)
+
+
+@law
+def seen_one(sums: Vec) -> tuple[Vec, Vec, bool]:
+    """Return offset and velocity of the nearest one, and whether there is one at all."""
+    o, e = like(sums[0], 0.0), like(sums[0], 1.0)
+    count = sums[len(sums) - 1]
+    share = e / count if count > o else o
+    if len(sums) == 5:
+        return (sums[0] * share, sums[1] * share), (sums[2] * share, sums[3] * share), count > o
+    else:
+        velocity = (sums[3] * share, sums[4] * share, sums[5] * share)
+        return (sums[0] * share, sums[1] * share, sums[2] * share), velocity, count > o
+
+
+def steered_groups(effect: Effect, scene: Any) -> list[int]:
+    """Return the numbers of the groups that a behaviour of a scene steers."""
+    found: set[int] = set()
+    for each in scene.effects:
+        if each == effect or effect in each.wishes:
+            only = getattr(each, "group", None) if each.wishes else None
+            found |= set(range(len(scene.groups))) if only is None else {only}
+    return sorted(found)
+
+
+class Behaviour(Effect):
+    """What an agent wants, F = weight x S: S is the change of velocity that a law of `flockenv.steering` asks for."""
+
+    weight: float = Field(ge=0, description="kg/s, force per change of velocity that is asked for")
+    steering: ClassVar[bool] = True
+    unlimited: ClassVar[tuple[str, ...]] = ()
+    """Names of the fields of which none means without limit."""
+
+    def parameters(self) -> dict[str, float | Vec]:
+        """Return its numbers; what has no limit is infinite."""
+        return {**dict.fromkeys(self.unlimited, math.inf), **super().parameters()}
+
+    def check(self, scene: Any) -> None:
+        """Refuse a group that is not there."""
+        super().check(scene)
+        for name in ("group", "other"):
+            which = getattr(self, name, None)
+            if which is not None and which >= len(scene.groups):
+                raise ValueError(f"{name} = {which}: there are {len(scene.groups)} groups, counted from 0")
+
+
+class Moving(Behaviour):
+    """A behaviour that heads somewhere, as fast as it may."""
+
+    speed: float | None = Field(default=None, gt=0, description="m/s, how fast at most; none = its max_speed")
+    unlimited: ClassVar[tuple[str, ...]] = ("speed",)
+
+    def check(self, scene: Any) -> None:
+        """Refuse those who may be infinitely fast; warn of a ramp that is too short to stop on."""
+        super().check(scene)
+        for k in steered_groups(self, scene):
+            group = scene.groups[k]
+            if group.max_force == 0:
+                continue  # it does nothing of what it is asked
+            speeds = [speed for speed in (self.speed, group.max_speed) if speed is not None]
+            if not speeds:
+                raise ValueError(f"speed = None: groups[{k}].max_speed is none too; give either of them")
+            slow_radius = getattr(self, "slow_radius", None)
+            if slow_radius is not None and group.max_force is not None:
+                _warn_of_overshoot(self.kind, slow_radius, min(speeds), group)
+
+
+def _warn_of_overshoot(kind: str, slow_radius: float, speed: float, group: Any) -> None:
+    """Say so if a ramp asks for a larger deceleration at its edge than the group's max_force allows: V^2 / d."""
+    least = speed**2 * group.mass / group.max_force
+    if slow_radius < least * (1 - 1e-9):
+        text = (
+            f"{kind}: slow_radius = {slow_radius:g} m: overshoots; with max_force = {group.max_force:g} N to stop from"
+        )
+        warnings.warn(f"{text} {speed:g} m/s takes speed^2 mass / max_force = {least:g} m", OvershootWarning, 2)
+
+
+class AboutNearest(Behaviour):
+    """A behaviour about the nearest of a group that it sees; it asks for nothing where it sees nobody."""
+
+    group: int | None = Field(default=None, ge=0, description="whom it is about: the nearest of it; none = of all")
+    radius: float = Field(gt=0, description="m, how far it sees")
+    fov: float = Field(default=360.0, gt=0, le=360, description="degrees, full angle of the field of view")
+    pair_law: ClassVar[str | None] = "nearest_one"
+
+    @property
+    def sight(self) -> Sight:
+        """The nearest one."""
+        return Sight(self.radius, self.fov, 1, self.group)
+
+    def sums(self, dimension: int) -> int:
+        """Offset, velocity, count."""
+        return 2 * dimension + 1

@@ -1,0 +1,203 @@
+"""Behaviours about the nearest of a group: pursue, evade, offset_pursue, shadow, match_velocity (Reynolds 1999)."""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar, Literal
+
+from pydantic import Field
+
+from flockenv import steering
+from flockenv.behaviours.base import AboutNearest, Moving, nearest_one, seen_one, top_speed
+from flockenv.effects.base import Me
+from flockenv.kernels import Vec, law, like
+from flockenv.vec import norm, scale, select, zero
+
+__all__ = ["PREDICTORS", "Evade", "MatchVelocity", "OffsetPursue", "Predicting", "Pursue", "Shadow", "nearest_one"]
+
+PREDICTORS = ("distance", "opensteer", "exact")
+
+
+@law
+def chosen(p: Any, distance: float, table: float, exact: float) -> float:
+    """Return what the predictor says, s, at most p.longest."""
+    e = like(distance, 1.0)
+    time = distance if p.method < e else (table if p.method < e + e else exact)
+    return time if time < p.longest else p.longest
+
+
+@law
+def to_meet(p: Any, me: Me, offset: Vec, velocity: Vec) -> float:
+    """Return for how long ahead a pursuer predicts, s."""
+    top = top_speed(p, me)
+    distance = steering.distance_time(offset, top, p.factor)
+    table = steering.opensteer_time(offset, me.vel, velocity, p.longest)
+    return chosen(p, distance, table, steering.interception_time(offset, velocity, top))
+
+
+@law
+def until_met(p: Any, me: Me, offset: Vec, velocity: Vec) -> float:
+    """Return for how long ahead an evader predicts, s: exact is when the pursuer at its speed can meet it."""
+    top, theirs = top_speed(p, me), norm(velocity)
+    distance = steering.distance_time(offset, top, p.factor)
+    table = steering.approach_time(offset, theirs, p.longest)
+    least = like(top, 1e-6) * top  # of somebody at rest there is no such time
+    back = scale(offset, like(top, -1.0))
+    return chosen(p, distance, table, steering.interception_time(back, me.vel, theirs if theirs > least else least))
+
+
+@law
+def pursued(p: Any, me: Me, sums: Vec) -> Vec:
+    """F = w (V unit(x_q + v_q T - x) - v)."""
+    offset, velocity, some = seen_one(sums)
+    time = to_meet(p, me, offset, velocity)
+    wish = steering.pursue(offset, me.vel, velocity, top_speed(p, me), time)
+    return select(some, scale(wish, p.weight), zero(wish))
+
+
+@law
+def evaded(p: Any, me: Me, sums: Vec) -> Vec:
+    """F = w (V unit(x - x_p - v_p T) - v)."""
+    offset, velocity, some = seen_one(sums)
+    time = until_met(p, me, offset, velocity)
+    wish = steering.evade(offset, me.vel, velocity, top_speed(p, me), time)
+    return select(some, scale(wish, p.weight), zero(wish))
+
+
+@law
+def passed(p: Any, me: Me, sums: Vec) -> Vec:
+    """Pursue a point beside the quarry."""
+    offset, velocity, some = seen_one(sums)
+    time = to_meet(p, me, offset, velocity)
+    wish = steering.offset_pursue(offset, me.vel, velocity, top_speed(p, me), p.distance, time)
+    return select(some, scale(wish, p.weight), zero(wish))
+
+
+@law
+def shadowed(p: Any, me: Me, sums: Vec) -> Vec:
+    """Pursue from afar, match near by."""
+    offset, velocity, some = seen_one(sums)
+    time = to_meet(p, me, offset, velocity)
+    wish = steering.shadow(offset, me.vel, velocity, top_speed(p, me), p.distance, p.band, time)
+    return select(some, scale(wish, p.weight), zero(wish))
+
+
+@law
+def matched(p: Any, me: Me, sums: Vec) -> Vec:
+    """F = w (v_j - v)."""
+    _, velocity, some = seen_one(sums)
+    return select(some, scale(steering.match_velocity(me.vel, velocity), p.weight), zero(velocity))
+
+
+class Predicting(AboutNearest, Moving):
+    """What behaviours that foresee somebody's way have in common."""
+
+    predictor: Literal["distance", "opensteer", "exact"] = Field(
+        default="exact",
+        description="how far ahead it foresees: factor d / V, OpenSteer's table, or until they can meet",
+    )
+    factor: float = Field(default=1.0, ge=0, description="of the predictor by distance, T = factor d / V")
+    longest: float = Field(default=10.0, ge=0, description="s, it foresees no further")
+
+    def parameters(self) -> dict[str, float | Vec]:
+        """Return its numbers; the predictor is one of them."""
+        return {**super().parameters(), "method": float(PREDICTORS.index(self.predictor))}
+
+
+class Pursue(Predicting):
+    """Seek where the nearest of a group will be: S = V unit(x_q + v_q T - x) - v (Reynolds 1999).
+
+    T is factor d / V (distance), OpenSteer's k d / |v| with k by where the quarry is and heads (opensteer), or the
+    first time at which the two can meet while the quarry goes straight on (exact).
+    """
+
+    kind: Literal["pursue"] = "pursue"
+    finish_law: ClassVar[str | None] = "pursued"
+    demo: ClassVar[str | None] = """
+groups:
+  - {count: 4, max_speed: 2, max_force: 10, role: pursuer, spawn: {low: [-6, -5], high: [-5, -1]}}
+  - {count: 1, max_speed: 1, role: evader, spawn: {low: [-3, 3], high: [-3, 3], speed: [1, 1], heading: [1, 0]}}
+effects:
+  - {kind: steer, group: 0, behaviours: [{kind: pursue, weight: 10, group: 1, radius: 30}]}
+"""
+    demo_time: ClassVar[float] = 6.0
+
+
+class Evade(Predicting):
+    """Flee from where the nearest of a group will be: S = V unit(x - x_p - v_p T) - v (Reynolds 1999).
+
+    T is factor d / V (distance), d / |v_p| (opensteer), or when the pursuer at its speed can meet it (exact).
+    """
+
+    kind: Literal["evade"] = "evade"
+    predictor: Literal["distance", "opensteer", "exact"] = Field(
+        default="opensteer", description="how far ahead it foresees: factor d / V, d / |v_p|, or until they can meet"
+    )
+    finish_law: ClassVar[str | None] = "evaded"
+    demo: ClassVar[str | None] = """
+groups:
+  - {count: 1, max_speed: 1.5, max_force: 4, role: pursuer, spawn: {low: [-6, 0], high: [-6, 0], speed: [1, 1]}}
+  - {count: 6, max_speed: 1.3, max_force: 4, role: evader, spawn: {low: [-3, -2], high: [1, 2]}}
+effects:
+  - {kind: steer, group: 0, behaviours: [{kind: pursue, weight: 10, group: 1, radius: 30}]}
+  - {kind: steer, group: 1, behaviours: [{kind: evade, weight: 10, group: 0, radius: 4}]}
+"""
+
+
+class OffsetPursue(Predicting):
+    """Pass the nearest of a group at a distance: seek a point so far beside where it will be (Reynolds 1999)."""
+
+    kind: Literal["offset_pursue"] = "offset_pursue"
+    distance: float = Field(ge=0, description="m, at which it passes")
+    finish_law: ClassVar[str | None] = "passed"
+    demo: ClassVar[str | None] = """
+groups:
+  - count: 6
+    max_speed: 2
+    max_force: 10
+    role: pursuer
+    spawn: {low: [-8, -3], high: [-6, 3], speed: [1, 2], heading: [1, 0]}
+  - {count: 1, max_speed: 1, role: evader, spawn: {low: [0, 0], high: [0, 0]}}
+effects:
+  - {kind: steer, group: 0, behaviours: [{kind: offset_pursue, weight: 10, group: 1, radius: 30, distance: 1}]}
+"""
+    demo_time: ClassVar[float] = 4.5
+
+
+class Shadow(Predicting):
+    """Approach the nearest of a group, then fly as it does: pursue from afar, match its velocity near by.
+
+    Pursuit fades linearly from distance + band to distance, where it is all matching, so that nothing chatters.
+    Reynolds 1999 in words; there the two alternate, and to do that with hysteresis takes a memory.
+    """
+
+    kind: Literal["shadow"] = "shadow"
+    distance: float = Field(ge=0, description="m, within which it only matches speed and heading")
+    band: float = Field(default=1.0, gt=0, description="m, from there on it pursues more and more")
+    finish_law: ClassVar[str | None] = "shadowed"
+    demo: ClassVar[str | None] = """
+groups:
+  - {count: 4, max_speed: 2, max_force: 10, role: pursuer, spawn: {low: [-8, -4], high: [-6, 4]}}
+  - count: 1
+    max_speed: 1
+    max_force: 2
+    role: evader
+    spawn: {low: [-4, 0], high: [-4, 0], speed: [1, 1], heading: [1, 0]}
+effects:
+  - {kind: steer, group: 0, behaviours: [{kind: shadow, weight: 10, group: 1, radius: 30, distance: 1.5}]}
+  - {kind: steer, group: 1, behaviours: [{kind: wander, weight: 2}]}
+"""
+    demo_time: ClassVar[float] = 12.0
+
+
+class MatchVelocity(AboutNearest):
+    """Take on the velocity of the nearest of a group: S = v_j - v (Reynolds 1987)."""
+
+    kind: Literal["match_velocity"] = "match_velocity"
+    finish_law: ClassVar[str | None] = "matched"
+    demo: ClassVar[str | None] = """
+groups:
+  - {count: 5, max_speed: 2, max_force: 4, spawn: {low: [-6, -4], high: [-5, 4], speed: [0, 1]}}
+  - {count: 1, role: learner, spawn: {low: [-6, 0], high: [-6, 0], speed: [1, 1], heading: [1, 0.2]}}
+effects:
+  - {kind: steer, group: 0, behaviours: [{kind: match_velocity, weight: 1, group: 1, radius: 30}]}
+"""

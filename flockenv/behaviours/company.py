@@ -1,0 +1,208 @@
+"""Behaviours about company: a formation, a leader to follow, two others to stand between (Reynolds 1999)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, ClassVar, Literal
+
+import numpy as np
+from pydantic import Field
+
+from flockenv import steering
+from flockenv.behaviours.base import AboutNearest, Moving, nearest_one, seen_one, top_speed
+from flockenv.effects.base import Me, Other, Sight
+from flockenv.kernels import Vec, law, like
+from flockenv.vec import norm, scale, select, zero
+
+__all__ = ["FollowLeader", "Formation", "Interpose", "nearest_one"]
+
+
+@law
+def _station(p: Any, offset: Vec) -> Vec:
+    """Return the place in the leader's frame."""
+    if len(offset) == 2:
+        return (p.ahead, p.left)
+    else:
+        return (p.ahead, p.left, p.up)
+
+
+@law
+def in_formation(p: Any, me: Me, sums: Vec) -> Vec:
+    """F = w (v_L + V min(1, d / d_slow) unit(d) - v)."""
+    offset, velocity, some = seen_one(sums)
+    place, top = _station(p, offset), top_speed(p, me)
+    wish = steering.keep_station(offset, me.vel, velocity, place, top, p.slow_radius)
+    return select(some, scale(wish, p.weight), zero(wish))
+
+
+@law
+def following(p: Any, me: Me, sums: Vec) -> Vec:
+    """Behind the leader, and out of its way."""
+    offset, velocity, some = seen_one(sums)
+    behind = p.distance + p.headway * norm(velocity)
+    wish = steering.follow_leader(offset, me.vel, velocity, behind, p.ahead, p.aside, top_speed(p, me), p.slow_radius)
+    return select(some, scale(wish, p.weight), zero(wish))
+
+
+@law
+def _halves(acc: Vec) -> tuple[Vec, Vec]:
+    """Return square, offset and velocity of the one and the other."""
+    if len(acc) == 10:
+        return acc[:5], acc[5:]
+    else:
+        return acc[:7], acc[7:]
+
+
+@law
+def _either(condition: bool, a: Vec, b: Vec) -> Vec:
+    """Return a where the condition holds, else b, of 5 or 7 numbers."""
+    if len(a) == 5:
+        return select(condition, a, b)
+    else:
+        return select(condition, a[:4], b[:4]) + select(condition, a[4:], b[4:])
+
+
+@law
+def _parts(one: Vec) -> tuple[Vec, Vec]:
+    """Return offset and velocity, 0 of nobody."""
+    if len(one) == 5:
+        return (one[1], one[2]), (one[3], one[4])
+    else:
+        return (one[1], one[2], one[3]), (one[4], one[5], one[6])
+
+
+@law
+def nobody_yet(p: Any, me: Me) -> Vec:
+    """Both infinitely far."""
+    o = zero(me.pos)
+    none = (like(me.radius, np.inf),) + o + o  # noqa: RUF005
+    return none + none
+
+
+@law
+def nearest_two(p: Any, me: Me, other: Other, acc: Vec) -> Vec:
+    """Keep the nearest of either group; of one group that is both, the two nearest."""
+    a, b = _halves(acc)
+    it = (other.square,) + other.offset + other.vel  # noqa: RUF005
+    in_a = (other.who >= p.first) & (other.who < p.end)
+    in_b = (other.who >= p.other_first) & (other.who < p.other_end)
+    nearer = in_a & (other.square < a[0])
+    left = _either(nearer, a, it)  # whom there is no place for as a: if both are one group, it is the next for b
+    return _either(nearer, it, a) + _either(in_b & (left[0] < b[0]), left, b)
+
+
+@law
+def between(p: Any, me: Me, acc: Vec) -> Vec:
+    """F = w S, 0 unless it sees both."""
+    a, b = _halves(acc)
+    far = like(me.max_speed, np.inf)
+    both = (a[0] < far) & (b[0] < far)
+    offset_a, velocity_a = _parts(a)
+    offset_b, velocity_b = _parts(b)
+    top = top_speed(p, me)
+    wish = steering.interpose(offset_a, velocity_a, offset_b, velocity_b, me.vel, p.share, top, p.slow_radius)
+    return select(both, scale(wish, p.weight), zero(wish))
+
+
+class Formation(AboutNearest, Moving):
+    """Keep a place in the frame of the nearest of a group: S = v_L + V min(1, d / d_slow) unit(d) - v.
+
+    The formation variant of offset pursuit (Reynolds 1999). Arriving where the place will be, as in yuka, would lag
+    behind: at the place itself it asks for standing still. A leader at standstill faces along the x axis.
+    """
+
+    kind: Literal["formation"] = "formation"
+    ahead: float = Field(description="m, where its place is: ahead of the leader; negative = behind")
+    left: float = Field(default=0.0, description="m, to its left; negative = to its right")
+    up: float = Field(default=0.0, description="m, above it, in 3-D")
+    slow_radius: float = Field(gt=0, description="d_slow, m, from the place, within which it slows down")
+    finish_law: ClassVar[str | None] = "in_formation"
+    demo: ClassVar[str | None] = """
+groups:
+  - count: 1
+    max_speed: 1
+    max_force: 2
+    role: learner
+    spawn: {low: [-6, 0], high: [-6, 0], speed: [1, 1], heading: [1, 0]}
+  - {count: 1, max_speed: 2, max_force: 10, spawn: {low: [-9, 3], high: [-9, 3]}}
+  - {count: 1, max_speed: 2, max_force: 10, spawn: {low: [-9, -3], high: [-9, -3]}}
+effects:
+  - {kind: steer, group: 0, behaviours: [{kind: wander, weight: 1, strength: 0.7, period: 2}]}
+  - kind: steer
+    group: 1
+    behaviours: [{kind: formation, weight: 10, group: 0, radius: 30, ahead: -1, left: 1, slow_radius: 1}]
+  - kind: steer
+    group: 2
+    behaviours: [{kind: formation, weight: 10, group: 0, radius: 30, ahead: -1, left: -1, slow_radius: 1}]
+"""
+    demo_time: ClassVar[float] = 12.0
+
+
+class FollowLeader(AboutNearest, Moving):
+    """Stay behind the nearest of a group, and out of its way: who is in the box in front of it moves out sideways.
+
+    The place is D = distance + headway x its speed behind it (Reynolds 1999). Separation keeps followers apart.
+    """
+
+    kind: Literal["follow_leader"] = "follow_leader"
+    distance: float = Field(gt=0, description="m, behind the leader")
+    headway: float = Field(default=0.0, ge=0, description="s, so much further behind per m/s of the leader")
+    ahead: float = Field(default=2.0, ge=0, description="m, length of the box in front of the leader")
+    aside: float = Field(default=0.5, ge=0, description="m, from the leader's way to a side of the box")
+    slow_radius: float = Field(gt=0, description="m, from the place, within which it slows down")
+    finish_law: ClassVar[str | None] = "following"
+    demo: ClassVar[str | None] = """
+groups:
+  - {count: 1, max_speed: 1, role: learner, spawn: {low: [-6, 0], high: [-6, 0], speed: [1, 1], heading: [1, 0]}}
+  - {count: 6, max_speed: 2, max_force: 8, spawn: {low: [-5.5, -1.5], high: [-3, 1.5]}}
+effects:
+  - kind: steer
+    group: 1
+    arbitration: {kind: blend}
+    behaviours:
+      - {kind: follow_leader, weight: 8, group: 0, radius: 30, distance: 1, slow_radius: 1}
+      - {kind: separation, weight: 3, radius: 1}
+"""
+    demo_time: ClassVar[float] = 10.0
+
+
+class Interpose(Moving):
+    """Arrive between the nearest of one group and the nearest of another, where that will be when it gets there.
+
+    With one group that is both, between the two nearest of it (Reynolds 1999; T = d / V). It asks for nothing unless it
+    sees both.
+    """
+
+    kind: Literal["interpose"] = "interpose"
+    group: int = Field(ge=0, description="the one group")
+    other: int = Field(ge=0, description="the other group, or the same")
+    radius: float = Field(gt=0, description="m, how far it sees")
+    fov: float = Field(default=360.0, gt=0, le=360, description="degrees, full angle of the field of view")
+    share: float = Field(default=0.5, ge=0, le=1, description="of the way from the one to the other")
+    slow_radius: float = Field(gt=0, description="m, within which it slows down")
+    pair_start: ClassVar[str | None] = "nobody_yet"
+    pair_law: ClassVar[str | None] = "nearest_two"
+    finish_law: ClassVar[str | None] = "between"
+    demo: ClassVar[str | None] = """
+groups:
+  - {count: 1, max_speed: 2, max_force: 10, role: learner, spawn: {low: [-4, -4], high: [-4, -4]}}
+  - {count: 1, max_speed: 1, max_force: 2, spawn: {low: [-3, 3], high: [-3, 3], speed: [1, 1], heading: [1, 0]}}
+  - {count: 1, max_speed: 1, max_force: 2, spawn: {low: [-3, -1], high: [-3, -1], speed: [1, 1], heading: [1, 0]}}
+effects:
+  - {kind: steer, group: 0, behaviours: [{kind: interpose, weight: 10, group: 1, other: 2, radius: 30, slow_radius: 1}]}
+"""
+
+    @property
+    def sight(self) -> Sight:
+        """Everybody: its law knows who is in which group."""
+        return Sight(self.radius, self.fov)
+
+    def sums(self, dimension: int) -> int:
+        """Square, offset, velocity, of two."""
+        return 2 * (1 + 2 * dimension)
+
+    def members(self, starts: Sequence[int]) -> dict[str, float]:
+        """Who is in either group."""
+        names = ("first", "end", "other_first", "other_end")
+        ends = (starts[self.group], starts[self.group + 1], starts[self.other], starts[self.other + 1])
+        return dict(zip(names, map(float, ends), strict=True))

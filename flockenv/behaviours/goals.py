@@ -1,0 +1,178 @@
+"""Behaviours about a place, a direction or a speed: seek, flee, arrive, dock, face, target_speed (Reynolds 1999)."""
+
+from __future__ import annotations
+
+import math
+from typing import Any, ClassVar, Literal, Self
+
+from pydantic import Field, model_validator
+
+from flockenv import steering
+from flockenv.behaviours.base import Behaviour, Moving, top_speed
+from flockenv.effects.base import Me, Vector
+from flockenv.kernels import Vec, law
+from flockenv.vec import dot, scale, select, sub, zero
+
+__all__ = ["Arrive", "Dock", "Face", "Flee", "Seek", "TargetSpeed"]
+
+
+@law
+def sought(p: Any, me: Me) -> Vec:
+    """F = w (V unit(T - x) - v)."""
+    return scale(steering.seek(sub(p.target, me.pos), me.vel, top_speed(p, me)), p.weight)
+
+
+@law
+def fled(p: Any, me: Me) -> Vec:
+    """F = w (V unit(x - T) - v), 0 beyond the radius."""
+    offset = sub(p.target, me.pos)
+    away = scale(steering.flee(offset, me.vel, top_speed(p, me)), p.weight)
+    return select(dot(offset, offset) < p.radius * p.radius, away, zero(offset))
+
+
+@law
+def arrived(p: Any, me: Me) -> Vec:
+    """F = w (V min(1, d / d_slow) unit(T - x) - v)."""
+    return scale(steering.arrive(sub(p.target, me.pos), me.vel, top_speed(p, me), p.slow_radius), p.weight)
+
+
+@law
+def docked(p: Any, me: Me) -> Vec:
+    """Through the gate, then along the axis."""
+    offset = sub(p.target, me.pos)
+    wish = steering.dock(offset, me.vel, p.direction, top_speed(p, me), p.gate, p.width, p.slow_radius)
+    return scale(wish, p.weight)
+
+
+@law
+def faced(p: Any, me: Me) -> Vec:
+    """Across the way alone."""
+    return scale(steering.face(me.vel, p.heading), p.weight)
+
+
+@law
+def at_speed(p: Any, me: Me) -> Vec:
+    """Along the way alone."""
+    return scale(steering.target_speed(me.vel, p.speed), p.weight)
+
+
+def _demand_direction(name: str, value: tuple[float, ...]) -> None:
+    """Refuse what points nowhere; the squares of others are no numbers of float32."""
+    if not 1e-15 <= math.hypot(*value) <= 1e15:
+        raise ValueError(f"{name} = {value}: a direction, not all 0 (from 1e-15 to 1e+15 long)")
+
+
+class _ToTarget(Moving):
+    """What behaviours about a place have in common; on a torus its nearest image counts."""
+
+    target: Vector = Field(description="m, the place")
+    places: ClassVar[tuple[str, ...]] = ("target",)
+
+
+class Seek(_ToTarget):
+    """Head for a place at full speed: S = V unit(T - x) - v (Reynolds 1999's figure; its pseudo-code flees)."""
+
+    kind: Literal["seek"] = "seek"
+    own_law: ClassVar[str | None] = "sought"
+    demo: ClassVar[str | None] = """
+groups:
+  - {count: 6, max_speed: 2, max_force: 4, spawn: {low: [-6, -5], high: [-4, 5], speed: [1, 2]}}
+effects:
+  - {kind: seek, weight: 5, target: [4, 0]}
+"""
+
+
+class Flee(_ToTarget):
+    """Head away from a place at full speed, if it is within a panic radius: S = V unit(x - T) - v (Reynolds 1999)."""
+
+    kind: Literal["flee"] = "flee"
+    radius: float | None = Field(default=None, gt=0, description="m, beyond it asks for nothing; none = everywhere")
+    own_law: ClassVar[str | None] = "fled"
+    unlimited: ClassVar[tuple[str, ...]] = ("speed", "radius")
+    demo: ClassVar[str | None] = """
+groups:
+  - {count: 8, max_speed: 2, max_force: 4, spawn: {low: [-8, -3], high: [-5, 3], speed: [1, 1.5], heading: [1, 0]}}
+effects:
+  - {kind: flee, weight: 5, target: [0, 0], radius: 4}
+"""
+
+
+class Arrive(_ToTarget):
+    """Seek a place and stand still there: S = V min(1, d / d_slow) unit(T - x) - v (Reynolds 1999).
+
+    It does not overshoot if d_slow >= V^2 m / max_force, of which OvershootWarning tells, and weight >= 4 m V / d_slow.
+    """
+
+    kind: Literal["arrive"] = "arrive"
+    slow_radius: float = Field(gt=0, description="d_slow, m, within which it slows down")
+    own_law: ClassVar[str | None] = "arrived"
+    demo: ClassVar[str | None] = """
+groups:
+  - {count: 6, max_speed: 2, max_force: 4, spawn: {low: [-6, -5], high: [-4, 5], speed: [1, 2]}}
+effects:
+  - {kind: arrive, weight: 10, target: [4, 0], slow_radius: 2}
+"""
+    demo_time: ClassVar[float] = 10.0
+
+
+class Dock(_ToTarget):
+    """Arrive at a place while flying in a given direction, through a gate in front of it (Reynolds 1999, in words).
+
+    It stands still at the place in the end, its last heading that direction: the distance from the axis falls as the
+    square of the distance to go.
+    """
+
+    kind: Literal["dock"] = "dock"
+    direction: Vector = Field(description="in which it flies when it docks, of any length")
+    gate: float = Field(gt=0, description="m, how far before the place the gate is")
+    width: float = Field(gt=0, description="m, within which of the axis it flies on along it")
+    slow_radius: float = Field(gt=0, description="m, within which it slows down")
+    own_law: ClassVar[str | None] = "docked"
+    demo: ClassVar[str | None] = """
+groups:
+  - {count: 5, max_speed: 2, max_force: 6, spawn: {low: [-6, -5], high: [-2, 5], speed: [0, 1]}}
+effects:
+  - {kind: dock, weight: 12, target: [4, 0], direction: [1, 0], gate: 4, width: 0.5, slow_radius: 2}
+"""
+    demo_time: ClassVar[float] = 14.0
+
+    @model_validator(mode="after")
+    def _points_somewhere(self) -> Self:
+        _demand_direction("direction", self.direction)
+        return self
+
+
+class Face(Behaviour):
+    """Turn the velocity toward a heading and leave the speed as it is; it never brakes, S is across the way.
+
+    tan(a/2) of the angle a between the two falls as exp(-weight t / m). The construction is ours.
+    """
+
+    kind: Literal["face"] = "face"
+    heading: Vector = Field(description="direction, of any length")
+    own_law: ClassVar[str | None] = "faced"
+    demo: ClassVar[str | None] = """
+groups:
+  - {count: 7, max_speed: 2, spawn: {low: [-6, -5], high: [-4, 5], speed: [1, 2]}}
+effects:
+  - {kind: face, weight: 1, heading: [1, 0]}
+"""
+
+    @model_validator(mode="after")
+    def _points_somewhere(self) -> Self:
+        _demand_direction("heading", self.heading)
+        return self
+
+
+class TargetSpeed(Behaviour):
+    """Take on a speed on the way that one is on: S = (v_t - |v|) unit(v); at standstill it asks for nothing."""
+
+    kind: Literal["target_speed"] = "target_speed"
+    speed: float = Field(ge=0, description="v_t, m/s")
+    own_law: ClassVar[str | None] = "at_speed"
+    demo: ClassVar[str | None] = """
+groups:
+  - {count: 7, spawn: {low: [-6, -5], high: [-4, 5], speed: [0.2, 2], heading: [1, 0]}}
+effects:
+  - {kind: target_speed, weight: 1, speed: 1}
+"""

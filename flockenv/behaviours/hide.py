@@ -1,0 +1,93 @@
+"""Hide: put an obstacle between oneself and who seeks (Reynolds 1999)."""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar, Literal
+
+import numpy as np
+from pydantic import Field
+
+from flockenv import steering
+from flockenv.behaviours.base import AboutNearest, Moving, nearest_one, seen_one, top_speed
+from flockenv.effects.base import Me, Other
+from flockenv.kernels import Vec, law, like
+from flockenv.vec import add, dot, norm, scale, select, zero
+
+__all__ = ["Hide", "nearest_one"]
+
+
+@law
+def seeker(p: Any, me: Me, sums: Vec) -> Vec:
+    """Return where who seeks will be, an offset in m; 0 if there is nobody."""
+    offset, velocity, some = seen_one(sums)
+    time = steering.approach_time(offset, norm(velocity), p.longest)
+    return select(some, add(offset, scale(velocity, time)), zero(offset))
+
+
+@law
+def no_place(p: Any, me: Me, threat: Vec) -> Vec:
+    """No hiding place yet: infinitely far; and the one to hide from."""
+    return (like(me.radius, np.inf),) + zero(threat) + threat  # noqa: RUF005  # numba joins tuples, does not unpack them
+
+
+@law
+def _places(acc: Vec) -> tuple[Vec, Vec]:
+    """Return the offsets of the nearest hiding place and of the one to hide from."""
+    if len(acc) == 5:
+        return (acc[1], acc[2]), (acc[3], acc[4])
+    else:
+        return (acc[1], acc[2], acc[3]), (acc[4], acc[5], acc[6])
+
+
+@law
+def nearest_place(p: Any, me: Me, other: Other, acc: Vec) -> Vec:
+    """Keep the nearest place behind an obstacle."""
+    goal, threat = _places(acc)
+    place = steering.hiding_place(other.offset, other.radius, me.radius + p.margin, threat)
+    square = dot(place, place)
+    nearer = (square < acc[0]) & (other.radius > like(square, 0.0))  # behind round ones alone
+    return (square if nearer else acc[0],) + select(nearer, place, goal) + threat  # noqa: RUF005
+
+
+@law
+def hidden(p: Any, me: Me, acc: Vec) -> Vec:
+    """F = w S: arrive there; without a place flee; without anybody nothing."""
+    goal, threat = _places(acc)
+    top, o = top_speed(p, me), like(me.radius, 0.0)
+    there = steering.arrive(goal, me.vel, top, p.slow_radius)
+    wish = select(acc[0] < like(o, np.inf), there, steering.flee(threat, me.vel, top))
+    return select(dot(threat, threat) > o, scale(wish, p.weight), zero(wish))
+
+
+class Hide(AboutNearest, Moving):
+    """Arrive at the nearest place behind a round obstacle, seen from the nearest of a group; evade if there is none.
+
+    The place is c + (radius + own radius + margin) unit(c - x_s) (Reynolds 1999; yuka), x_s where who seeks will be in
+    min(longest, d / |v_s|). What lies in between is for avoid_obstacles.
+    """
+
+    kind: Literal["hide"] = "hide"
+    margin: float = Field(default=0.5, ge=0, description="m, between an obstacle and who hides behind it")
+    slow_radius: float = Field(gt=0, description="m, from the place, within which it slows down")
+    longest: float = Field(default=0.5, ge=0, description="s, it foresees who seeks no further")
+    finish_law: ClassVar[str | None] = "seeker"
+    obstacle_start: ClassVar[str | None] = "no_place"
+    obstacle_law: ClassVar[str | None] = "nearest_place"
+    obstacle_finish: ClassVar[str | None] = "hidden"
+    demo: ClassVar[str | None] = """
+groups:
+  - {count: 4, max_speed: 2, max_force: 10, role: evader, spawn: {low: [-2, -6], high: [2, -4]}}
+  - {count: 1, max_speed: 0.5, role: pursuer, spawn: {low: [-8, 0], high: [-8, 0], speed: [0.5, 0.5], heading: [0, 1]}}
+obstacles: [{centre: [-2, -1], radius: 1}, {centre: [2.5, 0], radius: 0.8}]
+effects:
+  - kind: steer
+    group: 0
+    behaviours:
+      - {kind: avoid_obstacles, weight: 8, horizon: 1}
+      - {kind: separation, weight: 1, radius: 0.7}
+      - {kind: hide, weight: 8, group: 1, radius: 30, slow_radius: 1}
+"""
+
+    def folded(self, dimension: int) -> int:
+        """Square of the distance, and offsets of the nearest place and of the one to hide from."""
+        return 1 + 2 * dimension

@@ -1,0 +1,65 @@
+"""Wander: a way that turns now here, now there, and does not depend on the step size."""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar, Literal
+
+import numpy as np
+from pydantic import Field
+
+from flockenv import steering
+from flockenv.behaviours.base import Moving, top_speed
+from flockenv.kernels import Vec, law, like
+from flockenv.noise import smooth, uniform
+from flockenv.vec import add, dot, planar, scale, select, sub
+
+__all__ = ["Wander"]
+
+CHANNEL = 60_000
+GOLDEN = 0.6180339887498949
+
+
+@law
+def _aside(way: Vec, left: float, up: float) -> Vec:
+    """Return a point beside the way in the agent's own frame."""
+    o = like(left, 0.0)
+    if len(way) == 2:
+        return (o, left)
+    else:
+        return (o, left, up)
+
+
+@law
+def wandered(p: Any, me: Any) -> Vec:
+    """F = w (V unit(forward + strength (n1 left + n2 up)) - v) with n1, n2 smooth in time."""
+    o, e = like(p.strength, 0.0), like(p.strength, 1.0)
+    who = int(me.who)
+    when = np.float64(me.time) / np.float64(p.period) + GOLDEN * who  # not everybody turns to a new side at once
+    left, up = like(e, smooth(me.key, when, who, CHANNEL)), like(e, smooth(me.key, when, who, CHANNEL + 1))
+    begin = (
+        2.0 * np.pi * uniform(me.key, 0, who, CHANNEL + 2)
+    )  # whoever stands still sets off in a direction of his own
+    way = select(dot(me.vel, me.vel) > o, me.vel, planar(me.vel, like(e, np.cos(begin)), like(e, np.sin(begin))))
+    target = _aside(way, left * p.strength, up * p.strength)
+    velocity = add(steering.wander(target, way, top_speed(p, me), e), way)
+    return scale(sub(velocity, me.vel), p.weight)
+
+
+class Wander(Moving):
+    """Roam: seek a point in front that moves to and fro across the way: S = V unit(f + strength n) - v.
+
+    n is coherent noise (Perlin 1985) of each agent in [-1, 1] per axis across its way, a function of time: the same
+    walk for every dt. Reynolds 1999 displaces the point a little in each step; here too it stays near where it was.
+    """
+
+    kind: Literal["wander"] = "wander"
+    strength: float = Field(default=1.0, ge=0, description="m aside per m ahead of the point: 1 = up to 45 degrees")
+    period: float = Field(default=1.0, gt=0, description="s, how long it remembers to which side it turned")
+    own_law: ClassVar[str | None] = "wandered"
+    demo: ClassVar[str | None] = """
+groups:
+  - {count: 6, max_speed: 1, max_force: 4, spawn: {low: [-1, -1], high: [1, 1], speed: [1, 1]}}
+effects:
+  - {kind: wander, weight: 2, strength: 1, period: 1}
+"""
+    demo_time: ClassVar[float] = 12.0
