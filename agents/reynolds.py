@@ -204,9 +204,12 @@ def orca_crossing(see: Any, task: Crossing, p: OrcaRules) -> np.ndarray:
         see.velocity, wish, 0.3, task.max_speed, p.horizon, task.control_dt, p.turn, seen.reshape(len(seen), -1)
     )
     return p.gain * change
+
+
 # --- Evade: around what is in the way, off the walls, away from pursuers, into cover ----------------------------------
 class EvadeRules:
     """Textbook: evade whoever is near, hide from the nearest otherwise (Reynolds 1999), in order of priority."""
+
     horizon: float = 1.0  # s, how far ahead cover counts that is in the way
     avoid: float = 5.0  # kg/s, strength of steering around it
     wall: float = 0.5  # s, how far ahead walls count
@@ -219,6 +222,8 @@ class EvadeRules:
     danger: float = 0.0  # m added to the way to a hiding place per m that a pursuer is nearer to it than 10 m
     exposed: float = 0.0  # m added to it for each pursuer that sees that place
     hide: float = 3.0  # kg/s, towards the hiding place
+
+
 def evade(see: Any, task: Evade, p: EvadeRules) -> np.ndarray:
     """Avoid, contain, evade, hide: allocation in that order (Reynolds 1987)."""
     top, row = task.evader_speed, np.arange(len(see.velocity))
@@ -245,6 +250,8 @@ def evade(see: Any, task: Evade, p: EvadeRules) -> np.ndarray:
     soonest = np.argmin(np.where(there, way, np.inf), axis=1)
     hidden = p.hide * arrive(places[row, soonest], see.velocity, top, 0.5) * there.any(axis=1)[:, None]
     return allocate(np.stack([aside, inside, away, hidden], axis=1), task.evader_force)
+
+
 def _watchers(places: np.ndarray, see: Any) -> np.ndarray:
     """Return how many pursuers have no cover between themselves and each of the places (R, K)."""
     ways = places[:, :, None] - see.pursuers[:, None]
