@@ -21,7 +21,7 @@ import yaml
 from flockenv import arbitration, shapes, steering
 from flockenv.orca import orca
 from flockenv.rows import rows
-from flockenv.tasks import Crossing, Evade, Flock, Herd, Obstacles, Pursuit, Task
+from flockenv.tasks import Crossing, Evade, Flock, Herd, Obstacles, PathFollow, Pursuit, Task
 
 __all__ = ["PLAYERS", "RULES", "Reynolds", "player", "tuned"]
 
@@ -36,6 +36,7 @@ allocate, keep_clear = rows(arbitration.allocate), rows(orca)
 evade_from, hiding_place = rows(steering.evade), rows(steering.hiding_place)
 ray_hit = rows(shapes.ray_hit)
 herd_from = rows(steering.herd_from)
+follow_path = rows(steering.follow_path)
 
 
 # --- Pursuit: seek where the quarry will be, but never beyond the walls it cannot pass ------------------------------
@@ -207,6 +208,9 @@ def orca_crossing(see: Any, task: Crossing, p: OrcaRules) -> np.ndarray:
 
 
 # --- Evade: around what is in the way, off the walls, away from pursuers, into cover ----------------------------------
+
+
+@dataclass(frozen=True)
 class EvadeRules:
     """Textbook: evade whoever is near, hide from the nearest otherwise (Reynolds 1999), in order of priority."""
 
@@ -235,6 +239,7 @@ def evade(see: Any, task: Evade, p: EvadeRules) -> np.ndarray:
     aside = p.avoid * avoid(forward, see.cover[row, first], clearance[row, first], top)
     aside *= np.isfinite(hit[row, first])[:, None]
     inside = 5.0 * contain(see.to_low - 0.5, see.to_high - 0.5, see.velocity, top, p.wall)
+
     distance = np.linalg.norm(see.pursuers, axis=-1)
     time = np.minimum(distance / task.pursuer_speed, p.predict)
     flight = evade_from(see.pursuers, see.velocity[:, None], see.pursuer_velocity, top, time)
@@ -243,6 +248,7 @@ def evade(see: Any, task: Evade, p: EvadeRules) -> np.ndarray:
     away = p.evade * np.sum(flight * weight[..., None], axis=1) / np.maximum(weight.sum(axis=1), 1e-9)[:, None]
     near = (weight.sum(axis=1) > 0)[:, None]
     away += p.middle * (see.to_high - see.to_low) / 2 * near
+
     places = hiding_place(see.cover, see.cover_radius, p.margin, see.pursuers[:, :1])
     theirs = np.linalg.norm(places[:, :, None] - see.pursuers[:, None], axis=-1).min(axis=-1)
     way = np.linalg.norm(places, axis=-1) + p.danger * np.maximum(10.0 - theirs, 0.0)
@@ -298,6 +304,50 @@ def herd(see: Any, task: Herd, p: HerdRules) -> np.ndarray:
     return allocate(np.stack([mates, detour, course], axis=1), task.dog_force)
 
 
+# --- PathFollow: seek the track ahead if the predicted place is off it; brake before a bend ---------------------------
+
+
+@dataclass(frozen=True)
+class PathFollowRules:
+    """Textbook: half a second ahead, the whole track is the tube, full speed whatever comes."""
+
+    time: float = 0.5  # s, how far ahead it predicts itself
+    lead: float = 0.5  # s, how far ahead at its present speed the point lies that is sought
+    tube: float = 1.0  # share of the track's width that is left alone
+    keep: float = 0.5  # share of the speed it wants, below which it is sent on
+    speed: float = 1.0  # share of the top speed that is wanted
+    grip: float = 100.0  # share of all the force there is that a bend may ask for; much = never slows down
+    early: float = 1.0  # share of it that braking before a bend counts on
+    brake: float = 0.0  # kg/s against what is too fast
+    gain: float = 5.0  # kg/s, a change of velocity is asked for within 1/gain seconds
+
+
+def path_follow(see: Any, task: PathFollow, p: PathFollowRules) -> np.ndarray:
+    """Follow the path (Reynolds 1999), at a speed that the bends ahead allow; vectors are (along the track, left)."""
+    row, step = np.arange(len(see.left)), task.spacing / _FINE
+    spine = np.concatenate([np.stack([0.0 * see.left, -see.left], axis=-1)[:, None], see.points], axis=1)
+    share = (np.arange(task.ahead * _FINE) / _FINE) % 1.0
+    piece = np.arange(task.ahead * _FINE) // _FINE
+    fine = spine[:, piece] * (1.0 - share)[:, None] + spine[:, piece + 1] * share[:, None]
+    far = task.spacing * np.arange(task.ahead)[None]  # a bend begins a point earlier
+    bend = np.maximum(np.abs(see.curvature), 1e-6)
+    allowed = p.grip * task.max_force / bend + 2.0 * p.early * task.max_force * far
+    top = np.minimum(p.speed * task.max_speed, np.sqrt(allowed.min(axis=1)))
+    speed = np.linalg.norm(see.velocity, axis=-1)
+    gap = np.linalg.norm(fine - p.time * see.velocity[:, None], axis=-1)
+    then = np.argmin(gap, axis=1)
+    gained = then * step - p.keep * top * p.time
+    ahead = p.lead * np.maximum(speed, 0.25 * top)
+    target = fine[row, np.minimum(np.round(ahead / step), task.ahead * _FINE - 1).astype(int)]
+    wish = p.gain * follow_path(gap[row, then] - p.tube * task.half_width, gained, target, see.velocity, top)
+    slower = -p.brake * (np.maximum(speed - top, 0.0) / np.maximum(speed, 1e-9))[:, None] * see.velocity
+    return slower + wish
+
+
+_FINE = 5
+"""Places between two points of the track that are seen, among which the nearest is."""
+
+
 # --- the player ------------------------------------------------------------------------------------------------------
 
 RULES: dict[str, tuple[Callable[..., np.ndarray], type]] = {
@@ -307,6 +357,7 @@ RULES: dict[str, tuple[Callable[..., np.ndarray], type]] = {
     "flock": (flock, FlockRules),
     "crossing": (crossing, CrossingRules),
     "herd": (herd, HerdRules),
+    "path_follow": (path_follow, PathFollowRules),
 }
 """What the player "reynolds" does in each task, and its parameters."""
 

@@ -110,8 +110,8 @@ from flockenv.shapes import Circle
 from flockenv.space import Box, Plane, Space, Torus
 from flockenv.spawn import Spawn
 from flockenv.steer import Steer
+from flockenv.tasks import Crossing, Flock, Herd, Obstacles, PathFollow, Pursuit, Task
 from flockenv.tasks import Evade as EvadeTask
-from flockenv.tasks import Crossing, Flock, Herd, Obstacles, Pursuit, Task
 
 Array = NDArray[np.float64]
 
@@ -157,6 +157,7 @@ STEERING = (
     Law(steering.dock, ("vector", "vector", "heading", "positive", "length", "positive", "length"), "vector"),
     Law(steering.approach_time, ("vector", "positive", "length"), "positive"),
     Law(steering.opensteer_time, ("vector", "vector", "vector", "length"), "positive"),
+    Law(steering.passing_point, ("vector", "vector", "positive"), "vector"),
     Law(steering.offset_pursue, ("vector", "vector", "vector", "positive", "positive", "positive"), "vector"),
     Law(
         steering.keep_station, ("vector", "vector", "vector", "own", "positive", "length"), "vector", turns="upright",
@@ -355,9 +356,9 @@ EFFECTS = (
     ),
     EffectRow(Pursue(weight=2, speed=1.5, group=0, radius=2.5), family="others"),
     EffectRow(Evade(weight=2, speed=1.5, group=0, radius=2.5, predictor="exact", fov=300), family="others"),
-    EffectRow(OffsetPursue(weight=2, speed=1.5, radius=2.5, distance=0.5, predictor="opensteer"), family="others"),
+    EffectRow(OffsetPursue(weight=2, speed=1.5, radius=2.5, distance=0.3), family="others"),
     EffectRow(
-        Shadow(weight=2, speed=1.5, group=0, radius=2.5, distance=0.5, predictor="distance"), family="others"
+        Shadow(weight=2, speed=1.5, group=0, radius=2.5, distance=0.5, predictor="opensteer"), family="others"
     ),
     EffectRow(MatchVelocity(weight=2, radius=2.5), family="others"),
     EffectRow(
@@ -465,6 +466,7 @@ TASKS = (
     TaskRow(Crossing()),
     TaskRow(Crossing(agents=8, learners=1), "_single"),
     TaskRow(EvadeTask()),
+    TaskRow(PathFollow()),
     TaskRow(Herd()),
     TaskRow(Herd(dogs=3), "_team"),
 )
