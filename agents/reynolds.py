@@ -18,11 +18,12 @@ from typing import Any
 import numpy as np
 import yaml
 
-from flockenv import arbitration, steering
+from flockenv import arbitration, shapes, steering
+from flockenv.orca import orca
 from flockenv.rows import rows
-from flockenv.tasks import Flock, Herd, Obstacles, Pursuit, Task
+from flockenv.tasks import Crossing, Evade, Flock, Herd, Obstacles, PathFollow, Pursuit, Task
 
-__all__ = ["RULES", "Reynolds", "player", "tuned"]
+__all__ = ["PLAYERS", "RULES", "Reynolds", "player", "tuned"]
 
 CONFIGS = Path(__file__).parent.parent / "configs"
 
@@ -30,8 +31,12 @@ seek, arrive, contain = rows(steering.seek), rows(steering.arrive), rows(steerin
 interception_time, pursue = rows(steering.interception_time), rows(steering.pursue)
 threat, avoid = rows(steering.threat), rows(steering.avoid)
 separate, align = rows(steering.separate), rows(steering.align)
+unaligned_threat, give_way = rows(steering.unaligned_threat), rows(steering.give_way)
+allocate, keep_clear = rows(arbitration.allocate), rows(orca)
+evade_from, hiding_place = rows(steering.evade), rows(steering.hiding_place)
+ray_hit = rows(shapes.ray_hit)
 herd_from = rows(steering.herd_from)
-allocate = rows(arbitration.allocate)
+follow_path = rows(steering.follow_path)
 
 
 # --- Pursuit: seek where the quarry will be, but never beyond the walls it cannot pass ------------------------------
@@ -141,6 +146,128 @@ def flock(see: Any, task: Flock, p: FlockRules) -> np.ndarray:
     return (1.0 - p.blend) * ordered + p.blend * summed
 
 
+# --- Crossing: give way to whom one would meet first, and go on ------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class CrossingRules:
+    """Textbook: look three seconds ahead, give way with all the force there is, arrive with the rest."""
+
+    horizon: float = 3.0  # s, how far ahead a meeting counts
+    margin: float = 0.2  # m, clearance beyond the touching distance
+    evade: float = 5.0  # N, strength of an evasion
+    urgency: float = 0.0  # 0: evade with full strength however far ahead; 1: in proportion to nearness in time
+    radius: float = 1.0  # m, neighbours nearer than this push
+    apart: float = 0.0  # N m, separation
+    gain: float = 2.0  # kg/s towards the goal
+    speed: float = 1.0  # share of the top speed that is wanted
+    slow_radius: float = 0.8  # m, slow down within this of the goal
+
+
+def crossing(see: Any, task: Crossing, p: CrossingRules) -> np.ndarray:
+    """Unaligned collision avoidance (Reynolds 1999), then arrive; vectors are (along the course, to its left)."""
+    own = see.velocity[:, None]
+    others = own + see.neighbour_velocity
+    time = unaligned_threat(see.neighbours, own, others, 0.6 + p.margin, p.horizon)
+    time = np.where(see.neighbour_present > 0, time, np.inf)
+    row, first = np.arange(len(time)), np.argmin(time, axis=1)
+    soonest = time[row, first]
+    danger = np.isfinite(soonest)
+    nearness = 1.0 - np.where(danger, soonest, p.horizon) / p.horizon
+    strength = p.evade * (1.0 - p.urgency * (1.0 - nearness)) * danger
+    away = give_way(see.neighbours[row, first], see.velocity, others[row, first], np.where(danger, soonest, 0.0), 1.0)
+    near = see.neighbour_present * (np.linalg.norm(see.neighbours, axis=-1) < p.radius)
+    push = p.apart * np.sum(separate(see.neighbours, np.array([1.0, 0.0])) * near[..., None], axis=1)
+    course = p.gain * arrive(see.goal, see.velocity, p.speed * task.max_speed, p.slow_radius)
+    return allocate(np.stack([away * strength[:, None], push, course], axis=1), task.max_force)
+
+
+@dataclass(frozen=True)
+class OrcaRules:
+    """As published, both take half; a wish that is not free is turned right, or twelve wait for each other."""
+
+    horizon: float = 2.0  # s, for so long the velocity must be free
+    margin: float = 0.1  # m, clearance for what inertia delays
+    turn: float = 0.3  # rad, a wish that is not free is turned right by this
+    gain: float = 10.0  # kg/s: within a decision
+    slow_radius: float = 1.0  # m, slow down within this of the goal
+
+
+def orca_crossing(see: Any, task: Crossing, p: OrcaRules) -> np.ndarray:
+    """Optimal reciprocal collision avoidance (van den Berg et al. 2011) on the way to the goal."""
+    still = np.zeros_like(see.goal)
+    wish = arrive(see.goal, still, task.max_speed, p.slow_radius)
+    others = see.velocity[:, None] + see.neighbour_velocity
+    present = see.neighbour_present > 0
+    radius = np.where(present, 0.3 + p.margin, -1.0)[..., None]
+    seen = np.concatenate([see.neighbours, others, radius, np.full_like(radius, 0.5)], axis=-1)
+    change = keep_clear(
+        see.velocity, wish, 0.3, task.max_speed, p.horizon, task.control_dt, p.turn, seen.reshape(len(seen), -1)
+    )
+    return p.gain * change
+
+
+# --- Evade: around what is in the way, off the walls, away from pursuers, into cover ----------------------------------
+
+
+@dataclass(frozen=True)
+class EvadeRules:
+    """Textbook: evade whoever is near, hide from the nearest otherwise (Reynolds 1999), in order of priority."""
+
+    horizon: float = 1.0  # s, how far ahead cover counts that is in the way
+    avoid: float = 5.0  # kg/s, strength of steering around it
+    wall: float = 0.5  # s, how far ahead walls count
+    alarm: float = 6.0  # m, within which a pursuer is evaded
+    predict: float = 0.5  # s, how far ahead a pursuer is predicted at most
+    evade: float = 5.0  # kg/s, strength of an evasion
+    crowd: float = 1.0  # how much farther pursuers count beside the nearest; 0: he alone
+    middle: float = 0.2  # N/m towards the middle of the field while evading
+    margin: float = 1.0  # m, behind cover
+    danger: float = 0.0  # m added to the way to a hiding place per m that a pursuer is nearer to it than 10 m
+    exposed: float = 0.0  # m added to it for each pursuer that sees that place
+    hide: float = 3.0  # kg/s, towards the hiding place
+
+
+def evade(see: Any, task: Evade, p: EvadeRules) -> np.ndarray:
+    """Avoid, contain, evade, hide: allocation in that order (Reynolds 1987)."""
+    top, row = task.evader_speed, np.arange(len(see.velocity))
+    speed = np.linalg.norm(see.velocity, axis=-1)
+    forward = see.velocity / np.maximum(speed, 1e-9)[:, None]
+    there, clearance = see.cover_radius > 0, see.cover_radius + 0.4
+    hit = np.where(there, threat(forward[:, None], see.cover, clearance, (speed * p.horizon)[:, None]), np.inf)
+    first = np.argmin(hit, axis=1)
+    aside = p.avoid * avoid(forward, see.cover[row, first], clearance[row, first], top)
+    aside *= np.isfinite(hit[row, first])[:, None]
+    inside = 5.0 * contain(see.to_low - 0.5, see.to_high - 0.5, see.velocity, top, p.wall)
+
+    distance = np.linalg.norm(see.pursuers, axis=-1)
+    time = np.minimum(distance / task.pursuer_speed, p.predict)
+    flight = evade_from(see.pursuers, see.velocity[:, None], see.pursuer_velocity, top, time)
+    rank = np.where(np.arange(distance.shape[1]) == 0, 1.0, p.crowd)
+    weight = rank * (distance < p.alarm) / np.maximum(distance, 0.1) ** 2
+    away = p.evade * np.sum(flight * weight[..., None], axis=1) / np.maximum(weight.sum(axis=1), 1e-9)[:, None]
+    near = (weight.sum(axis=1) > 0)[:, None]
+    away += p.middle * (see.to_high - see.to_low) / 2 * near
+
+    places = hiding_place(see.cover, see.cover_radius, p.margin, see.pursuers[:, :1])
+    theirs = np.linalg.norm(places[:, :, None] - see.pursuers[:, None], axis=-1).min(axis=-1)
+    way = np.linalg.norm(places, axis=-1) + p.danger * np.maximum(10.0 - theirs, 0.0)
+    way += p.exposed * _watchers(places, see)
+    soonest = np.argmin(np.where(there, way, np.inf), axis=1)
+    hidden = p.hide * arrive(places[row, soonest], see.velocity, top, 0.5) * there.any(axis=1)[:, None]
+    return allocate(np.stack([aside, inside, away, hidden], axis=1), task.evader_force)
+
+
+def _watchers(places: np.ndarray, see: Any) -> np.ndarray:
+    """Return how many pursuers have no cover between themselves and each of the places (R, K)."""
+    ways = places[:, :, None] - see.pursuers[:, None]
+    length = np.linalg.norm(ways, axis=-1)
+    stones = (see.cover[:, None, :] - see.pursuers[:, :, None])[:, None]
+    hit = ray_hit(stones, (ways / np.maximum(length, 1e-9)[..., None])[..., None, :], see.cover_radius[:, None, None])
+    hit = np.where(see.cover_radius[:, None, None] > 0, hit, np.inf)
+    return np.sum(hit.min(axis=-1) > length, axis=-1)
+
+
 # --- Herd: collect who strays, else drive them all from behind --------------------------------------------------------
 
 
@@ -177,14 +304,67 @@ def herd(see: Any, task: Herd, p: HerdRules) -> np.ndarray:
     return allocate(np.stack([mates, detour, course], axis=1), task.dog_force)
 
 
+# --- PathFollow: seek the track ahead if the predicted place is off it; brake before a bend ---------------------------
+
+
+@dataclass(frozen=True)
+class PathFollowRules:
+    """Textbook: half a second ahead, the whole track is the tube, full speed whatever comes."""
+
+    time: float = 0.5  # s, how far ahead it predicts itself
+    lead: float = 0.5  # s, how far ahead at its present speed the point lies that is sought
+    tube: float = 1.0  # share of the track's width that is left alone
+    keep: float = 0.5  # share of the speed it wants, below which it is sent on
+    speed: float = 1.0  # share of the top speed that is wanted
+    grip: float = 100.0  # share of all the force there is that a bend may ask for; much = never slows down
+    early: float = 1.0  # share of it that braking before a bend counts on
+    brake: float = 0.0  # kg/s against what is too fast
+    gain: float = 5.0  # kg/s, a change of velocity is asked for within 1/gain seconds
+
+
+def path_follow(see: Any, task: PathFollow, p: PathFollowRules) -> np.ndarray:
+    """Follow the path (Reynolds 1999), at a speed that the bends ahead allow; vectors are (along the track, left)."""
+    row, step = np.arange(len(see.left)), task.spacing / _FINE
+    spine = np.concatenate([np.stack([0.0 * see.left, -see.left], axis=-1)[:, None], see.points], axis=1)
+    share = (np.arange(task.ahead * _FINE) / _FINE) % 1.0
+    piece = np.arange(task.ahead * _FINE) // _FINE
+    fine = spine[:, piece] * (1.0 - share)[:, None] + spine[:, piece + 1] * share[:, None]
+    far = task.spacing * np.arange(task.ahead)[None]  # a bend begins a point earlier
+    bend = np.maximum(np.abs(see.curvature), 1e-6)
+    allowed = p.grip * task.max_force / bend + 2.0 * p.early * task.max_force * far
+    top = np.minimum(p.speed * task.max_speed, np.sqrt(allowed.min(axis=1)))
+    speed = np.linalg.norm(see.velocity, axis=-1)
+    gap = np.linalg.norm(fine - p.time * see.velocity[:, None], axis=-1)
+    then = np.argmin(gap, axis=1)
+    gained = then * step - p.keep * top * p.time
+    ahead = p.lead * np.maximum(speed, 0.25 * top)
+    target = fine[row, np.minimum(np.round(ahead / step), task.ahead * _FINE - 1).astype(int)]
+    wish = p.gain * follow_path(gap[row, then] - p.tube * task.half_width, gained, target, see.velocity, top)
+    slower = -p.brake * (np.maximum(speed - top, 0.0) / np.maximum(speed, 1e-9))[:, None] * see.velocity
+    return slower + wish
+
+
+_FINE = 5
+"""Places between two points of the track that are seen, among which the nearest is."""
+
+
 # --- the player ------------------------------------------------------------------------------------------------------
 
 RULES: dict[str, tuple[Callable[..., np.ndarray], type]] = {
     "pursuit": (pursuit, PursuitRules),
     "obstacles": (obstacles, ObstaclesRules),
+    "evade": (evade, EvadeRules),
     "flock": (flock, FlockRules),
+    "crossing": (crossing, CrossingRules),
     "herd": (herd, HerdRules),
+    "path_follow": (path_follow, PathFollowRules),
 }
+"""What the player "reynolds" does in each task, and its parameters."""
+
+PLAYERS: dict[str, dict[str, tuple[Callable[..., np.ndarray], type]]] = {
+    "orca": {"crossing": (orca_crossing, OrcaRules)},
+}
+"""Other hand-written players by name, for those tasks that have one."""
 
 
 @dataclass(frozen=True)
@@ -193,13 +373,14 @@ class Reynolds:
 
     task: Task
     rules: Any
+    name: str = "reynolds"
 
     def predict(
         self, observation: Any, state: Any = None, episode_start: Any = None, deterministic: bool = True
     ) -> tuple[np.ndarray, Any]:
         """Return actions (R, A) float32 for observation rows (R, O), or (A,) for one row (O,)."""
         seen = np.asarray(observation)
-        steer = RULES[self.task.name][0]
+        steer = _rules(self.name)[self.task.name][0]
         force = steer(self.task.layout.unpack(np.atleast_2d(seen)), self.task, self.rules)
         strongest = self.task.action_layout.slots[0].scale
         wish = force / strongest
@@ -212,6 +393,11 @@ class Reynolds:
         return replace(self, rules=replace(self.rules, **values))
 
 
+def _rules(name: str) -> dict[str, tuple[Callable[..., np.ndarray], type]]:
+    """Return what a player does, by task."""
+    return RULES if name == "reynolds" else PLAYERS[name]
+
+
 def tuned(name: str) -> dict[str, float]:
     """Return the parameters that the search found for a task, from configs/<name>.yaml; {} if there are none yet."""
     path = CONFIGS / f"{name}.yaml"
@@ -221,12 +407,16 @@ def tuned(name: str) -> dict[str, float]:
     return dict((config.get("reynolds") or {}).get("rules") or {})
 
 
-def player(task: Task, textbook: bool = False) -> Reynolds:
-    """Return the hand-written player of a task, tuned unless the textbook's parameters are asked for."""
-    if task.name not in RULES:
-        raise ValueError(f"there is no hand-written player for {task.name!r}; there is one for: {', '.join(RULES)}")
-    rules = RULES[task.name][1]()
-    return Reynolds(task, replace(rules, **({} if textbook else tuned(task.name))))
+def player(task: Task, textbook: bool = False, name: str = "reynolds") -> Reynolds:
+    """Return a hand-written player of a task; "reynolds" is tuned unless the textbook's parameters are asked for."""
+    known = _rules(name)
+    if task.name not in known:
+        which = "" if name == "reynolds" else f" {name!r}"
+        raise ValueError(
+            f"there is no hand-written player{which} for {task.name!r}; there is one for: {', '.join(known)}"
+        )
+    found = tuned(task.name) if name == "reynolds" and not textbook else {}
+    return Reynolds(task, replace(known[task.name][1](), **found), name)
 
 
 def as_dict(rules: Any) -> dict[str, float]:

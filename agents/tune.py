@@ -37,13 +37,26 @@ RANGES: dict[str, dict[str, tuple[float, float]]] = {
         "horizon": (0.4, 3.0), "margin": (0.0, 0.6), "evade": (0.5, 8.0), "urgency": (0.0, 1.0), "brake": (0.0, 3.0),
         "gain": (0.5, 6.0), "speed": (0.6, 1.0), "push": (0.0, 2.0),
     },
+    "crossing": {
+        "horizon": (0.5, 6.0), "margin": (0.0, 0.8), "evade": (0.5, 8.0), "urgency": (0.0, 1.0), "radius": (0.6, 2.0),
+        "apart": (0.0, 4.0), "gain": (0.5, 6.0), "speed": (0.5, 1.0), "slow_radius": (0.1, 2.0),
+    },
     "flock": {
         "horizon": (0.5, 4.0), "margin": (0.0, 1.0), "evade": (0.5, 8.0), "radius": (1.0, 3.0), "apart": (0.0, 8.0),
         "match": (0.0, 5.0), "centre": (0.0, 2.0), "course": (0.2, 6.0), "blend": (0.0, 1.0),
     },
+    "evade": {
+        "horizon": (0.2, 2.0), "avoid": (0.5, 8.0), "wall": (0.1, 1.5), "alarm": (2.0, 15.0), "predict": (0.0, 2.0),
+        "evade": (0.5, 8.0), "crowd": (0.0, 2.0), "middle": (0.0, 1.5), "margin": (0.4, 2.5), "danger": (0.0, 3.0),
+        "exposed": (0.0, 10.0), "hide": (0.0, 8.0),
+    },
     "herd": {
         "together": (0.3, 2.0), "collecting": (0.0, 4.0), "driving": (0.3, 2.5), "near": (0.0, 5.0), "slow": (0.0, 1.0),
         "gain": (1.0, 12.0), "around": (0.0, 6.0), "width": (0.5, 2.0), "apart": (0.0, 10.0),
+    },
+    "path_follow": {
+        "time": (0.05, 0.8), "lead": (0.1, 0.8), "tube": (0.0, 1.0), "keep": (0.3, 0.99), "speed": (0.5, 1.0),
+        "grip": (0.3, 2.5), "early": (0.2, 1.5), "brake": (0.0, 12.0), "gain": (1.0, 12.0),
     },
 }  # fmt: skip
 """Where each parameter is looked for."""

@@ -20,7 +20,17 @@ if TYPE_CHECKING:
     from flockenv.scene import Scene
     from flockenv.snapshot import Snapshot
     from flockenv.state import Body, State
-    from flockenv.tasks import TASKS, Flock, Herd, Obstacles, Pursuit, Task
+    from flockenv.tasks import (
+        TASKS,
+        Crossing,
+        Evade,
+        Flock,
+        Herd,
+        Obstacles,
+        PathFollow,
+        Pursuit,
+        Task,
+    )
     from flockenv.world import Step, World
 
 __version__ = "0.1.0"
@@ -28,9 +38,12 @@ __version__ = "0.1.0"
 __all__ = [
     "TASKS",
     "Body",
+    "Crossing",
+    "Evade",
     "Flock",
     "Herd",
     "Obstacles",
+    "PathFollow",
     "Pursuit",
     "Scene",
     "Snapshot",
@@ -47,9 +60,12 @@ _HOME = {
     "Body": "state",
     "State": "state",
     "TASKS": "tasks",
+    "Crossing": "tasks",
+    "Evade": "tasks",
     "Flock": "tasks",
     "Herd": "tasks",
     "Obstacles": "tasks",
+    "PathFollow": "tasks",
     "Pursuit": "tasks",
     "Task": "tasks",
     "Step": "world",

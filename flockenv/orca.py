@@ -17,7 +17,7 @@ import numpy as np
 from flockenv.kernels import Numbers, Vec, law, like, stacked
 from flockenv.vec import add, axis, dot, limit, norm, scale, select, sub, unit
 
-__all__ = ["SLOT", "half_plane", "orca"]
+__all__ = ["SLOT", "clear", "half_plane", "orca"]
 
 SLOT = 6
 """Numbers of one neighbour in `orca`: offset (2) m, velocity (2) m/s, radius m (< 0: nobody), share."""
@@ -135,9 +135,20 @@ def orca(
     symmetric does not come to a halt; else it is granted as it is, up to `max_speed`.
     """
     given, lines, relaxed = stacked(neighbours), stacked(neighbours), stacked(neighbours)
+    asked = (wish, max_speed, turn)
+    return clear(velocity, radius, asked, horizon, step, given, len(neighbours) // 6, lines, relaxed)
+
+
+@law
+def clear(
+    velocity: Vec, radius: float, asked: Any, horizon: float, step: float, given: Any, slots: int, lines: Any,
+    relaxed: Any,
+) -> Vec:  # fmt: skip
+    """Do what `orca` says, for `slots` neighbours in an array; `asked` is (wish, max_speed, turn), the rest scratch."""
+    wish, max_speed, turn = asked
     count, hard, free = 0, 0, True
     for soft in range(2):
-        for k in range(len(neighbours) // 6):
+        for k in range(slots):
             at = 6 * k
             if given[at + 4] >= like(radius, 0.0) and (given[at + 5] < like(radius, 1.0)) == (soft == 1):
                 offset, other = (given[at], given[at + 1]), (given[at + 2], given[at + 3])

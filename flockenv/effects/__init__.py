@@ -11,6 +11,7 @@ for _module in pkgutil.iter_modules(__path__):
     importlib.import_module(f"{__name__}.{_module.name}")
 
 from flockenv.effects.attraction import Attraction  # noqa: E402  # after the folder has been walked
+from flockenv.effects.contact import ObstacleContact  # noqa: E402
 from flockenv.effects.drag import Drag, QuadraticDrag  # noqa: E402
 from flockenv.effects.elastic import Elastic  # noqa: E402
 from flockenv.effects.fields import Carried, Sink, Source, Uniform, Vortex, Wind  # noqa: E402
@@ -24,7 +25,7 @@ from flockenv.effects.wall import WallRepulsion  # noqa: E402
 
 __all__ = [
     "EFFECTS", "AngularSprings", "Attraction", "Carried", "Drag", "Effect",
-    "Elastic", "Far", "Fluctuation", "Gravitation", "Gravity", "InverseSquare", "Me", "Other", "Pressure",
-    "QuadraticDrag", "Sight", "Sink", "Source", "Springs", "Swing", "Tether", "Uniform", "Vortex",
+    "Elastic", "Far", "Fluctuation", "Gravitation", "Gravity", "InverseSquare", "Me", "ObstacleContact",
+    "Other", "Pressure", "QuadraticDrag", "Sight", "Sink", "Source", "Springs", "Swing", "Tether", "Uniform", "Vortex",
     "WallRepulsion", "Wind",
 ]  # fmt: skip

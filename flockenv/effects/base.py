@@ -19,7 +19,9 @@ An effect is of one or more of three forms, each a law for one agent:
   meets each obstacle for each of its rays, k = 0, 1, ...: where the agent's body, `margin` wider, would touch it
   first if it went along the unit vector `direction`. With an `obstacle_from(p, me) -> offset` it is met as from that
   place, so far from the agent, instead of from where the agent is. Of an effect with a pair law too, `finish_law` gives
-  no force but what it has found out about others, a vector that is told to `obstacle_start(p, me, told)` (hide).
+  no force but what it has found out about others, a vector that is told to `obstacle_start(p, me, told)` (hide). With
+  no start of its own it meets circles alone, goes before a fold over neighbours and hands over to it, so that both are
+  judged together (orca).
 
 `p` holds the effect's `parameters()` by name, and, if it is `tabled`, an array of numbers as `p.table`: the points of a
 path, the values of a grid. `me` and `other` are the records below. Laws live in the effect's module.
@@ -201,7 +203,7 @@ class Effect(Record):
     tabled: ClassVar[bool] = False
     """Do its laws look numbers up in its `table`?"""
     places: ClassVar[tuple[str, ...]] = ()
-    """Names of the parameters that are points: on a torus own, medium and flow laws are given the nearest images."""
+    """Names of the parameters that are points: on a torus all laws but of bonds and obstacles are given the nearest images."""
     strengths: ClassVar[tuple[str, ...]] = ("weight",)
     """Names of the fields that make it nothing when they are 0."""
     conserves_momentum: ClassVar[bool] = False
@@ -226,6 +228,11 @@ class Effect(Record):
     def reach(self) -> float:
         """How far it looks for neighbours, m; 0 if it does not."""
         return self.sight.radius if self.sight else 0.0
+
+    @property
+    def joined(self) -> bool:
+        """Is it one fold over obstacles and neighbours?"""
+        return self.obstacle_law is not None and self.obstacle_start is None
 
     @property
     def wishes(self) -> tuple[Effect, ...]:
@@ -288,6 +295,13 @@ class Effect(Record):
 
     def potential(self, groups: Sequence[Any], state: Any, offset: Any) -> NDArray[np.float64] | None:
         """Return its potential energy in each world, (B,) J; none if it has none. `offset(a, b)` is the space's."""
+        return None
+
+    def lookahead(self, speed: float) -> float | None:
+        """Return how far ahead somebody at this speed notices what he must avoid, m; none if it avoids nothing.
+
+        What gives it is called `horizon`, s, in such an effect.
+        """
         return None
 
     def check(self, scene: Any) -> None:

@@ -26,10 +26,10 @@ from flockenv.envs.face import (
     render_fps,
 )
 from flockenv.refusals import nearest
-from flockenv.tasks import Flock, Herd, Pursuit, Task
+from flockenv.tasks import Crossing, Flock, Herd, Pursuit, Task
 from flockenv.world import Step, World
 
-__all__ = ["FlockParallelEnv", "HerdParallelEnv", "PursuitParallelEnv", "WorldParallelEnv"]
+__all__ = ["CrossingParallelEnv", "FlockParallelEnv", "HerdParallelEnv", "PursuitParallelEnv", "WorldParallelEnv"]
 
 Named = dict[str, Any]
 
@@ -246,6 +246,12 @@ class PursuitParallelEnv(WorldParallelEnv):
 
     task_type = Pursuit
     fixed: ClassVar[dict[str, Any]] = {"pursuers": 3, "evaders": 2, "sides": "both"}
+
+
+class CrossingParallelEnv(WorldParallelEnv):
+    """Walkers swap places across a circle, all of them agents (learners=k: only the first k are)."""
+
+    task_type = Crossing
 
 
 class HerdParallelEnv(WorldParallelEnv):

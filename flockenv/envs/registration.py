@@ -9,13 +9,18 @@ import pettingzoo
 
 __all__ = ["HORIZONS", "PARALLEL", "SINGLE", "register_all"]
 
-HORIZONS = {"Pursuit": 300, "Obstacles": 250, "Flock": 300, "Herd": 600}
+HORIZONS = {"Pursuit": 300, "Obstacles": 250, "Flock": 300, "Herd": 600, "Crossing": 200, "Evade": 300, "PathFollow": 300}
 """Time limit of an episode in control steps, by name: `Task.horizon`, repeated here so that no task is imported."""
 
 SINGLE = tuple(f"flockenv/{name}-v0" for name in HORIZONS)
 """Ids for gymnasium.make and gymnasium.make_vec: one learner, everybody else is scripted."""
 
-PARALLEL = {"flockenv/Flock-v0": "flock_v0", "flockenv/Herd-v0": "herd_v0", "flockenv/Pursuit-v0": "pursuit_v0"}
+PARALLEL = {
+    "flockenv/Crossing-v0": "crossing_v0",
+    "flockenv/Flock-v0": "flock_v0",
+    "flockenv/Herd-v0": "herd_v0",
+    "flockenv/Pursuit-v0": "pursuit_v0",
+}
 """Ids for pettingzoo.make("parallel" or "aec", ...), and the module in flockenv.envs that builds each."""
 
 

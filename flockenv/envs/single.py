@@ -23,10 +23,20 @@ from flockenv.envs.face import (
     render_fps,
 )
 from flockenv.envs.page import page
-from flockenv.tasks import Flock, Herd, Obstacles, Pursuit, Task
+from flockenv.tasks import Crossing, Evade, Flock, Herd, Obstacles, PathFollow, Pursuit, Task
 from flockenv.world import Step, World
 
-__all__ = ["FlockEnv", "HerdEnv", "ObstaclesEnv", "PursuitEnv", "SingleEnv", "one_learner"]
+__all__ = [
+    "CrossingEnv",
+    "EvadeEnv",
+    "FlockEnv",
+    "HerdEnv",
+    "ObstaclesEnv",
+    "PathFollowEnv",
+    "PursuitEnv",
+    "SingleEnv",
+    "one_learner",
+]
 
 
 def one_learner(task_type: type[Task], parameters: dict[str, Any]) -> Task:
@@ -137,6 +147,13 @@ class ObstaclesEnv(SingleEnv):
     history = "v0: first version (flockenv 0.1.0)."
 
 
+class PathFollowEnv(SingleEnv):
+    """A runner follows a narrow winding track, as far as it gets."""
+
+    task_type = PathFollow
+    history = "v0: first version (flockenv 0.1.0)."
+
+
 class FlockEnv(SingleEnv):
     """A learner flies in a flock of scripted flockmates."""
 
@@ -145,8 +162,23 @@ class FlockEnv(SingleEnv):
     history = "v0: first version (flockenv 0.1.0)."
 
 
+class CrossingEnv(SingleEnv):
+    """A learner crosses a circle among scripted walkers who keep clear of each other by ORCA, and of him."""
+
+    task_type = Crossing
+    fixed: ClassVar[dict[str, Any]] = {"learners": 1}
+    history = "v0: first version (flockenv 0.2.0)."
+
+
 class HerdEnv(SingleEnv):
     """A dog gathers scripted sheep and drives them into a pen."""
 
     task_type = Herd
+    history = "v0: first version (flockenv 0.1.0)."
+
+
+class EvadeEnv(SingleEnv):
+    """An evader stays out of the hands of three scripted pursuers among cover."""
+
+    task_type = Evade
     history = "v0: first version (flockenv 0.1.0)."

@@ -31,10 +31,19 @@ from flockenv.envs.face import (
     together,
 )
 from flockenv.refusals import nearest
-from flockenv.tasks import Flock, Herd, Obstacles, Pursuit, Task
+from flockenv.tasks import Crossing, Evade, Flock, Herd, Obstacles, PathFollow, Pursuit, Task
 from flockenv.world import Step, World
 
-__all__ = ["FlockVectorEnv", "HerdVectorEnv", "ObstaclesVectorEnv", "PursuitVectorEnv", "WorldsEnv"]
+__all__ = [
+    "CrossingVectorEnv",
+    "EvadeVectorEnv",
+    "FlockVectorEnv",
+    "HerdVectorEnv",
+    "ObstaclesVectorEnv",
+    "PathFollowVectorEnv",
+    "PursuitVectorEnv",
+    "WorldsEnv",
+]
 
 Mask = NDArray[np.bool_]
 Info = dict[str, Any]
@@ -336,6 +345,12 @@ class ObstaclesVectorEnv(WorldsEnv):
     task_type = Obstacles
 
 
+class PathFollowVectorEnv(WorldsEnv):
+    """Runners, one per world; the page is that of flockenv.envs.single.PathFollowEnv."""
+
+    task_type = PathFollow
+
+
 class FlockVectorEnv(WorldsEnv):
     """Learners in flocks, one per world or `learners=` several; the page is that of flockenv.envs.single.FlockEnv."""
 
@@ -343,7 +358,20 @@ class FlockVectorEnv(WorldsEnv):
     fixed: ClassVar[dict[str, Any]] = {"learners": 1}
 
 
+class CrossingVectorEnv(WorldsEnv):
+    """Walkers, one per world or `learners=` several; the page is that of flockenv.envs.single.CrossingEnv."""
+
+    task_type = Crossing
+    fixed: ClassVar[dict[str, Any]] = {"learners": 1}
+
+
 class HerdVectorEnv(WorldsEnv):
     """Dogs, one per world or `dogs=` several; the page is that of flockenv.envs.single.HerdEnv."""
 
     task_type = Herd
+
+
+class EvadeVectorEnv(WorldsEnv):
+    """Evaders, one per world; the page is that of flockenv.envs.single.EvadeEnv."""
+
+    task_type = Evade

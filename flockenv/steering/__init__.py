@@ -12,6 +12,7 @@ Sources: Reynolds, "Flocks, Herds, and Schools" (SIGGRAPH 1987); "Steering Behav
 from __future__ import annotations
 
 from flockenv.steering.around import avoid, contain, threat
+from flockenv.steering.crowd import explore, give_way, queue, queue_gap, unaligned_threat
 from flockenv.steering.goals import (
     arrive,
     dock,
@@ -38,10 +39,12 @@ from flockenv.steering.others import (
     keep_station,
     offset_pursue,
     opensteer_time,
+    passing_point,
     pursue,
     separate,
     shadow,
 )
+from flockenv.steering.paths import follow_flow, follow_path, stay_on_path
 
 __all__ = [
     "align",
@@ -54,9 +57,13 @@ __all__ = [
     "distance_time",
     "dock",
     "evade",
+    "explore",
     "face",
     "flee",
+    "follow_flow",
     "follow_leader",
+    "follow_path",
+    "give_way",
     "heed",
     "herd_from",
     "hiding_place",
@@ -67,12 +74,17 @@ __all__ = [
     "match_velocity",
     "offset_pursue",
     "opensteer_time",
+    "passing_point",
     "pursue",
+    "queue",
+    "queue_gap",
     "seek",
     "separate",
     "shadow",
+    "stay_on_path",
     "target_speed",
     "threat",
+    "unaligned_threat",
     "wander",
     "wander_turn",
 ]

@@ -12,7 +12,18 @@ from flockenv.sweep.far import far
 from flockenv.sweep.obstacles import obstacles
 from flockenv.sweep.pairs import pairs
 from flockenv.sweep.parts import Parts
-from flockenv.sweep.text import CONTEXT, Slots, alone, indented, lane, lanes_of, tuple_of
+from flockenv.sweep.text import (
+    CONTEXT,
+    Slots,
+    alone,
+    frame_views,
+    given,
+    indented,
+    lane,
+    lanes_of,
+    nearest_image,
+    tuple_of,
+)
 
 __all__ = ["accelerate", "parameters"]
 
@@ -20,13 +31,14 @@ __all__ = ["accelerate", "parameters"]
 def accelerate(parts: Parts) -> str:
     """Return the source of `accelerate`: pair laws first, then each agent by itself, block after block."""
     d = parts.dimension
-    me = ["i = row + l", f"x, v = {lanes_of(parts, 'pos')}, {lanes_of(parts, 'vel')}", f"me = {alone()}"]
+    me = ["i = row + l", f"x, v = {lanes_of(parts, 'pos')}, {lanes_of(parts, 'vel')}", f"me = {alone(parts)}"]
     return f'''
 
 @kernel
 def sense(context, pos, vel, time):
     """Write what this thread's agents of one world feel from others, at this instant, whatever law it is by."""
     {CONTEXT} = context
+{indented(frame_views(parts), 4)}
 {indented(parameters(parts), 4)}
     if rank == 0:
         work[b, 0] += 1
@@ -40,6 +52,7 @@ def respond(around, pos, vel, time, acc):
     """Acceleration of the agents of some of this thread's blocks, m/s^2, once all is sensed."""
     context, first_, end_ = around
     {CONTEXT} = context
+{indented(frame_views(parts), 4)}
 {indented(parameters(parts), 4)}
     for block in range(np.uint64(first_), np.uint64(end_)):
         base, row = block * np.uint64({d * parts.width}), block * np.uint64({parts.width})
@@ -100,31 +113,18 @@ def parameters(parts: Parts) -> list[str]:
 
 def _nearest_images(parts: Parts) -> list[str]:
     """Write the numbers of those effects that know places anew: on a torus, with the images nearest to agent i."""
-    lines = []
-    for k, effect in enumerate(parts.effects):
-        if _given(parts, k) == f"near{k}":
-            values = [
-                f"add(x, offset_to(size, x, p{k}.{name}))" if name in effect.places else f"p{k}.{name}"
-                for name in parts.names_of(effect)
-            ]
-            lines.append(f"near{k} = P{k}({', '.join(values)})")
-    return lines
-
-
-def _given(parts: Parts, k: int) -> str:
-    """Write by which name the numbers of effect k are given to a law of one agent."""
-    return f"near{k}" if parts.space.periodic and parts.effects[k].places else f"p{k}"
+    return [nearest_image(parts, k, "x") for k in range(len(parts.effects)) if given(parts, k) == f"near{k}"]
 
 
 def _medium(parts: Parts) -> list[str]:
     """Write how fast the medium is where agent i is, if any effect says so."""
-    media = [f"m = add(m, medium_law_{k}({_given(parts, k)}, me))" for k, e in enumerate(parts.effects) if e.medium_law]
+    media = [f"m = add(m, medium_law_{k}({given(parts, k)}, me))" for k, e in enumerate(parts.effects) if e.medium_law]
     if not media:
         return []
     return [
         "m = o",
         *media,
-        f"me = {alone(medium='m')}",
+        f"me = {alone(parts, medium='m')}",
     ]
 
 
@@ -132,7 +132,7 @@ def _carry(parts: Parts) -> list[str]:
     """Write with which velocity the medium carries agent i, if it does."""
     if not parts.flows:
         return []
-    laws = [f"u = add(u, flow_law_{k}({_given(parts, k)}, me))" for k, e in enumerate(parts.effects) if e.flow_law]
+    laws = [f"u = add(u, flow_law_{k}({given(parts, k)}, me))" for k, e in enumerate(parts.effects) if e.flow_law]
     return [
         "u = o",
         *laws,
@@ -148,9 +148,9 @@ def _own(parts: Parts) -> list[str]:
         if effect.own_law is not None:
             still = effect.linear_drag is not None and parts.integrator.splits_drag
             if still:  # what is left of -c (v - u): the method adds -c v
-                lines.append(f"rest = {alone(medium='me.medium', vel='o', heading='o')}")
-            lines.append(f"{to} = add({to}, own_law_{k}({_given(parts, k)}, {'rest' if still else 'me'}))")
-        if effect.obstacle_law is not None:
+                lines.append(f"rest = {alone(parts, medium='me.medium', vel='o', heading='o')}")
+            lines.append(f"{to} = add({to}, own_law_{k}({given(parts, k)}, {'rest' if still else 'me'}))")
+        if effect.obstacle_start is not None:
             lines.append(f"{to} = add({to}, obstacle_finish_{k}(p{k}, me, ({', '.join(slot.all(f'o{k}_'))},)))")
     return lines
 

@@ -28,7 +28,7 @@ def look(
     n, rank, team = x_.shape[2], 0, 1
     first, end = 0, (n + {parts.width - 1}) // {parts.width}
     size, reach, within = {tuple_of("params[#]", parts.dimension)}, params[{at}], params[{at + 1}]
-    present, arranged, time = 0, False, params[0]  # nobody asks here what time it is
+    present, arranged, time, drawn = 0, False, params[0], np.uint64(0)  # nobody asks here what time it is, or draws
     for i in range(n):
         present += alive[b, i]
         living[i] = alive[b, i]

@@ -38,7 +38,7 @@ def obstacles(parts: Parts, me: list[str], found_out: Callable[[int], str]) -> l
     found_out(k): where what the pair law of effect k has found out about others is.
     """
     slot = Slots(parts)
-    asking = [(k, slot.all(f"o{k}_")) for k, e in enumerate(parts.effects) if e.obstacle_law is not None]
+    asking = [(k, slot.all(f"o{k}_")) for k, e in enumerate(parts.effects) if e.obstacle_start is not None]
     if not asking:
         return []
     starts = []

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from flockenv.sweep.parts import Parts, record_of, sight_of, sorted_at
 from flockenv.sweep.query import query, walk
-from flockenv.sweep.text import Slots, indented, indented_lines, place_of
+from flockenv.sweep.text import Slots, given, indented, indented_lines, nearest_image, place_of, tuple_of
 
 __all__ = ["meet_range", "pairs"]
 
@@ -19,8 +19,10 @@ def pairs(parts: Parts) -> list[str]:
         return []
     return [
         "# one query per instant, one sweep for all pair laws",
+        "drawn = key[b]",
         "if rank == 0:",
         "    work[b, 1] += 1",
+        *["    work[b, 3] += n * obstacle_radius.shape[1]" for _, e in parts.pairs if e.joined],
         *query(parts, parts.fields, parts.confines),
         *walk(parts, [*_clear(parts), *_select_nearest(parts), *_sum_up(parts)]),
         "tally[rank] = met",
@@ -37,11 +39,30 @@ def _clear(parts: Parts) -> list[str]:
     zeros = [f"{s} = 0" for k, e in parts.pairs if not e.pair_start for s in slot.all(f"c{k}_")]
     folds = [(k, slot.all(f"c{k}_")) for k, e in parts.pairs if e.pair_start]
     if folds:
-        zeros.append(_me(parts, parts.fields))
+        zeros += [_me(parts, parts.fields), *_nearest_images(parts)]
     for k, slots in folds:
-        zeros += [f"found_ = pair_start_{k}(p{k}, me)", *(f"{s} = found_[{j}]" for j, s in enumerate(slots))]
+        zeros.append(f"found_ = pair_start_{k}({given(parts, k)}, me)")
+        zeros += _obstacles(parts, k) if parts.effects[k].joined else []
+        zeros += [f"{s} = found_[{j}]" for j, s in enumerate(slots)]
     far = [f"{s} = np.inf" for q in range(len(parts.sights)) for s in slot.all(f"near{q}_")]
     return [f"for l in range(np.uint64({parts.width})):", indented(zeros + far, 4)]
+
+
+def _nearest_images(parts: Parts) -> list[str]:
+    """Write the numbers of those effects with pair laws that know places anew: with the images nearest to me."""
+    return [nearest_image(parts, k, "me.pos") for k, _ in parts.pairs if given(parts, k) == f"near{k}"]
+
+
+def _obstacles(parts: Parts, k: int) -> list[str]:
+    """Write how the fold of effect k meets the obstacles, before it meets neighbours."""
+    return [
+        "for m in range(obstacle_radius.shape[1]):",
+        "    rho = obstacle_radius[b, m]",
+        "    if rho > 0:",
+        f"        to = offset_to(size, me.pos, {tuple_of('obstacle_x[#, b, m]', parts.dimension)})",
+        "        it = Other(like(rho, m), to, dot(to, to), zero(to), rho, zero(to))",
+        f"        found_ = obstacle_law_{k}({given(parts, k)}, me, it, found_)",
+    ]
 
 
 def _select_nearest(parts: Parts) -> list[str]:
@@ -102,10 +123,10 @@ def _meet(parts: Parts) -> list[str]:
 def _finish(parts: Parts) -> list[str]:
     """Write what a block's sums come to."""
     slot, d = Slots(parts), parts.dimension
-    lines = [_me(parts, parts.fields)] + [f"{name} = zero(me.pos)" for name in parts.targets]
+    lines = [_me(parts, parts.fields), *_nearest_images(parts)] + [f"{name} = zero(me.pos)" for name in parts.targets]
     for k, _ in parts.pairs:
         to = parts.pair_target(k)
-        lines.append(f"{to} = add({to}, finish_law_{k}(p{k}, me, ({', '.join(slot.all(f'c{k}_'))},)))")
+        lines.append(f"{to} = add({to}, finish_law_{k}({given(parts, k)}, me, ({', '.join(slot.all(f'c{k}_'))},)))")
     return lines + [f"{slot(f'g{name}{j}')} = {name}[{j}]" for name in parts.targets for j in range(d)]
 
 
@@ -193,5 +214,5 @@ def _me(parts: Parts, fields: list[str]) -> str:
         return "(" + ", ".join(number(f"{letter}{k}") for k in range(parts.dimension)) + ")"
 
     numbers = ", ".join(number(name) for name in ("mass", "radius", "max_speed", "max_force"))
-    vectors = f"{vector('x')}, {vector('v')}, {vector('h')}"
-    return f"me = Me({number('who')}, {vectors}, {numbers}, {vector('t')}, time, zero({vector('x')}), key[b])"
+    vectors = f"{vector('x')}, {vector('v')}, {vector('d' if parts.oriented else 'h')}"
+    return f"me = Me({number('who')}, {vectors}, {numbers}, {vector('t')}, time, zero({vector('x')}), drawn)"

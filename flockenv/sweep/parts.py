@@ -54,6 +54,12 @@ class Parts:
     """What a task shows its agents, found by the same query."""
     crowded: bool = False
     """Are there enough agents for groups of them to be met as one, where they are far away?"""
+    oriented: bool = False
+    """Does anybody keep a heading (and an up vector) of his own?"""
+    turns: bool = False
+    """Is anybody's turn rate limited?"""
+    leans: bool = False
+    """Does anybody lean into his turns?"""
     starts: tuple[int, ...] = ()
     """The first agent of each group, and one more: numbers alone, the source does not depend on them."""
     shapes: tuple[Any, ...] = field(default=(), compare=False)
@@ -232,7 +238,9 @@ class Parts:
             names.add("heading")
         if any(sight.group is not None for sight in self.sights):
             names.add("who")
-        needed = {"x": True, "v": bool({"vel", "heading"} & names), "h": "heading" in names, "t": "tie" in names}
+        facing = "heading" in names
+        needed = {"x": True, "v": "vel" in names or (facing and not self.oriented)}
+        needed |= {"d" if self.oriented else "h": facing, "t": "tie" in names}
         rows = [f"{letter}{k}" for letter, need in needed.items() if need for k in range(self.dimension)]
         return rows + [name for name in ("who", "radius", "mass", "max_speed", "max_force") if name in names]
 
@@ -269,11 +277,32 @@ class Parts:
         return self.sorts and bool(self.pairs) and not self.pulls
 
     @property
+    def frame_vectors(self) -> list[str]:
+        """The vectors of an agent's frame: where it faces, and in space which way is up."""
+        return ["facing", "above"][: self.dimension - 1] if self.oriented else []
+
+    @property
+    def frame_numbers(self) -> list[str]:
+        """The numbers of an agent's frame, by `Body`'s names: how fast it may turn, and how soon it leans."""
+        wanted = {"max_turn_rate": self.turns, "banking": self.leans}
+        return [name for name, some in wanted.items() if some]
+
+    @property
+    def frame_argument(self) -> str:
+        """The state's array of frames among the arguments of an entry point, where there is one."""
+        return "frame_, " if self.oriented else ""
+
+    @property
+    def frame_rows(self) -> int:
+        """Coordinates of the vectors of a frame: what a state keeps of each agent."""
+        return self.dimension * len(self.frame_vectors)
+
+    @property
     def luggage(self) -> list[str]:
         """What an agent carries along then: an array, and the axis of a vector."""
-        vectors = ["pos", "vel", "want", *(["tie"] if "t0" in self.fields else [])]
+        vectors = ["pos", "vel", "want", *self.frame_vectors, *(["tie"] if "t0" in self.fields else [])]
         vector = [f"{name} {k}" for name in vectors for k in range(self.dimension)]
-        return [*vector, "mass", "radius", "max_speed", "max_force", "ident"]
+        return [*vector, "mass", "radius", "max_speed", "max_force", *self.frame_numbers, "ident"]
 
     @property
     def luggage_size(self) -> int:
@@ -286,7 +315,7 @@ class Parts:
         d, look = self.dimension, self.look or Look(0.0)
         runs = [(f"c{k}_", e.sums(d)) for k, e in self.pairs]
         runs += [(f"near{q}_", sight.nearest or 0) for q, sight in enumerate(self.sights)]
-        runs += [(f"o{k}_", e.folded(d) if e.obstacle_law else 0) for k, e in enumerate(self.effects)]
+        runs += [(f"o{k}_", e.folded(d) if e.obstacle_start else 0) for k, e in enumerate(self.effects)]
         runs += [(f"g{name}", d) for name in self.targets] + [
             ("bond", d * bool(self.bonded)),
             ("far", d * bool(self.far)),
@@ -332,7 +361,11 @@ def view_of(fov: float) -> float:
 def _names(effect: Effect) -> set[str]:
     """Return every name in the code of an effect's pair laws and of the laws that they call."""
     module = vars(sys.modules[type(effect).__module__])
-    todo = [module[law] for law in (effect.pair_start, effect.pair_law, effect.finish_law) if law]
+    todo = [
+        module[law]
+        for law in (effect.pair_start, effect.pair_law, effect.finish_law, effect.joined and effect.obstacle_law)
+        if law
+    ]
     seen: set[int] = set()
     names: set[str] = set()
     while todo:

@@ -10,8 +10,8 @@ from flockenv.sweep.far import tree_imports
 from flockenv.sweep.method import method, method_imports
 from flockenv.sweep.obstacles import blocked, obstacle_imports
 from flockenv.sweep.parts import Parts
-from flockenv.sweep.step import copies, step, step_world
-from flockenv.sweep.text import CONTEXT, SHARED
+from flockenv.sweep.step import copies, kept_frame, step, step_world
+from flockenv.sweep.text import CONTEXT, SHARED, frame_views, indented
 
 __all__ = ["field_source", "scene_source"]
 
@@ -53,7 +53,10 @@ def field_source(parts: Parts) -> str:
         copies(parts),
         f'''
 @njit(cache=True, **FAST)
-def field(x, v, alive, key, obstacle_x, obstacle_radius, work, drive, params, times, acc, flow, {SHARED}):
+def field(
+    x, v, {parts.frame_argument}alive, key, obstacle_x, obstacle_radius, work, drive, params, times, acc, flow,
+    {SHARED},
+):
     """Write acceleration, and the flow that carries everybody if there is one, of all worlds, (D, B, N)."""
     unaliased()
     n, rank, team, arranged = x.shape[2], 0, 1, False
@@ -65,6 +68,7 @@ def field(x, v, alive, key, obstacle_x, obstacle_radius, work, drive, params, ti
             living[i] = alive[b, i]
         into_blocks(pos, x, b, n, first, end)
         into_blocks(vel, v, b, n, first, end)
+{indented([*frame_views(parts), *kept_frame(parts, from_state=True)], 8)}
         if drive.shape[1] > 0:
             into_blocks(want, drive, b, n, first, end)
         else:
@@ -90,6 +94,7 @@ def _imports(parts: Parts) -> str:
         *([f"from flockenv.space import {parts.space.bounce_law} as bounce"] if parts.bounces else []),
         "from flockenv.noise import normal",
         "from flockenv.vec import add, dot, exact_dot, limit, norm, scale, select, sub, unit, zero",
+        *(["from flockenv.vehicle import faced, held, leant, raised, turned"] if parts.oriented else []),
         *tree_imports(parts),
         *obstacle_imports(parts),
         method_imports(parts),

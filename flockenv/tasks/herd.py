@@ -57,16 +57,15 @@ def spawn(p: Any, frame: Frame) -> None:
 
 @kernel
 def _somewhere(p: Any, frame: Frame, t: int, channel: int) -> Vec:
-    """Return a random place in the field, 5 m or more from its edge."""
-    inner = p.size - 10.0
-    x = 5.0 + inner * uniform(frame.key, t, 500 + channel, 5)
-    return (np.float64(x), np.float64(5.0 + inner * uniform(frame.key, t, 500 + channel, 6)))
+    """Return a random place in the middle of the field, a quarter of its edge or more from that."""
+    x = p.size * (0.25 + 0.5 * uniform(frame.key, t, 500 + channel, 5))
+    return (np.float64(x), np.float64(p.size * (0.25 + 0.5 * uniform(frame.key, t, 500 + channel, 6))))
 
 
 @kernel
 def _clear(frame: Frame, i: int, first: int, end: int, distance: float) -> bool:
     """Is agent i at least this far from those of [first, end)?"""
-    for j in range(first, end):
+    for j in range(first, end):  # noqa: SIM110  # there are no generators in compiled code
         if norm(_to(frame, i, j)) < distance:
             return False
     return True
@@ -216,7 +215,7 @@ def measure(p: Any, before: Frame, after: Frame, numbers: Any) -> None:
 
 @kernel
 def observe(p: Any, frame: Frame, rows: Any) -> None:
-    """All in the frame of the course: (along, left). Own velocity, pen, flock, who strays, nearest sheep, other dogs."""
+    """In the frame of the course, (along, left): own velocity, pen, flock, who strays, nearest sheep, other dogs."""
     centre, course, pen = _centre(p, frame), _course(p, frame), _pen(frame)
     far, spread = _farthest(p, frame, centre)
     slots, dogs = int(p.sheep_seen), int(p.dogs)
@@ -224,11 +223,11 @@ def observe(p: Any, frame: Frame, rows: Any) -> None:
         row = rows[i]
         here = _place(frame, i)
         _put(row, 0, scale(_velocity(frame, i), 1.0 / p.dog_speed), course)
-        _put(row, 2, scale(sub(pen, here), 1.0 / p.size), course)
+        _put(row, 2, scale(sub(pen, here), 1.0 / p.sight), course)
         to_centre = sub(centre, here)
-        _put(row, 4, scale(to_centre, 1.0 / p.size), course)
+        _put(row, 4, scale(to_centre, 1.0 / p.sight), course)
         _put(row, 6, unit(to_centre), course)
-        _put(row, 8, scale(_to(frame, i, far), 1.0 / p.size), course)
+        _put(row, 8, scale(_to(frame, i, far), 1.0 / p.sight), course)
         row[10] = min(spread / p.spread_scale, 1.0)
         row[11] = min(norm(sub(_place(frame, far), centre)) / p.spread_scale, 1.0)
         for c in range(12, rows.shape[1]):
@@ -237,7 +236,7 @@ def observe(p: Any, frame: Frame, rows: Any) -> None:
         at = 12 + 5 * slots + 3
         for j in range(dogs):
             if j != i:
-                _put(row, at, scale(_to(frame, i, j), 1.0 / p.size), course)
+                _put(row, at, scale(_to(frame, i, j), 1.0 / p.sight), course)
                 at += 2
 
 
@@ -256,7 +255,7 @@ def _show_sheep(p: Any, frame: Frame, i: int, slots: int, course: Vec, row: Any)
         if who < 0:
             break
         to = _to(frame, i, who)
-        _put(row, 12 + 2 * s, scale(to, 1.0 / p.size), course)
+        _put(row, 12 + 2 * s, scale(to, 1.0 / p.sight), course)
         _put(row, 12 + 2 * slots + 2 * s, scale(_velocity(frame, who), 1.0 / p.sheep_speed), course)
         row[12 + 4 * slots + s] = 1.0
         if s == 0:
@@ -277,8 +276,8 @@ class Herd(Task):
 
     Sheep graze until a dog comes near. Then they go, at full speed, as in Strombom et al. 2014 (doi
     10.1098/rsif.2014.0719): away from dogs, to the centre of the sheep around them, away from who is too near, on as
-    before, and a little anyhow. Everything a dog sees is relative to itself and turned into the frame of the course, which
-    leads from the flock's centre to the pen. All sheep in the pen at once end it.
+    before, and a little anyhow. Everything a dog sees is relative to itself and turned into the frame of the course,
+    which leads from the flock's centre to the pen. All sheep in the pen at once end it.
     """
 
     name: ClassVar[str] = "herd"
@@ -290,7 +289,9 @@ class Herd(Task):
     dogs: int = Field(default=1, ge=1, le=3, description="how many learn")
     sheep: int = Field(default=12, ge=2, le=200, description="how many are driven")
     horizon: int = Field(default=600, ge=1, description="decisions until the time limit (truncation)")
-    size: float = Field(default=40.0, ge=20, description="m, edge of the part of the field where everybody begins")
+    size: float = Field(
+        default=60.0, gt=0, description="m, edge of the part that is shown; all begin in its middle half"
+    )
     pen_radius: float = Field(default=4.0, gt=0, description="m")
     away: float = Field(default=15.0, ge=0, description="m, between the pen and the middle of the sheep, at least")
     scatter: float = Field(default=6.0, gt=0, description="m about that middle within which sheep begin")
@@ -307,6 +308,7 @@ class Herd(Task):
     apart: float = Field(default=2.0, ge=0, description="rho_a, weight of going away from who is too near")
     fear: float = Field(default=1.0, ge=0, description="rho_s, weight of going away from dogs")
     error: float = Field(default=0.3, ge=0, description="e, weight of going anyhow")
+    sight: float = Field(default=40.0, gt=0, description="m, a dog sees offsets up to this per axis")
     sheep_seen: int = Field(default=6, ge=1, le=32, description="how many sheep a dog tells apart, nearest first")
     progress_reward: float = Field(default=0.5, ge=0, description="per m that the flock's centre came nearer the pen")
     gathering_reward: float = Field(
@@ -318,9 +320,9 @@ class Herd(Task):
     @model_validator(mode="after")
     def _room(self) -> Herd:
         """Refuse a start that the field has no room for."""
-        if self.away > self.size - 10:
+        if self.away > self.size / 3:
             raise ValueError(
-                f"away = {self.away:g} m: in a field of {self.size:g} m at most size - 10 is sure to be found"
+                f"away = {self.away:g} m: in a field of {self.size:g} m at most {self.size / 3:g} m is sure to be found"
             )
         return self
 
@@ -369,22 +371,22 @@ class Herd(Task):
     @functools.cached_property
     def layout(self) -> Layout:
         """Every vector is (along the course, to its left); the course leads from the flock's centre to the pen."""
-        k, mates, size = self.sheep_seen, self.dogs - 1, self.size
+        k, mates, far = self.sheep_seen, self.dogs - 1, self.sight
         near = "1 - distance / fear_distance of the nearest sheep; 0 beyond"
         return Layout((
             Slot("velocity", (2,), self.dog_speed, "m/s", "own velocity (along the course, to its left)"),
-            Slot("goal", (2,), size, "m", "offset of the pen's centre"),
-            Slot("centre", (2,), size, "m", "offset of the flock's centre"),
+            Slot("goal", (2,), far, "m", "offset of the pen's centre"),
+            Slot("centre", (2,), far, "m", "offset of the flock's centre"),
             Slot("centre_bearing", (2,), 1.0, "1", "unit vector towards it"),
-            Slot("farthest", (2,), size, "m", "offset of the sheep that is farthest from that centre"),
+            Slot("farthest", (2,), far, "m", "offset of the sheep that is farthest from that centre"),
             Slot("spread", (), self.spread_scale, "m", "mean distance of the sheep from their centre", low=0.0),
             Slot("stray", (), self.spread_scale, "m", "distance of the farthest from it", low=0.0),
-            Slot("sheep", (k, 2), size, "m", "offsets of the nearest sheep, nearest first"),
+            Slot("sheep", (k, 2), far, "m", "offsets of the nearest sheep, nearest first"),
             Slot("sheep_velocity", (k, 2), self.sheep_speed, "m/s", "their velocities"),
             Slot("sheep_present", (k,), 1.0, "1", "1 where there is one, else 0 (and zeros before)", low=0.0),
             Slot("bearing", (2,), 1.0, "1", "unit vector towards the nearest sheep"),
             Slot("closeness", (), 1.0, "1", near, low=0.0),
-            Slot("mates", (mates, 2), size, "m", "offsets of the other dogs"),
+            Slot("mates", (mates, 2), far, "m", "offsets of the other dogs"),
         ))  # fmt: skip
 
     @functools.cached_property
@@ -394,7 +396,7 @@ class Herd(Task):
         return Layout((Slot("force", (2,), self.dog_force, "N", meaning),))
 
     def metrics(self, sums: Measured, last: Measured, steps: NDArray[np.int64]) -> dict[str, NDArray[np.float64]]:
-        """Share of the sheep in the pen now; s until all were (NaN if they are not); spread now, m; path of a dog, m."""
+        """Share of the sheep in the pen; s until all were (NaN if they are not); spread now, m; path of a dog, m."""
         return {
             "share_penned": last["penned"],
             "time_to_pen": np.where((last["penned"] >= 1.0) & (steps > 0), sums["time"], np.nan),
@@ -407,5 +409,5 @@ class Herd(Task):
         return (Mark("goal", memory[:2, world, 0], np.zeros(2), self.pen_radius),)
 
     def view(self, state: State, world: int) -> tuple[tuple[float, ...], tuple[float, ...]]:
-        """Return the part of the field where everybody begins."""
+        """Return the middle of the field."""
         return (0.0, 0.0), (self.size, self.size)

@@ -1,0 +1,307 @@
+"""Among many who want to get somewhere: unaligned collision avoidance, a queue, foraging, sweeping a region."""
+
+from __future__ import annotations
+
+import math
+from typing import Any, ClassVar, Literal
+
+import numpy as np
+from pydantic import Field
+
+from flockenv import steering
+from flockenv.effects.base import Effect, Me, Other, Sight, Vector
+from flockenv.kernels import Vec, law, like
+from flockenv.noise import smooth
+from flockenv.vec import scale, select, sub, unit, zero
+
+__all__ = ["Explore", "Forage", "Queue", "UnalignedAvoidance"]
+
+
+# --- unaligned collision avoidance ------------------------------------------------------------------------------------
+
+
+@law
+def no_meeting(p: Any, me: Me) -> Vec:
+    """Nobody is met yet, at any time."""
+    return (like(me.radius, np.inf),) + zero(me.pos)  # noqa: RUF005  # numba joins tuples, but does not unpack them
+
+
+@law
+def first_meeting(p: Any, me: Me, other: Other, acc: Vec) -> Vec:
+    """Keep whom I meet first: (time, where to give way to)."""
+    clearance = me.radius + other.radius + p.margin
+    time = steering.unaligned_threat(other.offset, me.vel, other.vel, clearance, p.horizon)
+    away = steering.give_way(other.offset, me.vel, other.vel, time, like(clearance, 1.0))
+    return select(time < acc[0], (time,) + away, acc)  # noqa: RUF005
+
+
+@law
+def giving_way(p: Any, me: Me, acc: Vec) -> Vec:
+    """F = w (1 m/s) away from the meeting."""
+    away: Vec
+    if len(acc) == 3:
+        away = (acc[1], acc[2])
+    else:
+        away = (acc[1], acc[2], acc[3])
+    return scale(away, p.weight)
+
+
+class UnalignedAvoidance(Effect):
+    """Give way to whom one would meet first within `horizon` seconds: aside, and braking or speeding up."""
+
+    kind: Literal["unaligned_avoidance"] = "unaligned_avoidance"
+    weight: float = Field(ge=0, description="N, the force with which it gives way")
+    radius: float = Field(default=10.0, gt=0, description="m, who is further away is not looked at")
+    fov: float = Field(default=360.0, gt=0, le=360, description="degrees, full angle of the field of view")
+    horizon: float = Field(default=3.0, gt=0, description="s, how far ahead it looks")
+    margin: float = Field(default=0.0, ge=0, description="m, clearance beyond both radii")
+    group: int | None = Field(default=None, ge=0, description="to whom it gives way; none = all")
+    steering: ClassVar[bool] = True
+    pair_start: ClassVar[str | None] = "no_meeting"
+    pair_law: ClassVar[str | None] = "first_meeting"
+    finish_law: ClassVar[str | None] = "giving_way"
+    demo_time: ClassVar[float] = 7.0
+    demo: ClassVar[str | None] = """
+dt: 0.05
+groups:
+  - {count: 4, radius: 0.3, max_speed: 1.6, max_force: 4, spawn: {low: [-5, -2], high: [-4, 2]}}
+  - {count: 4, radius: 0.3, max_speed: 1.6, max_force: 4, spawn: {low: [-2, -5], high: [2, -4]}}
+effects:
+  - kind: steer
+    group: 0
+    behaviours:
+      - {kind: unaligned_avoidance, weight: 4, margin: 0.2}
+      - {kind: queue, weight: 2, target: [30, 0], speed: 1.2}
+  - kind: steer
+    group: 1
+    behaviours:
+      - {kind: unaligned_avoidance, weight: 4, margin: 0.2}
+      - {kind: queue, weight: 2, target: [0, 30], speed: 1.2}
+"""
+
+    @property
+    def sight(self) -> Sight:
+        """Radius, field of view, whom."""
+        return Sight(self.radius, self.fov, group=self.group)
+
+    def parameters(self) -> dict[str, float | Vec]:
+        """How strongly, how far ahead, how wide: who is seen is the sweep's business."""
+        return {"weight": self.weight, "horizon": self.horizon, "margin": self.margin}
+
+    def sums(self, dimension: int) -> int:
+        """A time and a direction."""
+        return 1 + dimension
+
+
+# --- queue ------------------------------------------------------------------------------------------------------------
+
+
+@law
+def free_way(p: Any, me: Me) -> Vec:
+    """The way to the door, and nobody on it."""
+    return unit(sub(p.target, me.pos)) + (like(me.radius, np.inf),)  # noqa: RUF005
+
+
+@law
+def held_up(p: Any, me: Me, other: Other, acc: Vec) -> Vec:
+    """Keep the shortest gap."""
+    way: Vec
+    if len(acc) == 3:
+        way = (acc[0], acc[1])
+    else:
+        way = (acc[0], acc[1], acc[2])
+    clearance = me.radius + other.radius + p.margin
+    gap = steering.queue_gap(way, other.offset, other.vel, clearance, min(p.speed, me.max_speed))
+    nearest = acc[len(acc) - 1]
+    return way + (gap if gap < nearest else nearest,)  # noqa: RUF005
+
+
+@law
+def queueing(p: Any, me: Me, acc: Vec) -> Vec:
+    """F = w (v_queue - v)."""
+    way: Vec
+    if len(acc) == 3:
+        way = (acc[0], acc[1])
+    else:
+        way = (acc[0], acc[1], acc[2])
+    return scale(steering.queue(way, me.vel, acc[len(acc) - 1], min(p.speed, me.max_speed), p.headway), p.weight)
+
+
+class Queue(Effect):
+    """Seek a door, and slow down behind whoever is near, ahead on the way there, and slower: no pushing."""
+
+    kind: Literal["queue"] = "queue"
+    weight: float = Field(ge=0, description="kg/s, gain; 4 m / headway or more overshoots nothing")
+    target: Vector = Field(description="m, the door")
+    speed: float = Field(gt=0, description="m/s, wanted where the way is free; at most the agent's max_speed")
+    headway: float = Field(default=0.8, gt=0, description="s, a gap is closed as exp(-t / headway)")
+    margin: float = Field(default=0.0, ge=0, description="m, left between bodies that stand in the queue")
+    radius: float = Field(default=5.0, gt=0, description="m, who is further away holds up nobody")
+    group: int | None = Field(default=None, ge=0, description="behind whom it queues; none = all")
+    steering: ClassVar[bool] = True
+    places: ClassVar[tuple[str, ...]] = ("target",)
+    pair_start: ClassVar[str | None] = "free_way"
+    pair_law: ClassVar[str | None] = "held_up"
+    finish_law: ClassVar[str | None] = "queueing"
+    demo: ClassVar[str | None] = """
+dt: 0.05
+obstacles: [{centre: [0, 2.7], radius: 2}, {centre: [0, -2.7], radius: 2}]
+groups: [{count: 12, radius: 0.25, max_force: 8, spawn: {low: [-8, -3], high: [-3, 3]}}]
+effects:
+  - kind: steer
+    behaviours:
+      - {kind: avoid_obstacles, weight: 6, horizon: 1.2, margin: 0.1}
+      - {kind: separation, weight: 2, radius: 0.9}
+      - {kind: queue, weight: 3, target: [20, 0], speed: 1.3, margin: 0.1}
+"""
+
+    @property
+    def sight(self) -> Sight:
+        """Radius, whom; what is ahead is ahead on the way to the door."""
+        return Sight(self.radius, group=self.group)
+
+    def parameters(self) -> dict[str, float | Vec]:
+        """Where to, how fast, how close: who is seen is the sweep's business."""
+        names = ("weight", "speed", "headway", "margin")
+        return {"target": self.target, **{name: float(getattr(self, name)) for name in names}}
+
+    def sums(self, dimension: int) -> int:
+        """The way and the gap."""
+        return dimension + 1
+
+
+# --- forage -----------------------------------------------------------------------------------------------------------
+
+
+@law
+def no_food(p: Any, me: Me) -> Vec:
+    """Nothing found yet."""
+    far = like(me.radius, np.inf)
+    return (far, far) + zero(me.pos)  # noqa: RUF005
+
+
+@law
+def nearest_food(p: Any, me: Me, other: Other, acc: Vec) -> Vec:
+    """Keep the nearest, of two the one with the lower number: (square, who, offset)."""
+    nearer = (other.square < acc[0]) | ((other.square == acc[0]) & (other.who < acc[1]))
+    return select(nearer, (other.square, other.who) + other.offset, acc)  # noqa: RUF005
+
+
+@law
+def _drifting(p: Any, me: Me, pos: Vec) -> Vec:
+    """A direction in the agent's own frame that changes smoothly with time: coherent noise, the same for every dt."""
+    o = like(me.radius, 0.0)
+    who, time = np.int64(me.who), np.float64(me.time) / np.float64(p.period)
+    turn = like(o, math.pi) * like(o, smooth(me.key, time, who, 61_000))
+    if len(pos) == 2:
+        return (np.cos(turn), np.sin(turn))
+    else:
+        tilt = like(o, math.pi / 2) * like(o, smooth(me.key, time, who, 61_001))
+        return (np.cos(turn) * np.cos(tilt), np.sin(turn) * np.cos(tilt), np.sin(tilt))
+
+
+@law
+def foraging(p: Any, me: Me, acc: Vec) -> Vec:
+    """F = w (v_arrive - v) if there is food in sight, else F = w (v_wander - v)."""
+    o = like(me.radius, 0.0)
+    offset: Vec
+    if len(acc) == 4:
+        offset = (acc[2], acc[3])
+    else:
+        offset = (acc[2], acc[3], acc[4])
+    speed = min(p.speed, me.max_speed)
+    feed = steering.arrive(offset, me.vel, speed, p.slow_radius)
+    search = steering.wander(_drifting(p, me, me.pos), me.vel, speed, p.straight)
+    return scale(select(acc[0] < like(o, np.inf), feed, search), p.weight)
+
+
+class Forage(Effect):
+    """Arrive at the nearest food in sight, and wander as long as there is none (Reynolds 1999 names it)."""
+
+    kind: Literal["forage"] = "forage"
+    weight: float = Field(ge=0, description="kg/s, gain")
+    food: int = Field(ge=0, strict=True, description="the group whose agents are food")
+    speed: float = Field(gt=0, description="m/s, on its way; at most the agent's max_speed")
+    radius: float = Field(default=3.0, gt=0, description="m, food is seen within this")
+    fov: float = Field(default=360.0, gt=0, le=360, description="degrees, full angle of the field of view")
+    slow_radius: float = Field(default=0.5, gt=0, description="m, it slows down within this of its food")
+    period: float = Field(default=2.0, gt=0, description="s, how long wandering remembers a direction")
+    straight: float = Field(default=1.5, ge=0, description="how straight it wanders: 0 anyhow, 1 and more ahead")
+    steering: ClassVar[bool] = True
+    pair_start: ClassVar[str | None] = "no_food"
+    pair_law: ClassVar[str | None] = "nearest_food"
+    finish_law: ClassVar[str | None] = "foraging"
+    demo_time: ClassVar[float] = 20.0
+    demo: ClassVar[str | None] = """
+dt: 0.05
+space: {kind: torus, size: [16, 12]}
+groups:
+  - {count: 4, radius: 0.2, max_force: 4, spawn: {low: [0, 0], high: [16, 12], speed: [0.5, 1]}}
+  - {count: 6, radius: 0.15, spawn: {low: [0, 0], high: [16, 12]}}
+effects:
+  - {kind: steer, group: 0, behaviours: [{kind: forage, food: 1, weight: 2, speed: 1.2, radius: 2.5}]}
+"""
+
+    @property
+    def sight(self) -> Sight:
+        """Radius, field of view, food."""
+        return Sight(self.radius, self.fov, group=self.food)
+
+    def parameters(self) -> dict[str, float | Vec]:
+        """How fast, and how it wanders: who is seen is the sweep's business."""
+        names = ("weight", "speed", "slow_radius", "period", "straight")
+        return {name: float(getattr(self, name)) for name in names}
+
+    def check(self, scene: Any) -> None:
+        """Refuse a group that is not there."""
+        super().check(scene)
+        if self.food >= len(scene.groups):
+            raise ValueError(f"food = {self.food}: there are {len(scene.groups)} groups, counted from 0")
+
+    def sums(self, dimension: int) -> int:
+        """Square of the distance, who, and where the nearest is."""
+        return 2 + dimension
+
+
+# --- explore ----------------------------------------------------------------------------------------------------------
+
+
+@law
+def sweeping(p: Any, me: Me) -> Vec:
+    """F = w (v_track - v)."""
+    to_low, to_high = sub(me.pos, p.low), sub(p.high, me.pos)
+    return scale(steering.explore(to_low, to_high, me.vel, min(p.speed, me.max_speed), p.track), p.weight)
+
+
+class Explore(Effect):
+    """Sweep a region for ever along a closed comb of tracks, so that everything comes into sight once per round.
+
+    What was seen already is no state: where one is says where to go (steering.explore).
+    """
+
+    kind: Literal["explore"] = "explore"
+    weight: float = Field(ge=0, description="kg/s, gain")
+    low: Vector = Field(description="m, lower corner of the region")
+    high: Vector = Field(description="m, upper corner of the region")
+    speed: float = Field(gt=0, description="m/s, on the track; at most the agent's max_speed")
+    track: float = Field(gt=0, description="m, tracks lie at most so far apart; sight of 1.25 tracks misses nothing")
+    steering: ClassVar[bool] = True
+    places: ClassVar[tuple[str, ...]] = ("low", "high")
+    own_law: ClassVar[str | None] = "sweeping"
+    demo_time: ClassVar[float] = 60.0
+    demo: ClassVar[str | None] = """
+dt: 0.05
+groups: [{count: 2, radius: 0.2, max_force: 4, spawn: {low: [2, 2], high: [8, 6]}}]
+effects:
+  - {kind: explore, weight: 5, low: [0, 0], high: [10, 8], speed: 1.2, track: 1.5}
+"""
+
+    def check(self, scene: Any) -> None:
+        """Refuse a region that has no edges or no area, and tracks that are too narrow to turn."""
+        super().check(scene)
+        if scene.space.periodic:
+            raise ValueError(f"low = {self.low}: a region has edges; space.kind = {scene.space.kind!r} has none")
+        if any(b - a < 3 * self.track for a, b in zip(self.low[:2], self.high[:2], strict=True)):
+            raise ValueError(
+                f"high = {self.high}: must be at least 3 tracks = {3 * self.track:g} m above low, per axis"
+            )

@@ -1,0 +1,136 @@
+"""Reciprocal collision avoidance among agents and round obstacles, in a plane: ORCA as a behaviour."""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar, Literal
+
+import numpy as np
+from numba.extending import overload
+from pydantic import Field
+
+from flockenv import orca, steering
+from flockenv.effects.base import Effect, Me, Other, Sight, Vector
+from flockenv.kernels import OPTIONS, Vec, law, like
+from flockenv.vec import scale, select, sub, zero
+
+__all__ = ["Orca"]
+
+
+def kept(slots: Vec, new: Vec) -> Vec:
+    """Return the slots with a new one sorted in by its power distance, |offset|^2 - radius^2; the last drops out."""
+    raise TypeError("it is a part of kernels")
+
+
+@overload(kept, jit_options=OPTIONS)
+def _kept(slots, new):  # type: ignore[no-untyped-def]  # numba compares signatures, annotations included
+    """Written out for as many slots as there are, as choices without branches, so that lanes sort side by side."""
+    size, lines = len(new), ["def sort_in(slots, new):"]
+    held = [f"c{j}" for j in range(size)]
+    lines.append(f"    {', '.join(held)} = new")
+    kept_ = []
+    for k in range(0, len(slots), size):
+        old = [f"slots[{k + j}]" for j in range(size)]
+        lines.append(
+            f"    near = c0 * c0 + c1 * c1 - c4 * c4 < {old[0]} * {old[0]} + {old[1]} * {old[1]} - {old[4]} * {old[4]}"
+        )
+        for j in range(size):
+            lines.append(f"    k{k + j}, c{j} = (c{j}, {old[j]}) if near else ({old[j]}, c{j})")
+            kept_.append(f"k{k + j}")
+    lines.append(f"    return ({', '.join(kept_)},)")
+    made: dict[str, Any] = {}
+    exec("\n".join(lines), made)  # noqa: S102  # how many there are is a type's
+    return made["sort_in"]
+
+
+@law
+def nobody(p: Any, me: Me) -> Vec:
+    """Six places without anybody."""
+    far, o, e = like(me.radius, np.inf), like(me.radius, 0.0), like(me.radius, 1.0)
+    empty = (far, far, o, o, -e, o)
+    return empty + empty + empty + empty + empty + empty
+
+
+@law
+def near_agent(p: Any, me: Me, other: Other, acc: Vec) -> Vec:
+    """Keep an agent if he is among the nearest; who is in the same place is taken to be a little to one side."""
+    one_place = other.square <= like(other.square, 1e-12)
+    to = select(one_place, scale(sub(me.tie, other.tie), like(other.square, -1e-6)), other.offset)
+    return kept(acc, (to[0], to[1], other.vel[0], other.vel[1], other.radius, like(other.square, 0.5)))
+
+
+@law
+def near_obstacle(p: Any, me: Me, other: Other, acc: Vec) -> Vec:
+    """Keep an obstacle if it is among the nearest: it does not give way."""
+    o = like(other.square, 0.0)
+    return kept(acc, (other.offset[0], other.offset[1], o, o, other.radius, like(other.square, 1.0)))
+
+
+@law
+def reciprocal(p: Any, me: Me, acc: Vec) -> Vec:
+    """F = w (v_orca - v), the wish being to arrive."""
+    speed = min(p.speed, me.max_speed)
+    wish = steering.arrive(sub(p.target, me.pos), zero(me.vel), speed, p.slow_radius)
+    top = min(p.hurry * p.speed, me.max_speed)
+    return scale(orca.orca(me.vel, wish, me.radius + p.margin, top, p.horizon, p.step, p.turn, acc), p.weight)
+
+
+class Orca(Effect):
+    """Arrive at a point with the velocity nearest to the wished one that touches nobody within `horizon` seconds.
+
+    Optimal reciprocal collision avoidance (van den Berg et al. 2011) among the six nearest agents and obstacles.
+    It chooses a velocity: without inertia (weight = m / dt, no max_force) those who all do so never touch.
+    """
+
+    kind: Literal["orca"] = "orca"
+    weight: float = Field(ge=0, description="kg/s, gain; m / dt takes on the velocity at once")
+    target: Vector = Field(description="m, where to arrive; in a plane")
+    speed: float = Field(gt=0, description="m/s, wanted where nobody is in the way; at most the agent's max_speed")
+    hurry: float = Field(default=1.2, ge=1, description="top speed of an evasion, in `speed`s")
+    slow_radius: float = Field(default=0.5, gt=0, description="m, it slows down within this of its target")
+    radius: float = Field(default=8.0, gt=0, description="m, agents further away are not looked at")
+    horizon: float = Field(default=3.0, gt=0, description="s, for so long the velocity must be free")
+    step: float = Field(default=0.1, gt=0, description="s, who overlaps parts within this")
+    margin: float = Field(default=0.0, ge=0, description="m, clearance beyond both radii")
+    turn: float = Field(
+        default=0.05, ge=0, le=1.5, description="rad, a wish that is not free is turned right by this: no standstill"
+    )
+    group: int | None = Field(default=None, ge=0, description="whom it avoids; none = all")
+    steering: ClassVar[bool] = True
+    places: ClassVar[tuple[str, ...]] = ("target",)
+    pair_start: ClassVar[str | None] = "nobody"
+    pair_law: ClassVar[str | None] = "near_agent"
+    obstacle_law: ClassVar[str | None] = "near_obstacle"
+    finish_law: ClassVar[str | None] = "reciprocal"
+    demo: ClassVar[str | None] = """
+dt: 0.05
+obstacles: [{centre: [0, 0], radius: 0.6}]
+groups:
+  - {count: 5, radius: 0.3, spawn: {low: [-6, -2.5], high: [-4, 2.5]}}
+  - {count: 5, radius: 0.3, spawn: {low: [4, -2.5], high: [6, 2.5]}}
+effects:
+  - {kind: steer, group: 0, behaviours: [{kind: orca, weight: 10, target: [20, 0], speed: 1.2}]}
+  - {kind: steer, group: 1, behaviours: [{kind: orca, weight: 10, target: [-20, 0], speed: 1.2}]}
+"""
+
+    @property
+    def sight(self) -> Sight:
+        """Radius, whom."""
+        return Sight(self.radius, group=self.group)
+
+    def parameters(self) -> dict[str, float | Vec]:
+        """Where to, how fast, how far ahead: who is seen is the sweep's business."""
+        names = ("weight", "speed", "hurry", "slow_radius", "horizon", "step", "margin", "turn")
+        return {"target": self.target, **{name: float(getattr(self, name)) for name in names}}
+
+    def check(self, scene: Any) -> None:
+        """Refuse space."""
+        if scene.dimension != 2:
+            raise ValueError(f"kind = orca: dimension = {scene.dimension}, must be 2")
+        for k, obstacle in enumerate(scene.obstacles):
+            if obstacle.kind != "circle":
+                raise ValueError(f"kind = orca: sees round obstacles alone, obstacles[{k}].kind = {obstacle.kind}")
+        super().check(scene)
+
+    def sums(self, dimension: int) -> int:
+        """Six neighbours."""
+        return 6 * orca.SLOT

@@ -1,0 +1,92 @@
+"""Among many who want to get somewhere: not into each other's way, in a queue, and everywhere once."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from flockenv.kernels import Vec, law, like
+from flockenv.steering.around import threat
+from flockenv.vec import add, dot, perpendicular, planar, scale, select, sub, unit
+
+__all__ = ["explore", "give_way", "queue", "queue_gap", "unaligned_threat"]
+
+
+@law
+def unaligned_threat(offset: Vec, velocity: Vec, other_velocity: Vec, clearance: float, horizon: float) -> float:
+    """Return when somebody comes nearest if both go on, s; inf if that is behind us, too late, or not near enough.
+
+    t* = -dx . dv / |dv|^2, kept if 0 <= t* <= horizon and |dx + dv t*| < clearance, the sum of both radii and a margin
+    (Reynolds 1999, unaligned collision avoidance; not twice the own radius).
+    """
+    apart = sub(other_velocity, velocity)
+    square, closing = dot(apart, apart), -dot(offset, apart)
+    o = like(square, 0.0)
+    time = closing / square if square > o else o
+    miss = add(offset, scale(apart, time))
+    meets = (closing > o) & (time <= horizon) & (dot(miss, miss) < clearance * clearance)
+    return time if meets else like(time, np.inf)
+
+
+@law
+def give_way(offset: Vec, velocity: Vec, other_velocity: Vec, time: float, max_speed: float) -> Vec:
+    """Steer away from where somebody will be, as seen from where I shall be, when we are nearest: S = -V unit(p), m/s.
+
+    p lies across the motion relative to him. So who meets head-on steers aside, who crosses behind steers aside and
+    brakes, who crosses in front steers aside and speeds up; the two always do opposite things. If p = 0, both keep
+    right of that relative motion: of two who cross, the one on the other's right goes first (formulas.md 1.2).
+    """
+    meeting = add(offset, scale(sub(other_velocity, velocity), time))
+    noise = like(time, 1e-10) * dot(offset, offset)  # a rest of rounding has no side
+    right = perpendicular(unit(sub(velocity, other_velocity)))
+    away = select(dot(meeting, meeting) > noise, scale(unit(meeting), like(time, -1.0)), right)
+    return scale(away, max_speed)
+
+
+@law
+def queue_gap(way: Vec, offset: Vec, other_velocity: Vec, clearance: float, max_speed: float) -> float:
+    """Return how far I can go on my `way` (a unit vector) until I touch somebody slower than I want to be, m; or inf.
+
+    Who is behind, beside the way, or as fast as I want to be, holds up nobody (Reynolds 1999: near, ahead and slower).
+    """
+    far = like(clearance, np.inf)
+    holds_up = (dot(offset, way) > like(clearance, 0.0)) & (dot(other_velocity, way) < max_speed)
+    gap = threat(way, offset, clearance, far)
+    return gap if holds_up else far
+
+
+@law
+def queue(way: Vec, velocity: Vec, gap: float, max_speed: float, headway: float) -> Vec:
+    """Go on one's way as fast as the gap allows: S = way min(V, gap / T) - v, m/s; T = headway [s].
+
+    The brake of Reynolds 1999 in the form of Tordeux, Chraibi, Seyfried 2016 (doi 10.1007/978-3-319-33482-0_29): a gap
+    closes as exp(-t / T) and never to less than nothing, and 1 / (T + l / V) agents of length l pass in a second. With
+    a gain of k = 4 m / T or more nobody overshoots.
+    """
+    held = gap / headway
+    return sub(scale(way, held if held < max_speed else max_speed), velocity)
+
+
+@law
+def explore(to_low: Vec, to_high: Vec, velocity: Vec, max_speed: float, track: float) -> Vec:
+    """Sweep a rectangle for ever along a closed comb of tracks, at most `track` [m] apart: S, m/s.
+
+    To and fro along an even number of rows from the lower wall to the upper, and back down beside the left wall. Where
+    one is says where to go, so nothing is remembered: who is pushed away goes on from there, and everybody sweeps the
+    same loop. In space, on one's own level. `to_low` and `to_high` are distances to the walls per axis, m. It takes
+    track > V^2 m / F_max not to fly past a turn. (Ours: the textbook's boustrophedon, made a field.)
+    """
+    e, half = like(track, 1.0), like(track, 0.5)
+    x, y = to_low[0], to_low[1]
+    width, height = x + to_high[0], max(y + to_high[1], track)
+    rows = e + e
+    rows = rows * max(np.ceil(height / (rows * track)), e)
+    row = min(max(np.floor(y * rows / height), e - e), rows - e)
+    middle = (row + half) * height / rows
+    forth, last = row - (e + e) * np.floor(row * half) < half, row > rows - e - half  # an even row; the uppermost
+    back = x < track
+    down = planar(velocity, half * track - x, -track)
+    along = planar(velocity, track if forth | back else -track, middle - y)
+    up = planar(velocity, (width - half * track if forth else (e + half) * track) - x, track)
+    at_end = (x > width - track) if forth else (x < track + track) & (not last)
+    goal = select(back & (row > half), down, select(at_end & (not back), up, along))
+    return sub(scale(unit(goal), max_speed), velocity)

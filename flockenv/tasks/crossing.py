@@ -1,0 +1,294 @@
+"""Crossing: everybody starts on a circle and walks to the opposite point; all ways meet in the middle."""
+
+from __future__ import annotations
+
+import functools
+import math
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, model_validator
+
+from flockenv import orca
+from flockenv.kernels import kernel, like, stacked
+from flockenv.noise import uniform
+from flockenv.scene import Group, Scene
+from flockenv.snapshot import Mark
+from flockenv.space import Plane
+from flockenv.spawn import Spawn
+from flockenv.state import State
+from flockenv.sweep import Look
+from flockenv.tasks.base import Frame, Measured, Task
+from flockenv.tasks.layout import Layout, Slot
+from flockenv.tasks.sight import clip, put
+
+__all__ = ["Crossing"]
+
+_HEEDED = 6  # how many neighbours a scripted walker heeds
+_NOBODY = (0.0,) * (_HEEDED * orca.SLOT)
+
+
+@kernel
+def spawn(p: Any, frame: Frame) -> None:
+    """Evenly around a circle, each a little off his place and at rest; his goal is the opposite point."""
+    n = frame.pos.shape[1]
+    first = 2.0 * math.pi * uniform(frame.key, 0, 9999, 0)
+    for i in range(n):
+        off = p.jitter * (2.0 * uniform(frame.key, 0, i, 0) - 1.0)
+        angle = first + 2.0 * math.pi * (i + off) / n
+        r = p.circle * (1.0 + 0.05 * p.jitter * (2.0 * uniform(frame.key, 0, i, 1) - 1.0))
+        c, s = math.cos(angle), math.sin(angle)
+        frame.pos[0, i], frame.pos[1, i] = r * c, r * s
+        frame.vel[0, i], frame.vel[1, i] = 0.0, 0.0
+        frame.memory[0, i], frame.memory[1, i] = -r * c, -r * s
+        frame.memory[2, i], frame.memory[3, i] = -c, -s
+
+
+@kernel
+def drive(p: Any, frame: Frame, action: Any, force: Any) -> None:
+    """Learners push where their action says, in the frame of their course; the others keep clear by ORCA."""
+    for i in range(frame.pos.shape[1]):
+        if i < action.shape[0]:
+            hx, hy = frame.memory[2, i], frame.memory[3, i]
+            along, left = action[i, 0] * frame.max_force[i], action[i, 1] * frame.max_force[i]
+            force[0, i] = along * hx - left * hy
+            force[1, i] = along * hy + left * hx
+        else:
+            _walker(p, frame, i, force)
+
+
+@kernel
+def _walker(p: Any, frame: Frame, i: int, force: Any) -> None:
+    """A scripted walker: the velocity nearest to the way to his goal that is free of the nearest few for 2 s."""
+    given, lines, relaxed = stacked(_NOBODY), stacked(_NOBODY), stacked(_NOBODY)
+    v = (np.float64(frame.vel[0, i]), np.float64(frame.vel[1, i]))
+    found, last, last_square = 0, -1, -1.0
+    for _ in range(_HEEDED):
+        j, square = _next_nearest(p, frame, i, last, last_square)
+        if j < 0:
+            break
+        at, last, last_square = 6 * found, j, square
+        for k in range(2):
+            given[at + k] = frame.pos[k, j] - frame.pos[k, i]
+            given[at + 2 + k] = frame.vel[k, j]
+        given[at + 4], given[at + 5] = frame.radius[j] + 0.1, 0.5
+        found += 1
+    gx, gy = _to_goal(frame, i)
+    distance = math.sqrt(gx * gx + gy * gy)
+    top = np.float64(frame.max_speed[i])
+    share = min(top, distance) / max(distance, 1e-9)
+    asked = ((gx * share, gy * share), top, 0.3)
+    change = orca.clear(v, np.float64(frame.radius[i]), asked, 2.0, p.control_dt, given, found, lines, relaxed)
+    fx, fy = change[0] / p.control_dt, change[1] / p.control_dt
+    cut = min(1.0, frame.max_force[i] / max(math.sqrt(fx * fx + fy * fy), 1e-9))
+    force[0, i], force[1, i] = cut * fx, cut * fy
+
+
+@kernel
+def _next_nearest(p: Any, frame: Frame, i: int, last: int, last_square: float) -> tuple[int, float]:
+    """Return who is nearest to agent i within sight after `last`, equal distances by number, and the square; or -1."""
+    best, who = np.float64(p.sight * p.sight), -1
+    for j in range(frame.pos.shape[1]):
+        dx, dy = frame.pos[0, j] - frame.pos[0, i], frame.pos[1, j] - frame.pos[1, i]
+        square = np.float64(dx * dx + dy * dy)
+        beyond = square > last_square or (square == last_square and j > last)
+        if j != i and frame.alive[j] and beyond and square < best:
+            best, who = square, j
+    return who, best
+
+
+@kernel
+def _to_goal(frame: Frame, i: int) -> tuple[float, float]:
+    """Return the way to the goal of agent i, m."""
+    return frame.memory[0, i] - np.float64(frame.pos[0, i]), frame.memory[1, i] - np.float64(frame.pos[1, i])
+
+
+@kernel
+def _left(frame: Frame, i: int) -> float:
+    """Return how far it is to the goal of agent i, m."""
+    x, y = _to_goal(frame, i)
+    return math.sqrt(x * x + y * y)
+
+
+@kernel
+def _touches(frame: Frame, i: int) -> float:
+    """Return how many agent i touches."""
+    touches = 0.0
+    for s in range(frame.near_count[i]):
+        contact = frame.radius[i] + frame.radius[frame.near_who[s, i]]
+        touches += 1.0 if frame.near_square[s, i] < contact * contact else 0.0
+    return touches
+
+
+@kernel
+def reward(p: Any, before: Frame, after: Frame, action: Any, terms: Any) -> None:
+    """Terms: progress, arrival (given back by who leaves again), touch, time (until there), effort."""
+    for i in range(terms.shape[0]):
+        was, left = _left(before, i), _left(after, i)
+        came = (1.0 if left <= p.goal_radius else 0.0) - (1.0 if was <= p.goal_radius else 0.0)
+        push = action[i, 0] * action[i, 0] + action[i, 1] * action[i, 1]
+        terms[i, 0] = p.progress_reward * (was - left)
+        terms[i, 1] = p.arrival_reward * came
+        terms[i, 2] = -p.touch_cost * _touches(after, i) * p.control_dt
+        terms[i, 3] = -p.time_cost * p.control_dt if left > p.goal_radius else 0.0
+        terms[i, 4] = -p.effort_cost * min(push, 1.0) * p.control_dt
+
+
+@kernel
+def ended(p: Any, before: Frame, after: Frame, over: Any) -> bool:
+    """Over for all when every learner is at his goal: that is success."""
+    there = True
+    for i in range(over.shape[0]):
+        there &= _left(after, i) <= p.goal_radius
+    for i in range(over.shape[0]):
+        over[i] = there
+    return there
+
+
+@kernel
+def measure(p: Any, before: Frame, after: Frame, numbers: Any) -> None:
+    """Of the learners: touches that began just now; share at the goal; metres gained, and walked, on average."""
+    learners = int(p.learners)
+    began, there, gained, walked = 0.0, 0.0, 0.0, 0.0
+    for i in range(learners):
+        left = _left(after, i)
+        there += 1.0 if left <= p.goal_radius else 0.0
+        gained += _left(before, i) - left
+        walked += math.hypot(after.pos[0, i] - before.pos[0, i], after.pos[1, i] - before.pos[1, i])
+        for s in range(after.near_count[i]):
+            j = after.near_who[s, i]
+            contact = after.radius[i] + after.radius[j]
+            if after.near_square[s, i] >= contact * contact:
+                break
+            x, y = before.pos[0, j] - before.pos[0, i], before.pos[1, j] - before.pos[1, i]
+            both = 0.5 if j < learners else 1.0  # of a pair of learners each counts a half
+            began += both if x * x + y * y >= contact * contact else 0.0
+    numbers[0], numbers[1], numbers[2], numbers[3] = began, there / learners, gained / learners, walked / learners
+
+
+@kernel
+def observe(p: Any, frame: Frame, rows: Any) -> None:
+    """All in the frame of the course: (along, left). Own velocity, the way to the goal, the nearest neighbours."""
+    slots, one = int(p.neighbours), like(p.sight, 1.0)
+    for i in range(rows.shape[0]):
+        row, course = rows[i], (frame.memory[2, i], frame.memory[3, i])
+        put(row, 0, _turned((frame.vel[0, i], frame.vel[1, i]), course, one / p.max_speed))
+        put(row, 2, _turned(_to_goal(frame, i), course, one / (3.0 * p.circle)))
+        for c in range(4, rows.shape[1]):
+            row[np.uint64(c)] = 0.0
+        for s in range(frame.near_count[i]):
+            j = np.uint64(frame.near_who[s, i])
+            to = (frame.pos[0, j] - frame.pos[0, i], frame.pos[1, j] - frame.pos[1, i])
+            relative = (frame.vel[0, j] - frame.vel[0, i], frame.vel[1, j] - frame.vel[1, i])
+            put(row, 4 + 2 * s, _turned(to, course, one / p.sight))
+            put(row, 4 + 2 * slots + 2 * s, _turned(relative, course, 0.5 * one / p.max_speed))
+            row[np.uint64(4 + 4 * slots + s)] = 1.0
+
+
+@kernel
+def _turned(vector: Any, course: Any, factor: float) -> Any:
+    """Return a vector's parts along the course and to its left, scaled and clipped."""
+    along, left = vector[0] * course[0] + vector[1] * course[1], vector[1] * course[0] - vector[0] * course[1]
+    return clip(along * factor), clip(left * factor)
+
+
+class Crossing(Task):
+    """N walkers on a circle swap to the opposite points, all at once, without touching; one policy for all learners.
+
+    Everything a walker sees is relative to himself and turned into the frame of his course, from his start to his goal.
+    Nobody dies and nobody is stopped by a touch; it costs as long as it lasts. The episode ends when all are there.
+    """
+
+    name: ClassVar[str] = "crossing"
+    terms: ClassVar[tuple[str, ...]] = ("progress", "arrival", "touch", "time", "effort")
+    metric_names: ClassVar[tuple[str, ...]] = ("collisions", "time_to_goal", "arrived", "path_efficiency")
+    measures: ClassVar[tuple[str, ...]] = ("touches", "there", "gained", "walked")
+    memory: ClassVar[int] = 4
+
+    agents: int = Field(default=12, ge=1, le=1000, description="how many walk")
+    learners: int = Field(
+        default_factory=lambda given: given.get("agents", 12), ge=1,
+        description="how many of them learn (default: all); the others follow a script",
+    )  # fmt: skip
+    horizon: int = Field(default=200, ge=1, description="decisions until the time limit (truncation)")
+    circle: float = Field(default=6.0, gt=0, description="m, radius of the circle")
+    jitter: float = Field(default=0.1, ge=0, le=0.5, description="how far off his place one starts, in gaps")
+    max_speed: float = Field(default=2.0, gt=0, description="m/s")
+    max_force: float = Field(default=5.0, gt=0, description="N; the mass is 1 kg")
+    goal_radius: float = Field(default=0.4, gt=0, description="m, who is nearer to his goal than this is there")
+    sight: float = Field(default=6.0, gt=0, description="m, neighbours are seen within this")
+    neighbours: int = Field(default=6, ge=1, le=32, description="how many neighbours are seen, nearest first")
+    progress_reward: float = Field(default=0.5, ge=0, description="per m nearer to the goal")
+    arrival_reward: float = Field(default=5.0, ge=0, description="at the goal; given back by who leaves it")
+    touch_cost: float = Field(default=10.0, ge=0, description="per s and agent touched")
+    time_cost: float = Field(default=0.5, ge=0, description="per s away from the goal")
+    effort_cost: float = Field(default=0.1, ge=0, description="per s at full force")
+
+    @model_validator(mode="after")
+    def _enough(self) -> Crossing:
+        """Refuse more learners than agents, and more agents than have room on the circle."""
+        if self.learners > self.agents:
+            raise ValueError(f"learners = {self.learners}: there are only {self.agents} agents")
+        room = 2 * math.pi * self.circle * (1 - 2 * self.jitter) / self.agents
+        if self.agents > 1 and room < 0.8:
+            least = 0.8 * self.agents / (2 * math.pi * (1 - 2 * self.jitter)) if self.jitter < 0.5 else math.inf
+            raise ValueError(f"circle = {self.circle:g} m has no room for {self.agents} agents; at least {least:.3g}")
+        return self
+
+    @property
+    def agent_names(self) -> tuple[str, ...]:
+        """walker_0 ..."""
+        return tuple(f"walker_{i}" for i in range(self.learners))
+
+    @functools.cached_property
+    def scene(self) -> Scene:
+        """A plane; nothing acts but what walkers want."""
+        around = Spawn(low=(-self.circle, -self.circle), high=(self.circle, self.circle))
+        limits: dict[str, Any] = {"radius": 0.3, "max_speed": self.max_speed, "max_force": self.max_force}
+        limits["spawn"] = around  # before an episode begins
+        groups = [Group(count=self.learners, role="learner", **limits)]
+        if self.agents > self.learners:
+            groups.append(Group(count=self.agents - self.learners, role="walker", **limits))
+        return Scene(space=Plane(), groups=tuple(groups), integrator=self.integrator, dt=self.dt, dtype=self.dtype)
+
+    @property
+    def look(self) -> Look:
+        """The nearest walkers."""
+        return Look(self.sight, self.neighbours)
+
+    @functools.cached_property
+    def layout(self) -> Layout:
+        """Every vector is (along the course, to its left)."""
+        n = self.neighbours
+        return Layout((
+            Slot("velocity", (2,), self.max_speed, "m/s", "own velocity (along the course, to its left)"),
+            Slot("goal", (2,), 3 * self.circle, "m", "the way to the goal"),
+            Slot("neighbours", (n, 2), self.sight, "m", "offsets of the nearest neighbours, nearest first"),
+            Slot("neighbour_velocity", (n, 2), 2 * self.max_speed, "m/s", "their velocities minus one's own"),
+            Slot("neighbour_present", (n,), 1.0, "1", "1 where there is one, else 0 (and zeros elsewhere)", low=0.0),
+        ))  # fmt: skip
+
+    @functools.cached_property
+    def action_layout(self) -> Layout:
+        """A force in the frame of the course."""
+        meaning = "force (along the course, to its left) / max_force, shortened to length 1"
+        return Layout((Slot("force", (2,), self.max_force, "N", meaning),))
+
+    def metrics(self, sums: Measured, last: Measured, steps: NDArray[np.int64]) -> dict[str, NDArray[np.float64]]:
+        """Touches that began; mean time away from the goal, s; share there at the end; straight way / way walked."""
+        return {
+            "collisions": sums["touches"],
+            "time_to_goal": (steps - sums["there"]) * self.control_dt,
+            "arrived": last["there"],
+            "path_efficiency": sums["gained"] / np.maximum(sums["walked"], 1e-9),
+        }
+
+    def marks(self, state: State, memory: NDArray[np.float64], world: int) -> tuple[Mark, ...]:
+        """The goals."""
+        return tuple(Mark("goal", memory[:2, world, i], np.zeros(2), self.goal_radius) for i in range(self.agents))
+
+    def view(self, state: State, world: int) -> tuple[tuple[float, ...], tuple[float, ...]]:
+        """The circle, and some room around it."""
+        edge = 1.3 * self.circle
+        return (-edge, -edge), (edge, edge)

@@ -1,0 +1,408 @@
+"""Evade: stay out of the hands of a team of pursuers among cover, behind which they lose sight of you."""
+
+from __future__ import annotations
+
+import functools
+import math
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, model_validator
+
+from flockenv import arbitration, steering
+from flockenv.effects import ObstacleContact
+from flockenv.kernels import Vec, kernel, like
+from flockenv.noise import uniform
+from flockenv.scene import Group, Scene
+from flockenv.shapes import ray_hit
+from flockenv.space import Box
+from flockenv.sweep import Look
+from flockenv.tasks.base import Frame, Measured, Task
+from flockenv.tasks.layout import Layout, Slot
+from flockenv.tasks.sight import block_ways, clip, compass
+from flockenv.vec import add, norm, scale, unit
+
+__all__ = ["Evade"]
+
+_TRIES = 64
+_GAIN = 5.0  # kg/s: a pursuer has the velocity that it wants within 0.2 s, if it is strong enough
+_SEARCH = 4.0  # s, after which a pursuer that sees nobody looks behind another cover
+
+
+@kernel
+def spawn(p: Any, frame: Frame) -> None:
+    """Cover with gaps between; an evader in the open, pursuers `start_distance` m or more from it; all at rest."""
+    frame.vel[:, :] = 0.0
+    for m in range(frame.rho.shape[0]):
+        frame.rho[m] = 0.0
+        for t in range(_TRIES):
+            rho = p.least_radius + (p.greatest_radius - p.least_radius) * uniform(frame.key, t, 100 + m, 0)
+            edge = rho + p.min_gap
+            x = edge + (p.size - 2.0 * edge) * uniform(frame.key, t, 100 + m, 1)
+            y = edge + (p.size - 2.0 * edge) * uniform(frame.key, t, 100 + m, 2)
+            if _fits(p, frame, m, x, y, rho):
+                frame.centre[0, m], frame.centre[1, m], frame.rho[m] = x, y, rho
+                break
+    for i in range(frame.pos.shape[1]):
+        for t in range(_TRIES):
+            for k in range(2):
+                frame.pos[k, i] = 1.0 + (p.size - 2.0) * uniform(frame.key, t, i, k)
+            if _clear(p, frame, i):
+                break
+        frame.memory[:, i] = 0.0
+        frame.memory[2, i] = p.patience  # it has seen nobody yet
+
+
+@kernel
+def _fits(p: Any, frame: Frame, m: int, x: float, y: float, rho: float) -> bool:
+    """Does cover here leave a gap to that before it?"""
+    for k in range(m):
+        distance = math.hypot(frame.centre[0, k] - x, frame.centre[1, k] - y)
+        if frame.rho[k] > 0.0 and distance < frame.rho[k] + rho + p.min_gap:
+            return False
+    return True
+
+
+@kernel
+def _clear(p: Any, frame: Frame, i: int) -> bool:
+    """Is agent i in no cover, and far enough from the evader, and from the pursuers before it?"""
+    for m in range(frame.rho.shape[0]):
+        if frame.rho[m] > 0.0 and norm(_to_cover(frame, i, m)) < frame.rho[m] + 2.0 * frame.radius[i]:
+            return False
+    for j in range(i):  # noqa: SIM110  # there are no generators in compiled code
+        if norm(_to(frame, i, j)) < (p.start_distance if j == 0 else 2.0):
+            return False
+    return True
+
+
+@kernel
+def _to(frame: Frame, i: int, j: int) -> Vec:
+    """Return the offset of agent j from agent i, m."""
+    return (np.float64(frame.pos[0, j] - frame.pos[0, i]), np.float64(frame.pos[1, j] - frame.pos[1, i]))
+
+
+@kernel
+def _to_cover(frame: Frame, i: int, m: int) -> Vec:
+    """Return the offset of the centre of cover m from agent i, m."""
+    return (np.float64(frame.centre[0, m] - frame.pos[0, i]), np.float64(frame.centre[1, m] - frame.pos[1, i]))
+
+
+@kernel
+def _velocity(frame: Frame, i: int) -> Vec:
+    return (np.float64(frame.vel[0, i]), np.float64(frame.vel[1, i]))
+
+
+@kernel
+def _sees(p: Any, frame: Frame, i: int) -> bool:
+    """Does pursuer i see the evader: is it within sight, and no cover in the straight way between them?"""
+    to = _to(frame, i, 0)
+    distance, way = norm(to), unit(to)
+    if distance > p.sight:
+        return False
+    for m in range(frame.rho.shape[0]):
+        if frame.rho[m] > 0.0 and ray_hit(_to_cover(frame, i, m), way, np.float64(frame.rho[m])) < distance:
+            return False
+    return True
+
+
+@kernel
+def drive(p: Any, frame: Frame, action: Any, force: Any) -> None:
+    """The learner pushes where its action says; pursuers follow `_hunt`."""
+    for k in range(2):
+        force[k, 0] = action[0, k] * frame.max_force[0]
+    for i in range(1, frame.pos.shape[1]):
+        _hunt(p, frame, i, force)
+
+
+@kernel
+def _hunt(p: Any, frame: Frame, i: int, force: Any) -> None:
+    """A scripted pursuer: around cover, off its mates, inside the field, after the evader; allocation in that order."""
+    velocity, top = _velocity(frame, i), np.float64(frame.max_speed[i])
+    margin = 0.5
+    low = (frame.pos[0, i] - margin, frame.pos[1, i] - margin)
+    high = (p.size - margin - frame.pos[0, i], p.size - margin - frame.pos[1, i])
+    inside = steering.contain(
+        (np.float64(low[0]), np.float64(low[1])), (np.float64(high[0]), np.float64(high[1])), velocity, top, 0.3
+    )  # fmt: skip
+    wishes = (
+        scale(_around(frame, i, velocity, top), _GAIN), scale(_apart(frame, i), 2.0), scale(inside, _GAIN),
+        scale(_after(p, frame, i, velocity, top), _GAIN),
+    )  # fmt: skip
+    wish = arbitration.allocate(wishes, np.float64(frame.max_force[i]))
+    force[0, i], force[1, i] = wish[0], wish[1]
+
+
+@kernel
+def _after(p: Any, frame: Frame, i: int, velocity: Vec, top: float) -> Vec:
+    """Pursue who is seen; else go where it was seen last; there, or after `patience` s, look behind some cover.
+
+    Memory: the place where the evader was seen last, m, and how long ago that is, s.
+    """
+    if _sees(p, frame, i):
+        to, theirs = _to(frame, i, 0), _velocity(frame, 0)
+        frame.memory[0, i], frame.memory[1, i], frame.memory[2, i] = frame.pos[0, 0], frame.pos[1, 0], 0.0
+        return steering.pursue(to, velocity, theirs, top, min(steering.interception_time(to, theirs, top), 1.0))
+    frame.memory[2, i] += p.control_dt
+    back = (np.float64(frame.memory[0, i] - frame.pos[0, i]), np.float64(frame.memory[1, i] - frame.pos[1, i]))
+    if frame.memory[2, i] < p.patience and norm(back) > 0.5:
+        return steering.seek(back, velocity, top)
+    frame.memory[2, i] = p.patience
+    many = frame.rho.shape[0]
+    goal = (p.size * 0.5 - frame.pos[0, i], p.size * 0.5 - frame.pos[1, i])
+    aim = (np.float64(goal[0]), np.float64(goal[1]))
+    if many > 0:
+        turn = int(frame.step * p.control_dt / _SEARCH)
+        m = min(int(many * uniform(frame.key, turn, i, 7)), many - 1)
+        if frame.rho[m] > 0.0:
+            aim = steering.hiding_place(_to_cover(frame, i, m), np.float64(frame.rho[m]), 1.0, (0.0, 0.0))
+    return steering.arrive(aim, velocity, top, 1.0)
+
+
+@kernel
+def _around(frame: Frame, i: int, velocity: Vec, top: float) -> Vec:
+    """Steer around the cover that is touched first within 1 s."""
+    forward = unit(velocity)
+    nearest, where, room = np.inf, (0.0, 0.0), 0.0
+    for m in range(frame.rho.shape[0]):
+        if frame.rho[m] > 0.0:
+            to, clearance = _to_cover(frame, i, m), np.float64(frame.rho[m] + frame.radius[i]) + 0.1
+            t = steering.threat(forward, to, clearance, norm(velocity))
+            if t < nearest:
+                nearest, where, room = t, to, clearance
+    if nearest < np.inf:
+        return steering.avoid(forward, where, room, top)
+    else:
+        return (0.0, 0.0)
+
+
+@kernel
+def _apart(frame: Frame, i: int) -> Vec:
+    """Keep 2 m from other pursuers, so that they come from several sides."""
+    push = (0.0, 0.0)
+    for j in range(1, frame.pos.shape[1]):
+        to = _to(frame, i, j)
+        if j != i and norm(to) < 2.0:
+            push = add(push, steering.separate(to, (1.0, 0.0) if j < i else (-1.0, 0.0)))
+    return push
+
+
+@kernel
+def _nearest(frame: Frame) -> float:
+    """Return the distance of the nearest pursuer from the evader, m."""
+    best = np.inf
+    for j in range(1, frame.pos.shape[1]):
+        best = min(best, norm(_to(frame, 0, j)))
+    return best
+
+
+@kernel
+def reward(p: Any, before: Frame, after: Frame, action: Any, terms: Any) -> None:
+    """Terms: alive, caught, effort."""
+    caught = _nearest(after) <= p.capture_distance
+    square = min(action[0, 0] * action[0, 0] + action[0, 1] * action[0, 1], 1.0)
+    terms[0, 0] = 0.0 if caught else p.alive_reward * p.control_dt
+    terms[0, 1] = -p.caught_cost if caught else 0.0
+    terms[0, 2] = -p.effort_cost * square * p.control_dt
+
+
+@kernel
+def ended(p: Any, before: Frame, after: Frame, over: Any) -> bool:
+    """To be caught ends it; as long as nobody has caught the evader, the aim holds."""
+    over[0] = _nearest(after) <= p.capture_distance
+    return not over[0]
+
+
+@kernel
+def measure(p: Any, before: Frame, after: Frame, numbers: Any) -> None:
+    """Time, s; time in which nobody sees the evader, s; is it caught now; distance of the nearest pursuer, m."""
+    seen = False
+    for i in range(1, after.pos.shape[1]):
+        seen = seen or _sees(p, after, i)
+    numbers[0] = p.control_dt
+    numbers[1] = 0.0 if seen else p.control_dt
+    numbers[3] = _nearest(after)
+    numbers[2] = 1.0 if numbers[3] <= p.capture_distance else 0.0
+
+
+@kernel
+def observe(p: Any, frame: Frame, rows: Any) -> None:
+    """Own velocity, walls, pursuers nearest first and whether they see it, the nearest cover, free ways all around."""
+    row = rows[0]
+    for c in range(row.shape[0]):
+        row[c] = 0.0
+    for k in range(2):
+        row[k] = clip(frame.vel[k, 0] / p.evader_speed)
+        row[2 + k] = clip(frame.pos[k, 0] / p.size)
+        row[4 + k] = clip((p.size - frame.pos[k, 0]) / p.size)
+    at = _show_pursuers(p, frame, row)
+    slots, rays = int(p.slots), int(p.rays)
+    for s in range(frame.obstacle_count[0]):
+        m = frame.obstacle_who[s, 0]
+        for k in range(2):
+            row[at + 2 * s + k] = clip((frame.centre[k, m] - frame.pos[k, 0]) / p.size)
+        row[at + 2 * slots + s] = frame.rho[m] / p.greatest_radius
+    ways = at + 3 * slots
+    for r in range(rays):
+        row[ways + r] = 1.0
+    for m in range(frame.rho.shape[0]):
+        if frame.rho[m] > 0.0:
+            to = (frame.centre[0, m] - frame.pos[0, 0], frame.centre[1, m] - frame.pos[1, 0])
+            ahead = (like(to[0], 1.0), like(to[0], 0.0))
+            block_ways(row, ways, rays, frame.table, to, ahead, frame.rho[m] + frame.radius[0], p.way_sight)
+
+
+@kernel
+def _show_pursuers(p: Any, frame: Frame, row: Any) -> int:
+    """Write the pursuers, nearest first; return the place after them."""
+    count = frame.pos.shape[1] - 1
+    last, chosen = -1.0, 0
+    for s in range(count):
+        best, who = np.inf, 0
+        for j in range(1, count + 1):
+            distance = norm(_to(frame, 0, j))
+            later = distance > last or (distance == last and j > chosen)
+            if later and distance < best:
+                best, who = distance, j
+        to, way = _to(frame, 0, who), unit(_to(frame, 0, who))
+        for k in range(2):
+            row[6 + 2 * s + k] = clip(to[k] / p.size)
+            row[6 + 2 * count + 2 * s + k] = clip(frame.vel[k, who] / p.pursuer_speed)
+            row[6 + 4 * count + 2 * s + k] = way[k]
+        row[6 + 6 * count + s] = max(1.0 - best / p.near, 0.0)
+        row[6 + 7 * count + s] = 1.0 if _sees(p, frame, who) else 0.0
+        last, chosen = best, who
+    return 6 + 8 * count
+
+
+class Evade(Task):
+    """One learner stays out of the hands of a team of scripted pursuers among round cover, in a walled field.
+
+    Pursuers are slower and turn more slowly. They see the evader within `sight`, unless cover is in the straight way,
+    and head for where it will be; who has lost sight of it goes where it was last, then looks behind one cover after
+    another. Each sees for itself alone. Cover and walls are solid. To be caught ends it.
+    """
+
+    name: ClassVar[str] = "evade"
+    terms: ClassVar[tuple[str, ...]] = ("alive", "caught", "effort")
+    metric_names: ClassVar[tuple[str, ...]] = ("survival_time", "survived", "time_hidden", "least_distance")
+    measures: ClassVar[tuple[str, ...]] = ("time", "hidden", "caught", "distance")
+    memory: ClassVar[int] = 3
+
+    horizon: int = Field(default=300, ge=1, description="decisions until the time limit (truncation)")
+    pursuers: int = Field(default=3, ge=1, le=16, description="how many chase")
+    size: float = Field(default=28.0, gt=10, description="m, edge of the field")
+    cover: int = Field(default=10, ge=0, le=100, description="obstacles drawn; those that find no room are left out")
+    least_radius: float = Field(default=0.8, gt=0, description="m")
+    greatest_radius: float = Field(default=1.8, gt=0, description="m")
+    min_gap: float = Field(default=1.5, ge=0, description="m between obstacles, and to walls; bodies are 0.6 m wide")
+    start_distance: float = Field(default=8.0, ge=0, description="m, between the evader and pursuers at the start")
+    evader_speed: float = Field(default=3.0, gt=0, description="m/s")
+    evader_force: float = Field(default=8.0, gt=0, description="N; the mass is 1 kg")
+    pursuer_speed: float = Field(default=2.2, gt=0, description="m/s")
+    pursuer_force: float = Field(default=4.0, gt=0, description="N; the mass is 1 kg")
+    sight: float = Field(
+        default=10.0, gt=0, description="m, within which pursuers see the evader if nothing is between"
+    )
+    patience: float = Field(default=4.0, ge=0, description="s, how long they go to where it was seen last")
+    capture_distance: float = Field(default=0.7, gt=0, description="m between centres")
+    near: float = Field(default=6.0, gt=0, description="m, within which the closeness of pursuers is seen")
+    slots: int = Field(default=6, ge=1, le=32, description="how many obstacles are seen, nearest surface first")
+    rays: int = Field(default=16, ge=1, le=128, description="directions in which the free way is seen")
+    way_sight: float = Field(default=8.0, gt=0, description="m, up to which it is")
+    alive_reward: float = Field(default=1.0, ge=0, description="per s")
+    caught_cost: float = Field(default=10.0, ge=0, description="once")
+    effort_cost: float = Field(default=0.1, ge=0, description="per s of full force; goes with its square")
+
+    @model_validator(mode="after")
+    def _fitting(self) -> Evade:
+        """Refuse radii that run backwards, or for which the field has no room, and a start that is out of reach."""
+        widest = 2 * (self.greatest_radius + self.min_gap)
+        if self.least_radius > self.greatest_radius or widest > self.size:
+            raise ValueError(
+                f"least_radius = {self.least_radius:g}, greatest_radius = {self.greatest_radius:g}: the least comes "
+                f"first, and with min_gap on each side it must fit into a field of {self.size:g} m"
+            )
+        if self.start_distance > self.size / 2:
+            raise ValueError(f"start_distance = {self.start_distance:g}: at most size / 2 = {self.size / 2:g} m")
+        return self
+
+    @property
+    def learners(self) -> int:
+        """One."""
+        return 1
+
+    @property
+    def agents(self) -> int:
+        """The evader and its pursuers."""
+        return 1 + self.pursuers
+
+    @property
+    def agent_names(self) -> tuple[str, ...]:
+        """evader_0."""
+        return ("evader_0",)
+
+    @property
+    def obstacle_slots(self) -> int:
+        """As many as are drawn."""
+        return self.cover
+
+    @functools.cached_property
+    def scene(self) -> Scene:
+        """A walled square with solid obstacles."""
+        limits = {"max_speed": self.pursuer_speed, "max_force": self.pursuer_force}
+        return Scene(
+            space=Box(size=(self.size, self.size)),
+            groups=(
+                Group(count=1, radius=0.3, max_speed=self.evader_speed, max_force=self.evader_force, role="evader"),
+                Group(count=self.pursuers, radius=0.3, role="pursuer", **limits),
+            ),
+            effects=(ObstacleContact(stiffness=400.0, damping=20.0),),
+            integrator=self.integrator,
+            dt=self.dt,
+            dtype=self.dtype,
+        )
+
+    @property
+    def look(self) -> Look:
+        """The nearest cover."""
+        return Look(self.size, obstacles=self.slots)
+
+    def table(self) -> tuple[float, ...]:
+        """The directions of the rays."""
+        return compass(self.rays)
+
+    @functools.cached_property
+    def layout(self) -> Layout:
+        """Axes are the field's; offsets are relative to the agent."""
+        n, m = self.pursuers, self.slots
+        ways = "how far the body can go before it touches cover, anticlockwise from the x axis"
+        seen = "offsets of the centres of the nearest obstacles, nearest surface first; zeros = none"
+        return Layout((
+            Slot("velocity", (2,), self.evader_speed, "m/s", "own velocity (x, y)"),
+            Slot("to_low", (2,), self.size, "m", "distance to the walls at x = 0 and y = 0", low=0.0),
+            Slot("to_high", (2,), self.size, "m", "distance to the walls at x = size and y = size", low=0.0),
+            Slot("pursuers", (n, 2), self.size, "m", "offsets of the pursuers, nearest first"),
+            Slot("pursuer_velocity", (n, 2), self.pursuer_speed, "m/s", "their velocities"),
+            Slot("bearing", (n, 2), 1.0, "1", "unit vectors towards them"),
+            Slot("closeness", (n,), 1.0, "1", "1 - distance / near; 0 beyond", low=0.0),
+            Slot("seen", (n,), 1.0, "1", "1 where that pursuer sees the evader, else 0", low=0.0),
+            Slot("cover", (m, 2), self.size, "m", seen),
+            Slot("cover_radius", (m,), self.greatest_radius, "m", "their radii; 0 = none", low=0.0),
+            Slot("free_way", (self.rays,), self.way_sight, "m", ways, low=0.0),
+        ))  # fmt: skip
+
+    @functools.cached_property
+    def action_layout(self) -> Layout:
+        """A force, in the field's axes."""
+        meaning = "force (x, y) / max_force, shortened to length 1"
+        return Layout((Slot("force", (2,), self.evader_force, "N", meaning),))
+
+    def metrics(self, sums: Measured, last: Measured, steps: NDArray[np.int64]) -> dict[str, NDArray[np.float64]]:
+        """Seconds until it was caught, or now; is it free; seconds in which nobody saw it; nearest pursuer now, m."""
+        return {
+            "survival_time": sums["time"],
+            "survived": 1.0 - last["caught"],
+            "time_hidden": sums["hidden"],
+            "least_distance": last["distance"],
+        }
