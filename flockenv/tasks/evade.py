@@ -301,7 +301,9 @@ class Evade(Task):
     evader_force: float = Field(default=8.0, gt=0, description="N; the mass is 1 kg")
     pursuer_speed: float = Field(default=2.2, gt=0, description="m/s")
     pursuer_force: float = Field(default=4.0, gt=0, description="N; the mass is 1 kg")
-    sight: float = Field(default=10.0, gt=0, description="m, within which pursuers see the evader if nothing is between")
+    sight: float = Field(
+        default=10.0, gt=0, description="m, within which pursuers see the evader if nothing is between"
+    )
     patience: float = Field(default=4.0, ge=0, description="s, how long they go to where it was seen last")
     capture_distance: float = Field(default=0.7, gt=0, description="m between centres")
     near: float = Field(default=6.0, gt=0, description="m, within which the closeness of pursuers is seen")

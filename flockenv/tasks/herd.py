@@ -289,7 +289,9 @@ class Herd(Task):
     dogs: int = Field(default=1, ge=1, le=3, description="how many learn")
     sheep: int = Field(default=12, ge=2, le=200, description="how many are driven")
     horizon: int = Field(default=600, ge=1, description="decisions until the time limit (truncation)")
-    size: float = Field(default=60.0, gt=0, description="m, edge of the part that is shown; all begin in its middle half")
+    size: float = Field(
+        default=60.0, gt=0, description="m, edge of the part that is shown; all begin in its middle half"
+    )
     pen_radius: float = Field(default=4.0, gt=0, description="m")
     away: float = Field(default=15.0, ge=0, description="m, between the pen and the middle of the sheep, at least")
     scatter: float = Field(default=6.0, gt=0, description="m about that middle within which sheep begin")
@@ -309,7 +311,9 @@ class Herd(Task):
     sight: float = Field(default=40.0, gt=0, description="m, a dog sees offsets up to this per axis")
     sheep_seen: int = Field(default=6, ge=1, le=32, description="how many sheep a dog tells apart, nearest first")
     progress_reward: float = Field(default=0.5, ge=0, description="per m that the flock's centre came nearer the pen")
-    gathering_reward: float = Field(default=0.5, ge=0, description="per m that sheep came nearer their centre, on average")
+    gathering_reward: float = Field(
+        default=0.5, ge=0, description="per m that sheep came nearer their centre, on average"
+    )
     success_reward: float = Field(default=10.0, ge=0, description="once, when all are in the pen")
     time_cost: float = Field(default=0.2, ge=0, description="per s")
 
@@ -317,7 +321,9 @@ class Herd(Task):
     def _room(self) -> Herd:
         """Refuse a start that the field has no room for."""
         if self.away > self.size / 3:
-            raise ValueError(f"away = {self.away:g} m: in a field of {self.size:g} m at most {self.size / 3:g} is found")
+            raise ValueError(
+                f"away = {self.away:g} m: in a field of {self.size:g} m at most {self.size / 3:g} is found"
+            )
         return self
 
     @property
