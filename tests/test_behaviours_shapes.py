@@ -120,7 +120,7 @@ def test_of_a_circle_it_is_reynolds_own_rule() -> None:
 
 @pytest.mark.parametrize("effect", [AVOID, WHISKERS])
 def test_the_horizon_and_the_body_count(effect: Any) -> None:
-    """It reacts from where its body, not its centre, comes within the horizon; unequal radii (OpenSteer: twice its own)."""
+    """It reacts from where its body comes within the horizon; both radii count (OpenSteer: twice its own)."""
     near = effect.horizon * 2 + 0.2 + getattr(effect, "margin", 0)
     for offset, reacts in ((-0.01, True), (0.01, False)):
         wall = Block(centre=(near + 1 + offset, 0), size=(2, 8))

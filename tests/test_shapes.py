@@ -223,7 +223,7 @@ def test_what_is_no_shape_is_refused_in_one_line(make: Any, text: str) -> None:
 
 
 def test_an_unknown_kind_is_answered_with_those_there_are() -> None:
-    with pytest.raises(ValueError, match="polygn.*did you mean `polygon`"):
+    with pytest.raises(ValueError, match=r"polygn.*did you mean `polygon`"):
         load_scene(
             "groups: [{count: 1, spawn: {low: [0, 0], high: [1, 1]}}]\nobstacles: [{kind: polygn, vertices: []}]"
         )

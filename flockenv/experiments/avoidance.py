@@ -1,7 +1,7 @@
 """How obstacles should be avoided: a force field against steering around them, alone and with the way around them all.
 
-Reynolds 1988, "Not Bumping Into Things": a force field only brakes who comes head-on, and pushes who flies past. Steering
-to avoid does neither, and like everything local is caught in a dead end; there the global way is what helps.
+Reynolds 1988, "Not Bumping Into Things": a force field only brakes who comes head-on, and pushes who flies past.
+Steering to avoid does neither, and like everything local is caught in a dead end; there the global way is what helps.
 """
 
 from __future__ import annotations
@@ -38,8 +38,8 @@ CASES: dict[str, tuple[str, tuple[float, float], str, str]] = {
     ),
     "corridor": (
         "through a corridor 1.2 m wide", (12, 0), "{low: [0, -0.8], high: [0, 0.8]}",
-        "[{kind: polygon, vertices: [[3, 0.6], [9, 0.6], [9, 3], [3, 3]]}, "
-        "{kind: polygon, vertices: [[3, -0.6], [9, -0.6], [9, -3], [3, -3]]}]",
+        ("[{kind: polygon, vertices: [[3, 0.6], [9, 0.6], [9, 3], [3, 3]]}, "
+         "{kind: polygon, vertices: [[3, -0.6], [9, -0.6], [9, -3], [3, -3]]}]"),
     ),
     "corner": (
         "a target behind the inside of a corner", (9, 5), "{low: [0, -0.6], high: [0, 0.6]}",
