@@ -147,13 +147,13 @@ effects:
   - kind: steer
     group: 0
     behaviours:
-      - {kind: separation, weight: 1.5, radius: 0.8}
+      - {kind: unaligned_avoidance, weight: 8, horizon: 1.5, margin: 0.2}
       - {kind: follow_path, weight: 4, radius: 0.6, speed: 2, closed: true,
          points: [[1, 1], [6, 2.5], [11, 1], [12, 5], [10, 9], [6, 7.5], [2, 9], [0, 5]]}
   - kind: steer
     group: 1
     behaviours:
-      - {kind: separation, weight: 1.5, radius: 0.8}
+      - {kind: unaligned_avoidance, weight: 8, horizon: 1.5, margin: 0.2}
       - {kind: follow_path, weight: 4, radius: 0.6, speed: 2, closed: true, way: -1,
          points: [[1, 1], [6, 2.5], [11, 1], [12, 5], [10, 9], [6, 7.5], [2, 9], [0, 5]]}
 """
