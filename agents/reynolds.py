@@ -184,11 +184,11 @@ def crossing(see: Any, task: Crossing, p: CrossingRules) -> np.ndarray:
 
 @dataclass(frozen=True)
 class OrcaRules:
-    """As published: both take half, three seconds ahead."""
+    """As published, both take half; a wish that is not free is turned right, or twelve wait for each other."""
 
-    horizon: float = 3.0  # s, for so long the velocity must be free
+    horizon: float = 2.0  # s, for so long the velocity must be free
     margin: float = 0.1  # m, clearance for what inertia delays
-    turn: float = 0.1  # rad, a wish that is not free is turned right by this
+    turn: float = 0.3  # rad, a wish that is not free is turned right by this
     gain: float = 10.0  # kg/s: within a decision
     slow_radius: float = 1.0  # m, slow down within this of the goal
 
@@ -205,9 +205,15 @@ def orca_crossing(see: Any, task: Crossing, p: OrcaRules) -> np.ndarray:
         see.velocity, wish, 0.3, task.max_speed, p.horizon, task.control_dt, p.turn, seen.reshape(len(seen), -1)
     )
     return p.gain * change
+
+
 # --- Evade: around what is in the way, off the walls, away from pursuers, into cover ----------------------------------
+
+
+@dataclass(frozen=True)
 class EvadeRules:
     """Textbook: evade whoever is near, hide from the nearest otherwise (Reynolds 1999), in order of priority."""
+
     horizon: float = 1.0  # s, how far ahead cover counts that is in the way
     avoid: float = 5.0  # kg/s, strength of steering around it
     wall: float = 0.5  # s, how far ahead walls count
@@ -220,6 +226,8 @@ class EvadeRules:
     danger: float = 0.0  # m added to the way to a hiding place per m that a pursuer is nearer to it than 10 m
     exposed: float = 0.0  # m added to it for each pursuer that sees that place
     hide: float = 3.0  # kg/s, towards the hiding place
+
+
 def evade(see: Any, task: Evade, p: EvadeRules) -> np.ndarray:
     """Avoid, contain, evade, hide: allocation in that order (Reynolds 1987)."""
     top, row = task.evader_speed, np.arange(len(see.velocity))
@@ -231,6 +239,7 @@ def evade(see: Any, task: Evade, p: EvadeRules) -> np.ndarray:
     aside = p.avoid * avoid(forward, see.cover[row, first], clearance[row, first], top)
     aside *= np.isfinite(hit[row, first])[:, None]
     inside = 5.0 * contain(see.to_low - 0.5, see.to_high - 0.5, see.velocity, top, p.wall)
+
     distance = np.linalg.norm(see.pursuers, axis=-1)
     time = np.minimum(distance / task.pursuer_speed, p.predict)
     flight = evade_from(see.pursuers, see.velocity[:, None], see.pursuer_velocity, top, time)
@@ -239,6 +248,7 @@ def evade(see: Any, task: Evade, p: EvadeRules) -> np.ndarray:
     away = p.evade * np.sum(flight * weight[..., None], axis=1) / np.maximum(weight.sum(axis=1), 1e-9)[:, None]
     near = (weight.sum(axis=1) > 0)[:, None]
     away += p.middle * (see.to_high - see.to_low) / 2 * near
+
     places = hiding_place(see.cover, see.cover_radius, p.margin, see.pursuers[:, :1])
     theirs = np.linalg.norm(places[:, :, None] - see.pursuers[:, None], axis=-1).min(axis=-1)
     way = np.linalg.norm(places, axis=-1) + p.danger * np.maximum(10.0 - theirs, 0.0)
@@ -246,6 +256,8 @@ def evade(see: Any, task: Evade, p: EvadeRules) -> np.ndarray:
     soonest = np.argmin(np.where(there, way, np.inf), axis=1)
     hidden = p.hide * arrive(places[row, soonest], see.velocity, top, 0.5) * there.any(axis=1)[:, None]
     return allocate(np.stack([aside, inside, away, hidden], axis=1), task.evader_force)
+
+
 def _watchers(places: np.ndarray, see: Any) -> np.ndarray:
     """Return how many pursuers have no cover between themselves and each of the places (R, K)."""
     ways = places[:, :, None] - see.pursuers[:, None]

@@ -119,7 +119,8 @@ def _evaluation(scene: Scene, alone: State, drive: Floats) -> Evaluate:
         worlds = replace(
             alone, x=axes_first(x), v=axes_first(v), alive=copies(alone.alive), tick=copies(alone.tick),
             key=copies(alone.key), obstacle_x=copies(alone.obstacle_x, 1),
-            obstacle_radius=copies(alone.obstacle_radius), frame=copies(alone.frame, 1), work=np.zeros((many, len(WORK)), np.int64),
+            obstacle_radius=copies(alone.obstacle_radius), frame=copies(alone.frame, 1),
+            work=np.zeros((many, len(WORK)), np.int64),
         )  # fmt: skip
         push = copies(drive, 1).transpose(1, 2, 0) if drive.shape[1] else None
         acc, flow = scene.rates(worlds, push, np.full(many, time))

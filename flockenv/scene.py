@@ -38,7 +38,7 @@ from flockenv.shapes import AnyShape, Circle, HalfSpace, Shape, clear_of
 from flockenv.snapshot import Mark, Snapshot
 from flockenv.space import AnySpace, Box, Plane, Torus
 from flockenv.spawn import Spawn, scatter
-from flockenv.stability import check_dt
+from flockenv.stability import check_dt, check_lookahead
 from flockenv.state import Body, Floats, State
 from flockenv.steer import EVERY_EFFECT
 from flockenv.sweep import SHARED, Parts, Table, field_source, flattened, pack, scene_source
@@ -108,8 +108,8 @@ class Group(Record):
     )
     banking: float | None = Field(
         default=None, gt=0,
-        description="s, in which it leans into its turns (3-D), as far as lateral acceleration against 9.81 m/s^2 says; "
-        "none = it does not; oriented if given",
+        description="s, in which it leans into its turns (3-D), as far as lateral acceleration against 9.81 m/s^2 "
+        "says; none = it does not; oriented if given",
     )  # fmt: skip
     spawn: Spawn = Field(default_factory=Spawn)
     role: Literal["agent", "learner", "pursuer", "evader", "flockmate"] = Field(
@@ -197,6 +197,7 @@ class Scene(Record):
             )
         check_places(self)
         check_dt(self)
+        check_lookahead(self)
         return self
 
     def _check_counts(self) -> None:
@@ -492,8 +493,8 @@ class Scene(Record):
             raise ValueError(f"times is {times!r}, must be a finite number for each of {b} worlds, or one for all")
         when = np.ascontiguousarray(np.broadcast_to(given, b), self.dtype)
         self._field(
-            state.x, state.v, *state.frames, state.alive, state.key, state.obstacle_x, state.obstacle_radius, state.work,
-            self._drive(drive, state), self._params, when, acc, flow, *self._workspaces(1, 1)[0].of(0),
+            state.x, state.v, *state.frames, state.alive, state.key, state.obstacle_x, state.obstacle_radius,
+            state.work, self._drive(drive, state), self._params, when, acc, flow, *self._workspaces(1, 1)[0].of(0),
         )  # fmt: skip
         return acc.transpose(1, 2, 0), flow.transpose(1, 2, 0) if self.parts.flows else None
 
@@ -525,8 +526,8 @@ class Scene(Record):
         team = crew if worlds < crew and agents >= WORTH_SHARING and not self.integrator.adaptive else 1
         crew = crew if team > 1 else min(crew, worlds)
         arrays = (
-            state.x, state.v, *state.frames, state.alive, state.tick, state.key, state.obstacle_x, state.obstacle_radius, state.work,
-            drive, self._params, self._dt, steps,
+            state.x, state.v, *state.frames, state.alive, state.tick, state.key, state.obstacle_x,
+            state.obstacle_radius, state.work, drive, self._params, self._dt, steps,
         )  # fmt: skip
         if crew == 1:
             return self._kernel(*arrays, 0, worlds, 0, 1, *self._workspaces(1, 1)[0].of(0))  # type: ignore[no-any-return]

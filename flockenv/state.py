@@ -160,7 +160,7 @@ class State:
         return new
 
     def face(self) -> None:
-        """Let everybody face along his velocity, or where he faced if there is none; nothing if no headings are kept."""
+        """Where headings are kept, let everybody face along his velocity, or as before if there is none."""
         for b in range(self.shape[0] if self.frames else 0):
             entry(face)(self.v, self.frame, b, False)
 

@@ -89,14 +89,17 @@ class Trajectory:
     def save(self, path: Path) -> Path:
         """Write X.npz and X.json beside it, each whole or not at all; return the path of the latter.
 
-        Arrays: time (T,) s, pos (T, N, D) m, vel (T, N, D) m/s, alive (T, N), radius (N,) m, seed, heading
-        (T, N, D) where headings are kept, and `scene`, the YAML text that `load_scene` reads; none needs pickle. Missing folders are made.
+        Arrays: time (T,) s, pos (T, N, D) m, vel (T, N, D) m/s, alive (T, N), radius (N,) m, seed, and `scene`, the
+        YAML text that `load_scene` reads; and heading (T, N, D) where headings are kept. None needs pickle. Missing
+        folders are made.
         """
         path.parent.mkdir(parents=True, exist_ok=True)
+        more: dict[str, Any] = {} if self.heading is None else {"heading": self.heading}
         with replacing(path) as file:
             np.savez(
                 file, time=self.step * self.scene.dt, pos=self.pos, vel=self.vel, alive=self.alive,
-                **({} if self.heading is None else {"heading": self.heading}), radius=self.scene.body.radius, seed=np.uint64(self.seed), scene=np.array(dump_scene(self.scene)),
+                radius=self.scene.body.radius, seed=np.uint64(self.seed), scene=np.array(dump_scene(self.scene)),
+                **more,
             )  # fmt: skip
         beside = path.with_suffix(".json")
         with replacing(beside) as file:

@@ -59,8 +59,8 @@ def held(way: Vec, ahead: Vec, over: bool) -> Vec:
 def leant(heading: Vec, before: Vec, up: Vec, speed: float, seconds: float, memory: float) -> Vec:
     """Return the up vector of somebody who leans into a turn: it follows lateral acceleration + g upwards, in space.
 
-    The acceleration is s (f - f_before)/dt across f, that of the path; `memory` [s] is how long up takes to follow, with
-    a share of 1 - exp(-dt/memory) per step, whatever dt is. An infinite one leaves up as it is (Reynolds 1999, banking).
+    The acceleration is s (f - f_before)/dt across f, that of the path; `memory` [s] is how long up takes to follow,
+    with a share of 1 - exp(-dt/memory) per step, whatever dt is. An infinite one leaves up as it is (Reynolds 1999).
     """
     share = like(speed, 1.0) - np.exp(-seconds / memory)
     toward = scale(lateral(before, heading), -speed / seconds)
@@ -91,10 +91,10 @@ def face(v: Any, frame: Any, b: int, anew: bool) -> None:
             heading = select(dot(heading, heading) > like(heading[0], 0.0), heading, axis(heading, 0))
             frame[0, b, i], frame[1, b, i] = heading
         else:
-            old = (frame[0, b, i], frame[1, b, i], frame[2, b, i])
+            old: Vec = (frame[0, b, i], frame[1, b, i], frame[2, b, i])
             ahead = faced((v[0, b, i], v[1, b, i], v[2, b, i]), old)
             ahead = select(dot(ahead, ahead) > like(ahead[0], 0.0), ahead, axis(ahead, 0))
-            up = (frame[3, b, i], frame[4, b, i], frame[5, b, i])
+            up: Vec = (frame[3, b, i], frame[4, b, i], frame[5, b, i])
             up = select(dot(up, up) > like(up[0], 0.0), up, axis(up, 2))
             up = raised(ahead, axis(ahead, 1), up)
             frame[0, b, i], frame[1, b, i], frame[2, b, i] = ahead

@@ -99,8 +99,8 @@ class World:
         self._actions = np.zeros((b, i, self.action_size))
         numbers = (task.parts.given(), list(task.parameters().values()), task.table() or (0.0,))
         self._worlds = (
-            s.x, s.v, *s.frames, s.alive, s.tick, s.obstacle_x, s.obstacle_radius, s.work, s.key, self._memory, self.steps,
-            *(np.array(values, real) for values in numbers),
+            s.x, s.v, *s.frames, s.alive, s.tick, s.obstacle_x, s.obstacle_radius, s.work, s.key, self._memory,
+            self.steps, *(np.array(values, real) for values in numbers),
         )  # fmt: skip
         self._clock = (np.dtype(real).type(scene.dt), task.substeps, not task.ends_together)
         self._scratch = [self._allocate()]
@@ -294,7 +294,8 @@ class World:
         s: State = self.state
         low, high = self.task.view(s, world)
         return Snapshot(
-            time=float(s.time[world]), pos=s.pos[world], vel=s.vel[world], heading=s.heading[world] if s.frames else None, alive=s.alive[world],
+            time=float(s.time[world]), pos=s.pos[world], vel=s.vel[world], alive=s.alive[world],
+            heading=s.heading[world] if s.frames else None,
             radius=np.asarray(self.task.scene.body.radius, np.float64), roles=self.task.scene.roles,
             obstacle_centre=s.obstacles.centre[world], obstacle_radius=s.obstacle_radius[world],
             marks=self.task.marks(s, self._memory, world),

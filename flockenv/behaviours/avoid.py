@@ -86,6 +86,10 @@ class AvoidObstacles(Effect):
     obstacle_finish: ClassVar[str | None] = "around"
     demo: ClassVar[str | None] = AVOIDING
 
+    def lookahead(self, speed: float) -> float:
+        """As far as it comes within the horizon."""
+        return speed * self.horizon
+
     def folded(self, dimension: int) -> int:
         """Distance, clearance and offset of the nearest threat."""
         return 2 + dimension

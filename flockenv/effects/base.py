@@ -297,6 +297,13 @@ class Effect(Record):
         """Return its potential energy in each world, (B,) J; none if it has none. `offset(a, b)` is the space's."""
         return None
 
+    def lookahead(self, speed: float) -> float | None:
+        """Return how far ahead somebody at this speed notices what he must avoid, m; none if it avoids nothing.
+
+        What gives it is called `horizon`, s, in such an effect.
+        """
+        return None
+
     def check(self, scene: Any) -> None:
         """Refuse, with a ValueError that begins with the name of a field, a scene that does not suit it.
 

@@ -53,7 +53,10 @@ def field_source(parts: Parts) -> str:
         copies(parts),
         f'''
 @njit(cache=True, **FAST)
-def field(x, v, {parts.frame_argument}alive, key, obstacle_x, obstacle_radius, work, drive, params, times, acc, flow, {SHARED}):
+def field(
+    x, v, {parts.frame_argument}alive, key, obstacle_x, obstacle_radius, work, drive, params, times, acc, flow,
+    {SHARED},
+):
     """Write acceleration, and the flow that carries everybody if there is one, of all worlds, (D, B, N)."""
     unaliased()
     n, rank, team, arranged = x.shape[2], 0, 1, False

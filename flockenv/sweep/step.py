@@ -78,7 +78,8 @@ def step_world(parts: Parts) -> str:
     restored = "; ".join(f"work[b, {k}] = counted_[{k}]" for k in range(len(WORK)))
     return f'''@kernel
 def step_world(
-    x_, v_, {parts.frame_argument}alive, tick, key, obstacle_x, obstacle_radius, work, params, dt, count, b, rank, team, {SHARED},
+    x_, v_, {parts.frame_argument}alive, tick, key, obstacle_x, obstacle_radius, work, params, dt, count, b, rank, team,
+    {SHARED},
 ):
     """Advance this thread's part of world b by `count` steps; return the first agent that is not finite, or -1.
 
@@ -175,9 +176,10 @@ def _bound(parts: Parts, first: str, end: str) -> list[str]:
         *indented_lines(_kick(parts), 8),
         "        where = far if finite(dot(x, x) + dot(v, v)) else ident[i]",
         f"        {bad} = where if where < {bad} else {bad}",
+        *indented_lines(_turn(parts), 8),
         "        # nobody moves faster than max_speed, whatever a method makes of the velocity within the step",
         "        x = add(was, scale(limit(sub(x, was), max_speed[i] * dt), living[i]))",
-        *indented_lines([*_turn(parts), *_stay_inside(parts), *_face(parts)], 8),
+        *indented_lines([*_stay_inside(parts), *_face(parts)], 8),
         *(
             "        " + "; ".join(f"{lane(parts, array, k)} = {now}[{k}]" for array, now in stored)
             for k in range(parts.dimension)
@@ -272,8 +274,8 @@ def step(parts: Parts) -> str:
     return f'''
 @njit(cache=True, **FAST)
 def step(
-    x, v, {parts.frame_argument}alive, tick, key, obstacle_x, obstacle_radius, work, drive, params, dt, count, from_world, to_world, rank,
-    team, {SHARED},
+    x, v, {parts.frame_argument}alive, tick, key, obstacle_x, obstacle_radius, work, drive, params, dt, count,
+    from_world, to_world, rank, team, {SHARED},
 ):
     """Advance worlds [from_world, to_world) by `count` steps; return (world, agent) not finite first, or -1s.
 
@@ -291,7 +293,8 @@ def step(
         else:
             want[first * {d * parts.width} : end * {d * parts.width}] = 0
         bad = step_world(
-            x, v, {parts.frame_argument}alive, tick, key, obstacle_x, obstacle_radius, work, params, dt, count, b, rank, team, {SHARED},
+            x, v, {parts.frame_argument}alive, tick, key, obstacle_x, obstacle_radius, work, params, dt, count,
+            b, rank, team, {SHARED},
         )
         if rank == 0 and bad < 0:
             tick[b] += count

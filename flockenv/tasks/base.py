@@ -202,7 +202,10 @@ def task_source(task: Task) -> str:
     empty = ", ".join(f"{name}[:0]" for name in NEAR.split(", "))
     then = frame.format(x="x0", v="v0", alive="alive0", near=empty)
     look = f"look(x, alive, obstacle_x, obstacle_radius, b, params, {NEAR}, {SHARED})" if task.look else "pass"
-    worlds = f"x, v, {task.parts.frame_argument}alive, tick, obstacle_x, obstacle_radius, work, key, memory, steps, params, numbers, table"
+    worlds = (
+        f"x, v, {task.parts.frame_argument}alive, tick, obstacle_x, obstacle_radius, work, key, memory, steps, params, "
+        "numbers, table"
+    )
     return (
         scene_source(task.parts)
         + look_source(task.parts)
@@ -263,7 +266,8 @@ def play(
             drive(p, {now}, action, force[:, 0])
             into_blocks(want, force, 0, n, 0, blocks)
             bad = step_world(
-                x, v, {task.parts.frame_argument}alive, tick, key, obstacle_x, obstacle_radius, work, params, dt, count, b, 0, 1, {SHARED},
+                x, v, {task.parts.frame_argument}alive, tick, key, obstacle_x, obstacle_radius, work, params, dt,
+                count, b, 0, 1, {SHARED},
             )
             if bad >= 0 and broken < 0:
                 broken, who = b, bad

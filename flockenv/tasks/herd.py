@@ -65,7 +65,7 @@ def _somewhere(p: Any, frame: Frame, t: int, channel: int) -> Vec:
 @kernel
 def _clear(frame: Frame, i: int, first: int, end: int, distance: float) -> bool:
     """Is agent i at least this far from those of [first, end)?"""
-    for j in range(first, end):
+    for j in range(first, end):  # noqa: SIM110  # there are no generators in compiled code
         if norm(_to(frame, i, j)) < distance:
             return False
     return True
@@ -215,7 +215,7 @@ def measure(p: Any, before: Frame, after: Frame, numbers: Any) -> None:
 
 @kernel
 def observe(p: Any, frame: Frame, rows: Any) -> None:
-    """All in the frame of the course: (along, left). Own velocity, pen, flock, who strays, nearest sheep, other dogs."""
+    """In the frame of the course, (along, left): own velocity, pen, flock, who strays, nearest sheep, other dogs."""
     centre, course, pen = _centre(p, frame), _course(p, frame), _pen(frame)
     far, spread = _farthest(p, frame, centre)
     slots, dogs = int(p.sheep_seen), int(p.dogs)
@@ -276,8 +276,8 @@ class Herd(Task):
 
     Sheep graze until a dog comes near. Then they go, at full speed, as in Strombom et al. 2014 (doi
     10.1098/rsif.2014.0719): away from dogs, to the centre of the sheep around them, away from who is too near, on as
-    before, and a little anyhow. Everything a dog sees is relative to itself and turned into the frame of the course, which
-    leads from the flock's centre to the pen. All sheep in the pen at once end it.
+    before, and a little anyhow. Everything a dog sees is relative to itself and turned into the frame of the course,
+    which leads from the flock's centre to the pen. All sheep in the pen at once end it.
     """
 
     name: ClassVar[str] = "herd"
@@ -289,7 +289,9 @@ class Herd(Task):
     dogs: int = Field(default=1, ge=1, le=3, description="how many learn")
     sheep: int = Field(default=12, ge=2, le=200, description="how many are driven")
     horizon: int = Field(default=600, ge=1, description="decisions until the time limit (truncation)")
-    size: float = Field(default=60.0, gt=0, description="m, edge of the part that is shown; all begin in its middle half")
+    size: float = Field(
+        default=60.0, gt=0, description="m, edge of the part that is shown; all begin in its middle half"
+    )
     pen_radius: float = Field(default=4.0, gt=0, description="m")
     away: float = Field(default=15.0, ge=0, description="m, between the pen and the middle of the sheep, at least")
     scatter: float = Field(default=6.0, gt=0, description="m about that middle within which sheep begin")
@@ -309,7 +311,9 @@ class Herd(Task):
     sight: float = Field(default=40.0, gt=0, description="m, a dog sees offsets up to this per axis")
     sheep_seen: int = Field(default=6, ge=1, le=32, description="how many sheep a dog tells apart, nearest first")
     progress_reward: float = Field(default=0.5, ge=0, description="per m that the flock's centre came nearer the pen")
-    gathering_reward: float = Field(default=0.5, ge=0, description="per m that sheep came nearer their centre, on average")
+    gathering_reward: float = Field(
+        default=0.5, ge=0, description="per m that sheep came nearer their centre, on average"
+    )
     success_reward: float = Field(default=10.0, ge=0, description="once, when all are in the pen")
     time_cost: float = Field(default=0.2, ge=0, description="per s")
 
@@ -317,7 +321,9 @@ class Herd(Task):
     def _room(self) -> Herd:
         """Refuse a start that the field has no room for."""
         if self.away > self.size / 3:
-            raise ValueError(f"away = {self.away:g} m: in a field of {self.size:g} m at most {self.size / 3:g} is found")
+            raise ValueError(
+                f"away = {self.away:g} m: in a field of {self.size:g} m at most {self.size / 3:g} m is sure to be found"
+            )
         return self
 
     @property
@@ -390,7 +396,7 @@ class Herd(Task):
         return Layout((Slot("force", (2,), self.dog_force, "N", meaning),))
 
     def metrics(self, sums: Measured, last: Measured, steps: NDArray[np.int64]) -> dict[str, NDArray[np.float64]]:
-        """Share of the sheep in the pen now; s until all were (NaN if they are not); spread now, m; path of a dog, m."""
+        """Share of the sheep in the pen; s until all were (NaN if they are not); spread now, m; path of a dog, m."""
         return {
             "share_penned": last["penned"],
             "time_to_pen": np.where((last["penned"] >= 1.0) & (steps > 0), sums["time"], np.nan),
