@@ -363,7 +363,11 @@ def test_what_is_no_field_is_refused_in_one_line(change: dict[str, Any], text: s
 
 
 @pytest.mark.parametrize("behaviour", [FollowPath, StayOnPath, FollowFlow])
-def test_its_demo_is_a_small_scene(behaviour: Any) -> None:
+def test_its_demo_is_a_small_scene_and_shows_its_way(behaviour: Any) -> None:
     scene = load_scene(behaviour.demo)
     assert 0 < scene.agents <= 20
     assert behaviour.demo_time == 8
+    marks = scene.snapshot(scene.start(0)).marks
+    assert {mark.kind for mark in marks} == (set() if behaviour is FollowFlow else {"way"})
+    if behaviour is FollowPath:  # once for both ways
+        assert len(marks) == math.ceil(polyline.pieces(scene.parts.effects[1].points, True)[1] / 0.3) + 1
