@@ -21,7 +21,7 @@ import yaml
 from flockenv import arbitration, shapes, steering
 from flockenv.orca import orca
 from flockenv.rows import rows
-from flockenv.tasks import Crossing, Evade, Flock, Herd, Obstacles, Pursuit, Task
+from flockenv.tasks import Crossing, Evade, Flock, Herd, Obstacles, PathFollow, Pursuit, Task
 
 __all__ = ["PLAYERS", "RULES", "Reynolds", "player", "tuned"]
 
@@ -31,11 +31,12 @@ seek, arrive, contain = rows(steering.seek), rows(steering.arrive), rows(steerin
 interception_time, pursue = rows(steering.interception_time), rows(steering.pursue)
 threat, avoid = rows(steering.threat), rows(steering.avoid)
 separate, align = rows(steering.separate), rows(steering.align)
-evade_from, hiding_place = rows(steering.evade), rows(steering.hiding_place)
-ray_hit = rows(shapes.ray_hit)
 unaligned_threat, give_way = rows(steering.unaligned_threat), rows(steering.give_way)
 allocate, keep_clear = rows(arbitration.allocate), rows(orca)
+evade_from, hiding_place = rows(steering.evade), rows(steering.hiding_place)
+ray_hit = rows(shapes.ray_hit)
 herd_from = rows(steering.herd_from)
+follow_path = rows(steering.follow_path)
 
 
 # --- Pursuit: seek where the quarry will be, but never beyond the walls it cannot pass ------------------------------
@@ -145,6 +146,67 @@ def flock(see: Any, task: Flock, p: FlockRules) -> np.ndarray:
     return (1.0 - p.blend) * ordered + p.blend * summed
 
 
+# --- Crossing: give way to whom one would meet first, and go on ------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class CrossingRules:
+    """Textbook: look three seconds ahead, give way with all the force there is, arrive with the rest."""
+
+    horizon: float = 3.0  # s, how far ahead a meeting counts
+    margin: float = 0.2  # m, clearance beyond the touching distance
+    evade: float = 5.0  # N, strength of an evasion
+    urgency: float = 0.0  # 0: evade with full strength however far ahead; 1: in proportion to nearness in time
+    radius: float = 1.0  # m, neighbours nearer than this push
+    apart: float = 0.0  # N m, separation
+    gain: float = 2.0  # kg/s towards the goal
+    speed: float = 1.0  # share of the top speed that is wanted
+    slow_radius: float = 0.8  # m, slow down within this of the goal
+
+
+def crossing(see: Any, task: Crossing, p: CrossingRules) -> np.ndarray:
+    """Unaligned collision avoidance (Reynolds 1999), then arrive; vectors are (along the course, to its left)."""
+    own = see.velocity[:, None]
+    others = own + see.neighbour_velocity
+    time = unaligned_threat(see.neighbours, own, others, 0.6 + p.margin, p.horizon)
+    time = np.where(see.neighbour_present > 0, time, np.inf)
+    row, first = np.arange(len(time)), np.argmin(time, axis=1)
+    soonest = time[row, first]
+    danger = np.isfinite(soonest)
+    nearness = 1.0 - np.where(danger, soonest, p.horizon) / p.horizon
+    strength = p.evade * (1.0 - p.urgency * (1.0 - nearness)) * danger
+    away = give_way(see.neighbours[row, first], see.velocity, others[row, first], np.where(danger, soonest, 0.0), 1.0)
+    near = see.neighbour_present * (np.linalg.norm(see.neighbours, axis=-1) < p.radius)
+    push = p.apart * np.sum(separate(see.neighbours, np.array([1.0, 0.0])) * near[..., None], axis=1)
+    course = p.gain * arrive(see.goal, see.velocity, p.speed * task.max_speed, p.slow_radius)
+    return allocate(np.stack([away * strength[:, None], push, course], axis=1), task.max_force)
+
+
+@dataclass(frozen=True)
+class OrcaRules:
+    """As published, both take half; a wish that is not free is turned right, or twelve wait for each other."""
+
+    horizon: float = 2.0  # s, for so long the velocity must be free
+    margin: float = 0.1  # m, clearance for what inertia delays
+    turn: float = 0.3  # rad, a wish that is not free is turned right by this
+    gain: float = 10.0  # kg/s: within a decision
+    slow_radius: float = 1.0  # m, slow down within this of the goal
+
+
+def orca_crossing(see: Any, task: Crossing, p: OrcaRules) -> np.ndarray:
+    """Optimal reciprocal collision avoidance (van den Berg et al. 2011) on the way to the goal."""
+    still = np.zeros_like(see.goal)
+    wish = arrive(see.goal, still, task.max_speed, p.slow_radius)
+    others = see.velocity[:, None] + see.neighbour_velocity
+    present = see.neighbour_present > 0
+    radius = np.where(present, 0.3 + p.margin, -1.0)[..., None]
+    seen = np.concatenate([see.neighbours, others, radius, np.full_like(radius, 0.5)], axis=-1)
+    change = keep_clear(
+        see.velocity, wish, 0.3, task.max_speed, p.horizon, task.control_dt, p.turn, seen.reshape(len(seen), -1)
+    )
+    return p.gain * change
+
+
 # --- Evade: around what is in the way, off the walls, away from pursuers, into cover ----------------------------------
 
 
@@ -206,67 +268,6 @@ def _watchers(places: np.ndarray, see: Any) -> np.ndarray:
     return np.sum(hit.min(axis=-1) > length, axis=-1)
 
 
-# --- Crossing: give way to whom one would meet first, and go on ------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class CrossingRules:
-    """Textbook: look three seconds ahead, give way with all the force there is, arrive with the rest."""
-
-    horizon: float = 3.0  # s, how far ahead a meeting counts
-    margin: float = 0.2  # m, clearance beyond the touching distance
-    evade: float = 5.0  # N, strength of an evasion
-    urgency: float = 0.0  # 0: evade with full strength however far ahead; 1: in proportion to nearness in time
-    radius: float = 1.0  # m, neighbours nearer than this push
-    apart: float = 0.0  # N m, separation
-    gain: float = 2.0  # kg/s towards the goal
-    speed: float = 1.0  # share of the top speed that is wanted
-    slow_radius: float = 0.8  # m, slow down within this of the goal
-
-
-def crossing(see: Any, task: Crossing, p: CrossingRules) -> np.ndarray:
-    """Unaligned collision avoidance (Reynolds 1999), then arrive; vectors are (along the course, to its left)."""
-    own = see.velocity[:, None]
-    others = own + see.neighbour_velocity
-    time = unaligned_threat(see.neighbours, own, others, 0.6 + p.margin, p.horizon)
-    time = np.where(see.neighbour_present > 0, time, np.inf)
-    row, first = np.arange(len(time)), np.argmin(time, axis=1)
-    soonest = time[row, first]
-    danger = np.isfinite(soonest)
-    nearness = 1.0 - np.where(danger, soonest, p.horizon) / p.horizon
-    strength = p.evade * (1.0 - p.urgency * (1.0 - nearness)) * danger
-    away = give_way(see.neighbours[row, first], see.velocity, others[row, first], np.where(danger, soonest, 0.0), 1.0)
-    near = see.neighbour_present * (np.linalg.norm(see.neighbours, axis=-1) < p.radius)
-    push = p.apart * np.sum(separate(see.neighbours, np.array([1.0, 0.0])) * near[..., None], axis=1)
-    course = p.gain * arrive(see.goal, see.velocity, p.speed * task.max_speed, p.slow_radius)
-    return allocate(np.stack([away * strength[:, None], push, course], axis=1), task.max_force)
-
-
-@dataclass(frozen=True)
-class OrcaRules:
-    """As published: both take half, three seconds ahead."""
-
-    horizon: float = 3.0  # s, for so long the velocity must be free
-    margin: float = 0.1  # m, clearance for what inertia delays
-    turn: float = 0.1  # rad, a wish that is not free is turned right by this
-    gain: float = 10.0  # kg/s: within a decision
-    slow_radius: float = 1.0  # m, slow down within this of the goal
-
-
-def orca_crossing(see: Any, task: Crossing, p: OrcaRules) -> np.ndarray:
-    """Optimal reciprocal collision avoidance (van den Berg et al. 2011) on the way to the goal."""
-    still = np.zeros_like(see.goal)
-    wish = arrive(see.goal, still, task.max_speed, p.slow_radius)
-    others = see.velocity[:, None] + see.neighbour_velocity
-    present = see.neighbour_present > 0
-    radius = np.where(present, 0.3 + p.margin, -1.0)[..., None]
-    seen = np.concatenate([see.neighbours, others, radius, np.full_like(radius, 0.5)], axis=-1)
-    change = keep_clear(
-        see.velocity, wish, 0.3, task.max_speed, p.horizon, task.control_dt, p.turn, seen.reshape(len(seen), -1)
-    )
-    return p.gain * change
-
-
 # --- Herd: collect who strays, else drive them all from behind --------------------------------------------------------
 
 
@@ -303,6 +304,50 @@ def herd(see: Any, task: Herd, p: HerdRules) -> np.ndarray:
     return allocate(np.stack([mates, detour, course], axis=1), task.dog_force)
 
 
+# --- PathFollow: seek the track ahead if the predicted place is off it; brake before a bend ---------------------------
+
+
+@dataclass(frozen=True)
+class PathFollowRules:
+    """Textbook: half a second ahead, the whole track is the tube, full speed whatever comes."""
+
+    time: float = 0.5  # s, how far ahead it predicts itself
+    lead: float = 0.5  # s, how far ahead at its present speed the point lies that is sought
+    tube: float = 1.0  # share of the track's width that is left alone
+    keep: float = 0.5  # share of the speed it wants, below which it is sent on
+    speed: float = 1.0  # share of the top speed that is wanted
+    grip: float = 100.0  # share of all the force there is that a bend may ask for; much = never slows down
+    early: float = 1.0  # share of it that braking before a bend counts on
+    brake: float = 0.0  # kg/s against what is too fast
+    gain: float = 5.0  # kg/s, a change of velocity is asked for within 1/gain seconds
+
+
+def path_follow(see: Any, task: PathFollow, p: PathFollowRules) -> np.ndarray:
+    """Follow the path (Reynolds 1999), at a speed that the bends ahead allow; vectors are (along the track, left)."""
+    row, step = np.arange(len(see.left)), task.spacing / _FINE
+    spine = np.concatenate([np.stack([0.0 * see.left, -see.left], axis=-1)[:, None], see.points], axis=1)
+    share = (np.arange(task.ahead * _FINE) / _FINE) % 1.0
+    piece = np.arange(task.ahead * _FINE) // _FINE
+    fine = spine[:, piece] * (1.0 - share)[:, None] + spine[:, piece + 1] * share[:, None]
+    far = task.spacing * np.arange(task.ahead)[None]  # a bend begins a point earlier
+    bend = np.maximum(np.abs(see.curvature), 1e-6)
+    allowed = p.grip * task.max_force / bend + 2.0 * p.early * task.max_force * far
+    top = np.minimum(p.speed * task.max_speed, np.sqrt(allowed.min(axis=1)))
+    speed = np.linalg.norm(see.velocity, axis=-1)
+    gap = np.linalg.norm(fine - p.time * see.velocity[:, None], axis=-1)
+    then = np.argmin(gap, axis=1)
+    gained = then * step - p.keep * top * p.time
+    ahead = p.lead * np.maximum(speed, 0.25 * top)
+    target = fine[row, np.minimum(np.round(ahead / step), task.ahead * _FINE - 1).astype(int)]
+    wish = p.gain * follow_path(gap[row, then] - p.tube * task.half_width, gained, target, see.velocity, top)
+    slower = -p.brake * (np.maximum(speed - top, 0.0) / np.maximum(speed, 1e-9))[:, None] * see.velocity
+    return slower + wish
+
+
+_FINE = 5
+"""Places between two points of the track that are seen, among which the nearest is."""
+
+
 # --- the player ------------------------------------------------------------------------------------------------------
 
 RULES: dict[str, tuple[Callable[..., np.ndarray], type]] = {
@@ -312,6 +357,7 @@ RULES: dict[str, tuple[Callable[..., np.ndarray], type]] = {
     "flock": (flock, FlockRules),
     "crossing": (crossing, CrossingRules),
     "herd": (herd, HerdRules),
+    "path_follow": (path_follow, PathFollowRules),
 }
 """What the player "reynolds" does in each task, and its parameters."""
 

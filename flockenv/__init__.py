@@ -20,7 +20,17 @@ if TYPE_CHECKING:
     from flockenv.scene import Scene
     from flockenv.snapshot import Snapshot
     from flockenv.state import Body, State
-    from flockenv.tasks import TASKS, Crossing, Evade, Flock, Herd, Obstacles, Pursuit, Task
+    from flockenv.tasks import (
+        TASKS,
+        Crossing,
+        Evade,
+        Flock,
+        Herd,
+        Obstacles,
+        PathFollow,
+        Pursuit,
+        Task,
+    )
     from flockenv.world import Step, World
 
 __version__ = "0.1.0"
@@ -33,6 +43,7 @@ __all__ = [
     "Flock",
     "Herd",
     "Obstacles",
+    "PathFollow",
     "Pursuit",
     "Scene",
     "Snapshot",
@@ -54,6 +65,7 @@ _HOME = {
     "Flock": "tasks",
     "Herd": "tasks",
     "Obstacles": "tasks",
+    "PathFollow": "tasks",
     "Pursuit": "tasks",
     "Task": "tasks",
     "Step": "world",

@@ -245,7 +245,8 @@ class Dithering(Arbitration):
         each = self.probability if isinstance(self.probability, tuple) else (self.probability,) * wishes
         if len(each) != wishes:
             raise ValueError(
-                f"arbitration.probability = {self.probability}: must be one number, or one for each of {wishes} behaviours"
+                f"arbitration.probability = {self.probability}: must be one number, or one for each of "
+                f"{wishes} behaviours"
             )
         return {"period": self.period, "threshold": self.threshold, "probability": tuple(map(float, each))}
 

@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from flockenv.scene import Scene
+from flockenv.shapes import clear_of
 from flockenv.space import Space, Torus
 from flockenv.state import State
 
@@ -42,6 +43,9 @@ def _measure(scene: Scene, state: State, world: int) -> dict[str, float]:
     touching = nearest < radius + radius[who]
     for centre, size in zip(state.obstacles.centre[world], state.obstacles.radius[world], strict=True):
         touching |= (size > 0) & (np.linalg.norm(scene.space.displacement(pos, centre), axis=1) < radius + size)
+    if scene.shapes:
+        period = np.array(scene.space.extent(scene.dimension) if scene.space.periodic else (0.0,) * scene.dimension)
+        touching |= clear_of(scene.shapes, np.asarray(pos, float), period) < radius
     return {
         "agents": float(alive.sum()),
         "speed": float(speed.mean()) if len(speed) else np.nan,

@@ -40,7 +40,8 @@ def _places(scene: Any) -> Iterator[tuple[str, Any]]:
             yield f"groups[{k}].spawn.low", group.spawn.low or ()
             yield f"groups[{k}].spawn.high", group.spawn.high or ()
     for k, obstacle in enumerate(scene.obstacles):
-        yield f"obstacles[{k}].centre", obstacle.centre
+        what = "centre" if obstacle.kind == "circle" else "kind = " + obstacle.kind + ": its farthest coordinate"
+        yield f"obstacles[{k}].{what}", obstacle.anchor if obstacle.kind == "circle" else obstacle.extremes
     for k, effect in enumerate(scene.effects):
         for name in effect.places:
             yield f"effects[{k}].{name}", getattr(effect, name)

@@ -34,11 +34,11 @@ from flockenv.networks import EDGE, AnyNetwork
 from flockenv.noise import MASK, key_of
 from flockenv.records import Record, keep
 from flockenv.rounding import check_places
-from flockenv.shapes import Circle
+from flockenv.shapes import AnyShape, Circle, HalfSpace, Shape, clear_of
 from flockenv.snapshot import Mark, Snapshot
 from flockenv.space import AnySpace, Box, Plane, Torus
 from flockenv.spawn import Spawn, scatter
-from flockenv.stability import check_dt
+from flockenv.stability import check_dt, check_lookahead
 from flockenv.state import Body, Floats, State
 from flockenv.steer import EVERY_EFFECT
 from flockenv.sweep import SHARED, Parts, Table, field_source, flattened, pack, scene_source
@@ -51,6 +51,9 @@ WORTH_SHARING = 4096
 """Agent-steps below which a second thread costs more than it brings: handing work over takes about 20 us."""
 
 SYNC, STAGES = SHARED.split(", ").index("sync"), SHARED.split(", ").index("stages")
+
+ROUNDS = 256
+"""How often who would begin in an obstacle that is no circle is drawn anew."""
 
 EXACT = 2**24
 """Whole numbers, and so numbers of agents, that float32 tells apart."""
@@ -97,6 +100,17 @@ class Group(Record):
     radius: float = Field(default=0.1, ge=0, description="m")
     max_speed: float | None = Field(default=None, gt=0, description="m/s; none = no limit")
     max_force: float | None = Field(default=None, ge=0, description="N, what it may ask for; none = no limit")
+    oriented: bool = Field(
+        default=False, description="does it keep its heading (in 3-D an up vector too) while it stands still?"
+    )
+    max_turn_rate: float | None = Field(
+        default=None, gt=0, description="rad/s, how fast its heading turns; none = no limit; oriented if given"
+    )
+    banking: float | None = Field(
+        default=None, gt=0,
+        description="s, in which it leans into its turns (3-D), as far as lateral acceleration against 9.81 m/s^2 "
+        "says; none = it does not; oriented if given",
+    )  # fmt: skip
     spawn: Spawn = Field(default_factory=Spawn)
     role: Literal["agent", "learner", "pursuer", "evader", "flockmate"] = Field(
         default="agent", description="what it is in pictures"
@@ -112,6 +126,11 @@ class Group(Record):
         ):
             raise ValueError("spawn: a network is where it says; all it may be given is a speed, with a heading")
         return self
+
+    @property
+    def keeps_heading(self) -> bool:
+        """Has each of them a frame of its own?"""
+        return self.oriented or self.max_turn_rate is not None or self.banking is not None
 
     @property
     def size(self) -> int:
@@ -134,7 +153,9 @@ class Scene(Record):
     space: AnySpace = Field(default_factory=Plane)
     groups: tuple[Group, ...] = Field(min_length=1, description="agents, group after group")
     effects: tuple[AnyEffect, ...] = Field(default=(), description="what acts on them; nothing else is computed")
-    obstacles: tuple[Circle, ...] = Field(default=(), description="the same in every world")
+    obstacles: tuple[AnyShape, ...] = Field(
+        default=(), description="the same in every world; without a kind, with centre and radius, a circle"
+    )
     integrator: AnyIntegrator = Field(default_factory=SemiImplicitEuler)
     dt: float = Field(default=0.02, gt=0, description="s, one physics step")
     dtype: Literal["float64", "float32"] = Field(default="float64", description="precision of everything")
@@ -176,6 +197,7 @@ class Scene(Record):
             )
         check_places(self)
         check_dt(self)
+        check_lookahead(self)
         return self
 
     def _check_counts(self) -> None:
@@ -189,9 +211,14 @@ class Scene(Record):
         if size is not None and len(size) != self.dimension:
             raise ValueError(f"space.size = {size} has {len(size)} edges, but dimension = {self.dimension}")
         for k, obstacle in enumerate(self.obstacles):
-            if len(obstacle.centre) != self.dimension:
-                raise ValueError(f"obstacles[{k}].centre = {obstacle.centre}: dimension = {self.dimension}")
+            if obstacle.dimension != self.dimension:
+                where = f"centre = {obstacle.centre}" if isinstance(obstacle, Circle) else f"kind = {obstacle.kind}"
+                lies = "" if isinstance(obstacle, Circle) else f"lies in {obstacle.dimension} dimensions, but "
+                raise ValueError(f"obstacles[{k}].{where}: {lies}dimension = {self.dimension}")
+            self._check_shape(k, obstacle)
         for k, group in enumerate(self.groups):
+            if group.banking is not None and self.dimension == 2:
+                raise ValueError(f"groups[{k}].banking = {group.banking:g}: only in 3-D is there a side to lean to")
             for name in ("low", "high", "heading"):
                 value = getattr(group.spawn, name)
                 if value is not None and len(value) != self.dimension:
@@ -204,6 +231,22 @@ class Scene(Record):
             elif size is None and group.spawn.low is None:
                 raise ValueError(f"groups[{k}].spawn.low: missing; a plane has no size to spread agents over")
 
+    def _check_shape(self, k: int, shape: Shape) -> None:
+        """Refuse, on a torus, what reaches around it: only the nearest image of a shape is met."""
+        if not isinstance(self.space, Torus) or isinstance(shape, Circle):
+            return
+        if isinstance(shape, HalfSpace):
+            raise ValueError(
+                f"obstacles[{k}].kind = {shape.kind}: on a torus a plane has no two sides; only a plane or a box is "
+                "allowed"
+            )
+        edges = np.ptp(shape.extremes, axis=0)
+        if (edges > np.array(self.space.size) / 2).any():
+            raise ValueError(
+                f"obstacles[{k}].kind = {shape.kind}: {np.round(edges, 3).tolist()} m; at most half of the torus, "
+                f"{(np.array(self.space.size) / 2).tolist()} m, is allowed"
+            )
+
     # --- what follows from the fields -------------------------------------------------------------------------------
 
     @property
@@ -215,6 +258,16 @@ class Scene(Record):
     def starts(self) -> tuple[int, ...]:
         """The first agent of each group, and N."""
         return (0, *itertools.accumulate(group.size for group in self.groups))
+
+    @functools.cached_property
+    def circles(self) -> tuple[Circle, ...]:
+        """The round obstacles: they are part of the state."""
+        return tuple(shape for shape in self.obstacles if isinstance(shape, Circle))
+
+    @functools.cached_property
+    def shapes(self) -> tuple[Shape, ...]:
+        """The other obstacles: they are the same in every world."""
+        return tuple(shape for shape in self.obstacles if not isinstance(shape, Circle))
 
     @property
     def roles(self) -> tuple[str, ...]:
@@ -235,6 +288,7 @@ class Scene(Record):
             reals += parts.rows + parts.numbers
             whole += 3 * 4
         reals += d * (parts.pulls + parts.flows + parts.bounces)
+        reals += 2 * parts.frame_rows + len(parts.frame_numbers)
         if parts.treed:
             numbers = tree_sizes(self.agents, parts.width, d, 1)
             reals += -(-sum(numbers.values()) // self.agents)
@@ -252,7 +306,8 @@ class Scene(Record):
             return np.repeat(np.array(values, self.dtype), [g.size for g in self.groups])
 
         mass = all_masses(self.groups, self.dimension).astype(self.dtype)
-        return Body(mass, *(per_agent(name) for name in ("radius", "max_speed", "max_force")))
+        names = ("radius", "max_speed", "max_force", "max_turn_rate", "banking")
+        return Body(mass, *map(per_agent, names))
 
     @functools.cached_property
     def parts(self) -> Parts:
@@ -262,7 +317,11 @@ class Scene(Record):
         effects = flattened(self.effects)
         return Parts(
             self.dimension, self.space, effects, self.integrator, self.dtype, sorts, crowded=crowded,
-            starts=self.starts, tables=tuple(effect.table(self) for effect in effects if effect.tabled),
+            oriented=any(group.keeps_heading for group in self.groups),
+            turns=any(group.max_turn_rate is not None for group in self.groups),
+            leans=any(group.banking is not None for group in self.groups),
+            starts=self.starts, shapes=self.shapes, circles=len(self.circles),
+            tables=tuple(effect.table(self) for effect in effects if effect.tabled),
         )  # fmt: skip
 
     @functools.cached_property
@@ -300,14 +359,25 @@ class Scene(Record):
             need = self.bytes_per_world() * worlds / 2**30
             most = MEMORY_LIMIT / 2**30
             raise ValueError(f"worlds is {worlds}: needs about {need:.3g} GiB, at most {most:g} allowed")
-        state = states.blank(worlds, self.agents, self.dimension, len(self.obstacles), self.dt, self.dtype)
+        state = states.blank(
+            worlds, self.agents, self.dimension, len(self.circles), self.dt, self.dtype, self.parts.frame_rows
+        )
         state.key[:] = [key_of(seed + k, 0) for k in range(worlds)]
-        for m, obstacle in enumerate(self.obstacles):
+        for m, obstacle in enumerate(self.circles):
             state.obstacles.centre[:, m] = obstacle.centre
             state.obstacle_radius[:, m] = obstacle.radius
         for b in range(worlds):
             self._scatter(state, b)
+        self._face(state)
         return state
+
+    def _face(self, state: State) -> None:
+        """Write where everybody faces in the beginning: whither he flies, or as his group's heading says."""
+        for first, group in zip(self.starts, self.groups, strict=False):
+            if self.parts.oriented and group.spawn.heading is not None:
+                heading = np.asarray(group.spawn.heading, float)
+                state.heading[:, first : first + group.size] = heading / np.linalg.norm(heading)
+        state.face()
 
     def _scatter(self, state: State, b: int) -> None:
         place, first, d = entry(scatter), 0, self.dimension
@@ -321,11 +391,18 @@ class Scene(Record):
             low = np.array(spawn.low if spawn.low is not None else (0.0,) * d, float)
             high = np.array(spawn.high if spawn.high is not None else self.space.extent(d), float)
             heading = np.array(spawn.heading if spawn.heading is not None else (0.0,) * d, float)
-            place(
-                state.key[b], state.x[:, b], state.v[:, b], self.body.radius, first, first + group.size, low, high,
-                *spawn.speed, heading, state.obstacle_x[:, b], state.obstacle_radius[b],
-                period, np.zeros(d),
-            )  # fmt: skip
+            tried = np.zeros(self.agents, np.int64)
+            mine = slice(first, first + group.size)
+            for _ in range(ROUNDS if self.shapes else 1):
+                place(
+                    state.key[b], state.x[:, b], state.v[:, b], self.body.radius, first, first + group.size, low, high,
+                    *spawn.speed, heading, state.obstacle_x[:, b], state.obstacle_radius[b],
+                    period, np.zeros(d), tried,
+                )  # fmt: skip
+                inside = clear_of(self.shapes, np.array(state.pos[b, mine], np.float64), period) < group.radius
+                if not inside.any():
+                    break
+                tried[mine] += inside
             first += group.size
 
     def _place(self, state: State, b: int, first: int, group: Group) -> None:
@@ -416,8 +493,8 @@ class Scene(Record):
             raise ValueError(f"times is {times!r}, must be a finite number for each of {b} worlds, or one for all")
         when = np.ascontiguousarray(np.broadcast_to(given, b), self.dtype)
         self._field(
-            state.x, state.v, state.alive, state.key, state.obstacle_x, state.obstacle_radius, state.work,
-            self._drive(drive, state), self._params, when, acc, flow, *self._workspaces(1, 1)[0].of(0),
+            state.x, state.v, *state.frames, state.alive, state.key, state.obstacle_x, state.obstacle_radius,
+            state.work, self._drive(drive, state), self._params, when, acc, flow, *self._workspaces(1, 1)[0].of(0),
         )  # fmt: skip
         return acc.transpose(1, 2, 0), flow.transpose(1, 2, 0) if self.parts.flows else None
 
@@ -449,8 +526,8 @@ class Scene(Record):
         team = crew if worlds < crew and agents >= WORTH_SHARING and not self.integrator.adaptive else 1
         crew = crew if team > 1 else min(crew, worlds)
         arrays = (
-            state.x, state.v, state.alive, state.tick, state.key, state.obstacle_x, state.obstacle_radius, state.work,
-            drive, self._params, self._dt, steps,
+            state.x, state.v, *state.frames, state.alive, state.tick, state.key, state.obstacle_x,
+            state.obstacle_radius, state.work, drive, self._params, self._dt, steps,
         )  # fmt: skip
         if crew == 1:
             return self._kernel(*arrays, 0, worlds, 0, 1, *self._workspaces(1, 1)[0].of(0))  # type: ignore[no-any-return]
@@ -474,6 +551,9 @@ class Scene(Record):
                 f"the state holds (N, D) = {state.shape[1:]} of {state.x.dtype}, "
                 f"but this scene has {expected[:2]} of {expected[2]}"
             )
+        if len(state.frame) != self.parts.frame_rows:
+            has, keeps = ("keeps" if rows else "keeps no" for rows in (len(state.frame), self.parts.frame_rows))
+            raise ValueError(f"the state {has} headings, but this scene {keeps} headings")
         if state.dt != self.dt:
             raise ValueError(
                 f"the state counts steps of {state.dt:g} s, but this scene makes steps of {self.dt:g} s; "
@@ -528,12 +608,18 @@ class Scene(Record):
         low, high = self._view(state, world)
         return Snapshot(
             time=float(state.time[world]), pos=state.pos[world], vel=state.vel[world], alive=state.alive[world],
+            heading=state.heading[world] if state.frames else None,
             radius=np.asarray(self.body.radius, np.float64), roles=self.roles,
             obstacle_centre=state.obstacles.centre[world], obstacle_radius=state.obstacle_radius[world],
             marks=self.marks,
             low=np.array(low, np.float64), high=np.array(high, np.float64),
-            periodic=self.space.periodic, title=title, bonds=self.edges,
+            periodic=self.space.periodic, title=title, bonds=self.edges, outlines=self.outlines(low, high),
         )  # fmt: skip
+
+    def outlines(self, low: Sequence[float], high: Sequence[float]) -> tuple[Floats, ...]:
+        """Return obstacles that are no circles as polygons, each (n, 2) m, seen from above in a region."""
+        region = np.array(low, np.float64), np.array(high, np.float64)
+        return tuple(polygon for shape in self.shapes for polygon in shape.outline(*region))
 
     def _view(self, state: State, world: int) -> tuple[Sequence[float], Sequence[float]]:
         """Return the region to show: the space, or where everybody is."""
@@ -541,7 +627,10 @@ class Scene(Record):
             return (0.0,) * self.dimension, self.space.extent(self.dimension)
         pos = state.pos[world]
         margin = 1.0 + 0.05 * float(np.ptp(pos, axis=0).max())
-        return tuple(pos.min(axis=0) - margin), tuple(pos.max(axis=0) + margin)
+        low, high = pos.min(axis=0) - margin, pos.max(axis=0) + margin
+        around = [np.asarray(shape.extremes) for shape in self.shapes]
+        every = np.concatenate([low[None], high[None], *around])
+        return tuple(every.min(axis=0)), tuple(every.max(axis=0))
 
     @property
     def marks(self) -> tuple[Mark, ...]:

@@ -15,15 +15,16 @@ __all__ = ["KINDS", "ROLES", "Floats", "Mark", "Snapshot"]
 Floats = NDArray[np.float64]
 
 ROLES: Final = ("pursuer", "evader", "learner", "flockmate", "agent")
-KINDS: Final = ("goal", "heading")
+KINDS: Final = ("goal", "heading", "way")
 
 
 @dataclass(frozen=True, eq=False)
 class Mark:
-    """Something to see that is no body: a goal, or a heading that is asked for.
+    """Something to see that is no body: a goal, a heading that is asked for, a piece of a way.
 
     kind: "goal" (a disc of `radius` around `at`; `vector` is not read) or "heading" (an arrow that starts at `at` and
-    points along `vector`; only its direction counts, and a zero vector draws nothing; `radius` is not read).
+    points along `vector`; only its direction counts, and a zero vector draws nothing; `radius` is not read) or "way" (a
+    pale disc of `radius`: many of them that overlap are a track; `vector` is not read).
     at, vector: (D,) with D = 2 or 3, at in m. radius: m, >= 0. Arrays are copied and read-only.
     Raises ValueError or TypeError, in one line, on an unknown kind, a wrong shape or a number that is not finite.
     """
@@ -49,7 +50,9 @@ class Snapshot:
     time: s. pos (N, D): m. vel (N, D): m/s. alive (N,): bool. radius (N,): m. roles: N names out of ROLES.
     obstacle_centre (M, D), obstacle_radius (M,): m. marks: goals and headings. low, high (D,): the region to show, m.
     periodic: whether what leaves the region enters it on the far side. title: one line. D = 2 or 3; N and M may be 0.
+    outlines: polygons (n, 2), m, of obstacles that are not round, as seen from above.
     bonds (E, 2): int, pairs of agents that a line is drawn between, the shortest way; none by default.
+    heading (N, D): where everybody faces; none by default, and then that is along the velocity.
     Arrays are private copies and read-only; positions and velocities may hold NaN or inf (a run that diverged can be
     looked at: such bodies are left out), everything else is finite.
     Raises ValueError or TypeError, in one line that names the field, on anything else.
@@ -69,6 +72,8 @@ class Snapshot:
     periodic: bool
     title: str
     bonds: NDArray[np.int32] = field(default_factory=lambda: np.zeros((0, 2), np.int32))
+    outlines: tuple[Floats, ...] = ()
+    heading: Floats | None = None
 
     def __post_init__(self) -> None:
         pos = _array("Snapshot.pos", self.pos, (None, None), finite=False)
@@ -89,7 +94,9 @@ class Snapshot:
             low=_array("Snapshot.low", self.low, (dimension,)),
             high=_array("Snapshot.high", self.high, (dimension,)),
             periodic=bool(self.periodic),
+            heading=None if self.heading is None else _array("Snapshot.heading", self.heading, (agents, dimension)),
             bonds=_pairs("Snapshot.bonds", self.bonds, agents),
+            outlines=tuple(_array("Snapshot.outlines", polygon, (None, 2)) for polygon in self.outlines),
         )
         if not isinstance(self.title, str):
             raise TypeError(f"Snapshot.title: must be a str, got {type(self.title).__name__}")
@@ -105,6 +112,11 @@ class Snapshot:
     def dimension(self) -> int:
         """D: 2 or 3."""
         return int(self.pos.shape[1])
+
+    @property
+    def aim(self) -> Floats:
+        """Where everybody points, (N, D), of any length; zero where nobody knows."""
+        return self.vel if self.heading is None else self.heading
 
     @property
     def tied(self) -> NDArray[np.bool_]:

@@ -71,17 +71,18 @@ def _overlap(pos: Any, i: int, radius: float, centre: Any, obstacle_radius: Any,
 @kernel
 def scatter(
     key: Any, pos: Any, vel: Any, radius: Any, first: int, end: int, low: Any, high: Any, slow: float, fast: float,
-    heading: Any, centre: Any, obstacle_radius: Any, period: Any, unit: Any,
+    heading: Any, centre: Any, obstacle_radius: Any, period: Any, unit: Any, tried: Any,
 ) -> None:  # fmt: skip
     """Place agents [first, end) of one world: uniform in [low, high), clear of obstacles if 64 tries find room.
 
     pos, vel (D, N); low, high, heading, period, unit (D,); a heading of zeros means a random one; `period` is the
-    size of a periodic box, zeros for none; `unit` is scratch.
+    size of a periodic box, zeros for none; `unit` is scratch. `tried` (N,) is how many tries are over already, and
+    becomes the number of the one that is kept.
     """
     dimension = pos.shape[0]
     for i in range(first, end):
-        best, kept = 1e300, 0
-        for t in range(TRIES):
+        best, kept = 1e300, tried[i]
+        for t in range(tried[i], tried[i] + TRIES):
             for k in range(dimension):
                 pos[k, i] = low[k] + (high[k] - low[k]) * uniform(key, t, i, k)
             overlap = _overlap(pos, i, radius[i], centre, obstacle_radius, period)
@@ -91,6 +92,7 @@ def scatter(
                 break
         for k in range(dimension):
             pos[k, i] = low[k] + (high[k] - low[k]) * uniform(key, kept, i, k)
+        tried[i] = kept
         speed = slow + (fast - slow) * uniform(key, 0, i, 3)
         direction(key, 0, i, 4, unit)
         length = 0.0

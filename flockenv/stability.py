@@ -19,9 +19,19 @@ from flockenv.integrators.base import Integrator
 from flockenv.state import blank
 
 if TYPE_CHECKING:
-    from flockenv.scene import Scene
+    from flockenv.effects.base import Effect
+    from flockenv.scene import Group, Scene
 
-__all__ = ["Suggestion", "UnstableStepWarning", "amplification", "check_dt", "limit", "suggest_dt"]
+__all__ = [
+    "LookaheadWarning",
+    "Suggestion",
+    "UnstableStepWarning",
+    "amplification",
+    "check_dt",
+    "check_lookahead",
+    "limit",
+    "suggest_dt",
+]
 
 Floats = NDArray[np.float64]
 
@@ -46,6 +56,10 @@ FASTEST = 32
 
 class UnstableStepWarning(UserWarning):
     """A scene's dt is beyond the largest stable step."""
+
+
+class LookaheadWarning(UserWarning):
+    """Somebody notices obstacles too late to stop before them."""
 
 
 class Suggestion(NamedTuple):
@@ -216,3 +230,28 @@ def _blows_up(scene: Scene, found: Suggestion) -> bool:
     zeta = found.damping / (2 * found.frequency)
     slowest = min(growth(scene.integrator, y, *shares)[0] for shares in ((zeta, 0.0), (0.0, zeta)))
     return bool(slowest > 100 ** (1 / 100))
+
+
+def check_lookahead(scene: Scene) -> None:
+    """Warn of those who look ahead less far than it takes them to stop: V^2 m/(2 F), and their radius."""
+    for k, effect in enumerate(scene.effects):
+        several = [(f"effects[{k}].behaviours[{j}]", each) for j, each in enumerate(effect.wishes)]
+        only = getattr(effect, "group", None) if several else None
+        for name, each in several or [(f"effects[{k}]", effect)]:
+            for g, group in enumerate(scene.groups):
+                if only in (None, g):
+                    _warn_late(name, each, g, group)
+
+
+def _warn_late(name: str, effect: Effect, g: int, group: Group) -> None:
+    """Warn if one group sees too late by one effect; who has no top speed, or no bounds of force, is not judged."""
+    fastest, strongest = group.max_speed, group.max_force
+    if fastest is None or not strongest or (sees := effect.lookahead(fastest)) is None:
+        return
+    needs = fastest**2 * group.mass / (2 * strongest) + group.radius
+    if sees < needs:
+        message = (
+            f"{name}.horizon = {sees / fastest:g}: groups[{g}] at {fastest:g} m/s sees {sees:.3g} m ahead, and needs "
+            f"{needs:.3g} m to stop (V^2 m/(2 max_force) + radius); at least {needs / fastest:.3g} s is enough"
+        )
+        warnings.warn(message, LookaheadWarning, stacklevel=2)

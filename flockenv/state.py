@@ -13,6 +13,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from flockenv.kernels import entry
+from flockenv.vehicle import face
+
 __all__ = ["WORK", "Body", "Floats", "Obstacles", "State"]
 
 Floats = NDArray[np.floating[Any]]
@@ -41,14 +44,16 @@ class Body:
     radius: Floats  # (N,) m
     max_speed: Floats  # (N,) m/s, may be inf
     max_force: Floats  # (N,) N, bounds what an agent asks for (drive and steering), not what acts on it; may be inf
+    max_turn_rate: Floats  # (N,) rad/s, may be inf
+    banking: Floats  # (N,) s, in which it leans into its turns; inf = it does not
 
     def astype(self, dtype: Any) -> Body:
         """Return the same bodies in another precision."""
         return Body(*(np.ascontiguousarray(a, dtype) for a in self.arrays()))
 
-    def arrays(self) -> tuple[Floats, Floats, Floats, Floats]:
-        """Return the four arrays in the order in which kernels take them."""
-        return (self.mass, self.radius, self.max_speed, self.max_force)
+    def arrays(self) -> tuple[Floats, ...]:
+        """Return the arrays."""
+        return (self.mass, self.radius, self.max_speed, self.max_force, self.max_turn_rate, self.banking)
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,6 +71,7 @@ class State:
     obstacle_x: Floats  # (D, B, M) m
     obstacle_radius: Floats  # (B, M) m
     work: NDArray[np.int64]  # (B, 8) counters, see WORK
+    frame: Floats  # (F, B, N) unit vectors: where everybody faces, in space which way is up; F = 0 if nobody keeps that
     dt: float  # s, one physics step: time = tick dt
 
     @property
@@ -79,10 +85,27 @@ class State:
         return self.v.transpose(1, 2, 0)
 
     @property
+    def frames(self) -> tuple[Floats, ...]:
+        """The array of frames, if this state has one: what kernels are given of it."""
+        return (self.frame,) if len(self.frame) else ()
+
+    @property
     def heading(self) -> Floats:
-        """Where everybody faces, unit vectors (B, N, D): along the velocity; 0 at standstill."""
+        """Where everybody faces, unit vectors (B, N, D): a view if headings are kept.
+
+        If not, along the velocity, and 0 at standstill.
+        """
+        if self.frames:
+            return self.frame[: len(self.x)].transpose(1, 2, 0)
         speed = np.sqrt((self.vel**2).sum(axis=-1, keepdims=True))
         return np.asarray(np.divide(self.vel, speed, out=np.zeros_like(self.vel), where=speed > 0))
+
+    @property
+    def up(self) -> Floats:
+        """Which way is up for everybody, unit vectors across the heading as a view, (B, N, 3); none in the plane."""
+        if not self.frames or len(self.x) == 2:
+            raise ValueError("up: only states of scenes in 3-D have it in which a group is oriented")
+        return self.frame[3:].transpose(1, 2, 0)
 
     @property
     def time(self) -> NDArray[np.float64]:
@@ -121,7 +144,10 @@ class State:
             getattr(self, name)[...] = getattr(other, name)
 
     def with_motion(self, pos: ArrayLike, vel: ArrayLike) -> State:
-        """Return a copy with other positions and velocities, each (B, N, D); refuses other shapes and NaN."""
+        """Return a copy with other positions and velocities, each (B, N, D); refuses other shapes and NaN.
+
+        Where headings are kept, who moves faces along his new velocity.
+        """
         new = self.copy()
         for name, given, target in (("pos", pos, new.pos), ("vel", vel, new.vel)):
             array = np.asarray(given, float)
@@ -130,7 +156,13 @@ class State:
             if not np.isfinite(array).all():
                 raise ValueError(f"{name} holds NaN or infinity at (world, agent, axis) {tuple(_first_bad(array))}")
             target[...] = array
+        new.face()
         return new
+
+    def face(self) -> None:
+        """Where headings are kept, let everybody face along his velocity, or as before if there is none."""
+        for b in range(self.shape[0] if self.frames else 0):
+            entry(face)(self.v, self.frame, b, False)
 
     def with_dt(self, dt: float) -> State:
         """Return a copy whose clock counts steps of another length, s; refuses one that does not divide its time."""
@@ -155,15 +187,17 @@ class State:
         return replace(self, **arrays)
 
 
-_PER_COORDINATE = ("x", "v", "obstacle_x")
-_ARRAYS = ("x", "v", "alive", "tick", "key", "obstacle_x", "obstacle_radius", "work")
+_PER_COORDINATE = ("x", "v", "obstacle_x", "frame")
+_ARRAYS = ("x", "v", "alive", "tick", "key", "obstacle_x", "obstacle_radius", "work", "frame")
 
 
 def _first_bad(array: Floats) -> list[int]:
     return [int(k) for k in np.argwhere(~np.isfinite(array))[0]]
 
 
-def blank(worlds: int, agents: int, dimension: int, obstacles: int, dt: float, dtype: Any = np.float64) -> State:
+def blank(
+    worlds: int, agents: int, dimension: int, obstacles: int, dt: float, dtype: Any = np.float64, frame_rows: int = 0
+) -> State:
     """Return a state of zeros, everybody alive: what a spawn writes into."""
     return State(
         x=np.zeros((dimension, worlds, agents), dtype),
@@ -174,5 +208,6 @@ def blank(worlds: int, agents: int, dimension: int, obstacles: int, dt: float, d
         obstacle_x=np.zeros((dimension, worlds, obstacles), dtype),
         obstacle_radius=np.zeros((worlds, obstacles), dtype),
         work=np.zeros((worlds, len(WORK)), np.int64),
+        frame=np.zeros((frame_rows, worlds, agents), dtype),
         dt=dt,
     )

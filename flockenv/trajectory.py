@@ -48,6 +48,7 @@ class Trajectory:
     last: State
     wall: float  # s, without compiling
     stopped: str  # why it ended before its time; "" if it did not
+    heading: Floats | None = None  # (T, N, D) where everybody faces, of scenes that keep headings
 
     @property
     def rate(self) -> float:
@@ -62,9 +63,12 @@ class Trajectory:
     def snapshots(self, title: str = "") -> Iterator[Snapshot]:
         """Return every instant, ready to be drawn, all in one frame: the space, or where anybody ever was."""
         low, high = _region(self.scene, self.pos)
-        start = self.scene.snapshot(self.first, title=title)
-        for step, pos, vel, alive in zip(self.step, self.pos, self.vel, self.alive, strict=True):
-            yield replace(start, time=step * self.scene.dt, pos=pos, vel=vel, alive=alive, low=low, high=high)
+        start = replace(self.scene.snapshot(self.first, title=title), outlines=self.scene.outlines(low, high))
+        for k, step in enumerate(self.step):
+            yield replace(
+                start, time=step * self.scene.dt, pos=self.pos[k], vel=self.vel[k], alive=self.alive[k], low=low,
+                high=high, heading=None if self.heading is None else self.heading[k],
+            )  # fmt: skip
 
     def summary(self) -> dict[str, Any]:
         """Return what is worth knowing without the arrays, ready for JSON: what has no meaning is null, never NaN."""
@@ -86,13 +90,16 @@ class Trajectory:
         """Write X.npz and X.json beside it, each whole or not at all; return the path of the latter.
 
         Arrays: time (T,) s, pos (T, N, D) m, vel (T, N, D) m/s, alive (T, N), radius (N,) m, seed, and `scene`, the
-        YAML text that `load_scene` reads; none needs pickle. Missing folders are made.
+        YAML text that `load_scene` reads; and heading (T, N, D) where headings are kept. None needs pickle. Missing
+        folders are made.
         """
         path.parent.mkdir(parents=True, exist_ok=True)
+        more: dict[str, Any] = {} if self.heading is None else {"heading": self.heading}
         with replacing(path) as file:
             np.savez(
                 file, time=self.step * self.scene.dt, pos=self.pos, vel=self.vel, alive=self.alive,
                 radius=self.scene.body.radius, seed=np.uint64(self.seed), scene=np.array(dump_scene(self.scene)),
+                **more,
             )  # fmt: skip
         beside = path.with_suffix(".json")
         with replacing(beside) as file:
@@ -130,7 +137,10 @@ def record(
     film.keep(last)
     n = len(film.step)
     step = np.array(film.step, np.int64)
-    return Trajectory(scene, seed, step, film.pos[:n], film.vel[:n], film.alive[:n], first, last, wall, stopped)
+    return Trajectory(
+        scene, seed, step, film.pos[:n], film.vel[:n], film.alive[:n], first, last, wall, stopped,
+        None if film.heading is None else film.heading[:n],
+    )  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,18 +150,22 @@ class _Film:
     pos: Floats
     vel: Floats
     alive: NDArray[np.bool_]
+    heading: Floats | None
     step: list[int]
 
     @classmethod
     def of(cls, scene: Scene, instants: int) -> _Film:
         shape = (instants, scene.agents, scene.dimension)
-        return cls(np.empty(shape, scene.dtype), np.empty(shape, scene.dtype), np.empty(shape[:2], np.bool_), [])
+        pos, vel, heading = (np.empty(shape, scene.dtype) for _ in range(3))
+        return cls(pos, vel, np.empty(shape[:2], np.bool_), heading if scene.parts.oriented else None, [])
 
     def keep(self, state: State) -> None:
         """Add an instant, unless it is there already."""
         k, step = len(self.step), int(state.tick[0])
         if not k or step > self.step[-1]:
             self.pos[k], self.vel[k], self.alive[k] = state.pos[0], state.vel[0], state.alive[0]
+            if self.heading is not None:
+                self.heading[k] = state.heading[0]
             self.step.append(step)
 
 
@@ -159,7 +173,7 @@ def _checked_instants(scene: Scene, steps: int, every: int) -> int:
     if steps < 0 or every < 1:
         raise ValueError(f"steps = {steps} must be at least 0 and every = {every} at least 1")
     instants = 1 + -(-steps // every)
-    each = scene.agents * (2 * scene.dimension * np.dtype(scene.dtype).itemsize + 1)
+    each = scene.agents * ((2 + scene.parts.oriented) * scene.dimension * np.dtype(scene.dtype).itemsize + 1)
     needed = instants * (each + 40)  # the step is a Python number in a list
     if needed > MEMORY_LIMIT:
         rarer = every * math.ceil(needed / MEMORY_LIMIT) * scene.dt
@@ -189,7 +203,8 @@ def _region(scene: Scene, pos: Floats) -> tuple[NDArray[np.float64], NDArray[np.
         return np.zeros(scene.dimension), np.array(scene.space.extent(scene.dimension))
     low, high = (np.asarray(end(pos, axis=(0, 1)), np.float64) for end in (np.min, np.max))
     margin = 1.0 + 0.05 * float((high - low).max())
-    return low - margin, high + margin
+    every = np.concatenate([[low - margin], [high + margin], *(shape.extremes for shape in scene.shapes)])
+    return every.min(axis=0), every.max(axis=0)
 
 
 def _json(value: float) -> float | None:

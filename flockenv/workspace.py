@@ -50,6 +50,7 @@ class Workspace:
             "tie": padded * d if "t0" in parts.fields else 1,
             "pulled": padded * d if parts.pulls else 1,
             "carrying": padded * d if parts.flows else 1,
+            "frame": max(padded * (parts.frame_rows + len(parts.frame_numbers)), 1),
             "felt": max(swept * d * len(parts.targets), 1),
             "sorted_": parts.rows * (swept + width if parts.sorts else SMALL_STRIDE),
             "records": (swept if sorts else 1) * parts.numbers,
@@ -72,6 +73,10 @@ class Workspace:
         for name, pad in (("mass", 1), ("radius", 0), ("max_speed", 1), ("max_force", 1)):
             arrays[name][:] = pad
             arrays[name][:agents] = getattr(body, name)
+        for k, name in enumerate(parts.frame_numbers):
+            first = padded * (parts.frame_rows + k)
+            arrays["frame"][first : first + agents] = getattr(body, name)
+            arrays["frame"][first + agents : first + padded] = 1
         arrays["ident"][:] = np.arange(padded)
         if "t0" in parts.fields:
             blocks = ties(padded, d).reshape(-1, width, d).transpose(0, 2, 1)

@@ -79,8 +79,9 @@ class World:
         self.observation_size, self.action_size = task.layout.size, task.action_layout.size
         # The kernel is handed these arrays once and for all: write into them, never put others in their place.
         self.state: Final = states.blank(
-            self.worlds, self.agents, scene.dimension, task.obstacle_slots, scene.dt, scene.dtype
-        )
+            self.worlds, self.agents, scene.dimension, task.obstacle_slots, scene.dt, scene.dtype,
+            scene.parts.frame_rows,
+        )  # fmt: skip
         self.steps: Final = np.zeros(self.worlds, np.int64)
         self.paid: Final = np.zeros((self.worlds, self.learners, len(task.terms)))  # terms, summed over the episode
         self._memory: Final = np.zeros((task.memory, self.worlds, self.agents), scene.dtype)
@@ -98,8 +99,8 @@ class World:
         self._actions = np.zeros((b, i, self.action_size))
         numbers = (task.parts.given(), list(task.parameters().values()), task.table() or (0.0,))
         self._worlds = (
-            s.x, s.v, s.alive, s.tick, s.obstacle_x, s.obstacle_radius, s.work, s.key, self._memory, self.steps,
-            *(np.array(values, real) for values in numbers),
+            s.x, s.v, *s.frames, s.alive, s.tick, s.obstacle_x, s.obstacle_radius, s.work, s.key, self._memory,
+            self.steps, *(np.array(values, real) for values in numbers),
         )  # fmt: skip
         self._clock = (np.dtype(real).type(scene.dt), task.substeps, not task.ends_together)
         self._scratch = [self._allocate()]
@@ -294,11 +295,13 @@ class World:
         low, high = self.task.view(s, world)
         return Snapshot(
             time=float(s.time[world]), pos=s.pos[world], vel=s.vel[world], alive=s.alive[world],
+            heading=s.heading[world] if s.frames else None,
             radius=np.asarray(self.task.scene.body.radius, np.float64), roles=self.task.scene.roles,
             obstacle_centre=s.obstacles.centre[world], obstacle_radius=s.obstacle_radius[world],
             marks=self.task.marks(s, self._memory, world),
             low=np.array(low, np.float64), high=np.array(high, np.float64),
             periodic=self.task.scene.space.periodic, title=type(self.task).__name__,
+            outlines=self.task.scene.outlines(low, high),
         )  # fmt: skip
 
 

@@ -16,6 +16,7 @@ from types import ModuleType
 from typing import Any
 
 import numpy as np
+import pytest
 from numpy.typing import NDArray
 
 from flockenv import arbitration, steering
@@ -33,22 +34,35 @@ from flockenv.behaviours import (
     Arrive,
     AvoidObstacles,
     Cohesion,
+    Contain,
     Dock,
     Evade,
+    Explore,
     Face,
     Flee,
+    FollowFlow,
     FollowLeader,
+    FollowPath,
+    FollowWall,
+    FollowWay,
+    Forage,
+    ForceField,
     Formation,
     Hide,
     Interpose,
     MatchVelocity,
     OffsetPursue,
+    Orca,
     Pursue,
+    Queue,
     Seek,
     Separation,
     Shadow,
+    StayOnPath,
     TargetSpeed,
+    UnalignedAvoidance,
     Wander,
+    Whiskers,
 )
 from flockenv.effects import EFFECTS as EFFECT_KINDS
 from flockenv.effects import (
@@ -92,11 +106,12 @@ from flockenv.integrators import (
 )
 from flockenv.networks import Mesh
 from flockenv.scene import Group, Scene
+from flockenv.shapes import Circle
 from flockenv.space import Box, Plane, Space, Torus
 from flockenv.spawn import Spawn
 from flockenv.steer import Steer
+from flockenv.tasks import Crossing, Flock, Herd, Obstacles, PathFollow, Pursuit, Task
 from flockenv.tasks import Evade as EvadeTask
-from flockenv.tasks import Flock, Herd, Obstacles, Pursuit, Task
 
 Array = NDArray[np.float64]
 
@@ -142,6 +157,7 @@ STEERING = (
     Law(steering.dock, ("vector", "vector", "heading", "positive", "length", "positive", "length"), "vector"),
     Law(steering.approach_time, ("vector", "positive", "length"), "positive"),
     Law(steering.opensteer_time, ("vector", "vector", "vector", "length"), "positive"),
+    Law(steering.passing_point, ("vector", "vector", "positive"), "vector"),
     Law(steering.offset_pursue, ("vector", "vector", "vector", "positive", "positive", "positive"), "vector"),
     Law(
         steering.keep_station, ("vector", "vector", "vector", "own", "positive", "length"), "vector", turns="upright",
@@ -166,6 +182,14 @@ STEERING = (
     Law(steering.cohere, ("vector", "vector", "positive"), "vector"),
     Law(steering.threat, ("heading", "vector", "positive", "length"), "positive"),
     Law(steering.avoid, ("heading", "vector", "positive", "positive"), "vector"),
+    Law(steering.unaligned_threat, ("vector", "vector", "vector", "positive", "length"), "positive"),
+    Law(steering.give_way, ("vector", "vector", "vector", "positive", "positive"), "vector"),
+    Law(steering.queue_gap, ("heading", "vector", "vector", "positive", "positive"), "positive"),
+    Law(steering.queue, ("heading", "vector", "positive", "positive", "positive"), "vector"),
+    Law(steering.explore, ("walls", "walls", "vector", "positive", "positive"), "vector", turns="none", mirrors=False),
+    Law(steering.stay_on_path, ("positive", "vector", "vector", "positive"), "vector"),
+    Law(steering.follow_path, ("positive", "positive", "vector", "vector", "positive"), "vector"),
+    Law(steering.follow_flow, ("vector", "vector"), "vector"),
     Law(steering.contain, ("walls", "walls", "vector", "positive", "positive"), "vector", turns="none", mirrors=False),
     Law(steering.heed, ("vector",) * 5 + ("positive",) * 5, "vector"),
     Law(steering.behind, ("vector", "vector", "length"), "vector"),
@@ -193,7 +217,9 @@ class EffectRow:
     beside: tuple[Effect, ...] = ()  # without which it moves nobody: what a medium drags or carries
     obeys: frozenset[str] = frozenset({"translation", "rotation", "mirror", "relabelling"})
     signed: tuple[str, ...] = ()  # parameters that may be negative
+    dimensions: tuple[int, ...] = (2, 3)  # where it is at home
     family: str = ""  # rows of a family share a kernel: in its scene the others are there too, idle; see `company`
+    flat: Effect | None = None  # the effect in the plane, where it is not enough to leave an axis out
 
     @property
     def name(self) -> str:
@@ -203,8 +229,11 @@ class EffectRow:
         return "_".join([self.effect.kind, *words])
 
     def at(self, dimension: int) -> tuple[Effect, ...]:
-        """The effect in so many dimensions, and those beside it."""
-        return tuple(in_dimension(effect, dimension) for effect in (self.effect, *self.beside))
+        """The effect in so many dimensions, and those beside it; a test of others is skipped."""
+        if dimension not in self.dimensions:
+            pytest.skip(f"{self.name}: not in {dimension}-D")
+        effect = self.flat if self.flat is not None and dimension == 2 else self.effect
+        return tuple(in_dimension(effect, dimension) for effect in (effect, *self.beside))
 
     def company(self, dimension: int, idle: bool = False) -> tuple[Effect, ...]:
         """The same among those of its family, which are idle; idle, it is so too."""
@@ -216,17 +245,27 @@ class EffectRow:
         return tuple(effect if acts else effect.idle() for effect, acts in here)
 
 
-def vectors(effect: Effect) -> dict[str, tuple[float, ...]]:
-    """What of an effect's parameters are directions and places."""
-    return {name: value for name, value in effect.parameters().items() if isinstance(value, tuple)}
+def vectors(effect: Effect) -> dict[str, tuple[Any, ...]]:
+    """What of an effect's parameters are directions and places, and lists of places."""
+    given = effect.parameters() | {name: getattr(effect, name) for name in effect.places}
+    return {name: value for name, value in given.items() if isinstance(value, tuple)}
 
 
 def in_dimension(effect: Effect, dimension: int) -> Effect:
     """The same effect with the first numbers of its vectors; in the plane nobody turns about an axis."""
-    flat = {
+    flat: dict[str, Any] = {
         name: None if name == "axis" and dimension == 2 else value[:dimension]
         for name, value in vectors(effect).items()
+        if not isinstance(value[0], tuple)
     }
+    flat |= {
+        name: tuple(place[:dimension] for place in value)
+        for name, value in vectors(effect).items()
+        if isinstance(value[0], tuple)
+    }
+    within = getattr(effect, "within", None)
+    if isinstance(within, Circle) and dimension == 3:
+        flat["within"] = Circle(centre=(*within.centre[:2], 3.0), radius=within.radius)
     return effect.model_copy(update=flat)
 
 
@@ -234,18 +273,23 @@ def turned(effect: Effect, matrix: Array, shift: Array) -> Effect:
     """The same effect with its directions turned, and its places turned about the middle of EDGE and shifted."""
     middle = EDGE / 2
     change = {
-        name: tuple(
-            (np.array(value) - middle) @ matrix.T + middle + shift if name in effect.places else value @ matrix.T
-        )
+        name: (np.array(value) - middle) @ matrix.T + middle + shift if name in effect.places else value @ matrix.T
         for name, value in vectors(effect).items()
     }
-    return effect.model_copy(update={name: tuple(map(float, value)) for name, value in change.items()})
+    return effect.model_copy(update={name: _tuples(value.tolist()) for name, value in change.items()})
+
+
+def _tuples(value: Any) -> Any:
+    """Lists, and lists in them, as tuples."""
+    return tuple(map(_tuples, value)) if isinstance(value, list) else value
 
 
 DRAG = Drag(rate=0.4)
 WIND = Wind(velocity=(1.5, -0.7, 0.4), gust=(0.5, 1.0, -0.3), period=0.8)
 CENTRE = (2.5, 2.5, 2.5)
 UPRIGHT = frozenset({"translation", "relabelling"})
+LOOP = ((1.0, 1.0, 2.5), (5.0, 1.5, 3.0), (4.5, 5.0, 2.0), (1.5, 4.0, 3.5))
+FLOWS = tuple((0.3 * k % 2 - 1, 0.7 * k % 2 - 1, 0.9 * k % 2 - 1) for k in range(24))
 
 EFFECTS = (
     EffectRow(DRAG),
@@ -279,6 +323,18 @@ EFFECTS = (
     EffectRow(Alignment(weight=0.7, radius=3, fov=270)),
     EffectRow(Cohesion(weight=0.9, radius=2.8, fov=240)),
     EffectRow(AvoidObstacles(weight=5, horizon=3, margin=0.1)),
+    EffectRow(UnalignedAvoidance(weight=3, radius=4, horizon=2, margin=0.2), family="crowd"),
+    EffectRow(Queue(weight=2, target=CENTRE, speed=1.2, margin=0.1), family="crowd"),
+    # to each his own way to look for food
+    EffectRow(Forage(weight=2, food=1, speed=1.2, radius=2.4), obeys=frozenset({"translation"}), family="crowd"),
+    EffectRow(
+        Explore(weight=2, low=(-1, -1, -1), high=(7, 8, 7), speed=1.2, track=1.5),
+        obeys=frozenset({"translation", "relabelling"}), signed=("low", "high"), family="goals",
+    ),
+    EffectRow(
+        Orca(weight=5, target=CENTRE, speed=1.2), obeys=frozenset({"translation", "rotation", "relabelling"}),
+        dimensions=(2,),  # in its mirror image everybody keeps left
+    ),
     EffectRow(
         Steer(
             behaviours=(
@@ -300,9 +356,9 @@ EFFECTS = (
     ),
     EffectRow(Pursue(weight=2, speed=1.5, group=0, radius=2.5), family="others"),
     EffectRow(Evade(weight=2, speed=1.5, group=0, radius=2.5, predictor="exact", fov=300), family="others"),
-    EffectRow(OffsetPursue(weight=2, speed=1.5, radius=2.5, distance=0.5, predictor="opensteer"), family="others"),
+    EffectRow(OffsetPursue(weight=2, speed=1.5, radius=2.5, distance=0.3), family="others"),
     EffectRow(
-        Shadow(weight=2, speed=1.5, group=0, radius=2.5, distance=0.5, predictor="distance"), family="others"
+        Shadow(weight=2, speed=1.5, group=0, radius=2.5, distance=0.5, predictor="opensteer"), family="others"
     ),
     EffectRow(MatchVelocity(weight=2, radius=2.5), family="others"),
     EffectRow(
@@ -315,6 +371,24 @@ EFFECTS = (
     ),
     EffectRow(Interpose(weight=2, speed=1.5, group=0, other=0, radius=2.5, slow_radius=1), family="others"),
     EffectRow(Hide(weight=2, speed=1.5, group=0, radius=2.5, slow_radius=1)),
+    EffectRow(Whiskers(weight=5, horizon=3), obeys=UPRIGHT, family="around"),  # in space they are horizontal and vertical
+    EffectRow(ForceField(weight=0.5, range=2), family="around"),
+    EffectRow(FollowWall(weight=2, speed=1.5, distance=0.7, range=4), family="around"),
+    EffectRow(  # its circle stays where it is
+        Contain(weight=2, speed=1.5, within=Circle(centre=(3, 3), radius=2.5)), obeys=frozenset({"relabelling"})
+    ),
+    EffectRow(  # its grid lies along the axes
+        FollowWay(weight=2, speed=1.5, target=(3.0, 5.5, 2.5), clearance=0.1, spacing=0.3, margin=1),
+        obeys=frozenset({"relabelling"}),
+    ),
+    EffectRow(FollowPath(weight=2, points=LOOP, closed=True, radius=0.3, speed=1.5), signed=("way",)),
+    EffectRow(StayOnPath(weight=2, points=LOOP[:3], radius=0.4, speed=1.5, time=1)),
+    EffectRow(
+        FollowFlow(weight=1.5, centre=CENTRE, spacing=1.5, counts=(4, 3, 2), velocities=FLOWS),
+        flat=FollowFlow(weight=1.5, centre=CENTRE[:2], spacing=1.5, counts=(4, 3),
+                        velocities=tuple(flow[:2] for flow in FLOWS[:12])),
+        obeys=frozenset({"translation", "relabelling"}),  # its grid lies along the axes
+    ),
     EffectRow(Gravitation(constant=0.3, softening=0.5)),  # of few the sum is exact; of many, see test_gravitation.py
     EffectRow(InverseSquare(strength=-0.4, softening=0.3), signed=("strength",)),
     # everybody is tied to somebody else; see `tied`
@@ -389,7 +463,10 @@ TASKS = (
     TaskRow(Obstacles()),
     TaskRow(Flock()),
     TaskRow(Flock(learners=1), "_single"),
+    TaskRow(Crossing()),
+    TaskRow(Crossing(agents=8, learners=1), "_single"),
     TaskRow(EvadeTask()),
+    TaskRow(PathFollow()),
     TaskRow(Herd()),
     TaskRow(Herd(dogs=3), "_team"),
 )

@@ -17,8 +17,8 @@ ROOT = Path(__file__).resolve().parent.parent
 LAYERS = (
     {"divergence", "terminal", "refusals", "outputs", "recycle", "crew", "compilation", "inlining"},
     {"records", "vec", "noise", "kernels"},
-    {"state", "space", "steering", "arbitration"},
-    {"neighbours", "shapes", "grid", "orca", "rows", "networks", "elements", "tree"},
+    {"state", "space", "steering", "arbitration", "vehicle"},
+    {"neighbours", "shapes", "grid", "eikonal", "orca", "polyline", "rows", "networks", "elements", "tree"},
     {"effects", "integrators", "collisions", "population", "spawn", "sweep", "stability", "rounding"},
     {"behaviours"},
     {"steer"},

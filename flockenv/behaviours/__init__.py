@@ -17,7 +17,7 @@ from flockenv.effects.base import EFFECTS, Effect
 for _module in pkgutil.iter_modules(__path__):
     importlib.import_module(f"{__name__}.{_module.name}")
 
-from flockenv.behaviours.avoid import AvoidObstacles  # noqa: E402  # after the folder has been walked
+from flockenv.behaviours.avoid import AvoidObstacles, ForceField, Whiskers  # noqa: E402  # after the folder has been walked
 from flockenv.behaviours.base import OvershootWarning  # noqa: E402
 from flockenv.behaviours.chase import Evade, MatchVelocity, OffsetPursue, Pursue, Shadow  # noqa: E402
 from flockenv.behaviours.company import FollowLeader, Formation, Interpose  # noqa: E402
@@ -26,13 +26,17 @@ from flockenv.behaviours.flock import Alignment, Cohesion, Separation  # noqa: E
 from flockenv.behaviours.goals import Arrive, Dock, Face, Flee, Seek, TargetSpeed  # noqa: E402
 from flockenv.behaviours.hide import Hide  # noqa: E402
 from flockenv.behaviours.orca import Orca  # noqa: E402
+from flockenv.behaviours.paths import FollowFlow, FollowPath, StayOnPath  # noqa: E402
+from flockenv.behaviours.walls import Contain, FollowWall  # noqa: E402
 from flockenv.behaviours.wander import Wander  # noqa: E402
+from flockenv.behaviours.way import FollowWay  # noqa: E402
 
 __all__ = [
-    "BEHAVIOURS", "Alignment", "Arrive", "AvoidObstacles", "Cohesion", "Dock", "Evade", "Explore", "Face", "Flee",
-    "FollowLeader", "Forage", "Formation", "Hide", "Interpose", "MatchVelocity", "OffsetPursue", "Orca",
-    "OvershootWarning", "Pursue", "Queue", "Seek", "Separation", "Shadow", "TargetSpeed", "UnalignedAvoidance",
-    "Wander",
+    "BEHAVIOURS", "Alignment", "Arrive", "AvoidObstacles", "Cohesion", "Contain", "Dock", "Evade", "Explore",
+    "Face", "Flee", "FollowFlow", "FollowLeader", "FollowPath", "FollowWall", "FollowWay", "Forage", "ForceField",
+    "Formation", "Hide", "Interpose", "MatchVelocity", "OffsetPursue", "Orca", "OvershootWarning", "Pursue",
+    "Queue", "Seek", "Separation", "Shadow", "StayOnPath", "TargetSpeed", "UnalignedAvoidance", "Wander",
+    "Whiskers",
 ]  # fmt: skip
 
 BEHAVIOURS: dict[str, type[Effect]] = {kind: effect for kind, effect in EFFECTS.items() if effect.steering}

@@ -1,4 +1,8 @@
-"""Steering around round obstacles (Reynolds 1999, "steer to avoid"): zero unless something is really in the way."""
+"""Steering around obstacles of any shape: to avoid (Reynolds 1999), by whiskers, and by a force field, for contrast.
+
+To avoid is zero unless something is really in the way; a force field also pushes those who fly past, and stops those
+who come head-on (Reynolds 1988, "Not Bumping Into Things").
+"""
 
 from __future__ import annotations
 
@@ -8,11 +12,26 @@ import numpy as np
 from pydantic import Field
 
 from flockenv import steering
-from flockenv.effects.base import Effect, Me, Other
+from flockenv.effects.base import Effect, Me, Obstacle
 from flockenv.kernels import Vec, law, like
-from flockenv.vec import norm, scale, select, zero
+from flockenv.vec import add, cross, dot, lateral, norm, perpendicular, scale, select, zero
 
-__all__ = ["AvoidObstacles"]
+__all__ = ["AvoidObstacles", "ForceField", "Whiskers"]
+
+AVOIDING = """
+groups:
+- count: 7
+  radius: 0.2
+  max_speed: 2
+  max_force: 10
+  spawn: {low: [0, 0.5], high: [1, 8.5], speed: [1.8, 1.8], heading: [1, 0]}
+obstacles:
+- {centre: [5, 3], radius: 1.2}
+- {kind: polygon, vertices: [[4, 5.5], [6.5, 5], [7.5, 8], [5.5, 6.7]]}
+- {kind: capsule, start: [9, 1.5], end: [10, 4], radius: 0.3}
+effects:
+- {kind: avoid_obstacles, weight: 8}
+"""
 
 
 @law
@@ -23,10 +42,18 @@ def nothing(p: Any, me: Me) -> Vec:
 
 
 @law
-def nearest_threat(p: Any, me: Me, other: Other, acc: Vec) -> Vec:
+def straight_on(p: Any, me: Me, k: int) -> tuple[Vec, float]:
+    """Where it is heading."""
+    return me.heading, p.margin
+
+
+@law
+def nearest_threat(p: Any, me: Me, other: Obstacle, acc: Vec) -> Vec:
     """Keep the obstacle that the straight path touches first: (distance, clearance, offset)."""
-    clearance = me.radius + other.radius + p.margin
-    distance = steering.threat(me.heading, other.offset, clearance, norm(me.vel) * p.horizon)
+    far = like(me.who, np.inf)
+    distance = other.hit if other.hit <= norm(me.vel) * p.horizon else far
+    # who overlaps it already wants out, however the sum of the radii is rounded
+    clearance = me.radius + other.radius + p.margin if other.hit > like(me.who, 0.0) else far
     return select(distance < acc[0], (distance, clearance) + other.offset, acc)  # noqa: RUF005
 
 
@@ -43,24 +70,151 @@ def around(p: Any, me: Me, acc: Vec) -> Vec:
 
 
 class AvoidObstacles(Effect):
-    """Steer sideways around the obstacle that the straight path would touch first within `horizon` seconds."""
+    """Steer sideways around the obstacle that the straight path would touch first within `horizon` seconds.
+
+    Along the side of the surface's normal where the body would touch it: of a circle that is away from its centre.
+    """
 
     kind: Literal["avoid_obstacles"] = "avoid_obstacles"
     weight: float = Field(ge=0, description="N, the force of an evasion")
     horizon: float = Field(default=2.0, gt=0, description="s, how far ahead it looks at the present speed")
     margin: float = Field(default=0.0, ge=0, description="m, clearance beyond both radii")
-    demo: ClassVar[str | None] = """
-groups:
-  - {count: 7, radius: 0.2, max_speed: 2, spawn: {low: [0, -2.5], high: [1, 2.5], speed: [2, 2], heading: [1, 0]}}
-effects: [{kind: avoid_obstacles, weight: 5, horizon: 1.5, margin: 0.2}]
-obstacles: [{centre: [6, 0.5], radius: 1}, {centre: [9, -1.5], radius: 0.8}, {centre: [11, 2], radius: 1}]
-dt: 0.02
-"""
     steering: ClassVar[bool] = True
     obstacle_start: ClassVar[str | None] = "nothing"
+    obstacle_ray: ClassVar[str | None] = "straight_on"
     obstacle_law: ClassVar[str | None] = "nearest_threat"
     obstacle_finish: ClassVar[str | None] = "around"
+    demo: ClassVar[str | None] = AVOIDING
+
+    def lookahead(self, speed: float) -> float:
+        """As far as it comes within the horizon."""
+        return speed * self.horizon
 
     def folded(self, dimension: int) -> int:
         """Distance, clearance and offset of the nearest threat."""
         return 2 + dimension
+
+
+# --- whiskers ---------------------------------------------------------------------------------------------------------
+
+
+@law
+def whisker(p: Any, me: Me, k: int) -> tuple[Vec, float]:
+    """One straight ahead, then left and right, then (in 3-D) up and down."""
+    o, e = like(me.who, 0.0), like(me.who, 1.0)
+    right = perpendicular(me.heading)
+    turn = p.angle * like(me.who, np.pi / 180)
+    c, s = e if k == 0 else np.cos(turn), o if k == 0 else np.sin(turn)
+    s = s if k % 2 == 0 else -s
+    return add(scale(me.heading, c), scale(_across(me.heading, right, k), s)), o
+
+
+@law
+def _across(heading: Vec, right: Vec, k: int) -> Vec:
+    if len(heading) == 2:
+        return right
+    else:
+        return select(k > 2, cross(right, heading), right)
+
+
+@law
+def no_whisker(p: Any, me: Me) -> Vec:
+    """Nothing touched."""
+    return (like(me.who, 0.0),) + zero(me.pos)  # noqa: RUF005
+
+
+@law
+def deepest_whisker(p: Any, me: Me, other: Obstacle, acc: Vec) -> Vec:
+    """Keep what a whisker reaches into deepest: (the share of it that is inside, the normal where it enters)."""
+    o, e = like(me.who, 0.0), like(me.who, 1.0)
+    length = norm(me.vel) * p.horizon
+    share = e - other.hit / length if (other.hit < length) & (length > o) else o
+    return select(share > acc[0], (share,) + other.normal, acc)  # noqa: RUF005
+
+
+@law
+def along_normal(p: Any, me: Me, acc: Vec) -> Vec:
+    """F = w (share inside) n; head-on also to the right, or it would only brake."""
+    normal: Vec
+    if len(acc) == 3:
+        normal = (acc[1], acc[2])
+    else:
+        normal = (acc[1], acc[2], acc[3])
+    aside = lateral(normal, me.heading)
+    headon = (dot(aside, aside) < like(me.who, 1e-6)) & (acc[0] > like(me.who, 0.0))
+    wish = add(normal, select(headon, perpendicular(me.heading), zero(normal)))
+    return scale(wish, p.weight * acc[0])
+
+
+class Whiskers(Effect):
+    """Feel ahead and to the sides; push along the normal of what a whisker reaches into, by how deep it does.
+
+    Three whiskers in the plane, five in space, `horizon` times the speed long. Buckland 2005, "wall avoidance": there a
+    whisker has the length of a line and the body no size; here it is what the body would touch.
+    """
+
+    kind: Literal["whiskers"] = "whiskers"
+    weight: float = Field(ge=0, description="N, where a whisker is inside whole")
+    horizon: float = Field(default=1.5, gt=0, description="s, how far ahead it feels at the present speed")
+    angle: float = Field(default=35.0, gt=0, lt=90, description="degrees between the middle and the other whiskers")
+    steering: ClassVar[bool] = True
+    obstacle_start: ClassVar[str | None] = "no_whisker"
+    obstacle_ray: ClassVar[str | None] = "whisker"
+    obstacle_law: ClassVar[str | None] = "deepest_whisker"
+    obstacle_finish: ClassVar[str | None] = "along_normal"
+    demo: ClassVar[str | None] = AVOIDING.replace("avoid_obstacles, weight: 8", "whiskers, weight: 20")
+
+    def rays(self, dimension: int) -> int:
+        """Ahead, and two for each other axis."""
+        return 2 * dimension - 1
+
+    def folded(self, dimension: int) -> int:
+        """A share and a normal."""
+        return 1 + dimension
+
+
+# --- a force field ----------------------------------------------------------------------------------------------------
+
+
+@law
+def no_push(p: Any, me: Me) -> Vec:
+    """Nothing pushes yet."""
+    return zero(me.pos)
+
+
+@law
+def field_push(p: Any, me: Me, other: Obstacle, acc: Vec) -> Vec:
+    """n / d^p, within range."""
+    room = other.gap - me.radius
+    near = room if room > p.nearest else p.nearest
+    size = like(me.who, 1.0) / near**p.power
+    return add(acc, select(room < p.range, scale(other.normal, size), zero(me.pos)))
+
+
+@law
+def field_force(p: Any, me: Me, acc: Vec) -> Vec:
+    """F = w sum n / d^p."""
+    return scale(acc, p.weight)
+
+
+class ForceField(Effect):
+    """Pushed away from every surface within range, whether it is in the way or not: F = w sum n / d^p.
+
+    What Reynolds (1988) holds against it: head-on it only brakes; it is too strong near and too weak far away; and it
+    pushes those who fly past. Here for contrast.
+    """
+
+    kind: Literal["force_field"] = "force_field"
+    weight: float = Field(ge=0, description="N m^p, the force at 1 m")
+    power: float = Field(default=2.0, ge=0, le=6, description="p, how steeply it falls")
+    range: float = Field(default=3.0, gt=0, description="m between the surfaces, beyond which there is no force")
+    nearest: float = Field(default=0.05, gt=0, description="m, nearer counts as this near")
+    steering: ClassVar[bool] = True
+    obstacle_start: ClassVar[str | None] = "no_push"
+    obstacle_law: ClassVar[str | None] = "field_push"
+    obstacle_finish: ClassVar[str | None] = "field_force"
+    demo: ClassVar[str | None] = AVOIDING.replace("avoid_obstacles, weight: 8", "force_field, weight: 3")
+
+    def folded(self, dimension: int) -> int:
+        """A vector."""
+        return dimension

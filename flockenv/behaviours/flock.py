@@ -81,11 +81,12 @@ class _FlockRule(Effect):
     nearest: int | None = Field(
         default=None, ge=1, le=32, description="topological: only so many nearest ones of those count; none = all"
     )
+    occluded: bool = Field(default=False, description="whom an obstacle hides is not seen")
 
     @property
     def sight(self) -> Sight:
         """Radius, field of view, how many."""
-        return Sight(self.radius, self.fov, self.nearest)
+        return Sight(self.radius, self.fov, self.nearest, occluded=self.occluded)
 
     def parameters(self) -> dict[str, float | Vec]:
         """The weight: who is seen is the sweep's business."""
@@ -110,7 +111,7 @@ dt: 0.02
     @property
     def conserves_momentum(self) -> bool:  # type: ignore[override]  # a rule with a view cone is not mutual
         """True with eyes all around and for everybody near: then everybody pushes back as he is pushed."""
-        return self.fov >= 360.0 and self.nearest is None
+        return self.fov >= 360.0 and self.nearest is None  # who is hidden from me does not see me either
 
     def sums(self, dimension: int) -> int:
         """A vector."""

@@ -45,7 +45,7 @@ def nearest_place(p: Any, me: Me, other: Other, acc: Vec) -> Vec:
     goal, threat = _places(acc)
     place = steering.hiding_place(other.offset, other.radius, me.radius + p.margin, threat)
     square = dot(place, place)
-    nearer = square < acc[0]
+    nearer = (square < acc[0]) & (other.radius > like(square, 0.0))  # behind round ones alone
     return (square if nearer else acc[0],) + select(nearer, place, goal) + threat  # noqa: RUF005
 
 

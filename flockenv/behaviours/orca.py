@@ -10,7 +10,7 @@ from pydantic import Field
 
 from flockenv import orca, steering
 from flockenv.effects.base import Effect, Me, Other, Sight, Vector
-from flockenv.kernels import OPTIONS, Vec, law, like, replaced
+from flockenv.kernels import OPTIONS, Vec, law, like
 from flockenv.vec import scale, select, sub, zero
 
 __all__ = ["Orca"]
@@ -18,7 +18,7 @@ __all__ = ["Orca"]
 
 def kept(slots: Vec, new: Vec) -> Vec:
     """Return the slots with a new one sorted in by its power distance, |offset|^2 - radius^2; the last drops out."""
-    raise NotImplementedError("a part of kernels")
+    raise TypeError("it is a part of kernels")
 
 
 @overload(kept, jit_options=OPTIONS)
@@ -44,11 +44,10 @@ def _kept(slots, new):  # type: ignore[no-untyped-def]  # numba compares signatu
 
 @law
 def nobody(p: Any, me: Me) -> Vec:
-    """Eight places without anybody."""
+    """Six places without anybody."""
     far, o, e = like(me.radius, np.inf), like(me.radius, 0.0), like(me.radius, 1.0)
     empty = (far, far, o, o, -e, o)
-    four = empty + empty + empty + empty
-    return four + four
+    return empty + empty + empty + empty + empty + empty
 
 
 @law
@@ -78,7 +77,7 @@ def reciprocal(p: Any, me: Me, acc: Vec) -> Vec:
 class Orca(Effect):
     """Arrive at a point with the velocity nearest to the wished one that touches nobody within `horizon` seconds.
 
-    Optimal reciprocal collision avoidance (van den Berg et al. 2011) among the eight nearest agents and obstacles.
+    Optimal reciprocal collision avoidance (van den Berg et al. 2011) among the six nearest agents and obstacles.
     It chooses a velocity: without inertia (weight = m / dt, no max_force) those who all do so never touch.
     """
 
@@ -127,8 +126,11 @@ effects:
         """Refuse space."""
         if scene.dimension != 2:
             raise ValueError(f"kind = orca: dimension = {scene.dimension}, must be 2")
+        for k, obstacle in enumerate(scene.obstacles):
+            if obstacle.kind != "circle":
+                raise ValueError(f"kind = orca: sees round obstacles alone, obstacles[{k}].kind = {obstacle.kind}")
         super().check(scene)
 
     def sums(self, dimension: int) -> int:
-        """Eight neighbours."""
-        return 8 * orca.SLOT
+        """Six neighbours."""
+        return 6 * orca.SLOT

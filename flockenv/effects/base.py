@@ -15,10 +15,13 @@ An effect is of one or more of three forms, each a law for one agent:
 * `kick_law(p, me, seconds, gauss) -> velocity`: added once per step, however often a method asks for forces, with one
   standard normal number per axis (fluctuations);
 * `obstacle_start(p, me)`, `obstacle_law(p, me, other, acc) -> acc`, `obstacle_finish(p, me, acc) -> force`: a fold over
-  the obstacles. Of an effect with a pair law too, `finish_law` gives no force but what it has found out about others, a
-  vector that is told to `obstacle_start(p, me, told)` (hide).
-  the obstacles; with no start of its own it goes before a fold over neighbours and hands over to it, so that both are
-  judged together.
+  the obstacles, of whatever shape: `other` is an `Obstacle`. With an `obstacle_ray(p, me, k) -> (direction, margin)` it
+  meets each obstacle for each of its rays, k = 0, 1, ...: where the agent's body, `margin` wider, would touch it
+  first if it went along the unit vector `direction`. With an `obstacle_from(p, me) -> offset` it is met as from that
+  place, so far from the agent, instead of from where the agent is. Of an effect with a pair law too, `finish_law` gives
+  no force but what it has found out about others, a vector that is told to `obstacle_start(p, me, told)` (hide). With
+  no start of its own it meets circles alone, goes before a fold over neighbours and hands over to it, so that both are
+  judged together (orca).
 
 `p` holds the effect's `parameters()` by name, and, if it is `tabled`, an array of numbers as `p.table`: the points of a
 path, the values of a grid. `me` and `other` are the records below. Laws live in the effect's module.
@@ -43,8 +46,8 @@ from flockenv.records import Record
 from flockenv.vec import dot
 
 __all__ = [
-    "EFFECTS", "Bonds", "Effect", "Far", "Me", "Other", "Sight", "Vector", "all_masses", "in_view", "network_of",
-    "ties",
+    "EFFECTS", "Bonds", "Effect", "Far", "Me", "Obstacle", "Other", "Sight", "Vector", "all_masses", "in_view",
+    "network_of", "ties",
 ]  # fmt: skip
 
 Vector = Annotated[tuple[Annotated[float, Field(strict=True)], ...], Field(min_length=2, max_length=3)]
@@ -72,14 +75,34 @@ class Me(NamedTuple):
 
 
 class Other(NamedTuple):
-    """Whom it meets: a neighbour, or an obstacle (at rest)."""
+    """A neighbour that it meets."""
 
     who: float
     offset: Vec  # m, other minus me, the shortest way
     square: float  # m^2, |offset|^2
-    vel: Vec  # m/s; 0 for an obstacle
+    vel: Vec  # m/s
     radius: float  # m
-    tie: Vec  # a unit vector of its own; 0 for an obstacle
+    tie: Vec  # a unit vector of its own
+
+
+class Obstacle(NamedTuple):
+    """An obstacle that it meets. A circle or sphere is its centre and radius; any other shape is one point of it.
+
+    That point is the nearest of its surface; of a law that casts rays, the one that is touched first. Of a law that
+    sees circles alone, every shape is so a circle of radius 0 where it matters. From inside, and where a ray begins at
+    overlap, `offset` leads into the shape, from where `normal` leads out.
+    """
+
+    who: float  # circles in the order of the state, then other shapes in the order of the scene
+    offset: Vec  # m, to the centre, or to the point
+    square: float  # m^2, |offset|^2
+    vel: Vec  # m/s; 0
+    radius: float  # m; 0 of what is no circle
+    tie: Vec  # 0
+    gap: float  # m, how far the surface is; negative inside
+    normal: Vec  # outward unit normal at the nearest point of the surface, or where the ray touches
+    hit: float  # m, how far along the ray the body comes: 0 if it overlaps already, inf if it never touches
+    ray: Vec  # the ray's direction; 0 where none is cast
 
 
 class Far(NamedTuple):
@@ -97,6 +120,7 @@ class Sight(NamedTuple):
     fov: float = 360.0  # degrees, full angle; somebody at standstill has no heading and sees all around
     nearest: int | None = None  # at most so many (and whoever is exactly as far as the last); None = all
     group: int | None = None  # of this group alone; None = of all
+    occluded: bool = False  # not whom an obstacle hides: none stands in the straight way to his centre
 
 
 class Bonds(NamedTuple):
@@ -168,6 +192,8 @@ class Effect(Record):
     obstacle_start: ClassVar[str | None] = None
     obstacle_law: ClassVar[str | None] = None
     obstacle_finish: ClassVar[str | None] = None
+    obstacle_ray: ClassVar[str | None] = None
+    obstacle_from: ClassVar[str | None] = None
     linear_drag: ClassVar[str | None] = None
     """Name of the parameter c, kg/s, of an own_law that is -c (v - medium): a method may treat it by itself."""
     weighs_mass: ClassVar[bool] = True
@@ -230,6 +256,10 @@ class Effect(Record):
         """How many numbers its fold over the obstacles carries from one to the next."""
         return 0
 
+    def rays(self, dimension: int) -> int:
+        """How many rays its obstacle_ray casts."""
+        return 1
+
     def numbers(self, dimension: int) -> int:
         """How many numbers describe one of its bonds."""
         return 0
@@ -267,6 +297,13 @@ class Effect(Record):
         """Return its potential energy in each world, (B,) J; none if it has none. `offset(a, b)` is the space's."""
         return None
 
+    def lookahead(self, speed: float) -> float | None:
+        """Return how far ahead somebody at this speed notices what he must avoid, m; none if it avoids nothing.
+
+        What gives it is called `horizon`, s, in such an effect.
+        """
+        return None
+
     def check(self, scene: Any) -> None:
         """Refuse, with a ValueError that begins with the name of a field, a scene that does not suit it.
 
@@ -291,7 +328,8 @@ class Effect(Record):
             text
             for text, law in (
                 ("neighbour query", self.pair_law), ("all others", self.far_law), ("bonds", self.bond_law),
-                ("obstacles", self.obstacle_law), ("random numbers", self.kick_law),
+                ("obstacles", self.obstacle_law or (self.sight and self.sight.occluded)),
+                ("random numbers", self.kick_law),
             )
-            if law is not None
+            if law
         )  # fmt: skip

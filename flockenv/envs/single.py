@@ -23,10 +23,20 @@ from flockenv.envs.face import (
     render_fps,
 )
 from flockenv.envs.page import page
-from flockenv.tasks import Crossing, Evade, Flock, Herd, Obstacles, Pursuit, Task
+from flockenv.tasks import Crossing, Evade, Flock, Herd, Obstacles, PathFollow, Pursuit, Task
 from flockenv.world import Step, World
 
-__all__ = ["CrossingEnv", "EvadeEnv", "FlockEnv", "HerdEnv", "ObstaclesEnv", "PursuitEnv", "SingleEnv", "one_learner"]
+__all__ = [
+    "CrossingEnv",
+    "EvadeEnv",
+    "FlockEnv",
+    "HerdEnv",
+    "ObstaclesEnv",
+    "PathFollowEnv",
+    "PursuitEnv",
+    "SingleEnv",
+    "one_learner",
+]
 
 
 def one_learner(task_type: type[Task], parameters: dict[str, Any]) -> Task:
@@ -134,6 +144,13 @@ class ObstaclesEnv(SingleEnv):
     """A walker goes to its goal through a random field of obstacles."""
 
     task_type = Obstacles
+    history = "v0: first version (flockenv 0.1.0)."
+
+
+class PathFollowEnv(SingleEnv):
+    """A runner follows a narrow winding track, as far as it gets."""
+
+    task_type = PathFollow
     history = "v0: first version (flockenv 0.1.0)."
 
 

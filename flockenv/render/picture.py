@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
-from flockenv.render.palette import ARROW, BODY_DISC, BOND, DART, DART_REACH, JUMP, PAPER, ROLE_COLOURS, mix, rgb
+from flockenv.render.palette import ARROW, BODY_DISC, BOND, DART, DART_REACH, JUMP, PAPER, ROLE_COLOURS, WAY, mix, rgb
 from flockenv.render.view import View, look
 from flockenv.snapshot import Floats, Mark, Snapshot
 
@@ -43,13 +43,18 @@ def draw(snapshot: Snapshot, size: int = 600, scale: int = 2, trails: Sequence[S
     _whole("scale", scale, _SCALES)
     view = look(snapshot, size, scale)
     stones = np.column_stack([snapshot.obstacle_centre[:, :2], snapshot.obstacle_radius])
-    backdrop = _backdrop(view, snapshot.title, tuple(dict.fromkeys(snapshot.roles)), stones.tobytes())
+    walls = tuple(polygon.tobytes() for polygon in snapshot.outlines)
+    backdrop = _backdrop(view, snapshot.title, tuple(dict.fromkeys(snapshot.roles)), stones.tobytes(), walls)
     canvas = backdrop.copy()
     pen = ImageDraw.Draw(canvas, "RGBA")
+    ways = [mark for mark in snapshot.marks if mark.kind == "way"]
+    for mark in ways:
+        _mark(pen, view, mark)
     if trails:
         _trails(pen, view, [*trails, snapshot])
     for mark in snapshot.marks:
-        _mark(pen, view, mark)
+        if mark.kind != "way":
+            _mark(pen, view, mark)
     _bonds(pen, view, snapshot)
     _bodies(pen, view, snapshot)
     _trim(canvas, backdrop, view, view.spill)
@@ -69,7 +74,7 @@ def _whole(name: str, value: int, limits: tuple[int, int]) -> None:
 
 
 @lru_cache(maxsize=4)
-def _backdrop(view: View, title: str, roles: tuple[str, ...], stones: bytes) -> Image.Image:
+def _backdrop(view: View, title: str, roles: tuple[str, ...], stones: bytes, walls: tuple[bytes, ...]) -> Image.Image:
     canvas = Image.new("RGB", (view.width, view.height), rgb(PAPER["page"][0]))
     pen = ImageDraw.Draw(canvas, "RGBA")
     world = (view.left, view.top, view.right, view.bottom)
@@ -77,6 +82,8 @@ def _backdrop(view: View, title: str, roles: tuple[str, ...], stones: bytes) -> 
     _grid(pen, view)
     for x, y, radius in np.frombuffer(stones).reshape(-1, 3).tolist():
         _stone(pen, view, x, y, radius)
+    for wall in walls:
+        _wall(pen, view, np.frombuffer(wall).reshape(-1, 2))
     _trim(canvas, Image.new("RGB", canvas.size, rgb(PAPER["page"][0])), view, spill=0.0)
     _edge(pen, view)
     _caption(pen, view, title, roles)
@@ -102,6 +109,16 @@ def _stone(pen: ImageDraw.ImageDraw, view: View, x: float, y: float, radius: flo
     for a, b in view.sightings(px, py, reach):
         _disc(pen, a, b, reach, PAPER["rim"][0])
         _disc(pen, a, b, reach - view.width / 400, PAPER["stone"][0])
+
+
+def _wall(pen: ImageDraw.ImageDraw, view: View, polygon: Floats) -> None:
+    """Draw an obstacle that is not round; on a torus, across every edge that its box overlaps."""
+    spots = view.place(polygon)
+    middle = (spots.min(axis=0) + spots.max(axis=0)) / 2
+    reach = float((spots.max(axis=0) - middle).max())
+    for a, b in view.sightings(*middle.tolist(), reach):
+        corners = (spots - middle + (a, b)).ravel().tolist()
+        pen.polygon(corners, fill=PAPER["stone"][0], outline=PAPER["rim"][0], width=max(1, round(view.width / 400)))
 
 
 def _edge(pen: ImageDraw.ImageDraw, view: View) -> None:
@@ -171,6 +188,10 @@ def _mark(pen: ImageDraw.ImageDraw, view: View, mark: Mark) -> None:
     x, y = view.place(mark.at).tolist()
     if mark.kind == "heading":
         _arrow(pen, view, x, y, _aim(mark.vector[None])[0])
+        return
+    if mark.kind == "way":
+        for a, b in view.sightings(x, y, mark.radius * view.metre):
+            _disc(pen, a, b, mark.radius * view.metre, mix(_GOAL, _PAPER, WAY))
         return
     reach = max(mark.radius * view.metre, view.width / 75)
     thick = max(1, round(view.width / 240))
@@ -249,7 +270,7 @@ def _bodies(pen: ImageDraw.ImageDraw, view: View, snapshot: Snapshot) -> None:
     reach = np.maximum(body, DART_REACH * view.width * swell)
     tied, dot = snapshot.tied, view.width * BOND
     spots = view.place(snapshot.pos)
-    aim = _aim(np.where(snapshot.visible[:, None], snapshot.vel, 0.0))
+    aim = _aim(np.where(snapshot.visible[:, None], snapshot.aim, 0.0))
     darts = _darts(spots, aim, 0.94 * reach)
     # The lowest first, and crosses over everything: an end must not hide under whoever brought it.
     for i in seen[np.argsort(np.where(snapshot.alive, depth, 2.0)[seen], kind="stable")].tolist():

@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flockenv.outputs import replacing
-from flockenv.render.palette import ARROW, BODY_DISC, BOND, DART, DART_REACH, JUMP, PAPER, ROLE_COLOURS
+from flockenv.render.palette import ARROW, BODY_DISC, BOND, DART, DART_REACH, JUMP, PAPER, ROLE_COLOURS, WAY
 from flockenv.snapshot import Floats, Mark, Snapshot
 
 __all__ = ["Group", "Panel", "write_replay"]
@@ -106,6 +106,7 @@ def write_replay(path: str | os.PathLike[str], groups: Sequence[Group], title: s
         "disc": BODY_DISC,
         "bond": BOND,
         "jump": JUMP,
+        "way": WAY,
         "beyond": _BEYOND,
         "directions": _DIRECTIONS,
     }
@@ -173,8 +174,8 @@ def _positions(shot: Snapshot) -> NDArray[np.uint16]:
 
 
 def _headings(shot: Snapshot) -> NDArray[np.uint8]:
-    """Return (N,) uint8: the direction of the velocity in x and y, or that the body rests or is not there."""
-    vel = np.where(shot.visible[:, None], shot.vel, 0.0)[:, :2]
+    """Return (N,) uint8: the direction in x and y where each points, or that the body rests or is not there."""
+    vel = np.where(shot.visible[:, None], shot.aim, 0.0)[:, :2]
     turn = np.arctan2(vel[:, 1], vel[:, 0]) / (2.0 * np.pi)
     heading = np.rint(turn * _DIRECTIONS).astype(np.int64) % _DIRECTIONS
     heading[~vel.any(axis=1)] = _RESTING
@@ -189,6 +190,7 @@ def _scenery(shots: Sequence[Snapshot]) -> list[dict[str, Any]]:
         stones = np.column_stack([shot.obstacle_centre[:, :2], shot.obstacle_radius]).tolist()
         scene = {
             "stones": [[_short(x, 6) for x in stone] for stone in stones],
+            "walls": [[[_short(x, 6) for x in corner] for corner in wall.tolist()] for wall in shot.outlines],
             "marks": [_mark(mark) for mark in shot.marks],
         }
         if not scenes or scene != {name: scenes[-1][name] for name in scene}:

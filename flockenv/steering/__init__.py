@@ -39,10 +39,12 @@ from flockenv.steering.others import (
     keep_station,
     offset_pursue,
     opensteer_time,
+    passing_point,
     pursue,
     separate,
     shadow,
 )
+from flockenv.steering.paths import follow_flow, follow_path, stay_on_path
 
 __all__ = [
     "align",
@@ -58,7 +60,9 @@ __all__ = [
     "explore",
     "face",
     "flee",
+    "follow_flow",
     "follow_leader",
+    "follow_path",
     "give_way",
     "heed",
     "herd_from",
@@ -70,12 +74,14 @@ __all__ = [
     "match_velocity",
     "offset_pursue",
     "opensteer_time",
+    "passing_point",
     "pursue",
     "queue",
     "queue_gap",
     "seek",
     "separate",
     "shadow",
+    "stay_on_path",
     "target_speed",
     "threat",
     "unaligned_threat",

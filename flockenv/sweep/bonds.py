@@ -127,7 +127,7 @@ def _meet(parts: Parts, e: int, k: int, effect: Effect, sums: list[str]) -> list
         f"    for l in range(np.uint64({w})):",
         "        i = row + l",
         f"        x, v = {lanes_of(parts, 'pos')}, {lanes_of(parts, 'vel')}",
-        f"        me = {alone()}",
+        f"        me = {alone(parts)}",
         indented(others, 8),
         f"        says = bond_law_{k}(p{k}, me, ({', '.join(f'it{q}' for q in range(p))},), ({numbers},))",
         f"        whole = {' & '.join(f'(living[who{q}] > zero(x)[0])' for q in range(p))}  # the dead hold nobody",

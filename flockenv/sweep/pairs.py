@@ -106,7 +106,7 @@ def _meet(parts: Parts) -> list[str]:
     slot, lines = Slots(parts), _ahead(parts)
     for q, sight in enumerate(parts.sights):
         cut = f" & (square <= {slot(f'near{q}_{sight.nearest - 1}')})" if sight.nearest else ""
-        lines.append(f"seen{q} = {_seen(parts, q)}{cut}")
+        lines.append(f"seen{q} = ({_seen(parts, q)}){cut}" if sight.occluded else f"seen{q} = {_seen(parts, q)}{cut}")
     for k, effect in parts.pairs:
         q, slots = parts.sights.index(sight_of(effect)), slot.all(f"c{k}_")
         if effect.pair_start:
@@ -135,7 +135,11 @@ def _seen(parts: Parts, q: int) -> str:
     sight = parts.sights[q]
     ahead = "other" if sight.fov >= 360 else f"ahead{_fovs(parts).index(sight.fov)}"
     member = f" & (aj >= first{q}) & (aj < end{q})" if sight.group is not None else ""
-    return f"{ahead} & (square < within{q}){member}"
+    open_ = f"{ahead} & (square < within{q}){member}"
+    if not sight.occluded:
+        return open_
+    # whoever is out of sight anyhow is not looked for behind obstacles: here a branch is cheaper than a choice
+    return f"({open_}) and not blocked(obstacle_x, obstacle_radius, params, size, b, me.pos, to)"
 
 
 def _fovs(parts: Parts) -> list[float]:
@@ -210,5 +214,5 @@ def _me(parts: Parts, fields: list[str]) -> str:
         return "(" + ", ".join(number(f"{letter}{k}") for k in range(parts.dimension)) + ")"
 
     numbers = ", ".join(number(name) for name in ("mass", "radius", "max_speed", "max_force"))
-    vectors = f"{vector('x')}, {vector('v')}, {vector('h')}"
+    vectors = f"{vector('x')}, {vector('v')}, {vector('d' if parts.oriented else 'h')}"
     return f"me = Me({number('who')}, {vectors}, {numbers}, {vector('t')}, time, zero({vector('x')}), drawn)"

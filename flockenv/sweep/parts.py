@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from flockenv.effects.base import Effect, Sight
 from flockenv.integrators.base import Integrator
 from flockenv.kernels import LINE
+from flockenv.shapes import packed
 from flockenv.space import Space
 
 __all__ = ["SMALL_STRIDE", "Look", "Parts", "flattened", "record_of", "sight_of", "sorted_at", "view_of"]
@@ -53,8 +54,18 @@ class Parts:
     """What a task shows its agents, found by the same query."""
     crowded: bool = False
     """Are there enough agents for groups of them to be met as one, where they are far away?"""
+    oriented: bool = False
+    """Does anybody keep a heading (and an up vector) of his own?"""
+    turns: bool = False
+    """Is anybody's turn rate limited?"""
+    leans: bool = False
+    """Does anybody lean into his turns?"""
     starts: tuple[int, ...] = ()
     """The first agent of each group, and one more: numbers alone, the source does not depend on them."""
+    shapes: tuple[Any, ...] = field(default=(), compare=False)
+    """Obstacles that are no circles: the source depends on their forms."""
+    circles: int = 0
+    """How many obstacles come before them."""
     tables: tuple[NDArray[np.float64], ...] = field(default=(), compare=False)
     """What the laws of each tabled effect look up, in order: numbers alone, too."""
 
@@ -83,6 +94,21 @@ class Parts:
     def pairs(self) -> list[tuple[int, Effect]]:
         """The effects with a pair law, and their numbers."""
         return [(k, e) for k, e in enumerate(self.effects) if e.pair_law is not None]
+
+    @functools.cached_property
+    def shaped(self) -> tuple[NDArray[np.float64], dict[str, tuple[int, int]]]:
+        """The table of shapes that are no circles, and the forms that there are: where each begins, how many."""
+        return packed(self.shapes, self.dimension, self.circles) if self.meets_obstacles else (np.zeros(0), {})
+
+    @property
+    def meets_obstacles(self) -> bool:
+        """Does any law ask for obstacles, or what is hidden by them?"""
+        return any(e.obstacle_law is not None for e in self.effects) or self.occludes
+
+    @property
+    def occludes(self) -> bool:
+        """Is anybody hidden by obstacles?"""
+        return any(sight.occluded for sight in self.sights)
 
     @functools.cached_property
     def bonded(self) -> list[tuple[int, Effect]]:
@@ -124,9 +150,13 @@ class Parts:
 
         For each table there are two: where it begins, and where it ends.
         """
-        bounds, tables = [], iter(np.cumsum([0, *map(len, self.tables)]).tolist())
+        shapes, forms = self.shaped
+        bounds, tables = [], iter(np.cumsum([len(shapes), *map(len, self.tables)]).tolist())
         begin = next(tables)
         values = [*self.space.extent(self.dimension), self.reach]
+        for where, count in forms.values():
+            bounds.append((len(values), where))
+            values += [0.0, float(count)]
         for sight in self.sights:
             values += [sight.radius**2, view_of(sight.fov)]
             if sight.group is not None:
@@ -151,7 +181,7 @@ class Parts:
 
     def given(self) -> NDArray[Any]:
         """Return `parameters()` and the tables behind them, in the scene's precision: what the kernel is handed."""
-        return np.concatenate([self.parameters(), *self.tables]).astype(self.dtype)
+        return np.concatenate([self.parameters(), self.shaped[0], *self.tables]).astype(self.dtype)
 
     def numbers_of(self, effect: Effect) -> dict[str, Any]:
         """Return the numbers and vectors that the laws of an effect are given, by name."""
@@ -208,7 +238,9 @@ class Parts:
             names.add("heading")
         if any(sight.group is not None for sight in self.sights):
             names.add("who")
-        needed = {"x": True, "v": bool({"vel", "heading"} & names), "h": "heading" in names, "t": "tie" in names}
+        facing = "heading" in names
+        needed = {"x": True, "v": "vel" in names or (facing and not self.oriented)}
+        needed |= {"d" if self.oriented else "h": facing, "t": "tie" in names}
         rows = [f"{letter}{k}" for letter, need in needed.items() if need for k in range(self.dimension)]
         return rows + [name for name in ("who", "radius", "mass", "max_speed", "max_force") if name in names]
 
@@ -245,11 +277,32 @@ class Parts:
         return self.sorts and bool(self.pairs) and not self.pulls
 
     @property
+    def frame_vectors(self) -> list[str]:
+        """The vectors of an agent's frame: where it faces, and in space which way is up."""
+        return ["facing", "above"][: self.dimension - 1] if self.oriented else []
+
+    @property
+    def frame_numbers(self) -> list[str]:
+        """The numbers of an agent's frame, by `Body`'s names: how fast it may turn, and how soon it leans."""
+        wanted = {"max_turn_rate": self.turns, "banking": self.leans}
+        return [name for name, some in wanted.items() if some]
+
+    @property
+    def frame_argument(self) -> str:
+        """The state's array of frames among the arguments of an entry point, where there is one."""
+        return "frame_, " if self.oriented else ""
+
+    @property
+    def frame_rows(self) -> int:
+        """Coordinates of the vectors of a frame: what a state keeps of each agent."""
+        return self.dimension * len(self.frame_vectors)
+
+    @property
     def luggage(self) -> list[str]:
         """What an agent carries along then: an array, and the axis of a vector."""
-        vectors = ["pos", "vel", "want", *(["tie"] if "t0" in self.fields else [])]
+        vectors = ["pos", "vel", "want", *self.frame_vectors, *(["tie"] if "t0" in self.fields else [])]
         vector = [f"{name} {k}" for name in vectors for k in range(self.dimension)]
-        return [*vector, "mass", "radius", "max_speed", "max_force", "ident"]
+        return [*vector, "mass", "radius", "max_speed", "max_force", *self.frame_numbers, "ident"]
 
     @property
     def luggage_size(self) -> int:

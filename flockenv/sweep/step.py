@@ -16,6 +16,7 @@ from flockenv.sweep.text import (
     Slots,
     alone,
     copied,
+    frame_views,
     indented,
     indented_lines,
     lane,
@@ -23,7 +24,7 @@ from flockenv.sweep.text import (
     tuple_of,
 )
 
-__all__ = ["copies", "step", "step_world"]
+__all__ = ["copies", "kept_frame", "step", "step_world"]
 
 PART = 64
 """Blocks that are advanced together: what they take fits into the nearest caches."""
@@ -60,6 +61,15 @@ def {name}(blocks, array, b, n, first, end):
 '''
 
 
+def kept_frame(parts: Parts, from_state: bool) -> list[str]:
+    """Write how frames come out of the state's array, or go back into it; nothing if nobody keeps one."""
+    d, way = parts.dimension, "into_blocks" if from_state else "out_of_blocks"
+    return [
+        f"{way}({name}, frame_[{k * d} : {(k + 1) * d}], b, n, first, end)"
+        for k, name in enumerate(parts.frame_vectors)
+    ]
+
+
 def step_world(parts: Parts) -> str:
     """Return the source of `step_world`: steps of one world, or of one thread's part of it."""
     d = parts.dimension
@@ -68,7 +78,8 @@ def step_world(parts: Parts) -> str:
     restored = "; ".join(f"work[b, {k}] = counted_[{k}]" for k in range(len(WORK)))
     return f'''@kernel
 def step_world(
-    x_, v_, alive, tick, key, obstacle_x, obstacle_radius, work, params, dt, count, b, rank, team, {SHARED},
+    x_, v_, {parts.frame_argument}alive, tick, key, obstacle_x, obstacle_radius, work, params, dt, count, b, rank, team,
+    {SHARED},
 ):
     """Advance this thread's part of world b by `count` steps; return the first agent that is not finite, or -1.
 
@@ -85,6 +96,7 @@ def step_world(
         living[i] = alive[b, i]
     into_blocks(pos, x_, b, n, first, end)
     into_blocks(vel, v_, b, n, first, end)
+{indented([*frame_views(parts), *kept_frame(parts, from_state=True)], 4)}
 {indented(_confine(parts), 4)}
 {indented(move_in(parts), 4)}
 {indented(_remember(parts), 4)}
@@ -113,6 +125,7 @@ def step_world(
         return first_bad
     out_of_blocks(pos, x_, b, n, first, end)
     out_of_blocks(vel, v_, b, n, first, end)
+{indented(kept_frame(parts, from_state=False), 4)}
     return -1
 '''
 
@@ -163,14 +176,49 @@ def _bound(parts: Parts, first: str, end: str) -> list[str]:
         *indented_lines(_kick(parts), 8),
         "        where = far if finite(dot(x, x) + dot(v, v)) else ident[i]",
         f"        {bad} = where if where < {bad} else {bad}",
+        *indented_lines(_turn(parts), 8),
         "        # nobody moves faster than max_speed, whatever a method makes of the velocity within the step",
         "        x = add(was, scale(limit(sub(x, was), max_speed[i] * dt), living[i]))",
-        *indented_lines(_stay_inside(parts), 8),
+        *indented_lines([*_stay_inside(parts), *_face(parts)], 8),
         *(
             "        " + "; ".join(f"{lane(parts, array, k)} = {now}[{k}]" for array, now in stored)
             for k in range(parts.dimension)
         ),
     ]
+
+
+def _turn(parts: Parts) -> list[str]:
+    """Write how agent i is kept from turning faster than it can: neither its velocity nor its way in this step does.
+
+    What a medium adds to its way is none of its doing.
+    """
+    if not parts.turns:
+        return []
+    way = f"sub(x, add(was, scale({lanes_of(parts, 'carrying')}, dt)))" if parts.flows else "sub(x, was)"
+    return [
+        "most = min(max_turn_rate[i] * dt, like(dt, np.pi))",
+        f"before, way = {lanes_of(parts, 'facing')}, {way}",
+        "there, over = turned(way, before, most)",
+        "x = add(x, sub(held(way, there, over), way))",
+        "ahead, over = turned(v, before, most)",
+        "v = held(v, ahead, over)",
+    ]
+
+
+def _face(parts: Parts) -> list[str]:
+    """Write where agent i faces after the step, and which way is up."""
+    if not parts.oriented:
+        return []
+    # who may not turn as fast as he wants to turns while he stands still, too
+    lines = [f"before = {lanes_of(parts, 'facing')}", f"ahead = faced(v, {'ahead' if parts.turns else 'before'})"]
+    lines += [f"{lane(parts, 'facing', k)} = ahead[{k}]" for k in range(parts.dimension)]
+    if parts.dimension == 2:
+        return lines
+    lines.append(f"up = {lanes_of(parts, 'above')}")
+    if parts.leans:
+        lines.append("up = leant(ahead, before, up, norm(v), dt, banking[i])")
+    lines.append("up = raised(ahead, before, up)")
+    return lines + [f"{lane(parts, 'above', k)} = up[{k}]" for k in range(parts.dimension)]
 
 
 def _remember(parts: Parts) -> list[str]:
@@ -217,7 +265,7 @@ def _kick(parts: Parts) -> list[str]:
             "kick = (" + ", ".join(f"says[{j}] if free else like(dt, 0.0)" for j in range(parts.dimension)) + ",)",
             "x, v = add(x, scale(kick, like(dt, 0.5) * dt)), add(v, kick)  # as if it came in the middle of the step",
         ]
-    return [f"me = {alone()}", *lines] if lines else []
+    return [f"me = {alone(parts)}", *lines] if lines else []
 
 
 def step(parts: Parts) -> str:
@@ -226,8 +274,8 @@ def step(parts: Parts) -> str:
     return f'''
 @njit(cache=True, **FAST)
 def step(
-    x, v, alive, tick, key, obstacle_x, obstacle_radius, work, drive, params, dt, count, from_world, to_world, rank,
-    team, {SHARED},
+    x, v, {parts.frame_argument}alive, tick, key, obstacle_x, obstacle_radius, work, drive, params, dt, count,
+    from_world, to_world, rank, team, {SHARED},
 ):
     """Advance worlds [from_world, to_world) by `count` steps; return (world, agent) not finite first, or -1s.
 
@@ -245,7 +293,8 @@ def step(
         else:
             want[first * {d * parts.width} : end * {d * parts.width}] = 0
         bad = step_world(
-            x, v, alive, tick, key, obstacle_x, obstacle_radius, work, params, dt, count, b, rank, team, {SHARED},
+            x, v, {parts.frame_argument}alive, tick, key, obstacle_x, obstacle_radius, work, params, dt, count,
+            b, rank, team, {SHARED},
         )
         if rank == 0 and bad < 0:
             tick[b] += count

@@ -10,14 +10,14 @@ from flockenv.kernels import LINE
 from flockenv.sweep.parts import Parts
 
 __all__ = [
-    "CONTEXT", "SHARED", "Slots", "alone", "copied", "given", "indented", "indented_lines", "lane", "lanes_of",
-    "nearest_image", "place_of", "tuple_of",
+    "CONTEXT", "SHARED", "Slots", "alone", "copied", "frame_views", "given", "indented", "indented_lines", "lane",
+    "lanes_of", "nearest_image", "place_of", "tuple_of",
 ]  # fmt: skip
 
 _READ = (
-    "mass, radius, max_speed, max_force, living, ident, want, felt, pulled, carrying, sorted_, records, luggage, "
-    "order, cell, start, offset, bounds, tally, sync, tie, bond_place, bond_number, bond_start, tree_key, tree_place, "
-    "tree_digit, tree_leaf, tree_node, tree_near, number, lanes, ranges"
+    "mass, radius, max_speed, max_force, living, ident, want, felt, pulled, carrying, frame, sorted_, records, "
+    "luggage, order, cell, start, offset, bounds, tally, sync, tie, bond_place, bond_number, bond_start, tree_key, "
+    "tree_place, tree_digit, tree_leaf, tree_node, tree_near, number, lanes, ranges"
 )
 SHARED = f"pos, vel, origin, stages, {_READ}"
 """Scratch of one world in progress, in order; see workspace.Workspace. The last two belong to one thread."""
@@ -47,9 +47,10 @@ def place_of(parts: Parts, rows: int) -> str:
     return f"(i // np.uint64({w})) * np.uint64({rows * w}) + i % np.uint64({w})"
 
 
-def alone(medium: str = "zero(x)", vel: str = "v", heading: str = "unit(v)") -> str:
+def alone(parts: Parts, medium: str = "zero(x)", vel: str = "v", heading: str = "") -> str:
     """Write agent i, at x, as the laws of one agent see it: no tie, there is nobody to part from."""
     body = "mass[i], radius[i], max_speed[i], max_force[i]"
+    heading = heading or (lanes_of(parts, "facing") if parts.oriented else "unit(v)")
     return f"Me(ident[i], x, {vel}, {heading}, {body}, zero(x), time, {medium}, key[b])"
 
 
@@ -66,6 +67,13 @@ def nearest_image(parts: Parts, k: int, here: str) -> str:
         for name in parts.names_of(effect)
     ]
     return f"near{k} = P{k}({', '.join(values)})"
+
+
+def frame_views(parts: Parts) -> list[str]:
+    """Write by which names the parts of the scratch `frame` are known: blocks of vectors, and numbers by agent."""
+    vectors = [f"{name} = frame[{k} * len(pos) :]" for k, name in enumerate(parts.frame_vectors)]
+    begin, each = f"{len(parts.frame_vectors)} * len(pos)", f"len(pos) // {parts.dimension}"
+    return vectors + [f"{name} = frame[{begin} + {k} * {each} :]" for k, name in enumerate(parts.frame_numbers)]
 
 
 def copied(parts: Parts, to: str, at: str, source: str, place: str) -> list[str]:

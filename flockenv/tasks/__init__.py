@@ -12,10 +12,24 @@ for _module in pkgutil.iter_modules(__path__):
     importlib.import_module(f"{__name__}.{_module.name}")
 
 from flockenv.tasks.crossing import Crossing  # noqa: E402  # after the folder has been walked
-from flockenv.tasks.evade import Evade  # noqa: E402
+from flockenv.tasks.evade import Evade  # noqa: E402  # after the folder has been walked
 from flockenv.tasks.flock import Flock  # noqa: E402
 from flockenv.tasks.herd import Herd  # noqa: E402
 from flockenv.tasks.obstacles import Obstacles  # noqa: E402
+from flockenv.tasks.path_follow import PathFollow  # noqa: E402
 from flockenv.tasks.pursuit import Pursuit  # noqa: E402
 
-__all__ = ["TASKS", "Crossing", "Evade", "Flock", "Frame", "Herd", "Layout", "Obstacles", "Pursuit", "Slot", "Task"]
+__all__ = [
+    "TASKS",
+    "Crossing",
+    "Evade",
+    "Flock",
+    "Frame",
+    "Herd",
+    "Layout",
+    "Obstacles",
+    "PathFollow",
+    "Pursuit",
+    "Slot",
+    "Task",
+]

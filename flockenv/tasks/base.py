@@ -202,13 +202,17 @@ def task_source(task: Task) -> str:
     empty = ", ".join(f"{name}[:0]" for name in NEAR.split(", "))
     then = frame.format(x="x0", v="v0", alive="alive0", near=empty)
     look = f"look(x, alive, obstacle_x, obstacle_radius, b, params, {NEAR}, {SHARED})" if task.look else "pass"
-    worlds = "x, v, alive, tick, obstacle_x, obstacle_radius, work, key, memory, steps, params, numbers, table"
+    worlds = (
+        f"x, v, {task.parts.frame_argument}alive, tick, obstacle_x, obstacle_radius, work, key, memory, steps, params, "
+        "numbers, table"
+    )
     return (
         scene_source(task.parts)
         + look_source(task.parts)
         + f'''
 
 from flockenv.tasks.base import Frame
+from flockenv.vehicle import face
 from {type(task).__module__} import {", ".join(_KERNELS)}
 
 P = namedtuple("P", {" ".join(names)!r})
@@ -247,6 +251,7 @@ def play(
             for i in range(n):
                 alive[b, i] = True
             spawn(p, {now})
+            {"face(v, frame_, b, True)" if task.parts.oriented else "pass"}
         if acting:
             for k in range({d}):
                 for i in range(n):
@@ -261,7 +266,8 @@ def play(
             drive(p, {now}, action, force[:, 0])
             into_blocks(want, force, 0, n, 0, blocks)
             bad = step_world(
-                x, v, alive, tick, key, obstacle_x, obstacle_radius, work, params, dt, count, b, 0, 1, {SHARED},
+                x, v, {task.parts.frame_argument}alive, tick, key, obstacle_x, obstacle_radius, work, params, dt,
+                count, b, 0, 1, {SHARED},
             )
             if bad >= 0 and broken < 0:
                 broken, who = b, bad

@@ -1,0 +1,228 @@
+"""Along paths and fields (Reynolds 1999): follow a path, stay on it, follow a field of velocities on a grid.
+
+A path is a tube: straight pieces, its spine, and a radius. Who will still be in it in `time` seconds is let alone.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Annotated, Any, ClassVar, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, model_validator
+
+from flockenv import grid, polyline, steering
+from flockenv.effects.base import Effect, Me, Vector
+from flockenv.kernels import Vec, law, like
+from flockenv.vec import add, norm, scale, select, sub, zero
+
+__all__ = ["FollowFlow", "FollowPath", "StayOnPath"]
+
+SLOWEST = 0.25
+"""Share of the wanted speed at which it looks ahead at least: who stands still must be sent somewhere."""
+
+
+@law
+def _offset(found: Vec) -> Vec:
+    """Return the offset of what `polyline.nearest` found."""
+    if len(found) == 3:
+        return (found[1], found[2])
+    else:
+        return (found[1], found[2], found[3])
+
+
+@law
+def path_followed(p: Any, me: Me) -> Vec:
+    """F = w S."""
+    top = min(p.speed, me.max_speed)
+    o, way = like(top, 0.0), like(top, p.way)
+    now = polyline.nearest(p.table, me.pos)
+    then = polyline.nearest(p.table, add(me.pos, scale(me.vel, p.time)))
+    gained = way * polyline.gained(p.table, now[0], then[0]) - p.keep * top * p.time
+    ahead = p.time * max(norm(me.vel), like(top, SLOWEST) * top)
+    target = polyline.spine(p.table, me.pos, now[0] + way * ahead)
+    wish = steering.follow_path(norm(_offset(then)) - p.radius, gained, target, me.vel, top)
+    slow = max(p.slow_radius, like(top, 1e-9))
+    end = polyline.spine(p.table, me.pos, p.table[1] if way > o else o)
+    arriving = polyline.to_end(p.table, now[0], way) < p.slow_radius
+    return scale(select(arriving, steering.arrive(end, me.vel, top, slow), wish), p.weight)
+
+
+@law
+def path_kept(p: Any, me: Me) -> Vec:
+    """F = w S."""
+    step = scale(me.vel, p.time)
+    to_spine = _offset(polyline.nearest(p.table, add(me.pos, step)))
+    beyond = norm(to_spine) - p.radius
+    wish = steering.stay_on_path(beyond, add(step, to_spine), me.vel, min(p.speed, me.max_speed))
+    return scale(wish, p.weight)
+
+
+@law
+def _middle(table: Any, x: Vec) -> Vec:
+    """Return the middle of a grid."""
+    d = len(x)
+    half = like(x[0], 0.5) * table[d]
+    e = like(x[0], 1.0)
+    if len(x) == 2:
+        return (table[0] + half * (table[3] - e), table[1] + half * (table[4] - e))
+    else:
+        x0, x1 = table[0] + half * (table[4] - e), table[1] + half * (table[5] - e)
+        return (x0, x1, table[2] + half * (table[6] - e))
+
+
+@law
+def flow_followed(p: Any, me: Me) -> Vec:
+    """F = w S, 0 outside the grid."""
+    there = add(me.pos, scale(me.vel, p.time))
+    at = add(sub(there, p.centre), _middle(p.table, there))  # on a torus p.centre is the image that is nearest
+    wish = steering.follow_flow(grid.sample_vector(p.table, at, 0), me.vel)
+    return scale(select(grid.covers(p.table, at), wish, zero(me.vel)), p.weight)
+
+
+class _OnPath(Effect):
+    """What both have in common: a tube, and how far ahead they look."""
+
+    steering: ClassVar[bool] = True
+    tabled: ClassVar[bool] = True
+    places: ClassVar[tuple[str, ...]] = ("points",)
+
+    weight: float
+    points: Annotated[tuple[Vector, ...], Field(min_length=2, max_length=1024)] = Field(
+        description="m, the corners of its spine; on a torus each piece between two goes the shortest way"
+    )
+    closed: bool = Field(default=False, description="does the last point lead back to the first?")
+    radius: float = Field(gt=0, description="m, of the tube")
+    speed: float = Field(gt=0, description="m/s, how fast it wants to be; at most its max_speed")
+    time: float = Field(default=0.5, ge=0, description="s, how far ahead it looks")
+
+    @model_validator(mode="after")
+    def _is_a_path(self) -> _OnPath:
+        """Refuse points of different dimensions, and two in one place."""
+        for k, point in enumerate(self.points):
+            if len(point) != len(self.points[0]):
+                raise ValueError(f"points[{k}] = {point}: the first point has {len(self.points[0])} coordinates")
+        polyline.pieces(self.points, self.closed)
+        return self
+
+    def parameters(self) -> dict[str, float | Vec]:
+        """All but the path itself, which is in the table."""
+        names = ("weight", "radius", "speed", "time")
+        return {name: float(getattr(self, name)) for name in names}
+
+    def table(self, scene: Any) -> NDArray[np.float64]:
+        """The path."""
+        return polyline.pieces(self.points, self.closed, scene.space)
+
+    def check(self, scene: Any) -> None:
+        """Refuse a path of another dimension, or one that a torus makes a point of."""
+        if len(self.points[0]) != scene.dimension:
+            raise ValueError(f"points[0] = {self.points[0]}: dimension = {scene.dimension}")
+        self.table(scene)
+
+
+class FollowPath(_OnPath):
+    """Follow a path in one of its directions: nothing while on its way in the tube, else seek the spine further along.
+
+    Reynolds lets alone whoever gains anything on its way, so that it coasts for ever at whatever speed it has: here it
+    must gain `keep` times its speed. Two groups with opposite ways are traffic. The end of an open path is sought, or
+    arrived at within `slow_radius`.
+    """
+
+    kind: Literal["follow_path"] = "follow_path"
+    weight: float = Field(ge=0, description="kg/s")
+    time: float = Field(default=0.5, gt=0, description="s, how far ahead it looks")
+    way: Literal[1, -1] = Field(default=1, description="1: as the points are listed; -1: the other way")
+    keep: float = Field(
+        default=0.5, ge=0, lt=1, description="share of its speed: who is slower on its way is sent on; 0 = nobody is"
+    )
+    slow_radius: float = Field(default=0.0, ge=0, description="m, it brakes so far from the end of an open path")
+    own_law: ClassVar[str | None] = "path_followed"
+    demo: ClassVar[str | None] = """
+groups:
+  - {count: 5, max_speed: 2, max_force: 6, spawn: {low: [3, 0], high: [9, 3], speed: [0.5, 1.5]}}
+  - {count: 5, max_speed: 2, max_force: 6, role: evader, spawn: {low: [3, 6], high: [9, 9], speed: [0.5, 1.5]}}
+effects:
+  - kind: steer
+    group: 0
+    behaviours:
+      - {kind: separation, weight: 1.5, radius: 0.8}
+      - {kind: follow_path, weight: 4, radius: 0.6, speed: 2, closed: true,
+         points: [[1, 1], [6, 2.5], [11, 1], [12, 5], [10, 9], [6, 7.5], [2, 9], [0, 5]]}
+  - kind: steer
+    group: 1
+    behaviours:
+      - {kind: separation, weight: 1.5, radius: 0.8}
+      - {kind: follow_path, weight: 4, radius: 0.6, speed: 2, closed: true, way: -1,
+         points: [[1, 1], [6, 2.5], [11, 1], [12, 5], [10, 9], [6, 7.5], [2, 9], [0, 5]]}
+"""
+
+    def parameters(self) -> dict[str, float | Vec]:
+        """And what is about its way along it."""
+        own = {"way": float(self.way), "keep": float(self.keep), "slow_radius": float(self.slow_radius)}
+        return super().parameters() | own
+
+
+class StayOnPath(_OnPath):
+    """Stay in a path's tube, whichever way: if the place after `time` s is outside, seek the spine beside it."""
+
+    kind: Literal["stay_on_path"] = "stay_on_path"
+    weight: float = Field(ge=0, description="kg/s")
+    own_law: ClassVar[str | None] = "path_kept"
+    demo: ClassVar[str | None] = """
+groups:
+  - {count: 12, max_speed: 2, max_force: 6, spawn: {low: [2, 2], high: [10, 6], speed: [1, 2]}}
+effects:
+  - kind: steer
+    behaviours:
+      - {kind: stay_on_path, weight: 4, radius: 1, speed: 2, points: [[-12, 4], [0, 4], [6, 2], [12, 4], [24, 4]]}
+"""
+
+
+class FollowFlow(Effect):
+    """Follow a field of velocities on a grid, linear in between: F = w (u - v), 0 outside the grid."""
+
+    kind: Literal["follow_flow"] = "follow_flow"
+    weight: float = Field(ge=0, description="kg/s")
+    centre: Vector = Field(description="m, the middle of the grid")
+    spacing: float = Field(gt=0, description="m, from one point of the grid to the next")
+    counts: tuple[Annotated[int, Field(ge=2, le=1024)], ...] = Field(
+        min_length=2, max_length=3, description="points along each axis"
+    )
+    velocities: tuple[Vector, ...] = Field(description="m/s, at all points; the last axis runs fastest")
+    time: float = Field(default=0.2, ge=0, description="s, how far ahead it looks")
+    steering: ClassVar[bool] = True
+    tabled: ClassVar[bool] = True
+    places: ClassVar[tuple[str, ...]] = ("centre",)
+    own_law: ClassVar[str | None] = "flow_followed"
+    demo: ClassVar[str | None] = """
+groups:
+  - {count: 15, max_speed: 2, max_force: 4, spawn: {low: [1, 1], high: [9, 9]}}
+effects:
+  - {kind: follow_flow, weight: 4, centre: [5, 5], spacing: 5, counts: [3, 3],
+     velocities: [[1.8, -0.6], [0.6, -1.2], [-0.6, -1.8], [1.2, 0.6], [0, 0], [-1.2, -0.6], [0.6, 1.8], [-0.6, 1.2],
+                  [-1.8, 0.6]]}
+"""
+
+    @model_validator(mode="after")
+    def _fills_the_grid(self) -> FollowFlow:
+        """Refuse another number of velocities than of points, and vectors of different dimensions."""
+        d = len(self.centre)
+        if len(self.counts) != d:
+            raise ValueError(f"counts = {self.counts}: the centre has {d} coordinates")
+        if len(self.velocities) != math.prod(self.counts):
+            raise ValueError(f"velocities: {len(self.velocities)}, must be {math.prod(self.counts)}, one at each point")
+        for k, velocity in enumerate(self.velocities):
+            if len(velocity) != d or not all(map(math.isfinite, velocity)):
+                raise ValueError(f"velocities[{k}] = {velocity}: must be {d} finite numbers")
+        return self
+
+    def parameters(self) -> dict[str, float | Vec]:
+        """All but the grid, which is in the table."""
+        return {"weight": self.weight, "centre": tuple(map(float, self.centre)), "time": self.time}
+
+    def table(self, scene: Any) -> NDArray[np.float64]:
+        """The grid."""
+        low = np.array(self.centre) - self.spacing * (np.array(self.counts) - 1) / 2
+        return grid.packed(np.reshape(self.velocities, (*self.counts, -1)), low.tolist(), self.spacing)

@@ -1,0 +1,190 @@
+"""Walls to keep to: following them at a distance, and staying within them (Reynolds 1999)."""
+
+from __future__ import annotations
+
+import math
+from typing import Any, ClassVar, Literal, Self
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, model_validator
+
+from flockenv import steering
+from flockenv.behaviours.base import Moving, top_speed
+from flockenv.effects.base import Me, Obstacle
+from flockenv.kernels import Vec, law, like
+from flockenv.shapes import AnyShape, packed
+from flockenv.shapes.block import nearest_block
+from flockenv.shapes.chain import nearest_chain
+from flockenv.space import Torus
+from flockenv.vec import add, dot, lateral, perpendicular, scale, select, sub, unit, zero
+
+__all__ = ["Contain", "FollowWall"]
+
+
+@law
+def soon(p: Any, me: Me) -> Vec:
+    """Where it will be, at its present velocity."""
+    return scale(me.vel, p.time)
+
+
+@law
+def no_wall(p: Any, me: Me) -> Vec:
+    """No wall yet: at infinity."""
+    return (like(me.who, np.inf),) + zero(me.pos)  # noqa: RUF005  # numba joins tuples, but does not unpack them
+
+
+@law
+def nearest_wall(p: Any, me: Me, other: Obstacle, acc: Vec) -> Vec:
+    """Keep the nearest surface: (how far it is from there, its normal)."""
+    return select(abs(other.gap) < abs(acc[0]), (other.gap,) + other.normal, acc)  # noqa: RUF005
+
+
+@law
+def along_wall(p: Any, me: Me, acc: Vec) -> Vec:
+    """F = w (seek of w + D n, the point off the wall, nearest to where it will be)."""
+    o, e = like(me.who, 0.0), like(me.who, 1.0)
+    normal: Vec
+    if len(acc) == 3:
+        normal = (acc[1], acc[2])
+    else:
+        normal = (acc[1], acc[2], acc[3])
+    near = abs(acc[0]) < p.range
+    step = scale(me.vel, p.time)
+    gap = acc[0] if near else o
+    crossed = gap - dot(step, normal) < o  # it will be through a thin wall: its own side counts
+    normal, gap = scale(normal, -e if crossed else e), -gap if crossed else gap
+    still = dot(step, step) <= o
+    onward = select(still, scale(perpendicular(normal), p.time * top_speed(p, me)), step)
+    goal = add(onward, scale(normal, p.distance - gap))
+    wish = scale(steering.seek(goal, me.vel, top_speed(p, me)), p.weight)
+    return select(near, wish, zero(wish))
+
+
+class FollowWall(Moving):
+    """Keep `distance` to the nearest surface and go on along it: seek the point off the wall beside the place ahead.
+
+    On whichever side it comes by; at rest it sets out with the wall on its left. Around a corner it turns as sharply as
+    its force allows: `time` of about 2 m / w cuts no corner.
+    """
+
+    kind: Literal["follow_wall"] = "follow_wall"
+    distance: float = Field(gt=0, description="m, of its centre from the wall")
+    time: float = Field(default=0.5, gt=0, description="s, how far ahead it looks")
+    range: float = Field(default=5.0, gt=0, description="m, walls further away than this are not seen")
+    obstacle_from: ClassVar[str | None] = "soon"
+    obstacle_start: ClassVar[str | None] = "no_wall"
+    obstacle_law: ClassVar[str | None] = "nearest_wall"
+    obstacle_finish: ClassVar[str | None] = "along_wall"
+    demo: ClassVar[str | None] = """
+groups:
+- count: 2
+  radius: 0.15
+  max_speed: 2
+  max_force: 20
+  spawn: {low: [2, 0.8], high: [3, 1.2], speed: [1, 1], heading: [1, 0]}
+obstacles:
+- {kind: polygon, vertices: [[0, 2], [8, 2], [8, 7], [5, 7], [5, 4.5], [0, 4.5]]}
+effects:
+- {kind: steer, behaviours: [{kind: follow_wall, weight: 8, distance: 0.8, time: 0.25}]}
+"""
+
+    def folded(self, dimension: int) -> int:
+        """A distance and a normal."""
+        return 1 + dimension
+
+
+# --- containment ------------------------------------------------------------------------------------------------------
+
+
+@law
+def back_inside(p: Any, me: Me, now: float, gap: float, out: Vec) -> Vec:
+    """Turn along the wall that it will come through, braking as it comes head-on; from outside, straight back."""
+    o, e = like(me.who, 0.0), like(me.who, 1.0)
+    aside = scale(lateral(out, me.heading), -e)
+    straight = dot(aside, aside) < like(me.who, 1e-6)
+    side = select(straight, perpendicular(me.heading), unit(aside))
+    ahead = dot(out, me.heading)
+    brake = scale(me.vel, -(ahead * ahead if ahead > o else o))
+    turn = add(scale(side, top_speed(p, me)), brake)
+    home = sub(scale(out, -top_speed(p, me)), me.vel)
+    wish = scale(select(now + me.radius > o, home, turn), p.weight)
+    return select(gap + me.radius > o, wish, zero(wish))
+
+
+@law
+def contain_chain(p: Any, me: Me) -> Vec:
+    """Within a circle, a polygon or whatever else is a chain."""
+    x = _relative(p.table, me.pos)
+    now, away = nearest_chain(p.table, 0, x)
+    gap, out = nearest_chain(p.table, 0, add(x, scale(me.vel, p.time)))
+    beyond = now + me.radius > like(me.who, 0.0)
+    return back_inside(p, me, now, now if beyond else gap, select(beyond, away, out))
+
+
+@law
+def contain_block(p: Any, me: Me) -> Vec:
+    """Within a box."""
+    x = _relative(p.table, me.pos)
+    now, away = nearest_block(p.table, 0, x)
+    gap, out = nearest_block(p.table, 0, add(x, scale(me.vel, p.time)))
+    beyond = now + me.radius > like(me.who, 0.0)
+    return back_inside(p, me, now, now if beyond else gap, select(beyond, away, out))
+
+
+@law
+def _relative(table: Any, x: Vec) -> Vec:
+    if len(x) == 2:
+        return (x[0] - table[2], x[1] - table[3])
+    else:
+        return (x[0] - table[2], x[1] - table[3], x[2] - table[4])
+
+
+class Contain(Moving):
+    """Stay within a shape: zero while the place `time` seconds ahead is inside it, else along the wall met there.
+
+    The inward normal's part across the heading steers; head-on it has none, so it brakes and keeps right. Whoever is
+    outside heads straight back in. Reynolds 1999, containment.
+    """
+
+    kind: Literal["contain"] = "contain"
+    within: AnyShape = Field(description="a circle (or sphere), a block, a polygon; the body stays inside it whole")
+    time: float = Field(default=1.0, gt=0, description="s, how far ahead it looks")
+    tabled: ClassVar[bool] = True
+    demo: ClassVar[str | None] = """
+groups:
+- {count: 8, radius: 0.15, max_speed: 2, max_force: 12, spawn: {low: [3, 3], high: [5, 5], speed: [1.5, 2]}}
+effects:
+- kind: steer
+  behaviours:
+  - kind: contain
+    weight: 5
+    within: {kind: polygon, vertices: [[0, 0], [8, 0], [8, 8], [4, 6], [0, 8]]}
+"""
+
+    @model_validator(mode="after")
+    def _has_an_inside(self) -> Self:
+        if self.within.kind not in ("circle", "block", "polygon"):
+            raise ValueError(f"within.kind = {self.within.kind}: must be one of circle, block, polygon")
+        return self
+
+    @property
+    def own_law(self) -> str | None:  # type: ignore[override]  # which law it is depends on the shape
+        """The law for this form of shape."""
+        return f"contain_{self.within.form}"
+
+    def parameters(self) -> dict[str, float | Vec]:
+        """The shape is a table."""
+        return {"speed": math.inf if self.speed is None else self.speed, "weight": self.weight, "time": self.time}
+
+    def table(self, scene: Any) -> NDArray[np.float64]:
+        """The row of the shape."""
+        return packed([self.within], scene.dimension)[0]
+
+    def check(self, scene: Any) -> None:
+        """Refuse a torus, where there is no outside, and another dimension."""
+        super().check(scene)
+        if isinstance(scene.space, Torus):
+            raise ValueError("kind = contain: on a torus everybody is inside; only a plane or a box is allowed")
+        if self.within.dimension != scene.dimension:
+            raise ValueError(f"within: lies in {self.within.dimension} dimensions, but dimension = {scene.dimension}")

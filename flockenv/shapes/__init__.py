@@ -1,0 +1,28 @@
+"""Obstacles: circles, capsules, walls, polygons, blocks, half-spaces, distance fields; in 2-D and (but polygons) 3-D.
+
+`round`, `chain`, `block`, `field` hold the laws of one agent and one shape; `table` how kernels are handed shapes;
+`records` what scenes list; `outlines` what pictures show.
+"""
+
+from __future__ import annotations
+
+from flockenv.shapes.records import (
+    SHAPES,
+    AnyShape,
+    Block,
+    Capsule,
+    Circle,
+    DistanceField,
+    HalfSpace,
+    Polygon,
+    Shape,
+    Wall,
+    clear_of,
+)
+from flockenv.shapes.round import blocks, gap, normal, ray_hit, silhouette, touched_normal
+from flockenv.shapes.table import FORMS, packed
+
+__all__ = [
+    "FORMS", "SHAPES", "AnyShape", "Block", "Capsule", "Circle", "DistanceField", "HalfSpace", "Polygon", "Shape",
+    "Wall", "blocks", "clear_of", "gap", "normal", "packed", "ray_hit", "silhouette", "touched_normal",
+]  # fmt: skip

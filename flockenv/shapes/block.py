@@ -1,0 +1,178 @@
+"""Boxes that may be turned, and half-spaces. See shapes/table.py for how they lie in a table.
+
+A block is its half edges (D, m) and its axes (D unit vectors of D numbers); a half-space is the unit normal that points
+out of it. `x` is where the agent is, relative to the anchor: the centre, or a point of the surface.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from flockenv.kernels import Vec, law, like
+from flockenv.shapes.chain import segment_hit
+from flockenv.shapes.round import ray_hit
+from flockenv.vec import add, axis, dot, norm, scale, select, sub, unit
+
+__all__ = ["box_hit", "box_nearest", "hit_block", "hit_half_space", "nearest_block", "nearest_half_space"]
+
+
+@law
+def _read(table: Any, at: int, x: Vec) -> Vec:
+    if len(x) == 2:
+        return (table[at], table[at + 1])
+    else:
+        return (table[at], table[at + 1], table[at + 2])
+
+
+@law
+def _turned(table: Any, at: int, x: Vec) -> Vec:
+    """Return x in the frame whose axes begin at `at`."""
+    if len(x) == 2:
+        return (dot(_read(table, at, x), x), dot(_read(table, at + 2, x), x))
+    else:
+        return (dot(_read(table, at, x), x), dot(_read(table, at + 3, x), x), dot(_read(table, at + 6, x), x))
+
+
+@law
+def _turned_back(table: Any, at: int, y: Vec) -> Vec:
+    out = add(scale(_read(table, at, y), y[0]), scale(_read(table, at + len(y), y), y[1]))
+    if len(y) == 2:
+        return out
+    else:
+        return add(out, scale(_read(table, at + 6, y), y[2]))
+
+
+@law
+def _beyond(y: float, h: float) -> float:
+    """How far y lies outside [-h, h], with its sign."""
+    return y - h if y > h else (y + h if y < -h else like(y, 0.0))
+
+
+@law
+def _depth(y: float, h: float) -> float:
+    return abs(y) - h
+
+
+@law
+def _signed(y: float, k: int, x: Vec) -> Vec:
+    return scale(axis(x, k), like(y, 1.0) if y >= like(y, 0.0) else like(y, -1.0))
+
+
+@law
+def box_nearest(y: Vec, h: Vec) -> tuple[float, Vec]:
+    """Return the distance to a box around 0 along the axes, m (negative inside), and its outward unit normal."""
+    x_, y_ = _depth(y[0], h[0]), _depth(y[1], h[1])
+    wide = x_ > y_
+    deepest, face = x_ if wide else y_, select(wide, _signed(y[0], 0, y), _signed(y[1], 1, y))
+    out: Vec
+    if len(y) == 2:
+        out = (_beyond(y[0], h[0]), _beyond(y[1], h[1]))
+    else:
+        out = (_beyond(y[0], h[0]), _beyond(y[1], h[1]), _beyond(y[2], h[2]))
+        z_ = _depth(y[2], h[2])
+        tall = z_ > deepest
+        deepest, face = z_ if tall else deepest, select(tall, _signed(y[2], 2, y), face)
+    outside = dot(out, out) > like(deepest, 0.0)
+    return norm(out) if outside else deepest, select(outside, unit(out), face)
+
+
+@law
+def _slab(y: float, d: float, h: float) -> tuple[float, float]:
+    """Return where a line is between two faces: from, to."""
+    o, far = like(h, 0.0), like(h, np.inf)
+    moves = d != o
+    rate = d if moves else like(h, 1.0)
+    a, b = (-h - y) / rate, (h - y) / rate
+    a, b = (a, b) if a < b else (b, a)
+    between = abs(y) <= h
+    return a if moves else (-far if between else far), b if moves else (far if between else -far)
+
+
+@law
+def box_hit(y: Vec, d: Vec, h: Vec) -> float:
+    """Return the distance along d to a box around 0 along the axes, m: 0 from inside, inf if missed."""
+    a, b = _slab(y[0], d[0], h[0])
+    c, e = _slab(y[1], d[1], h[1])
+    first, last = c if c > a else a, e if e < b else b
+    if len(y) == 3:
+        c, e = _slab(y[2], d[2], h[2])
+        first, last = c if c > first else first, e if e < last else last
+    o = like(first, 0.0)
+    return (first if first > o else o) if (first <= last) & (last >= o) else like(o, np.inf)
+
+
+@law
+def _rounded_square(y: Vec, d: Vec, h: Vec, r: float) -> float:
+    """Return where a ray meets what is within r of a rectangle: two rectangles and four circles."""
+    a, b = box_hit(y, d, (h[0] + r, h[1])), box_hit(y, d, (h[0], h[1] + r))
+    best = a if a < b else b
+    for corner in range(4):
+        place = (h[0] if corner & 1 else -h[0], h[1] if corner & 2 else -h[1])
+        here = ray_hit(sub(place, y), d, r)
+        best = here if here < best else best
+    return best
+
+
+@law
+def _rounded_cube(y: Vec, d: Vec, h: Vec, r: float) -> float:
+    """Return where a ray meets what is within r of a box: three boxes, and a tube around each of twelve edges."""
+    a, b = box_hit(y, d, (h[0] + r, h[1], h[2])), box_hit(y, d, (h[0], h[1] + r, h[2]))
+    c = box_hit(y, d, (h[0], h[1], h[2] + r))
+    best = a if a < b else b
+    best = c if c < best else best
+    for edge in range(4):
+        p, q = (edge & 1) * 2 - 1, (edge & 2) - 1
+        u, v, w = h[0] * like(r, p), h[1] * like(r, p), h[1] * like(r, q)
+        s = h[2] * like(r, q)
+        x_ = segment_hit(y, d, (-h[0], v, s), (h[0], v, s), r)
+        y_ = segment_hit(y, d, (u, -h[1], s), (u, h[1], s), r)
+        z_ = segment_hit(y, d, (u, w, -h[2]), (u, w, h[2]), r)
+        best = x_ if x_ < best else best
+        best = y_ if y_ < best else best
+        best = z_ if z_ < best else best
+    return best
+
+
+@law
+def nearest_block(table: Any, at: int, x: Vec) -> tuple[float, Vec]:
+    """Return the distance to the surface, m (negative inside), and the outward unit normal at its nearest point."""
+    d = len(x)
+    frame = at + 2 + 2 * d
+    gap, normal = box_nearest(_turned(table, frame, x), _read(table, at + 2 + d, x))
+    return gap, _turned_back(table, frame, normal)
+
+
+@law
+def hit_block(table: Any, at: int, x: Vec, direction: Vec, clearance: float) -> float:
+    """Return the distance along a unit `direction` at which a body of radius `clearance` touches it, m; inf if never.
+
+    From where it overlaps already it is 0.
+    """
+    frame = at + 2 + 2 * len(x)
+    y, d = _turned(table, frame, x), _turned(table, frame, direction)
+    h = _read(table, at + 2 + len(x), x)
+    if len(x) == 2:
+        return _rounded_square(y, d, h, clearance)
+    else:
+        return _rounded_cube(y, d, h, clearance)
+
+
+@law
+def nearest_half_space(table: Any, at: int, x: Vec) -> tuple[float, Vec]:
+    """Return the distance to the plane, m (negative behind it), and its normal."""
+    normal = _read(table, at + 2 + len(x), x)
+    return dot(x, normal), normal
+
+
+@law
+def hit_half_space(table: Any, at: int, x: Vec, direction: Vec, clearance: float) -> float:
+    """Return the distance along a unit `direction` at which a body of radius `clearance` touches it, m; inf if never.
+
+    From where it overlaps already it is 0.
+    """
+    normal = _read(table, at + 2 + len(x), x)
+    room, speed = dot(x, normal) - clearance, dot(direction, normal)
+    o = like(room, 0.0)
+    return o if room < o else (room / -speed if speed < o else like(o, np.inf))

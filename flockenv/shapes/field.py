@@ -1,0 +1,77 @@
+"""Any shape as distances on a grid (a signed distance field): between its points they are interpolated.
+
+A field is a grid (see flockenv/grid.py) relative to the anchor, whose points have 1 + D numbers: the distance to the surface (m, negative inside) and its direction, outward.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from flockenv.grid import sample, sample_vector
+from flockenv.kernels import Vec, law, like
+from flockenv.vec import add, axis, dot, norm, scale, select, sub, unit
+
+__all__ = ["hit_distance_field", "nearest_distance_field"]
+
+STEPS = 96
+"""Places that a ray is followed through before it counts as missed: it comes nearer by most of its distance each."""
+
+
+@law
+def _inside(grid: Any, x: float, d: int, k: int) -> float:
+    """Return x, or the edge of the grid that it is beyond, along axis k."""
+    high = grid[k] + grid[d] * (grid[d + 1 + k] - like(x, 1.0))
+    x = x if x > grid[k] else grid[k]
+    return x if x < high else high
+
+
+@law
+def _on_grid(grid: Any, x: Vec) -> Vec:
+    if len(x) == 2:
+        return (_inside(grid, x[0], 2, 0), _inside(grid, x[1], 2, 1))
+    else:
+        return (_inside(grid, x[0], 3, 0), _inside(grid, x[1], 3, 1), _inside(grid, x[2], 3, 2))
+
+
+@law
+def nearest_distance_field(table: Any, at: int, x: Vec) -> tuple[float, Vec]:
+    """Return the distance to the surface, m (negative inside), and the outward unit normal at its nearest point.
+
+    Outside the grid: the distance to the grid and the distance there, which is at least as far as it is.
+    """
+    grid = table[at + 2 + len(x) :]
+    y = _on_grid(grid, x)
+    beyond = sub(x, y)
+    out = unit(add(sample_vector(grid, y, 1), beyond))
+    some = dot(out, out) > like(x[0], 0.0)
+    return sample(grid, y, 0) + norm(beyond), select(some, out, axis(x, 0))
+
+
+@law
+def hit_distance_field(table: Any, at: int, x: Vec, direction: Vec, clearance: float) -> float:
+    """Return the distance along a unit `direction` at which a body of radius `clearance` touches it, m; inf if never.
+
+    From where it overlaps already it is 0. Followed step by step, each as long as the surface is far, to a hundredth of
+    the grid's spacing.
+    """
+    grid = table[at + 2 + len(x) :]
+    d = len(x)
+    near, longest = grid[d] * like(clearance, 0.01), grid[d] * (grid[d + 1] + grid[d + 2] + grid[2 * d])
+    o, most = like(clearance, 0.0), like(clearance, 0.9)
+    way, room = o, o
+    limit = norm(x) + longest + longest + clearance
+    for _ in range(STEPS):
+        spot = add(x, scale(direction, way))
+        y = _on_grid(grid, spot)
+        beyond = norm(sub(spot, y))
+        here = sample(grid, y, 0)
+        # beyond the grid the surface is as far as the grid at least, and the body that comes nearer has a size
+        here -= beyond
+        room = (beyond if beyond > here else here) - clearance
+        if (room < near) | (way > limit):
+            break
+        way += room * most
+    out = way if room < near else like(clearance, np.inf)
+    return o if (room < near) & (way <= o) else out

@@ -1,0 +1,130 @@
+"""Shapes as polygons of the plane, for pictures, and what only needs their vertices. numpy, no laws."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = ["area", "around", "behind", "crossing", "hull", "silhouette", "strips"]
+
+Floats = NDArray[np.float64]
+ROUND = 48
+"""Corners of a circle in a picture."""
+
+
+def area(vertices: Floats) -> float:
+    """Return the area of a polygon (n, 2), positive if it runs counter-clockwise."""
+    x, y = vertices.T
+    return float(0.5 * (x * np.roll(y, -1) - np.roll(x, -1) * y).sum())
+
+
+def crossing(vertices: Floats) -> tuple[int, int] | None:
+    """Return two edges of a closed polygon (n, 2) that cross, touch or overlap, each by its first vertex; or none."""
+    n = len(vertices)
+    a, b = vertices, np.roll(vertices, -1, axis=0)
+    for i in range(n):
+        if (a[i] == b[i]).all():
+            return i, (i + 1) % n
+        turn = _turn(a[i], b[i], a), _turn(a[i], b[i], b)
+        other = _turn(a, b, a[i]), _turn(a, b, b[i])
+        apart = (turn[0] * turn[1] > 0) | (other[0] * other[1] > 0)
+        low, high = np.minimum(a, b), np.maximum(a, b)
+        apart |= (low > high[i]).any(axis=1) | (high < low[i]).any(axis=1)
+        following = (i + 1) % n
+        back = float((b[i] - a[i]) @ (b[following] - a[following])) < 0
+        if turn[1][following] == 0 and back:
+            return i, following  # it runs back along itself
+        apart[[i, following, (i - 1) % n]] = True
+        if not apart.all():
+            return i, int(np.flatnonzero(~apart)[0])
+    return None
+
+
+def _turn(a: Floats, b: Floats, c: Floats) -> Floats:
+    """Return on which side of the lines from a to b points c lie."""
+    return np.asarray(
+        (b[..., 0] - a[..., 0]) * (c[..., 1] - a[..., 1]) - (b[..., 1] - a[..., 1]) * (c[..., 0] - a[..., 0])
+    )
+
+
+def hull(points: Floats) -> Floats:
+    """Return the convex hull of points (n, 2), counter-clockwise (Andrew's monotone chain)."""
+    ordered = sorted(set(map(tuple, points.tolist())))
+    half: list[list[tuple[float, float]]] = []
+    for run in (ordered, ordered[::-1]):
+        chain: list[tuple[float, float]] = []
+        for p in run:
+            while len(chain) > 1 and _turn(np.array(chain[-2]), np.array(chain[-1]), np.array(p)) <= 0:
+                chain.pop()
+            chain.append(p)
+        half.append(chain[:-1])
+    return np.array(half[0] + half[1])
+
+
+def around(points: Floats, radius: float) -> Floats:
+    """Return all that is within `radius` of the convex hull of one or two points (n, 2), as a polygon."""
+    turn = np.linspace(0, 2 * np.pi, ROUND, endpoint=False)
+    ring = radius * np.stack([np.cos(turn), np.sin(turn)], axis=1)
+    return hull((points[:, None] + ring).reshape(-1, 2))
+
+
+def behind(point: Floats, direction: Floats, low: Floats, high: Floats) -> list[Floats]:
+    """Return what of a region lies behind a line, as a polygon; nothing if the direction is 0 (a floor)."""
+    if not direction.any():
+        return []
+    box = np.array([[low[0], low[1]], [high[0], low[1]], [high[0], high[1]], [low[0], high[1]]])
+    side = (box - point) @ direction
+    kept: list[Floats] = []
+    for k in range(4):
+        a, b, p, q = side[k - 1], side[k], box[k - 1], box[k]
+        if (a > 0) != (b > 0):
+            kept.append(p + (q - p) * (a / (a - b)))
+        if b <= 0:
+            kept.append(q)
+    return [np.array(kept)] if len(kept) > 2 else []
+
+
+def strips(distances: Floats, low: Sequence[float], spacing: float) -> list[Floats]:
+    """Return rectangles that cover where a grid of distances (nx, ny) is negative."""
+    found = []
+    for i, column in enumerate(distances < 0):
+        edges = np.flatnonzero(np.diff(np.concatenate([[False], column, [False]]).astype(int)))
+        x = low[0] + spacing * (i + np.array([-0.5, 0.5, 0.5, -0.5]))
+        for first, end in edges.reshape(-1, 2).tolist():
+            y = low[1] + spacing * (np.array([first, first, end, end]) - 0.5)
+            found.append(np.stack([x, y], axis=1))
+    return found
+
+
+def silhouette(shape: Any, point: Floats, clearance: float) -> tuple[Floats, Floats]:
+    """Return the left and right ends of a shape's outline, inflated by `clearance`, as seen from a point; m.
+
+    Lines from the point through them touch the shape: tangents of the circles around its corners.
+    """
+    corners, radius = np.asarray(shape.extremes), clearance
+    if len(point) != 2 or shape.dimension != 2:
+        raise ValueError(f"silhouette: of a {shape.kind} in {shape.dimension}-D; the outline has two ends in the plane")
+    if shape.form in ("half_space", "distance_field"):
+        raise ValueError(f"silhouette: a {shape.kind} has no corners")
+    if shape.kind == "circle":
+        corners, radius = np.array([shape.centre]), radius + shape.radius
+    elif shape.kind in ("capsule", "wall"):
+        corners = np.array(shape.vertices if shape.kind == "wall" else (shape.start, shape.end))
+        radius += shape.radius
+    if float(shape.gap(point)) <= clearance:
+        raise ValueError(f"silhouette: {point.tolist()} m is not outside of it")
+    offset = corners - point
+    distance = np.linalg.norm(offset, axis=1)
+    middle = offset.mean(axis=0)
+    base = math.atan2(middle[1], middle[0])
+    bearing = (np.arctan2(offset[:, 1], offset[:, 0]) - base + np.pi) % (2 * np.pi) - np.pi
+    half = np.arcsin(np.minimum(1, radius / distance))
+    reach = np.sqrt(np.maximum(distance**2 - radius**2, 0))
+    left, right = int(np.argmax(bearing + half)), int(np.argmin(bearing - half))
+    ends = [(left, bearing[left] + half[left]), (right, bearing[right] - half[right])]
+    first, last = (point + reach[k] * np.array([math.cos(base + a), math.sin(base + a)]) for k, a in ends)
+    return first, last

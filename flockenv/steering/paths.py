@@ -1,0 +1,39 @@
+"""Along paths and fields: what to ask for once it is known where the path, or how fast the flow, is.
+
+Where the nearest point of a path lies is geometry (`flockenv.polyline`), and so is what a grid says (`flockenv.grid`).
+"""
+
+from __future__ import annotations
+
+from flockenv.kernels import Vec, law, like
+from flockenv.steering.goals import seek
+from flockenv.vec import select, sub, zero
+
+__all__ = ["follow_flow", "follow_path", "stay_on_path"]
+
+
+@law
+def stay_on_path(beyond: float, to_spine: Vec, velocity: Vec, max_speed: float) -> Vec:
+    """Ask for nothing where the predicted place is in the tube, else seek the spine's nearest point (Reynolds 1999).
+
+    `beyond` is how far the predicted place lies outside the tube, m, negative inside; `to_spine` leads to the spine.
+    """
+    return select(beyond > like(beyond, 0.0), seek(to_spine, velocity, max_speed), zero(velocity))
+
+
+@law
+def follow_path(beyond: float, gained: float, target: Vec, velocity: Vec, max_speed: float) -> Vec:
+    """Ask for nothing on the way in the tube, else seek a point of the spine further along it (Reynolds 1999).
+
+    `gained` is how much further along its way the predicted place is, m, less what it must gain: who does not has
+    turned round, or is too slow, and is sent on. `beyond` is how far it lies outside the tube, m, negative inside.
+    """
+    o = like(beyond, 0.0)
+    good = (beyond <= o) & (gained > o)
+    return select(good, zero(velocity), seek(target, velocity, max_speed))
+
+
+@law
+def follow_flow(flow: Vec, velocity: Vec) -> Vec:
+    """Move as a field says: S = F - v, with F the velocity that it asks for at the predicted place (Reynolds 1999)."""
+    return sub(flow, velocity)

@@ -1,0 +1,159 @@
+"""Folds over the obstacles, all of them in one pass: circles, which may differ from world to world, then other shapes.
+
+A law meets circles as they are, and of any other shape one point (`effects.base.Obstacle`): the nearest of its surface,
+or, where the law casts a ray, the one that it touches first. Nothing is written if no law asks for obstacles.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from flockenv.shapes import FORMS
+from flockenv.sweep.parts import Parts
+from flockenv.sweep.text import Slots, indented, indented_lines, tuple_of
+
+__all__ = ["blocked", "obstacle_imports", "obstacles"]
+
+CIRCLE = "circle"
+
+
+def obstacle_imports(parts: Parts) -> list[str]:
+    """Write what folds over obstacles, and who is hidden by them, are made of."""
+    if not parts.meets_obstacles:
+        return []
+    lines = [
+        "from flockenv.effects.base import Obstacle",
+        "from flockenv.shapes.round import blocks, normal, touched_normal",
+        "from flockenv.shapes.touch import touched_offset, touched_spot",
+        "from flockenv.steering.around import threat",
+    ]
+    return lines + [
+        f"from {module} import hit_{form}, nearest_{form}" for form, module in FORMS.items() if form in parts.shaped[1]
+    ]
+
+
+def obstacles(parts: Parts, me: list[str], found_out: Callable[[int], str]) -> list[str]:
+    """Write the folds over the obstacles; nothing if no law asks for obstacles.
+
+    found_out(k): where what the pair law of effect k has found out about others is.
+    """
+    slot = Slots(parts)
+    asking = [(k, slot.all(f"o{k}_")) for k, e in enumerate(parts.effects) if e.obstacle_start is not None]
+    if not asking:
+        return []
+    starts = []
+    for k, slots in asking:
+        told = f", {found_out(k)}" if parts.effects[k].pair_law else ""
+        starts.append(f"found = obstacle_start_{k}(p{k}, me{told})")
+        starts += [f"{s} = found[{j}]" for j, s in enumerate(slots)]
+    count = " + ".join(["obstacle_radius.shape[1]", *(f"{form}_count" for form in parts.shaped[1])])
+    d, w = parts.dimension, parts.width
+    lines = [
+        "if block == 0:",
+        f"    work[b, 3] += n * ({count})",
+        f"for l in range(np.uint64({w})):",
+        indented(me + starts, 4),
+        "for m in range(obstacle_radius.shape[1]):",
+        "    rho = obstacle_radius[b, m]",
+        "    if rho > 0:",
+        f"        place = {tuple_of('obstacle_x[#, b, m]', d)}",
+        f"        for l in range(np.uint64({w})):",
+        indented([*me, "to = offset_to(size, x, place)", *_meet(parts, asking, CIRCLE)], 12),
+    ]
+    for form in parts.shaped[1]:
+        met = [
+            *me,
+            "y = offset_to(size, place, x)",
+            f"gap, out = nearest_{form}(params, at_, y)",
+            *_meet(parts, asking, form),
+        ]
+        lines += [
+            f"at_ = {form}_at",
+            f"for m in range({form}_count):",
+            f"    place = {tuple_of('params[at_ + 2 + #]', d)}",
+            f"    for l in range(np.uint64({w})):",
+            indented(met, 8),
+            "    at_ += np.int64(params[at_])",
+        ]
+    return lines
+
+
+def _meet(parts: Parts, asking: list[tuple[int, list[str]]], form: str) -> list[str]:
+    """Write how every law that asks meets one obstacle."""
+    lines = []
+    for k, slots in asking:
+        effect = parts.effects[k]
+        for j in range(effect.rays(parts.dimension) if effect.obstacle_ray else 1):
+            lines += _touched(form, k, j) if effect.obstacle_ray else _near(form, k if effect.obstacle_from else None)
+            lines.append(f"found = obstacle_law_{k}(p{k}, me, it, ({', '.join(slots)},))")
+            lines += [f"{s} = found[{i}]" for i, s in enumerate(slots)]
+    return lines
+
+
+def _near(form: str, k: int | None) -> list[str]:
+    """Write an obstacle as a law sees it that casts no rays, from where it is or, for effect k, from elsewhere."""
+    if form == CIRCLE:
+        way, from_ = ("to", []) if k is None else ("way", [f"way = sub(to, obstacle_from_{k}(p{k}, me))"])
+        body = f"{way}, dot({way}, {way}), zero(x), rho, zero(x), norm({way}) - rho, normal({way})"
+        return [*from_, f"it = Obstacle(like(rho, m), {body}, like(rho, np.inf), zero(x))"]
+    far, side, from_ = "gap", "out", []
+    if k is not None:
+        far, side = "far", "side"
+        from_ = [f"far, side = nearest_{form}(params, at_, add(y, obstacle_from_{k}(p{k}, me)))"]
+    body = f"zero(x), like({far}, 0.0), zero(x), {far}, {side}, like({far}, np.inf), zero(x)"
+    return [
+        *from_,
+        f"to = touched_offset(zero(x), like({far}, 0.0), {side}, {far}, {far})",
+        f"it = Obstacle(params[at_ + 1], to, dot(to, to), {body})",
+    ]
+
+
+def _touched(form: str, k: int, j: int) -> list[str]:
+    """Write an obstacle as a law sees it that casts ray j."""
+    ray = f"ray, margin = obstacle_ray_{k}(p{k}, me, {j})"
+    if form == CIRCLE:
+        body = "to, dot(to, to), zero(x), rho, zero(x)"
+        return [
+            ray,
+            "hit = threat(ray, to, me.radius + rho + margin, like(rho, np.inf))",
+            f"it = Obstacle(like(rho, m), {body}, norm(to) - rho, touched_normal(to, ray, hit), hit, ray)",
+        ]
+    return [
+        ray,
+        "room = me.radius + margin",
+        f"hit = like(gap, 0.0) if gap < room else hit_{form}(params, at_, y, ray, room)",
+        f"side = nearest_{form}(params, at_, touched_spot(y, ray, hit, room))[1]",
+        "to = touched_offset(ray, hit, side, room, gap)",
+        "it = Obstacle(params[at_ + 1], to, dot(to, to), zero(x), like(gap, 0.0), zero(x), gap, side, hit, ray)",
+    ]
+
+
+def blocked(parts: Parts) -> str:
+    """Return the source of `blocked`: does an obstacle hide what is at `to` from x? Empty if nobody asks."""
+    if not parts.occludes:
+        return ""
+    d = parts.dimension
+    lines = [
+        "found = False",
+        "for m in range(obstacle_radius.shape[1]):",
+        "    rho = obstacle_radius[b, m]",
+        "    if rho > 0:",
+        f"        found |= blocks(offset_to(size, x, {tuple_of('obstacle_x[#, b, m]', d)}), rho, to)",
+    ]
+    at = d + 1
+    for form in parts.shaped[1]:
+        lines += [
+            f"at_ = np.int64(params[{at}])",
+            f"for m in range(np.int64(params[{at + 1}])):",
+            f"    y = offset_to(size, {tuple_of('params[at_ + 2 + #]', d)}, x)",
+            f"    found |= hit_{form}(params, at_, y, unit(to), like(to[0], 0.0)) < norm(to)",
+            "    at_ += np.int64(params[at_])",
+        ]
+        at += 2
+    return f'''
+@kernel
+def blocked(obstacle_x, obstacle_radius, params, size, b, x, to):
+    """Does an obstacle stand in the straight way to whom is at `to` m?"""
+{indented(indented_lines(lines, 0), 4)}
+    return found
+'''
