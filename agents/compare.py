@@ -5,6 +5,7 @@ Writes results.json, table.md, comparison.png and replay.html. Needs no torch: l
 
 from __future__ import annotations
 
+import functools
 import os
 import platform
 import re
@@ -26,6 +27,8 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 import flockenv
 from agents import report
 from agents.experiment import CONFIGS, WEIGHTS, Experiment, load_experiment
+from agents.reynolds import PLAYERS as OTHERS
+from agents.reynolds import player as hand_written
 from flockenv.evaluation import WORLDS_PER_SEED, Episodes, rollout, task_digest, worlds_for
 from flockenv.outputs import checked_path
 from flockenv.policy import MlpPolicy, Policy, RandomPolicy, load_player
@@ -38,7 +41,7 @@ __all__ = [
 ]  # fmt: skip
 
 ROOT = Path(__file__).resolve().parent.parent
-PLAYERS = ("random", "textbook", "reynolds", "ppo")
+PLAYERS = ("random", "textbook", *OTHERS, "reynolds", "ppo")
 """From the least to the most that is claimed: a pair is always the later minus the earlier, "ppo - reynolds"."""
 
 WORLDS, SMOKE_WORLDS = 256, 16
@@ -78,13 +81,12 @@ def known_players(seed: int) -> dict[str, Callable[[Task], Policy]]:
         "textbook": lambda task: _reynolds(task, textbook=True),
         "reynolds": lambda task: _reynolds(task, textbook=False),
         "ppo": lambda task: _learned(task, seed),
+        **{name: functools.partial(_reynolds, textbook=True, name=name) for name in OTHERS},
     }
 
 
-def _reynolds(task: Task, textbook: bool) -> Policy:
-    from agents.reynolds import player
-
-    policy: Policy = player(task, textbook=textbook)
+def _reynolds(task: Task, textbook: bool, name: str = "reynolds") -> Policy:
+    policy: Policy = hand_written(task, textbook=textbook, name=name)
     return policy
 
 
@@ -115,8 +117,13 @@ def compare(
     known = known_players(seed)
     plays: dict[str, dict[str, Policy]] = {task.name: {} for task in tasks}
     for task, player in product(tasks, players):
+        if _sits_out(player, task, tasks):
+            continue
         with blaming(player.name, task, ValueError):  # those of load_player name the player themselves
             plays[task.name][player.name] = load_player(player.spec, task, known, trust_pickle)
+    alone = next((name for name, playing in plays.items() if not playing), None)
+    if alone is not None:
+        raise ValueError(f"task {alone!r}: nobody plays; {', '.join(OTHERS)} know other tasks")
     episodes = {task.name: _play(task, plays[task.name], worlds, first, advance) for task in tasks}
     results: report.Results = {
         "seed": seed,
@@ -134,6 +141,18 @@ def compare(
     }
     results["wall_time_s"] = perf_counter() - began
     return results, episodes
+
+
+def usual_players(tasks: Sequence[Task]) -> list[str]:
+    """Return who plays if nobody is asked for: everybody with a name who knows one of the tasks."""
+    known = {task.name for task in tasks}
+    return [name for name in PLAYERS if name not in OTHERS or known & OTHERS[name].keys()]
+
+
+def _sits_out(player: Player, task: Task, tasks: Sequence[Task]) -> bool:
+    """Is it a hand-written player for other tasks that are played here?"""
+    of = OTHERS.get(player.spec)
+    return of is not None and task.name not in of and any(other.name in of for other in tasks)
 
 
 def _play(task: Task, policies: Mapping[str, Policy], worlds: int, first: int, advance: Advance) -> dict[str, Episodes]:
@@ -210,7 +229,7 @@ def main(
     tasks: Annotated[list[str] | None, typer.Option(help="Tasks, by comma or repeated; all if left out.")] = None,
     players: Annotated[
         list[str] | None,
-        typer.Option(help="Players: random, textbook, reynolds, ppo, a .py file with a predict, or a .safetensors."),
+        typer.Option(help=f"Players: {', '.join(PLAYERS)}, a .py file with a predict, or a .safetensors."),
     ] = None,
     worlds: Annotated[int | None, typer.Option(help=f"Worlds per task, the same for everyone. [{WORLDS}]")] = None,
     seed: Annotated[int, typer.Option(help="Which evaluation worlds, 0 to 999.")] = 0,
@@ -225,7 +244,7 @@ def main(
     try:
         folder = folder_of(out)
         chosen = [experiment_of(name).build() for name in pick("--tasks", split(tasks) or list(TASKS), TASKS)]
-        field = field_of(split(players) or list(PLAYERS))
+        field = field_of(split(players) or usual_players(chosen))
         count = worlds if worlds is not None else SMOKE_WORLDS if smoke else WORLDS
         if not 2 <= count <= WORLDS_PER_SEED:
             raise ValueError(f"--worlds {count}: must be from 2 to {WORLDS_PER_SEED}")

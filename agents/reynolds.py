@@ -21,7 +21,7 @@ import yaml
 from flockenv import arbitration, shapes, steering
 from flockenv.orca import orca
 from flockenv.rows import rows
-from flockenv.tasks import Crossing, Evade, Flock, Herd, Obstacles, Pursuit, Task
+from flockenv.tasks import Crossing, Evade, Flock, Herd, Obstacles, PathFollow, Pursuit, Task
 
 __all__ = ["PLAYERS", "RULES", "Reynolds", "player", "tuned"]
 
@@ -36,6 +36,7 @@ allocate, keep_clear = rows(arbitration.allocate), rows(orca)
 evade_from, hiding_place = rows(steering.evade), rows(steering.hiding_place)
 ray_hit = rows(shapes.ray_hit)
 herd_from = rows(steering.herd_from)
+follow_path = rows(steering.follow_path)
 
 
 # --- Pursuit: seek where the quarry will be, but never beyond the walls it cannot pass ------------------------------
@@ -183,11 +184,11 @@ def crossing(see: Any, task: Crossing, p: CrossingRules) -> np.ndarray:
 
 @dataclass(frozen=True)
 class OrcaRules:
-    """As published: both take half, three seconds ahead."""
+    """As published, both take half; a wish that is not free is turned right, or twelve wait for each other."""
 
-    horizon: float = 3.0  # s, for so long the velocity must be free
+    horizon: float = 2.0  # s, for so long the velocity must be free
     margin: float = 0.1  # m, clearance for what inertia delays
-    turn: float = 0.1  # rad, a wish that is not free is turned right by this
+    turn: float = 0.3  # rad, a wish that is not free is turned right by this
     gain: float = 10.0  # kg/s: within a decision
     slow_radius: float = 1.0  # m, slow down within this of the goal
 
@@ -204,9 +205,15 @@ def orca_crossing(see: Any, task: Crossing, p: OrcaRules) -> np.ndarray:
         see.velocity, wish, 0.3, task.max_speed, p.horizon, task.control_dt, p.turn, seen.reshape(len(seen), -1)
     )
     return p.gain * change
+
+
 # --- Evade: around what is in the way, off the walls, away from pursuers, into cover ----------------------------------
+
+
+@dataclass(frozen=True)
 class EvadeRules:
     """Textbook: evade whoever is near, hide from the nearest otherwise (Reynolds 1999), in order of priority."""
+
     horizon: float = 1.0  # s, how far ahead cover counts that is in the way
     avoid: float = 5.0  # kg/s, strength of steering around it
     wall: float = 0.5  # s, how far ahead walls count
@@ -219,6 +226,8 @@ class EvadeRules:
     danger: float = 0.0  # m added to the way to a hiding place per m that a pursuer is nearer to it than 10 m
     exposed: float = 0.0  # m added to it for each pursuer that sees that place
     hide: float = 3.0  # kg/s, towards the hiding place
+
+
 def evade(see: Any, task: Evade, p: EvadeRules) -> np.ndarray:
     """Avoid, contain, evade, hide: allocation in that order (Reynolds 1987)."""
     top, row = task.evader_speed, np.arange(len(see.velocity))
@@ -230,6 +239,7 @@ def evade(see: Any, task: Evade, p: EvadeRules) -> np.ndarray:
     aside = p.avoid * avoid(forward, see.cover[row, first], clearance[row, first], top)
     aside *= np.isfinite(hit[row, first])[:, None]
     inside = 5.0 * contain(see.to_low - 0.5, see.to_high - 0.5, see.velocity, top, p.wall)
+
     distance = np.linalg.norm(see.pursuers, axis=-1)
     time = np.minimum(distance / task.pursuer_speed, p.predict)
     flight = evade_from(see.pursuers, see.velocity[:, None], see.pursuer_velocity, top, time)
@@ -238,6 +248,7 @@ def evade(see: Any, task: Evade, p: EvadeRules) -> np.ndarray:
     away = p.evade * np.sum(flight * weight[..., None], axis=1) / np.maximum(weight.sum(axis=1), 1e-9)[:, None]
     near = (weight.sum(axis=1) > 0)[:, None]
     away += p.middle * (see.to_high - see.to_low) / 2 * near
+
     places = hiding_place(see.cover, see.cover_radius, p.margin, see.pursuers[:, :1])
     theirs = np.linalg.norm(places[:, :, None] - see.pursuers[:, None], axis=-1).min(axis=-1)
     way = np.linalg.norm(places, axis=-1) + p.danger * np.maximum(10.0 - theirs, 0.0)
@@ -245,6 +256,8 @@ def evade(see: Any, task: Evade, p: EvadeRules) -> np.ndarray:
     soonest = np.argmin(np.where(there, way, np.inf), axis=1)
     hidden = p.hide * arrive(places[row, soonest], see.velocity, top, 0.5) * there.any(axis=1)[:, None]
     return allocate(np.stack([aside, inside, away, hidden], axis=1), task.evader_force)
+
+
 def _watchers(places: np.ndarray, see: Any) -> np.ndarray:
     """Return how many pursuers have no cover between themselves and each of the places (R, K)."""
     ways = places[:, :, None] - see.pursuers[:, None]
@@ -291,6 +304,50 @@ def herd(see: Any, task: Herd, p: HerdRules) -> np.ndarray:
     return allocate(np.stack([mates, detour, course], axis=1), task.dog_force)
 
 
+# --- PathFollow: seek the track ahead if the predicted place is off it; brake before a bend ---------------------------
+
+
+@dataclass(frozen=True)
+class PathFollowRules:
+    """Textbook: half a second ahead, the whole track is the tube, full speed whatever comes."""
+
+    time: float = 0.5  # s, how far ahead it predicts itself
+    lead: float = 0.5  # s, how far ahead at its present speed the point lies that is sought
+    tube: float = 1.0  # share of the track's width that is left alone
+    keep: float = 0.5  # share of the speed it wants, below which it is sent on
+    speed: float = 1.0  # share of the top speed that is wanted
+    grip: float = 100.0  # share of all the force there is that a bend may ask for; much = never slows down
+    early: float = 1.0  # share of it that braking before a bend counts on
+    brake: float = 0.0  # kg/s against what is too fast
+    gain: float = 5.0  # kg/s, a change of velocity is asked for within 1/gain seconds
+
+
+def path_follow(see: Any, task: PathFollow, p: PathFollowRules) -> np.ndarray:
+    """Follow the path (Reynolds 1999), at a speed that the bends ahead allow; vectors are (along the track, left)."""
+    row, step = np.arange(len(see.left)), task.spacing / _FINE
+    spine = np.concatenate([np.stack([0.0 * see.left, -see.left], axis=-1)[:, None], see.points], axis=1)
+    share = (np.arange(task.ahead * _FINE) / _FINE) % 1.0
+    piece = np.arange(task.ahead * _FINE) // _FINE
+    fine = spine[:, piece] * (1.0 - share)[:, None] + spine[:, piece + 1] * share[:, None]
+    far = task.spacing * np.arange(task.ahead)[None]  # a bend begins a point earlier
+    bend = np.maximum(np.abs(see.curvature), 1e-6)
+    allowed = p.grip * task.max_force / bend + 2.0 * p.early * task.max_force * far
+    top = np.minimum(p.speed * task.max_speed, np.sqrt(allowed.min(axis=1)))
+    speed = np.linalg.norm(see.velocity, axis=-1)
+    gap = np.linalg.norm(fine - p.time * see.velocity[:, None], axis=-1)
+    then = np.argmin(gap, axis=1)
+    gained = then * step - p.keep * top * p.time
+    ahead = p.lead * np.maximum(speed, 0.25 * top)
+    target = fine[row, np.minimum(np.round(ahead / step), task.ahead * _FINE - 1).astype(int)]
+    wish = p.gain * follow_path(gap[row, then] - p.tube * task.half_width, gained, target, see.velocity, top)
+    slower = -p.brake * (np.maximum(speed - top, 0.0) / np.maximum(speed, 1e-9))[:, None] * see.velocity
+    return slower + wish
+
+
+_FINE = 5
+"""Places between two points of the track that are seen, among which the nearest is."""
+
+
 # --- the player ------------------------------------------------------------------------------------------------------
 
 RULES: dict[str, tuple[Callable[..., np.ndarray], type]] = {
@@ -300,6 +357,7 @@ RULES: dict[str, tuple[Callable[..., np.ndarray], type]] = {
     "flock": (flock, FlockRules),
     "crossing": (crossing, CrossingRules),
     "herd": (herd, HerdRules),
+    "path_follow": (path_follow, PathFollowRules),
 }
 """What the player "reynolds" does in each task, and its parameters."""
 

@@ -54,6 +54,10 @@ RANGES: dict[str, dict[str, tuple[float, float]]] = {
         "together": (0.3, 2.0), "collecting": (0.0, 4.0), "driving": (0.3, 2.5), "near": (0.0, 5.0), "slow": (0.0, 1.0),
         "gain": (1.0, 12.0), "around": (0.0, 6.0), "width": (0.5, 2.0), "apart": (0.0, 10.0),
     },
+    "path_follow": {
+        "time": (0.05, 0.8), "lead": (0.1, 0.8), "tube": (0.0, 1.0), "keep": (0.3, 0.99), "speed": (0.5, 1.0),
+        "grip": (0.3, 2.5), "early": (0.2, 1.5), "brake": (0.0, 12.0), "gain": (1.0, 12.0),
+    },
 }  # fmt: skip
 """Where each parameter is looked for."""
 

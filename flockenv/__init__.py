@@ -27,6 +27,7 @@ if TYPE_CHECKING:
         Flock,
         Herd,
         Obstacles,
+        PathFollow,
         Pursuit,
         Task,
     )
@@ -42,6 +43,7 @@ __all__ = [
     "Flock",
     "Herd",
     "Obstacles",
+    "PathFollow",
     "Pursuit",
     "Scene",
     "Snapshot",
@@ -63,6 +65,7 @@ _HOME = {
     "Flock": "tasks",
     "Herd": "tasks",
     "Obstacles": "tasks",
+    "PathFollow": "tasks",
     "Pursuit": "tasks",
     "Task": "tasks",
     "Step": "world",

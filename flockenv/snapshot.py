@@ -15,15 +15,16 @@ __all__ = ["KINDS", "ROLES", "Floats", "Mark", "Snapshot"]
 Floats = NDArray[np.float64]
 
 ROLES: Final = ("pursuer", "evader", "learner", "flockmate", "agent")
-KINDS: Final = ("goal", "heading")
+KINDS: Final = ("goal", "heading", "way")
 
 
 @dataclass(frozen=True, eq=False)
 class Mark:
-    """Something to see that is no body: a goal, or a heading that is asked for.
+    """Something to see that is no body: a goal, a heading that is asked for, a piece of a way.
 
     kind: "goal" (a disc of `radius` around `at`; `vector` is not read) or "heading" (an arrow that starts at `at` and
-    points along `vector`; only its direction counts, and a zero vector draws nothing; `radius` is not read).
+    points along `vector`; only its direction counts, and a zero vector draws nothing; `radius` is not read) or "way" (a
+    pale disc of `radius`: many of them that overlap are a track; `vector` is not read).
     at, vector: (D,) with D = 2 or 3, at in m. radius: m, >= 0. Arrays are copied and read-only.
     Raises ValueError or TypeError, in one line, on an unknown kind, a wrong shape or a number that is not finite.
     """

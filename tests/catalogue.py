@@ -16,6 +16,7 @@ from types import ModuleType
 from typing import Any
 
 import numpy as np
+import pytest
 from numpy.typing import NDArray
 
 from flockenv import arbitration, steering
@@ -36,6 +37,7 @@ from flockenv.behaviours import (
     Contain,
     Dock,
     Evade,
+    Explore,
     Face,
     Flee,
     FollowFlow,
@@ -43,18 +45,22 @@ from flockenv.behaviours import (
     FollowPath,
     FollowWall,
     FollowWay,
+    Forage,
     ForceField,
     Formation,
     Hide,
     Interpose,
     MatchVelocity,
     OffsetPursue,
+    Orca,
     Pursue,
+    Queue,
     Seek,
     Separation,
     Shadow,
     StayOnPath,
     TargetSpeed,
+    UnalignedAvoidance,
     Wander,
     Whiskers,
 )
@@ -104,8 +110,8 @@ from flockenv.shapes import Circle
 from flockenv.space import Box, Plane, Space, Torus
 from flockenv.spawn import Spawn
 from flockenv.steer import Steer
+from flockenv.tasks import Crossing, Flock, Herd, Obstacles, PathFollow, Pursuit, Task
 from flockenv.tasks import Evade as EvadeTask
-from flockenv.tasks import Flock, Herd, Obstacles, Pursuit, Task
 
 Array = NDArray[np.float64]
 
@@ -151,6 +157,7 @@ STEERING = (
     Law(steering.dock, ("vector", "vector", "heading", "positive", "length", "positive", "length"), "vector"),
     Law(steering.approach_time, ("vector", "positive", "length"), "positive"),
     Law(steering.opensteer_time, ("vector", "vector", "vector", "length"), "positive"),
+    Law(steering.passing_point, ("vector", "vector", "positive"), "vector"),
     Law(steering.offset_pursue, ("vector", "vector", "vector", "positive", "positive", "positive"), "vector"),
     Law(
         steering.keep_station, ("vector", "vector", "vector", "own", "positive", "length"), "vector", turns="upright",
@@ -175,6 +182,11 @@ STEERING = (
     Law(steering.cohere, ("vector", "vector", "positive"), "vector"),
     Law(steering.threat, ("heading", "vector", "positive", "length"), "positive"),
     Law(steering.avoid, ("heading", "vector", "positive", "positive"), "vector"),
+    Law(steering.unaligned_threat, ("vector", "vector", "vector", "positive", "length"), "positive"),
+    Law(steering.give_way, ("vector", "vector", "vector", "positive", "positive"), "vector"),
+    Law(steering.queue_gap, ("heading", "vector", "vector", "positive", "positive"), "positive"),
+    Law(steering.queue, ("heading", "vector", "positive", "positive", "positive"), "vector"),
+    Law(steering.explore, ("walls", "walls", "vector", "positive", "positive"), "vector", turns="none", mirrors=False),
     Law(steering.stay_on_path, ("positive", "vector", "vector", "positive"), "vector"),
     Law(steering.follow_path, ("positive", "positive", "vector", "vector", "positive"), "vector"),
     Law(steering.follow_flow, ("vector", "vector"), "vector"),
@@ -205,6 +217,7 @@ class EffectRow:
     beside: tuple[Effect, ...] = ()  # without which it moves nobody: what a medium drags or carries
     obeys: frozenset[str] = frozenset({"translation", "rotation", "mirror", "relabelling"})
     signed: tuple[str, ...] = ()  # parameters that may be negative
+    dimensions: tuple[int, ...] = (2, 3)  # where it is at home
     family: str = ""  # rows of a family share a kernel: in its scene the others are there too, idle; see `company`
     flat: Effect | None = None  # the effect in the plane, where it is not enough to leave an axis out
 
@@ -216,7 +229,9 @@ class EffectRow:
         return "_".join([self.effect.kind, *words])
 
     def at(self, dimension: int) -> tuple[Effect, ...]:
-        """The effect in so many dimensions, and those beside it."""
+        """The effect in so many dimensions, and those beside it; a test of others is skipped."""
+        if dimension not in self.dimensions:
+            pytest.skip(f"{self.name}: not in {dimension}-D")
         effect = self.flat if self.flat is not None and dimension == 2 else self.effect
         return tuple(in_dimension(effect, dimension) for effect in (effect, *self.beside))
 
@@ -308,6 +323,18 @@ EFFECTS = (
     EffectRow(Alignment(weight=0.7, radius=3, fov=270)),
     EffectRow(Cohesion(weight=0.9, radius=2.8, fov=240)),
     EffectRow(AvoidObstacles(weight=5, horizon=3, margin=0.1)),
+    EffectRow(UnalignedAvoidance(weight=3, radius=4, horizon=2, margin=0.2), family="crowd"),
+    EffectRow(Queue(weight=2, target=CENTRE, speed=1.2, margin=0.1), family="crowd"),
+    # to each his own way to look for food
+    EffectRow(Forage(weight=2, food=1, speed=1.2, radius=2.4), obeys=frozenset({"translation"}), family="crowd"),
+    EffectRow(
+        Explore(weight=2, low=(-1, -1, -1), high=(7, 8, 7), speed=1.2, track=1.5),
+        obeys=frozenset({"translation", "relabelling"}), signed=("low", "high"), family="goals",
+    ),
+    EffectRow(
+        Orca(weight=5, target=CENTRE, speed=1.2), obeys=frozenset({"translation", "rotation", "relabelling"}),
+        dimensions=(2,),  # in its mirror image everybody keeps left
+    ),
     EffectRow(
         Steer(
             behaviours=(
@@ -329,9 +356,9 @@ EFFECTS = (
     ),
     EffectRow(Pursue(weight=2, speed=1.5, group=0, radius=2.5), family="others"),
     EffectRow(Evade(weight=2, speed=1.5, group=0, radius=2.5, predictor="exact", fov=300), family="others"),
-    EffectRow(OffsetPursue(weight=2, speed=1.5, radius=2.5, distance=0.5, predictor="opensteer"), family="others"),
+    EffectRow(OffsetPursue(weight=2, speed=1.5, radius=2.5, distance=0.3), family="others"),
     EffectRow(
-        Shadow(weight=2, speed=1.5, group=0, radius=2.5, distance=0.5, predictor="distance"), family="others"
+        Shadow(weight=2, speed=1.5, group=0, radius=2.5, distance=0.5, predictor="opensteer"), family="others"
     ),
     EffectRow(MatchVelocity(weight=2, radius=2.5), family="others"),
     EffectRow(
@@ -436,7 +463,10 @@ TASKS = (
     TaskRow(Obstacles()),
     TaskRow(Flock()),
     TaskRow(Flock(learners=1), "_single"),
+    TaskRow(Crossing()),
+    TaskRow(Crossing(agents=8, learners=1), "_single"),
     TaskRow(EvadeTask()),
+    TaskRow(PathFollow()),
     TaskRow(Herd()),
     TaskRow(Herd(dogs=3), "_team"),
 )

@@ -7,7 +7,6 @@ about has max_force = 0: it is steered too, and goes straight on.
 from __future__ import annotations
 
 import math
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,7 +14,6 @@ import pytest
 
 from flockenv import steering
 from flockenv.behaviours import (
-    BEHAVIOURS,
     Arrive,
     Dock,
     Evade,
@@ -34,7 +32,6 @@ from flockenv.behaviours import (
     TargetSpeed,
     Wander,
 )
-from flockenv.config import load_scene
 from flockenv.effects import Effect
 from flockenv.rows import rows
 from flockenv.scene import Group, Scene
@@ -160,16 +157,17 @@ def test_dock_ends_at_the_place_slowly_and_in_the_right_direction() -> None:
     scene = trio(dock, followers=40, dt=0.02)
     start = scene.start(0)
     start.pos[0, :40], start.vel[...] = crowd(40, 1, 9), 0
+    start.pos[0, :4] = way * np.array([[-5], [-1.5], [1.5], [5]])  # on the axis, on either side
     pos, vel = (a[:, :40] for a in course(scene, start, 25))
     assert np.linalg.norm(pos[-1], axis=1).max() < 1e-3
     assert np.linalg.norm(vel[-1], axis=1).max() < 2e-3
     for k in range(40):
         d = np.linalg.norm(pos[:, k], axis=1)
         last = int(np.nonzero(d > 0.05)[0][-1])  # the last 5 cm
-        assert (unit(vel[last, k]) * way).sum() > math.cos(math.radians(5))
+        assert (unit(vel[last, k]) * way).sum() > math.cos(math.radians(2))
         inside = pos[int(np.nonzero(d > 1.0)[0][-1]), k]  # where it comes within 1 m: on the axis, before the place
         assert inside @ way < -0.9
-        assert abs(inside[0] * way[1] - inside[1] * way[0]) < 0.31
+        assert abs(inside[0] * way[1] - inside[1] * way[0]) < 0.1
 
 
 # --- a direction, a speed ---------------------------------------------------------------------------------------------
@@ -219,7 +217,7 @@ def test_wander_is_the_same_walk_for_every_step_size() -> None:
     """What differs is the error of the method: it falls with dt, in proportion."""
     coarse, middle, fine, finest = (wanderers(dt)[0] for dt in (0.02, 0.01, 0.005, 0.00125))
     errors = [np.linalg.norm(a[-1] - finest[-1], axis=1) for a in (coarse, middle, fine)]
-    assert errors[0].max() < 0.15  # of 6 m; noise per step would give metres
+    assert errors[0].max() < 0.3  # of 6 m; noise per step would give metres
     assert 1.5 < np.median(errors[0] / errors[1]) < 2.8
     assert 1.5 < np.median(errors[1] / errors[2]) < 2.8
 
@@ -227,7 +225,7 @@ def test_wander_is_the_same_walk_for_every_step_size() -> None:
 def test_wander_is_a_small_persistent_displacement_and_everybody_s_own() -> None:
     pos, vel = wanderers(0.01, 20.0)
     speed = np.linalg.norm(vel[20:], axis=2)
-    assert 0.8 < speed.min() <= speed.max() <= 1 + 1e-9
+    assert 0.65 < speed.min() <= speed.max() <= 1 + 1e-9
     way = unit(vel)
     assert (way[1:] * way[:-1]).sum(axis=2).min() > math.cos(math.radians(20))  # in 0.1 s
     assert abs((way[60:] * way[:-60]).sum(axis=2).mean()) < 0.25  # after 6 s it goes anywhere
@@ -326,7 +324,8 @@ def test_offset_pursuit_passes_its_quarry_at_the_distance(quarry: tuple[float, f
         scene = trio(pursuit)
         pos, _ = course(scene, at(scene, ((0, y), (2, 0)), ((10, 0), quarry)), 12)
         gap = np.linalg.norm(pos[:, 0] - pos[:, 1], axis=1)
-        assert gap.min() == pytest.approx(1.5, rel=0.05)
+        first = int(np.argmax(np.diff(gap) > 0))  # then it turns round
+        assert gap[first] == pytest.approx(1.5, rel=0.05)
 
 
 def test_shadow_comes_near_and_then_flies_as_its_quarry_does() -> None:
@@ -412,7 +411,7 @@ def test_interpose_between_the_two_nearest_of_one_group_and_never_about_one_alon
     places = [(1.0, 0.0), (0.0, 2.0), (9.0, 9.0)]
     for order in ((0, 1, 2), (2, 1, 0), (1, 2, 0), (2, 0, 1)):  # whom it meets first makes no difference
         state = at(scene, ((0, 0), (0, 0)), *((places[k], (0, 0)) for k in order), ((0.1, 0), (0, 0)))
-        np.testing.assert_allclose(change(scene, state)[0], 2 * np.array([0.5, 1.0]), atol=1e-9)
+        np.testing.assert_allclose(change(scene, state)[0], 2 * unit(np.array([0.5, 1.0])), atol=1e-9)
     state = at(scene, ((0, 0), (0.3, 0)), ((1, 0), (0, 0)), *(((99, 0), (0, 0)),) * 2)
     np.testing.assert_array_equal(change(scene, state)[0], 0)
 
@@ -474,10 +473,6 @@ def test_who_finds_no_place_to_hide_evades_and_who_sees_nobody_does_nothing() ->
 
 # --- what holds for all of them ---------------------------------------------------------------------------------------
 
-OURS = (
-    "seek", "flee", "arrive", "dock", "face", "target_speed", "wander", "pursue", "evade", "offset_pursue", "shadow",
-    "match_velocity", "formation", "follow_leader", "interpose", "hide",
-)  # fmt: skip
 ABOUT_OTHERS = tuple(row for row in EFFECTS if row.family == "others")
 
 
@@ -531,26 +526,3 @@ def test_a_direction_of_nothing_is_refused() -> None:
         Face(weight=1, heading=(0, 0))
     with pytest.raises(ValueError, match=r"direction = \(0.0, 0.0\): a direction"):
         Dock(weight=1, target=(0, 0), direction=(0, 0), gate=1, width=1, slow_radius=1)
-
-
-@pytest.mark.parametrize("kind", OURS)
-def test_its_demonstration_is_a_scene_about_it(kind: str, tmp_path: Path) -> None:
-    scene = demonstration(kind, tmp_path)
-    inner = {behaviour.kind for effect in scene.effects for behaviour in (effect, *effect.wishes)}
-    assert kind in inner
-    assert scene.agents <= 20
-
-
-@pytest.mark.slow  # a kernel each
-@pytest.mark.parametrize("kind", OURS)
-def test_its_demonstration_runs(kind: str, tmp_path: Path) -> None:
-    scene = demonstration(kind, tmp_path)
-    start = scene.start(1)
-    end = scene.run(start, round(BEHAVIOURS[kind].demo_time / scene.dt))
-    assert np.abs(end.pos - start.pos).max() > 1
-    assert np.abs(end.pos).max() < 60
-
-
-def demonstration(kind: str, folder: Path) -> Scene:
-    (folder / "demo.yaml").write_text(BEHAVIOURS[kind].demo or "")
-    return load_scene(folder / "demo.yaml")

@@ -503,7 +503,7 @@ import json, sys
 from tests.catalogue import EFFECTS, scene_under
 found = {}
 for row in EFFECTS:
-    for dimension in (2, 3):
+    for dimension in row.dimensions:
         scene = scene_under(row, dimension)
         end = scene.run(scene.start(3), 5)
         found[f"{row.name} {dimension}"] = end.x.tobytes().hex()
@@ -516,7 +516,7 @@ json.dump(found, sys.stdout)
 def test_a_second_process_compiles_nothing_and_finds_the_same() -> None:
     here = {}
     for row in EFFECTS:
-        for dimension in (2, 3):
+        for dimension in row.dimensions:
             scene = scene_under(row, dimension)
             here[f"{row.name} {dimension}"] = scene.run(scene.start(3), 5).x.tobytes().hex()
     done = subprocess.run(

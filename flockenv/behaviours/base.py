@@ -6,6 +6,7 @@ import math
 import warnings
 from typing import Any, ClassVar
 
+import numpy as np
 from pydantic import Field
 
 from flockenv.effects.base import Effect, Me, Other, Sight
@@ -29,8 +30,12 @@ class OvershootWarning(UserWarning):
 
 @law
 def top_speed(p: Any, me: Me) -> float:
-    """Return how fast a behaviour goes at most, m/s."""
-    return p.speed if p.speed < me.max_speed else me.max_speed
+    """Return how fast a behaviour goes at most, m/s.
+
+    1 for those without any limit: they are not steered (see Moving), but their wish must be a number.
+    """
+    top = p.speed if p.speed < me.max_speed else me.max_speed
+    return top if top < like(top, np.inf) else like(top, 1.0)
 
 
 @law
@@ -120,12 +125,13 @@ class AboutNearest(Behaviour):
     group: int | None = Field(default=None, ge=0, description="whom it is about: the nearest of it; none = of all")
     radius: float = Field(gt=0, description="m, how far it sees")
     fov: float = Field(default=360.0, gt=0, le=360, description="degrees, full angle of the field of view")
+    occluded: bool = Field(default=False, description="whom an obstacle hides is not seen")
     pair_law: ClassVar[str | None] = "nearest_one"
 
     @property
     def sight(self) -> Sight:
         """The nearest one."""
-        return Sight(self.radius, self.fov, 1, self.group)
+        return Sight(self.radius, self.fov, 1, self.group, self.occluded)
 
     def sums(self, dimension: int) -> int:
         """Offset, velocity, count."""

@@ -67,7 +67,7 @@ def evaded(p: Any, me: Me, sums: Vec) -> Vec:
 def passed(p: Any, me: Me, sums: Vec) -> Vec:
     """Pursue a point beside the quarry."""
     offset, velocity, some = seen_one(sums)
-    time = to_meet(p, me, offset, velocity)
+    time = to_meet(p, me, steering.passing_point(offset, me.vel, p.distance), velocity)
     wish = steering.offset_pursue(offset, me.vel, velocity, top_speed(p, me), p.distance, time)
     return select(some, scale(wish, p.weight), zero(wish))
 

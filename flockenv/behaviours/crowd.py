@@ -69,10 +69,14 @@ groups:
 effects:
   - kind: steer
     group: 0
-    behaviours: [{kind: unaligned_avoidance, weight: 4, margin: 0.2}, {kind: queue, weight: 2, target: [30, 0], speed: 1.2}]
+    behaviours:
+      - {kind: unaligned_avoidance, weight: 4, margin: 0.2}
+      - {kind: queue, weight: 2, target: [30, 0], speed: 1.2}
   - kind: steer
     group: 1
-    behaviours: [{kind: unaligned_avoidance, weight: 4, margin: 0.2}, {kind: queue, weight: 2, target: [0, 30], speed: 1.2}]
+    behaviours:
+      - {kind: unaligned_avoidance, weight: 4, margin: 0.2}
+      - {kind: queue, weight: 2, target: [0, 30], speed: 1.2}
 """
 
     @property
@@ -141,14 +145,14 @@ class Queue(Effect):
     finish_law: ClassVar[str | None] = "queueing"
     demo: ClassVar[str | None] = """
 dt: 0.05
-obstacles: [{centre: [0, 2.5], radius: 2}, {centre: [0, -2.5], radius: 2}]
-groups: [{count: 12, radius: 0.25, max_force: 6, spawn: {low: [-8, -3], high: [-3, 3]}}]
+obstacles: [{centre: [0, 2.7], radius: 2}, {centre: [0, -2.7], radius: 2}]
+groups: [{count: 12, radius: 0.25, max_force: 8, spawn: {low: [-8, -3], high: [-3, 3]}}]
 effects:
   - kind: steer
     behaviours:
-      - {kind: avoid_obstacles, weight: 4, horizon: 1.2, margin: 0.1}
-      - {kind: separation, weight: 0.4, radius: 0.9}
-      - {kind: queue, weight: 5, target: [20, 0], speed: 1.3, margin: 0.1}
+      - {kind: avoid_obstacles, weight: 6, horizon: 1.2, margin: 0.1}
+      - {kind: separation, weight: 2, radius: 0.9}
+      - {kind: queue, weight: 3, target: [20, 0], speed: 1.3, margin: 0.1}
 """
 
     @property

@@ -44,11 +44,10 @@ def _kept(slots, new):  # type: ignore[no-untyped-def]  # numba compares signatu
 
 @law
 def nobody(p: Any, me: Me) -> Vec:
-    """Eight places without anybody."""
+    """Six places without anybody."""
     far, o, e = like(me.radius, np.inf), like(me.radius, 0.0), like(me.radius, 1.0)
     empty = (far, far, o, o, -e, o)
-    four = empty + empty + empty + empty
-    return four + four
+    return empty + empty + empty + empty + empty + empty
 
 
 @law
@@ -78,7 +77,7 @@ def reciprocal(p: Any, me: Me, acc: Vec) -> Vec:
 class Orca(Effect):
     """Arrive at a point with the velocity nearest to the wished one that touches nobody within `horizon` seconds.
 
-    Optimal reciprocal collision avoidance (van den Berg et al. 2011) among the eight nearest agents and obstacles.
+    Optimal reciprocal collision avoidance (van den Berg et al. 2011) among the six nearest agents and obstacles.
     It chooses a velocity: without inertia (weight = m / dt, no max_force) those who all do so never touch.
     """
 
@@ -133,5 +132,5 @@ effects:
         super().check(scene)
 
     def sums(self, dimension: int) -> int:
-        """Eight neighbours."""
-        return 8 * orca.SLOT
+        """Six neighbours."""
+        return 6 * orca.SLOT

@@ -23,7 +23,7 @@ from flockenv.envs.face import (
     render_fps,
 )
 from flockenv.envs.page import page
-from flockenv.tasks import Crossing, Evade, Flock, Herd, Obstacles, Pursuit, Task
+from flockenv.tasks import Crossing, Evade, Flock, Herd, Obstacles, PathFollow, Pursuit, Task
 from flockenv.world import Step, World
 
 __all__ = [
@@ -32,6 +32,7 @@ __all__ = [
     "FlockEnv",
     "HerdEnv",
     "ObstaclesEnv",
+    "PathFollowEnv",
     "PursuitEnv",
     "SingleEnv",
     "one_learner",
@@ -143,6 +144,13 @@ class ObstaclesEnv(SingleEnv):
     """A walker goes to its goal through a random field of obstacles."""
 
     task_type = Obstacles
+    history = "v0: first version (flockenv 0.1.0)."
+
+
+class PathFollowEnv(SingleEnv):
+    """A runner follows a narrow winding track, as far as it gets."""
+
+    task_type = PathFollow
     history = "v0: first version (flockenv 0.1.0)."
 
 

@@ -31,7 +31,7 @@ from flockenv.envs.face import (
     together,
 )
 from flockenv.refusals import nearest
-from flockenv.tasks import Crossing, Evade, Flock, Herd, Obstacles, Pursuit, Task
+from flockenv.tasks import Crossing, Evade, Flock, Herd, Obstacles, PathFollow, Pursuit, Task
 from flockenv.world import Step, World
 
 __all__ = [
@@ -40,6 +40,7 @@ __all__ = [
     "FlockVectorEnv",
     "HerdVectorEnv",
     "ObstaclesVectorEnv",
+    "PathFollowVectorEnv",
     "PursuitVectorEnv",
     "WorldsEnv",
 ]
@@ -342,6 +343,12 @@ class ObstaclesVectorEnv(WorldsEnv):
     """Walkers, one per world; the page is that of flockenv.envs.single.ObstaclesEnv."""
 
     task_type = Obstacles
+
+
+class PathFollowVectorEnv(WorldsEnv):
+    """Runners, one per world; the page is that of flockenv.envs.single.PathFollowEnv."""
+
+    task_type = PathFollow
 
 
 class FlockVectorEnv(WorldsEnv):

@@ -16,6 +16,9 @@ ROLE_COLOURS: Final[dict[str, tuple[str, str]]] = {
     "agent": ("#52637a", "#a5b3c6"),
 }
 
+#: how much of the colour of goals is in a way's
+WAY: Final = 0.18
+
 #: part of the picture -> (light, dark)
 PAPER: Final[dict[str, tuple[str, str]]] = {
     "page": ("#f3f5f8", "#0e1218"),

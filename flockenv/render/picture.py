@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
-from flockenv.render.palette import ARROW, BODY_DISC, BOND, DART, DART_REACH, JUMP, PAPER, ROLE_COLOURS, mix, rgb
+from flockenv.render.palette import ARROW, BODY_DISC, BOND, DART, DART_REACH, JUMP, PAPER, ROLE_COLOURS, WAY, mix, rgb
 from flockenv.render.view import View, look
 from flockenv.snapshot import Floats, Mark, Snapshot
 
@@ -47,10 +47,14 @@ def draw(snapshot: Snapshot, size: int = 600, scale: int = 2, trails: Sequence[S
     backdrop = _backdrop(view, snapshot.title, tuple(dict.fromkeys(snapshot.roles)), stones.tobytes(), walls)
     canvas = backdrop.copy()
     pen = ImageDraw.Draw(canvas, "RGBA")
+    ways = [mark for mark in snapshot.marks if mark.kind == "way"]
+    for mark in ways:
+        _mark(pen, view, mark)
     if trails:
         _trails(pen, view, [*trails, snapshot])
     for mark in snapshot.marks:
-        _mark(pen, view, mark)
+        if mark.kind != "way":
+            _mark(pen, view, mark)
     _bonds(pen, view, snapshot)
     _bodies(pen, view, snapshot)
     _trim(canvas, backdrop, view, view.spill)
@@ -184,6 +188,10 @@ def _mark(pen: ImageDraw.ImageDraw, view: View, mark: Mark) -> None:
     x, y = view.place(mark.at).tolist()
     if mark.kind == "heading":
         _arrow(pen, view, x, y, _aim(mark.vector[None])[0])
+        return
+    if mark.kind == "way":
+        for a, b in view.sightings(x, y, mark.radius * view.metre):
+            _disc(pen, a, b, mark.radius * view.metre, mix(_GOAL, _PAPER, WAY))
         return
     reach = max(mark.radius * view.metre, view.width / 75)
     thick = max(1, round(view.width / 240))

@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flockenv.outputs import replacing
-from flockenv.render.palette import ARROW, BODY_DISC, BOND, DART, DART_REACH, JUMP, PAPER, ROLE_COLOURS
+from flockenv.render.palette import ARROW, BODY_DISC, BOND, DART, DART_REACH, JUMP, PAPER, ROLE_COLOURS, WAY
 from flockenv.snapshot import Floats, Mark, Snapshot
 
 __all__ = ["Group", "Panel", "write_replay"]
@@ -106,6 +106,7 @@ def write_replay(path: str | os.PathLike[str], groups: Sequence[Group], title: s
         "disc": BODY_DISC,
         "bond": BOND,
         "jump": JUMP,
+        "way": WAY,
         "beyond": _BEYOND,
         "directions": _DIRECTIONS,
     }

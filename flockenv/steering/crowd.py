@@ -77,12 +77,12 @@ def explore(to_low: Vec, to_high: Vec, velocity: Vec, max_speed: float, track: f
     """
     e, half = like(track, 1.0), like(track, 0.5)
     x, y = to_low[0], to_low[1]
-    width, height = x + to_high[0], y + to_high[1]
+    width, height = x + to_high[0], max(y + to_high[1], track)
     rows = e + e
     rows = rows * max(np.ceil(height / (rows * track)), e)
     row = min(max(np.floor(y * rows / height), e - e), rows - e)
     middle = (row + half) * height / rows
-    forth, last = row - (e + e) * np.floor(row * half) < half, row > rows - e - half
+    forth, last = row - (e + e) * np.floor(row * half) < half, row > rows - e - half  # an even row; the uppermost
     back = x < track
     down = planar(velocity, half * track - x, -track)
     along = planar(velocity, track if forth | back else -track, middle - y)

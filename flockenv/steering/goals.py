@@ -115,19 +115,24 @@ def dock(
 ) -> Vec:
     """Arrive at a point while flying in a `direction`: through a gate `gate` [m] before it, then along its axis.
 
-    Within `width` [m] of the axis it aims at the axis half-way to the point, so that the distance from the axis falls
-    as the square of the distance to go, and the angle with it; outside twice that, at the gate (Reynolds 1999 describes
-    it in words; the construction is ours).
+    In a cone about the axis, with its tip at the point and `width` [m] from the axis at the gate, it aims at the axis
+    half-way to the point: the distance from the axis falls as the square of the distance to go, and the angle with it.
+    Outside twice that it aims at the gate; from beyond the point, beside it first. Reynolds 1999 has it in words, the
+    construction is ours.
     """
     o, e, half = like(gate, 0.0), like(gate, 1.0), like(gate, 0.5)
     forward = unit(direction)
-    to_go = dot(offset, forward)
-    aside = norm(lateral(offset, forward))
-    out = aside / width - e
-    out = e if to_go < -width else min(max(out, o), e)  # past the point: around again
+    to_go, beside = dot(offset, forward), scale(lateral(offset, forward), like(gate, -1.0))
+    aside = norm(beside)
+    there = like(gate, 0.02) * width  # as near as this it is there, on whichever side
+    wide = max(to_go * (width / gate), half * there)
+    out = min(max(aside / wide - e, o), e)
     near = min(half * max(to_go, o), gate)
-    before = near + (gate - near) * out
+    behind = (to_go < o) & (norm(offset) > there)
+    before = half * gate if behind else near + (gate - near) * out
+    side = select(aside > like(gate, 1e-10) * norm(offset), unit(beside), perpendicular(forward))
     aim = sub(offset, scale(forward, before))
+    aim = select(behind, add(aim, scale(side, half * gate)), aim)  # around the point, not through it
     way = norm(aim) + before
     ramped = max_speed * (way / slow_radius)
     return sub(scale(unit(aim), ramped if ramped < max_speed else max_speed), velocity)

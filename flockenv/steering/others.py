@@ -21,6 +21,7 @@ __all__ = [
     "keep_station",
     "offset_pursue",
     "opensteer_time",
+    "passing_point",
     "pursue",
     "separate",
     "shadow",
@@ -121,19 +122,28 @@ def cohere(mean_offset: Vec, velocity: Vec, max_speed: float) -> Vec:
 
 
 @law
+def passing_point(offset: Vec, velocity: Vec, distance: float) -> Vec:
+    """Return the offset of the point beside somebody, `distance` [m] from him towards one's own way, to pass him by.
+
+    Across the way; dead ahead he is passed on the right.
+    """
+    forward = unit(velocity)
+    aside = lateral(offset, forward)
+    noise = like(distance, 1e-10) * dot(offset, offset)
+    toward = select(dot(aside, aside) > noise, unit(aside), scale(perpendicular(forward), like(distance, -1.0)))
+    return sub(offset, scale(toward, distance))
+
+
+@law
 def offset_pursue(
     offset: Vec, velocity: Vec, quarry_velocity: Vec, max_speed: float, distance: float, time: float
 ) -> Vec:
     """Pass the quarry at a distance [m]: seek a point so far beside where it will be, on this side (Reynolds 1999).
 
-    Beside is across one's own way, towards it; dead ahead it is passed on the right.
+    It is passed at that distance if `time` is predicted for the passing point, not for the quarry.
     """
     there = add(offset, scale(quarry_velocity, time))
-    forward = unit(velocity)
-    aside = lateral(there, forward)
-    noise = like(distance, 1e-10) * dot(there, there)
-    toward = select(dot(aside, aside) > noise, unit(aside), scale(perpendicular(forward), like(distance, -1.0)))
-    return seek(sub(there, scale(toward, distance)), velocity, max_speed)
+    return seek(passing_point(there, velocity, distance), velocity, max_speed)
 
 
 @law

@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 
 from flockenv.behaviours import Alignment, Cohesion, Separation
-from flockenv.integrators import Integrator
+from flockenv.integrators import Adaptive, Integrator
 from flockenv.scene import Group, Scene
 from flockenv.space import Torus
 from flockenv.stress.case import Case, Value, started
@@ -65,11 +65,12 @@ def seam(method: Integrator) -> Value:
     alone = flock(method, 1)
     end = alone.step(started(alone, [(-1e-17, EDGE)], [(0.0, 0.0)]))
     inside &= bool(((end.pos >= 0) & (end.pos < EDGE)).all())
-    return Value(worst, worst <= 1e-9 and inside, f"{worst:.1g} m apart; inside: {inside}")
+    bound = method.tolerance if isinstance(method, Adaptive) else 1e-9  # which step is taken hangs by a rounding
+    return Value(worst, worst <= bound and inside, f"{worst:.1g} m apart; inside: {inside}")
 
 
 CROWDS = (
     Case("N09 crowd", "50 agents in one place", "apart within 1 s, momentum 1e-10", in_one_place),
     Case("N10", "opposite headings; alone at rest", "no drift, no NaN", at_rest_and_alone),
-    Case("N18", "pairs across the seam of a torus", "1e-9 m, inside", seam),
+    Case("N18", "pairs across the seam of a torus", "1e-9 m (steps of its own: tolerance), inside", seam),
 )

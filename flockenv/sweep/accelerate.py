@@ -113,11 +113,7 @@ def parameters(parts: Parts) -> list[str]:
 
 def _nearest_images(parts: Parts) -> list[str]:
     """Write the numbers of those effects that know places anew: on a torus, with the images nearest to agent i."""
-    lines = []
-    for k in range(len(parts.effects)):
-        if given(parts, k) == f"near{k}":
-            lines.append(nearest_image(parts, k, "x"))
-    return lines
+    return [nearest_image(parts, k, "x") for k in range(len(parts.effects)) if given(parts, k) == f"near{k}"]
 
 
 def _medium(parts: Parts) -> list[str]:

@@ -16,6 +16,7 @@ from flockenv.tasks.evade import Evade  # noqa: E402  # after the folder has bee
 from flockenv.tasks.flock import Flock  # noqa: E402
 from flockenv.tasks.herd import Herd  # noqa: E402
 from flockenv.tasks.obstacles import Obstacles  # noqa: E402
+from flockenv.tasks.path_follow import PathFollow  # noqa: E402
 from flockenv.tasks.pursuit import Pursuit  # noqa: E402
 
 __all__ = [
@@ -27,6 +28,7 @@ __all__ = [
     "Herd",
     "Layout",
     "Obstacles",
+    "PathFollow",
     "Pursuit",
     "Slot",
     "Task",

@@ -60,7 +60,7 @@ def drive(p: Any, frame: Frame, action: Any, force: Any) -> None:
 
 @kernel
 def _walker(p: Any, frame: Frame, i: int, force: Any) -> None:
-    """A scripted walker: the velocity nearest to the way to his goal that is free of the nearest few for 3 s."""
+    """A scripted walker: the velocity nearest to the way to his goal that is free of the nearest few for 2 s."""
     given, lines, relaxed = stacked(_NOBODY), stacked(_NOBODY), stacked(_NOBODY)
     v = (np.float64(frame.vel[0, i]), np.float64(frame.vel[1, i]))
     found, last, last_square = 0, -1, -1.0
@@ -78,8 +78,8 @@ def _walker(p: Any, frame: Frame, i: int, force: Any) -> None:
     distance = math.sqrt(gx * gx + gy * gy)
     top = np.float64(frame.max_speed[i])
     share = min(top, distance) / max(distance, 1e-9)
-    asked = ((gx * share, gy * share), top, 0.1)
-    change = orca.clear(v, np.float64(frame.radius[i]), asked, 3.0, p.control_dt, given, found, lines, relaxed)
+    asked = ((gx * share, gy * share), top, 0.3)
+    change = orca.clear(v, np.float64(frame.radius[i]), asked, 2.0, p.control_dt, given, found, lines, relaxed)
     fx, fy = change[0] / p.control_dt, change[1] / p.control_dt
     cut = min(1.0, frame.max_force[i] / max(math.sqrt(fx * fx + fy * fy), 1e-9))
     force[0, i], force[1, i] = cut * fx, cut * fy

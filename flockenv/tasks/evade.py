@@ -70,7 +70,7 @@ def _clear(p: Any, frame: Frame, i: int) -> bool:
     for m in range(frame.rho.shape[0]):
         if frame.rho[m] > 0.0 and norm(_to_cover(frame, i, m)) < frame.rho[m] + 2.0 * frame.radius[i]:
             return False
-    for j in range(i):
+    for j in range(i):  # noqa: SIM110  # there are no generators in compiled code
         if norm(_to(frame, i, j)) < (p.start_distance if j == 0 else 2.0):
             return False
     return True
@@ -117,7 +117,7 @@ def drive(p: Any, frame: Frame, action: Any, force: Any) -> None:
 
 @kernel
 def _hunt(p: Any, frame: Frame, i: int, force: Any) -> None:
-    """A scripted pursuer: around cover, off its mates, inside the field, after the evader, by prioritised allocation."""
+    """A scripted pursuer: around cover, off its mates, inside the field, after the evader; allocation in that order."""
     velocity, top = _velocity(frame, i), np.float64(frame.max_speed[i])
     margin = 0.5
     low = (frame.pos[0, i] - margin, frame.pos[1, i] - margin)
@@ -135,7 +135,7 @@ def _hunt(p: Any, frame: Frame, i: int, force: Any) -> None:
 
 @kernel
 def _after(p: Any, frame: Frame, i: int, velocity: Vec, top: float) -> Vec:
-    """Pursue who is seen; else go where it was seen last; there, or after `patience` s, look behind one cover or another.
+    """Pursue who is seen; else go where it was seen last; there, or after `patience` s, look behind some cover.
 
     Memory: the place where the evader was seen last, m, and how long ago that is, s.
     """
@@ -278,8 +278,8 @@ def _show_pursuers(p: Any, frame: Frame, row: Any) -> int:
 class Evade(Task):
     """One learner stays out of the hands of a team of scripted pursuers among round cover, in a walled field.
 
-    Pursuers are a little slower and turn more slowly. They see the evader within `sight`, unless cover is in the straight
-    way, and chase where it will be; who has lost sight of it goes where it was last, then looks behind one cover after
+    Pursuers are slower and turn more slowly. They see the evader within `sight`, unless cover is in the straight way,
+    and head for where it will be; who has lost sight of it goes where it was last, then looks behind one cover after
     another. Each sees for itself alone. Cover and walls are solid. To be caught ends it.
     """
 

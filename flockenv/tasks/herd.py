@@ -65,7 +65,7 @@ def _somewhere(p: Any, frame: Frame, t: int, channel: int) -> Vec:
 @kernel
 def _clear(frame: Frame, i: int, first: int, end: int, distance: float) -> bool:
     """Is agent i at least this far from those of [first, end)?"""
-    for j in range(first, end):
+    for j in range(first, end):  # noqa: SIM110  # there are no generators in compiled code
         if norm(_to(frame, i, j)) < distance:
             return False
     return True
@@ -215,7 +215,7 @@ def measure(p: Any, before: Frame, after: Frame, numbers: Any) -> None:
 
 @kernel
 def observe(p: Any, frame: Frame, rows: Any) -> None:
-    """All in the frame of the course: (along, left). Own velocity, pen, flock, who strays, nearest sheep, other dogs."""
+    """In the frame of the course, (along, left): own velocity, pen, flock, who strays, nearest sheep, other dogs."""
     centre, course, pen = _centre(p, frame), _course(p, frame), _pen(frame)
     far, spread = _farthest(p, frame, centre)
     slots, dogs = int(p.sheep_seen), int(p.dogs)
@@ -276,8 +276,8 @@ class Herd(Task):
 
     Sheep graze until a dog comes near. Then they go, at full speed, as in Strombom et al. 2014 (doi
     10.1098/rsif.2014.0719): away from dogs, to the centre of the sheep around them, away from who is too near, on as
-    before, and a little anyhow. Everything a dog sees is relative to itself and turned into the frame of the course, which
-    leads from the flock's centre to the pen. All sheep in the pen at once end it.
+    before, and a little anyhow. Everything a dog sees is relative to itself and turned into the frame of the course,
+    which leads from the flock's centre to the pen. All sheep in the pen at once end it.
     """
 
     name: ClassVar[str] = "herd"
@@ -322,7 +322,7 @@ class Herd(Task):
         """Refuse a start that the field has no room for."""
         if self.away > self.size / 3:
             raise ValueError(
-                f"away = {self.away:g} m: in a field of {self.size:g} m at most {self.size / 3:g} is found"
+                f"away = {self.away:g} m: in a field of {self.size:g} m at most {self.size / 3:g} m is sure to be found"
             )
         return self
 
@@ -396,7 +396,7 @@ class Herd(Task):
         return Layout((Slot("force", (2,), self.dog_force, "N", meaning),))
 
     def metrics(self, sums: Measured, last: Measured, steps: NDArray[np.int64]) -> dict[str, NDArray[np.float64]]:
-        """Share of the sheep in the pen now; s until all were (NaN if they are not); spread now, m; path of a dog, m."""
+        """Share of the sheep in the pen; s until all were (NaN if they are not); spread now, m; path of a dog, m."""
         return {
             "share_penned": last["penned"],
             "time_to_pen": np.where((last["penned"] >= 1.0) & (steps > 0), sums["time"], np.nan),

@@ -1,0 +1,292 @@
+"""PathFollow: a narrow winding track, as far along it as one gets."""
+
+from __future__ import annotations
+
+import functools
+import math
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, model_validator
+
+from flockenv.kernels import Vec, kernel
+from flockenv.noise import uniform
+from flockenv.scene import Group, Scene
+from flockenv.snapshot import Mark
+from flockenv.space import Box
+from flockenv.state import State
+from flockenv.tasks.base import Frame, Measured, Task
+from flockenv.tasks.layout import Layout, Slot
+from flockenv.tasks.sight import clip
+from flockenv.vec import dot, norm, sub
+
+__all__ = ["PathFollow"]
+
+POINTS = 128
+"""Corners of a track, evenly spread in angle about the middle of the field."""
+
+HARMONICS = 7
+"""Waves around a track; the first of them has two."""
+
+WINDOW = 16
+"""Pieces on either side of one's own angle among which the nearest point of the spine is."""
+
+# what is kept of a world: x and y of every corner, how far along the track it is, the whole length, what was gained
+_Y, _S, _LENGTH, _GAINED, _TURN = POINTS, 2 * POINTS, 3 * POINTS, 3 * POINTS + 1, 3 * POINTS + 2
+
+
+@kernel
+def spawn(p: Any, frame: Frame) -> None:
+    """A closed track, r(a) = R (1 + sum of waves), run counterclockwise or clockwise; somewhere on it, at rest."""
+    m, turn = frame.memory, 1.0 if uniform(frame.key, 0, 0, 0) < 0.5 else -1.0
+    for i in range(POINTS):
+        m[i, 0] = 0.0
+    for k in range(HARMONICS):
+        high = p.winding * (0.4 + 0.6 * uniform(frame.key, 0, 1, k)) / HARMONICS
+        phase = 2.0 * math.pi * uniform(frame.key, 0, 2, k)
+        for i in range(POINTS):
+            m[i, 0] += high * math.sin(2.0 * math.pi * (k + 2) * i / POINTS + phase)
+    for i in range(POINTS):
+        a, r = 2.0 * math.pi * i / POINTS, p.ring * (1.0 + m[i, 0])
+        m[i, 0], m[_Y + i, 0] = p.middle + r * math.cos(a), p.middle + turn * r * math.sin(a)
+    s = 0.0
+    for i in range(POINTS):
+        m[_S + i, 0] = s
+        s += norm(sub(_corner(frame, i + 1), _corner(frame, i)))
+    m[_LENGTH, 0], m[_GAINED, 0], m[_TURN, 0] = s, 0.0, turn
+    begin = int(POINTS * uniform(frame.key, 0, 3, 0))
+    frame.pos[0, 0], frame.pos[1, 0] = _corner(frame, begin)
+    frame.vel[:, 0] = 0.0
+
+
+@kernel
+def _corner(frame: Frame, i: int) -> Vec:
+    return (frame.memory[i % POINTS, 0], frame.memory[_Y + i % POINTS, 0])
+
+
+@kernel
+def _nearest(p: Any, frame: Frame) -> tuple[int, float, float, Vec]:
+    """Return the piece whose point is nearest, how far along it is, m, how far to the left of it one is, and its way.
+
+    Only pieces at about one's own angle are asked: a track that comes near another part of itself is not confused.
+    """
+    x, y = frame.pos[0, 0], frame.pos[1, 0]
+    angle = math.atan2(frame.memory[_TURN, 0] * (y - p.middle), x - p.middle) / (2.0 * math.pi)
+    here = math.floor(angle * POINTS) + POINTS
+    best, piece, along, left, way = np.inf, 0, 0.0, 0.0, (1.0, 0.0)
+    for k in range(-WINDOW, WINDOW + 1):
+        i = (here + k) % POINTS
+        a = _corner(frame, i)
+        u = sub(_corner(frame, i + 1), a)
+        size = norm(u)
+        u = (u[0] / size, u[1] / size)
+        to = (x - a[0], y - a[1])
+        s = min(max(dot(to, u), 0.0), size)
+        off = (to[0] - s * u[0], to[1] - s * u[1])
+        square = dot(off, off)
+        if square < best:
+            side = u[0] * to[1] - u[1] * to[0]
+            best, piece, along, way = square, i, s, u
+            left = math.sqrt(square) if side > 0.0 else -math.sqrt(square)
+    return piece, along, left, way
+
+
+@kernel
+def _gain(p: Any, before: Frame, after: Frame) -> float:
+    """How far one came along the track, m."""
+    i, a, _, _ = _nearest(p, before)
+    j, b, _, _ = _nearest(p, after)
+    gained = after.memory[_S + j, 0] + b - after.memory[_S + i, 0] - a
+    length = after.memory[_LENGTH, 0]
+    return gained - length * math.floor(gained / length + 0.5)  # type: ignore[no-any-return]
+
+
+@kernel
+def drive(p: Any, frame: Frame, action: Any, force: Any) -> None:
+    """The learner pushes along the track and to its left, as it is where it is."""
+    _, _, _, way = _nearest(p, frame)
+    f = frame.max_force[0]
+    force[0, 0] = f * (action[0, 0] * way[0] - action[0, 1] * way[1])
+    force[1, 0] = f * (action[0, 0] * way[1] + action[0, 1] * way[0])
+
+
+@kernel
+def reward(p: Any, before: Frame, after: Frame, action: Any, terms: Any) -> None:
+    """Terms: progress, off_track, lost."""
+    _, _, left, _ = _nearest(p, after)
+    terms[0, 0] = p.progress_reward * _gain(p, before, after)
+    terms[0, 1] = -p.off_cost * p.control_dt if abs(left) > p.half_width else 0.0
+    terms[0, 2] = -p.lost_cost if abs(left) > p.lost_distance else 0.0
+
+
+@kernel
+def ended(p: Any, before: Frame, after: Frame, over: Any) -> bool:
+    """Who is lost is out; a whole lap, without that, is success."""
+    _, _, left, _ = _nearest(p, after)
+    after.memory[_GAINED, 0] += _gain(p, before, after)
+    over[0] = abs(left) > p.lost_distance
+    return not over[0] and after.memory[_GAINED, 0] >= after.memory[_LENGTH, 0]  # type: ignore[no-any-return]
+
+
+@kernel
+def measure(p: Any, before: Frame, after: Frame, numbers: Any) -> None:
+    """Progress, m; off the track; path, m."""
+    _, _, left, _ = _nearest(p, after)
+    numbers[0] = _gain(p, before, after)
+    numbers[1] = 1.0 if abs(left) > p.half_width else 0.0
+    numbers[2] = math.hypot(after.pos[0, 0] - before.pos[0, 0], after.pos[1, 0] - before.pos[1, 0])
+
+
+@kernel
+def observe(p: Any, frame: Frame, rows: Any) -> None:
+    """All in the frame of the track here: own velocity, how far to the left, the spine ahead and how it bends."""
+    i, along, left, way = _nearest(p, frame)
+    row, count = rows[0], int(p.ahead)
+    vx, vy = frame.vel[0, 0], frame.vel[1, 0]
+    row[0] = clip((vx * way[0] + vy * way[1]) / p.max_speed)
+    row[1] = clip((vy * way[0] - vx * way[1]) / p.max_speed)
+    row[2] = clip(left / p.lost_distance)
+    scale = p.spacing * p.ahead + p.lost_distance
+    for k in range(count):
+        along += p.spacing
+        a = _corner(frame, i)
+        u = sub(_corner(frame, i + 1), a)
+        size = norm(u)
+        for _ in range(POINTS):
+            if along <= size:
+                break
+            along -= size
+            i += 1
+            a = _corner(frame, i)
+            u = sub(_corner(frame, i + 1), a)
+            size = norm(u)
+        to = (a[0] + along / size * u[0] - frame.pos[0, 0], a[1] + along / size * u[1] - frame.pos[1, 0])
+        row[3 + 2 * k] = clip((to[0] * way[0] + to[1] * way[1]) / scale)
+        row[4 + 2 * k] = clip((to[1] * way[0] - to[0] * way[1]) / scale)
+        row[3 + 2 * count + k] = clip(_bend(frame, i, along / size) * p.half_width)
+
+
+@kernel
+def _bend(frame: Frame, i: int, share: float) -> float:
+    """Return the curvature at a share of piece i, 1/m, left positive: between those of its two corners."""
+    return (1.0 - share) * _corner_bend(frame, i) + share * _corner_bend(frame, i + 1)
+
+
+@kernel
+def _corner_bend(frame: Frame, i: int) -> float:
+    """Return one over the radius of the circle through a corner and its two neighbours."""
+    a, b, c = _corner(frame, i + POINTS - 1), _corner(frame, i), _corner(frame, i + 1)
+    u, v, w = sub(b, a), sub(c, b), sub(c, a)
+    return 2.0 * (u[0] * v[1] - u[1] * v[0]) / (norm(u) * norm(v) * norm(w))  # type: ignore[no-any-return]
+
+
+class PathFollow(Task):
+    """One learner on a narrow winding closed track, another one in each episode: as far as possible, and not off it.
+
+    The track is a circle with waves, run either way. Everything is seen and done in the frame of the track beside the
+    learner: along it, and to its left. Whoever is `lost_distance` from its middle is lost, which ends it.
+    """
+
+    name: ClassVar[str] = "path_follow"
+    terms: ClassVar[tuple[str, ...]] = ("progress", "off_track", "lost")
+    metric_names: ClassVar[tuple[str, ...]] = ("progress", "off_track", "mean_speed")
+    measures: ClassVar[tuple[str, ...]] = ("gained", "off", "path")
+    memory: ClassVar[int] = 3 * POINTS + 3
+
+    horizon: int = Field(default=300, ge=1, description="decisions until the time limit (truncation)")
+    ring: float = Field(default=12.0, ge=5, le=50, description="m, mean radius of the track")
+    winding: float = Field(default=0.55, ge=0, le=0.8, description="bound of all its waves together, of the radius")
+    half_width: float = Field(default=0.7, gt=0, description="m, of the track")
+    lost_distance: float = Field(default=2.5, gt=0, description="m from its middle, from which on one is lost")
+    max_speed: float = Field(default=8.0, gt=0, description="m/s")
+    max_force: float = Field(default=8.0, gt=0, description="N; the mass is 1 kg")
+    ahead: int = Field(default=8, ge=1, le=64, description="how many points of the track are seen")
+    spacing: float = Field(default=1.2, gt=0, description="m along the track from one to the next")
+    progress_reward: float = Field(default=0.2, ge=0, description="per m along the track")
+    off_cost: float = Field(default=3.0, ge=0, description="per s off the track")
+    lost_cost: float = Field(default=10.0, ge=0, description="once")
+
+    @model_validator(mode="after")
+    def _widths(self) -> PathFollow:
+        """Refuse a track that is wider than where one is lost, or sees more than half of itself."""
+        if self.half_width >= self.lost_distance:
+            raise ValueError(
+                f"lost_distance = {self.lost_distance:g}: must be more than half_width = {self.half_width:g}"
+            )
+        if self.lost_distance > 0.3 * self.ring:
+            raise ValueError(f"lost_distance = {self.lost_distance:g}: at most 0.3 of ring = {self.ring:g} is allowed")
+        if self.ahead * self.spacing > math.pi * self.ring:
+            raise ValueError(
+                f"spacing = {self.spacing:g}: {self.ahead} points are {self.ahead * self.spacing:g} m, at most half a "
+                f"ring, {math.pi * self.ring:g} m, is allowed"
+            )
+        return self
+
+    @property
+    def size(self) -> float:
+        """Edge of the field, m: nobody who is not lost comes to its walls."""
+        return 2 * (self.ring * (1 + self.winding) + self.lost_distance + 1)
+
+    def parameters(self) -> dict[str, float]:
+        """And the middle of the field."""
+        return super().parameters() | {"middle": self.size / 2}
+
+    @property
+    def learners(self) -> int:
+        """One."""
+        return 1
+
+    @property
+    def agents(self) -> int:
+        """One."""
+        return 1
+
+    @property
+    def agent_names(self) -> tuple[str, ...]:
+        """runner_0."""
+        return ("runner_0",)
+
+    @functools.cached_property
+    def scene(self) -> Scene:
+        """A walled square that is large enough; nothing acts but what the agent wants."""
+        runner = Group(count=1, radius=0.2, max_speed=self.max_speed, max_force=self.max_force, role="learner")
+        return Scene(
+            space=Box(size=(self.size, self.size)),
+            groups=(runner,),
+            integrator=self.integrator,
+            dt=self.dt,
+            dtype=self.dtype,
+        )
+
+    @functools.cached_property
+    def layout(self) -> Layout:
+        """All in the frame of the track beside the learner: (along, to its left)."""
+        far = self.spacing * self.ahead + self.lost_distance
+        points = f"offsets of {self.ahead} points of its middle line, {self.spacing:g} m apart, the first so far ahead"
+        return Layout((
+            Slot("velocity", (2,), self.max_speed, "m/s", "own velocity (along the track, to its left)"),
+            Slot("left", (), self.lost_distance, "m", "how far to the left of its middle line"),
+            Slot("points", (self.ahead, 2), far, "m", points),
+            Slot("curvature", (self.ahead,), 1.0 / self.half_width, "1/m", "how it bends there, to the left positive"),
+        ))  # fmt: skip
+
+    @functools.cached_property
+    def action_layout(self) -> Layout:
+        """A force, in the same frame."""
+        said = "force (along the track, to its left) / max_force, shortened to length 1"
+        return Layout((Slot("force", (2,), self.max_force, "N", said),))
+
+    def metrics(self, sums: Measured, last: Measured, steps: NDArray[np.int64]) -> dict[str, NDArray[np.float64]]:
+        """Metres along the track, share of the time off it, metres run per second."""
+        made = np.maximum(steps, 1)
+        return {
+            "progress": sums["gained"],
+            "off_track": sums["off"] / made,
+            "mean_speed": sums["path"] / (made * self.control_dt),
+        }
+
+    def marks(self, state: State, memory: NDArray[np.float64], world: int) -> tuple[Mark, ...]:
+        """The track: a disc of its width at every corner."""
+        corners = memory[: 2 * POINTS, world, 0].reshape(2, POINTS).T
+        return tuple(Mark("way", corner, np.zeros(2), self.half_width) for corner in corners)

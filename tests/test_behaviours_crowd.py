@@ -1,0 +1,329 @@
+"""Giving way, queueing, foraging, sweeping: what each must do, and in closed form where there is one."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+
+from flockenv import steering
+from flockenv.arbitration import Allocation
+from flockenv.behaviours import AvoidObstacles, Explore, Forage, Queue, Separation, UnalignedAvoidance
+from flockenv.rows import rows
+from flockenv.scene import Group, Scene
+from flockenv.space import Torus
+from flockenv.spawn import Spawn
+from flockenv.state import State
+from flockenv.steer import Steer
+from tests.catalogue import Array
+
+threat, give_way = rows(steering.unaligned_threat), rows(steering.give_way)
+queue_gap, queue, explore = rows(steering.queue_gap), rows(steering.queue), rows(steering.explore)
+SPAWN = Spawn(low=(0, 0), high=(1, 1))
+
+
+# --- whom one would meet, in closed form ------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("offset", "other", "clearance", "seconds"),
+    [
+        ((6, 0), (-1, 0), 1.0, 3.0),  # head-on
+        ((6, 0.9), (-1, 0), 1.0, 3.0),
+        ((6, 1.1), (-1, 0), 1.0, math.inf),  # passes by
+        ((3, -3), (0, 1), 1.0, 3.0),  # crossing, in the same place at the same time
+        ((3, -4.5), (0, 1), 1.1, 3.75),  # crossing behind: nearest at 1.06 m
+        ((3, -4.5), (0, 1), 1.0, math.inf),
+        ((2, 0), (0.5, 0), 1.0, 4.0),  # catching up
+        ((-2, 0), (0.5, 0), 1.0, math.inf),  # already past
+        ((2, 0), (1, 0), 3.0, math.inf),  # at the same velocity: never nearer than now
+        ((20, 0), (-1, 0), 1.0, math.inf),  # later than the horizon
+    ],
+)
+def test_a_threat_is_the_closest_approach(offset: Any, other: Any, clearance: float, seconds: float) -> None:
+    assert threat(offset, (1.0, 0.0), other, clearance, 5.0) == pytest.approx(seconds)
+
+
+def test_a_threat_is_found_by_the_sum_of_both_radii() -> None:
+    """formulas.md 1.4: twice the own radius lets the small one run into the large one."""
+    for mine, his in ((0.1, 0.9), (0.9, 0.1)):
+        assert np.isfinite(threat((6.0, 0.95), (1.0, 0.0), (-1.0, 0.0), mine + his, 5.0))
+    assert threat((6.0, 0.95), (1.0, 0.0), (-1.0, 0.0), 2 * 0.1, 5.0) == np.inf
+
+
+def meeting(offset: Any, mine: Any, other: Any) -> tuple[Array, Array]:
+    """What both do, who are to meet."""
+    o, v, w = (np.asarray(a, float) for a in (offset, mine, other))
+    time = threat(o, v, w, 99.0, 99.0)
+    return give_way(o, v, w, time, 1.0), give_way(-o, w, v, time, 1.0)
+
+
+def test_both_do_opposite_things_even_if_they_would_meet_exactly() -> None:
+    rng = np.random.default_rng(0)
+    v, w, t = rng.normal(size=(200, 2)), rng.normal(size=(200, 2)), rng.uniform(1, 4, (200, 1))
+    for miss in (0.0, 0.2):
+        mine, his = meeting((v - w) * t + miss * rng.normal(size=(200, 2)), v, w)
+        np.testing.assert_allclose(mine, -his, atol=1e-12)
+        np.testing.assert_allclose(np.linalg.norm(mine, axis=1), 1)
+        np.testing.assert_allclose((mine * (v - w)).sum(axis=1), 0, atol=1e-4)  # across the relative motion
+
+
+def test_head_on_everybody_keeps_right_and_nobody_brakes() -> None:
+    mine, his = meeting((6, 0), (1, 0), (-1, 0))
+    np.testing.assert_allclose([mine, his], [[0, -1], [0, 1]], atol=1e-12)
+
+
+def test_of_two_who_cross_one_brakes_and_one_speeds_up() -> None:
+    """The one on the other's right goes first; who passes behind turns behind him and brakes."""
+    behind, ahead = meeting((3, -3), (1, 0), (0, 1))
+    np.testing.assert_allclose(behind, [-math.sqrt(0.5), -math.sqrt(0.5)], atol=1e-12)
+    np.testing.assert_allclose(ahead, [math.sqrt(0.5), math.sqrt(0.5)], atol=1e-12)
+    late, early = meeting((3, -3.5), (1, 0), (0, 1))  # he will be late: I go first
+    assert late[0] > 0
+    assert early[1] < 0
+
+
+def test_who_converges_from_the_side_brakes_or_speeds_up() -> None:
+    """Almost parallel ways: turning right would lead one of them into the other."""
+    mine, his = meeting((0.3, -2), (1, 0.1), (1, 0.2))
+    np.testing.assert_allclose([mine, his], [[-1, 0], [1, 0]], atol=1e-12)
+
+
+# --- giving way, and queues, in a scene -------------------------------------------------------------------------------
+
+OFF = {"give_way": 0.0, "avoid": 0.0, "apart": 0.0}
+
+
+def crowd(groups: tuple[Group, ...], targets: Any, obstacles: Any = (), dt: float = 0.05, **given: float) -> Scene:
+    """Two groups with a target each: one kernel for all tests of giving way and of queues."""
+    p = OFF | {"queue": 4.0, "speed": 1.2, "headway": 1.0, "margin": 0.1} | given
+    asked = [
+        Steer(
+            group=k, arbitration=Allocation(),
+            behaviours=(
+                AvoidObstacles(weight=p["avoid"], horizon=1.2, margin=0.1),
+                UnalignedAvoidance(weight=p["give_way"], radius=20, horizon=4, margin=p["margin"]),
+                Separation(weight=p["apart"], radius=0.9),
+                Queue(
+                    weight=p["queue"], target=target, speed=p["speed"], headway=p["headway"], margin=p["margin"], group=k,
+                ),
+            ),
+        )
+        for k, target in enumerate(targets)
+    ]  # fmt: skip
+    return Scene(dimension=2, space=Torus(size=(400, 400)), groups=groups, obstacles=obstacles, effects=asked, dt=dt)
+
+
+def bodies(count: int, radius: float = 0.3, **limits: float) -> Group:
+    return Group(count=count, radius=radius, spawn=SPAWN, **({"max_force": 5.0} | limits))
+
+
+def placed(scene: Scene, pos: Any, vel: Any) -> State:
+    start = scene.start(0)
+    start.pos[0], start.vel[0] = np.asarray(pos, float), np.asarray(vel, float)
+    return start
+
+
+def played(scene: Scene, state: State, steps: int) -> tuple[Array, Array]:
+    """Positions and velocities after every step, (steps + 1, N, 2)."""
+    pos, vel = [state.pos[0].copy()], [state.vel[0].copy()]
+    for _ in range(steps):
+        state = scene.step(state)
+        pos.append(state.pos[0].copy())
+        vel.append(state.vel[0].copy())
+    return np.array(pos), np.array(vel)
+
+
+def least_gap(scene: Scene, pos: Array) -> float:
+    """Between any two bodies, at any time, m."""
+    own = scene.body.radius
+    apart = np.linalg.norm(pos[:, :, None] - pos[:, None], axis=-1) - own - own[:, None]
+    return float((apart + np.diag(np.full(len(own), np.inf))).min())
+
+
+MEETINGS = {  # positions and velocities about (100, 100); the targets lie far ahead
+    "head-on": (((-6, 0), (6, 0)), ((1.2, 0), (-1.2, 0))),
+    "crossing": (((-6, 0), (0, -6)), ((1.2, 0), (0, 1.2))),
+    "catching up": (((-6, 0), (-2, 0)), ((1.2, 0), (0.4, 0))),
+    "converging": (((-6, 0), (-6, 2.4)), ((1.2, 0.2), (1.2, -0.2))),
+}
+
+
+@pytest.mark.parametrize("case", MEETINGS)
+@pytest.mark.parametrize("radii", [(0.3, 0.3), (0.1, 0.9), (0.9, 0.1)])
+def test_two_who_would_run_into_each_other_do_not(case: str, radii: tuple[float, float]) -> None:
+    pos, vel = (np.array(a, float) for a in MEETINGS[case])
+    targets = tuple(tuple(map(float, 100 + x + 60 * v)) for x, v in zip(pos, vel, strict=True))
+    groups = tuple(bodies(1, radius=r, max_speed=2.0) for r in radii)
+    speeds = {} if case != "catching up" else {"queue": 0.0}
+    gaps = []
+    for weight in (0.0, 4.0):
+        scene = crowd(groups, targets, give_way=weight, **speeds)
+        moved, _ = played(scene, placed(scene, 100 + pos, vel), 240)
+        gaps.append(least_gap(scene, moved))
+    assert gaps[0] < -0.2, "they meet if nobody gives way"
+    assert gaps[1] > 0
+
+
+def test_who_passes_behind_slows_down_and_who_goes_first_does_not() -> None:
+    pos, vel = (np.array(a, float) for a in MEETINGS["crossing"])
+    scene = crowd((bodies(1), bodies(1)), ((172.0, 100.0), (100.0, 172.0)), give_way=4.0)
+    _, moved = played(scene, placed(scene, 100 + pos, vel), 150)
+    speed = np.linalg.norm(moved, axis=-1)
+    assert speed[:, 0].min() < 1.1
+    assert speed[:, 1].min() > 1.19
+
+
+def test_a_gap_in_a_queue_is_how_far_one_can_go() -> None:
+    way = (1.0, 0.0)
+    gaps = queue_gap(way, [(5, 0), (5, 0.6), (5, 1.01), (-5, 0), (5, 0)], (0.5, 0.0), 1.0, [1.2, 1.2, 1.2, 1.2, 0.4])
+    np.testing.assert_allclose(gaps, [4, 5 - 0.8, np.inf, np.inf, np.inf])  # beside; behind; not slower than I
+    np.testing.assert_allclose(queue(way, (0.2, 0.1), [0.5, np.inf, 0.0], 1.2, 1.0), [[0.3, -0.1], [1.0, -0.1], [-0.2, -0.1]])
+
+
+def file_of(count: int, slow: float, **given: float) -> tuple[Scene, State]:
+    """A leader (group 1) at constant speed, and a queue behind him."""
+    scene = crowd((bodies(count), bodies(1, max_speed=max(slow, 1e-9))), ((160.0, 100.0), (160.0, 100.0)), **given)
+    # followers heed their own group alone; so the leader stands in both: he is the first of group 0 here
+    x = 100 - 1.2 * np.arange(count)
+    return scene, placed(scene, [*((a, 100.0) for a in x), (50.0, 50.0)], [(0.0, 0.0)] * (count + 1))
+
+
+def test_a_queue_flows_at_its_headway_and_never_overlaps() -> None:
+    """Tordeux et al. 2016: at a speed v gaps are v T, so that 1 / (T + l / v) pass in a second; here at full speed.
+
+    In front nobody holds up the first; behind him gaps widen to speed x headway + margin, whoever began how near.
+    """
+    scene, start = file_of(8, 0.0)
+    pos, vel = played(scene, start, 600)
+    gaps = pos[:, :7, 0] - pos[:, 1:8, 0] - 0.6
+    assert gaps.min() >= 0.1
+    np.testing.assert_allclose(vel[-1, :8], np.tile([1.2, 0.0], (8, 1)), atol=0.02)
+    assert (gaps[-1] >= 1.2 * 1.0 + 0.1 - 0.05).all()
+    at = 115.0
+    passed = np.sort([np.argmax(pos[:, k, 0] > at) * scene.dt for k in range(8)])
+    flow = 7 / (passed[-1] - passed[0])
+    assert flow == pytest.approx(1 / (1.0 + (0.6 + 0.1) / 1.2), rel=0.1)
+
+
+def test_a_queue_stops_behind_who_stops_and_closes_up_exponentially() -> None:
+    """Second order, gain 4 m / T: critically damped, so a gap closes to the margin and never beyond it."""
+    scene, start = file_of(4, 0.0, queue=4.0)
+    stone = np.array([110.0, 100.0])
+    start.pos[0, 0] = stone  # the first, who is as heavy as a wall: he stays where he is
+    heavy = scene.model_copy(update={"groups": (bodies(4), bodies(1, max_speed=1e-9))})
+    for _ in range(800):
+        start = heavy.step(start)
+        start.pos[0, 0], start.vel[0, 0] = stone, 0.0
+        gaps = start.pos[0, :3, 0] - start.pos[0, 1:4, 0] - 0.6
+        assert gaps.min() >= 0.1 - 1e-9
+    np.testing.assert_allclose(gaps, 0.1, atol=0.01)
+    assert np.abs(start.vel[0, :4]).max() < 0.01
+
+
+def test_a_queue_passes_a_door_without_a_touch() -> None:
+    """A gap of 1.4 m between two round pillars, 12 bodies of 0.5 m: all are through in 30 s."""
+    stones = ({"centre": (100.0, 102.7), "radius": 2.0}, {"centre": (100.0, 97.3), "radius": 2.0})
+    scene = crowd(
+        (bodies(12, radius=0.25, max_force=8.0), bodies(1)), ((130.0, 100.0), (50.0, 50.0)), stones,
+        avoid=6.0, apart=2.0, queue=3.0, speed=1.3,
+    )  # fmt: skip
+    begin = [(96.0 - 0.9 * i, 98.65 + 0.9 * j) for i in range(3) for j in range(4)]
+    pos, _ = played(scene, placed(scene, [*begin, (50, 50)], [(0, 0)] * 13), 600)
+    own = pos[:, :12]
+    apart = np.linalg.norm(own[:, :, None] - own[:, None], axis=-1) + np.diag(np.full(12, np.inf))
+    assert apart.min() >= 0.5
+    for stone in scene.obstacles:
+        assert np.linalg.norm(own - stone.centre, axis=-1).min() >= stone.radius + 0.25
+    assert (own[-1, :, 0] > 101).all()
+    passed = np.argmax(own[:, :, 0] > 100, axis=0) * scene.dt
+    assert 11 / (passed.max() - passed.min()) > 0.8  # per second: it flows
+
+
+def test_on_a_torus_the_door_is_the_nearest_one() -> None:
+    scene = crowd((bodies(1), bodies(1)), ((3.0, 100.0), (50.0, 50.0)))
+    end = scene.run(placed(scene, [(398, 100), (50, 50)], [(0, 0), (0, 0)]), 20)
+    assert end.vel[0, 0, 0] > 0.5
+
+
+# --- forage -----------------------------------------------------------------------------------------------------------
+
+
+def meadow(dt: float = 0.05, **given: float) -> Scene:
+    asked: dict[str, Any] = {"weight": 3.0, "food": 1, "speed": 1.2, "radius": 2.5} | given
+    groups = (Group(count=2, radius=0.2, spawn=SPAWN), Group(count=3, radius=0.1, spawn=SPAWN))
+    return Scene(dimension=2, groups=groups, effects=(Steer(group=0, behaviours=(Forage(**asked),)),), dt=dt)
+
+
+FOOD = [(0.0, 1.5), (2.0, 0.0), (60.0, 60.0)]
+
+
+def test_a_forager_goes_to_the_nearest_food_in_sight_and_stays() -> None:
+    scene = meadow()
+    end = scene.run(placed(scene, [(0, 0), (58, 60), *FOOD], [(0.3, 0), (0, 0), (0, 0), (0, 0), (0, 0)]), 300)
+    np.testing.assert_allclose(end.pos[0, 0], FOOD[0], atol=0.01)
+    np.testing.assert_allclose(end.pos[0, 1], FOOD[2], atol=0.01)
+    np.testing.assert_array_equal(end.pos[0, 2:], FOOD)  # food does not run
+
+
+def test_without_food_in_sight_it_wanders_and_the_walk_does_not_depend_on_the_step() -> None:
+    ends = []
+    for dt in (0.05, 0.025, 0.0125):
+        scene = meadow(dt)
+        vel = [(1, 0), (0, 1), (0, 0), (0, 0), (0, 0)]
+        start = placed(scene, [(20, 20), (30, 20), *FOOD], vel)
+        pos, _ = played(scene, start, round(6 / dt))
+        ends.append(pos[-1, :2])
+    assert np.linalg.norm(ends[1] - ends[2], axis=1).max() < 0.6 * np.linalg.norm(ends[0] - ends[1], axis=1).max() + 0.02
+    assert np.linalg.norm(ends[0] - ends[2], axis=1).max() < 0.4
+    straight = np.array([(20 + 6 * 1.2, 20), (30, 20 + 6 * 1.2)])
+    assert (np.linalg.norm(ends[2] - straight, axis=1) > 0.3).all()  # it turns, and each in its own way
+    assert not np.allclose(ends[2][0] - straight[0], (ends[2][1] - straight[1])[::-1], atol=0.1)
+
+
+# --- explore ----------------------------------------------------------------------------------------------------------
+
+
+def sweep(x: Array, seconds: float, width: float = 12.0, height: float = 9.0, track: float = 1.5) -> Array:
+    """Paths of agents of 1 kg at 1 m/s with 2 N, under a gain of 5 kg/s."""
+    v, path = np.zeros_like(x), [x]
+    for _ in range(round(seconds / 0.05)):
+        force = 5 * explore(x, np.array([width, height]) - x, v, 1.0, track)
+        size = np.linalg.norm(force, axis=1, keepdims=True)
+        v = v + 0.05 * force * np.minimum(1, 2 / np.maximum(size, 1e-9))
+        x = x + 0.05 * v
+        path.append(x)
+    return np.array(path)
+
+
+def test_whoever_sweeps_sees_everything_once_per_round_wherever_he_began() -> None:
+    """A closed comb of 6 rows is 6 (12 - 2 x 1.5) + 2 x 9 = 72 m long; some corners are cut."""
+    begun = np.random.default_rng(0).uniform(0, 1, (6, 2)) * [12, 9]
+    path = sweep(begun, 1.25 * 72)
+    places = np.stack(np.meshgrid(np.linspace(0, 12, 49), np.linspace(0, 9, 37)), axis=-1).reshape(-1, 2)
+    for k in range(len(begun)):
+        seen = np.zeros(len(places), bool)
+        for here in path[::4, k]:
+            seen |= np.linalg.norm(places - here, axis=1) < 1.25 * 1.5
+        assert seen.all()
+    assert path.min() >= 0
+    assert (path <= [12, 9]).all()
+
+
+@pytest.mark.parametrize(
+    ("effect", "space", "said"),
+    [
+        (Explore(weight=1, low=(0, 0), high=(9, 9), speed=1, track=1), Torus(size=(9, 9)), "space.kind = 'torus'"),
+        (Explore(weight=1, low=(0, 0), high=(9, 2), speed=1, track=1), None, "must be at least 3 tracks = 3 m"),
+        (Forage(weight=1, food=2, speed=1), None, "food = 2: there are 1 groups, counted from 0"),
+        (Queue(weight=1, target=(0, 0, 0), speed=1), None, "target = (0.0, 0.0, 0.0): dimension = 2"),
+    ],
+)
+def test_what_does_not_suit_a_scene_is_refused_in_one_line(effect: Any, space: Any, said: str) -> None:
+    given = {} if space is None else {"space": space}
+    with pytest.raises(ValueError, match=r".") as caught:
+        Scene(dimension=2, groups=(bodies(2),), effects=(effect,), **given)
+    assert said in str(caught.value)
+    assert "\n" not in str(caught.value)
