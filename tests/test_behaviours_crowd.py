@@ -185,10 +185,9 @@ def test_a_gap_in_a_queue_is_how_far_one_can_go() -> None:
     )
 
 
-def file_of(count: int, slow: float, **given: float) -> tuple[Scene, State]:
-    """A leader (group 1) at constant speed, and a queue behind him."""
-    scene = crowd((bodies(count), bodies(1, max_speed=max(slow, 1e-9))), ((160.0, 100.0), (160.0, 100.0)), **given)
-    # followers heed their own group alone; so the leader stands in both: he is the first of group 0 here
+def file_of(count: int, **given: float) -> tuple[Scene, State]:
+    """Some in a file, 0.6 m apart, at rest; group 1 is somebody far away."""
+    scene = crowd((bodies(count), bodies(1)), ((160.0, 100.0), (160.0, 100.0)), **given)
     x = 100 - 1.2 * np.arange(count)
     return scene, placed(scene, [*((a, 100.0) for a in x), (50.0, 50.0)], [(0.0, 0.0)] * (count + 1))
 
@@ -198,7 +197,7 @@ def test_a_queue_flows_at_its_headway_and_never_overlaps() -> None:
 
     In front nobody holds up the first; behind him gaps widen to speed x headway + margin, whoever began how near.
     """
-    scene, start = file_of(8, 0.0)
+    scene, start = file_of(8)
     pos, vel = played(scene, start, 600)
     gaps = pos[:, :7, 0] - pos[:, 1:8, 0] - 0.6
     assert gaps.min() >= 0.1
@@ -212,12 +211,11 @@ def test_a_queue_flows_at_its_headway_and_never_overlaps() -> None:
 
 def test_a_queue_stops_behind_who_stops_and_closes_up_exponentially() -> None:
     """Second order, gain 4 m / T: critically damped, so a gap closes to the margin and never beyond it."""
-    scene, start = file_of(4, 0.0, queue=4.0)
-    stone = np.array([110.0, 100.0])
-    start.pos[0, 0] = stone  # the first, who is as heavy as a wall: he stays where he is
-    heavy = scene.model_copy(update={"groups": (bodies(4), bodies(1, max_speed=1e-9))})
+    scene, start = file_of(4, queue=4.0)
+    stone = np.array([110.0, 100.0])  # where the first is held
+    start.pos[0, 0] = stone
     for _ in range(800):
-        start = heavy.step(start)
+        start = scene.step(start)
         start.pos[0, 0], start.vel[0, 0] = stone, 0.0
         gaps = start.pos[0, :3, 0] - start.pos[0, 1:4, 0] - 0.6
         assert gaps.min() >= 0.1 - 1e-9
