@@ -96,7 +96,7 @@ def test_who_converges_from_the_side_brakes_or_speeds_up() -> None:
 OFF = {"give_way": 0.0, "avoid": 0.0, "apart": 0.0}
 
 
-def crowd(groups: tuple[Group, ...], targets: Any, obstacles: Any = (), dt: float = 0.05, **given: float) -> Scene:
+def crowd(groups: tuple[Group, ...], targets: Any, obstacles: Any = (), yielding: int = 2, **given: float) -> Scene:
     """Two groups with a target each: one kernel for all tests of giving way and of queues."""
     p = OFF | {"queue": 4.0, "speed": 1.2, "headway": 1.0, "margin": 0.1} | given
     asked = [
@@ -104,16 +104,17 @@ def crowd(groups: tuple[Group, ...], targets: Any, obstacles: Any = (), dt: floa
             group=k, arbitration=Allocation(),
             behaviours=(
                 AvoidObstacles(weight=p["avoid"], horizon=1.2, margin=0.1),
-                UnalignedAvoidance(weight=p["give_way"], radius=20, horizon=4, margin=p["margin"]),
+                UnalignedAvoidance(weight=p["give_way"] * (k < yielding), radius=20, horizon=4, margin=p["margin"]),
                 Separation(weight=p["apart"], radius=0.9),
                 Queue(
-                    weight=p["queue"], target=target, speed=p["speed"], headway=p["headway"], margin=p["margin"], group=k,
+                    weight=p["queue"], target=target, speed=p["speed"], headway=p["headway"], margin=p["margin"],
+                    group=k,
                 ),
             ),
         )
         for k, target in enumerate(targets)
     ]  # fmt: skip
-    return Scene(dimension=2, space=Torus(size=(400, 400)), groups=groups, obstacles=obstacles, effects=asked, dt=dt)
+    return Scene(dimension=2, space=Torus(size=(400, 400)), groups=groups, obstacles=obstacles, effects=asked, dt=0.05)
 
 
 def bodies(count: int, radius: float = 0.3, **limits: float) -> Group:
@@ -165,6 +166,16 @@ def test_two_who_would_run_into_each_other_do_not(case: str, radii: tuple[float,
         gaps.append(least_gap(scene, moved))
     assert gaps[0] < -0.2, "they meet if nobody gives way"
     assert gaps[1] > 0
+
+
+def test_the_small_one_alone_gives_way_to_a_large_one() -> None:
+    """It would miss the other's centre by 0.8 m: more than twice its own radius, less than the sum of both."""
+    for weight, clear in ((0.0, False), (4.0, True)):
+        groups = (bodies(1, radius=0.1), bodies(1, radius=0.9))
+        scene = crowd(groups, ((172.0, 100.0), (100.0, 100.8)), give_way=weight, yielding=1)
+        pos, _ = played(scene, placed(scene, [(94, 100), (100, 100.8)], [(1.2, 0), (0, 0)]), 200)
+        assert (least_gap(scene, pos) > 0) == clear
+        np.testing.assert_array_equal(pos[-1, 1], (100, 100.8))
 
 
 def test_who_passes_behind_slows_down_and_who_goes_first_does_not() -> None:
