@@ -118,7 +118,7 @@ def test_a_walker_sees_what_is_there_in_the_frame_of_its_course() -> None:
 
 
 def test_scripted_walkers_cross_without_a_touch() -> None:
-    """The learner stays where he is; the others get to their goals and touch nobody."""
+    """The learner stays where he is; the others touch nobody, and get to their goals but for who finds him there."""
     world = world_of(Crossing(agents=8, learners=1), worlds=4)
     least = np.inf
     for _ in range(150):
@@ -127,7 +127,7 @@ def test_scripted_walkers_cross_without_a_touch() -> None:
         least = min(least, (np.linalg.norm(pos[:, :, None] - pos[:, None], axis=3) + 1e9 * np.eye(8)).min())
     assert least >= 0.6
     left = np.linalg.norm(world._memory[:2].transpose(1, 2, 0) - pos, axis=2)
-    assert left[:, 1:].max() < 0.4
+    assert np.delete(left, [0, 4], axis=1).max() < 0.1
 
 
 def test_hand_written_walkers_arrive_and_orca_touches_nobody() -> None:

@@ -87,6 +87,10 @@ effects:
         """How strongly, how far ahead, how wide: who is seen is the sweep's business."""
         return {"weight": self.weight, "horizon": self.horizon, "margin": self.margin}
 
+    def lookahead(self, speed: float) -> float:
+        """As far as it comes within the horizon, and as it sees."""
+        return min(speed * self.horizon, self.radius)
+
     def sums(self, dimension: int) -> int:
         """A time and a direction."""
         return 1 + dimension

@@ -122,16 +122,17 @@ effects:
         names = ("weight", "speed", "hurry", "slow_radius", "horizon", "step", "margin", "turn")
         return {"target": self.target, **{name: float(getattr(self, name)) for name in names}}
 
+    def lookahead(self, speed: float) -> float:
+        """As far as it comes within the horizon, and as it sees."""
+        return min(speed * self.horizon, self.radius)
+
     def check(self, scene: Any) -> None:
-        """Refuse space, and obstacles that are not round."""
+        """Refuse space."""
         if scene.dimension != 2:
             raise ValueError(f"kind = orca: dimension = {scene.dimension}, must be 2")
         for k, obstacle in enumerate(scene.obstacles):
             if obstacle.kind != "circle":
                 raise ValueError(f"kind = orca: sees round obstacles alone, obstacles[{k}].kind = {obstacle.kind}")
-        for k, obstacle in enumerate(scene.obstacles):
-            if obstacle.kind != "circle":
-                raise ValueError(f"kind = orca: obstacles[{k}].kind = {obstacle.kind!r}, must be 'circle'")
         super().check(scene)
 
     def sums(self, dimension: int) -> int:
