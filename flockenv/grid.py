@@ -46,7 +46,7 @@ def points_of(low: Sequence[float], spacing: float, counts: Sequence[int]) -> Fl
 
 
 @law
-def _along(table: Table, x: float, d: int, k: int) -> tuple[int, float]:
+def _along(table: Table, x: float, d: int, k: int) -> tuple[Any, float]:
     """Return the cell along axis k that holds x, and where in it: 0 at its lower edge, 1 at its upper one."""
     o, e = like(x, 0.0), like(x, 1.0)
     last = table[d + 1 + k] - e

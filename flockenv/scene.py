@@ -616,7 +616,9 @@ class Scene(Record):
             periodic=self.space.periodic, title=title, bonds=self.edges, outlines=self.outlines(low, high),
         )  # fmt: skip
 
-    def outlines(self, low: Sequence[float], high: Sequence[float]) -> tuple[Floats, ...]:
+    def outlines(
+        self, low: Sequence[float] | NDArray[np.float64], high: Sequence[float] | NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], ...]:
         """Return obstacles that are no circles as polygons, each (n, 2) m, seen from above in a region."""
         region = np.array(low, np.float64), np.array(high, np.float64)
         return tuple(polygon for shape in self.shapes for polygon in shape.outline(*region))

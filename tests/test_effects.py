@@ -22,6 +22,7 @@ from flockenv.integrators import RK4
 from flockenv.kernels import cache_folder
 from flockenv.networks import Mesh
 from flockenv.scene import Group, Scene
+from flockenv.shapes import Circle
 from flockenv.space import Plane
 from flockenv.spawn import Spawn
 from flockenv.state import State
@@ -449,7 +450,7 @@ def test_several_pair_effects_share_one_query() -> None:
 def names_of_effects() -> dict[str, Any]:
     """What a printed effect or scene is read with: effects, behaviours, arbitrations."""
     kinds = (*effects_module.EFFECTS.values(), *ARBITRATIONS.values())
-    return {kind.__name__: kind for kind in kinds}
+    return {kind.__name__: kind for kind in kinds} | {"Circle": Circle}
 
 
 @ROWS

@@ -42,7 +42,7 @@ def _side_hit(m: Vec, direction: Vec, along: Vec, radius: float) -> float:
         p, q = sub(m, scale(axle, dot(m, axle))), sub(direction, scale(axle, dot(direction, axle)))
         a, b, c = dot(q, q), dot(p, q), dot(p, p) - radius * radius
         square = b * b - a * c
-        return c / (np.sqrt(square) - b) if (square >= o) & (b < o) & (c >= o) else far  # type: ignore[no-any-return]
+        return c / (np.sqrt(square) - b) if (square >= o) & (b < o) & (c >= o) else far
 
 
 @law
@@ -77,7 +77,8 @@ def _crosses(x: Vec, a: Vec, b: Vec) -> bool:
     """Does the line from x to the right cross the segment?"""
     rise = b[1] - a[1]
     between = (a[1] > x[1]) != (b[1] > x[1])
-    return between and x[0] < a[0] + (b[0] - a[0]) * ((x[1] - a[1]) / (rise if between else like(rise, 1.0)))
+    slope = rise if between else like(rise, 1.0)
+    return between & (x[0] < a[0] + (b[0] - a[0]) * ((x[1] - a[1]) / slope))
 
 
 @law
@@ -91,7 +92,8 @@ def nearest_chain(table: Any, at: int, x: Vec) -> tuple[float, Vec]:
     closed = table[at + 4 + d] > like(radius, 0.0)
     e = like(radius, 1.0)
     best, away, side, inside = like(radius, np.inf), sub(x, x), axis(x, 0), False
-    for j in range(max(count if closed else count - 1, 1)):
+    edges: Any = count if closed or count < 2 else count - 1
+    for j in range(edges):
         a = _vertex(table, at, j, x)
         b = _vertex(table, at, j + 1 if j + 1 < count else 0, x)
         off = sub(x, add(a, scale(sub(b, a), segment_share(x, a, b))))
@@ -116,7 +118,8 @@ def hit_chain(table: Any, at: int, x: Vec, direction: Vec, clearance: float) -> 
     closed = table[at + 4 + d] > like(room, 0.0)
     best = like(room, np.inf)
     inside = False
-    for j in range(max(count if closed else count - 1, 1)):
+    edges: Any = count if closed or count < 2 else count - 1
+    for j in range(edges):
         a = _vertex(table, at, j, x)
         b = _vertex(table, at, j + 1 if j + 1 < count else 0, x)
         here = segment_hit(x, direction, a, b, room)

@@ -390,7 +390,8 @@ class DistanceField(Shape):
 
     def row(self, dimension: int) -> Sequence[float]:
         """Its grid: distances and unit gradients."""
-        slopes = np.stack(np.gradient(self.distances, self.spacing), axis=-1)
+        along: Any = np.gradient(self.distances, self.spacing)
+        slopes = np.stack(along, axis=-1)
         size = np.linalg.norm(slopes, axis=-1, keepdims=True)
         numbers = np.concatenate([self.distances[..., None], slopes / np.maximum(size, 1e-12)], axis=-1)
         return packed(numbers, (0.0,) * dimension, self.spacing)  # type: ignore[return-value]

@@ -23,7 +23,7 @@ def obstacle_imports(parts: Parts) -> list[str]:
         return []
     lines = [
         "from flockenv.effects.base import Obstacle",
-        "from flockenv.shapes.round import blocks, normal, touched_normal",
+        "from flockenv.shapes.round import blocks as stands_between, normal as outward, touched_normal",
         "from flockenv.shapes.touch import touched_offset, touched_spot",
         "from flockenv.steering.around import threat",
     ]
@@ -94,7 +94,7 @@ def _near(form: str, k: int | None) -> list[str]:
     """Write an obstacle as a law sees it that casts no rays, from where it is or, for effect k, from elsewhere."""
     if form == CIRCLE:
         way, from_ = ("to", []) if k is None else ("way", [f"way = sub(to, obstacle_from_{k}(p{k}, me))"])
-        body = f"{way}, dot({way}, {way}), zero(x), rho, zero(x), norm({way}) - rho, normal({way})"
+        body = f"{way}, dot({way}, {way}), zero(x), rho, zero(x), norm({way}) - rho, outward({way})"
         return [*from_, f"it = Obstacle(like(rho, m), {body}, like(rho, np.inf), zero(x))"]
     far, side, from_ = "gap", "out", []
     if k is not None:
@@ -138,7 +138,7 @@ def blocked(parts: Parts) -> str:
         "for m in range(obstacle_radius.shape[1]):",
         "    rho = obstacle_radius[b, m]",
         "    if rho > 0:",
-        f"        found |= blocks(offset_to(size, x, {tuple_of('obstacle_x[#, b, m]', d)}), rho, to)",
+        f"        found |= stands_between(offset_to(size, x, {tuple_of('obstacle_x[#, b, m]', d)}), rho, to)",
     ]
     at = d + 1
     for form in parts.shaped[1]:
