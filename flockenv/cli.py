@@ -1,4 +1,6 @@
-"""flockenv on the command line: list | run | render | explain | accuracy | stress | gallery | warmup | schema.
+"""flockenv on the command line.
+
+list | run | render | explain | accuracy | stress | experiment | gallery | warmup | schema
 
 Errors are one line on stderr, exit code 2.
 """
@@ -20,7 +22,7 @@ import typer
 
 import flockenv
 from flockenv.refusals import nearest, shown
-from flockenv.studies import accuracy, gallery, stress
+from flockenv.studies import accuracy, experiment, gallery, stress
 from flockenv.terminal import (
     BAD_INPUT,
     DIVERGED,
@@ -241,11 +243,15 @@ def explain(scene: SceneFile) -> None:
     counted = (f"{number:g} {name.replace('_', ' ')}" for name, number in found.work.items())
     console.print(f"Per step: {', '.join(counted)}")
     console.print(f"Largest stable step: {found.largest_step}")
+    if found.shares:
+        shares = [(k, name, "-" if math.isnan(x) else f"{x:.3g}") for k, name, x in found.shares]
+        show_table(console, "Of what behaviours wish for, granted on average", shares, ("effect", "behaviour", "share"))
     show_table(console, "Left out, because nobody asked for it", ([line] for line in found.left_out), [""])
 
 
 app.command()(accuracy)
 app.command()(stress)
+app.command()(experiment)
 app.command()(gallery)
 
 

@@ -7,7 +7,10 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from time import perf_counter
 
+import numpy as np
+
 from flockenv.effects import EFFECTS, Effect
+from flockenv.grants import Grants
 from flockenv.scene import Scene
 from flockenv.stability import Suggestion, suggest_dt
 from flockenv.state import WORK, State
@@ -15,6 +18,7 @@ from flockenv.state import WORK, State
 __all__ = ["Explanation", "Row", "explain"]
 
 ROUNDS = 7
+INSTANTS, BETWEEN = 20, 10  # at which shares are looked at, and the steps between two
 TIMED = 0.01  # s per measurement: long against the clock, short against a change of the processor's speed
 
 
@@ -38,6 +42,7 @@ class Explanation:
     work: dict[str, float]  # per step, see state.WORK
     left_out: tuple[str, ...]  # one line each
     stable: Suggestion  # the largest stable step
+    shares: tuple[tuple[str, str, float], ...] = ()  # of each Steer's behaviours: which, and the mean share granted
 
     @property
     def shared(self) -> float:
@@ -78,7 +83,9 @@ def explain(
         Row(effect, _calls(scene, k), max(0.0, whole - less))
         for k, (effect, less) in enumerate(zip(effects, without, strict=True))
     )
-    return Explanation(scene, rows, whole, bare, _work(scene, state), _left_out(scene), suggest_dt(scene))
+    return Explanation(
+        scene, rows, whole, bare, _work(scene, state), _left_out(scene), suggest_dt(scene), _shares(scene, state)
+    )
 
 
 class _Timer:
@@ -113,6 +120,23 @@ def _calls(scene: Scene, k: int) -> tuple[str, ...]:
 def _work(scene: Scene, state: State) -> dict[str, float]:
     after = scene.step(state)
     return {what: (after.counted(what) - state.counted(what)) / state.shape[0] for what in WORK}
+
+
+def _shares(scene: Scene, state: State) -> tuple[tuple[str, str, float], ...]:
+    """Return the mean share of each wish, while it is one, over INSTANTS of a run from a state on."""
+    if not any(effect.wishes for effect in scene.effects):
+        return ()
+    grants, found = Grants(scene), []
+    for _ in range(INSTANTS):
+        found.append(grants.at(state))
+        state = scene.run(state, BETWEEN)
+    rows = []
+    for one in zip(*found, strict=True):
+        share, asked = np.stack([g.share for g in one]), np.stack([g.asked for g in one])
+        for k, name in enumerate(one[0].names):
+            mean = float(share[..., k][asked[..., k]].mean()) if asked[..., k].any() else math.nan
+            rows.append((f"effects[{one[0].effect}]", name, mean))
+    return tuple(rows)
 
 
 def _left_out(scene: Scene) -> tuple[str, ...]:

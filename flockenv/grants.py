@@ -24,7 +24,7 @@ from flockenv.state import State
 from flockenv.steer import Steer
 from flockenv.vec import zero
 
-__all__ = ["Granted", "granted", "reconcile"]
+__all__ = ["Granted", "Grants", "granted", "reconcile"]
 
 Reals = NDArray[np.floating[Any]]
 
@@ -93,38 +93,55 @@ def heard(p: Any, me: Any, wishes: Wishes) -> tuple[Vec, Shares]:
     return total, (p.which,)
 
 
+class Grants:
+    """Asks a scene again and again what its `Steer` effects grant; what that takes is made once."""
+
+    def __init__(self, scene: Scene) -> None:
+        """scene: with any number of Steer effects."""
+        self.scene = scene
+        # a behaviour may read the medium; one that pushes, too, is no behaviour's business
+        media = tuple(e for e in scene.effects if e.medium_law is not None and e.own_law is None)
+        self._heard = {
+            k: [scene.with_effects(*media, _heard_alone(effect, j)) for j in range(len(effect.behaviours))]
+            for k, effect in enumerate(scene.effects)
+            if isinstance(effect, Steer)
+        }
+
+    def at(self, state: State) -> tuple[Granted, ...]:
+        """Return what each of them grants at this instant, in the order of the effects; nothing moves."""
+        return tuple(self._one(state, k) for k in self._heard)
+
+    def _one(self, state: State, which: int) -> Granted:
+        """Return what one of them grants."""
+        steer, body = self.scene.effects[which], self.scene.body
+        assert isinstance(steer, Steer)
+        counted = state.copy()  # what is counted is the scene's
+        mass = np.where(np.isfinite(body.mass), body.mass, 0)[:, None]
+        wish = np.stack([scene.acceleration(counted) * mass for scene in self._heard[which]], axis=2)
+        b, n, d = state.shape
+        force, share = reconcile(
+            steer.arbitration, wish.reshape(b * n, -1, d), max_force=np.tile(body.max_force, b),
+            time=np.repeat(state.time, n), key=np.repeat(state.key, n), who=np.arange(b * n) % n,
+            heading=state.heading.reshape(b * n, d), dtype=self.scene.dtype,
+        )  # fmt: skip
+        share = np.where((wish != 0).any(axis=-1), share.reshape(wish.shape[:-1]), 0)
+        return Granted(steer, which, wish, share, force.reshape(state.shape))
+
+
+def _heard_alone(steer: Steer, which: int) -> _Heard:
+    """Return an effect that hears one of the behaviours."""
+    return _Heard(
+        kind="heard", behaviours=steer.behaviours, arbitration=steer.arbitration, group=steer.group, which=which
+    )
+
+
 def granted(scene: Scene, state: State) -> tuple[Granted, ...]:
     """Return what each `Steer` of a scene grants at this instant, in the order of its effects; nothing moves.
 
-    The budget is max_force, whatever else the agents are driven to do.
+    The budget is max_force, whatever else the agents are driven to do. `Grants(scene).at(state)` is the same for who
+    asks more than once.
     """
-    return tuple(_granted(scene, state, k) for k, effect in enumerate(scene.effects) if isinstance(effect, Steer))
-
-
-def _granted(scene: Scene, state: State, which: int) -> Granted:
-    """Return what one of them grants."""
-    steer = scene.effects[which]
-    assert isinstance(steer, Steer)
-    wish = np.stack([_wishes(scene, state, steer, k) for k in range(len(steer.behaviours))], axis=2)
-    b, n, d = state.shape
-    many = np.arange(b * n)
-    force, share = reconcile(
-        steer.arbitration, wish.reshape(b * n, -1, d), max_force=np.tile(scene.body.max_force, b),
-        time=np.repeat(state.time, n), key=np.repeat(state.key, n), who=many % n,
-        heading=state.heading.reshape(b * n, d), dtype=scene.dtype,
-    )  # fmt: skip
-    share = share.reshape(wish.shape[:-1])
-    share = np.where((wish != 0).any(axis=-1), share, 0)
-    return Granted(steer, which, wish, share, force.reshape(state.shape))
-
-
-def _wishes(scene: Scene, state: State, steer: Steer, k: int) -> Reals:
-    """Return what one behaviour wishes for, (B, N, D) N."""
-    alone = _Heard(kind="heard", behaviours=steer.behaviours, arbitration=steer.arbitration, group=steer.group, which=k)
-    # a behaviour may read the medium; one that pushes, too, is no behaviour's business
-    media = tuple(effect for effect in scene.effects if effect.medium_law is not None and effect.own_law is None)
-    found = scene.with_effects(*media, alone).acceleration(state.copy())  # a copy: what is counted is the scene's
-    return np.asarray(found * np.where(np.isfinite(scene.body.mass), scene.body.mass, 0)[:, None])
+    return Grants(scene).at(state)
 
 
 def reconcile(

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from flockenv.refusals import shown
+from flockenv.refusals import nearest, shown
 from flockenv.terminal import INTERRUPTED, EarlyEnd, Force, Seed, new_console, progress_bar, relative, show_table
 
 if TYPE_CHECKING:
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from flockenv.records import Record
     from flockenv.stress import Results
 
-__all__ = ["accuracy", "gallery", "stress"]
+__all__ = ["accuracy", "experiment", "gallery", "stress"]
 
 
 def accuracy(
@@ -195,6 +195,35 @@ def _known(numbers: Path) -> Results | None:
         return Results.model_validate_json(numbers.read_text(encoding="utf-8")) if numbers.exists() else None
     except ValueError:
         raise ValueError(f"--out: {numbers.name} holds no findings of hard cases; --force overwrites it") from None
+
+
+def experiment(
+    name: Annotated[str, typer.Argument(metavar="NAME", help="Which; a name that is not known shows all of them.")],
+    out: Annotated[
+        str | None, typer.Option(metavar="X.json|X.png", help="Write the numbers; a picture has X.json beside it.")
+    ] = None,
+    force: Force = False,
+) -> None:
+    """Run an experiment about steering: a table of what was measured, and a picture of where everybody went."""
+    from flockenv.experiments import EXPERIMENTS, run
+    from flockenv.outputs import checked_file
+    from flockenv.render.trials import write_trials
+
+    if name not in EXPERIMENTS:
+        raise ValueError(f"{shown(name)}: no such experiment{nearest(name, EXPERIMENTS)} ({', '.join(EXPERIMENTS)})")
+    path = checked_file(out, [".json", ".png"], force) if out is not None else None
+    if path is not None and path.suffix.lower() == ".png":
+        checked_file(str(path.with_suffix(".json")), [".json"], force)
+    chosen = EXPERIMENTS[name]
+    with progress_bar(chosen.title, len(chosen.cases) * len(chosen.variants), "trials") as advance:
+        results, trials = run(chosen, advance)
+    console = new_console()
+    show_table(console, chosen.title, results.rows(), ("case", "", *results.columns))
+    show_table(console, "Cases", results.cases.items())
+    show_table(console, "Columns", results.columns.items())
+    if path is not None:
+        _write(path, results, lambda picture: write_trials(picture, chosen, trials))
+        console.print(f"{len(results.cells)} trials in {relative(path)}")
 
 
 def gallery(

@@ -70,7 +70,9 @@ def test_schema_is_json_and_the_one_of_scenes(capsys: pytest.CaptureFixture[str]
     assert json.loads(capsys.readouterr().out) == schema()
 
 
-@pytest.mark.parametrize("command", ["list", "run", "render", "explain", "accuracy", "stress", "gallery", "schema"])
+@pytest.mark.parametrize(
+    "command", ["list", "run", "render", "explain", "accuracy", "stress", "experiment", "gallery", "schema"]
+)
 def test_every_command_has_a_page_of_help(command: str) -> None:
     done = CliRunner().invoke(app, [command, "--help"])
     assert done.exit_code == 0

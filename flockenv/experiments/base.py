@@ -1,0 +1,95 @@
+"""An experiment: some cases, each under some variants, and the numbers that come of it, as table, JSON and picture."""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+from pydantic import Field
+
+from flockenv.kernels import laws_digest
+from flockenv.records import Record
+from flockenv.scene import Scene
+from flockenv.state import Floats
+
+__all__ = ["Cell", "Experiment", "Results", "Trial", "run"]
+
+
+class Trial(NamedTuple):
+    """What came of one case under one variant."""
+
+    numbers: Mapping[str, float]  # by the names of the experiment's columns; NaN has no value
+    scene: Scene
+    path: Floats  # (T, N, D) m, of the first world, for pictures
+
+
+@dataclass(frozen=True)
+class Experiment:
+    """What is tried, and what is measured of it."""
+
+    name: str
+    title: str
+    cases: Mapping[str, str]  # what happens in each
+    variants: tuple[str, ...]
+    columns: Mapping[str, str]  # what each number is, with its unit
+    shown: tuple[str, ...]  # those of them that stand below a picture
+    trial: Callable[[str, str], Trial]  # of a case and a variant
+
+
+class Cell(Record):
+    """The numbers of one case under one variant."""
+
+    case: str
+    variant: str
+    numbers: dict[str, float | None] = Field(description="by column; none has no value")
+
+
+class Results(Record):
+    """All that was measured, and by which sources."""
+
+    experiment: str
+    title: str
+    cases: dict[str, str]
+    columns: dict[str, str]
+    cells: tuple[Cell, ...]
+    sources: str = Field(default="", description="fingerprint of the laws")
+
+    def at(self, case: str, variant: str) -> dict[str, float | None]:
+        """Return the numbers of one of them."""
+        return next(c.numbers for c in self.cells if (c.case, c.variant) == (case, variant))
+
+    def rows(self) -> list[list[str]]:
+        """Return the table: a row for each case and variant."""
+        return [
+            [cell.case, cell.variant, *("-" if x is None else f"{x:.3g}" for x in cell.numbers.values())]
+            for cell in self.cells
+        ]
+
+
+def run(
+    experiment: Experiment, progress: Callable[[int], None] = lambda done: None
+) -> tuple[Results, dict[tuple[str, str], Trial]]:
+    """Try every case under every variant; return the numbers, and the trials for whoever draws them."""
+    trials: dict[tuple[str, str], Trial] = {}
+    for case in experiment.cases:
+        for variant in experiment.variants:
+            progress(len(trials))
+            trials[case, variant] = experiment.trial(case, variant)
+    cells = tuple(
+        Cell(case=case, variant=variant, numbers=_known(trial.numbers, tuple(experiment.columns)))
+        for (case, variant), trial in trials.items()
+    )
+    sources = hashlib.sha256(laws_digest().encode()).hexdigest()[:20]
+    results = Results(
+        experiment=experiment.name, title=experiment.title, cases=dict(experiment.cases),
+        columns=dict(experiment.columns), cells=cells, sources=sources,
+    )  # fmt: skip
+    return results, trials
+
+
+def _known(numbers: Mapping[str, float], columns: Sequence[str]) -> dict[str, float | None]:
+    """Return the numbers in the order of the columns; none for what is no number."""
+    return {name: float(numbers[name]) if math.isfinite(numbers[name]) else None for name in columns}
