@@ -283,7 +283,7 @@ class HerdRules:
     gain: float = 5.0  # kg/s, a change of velocity is asked for within 1/gain seconds
     around: float = 0.0  # kg/s: keep outside a circle about the flock on the way to the place behind it
     width: float = 1.0  # of that circle, times the distance of the farthest sheep from the centre
-    apart: float = 0.0  # N, away from other dogs, in proportion to nearness within 10 m
+    apart: float = 4.0  # N, away from other dogs, in proportion to nearness within 10 m
 
 
 def herd(see: Any, task: Herd, p: HerdRules) -> np.ndarray:
