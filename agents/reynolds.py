@@ -217,7 +217,7 @@ class EvadeRules:
     horizon: float = 1.0  # s, how far ahead cover counts that is in the way
     avoid: float = 5.0  # kg/s, strength of steering around it
     wall: float = 0.5  # s, how far ahead walls count
-    alarm: float = 6.0  # m, within which a pursuer is evaded
+    alarm: float = 10.0  # m, within which a pursuer is evaded: as far as it sees
     predict: float = 0.5  # s, how far ahead a pursuer is predicted at most
     evade: float = 5.0  # kg/s, strength of an evasion
     crowd: float = 1.0  # how much farther pursuers count beside the nearest; 0: he alone

@@ -1,6 +1,7 @@
 """How far every place is from a goal around obstacles: |grad u| = 1 on a grid, solved once by fast sweeping.
 
-A global controller: agents follow -grad u, local steering does the rest. Zhao, "A fast sweeping method for Eikonal equations" (Math. Comp. 2005); first order in the spacing.
+A global controller: agents follow -grad u, local steering does the rest. Zhao, "A fast sweeping method for Eikonal
+equations" (Math. Comp. 2005); first order in the spacing.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ NEAR = 4.0
 
 @kernel
 def _updated(a: float, b: float, c: float, h: float) -> float:
-    """Return u where sum of ((u - neighbour) / h)^2 over the axes that count is 1; of each axis the smaller neighbour."""
+    """Return u where sum of ((u - neighbour) / h)^2 over the axes that count is 1; of each the smaller neighbour."""
     a, b = (a, b) if a < b else (b, a)
     b, c = (b, c) if b < c else (c, b)
     a, b = (a, b) if a < b else (b, a)
@@ -90,26 +91,25 @@ def way_table(
     direction is away from the nearest surface, and the way as long as the longest. ValueError, in one line, if the goal
     is not free or outside the grid.
     """
+    shown = tuple(map(float, goal))
     counts = [1 + math.ceil((b - a) / spacing - 1e-9) for a, b in zip(low, high, strict=True)]
     points = points_of(low, spacing, counts)
     gap = np.min([shape.gap(points) for shape in shapes], axis=0) if shapes else np.full(points.shape[:-1], np.inf)
     out = _directions_out(shapes, points)
     straight = np.linalg.norm(points - np.asarray(goal), axis=-1)
     if any(not a <= x <= b for a, x, b in zip(low, goal, high, strict=True)):
-        raise ValueError(f"goal = {tuple(goal)}: is outside the grid, {tuple(low)} to {tuple(high)} m")
+        raise ValueError(f"target = {shown}: is outside the grid, {tuple(low)} to {tuple(high)} m")
     free = gap >= clearance
     sight = np.maximum(NEAR * spacing, 1.0001 * spacing * math.sqrt(len(goal)))
     goal_gap = min((float(shape.gap(goal)) for shape in shapes), default=math.inf)
     if goal_gap < clearance:
-        raise ValueError(
-            f"goal = {tuple(goal)}: is {goal_gap:.3g} m from an obstacle, must be at least {clearance:g} m"
-        )
+        raise ValueError(f"target = {shown}: is {goal_gap:.3g} m from an obstacle, must be at least {clearance:g} m")
     # straight lines count where nothing can be between: nearer than the nearest obstacle
     known = np.where(straight <= min(sight, goal_gap - clearance + spacing * math.sqrt(len(goal))), straight, np.inf)
     u = distances_around(free, spacing, np.where(free, known, np.inf))
     reached = np.isfinite(u)
     if not reached.any():
-        raise ValueError(f"goal = {tuple(goal)}: no point of the grid beside it is free; use a smaller spacing")
+        raise ValueError(f"target = {shown}: no point of the grid beside it is free; use a smaller spacing")
     way = -_slopes(u, spacing)
     near = (straight <= 2 * spacing)[..., None]
     way = np.where(near, (np.asarray(goal) - points), way)

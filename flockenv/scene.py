@@ -634,14 +634,14 @@ class Scene(Record):
 
     @property
     def marks(self) -> tuple[Mark, ...]:
-        """The places that behaviours are about."""
-        still = np.zeros(self.dimension)
-        return tuple(
-            Mark("goal", np.array(getattr(wish, name)), still, 2 * max(group.radius for group in self.groups))
-            for wish in self.parts.effects
-            if wish.steering
-            for name in wish.places
-            if getattr(wish, name) is not None
+        """The ways and places that behaviours are about."""
+        still, size = np.zeros(self.dimension), 2 * max(group.radius for group in self.groups)
+        wishes = [effect for effect in self.parts.effects if effect.steering]
+        tracks = dict.fromkeys(effect.way_shown(self) for effect in wishes)
+        places = [getattr(wish, name) for wish in wishes if wish.heads_for for name in wish.places]
+        return (
+            *(Mark("way", np.array(at), still, radius) for track, radius in filter(None, tracks) for at in track),
+            *(Mark("goal", np.array(place), still, size) for place in places if place is not None),
         )
 
     def with_effects(self, *effects: Effect) -> Scene:

@@ -371,7 +371,7 @@ EFFECTS = (
     ),
     EffectRow(Interpose(weight=2, speed=1.5, group=0, other=0, radius=2.5, slow_radius=1), family="others"),
     EffectRow(Hide(weight=2, speed=1.5, group=0, radius=2.5, slow_radius=1)),
-    EffectRow(Whiskers(weight=5, horizon=3), obeys=UPRIGHT, family="around"),  # in space they are horizontal and vertical
+    EffectRow(Whiskers(weight=5, horizon=3), obeys=UPRIGHT, family="around"),  # some are horizontal
     EffectRow(ForceField(weight=0.5, range=2), family="around"),
     EffectRow(FollowWall(weight=2, speed=1.5, distance=0.7, range=4), family="around"),
     EffectRow(  # its circle stays where it is

@@ -180,7 +180,9 @@ def test_a_gap_in_a_queue_is_how_far_one_can_go() -> None:
     way = (1.0, 0.0)
     gaps = queue_gap(way, [(5, 0), (5, 0.6), (5, 1.01), (-5, 0), (5, 0)], (0.5, 0.0), 1.0, [1.2, 1.2, 1.2, 1.2, 0.4])
     np.testing.assert_allclose(gaps, [4, 5 - 0.8, np.inf, np.inf, np.inf])  # beside; behind; not slower than I
-    np.testing.assert_allclose(queue(way, (0.2, 0.1), [0.5, np.inf, 0.0], 1.2, 1.0), [[0.3, -0.1], [1.0, -0.1], [-0.2, -0.1]])
+    np.testing.assert_allclose(
+        queue(way, (0.2, 0.1), [0.5, np.inf, 0.0], 1.2, 1.0), [[0.3, -0.1], [1.0, -0.1], [-0.2, -0.1]]
+    )
 
 
 def file_of(count: int, slow: float, **given: float) -> tuple[Scene, State]:
@@ -276,7 +278,9 @@ def test_without_food_in_sight_it_wanders_and_the_walk_does_not_depend_on_the_st
         start = placed(scene, [(20, 20), (30, 20), *FOOD], vel)
         pos, _ = played(scene, start, round(6 / dt))
         ends.append(pos[-1, :2])
-    assert np.linalg.norm(ends[1] - ends[2], axis=1).max() < 0.6 * np.linalg.norm(ends[0] - ends[1], axis=1).max() + 0.02
+    assert (
+        np.linalg.norm(ends[1] - ends[2], axis=1).max() < 0.6 * np.linalg.norm(ends[0] - ends[1], axis=1).max() + 0.02
+    )
     assert np.linalg.norm(ends[0] - ends[2], axis=1).max() < 0.4
     straight = np.array([(20 + 6 * 1.2, 20), (30, 20 + 6 * 1.2)])
     assert (np.linalg.norm(ends[2] - straight, axis=1) > 0.3).all()  # it turns, and each in its own way

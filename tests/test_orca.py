@@ -307,6 +307,11 @@ def test_it_looks_at_the_nearest_obstacles_in_whatever_order_they_are_listed() -
     assert ends[0][1] != 0
 
 
+def test_other_obstacles_are_refused() -> None:
+    with pytest.raises(ValueError, match=r"obstacles\[0\].kind = 'segment', must be 'circle'"):
+        walkers(obstacles=({"kind": "segment", "start": (0.0, 0.0), "end": (1.0, 0.0)},))
+
+
 def test_it_is_refused_in_space() -> None:
     with pytest.raises(ValueError, match=r"dimension = 3, must be 2"):
         Scene(

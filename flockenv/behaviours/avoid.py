@@ -14,7 +14,7 @@ from pydantic import Field
 from flockenv import steering
 from flockenv.effects.base import Effect, Me, Obstacle
 from flockenv.kernels import Vec, law, like
-from flockenv.vec import add, cross, dot, lateral, norm, perpendicular, scale, select, zero
+from flockenv.vec import add, cross, dot, lateral, norm, perpendicular, scale, select, unit, zero
 
 __all__ = ["AvoidObstacles", "ForceField", "Whiskers"]
 
@@ -134,20 +134,20 @@ def deepest_whisker(p: Any, me: Me, other: Obstacle, acc: Vec) -> Vec:
 
 @law
 def along_normal(p: Any, me: Me, acc: Vec) -> Vec:
-    """F = w (share inside) n; head-on also to the right, or it would only brake."""
+    """F = w (share inside) (n + unit(lateral n)): n alone would mostly brake; head-on the side is the right."""
     normal: Vec
     if len(acc) == 3:
         normal = (acc[1], acc[2])
     else:
         normal = (acc[1], acc[2], acc[3])
     aside = lateral(normal, me.heading)
-    headon = (dot(aside, aside) < like(me.who, 1e-6)) & (acc[0] > like(me.who, 0.0))
-    wish = add(normal, select(headon, perpendicular(me.heading), zero(normal)))
-    return scale(wish, p.weight * acc[0])
+    headon = dot(aside, aside) < like(me.who, 1e-6)
+    side = select(headon, perpendicular(me.heading), unit(aside))
+    return scale(add(normal, side), p.weight * acc[0])
 
 
 class Whiskers(Effect):
-    """Feel ahead and to the sides; push along the normal of what a whisker reaches into, by how deep it does.
+    """Feel ahead and to the sides; turn away from, and brake before, what a whisker reaches into, by how deep it does.
 
     Three whiskers in the plane, five in space, `horizon` times the speed long. Buckland 2005, "wall avoidance": there a
     whisker has the length of a line and the body no size; here it is what the body would touch.

@@ -123,12 +123,15 @@ effects:
         return {"target": self.target, **{name: float(getattr(self, name)) for name in names}}
 
     def check(self, scene: Any) -> None:
-        """Refuse space."""
+        """Refuse space, and obstacles that are not round."""
         if scene.dimension != 2:
             raise ValueError(f"kind = orca: dimension = {scene.dimension}, must be 2")
         for k, obstacle in enumerate(scene.obstacles):
             if obstacle.kind != "circle":
                 raise ValueError(f"kind = orca: sees round obstacles alone, obstacles[{k}].kind = {obstacle.kind}")
+        for k, obstacle in enumerate(scene.obstacles):
+            if obstacle.kind != "circle":
+                raise ValueError(f"kind = orca: obstacles[{k}].kind = {obstacle.kind!r}, must be 'circle'")
         super().check(scene)
 
     def sums(self, dimension: int) -> int:

@@ -64,8 +64,8 @@ def along_wall(p: Any, me: Me, acc: Vec) -> Vec:
 class FollowWall(Moving):
     """Keep `distance` to the nearest surface and go on along it: seek the point off the wall beside the place ahead.
 
-    On whichever side it comes by; at rest it sets out with the wall on its left. Around a corner it turns as sharply as
-    its force allows: `time` of about 2 m / w cuts no corner.
+    On whichever side it comes by; at rest it sets out with the wall on its right. Around a corner it turns as sharply
+    as its force allows: `time` of about 2 m / w cuts no corner.
     """
 
     kind: Literal["follow_wall"] = "follow_wall"

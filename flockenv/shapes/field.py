@@ -1,6 +1,7 @@
 """Any shape as distances on a grid (a signed distance field): between its points they are interpolated.
 
-A field is a grid (see flockenv/grid.py) relative to the anchor, whose points have 1 + D numbers: the distance to the surface (m, negative inside) and its direction, outward.
+A field is a grid (see flockenv/grid.py) relative to the anchor, whose points have 1 + D numbers: the distance to the
+surface (m, negative inside) and its direction, outward.
 """
 
 from __future__ import annotations

@@ -1,0 +1,229 @@
+"""Obstacles of every shape: how far, which way is out, where a ray hits, against independent answers."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from flockenv.config import dump_scene, load_scene
+from flockenv.scene import Group, Scene
+from flockenv.shapes import Block, Capsule, Circle, DistanceField, HalfSpace, Polygon, Shape, Wall, clear_of
+from flockenv.space import Torus
+from flockenv.spawn import Spawn
+
+L = Polygon(vertices=((0, 0), (3, 0), (3, 1), (1, 1), (1, 3), (0, 3)))
+SHAPES: dict[str, Shape] = {
+    "circle": Circle(centre=(1, 0.5), radius=1.2),
+    "sphere": Circle(centre=(1, 0.5, -0.3), radius=1.2),
+    "capsule": Capsule(start=(-1, 0), end=(1.5, 1), radius=0.4),
+    "capsule_3": Capsule(start=(-1, 0, 0.5), end=(1.5, 1, -0.5), radius=0.4),
+    "segment": Capsule(start=(-1, 0), end=(1.5, 1)),
+    "wall": Wall(vertices=((-2, 0), (0, 1), (1, -1), (2, 1)), radius=0.1),
+    "convex": Polygon(vertices=((-1, -1), (2, -0.5), (1, 1.5))),
+    "clockwise": Polygon(vertices=((1, 1.5), (2, -0.5), (-1, -1))),
+    "concave": L,
+    "block": Block(centre=(0.5, 0.2), size=(2, 1)),
+    "turned_block": Block(centre=(0.5, 0.2), size=(2, 1), turn=33),
+    "box": Block(centre=(0.5, 0.2, 0.1), size=(2, 1, 1.5)),
+    "turned_box": Block(centre=(0.5, 0.2, 0.1), size=(2, 1, 1.5), turn=50, axis=(1, 2, -0.5)),
+    "line": HalfSpace(point=(0.3, 0.1), direction=(1, 2)),
+    "plane": HalfSpace(point=(0.3, 0.1, 0), direction=(1, 2, -1)),
+}
+every = pytest.mark.parametrize("name", SHAPES)
+
+
+def places(shape: Shape, count: int = 300, seed: int = 1) -> Any:
+    return np.random.default_rng(seed).uniform(-4, 4, (count, shape.dimension))
+
+
+def directions(shape: Shape, count: int = 300) -> Any:
+    ways = np.random.default_rng(2).normal(size=(count, shape.dimension))
+    return ways / np.linalg.norm(ways, axis=1, keepdims=True)
+
+
+@every
+def test_the_normal_is_the_slope_of_the_distance(name: str) -> None:
+    shape, h = SHAPES[name], 1e-6
+    x = places(shape)
+    steps = h * np.eye(shape.dimension)
+    slope = np.stack([(shape.gap(x + s) - shape.gap(x - s)) / (2 * h) for s in steps], axis=1)
+    smooth = np.abs(np.linalg.norm(slope, axis=1) - 1) < 1e-6  # not where two places of the surface are equally near
+    assert smooth.mean() > 0.9
+    np.testing.assert_allclose(shape.normal(x)[smooth], slope[smooth], atol=1e-5)
+
+
+@every
+def test_the_nearest_place_lies_on_the_surface_and_no_place_of_it_is_nearer(name: str) -> None:
+    shape = SHAPES[name]
+    x = places(shape)
+    nearest = shape.nearest(x)
+    np.testing.assert_allclose(shape.gap(nearest), 0, atol=1e-9)
+    np.testing.assert_allclose(np.linalg.norm(nearest - x, axis=1), np.abs(shape.gap(x)), rtol=1e-9)
+    # whatever lies within the distance of a place is on its side of the surface
+    inner = x + 0.999 * np.abs(shape.gap(x))[:, None] * directions(shape)
+    assert (np.sign(shape.gap(inner)) == np.sign(shape.gap(x))).all()
+
+
+@every
+@pytest.mark.parametrize("clearance", [0.0, 0.35])
+def test_a_ray_hits_where_the_body_touches_first(name: str, clearance: float) -> None:
+    """Oracle: a fine walk along the ray, which stops where the distance is the clearance for the first time."""
+    shape = SHAPES[name]
+    x = places(shape, 200)
+    way = np.array(shape.anchor) + places(shape, 200, 3) / 3 - x  # somewhere towards it
+    way /= np.linalg.norm(way, axis=1, keepdims=True)
+    found = shape.hit(x, way, clearance)
+    room = lambda t: shape.gap(x + t[:, None] * way) - clearance  # noqa: E731
+    np.testing.assert_array_equal(found == 0, room(np.zeros(200)) < 0)
+    hits = np.isfinite(found) & (found > 0)
+    assert 10 < hits.sum() < 190
+    np.testing.assert_allclose(room(np.where(hits, found, 0))[hits], 0, atol=1e-9)
+    for share in np.linspace(0.01, 0.999, 120):
+        assert (room(share * np.where(hits, found, 0))[hits] > -1e-9).all(), "it was touched before"
+    missed = np.isinf(found)
+    for t in np.linspace(0, 20, 300):
+        assert (room(np.full(200, t))[missed] > -1e-9).all(), "it is touched, and missed"
+
+
+@pytest.mark.parametrize("name", ["concave", "convex", "clockwise"])
+def test_inside_of_a_polygon_is_where_the_winding_number_says(name: str) -> None:
+    shape: Any = SHAPES[name]
+    x = places(shape, 500)
+    corners = np.array(shape.vertices)[None] - x[:, None]
+    angles = np.arctan2(corners[..., 1], corners[..., 0])
+    turns = np.diff(np.concatenate([angles, angles[:, :1]], axis=1), axis=1)
+    winding = ((turns + np.pi) % (2 * np.pi) - np.pi).sum(axis=1) / (2 * np.pi)
+    np.testing.assert_array_equal(shape.inside(x), np.abs(winding) > 0.5)
+
+
+def test_a_polygon_does_not_care_in_which_sense_it_is_given() -> None:
+    x, way = places(L), directions(L)
+    a, b = SHAPES["convex"], SHAPES["clockwise"]
+    np.testing.assert_allclose(a.gap(x), b.gap(x), atol=1e-12)
+    np.testing.assert_allclose(a.hit(x, way, 0.2), b.hit(x, way, 0.2), atol=1e-12)
+    on_edge = np.array([0.5, -0.75])
+    np.testing.assert_allclose(a.normal(on_edge), b.normal(on_edge), atol=1e-9)
+
+
+@pytest.mark.parametrize("clearance", [0.0, 0.3])
+@pytest.mark.parametrize("name", ["circle", "capsule", "segment", "wall", "convex", "concave", "block", "turned_block"])
+def test_lines_to_the_ends_of_the_silhouette_just_touch(name: str, clearance: float) -> None:
+    shape = SHAPES[name]
+    point = np.array([-5.0, 3.0])
+    for end, side in zip(shape.silhouette(point, clearance), (1, -1), strict=True):
+        way = (end - point) / np.linalg.norm(end - point)
+        assert shape.hit(point, way, clearance + 1e-6) < np.inf
+        for turn in (1e-4, 0.1, 1.0):
+            c, s = np.cos(side * turn), np.sin(side * turn)
+            outward = np.array([way[0] * c - way[1] * s, way[0] * s + way[1] * c])
+            assert shape.hit(point, outward, clearance) == np.inf
+        assert abs(float(shape.gap(end)) - clearance) < 1e-9
+
+
+@pytest.mark.parametrize("name", ["concave", "turned_box"])
+def test_a_distance_field_is_the_shape_to_the_spacing(name: str) -> None:
+    shape = SHAPES[name]
+    d, spacing = shape.dimension, 0.05 if name == "concave" else 0.1
+    field = DistanceField(low=(-3,) * d, high=(5,) * d, spacing=spacing, shapes=(shape,))
+    x, way = np.random.default_rng(1).uniform(-2.5, 4, (300, d)), directions(shape)
+    assert np.abs(field.gap(x) - shape.gap(x)).max() < spacing
+    far = np.abs(shape.gap(x)) > 3 * spacing
+    assert np.median((field.normal(x) * shape.normal(x)).sum(axis=1)[far]) > 0.999
+    found, exact = field.hit(x, way, 0.3), shape.hit(x, way, 0.3)
+    both = np.isfinite(found) & np.isfinite(exact)
+    assert (np.isfinite(found) == np.isfinite(exact)).mean() > 0.98  # but for grazing rays
+    assert np.quantile(np.abs(found[both] - exact[both]), 0.95) < 1.5 * spacing
+    again = DistanceField(low=field.low, spacing=spacing, values=tuple(field.distances.tolist()))
+    np.testing.assert_array_equal(again.gap(x), field.gap(x))
+    outside = np.full(d, 40.0)
+    assert 0.9 * float(shape.gap(outside)) < float(field.gap(outside)) < 1.2 * float(shape.gap(outside))
+
+
+@every
+def test_it_is_finite_everywhere_and_without_a_direction(name: str) -> None:
+    shape = SHAPES[name]
+    special = [np.array(shape.anchor), *shape.extremes, np.zeros(shape.dimension), np.full(shape.dimension, 1e9)]
+    x = np.array(special)
+    assert np.isfinite(shape.gap(x)).all()
+    np.testing.assert_allclose(np.linalg.norm(shape.normal(x), axis=1), 1, rtol=1e-9)
+    for way in (np.zeros_like(x), np.eye(shape.dimension)[np.zeros(len(x), int)]):
+        assert not np.isnan(shape.hit(x, way, 0.1)).any()
+
+
+# --- as obstacles of a scene ------------------------------------------------------------------------------------------
+
+GROUP = Group(count=200, radius=0.2, spawn=Spawn(low=(-3, -3), high=(4, 4)))
+
+
+def test_a_plain_centre_and_radius_goes_on_meaning_a_circle() -> None:
+    scene = load_scene(
+        "groups: [{count: 1, spawn: {low: [0, 0], high: [1, 1]}}]\nobstacles: [{centre: [3, 3], radius: 1}]"
+    )
+    assert scene.obstacles == (Circle(centre=(3, 3), radius=1),)
+    assert scene.start(0).obstacle_radius.shape == (1, 1)
+
+
+def test_every_shape_comes_back_from_its_file() -> None:
+    flat = tuple(shape for shape in SHAPES.values() if shape.dimension == 2)
+    field = DistanceField(low=(0, 0), high=(1, 1), spacing=0.5, shapes=(Circle(centre=(0.5, 0.5), radius=0.2),))
+    for obstacles in (flat, (*flat, field)):
+        scene = Scene(groups=(GROUP,), obstacles=obstacles)
+        assert load_scene(dump_scene(scene)) == scene
+
+
+def test_nobody_begins_in_an_obstacle() -> None:
+    obstacles = (L, SHAPES["wall"], Circle(centre=(-2, -2), radius=0.8), Block(centre=(3, 3), size=(1, 1), turn=45))
+    scene = Scene(groups=(GROUP,), obstacles=obstacles)
+    pos = scene.start(4, worlds=2).pos
+    for shape in obstacles:
+        assert (shape.gap(pos) >= 0.2 - 1e-9).all()
+    # who was clear anyhow begins where he did without them
+    free = Scene(groups=(GROUP,), obstacles=obstacles[2:3]).start(4, worlds=2).pos
+    clear = np.min([shape.gap(free) for shape in obstacles], axis=0) >= 0.2
+    assert clear.sum() > 100
+    np.testing.assert_array_equal(pos[clear], free[clear])
+
+
+def test_on_a_torus_the_nearest_image_counts() -> None:
+    x, period = np.array([[0.1, 5.0], [9.9, 5.0]]), np.array([10.0, 10.0])
+    block = Block(centre=(0, 5), size=(1, 1))
+    np.testing.assert_allclose(clear_of([block], x, period), [-0.4, -0.4], atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("make", "text"),
+    [
+        (lambda: Polygon(vertices=((0, 0), (1, 1), (1, 0), (0, 1))), "edges from vertices 0 and 2 cross"),
+        (lambda: Polygon(vertices=((0, 0), (1, 0), (2, 0))), "cross or touch|enclose no area"),
+        (lambda: Polygon(vertices=((0, 0), (1, 0), (1, 0), (0, 1))), "edges from vertices . and 2"),
+        (lambda: Polygon(vertices=((0, 0, 0), (1, 0, 0), (0, 1, 0))), "vertices"),
+        (lambda: Wall(vertices=((0, 0), (1, 0, 0))), r"vertices\[1\] = .*the first has 2"),
+        (lambda: Block(centre=(0, 0), size=(1, 1, 1)), "centre has 2 numbers"),
+        (lambda: Block(centre=(0, 0), size=(1, 0)), "size"),
+        (lambda: HalfSpace(point=(0, 0), direction=(0, 0)), "not all 0"),
+        (lambda: DistanceField(low=(0, 0), spacing=1), "give either shapes or values"),
+        (lambda: DistanceField(low=(0, 0), spacing=1e-4, high=(9, 9), shapes=(L,)), "points, at most"),
+        (lambda: Scene(groups=(GROUP,), obstacles=(SHAPES["box"],)), "lies in 3 dimensions, but dimension = 2"),
+        (lambda: Scene(groups=(GROUP,), obstacles=(Circle(centre=(0, 0, 0), radius=1),)), r"obstacles\[0\].centre"),
+        (lambda: Scene(space=Torus(size=(9, 9)), groups=(GROUP,), obstacles=(SHAPES["line"],)), "no two sides"),
+        (
+            lambda: Scene(space=Torus(size=(5, 5)), groups=(GROUP,), obstacles=(Wall(vertices=((0, 0), (4, 0))),)),
+            "at most half of the torus",
+        ),
+        (lambda: SHAPES["line"].silhouette((1, 2)), "has no corners"),
+        (lambda: L.silhouette((0.5, 0.5)), "is not outside"),
+    ],
+)  # fmt: skip
+def test_what_is_no_shape_is_refused_in_one_line(make: Any, text: str) -> None:
+    with pytest.raises(ValueError, match=text) as caught:
+        make()
+    assert "\n" not in str(caught.value)
+
+
+def test_an_unknown_kind_is_answered_with_those_there_are() -> None:
+    with pytest.raises(ValueError, match=r"polygn.*did you mean `polygon`"):
+        load_scene(
+            "groups: [{count: 1, spawn: {low: [0, 0], high: [1, 1]}}]\nobstacles: [{kind: polygn, vertices: []}]"
+        )
