@@ -215,7 +215,7 @@ class Priority(Arbitration):
 def dithered(p: Any, me: Any, wishes: Wishes) -> tuple[Vec, Shares]:
     """One of them, by lot."""
     shares, open_ = no_shares(wishes), True
-    frame, who = _turn(me.time, p.period), np.int64(me.who)
+    frame, who = _turn(me.time, p.period), int(me.who)
     for k in range(len(wishes)):
         length = norm(wishes[k])
         drawn = uniform(me.key, frame, who, 50_000 + k) < p.probability[k]

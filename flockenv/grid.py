@@ -56,7 +56,7 @@ def _along(table: Table, x: float, d: int, k: int) -> tuple[Any, float]:
     cell = np.int64(at)
     most = np.int64(last) - 1
     cell = cell if cell < most else most
-    return cell, at - like(x, cell)  # type: ignore[arg-type]  # a whole number that it makes a float of
+    return cell, at - like(x, cell)  # type: ignore[arg-type,operator]  # a whole number that it makes a float of
 
 
 @law

@@ -57,8 +57,8 @@ def smooth(key: np.uint64, time: float, agent: int, channel: int) -> float:
     """
     begin = math.floor(time)
     s = time - begin
-    first = 2.0 * uniform(key, np.int64(begin), agent, channel) - 1.0
-    second = 2.0 * uniform(key, np.int64(begin) + 1, agent, channel) - 1.0
+    first = 2.0 * uniform(key, begin, agent, channel) - 1.0
+    second = 2.0 * uniform(key, begin + 1, agent, channel) - 1.0
     return first + (second - first) * s * s * s * (10.0 + s * (6.0 * s - 15.0))
 
 
