@@ -203,7 +203,7 @@ class Effect(Record):
     tabled: ClassVar[bool] = False
     """Do its laws look numbers up in its `table`?"""
     places: ClassVar[tuple[str, ...]] = ()
-    """Names of the parameters that are points: on a torus laws, but of bonds and obstacles, see their nearest images."""
+    """Names of the parameters that are points: on a torus all but bonds and obstacles see the nearest images."""
     heads_for: ClassVar[bool] = True
     """Are its places what a behaviour heads for? Pictures show them."""
     strengths: ClassVar[tuple[str, ...]] = ("weight",)
