@@ -250,7 +250,7 @@ def test_curves_are_of_one_config_a_task_and_a_picture_is_a_png(tmp_path: Path) 
 def test_the_stored_curves_are_of_the_settings_in_the_configs() -> None:
     """Threads aside, which change how long it took. If this fails: docs/players.md says how they are made."""
     stored = json.loads((ROOT / "docs" / "learning.json").read_text(encoding="utf-8"))
-    assert stored.keys() == TASKS.keys()
+    assert stored.keys() == {name for name in TASKS if load_experiment(CONFIGS / f"{name}.yaml").curves}
     for name, numbers in stored.items():
         experiment = load_experiment(CONFIGS / f"{name}.yaml")
         assert numbers["rules"] == experiment.reynolds.found["tuning_mean"]
