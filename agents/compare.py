@@ -123,7 +123,7 @@ def compare(
             plays[task.name][player.name] = load_player(player.spec, task, known, trust_pickle)
     alone = next((name for name, playing in plays.items() if not playing), None)
     if alone is not None:
-        raise ValueError(f"task {alone!r}: nobody plays; {', '.join(OTHERS)} know other tasks")
+        raise ValueError(f"task {alone!r}: nobody plays it; in other tasks alone: {', '.join(OTHERS)}")
     episodes = {task.name: _play(task, plays[task.name], worlds, first, advance) for task in tasks}
     results: report.Results = {
         "seed": seed,

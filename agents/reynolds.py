@@ -217,7 +217,7 @@ class EvadeRules:
     horizon: float = 1.0  # s, how far ahead cover counts that is in the way
     avoid: float = 5.0  # kg/s, strength of steering around it
     wall: float = 0.5  # s, how far ahead walls count
-    alarm: float = 6.0  # m, within which a pursuer is evaded
+    alarm: float = 10.0  # m, within which a pursuer is evaded: as far as it sees
     predict: float = 0.5  # s, how far ahead a pursuer is predicted at most
     evade: float = 5.0  # kg/s, strength of an evasion
     crowd: float = 1.0  # how much farther pursuers count beside the nearest; 0: he alone
@@ -283,7 +283,7 @@ class HerdRules:
     gain: float = 5.0  # kg/s, a change of velocity is asked for within 1/gain seconds
     around: float = 0.0  # kg/s: keep outside a circle about the flock on the way to the place behind it
     width: float = 1.0  # of that circle, times the distance of the farthest sheep from the centre
-    apart: float = 0.0  # N, away from other dogs, in proportion to nearness within 10 m
+    apart: float = 4.0  # N, away from other dogs, in proportion to nearness within 10 m
 
 
 def herd(see: Any, task: Herd, p: HerdRules) -> np.ndarray:

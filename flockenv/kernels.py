@@ -109,7 +109,7 @@ def replaced(numbers: tuple[float, ...], k: int, x: float) -> tuple[float, ...]:
 
 @overload(replaced, jit_options=OPTIONS)
 def _replaced(numbers, k, x):  # type: ignore[no-untyped-def]
-    return lambda numbers, k, x: tuple_setitem(numbers, k, x)
+    return lambda numbers, k, x: tuple_setitem(numbers, k, x)  # type: ignore[call-arg]
 
 
 @law
@@ -193,15 +193,17 @@ def _stacked(typing_context: Any, numbers: Any) -> Any:
     if not isinstance(numbers, types.UniTuple):
         raise numba.TypingError(f"stacked: {numbers}, must be a tuple of numbers of one kind")
     array = types.Array(numbers.dtype, 1, "C")
+    on_stack: Any = cgutils.alloca_once_value
+    fill: Any = arrayobj.populate_array
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         make: Any = arrayobj.make_array
         number = context.get_data_type(numbers.dtype)
-        place = cgutils.alloca_once_value(builder, arguments[0])
+        place = on_stack(builder, arguments[0])
         made = make(array)(context, builder)
         size, count = (context.get_constant(types.intp, n) for n in (context.get_abi_sizeof(number), numbers.count))
         data = builder.bitcast(place, number.as_pointer())
-        arrayobj.populate_array(made, data=data, shape=[count], strides=[size], itemsize=size, meminfo=None)
+        fill(made, data=data, shape=[count], strides=[size], itemsize=size, meminfo=None)
         return made._getvalue()
 
     return array(numbers), generate

@@ -133,7 +133,7 @@ def gained(table: Table, begin: float, end: float) -> float:
     """Return how far it is along the path from one length to another, m: the shorter way round if it is closed."""
     s, length = end - begin, table[1]
     round_ = length * np.floor(s / length + like(s, 0.5))
-    return s - round_ if table[0] > like(s, 0.0) else s  # type: ignore[no-any-return]
+    return s - round_ if table[0] > like(s, 0.0) else s
 
 
 @law

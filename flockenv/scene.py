@@ -630,20 +630,30 @@ class Scene(Record):
         pos = state.pos[world]
         margin = 1.0 + 0.05 * float(np.ptp(pos, axis=0).max())
         low, high = pos.min(axis=0) - margin, pos.max(axis=0) + margin
-        around = [np.asarray(shape.extremes) for shape in self.shapes]
-        every = np.concatenate([low[None], high[None], *around])
+        every = np.concatenate([low[None], high[None], *self.extremes])
         return tuple(every.min(axis=0)), tuple(every.max(axis=0))
 
     @property
+    def extremes(self) -> list[Floats]:
+        """Places that a picture must show whoever is there: of shapes, of the ways that behaviours are about."""
+        tracks = [np.asarray(track) + side for track, radius in self._tracks for side in (-radius, radius)]
+        return [*(np.asarray(shape.extremes) for shape in self.shapes), *tracks]
+
+    @functools.cached_property
+    def _tracks(self) -> tuple[tuple[tuple[tuple[float, ...], ...], float], ...]:
+        """The ways that behaviours are about, each once."""
+        ways = dict.fromkeys(effect.way_shown(self) for effect in self.parts.effects if effect.steering)
+        return tuple(way for way in ways if way is not None)
+
+    @property
     def marks(self) -> tuple[Mark, ...]:
-        """The places that behaviours are about."""
-        still = np.zeros(self.dimension)
-        return tuple(
-            Mark("goal", np.array(getattr(wish, name)), still, 2 * max(group.radius for group in self.groups))
-            for wish in self.parts.effects
-            if wish.steering
-            for name in wish.places
-            if getattr(wish, name) is not None
+        """The ways and places that behaviours are about."""
+        still, size = np.zeros(self.dimension), 2 * max(group.radius for group in self.groups)
+        wishes = [effect for effect in self.parts.effects if effect.steering]
+        places = [getattr(wish, name) for wish in wishes if wish.heads_for for name in wish.places]
+        return (
+            *(Mark("way", np.array(at), still, radius) for track, radius in self._tracks for at in track),
+            *(Mark("goal", np.array(place), still, size) for place in places if place is not None),
         )
 
     def with_effects(self, *effects: Effect) -> Scene:

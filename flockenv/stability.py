@@ -59,7 +59,7 @@ class UnstableStepWarning(UserWarning):
 
 
 class LookaheadWarning(UserWarning):
-    """Somebody notices obstacles too late to stop before them."""
+    """Somebody notices obstacles, or where to slow down, too late to stop there."""
 
 
 class Suggestion(NamedTuple):

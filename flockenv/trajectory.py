@@ -203,7 +203,7 @@ def _region(scene: Scene, pos: Floats) -> tuple[NDArray[np.float64], NDArray[np.
         return np.zeros(scene.dimension), np.array(scene.space.extent(scene.dimension))
     low, high = (np.asarray(end(pos, axis=(0, 1)), np.float64) for end in (np.min, np.max))
     margin = 1.0 + 0.05 * float((high - low).max())
-    every = np.concatenate([[low - margin], [high + margin], *(shape.extremes for shape in scene.shapes)])
+    every = np.concatenate([[low - margin], [high + margin], *scene.extremes])
     return every.min(axis=0), every.max(axis=0)
 
 

@@ -326,7 +326,7 @@ EFFECTS = (
     EffectRow(UnalignedAvoidance(weight=3, radius=4, horizon=2, margin=0.2), family="crowd"),
     EffectRow(Queue(weight=2, target=CENTRE, speed=1.2, margin=0.1), family="crowd"),
     # to each his own way to look for food
-    EffectRow(Forage(weight=2, food=1, speed=1.2, radius=2.4), obeys=frozenset({"translation"}), family="crowd"),
+    EffectRow(Forage(weight=2, food=0, speed=1.2, radius=2.4), obeys=frozenset({"translation"}), family="crowd"),
     EffectRow(
         Explore(weight=2, low=(-1, -1, -1), high=(7, 8, 7), speed=1.2, track=1.5),
         obeys=frozenset({"translation", "relabelling"}), signed=("low", "high"), family="goals",

@@ -25,6 +25,7 @@ from flockenv.arbitration import (
 from flockenv.behaviours import AvoidObstacles, Separation
 from flockenv.config import dump_scene, load_scene
 from flockenv.effects import Drag, Effect
+from flockenv.explanation import _shares
 from flockenv.grants import granted, reconcile
 from flockenv.noise import key_of
 from flockenv.rows import rows
@@ -258,6 +259,10 @@ def test_steer_leaves_other_groups_alone_and_grants_what_it_says() -> None:
     assert set(found.mean_share()) == {"avoid_obstacles", "separation"}
     where = found.asked[..., 1]
     assert found.mean_share()["separation"] == pytest.approx(float(found.share[..., 1][where].mean()))
+    shares = _shares(scene, state)  # what `flockenv explain` shows: means over a run
+    assert [(where, name) for where, name, _ in shares] == [("effects[0]", name) for name in found.names]
+    assert all(0 < mean <= 1 for _, _, mean in shares)
+    assert _shares(crowd(SEPARATION), state) == ()
     order = found.asked[..., 0] & found.asked[..., 1]
     assert (found.share[order][:, 0] >= found.share[order][:, 1]).all()
 

@@ -96,7 +96,7 @@ def test_who_converges_from_the_side_brakes_or_speeds_up() -> None:
 OFF = {"give_way": 0.0, "avoid": 0.0, "apart": 0.0}
 
 
-def crowd(groups: tuple[Group, ...], targets: Any, obstacles: Any = (), dt: float = 0.05, **given: float) -> Scene:
+def crowd(groups: tuple[Group, ...], targets: Any, obstacles: Any = (), yielding: int = 2, **given: float) -> Scene:
     """Two groups with a target each: one kernel for all tests of giving way and of queues."""
     p = OFF | {"queue": 4.0, "speed": 1.2, "headway": 1.0, "margin": 0.1} | given
     asked = [
@@ -104,16 +104,17 @@ def crowd(groups: tuple[Group, ...], targets: Any, obstacles: Any = (), dt: floa
             group=k, arbitration=Allocation(),
             behaviours=(
                 AvoidObstacles(weight=p["avoid"], horizon=1.2, margin=0.1),
-                UnalignedAvoidance(weight=p["give_way"], radius=20, horizon=4, margin=p["margin"]),
+                UnalignedAvoidance(weight=p["give_way"] * (k < yielding), radius=20, horizon=4, margin=p["margin"]),
                 Separation(weight=p["apart"], radius=0.9),
                 Queue(
-                    weight=p["queue"], target=target, speed=p["speed"], headway=p["headway"], margin=p["margin"], group=k,
+                    weight=p["queue"], target=target, speed=p["speed"], headway=p["headway"], margin=p["margin"],
+                    group=k,
                 ),
             ),
         )
         for k, target in enumerate(targets)
     ]  # fmt: skip
-    return Scene(dimension=2, space=Torus(size=(400, 400)), groups=groups, obstacles=obstacles, effects=asked, dt=dt)
+    return Scene(dimension=2, space=Torus(size=(400, 400)), groups=groups, obstacles=obstacles, effects=asked, dt=0.05)
 
 
 def bodies(count: int, radius: float = 0.3, **limits: float) -> Group:
@@ -167,6 +168,16 @@ def test_two_who_would_run_into_each_other_do_not(case: str, radii: tuple[float,
     assert gaps[1] > 0
 
 
+def test_the_small_one_alone_gives_way_to_a_large_one() -> None:
+    """It would miss the other's centre by 0.8 m: more than twice its own radius, less than the sum of both."""
+    for weight, clear in ((0.0, False), (4.0, True)):
+        groups = (bodies(1, radius=0.1), bodies(1, radius=0.9))
+        scene = crowd(groups, ((172.0, 100.0), (100.0, 100.8)), give_way=weight, yielding=1)
+        pos, _ = played(scene, placed(scene, [(94, 100), (100, 100.8)], [(1.2, 0), (0, 0)]), 200)
+        assert (least_gap(scene, pos) > 0) == clear
+        np.testing.assert_array_equal(pos[-1, 1], (100, 100.8))
+
+
 def test_who_passes_behind_slows_down_and_who_goes_first_does_not() -> None:
     pos, vel = (np.array(a, float) for a in MEETINGS["crossing"])
     scene = crowd((bodies(1), bodies(1)), ((172.0, 100.0), (100.0, 172.0)), give_way=4.0)
@@ -180,13 +191,14 @@ def test_a_gap_in_a_queue_is_how_far_one_can_go() -> None:
     way = (1.0, 0.0)
     gaps = queue_gap(way, [(5, 0), (5, 0.6), (5, 1.01), (-5, 0), (5, 0)], (0.5, 0.0), 1.0, [1.2, 1.2, 1.2, 1.2, 0.4])
     np.testing.assert_allclose(gaps, [4, 5 - 0.8, np.inf, np.inf, np.inf])  # beside; behind; not slower than I
-    np.testing.assert_allclose(queue(way, (0.2, 0.1), [0.5, np.inf, 0.0], 1.2, 1.0), [[0.3, -0.1], [1.0, -0.1], [-0.2, -0.1]])
+    np.testing.assert_allclose(
+        queue(way, (0.2, 0.1), [0.5, np.inf, 0.0], 1.2, 1.0), [[0.3, -0.1], [1.0, -0.1], [-0.2, -0.1]]
+    )
 
 
-def file_of(count: int, slow: float, **given: float) -> tuple[Scene, State]:
-    """A leader (group 1) at constant speed, and a queue behind him."""
-    scene = crowd((bodies(count), bodies(1, max_speed=max(slow, 1e-9))), ((160.0, 100.0), (160.0, 100.0)), **given)
-    # followers heed their own group alone; so the leader stands in both: he is the first of group 0 here
+def file_of(count: int, **given: float) -> tuple[Scene, State]:
+    """Some in a file, 0.6 m apart, at rest; group 1 is somebody far away."""
+    scene = crowd((bodies(count), bodies(1)), ((160.0, 100.0), (160.0, 100.0)), **given)
     x = 100 - 1.2 * np.arange(count)
     return scene, placed(scene, [*((a, 100.0) for a in x), (50.0, 50.0)], [(0.0, 0.0)] * (count + 1))
 
@@ -196,7 +208,7 @@ def test_a_queue_flows_at_its_headway_and_never_overlaps() -> None:
 
     In front nobody holds up the first; behind him gaps widen to speed x headway + margin, whoever began how near.
     """
-    scene, start = file_of(8, 0.0)
+    scene, start = file_of(8)
     pos, vel = played(scene, start, 600)
     gaps = pos[:, :7, 0] - pos[:, 1:8, 0] - 0.6
     assert gaps.min() >= 0.1
@@ -210,12 +222,11 @@ def test_a_queue_flows_at_its_headway_and_never_overlaps() -> None:
 
 def test_a_queue_stops_behind_who_stops_and_closes_up_exponentially() -> None:
     """Second order, gain 4 m / T: critically damped, so a gap closes to the margin and never beyond it."""
-    scene, start = file_of(4, 0.0, queue=4.0)
-    stone = np.array([110.0, 100.0])
-    start.pos[0, 0] = stone  # the first, who is as heavy as a wall: he stays where he is
-    heavy = scene.model_copy(update={"groups": (bodies(4), bodies(1, max_speed=1e-9))})
+    scene, start = file_of(4, queue=4.0)
+    stone = np.array([110.0, 100.0])  # where the first is held
+    start.pos[0, 0] = stone
     for _ in range(800):
-        start = heavy.step(start)
+        start = scene.step(start)
         start.pos[0, 0], start.vel[0, 0] = stone, 0.0
         gaps = start.pos[0, :3, 0] - start.pos[0, 1:4, 0] - 0.6
         assert gaps.min() >= 0.1 - 1e-9
@@ -276,7 +287,9 @@ def test_without_food_in_sight_it_wanders_and_the_walk_does_not_depend_on_the_st
         start = placed(scene, [(20, 20), (30, 20), *FOOD], vel)
         pos, _ = played(scene, start, round(6 / dt))
         ends.append(pos[-1, :2])
-    assert np.linalg.norm(ends[1] - ends[2], axis=1).max() < 0.6 * np.linalg.norm(ends[0] - ends[1], axis=1).max() + 0.02
+    assert (
+        np.linalg.norm(ends[1] - ends[2], axis=1).max() < 0.6 * np.linalg.norm(ends[0] - ends[1], axis=1).max() + 0.02
+    )
     assert np.linalg.norm(ends[0] - ends[2], axis=1).max() < 0.4
     straight = np.array([(20 + 6 * 1.2, 20), (30, 20 + 6 * 1.2)])
     assert (np.linalg.norm(ends[2] - straight, axis=1) > 0.3).all()  # it turns, and each in its own way

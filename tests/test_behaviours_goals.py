@@ -25,7 +25,6 @@ from flockenv.behaviours import (
     Interpose,
     MatchVelocity,
     OffsetPursue,
-    OvershootWarning,
     Pursue,
     Seek,
     Shadow,
@@ -36,6 +35,7 @@ from flockenv.effects import Effect
 from flockenv.rows import rows
 from flockenv.scene import Group, Scene
 from flockenv.spawn import Spawn
+from flockenv.stability import LookaheadWarning
 from flockenv.state import State
 from flockenv.steer import Steer
 from tests.catalogue import EFFECTS, Array, in_dimension, scene_of
@@ -141,7 +141,7 @@ def test_arrive_stops_within_a_centimetre_and_does_not_overshoot() -> None:
 def test_arrive_warns_of_a_ramp_on_which_nobody_can_stop_and_they_do_overshoot() -> None:
     """The error of several libraries: a look-ahead shorter than the stopping distance (formulas.md 1.4)."""
     arrive = Arrive(weight=50, target=(0, 0), slow_radius=0.2)
-    with pytest.warns(OvershootWarning, match=r"slow_radius = 0.2 m: overshoots.* = 1 m") as told:
+    with pytest.warns(LookaheadWarning, match=r"slow_radius = 0.2 m: overshoots.* = 1 m") as told:
         scene = trio(arrive, max_force=4.0)
     assert len(told) == 1
     pos, _ = course(scene, at(scene, ((6, 0), (0, 0))), 8)

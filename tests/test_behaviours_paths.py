@@ -11,7 +11,8 @@ from scipy.linalg import expm
 from scipy.optimize import brentq
 
 from flockenv import polyline
-from flockenv.behaviours import FollowFlow, FollowPath, Separation, StayOnPath
+from flockenv.behaviours import FollowFlow, FollowPath, StayOnPath
+from flockenv.behaviours.crowd import UnalignedAvoidance
 from flockenv.config import load_scene
 from flockenv.scene import Group, Scene
 from flockenv.space import Plane, Space, Torus
@@ -39,7 +40,8 @@ def traffic(*follow: FollowPath, apart: float = 0.0, counts: tuple[int, ...] = (
         for n in each
     )
     steer = tuple(
-        Steer(group=g, behaviours=(Separation(weight=apart, radius=1.0), path)) for g, path in enumerate(both)
+        Steer(group=g, behaviours=(UnalignedAvoidance(weight=apart, horizon=1.5, margin=0.2), path))
+        for g, path in enumerate(both)
     )
     return Scene(groups=groups, effects=steer, **({"dt": 0.02} | fields))
 
@@ -195,20 +197,25 @@ def test_on_a_circle_it_stays_in_the_tube_and_goes_round_and_round() -> None:
 
 
 def test_traffic_of_both_ways_passes() -> None:
-    """Eight against eight in a tube of two metres: nobody turns round, all come as far as three quarters of the way."""
+    """Eight against eight in a tube of two metres, in the way of each other: all come round, and nobody is touched."""
     path = FollowPath(weight=5, points=ring(), closed=True, radius=1.0, speed=2, time=0.5, keep=0.9)
-    scene = traffic(path, path.model_copy(update={"way": -1}), apart=3.0, counts=(8, 8))
+    scene = traffic(path, path.model_copy(update={"way": -1}), apart=10.0, counts=(8, 8))
     angle, away = 2 * np.pi * np.arange(16) / 16, RING_RADIUS + np.random.default_rng(0).uniform(-0.7, 0.7, 16)
     places = np.stack([away * np.cos(angle), away * np.sin(angle)], axis=1)
     order = np.concatenate([np.arange(0, 16, 2), np.arange(1, 16, 2)])
     state = begun(scene, places[order], np.zeros((16, 2)))
-    turned = []
+    turned, gap, out = [], np.inf, 0.0
     for _ in range(400):
         state = scene.step(state, steps=5)
-        turned.append(np.arctan2(state.pos[0, :, 1], state.pos[0, :, 0]))
+        x = state.pos[0]
+        turned.append(np.arctan2(x[:, 1], x[:, 0]))
+        out = max(out, np.abs(np.linalg.norm(x, axis=1) - RING_RADIUS).max())
+        gap = min(gap, np.linalg.norm(x[:, None] - x, axis=2)[~np.eye(16, dtype=bool)].min())
     way = np.unwrap(np.array(turned), axis=0)
     gone = (way[-1] - way[0]) * RING_RADIUS * np.repeat([1, -1], 8)
-    assert gone.min() > 0.75 * 2.0 * 40.0
+    assert gone.min() > 0.9 * 2.0 * 40.0 - 2.0  # they began at rest
+    assert gap > 0.4  # both radii
+    assert out < 1.2  # the tube, and what it takes to give way at its edge
 
 
 def test_an_open_path_s_end_is_arrived_at() -> None:
@@ -356,7 +363,11 @@ def test_what_is_no_field_is_refused_in_one_line(change: dict[str, Any], text: s
 
 
 @pytest.mark.parametrize("behaviour", [FollowPath, StayOnPath, FollowFlow])
-def test_its_demo_is_a_small_scene(behaviour: Any) -> None:
+def test_its_demo_is_a_small_scene_and_shows_its_way(behaviour: Any) -> None:
     scene = load_scene(behaviour.demo)
     assert 0 < scene.agents <= 20
     assert behaviour.demo_time == 8
+    marks = scene.snapshot(scene.start(0)).marks
+    assert {mark.kind for mark in marks} == (set() if behaviour is FollowFlow else {"way"})
+    if behaviour is FollowPath:  # once for both ways
+        assert len(marks) == math.ceil(polyline.pieces(scene.parts.effects[1].points, True)[1] / 0.3) + 1

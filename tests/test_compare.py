@@ -283,7 +283,7 @@ def test_weights_of_ones_own_play_under_the_name_of_their_file() -> None:
         (("--players", "still.py,sub/still.py"), "two players are called 'still'"),
         (("--players", "model.zip"), "executes the code stored in it"),
         (("--players", "broken.py"), "player 'broken.py': ZeroDivisionError while loading it"),
-        (("--players", "late.py"), "player 'late', task 'flock': KeyError: 'no'"),
+        (("--players", "late.py"), "player 'late', task 'crossing': KeyError: 'no'"),
         (("--worlds", "1"), "--worlds 1: must be from 2"),
         (("--worlds", "0"), "--worlds 0: must be from 2"),
         (("--worlds", "1000000000"), "--worlds 1000000000: must be from 2 to 1000000"),
@@ -412,3 +412,17 @@ assert result.exit_code == 0, result.output
 def test_comparing_needs_no_torch() -> None:
     arguments = ["--players", "random,textbook,reynolds", "--worlds", "2", "--smoke", "--out", str(Path.cwd() / "out")]
     subprocess.run([sys.executable, "-c", NO_TORCH, *arguments], check=True, cwd=ROOT)
+
+
+def test_a_hand_written_player_of_some_tasks_sits_out_the_others() -> None:
+    crossing, flock = TASKS["crossing"](), TASKS["flock"]()
+    assert comparison.usual_players([crossing]) == ["random", "textbook", "orca", "reynolds", "ppo"]
+    assert comparison.usual_players([flock]) == ["random", "textbook", "reynolds", "ppo"]
+    orca, chance = comparison.Player.of("orca"), comparison.Player.of("random")
+    assert comparison._sits_out(orca, flock, [crossing, flock])
+    assert not comparison._sits_out(orca, crossing, [crossing, flock])
+    assert not comparison._sits_out(chance, flock, [crossing, flock])
+    with pytest.raises(ValueError, match="no hand-written player 'orca' for 'flock'; there is one for: crossing"):
+        comparison.compare([flock], [orca], 2)
+    with pytest.raises(ValueError, match="task 'flock': nobody plays it; in other tasks alone: orca"):
+        comparison.compare([crossing, flock], [orca], 2)

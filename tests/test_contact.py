@@ -10,6 +10,7 @@ import pytest
 from flockenv.effects import ObstacleContact
 from flockenv.integrators import RK4
 from flockenv.scene import Group, Scene
+from flockenv.shapes import Block
 from flockenv.spawn import Spawn
 
 STIFFNESS, MASS, SPEED = 50.0, 2.0, 1.5
@@ -30,15 +31,12 @@ def scene(damping: float = 0.0, at: float = 3.4, speed: float = SPEED) -> Scene:
 
 def test_a_body_goes_in_as_far_as_its_energy_carries_it_and_comes_out_as_fast() -> None:
     elastic = scene()
-    (contact,) = elastic.effects
     deepest = elastic.run(elastic.start(0), round(1000 * (0.2 + math.pi / 2 / OMEGA)))
     assert deepest.pos[0, 0, 0] == pytest.approx(3.7 + SPEED / OMEGA, abs=1e-5)
-    stored = contact.potential(elastic.groups, deepest, elastic.space.displacement)
-    np.testing.assert_allclose(stored, 0.5 * MASS * SPEED**2, rtol=1e-4)
+    np.testing.assert_allclose(deepest.vel[0, 0], 0.0, atol=0.01)
     out = elastic.run(elastic.start(0), round(1000 * (0.4 + math.pi / OMEGA)))
     assert out.vel[0, 0, 0] == pytest.approx(-SPEED, rel=1e-3)
     assert out.pos[0, 0, 0] == pytest.approx(3.4, abs=2e-3)
-    np.testing.assert_array_equal(contact.potential(elastic.groups, out, elastic.space.displacement), 0.0)
 
 
 @pytest.mark.parametrize("damping", [2.0, 20.0, 100.0])
@@ -64,3 +62,10 @@ def test_nobody_is_pushed_who_does_not_touch() -> None:
     apart = scene(at=3.7 - 1e-9, speed=0.0)
     state = apart.run(apart.start(0), 100)
     np.testing.assert_array_equal(state.vel, 0.0)
+
+
+def test_other_shapes_are_as_solid() -> None:
+    """A block whose side is where the circle's nearest point was: head-on there is no difference."""
+    block = scene().model_copy(update={"obstacles": (Block(centre=(5.0, 0.0), size=(2.0, 6.0)),)})
+    steps = round(1000 * (0.2 + math.pi / 2 / OMEGA))
+    assert block.run(block.start(0), steps).pos[0, 0, 0] == pytest.approx(3.7 + SPEED / OMEGA, abs=1e-5)

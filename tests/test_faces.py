@@ -6,7 +6,7 @@ import pettingzoo
 import pytest
 
 from flockenv.sb3 import WorldVecEnv
-from flockenv.tasks import Evade, Flock, Herd, Obstacles, Pursuit
+from flockenv.tasks import Crossing, Evade, Flock, Herd, Obstacles, Pursuit
 from flockenv.world import World
 
 SEED, LIMIT, STEPS = 21, 15, 40
@@ -16,6 +16,7 @@ ALONE = {
     "Flock": (Flock(agents=8, learners=1), {"agents": 8}),
     "Evade": (Evade(), {}),
     "Herd": (Herd(), {}),
+    "Crossing": (Crossing(agents=8, learners=1), {"agents": 8}),
 }
 """Per id: a task with one learner, and the parameters with which make() gives just that task."""
 
@@ -135,7 +136,7 @@ def test_one_learner_through_every_face(name):
     assert through_sb3(task, actions) == expected
     if name in (alone := {
         "Pursuit": {"pursuers": 1, "evaders": 1, "sides": "pursuers"}, "Flock": {"agents": 8, "learners": 1},
-        "Herd": {"dogs": 1},
+        "Herd": {"dogs": 1}, "Crossing": {"agents": 8, "learners": 1},
     }):  # fmt: skip
         assert through_parallel(env_id, alone[name], actions) == expected
         assert through_turns(env_id, alone[name], actions) == expected

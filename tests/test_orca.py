@@ -184,11 +184,7 @@ def test_it_turns_with_the_world_and_does_not_mind_the_order() -> None:
 def test_it_is_finite_wherever_it_may_be_asked() -> None:
     """At rest, in one place, at equal velocities, exactly head-on, at a vertex of the cone, among equal neighbours."""
     sizes, ways = (0.0, 1e-12, 1.0, 1e6), [(1.0, 0.0), (-1.0, 0.0), (0.0, 1.0)]
-    cases = []
-    for distance in sizes:
-        for speed in sizes:
-            for way in ways:
-                cases.append((distance, 0.0, speed * way[0], speed * way[1], 0.3, 0.5))
+    cases = [(distance, 0.0, speed * x, speed * y, 0.3, 0.5) for distance in sizes for speed in sizes for x, y in ways]
     for own in sizes:
         asked = np.array([slots(case, case, (0, 0, 0, 0, 0.0, 1.0)) for case in cases])
         found = change(np.array([own, 0.0]), np.array([1.0, 0.0]), asked, turn=0.1)
@@ -305,6 +301,11 @@ def test_it_looks_at_the_nearest_obstacles_in_whatever_order_they_are_listed() -
         ends.append(scene.step(start).vel[0, 0])
     np.testing.assert_array_equal(*ends)
     assert ends[0][1] != 0
+
+
+def test_other_obstacles_are_refused() -> None:
+    with pytest.raises(ValueError, match=r"sees round obstacles alone, obstacles\[0\].kind = wall"):
+        walkers(obstacles=({"kind": "wall", "vertices": ((0.0, 0.0), (1.0, 0.0))},))
 
 
 def test_it_is_refused_in_space() -> None:

@@ -21,7 +21,9 @@ EASY = {
     "flockenv/Pursuit-v0": {"capture_distance": 6.0},
     "flockenv/Obstacles-v0": {"goal_radius": 20.5},
     "flockenv/Evade-v0": {"capture_distance": 6.0},
-    "flockenv/Herd-v0": {"pen_radius": 18.0},
+    "flockenv/Herd-v0": {"pen_radius": 20.5},
+    "flockenv/Crossing-v0": {"goal_radius": 11.8},
+    "flockenv/PathFollow-v0": {"lost_distance": 1.5, "max_force": 2.5},
     "flockenv/Flock-v0": {},  # nobody ever terminates there
 }
 """Parameters under which random actions sometimes end an episode, and the clock ends the others."""

@@ -21,9 +21,11 @@ from flockenv.stability import LookaheadWarning
 from flockenv.state import State
 from flockenv.steer import Steer
 from flockenv.sweep import scene_source
+from flockenv.tasks import Obstacles
 from flockenv.trajectory import record
 from flockenv.vehicle import GRAVITY
 from flockenv.workspace import Workspace
+from flockenv.world import World
 from tests.catalogue import Array
 
 DIMENSIONS = pytest.mark.parametrize("dimension", [2, pytest.param(3, marks=pytest.mark.slow)])
@@ -393,3 +395,39 @@ def test_a_lookahead_shorter_than_the_stopping_distance_is_warned_of() -> None:
         other = Group(count=1, spawn=Spawn(low=(0, 0), high=(1, 1)), max_speed=2.0, max_force=40.0)
         slow = vehicles(2, (Drag(rate=0.0),), max_speed=2.0, max_force=4.0)
         slow.model_copy(update={"groups": (other, *slow.groups), "effects": (steer,)})  # it is about others
+
+
+# --- tasks ------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.slow
+def test_a_task_whose_agents_keep_headings_plays_on() -> None:
+    """An episode begins with headings along the velocities; turns are limited; a world of a batch is itself alone."""
+
+    def world(count: int) -> World:
+        task = Obstacles()
+        groups = tuple(group.model_copy(update={"max_turn_rate": RATE}) for group in task.scene.groups)
+        vars(task)["scene"] = task.scene.model_copy(update={"groups": groups})  # before anything follows from it
+        return World(task, worlds=count)
+
+    batch, alone = world(3), world(1)
+    batch.reset(5)
+    alone.reset(7)
+    for episode in range(2):
+        for _ in range(20):
+            before = batch.state.heading.copy()
+            batch.step(np.full((3, 1, 2), (-1.0, 0.3)))
+            alone.step(np.full((1, 1, 2), (-1.0, 0.3)))
+            assert (angle(batch.state.heading, before) <= RATE * batch.task.control_dt + 1e-9).all()
+        np.testing.assert_array_equal(batch.state.frame[:, 2], alone.state.frame[:, 0])
+        shot = batch.snapshot(1)
+        assert shot.heading is not None
+        np.testing.assert_array_equal(shot.heading, batch.state.heading[1])
+        if episode == 0:
+            batch.reset()
+            alone.reset()
+            first = batch.state.heading
+            np.testing.assert_allclose(np.linalg.norm(first, axis=-1), 1)
+            moving = np.linalg.norm(batch.state.vel, axis=-1) > 0
+            assert (angle(first[moving], batch.state.vel[moving]) < 1e-7).all()
+            np.testing.assert_array_equal(first[~moving], np.broadcast_to((1.0, 0.0), first[~moving].shape))

@@ -18,7 +18,6 @@ for _module in pkgutil.iter_modules(__path__):
     importlib.import_module(f"{__name__}.{_module.name}")
 
 from flockenv.behaviours.avoid import AvoidObstacles, ForceField, Whiskers  # noqa: E402  # after the folder has been walked
-from flockenv.behaviours.base import OvershootWarning  # noqa: E402
 from flockenv.behaviours.chase import Evade, MatchVelocity, OffsetPursue, Pursue, Shadow  # noqa: E402
 from flockenv.behaviours.company import FollowLeader, Formation, Interpose  # noqa: E402
 from flockenv.behaviours.crowd import Explore, Forage, Queue, UnalignedAvoidance  # noqa: E402
@@ -34,7 +33,7 @@ from flockenv.behaviours.way import FollowWay  # noqa: E402
 __all__ = [
     "BEHAVIOURS", "Alignment", "Arrive", "AvoidObstacles", "Cohesion", "Contain", "Dock", "Evade", "Explore",
     "Face", "Flee", "FollowFlow", "FollowLeader", "FollowPath", "FollowWall", "FollowWay", "Forage", "ForceField",
-    "Formation", "Hide", "Interpose", "MatchVelocity", "OffsetPursue", "Orca", "OvershootWarning", "Pursue",
+    "Formation", "Hide", "Interpose", "MatchVelocity", "OffsetPursue", "Orca", "Pursue",
     "Queue", "Seek", "Separation", "Shadow", "StayOnPath", "TargetSpeed", "UnalignedAvoidance", "Wander",
     "Whiskers",
 ]  # fmt: skip

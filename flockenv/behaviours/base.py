@@ -11,21 +11,17 @@ from pydantic import Field
 
 from flockenv.effects.base import Effect, Me, Other, Sight
 from flockenv.kernels import Vec, law, like
+from flockenv.stability import LookaheadWarning
 
 __all__ = [
     "AboutNearest",
     "Behaviour",
     "Moving",
-    "OvershootWarning",
     "nearest_one",
     "seen_one",
     "steered_groups",
     "top_speed",
 ]
-
-
-class OvershootWarning(UserWarning):
-    """What an agent looks ahead is shorter than the way on which it can stop: it cannot but overshoot."""
 
 
 @law
@@ -116,7 +112,7 @@ def _warn_of_overshoot(kind: str, slow_radius: float, speed: float, group: Any) 
         text = (
             f"{kind}: slow_radius = {slow_radius:g} m: overshoots; with max_force = {group.max_force:g} N to stop from"
         )
-        warnings.warn(f"{text} {speed:g} m/s takes speed^2 mass / max_force = {least:g} m", OvershootWarning, 2)
+        warnings.warn(f"{text} {speed:g} m/s takes speed^2 mass / max_force = {least:g} m", LookaheadWarning, 2)
 
 
 class AboutNearest(Behaviour):

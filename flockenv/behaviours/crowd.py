@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import math
 from typing import Any, ClassVar, Literal
 
 import numpy as np
 from pydantic import Field
 
 from flockenv import steering
+from flockenv.behaviours.wander import wandered
 from flockenv.effects.base import Effect, Me, Other, Sight, Vector
 from flockenv.kernels import Vec, law, like
-from flockenv.noise import smooth
 from flockenv.vec import scale, select, sub, unit, zero
 
 __all__ = ["Explore", "Forage", "Queue", "UnalignedAvoidance"]
@@ -87,6 +86,10 @@ effects:
     def parameters(self) -> dict[str, float | Vec]:
         """How strongly, how far ahead, how wide: who is seen is the sweep's business."""
         return {"weight": self.weight, "horizon": self.horizon, "margin": self.margin}
+
+    def lookahead(self, speed: float) -> float:
+        """As far as it comes within the horizon, and as it sees."""
+        return min(speed * self.horizon, self.radius)
 
     def sums(self, dimension: int) -> int:
         """A time and a direction."""
@@ -188,19 +191,6 @@ def nearest_food(p: Any, me: Me, other: Other, acc: Vec) -> Vec:
 
 
 @law
-def _drifting(p: Any, me: Me, pos: Vec) -> Vec:
-    """A direction in the agent's own frame that changes smoothly with time: coherent noise, the same for every dt."""
-    o = like(me.radius, 0.0)
-    who, time = np.int64(me.who), np.float64(me.time) / np.float64(p.period)
-    turn = like(o, math.pi) * like(o, smooth(me.key, time, who, 61_000))
-    if len(pos) == 2:
-        return (np.cos(turn), np.sin(turn))
-    else:
-        tilt = like(o, math.pi / 2) * like(o, smooth(me.key, time, who, 61_001))
-        return (np.cos(turn) * np.cos(tilt), np.sin(turn) * np.cos(tilt), np.sin(tilt))
-
-
-@law
 def foraging(p: Any, me: Me, acc: Vec) -> Vec:
     """F = w (v_arrive - v) if there is food in sight, else F = w (v_wander - v)."""
     o = like(me.radius, 0.0)
@@ -211,8 +201,7 @@ def foraging(p: Any, me: Me, acc: Vec) -> Vec:
         offset = (acc[2], acc[3], acc[4])
     speed = min(p.speed, me.max_speed)
     feed = steering.arrive(offset, me.vel, speed, p.slow_radius)
-    search = steering.wander(_drifting(p, me, me.pos), me.vel, speed, p.straight)
-    return scale(select(acc[0] < like(o, np.inf), feed, search), p.weight)
+    return select(acc[0] < like(o, np.inf), scale(feed, p.weight), wandered(p, me))
 
 
 class Forage(Effect):
@@ -225,8 +214,8 @@ class Forage(Effect):
     radius: float = Field(default=3.0, gt=0, description="m, food is seen within this")
     fov: float = Field(default=360.0, gt=0, le=360, description="degrees, full angle of the field of view")
     slow_radius: float = Field(default=0.5, gt=0, description="m, it slows down within this of its food")
-    period: float = Field(default=2.0, gt=0, description="s, how long wandering remembers a direction")
-    straight: float = Field(default=1.5, ge=0, description="how straight it wanders: 0 anyhow, 1 and more ahead")
+    period: float = Field(default=2.0, gt=0, description="s, how long it remembers to which side it turned")
+    strength: float = Field(default=1.0, ge=0, description="m aside per m ahead: how far it turns while it wanders")
     steering: ClassVar[bool] = True
     pair_start: ClassVar[str | None] = "no_food"
     pair_law: ClassVar[str | None] = "nearest_food"
@@ -249,7 +238,7 @@ effects:
 
     def parameters(self) -> dict[str, float | Vec]:
         """How fast, and how it wanders: who is seen is the sweep's business."""
-        names = ("weight", "speed", "slow_radius", "period", "straight")
+        names = ("weight", "speed", "slow_radius", "period", "strength")
         return {name: float(getattr(self, name)) for name in names}
 
     def check(self, scene: Any) -> None:

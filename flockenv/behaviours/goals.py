@@ -100,7 +100,7 @@ effects:
 class Arrive(_ToTarget):
     """Seek a place and stand still there: S = V min(1, d / d_slow) unit(T - x) - v (Reynolds 1999).
 
-    It does not overshoot if d_slow >= V^2 m / max_force, of which OvershootWarning tells, and weight >= 4 m V / d_slow.
+    It does not overshoot if d_slow >= V^2 m / max_force, of which LookaheadWarning tells, and weight >= 4 m V / d_slow.
     """
 
     kind: Literal["arrive"] = "arrive"

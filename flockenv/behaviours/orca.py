@@ -122,6 +122,10 @@ effects:
         names = ("weight", "speed", "hurry", "slow_radius", "horizon", "step", "margin", "turn")
         return {"target": self.target, **{name: float(getattr(self, name)) for name in names}}
 
+    def lookahead(self, speed: float) -> float:
+        """As far as it comes within the horizon, and as it sees."""
+        return min(speed * self.horizon, self.radius)
+
     def check(self, scene: Any) -> None:
         """Refuse space."""
         if scene.dimension != 2:

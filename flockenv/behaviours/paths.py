@@ -23,6 +23,10 @@ SLOWEST = 0.25
 """Share of the wanted speed at which it looks ahead at least: who stands still must be sent somewhere."""
 
 
+MOST_PLACES = 500
+"""Of a path, in pictures."""
+
+
 @law
 def _offset(found: Vec) -> Vec:
     """Return the offset of what `polyline.nearest` found."""
@@ -87,6 +91,7 @@ class _OnPath(Effect):
     steering: ClassVar[bool] = True
     tabled: ClassVar[bool] = True
     places: ClassVar[tuple[str, ...]] = ("points",)
+    heads_for: ClassVar[bool] = False
 
     weight: float
     points: Annotated[tuple[Vector, ...], Field(min_length=2, max_length=1024)] = Field(
@@ -114,6 +119,13 @@ class _OnPath(Effect):
     def table(self, scene: Any) -> NDArray[np.float64]:
         """The path."""
         return polyline.pieces(self.points, self.closed, scene.space)
+
+    def way_shown(self, scene: Any) -> tuple[tuple[Vec, ...], float] | None:
+        """Its tube: places half a radius apart, at most MOST_PLACES."""
+        path = self.table(scene)
+        count = min(math.ceil(path[1] / (0.5 * self.radius)), MOST_PLACES)
+        along = polyline.on_spine(path, np.linspace(0.0, path[1], count + 1), scene.dimension)
+        return tuple(map(tuple, scene.space.wrap(along).tolist())), self.radius
 
     def check(self, scene: Any) -> None:
         """Refuse a path of another dimension, or one that a torus makes a point of."""
@@ -147,13 +159,13 @@ effects:
   - kind: steer
     group: 0
     behaviours:
-      - {kind: separation, weight: 1.5, radius: 0.8}
+      - {kind: unaligned_avoidance, weight: 8, horizon: 1.5, margin: 0.2}
       - {kind: follow_path, weight: 4, radius: 0.6, speed: 2, closed: true,
          points: [[1, 1], [6, 2.5], [11, 1], [12, 5], [10, 9], [6, 7.5], [2, 9], [0, 5]]}
   - kind: steer
     group: 1
     behaviours:
-      - {kind: separation, weight: 1.5, radius: 0.8}
+      - {kind: unaligned_avoidance, weight: 8, horizon: 1.5, margin: 0.2}
       - {kind: follow_path, weight: 4, radius: 0.6, speed: 2, closed: true, way: -1,
          points: [[1, 1], [6, 2.5], [11, 1], [12, 5], [10, 9], [6, 7.5], [2, 9], [0, 5]]}
 """
@@ -195,6 +207,7 @@ class FollowFlow(Effect):
     steering: ClassVar[bool] = True
     tabled: ClassVar[bool] = True
     places: ClassVar[tuple[str, ...]] = ("centre",)
+    heads_for: ClassVar[bool] = False
     own_law: ClassVar[str | None] = "flow_followed"
     demo: ClassVar[str | None] = """
 groups:

@@ -204,6 +204,8 @@ class Effect(Record):
     """Do its laws look numbers up in its `table`?"""
     places: ClassVar[tuple[str, ...]] = ()
     """Names of the parameters that are points: on a torus all laws but of bonds and obstacles are given the nearest images."""
+    heads_for: ClassVar[bool] = True
+    """Are its places what a behaviour heads for? Pictures show them."""
     strengths: ClassVar[tuple[str, ...]] = ("weight",)
     """Names of the fields that make it nothing when they are 0."""
     conserves_momentum: ClassVar[bool] = False
@@ -285,6 +287,10 @@ class Effect(Record):
         Asked for when a scene is built, after `check`; they are arguments, another table compiles nothing.
         """
         raise TypeError(f"{type(self).__name__} has no table")
+
+    def way_shown(self, scene: Any) -> tuple[tuple[Vec, ...], float] | None:
+        """Return the way that it is about, for pictures: places along it, m, and half its width, m; or none."""
+        return None
 
     def rates(self, groups: Sequence[Any], dimension: int) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
         """Return bounds of w^2, 1/s^2, and of damping, 1/s, of every agent, (N,): how stiff it is, whatever happens.

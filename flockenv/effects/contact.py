@@ -9,11 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from flockenv.effects.base import Effect, Me, Other, all_masses
+from flockenv.effects.base import Effect, Me, Obstacle, all_masses
 from flockenv.kernels import Vec, law, like
-from flockenv.shapes import normal
-from flockenv.state import State
-from flockenv.vec import add, dot, norm, scale, zero
+from flockenv.vec import add, dot, scale, zero
 
 __all__ = ["ObstacleContact"]
 
@@ -27,13 +25,12 @@ def untouched(p: Any, me: Me) -> Vec:
 
 
 @law
-def pushed_out(p: Any, me: Me, other: Other, acc: Vec) -> Vec:
+def pushed_out(p: Any, me: Me, other: Obstacle, acc: Vec) -> Vec:
     """Add max(0, k overlap - c v.n) n, if there is an overlap."""
     o = like(me.radius, 0.0)
-    overlap = me.radius + other.radius - norm(other.offset)
-    n = normal(other.offset)
-    force = p.stiffness * overlap - p.damping * dot(me.vel, n)
-    return add(acc, scale(n, force if (overlap > o) & (force > o) else o))
+    overlap = me.radius - other.gap
+    force = p.stiffness * overlap - p.damping * dot(me.vel, other.normal)
+    return add(acc, scale(other.normal, force if (overlap > o) & (force > o) else o))
 
 
 @law
@@ -43,7 +40,7 @@ def of_all(p: Any, me: Me, acc: Vec) -> Vec:
 
 
 class ObstacleContact(Effect):
-    """A body that overlaps a round obstacle by d is pushed out of it, F = max(0, k d - c v.n) n; n leads out.
+    """A body that overlaps an obstacle by d is pushed out of it, F = max(0, k d - c v.n) n; n leads out.
 
     The elastic part is the contact force of Helbing, Farkas and Vicsek 2000 (k g(r - d)); it never pulls. A body of
     mass m that comes at v goes in by at most v sqrt(m / k).
@@ -65,12 +62,3 @@ class ObstacleContact(Effect):
         """w^2 = k / m, and c / m, of a body in one obstacle."""
         mass = all_masses(groups, dimension)
         return self.stiffness / mass, self.damping / mass
-
-    def potential(self, groups: Sequence[Any], state: State, offset: Any) -> Floats:
-        """Sum of k d^2 / 2 of all agents and obstacles, (B,) J; what the damper takes is not in it."""
-        radius = np.concatenate([np.full(group.size, group.radius) for group in groups])
-        obstacles = state.obstacles
-        gone = offset(state.pos[:, :, None], obstacles.centre[:, None])
-        touching = radius[:, None] + obstacles.radius[:, None]
-        overlap = np.maximum(touching - np.linalg.norm(gone, axis=-1), 0.0) * (obstacles.radius[:, None] > 0)
-        return np.asarray(0.5 * self.stiffness * (overlap**2).sum(axis=(1, 2)))

@@ -9,7 +9,15 @@ import pettingzoo
 
 __all__ = ["HORIZONS", "PARALLEL", "SINGLE", "register_all"]
 
-HORIZONS = {"Pursuit": 300, "Obstacles": 250, "Flock": 300, "Herd": 600, "Crossing": 200, "Evade": 300, "PathFollow": 300}
+HORIZONS = {
+    "Pursuit": 300,
+    "Obstacles": 250,
+    "Flock": 300,
+    "Herd": 600,
+    "Crossing": 200,
+    "Evade": 300,
+    "PathFollow": 300,
+}
 """Time limit of an episode in control steps, by name: `Task.horizon`, repeated here so that no task is imported."""
 
 SINGLE = tuple(f"flockenv/{name}-v0" for name in HORIZONS)

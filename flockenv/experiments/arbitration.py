@@ -34,8 +34,10 @@ SEED = 0
 
 CASES: dict[str, tuple[str, float, str]] = {
     "cancelling": (
-        "the way around an obstacle and the course to a goal behind it pull to opposite sides, until their sum is "
-        "nothing",
+        (
+            "the way around an obstacle and the course to a goal behind it pull to opposite sides, until their sum is "
+            "nothing"
+        ),
         8.0,
         """
 groups:

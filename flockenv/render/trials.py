@@ -53,7 +53,7 @@ def draw_trials(experiment: Experiment, trials: Mapping[tuple[str, str], Trial])
     return figure
 
 
-def _region(trials: list[Trial]) -> tuple[np.ndarray, np.ndarray]:  # type: ignore[type-arg]
+def _region(trials: list[Trial]) -> tuple[np.ndarray, np.ndarray]:
     """Return the corners of where anybody went, with the obstacles, m."""
     points = [trial.path[..., :2].reshape(-1, 2) for trial in trials]
     points += [np.array([c.centre[:2]]) + s * c.radius for c in trials[0].scene.circles for s in (-1, 1)]
@@ -68,7 +68,7 @@ def _draw_trial(axes: Axes, trial: Trial) -> None:
 
     low, high = _region([trial])
     for circle in trial.scene.circles:
-        axes.add_patch(Circle(circle.centre[:2], circle.radius, color=GRID, ec=FAINT, lw=0.5))
+        axes.add_patch(Circle((circle.centre[0], circle.centre[1]), circle.radius, color=GRID, ec=FAINT, lw=0.5))
     for outline in trial.scene.outlines(tuple(low), tuple(high)):
         axes.add_patch(Polygon(outline, closed=True, color=GRID, ec=FAINT, lw=0.5))
     colour = COLOURS[1]

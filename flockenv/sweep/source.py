@@ -92,7 +92,7 @@ def _imports(parts: Parts) -> str:
         "from flockenv.neighbours import candidates, count_cells, order_records, row_of",
         f"from flockenv.space import {parts.space.offset_law} as offset_to, {parts.space.confine_law} as confine",
         *([f"from flockenv.space import {parts.space.bounce_law} as bounce"] if parts.bounces else []),
-        "from flockenv.noise import normal",
+        "from flockenv.noise import normal as standard_normal",
         "from flockenv.vec import add, dot, exact_dot, limit, norm, scale, select, sub, unit, zero",
         *(["from flockenv.vehicle import faced, held, leant, raised, turned"] if parts.oriented else []),
         *tree_imports(parts),

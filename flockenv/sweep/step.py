@@ -257,7 +257,8 @@ def _kick(parts: Parts) -> list[str]:
         if effect.kick_law is None:
             continue
         gauss = ", ".join(
-            f"like(dt, normal(key[b], begun + step_, np.int64(ident[i]), {8 * k + j}))" for j in range(parts.dimension)
+            f"like(dt, standard_normal(key[b], begun + step_, np.int64(ident[i]), {8 * k + j}))"
+            for j in range(parts.dimension)
         )
         lines += [
             f"says = kick_law_{k}(p{k}, me, dt, ({gauss},))",

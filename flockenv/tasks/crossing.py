@@ -249,7 +249,7 @@ class Crossing(Task):
         limits["spawn"] = around  # before an episode begins
         groups = [Group(count=self.learners, role="learner", **limits)]
         if self.agents > self.learners:
-            groups.append(Group(count=self.agents - self.learners, role="walker", **limits))
+            groups.append(Group(count=self.agents - self.learners, role="agent", **limits))
         return Scene(space=Plane(), groups=tuple(groups), integrator=self.integrator, dt=self.dt, dtype=self.dtype)
 
     @property

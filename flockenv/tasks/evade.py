@@ -150,7 +150,7 @@ def _after(p: Any, frame: Frame, i: int, velocity: Vec, top: float) -> Vec:
     frame.memory[2, i] = p.patience
     many = frame.rho.shape[0]
     goal = (p.size * 0.5 - frame.pos[0, i], p.size * 0.5 - frame.pos[1, i])
-    aim = (np.float64(goal[0]), np.float64(goal[1]))
+    aim: Vec = (np.float64(goal[0]), np.float64(goal[1]))
     if many > 0:
         turn = int(frame.step * p.control_dt / _SEARCH)
         m = min(int(many * uniform(frame.key, turn, i, 7)), many - 1)
@@ -163,7 +163,8 @@ def _after(p: Any, frame: Frame, i: int, velocity: Vec, top: float) -> Vec:
 def _around(frame: Frame, i: int, velocity: Vec, top: float) -> Vec:
     """Steer around the cover that is touched first within 1 s."""
     forward = unit(velocity)
-    nearest, where, room = np.inf, (0.0, 0.0), 0.0
+    where: Vec = (0.0, 0.0)
+    nearest, room = np.inf, 0.0
     for m in range(frame.rho.shape[0]):
         if frame.rho[m] > 0.0:
             to, clearance = _to_cover(frame, i, m), np.float64(frame.rho[m] + frame.radius[i]) + 0.1
@@ -179,7 +180,7 @@ def _around(frame: Frame, i: int, velocity: Vec, top: float) -> Vec:
 @kernel
 def _apart(frame: Frame, i: int) -> Vec:
     """Keep 2 m from other pursuers, so that they come from several sides."""
-    push = (0.0, 0.0)
+    push: Vec = (0.0, 0.0)
     for j in range(1, frame.pos.shape[1]):
         to = _to(frame, i, j)
         if j != i and norm(to) < 2.0:
@@ -272,7 +273,7 @@ def _show_pursuers(p: Any, frame: Frame, row: Any) -> int:
         row[6 + 6 * count + s] = max(1.0 - best / p.near, 0.0)
         row[6 + 7 * count + s] = 1.0 if _sees(p, frame, who) else 0.0
         last, chosen = best, who
-    return 6 + 8 * count
+    return 6 + 8 * int(count)
 
 
 class Evade(Task):

@@ -33,7 +33,7 @@ _GAIN = 5.0  # kg/s: a sheep has the velocity that it wants within 0.2 s
 def spawn(p: Any, frame: Frame) -> None:
     """A pen, sheep about a place at least `away` m from it, dogs out of the sheep's sight; everybody at rest."""
     frame.vel[:, :] = 0.0
-    middle = (0.0, 0.0)
+    middle: Vec = (0.0, 0.0)
     for t in range(_TRIES):
         pen, middle = _somewhere(p, frame, t, 0), _somewhere(p, frame, t, 1)
         frame.memory[0, :], frame.memory[1, :] = pen[0], pen[1]
@@ -125,12 +125,14 @@ def drive(p: Any, frame: Frame, action: Any, force: Any) -> None:
 def _sheep(p: Any, frame: Frame, i: int, force: Any) -> None:
     """Heed dogs within `fear_distance` as in Strombom et al. 2014; graze otherwise, slowly, and not too near others."""
     velocity, dogs = _velocity(frame, i), int(p.dogs)
-    crowd, centre, away, found = (0.0, 0.0), (0.0, 0.0), (0.0, 0.0), 0
+    crowd: Vec = (0.0, 0.0)
+    centre: Vec = (0.0, 0.0)
+    away: Vec = (0.0, 0.0)
     for j in range(dogs, frame.pos.shape[1]):
         to = _to(frame, i, j)
         square = to[0] * to[0] + to[1] * to[1]
         if j != i and square < p.flock_sight * p.flock_sight:
-            centre, found = add(centre, to), found + 1
+            centre = add(centre, to)
             if square < p.apart_distance * p.apart_distance:
                 crowd = sub(crowd, unit(to))
     for j in range(dogs):
@@ -173,7 +175,7 @@ def _penned(p: Any, frame: Frame) -> int:
 
 @kernel
 def _all_in(p: Any, frame: Frame) -> bool:
-    return _penned(p, frame) == frame.pos.shape[1] - int(p.dogs)
+    return bool(_penned(p, frame) == frame.pos.shape[1] - int(p.dogs))
 
 
 @kernel

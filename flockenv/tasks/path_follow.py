@@ -126,7 +126,7 @@ def ended(p: Any, before: Frame, after: Frame, over: Any) -> bool:
     _, _, left, _ = _nearest(p, after)
     after.memory[_GAINED, 0] += _gain(p, before, after)
     over[0] = abs(left) > p.lost_distance
-    return not over[0] and after.memory[_GAINED, 0] >= after.memory[_LENGTH, 0]  # type: ignore[no-any-return]
+    return not over[0] and after.memory[_GAINED, 0] >= after.memory[_LENGTH, 0]
 
 
 @kernel
@@ -178,7 +178,7 @@ def _corner_bend(frame: Frame, i: int) -> float:
     """Return one over the radius of the circle through a corner and its two neighbours."""
     a, b, c = _corner(frame, i + POINTS - 1), _corner(frame, i), _corner(frame, i + 1)
     u, v, w = sub(b, a), sub(c, b), sub(c, a)
-    return 2.0 * (u[0] * v[1] - u[1] * v[0]) / (norm(u) * norm(v) * norm(w))  # type: ignore[no-any-return]
+    return 2.0 * (u[0] * v[1] - u[1] * v[0]) / (norm(u) * norm(v) * norm(w))
 
 
 class PathFollow(Task):

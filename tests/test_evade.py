@@ -1,0 +1,179 @@
+"""Evade keeps its promises: who sees whom, where pursuers go who see nobody, what is solid, what ends and what pays."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from flockenv.tasks import Evade
+from flockenv.world import Step, World
+
+FAR = (27.0, 27.0)
+
+
+def scene(evader: Any, *pursuers: Any, cover: Any = (), **fields: Any) -> World:
+    """One world, everybody at rest where they are told; cover is (x, y, radius)."""
+    world = World(Evade(pursuers=len(pursuers), **fields))
+    world.reset(3)
+    world.state.pos[0], world.state.vel[0] = [evader, *pursuers], 0.0
+    world.state.obstacle_radius[0] = 0.0
+    for m, (x, y, radius) in enumerate(cover):
+        world.state.obstacles.centre[0, m], world.state.obstacle_radius[0, m] = (x, y), radius
+    return world
+
+
+def act(world: World, action: Any = (0.0, 0.0)) -> Step:
+    return world.step(np.asarray(action, float).reshape(1, 1, 2))
+
+
+def seen(world: World) -> Any:
+    """What the evader sees now, by name."""
+    rows = world.reset(mask=np.zeros(1, bool))
+    return world.task.layout.unpack(rows[0, 0])
+
+
+def paid(world: World, step: Step) -> dict[str, float]:
+    return dict(zip(world.task.terms, step.terms[0, 0].tolist(), strict=True))
+
+
+@pytest.mark.parametrize(
+    ("cover", "visible"),
+    [
+        ((), True),
+        (((10.0, 14.0, 1.0),), False),
+        (((10.0, 15.01, 1.0),), True),  # the line of sight grazes by
+        (((10.0, 14.99, 1.0),), False),
+        (((4.5, 14.0, 1.0),), True),  # behind the evader
+        (((15.5, 14.0, 1.0),), True),  # behind the pursuer
+        (((5.5, 14.0, 1.0), (20.0, 5.0, 1.5)), True),
+    ],
+)
+def test_cover_in_the_straight_way_takes_sight_and_nothing_else_does(cover: Any, visible: bool) -> None:
+    world = scene((6.6, 14.0), (13.4, 14.0), FAR, FAR, cover=cover)
+    assert bool(seen(world).seen[0]) == visible
+
+
+def test_nobody_sees_farther_than_their_sight() -> None:
+    assert seen(scene((2.0, 14.0), (11.99, 14.0), FAR, FAR)).seen[0] == 1
+    assert seen(scene((2.0, 14.0), (12.01, 14.0), FAR, FAR)).seen[0] == 0
+
+
+def test_a_pursuer_that_sees_nobody_goes_where_it_saw_the_evader_last_and_not_where_it_is() -> None:
+    world = scene((10.0, 4.0), (10.0, 12.0), FAR, FAR)
+    act(world)
+    last = world.state.pos[0, 0].copy()
+    world.state.obstacles.centre[0, 0], world.state.obstacle_radius[0, 0] = (15.0, 8.0), 1.8
+    world.state.pos[0, 0] = (20.0, 4.0)  # far to the side, behind cover that has grown there
+    world.state.pos[0, 2:] = FAR
+    for _ in range(12):
+        world.state.pos[0, 0], world.state.vel[0, 0] = (20.0, 4.0), 0.0
+        act(world)
+        assert seen(world).seen.sum() == 0
+    heading = world.state.vel[0, 1] / np.linalg.norm(world.state.vel[0, 1])
+    way = last - world.state.pos[0, 1]
+    assert heading @ (way / np.linalg.norm(way)) > 0.99
+
+
+def test_a_pursuer_that_has_lost_the_evader_looks_behind_cover() -> None:
+    """It has never seen anybody, and there is one obstacle: 8 s later it has been on the far side of that."""
+    world = scene((1.0, 27.0), (14.0, 8.0), FAR, FAR, cover=((14.0, 14.0, 1.5),), sight=3.0)
+    world.state.pos[0, 2:] = (27.0, 1.0)
+    highest = 0.0
+    for _ in range(80):
+        act(world)
+        highest = max(highest, float(world.state.pos[0, 1, 1]))
+    assert highest > 15.5
+
+
+def test_pursuers_head_for_where_the_evader_will_be() -> None:
+    """Exact interception, at most 1 s ahead: seen from the side, the quarry running along x at 2 m/s is led by 2 m."""
+    world = scene((8.0, 4.0), (8.0, 12.0), FAR, FAR)
+    world.state.vel[0, 0] = (2.0, 0.0)
+    act(world)
+    way = world.state.vel[0, 1]
+    assert way[0] / -way[1] == pytest.approx(2.0 / 8.0, rel=1e-6)
+
+
+def test_to_be_caught_costs_once_and_ends_it_and_being_free_pays_by_the_second() -> None:
+    world = scene((10.0, 10.0), (11.5, 10.0), FAR, FAR)
+    step = act(world, (0.6, 0.8))
+    terms = paid(world, step)
+    assert terms == pytest.approx({"alive": 0.1, "caught": 0.0, "effort": -0.1 * 0.1})
+    assert step.success.all()
+    assert not step.terminated.any()
+    world.state.pos[0, 1] = world.state.pos[0, 0] + [0.6, 0.0]
+    step = act(world)
+    assert paid(world, step) == pytest.approx({"alive": 0.0, "caught": -10.0, "effort": 0.0})
+    assert step.terminated.all()
+    assert not step.success.any()
+    measured = world.measure()
+    assert measured["survived"] == 0
+    assert measured["survival_time"] == pytest.approx(0.2)
+
+
+def test_time_hidden_is_the_time_in_which_nobody_sees_it() -> None:
+    cover = ((10.0, 14.0, 1.5),)
+    world = scene((6.0, 14.0), (14.0, 14.0), FAR, FAR, cover=cover)
+    for k in range(5):
+        world.state.pos[0] = [(6.0, 14.0), (14.0, 14.0), FAR, FAR]
+        world.state.vel[0] = 0.0
+        act(world)
+        assert world.measure()["time_hidden"] == pytest.approx(0.1 * (k + 1))
+    world.state.pos[0, 1] = (6.0, 9.0)
+    act(world)
+    assert world.measure()["time_hidden"] == pytest.approx(0.5)
+
+
+def test_cover_is_solid_for_whoever_runs_into_it() -> None:
+    world = scene((5.0, 14.0), FAR, FAR, FAR, cover=((10.0, 14.0, 1.5),))
+    deepest = 0.0
+    for _ in range(60):
+        world.state.pos[0, 1:] = FAR
+        act(world, (1.0, 0.0))
+        deepest = max(deepest, float(world.state.pos[0, 0, 0]))
+    assert 10.0 - 1.8 < deepest < 10.0 - 1.8 + 0.25
+    assert world.state.pos[0, 0, 0] == pytest.approx(8.2 + 8.0 / 400.0, abs=0.02)  # pressed by 8 N
+
+
+def test_pursuers_stay_out_of_cover_and_within_their_speed() -> None:
+    world = World(Evade(), 32)
+    world.reset(5)
+    rng, s, deepest, fastest = np.random.default_rng(1), world.state, [], 0.0
+    for _ in range(100):
+        step = world.step(rng.uniform(-1, 1, (32, 1, 2)))
+        gone = s.pos[:, 1:, None] - s.obstacles.centre[:, None]
+        gap = np.linalg.norm(gone, axis=3) - s.obstacle_radius[:, None] - 0.3
+        deepest.append(np.where(s.obstacle_radius[:, None] > 0, gap, np.inf).min())
+        fastest = max(fastest, np.linalg.norm(s.vel[:, 1:], axis=2).max())
+        world.reset(mask=step.ended)
+    assert min(deepest) > -0.2
+    assert 2.1 < fastest <= 2.2 * (1 + 1e-9)
+
+
+def test_everybody_begins_clear_of_cover_and_of_each_other() -> None:
+    world = World(Evade(), 100)
+    world.reset(3)
+    s = world.state
+    assert (s.obstacle_radius > 0).sum(axis=1).min() >= 6
+    gone = np.linalg.norm(s.pos[:, :, None] - s.obstacles.centre[:, None], axis=3) - s.obstacle_radius[:, None]
+    assert np.where(s.obstacle_radius[:, None] > 0, gone, np.inf).min() > 0.3
+    assert np.linalg.norm(s.pos[:, 1:] - s.pos[:, :1], axis=2).min() >= 8.0
+    assert not s.vel.any()
+
+
+@pytest.mark.parametrize(
+    ("fields", "said"),
+    [
+        ({"least_radius": 3.0}, "least_radius = 3"),
+        ({"greatest_radius": 13.0}, "field of 28 m"),
+        ({"start_distance": 20.0}, "start_distance = 20"),
+        ({"pursuers": 0}, "pursuers = 0"),
+    ],
+)
+def test_what_it_cannot_be_is_refused_in_one_line(fields: dict[str, Any], said: str) -> None:
+    with pytest.raises(ValueError, match=r".") as caught:
+        Evade(**fields)
+    assert said in str(caught.value)
+    assert "\n" not in str(caught.value)
