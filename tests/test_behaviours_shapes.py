@@ -45,7 +45,9 @@ def scene(
 def wish(*chosen: Any, **fields: Any) -> Any:
     """The force of one agent of 1 kg in its first step, by the kernel that moves it: nothing else is compiled."""
     made = scene(*chosen, **fields)
-    free = made.model_copy(update={"groups": (made.groups[0].model_copy(update={"max_speed": 1e6}),)})
+    free = made.model_copy(
+        update={"groups": (made.groups[0].model_copy(update={"max_speed": None, "max_force": None}),)}
+    )
     start = free.start(0)
     return (free.step(start).vel - start.vel)[0, 0] / made.dt
 

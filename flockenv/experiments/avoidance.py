@@ -34,7 +34,7 @@ CASES: dict[str, tuple[str, tuple[float, float], str, str]] = {
     ),
     "along a wall": (
         "straight along a wall, 0.4 m beside it", (12, 0), "{low: [0, 0], high: [0, 0]}",
-        "[{kind: polygon, vertices: [[-20, -0.6], [-20, -3], [30, -3], [30, -0.6]]}]",
+        "[{kind: polygon, vertices: [[-3, -0.6], [-3, -2], [15, -2], [15, -0.6]]}]",
     ),
     "corridor": (
         "through a corridor 1.2 m wide", (12, 0), "{low: [0, -0.8], high: [0, 0.8]}",

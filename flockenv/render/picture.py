@@ -116,7 +116,8 @@ def _wall(pen: ImageDraw.ImageDraw, view: View, polygon: Floats) -> None:
     spots = view.place(polygon)
     middle = (spots.min(axis=0) + spots.max(axis=0)) / 2
     reach = float((spots.max(axis=0) - middle).max())
-    for a, b in view.sightings(float(middle[0]), float(middle[1]), reach):
+    x, y = middle.tolist()
+    for a, b in view.sightings(x, y, reach):
         corners = (spots - middle + (a, b)).ravel().tolist()
         pen.polygon(corners, fill=PAPER["stone"][0], outline=PAPER["rim"][0], width=max(1, round(view.width / 400)))
 

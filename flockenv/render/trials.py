@@ -54,9 +54,10 @@ def draw_trials(experiment: Experiment, trials: Mapping[tuple[str, str], Trial])
 
 
 def _region(trials: list[Trial]) -> tuple[np.ndarray, np.ndarray]:
-    """Return the corners of where anybody went, with the round obstacles, m."""
+    """Return the corners of where anybody went, with the obstacles, m."""
     points = [trial.path[..., :2].reshape(-1, 2) for trial in trials]
     points += [np.array([c.centre[:2]]) + s * c.radius for c in trials[0].scene.circles for s in (-1, 1)]
+    points += [shape.extremes[:, :2] for shape in trials[0].scene.shapes]
     every = np.concatenate(points)
     return every.min(axis=0) - 0.5, every.max(axis=0) + 0.5
 
