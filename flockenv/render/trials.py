@@ -20,6 +20,10 @@ if TYPE_CHECKING:
 __all__ = ["draw_trials", "write_trials"]
 
 
+WIDE, GAP = 1.9, 0.35
+"""Inches: the width of a picture, and the height of what stands below it."""
+
+
 def write_trials(path: str | Path, experiment: Experiment, trials: Mapping[tuple[str, str], Trial]) -> None:
     """Write the picture as a PNG file, whole or not at all; the same trials give the same bytes."""
     figure = draw_trials(experiment, trials)
@@ -35,12 +39,16 @@ def draw_trials(experiment: Experiment, trials: Mapping[tuple[str, str], Trial])
     from matplotlib.figure import Figure
 
     cases, variants = list(experiment.cases), list(experiment.variants)
-    figure = Figure(figsize=(1.2 + 1.9 * len(variants), 0.8 + 1.7 * len(cases)), facecolor="white")
+    regions = [_region([trials[case, variant] for variant in variants]) for case in cases]
+    shapes = [float((high[1] - low[1]) / (high[0] - low[0])) for low, high in regions]
+    heights = [WIDE * min(max(shape, 0.25), 1.0) for shape in shapes]
+    tall = 1.0 + sum(heights) + GAP * len(cases)
+    figure = Figure(figsize=(0.5 + 1.08 * WIDE * len(variants), tall), facecolor="white")
     FigureCanvasAgg(figure)
-    figure.suptitle(experiment.title, fontsize=12, fontweight="bold", color=INK, x=0.02, ha="left")
-    grid = figure.subplots(len(cases), len(variants), squeeze=False)
+    figure.text(0.02, 1 - 0.3 / tall, experiment.title, fontsize=12, fontweight="bold", color=INK, va="center")
+    grid = figure.subplots(len(cases), len(variants), squeeze=False, height_ratios=heights)
     for row, case in enumerate(cases):
-        low, high = _region([trials[case, variant] for variant in variants])
+        low, high = regions[row]
         for column, variant in enumerate(variants):
             axes, trial = grid[row, column], trials[case, variant]
             _draw_trial(axes, trial)
@@ -49,7 +57,15 @@ def draw_trials(experiment: Experiment, trials: Mapping[tuple[str, str], Trial])
             axes.set_title(variant.replace("_", " ") if row == 0 else "", fontsize=8, color=INK)
             axes.set_xlabel(_caption(experiment, trial), fontsize=6.5, color=FAINT)
         grid[row, 0].set_ylabel(case.replace("_", " "), fontsize=8, fontweight="bold", color=INK)
-    figure.subplots_adjust(left=0.04, right=0.99, bottom=0.07, top=0.86, wspace=0.08, hspace=0.3)
+    between = GAP * len(cases) / sum(heights)
+    figure.subplots_adjust(
+        left=0.35 / figure.get_figwidth(),
+        right=0.995,
+        bottom=0.4 / tall,
+        top=1 - 0.75 / tall,
+        wspace=0.08,
+        hspace=between,
+    )
     return figure
 
 
@@ -84,4 +100,5 @@ def _draw_trial(axes: Axes, trial: Trial) -> None:
 
 def _caption(experiment: Experiment, trial: Trial) -> str:
     """Return the numbers that go below a picture."""
-    return ", ".join(f"{name} {trial.numbers[name]:.2g}" for name in experiment.shown)
+    numbers = {name: trial.numbers[name] for name in experiment.shown}
+    return ", ".join(f"{name} {x:.2g}" if x == x else f"{name} -" for name, x in numbers.items())
