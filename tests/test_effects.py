@@ -7,6 +7,7 @@ import json
 import pickle
 import subprocess
 import sys
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -42,13 +43,27 @@ from tests.catalogue import (
     users_module,
 )
 
-ROWS = pytest.mark.parametrize("row", EFFECTS, ids=lambda row: row.name)
+EVERY_ROW = pytest.mark.parametrize("row", EFFECTS, ids=lambda row: row.name)
+"""For tests that compile nothing."""
+
+
+def among(rows: Iterable[EffectRow]) -> pytest.MarkDecorator:
+    """Those rows; most behaviours where slow tests run: quick tests of theirs are in test_behaviours_*.py."""
+    given = [
+        pytest.param(row, marks=pytest.mark.slow) if row.effect.steering and row.effect.kind not in QUICK else row
+        for row in rows
+    ]
+    return pytest.mark.parametrize("row", given, ids=lambda row: row.name)
+
+
+QUICK = AMONG_ALL | {"steer"}
+
+ROWS = among(EFFECTS)
 
 
 def obeying(symmetry: str) -> pytest.MarkDecorator:
     """The rows that declare a symmetry."""
-    rows = [row for row in EFFECTS if symmetry in row.obeys]
-    return pytest.mark.parametrize("row", rows, ids=lambda row: row.name)
+    return among(row for row in EFFECTS if symmetry in row.obeys)
 
 
 DIMENSIONS = pytest.mark.parametrize("dimension", [2, pytest.param(3, marks=pytest.mark.slow)])
@@ -453,13 +468,13 @@ def names_of_effects() -> dict[str, Any]:
     return {kind.__name__: kind for kind in kinds} | {"Circle": Circle}
 
 
-@ROWS
+@EVERY_ROW
 def test_it_prints_as_its_own_constructor(row: EffectRow) -> None:
     assert eval(repr(row.effect), names_of_effects()) == row.effect  # noqa: S307  # that is what is promised
     assert str(row.effect) == repr(row.effect)
 
 
-@ROWS
+@EVERY_ROW
 def test_it_is_a_value(row: EffectRow) -> None:
     again = pickle.loads(pickle.dumps(row.effect))
     assert again == row.effect == copy.deepcopy(row.effect)
@@ -473,7 +488,7 @@ def test_it_is_a_value(row: EffectRow) -> None:
 
 
 @DIMENSIONS
-@ROWS
+@EVERY_ROW
 def test_a_scene_under_it_is_a_value(row: EffectRow, dimension: int) -> None:
     scene = scene_under(row, dimension)
     end = scene.run(scene.start(3), 5)
