@@ -49,14 +49,13 @@ EVERY_ROW = pytest.mark.parametrize("row", EFFECTS, ids=lambda row: row.name)
 
 def among(rows: Iterable[EffectRow]) -> pytest.MarkDecorator:
     """Those rows; most behaviours where slow tests run: quick tests of theirs are in test_behaviours_*.py."""
-    given = [
-        pytest.param(row, marks=pytest.mark.slow) if row.effect.steering and row.effect.kind not in QUICK else row
-        for row in rows
-    ]
+    given = [pytest.param(row, marks=pytest.mark.slow) if _slow(row) else row for row in rows]
     return pytest.mark.parametrize("row", given, ids=lambda row: row.name)
 
 
-QUICK = AMONG_ALL | {"steer"}
+def _slow(row: EffectRow) -> bool:
+    return row.effect.steering and row.effect.kind not in {*AMONG_ALL, "steer"}
+
 
 ROWS = among(EFFECTS)
 
@@ -208,7 +207,24 @@ def test_the_dead_are_not_there(row: EffectRow, dimension: int) -> None:
 
 # --- the same in single precision -------------------------------------------------------------------------------------
 
-KINDS = pytest.mark.parametrize("row", FIRST, ids=lambda row: row.name)
+
+def singly(rows: Iterable[EffectRow], changes: tuple[str, ...] = ("",)) -> pytest.MarkDecorator:
+    """Rows, dimensions and what they obey, in single precision; in space those alone that share a kernel.
+
+    What float32 can break is a constant that makes it float64, or a threshold: no other in space than in the plane.
+    """
+    given = [
+        pytest.param(row, d, *filter(None, [change]), marks=pytest.mark.slow if d == 3 or _slow(row) else ())
+        for row in rows
+        for d in (2, 3)
+        for change in changes
+        if (d == 2 or row.effect.kind in AMONG_ALL) and (not change or change in row.obeys)
+    ]
+    names = ("row", "dimension", "change") if any(changes) else ("row", "dimension")
+    return pytest.mark.parametrize(names, given, ids=lambda value: getattr(value, "name", value))
+
+
+KINDS = singly(FIRST)
 
 
 def single(row: EffectRow, dimension: int) -> Scene:
@@ -218,20 +234,14 @@ def single(row: EffectRow, dimension: int) -> Scene:
     return everything(dimension, *row.at(dimension), space=Plane(), dtype="float32")
 
 
-@DIMENSIONS
-@pytest.mark.parametrize(
-    ("row", "change"),
-    [(row, change) for row in FIRST for change in ("rotation", "mirror", "translation") if change in row.obeys],
-    ids=lambda value: getattr(value, "name", value),
-)
+@singly(FIRST, ("rotation", "mirror", "translation"))
 def test_in_single_precision_it_obeys_the_same_symmetries(row: EffectRow, dimension: int, change: str) -> None:
     matrix = {"rotation": rotation(dimension, 7), "mirror": mirror(dimension)}.get(change, np.eye(dimension))
     shift = np.arange(1, dimension + 1) * (37.25 if change == "translation" else 0.0)
     assert_moves_alike(single(row, dimension), matrix, shift)
 
 
-@DIMENSIONS
-@pytest.mark.parametrize("row", [row for row in FIRST if "relabelling" in row.obeys], ids=lambda row: row.name)
+@singly(row for row in FIRST if "relabelling" in row.obeys)
 def test_in_single_precision_too_the_order_of_the_agents_does_not_matter(row: EffectRow, dimension: int) -> None:
     scene = single(row, dimension)
     start = scene.start(3)
@@ -242,7 +252,6 @@ def test_in_single_precision_too_the_order_of_the_agents_does_not_matter(row: Ef
     np.testing.assert_allclose(found.v, end.v[:, :, order], atol=tolerance)
 
 
-@DIMENSIONS
 @KINDS
 def test_in_single_precision_it_conserves_momentum_if_it_says_so(row: EffectRow, dimension: int) -> None:
     """To the rounding of the momenta that were exchanged: 50 steps, each with a rounding of every velocity."""

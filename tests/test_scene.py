@@ -117,13 +117,12 @@ ALL = [
             ),
             marks=pytest.mark.slow,
         )
-        for d in (2, 3)
-        for dtype in ("float64", "float32")
+        for d, dtype in ((2, "float64"), (3, "float32"))
         for row in INTEGRATORS
         if not row.method.solves  # see test_implicit.py
     ),
 ]
-"""Every dimension, precision and method; where slow tests run, every combination of them."""
+"""Every space, dimension, precision and method; where slow tests run, every method flat and in space."""
 
 EVERY = pytest.mark.parametrize("variant", ALL, ids=lambda variant: variant.name)
 
