@@ -21,6 +21,7 @@ KeyPath = tuple[str | int, ...]
 
 Schema = dict[str, Any]
 
+MANY = 30  # names that are listed beside one that is near
 MOST = 100  # errors that are looked at: a file with more is broken in one way, not in a hundred
 
 
@@ -149,8 +150,10 @@ def _reason(path: KeyPath, detail: ErrorDetails, schema: Schema, data: object) -
         return f"unknown key{nearest(str(path[-1]), keys) or ';'} allowed here: {', '.join(keys) or 'no key'}"
     choices = _choices(path, detail, schema, data)
     if choices:
-        start = "missing;" if kind in _MISSING else f"unknown{nearest(str(_value(detail)), choices) or ';'}"
-        return f"{start} allowed: {', '.join(choices)}"
+        close = "" if kind in _MISSING else nearest(str(_value(detail)), choices)
+        start = "missing;" if kind in _MISSING else f"unknown{close or ';'}"
+        more = f" allowed: {', '.join(choices)}" if not close or len(choices) <= MANY else ""
+        return f"{start}{more}"
     node = _schema_at(path, schema, data)
     allowed, about = _range(node), _one_line(node.get("description", ""))
     if kind in _MISSING:
@@ -262,7 +265,8 @@ def _pick(node: Schema, place: object, schema: Schema) -> Schema:
     tagged = node.get("discriminator")
     if tagged and isinstance(place, Mapping):
         name = tagged["mapping"].get(str(place.get(tagged["propertyName"])))
-        chosen = {"$ref": name} if name else {}
+        if name or tagged["propertyName"] in place or not _fits(_follow(chosen, schema), place):
+            chosen = {"$ref": name} if name else {}  # else the first kind, that of a block without one
     elif not tagged:
         chosen = next((m for m in members if _fits(_follow(m, schema), place)), chosen)
     own = {key: value for key, value in node.items() if key == "description"}

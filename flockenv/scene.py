@@ -76,6 +76,10 @@ else:
     ]
 
 
+TURNING = ("max_turn_rate", "banking")
+"""What bodies have only where a group does."""
+
+
 def _demand_whole(name: str, value: object, least: int, most: int | None = None) -> None:
     """Refuse what is no whole number from `least` to `most`, True included."""
     whole = isinstance(value, (int, np.integer)) and not isinstance(value, bool)
@@ -306,8 +310,9 @@ class Scene(Record):
             return np.repeat(np.array(values, self.dtype), [g.size for g in self.groups])
 
         mass = all_masses(self.groups, self.dimension).astype(self.dtype)
-        names = ("radius", "max_speed", "max_force", "max_turn_rate", "banking")
-        return Body(mass, *map(per_agent, names))
+        nobody = np.zeros(0, self.dtype)
+        turning = (per_agent(name) if name in self.parts.frame_numbers else nobody for name in TURNING)
+        return Body(mass, *map(per_agent, ("radius", "max_speed", "max_force")), *turning)
 
     @functools.cached_property
     def parts(self) -> Parts:

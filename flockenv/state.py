@@ -44,8 +44,8 @@ class Body:
     radius: Floats  # (N,) m
     max_speed: Floats  # (N,) m/s, may be inf
     max_force: Floats  # (N,) N, bounds what an agent asks for (drive and steering), not what acts on it; may be inf
-    max_turn_rate: Floats  # (N,) rad/s, may be inf
-    banking: Floats  # (N,) s, in which it leans into its turns; inf = it does not
+    max_turn_rate: Floats  # (N,) rad/s, may be inf; (0,) if nobody has a limit
+    banking: Floats  # (N,) s, in which it leans into its turns; inf = it does not, (0,) if nobody does
 
     def astype(self, dtype: Any) -> Body:
         """Return the same bodies in another precision."""

@@ -26,7 +26,7 @@ from flockenv.spawn import Spawn
 from flockenv.state import State
 from flockenv.sweep import SHARED
 from flockenv.workspace import Workspace
-from tests.catalogue import INTEGRATORS, TETHER, VARIANTS, Array, Variant, everything, scene_of, users_module
+from tests.catalogue import INTEGRATORS, NEAREST, TETHER, VARIANTS, Array, Variant, everything, scene_of, users_module
 
 SPAWN = Spawn(low=(0, 0), high=(10, 10))
 ARRAYS = ("x", "v", "alive", "tick", "key", "obstacle_x", "obstacle_radius", "work")
@@ -104,7 +104,7 @@ FEW = (Separation(weight=1.3, radius=2.5), Alignment(weight=0.7, radius=3, fov=2
 """A sweep, a view cone and a law of one agent: what a method may go wrong with, in a third of the time to compile."""
 
 ALL = [
-    *VARIANTS,
+    *(pytest.param(v, marks=pytest.mark.slow) if v in NEAREST else v for v in VARIANTS),  # see test_neighbours.py too
     *(
         pytest.param(
             Variant(
