@@ -10,12 +10,14 @@ import os
 import platform
 import re
 import subprocess
+import sys
 import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib import metadata
 from itertools import product
+from multiprocessing import get_context
 from pathlib import Path
 from time import perf_counter
 from typing import Annotated, Any
@@ -30,6 +32,7 @@ from agents.experiment import CONFIGS, WEIGHTS, Experiment, load_experiment
 from agents.reynolds import PLAYERS as OTHERS
 from agents.reynolds import player as hand_written
 from flockenv.evaluation import WORLDS_PER_SEED, Episodes, rollout, task_digest, worlds_for
+from flockenv.kernels import cache_folder, laws_digest
 from flockenv.outputs import checked_path
 from flockenv.policy import MlpPolicy, Policy, RandomPolicy, load_player
 from flockenv.refusals import nearest, shown
@@ -124,7 +127,8 @@ def compare(
     alone = next((name for name, playing in plays.items() if not playing), None)
     if alone is not None:
         raise ValueError(f"task {alone!r}: nobody plays it; in other tasks alone: {', '.join(OTHERS)}")
-    episodes = {task.name: _play(task, plays[task.name], worlds, first, advance) for task in tasks}
+    with _compiled_ahead(plays, tasks, worlds):
+        episodes = {task.name: _play(task, plays[task.name], worlds, first, advance) for task in tasks}
     results: report.Results = {
         "seed": seed,
         "worlds": worlds,
@@ -153,6 +157,36 @@ def _sits_out(player: Player, task: Task, tasks: Sequence[Task]) -> bool:
     """Is it a hand-written player for other tasks that are played here?"""
     of = OTHERS.get(player.spec)
     return of is not None and task.name not in of and any(other.name in of for other in tasks)
+
+
+@contextmanager
+def _compiled_ahead(plays: Plays, tasks: Sequence[Task], worlds: int) -> Iterator[None]:
+    """While tasks are played from the first on, let a second process compile what they need from the last on.
+
+    Where this was done before with the same laws, everything is on the disk, and nothing is started.
+    """
+    done = cache_folder() / f"compared_{laws_digest()[:20]}"
+    if len(tasks) < 2 or worlds < WORLDS or (os.cpu_count() or 1) < 2 or done.exists():
+        yield
+        return
+    ours = {task.name: [name for name in plays[task.name] if name in PLAYERS] for task in tasks}
+    child = get_context("spawn").Process(target=_compile, args=([*tasks][::-1], ours), daemon=True)
+    child.start()
+    try:
+        yield
+        done.touch()
+    finally:
+        child.terminate()
+        child.join()
+
+
+def _compile(tasks: Sequence[Task], names: Mapping[str, Sequence[str]]) -> None:
+    """Let the players of each task play a world of it, unseen."""
+    sys.stderr = open(os.devnull, "w")  # noqa: SIM115  # for as long as this process lives
+    known, first = known_players(0), worlds_for("tuning", 0, 1)
+    for task in tasks:
+        for name in names[task.name]:
+            rollout(task, known[name](task), 1, first)
 
 
 def _play(task: Task, policies: Mapping[str, Policy], worlds: int, first: int, advance: Advance) -> dict[str, Episodes]:
