@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from abc import abstractmethod
 from collections.abc import Iterator
 from typing import Annotated, Any, ClassVar, Literal, NamedTuple, Self
 
@@ -107,9 +108,9 @@ class Network(Record):
             raise ValueError(f"{self.kind}: lies in {self.dimension} dimensions, not in {dimension}")
 
     @property
+    @abstractmethod
     def size(self) -> int:
         """How many particles, n."""
-        raise NotImplementedError
 
     @property
     def dimension(self) -> int | None:
@@ -121,34 +122,34 @@ class Network(Record):
         """The names that `pinned` knows."""
         return ()
 
+    @abstractmethod
     def _place(self, name: str) -> NDArray[Any]:
         """The particles of a place."""
-        raise NotImplementedError
 
+    @abstractmethod
     def points(self, dimension: int) -> Floats:
         """Return where particles begin, (n, D) m."""
-        raise NotImplementedError
 
     def rest_points(self, dimension: int) -> Floats:
         """Return where particles are when nothing is strained, (n, D) m; the first one where it begins."""
         points = self.points(dimension)
         return np.asarray(points if self.stretch == 1 else points[0] + (points - points[0]) / self.stretch)
 
+    @abstractmethod
     def springs(self, dimension: int) -> Springs:
         """Return who is tied to whom, and how long each spring is at rest."""
-        raise NotImplementedError
 
     def hinges(self, dimension: int) -> Ints:
         """Return which angles resist bending, (H, 3): end, apex, end."""
         self._demand(dimension)
         return np.zeros((0, 3), np.int32)
 
+    @abstractmethod
     def elements(self, dimension: int) -> Ints:
         """Return finite elements, (E, k): bars (k = 2), triangles (k = 3) or tetrahedra (k = 4).
 
         Triangles in the plane and tetrahedra in space turn positively (det of the edges from the first corner > 0).
         """
-        raise NotImplementedError
 
     def pins(self) -> Ints:
         """Return who is held, (P,) ascending."""

@@ -8,6 +8,7 @@ from __future__ import annotations
 import functools
 import math
 import operator
+from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
@@ -43,22 +44,22 @@ class Shape(Record):
         return len(self.anchor)
 
     @property
+    @abstractmethod
     def anchor(self) -> tuple[float, ...]:
         """The place that the rest is relative to, m."""
-        raise NotImplementedError
 
     @property
+    @abstractmethod
     def extremes(self) -> Floats:
         """Places that everything of it lies between, (n, D) m; none if it has no end."""
-        raise NotImplementedError
 
+    @abstractmethod
     def row(self, dimension: int) -> Sequence[float]:
         """Return the numbers that its laws read, behind the anchor."""
-        raise NotImplementedError
 
+    @abstractmethod
     def outline(self, low: Floats, high: Floats) -> list[Floats]:
         """Return the polygons, each (n, 2) m, that show it from above in a region."""
-        raise NotImplementedError
 
     def gap(self, points: ArrayLike) -> Floats:
         """Return how far its surface is, (...) m; negative inside."""
