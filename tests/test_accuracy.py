@@ -63,6 +63,7 @@ def damped() -> Report:
 # --- orders -----------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_orders_are_the_declared_ones_where_forces_are_smooth(damped: Report) -> None:
     steady = {method.kind for method in usual_methods() if not method.adaptive}
     assert len(steady) >= 8

@@ -100,6 +100,7 @@ def test_the_search_writes_its_result_and_keeps_the_rest_of_the_file(tmp_path: P
 PURSUIT = Experiment(task="pursuit", ppo={**TINY, "steps": 1024})
 
 
+@pytest.mark.slow
 def test_training_is_repeatable_and_exports(tmp_path: Path) -> None:
     from agents import ppo
 
@@ -190,6 +191,7 @@ def _curves(folder: Path, code: int = 0, **changes: Any) -> str:
     return result.stderr
 
 
+@pytest.mark.slow
 def test_curves_train_every_setting_once_and_draw_them(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     from agents import ppo
     from agents.curves import draw

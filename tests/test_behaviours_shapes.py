@@ -316,6 +316,7 @@ def arrived(made: Scene, seconds: float) -> tuple[float, float]:
     return float((np.linalg.norm(state.pos[0] - (12, 0), axis=1) < 0.5).mean()), clear
 
 
+@pytest.mark.slow
 def test_in_a_u_local_steering_is_caught_and_the_global_way_leads_around() -> None:
     local = AvoidObstacles(weight=12, horizon=1, margin=0.1)
     there, _ = arrived(trapped(local, Seek(weight=4, target=(12, 0))), 30)

@@ -206,6 +206,7 @@ def test_pressure_is_its_formula_smooth_and_nothing_beyond_its_radius(dimension:
     assert force(1e-9) == pytest.approx(1.5 * 64, rel=1e-6)
 
 
+@pytest.mark.slow
 @DIMENSIONS
 @pytest.mark.parametrize("crowding", [1.5, 2.0])
 def test_a_crowded_gas_relaxes_to_the_density(dimension: int, crowding: float) -> None:

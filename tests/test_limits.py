@@ -16,7 +16,12 @@ from flockenv.world import World
 HERE = Spawn(low=(4, 4), high=(5, 5))
 
 
-@pytest.mark.parametrize("kind", sorted(INTEGRATORS))
+QUICK = ("dormand_prince", "rk4", "semi_implicit_euler")
+
+
+@pytest.mark.parametrize(
+    "kind", [kind if kind in QUICK else pytest.param(kind, marks=pytest.mark.slow) for kind in sorted(INTEGRATORS)]
+)
 def test_nobody_moves_faster_than_max_speed_by_pushing_on(kind: str) -> None:
     walker = Group(count=1, max_speed=2, max_force=10, spawn=HERE)
     scene = Scene(groups=(walker,), dt=0.1, integrator=INTEGRATORS[kind]())

@@ -497,6 +497,7 @@ def test_two_threads_leave_a_world_of_it_whole(kind: type[Integrator], tether: A
     np.testing.assert_array_equal(ends[0].work, ends[1].work)
 
 
+@pytest.mark.slow
 def test_only_methods_with_steps_of_their_own_count_them(tether: Any) -> None:
     for row in INTEGRATORS:
         scene = Scene(groups=(Group(count=1, spawn=HERE),), effects=(tether(stiffness=1),), integrator=row.method)

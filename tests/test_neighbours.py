@@ -145,6 +145,7 @@ def test_in_a_plane_every_rule_meets_exactly_its_neighbours(rule: int, count: in
     assert met == 1 if count < 96 else met < {96: 1.01, 400: 0.5, 3000: 0.06}[count]  # a grid was used at all
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rule", [0, 1, 2])
 def test_in_space_too(rule: int) -> None:
     after = assert_as_expected((rules(1.0)[rule],), uniform(3000, (9.0, 9.0, 9.0)) - 3.0, None)

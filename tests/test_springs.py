@@ -75,6 +75,7 @@ def test_the_force_is_the_gradient_of_the_energy(name: str, dimension: int) -> N
             assert found[i, k] == pytest.approx(expected, rel=1e-5, abs=1e-4)
 
 
+@pytest.mark.slow
 @DIMENSIONS
 def test_springs_and_hinges_turn_and_move_nothing_as_a_whole(dimension: int) -> None:
     """Momentum and angular momentum, under damping too."""
@@ -92,6 +93,7 @@ def test_springs_and_hinges_turn_and_move_nothing_as_a_whole(dimension: int) -> 
     np.testing.assert_allclose(torque, 0, atol=1e-11)
 
 
+@pytest.mark.slow
 @DIMENSIONS
 def test_damping_only_ever_takes_energy(dimension: int) -> None:
     """E1 of numerics.md: with the printed sign it pumps."""
@@ -225,6 +227,7 @@ def test_a_chain_swings_at_its_eigenfrequencies(ends: str) -> None:
     np.testing.assert_allclose(found, 2 * math.sqrt(k / m) * expected, atol=1e-4)
 
 
+@pytest.mark.slow
 def test_finite_elements_in_motion_come_to_rest_where_statics_says() -> None:
     """M a + D v + K u = F: a bar of ten elements and a plate of triangles under their weight."""
     rope = Rope(links=10, length=1.0, direction=(0, -1), pinned=("start",))
@@ -244,6 +247,7 @@ def test_finite_elements_in_motion_come_to_rest_where_statics_says() -> None:
         np.testing.assert_allclose(end.pos[0] - network.points(2), u.reshape(-1, 2), atol=1e-8)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", [RK4(), ImplicitMidpoint()], ids=lambda method: method.kind)
 def test_a_plate_swings_at_the_frequency_of_its_first_mode(method: Any) -> None:
     """Explicit and implicit: after one period of the first mode everybody is back."""
@@ -289,6 +293,7 @@ def test_lumped_frequencies_are_those_of_the_effect() -> None:
 # --- the same whoever steps -------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @DIMENSIONS
 def test_threads_and_batches_make_no_difference(dimension: int) -> None:
     """A large world is shared, a batch is handed out: bits are the same."""
