@@ -122,9 +122,9 @@ class Network(Record):
         """The names that `pinned` knows."""
         return ()
 
-    @abstractmethod
     def _place(self, name: str) -> NDArray[Any]:
         """The particles of a place."""
+        raise ValueError(f"pinned: a {self.kind} has no place {name!r}; give numbers of particles")
 
     @abstractmethod
     def points(self, dimension: int) -> Floats:
