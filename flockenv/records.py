@@ -68,7 +68,7 @@ class Record(BaseModel, metaclass=_OneLine):
     An unknown or invalid field is refused at construction with a ValueError of one line that names it.
     """
 
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, use_attribute_docstrings=True)
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     def __str__(self) -> str:
         return repr(self)

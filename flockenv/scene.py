@@ -21,6 +21,7 @@ from numpy.typing import ArrayLike, NDArray
 from pydantic import Field, WrapValidator, model_validator
 
 from flockenv import state as states
+from flockenv.constraints import CONSTRAINTS, Constraint, Settler
 from flockenv.crew import share, threads
 from flockenv.divergence import SimulationDiverged
 from flockenv.effects import Effect
@@ -65,6 +66,7 @@ MEMORY_LIMIT = 8 * 2**30
 if TYPE_CHECKING:
     AnyEffect = Effect
     AnyIntegrator = Integrator
+    AnyConstraint = Constraint
 else:
     AnyEffect = Annotated[
         Annotated[functools.reduce(operator.or_, EVERY_EFFECT), Field(discriminator="kind")],
@@ -73,6 +75,10 @@ else:
     AnyIntegrator = Annotated[
         Annotated[functools.reduce(operator.or_, INTEGRATORS.values()), Field(discriminator="kind")],
         WrapValidator(keep(Integrator)),
+    ]
+    AnyConstraint = Annotated[
+        Annotated[functools.reduce(operator.or_, CONSTRAINTS.values()), Field(discriminator="kind")],
+        WrapValidator(keep(Constraint)),
     ]
 
 
@@ -161,6 +167,9 @@ class Scene(Record):
         default=(), description="the same in every world; without a kind, with centre and radius, a circle"
     )
     integrator: AnyIntegrator = Field(default_factory=SemiImplicitEuler)
+    constraints: tuple[AnyConstraint, ...] = Field(
+        default=(), description="what every step must end with, in this order; nothing else is looked after"
+    )
     dt: float = Field(default=0.02, gt=0, description="s, one physics step")
     dtype: Literal["float64", "float32"] = Field(default="float64", description="precision of everything")
 
@@ -168,11 +177,29 @@ class Scene(Record):
     def _consistent(self) -> Scene:
         """Refuse what no single field can know: dimensions that differ, a reach around the torus, too much memory."""
         self._check_dimensions()
-        for k, effect in enumerate(self.effects):
-            try:
-                effect.check(self)
-            except ValueError as error:
-                raise ValueError(f"effects[{k}].{error}") from None
+        listed: dict[str, tuple[Effect | Constraint, ...]] = {"effects": self.effects, "constraints": self.constraints}
+        for name, members in listed.items():
+            for k, member in enumerate(members):
+                try:
+                    member.check(self)
+                except ValueError as error:
+                    raise ValueError(f"{name}[{k}].{error}") from None
+        self._check_space()
+        if self.dtype == "float32":
+            self._check_counts()
+        needed = self.bytes_per_world()
+        if needed > MEMORY_LIMIT:
+            each = needed / self.agents
+            raise ValueError(
+                f"groups: {self.agents:,} agents need about {needed / 2**30:.3g} GiB; at most {MEMORY_LIMIT / 2**30:g} "
+                f"GiB, {int(MEMORY_LIMIT / each):,} agents, are allowed"
+            )
+        check_places(self)
+        check_dt(self)
+        check_lookahead(self)
+        return self
+
+    def _check_space(self) -> None:
         size = getattr(self.space, "size", None)
         if isinstance(self.space, Torus):
             for k, effect in enumerate(self.effects):
@@ -190,19 +217,6 @@ class Scene(Record):
             for k, group in enumerate(self.groups):
                 if 2 * group.radius > min(self.space.size):
                     raise ValueError(f"groups[{k}].radius = {group.radius:g} does not fit into a box of size {size}")
-        if self.dtype == "float32":
-            self._check_counts()
-        needed = self.bytes_per_world()
-        if needed > MEMORY_LIMIT:
-            each = needed / self.agents
-            raise ValueError(
-                f"groups: {self.agents:,} agents need about {needed / 2**30:.3g} GiB; at most {MEMORY_LIMIT / 2**30:g} "
-                f"GiB, {int(MEMORY_LIMIT / each):,} agents, are allowed"
-            )
-        check_places(self)
-        check_dt(self)
-        check_lookahead(self)
-        return self
 
     def _check_counts(self) -> None:
         limit = f"float32 counts exactly up to {EXACT:,}; use dtype = float64"
@@ -299,6 +313,8 @@ class Scene(Record):
             whole += 24
         if parts.arranges and self.agents >= WORTH_ARRANGING:
             reals += parts.luggage_size
+        if self.constraints:
+            reals += 4 * d + sum(constraint.numbers(self) for constraint in self.constraints)
         return self.agents * (reals * real + whole)
 
     @functools.cached_property
@@ -522,6 +538,50 @@ class Scene(Record):
         return self._stepped(state, np.zeros((self.dimension, 0, 0), self.dtype), 1)
 
     def _stepped(self, state: State, drive: Floats, steps: int) -> tuple[int, int]:
+        """Step in place without solving: all steps in one call, or each with its end mended."""
+        return self._settled(state, drive, steps) if self.constraints else self._moved(state, drive, steps)
+
+    def _settled(self, state: State, drive: Floats, steps: int) -> tuple[int, int]:
+        """Step in place and mend the end of each step; a world in which that fails stays as it was, whole."""
+        kept, begun = state.copy(), state.tick.copy()
+        x0, v0, failed = np.empty_like(state.x), np.empty_like(state.v), np.zeros(len(begun), np.bool_)
+        found = (-1, -1)
+        for step in range(steps):
+            x0[...], v0[...] = state.x, state.v
+            moved = self._moved(state, drive, 1)
+            mended = self._mended(x0, v0, state)
+            failed |= state.tick != begun + step + 1
+            failed[[world for world, _ in mended]] = True
+            found = min([f for f in (moved, *mended) if f[0] >= 0], default=found) if found[0] < 0 else found
+            if failed.any():
+                state.put(failed, kept)
+                state.tick[failed] += step + 1  # they take part as if nothing was
+        if failed.any():
+            state.put(failed, kept)
+        return found
+
+    def _mended(self, x0: Floats, v0: Floats, state: State) -> list[tuple[int, int]]:
+        """Mend a step that began at x0, v0, constraint after constraint; return every (world, agent) not finite."""
+        worlds, agents, _ = state.shape
+        crew = min(threads() if worlds * agents >= WORTH_SHARING else 1, worlds)
+        settlers = self._settlers(crew)
+
+        def settle(k: int) -> list[tuple[int, int]]:
+            part = worlds * k // crew, worlds * (k + 1) // crew
+            return [bad for each in settlers[k] if (bad := each(x0, v0, state, *part))[0] >= 0]
+
+        if crew == 1:
+            return settle(0)
+        return [bad for found in share([functools.partial(settle, k) for k in range(crew)]) for bad in found]
+
+    def _settlers(self, count: int) -> list[list[Settler]]:
+        """Return what mends steps, for so many threads: each has scratch of its own."""
+        kept: list[list[Settler]] = vars(self._threads).setdefault("settlers", [])
+        while len(kept) < count:
+            kept.append([constraint.settler(self) for constraint in self.constraints])
+        return kept
+
+    def _moved(self, state: State, drive: Floats, steps: int) -> tuple[int, int]:
         """Step in place by the kernel alone, by as many threads as are in use.
 
         Threads take worlds apart, or, of a large world, its agents.

@@ -143,6 +143,12 @@ class State:
         for name in _ARRAYS:
             getattr(self, name)[...] = getattr(other, name)
 
+    def put(self, rows: NDArray[np.bool_], other: State) -> None:
+        """Overwrite some worlds, (B,), with the same of another state of this shape."""
+        for name in _ARRAYS:
+            at = (slice(None), rows) if name in _PER_COORDINATE else rows
+            getattr(self, name)[at] = getattr(other, name)[at]
+
     def with_motion(self, pos: ArrayLike, vel: ArrayLike) -> State:
         """Return a copy with other positions and velocities, each (B, N, D); refuses other shapes and NaN.
 

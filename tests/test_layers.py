@@ -19,7 +19,7 @@ LAYERS = (
     {"records", "vec", "noise", "kernels"},
     {"state", "space", "steering", "arbitration", "vehicle"},
     {"neighbours", "shapes", "grid", "eikonal", "orca", "polyline", "rows", "networks", "elements", "tree"},
-    {"effects", "integrators", "collisions", "population", "spawn", "sweep", "stability", "rounding"},
+    {"effects", "integrators", "constraints", "population", "spawn", "sweep", "stability", "rounding"},
     {"behaviours"},
     {"steer"},
     {"snapshot", "implicit", "workspace", "scene", "config", "measures", "grants", "explanation"},

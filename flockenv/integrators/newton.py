@@ -14,8 +14,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import sparse
-from scipy.sparse import linalg
 
 __all__ = ["Coupling", "NotSolvedError", "Stage", "coupled", "solve_stage"]
 
@@ -66,6 +64,8 @@ class Coupling:
 
 def coupled(agents: int, first: NDArray[np.integer[Any]], second: NDArray[np.integer[Any]]) -> Coupling:
     """Return who depends on whom: everybody on himself, and `first` on `second`, (R,) each."""
+    from scipy import sparse  # here: it takes a third of a second to load, and who solves nothing need not wait for it
+
     own = np.arange(agents)
     ones = np.ones(agents + len(first))
     depends = sparse.csr_matrix((ones, (np.r_[own, first], np.r_[own, second])), (agents, agents))
@@ -196,6 +196,9 @@ def _matrix(
     residual: _Residual, w: Rows, r: Rows, dimension: int, coupling: Coupling
 ) -> Callable[[Rows], tuple[Rows, int]]:
     """Return a solver of J s = b by a sparse factorisation."""
+    from scipy import sparse
+    from scipy.sparse import linalg
+
     agents, step = len(w) // dimension, _step_of(w)
     moved = np.repeat(w[None], coupling.colours * dimension, axis=0)
     who = np.arange(agents)
@@ -221,6 +224,8 @@ def _matrix(
 
 def _free(residual: _Residual, w: Rows, r: Rows) -> Callable[[Rows], tuple[Rows, int]]:
     """Return a solver of J s = b by GMRES, with J s as a difference along s."""
+    from scipy.sparse import linalg
+
     taken = 0
 
     def along(direction: Rows) -> Rows:

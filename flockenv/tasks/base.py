@@ -159,6 +159,9 @@ class Task(Record):
     @functools.cached_property
     def parts(self) -> Parts:
         """What its kernel is made of: the scene's parts, and the look."""
+        if self.scene.constraints:
+            kinds = ", ".join(constraint.kind for constraint in self.scene.constraints)
+            raise ValueError(f"scene.constraints: {kinds}: a task plays in one kernel, which knows of none yet")
         return replace(self.scene.parts, look=self.look)
 
     def parameters(self) -> dict[str, float]:
