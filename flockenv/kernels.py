@@ -91,6 +91,11 @@ def kernel(function: F) -> F:
     return cast(F, _njit(**OPTIONS)(function))
 
 
+def routine(function: F) -> F:
+    """Mark a function that a kernel calls from several places, and that is compiled once for all of them."""
+    return cast(F, _njit(**{**OPTIONS, "forceinline": False})(function))
+
+
 def shared(function: F) -> F:
     """Mark a law that Python calls too, as it stands: what a method's `advance` needs, which runs in both."""
     mark: Any = register_jitable

@@ -21,7 +21,7 @@ from numpy.typing import ArrayLike, NDArray
 from pydantic import Field, WrapValidator, model_validator
 
 from flockenv import state as states
-from flockenv.constraints import CONSTRAINTS, Constraint, Settler
+from flockenv.constraints import CONSTRAINTS, Collisions, Constraint, Settler
 from flockenv.crew import share, threads
 from flockenv.divergence import SimulationDiverged
 from flockenv.effects import Effect
@@ -336,8 +336,10 @@ class Scene(Record):
         sorts = self.agents >= FEWEST_AGENTS
         crowded = self.agents > MOST_DIRECT
         effects = flattened(self.effects)
+        walled = any(isinstance(constraint, Collisions) and constraint.obstacles for constraint in self.constraints)
+        space = Plane() if walled and isinstance(self.space, Box) else self.space  # its walls are obstacles then
         return Parts(
-            self.dimension, self.space, effects, self.integrator, self.dtype, sorts, crowded=crowded,
+            self.dimension, space, effects, self.integrator, self.dtype, sorts, crowded=crowded,
             oriented=any(group.keeps_heading for group in self.groups),
             turns=any(group.max_turn_rate is not None for group in self.groups),
             leans=any(group.banking is not None for group in self.groups),

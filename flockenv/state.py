@@ -22,10 +22,11 @@ Floats = NDArray[np.floating[Any]]
 
 WORK = (
     "evaluations", "neighbour_queries", "pairs", "obstacle_tests", "substeps", "rejected_steps", "newton_iterations",
-    "linear_iterations",
+    "linear_iterations", "impacts", "unsolved",
 )  # fmt: skip
 """What is counted in State.work: force evaluations, neighbour queries, candidate pairs met, agent-obstacle tests; and,
-by methods that choose their own steps, those accepted and rejected; by methods that solve, their iterations."""
+by methods that choose their own steps, those accepted and rejected; by methods that solve, their iterations; by
+collisions, impacts, and those that were cut short or left unsolved."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,7 +71,7 @@ class State:
     key: NDArray[np.uint64]  # (B,) the world's random key, see noise.py
     obstacle_x: Floats  # (D, B, M) m
     obstacle_radius: Floats  # (B, M) m
-    work: NDArray[np.int64]  # (B, 8) counters, see WORK
+    work: NDArray[np.int64]  # (B, len(WORK)) counters, see WORK
     frame: Floats  # (F, B, N) unit vectors: where everybody faces, in space which way is up; F = 0 if nobody keeps that
     dt: float  # s, one physics step: time = tick dt
 

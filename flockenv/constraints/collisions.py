@@ -1,24 +1,188 @@
-"""Bodies that hit obstacles and each other."""
+"""Bodies that hit obstacles, walls and each other."""
 
 from __future__ import annotations
 
-from typing import Any, Literal
+import warnings
+from typing import Any, ClassVar, Literal
+
+import numpy as np
+from pydantic import Field
 
 from flockenv.constraints.base import Constraint, Settler
-from flockenv.state import Floats, State
+from flockenv.constraints.collide import COUNTED, collide
+from flockenv.constraints.contacts import Contacts, Ends
+from flockenv.constraints.events import Bodies, Meetings, Rules, Things
+from flockenv.constraints.impact import FORM_NUMBERS
+from flockenv.effects.base import ties
+from flockenv.kernels import entry
+from flockenv.neighbours import MAX_RANGES
+from flockenv.shapes import HalfSpace, packed
+from flockenv.space import Box, Torus
+from flockenv.state import WORK, Floats, State
 
-__all__ = ["Collisions"]
+__all__ = ["Collisions", "UnsolvedContactsWarning"]
+
+
+class UnsolvedContactsWarning(RuntimeWarning):
+    """More impacts in a step than are allowed, or contacts that the passes allowed have not solved."""
 
 
 class Collisions(Constraint):
-    """Bodies do not go through obstacles, nor through each other."""
+    """Bodies are solid: discs or balls that do not go through obstacles, the walls of a box, or each other.
+
+    Where within a step somebody meets something is found on the parabola that the method has made of the step, exactly
+    under constant forces, for bodies of any speed. What happens then is a matter of `response`:
+
+    - "earliest": the earliest impact of all happens, those two go on from there, their further ways are looked at anew,
+      and so on; nothing is missed, and an elastic ball keeps its energy.
+    - "back_up": everybody goes back to his first impact with others, responds, and flies on; what further way he then has
+      is looked at with obstacles only.
+    - "impulses": nothing happens within the step; at its end all who overlap give each other impulses, in passes, until
+      nobody goes into anybody. For heaps and crowds; who is fast and small may pass through what is thin.
+    - "project": one such pass, and who is inside is put on the surface. The cheapest, and no more than that.
+
+    All end with a pass over what still touches, so that nobody overlaps. Restitution e is speed after over speed before,
+    across the surface; friction is Coulomb's. A ball dropped from h bounces to e^2 h, and is at rest after
+    sqrt(2 h / g) (1 + e) / (1 - e); a body sticks on an incline up to tan(angle) = friction. Bodies do not spin.
+    """
 
     kind: Literal["collisions"] = "collisions"
+    response: Literal["earliest", "back_up", "impulses", "project"] = Field(
+        default="earliest", description="what happens at an impact, and when"
+    )
+    agents: bool = Field(default=True, description="do bodies meet each other?")
+    obstacles: bool = Field(default=True, description="do they meet obstacles, and the walls of a box?")
+    restitution: float = Field(default=0.5, ge=0, le=1, description="e: 0 = soft, 1 = elastic")
+    friction: float = Field(default=0.0, ge=0, description="Coulomb's coefficient, along surfaces")
+    sticky: bool = Field(default=False, description="do those stay together who touch (glue)?")
+    most: int = Field(default=100, ge=1, description="impacts of the same two in one step; then they rest")
+    passes: int = Field(default=200, ge=1, description="passes over all contacts at the end of a step")
+    part_speed: float | None = Field(
+        default=None, gt=0, description="m/s, how fast those who overlap are moved apart; none = at once"
+    )
+    capacity: ClassVar[int] = 4
+    """Meetings per agent that there is room for at first."""
+
+    def check(self, scene: Any) -> None:
+        """Refuse what cannot be right: twice the same constraint, and bodies as wide as a periodic box."""
+        if sum(isinstance(other, Collisions) for other in scene.constraints) > 1:
+            raise ValueError("kind = collisions: there is another; a scene has its collisions once")
+        widest = max(group.radius for group in scene.groups)
+        if isinstance(scene.space, Torus) and 4 * widest > min(scene.space.size):
+            raise ValueError(
+                f"kind = collisions: bodies of radius {widest:g} m meet their own images on a torus of size "
+                f"{scene.space.size}; at most a quarter of its shortest edge is allowed"
+            )
+
+    def numbers(self, scene: Any) -> int:
+        """Bodies, ends, and room for meetings."""
+        return 8 * scene.dimension + 12 + self.capacity * (8 + 2 * scene.dimension)
 
     def settler(self, scene: Any) -> Settler:
         """Return what mends a step."""
+        return _Settler(self, scene)
 
-        def settle(x0: Floats, v0: Floats, state: State, first: int, end: int) -> tuple[int, int]:
-            return -1, -1
 
-        return settle
+class _Settler:
+    """Mends steps of one scene, with scratch of its own."""
+
+    def __init__(self, record: Collisions, scene: Any) -> None:
+        n, d = scene.agents, scene.dimension
+        self.record, self.scene, self.told = record, scene, False
+        self.size = tuple(float(s) for s in scene.space.size) if scene.space.periodic else (0.0,) * d
+        vectors = [np.zeros((n, d)) for _ in range(6)]
+        body = scene.body
+        light = np.where(np.isfinite(body.mass), 1 / np.asarray(body.mass, float), 0.0)
+        self.bodies = Bodies(
+            *vectors, np.zeros(n), np.zeros(n), np.asarray(body.radius, np.float64), light, np.zeros(n, np.int64),
+            np.zeros(n, np.int64), np.full(n, -1),
+        )  # fmt: skip
+        self.ends = Ends(np.zeros((n, d)), np.zeros((n, d)), ties(n, d))
+        self.before, self.reach = np.zeros((n, d)), np.zeros(n)
+        self.query = (
+            np.zeros(max(n, 64), np.int64), np.zeros(n, np.int32), np.zeros(n, np.int32), np.zeros(n + 1, np.int32),
+            np.zeros((1, n), np.int32), np.zeros((1, 6)), np.zeros(8, np.int64), np.zeros((MAX_RANGES, 3), np.int64),
+        )  # fmt: skip
+        self.things = self._things()
+        self.report = np.zeros(COUNTED, np.int64)
+        self._make_room(record.capacity * n + 64)
+
+    def _make_room(self, places: int) -> None:
+        d = self.scene.dimension
+        whole = lambda *shape: np.zeros(shape, np.int64)  # noqa: E731
+        self.meetings = Meetings(
+            whole(places), whole(places), np.zeros(places), whole(places), whole(places), whole(2, places), whole(places),
+            whole(places), whole(2 * places),
+        )  # fmt: skip
+        self.contacts = Contacts(
+            whole(places), whole(places), np.zeros((places, d)), np.zeros(places), whole(places), np.zeros(places),
+            np.zeros((places, d)), np.zeros((places, d + 1)), np.zeros((places, d + 1)), np.zeros(places),
+            whole(places),
+        )  # fmt: skip
+
+    def _things(self) -> Things:
+        """Return the obstacles: round ones, whose places are those of a world, then others, then walls of a box."""
+        scene, d = self.scene, self.scene.dimension
+        shapes, given = list(scene.shapes), self.record.restitution
+        restitution = [given] * (len(scene.circles) + len(shapes))
+        if isinstance(scene.space, Box):
+            for k in range(d):
+                for side in (0, 1):
+                    point = [0.0] * d
+                    point[k] = side * scene.space.size[k]
+                    out = [0.0] * d
+                    out[k] = 1.0 - 2.0 * side
+                    shapes.append(HalfSpace(point=tuple(point), direction=tuple(out)))
+                    restitution.append(scene.space.restitution)
+        if not self.record.obstacles:
+            shapes, restitution = [], []
+        table, where = packed(shapes, d)
+        rows, forms, places, owners = [], [], [], []
+        for form, (at, count) in where.items():
+            for _ in range(count):
+                rows.append(at)
+                forms.append(FORM_NUMBERS[form])
+                places.append(table[at + 2 : at + 2 + d])
+                owners.append(int(table[at + 1]))
+                at += int(table[at])
+        circles = len(scene.circles) if self.record.obstacles else 0
+        m = circles + len(rows)
+        place = np.zeros((m, d))
+        place[circles:] = np.reshape(places, (-1, d))
+        elastic = np.array(restitution[:circles] + [restitution[circles + k] for k in owners], float).reshape(m)
+        return Things(
+            np.append(table, 0.0), np.array([0] * circles + rows, np.int64), np.array([-1] * circles + forms, np.int64),
+            place, np.zeros((m, d)), np.zeros(m), elastic,
+        )  # fmt: skip
+
+    def __call__(self, x0: Floats, v0: Floats, state: State, first: int, end: int) -> tuple[int, int]:
+        """Mend the steps of some worlds."""
+        r = self.record
+        rules = Rules(
+            self.scene.dt, r.restitution, r.friction, r.sticky, r.most, r.response == "earliest", 1e-12, r.agents
+        )
+        circles = slice(None) if r.obstacles else slice(0, 0)
+        spread = np.inf if r.part_speed is None else r.part_speed * self.scene.dt
+        bad, unsolved = (-1, -1), 0
+        while first < end:
+            short = entry(collide)(
+                self.size, self.size, x0, v0, state.x, state.v, state.alive, state.obstacle_x[:, :, circles],
+                state.obstacle_radius[:, circles], self.bodies, self.meetings, self.things, self.contacts, self.ends,
+                self.before, self.reach, *self.query, rules, r.response in ("earliest", "back_up"),
+                r.response == "project", r.passes, spread, first, end, state.work, WORK.index("impacts"), self.report,
+            )  # fmt: skip
+            world, agent, needed = (int(k) for k in self.report[:3])
+            unsolved += int(self.report[4] + self.report[5])
+            bad = (world, agent) if bad[0] < 0 else bad
+            if short < 0:
+                break
+            first = short
+            self._make_room(2 * needed)
+        if unsolved and not self.told:
+            self.told = True
+            warnings.warn(
+                f"constraints: collisions: {unsolved} impacts or worlds with contacts not solved within most = {r.most} "
+                f"and passes = {r.passes} in a step",
+                UnsolvedContactsWarning, stacklevel=2,
+            )  # fmt: skip
+        return bad

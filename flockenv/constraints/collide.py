@@ -1,0 +1,264 @@
+"""One step of many worlds, mended: who may meet whom, impacts in the order of time or all at once, overlaps parted."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from flockenv.constraints.broad import image, nearby, vector, write
+from flockenv.constraints.contacts import NEARLY, Contacts, Ends, gather, impacts, part, press
+from flockenv.constraints.events import Bodies, Meetings, Rules, Things, link, play, take_off
+from flockenv.constraints.impact import along, surface
+from flockenv.kernels import Vec, kernel
+from flockenv.vec import add, axis, dot, norm, scale, sub, zero
+
+__all__ = ["COUNTED", "collide"]
+
+COUNTED = 6
+"""Numbers that a call reports: world, agent, meetings in all, impacts, impacts cut short, contacts not solved."""
+
+UNSOLVED = 0.1
+"""Part of the velocity that a step adds with which somebody may still go into somebody else."""
+
+DEEP = 0.05
+"""Part of a radius by which two may still overlap."""
+
+EXACT = 8 * 2.0**-52
+"""Rounding of a coordinate, times how large it is."""
+
+
+@kernel
+def _load(period: Vec, array: Any, b: int, i: int) -> Vec:
+    """Return a vector of agent i of world b of an array (D, B, N), in double precision."""
+    if len(period) == 2:
+        return (np.float64(array[0, b, i]), np.float64(array[1, b, i]))
+    else:
+        return (np.float64(array[0, b, i]), np.float64(array[1, b, i]), np.float64(array[2, b, i]))
+
+
+@kernel
+def _board(
+    period: Vec, x0: Any, v0: Any, x: Any, v: Any, alive: Any, b: int, bodies: Bodies, ends: Ends, before: Any,
+    seconds: float,
+) -> tuple[float, float, float, Vec]:  # fmt: skip
+    """Take all bodies of world b aboard; return their largest coordinate, speed, acceleration, and the mean of that."""
+    far, fast, hard, mean = 0.0, 0.0, 0.0, zero(period)
+    for i in range(x.shape[2]):
+        bodies.living[i] = 1 if alive[b, i] else 0
+        begun, done = _load(period, x0, b, i), _load(period, x, b, i)
+        was, now = _load(period, v0, b, i), _load(period, v, b, i)
+        write(bodies.start, i, begun)
+        write(bodies.at, i, begun)
+        write(before, i, was)
+        write(ends.pos, i, done)
+        write(ends.vel, i, now)
+        take_off(period, bodies, i, seconds, image(period, sub(done, begun)), was, now)
+        if bodies.living[i] > 0 and bodies.light[i] > 0.0:
+            for k in range(len(period)):
+                far = max(far, abs(begun[k]), abs(done[k]))
+            a = vector(period, bodies.acc, i)
+            fast, hard, mean = max(fast, norm(now), norm(was)), max(hard, norm(a)), add(mean, a)
+    return far, fast, hard, mean
+
+
+@kernel
+def _with_obstacles(
+    period: Vec, bodies: Bodies, meetings: Meetings, things: Things, at: Any, seconds: float, touch: float, ahead: bool,
+    count: int,
+) -> int:  # fmt: skip
+    """Add who may touch which obstacle: within the step, or at its end; return how many there are."""
+    capacity = meetings.who.shape[0]
+    for m in range(things.form.shape[0]):
+        if things.form[m] < 0:
+            continue
+        drift = vector(period, things.drift, m)
+        place = vector(period, things.place, m)
+        place = place if ahead else add(place, scale(drift, seconds))
+        way = norm(drift) * seconds if ahead else 0.0
+        for i in range(bodies.living.shape[0]):
+            if bodies.living[i] > 0 and bodies.light[i] > 0.0:
+                y = image(period, sub(vector(period, at, i), place))
+                gap, _ = surface(things.form[m], things.table, things.row[m], y)
+                if (
+                    gap
+                    - things.size[m]
+                    - bodies.radius[i]
+                    - (bodies.reach[i] if ahead else NEARLY * bodies.radius[i])
+                    - way
+                    <= touch
+                ):
+                    if count < capacity:
+                        meetings.who[count], meetings.other[count] = i, -1 - m
+                    count += 1
+    return count
+
+
+@kernel
+def _round_ones(period: Vec, things: Things, obstacle_x: Any, obstacle_radius: Any, b: int) -> None:
+    """Take the round obstacles of world b, which come first."""
+    for m in range(obstacle_radius.shape[1]):
+        radius = np.float64(obstacle_radius[b, m])
+        things.form[m] = 0 if radius > 0.0 else -1
+        things.size[m] = radius
+        write(things.place, m, _load(period, obstacle_x, b, m))
+
+
+@kernel
+def collide(
+    size: Vec, period: Vec, x0: Any, v0: Any, x: Any, v: Any, alive: Any, obstacle_x: Any, obstacle_radius: Any,
+    bodies: Bodies, meetings: Meetings, things: Things, contacts: Contacts, ends: Ends, before: Any, reach: Any,
+    grid: Any, order: Any, cell: Any, start: Any, offset: Any, bounds: Any, sync: Any, ranges: Any, rules: Rules,
+    in_time: bool, once: bool, rounds: int, spread: float, first: int, end: int, work: Any, at_work: int, report: Any,
+) -> int:  # fmt: skip
+    """Mend the steps of worlds [first, end) that led from x0, v0 to x, v (D, B, N), in place.
+
+    size: where a periodic box ends, zeros = nowhere; in_time: impacts within the step, one after another; once: one
+    pass over contacts, and places are not advanced anew; spread: m, how far two are parted at most. Returns the world
+    that there was no room for, with the number of its meetings in report[2]: nothing of it is written; else -1.
+    """
+    n, seconds = x.shape[2], rules.seconds
+    report[0], report[1], report[3], report[4], report[5] = -1, -1, 0, 0, 0
+    for b in range(first, end):
+        far, fast, hard, mean = _board(period, x0, v0, x, v, alive, b, bodies, ends, before, seconds)
+        if not (far < np.inf and fast < np.inf):
+            continue
+        _round_ones(period, things, obstacle_x, obstacle_radius, b)
+        touch = rules.touch + EXACT * far
+        count = 0
+        for i in range(n):
+            reach[i] = bodies.reach[i] if in_time else touch + NEARLY * bodies.radius[i]
+        if rules.pairs:
+            work[b, 1] += 1
+            count = nearby(
+                size, bodies.start if in_time else ends.pos, bodies.living, bodies.radius, reach, n, grid, order,
+                cell, start, offset, bounds, sync, ranges, meetings.who, meetings.other,
+            )  # fmt: skip
+        where = bodies.start if in_time else ends.pos
+        count = _with_obstacles(period, bodies, meetings, things, where, seconds, touch, in_time, count)
+        report[2] = count
+        if count > meetings.who.shape[0]:
+            return b
+        for c in range(count):
+            link(bodies, meetings, c)
+        if in_time:
+            told = Rules(
+                rules.seconds,
+                rules.restitution,
+                rules.friction,
+                rules.sticky,
+                rules.most,
+                rules.anew,
+                touch,
+                rules.pairs,
+            )
+            some, cut, count = play(period, bodies, meetings, things, told, count, before)
+            report[2] = count
+            if count > meetings.who.shape[0]:
+                return b
+            report[3] += some
+            report[4] += cut
+            work[b, at_work] += some
+            work[b, at_work + 1] += cut
+            for i in range(n):
+                if bodies.moved[i] > 0:
+                    _land(period, bodies, ends, i, seconds)
+        mean = scale(mean, -1.0 / norm(mean)) if norm(mean) > 1e-9 * hard * n else axis(mean, 0)
+        touching = gather(
+            period,
+            bodies,
+            meetings,
+            things,
+            ends,
+            contacts,
+            seconds,
+            mean,
+            touch,
+            1e-3 * hard * seconds + 1e-12 * fast,
+            in_time,
+            count,
+        )
+        if touching > 0:
+            left = _at_once(
+                period, bodies, things, contacts, ends, before, rules, in_time, once, rounds, fast, hard, spread, touch,
+                touching, work, b, at_work,
+            )  # fmt: skip
+            report[5] += left
+            work[b, at_work + 1] += left
+        bad = _leave(period, size, x, v, b, ends, bodies)
+        if bad >= 0 and report[0] < 0:
+            report[0], report[1] = b, bad
+    return -1
+
+
+@kernel
+def _land(period: Vec, bodies: Bodies, ends: Ends, i: int, seconds: float) -> None:
+    """Write where and how fast the way of body i ends."""
+    left = seconds - bodies.since[i]
+    v, a = vector(period, bodies.vel, i), vector(period, bodies.acc, i)
+    write(ends.pos, i, along(vector(period, bodies.at, i), v, a, left))
+    write(ends.vel, i, add(add(v, scale(a, left)), vector(period, bodies.excess, i)))
+
+
+@kernel
+def _at_once(
+    period: Vec, bodies: Bodies, things: Things, contacts: Contacts, ends: Ends, before: Any, rules: Rules,
+    in_time: bool, once: bool, rounds: int, fast: float, hard: float, spread: float, touch: float, count: int,
+    work: Any, b: int, at_work: int,
+) -> int:  # fmt: skip
+    """Change velocities until nobody goes into anybody, and places until nobody overlaps; return 1 if somebody does."""
+    passes, seconds = 1 if once else rounds, rules.seconds
+    slow = hard * seconds + 1e-12 * fast  # what is slower does not bounce
+    gain = 1e-6 * hard * seconds + 1e-12 * fast
+    n = bodies.living.shape[0]
+    if not in_time:
+        for i in range(n):  # what the step has added comes after the impacts
+            add_ = sub(vector(period, ends.vel, i), vector(period, before, i))
+            write(bodies.vel, i, vector(period, ends.vel, i))
+            write(bodies.acc, i, add_)
+        work[b, at_work] += impacts(
+            period,
+            bodies,
+            things,
+            contacts,
+            before,
+            rules.restitution,
+            rules.friction,
+            rules.sticky,
+            passes,
+            slow,
+            count,
+        )
+        for i in range(n):
+            write(ends.vel, i, add(vector(period, before, i), vector(period, bodies.acc, i)))
+    left = press(period, bodies, things, contacts, ends.vel, rules.friction, rules.sticky, passes, gain, count)
+    if not in_time and not once:
+        for i in range(n):
+            more = sub(vector(period, ends.vel, i), vector(period, bodies.vel, i))
+            write(ends.pos, i, add(vector(period, ends.pos, i), scale(more, seconds)))
+    deep = part(period, bodies, things, ends, seconds, passes, touch, spread, contacts, count)
+    widest = 0.0
+    for i in range(n):
+        widest = max(widest, bodies.radius[i])
+    fails = left > UNSOLVED * hard * seconds + 1e3 * gain or deep > DEEP * widest + 1e3 * touch
+    return 1 if fails and not once else 0
+
+
+@kernel
+def _leave(period: Vec, size: Vec, x: Any, v: Any, b: int, ends: Ends, bodies: Bodies) -> int:
+    """Write everybody back into the batch; return the first who is nowhere, or -1."""
+    bad = -1
+    for i in range(x.shape[2]):
+        if bodies.living[i] == 0:
+            continue
+        at, now = vector(period, ends.pos, i), vector(period, ends.vel, i)
+        if not dot(at, at) + dot(now, now) < np.inf and bad < 0:
+            bad = i
+        for k in range(len(period)):
+            place = at[k]
+            if size[k] > 0.0 and not 0.0 <= place < size[k]:
+                place = place - size[k] * np.floor(place / size[k])
+                place = 0.0 if place >= size[k] or place < 0.0 else place
+            x[k, b, i] = place
+            v[k, b, i] = now[k]
+    return bad

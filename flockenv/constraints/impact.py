@@ -1,0 +1,189 @@
+"""When a body that flies along a parabola first touches something, and what that does to its velocity.
+
+Laws for one body, relative to what it may touch; lengths in m, times in s. What it may touch is a row of a table of
+shapes (flockenv/shapes/table.py), or a point: two round bodies touch when the centre of one is as far from that of the
+other as both radii together, their `room`.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from flockenv.kernels import Vec, kernel, law, routine
+from flockenv.shapes.block import hit_block, hit_half_space, nearest_block, nearest_half_space
+from flockenv.shapes.chain import hit_chain, nearest_chain
+from flockenv.shapes.field import hit_distance_field, nearest_distance_field
+from flockenv.shapes.round import ray_hit
+from flockenv.vec import add, axis, dot, norm, scale, select, sub, unit
+
+__all__ = [
+    "FORM_NUMBERS", "POINT", "along", "bounced", "ends_here", "first_impact", "flight", "rubbed", "surface",
+]  # fmt: skip
+
+POINT = 0
+FORM_NUMBERS = {"chain": 1, "block": 2, "half_space": 3, "distance_field": 4}
+"""By which number a row says what form it has (those of flockenv.shapes.FORMS); 0 is a point."""
+
+CHORDS = 8
+"""Pieces that a path is cut into at most."""
+
+POLISH = 8
+"""Steps of Newton's method after a chord has hit."""
+
+
+@routine
+def surface(form: int, table: Any, at: int, y: Vec) -> tuple[float, Vec]:
+    """Return how far the surface is, m, and the unit normal there, of a shape or a point, from y relative to it."""
+    if form == 1:
+        return nearest_chain(table, at, y)
+    if form == 2:
+        return nearest_block(table, at, y)
+    if form == 3:
+        return nearest_half_space(table, at, y)
+    if form == 4:
+        return nearest_distance_field(table, at, y)
+    far = norm(y)
+    return far, select(far > 0.0, unit(y), axis(y, 0))
+
+
+@routine
+def _hit(form: int, table: Any, at: int, y: Vec, way: Vec, room: float) -> float:
+    """Return how far along a unit vector a body of this radius touches, m."""
+    if form == 1:
+        return hit_chain(table, at, y, way, room)
+    if form == 2:
+        return hit_block(table, at, y, way, room)
+    if form == 3:
+        return hit_half_space(table, at, y, way, room)
+    if form == 4:
+        return hit_distance_field(table, at, y, way, room)
+    return ray_hit(scale(y, -1.0), way, room)
+
+
+@law
+def along(x: Vec, v: Vec, a: Vec, t: float) -> Vec:
+    """Return x + v t + a t^2 / 2."""
+    return add(x, scale(add(v, scale(a, 0.5 * t)), t))
+
+
+@law
+def flight(dt: float, moved: Vec, before: Vec, after: Vec) -> tuple[Vec, Vec, Vec]:
+    """Return the velocity at the beginning of a step, the acceleration, and the method's excess of velocity at its end.
+
+    The parabola leads `moved` m further in a step over which the method changed velocity from `before` to `after`. A
+    method of first order is half a step ahead or behind with its velocity; its points lie on a parabola all the same
+    (flockenv/space.py).
+    """
+    a = scale(sub(after, before), 1.0 / dt)
+    excess = sub(sub(after, scale(moved, 1.0 / dt)), scale(a, 0.5 * dt))
+    return sub(before, excess), a, excess
+
+
+@law
+def _starts(w: float, a: float, far: float, touch: float) -> float:
+    """Return from when on a body that touches already may touch anew: 0 = now, inf = never.
+
+    w, a: how fast it leaves, and is accelerated, along the normal. What takes it in by less than it counts as touching
+    is rounding.
+    """
+    fall = -a if a < 0.0 else 0.0
+    if w <= 0.0:
+        return 0.0 if (0.5 * fall * far - w) * far > 0.5 * touch else np.inf
+    return w / fall if 2.0 * w < fall * far else np.inf  # the top of its hop
+
+
+@routine
+def first_impact(
+    form: int, table: Any, at: int, y: Vec, v: Vec, a: Vec, far: float, room: float, touch: float
+) -> float:
+    """Return when a body at y, at v, accelerated by a, first comes to touch within `far` s; inf if it does not.
+
+    It touches where its gap is at most `touch`, m. A path is cut into chords so short that it bends by no more than a
+    hundredth of the room, each chord is followed exactly, and where one hits the moment is polished on the parabola.
+    Who overlaps already and goes in deeper touches now; who leaves, only where he comes back.
+    """
+    gap, n = surface(form, table, at, y)
+    if gap - room > touch:
+        return _followed(form, table, at, y, v, a, 0.0, far, room, room, touch)
+    top = _starts(dot(v, n), dot(a, n), far, touch)
+    if top <= 0.0:
+        return 0.0
+    away = min(top, far)  # until then it leaves what it touches; of the same shape it may meet something else
+    t = _followed(form, table, at, y, v, a, 0.0, away, room, gap - 1e-9 * room - touch, touch)
+    if t < np.inf or top >= far:
+        return t
+    if surface(form, table, at, along(y, v, a, top))[0] - room <= touch:  # it never got away
+        return min(2.0 * top, far)
+    return _followed(form, table, at, y, v, a, top, far, room, room, touch)
+
+
+@routine
+def _followed(
+    form: int, table: Any, at: int, y: Vec, v: Vec, a: Vec, begin: float, far: float, room: float, seen: float,
+    touch: float,
+) -> float:  # fmt: skip
+    """Return when within [begin, far] its surface is met, whose chords are followed as if the room was `seen`."""
+    bend = norm(a) * (far - begin) * (far - begin) / 8.0
+    chords = int(min(1.0 + np.sqrt(bend / (0.01 * room + 1e-12)), CHORDS * 1.0))
+    each = (far - begin) / chords
+    for c in range(chords):
+        since = begin + c * each
+        here = along(y, v, a, since)
+        way = sub(along(y, v, a, since + each), here)
+        length = norm(way)
+        hit = _hit(form, table, at, here, unit(way), max(seen, 0.0)) if length > 0.0 else np.inf
+        if hit <= length:
+            t = _polished(form, table, at, y, v, a, begin, far, room, since + each * hit / length)
+            gap, n = surface(form, table, at, along(y, v, a, t))
+            if gap - room <= touch + 1e-9 * room and dot(add(v, scale(a, t)), n) < 0.0:
+                return t
+    return np.inf
+
+
+@kernel
+def _polished(
+    form: int, table: Any, at: int, y: Vec, v: Vec, a: Vec, begin: float, far: float, room: float, t: float
+) -> float:
+    """Return the moment near t at which the gap is 0, by Newton's method."""
+    for _ in range(POLISH):
+        gap, n = surface(form, table, at, along(y, v, a, t))
+        w = dot(add(v, scale(a, t)), n)
+        if not w < 0.0:
+            break
+        off = (gap - room) / w
+        t = min(max(t - off, begin), far)
+        if abs(off) <= 1e-15 * far:
+            break
+    return t
+
+
+@law
+def bounced(c: Vec, n: Vec, restitution: float, friction: float) -> Vec:
+    """Return the velocity after an impact at velocity c relative to a surface of normal n, if it goes into it.
+
+    The normal part turns around and keeps the share `restitution`. Coulomb's friction takes at most friction times as
+    much from the part along the surface as the impact gave across it, and never turns that part around.
+    """
+    w = -dot(c, n)
+    if w <= 0.0:
+        return c
+    side = add(c, scale(n, w))
+    return add(rubbed(side, friction * (1.0 + restitution) * w), scale(n, restitution * w))
+
+
+@law
+def rubbed(side: Vec, most: float) -> Vec:
+    """Return a velocity along a surface, less `most` m/s; nothing if that is more than there is."""
+    speed = norm(side)
+    return scale(side, 1.0 - most / speed if speed > most else 0.0)
+
+
+@law
+def ends_here(w: float, push: float, restitution: float, left: float) -> bool:
+    """Do all further bounces on a plane, each of `restitution` times the speed, end within so many seconds?
+
+    A body that comes at w > 0 and is accelerated by `push` < 0 into the plane bounces 2 e w / (-push (1 - e)) s long.
+    """
+    return push < 0.0 and 2.0 * restitution * w <= -push * (1.0 - restitution) * left
