@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from flockenv.kernels import Vec, kernel, law
-from flockenv.neighbours import candidates, count_cells
+from flockenv.neighbours import candidates, count_cells, row_of
 from flockenv.vec import dot, sub
 
 __all__ = ["image", "nearby", "vector", "write"]
@@ -52,7 +52,7 @@ def near(period: Vec, at: Any, radius: Any, reach: Any, i: int, j: int) -> bool:
     """Do the balls of two bodies overlap?"""
     d = image(period, sub(vector(period, at, j), vector(period, at, i)))
     room = radius[i] + radius[j] + reach[i] + reach[j]
-    return dot(d, d) <= room * room
+    return bool(dot(d, d) <= room * room)
 
 
 @kernel
@@ -86,66 +86,63 @@ def nearby(
     at (N, D) m; living, radius, reach (N,); `first` and `second` are written as far as they go: more pairs than that
     are counted only. The rest is scratch of the query.
     """
-    size, periodic = period, period[0] > 0.0
+    periodic = period[0] > 0.0
     common = _common_reach(living, radius, reach, n, grid)
-    found, capacity = 0, first.shape[0]
-    present = 0
-    for i in range(n):  # those that are met by cells; the others are compared with everybody
-        usual = living[i] > 0 and radius[i] + reach[i] <= common
-        grid[i] = 1 if usual else 0
-        present += 1 if usual else 0
+    present = _mark(living, radius, reach, n, common, grid)
     shape = count_cells(
-        at.reshape(-1),
-        grid,
-        0,
-        n,
-        1,
-        0,
-        1,
-        sync,
-        bounds,
-        size,
-        2.0 * common,
-        periodic,
-        periodic,
-        n,
-        cell,
-        start,
+        at.reshape(-1), grid, 0, n, 1, 0, 1, sync, bounds, period, 2.0 * common, periodic, periodic, n, cell, start,
         offset,
-    )
+    )  # fmt: skip
     cells = shape[0] * shape[1] * shape[2]
-    if cells == 0:
-        k = 0
-        for i in range(n):
-            if grid[i] > 0:
-                order[k] = i
-                k += 1
-    else:
-        for i in range(n):
-            if grid[i] > 0:
-                order[offset[0, cell[i]]] = i
-                offset[0, cell[i]] += 1
-    line, spot = 0, 0
+    _arrange(grid, cell, offset, n, cells, order)
+    found, line, spot, count = 0, 0, 0, 1
     for p in range(present):
-        i = order[p]
         if cells == 0:
-            ranges[0, 0], ranges[0, 1], count = p + 1, present, 1
+            ranges[0, 0], ranges[0, 1] = p + 1, present
         else:
-            while start[(line + 1) * shape[0]] <= p:
-                line += 1
+            line = row_of(p, start, line, shape[0])
             count, spot = candidates(p, p + 1, line, max(spot, line * shape[0]), shape, start, periodic, ranges)
         for r in range(count):
             for q in range(ranges[r, 0], ranges[r, 1]):
-                j = order[q]
-                if (cells == 0 or j > i) and near(period, at, radius, reach, i, j):
-                    if found < capacity:
-                        first[found], second[found] = min(i, j), max(i, j)
-                    found += 1
+                if cells == 0 or order[q] > order[p]:
+                    found = _kept(period, at, radius, reach, order[p], order[q], found, first, second)
     for i in range(n):
         if living[i] > 0 and grid[i] == 0:
             for j in range(n):
-                if living[j] > 0 and j != i and (grid[j] > 0 or j > i) and near(period, at, radius, reach, i, j):
-                    if found < capacity:
-                        first[found], second[found] = min(i, j), max(i, j)
-                    found += 1
+                if living[j] > 0 and j != i and (grid[j] > 0 or j > i):
+                    found = _kept(period, at, radius, reach, i, j, found, first, second)
     return found
+
+
+@kernel
+def _mark(living: Any, radius: Any, reach: Any, n: int, common: float, grid: Any) -> int:
+    """Mark those who are met by cells; the others are compared with everybody. Return how many are marked."""
+    present = 0
+    for i in range(n):
+        grid[i] = 1 if living[i] > 0 and radius[i] + reach[i] <= common else 0
+        present += grid[i]
+    return present
+
+
+@kernel
+def _arrange(grid: Any, cell: Any, offset: Any, n: int, cells: int, order: Any) -> None:
+    """List the marked in the order of their cells; as they come if there are none."""
+    at = 0
+    for i in range(n):
+        if grid[i] > 0:
+            to = at
+            if cells > 0:
+                to = offset[0, cell[i]]
+                offset[0, cell[i]] += 1
+            order[to] = i
+            at += 1
+
+
+@kernel
+def _kept(period: Vec, at: Any, radius: Any, reach: Any, i: int, j: int, found: int, first: Any, second: Any) -> int:
+    """Add a pair if its balls overlap, and there is room; return how many there are."""
+    if not near(period, at, radius, reach, i, j):
+        return found
+    if found < first.shape[0]:
+        first[found], second[found] = min(i, j), max(i, j)
+    return found + 1

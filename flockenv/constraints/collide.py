@@ -15,8 +15,8 @@ from flockenv.vec import add, axis, dot, norm, scale, sub, zero
 
 __all__ = ["COUNTED", "collide"]
 
-COUNTED = 6
-"""Numbers that a call reports: world, agent, meetings in all, impacts, impacts cut short, contacts not solved."""
+COUNTED = 5
+"""Numbers that a call reports: world, agent, meetings in all, impacts, and what was cut short or left unsolved."""
 
 UNSOLVED = 0.1
 """Part of the velocity that a step adds with which somebody may still go into somebody else."""
@@ -117,78 +117,80 @@ def collide(
     pass over contacts, and places are not advanced anew; spread: m, how far two are parted at most. Returns the world
     that there was no room for, with the number of its meetings in report[2]: nothing of it is written; else -1.
     """
-    n, seconds = x.shape[2], rules.seconds
-    report[0], report[1], report[3], report[4], report[5] = -1, -1, 0, 0, 0
+    scratch = (grid, order, cell, start, offset, bounds, sync, ranges)
+    report[0], report[1], report[3], report[4] = -1, -1, 0, 0
     for b in range(first, end):
-        far, fast, hard, mean = _board(period, x0, v0, x, v, alive, b, bodies, ends, before, seconds)
+        impacts_before, unsolved_before = report[3], report[4]
+        far, fast, hard, mean = _board(period, x0, v0, x, v, alive, b, bodies, ends, before, rules.seconds)
         if not (far < np.inf and fast < np.inf):
             continue
         _round_ones(period, things, obstacle_x, obstacle_radius, b)
-        touch = rules.touch + EXACT * far
-        count = 0
-        for i in range(n):
-            reach[i] = bodies.reach[i] if in_time else touch + NEARLY * bodies.radius[i]
-        if rules.pairs:
-            work[b, 1] += 1
-            count = nearby(
-                size, bodies.start if in_time else ends.pos, bodies.living, bodies.radius, reach, n, grid, order,
-                cell, start, offset, bounds, sync, ranges, meetings.who, meetings.other,
-            )  # fmt: skip
-        where = bodies.start if in_time else ends.pos
-        count = _with_obstacles(period, bodies, meetings, things, where, seconds, touch, in_time, count)
+        told = Rules(
+            rules.seconds, rules.restitution, rules.friction, rules.sticky, rules.most, rules.anew,
+            rules.touch + EXACT * far, rules.pairs,
+        )  # fmt: skip
+        count = _meetings(size, period, bodies, meetings, things, ends, told, reach, in_time, scratch)
+        if in_time and count <= meetings.who.shape[0]:
+            count = _fly(period, bodies, meetings, things, ends, told, before, count, report)
         report[2] = count
         if count > meetings.who.shape[0]:
             return b
-        for c in range(count):
-            link(bodies, meetings, c)
-        if in_time:
-            told = Rules(
-                rules.seconds,
-                rules.restitution,
-                rules.friction,
-                rules.sticky,
-                rules.most,
-                rules.anew,
-                touch,
-                rules.pairs,
-            )
-            some, cut, count = play(period, bodies, meetings, things, told, count, before)
-            report[2] = count
-            if count > meetings.who.shape[0]:
-                return b
-            report[3] += some
-            report[4] += cut
-            work[b, at_work] += some
-            work[b, at_work + 1] += cut
-            for i in range(n):
-                if bodies.moved[i] > 0:
-                    _land(period, bodies, ends, i, seconds)
-        mean = scale(mean, -1.0 / norm(mean)) if norm(mean) > 1e-9 * hard * n else axis(mean, 0)
+        mean = scale(mean, -1.0 / norm(mean)) if norm(mean) > 1e-9 * hard * x.shape[2] else axis(mean, 0)
+        slow = 1e-3 * hard * rules.seconds + 1e-12 * fast
         touching = gather(
-            period,
-            bodies,
-            meetings,
-            things,
-            ends,
-            contacts,
-            seconds,
-            mean,
-            touch,
-            1e-3 * hard * seconds + 1e-12 * fast,
-            in_time,
-            count,
+            period, bodies, meetings, things, ends, contacts, rules.seconds, mean, told.touch, slow, in_time, count
         )
         if touching > 0:
-            left = _at_once(
-                period, bodies, things, contacts, ends, before, rules, in_time, once, rounds, fast, hard, spread, touch,
-                touching, work, b, at_work,
+            _at_once(
+                period, bodies, things, contacts, ends, before, told, in_time, once, rounds, fast, hard, spread,
+                touching, report,
             )  # fmt: skip
-            report[5] += left
-            work[b, at_work + 1] += left
+        work[b, 1] += 1 if rules.pairs else 0
+        work[b, at_work] += report[3] - impacts_before
+        work[b, at_work + 1] += report[4] - unsolved_before
         bad = _leave(period, size, x, v, b, ends, bodies)
         if bad >= 0 and report[0] < 0:
             report[0], report[1] = b, bad
     return -1
+
+
+@kernel
+def _meetings(
+    size: Vec, period: Vec, bodies: Bodies, meetings: Meetings, things: Things, ends: Ends, rules: Rules, reach: Any,
+    in_time: bool, scratch: Any,
+) -> int:  # fmt: skip
+    """Find who may meet what within the step, or nearly touches at its end; return how many, room for them or not."""
+    grid, order, cell, start, offset, bounds, sync, ranges = scratch
+    n, count = bodies.living.shape[0], 0
+    where = bodies.start if in_time else ends.pos
+    for i in range(n):
+        reach[i] = bodies.reach[i] if in_time else rules.touch + NEARLY * bodies.radius[i]
+    if rules.pairs:
+        count = nearby(
+            size, where, bodies.living, bodies.radius, reach, n, grid, order, cell, start, offset, bounds, sync, ranges,
+            meetings.who, meetings.other,
+        )  # fmt: skip
+    count = _with_obstacles(period, bodies, meetings, things, where, rules.seconds, rules.touch, in_time, count)
+    if count <= meetings.who.shape[0]:
+        for c in range(count):
+            link(bodies, meetings, c)
+    return count
+
+
+@kernel
+def _fly(
+    period: Vec, bodies: Bodies, meetings: Meetings, things: Things, ends: Ends, rules: Rules, before: Any, count: int,
+    report: Any,
+) -> int:  # fmt: skip
+    """Let everybody fly through the step; return how many meetings there are, room for them or not."""
+    some, cut, count = play(period, bodies, meetings, things, rules, count, before)
+    if count <= meetings.who.shape[0]:
+        report[3] += some
+        report[4] += cut
+        for i in range(bodies.living.shape[0]):
+            if bodies.moved[i] > 0:
+                _land(period, bodies, ends, i, rules.seconds)
+    return count
 
 
 @kernel
@@ -203,32 +205,20 @@ def _land(period: Vec, bodies: Bodies, ends: Ends, i: int, seconds: float) -> No
 @kernel
 def _at_once(
     period: Vec, bodies: Bodies, things: Things, contacts: Contacts, ends: Ends, before: Any, rules: Rules,
-    in_time: bool, once: bool, rounds: int, fast: float, hard: float, spread: float, touch: float, count: int,
-    work: Any, b: int, at_work: int,
-) -> int:  # fmt: skip
-    """Change velocities until nobody goes into anybody, and places until nobody overlaps; return 1 if somebody does."""
-    passes, seconds = 1 if once else rounds, rules.seconds
-    slow = hard * seconds + 1e-12 * fast  # what is slower does not bounce
-    gain = 1e-6 * hard * seconds + 1e-12 * fast
-    n = bodies.living.shape[0]
+    in_time: bool, once: bool, rounds: int, fast: float, hard: float, spread: float, count: int, report: Any,
+) -> None:  # fmt: skip
+    """Change velocities until nobody goes into anybody, and places until nobody overlaps; report if somebody does."""
+    passes, seconds, n = 1 if once else rounds, rules.seconds, bodies.living.shape[0]
+    least = 1e-12 * fast
+    gain = 1e-6 * hard * seconds + least
     if not in_time:
-        for i in range(n):  # what the step has added comes after the impacts
-            add_ = sub(vector(period, ends.vel, i), vector(period, before, i))
+        for i in range(n):  # what the step has added comes after the impacts; what is slower than it does not bounce
             write(bodies.vel, i, vector(period, ends.vel, i))
-            write(bodies.acc, i, add_)
-        work[b, at_work] += impacts(
-            period,
-            bodies,
-            things,
-            contacts,
-            before,
-            rules.restitution,
-            rules.friction,
-            rules.sticky,
-            passes,
-            slow,
-            count,
-        )
+            write(bodies.acc, i, sub(vector(period, ends.vel, i), vector(period, before, i)))
+        report[3] += impacts(
+            period, bodies, things, contacts, before, rules.restitution, rules.friction, rules.sticky, passes,
+            hard * seconds + least, count,
+        )  # fmt: skip
         for i in range(n):
             write(ends.vel, i, add(vector(period, before, i), vector(period, bodies.acc, i)))
     left = press(period, bodies, things, contacts, ends.vel, rules.friction, rules.sticky, passes, gain, count)
@@ -236,12 +226,11 @@ def _at_once(
         for i in range(n):
             more = sub(vector(period, ends.vel, i), vector(period, bodies.vel, i))
             write(ends.pos, i, add(vector(period, ends.pos, i), scale(more, seconds)))
-    deep = part(period, bodies, things, ends, seconds, passes, touch, spread, contacts, count)
-    widest = 0.0
+    deep, widest = part(period, bodies, things, ends, seconds, passes, rules.touch, spread, contacts, count), 0.0
     for i in range(n):
         widest = max(widest, bodies.radius[i])
-    fails = left > UNSOLVED * hard * seconds + 1e3 * gain or deep > DEEP * widest + 1e3 * touch
-    return 1 if fails and not once else 0
+    if not once and (left > UNSOLVED * hard * seconds + 1e3 * gain or deep > DEEP * widest + 1e3 * rules.touch):
+        report[4] += 1
 
 
 @kernel

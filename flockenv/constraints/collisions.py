@@ -6,6 +6,7 @@ import warnings
 from typing import Any, ClassVar, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field
 
 from flockenv.constraints.base import Constraint, Settler
@@ -35,14 +36,15 @@ class Collisions(Constraint):
 
     - "earliest": the earliest impact of all happens, those two go on from there, their further ways are looked at anew,
       and so on; nothing is missed, and an elastic ball keeps its energy.
-    - "back_up": everybody goes back to his first impact with others, responds, and flies on; what further way he then has
-      is looked at with obstacles only.
-    - "impulses": nothing happens within the step; at its end all who overlap give each other impulses, in passes, until
+    - "back_up": everybody goes back to his first impact with others, responds, and flies on; what further way he then
+      has is looked at with obstacles only.
+    - "impulses": nothing happens within the step; at its end all who touch give each other impulses, in passes, until
       nobody goes into anybody. For heaps and crowds; who is fast and small may pass through what is thin.
-    - "project": one such pass, and who is inside is put on the surface. The cheapest, and no more than that.
+    - "project": one such pass, and who is inside is put on the surface. The cheapest, and no more than that: it loses
+      energy at every impact.
 
-    All end with a pass over what still touches, so that nobody overlaps. Restitution e is speed after over speed before,
-    across the surface; friction is Coulomb's. A ball dropped from h bounces to e^2 h, and is at rest after
+    All end with passes over what still touches, so that nobody overlaps. Restitution e is speed after over speed
+    before, across the surface; friction is Coulomb's. A ball dropped from h bounces to e^2 h, and is at rest after
     sqrt(2 h / g) (1 + e) / (1 - e); a body sticks on an incline up to tan(angle) = friction. Bodies do not spin.
     """
 
@@ -76,7 +78,7 @@ class Collisions(Constraint):
 
     def numbers(self, scene: Any) -> int:
         """Bodies, ends, and room for meetings."""
-        return 8 * scene.dimension + 12 + self.capacity * (8 + 2 * scene.dimension)
+        return int(8 * scene.dimension + 12 + self.capacity * (12 + 4 * scene.dimension))
 
     def settler(self, scene: Any) -> Settler:
         """Return what mends a step."""
@@ -90,12 +92,13 @@ class _Settler:
         n, d = scene.agents, scene.dimension
         self.record, self.scene, self.told = record, scene, False
         self.size = tuple(float(s) for s in scene.space.size) if scene.space.periodic else (0.0,) * d
-        vectors = [np.zeros((n, d)) for _ in range(6)]
+        start, at, vel, acc, free, excess = (np.zeros((n, d)) for _ in range(6))
         body = scene.body
         light = np.where(np.isfinite(body.mass), 1 / np.asarray(body.mass, float), 0.0)
         self.bodies = Bodies(
-            *vectors, np.zeros(n), np.zeros(n), np.asarray(body.radius, np.float64), light, np.zeros(n, np.int64),
-            np.zeros(n, np.int64), np.full(n, -1),
+            start=start, at=at, vel=vel, acc=acc, free=free, excess=excess, since=np.zeros(n), reach=np.zeros(n),
+            radius=np.asarray(body.radius, np.float64), light=light, living=np.zeros(n, np.int64),
+            moved=np.zeros(n, np.int64), first=np.full(n, -1),
         )  # fmt: skip
         self.ends = Ends(np.zeros((n, d)), np.zeros((n, d)), ties(n, d))
         self.before, self.reach = np.zeros((n, d)), np.zeros(n)
@@ -108,16 +111,20 @@ class _Settler:
         self._make_room(record.capacity * n + 64)
 
     def _make_room(self, places: int) -> None:
+        """Allocate for so many meetings."""
         d = self.scene.dimension
-        whole = lambda *shape: np.zeros(shape, np.int64)  # noqa: E731
+
+        def whole(*shape: int) -> NDArray[np.int64]:
+            return np.zeros(shape, np.int64)
+
         self.meetings = Meetings(
-            whole(places), whole(places), np.zeros(places), whole(places), whole(places), whole(2, places), whole(places),
-            whole(places), whole(2 * places),
+            who=whole(places), other=whole(places), time=np.zeros(places), hits=whole(places), closed=whole(places),
+            following=whole(2, places), listed=whole(places), active=whole(places), todo=whole(2 * places),
         )  # fmt: skip
         self.contacts = Contacts(
-            whole(places), whole(places), np.zeros((places, d)), np.zeros(places), whole(places), np.zeros(places),
-            np.zeros((places, d)), np.zeros((places, d + 1)), np.zeros((places, d + 1)), np.zeros(places),
-            whole(places),
+            who=whole(places), other=whole(places), normal=np.zeros((places, d)), allowed=np.zeros(places),
+            open=whole(places), push=np.zeros(places), rub=np.zeros((places, d)), was=np.zeros((places, d + 1)),
+            way=np.zeros((places, d + 1)), rank=np.zeros(places), order=whole(places),
         )  # fmt: skip
 
     def _things(self) -> Things:
@@ -172,7 +179,7 @@ class _Settler:
                 r.response == "project", r.passes, spread, first, end, state.work, WORK.index("impacts"), self.report,
             )  # fmt: skip
             world, agent, needed = (int(k) for k in self.report[:3])
-            unsolved += int(self.report[4] + self.report[5])
+            unsolved += int(self.report[4])
             bad = (world, agent) if bad[0] < 0 else bad
             if short < 0:
                 break
@@ -181,8 +188,8 @@ class _Settler:
         if unsolved and not self.told:
             self.told = True
             warnings.warn(
-                f"constraints: collisions: {unsolved} impacts or worlds with contacts not solved within most = {r.most} "
-                f"and passes = {r.passes} in a step",
+                f"constraints: collisions: in a step {unsolved} impacts or worlds with contacts were not solved within "
+                f"most = {r.most} and passes = {r.passes}",
                 UnsolvedContactsWarning, stacklevel=2,
             )  # fmt: skip
         return bad

@@ -3,16 +3,14 @@
 Sequential impulses: contact after contact, up and down along the mean acceleration, each as if it were the only one,
 until none is left to do anything. First impacts, with the velocities of before the step, which keep the share e of
 their approach (Guendelman, Bridson and Fedkiw 2003: so what a step's own acceleration adds never bounces, and what lies
-is still); then what the step has added, without any bounce, with impulses that are summed, never pull, and give friction
-its bound. Overlaps that are left are parted, the lighter one further; velocities do not hear of that, so nobody is
-shot away from where he overlapped.
+is still); then what the step has added, without any bounce, with impulses that are summed, never pull, and give
+friction its bound. Overlaps that are left are parted, the lighter one further; velocities do not hear of that, so
+nobody is shot away from where he overlapped.
 """
 
 from __future__ import annotations
 
 from typing import Any, NamedTuple
-
-import numpy as np
 
 from flockenv.constraints.broad import image, vector, write
 from flockenv.constraints.events import Bodies, Meetings, Things
@@ -138,7 +136,7 @@ def _give(period: Vec, bodies: Bodies, vel: Any, i: int, j: int, impulse: Vec) -
 @kernel
 def _ease(bodies: Bodies, i: int, j: int) -> float:
     """Return by how much an impulse of 1 kg m/s changes the velocity between two, 1/kg."""
-    return bodies.light[i] + (bodies.light[j] if j >= 0 else 0.0)
+    return float(bodies.light[i] + (bodies.light[j] if j >= 0 else 0.0))
 
 
 @kernel
@@ -210,7 +208,7 @@ def press(
     period: Vec, bodies: Bodies, things: Things, contacts: Contacts, vel: Any, friction: float, sticky: bool,
     rounds: int, slow: float, count: int,
 ) -> float:  # fmt: skip
-    """Stop those who go into each other at velocities (N, D), without a bounce; return the fastest change of the last pass.
+    """Stop those who go into each other at velocities (N, D), without a bounce; return the last pass's fastest change.
 
     The impulse of each contact is summed and never pulls; friction is bounded by what was given across, friction times
     as much (Coulomb), and stops what it can. Sticky contacts pull as well as push. Passes go on along the direction of
@@ -258,7 +256,7 @@ def part(
     period: Vec, bodies: Bodies, things: Things, ends: Ends, seconds: float, rounds: int, touch: float, most: float,
     contacts: Contacts, count: int,
 ) -> float:  # fmt: skip
-    """Move apart those who overlap at the end, each two by at most `most` m; return the deepest overlap that was left."""
+    """Move apart those who overlap at the end, each two by at most `most` m; return the last pass's deepest overlap."""
     for c in range(count):
         contacts.push[c] = 0.0
     worst = 0.0

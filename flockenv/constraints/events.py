@@ -178,44 +178,42 @@ def play(
         for k in range(todo):
             c = meetings.todo[k]
             active = _look(period, bodies, meetings, things, rules, c, active)
-        best, when = -1, np.inf
-        k = 0
-        while k < active:
-            c = meetings.active[k]
-            if meetings.time[c] == np.inf:
-                active -= 1
-                meetings.listed[c] = 0
-                meetings.active[k] = meetings.active[active]
-                continue
-            if meetings.time[c] < when or (
-                meetings.time[c] == when
-                and _height(period, bodies, meetings, c) < _height(period, bodies, meetings, best)
-            ):
-                best, when = c, meetings.time[c]
-            k += 1
+        best, active = _earliest(period, bodies, meetings, active)
         if best < 0:
             return impacts, cut, count
-        impacts += 1
+        impacts, when = impacts + 1, meetings.time[best]
         meetings.hits[best] += 1
         over = meetings.hits[best] > rules.most
         cut += 1 if over else 0
         _impact(period, bodies, meetings, things, rules, best, when, over)
-        todo = 0
-        i, j = meetings.who[best], meetings.other[best]
-        meetings.time[best] = np.inf
-        if rules.anew:
-            count = _widened(period, bodies, meetings, things, rules, i, when, count)
-            todo = _again(bodies, meetings, i, todo)
-        else:
-            todo = _again_obstacles(bodies, meetings, i, todo)
-        if j >= 0:
-            if rules.anew:
-                count = _widened(period, bodies, meetings, things, rules, j, when, count)
-                todo = _again(bodies, meetings, j, todo)
-            else:
-                todo = _again_obstacles(bodies, meetings, j, todo)
+        todo, meetings.time[best] = 0, np.inf
+        for who in (meetings.who[best], meetings.other[best]):
+            if who >= 0 and rules.anew:
+                count = _widened(period, bodies, meetings, things, rules, who, when, count)
+            if who >= 0:
+                todo = _again(bodies, meetings, who, rules.anew, todo)
         if count > meetings.who.shape[0]:
             return impacts, cut, count
+
+
+@kernel
+def _earliest(period: Vec, bodies: Bodies, meetings: Meetings, active: int) -> tuple[int, int]:
+    """Return the earliest meeting, -1 if there is none, and how many are active; those without a time are let go of."""
+    best, k = -1, 0
+    while k < active:
+        c = meetings.active[k]
+        if meetings.time[c] == np.inf:
+            active -= 1
+            meetings.listed[c] = 0
+            meetings.active[k] = meetings.active[active]
+            continue
+        if best < 0 or meetings.time[c] < meetings.time[best]:
+            best = c
+        elif meetings.time[c] == meetings.time[best]:
+            first = _height(period, bodies, meetings, c) < _height(period, bodies, meetings, best)
+            best = c if first else best
+        k += 1
+    return best, active
 
 
 @kernel
@@ -248,23 +246,12 @@ def _look(period: Vec, bodies: Bodies, meetings: Meetings, things: Things, rules
 
 
 @kernel
-def _again(bodies: Bodies, meetings: Meetings, i: int, todo: int) -> int:
-    """List the meetings of body i to be looked at anew."""
-    place = bodies.first[i]
-    while place >= 0:
-        meetings.todo[todo] = place // 2
-        todo += 1
-        place = meetings.following[place % 2, place // 2]
-    return todo
-
-
-@kernel
-def _again_obstacles(bodies: Bodies, meetings: Meetings, i: int, todo: int) -> int:
-    """List those with obstacles; those with other bodies are over for this step."""
+def _again(bodies: Bodies, meetings: Meetings, i: int, anew: bool, todo: int) -> int:
+    """List the meetings of body i to be looked at anew: all, or those with obstacles; then the others are over."""
     place = bodies.first[i]
     while place >= 0:
         c = place // 2
-        if meetings.other[c] < 0:
+        if anew or meetings.other[c] < 0:
             meetings.todo[todo] = c
             todo += 1
         else:
@@ -281,7 +268,7 @@ def _impact(
     """Do what an impact does to those who take part; `over`: they have met too often, and are at rest from now on."""
     i, j = meetings.who[c], meetings.other[c]
     y, v, a = _relative(period, bodies, things, i, j, t)
-    form, row, room = _met(bodies, things, i, j)
+    form, row, _ = _met(bodies, things, i, j)
     _, n = surface(form, things.table, row, y)
     left, push, w = rules.seconds - t, dot(a, n), -dot(v, n)
     restitution = rules.restitution if j >= 0 else things.restitution[-1 - j]
