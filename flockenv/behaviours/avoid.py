@@ -72,7 +72,8 @@ def around(p: Any, me: Me, acc: Vec) -> Vec:
 class AvoidObstacles(Effect):
     """Steer sideways around the obstacle that the straight path would touch first within `horizon` seconds.
 
-    Along the side of the surface's normal where the body would touch it: of a circle that is away from its centre.
+    Along the side of the surface's normal where the body would touch it: of a circle that is away from its centre. An
+    obstacle that moves is avoided where it is, as if it stood still.
     """
 
     kind: Literal["avoid_obstacles"] = "avoid_obstacles"

@@ -166,6 +166,8 @@ effects:
     def _has_an_inside(self) -> Self:
         if self.within.kind not in ("circle", "block", "polygon"):
             raise ValueError(f"within.kind = {self.within.kind}: must be one of circle, block, polygon")
+        if self.within.moves or self.within.form.startswith("hollow"):
+            raise ValueError("within: must stand still and be solid; what it encloses is where the body stays")
         return self
 
     @property

@@ -86,18 +86,20 @@ class Other(NamedTuple):
 
 
 class Obstacle(NamedTuple):
-    """An obstacle that it meets. A circle or sphere is its centre and radius; any other shape is one point of it.
+    """An obstacle that it meets: a circle or sphere of the state by its centre and radius, any other shape by a point.
 
     That point is the nearest of its surface; of a law that casts rays, the one that is touched first. Of a law that
     sees circles alone, every shape is so a circle of radius 0 where it matters. From inside, and where a ray begins at
     overlap, `offset` leads into the shape, from where `normal` leads out.
+
+    It is where it is at the time of the stage. `hit` is along a straight ray, as if it stood still.
     """
 
-    who: float  # circles in the order of the state, then other shapes in the order of the scene
+    who: float  # circles of the state in its order, then the other shapes in the order of the scene
     offset: Vec  # m, to the centre, or to the point
     square: float  # m^2, |offset|^2
-    vel: Vec  # m/s; 0
-    radius: float  # m; 0 of what is no circle
+    vel: Vec  # m/s
+    radius: float  # m; 0 of what is not in the state: no circle, or one that moves or is hollow
     tie: Vec  # 0
     gap: float  # m, how far the surface is; negative inside
     normal: Vec  # outward unit normal at the nearest point of the surface, or where the ray touches

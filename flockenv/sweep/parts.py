@@ -63,7 +63,7 @@ class Parts:
     starts: tuple[int, ...] = ()
     """The first agent of each group, and one more: numbers alone, the source does not depend on them."""
     shapes: tuple[Any, ...] = field(default=(), compare=False)
-    """Obstacles that are no circles: the source depends on their forms."""
+    """Obstacles that are not in the state: the source depends on their forms, and on whether any of them moves."""
     circles: int = 0
     """How many obstacles come before them."""
     tables: tuple[NDArray[np.float64], ...] = field(default=(), compare=False)
@@ -97,8 +97,13 @@ class Parts:
 
     @functools.cached_property
     def shaped(self) -> tuple[NDArray[np.float64], dict[str, tuple[int, int]]]:
-        """The table of shapes that are no circles, and the forms that there are: where each begins, how many."""
+        """The table of shapes that are not in the state, and the forms there are: where each begins, how many."""
         return packed(self.shapes, self.dimension, self.circles) if self.meets_obstacles else (np.zeros(0), {})
+
+    @property
+    def moving(self) -> bool:
+        """Does any of them move? If not, nothing of that is written."""
+        return any(shape.moves for shape in self.shapes)
 
     @property
     def meets_obstacles(self) -> bool:
