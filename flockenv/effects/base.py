@@ -18,7 +18,9 @@ An effect is of one or more of three forms, each a law for one agent:
   the obstacles, of whatever shape: `other` is an `Obstacle`. With an `obstacle_ray(p, me, k) -> (direction, margin)` it
   meets each obstacle for each of its rays, k = 0, 1, ...: where the agent's body, `margin` wider, would touch it
   first if it went along the unit vector `direction`. With an `obstacle_from(p, me) -> offset` it is met as from that
-  place, so far from the agent, instead of from where the agent is. Of an effect with a pair law too, `finish_law` gives
+  place, so far from the agent, instead of from where the agent is. With an `obstacle_reach(p, me) -> m` it says that
+  its law leaves acc as it is wherever the surface is farther than this from the agent: long shapes that lie beyond are
+  not looked at. Of an effect with a pair law too, `finish_law` gives
   no force but what it has found out about others, a vector that is told to `obstacle_start(p, me, told)` (hide). With
   no start of its own it meets circles alone, goes before a fold over neighbours and hands over to it, so that both are
   judged together (orca).
@@ -196,6 +198,7 @@ class Effect(Record):
     obstacle_finish: ClassVar[str | None] = None
     obstacle_ray: ClassVar[str | None] = None
     obstacle_from: ClassVar[str | None] = None
+    obstacle_reach: ClassVar[str | None] = None
     linear_drag: ClassVar[str | None] = None
     """Name of the parameter c, kg/s, of an own_law that is -c (v - medium): a method may treat it by itself."""
     weighs_mass: ClassVar[bool] = True

@@ -34,6 +34,12 @@ def pushed_out(p: Any, me: Me, other: Obstacle, acc: Vec) -> Vec:
 
 
 @law
+def touching(p: Any, me: Me) -> float:
+    """Its radius."""
+    return me.radius
+
+
+@law
 def of_all(p: Any, me: Me, acc: Vec) -> Vec:
     """All of them at once."""
     return acc
@@ -53,6 +59,7 @@ class ObstacleContact(Effect):
     obstacle_start: ClassVar[str | None] = "untouched"
     obstacle_law: ClassVar[str | None] = "pushed_out"
     obstacle_finish: ClassVar[str | None] = "of_all"
+    obstacle_reach: ClassVar[str | None] = "touching"
 
     def folded(self, dimension: int) -> int:
         """The force so far."""

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from flockenv.kernels import Vec, law, like
-from flockenv.shapes.head import body_of, vector_at
+from flockenv.shapes.head import body_of, bound_of, vector_at
 from flockenv.shapes.round import ray_hit
 from flockenv.vec import add, axis, dot, perpendicular, scale, select, sub, unit
 
@@ -116,6 +116,9 @@ def hit_chain(table: Any, at: int, x: Vec, direction: Vec, clearance: float) -> 
     count, room = np.int64(table[body]), table[body + 1] + clearance
     closed = table[body + 2] > like(room, 0.0)
     best = like(room, np.inf)
+    middle, around = bound_of(table, at, x)
+    if ray_hit(sub(middle, x), direction, around + clearance) == best:
+        return best
     inside = False
     edges: Any = count if closed or count < 2 else count - 1
     for j in range(edges):

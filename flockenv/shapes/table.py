@@ -32,6 +32,10 @@ FORMS = {
 """The forms that rows have, and where their laws `nearest_FORM` and `hit_FORM` are."""
 
 
+UP = 1 + 1e-6
+"""Bounds in a row are larger by this: whoever is beyond one is clear of the shape, however single precision rounds."""
+
+
 def packed(shapes: Sequence[Any], dimension: int, first: int = 0) -> tuple[Floats, dict[str, tuple[int, int]]]:
     """Return the table of some shapes, numbered from `first`, and for each form there is: (where, how many)."""
     rows: list[Floats] = []
@@ -53,7 +57,7 @@ def _head(shape: Any, form: int) -> list[float]:
     """Return what stands in a row before its body, after its length and number; see head.py."""
     bound = shape.bound
     middle = bound.centre - np.array(shape.anchor)
-    return [*shape.anchor, float(form), *middle, *bound.half, bound.radius, *shape.motion]
+    return [*shape.anchor, float(form), *middle, *(bound.half * UP), bound.radius * UP, *shape.motion]
 
 
 @functools.cache

@@ -22,13 +22,13 @@ def obstacle_imports(parts: Parts) -> list[str]:
     """Write what folds over obstacles, and who is hidden by them, are made of."""
     if not parts.meets_obstacles:
         return []
-    moving = ["from flockenv.shapes.head import shift_of, velocity_of"] if parts.moving else []
+    asked = ["bound_of"] * bool(parts.bounded) + ["shift_of", "velocity_of"] * parts.moving
     lines = [
         "from flockenv.effects.base import Obstacle",
         "from flockenv.shapes.round import blocks as stands_between, normal as outward, touched_normal",
         "from flockenv.shapes.touch import touched_offset, touched_spot",
         "from flockenv.steering.around import threat",
-        *moving,
+        *([f"from flockenv.shapes.head import {', '.join(asked)}"] if asked else []),
     ]
     return lines + [
         f"from {module} import hit_{form}, nearest_{form}" for form, module in FORMS.items() if form in parts.shaped[1]
@@ -49,6 +49,10 @@ def obstacles(parts: Parts, me: list[str], found_out: Callable[[int], str]) -> l
         told = f", {found_out(k)}" if parts.effects[k].pair_law else ""
         starts.append(f"found = obstacle_start_{k}(p{k}, me{told})")
         starts += [f"{s} = found[{j}]" for j, s in enumerate(slots)]
+    if parts.bounded:
+        starts.append(f"seen = obstacle_reach_{asking[0][0]}(p{asking[0][0]}, me)")
+        starts += [f"seen = max(seen, obstacle_reach_{k}(p{k}, me))" for k, _ in asking[1:]]
+        starts.append(f"{slot('reach0')} = seen")
     count = " + ".join(["obstacle_radius.shape[1]", *(f"{form}_count" for form in parts.shaped[1])])
     d, w = parts.dimension, parts.width
     lines = [
@@ -64,12 +68,12 @@ def obstacles(parts: Parts, me: list[str], found_out: Callable[[int], str]) -> l
         indented([*me, "to = offset_to(size, x, place)", *_meet(parts, asking, CIRCLE)], 12),
     ]
     for form in parts.shaped[1]:
-        met = [
-            *me,
-            "y = offset_to(size, place, x)",
-            f"gap, out = nearest_{form}(params, at_, y)",
-            *_meet(parts, asking, form),
-        ]
+        met = [f"gap, out = nearest_{form}(params, at_, y)", *_meet(parts, asking, form)]
+        if form in parts.bounded:
+            within = "if dot(beside, beside) < (around + seen) * (around + seen):"
+            bound = ["middle, around = bound_of(params, at_, y)", f"beside, seen = sub(y, middle), {slot('reach0')}"]
+            met = [*bound, within, *indented_lines(met, 4)]
+        met = [*me, "y = offset_to(size, place, x)", *met]
         lines += [
             f"at_ = {form}_at",
             f"for m in range({form}_count):",
@@ -136,7 +140,7 @@ def _touched(form: str, k: int, j: int, vel: str) -> list[str]:
         ray,
         "room = me.radius + margin",
         f"hit = like(gap, 0.0) if gap < room else hit_{form}(params, at_, y, ray, room)",
-        f"side = nearest_{form}(params, at_, touched_spot(y, ray, hit, room))[1]",
+        _touched_side(form),
         "to = touched_offset(ray, hit, side, room, gap)",
         f"it = Obstacle(params[at_ + 1], to, dot(to, to), {vel}, like(gap, 0.0), zero(x), gap, side, hit, ray)",
     ]
@@ -146,6 +150,17 @@ def _place(parts: Parts) -> str:
     """Write where the anchor of the shape at `at_` is."""
     place = tuple_of("params[at_ + 2 + #]", parts.dimension)
     return f"add({place}, shift_of(params, at_, time, x))" if parts.moving else place
+
+
+def _touched_side(form: str) -> str:
+    """Write the normal where a ray touches; where none does it is that of the nearest place, which is known.
+
+    Lanes of blocks and half-spaces lie side by side: there a choice costs less than a branch.
+    """
+    found = f"nearest_{form}(params, at_, touched_spot(y, ray, hit, room))[1]"
+    if form in ("block", "half_space"):
+        return f"side = {found}"
+    return f"side = {found} if (hit > like(gap, 0.0)) & (hit < like(gap, np.inf)) else out"
 
 
 def blocked(parts: Parts) -> str:

@@ -105,6 +105,17 @@ class Parts:
         """Does any of them move? If not, nothing of that is written."""
         return any(shape.moves for shape in self.shapes)
 
+    @functools.cached_property
+    def bounded(self) -> tuple[str, ...]:
+        """The forms of shapes that are only looked at where they lie within reach: none if some law asks for all.
+
+        Those whose laws go from edge to edge, or from place to place. Blocks and half-spaces are met by lanes side by
+        side, which would go through all of the law anyhow: there it was no faster, with rays or without.
+        """
+        folds = [e for e in self.effects if e.obstacle_start is not None]
+        asked = bool(folds) and all(e.obstacle_reach is not None for e in folds)
+        return tuple(form for form in ("chain", "distance_field") if form in self.shaped[1]) if asked else ()
+
     @property
     def meets_obstacles(self) -> bool:
         """Does any law ask for obstacles, or what is hidden by them?"""
@@ -325,6 +336,7 @@ class Parts:
             ("bond", d * bool(self.bonded)),
             ("far", d * bool(self.far)),
         ]
+        runs += [("reach", int(bool(self.bounded)))]
         runs += [("square", look.agents), ("place", look.agents), ("gap", look.obstacles), ("which", look.obstacles)]
         names = [f"{name}{j}" for name, many in runs for j in range(many)]
         return {name: place for place, name in enumerate([*names, "bad"])}
