@@ -70,8 +70,8 @@ def obstacles(parts: Parts, me: list[str], found_out: Callable[[int], str]) -> l
     for form in parts.shaped[1]:
         met = [f"gap, out = nearest_{form}(params, at_, y)", *_meet(parts, asking, form)]
         if form in parts.bounded:
-            within = "if dot(beside, beside) < (around + seen) * (around + seen):"
-            bound = ["middle, around = bound_of(params, at_, y)", f"beside, seen = sub(y, middle), {slot('reach0')}"]
+            within = "if dot(beside, beside) < (wide + seen) * (wide + seen):"
+            bound = ["middle, wide = bound_of(params, at_, y)", f"beside, seen = sub(y, middle), {slot('reach0')}"]
             met = [*bound, within, *indented_lines(met, 4)]
         met = [*me, "y = offset_to(size, place, x)", *met]
         lines += [
