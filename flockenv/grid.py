@@ -16,11 +16,13 @@ from numpy.typing import ArrayLike, NDArray
 
 from flockenv.kernels import Vec, entry, kernel, law, like
 
-__all__ = ["Floats", "Table", "covers", "packed", "points_of", "sample", "sample_vector", "sampled"]
+__all__ = ["MOST_POINTS", "Floats", "Table", "covers", "packed", "points_of", "sample", "sample_vector", "sampled"]
 
 Floats = NDArray[np.float64]
 Table = Any
 """One axis of numbers, in the precision of the scene."""
+MOST_POINTS = 2**22
+"""Points of a grid that a scene may have: with a distance and a direction each, 100 MB in the plane."""
 
 
 def packed(values: ArrayLike, low: Sequence[float], spacing: float) -> Floats:

@@ -45,7 +45,7 @@ def _measure(scene: Scene, state: State, world: int) -> dict[str, float]:
         touching |= (size > 0) & (np.linalg.norm(scene.space.displacement(pos, centre), axis=1) < radius + size)
     if scene.shapes:
         period = np.array(scene.space.extent(scene.dimension) if scene.space.periodic else (0.0,) * scene.dimension)
-        touching |= clear_of(scene.shapes, np.asarray(pos, float), period) < radius
+        touching |= clear_of(scene.shapes, np.asarray(pos, float), period, float(state.time[world])) < radius
     return {
         "agents": float(alive.sum()),
         "speed": float(speed.mean()) if len(speed) else np.nan,

@@ -11,7 +11,7 @@ from pydantic_core import PydanticCustomError
 
 from flockenv.refusals import refusals
 
-__all__ = ["Record", "keep"]
+__all__ = ["Record", "in_tuples", "keep"]
 
 _NUMBERS = (float, int, float | None, int | None)
 
@@ -23,19 +23,19 @@ def keep(*kinds: type) -> Callable[[Any, Any], Any]:
     """
 
     def kept(value: Any, handler: Any) -> Any:
-        return value if isinstance(value, kinds) else handler(_in_tuples(value))
+        return value if isinstance(value, kinds) else handler(in_tuples(value))
 
     return kept
 
 
-def _in_tuples(value: Any) -> Any:
-    """Return what a file says with tuples in the place of lists: strictly read, only JSON's lists are taken for tuples.
+def in_tuples(value: Any) -> Any:
+    """Return what a file says with tuples in the place of lists, however deep; blocks stay blocks.
 
-    (And here they are Python's already: pydantic hands them over so to a function like `kept`.)
+    Strictly read, only JSON's lists are taken for tuples, and pydantic hands Python's to a function like `kept`.
     """
     if isinstance(value, Mapping):
-        return {key: _in_tuples(inner) for key, inner in value.items()}
-    return tuple(map(_in_tuples, value)) if isinstance(value, list) else value
+        return {key: in_tuples(inner) for key, inner in value.items()}
+    return tuple(map(in_tuples, value)) if isinstance(value, (list, tuple)) else value
 
 
 class _OneLine(ModelMetaclass):

@@ -251,7 +251,7 @@ class Scene(Record):
 
     def _check_shape(self, k: int, shape: Shape) -> None:
         """Refuse, on a torus, what reaches around it: only the nearest image of a shape is met."""
-        if not isinstance(self.space, Torus) or isinstance(shape, Circle):
+        if not isinstance(self.space, Torus) or shape.in_state:
             return
         if isinstance(shape, HalfSpace):
             raise ValueError(
@@ -279,13 +279,13 @@ class Scene(Record):
 
     @functools.cached_property
     def circles(self) -> tuple[Circle, ...]:
-        """The round obstacles: they are part of the state."""
-        return tuple(shape for shape in self.obstacles if isinstance(shape, Circle))
+        """The round obstacles that stand still and are solid: they are part of the state."""
+        return tuple(shape for shape in self.obstacles if isinstance(shape, Circle) and shape.in_state)
 
     @functools.cached_property
     def shapes(self) -> tuple[Shape, ...]:
-        """The other obstacles: they are the same in every world."""
-        return tuple(shape for shape in self.obstacles if not isinstance(shape, Circle))
+        """The other obstacles: they are the same in every world, a function of time."""
+        return tuple(shape for shape in self.obstacles if not shape.in_state)
 
     @property
     def roles(self) -> tuple[str, ...]:
@@ -680,15 +680,26 @@ class Scene(Record):
             obstacle_centre=state.obstacles.centre[world], obstacle_radius=state.obstacle_radius[world],
             marks=self.marks,
             low=np.array(low, np.float64), high=np.array(high, np.float64),
-            periodic=self.space.periodic, title=title, bonds=self.edges, outlines=self.outlines(low, high),
+            periodic=self.space.periodic, title=title, bonds=self.edges,
+            outlines=self.outlines(low, high, float(state.time[world])),
         )  # fmt: skip
 
     def outlines(
-        self, low: Sequence[float] | NDArray[np.float64], high: Sequence[float] | NDArray[np.float64]
+        self, low: Sequence[float] | NDArray[np.float64], high: Sequence[float] | NDArray[np.float64], time: float = 0.0
     ) -> tuple[NDArray[np.float64], ...]:
-        """Return obstacles that are no circles as polygons, each (n, 2) m, seen from above in a region."""
-        region = np.array(low, np.float64), np.array(high, np.float64)
-        return tuple(polygon for shape in self.shapes for polygon in shape.outline(*region))
+        """Return the obstacles of `shapes` as polygons, each (n, 2) m, seen from above in a region at a time, s."""
+        region, found = np.array([low, high], np.float64), []
+        for shape in self.shapes:
+            shift = self._shift(shape, time)
+            found += [polygon + shift[:2] for polygon in shape.outline(*(region - shift))]
+        return tuple(found)
+
+    def _shift(self, shape: Shape, time: float) -> Floats:
+        """Return how far a shape is at a time from where its fields say, m; on a torus, to its image in the box."""
+        shift = shape.shift(time)
+        if not (shape.moves and self.space.periodic):
+            return shift
+        return np.asarray(self.space.wrap(np.array(shape.anchor) + shift)) - shape.anchor
 
     def _view(self, state: State, world: int) -> tuple[Sequence[float], Sequence[float]]:
         """Return the region to show: the space, or where everybody is."""
@@ -697,14 +708,14 @@ class Scene(Record):
         pos = state.pos[world]
         margin = 1.0 + 0.05 * float(np.ptp(pos, axis=0).max())
         low, high = pos.min(axis=0) - margin, pos.max(axis=0) + margin
-        every = np.concatenate([low[None], high[None], *self.extremes])
+        every = np.concatenate([low[None], high[None], *self.extremes(float(state.time[world]))])
         return tuple(every.min(axis=0)), tuple(every.max(axis=0))
 
-    @property
-    def extremes(self) -> list[Floats]:
-        """Places that a picture must show whoever is there: of shapes, of the ways that behaviours are about."""
+    def extremes(self, *times: float) -> list[Floats]:
+        """Return places that pictures of some times, s, must show: of shapes, of the ways that behaviours are about."""
         tracks = [np.asarray(track) + side for track, radius in self._tracks for side in (-radius, radius)]
-        return [*(np.asarray(shape.extremes) for shape in self.shapes), *tracks]
+        shown = [shape.extremes + shape.shift(time) for shape in self.shapes for time in times]
+        return [*shown, *tracks]
 
     @functools.cached_property
     def _tracks(self) -> tuple[tuple[tuple[tuple[float, ...], ...], float], ...]:

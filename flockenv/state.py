@@ -31,7 +31,10 @@ collisions, impacts, and those that were cut short or left unsolved."""
 
 @dataclass(frozen=True, eq=False)
 class Obstacles:
-    """Round obstacles of every world, as views: they may differ from world to world, and do not move yet."""
+    """Round obstacles of every world, as views: they may differ from world to world, and stand still.
+
+    Circles that move or are hollow are not among them: with the other shapes they are the scene's, `Scene.shapes`.
+    """
 
     centre: Floats  # (B, M, D) m
     radius: Floats  # (B, M) m; 0 = no obstacle in this slot

@@ -62,12 +62,14 @@ class Trajectory:
 
     def snapshots(self, title: str = "") -> Iterator[Snapshot]:
         """Return every instant, ready to be drawn, all in one frame: the space, or where anybody ever was."""
-        low, high = _region(self.scene, self.pos)
-        start = replace(self.scene.snapshot(self.first, title=title), outlines=self.scene.outlines(low, high))
-        for k, step in enumerate(self.step):
+        times = (self.step * self.scene.dt).tolist()
+        low, high = _region(self.scene, self.pos, times)
+        start = replace(self.scene.snapshot(self.first, title=title), outlines=self.scene.outlines(low, high, times[0]))
+        for k, time in enumerate(times):
+            walls = self.scene.outlines(low, high, time) if self.scene.parts.moving else start.outlines
             yield replace(
-                start, time=step * self.scene.dt, pos=self.pos[k], vel=self.vel[k], alive=self.alive[k], low=low,
-                high=high, heading=None if self.heading is None else self.heading[k],
+                start, time=time, pos=self.pos[k], vel=self.vel[k], alive=self.alive[k], low=low, high=high,
+                heading=None if self.heading is None else self.heading[k], outlines=walls,
             )  # fmt: skip
 
     def summary(self) -> dict[str, Any]:
@@ -198,12 +200,13 @@ def whole_steps(name: str, seconds: float, dt: float, least: int = 0) -> int:
     return steps
 
 
-def _region(scene: Scene, pos: Floats) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _region(scene: Scene, pos: Floats, times: list[float]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     if not isinstance(scene.space, Plane):
         return np.zeros(scene.dimension), np.array(scene.space.extent(scene.dimension))
     low, high = (np.asarray(end(pos, axis=(0, 1)), np.float64) for end in (np.min, np.max))
     margin = 1.0 + 0.05 * float((high - low).max())
-    every = np.concatenate([[low - margin], [high + margin], *scene.extremes])
+    shown = scene.extremes(*(times if scene.parts.moving else times[:1]))
+    every = np.concatenate([[low - margin], [high + margin], *shown])
     return every.min(axis=0), every.max(axis=0)
 
 

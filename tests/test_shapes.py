@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
 import pytest
 
+from flockenv.behaviours.orca import Orca
+from flockenv.behaviours.walls import Contain
+from flockenv.behaviours.way import FollowWay
 from flockenv.config import dump_scene, load_scene
 from flockenv.scene import Group, Scene
-from flockenv.shapes import Block, Capsule, Circle, DistanceField, HalfSpace, Polygon, Shape, Wall, clear_of
+from flockenv.shapes import Block, Capsule, Circle, DistanceField, HalfSpace, Polygon, Shape, Sway, Wall, clear_of
 from flockenv.space import Torus
 from flockenv.spawn import Spawn
 
+rolling = Circle(centre=(1, 1), radius=0.3, velocity=(1, 0))
 L = Polygon(vertices=((0, 0), (3, 0), (3, 1), (1, 1), (1, 3), (0, 3)))
 SHAPES: dict[str, Shape] = {
     "circle": Circle(centre=(1, 0.5), radius=1.2),
@@ -30,12 +35,20 @@ SHAPES: dict[str, Shape] = {
     "turned_box": Block(centre=(0.5, 0.2, 0.1), size=(2, 1, 1.5), turn=50, axis=(1, 2, -0.5)),
     "line": HalfSpace(point=(0.3, 0.1), direction=(1, 2)),
     "plane": HalfSpace(point=(0.3, 0.1, 0), direction=(1, 2, -1)),
+    "hollow_circle": Circle(centre=(1, 0.5), radius=2.2, hollow=True),
+    "hollow_sphere": Circle(centre=(1, 0.5, -0.3), radius=2.2, hollow=True),
+    "hollow_capsule": Capsule(start=(-1, 0), end=(1.5, 1), radius=1.4, hollow=True),
+    "hollow_capsule_3": Capsule(start=(-1, 0, 0.5), end=(1.5, 1, -0.5), radius=1.4, hollow=True),
+    "hollow_polygon": Polygon(vertices=((0, 0), (6, 0), (6, 2), (2, 2), (2, 6), (0, 6)), hollow=True),
+    "hollow_block": Block(centre=(0.5, 0.2), size=(4, 3), turn=33, hollow=True),
+    "hollow_box": Block(centre=(0.5, 0.2, 0.1), size=(4, 3, 3.5), turn=50, axis=(1, 2, -0.5), hollow=True),
 }
 every = pytest.mark.parametrize("name", SHAPES)
 
 
 def places(shape: Shape, count: int = 300, seed: int = 1) -> Any:
-    return np.random.default_rng(seed).uniform(-4, 4, (count, shape.dimension))
+    low, high = (shape.extremes.min(axis=0), shape.extremes.max(axis=0)) if shape.is_hollow else (-4, 4)
+    return np.random.default_rng(seed).uniform(low, high, (count, shape.dimension))
 
 
 def directions(shape: Shape, count: int = 300) -> Any:
@@ -141,6 +154,36 @@ def test_a_distance_field_is_the_shape_to_the_spacing(name: str) -> None:
     assert 0.9 * float(shape.gap(outside)) < float(field.gap(outside)) < 1.2 * float(shape.gap(outside))
 
 
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_in_a_hollow_circle_or_sphere_everything_has_a_closed_form(dimension: int) -> None:
+    """R - |x|, inward, and t = -x.d + sqrt((x.d)^2 - |x|^2 + (R - r)^2)."""
+    ball = Circle(centre=(0,) * dimension, radius=2.0, hollow=True)
+    x = np.random.default_rng(5).uniform(-0.9, 0.9, (200, dimension))
+    way, far = directions(ball, 200), np.linalg.norm(x, axis=1)
+    np.testing.assert_allclose(ball.gap(x), 2 - far, atol=1e-14)
+    np.testing.assert_allclose(ball.normal(x), -x / far[:, None], atol=1e-14)
+    along = (x * way).sum(axis=1)
+    np.testing.assert_allclose(ball.hit(x, way, 0.3), np.sqrt(along**2 - far**2 + 1.7**2) - along, rtol=1e-14)
+    assert (ball.hit(x, way, 2.5) == 0).all()
+    assert float(ball.gap(np.full(dimension, 5.0))) < 0
+
+
+@every
+def test_whatever_it_is_made_of_lies_within_its_bounds(name: str) -> None:
+    shape = SHAPES[name]
+    x = 3 * places(shape, 400)
+    offset = x - shape.bound.centre
+    if shape.is_hollow or shape.kind == "half_space":
+        assert np.isinf(shape.bound.half).all() and np.isinf(shape.bound.radius)
+        return
+    beyond = np.linalg.norm(np.maximum(np.abs(offset) - shape.bound.half, 0), axis=1)
+    assert (shape.gap(x)[beyond > 0] >= beyond[beyond > 0] - 1e-12).all()
+    assert (shape.gap(x) >= np.linalg.norm(offset, axis=1) - shape.bound.radius - 1e-12).all()
+    surface = shape.nearest(x) - shape.bound.centre
+    assert (np.abs(surface).max(axis=0) > 0.9 * shape.bound.half).all(), "the box is too large"
+    assert shape.bound.radius < 1.01 * np.linalg.norm(shape.bound.half), "so is the circle"
+
+
 @every
 def test_it_is_finite_everywhere_and_without_a_direction(name: str) -> None:
     shape = SHAPES[name]
@@ -168,9 +211,12 @@ def test_a_plain_centre_and_radius_goes_on_meaning_a_circle() -> None:
 def test_every_shape_comes_back_from_its_file() -> None:
     flat = tuple(shape for shape in SHAPES.values() if shape.dimension == 2)
     field = DistanceField(low=(0, 0), high=(1, 1), spacing=0.5, shapes=(Circle(centre=(0.5, 0.5), radius=0.2),))
-    for obstacles in (flat, (*flat, field)):
+    sway = Sway(amplitude=(0.5, 0), period=3, phase=1)
+    moving = tuple(shape.model_copy(update={"velocity": (1, 2), "sway": sway}) for shape in flat)
+    for obstacles in (flat, moving, (*flat, field)):
         scene = Scene(groups=(GROUP,), obstacles=obstacles)
         assert load_scene(dump_scene(scene)) == scene
+    assert scene.shapes != moving
 
 
 def test_nobody_begins_in_an_obstacle() -> None:
@@ -214,6 +260,26 @@ def test_on_a_torus_the_nearest_image_counts() -> None:
         ),
         (lambda: SHAPES["line"].silhouette((1, 2)), "has no corners"),
         (lambda: L.silhouette((0.5, 0.5)), "is not outside"),
+        (lambda: SHAPES["hollow_circle"].silhouette((1, 1)), "its outline has no ends"),
+        (lambda: Capsule(start=(0, 0), end=(1, 0), hollow=True), "radius = 0: a hollow capsule"),
+        (lambda: HalfSpace(point=(0, 0), direction=(0, 1), hollow=True), "hollow = True: unknown key"),
+        (lambda: Wall(vertices=((0, 0), (4, 0)), hollow=True), "hollow = True: unknown key"),
+        (lambda: Circle(centre=(0, 0), radius=1, velocity=(1, 0, 0)), r"velocity = .*must have 2 numbers"),
+        (lambda: Block(centre=(0, 0, 0), size=(1, 1, 1), velocity=(1, 0)), r"velocity = .*must have 3 numbers"),
+        (lambda: Polygon(vertices=L.vertices, velocity=(1, math.nan)), r"velocity\[1\] = nan"),
+        (lambda: Wall(vertices=((0, 0), (1, 0, 0)), velocity=(1, 0)), r"vertices\[1\] = .*the first has 2"),
+        (lambda: Sway(amplitude=(1, 0), period=0), "period = 0: must be a number > 0"),
+        (
+            lambda: Circle(centre=(0, 0), radius=1, sway=Sway(amplitude=(1, 0, 0), period=1)),
+            r"sway.amplitude = .*must have 2 numbers",
+        ),
+        (
+            lambda: DistanceField(low=(0, 0), high=(1, 1), spacing=0.5, shapes=(rolling,)),
+            r"shapes\[0\]: moves",
+        ),
+        (lambda: FollowWay(weight=1, target=(9, 9)).check(Scene(groups=(GROUP,), obstacles=(rolling,))), "moves"),
+        (lambda: Orca(weight=1, target=(9, 9), speed=1).check(Scene(groups=(GROUP,), obstacles=(rolling,))), "moves"),
+        (lambda: Contain(weight=1, within=SHAPES["hollow_circle"]), "within: must stand still and be solid"),
     ],
 )  # fmt: skip
 def test_what_is_no_shape_is_refused_in_one_line(make: Any, text: str) -> None:

@@ -58,6 +58,12 @@ def nearest_threat(p: Any, me: Me, other: Obstacle, acc: Vec) -> Vec:
 
 
 @law
+def in_time(p: Any, me: Me) -> float:
+    """As far as it comes within the horizon, and its size."""
+    return norm(me.vel) * p.horizon + me.radius + p.margin  # type: ignore[no-any-return]
+
+
+@law
 def around(p: Any, me: Me, acc: Vec) -> Vec:
     """F = w (1 m/s) sideways, away from the threat's centre."""
     offset: Vec
@@ -72,7 +78,8 @@ def around(p: Any, me: Me, acc: Vec) -> Vec:
 class AvoidObstacles(Effect):
     """Steer sideways around the obstacle that the straight path would touch first within `horizon` seconds.
 
-    Along the side of the surface's normal where the body would touch it: of a circle that is away from its centre.
+    Along the side of the surface's normal where the body would touch it: of a circle that is away from its centre. An
+    obstacle that moves is avoided where it is, as if it stood still.
     """
 
     kind: Literal["avoid_obstacles"] = "avoid_obstacles"
@@ -84,6 +91,7 @@ class AvoidObstacles(Effect):
     obstacle_ray: ClassVar[str | None] = "straight_on"
     obstacle_law: ClassVar[str | None] = "nearest_threat"
     obstacle_finish: ClassVar[str | None] = "around"
+    obstacle_reach: ClassVar[str | None] = "in_time"
     demo: ClassVar[str | None] = AVOIDING
 
     def lookahead(self, speed: float) -> float:
@@ -133,6 +141,12 @@ def deepest_whisker(p: Any, me: Me, other: Obstacle, acc: Vec) -> Vec:
 
 
 @law
+def whiskers_end(p: Any, me: Me) -> float:
+    """The length of a whisker, and its size."""
+    return norm(me.vel) * p.horizon + me.radius  # type: ignore[no-any-return]
+
+
+@law
 def along_normal(p: Any, me: Me, acc: Vec) -> Vec:
     """F = w (share inside) (n + unit(lateral n)): n alone would mostly brake; head-on the side is the right."""
     normal: Vec
@@ -162,6 +176,7 @@ class Whiskers(Effect):
     obstacle_ray: ClassVar[str | None] = "whisker"
     obstacle_law: ClassVar[str | None] = "deepest_whisker"
     obstacle_finish: ClassVar[str | None] = "along_normal"
+    obstacle_reach: ClassVar[str | None] = "whiskers_end"
     demo: ClassVar[str | None] = AVOIDING.replace("avoid_obstacles, weight: 8", "whiskers, weight: 20")
 
     def rays(self, dimension: int) -> int:
@@ -192,6 +207,12 @@ def field_push(p: Any, me: Me, other: Obstacle, acc: Vec) -> Vec:
 
 
 @law
+def field_end(p: Any, me: Me) -> float:
+    """Its range, and its size."""
+    return p.range + me.radius  # type: ignore[no-any-return]
+
+
+@law
 def field_force(p: Any, me: Me, acc: Vec) -> Vec:
     """F = w sum n / d^p."""
     return scale(acc, p.weight)
@@ -213,6 +234,7 @@ class ForceField(Effect):
     obstacle_start: ClassVar[str | None] = "no_push"
     obstacle_law: ClassVar[str | None] = "field_push"
     obstacle_finish: ClassVar[str | None] = "field_force"
+    obstacle_reach: ClassVar[str | None] = "field_end"
     demo: ClassVar[str | None] = AVOIDING.replace("avoid_obstacles, weight: 8", "force_field, weight: 3")
 
     def folded(self, dimension: int) -> int:

@@ -131,8 +131,11 @@ effects:
         if scene.dimension != 2:
             raise ValueError(f"kind = orca: dimension = {scene.dimension}, must be 2")
         for k, obstacle in enumerate(scene.obstacles):
-            if obstacle.kind != "circle":
-                raise ValueError(f"kind = orca: sees round obstacles alone, obstacles[{k}].kind = {obstacle.kind}")
+            if not obstacle.in_state:
+                what = ", which moves or is hollow" if obstacle.kind == "circle" else ""
+                raise ValueError(
+                    f"kind = orca: sees round obstacles alone, obstacles[{k}].kind = {obstacle.kind}{what}"
+                )
         super().check(scene)
 
     def sums(self, dimension: int) -> int:

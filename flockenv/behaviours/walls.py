@@ -17,7 +17,7 @@ from flockenv.shapes import AnyShape, packed
 from flockenv.shapes.block import nearest_block
 from flockenv.shapes.chain import nearest_chain
 from flockenv.space import Torus
-from flockenv.vec import add, dot, lateral, perpendicular, scale, select, sub, unit, zero
+from flockenv.vec import add, dot, lateral, norm, perpendicular, scale, select, sub, unit, zero
 
 __all__ = ["Contain", "FollowWall"]
 
@@ -38,6 +38,12 @@ def no_wall(p: Any, me: Me) -> Vec:
 def nearest_wall(p: Any, me: Me, other: Obstacle, acc: Vec) -> Vec:
     """Keep the nearest surface: (how far it is from there, its normal)."""
     return select(abs(other.gap) < abs(acc[0]), (other.gap,) + other.normal, acc)  # noqa: RUF005
+
+
+@law
+def walls_seen(p: Any, me: Me) -> float:
+    """Its range, from where it will be."""
+    return p.range + norm(me.vel) * p.time  # type: ignore[no-any-return]
 
 
 @law
@@ -76,6 +82,7 @@ class FollowWall(Moving):
     obstacle_start: ClassVar[str | None] = "no_wall"
     obstacle_law: ClassVar[str | None] = "nearest_wall"
     obstacle_finish: ClassVar[str | None] = "along_wall"
+    obstacle_reach: ClassVar[str | None] = "walls_seen"
     demo: ClassVar[str | None] = """
 groups:
 - count: 2
@@ -166,6 +173,8 @@ effects:
     def _has_an_inside(self) -> Self:
         if self.within.kind not in ("circle", "block", "polygon"):
             raise ValueError(f"within.kind = {self.within.kind}: must be one of circle, block, polygon")
+        if self.within.moves or self.within.form.startswith("hollow"):
+            raise ValueError("within: must stand still and be solid; what it encloses is where the body stays")
         return self
 
     @property

@@ -12,15 +12,13 @@ from pydantic import Field
 from flockenv.behaviours.base import Moving, top_speed
 from flockenv.effects.base import Me, Vector
 from flockenv.eikonal import way_table
-from flockenv.grid import covers, sample, sample_vector
+from flockenv.grid import MOST_POINTS, covers, sample, sample_vector
 from flockenv.kernels import Vec, law, like
 from flockenv.shapes import Shape
 from flockenv.space import Torus
 from flockenv.vec import norm, scale, select, sub, unit
 
 __all__ = ["FollowWay"]
-
-MOST_POINTS = 2**22
 
 
 @law
@@ -92,8 +90,11 @@ effects:
         return way_table(shapes, self.target, low.tolist(), high.tolist(), self.spacing, self.clearance)
 
     def check(self, scene: Any) -> None:
-        """Refuse a torus, a grid too large, and a target that is in an obstacle."""
+        """Refuse a torus, obstacles that move, a grid too large, and a target that is in an obstacle."""
         super().check(scene)
+        for k, shape in enumerate(scene.obstacles):
+            if shape.moves:
+                raise ValueError(f"kind = follow_way: its way is found once, and obstacles[{k}] moves")
         if isinstance(scene.space, Torus):
             raise ValueError("kind = follow_way: on a torus ways lead around; only a plane or a box is allowed")
         low, high = self.region(scene)

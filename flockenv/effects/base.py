@@ -18,7 +18,9 @@ An effect is of one or more of three forms, each a law for one agent:
   the obstacles, of whatever shape: `other` is an `Obstacle`. With an `obstacle_ray(p, me, k) -> (direction, margin)` it
   meets each obstacle for each of its rays, k = 0, 1, ...: where the agent's body, `margin` wider, would touch it
   first if it went along the unit vector `direction`. With an `obstacle_from(p, me) -> offset` it is met as from that
-  place, so far from the agent, instead of from where the agent is. Of an effect with a pair law too, `finish_law` gives
+  place, so far from the agent, instead of from where the agent is. With an `obstacle_reach(p, me) -> m` it says that
+  its law leaves acc as it is wherever the surface is farther than this from the agent: long shapes that lie beyond are
+  not looked at. Of an effect with a pair law too, `finish_law` gives
   no force but what it has found out about others, a vector that is told to `obstacle_start(p, me, told)` (hide). With
   no start of its own it meets circles alone, goes before a fold over neighbours and hands over to it, so that both are
   judged together (orca).
@@ -86,18 +88,20 @@ class Other(NamedTuple):
 
 
 class Obstacle(NamedTuple):
-    """An obstacle that it meets. A circle or sphere is its centre and radius; any other shape is one point of it.
+    """An obstacle that it meets: a circle or sphere of the state by its centre and radius, any other shape by a point.
 
     That point is the nearest of its surface; of a law that casts rays, the one that is touched first. Of a law that
     sees circles alone, every shape is so a circle of radius 0 where it matters. From inside, and where a ray begins at
     overlap, `offset` leads into the shape, from where `normal` leads out.
+
+    It is where it is at the time of the stage. `hit` is along a straight ray, as if it stood still.
     """
 
-    who: float  # circles in the order of the state, then other shapes in the order of the scene
+    who: float  # circles of the state in its order, then the other shapes in the order of the scene
     offset: Vec  # m, to the centre, or to the point
     square: float  # m^2, |offset|^2
-    vel: Vec  # m/s; 0
-    radius: float  # m; 0 of what is no circle
+    vel: Vec  # m/s
+    radius: float  # m; 0 of what is not in the state: no circle, or one that moves or is hollow
     tie: Vec  # 0
     gap: float  # m, how far the surface is; negative inside
     normal: Vec  # outward unit normal at the nearest point of the surface, or where the ray touches
@@ -194,6 +198,7 @@ class Effect(Record):
     obstacle_finish: ClassVar[str | None] = None
     obstacle_ray: ClassVar[str | None] = None
     obstacle_from: ClassVar[str | None] = None
+    obstacle_reach: ClassVar[str | None] = None
     linear_drag: ClassVar[str | None] = None
     """Name of the parameter c, kg/s, of an own_law that is -c (v - medium): a method may treat it by itself."""
     weighs_mass: ClassVar[bool] = True

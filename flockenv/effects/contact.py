@@ -11,7 +11,7 @@ from pydantic import Field
 
 from flockenv.effects.base import Effect, Me, Obstacle, all_masses
 from flockenv.kernels import Vec, law, like
-from flockenv.vec import add, dot, scale, zero
+from flockenv.vec import add, dot, scale, sub, zero
 
 __all__ = ["ObstacleContact"]
 
@@ -26,11 +26,17 @@ def untouched(p: Any, me: Me) -> Vec:
 
 @law
 def pushed_out(p: Any, me: Me, other: Obstacle, acc: Vec) -> Vec:
-    """Add max(0, k overlap - c v.n) n, if there is an overlap."""
+    """Add max(0, k overlap - c v.n) n, if there is an overlap; v relative to the obstacle."""
     o = like(me.radius, 0.0)
     overlap = me.radius - other.gap
-    force = p.stiffness * overlap - p.damping * dot(me.vel, other.normal)
+    force = p.stiffness * overlap - p.damping * dot(sub(me.vel, other.vel), other.normal)
     return add(acc, scale(other.normal, force if (overlap > o) & (force > o) else o))
+
+
+@law
+def touching(p: Any, me: Me) -> float:
+    """Its radius."""
+    return me.radius
 
 
 @law
@@ -42,8 +48,8 @@ def of_all(p: Any, me: Me, acc: Vec) -> Vec:
 class ObstacleContact(Effect):
     """A body that overlaps an obstacle by d is pushed out of it, F = max(0, k d - c v.n) n; n leads out.
 
-    The elastic part is the contact force of Helbing, Farkas and Vicsek 2000 (k g(r - d)); it never pulls. A body of
-    mass m that comes at v goes in by at most v sqrt(m / k).
+    v is relative to the obstacle. The elastic part is the contact force of Helbing, Farkas and Vicsek 2000
+    (k g(r - d)); it never pulls. A body of mass m that comes at v goes in by at most v sqrt(m / k).
     """
 
     kind: Literal["obstacle_contact"] = "obstacle_contact"
@@ -53,6 +59,7 @@ class ObstacleContact(Effect):
     obstacle_start: ClassVar[str | None] = "untouched"
     obstacle_law: ClassVar[str | None] = "pushed_out"
     obstacle_finish: ClassVar[str | None] = "of_all"
+    obstacle_reach: ClassVar[str | None] = "touching"
 
     def folded(self, dimension: int) -> int:
         """The force so far."""

@@ -1,7 +1,8 @@
 """Boxes that may be turned, and half-spaces. See shapes/table.py for how they lie in a table.
 
 A block is its half edges (D, m) and its axes (D unit vectors of D numbers); a half-space is the unit normal that points
-out of it. `x` is where the agent is, relative to the anchor: the centre, or a point of the surface.
+out of it; behind the head (see head.py). `x` is where the agent is, relative to the anchor: the centre, or a point of
+the surface.
 """
 
 from __future__ import annotations
@@ -12,36 +13,43 @@ import numpy as np
 
 from flockenv.kernels import Vec, law, like
 from flockenv.shapes.chain import segment_hit
+from flockenv.shapes.head import body_of, vector_at
 from flockenv.shapes.round import ray_hit
 from flockenv.vec import add, axis, dot, norm, scale, select, sub, unit
 
-__all__ = ["box_hit", "box_nearest", "hit_block", "hit_half_space", "nearest_block", "nearest_half_space"]
+__all__ = [
+    "box_hit", "box_nearest", "half_edges", "hit_block", "hit_half_space", "nearest_block", "nearest_half_space",
+    "turned",
+]  # fmt: skip
 
 
 @law
-def _read(table: Any, at: int, x: Vec) -> Vec:
-    if len(x) == 2:
-        return (table[at], table[at + 1])
-    else:
-        return (table[at], table[at + 1], table[at + 2])
+def half_edges(table: Any, at: int, x: Vec) -> Vec:
+    """Return half the edges of a block, m."""
+    return vector_at(table, body_of(at, x), x)
 
 
 @law
-def _turned(table: Any, at: int, x: Vec) -> Vec:
-    """Return x in the frame whose axes begin at `at`."""
+def _axis(table: Any, at: int, k: int, x: Vec) -> Vec:
+    return vector_at(table, body_of(at, x) + (k + 1) * len(x), x)
+
+
+@law
+def turned(table: Any, at: int, x: Vec) -> Vec:
+    """Return x in the frame of a block's axes."""
     if len(x) == 2:
-        return (dot(_read(table, at, x), x), dot(_read(table, at + 2, x), x))
+        return (dot(_axis(table, at, 0, x), x), dot(_axis(table, at, 1, x), x))
     else:
-        return (dot(_read(table, at, x), x), dot(_read(table, at + 3, x), x), dot(_read(table, at + 6, x), x))
+        return (dot(_axis(table, at, 0, x), x), dot(_axis(table, at, 1, x), x), dot(_axis(table, at, 2, x), x))
 
 
 @law
 def _turned_back(table: Any, at: int, y: Vec) -> Vec:
-    out = add(scale(_read(table, at, y), y[0]), scale(_read(table, at + len(y), y), y[1]))
+    out = add(scale(_axis(table, at, 0, y), y[0]), scale(_axis(table, at, 1, y), y[1]))
     if len(y) == 2:
         return out
     else:
-        return add(out, scale(_read(table, at + 6, y), y[2]))
+        return add(out, scale(_axis(table, at, 2, y), y[2]))
 
 
 @law
@@ -138,10 +146,8 @@ def _rounded_cube(y: Vec, d: Vec, h: Vec, r: float) -> float:
 @law
 def nearest_block(table: Any, at: int, x: Vec) -> tuple[float, Vec]:
     """Return the distance to the surface, m (negative inside), and the outward unit normal at its nearest point."""
-    d = len(x)
-    frame = at + 2 + 2 * d
-    gap, normal = box_nearest(_turned(table, frame, x), _read(table, at + 2 + d, x))
-    return gap, _turned_back(table, frame, normal)
+    gap, normal = box_nearest(turned(table, at, x), half_edges(table, at, x))
+    return gap, _turned_back(table, at, normal)
 
 
 @law
@@ -150,9 +156,7 @@ def hit_block(table: Any, at: int, x: Vec, direction: Vec, clearance: float) -> 
 
     From where it overlaps already it is 0.
     """
-    frame = at + 2 + 2 * len(x)
-    y, d = _turned(table, frame, x), _turned(table, frame, direction)
-    h = _read(table, at + 2 + len(x), x)
+    y, d, h = turned(table, at, x), turned(table, at, direction), half_edges(table, at, x)
     if len(x) == 2:
         return _rounded_square(y, d, h, clearance)
     else:
@@ -162,7 +166,7 @@ def hit_block(table: Any, at: int, x: Vec, direction: Vec, clearance: float) -> 
 @law
 def nearest_half_space(table: Any, at: int, x: Vec) -> tuple[float, Vec]:
     """Return the distance to the plane, m (negative behind it), and its normal."""
-    normal = _read(table, at + 2 + len(x), x)
+    normal = vector_at(table, body_of(at, x), x)
     return dot(x, normal), normal
 
 
@@ -172,7 +176,7 @@ def hit_half_space(table: Any, at: int, x: Vec, direction: Vec, clearance: float
 
     From where it overlaps already it is 0.
     """
-    normal = _read(table, at + 2 + len(x), x)
+    normal = vector_at(table, body_of(at, x), x)
     room, speed = dot(x, normal) - clearance, dot(direction, normal)
     o = like(room, 0.0)
     return o if room < o else (room / -speed if speed < o else like(o, np.inf))

@@ -1,6 +1,6 @@
 """Segments one after another: capsules, walls along a line, polygons (closed, and solid inside, in the plane).
 
-A chain is some numbers of a table: a header (see shapes/table.py), how many vertices there are, how far around the line
+A chain is some numbers of a table: a head (see head.py), how many vertices there are, how far around the line
 it is thick (m), 1 if the last vertex is joined to the first and what lies within is solid; then the vertices, relative
 to the anchor. A chain of one vertex is a circle or sphere. `x` is where the agent is, relative to the anchor.
 """
@@ -12,10 +12,11 @@ from typing import Any
 import numpy as np
 
 from flockenv.kernels import Vec, law, like
+from flockenv.shapes.head import body_of, bound_of, vector_at
 from flockenv.shapes.round import ray_hit
 from flockenv.vec import add, axis, dot, perpendicular, scale, select, sub, unit
 
-__all__ = ["hit_chain", "nearest_chain", "segment_hit", "segment_share"]
+__all__ = ["crosses", "hit_chain", "nearest_chain", "segment_hit", "segment_share", "vertex"]
 
 
 @law
@@ -65,15 +66,13 @@ def segment_hit(x: Vec, direction: Vec, a: Vec, b: Vec, radius: float) -> float:
 
 
 @law
-def _vertex(table: Any, at: int, j: int, x: Vec) -> Vec:
-    if len(x) == 2:
-        return (table[at + 7 + 2 * j], table[at + 8 + 2 * j])
-    else:
-        return (table[at + 8 + 3 * j], table[at + 9 + 3 * j], table[at + 10 + 3 * j])
+def vertex(table: Any, at: int, j: int, x: Vec) -> Vec:
+    """Return its vertex j, from the anchor."""
+    return vector_at(table, body_of(at, x) + 3 + len(x) * j, x)
 
 
 @law
-def _crosses(x: Vec, a: Vec, b: Vec) -> bool:
+def crosses(x: Vec, a: Vec, b: Vec) -> bool:
     """Does the line from x to the right cross the segment?"""
     rise = b[1] - a[1]
     between = (a[1] > x[1]) != (b[1] > x[1])
@@ -87,21 +86,21 @@ def nearest_chain(table: Any, at: int, x: Vec) -> tuple[float, Vec]:
 
     On the very line the normal is across it: to the right of a segment from a to b, which is out of a polygon.
     """
-    d = len(x)
-    count, radius = np.int64(table[at + 2 + d]), table[at + 3 + d]
-    closed = table[at + 4 + d] > like(radius, 0.0)
+    body = body_of(at, x)
+    count, radius = np.int64(table[body]), table[body + 1]
+    closed = table[body + 2] > like(radius, 0.0)
     e = like(radius, 1.0)
     best, away, side, inside = like(radius, np.inf), sub(x, x), axis(x, 0), False
     edges: Any = count if closed or count < 2 else count - 1
     for j in range(edges):
-        a = _vertex(table, at, j, x)
-        b = _vertex(table, at, j + 1 if j + 1 < count else 0, x)
+        a = vertex(table, at, j, x)
+        b = vertex(table, at, j + 1 if j + 1 < count else 0, x)
         off = sub(x, add(a, scale(sub(b, a), segment_share(x, a, b))))
         square = dot(off, off)
         nearer = square < best
         best, away = square if nearer else best, select(nearer, off, away)
         side = select(nearer, perpendicular(unit(sub(b, a))), side)
-        inside = inside != (closed & _crosses(x, a, b))
+        inside = inside != (closed & crosses(x, a, b))
     sign = -e if inside else e
     apart = best > like(best, 1e-24)
     return sign * np.sqrt(best) - radius, select(apart, scale(unit(away), sign), side)
@@ -113,16 +112,19 @@ def hit_chain(table: Any, at: int, x: Vec, direction: Vec, clearance: float) -> 
 
     From where it overlaps already it is 0.
     """
-    d = len(x)
-    count, room = np.int64(table[at + 2 + d]), table[at + 3 + d] + clearance
-    closed = table[at + 4 + d] > like(room, 0.0)
+    body = body_of(at, x)
+    count, room = np.int64(table[body]), table[body + 1] + clearance
+    closed = table[body + 2] > like(room, 0.0)
     best = like(room, np.inf)
+    middle, around = bound_of(table, at, x)
+    if ray_hit(sub(middle, x), direction, around + clearance) == best:
+        return best
     inside = False
     edges: Any = count if closed or count < 2 else count - 1
     for j in range(edges):
-        a = _vertex(table, at, j, x)
-        b = _vertex(table, at, j + 1 if j + 1 < count else 0, x)
+        a = vertex(table, at, j, x)
+        b = vertex(table, at, j + 1 if j + 1 < count else 0, x)
         here = segment_hit(x, direction, a, b, room)
         best = here if here < best else best
-        inside = inside != (closed & _crosses(x, a, b))
+        inside = inside != (closed & crosses(x, a, b))
     return like(best, 0.0) if inside else best

@@ -12,9 +12,10 @@ import numpy as np
 
 from flockenv.grid import sample, sample_vector
 from flockenv.kernels import Vec, law, like
+from flockenv.shapes.head import body_of
 from flockenv.vec import add, axis, dot, norm, scale, select, sub, unit
 
-__all__ = ["hit_distance_field", "nearest_distance_field"]
+__all__ = ["STEPS", "hit_distance_field", "nearest_distance_field", "on_grid"]
 
 STEPS = 96
 """Places that a ray is followed through before it counts as missed: it comes nearer by most of its distance each."""
@@ -29,7 +30,8 @@ def _inside(grid: Any, x: float, d: int, k: int) -> float:
 
 
 @law
-def _on_grid(grid: Any, x: Vec) -> Vec:
+def on_grid(grid: Any, x: Vec) -> Vec:
+    """Return the place of the grid that is nearest to x."""
     if len(x) == 2:
         return (_inside(grid, x[0], 2, 0), _inside(grid, x[1], 2, 1))
     else:
@@ -42,8 +44,8 @@ def nearest_distance_field(table: Any, at: int, x: Vec) -> tuple[float, Vec]:
 
     Outside the grid: the distance to the grid and the distance there, which is at least as far as it is.
     """
-    grid = table[at + 2 + len(x) :]
-    y = _on_grid(grid, x)
+    grid = table[body_of(at, x) :]
+    y = on_grid(grid, x)
     beyond = sub(x, y)
     out = unit(add(sample_vector(grid, y, 1), beyond))
     some = dot(out, out) > like(x[0], 0.0)
@@ -57,7 +59,7 @@ def hit_distance_field(table: Any, at: int, x: Vec, direction: Vec, clearance: f
     From where it overlaps already it is 0. Followed step by step, each as long as the surface is far, to a hundredth of
     the grid's spacing.
     """
-    grid = table[at + 2 + len(x) :]
+    grid = table[body_of(at, x) :]
     d = len(x)
     near, longest = grid[d] * like(clearance, 0.01), grid[d] * (grid[d + 1] + grid[d + 2] + grid[2 * d])
     o, most = like(clearance, 0.0), like(clearance, 0.9)
@@ -65,7 +67,7 @@ def hit_distance_field(table: Any, at: int, x: Vec, direction: Vec, clearance: f
     limit = norm(x) + longest + longest + clearance
     for _ in range(STEPS):
         spot = add(x, scale(direction, way))
-        y = _on_grid(grid, spot)
+        y = on_grid(grid, spot)
         beyond = norm(sub(spot, y))
         here = sample(grid, y, 0)
         # beyond the grid the surface is as far as the grid at least, and the body that comes nearer has a size

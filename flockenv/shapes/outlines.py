@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["area", "around", "behind", "crossing", "hull", "silhouette", "strips"]
+__all__ = ["area", "around", "band", "behind", "crossing", "hull", "silhouette", "strips"]
 
 Floats = NDArray[np.float64]
 ROUND = 48
@@ -72,6 +72,17 @@ def around(points: Floats, radius: float) -> Floats:
     return hull((points[:, None] + ring).reshape(-1, 2))
 
 
+def band(vertices: Floats, width: float) -> Floats:
+    """Return a strip along the outside of a closed polygon (n, 2), as one polygon: around it, and back."""
+    inner = vertices if area(vertices) > 0 else vertices[::-1]
+    along = np.roll(inner, -1, axis=0) - inner
+    out = np.stack([along[:, 1], -along[:, 0]], axis=1) / np.hypot(*along.T)[:, None]
+    both = out + np.roll(out, 1, axis=0)
+    # where two edges meet the strip is a mitre, but for corners so sharp that it would become a spike
+    outer = inner + width * both / np.maximum((both**2).sum(axis=1, keepdims=True) / 2, 0.5)
+    return np.concatenate([outer, outer[:1], inner[:1], inner[::-1]])
+
+
 def behind(point: Floats, direction: Floats, low: Floats, high: Floats) -> list[Floats]:
     """Return what of a region lies behind a line, as a polygon; nothing if the direction is 0 (a floor)."""
     if not direction.any():
@@ -105,16 +116,14 @@ def silhouette(shape: Any, point: Floats, clearance: float) -> tuple[Floats, Flo
 
     Lines from the point through them touch the shape: tangents of the circles around its corners.
     """
-    corners, radius = np.asarray(shape.extremes), clearance
+    corners, radius = shape.corners
     if len(point) != 2 or shape.dimension != 2:
         raise ValueError(f"silhouette: of a {shape.kind} in {shape.dimension}-D; the outline has two ends in the plane")
-    if shape.form in ("half_space", "distance_field"):
+    if shape.is_hollow:
+        raise ValueError(f"silhouette: a hollow {shape.kind} is all around, its outline has no ends")
+    if not len(corners):
         raise ValueError(f"silhouette: a {shape.kind} has no corners")
-    if shape.kind == "circle":
-        corners, radius = np.array([shape.centre]), radius + shape.radius
-    elif shape.kind in ("capsule", "wall"):
-        corners = np.array(shape.vertices if shape.kind == "wall" else (shape.start, shape.end))
-        radius += shape.radius
+    radius += clearance
     if float(shape.gap(point)) <= clearance:
         raise ValueError(f"silhouette: {point.tolist()} m is not outside of it")
     offset = corners - point

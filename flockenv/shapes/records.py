@@ -1,6 +1,8 @@
 """Obstacles as records: each answers for itself how far its surface is, which way is out, where a ray hits.
 
 Polygon(vertices=((0, 0), (4, 0), (4, 3))).gap([5.0, 1.0])
+
+Where one moves, it answers for the place that its fields say; `shift` tells how far it is from there at a time.
 """
 
 from __future__ import annotations
@@ -10,38 +12,115 @@ import math
 import operator
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
 from pydantic import Field, WrapValidator, model_validator
 
-from flockenv.grid import packed, points_of
-from flockenv.records import Record, keep
-from flockenv.shapes import outlines
+from flockenv.grid import MOST_POINTS, packed, points_of
+from flockenv.records import Record, in_tuples, keep
+from flockenv.shapes import outlines, table
 from flockenv.shapes.table import Floats, hits, nearest
 
 __all__ = [
-    "SHAPES", "AnyShape", "Block", "Capsule", "Circle", "DistanceField", "HalfSpace", "Polygon", "Shape", "Wall",
-    "clear_of",
+    "SHAPES", "AnyShape", "Block", "Bound", "Capsule", "Circle", "Closed", "DistanceField", "HalfSpace", "Polygon",
+    "Shape", "Sway", "Wall", "clear_of",
 ]  # fmt: skip
 
 Point = Annotated[tuple[float, ...], Field(min_length=2, max_length=3)]
-MOST_POINTS = 2**22
-"""Points of a grid of distances: 128 MB in the plane."""
+
+
+class Sway(Record):
+    """To and fro: amplitude sin(2 pi t / period + phase) beside whatever else moves it."""
+
+    amplitude: Point = Field(description="m, how far from the middle, and in which direction")
+    period: float = Field(gt=0, description="s, there and back")
+    phase: float = Field(default=0.0, description="rad, where it is at time 0")
+
+
+class Bound(NamedTuple):
+    """What a shape lies within where its fields say; all infinite but the centre if it has no end."""
+
+    centre: Floats  # (D,) m, the middle of the box
+    half: Floats  # (D,) m, half the edges of the box along the axes
+    radius: float  # m, of a circle or sphere around the centre
 
 
 class Shape(Record):
-    """Something solid that stands still: what every obstacle answers. Points are (..., D) arrays in m."""
+    """Something solid: what every obstacle answers. Points are (..., D) arrays in m."""
 
     kind: str
-    form: ClassVar[str] = "chain"
-    """By which laws it is met; see shapes/table.py."""
+    velocity: Point | None = Field(default=None, description="m/s, how it moves from time 0 on; none = it does not")
+    sway: Sway | None = Field(default=None, description="how it goes to and fro; none = it does not")
+    laws: ClassVar[str] = "chain"
+    """By which laws it is met while it is solid; see shapes/table.py."""
+
+    @model_validator(mode="after")
+    def _moves_in_its_dimension(self) -> Self:
+        """Refuse a motion in another dimension."""
+        swaying = self.sway.amplitude if self.sway else None
+        for name, value in (("velocity", self.velocity), ("sway.amplitude", swaying)):
+            if value is not None and len(value) != self.dimension:
+                raise ValueError(f"{name} = {value}: must have {self.dimension} numbers, as the {self.kind} has")
+        return self
+
+    @property
+    def is_hollow(self) -> bool:
+        """Is it free within and solid all around?"""
+        return False
+
+    @property
+    def form(self) -> str:
+        """By which laws it is met; see shapes/table.py."""
+        return f"hollow_{self.laws}" if self.is_hollow else self.laws
+
+    @property
+    def in_state(self) -> bool:
+        """Is it a circle or sphere that a state has a place for? Every other shape is the same in all worlds."""
+        return False
+
+    @property
+    def moves(self) -> bool:
+        """Is it ever somewhere else?"""
+        return any(self.velocity or ()) or (self.sway is not None and any(self.sway.amplitude))
+
+    @property
+    def motion(self) -> list[float]:
+        """Its velocity (D), the amplitude of its sway (D), 2 pi / period and phase: what laws read of how it moves."""
+        still = (0.0,) * self.dimension
+        sway = (*self.sway.amplitude, math.tau / self.sway.period, self.sway.phase) if self.sway else (*still, 0.0, 0.0)
+        return [*(self.velocity or still), *sway]
+
+    def shift(self, time: float) -> Floats:
+        """Return how far it is at a time, s, from where its fields say, (D,) m: v t + a sin(2 pi t / T + phase)."""
+        d, motion = self.dimension, np.array(self.motion)
+        return np.asarray(motion[:d] * time + motion[d:-2] * math.sin(motion[-2] * time + motion[-1]))
 
     @property
     def dimension(self) -> int:
         """In how many dimensions it lies."""
         return len(self.anchor)
+
+    @functools.cached_property
+    def table(self) -> Floats:
+        """It alone, as laws read it."""
+        return table.packed([self], self.dimension)[0]
+
+    @functools.cached_property
+    def bound(self) -> Bound:
+        """What it lies within; without an end if it is hollow: then all around is solid."""
+        extremes, (corners, around) = self.extremes, self.corners
+        if self.is_hollow or not len(extremes):
+            return Bound(np.array(self.anchor), np.full(self.dimension, np.inf), math.inf)
+        low, high = extremes.min(axis=0), extremes.max(axis=0)
+        middle = (low + high) / 2
+        return Bound(middle, (high - low) / 2, around + float(np.linalg.norm(corners - middle, axis=1).max()))
+
+    @property
+    def corners(self) -> tuple[Floats, float]:
+        """Places (n, D) m, and how far around them it reaches, m: its hull is that of these circles; of some none."""
+        return np.zeros((0, self.dimension)), 0.0
 
     @property
     @abstractmethod
@@ -54,12 +133,17 @@ class Shape(Record):
         """Places that everything of it lies between, (n, D) m; none if it has no end."""
 
     @abstractmethod
-    def row(self, dimension: int) -> Sequence[float]:
-        """Return the numbers that its laws read, behind the anchor."""
+    def row(self, dimension: int) -> Sequence[float] | Floats:
+        """Return the numbers that its laws read, behind the head."""
 
     @abstractmethod
+    def polygons(self, low: Floats, high: Floats) -> list[Floats]:
+        """Return the polygons, each (n, 2) m, that show its solid from above in a region."""
+
     def outline(self, low: Floats, high: Floats) -> list[Floats]:
-        """Return the polygons, each (n, 2) m, that show it from above in a region."""
+        """Return the polygons, each (n, 2) m, that show it from above in a region: of a hollow one, its edge alone."""
+        whole = self.polygons(low, high)
+        return [outlines.band(each, 0.004 * float((high - low).max())) for each in whole] if self.is_hollow else whole
 
     def gap(self, points: ArrayLike) -> Floats:
         """Return how far its surface is, (...) m; negative inside."""
@@ -93,7 +177,18 @@ class Shape(Record):
         return outlines.silhouette(self, np.asarray(point, float), clearance)
 
 
-class Circle(Shape):
+class Closed(Shape):
+    """A shape with an inside, which may be solid or free."""
+
+    hollow: bool = Field(default=False, description="is it free within, and solid all around? Bodies stay inside")
+
+    @property
+    def is_hollow(self) -> bool:
+        """Is it free within and solid all around?"""
+        return self.hollow
+
+
+class Circle(Closed):
     """A round obstacle of a scene: a circle in 2-D, a sphere in 3-D."""
 
     kind: Literal["circle"] = "circle"
@@ -101,9 +196,19 @@ class Circle(Shape):
     radius: float = Field(gt=0, description="m")
 
     @property
+    def in_state(self) -> bool:
+        """If it stands still and is solid."""
+        return not (self.moves or self.hollow)
+
+    @property
     def anchor(self) -> tuple[float, ...]:
         """Its centre."""
         return self.centre
+
+    @property
+    def corners(self) -> tuple[Floats, float]:
+        """Its centre and radius."""
+        return np.array([self.centre]), self.radius
 
     @property
     def extremes(self) -> Floats:
@@ -114,7 +219,7 @@ class Circle(Shape):
         """A chain of one vertex."""
         return [1.0, self.radius, 0.0] + [0.0] * dimension
 
-    def outline(self, low: Floats, high: Floats) -> list[Floats]:
+    def polygons(self, low: Floats, high: Floats) -> list[Floats]:
         """A circle."""
         return [outlines.around(np.array([self.centre[:2]]), self.radius)]
 
@@ -132,9 +237,19 @@ class Wall(Shape):
         return self
 
     @property
+    def dimension(self) -> int:
+        """As many as its first vertex has numbers."""
+        return len(self.vertices[0])
+
+    @property
     def anchor(self) -> tuple[float, ...]:
         """The middle of its box."""
         return _middle(self.vertices)
+
+    @property
+    def corners(self) -> tuple[Floats, float]:
+        """Its vertices and half its thickness."""
+        return np.array(self.vertices), self.radius
 
     @property
     def extremes(self) -> Floats:
@@ -146,14 +261,14 @@ class Wall(Shape):
         around = np.array(self.vertices) - self.anchor
         return [float(len(self.vertices)), self.radius, 0.0, *around.ravel().tolist()]
 
-    def outline(self, low: Floats, high: Floats) -> list[Floats]:
+    def polygons(self, low: Floats, high: Floats) -> list[Floats]:
         """A capsule around each part."""
         flat = np.array(self.vertices)[:, :2]
         radius = max(self.radius, 0.002 * float((high - low).max()))
         return [outlines.around(flat[k : k + 2], radius) for k in range(len(flat) - 1)]
 
 
-class Capsule(Shape):
+class Capsule(Closed):
     """A straight piece of wall with round ends; with radius 0 a segment."""
 
     kind: Literal["capsule"] = "capsule"
@@ -165,11 +280,23 @@ class Capsule(Shape):
     def _in_one_dimension(self) -> Capsule:
         if len(self.start) != len(self.end):
             raise ValueError(f"end = {self.end}: start has {len(self.start)} numbers")
+        if self.hollow and self.radius == 0:
+            raise ValueError("radius = 0: a hollow capsule has room inside, its radius is greater than 0")
         return self
 
     @property
     def _wall(self) -> Wall:
         return Wall(vertices=(self.start, self.end), radius=self.radius)
+
+    @property
+    def dimension(self) -> int:
+        """As many as its start has numbers."""
+        return len(self.start)
+
+    @property
+    def corners(self) -> tuple[Floats, float]:
+        """Its ends and radius."""
+        return self._wall.corners
 
     @property
     def anchor(self) -> tuple[float, ...]:
@@ -185,12 +312,12 @@ class Capsule(Shape):
         """A chain of two vertices."""
         return self._wall.row(dimension)
 
-    def outline(self, low: Floats, high: Floats) -> list[Floats]:
+    def polygons(self, low: Floats, high: Floats) -> list[Floats]:
         """A capsule."""
-        return self._wall.outline(low, high)
+        return self._wall.polygons(low, high)
 
 
-class Polygon(Shape):
+class Polygon(Closed):
     """A solid of the plane, convex or concave; its edges do not cross."""
 
     kind: Literal["polygon"] = "polygon"
@@ -214,6 +341,11 @@ class Polygon(Shape):
         return _middle(self.vertices)
 
     @property
+    def corners(self) -> tuple[Floats, float]:
+        """Its vertices."""
+        return np.array(self.vertices), 0.0
+
+    @property
     def extremes(self) -> Floats:
         """Its vertices."""
         return np.array(self.vertices)
@@ -224,16 +356,16 @@ class Polygon(Shape):
         around = around if outlines.area(around) > 0 else around[::-1]
         return [float(len(around)), 0.0, 1.0, *around.ravel().tolist()]
 
-    def outline(self, low: Floats, high: Floats) -> list[Floats]:
+    def polygons(self, low: Floats, high: Floats) -> list[Floats]:
         """Itself."""
         return [np.array(self.vertices)]
 
 
-class Block(Shape):
+class Block(Closed):
     """A rectangle, or in 3-D a box, along the axes or turned."""
 
     kind: Literal["block"] = "block"
-    form: ClassVar[str] = "block"
+    laws: ClassVar[str] = "block"
     centre: Point = Field(description="m")
     size: Annotated[tuple[Annotated[float, Field(gt=0)], ...], Field(min_length=2, max_length=3)] = Field(
         description="m, its edges"
@@ -268,6 +400,11 @@ class Block(Shape):
         return np.ascontiguousarray(full[:d, :d].T)
 
     @property
+    def corners(self) -> tuple[Floats, float]:
+        """The same as its extremes."""
+        return self.extremes, 0.0
+
+    @property
     def extremes(self) -> Floats:
         """Its corners, (2^D, D)."""
         d = len(self.centre)
@@ -278,7 +415,7 @@ class Block(Shape):
         """Half edges and axes."""
         return [*(0.5 * edge for edge in self.size), *self.axes.ravel().tolist()]
 
-    def outline(self, low: Floats, high: Floats) -> list[Floats]:
+    def polygons(self, low: Floats, high: Floats) -> list[Floats]:
         """Its corners as seen from above."""
         return [outlines.hull(self.extremes[:, :2])]
 
@@ -287,7 +424,7 @@ class HalfSpace(Shape):
     """All that lies behind a line, or in 3-D a plane."""
 
     kind: Literal["half_space"] = "half_space"
-    form: ClassVar[str] = "half_space"
+    laws: ClassVar[str] = "half_space"
     point: Point = Field(description="m, any place of its surface")
     direction: Point = Field(description="out of it, of any length")
 
@@ -313,16 +450,16 @@ class HalfSpace(Shape):
         """The unit normal."""
         return (np.array(self.direction) / math.hypot(*self.direction)).tolist()  # type: ignore[no-any-return]
 
-    def outline(self, low: Floats, high: Floats) -> list[Floats]:
+    def polygons(self, low: Floats, high: Floats) -> list[Floats]:
         """What of the region lies behind it; nothing of a floor."""
         return outlines.behind(np.array(self.point[:2]), np.array(self.direction[:2]), low, high)
 
 
-class DistanceField(Shape):
+class DistanceField(Closed):
     """Distances on a grid: of other shapes, or any that are given as an array (negative inside)."""
 
     kind: Literal["distance_field"] = "distance_field"
-    form: ClassVar[str] = "distance_field"
+    laws: ClassVar[str] = "distance_field"
     low: Point = Field(description="m, the lowest corner of the grid")
     high: Point | None = Field(default=None, description="m, its highest corner; goes with shapes")
     spacing: float = Field(gt=0, description="m, between points of the grid")
@@ -358,6 +495,8 @@ class DistanceField(Shape):
         for k, shape in enumerate(self.shapes):
             if shape.dimension != len(self.low):
                 raise ValueError(f"shapes[{k}]: lies in {shape.dimension} dimensions, low in {len(self.low)}")
+            if shape.moves:
+                raise ValueError(f"shapes[{k}]: moves; a distance field moves as a whole, by its own velocity and sway")
         if not np.isfinite(self.distances).all():
             raise ValueError("values: must be finite")
         return self
@@ -389,18 +528,39 @@ class DistanceField(Shape):
         """The corners of its grid."""
         return np.array([self.low, np.array(self.low) + self.spacing * (np.array(self.counts) - 1)])
 
-    def row(self, dimension: int) -> Sequence[float]:
-        """Its grid: distances and unit gradients."""
+    @functools.cached_property
+    def bound(self) -> Bound:
+        """The box of its grid, and as far around it as what is solid there may go on."""
+        if self.hollow:
+            return super().bound
+        low, high = self.extremes
+        half = (high - low) / 2 + max(0.0, -float(self.distances.min()))
+        return Bound((low + high) / 2, half, float(np.linalg.norm(half)))
+
+    @functools.cached_property
+    def _grid(self) -> Floats:
         along: Any = np.gradient(self.distances, self.spacing)
         slopes = np.stack(along, axis=-1)
         size = np.linalg.norm(slopes, axis=-1, keepdims=True)
         numbers = np.concatenate([self.distances[..., None], slopes / np.maximum(size, 1e-12)], axis=-1)
-        return packed(numbers, (0.0,) * dimension, self.spacing)  # type: ignore[return-value]
+        return packed(numbers, (0.0,) * len(self.low), self.spacing)
+
+    def row(self, dimension: int) -> Floats:
+        """Its grid: distances and unit gradients."""
+        return self._grid
+
+    def polygons(self, low: Floats, high: Floats) -> list[Floats]:
+        """Strips of the grid that lie in it; in 3-D, of what lies below or above."""
+        return outlines.strips(self._from_above, self.low[:2], self.spacing)
 
     def outline(self, low: Floats, high: Floats) -> list[Floats]:
-        """Strips of the grid that lie in it; in 3-D, of what lies below or above."""
-        flat = self.distances if self.distances.ndim == 2 else self.distances.min(axis=2)
-        return outlines.strips(flat, self.low[:2], self.spacing)
+        """The same, or of a hollow one what lies at its edge."""
+        edge = np.abs(self._from_above) - self.spacing / 2
+        return outlines.strips(edge, self.low[:2], self.spacing) if self.hollow else self.polygons(low, high)
+
+    @property
+    def _from_above(self) -> Floats:
+        return self.distances if self.distances.ndim == 2 else np.asarray(self.distances.min(axis=2))
 
 
 def _nested(values: Any) -> tuple[Any, ...]:
@@ -454,22 +614,17 @@ def shape_of(data: Any) -> Shape:
     if kind not in SHAPES or kind == "distance_field":
         allowed = ", ".join(name for name in SHAPES if name != "distance_field")
         raise ValueError(f"shapes: kind = {kind!r}; must be one of {allowed}")
-    fields = {name: _in_tuples(value) for name, value in data.items()}
-    return SHAPES[kind](**fields)
+    return SHAPES[kind](**in_tuples(data))
 
 
-def _in_tuples(value: Any) -> Any:
-    return tuple(map(_in_tuples, value)) if isinstance(value, (list, tuple)) else value
-
-
-def clear_of(shapes: Sequence[Shape], points: Floats, period: Floats) -> Floats:
+def clear_of(shapes: Sequence[Shape], points: Floats, period: Floats, time: float = 0.0) -> Floats:
     """Return the distance of points (N, D) to the nearest of some shapes, (N,) m; inf if there is none.
 
-    period: of each axis, (D,) m; 0 where the world does not repeat.
+    period: of each axis, (D,) m; 0 where the world does not repeat. time: s, when.
     """
     best = np.full(len(points), np.inf)
     for shape in shapes:
-        offset = points - shape.anchor
+        offset = points - shape.anchor - shape.shift(time)
         turns = np.divide(offset, period, out=np.zeros_like(offset), where=period > 0)
         best = np.minimum(best, shape.gap(shape.anchor + offset - period * np.floor(turns + 0.5)))
     return best

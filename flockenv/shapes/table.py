@@ -1,8 +1,8 @@
 """Shapes as rows of one table that kernels read, and loops over points for Python.
 
-A row is its length, the number of the obstacle, the anchor (D, m: everything else is relative to it, so that on a torus
-the nearest image counts, and float32 loses nothing far from the origin), then what its form calls for: see chain.py,
-block.py and field.py. Rows of one form lie one after another.
+A row is a head, the same for every form (see head.py), then what its form calls for: see chain.py, block.py and
+field.py. Everything is relative to the anchor, so that on a torus the nearest image counts, and float32 loses nothing
+far from the origin. Rows of one form lie one after another.
 """
 
 from __future__ import annotations
@@ -25,8 +25,15 @@ FORMS = {
     "block": "flockenv.shapes.block",
     "half_space": "flockenv.shapes.block",
     "distance_field": "flockenv.shapes.field",
+    "hollow_chain": "flockenv.shapes.hollow",
+    "hollow_block": "flockenv.shapes.hollow",
+    "hollow_distance_field": "flockenv.shapes.hollow",
 }
 """The forms that rows have, and where their laws `nearest_FORM` and `hit_FORM` are."""
+
+
+UP = 1 + 1e-6
+"""Bounds in a row are larger by this: whoever is beyond one is clear of the shape, however single precision rounds."""
 
 
 def packed(shapes: Sequence[Any], dimension: int, first: int = 0) -> tuple[Floats, dict[str, tuple[int, int]]]:
@@ -34,15 +41,23 @@ def packed(shapes: Sequence[Any], dimension: int, first: int = 0) -> tuple[Float
     rows: list[Floats] = []
     where: dict[str, tuple[int, int]] = {}
     at = 0
-    for form in FORMS:
+    for number, form in enumerate(FORMS):
         mine = [(first + k, shape) for k, shape in enumerate(shapes) if shape.form == form]
         if mine:
             where[form] = (at, len(mine))
         for who, shape in mine:
-            body = shape.row(dimension)
-            rows.append(np.array([2 + dimension + len(body), who, *shape.anchor, *body], np.float64))
-            at += len(rows[-1])
+            row = np.concatenate([[0.0, who], _head(shape, number), shape.row(dimension)])
+            row[0] = len(row)
+            rows.append(row)
+            at += len(row)
     return np.concatenate(rows) if rows else np.zeros(0), where
+
+
+def _head(shape: Any, form: int) -> list[float]:
+    """Return what stands in a row before its body, after its length and number; see head.py."""
+    bound = shape.bound
+    middle = bound.centre - np.array(shape.anchor)
+    return [*shape.anchor, float(form), *middle, *(bound.half * UP), bound.radius * UP, *shape.motion]
 
 
 @functools.cache
@@ -82,8 +97,7 @@ def nearest(shape: Any, points: ArrayLike) -> tuple[Floats, Floats]:
     """Return the distances to the surface of points (..., D), (...) m, and the outward unit normals there (..., D)."""
     flat, lead = _flat(points)
     gap, normal = np.empty(len(flat)), np.empty_like(flat)
-    table, _ = packed([shape], flat.shape[1])
-    _loops(shape.form, flat.shape[1]).nearest(table, flat, gap, normal)
+    _loops(shape.form, flat.shape[1]).nearest(shape.table, flat, gap, normal)
     return gap.reshape(lead), normal.reshape((*lead, -1))
 
 
@@ -93,7 +107,6 @@ def hits(shape: Any, points: ArrayLike, directions: ArrayLike, clearance: ArrayL
     ways, _ = _flat(np.broadcast_arrays(points, directions)[1])
     room = np.ascontiguousarray(np.broadcast_to(np.asarray(clearance, np.float64), lead)).reshape(-1)
     out = np.empty(len(flat))
-    table, _ = packed([shape], flat.shape[1])
     loop: Callable[..., None] = _loops(shape.form, flat.shape[1]).hits
-    loop(table, flat, ways, room, out)
+    loop(shape.table, flat, ways, room, out)
     return out.reshape(lead)

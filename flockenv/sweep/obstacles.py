@@ -1,4 +1,5 @@
-"""Folds over the obstacles, all of them in one pass: circles, which may differ from world to world, then other shapes.
+"""Folds over the obstacles, all of them in one pass: circles of the state, which may differ from world to world, then
+the other shapes: what is not round, moves, or is hollow. These are met where they are at the time of the stage.
 
 A law meets circles as they are, and of any other shape one point (`effects.base.Obstacle`): the nearest of its surface,
 or, where the law casts a ray, the one that it touches first. Nothing is written if no law asks for obstacles.
@@ -21,11 +22,13 @@ def obstacle_imports(parts: Parts) -> list[str]:
     """Write what folds over obstacles, and who is hidden by them, are made of."""
     if not parts.meets_obstacles:
         return []
+    asked = ["bound_of"] * bool(parts.bounded) + ["shift_of", "velocity_of"] * parts.moving
     lines = [
         "from flockenv.effects.base import Obstacle",
         "from flockenv.shapes.round import blocks as stands_between, normal as outward, touched_normal",
         "from flockenv.shapes.touch import touched_offset, touched_spot",
         "from flockenv.steering.around import threat",
+        *([f"from flockenv.shapes.head import {', '.join(asked)}"] if asked else []),
     ]
     return lines + [
         f"from {module} import hit_{form}, nearest_{form}" for form, module in FORMS.items() if form in parts.shaped[1]
@@ -46,6 +49,10 @@ def obstacles(parts: Parts, me: list[str], found_out: Callable[[int], str]) -> l
         told = f", {found_out(k)}" if parts.effects[k].pair_law else ""
         starts.append(f"found = obstacle_start_{k}(p{k}, me{told})")
         starts += [f"{s} = found[{j}]" for j, s in enumerate(slots)]
+    if parts.bounded:
+        starts.append(f"seen = obstacle_reach_{asking[0][0]}(p{asking[0][0]}, me)")
+        starts += [f"seen = max(seen, obstacle_reach_{k}(p{k}, me))" for k, _ in asking[1:]]
+        starts.append(f"{slot('reach0')} = seen")
     count = " + ".join(["obstacle_radius.shape[1]", *(f"{form}_count" for form in parts.shaped[1])])
     d, w = parts.dimension, parts.width
     lines = [
@@ -61,21 +68,30 @@ def obstacles(parts: Parts, me: list[str], found_out: Callable[[int], str]) -> l
         indented([*me, "to = offset_to(size, x, place)", *_meet(parts, asking, CIRCLE)], 12),
     ]
     for form in parts.shaped[1]:
-        met = [
-            *me,
-            "y = offset_to(size, place, x)",
-            f"gap, out = nearest_{form}(params, at_, y)",
-            *_meet(parts, asking, form),
-        ]
+        met = [f"gap, out = nearest_{form}(params, at_, y)", *_meet(parts, asking, form)]
+        if form in parts.bounded:
+            within = "if dot(beside, beside) < (wide + seen) * (wide + seen):"
+            bound = ["middle, wide = bound_of(params, at_, y)", f"beside, seen = sub(y, middle), {slot('reach0')}"]
+            met = [*bound, within, *indented_lines(met, 4)]
+        met = [*me, "y = offset_to(size, place, x)", *met]
         lines += [
             f"at_ = {form}_at",
             f"for m in range({form}_count):",
             f"    place = {tuple_of('params[at_ + 2 + #]', d)}",
+            *_moved(parts),
             f"    for l in range(np.uint64({w})):",
             indented(met, 8),
             "    at_ += np.int64(params[at_])",
         ]
     return lines
+
+
+def _moved(parts: Parts) -> list[str]:
+    """Write where a shape is at this instant, and how fast it moves."""
+    if not parts.moving:
+        return []
+    velocity = "    glide = velocity_of(params, at_, time, place)"
+    return [velocity, "    place = add(place, shift_of(params, at_, time, place))"]
 
 
 def _meet(parts: Parts, asking: list[tuple[int, list[str]]], form: str) -> list[str]:
@@ -84,13 +100,15 @@ def _meet(parts: Parts, asking: list[tuple[int, list[str]]], form: str) -> list[
     for k, slots in asking:
         effect = parts.effects[k]
         for j in range(effect.rays(parts.dimension) if effect.obstacle_ray else 1):
-            lines += _touched(form, k, j) if effect.obstacle_ray else _near(form, k if effect.obstacle_from else None)
+            vel = "glide" if parts.moving and form != CIRCLE else "zero(x)"
+            from_ = k if effect.obstacle_from else None
+            lines += _touched(form, k, j, vel) if effect.obstacle_ray else _near(form, from_, vel)
             lines.append(f"found = obstacle_law_{k}(p{k}, me, it, ({', '.join(slots)},))")
             lines += [f"{s} = found[{i}]" for i, s in enumerate(slots)]
     return lines
 
 
-def _near(form: str, k: int | None) -> list[str]:
+def _near(form: str, k: int | None, vel: str) -> list[str]:
     """Write an obstacle as a law sees it that casts no rays, from where it is or, for effect k, from elsewhere."""
     if form == CIRCLE:
         way, from_ = ("to", []) if k is None else ("way", [f"way = sub(to, obstacle_from_{k}(p{k}, me))"])
@@ -100,7 +118,7 @@ def _near(form: str, k: int | None) -> list[str]:
     if k is not None:
         far, side = "far", "side"
         from_ = [f"far, side = nearest_{form}(params, at_, add(y, obstacle_from_{k}(p{k}, me)))"]
-    body = f"zero(x), like({far}, 0.0), zero(x), {far}, {side}, like({far}, np.inf), zero(x)"
+    body = f"{vel}, like({far}, 0.0), zero(x), {far}, {side}, like({far}, np.inf), zero(x)"
     return [
         *from_,
         f"to = touched_offset(zero(x), like({far}, 0.0), {side}, {far}, {far})",
@@ -108,7 +126,7 @@ def _near(form: str, k: int | None) -> list[str]:
     ]
 
 
-def _touched(form: str, k: int, j: int) -> list[str]:
+def _touched(form: str, k: int, j: int, vel: str) -> list[str]:
     """Write an obstacle as a law sees it that casts ray j."""
     ray = f"ray, margin = obstacle_ray_{k}(p{k}, me, {j})"
     if form == CIRCLE:
@@ -122,10 +140,27 @@ def _touched(form: str, k: int, j: int) -> list[str]:
         ray,
         "room = me.radius + margin",
         f"hit = like(gap, 0.0) if gap < room else hit_{form}(params, at_, y, ray, room)",
-        f"side = nearest_{form}(params, at_, touched_spot(y, ray, hit, room))[1]",
+        _touched_side(form),
         "to = touched_offset(ray, hit, side, room, gap)",
-        "it = Obstacle(params[at_ + 1], to, dot(to, to), zero(x), like(gap, 0.0), zero(x), gap, side, hit, ray)",
+        f"it = Obstacle(params[at_ + 1], to, dot(to, to), {vel}, like(gap, 0.0), zero(x), gap, side, hit, ray)",
     ]
+
+
+def _place(parts: Parts) -> str:
+    """Write where the anchor of the shape at `at_` is."""
+    place = tuple_of("params[at_ + 2 + #]", parts.dimension)
+    return f"add({place}, shift_of(params, at_, time, x))" if parts.moving else place
+
+
+def _touched_side(form: str) -> str:
+    """Write the normal where a ray touches; where none does it is that of the nearest place, which is known.
+
+    Lanes of blocks and half-spaces lie side by side: there a choice costs less than a branch.
+    """
+    found = f"nearest_{form}(params, at_, touched_spot(y, ray, hit, room))[1]"
+    if form in ("block", "half_space"):
+        return f"side = {found}"
+    return f"side = {found} if (hit > like(gap, 0.0)) & (hit < like(gap, np.inf)) else out"
 
 
 def blocked(parts: Parts) -> str:
@@ -145,14 +180,14 @@ def blocked(parts: Parts) -> str:
         lines += [
             f"at_ = np.int64(params[{at}])",
             f"for m in range(np.int64(params[{at + 1}])):",
-            f"    y = offset_to(size, {tuple_of('params[at_ + 2 + #]', d)}, x)",
+            f"    y = offset_to(size, {_place(parts)}, x)",
             f"    found |= hit_{form}(params, at_, y, unit(to), like(to[0], 0.0)) < norm(to)",
             "    at_ += np.int64(params[at_])",
         ]
         at += 2
     return f'''
 @kernel
-def blocked(obstacle_x, obstacle_radius, params, size, b, x, to):
+def blocked(obstacle_x, obstacle_radius, params, size, b, {"time, " if parts.moving else ""}x, to):
     """Does an obstacle stand in the straight way to whom is at `to` m?"""
 {indented(indented_lines(lines, 0), 4)}
     return found

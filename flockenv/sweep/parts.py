@@ -63,7 +63,7 @@ class Parts:
     starts: tuple[int, ...] = ()
     """The first agent of each group, and one more: numbers alone, the source does not depend on them."""
     shapes: tuple[Any, ...] = field(default=(), compare=False)
-    """Obstacles that are no circles: the source depends on their forms."""
+    """Obstacles that are not in the state: the source depends on their forms, and on whether any of them moves."""
     circles: int = 0
     """How many obstacles come before them."""
     tables: tuple[NDArray[np.float64], ...] = field(default=(), compare=False)
@@ -97,8 +97,24 @@ class Parts:
 
     @functools.cached_property
     def shaped(self) -> tuple[NDArray[np.float64], dict[str, tuple[int, int]]]:
-        """The table of shapes that are no circles, and the forms that there are: where each begins, how many."""
+        """The table of shapes that are not in the state, and the forms there are: where each begins, how many."""
         return packed(self.shapes, self.dimension, self.circles) if self.meets_obstacles else (np.zeros(0), {})
+
+    @property
+    def moving(self) -> bool:
+        """Does any of them move? If not, nothing of that is written."""
+        return any(shape.moves for shape in self.shapes)
+
+    @functools.cached_property
+    def bounded(self) -> tuple[str, ...]:
+        """The forms of shapes that are only looked at where they lie within reach: none if some law asks for all.
+
+        Those whose laws go from edge to edge, or from place to place. Blocks and half-spaces are met by lanes side by
+        side, which would go through all of the law anyhow: there it was no faster, with rays or without.
+        """
+        folds = [e for e in self.effects if e.obstacle_start is not None]
+        asked = bool(folds) and all(e.obstacle_reach is not None for e in folds)
+        return tuple(form for form in ("chain", "distance_field") if form in self.shaped[1]) if asked else ()
 
     @property
     def meets_obstacles(self) -> bool:
@@ -320,6 +336,7 @@ class Parts:
             ("bond", d * bool(self.bonded)),
             ("far", d * bool(self.far)),
         ]
+        runs += [("reach", int(bool(self.bounded)))]
         runs += [("square", look.agents), ("place", look.agents), ("gap", look.obstacles), ("which", look.obstacles)]
         names = [f"{name}{j}" for name, many in runs for j in range(many)]
         return {name: place for place, name in enumerate([*names, "bad"])}

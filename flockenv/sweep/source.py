@@ -18,7 +18,7 @@ __all__ = ["field_source", "scene_source"]
 LAWS = (
     "own_law", "medium_law", "flow_law", "far_law", "bond_law", "kick_law", "pair_start", "pair_law", "finish_law",
     "obstacle_start", "obstacle_law", "obstacle_finish", "obstacle_ray",
-    "obstacle_from",
+    "obstacle_from", "obstacle_reach",
 )  # fmt: skip
 """The slots that an effect may fill with the name of a law."""
 

@@ -1,0 +1,158 @@
+"""Shapes turned inside out: free within, solid all around. Rooms, spheres and boxes that bodies stay in.
+
+The rows are those of the solid shapes. Distances and normals are theirs with the other sign, and so as exact. A ray
+from within ends where a body of radius r touches the surface from inside: where its centre leaves all that is deeper
+than r within the solid. Of a circle, a sphere, a capsule or a block that is the same shape, smaller by r; of a polygon
+it is what is not within r of an edge: exact, all of them. A distance field is followed step by step.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from flockenv.grid import sample
+from flockenv.kernels import Vec, law, like
+from flockenv.shapes.block import half_edges, nearest_block, turned
+from flockenv.shapes.chain import crosses, nearest_chain, segment_hit, segment_share, vertex
+from flockenv.shapes.field import STEPS, nearest_distance_field, on_grid
+from flockenv.shapes.head import body_of
+from flockenv.vec import add, dot, norm, scale, sub, unit
+
+__all__ = [
+    "hit_hollow_block", "hit_hollow_chain", "hit_hollow_distance_field", "nearest_hollow_block", "nearest_hollow_chain",
+    "nearest_hollow_distance_field",
+]  # fmt: skip
+
+
+@law
+def _inside_out(found: tuple[float, Vec]) -> tuple[float, Vec]:
+    gap, normal = found
+    return -gap, scale(normal, like(gap, -1.0))
+
+
+@law
+def nearest_hollow_chain(table: Any, at: int, x: Vec) -> tuple[float, Vec]:
+    """Return the distance to the surface, m (negative outside), and the inward unit normal at its nearest point."""
+    return _inside_out(nearest_chain(table, at, x))
+
+
+@law
+def nearest_hollow_block(table: Any, at: int, x: Vec) -> tuple[float, Vec]:
+    """Return the distance to the surface, m (negative outside), and the inward unit normal at its nearest point."""
+    return _inside_out(nearest_block(table, at, x))
+
+
+@law
+def nearest_hollow_distance_field(table: Any, at: int, x: Vec) -> tuple[float, Vec]:
+    """Return the distance to the surface, m (negative outside), and the inward unit normal at its nearest point."""
+    return _inside_out(nearest_distance_field(table, at, x))
+
+
+@law
+def _root(a: float, b: float, c: float) -> float:
+    """Return the larger t where a t^2 + 2 b t + c is 0, for a > 0; -inf if there is none. It does not cancel."""
+    o = like(a, 0.0)
+    square = b * b - a * c
+    root = np.sqrt(square if square > o else o)
+    out = (root - b) / a if b <= o else -c / (root + b)
+    return out if square >= o else like(a, -np.inf)
+
+
+@law
+def _capsule_exit(x: Vec, direction: Vec, a: Vec, b: Vec, radius: float) -> float:
+    """Return where a ray from within leaves what is within `radius` of a segment.
+
+    The last place where it leaves the straight sides, or the circle or sphere around an end: all of these lie in it.
+    """
+    o, e = like(radius, 0.0), like(radius, 1.0)
+    along, m = sub(b, a), sub(x, a)
+    axle = unit(along)
+    p, q = sub(m, scale(axle, dot(m, axle))), sub(direction, scale(axle, dot(direction, axle)))
+    slope = dot(q, q)
+    side = _root(slope if slope > o else e, dot(p, q), dot(p, p) - radius * radius)
+    place = dot(m, along) + side * dot(direction, along)
+    out = side if (slope > o) & (place >= o) & (place <= dot(along, along)) else o
+    n = sub(x, b)
+    first = _root(e, dot(m, direction), dot(m, m) - radius * radius)
+    last = _root(e, dot(n, direction), dot(n, n) - radius * radius)
+    out = first if first > out else out
+    return last if last > out else out
+
+
+@law
+def hit_hollow_chain(table: Any, at: int, x: Vec, direction: Vec, clearance: float) -> float:
+    """Return the distance along a unit `direction` at which a body of radius `clearance` touches it, m; inf if never.
+
+    From where it overlaps already it is 0.
+    """
+    body = body_of(at, x)
+    count: Any = np.int64(table[body])
+    radius = table[body + 1]
+    o, far = like(radius, 0.0), like(radius, np.inf)
+    moves = dot(direction, direction) > o
+    if table[body + 2] > o:
+        best, inside = far, False
+        for j in range(count):
+            a, b = vertex(table, at, j, x), vertex(table, at, j + 1 if j + 1 < count else 0, x)
+            here = segment_hit(x, direction, a, b, clearance)
+            best = here if here < best else best
+            inside = inside != crosses(x, a, b)
+        return best if inside else o
+    else:
+        a, b = vertex(table, at, 0, x), vertex(table, at, count - 1, x)
+        room = radius - clearance
+        off = sub(x, add(a, scale(sub(b, a), segment_share(x, a, b))))
+        free = (room >= o) & (dot(off, off) <= room * room)
+        out = _capsule_exit(x, direction, a, b, room) if moves else far
+        return out if free else o
+
+
+@law
+def _leaves(y: float, d: float, h: float) -> float:
+    """Return where a ray leaves [-h, h] along one axis."""
+    o = like(h, 0.0)
+    ends = h - y if d > o else -h - y
+    return ends / d if d != o else like(h, np.inf)
+
+
+@law
+def hit_hollow_block(table: Any, at: int, x: Vec, direction: Vec, clearance: float) -> float:
+    """Return the distance along a unit `direction` at which a body of radius `clearance` touches it, m; inf if never.
+
+    From where it overlaps already it is 0.
+    """
+    y, d, h = turned(table, at, x), turned(table, at, direction), half_edges(table, at, x)
+    h0, h1 = h[0] - clearance, h[1] - clearance
+    free = (abs(y[0]) <= h0) & (abs(y[1]) <= h1)
+    a, b = _leaves(y[0], d[0], h0), _leaves(y[1], d[1], h1)
+    out = a if a < b else b
+    if len(x) == 3:
+        h2 = h[2] - clearance
+        free &= abs(y[2]) <= h2
+        c = _leaves(y[2], d[2], h2)
+        out = c if c < out else out
+    return out if free else like(out, 0.0)
+
+
+@law
+def hit_hollow_distance_field(table: Any, at: int, x: Vec, direction: Vec, clearance: float) -> float:
+    """Return the distance along a unit `direction` at which a body of radius `clearance` touches it, m; inf if never.
+
+    From where it overlaps already it is 0. Followed as the solid one is, to a hundredth of the grid's spacing.
+    """
+    grid = table[body_of(at, x) :]
+    d = len(x)
+    near, longest = grid[d] * like(clearance, 0.01), grid[d] * (grid[d + 1] + grid[d + 2] + grid[2 * d])
+    o, most = like(clearance, 0.0), like(clearance, 0.9)
+    way, room = o, o
+    limit = norm(x) + longest + longest + clearance
+    for _ in range(STEPS):
+        spot = add(x, scale(direction, way))
+        y = on_grid(grid, spot)
+        room = -sample(grid, y, 0) - norm(sub(spot, y)) - clearance
+        if (room < near) | (way > limit):
+            break
+        way += room * most
+    return way if room < near else like(clearance, np.inf)
