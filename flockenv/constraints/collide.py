@@ -11,6 +11,7 @@ from flockenv.constraints.contacts import NEARLY, Contacts, Ends, gather, impact
 from flockenv.constraints.events import Bodies, Meetings, Rules, Things, link, play, take_off
 from flockenv.constraints.impact import along, surface
 from flockenv.kernels import Vec, kernel
+from flockenv.shapes.head import bound_of, shift_of
 from flockenv.vec import add, axis, dot, norm, scale, sub, zero
 
 __all__ = ["COUNTED", "collide"]
@@ -69,25 +70,24 @@ def _with_obstacles(
 ) -> int:  # fmt: skip
     """Add who may touch which obstacle: within the step, or at its end; return how many there are."""
     capacity = meetings.who.shape[0]
-    for m in range(things.form.shape[0]):
-        if things.form[m] < 0:
+    for m in range(things.row.shape[0]):
+        if things.size[m] < 0.0:
             continue
-        drift = vector(period, things.drift, m)
-        place = vector(period, things.place, m)
+        drift, place = vector(period, things.drift, m), vector(period, things.place, m)
         place = place if ahead else add(place, scale(drift, seconds))
         way = norm(drift) * seconds if ahead else 0.0
+        bounded, middle, radius = things.row[m] >= 0, zero(period), things.size[m]
+        if bounded:
+            middle, radius = bound_of(things.table, things.row[m], period)
         for i in range(bodies.living.shape[0]):
             if bodies.living[i] > 0 and bodies.light[i] > 0.0:
                 y = image(period, sub(vector(period, at, i), place))
-                gap, _ = surface(things.form[m], things.table, things.row[m], y)
-                if (
-                    gap
-                    - things.size[m]
-                    - bodies.radius[i]
-                    - (bodies.reach[i] if ahead else NEARLY * bodies.radius[i])
-                    - way
-                    <= touch
-                ):
+                room = bodies.radius[i] + touch + way + (bodies.reach[i] if ahead else NEARLY * bodies.radius[i])
+                off, far = sub(y, middle), radius + room
+                if bounded and not dot(off, off) <= far * far:
+                    continue  # it is not even near the circle or sphere around it
+                gap, _ = surface(things.table, things.row[m], y)
+                if gap - things.size[m] <= room:
                     if count < capacity:
                         meetings.who[count], meetings.other[count] = i, -1 - m
                     count += 1
@@ -95,25 +95,32 @@ def _with_obstacles(
 
 
 @kernel
-def _round_ones(period: Vec, things: Things, obstacle_x: Any, obstacle_radius: Any, b: int) -> None:
-    """Take the round obstacles of world b, which come first."""
-    for m in range(obstacle_radius.shape[1]):
-        radius = np.float64(obstacle_radius[b, m])
-        things.form[m] = 0 if radius > 0.0 else -1
-        things.size[m] = radius
-        write(things.place, m, _load(period, obstacle_x, b, m))
+def _obstacles(
+    period: Vec, things: Things, obstacle_x: Any, obstacle_radius: Any, b: int, begun: float, ended: float
+) -> None:
+    """Find where the obstacles of world b are, and how they move in this step; its own round ones come first."""
+    for m in range(things.row.shape[0]):
+        if m < obstacle_radius.shape[1]:
+            radius = np.float64(obstacle_radius[b, m])
+            things.size[m] = radius if radius > 0.0 else -1.0
+            write(things.place, m, _load(period, obstacle_x, b, m))
+        else:
+            here = shift_of(things.table, things.row[m], begun, period)
+            there = shift_of(things.table, things.row[m], ended, period)
+            write(things.place, m, add(vector(period, things.anchor, m), here))
+            write(things.drift, m, scale(sub(there, here), 1.0 / (ended - begun)))
 
 
 @kernel
 def collide(
-    size: Vec, period: Vec, x0: Any, v0: Any, x: Any, v: Any, alive: Any, obstacle_x: Any, obstacle_radius: Any,
+    period: Vec, x0: Any, v0: Any, x: Any, v: Any, alive: Any, tick: Any, obstacle_x: Any, obstacle_radius: Any,
     bodies: Bodies, meetings: Meetings, things: Things, contacts: Contacts, ends: Ends, before: Any, reach: Any,
     grid: Any, order: Any, cell: Any, start: Any, offset: Any, bounds: Any, sync: Any, ranges: Any, rules: Rules,
     in_time: bool, once: bool, rounds: int, spread: float, first: int, end: int, work: Any, at_work: int, report: Any,
 ) -> int:  # fmt: skip
     """Mend the steps of worlds [first, end) that led from x0, v0 to x, v (D, B, N), in place.
 
-    size: where a periodic box ends, zeros = nowhere; in_time: impacts within the step, one after another; once: one
+    period: where a periodic box ends, zeros = nowhere; in_time: impacts within the step, one after another; once: one
     pass over contacts, and places are not advanced anew; spread: m, how far two are parted at most. Returns the world
     that there was no room for, with the number of its meetings in report[2]: nothing of it is written; else -1.
     """
@@ -124,12 +131,13 @@ def collide(
         far, fast, hard, mean = _board(period, x0, v0, x, v, alive, b, bodies, ends, before, rules.seconds)
         if not (far < np.inf and fast < np.inf):
             continue
-        _round_ones(period, things, obstacle_x, obstacle_radius, b)
+        began = (tick[b] - 1) * rules.seconds
+        _obstacles(period, things, obstacle_x, obstacle_radius, b, began, tick[b] * rules.seconds)
         told = Rules(
             rules.seconds, rules.restitution, rules.friction, rules.sticky, rules.most, rules.anew,
             rules.touch + EXACT * far, rules.pairs,
         )  # fmt: skip
-        count = _meetings(size, period, bodies, meetings, things, ends, told, reach, in_time, scratch)
+        count = _meetings(period, bodies, meetings, things, ends, told, reach, in_time, scratch)
         if in_time and count <= meetings.who.shape[0]:
             count = _fly(period, bodies, meetings, things, ends, told, before, count, report)
         report[2] = count
@@ -148,7 +156,7 @@ def collide(
         work[b, 1] += 1 if rules.pairs else 0
         work[b, at_work] += report[3] - impacts_before
         work[b, at_work + 1] += report[4] - unsolved_before
-        bad = _leave(period, size, x, v, b, ends, bodies)
+        bad = _leave(period, x, v, b, ends, bodies)
         if bad >= 0 and report[0] < 0:
             report[0], report[1] = b, bad
     return -1
@@ -156,7 +164,7 @@ def collide(
 
 @kernel
 def _meetings(
-    size: Vec, period: Vec, bodies: Bodies, meetings: Meetings, things: Things, ends: Ends, rules: Rules, reach: Any,
+    period: Vec, bodies: Bodies, meetings: Meetings, things: Things, ends: Ends, rules: Rules, reach: Any,
     in_time: bool, scratch: Any,
 ) -> int:  # fmt: skip
     """Find who may meet what within the step, or nearly touches at its end; return how many, room for them or not."""
@@ -167,7 +175,8 @@ def _meetings(
         reach[i] = bodies.reach[i] if in_time else rules.touch + NEARLY * bodies.radius[i]
     if rules.pairs:
         count = nearby(
-            size, where, bodies.living, bodies.radius, reach, n, grid, order, cell, start, offset, bounds, sync, ranges,
+            period, where, bodies.living, bodies.radius, reach, n, grid, order, cell, start, offset, bounds, sync,
+            ranges, meetings.who, meetings.other,
             meetings.who, meetings.other,
         )  # fmt: skip
     count = _with_obstacles(period, bodies, meetings, things, where, rules.seconds, rules.touch, in_time, count)
@@ -234,7 +243,7 @@ def _at_once(
 
 
 @kernel
-def _leave(period: Vec, size: Vec, x: Any, v: Any, b: int, ends: Ends, bodies: Bodies) -> int:
+def _leave(period: Vec, x: Any, v: Any, b: int, ends: Ends, bodies: Bodies) -> int:
     """Write everybody back into the batch; return the first who is nowhere, or -1."""
     bad = -1
     for i in range(x.shape[2]):
@@ -245,9 +254,9 @@ def _leave(period: Vec, size: Vec, x: Any, v: Any, b: int, ends: Ends, bodies: B
             bad = i
         for k in range(len(period)):
             place = at[k]
-            if size[k] > 0.0 and not 0.0 <= place < size[k]:
-                place = place - size[k] * np.floor(place / size[k])
-                place = 0.0 if place >= size[k] or place < 0.0 else place
+            if period[k] > 0.0 and not 0.0 <= place < period[k]:
+                place = place - period[k] * np.floor(place / period[k])
+                place = 0.0 if place >= period[k] or place < 0.0 else place
             x[k, b, i] = place
             v[k, b, i] = now[k]
     return bad

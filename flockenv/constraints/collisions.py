@@ -13,7 +13,7 @@ from flockenv.constraints.base import Constraint, Settler
 from flockenv.constraints.collide import COUNTED, collide
 from flockenv.constraints.contacts import Contacts, Ends
 from flockenv.constraints.events import Bodies, Meetings, Rules, Things
-from flockenv.constraints.impact import FORM_NUMBERS
+from flockenv.constraints.impact import POINT
 from flockenv.effects.base import ties
 from flockenv.kernels import entry
 from flockenv.neighbours import MAX_RANGES
@@ -91,7 +91,7 @@ class _Settler:
     def __init__(self, record: Collisions, scene: Any) -> None:
         n, d = scene.agents, scene.dimension
         self.record, self.scene, self.told = record, scene, False
-        self.size = tuple(float(s) for s in scene.space.size) if scene.space.periodic else (0.0,) * d
+        self.period = tuple(float(s) for s in scene.space.size) if scene.space.periodic else (0.0,) * d
         start, at, vel, acc, free, excess = (np.zeros((n, d)) for _ in range(6))
         body = scene.body
         light = np.where(np.isfinite(body.mass), 1 / np.asarray(body.mass, float), 0.0)
@@ -144,22 +144,19 @@ class _Settler:
         if not self.record.obstacles:
             shapes, restitution = [], []
         table, where = packed(shapes, d)
-        rows, forms, places, owners = [], [], [], []
-        for form, (at, count) in where.items():
+        rows = []
+        for at, count in where.values():
             for _ in range(count):
                 rows.append(at)
-                forms.append(FORM_NUMBERS[form])
-                places.append(table[at + 2 : at + 2 + d])
-                owners.append(int(table[at + 1]))
                 at += int(table[at])
         circles = len(scene.circles) if self.record.obstacles else 0
         m = circles + len(rows)
-        place = np.zeros((m, d))
-        place[circles:] = np.reshape(places, (-1, d))
-        elastic = np.array(restitution[:circles] + [restitution[circles + k] for k in owners], float).reshape(m)
+        anchor, elastic = np.zeros((m, d)), np.array(restitution, float)
+        for k, at in enumerate(rows, circles):
+            anchor[k], elastic[k] = table[at + 2 : at + 2 + d], restitution[circles + int(table[at + 1])]
         return Things(
-            np.append(table, 0.0), np.array([0] * circles + rows, np.int64), np.array([-1] * circles + forms, np.int64),
-            place, np.zeros((m, d)), np.zeros(m), elastic,
+            table=np.append(table, 0.0), row=np.array([POINT] * circles + rows, np.int64), anchor=anchor,
+            place=np.zeros((m, d)), drift=np.zeros((m, d)), size=np.zeros(m), restitution=elastic,
         )  # fmt: skip
 
     def __call__(self, x0: Floats, v0: Floats, state: State, first: int, end: int) -> tuple[int, int]:
@@ -173,7 +170,7 @@ class _Settler:
         bad, unsolved = (-1, -1), 0
         while first < end:
             short = entry(collide)(
-                self.size, self.size, x0, v0, state.x, state.v, state.alive, state.obstacle_x[:, :, circles],
+                self.period, x0, v0, state.x, state.v, state.alive, state.tick, state.obstacle_x[:, :, circles],
                 state.obstacle_radius[:, circles], self.bodies, self.meetings, self.things, self.contacts, self.ends,
                 self.before, self.reach, *self.query, rules, r.response in ("earliest", "back_up"),
                 r.response == "project", r.passes, spread, first, end, state.work, WORK.index("impacts"), self.report,

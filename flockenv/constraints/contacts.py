@@ -63,7 +63,7 @@ def _normal(
         return far - bodies.radius[i] - bodies.radius[j], select(far > 0.0, unit(d), aside)
     m = -1 - j
     place = add(vector(period, things.place, m), scale(vector(period, things.drift, m), seconds))
-    gap, n = surface(things.form[m], things.table, things.row[m], image(period, sub(x, place)))
+    gap, n = surface(things.table, things.row[m], image(period, sub(x, place)))
     return gap - bodies.radius[i] - things.size[m], n
 
 

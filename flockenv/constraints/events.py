@@ -61,11 +61,11 @@ class Things(NamedTuple):
     """The obstacles of one world; arrays of M rows."""
 
     table: Any  # their numbers, see flockenv/shapes/table.py
-    row: Any  # (M,) where in the table
-    form: Any  # (M,) by which law it is met, see impact.FORM_NUMBERS; -1 = there is none
-    place: Any  # (M, D) m, its anchor at the beginning of the step
-    drift: Any  # (M, D) m/s, its velocity
-    size: Any  # (M,) m, how thick it is beside what its law says: the radius of a circle
+    row: Any  # (M,) where in the table; impact.POINT = it is round, and `size` says how large
+    anchor: Any  # (M, D) m, what its row is relative to, before it has moved
+    place: Any  # (M, D) m, where that is at the beginning of the step
+    drift: Any  # (M, D) m/s, how fast it moves in this step
+    size: Any  # (M,) m, the radius of what is round, 0 of others; negative = it is not there
     restitution: Any  # (M,) of its surface
 
 
@@ -133,11 +133,11 @@ def _relative(period: Vec, bodies: Bodies, things: Things, i: int, j: int, t: fl
 
 
 @kernel
-def _met(bodies: Bodies, things: Things, i: int, j: int) -> tuple[int, int, float]:
-    """Return the form and the row of what body i meets, and how near to it its centre comes."""
+def _met(bodies: Bodies, things: Things, i: int, j: int) -> tuple[int, float]:
+    """Return the row of what body i meets, and how near to it its centre comes."""
     if j >= 0:
-        return POINT, 0, bodies.radius[i] + bodies.radius[j]
-    return things.form[-1 - j], things.row[-1 - j], bodies.radius[i] + things.size[-1 - j]
+        return POINT, bodies.radius[i] + bodies.radius[j]
+    return things.row[-1 - j], bodies.radius[i] + things.size[-1 - j]
 
 
 @kernel
@@ -147,8 +147,8 @@ def _together(period: Vec, bodies: Bodies, things: Things, i: int, j: int, touch
     The half step by which a method of first order is ahead would take them into it, or away from it.
     """
     y, _, _ = _relative(period, bodies, things, i, j, 0.0)
-    form, row, room = _met(bodies, things, i, j)
-    if surface(form, things.table, row, y)[0] - room <= touch:
+    row, room = _met(bodies, things, i, j)
+    if surface(things.table, row, y)[0] - room <= touch:
         _as_it_is(period, bodies, i, before)
         if j >= 0:
             _as_it_is(period, bodies, j, before)
@@ -236,8 +236,8 @@ def _look(period: Vec, bodies: Bodies, meetings: Meetings, things: Things, rules
     i, j = meetings.who[c], meetings.other[c]
     now = bodies.since[i] if j < 0 else max(bodies.since[i], bodies.since[j])
     y, v, a = _relative(period, bodies, things, i, j, now)
-    form, row, room = _met(bodies, things, i, j)
-    t = now + first_impact(form, things.table, row, y, v, a, rules.seconds - now, room, rules.touch)
+    row, room = _met(bodies, things, i, j)
+    t = now + first_impact(things.table, row, y, v, a, rules.seconds - now, room, rules.touch)
     meetings.time[c] = t if t <= rules.seconds else np.inf
     if meetings.time[c] < np.inf and meetings.listed[c] == 0:
         meetings.active[active], meetings.listed[c] = c, 1
@@ -268,8 +268,8 @@ def _impact(
     """Do what an impact does to those who take part; `over`: they have met too often, and are at rest from now on."""
     i, j = meetings.who[c], meetings.other[c]
     y, v, a = _relative(period, bodies, things, i, j, t)
-    form, row, _ = _met(bodies, things, i, j)
-    _, n = surface(form, things.table, row, y)
+    row, _ = _met(bodies, things, i, j)
+    _, n = surface(things.table, row, y)
     left, push, w = rules.seconds - t, dot(a, n), -dot(v, n)
     restitution = rules.restitution if j >= 0 else things.restitution[-1 - j]
     rests = over or rules.sticky or ends_here(max(w, 0.0), push, restitution, left)
@@ -339,8 +339,8 @@ def _widened(
     if reach <= bodies.reach[i]:
         return count
     bodies.reach[i] = 1.5 * reach
-    for m in range(things.form.shape[0]):
-        if things.form[m] >= 0:
+    for m in range(things.row.shape[0]):
+        if things.size[m] >= 0.0:
             count = _joined(bodies, meetings, i, -1 - m, count)
     for j in range(bodies.living.shape[0]):
         here = rules.pairs and bodies.living[j] > 0 and j != i and bodies.light[i] + bodies.light[j] > 0.0

@@ -12,19 +12,16 @@ from typing import Any
 import numpy as np
 
 from flockenv.kernels import Vec, kernel, law, routine
-from flockenv.shapes.block import hit_block, hit_half_space, nearest_block, nearest_half_space
-from flockenv.shapes.chain import hit_chain, nearest_chain
-from flockenv.shapes.field import hit_distance_field, nearest_distance_field
+from flockenv.shapes.every import hit_shape, nearest_shape
 from flockenv.shapes.round import ray_hit
 from flockenv.vec import add, axis, dot, norm, scale, select, sub, unit
 
 __all__ = [
-    "FORM_NUMBERS", "POINT", "along", "bounced", "ends_here", "first_impact", "flight", "rubbed", "surface",
+    "POINT", "along", "bounced", "ends_here", "first_impact", "flight", "rubbed", "surface",
 ]  # fmt: skip
 
-POINT = 0
-FORM_NUMBERS = {"chain": 1, "block": 2, "half_space": 3, "distance_field": 4}
-"""By which number a row says what form it has (those of flockenv.shapes.FORMS); 0 is a point."""
+POINT = -1
+"""The row of what is a point."""
 
 CHORDS = 8
 """Pieces that a path is cut into at most."""
@@ -34,31 +31,19 @@ POLISH = 8
 
 
 @routine
-def surface(form: int, table: Any, at: int, y: Vec) -> tuple[float, Vec]:
+def surface(table: Any, at: int, y: Vec) -> tuple[float, Vec]:
     """Return how far the surface is, m, and the unit normal there, of a shape or a point, from y relative to it."""
-    if form == 1:
-        return nearest_chain(table, at, y)
-    if form == 2:
-        return nearest_block(table, at, y)
-    if form == 3:
-        return nearest_half_space(table, at, y)
-    if form == 4:
-        return nearest_distance_field(table, at, y)
+    if at >= 0:
+        return nearest_shape(table, at, y)
     far = norm(y)
     return far, select(far > 0.0, unit(y), axis(y, 0))
 
 
 @routine
-def _hit(form: int, table: Any, at: int, y: Vec, way: Vec, room: float) -> float:
+def _hit(table: Any, at: int, y: Vec, way: Vec, room: float) -> float:
     """Return how far along a unit vector a body of this radius touches, m."""
-    if form == 1:
-        return hit_chain(table, at, y, way, room)
-    if form == 2:
-        return hit_block(table, at, y, way, room)
-    if form == 3:
-        return hit_half_space(table, at, y, way, room)
-    if form == 4:
-        return hit_distance_field(table, at, y, way, room)
+    if at >= 0:
+        return hit_shape(table, at, y, way, room)
     return ray_hit(scale(y, -1.0), way, room)
 
 
@@ -95,33 +80,31 @@ def _starts(w: float, a: float, far: float, touch: float) -> float:
 
 
 @routine
-def first_impact(
-    form: int, table: Any, at: int, y: Vec, v: Vec, a: Vec, far: float, room: float, touch: float
-) -> float:
+def first_impact(table: Any, at: int, y: Vec, v: Vec, a: Vec, far: float, room: float, touch: float) -> float:
     """Return when a body at y, at v, accelerated by a, first comes to touch within `far` s; inf if it does not.
 
     It touches where its gap is at most `touch`, m. A path is cut into chords so short that it bends by no more than a
     hundredth of the room, each chord is followed exactly, and where one hits the moment is polished on the parabola.
     Who overlaps already and goes in deeper touches now; who leaves, only where he comes back.
     """
-    gap, n = surface(form, table, at, y)
+    gap, n = surface(table, at, y)
     if gap - room > touch:
-        return _followed(form, table, at, y, v, a, 0.0, far, room, room, touch)
+        return _followed(table, at, y, v, a, 0.0, far, room, room, touch)
     top = _starts(dot(v, n), dot(a, n), far, touch)
     if top <= 0.0:
         return 0.0
     away = min(top, far)  # until then it leaves what it touches; of the same shape it may meet something else
-    t = _followed(form, table, at, y, v, a, 0.0, away, room, gap - 1e-9 * room - touch, touch)
+    t = _followed(table, at, y, v, a, 0.0, away, room, gap - 1e-9 * room - touch, touch)
     if t < np.inf or top >= far:
         return t
-    if surface(form, table, at, along(y, v, a, top))[0] - room <= touch:  # it never got away
+    if surface(table, at, along(y, v, a, top))[0] - room <= touch:  # it never got away
         return min(2.0 * top, far)
-    return _followed(form, table, at, y, v, a, top, far, room, room, touch)
+    return _followed(table, at, y, v, a, top, far, room, room, touch)
 
 
 @routine
 def _followed(
-    form: int, table: Any, at: int, y: Vec, v: Vec, a: Vec, begin: float, far: float, room: float, seen: float,
+    table: Any, at: int, y: Vec, v: Vec, a: Vec, begin: float, far: float, room: float, seen: float,
     touch: float,
 ) -> float:  # fmt: skip
     """Return when within [begin, far] its surface is met, whose chords are followed as if the room was `seen`."""
@@ -133,22 +116,20 @@ def _followed(
         here = along(y, v, a, since)
         way = sub(along(y, v, a, since + each), here)
         length = norm(way)
-        hit = _hit(form, table, at, here, unit(way), max(seen, 0.0)) if length > 0.0 else np.inf
+        hit = _hit(table, at, here, unit(way), max(seen, 0.0)) if length > 0.0 else np.inf
         if hit <= length:
-            t = _polished(form, table, at, y, v, a, begin, far, room, since + each * hit / length)
-            gap, n = surface(form, table, at, along(y, v, a, t))
+            t = _polished(table, at, y, v, a, begin, far, room, since + each * hit / length)
+            gap, n = surface(table, at, along(y, v, a, t))
             if gap - room <= touch + 1e-9 * room and dot(add(v, scale(a, t)), n) < 0.0:
                 return t
     return np.inf
 
 
 @kernel
-def _polished(
-    form: int, table: Any, at: int, y: Vec, v: Vec, a: Vec, begin: float, far: float, room: float, t: float
-) -> float:
+def _polished(table: Any, at: int, y: Vec, v: Vec, a: Vec, begin: float, far: float, room: float, t: float) -> float:
     """Return the moment near t at which the gap is 0, by Newton's method."""
     for _ in range(POLISH):
-        gap, n = surface(form, table, at, along(y, v, a, t))
+        gap, n = surface(table, at, along(y, v, a, t))
         w = dot(add(v, scale(a, t)), n)
         if not w < 0.0:
             break
