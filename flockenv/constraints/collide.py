@@ -177,7 +177,6 @@ def _meetings(
         count = nearby(
             period, where, bodies.living, bodies.radius, reach, n, grid, order, cell, start, offset, bounds, sync,
             ranges, meetings.who, meetings.other,
-            meetings.who, meetings.other,
         )  # fmt: skip
     count = _with_obstacles(period, bodies, meetings, things, where, rules.seconds, rules.touch, in_time, count)
     if count <= meetings.who.shape[0]:
