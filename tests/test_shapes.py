@@ -184,6 +184,16 @@ def test_whatever_it_is_made_of_lies_within_its_bounds(name: str) -> None:
     assert shape.bound.radius < 1.01 * np.linalg.norm(shape.bound.half), "so is the circle"
 
 
+def test_a_distance_field_that_is_solid_up_to_the_edge_of_its_grid_goes_on_within_its_bounds() -> None:
+    field = DistanceField(low=(0, 0), high=(2, 1), spacing=0.25, shapes=(Circle(centre=(0.5, 0.5), radius=1.0),))
+    x, bound = places(field, 1000), field.bound
+    offset = x - bound.centre
+    beyond = np.linalg.norm(np.maximum(np.abs(offset) - bound.half, 0), axis=1)
+    assert (field.gap(x)[beyond > 0] >= beyond[beyond > 0] - 1e-12).all()
+    assert (field.gap(x) >= np.linalg.norm(offset, axis=1) - bound.radius - 1e-12).all()
+    assert field.gap([0.5, 1.4]) < 0, "it does go on"
+
+
 @every
 def test_it_is_finite_everywhere_and_without_a_direction(name: str) -> None:
     shape = SHAPES[name]
