@@ -13,8 +13,10 @@ import pytest
 
 from flockenv import frontend
 from flockenv.inlining import Whole
-from flockenv.kernels import law
+from flockenv.kernels import law, load
+from flockenv.sweep.source import scene_source
 from flockenv.vec import add, dot, scale
+from tests.catalogue import EFFECTS, scene_under
 
 TRIED = "0.68.1"
 """The numba that replacements were tried with; configs/constraints.txt holds CI to it."""
@@ -109,3 +111,14 @@ def test_closures_comprehensions_and_reductions_are_still_inlined() -> None:
     compiled: Any = numba.njit(several, pipeline_class=Whole)
     x = np.array([1.0, 2.0, 3.0])
     assert compiled(x) == several(x) == 22.0
+
+
+def test_no_part_of_a_kernel_is_compiled_twice(tmp_path: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("FLOCKENV_CACHE", str(tmp_path))
+    scene = scene_under(next(row for row in EFFECTS if row.effect.kind == "drag"), 2)
+    module = load("scene", scene_source(scene.parts) + "\n# compiled here\n")
+    vars(scene)["_kernel"] = module.step
+    scene.step(scene.start(seed=1))
+    own = {name: f for name, f in vars(module).items() if getattr(f, "__module__", "") == module.__name__}
+    twice = [name for name, f in own.items() if len(getattr(f, "signatures", ())) > 1]
+    assert "advance" in own and not twice

@@ -62,7 +62,7 @@ def field(
     n, rank, team, arranged = x.shape[2], 0, 1, False
     first, end = 0, (n + {w - 1}) // {w}
     for b in range(x.shape[1]):
-        present = 0
+        present = np.int64(0)
         for i in range(n):
             present += alive[b, i]
             living[i] = alive[b, i]
