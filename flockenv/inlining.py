@@ -1,4 +1,4 @@
-"""Compile what is only ever inlined: no machine code of its own, and nothing that Python could call.
+"""numba's compiler as our functions use it: entry points whole, and what is only ever inlined without machine code.
 
 numba makes machine code, and a wrapper for Python, of every compiled function, and optimises each to the end before it
 optimises its caller. Laws and kernels are parts of an entry point and of nothing else; that work was half of the time a
@@ -16,7 +16,9 @@ import numba
 from numba import _dynfunc  # type: ignore[attr-defined]  # compiled
 from numba.core import compiler, compiler_machinery, typed_passes
 
-__all__ = ["Inlined"]
+from flockenv.frontend import lighter, spared
+
+__all__ = ["Inlined", "Whole"]
 
 _register: Any = compiler_machinery.register_pass  # numba is untyped
 _Native: Any = typed_passes.NativeLowering
@@ -78,12 +80,26 @@ class _Lowering(_Native):  # type: ignore[misc]
         return True
 
 
-class Inlined(_Compiler):  # type: ignore[misc]
-    """numba's pipeline with that lowering."""
+class Whole(_Compiler):  # type: ignore[misc]
+    """numba's pipeline, less what frontend spares it: how an entry point is compiled."""
 
     def define_pipelines(self) -> list[Any]:
         """Return the passes."""
         passes = _Passes.define_nopython_pipeline(self.state)
-        passes.passes = [(_Lowering if p is _Native else p, text) for p, text in passes.passes]
+        passes.passes = self._chosen(spared(passes.passes))
         passes.finalize()
         return [passes]
+
+    def _chosen(self, passes: list[Any]) -> list[Any]:
+        return passes
+
+    def _compile_core(self) -> Any:
+        with lighter():
+            return super()._compile_core()
+
+
+class Inlined(Whole):
+    """The same with that lowering."""
+
+    def _chosen(self, passes: list[Any]) -> list[Any]:
+        return [(_Lowering if p is _Native else p, text) for p, text in passes]

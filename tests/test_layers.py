@@ -15,7 +15,7 @@ import pytest
 ROOT = Path(__file__).resolve().parent.parent
 
 LAYERS = (
-    {"divergence", "terminal", "refusals", "outputs", "recycle", "crew", "compilation", "inlining"},
+    {"divergence", "terminal", "refusals", "outputs", "recycle", "crew", "compilation", "inlining", "frontend"},
     {"records", "vec", "noise", "kernels"},
     {"state", "space", "steering", "arbitration", "vehicle"},
     {"neighbours", "shapes", "grid", "eikonal", "orca", "polyline", "rows", "networks", "elements", "tree"},

@@ -62,7 +62,7 @@ def field(
     n, rank, team, arranged = x.shape[2], 0, 1, False
     first, end = 0, (n + {w - 1}) // {w}
     for b in range(x.shape[1]):
-        present = 0
+        present = np.int64(0)
         for i in range(n):
             present += alive[b, i]
             living[i] = alive[b, i]
@@ -88,6 +88,7 @@ def _imports(parts: Parts) -> str:
         "import numpy as np",
         "from numba import njit",
         "from flockenv.effects.base import Far, Me, Other, in_view",
+        "from flockenv.inlining import Whole",
         "from flockenv.kernels import copy_line, finite, kernel, like, unaliased, wait_for_team",
         "from flockenv.neighbours import candidates, count_cells, order_records, row_of",
         f"from flockenv.space import {parts.space.offset_law} as offset_to, {parts.space.confine_law} as confine",
@@ -107,7 +108,7 @@ def _imports(parts: Parts) -> str:
         if effect.wishes:
             module, name = effect.steer_law
             lines.append(f"from {module} import {name} as steer_law_{k}")
-    options = 'dict(fastmath={"contract"}, error_model="numpy", nogil=True, _nrt=False)'
+    options = 'dict(fastmath={"contract"}, error_model="numpy", nogil=True, _nrt=False, pipeline_class=Whole)'
     return "\n".join(lines) + f"\n\nFAST = {options}\n"
 
 

@@ -89,7 +89,7 @@ def step_world(
     blocks = (n + {parts.width - 1}) // {parts.width}
     first, end = blocks * rank // team, blocks * (rank + 1) // team
     size, reach = {tuple_of("params[#]", d)}, params[{d}]
-    present = 0
+    present = np.int64(0)  # not a literal: laws would be typed for it too, and compiled twice
     for i in range(n):
         present += alive[b, i]
     for i in range(first * {parts.width}, min(end * {parts.width}, n)):

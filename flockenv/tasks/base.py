@@ -267,7 +267,7 @@ def play(
                 for k in range(actions.shape[2]):
                     action[i, k] = min(max(actions[b, i, k], -1.0), 1.0)
             drive(p, {now}, action, force[:, 0])
-            into_blocks(want, force, 0, n, 0, blocks)
+            into_blocks(want, force, np.int64(0), n, np.int64(0), blocks)
             bad = step_world(
                 x, v, {task.parts.frame_argument}alive, tick, key, obstacle_x, obstacle_radius, work, params, dt,
                 count, b, 0, 1, {SHARED},

@@ -1,0 +1,406 @@
+"""numba's front end with less to do: while it compiles our kernels, it does nothing twice and nothing for nobody.
+
+Four fifths of the time that a kernel takes to compile are numba's Python. The machine code that comes out is the same,
+instruction for instruction. What is replaced here is replaced while one of our functions compiles, under numba's own
+lock, and put back afterwards. Each replacement names the functions of numba that it relies on, by digests of their
+text: where one of them reads otherwise (another numba), it is left out, and numba does all of its own work.
+"""
+
+from __future__ import annotations
+
+import functools
+import gc
+import hashlib
+import inspect
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any, NamedTuple
+
+from numba.core import (
+    base,
+    compiler_lock,
+    dispatcher,
+    inline_closurecall,
+    ir,
+    postproc,
+    targetconfig,
+    transforms,
+    typed_passes,
+    types,
+    untyped_passes,
+)
+from numba.core.compiler_machinery import register_pass
+from numba.core.ir_utils import fixup_var_define_in_scope
+from numba.core.types import containers, functions
+from numba.core.typing import context as typing_context
+
+__all__ = ["SPARED", "TRICKS", "Spared", "Trick", "lighter", "reads_as_known", "spared"]
+
+# numba is untyped
+_canonical: Any = transforms.canonicalize_cfg
+_fixup: Any = fixup_var_define_in_scope
+_lock: Any = compiler_lock.global_compiler_lock
+_register: Any = register_pass
+_Closures: Any = untyped_passes.InlineClosureLikes
+_Processor: Any = postproc.PostProcessor
+_Tuple: Any = containers.BaseAnonymousTuple
+_Rewrites: Any = typed_passes.NopythonRewrites
+
+
+class Known(NamedTuple):
+    """A function of numba, as it reads where a replacement of it was tried."""
+
+    owner: Any
+    name: str
+    digest: str
+
+
+class Trick(NamedTuple):
+    """A replacement: `owner.name` becomes `make(what was there)`."""
+
+    owner: Any
+    name: str
+    make: Callable[[Any], Any]
+    reads: tuple[Known, ...]
+
+
+def digest(owner: Any, name: str) -> str:
+    """Return a digest of the text of `owner.name`; nothing if there is no such function."""
+    try:
+        return hashlib.sha256(inspect.getsource(vars(owner)[name]).encode()).hexdigest()[:12]
+    except (KeyError, OSError, TypeError):
+        return ""
+
+
+def reads_as_known(reads: tuple[Known, ...]) -> bool:
+    """Does every function read as it did where the replacement was tried?"""
+    return all(digest(known.owner, known.name) == known.digest for known in reads)
+
+
+# --- remembered: which implementation a call of given types has -------------------------------------------------------
+
+_remembered: dict[int, tuple[Any, dict[Any, Any]]] = {}  # by the function type's id; the type itself, so that it stays
+
+
+def _memory(function: Any) -> dict[Any, Any]:
+    kept = _remembered.get(id(function))
+    if kept is None:
+        kept = _remembered[id(function)] = function, {}
+    return kept[1]
+
+
+def _call(context: Any, args: Any, kws: Any) -> tuple[Any, ...]:
+    """Return what a resolution depends on beside the function: types, and the flags of whoever calls."""
+    flags = targetconfig.ConfigStack.top_or_none()  # type: ignore[no-untyped-call]
+    return context, tuple(args), tuple(kws.items()) if kws else (), flags
+
+
+def _recalled(function: Any, call: tuple[Any, ...]) -> Any:
+    """Return the signature that was found before, None if there was none."""
+    known = _memory(function).get(call)
+    if known is None:
+        return None
+    if isinstance(function, functions.Dispatcher):
+        return known if known.args in function.dispatcher.overloads else None
+    signature, function._impl_keys[signature.args] = known
+    return signature
+
+
+def _known_calls(resolve: Any) -> Any:
+    """Remember what `+` of two numbers is: numba asks dozens of templates, for every `+` and several times over."""
+
+    def get_call_type(self: Any, context: Any, args: Any, kws: Any) -> Any:
+        call = _call(context, args, kws)
+        signature = _recalled(self, call)
+        if signature is None:
+            signature = resolve(self, context, args, kws)
+            if signature is not None and signature.args in self._impl_keys:
+                _memory(self)[call] = signature, self._impl_keys[signature.args]
+        return signature
+
+    return get_call_type
+
+
+def _known_laws(resolve: Any) -> Any:
+    """Remember the signature of a compiled function for given types, as long as it is there."""
+
+    def get_call_type(self: Any, context: Any, args: Any, kws: Any) -> Any:
+        call = _call(context, args, kws)
+        signature = _recalled(self, call)
+        if signature is None:
+            signature = resolve(self, context, args, kws)
+            if signature is not None:
+                _memory(self)[call] = signature
+        return signature
+
+    return get_call_type
+
+
+def _known_first(resolve: Any) -> Any:
+    """Ask what is remembered before anything else, the items of tuples (which have no function) among it."""
+    items: dict[Any, Any] = {}
+
+    def resolve_function_type(self: Any, function: Any, args: Any, kws: Any) -> Any:
+        if isinstance(function, (functions.BaseFunction, functions.Dispatcher)):
+            signature = _recalled(function, _call(self, args, kws))
+            return resolve(self, function, args, kws) if signature is None else signature
+        if function != "static_getitem" or kws or not isinstance(args[0], types.BaseTuple) or type(args[1]) is not int:
+            return resolve(self, function, args, kws)
+        item = self, id(args[0]), args[1]
+        if item not in items:
+            items[item] = resolve(self, function, args, kws), args[0]  # which stays, and its id with it
+        return items[item][0]
+
+    return resolve_function_type
+
+
+def _known_plain(find: Any) -> Any:
+    """Remember the type of a tuple without literals."""
+    known: dict[int, tuple[Any, Any]] = {}
+
+    def unliteral(self: Any) -> Any:
+        if id(self) not in known:
+            known[id(self)] = self, find(self)
+        return known[id(self)][1]
+
+    return unliteral
+
+
+# --- cheaper: the same answer, found sooner ---------------------------------------------------------------------------
+
+
+def _values(_: Any) -> Any:
+    """Return the values of flags: defaults, and what is set."""
+    defaults: dict[Any, dict[str, Any]] = {}
+
+    def values(self: Any) -> dict[str, Any]:
+        cls = type(self)
+        if cls not in defaults:
+            defaults[cls] = {name: option.default for name, option in cls.options.items()}
+        values: dict[str, Any] = defaults[cls] | self._values
+        return values
+
+    return values
+
+
+def _equal(slowly: Any) -> Any:
+    """Compare flags by what is set first."""
+
+    def equal(self: Any, other: Any) -> Any:
+        same = self is other or (type(self) is type(other) and self._values == other._values)
+        return same or slowly(self, other)
+
+    return equal
+
+
+def _hashed(_: Any) -> Any:
+    """Hash flags: numba sorts the names of all options, which are the same for all."""
+    return lambda self: hash(type(self))
+
+
+_PLAIN = frozenset((ir.Loc, ir.Const, ir.Global, ir.FreeVar, ir.Arg, ir.Scope, str, int, float, bool, type(None)))
+
+
+def _variables(slowly: Any) -> Any:
+    """List the variables of a statement by the types of its parts."""
+
+    def rec_list_vars(self: Any, value: Any) -> list[Any]:
+        kind = type(value)
+        if kind is dict:
+            parts = value.values()
+        elif kind in (list, tuple):
+            parts = value
+        else:
+            return slowly(self, value)  # type: ignore[no-any-return]
+        found = []
+        for part in parts:
+            kind = type(part)
+            if kind is ir.Var:
+                found.append(part)
+            elif kind not in _PLAIN:
+                found += rec_list_vars(self, part) if kind in (list, tuple, dict) else slowly(self, part)
+        return found
+
+    return rec_list_vars
+
+
+def _when_asked(slowly: Any) -> Any:
+    """Leave the lives of variables to whoever asks: numba finds them anew after each of its passes.
+
+    What is entered into `block_entry_vars` is for generators and for Python's objects, of which kernels have none.
+    """
+
+    def run(self: Any, emit_dels: bool = False, extend_lifetimes: bool = False) -> None:
+        function = self.func_ir
+        if function.is_generator:
+            slowly(self, emit_dels, extend_lifetimes)
+            return
+        function.blocks = _canonical(function.blocks)
+        function.variable_lifetime = postproc.VariableLifetime(function.blocks)  # type: ignore[no-untyped-call]
+        function.generator_info = None
+        if emit_dels:
+            self._insert_var_dels(extend_lifetimes=extend_lifetimes)
+
+    return run
+
+
+def _if_new(refresh: Any) -> Any:
+    """Look for new declarations only if there are some: numba runs through all of them for each function."""
+    seen: dict[int, int] = {}  # by the registries: a target's copies share them
+
+    def refreshed(self: Any) -> None:
+        known = sum(
+            len(getattr(registry, kind))
+            for context in (self, getattr(self, "typing_context", None) or self)
+            for registry, loader in list(context._registries.items())
+            for kind in loader.registry_items
+        )
+        if seen.get(id(self._registries)) != known:
+            refresh(self)
+            seen[id(self._registries)] = known
+
+    return refreshed
+
+
+TRICKS = (
+    Trick(functions.BaseFunction, "get_call_type", _known_calls, (
+        Known(functions.BaseFunction, "get_call_type", "6559c167bfc0"),
+        Known(functions.BaseFunction, "get_impl_key", "ebed5750a018"),
+    )),
+    Trick(functions.Dispatcher, "get_call_type", _known_laws, (
+        Known(functions.Dispatcher, "get_call_type", "ae1ef289d128"),
+        Known(dispatcher._DispatcherBase, "get_call_template", "f15b62d0e9c0"),
+    )),
+    Trick(typing_context.BaseContext, "resolve_function_type", _known_first, (
+        Known(typing_context.BaseContext, "resolve_function_type", "81a6c18964e1"),
+        Known(typing_context.BaseContext, "_resolve_user_function_type", "a0fa2751b7c1"),
+        Known(typing_context.BaseContext, "_resolve_builtin_function_type", "52d7c153a4d1"),
+    )),
+    Trick(_Tuple, "__unliteral__", _known_plain, (Known(_Tuple, "__unliteral__", "0b50cd0611a0"),)),
+    Trick(targetconfig.TargetConfig, "values", _values, (
+        Known(targetconfig.TargetConfig, "values", "12a29dc810f6"),
+        Known(targetconfig._MetaTargetConfig, "__init__", "f2ff91c25728"),
+    )),
+    Trick(targetconfig.TargetConfig, "__eq__", _equal, (Known(targetconfig.TargetConfig, "__eq__", "6d8774572d07"),)),
+    Trick(targetconfig.TargetConfig, "__hash__", _hashed, (
+        Known(targetconfig.TargetConfig, "__hash__", "4d15a6c75137"),
+    )),
+    Trick(ir.Inst, "_rec_list_vars", _variables, (Known(ir.Inst, "_rec_list_vars", "054700e9100b"),)),
+    Trick(postproc.PostProcessor, "run", _when_asked, (Known(postproc.PostProcessor, "run", "e1a8e77d6f17"),)),
+    Trick(base.BaseContext, "refresh", _if_new, (
+        Known(base.BaseContext, "refresh", "83e8f5cc63a7"),
+        Known(base.BaseContext, "install_registry", "bdaf4e9db8fe"),
+    )),
+    Trick(typing_context.BaseContext, "refresh", _if_new, (
+        Known(typing_context.BaseContext, "refresh", "144078234921"),
+        Known(typing_context.BaseContext, "install_registry", "8b38bc0cff80"),
+    )),
+)  # fmt: skip
+"""All of them, by the function that each replaces."""
+
+
+@functools.cache
+def _replacements() -> tuple[tuple[Any, str, Any, Any], ...]:
+    """Return (owner, name, numba's, ours) of all that apply to this numba."""
+    found = []
+    for trick in TRICKS:
+        if reads_as_known(trick.reads):
+            numbas = vars(trick.owner)[trick.name]
+            found.append((trick.owner, trick.name, numbas, trick.make(numbas)))
+    return tuple(found)
+
+
+_depth = 0
+
+
+@contextmanager
+def lighter() -> Iterator[None]:
+    """Compile with all that applies, and without looking for garbage: what a kernel leaves behind is 100 MB at most."""
+    global _depth
+    with _lock:
+        collects = gc.isenabled()
+        if _depth == 0:
+            gc.disable()
+            for owner, name, _, ours in _replacements():
+                setattr(owner, name, ours)
+        _depth += 1
+        try:
+            yield
+        finally:
+            _depth -= 1
+            if _depth == 0:
+                for owner, name, numbas, _ in _replacements():
+                    setattr(owner, name, numbas)
+                if collects:
+                    gc.enable()
+
+
+# --- passes that find nothing to do -----------------------------------------------------------------------------------
+
+
+@_register(mutates_CFG=True, analysis_only=False)
+class ClosuresIfAny(_Closures):  # type: ignore[misc]
+    """Look for closures, comprehensions, reductions and stencils only where there may be one."""
+
+    _name = "inline_closure_likes_if_any"
+
+    def run_pass(self, state: Any) -> bool:
+        """Run numba's pass, or what it ends with."""
+        if any(_may_be_inlined(statement) for b in state.func_ir.blocks.values() for statement in b.body):
+            return bool(super().run_pass(state))
+        _Processor(state.func_ir).run()
+        _fixup(state.func_ir.blocks)
+        return True
+
+
+def _may_be_inlined(statement: Any) -> bool:
+    value = getattr(statement, "value", None)
+    if isinstance(value, ir.Expr):
+        return value.op in ("make_function", "build_list") or (value.op == "getattr" and value.attr in _INLINED)
+    if isinstance(value, (ir.Global, ir.FreeVar)):
+        return value.name in _INLINED or getattr(value.value, "__name__", "") in _INLINED
+    return False
+
+
+_INLINED = ("reduce", "stencil")
+
+
+@_register(mutates_CFG=True, analysis_only=False)
+class RewritesIfAny(_Rewrites):  # type: ignore[misc]
+    """Look for array expressions and named fields only where there may be one: kernels allocate no arrays."""
+
+    _name = "nopython_rewrites_if_any"
+
+    def run_pass(self, state: Any) -> bool:
+        """Run numba's pass, or nothing."""
+        kinds = (types.Record, types.StringLiteral, types.DictType, types.LiteralStrKeyDict, types.List)
+        if state.flags.nrt or any(isinstance(kind, kinds) for kind in state.typemap.values()):
+            return bool(super().run_pass(state))
+        return False
+
+
+class Spared(NamedTuple):
+    """A pass of numba and what takes its place."""
+
+    numbas: Any
+    ours: Any
+    reads: tuple[Known, ...]
+
+
+SPARED = (
+    Spared(_Closures, ClosuresIfAny, (
+        Known(_Closures, "run_pass", "b61f17f30105"),
+        Known(inline_closurecall.InlineClosureCallPass, "run", "d826ba18dd63"),
+    )),
+    Spared(_Rewrites, RewritesIfAny, (Known(_Rewrites, "run_pass", "954ea0cf2043"),)),
+)  # fmt: skip
+
+
+@functools.cache
+def _places() -> dict[Any, Any]:
+    return {pair.numbas: pair.ours for pair in SPARED if reads_as_known(pair.reads)}
+
+
+def spared(passes: list[tuple[Any, str]]) -> list[tuple[Any, str]]:
+    """Return numba's list of passes with ours in their places."""
+    return [(_places().get(each, each), text) for each, text in passes]

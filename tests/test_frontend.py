@@ -1,0 +1,124 @@
+"""What numba is spared while our kernels compile: the same machine code, and numba as it was before and after."""
+
+from __future__ import annotations
+
+import gc
+import re
+from functools import reduce
+from typing import Any
+
+import numba
+import numpy as np
+import pytest
+
+from flockenv import frontend
+from flockenv.inlining import Whole
+from flockenv.kernels import law, load
+from flockenv.sweep.source import scene_source
+from flockenv.vec import add, dot, scale
+from tests.catalogue import EFFECTS, scene_under
+
+TRIED = "0.68.1"
+"""The numba that replacements were tried with; configs/constraints.txt holds CI to it."""
+
+
+def now() -> list[Any]:
+    return [vars(trick.owner)[trick.name] for trick in frontend.TRICKS]
+
+
+@pytest.mark.skipif(numba.__version__ != TRIED, reason="replacements were tried with another numba")
+def test_every_replacement_applies_to_the_numba_it_was_tried_with() -> None:
+    frontend._replacements.cache_clear()
+    assert len(frontend._replacements()) == len(frontend.TRICKS)
+    assert len(frontend._places()) == len(frontend.SPARED)
+    before = now()
+    with frontend.lighter():
+        assert all(new is not old for new, old in zip(now(), before, strict=True))
+
+
+def test_a_numba_that_reads_otherwise_is_left_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(frontend, "digest", lambda owner, name: "")
+    frontend._replacements.cache_clear()
+    frontend._places.cache_clear()
+    try:
+        before = now()
+        with frontend.lighter():
+            assert all(new is old for new, old in zip(now(), before, strict=True))
+        assert frontend.spared([(frontend.SPARED[0].numbas, "")]) == [(frontend.SPARED[0].numbas, "")]
+        assert machine_code(Whole) == machine_code(None)
+    finally:
+        frontend._replacements.cache_clear()
+        frontend._places.cache_clear()
+
+
+def test_afterwards_everything_is_as_it_was_whatever_happens() -> None:
+    before = now()
+    compiled: Any = numba.njit(pipeline_class=Whole)
+    assert compiled(lambda x: x + 1)(2) == 3
+    assert all(new is old for new, old in zip(now(), before, strict=True)) and gc.isenabled()
+    with pytest.raises(numba.TypingError):
+        compiled(lambda x: x + "1")(2)
+    assert all(new is old for new, old in zip(now(), before, strict=True)) and gc.isenabled()
+    gc.disable()
+    try:
+        compiled(lambda x: x + 2)(2)
+        assert not gc.isenabled()  # who had switched it off finds it off
+    finally:
+        gc.enable()
+
+
+@law
+def _pull(p: Any, x: tuple[float, float], k: int) -> tuple[float, float]:
+    far = dot(x, x)
+    way = scale(x, p[0] if far > p[1] else -p[0])
+    return add(way, x) if k % 2 == 0 else way
+
+
+def sample(x: Any, numbers: Any, count: int) -> float:
+    context = (x, numbers, count, (x[0], 1.5))
+    total = (0.0, 0.0)
+    for k in range(context[2]):
+        p = (numbers[0], numbers[1], k)
+        pulled = _pull(p, (context[0][k], x[k + 1]), k)
+        total = add(total, pulled)
+        if total[0] > 100.0:
+            break
+        x[k] = total[1] * context[3][1]
+    return total[0] + total[1]
+
+
+def machine_code(pipeline: Any) -> str:
+    """The assembly of `sample`, without the names that numba counts up."""
+    given: Any = {} if pipeline is None else {"pipeline_class": pipeline}
+    compiled: Any = numba.njit(error_model="numpy", fastmath={"contract"}, _nrt=False, **given)(sample)
+    compiled.compile((numba.float64[::1], numba.float64[::1], numba.int64))
+    text = next(iter(compiled.inspect_asm().values()))
+    return re.sub(r"_ZN\w+|[.\w$]*_ZN[^\s,()]+|\.L\w+|\d{10,}|v\d+", "#", text)
+
+
+def test_the_machine_code_is_what_numba_makes_on_its_own() -> None:
+    assert machine_code(Whole) == machine_code(None)
+    assert machine_code(Whole).count("\n") > 50
+
+
+def test_closures_comprehensions_and_reductions_are_still_inlined() -> None:
+    def several(x: Any) -> float:
+        def twice(y: float) -> float:
+            return 2 * y
+
+        return reduce(lambda a, b: a + b, x) + twice(x[0]) + sum([y * y for y in x])
+
+    compiled: Any = numba.njit(several, pipeline_class=Whole)
+    x = np.array([1.0, 2.0, 3.0])
+    assert compiled(x) == several(x) == 22.0
+
+
+def test_no_part_of_a_kernel_is_compiled_twice(tmp_path: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("FLOCKENV_CACHE", str(tmp_path))
+    scene = scene_under(next(row for row in EFFECTS if row.effect.kind == "drag"), 2)
+    module = load("scene", scene_source(scene.parts) + "\n# compiled here\n")
+    vars(scene)["_kernel"] = module.step
+    scene.step(scene.start(seed=1))
+    own = {name: f for name, f in vars(module).items() if getattr(f, "__module__", "") == module.__name__}
+    twice = [name for name, f in own.items() if len(getattr(f, "signatures", ())) > 1]
+    assert "advance" in own and not twice
