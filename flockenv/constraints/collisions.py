@@ -41,7 +41,7 @@ class Collisions(Constraint):
     - "impulses": nothing happens within the step; at its end all who touch give each other impulses, in passes, until
       nobody goes into anybody. For heaps and crowds; who is fast and small may pass through what is thin.
     - "project": one such pass, and who is inside is put on the surface. The cheapest, and no more than that: it loses
-      energy at every impact.
+      energy at every impact, and friction holds nobody in place.
 
     All end with passes over what still touches, so that nobody overlaps. Restitution e is speed after over speed
     before, across the surface; friction is Coulomb's. A ball dropped from h bounces to e^2 h, and is at rest after

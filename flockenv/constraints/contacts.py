@@ -91,7 +91,7 @@ def gather(
         if gap <= max(touch, NEARLY * width):
             contacts.who[found], contacts.other[found] = i, j
             w = -dot(_seen(period, things, ends.vel, i, j), n)
-            later = in_time and (gap > touch or (j >= 0 and meetings.closed[c] != 1 and w > slow))
+            later = in_time and (gap > touch or (meetings.closed[c] != 1 and w > slow))
             contacts.open[found] = 1 if later else 0
             contacts.allowed[found] = 0.0 if in_time else max(gap / seconds + w, 0.0)
             write(contacts.normal, found, n)

@@ -26,8 +26,8 @@ POINT = -1
 CHORDS = 8
 """Pieces that a path is cut into at most."""
 
-POLISH = 8
-"""Steps of Newton's method after a chord has hit."""
+POLISH = 40
+"""Steps of Newton's method after a chord has hit; two or three are usual."""
 
 
 @routine
@@ -118,7 +118,7 @@ def _followed(
         length = norm(way)
         hit = _hit(table, at, here, unit(way), max(seen, 0.0)) if length > 0.0 else np.inf
         if hit <= length:
-            t = _polished(table, at, y, v, a, begin, far, room, since + each * hit / length)
+            t = _polished(table, at, y, v, a, since, since + each, room, since + each * hit / length)
             gap, n = surface(table, at, along(y, v, a, t))
             if gap - room <= touch + 1e-9 * room and dot(add(v, scale(a, t)), n) < 0.0:
                 return t
@@ -126,16 +126,30 @@ def _followed(
 
 
 @kernel
-def _polished(table: Any, at: int, y: Vec, v: Vec, a: Vec, begin: float, far: float, room: float, t: float) -> float:
-    """Return the moment near t at which the gap is 0, by Newton's method."""
+def _polished(
+    table: Any, at: int, y: Vec, v: Vec, a: Vec, early: float, late: float, room: float, t: float
+) -> float:  # fmt: skip
+    """Return the moment near t, from `early` to `late`, at which the surface is reached: Newton's method, kept between.
+
+    Where it is beyond the surface in the end, halves of the time in between take over wherever Newton's step leads out
+    of them: a chord may hit while the body still rises.
+    """
+    through = surface(table, at, along(y, v, a, late))[0] < room
     for _ in range(POLISH):
         gap, n = surface(table, at, along(y, v, a, t))
-        w = dot(add(v, scale(a, t)), n)
-        if not w < 0.0:
-            break
-        off = (gap - room) / w
-        t = min(max(t - off, begin), far)
-        if abs(off) <= 1e-15 * far:
+        off, w = gap - room, dot(add(v, scale(a, t)), n)
+        if off > 0.0:
+            early = t
+        elif through:
+            late = t
+        step = t - off / w if w < 0.0 else late + 1.0
+        if not early <= step <= late:
+            if not through:
+                break
+            step = 0.5 * (early + late)
+        done = abs(step - t) <= 1e-15 * late
+        t = step
+        if done:
             break
     return t
 

@@ -1,0 +1,462 @@
+"""Hard collisions: closed forms, conservation, and what must not depend on numbering, batches, threads or place."""
+
+from __future__ import annotations
+
+import copy
+import itertools
+import math
+import pickle
+import warnings
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from flockenv.config import dump_scene, load_scene
+from flockenv.constraints import Collisions
+from flockenv.constraints.broad import nearby
+from flockenv.constraints.collisions import UnsolvedContactsWarning
+from flockenv.crew import use_threads
+from flockenv.effects import Gravity
+from flockenv.integrators import RK4, Integrator, SemiImplicitEuler, VelocityVerlet
+from flockenv.kernels import entry
+from flockenv.scene import Group, Scene
+from flockenv.shapes import Block, Circle, HalfSpace, Polygon, Wall
+from flockenv.space import Box, Plane, Space, Torus
+from flockenv.spawn import Spawn
+from flockenv.state import Floats, State
+
+IN_TIME = ("earliest", "back_up")
+EXACT = (*IN_TIME, "impulses")
+ALL = (*EXACT, "project")
+FLOOR = (HalfSpace(point=(0.0, 0.0), direction=(0.0, 1.0)),)
+R, G = 0.1, 9.81
+
+
+def scene(
+    masses: Any, response: str = "earliest", *, e: float = 1.0, g: float = 0.0, dt: float = 0.01, radius: float = R,
+    obstacles: tuple[Any, ...] = (), space: Space | None = None, method: Integrator | None = None,
+    dtype: str = "float64", **more: Any,
+) -> Scene:  # fmt: skip
+    """Discs under gravity: one kernel for a method, a space and a precision."""
+    spawn = Spawn(low=(0, 0), high=(1, 1))
+    return Scene(
+        groups=tuple(Group(count=1, mass=float(m), radius=radius, spawn=spawn) for m in masses),
+        effects=(Gravity(acceleration=(0.0, -g)),), obstacles=obstacles, space=space or Plane(), dt=dt, dtype=dtype,
+        constraints=(Collisions(response=response, restitution=e, **more),), integrator=method or SemiImplicitEuler(),
+    )  # fmt: skip
+
+
+def begun(of: Scene, pos: Any, vel: Any) -> State:
+    return of.start(0).with_motion(np.asarray(pos, float)[None], np.asarray(vel, float)[None])
+
+
+def energy(of: Scene, state: State, g: float = 0.0) -> float:
+    mass, pos, vel = of.body.mass, state.pos[0], state.vel[0]
+    return float((mass * ((vel**2).sum(axis=1) / 2 + g * pos[:, 1])).sum())
+
+
+def gas(response: str, e: float, count: int = 40, order: Any = None, offset: float = 0.0, **more: Any) -> Any:
+    """Discs of different masses on a lattice, with random velocities; and their scene."""
+    rng, edge = np.random.default_rng(3), 4.0
+    side = math.ceil(math.sqrt(count))
+    lattice = np.stack(np.meshgrid(np.arange(side), np.arange(side)), -1).reshape(-1, 2)[:count]
+    pos, vel, masses = (lattice + 0.5) * edge / side, rng.normal(size=(count, 2)) * 2, rng.uniform(0.5, 3, count)
+    order = np.arange(count) if order is None else order
+    of = scene(masses[order], response, e=e, **more)
+    return of, begun(of, pos[order] + offset, vel[order])
+
+
+def walls(offset: float = 0.0) -> tuple[Wall, ...]:
+    corners = np.array([(0, 0), (4, 0), (4, 4), (0, 4), (0, 0)]) + offset
+    return tuple(Wall(vertices=(tuple(a), tuple(b))) for a, b in itertools.pairwise(corners.tolist()))
+
+
+# --- closed forms -----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("response", IN_TIME)
+@pytest.mark.parametrize("method", [SemiImplicitEuler(), VelocityVerlet(), RK4()], ids=lambda m: m.kind)
+def test_an_elastic_ball_bounces_a_hundred_times_as_high(response: str, method: Integrator) -> None:
+    of = scene([1], response, g=G, dt=0.02, obstacles=FLOOR, method=method)
+    state = begun(of, [(0, 1 + R)], [(1, 0)])
+    # velocity and place of a method of order 1 are half a step apart
+    ahead = G * of.dt / 2 if method.order == 1 else 0.0
+
+    def height() -> float:
+        return float(state.pos[0, 0, 1] - R + (state.vel[0, 0, 1] - ahead) ** 2 / (2 * G))
+
+    first = height()
+    for _ in range(round(100 * 2 * math.sqrt(2 / G) / of.dt)):
+        state = of.step(state)
+        assert R <= state.pos[0, 0, 1] <= 1.01 + R
+    assert abs(height() / first - 1) < 1e-9
+    assert state.counted("impacts") >= 99 and state.vel[0, 0, 0] == 1
+
+
+@pytest.mark.parametrize("response", IN_TIME)
+@pytest.mark.parametrize(("e", "seconds"), [(0.5, 1.354571), (0.8, 4.063713)])
+@pytest.mark.parametrize("phase", [0.0, 0.3, 0.77])
+def test_a_ball_comes_to_rest_when_the_series_of_its_hops_ends(
+    response: str, e: float, seconds: float, phase: float
+) -> None:
+    dt = 0.02
+    of = scene([1], response, e=e, g=G, dt=dt, obstacles=FLOOR)
+    away = phase * dt  # it has been falling for so long
+    state = begun(of, [(0, 1 + R - G * away**2 / 2)], [(0, -G * away + G * dt / 2)])  # half a step apart
+    state = of.run(state, math.floor((seconds - away) / dt) - 1)
+    assert state.vel[0, 0, 1] != 0
+    state = of.run(state, 3)
+    np.testing.assert_array_equal(state.vel[0, 0], 0)
+    assert abs(state.pos[0, 0, 1] - R) < 1e-12
+    later = of.run(state, 500)
+    np.testing.assert_allclose(later.pos, state.pos, rtol=0, atol=1e-12)
+    assert of.run(later, 1).counted("unsolved") == 0
+
+
+@pytest.mark.parametrize("response", EXACT)
+@pytest.mark.parametrize("gap", [0.0, 0.03])
+@pytest.mark.parametrize("sign", [1, -1], ids=["up", "down"])
+@pytest.mark.parametrize(
+    ("masses", "before", "after"),
+    [
+        ((1, 1, 1, 1, 1), (1, 0, 0, 0, 0), (0, 0, 0, 0, 1)),
+        ((1, 1, 1, 1, 1), (1, 1, 0, 0, 0), (0, 0, 0, 1, 1)),
+        ((1, 2, 1), (1, 0, 0), (-1 / 3, 2 / 9, 8 / 9)),
+    ],
+)
+def test_newton_s_cradle(response: str, gap: float, sign: int, masses: Any, before: Any, after: Any) -> None:
+    of = scene(masses, response)
+    x = sign * np.arange(len(masses)) * (2 * R + gap)
+    state = begun(of, np.stack([x, 0 * x], 1), np.stack([sign * np.array(before, float), 0 * x], 1))
+    end = of.run(state, 30 + int(2 * gap * len(masses) / of.dt))
+    np.testing.assert_allclose(sign * end.vel[0, :, 0], after, rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("ratio", [1e3, 1e6, 1e12])
+@pytest.mark.parametrize("response", EXACT)
+def test_a_light_body_and_a_heavy_one_obey_the_closed_form(response: str, ratio: float) -> None:
+    of = scene([1, ratio], response)
+    end = of.run(begun(of, [(0, 0), (1, 0)], [(3, 0), (0, 0)]), 40)
+    v = end.vel[0, :, 0]
+    np.testing.assert_allclose(v, [3 * (1 - ratio) / (1 + ratio), 6 / (1 + ratio)], rtol=1e-12, atol=1e-13)
+    assert abs(v[0] + ratio * v[1] - 3) <= 1e-14 * ratio
+    assert abs((v[0] ** 2 + ratio * v[1] ** 2) / 9 - 1) <= 1e-12
+
+
+@pytest.mark.parametrize("response", EXACT)
+def test_equal_balls_part_at_a_right_angle(response: str) -> None:
+    of = scene([1, 1], response)
+    end = of.run(begun(of, [(0, 0), (1, 0.08)], [(2, 0), (0, 0)]), 80)
+    a, b = end.vel[0]
+    assert abs(a @ b) < 1e-12 and min(np.linalg.norm(a), np.linalg.norm(b)) > 0.1
+
+
+@pytest.mark.parametrize("response", EXACT)
+def test_on_an_incline_it_sticks_up_to_the_angle_of_friction(response: str) -> None:
+    for degrees in (16.6, 16.8, 30.0):
+        angle = math.radians(degrees)
+        out = np.array([-math.sin(angle), math.cos(angle)])
+        plane = (HalfSpace(point=(0.0, 0.0), direction=tuple(out)),)
+        of = scene([1], response, e=0.0, g=G, obstacles=plane, friction=0.3)
+        steps = 6000 if degrees < 16.7 else 100
+        end = of.run(begun(of, [R * out], [(0, 0)]), steps)
+        moved, pull = np.linalg.norm(end.pos[0, 0] - R * out), G * (math.sin(angle) - 0.3 * math.cos(angle))
+        if degrees < 16.7:
+            assert moved < 1e-9
+        else:
+            assert abs(np.linalg.norm(end.vel[0, 0]) / pull - 1) < 1e-9
+            assert abs(moved / (pull / 2) - 1) < (1e-9 if response in IN_TIME else 0.0101)  # half a step of Euler's
+
+
+@pytest.mark.parametrize(("response", "dt"), [("earliest", 0.01), ("back_up", 0.01), ("impulses", 0.005)])
+def test_friction_stops_it_where_it_should_and_does_not_turn_it_round(response: str, dt: float) -> None:
+    of = scene([1], response, e=0.0, g=G, dt=dt, obstacles=FLOOR, friction=0.4)
+    end = of.run(begun(of, [(0, R)], [(3, 0)]), round(2 / dt))
+    assert abs(end.pos[0, 0, 0] / 1.14679 - 1) < 0.01
+    np.testing.assert_array_equal(end.vel[0, 0], 0)
+
+
+@pytest.mark.parametrize("response", ["earliest", "impulses"])
+@pytest.mark.parametrize("e", [0.0, 0.5])
+def test_a_stack_of_ten_lies_still(response: str, e: float) -> None:
+    of = scene([1] * 10, response, e=e, g=G, dt=1 / 60, obstacles=FLOOR)
+    state = begun(of, [(0, R + 2 * R * k) for k in range(10)], np.zeros((10, 2)))
+    end = of.run(state, 1200)
+    assert np.abs(end.pos - state.pos).max() < 0.01 * R
+    assert np.abs(end.vel).max() <= G * of.dt
+
+
+def test_a_billiard_ball_is_where_unfolding_the_table_says() -> None:
+    of = scene([1], radius=0.0, space=Box(size=(1, 1), restitution=1.0))
+    end = of.run(begun(of, [(0.37, 0.2)], [(3.3, 0)]), 1000)
+    assert abs(end.pos[0, 0, 0] - 0.63) < 1e-9 and end.counted("impacts") == 33
+
+
+# --- nothing is missed ------------------------------------------------------------------------------------------------
+
+AIMED = [(phase / 16, math.radians(-40 + 80 * k / 7)) for phase in range(16) for k in range(8)]
+
+
+@pytest.mark.parametrize("response", IN_TIME)
+@pytest.mark.parametrize(
+    ("obstacle", "turn", "home"),
+    [
+        (Wall(vertices=((0.0, -100.0), (0.0, 100.0))), 0.0, (-2.0, 0.0)),
+        (Wall(vertices=((0.0, -100.0), (0.0, 100.0)), velocity=(-30.0, 0.0)), 0.0, (-9.0, 0.0)),
+        (Block(centre=(0.05, 0.0), size=(0.1, 200.0)), 0.0, (-2.0, 0.0)),
+        (Wall(vertices=((0.0, -50.0), (0.0, 0.0), (-50.0, 0.0))), 45.0, (-0.2, -0.2)),
+        (Polygon(vertices=((-50.0, 0.0), (0.0, 0.0), (0.0, -50.0), (1.0, -50.0), (1.0, 1.0), (-50.0, 1.0))), 45.0,
+         (-0.2, -0.2)),
+    ],
+    ids=["wall", "moving wall", "block", "corner of walls", "corner of a polygon"],
+)  # fmt: skip
+def test_no_bullet_goes_through(response: str, obstacle: Any, turn: float, home: tuple[float, float]) -> None:
+    of = scene([1] * len(AIMED), response, e=0.5, dt=1 / 60, obstacles=(obstacle,), agents=False)
+    ways = np.array([(math.cos(a + math.radians(turn)), math.sin(a + math.radians(turn))) for _, a in AIMED])
+    ways = np.clip(ways, 0.05, None) if turn else ways
+    back = np.array([2 + 200 / 60 * phase for phase, _ in AIMED])[:, None]
+    state = begun(of, np.array(home) - back * ways, 200 * ways)
+    end = of.run(state, 5)
+    u = np.array(getattr(obstacle, "velocity", None) or (0.0, 0.0))
+    here = end.pos[0] - u * end.time[0]
+    beyond = here[:, 0] if not turn else here.max(axis=1)
+    assert beyond.max() <= -R + 1e-9
+    assert end.counted("impacts") >= 100
+
+
+@pytest.mark.parametrize("response", IN_TIME)
+def test_two_bullets_do_not_pass_each_other(response: str) -> None:
+    of = scene([1, 1], response, dt=1 / 60)
+    for phase in range(16):
+        end = of.run(begun(of, [(-5 - phase * 0.21, 0), (5, 0)], [(200, 0), (-200, 0)]), 6)
+        assert end.pos[0, 0, 0] < end.pos[0, 1, 0] - 2 * R
+        np.testing.assert_allclose(end.vel[0, :, 0], [-200, 200], rtol=1e-12)
+
+
+def test_who_is_hit_meets_who_was_out_of_its_reach() -> None:
+    """One that lies still is sent through the whole row by one that comes fast, within one step."""
+    of = scene([1] * 6, dt=0.1)
+    end = of.run(begun(of, [(0.5 * k, 0) for k in range(6)], [(40, 0)] + [(0, 0)] * 5), 1)
+    np.testing.assert_allclose(end.vel[0, :, 0], [0, 0, 0, 0, 0, 40], atol=1e-9)
+
+
+@pytest.mark.parametrize("period", [0.0, 4.0])
+@pytest.mark.parametrize("count", [5, 60, 500])
+def test_pairs_that_may_meet_are_the_oracle_s(count: int, period: float) -> None:
+    rng = np.random.default_rng(count)
+    at, radius, living = rng.uniform(0, 4, (count, 2)), rng.uniform(0.01, 0.06, count), rng.random(count) > 0.1
+    reach = np.where(rng.random(count) > 0.98, 1.0, 0.01)  # a few go far
+    places, who = 50_000, np.zeros(50_000, np.int64)
+    other, whole = np.zeros(places, np.int64), np.int32
+    scratch = (
+        np.zeros(max(count, 64), np.int64), np.zeros(count, whole), np.zeros(count, whole), np.zeros(count + 1, whole),
+        np.zeros((1, count), whole), np.zeros((1, 6)), np.zeros(8, np.int64), np.zeros((27, 3), np.int64),
+    )  # fmt: skip
+    found = entry(nearby)((period,) * 2, at, living.astype(np.int64), radius, reach, count, *scratch, who, other)
+    d = at[:, None] - at[None]
+    d -= period * np.floor(d / period + 0.5) if period else 0.0
+    room = radius[:, None] + radius[None] + reach[:, None] + reach[None]
+    near = (np.linalg.norm(d, axis=-1) <= room) & living[:, None] & living[None]
+    expected = {(i, j) for i, j in np.argwhere(near).tolist() if i < j}
+    assert found == len(expected)
+    assert set(zip(who[:found].tolist(), other[:found].tolist(), strict=True)) == expected
+
+
+# --- conservation and symmetry ----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("response", ALL)
+@pytest.mark.parametrize("e", [1.0, 0.6])
+def test_a_gas_keeps_its_momentum_and_never_gains_energy(response: str, e: float) -> None:
+    of, state = gas(response, e, space=Torus(size=(4, 4)))
+    mass = of.body.mass[:, None]
+    last, first = energy(of, state), energy(of, state)
+    for _ in range(30):
+        after = of.run(state, 10)
+        assert np.abs((mass * (after.vel[0] - state.vel[0])).sum(axis=0)).max() < 1e-12 * of.agents
+        assert energy(of, after) <= last * (1 + 1e-12)
+        d = of.space.displacement(after.pos[0][:, None], after.pos[0][None])
+        apart = np.linalg.norm(d, axis=-1) + 9 * np.eye(of.agents)
+        assert apart.min() > 2 * R * (1 - 0.05)
+        state, last = after, energy(of, after)
+    assert state.counted("impacts") > 100
+    if response in EXACT:
+        assert (abs(last / first - 1) < 1e-11) == (e == 1.0)
+        assert state.counted("unsolved") == 0
+
+
+@pytest.mark.parametrize("response", EXACT)
+def test_numbers_of_bodies_mean_nothing(response: str) -> None:
+    order = np.random.default_rng(1).permutation(40)
+    (one, a), (other, b) = (gas(response, 0.9, order=o, space=Torus(size=(4, 4))) for o in (None, order))
+    np.testing.assert_allclose(other.run(b, 100).pos[0], one.run(a, 100).pos[0][order], rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("response", EXACT)
+@pytest.mark.parametrize("offset", [1e4, 1e7])
+def test_it_is_the_same_far_away(response: str, offset: float) -> None:
+    (near, a), (far, b) = (gas(response, 0.9, offset=o, obstacles=walls(o)) for o in (0.0, offset))
+    steps = 20 if offset > 1e6 else 40  # a gas forgets a rounding of 1e-9 m no longer than that
+    np.testing.assert_allclose(far.run(b, steps).pos - offset, near.run(a, steps).pos, rtol=0, atol=1e-6)
+    assert near.run(a, steps).counted("impacts") > 10
+
+
+def test_worlds_and_threads_do_not_know_of_each_other() -> None:
+    of, state = gas("earliest", 0.8, obstacles=walls())
+    batch = of.start(0, worlds=120)
+    rng = np.random.default_rng(0)
+    batch = batch.with_motion(np.repeat(state.pos, 120, 0), state.vel + rng.normal(size=batch.shape))
+    ends = []
+    for count in (1, 2, 3):
+        use_threads(count)
+        try:
+            ends.append(of.run(batch, 60))
+        finally:
+            use_threads(1)
+    for end in ends[1:]:
+        np.testing.assert_array_equal(end.x, ends[0].x)
+        np.testing.assert_array_equal(end.work, ends[0].work)
+    alone = of.run(batch.worlds([77]), 60)
+    np.testing.assert_array_equal(alone.x[:, 0], ends[0].x[:, 77])
+    split = of.run(of.run(batch.worlds([77]), 23), 37)
+    np.testing.assert_array_equal(split.x, alone.x)
+    np.testing.assert_array_equal(of.run(copy.deepcopy(batch).worlds([77]), 60).v, alone.v)
+
+
+@pytest.mark.filterwarnings("default::flockenv.constraints.collisions.UnsolvedContactsWarning")
+@pytest.mark.parametrize("response", EXACT)
+def test_fifty_in_one_place_part_in_no_preferred_direction(response: str) -> None:
+    of = scene([1] * 50, response, e=0.5)
+    end = of.run(begun(of, np.zeros((50, 2)), np.zeros((50, 2))), 100)
+    apart = np.linalg.norm(end.pos[0][:, None] - end.pos[0][None], axis=-1) + 9 * np.eye(50)
+    assert apart.min() > 2 * R * (1 - 1e-9)
+    assert np.abs(end.vel).max() == 0  # nobody is shot away
+    assert np.linalg.norm(end.pos[0].mean(axis=0)) < 1e-12
+    slow = scene([1] * 50, response, e=0.5, part_speed=1.0)
+    after = slow.run(begun(slow, np.zeros((50, 2)), np.zeros((50, 2))), 1)
+    assert 0 < np.abs(after.pos).max() <= 49 * 1.0 * slow.dt
+
+
+def test_who_is_held_or_dead_is_not_moved_and_dead_ones_meet_nobody() -> None:
+    of = scene([1, 1, 1])
+    state = begun(of, [(0, 0), (0.5, 0), (1.0, 0)], [(5, 0), (0, 0), (0, 0)])
+    state.alive[0, 1] = False
+    end = of.run(state, 30)
+    np.testing.assert_array_equal(end.pos[0, 1], (0.5, 0))
+    assert end.vel[0, 2, 0] == pytest.approx(5) and end.counted("impacts") == 1
+
+
+def test_what_is_sticky_stays_where_it_falls() -> None:
+    roof = (*FLOOR, Block(centre=(0.0, 1.0), size=(2.0, 0.2)))
+    of = scene([1] * 3, e=1.0, g=G, obstacles=roof, sticky=True)
+    end = of.run(begun(of, [(-0.5, 3), (0.5, 4), (4, 2)], [(0, -1), (0.5, 0), (1, 0)]), 200)
+    np.testing.assert_allclose(end.pos[0, :, 1], [1.1 + R, 1.1 + R, R], atol=1e-9)
+    np.testing.assert_array_equal(of.run(end, 100).pos, end.pos)
+
+
+def test_in_a_hollow_sphere_it_stays_and_keeps_its_energy() -> None:
+    shell = Circle(centre=(0.0, 0.0), radius=2.0, hollow=True)
+    of, state = gas("earliest", 1.0, count=16, obstacles=(shell,))
+    state = state.with_motion(0.5 * (state.pos - 2.0), state.vel)
+    end = of.run(state, 400)
+    assert np.linalg.norm(end.pos[0], axis=1).max() <= 2.0 - R + 1e-9
+    assert energy(of, end) == pytest.approx(energy(of, state), rel=1e-11)
+
+
+@pytest.mark.slow
+def test_in_space_it_is_the_same() -> None:
+    rng = np.random.default_rng(5)
+    spawn = Spawn(low=(0, 0, 0), high=(1, 1, 1))
+    of = Scene(
+        dimension=3, groups=tuple(Group(count=1, mass=m, radius=R, spawn=spawn) for m in rng.uniform(0.5, 2, 40)),
+        space=Box(size=(1.5, 1.5, 1.5), restitution=1.0), constraints=(Collisions(restitution=1.0),), dt=0.01,
+    )  # fmt: skip
+    lattice = np.stack(np.meshgrid(*[np.arange(4)] * 3), -1).reshape(-1, 3)[:40] * 0.33 + 0.2
+    state = of.start(0).with_motion(lattice[None], 2 * rng.normal(size=(1, 40, 3)))
+    end = of.run(state, 500)
+    mass = of.body.mass[:, None]
+    assert (mass * end.vel[0] ** 2).sum() == pytest.approx((mass * state.vel[0] ** 2).sum(), rel=1e-11)
+    assert end.pos.min() >= R - 1e-9 and end.pos.max() <= 1.5 - R + 1e-9 and end.counted("impacts") > 500
+
+
+def test_in_single_precision_it_does_the_same_for_a_while() -> None:
+    (double, a), (single, b) = (gas("earliest", 0.8, obstacles=walls(), dtype=t) for t in ("float64", "float32"))
+    end = single.run(b, 30)
+    assert end.x.dtype == np.float32
+    np.testing.assert_allclose(end.pos, double.run(a, 30).pos, atol=2e-4)
+
+
+# --- what it costs, and what it says ----------------------------------------------------------------------------------
+
+
+def test_collisions_ask_once_per_step_and_scenes_without_them_never() -> None:
+    of, state = gas("earliest", 1.0, space=Torus(size=(4, 4)))
+    assert of.run(state, 7).counted("neighbour_queries") == 7
+    bare = of.model_copy(update={"constraints": ()})
+    end = bare.run(state, 7)
+    assert [end.counted(what) for what in ("neighbour_queries", "impacts", "unsolved", "pairs")] == [0, 0, 0, 0]
+    walls_only = of.model_copy(update={"constraints": (Collisions(agents=False),)})
+    assert walls_only.run(state, 7).counted("neighbour_queries") == 0
+
+
+def test_who_meets_nobody_flies_as_if_nothing_was() -> None:
+    of, state = gas("earliest", 1.0, count=4, g=G)
+    bare = of.model_copy(update={"constraints": ()})
+    np.testing.assert_array_equal(of.run(state, 3).x, bare.run(state, 3).x)
+    np.testing.assert_array_equal(of.run(state, 3).v, bare.run(state, 3).v)
+
+
+def test_a_cap_that_bites_is_reported_once() -> None:
+    of = scene([1] * 12, g=G, e=0.9, obstacles=FLOOR, most=1, passes=1)
+    state = begun(of, [(0, R + 2 * R * k) for k in range(12)], [(0, -3)] * 12)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        end = of.run(state, 20)
+    told = [str(w.message) for w in caught if issubclass(w.category, UnsolvedContactsWarning)]
+    assert len(told) == 1 and "most = 1 and passes = 1" in told[0]
+    assert end.counted("unsolved") > 0
+
+
+def test_a_scene_with_collisions_is_a_value(tmp_path: Path) -> None:
+    of = scene([1, 2], "impulses", e=0.3, friction=0.2, sticky=True, part_speed=2.0, obstacles=FLOOR)
+    file = tmp_path / "scene.yaml"
+    file.write_text(dump_scene(of))
+    assert load_scene(file) == of and pickle.loads(pickle.dumps(of)) == of and hash(of) == hash(copy.copy(of))
+
+
+@pytest.mark.parametrize(
+    ("given", "told"),
+    [
+        ({"restitution": -0.1}, "restitution = -0.1"),
+        ({"restitution": 1.5}, "restitution = 1.5"),
+        ({"friction": -1.0}, "friction = -1"),
+        ({"most": 0}, "most = 0"),
+        ({"passes": 0}, "passes = 0"),
+        ({"part_speed": 0.0}, "part_speed = 0"),
+        ({"response": "bounce"}, "response = 'bounce'"),
+        ({"restituton": 0.1}, "restitution"),
+    ],
+)
+def test_bad_numbers_are_refused_in_one_line(given: dict[str, Any], told: str) -> None:
+    with pytest.raises(ValueError, match="Collisions: ") as caught:
+        Collisions(**given)
+    assert told in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_scenes_that_cannot_have_them_are_refused() -> None:
+    group = (Group(count=2, radius=0.3, spawn=Spawn(low=(0, 0), high=(1, 1))),)
+    with pytest.raises(ValueError, match=r"constraints\[0\]\.kind = collisions: there is another"):
+        Scene(groups=group, constraints=(Collisions(), Collisions()))
+    with pytest.raises(ValueError, match=r"constraints\[0\]\.kind = collisions: bodies of radius 0.3 m"):
+        Scene(groups=group, space=Torus(size=(1, 4)), constraints=(Collisions(),))
+
+
+def heights(of: Scene, state: State, steps: int) -> Floats:
+    return np.array([(state := of.step(state)).pos[0, 0, 1] for _ in range(steps)])
+
+
+def test_projection_is_crude_and_says_so_by_losing_energy() -> None:
+    of = scene([1], "project", g=G, dt=0.02, obstacles=FLOOR)
+    assert heights(of, begun(of, [(0, 1 + R)], [(0, 0)]), 400)[-50:].max() < 0.9
