@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from typing import Any, ClassVar, Literal
 
 import numpy as np
@@ -68,8 +67,7 @@ effects:
     def parameters(self) -> dict[str, float | Vec]:
         """What the law reads beside the grid."""
         return {
-            "speed": math.inf if self.speed is None else self.speed,
-            "weight": self.weight, "target": self.target, "slow_radius": self.slow_radius,
+            "speed": self.limit, "weight": self.weight, "target": self.target, "slow_radius": self.slow_radius,
         }  # fmt: skip
 
     def region(self, scene: Any) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
