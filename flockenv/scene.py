@@ -342,8 +342,18 @@ class Scene(Record):
             turns=any(group.max_turn_rate is not None for group in self.groups),
             leans=any(group.banking is not None for group in self.groups),
             starts=self.starts, shapes=self.shapes, circles=len(self.circles),
-            tables=tuple(effect.table(self) for effect in effects if effect.tabled),
+            tables=tuple(self.table_of(effect) for effect in effects if effect.tabled),
         )  # fmt: skip
+
+    def table_of(self, effect: Effect) -> Floats:
+        """Return the numbers that the laws of a tabled effect look up: made once, whoever asks first."""
+        if effect not in self._tables:
+            self._tables[effect] = effect.table(self)
+        return self._tables[effect]
+
+    @functools.cached_property
+    def _tables(self) -> dict[Effect, Floats]:
+        return {}
 
     @functools.cached_property
     def table(self) -> Table:

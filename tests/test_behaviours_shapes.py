@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from flockenv.behaviours import AvoidObstacles, Cohesion, Contain, FollowWall, FollowWay, ForceField, Seek, Whiskers
+from flockenv.behaviours import way as way_module
 from flockenv.eikonal import way_table
 from flockenv.grid import sampled
 from flockenv.scene import Group, Scene
@@ -336,6 +337,17 @@ def test_it_stops_at_its_target_and_beyond_the_grid_goes_straight() -> None:
     far = made.start(0)
     far.pos[0, 0] = (3, 500)
     np.testing.assert_allclose(made.acceleration(far)[0, 0], (0, -8), atol=1e-9)
+
+
+def test_a_way_is_found_once_for_a_scene(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Refusing what cannot be, building the scene, drawing it: all of them ask for the same grid."""
+    solved: list[Any] = []
+    monkeypatch.setattr(way_module, "way_table", lambda *given: solved.append(given) or way_table(*given))
+    made = trapped(FollowWay(weight=4, target=(12, 0), clearance=0.4))
+    assert made.parts.tables
+    assert len(solved) == 1
+    made.with_effects(FollowWay(weight=4, target=(12, 0), clearance=0.3))  # another way is another grid
+    assert len(solved) == 2
 
 
 @pytest.mark.parametrize(

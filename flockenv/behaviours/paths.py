@@ -119,7 +119,7 @@ class _OnPath(Moving):
 
     def way_shown(self, scene: Any) -> tuple[tuple[Vec, ...], float] | None:
         """Its tube: places half a radius apart, at most MOST_PLACES."""
-        path = self.table(scene)
+        path = scene.table_of(self)
         count = min(math.ceil(path[1] / (0.5 * self.radius)), MOST_PLACES)
         along = polyline.on_spine(path, np.linspace(0.0, path[1], count + 1), scene.dimension)
         return tuple(map(tuple, scene.space.wrap(along).tolist())), self.radius
@@ -129,7 +129,7 @@ class _OnPath(Moving):
         if len(self.points[0]) != scene.dimension:
             raise ValueError(f"points[0] = {self.points[0]}: dimension = {scene.dimension}")
         super().check(scene)
-        self.table(scene)
+        scene.table_of(self)
 
 
 class FollowPath(_OnPath):

@@ -98,4 +98,4 @@ effects:
         points = float(np.prod((high - low) / self.spacing + 1))
         if points > MOST_POINTS:
             raise ValueError(f"spacing = {self.spacing:g}: {points:,.0f} points, at most {MOST_POINTS:,} are allowed")
-        self.table(scene)
+        scene.table_of(self)
