@@ -1,10 +1,11 @@
 """Task: what is seen, what is paid, when it ends; functions of frames, over a scene that knows nothing of them.
 
-A task is one file: a frozen record whose fields are the keyword arguments of `make`, and six kernels, or seven, over one world:
+A task is one file: a frozen record whose fields are the keyword arguments of `make`, and six kernels, or seven, over
+one world:
 
 * `spawn(p, frame)` writes the first positions, velocities, obstacles and memory from the world's key;
 * `drive(p, frame, action, force)` turns actions (L, A) into forces asked for (D, N) N, of scripted agents too;
-* `keep(p, before, after)`, of a task that `keeps` alone, writes into the memory what the others read there of this step;
+* `keep(p, before, after)`, of a task that `keeps` alone, writes into the memory what the others read of this step;
 * `reward(p, before, after, action, terms)` writes the named terms (L, K) and nothing else, as a test checks;
 * `ended(p, before, after, over) -> success` writes which learners are over (L,), may take agents out of `after.alive`,
   and says whether the aim is reached;
