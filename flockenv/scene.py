@@ -345,14 +345,14 @@ class Scene(Record):
             tables=tuple(self.table_of(effect) for effect in effects if effect.tabled),
         )  # fmt: skip
 
-    def table_of(self, effect: Effect) -> Floats:
+    def table_of(self, effect: Effect) -> NDArray[np.float64]:
         """Return the numbers that the laws of a tabled effect look up: made once, whoever asks first."""
         if effect not in self._tables:
             self._tables[effect] = effect.table(self)
         return self._tables[effect]
 
     @functools.cached_property
-    def _tables(self) -> dict[Effect, Floats]:
+    def _tables(self) -> dict[Effect, NDArray[np.float64]]:
         return {}
 
     @functools.cached_property

@@ -42,7 +42,10 @@ def test_every_effect_can_be_idle() -> None:
 
 
 ABOUT_GROUPS = [
-    (row, name) for row in catalogue.FIRST for name in ("group", "other", "food") if name in type(row.effect).model_fields
+    (row, name)
+    for row in catalogue.FIRST
+    for name in ("group", "other", "food")
+    if name in type(row.effect).model_fields
 ]
 
 
