@@ -213,10 +213,12 @@ class Scene(Record):
                         f"effects[{k}].radius = {effect.reach:g} reaches around the torus; at most half its shortest "
                         f"edge, {min(self.space.size) / 2:g} m, is allowed"
                     )
-        if isinstance(self.space, Box):
+        if isinstance(self.space, (Box, Torus)):
             for k, group in enumerate(self.groups):
                 if 2 * group.radius > min(self.space.size):
-                    raise ValueError(f"groups[{k}].radius = {group.radius:g} does not fit into a box of size {size}")
+                    raise ValueError(
+                        f"groups[{k}].radius = {group.radius:g} does not fit into a {self.space.kind} of size {size}"
+                    )
 
     def _check_counts(self) -> None:
         limit = f"float32 counts exactly up to {EXACT:,}; use dtype = float64"
