@@ -105,7 +105,14 @@ def test_who_converges_from_the_side_brakes_or_speeds_up() -> None:
 OFF = {"give_way": 0.0, "avoid": 0.0, "apart": 0.0}
 
 
-def crowd(groups: tuple[Group, ...], targets: Any, obstacles: Any = (), yielding: int = 2, **given: float) -> Scene:
+def crowd(
+    groups: tuple[Group, ...],
+    targets: Any,
+    obstacles: Any = (),
+    yielding: int = 2,
+    behind: Any = (0, 1),
+    **given: float,
+) -> Scene:
     """Two groups with a target each: one kernel for all tests of giving way and of queues."""
     p = OFF | {"queue": 4.0, "speed": 1.2, "headway": 1.0, "margin": 0.1} | given
     asked = [
@@ -117,7 +124,7 @@ def crowd(groups: tuple[Group, ...], targets: Any, obstacles: Any = (), yielding
                 Separation(weight=p["apart"], radius=0.9),
                 Queue(
                     weight=p["queue"], target=target, speed=p["speed"], headway=p["headway"], margin=p["margin"],
-                    group=k,
+                    group=behind[k],
                 ),
             ),
         )
@@ -241,6 +248,17 @@ def test_a_queue_stops_behind_who_stops_and_closes_up_exponentially() -> None:
         assert gaps.min() >= 0.1 - 1e-9
     np.testing.assert_allclose(gaps, 0.1, atol=0.01)
     assert np.abs(start.vel[0, :4]).max() < 0.01
+
+
+def test_a_gap_in_a_queue_is_between_bodies_of_either_size() -> None:
+    """A small one stops the margin short of a large one that stands, not of one of its own size (formulas.md 1.4)."""
+    small, large = bodies(1, radius=0.1), bodies(1, radius=0.9)
+    scene = crowd((small, large), ((160.0, 100.0), (160.0, 100.0)), behind=(1, 1), queue=4.0)
+    state = placed(scene, [(100.0, 100.0), (106.0, 100.0)], [(0.0, 0.0), (0.0, 0.0)])
+    for _ in range(400):
+        state = scene.step(state)
+        state.pos[0, 1], state.vel[0, 1] = (106.0, 100.0), 0.0
+    assert 106.0 - state.pos[0, 0, 0] == pytest.approx(0.1 + 0.9 + 0.1, abs=0.01)
 
 
 def test_a_queue_passes_a_door_without_a_touch() -> None:
