@@ -122,7 +122,15 @@ def test_one_damped_spring_is_the_worked_example() -> None:
 
 
 def test_a_ratio_of_one_is_critical_for_a_spring_between_two() -> None:
-    """numerics.md E14: c = 2 sqrt(k mu) with the reduced mass; nothing swings through."""
+    """numerics.md E14: c = 2 sqrt(k mu) with the reduced mass; nothing swings through, and nothing is slower.
+
+    With the mass of one end it would be sqrt(2) times too much: the stretch falls as (1 + w t) exp(-w t) of both alone.
+    """
+    world = scene(Rope(links=1, length=1.0, stretch=1.5), Springs(stiffness=40, ratio=1), integrator=RK4())
+    w = math.sqrt(40 * (1 / world.body.mass).sum())
+    end = world.run(world.start(0), 150)
+    stretch = float(np.ptp(end.pos[0, :, 0])) - 1
+    assert stretch == pytest.approx(0.5 * (1 + w * 0.15) * math.exp(-w * 0.15), rel=1e-5)
     for ratio, swings in ((1.0, False), (0.5, True)):
         world = scene(Rope(links=1, length=1.0, stretch=1.5), Springs(stiffness=40, ratio=ratio), integrator=RK4())
         state, least = world.start(0), math.inf
