@@ -463,6 +463,14 @@ ROWS = (
 """A row per number of numerics.md 6.1."""
 
 
-@pytest.mark.parametrize("row", ROWS, ids=lambda row: row.__name__)
+SLOW = (b34_another_method,)
+"""It compiles a method more."""
+
+
+@pytest.mark.parametrize(
+    "row",
+    [pytest.param(row, marks=pytest.mark.slow) if row in SLOW else row for row in ROWS],
+    ids=[row.__name__ for row in ROWS],
+)
 def test_bad_input(row: Callable[[Path], None], tmp_path: Path) -> None:
     row(tmp_path)
