@@ -6,6 +6,8 @@ Writes results.json, table.md, comparison.png and replay.html. Needs no torch: l
 from __future__ import annotations
 
 import functools
+import hashlib
+import json
 import os
 import platform
 import re
@@ -163,13 +165,13 @@ def _sits_out(player: Player, task: Task, tasks: Sequence[Task]) -> bool:
 def _compiled_ahead(plays: Plays, tasks: Sequence[Task], worlds: int) -> Iterator[None]:
     """While tasks are played from the first on, let a second process compile what they need from the last on.
 
-    Where this was done before with the same laws, everything is on the disk, and nothing is started.
+    Where this was done before with the same laws, tasks and players, everything is on the disk, and nothing is started.
     """
-    done = cache_folder() / f"compared_{laws_digest()[:20]}"
+    ours = {task.name: [name for name in plays[task.name] if name in PLAYERS] for task in tasks}
+    done = _compiled_marker(tasks, ours)
     if len(tasks) < 2 or worlds < WORLDS or (os.cpu_count() or 1) < 2 or done.exists():
         yield
         return
-    ours = {task.name: [name for name in plays[task.name] if name in PLAYERS] for task in tasks}
     child = get_context("spawn").Process(target=_compile, args=([*tasks][::-1], ours), daemon=True)
     child.start()
     try:
@@ -178,6 +180,13 @@ def _compiled_ahead(plays: Plays, tasks: Sequence[Task], worlds: int) -> Iterato
     finally:
         child.terminate()
         child.join()
+
+
+def _compiled_marker(tasks: Sequence[Task], names: Mapping[str, Sequence[str]]) -> Path:
+    """Return the file that says: these players of these tasks have been compiled with these laws."""
+    played = sorted([task_digest(task), *sorted(names[task.name])] for task in tasks)
+    said = json.dumps([laws_digest(), played])
+    return cache_folder() / f"compared_{hashlib.sha256(said.encode()).hexdigest()[:20]}"
 
 
 def _compile(tasks: Sequence[Task], names: Mapping[str, Sequence[str]]) -> None:

@@ -136,7 +136,7 @@ def orca(
     """
     given, lines, relaxed = stacked(neighbours), stacked(neighbours), stacked(neighbours)
     asked = (wish, max_speed, turn)
-    return clear(velocity, radius, asked, horizon, step, given, len(neighbours) // 6, lines, relaxed)
+    return clear(velocity, radius, asked, horizon, step, given, len(neighbours) // SLOT, lines, relaxed)
 
 
 @law
@@ -149,7 +149,7 @@ def clear(
     count, hard, free = 0, 0, True
     for soft in range(2):
         for k in range(slots):
-            at = 6 * k
+            at = SLOT * k
             if given[at + 4] >= like(radius, 0.0) and (given[at + 5] < like(radius, 1.0)) == (soft == 1):
                 offset, other = (given[at], given[at + 1]), (given[at + 2], given[at + 3])
                 line = half_plane(velocity, offset, other, radius + given[at + 4], given[at + 5], horizon, step)

@@ -213,10 +213,12 @@ class Scene(Record):
                         f"effects[{k}].radius = {effect.reach:g} reaches around the torus; at most half its shortest "
                         f"edge, {min(self.space.size) / 2:g} m, is allowed"
                     )
-        if isinstance(self.space, Box):
+        if isinstance(self.space, (Box, Torus)):
             for k, group in enumerate(self.groups):
                 if 2 * group.radius > min(self.space.size):
-                    raise ValueError(f"groups[{k}].radius = {group.radius:g} does not fit into a box of size {size}")
+                    raise ValueError(
+                        f"groups[{k}].radius = {group.radius:g} does not fit into a {self.space.kind} of size {size}"
+                    )
 
     def _check_counts(self) -> None:
         limit = f"float32 counts exactly up to {EXACT:,}; use dtype = float64"
@@ -344,8 +346,18 @@ class Scene(Record):
             turns=any(group.max_turn_rate is not None for group in self.groups),
             leans=any(group.banking is not None for group in self.groups),
             starts=self.starts, shapes=self.shapes, circles=len(self.circles),
-            tables=tuple(effect.table(self) for effect in effects if effect.tabled),
+            tables=tuple(self.table_of(effect) for effect in effects if effect.tabled),
         )  # fmt: skip
+
+    def table_of(self, effect: Effect) -> NDArray[np.float64]:
+        """Return the numbers that the laws of a tabled effect look up: made once, whoever asks first."""
+        if effect not in self._tables:
+            self._tables[effect] = effect.table(self)
+        return self._tables[effect]
+
+    @functools.cached_property
+    def _tables(self) -> dict[Effect, NDArray[np.float64]]:
+        return {}
 
     @functools.cached_property
     def table(self) -> Table:

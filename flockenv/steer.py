@@ -14,7 +14,7 @@ from pydantic import Field, WrapValidator, model_validator
 
 from flockenv.arbitration import Allocation, AnyArbitration, Arbitration
 from flockenv.behaviours import BEHAVIOURS
-from flockenv.effects.base import EFFECTS, Effect
+from flockenv.effects.base import EFFECTS, Effect, demand_group
 from flockenv.kernels import Vec
 from flockenv.records import keep
 
@@ -79,8 +79,7 @@ class Steer(Effect):
 
     def check(self, scene: Any) -> None:
         """Refuse a group that is not there, and behaviours that do not suit the scene."""
-        if self.group is not None and self.group >= len(scene.groups):
-            raise ValueError(f"group = {self.group}: there are {len(scene.groups)} groups, counted from 0")
+        demand_group("group", self.group, scene.groups)
         for k, behaviour in enumerate(self.behaviours):
             try:
                 behaviour.check(scene)

@@ -10,7 +10,16 @@ import pytest
 
 from flockenv import steering
 from flockenv.arbitration import Allocation
-from flockenv.behaviours import AvoidObstacles, Explore, Forage, Queue, Separation, UnalignedAvoidance
+from flockenv.behaviours import (
+    AvoidObstacles,
+    Explore,
+    Forage,
+    Orca,
+    Queue,
+    Separation,
+    StayOnPath,
+    UnalignedAvoidance,
+)
 from flockenv.rows import rows
 from flockenv.scene import Group, Scene
 from flockenv.space import Torus
@@ -96,7 +105,14 @@ def test_who_converges_from_the_side_brakes_or_speeds_up() -> None:
 OFF = {"give_way": 0.0, "avoid": 0.0, "apart": 0.0}
 
 
-def crowd(groups: tuple[Group, ...], targets: Any, obstacles: Any = (), yielding: int = 2, **given: float) -> Scene:
+def crowd(
+    groups: tuple[Group, ...],
+    targets: Any,
+    obstacles: Any = (),
+    yielding: int = 2,
+    behind: Any = (0, 1),
+    **given: float,
+) -> Scene:
     """Two groups with a target each: one kernel for all tests of giving way and of queues."""
     p = OFF | {"queue": 4.0, "speed": 1.2, "headway": 1.0, "margin": 0.1} | given
     asked = [
@@ -108,7 +124,7 @@ def crowd(groups: tuple[Group, ...], targets: Any, obstacles: Any = (), yielding
                 Separation(weight=p["apart"], radius=0.9),
                 Queue(
                     weight=p["queue"], target=target, speed=p["speed"], headway=p["headway"], margin=p["margin"],
-                    group=k,
+                    group=behind[k],
                 ),
             ),
         )
@@ -234,6 +250,17 @@ def test_a_queue_stops_behind_who_stops_and_closes_up_exponentially() -> None:
     assert np.abs(start.vel[0, :4]).max() < 0.01
 
 
+def test_a_gap_in_a_queue_is_between_bodies_of_either_size() -> None:
+    """A small one stops the margin short of a large one that stands, not of one of its own size (formulas.md 1.4)."""
+    small, large = bodies(1, radius=0.1), bodies(1, radius=0.9)
+    scene = crowd((small, large), ((160.0, 100.0), (160.0, 100.0)), behind=(1, 1), queue=4.0)
+    state = placed(scene, [(100.0, 100.0), (106.0, 100.0)], [(0.0, 0.0), (0.0, 0.0)])
+    for _ in range(400):
+        state = scene.step(state)
+        state.pos[0, 1], state.vel[0, 1] = (106.0, 100.0), 0.0
+    assert 106.0 - state.pos[0, 0, 0] == pytest.approx(0.1 + 0.9 + 0.1, abs=0.01)
+
+
 def test_a_queue_passes_a_door_without_a_touch() -> None:
     """A gap of 1.4 m between two round pillars, 12 bodies of 0.5 m: all are through in 30 s."""
     stones = ({"centre": (100.0, 102.7), "radius": 2.0}, {"centre": (100.0, 97.3), "radius": 2.0})
@@ -332,6 +359,11 @@ def test_whoever_sweeps_sees_everything_once_per_round_wherever_he_began() -> No
         (Explore(weight=1, low=(0, 0), high=(9, 2), speed=1, track=1), None, "must be at least 3 tracks = 3 m"),
         (Forage(weight=1, food=2, speed=1), None, "food = 2: there are 1 groups, counted from 0"),
         (Queue(weight=1, target=(0, 0, 0), speed=1), None, "target = (0.0, 0.0, 0.0): dimension = 2"),
+        (Queue(weight=1, target=(0, 0)), None, "speed = None: groups[0].max_speed is none too"),
+        (Forage(weight=1, food=0), None, "speed = None: groups[0].max_speed is none too"),
+        (Explore(weight=1, low=(0, 0), high=(9, 9), track=1), None, "speed = None: groups[0].max_speed is none too"),
+        (Orca(weight=1, target=(0, 0)), None, "speed = None: groups[0].max_speed is none too"),
+        (StayOnPath(weight=1, points=((0, 0), (1, 0)), radius=1), None, "speed = None: groups[0].max_speed is none"),
     ],
 )
 def test_what_does_not_suit_a_scene_is_refused_in_one_line(effect: Any, space: Any, said: str) -> None:

@@ -8,7 +8,18 @@ from typing import Any
 import numpy as np
 import pytest
 
-from flockenv.behaviours import AvoidObstacles, Cohesion, Contain, FollowWall, FollowWay, ForceField, Seek, Whiskers
+from flockenv.behaviours import (
+    AvoidObstacles,
+    Cohesion,
+    Contain,
+    FollowWall,
+    FollowWay,
+    ForceField,
+    MatchVelocity,
+    Seek,
+    Whiskers,
+)
+from flockenv.behaviours import way as way_module
 from flockenv.eikonal import way_table
 from flockenv.grid import sampled
 from flockenv.scene import Group, Scene
@@ -175,6 +186,34 @@ def test_whiskers_head_on_do_not_only_brake() -> None:
     assert np.abs(x[:, 1]).max() > 0.5
 
 
+@pytest.mark.slow
+def test_in_space_whiskers_feel_above_and_below_too() -> None:
+    """A level flight 0.5 m below a ceiling, or above a floor: the middle and the side whiskers touch nothing."""
+    ahead = Spawn(low=(0, 0, 0), high=(0, 0, 0), speed=(2, 2), heading=(1, 0, 0))
+    group = Group(count=1, radius=0.2, spawn=ahead)
+    for up in (1, -1):
+        ceiling = Block(centre=(0, 0, 1.5 * up), size=(90, 90, 2))
+        made = Scene(dimension=3, groups=(group,), effects=(WHISKERS,), obstacles=(ceiling,))
+        # it enters 0.3 m further up, after 0.3 / sin 35 of its 3 m; the normal is across, so is its lateral part
+        share = 1 - 0.3 / math.sin(math.radians(35)) / 3
+        np.testing.assert_allclose(
+            made.acceleration(made.start(0))[0, 0], [0, 0, -2 * up * 20 * share], rtol=1e-9, atol=1e-9
+        )
+
+
+# --- a force field ----------------------------------------------------------------------------------------------------
+
+
+def test_in_a_corridor_the_force_field_of_both_walls_leads_to_the_middle_without_chatter() -> None:
+    """formulas.md 1.4: the nearest wall alone pushes to and fro."""
+    walls = (HalfSpace(point=(0, -0.9), direction=(0, 1)), HalfSpace(point=(0, 0.9), direction=(0, -1)))
+    np.testing.assert_allclose(wish(FIELD, obstacles=walls), 0, atol=1e-12)
+    x, v = path(scene(FIELD, SEEK, obstacles=walls, at=(0.0, 0.3)), 4)
+    late = slice(3 * len(x) // 4, None)
+    assert np.abs(x[late, 1]).max() < 1e-3
+    assert np.abs(v[late, 1]).max() < 1e-3
+
+
 # --- wall following ---------------------------------------------------------------------------------------------------
 
 
@@ -228,8 +267,9 @@ def contained(within: Shape, at: Any, v: Any, count: int = 1) -> Scene:
     return Scene(groups=(group,), effects=(Contain(weight=6, within=within, time=1.0),), dt=0.02)
 
 
-def test_it_asks_for_nothing_while_the_place_ahead_is_inside() -> None:
-    still_inside, leaving = contained(ROOM, (4, 3), (1.7, 0)), contained(ROOM, (6, 3), (1.9, 0))
+@pytest.mark.parametrize("within", [ROOM, Block(centre=(4, 4), size=(8, 8))])
+def test_it_asks_for_nothing_while_the_place_ahead_is_inside(within: Shape) -> None:
+    still_inside, leaving = contained(within, (4, 3), (1.7, 0)), contained(within, (6, 3), (1.9, 0))
     np.testing.assert_array_equal(still_inside.acceleration(still_inside.start(0)), 0)
     assert leaving.acceleration(leaving.start(0)).any()
 
@@ -242,7 +282,9 @@ def test_head_on_it_brakes_and_keeps_right() -> None:
     np.testing.assert_allclose(force / np.linalg.norm(force), np.array([-1.9, -2]) / math.hypot(1.9, 2), atol=1e-9)
 
 
-@pytest.mark.parametrize("within", [ROOM, Circle(centre=(4, 4), radius=3.5)])
+@pytest.mark.parametrize(
+    "within", [ROOM, Circle(centre=(4, 4), radius=3.5), Block(centre=(4, 4), size=(7, 6), turn=30)]
+)
 def test_nobody_leaves(within: Shape) -> None:
     made = contained(within, (4, 3), (2, 0), count=60)
     state, worst = made.start(3), -np.inf
@@ -338,6 +380,17 @@ def test_it_stops_at_its_target_and_beyond_the_grid_goes_straight() -> None:
     np.testing.assert_allclose(made.acceleration(far)[0, 0], (0, -8), atol=1e-9)
 
 
+def test_a_way_is_found_once_for_a_scene(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Refusing what cannot be, building the scene, drawing it: all of them ask for the same grid."""
+    solved: list[Any] = []
+    monkeypatch.setattr(way_module, "way_table", lambda *given: solved.append(given) or way_table(*given))
+    made = trapped(FollowWay(weight=4, target=(12, 0), clearance=0.4))
+    assert made.parts.tables
+    assert len(solved) == 1
+    made.with_effects(FollowWay(weight=4, target=(12, 0), clearance=0.3))  # another way is another grid
+    assert len(solved) == 2
+
+
 @pytest.mark.parametrize(
     ("change", "text"),
     [
@@ -369,13 +422,31 @@ def test_nobody_is_drawn_to_whom_an_obstacle_hides(kind: str) -> None:
         made = Scene(groups=groups, effects=effects, obstacles=(obstacle, *FAR))
         return made.acceleration(made.start(0))[0, 0]
 
-    hiding, aside = SCREENS[kind]
+    hiding, aside, beyond, behind = SCREENS[kind]
     np.testing.assert_allclose(force(hiding), [0, 2], atol=1e-12)
-    np.testing.assert_allclose(force(aside), [1, 1], atol=1e-12)
+    for harmless in (aside, beyond, behind):
+        np.testing.assert_allclose(force(harmless), [1, 1], atol=1e-12)
 
 
-SCREENS: dict[str, tuple[Shape, Shape]] = {
-    "circle": (Circle(centre=(1, 0.2), radius=0.5), Circle(centre=(1, -0.6), radius=0.5)),
-    "block": (Block(centre=(1, 0), size=(0.2, 2)), Block(centre=(1, -1.2), size=(0.2, 2))),
-    "wall": (Wall(vertices=((1, -1), (1, 0.1))), Wall(vertices=((1, -1), (1, -0.1)))),
+SCREENS: dict[str, tuple[Shape, ...]] = {
+    "circle": tuple(Circle(centre=at, radius=0.5) for at in ((1, 0.2), (1, -0.6), (3, 0), (-1, 0))),
+    "block": tuple(Block(centre=at, size=(0.2, 2)) for at in ((1, 0), (1, -1.2), (3, 0), (-1, 0))),
+    "wall": tuple(Wall(vertices=((x, -1), (x, high))) for x, high in ((1, 0.1), (1, -0.1), (3, 1), (-1, 1))),
 }
+"""What stands between me and whom is at (2, 0), beside the way to him, beyond him, and behind me."""
+
+
+def test_who_is_hidden_is_not_the_nearest() -> None:
+    """A behaviour about the nearest one is about the nearest that it sees: who is hidden takes nobody's place."""
+    group = Group(count=3, radius=0.05, spawn=Spawn(low=(0, 0), high=(0, 0)))
+    screen = Circle(centre=(1, 0), radius=0.5)
+
+    def force(occluded: bool) -> Any:
+        effect = MatchVelocity(weight=2, radius=9, occluded=occluded)
+        made = Scene(groups=(group,), effects=(effect,), obstacles=(screen,))
+        state = made.start(0)
+        state.pos[0], state.vel[0] = [(0, 0), (2, 0), (0, 3)], [(0, 0), (1, 0), (0, 1)]
+        return made.acceleration(state)[0, 0]
+
+    np.testing.assert_allclose(force(occluded=True), [0, 2], atol=1e-12)
+    np.testing.assert_allclose(force(occluded=False), [2, 0], atol=1e-12)

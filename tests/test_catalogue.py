@@ -6,10 +6,13 @@ import ast
 from collections.abc import Iterator
 from pathlib import Path
 
+import pytest
+
 from flockenv import arbitration, steering
 from flockenv.effects import EFFECTS
 from flockenv.integrators import INTEGRATORS
 from flockenv.space import Space
+from flockenv.steer import Steer
 from flockenv.tasks import TASKS
 from tests import catalogue
 
@@ -36,6 +39,27 @@ def test_every_effect_has_a_row() -> None:
 
 def test_every_effect_can_be_idle() -> None:
     assert [row.name for row in catalogue.EFFECTS if row.effect.idle() == row.effect] == []
+
+
+ABOUT_GROUPS = [
+    (row, name)
+    for row in catalogue.FIRST
+    for name in ("group", "other", "food")
+    if name in type(row.effect).model_fields
+]
+
+
+@pytest.mark.parametrize(("row", "name"), ABOUT_GROUPS, ids=lambda given: getattr(given, "name", given))
+def test_a_group_that_is_not_there_is_refused_by_its_name(row: catalogue.EffectRow, name: str) -> None:
+    """Its numbers would be read from where those of others are."""
+    assert len(ABOUT_GROUPS) >= 18
+    said = rf"{name} = 2: there are 2 groups, counted from 0$"
+    beyond = row.at(2)[0].model_copy(update={name: 2})
+    with pytest.raises(ValueError, match=rf"effects\[0\]\.{said}"):
+        catalogue.scene_of(beyond).start(0)
+    if beyond.steering and not beyond.wishes:
+        with pytest.raises(ValueError, match=rf"effects\[0\]\.behaviours\[0\]\.{said}"):
+            catalogue.scene_of(Steer(group=0, behaviours=(beyond,)))
 
 
 def test_every_integrator_has_a_row() -> None:

@@ -11,7 +11,19 @@ from typing import Any
 import numpy as np
 import pytest
 
-from flockenv.effects import Attraction, Carried, Drag, Effect, Gravity, QuadraticDrag, Sink, Source, Uniform, Vortex
+from flockenv.effects import (
+    Attraction,
+    Carried,
+    Drag,
+    Effect,
+    Gravity,
+    QuadraticDrag,
+    Sink,
+    Source,
+    Tether,
+    Uniform,
+    Vortex,
+)
 from flockenv.integrators import RK4, ExplicitEuler, Integrator, SemiImplicitEuler, VelocityVerlet
 from flockenv.scene import Group, Scene
 from flockenv.spawn import Spawn
@@ -282,3 +294,12 @@ def test_in_space_a_vortex_turns_about_its_axis() -> None:
     quarter = scene.run(start, 50).pos[0, 0] - centre
     np.testing.assert_allclose(quarter, height * axis + R * np.cross(axis, out), atol=1e-6)
     np.testing.assert_allclose(scene.run(start, 200).pos, start.pos, atol=1e-6)
+
+
+def test_a_tether_damps_what_it_holds() -> None:
+    """numerics.md E2: F = -k u - c v; with the other sign of v it would pump."""
+    held = Scene(
+        groups=(Group(count=1, mass=2, spawn=Spawn(low=(1, 0), high=(1, 0), speed=(3, 3), heading=(0, 1))),),
+        effects=(Tether(centre=(0, 0), stiffness=8, damping=0.5),),
+    )
+    np.testing.assert_allclose(held.acceleration(held.start(0))[0, 0], [-8 / 2, -0.5 * 3 / 2], rtol=1e-12)

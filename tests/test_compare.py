@@ -133,6 +133,36 @@ def test_the_sentence_does_not_hide_that_rules_win_or_that_nobody_does() -> None
     assert level.startswith("toy: ppo and reynolds are level: difference 0.000")
 
 
+def test_what_was_compiled_is_known_by_its_tasks_and_players() -> None:
+    """Whoever compared one task has not compiled the others, nor what other players or other settings take."""
+    pursuit, obstacles, all_ = TASKS["pursuit"](), TASKS["obstacles"](), ["random", "reynolds"]
+    asked = [
+        ([pursuit], {"pursuit": all_}),
+        ([pursuit, obstacles], {"pursuit": all_, "obstacles": all_}),
+        ([pursuit, obstacles], {"pursuit": all_, "obstacles": ["random"]}),
+        ([pursuit, TASKS["obstacles"](size=21.0)], {"pursuit": all_, "obstacles": all_}),
+    ]
+    marks = [comparison._compiled_marker(tasks, names) for tasks, names in asked]
+    assert len(set(marks)) == len(marks)
+    assert comparison._compiled_marker(*asked[1]) == marks[1]
+
+
+def test_a_second_comparison_of_the_same_compiles_nothing_ahead(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    tasks = [TASKS["pursuit"](), TASKS["obstacles"]()]
+    plays = {"pursuit": {"random": None, "mine": None}, "obstacles": {"random": None}}
+    started: list[Any] = []
+    child = SimpleNamespace(start=lambda: started.append(1), terminate=lambda: None, join=lambda: None)
+    monkeypatch.setattr(comparison, "cache_folder", lambda: tmp_path)
+    monkeypatch.setattr(comparison.os, "cpu_count", lambda: 2)
+    monkeypatch.setattr(comparison, "get_context", lambda _: SimpleNamespace(Process=lambda **_: child))
+    for asked, expected in ((tasks[:1], 0), (tasks, 1), (tasks, 1), (tasks[::-1], 1)):
+        with comparison._compiled_ahead(plays, asked, comparison.WORLDS):  # type: ignore[arg-type]  # nobody plays
+            pass
+        assert len(started) == expected
+
+
 def test_without_ppo_the_two_best_are_compared_and_one_alone_is_not() -> None:
     luck = np.linspace(-1, 1, 101)
     three = made_up_results({"random": luck, "textbook": luck + 3, "reynolds": luck + 2})["verdict"]

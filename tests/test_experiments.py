@@ -26,8 +26,8 @@ def test_every_arbitration_is_tried_in_every_conflict() -> None:
 
 def test_numbers_about_contacts_and_grants() -> None:
     depth = np.array([[[-1.0, 0.1]], [[0.2, -0.1]], [[-0.1, 0.3]]])  # one inside from the start, out, in again
-    assert arbitration._contacts(depth, 0.1) == {"collisions": 1.5, "deepest": 0.3}
-    assert arbitration._contacts(-np.ones((3, 1, 2)), 0.1) == {"collisions": 0.0, "deepest": 0.0}
+    assert arbitration._contacts(depth) == {"collisions": 1.5, "deepest": 0.3}
+    assert arbitration._contacts(-np.ones((3, 1, 2))) == {"collisions": 0.0, "deepest": 0.0}
 
 
 @pytest.mark.slow

@@ -136,6 +136,22 @@ def test_what_it_gains_is_how_far_it_came_along_the_track() -> None:
     assert world.measure()["progress"][0] == pytest.approx(gone)
 
 
+def test_who_is_put_elsewhere_is_found_there() -> None:
+    """The place on the track is kept from step to step: it is that of where he is, not of where he was left."""
+    world = world_of()
+    world.step(np.zeros((1, 1, 2)))
+    track = corners(world)
+    way, _ = ways(track)
+    place, across = (track[40] + track[41]) / 2, 0.3 * left_of(way[40])
+    at(world, place + across)
+    row = world.reset(mask=np.zeros(1, bool))[0, 0]  # nobody begins anew, he is only looked at
+    assert row[2] == pytest.approx(0.3 / TASK.lost_distance, abs=1e-5)
+    step = world.step(np.array([[[1.0, 0.0]]]))  # along the track there
+    gone = world.state.pos[0, 0] - place - across
+    assert gone @ way[40] == pytest.approx(np.linalg.norm(gone), rel=1e-6)
+    assert step.terms[0, 0, 0] == pytest.approx(TASK.progress_reward * (gone @ way[40]), rel=1e-3)
+
+
 def test_success_is_a_lap() -> None:
     world = world_of()
     world._memory[3 * POINTS + 1, 0, 0] = world._memory[3 * POINTS, 0, 0] - 0.05  # nearly all of it was gained

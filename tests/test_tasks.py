@@ -191,6 +191,7 @@ for name, task, before, after, action, terms, observation in pickle.load(open(sy
     before, after = Frame(*before), Frame(*after)
     found, rows = np.full(terms.shape, np.nan), np.full(observation.shape, np.nan, np.float32)
     module.reward(p, before, after._replace(alive=before.alive), action, found)
+    module.ended(p, before, after._replace(alive=after.alive.copy()), np.zeros(len(terms), bool))
     module.measure(p, before, after, np.zeros(len(task.measures)))
     module.observe(p, after, rows)
     np.testing.assert_allclose(found, terms, rtol=1e-9, atol=1e-9, err_msg=name)
@@ -210,7 +211,10 @@ def frame(world: World) -> list[Any]:
 
 
 def test_reward_and_observation_touch_nothing(tmp_path: Path) -> None:
-    """They run in plain Python, every array of both frames locked against writing, and find what was compiled."""
+    """They run in plain Python, every array of both frames locked against writing, and find what was compiled.
+
+    So do `measure` and `ended`, which may say of who is in the world, and of nothing else.
+    """
     questions = []
     for row in ROWS:
         world = world_of(row.task)

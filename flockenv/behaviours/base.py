@@ -9,7 +9,7 @@ from typing import Any, ClassVar
 import numpy as np
 from pydantic import Field
 
-from flockenv.effects.base import Effect, Me, Other, Sight
+from flockenv.effects.base import Effect, Me, Other, Sight, demand_group
 from flockenv.kernels import Vec, law, like
 from flockenv.stability import LookaheadWarning
 
@@ -59,7 +59,8 @@ def steered_groups(effect: Effect, scene: Any) -> list[int]:
     for each in scene.effects:
         if each == effect or effect in each.wishes:
             only = getattr(each, "group", None) if each.wishes else None
-            found |= set(range(len(scene.groups))) if only is None else {only}
+            every = set(range(len(scene.groups)))
+            found |= every if only is None else every & {only}
     return sorted(found)
 
 
@@ -76,12 +77,10 @@ class Behaviour(Effect):
         return {**dict.fromkeys(self.unlimited, math.inf), **super().parameters()}
 
     def check(self, scene: Any) -> None:
-        """Refuse a group that is not there."""
+        """Refuse a group that is not there, by the name under which it was given."""
+        for name in ("group", "other", "food"):
+            demand_group(name, getattr(self, name, None), scene.groups)
         super().check(scene)
-        for name in ("group", "other"):
-            which = getattr(self, name, None)
-            if which is not None and which >= len(scene.groups):
-                raise ValueError(f"{name} = {which}: there are {len(scene.groups)} groups, counted from 0")
 
 
 class Moving(Behaviour):
@@ -89,6 +88,16 @@ class Moving(Behaviour):
 
     speed: float | None = Field(default=None, gt=0, description="m/s, how fast at most; none = its max_speed")
     unlimited: ClassVar[tuple[str, ...]] = ("speed",)
+
+    @property
+    def limit(self) -> float:
+        """How fast it goes at most, m/s, of its own accord; infinite without a limit."""
+        return math.inf if self.speed is None else self.speed
+
+    @property
+    def ramp(self) -> float | None:
+        """Over how many metres it slows down to stop; none if it does not."""
+        return getattr(self, "slow_radius", None)
 
     def check(self, scene: Any) -> None:
         """Refuse those who may be infinitely fast; warn of a ramp that is too short to stop on."""
@@ -100,9 +109,8 @@ class Moving(Behaviour):
             speeds = [speed for speed in (self.speed, group.max_speed) if speed is not None]
             if not speeds:
                 raise ValueError(f"speed = None: groups[{k}].max_speed is none too; give either of them")
-            slow_radius = getattr(self, "slow_radius", None)
-            if slow_radius is not None and group.max_force is not None:
-                _warn_of_overshoot(self.kind, slow_radius, min(speeds), group)
+            if self.ramp is not None and group.max_force is not None:
+                _warn_of_overshoot(self.kind, self.ramp, min(speeds), group)
 
 
 def _warn_of_overshoot(kind: str, slow_radius: float, speed: float, group: Any) -> None:

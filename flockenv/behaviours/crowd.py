@@ -8,8 +8,9 @@ import numpy as np
 from pydantic import Field
 
 from flockenv import steering
+from flockenv.behaviours.base import Behaviour, Moving, top_speed
 from flockenv.behaviours.wander import wandered
-from flockenv.effects.base import Effect, Me, Other, Sight, Vector
+from flockenv.effects.base import Me, Other, Sight, Vector
 from flockenv.kernels import Vec, law, like
 from flockenv.vec import scale, select, sub, unit, zero
 
@@ -45,7 +46,7 @@ def giving_way(p: Any, me: Me, acc: Vec) -> Vec:
     return scale(away, p.weight)
 
 
-class UnalignedAvoidance(Effect):
+class UnalignedAvoidance(Behaviour):
     """Give way to whom one would meet first within `horizon` seconds: aside, and braking or speeding up."""
 
     kind: Literal["unaligned_avoidance"] = "unaligned_avoidance"
@@ -55,7 +56,6 @@ class UnalignedAvoidance(Effect):
     horizon: float = Field(default=3.0, gt=0, description="s, how far ahead it looks")
     margin: float = Field(default=0.0, ge=0, description="m, clearance beyond both radii")
     group: int | None = Field(default=None, ge=0, description="to whom it gives way; none = all")
-    steering: ClassVar[bool] = True
     pair_start: ClassVar[str | None] = "no_meeting"
     pair_law: ClassVar[str | None] = "first_meeting"
     finish_law: ClassVar[str | None] = "giving_way"
@@ -114,7 +114,7 @@ def held_up(p: Any, me: Me, other: Other, acc: Vec) -> Vec:
     else:
         way = (acc[0], acc[1], acc[2])
     clearance = me.radius + other.radius + p.margin
-    gap = steering.queue_gap(way, other.offset, other.vel, clearance, min(p.speed, me.max_speed))
+    gap = steering.queue_gap(way, other.offset, other.vel, clearance, top_speed(p, me))
     nearest = acc[len(acc) - 1]
     return way + (gap if gap < nearest else nearest,)  # noqa: RUF005
 
@@ -127,21 +127,19 @@ def queueing(p: Any, me: Me, acc: Vec) -> Vec:
         way = (acc[0], acc[1])
     else:
         way = (acc[0], acc[1], acc[2])
-    return scale(steering.queue(way, me.vel, acc[len(acc) - 1], min(p.speed, me.max_speed), p.headway), p.weight)
+    return scale(steering.queue(way, me.vel, acc[len(acc) - 1], top_speed(p, me), p.headway), p.weight)
 
 
-class Queue(Effect):
+class Queue(Moving):
     """Seek a door, and slow down behind whoever is near, ahead on the way there, and slower: no pushing."""
 
     kind: Literal["queue"] = "queue"
     weight: float = Field(ge=0, description="kg/s, gain; 4 m / headway or more overshoots nothing")
     target: Vector = Field(description="m, the door")
-    speed: float = Field(gt=0, description="m/s, wanted where the way is free; at most the agent's max_speed")
     headway: float = Field(default=0.8, gt=0, description="s, a gap is closed as exp(-t / headway)")
     margin: float = Field(default=0.0, ge=0, description="m, left between bodies that stand in the queue")
     radius: float = Field(default=5.0, gt=0, description="m, who is further away holds up nobody")
     group: int | None = Field(default=None, ge=0, description="behind whom it queues; none = all")
-    steering: ClassVar[bool] = True
     places: ClassVar[tuple[str, ...]] = ("target",)
     pair_start: ClassVar[str | None] = "free_way"
     pair_law: ClassVar[str | None] = "held_up"
@@ -165,8 +163,8 @@ effects:
 
     def parameters(self) -> dict[str, float | Vec]:
         """Where to, how fast, how close: who is seen is the sweep's business."""
-        names = ("weight", "speed", "headway", "margin")
-        return {"target": self.target, **{name: float(getattr(self, name)) for name in names}}
+        names = ("weight", "headway", "margin")
+        return {"target": self.target, "speed": self.limit, **{name: float(getattr(self, name)) for name in names}}
 
     def sums(self, dimension: int) -> int:
         """The way and the gap."""
@@ -199,24 +197,21 @@ def foraging(p: Any, me: Me, acc: Vec) -> Vec:
         offset = (acc[2], acc[3])
     else:
         offset = (acc[2], acc[3], acc[4])
-    speed = min(p.speed, me.max_speed)
+    speed = top_speed(p, me)
     feed = steering.arrive(offset, me.vel, speed, p.slow_radius)
     return select(acc[0] < like(o, np.inf), scale(feed, p.weight), wandered(p, me))
 
 
-class Forage(Effect):
+class Forage(Moving):
     """Arrive at the nearest food in sight, and wander as long as there is none (Reynolds 1999 names it)."""
 
     kind: Literal["forage"] = "forage"
-    weight: float = Field(ge=0, description="kg/s, gain")
     food: int = Field(ge=0, strict=True, description="the group whose agents are food")
-    speed: float = Field(gt=0, description="m/s, on its way; at most the agent's max_speed")
     radius: float = Field(default=3.0, gt=0, description="m, food is seen within this")
     fov: float = Field(default=360.0, gt=0, le=360, description="degrees, full angle of the field of view")
     slow_radius: float = Field(default=0.5, gt=0, description="m, it slows down within this of its food")
     period: float = Field(default=2.0, gt=0, description="s, how long it remembers to which side it turned")
     strength: float = Field(default=1.0, ge=0, description="m aside per m ahead: how far it turns while it wanders")
-    steering: ClassVar[bool] = True
     pair_start: ClassVar[str | None] = "no_food"
     pair_law: ClassVar[str | None] = "nearest_food"
     finish_law: ClassVar[str | None] = "foraging"
@@ -238,14 +233,8 @@ effects:
 
     def parameters(self) -> dict[str, float | Vec]:
         """How fast, and how it wanders: who is seen is the sweep's business."""
-        names = ("weight", "speed", "slow_radius", "period", "strength")
-        return {name: float(getattr(self, name)) for name in names}
-
-    def check(self, scene: Any) -> None:
-        """Refuse a group that is not there."""
-        super().check(scene)
-        if self.food >= len(scene.groups):
-            raise ValueError(f"food = {self.food}: there are {len(scene.groups)} groups, counted from 0")
+        names = ("weight", "slow_radius", "period", "strength")
+        return {"speed": self.limit, **{name: float(getattr(self, name)) for name in names}}
 
     def sums(self, dimension: int) -> int:
         """Square of the distance, who, and where the nearest is."""
@@ -259,22 +248,19 @@ effects:
 def sweeping(p: Any, me: Me) -> Vec:
     """F = w (v_track - v)."""
     to_low, to_high = sub(me.pos, p.low), sub(p.high, me.pos)
-    return scale(steering.explore(to_low, to_high, me.vel, min(p.speed, me.max_speed), p.track), p.weight)
+    return scale(steering.explore(to_low, to_high, me.vel, top_speed(p, me), p.track), p.weight)
 
 
-class Explore(Effect):
+class Explore(Moving):
     """Sweep a region for ever along a closed comb of tracks, so that everything comes into sight once per round.
 
     What was seen already is no state: where one is says where to go (steering.explore).
     """
 
     kind: Literal["explore"] = "explore"
-    weight: float = Field(ge=0, description="kg/s, gain")
     low: Vector = Field(description="m, lower corner of the region")
     high: Vector = Field(description="m, upper corner of the region")
-    speed: float = Field(gt=0, description="m/s, on the track; at most the agent's max_speed")
     track: float = Field(gt=0, description="m, tracks lie at most so far apart; sight of 1.25 tracks misses nothing")
-    steering: ClassVar[bool] = True
     places: ClassVar[tuple[str, ...]] = ("low", "high")
     own_law: ClassVar[str | None] = "sweeping"
     demo_time: ClassVar[float] = 60.0

@@ -9,7 +9,8 @@ from numba.extending import overload
 from pydantic import Field
 
 from flockenv import orca, steering
-from flockenv.effects.base import Effect, Me, Other, Sight, Vector
+from flockenv.behaviours.base import Moving, top_speed
+from flockenv.effects.base import Me, Other, Sight, Vector
 from flockenv.kernels import OPTIONS, Vec, law, like
 from flockenv.vec import scale, select, sub, zero
 
@@ -68,13 +69,13 @@ def near_obstacle(p: Any, me: Me, other: Other, acc: Vec) -> Vec:
 @law
 def reciprocal(p: Any, me: Me, acc: Vec) -> Vec:
     """F = w (v_orca - v), the wish being to arrive."""
-    speed = min(p.speed, me.max_speed)
+    speed = top_speed(p, me)
     wish = steering.arrive(sub(p.target, me.pos), zero(me.vel), speed, p.slow_radius)
-    top = min(p.hurry * p.speed, me.max_speed)
+    top = min(p.hurry * speed, me.max_speed)
     return scale(orca.orca(me.vel, wish, me.radius + p.margin, top, p.horizon, p.step, p.turn, acc), p.weight)
 
 
-class Orca(Effect):
+class Orca(Moving):
     """Arrive at a point with the velocity nearest to the wished one that touches nobody within `horizon` seconds.
 
     Optimal reciprocal collision avoidance (van den Berg et al. 2011) among the six nearest agents and obstacles.
@@ -84,8 +85,7 @@ class Orca(Effect):
     kind: Literal["orca"] = "orca"
     weight: float = Field(ge=0, description="kg/s, gain; m / dt takes on the velocity at once")
     target: Vector = Field(description="m, where to arrive; in a plane")
-    speed: float = Field(gt=0, description="m/s, wanted where nobody is in the way; at most the agent's max_speed")
-    hurry: float = Field(default=1.2, ge=1, description="top speed of an evasion, in `speed`s")
+    hurry: float = Field(default=1.2, ge=1, description="top speed of an evasion, in `speed`s; at most max_speed")
     slow_radius: float = Field(default=0.5, gt=0, description="m, it slows down within this of its target")
     radius: float = Field(default=8.0, gt=0, description="m, agents further away are not looked at")
     horizon: float = Field(default=3.0, gt=0, description="s, for so long the velocity must be free")
@@ -95,7 +95,6 @@ class Orca(Effect):
         default=0.05, ge=0, le=1.5, description="rad, a wish that is not free is turned right by this: no standstill"
     )
     group: int | None = Field(default=None, ge=0, description="whom it avoids; none = all")
-    steering: ClassVar[bool] = True
     places: ClassVar[tuple[str, ...]] = ("target",)
     pair_start: ClassVar[str | None] = "nobody"
     pair_law: ClassVar[str | None] = "near_agent"
@@ -119,8 +118,8 @@ effects:
 
     def parameters(self) -> dict[str, float | Vec]:
         """Where to, how fast, how far ahead: who is seen is the sweep's business."""
-        names = ("weight", "speed", "hurry", "slow_radius", "horizon", "step", "margin", "turn")
-        return {"target": self.target, **{name: float(getattr(self, name)) for name in names}}
+        names = ("weight", "hurry", "slow_radius", "horizon", "step", "margin", "turn")
+        return {"target": self.target, "speed": self.limit, **{name: float(getattr(self, name)) for name in names}}
 
     def lookahead(self, speed: float) -> float:
         """As far as it comes within the horizon, and as it sees."""

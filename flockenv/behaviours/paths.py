@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from flockenv import grid, polyline, steering
-from flockenv.effects.base import Effect, Me, Vector
+from flockenv.behaviours.base import Behaviour, Moving, top_speed
+from flockenv.effects.base import Me, Vector
 from flockenv.kernels import Vec, law, like
 from flockenv.vec import add, norm, scale, select, sub, zero
 
@@ -39,7 +40,7 @@ def _offset(found: Vec) -> Vec:
 @law
 def path_followed(p: Any, me: Me) -> Vec:
     """F = w S."""
-    top = min(p.speed, me.max_speed)
+    top = top_speed(p, me)
     o, way = like(top, 0.0), like(top, p.way)
     now = polyline.nearest(p.table, me.pos)
     then = polyline.nearest(p.table, add(me.pos, scale(me.vel, p.time)))
@@ -59,7 +60,7 @@ def path_kept(p: Any, me: Me) -> Vec:
     step = scale(me.vel, p.time)
     to_spine = _offset(polyline.nearest(p.table, add(me.pos, step)))
     beyond = norm(to_spine) - p.radius
-    wish = steering.stay_on_path(beyond, add(step, to_spine), me.vel, min(p.speed, me.max_speed))
+    wish = steering.stay_on_path(beyond, add(step, to_spine), me.vel, top_speed(p, me))
     return scale(wish, p.weight)
 
 
@@ -85,21 +86,18 @@ def flow_followed(p: Any, me: Me) -> Vec:
     return scale(select(grid.covers(p.table, at), wish, zero(me.vel)), p.weight)
 
 
-class _OnPath(Effect):
+class _OnPath(Moving):
     """What both have in common: a tube, and how far ahead they look."""
 
-    steering: ClassVar[bool] = True
     tabled: ClassVar[bool] = True
     places: ClassVar[tuple[str, ...]] = ("points",)
     heads_for: ClassVar[bool] = False
 
-    weight: float
     points: Annotated[tuple[Vector, ...], Field(min_length=2, max_length=1024)] = Field(
         description="m, the corners of its spine; on a torus each piece between two goes the shortest way"
     )
     closed: bool = Field(default=False, description="does the last point lead back to the first?")
     radius: float = Field(gt=0, description="m, of the tube")
-    speed: float = Field(gt=0, description="m/s, how fast it wants to be; at most its max_speed")
     time: float = Field(default=0.5, ge=0, description="s, how far ahead it looks")
 
     @model_validator(mode="after")
@@ -113,8 +111,7 @@ class _OnPath(Effect):
 
     def parameters(self) -> dict[str, float | Vec]:
         """All but the path itself, which is in the table."""
-        names = ("weight", "radius", "speed", "time")
-        return {name: float(getattr(self, name)) for name in names}
+        return {"speed": self.limit, "weight": self.weight, "radius": self.radius, "time": self.time}
 
     def table(self, scene: Any) -> NDArray[np.float64]:
         """The path."""
@@ -122,7 +119,7 @@ class _OnPath(Effect):
 
     def way_shown(self, scene: Any) -> tuple[tuple[Vec, ...], float] | None:
         """Its tube: places half a radius apart, at most MOST_PLACES."""
-        path = self.table(scene)
+        path = scene.table_of(self)
         count = min(math.ceil(path[1] / (0.5 * self.radius)), MOST_PLACES)
         along = polyline.on_spine(path, np.linspace(0.0, path[1], count + 1), scene.dimension)
         return tuple(map(tuple, scene.space.wrap(along).tolist())), self.radius
@@ -131,7 +128,8 @@ class _OnPath(Effect):
         """Refuse a path of another dimension, or one that a torus makes a point of."""
         if len(self.points[0]) != scene.dimension:
             raise ValueError(f"points[0] = {self.points[0]}: dimension = {scene.dimension}")
-        self.table(scene)
+        super().check(scene)
+        scene.table_of(self)
 
 
 class FollowPath(_OnPath):
@@ -143,7 +141,6 @@ class FollowPath(_OnPath):
     """
 
     kind: Literal["follow_path"] = "follow_path"
-    weight: float = Field(ge=0, description="kg/s")
     time: float = Field(default=0.5, gt=0, description="s, how far ahead it looks")
     way: Literal[1, -1] = Field(default=1, description="1: as the points are listed; -1: the other way")
     keep: float = Field(
@@ -170,6 +167,11 @@ effects:
          points: [[1, 1], [6, 2.5], [11, 1], [12, 5], [10, 9], [6, 7.5], [2, 9], [0, 5]]}
 """
 
+    @property
+    def ramp(self) -> float | None:
+        """Of an open path alone, and 0 is none."""
+        return None if self.closed or self.slow_radius == 0 else self.slow_radius
+
     def parameters(self) -> dict[str, float | Vec]:
         """And what is about its way along it."""
         own = {"way": float(self.way), "keep": float(self.keep), "slow_radius": float(self.slow_radius)}
@@ -180,7 +182,6 @@ class StayOnPath(_OnPath):
     """Stay in a path's tube, whichever way: if the place after `time` s is outside, seek the spine beside it."""
 
     kind: Literal["stay_on_path"] = "stay_on_path"
-    weight: float = Field(ge=0, description="kg/s")
     own_law: ClassVar[str | None] = "path_kept"
     demo: ClassVar[str | None] = """
 groups:
@@ -192,11 +193,10 @@ effects:
 """
 
 
-class FollowFlow(Effect):
+class FollowFlow(Behaviour):
     """Follow a field of velocities on a grid, linear in between: F = w (u - v), 0 outside the grid."""
 
     kind: Literal["follow_flow"] = "follow_flow"
-    weight: float = Field(ge=0, description="kg/s")
     centre: Vector = Field(description="m, the middle of the grid")
     spacing: float = Field(gt=0, description="m, from one point of the grid to the next")
     counts: tuple[Annotated[int, Field(ge=2, le=1024)], ...] = Field(
@@ -204,7 +204,6 @@ class FollowFlow(Effect):
     )
     velocities: tuple[Vector, ...] = Field(description="m/s, at all points; the last axis runs fastest")
     time: float = Field(default=0.2, ge=0, description="s, how far ahead it looks")
-    steering: ClassVar[bool] = True
     tabled: ClassVar[bool] = True
     places: ClassVar[tuple[str, ...]] = ("centre",)
     heads_for: ClassVar[bool] = False

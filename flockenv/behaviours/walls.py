@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from typing import Any, ClassVar, Literal, Self
 
 import numpy as np
@@ -184,7 +183,7 @@ effects:
 
     def parameters(self) -> dict[str, float | Vec]:
         """The shape is a table."""
-        return {"speed": math.inf if self.speed is None else self.speed, "weight": self.weight, "time": self.time}
+        return {"speed": self.limit, "weight": self.weight, "time": self.time}
 
     def table(self, scene: Any) -> NDArray[np.float64]:
         """The row of the shape."""

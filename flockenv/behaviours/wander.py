@@ -36,9 +36,8 @@ def wandered(p: Any, me: Any) -> Vec:
     who = int(me.who)
     when = np.float64(me.time) / np.float64(p.period) + GOLDEN * who  # not everybody turns to a new side at once
     left, up = like(e, smooth(me.key, when, who, CHANNEL)), like(e, smooth(me.key, when, who, CHANNEL + 1))
-    begin = (
-        2.0 * np.pi * uniform(me.key, 0, who, CHANNEL + 2)
-    )  # whoever stands still sets off in a direction of his own
+    # whoever stands still sets off in a direction of his own
+    begin = 2.0 * np.pi * uniform(me.key, 0, who, CHANNEL + 2)
     way = select(dot(me.vel, me.vel) > o, me.vel, planar(me.vel, like(e, np.cos(begin)), like(e, np.sin(begin))))
     target = _aside(way, left * p.strength, up * p.strength)
     velocity = add(steering.wander(target, way, top_speed(p, me), e), way)

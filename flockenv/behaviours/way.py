@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from typing import Any, ClassVar, Literal
 
 import numpy as np
@@ -66,8 +65,7 @@ effects:
     def parameters(self) -> dict[str, float | Vec]:
         """What the law reads beside the grid."""
         return {
-            "speed": math.inf if self.speed is None else self.speed,
-            "weight": self.weight, "target": self.target, "slow_radius": self.slow_radius,
+            "speed": self.limit, "weight": self.weight, "target": self.target, "slow_radius": self.slow_radius,
         }  # fmt: skip
 
     def region(self, scene: Any) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -101,4 +99,4 @@ effects:
         points = float(np.prod((high - low) / self.spacing + 1))
         if points > MOST_POINTS:
             raise ValueError(f"spacing = {self.spacing:g}: {points:,.0f} points, at most {MOST_POINTS:,} are allowed")
-        self.table(scene)
+        scene.table_of(self)

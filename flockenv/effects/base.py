@@ -48,8 +48,8 @@ from flockenv.records import Record
 from flockenv.vec import dot
 
 __all__ = [
-    "EFFECTS", "Bonds", "Effect", "Far", "Me", "Obstacle", "Other", "Sight", "Vector", "all_masses", "in_view",
-    "network_of", "ties",
+    "EFFECTS", "Bonds", "Effect", "Far", "Me", "Obstacle", "Other", "Sight", "Vector", "all_masses", "demand_group",
+    "in_view", "network_of", "ties",
 ]  # fmt: skip
 
 Vector = Annotated[tuple[Annotated[float, Field(strict=True)], ...], Field(min_length=2, max_length=3)]
@@ -168,10 +168,15 @@ def all_masses(groups: Sequence[Any], dimension: int) -> NDArray[np.float64]:
     return np.concatenate([group.masses(dimension) for group in groups])
 
 
+def demand_group(name: str, which: int | None, groups: Sequence[Any]) -> None:
+    """Refuse the number of a group that is not there, by the name of the field that holds it; none is all of them."""
+    if which is not None and not 0 <= which < len(groups):
+        raise ValueError(f"{name} = {which}: there are {len(groups)} groups, counted from 0")
+
+
 def network_of(groups: Sequence[Any], which: int, dimension: int) -> tuple[int, Any, NDArray[np.float64]]:
     """Return the first agent of a group, its network, and the masses of its particles, kg; refuses one without."""
-    if which >= len(groups):
-        raise ValueError(f"group = {which}: there are {len(groups)} groups, counted from 0")
+    demand_group("group", which, groups)
     if groups[which].network is None:
         raise ValueError(f"group = {which}: has no network; give groups[{which}].network")
     first = sum(group.size for group in groups[:which])
@@ -318,11 +323,14 @@ class Effect(Record):
     def check(self, scene: Any) -> None:
         """Refuse, with a ValueError that begins with the name of a field, a scene that does not suit it.
 
-        Vectors have the dimension of the scene: whoever overrides this asks for that too.
+        Vectors have the dimension of the scene, and it sees a group that is there: whoever overrides this asks for that
+        too.
         """
         for name, value in self.parameters().items():
             if isinstance(value, tuple) and len(value) != scene.dimension:
                 raise ValueError(f"{name} = {value}: dimension = {scene.dimension}")
+        if self.sight is not None:
+            demand_group("group", self.sight.group, scene.groups)
 
     def parameters(self) -> dict[str, float | Vec]:
         """The numbers and vectors its laws are given, by name; what is none, or a word, is no number."""

@@ -6,8 +6,6 @@ emergency the most pressing wish must not share a bounded force with all others.
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
 from flockenv.arbitration import (
@@ -21,10 +19,10 @@ from flockenv.arbitration import (
     RunningSum,
 )
 from flockenv.config import load_scene
-from flockenv.experiments.base import Experiment, Trial
+from flockenv.experiments.base import Experiment, Trial, depth
 from flockenv.grants import Granted, Grants
 from flockenv.scene import Scene
-from flockenv.state import Floats, State
+from flockenv.state import Floats
 from flockenv.steer import Steer
 
 __all__ = ["CASES", "EXPERIMENT", "VARIANTS", "scene_of"]
@@ -34,10 +32,7 @@ SEED = 0
 
 CASES: dict[str, tuple[str, float, str]] = {
     "cancelling": (
-        (
-            "the way around an obstacle and the course to a goal behind it pull to opposite sides, until their sum is "
-            "nothing"
-        ),
+        "the way around an obstacle and the course to a goal behind it pull apart, until their sum is nothing",
         8.0,
         """
 groups:
@@ -111,28 +106,21 @@ def _trial(case: str, variant: str) -> Trial:
     scene = scene_of(case, variant)
     steer, grants, steps = scene.effects[0], Grants(scene), round(CASES[case][1] / scene.dt)
     assert isinstance(steer, Steer)
+    target = np.array(next(b for b in steer.behaviours if b.kind == "seek").parameters()["target"])
     state = scene.start(SEED, worlds=WORLDS)
-    depth, granted, path = [], [], [state.pos[0].copy()]
+    began = np.linalg.norm(state.pos - target, axis=-1)
+    deep, granted, path = [], [], [state.pos[0].copy()]
     for _ in range(steps):
         granted.append(grants.at(state)[0])
         state = scene.step(state)
-        depth.append(_depth(scene, state))
+        deep.append(depth(scene, state))
         path.append(state.pos[0].copy())
-    target = np.array(next(b for b in steer.behaviours if b.kind == "seek").parameters()["target"])
-    numbers = _contacts(np.array(depth), scene.dt) | _grants(granted, scene.dt)
-    gone = np.linalg.norm(scene.start(SEED, worlds=WORLDS).pos - target, axis=-1)
-    nearer = gone - np.linalg.norm(state.pos - target, axis=-1)
+    numbers = _contacts(np.array(deep)) | _grants(granted, scene.dt)
+    nearer = began - np.linalg.norm(state.pos - target, axis=-1)
     return Trial(numbers | {"nearer": float(nearer.mean())}, scene, np.array(path))
 
 
-def _depth(scene: Scene, state: State) -> Floats:
-    """Return how deep everybody is in an obstacle, (B, N) m; negative outside of all."""
-    offset = state.pos[:, :, None] - state.obstacles.centre[:, None]
-    gap = np.linalg.norm(offset, axis=-1) - state.obstacle_radius[:, None]
-    return np.asarray(scene.body.radius - gap.min(axis=-1))
-
-
-def _contacts(depth: Floats, dt: float) -> dict[str, float]:
+def _contacts(depth: Floats) -> dict[str, float]:
     """Return numbers about obstacles that were run into; depth (T, B, N) m."""
     inside = depth > 0
     entered = inside[0].sum() + (inside[1:] & ~inside[:-1]).sum()
@@ -154,7 +142,7 @@ def _grants(granted: list[Granted], dt: float) -> dict[str, float]:
     return {"switches": float(switches), **shares}
 
 
-def _columns() -> dict[str, Any]:
+def _columns() -> dict[str, str]:
     names = ("avoid_obstacles", "separation", "seek")
     return {
         "collisions": "obstacles run into, per agent",

@@ -13,9 +13,8 @@ import numpy as np
 from flockenv.arbitration import Allocation, Blend
 from flockenv.behaviours import AvoidObstacles, FollowWay, ForceField, Seek, Whiskers
 from flockenv.config import load_scene
-from flockenv.experiments.base import Experiment, Trial
+from flockenv.experiments.base import Experiment, Trial, depth
 from flockenv.scene import Scene
-from flockenv.state import Floats, State
 from flockenv.steer import Steer
 
 __all__ = ["CASES", "EXPERIMENT", "VARIANTS", "scene_of"]
@@ -23,6 +22,11 @@ __all__ = ["CASES", "EXPERIMENT", "VARIANTS", "scene_of"]
 WORLDS, SEED, SECONDS = 16, 0, 20.0
 SPEED, ARRIVED = 2.0, 0.4
 """m/s, the top speed; m from the target, where an agent has arrived."""
+
+CORRIDOR = """
+- {kind: polygon, vertices: [[3, 0.6], [9, 0.6], [9, 3], [3, 3]]}
+- {kind: polygon, vertices: [[3, -0.6], [9, -0.6], [9, -3], [3, -3]]}
+"""
 
 CASES: dict[str, tuple[str, tuple[float, float], str, str]] = {
     "dead ahead": (
@@ -37,9 +41,7 @@ CASES: dict[str, tuple[str, tuple[float, float], str, str]] = {
         "[{kind: polygon, vertices: [[-3, -0.6], [-3, -2], [15, -2], [15, -0.6]]}]",
     ),
     "corridor": (
-        "through a corridor 1.2 m wide", (12, 0), "{low: [0, -0.8], high: [0, 0.8]}",
-        ("[{kind: polygon, vertices: [[3, 0.6], [9, 0.6], [9, 3], [3, 3]]}, "
-         "{kind: polygon, vertices: [[3, -0.6], [9, -0.6], [9, -3], [3, -3]]}]"),
+        "through a corridor 1.2 m wide", (12, 0), "{low: [0, -0.8], high: [0, 0.8]}", CORRIDOR,
     ),
     "corner": (
         "a target behind the inside of a corner", (9, 5), "{low: [0, -0.6], high: [0, 0.6]}",
@@ -77,13 +79,13 @@ def _trial(case: str, variant: str) -> Trial:
     """Run one case under one variant, in so many worlds, until everybody is there or time is over."""
     scene, target = scene_of(case, variant), np.array(CASES[case][1])
     state = scene.start(SEED, worlds=WORLDS)
-    begin, path, depth, speed = state.pos[:, 0].copy(), [state.pos[:, 0].copy()], [_depth(scene, state)], []
+    begin, path, deep, speed = state.pos[:, 0].copy(), [state.pos[:, 0].copy()], [depth(scene, state)[:, 0]], []
     for _ in range(round(SECONDS / scene.dt)):
         state = scene.step(state)
         path.append(state.pos[:, 0].copy())
         speed.append(np.linalg.norm(state.vel[:, 0], axis=1))
-        depth.append(_depth(scene, state))
-    way, deep, fast = np.array(path), np.array(depth), np.array(speed)
+        deep.append(depth(scene, state)[:, 0])
+    way, within, fast = np.array(path), np.array(deep), np.array(speed)
     near = np.linalg.norm(way - target, axis=-1) < ARRIVED
     there = near.any(axis=0)
     last = np.where(there, near.argmax(axis=0), len(way) - 1)  # (B,) steps until then
@@ -91,7 +93,7 @@ def _trial(case: str, variant: str) -> Trial:
     moved = np.linalg.norm(np.diff(way, axis=0), axis=-1)
     length = (moved * until[1:]).sum(axis=0)
     straight = np.linalg.norm(target - begin, axis=1) - ARRIVED
-    inside = (deep > 0) & until
+    inside = (within > 0) & until
     lost = 1 - (fast * until[1:]).sum(axis=0) / (SPEED * last)
     numbers = {
         "arrived": float(there.mean()),
@@ -99,15 +101,9 @@ def _trial(case: str, variant: str) -> Trial:
         "path": float((length / straight)[there].mean()) if there.any() else np.nan,
         "speed lost": float(lost.mean()),
         "collisions": float((inside[0] + (inside[1:] & ~inside[:-1]).sum(axis=0)).mean()),
-        "deepest": float(max(0.0, (deep * until).max())),
+        "deepest": float(max(0.0, (within * until).max())),
     }
     return Trial(numbers, scene, way[: int(last.max()) + 1, :1])
-
-
-def _depth(scene: Scene, state: State) -> Floats:
-    """Return how deep each world's agent is in an obstacle, (B,) m; negative outside of all."""
-    gap = np.min([shape.gap(state.pos[:, 0]) for shape in scene.obstacles], axis=0)
-    return np.asarray(float(scene.body.radius[0]) - gap)
 
 
 EXPERIMENT = Experiment(

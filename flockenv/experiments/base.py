@@ -8,14 +8,15 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
+import numpy as np
 from pydantic import Field
 
 from flockenv.kernels import laws_digest
 from flockenv.records import Record
 from flockenv.scene import Scene
-from flockenv.state import Floats
+from flockenv.state import Floats, State
 
-__all__ = ["Cell", "Experiment", "Results", "Trial", "run"]
+__all__ = ["Cell", "Experiment", "Results", "Trial", "depth", "run"]
 
 
 class Trial(NamedTuple):
@@ -67,6 +68,12 @@ class Results(Record):
             [cell.case, cell.variant, *("-" if x is None else f"{x:.3g}" for x in cell.numbers.values())]
             for cell in self.cells
         ]
+
+
+def depth(scene: Scene, state: State) -> Floats:
+    """Return how deep everybody is in an obstacle, (B, N) m; negative outside of all."""
+    gap = np.min([shape.gap(state.pos) for shape in scene.obstacles], axis=0)
+    return np.asarray(scene.body.radius - gap)
 
 
 def run(

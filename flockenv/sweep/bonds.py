@@ -40,7 +40,8 @@ def pack(parts: Parts, agents: int, groups: Sequence[object]) -> Table:
         try:
             found = effect.bonds(groups, d)
         except ValueError as error:
-            raise ValueError(f"effects[{k}].{error}") from None
+            listed = k - sum(wish < k for wish in parts.wishes)  # those lie before the effect that reconciles them
+            raise ValueError(f"effects[{listed}].{error}") from None
         start, place, number = _packed(found, agents, blocks, w, d)
         starts.append(start)
         bases += [first_place, first_number]

@@ -1,9 +1,11 @@
 """Task: what is seen, what is paid, when it ends; functions of frames, over a scene that knows nothing of them.
 
-A task is one file: a frozen record whose fields are the keyword arguments of `make`, and six kernels over one world:
+A task is one file: a frozen record whose fields are the keyword arguments of `make`, and six kernels, or seven, over
+one world:
 
 * `spawn(p, frame)` writes the first positions, velocities, obstacles and memory from the world's key;
 * `drive(p, frame, action, force)` turns actions (L, A) into forces asked for (D, N) N, of scripted agents too;
+* `keep(p, before, after)`, of a task that `keeps` alone, writes into the memory what the others read of this step;
 * `reward(p, before, after, action, terms)` writes the named terms (L, K) and nothing else, as a test checks;
 * `ended(p, before, after, over) -> success` writes which learners are over (L,), may take agents out of `after.alive`,
   and says whether the aim is reached;
@@ -77,6 +79,8 @@ class Task(Record):
     """Names of the numbers that `measure` writes each step."""
     memory: ClassVar[int] = 0
     """Numbers kept per agent between steps."""
+    keeps: ClassVar[bool] = False
+    """Has it a kernel `keep`?"""
 
     control_dt: float = Field(default=0.1, gt=0, description="s, one decision; a whole multiple of dt")
     dt: float = Field(default=0.05, gt=0, description="s, one physics step")
@@ -216,7 +220,7 @@ def task_source(task: Task) -> str:
 
 from flockenv.tasks.base import Frame
 from flockenv.vehicle import face
-from {type(task).__module__} import {", ".join(_KERNELS)}
+from {type(task).__module__} import {", ".join([*_KERNELS, *["keep"] * task.keeps])}
 
 P = namedtuple("P", {" ".join(names)!r})
 
@@ -280,6 +284,7 @@ def play(
         now = {now}
         if acting:
             before = {then}
+            {"keep(p, before, now)" if task.keeps else "pass"}
             reward(p, before, now, action, terms[b])
             success[b] = ended(p, before, now, over[b])
             measure(p, before, now, measured[b])

@@ -21,7 +21,7 @@ from flockenv.state import State
 from flockenv.sweep import Look
 from flockenv.tasks.base import Frame, Measured, Task
 from flockenv.tasks.layout import Layout, Slot
-from flockenv.tasks.sight import clip, put
+from flockenv.tasks.sight import put, turned
 
 __all__ = ["Crossing"]
 
@@ -68,7 +68,7 @@ def _walker(p: Any, frame: Frame, i: int, force: Any) -> None:
         j, square = _next_nearest(p, frame, i, last, last_square)
         if j < 0:
             break
-        at, last, last_square = 6 * found, j, square
+        at, last, last_square = orca.SLOT * found, j, square
         for k in range(2):
             given[at + k] = frame.pos[k, j] - frame.pos[k, i]
             given[at + 2 + k] = frame.vel[k, j]
@@ -173,24 +173,17 @@ def observe(p: Any, frame: Frame, rows: Any) -> None:
     slots, one = int(p.neighbours), like(p.sight, 1.0)
     for i in range(rows.shape[0]):
         row, course = rows[i], (frame.memory[2, i], frame.memory[3, i])
-        put(row, 0, _turned((frame.vel[0, i], frame.vel[1, i]), course, one / p.max_speed))
-        put(row, 2, _turned(_to_goal(frame, i), course, one / (3.0 * p.circle)))
+        put(row, 0, turned((frame.vel[0, i], frame.vel[1, i]), course, one / p.max_speed))
+        put(row, 2, turned(_to_goal(frame, i), course, one / (3.0 * p.circle)))
         for c in range(4, rows.shape[1]):
             row[np.uint64(c)] = 0.0
         for s in range(frame.near_count[i]):
             j = np.uint64(frame.near_who[s, i])
             to = (frame.pos[0, j] - frame.pos[0, i], frame.pos[1, j] - frame.pos[1, i])
             relative = (frame.vel[0, j] - frame.vel[0, i], frame.vel[1, j] - frame.vel[1, i])
-            put(row, 4 + 2 * s, _turned(to, course, one / p.sight))
-            put(row, 4 + 2 * slots + 2 * s, _turned(relative, course, 0.5 * one / p.max_speed))
+            put(row, 4 + 2 * s, turned(to, course, one / p.sight))
+            put(row, 4 + 2 * slots + 2 * s, turned(relative, course, 0.5 * one / p.max_speed))
             row[np.uint64(4 + 4 * slots + s)] = 1.0
-
-
-@kernel
-def _turned(vector: Any, course: Any, factor: float) -> Any:
-    """Return a vector's parts along the course and to its left, scaled and clipped."""
-    along, left = vector[0] * course[0] + vector[1] * course[1], vector[1] * course[0] - vector[0] * course[1]
-    return clip(along * factor), clip(left * factor)
 
 
 class Crossing(Task):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import math
 from typing import Any, ClassVar
 
 import numpy as np
@@ -20,7 +19,7 @@ from flockenv.space import Box
 from flockenv.sweep import Look
 from flockenv.tasks.base import Frame, Measured, Task
 from flockenv.tasks.layout import Layout, Slot
-from flockenv.tasks.sight import block_ways, clip, compass
+from flockenv.tasks.sight import block_ways, clip, compass, leaves_gap, velocity_of
 from flockenv.vec import add, norm, scale, unit
 
 __all__ = ["Evade"]
@@ -41,7 +40,7 @@ def spawn(p: Any, frame: Frame) -> None:
             edge = rho + p.min_gap
             x = edge + (p.size - 2.0 * edge) * uniform(frame.key, t, 100 + m, 1)
             y = edge + (p.size - 2.0 * edge) * uniform(frame.key, t, 100 + m, 2)
-            if _fits(p, frame, m, x, y, rho):
+            if leaves_gap(p, frame, m, x, y, rho):
                 frame.centre[0, m], frame.centre[1, m], frame.rho[m] = x, y, rho
                 break
     for i in range(frame.pos.shape[1]):
@@ -52,16 +51,6 @@ def spawn(p: Any, frame: Frame) -> None:
                 break
         frame.memory[:, i] = 0.0
         frame.memory[2, i] = p.patience  # it has seen nobody yet
-
-
-@kernel
-def _fits(p: Any, frame: Frame, m: int, x: float, y: float, rho: float) -> bool:
-    """Does cover here leave a gap to that before it?"""
-    for k in range(m):
-        distance = math.hypot(frame.centre[0, k] - x, frame.centre[1, k] - y)
-        if frame.rho[k] > 0.0 and distance < frame.rho[k] + rho + p.min_gap:
-            return False
-    return True
 
 
 @kernel
@@ -78,7 +67,7 @@ def _clear(p: Any, frame: Frame, i: int) -> bool:
 
 @kernel
 def _to(frame: Frame, i: int, j: int) -> Vec:
-    """Return the offset of agent j from agent i, m."""
+    """Return the offset of agent j from agent i, m; taken in the precision of the scene, in which policies learned."""
     return (np.float64(frame.pos[0, j] - frame.pos[0, i]), np.float64(frame.pos[1, j] - frame.pos[1, i]))
 
 
@@ -86,11 +75,6 @@ def _to(frame: Frame, i: int, j: int) -> Vec:
 def _to_cover(frame: Frame, i: int, m: int) -> Vec:
     """Return the offset of the centre of cover m from agent i, m."""
     return (np.float64(frame.centre[0, m] - frame.pos[0, i]), np.float64(frame.centre[1, m] - frame.pos[1, i]))
-
-
-@kernel
-def _velocity(frame: Frame, i: int) -> Vec:
-    return (np.float64(frame.vel[0, i]), np.float64(frame.vel[1, i]))
 
 
 @kernel
@@ -118,7 +102,7 @@ def drive(p: Any, frame: Frame, action: Any, force: Any) -> None:
 @kernel
 def _hunt(p: Any, frame: Frame, i: int, force: Any) -> None:
     """A scripted pursuer: around cover, off its mates, inside the field, after the evader; allocation in that order."""
-    velocity, top = _velocity(frame, i), np.float64(frame.max_speed[i])
+    velocity, top = velocity_of(frame, i), np.float64(frame.max_speed[i])
     margin = 0.5
     low = (frame.pos[0, i] - margin, frame.pos[1, i] - margin)
     high = (p.size - margin - frame.pos[0, i], p.size - margin - frame.pos[1, i])
@@ -140,7 +124,7 @@ def _after(p: Any, frame: Frame, i: int, velocity: Vec, top: float) -> Vec:
     Memory: the place where the evader was seen last, m, and how long ago that is, s.
     """
     if _sees(p, frame, i):
-        to, theirs = _to(frame, i, 0), _velocity(frame, 0)
+        to, theirs = _to(frame, i, 0), velocity_of(frame, 0)
         frame.memory[0, i], frame.memory[1, i], frame.memory[2, i] = frame.pos[0, 0], frame.pos[1, 0], 0.0
         return steering.pursue(to, velocity, theirs, top, min(steering.interception_time(to, theirs, top), 1.0))
     frame.memory[2, i] += p.control_dt

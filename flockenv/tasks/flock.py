@@ -20,7 +20,7 @@ from flockenv.state import State
 from flockenv.sweep import Look
 from flockenv.tasks.base import Frame, Measured, Task
 from flockenv.tasks.layout import Layout, Slot
-from flockenv.tasks.sight import block_ways, clip, compass, offset, put
+from flockenv.tasks.sight import block_ways, compass, offset, put, turned
 from flockenv.vec import norm, scale, sub, unit
 
 __all__ = ["Flock"]
@@ -262,7 +262,7 @@ def observe(p: Any, frame: Frame, rows: Any) -> None:
     for i in range(rows.shape[0]):
         row = rows[i]
         heading = (like(one, frame.memory[0, i]), like(one, frame.memory[1, i]))
-        put(row, 0, _turned((frame.vel[0, i], frame.vel[1, i]), heading, like(one, 2.0) * scales[1]))
+        put(row, 0, turned((frame.vel[0, i], frame.vel[1, i]), heading, like(one, 2.0) * scales[1]))
         for c in range(2, ways):
             row[np.uint64(c)] = 0.0
         for c in range(ways, rows.shape[1]):
@@ -273,7 +273,7 @@ def observe(p: Any, frame: Frame, rows: Any) -> None:
             m = np.uint64(frame.obstacle_who[s, i])
             dx = offset(frame.pos[0, i], frame.centre[0, m], p.size)
             dy = offset(frame.pos[1, i], frame.centre[1, m], p.size)
-            put(row, obstacles + 2 * s, _turned((dx, dy), heading, one / (p.sight + p.greatest_radius)))
+            put(row, obstacles + 2 * s, turned((dx, dy), heading, one / (p.sight + p.greatest_radius)))
             row[obstacles + 2 * seen + s] = frame.rho[m] / p.greatest_radius
             clearance = frame.rho[m] + frame.radius[i]
             block_ways(row, ways, int(p.rays), frame.table, (dx, dy), heading, clearance, p.sight)
@@ -284,22 +284,15 @@ def _show_neighbour(p: Any, frame: Frame, i: int, s: int, slots: int, heading: A
     """Write what agent i sees of its s-th nearest neighbour: offset, relative velocity, presence, crowding."""
     j = np.uint64(frame.near_who[s, i])
     to = (offset(frame.pos[0, i], frame.pos[0, j], p.size), offset(frame.pos[1, i], frame.pos[1, j], p.size))
-    put(row, 2 + 2 * s, _turned(to, heading, scales[0]))
+    put(row, 2 + 2 * s, turned(to, heading, scales[0]))
     relative = (frame.vel[0, j] - frame.vel[0, i], frame.vel[1, j] - frame.vel[1, i])
-    put(row, 2 + 2 * slots + 2 * s, _turned(relative, heading, scales[1]))
+    put(row, 2 + 2 * slots + 2 * s, turned(relative, heading, scales[1]))
     row[np.uint64(2 + 4 * slots + s)] = 1.0
     o, one = like(scales[0], 0.0), like(scales[0], 1.0)
     distance = np.sqrt(frame.near_square[s, i])
     closeness = one - distance * scales[2]
     crowded = (closeness > o) & (distance > o)
-    put(row, 2 + 5 * slots + 2 * s, _turned(to, heading, closeness / distance if crowded else o))
-
-
-@kernel
-def _turned(vector: Any, heading: Any, factor: float) -> Any:
-    """Return a vector's parts along the heading and to its left, scaled and clipped."""
-    along, left = vector[0] * heading[0] + vector[1] * heading[1], vector[1] * heading[0] - vector[0] * heading[1]
-    return clip(along * factor), clip(left * factor)
+    put(row, 2 + 5 * slots + 2 * s, turned(to, heading, closeness / distance if crowded else o))
 
 
 class Flock(Task):

@@ -20,7 +20,7 @@ from flockenv.spawn import Spawn
 from flockenv.state import State
 from flockenv.tasks.base import Frame, Measured, Task
 from flockenv.tasks.layout import Layout, Slot
-from flockenv.tasks.sight import clip
+from flockenv.tasks.sight import clip, place_of, velocity_of
 from flockenv.vec import add, norm, scale, sub, unit
 
 __all__ = ["Herd"]
@@ -74,17 +74,7 @@ def _clear(frame: Frame, i: int, first: int, end: int, distance: float) -> bool:
 @kernel
 def _to(frame: Frame, i: int, j: int) -> Vec:
     """Return the offset of agent j from agent i, m."""
-    return sub(_place(frame, j), _place(frame, i))
-
-
-@kernel
-def _place(frame: Frame, i: int) -> Vec:
-    return (np.float64(frame.pos[0, i]), np.float64(frame.pos[1, i]))
-
-
-@kernel
-def _velocity(frame: Frame, i: int) -> Vec:
-    return (np.float64(frame.vel[0, i]), np.float64(frame.vel[1, i]))
+    return sub(place_of(frame, j), place_of(frame, i))
 
 
 @kernel
@@ -124,7 +114,7 @@ def drive(p: Any, frame: Frame, action: Any, force: Any) -> None:
 @kernel
 def _sheep(p: Any, frame: Frame, i: int, force: Any) -> None:
     """Heed dogs within `fear_distance` as in Strombom et al. 2014; graze otherwise, slowly, and not too near others."""
-    velocity, dogs = _velocity(frame, i), int(p.dogs)
+    velocity, dogs = velocity_of(frame, i), int(p.dogs)
     crowd: Vec = (0.0, 0.0)
     centre: Vec = (0.0, 0.0)
     away: Vec = (0.0, 0.0)
@@ -157,7 +147,7 @@ def _farthest(p: Any, frame: Frame, centre: Vec) -> tuple[int, float]:
     """Return the sheep that is farthest from the centre, and the mean distance of all of them, m."""
     who, most, total, dogs, n = 0, -1.0, 0.0, int(p.dogs), frame.pos.shape[1]
     for j in range(dogs, n):
-        distance = norm(sub(_place(frame, j), centre))
+        distance = norm(sub(place_of(frame, j), centre))
         total += distance
         if distance > most:
             who, most = j, distance
@@ -169,7 +159,7 @@ def _penned(p: Any, frame: Frame) -> int:
     """Return how many sheep are in the pen."""
     count, pen = 0, _pen(frame)
     for j in range(int(p.dogs), frame.pos.shape[1]):
-        count += 1 if norm(sub(_place(frame, j), pen)) <= p.pen_radius else 0
+        count += 1 if norm(sub(place_of(frame, j), pen)) <= p.pen_radius else 0
     return count
 
 
@@ -211,7 +201,7 @@ def measure(p: Any, before: Frame, after: Frame, numbers: Any) -> None:
     _, numbers[2] = _farthest(p, after, _centre(p, after))
     path = 0.0
     for i in range(dogs):
-        path += norm(sub(_place(after, i), _place(before, i)))
+        path += norm(sub(place_of(after, i), place_of(before, i)))
     numbers[3] = path / dogs
 
 
@@ -223,15 +213,15 @@ def observe(p: Any, frame: Frame, rows: Any) -> None:
     slots, dogs = int(p.sheep_seen), int(p.dogs)
     for i in range(rows.shape[0]):
         row = rows[i]
-        here = _place(frame, i)
-        _put(row, 0, scale(_velocity(frame, i), 1.0 / p.dog_speed), course)
+        here = place_of(frame, i)
+        _put(row, 0, scale(velocity_of(frame, i), 1.0 / p.dog_speed), course)
         _put(row, 2, scale(sub(pen, here), 1.0 / p.sight), course)
         to_centre = sub(centre, here)
         _put(row, 4, scale(to_centre, 1.0 / p.sight), course)
         _put(row, 6, unit(to_centre), course)
         _put(row, 8, scale(_to(frame, i, far), 1.0 / p.sight), course)
         row[10] = min(spread / p.spread_scale, 1.0)
-        row[11] = min(norm(sub(_place(frame, far), centre)) / p.spread_scale, 1.0)
+        row[11] = min(norm(sub(place_of(frame, far), centre)) / p.spread_scale, 1.0)
         for c in range(12, rows.shape[1]):
             row[c] = 0.0
         _show_sheep(p, frame, i, slots, course, row)
@@ -258,7 +248,7 @@ def _show_sheep(p: Any, frame: Frame, i: int, slots: int, course: Vec, row: Any)
             break
         to = _to(frame, i, who)
         _put(row, 12 + 2 * s, scale(to, 1.0 / p.sight), course)
-        _put(row, 12 + 2 * slots + 2 * s, scale(_velocity(frame, who), 1.0 / p.sheep_speed), course)
+        _put(row, 12 + 2 * slots + 2 * s, scale(velocity_of(frame, who), 1.0 / p.sheep_speed), course)
         row[12 + 4 * slots + s] = 1.0
         if s == 0:
             _put(row, 12 + 5 * slots, unit(to), course)

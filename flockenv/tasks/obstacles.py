@@ -19,7 +19,7 @@ from flockenv.state import State
 from flockenv.sweep import Look
 from flockenv.tasks.base import Frame, Measured, Task
 from flockenv.tasks.layout import Layout, Slot
-from flockenv.tasks.sight import block_ways, clip, compass
+from flockenv.tasks.sight import block_ways, clip, compass, leaves_gap
 
 __all__ = ["Obstacles"]
 
@@ -39,19 +39,9 @@ def spawn(p: Any, frame: Frame) -> None:
             rho = p.least_radius + (p.greatest_radius - p.least_radius) * uniform(frame.key, t, 100 + m, 0)
             x = 4.0 + (p.size - 8.0) * uniform(frame.key, t, 100 + m, 1)
             y = p.size * uniform(frame.key, t, 100 + m, 2)
-            if _fits(p, frame, m, x, y, rho):
+            if leaves_gap(p, frame, m, x, y, rho):
                 frame.centre[0, m], frame.centre[1, m], frame.rho[m] = x, y, rho
                 break
-
-
-@kernel
-def _fits(p: Any, frame: Frame, m: int, x: float, y: float, rho: float) -> bool:
-    """Does an obstacle here leave a gap to those before it?"""
-    for k in range(m):
-        distance = math.hypot(frame.centre[0, k] - x, frame.centre[1, k] - y)
-        if frame.rho[k] > 0.0 and distance < frame.rho[k] + rho + p.min_gap:
-            return False
-    return True
 
 
 @kernel

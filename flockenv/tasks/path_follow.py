@@ -34,6 +34,8 @@ WINDOW = 16
 
 # what is kept of a world: x and y of every corner, how far along the track it is, the whole length, what was gained
 _Y, _S, _LENGTH, _GAINED, _TURN = POINTS, 2 * POINTS, 3 * POINTS, 3 * POINTS + 1, 3 * POINTS + 2
+# where one is, x and y, and the place there: which piece, and how far along it; and the place before this step
+_HERE, _NOW, _THEN = 3 * POINTS + 3, 3 * POINTS + 5, 3 * POINTS + 7
 
 
 @kernel
@@ -58,6 +60,7 @@ def spawn(p: Any, frame: Frame) -> None:
     begin = int(POINTS * uniform(frame.key, 0, 3, 0))
     frame.pos[0, 0], frame.pos[1, 0] = _corner(frame, begin)
     frame.vel[:, 0] = 0.0
+    _remember(p, frame)
 
 
 @kernel
@@ -66,56 +69,109 @@ def _corner(frame: Frame, i: int) -> Vec:
 
 
 @kernel
-def _nearest(p: Any, frame: Frame) -> tuple[int, float, float, Vec]:
-    """Return the piece whose point is nearest, how far along it is, m, how far to the left of it one is, and its way.
+def _line(frame: Frame, i: int) -> tuple[Vec, Vec, float]:
+    """Return where piece i begins, the way from there to its end, and its length, m."""
+    a = _corner(frame, i)
+    u = sub(_corner(frame, i + 1), a)
+    return a, u, norm(u)
+
+
+@kernel
+def _piece(frame: Frame, i: int) -> tuple[Vec, Vec, float]:
+    """Return where piece i begins, its direction, and its length, m."""
+    a, u, size = _line(frame, i)
+    return a, (u[0] / size, u[1] / size), size
+
+
+@kernel
+def _way(frame: Frame, i: int) -> Vec:
+    _, u, _ = _piece(frame, i)
+    return (np.float64(u[0]), np.float64(u[1]))
+
+
+@kernel
+def _nearest(p: Any, frame: Frame) -> tuple[int, float]:
+    """Return the piece whose point is nearest, and how far along it that is, m.
 
     Only pieces at about one's own angle are asked: a track that comes near another part of itself is not confused.
     """
     x, y = frame.pos[0, 0], frame.pos[1, 0]
     angle = math.atan2(frame.memory[_TURN, 0] * (y - p.middle), x - p.middle) / (2.0 * math.pi)
     here = math.floor(angle * POINTS) + POINTS
-    best, piece, along, left, way = np.inf, 0, 0.0, 0.0, (1.0, 0.0)
+    best, piece, along = np.inf, 0, 0.0
     for k in range(-WINDOW, WINDOW + 1):
         i = (here + k) % POINTS
-        a = _corner(frame, i)
-        u = sub(_corner(frame, i + 1), a)
-        size = norm(u)
-        u = (u[0] / size, u[1] / size)
+        a, u, size = _piece(frame, i)
         to = (x - a[0], y - a[1])
         s = min(max(dot(to, u), 0.0), size)
         off = (to[0] - s * u[0], to[1] - s * u[1])
         square = dot(off, off)
         if square < best:
-            side = u[0] * to[1] - u[1] * to[0]
-            best, piece, along, way = square, i, s, u
-            left = math.sqrt(square) if side > 0.0 else -math.sqrt(square)
-    return piece, along, left, way
+            best, piece, along = square, i, s
+    return piece, along
 
 
 @kernel
-def _gain(p: Any, before: Frame, after: Frame) -> float:
-    """How far one came along the track, m."""
-    i, a, _, _ = _nearest(p, before)
-    j, b, _, _ = _nearest(p, after)
-    gained = after.memory[_S + j, 0] + b - after.memory[_S + i, 0] - a
-    length = after.memory[_LENGTH, 0]
+def _remember(p: Any, frame: Frame) -> None:
+    """Keep where one is, and the place on the track there."""
+    i, s = _nearest(p, frame)
+    m = frame.memory
+    m[_HERE, 0], m[_HERE + 1, 0], m[_NOW, 0], m[_NOW + 1, 0] = frame.pos[0, 0], frame.pos[1, 0], i, s
+
+
+@kernel
+def _place(p: Any, frame: Frame) -> tuple[int, float]:
+    """Return what `_nearest` does: what is kept, unless somebody has put the runner elsewhere since."""
+    m = frame.memory
+    if frame.pos[0, 0] == m[_HERE, 0] and frame.pos[1, 0] == m[_HERE + 1, 0]:
+        return int(m[_NOW, 0]), np.float64(m[_NOW + 1, 0])
+    return _nearest(p, frame)
+
+
+@kernel
+def _left(p: Any, frame: Frame) -> float:
+    """Return how far to the left of the track one is, m."""
+    i, s = _place(p, frame)
+    a, u, _ = _piece(frame, i)
+    to = (frame.pos[0, 0] - a[0], frame.pos[1, 0] - a[1])
+    off = (to[0] - s * u[0], to[1] - s * u[1])
+    away = math.sqrt(dot(off, off))
+    return away if u[0] * to[1] - u[1] * to[0] > 0.0 else -away
+
+
+@kernel
+def _gain(after: Frame) -> float:
+    """How far one came along the track in this step, m."""
+    m = after.memory
+    i, a = int(m[_THEN, 0]), np.float64(m[_THEN + 1, 0])
+    j, b = int(m[_NOW, 0]), np.float64(m[_NOW + 1, 0])
+    gained, length = m[_S + j, 0] + b - m[_S + i, 0] - a, m[_LENGTH, 0]
     return gained - length * math.floor(gained / length + 0.5)  # type: ignore[no-any-return]
 
 
 @kernel
 def drive(p: Any, frame: Frame, action: Any, force: Any) -> None:
     """The learner pushes along the track and to its left, as it is where it is."""
-    _, _, _, way = _nearest(p, frame)
-    f = frame.max_force[0]
+    i, _ = _place(p, frame)
+    way, f = _way(frame, i), frame.max_force[0]
     force[0, 0] = f * (action[0, 0] * way[0] - action[0, 1] * way[1])
     force[1, 0] = f * (action[0, 0] * way[1] + action[0, 1] * way[0])
 
 
 @kernel
+def keep(p: Any, before: Frame, after: Frame) -> None:
+    """The place on the track before and after the step, the only search for it; what was gained since the start."""
+    i, s = _place(p, before)
+    after.memory[_THEN, 0], after.memory[_THEN + 1, 0] = i, s
+    _remember(p, after)
+    after.memory[_GAINED, 0] += _gain(after)
+
+
+@kernel
 def reward(p: Any, before: Frame, after: Frame, action: Any, terms: Any) -> None:
     """Terms: progress, off_track, lost."""
-    _, _, left, _ = _nearest(p, after)
-    terms[0, 0] = p.progress_reward * _gain(p, before, after)
+    left = _left(p, after)
+    terms[0, 0] = p.progress_reward * _gain(after)
     terms[0, 1] = -p.off_cost * p.control_dt if abs(left) > p.half_width else 0.0
     terms[0, 2] = -p.lost_cost if abs(left) > p.lost_distance else 0.0
 
@@ -123,25 +179,23 @@ def reward(p: Any, before: Frame, after: Frame, action: Any, terms: Any) -> None
 @kernel
 def ended(p: Any, before: Frame, after: Frame, over: Any) -> bool:
     """Who is lost is out; a whole lap, without that, is success."""
-    _, _, left, _ = _nearest(p, after)
-    after.memory[_GAINED, 0] += _gain(p, before, after)
-    over[0] = abs(left) > p.lost_distance
+    over[0] = abs(_left(p, after)) > p.lost_distance
     return not over[0] and after.memory[_GAINED, 0] >= after.memory[_LENGTH, 0]
 
 
 @kernel
 def measure(p: Any, before: Frame, after: Frame, numbers: Any) -> None:
     """Progress, m; off the track; path, m."""
-    _, _, left, _ = _nearest(p, after)
-    numbers[0] = _gain(p, before, after)
-    numbers[1] = 1.0 if abs(left) > p.half_width else 0.0
+    numbers[0] = _gain(after)
+    numbers[1] = 1.0 if abs(_left(p, after)) > p.half_width else 0.0
     numbers[2] = math.hypot(after.pos[0, 0] - before.pos[0, 0], after.pos[1, 0] - before.pos[1, 0])
 
 
 @kernel
 def observe(p: Any, frame: Frame, rows: Any) -> None:
     """All in the frame of the track here: own velocity, how far to the left, the spine ahead and how it bends."""
-    i, along, left, way = _nearest(p, frame)
+    i, along = _place(p, frame)
+    left, way = _left(p, frame), _way(frame, i)
     row, count = rows[0], int(p.ahead)
     vx, vy = frame.vel[0, 0], frame.vel[1, 0]
     row[0] = clip((vx * way[0] + vy * way[1]) / p.max_speed)
@@ -150,17 +204,13 @@ def observe(p: Any, frame: Frame, rows: Any) -> None:
     scale = p.spacing * p.ahead + p.lost_distance
     for k in range(count):
         along += p.spacing
-        a = _corner(frame, i)
-        u = sub(_corner(frame, i + 1), a)
-        size = norm(u)
+        a, u, size = _line(frame, i)
         for _ in range(POINTS):
             if along <= size:
                 break
             along -= size
             i += 1
-            a = _corner(frame, i)
-            u = sub(_corner(frame, i + 1), a)
-            size = norm(u)
+            a, u, size = _line(frame, i)
         to = (a[0] + along / size * u[0] - frame.pos[0, 0], a[1] + along / size * u[1] - frame.pos[1, 0])
         row[3 + 2 * k] = clip((to[0] * way[0] + to[1] * way[1]) / scale)
         row[4 + 2 * k] = clip((to[1] * way[0] - to[0] * way[1]) / scale)
@@ -192,7 +242,8 @@ class PathFollow(Task):
     terms: ClassVar[tuple[str, ...]] = ("progress", "off_track", "lost")
     metric_names: ClassVar[tuple[str, ...]] = ("progress", "off_track", "mean_speed")
     measures: ClassVar[tuple[str, ...]] = ("gained", "off", "path")
-    memory: ClassVar[int] = 3 * POINTS + 3
+    memory: ClassVar[int] = 3 * POINTS + 9
+    keeps: ClassVar[bool] = True
 
     horizon: int = Field(default=300, ge=1, description="decisions until the time limit (truncation)")
     ring: float = Field(default=12.0, ge=5, le=50, description="m, mean radius of the track")

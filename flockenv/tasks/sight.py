@@ -1,4 +1,4 @@
-"""What several tasks write into their observation rows."""
+"""What several tasks share: what they write into observation rows, and what they ask of a frame."""
 
 from __future__ import annotations
 
@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from flockenv.kernels import kernel, like
+from flockenv.kernels import Vec, kernel, like
 from flockenv.shapes import ray_hit
 
-__all__ = ["block_ways", "clip", "compass", "offset", "put"]
+__all__ = ["block_ways", "clip", "compass", "leaves_gap", "offset", "place_of", "put", "turned", "velocity_of"]
 
 
 @kernel
@@ -26,6 +26,35 @@ def offset(a: float, b: float, size: float) -> float:
     o, one, half = like(d, 0.0), like(d, 1.0), like(d, 0.5)
     around = one / like(d, size) if size > o else o  # the same for all pairs: the division leaves the loop
     return d - like(d, size) * np.floor(d * around + half)  # type: ignore[no-any-return]  # numpy's floor of a float is one
+
+
+@kernel
+def turned(vector: Any, heading: Any, factor: float) -> Any:
+    """Return a vector's parts along the heading and to its left, scaled and clipped."""
+    along, left = vector[0] * heading[0] + vector[1] * heading[1], vector[1] * heading[0] - vector[0] * heading[1]
+    return clip(along * factor), clip(left * factor)
+
+
+@kernel
+def place_of(frame: Any, i: int) -> Vec:
+    """Return where agent i is, m."""
+    return (np.float64(frame.pos[0, i]), np.float64(frame.pos[1, i]))
+
+
+@kernel
+def velocity_of(frame: Any, i: int) -> Vec:
+    """Return the velocity of agent i, m/s."""
+    return (np.float64(frame.vel[0, i]), np.float64(frame.vel[1, i]))
+
+
+@kernel
+def leaves_gap(p: Any, frame: Any, m: int, x: float, y: float, rho: float) -> bool:
+    """Does obstacle m, a circle of radius rho here, leave a gap of `min_gap` to those before it?"""
+    for k in range(m):
+        distance = math.hypot(frame.centre[0, k] - x, frame.centre[1, k] - y)
+        if frame.rho[k] > 0.0 and distance < frame.rho[k] + rho + p.min_gap:
+            return False
+    return True
 
 
 @kernel
