@@ -167,8 +167,9 @@ def suggest_dt(scene: Scene) -> Suggestion:
     """Return the largest stable step of a scene, from its effects' own stiffness, and the effect that sets it.
 
     Stiffness is a bound (Gershgorin's circles for springs), so the limit is on the safe side; what is only stiff in
-    some states (agents that touch more than one other) is not in it. Damping is a bound too: a method that needs damping to be stable
-    (explicit Euler, Heun, midpoint) may find motions that are damped less, springs across their length for one.
+    some states (agents that touch more than one other) is not in it. Damping is a bound too: a method that needs
+    damping to be stable (explicit Euler, Heun, midpoint) may find motions that are damped less, springs across their
+    length for one.
     Source: numerics.md 2.2 P02, 3.1, 3.3.
     """
     found = _found(scene)

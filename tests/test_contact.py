@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 import warnings
 from typing import Any
@@ -10,7 +11,7 @@ import numpy as np
 import pytest
 from scipy.optimize import brentq
 
-from flockenv.effects import Contact, Drag, ObstacleContact
+from flockenv.effects import Contact, ObstacleContact
 from flockenv.effects.contact import restitution
 from flockenv.integrators import (
     RK4,
@@ -22,7 +23,7 @@ from flockenv.integrators import (
     SemiImplicitEuler,
 )
 from flockenv.scene import Group, Scene
-from flockenv.shapes import Block, HalfSpace
+from flockenv.shapes import Block
 from flockenv.spawn import Spawn
 from flockenv.stability import CoarseContactWarning, check_contact, contact_limit
 from flockenv.state import State
@@ -30,6 +31,8 @@ from tests.catalogue import Array
 
 STIFFNESS, MASS, SPEED = 50.0, 2.0, 1.5
 OMEGA = math.sqrt(STIFFNESS / MASS)
+FLOOR = Block(centre=(0.0, -30.0), size=(200.0, 20.0))
+"""Its top is at y = -20 m; it is in every scene here, which are one kernel."""
 
 
 def scene(damping: float = 0.0, at: float = 3.4, speed: float = SPEED) -> Scene:
@@ -37,8 +40,8 @@ def scene(damping: float = 0.0, at: float = 3.4, speed: float = SPEED) -> Scene:
     place = Spawn(low=(at, 0), high=(at, 0), speed=(speed, speed), heading=(1, 0))
     return Scene(
         groups=(Group(count=1, mass=MASS, radius=0.3, spawn=place),),
-        obstacles=({"centre": (5.0, 0.0), "radius": 1.0},),
-        effects=(ObstacleContact(stiffness=STIFFNESS, damping=damping),),
+        obstacles=({"centre": (5.0, 0.0), "radius": 1.0}, FLOOR),
+        effects=(Contact(stiffness=0.0, radius=0.6), ObstacleContact(stiffness=STIFFNESS, damping=damping)),
         integrator=RK4(),
         dt=0.001,
     )
@@ -81,7 +84,8 @@ def test_nobody_is_pushed_who_does_not_touch() -> None:
 
 def test_other_shapes_are_as_solid() -> None:
     """A block whose side is where the circle's nearest point was: head-on there is no difference."""
-    block = scene().model_copy(update={"obstacles": (Block(centre=(5.0, 0.0), size=(2.0, 6.0)),)})
+    away = {"centre": (5.0, 90.0), "radius": 1.0}
+    block = scene().model_copy(update={"obstacles": (away, Block(centre=(5.0, 0.0), size=(2.0, 6.0)))})
     steps = round(1000 * (0.2 + math.pi / 2 / OMEGA))
     assert block.run(block.start(0), steps).pos[0, 0, 0] == pytest.approx(3.7 + SPEED / OMEGA, abs=1e-5)
 
@@ -89,15 +93,15 @@ def test_other_shapes_are_as_solid() -> None:
 # --- pairs, and a floor: one kernel for all that follows ------------------------------------------------------------
 
 K, RADIUS = 400.0, 0.3  # N/m, m
-FLOOR = HalfSpace(point=(0.0, -20.0), direction=(0.0, 1.0))
 
 
 def bodies(masses: tuple[float, ...] = (2.0, 0.5), dt: float = 2e-4, **law: Any) -> Scene:
     """Return single bodies over a floor that touch each other, and it, by the same law."""
     groups = tuple(Group(count=1, mass=m, radius=RADIUS, spawn=Spawn(low=(0, 0), high=(1, 1))) for m in masses)
     given = {"stiffness": K} | law
-    effects = (Contact(radius=2 * RADIUS, **given), ObstacleContact(**given), Drag(rate=0.0))
-    return Scene(groups=groups, effects=effects, obstacles=(FLOOR,), integrator=SemiImplicitEuler(), dt=dt)
+    effects = (Contact(radius=2 * RADIUS, **given), ObstacleContact(**given))
+    around = ({"centre": (5.0, 90.0), "radius": 1.0}, FLOOR)
+    return Scene(groups=groups, effects=effects, obstacles=around, integrator=RK4(), dt=dt)
 
 
 def begun(of: Scene, pos: Any, vel: Any) -> State:
@@ -109,8 +113,10 @@ def energy(of: Scene, state: State) -> float:
 
 
 def forces(of: Scene, state: State) -> Array:
-    """Return what acts on everybody, (N, D) N: of semi-implicit Euler, what a step makes of the velocity."""
-    return np.asarray((of.step(state).vel[0] - state.vel[0]) / of.dt * of.body.mass[:, None])
+    """Return what acts on everybody, (N, D) N: what a very short step makes of the velocity."""
+    short = of.model_copy(update={"dt": 1e-8})
+    after = short.step(dataclasses.replace(state, dt=1e-8))
+    return np.asarray((after.vel[0] - state.vel[0]) * 1e8 * of.body.mass[:, None])
 
 
 def momentum(of: Scene, state: State) -> Array:
@@ -118,7 +124,9 @@ def momentum(of: Scene, state: State) -> Array:
 
 
 @pytest.mark.parametrize("adhesive", [False, True])
-@pytest.mark.parametrize(("ratio", "released", "kept"), [(0.05, 0.8588, 0.8545), (0.2, 0.5717, 0.5266), (0.5, 0.2984, 0.163)])
+@pytest.mark.parametrize(
+    ("ratio", "released", "kept"), [(0.05, 0.8588, 0.8545), (0.2, 0.5717, 0.5266), (0.5, 0.2984, 0.163)]
+)
 def test_a_damped_hit_gives_back_what_the_formula_says(
     ratio: float, released: float, kept: float, adhesive: bool
 ) -> None:
@@ -150,13 +158,13 @@ def test_overdamped_and_critical_contacts_have_a_formula_too() -> None:
     {"friction": 300.0}, {"friction": 3000.0, "coulomb": 0.4}, {"friction": 300.0, "ratio": 0.2, "most": 1.0},
 ])  # fmt: skip
 def test_friction_takes_slip_keeps_momentum_and_never_adds_energy(law: dict[str, Any]) -> None:
-    """An oblique hit of two, and one on the floor: with its sign turned round friction drives both (JuPedSim, Menge)."""
+    """An oblique hit of two, and one on the floor: with its sign turned round friction drives both (peers.md)."""
     pair = bodies(**law)
     start = begun(pair, [(0, 0), (0.62, 0.1)], [(1.0, 0.5), (-1.0, -2.0)])
     end = pair.run(start, 2000)
     np.testing.assert_allclose(momentum(pair, end), momentum(pair, start), atol=1e-12)
     assert energy(pair, end) < 0.999 * energy(pair, start)
-    frictionless = pair.with_effects(*(e.model_copy(update={"friction": 0.0}) for e in pair.effects[:2]), Drag(rate=0))
+    frictionless = pair.with_effects(*(e.model_copy(update={"friction": 0.0}) for e in pair.effects))
     smooth = frictionless.run(start, 2000)
     n = np.array([0.62, 0.1]) / math.hypot(0.62, 0.1)
     slips = [(s.vel[0, 1] - s.vel[0, 0]) @ (-n[1], n[0]) for s in (start, smooth, end)]
@@ -168,7 +176,7 @@ def test_friction_takes_slip_keeps_momentum_and_never_adds_energy(law: dict[str,
         state = pair.run(state, 10)
         depth = max(0.0, RADIUS - (float(state.pos[0, 0, 1]) + 20))
         now = energy(pair, state) + 0.5 * K * depth**2
-        assert now <= before * (1 + 2e-3)  # semi-implicit Euler's own
+        assert now <= before * (1 + 1e-9)
         assert 0 <= state.vel[0, 0, 0] <= slip
         slip = float(state.vel[0, 0, 0])
     assert slip < 1.95
@@ -181,7 +189,7 @@ def test_friction_below_coulomb_s_bound_is_helbing_s_and_above_it_mu_times_the_n
     for speed, friction in ((slow, 3e4 * depth * slow), (fast, mu * K * depth)):
         state = begun(floor, [(0, -20 + RADIUS - depth), (50, 0)], [(speed, 0), (0, 0)])
         force = forces(floor, state)[0]
-        np.testing.assert_allclose(force, [-friction, K * depth], rtol=1e-9)
+        np.testing.assert_allclose(force, [-friction, K * depth], rtol=1e-4)
 
 
 def test_two_who_touch_feel_helbing_s_contact() -> None:
@@ -193,7 +201,7 @@ def test_two_who_touch_feel_helbing_s_contact() -> None:
     n = d / np.linalg.norm(d)
     t, g = np.array([-n[1], n[0]]), 2 * RADIUS - np.linalg.norm(d)
     expected = K * g * n + 700.0 * g * ((vel[1] - vel[0]) @ t) * t
-    np.testing.assert_allclose(force, [expected, -expected], rtol=1e-9)
+    np.testing.assert_allclose(force, [expected, -expected], rtol=1e-4)
 
 
 @pytest.mark.parametrize("depth", [0.05, 0.2, 0.59, 0.6])
@@ -216,7 +224,7 @@ def test_whoever_begins_inside_another_leaves_no_faster_than_most(depth: float) 
     else:
         assert fastest > 0.8 * most
     if depth == 0.2:
-        wild = pair.with_effects(Contact(radius=0.6, stiffness=K), ObstacleContact(stiffness=K), Drag(rate=0))
+        wild = pair.with_effects(Contact(radius=0.6, stiffness=K), ObstacleContact(stiffness=K))
         end = wild.run(start, 2000)
         assert np.linalg.norm(end.vel[0, 1] - end.vel[0, 0]) == pytest.approx(omega * depth, rel=1e-2)
 
@@ -233,7 +241,8 @@ def warned(of: Scene) -> list[str]:
 
 
 @pytest.mark.parametrize(("method", "steps"), [
-    (SemiImplicitEuler(), 30), (RK4(), 30), (AveragedVelocity(), 50.5), (ExplicitEuler(), 101.1), (ImplicitEuler(), 101.2),
+    (SemiImplicitEuler(), 30), (RK4(), 30), (AveragedVelocity(), 50.5), (ExplicitEuler(), 101.1),
+    (ImplicitEuler(), 101.2),
 ])  # fmt: skip
 def test_a_contact_wants_thirty_steps_and_of_euler_a_hundred(method: Integrator, steps: float) -> None:
     """Explicit Euler: (1 + y^2)^(pi / 2y) = 1.05 (numerics.md P17)."""
@@ -250,8 +259,7 @@ def test_a_contact_of_too_few_steps_is_warned_of_and_the_limit_named() -> None:
     assert warned(silent) == []
     with pytest.warns(CoarseContactWarning, match=rf"effects\[0\].contact lasts .* dt is at most {most:.3g} s"):
         coarse = bodies(dt=1.01 * most)
-    # the wall is the one body's own affair, and so slower
-    assert len(warned(coarse)) == 1
+    assert len(warned(coarse)) == 1  # the lighter body's contact with a wall is slower than the pair's
     assert warned(bodies(dt=1.01 * most, ratio=0.3)) == []  # it is not there to bounce
     assert math.isinf(contact_limit(AdaptiveRK4()))
 

@@ -38,9 +38,28 @@ class Ties(NamedTuple):
     way: NDArray[np.float64]  # (R, D) from i to j when nothing is strained; 0 = nobody knows
 
 
+class Hold(NamedTuple):
+    """What a kernel is given of R rods: who, how, and scratch."""
+
+    weight: Any  # (N,) 1/kg; 0 of who is held in place
+    i: Any  # (R,)
+    j: Any  # (R,)
+    length: Any  # (R,) m
+    period: Any  # (D,) m, around a torus; 0 = it has none
+    per_dt: float  # 1/s
+    slack: bool
+    tolerance: float
+    most: int
+    rho: float  # see _slowness
+    pull: Any  # (R,) what each rod has done in these sweeps
+    way: Any  # (D,) m, from i to j now
+    along: Any  # (D,) the direction in which it acts, of any length
+    kept: Any  # (2, D, N) where everybody came by the method, and how fast
+
+
 @kernel
 def _to(x: Any, b: int, i: int, j: int, period: Any, way: Any) -> float:
-    """Write the way from agent i to agent j, the shortest around a torus; return its square."""
+    """Write the way from agent i to agent j, the shortest around a torus; return how long it is."""
     square = like(way[0], 0.0)
     for k in range(x.shape[0]):
         d = x[k, b, j] - x[k, b, i]
@@ -48,11 +67,11 @@ def _to(x: Any, b: int, i: int, j: int, period: Any, way: Any) -> float:
             d -= period[k] * np.floor(d / period[k] + like(d, 0.5))
         way[k] = d
         square += d * d
-    return square
+    return np.sqrt(square)  # type: ignore[no-any-return]
 
 
 @kernel
-def _along(a: Any, b: Any) -> float:
+def _sum(a: Any, b: Any) -> float:
     """Return a . b."""
     total = like(a[0], 0.0)
     for k in range(a.shape[0]):
@@ -61,19 +80,29 @@ def _along(a: Any, b: Any) -> float:
 
 
 @kernel
-def _push(x: Any, b: int, i: int, by: float, way: Any) -> None:
-    """Add by times way to agent i."""
+def _push(x: Any, b: int, rods: Any, r: int, by: float) -> None:
+    """Move both ends of a rod along it, each by its weight: x of one end grows as that of the other falls."""
+    i, j = rods.i[r], rods.j[r]
     for k in range(x.shape[0]):
-        x[k, b, i] += by * way[k]
+        x[k, b, i] += by * rods.weight[i] * rods.along[k]
+        x[k, b, j] -= by * rods.weight[j] * rods.along[k]
 
 
 @kernel
-def _grain(x: Any, b: int, i: int, j: int) -> float:
-    """Return some roundings of the largest coordinate of two agents: no length is known better."""
+def _allowed(x: Any, b: int, rods: Any, r: int) -> float:
+    """Return how far off a length may be, m: no length is known better than some roundings of the coordinates."""
     most = like(x[0, 0, 0], 0.0)
     for k in range(x.shape[0]):
-        most = max(most, max(abs(x[k, b, i]), abs(x[k, b, j])))
-    return most * like(most, 3e-15 if x.itemsize == 8 else 1.5e-6)
+        most = max(most, max(abs(x[k, b, rods.i[r]]), abs(x[k, b, rods.j[r]])))
+    grain = like(most, 3e-15 if x.itemsize == 8 else 1.5e-6)
+    return max(rods.tolerance * rods.length[r], most * grain)  # type: ignore[no-any-return]
+
+
+@kernel
+def _moves(alive: Any, b: int, rods: Any, r: int) -> bool:
+    """Are both ends alive, and can one of them move?"""
+    i, j = rods.i[r], rods.j[r]
+    return alive[b, i] and alive[b, j] and rods.weight[i] + rods.weight[j] > 0  # type: ignore[no-any-return]
 
 
 @kernel
@@ -87,141 +116,150 @@ def _sooner(over: float, rho: float, sweep: int) -> float:
 
 
 @kernel
-def _reach(
-    x0: Any, x: Any, v: Any, alive: Any, b: int, weight: Any, i_: Any, j_: Any, length: Any, pull: Any, way: Any,
-    was: Any, period: Any, per_dt: float, slack: bool, tolerance: float, most: int, rho: float, carry: bool,
-) -> tuple[int, float]:  # fmt: skip
-    """Move agents of world b until all lengths hold; with `carry`, as velocities that act along the old ways.
+def _aim(x0: Any, b: int, rods: Any, r: int, allowed: float, carry: bool) -> float:
+    """Return how long a rod shall be, and write along which way it acts: the one before the step, if it carries.
 
-    Gauss and Seidel's sweeps, over-relaxed. Carried, the aim is the length before the step where that was wrong: what
-    was wrong already is mended without it. Returns the worst rod, or -1, and by which share of its length.
+    What was wrong before the step stays so while velocities come to fit, and is mended without them.
     """
-    count, o = i_.shape[0], like(per_dt, 0.0)
-    for r in range(count):
-        pull[r] = o
-    bad, off, over = -1, o, like(o, 1.0)
-    for sweep in range(most):
-        bad, off = -1, o
-        for r in range(count):
-            i, j, aim = i_[r], j_[r], length[r]
-            w = weight[i] + weight[j]
-            if not (alive[b, i] and alive[b, j] and w > o):
-                continue
-            allowed = max(tolerance * length[r], _grain(x, b, i, j))
-            if carry:
-                before = np.sqrt(_to(x0, b, i, j, period, was))
-                if before > aim + allowed or (before < aim - allowed and not slack):
-                    aim = before
-            square = _to(x, b, i, j, period, way)
-            now = np.sqrt(square)
-            if slack and now <= aim and pull[r] <= o:
-                continue
-            wrong = abs(now - aim) / length[r]
-            if wrong > off:
-                off = wrong
-                if abs(now - aim) > like(o, 0.5) * allowed:
-                    bad = r
-            along = _along(way, was) if carry else o
-            if not (carry and along > like(o, 0.3) * now * np.sqrt(_along(was, was))):
-                for k in range(way.shape[0]):
-                    was[k] = way[k]  # it turned too far in one step, or was in one place: along the way it has now
-                along = square
-            if not along > o:
-                was[0], along = length[r], length[r] * length[r]  # both are in one place
-            by = over * (square - aim * aim) / (like(o, 2.0) * w * along)
-            if slack:
-                by = max(by, -pull[r])
-            pull[r] += by
-            _push(x, b, i, by * weight[i], was)
-            _push(x, b, j, -by * weight[j], was)
-            if carry:
-                _push(v, b, i, by * weight[i] * per_dt, was)
-                _push(v, b, j, -by * weight[j] * per_dt, was)
-        if bad < 0:
-            break
-        over = _sooner(over, rho, sweep)
-    return bad, off
+    aim = rods.length[r]
+    if carry:
+        before = _to(x0, b, rods.i[r], rods.j[r], rods.period, rods.along)
+        if before > aim + allowed or (before < aim - allowed and not rods.slack):
+            aim = before
+    return aim  # type: ignore[no-any-return]
 
 
 @kernel
-def _still(
-    x: Any, v: Any, alive: Any, b: int, weight: Any, i_: Any, j_: Any, length: Any, pull: Any, way: Any, period: Any,
-    per_dt: float, slack: bool, tolerance: float, most: int, rho: float,
-) -> tuple[int, float]:  # fmt: skip
-    """Take the velocities along rods from the agents of world b, and those that would stretch taut ropes."""
-    count, o = i_.shape[0], like(per_dt, 0.0)
-    for r in range(count):
-        pull[r] = o
-    bad, off, over = -1, o, like(o, 1.0)
-    for sweep in range(most):
-        bad, off = -1, o
-        for r in range(count):
-            i, j = i_[r], j_[r]
-            w = weight[i] + weight[j]
-            if not (alive[b, i] and alive[b, j] and w > o):
-                continue
-            allowed = max(tolerance * length[r], _grain(x, b, i, j))
-            square = _to(x, b, i, j, period, way)
-            now = np.sqrt(square)
-            if not square > o or (slack and now < length[r] - like(o, 2.0) * allowed):
-                continue
-            rate = o
-            for k in range(way.shape[0]):
-                way[k] /= now
-                rate += way[k] * (v[k, b, j] - v[k, b, i])
-            if slack and rate <= o and pull[r] <= o:
-                continue
-            wrong = abs(rate) / (length[r] * per_dt)
-            if wrong > off:
-                off = wrong
-                if abs(rate) > like(o, 0.5) * allowed * per_dt:
-                    bad = r
-            by = over * rate / w
-            if slack:
-                by = max(by, -pull[r])
-            pull[r] += by
-            _push(v, b, i, by * weight[i], way)
-            _push(v, b, j, -by * weight[j], way)
-        if bad < 0:
-            break
-        over = _sooner(over, rho, sweep)
-    return bad, off
+def _turned(rods: Any, r: int, now: float, carry: bool) -> float:
+    """Return way . along, > 0; if it turned too far in one step, or was in one place, it acts along the way it has."""
+    o = like(now, 0.0)
+    if carry:
+        cosine = _sum(rods.way, rods.along)
+        if cosine > like(o, 0.3) * now * np.sqrt(_sum(rods.along, rods.along)):
+            return cosine
+    for k in range(rods.way.shape[0]):
+        rods.along[k] = rods.way[k]
+    if now > o:
+        return now * now
+    rods.along[0] = rods.length[r]  # both are in one place: any way will do
+    return rods.length[r] * rods.length[r]  # type: ignore[no-any-return]
 
 
 @kernel
-def hold(
-    x0: Any, x: Any, v: Any, alive: Any, weight: Any, i_: Any, j_: Any, length: Any, pull: Any, ways: Any, period: Any,
-    per_dt: float, slack: bool, tolerance: float, most: int, rho: float, first: int, end: int,
-) -> tuple[int, int, int, float]:  # fmt: skip
+def _longer(x0: Any, x: Any, v: Any, b: int, rods: Any, r: int, over: float, carry: bool) -> tuple[float, bool]:
+    """Move the ends of a rod so that it is as long as it shall be; return by which share it was not, and if it counts.
+
+    With `carry` velocities change by as much as positions did in the step.
+    """
+    o, allowed = like(over, 0.0), _allowed(x, b, rods, r)
+    aim = _aim(x0, b, rods, r, allowed, carry)
+    now = _to(x, b, rods.i[r], rods.j[r], rods.period, rods.way)
+    if rods.slack and now <= aim and rods.pull[r] <= o:
+        return o, False
+    cosine, w = _turned(rods, r, now, carry), rods.weight[rods.i[r]] + rods.weight[rods.j[r]]
+    by = over * (now * now - aim * aim) / (like(o, 2.0) * w * cosine)
+    if rods.slack:
+        by = max(by, -rods.pull[r])
+    rods.pull[r] += by
+    _push(x, b, rods, r, by)
+    if carry:
+        _push(v, b, rods, r, by * rods.per_dt)
+    return abs(now - aim) / rods.length[r], abs(now - aim) > like(o, 0.5) * allowed
+
+
+@kernel
+def _stiller(x: Any, v: Any, b: int, rods: Any, r: int, over: float) -> tuple[float, bool]:
+    """Take the velocity along a rod, or what would stretch a taut rope; return its share, and if it counts."""
+    o, allowed = like(over, 0.0), _allowed(x, b, rods, r)
+    now = _to(x, b, rods.i[r], rods.j[r], rods.period, rods.way)
+    if not now > o or (rods.slack and now < rods.length[r] - like(o, 2.0) * allowed):
+        return o, False
+    rate, w = o, rods.weight[rods.i[r]] + rods.weight[rods.j[r]]
+    for k in range(rods.way.shape[0]):
+        rods.along[k] = rods.way[k] / now
+        rate += rods.along[k] * (v[k, b, rods.j[r]] - v[k, b, rods.i[r]])
+    if rods.slack and rate <= o and rods.pull[r] <= o:
+        return o, False
+    by = over * rate / w
+    if rods.slack:
+        by = max(by, -rods.pull[r])
+    rods.pull[r] += by
+    _push(v, b, rods, r, by)
+    return abs(rate) / (rods.length[r] * rods.per_dt), abs(rate) > like(o, 0.5) * allowed * rods.per_dt
+
+
+@kernel
+def _swept(x0: Any, x: Any, v: Any, alive: Any, b: int, rods: Any, stage: int) -> tuple[int, float]:
+    """Sweep over all rods until they are right, over-relaxed; return the worst one if they are not, and its share.
+
+    Stage 0: lengths, velocities with them; 1: lengths that were wrong before; 2: velocities.
+    """
+    count, o = rods.i.shape[0], like(rods.per_dt, 0.0)
+    for r in range(count):
+        rods.pull[r] = o
+    worst, off, over = -1, o, like(o, 1.0)
+    for sweep in range(rods.most):
+        worst, off = -1, o
+        for r in range(count):
+            if _moves(alive, b, rods, r):
+                if stage < 2:
+                    wrong, counts = _longer(x0, x, v, b, rods, r, over, stage == 0)
+                else:
+                    wrong, counts = _stiller(x, v, b, rods, r, over)
+                if counts and wrong > off:
+                    worst, off = r, wrong
+        if worst < 0:
+            break
+        over = _sooner(over, rods.rho, sweep)
+    return worst, off
+
+
+@kernel
+def _copy(x: Any, v: Any, kept: Any, b: int, keep: bool) -> None:
+    """Keep positions and velocities of world b, or put back what was kept."""
+    for k in range(x.shape[0]):
+        for i in range(x.shape[2]):
+            if keep:
+                kept[0, k, i], kept[1, k, i] = x[k, b, i], v[k, b, i]
+            else:
+                x[k, b, i], v[k, b, i] = kept[0, k, i], kept[1, k, i]
+
+
+@kernel
+def _inside(x: Any, v: Any, b: int, i: int, period: Any) -> bool:
+    """Bring an agent back into a torus; is it where there are numbers?"""
+    sound = True
+    for k in range(x.shape[0]):
+        p = period[k]
+        if p > 0:
+            x[k, b, i] -= p * np.floor(x[k, b, i] / p)
+            if x[k, b, i] >= p:
+                x[k, b, i] = 0
+        sound = sound and finite(x[k, b, i] + v[k, b, i])
+    return sound
+
+
+@kernel
+def hold(x0: Any, x: Any, v: Any, alive: Any, rods: Any, first: int, end: int) -> tuple[int, int, int, float]:
     """Hold the agents of worlds [first, end) together.
 
+    Where velocities do not come to fit, as they may not in far too long a step, they are left as they were: those that
+    come of sweeps without end would be anything, and so energy is lost and never won.
     Returns the first (world, agent) not finite, or -1s, and the last rod that is not right, or -1, and by which share.
     """
-    world, agent, rod, off = -1, -1, -1, like(per_dt, 0.0)
-    way, was = ways[0], ways[1]
+    world, agent, rod, off = -1, -1, -1, like(rods.per_dt, 0.0)
     for b in range(first, end):
+        _copy(x, v, rods.kept, b, True)
         for stage in range(3):
-            if stage < 2:
-                bad, by = _reach(
-                    x0, x, v, alive, b, weight, i_, j_, length, pull, way, was, period, per_dt, slack, tolerance, most,
-                    rho, stage == 0,
-                )
-            else:
-                bad, by = _still(
-                    x, v, alive, b, weight, i_, j_, length, pull, way, period, per_dt, slack, tolerance, most, rho
-                )
-            if bad >= 0:
-                rod, off = bad, by
-        for r in range(2 * i_.shape[0]):
-            i = i_[r // 2] if r % 2 == 0 else j_[r // 2]
-            for k in range(x.shape[0]):
-                p = period[k]
-                if p > 0:
-                    x[k, b, i] -= p * np.floor(x[k, b, i] / p)
-                    if x[k, b, i] >= p:
-                        x[k, b, i] = 0
-                if world < 0 and not finite(x[k, b, i] + v[k, b, i]):
-                    world, agent = b, i
+            worst, by = _swept(x0, x, v, alive, b, rods, stage)
+            if worst >= 0:
+                rod, off = worst, by
+                if stage == 0:
+                    _copy(x, v, rods.kept, b, False)
+        for r in range(2 * rods.i.shape[0]):
+            i = rods.i[r // 2] if r % 2 == 0 else rods.j[r // 2]
+            if not _inside(x, v, b, i, rods.period) and world < 0:
+                world, agent = b, i
     return world, agent, rod, off
 
 
@@ -288,33 +326,34 @@ class Rods(Constraint):
             )
 
     def numbers(self, scene: Any) -> int:
-        """Of each pair its two agents, length and pull."""
-        return 1 + -(-3 * len(self.ties(scene).i) // scene.agents)
+        """Of each pair its two agents, length and pull; and a copy of where everybody is, and how fast."""
+        return 1 + 2 * int(scene.dimension) - (-3 * len(self.ties(scene).i) // int(scene.agents))
 
     def settler(self, scene: Any) -> Settler:
         """Return what mends a step, with scratch of its own; it warns once if lengths are not met."""
-        ties, real = self.ties(scene), np.dtype(scene.dtype).type
+        ties, real, d = self.ties(scene), np.dtype(scene.dtype).type, scene.dimension
         weight = (1 / scene.body.mass).astype(real)  # who is held in place has an infinite mass
-        period = np.array(scene.space.extent(scene.dimension) if scene.space.periodic else (0.0,) * scene.dimension)
-        numbers = (
-            weight, ties.i, ties.j, ties.length.astype(real), np.zeros(len(ties.i), real),
-            np.zeros((2, scene.dimension), real), period.astype(real), real(1 / scene.dt), self.slack,
-            real(self.tolerance), self.most, real(_slowness(ties, weight)),
+        period = np.array(scene.space.extent(d) if scene.space.periodic else (0.0,) * d, real)
+        rods = Hold(
+            weight, ties.i, ties.j, ties.length.astype(real), period, real(1 / scene.dt), self.slack,
+            real(self.tolerance), self.most, real(_slowness(ties, weight)), np.zeros(len(ties.i), real),
+            np.zeros(d, real), np.zeros(d, real), np.zeros((2, d, scene.agents), real),
         )  # fmt: skip
         solve, told = entry(hold), False
 
         def settle(x0: Floats, v0: Floats, state: State, first: int, end: int) -> tuple[int, int]:
             nonlocal told
-            world, agent, rod, off = solve(x0, state.x, state.v, state.alive, *numbers, first, end)
+            world, agent, rod, off = solve(x0, state.x, state.v, state.alive, rods, first, end)
             if rod >= 0 and world < 0 and not told:
                 told = True
                 warnings.warn(
-                    f"rods: after most = {self.most} sweeps agents {ties.i[rod]} and {ties.j[rod]} are {off:.2g} of "
-                    f"their length off (tolerance = {self.tolerance:g}); allow more sweeps, or make shorter steps",
+                    f"rods: after most = {self.most} sweeps agents {ties.i[rod]} and {ties.j[rod]} were {off:.2g} of "
+                    f"their length off (tolerance = {self.tolerance:g}); their speeds are only damped then, so allow "
+                    "more sweeps, or make shorter steps",
                     UnmetWarning,
                     stacklevel=2,
                 )
-            return world, agent
+            return int(world), int(agent)
 
         return settle
 

@@ -27,6 +27,6 @@ from flockenv.effects.wall import WallRepulsion  # noqa: E402
 __all__ = [
     "EFFECTS", "AngularSprings", "Attraction", "Carried", "Contact", "Drag", "Effect",
     "Elastic", "Far", "Fluctuation", "Gravitation", "Gravity", "InverseSquare", "Me", "ObstacleContact",
-    "Other", "Pressure", "QuadraticDrag", "Sight", "Sink", "Source", "SpeedLimit", "Springs", "Swing", "Tether", "Uniform",
-    "Vortex", "WallRepulsion", "Wind",
+    "Other", "Pressure", "QuadraticDrag", "Sight", "Sink", "Source", "SpeedLimit", "Springs", "Swing", "Tether",
+    "Uniform", "Vortex", "WallRepulsion", "Wind",
 ]  # fmt: skip

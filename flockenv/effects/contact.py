@@ -117,8 +117,12 @@ class _Solid(Effect):
 
     def parameters(self) -> dict[str, float | Vec]:
         """Numbers; grip: mu, negative = any; ease: 1 / U."""
-        plain = ("stiffness", "damping", "ratio", "adhesive", "friction")
-        return {name: float(getattr(self, name)) for name in plain} | {
+        return {
+            "stiffness": self.stiffness,
+            "damping": self.damping,
+            "ratio": self.ratio,
+            "adhesive": float(self.adhesive),
+            "friction": self.friction,
             "grip": -1.0 if self.coulomb is None else self.coulomb,
             "ease": 0.0 if self.most is None else 1 / self.most,
         }

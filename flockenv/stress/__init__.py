@@ -3,9 +3,9 @@
 from flockenv.stress import CASES, run
 results = run(CASES, methods)
 
-Cases are functions from a method to a `Value`; see `bodies`, `bonded`, `crowds`, `contacts`. What a case raises is a verdict too: a
-scene that is refused because its step must blow up, a simulation that diverges and says so. Nothing ends in NaN without
-a word.
+Cases are functions from a method to a `Value`; see `bodies`, `bonded`, `crowds`, `contacts`. What a case raises is a
+verdict too: a scene that is refused because its step must blow up, a simulation that diverges and says so. Nothing ends
+in NaN without a word.
 """
 
 from __future__ import annotations
