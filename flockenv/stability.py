@@ -61,8 +61,9 @@ class UnstableStepWarning(UserWarning):
     """A scene's dt is beyond the largest stable step."""
 
 
-STEPS = 30
-"""That a contact should last: with fewer, how fast a body comes out hangs by where in a step it touched."""
+STEPS, STEPS_OF_ITS_OWN = 30, 4
+"""That a contact should last: with fewer, how fast a body comes out hangs by where in a step it touched. Under a method
+with steps of its own within dt: or it steps over what has hardly begun (measured at the default tolerance)."""
 
 OFF = 1.05
 """By which factor a contact without damping may change the speed at most."""
@@ -252,13 +253,13 @@ def _blows_up(scene: Scene, found: Suggestion) -> bool:
 
 @functools.lru_cache(maxsize=64)
 def contact_limit(method: Integrator) -> float:
-    """Return the largest h w at which half an undamped oscillation is resolved; inf for a method with its own steps.
+    """Return the largest h w at which half an undamped oscillation is resolved.
 
     At least STEPS steps (numerics.md P17), and the amplitude is the same within OFF: explicit Euler multiplies it by
     (1 + y^2)^(pi / 2y), implicit Euler divides it, and both take 101 steps for that.
     """
     if method.adaptive:
-        return math.inf
+        return math.pi / STEPS_OF_ITS_OWN
     low, high = 1e-3, math.pi / STEPS
     for _ in range(ROUNDS):
         y = np.linspace(low, high, FASTEST)  # few: methods that solve do so in Python

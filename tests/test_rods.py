@@ -244,6 +244,23 @@ def test_a_slack_rope_lets_fly_and_a_taut_one_never_adds_energy() -> None:
     assert abs(state.pos[0, 1]).max() <= 1 + 1e-9
 
 
+def test_of_two_ropes_only_the_one_that_ends_taut_has_pulled() -> None:
+    """Agent 2 leaves the reach of both in one step; once 1 has pulled, the rope to 0 is slack: as if it were not."""
+    both, one = (
+        free(pairs=((0, 2), (1, 2)), lengths=(0.83, 1.15), slack=True),
+        free(pairs=((1, 2),), lengths=(1.15,), slack=True),
+    )
+    pos = np.arange(24.0).reshape(1, 12, 2) / 4
+    vel = np.zeros((1, 12, 2))
+    pos[0, :3], vel[0, 2] = [(10, 9.2), (9, 9.5), (10, 10)], (30, 0)
+    start = both.start(0).with_motion(pos, vel)
+    first, second = both.step(start), one.step(start)
+    assert np.linalg.norm(first.pos[0, 2] - first.pos[0, 0]) < 0.8
+    assert np.linalg.norm(first.pos[0, 2] - first.pos[0, 1]) == pytest.approx(1.15)
+    np.testing.assert_allclose(first.pos, second.pos, atol=1e-9)
+    np.testing.assert_allclose(first.vel, second.vel, atol=1e-7)
+
+
 # --- what cannot be met ---------------------------------------------------------------------------------------------
 
 

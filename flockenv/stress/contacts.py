@@ -18,7 +18,7 @@ from flockenv.effects import Contact, ObstacleContact
 from flockenv.integrators import Integrator
 from flockenv.scene import Group, Scene
 from flockenv.spawn import Spawn
-from flockenv.stability import CoarseContactWarning
+from flockenv.stability import CoarseContactWarning, contact_limit
 from flockenv.state import State
 from flockenv.stress.case import TOO_LONG, Case, Value, quietly, started
 
@@ -85,11 +85,12 @@ def gives_back(wall: bool) -> Callable[[Integrator], Value]:
     """Return the trial: wherever nobody was warned, a hit gives back 95 to 105 % of its speed."""
 
     def trial(method: Integrator) -> Value:
-        found = [hits(method, dt, wall) for dt in DTS]
+        edge = 0.999 * contact_limit(method) / math.sqrt(2 * STIFFNESS / MASS)  # where nobody is warned any more
+        found = [hits(method, dt, wall) for dt in (*DTS, edge)]
         silent = [h for h in found if not h.told]
         off = max((max(abs(h.least - 1), abs(h.largest - 1)) for h in silent), default=0.0)
         note = ", ".join(
-            f"{h.dt:g} s: " + (f"{h.least:.3f} to {h.largest:.3f}" if h.least == h.least else "")
+            f"{h.dt:.3g} s: " + (f"{h.least:.3f} to {h.largest:.3f}" if h.least == h.least else "")
             + (f" ({h.told})" if h.told else "") for h in found
         )  # fmt: skip
         return Value(off, off <= 0.05 and bool(silent), note)  # somewhere it must be silent
