@@ -54,6 +54,9 @@ class Hold(NamedTuple):
     tolerance: float
     most: int
     rho: float  # see _slowness
+    allowed: Any  # (R,) m, by which a length may be off
+    old: Any  # (R, D) m, from i to j before the step
+    before: Any  # (R,) m, how long that was
     pull: Any  # (R,) what each rod has done in these sweeps
     way: Any  # (D,) m, from i to j now
     along: Any  # (D,) the direction in which it acts, of any length
@@ -92,13 +95,15 @@ def _push(x: Any, b: int, rods: Any, r: int, by: float) -> None:
 
 
 @kernel
-def _allowed(x: Any, b: int, rods: Any, r: int) -> float:
-    """Return how far off a length may be, m: no length is known better than some roundings of the coordinates."""
-    most = like(x[0, 0, 0], 0.0)
-    for k in range(x.shape[0]):
-        most = max(most, max(abs(x[k, b, rods.i[r]]), abs(x[k, b, rods.j[r]])))
-    grain = like(most, 3e-15 if x.itemsize == 8 else 1.5e-6)
-    return max(rods.tolerance * rods.length[r], most * grain)  # type: ignore[no-any-return]
+def _begin(x0: Any, x: Any, b: int, rods: Any) -> None:
+    """Write how every rod was before the step, and how far off it may be: no length is known better than a place is."""
+    for r in range(rods.i.shape[0]):
+        i, j = rods.i[r], rods.j[r]
+        rods.before[r] = _to(x0, b, i, j, rods.period, rods.old[r])
+        most = like(rods.per_dt, 0.0)
+        for k in range(x.shape[0]):
+            most = max(most, max(abs(x[k, b, i]), abs(x[k, b, j])))
+        rods.allowed[r] = max(rods.tolerance * rods.length[r], most * like(most, 3e-15 if x.itemsize == 8 else 1.5e-6))
 
 
 @kernel
@@ -119,26 +124,26 @@ def _sooner(over: float, rho: float, sweep: int) -> float:
 
 
 @kernel
-def _aim(x0: Any, b: int, rods: Any, r: int, allowed: float, carry: bool) -> float:
-    """Return how long a rod shall be, and write along which way it acts: the one before the step, if it carries.
-
-    What was wrong before the step stays so while velocities come to fit, and is mended without them.
-    """
-    aim = rods.length[r]
-    if carry:
-        before = _to(x0, b, rods.i[r], rods.j[r], rods.period, rods.along)
-        if before > aim + allowed or (before < aim - allowed and not rods.slack):
-            aim = before
+def _aim(rods: Any, r: int) -> float:
+    """Return how long a rod shall be while velocities come to fit: as it was, if that was wrong already."""
+    aim, before, allowed = rods.length[r], rods.before[r], rods.allowed[r]
+    if before > aim + allowed or (before < aim - allowed and not rods.slack):
+        aim = before
     return aim  # type: ignore[no-any-return]
 
 
 @kernel
 def _turned(rods: Any, r: int, now: float, carry: bool) -> float:
-    """Return way . along, > 0; if it turned too far in one step, or was in one place, it acts along the way it has."""
+    """Write along which way a rod acts, and return way . along, > 0.
+
+    The one before the step, if it carries; if it turned too far since, or was in one place, the one it has now.
+    """
     o = like(now, 0.0)
     if carry:
-        cosine = _sum(rods.way, rods.along)
-        if cosine > like(o, 0.3) * now * np.sqrt(_sum(rods.along, rods.along)):
+        cosine = _sum(rods.way, rods.old[r])
+        if cosine > like(o, 0.3) * now * rods.before[r]:
+            for k in range(rods.way.shape[0]):
+                rods.along[k] = rods.old[r, k]
             return cosine
     for k in range(rods.way.shape[0]):
         rods.along[k] = rods.way[k]
@@ -149,13 +154,12 @@ def _turned(rods: Any, r: int, now: float, carry: bool) -> float:
 
 
 @kernel
-def _longer(x0: Any, x: Any, v: Any, b: int, rods: Any, r: int, over: float, carry: bool) -> tuple[float, bool]:
+def _longer(x: Any, v: Any, b: int, rods: Any, r: int, over: float, carry: bool) -> tuple[float, bool]:
     """Move the ends of a rod so that it is as long as it shall be; return by which share it was not, and if it counts.
 
     With `carry` velocities change by as much as positions did in the step.
     """
-    o, allowed = like(over, 0.0), _allowed(x, b, rods, r)
-    aim = _aim(x0, b, rods, r, allowed, carry)
+    o, aim = like(over, 0.0), _aim(rods, r) if carry else rods.length[r]
     now = _to(x, b, rods.i[r], rods.j[r], rods.period, rods.way)
     if rods.slack and now <= aim and rods.pull[r] <= o:
         return o, False
@@ -167,13 +171,13 @@ def _longer(x0: Any, x: Any, v: Any, b: int, rods: Any, r: int, over: float, car
     _push(x, b, rods, r, by)
     if carry:
         _push(v, b, rods, r, by * rods.per_dt)
-    return abs(now - aim) / rods.length[r], abs(now - aim) > like(o, 0.5) * allowed
+    return abs(now - aim) / rods.length[r], abs(now - aim) > like(o, 0.5) * rods.allowed[r]
 
 
 @kernel
 def _stiller(x: Any, v: Any, b: int, rods: Any, r: int, over: float) -> tuple[float, bool]:
     """Take the velocity along a rod, or what would stretch a taut rope; return its share, and if it counts."""
-    o, allowed = like(over, 0.0), _allowed(x, b, rods, r)
+    o, allowed = like(over, 0.0), rods.allowed[r]
     now = _to(x, b, rods.i[r], rods.j[r], rods.period, rods.way)
     if not now > o or (rods.slack and now < rods.length[r] - like(o, 2.0) * allowed):
         return o, False
@@ -192,7 +196,7 @@ def _stiller(x: Any, v: Any, b: int, rods: Any, r: int, over: float) -> tuple[fl
 
 
 @kernel
-def _swept(x0: Any, x: Any, v: Any, alive: Any, b: int, rods: Any, stage: int) -> tuple[int, float]:
+def _swept(x: Any, v: Any, alive: Any, b: int, rods: Any, stage: int) -> tuple[int, float]:
     """Sweep over all rods until they are right, over-relaxed; return the worst one if they are not, and its share.
 
     Stage 0: lengths, velocities with them; 1: lengths that were wrong before; 2: velocities.
@@ -206,7 +210,7 @@ def _swept(x0: Any, x: Any, v: Any, alive: Any, b: int, rods: Any, stage: int) -
         for r in range(count):
             if _moves(alive, b, rods, r):
                 if stage < 2:
-                    wrong, counts = _longer(x0, x, v, b, rods, r, over, stage == 0)
+                    wrong, counts = _longer(x, v, b, rods, r, over, stage == 0)
                 else:
                     wrong, counts = _stiller(x, v, b, rods, r, over)
                 if counts and wrong > off:
@@ -253,8 +257,9 @@ def hold(x0: Any, x: Any, v: Any, alive: Any, rods: Any, first: int, end: int) -
     world, agent, rod, off = -1, -1, -1, like(rods.per_dt, 0.0)
     for b in range(first, end):
         _copy(x, v, rods.kept, b, True)
+        _begin(x0, x, b, rods)
         for stage in range(3):
-            worst, by = _swept(x0, x, v, alive, b, rods, stage)
+            worst, by = _swept(x, v, alive, b, rods, stage)
             if worst >= 0:
                 rod, off = worst, by
                 if stage == 0:
@@ -330,18 +335,21 @@ class Rods(Constraint):
             )
 
     def numbers(self, scene: Any) -> int:
-        """Of each pair its two agents, length and pull; and a copy of where everybody is, and how fast."""
-        return 1 + 2 * int(scene.dimension) - (-3 * len(self.ties(scene).i) // int(scene.agents))
+        """Of each pair what `Hold` lists; and a copy of where everybody is, and how fast."""
+        d = int(scene.dimension)
+        return 2 * d - (-(6 + d) * len(self.ties(scene).i) // int(scene.agents))
 
     def settler(self, scene: Any) -> Settler:
         """Return what mends a step, with scratch of its own; it warns once if lengths are not met."""
         ties, real, d = self.ties(scene), np.dtype(scene.dtype).type, scene.dimension
         weight = (1 / scene.body.mass).astype(real)  # who is held in place has an infinite mass
         period = np.array(scene.space.extent(d) if scene.space.periodic else (0.0,) * d, real)
+        length = ties.length.astype(real)
         rods = Hold(
-            weight, ties.i, ties.j, ties.length.astype(real), period, real(1 / scene.dt), self.slack,
-            real(self.tolerance), self.most, real(_slowness(ties, weight)), np.zeros(len(ties.i), real),
-            np.zeros(d, real), np.zeros(d, real), np.zeros((2, d, scene.agents), real),
+            weight, ties.i, ties.j, length, period, real(1 / scene.dt), self.slack,
+            real(self.tolerance), self.most, real(_slowness(ties, weight)), np.zeros_like(length),
+            np.zeros((len(length), d), real), np.zeros_like(length), np.zeros_like(length), np.zeros(d, real),
+            np.zeros(d, real), np.zeros((2, d, scene.agents), real),
         )  # fmt: skip
         solve, told = entry(hold), False
 
