@@ -24,8 +24,8 @@ Length = Annotated[float, Field(gt=0, strict=True)]
 KNOWN, UNKNOWN = 0.9999, 0.99
 """By which factor at most Jacobi's iteration is taken to shrink errors: where directions at rest are known, or not."""
 
-POWERS = 1000
-"""Steps in which that is found."""
+POWERS, LEAST = 50, 1e-9
+"""Steps in which that is found, and what rods are taken to resist at least: there may be one too many."""
 
 
 class UnmetWarning(UserWarning):
@@ -278,7 +278,7 @@ class Rods(Constraint):
     then without any speed along the rods (Ryckaert, Ciccotti and Berendsen 1977; Andersen 1983, RATTLE): momentum is
     kept, and in gravity no energy is pumped. A rope that is drawn tight loses the speed that would stretch it. Who is
     held in place is not moved. Distances that are wrong to begin with are mended in the first step, without a speed.
-    A chain of n links takes some 6 n sweeps in a step, a cloth of n x n cells about as many.
+    A chain of n links takes some 6 n sweeps in a step, and so does a cloth of n x n cells.
     Rods have the last word: a limit of speed, and the walls of a box, were before them.
     """
 
@@ -390,12 +390,15 @@ def _layered(ties: Ties) -> Ties:
 
 
 def _slowness(ties: Ties, weight: Floats) -> float:
-    """Return rho, by which Jacobi's iteration shrinks errors, of everybody at rest.
+    """Return rho, by which Jacobi's iteration shrinks what shrinks the least, of everybody at rest.
 
-    Rods of unknown directions count as if all were in line. A wrong one makes more sweeps, and no other result.
+    1 less the least eigenvalue of what rods do to each other, by inverse iteration. Rods of unknown directions count as
+    if all were in line. A wrong rho makes more sweeps, and no other result.
     """
     from scipy import sparse  # here: who simulates without rods need not wait for it
+    from scipy.sparse.linalg import splu
 
+    weight = weight.astype(np.float64)
     moves = weight[ties.i] + weight[ties.j] > 0
     way, d = ties.way[moves], ties.way.shape[1]
     long = np.linalg.norm(way, axis=1)
@@ -407,11 +410,11 @@ def _slowness(ties: Ties, weight: Floats) -> float:
         column = ends[:, None] * d + np.arange(d)
         entries = (sign * share[:, None] * ways).ravel(), (np.repeat(np.arange(len(way)), d), column.ravel())
         speeds = sparse.csr_array(entries, shape=(len(way), len(weight) * d)) + speeds
-    said, rho, back = np.random.default_rng(0).normal(size=len(way)), 0.0, speeds.T.tocsr()
+    if not len(way):
+        return 0.0
+    lu = splu((speeds @ speeds.T + LEAST * sparse.eye_array(len(way))).tocsc())
+    said, grown = np.random.default_rng(0).normal(size=len(way)), 1.0
     for _ in range(POWERS):
-        said = said - speeds @ (back @ said)
-        rho = float(np.linalg.norm(said))
-        if not rho > 0:
-            break
-        said /= rho
-    return min(rho, KNOWN if known else UNKNOWN)
+        said = lu.solve(said / np.linalg.norm(said))
+        grown = float(np.linalg.norm(said))
+    return min(max(0.0, 1 - 1 / grown), KNOWN if known else UNKNOWN)
