@@ -39,7 +39,7 @@ from flockenv.shapes import AnyShape, Circle, HalfSpace, Shape, clear_of
 from flockenv.snapshot import Mark, Snapshot
 from flockenv.space import AnySpace, Box, Plane, Torus
 from flockenv.spawn import Spawn, scatter
-from flockenv.stability import check_dt, check_lookahead
+from flockenv.stability import check_contact, check_dt, check_lookahead
 from flockenv.state import Body, Floats, State
 from flockenv.steer import EVERY_EFFECT
 from flockenv.sweep import SHARED, Parts, Table, field_source, flattened, pack, scene_source
@@ -196,6 +196,7 @@ class Scene(Record):
             )
         check_places(self)
         check_dt(self)
+        check_contact(self)
         check_lookahead(self)
         return self
 

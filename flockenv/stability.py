@@ -23,12 +23,15 @@ if TYPE_CHECKING:
     from flockenv.scene import Group, Scene
 
 __all__ = [
+    "CoarseContactWarning",
     "LookaheadWarning",
     "Suggestion",
     "UnstableStepWarning",
     "amplification",
+    "check_contact",
     "check_dt",
     "check_lookahead",
+    "contact_limit",
     "limit",
     "suggest_dt",
 ]
@@ -56,6 +59,21 @@ FASTEST = 32
 
 class UnstableStepWarning(UserWarning):
     """A scene's dt is beyond the largest stable step."""
+
+
+STEPS, STEPS_OF_ITS_OWN = 30, 4
+"""That a contact should last: with fewer, how fast a body comes out hangs by where in a step it touched. Under a method
+with steps of its own within dt: or it steps over what has hardly begun (measured at the default tolerance)."""
+
+OFF = 1.048
+"""By which factor a method may change the speed in an undamped contact: 5 %, less what the phase of a step does."""
+
+BOUNCY = 0.2
+"""Damping as a share of what is critical, below which a contact is there to bounce: it gives back half, or more."""
+
+
+class CoarseContactWarning(UserWarning):
+    """A contact is over in so few steps that bodies come out of it faster or slower than its law says."""
 
 
 class LookaheadWarning(UserWarning):
@@ -150,8 +168,9 @@ def suggest_dt(scene: Scene) -> Suggestion:
     """Return the largest stable step of a scene, from its effects' own stiffness, and the effect that sets it.
 
     Stiffness is a bound (Gershgorin's circles for springs), so the limit is on the safe side; what is only stiff in
-    some states (agents that touch) is not in it. Damping is a bound too: a method that needs damping to be stable
-    (explicit Euler, Heun, midpoint) may find motions that are damped less, springs across their length for one.
+    some states (agents that touch more than one other) is not in it. Damping is a bound too: a method that needs
+    damping to be stable (explicit Euler, Heun, midpoint) may find motions that are damped less, springs across their
+    length for one.
     Source: numerics.md 2.2 P02, 3.1, 3.3.
     """
     found = _found(scene)
@@ -230,6 +249,44 @@ def _blows_up(scene: Scene, found: Suggestion) -> bool:
     zeta = found.damping / (2 * found.frequency)
     slowest = min(growth(scene.integrator, y, *shares)[0] for shares in ((zeta, 0.0), (0.0, zeta)))
     return bool(slowest > 100 ** (1 / 100))
+
+
+@functools.lru_cache(maxsize=64)
+def contact_limit(method: Integrator) -> float:
+    """Return the largest h w at which half an undamped oscillation is resolved.
+
+    At least STEPS steps (numerics.md P17), and the amplitude is the same within OFF: explicit Euler multiplies it by
+    (1 + y^2)^(pi / 2y), implicit Euler divides it, and both take 105 steps for that.
+    """
+    if method.adaptive:
+        return math.pi / STEPS_OF_ITS_OWN
+    low, high = 1e-3, math.pi / STEPS
+    for _ in range(ROUNDS):
+        y = np.linspace(low, high, FASTEST)  # few: methods that solve do so in Python
+        off = np.abs(np.log(growth(method, y, 0.0))) * math.pi / y > math.log(OFF)
+        if not off.any():
+            return high
+        first = max(int(np.argmax(off)), 1)
+        low, high = float(y[first - 1]), float(y[first])
+    return low
+
+
+def check_contact(scene: Scene) -> None:
+    """Warn where bodies that should bounce are in contact for too few steps, naming the limit."""
+    for k, effect in enumerate(scene.effects):
+        found = effect.rates(scene.groups, scene.dimension) if effect.contact else None
+        if found is None or (effect.obstacle_law and not scene.obstacles):
+            continue
+        frequency = np.sqrt(found[0])
+        frequency[found[1] > 2 * BOUNCY * frequency] = 0.0
+        agent = int(np.argmax(frequency))
+        if scene.dt * frequency[agent] > contact_limit(scene.integrator) * (1 + 1e-9):
+            most, lasts = contact_limit(scene.integrator) / frequency[agent], math.pi / frequency[agent]
+            message = (
+                f"dt = {scene.dt:g} s: effects[{k}].{effect.kind} lasts {lasts:.3g} s at agent {agent}; bodies come "
+                f"out of it at the right speed with {scene.integrator.kind} if dt is at most {most:.3g} s"
+            )
+            warnings.warn(message, CoarseContactWarning, stacklevel=2)
 
 
 def check_lookahead(scene: Scene) -> None:

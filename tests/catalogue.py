@@ -69,6 +69,7 @@ from flockenv.effects import (
     AngularSprings,
     Attraction,
     Carried,
+    Contact,
     Drag,
     Effect,
     Elastic,
@@ -81,6 +82,7 @@ from flockenv.effects import (
     QuadraticDrag,
     Sink,
     Source,
+    SpeedLimit,
     Springs,
     Swing,
     Tether,
@@ -315,7 +317,9 @@ EFFECTS = (
         Swing(centre=CENTRE, strength=0.8, length=0.7), obeys=frozenset({"translation", "mirror", "relabelling"})
     ),
     EffectRow(WallRepulsion(point=CENTRE, normal=(1.2, -0.7, 0.9), strength=2, decay=1.5)),
-    EffectRow(ObstacleContact(stiffness=30, damping=0.5)),
+    EffectRow(ObstacleContact(stiffness=30, damping=4, friction=8, coulomb=0.6, most=5)),
+    EffectRow(Contact(stiffness=20, ratio=0.3, damping=0.1, friction=6, coulomb=0.5, most=4, radius=0.5)),
+    EffectRow(SpeedLimit(speed=1.2, strength=0.8)),
     EffectRow(Fluctuation(strength=0.8), obeys=frozenset({"translation"})),  # to each his own, along the axes
     EffectRow(Pressure(strength=1.5, density=1, radius=1.35)),
     EffectRow(Separation(weight=1.3, radius=2.5)),

@@ -11,5 +11,6 @@ for _module in pkgutil.iter_modules(__path__):
     importlib.import_module(f"{__name__}.{_module.name}")
 
 from flockenv.constraints.collisions import Collisions  # noqa: E402  # after the folder has been walked
+from flockenv.constraints.rods import Rods, UnmetWarning  # noqa: E402
 
-__all__ = ["CONSTRAINTS", "Collisions", "Constraint", "Settler"]
+__all__ = ["CONSTRAINTS", "Collisions", "Constraint", "Rods", "Settler", "UnmetWarning"]

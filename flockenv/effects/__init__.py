@@ -11,7 +11,7 @@ for _module in pkgutil.iter_modules(__path__):
     importlib.import_module(f"{__name__}.{_module.name}")
 
 from flockenv.effects.attraction import Attraction  # noqa: E402  # after the folder has been walked
-from flockenv.effects.contact import ObstacleContact  # noqa: E402
+from flockenv.effects.contact import Contact, ObstacleContact  # noqa: E402
 from flockenv.effects.drag import Drag, QuadraticDrag  # noqa: E402
 from flockenv.effects.elastic import Elastic  # noqa: E402
 from flockenv.effects.fields import Carried, Sink, Source, Uniform, Vortex, Wind  # noqa: E402
@@ -19,13 +19,14 @@ from flockenv.effects.fluctuation import Fluctuation  # noqa: E402
 from flockenv.effects.gravitation import Gravitation, InverseSquare  # noqa: E402
 from flockenv.effects.gravity import Gravity  # noqa: E402
 from flockenv.effects.pressure import Pressure  # noqa: E402
+from flockenv.effects.speed_limit import SpeedLimit  # noqa: E402
 from flockenv.effects.springs import AngularSprings, Springs  # noqa: E402
 from flockenv.effects.tether import Swing, Tether  # noqa: E402
 from flockenv.effects.wall import WallRepulsion  # noqa: E402
 
 __all__ = [
-    "EFFECTS", "AngularSprings", "Attraction", "Carried", "Drag", "Effect",
+    "EFFECTS", "AngularSprings", "Attraction", "Carried", "Contact", "Drag", "Effect",
     "Elastic", "Far", "Fluctuation", "Gravitation", "Gravity", "InverseSquare", "Me", "ObstacleContact",
-    "Other", "Pressure", "QuadraticDrag", "Sight", "Sink", "Source", "Springs", "Swing", "Tether", "Uniform", "Vortex",
-    "WallRepulsion", "Wind",
+    "Other", "Pressure", "QuadraticDrag", "Sight", "Sink", "Source", "SpeedLimit", "Springs", "Swing", "Tether",
+    "Uniform", "Vortex", "WallRepulsion", "Wind",
 ]  # fmt: skip

@@ -85,6 +85,7 @@ class Other(NamedTuple):
     vel: Vec  # m/s
     radius: float  # m
     tie: Vec  # a unit vector of its own
+    mass: float  # kg; of what is no agent: inf
 
 
 class Obstacle(NamedTuple):
@@ -216,6 +217,8 @@ class Effect(Record):
     """Names of the parameters that are points: on a torus all but bonds and obstacles see the nearest images."""
     heads_for: ClassVar[bool] = True
     """Are its places what a behaviour heads for? Pictures show them."""
+    contact: ClassVar[bool] = False
+    """Are its `rates` those of a contact, which is over after half of an oscillation?"""
     strengths: ClassVar[tuple[str, ...]] = ("weight",)
     """Names of the fields that make it nothing when they are 0."""
     conserves_momentum: ClassVar[bool] = False

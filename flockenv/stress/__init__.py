@@ -3,9 +3,9 @@
 from flockenv.stress import CASES, run
 results = run(CASES, methods)
 
-Cases are functions from a method to a `Value`; see `bodies`, `bonded`, `crowds`. What a case raises is a verdict too: a
-scene that is refused because its step must blow up, a simulation that diverges and says so. Nothing ends in NaN without
-a word.
+Cases are functions from a method to a `Value`; see `bodies`, `bonded`, `crowds`, `contacts`. What a case raises is a
+verdict too: a scene that is refused because its step must blow up, a simulation that diverges and says so. Nothing ends
+in NaN without a word.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ from __future__ import annotations
 from flockenv.stress.bodies import BODIES
 from flockenv.stress.bonded import BONDED
 from flockenv.stress.case import Case, Value
+from flockenv.stress.contacts import CONTACTS
 from flockenv.stress.crowds import CROWDS
 from flockenv.stress.results import VERDICTS, Finding, Results
 from flockenv.stress.run import cases_named, fingerprint, run, usual_methods
@@ -21,5 +22,5 @@ __all__ = [
     "CASES", "VERDICTS", "Case", "Finding", "Results", "Value", "cases_named", "fingerprint", "run", "usual_methods",
 ]  # fmt: skip
 
-CASES: tuple[Case, ...] = (*BODIES, *BONDED, *CROWDS)
+CASES: tuple[Case, ...] = (*BODIES, *BONDED, *CROWDS, *CONTACTS)
 """Every hard case, in the order of shared/reference/numerics.md, section 6.2, within each kind of scene."""

@@ -12,10 +12,13 @@ import numpy as np
 
 from flockenv.integrators import Integrator
 from flockenv.scene import Scene
-from flockenv.stability import UnstableStepWarning
+from flockenv.stability import CoarseContactWarning, UnstableStepWarning
 from flockenv.state import State
 
-__all__ = ["Case", "Value", "quietly", "started"]
+__all__ = ["TOO_LONG", "Case", "Value", "quietly", "started"]
+
+TOO_LONG = (UnstableStepWarning, CoarseContactWarning)
+"""What says that a step is too long."""
 
 
 @dataclass(frozen=True)
@@ -44,7 +47,8 @@ def started(scene: Scene, pos: Any, vel: Any) -> State:
 
 @contextmanager
 def quietly() -> Iterator[list[warnings.WarningMessage]]:
-    """Collect warnings of unstable steps where a case goes beyond a limit on purpose; all others pass on."""
+    """Collect warnings of steps that are too long where a case goes beyond a limit on purpose; all others pass on."""
     with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always", UnstableStepWarning)
+        for kind in TOO_LONG:
+            warnings.simplefilter("always", kind)
         yield caught

@@ -14,8 +14,7 @@ from flockenv.divergence import SimulationDiverged
 from flockenv.integrators import INTEGRATORS, Integrator
 from flockenv.kernels import laws_digest
 from flockenv.refusals import nearest, shown
-from flockenv.stability import UnstableStepWarning
-from flockenv.stress.case import Case
+from flockenv.stress.case import TOO_LONG, Case
 from flockenv.stress.results import Finding, Results, Verdict
 
 __all__ = ["cases_named", "fingerprint", "run", "usual_methods"]
@@ -80,7 +79,8 @@ def _tried(case: Case, method: Integrator) -> Finding:
     number: float | None = None
     verdict: Verdict
     with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always", UnstableStepWarning)
+        for kind in TOO_LONG:
+            warnings.simplefilter("always", kind)
         try:
             value = case.trial(method)
         except SimulationDiverged as error:
@@ -91,7 +91,7 @@ def _tried(case: Case, method: Integrator) -> Finding:
             number = value.number if math.isfinite(value.number) else None
             # a bound that is asked the other way round holds for what is no number
             verdict, note = ("pass" if value.holds and not math.isnan(value.number) else "fails"), value.note
-    told = next((str(w.message) for w in caught if issubclass(w.category, UnstableStepWarning)), "")
+    told = next((str(w.message) for w in caught if issubclass(w.category, TOO_LONG)), "")
     if told and verdict == "pass":
         verdict = "warned"
     return Finding(

@@ -60,7 +60,7 @@ def _obstacles(parts: Parts, k: int) -> list[str]:
         "    rho = obstacle_radius[b, m]",
         "    if rho > 0:",
         f"        to = offset_to(size, me.pos, {tuple_of('obstacle_x[#, b, m]', parts.dimension)})",
-        "        it = Other(like(rho, m), to, dot(to, to), zero(to), rho, zero(to))",
+        "        it = Other(like(rho, m), to, dot(to, to), zero(to), rho, zero(to), like(rho, np.inf))",
         f"        found_ = obstacle_law_{k}({given(parts, k)}, me, it, found_)",
     ]
 
@@ -169,7 +169,7 @@ def meet_range(parts: Parts, fields: list[str], lines: list[str]) -> list[str]:
             "    own, o = np.int32(j - block), like(reach, -0.0)",
             f"    for l in range(np.uint64({parts.width})):",
             indented([_me(parts, fields), "other = own != number[l]", f"to = {offset}", f"square = {square}"], 8),
-            "        it = Other(aj, to, square, vj, rj, tj)",
+            "        it = Other(aj, to, square, vj, rj, tj, mj)",
             indented(lines, 8),
             "    j += np.uint64(1)",
         ]
@@ -195,10 +195,11 @@ def _candidate(parts: Parts, fields: list[str]) -> list[str]:
             return "xj"
         return "(" + ", ".join(number(f"{letter}{k}") for k in range(parts.dimension)) + ")"
 
-    scalar = {name: number(name) if name in row else "reach" for name in ("who", "radius")}
+    scalar = {name: number(name) if name in row else "reach" for name in ("who", "radius", "mass")}
     return [
         f"xj = {vector('x')}",
         f"vj, tj, aj, rj = {vector('v')}, {vector('t')}, {scalar['who']}, {scalar['radius']}",
+        f"mj = {scalar['mass']}",
     ]
 
 

@@ -1,0 +1,331 @@
+"""Rods and ropes: closed forms of pendulums and chains, what is kept, and what is refused."""
+
+from __future__ import annotations
+
+import math
+import pickle
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+from scipy.special import ellipk
+
+from flockenv.config import dump_scene, load_scene
+from flockenv.constraints import Rods, UnmetWarning
+from flockenv.effects import Drag, Gravity
+from flockenv.integrators import RK4, ExplicitEuler, ImplicitMidpoint, Integrator, SemiImplicitEuler, VelocityVerlet
+from flockenv.networks import Cloth, Rope
+from flockenv.scene import Group, Scene
+from flockenv.space import Torus
+from flockenv.spawn import Spawn
+from flockenv.state import State
+from tests.catalogue import Array
+
+G = 9.81
+HERE = Spawn(low=(0, 0), high=(1, 1))
+
+
+def hanging(
+    network: Any, dt: float, *, drag: float = 0.0, gravity: float = G, mass: float = 1.0,
+    method: Integrator | None = None, **rods: Any,
+) -> Scene:  # fmt: skip
+    """Return a network of rods under gravity: one set of laws for all tests with the same method."""
+    return Scene(
+        groups=(Group(network=network, mass=mass),), effects=(Gravity(acceleration=(0, -gravity)), Drag(rate=drag)),
+        constraints=(Rods(**({"group": 0} | rods)),), integrator=method or VelocityVerlet(), dt=dt,
+    )  # fmt: skip
+
+
+def pendulum(dt: float, *angles: float, method: Integrator | None = None, **rods: Any) -> tuple[Scene, State]:
+    """Return a metre long pendulum, at rest at each of these angles from its lowest point, a world each."""
+    scene = hanging(Rope(links=1, length=1.0, direction=(0, -1), pinned=("start",)), dt, method=method, **rods)
+    start = scene.start(0, worlds=len(angles))
+    pos = np.array(start.pos)
+    pos[:, 1] = np.stack([np.sin(angles), -np.cos(angles)], axis=1)
+    return scene, start.with_motion(pos, start.vel)
+
+
+def energy(state: State) -> Array:
+    """Return the energy of free particles of 1 kg, (B,) J; who is held stays at height 0 at rest."""
+    return np.asarray((0.5 * (state.vel**2).sum(axis=2) + G * state.pos[..., 1]).sum(axis=1))
+
+
+def lengths(state: State) -> Array:
+    return np.asarray(np.linalg.norm(np.diff(state.pos, axis=1), axis=2))
+
+
+# --- closed forms ---------------------------------------------------------------------------------------------------
+
+
+def test_a_pendulum_keeps_its_length_its_energy_and_its_period() -> None:
+    """Of a small swing 2 pi sqrt(l / g), of a large one 4 sqrt(l / g) K(sin^2(a / 2)); over 100 periods and more."""
+    angles, dt = np.array([0.02, 1.0, 2.5]), 0.01
+    scene, state = pendulum(dt, *angles)
+    before, worst, off, found = energy(state), 0.0, np.zeros(3), [np.sin(angles)]
+    for _ in range(round(205 / dt)):
+        state = scene.step(state, out=state)
+        found.append(np.array(state.pos[:, 1, 0]))
+        worst = max(worst, float(np.abs(lengths(state) - 1).max()))
+        off = np.maximum(off, np.abs(energy(state) - before))
+    assert worst <= 1e-9
+    assert (off <= 2e-3 * G * (1 - np.cos(angles))).all()
+    np.testing.assert_allclose(energy(state), before, atol=1e-3 * G)
+    x = np.array(found)
+    for k, angle in enumerate(angles):
+        falls = np.flatnonzero((x[:-1, k] > 0) & (x[1:, k] <= 0))
+        times = (falls + x[falls, k] / (x[falls, k] - x[falls + 1, k])) * dt
+        period = (times[-1] - times[0]) / (len(times) - 1)
+        exact = 4 * math.sqrt(1 / G) * ellipk(math.sin(angle / 2) ** 2)
+        assert period == pytest.approx(exact, rel=2e-4)
+        assert len(times) >= 60
+    assert len(np.flatnonzero((x[:-1, 0] > 0) & (x[1:, 0] <= 0))) > 100
+
+
+def test_a_hanging_chain_is_the_catenary_of_its_links() -> None:
+    """tan theta_i = (m g / H)(i - (n + 1) / 2), H so that sum l cos theta_i = span (numerics.md 3.3)."""
+    links, long, span = 8, 2.0, 1.3
+    rope = Rope(links=links, start=(0, 0), end=(span, 0), length=long, pinned=("ends",))
+    scene = hanging(rope, 0.01, drag=1.5, mass=0.2)
+    end = scene.run(scene.start(0), 4000)
+    steps = np.diff(end.pos[0], axis=0)
+    slopes = steps[:, 1] / steps[:, 0]
+    rise = np.arange(1, links + 1) - (links + 1) / 2
+    low, high = 0.01, 100.0
+    for _ in range(200):  # of m g / H
+        middle = (low + high) / 2
+        wide = (long / links * np.cos(np.arctan(middle * rise))).sum()
+        low, high = (middle, high) if wide > span else (low, middle)
+    np.testing.assert_allclose(slopes, low * rise, atol=1e-6)
+    np.testing.assert_allclose(np.linalg.norm(steps, axis=1), long / links, rtol=1e-9)
+
+
+def double(t: float, y: Array) -> list[float]:
+    """The double pendulum of equal masses and rods of 1 m, angles from the lowest point."""
+    a, b, u, w = y
+    d, k = a - b, 3 - math.cos(2 * (a - b))
+    return [
+        u, w,
+        (-3 * G * math.sin(a) - G * math.sin(a - 2 * b) - 2 * math.sin(d) * (w * w + u * u * math.cos(d))) / k,
+        2 * math.sin(d) * (2 * u * u + 2 * G * math.cos(a) + w * w * math.cos(d)) / k,
+    ]  # fmt: skip
+
+
+def test_a_double_pendulum_goes_where_its_equations_say_and_keeps_its_energy() -> None:
+    begin = (2.0, 1.0)
+    angles = solve_ivp(double, (0, 1.5), [*begin, 0, 0], "DOP853", rtol=1e-12, atol=1e-12).y[:2, -1]
+    exact = np.cumsum(np.stack([np.sin(angles), -np.cos(angles)], axis=1), axis=0)
+    errors = []
+    for steps in (300, 600, 1200):
+        scene = hanging(Rope(links=2, length=2.0, direction=(0, -1), pinned=("start",)), 1.5 / steps)
+        start = scene.start(0)
+        pos = np.array(start.pos)
+        pos[0, 1:] = np.cumsum(np.stack([np.sin(begin), -np.cos(begin)], axis=1), axis=0)
+        start = start.with_motion(pos, start.vel)
+        errors.append(np.abs(scene.run(start, steps).pos[0, 1:] - exact).max())
+    assert errors[-1] < 1e-3
+    assert np.diff(np.log2(errors)) == pytest.approx([-2, -2], abs=0.2)
+    state, before, off = start, energy(start), 0.0
+    for _ in range(200):
+        state = scene.run(state, 40)  # 10 s
+        off = max(off, float(np.abs(energy(state) - before)[0]))
+    assert off < 2e-3 * G
+
+
+@pytest.mark.slow  # a kernel each
+@pytest.mark.parametrize(
+    "method", [SemiImplicitEuler(), ExplicitEuler(), RK4(), ImplicitMidpoint()], ids=lambda m: m.kind
+)
+def test_under_every_method_a_pendulum_keeps_length_and_energy(method: Integrator) -> None:
+    scene, state = pendulum(0.005, 1.0, method=method)
+    before, worst = energy(state), 0.0
+    for _ in range(200):
+        state = scene.run(state, 20)
+        worst = max(worst, float(np.abs(energy(state) - before)[0]))
+        assert abs(lengths(state) - 1).max() <= 1e-9
+    assert worst <= (0.06 if method.order == 1 else 1e-3) * G
+    np.testing.assert_allclose(np.abs(energy(state) - before), 0, atol=0.06 * G)
+
+
+# --- what is kept, whatever the order -------------------------------------------------------------------------------
+
+
+def free(space: Any = None, pairs: Any = None, **rods: Any) -> Scene:
+    """Return 12 agents of two masses in a ring of rods, and nothing else."""
+    ring = tuple((k, (k + 1) % 12) for k in range(12)) if pairs is None else pairs
+    groups = (Group(count=6, mass=0.7, spawn=HERE), Group(count=6, mass=3.0, spawn=HERE))
+    held = Rods(**({"pairs": ring, "lengths": (1.0,)} | rods))
+    return Scene(space=space or Torus(size=(20.0, 20.0)), groups=groups, constraints=(held,), dt=0.01)
+
+
+def ring_state(scene: Scene, worlds: int = 1) -> State:
+    """Return the ring across a corner of the torus, each world with other velocities."""
+    turn = 2 * np.pi * np.arange(12) / 12
+    pos = 0.5 / math.sin(math.pi / 12) * np.stack([np.cos(turn), np.sin(turn)], axis=1) % 20
+    vel = np.random.default_rng(3).normal(size=(worlds, 12, 2)) * 2
+    return scene.start(0, worlds=worlds).with_motion(np.repeat(pos[None], worlds, axis=0), vel)
+
+
+def gaps(scene: Scene, state: State) -> Array:
+    way = scene.space.displacement(state.pos, np.roll(state.pos, -1, axis=1))
+    return np.asarray(np.linalg.norm(way, axis=2))
+
+
+def test_free_bodies_keep_momentum_lengths_and_energy_across_the_seam_of_a_torus() -> None:
+    """Once their velocities suit their rods."""
+    scene = free()
+    state = scene.step(ring_state(scene, worlds=3))
+    mass = scene.body.mass[None, :, None]
+    carried, kinetic = (state.vel * mass).sum(axis=1), (mass * state.vel**2).sum(axis=(1, 2))
+    for _ in range(20):
+        state = scene.run(state, 20)
+        np.testing.assert_allclose(gaps(scene, state), 1.0, rtol=1e-9)
+        assert ((state.pos >= 0) & (state.pos < 20)).all()
+    np.testing.assert_allclose((state.vel * mass).sum(axis=1), carried, atol=1e-12 * 400)
+    np.testing.assert_allclose((mass * state.vel**2).sum(axis=(1, 2)), kinetic, rtol=1e-2)
+
+
+def test_a_world_of_a_batch_is_that_world_alone_and_the_order_of_the_rods_is_none() -> None:
+    scene = free()
+    start = ring_state(scene, worlds=3)
+    batch = scene.run(start, 50)
+    for k in range(3):
+        alone = scene.run(start.worlds([k]), 50)
+        np.testing.assert_array_equal(alone.x[:, 0], batch.x[:, k])
+        np.testing.assert_array_equal(alone.v[:, 0], batch.v[:, k])
+    shuffled = np.random.default_rng(0).permutation([((k + 1) % 12, k) for k in range(12)]).tolist()
+    other = free(pairs=tuple(map(tuple, shuffled)))
+    np.testing.assert_array_equal(other.run(start, 50).pos, batch.pos)
+    third = free(pairs=tuple(((k + 7) % 12, (k + 8) % 12) for k in range(12)), tolerance=1e-13)
+    np.testing.assert_allclose(third.run(start, 50).pos, batch.pos, atol=1e-7)
+
+
+def test_the_dead_and_the_held_are_where_they_were() -> None:
+    """Who is dead pulls nobody; of two who are held nobody moves, and nobody is told."""
+    scene = free(pairs=((0, 1), (1, 2)))
+    start = ring_state(scene)
+    start.alive[0, 1] = False
+    end = scene.run(start, 20)
+    np.testing.assert_array_equal(end.vel[0, [0, 2]], start.vel[0, [0, 2]])
+    np.testing.assert_array_equal(end.pos[0, 1], start.pos[0, 1])
+    both = hanging(Rope(links=1, start=(0, 0), end=(1, 0), length=2.0, pinned=("ends",)), 0.01)
+    here = both.start(0)
+    np.testing.assert_array_equal(both.run(here, 5).pos, here.pos)
+
+
+@pytest.mark.slow  # two kernels
+def test_single_precision_holds_as_far_as_its_numbers_go() -> None:
+    scene = free().model_copy(update={"dtype": "float32"})
+    end = scene.run(ring_state(scene), 200)
+    np.testing.assert_allclose(gaps(scene, end), 1.0, rtol=4e-5)
+
+
+# --- ropes ----------------------------------------------------------------------------------------------------------
+
+
+def test_a_slack_rope_lets_fly_and_a_taut_one_never_adds_energy() -> None:
+    """Thrown up inside its length it flies a parabola, is caught, and swings on with what is left."""
+    scene, state = pendulum(0.002, 0.0, slack=True)
+    pos, vel = np.array(state.pos), np.array(state.vel)
+    pos[0, 1], vel[0, 1] = (0.3, -0.2), (1.5, 2.0)
+    state = state.with_motion(pos, vel)
+    flown = scene.run(state, 100)
+    np.testing.assert_allclose(flown.pos[0, 1], [0.3 + 1.5 * 0.2, -0.2 + 2.0 * 0.2 - G / 2 * 0.04], atol=1e-9)
+    before, caught = energy(state)[0], False
+    for _ in range(600):
+        state = scene.run(state, 5)
+        now = energy(state)[0]
+        assert lengths(state).max() <= 1 + 1e-9
+        assert now <= before + 1e-4 * G  # Verlet's own, while it swings
+        caught |= now < before - 0.01
+        before = min(before, now)
+    assert caught
+    assert abs(state.pos[0, 1]).max() <= 1 + 1e-9
+
+
+def test_of_two_ropes_only_the_one_that_ends_taut_has_pulled() -> None:
+    """Agent 2 leaves the reach of both in one step; once 1 has pulled, the rope to 0 is slack: as if it were not."""
+    both, one = (
+        free(pairs=((0, 2), (1, 2)), lengths=(0.83, 1.15), slack=True),
+        free(pairs=((1, 2),), lengths=(1.15,), slack=True),
+    )
+    pos = np.arange(24.0).reshape(1, 12, 2) / 4
+    vel = np.zeros((1, 12, 2))
+    pos[0, :3], vel[0, 2] = [(10, 9.2), (9, 9.5), (10, 10)], (30, 0)
+    start = both.start(0).with_motion(pos, vel)
+    first, second = both.step(start), one.step(start)
+    assert np.linalg.norm(first.pos[0, 2] - first.pos[0, 0]) < 0.8
+    assert np.linalg.norm(first.pos[0, 2] - first.pos[0, 1]) == pytest.approx(1.15)
+    np.testing.assert_allclose(first.pos, second.pos, atol=1e-9)
+    np.testing.assert_allclose(first.vel, second.vel, atol=1e-7)
+
+
+# --- what cannot be met ---------------------------------------------------------------------------------------------
+
+
+def test_what_is_wrong_to_begin_with_is_mended_without_a_speed() -> None:
+    stretched = Rope(links=4, length=1.0, direction=(1, 0), stretch=1.5)
+    scene = hanging(stretched, 0.01, gravity=0.0)
+    end = scene.step(scene.start(0))
+    np.testing.assert_allclose(lengths(end), 0.25, rtol=1e-9)
+    np.testing.assert_allclose(end.vel, 0, atol=1e-12)
+    np.testing.assert_allclose(end.pos.mean(axis=1), scene.start(0).pos.mean(axis=1), atol=1e-12)
+    together = free(pairs=((0, 1),), lengths=(0.4,))
+    start = ring_state(together)
+    start.pos[0, 1], start.vel[...] = start.pos[0, 0], 0.0
+    np.testing.assert_allclose(gaps(together, together.step(start))[0, 0], 0.4, rtol=1e-9)
+
+
+def test_too_few_sweeps_are_told_once() -> None:
+    sheet = Cloth(cells=(9, 9), edges=((1, 0), (0, 1)), pinned=("top",))
+    cloth = hanging(sheet, 0.02, gravity=0.0, most=3)
+    start = cloth.start(0)
+    start.vel[0, cloth.body.mass < 1e9] = np.random.default_rng(0).normal(size=(90, 2))
+    with pytest.warns(UnmetWarning, match=r"after most = 3 sweeps agents \d+ and \d+ were .* more sweeps") as told:
+        end = cloth.run(start, 50)
+    assert len(told) == 1
+    assert (end.vel**2).sum() <= (start.vel**2).sum()
+    start.vel[...] *= 0.2
+    enough = hanging(sheet, 0.005)
+    hung = enough.run(start.with_dt(0.005), 20)  # and here nobody is told
+    assert np.abs(np.linalg.norm(hung.pos[0, 1] - hung.pos[0, 0]) - 1 / 9) < 1e-9
+
+
+@pytest.mark.parametrize(("fields", "message"), [
+    ({}, "group: give either"),
+    ({"group": 0, "pairs": ((0, 1),), "lengths": (1.0,)}, "group: give either"),
+    ({"pairs": ((0, 1), (1, 2))}, "lengths: 0 of them; 1 or 2"),
+    ({"pairs": ((0, 1), (1, 2), (2, 3)), "lengths": (1.0, 2.0)}, "lengths: 2 of them; 1 or 3"),
+    ({"group": 0, "lengths": (1.0,)}, "lengths: 1 of them; none"),
+    ({"pairs": ((1, 1),), "lengths": (1.0,)}, r"pairs\[0\] = \(1, 1\): two different"),
+    ({"pairs": ((0, 1), (1, 0)), "lengths": (1.0,)}, r"pairs\[1\] = \(1, 0\): is pairs\[0\] again"),
+    ({"pairs": ((0, 1),), "lengths": (0.0,)}, "lengths"),
+    ({"pairs": ((0, 1),), "lengths": (math.inf,)}, "lengths"),
+    ({"pairs": ((0, -1),), "lengths": (1.0,)}, "pairs"),
+    ({"pairs": ((0, 1.5),), "lengths": (1.0,)}, "pairs"),
+    ({"group": 0, "tolerance": 0.0}, "tolerance"),
+    ({"group": 0, "most": 0}, "most"),
+])  # fmt: skip
+def test_bad_rods_are_refused_in_one_line(fields: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message) as caught:
+        Rods(**fields)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(("rods", "message"), [
+    (Rods(pairs=((0, 12),), lengths=(1.0,)), r"constraints\[0\].pairs: there is no agent 12, they are 0 to 11"),
+    (Rods(group=2), r"constraints\[0\].group = 2: there are 2 groups"),
+    (Rods(group=1), r"constraints\[0\].group = 1: has no network"),
+    (Rods(pairs=((0, 1),), lengths=(10.1,)), r"constraints\[0\].lengths: 10.1 m reaches around the torus"),
+])  # fmt: skip
+def test_scenes_that_rods_do_not_suit_are_refused(rods: Rods, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        free().model_copy(update={"constraints": (rods,)})
+
+
+def test_a_scene_with_rods_is_a_file_and_a_value(tmp_path: Path) -> None:
+    scene = free(tolerance=1e-8, slack=True)
+    (tmp_path / "ring.yaml").write_text(dump_scene(scene))
+    assert load_scene(tmp_path / "ring.yaml") == scene
+    assert pickle.loads(pickle.dumps(scene)) == scene
