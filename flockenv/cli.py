@@ -382,16 +382,19 @@ def _write_picture(path: Path, panel: Panel, title: str, fps: float, size: int) 
     if path.suffix.lower() == ".html":
         write_replay(path, [Group(title, [panel])], title)
     elif path.suffix.lower() == ".png":
-        write_png(path, draw(panel.snapshots[-1], size=size, trails=panel.snapshots[-TRAIL:-1]))
+        behind = max(TRAIL, 1 + math.ceil(fps * max((look.trail for look in panel.snapshots[-1].looks), default=0.0)))
+        write_png(path, draw(panel.snapshots[-1], size=size, trails=panel.snapshots[-behind:-1]))
     else:
         stride = math.ceil(fps / MOST_FPS)
-        write_gif(path, _frames(panel.snapshots[::stride], size), fps / stride)
+        write_gif(path, _frames(panel.snapshots[::stride], size, fps / stride), fps / stride)
 
 
-def _frames(snapshots: Sequence[Snapshot], size: int) -> Iterator[Any]:
+def _frames(snapshots: Sequence[Snapshot], size: int, fps: float) -> Iterator[Any]:
+    """Draw every snapshot, with ways behind those whose look has one."""
     from flockenv.render import draw
 
+    behind = math.ceil(fps * max((look.trail for look in snapshots[0].looks), default=0.0))
     with progress_bar("drawing", len(snapshots), "frames") as progress:
         for k, snapshot in enumerate(snapshots):
             progress(k)
-            yield draw(snapshot, size=size)
+            yield draw(snapshot, size=size, trails=snapshots[max(0, k - behind) : k], all_trails=False)

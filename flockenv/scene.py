@@ -21,6 +21,7 @@ from numpy.typing import ArrayLike, NDArray
 from pydantic import Field, WrapValidator, model_validator
 
 from flockenv import state as states
+from flockenv.appearance import Appearance
 from flockenv.constraints import CONSTRAINTS, Constraint, Settler
 from flockenv.crew import share, threads
 from flockenv.divergence import SimulationDiverged
@@ -136,6 +137,7 @@ class Group(Record):
     role: Literal["agent", "learner", "pursuer", "evader", "flockmate"] = Field(
         default="agent", description="what it is in pictures"
     )
+    appearance: Appearance | None = Field(default=None, description="how it is drawn; none = as its role is")
 
     @model_validator(mode="after")
     def _one_or_the_other(self) -> Group:
@@ -593,7 +595,8 @@ class Scene(Record):
         begun, failed = state.tick.copy(), np.zeros(len(state.tick), np.bool_)
         found = (-1, -1)
         for step in range(steps):
-            x0[...], v0[...] = state.x, state.v
+            if self._looks_back:
+                x0[...], v0[...] = state.x, state.v
             moved = self._moved(state, drive, 1)
             mended = self._mended(x0, v0, state)
             failed |= state.tick != begun + step + 1
@@ -605,6 +608,11 @@ class Scene(Record):
         if failed.any():
             state.put(failed, kept)
         return found
+
+    @functools.cached_property
+    def _looks_back(self) -> bool:
+        """Does what a step must end with depend on where it began?"""
+        return bool(self.constraints) or any(member.looks_back for member in self.population)
 
     def _remembered(self, state: State) -> tuple[State, Floats, Floats]:
         """Return a copy of a state, and room for positions and velocities: memory of this thread's own, used again."""
@@ -676,7 +684,7 @@ class Scene(Record):
             has, keeps = ("keeps" if rows else "keeps no" for rows in (len(state.frame), self.parts.frame_rows))
             raise ValueError(f"the state {has} headings, but this scene {keeps} headings")
         if state.identity.shape[1] != (self.agents if self.population else 0):
-            has, keeps = ("identities" if there else "no identities" for there in (state.identity.size, self.population))
+            has, keeps = ("identities" if k else "no identities" for k in (state.identity.size, self.population))
             raise ValueError(f"the state has {has}, but this scene has {keeps}: only a population gives them")
         if state.dt != self.dt:
             raise ValueError(
@@ -738,7 +746,22 @@ class Scene(Record):
             marks=self.marks,
             low=np.array(low, np.float64), high=np.array(high, np.float64),
             periodic=self.space.periodic, title=title, bonds=self.edges, outlines=self.outlines(low, high),
+            looks=self.looks, look=self.look if self.looks else None,
+            age=state.age[world] if self.population else None,
+            identity=state.identity[world] if self.population else None,
         )  # fmt: skip
+
+    @property
+    def looks(self) -> tuple[Appearance, ...]:
+        """How some groups are drawn."""
+        return tuple(group.appearance for group in self.groups if group.appearance is not None)
+
+    @property
+    def look(self) -> NDArray[np.int32]:
+        """Which of `looks` everybody has, (N,); -1 = none."""
+        dressed = [group.appearance is not None for group in self.groups]
+        number = np.where(dressed, np.cumsum(dressed) - 1, -1)
+        return np.repeat(number, [group.size for group in self.groups]).astype(np.int32)
 
     def outlines(
         self, low: Sequence[float] | NDArray[np.float64], high: Sequence[float] | NDArray[np.float64]
@@ -751,7 +774,8 @@ class Scene(Record):
         """Return the region to show: the space, or where everybody is."""
         if not isinstance(self.space, Plane):
             return (0.0,) * self.dimension, self.space.extent(self.dimension)
-        pos = state.pos[world]
+        pos, living = state.pos[world], state.alive[world]
+        pos = pos[living] if self.population and living.any() else pos  # slots of nobody are nowhere
         margin = 1.0 + 0.05 * float(np.ptp(pos, axis=0).max())
         low, high = pos.min(axis=0) - margin, pos.max(axis=0) + margin
         every = np.concatenate([low[None], high[None], *self.extremes])
@@ -761,7 +785,8 @@ class Scene(Record):
     def extremes(self) -> list[Floats]:
         """Places that a picture must show whoever is there: of shapes, of the ways that behaviours are about."""
         tracks = [np.asarray(track) + side for track, radius in self._tracks for side in (-radius, radius)]
-        return [*(np.asarray(shape.extremes) for shape in self.shapes), *tracks]
+        places = [member.place.extremes for member in self.population if isinstance(member, Emitter)]
+        return [*(np.asarray(shape.extremes) for shape in self.shapes), *places, *tracks]
 
     @functools.cached_property
     def _tracks(self) -> tuple[tuple[tuple[tuple[float, ...], ...], float], ...]:

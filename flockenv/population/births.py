@@ -41,7 +41,7 @@ def due(row: Any, time: float, dt: float) -> int:
     if row[4] == 0.0:
         return int(row[5]) if time + 1e-9 * dt >= row[2] else 0
     expected = row[4] * (min(time, row[3]) - row[2])
-    return int(math.floor(expected * (1.0 + 4e-16) + 1e-9)) if expected > 0.0 else 0
+    return math.floor(expected * (1.0 + 4e-16) + 1e-9) if expected > 0.0 else 0
 
 
 @law
@@ -114,7 +114,8 @@ def _within(piece: Any, spot: Vec) -> bool:
 def _on_surface(flat: bool, row: Any, pieces: Any, key: Any, who: int, channel: int) -> tuple[Vec, Vec]:
     """Return a place of a surface, and the outward normal there."""
     first, end = int(row[PLACE]), int(row[PLACE + 1])
-    spot, normal = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
+    spot: Vec = (0.0, 0.0, 0.0)
+    normal: Vec = spot
     for attempt in range(TRIES):
         draws = _draw(key, who, channel + 16 * attempt)
         low, high = first, end - 1
@@ -163,7 +164,8 @@ def _in_clearing(
     born: Any, identity: Any,
 ) -> Vec:  # fmt: skip
     """Return that of some places of a box that has the fewest of the living around it; of equals the first."""
-    best, fewest = (0.0, 0.0, 0.0), 2**62
+    best: Vec = (0.0, 0.0, 0.0)
+    fewest = 2**62
     for attempt in range(int(row[PLACE + 7])):
         spot = _in_box(row, _draw(key, who, channel + 16 * attempt))
         near = count_near(x, b, spot, row[PLACE + 6], fewest, period, grid, start, order, born, identity, -1)
@@ -182,74 +184,94 @@ def _into_space(walls: bool, period: Any, size: float, radius: float, p: float) 
 
 
 @kernel
+def _spot(
+    d: int, row: Any, pieces: Any, x: Any, b: int, key: Any, who: int, channel: int, period: Any, grid: Any, start: Any,
+    order: Any, born: Any, identity: Any,
+) -> tuple[Vec, Vec]:  # fmt: skip
+    """Return where somebody is born, and whither the direction is: the row's, or the outward normal of a surface."""
+    draws, aim = _draw(key, who, channel), _three(row, 10)
+    if row[16] <= 1.0:
+        return _in_box(row, (draws[0], draws[0], draws[0])), aim
+    if row[16] == 2.0:
+        return _in_disc(row, d == 2, draws), aim
+    if row[16] == 4.0:
+        spot, normal = _on_surface(d == 2, row, pieces, key, who, channel)
+        return spot, select(row[9] == 1.0, normal, aim)
+    spot = _in_box(row, draws)
+    if order is not None:  # noqa: SIM102  # alone, numba leaves the rest away
+        if row[16] == 5.0:
+            spot = _in_clearing(x, b, row, key, who, channel, period, grid, start, order, born, identity)
+    return spot, aim
+
+
+@kernel
 def births(
     streams: Any, pieces: Any, clearing: float, x: Any, v: Any, frame: Any, alive: Any, identity: Any, born: Any,
     dies: Any, tick: Any, key: Any, work: Any, radius: Any, dt: float, walls: bool, size: Any, period: Any, first: int,
     end: int, grid: Any, cell: Any, start: Any, order: Any,
 ) -> None:  # fmt: skip
-    """Bring to life who is due in the step that ends now, in worlds [first, end); before the first step, who is at once.
+    """Bring to life who is due in the step that ends now, in worlds [first, end); at the start, who is at once.
 
     clearing: m, the widest radius within which neighbours are asked for; where nobody asks, grid, cell, start and order
     are None, and nothing of it is compiled. walls: is the space a box of `size` (3,) m? period (3,) m: 0 where an axis
     does not repeat.
     """
-    d, n, kinds = x.shape[0], x.shape[2], streams.shape[0]
+    n, kinds = x.shape[2], streams.shape[0]
     for b in range(first, end):
-        now = tick[b] * dt
-        begun = now - dt
         sorted_, slot, until = False, 0, -1
         for e in range(kinds):
             row = streams[e]
             before = due(row, (tick[b] - 1) * dt, dt) if tick[b] > 0 else 0
-            after = due(row, now, dt)
-            if order is not None:
+            after = due(row, tick[b] * dt, dt)
+            if order is not None:  # noqa: SIM102  # alone, numba leaves the rest away
                 if after > before and not sorted_:
                     sort_living(x, alive, b, 0, n, clearing, period, grid, cell, start, order)
                     sorted_ = True
             if until != int(row[1]):  # streams of a group come one after another, and go on where the last one ended
                 slot, until = int(row[0]), int(row[1])
-            for k in range(before, after):
-                who = n + k * kinds + e
-                when = row[2] + (k + 1) / row[4] if row[4] > 0.0 else row[2]
-                when = min(max(when, begun), now)
-                life = row[13]
-                if life < math.inf:
-                    life += (row[14] - row[13]) * uniform(key[b], 0, who, CHANNEL + 3)
-                if when + life <= now:  # born and dead within the step
-                    work[b, BIRTHS] += 1
-                    work[b, DEATHS] += 1
-                    continue
-                while slot < until and alive[b, slot]:
-                    slot += 1
-                if slot >= until:
-                    work[b, REFUSED] += after - k
-                    break
-                drawn, channel = (n + e, TOGETHER) if row[15] == 1.0 else (who, CHANNEL + 16)
-                draws = _draw(key[b], drawn, channel)
-                normal = _three(row, 10)
-                if row[16] <= 1.0:
-                    spot = _in_box(row, (draws[0], draws[0], draws[0]))
-                elif row[16] == 2.0:
-                    spot = _in_disc(row, d == 2, draws)
-                elif row[16] == 3.0:
-                    spot = _in_box(row, draws)
-                elif row[16] == 4.0:
-                    spot, out = _on_surface(d == 2, row, pieces, key[b], drawn, channel)
-                    normal = select(row[9] == 1.0, out, normal)
-                else:
-                    spot = _three(row, PLACE)
-                    if order is not None:
-                        spot = _in_clearing(
-                            x, b, row, key[b], drawn, channel, period, grid, start, order, born, identity
-                        )  # fmt: skip
-                draws = _draw(key[b], who, CHANNEL)
-                vel = scale(_cone(d == 2, normal, row[8], draws[1], draws[2]), row[6] + (row[7] - row[6]) * draws[0])
-                spot = add(spot, scale(vel, now - when))
-                for j in range(d):
-                    v[j, b, slot] = vel[j]
-                    x[j, b, slot] = _into_space(walls, period[j], size[j], float(radius[slot]), spot[j])
-                alive[b, slot] = True
-                identity[b, slot], born[b, slot], dies[b, slot] = who, when, when + life
-                if frame.shape[0] > 0:
-                    face_one(v, frame, b, slot, True)
-                work[b, BIRTHS] += 1
+            slot = _bear(
+                before, after, e, kinds, slot, until, row, pieces, x, v, frame, alive, identity, born, dies,
+                tick[b] * dt, key[b], work, radius, dt, walls, size, period, b, grid, start, order,
+            )  # fmt: skip
+
+
+@kernel
+def _bear(
+    before: int, after: int, stream: int, kinds: int, slot: int, until: int, row: Any, pieces: Any, x: Any, v: Any,
+    frame: Any, alive: Any, identity: Any, born: Any, dies: Any, now: float, key: Any, work: Any, radius: Any,
+    dt: float, walls: bool, size: Any, period: Any, b: int, grid: Any, start: Any, order: Any,
+) -> int:  # fmt: skip
+    """Bring births `before` to `after` of a stream to life, in free slots from `slot` on; return where that ends."""
+    d, n = x.shape[0], x.shape[2]
+    for k in range(before, after):
+        who = n + k * kinds + stream
+        when = row[2] + (k + 1) / row[4] if row[4] > 0.0 else row[2]
+        when = min(max(when, now - dt), now)
+        life = row[13]
+        if life < math.inf:
+            life += (row[14] - row[13]) * uniform(key, 0, who, CHANNEL + 3)
+        if when + life <= now:  # born and dead within the step
+            work[b, BIRTHS] += 1
+            work[b, DEATHS] += 1
+            continue
+        while slot < until and alive[b, slot]:
+            slot += 1
+        if slot >= until:
+            work[b, REFUSED] += after - k
+            break
+        drawn, channel = (n + stream, TOGETHER) if row[15] == 1.0 else (who, CHANNEL + 16)
+        spot, aim = _spot(
+            d, row, pieces, x, b, key, drawn, channel, period, grid, start, order, born, identity
+        )  # fmt: skip
+        draws = _draw(key, who, CHANNEL)
+        vel = scale(_cone(d == 2, aim, row[8], draws[1], draws[2]), row[6] + (row[7] - row[6]) * draws[0])
+        spot = add(spot, scale(vel, now - when))
+        for j in range(d):
+            v[j, b, slot] = vel[j]
+            x[j, b, slot] = _into_space(walls, period[j], size[j], float(radius[slot]), spot[j])
+        alive[b, slot] = True
+        identity[b, slot], born[b, slot], dies[b, slot] = who, when, when + life
+        if frame.shape[0] > 0:
+            face_one(v, frame, b, slot, True)
+        work[b, BIRTHS] += 1
+    return slot

@@ -35,10 +35,14 @@ def _die(b: int, i: int, v: Any, alive: Any, work: Any) -> None:
     work[b, DEATHS] += 1
 
 
-@kernel
-def _exposed(born: float, now: float, dt: float) -> float:
-    """Return how long somebody has been alive since sinks asked last, s: longer than a step if born within the last."""
-    return now - born if born > now - (2.0 - 1e-6) * dt and born < now - dt else dt
+@law
+def _chance(rate: float, usual: float, born: float, now: float, dt: float) -> float:
+    """Return with which probability somebody dies since sinks asked last; `usual` is that of a step, 1 - exp(-rate dt).
+
+    Who was born within the step before was not asked then: he has been alive for longer than a step.
+    """
+    late = born > now - (2.0 - 1e-6) * dt and born < now - dt
+    return 1.0 - math.exp(-rate * (now - born)) if late else usual
 
 
 @kernel
@@ -57,6 +61,7 @@ def passing(
                 _die(b, i, v, alive, work)
         for s in range(sinks.shape[0]):
             row = sinks[s]
+            usual = 1.0 - math.exp(-row[3] * dt) if row[0] == 2.0 else 0.0
             for i in range(int(row[1]), int(row[2])):
                 if not alive[b, i]:
                     continue
@@ -67,7 +72,7 @@ def passing(
                     for k in range(x.shape[0]):
                         gone = gone or not (row[3 + k] <= x[k, b, i] <= row[6 + k])
                 else:
-                    chance = 1.0 - math.exp(-row[3] * _exposed(born[b, i], now, dt))
+                    chance = _chance(row[3], usual, born[b, i], now, dt)
                     gone = uniform(key[b], tick[b], identity[b, i], DECAY + channel + s) < chance
                 if gone:
                     _die(b, i, v, alive, work)
@@ -85,16 +90,16 @@ def _drained(table: Any, form: int, margin: float, y: Vec, way: Vec) -> bool:
     ray, begin = unit(way), sub(y, way)
     if form == 0:
         gap, _ = nearest_chain(table, 0, y)
-        return gap <= margin or hit_chain(table, 0, begin, ray, margin) <= far  # type: ignore[no-any-return]
+        return gap <= margin or hit_chain(table, 0, begin, ray, margin) <= far
     elif form == 1:
         gap, _ = nearest_block(table, 0, y)
-        return gap <= margin or hit_block(table, 0, begin, ray, margin) <= far  # type: ignore[no-any-return]
+        return gap <= margin or hit_block(table, 0, begin, ray, margin) <= far
     elif form == 2:
         gap, _ = nearest_half_space(table, 0, y)
-        return gap <= margin or hit_half_space(table, 0, begin, ray, margin) <= far  # type: ignore[no-any-return]
+        return gap <= margin or hit_half_space(table, 0, begin, ray, margin) <= far
     else:
         gap, _ = nearest_distance_field(table, 0, y)
-        return gap <= margin or hit_distance_field(table, 0, begin, ray, margin) <= far  # type: ignore[no-any-return]
+        return gap <= margin or hit_distance_field(table, 0, begin, ray, margin) <= far
 
 
 @kernel
@@ -149,14 +154,12 @@ def crowding(
             if not alive[b, i]:
                 continue
             if row[5] < math.inf:
-                chance = 1.0 - math.exp(-row[5] * _exposed(born[b, i], now, dt))
+                chance = _chance(row[5], 1.0 - math.exp(-row[5] * dt), born[b, i], now, dt)
                 if uniform(key[b], tick[b], identity[b, i], DECAY + channel) >= chance:
                     continue
             place = (float(x[0, b, i]), float(x[1, b, i]), float(x[2, b, i]) if x.shape[0] == 3 else 0.0)
             most = int(row[4])
-            doomed[i] = (
-                count_near(x, b, place, row[3], most, period, grid, start, order, born, identity, i) > most
-            )
+            doomed[i] = count_near(x, b, place, row[3], most, period, grid, start, order, born, identity, i) > most
         for i in range(low, high):
             if doomed[i]:
                 _die(b, i, v, alive, work)

@@ -111,7 +111,7 @@ class Emitter(Member):
 
     def rows(self, first: int, end: int, dimension: int) -> list[list[float]]:
         """Return a row of numbers for the rate and for each burst, as births.py reads them; slots are [first, end)."""
-        spread = (0.0 if self.direction is not None or isinstance(self.place, Surface) else 180.0)
+        spread = 0.0 if self.direction is not None or isinstance(self.place, Surface) else 180.0
         spread = math.radians(spread if self.spread is None else self.spread)
         aim = in_space(self.direction or (1.0,) + (0.0,) * (dimension - 1))
         length = math.hypot(*aim)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, ClassVar
 
 from flockenv.records import Record
 
@@ -16,6 +16,8 @@ class Member(Record):
     """What brings agents to life, or lets them die, at the end of a step."""
 
     kind: str
+    looks_back: ClassVar[bool] = False
+    """Does it ask where everybody was before the step?"""
 
     @classmethod
     def __pydantic_init_subclass__(cls, **kwargs: Any) -> None:

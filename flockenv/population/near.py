@@ -55,7 +55,7 @@ def _divide(d: int, reach: float, most: int, grid: Any) -> int:
 @kernel
 def _cell_along(p: float, k: int, grid: Any) -> int:
     """Return the cell along an axis in which an agent counts."""
-    c = int(math.floor((p - grid[0, k]) * grid[3, k]))
+    c: int = math.floor((p - grid[0, k]) * grid[3, k])
     return min(max(c, 0), int(grid[2, k]) - 1)
 
 
@@ -122,9 +122,9 @@ def count_near(
     """
     d, found = x.shape[0], 0
     nx, ny, nz = int(grid[2, 0]), int(grid[2, 1]), int(grid[2, 2])
-    cx = int(math.floor((_inside(place[0], period[0]) - grid[0, 0]) * grid[3, 0]))
-    cy = int(math.floor((_inside(place[1], period[1]) - grid[0, 1]) * grid[3, 1]))
-    cz = int(math.floor((_inside(place[2], period[2]) - grid[0, 2]) * grid[3, 2])) if d == 3 else 0
+    cx = math.floor((_inside(place[0], period[0]) - grid[0, 0]) * grid[3, 0])
+    cy = math.floor((_inside(place[1], period[1]) - grid[0, 1]) * grid[3, 1])
+    cz = math.floor((_inside(place[2], period[2]) - grid[0, 2]) * grid[3, 2]) if d == 3 else 0
     for tz in range(3):
         z = _neighbouring(cz, tz, nz, period[2] > 0.0) if d == 3 else (0 if tz == 0 else -1)
         for ty in range(3):

@@ -128,16 +128,15 @@ class Disc(Place):
             raise ValueError(f"axis = {self.axis}: only in 3-D does a disc lie across something")
 
 
-class BoxPlace(Place):
-    """A box along the axes."""
+class _Corners(Place):
+    """What lies between two corners."""
 
-    kind: Literal["box"] = "box"
-    code: ClassVar[int] = 3
     low: Vector = Field(description="m, lower corner")
     high: Vector = Field(description="m, upper corner")
 
     @model_validator(mode="after")
-    def _ordered(self) -> BoxPlace:
+    def _ordered(self) -> _Corners:
+        """Refuse corners that are none."""
         ordered(self.low, self.high)
         return self
 
@@ -153,6 +152,13 @@ class BoxPlace(Place):
     def check(self, scene: Any) -> None:
         """Refuse other dimensions."""
         dimensions(scene, low=self.low, high=self.high)
+
+
+class BoxPlace(_Corners):
+    """A box along the axes."""
+
+    kind: Literal["box"] = "box"
+    code: ClassVar[int] = 3
 
 
 class Surface(Place):
@@ -185,7 +191,7 @@ class Surface(Place):
         self.pieces()
 
 
-class Clearing(BoxPlace):
+class Clearing(_Corners):
     """Where few are in a box: of some places that are drawn, the one that has the fewest of the living around it."""
 
     kind: Literal["clearing"] = "clearing"

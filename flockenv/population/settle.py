@@ -44,8 +44,8 @@ class _Scratch:
     @classmethod
     def of(cls, agents: int, asks: bool) -> _Scratch:
         n = agents if asks else 1
-        whole = (np.zeros(size, np.int32) for size in (n, n + 1, n))
-        return cls(np.zeros((4, 3)), *whole, np.zeros(n, np.bool_))
+        cell, start, order = (np.zeros(size, np.int32) for size in (n, n + 1, n))
+        return cls(np.zeros((4, 3)), cell, start, order, np.zeros(n, np.bool_))
 
 
 def _sized(scene: Any, there: bool) -> NDArray[np.float64]:

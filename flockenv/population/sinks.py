@@ -92,6 +92,7 @@ class Drain(Sink):
 
     kind: Literal["drain"] = "drain"
     code: ClassVar[int] = 3
+    looks_back: ClassVar[bool] = True
     shape: AnyShape = Field(description="as obstacles are; it need not be one")
     margin: float = Field(default=0.0, ge=0, description="m")
 
@@ -114,8 +115,8 @@ class Drain(Sink):
 class Crowding(Sink):
     """Where it is too crowded the youngest die: who has more than `most` elders within a radius.
 
-    Elders are those of the same group (or all) who were born earlier. With a rate, each of them dies at random; without,
-    at once.
+    Elders are those of the same group (or all) who were born earlier. With a rate, each of the youngest dies at random;
+    without, at once.
     """
 
     kind: Literal["crowding"] = "crowding"

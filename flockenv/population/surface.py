@@ -8,6 +8,7 @@ tube's line, and its radius.
 
 from __future__ import annotations
 
+import itertools
 import math
 from typing import Any
 
@@ -85,7 +86,7 @@ def _chain(shape: Any) -> list[list[float]]:
     around = 2.0 if shape.dimension == 2 else 2.0 * math.pi * radius
     ends = 2.0 * math.pi * radius if shape.dimension == 2 else 4.0 * math.pi * radius**2
     found = []
-    for a, b in zip(line[:-1], line[1:], strict=True):
+    for a, b in itertools.pairwise(line):
         length = math.dist(a, b)
         # a line without thickness in space has no surface: its length counts
         size = length * (around if around > 0 else 1.0)
