@@ -129,7 +129,7 @@ def _options(
 
 @app.command("list")
 def listing() -> None:
-    """Show the tasks and their ids, effects, behaviours, integrators and spaces, each in one sentence."""
+    """Show the tasks and their ids, effects, behaviours, integrators, emitters, sinks and spaces, a sentence each."""
     import gymnasium
     import pettingzoo
 
@@ -137,6 +137,7 @@ def listing() -> None:
     from flockenv.behaviours import BEHAVIOURS
     from flockenv.effects import EFFECTS
     from flockenv.integrators import INTEGRATORS
+    from flockenv.population import POPULATION
     from flockenv.space import AnySpace
     from flockenv.tasks import TASKS
 
@@ -151,6 +152,7 @@ def listing() -> None:
     show_table(console, "Behaviours", ((kind, _sentence(effect)) for kind, effect in sorted(BEHAVIOURS.items())))
     show_table(console, "Arbitrations", ((kind, _sentence(how)) for kind, how in sorted(ARBITRATIONS.items())))
     show_table(console, "Integrators", ((kind, _sentence(method)) for kind, method in sorted(INTEGRATORS.items())))
+    show_table(console, "Population", ((kind, _sentence(member)) for kind, member in sorted(POPULATION.items())))
     spaces = get_args(get_args(AnySpace)[0])
     show_table(console, "Spaces", ((space.model_fields["kind"].default, _sentence(space)) for space in spaces))
 
