@@ -617,8 +617,10 @@ class Scene(Record):
     def _remembered(self, state: State) -> tuple[State, Floats, Floats]:
         """Return a copy of a state, and room for positions and velocities: memory of this thread's own, used again."""
         memory = vars(self._threads)
-        if "remembered" not in memory or memory["remembered"][0].shape != state.shape:
+        sizes = state.shape, state.obstacle_radius.shape
+        if memory.get("remembered_sizes") != sizes:
             memory["remembered"] = state.copy(), np.empty_like(state.x), np.empty_like(state.v)
+            memory["remembered_sizes"] = sizes
         kept, x0, v0 = memory["remembered"]
         kept.copy_from(state)
         return kept, x0, v0

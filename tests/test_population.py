@@ -246,6 +246,7 @@ def test_a_surface_is_drawn_from_evenly_and_left_along_its_normal(shape: Shape) 
     state = newborn(Surface(shape=shape), dimension=shape.dimension, speed=(1, 1))
     pos, vel = state.pos[0], state.vel[0]
     np.testing.assert_allclose(shape.gap(pos), 0, atol=1e-12)
+    assert shape.gap(pos[:0]).shape == (0,)  # as of a world where nobody lives
     np.testing.assert_allclose(vel, shape.normal(pos + 1e-6 * vel), atol=1e-5)
     # as many in a ball around any place as in one around another, as far as the surface there is flat
     square = ((pos[:, None] - pos[None, :50]) ** 2).sum(axis=2)
@@ -310,6 +311,12 @@ def test_a_clearing_is_filled_first() -> None:
         )  # fmt: skip
         pos = meadow.start(0).pos[0, 300:400]
         assert share[0] <= (pos[:, 0] < 1).mean() <= share[1]
+
+
+def test_who_is_born_faces_ahead() -> None:
+    emitter = Emitter(place=ORIGIN, bursts=(Burst(time=0.0, count=3),), speed=(2, 2), direction=(3, 4))
+    oriented = Scene(groups=(Group(count=5, oriented=True),), population=(emitter,))
+    np.testing.assert_allclose(oriented.start(0).heading[0, :3], [(0.6, 0.8)] * 3, rtol=1e-12)
 
 
 # --- sinks -----------------------------------------------------------------------------------------------------------
