@@ -82,7 +82,8 @@ def main(
                     rate = result.rate
                     bench.note(
                         f"{dimension}-D {dtype}, {result.name}: {1e9 / rate:.3g} ns per particle-step, "
-                        f"{rate / alive:,.0f} steps of {alive:,} per s, {rate / alive * DT:.3g} times as fast as time."
+                        f"{rate / alive:,.0f} steps of {alive:,} per s, {rate / alive * DT:.3g} times as fast as time; "
+                        f"{rate / alive / (result.cores or 1):,.0f} per s of processor time."
                     )
         bench.note("One thread unless FLOCKENV_THREADS says otherwise; ten steps per call.")
 
