@@ -129,7 +129,7 @@ def _options(
 
 @app.command("list")
 def listing() -> None:
-    """Show the tasks and their ids, effects, behaviours, integrators and spaces, each in one sentence."""
+    """Show the tasks and their ids, effects, behaviours, integrators, emitters, sinks and spaces, a sentence each."""
     import gymnasium
     import pettingzoo
 
@@ -137,6 +137,7 @@ def listing() -> None:
     from flockenv.behaviours import BEHAVIOURS
     from flockenv.effects import EFFECTS
     from flockenv.integrators import INTEGRATORS
+    from flockenv.population import POPULATION
     from flockenv.space import AnySpace
     from flockenv.tasks import TASKS
 
@@ -151,6 +152,7 @@ def listing() -> None:
     show_table(console, "Behaviours", ((kind, _sentence(effect)) for kind, effect in sorted(BEHAVIOURS.items())))
     show_table(console, "Arbitrations", ((kind, _sentence(how)) for kind, how in sorted(ARBITRATIONS.items())))
     show_table(console, "Integrators", ((kind, _sentence(method)) for kind, method in sorted(INTEGRATORS.items())))
+    show_table(console, "Population", ((kind, _sentence(member)) for kind, member in sorted(POPULATION.items())))
     spaces = get_args(get_args(AnySpace)[0])
     show_table(console, "Spaces", ((space.model_fields["kind"].default, _sentence(space)) for space in spaces))
 
@@ -382,16 +384,19 @@ def _write_picture(path: Path, panel: Panel, title: str, fps: float, size: int) 
     if path.suffix.lower() == ".html":
         write_replay(path, [Group(title, [panel])], title)
     elif path.suffix.lower() == ".png":
-        write_png(path, draw(panel.snapshots[-1], size=size, trails=panel.snapshots[-TRAIL:-1]))
+        behind = max(TRAIL, 1 + math.ceil(fps * max((look.trail for look in panel.snapshots[-1].looks), default=0.0)))
+        write_png(path, draw(panel.snapshots[-1], size=size, trails=panel.snapshots[-behind:-1]))
     else:
         stride = math.ceil(fps / MOST_FPS)
-        write_gif(path, _frames(panel.snapshots[::stride], size), fps / stride)
+        write_gif(path, _frames(panel.snapshots[::stride], size, fps / stride), fps / stride)
 
 
-def _frames(snapshots: Sequence[Snapshot], size: int) -> Iterator[Any]:
+def _frames(snapshots: Sequence[Snapshot], size: int, fps: float) -> Iterator[Any]:
+    """Draw every snapshot, with ways behind those whose look has one."""
     from flockenv.render import draw
 
+    behind = math.ceil(fps * max((look.trail for look in snapshots[0].looks), default=0.0))
     with progress_bar("drawing", len(snapshots), "frames") as progress:
         for k, snapshot in enumerate(snapshots):
             progress(k)
-            yield draw(snapshot, size=size)
+            yield draw(snapshot, size=size, trails=snapshots[max(0, k - behind) : k], all_trails=False)

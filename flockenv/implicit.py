@@ -99,7 +99,8 @@ def _put(state: State, b: int, alone: State) -> None:
     """Write a world back to its place in the batch."""
     state.x[:, b], state.v[:, b] = alone.x[:, 0], alone.v[:, 0]
     state.frame[:, b] = alone.frame[:, 0]
-    state.tick[b], state.work[b] = alone.tick[0], alone.work[0]
+    for name in ("tick", "work", "alive", "identity", "born", "dies"):
+        getattr(state, name)[b] = getattr(alone, name)[0]
 
 
 def _evaluation(scene: Scene, alone: State, drive: Floats) -> Evaluate:

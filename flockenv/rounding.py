@@ -42,6 +42,9 @@ def _places(scene: Any) -> Iterator[tuple[str, Any]]:
     for k, obstacle in enumerate(scene.obstacles):
         what = "centre" if obstacle.kind == "circle" else "kind = " + obstacle.kind + ": its farthest coordinate"
         yield f"obstacles[{k}].{what}", obstacle.anchor if obstacle.kind == "circle" else obstacle.extremes
+    for k, member in enumerate(scene.population):
+        place = getattr(member, "place", None)
+        yield f"population[{k}].place: its farthest coordinate", () if place is None else place.extremes
     for k, effect in enumerate(scene.effects):
         for name in effect.places:
             yield f"effects[{k}].{name}", getattr(effect, name)

@@ -21,6 +21,7 @@ from numpy.typing import ArrayLike, NDArray
 from pydantic import Field, WrapValidator, model_validator
 
 from flockenv import state as states
+from flockenv.appearance import Appearance
 from flockenv.constraints import CONSTRAINTS, Collisions, Constraint, Settler
 from flockenv.crew import share, threads
 from flockenv.divergence import SimulationDiverged
@@ -33,6 +34,9 @@ from flockenv.kernels import entry, load
 from flockenv.neighbours import FEWEST_AGENTS, WORTH_ARRANGING
 from flockenv.networks import EDGE, AnyNetwork
 from flockenv.noise import MASK, key_of
+from flockenv.population import POPULATION, Emitter, Member, beget
+from flockenv.population import settler as population_settler
+from flockenv.population.settle import NUMBERS as POPULATION_NUMBERS
 from flockenv.records import Record, keep
 from flockenv.rounding import check_places
 from flockenv.shapes import AnyShape, Circle, HalfSpace, Shape, clear_of
@@ -67,6 +71,7 @@ if TYPE_CHECKING:
     AnyEffect = Effect
     AnyIntegrator = Integrator
     AnyConstraint = Constraint
+    AnyMember = Member
 else:
     AnyEffect = Annotated[
         Annotated[functools.reduce(operator.or_, EVERY_EFFECT), Field(discriminator="kind")],
@@ -79,6 +84,10 @@ else:
     AnyConstraint = Annotated[
         Annotated[functools.reduce(operator.or_, CONSTRAINTS.values()), Field(discriminator="kind")],
         WrapValidator(keep(Constraint)),
+    ]
+    AnyMember = Annotated[
+        Annotated[functools.reduce(operator.or_, POPULATION.values()), Field(discriminator="kind")],
+        WrapValidator(keep(Member)),
     ]
 
 
@@ -122,9 +131,13 @@ class Group(Record):
         "says; none = it does not; oriented if given",
     )  # fmt: skip
     spawn: Spawn = Field(default_factory=Spawn)
+    alive: int | None = Field(
+        default=None, ge=0, description="how many live at the start; none = all, or nobody where an emitter feeds them"
+    )
     role: Literal["agent", "learner", "pursuer", "evader", "flockmate"] = Field(
         default="agent", description="what it is in pictures"
     )
+    appearance: Appearance | None = Field(default=None, description="how it is drawn; none = as its role is")
 
     @model_validator(mode="after")
     def _one_or_the_other(self) -> Group:
@@ -135,6 +148,10 @@ class Group(Record):
             self.spawn.low is not None or (any(self.spawn.speed) and not self.spawn.heading)
         ):
             raise ValueError("spawn: a network is where it says; all it may be given is a speed, with a heading")
+        if self.alive is not None and self.network is not None:
+            raise ValueError(f"alive = {self.alive}: all particles of a network live")
+        if self.alive is not None and self.alive > self.size:
+            raise ValueError(f"alive = {self.alive}: at most its count, {self.size}, is allowed")
         return self
 
     @property
@@ -170,6 +187,9 @@ class Scene(Record):
     constraints: tuple[AnyConstraint, ...] = Field(
         default=(), description="what every step must end with, in this order; nothing else is looked after"
     )
+    population: tuple[AnyMember, ...] = Field(
+        default=(), description="who dies and who is born at the end of every step: sinks, in this order, and emitters"
+    )
     dt: float = Field(default=0.02, gt=0, description="s, one physics step")
     dtype: Literal["float64", "float32"] = Field(default="float64", description="precision of everything")
 
@@ -177,7 +197,9 @@ class Scene(Record):
     def _consistent(self) -> Scene:
         """Refuse what no single field can know: dimensions that differ, a reach around the torus, too much memory."""
         self._check_dimensions()
-        listed: dict[str, tuple[Effect | Constraint, ...]] = {"effects": self.effects, "constraints": self.constraints}
+        listed: dict[str, tuple[Effect | Constraint | Member, ...]] = {
+            "effects": self.effects, "constraints": self.constraints, "population": self.population,
+        }  # fmt: skip
         for name, members in listed.items():
             for k, member in enumerate(members):
                 try:
@@ -249,7 +271,7 @@ class Scene(Record):
                     group.network.rest_points(self.dimension)
                 except ValueError as error:
                     raise ValueError(f"groups[{k}].network.{error}") from None
-            elif size is None and group.spawn.low is None:
+            elif size is None and group.spawn.low is None and self.living[k]:
                 raise ValueError(f"groups[{k}].spawn.low: missing; a plane has no size to spread agents over")
 
     def _check_shape(self, k: int, shape: Shape) -> None:
@@ -279,6 +301,15 @@ class Scene(Record):
     def starts(self) -> tuple[int, ...]:
         """The first agent of each group, and N."""
         return (0, *itertools.accumulate(group.size for group in self.groups))
+
+    @functools.cached_property
+    def living(self) -> tuple[int, ...]:
+        """How many of each group live at the start: its first ones."""
+        fed = (any(member.feeds(k) for member in self.population) for k in range(len(self.groups)))
+        return tuple(
+            group.alive if group.alive is not None else (0 if by else group.size)
+            for group, by in zip(self.groups, fed, strict=True)
+        )
 
     @functools.cached_property
     def circles(self) -> tuple[Circle, ...]:
@@ -316,8 +347,10 @@ class Scene(Record):
             whole += 24
         if parts.arranges and self.agents >= WORTH_ARRANGING:
             reals += parts.luggage_size
-        if self.constraints:
+        if self.constraints or self.population:
             reals += 4 * d + sum(constraint.numbers(self) for constraint in self.constraints)
+        if self.population:
+            whole += 2 * 3 * 8 + 4 * POPULATION_NUMBERS  # who, since when, until when, and what they were before
         return self.agents * (reals * real + whole)
 
     @functools.cached_property
@@ -396,16 +429,30 @@ class Scene(Record):
             most = MEMORY_LIMIT / 2**30
             raise ValueError(f"worlds is {worlds}: needs about {need:.3g} GiB, at most {most:g} allowed")
         state = states.blank(
-            worlds, self.agents, self.dimension, len(self.circles), self.dt, self.dtype, self.parts.frame_rows
-        )
+            worlds, self.agents, self.dimension, len(self.circles), self.dt, self.dtype, self.parts.frame_rows,
+            population=bool(self.population),
+        )  # fmt: skip
         state.key[:] = [key_of(seed + k, 0) for k in range(worlds)]
         for m, obstacle in enumerate(self.circles):
             state.obstacles.centre[:, m] = obstacle.centre
             state.obstacle_radius[:, m] = obstacle.radius
         for b in range(worlds):
             self._scatter(state, b)
+        self._bury(state)
         self._face(state)
+        beget(self, state)
         return state
+
+    def _bury(self, state: State) -> None:
+        """Let those be dead who do not live at the start: nobody, where they may be born."""
+        for k, (first, alive) in enumerate(zip(self.starts, self.living, strict=False)):
+            dead = slice(first + alive, self.starts[k + 1])
+            feeding = [member for member in self.population if isinstance(member, Emitter) and member.feeds(k)]
+            state.alive[:, dead], state.vel[:, dead] = False, 0
+            if self.population:
+                state.identity[:, dead] = -1
+            if feeding:
+                state.pos[:, dead] = feeding[0].place.extremes.mean(axis=0)
 
     def _face(self, state: State) -> None:
         """Write where everybody faces in the beginning: whither he flies, or as his group's heading says."""
@@ -554,15 +601,17 @@ class Scene(Record):
 
     def _stepped(self, state: State, drive: Floats, steps: int) -> tuple[int, int]:
         """Step in place without solving: all steps in one call, or each with its end mended."""
-        return self._settled(state, drive, steps) if self.constraints else self._moved(state, drive, steps)
+        ends = self.constraints or self.population
+        return self._settled(state, drive, steps) if ends else self._moved(state, drive, steps)
 
     def _settled(self, state: State, drive: Floats, steps: int) -> tuple[int, int]:
         """Step in place and mend the end of each step; a world in which that fails stays as it was, whole."""
-        kept, begun = state.copy(), state.tick.copy()
-        x0, v0, failed = np.empty_like(state.x), np.empty_like(state.v), np.zeros(len(begun), np.bool_)
+        kept, x0, v0 = self._remembered(state)
+        begun, failed = state.tick.copy(), np.zeros(len(state.tick), np.bool_)
         found = (-1, -1)
         for step in range(steps):
-            x0[...], v0[...] = state.x, state.v
+            if self._looks_back:
+                x0[...], v0[...] = state.x, state.v
             moved = self._moved(state, drive, 1)
             mended = self._mended(x0, v0, state)
             failed |= state.tick != begun + step + 1
@@ -574,6 +623,22 @@ class Scene(Record):
         if failed.any():
             state.put(failed, kept)
         return found
+
+    @functools.cached_property
+    def _looks_back(self) -> bool:
+        """Does what a step must end with depend on where it began?"""
+        return bool(self.constraints) or any(member.looks_back for member in self.population)
+
+    def _remembered(self, state: State) -> tuple[State, Floats, Floats]:
+        """Return a copy of a state, and room for positions and velocities: memory of this thread's own, used again."""
+        memory = vars(self._threads)
+        sizes = state.shape, state.obstacle_radius.shape
+        if memory.get("remembered_sizes") != sizes:
+            memory["remembered"] = state.copy(), np.empty_like(state.x), np.empty_like(state.v)
+            memory["remembered_sizes"] = sizes
+        kept, x0, v0 = memory["remembered"]
+        kept.copy_from(state)
+        return kept, x0, v0
 
     def _mended(self, x0: Floats, v0: Floats, state: State) -> list[tuple[int, int]]:
         """Mend a step that began at x0, v0, constraint after constraint; return every (world, agent) not finite."""
@@ -593,7 +658,8 @@ class Scene(Record):
         """Return what mends steps, for so many threads: each has scratch of its own."""
         kept: list[list[Settler]] = vars(self._threads).setdefault("settlers", [])
         while len(kept) < count:
-            kept.append([constraint.settler(self) for constraint in self.constraints])
+            last = [population_settler(self)] if self.population else []
+            kept.append([constraint.settler(self) for constraint in self.constraints] + last)
         return kept
 
     def _moved(self, state: State, drive: Floats, steps: int) -> tuple[int, int]:
@@ -634,6 +700,9 @@ class Scene(Record):
         if len(state.frame) != self.parts.frame_rows:
             has, keeps = ("keeps" if rows else "keeps no" for rows in (len(state.frame), self.parts.frame_rows))
             raise ValueError(f"the state {has} headings, but this scene {keeps} headings")
+        if state.identity.shape[1] != (self.agents if self.population else 0):
+            has, keeps = ("identities" if k else "no identities" for k in (state.identity.size, self.population))
+            raise ValueError(f"the state has {has}, but this scene has {keeps}: only a population gives them")
         if state.dt != self.dt:
             raise ValueError(
                 f"the state counts steps of {state.dt:g} s, but this scene makes steps of {self.dt:g} s; "
@@ -695,7 +764,22 @@ class Scene(Record):
             low=np.array(low, np.float64), high=np.array(high, np.float64),
             periodic=self.space.periodic, title=title, bonds=self.edges,
             outlines=self.outlines(low, high, float(state.time[world])),
+            looks=self.looks, look=self.look if self.looks else None,
+            age=state.age[world] if self.population else None,
+            identity=state.identity[world] if self.population else None,
         )  # fmt: skip
+
+    @property
+    def looks(self) -> tuple[Appearance, ...]:
+        """How some groups are drawn."""
+        return tuple(group.appearance for group in self.groups if group.appearance is not None)
+
+    @property
+    def look(self) -> NDArray[np.int32]:
+        """Which of `looks` everybody has, (N,); -1 = none."""
+        dressed = [group.appearance is not None for group in self.groups]
+        number = np.where(dressed, np.cumsum(dressed) - 1, -1)
+        return np.repeat(number, [group.size for group in self.groups]).astype(np.int32)
 
     def outlines(
         self, low: Sequence[float] | NDArray[np.float64], high: Sequence[float] | NDArray[np.float64], time: float = 0.0
@@ -718,7 +802,8 @@ class Scene(Record):
         """Return the region to show: the space, or where everybody is."""
         if not isinstance(self.space, Plane):
             return (0.0,) * self.dimension, self.space.extent(self.dimension)
-        pos = state.pos[world]
+        pos, living = state.pos[world], state.alive[world]
+        pos = pos[living] if self.population and living.any() else pos  # slots of nobody are nowhere
         margin = 1.0 + 0.05 * float(np.ptp(pos, axis=0).max())
         low, high = pos.min(axis=0) - margin, pos.max(axis=0) + margin
         every = np.concatenate([low[None], high[None], *self.extremes(float(state.time[world]))])
@@ -728,7 +813,8 @@ class Scene(Record):
         """Return places that pictures of some times, s, must show: of shapes, of the ways that behaviours are about."""
         tracks = [np.asarray(track) + side for track, radius in self._tracks for side in (-radius, radius)]
         shown = [shape.extremes + shape.shift(time) for shape in self.shapes for time in times]
-        return [*shown, *tracks]
+        places = [member.place.extremes for member in self.population if isinstance(member, Emitter)]
+        return [*shown, *places, *tracks]
 
     @functools.cached_property
     def _tracks(self) -> tuple[tuple[tuple[tuple[float, ...], ...], float], ...]:

@@ -10,6 +10,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from flockenv.appearance import Appearance
+
 __all__ = ["KINDS", "ROLES", "Floats", "Mark", "Snapshot"]
 
 Floats = NDArray[np.float64]
@@ -53,6 +55,8 @@ class Snapshot:
     outlines: polygons (n, 2), m, of obstacles that are not round, as seen from above.
     bonds (E, 2): int, pairs of agents that a line is drawn between, the shortest way; none by default.
     heading (N, D): where everybody faces; none by default, and then that is along the velocity.
+    looks: how some are drawn; look (N,): which of these everybody has, -1 = none. age (N,): s, of the living; none by
+    default, and then it is the time. identity (N,): int, who is in each row; none by default, and then always the same.
     Arrays are private copies and read-only; positions and velocities may hold NaN or inf (a run that diverged can be
     looked at: such bodies are left out), everything else is finite.
     Raises ValueError or TypeError, in one line that names the field, on anything else.
@@ -74,6 +78,10 @@ class Snapshot:
     bonds: NDArray[np.int32] = field(default_factory=lambda: np.zeros((0, 2), np.int32))
     outlines: tuple[Floats, ...] = ()
     heading: Floats | None = None
+    looks: tuple[Appearance, ...] = ()
+    look: NDArray[np.int32] | None = None
+    age: Floats | None = None
+    identity: NDArray[np.int64] | None = None
 
     def __post_init__(self) -> None:
         pos = _array("Snapshot.pos", self.pos, (None, None), finite=False)
@@ -97,7 +105,13 @@ class Snapshot:
             heading=None if self.heading is None else _array("Snapshot.heading", self.heading, (agents, dimension)),
             bonds=_pairs("Snapshot.bonds", self.bonds, agents),
             outlines=tuple(_array("Snapshot.outlines", polygon, (None, 2)) for polygon in self.outlines),
+            looks=tuple(self.looks),
+            look=_whole("Snapshot.look", np.full(agents, -1) if self.look is None else self.look, agents),
+            age=None if self.age is None else _array("Snapshot.age", self.age, (agents,)),
+            identity=None if self.identity is None else _whole("Snapshot.identity", self.identity, agents),
         )
+        if self.look is not None and not (self.look < len(self.looks)).all():
+            raise ValueError(f"Snapshot.look: must be below {len(self.looks)}, the number of looks")
         if not isinstance(self.title, str):
             raise TypeError(f"Snapshot.title: must be a str, got {type(self.title).__name__}")
         if not (self.low < self.high).all():
@@ -117,6 +131,24 @@ class Snapshot:
     def aim(self) -> Floats:
         """Where everybody points, (N, D), of any length; zero where nobody knows."""
         return self.vel if self.heading is None else self.heading
+
+    @property
+    def shade(self) -> Floats:
+        """How far along the range of its look everybody is, (N,) from 0 to 1; 0 without one."""
+        shade = np.zeros(self.agents)
+        age = np.full(self.agents, self.time) if self.age is None else self.age
+        with np.errstate(over="ignore", invalid="ignore"):
+            speed = np.linalg.norm(self.vel, axis=1)
+        for k, look in enumerate(self.looks):
+            mine = self.look == k
+            shade[mine] = look.shade(age[mine], speed[mine])
+        return shade
+
+    def same(self, other: Snapshot) -> NDArray[np.bool_]:
+        """Whose row holds the same one in another snapshot, (N,) bool."""
+        if self.identity is None or other.identity is None:
+            return np.ones(self.agents, np.bool_)
+        return np.asarray(self.identity == other.identity)
 
     @property
     def tied(self) -> NDArray[np.bool_]:
@@ -184,6 +216,16 @@ def _switches(field: str, value: ArrayLike, count: int) -> NDArray[np.bool_]:
     switches = switches.astype(np.bool_)
     switches.flags.writeable = False
     return switches
+
+
+def _whole(field: str, value: ArrayLike, count: int) -> NDArray[np.int64]:
+    numbers = np.array(value)
+    if numbers.size and numbers.dtype.kind not in "iu":
+        raise TypeError(f"{field}: must be whole numbers, got {numbers.dtype}")
+    _demand(numbers.shape == (count,), field, f"must have shape ({count},)", f"shape {numbers.shape}")
+    numbers = numbers.astype(np.int64)
+    numbers.flags.writeable = False
+    return numbers
 
 
 def _pairs(field: str, value: ArrayLike, count: int) -> NDArray[np.int32]:

@@ -16,17 +16,21 @@ from numpy.typing import ArrayLike, NDArray
 from flockenv.kernels import entry
 from flockenv.vehicle import face
 
-__all__ = ["WORK", "Body", "Floats", "Obstacles", "State"]
+__all__ = ["COUNTED_BY_KERNELS", "WORK", "Body", "Floats", "Obstacles", "State"]
 
 Floats = NDArray[np.floating[Any]]
 
 WORK = (
     "evaluations", "neighbour_queries", "pairs", "obstacle_tests", "substeps", "rejected_steps", "newton_iterations",
-    "linear_iterations", "impacts", "unsolved",
+    "linear_iterations", "impacts", "unsolved", "births", "deaths", "births_refused",
 )  # fmt: skip
 """What is counted in State.work: force evaluations, neighbour queries, candidate pairs met, agent-obstacle tests; and,
 by methods that choose their own steps, those accepted and rejected; by methods that solve, their iterations; by
-collisions, impacts, and those that were cut short or left unsolved."""
+collisions, impacts, and those that were cut short or left unsolved; of a population, who was born, who died, and who
+was due but found no free slot."""
+
+COUNTED_BY_KERNELS = 8
+"""How many of these the kernel of a scene counts: the first."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,6 +80,9 @@ class State:
     obstacle_radius: Floats  # (B, M) m
     work: NDArray[np.int64]  # (B, len(WORK)) counters, see WORK
     frame: Floats  # (F, B, N) unit vectors: where everybody faces, in space which way is up; F = 0 if nobody keeps that
+    identity: NDArray[np.int64]  # (B, N) who is in this slot, or was last, -1 = nobody; (B, 0) without a population
+    born: NDArray[np.float64]  # (B, N) s, since when; (B, 0) without a population
+    dies: NDArray[np.float64]  # (B, N) s, when its own lifetime ends, inf = never; (B, 0) without a population
     dt: float  # s, one physics step: time = tick dt
 
     @property
@@ -115,6 +122,12 @@ class State:
     def time(self) -> NDArray[np.float64]:
         """Time of each world, (B,) s: a whole number of steps times dt, so that it never drifts."""
         return np.asarray(self.tick * self.dt, np.float64)
+
+    @property
+    def age(self) -> NDArray[np.float64]:
+        """How long everybody has lived, (B, N) s, of the living; all as old as the world without a population."""
+        born = self.born if self.born.shape[1] else 0.0
+        return np.asarray(np.broadcast_to(self.time[:, None], self.alive.shape) - born, np.float64)
 
     @property
     def obstacles(self) -> Obstacles:
@@ -198,7 +211,9 @@ class State:
 
 
 _PER_COORDINATE = ("x", "v", "obstacle_x", "frame")
-_ARRAYS = ("x", "v", "alive", "tick", "key", "obstacle_x", "obstacle_radius", "work", "frame")
+_ARRAYS = (
+    "x", "v", "alive", "tick", "key", "obstacle_x", "obstacle_radius", "work", "frame", "identity", "born", "dies",
+)  # fmt: skip
 
 
 def _first_bad(array: Floats) -> list[int]:
@@ -206,9 +221,11 @@ def _first_bad(array: Floats) -> list[int]:
 
 
 def blank(
-    worlds: int, agents: int, dimension: int, obstacles: int, dt: float, dtype: Any = np.float64, frame_rows: int = 0
-) -> State:
-    """Return a state of zeros, everybody alive: what a spawn writes into."""
+    worlds: int, agents: int, dimension: int, obstacles: int, dt: float, dtype: Any = np.float64, frame_rows: int = 0,
+    population: bool = False,
+) -> State:  # fmt: skip
+    """Return a state of zeros, everybody alive: what a spawn writes into; identities are numbers of slots, if kept."""
+    slots = agents if population else 0
     return State(
         x=np.zeros((dimension, worlds, agents), dtype),
         v=np.zeros((dimension, worlds, agents), dtype),
@@ -219,5 +236,8 @@ def blank(
         obstacle_radius=np.zeros((worlds, obstacles), dtype),
         work=np.zeros((worlds, len(WORK)), np.int64),
         frame=np.zeros((frame_rows, worlds, agents), dtype),
+        identity=np.tile(np.arange(slots), (worlds, 1)),
+        born=np.zeros((worlds, slots)),
+        dies=np.full((worlds, slots), np.inf),
         dt=dt,
     )

@@ -49,6 +49,8 @@ class Trajectory:
     wall: float  # s, without compiling
     stopped: str  # why it ended before its time; "" if it did not
     heading: Floats | None = None  # (T, N, D) where everybody faces, of scenes that keep headings
+    identity: NDArray[np.int64] | None = None  # (T, N) who is in each slot, of scenes with a population
+    born: NDArray[np.float64] | None = None  # (T, N) s, since when
 
     @property
     def rate(self) -> float:
@@ -63,13 +65,15 @@ class Trajectory:
     def snapshots(self, title: str = "") -> Iterator[Snapshot]:
         """Return every instant, ready to be drawn, all in one frame: the space, or where anybody ever was."""
         times = (self.step * self.scene.dt).tolist()
-        low, high = _region(self.scene, self.pos, times)
+        low, high = _region(self.scene, self.pos, self.alive, times)
         start = replace(self.scene.snapshot(self.first, title=title), outlines=self.scene.outlines(low, high, times[0]))
         for k, time in enumerate(times):
             walls = self.scene.outlines(low, high, time) if self.scene.parts.moving else start.outlines
             yield replace(
                 start, time=time, pos=self.pos[k], vel=self.vel[k], alive=self.alive[k], low=low, high=high,
                 heading=None if self.heading is None else self.heading[k], outlines=walls,
+                identity=None if self.identity is None else self.identity[k],
+                age=None if self.born is None else time - self.born[k],
             )  # fmt: skip
 
     def summary(self) -> dict[str, Any]:
@@ -92,11 +96,12 @@ class Trajectory:
         """Write X.npz and X.json beside it, each whole or not at all; return the path of the latter.
 
         Arrays: time (T,) s, pos (T, N, D) m, vel (T, N, D) m/s, alive (T, N), radius (N,) m, seed, and `scene`, the
-        YAML text that `load_scene` reads; and heading (T, N, D) where headings are kept. None needs pickle. Missing
-        folders are made.
+        YAML text that `load_scene` reads; heading (T, N, D) where headings are kept; identity and born (T, N), s, where
+        there is a population. None needs pickle. Missing folders are made.
         """
         path.parent.mkdir(parents=True, exist_ok=True)
-        more: dict[str, Any] = {} if self.heading is None else {"heading": self.heading}
+        kept = {"heading": self.heading, "identity": self.identity, "born": self.born}
+        more: dict[str, Any] = {name: array for name, array in kept.items() if array is not None}
         with replacing(path) as file:
             np.savez(
                 file, time=self.step * self.scene.dt, pos=self.pos, vel=self.vel, alive=self.alive,
@@ -141,7 +146,8 @@ def record(
     step = np.array(film.step, np.int64)
     return Trajectory(
         scene, seed, step, film.pos[:n], film.vel[:n], film.alive[:n], first, last, wall, stopped,
-        None if film.heading is None else film.heading[:n],
+        None if film.heading is None else film.heading[:n], None if film.identity is None else film.identity[:n],
+        None if film.born is None else film.born[:n],
     )  # fmt: skip
 
 
@@ -153,13 +159,16 @@ class _Film:
     vel: Floats
     alive: NDArray[np.bool_]
     heading: Floats | None
+    identity: NDArray[np.int64] | None
+    born: NDArray[np.float64] | None
     step: list[int]
 
     @classmethod
     def of(cls, scene: Scene, instants: int) -> _Film:
         shape = (instants, scene.agents, scene.dimension)
         pos, vel, heading = (np.empty(shape, scene.dtype) for _ in range(3))
-        return cls(pos, vel, np.empty(shape[:2], np.bool_), heading if scene.parts.oriented else None, [])
+        who, since = (np.empty(shape[:2], np.int64), np.empty(shape[:2])) if scene.population else (None, None)
+        return cls(pos, vel, np.empty(shape[:2], np.bool_), heading if scene.parts.oriented else None, who, since, [])
 
     def keep(self, state: State) -> None:
         """Add an instant, unless it is there already."""
@@ -168,6 +177,8 @@ class _Film:
             self.pos[k], self.vel[k], self.alive[k] = state.pos[0], state.vel[0], state.alive[0]
             if self.heading is not None:
                 self.heading[k] = state.heading[0]
+            if self.identity is not None and self.born is not None:
+                self.identity[k], self.born[k] = state.identity[0], state.born[0]
             self.step.append(step)
 
 
@@ -176,6 +187,7 @@ def _checked_instants(scene: Scene, steps: int, every: int) -> int:
         raise ValueError(f"steps = {steps} must be at least 0 and every = {every} at least 1")
     instants = 1 + -(-steps // every)
     each = scene.agents * ((2 + scene.parts.oriented) * scene.dimension * np.dtype(scene.dtype).itemsize + 1)
+    each += 16 * scene.agents * bool(scene.population)
     needed = instants * (each + 40)  # the step is a Python number in a list
     if needed > MEMORY_LIMIT:
         rarer = every * math.ceil(needed / MEMORY_LIMIT) * scene.dt
@@ -200,10 +212,14 @@ def whole_steps(name: str, seconds: float, dt: float, least: int = 0) -> int:
     return steps
 
 
-def _region(scene: Scene, pos: Floats, times: list[float]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _region(
+    scene: Scene, pos: Floats, alive: NDArray[np.bool_], times: list[float]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     if not isinstance(scene.space, Plane):
         return np.zeros(scene.dimension), np.array(scene.space.extent(scene.dimension))
-    low, high = (np.asarray(end(pos, axis=(0, 1)), np.float64) for end in (np.min, np.max))
+    living = alive[..., None] if scene.population and alive.any() else True  # slots of nobody are nowhere
+    ends = ((np.min, np.inf), (np.max, -np.inf))
+    low, high = (np.asarray(end(pos, axis=(0, 1), where=living, initial=far), np.float64) for end, far in ends)
     margin = 1.0 + 0.05 * float((high - low).max())
     shown = scene.extremes(*(times if scene.parts.moving else times[:1]))
     every = np.concatenate([[low - margin], [high + margin], *shown])

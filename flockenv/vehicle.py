@@ -78,24 +78,30 @@ def raised(heading: Vec, before: Vec, up: Vec) -> Vec:
 
 
 @kernel
+def face_one(v: Any, frame: Any, b: int, i: int, anew: bool) -> None:
+    """Write where agent i of world b faces, and which way is up; see `face`."""
+    if anew:
+        frame[:, b, i] = 0
+    if v.shape[0] == 2:
+        heading = faced((v[0, b, i], v[1, b, i]), (frame[0, b, i], frame[1, b, i]))
+        heading = select(dot(heading, heading) > like(heading[0], 0.0), heading, axis(heading, 0))
+        frame[0, b, i], frame[1, b, i] = heading
+    else:
+        old: Vec = (frame[0, b, i], frame[1, b, i], frame[2, b, i])
+        ahead = faced((v[0, b, i], v[1, b, i], v[2, b, i]), old)
+        ahead = select(dot(ahead, ahead) > like(ahead[0], 0.0), ahead, axis(ahead, 0))
+        up: Vec = (frame[3, b, i], frame[4, b, i], frame[5, b, i])
+        up = select(dot(up, up) > like(up[0], 0.0), up, axis(up, 2))
+        up = raised(ahead, axis(ahead, 1), up)
+        frame[0, b, i], frame[1, b, i], frame[2, b, i] = ahead
+        frame[3, b, i], frame[4, b, i], frame[5, b, i] = up
+
+
+@kernel
 def face(v: Any, frame: Any, b: int, anew: bool) -> None:
     """Write where the agents of world b face, and which way is up, for these velocities; v (D, B, N), frame (F, B, N).
 
     Who stands still faces as he did, or along the x axis if that was nowhere, or all is `anew`; up is the z axis then.
     """
     for i in range(v.shape[2]):
-        if anew:
-            frame[:, b, i] = 0
-        if v.shape[0] == 2:
-            heading = faced((v[0, b, i], v[1, b, i]), (frame[0, b, i], frame[1, b, i]))
-            heading = select(dot(heading, heading) > like(heading[0], 0.0), heading, axis(heading, 0))
-            frame[0, b, i], frame[1, b, i] = heading
-        else:
-            old: Vec = (frame[0, b, i], frame[1, b, i], frame[2, b, i])
-            ahead = faced((v[0, b, i], v[1, b, i], v[2, b, i]), old)
-            ahead = select(dot(ahead, ahead) > like(ahead[0], 0.0), ahead, axis(ahead, 0))
-            up: Vec = (frame[3, b, i], frame[4, b, i], frame[5, b, i])
-            up = select(dot(up, up) > like(up[0], 0.0), up, axis(up, 2))
-            up = raised(ahead, axis(ahead, 1), up)
-            frame[0, b, i], frame[1, b, i], frame[2, b, i] = ahead
-            frame[3, b, i], frame[4, b, i], frame[5, b, i] = up
+        face_one(v, frame, b, i, anew)

@@ -188,6 +188,31 @@ def test_who_is_captured_leaves_and_the_others_play_on():
     assert all(set(part) == set(env.possible_agents) - set(gone) for part in outcome)
 
 
+def test_everybody_ends_once_and_nobody_comes_back():
+    """Over whole episodes: who left is dead in the world, too, and asks for nothing; a reset brings everybody back."""
+    env, rng = make(PURSUIT, capture_distance=2.5, max_cycles=40), np.random.default_rng(0)
+    early = 0
+    for seed in range(6):
+        env.reset(seed=seed)
+        assert env.agents == env.possible_agents
+        assert env.world.state.alive.all()
+        ended = []
+        while env.agents:
+            present = env.agents
+            outcome = env.step(some(env, rng))
+            assert all(list(part) == present for part in outcome)
+            over = [name for name in present if outcome[2][name] or outcome[3][name]]
+            assert not set(over) & set(ended)
+            ended += over
+            early += bool(over) and bool(env.agents)
+            assert env.agents == [name for name in present if name not in over]
+            if env.agents:
+                living = dict(zip(env.possible_agents, env.world.state.alive[0].tolist(), strict=True))
+                assert [name for name, alive in living.items() if alive] == env.agents
+        assert sorted(ended) == sorted(env.possible_agents)
+    assert early > 0  # somebody left before the others
+
+
 def test_everybody_may_end_in_the_same_step():
     env = make(PURSUIT, capture_distance=100.0)
     env.reset(seed=0)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Final
 
-__all__ = ["ARROW", "BODY_DISC", "BOND", "DART", "DART_REACH", "JUMP", "PAPER", "ROLE_COLOURS", "mix", "rgb"]
+__all__ = ["ARROW", "BODY_DISC", "BOND", "DART", "DART_REACH", "JUMP", "PAPER", "POINT", "ROLE_COLOURS", "mix", "rgb"]
 
 #: role -> (on light paper, on dark paper): after Okabe and Ito's set, told apart with any colour vision
 #: (jfly.uni-koeln.de/color).
@@ -44,6 +44,9 @@ BODY_DISC: Final = 0.4
 
 #: Width of the line of a bond, and the least radius of a dot at its end, as a share of the picture's width.
 BOND: Final = 0.0022
+
+#: The least radius of a point of somebody with a look, as a share of the picture's width.
+POINT: Final = 0.0022
 
 #: Corners of the arrow that shows a heading, x along it, in units of its length.
 ARROW: Final = ((0.0, 0.035), (0.7, 0.05), (0.66, 0.16), (1.0, 0.0), (0.66, -0.16), (0.7, -0.05), (0.0, -0.035))

@@ -6,6 +6,7 @@ caption) is drawn once per world and kept.
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Sequence
 from functools import lru_cache
@@ -15,7 +16,20 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
-from flockenv.render.palette import ARROW, BODY_DISC, BOND, DART, DART_REACH, JUMP, PAPER, ROLE_COLOURS, WAY, mix, rgb
+from flockenv.render.palette import (
+    ARROW,
+    BODY_DISC,
+    BOND,
+    DART,
+    DART_REACH,
+    JUMP,
+    PAPER,
+    POINT,
+    ROLE_COLOURS,
+    WAY,
+    mix,
+    rgb,
+)
 from flockenv.render.view import View, look
 from flockenv.snapshot import Floats, Mark, Snapshot
 
@@ -30,13 +44,18 @@ _SCALES: Final = (1, 4)
 _NAMED: Final = ("pursuer", "evader", "learner")
 
 
-def draw(snapshot: Snapshot, size: int = 600, scale: int = 2, trails: Sequence[Snapshot] | None = None) -> Pixels:
+def draw(
+    snapshot: Snapshot, size: int = 600, scale: int = 2, trails: Sequence[Snapshot] | None = None,
+    all_trails: bool = True,
+) -> Pixels:  # fmt: skip
     """Return the picture of a snapshot, (height, width, 3) uint8, width = size and height <= size px, both even.
 
     Agents are darts that point along their velocity, over a disc of their body radius, coloured by role (Okabe-Ito);
     one at rest is a dot. Those with bonds are dots of their radius, behind which bonds are thin lines. 3-D is seen from
     above: what is higher is larger and drawn last.
-    trails: earlier snapshots of the same world, oldest first; agents without bonds then draw their way behind them.
+    Who has a look is drawn as that says: points, discs or polygons, whose colour may tell age or speed.
+    trails: earlier snapshots of the same world, oldest first; agents without bonds then draw their way behind them, who
+    has a look as long a one as that says. all_trails=False: only those with a look.
     scale: supersampling, 1 (fast, jagged) to 4. Raises ValueError or TypeError on a size or scale out of range.
     """
     _whole("size", size, _SIZES)
@@ -51,7 +70,11 @@ def draw(snapshot: Snapshot, size: int = 600, scale: int = 2, trails: Sequence[S
     for mark in ways:
         _mark(pen, view, mark)
     if trails:
-        _trails(pen, view, [*trails, snapshot])
+        path = [*trails, snapshot]
+        if all_trails:
+            _trails(pen, view, path)
+        if any(dress.trail > 0 for dress in snapshot.looks):
+            _dressed_trails(pen, view, path)
     for mark in snapshot.marks:
         if mark.kind != "way":
             _mark(pen, view, mark)
@@ -273,12 +296,16 @@ def _bodies(pen: ImageDraw.ImageDraw, view: View, snapshot: Snapshot) -> None:
     spots = view.place(snapshot.pos)
     aim = _aim(np.where(snapshot.visible[:, None], snapshot.aim, 0.0))
     darts = _darts(spots, aim, 0.94 * reach)
+    shades, plain = snapshot.shade, _plain(snapshot)
     # The lowest first, and crosses over everything: an end must not hide under whoever brought it.
     for i in seen[np.argsort(np.where(snapshot.alive, depth, 2.0)[seen], kind="stable")].tolist():
         role, (x, y) = snapshot.roles[i], spots[i].tolist()
         for a, b in view.sightings(x, y, 1.1 * float(reach[i])):
             if not snapshot.alive[i]:
                 _cross(pen, a, b, float(reach[i]), role)
+                continue
+            if not plain[i]:
+                _dressed(pen, view, snapshot, i, (a, b), aim[i], float(shades[i]), float(swell[i]))
                 continue
             if tied[i]:
                 shade = mix(ROLE_COLOURS[role][0], _PAPER, 0.45 + 0.55 * float(depth[i]))
@@ -320,9 +347,8 @@ def _trails(pen: ImageDraw.ImageDraw, view: View, path: Sequence[Snapshot]) -> N
         if old.pos.shape != now.pos.shape:
             raise ValueError(f"trails: must have positions of shape {now.pos.shape}, got {old.pos.shape}")
     spots = view.place(np.stack([old.pos for old in path]))
-    there = np.stack([old.alive & old.visible & ~now.tied for old in path])
-    jump = np.abs(np.diff(spots, axis=0)) < JUMP * np.array([view.right - view.left, view.bottom - view.top])
-    linked = there[1:] & there[:-1] & jump.all(axis=2)
+    there = np.stack([old.alive & old.visible & ~now.tied & _plain(now) for old in path])
+    linked = there[1:] & there[:-1] & _steady(view, spots, path)
     lines = np.concatenate([spots[:-1], spots[1:]], axis=2)
     for k in range(len(linked)):
         age = (k + 1) / len(linked)  # 1 is now
@@ -330,6 +356,57 @@ def _trails(pen: ImageDraw.ImageDraw, view: View, path: Sequence[Snapshot]) -> N
         thick = max(1, round(view.width / 240 * (0.35 + 0.65 * age)))
         for i in np.flatnonzero(linked[k]).tolist():
             pen.line(lines[k, i].tolist(), fill=colours[now.roles[i]], width=thick)
+
+
+def _plain(snapshot: Snapshot) -> NDArray[np.bool_]:
+    """Return who is drawn as his role is, (N,)."""
+    return np.asarray(np.asarray(snapshot.look) < 0)
+
+
+def _steady(view: View, spots: Floats, path: Sequence[Snapshot]) -> NDArray[np.bool_]:
+    """Return who stayed himself from each snapshot to the next, and did not leap across the world, (T - 1, N)."""
+    leap = np.abs(np.diff(spots, axis=0)) < JUMP * np.array([view.right - view.left, view.bottom - view.top])
+    same = np.stack([old.same(new) for old, new in itertools.pairwise(path)])
+    return np.asarray(leap.all(axis=2) & same)
+
+
+def _dressed_trails(pen: ImageDraw.ImageDraw, view: View, path: Sequence[Snapshot]) -> None:
+    """Draw the way behind those whose look says so: as coloured as they were there, fainter towards the past."""
+    now = path[-1]
+    spots = view.place(np.stack([old.pos for old in path]))
+    there = np.stack([old.alive & old.visible & ~_plain(old) for old in path])
+    linked = there[1:] & there[:-1] & _steady(view, spots, path)
+    lines = np.concatenate([spots[:-1], spots[1:]], axis=2)
+    length = np.array([dress.trail for dress in now.looks])
+    thick = max(1, round(view.width / 400))
+    for k, old in enumerate(path[:-1]):
+        behind = now.time - path[k + 1].time
+        shade = old.shade
+        for i in np.flatnonzero(linked[k] & ~_plain(now)).tolist():
+            which = int(np.asarray(now.look)[i])
+            dress, left = now.looks[which], 1.0 - behind / length[which] if length[which] > 0 else 0.0
+            if left > 1e-9:
+                colour = dress.colour(float(shade[i]), ROLE_COLOURS[now.roles[i]][0])
+                fill = (*colour, round(255 * 0.6 * left * dress.opaque(float(shade[i]))))
+                pen.line(lines[k, i].tolist(), fill=fill, width=thick)
+
+
+def _dressed(
+    pen: ImageDraw.ImageDraw, view: View, snapshot: Snapshot, i: int, spot: tuple[float, float], aim: Floats,
+    shade: float, swell: float,
+) -> None:  # fmt: skip
+    """Draw somebody as his look says."""
+    dress = snapshot.looks[int(np.asarray(snapshot.look)[i])]
+    x, y = spot
+    reach = dress.sized(shade, float(snapshot.radius[i])) * view.metre * swell
+    fill = (*dress.colour(shade, ROLE_COLOURS[snapshot.roles[i]][0]), round(255 * dress.opaque(shade)))
+    if dress.form == "polygon":
+        length = math.hypot(*aim)
+        c, s = (aim / length).tolist() if length > 0 else (1.0, 0.0)
+        corners = [p for a, b in dress.vertices for p in (x + reach * (a * c - b * s), y - reach * (a * s + b * c))]
+        pen.polygon(corners, fill=fill)
+    else:
+        _disc(pen, x, y, max(reach, view.width * POINT) if dress.form == "point" else reach, fill)
 
 
 def _trim(canvas: Image.Image, backdrop: Image.Image, view: View, spill: float) -> None:

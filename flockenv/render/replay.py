@@ -21,8 +21,9 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from flockenv.appearance import Appearance
 from flockenv.outputs import replacing
-from flockenv.render.palette import ARROW, BODY_DISC, BOND, DART, DART_REACH, JUMP, PAPER, ROLE_COLOURS, WAY
+from flockenv.render.palette import ARROW, BODY_DISC, BOND, DART, DART_REACH, JUMP, PAPER, POINT, ROLE_COLOURS, WAY
 from flockenv.snapshot import Floats, Mark, Snapshot
 
 __all__ = ["Group", "Panel", "write_replay"]
@@ -34,6 +35,8 @@ _ABSENT: Final = 255
 #: The packed region: [low, high] and this share of its extent beyond it on each side; what is further out stays there.
 _BEYOND: Final = 0.5
 _LEVELS: Final = 65535
+#: Places of a look's range whose colours are written.
+_LOOKS: Final = 16
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,6 +108,7 @@ def write_replay(path: str | os.PathLike[str], groups: Sequence[Group], title: s
         "reach": DART_REACH,
         "disc": BODY_DISC,
         "bond": BOND,
+        "point": POINT,
         "jump": JUMP,
         "way": WAY,
         "beyond": _BEYOND,
@@ -130,6 +134,8 @@ def _alike(one: Snapshot, other: Snapshot) -> bool:
         and one.roles == other.roles
         and one.periodic == other.periodic
         and np.array_equal(one.bonds, other.bonds)
+        and one.looks == other.looks
+        and np.array_equal(np.asarray(one.look), np.asarray(other.look))
         and np.array_equal(one.low, other.low)
         and np.array_equal(one.high, other.high)
     )
@@ -152,6 +158,35 @@ def _panel(panel: Panel) -> dict[str, Any]:
         "heading": _packed(np.stack([_headings(shot) for shot in shots])),
         "bonds": first.bonds.tolist(),
         "scenery": _scenery(shots),
+        **_dress(shots),
+    }
+
+
+def _dress(shots: Sequence[Snapshot]) -> dict[str, Any]:
+    """Return looks, who has which, shades 0..255 and who is new per frame; nothing of it where nobody has any."""
+    first, found = shots[0], dict[str, Any]()
+    if first.looks:
+        found["looks"] = [_look(look) for look in first.looks]
+        found["look"] = np.asarray(first.look).tolist()
+        found["shade"] = _packed(np.stack([np.rint(255 * shot.shade).astype(np.uint8) for shot in shots]))
+    if first.identity is not None:
+        before = [first, *shots[:-1]]
+        fresh = [~old.same(new) for old, new in zip(before, shots, strict=True)]
+        found["fresh"] = _packed(np.stack(fresh).astype(np.uint8))
+    return found
+
+
+def _look(look: Appearance) -> dict[str, Any]:
+    """Return a look with its colours, opacities and sizes at LOOKS places of its range."""
+    places = np.linspace(0.0, 1.0, _LOOKS).tolist()
+    colours = ["#{:02x}{:02x}{:02x}".format(*look.colour(s, "#000000")) for s in places] if look.colours else None
+    return {
+        "form": look.form,
+        "vertices": look.vertices,
+        "trail": look.trail,
+        "colours": colours,
+        "opacity": [_short(look.opaque(s), 3) for s in places],
+        "size": None if look.size is None else [_short(look.sized(s, 0.0), 4) for s in places],
     }
 
 

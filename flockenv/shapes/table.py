@@ -99,7 +99,7 @@ def nearest(shape: Any, points: ArrayLike) -> tuple[Floats, Floats]:
     flat, lead = _flat(points)
     gap, normal = np.empty(len(flat)), np.empty_like(flat)
     _loops(shape.form, flat.shape[1]).nearest(shape.table, flat, gap, normal)
-    return gap.reshape(lead), normal.reshape((*lead, -1))
+    return gap.reshape(lead), normal.reshape((*lead, flat.shape[1]))
 
 
 def hits(shape: Any, points: ArrayLike, directions: ArrayLike, clearance: ArrayLike) -> Floats:

@@ -6,7 +6,7 @@ world together, each the agents of its own blocks.
 
 from __future__ import annotations
 
-from flockenv.state import WORK
+from flockenv.state import COUNTED_BY_KERNELS
 from flockenv.sweep.accelerate import parameters
 from flockenv.sweep.arrange import go_home, move_in
 from flockenv.sweep.parts import Parts
@@ -74,8 +74,8 @@ def step_world(parts: Parts) -> str:
     """Return the source of `step_world`: steps of one world, or of one thread's part of it."""
     d = parts.dimension
     bad = Slots(parts)("bad")
-    kept = "(" + ", ".join(f"work[b, {k}]" for k in range(len(WORK))) + ")"
-    restored = "; ".join(f"work[b, {k}] = counted_[{k}]" for k in range(len(WORK)))
+    kept = "(" + ", ".join(f"work[b, {k}]" for k in range(COUNTED_BY_KERNELS)) + ")"
+    restored = "; ".join(f"work[b, {k}] = counted_[{k}]" for k in range(COUNTED_BY_KERNELS))
     return f'''@kernel
 def step_world(
     x_, v_, {parts.frame_argument}alive, tick, key, obstacle_x, obstacle_radius, work, params, dt, count, b, rank, team,

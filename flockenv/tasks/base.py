@@ -166,6 +166,8 @@ class Task(Record):
         if self.scene.constraints:
             kinds = ", ".join(constraint.kind for constraint in self.scene.constraints)
             raise ValueError(f"scene.constraints: {kinds}: a task plays in one kernel, which knows of none yet")
+        if self.scene.population:
+            raise ValueError("scene.population: a task plays in one kernel, which knows of no births; it has `ended`")
         return replace(self.scene.parts, look=self.look)
 
     def parameters(self) -> dict[str, float]:

@@ -1,0 +1,75 @@
+"""Appearance: how agents of a group are drawn, as data; pictures, GIFs and replays read it, and nothing else does."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, model_validator
+
+from flockenv.records import Record
+
+__all__ = ["Appearance"]
+
+Colour = Annotated[str, Field(pattern=r"^#[0-9a-fA-F]{6}$")]
+Share = Annotated[float, Field(ge=0, le=1)]
+Size = Annotated[float, Field(ge=0)]
+
+
+class Appearance(Record):
+    """Points, discs or polygons, whose colour, opacity and size may change with age or speed; and the way behind them.
+
+    `by` and `over` say when there is the first and when the last of colours, opacities and sizes; between, a mixture.
+    """
+
+    form: Literal["point", "disc", "polygon"] = Field(
+        default="point", description="a dot, seen however small; a disc of its true size; a polygon that points ahead"
+    )
+    vertices: tuple[tuple[float, float], ...] = Field(
+        default=((1.0, 0.0), (-0.8, 0.6), (-0.8, -0.6)), min_length=3, max_length=64,
+        description="corners of a polygon, x ahead, in units of its size",
+    )  # fmt: skip
+    by: Literal["age", "speed"] | None = Field(default=None, description="with what it changes; none = not at all")
+    over: tuple[float, float] = Field(default=(0.0, 1.0), description="s or m/s, from where to where it changes")
+    colours: tuple[Colour, ...] = Field(
+        default=(), description="#rrggbb, from the first to the last, evenly; none = its role's"
+    )
+    opacity: tuple[Share, Share] = Field(default=(1.0, 1.0), description="from, to; 0 = nothing is seen")
+    size: tuple[Size, Size] | None = Field(default=None, description="m, from, to; none = the body's radius")
+    trail: float = Field(default=0.0, ge=0, description="s, how long a way behind it is drawn")
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Appearance:
+        """Refuse a range that is none, and one that nothing changes over."""
+        if not self.over[0] < self.over[1]:
+            raise ValueError(f"over = {self.over}: the least comes first, and they differ")
+        changes = len(self.colours) > 1 or self.opacity[0] != self.opacity[1]
+        changes |= self.size is not None and self.size[0] != self.size[1]
+        if changes and self.by is None:
+            raise ValueError("by: missing; colours, opacity or size change with age or with speed")
+        return self
+
+    def shade(self, age: NDArray[np.float64], speed: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return how far along its range everybody is, (N,) from 0 to 1."""
+        if self.by is None:
+            return np.zeros(len(age))
+        value = np.nan_to_num(age if self.by == "age" else speed, posinf=self.over[1])
+        return np.asarray(np.clip((value - self.over[0]) / (self.over[1] - self.over[0]), 0.0, 1.0))
+
+    def colour(self, shade: float, usual: str) -> tuple[int, int, int]:
+        """Return the colour at a shade, 0..255 each; `usual` is that of the role."""
+        names = self.colours or (usual,)
+        place = shade * (len(names) - 1)
+        k = min(int(place), len(names) - 2) if len(names) > 1 else 0
+        ends = [[int(name[j : j + 2], 16) for j in (1, 3, 5)] for name in (names[k], names[min(k + 1, len(names) - 1)])]
+        r, g, b = (round(first + (last - first) * (place - k)) for first, last in zip(*ends, strict=True))
+        return r, g, b
+
+    def opaque(self, shade: float) -> float:
+        """Return the opacity at a shade."""
+        return self.opacity[0] + (self.opacity[1] - self.opacity[0]) * shade
+
+    def sized(self, shade: float, radius: float) -> float:
+        """Return the size at a shade, m; `radius` is the body's."""
+        return radius if self.size is None else self.size[0] + (self.size[1] - self.size[0]) * shade

@@ -1,0 +1,165 @@
+"""Deaths of all worlds in one call for each sink: whose time has come, who left, who decays, who is in a drain.
+
+Each sink decides about everybody who lives when its turn comes, before any of them dies: the order of agents is
+nothing to it.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+
+from flockenv.kernels import Vec, kernel, law
+from flockenv.noise import uniform
+from flockenv.population.births import DEATHS
+from flockenv.population.near import count_near, sort_living
+from flockenv.shapes.block import hit_block, hit_half_space, nearest_block, nearest_half_space
+from flockenv.shapes.chain import hit_chain, nearest_chain
+from flockenv.shapes.field import hit_distance_field, nearest_distance_field
+from flockenv.vec import norm, sub, unit
+
+__all__ = ["crowding", "drain", "passing"]
+
+DECAY = 2_000_000
+"""Channel of the draws of the first sink; the next has the next."""
+
+
+@kernel
+def _die(b: int, i: int, v: Any, alive: Any, work: Any) -> None:
+    """Let an agent die: its slot is free, and keeps where it died and who it was."""
+    alive[b, i] = False
+    for k in range(v.shape[0]):
+        v[k, b, i] = 0
+    work[b, DEATHS] += 1
+
+
+@law
+def _chance(rate: float, usual: float, born: float, now: float, dt: float) -> float:
+    """Return with which probability somebody dies since sinks asked last; `usual` is that of a step, 1 - exp(-rate dt).
+
+    Who was born within the step before was not asked then: he has been alive for longer than a step.
+    """
+    late = born > now - (2.0 - 1e-6) * dt and born < now - dt
+    return 1.0 - math.exp(-rate * (now - born)) if late else usual
+
+
+@kernel
+def passing(
+    sinks: Any, x: Any, v: Any, alive: Any, identity: Any, born: Any, dies: Any, tick: Any, key: Any, work: Any,
+    dt: float, first: int, end: int, channel: int,
+) -> None:  # fmt: skip
+    """Let those die whose own time has come, then those whom sinks of age, region and chance take; worlds [first, end).
+
+    sinks: a row each: kind (0 age, 1 region, 2 chance), first slot, the one after the last, numbers.
+    """
+    for b in range(first, end):
+        now = tick[b] * dt
+        for i in range(alive.shape[1]):
+            if dies[b, i] <= now + 1e-9 * dt and alive[b, i]:
+                _die(b, i, v, alive, work)
+        for s in range(sinks.shape[0]):
+            row = sinks[s]
+            usual = 1.0 - math.exp(-row[3] * dt) if row[0] == 2.0 else 0.0
+            for i in range(int(row[1]), int(row[2])):
+                if not alive[b, i]:
+                    continue
+                gone = False
+                if row[0] == 0.0:
+                    gone = now - born[b, i] >= row[3] - 1e-9 * dt
+                elif row[0] == 1.0:
+                    for k in range(x.shape[0]):
+                        gone = gone or not (row[3 + k] <= x[k, b, i] <= row[6 + k])
+                else:
+                    chance = _chance(row[3], usual, born[b, i], now, dt)
+                    gone = uniform(key[b], tick[b], identity[b, i], DECAY + channel + s) < chance
+                if gone:
+                    _die(b, i, v, alive, work)
+
+
+@law
+def _shortest(way: float, period: float) -> float:
+    return way - period * math.floor(way / period + 0.5) if period > 0.0 else way
+
+
+@law
+def _drained(table: Any, form: int, margin: float, y: Vec, way: Vec) -> bool:
+    """Is somebody at y, relative to a shape's anchor, within `margin` of it, or was he on the `way` here?"""
+    far = norm(way)
+    ray, begin = unit(way), sub(y, way)
+    if form == 0:
+        gap, _ = nearest_chain(table, 0, y)
+        return gap <= margin or hit_chain(table, 0, begin, ray, margin) <= far
+    elif form == 1:
+        gap, _ = nearest_block(table, 0, y)
+        return gap <= margin or hit_block(table, 0, begin, ray, margin) <= far
+    elif form == 2:
+        gap, _ = nearest_half_space(table, 0, y)
+        return gap <= margin or hit_half_space(table, 0, begin, ray, margin) <= far
+    else:
+        gap, _ = nearest_distance_field(table, 0, y)
+        return gap <= margin or hit_distance_field(table, 0, begin, ray, margin) <= far
+
+
+@kernel
+def drain(
+    table: Any, form: int, margin: float, slots: Any, anchor: Vec, period: Vec, x0: Any, x: Any, v: Any, alive: Any,
+    work: Any, first: int, end: int,
+) -> None:  # fmt: skip
+    """Let those die who are in a shape, or went through it in the step that began at x0; slots (first, end).
+
+    table: the shape's row (see shapes/table.py); anchor, period: (D,) m, the latter 0 where an axis does not repeat.
+    """
+    for b in range(first, end):
+        for i in range(slots[0], slots[1]):
+            if not alive[b, i]:
+                continue
+            if len(anchor) == 2:
+                y: Any = (_shortest(x[0, b, i] - anchor[0], period[0]), _shortest(x[1, b, i] - anchor[1], period[1]))
+                way: Any = (
+                    _shortest(np.float64(x[0, b, i]) - x0[0, b, i], period[0]),
+                    _shortest(np.float64(x[1, b, i]) - x0[1, b, i], period[1]),
+                )
+            else:
+                y = (
+                    _shortest(x[0, b, i] - anchor[0], period[0]),
+                    _shortest(x[1, b, i] - anchor[1], period[1]),
+                    _shortest(x[2, b, i] - anchor[2], period[2]),
+                )
+                way = (
+                    _shortest(np.float64(x[0, b, i]) - x0[0, b, i], period[0]),
+                    _shortest(np.float64(x[1, b, i]) - x0[1, b, i], period[1]),
+                    _shortest(np.float64(x[2, b, i]) - x0[2, b, i], period[2]),
+                )
+            if _drained(table, form, margin, y, way):
+                _die(b, i, v, alive, work)
+
+
+@kernel
+def crowding(
+    row: Any, channel: int, x: Any, v: Any, alive: Any, identity: Any, born: Any, tick: Any, key: Any, work: Any,
+    dt: float, period: Any, first: int, end: int, grid: Any, cell: Any, start: Any, order: Any, doomed: Any,
+) -> None:  # fmt: skip
+    """Let those die who have too many elders around them.
+
+    row: kind, first slot, the one after the last, radius [m], how many, rate [1/s]. doomed (N,): scratch.
+    """
+    low, high = int(row[1]), int(row[2])
+    for b in range(first, end):
+        sort_living(x, alive, b, low, high, row[3], period, grid, cell, start, order)
+        now = tick[b] * dt
+        for i in range(low, high):
+            doomed[i] = False
+            if not alive[b, i]:
+                continue
+            if row[5] < math.inf:
+                chance = _chance(row[5], 1.0 - math.exp(-row[5] * dt), born[b, i], now, dt)
+                if uniform(key[b], tick[b], identity[b, i], DECAY + channel) >= chance:
+                    continue
+            place = (float(x[0, b, i]), float(x[1, b, i]), float(x[2, b, i]) if x.shape[0] == 3 else 0.0)
+            most = int(row[4])
+            doomed[i] = count_near(x, b, place, row[3], most, period, grid, start, order, born, identity, i) > most
+        for i in range(low, high):
+            if doomed[i]:
+                _die(b, i, v, alive, work)

@@ -1,0 +1,48 @@
+"""Member: one line of a scene's population, an emitter or a sink."""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar
+
+from flockenv.records import Record
+
+__all__ = ["POPULATION", "Member", "demand_group", "dimensions"]
+
+POPULATION: dict[str, type[Member]] = {}
+"""Every emitter and sink by its kind; a class registers itself when it is defined."""
+
+
+class Member(Record):
+    """What brings agents to life, or lets them die, at the end of a step."""
+
+    kind: str
+    looks_back: ClassVar[bool] = False
+    """Does it ask where everybody was before the step?"""
+
+    @classmethod
+    def __pydantic_init_subclass__(cls, **kwargs: Any) -> None:
+        """Register the class under its kind."""
+        if "kind" in vars(cls).get("__annotations__", {}):
+            POPULATION[cls.model_fields["kind"].default] = cls
+
+    def check(self, scene: Any) -> None:
+        """Refuse a scene that this does not suit: ValueError that begins with the field's name."""
+
+    def feeds(self, group: int) -> bool:
+        """Does it bring agents of this group to life?"""
+        return False
+
+
+def demand_group(scene: Any, which: int | None) -> None:
+    """Refuse a group that there is not."""
+    count = len(scene.groups)
+    if which is not None and which >= count:
+        known = f"the scene has {count}, counted from 0" if count > 1 else "the scene has one, group 0"
+        raise ValueError(f"group = {which}: {known}; did you mean {count - 1}?")
+
+
+def dimensions(scene: Any, **given: tuple[float, ...] | None) -> None:
+    """Refuse a vector that has not as many numbers as the scene has dimensions."""
+    for name, value in given.items():
+        if value is not None and len(value) != scene.dimension:
+            raise ValueError(f"{name} = {value}: has {len(value)} numbers, but dimension = {scene.dimension}")

@@ -1,0 +1,155 @@
+"""How many of the living are near a place: agents of one world counted into cells, for sinks and clearings alone.
+
+Effects have a query of their own, over blocks of lanes, before a step; here it is its end, places need not be agents,
+and most scenes never ask.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+from flockenv.kernels import kernel
+
+__all__ = ["count_near", "sort_living"]
+
+
+@kernel
+def _inside(p: float, size: float) -> float:
+    """Return a coordinate in [0, size), of a periodic axis; as it is where size is 0."""
+    return p - size * math.floor(p / size) if size > 0.0 else p
+
+
+@kernel
+def _bounds(x: Any, alive: Any, b: int, first: int, end: int, period: Any, grid: Any) -> None:
+    """Write where the living of slots [first, end) begin, grid[0], and how far they are spread, grid[1]; (4, 3)."""
+    for k in range(x.shape[0]):
+        low, high = math.inf, -math.inf
+        for i in range(first, end):
+            if alive[b, i]:
+                p = float(x[k, b, i])
+                low, high = min(low, p), max(high, p)
+        grid[0, k] = low if low <= high else 0.0
+        grid[1, k] = high - low if low <= high else 0.0
+        if period[k] > 0.0:
+            grid[0, k], grid[1, k] = 0.0, period[k]
+
+
+@kernel
+def _divide(d: int, reach: float, most: int, grid: Any) -> int:
+    """Write cells per axis, grid[2], none narrower than `reach` and at most `most` in all; return how many."""
+    for k in range(3):
+        grid[2, k] = 1.0
+    for k in range(d):
+        grid[2, k] = min(max(1.0, math.floor(grid[1, k] / (reach * 1.001))), 1e6)
+    while grid[2, 0] * grid[2, 1] * grid[2, 2] > most:
+        widest = 0
+        for k in range(1, d):
+            widest = k if grid[2, k] > grid[2, widest] else widest
+        grid[2, widest] = math.floor((grid[2, widest] + 1.0) / 2.0)
+    for k in range(3):
+        grid[3, k] = grid[2, k] / grid[1, k] if k < d and grid[1, k] > 0.0 else 0.0
+    return int(grid[2, 0] * grid[2, 1] * grid[2, 2])
+
+
+@kernel
+def _cell_along(p: float, k: int, grid: Any) -> int:
+    """Return the cell along an axis in which an agent counts."""
+    c: int = math.floor((p - grid[0, k]) * grid[3, k])
+    return min(max(c, 0), int(grid[2, k]) - 1)
+
+
+@kernel
+def sort_living(
+    x: Any, alive: Any, b: int, first: int, end: int, reach: float, period: Any, grid: Any, cell: Any, start: Any,
+    order: Any,
+) -> None:  # fmt: skip
+    """List the living of slots [first, end) by cell, `reach` [m] wide and more.
+
+    period (3,): m, 0 where an axis does not repeat. Writes grid (4, 3): corner, edges, cells, cells per metre; order
+    (N,): who they are; start (N + 1,): the first of each cell. cell (N,) is scratch.
+    """
+    d = x.shape[0]
+    _bounds(x, alive, b, first, end, period, grid)
+    cells = _divide(d, reach, max(end - first, 1), grid)
+    for c in range(cells + 1):
+        start[c] = 0
+    for i in range(first, end):
+        cell[i] = -1
+        if alive[b, i]:
+            c = 0
+            for j in range(d):
+                k = d - 1 - j
+                c = c * int(grid[2, k]) + _cell_along(_inside(float(x[k, b, i]), period[k]), k, grid)
+            cell[i] = c
+            start[c + 1] += 1
+    for c in range(cells):
+        start[c + 1] += start[c]
+    for j in range(end - first):  # backwards, so that each cell begins where it should when it is full
+        i = end - 1 - j
+        if cell[i] >= 0:
+            start[cell[i] + 1] -= 1
+            order[start[cell[i] + 1]] = i
+    # start[c + 1] is now the first of cell c: it begins where the one before ends
+    for c in range(cells):
+        start[c] = start[c + 1]
+    total = 0
+    for i in range(first, end):
+        total += 1 if cell[i] >= 0 else 0
+    start[cells] = total
+
+
+@kernel
+def _neighbouring(c: int, turn: int, count: int, periodic: bool) -> int:
+    """Return one of up to three cells along an axis, c - 1 to c + 1 by `turn` 0 to 2; -1 if there is none."""
+    if periodic:
+        if turn >= count:  # an axis of one or two cells is walked through once
+            return -1
+        return (c + turn - (1 if count > 2 else 0)) % count
+    c += turn - 1
+    return c if 0 <= c < count else -1
+
+
+@kernel
+def count_near(
+    x: Any, b: int, place: Any, reach: float, most: int, period: Any, grid: Any, start: Any, order: Any, born: Any,
+    identity: Any, elder_than: int,
+) -> int:  # fmt: skip
+    """Return how many of the listed are within `reach` of a place (3,), m; it stops counting beyond `most`.
+
+    elder_than: a slot, if those alone count that were born before its agent (of two at once, whose identity is less);
+    -1 = everybody.
+    """
+    d, found = x.shape[0], 0
+    nx, ny, nz = int(grid[2, 0]), int(grid[2, 1]), int(grid[2, 2])
+    cx = math.floor((_inside(place[0], period[0]) - grid[0, 0]) * grid[3, 0])
+    cy = math.floor((_inside(place[1], period[1]) - grid[0, 1]) * grid[3, 1])
+    cz = math.floor((_inside(place[2], period[2]) - grid[0, 2]) * grid[3, 2]) if d == 3 else 0
+    for tz in range(3):
+        z = _neighbouring(cz, tz, nz, period[2] > 0.0) if d == 3 else (0 if tz == 0 else -1)
+        for ty in range(3):
+            y = _neighbouring(cy, ty, ny, period[1] > 0.0)
+            for tx in range(3):
+                x_ = _neighbouring(cx, tx, nx, period[0] > 0.0)
+                if x_ < 0 or y < 0 or z < 0:
+                    continue
+                c = (z * ny + y) * nx + x_
+                for at in range(start[c], start[c + 1]):
+                    i = order[at]
+                    square = 0.0
+                    for k in range(d):
+                        way = float(x[k, b, i]) - place[k]
+                        way -= period[k] * math.floor(way / period[k] + 0.5) if period[k] > 0.0 else 0.0
+                        square += way * way
+                    if square > reach * reach:
+                        continue
+                    if elder_than >= 0:
+                        older = born[b, i] < born[b, elder_than] or (
+                            born[b, i] == born[b, elder_than] and identity[b, i] < identity[b, elder_than]
+                        )
+                        if not older:
+                            continue
+                    found += 1
+                    if found > most:
+                        return found
+    return found

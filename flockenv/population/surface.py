@@ -1,0 +1,98 @@
+"""Surfaces as pieces that places can be drawn from, each as large as the share of births that it gets.
+
+A piece is 14 numbers: the measure of it and all before it (m in the plane, m^2 in space); 0 if it is flat, 1 if it is
+the side of a tube, 2 if it is the two ends of a tube or a ball; then three vectors. Flat: a corner, and the two edges
+from there (one in the plane); behind the last a sign, on which side of the edges is outside. Round: both ends of the
+tube's line, and its radius.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flockenv.shapes.outlines import area
+
+__all__ = ["COLUMNS", "pieces"]
+
+Floats = NDArray[np.float64]
+COLUMNS = 14
+FLAT, SIDE, ENDS = 0.0, 1.0, 2.0
+
+
+def pieces(shape: Any) -> Floats:
+    """Return the pieces of a shape's surface, (n, 14); ValueError of one that has no end, or is only numbers."""
+    if shape.form == "block":
+        found = _block(shape)
+    elif shape.kind == "polygon":
+        found = _polygon(shape)
+    elif shape.form == "chain":
+        found = _chain(shape)
+    else:
+        why = "has no end" if shape.kind == "half_space" else "is a grid of distances"
+        raise ValueError(
+            f"shape.kind = {shape.kind}: {why}, its surface cannot be drawn from; allowed: circle, capsule, wall, "
+            "polygon, block"
+        )
+    rows = np.array(found)
+    rows[:, 0] = np.cumsum(rows[:, 0])
+    return rows
+
+
+def _full(vector: Any) -> list[float]:
+    flat = [float(x) for x in vector]
+    return flat + [0.0] * (3 - len(flat))
+
+
+def _flat(corner: Any, u: Any, v: Any, size: float, sign: float = 1.0) -> list[float]:
+    return [size, FLAT, *_full(corner), *_full(u), *_full(v), sign, 0.0, 0.0]
+
+
+def _polygon(shape: Any) -> list[list[float]]:
+    """Return its edges, counter-clockwise: the right of an edge is outside."""
+    corners = np.array(shape.vertices)
+    corners = corners if area(corners) > 0 else corners[::-1]
+    edges = np.roll(corners, -1, axis=0) - corners
+    return [_flat(a, e, (), math.hypot(*e)) for a, e in zip(corners, edges, strict=True)]
+
+
+def _block(shape: Any) -> list[list[float]]:
+    """Return the edges of a rectangle, or the faces of a box."""
+    d, centre = shape.dimension, np.array(shape.centre)
+    edges = shape.axes * np.array(shape.size)[:, None]  # a row each
+    found = []
+    for k in range(d):
+        others = [edges[j] for j in range(d) if j != k]
+        for side in (-0.5, 0.5):
+            corner = centre + side * edges[k] - 0.5 * sum(others)
+            u, v = others[0], others[1] if d == 3 else ()
+            out = np.cross(u, v) if d == 3 else np.array([u[1], -u[0]])
+            size = math.prod(float(np.linalg.norm(e)) for e in others)
+            found.append(_flat(corner, u, v, size, float(np.sign(out @ edges[k] * side))))
+    return found
+
+
+def _chain(shape: Any) -> list[list[float]]:
+    """Return the sides and the ends of each part of a line with a thickness; of a circle or sphere the ends alone."""
+    if shape.kind == "circle":
+        line, radius = [shape.centre, shape.centre], shape.radius
+    else:
+        line = [shape.start, shape.end] if shape.kind == "capsule" else list(shape.vertices)
+        radius = shape.radius
+    around = 2.0 if shape.dimension == 2 else 2.0 * math.pi * radius
+    ends = 2.0 * math.pi * radius if shape.dimension == 2 else 4.0 * math.pi * radius**2
+    found = []
+    for a, b in itertools.pairwise(line):
+        length = math.dist(a, b)
+        # a line without thickness in space has no surface: its length counts
+        size = length * (around if around > 0 else 1.0)
+        for kind, measure in ((SIDE, size), (ENDS, ends)):
+            if measure > 0:
+                found.append([measure, kind, *_full(a), *_full(b), radius, *[0.0] * 5])
+    if not found:
+        raise ValueError(f"shape.kind = {shape.kind}: a point has no surface; give it a radius")
+    return found
