@@ -38,7 +38,7 @@ class Explanation:
     scene: Scene
     rows: tuple[Row, ...]
     step: float  # us, a whole step
-    rest: float  # us, a step without any effect: integrator, limits, confinement
+    rest: float  # us, a step without any effect: integrator, limits, confinement, constraints, population
     work: dict[str, float]  # per step, see state.WORK
     left_out: tuple[str, ...]  # one line each
     stable: Suggestion  # the largest stable step
@@ -147,6 +147,10 @@ def _left_out(scene: Scene) -> tuple[str, ...]:
         lines.append("neighbour query: no effect asks who is near whom")
     if "obstacles" not in asked:
         lines.append(f"pass over obstacles ({len(scene.obstacles)}): no effect asks for them")
+    if not scene.constraints:
+        lines.append("collisions, rods: no constraint is listed; bodies pass through each other and through obstacles")
+    if not scene.population:
+        lines.append("births and deaths: nothing in its population")
     if others:
         lines.append(f"effects that are not listed: {', '.join(others)}")
     return tuple(lines)
