@@ -9,7 +9,7 @@ from typing import Any
 import hypothesis
 import pytest
 
-from tests.catalogue import TETHER, users_module
+from tests.catalogue import TETHER, Variant, users_module
 
 # Before anything imports pygame: a window is opened, but nowhere.
 os.environ.setdefault("SDL_VIDEODRIVER", "dummy")
@@ -18,6 +18,31 @@ os.environ.setdefault("SDL_AUDIODRIVER", "dummy")
 # Examples are the same in every run (a failure is nobody's bad luck), and a first call may compile for seconds.
 hypothesis.settings.register_profile("flockenv", derandomize=True, deadline=None, database=None, max_examples=60)
 hypothesis.settings.load_profile("flockenv")
+
+
+RARE = {"torus_single_rk4", "plane_single", "plane_3_single", "nearest_plane_3", "nearest_torus_single"}
+"""Kernels of catalogue.Variant that only slow tests compile."""
+
+IN_SPACE_SLOW = {
+    "test_behaviours_crowd", "test_behaviours_goals", "test_behaviours_paths", "test_behaviours_shapes", "test_effects",
+    "test_fields", "test_springs", "test_steering",
+}  # fmt: skip
+"""Where a law is written once for the plane and for space: quick tests try the plane."""
+
+
+@pytest.hookimpl(tryfirst=True)  # before -m chooses
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Mark what compiles a kernel of its own for one more variant of what quick tests try already."""
+    for item in items:
+        given = getattr(getattr(item, "callspec", None), "params", {})
+        named = {value.name if isinstance(value, Variant) else value for value in map(_hashable, given.values())}
+        in_space = given.get("dimension") == 3 and item.path.stem in IN_SPACE_SLOW
+        if named & RARE or in_space:
+            item.add_marker(pytest.mark.slow)
+
+
+def _hashable(value: Any) -> Any:
+    return value if isinstance(value, (str, Variant)) else None
 
 
 @pytest.fixture(scope="module")  # and forgotten afterwards: other files count the effects there are

@@ -381,6 +381,7 @@ def test_in_space_it_is_the_same() -> None:
     assert end.pos.min() >= R - 1e-9 and end.pos.max() <= 1.5 - R + 1e-9 and end.counted("impacts") > 500
 
 
+@pytest.mark.slow
 def test_in_single_precision_it_does_the_same_for_a_while() -> None:
     (double, a), (single, b) = (gas("earliest", 0.8, obstacles=walls(), dtype=t) for t in ("float64", "float32"))
     end = single.run(b, 30)
