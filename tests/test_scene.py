@@ -89,7 +89,10 @@ def test_with_a_spacing_nobody_starts_in_anybody_or_in_an_obstacle(dimension: in
     """Cells that an obstacle reaches into are left out, of whatever shape it is; worlds differ by the jitter alone."""
     obstacles = (Circle(centre=(2,) * dimension, radius=0.8), Block(centre=(0,) * dimension, size=(1,) * dimension))
     spawn = Spawn(low=(0,) * dimension, high=(5,) * dimension, spacing=0.6, jitter=0.1)
-    groups = (Group(count=40, radius=0.2, spawn=spawn), Group(count=1, spawn=Spawn(low=(9,) * dimension, high=(9,) * dimension)))
+    groups = (
+        Group(count=40, radius=0.2, spawn=spawn),
+        Group(count=1, spawn=Spawn(low=(9,) * dimension, high=(9,) * dimension)),
+    )
     scene = scene_of(dimension=dimension, obstacles=obstacles, groups=groups)
     pos = scene.start(0, worlds=3).pos[:, :40]
     for place in pos:

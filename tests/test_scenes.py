@@ -102,6 +102,24 @@ def test_newtons_cradle_passes_everything_on(apart: float) -> None:
     assert np.abs(way[:, 1:4]).max() < 0.01
 
 
+@pytest.mark.slow
+@pytest.mark.filterwarnings(UNSOLVED)
+@pytest.mark.parametrize(("name", "seconds", "apart"), [("rope_on_ball", 4.0, 0.08), ("cloth_on_ball", 2.0, 0.04)])
+def test_where_it_folds_a_rope_or_a_cloth_keeps_off_itself(name: str, seconds: float, apart: float) -> None:
+    """Those whom no spring ties to each other; without the push between them they come as near as 2 mm and less."""
+    scene = scene_of(name)
+    network: Any = scene.groups[0].network
+    springs = network.springs(scene.dimension)
+    tied = {(int(i), int(j)) for i, j in zip(springs.i, springs.j, strict=True)}
+    state, nearest = scene.start(0), np.inf
+    for _ in range(round(seconds / scene.dt / 20)):
+        state = scene.step(state, steps=20)
+        pos = state.pos[0]
+        for i, j in cKDTree(pos).query_pairs(0.1) - tied:
+            nearest = min(nearest, float(np.linalg.norm(pos[i] - pos[j])))
+    assert apart < nearest < 0.1
+
+
 def test_the_page_of_scenes_has_a_picture_and_a_command_for_each() -> None:
     page = (ROOT / "docs" / "scenes.md").read_text()
     for name in SECONDS:

@@ -269,9 +269,7 @@ def _again(
 
 
 @kernel
-def _hit_anew(
-    period: Vec, bodies: Bodies, meetings: Meetings, things: Things, rules: Rules, c: int, t: float
-) -> bool:
+def _hit_anew(period: Vec, bodies: Bodies, meetings: Meetings, things: Things, rules: Rules, c: int, t: float) -> bool:
     """Has a third one driven two elastic bodies into each other that came to rest, by more than the step itself does?
 
     They trembled too often; but what comes from outside they pass on. At most so often that a step has an end.
