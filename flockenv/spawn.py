@@ -65,7 +65,7 @@ def cells(
     spawn: Spawn, low: Sequence[float], high: Sequence[float], count: int, radius: float, shapes: Sequence[Shape],
     period: NDArray[np.float64],
 ) -> NDArray[np.float64]:  # fmt: skip
-    """Return the middles of the first `count` cells of a spawn's grid in [low, high) that are clear of shapes, (count, D) m.
+    """Return the middles of the first cells of a spawn's grid in [low, high) that are clear of shapes, (count, D) m.
 
     ValueError that begins with the field's name if bodies of that radius, m, are wider than a cell, or have no room.
     """

@@ -81,7 +81,7 @@ def test_particles_in_a_sphere_keep_their_energy() -> None:
 def test_newtons_cradle_passes_everything_on(apart: float) -> None:
     """Also where balls touch: they tremble there until they rest, and what comes from outside goes through them.
 
-    One after another swings out as far as the first, and those between stay; before, the third impact took half of the energy.
+    One after another swings out as far as the first, and those between stay; before, the third impact took half of it.
     """
     scene = scene_of("newtons_cradle")
     k = np.arange(5) - 2

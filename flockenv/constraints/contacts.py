@@ -214,9 +214,9 @@ def press(
     """Stop those who go into each other at velocities (N, D), without a bounce; return the last pass's fastest change.
 
     The impulse of each contact is summed and never pulls; friction is bounded by what was given across, friction times
-    as much (Coulomb), and stops what it can. Sticky contacts pull as well as push, in every direction. Passes go on along the direction of
-    those before, as conjugate gradients do (Silcowitz, Niebe and Erleben 2010): the weight of a heap is known at its
-    foot after about as many passes as it is high, and not after their square.
+    as much (Coulomb), and stops what it can. Sticky contacts pull as well as push, in every direction. Passes go on
+    along the direction of those before, as conjugate gradients do (Silcowitz, Niebe and Erleben 2010): the weight of a
+    heap is known at its foot after about as many passes as it is high, and not after their square.
     """
     for c in range(count):
         contacts.push[c] = 0.0
