@@ -42,7 +42,7 @@ from flockenv.rounding import check_places
 from flockenv.shapes import AnyShape, Circle, HalfSpace, Shape, clear_of
 from flockenv.snapshot import Mark, Snapshot
 from flockenv.space import AnySpace, Box, Plane, Torus
-from flockenv.spawn import Spawn, scatter
+from flockenv.spawn import Spawn, cells, scatter
 from flockenv.stability import check_contact, check_dt, check_lookahead
 from flockenv.state import Body, Floats, State
 from flockenv.steer import EVERY_EFFECT
@@ -145,7 +145,9 @@ class Group(Record):
         if (self.count is None) == (self.network is None):
             raise ValueError("count: give either a count or a network")
         if self.network is not None and (
-            self.spawn.low is not None or (any(self.spawn.speed) and not self.spawn.heading)
+            self.spawn.low is not None
+            or self.spawn.spacing is not None
+            or (any(self.spawn.speed) and not self.spawn.heading)
         ):
             raise ValueError("spawn: a network is where it says; all it may be given is a speed, with a heading")
         if self.alive is not None and self.network is not None:
@@ -216,6 +218,7 @@ class Scene(Record):
                 f"groups: {self.agents:,} agents need about {needed / 2**30:.3g} GiB; at most {MEMORY_LIMIT / 2**30:g} "
                 f"GiB, {int(MEMORY_LIMIT / each):,} agents, are allowed"
             )
+        self._cells  # noqa: B018  # refuses groups that have no room
         check_places(self)
         check_dt(self)
         check_contact(self)
@@ -465,28 +468,55 @@ class Scene(Record):
     def _scatter(self, state: State, b: int) -> None:
         place, first, d = entry(scatter), 0, self.dimension
         period = np.array(self.space.extent(d) if self.space.periodic else (0.0,) * d, float)
-        for group in self.groups:
+        for k, group in enumerate(self.groups):
             spawn = group.spawn
             if group.network is not None:
                 self._place(state, b, first, group)
                 first += group.size
                 continue
-            low = np.array(spawn.low if spawn.low is not None else (0.0,) * d, float)
-            high = np.array(spawn.high if spawn.high is not None else self.space.extent(d), float)
+            middles = self._cells[k]
+            low, high = (np.array(corner, float) for corner in self._corners(spawn))
+            if middles is not None:
+                low, high = np.full(d, -spawn.jitter), np.full(d, spawn.jitter)
             heading = np.array(spawn.heading if spawn.heading is not None else (0.0,) * d, float)
             tried = np.zeros(self.agents, np.int64)
             mine = slice(first, first + group.size)
+            looked = 0 if middles is not None else len(self.circles)  # a cell has been found clear of all of them
             for _ in range(ROUNDS if self.shapes else 1):
                 place(
                     state.key[b], state.x[:, b], state.v[:, b], self.body.radius, first, first + group.size, low, high,
-                    *spawn.speed, heading, state.obstacle_x[:, b], state.obstacle_radius[b],
+                    *spawn.speed, heading, state.obstacle_x[:, b, :looked], state.obstacle_radius[b, :looked],
                     period, np.zeros(d), tried,
                 )  # fmt: skip
+                if middles is not None:
+                    state.pos[b, mine] += middles
+                    break
                 inside = clear_of(self.shapes, np.array(state.pos[b, mine], np.float64), period) < group.radius
                 if not inside.any():
                     break
                 tried[mine] += inside
             first += group.size
+
+    def _corners(self, spawn: Spawn) -> tuple[Sequence[float], Sequence[float]]:
+        """Return the box that agents begin in, m."""
+        d = self.dimension
+        return spawn.low or (0.0,) * d, spawn.high or self.space.extent(d)
+
+    @functools.cached_property
+    def _cells(self) -> tuple[Floats | None, ...]:
+        """Where those of each group begin that have a cell each, (size, D) m; none for others."""
+        period = np.array(self.space.extent(self.dimension) if self.space.periodic else (0.0,) * self.dimension, float)
+        found: list[Floats | None] = []
+        for k, group in enumerate(self.groups):
+            if group.spawn.spacing is None:
+                found.append(None)
+                continue
+            try:
+                box = self._corners(group.spawn)
+                found.append(cells(group.spawn, *box, group.size, group.radius, self.obstacles, period))
+            except ValueError as error:
+                raise ValueError(f"groups[{k}].spawn.{error}") from None
+        return tuple(found)
 
     def _place(self, state: State, b: int, first: int, group: Group) -> None:
         """Write where the particles of a network begin, and how fast they all fly."""

@@ -3,26 +3,44 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Annotated, Any, Literal
 
+import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from flockenv.kernels import kernel
 from flockenv.noise import uniform
 from flockenv.records import Record
+from flockenv.shapes import Shape, clear_of
 
-__all__ = ["Spawn", "direction", "scatter"]
+__all__ = ["Spawn", "cells", "direction", "scatter"]
 
 TRIES = 64
 """Places tried per agent before it is put where it overlaps least."""
 
+MOST_CELLS = 10_000_000
+"""Cells of a grid that are looked through for free ones."""
+
 
 class Spawn(Record):
-    """Uniform in a box (default: the whole space), at a speed drawn from a range, in a random or a given direction."""
+    """Uniform in a box (default: the whole space), at a speed drawn from a range, in a random or a given direction.
+
+    With `spacing` nobody overlaps: each has a cell of a grid for himself.
+    """
 
     kind: Literal["uniform"] = "uniform"
     low: tuple[float, ...] | None = Field(default=None, description="m, lower corner")
     high: tuple[float, ...] | None = Field(default=None, description="m, upper corner")
+    spacing: float | None = Field(
+        default=None, gt=0,
+        description="m, edge of cells, from `low` on, along the first axis first; each has one that is clear of the "
+        "obstacles, and is in its middle; none = anywhere, whoever else is there",
+    )  # fmt: skip
+    jitter: float = Field(
+        default=0.0, ge=0, description="m, how far from the middle of its cell at most, along every axis"
+    )
     speed: tuple[Annotated[float, Field(ge=0)], Annotated[float, Field(ge=0)]] = Field(
         default=(0.0, 0.0), description="m/s, least and most"
     )
@@ -38,7 +56,42 @@ class Spawn(Record):
         corners = tuple(zip(self.low or (), self.high or (), strict=False))
         if len(self.low or ()) != len(self.high or ()) or any(a > b for a, b in corners):
             raise ValueError(f"low = {self.low}, high = {self.high}: the lower corner comes first")
+        if self.jitter and self.spacing is None:
+            raise ValueError(f"jitter = {self.jitter:g}: goes with spacing, within whose cells it is")
         return self
+
+
+def cells(
+    spawn: Spawn, low: Sequence[float], high: Sequence[float], count: int, radius: float, shapes: Sequence[Shape],
+    period: NDArray[np.float64],
+) -> NDArray[np.float64]:  # fmt: skip
+    """Return the middles of the first cells of a spawn's grid in [low, high) that are clear of shapes, (count, D) m.
+
+    ValueError that begins with the field's name if bodies of that radius, m, are wider than a cell, or have no room.
+    """
+    spacing, dimension = float(spawn.spacing or 0.0), len(low)
+    if spacing < 2 * (radius + spawn.jitter) * (1 - 1e-12):
+        raise ValueError(
+            f"spacing = {spacing:g}: bodies of radius {radius:g} m, up to {spawn.jitter:g} m from the middle, need "
+            f"cells of at least {2 * (radius + spawn.jitter):g} m"
+        )
+    along = [math.floor((b - a) / spacing + 1e-9) for a, b in zip(low, high, strict=True)]
+    total = math.prod(along)
+    if total > MOST_CELLS:
+        raise ValueError(f"spacing = {spacing:g}: {total:,} cells; at most {MOST_CELLS:,} are looked through")
+    found = np.zeros((0, dimension))
+    for first in range(0, total, 65_536):
+        if len(found) >= count:
+            break
+        ids = np.unravel_index(np.arange(first, min(first + 65_536, total)), along, order="F")
+        middles = np.array(low, float) + spacing * (np.stack(ids, axis=1) + 0.5)
+        free = clear_of(shapes, middles, period) >= radius + spawn.jitter * math.sqrt(dimension)
+        found = np.concatenate([found, middles[free]])
+    if len(found) < count:
+        raise ValueError(
+            f"spacing = {spacing:g}: room for {len(found):,} of {count:,} agents from {tuple(low)} to {tuple(high)}"
+        )
+    return found[:count]
 
 
 @kernel

@@ -20,7 +20,7 @@ from flockenv.effects import EFFECTS, Drag, Gravity, QuadraticDrag
 from flockenv.integrators import RK4, SemiImplicitEuler
 from flockenv.kernels import cache_folder
 from flockenv.scene import Group, Scene
-from flockenv.shapes import Circle
+from flockenv.shapes import Block, Circle
 from flockenv.space import Box, Plane, Space, Torus
 from flockenv.spawn import Spawn
 from flockenv.state import State
@@ -82,6 +82,27 @@ def test_nobody_starts_in_an_obstacle(space: Space) -> None:
     for obstacle in obstacles:
         gap = np.linalg.norm(space.displacement(state.pos, obstacle.centre), axis=2) - obstacle.radius
         assert gap.min() >= 0.2
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_with_a_spacing_nobody_starts_in_anybody_or_in_an_obstacle(dimension: int) -> None:
+    """Cells that an obstacle reaches into are left out, of whatever shape it is; worlds differ by the jitter alone."""
+    obstacles = (Circle(centre=(2,) * dimension, radius=0.8), Block(centre=(0,) * dimension, size=(1,) * dimension))
+    spawn = Spawn(low=(0,) * dimension, high=(5,) * dimension, spacing=0.6, jitter=0.1)
+    groups = (
+        Group(count=40, radius=0.2, spawn=spawn),
+        Group(count=1, spawn=Spawn(low=(9,) * dimension, high=(9,) * dimension)),
+    )
+    scene = scene_of(dimension=dimension, obstacles=obstacles, groups=groups)
+    pos = scene.start(0, worlds=3).pos[:, :40]
+    for place in pos:
+        far = np.linalg.norm(place[:, None] - place, axis=2) + np.eye(40)
+        assert 0.4 <= far.min() < 0.5
+        assert min(shape.gap(place).min() for shape in obstacles) >= 0.2
+    cell = np.floor(pos / 0.6)
+    np.testing.assert_array_equal(cell[0], cell[1])
+    assert 0.05 < np.abs(pos - 0.6 * (cell + 0.5)).max() <= 0.1
+    assert not np.array_equal(pos[0], pos[1])
 
 
 # --- steps ------------------------------------------------------------------------------------------------------------
@@ -361,6 +382,9 @@ BAD_SCENES = [
     ({"groups": (Group(count=3),)}, ["groups[0].spawn.low", "missing"]),
     ({"groups": (Group(count=3, spawn=Spawn(low=(0, 0, 0), high=(1, 1, 1))),)}, ["groups[0].spawn.low", "dimension"]),
     ({"groups": (Group(count=3, spawn=SPAWN), {"count": 2, "mas": 1})}, ["groups[1].mas", "did you mean `mass`"]),
+    ({"groups": (Group(count=3, spawn=Spawn(low=(0, 0), high=(1, 0.4), spacing=0.4)),)}, ["room for 2 of 3 agents"]),
+    ({"groups": (Group(count=3, spawn=Spawn(low=(0, 0), high=(1, 1), spacing=0.3, jitter=0.1)),)}, ["at least 0.4 m"]),
+    ({"groups": (Group(count=3, radius=0, spawn=Spawn(low=(0, 0), high=(9, 9), spacing=1e-4)),)}, ["8,100,000,000"]),
     ({"space": Box(size=(1, 1)), "groups": (Group(count=3, radius=2),)}, ["groups[0].radius = 2", "does not fit"]),
     ({"groups": (Group(count=10**9, spawn=SPAWN),)}, ["1,000,000,000 agents", "GiB", "are allowed"]),
     ({"groups": (Group(count=10**30, spawn=SPAWN),)}, ["GiB"]),
@@ -403,6 +427,8 @@ def test_a_bad_scene_is_refused_in_one_line_before_anything_is_allocated(fields:
         ({"spawn": {"speed": (2, 1)}}, "speed = (2.0, 1.0)"),
         ({"spawn": {"low": (1, 1), "high": (0, 2)}}, "low = (1.0, 1.0)"),
         ({"spawn": {"low": (1, 1)}}, "low and high"),
+        ({"spawn": {"jitter": 0.1}}, "jitter = 0.1: goes with spacing"),
+        ({"spawn": {"spacing": 0}}, "spacing = 0"),
     ],
     ids=str,
 )

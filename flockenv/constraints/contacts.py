@@ -182,8 +182,11 @@ def _press_once(
             continue
         v = _seen(period, things, vel, i, j)
         if sticky:
-            _give(period, bodies, vel, i, j, scale(v, -1.0 / ease))
+            impulse = scale(v, -1.0 / ease)
+            write(contacts.rub, c, add(vector(period, contacts.rub, c), impulse))
+            _give(period, bodies, vel, i, j, impulse)
             worst = max(worst, norm(v))
+            square += dot(impulse, impulse)
             continue
         total = max(contacts.push[c] - (dot(v, n) + contacts.allowed[c]) / ease, 0.0)
         given = total - contacts.push[c]
@@ -211,9 +214,9 @@ def press(
     """Stop those who go into each other at velocities (N, D), without a bounce; return the last pass's fastest change.
 
     The impulse of each contact is summed and never pulls; friction is bounded by what was given across, friction times
-    as much (Coulomb), and stops what it can. Sticky contacts pull as well as push. Passes go on along the direction of
-    those before, as conjugate gradients do (Silcowitz, Niebe and Erleben 2010): the weight of a heap is known at its
-    foot after about as many passes as it is high, and not after their square.
+    as much (Coulomb), and stops what it can. Sticky contacts pull as well as push, in every direction. Passes go on
+    along the direction of those before, as conjugate gradients do (Silcowitz, Niebe and Erleben 2010): the weight of a
+    heap is known at its foot after about as many passes as it is high, and not after their square.
     """
     for c in range(count):
         contacts.push[c] = 0.0
@@ -228,10 +231,8 @@ def press(
             for k in range(len(period)):
                 contacts.was[c, k] = contacts.rub[c, k]
         worst, square = _press_once(period, bodies, things, contacts, vel, friction, sticky, turn % 2 == 0, count)
-        if worst <= slow or sticky or turn == rounds - 1:
-            if worst <= slow:
-                break
-            continue
+        if worst <= slow or turn == rounds - 1:
+            break
         share = square / before if turn > 0 and square < before else 0.0
         before = square
         for c in range(count):

@@ -16,13 +16,16 @@ import numpy as np
 from flockenv.constraints.broad import image, near, vector, write
 from flockenv.constraints.impact import POINT, along, bounced, ends_here, first_impact, flight, rubbed, surface
 from flockenv.kernels import Vec, kernel
-from flockenv.vec import add, dot, norm, scale, sub
+from flockenv.vec import add, dot, norm, scale, sub, unit
 
 __all__ = ["Bodies", "Meetings", "Rules", "Things", "link", "play", "take_off"]
 
 
 OBLIQUE = 0.6180339887498949
 """An axis in no special direction: coordinates weigh 1, this, and its square."""
+
+ANEW = 4
+"""How often two elastic bodies may come to rest in one step, and be driven into each other again."""
 
 
 class Bodies(NamedTuple):
@@ -183,7 +186,7 @@ def play(
             return impacts, cut, count
         impacts, when = impacts + 1, meetings.time[best]
         meetings.hits[best] += 1
-        over = meetings.hits[best] > rules.most
+        over = meetings.hits[best] % (rules.most + 1) == 0
         cut += 1 if over else 0
         _impact(period, bodies, meetings, things, rules, best, when, over)
         todo, meetings.time[best] = 0, np.inf
@@ -191,7 +194,7 @@ def play(
             if who >= 0 and rules.anew:
                 count = _widened(period, bodies, meetings, things, rules, who, when, count)
             if who >= 0:
-                todo = _again(bodies, meetings, who, rules.anew, todo)
+                todo = _again(period, bodies, meetings, things, rules, who, when, todo)
         if count > meetings.who.shape[0]:
             return impacts, cut, count
 
@@ -246,12 +249,16 @@ def _look(period: Vec, bodies: Bodies, meetings: Meetings, things: Things, rules
 
 
 @kernel
-def _again(bodies: Bodies, meetings: Meetings, i: int, anew: bool, todo: int) -> int:
+def _again(
+    period: Vec, bodies: Bodies, meetings: Meetings, things: Things, rules: Rules, i: int, t: float, todo: int
+) -> int:
     """List the meetings of body i to be looked at anew: all, or those with obstacles; then the others are over."""
     place = bodies.first[i]
     while place >= 0:
         c = place // 2
-        if anew or meetings.other[c] < 0:
+        if meetings.closed[c] == 1 and rules.anew and _hit_anew(period, bodies, meetings, things, rules, c, t):
+            meetings.closed[c] = 0
+        if rules.anew or meetings.other[c] < 0:
             meetings.todo[todo] = c
             todo += 1
         else:
@@ -259,6 +266,20 @@ def _again(bodies: Bodies, meetings: Meetings, i: int, anew: bool, todo: int) ->
             meetings.time[c] = np.inf
         place = meetings.following[place % 2, c]
     return todo
+
+
+@kernel
+def _hit_anew(period: Vec, bodies: Bodies, meetings: Meetings, things: Things, rules: Rules, c: int, t: float) -> bool:
+    """Has a third one driven two elastic bodies into each other that came to rest, by more than the step itself does?
+
+    They trembled too often; but what comes from outside they pass on. At most so often that a step has an end.
+    """
+    i, j = meetings.who[c], meetings.other[c]
+    if j < 0 or rules.restitution < 1.0 or rules.sticky or meetings.hits[c] >= ANEW * (rules.most + 1):
+        return False
+    y, v, _ = _relative(period, bodies, things, i, j, t)
+    hard = max(norm(vector(period, bodies.free, i)), norm(vector(period, bodies.free, j)))
+    return bool(-dot(v, unit(y)) > hard * rules.seconds)
 
 
 @kernel
