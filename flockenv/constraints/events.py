@@ -187,11 +187,12 @@ def play(
         cut += 1 if over else 0
         _impact(period, bodies, meetings, things, rules, best, when, over)
         todo, meetings.time[best] = 0, np.inf
+        anew = rules.anew or meetings.other[best] < 0 or meetings.closed[best] == 1  # who lies may still be hit
         for who in (meetings.who[best], meetings.other[best]):
             if who >= 0 and rules.anew:
                 count = _widened(period, bodies, meetings, things, rules, who, when, count)
             if who >= 0:
-                todo = _again(bodies, meetings, who, rules.anew, todo)
+                todo = _again(bodies, meetings, who, anew, todo)
         if count > meetings.who.shape[0]:
             return impacts, cut, count
 
