@@ -18,7 +18,7 @@ from flockenv.scene import Group, Scene
 from flockenv.shapes import Block
 from flockenv.spawn import Spawn
 from flockenv.stress.case import Case, Value
-from flockenv.stress.solids import Floats, Response, batch, overlap, per_response, solid
+from flockenv.stress.solids import Response, batch, overlap, per_response, solid
 
 __all__ = ["GATHERINGS"]
 
@@ -55,7 +55,9 @@ def crossing(count: int, circle: float, seconds: float) -> Callable[[Integrator,
             state = scene.step(state, drive=(wish / 0.5)[None])
             deep = max(deep, overlap(state.pos[0], R) / R)
         there = int(np.isfinite(arrived).sum())
-        when = f"after {arrived.max():.1f} s" if there == count else f"deadlock: {count - there} not within {seconds:g} s"
+        when = (
+            f"after {arrived.max():.1f} s" if there == count else f"deadlock: {count - there} not within {seconds:g} s"
+        )
         return Value(deep, deep <= 0.05, f"{there} of {count} there, {when}; overlap {deep:.2%} of R at most")
 
     return trial
@@ -73,7 +75,9 @@ def stalls(method: Integrator) -> Value:
         ends.append(float(end.pos[0, 0, 0]))
         aside.append(float(np.abs(end.pos[0, 0, 1])))
     holds = ends[0] < 5.0 and aside[0] == 0.0 and ends[1] > 7.0
-    note = f"after 12 s the field is at x = {ends[0]:.2f} m, {aside[0]:.1g} m aside; to avoid at x = {ends[1]:.2f} m of 12"
+    note = (
+        f"after 12 s the field is at x = {ends[0]:.2f} m, {aside[0]:.1g} m aside; to avoid at x = {ends[1]:.2f} m of 12"
+    )
     return Value(ends[0], holds, note)
 
 
@@ -100,7 +104,7 @@ def _under(scene: Scene, method: Integrator) -> Scene:
 
 
 def chaos(method: Integrator, response: Response) -> Value:
-    """60 discs in a room, 36 worlds: again, by 1 and 4 threads, all the same bits; renumbered within 1e-9, till when."""
+    """60 discs in a room, 72 worlds: again, and by 4 threads, the same bits; renumbered within 1e-9, till when."""
     room = Block(centre=(0.0, 0.0), size=(8.0, 8.0), hollow=True)
     scene = solid(method, response, 0.02, count=60, obstacles=(room,), restitution=0.9, pull=(0.0, -1.0))
     rng = np.random.default_rng(0)
@@ -132,7 +136,8 @@ def _crowds() -> Sequence[Case]:
     """Return the cases of N11."""
     cases: list[Case] = []
     for name, count, circle, seconds in (
-        ("pair", 2, 4.0, 20.0), ("four", 4, 4.0, 20.0), ("8", 8, 4.0, 40.0), ("16", 16, 5.0, 40.0), ("64", 64, 8.0, 60.0)
+        ("pair", 2, 4.0, 20.0), ("four", 4, 4.0, 20.0), ("8", 8, 4.0, 40.0), ("16", 16, 5.0, 40.0),
+        ("64", 64, 8.0, 60.0),
     ):  # fmt: skip
         title = {"pair": "two head-on", "four": "four at a crossing"}.get(name, f"{name} across a circle")
         bound = "pass or told, overlap 5 % R"

@@ -19,7 +19,7 @@ from flockenv.stability import UnstableStepWarning
 from flockenv.stress.case import Case
 from flockenv.stress.results import Finding, Results, Verdict
 
-__all__ = ["cases_named", "fingerprint", "run", "usual_methods"]
+__all__ = ["cases_named", "fingerprint", "run", "trials", "usual_methods"]
 
 TOLD = (UnstableStepWarning, UnsolvedContactsWarning)
 """Warnings that are part of a verdict."""
@@ -37,6 +37,11 @@ def cases_named(cases: Sequence[Case], names: Sequence[str]) -> tuple[Case, ...]
         if name not in known:
             raise ValueError(f"case {shown(name)}: unknown{nearest(name, known)}; {', '.join(sorted(known))}")
     return tuple(c for c in cases if not names or c.name in names or c.name.split()[0] in names)
+
+
+def trials(cases: Sequence[Case], methods: Sequence[Integrator]) -> int:
+    """Return how many trials there are of these cases under these methods."""
+    return sum(case.under(method) for case in cases for method in methods)
 
 
 def fingerprint() -> str:

@@ -20,7 +20,7 @@ from flockenv.spawn import Spawn
 from flockenv.state import State
 from flockenv.stress.case import Case, Value
 
-__all__ = ["G", "RESPONSES", "Floats", "Response", "batch", "overlap", "per_response", "solid"]
+__all__ = ["RESPONSES", "Floats", "G", "Response", "batch", "overlap", "per_response", "solid"]
 
 Floats = NDArray[np.float64]
 Response = Literal["earliest", "back_up", "impulses", "project"]
