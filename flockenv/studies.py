@@ -151,9 +151,9 @@ def stress(
     force: Annotated[bool, typer.Option("--force", help="Begin anew, whatever X.json says.")] = False,
 ) -> None:
     """Try every hard case under every integrator, and show value, bound and verdict of each."""
-    from flockenv.integrators import INTEGRATORS, methods_named
+    from flockenv.integrators import methods_named
     from flockenv.outputs import checked_file
-    from flockenv.stress import CASES, VERDICTS, cases_named, run, usual_methods
+    from flockenv.stress import CASES, VERDICTS, cases_named, run, trials, usual_methods
 
     path = checked_file(out, [".json", ".png"], True) if out is not None else None
     todo = cases_named(CASES, _words(cases))
@@ -168,7 +168,7 @@ def stress(
 
     stopped = False
     try:
-        with progress_bar("hard cases", len(todo) * len(under), "trials") as advance:
+        with progress_bar("hard cases", trials(todo, under), "trials") as advance:
             found = run(todo, under, found, advance, keep)
     except KeyboardInterrupt:
         if found is None:
@@ -182,7 +182,7 @@ def stress(
     show_table(console, "Verdicts", VERDICTS.items())
     if path is not None:
         _write(path, found, functools.partial(_draw_verdicts, found))
-        console.print(f"{relative(path)} holds {len(found.findings)} of {len(CASES) * len(INTEGRATORS)} findings")
+        console.print(f"{relative(path)} holds {len(found.findings)} of {trials(CASES, usual_methods())} findings")
     if stopped:
         raise EarlyEnd("interrupted; what was done is shown, the same command goes on", INTERRUPTED)
 

@@ -24,6 +24,9 @@ from flockenv.integrators import (
 )
 from flockenv.stability import UnstableStepWarning
 from flockenv.stress import CASES, Case, Finding, Results, Value, cases_named, fingerprint, run, usual_methods
+from flockenv.stress.gatherings import GATHERINGS
+from flockenv.stress.heaps import HEAPS
+from flockenv.stress.impacts import IMPACTS
 
 pytestmark = pytest.mark.slow
 """Many kernels: where slow tests run."""
@@ -180,7 +183,8 @@ def test_names_are_known_and_unknown_ones_get_a_suggestion() -> None:
 
 # --- the cases --------------------------------------------------------------------------------------------------------
 
-BOUNDED = tuple(name for name in NAMES if not name.startswith(("N14", "N20")))
+SOLID = {case.name for case in (*IMPACTS, *HEAPS, *GATHERINGS)}  # of these: tests/test_stress_solids.py
+BOUNDED = tuple(name for name in NAMES if not name.startswith(("N14", "N20")) and name not in SOLID)
 HEAVY = ("N09 crowd", "N10", "N18", "N09 centre")  # a kernel each, of ten seconds
 LIGHT = tuple(name for name in BOUNDED if name not in HEAVY)
 

@@ -190,11 +190,12 @@ def play(
         cut += 1 if over else 0
         _impact(period, bodies, meetings, things, rules, best, when, over)
         todo, meetings.time[best] = 0, np.inf
+        anew = rules.anew or meetings.other[best] < 0 or meetings.closed[best] == 1  # who lies may still be hit
         for who in (meetings.who[best], meetings.other[best]):
             if who >= 0 and rules.anew:
                 count = _widened(period, bodies, meetings, things, rules, who, when, count)
             if who >= 0:
-                todo = _again(period, bodies, meetings, things, rules, who, when, todo)
+                todo = _again(period, bodies, meetings, things, rules, who, when, anew, todo)
         if count > meetings.who.shape[0]:
             return impacts, cut, count
 
@@ -250,15 +251,16 @@ def _look(period: Vec, bodies: Bodies, meetings: Meetings, things: Things, rules
 
 @kernel
 def _again(
-    period: Vec, bodies: Bodies, meetings: Meetings, things: Things, rules: Rules, i: int, t: float, todo: int
-) -> int:
+    period: Vec, bodies: Bodies, meetings: Meetings, things: Things, rules: Rules, i: int, t: float, anew: bool,
+    todo: int,
+) -> int:  # fmt: skip
     """List the meetings of body i to be looked at anew: all, or those with obstacles; then the others are over."""
     place = bodies.first[i]
     while place >= 0:
         c = place // 2
         if meetings.closed[c] == 1 and rules.anew and _hit_anew(period, bodies, meetings, things, rules, c, t):
             meetings.closed[c] = 0
-        if rules.anew or meetings.other[c] < 0:
+        if anew or meetings.other[c] < 0:
             meetings.todo[todo] = c
             todo += 1
         else:

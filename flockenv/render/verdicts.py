@@ -37,7 +37,7 @@ def draw_verdicts(results: Results) -> Figure:
     from matplotlib.patches import Rectangle
 
     cases, methods = results.cases, results.methods
-    wide, left = 1.15, 5.2
+    wide, left = 1.15, 5.6
     figure = Figure(figsize=(left + wide * len(methods), 1.7 + 0.36 * len(cases)), facecolor="white")
     FigureCanvasAgg(figure)
     axes = figure.add_axes((0, 0, 1, 1))
@@ -53,7 +53,7 @@ def draw_verdicts(results: Results) -> Figure:
         found = [results.at(case, method) for method in methods]
         title = next(f.title for f in found if f is not None)
         axes.text(0.15, y + 0.18, case, fontsize=8, va="center", fontweight="bold", color=INK)
-        axes.text(1.15, y + 0.18, title, fontsize=8, va="center", color=INK)
+        axes.text(1.55, y + 0.18, title, fontsize=8, va="center", color=INK)
         for k, finding in enumerate(found):
             if finding is None:
                 continue

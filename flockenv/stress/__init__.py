@@ -3,9 +3,9 @@
 from flockenv.stress import CASES, run
 results = run(CASES, methods)
 
-Cases are functions from a method to a `Value`; see `bodies`, `bonded`, `crowds`, `contacts`. What a case raises is a
-verdict too: a scene that is refused because its step must blow up, a simulation that diverges and says so. Nothing ends
-in NaN without a word.
+Cases are functions from a method to a `Value`; see `bodies`, `bonded`, `crowds`, `contacts`; of bodies that collide
+there is a case for each response, see `impacts`, `heaps`, `gatherings`. What a case raises is a verdict too: a scene that
+is refused because its step must blow up, a simulation that diverges and says so. Nothing ends in NaN without a word.
 """
 
 from __future__ import annotations
@@ -15,12 +15,16 @@ from flockenv.stress.bonded import BONDED
 from flockenv.stress.case import Case, Value
 from flockenv.stress.contacts import CONTACTS
 from flockenv.stress.crowds import CROWDS
+from flockenv.stress.gatherings import GATHERINGS
+from flockenv.stress.heaps import HEAPS
+from flockenv.stress.impacts import IMPACTS
 from flockenv.stress.results import VERDICTS, Finding, Results
-from flockenv.stress.run import cases_named, fingerprint, run, usual_methods
+from flockenv.stress.run import cases_named, fingerprint, run, trials, usual_methods
 
 __all__ = [
-    "CASES", "VERDICTS", "Case", "Finding", "Results", "Value", "cases_named", "fingerprint", "run", "usual_methods",
+    "CASES", "VERDICTS", "Case", "Finding", "Results", "Value", "cases_named", "fingerprint", "run", "trials",
+    "usual_methods",
 ]  # fmt: skip
 
-CASES: tuple[Case, ...] = (*BODIES, *BONDED, *CROWDS, *CONTACTS)
+CASES: tuple[Case, ...] = (*BODIES, *BONDED, *CROWDS, *CONTACTS, *IMPACTS, *HEAPS, *GATHERINGS)
 """Every hard case, in the order of shared/reference/numerics.md, section 6.2, within each kind of scene."""

@@ -38,6 +38,12 @@ class Case:
     title: str
     bound: str
     trial: Callable[[Integrator], Value]
+    methods: tuple[str, ...] = ()
+    """Kinds of methods that it is tried under; none = all."""
+
+    def under(self, method: Integrator) -> bool:
+        """Is it tried under a method?"""
+        return not self.methods or method.kind in self.methods
 
 
 def started(scene: Scene, pos: Any, vel: Any) -> State:

@@ -16,7 +16,7 @@ Verdict = Literal["pass", "warned", "refused", "fails", "diverges"]
 
 VERDICTS: dict[Verdict, str] = {
     "pass": "within the bound",
-    "warned": "within the bound, after a warning that the step is too long",
+    "warned": "within the bound, after a warning: of a step that is too long, of contacts that were not solved",
     "refused": "the scene was refused: this step must blow up, and the message names the largest that does not",
     "fails": "beyond the bound",
     "diverges": "no longer finite, and reported: world, agent, step, effect",

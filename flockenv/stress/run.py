@@ -10,6 +10,7 @@ from itertools import product
 from pathlib import Path
 from time import perf_counter
 
+from flockenv.constraints.collisions import UnsolvedContactsWarning
 from flockenv.divergence import SimulationDiverged
 from flockenv.integrators import INTEGRATORS, Integrator
 from flockenv.kernels import laws_digest
@@ -17,7 +18,10 @@ from flockenv.refusals import nearest, shown
 from flockenv.stress.case import TOO_LONG, Case
 from flockenv.stress.results import Finding, Results, Verdict
 
-__all__ = ["cases_named", "fingerprint", "run", "usual_methods"]
+__all__ = ["cases_named", "fingerprint", "run", "trials", "usual_methods"]
+
+TOLD = (*TOO_LONG, UnsolvedContactsWarning)
+"""Warnings that are part of a verdict."""
 
 
 def usual_methods() -> tuple[Integrator, ...]:
@@ -32,6 +36,11 @@ def cases_named(cases: Sequence[Case], names: Sequence[str]) -> tuple[Case, ...]
         if name not in known:
             raise ValueError(f"case {shown(name)}: unknown{nearest(name, known)}; {', '.join(sorted(known))}")
     return tuple(c for c in cases if not names or c.name in names or c.name.split()[0] in names)
+
+
+def trials(cases: Sequence[Case], methods: Sequence[Integrator]) -> int:
+    """Return how many trials there are of these cases under these methods."""
+    return sum(case.under(method) for case in cases for method in methods)
 
 
 def fingerprint() -> str:
@@ -54,6 +63,7 @@ def run(
 ) -> Results:
     """Try every case under every method, and return that beside what is known.
 
+    A case that says under which methods it is tried is tried under no others.
     What is known from the same sources is not tried again, and not lost; of other sources nothing is taken over.
     `progress` is called with how many are done, `keep` with all there is after each: whoever is interrupted has that.
     """
@@ -65,7 +75,8 @@ def run(
         ordered = sorted(found.values(), key=lambda f: (place.get(f.case, len(place)), f.case))
         return Results(findings=tuple(ordered), sources=sources)
 
-    for done, (method, case) in enumerate(product(methods, cases)):
+    pairs = [(method, case) for method, case in product(methods, cases) if case.under(method)]
+    for done, (method, case) in enumerate(pairs):
         progress(done)
         if (case.name, method.kind) not in found:
             found[case.name, method.kind] = _tried(case, method)
@@ -79,7 +90,7 @@ def _tried(case: Case, method: Integrator) -> Finding:
     number: float | None = None
     verdict: Verdict
     with warnings.catch_warnings(record=True) as caught:
-        for kind in TOO_LONG:
+        for kind in TOLD:
             warnings.simplefilter("always", kind)
         try:
             value = case.trial(method)
@@ -91,7 +102,7 @@ def _tried(case: Case, method: Integrator) -> Finding:
             number = value.number if math.isfinite(value.number) else None
             # a bound that is asked the other way round holds for what is no number
             verdict, note = ("pass" if value.holds and not math.isnan(value.number) else "fails"), value.note
-    told = next((str(w.message) for w in caught if issubclass(w.category, TOO_LONG)), "")
+    told = next((str(w.message) for w in caught if issubclass(w.category, TOLD)), "")
     if told and verdict == "pass":
         verdict = "warned"
     return Finding(
