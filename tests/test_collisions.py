@@ -170,6 +170,16 @@ def test_on_an_incline_it_sticks_up_to_the_angle_of_friction(response: str) -> N
             assert abs(moved / (pull / 2) - 1) < (1e-9 if response in IN_TIME else 0.0101)  # half a step of Euler's
 
 
+@pytest.mark.parametrize("response", EXACT)
+@pytest.mark.parametrize("method", [VelocityVerlet(), RK4()], ids=lambda m: m.kind)
+def test_what_rests_creeps_under_no_method(response: str, method: Integrator) -> None:
+    out = np.array([-math.sin(0.2), math.cos(0.2)])
+    plane = (HalfSpace(point=(0.0, 0.0), direction=tuple(out)),)
+    of = scene([1], response, e=0.3, g=G, dt=0.02, obstacles=plane, friction=0.3, method=method)
+    end = of.run(begun(of, [R * out], [(0, 0)]), 500)
+    np.testing.assert_allclose(end.pos[0, 0], R * out, rtol=0, atol=1e-9)
+
+
 @pytest.mark.parametrize(("response", "dt"), [("earliest", 0.01), ("back_up", 0.01), ("impulses", 0.005)])
 def test_friction_stops_it_where_it_should_and_does_not_turn_it_round(response: str, dt: float) -> None:
     of = scene([1], response, e=0.0, g=G, dt=dt, obstacles=FLOOR, friction=0.4)

@@ -231,9 +231,11 @@ def _at_once(
             write(ends.vel, i, add(vector(period, before, i), vector(period, bodies.acc, i)))
     left = press(period, bodies, things, contacts, ends.vel, rules.friction, rules.sticky, passes, gain, count)
     if not in_time and not once:
-        for i in range(n):
-            more = sub(vector(period, ends.vel, i), vector(period, bodies.vel, i))
-            write(ends.pos, i, add(vector(period, ends.pos, i), scale(more, seconds)))
+        for i in range(n):  # whom contacts have changed goes from where he was as fast as he is now, under every method
+            now = vector(period, ends.vel, i)
+            more = sub(now, vector(period, bodies.vel, i))
+            if dot(more, more) > 0.0:
+                write(ends.pos, i, add(vector(period, bodies.start, i), scale(now, seconds)))
     deep, widest = part(period, bodies, things, ends, seconds, passes, rules.touch, spread, contacts, count), 0.0
     for i in range(n):
         widest = max(widest, bodies.radius[i])

@@ -93,7 +93,11 @@ def gather(
             w = -dot(_seen(period, things, ends.vel, i, j), n)
             later = in_time and (gap > touch or (meetings.closed[c] != 1 and w > slow))
             contacts.open[found] = 1 if later else 0
-            contacts.allowed[found] = 0.0 if in_time else max(gap / seconds + w, 0.0)
+            contacts.allowed[found] = 0.0
+            if not in_time:
+                going = _moved(period, bodies, ends, i)
+                going = sub(going, _moved(period, bodies, ends, j) if j >= 0 else _drifted(period, things, j, seconds))
+                contacts.allowed[found] = max(gap - dot(going, n), 0.0) / seconds
             write(contacts.normal, found, n)
             middle = sub(vector(period, ends.pos, i), scale(n, bodies.radius[i]))
             contacts.rank[found] = dot(middle, up)
@@ -101,6 +105,18 @@ def gather(
             found += 1
     _sort(contacts.rank, contacts.order, found)
     return found
+
+
+@kernel
+def _moved(period: Vec, bodies: Bodies, ends: Ends, i: int) -> Vec:
+    """Return how far a step has led a body, m."""
+    return image(period, sub(vector(period, ends.pos, i), vector(period, bodies.start, i)))
+
+
+@kernel
+def _drifted(period: Vec, things: Things, j: int, seconds: float) -> Vec:
+    """Return how far obstacle -1 - j moves in a step, m."""
+    return scale(vector(period, things.drift, -1 - j), seconds)
 
 
 @kernel
