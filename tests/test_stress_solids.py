@@ -31,8 +31,7 @@ def found(name: str, method: Integrator | None = None) -> Finding:
 
 def as_known(name: str, method: Integrator | None = None) -> None:
     finding = found(name, method)
-    creeps = name == "N22 impulses" and finding.method != "semi_implicit_euler"  # half a g t^2 is parted, no velocity
-    assert finding.verdict == ("fails" if name in FAIL or creeps else "pass"), finding.note
+    assert finding.verdict == ("fails" if name in FAIL else "pass"), finding.note
 
 
 @pytest.mark.parametrize(
