@@ -9,7 +9,7 @@ from typing import Any
 import hypothesis
 import pytest
 
-from tests.catalogue import TETHER, Variant, users_module
+from tests.catalogue import TETHER, users_module
 
 # Before anything imports pygame: a window is opened, but nowhere.
 os.environ.setdefault("SDL_VIDEODRIVER", "dummy")
@@ -35,14 +35,10 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Mark what compiles a kernel of its own for one more variant of what quick tests try already."""
     for item in items:
         given = getattr(getattr(item, "callspec", None), "params", {})
-        named = {value.name if isinstance(value, Variant) else value for value in map(_hashable, given.values())}
+        named = [getattr(value, "name", value) for value in given.values()]
         in_space = given.get("dimension") == 3 and item.path.stem in IN_SPACE_SLOW
-        if named & RARE or in_space:
+        if any(isinstance(name, str) and name in RARE for name in named) or in_space:
             item.add_marker(pytest.mark.slow)
-
-
-def _hashable(value: Any) -> Any:
-    return value if isinstance(value, (str, Variant)) else None
 
 
 @pytest.fixture(scope="module")  # and forgotten afterwards: other files count the effects there are

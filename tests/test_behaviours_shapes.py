@@ -208,7 +208,7 @@ def test_in_a_corridor_the_force_field_of_both_walls_leads_to_the_middle_without
     """formulas.md 1.4: the nearest wall alone pushes to and fro."""
     walls = (HalfSpace(point=(0, -0.9), direction=(0, 1)), HalfSpace(point=(0, 0.9), direction=(0, -1)))
     np.testing.assert_allclose(wish(FIELD, obstacles=walls), 0, atol=1e-12)
-    x, v = path(scene(FIELD, SEEK, obstacles=walls, at=(0.0, 0.3)), 4)
+    x, v = path(scene(FIELD, SEEK, obstacles=walls, at=(0.0, 0.3)), 6)
     late = slice(3 * len(x) // 4, None)
     assert np.abs(x[late, 1]).max() < 1e-3
     assert np.abs(v[late, 1]).max() < 1e-3

@@ -47,14 +47,19 @@ EVERY_ROW = pytest.mark.parametrize("row", EFFECTS, ids=lambda row: row.name)
 """For tests that compile nothing."""
 
 
+ELSEWHERE = {"flockenv.effects.fields", "flockenv.effects.tether", "flockenv.effects.attraction"}
+"""Effects of these files have quick tests in test_fields.py, test_closed_forms.py and test_springs.py."""
+
+
 def among(rows: Iterable[EffectRow]) -> pytest.MarkDecorator:
-    """Those rows; most behaviours where slow tests run: quick tests of theirs are in test_behaviours_*.py."""
+    """Those rows; most behaviours and fields where slow tests run: quick tests of theirs are in files of their own."""
     given = [pytest.param(row, marks=pytest.mark.slow) if _slow(row) else row for row in rows]
     return pytest.mark.parametrize("row", given, ids=lambda row: row.name)
 
 
 def _slow(row: EffectRow) -> bool:
-    return row.effect.steering and row.effect.kind not in {*AMONG_ALL, "steer"}
+    elsewhere = row.effect.steering or type(row.effect).__module__ in ELSEWHERE
+    return elsewhere and row.effect.kind not in {*AMONG_ALL, "steer"}
 
 
 ROWS = among(EFFECTS)

@@ -129,6 +129,7 @@ def over(given, answers):
     load("single_precision", source).over(tuple(map(tuple, given_)), tuple(answers))
 
 
+@pytest.mark.slow
 @DIMENSIONS
 def test_in_single_precision_they_stay_there_and_stay_accurate(dimension: int) -> None:
     given_ = [[a.astype(np.float32) for a in arguments(row, dimension, 200)] for row in STEERING]
