@@ -502,7 +502,7 @@ def test_it_is_a_value(row: EffectRow) -> None:
 
 
 @DIMENSIONS
-@EVERY_ROW
+@ROWS
 def test_a_scene_under_it_is_a_value(row: EffectRow, dimension: int) -> None:
     scene = scene_under(row, dimension)
     end = scene.run(scene.start(3), 5)
