@@ -164,6 +164,8 @@ class Arbitration(Record):
 
     kind: str
     law: ClassVar[str]
+    recalls: ClassVar[tuple[str, ...]] = ()
+    """Names of the numbers inside agents that its law reads as me.inner.NAME, and that some effect keeps."""
 
     @classmethod
     def __pydantic_init_subclass__(cls, **kwargs: Any) -> None:

@@ -25,7 +25,7 @@ from flockenv.appearance import Appearance
 from flockenv.constraints import CONSTRAINTS, Collisions, Constraint, Settler
 from flockenv.crew import share, threads
 from flockenv.divergence import SimulationDiverged
-from flockenv.effects import Effect
+from flockenv.effects import EFFECTS, Effect
 from flockenv.effects.base import all_masses
 from flockenv.implicit import coupling_of, solve_steps
 from flockenv.integrators import INTEGRATORS, Adaptive, ImplicitEuler, Integrator, SemiImplicitEuler
@@ -43,6 +43,7 @@ from flockenv.shapes import AnyShape, Circle, HalfSpace, Shape, clear_of
 from flockenv.snapshot import Mark, Snapshot
 from flockenv.space import AnySpace, Box, Plane, Torus
 from flockenv.spawn import Spawn, cells, scatter
+from flockenv.spread import Spread, drawn, largest
 from flockenv.stability import check_contact, check_dt, check_lookahead
 from flockenv.state import Body, Floats, State
 from flockenv.steer import EVERY_EFFECT
@@ -94,6 +95,11 @@ else:
 TURNING = ("max_turn_rate", "banking")
 """What bodies have only where a group does."""
 
+SIZE, PACE = 0, 1
+"""Channels of what differs within a group: whoever is heavy is wide, but not faster."""
+
+PositiveSpread = Annotated[float, Field(gt=0)] | Spread
+
 
 def _demand_whole(name: str, value: object, least: int, most: int | None = None) -> None:
     """Refuse what is no whole number from `least` to `most`, True included."""
@@ -115,9 +121,15 @@ class Group(Record):
 
     count: int | None = Field(default=None, ge=1, description="how many")
     network: AnyNetwork | None = Field(default=None, description="particles that are tied to each other, and where")
-    mass: float = Field(default=1.0, gt=0, description="kg")
-    radius: float = Field(default=0.1, ge=0, description="m")
+    mass: PositiveSpread = Field(default=1.0, description="kg; or how it is spread")
+    radius: Annotated[float, Field(ge=0)] | Spread = Field(default=0.1, description="m; or how it is spread")
+    desired_speed: PositiveSpread | None = Field(
+        default=None, description="m/s, how fast each would like to go, or how that is spread; see driving"
+    )
     max_speed: float | None = Field(default=None, gt=0, description="m/s; none = no limit")
+    haste: float | None = Field(
+        default=None, ge=1, description="max_speed of each as a multiple of its desired_speed, instead of one for all"
+    )
     max_force: float | None = Field(default=None, ge=0, description="N, what it may ask for; none = no limit")
     oriented: bool = Field(
         default=False, description="does it keep its heading (in 3-D an up vector too) while it stands still?"
@@ -150,6 +162,10 @@ class Group(Record):
             or (any(self.spawn.speed) and not self.spawn.heading)
         ):
             raise ValueError("spawn: a network is where it says; all it may be given is a speed, with a heading")
+        if self.network is not None and (isinstance(self.mass, Spread) or isinstance(self.radius, Spread)):
+            raise ValueError("mass: of a network it is the mean, and its radius is a number")
+        if self.haste is not None and (self.max_speed is not None or self.desired_speed is None):
+            raise ValueError(f"haste = {self.haste:g}: goes with a desired_speed, and instead of a max_speed")
         if self.alive is not None and self.network is not None:
             raise ValueError(f"alive = {self.alive}: all particles of a network live")
         if self.alive is not None and self.alive > self.size:
@@ -166,10 +182,43 @@ class Group(Record):
         """How many agents it has."""
         return self.network.size if self.network is not None else int(self.count or 0)
 
+    @property
+    def radii(self) -> NDArray[np.float64]:
+        """The radius of each agent, (size,) m."""
+        return drawn(self.radius, self.size, SIZE)
+
+    @property
+    def desired_speeds(self) -> NDArray[np.float64]:
+        """How fast each agent would like to go, (size,) m/s; 0 if nobody says."""
+        return drawn(self.desired_speed or 0.0, self.size, PACE)
+
+    @property
+    def max_speeds(self) -> NDArray[np.float64]:
+        """How fast each agent goes at most, (size,) m/s; may be infinite."""
+        if self.haste is not None:
+            return self.haste * self.desired_speeds
+        return np.full(self.size, math.inf if self.max_speed is None else self.max_speed)
+
+    @property
+    def widest(self) -> float:
+        """The largest radius, m."""
+        return largest(self.radius, self.size, SIZE)
+
+    @property
+    def heaviest(self) -> float:
+        """The largest mass, kg; of a network the mean."""
+        return largest(self.mass, self.size, SIZE)
+
+    @property
+    def fastest(self) -> float | None:
+        """The largest max_speed, m/s; none without a limit."""
+        return self.max_speed if self.haste is None else float(self.max_speeds.max())
+
     def masses(self, dimension: int) -> NDArray[np.float64]:
         """Return the mass of each agent, (size,) kg; infinite where a network pins one."""
         if self.network is None:
-            return np.full(self.size, self.mass)
+            return drawn(self.mass, self.size, SIZE)
+        assert not isinstance(self.mass, Spread)
         out = self.network.masses(self.mass * self.size, dimension)
         out[self.network.pins()] = np.inf
         return out
@@ -208,6 +257,7 @@ class Scene(Record):
                     member.check(self)
                 except ValueError as error:
                     raise ValueError(f"{name}[{k}].{error}") from None
+        self._check_recalled()
         self._check_space()
         if self.dtype == "float32":
             self._check_counts()
@@ -225,6 +275,18 @@ class Scene(Record):
         check_lookahead(self)
         return self
 
+    def _check_recalled(self) -> None:
+        """Refuse laws that read what nobody keeps."""
+        kept = {name for effect in self.effects for each in (*effect.wishes, effect) for name in each.keeps}
+        for k, effect in enumerate(self.effects):
+            for each in (*effect.wishes, effect):
+                if missing := [name for name in each.recalled if name not in kept]:
+                    keepers = sorted(kind for kind, e in EFFECTS.items() if missing[0] in e.keeps)
+                    raise ValueError(
+                        f"effects[{k}].kind = {each.kind}: needs {missing[0]!r}, which no effect of this scene keeps; "
+                        f"{' or '.join(keepers) or 'none'} does"
+                    )
+
     def _check_space(self) -> None:
         size = getattr(self.space, "size", None)
         if isinstance(self.space, Torus):
@@ -241,9 +303,9 @@ class Scene(Record):
                     )
         if isinstance(self.space, (Box, Torus)):
             for k, group in enumerate(self.groups):
-                if 2 * group.radius > min(self.space.size):
+                if 2 * group.widest > min(self.space.size):
                     raise ValueError(
-                        f"groups[{k}].radius = {group.radius:g} does not fit into a {self.space.kind} of size {size}"
+                        f"groups[{k}].radius = {group.widest:g} does not fit into a {self.space.kind} of size {size}"
                     )
 
     def _check_counts(self) -> None:
@@ -343,7 +405,7 @@ class Scene(Record):
             reals += parts.rows + parts.numbers
             whole += 3 * 4
         reals += d * (parts.pulls + parts.flows + parts.bounces)
-        reals += 2 * parts.frame_rows + len(parts.frame_numbers)
+        reals += parts.frame_rows + len(parts.inner) + parts.framed
         if parts.treed:
             numbers = tree_sizes(self.agents, parts.width, d, 1)
             reals += -(-sum(numbers.values()) // self.agents)
@@ -367,7 +429,11 @@ class Scene(Record):
         mass = all_masses(self.groups, self.dimension).astype(self.dtype)
         nobody = np.zeros(0, self.dtype)
         turning = (per_agent(name) if name in self.parts.frame_numbers else nobody for name in TURNING)
-        return Body(mass, *map(per_agent, ("radius", "max_speed", "max_force")), *turning)
+        radius, fastest, pace = (
+            np.concatenate([getattr(group, name) for group in self.groups]).astype(self.dtype)
+            for name in ("radii", "max_speeds", "desired_speeds")
+        )
+        return Body(mass, radius, fastest, per_agent("max_force"), pace, *turning)
 
     @functools.cached_property
     def parts(self) -> Parts:
@@ -433,7 +499,7 @@ class Scene(Record):
             raise ValueError(f"worlds is {worlds}: needs about {need:.3g} GiB, at most {most:g} allowed")
         state = states.blank(
             worlds, self.agents, self.dimension, len(self.circles), self.dt, self.dtype, self.parts.frame_rows,
-            population=bool(self.population),
+            population=bool(self.population), inner_rows=len(self.parts.inner),
         )  # fmt: skip
         state.key[:] = [key_of(seed + k, 0) for k in range(worlds)]
         for m, obstacle in enumerate(self.circles):
@@ -444,7 +510,23 @@ class Scene(Record):
         self._bury(state)
         self._face(state)
         beget(self, state)
+        self._begin(state, np.ones_like(state.alive))
         return state
+
+    def _begin(self, state: State, fresh: NDArray[np.bool_]) -> None:
+        """Write what goes on inside those who come into being, (B, N)."""
+        if self.parts.inner and fresh.any():
+            self._beginner(
+                state.x, state.v, *state.carried, state.key, state.tick, self._params, self._dt, fresh,
+                *self._workspaces(1, 1)[0].of(0),
+            )  # fmt: skip
+
+    def inner(self, state: State, name: str) -> Floats:
+        """Return what goes on inside everybody by name, as a view, (B, N); see `Effect.keeps`."""
+        if name not in self.parts.inner:
+            raise ValueError(f"{name!r}: no effect keeps it; those of this scene keep {self.parts.inner or 'nothing'}")
+        found: Floats = state.inner[self.parts.inner.index(name)]
+        return found
 
     def _bury(self, state: State) -> None:
         """Let those be dead who do not live at the start: nobody, where they may be born."""
@@ -491,7 +573,7 @@ class Scene(Record):
                 if middles is not None:
                     state.pos[b, mine] += middles
                     break
-                inside = clear_of(self.shapes, np.array(state.pos[b, mine], np.float64), period) < group.radius
+                inside = clear_of(self.shapes, np.array(state.pos[b, mine], np.float64), period) < group.radii
                 if not inside.any():
                     break
                 tried[mine] += inside
@@ -513,7 +595,7 @@ class Scene(Record):
                 continue
             try:
                 box = self._corners(group.spawn)
-                found.append(cells(group.spawn, *box, group.size, group.radius, self.obstacles, period))
+                found.append(cells(group.spawn, *box, group.size, group.widest, self.obstacles, period))
             except ValueError as error:
                 raise ValueError(f"groups[{k}].spawn.{error}") from None
         return tuple(found)
@@ -606,7 +688,7 @@ class Scene(Record):
             raise ValueError(f"times is {times!r}, must be a finite number for each of {b} worlds, or one for all")
         when = np.ascontiguousarray(np.broadcast_to(given, b), self.dtype)
         self._field(
-            state.x, state.v, *state.frames, state.alive, state.key, state.obstacle_x, state.obstacle_radius,
+            state.x, state.v, *state.carried, state.alive, state.key, state.obstacle_x, state.obstacle_radius,
             state.work, self._drive(drive, state), self._params, when, acc, flow, *self._workspaces(1, 1)[0].of(0),
         )  # fmt: skip
         return acc.transpose(1, 2, 0), flow.transpose(1, 2, 0) if self.parts.flows else None
@@ -643,7 +725,9 @@ class Scene(Record):
             if self._looks_back:
                 x0[...], v0[...] = state.x, state.v
             moved = self._moved(state, drive, 1)
+            who = state.identity.copy() if self.parts.inner else state.identity
             mended = self._mended(x0, v0, state)
+            self._begin(state, state.identity != who if self.population else np.zeros_like(state.alive))
             failed |= state.tick != begun + step + 1
             failed[[world for world, _ in mended]] = True
             found = min([f for f in (moved, *mended) if f[0] >= 0], default=found) if found[0] < 0 else found
@@ -702,7 +786,7 @@ class Scene(Record):
         team = crew if worlds < crew and agents >= WORTH_SHARING and not self.integrator.adaptive else 1
         crew = crew if team > 1 else min(crew, worlds)
         arrays = (
-            state.x, state.v, *state.frames, state.alive, state.tick, state.key, state.obstacle_x,
+            state.x, state.v, *state.carried, state.alive, state.tick, state.key, state.obstacle_x,
             state.obstacle_radius, state.work, drive, self._params, self._dt, steps,
         )  # fmt: skip
         if crew == 1:
@@ -730,6 +814,9 @@ class Scene(Record):
         if len(state.frame) != self.parts.frame_rows:
             has, keeps = ("keeps" if rows else "keeps no" for rows in (len(state.frame), self.parts.frame_rows))
             raise ValueError(f"the state {has} headings, but this scene {keeps} headings")
+        if len(state.inner) != len(self.parts.inner):
+            keeps = ", ".join(self.parts.inner) or "nothing"
+            raise ValueError(f"the state has {len(state.inner)} inner numbers, but effects of this scene keep {keeps}")
         if state.identity.shape[1] != (self.agents if self.population else 0):
             has, keeps = ("identities" if k else "no identities" for k in (state.identity.size, self.population))
             raise ValueError(f"the state has {has}, but this scene has {keeps}: only a population gives them")
@@ -768,6 +855,10 @@ class Scene(Record):
     def _kernel(self) -> Any:
         return load("scene", scene_source(self.parts)).step
 
+    @functools.cached_property
+    def _beginner(self) -> Any:
+        return load("scene", scene_source(self.parts)).begin
+
     def _workspaces(self, count: int, team: int) -> list[Workspace]:
         """Return scratch of this thread's own: two threads may step one scene at the same time."""
         kept: dict[int, list[Workspace]] = vars(self._threads).setdefault("workspaces", {})
@@ -787,7 +878,7 @@ class Scene(Record):
         low, high = self._view(state, world)
         return Snapshot(
             time=float(state.time[world]), pos=state.pos[world], vel=state.vel[world], alive=state.alive[world],
-            heading=state.heading[world] if state.frames else None,
+            heading=state.heading[world] if len(state.frame) else None,
             radius=np.asarray(self.body.radius, np.float64), roles=self.roles,
             obstacle_centre=state.obstacles.centre[world], obstacle_radius=state.obstacle_radius[world],
             marks=self.marks,
@@ -855,7 +946,7 @@ class Scene(Record):
     @property
     def marks(self) -> tuple[Mark, ...]:
         """The ways and places that behaviours are about."""
-        still, size = np.zeros(self.dimension), 2 * max(group.radius for group in self.groups)
+        still, size = np.zeros(self.dimension), 2 * max(group.widest for group in self.groups)
         wishes = [effect for effect in self.parts.effects if effect.steering]
         places = [getattr(wish, name) for wish in wishes if wish.heads_for for name in wish.places]
         return (

@@ -302,10 +302,10 @@ def check_lookahead(scene: Scene) -> None:
 
 def _warn_late(name: str, effect: Effect, g: int, group: Group) -> None:
     """Warn if one group sees too late by one effect; who has no top speed, or no bounds of force, is not judged."""
-    fastest, strongest = group.max_speed, group.max_force
+    fastest, strongest = group.fastest, group.max_force
     if fastest is None or not strongest or (sees := effect.lookahead(fastest)) is None:
         return
-    needs = fastest**2 * group.mass / (2 * strongest) + group.radius
+    needs = fastest**2 * group.heaviest / (2 * strongest) + group.widest
     if sees < needs:
         message = (
             f"{name}.horizon = {sees / fastest:g}: groups[{g}] at {fastest:g} m/s sees {sees:.3g} m ahead, and needs "

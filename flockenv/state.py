@@ -7,7 +7,7 @@ people see (B, N, D) through a transposed view that costs nothing.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numpy as np
@@ -52,6 +52,7 @@ class Body:
     radius: Floats  # (N,) m
     max_speed: Floats  # (N,) m/s, may be inf
     max_force: Floats  # (N,) N, bounds what an agent asks for (drive and steering), not what acts on it; may be inf
+    desired_speed: Floats  # (N,) m/s, how fast it would like to go; 0 if nobody says
     max_turn_rate: Floats  # (N,) rad/s, may be inf; (0,) if nobody has a limit
     banking: Floats  # (N,) s, in which it leans into its turns; inf = it does not, (0,) if nobody does
 
@@ -61,7 +62,7 @@ class Body:
 
     def arrays(self) -> tuple[Floats, ...]:
         """Return the arrays."""
-        return (self.mass, self.radius, self.max_speed, self.max_force, self.max_turn_rate, self.banking)
+        return tuple(getattr(self, each.name) for each in fields(self))
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,6 +81,7 @@ class State:
     obstacle_radius: Floats  # (B, M) m
     work: NDArray[np.int64]  # (B, len(WORK)) counters, see WORK
     frame: Floats  # (F, B, N) unit vectors: where everybody faces, in space which way is up; F = 0 if nobody keeps that
+    inner: Floats  # (K, B, N) what goes on inside everybody: the numbers that effects keep, see Scene.kept
     identity: NDArray[np.int64]  # (B, N) who is in this slot, or was last, -1 = nobody; (B, 0) without a population
     born: NDArray[np.float64]  # (B, N) s, since when; (B, 0) without a population
     dies: NDArray[np.float64]  # (B, N) s, when its own lifetime ends, inf = never; (B, 0) without a population
@@ -96,9 +98,9 @@ class State:
         return self.v.transpose(1, 2, 0)
 
     @property
-    def frames(self) -> tuple[Floats, ...]:
-        """The array of frames, if this state has one: what kernels are given of it."""
-        return (self.frame,) if len(self.frame) else ()
+    def carried(self) -> tuple[Floats, ...]:
+        """Frames and inner states, if this state has some: what kernels are given of it."""
+        return tuple(array for array in (self.frame, self.inner) if len(array))
 
     @property
     def heading(self) -> Floats:
@@ -106,7 +108,7 @@ class State:
 
         If not, along the velocity, and 0 at standstill.
         """
-        if self.frames:
+        if len(self.frame):
             return self.frame[: len(self.x)].transpose(1, 2, 0)
         speed = np.sqrt((self.vel**2).sum(axis=-1, keepdims=True))
         return np.asarray(np.divide(self.vel, speed, out=np.zeros_like(self.vel), where=speed > 0))
@@ -114,7 +116,7 @@ class State:
     @property
     def up(self) -> Floats:
         """Which way is up for everybody, unit vectors across the heading as a view, (B, N, 3); none in the plane."""
-        if not self.frames or len(self.x) == 2:
+        if not len(self.frame) or len(self.x) == 2:
             raise ValueError("up: only states of scenes in 3-D have it in which a group is oriented")
         return self.frame[3:].transpose(1, 2, 0)
 
@@ -184,7 +186,7 @@ class State:
 
     def face(self) -> None:
         """Where headings are kept, let everybody face along his velocity, or as before if there is none."""
-        for b in range(self.shape[0] if self.frames else 0):
+        for b in range(self.shape[0] if len(self.frame) else 0):
             entry(face)(self.v, self.frame, b, False)
 
     def with_dt(self, dt: float) -> State:
@@ -210,9 +212,10 @@ class State:
         return replace(self, **arrays)
 
 
-_PER_COORDINATE = ("x", "v", "obstacle_x", "frame")
+_PER_COORDINATE = ("x", "v", "obstacle_x", "frame", "inner")
 _ARRAYS = (
-    "x", "v", "alive", "tick", "key", "obstacle_x", "obstacle_radius", "work", "frame", "identity", "born", "dies",
+    "x", "v", "alive", "tick", "key", "obstacle_x", "obstacle_radius", "work", "frame", "inner", "identity", "born",
+    "dies",
 )  # fmt: skip
 
 
@@ -222,7 +225,7 @@ def _first_bad(array: Floats) -> list[int]:
 
 def blank(
     worlds: int, agents: int, dimension: int, obstacles: int, dt: float, dtype: Any = np.float64, frame_rows: int = 0,
-    population: bool = False,
+    population: bool = False, inner_rows: int = 0,
 ) -> State:  # fmt: skip
     """Return a state of zeros, everybody alive: what a spawn writes into; identities are numbers of slots, if kept."""
     slots = agents if population else 0
@@ -236,6 +239,7 @@ def blank(
         obstacle_radius=np.zeros((worlds, obstacles), dtype),
         work=np.zeros((worlds, len(WORK)), np.int64),
         frame=np.zeros((frame_rows, worlds, agents), dtype),
+        inner=np.zeros((inner_rows, worlds, agents), dtype),
         identity=np.tile(np.arange(slots), (worlds, 1)),
         born=np.zeros((worlds, slots)),
         dies=np.full((worlds, slots), np.inf),

@@ -60,6 +60,11 @@ class Steer(Effect):
         return type(self.arbitration).__module__, self.arbitration.law
 
     @property
+    def recalled(self) -> tuple[str, ...]:
+        """What the arbitration recalls."""
+        return self.arbitration.recalls
+
+    @property
     def reach(self) -> float:
         """How far any of its behaviours looks, m."""
         return max(behaviour.reach for behaviour in self.behaviours)

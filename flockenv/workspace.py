@@ -50,7 +50,7 @@ class Workspace:
             "tie": padded * d if "t0" in parts.fields else 1,
             "pulled": padded * d if parts.pulls else 1,
             "carrying": padded * d if parts.flows else 1,
-            "frame": max(padded * (parts.frame_rows + len(parts.frame_numbers)), 1),
+            "frame": max(padded * parts.framed, 1),
             "felt": max(swept * d * len(parts.targets), 1),
             "sorted_": parts.rows * (swept + width if parts.sorts else SMALL_STRIDE),
             "records": (swept if sorts else 1) * parts.numbers,
@@ -74,7 +74,7 @@ class Workspace:
             arrays[name][:] = pad
             arrays[name][:agents] = getattr(body, name)
         for k, name in enumerate(parts.frame_numbers):
-            first = padded * (parts.frame_rows + k)
+            first = padded * (parts.frame_rows + d * parts.aims + k)
             arrays["frame"][first : first + agents] = getattr(body, name)
             arrays["frame"][first + agents : first + padded] = 1
         arrays["ident"][:] = np.arange(padded)

@@ -80,7 +80,7 @@ class World:
         # The kernel is handed these arrays once and for all: write into them, never put others in their place.
         self.state: Final = states.blank(
             self.worlds, self.agents, scene.dimension, task.obstacle_slots, scene.dt, scene.dtype,
-            scene.parts.frame_rows,
+            scene.parts.frame_rows, inner_rows=len(scene.parts.inner),
         )  # fmt: skip
         self.steps: Final = np.zeros(self.worlds, np.int64)
         self.paid: Final = np.zeros((self.worlds, self.learners, len(task.terms)))  # terms, summed over the episode
@@ -99,7 +99,7 @@ class World:
         self._actions = np.zeros((b, i, self.action_size))
         numbers = (task.parts.given(), list(task.parameters().values()), task.table() or (0.0,))
         self._worlds = (
-            s.x, s.v, *s.frames, s.alive, s.tick, s.obstacle_x, s.obstacle_radius, s.work, s.key, self._memory,
+            s.x, s.v, *s.carried, s.alive, s.tick, s.obstacle_x, s.obstacle_radius, s.work, s.key, self._memory,
             self.steps, *(np.array(values, real) for values in numbers),
         )  # fmt: skip
         self._clock = (np.dtype(real).type(scene.dt), task.substeps, not task.ends_together)
@@ -295,7 +295,7 @@ class World:
         low, high = self.task.view(s, world)
         return Snapshot(
             time=float(s.time[world]), pos=s.pos[world], vel=s.vel[world], alive=s.alive[world],
-            heading=s.heading[world] if s.frames else None,
+            heading=s.heading[world] if len(s.frame) else None,
             radius=np.asarray(self.task.scene.body.radius, np.float64), roles=self.task.scene.roles,
             obstacle_centre=s.obstacles.centre[world], obstacle_radius=s.obstacle_radius[world],
             marks=self.task.marks(s, self._memory, world),

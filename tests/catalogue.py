@@ -36,6 +36,7 @@ from flockenv.behaviours import (
     Cohesion,
     Contain,
     Dock,
+    Driving,
     Evade,
     Explore,
     Face,
@@ -67,13 +68,16 @@ from flockenv.behaviours import (
 from flockenv.effects import EFFECTS as EFFECT_KINDS
 from flockenv.effects import (
     AngularSprings,
+    Antipode,
     Attraction,
     Carried,
     Contact,
+    Course,
     Drag,
     Effect,
     Elastic,
     Fluctuation,
+    Goal,
     Gravitation,
     Gravity,
     InverseSquare,
@@ -293,6 +297,8 @@ UPRIGHT = frozenset({"translation", "relabelling"})
 LOOP = ((1.0, 1.0, 2.5), (5.0, 1.5, 3.0), (4.5, 5.0, 2.0), (1.5, 4.0, 3.5))
 FLOWS = tuple((0.3 * k % 2 - 1, 0.7 * k % 2 - 1, 0.9 * k % 2 - 1) for k in range(24))
 
+DRIVING = Driving(tau=0.8)
+
 EFFECTS = (
     EffectRow(DRAG),
     EffectRow(QuadraticDrag(rate=0.3)),
@@ -316,6 +322,12 @@ EFFECTS = (
     EffectRow(
         Swing(centre=CENTRE, strength=0.8, length=0.7), obeys=frozenset({"translation", "mirror", "relabelling"})
     ),
+    EffectRow(Goal(target=CENTRE, slow_radius=2), beside=(DRIVING,)),
+    EffectRow(Course(direction=(0.8, -0.5, 0.3), share=0.7), beside=(DRIVING,)),
+    EffectRow(  # it keeps where it began: whoever is moved afterwards goes there all the same
+        Antipode(centre=CENTRE[:2]), beside=(DRIVING,), dimensions=(2,), obeys=frozenset()
+    ),
+    EffectRow(DRIVING, beside=(Goal(target=CENTRE, slow_radius=2),)),
     EffectRow(WallRepulsion(point=CENTRE, normal=(1.2, -0.7, 0.9), strength=2, decay=1.5)),
     EffectRow(ObstacleContact(stiffness=30, damping=4, friction=8, coulomb=0.6, most=5)),
     EffectRow(Contact(stiffness=20, ratio=0.3, damping=0.1, friction=6, coulomb=0.5, most=4, radius=0.5)),
@@ -497,7 +509,8 @@ def scene_of(*effects: Effect, dimension: int = 2, space: Space | None = None, *
     """Return two kinds of agents under some effects, among two obstacles if one of them asks for obstacles."""
     low, high = (0.0,) * dimension, (EDGE,) * dimension
     spawn = Spawn(low=low, high=high, speed=(0.2, 1.5))
-    groups = (Group(count=14, mass=0.7, radius=0.1, spawn=spawn), Group(count=10, mass=2, radius=0.25, spawn=spawn))
+    paced = {"desired_speed": 1.2, "spawn": spawn}
+    groups = (Group(count=14, mass=0.7, radius=0.1, **paced), Group(count=10, mass=2, radius=0.25, **paced))
     groups = fields.pop("groups", groups)
     if any(effect.bond_law for effect in effects):
         groups = (tied(groups[0], dimension), *groups[1:])
@@ -558,7 +571,7 @@ class Variant:
         spawn = Spawn(low=(0.0,) * self.dimension, high=corner, speed=(0.2, 1.5))
         given: dict[str, Any] = {
             "space": space, "dtype": self.dtype, "integrator": self.method, "dt": 0.05,
-            "groups": (Group(count=count, max_speed=3, max_force=8, radius=0.05, spawn=spawn),),
+            "groups": (Group(count=count, max_speed=3, max_force=8, radius=0.05, desired_speed=1.2, spawn=spawn),),
         } | fields  # fmt: skip
         if self.effects:
             return scene_of(*self.effects, dimension=self.dimension, **given)

@@ -278,7 +278,9 @@ def test_in_single_precision_it_conserves_momentum_if_it_says_so(row: EffectRow,
 def test_it_is_finite_where_everybody_is_in_one_place_at_rest(row: EffectRow, dimension: int, count: int) -> None:
     """In an obstacle's very centre, if there are obstacles: nothing has a direction there."""
     spawn = Spawn(low=(0,) * dimension, high=(1,) * dimension)
-    scene = scene_of(*row.company(dimension), dimension=dimension, groups=(Group(count=count, spawn=spawn),))
+    scene = scene_of(
+        *row.company(dimension), dimension=dimension, groups=(Group(count=count, desired_speed=1.2, spawn=spawn),)
+    )
     state = scene.start(0)
     state.pos[...] = scene.obstacles[0].centre if scene.obstacles else 2.5
     state.vel[...] = 0
@@ -311,7 +313,7 @@ def test_two_in_one_place_part_in_opposite_directions_every_pair_in_its_own(dime
     """30 pairs far from each other: momentum is kept to the last bit, and no direction is preferred."""
     given = {
         "dimension": dimension,
-        "groups": (Group(count=60, spawn=Spawn(low=(0,) * dimension, high=(1,) * dimension)),),
+        "groups": (Group(count=60, desired_speed=1.2, spawn=Spawn(low=(0,) * dimension, high=(1,) * dimension)),),
     }
     separation = Separation(weight=1, radius=2.5)
     if dtype == "float32":
@@ -441,8 +443,7 @@ def test_a_pair_law_may_read_bodies_in_another_module_of_the_user_s(tmp_path: Pa
 def test_an_idle_effect_is_an_absent_one(row: EffectRow, dimension: int) -> None:
     absent = () if row.family else row.at(dimension)[1:]
     idle, absent = (scene_of(*some, dimension=dimension) for some in (row.company(dimension, idle=True), absent))
-    start = idle.start(3)
-    ends = [scene.run(start, 20) for scene in (idle, absent)]
+    ends = [scene.run(scene.start(3), 20) for scene in (idle, absent)]
     np.testing.assert_array_equal(ends[0].x, ends[1].x)
     np.testing.assert_array_equal(ends[0].v, ends[1].v)
 

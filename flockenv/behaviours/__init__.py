@@ -21,6 +21,7 @@ from flockenv.behaviours.avoid import AvoidObstacles, ForceField, Whiskers  # no
 from flockenv.behaviours.chase import Evade, MatchVelocity, OffsetPursue, Pursue, Shadow  # noqa: E402
 from flockenv.behaviours.company import FollowLeader, Formation, Interpose  # noqa: E402
 from flockenv.behaviours.crowd import Explore, Forage, Queue, UnalignedAvoidance  # noqa: E402
+from flockenv.behaviours.driving import Driving  # noqa: E402
 from flockenv.behaviours.flock import Alignment, Cohesion, Separation  # noqa: E402
 from flockenv.behaviours.goals import Arrive, Dock, Face, Flee, Seek, TargetSpeed  # noqa: E402
 from flockenv.behaviours.groups import Friends, Interest, WalkingGroup  # noqa: E402
@@ -36,7 +37,7 @@ from flockenv.behaviours.way import FollowWay  # noqa: E402
 
 __all__ = [
     "BEHAVIOURS", "Alignment", "Arrive", "AvoidObstacles", "CircularRepulsion", "Cohesion", "Contain", "Dock",
-    "EllipticalRepulsion", "Evade", "Explore", "Face", "Flee", "FollowFlow", "FollowLeader", "FollowPath", "FollowWall",
+    "Driving", "EllipticalRepulsion", "Evade", "Explore", "Face", "Flee", "FollowFlow", "FollowLeader", "FollowPath", "FollowWall",
     "FollowWay", "Forage", "ForceField", "Formation", "Friends", "Heuristics", "Hide", "Interest", "Interpose",
     "MatchVelocity", "ObstacleRepulsion", "OffsetPursue", "Orca", "Pursue", "Queue", "Seek", "Separation", "Shadow",
     "Sidestep", "StayOnPath", "TargetSpeed", "UnalignedAvoidance", "WalkingGroup", "Wander", "Whiskers",

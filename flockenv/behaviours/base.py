@@ -106,7 +106,7 @@ class Moving(Behaviour):
             group = scene.groups[k]
             if group.max_force == 0:
                 continue  # it does nothing of what it is asked
-            speeds = [speed for speed in (self.speed, group.max_speed) if speed is not None]
+            speeds = [speed for speed in (self.speed, group.fastest) if speed is not None]
             if not speeds:
                 raise ValueError(f"speed = None: groups[{k}].max_speed is none too; give either of them")
             if self.ramp is not None and group.max_force is not None:
@@ -115,7 +115,7 @@ class Moving(Behaviour):
 
 def _warn_of_overshoot(kind: str, slow_radius: float, speed: float, group: Any) -> None:
     """Say so if a ramp asks for a larger deceleration at its edge than the group's max_force allows: V^2 / d."""
-    least = speed**2 * group.mass / group.max_force
+    least = speed**2 * group.heaviest / group.max_force
     if slow_radius < least * (1 - 1e-9):
         text = (
             f"{kind}: slow_radius = {slow_radius:g} m: overshoots; with max_force = {group.max_force:g} N to stop from"

@@ -69,7 +69,7 @@ class Collisions(Constraint):
         """Refuse what cannot be right: twice the same constraint, and bodies as wide as a periodic box."""
         if sum(isinstance(other, Collisions) for other in scene.constraints) > 1:
             raise ValueError("kind = collisions: there is another; a scene has its collisions once")
-        widest = max(group.radius for group in scene.groups)
+        widest = max(group.widest for group in scene.groups)
         if isinstance(scene.space, Torus) and 4 * widest > min(scene.space.size):
             raise ValueError(
                 f"kind = collisions: bodies of radius {widest:g} m meet their own images on a torus of size "

@@ -10,7 +10,8 @@ from flockenv.effects.base import EFFECTS, Effect, Far, Me, Other, Sight
 for _module in pkgutil.iter_modules(__path__):
     importlib.import_module(f"{__name__}.{_module.name}")
 
-from flockenv.effects.attraction import Attraction  # noqa: E402  # after the folder has been walked
+from flockenv.effects.aims import Aim, Antipode, Course, Goal  # noqa: E402  # after the folder has been walked
+from flockenv.effects.attraction import Attraction  # noqa: E402
 from flockenv.effects.contact import Contact, ObstacleContact  # noqa: E402
 from flockenv.effects.drag import Drag, QuadraticDrag  # noqa: E402
 from flockenv.effects.elastic import Elastic  # noqa: E402
@@ -25,8 +26,8 @@ from flockenv.effects.tether import Swing, Tether  # noqa: E402
 from flockenv.effects.wall import WallRepulsion  # noqa: E402
 
 __all__ = [
-    "EFFECTS", "AngularSprings", "Attraction", "Carried", "Contact", "Drag", "Effect",
-    "Elastic", "Far", "Fluctuation", "Gravitation", "Gravity", "InverseSquare", "Me", "ObstacleContact",
+    "EFFECTS", "Aim", "AngularSprings", "Antipode", "Attraction", "Carried", "Contact", "Course", "Drag", "Effect",
+    "Elastic", "Far", "Fluctuation", "Goal", "Gravitation", "Gravity", "InverseSquare", "Me", "ObstacleContact",
     "Other", "Pressure", "QuadraticDrag", "Sight", "Sink", "Source", "SpeedLimit", "Springs", "Swing", "Tether",
     "Uniform", "Vortex", "WallRepulsion", "Wind",
 ]  # fmt: skip

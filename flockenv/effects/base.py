@@ -14,6 +14,13 @@ An effect is of one or more of three forms, each a law for one agent:
   agent and one or more partners (springs, hinges, finite elements);
 * `kick_law(p, me, seconds, gauss) -> velocity`: added once per step, however often a method asks for forces, with one
   standard normal number per axis (fluctuations);
+* `aim_law(p, me) -> direction` in which it wants to go: all of them sum up to `me.aim` of the other laws;
+* `begin_law(p, me) -> numbers` and `keep_law(p, me, told, seconds) -> numbers`: what goes on inside an agent, the
+  numbers that `keeps` names (how hungry it is, which door it heads for). The first are what they are when it comes into
+  being; the others what they are after a step of so many seconds, from what they were, where it is then, and what
+  `finish_law` has `told` of others in the last stage, a vector that is no force then (of an effect without a pair law:
+  0). Changes by several effects add up. Laws read them as `me.inner.NAME` and `other.inner.NAME`, and say so in
+  `recalls` if they do not keep them;
 * `obstacle_start(p, me)`, `obstacle_law(p, me, other, acc) -> acc`, `obstacle_finish(p, me, acc) -> force`: a fold over
   the obstacles, of whatever shape: `other` is an `Obstacle`. With an `obstacle_ray(p, me, k) -> (direction, margin)` it
   meets each obstacle for each of its rays, k = 0, 1, ...: where the agent's body, `margin` wider, would touch it
@@ -75,6 +82,9 @@ class Me(NamedTuple):
     time: float  # s, of the stage that is asked for
     medium: Vec  # m/s, velocity of the medium here; 0 in pair laws and bonds
     key: int  # of its world, for random numbers that are functions of time, see noise.py
+    aim: Vec  # unit vector, where it wants to go: shorter if slower than it would like, 0 to stay, or if nobody says
+    desired_speed: float  # m/s, how fast it would like to go
+    inner: Any  # what goes on inside it, by name; see `Effect.keeps`
 
 
 class Other(NamedTuple):
@@ -87,6 +97,7 @@ class Other(NamedTuple):
     radius: float  # m
     tie: Vec  # a unit vector of its own
     mass: float  # kg; of what is no agent: inf
+    inner: Any  # what goes on inside him, by name; of what is no agent: 0
 
 
 class Obstacle(NamedTuple):
@@ -197,6 +208,13 @@ class Effect(Record):
     far_law: ClassVar[str | None] = None
     bond_law: ClassVar[str | None] = None
     kick_law: ClassVar[str | None] = None
+    aim_law: ClassVar[str | None] = None
+    begin_law: ClassVar[str | None] = None
+    keep_law: ClassVar[str | None] = None
+    keeps: ClassVar[tuple[str, ...]] = ()
+    """Names of the numbers that it keeps of every agent, see State.inner."""
+    recalls: ClassVar[tuple[str, ...]] = ()
+    """Names of those that its laws read and that other effects keep."""
     pair_start: ClassVar[str | None] = None
     pair_law: ClassVar[str | None] = None
     finish_law: ClassVar[str | None] = None
@@ -266,6 +284,11 @@ class Effect(Record):
     def steer_law(self) -> tuple[str, str]:
         """Module and name of the law (p, me, wishes) -> force by which it reconciles them."""
         raise TypeError(f"{type(self).__name__} reconciles no wishes")
+
+    @property
+    def recalled(self) -> tuple[str, ...]:
+        """What it recalls, and whatever reconciles its wishes."""
+        return self.recalls
 
     def members(self, starts: Sequence[int]) -> dict[str, float]:
         """More numbers for its laws: which agents it is about; starts[g] is the first agent of group g."""

@@ -90,7 +90,7 @@ class Emitter(Member):
             self.place.check(scene)
         except ValueError as error:
             raise ValueError(f"place.{error}") from None
-        limit = group.max_speed
+        limit = group.fastest
         if limit is not None and self.speed[1] > limit:
             raise ValueError(f"speed = {self.speed}: groups[{self.group}].max_speed = {limit:g} m/s is the most")
         self._check_space(scene, group)

@@ -19,13 +19,14 @@ from flockenv.sweep.text import (
     frame_views,
     given,
     indented,
+    indented_lines,
     lane,
     lanes_of,
-    nearest_image,
+    nearest_images,
     tuple_of,
 )
 
-__all__ = ["accelerate", "parameters"]
+__all__ = ["accelerate", "felt_as", "parameters"]
 
 
 def accelerate(parts: Parts) -> str:
@@ -42,6 +43,7 @@ def sense(context, pos, vel, time):
 {indented(parameters(parts), 4)}
     if rank == 0:
         work[b, 0] += 1
+{indented(_aim(parts), 4)}
 {indented(pairs(parts), 4)}
 {indented(far(parts), 4)}
 {indented(bonds(parts), 4)}
@@ -56,13 +58,13 @@ def respond(around, pos, vel, time, acc):
 {indented(parameters(parts), 4)}
     for block in range(np.uint64(first_), np.uint64(end_)):
         base, row = block * np.uint64({d * parts.width}), block * np.uint64({parts.width})
-{indented(obstacles(parts, me, lambda k: _felt_as(parts, f"n{k}_")), 8)}
+{indented(obstacles(parts, me, lambda k: felt_as(parts, f"n{k}_")), 8)}
         for l in range(np.uint64({parts.width})):
 {indented(me, 12)}
             o = zero(x)
             s, f = {lanes_of(parts, "want")}, o
 {indented([f"{parts.target(k)} = o" for k in parts.wishes], 12)}
-{indented(_nearest_images(parts), 12)}
+{indented(nearest_images(parts, list(enumerate(parts.effects))), 12)}
 {indented(_medium(parts), 12)}
 {indented(_own(parts), 12)}
 {indented(_felt(parts), 12)}
@@ -111,9 +113,23 @@ def parameters(parts: Parts) -> list[str]:
     return lines
 
 
-def _nearest_images(parts: Parts) -> list[str]:
-    """Write the numbers of those effects that know places anew: on a torus, with the images nearest to agent i."""
-    return [nearest_image(parts, k, "x") for k in range(len(parts.effects)) if given(parts, k) == f"near{k}"]
+def _aim(parts: Parts) -> list[str]:
+    """Write where everybody wants to go, if any effect says so."""
+    effects = [(k, e) for k, e in enumerate(parts.effects) if e.aim_law is not None]
+    if not effects:
+        return []
+    d, w = parts.dimension, parts.width
+    return [
+        "for block in range(np.uint64(first), np.uint64(end)):",
+        f"    base, row = block * np.uint64({d * w}), block * np.uint64({w})",
+        f"    for l in range(np.uint64({w})):",
+        f"        i, x, v = row + l, {lanes_of(parts, 'pos')}, {lanes_of(parts, 'vel')}",
+        f"        me, e = {alone(parts, aim='zero(x)')}, zero(x)",
+        *indented_lines(nearest_images(parts, effects), 8),
+        *(f"        e = add(e, aim_law_{k}({given(parts, k)}, me))" for k, _ in effects),
+        "        e = limit(e, like(x[0], 1.0))",
+        *(f"        {lane(parts, 'aiming', k)} = e[{k}]" for k in range(d)),
+    ]
 
 
 def _medium(parts: Parts) -> list[str]:
@@ -155,7 +171,7 @@ def _own(parts: Parts) -> list[str]:
     return lines
 
 
-def _felt_as(parts: Parts, name: str) -> str:
+def felt_as(parts: Parts, name: str) -> str:
     """Write what the pair laws came to for one of their targets."""
     d, t = parts.dimension, parts.targets.index(name)
     each = d * len(parts.targets)
@@ -165,7 +181,7 @@ def _felt_as(parts: Parts, name: str) -> str:
 
 def _felt(parts: Parts) -> list[str]:
     """Write how what the pair laws came to is added."""
-    lines = [f"{name} = add({name}, {_felt_as(parts, name)})" for name in parts.targets if name[0] != "n"]
+    lines = [f"{name} = add({name}, {felt_as(parts, name)})" for name in parts.targets if name[0] != "n"]
     if parts.pulls:
         lines.append(f"f = add(f, {lanes_of(parts, 'pulled')})")
     return lines

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from flockenv.effects.base import Bonds, Effect
 from flockenv.sweep.parts import Parts
-from flockenv.sweep.text import Slots, alone, indented, indented_lines, lane, lanes_of
+from flockenv.sweep.text import Slots, alone, indented, indented_lines, inner_of, lane, lanes_of
 
 __all__ = ["Table", "bonds", "pack"]
 
@@ -117,8 +117,8 @@ def _meet(parts: Parts, e: int, k: int, effect: Effect, sums: list[str]) -> list
             f"to{q} = offset_to(size, x, {vector('pos', f'at{q}')})",
             f"who{q} = at{q} // np.uint64({d * w}) * np.uint64({w}) + at{q} % np.uint64({w})",
             f"fast{q} = {vector('vel', f'at{q}')}",
-            f"wide{q}, heavy{q} = radius[who{q}], mass[who{q}]",
-            f"it{q} = Other(like(x[0], who{q}), to{q}, dot(to{q}, to{q}), fast{q}, wide{q}, zero(x), heavy{q})",
+            f"wide{q}, heavy{q}, in{q} = radius[who{q}], mass[who{q}], {inner_of(parts, f'who{q}')}",
+            f"it{q} = Other(like(x[0], who{q}), to{q}, dot(to{q}, to{q}), fast{q}, wide{q}, zero(x), heavy{q}, in{q})",
         ]
     numbers = ", ".join(f"bond_number[numbers + np.uint64({j * w}) + l]" for j in range(c))
     return [

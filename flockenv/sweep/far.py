@@ -75,7 +75,7 @@ def _meet(effects: list[tuple[int, Effect]], sums: list[str], count: str) -> lis
         "to = sub(xj, x)",
         "square, o, one = dot(to, to), like(m, -0.0), like(m, 1.0)",
         "there, z = square > o, zero(x)",
-        "me = Me(m, x, z, z, m, m, m, m, z, time, z, key[b])",
+        "me = Me(m, x, z, z, m, m, m, m, z, time, z, key[b], z, m, ())",
     ]
     for k, effect in effects:
         weight = "heavy" if effect.weighs_mass else count

@@ -6,6 +6,8 @@ needs a pass before that one, which finds how far its k nearest are. `look` meet
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
+
 from flockenv.sweep.parts import Parts, record_of, sight_of, sorted_at
 from flockenv.sweep.query import query, walk
 from flockenv.sweep.text import Slots, given, indented, indented_lines, nearest_image, place_of, tuple_of
@@ -60,7 +62,7 @@ def _obstacles(parts: Parts, k: int) -> list[str]:
         "    rho = obstacle_radius[b, m]",
         "    if rho > 0:",
         f"        to = offset_to(size, me.pos, {tuple_of('obstacle_x[#, b, m]', parts.dimension)})",
-        "        it = Other(like(rho, m), to, dot(to, to), zero(to), rho, zero(to), like(rho, np.inf))",
+        "        it = Other(like(rho, m), to, dot(to, to), zero(to), rho, zero(to), like(rho, np.inf), ())",
         f"        found_ = obstacle_law_{k}({given(parts, k)}, me, it, found_)",
     ]
 
@@ -169,7 +171,7 @@ def meet_range(parts: Parts, fields: list[str], lines: list[str]) -> list[str]:
             "    own, o = np.int32(j - block), like(reach, -0.0)",
             f"    for l in range(np.uint64({parts.width})):",
             indented([_me(parts, fields), "other = own != number[l]", f"to = {offset}", f"square = {square}"], 8),
-            "        it = Other(aj, to, square, vj, rj, tj, mj)",
+            "        it = Other(aj, to, square, vj, rj, tj, mj, nj)",
             indented(lines, 8),
             "    j += np.uint64(1)",
         ]
@@ -199,8 +201,15 @@ def _candidate(parts: Parts, fields: list[str]) -> list[str]:
     return [
         f"xj = {vector('x')}",
         f"vj, tj, aj, rj = {vector('v')}, {vector('t')}, {scalar['who']}, {scalar['radius']}",
-        f"mj = {scalar['mass']}",
+        f"mj, nj = {scalar['mass']}, {_inner(parts, row, number)}",
     ]
+
+
+def _inner(parts: Parts, row: Mapping[str, int], number: Callable[[str], str]) -> str:
+    """Write what goes on inside somebody, if any law reads it."""
+    if "inner0" not in row:
+        return "()"
+    return f"Inner({', '.join(number(f'inner{k}') for k in range(len(parts.inner)))})"
 
 
 def _me(parts: Parts, fields: list[str]) -> str:
@@ -217,4 +226,7 @@ def _me(parts: Parts, fields: list[str]) -> str:
 
     numbers = ", ".join(number(name) for name in ("mass", "radius", "max_speed", "max_force"))
     vectors = f"{vector('x')}, {vector('v')}, {vector('d' if parts.oriented else 'h')}"
-    return f"me = Me({number('who')}, {vectors}, {numbers}, {vector('t')}, time, zero({vector('x')}), drawn)"
+    nothing = f"zero({vector('x')})"
+    aim = vector("a") if "a0" in row else nothing
+    wishes = f"{aim}, {number('desired_speed')}, {_inner(parts, row, number)}"
+    return f"me = Me({number('who')}, {vectors}, {numbers}, {vector('t')}, time, {nothing}, drawn, {wishes})"

@@ -24,10 +24,18 @@ from flockenv.kernels import LINE
 from flockenv.shapes import packed
 from flockenv.space import Space
 
-__all__ = ["SMALL_STRIDE", "Look", "Parts", "flattened", "record_of", "sight_of", "sorted_at", "view_of"]
+__all__ = ["LAWS", "SMALL_STRIDE", "Look", "Parts", "flattened", "record_of", "sight_of", "sorted_at", "view_of"]
 
 SMALL_STRIDE = 128
 """Places in a row of sorted agents where there are too few to be sorted by cell: their blocks, and one more."""
+
+
+LAWS = (
+    "own_law", "medium_law", "flow_law", "far_law", "bond_law", "kick_law", "aim_law", "begin_law", "keep_law",
+    "pair_start", "pair_law", "finish_law", "obstacle_start", "obstacle_law", "obstacle_finish", "obstacle_ray",
+    "obstacle_from", "obstacle_reach",
+)  # fmt: skip
+"""The slots that an effect may fill with the name of a law."""
 
 
 class Look(NamedTuple):
@@ -224,13 +232,34 @@ class Parts:
 
     def pair_target(self, k: int) -> str:
         """Write what the pair law of effect k adds to: the same, or what its fold over the obstacles is told."""
-        return f"n{k}_" if self.effects[k].obstacle_start is not None else self.target(k)
+        effect = self.effects[k]
+        return f"n{k}_" if effect.obstacle_start is not None or effect.keep_law is not None else self.target(k)
 
     def last_numbers(self, kind: str) -> int:
         """Return where in `parameters` the numbers of the "space" begin, or of the "method": they come last but one."""
         look, method, space = 2 if self.look else 0, len(self.integrator.settings()), len(self.space.numbers())
         behind = {"method": look + method, "space": look + method + space}
         return len(self.parameters()) - behind[kind]
+
+    @functools.cached_property
+    def inner(self) -> tuple[str, ...]:
+        """Names of what goes on inside every agent: all that some effect keeps."""
+        return tuple(dict.fromkeys(name for effect in self.effects for name in effect.keeps))
+
+    @property
+    def keeping(self) -> list[tuple[int, Effect]]:
+        """The effects that keep some of it, and their numbers."""
+        return [(k, e) for k, e in enumerate(self.effects) if e.keeps]
+
+    @property
+    def aims(self) -> bool:
+        """Does any effect say where agents want to go?"""
+        return any(e.aim_law is not None for e in self.effects)
+
+    @functools.cached_property
+    def read(self) -> set[str]:
+        """Every name in the code of all laws."""
+        return set().union(*(_names(e, LAWS) for e in self.effects))
 
     @property
     def bounces(self) -> bool:
@@ -252,16 +281,17 @@ class Parts:
     @functools.cached_property
     def fields(self) -> list[str]:
         """What is sorted of each agent, a row each: what the pair laws read, found from the names in their code."""
-        names = set().union(*(_names(e) for _, e in self.pairs)) if self.pairs else set()
+        names = set().union(*(_names(e, _OF_PAIRS) for _, e in self.pairs))
         if any(sight.fov < 360 for sight in self.sights):
             names.add("heading")
         if any(sight.group is not None for sight in self.sights):
             names.add("who")
         facing = "heading" in names
         needed = {"x": True, "v": "vel" in names or (facing and not self.oriented)}
-        needed |= {"d" if self.oriented else "h": facing, "t": "tie" in names}
+        needed |= {"d" if self.oriented else "h": facing, "t": "tie" in names, "a": self.aims and "aim" in names}
         rows = [f"{letter}{k}" for letter, need in needed.items() if need for k in range(self.dimension)]
-        return rows + [name for name in ("who", "radius", "mass", "max_speed", "max_force") if name in names]
+        rows += [name for name in ("who", "radius", "mass", "max_speed", "max_force", "desired_speed") if name in names]
+        return rows + [f"inner{k}" for k in range(len(self.inner)) if "inner" in names]
 
     @property
     def seen_fields(self) -> list[str]:
@@ -302,14 +332,16 @@ class Parts:
 
     @property
     def frame_numbers(self) -> list[str]:
-        """The numbers of an agent's frame, by `Body`'s names: how fast it may turn, and how soon it leans."""
-        wanted = {"max_turn_rate": self.turns, "banking": self.leans}
+        """More numbers of an agent's body, by `Body`'s names, of which not every scene knows."""
+        wanted = {
+            "max_turn_rate": self.turns, "banking": self.leans, "desired_speed": "desired_speed" in self.read,
+        }  # fmt: skip
         return [name for name, some in wanted.items() if some]
 
     @property
     def frame_argument(self) -> str:
-        """The state's array of frames among the arguments of an entry point, where there is one."""
-        return "frame_, " if self.oriented else ""
+        """The state's arrays of frames and inner states among the arguments of an entry point, where there are some."""
+        return "frame_, " * self.oriented + "inner_, " * bool(self.inner)
 
     @property
     def frame_rows(self) -> int:
@@ -317,11 +349,18 @@ class Parts:
         return self.dimension * len(self.frame_vectors)
 
     @property
+    def framed(self) -> int:
+        """Numbers of an agent in the scratch `frame`: its frame, where it wants to go, of its body, what is inside."""
+        aim = self.dimension * self.aims
+        return self.frame_rows + aim + len(self.frame_numbers) + len(self.inner)
+
+    @property
     def luggage(self) -> list[str]:
         """What an agent carries along then: an array, and the axis of a vector."""
         vectors = ["pos", "vel", "want", *self.frame_vectors, *(["tie"] if "t0" in self.fields else [])]
         vector = [f"{name} {k}" for name in vectors for k in range(self.dimension)]
-        return [*vector, "mass", "radius", "max_speed", "max_force", *self.frame_numbers, "ident"]
+        inner = (f"inner{k}" for k in range(len(self.inner)))
+        return [*vector, "mass", "radius", "max_speed", "max_force", *self.frame_numbers, *inner, "ident"]
 
     @property
     def luggage_size(self) -> int:
@@ -378,14 +417,17 @@ def view_of(fov: float) -> float:
     return cosine * abs(cosine)
 
 
-def _names(effect: Effect) -> set[str]:
-    """Return every name in the code of an effect's pair laws and of the laws that they call."""
+_OF_PAIRS = ("pair_start", "pair_law", "finish_law")
+
+
+def _names(effect: Effect, slots: Sequence[str]) -> set[str]:
+    """Return every name in the code of some of an effect's laws and of the laws that they call."""
     module = vars(sys.modules[type(effect).__module__])
-    todo = [
-        module[law]
-        for law in (effect.pair_start, effect.pair_law, effect.finish_law, effect.joined and effect.obstacle_law)
-        if law
-    ]
+    laws = [getattr(effect, slot) for slot in slots]
+    todo = [module[law] for law in (*laws, effect.obstacle_law if effect.joined else None) if law]
+    if effect.wishes and slots == LAWS:
+        where, law = effect.steer_law
+        todo.append(getattr(sys.modules[where], law))
     seen: set[int] = set()
     names: set[str] = set()
     while todo:

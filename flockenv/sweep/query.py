@@ -12,7 +12,7 @@ from flockenv.sweep.text import copied, indented, indented_lines, place_of, tupl
 
 __all__ = ["counted", "query", "walk"]
 
-_ARRAYS = {"x": "pos", "v": "vel", "t": "tie", "d": "facing"}
+_ARRAYS = {"x": "pos", "v": "vel", "t": "tie", "d": "facing", "a": "aiming"}
 
 
 def query(parts: Parts, fields: list[str], inside: bool = False) -> list[str]:

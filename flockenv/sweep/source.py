@@ -9,18 +9,11 @@ from flockenv.sweep.accelerate import accelerate
 from flockenv.sweep.far import tree_imports
 from flockenv.sweep.method import method, method_imports
 from flockenv.sweep.obstacles import blocked, obstacle_imports
-from flockenv.sweep.parts import Parts
-from flockenv.sweep.step import copies, kept_frame, step, step_world
+from flockenv.sweep.parts import LAWS, Parts
+from flockenv.sweep.step import begin, copies, kept_frame, kept_inner, step, step_world
 from flockenv.sweep.text import CONTEXT, SHARED, frame_views, indented
 
 __all__ = ["field_source", "scene_source"]
-
-LAWS = (
-    "own_law", "medium_law", "flow_law", "far_law", "bond_law", "kick_law", "pair_start", "pair_law", "finish_law",
-    "obstacle_start", "obstacle_law", "obstacle_finish", "obstacle_ray",
-    "obstacle_from", "obstacle_reach",
-)  # fmt: skip
-"""The slots that an effect may fill with the name of a law."""
 
 
 def scene_source(parts: Parts) -> str:
@@ -35,6 +28,7 @@ def scene_source(parts: Parts) -> str:
         accelerate(parts),
         method(parts),
         copies(parts) + step_world(parts),
+        begin(parts),
         step(parts),
     ]
     return "\n".join(chapters)
@@ -68,7 +62,7 @@ def field(
             living[i] = alive[b, i]
         into_blocks(pos, x, b, n, first, end)
         into_blocks(vel, v, b, n, first, end)
-{indented([*frame_views(parts), *kept_frame(parts, from_state=True)], 8)}
+{indented([*frame_views(parts), *kept_frame(parts, from_state=True), *kept_inner(parts, from_state=True)], 8)}
         if drive.shape[1] > 0:
             into_blocks(want, drive, b, n, first, end)
         else:
@@ -108,6 +102,8 @@ def _imports(parts: Parts) -> str:
         if effect.wishes:
             module, name = effect.steer_law
             lines.append(f"from {module} import {name} as steer_law_{k}")
+    if parts.inner:
+        lines.append(f'Inner = namedtuple("Inner", {" ".join(parts.inner)!r})')
     options = 'dict(fastmath={"contract"}, error_model="numpy", nogil=True, _nrt=False, pipeline_class=Whole)'
     return "\n".join(lines) + f"\n\nFAST = {options}\n"
 

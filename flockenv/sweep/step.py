@@ -7,7 +7,7 @@ world together, each the agents of its own blocks.
 from __future__ import annotations
 
 from flockenv.state import COUNTED_BY_KERNELS
-from flockenv.sweep.accelerate import parameters
+from flockenv.sweep.accelerate import felt_as, parameters
 from flockenv.sweep.arrange import go_home, move_in
 from flockenv.sweep.parts import Parts
 from flockenv.sweep.text import (
@@ -17,14 +17,16 @@ from flockenv.sweep.text import (
     alone,
     copied,
     frame_views,
+    given,
     indented,
     indented_lines,
     lane,
     lanes_of,
+    nearest_images,
     tuple_of,
 )
 
-__all__ = ["copies", "kept_frame", "step", "step_world"]
+__all__ = ["begin", "copies", "kept_frame", "kept_inner", "step", "step_world"]
 
 PART = 64
 """Blocks that are advanced together: what they take fits into the nearest caches."""
@@ -70,6 +72,17 @@ def kept_frame(parts: Parts, from_state: bool) -> list[str]:
     ]
 
 
+def kept_inner(parts: Parts, from_state: bool) -> list[str]:
+    """Write how inner states come out of the state's array, or go back into it; nothing if nobody has one."""
+    if not parts.inner:
+        return []
+    pairs = [(f"inner{k}[i]", f"inner_[{k}, b, i]") for k in range(len(parts.inner))]
+    return [
+        f"for i in range(first * {parts.width}, min(end * {parts.width}, n)):",
+        *(f"    {mine} = {kept}" if from_state else f"    {kept} = {mine}" for mine, kept in pairs),
+    ]
+
+
 def step_world(parts: Parts) -> str:
     """Return the source of `step_world`: steps of one world, or of one thread's part of it."""
     d = parts.dimension
@@ -96,14 +109,14 @@ def step_world(
         living[i] = alive[b, i]
     into_blocks(pos, x_, b, n, first, end)
     into_blocks(vel, v_, b, n, first, end)
-{indented([*frame_views(parts), *kept_frame(parts, from_state=True)], 4)}
+{indented([*frame_views(parts), *kept_frame(parts, from_state=True), *kept_inner(parts, from_state=True)], 4)}
 {indented(_confine(parts), 4)}
 {indented(move_in(parts), 4)}
 {indented(_remember(parts), 4)}
     context = ({CONTEXT})
     far, begun = like(dt, np.inf), tick[b]
     counted_ = {kept}
-{indented(_kick_parameters(parts), 4)}
+{indented(_parameters(parts), 4)}
     for l in range(np.uint64({parts.width})):
         {bad} = far
     for step_ in range(count):
@@ -125,7 +138,7 @@ def step_world(
         return first_bad
     out_of_blocks(pos, x_, b, n, first, end)
     out_of_blocks(vel, v_, b, n, first, end)
-{indented(kept_frame(parts, from_state=False), 4)}
+{indented([*kept_frame(parts, from_state=False), *kept_inner(parts, from_state=False)], 4)}
     return -1
 '''
 
@@ -153,7 +166,8 @@ def _advance(parts: Parts) -> list[str]:
     size, flow = parts.dimension * parts.width, "carrying" if parts.flows else "()"
     if parts.integrator.evaluations != 1:
         advance = f"advance((context, first, end), pos, vel, {flow}, time, dt, stages, first * {size}, end * {size})"
-        return [advance, *_bound(parts, "first", "end")]
+        told = ["sense(context, pos, vel, time)"] * (parts.inner != () and parts.integrator.solves)
+        return [*told, advance, *_bound(parts, "first", "end")]
     return [
         "sense(context, pos, vel, time)",
         f"for begin in range(first, end, {PART}):",
@@ -184,6 +198,7 @@ def _bound(parts: Parts, first: str, end: str) -> list[str]:
             "        " + "; ".join(f"{lane(parts, array, k)} = {now}[{k}]" for array, now in stored)
             for k in range(parts.dimension)
         ),
+        *indented_lines(_keep(parts), 8),
     ]
 
 
@@ -245,9 +260,9 @@ def _stay_inside(parts: Parts) -> list[str]:
     ]
 
 
-def _kick_parameters(parts: Parts) -> list[str]:
-    """Write how the numbers are read where laws kick."""
-    return parameters(parts) if any(e.kick_law for e in parts.effects) else []
+def _parameters(parts: Parts) -> list[str]:
+    """Write how the numbers are read where laws are asked once per step."""
+    return parameters(parts) if parts.inner or any(e.kick_law for e in parts.effects) else []
 
 
 def _kick(parts: Parts) -> list[str]:
@@ -267,6 +282,70 @@ def _kick(parts: Parts) -> list[str]:
             "x, v = add(x, scale(kick, like(dt, 0.5) * dt)), add(v, kick)  # as if it came in the middle of the step",
         ]
     return [f"me = {alone(parts)}", *lines] if lines else []
+
+
+def _keep(parts: Parts) -> list[str]:
+    """Write what goes on inside agent i after the step."""
+    if not parts.inner:
+        return []
+    bad, lines = Slots(parts)("bad"), [f"me = {alone(parts)}", *nearest_images(parts, parts.keeping)]
+    for k, effect in parts.keeping:
+        told = felt_as(parts, f"n{k}_") if effect.pair_law else "zero(x)"
+        lines.append(f"says{k} = keep_law_{k}({given(parts, k)}, me, {told}, dt)")
+    now = [_summed(parts, name, "me.inner") for name in parts.inner]
+    return [
+        *lines,
+        *(f"now{j} = {value}" for j, value in enumerate(now)),
+        f"where = far if finite({' + '.join(f'now{j}' for j in range(len(now)))}) else ident[i]",
+        f"{bad} = where if where < {bad} else {bad}",
+        *(f"inner{j}[i] = now{j} if living[i] > like(dt, 0.0) else me.inner.{n}" for j, n in enumerate(parts.inner)),
+    ]
+
+
+def _summed(parts: Parts, name: str, was: str) -> str:
+    """Write what a number becomes: what the effect that keeps it says, or what was and the changes by several."""
+    says = [f"says{k}[{e.keeps.index(name)}]" for k, e in parts.keeping if name in e.keeps]
+    if len(says) == 1:
+        return says[0]
+    return f"{was}.{name}" + "".join(f" + ({value} - {was}.{name})" for value in says)
+
+
+def begin(parts: Parts) -> str:
+    """Return the source of `begin_inner`, and of the entry point `begin`: what goes on inside who comes into being."""
+    if not parts.inner:
+        return ""
+    d, w = parts.dimension, parts.width
+    lines = [f"me = {alone(parts, aim='zero(x)')}", *nearest_images(parts, parts.keeping)]
+    lines += [f"says{k} = begin_law_{k}({given(parts, k)}, me)" for k, _ in parts.keeping]
+    lines += [f"inner_[{j}, b, i] = {_summed(parts, name, 'me.inner')}" for j, name in enumerate(parts.inner)]
+    return f'''
+@kernel
+def begin_inner(x_, v_, {parts.frame_argument}key, tick, params, dt, fresh, b, {SHARED}):
+    """Write what goes on inside those of world b who are `fresh`."""
+    n = x_.shape[2]
+    first, end = 0, (n + {w - 1}) // {w}
+    time = like(dt, tick[b] * np.float64(dt))
+{indented([*frame_views(parts), *parameters(parts)], 4)}
+    into_blocks(pos, x_, b, n, first, end)
+    into_blocks(vel, v_, b, n, first, end)
+{indented(kept_frame(parts, from_state=True), 4)}
+    for block in range(np.uint64(first), np.uint64(end)):
+        base, row = block * np.uint64({d * w}), block * np.uint64({w})
+        for l in range(np.uint64({w})):
+            i, x, v = row + l, {lanes_of(parts, "pos")}, {lanes_of(parts, "vel")}
+            if i < n and fresh[b, i]:
+{indented([f"inner{k}[i] = 0" for k in range(len(parts.inner))], 16)}
+{indented(lines, 16)}
+
+
+@njit(cache=True, **FAST)
+def begin(x, v, {parts.frame_argument}key, tick, params, dt, fresh, {SHARED}):
+    """Write what goes on inside those of all worlds who are `fresh`, (B, N)."""
+    unaliased()
+    for b in range(x.shape[1]):
+        begin_inner(x, v, {parts.frame_argument}key, tick, params, dt, fresh, b, {SHARED})
+
+'''
 
 
 def step(parts: Parts) -> str:

@@ -6,12 +6,13 @@ lanes would stay scalar.
 
 from __future__ import annotations
 
+from flockenv.effects.base import Effect
 from flockenv.kernels import LINE
 from flockenv.sweep.parts import Parts
 
 __all__ = [
-    "CONTEXT", "SHARED", "Slots", "alone", "copied", "frame_views", "given", "indented", "indented_lines", "lane",
-    "lanes_of", "nearest_image", "place_of", "tuple_of",
+    "CONTEXT", "SHARED", "Slots", "alone", "copied", "frame_views", "given", "indented", "indented_lines", "inner_of",
+    "lane", "lanes_of", "nearest_image", "nearest_images", "place_of", "tuple_of",
 ]  # fmt: skip
 
 _READ = (
@@ -47,11 +48,19 @@ def place_of(parts: Parts, rows: int) -> str:
     return f"(i // np.uint64({w})) * np.uint64({rows * w}) + i % np.uint64({w})"
 
 
-def alone(parts: Parts, medium: str = "zero(x)", vel: str = "v", heading: str = "") -> str:
+def inner_of(parts: Parts, i: str) -> str:
+    """Write what goes on inside an agent."""
+    return f"Inner({', '.join(f'inner{k}[{i}]' for k in range(len(parts.inner)))})" if parts.inner else "()"
+
+
+def alone(parts: Parts, medium: str = "zero(x)", vel: str = "v", heading: str = "", aim: str = "") -> str:
     """Write agent i, at x, as the laws of one agent see it: no tie, there is nobody to part from."""
+    aim = aim or (lanes_of(parts, "aiming") if parts.aims else "zero(x)")
+    wished = "desired_speed[i]" if "desired_speed" in parts.frame_numbers else "like(x[0], 0.0)"
     body = "mass[i], radius[i], max_speed[i], max_force[i]"
     heading = heading or (lanes_of(parts, "facing") if parts.oriented else "unit(v)")
-    return f"Me(ident[i], x, {vel}, {heading}, {body}, zero(x), time, {medium}, key[b])"
+    more = f"{aim}, {wished}, {inner_of(parts, 'i')}"
+    return f"Me(ident[i], x, {vel}, {heading}, {body}, zero(x), time, {medium}, key[b], {more})"
 
 
 def given(parts: Parts, k: int) -> str:
@@ -69,11 +78,18 @@ def nearest_image(parts: Parts, k: int, here: str) -> str:
     return f"near{k} = P{k}({', '.join(values)})"
 
 
+def nearest_images(parts: Parts, effects: list[tuple[int, Effect]]) -> list[str]:
+    """Write the numbers of those that know places anew: on a torus, with the images nearest to agent i, at x."""
+    return [nearest_image(parts, k, "x") for k, _ in effects if given(parts, k) == f"near{k}"]
+
+
 def frame_views(parts: Parts) -> list[str]:
     """Write by which names the parts of the scratch `frame` are known: blocks of vectors, and numbers by agent."""
-    vectors = [f"{name} = frame[{k} * len(pos) :]" for k, name in enumerate(parts.frame_vectors)]
-    begin, each = f"{len(parts.frame_vectors)} * len(pos)", f"len(pos) // {parts.dimension}"
-    return vectors + [f"{name} = frame[{begin} + {k} * {each} :]" for k, name in enumerate(parts.frame_numbers)]
+    blocks = [*parts.frame_vectors, *["aiming"] * parts.aims]
+    numbers = [*parts.frame_numbers, *(f"inner{k}" for k in range(len(parts.inner)))]
+    vectors = [f"{name} = frame[{k} * len(pos) :]" for k, name in enumerate(blocks)]
+    begin, each = f"{len(blocks)} * len(pos)", f"len(pos) // {parts.dimension}"
+    return vectors + [f"{name} = frame[{begin} + {k} * {each} :]" for k, name in enumerate(numbers)]
 
 
 def copied(parts: Parts, to: str, at: str, source: str, place: str) -> list[str]:

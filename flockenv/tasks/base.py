@@ -211,6 +211,7 @@ def task_source(task: Task) -> str:
     empty = ", ".join(f"{name}[:0]" for name in NEAR.split(", "))
     then = frame.format(x="x0", v="v0", alive="alive0", near=empty)
     look = f"look(x, alive, obstacle_x, obstacle_radius, b, params, {NEAR}, {SHARED})" if task.look else "pass"
+    begin_inner = f"begin_inner(x, v, {task.parts.frame_argument}key, tick, params, dt, alive, b, {SHARED})"
     worlds = (
         f"x, v, {task.parts.frame_argument}alive, tick, obstacle_x, obstacle_radius, work, key, memory, steps, params, "
         "numbers, table"
@@ -261,6 +262,7 @@ def play(
                 alive[b, i] = True
             spawn(p, {now})
             {"face(v, frame_, b, True)" if task.parts.oriented else "pass"}
+            {begin_inner if task.parts.inner else "pass"}
         if acting:
             for k in range({d}):
                 for i in range(n):

@@ -1,0 +1,71 @@
+"""Spread: a number that differs from one to the next of a group, uniform or normal; the same ones in every world."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, model_validator
+from scipy.special import ndtr, ndtri
+
+from flockenv.records import Record
+
+__all__ = ["Spread", "drawn", "largest"]
+
+
+class Spread(Record):
+    """Uniform from `low` to `high`; with `mean` and `sd` normal, and cut off at `low` and `high`."""
+
+    low: float | None = Field(default=None, description="least; none = 0, of a normal one")
+    high: float | None = Field(default=None, description="most; none = any, of a normal one")
+    mean: float | None = Field(default=None, description="of a normal one, before it is cut off")
+    sd: float | None = Field(default=None, ge=0, description="standard deviation of a normal one")
+    seed: int = Field(default=0, ge=0, description="another one draws other numbers")
+
+    @model_validator(mode="after")
+    def _one_of_both(self) -> Spread:
+        """Refuse what is neither uniform nor normal, and what leaves nothing over."""
+        if (self.mean is None) != (self.sd is None):
+            raise ValueError("mean and sd go together: give both or neither")
+        if self.mean is None and (self.low is None or self.high is None):
+            raise ValueError("low: give low and high, or mean and sd")
+        if self.low is not None and self.high is not None and self.low > self.high:
+            raise ValueError(f"low = {self.low:g}: must not be above high = {self.high:g}")
+        if self.least < 0:
+            raise ValueError(f"low = {self.least:g}: at least 0 is allowed")
+        if self.mean is not None and not self.least <= self.mean <= self.most:
+            raise ValueError(f"mean = {self.mean:g}: must lie between low and high")
+        return self
+
+    @property
+    def least(self) -> float:
+        """What nobody is below."""
+        return 0.0 if self.low is None else self.low
+
+    @property
+    def most(self) -> float:
+        """What nobody is above; may be infinite."""
+        return math.inf if self.high is None else self.high
+
+    def at(self, share: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the numbers that such shares of all are below, each in [0, 1]."""
+        if self.mean is None or self.sd is None:
+            return self.least + (self.most - self.least) * share
+        if self.sd == 0:
+            return np.full(len(share), self.mean)
+        low, high = (ndtr((bound - self.mean) / self.sd) for bound in (self.least, self.most))
+        found = self.mean + self.sd * ndtri(low + (high - low) * share)
+        return np.asarray(np.clip(found, self.least, self.most))
+
+
+def drawn(value: float | Spread, count: int, channel: int) -> NDArray[np.float64]:
+    """Return a number for each of so many; spreads of one channel and seed have the same ranks (the heavy are wide)."""
+    if not isinstance(value, Spread):
+        return np.full(count, float(value))
+    return value.at(np.random.default_rng([value.seed, channel]).random(count))
+
+
+def largest(value: float | Spread, count: int, channel: int) -> float:
+    """Return the largest of these numbers."""
+    return float(drawn(value, count, channel).max())

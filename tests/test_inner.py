@@ -1,0 +1,190 @@
+"""What goes on inside agents, where they want to go, and how a group's numbers are spread."""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar
+
+import numpy as np
+import pytest
+from scipy.spatial import cKDTree
+
+from flockenv.behaviours import Driving
+from flockenv.crew import use_threads
+from flockenv.effects import Antipode, Course, Effect, Goal, Sight
+from flockenv.kernels import law
+from flockenv.population import Emitter
+from flockenv.population.places import Point
+from flockenv.scene import Group, Scene
+from flockenv.space import Torus
+from flockenv.spawn import Spawn
+from flockenv.spread import Spread
+
+
+@law
+def numbered(p: Any, me: Any) -> Any:
+    """Everybody begins as warm as his number, and has not lived yet."""
+    return me.who, me.who - me.who
+
+
+@law
+def warmer(p: Any, me: Any, other: Any) -> Any:
+    """How much warmer a neighbour is."""
+    return (other.inner.warmth - me.inner.warmth,)
+
+
+@law
+def all_of_them(p: Any, me: Any, sums: Any) -> Any:
+    """As a vector, which is told."""
+    return sums[0], sums[0] - sums[0]
+
+
+@law
+def warmed(p: Any, me: Any, told: Any, seconds: float) -> Any:
+    """Heat flows from neighbours, and time goes by."""
+    return me.inner.warmth + p.rate * seconds * told[0], me.inner.lived + seconds
+
+
+class Warmth(Effect):
+    """A toy that keeps two numbers, one of them about neighbours."""
+
+    kind: str
+    rate: float = 0.5
+    pair_law: ClassVar[str | None] = "warmer"
+    finish_law: ClassVar[str | None] = "all_of_them"
+    begin_law: ClassVar[str | None] = "numbered"
+    keep_law: ClassVar[str | None] = "warmed"
+    keeps: ClassVar[tuple[str, ...]] = ("warmth", "lived")
+
+    @property
+    def sight(self) -> Sight:
+        """All around."""
+        return Sight(1.0)
+
+    def sums(self, dimension: int) -> int:
+        """One."""
+        return 1
+
+    def parameters(self) -> dict[str, Any]:
+        """How fast."""
+        return {"rate": self.rate}
+
+
+def warm(count: int, size: float) -> Scene:
+    group = Group(count=count, radius=0.0, spawn=Spawn(speed=(0.5, 2.0)))
+    return Scene(space=Torus(size=(size, size)), dt=0.01, groups=(group,), effects=(Warmth(kind="warmth"),))
+
+
+@pytest.mark.parametrize(("count", "size"), [(30, 5.0), (2**14, 90.0)])
+def test_what_is_kept_follows_neighbours_and_not_the_order_threads_or_calls(count: int, size: float) -> None:
+    scene = warm(count, size)
+    start = scene.start(3, 2)
+    warmth = np.array(scene.inner(start, "warmth"))
+    np.testing.assert_array_equal(warmth, np.tile(np.arange(count), (2, 1)))
+    state = start
+    for _ in range(5):
+        for b in range(2):
+            near = cKDTree(state.pos[b], boxsize=size).query_pairs(1.0, output_type="ndarray")
+            told = np.zeros(count)
+            for i, j in ((0, 1), (1, 0)):
+                np.add.at(told, near[:, i], warmth[b, near[:, j]] - warmth[b, near[:, i]])
+            warmth[b] += 0.5 * 0.01 * told
+        state = scene.step(state)
+        np.testing.assert_allclose(scene.inner(state, "warmth"), warmth, rtol=1e-12)
+    np.testing.assert_allclose(scene.inner(state, "lived"), 0.05, rtol=1e-12)
+    use_threads(2)
+    try:
+        again = scene.step(start, steps=5)  # in one call agents of a large world are put in order
+    finally:
+        use_threads(1)
+    np.testing.assert_array_equal(again.inner, state.inner)
+    alone = scene.step(scene.start(4), steps=5)
+    np.testing.assert_array_equal(alone.inner[:, 0], state.inner[:, 1])
+
+
+WALKERS = Group(count=6, radius=0.2, mass=70, desired_speed=1.3, spawn=Spawn(low=(0, 0), high=(4, 4)))
+
+
+def test_an_antipode_is_kept_from_the_start_and_reached() -> None:
+    scene = Scene(groups=(WALKERS,), effects=(Antipode(centre=(2, 2)), Driving()), dt=0.02)
+    start = scene.start(0)
+    end = scene.run(start, 600)
+    np.testing.assert_allclose(end.pos, 4 - start.pos, atol=1e-3)
+    np.testing.assert_array_equal(scene.inner(end, "goal_x"), 4 - start.pos[..., 0])
+
+
+def test_driving_relaxes_to_the_desired_speed_of_each() -> None:
+    group = WALKERS.model_copy(update={"desired_speed": Spread(mean=1.34, sd=0.26, low=0.5)})
+    scene = Scene(groups=(group, WALKERS), effects=(Course(group=0, direction=(3, 4)), Driving(tau=0.5)), dt=1e-3)
+    state = scene.run(scene.start(1), 500)
+    wanted = scene.body.desired_speed[:6]
+    assert np.ptp(wanted) > 0.1
+    np.testing.assert_allclose(state.vel[0, :6], wanted[:, None] * (0.6, 0.8) * (1 - np.exp(-1)), rtol=2e-3)
+    np.testing.assert_array_equal(state.vel[0, 6:], 0)  # nobody told them where to go
+
+
+def test_a_goal_is_reached_at_rest_and_on_a_torus_the_short_way() -> None:
+    walkers = WALKERS.model_copy(update={"count": 1, "spawn": Spawn(low=(9, 5), high=(9.01, 5))})
+    scene = Scene(space=Torus(size=(10, 10)), groups=(walkers,), effects=(Goal(target=(1, 5)), Driving()), dt=0.02)
+    state = scene.step(scene.start(0), steps=20)
+    assert state.vel[0, 0, 0] > 0.5
+    state = scene.step(state, steps=800)
+    np.testing.assert_allclose(state.pos[0, 0], (1, 5), atol=1e-3)
+    np.testing.assert_allclose(state.vel[0, 0], 0, atol=1e-3)
+
+
+def test_who_is_born_begins_anew() -> None:
+    group = WALKERS.model_copy(update={"count": 4, "desired_speed": 0.1})
+    born = Emitter(group=0, place=Point(at=(1.0, 3.0)), rate=10.0)
+    scene = Scene(groups=(group,), effects=(Antipode(centre=(2, 2)), Driving()), population=(born,), dt=0.05)
+    state = scene.run(scene.start(0), 10)
+    assert state.alive.all()
+    np.testing.assert_allclose(scene.inner(state, "goal_x"), 3.0, atol=0.02)
+    np.testing.assert_allclose(scene.inner(state, "goal_y"), 1.0, atol=0.02)
+
+
+def test_a_scene_without_inner_states_has_none() -> None:
+    scene = Scene(groups=(WALKERS,), effects=(Course(direction=(1, 0)), Driving()))
+    assert scene.start(0).inner.size == 0
+    with pytest.raises(ValueError, match="'hunger': no effect keeps it"):
+        scene.inner(scene.start(0), "hunger")
+    kept = Scene(groups=(WALKERS,), effects=(Antipode(centre=(0, 0)), Driving()))
+    with pytest.raises(ValueError, match="the state has 0 inner numbers, but effects of this scene keep goal_x"):
+        kept.step(scene.start(0))
+
+
+def test_spreads_are_what_they_say() -> None:
+    share = (np.arange(10_000) + 0.5) / 10_000
+    normal = Spread(mean=1.34, sd=0.26).at(share)
+    assert abs(normal.mean() - 1.34) < 1e-3
+    assert abs(normal.std() - 0.26) < 1e-3
+    cut = Spread(mean=1.34, sd=0.26, low=1.2, high=1.4).at(share)
+    assert cut.min() >= 1.2
+    assert cut.max() <= 1.4
+    group = Group(count=500, mass=Spread(low=60, high=100), radius=Spread(low=0.1875, high=0.3125))
+    np.testing.assert_allclose(group.radii * 320, group.masses(2))  # the heavy are wide
+    haste = Group(count=5, desired_speed=Spread(low=1, high=2), haste=1.3)
+    np.testing.assert_allclose(haste.max_speeds, 1.3 * haste.desired_speeds)
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"low": 2.0, "high": 1.0}, "low = 2: must not be above high = 1"),
+        ({"mean": 2.0}, "mean and sd go together"),
+        ({"low": 2.0}, "low: give low and high, or mean and sd"),
+        ({"low": -1.0, "high": 1.0}, "low = -1: at least 0 is allowed"),
+        ({"mean": 3.0, "sd": 1.0, "high": 2.0}, "mean = 3: must lie between low and high"),
+    ],
+)
+def test_spreads_that_make_no_sense_are_refused(given: dict[str, float], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        Spread(**given)
+
+
+def test_driving_wants_to_know_how_fast() -> None:
+    with pytest.raises(ValueError, match=r"groups\[0\].desired_speed = None: give m/s"):
+        Scene(groups=(Group(count=1, spawn=Spawn(low=(0, 0), high=(1, 1))),), effects=(Driving(),))
+    with pytest.raises(ValueError, match=r"direction = \(0.0, 0.0\): leads nowhere"):
+        Scene(groups=(WALKERS,), effects=(Course(direction=(0, 0)), Driving()))
+    with pytest.raises(ValueError, match=r"haste = 1\.3: goes with a desired_speed"):
+        Group(count=1, haste=1.3)
