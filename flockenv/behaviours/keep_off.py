@@ -1,4 +1,4 @@
-"""Keep off walls: a repulsion that falls exponentially with the distance, summed over all sides of what stands around."""
+"""Keep off walls: a repulsion that falls exponentially with the distance, summed over all sides around."""
 
 from __future__ import annotations
 
@@ -107,7 +107,7 @@ effects:
         return dimension
 
     def rates(self, groups: Sequence[Any], dimension: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """w^2 = A / (m B) where a body touches a wall (or, of distances alone, its centre does); deeper it is steeper."""
+        """w^2 = A / (m B) where a body touches a wall (of distances alone, its centre does); deeper it is steeper."""
         mass = all_masses(groups, dimension)
         square = (self.strength / mass + np.where(np.isfinite(mass), self.acceleration, 0.0)) / self.decay
         return square, np.zeros(len(mass))

@@ -203,8 +203,8 @@ class Sidestep(Social):
     """Slow down before others and pass them on one side, as was measured (Moussaid et al. 2009, equations 4 to 7).
 
     D = lambda (v_i - v_j) + e_ij, t = unit(D), B = gamma |D|, theta the angle from t to e_ij in (-pi, pi], with B eps
-    added: -A exp(-d / B - (n' B theta)^2) along t, and A exp(-d / B - (n B theta)^2) to the side where he is not. In a
-    plane. eps > 0 keeps right where he is dead ahead; their fit of a side preference differs, see the docs.
+    added: -A exp(-d / B - (n' B theta)^2) along t, and A exp(-d / B - (n B theta)^2) to the side where he is not.
+    eps > 0 keeps right where he is dead ahead. In space it turns in the plane of t and e_ij: that is ours.
     """
 
     kind: Literal["sidestep"] = "sidestep"
@@ -220,9 +220,3 @@ class Sidestep(Social):
         """A, and the numbers of the fit."""
         names = ("importance", "gamma", "angular", "forward", "bias")
         return {**super().parameters(), **{name: float(getattr(self, name)) for name in names}}
-
-    def check(self, scene: Any) -> None:
-        """Refuse space."""
-        if scene.dimension != 2:
-            raise ValueError(f"kind = sidestep: dimension = {scene.dimension}, must be 2: it goes to the left or right")
-        super().check(scene)
