@@ -438,14 +438,17 @@ EFFECTS = (
     EffectRow(  # it keeps right
         Sidestep(acceleration=2, radius=2.5, bias=0.1), obeys=UPRIGHT | {"rotation"}, family="social"
     ),
-    EffectRow(ObstacleRepulsion(strength=3, decay=0.9), family="social"),
-    EffectRow(Interest(target=CENTRE, strength=1, decay=2, fades=5), family="social"),
+    EffectRow(ObstacleRepulsion(strength=3, decay=0.9), family="around"),
+    EffectRow(Interest(target=CENTRE, strength=1, decay=2, fades=5), family="goals"),
     EffectRow(Friends(group=0, strength=1, decay=2, fades=5, radius=2.5), family="social"),
     EffectRow(  # who belongs together is a matter of numbers
         WalkingGroup(group=0, party=3, radius=2.5), obeys=frozenset({"translation", "rotation", "mirror"}),
         family="social",
     ),
-    EffectRow(Heuristics(radius=2.5), beside=(Goal(target=CENTRE, slow_radius=2),), dimensions=(2,)),
+    EffectRow(  # of two ways as good it takes the right one
+        Heuristics(radius=2.5), beside=(Goal(target=CENTRE, slow_radius=2),),
+        obeys=frozenset({"translation", "rotation", "relabelling"}), dimensions=(2,),
+    ),
     # everybody is tied to somebody else; see `tied`
     EffectRow(Springs(stiffness=3, damping=0.2), obeys=frozenset({"translation", "rotation", "mirror"})),
     EffectRow(

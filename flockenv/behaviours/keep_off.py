@@ -28,7 +28,7 @@ def nowhere(p: Any, me: Me) -> Vec:
 def pushed_off(p: Any, me: Me, other: Obstacle, acc: Vec) -> Vec:
     """A exp((r_i - d) / B) n, within reach."""
     force = (p.strength + me.mass * p.acceleration) * exp((p.bodies * me.radius - other.gap) / p.decay)
-    force = force if force < p.most else p.most
+    force = force if force < p.bound else p.bound
     return select(other.gap < p.radius, add(acc, scale(other.normal, force)), acc)
 
 
@@ -99,7 +99,7 @@ effects:
         """A, B, whose surface, and how far it looks."""
         return {
             "strength": self.strength, "acceleration": self.acceleration, "decay": self.decay,
-            "bodies": float(self.bodies), "radius": self.radius, "most": math.inf if self.most is None else self.most,
+            "bodies": float(self.bodies), "radius": self.radius, "bound": math.inf if self.most is None else self.most,
         }  # fmt: skip
 
     def folded(self, dimension: int) -> int:

@@ -75,7 +75,7 @@ class Social(Effect):
     def parameters(self) -> dict[str, float | Vec]:
         """Its strength, and its bound."""
         most = math.inf if self.most is None else self.most
-        return {"strength": self.strength, "acceleration": self.acceleration, "most": most}
+        return {"strength": self.strength, "acceleration": self.acceleration, "bound": most}
 
     def sums(self, dimension: int) -> int:
         """The force so far."""
@@ -107,7 +107,7 @@ def pushed_by_distance(p: Any, me: Me, other: Other) -> Vec:
     touching = p.bodies * (me.radius + other.radius)
     push = steering.repulsion(other.offset, sub(me.tie, other.tie), touching, p.decay)
     weight = steering.view_weight(steering.looking(me.aim, me.heading), other.offset, p.anisotropy)
-    return limit(scale(push, weight * size_of(p, me)), p.most)
+    return limit(scale(push, weight * size_of(p, me)), p.bound)
 
 
 class CircularRepulsion(Social):
@@ -150,7 +150,7 @@ def pushed_by_ellipse(p: Any, me: Me, other: Other) -> Vec:
     push = steering.elliptical_repulsion(other.offset, step, sub(me.tie, other.tie), p.decay)
     way = steering.looking(me.aim, me.heading)
     weight = steering.view_weight(way, other.offset, p.anisotropy) * steering.in_cone(way, push, p.edge, p.outside)
-    return limit(scale(push, weight * size_of(p, me)), p.most)
+    return limit(scale(push, weight * size_of(p, me)), p.bound)
 
 
 class EllipticalRepulsion(Social):
@@ -196,7 +196,7 @@ def stepped_aside(p: Any, me: Me, other: Other) -> Vec:
     wish = steering.sidestep(
         other.offset, me.vel, other.vel, sub(other.tie, me.tie), p.importance, p.gamma, p.angular, p.forward, p.bias
     )
-    return limit(scale(wish, size_of(p, me)), p.most)
+    return limit(scale(wish, size_of(p, me)), p.bound)
 
 
 class Sidestep(Social):

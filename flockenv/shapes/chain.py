@@ -169,8 +169,8 @@ def end_acts(table: Any, at: int, which: int, x: Vec) -> bool:
     corner = vertex(table, at, 0 if which == 0 else count - 1, x)
     code = table[place]
     nearest = dot(sub(x, corner), vector_at(table, place + 1, x)) <= like(code, 0.0)
-    free: bool = code < like(code, 0.5)
-    return free | ((code < like(code, 1.5)) & nearest)
+    acts: bool = (code < like(code, 0.5)) | ((code < like(code, 1.5)) & nearest)
+    return acts
 
 
 @law
