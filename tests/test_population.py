@@ -353,13 +353,17 @@ def test_regions_take_who_is_in_them_and_who_leaves() -> None:
 
 
 @pytest.mark.parametrize(
-    "space", [Plane(), Torus(size=(4.0, 4.0)), Torus(size=(1.0, 4.0))], ids=["plane", "torus", "thin"]
-)
-def test_of_a_crowd_the_youngest_die(space: Space) -> None:
+    ("space", "dtype"),
+    [
+        (Plane(), "float64"), (Torus(size=(4.0, 4.0)), "float64"), (Torus(size=(1.0, 4.0)), "float64"),
+        (Plane(), "float32"),
+    ],
+    ids=["plane", "torus", "thin", "single"],
+)  # fmt: skip
+def test_of_a_crowd_the_youngest_die(space: Space, dtype: str) -> None:
     radius, most, n = 0.45, 6, 400
-    crowd = scene(
-        Crowding(radius=radius, most=most), count=n, space=space, group={"spawn": Spawn(low=(0, 0), high=(1.0, 3.9))}
-    )
+    group = {"spawn": Spawn(low=(0, 0), high=(1.0, 3.9))}
+    crowd = scene(Crowding(radius=radius, most=most), count=n, space=space, group=group, dtype=dtype)
     before = crowd.start(0)
     after = before.copy()
     settler(crowd)(before.x, before.v, after, 0, 1)  # the end of a step in which nobody moved

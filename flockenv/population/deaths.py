@@ -157,7 +157,8 @@ def crowding(
                 chance = _chance(row[5], 1.0 - math.exp(-row[5] * dt), born[b, i], now, dt)
                 if uniform(key[b], tick[b], identity[b, i], DECAY + channel) >= chance:
                     continue
-            place = (float(x[0, b, i]), float(x[1, b, i]), float(x[2, b, i]) if x.shape[0] == 3 else 0.0)
+            y, z = np.float64(x[1, b, i]), np.float64(x[2, b, i]) if x.shape[0] == 3 else 0.0
+            place = (np.float64(x[0, b, i]), y, z)
             most = int(row[4])
             doomed[i] = count_near(x, b, place, row[3], most, period, grid, start, order, born, identity, i) > most
         for i in range(low, high):
