@@ -245,6 +245,21 @@ def test_two_bullets_do_not_pass_each_other(response: str) -> None:
         np.testing.assert_allclose(end.vel[0, :, 0], [-200, 200], rtol=1e-12)
 
 
+def test_who_goes_far_round_a_torus_in_a_step_gains_no_energy_and_is_told_of() -> None:
+    """Ways of more than half of its edge, 4 m: what is met is met on the way there, not on the shorter one back."""
+    post = (Circle(centre=(1.0, 2.0), radius=0.2),)
+    of = scene([1, 1], dt=1 / 60, space=Torus(size=(4.0, 4.0)), obstacles=post)
+    with pytest.warns(UnsolvedContactsWarning, match="further than a quarter of the torus") as told:
+        for speed in (100.0, 150.0, 200.0, 300.0, 395.0, 450.0):
+            state = begun(of, [(0.5, 2.0), (0.3, 2.0)], [(speed, 1.0), (0.0, 0.0)])
+            end = of.run(state, 3)
+            np.testing.assert_allclose(energy(of, end), energy(of, state), rtol=1e-12)
+            assert end.counted("unsolved") == 3, speed  # more than a quarter in each
+        slow = of.run(begun(of, [(0.5, 2.0), (0.3, 2.0)], [(50.0, 1.0), (0.0, 0.0)]), 3)
+        assert slow.counted("unsolved") == 0
+    assert len(told) == 1
+
+
 def test_who_is_hit_meets_who_was_out_of_its_reach() -> None:
     """One that lies still is sent through the whole row by one that comes fast, within one step."""
     of = scene([1] * 6, dt=0.1)

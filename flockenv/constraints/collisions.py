@@ -25,7 +25,7 @@ __all__ = ["Collisions", "UnsolvedContactsWarning"]
 
 
 class UnsolvedContactsWarning(RuntimeWarning):
-    """More impacts in a step than are allowed, or contacts that the passes allowed have not solved."""
+    """More impacts in a step than are allowed, contacts that passes have not solved, too long a way round a torus."""
 
 
 class Collisions(Constraint):
@@ -184,9 +184,10 @@ class _Settler:
             self._make_room(2 * needed)
         if unsolved and not self.told:
             self.told = True
+            far = ", or somebody went further than a quarter of the torus" if self.period[0] > 0 else ""
             warnings.warn(
                 f"constraints: collisions: in a step {unsolved} impacts or worlds with contacts were not solved within "
-                f"most = {r.most} and passes = {r.passes}",
+                f"most = {r.most} and passes = {r.passes}{far}",
                 UnsolvedContactsWarning, stacklevel=2,
             )  # fmt: skip
         return bad
