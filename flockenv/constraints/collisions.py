@@ -76,6 +76,11 @@ class Collisions(Constraint):
                 f"{scene.space.size}; at most a quarter of its shortest edge is allowed"
             )
 
+    def calls_for(self) -> tuple[str, ...]:
+        """Who is near whom, and obstacles, if they are met."""
+        asked = ("neighbour query", self.agents), ("obstacles", self.obstacles)
+        return tuple(what for what, is_met in asked if is_met)
+
     def numbers(self, scene: Any) -> int:
         """Bodies, ends, and room for meetings."""
         return int(8 * scene.dimension + 12 + self.capacity * (12 + 4 * scene.dimension))
