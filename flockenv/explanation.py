@@ -147,7 +147,8 @@ def _shares(scene: Scene, state: State) -> tuple[tuple[str, str, float], ...]:
 
 
 def _left_out(scene: Scene) -> tuple[str, ...]:
-    asked = {what for each in (*scene.effects, *scene.constraints) for what in each.calls_for()}
+    asked = {what for effect in scene.effects for what in effect.calls_for()}
+    asked |= {what for constraint in scene.constraints for what in constraint.calls_for()}
     others = sorted(EFFECTS.keys() - {effect.kind for effect in scene.parts.effects})
     lines = []
     if "neighbour query" not in asked:

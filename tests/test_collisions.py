@@ -457,6 +457,16 @@ def test_a_cap_that_bites_is_reported_once() -> None:
     assert end.counted("unsolved") > 0
 
 
+def test_who_is_parted_slowly_is_not_unsolved() -> None:
+    """Two .15 m deep in each other, parted at .5 m/s: after .3 s, and no passes are missed on the way."""
+    of = scene([1, 1], part_speed=0.5)
+    state = begun(of, [(0, 0), (0.05, 0)], [(0, 0), (0, 0)])
+    early, end = of.run(state, 20), of.run(state, 40)
+    assert early.pos[0, 1, 0] - early.pos[0, 0, 0] == pytest.approx(0.05 + 0.5 * 0.2, abs=1e-12)
+    assert end.pos[0, 1, 0] - end.pos[0, 0, 0] == pytest.approx(2 * R, abs=1e-9)
+    assert np.abs(end.vel).max() == 0.0 and end.counted("unsolved") == 0
+
+
 def test_a_scene_with_collisions_is_a_value(tmp_path: Path) -> None:
     of = scene([1, 2], "impulses", e=0.3, friction=0.2, sticky=True, part_speed=2.0, obstacles=FLOOR)
     file = tmp_path / "scene.yaml"
