@@ -21,7 +21,14 @@ SECONDS = {
     "billiards": 1.0, "bouncing_balls": 3.0, "newtons_cradle": 2.0, "sphere": 2.0,
     "snow": 3.0, "stampede": 3.0, "rope_on_ball": 1.0, "cloth_on_ball": 0.7, "funnel": 1.5,
 }  # fmt: skip
-SLOW = ("snow", "stampede", "rope_on_ball", "cloth_on_ball", "funnel")  # half a minute of compiling, or many bodies
+SLOW = (
+    "sphere",
+    "snow",
+    "stampede",
+    "rope_on_ball",
+    "cloth_on_ball",
+    "funnel",
+)  # half a minute of compiling, or many bodies
 FAST = pytest.mark.parametrize(
     "name", [pytest.param(name, marks=[pytest.mark.slow] if name in SLOW else []) for name in SECONDS]
 )
