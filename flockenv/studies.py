@@ -207,6 +207,7 @@ def experiment(
     """Run an experiment about steering: a table of what was measured, and a picture of where everybody went."""
     from flockenv.experiments import EXPERIMENTS, run
     from flockenv.outputs import checked_file
+    from flockenv.render.curves import write_order
     from flockenv.render.trials import write_trials
 
     if name not in EXPERIMENTS:
@@ -222,7 +223,8 @@ def experiment(
     show_table(console, "Cases", results.cases.items())
     show_table(console, "Columns", results.columns.items())
     if path is not None:
-        _write(path, results, lambda picture: write_trials(picture, chosen, trials))
+        draw = write_trials if chosen.curve is None else write_order
+        _write(path, results, lambda picture: draw(picture, chosen, trials))
         console.print(f"{len(results.cells)} trials in {relative(path)}")
 
 
