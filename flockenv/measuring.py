@@ -252,8 +252,9 @@ def _draw(folder: Path, run: Trajectory, found: Sequence[Survey], asked: Asked, 
     """Write the pictures that there is something to draw for; return their names."""
     import numpy as np
 
-    from flockenv.measures import tail
+    from flockenv.measures import goodness, tail
     from flockenv.render.crowd import write_flow_density, write_gaps, write_lanes, write_space_time
+    from flockenv.survey import SAMPLES
 
     folder.mkdir(parents=True, exist_ok=True)
     drawn = []
@@ -272,7 +273,9 @@ def _draw(folder: Path, run: Trajectory, found: Sequence[Survey], asked: Asked, 
         )  # fmt: skip
         drawn.append(PICTURES[1])
     if (gaps > 0).any():
-        write_gaps(folder / PICTURES[2], gaps, tail(gaps), f"{name}: {len(gaps)} gaps between passages")
+        fit = tail(gaps)
+        title = f"{name}: {len(gaps)} gaps between passages"
+        write_gaps(folder / PICTURES[2], gaps, fit, goodness(gaps, fit, SAMPLES), title)
         drawn.append(PICTURES[2])
     if run.scene.dimension == 2 and len(run.step) > 2:
         time, place, image = _space_time(run, found[0])

@@ -68,6 +68,7 @@ def test_of_two_streams_everything_is_known(capsys: pytest.CaptureFixture[str]) 
     assert found["forward"] == turns[:40].sum()
     assert found["backward"] == turns[40:].sum()
     assert found["specific flow"] == pytest.approx((turns[:40].sum() - turns[40:].sum()) / 20 / 4)
+    assert found["both ways"] == pytest.approx(turns.sum() / 20 / 4)
     assert found["lanes"] == found["band index"] == 1
     assert found["lanes p"] < 0.05
     assert found["density"] == pytest.approx(2)
