@@ -53,9 +53,12 @@ def values(found: dict[str, Any]) -> dict[str, float]:
 
 def test_of_two_streams_everything_is_known(capsys: pytest.CaptureFixture[str]) -> None:
     """24 m in 20 s: everybody comes through the line twice, and .4 of them three times, more or less."""
-    assert main(["measure", "streams.yaml", "--time", "20", "--json", "x.json", "--out", "p", *LINE]) == 0
+    assert (
+        main(["measure", "streams.yaml", "--time", "20", "--every", "0.4", "--json", "x.json", "--out", "p", *LINE])
+        == 0
+    )
     said = capsys.readouterr().out
-    assert "positions every 0.1 s, seed 0" in said
+    assert "positions every 0.4 s, seed 0" in said
     assert "Phi, 1 = nobody shares a row" in said
     scene = load_scene(Path("streams.yaml"))
     x = scene.start(0).pos[0, :, 0]
@@ -121,7 +124,7 @@ def test_of_the_beginning_as_much_is_skipped_as_asked_for() -> None:
 
 
 def test_many_seeds_have_intervals_and_are_held_against_chance(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["measure", "streams.yaml", "--time", "2", "--seeds", "5", "--seed", "3", "--json", "x.json"]) == 0
+    assert main(["measure", "streams.yaml", "--time", "1", "--seeds", "5", "--seed", "3", "--json", "x.json"]) == 0
     said = capsys.readouterr().out
     assert "seeds 3 to 7: means and 95 % intervals" in said
     assert "Above chance?" in said
@@ -137,7 +140,7 @@ def test_many_seeds_have_intervals_and_are_held_against_chance(capsys: pytest.Ca
 
 def test_the_same_seed_is_the_same_picture() -> None:
     for name in ("a", "b"):
-        assert main(["measure", "streams.yaml", "--time", "2", "--out", name, *LINE]) == 0
+        assert main(["measure", "streams.yaml", "--time", "1", "--out", name, *LINE]) == 0
     for path in Path("a").iterdir():
         assert path.read_bytes() == (Path("b") / path.name).read_bytes()
 
