@@ -267,7 +267,7 @@ def _draw(folder: Path, run: Trajectory, found: Sequence[Survey], asked: Asked, 
         solids = [*start.outlines, *(p for shape in run.scene.circles for p in shape.polygons(start.low, start.high))]
         alive = run.alive & np.isfinite(run.pos).all(axis=2)
         write_lanes(
-            folder / PICTURES[1], run.pos.astype(np.float64), alive, found[0].way, (start.low, start.high),
+            folder / PICTURES[1], run.pos, alive, found[0].way, (start.low, start.high),
             f"{name}: who went where (orange along {_pointing(found[0].axis)}, blue against it)",
             solids, asked.line, asked.area,
         )  # fmt: skip

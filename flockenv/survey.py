@@ -24,6 +24,9 @@ Floats = NDArray[np.float64]
 INSTANTS = 200
 """At so many instants of a run, evenly, cells, lanes and order are looked at."""
 
+MOST_DEALT = 20_000_000
+"""Directions that are dealt out anew, in all, for the null of lanes."""
+
 SAMPLES = 100
 """So many samples of a power law are drawn, to see whether gaps are of one."""
 
@@ -298,7 +301,8 @@ def _lanes(run: _Run) -> Part:
         return {}, {}
     y = pos @ across
     low, high = float(y[here].min()), float(y[here].max())
-    found = m.lanes(y, run.way, low, high + 1e-9 * (1 + abs(high)), here)
+    deals = min(400, max(50, MOST_DEALT // y.shape[1]))
+    found = m.lanes(y, run.way, low, high + 1e-9 * (1 + abs(high)), here, deals=deals)
     return {"lanes": found.order, "lanes by chance": found.null, "lanes p": found.p, "band index": found.bands}, {}
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from pathlib import Path
 from typing import Any
 
@@ -236,3 +237,25 @@ def test_what_is_there_is_overwritten_only_by_force() -> None:
     (Path("p") / "lanes.png").write_text("mine")
     assert main(["measure", "room.yaml", "--time", "1", "--out", "p"]) == 2
     assert (Path("p") / "lanes.png").read_text() == "mine"
+
+
+def test_the_page_of_measures_shows_what_there_is() -> None:
+    """Its pictures are there and small, the commands it gives exist, and each scene in them is one."""
+    root = Path(__file__).resolve().parent.parent
+    page = (root / "docs" / "measures.md").read_text()
+    pictures = re.findall(r"!\[[^\]]*\]\((measures/\w+\.png)\)", page)
+    assert len(pictures) == 5
+    assert all(1000 < (root / "docs" / name).stat().st_size < 100_000 for name in pictures)
+    scenes = re.findall(r"flockenv measure (configs/\w+\.yaml) ", page)
+    assert len(scenes) == 2
+    for scene in scenes:
+        load_scene(root / scene)
+
+
+def test_a_run_of_one_instant_is_measured_as_far_as_it_goes() -> None:
+    run = record(load_scene(Path("streams.yaml")), 0, 0, 1)
+    found = survey(run, Asked(line=np.array([(5.0, 0.0), (5.0, 4.0)]))).values
+    assert found["density"] == pytest.approx(2)
+    assert found["lanes"] == 1
+    assert "flow" not in found
+    assert math.isnan(found["collisions"])

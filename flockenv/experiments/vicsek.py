@@ -24,7 +24,7 @@ from flockenv.spawn import Spawn
 
 __all__ = ["EXPERIMENT", "bound", "order", "scene_of"]
 
-WORLDS, SEED, SETTLE, STEPS, EVERY = 4, 0, 5000, 10_000, 10
+WORLDS, SEED, SETTLE, STEPS, EVERY = 4, 0, 3000, 4000, 10
 SPEED, DENSITY = 0.03, 4.0
 """m/s, of all; agents per m^2. Vicsek's text says .4, but his sizes (N = 400, L = 10) are 4."""
 

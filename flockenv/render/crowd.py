@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -54,7 +54,8 @@ def write_flow_density(path: str | Path, density: Floats, speed: Floats, title: 
 
 
 def write_lanes(
-    path: str | Path, pos: Floats, alive: NDArray[np.bool_], way: NDArray[np.int64], region: tuple[Floats, Floats],
+    path: str | Path, pos: NDArray[np.floating[Any]], alive: NDArray[np.bool_],
+    way: NDArray[np.int64], region: tuple[Floats, Floats],
     title: str, solids: Sequence[Floats] = (), line: Floats | None = None, area: Floats | None = None,
 ) -> None:  # fmt: skip
     """Draw where everybody went, (T, N, 2) m, in the colour of his way (N,), and a dot where he is at the end.
@@ -70,7 +71,7 @@ def write_lanes(
     every = -(-pos.shape[0] // MOST_POINTS)
     jump = 0.5 * np.array([wide, tall])
     for k in range(0, pos.shape[1], -(-pos.shape[1] // MOST_WAYS)):
-        places = np.where(alive[:, k, None], pos[:, k], np.nan)[::every]
+        places = np.where(alive[::every, k, None], pos[::every, k], np.nan).astype(np.float64)
         far = (np.abs(np.diff(places, axis=0)) > jump).any(axis=1)
         places = np.insert(places, np.flatnonzero(far) + 1, np.nan, axis=0)
         axes.plot(*places.T, color=_colour(int(way[k])), lw=0.6, alpha=0.5, zorder=2)
