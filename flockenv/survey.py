@@ -21,8 +21,8 @@ __all__ = ["UNITS", "Asked", "Survey", "combined", "survey"]
 
 Floats = NDArray[np.float64]
 
-INSTANTS = 200
-"""At so many instants of a run, evenly, cells, lanes and order are looked at."""
+INSTANTS, FEWEST, MOST_CELLS = 200, 10, 400_000
+"""At so many instants of a run, evenly, cells, lanes and order are looked at; at fewer if that is more cells in all."""
 
 MOST_DEALT = 20_000_000
 """Directions that are dealt out anew, in all, for the null of lanes."""
@@ -187,8 +187,8 @@ class _Run:
 
     def instants(self) -> list[int]:
         """Return so many instants that count, evenly."""
-        many = len(self.time) - self.first
-        return sorted({round(float(k)) for k in np.linspace(self.first, len(self.time) - 1, min(many, INSTANTS))})
+        most = min(INSTANTS, max(FEWEST, MOST_CELLS // self.scene.agents), len(self.time) - self.first)
+        return sorted({round(float(k)) for k in np.linspace(self.first, len(self.time) - 1, most)})
 
     def worlds(self) -> Iterator[tuple[Floats, Floats, NDArray[np.bool_]]]:
         """Return positions and velocities of the living at those instants, and who they are."""
