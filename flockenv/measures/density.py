@@ -16,6 +16,9 @@ __all__ = ["Ground", "Room", "classical_density", "speed_in_area", "voronoi", "v
 
 Floats = NDArray[np.float64]
 
+EDGE = 8.0
+"""How wide an edge of images is tried first, in mean distances of people."""
+
 
 class Room(NamedTuple):
     """How much room everybody has."""
@@ -134,16 +137,35 @@ def voronoi_speed(room: Room, speed: ArrayLike) -> float:
 
 
 def _cells(places: Floats, walk: Floats, period: tuple[float, float]) -> list[Corners]:
-    """Return the cells of different places, cut to a box around the walkable area, or to a period around each."""
+    """Return the cells of different places, cut to a box around the walkable area, or to a period around each.
+
+    Of a world that goes on with itself images near its edge are enough where cells are small: who is missing is further
+    from a corner of a cell than the cell's own place.
+    """
     low, high = walk.min(axis=0), walk.max(axis=0)
-    every = np.concatenate([places + np.multiply(shift, period) for shift in _shifts(period)])
+    images = [places + np.multiply(shift, period) for shift in _shifts(period)]
+    margin = EDGE * float(np.sqrt(np.prod(high - low) / len(places)))
+    if len(images) > 1:
+        near = [each[((each > low - margin) & (each < high + margin)).all(axis=1)] for each in images[1:]]
+        cells = _cut(places, np.concatenate([places, *near]), low, high, period)
+        far = max(
+            max((x - u) ** 2 + (y - v) ** 2 for x, y in cell)
+            for cell, (u, v) in zip(cells, places.tolist(), strict=True)
+        )
+        if 4 * far < margin**2:
+            return cells
+    return _cut(places, np.concatenate(images), low, high, period)
+
+
+def _cut(places: Floats, every: Floats, low: Floats, high: Floats, period: tuple[float, float]) -> list[Corners]:
+    """Return the cells of places, the first of every place that there is."""
     middle, far = (low + high) / 2, 20 * float(max(np.ptp(every - every.mean(axis=0)), *(high - low), *period))
     # four more far outside: every cell ends, and they are too far away to take anything of the walkable area
     ring = middle + far * np.array([(1, 1), (-1, 1), (-1, -1), (1, -1)])
     pairs = Voronoi(np.concatenate([every, ring])).ridge_points
     pairs = pairs[(pairs < len(every)).all(axis=1)]
     pairs = np.concatenate([pairs, pairs[:, ::-1]])
-    pairs = pairs[pairs[:, 0] < len(places)]  # the first image is the place itself
+    pairs = pairs[pairs[:, 0] < len(places)]
     begin = [_box(place, low, high, period) for place in places.tolist()]
     points: list[tuple[float, float]] = list(map(tuple, every.tolist()))
     for i, j in pairs.tolist():
