@@ -106,7 +106,7 @@ def test_noise_takes_order_away() -> None:
 
 @pytest.mark.slow
 def test_with_the_old_velocity_there_is_more_order_near_the_transition() -> None:
-    """.28 and not .20 at eta = 4: a loop in numpy with draws of its own found .29 (.32, .27) and .21 (.208, .209)."""
+    """.28 and not .20 at eta = 4: a separate loop with draws of its own found .29 (.32, .27) and .21 (.208, .209)."""
     found = float(order(flock(4.0, integrator=ExplicitEuler()), 3000, 8000).mean())
     assert found == pytest.approx(0.282, abs=0.035)
 
