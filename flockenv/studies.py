@@ -209,15 +209,15 @@ def experiment(
     force: Force = False,
 ) -> None:
     """Run an experiment about steering: a table of what was measured, and a picture of where everybody went."""
-    from flockenv.config import load
-    from flockenv.experiments import Plan, experiment_of, run
+    from flockenv.experiments import load_plan, run
     from flockenv.outputs import checked_file
+    from flockenv.render.curves import write_order
     from flockenv.render.trials import write_trials
 
     path = checked_file(out, [".json", ".png"], force) if out is not None else None
     if path is not None and path.suffix.lower() == ".png":
         checked_file(str(path.with_suffix(".json")), [".json"], force)
-    chosen = experiment_of(load(Path(plan), Plan))
+    chosen = load_plan(Path(plan)).experiment()
     with progress_bar(chosen.title, len(chosen.cases) * len(chosen.variants), "trials") as advance:
         results, trials = run(chosen, advance)
     console = new_console()
@@ -225,7 +225,8 @@ def experiment(
     show_table(console, "Cases", results.cases.items())
     show_table(console, "Columns", results.columns.items())
     if path is not None:
-        _write(path, results, lambda picture: write_trials(picture, chosen, trials))
+        draw = write_trials if chosen.curve is None else write_order
+        _write(path, results, lambda picture: draw(picture, chosen, trials))
         console.print(f"{len(results.cells)} trials in {relative(path)}")
 
 

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from flockenv.cli import main
-from flockenv.config import ConfigError, load
-from flockenv.experiments import Plan, Results, arbitration, experiment_of, run
+from flockenv.config import ConfigError
+from flockenv.experiments import Results, SteerPlan, arbitration, load_plan, run
 from tests import catalogue
 
 PLANS = Path(__file__).parent.parent / "configs" / "experiments"
@@ -19,13 +19,20 @@ PLANS = Path(__file__).parent.parent / "configs" / "experiments"
 
 @pytest.mark.parametrize("path", sorted(PLANS.glob("*.yaml")), ids=lambda path: path.stem)
 def test_every_plan_can_be_run_and_is_named_as_what_it_measures(path: Path) -> None:
-    plan = load(path, Plan)
-    experiment = experiment_of(plan)  # builds every scene
-    assert (experiment.name, experiment.variants) == (path.stem, tuple(plan.variants))
+    experiment = load_plan(path).experiment()  # builds every scene
+    assert experiment.name == path.stem
+    assert experiment.cases
+    assert experiment.variants
+
+
+def steer_plan(name: str) -> SteerPlan:
+    plan = load_plan(PLANS / f"{name}.yaml")
+    assert isinstance(plan, SteerPlan)
+    return plan
 
 
 def test_every_arbitration_is_tried_in_every_conflict() -> None:
-    plan = load(PLANS / "arbitration.yaml", Plan)
+    plan = steer_plan("arbitration")
     assert list(plan.variants) == [a.kind for a in catalogue.ARBITRATIONS]
     for case in plan.cases:
         for variant in plan.variants:
@@ -33,7 +40,7 @@ def test_every_arbitration_is_tried_in_every_conflict() -> None:
 
 
 def test_the_global_way_leads_to_what_was_sought() -> None:
-    plan = load(PLANS / "avoidance.yaml", Plan)
+    plan = steer_plan("avoidance")
     avoid, way = plan.scene_of("U trap", "to avoid, global way").effects[0].wishes
     assert (avoid.kind, way.kind, way.target) == ("avoid_obstacles", "follow_way", (12, 0))  # type: ignore[attr-defined]
     assert [wish.kind for wish in plan.scene_of("U trap", "whiskers").effects[0].wishes] == ["whiskers", "seek"]
@@ -48,8 +55,8 @@ def test_numbers_about_contacts_and_grants() -> None:
 @pytest.mark.slow
 def test_what_the_experiment_shows() -> None:
     """A blend runs into what it is warned of, where wishes cancel and in an emergency; an ordered budget does not."""
-    plan = load(PLANS / "arbitration.yaml", Plan)
-    results, trials = run(experiment_of(plan))
+    plan = steer_plan("arbitration")
+    results, trials = run(plan.experiment())
     assert len(trials) == len(plan.cases) * len(plan.variants)
     assert results.at("cancelling", "blend")["collisions"] == 1.0
     emergency = results.at("emergency", "blend")["collisions"]
@@ -111,10 +118,10 @@ def test_the_command_writes_table_numbers_and_picture(tmp_path: Path, capsys: py
 )
 def test_a_plan_that_makes_no_sense_is_refused(old: str, new: str, message: str) -> None:
     with pytest.raises(ConfigError, match=message):
-        load(SMALL.replace(old, new), Plan)
+        load_plan(SMALL.replace(old, new))
 
 
 def test_who_is_fast_without_limit_loses_no_share_of_it() -> None:
     limitless = SMALL.replace("max_speed: 2, ", "").replace("weight: 4,", "weight: 4, speed: 2,")
     with pytest.raises(ValueError, match=r"cases.ahead.scene.groups\[0\].max_speed = None: give m/s"):
-        run(experiment_of(load(limitless, Plan)))
+        run(load_plan(limitless).experiment())

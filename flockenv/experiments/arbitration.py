@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from flockenv.experiments.base import Trial, depth
-from flockenv.experiments.plan import Plan
+from flockenv.experiments.plan import SteerPlan
 from flockenv.grants import Granted, Grants
 from flockenv.state import Floats
 
@@ -24,14 +24,14 @@ COLUMNS = {
 SHOWN = ("collisions", "switches")
 
 
-def more_columns(plan: Plan) -> dict[str, str]:
+def more_columns(plan: SteerPlan) -> dict[str, str]:
     """Return a column for every behaviour that the cases have."""
     scenes = (plan.scene_of(case, variant) for case in plan.cases for variant in plan.variants)
     names = dict.fromkeys(wish.kind for scene in scenes for wish in scene.effects[0].wishes)
     return {f"share {name}": f"of what {name} wishes for, granted on average while it wishes" for name in names}
 
 
-def trial(plan: Plan, case: str, variant: str) -> Trial:
+def trial(plan: SteerPlan, case: str, variant: str) -> Trial:
     """Run one case under one variant, in so many worlds."""
     scene, target = plan.scene_of(case, variant), np.array(plan.cases[case].target)
     grants, steps = Grants(scene), round(plan.cases[case].seconds / scene.dt)

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from flockenv.experiments.base import Trial, depth
-from flockenv.experiments.plan import Plan
+from flockenv.experiments.plan import SteerPlan
 
 __all__ = ["ARRIVED", "COLUMNS", "SHOWN", "trial"]
 
@@ -27,7 +27,7 @@ COLUMNS = {
 SHOWN = ("arrived", "time", "collisions")
 
 
-def trial(plan: Plan, case: str, variant: str) -> Trial:
+def trial(plan: SteerPlan, case: str, variant: str) -> Trial:
     """Run one case under one variant, in so many worlds, until everybody is there or time is over; of the first agent.
 
     ValueError if nothing limits how fast it is.

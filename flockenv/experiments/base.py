@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import functools
 import hashlib
-import importlib
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -13,13 +11,12 @@ from typing import NamedTuple
 import numpy as np
 from pydantic import Field
 
-from flockenv.experiments.plan import Plan
 from flockenv.kernels import laws_digest
 from flockenv.records import Record
 from flockenv.scene import Scene
 from flockenv.state import Floats, State
 
-__all__ = ["Cell", "Experiment", "Results", "Trial", "depth", "experiment_of", "run"]
+__all__ = ["Cell", "Experiment", "Results", "Trial", "depth", "run"]
 
 
 class Trial(NamedTuple):
@@ -41,6 +38,7 @@ class Experiment:
     columns: Mapping[str, str]  # what each number is, with its unit
     shown: tuple[str, ...]  # those of them that stand below a picture
     trial: Callable[[str, str], Trial]  # of a case and a variant
+    curve: tuple[str, str] | None = None  # names of axes: cases are numbers, and the first column is drawn over them
 
 
 class Cell(Record):
@@ -77,23 +75,6 @@ def depth(scene: Scene, state: State) -> Floats:
     """Return how deep everybody is in an obstacle, (B, N) m; negative outside of all."""
     gap = np.min([shape.gap(state.pos) for shape in scene.obstacles], axis=0)
     return np.asarray(scene.body.radius - gap)
-
-
-def experiment_of(plan: Plan) -> Experiment:
-    """Return what a plan is about, ready to be run; ValueError, of one line, if one of its scenes cannot be built."""
-    measure = importlib.import_module(f"flockenv.experiments.{plan.measure}")
-    for case in plan.cases:
-        for variant in plan.variants:
-            try:
-                plan.scene_of(case, variant)
-            except ValueError as error:
-                raise ValueError(f"cases.{case} with variants.{variant}: {error}") from None
-    more = measure.more_columns(plan) if hasattr(measure, "more_columns") else {}
-    return Experiment(
-        name=plan.measure, title=plan.title, cases={name: case.what for name, case in plan.cases.items()},
-        variants=tuple(plan.variants), columns={**measure.COLUMNS, **more}, shown=measure.SHOWN,
-        trial=functools.partial(measure.trial, plan),
-    )  # fmt: skip
 
 
 def run(

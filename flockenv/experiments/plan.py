@@ -1,21 +1,37 @@
-"""A plan: an experiment as data. Some scenes, what is varied in each, and which numbers are measured.
+"""A plan: an experiment as data. Some cases, what is varied in each, and which numbers are measured.
 
-configs/experiments/ holds some; `flockenv experiment FILE.yaml` runs one.
+configs/experiments/ holds some; `flockenv experiment FILE.yaml` runs one. A `SteerPlan` varies what is in a steer.
 """
 
 from __future__ import annotations
 
+import functools
+import importlib
 from typing import Literal
 
 from pydantic import Field, model_validator
 
 from flockenv.behaviours import FollowWay, Seek
 from flockenv.effects import Effect
+from flockenv.experiments.base import Experiment
 from flockenv.records import Record
 from flockenv.scene import Scene
 from flockenv.steer import AnyBehaviour, AnyReconciling, Steer
 
-__all__ = ["Case", "GlobalWay", "Plan", "Variant"]
+__all__ = ["Case", "GlobalWay", "Plan", "SteerPlan", "Variant"]
+
+
+class Plan(Record):
+    """An experiment as data: what all of them say."""
+
+    measure: str = Field(description="which numbers are measured")
+    title: str
+    worlds: int = Field(ge=1, description="how many worlds each case is tried in")
+    seed: int = Field(default=0, ge=0)
+
+    def experiment(self) -> Experiment:
+        """Return what is to be run; ValueError, of one line, if one of its scenes cannot be built."""
+        raise TypeError(f"{type(self).__name__} must say what is run")
 
 
 class Case(Record):
@@ -70,13 +86,10 @@ class Variant(Record):
     way: GlobalWay | None = Field(default=None, description="instead of seeking straight ahead; none = straight ahead")
 
 
-class Plan(Record):
-    """An experiment as data."""
+class SteerPlan(Plan):
+    """Scenes in which somebody steers, each under several ways to do so."""
 
     measure: Literal["avoidance", "arbitration"] = Field(description="which numbers are measured")
-    title: str
-    worlds: int = Field(ge=1, description="how many worlds each case is tried in")
-    seed: int = Field(default=0, ge=0)
     cases: dict[str, Case] = Field(min_length=1)
     variants: dict[str, Variant] = Field(min_length=1)
 
@@ -92,3 +105,19 @@ class Plan(Record):
         )
         fields = {name: getattr(given.scene, name) for name in Scene.model_fields}
         return Scene(**fields | {"effects": (steer, *given.scene.effects[1:])})
+
+    def experiment(self) -> Experiment:
+        """Return what is to be run."""
+        measure = importlib.import_module(f"flockenv.experiments.{self.measure}")
+        for case in self.cases:
+            for variant in self.variants:
+                try:
+                    self.scene_of(case, variant)
+                except ValueError as error:
+                    raise ValueError(f"cases.{case} with variants.{variant}: {error}") from None
+        more = measure.more_columns(self) if hasattr(measure, "more_columns") else {}
+        return Experiment(
+            name=self.measure, title=self.title, cases={name: case.what for name, case in self.cases.items()},
+            variants=tuple(self.variants), columns={**measure.COLUMNS, **more}, shown=measure.SHOWN,
+            trial=functools.partial(measure.trial, self),
+        )  # fmt: skip
