@@ -136,17 +136,15 @@ def social_corridor(agents: int) -> Case:
         count=agents, mass=80.0, radius=0.3, desired_speed=0.8,
         spawn=Spawn(low=(1.0, 1.0), high=(1.0 + agents * wide / 1000, wide - 1.0), spacing=0.95, jitter=0.1),
     )  # fmt: skip
-    effects = tuple(
-        effect.model_copy(update={"radius": 2.5}) if effect.steering and hasattr(effect, "radius") else effect
-        for effect in preset("helbing_farkas_vicsek_2000")
-    )
+    effects = preset("helbing_farkas_vicsek_2000")
     room = Polygon(vertices=((0, 0), (long, 0), (long, wide), (0, wide)), hollow=True)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # contacts last for 6 steps, as on the other side
         scene = Scene(groups=(people,), effects=(Course(direction=(1, 0)), *effects), obstacles=(room,), dt=0.01)
     does = (
         f"social force model, one crowd of {agents} people, 1 per m2 at first, float64, dt 0.01 s, semi-implicit: "
-        "repulsion, body force and friction within 2.5 m, four walls, one way to go; no observations, no rewards"
+        "repulsion within 1.6 m (beyond it is below 4e-4 m/s2), body force and friction, four walls, one way to go; "
+        "no observations, no rewards"
     )
     return _walking(scene, does)
 
