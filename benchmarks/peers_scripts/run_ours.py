@@ -128,7 +128,7 @@ def social_corridor(agents: int) -> Case:
     from flockenv.effects import Course
     from flockenv.presets import preset
     from flockenv.scene import Group, Scene
-    from flockenv.shapes import Polygon
+    from flockenv.shapes import Wall
     from flockenv.spawn import Spawn
 
     wide, long = 32.0, 300.0  # m
@@ -137,10 +137,11 @@ def social_corridor(agents: int) -> Case:
         spawn=Spawn(low=(1.0, 1.0), high=(1.0 + agents * wide / 1000, wide - 1.0), spacing=0.95, jitter=0.1),
     )  # fmt: skip
     effects = preset("helbing_farkas_vicsek_2000")
-    room = Polygon(vertices=((0, 0), (long, 0), (long, wide), (0, wide)), hollow=True)
+    corners = ((0.0, 0.0), (long, 0.0), (long, wide), (0.0, wide))
+    walls = tuple(Wall(vertices=(corners[k - 1], corners[k])) for k in range(4))
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # contacts last for 6 steps, as on the other side
-        scene = Scene(groups=(people,), effects=(Course(direction=(1, 0)), *effects), obstacles=(room,), dt=0.01)
+        scene = Scene(groups=(people,), effects=(Course(direction=(1, 0)), *effects), obstacles=walls, dt=0.01)
     does = (
         f"social force model, one crowd of {agents} people, 1 per m2 at first, float64, dt 0.01 s, semi-implicit: "
         "repulsion within 1.6 m (beyond it is below 4e-4 m/s2), body force and friction, four walls, one way to go; "
@@ -169,16 +170,16 @@ def social_field(agents: int) -> Case:
 
 
 def _walking(scene: Any, does: str) -> Case:
-    """Step a crowd, and begin again after 2,000 steps, before it piles up or is gone (that is timed too)."""
+    """Make ten steps per call, and begin again after 2,000, before it piles up or is gone (that is timed too)."""
     start = scene.start(seed=0)
-    state = scene.step(start)
+    state = scene.step(start, steps=10)
 
     def step() -> None:
-        scene.step(state, out=state)
+        scene.step(state, out=state, steps=10)
         if state.tick[0] % 2000 == 0:
             state.x[...], state.v[...] = start.x, start.v
 
-    return Case(step, scene.agents, does)
+    return Case(step, 10 * scene.agents, does + "; ten steps a call")
 
 
 CASES = {
