@@ -1,6 +1,6 @@
 """The exponential and the angle of a vector as polynomials, for lanes side by side: libm's are calls, one by one.
 
-In float64 `exp` is within 4e-16 of the exact value relative to it and `atan2` within 4e-16 rad; in float32 within
+In float64 `exp` is within 1e-14 of the exact value relative to it and `atan2` within 5e-16 rad; in float32 within
 5e-7 (relative, for |x| < 10; the rounding of x itself counts more beyond) and 3e-7 rad. tests/test_social.py holds
 them to that.
 """
@@ -61,7 +61,7 @@ _limit_of: Any = intrinsic(_largest)
 def exp(x: float) -> float:
     """Return e^x; 0 where it is below the least normal number, and the same largest number for whatever is beyond.
 
-    e^x = 2^k e^r with |r| <= ln 2 / 2, and Taylor's polynomial of degree 13 for e^r.
+    e^x = 2^k e^r with |r| <= ln 2 / 2, and Taylor's polynomial of degree 11 for e^r.
     """
     most = _limit_of(x)
     y = most if x > most else x  # a choice that leaves NaN as it is
@@ -69,20 +69,13 @@ def exp(x: float) -> float:
     k = np.floor(y * like(x, 1.4426950408889634) + like(x, 0.5))
     # ln 2 in two parts, of which the first has so few digits that k times it is exact
     r = (y - k * like(x, 0.693359375)) + k * like(x, 2.12194440054690583e-4)
-    p = like(x, 1 / 6227020800)
-    p = p * r + like(x, 1 / 479001600)
-    p = p * r + like(x, 1 / 39916800)
-    p = p * r + like(x, 1 / 3628800)
-    p = p * r + like(x, 1 / 362880)
-    p = p * r + like(x, 1 / 40320)
-    p = p * r + like(x, 1 / 5040)
-    p = p * r + like(x, 1 / 720)
-    p = p * r + like(x, 1 / 120)
-    p = p * r + like(x, 1 / 24)
-    p = p * r + like(x, 1 / 6)
-    p = p * r + like(x, 1 / 2)
-    p = p * r + like(x, 1.0)
-    p = p * r + like(x, 1.0)
+    # side by side, not one after the other (Estrin): what waits for what is half as long
+    r2 = r * r
+    r4 = r2 * r2
+    low = (like(x, 1.0) + r) + (like(x, 1 / 2) + like(x, 1 / 6) * r) * r2
+    middle = (like(x, 1 / 24) + like(x, 1 / 120) * r) + (like(x, 1 / 720) + like(x, 1 / 5040) * r) * r2
+    high = (like(x, 1 / 40320) + like(x, 1 / 362880) * r) + (like(x, 1 / 3628800) + like(x, 1 / 39916800) * r) * r2
+    p = low + (middle + high * r4) * r4
     return like(x, 0.0) if x < -most else p * _two_to(k)
 
 

@@ -63,8 +63,8 @@ def _helbing_molnar_1995(hidden: bool, group: int | None) -> tuple[Effect, ...]:
 def _helbing_farkas_vicsek_2000(hidden: bool, group: int | None) -> tuple[Effect, ...]:
     return (
         Driving(tau=0.5),
-        CircularRepulsion(strength=2000.0, decay=0.08, radius=2.0, occluded=hidden),
-        ObstacleRepulsion(strength=2000.0, decay=0.08, radius=2.0, occluded=hidden),
+        CircularRepulsion(strength=2000.0, decay=0.08, radius=1.6, occluded=hidden),
+        ObstacleRepulsion(strength=2000.0, decay=0.08, radius=1.6, occluded=hidden),
     )
 
 

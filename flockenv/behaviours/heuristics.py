@@ -159,7 +159,7 @@ def chosen_way(p: Any, me: Me, acc: Vec) -> Vec:
             wall = until_a_wall(p, me, u, p.radius)
             f = min(min(free[k], wall), p.radius)
             d = p.radius * p.radius + f * f - (f + f) * p.radius * dot(aim, u)
-            better = d < best
+            better = d < best - like(d, 1e-6) * p.radius * p.radius  # what rounding tells apart is as good
             best, chosen = d if better else best, select(better, u, chosen)
             ahead = min(free[count + k], wall) if better else ahead
         if j > 0:

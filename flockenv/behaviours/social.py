@@ -15,8 +15,10 @@ from pydantic import Field, model_validator
 
 from flockenv import steering
 from flockenv.effects.base import Effect, Me, Other, Sight, all_masses, demand_group
-from flockenv.kernels import Vec, law
-from flockenv.vec import limit, scale, sub
+from flockenv.elementary import exp
+from flockenv.kernels import Vec, law, like
+from flockenv.steering import social
+from flockenv.vec import dot, limit, scale, select, sub, unit
 
 __all__ = ["CircularRepulsion", "EllipticalRepulsion", "Sidestep", "Social"]
 
@@ -52,7 +54,9 @@ class Social(Effect):
 
     strength: float = Field(default=0.0, ge=0, description="A, N")
     acceleration: float = Field(default=0.0, ge=0, description="A, m/s^2: the force is that times its own mass")
-    most: float | None = Field(default=None, gt=0, description="N, that one of those it is about does at most")
+    most: float | None = Field(
+        default=None, gt=0, description="N, that one of those it is about does at most, before it is weighed"
+    )
     radius: float = Field(gt=0, description="m, who is further away is not looked at")
     group: int | None = Field(default=None, ge=0, description="whom it is about; none = all")
     occluded: bool = Field(default=False, description="whom an obstacle hides does nothing")
@@ -103,11 +107,42 @@ class Social(Effect):
 
 @law
 def pushed_by_distance(p: Any, me: Me, other: Other) -> Vec:
-    """A w(phi) exp((r_ij - d) / B) n."""
-    touching = p.bodies * (me.radius + other.radius)
-    push = steering.repulsion(other.offset, sub(me.tie, other.tie), touching, p.decay)
-    weight = steering.view_weight(steering.looking(me.aim, me.heading), other.offset, p.anisotropy)
-    return limit(scale(push, weight * size_of(p, me)), p.bound)
+    """f n, and f n n^T by its different numbers: f = A exp((r_ij - d) / B), n away from him."""
+    n, distance = social.apart(other.offset, sub(me.tie, other.tie))
+    force = size_of(p, me) * exp((p.bodies * (me.radius + other.radius) - distance) * p.slope)
+    force = force if force < p.bound else p.bound
+    return _products(n, force)
+
+
+@law
+def _products(n: Vec, force: float) -> Vec:
+    f = scale(n, force)
+    if len(n) == 2:
+        return (f[0], f[1], f[0] * n[0], f[0] * n[1], f[1] * n[1])
+    else:
+        return (f[0], f[1], f[2], f[0] * n[0], f[0] * n[1], f[0] * n[2], f[1] * n[1], f[1] * n[2], f[2] * n[2])
+
+
+@law
+def weighed_by_view(p: Any, me: Me, sums: Vec) -> Vec:
+    """Sum of w f n: w = lambda + (1 - lambda)(1 - n . e) / 2 is linear in n, so all are weighed at once."""
+    e, half = like(me.mass, 1.0), like(me.mass, 0.5)
+    way = unit(steering.looking(me.aim, me.heading))
+    push: Vec
+    along: Vec
+    if len(sums) == 5:
+        push = (sums[0], sums[1])
+        along = (sums[2] * way[0] + sums[3] * way[1], sums[3] * way[0] + sums[4] * way[1])
+    else:
+        push = (sums[0], sums[1], sums[2])
+        along = (
+            sums[3] * way[0] + sums[4] * way[1] + sums[5] * way[2],
+            sums[4] * way[0] + sums[6] * way[1] + sums[7] * way[2],
+            sums[5] * way[0] + sums[7] * way[1] + sums[8] * way[2],
+        )
+    rest = half * (e - p.anisotropy)
+    weighed = sub(scale(push, p.anisotropy + rest), scale(along, rest))
+    return select(dot(way, way) > like(me.mass, 0.0), weighed, push)
 
 
 class CircularRepulsion(Social):
@@ -123,14 +158,19 @@ class CircularRepulsion(Social):
     bodies: bool = Field(default=True, description="is the distance that between the surfaces, not the centres?")
     anisotropy: float = Field(default=1.0, ge=0, le=1, description="lambda, how much who is straight behind counts")
     pair_law: ClassVar[str | None] = "pushed_by_distance"
+    finish_law: ClassVar[str | None] = "weighed_by_view"
     demo: ClassVar[str | None] = HEAD_ON.replace(
         "FORCE", "{kind: circular_repulsion, strength: 2000, decay: 0.08, radius: 3}"
     )
 
     def parameters(self) -> dict[str, float | Vec]:
         """A, B, lambda."""
-        shape = {"decay": self.decay, "bodies": float(self.bodies), "anisotropy": self.anisotropy}
+        shape = {"slope": 1 / self.decay, "bodies": float(self.bodies), "anisotropy": self.anisotropy}
         return {**super().parameters(), **shape}
+
+    def sums(self, dimension: int) -> int:
+        """A vector, and a symmetric matrix."""
+        return dimension + dimension * (dimension + 1) // 2
 
     def rates(self, groups: Sequence[Any], dimension: int) -> tuple[Floats, Floats]:
         """A / B over the reduced mass, where two bodies touch (or, of distances alone, are in one place).
@@ -147,10 +187,11 @@ class CircularRepulsion(Social):
 def pushed_by_ellipse(p: Any, me: Me, other: Other) -> Vec:
     """A w (-B grad exp(-b / B))."""
     step = scale(sub(other.vel, scale(me.vel, p.relative)), p.step)
-    push = steering.elliptical_repulsion(other.offset, step, sub(me.tie, other.tie), p.decay)
+    out, size = social.off_ellipse(other.offset, step, sub(me.tie, other.tie), p.decay)
     way = steering.looking(me.aim, me.heading)
-    weight = steering.view_weight(way, other.offset, p.anisotropy) * steering.in_cone(way, push, p.edge, p.outside)
-    return limit(scale(push, weight * size_of(p, me)), p.bound)
+    weight = steering.view_weight(way, other.offset, p.anisotropy) * steering.in_cone(way, out, p.edge, p.outside)
+    force = size * size_of(p, me)
+    return scale(out, weight * (force if force < p.bound else p.bound))
 
 
 class EllipticalRepulsion(Social):

@@ -15,10 +15,10 @@ from typing import Any
 
 import numpy as np
 
-from flockenv.kernels import Vec, law
+from flockenv.kernels import Vec, law, like
 from flockenv.vec import add, scale
 
-__all__ = ["body_of", "bound_of", "box_of", "form_of", "shift_of", "vector_at", "velocity_of"]
+__all__ = ["body_of", "bound_of", "box_of", "form_of", "outside_box", "shift_of", "vector_at", "velocity_of"]
 
 
 @law
@@ -46,6 +46,23 @@ def box_of(table: Any, at: int, x: Vec) -> tuple[Vec, Vec]:
 def bound_of(table: Any, at: int, x: Vec) -> tuple[Vec, float]:
     """Return the circle or sphere that it lies within: the centre, from the anchor, and the radius, m."""
     return vector_at(table, at + 3 + len(x), x), table[at + 3 + 3 * len(x)]
+
+
+@law
+def outside_box(table: Any, at: int, x: Vec) -> Vec:
+    """Return how far x is from the box that it lies within, per axis, m: 0 inside. Of a long wall that is near."""
+    middle, half = box_of(table, at, x)
+    if len(x) == 2:
+        return (_beyond(x[0] - middle[0], half[0]), _beyond(x[1] - middle[1], half[1]))
+    else:
+        out = (_beyond(x[0] - middle[0], half[0]), _beyond(x[1] - middle[1], half[1]))
+        return out + (_beyond(x[2] - middle[2], half[2]),)  # noqa: RUF005  # numba does not unpack tuples
+
+
+@law
+def _beyond(x: float, half: float) -> float:
+    far, o = abs(x) - half, like(x, 0.0)
+    return far if far > o else o
 
 
 @law

@@ -17,12 +17,14 @@ from flockenv.kernels import Vec, law, like
 from flockenv.vec import add, cross, dot, lateral, norm, perpendicular, scale, select, sub, unit
 
 __all__ = [
+    "apart",
     "collision_distance",
     "draw",
     "elliptical_repulsion",
     "gaze_turn",
     "in_cone",
     "looking",
+    "off_ellipse",
     "repulsion",
     "sidestep",
     "view_weight",
@@ -37,8 +39,11 @@ NO_SIDE = 1e-14
 
 @law
 def looking(aim: Vec, heading: Vec) -> Vec:
-    """Return where somebody looks: where he wants to go, or if he says nothing where he goes; 0 if he does neither."""
-    return select(dot(aim, aim) > like(aim[0], 0.0), unit(aim), heading)
+    """Return where somebody looks: where he wants to go, or if he says nothing where he goes; 0 if he does neither.
+
+    A way, of any length: laws that take one look at its direction alone.
+    """
+    return select(dot(aim, aim) > like(aim[0], 0.0), aim, heading)
 
 
 @law
@@ -61,9 +66,21 @@ def in_cone(way: Vec, force: Vec, cosine: float, outside: float) -> float:
 
     w = 1 if e . (-f) >= |f| cos phi, else c; 2 phi is the full angle (Helbing and Molnar 1995, equation 8).
     """
-    ahead = -dot(way, force)
-    seen = (ahead >= norm(force) * cosine) | (dot(way, way) <= like(cosine, 0.0))
+    ahead, square = -dot(way, force), dot(way, way)
+    seen = (ahead >= np.sqrt(dot(force, force) * square) * cosine) | (square <= like(cosine, 0.0))
     return like(cosine, 1.0) if seen else outside
+
+
+@law
+def apart(offset: Vec, tie: Vec) -> tuple[Vec, float]:
+    """Return the unit vector away from the other, along the tie where both are in one place, and the distance, m."""
+    square = dot(offset, offset)
+    some = square > like(square, ONE_PLACE)
+    away = select(some, scale(offset, like(square, -1.0)), tie)
+    long = dot(away, away)
+    length = np.sqrt(long)
+    o, e = like(square, 0.0), like(square, 1.0)
+    return scale(away, e / length if long > o else o), length if some else o
 
 
 @law
@@ -72,10 +89,8 @@ def repulsion(offset: Vec, tie: Vec, size: float, decay: float) -> Vec:
 
     Helbing, Farkas and Vicsek 2000; the circular specification of Johansson, Helbing and Shukla 2007.
     """
-    square = dot(offset, offset)
-    apart = square > like(square, ONE_PLACE)
-    away = select(apart, scale(offset, like(square, -1.0)), tie)
-    return scale(unit(away), exp((size - np.sqrt(square)) / decay))
+    away, distance = apart(offset, tie)
+    return scale(away, exp((size - distance) / decay))
 
 
 @law
@@ -90,6 +105,13 @@ def elliptical_repulsion(offset: Vec, step: Vec, tie: Vec, decay: float) -> Vec:
     It has no side where I stand in the way of his step, and grows as 1 / sqrt(q) at its end: there a tie says where to,
     and (p + q) / (2 sqrt(p q)) is at most 500.
     """
+    out, size = off_ellipse(offset, step, tie, decay)
+    return scale(out, size)
+
+
+@law
+def off_ellipse(offset: Vec, step: Vec, tie: Vec, decay: float) -> tuple[Vec, float]:
+    """Return direction and size of `elliptical_repulsion`."""
     o, e, half = like(decay, 0.0), like(decay, 1.0), like(decay, 0.5)
     d = scale(offset, -e)
     ahead = sub(d, step)
@@ -104,8 +126,7 @@ def elliptical_repulsion(offset: Vec, step: Vec, tie: Vec, decay: float) -> Vec:
     there = p * p > like(decay, ONE_PLACE)
     out = select(square > like(decay, NO_SIDE), unit(sides), unit(across))
     # in one place he is all around: as strong as with no step at all
-    away = select(there, scale(out, ratio), unit(tie))
-    return scale(away, exp(-(b if there else o) / decay))
+    return select(there, out, unit(tie)), (ratio if there else e) * exp(-(b if there else o) / decay)
 
 
 @law

@@ -28,7 +28,7 @@ def obstacle_imports(parts: Parts) -> list[str]:
     """Write what folds over obstacles, and who is hidden by them, are made of."""
     if not parts.meets_obstacles:
         return []
-    asked = ["bound_of"] * bool(parts.bounded) + ["shift_of", "velocity_of"] * parts.moving
+    asked = ["outside_box"] * bool(parts.bounded) + ["shift_of", "velocity_of"] * parts.moving
     lines = [
         "from flockenv.effects.base import Obstacle",
         "from flockenv.shapes.round import blocks as stands_between, normal as outward, touched_normal",
@@ -77,8 +77,8 @@ def obstacles(parts: Parts, me: list[str], found_out: Callable[[int], str]) -> l
     for form in parts.shaped[1]:
         met = [f"gap, out = nearest_{form}(params, at_, y)", *_meet(parts, asking, form)]
         if form in parts.bounded:
-            within = "if dot(beside, beside) < (wide + seen) * (wide + seen):"
-            bound = ["middle, wide = bound_of(params, at_, y)", f"beside, seen = sub(y, middle), {slot('reach0')}"]
+            within = "if dot(beside, beside) < seen * seen:"
+            bound = [f"beside, seen = outside_box(params, at_, y), {slot('reach0')}"]
             met = [*bound, within, *indented_lines(met, 4)]
         met = [*me, "y = offset_to(size, place, x)", *met]
         lines += [
@@ -142,6 +142,14 @@ def _by_pieces(parts: Parts, k: int, slots: list[str], form: str, vel: str) -> l
         f"found = obstacle_law_{k}(p{k}, me, it, ({', '.join(slots)},))",
         *_kept(slots, ""),
     ]
+    reach = parts.effects[k].obstacle_reach
+    if reach:  # where nothing is near enough its sides are not either
+        return [f"if gap < obstacle_reach_{k}(p{k}, me):", *indented_lines(_each_piece(form, seen, met), 4)]
+    return _each_piece(form, seen, met)
+
+
+def _each_piece(form: str, seen: str, met: list[str]) -> list[str]:
+    """Write the loop over the sides of a shape."""
     return [
         f"for piece in range(pieces_{form}(params, at_, y, gap)):",
         f"    far, side, acts = piece_{form}(params, at_, piece, y, gap, out)",
