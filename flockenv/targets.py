@@ -146,7 +146,7 @@ def _share(to_along: float, square: float) -> float:
 
 
 @law
-def to_target(table: Any, at: int, x: Vec) -> Vec:
+def to_target(table: Any, at: Any, x: Vec) -> Vec:
     """Return the straight way from x to the nearest point of the target whose row begins at `at`; 0 within it."""
     if len(x) == 2:
         a, b, u, v = table[at] - x[0], table[at + 1] - x[1], table[at + 2], table[at + 3]
@@ -163,7 +163,7 @@ def to_target(table: Any, at: int, x: Vec) -> Vec:
 
 
 @law
-def to_any(table: Any, at: int, count: Any, x: Vec) -> Vec:
+def to_any(table: Any, at: Any, count: Any, x: Vec) -> Vec:
     """Return the straight way from x to the nearest of `count` targets whose rows begin at `at`."""
     best = to_target(table, at, x)
     size = 3 * len(x) + 1
@@ -174,7 +174,7 @@ def to_any(table: Any, at: int, count: Any, x: Vec) -> Vec:
 
 
 @law
-def passed(table: Any, at: int, was: Vec, now: Vec) -> bool:
+def passed(table: Any, at: Any, was: Vec, now: Vec) -> bool:
     """Has who was here come into the target whose row begins at `at`, or across it if it is a door? In the plane."""
     to = to_target(table, at, now)
     a, b, u, v = table[at], table[at + 1], table[at + 2], table[at + 3]
@@ -185,4 +185,5 @@ def passed(table: Any, at: int, was: Vec, now: Vec) -> bool:
     x, y = was[0] + part * (now[0] - was[0]) - a, was[1] + part * (now[1] - was[1]) - b
     along, square = x * u + y * v, u * u + v * v
     across = (before * after <= o) & (before != after) & (along >= o) & (along <= square) & (square > o)
-    return (dot(to, to) <= o) | across
+    there: bool = (dot(to, to) <= o) | across
+    return there

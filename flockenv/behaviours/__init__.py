@@ -21,7 +21,7 @@ from flockenv.behaviours.avoid import AvoidObstacles, ForceField, Whiskers  # no
 from flockenv.behaviours.chase import Evade, MatchVelocity, OffsetPursue, Pursue, Shadow  # noqa: E402
 from flockenv.behaviours.company import FollowLeader, Formation, Interpose  # noqa: E402
 from flockenv.behaviours.crowd import Explore, Forage, Queue, UnalignedAvoidance  # noqa: E402
-from flockenv.behaviours.driving import Driving  # noqa: E402
+from flockenv.behaviours.driving import Driving, LineUp  # noqa: E402
 from flockenv.behaviours.flock import Alignment, Cohesion, Separation  # noqa: E402
 from flockenv.behaviours.goals import Arrive, Dock, Face, Flee, Seek, TargetSpeed  # noqa: E402
 from flockenv.behaviours.hide import Hide  # noqa: E402
@@ -34,7 +34,7 @@ from flockenv.behaviours.way import FollowWay  # noqa: E402
 __all__ = [
     "BEHAVIOURS", "Alignment", "Arrive", "AvoidObstacles", "Cohesion", "Contain", "Dock", "Driving", "Evade", "Explore",
     "Face", "Flee", "FollowFlow", "FollowLeader", "FollowPath", "FollowWall", "FollowWay", "Forage", "ForceField",
-    "Formation", "Hide", "Interpose", "MatchVelocity", "OffsetPursue", "Orca", "Pursue",
+    "Formation", "Hide", "Interpose", "LineUp", "MatchVelocity", "OffsetPursue", "Orca", "Pursue",
     "Queue", "Seek", "Separation", "Shadow", "StayOnPath", "TargetSpeed", "UnalignedAvoidance", "Wander",
     "Whiskers",
 ]  # fmt: skip

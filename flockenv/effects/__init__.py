@@ -21,6 +21,7 @@ from flockenv.effects.gravitation import Gravitation, InverseSquare  # noqa: E40
 from flockenv.effects.gravity import Gravity  # noqa: E402
 from flockenv.effects.journey import Journey, Stage  # noqa: E402
 from flockenv.effects.pressure import Pressure  # noqa: E402
+from flockenv.effects.routes import Door, Routes  # noqa: E402
 from flockenv.effects.speed_limit import SpeedLimit  # noqa: E402
 from flockenv.effects.springs import AngularSprings, Springs  # noqa: E402
 from flockenv.effects.tether import Swing, Tether  # noqa: E402
@@ -28,8 +29,42 @@ from flockenv.effects.wall import WallRepulsion  # noqa: E402
 from flockenv.effects.way import Way  # noqa: E402
 
 __all__ = [
-    "EFFECTS", "Aim", "AngularSprings", "Antipode", "Attraction", "Carried", "Contact", "Course", "Drag", "Effect",
-    "Elastic", "Far", "Fluctuation", "Goal", "Gravitation", "Gravity", "InverseSquare", "Journey", "Me", "ObstacleContact",
-    "Other", "Pressure", "QuadraticDrag", "Sight", "Sink", "Source", "SpeedLimit", "Springs", "Stage", "Swing", "Tether",
-    "Uniform", "Vortex", "WallRepulsion", "Way", "Wind",
+    "EFFECTS",
+    "Aim",
+    "AngularSprings",
+    "Antipode",
+    "Attraction",
+    "Carried",
+    "Contact",
+    "Course",
+    "Door",
+    "Drag",
+    "Effect",
+    "Elastic",
+    "Far",
+    "Fluctuation",
+    "Goal",
+    "Gravitation",
+    "Gravity",
+    "InverseSquare",
+    "Journey",
+    "Me",
+    "ObstacleContact",
+    "Other",
+    "Pressure",
+    "QuadraticDrag",
+    "Routes",
+    "Sight",
+    "Sink",
+    "Source",
+    "SpeedLimit",
+    "Springs",
+    "Stage",
+    "Swing",
+    "Tether",
+    "Uniform",
+    "Vortex",
+    "WallRepulsion",
+    "Way",
+    "Wind",
 ]  # fmt: skip

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +18,8 @@ from flockenv.vec import norm, scale, select, sub, unit, zero
 from flockenv.ways import towards
 
 __all__ = ["Journey", "Stage", "onwards", "place_kept"]
+
+Seconds = Annotated[float, Field(ge=0)] | Spread
 
 PREMOVEMENT = 2
 """Channel of what is drawn for everybody: Group has 0 and 1; stage k has this one, and k more, and one more."""
@@ -102,9 +104,7 @@ def journey_kept(p: Any, me: Me, told: Vec, seconds: float) -> Vec:
 class Stage(Target):
     """A place on a journey: reached when one is in it (a point: within its radius), or has crossed it (a door)."""
 
-    wait: float | Spread = Field(
-        default=0.0, ge=0, description="s, for how long one stays there; or how that is spread"
-    )
+    wait: Seconds = Field(default=0.0, description="s, for how long one stays; or how that is spread")
     around: bool = Field(default=True, description="by the way around obstacles; else straight")
 
     @model_validator(mode="after")
@@ -126,15 +126,11 @@ class Journey(Around):
 
     kind: Literal["journey"] = "journey"
     stages: tuple[Stage, ...] = Field(min_length=1, description="where to, one after another")
-    premovement: float | Spread = Field(
-        default=0.0, ge=0, description="s, after which one sets out; or how that is spread"
-    )
+    premovement: Seconds = Field(default=0.0, description="s, after which one sets out; or how that is spread")
     then: Literal["stay", "leave", "loop"] = Field(
         default="stay", description="after the last: stay there, go straight on, or begin again"
     )
-    slow_radius: float = Field(
-        default=0.5, gt=0, description="m, over which one slows down where one will stay or wait"
-    )
+    slow_radius: float = Field(default=0.5, gt=0, description="m, over which one slows down before one stays or waits")
     aim_law: ClassVar[str | None] = "journey_aim"
     begin_law: ClassVar[str | None] = "journey_begun"
     keep_law: ClassVar[str | None] = "journey_kept"
@@ -173,7 +169,7 @@ class Journey(Around):
         return self.slow_radius if stays or self.stages[k].wait != 0 else 0.0
 
     def check(self, scene: Any) -> None:
-        """Refuse space, a torus, and whom two effects tell where to go."""
+        """Refuse space, and a torus."""
         if scene.dimension != 2 or scene.space.periodic:
             raise ValueError(f"kind = {self.kind}: only a plane or a box of dimension 2 is allowed")
         super().check(scene)
