@@ -276,18 +276,18 @@ def test_routes_of_a_large_crowd_do_not_depend_on_threads_or_calls() -> None:
 
 def test_who_lines_up_stops_behind_whoever_is_ahead() -> None:
     """The first does not walk, and the others come to rest a margin behind each other."""
-    groups = (walkers(2, (4, 3), (6, 3)), walkers(1, (1, 3), (1, 3)))
+    groups = (walkers(1, (1, 3), (1, 3)), walkers(2, (4, 3), (6, 3)))
     routes = tuple(Routes(group=k, doors=(Door(ends=RIGHT),), spacing=0.1) for k in range(2))
-    routes = (routes[0].model_copy(update={"share": 0.0}), routes[1])
-    lines = tuple(Steer(group=k, behaviours=(LineUp(margin=0.1, group=0),)) for k in range(2))
+    routes = (routes[0], routes[1].model_copy(update={"share": 0.0}))
+    lines = tuple(Steer(group=k, behaviours=(LineUp(margin=0.1, group=1 - k),)) for k in range(2))
     scene = Scene(groups=groups, obstacles=ROOM, effects=(*routes, *lines), dt=0.02)
     state, least = scene.start(0), np.inf
-    state.pos[0] = ((6, 3), (4.5, 4.5), (1, 3))
+    state.pos[0] = ((1, 3), (6, 3), (4.5, 4.5))
     for _ in range(80):
         scene.step(state, out=state, steps=10)
-        least = min(least, float(state.pos[0, 0, 0] - state.pos[0, 2, 0]))
-    np.testing.assert_allclose(state.pos[0, 2], (5.5, 3), atol=0.01)
-    np.testing.assert_array_equal(state.pos[0, :2], ((6, 3), (4.5, 4.5)))
+        least = min(least, float(state.pos[0, 1, 0] - state.pos[0, 0, 0]))
+    np.testing.assert_allclose(state.pos[0, 0], (5.5, 3), atol=0.01)
+    np.testing.assert_array_equal(state.pos[0, 1:], ((6, 3), (4.5, 4.5)))
     assert least > 0.5 - 1e-6
 
 

@@ -12,7 +12,7 @@ from flockenv import steering
 from flockenv.behaviours.base import Behaviour, steered_groups
 from flockenv.effects.base import Me, Other, Sight, all_masses
 from flockenv.kernels import Vec, law, like
-from flockenv.vec import norm, scale, sub, unit
+from flockenv.vec import dot, norm, scale, sub, unit
 
 __all__ = ["Driving", "LineUp"]
 
@@ -78,11 +78,17 @@ def nobody_ahead(p: Any, me: Me) -> Vec:
 
 @law
 def next_ahead(p: Any, me: Me, other: Other, acc: Vec) -> Vec:
-    """Keep the shortest gap to who is ahead where one wants to go, and slower."""
+    """Keep the shortest gap to who is ahead where one wants to go, and slower.
+
+    Ahead is within 45 degrees: two whose ways meet at less than a right angle never wait for each other.
+    """
+    way, o = unit(me.aim), like(me.radius, 0.0)
+    along = dot(other.offset, way)
+    ahead = (along > o) & (like(o, 2.0) * along * along > other.square)
     clearance = me.radius + other.radius + p.margin
     top = me.desired_speed * norm(me.aim)
-    gap = steering.queue_gap(unit(me.aim), other.offset, other.vel, clearance, top)
-    return (gap if gap < acc[0] else acc[0],)
+    gap = steering.queue_gap(way, other.offset, other.vel, clearance, top)
+    return (gap if ahead & (gap < acc[0]) else acc[0],)
 
 
 @law
@@ -96,7 +102,8 @@ class LineUp(Behaviour):
     """Driving without pushing: walk where one wants to go, no faster than the gap to who is ahead there allows.
 
     F = m (e min(v0, gap / T) - v) / tau: instead of `driving`, with the same aims. With T of 4 tau or more a gap closes
-    as exp(-t / T) and nobody overshoots (see `queue`).
+    as exp(-t / T) and nobody overshoots (see `queue`). Ahead is within 45 degrees of one's way; who is beside is kept
+    apart by separation or contact, if at all. Who comes the other way holds up too: bodies that meet need to give way.
     """
 
     kind: Literal["line_up"] = "line_up"
