@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import distance_transform_edt
 from scipy.spatial import cKDTree
 
 from flockenv.grid import packed, points_of
@@ -118,7 +119,8 @@ def way_table(
     """Return the ways to the nearest of some targets as a grid (see grid.py): the length, m, and the first direction.
 
     The way of a body's centre that keeps `clearance` from all shapes. Where no way leads, in an obstacle too, the
-    direction is away from the nearest surface, and the way as long as the longest. ValueError, in one line, if a target
+    direction is away from the nearest surface; beside an obstacle the way is as long as from the nearest point that is
+    clear of it, and from there; farther from those as long as the longest. ValueError, in one line, if a target
     is not free or outside the grid, which its name begins with, or if from one of `starts` no way leads to any.
     """
     found = ground(tuple(shapes), tuple(map(float, low)), tuple(map(float, high)), spacing)
@@ -139,8 +141,14 @@ def way_table(
     way = np.where(near[..., None], towards, -_slopes(u, spacing))
     size = np.linalg.norm(way, axis=-1, keepdims=True)
     way = np.where(reached[..., None], way / np.where(size > 0, size, 1), found.out)
-    length = np.where(reached, u, u[reached].max())
+    length = _lengths_beside(u, reached, spacing, clearance)
     return packed(np.concatenate([length[..., None], way], axis=-1), found.low, spacing)
+
+
+def _lengths_beside(u: Floats, reached: NDArray[np.bool_], spacing: float, clearance: float) -> Floats:
+    """Return lengths everywhere: whoever is pushed against a wall is still as near to his target as he is."""
+    far, place = distance_transform_edt(~reached, sampling=spacing, return_indices=True)
+    return np.where(far <= clearance + 2 * spacing, u[tuple(place)] + far, u[reached].max())
 
 
 def free_part(

@@ -74,6 +74,14 @@ def test_the_nearest_door_is_nearest_by_way_and_not_by_air() -> None:
     assert one.lengths(scene.with_effects(one), [0.0, 0.0]) == pytest.approx(around, rel=0.04)
 
 
+def test_who_is_pushed_against_a_wall_is_as_near_as_he_is() -> None:
+    """Nearer to a jamb than the clearance no way is searched; lengths go on there, or people would turn away."""
+    way = Way(targets=(Target(ends=LEFT),), spacing=0.1)
+    scene = Scene(groups=(walkers(1, (5, 3), (5, 3)),), obstacles=ROOM, effects=(way,))
+    assert way.lengths(scene, [0.2, 3.2]) == pytest.approx(0.25, abs=0.15)
+    assert way.lengths(scene, [5.0, 0.3]) == pytest.approx(math.hypot(5, 2.6), abs=0.5)
+
+
 def test_a_thousand_places_of_a_plan_are_asked_for_once() -> None:
     """What is near obstacles does not depend on targets: several share it."""
     ground.cache_clear()

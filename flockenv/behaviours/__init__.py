@@ -40,7 +40,8 @@ __all__ = [
     "Driving", "EllipticalRepulsion", "Evade", "Explore", "Face", "Flee", "FollowFlow", "FollowLeader", "FollowPath",
     "FollowWall", "FollowWay", "Forage", "ForceField", "Formation", "Friends", "Heuristics", "Hide", "Interest",
     "Interpose", "LineUp", "MatchVelocity", "ObstacleRepulsion", "OffsetPursue", "Orca", "Pursue", "Queue", "Seek",
-    "Separation", "Shadow", "Sidestep", "StayOnPath", "TargetSpeed", "UnalignedAvoidance", "WalkingGroup", "Wander", "Whiskers",
+    "Separation", "Shadow", "Sidestep", "StayOnPath", "TargetSpeed", "UnalignedAvoidance", "WalkingGroup", "Wander",
+    "Whiskers",
 ]  # fmt: skip
 
 BEHAVIOURS: dict[str, type[Effect]] = {kind: effect for kind, effect in EFFECTS.items() if effect.steering}

@@ -42,7 +42,7 @@ def onwards(me: Me) -> Vec:
 @law
 def stage_row(p: Any, stage: float) -> Any:
     """Return where in the table the numbers of a stage begin; of those beyond the last, the last."""
-    last = p.stages - like(stage, 1.0)
+    last = p.many - like(stage, 1.0)
     k = np.floor(stage)
     k = k if k < last else last
     o = like(stage, 0.0)
@@ -60,7 +60,7 @@ def journey_aim(p: Any, me: Me) -> Vec:
     if block >= 0:
         length, direction = towards(p.table[block:], me.pos)
     e = slowed(direction, length, p.table[row + 1])
-    e = select((stage >= p.stages) & (p.leaves > o), unit(sub(me.pos, place_kept(me))), e)
+    e = select((stage >= p.many) & (p.leaves > o), unit(sub(me.pos, place_kept(me))), e)
     return select(about(p, me) & (stage >= o), scale(e, p.share), zero(me.pos))
 
 
@@ -68,8 +68,8 @@ def journey_aim(p: Any, me: Me) -> Vec:
 def journey_begun(p: Any, me: Me) -> Vec:
     """Before the first stage until it sets out."""
     o = like(p.share, 0.0)
-    begin = np.int64(p.stages) * np.int64(p.size)
-    each = np.int64(p.stages) + 1
+    begin = np.int64(p.many) * np.int64(p.size)
+    each = np.int64(p.many) + 1
     mine = about(p, me)
     wait = p.table[begin + np.int64(me.who - p.first) * each] if mine else o
     stage = like(o, -0.5) if wait > o else o
@@ -81,7 +81,7 @@ def journey_kept(p: Any, me: Me, told: Vec, seconds: float) -> Vec:
     """Stage k, k + 1/2 while it waits there, and so on; the time until which it waits; where it is."""
     stage, ready, was = me.inner.stage, me.inner.ready, place_kept(me)
     before = (stage, ready, was[0], was[1])
-    if not about(p, me) or (stage >= p.stages and p.leaves > like(stage, 0.0)):
+    if not about(p, me) or (stage >= p.many and p.leaves > like(stage, 0.0)):
         return before
     half, now = like(stage, 0.5), me.time + seconds
     on = np.floor(stage) + like(stage, 1.0)
@@ -89,13 +89,13 @@ def journey_kept(p: Any, me: Me, told: Vec, seconds: float) -> Vec:
     if waits:
         over = now >= ready - like(seconds, 0.01) * seconds
         stage = on if over else stage
-    elif stage < p.stages and passed(p.table, stage_row(p, stage) + 2, was, me.pos):
-        each = np.int64(p.stages) + 1
-        begin = np.int64(p.stages) * np.int64(p.size) + np.int64(me.who - p.first) * each
+    elif stage < p.many and passed(p.table, stage_row(p, stage) + 2, was, me.pos):
+        each = np.int64(p.many) + 1
+        begin = np.int64(p.many) * np.int64(p.size) + np.int64(me.who - p.first) * each
         wait = p.table[begin + 1 + np.int64(stage)]
         ready = now + wait
         stage = stage + half if wait > like(wait, 0.0) else on
-    ended = stage >= p.stages
+    ended = stage >= p.many
     stage = like(stage, 0.0) if ended and p.loops > like(stage, 0.0) else stage
     place = select(ended & (p.leaves > like(stage, 0.0)), onwards(me), me.pos)
     return (stage, ready, place[0], place[1])
@@ -145,7 +145,7 @@ class Journey(Around):
     def parameters(self) -> dict[str, float | Vec]:
         """How many stages, what comes then."""
         ends = {"leaves": float(self.then == "leave"), "loops": float(self.then == "loop")}
-        return {"share": self.share, "stages": float(len(self.stages)), "size": float(HEAD + row_size(2)), **ends}
+        return {"share": self.share, "many": float(len(self.stages)), "size": float(HEAD + row_size(2)), **ends}
 
     def table(self, scene: Any) -> NDArray[np.float64]:
         """A row for each stage, what is drawn for everybody, and the ways to each place, once."""

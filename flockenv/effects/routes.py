@@ -43,7 +43,7 @@ def bin_of(p: Any, length: float) -> float:
 def at_door(p: Any, me: Me) -> float:
     """Count who heads for a door, in the piece of the way in which he is; nobody who has passed his."""
     door = me.inner.door
-    heading = about(p, me) & (door < p.doors)
+    heading = about(p, me) & (door < p.many)
     return door * p.bins + bin_of(p, me.inner.left) if heading else like(door, -1.0)
 
 
@@ -76,7 +76,7 @@ def expected(p: Any, me: Me, k: Any, waits: bool) -> float:
 def quickest(p: Any, me: Me, waits: bool) -> tuple[Any, float]:
     """Return the door that is expected to take the least time, and that time, s; of equals, the first."""
     best, time = 0, expected(p, me, 0, waits)
-    for k in range(1, np.int64(p.doors)):
+    for k in range(1, np.int64(p.many)):
         other = expected(p, me, k, waits)
         if other < time:
             best, time = k, other
@@ -99,12 +99,12 @@ def routes_begun(p: Any, me: Me) -> Vec:
 def routes_kept(p: Any, me: Me, told: Vec, seconds: float) -> Vec:
     """Its door, anew once per period; how far that is; when it decides again; where it is."""
     door, left, ready, was = me.inner.door, me.inner.left, me.inner.ready, place_kept(me)
-    if not about(p, me) or door >= p.doors:
+    if not about(p, me) or door >= p.many:
         return (door, left, ready, was[0], was[1])
     e, now, mine = like(door, 1.0), me.time + seconds, np.int64(door)
     if passed(p.table, 1 + mine * np.int64(p.size) + 2, was, me.pos):
         place = onwards(me)
-        return (p.doors, like(door, 0.0), ready, place[0], place[1])
+        return (p.many, like(door, 0.0), ready, place[0], place[1])
     if now >= ready - like(seconds, 0.01) * seconds:
         found, time = quickest(p, me, True)
         if time < (e - p.hysteresis) * expected(p, me, mine, True):
@@ -119,7 +119,7 @@ def routes_aim(p: Any, me: Me) -> Vec:
     """Along the way to its door; straight on when it is through."""
     if not about(p, me):
         return zero(me.pos)
-    if me.inner.door >= p.doors:
+    if me.inner.door >= p.many:
         return scale(unit(sub(me.pos, place_kept(me))), p.share)
     _, direction = way_to_door(p, me, np.int64(me.inner.door))
     return scale(direction, p.share)
@@ -177,7 +177,7 @@ class Routes(Around):
     def parameters(self) -> dict[str, float | Vec]:
         """What the laws read beside the table."""
         numbers = {name: float(getattr(self, name)) for name in ("share", "period", "hysteresis")}
-        return {**numbers, "doors": float(len(self.doors)), "bins": float(BINS), "size": float(HEAD + row_size(2))}
+        return {**numbers, "many": float(len(self.doors)), "bins": float(BINS), "size": float(HEAD + row_size(2))}
 
     def table(self, scene: Any) -> NDArray[np.float64]:
         """How long a piece of a way is, a row for each door, and the ways to each."""
