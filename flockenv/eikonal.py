@@ -148,7 +148,7 @@ def way_table(
 def _lengths_beside(u: Floats, reached: NDArray[np.bool_], spacing: float, clearance: float) -> Floats:
     """Return lengths everywhere: whoever is pushed against a wall is still as near to his target as he is."""
     far, place = distance_transform_edt(~reached, sampling=spacing, return_indices=True)
-    return np.where(far <= clearance + 2 * spacing, u[tuple(place)] + far, u[reached].max())
+    return np.asarray(np.where(far <= clearance + 2 * spacing, u[tuple(place)] + far, u[reached].max()))
 
 
 def free_part(
