@@ -239,7 +239,7 @@ def explain(scene: SceneFile) -> None:
     console = new_console()
     rows = [(str(row.effect), ", ".join(row.calls_for) or "nothing", f"{row.cost:.3g}") for row in found.rows]
     rows.append(("what several of them share", "", f"{found.shared:.3g}"))
-    rows.append((f"{loaded.integrator.kind}, limits, {loaded.space.kind}", "", f"{found.rest:.3g}"))
+    rows.append((found.remains, "", f"{found.rest:.3g}"))
     title = f"One step of {loaded.agents:,} agents: {found.step:.3g} us"
     show_table(console, title, rows, ("effect", "calls for", "costs us/step"))
     counted = (f"{number:g} {name.replace('_', ' ')}" for name, number in found.work.items())

@@ -50,6 +50,13 @@ class Explanation:
         return max(0.0, self.step - self.rest - sum(row.cost for row in self.rows))
 
     @property
+    def remains(self) -> str:
+        """What is left of a step without any effect, in words."""
+        scene = self.scene
+        parts = [scene.integrator.kind, "limits", scene.space.kind, *(each.kind for each in scene.constraints)]
+        return ", ".join(parts + ["births and deaths"] * bool(scene.population))
+
+    @property
     def largest_step(self) -> str:
         """The largest stable step in words, beside the step that is made."""
         found, made = self.stable, f"dt = {self.scene.dt:g} s"
@@ -141,6 +148,7 @@ def _shares(scene: Scene, state: State) -> tuple[tuple[str, str, float], ...]:
 
 def _left_out(scene: Scene) -> tuple[str, ...]:
     asked = {what for effect in scene.effects for what in effect.calls_for()}
+    asked |= {what for constraint in scene.constraints for what in constraint.calls_for()}
     others = sorted(EFFECTS.keys() - {effect.kind for effect in scene.parts.effects})
     lines = []
     if "neighbour query" not in asked:

@@ -188,13 +188,17 @@ def stress(
 
 
 def _known(numbers: Path) -> Results | None:
-    """Return what a file says already, none if it is not there; ValueError if it says something else."""
-    from flockenv.stress import Results
+    """Return what a file says already, none if it is not there; ValueError if it says something else, or once did."""
+    from flockenv.stress import Results, fingerprint
 
     try:
-        return Results.model_validate_json(numbers.read_text(encoding="utf-8")) if numbers.exists() else None
+        found = Results.model_validate_json(numbers.read_text(encoding="utf-8")) if numbers.exists() else None
     except ValueError:
         raise ValueError(f"--out: {numbers.name} holds no findings of hard cases; --force overwrites it") from None
+    if found is not None and found.sources != fingerprint():
+        count = len(found.findings)
+        raise ValueError(f"--out: {numbers.name} holds {count} findings of other sources; --force begins anew")
+    return found
 
 
 def experiment(

@@ -20,7 +20,14 @@ hypothesis.settings.register_profile("flockenv", derandomize=True, deadline=None
 hypothesis.settings.load_profile("flockenv")
 
 
-RARE = {"torus_single_rk4", "plane_single", "plane_3_single", "nearest_plane_3", "nearest_torus_single"}
+RARE = {
+    "torus_single_rk4",
+    "plane_single",
+    "plane_3_single",
+    "nearest_plane_3",
+    "nearest_torus_single",
+    "nearest_torus_3",
+}
 """Kernels of catalogue.Variant that only slow tests compile."""
 
 IN_SPACE_SLOW = {

@@ -88,6 +88,7 @@ def test_orders_are_the_declared_ones_on_every_smooth_problem(name: str) -> None
 METHODS = methods_named(["semi_implicit_euler", "velocity_verlet", "rk4"])
 
 
+@pytest.mark.slow
 def test_a_speed_limit_makes_every_method_one_of_order_1() -> None:
     """numerics.md, P09: what a scene does after each step, no method knows of.
 

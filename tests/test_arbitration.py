@@ -230,6 +230,7 @@ def crowd(*effects: Effect, **more: Any) -> Scene:
     return Scene(**given | more)
 
 
+@pytest.mark.slow
 def test_steer_of_one_behaviour_under_blend_is_the_behaviour() -> None:
     """Bit for bit: neither the sum nor its bound is taken twice."""
     alone, steered = crowd(SEPARATION), crowd(Steer(behaviours=(SEPARATION,), arbitration=Blend()))

@@ -310,7 +310,7 @@ def test_stress_shows_values_and_what_is_wrong(tried: list[str], capsys: pytest.
     assert not list(Path().glob("*.json"))
 
 
-def test_stress_goes_on_where_it_was_and_loses_nothing(tried: list[str]) -> None:
+def test_stress_goes_on_where_it_was_and_loses_nothing(tried: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["stress", "--methods", "rk4", "--out", "hard.png"]) == 0
     with Image.open("hard.png") as picture:
         assert picture.width > 100
@@ -321,9 +321,14 @@ def test_stress_goes_on_where_it_was_and_loses_nothing(tried: list[str]) -> None
     kept["sources"] = "those of yesterday"
     Path("hard.json").write_text(json.dumps(kept))
     tried.clear()
-    assert main(["stress", "--methods", "rk4", "--out", "hard.json"]) == 0
+    capsys.readouterr()
+    assert main(["stress", "--methods", "rk4", "--out", "hard.json"]) == 2
+    assert capsys.readouterr().err == (
+        "flockenv: --out: hard.json holds 3 findings of other sources; --force begins anew\n"
+    )
+    assert not tried and json.loads(Path("hard.json").read_text()) == kept
     assert main(["stress", "--methods", "rk4", "--cases", "X01", "--out", "hard.json", "--force"]) == 0
-    assert tried == ["X01 rk4", "X02 rk4", "X01 rk4"]
+    assert tried == ["X01 rk4"]
 
 
 def test_stress_does_not_take_another_file_for_its_own(tried: list[str], capsys: pytest.CaptureFixture[str]) -> None:

@@ -19,6 +19,7 @@ from flockenv.constraints.broad import nearby
 from flockenv.constraints.collisions import UnsolvedContactsWarning
 from flockenv.crew import use_threads
 from flockenv.effects import Gravity
+from flockenv.explanation import explain
 from flockenv.integrators import RK4, Integrator, SemiImplicitEuler, VelocityVerlet
 from flockenv.kernels import entry
 from flockenv.scene import Group, Scene
@@ -245,6 +246,22 @@ def test_two_bullets_do_not_pass_each_other(response: str) -> None:
         np.testing.assert_allclose(end.vel[0, :, 0], [-200, 200], rtol=1e-12)
 
 
+def test_who_goes_far_round_a_torus_in_a_step_gains_no_energy_and_is_told_of() -> None:
+    """Ways of more than half of its edge, 4 m: what is met is met on the way there, not on the shorter one back."""
+    post = (Circle(centre=(1.0, 2.0), radius=0.2),)
+    of = scene([1, 1], dt=1 / 60, space=Torus(size=(4.0, 4.0)), obstacles=post)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        for speed in (100.0, 150.0, 200.0, 300.0, 395.0, 450.0):
+            state = begun(of, [(0.5, 2.0), (0.3, 2.0)], [(speed, 1.0), (0.0, 0.0)])
+            end = of.run(state, 3)
+            np.testing.assert_allclose(energy(of, end), energy(of, state), rtol=1e-12)
+            assert end.counted("unsolved") == 3, speed  # more than a quarter in each
+        slow = of.run(begun(of, [(0.5, 2.0), (0.3, 2.0)], [(50.0, 1.0), (0.0, 0.0)]), 3)
+        assert slow.counted("unsolved") == 0
+    assert ["further than a quarter of the torus" in str(w.message) for w in caught] == [True]
+
+
 def test_who_is_hit_meets_who_was_out_of_its_reach() -> None:
     """One that lies still is sent through the whole row by one that comes fast, within one step."""
     of = scene([1] * 6, dt=0.1)
@@ -412,6 +429,16 @@ def test_collisions_ask_once_per_step_and_scenes_without_them_never() -> None:
     assert walls_only.run(state, 7).counted("neighbour_queries") == 0
 
 
+def test_an_explanation_says_who_asks_for_what() -> None:
+    found = explain(scene([1, 1], obstacles=FLOOR, space=Box(size=(4, 4))))
+    assert found.work["neighbour_queries"] == 1
+    assert not [line for line in found.left_out if line.startswith(("neighbour query", "pass over obstacles"))]
+    assert found.remains == "semi_implicit_euler, limits, box, collisions"
+    alone = explain(scene([1, 1], agents=False, space=Box(size=(4, 4))))
+    assert alone.work["neighbour_queries"] == 0
+    assert "neighbour query: no effect asks who is near whom" in alone.left_out
+
+
 def test_who_meets_nobody_flies_as_if_nothing_was() -> None:
     of, state = gas("earliest", 1.0, count=4, g=G)
     bare = of.model_copy(update={"constraints": ()})
@@ -428,6 +455,16 @@ def test_a_cap_that_bites_is_reported_once() -> None:
     told = [str(w.message) for w in caught if issubclass(w.category, UnsolvedContactsWarning)]
     assert len(told) == 1 and "most = 1 and passes = 1" in told[0]
     assert end.counted("unsolved") > 0
+
+
+def test_who_is_parted_slowly_is_not_unsolved() -> None:
+    """Two .15 m deep in each other, parted at .5 m/s: after .3 s, and no passes are missed on the way."""
+    of = scene([1, 1], part_speed=0.5)
+    state = begun(of, [(0, 0), (0.05, 0)], [(0, 0), (0, 0)])
+    early, end = of.run(state, 20), of.run(state, 40)
+    assert early.pos[0, 1, 0] - early.pos[0, 0, 0] == pytest.approx(0.05 + 0.5 * 0.2, abs=1e-12)
+    assert end.pos[0, 1, 0] - end.pos[0, 0, 0] == pytest.approx(2 * R, abs=1e-9)
+    assert np.abs(end.vel).max() == 0.0 and end.counted("unsolved") == 0
 
 
 def test_a_scene_with_collisions_is_a_value(tmp_path: Path) -> None:

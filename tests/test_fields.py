@@ -124,6 +124,7 @@ def test_on_a_torus_the_nearest_image_of_a_centre_acts(dimension: int) -> None:
 # --- fluctuations -----------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_fluctuations_do_not_depend_on_the_step() -> None:
     """numerics.md, P15: var x after T within 5 % for three steps, and (s/m)^2 T^3 / 3; var v = (s/m)^2 T."""
     seconds, s, m = 2.0, 0.6, 1.5
@@ -225,6 +226,7 @@ def test_a_crowded_gas_relaxes_to_the_density(dimension: int, crowding: float) -
     np.testing.assert_allclose(end.pos.mean(axis=1), start.pos.mean(axis=1), atol=1e-10)  # it began at rest
 
 
+@pytest.mark.slow
 def test_without_drag_a_gas_under_pressure_conserves_momentum() -> None:
     scene = scene_of(PRESSURE, Drag(rate=0), count=400, dt=0.002, integrator=SemiImplicitEuler())
     start = scene.start(1)

@@ -296,6 +296,7 @@ def test_a_world_without_a_solution_is_named_and_the_others_go_on() -> None:
 # --- other laws -------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_in_single_precision_around_a_torus() -> None:
     """Float32 stays float32, and everybody in the box; the same motion to its rounding."""
     groups = (Group(network=Rope(links=4, length=0.4, start=(3.8, 2.0), stretch=1.2), mass=0.1), LOOSE)
@@ -310,6 +311,7 @@ def test_in_single_precision_around_a_torus() -> None:
     np.testing.assert_allclose(apart, 0, atol=1e-4)
 
 
+@pytest.mark.slow
 def test_a_medium_carries_and_agents_that_look_around_are_coupled() -> None:
     """x' = v + u(x): against scipy on the scene's own rates; few agents by a full matrix, many without one."""
     group = Group(count=6, spawn=Spawn(low=(0, 0), high=(2, 2), speed=(0.2, 1.0)))

@@ -337,6 +337,24 @@ def test_nobody_goes_through_a_drain() -> None:
     assert state.counted("deaths") == 64
 
 
+def test_a_drain_takes_whom_it_comes_upon_and_a_hollow_one_who_is_outside() -> None:
+    """A disc that moves .4 m a step along a row that stands; a ring's solid part is all around."""
+    row = np.stack([np.linspace(-4, 4, 17), np.zeros(17)], axis=1)[None]
+    group = {"spawn": Spawn(low=(0, 0), high=(1, 1))}
+    for shape, left, steps in (
+        (
+            Circle(centre=(-3.9, 0.0), radius=0.05, velocity=(20.0, 0.0)),
+            (row[0, :, 0] < -3.95) | (row[0, :, 0] > 2.2),
+            15,
+        ),
+        (Circle(centre=(0.0, 0.0), radius=1.7, hollow=True), np.abs(row[0, :, 0]) < 1.7, 1),
+        (Block(centre=(0.0, 0.0), size=(3.0, 3.0), hollow=True), np.abs(row[0, :, 0]) < 1.5, 1),
+    ):
+        taken = scene(Drain(shape=shape), count=17, group=group)
+        end = taken.run(taken.start(0).with_motion(row, 0 * row), steps)
+        np.testing.assert_array_equal(end.alive[0], left)
+
+
 def test_regions_take_who_is_in_them_and_who_leaves() -> None:
     group = {"spawn": Spawn(low=(-2, -2), high=(2, 2))}
     inside = scene(Drain(shape=Block(centre=(0, 0), size=(2, 2)), margin=0.25), count=500, group=group)
@@ -353,13 +371,17 @@ def test_regions_take_who_is_in_them_and_who_leaves() -> None:
 
 
 @pytest.mark.parametrize(
-    "space", [Plane(), Torus(size=(4.0, 4.0)), Torus(size=(1.0, 4.0))], ids=["plane", "torus", "thin"]
-)
-def test_of_a_crowd_the_youngest_die(space: Space) -> None:
+    ("space", "dtype"),
+    [
+        (Plane(), "float64"), (Torus(size=(4.0, 4.0)), "float64"), (Torus(size=(1.0, 4.0)), "float64"),
+        (Plane(), "float32"),
+    ],
+    ids=["plane", "torus", "thin", "single"],
+)  # fmt: skip
+def test_of_a_crowd_the_youngest_die(space: Space, dtype: str) -> None:
     radius, most, n = 0.45, 6, 400
-    crowd = scene(
-        Crowding(radius=radius, most=most), count=n, space=space, group={"spawn": Spawn(low=(0, 0), high=(1.0, 3.9))}
-    )
+    group = {"spawn": Spawn(low=(0, 0), high=(1.0, 3.9))}
+    crowd = scene(Crowding(radius=radius, most=most), count=n, space=space, group=group, dtype=dtype)
     before = crowd.start(0)
     after = before.copy()
     settler(crowd)(before.x, before.v, after, 0, 1)  # the end of a step in which nobody moved
@@ -516,6 +538,11 @@ ONE = {"kind": "emitter", "place": {"kind": "point", "at": [0, 0]}, "rate": 1.0}
         (
             {**ONE, "place": {"kind": "surface", "shape": PLANE}},
             "has no end",
+        ),
+        ({**ONE, "place": {"kind": "surface", "shape": {"centre": [0, 0], "radius": 1, "hollow": True}}}, "is hollow"),
+        (
+            {**ONE, "place": {"kind": "surface", "shape": {"centre": [0, 0], "radius": 1, "velocity": [1, 0]}}},
+            "place.shape.kind = circle: moves",
         ),
         ({**ONE, "place": {"kind": "box", "low": [1, 0], "high": [0, 1]}}, "lower corner comes first"),
         ({**ONE, "lifetime": [0, 0]}, "must be more than 0 s"),

@@ -17,6 +17,7 @@ from flockenv.constraints import Rods, UnmetWarning
 from flockenv.effects import Drag, Gravity
 from flockenv.integrators import RK4, ExplicitEuler, ImplicitMidpoint, Integrator, SemiImplicitEuler, VelocityVerlet
 from flockenv.networks import Cloth, Rope
+from flockenv.population import Decay, Emitter, Point
 from flockenv.scene import Group, Scene
 from flockenv.space import Torus
 from flockenv.spawn import Spawn
@@ -322,6 +323,15 @@ def test_bad_rods_are_refused_in_one_line(fields: dict[str, Any], message: str) 
 def test_scenes_that_rods_do_not_suit_are_refused(rods: Rods, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         free().model_copy(update={"constraints": (rods,)})
+
+
+def test_nobody_is_born_into_a_rod() -> None:
+    """He would be drawn to where the dead one was, in one step; but those who are tied may die."""
+    rods, born = Rods(pairs=((0, 1),), lengths=(1.0,)), Emitter(place=Point(at=(0.0, 0.0)), rate=1.0)
+    update = {"constraints": (rods,), "population": (Decay(rate=1.0), born)}
+    with pytest.raises(ValueError, match=r"constraints\[0\].pairs: agent 0 is of a group that population\[1\] fills"):
+        free().model_copy(update=update)
+    free().model_copy(update=update | {"population": (Decay(rate=1.0), born.model_copy(update={"group": 1}))})
 
 
 def test_a_scene_with_rods_is_a_file_and_a_value(tmp_path: Path) -> None:

@@ -21,7 +21,14 @@ SECONDS = {
     "billiards": 1.0, "bouncing_balls": 3.0, "newtons_cradle": 2.0, "sphere": 2.0,
     "snow": 3.0, "stampede": 3.0, "rope_on_ball": 1.0, "cloth_on_ball": 0.7, "funnel": 1.5,
 }  # fmt: skip
-SLOW = ("snow", "stampede", "rope_on_ball", "cloth_on_ball", "funnel")  # half a minute of compiling, or many bodies
+SLOW = (
+    "sphere",
+    "snow",
+    "stampede",
+    "rope_on_ball",
+    "cloth_on_ball",
+    "funnel",
+)  # half a minute of compiling, or many bodies
 FAST = pytest.mark.parametrize(
     "name", [pytest.param(name, marks=[pytest.mark.slow] if name in SLOW else []) for name in SECONDS]
 )
@@ -122,7 +129,7 @@ def test_where_it_folds_a_rope_or_a_cloth_keeps_off_itself(name: str, seconds: f
 
 def test_the_page_of_scenes_has_a_picture_and_a_command_for_each() -> None:
     page = (ROOT / "docs" / "scenes.md").read_text()
-    for name in SECONDS:
+    for name in (*SECONDS, "fountain", "fireworks"):
         assert re.search(rf"flockenv render configs/{name}\.yaml .*--out docs/scenes/{name}\.png", page)
         assert f"scenes/{name}.png" in page
         assert 1000 < (ROOT / "docs" / "scenes" / f"{name}.png").stat().st_size < 150_000

@@ -200,6 +200,7 @@ def test_what_is_pinned_stays_where_it_is() -> None:
 # --- closed forms -----------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_hanging_chain_is_as_long_as_it_should_be() -> None:
     """numerics.md 3.3, N15: N L + (m g / k) N (N + 1) / 2 = 1.1348875 m for ten links of .1 m."""
     rope = Rope(links=10, length=1.0, direction=(0, -1), pinned=("start",))

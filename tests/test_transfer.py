@@ -77,6 +77,7 @@ def test_every_number_of_steps_fits_into_a_decision(control_dt: float) -> None:
 # --- what is measured
 
 
+@pytest.mark.slow
 def test_the_trained_setting_scores_what_the_comparison_says_bit_for_bit_and_again_the_same() -> None:
     run(*TINY, *TRAINED, "--players", "random,reynolds,ppo")
     task = TASKS["pursuit"]()

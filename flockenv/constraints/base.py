@@ -42,6 +42,10 @@ class Constraint(Record):
     def check(self, scene: Any) -> None:
         """Refuse a scene that this cannot be demanded of: ValueError that begins with the field's name."""
 
+    def calls_for(self) -> tuple[str, ...]:
+        """What it makes a scene compute beside itself, in words, as effects say it."""
+        return ()
+
     def numbers(self, scene: Any) -> int:
         """How many numbers of scratch it takes per agent."""
         return 0

@@ -14,7 +14,7 @@ from flockenv.kernels import Vec, kernel, law
 from flockenv.neighbours import candidates, count_cells, row_of
 from flockenv.vec import dot, sub
 
-__all__ = ["image", "nearby", "vector", "write"]
+__all__ = ["image", "loaded", "nearby", "vector", "write"]
 
 
 @law
@@ -31,6 +31,15 @@ def write(array: Any, i: int, x: Vec) -> None:
     """Set row i of an array (N, D)."""
     for k in range(len(x)):
         array[i, k] = x[k]
+
+
+@kernel
+def loaded(size: Vec, array: Any, b: int, i: int) -> Vec:
+    """Return a vector of agent i of world b of an array (D, B, N), in double precision; `size` says what D is."""
+    if len(size) == 2:
+        return (np.float64(array[0, b, i]), np.float64(array[1, b, i]))
+    else:
+        return (np.float64(array[0, b, i]), np.float64(array[1, b, i]), np.float64(array[2, b, i]))
 
 
 @law

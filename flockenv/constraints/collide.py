@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from flockenv.constraints.broad import image, nearby, vector, write
+from flockenv.constraints.broad import image, loaded, nearby, vector, write
 from flockenv.constraints.contacts import NEARLY, Contacts, Ends, gather, impacts, part, press
 from flockenv.constraints.events import Bodies, Meetings, Rules, Things, link, play, take_off
 from flockenv.constraints.impact import along, surface
@@ -30,12 +30,19 @@ EXACT = 8 * 2.0**-52
 
 
 @kernel
-def _load(period: Vec, array: Any, b: int, i: int) -> Vec:
-    """Return a vector of agent i of world b of an array (D, B, N), in double precision."""
-    if len(period) == 2:
-        return (np.float64(array[0, b, i]), np.float64(array[1, b, i]))
-    else:
-        return (np.float64(array[0, b, i]), np.float64(array[1, b, i]), np.float64(array[2, b, i]))
+def _led(period: Vec, apart: Vec, guess: Vec) -> Vec:
+    """Return how far a step has led somebody to a place `apart` from where he was: the image nearest to a guess."""
+    off = sub(apart, guess)
+    return sub(apart, sub(off, image(period, off)))
+
+
+@kernel
+def _goes_round(period: Vec, way: float) -> bool:
+    """May two who go so far, m, come to where one is met that is not the nearest image of the other?"""
+    least = np.inf
+    for k in range(len(period)):
+        least = min(least, period[k])
+    return bool(4.0 * way > least > 0.0)
 
 
 @kernel
@@ -47,14 +54,15 @@ def _board(
     far, fast, hard, mean = 0.0, 0.0, 0.0, zero(period)
     for i in range(x.shape[2]):
         bodies.living[i] = 1 if alive[b, i] else 0
-        begun, done = _load(period, x0, b, i), _load(period, x, b, i)
-        was, now = _load(period, v0, b, i), _load(period, v, b, i)
+        begun, done = loaded(period, x0, b, i), loaded(period, x, b, i)
+        was, now = loaded(period, v0, b, i), loaded(period, v, b, i)
         write(bodies.start, i, begun)
         write(bodies.at, i, begun)
         write(before, i, was)
         write(ends.pos, i, done)
         write(ends.vel, i, now)
-        take_off(period, bodies, i, seconds, image(period, sub(done, begun)), was, now)
+        moved = _led(period, sub(done, begun), scale(add(was, now), 0.5 * seconds))
+        take_off(period, bodies, i, seconds, moved, was, now)
         if bodies.living[i] > 0 and bodies.light[i] > 0.0:
             for k in range(len(period)):
                 far = max(far, abs(begun[k]), abs(done[k]))
@@ -103,7 +111,7 @@ def _obstacles(
         if m < obstacle_radius.shape[1]:
             radius = np.float64(obstacle_radius[b, m])
             things.size[m] = radius if radius > 0.0 else -1.0
-            write(things.place, m, _load(period, obstacle_x, b, m))
+            write(things.place, m, loaded(period, obstacle_x, b, m))
         else:
             here = shift_of(things.table, things.row[m], begun, period)
             there = shift_of(things.table, things.row[m], ended, period)
@@ -143,6 +151,8 @@ def collide(
         report[2] = count
         if count > meetings.who.shape[0]:
             return b
+        if in_time and _goes_round(period, fast * rules.seconds):
+            report[4] += 1
         mean = scale(mean, -1.0 / norm(mean)) if norm(mean) > 1e-9 * hard * x.shape[2] else axis(mean, 0)
         slow = 1e-3 * hard * rules.seconds + 1e-12 * fast
         touching = gather(

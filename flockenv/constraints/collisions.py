@@ -25,7 +25,7 @@ __all__ = ["Collisions", "UnsolvedContactsWarning"]
 
 
 class UnsolvedContactsWarning(RuntimeWarning):
-    """More impacts in a step than are allowed, or contacts that the passes allowed have not solved."""
+    """More impacts in a step than are allowed, contacts that passes have not solved, too long a way round a torus."""
 
 
 class Collisions(Constraint):
@@ -75,6 +75,11 @@ class Collisions(Constraint):
                 f"kind = collisions: bodies of radius {widest:g} m meet their own images on a torus of size "
                 f"{scene.space.size}; at most a quarter of its shortest edge is allowed"
             )
+
+    def calls_for(self) -> tuple[str, ...]:
+        """Who is near whom, and obstacles, if they are met."""
+        asked = ("neighbour query", self.agents), ("obstacles", self.obstacles)
+        return tuple(what for what, is_met in asked if is_met)
 
     def numbers(self, scene: Any) -> int:
         """Bodies, ends, and room for meetings."""
@@ -184,9 +189,10 @@ class _Settler:
             self._make_room(2 * needed)
         if unsolved and not self.told:
             self.told = True
+            far = ", or somebody went further than a quarter of the torus" if self.period[0] > 0 else ""
             warnings.warn(
                 f"constraints: collisions: in a step {unsolved} impacts or worlds with contacts were not solved within "
-                f"most = {r.most} and passes = {r.passes}",
+                f"most = {r.most} and passes = {r.passes}{far}",
                 UnsolvedContactsWarning, stacklevel=2,
             )  # fmt: skip
         return bad

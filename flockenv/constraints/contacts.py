@@ -273,7 +273,7 @@ def part(
     period: Vec, bodies: Bodies, things: Things, ends: Ends, seconds: float, rounds: int, touch: float, most: float,
     contacts: Contacts, count: int,
 ) -> float:  # fmt: skip
-    """Move apart those who overlap at the end, each two by at most `most` m; return the last pass's deepest overlap."""
+    """Move apart those who overlap at the end, each two by at most `most` m; return the last pass's farthest move."""
     for c in range(count):
         contacts.push[c] = 0.0
     worst = 0.0
@@ -291,7 +291,7 @@ def part(
                 write(ends.pos, i, add(vector(period, ends.pos, i), scale(way, bodies.light[i])))
                 if j >= 0:
                     write(ends.pos, j, sub(vector(period, ends.pos, j), scale(way, bodies.light[j])))
-                worst = max(worst, -gap)
+                worst = max(worst, far)
         if worst <= touch:
             break
     return worst

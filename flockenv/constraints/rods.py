@@ -323,11 +323,17 @@ class Rods(Constraint):
         return _layered(Ties(i + np.int32(first), j + np.int32(first), springs.rest[edges], points[j] - points[i]))
 
     def check(self, scene: Any) -> None:
-        """Refuse agents and networks that are not there, and lengths that reach around a torus."""
+        """Refuse agents and networks that are not there, newborn ends, and lengths that reach around a torus."""
         ties = self.ties(scene)
         most = int(max(ties.i.max(initial=0), ties.j.max(initial=0)))
         if most >= scene.agents:
             raise ValueError(f"pairs: there is no agent {most}, they are 0 to {scene.agents - 1}")
+        for k, member in enumerate(scene.population):
+            for agent in np.unique([ties.i, ties.j]):
+                if member.feeds(int(np.searchsorted(scene.starts, agent, "right")) - 1):
+                    raise ValueError(
+                        f"pairs: agent {agent} is of a group that population[{k}] fills: a newborn has no rod"
+                    )
         if isinstance(scene.space, Torus) and ties.length.max(initial=0.0) > min(scene.space.size) / 2:
             raise ValueError(
                 f"lengths: {ties.length.max():g} m reaches around the torus; at most half its shortest edge, "

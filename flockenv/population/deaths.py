@@ -11,14 +11,14 @@ from typing import Any
 
 import numpy as np
 
+from flockenv.constraints.broad import image, loaded
 from flockenv.kernels import Vec, kernel, law
 from flockenv.noise import uniform
 from flockenv.population.births import DEATHS
 from flockenv.population.near import count_near, sort_living
-from flockenv.shapes.block import hit_block, hit_half_space, nearest_block, nearest_half_space
-from flockenv.shapes.chain import hit_chain, nearest_chain
-from flockenv.shapes.field import hit_distance_field, nearest_distance_field
-from flockenv.vec import norm, sub, unit
+from flockenv.shapes.every import hit_shape, nearest_shape
+from flockenv.shapes.head import shift_of
+from flockenv.vec import add, norm, sub, unit
 
 __all__ = ["crowding", "drain", "passing"]
 
@@ -78,61 +78,27 @@ def passing(
                     _die(b, i, v, alive, work)
 
 
-@law
-def _shortest(way: float, period: float) -> float:
-    return way - period * math.floor(way / period + 0.5) if period > 0.0 else way
-
-
-@law
-def _drained(table: Any, form: int, margin: float, y: Vec, way: Vec) -> bool:
-    """Is somebody at y, relative to a shape's anchor, within `margin` of it, or was he on the `way` here?"""
-    far = norm(way)
-    ray, begin = unit(way), sub(y, way)
-    if form == 0:
-        gap, _ = nearest_chain(table, 0, y)
-        return gap <= margin or hit_chain(table, 0, begin, ray, margin) <= far
-    elif form == 1:
-        gap, _ = nearest_block(table, 0, y)
-        return gap <= margin or hit_block(table, 0, begin, ray, margin) <= far
-    elif form == 2:
-        gap, _ = nearest_half_space(table, 0, y)
-        return gap <= margin or hit_half_space(table, 0, begin, ray, margin) <= far
-    else:
-        gap, _ = nearest_distance_field(table, 0, y)
-        return gap <= margin or hit_distance_field(table, 0, begin, ray, margin) <= far
-
-
 @kernel
 def drain(
-    table: Any, form: int, margin: float, slots: Any, anchor: Vec, period: Vec, x0: Any, x: Any, v: Any, alive: Any,
-    work: Any, first: int, end: int,
+    table: Any, margin: float, slots: Any, anchor: Vec, period: Vec, x0: Any, x: Any, v: Any, alive: Any, tick: Any,
+    work: Any, dt: float, first: int, end: int,
 ) -> None:  # fmt: skip
     """Let those die who are in a shape, or went through it in the step that began at x0; slots (first, end).
 
     table: the shape's row (see shapes/table.py); anchor, period: (D,) m, the latter 0 where an axis does not repeat.
+    Where the shape moves, ways are as seen from it.
     """
     for b in range(first, end):
+        shift = shift_of(table, 0, tick[b] * dt, anchor)
+        place, moved = add(anchor, shift), sub(shift, shift_of(table, 0, (tick[b] - 1) * dt, anchor))
         for i in range(slots[0], slots[1]):
             if not alive[b, i]:
                 continue
-            if len(anchor) == 2:
-                y: Any = (_shortest(x[0, b, i] - anchor[0], period[0]), _shortest(x[1, b, i] - anchor[1], period[1]))
-                way: Any = (
-                    _shortest(np.float64(x[0, b, i]) - x0[0, b, i], period[0]),
-                    _shortest(np.float64(x[1, b, i]) - x0[1, b, i], period[1]),
-                )
-            else:
-                y = (
-                    _shortest(x[0, b, i] - anchor[0], period[0]),
-                    _shortest(x[1, b, i] - anchor[1], period[1]),
-                    _shortest(x[2, b, i] - anchor[2], period[2]),
-                )
-                way = (
-                    _shortest(np.float64(x[0, b, i]) - x0[0, b, i], period[0]),
-                    _shortest(np.float64(x[1, b, i]) - x0[1, b, i], period[1]),
-                    _shortest(np.float64(x[2, b, i]) - x0[2, b, i], period[2]),
-                )
-            if _drained(table, form, margin, y, way):
+            here = loaded(anchor, x, b, i)
+            y = image(period, sub(here, place))
+            way = sub(image(period, sub(here, loaded(anchor, x0, b, i))), moved)
+            gap, _ = nearest_shape(table, 0, y)
+            if gap <= margin or hit_shape(table, 0, sub(y, way), unit(way), margin) <= norm(way):
                 _die(b, i, v, alive, work)
 
 
@@ -157,7 +123,8 @@ def crowding(
                 chance = _chance(row[5], 1.0 - math.exp(-row[5] * dt), born[b, i], now, dt)
                 if uniform(key[b], tick[b], identity[b, i], DECAY + channel) >= chance:
                     continue
-            place = (float(x[0, b, i]), float(x[1, b, i]), float(x[2, b, i]) if x.shape[0] == 3 else 0.0)
+            y, z = np.float64(x[1, b, i]), np.float64(x[2, b, i]) if x.shape[0] == 3 else 0.0
+            place = (np.float64(x[0, b, i]), y, z)
             most = int(row[4])
             doomed[i] = count_near(x, b, place, row[3], most, period, grid, start, order, born, identity, i) > most
         for i in range(low, high):

@@ -182,12 +182,14 @@ class Surface(Place):
         return pieces(self.shape)
 
     def check(self, scene: Any) -> None:
-        """Refuse other dimensions, and shapes without an end."""
+        """Refuse other dimensions, and shapes that move, are hollow, or have no end."""
         if self.shape.dimension != scene.dimension:
             raise ValueError(
                 f"shape.kind = {self.shape.kind}: lies in {self.shape.dimension} dimensions, "
                 f"but dimension = {scene.dimension}"
             )
+        if self.shape.moves:
+            raise ValueError(f"shape.kind = {self.shape.kind}: moves, and births come of what stays where it is")
         self.pieces()
 
 

@@ -15,7 +15,7 @@ from flockenv.population.deaths import crowding, drain, passing
 from flockenv.population.emitters import Emitter
 from flockenv.population.places import Clearing, Surface
 from flockenv.population.sinks import Crowding, Drain, Sink
-from flockenv.shapes.table import FORMS, packed
+from flockenv.shapes.table import packed
 from flockenv.space import Box
 from flockenv.state import Floats, State
 
@@ -119,12 +119,13 @@ def _passing(scene: Any, sinks: Sequence[Sink], channel: int) -> Part:
 
 def _drain(scene: Any, sink: Drain) -> Part:
     table, _ = packed([sink.shape], scene.dimension)
-    form = list(FORMS).index(sink.shape.form)
     anchor, slots = tuple(float(a) for a in sink.shape.anchor), _slots(scene, sink)
-    kernel, period = entry(drain), tuple(_period(scene)[: scene.dimension].tolist())
+    kernel, period, dt = entry(drain), tuple(_period(scene)[: scene.dimension].tolist()), float(scene.dt)
 
     def part(x0: Floats, s: State, first: int, end: int) -> None:
-        kernel(table, form, sink.margin, slots, anchor, period, x0, s.x, s.v, s.alive, s.work, first, end)
+        kernel(
+            table, sink.margin, slots, anchor, period, x0, s.x, s.v, s.alive, s.tick, s.work, dt, first, end
+        )  # fmt: skip
 
     return part
 

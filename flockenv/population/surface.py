@@ -34,6 +34,7 @@ def pieces(shape: Any) -> Floats:
         found = _chain(shape)
     else:
         why = "has no end" if shape.kind == "half_space" else "is a grid of distances"
+        why = "is hollow" if shape.is_hollow else why
         raise ValueError(
             f"shape.kind = {shape.kind}: {why}, its surface cannot be drawn from; allowed: circle, capsule, wall, "
             "polygon, block"
