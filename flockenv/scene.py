@@ -419,7 +419,7 @@ class Scene(Record):
             reals += 4 * d + sum(constraint.numbers(self) for constraint in self.constraints)
         if self.population:
             whole += 2 * 3 * 8 + 4 * POPULATION_NUMBERS  # who, since when, until when, and what they were before
-        return self.agents * (reals * real + whole)
+        return self.agents * (reals * real + whole) + parts.counters * real
 
     @functools.cached_property
     def body(self) -> Body:

@@ -50,7 +50,7 @@ class Workspace:
             "tie": padded * d if "t0" in parts.fields else 1,
             "pulled": padded * d if parts.pulls else 1,
             "carrying": padded * d if parts.flows else 1,
-            "frame": max(padded * parts.framed, 1),
+            "frame": max(padded * parts.framed + parts.counters, 1),
             "felt": max(swept * d * len(parts.targets), 1),
             "sorted_": parts.rows * (swept + width if parts.sorts else SMALL_STRIDE),
             "records": (swept if sorts else 1) * parts.numbers,

@@ -56,6 +56,7 @@ from flockenv.behaviours import (
     Hide,
     Interest,
     Interpose,
+    LineUp,
     MatchVelocity,
     ObstacleRepulsion,
     OffsetPursue,
@@ -81,6 +82,7 @@ from flockenv.effects import (
     Carried,
     Contact,
     Course,
+    Door,
     Drag,
     Effect,
     Elastic,
@@ -89,19 +91,23 @@ from flockenv.effects import (
     Gravitation,
     Gravity,
     InverseSquare,
+    Journey,
     ObstacleContact,
     Pressure,
     QuadraticDrag,
+    Routes,
     Sink,
     Source,
     SpeedLimit,
     Springs,
+    Stage,
     Swing,
     Tether,
     Uniform,
     Vicsek,
     Vortex,
     WallRepulsion,
+    Way,
     Wind,
 )
 from flockenv.integrators import (
@@ -125,6 +131,7 @@ from flockenv.shapes import Circle
 from flockenv.space import Box, Plane, Space, Torus
 from flockenv.spawn import Spawn
 from flockenv.steer import Steer
+from flockenv.targets import Target
 from flockenv.tasks import Crossing, Flock, Herd, Obstacles, PathFollow, Pursuit, Task
 from flockenv.tasks import Evade as EvadeTask
 
@@ -350,6 +357,19 @@ EFFECTS = (
         Antipode(centre=CENTRE[:2]), beside=(DRIVING,), dimensions=(2,), obeys=frozenset()
     ),
     EffectRow(DRIVING, beside=(Goal(target=CENTRE, slow_radius=2),)),
+    EffectRow(  # its grid lies along the axes
+        Way(targets=(Target(at=(3.0, 5.5)),), clearance=0.1, spacing=0.3, margin=1), beside=(DRIVING,),
+        dimensions=(2,), obeys=frozenset({"relabelling"}),
+    ),
+    EffectRow(  # where somebody was is kept
+        Journey(stages=(Stage(at=(3.0, 5.5), radius=0.3, wait=0.1),), premovement=0.05, clearance=0.1, margin=1),
+        beside=(DRIVING,), dimensions=(2,), obeys=frozenset(),
+    ),
+    EffectRow(  # so is the door, and everybody decides at times of his own
+        Routes(doors=(Door(ends=((3.0, 5.5), (4.0, 5.5))), Door(at=(1.0, 1.0), width=1)), clearance=0.1, margin=1),
+        beside=(DRIVING,), dimensions=(2,), obeys=frozenset(),
+    ),
+    EffectRow(LineUp(margin=0.1, radius=2.5), beside=(Goal(target=CENTRE, slow_radius=2),)),
     EffectRow(WallRepulsion(point=CENTRE, normal=(1.2, -0.7, 0.9), strength=2, decay=1.5)),
     EffectRow(ObstacleContact(stiffness=30, damping=4, friction=8, coulomb=0.6, most=5)),
     EffectRow(Contact(stiffness=20, ratio=0.3, damping=0.1, friction=6, coulomb=0.5, most=4, radius=0.5)),

@@ -18,7 +18,7 @@ import flockenv
 from flockenv import effects as effects_module
 from flockenv.arbitration import ARBITRATIONS
 from flockenv.behaviours import Separation
-from flockenv.effects import Drag
+from flockenv.effects import Door, Drag, Stage
 from flockenv.integrators import RK4
 from flockenv.kernels import cache_folder
 from flockenv.networks import Mesh
@@ -27,6 +27,7 @@ from flockenv.shapes import Circle
 from flockenv.space import Plane
 from flockenv.spawn import Spawn
 from flockenv.state import State
+from flockenv.targets import Target
 from tests.catalogue import (
     AMONG_ALL,
     EDGE,
@@ -480,7 +481,7 @@ def test_several_pair_effects_share_one_query() -> None:
 def names_of_effects() -> dict[str, Any]:
     """What a printed effect or scene is read with: effects, behaviours, arbitrations."""
     kinds = (*effects_module.EFFECTS.values(), *ARBITRATIONS.values())
-    return {kind.__name__: kind for kind in kinds} | {"Circle": Circle}
+    return {kind.__name__: kind for kind in kinds} | {"Circle": Circle, "Target": Target, "Stage": Stage, "Door": Door}
 
 
 @EVERY_ROW

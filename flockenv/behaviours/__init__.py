@@ -21,7 +21,7 @@ from flockenv.behaviours.avoid import AvoidObstacles, ForceField, Whiskers  # no
 from flockenv.behaviours.chase import Evade, MatchVelocity, OffsetPursue, Pursue, Shadow  # noqa: E402
 from flockenv.behaviours.company import FollowLeader, Formation, Interpose  # noqa: E402
 from flockenv.behaviours.crowd import Explore, Forage, Queue, UnalignedAvoidance  # noqa: E402
-from flockenv.behaviours.driving import Driving  # noqa: E402
+from flockenv.behaviours.driving import Driving, LineUp  # noqa: E402
 from flockenv.behaviours.flock import Alignment, Cohesion, Separation  # noqa: E402
 from flockenv.behaviours.goals import Arrive, Dock, Face, Flee, Seek, TargetSpeed  # noqa: E402
 from flockenv.behaviours.groups import Friends, Interest, WalkingGroup  # noqa: E402
@@ -39,8 +39,9 @@ __all__ = [
     "BEHAVIOURS", "Alignment", "Arrive", "AvoidObstacles", "CircularRepulsion", "Cohesion", "Contain", "Dock",
     "Driving", "EllipticalRepulsion", "Evade", "Explore", "Face", "Flee", "FollowFlow", "FollowLeader", "FollowPath",
     "FollowWall", "FollowWay", "Forage", "ForceField", "Formation", "Friends", "Heuristics", "Hide", "Interest",
-    "Interpose", "MatchVelocity", "ObstacleRepulsion", "OffsetPursue", "Orca", "Pursue", "Queue", "Seek", "Separation",
-    "Shadow", "Sidestep", "StayOnPath", "TargetSpeed", "UnalignedAvoidance", "WalkingGroup", "Wander", "Whiskers",
+    "Interpose", "LineUp", "MatchVelocity", "ObstacleRepulsion", "OffsetPursue", "Orca", "Pursue", "Queue", "Seek",
+    "Separation", "Shadow", "Sidestep", "StayOnPath", "TargetSpeed", "UnalignedAvoidance", "WalkingGroup", "Wander",
+    "Whiskers",
 ]  # fmt: skip
 
 BEHAVIOURS: dict[str, type[Effect]] = {kind: effect for kind, effect in EFFECTS.items() if effect.steering}

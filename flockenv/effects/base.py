@@ -21,6 +21,9 @@ An effect is of one or more of three forms, each a law for one agent:
   `finish_law` has `told` of others in the last stage, a vector that is no force then (of an effect without a pair law:
   0). Changes by several effects add up. Laws read them as `me.inner.NAME` and `other.inner.NAME`, and say so in
   `recalls` if they do not keep them;
+* `count_law(p, me) -> number` of the counter in which an agent counts, or a negative one for none: what all of a world
+  are doing, in whole numbers, so that nobody's place in it matters. Its keep_law finds `counters` of them as
+  `p.counted`: how many of the living it was for each when the step began. One pass over all agents per step;
 * `obstacle_start(p, me)`, `obstacle_law(p, me, other, acc) -> acc`, `obstacle_finish(p, me, acc) -> force`: a fold over
   the obstacles, of whatever shape: `other` is an `Obstacle`. With an `obstacle_ray(p, me, k) -> (direction, margin)` it
   meets each obstacle for each of its rays, k = 0, 1, ...: where the agent's body, `margin` wider, would touch it
@@ -211,6 +214,7 @@ class Effect(Record):
     aim_law: ClassVar[str | None] = None
     begin_law: ClassVar[str | None] = None
     keep_law: ClassVar[str | None] = None
+    count_law: ClassVar[str | None] = None
     keeps: ClassVar[tuple[str, ...]] = ()
     """Names of the numbers that it keeps of every agent, see State.inner."""
     recalls: ClassVar[tuple[str, ...]] = ()
@@ -289,6 +293,11 @@ class Effect(Record):
     def recalled(self) -> tuple[str, ...]:
         """What it recalls, and whatever reconciles its wishes."""
         return self.recalls
+
+    @property
+    def counters(self) -> int:
+        """Into how many counters its count_law sorts all agents."""
+        return 0
 
     def members(self, starts: Sequence[int]) -> dict[str, float]:
         """More numbers for its laws: which agents it is about; starts[g] is the first agent of group g."""

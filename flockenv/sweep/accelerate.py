@@ -109,6 +109,10 @@ def parameters(parts: Parts) -> list[str]:
         if effect.tabled:
             values.append(f"params[np.int64(params[{at}]) : np.int64(params[{at + 1}])]")
             at += 2
+        if effect.count_law:
+            begin, end = (f"len(frame) - np.int64(params[{at + j}])" for j in range(2))
+            values.append(f"frame[{begin} : {end}]")
+            at += 2
         lines.append(f"p{k} = P{k}({', '.join(values) or 'params[0]'})")
     return lines
 

@@ -32,8 +32,8 @@ SMALL_STRIDE = 128
 
 LAWS = (
     "own_law", "medium_law", "flow_law", "far_law", "bond_law", "kick_law", "aim_law", "begin_law", "keep_law",
-    "pair_start", "pair_law", "finish_law", "obstacle_start", "obstacle_law", "obstacle_finish", "obstacle_ray",
-    "obstacle_from", "obstacle_reach",
+    "count_law", "pair_start", "pair_law", "finish_law", "obstacle_start", "obstacle_law", "obstacle_finish",
+    "obstacle_ray", "obstacle_from", "obstacle_reach",
 )  # fmt: skip
 """The slots that an effect may fill with the name of a law."""
 
@@ -188,12 +188,16 @@ class Parts:
             values += [sight.radius**2, view_of(sight.fov)]
             if sight.group is not None:
                 values += self.starts[sight.group : sight.group + 2]
+        left = self.counters
         for effect in self.effects:
             for value in self.numbers_of(effect).values():
                 values.extend(value if isinstance(value, tuple) else (value,))
             if effect.tabled:
                 bounds += [(len(values), begin), (len(values) + 1, begin := next(tables))]
                 values += [0.0, 0.0]
+            if effect.count_law:
+                values += [float(left), float(left - effect.counters)]
+                left -= effect.counters
         values += self.space.numbers()
         values += self.integrator.settings()
         values += [self.look.radius, self.look.radius**2] if self.look else []
@@ -216,7 +220,8 @@ class Parts:
 
     def names_of(self, effect: Effect) -> list[str]:
         """Return the names under which the laws of an effect find what they are given."""
-        return [*self.numbers_of(effect), *(["table"] if effect.tabled else [])]
+        more = ["table"] * effect.tabled + ["counted"] * (effect.count_law is not None)
+        return [*self.numbers_of(effect), *more]
 
     @functools.cached_property
     def wishes(self) -> dict[int, int]:
@@ -250,6 +255,11 @@ class Parts:
     def keeping(self) -> list[tuple[int, Effect]]:
         """The effects that keep some of it, and their numbers."""
         return [(k, e) for k, e in enumerate(self.effects) if e.keeps]
+
+    @property
+    def counters(self) -> int:
+        """How many counters all effects have; they lie at the end of the scratch `frame`."""
+        return sum(effect.counters for effect in self.effects if effect.count_law)
 
     @property
     def aims(self) -> bool:

@@ -167,13 +167,41 @@ def _advance(parts: Parts) -> list[str]:
     if parts.integrator.evaluations != 1:
         advance = f"advance((context, first, end), pos, vel, {flow}, time, dt, stages, first * {size}, end * {size})"
         told = ["sense(context, pos, vel, time)"] * (parts.inner != () and parts.integrator.solves)
-        return [*told, advance, *_bound(parts, "first", "end")]
+        return [*_count(parts), *told, advance, *_bound(parts, "first", "end")]
     return [
+        *_count(parts),
         "sense(context, pos, vel, time)",
         f"for begin in range(first, end, {PART}):",
         f"    until = min(begin + {PART}, end)",
         f"    advance((context, begin, until), pos, vel, {flow}, time, dt, stages, begin * {size}, until * {size})",
         *indented_lines(_bound(parts, "begin", "until"), 4),
+    ]
+
+
+def _count(parts: Parts) -> list[str]:
+    """Write how all agents of the world are counted at the beginning of a step, by one of the team."""
+    effects = [(k, e) for k, e in enumerate(parts.effects) if e.count_law is not None]
+    if not effects:
+        return []
+    d, w = parts.dimension, parts.width
+    lines = []
+    for k, _ in effects:
+        lines += [
+            f"which = np.int64(count_law_{k}({given(parts, k)}, me))",
+            f"if living[i] > like(dt, 0.0) and which >= 0 and which < len(p{k}.counted):",
+            f"    p{k}.counted[which] += like(dt, 1.0)",
+        ]
+    return [
+        "wait_for_team(sync, team)  # what goes on inside everybody was written by others",
+        "if rank == 0:",
+        *(f"    p{k}.counted[:] = 0" for k, _ in effects),
+        "    for i in range(np.uint64(n)):",
+        f"        block, l = i // np.uint64({w}), i % np.uint64({w})",
+        f"        base = block * np.uint64({d * w})",
+        f"        x, v = {lanes_of(parts, 'pos')}, {lanes_of(parts, 'vel')}",
+        f"        me = {alone(parts, aim='zero(x)')}",
+        *indented_lines([*nearest_images(parts, effects), *lines], 8),
+        "wait_for_team(sync, team)  # before anybody changes",
     ]
 
 

@@ -1,0 +1,381 @@
+"""Ways to go: around obstacles, to the nearest of several doors, from place to place, by the quickest door; in line."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from flockenv.behaviours import Driving, LineUp, UnalignedAvoidance
+from flockenv.crew import use_threads
+from flockenv.effects import Door, Journey, Routes, Stage, Way
+from flockenv.eikonal import ground
+from flockenv.population import Drain, Emitter
+from flockenv.population.places import Point
+from flockenv.scene import Group, Scene
+from flockenv.shapes import Circle, Wall
+from flockenv.spawn import Spawn
+from flockenv.spread import Spread
+from flockenv.steer import Steer
+from flockenv.targets import Target
+
+Array = NDArray[np.float64]
+
+
+def walkers(count: int, low: Any, high: Any, speed: Any = 1.0, **more: Any) -> Group:
+    spawn = Spawn(low=low, high=high)
+    return Group(count=count, radius=0.2, mass=70, desired_speed=speed, spawn=spawn, **more)
+
+
+# A room of 10 x 6 m, closed but for a door of 1 m on the left and one of 2 m on the right.
+ROOM = (
+    Wall(vertices=((0, 2.5), (0, 0), (10, 0), (10, 2)), radius=0.1),
+    Wall(vertices=((0, 3.5), (0, 6), (10, 6), (10, 4)), radius=0.1),
+)
+LEFT, RIGHT = ((0.0, 2.5), (0.0, 3.5)), ((10.0, 2.0), (10.0, 4.0))
+
+
+# --- the way itself ---------------------------------------------------------------------------------------------------
+
+
+def test_the_way_around_a_disc_is_as_long_as_tangents_and_an_arc() -> None:
+    """Closed form, to a few hundredths of a metre, for a body that keeps 0.3 m from a disc of 0.7 m."""
+    way = Way(targets=(Target(at=(3, 0)),), clearance=0.3, spacing=0.05, margin=4)
+    scene = Scene(
+        groups=(walkers(1, (-4, 0), (-4, 0)),), obstacles=(Circle(centre=(0, 0), radius=0.7),), effects=(way,)
+    )
+    x = np.random.default_rng(0).uniform(-4, 4, (400, 2))
+    d = np.linalg.norm(x, axis=1)
+    x, d = x[d > 1.1], d[d > 1.1]
+    arc = np.arccos(x[:, 0] / d) - np.arccos(1 / d) - math.acos(1 / 3)
+    exact = np.where(arc <= 0, np.linalg.norm(x - (3, 0), axis=1), np.sqrt(d**2 - 1) + math.sqrt(8) + arc)
+    wrong = way.lengths(scene, x) - exact
+    assert np.abs(wrong).mean() < 0.05
+    assert np.abs(wrong).max() < 0.2
+
+
+def test_the_nearest_door_is_nearest_by_way_and_not_by_air() -> None:
+    """A wall lies before one of two points: by air it is 3 m away, by way 13 m, and the other is 6 m away."""
+    wall = (Wall(vertices=((2, -6), (2, 20)), radius=0.1),)
+    way = Way(targets=(Target(at=(3, 0)), Target(at=(-6, 0))), spacing=0.1, margin=1)
+    scene = Scene(groups=(walkers(1, (0, 0), (0, 0)),), obstacles=wall, effects=(way,))
+    assert way.lengths(scene, [0.0, 0.0]) == pytest.approx(6, abs=0.1)
+    one = way.model_copy(update={"targets": way.targets[:1]})
+    there, back, r = (
+        math.hypot(2, 6),
+        math.hypot(1, 6),
+        0.4,
+    )  # tangents to a disc around the end of the wall, and an arc
+    arc = 2 * math.pi - math.atan(2 / 6) - math.atan(1 / 6) - math.acos(r / there) - math.acos(r / back)
+    around = math.sqrt(there**2 - r**2) + math.sqrt(back**2 - r**2) + r * arc
+    assert one.lengths(scene.with_effects(one), [0.0, 0.0]) == pytest.approx(around, rel=0.04)
+
+
+def test_who_is_pushed_against_a_wall_is_as_near_as_he_is() -> None:
+    """Nearer to a jamb than the clearance no way is searched; lengths go on there, or people would turn away."""
+    way = Way(targets=(Target(ends=LEFT),), spacing=0.1)
+    scene = Scene(groups=(walkers(1, (5, 3), (5, 3)),), obstacles=ROOM, effects=(way,))
+    assert way.lengths(scene, [0.2, 3.2]) == pytest.approx(0.25, abs=0.15)
+    assert way.lengths(scene, [5.0, 0.3]) == pytest.approx(math.hypot(5, 2.6), abs=0.5)
+
+
+def test_a_thousand_places_of_a_plan_are_asked_for_once() -> None:
+    """What is near obstacles does not depend on targets: several share it."""
+    ground.cache_clear()
+    targets = tuple(Target(at=(x, 3.0)) for x in (2, 4, 6))
+    stages = tuple(Stage(at=target.at, radius=0.3) for target in targets)
+    Scene(groups=(walkers(2, (1, 1), (9, 5)),), obstacles=ROOM, effects=(Journey(stages=stages),))
+    assert ground.cache_info().misses == 1
+
+
+# --- journeys ---------------------------------------------------------------------------------------------------------
+
+STAGES = (
+    Stage(ends=((5, 1), (5, 5))),
+    Stage(at=(8, 3), radius=0.3, wait=Spread(low=1.0, high=2.0)),
+    Stage(ends=RIGHT),
+)
+THERE = Journey(group=0, stages=STAGES, premovement=Spread(low=0.5, high=1.5), then="leave", spacing=0.1)
+LOOP = Journey(
+    group=1, stages=(Stage(at=(7, 5), radius=0.3, around=False), Stage(at=(3, 5), radius=0.3, around=False)),
+    then="loop", spacing=0.1,
+)  # fmt: skip
+
+
+def travellers(dt: float = 0.02, **more: Any) -> Scene:
+    groups = (walkers(5, (1, 1), (4, 5)), walkers(3, (2, 4.5), (6, 5.5)))
+    return Scene(groups=groups, obstacles=ROOM, effects=(THERE, LOOP, Driving()), dt=dt, **more)
+
+
+def history(scene: Scene, seconds: float, name: str = "stage") -> tuple[Array, Array]:
+    """When, and what goes on inside everybody then, from the start to the end."""
+    state, times, found = scene.start(0), [0.0], []
+    found.append(np.array(scene.inner(state, name)[0]))
+    for _ in range(round(seconds / scene.dt)):
+        scene.step(state, out=state)
+        times.append(float(state.time[0]))
+        found.append(np.array(scene.inner(state, name)[0]))
+    return np.array(times), np.array(found)
+
+
+@pytest.mark.parametrize("dt", [0.01, 0.02, 0.05, 0.07])
+def test_places_come_in_order_and_waits_are_exact_for_every_dt(dt: float) -> None:
+    scene = travellers(dt)
+    times, stage = history(scene, 14)
+    table = scene.table_of(THERE)
+    drawn = table[3 * 9 : 3 * 9 + 5 * 4].reshape(5, 4)  # premovement, and a wait at each place
+    assert np.ptp(drawn[:, 0]) > 0.2
+    assert ((drawn[:, 2] >= 1) & (drawn[:, 2] <= 2)).all()
+    for i in range(5):
+        order = [stage[0, i], *stage[1:, i][np.diff(stage[:, i]) != 0]]
+        assert order == [-0.5, 0, 1, 1.5, 2, 3]
+        first = {value: times[np.argmax(stage[:, i] == value)] for value in order}
+        assert 0 <= first[0.0] - drawn[i, 0] < dt * 1.02  # it sets out with the first step after its time
+        assert 0 <= first[2.0] - first[1.5] - drawn[i, 2] < dt * 1.02
+    assert (stage[-1, 5:] <= 1).all()
+    assert (np.abs(np.diff(stage[:, 5:], axis=0)).sum(axis=0) >= 3).all()  # round and round
+
+
+def test_nobody_moves_before_he_sets_out_and_who_has_left_goes_straight_on() -> None:
+    scene = travellers()
+    start = scene.start(0)
+    early = scene.run(start, 24)
+    np.testing.assert_array_equal(early.pos[0, :5], start.pos[0, :5])
+    assert (np.linalg.norm(early.pos - start.pos, axis=-1)[0, 5:] > 0.05).all()
+    end = scene.run(early, 800)
+    assert (end.pos[0, :5, 0] > 12).all()
+    assert (end.pos[0, 5:, 0] < 8).all()
+    np.testing.assert_allclose(np.linalg.norm(end.vel[0, :5], axis=1), 1, atol=1e-3)
+
+
+def test_nobody_goes_through_a_wall() -> None:
+    scene = travellers()
+    state, clear = scene.start(3, 4), np.inf
+    for _ in range(140):
+        scene.step(state, out=state, steps=5)
+        clear = min(clear, *(float(wall.gap(state.pos).min()) for wall in ROOM))
+    assert clear > 0.15
+
+
+def test_journeys_do_not_depend_on_threads_batches_or_calls() -> None:
+    scene = travellers()
+    start = scene.start(5, 3)
+    end = scene.step(start, steps=300)
+    slow = start.copy()
+    for _ in range(300):
+        scene.step(slow, out=slow)
+    np.testing.assert_array_equal(slow.pos, end.pos)
+    np.testing.assert_array_equal(slow.inner, end.inner)
+    alone = scene.step(scene.start(6), steps=300)
+    np.testing.assert_array_equal(alone.pos[0], end.pos[1])
+    np.testing.assert_array_equal(alone.inner[:, 0], end.inner[:, 1])
+
+
+def test_who_is_born_begins_his_journey_and_leaves_through_a_sink() -> None:
+    scene = travellers(population=(
+        Emitter(group=0, place=Point(at=(1.0, 3.0)), rate=1.0),
+        Drain(group=0, shape=Wall(vertices=((11, 0), (11, 6)), radius=0.1)),
+    ))  # fmt: skip
+    state = scene.start(0)
+    assert not state.alive[0, :5].any()
+    kept: list[tuple[int, float]] = []
+    for _ in range(900):
+        was = state.identity[0].copy()
+        scene.step(state, out=state)
+        for i in np.flatnonzero((state.identity[0] != was) & state.alive[0]):
+            kept.append((int(i), float(scene.inner(state, "stage")[0, i])))
+            ready = scene.inner(state, "ready")[0, i] - state.time[0]
+            assert 0.5 <= ready <= 1.5
+    assert len(kept) > 7  # slots are used again
+    assert {stage for _, stage in kept} == {-0.5}
+
+
+# --- routes -----------------------------------------------------------------------------------------------------------
+
+
+def two_groups(groups: Any, routes: Any) -> Scene:
+    """Everybody in the room lines up behind his own group; one kernel for all tests."""
+    lines = tuple(Steer(group=k, behaviours=(LineUp(margin=0.1, group=k),)) for k in range(2))
+    return Scene(groups=groups, obstacles=ROOM, effects=(*routes, *lines), dt=0.02)
+
+
+def waiting(count: int, doors: tuple[Door, ...], at: Any, **more: Any) -> Array:
+    """Which door everybody heads for who thinks about it for 20 s, and does not walk."""
+    routes = tuple(Routes(group=k, doors=doors, spacing=0.1, share=0.0, period=0.5, **more) for k in range(2))
+    scene = two_groups((walkers(count, at, at), walkers(1, (5, 5), (5, 5))), routes)
+    return np.array(scene.inner(scene.run(scene.start(1), 1000), "door")[0, :count])
+
+
+EQUAL = (Door(ends=LEFT, width=1.0), Door(ends=RIGHT, width=1.0))
+
+
+def test_of_two_equal_doors_half_take_each_and_of_unequal_ones_as_computed() -> None:
+    """All stand in one place, so that half of those of a door are ahead: L1 + n1 / (2 J w1) = L2 + n2 / (2 J w2)."""
+    more = {"flow": 1.9, "hysteresis": 0.0}
+    assert abs((waiting(60, EQUAL, (5, 3), **more) == 0).sum() - 30) <= 3
+    assert abs((waiting(60, EQUAL, (3, 3), **more) == 0).sum() - (30 + 1.9 * 4)) <= 3
+    wide = (EQUAL[0], Door(ends=RIGHT, width=2.0))
+    assert abs((waiting(60, wide, (5, 3), **more) == 1).sum() - 40) <= 3
+
+
+def test_who_has_decided_stays_with_it_unless_another_door_is_quicker_by_the_hysteresis() -> None:
+    """Nine people 4.4 m from one door, 5.6 m from the other: 4.4 + 4 / 1.9 s against 5.6 s is 14 % more."""
+    assert (waiting(9, EQUAL, (4.4, 3), hysteresis=0.3) == 0).all()
+    assert 0 < (waiting(9, EQUAL, (4.4, 3), hysteresis=0.0) == 1).sum() < 5
+
+
+def test_an_assigned_door_is_used_by_everybody_and_all_get_out_for_any_threads() -> None:
+    groups = (walkers(20, (1, 1), (9, 5)), walkers(20, (1, 1), (9, 5)))
+    doors = (Door(ends=LEFT),), (Door(ends=RIGHT),)
+    scene = two_groups(groups, tuple(Routes(group=k, doors=doors[k], spacing=0.1) for k in range(2)))
+    start = scene.start(2, 3)
+    end = scene.run(start, 2500)
+    assert (end.pos[:, :20, 0] < 0).all()
+    assert (end.pos[:, 20:, 0] > 10).all()
+    np.testing.assert_array_equal(scene.inner(end, "door"), 1)
+    use_threads(2)
+    try:
+        again = scene.run(start, 2500)
+    finally:
+        use_threads(1)
+    np.testing.assert_array_equal(again.pos, end.pos)
+    np.testing.assert_array_equal(again.inner, end.inner)
+
+
+def test_a_group_in_another_order_goes_the_same_ways() -> None:
+    """Who is where decides, not his number: but of the times at which decisions fall, which are each one's own."""
+    routes = tuple(Routes(group=k, doors=EQUAL, spacing=0.1, period=0.02) for k in range(2))
+    scene = two_groups((walkers(20, (1, 1), (4, 5)), walkers(1, (5, 5), (5, 5))), routes)
+    start, order = scene.start(4), [*np.random.default_rng(0).permutation(20), 20]
+    mixed = start.copy()
+    for array in (mixed.x, mixed.v, mixed.inner):
+        array[...] = array[:, :, order]
+    end, other = scene.run(start, 300), scene.run(mixed, 300)
+    np.testing.assert_allclose(other.pos, end.pos[:, order], atol=1e-9)
+    np.testing.assert_array_equal(scene.inner(other, "door"), scene.inner(end, "door")[:, order])
+    assert len(np.unique(scene.inner(end, "door")[0, :20])) > 1
+
+
+@pytest.mark.slow
+def test_routes_of_a_large_crowd_do_not_depend_on_threads_or_calls() -> None:
+    """A large crowd is advanced by two threads together, and put in order where many steps are one call."""
+    routes = Routes(doors=EQUAL, spacing=0.1, period=0.2)
+    groups = (walkers(4200, (1, 1), (4, 5)),)
+    scene = Scene(groups=groups, obstacles=ROOM, effects=(routes, Steer(behaviours=(LineUp(margin=0.05),))), dt=0.02)
+    start = scene.start(0)
+    end = start.copy()
+    for _ in range(12):
+        scene.step(end, out=end)
+    assert (scene.inner(end, "door") != scene.inner(start, "door")).any()
+    use_threads(2)
+    try:
+        again = scene.step(start, steps=12)
+    finally:
+        use_threads(1)
+    np.testing.assert_array_equal(again.inner, end.inner)
+    np.testing.assert_array_equal(again.pos, end.pos)
+
+
+# --- in line, and past each other -------------------------------------------------------------------------------------
+
+
+def test_who_lines_up_stops_behind_whoever_is_ahead() -> None:
+    """The first does not walk, and the others come to rest a margin behind each other."""
+    groups = (walkers(1, (1, 3), (1, 3)), walkers(2, (4, 3), (6, 3)))
+    routes = tuple(Routes(group=k, doors=(Door(ends=RIGHT),), spacing=0.1) for k in range(2))
+    routes = (routes[0], routes[1].model_copy(update={"share": 0.0}))
+    lines = tuple(Steer(group=k, behaviours=(LineUp(margin=0.1, group=1 - k),)) for k in range(2))
+    scene = Scene(groups=groups, obstacles=ROOM, effects=(*routes, *lines), dt=0.02)
+    state, least = scene.start(0), np.inf
+    state.pos[0] = ((1, 3), (6, 3), (4.5, 4.5))
+    for _ in range(80):
+        scene.step(state, out=state, steps=10)
+        least = min(least, float(state.pos[0, 1, 0] - state.pos[0, 0, 0]))
+    np.testing.assert_allclose(state.pos[0, 0], (5.5, 3), atol=0.01)
+    np.testing.assert_array_equal(state.pos[0, 1:], ((6, 3), (4.5, 4.5)))
+    assert least > 0.5 - 1e-6
+
+
+def passing(second: Group, both: bool) -> Array:
+    """The paths of somebody who walks from -4 to 4 m, and of another; all but a bystander give way."""
+    give = UnalignedAvoidance(weight=120.0, radius=4.0, horizon=2.0, margin=0.1)
+    ways = (
+        Way(group=0, targets=(Target(at=(-30, 0)), Target(at=(4, 0))), slow_radius=0.5),
+        Way(group=1, targets=(Target(at=(30, 0)), Target(at=(-4, 0))), slow_radius=0.5, share=float(both)),
+    )
+    steers = (Steer(group=0, behaviours=(Driving(), give)), Steer(group=1, behaviours=(Driving(), give)))
+    scene = Scene(groups=(walkers(1, (-4, 0), (-4, 0)), second), effects=(*ways, *steers), dt=0.02)
+    state, path = scene.start(0), []
+    for _ in range(700):
+        scene.step(state, out=state)
+        path.append(state.pos[0].copy())
+    return np.array(path)
+
+
+def test_somebody_who_stands_is_passed_and_two_who_meet_head_on_both_keep_right() -> None:
+    """JuPedSim's T4 and T12: no overlap; who stands and does not care stays; two are each other's mirror image."""
+    path = passing(walkers(1, (0, 0), (0, 0), max_force=0), both=False)
+    assert np.linalg.norm(path[:, 0] - path[:, 1], axis=1).min() > 0.4
+    np.testing.assert_array_equal(path[:, 1], 0)
+    np.testing.assert_allclose(path[-1, 0], (4, 0), atol=0.01)
+    path = passing(walkers(1, (4, 0), (4, 0)), both=True)
+    assert np.linalg.norm(path[:, 0] - path[:, 1], axis=1).min() > 0.4
+    assert np.abs(path.sum(axis=1)).max() < 0.005
+    np.testing.assert_allclose(path[-1], ((4, 0), (-4, 0)), atol=0.01)
+    middle = np.argmin(np.abs(path[:, 0, 0]))
+    assert path[middle, 0, 1] < -0.1  # to the right of who comes from the left
+
+
+# --- what cannot be ---------------------------------------------------------------------------------------------------
+
+DOOR = Door(ends=LEFT)
+
+
+@pytest.mark.parametrize(
+    ("make", "text"),
+    [
+        (lambda: Target(), "at: give one of at, ends, or low and high"),
+        (lambda: Target(at=(1, 1), low=(0, 0), high=(1, 1)), "at: give one of"),
+        (lambda: Target(low=(0, 2), high=(1, 1)), r"low = \(0.0, 2.0\): must not be above high"),
+        (lambda: Target(ends=((0, 2), (0, 2))), "is a point; give at"),
+        (lambda: Stage(at=(1, 1)), "radius = 0: a point is reached within a radius"),
+        (lambda: Door(at=(1, 1), radius=1), "width = None: a door without ends needs one"),
+        (lambda: Way(targets=()), "targets: must be a list of at least 1"),
+        (lambda: Journey(stages=()), "stages: must be a list of at least 1"),
+        (lambda: Routes(doors=()), "doors: must be a list of at least 1"),
+        (
+            lambda: Way(targets=(Target(at=(0, 1)),)),
+            r"targets\[0\] = \(0.0, 1.0\): is -0.1 m from an obstacle",
+        ),
+        (
+            lambda: Way(targets=(Target(at=(3, 3)), Target(ends=((0, 0), (0, 1))))),
+            r"targets\[1\] = .*: is at most -0.1 m",
+        ),
+        (lambda: Way(targets=(Target(at=(1, 2, 3)),)), r"targets\[0\] = \(1.0, 2.0, 3.0\): dimension = 2"),
+        (lambda: Way(targets=(Target(at=(3, 3)),), clearance=0.1, spacing=0.5), "must be below 0.4 m, twice clearance"),
+        (lambda: Way(targets=(Target(at=(3, 3)),), group=4), "group = 4: there are 1 groups"),
+        (
+            lambda: Way(targets=(Target(at=(12, 3)),), clearance=1.0),
+            r"targets\[0\] = \(12.0, 3.0\): no way leads",
+        ),
+        (lambda: Way(targets=(Target(at=(3, 3)),), spacing=1e-4), "points, at most"),
+        (lambda: Journey(stages=(Stage(at=(5, 0), radius=0.1),)), r"stages\[0\] = \(5.0, 0.0\): is -0.1 m"),
+        (lambda: Routes(doors=(DOOR, Door(ends=((0, 0), (0, 1))))), r"doors\[1\] = .*: is at most -0.1 m"),
+    ],
+)
+def test_what_cannot_be_is_refused_in_one_line(make: Any, text: str) -> None:
+    with pytest.raises(ValueError, match=text) as error:
+        Scene(groups=(walkers(2, (2, 2), (3, 3)),), obstacles=ROOM, effects=(make(),))
+    assert "\n" not in str(error.value)
+
+
+def test_two_journeys_of_one_group_are_refused_and_so_is_a_choice_without_a_speed() -> None:
+    groups = (walkers(2, (2, 2), (3, 3)), walkers(2, (2, 2), (3, 3)))
+    with pytest.raises(ValueError, match=r"effects\[0\].group = 0: effects\[1\], a routes, says too where"):
+        Scene(groups=groups, obstacles=ROOM, effects=(THERE, Routes(doors=(DOOR,))))
+    slow = Group(count=1, spawn=Spawn(low=(2, 2), high=(3, 3)))
+    with pytest.raises(ValueError, match=r"groups\[0\].desired_speed = None: give m/s"):
+        Scene(groups=(slow,), obstacles=ROOM, effects=(Routes(doors=(DOOR,)),))
