@@ -45,8 +45,9 @@ class Collisions(Constraint):
 
     All end with passes over who is near then, so that none of them overlap; who is moved further than a tenth of his
     radius by them may end in somebody who was not near (docs/collisions.md says when: steps of 1/400 s help heaps that
-    a wall drives). Restitution e is speed after over speed before, across the surface; friction is Coulomb's. A ball dropped from h bounces to e^2 h, and is at rest after
-    sqrt(2 h / g) (1 + e) / (1 - e); a body sticks on an incline up to tan(angle) = friction. Bodies do not spin.
+    a wall drives). Restitution e is speed after over speed before, across the surface; friction is Coulomb's. A ball
+    dropped from h bounces to e^2 h, and is at rest after sqrt(2 h / g) (1 + e) / (1 - e); a body sticks on an incline
+    up to tan(angle) = friction. Bodies do not spin.
     """
 
     kind: Literal["collisions"] = "collisions"
