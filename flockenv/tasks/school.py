@@ -317,13 +317,17 @@ def measure(p: Any, before: Frame, after: Frame, numbers: Any) -> None:
 
 @kernel
 def observe(p: Any, frame: Frame, rows: Any) -> None:
-    """Own velocity, walls, hunger, fear; hunters, food and fish in sight, nearest first. Who is out sees nothing."""
+    """Own velocity, walls, hunger, fear; hunters, food and fish in sight, nearest first.
+
+    Who is out sees nothing but a hunger of 1, at no distance from any wall: no row of a living fish is like it.
+    """
     fish, foes, n = int(p.fish), int(p.fish + p.hunters), frame.pos.shape[1]
     for i in range(rows.shape[0]):
         row = rows[i]
         for c in range(row.shape[0]):
             row[c] = 0.0
         if not frame.alive[i]:
+            row[6] = 1.0
             continue
         for k in range(2):
             row[k] = clip(frame.vel[k, i] / p.fish_speed)
