@@ -121,7 +121,7 @@ def build(task: Task, p: PpoSettings, tensorboard: str | None) -> PPO:
     """Make the worlds and the model; how many threads they use is for `on_threads` to say."""
     torch.manual_seed(p.seed)
     learned = task.model_copy(update={"dtype": p.dtype})
-    worlds = ForLearning(WorldVecEnv(learned, p.worlds), p.reward_scale, p.stagger)
+    worlds = ForLearning(WorldVecEnv(learned, p.worlds, leaving=not task.ends_together), p.reward_scale, p.stagger)
     model = PPO(
         "MlpPolicy",
         worlds,

@@ -58,6 +58,12 @@ RANGES: dict[str, dict[str, tuple[float, float]]] = {
         "time": (0.05, 0.8), "lead": (0.1, 0.8), "tube": (0.0, 1.0), "keep": (0.3, 0.99), "speed": (0.5, 1.0),
         "grip": (0.3, 2.5), "early": (0.2, 1.5), "brake": (0.0, 12.0), "gain": (1.0, 12.0),
     },
+    "school": {
+        "escape": (0.05, 1.0), "school": (0.05, 1.0), "need": (0.05, 0.8), "calm": (0.0, 0.2), "content": (0.0, 0.6),
+        "wall": (0.1, 1.5), "apart": (0.0, 4.0), "predict": (0.0, 2.0), "evade": (1.0, 8.0), "middle": (0.0, 1.5),
+        "forage": (1.0, 8.0), "rich": (0.0, 20.0), "match": (0.0, 5.0), "centre": (0.0, 3.0), "pace": (0.1, 1.0),
+        "turn": (0.0, 1.0),
+    },
 }  # fmt: skip
 """Where each parameter is looked for."""
 

@@ -29,6 +29,7 @@ if TYPE_CHECKING:
         Obstacles,
         PathFollow,
         Pursuit,
+        School,
         Task,
     )
     from flockenv.world import Step, World
@@ -46,6 +47,7 @@ __all__ = [
     "PathFollow",
     "Pursuit",
     "Scene",
+    "School",
     "Snapshot",
     "State",
     "Step",
@@ -67,6 +69,7 @@ _HOME = {
     "Obstacles": "tasks",
     "PathFollow": "tasks",
     "Pursuit": "tasks",
+    "School": "tasks",
     "Task": "tasks",
     "Step": "world",
     "World": "world",

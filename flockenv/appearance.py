@@ -18,7 +18,7 @@ Size = Annotated[float, Field(ge=0)]
 
 
 class Appearance(Record):
-    """Points, discs or polygons, whose colour, opacity and size may change with age or speed; and the way behind them.
+    """Points, discs or polygons, whose colour, opacity and size may change with age, speed or what goes on inside.
 
     `by` and `over` say when there is the first and when the last of colours, opacities and sizes; between, a mixture.
     """
@@ -30,8 +30,13 @@ class Appearance(Record):
         default=((1.0, 0.0), (-0.8, 0.6), (-0.8, -0.6)), min_length=3, max_length=64,
         description="corners of a polygon, x ahead, in units of its size",
     )  # fmt: skip
-    by: Literal["age", "speed"] | None = Field(default=None, description="with what it changes; none = not at all")
-    over: tuple[float, float] = Field(default=(0.0, 1.0), description="s or m/s, from where to where it changes")
+    by: Literal["age", "speed", "inner"] | None = Field(
+        default=None, description="with what it changes; none = not at all"
+    )
+    of: str | None = Field(default=None, description="name of what goes on inside, where it changes by inner")
+    over: tuple[float, float] = Field(
+        default=(0.0, 1.0), description="s, m/s, or as that is counted: from where to where it changes"
+    )
     colours: tuple[Colour, ...] = Field(
         default=(), description="#rrggbb, from the first to the last, evenly; none = its role's"
     )
@@ -47,14 +52,19 @@ class Appearance(Record):
         changes = len(self.colours) > 1 or self.opacity[0] != self.opacity[1]
         changes |= self.size is not None and self.size[0] != self.size[1]
         if changes and self.by is None:
-            raise ValueError("by: missing; colours, opacity or size change with age or with speed")
+            raise ValueError("by: missing; colours, opacity or size change with age, speed, or what goes on inside")
+        if (self.by == "inner") != (self.of is not None):
+            raise ValueError(f"of = {self.of}: goes with by = inner, and says which number")
         return self
 
-    def shade(self, age: NDArray[np.float64], speed: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return how far along its range everybody is, (N,) from 0 to 1."""
-        if self.by is None:
+    def shade(
+        self, age: NDArray[np.float64], speed: NDArray[np.float64], inner: NDArray[np.float64] | None = None
+    ) -> NDArray[np.float64]:
+        """Return how far along its range everybody is, (N,) from 0 to 1; `inner` is the number that it names."""
+        value = {"age": age, "speed": speed, "inner": inner}.get(self.by or "")
+        if value is None:
             return np.zeros(len(age))
-        value = np.nan_to_num(age if self.by == "age" else speed, posinf=self.over[1])
+        value = np.nan_to_num(value, posinf=self.over[1])
         return np.asarray(np.clip((value - self.over[0]) / (self.over[1] - self.over[0]), 0.0, 1.0))
 
     def colour(self, shade: float, usual: str) -> tuple[int, int, int]:

@@ -22,11 +22,12 @@ from pydantic import Field
 from flockenv.kernels import OPTIONS, Vec, law, like, replaced
 from flockenv.noise import uniform
 from flockenv.records import Record
+from flockenv.urges import INTENTIONS
 from flockenv.vec import add, axis, cross, dot, limit, norm, perpendicular, scale, select, unit, zero
 
 __all__ = [
-    "ARBITRATIONS", "Allocation", "AnyArbitration", "Arbitration", "Blend", "ContextSteering", "Dithering", "Priority",
-    "RoundRobin", "RunningSum", "allocate", "allocate_running", "blend", "prioritise",
+    "ARBITRATIONS", "Allocation", "AnyArbitration", "Arbitration", "Blend", "ContextSteering", "Dithering",
+    "Intentions", "Priority", "RoundRobin", "RunningSum", "allocate", "allocate_running", "blend", "prioritise",
 ]  # fmt: skip
 
 Wishes = tuple[Vec, ...]
@@ -372,6 +373,41 @@ class ContextSteering(Arbitration):
     dangers: int = Field(default=1, ge=0, description="how many behaviours, from the first on, avert a danger")
     directions: int = Field(default=24, ge=4, le=256, description="how many directions are weighed")
     law: ClassVar[str] = "by_context"
+
+
+@law
+def by_intention(p: Any, me: Any, wishes: Wishes) -> tuple[Vec, Shares]:
+    """Those that are always heard and those of the intention, until their lengths have used up the budget."""
+    shares, left = no_shares(wishes), me.max_force
+    o, e = like(left, 0.0), like(left, 1.0)
+    for k in range(len(wishes)):
+        length = norm(wishes[k])
+        heard = (p.when[k] < o) | (p.when[k] == me.inner.intention)
+        whole = length <= left
+        share = e if whole else left / length
+        shares = replaced(shares, k, share if heard else o)
+        left = left - (length if whole else left) if heard else left
+    return granted(wishes, shares), shares
+
+
+class Intentions(Arbitration):
+    """A finite state machine's: each behaviour is heard in one state alone, or always (avoid); the others get nothing.
+
+    Which state it is an effect `intention` keeps. Those that are heard share max_force as in allocation, in order.
+    """
+
+    kind: Literal["intentions"] = "intentions"
+    when: tuple[Literal["avoid", "escape", "eat", "mate", "school", "wander"], ...] = Field(
+        min_length=1, description="when each behaviour is heard; avoid = always"
+    )
+    law: ClassVar[str] = "by_intention"
+    recalls: ClassVar[tuple[str, ...]] = ("intention",)
+
+    def parameters(self, wishes: int) -> dict[str, float | Vec]:
+        """The number of a state for each wish; -1 = always."""
+        if len(self.when) != wishes:
+            raise ValueError(f"arbitration.when = {list(self.when)}: must be one for each of {wishes} behaviours")
+        return {"when": tuple(float(INTENTIONS.index(name)) if name != "avoid" else -1.0 for name in self.when)}
 
 
 if TYPE_CHECKING:

@@ -66,19 +66,22 @@ class WorldVecEnv(VecEnv):
     Seeds: `seed(s)` gives world k the seed s + k at the next reset; a world goes on with the next episodes of its seed.
 
     Args:
-        task: of which all learners of a world end together.
+        task: of which all learners of a world end together, unless `leaving`.
         worlds: B.
         time_limit: decisions after which a world is truncated; None = the task's own horizon.
         render_mode: "rgb_array" (world 0) or None.
+        leaving: let learners end one by one. A row is done when its learner is; until its world begins anew it is paid
+            nothing and is done in every step, so that nothing that is learned of it reaches across.
 
     Raises:
-        ValueError: the task's learners end one by one, for which a row has no meaning after its end.
+        ValueError: the task's learners end one by one, for which a row has no meaning after its end, and not `leaving`.
     """
 
     def __init__(
-        self, task: Task, worlds: int = 1, time_limit: int | None = None, render_mode: str | None = None
-    ) -> None:
-        self.task = together(task)
+        self, task: Task, worlds: int = 1, time_limit: int | None = None, render_mode: str | None = None,
+        leaving: bool = False,
+    ) -> None:  # fmt: skip
+        self.task = task if leaving else together(task)
         self.world = World(task, worlds, time_limit=task.horizon if time_limit is None else time_limit)
         self.render_mode = render_mode
         self._screen = Screen(render_mode, render_fps(task), modes=("rgb_array",))
@@ -123,28 +126,29 @@ class WorldVecEnv(VecEnv):
         if actions is None:
             raise ResetNeeded("step_wait: there are no actions; call step_async(actions) first")
         result = self.world.step(actions)
-        ended = result.truncated | result.terminated[:, 0]  # all learners of a world end together
+        ended = result.truncated | result.terminated.all(axis=1)
         infos: list[Info] = [NOTHING] * self.num_envs
         if ended.any():
             self._tell(infos, result, np.flatnonzero(ended))
             self.world.reset(mask=ended, into=result.observation)
-        return self._rows(result.observation), result.reward.reshape(-1), np.repeat(ended, self.task.learners), infos
+        done = (ended[:, None] | result.terminated).reshape(-1)
+        return self._rows(result.observation), result.reward.reshape(-1), done, infos
 
     def _tell(self, infos: list[Info], result: Step, worlds: NDArray[np.intp]) -> None:
         """Write how the episodes that end in this step ended; the only loop over rows."""
         learners, of_world = self.task.learners, self._ends(result, worlds)
         rows = (worlds[:, None] * learners + np.arange(learners)).ravel().tolist()
         paid = named(self.task.terms, self.world.paid[worlds].reshape(len(rows), -1))
-        seen = self._rows(result.observation[worlds])
+        seen, over = self._rows(result.observation[worlds]), result.terminated.reshape(-1).tolist()
         for k, (row, terms, last) in enumerate(zip(rows, paid, seen, strict=True)):
             infos[row] = info = of_world[k // learners].copy()
             info["terms"], info["terminal_observation"] = terms, last
+            info["TimeLimit.truncated"] = bool(result.truncated[row // learners]) and not over[row]
 
     def _ends(self, result: Step, worlds: NDArray[np.intp]) -> list[Info]:
         """Return what all rows of a world are told of its end, for each of these worlds."""
         columns = {name: column[worlds].tolist() for name, column in self.world.measure().items()}
         columns["is_success"] = result.success[worlds].tolist()
-        columns["TimeLimit.truncated"] = (result.truncated & ~result.terminated[:, 0])[worlds].tolist()
         ends = (dict(zip(columns, values, strict=True)) for values in zip(*columns.values(), strict=True))
         return [{name: value for name, value in end.items() if value == value} for end in ends]  # NaN: no value
 

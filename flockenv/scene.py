@@ -289,6 +289,10 @@ class Scene(Record):
                         f"effects[{k}].kind = {each.kind}: needs {missing[0]!r}, which no effect of this scene keeps; "
                         f"{' or '.join(keepers) or 'none'} does"
                     )
+        for k, group in enumerate(self.groups):
+            if group.appearance is not None and group.appearance.of not in {None, *kept}:
+                of = group.appearance.of
+                raise ValueError(f"groups[{k}].appearance.of = {of!r}: no effect of this scene keeps it")
 
     def _check_space(self) -> None:
         size = getattr(self.space, "size", None)
@@ -890,8 +894,19 @@ class Scene(Record):
             outlines=self.outlines(low, high, float(state.time[world])),
             looks=self.looks, look=self.look if self.looks else None,
             age=state.age[world] if self.population else None,
-            identity=state.identity[world] if self.population else None,
+            identity=state.identity[world] if self.population else None, inner=self.shown(state, world),
         )  # fmt: skip
+
+    def shown(self, state: State, world: int = 0) -> NDArray[np.float64] | None:
+        """Return the number inside everybody that pictures show, (N,): what his look is about; none if no look is."""
+        if not any(look.by == "inner" for look in self.looks):
+            return None
+        shown = np.zeros(self.agents)
+        for k, group in enumerate(self.groups):
+            if group.appearance is not None and group.appearance.of is not None:
+                mine = slice(self.starts[k], self.starts[k + 1])
+                shown[mine] = self.inner(state, group.appearance.of)[world, mine]
+        return shown
 
     @property
     def looks(self) -> tuple[Appearance, ...]:

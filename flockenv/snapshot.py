@@ -57,6 +57,7 @@ class Snapshot:
     heading (N, D): where everybody faces; none by default, and then that is along the velocity.
     looks: how some are drawn; look (N,): which of these everybody has, -1 = none. age (N,): s, of the living; none by
     default, and then it is the time. identity (N,): int, who is in each row; none by default, and then always the same.
+    inner (N,): what goes on inside of what one's look is about; none by default.
     Arrays are private copies and read-only; positions and velocities may hold NaN or inf (a run that diverged can be
     looked at: such bodies are left out), everything else is finite.
     Raises ValueError or TypeError, in one line that names the field, on anything else.
@@ -82,6 +83,7 @@ class Snapshot:
     look: NDArray[np.int32] | None = None
     age: Floats | None = None
     identity: NDArray[np.int64] | None = None
+    inner: Floats | None = None
 
     def __post_init__(self) -> None:
         pos = _array("Snapshot.pos", self.pos, (None, None), finite=False)
@@ -109,6 +111,7 @@ class Snapshot:
             look=_whole("Snapshot.look", np.full(agents, -1) if self.look is None else self.look, agents),
             age=None if self.age is None else _array("Snapshot.age", self.age, (agents,)),
             identity=None if self.identity is None else _whole("Snapshot.identity", self.identity, agents),
+            inner=None if self.inner is None else _array("Snapshot.inner", self.inner, (agents,)),
         )
         if self.look is not None and not (self.look < len(self.looks)).all():
             raise ValueError(f"Snapshot.look: must be below {len(self.looks)}, the number of looks")
@@ -141,7 +144,7 @@ class Snapshot:
             speed = np.linalg.norm(self.vel, axis=1)
         for k, look in enumerate(self.looks):
             mine = self.look == k
-            shade[mine] = look.shade(age[mine], speed[mine])
+            shade[mine] = look.shade(age[mine], speed[mine], None if self.inner is None else self.inner[mine])
         return shade
 
     def same(self, other: Snapshot) -> NDArray[np.bool_]:

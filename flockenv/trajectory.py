@@ -51,6 +51,7 @@ class Trajectory:
     heading: Floats | None = None  # (T, N, D) where everybody faces, of scenes that keep headings
     identity: NDArray[np.int64] | None = None  # (T, N) who is in each slot, of scenes with a population
     born: NDArray[np.float64] | None = None  # (T, N) s, since when
+    shown: NDArray[np.float64] | None = None  # (T, N) what goes on inside, of scenes whose pictures show it
 
     @property
     def rate(self) -> float:
@@ -74,6 +75,7 @@ class Trajectory:
                 heading=None if self.heading is None else self.heading[k], outlines=walls,
                 identity=None if self.identity is None else self.identity[k],
                 age=None if self.born is None else time - self.born[k],
+                inner=None if self.shown is None else self.shown[k],
             )  # fmt: skip
 
     def summary(self) -> dict[str, Any]:
@@ -97,10 +99,11 @@ class Trajectory:
 
         Arrays: time (T,) s, pos (T, N, D) m, vel (T, N, D) m/s, alive (T, N), radius (N,) m, seed, and `scene`, the
         YAML text that `load_scene` reads; heading (T, N, D) where headings are kept; identity and born (T, N), s, where
-        there is a population. None needs pickle. Missing folders are made.
+        there is a population; shown (T, N), where pictures show what goes on inside. None needs pickle. Missing folders
+        are made.
         """
         path.parent.mkdir(parents=True, exist_ok=True)
-        kept = {"heading": self.heading, "identity": self.identity, "born": self.born}
+        kept = {"heading": self.heading, "identity": self.identity, "born": self.born, "shown": self.shown}
         more: dict[str, Any] = {name: array for name, array in kept.items() if array is not None}
         with replacing(path) as file:
             np.savez(
@@ -147,7 +150,7 @@ def record(
     return Trajectory(
         scene, seed, step, film.pos[:n], film.vel[:n], film.alive[:n], first, last, wall, stopped,
         None if film.heading is None else film.heading[:n], None if film.identity is None else film.identity[:n],
-        None if film.born is None else film.born[:n],
+        None if film.born is None else film.born[:n], None if film.shown is None else film.shown[:n],
     )  # fmt: skip
 
 
@@ -161,6 +164,8 @@ class _Film:
     heading: Floats | None
     identity: NDArray[np.int64] | None
     born: NDArray[np.float64] | None
+    shown: NDArray[np.float64] | None
+    scene: Scene
     step: list[int]
 
     @classmethod
@@ -168,7 +173,9 @@ class _Film:
         shape = (instants, scene.agents, scene.dimension)
         pos, vel, heading = (np.empty(shape, scene.dtype) for _ in range(3))
         who, since = (np.empty(shape[:2], np.int64), np.empty(shape[:2])) if scene.population else (None, None)
-        return cls(pos, vel, np.empty(shape[:2], np.bool_), heading if scene.parts.oriented else None, who, since, [])
+        faced = heading if scene.parts.oriented else None
+        shown = np.empty(shape[:2]) if any(look.by == "inner" for look in scene.looks) else None
+        return cls(pos, vel, np.empty(shape[:2], np.bool_), faced, who, since, shown, scene, [])
 
     def keep(self, state: State) -> None:
         """Add an instant, unless it is there already."""
@@ -179,6 +186,8 @@ class _Film:
                 self.heading[k] = state.heading[0]
             if self.identity is not None and self.born is not None:
                 self.identity[k], self.born[k] = state.identity[0], state.born[0]
+            if self.shown is not None:
+                self.shown[k] = self.scene.shown(state)
             self.step.append(step)
 
 
@@ -187,7 +196,7 @@ def _checked_instants(scene: Scene, steps: int, every: int) -> int:
         raise ValueError(f"steps = {steps} must be at least 0 and every = {every} at least 1")
     instants = 1 + -(-steps // every)
     each = scene.agents * ((2 + scene.parts.oriented) * scene.dimension * np.dtype(scene.dtype).itemsize + 1)
-    each += 16 * scene.agents * bool(scene.population)
+    each += (16 * bool(scene.population) + 8 * any(look.by == "inner" for look in scene.looks)) * scene.agents
     needed = instants * (each + 40)  # the step is a Python number in a list
     if needed > MEMORY_LIMIT:
         rarer = every * math.ceil(needed / MEMORY_LIMIT) * scene.dt

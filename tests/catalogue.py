@@ -25,6 +25,7 @@ from flockenv.arbitration import (
     Blend,
     ContextSteering,
     Dithering,
+    Intentions,
     Priority,
     RoundRobin,
     RunningSum,
@@ -86,13 +87,19 @@ from flockenv.effects import (
     Drag,
     Effect,
     Elastic,
+    Fear,
     Fluctuation,
     Goal,
     Gravitation,
     Gravity,
+    Grazing,
+    Intention,
     InverseSquare,
     Journey,
+    Libido,
+    Metabolism,
     ObstacleContact,
+    Predation,
     Pressure,
     QuadraticDrag,
     Routes,
@@ -132,7 +139,7 @@ from flockenv.space import Box, Plane, Space, Torus
 from flockenv.spawn import Spawn
 from flockenv.steer import Steer
 from flockenv.targets import Target
-from flockenv.tasks import Crossing, Flock, Herd, Obstacles, PathFollow, Pursuit, Task
+from flockenv.tasks import Crossing, Flock, Herd, Obstacles, PathFollow, Pursuit, School, Task
 from flockenv.tasks import Evade as EvadeTask
 
 Array = NDArray[np.float64]
@@ -236,6 +243,9 @@ ARBITRATION = (arbitration.blend, arbitration.prioritise, arbitration.allocate, 
 
 ARBITRATIONS = (Blend(), Priority(), Dithering(), Allocation(), RunningSum(), RoundRobin(), ContextSteering())
 """Those that a `Steer` effect may be given; tests/test_arbitration.py tries all of them."""
+
+RECALLING = (Intentions(when=("avoid", "escape", "eat", "mate", "school", "wander")),)
+"""Those that ask what goes on inside agents, so that no scene may have them alone; see tests/test_school.py."""
 
 
 # --- effects ----------------------------------------------------------------------------------------------------------
@@ -370,6 +380,13 @@ EFFECTS = (
         beside=(DRIVING,), dimensions=(2,), obeys=frozenset(),
     ),
     EffectRow(LineUp(margin=0.1, radius=2.5), beside=(Goal(target=CENTRE, slow_radius=2),)),
+    # what goes on inside moves nobody; tests/test_school.py asks what it is
+    EffectRow(Metabolism(rate=0.1, effort=0.1, spread=0.4), family="urges", obeys=frozenset()),
+    EffectRow(Grazing(group=0, other=1, radius=1.0, appetite=0.8), family="urges", obeys=frozenset()),
+    EffectRow(Predation(group=1, other=0, radius=0.8, meal=0.2), family="urges", obeys=frozenset()),
+    EffectRow(Fear(group=0, other=1, radius=2.5), family="urges", obeys=frozenset()),
+    EffectRow(Libido(radius=1.0, start=0.4, spread=0.6), family="urges", obeys=frozenset()),
+    EffectRow(Intention(), family="urges", obeys=frozenset()),
     EffectRow(WallRepulsion(point=CENTRE, normal=(1.2, -0.7, 0.9), strength=2, decay=1.5)),
     EffectRow(ObstacleContact(stiffness=30, damping=4, friction=8, coulomb=0.6, most=5)),
     EffectRow(Contact(stiffness=20, ratio=0.3, damping=0.1, friction=6, coulomb=0.5, most=4, radius=0.5)),
@@ -551,6 +568,8 @@ TASKS = (
     TaskRow(PathFollow()),
     TaskRow(Herd()),
     TaskRow(Herd(dogs=3), "_team"),
+    TaskRow(School()),
+    TaskRow(School(learners=1), "_single"),
 )
 
 

@@ -342,4 +342,4 @@ def test_wishes_of_a_wrong_shape_are_refused() -> None:
 
 
 def test_every_kind_is_registered_once() -> None:
-    assert sorted(ARBITRATIONS) == sorted(a.kind for a in catalogue.ARBITRATIONS)
+    assert sorted(ARBITRATIONS) == sorted(a.kind for a in (*catalogue.ARBITRATIONS, *catalogue.RECALLING))

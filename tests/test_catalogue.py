@@ -78,7 +78,7 @@ def test_every_behaviour_has_a_row() -> None:
 def test_every_arbitration_has_a_row() -> None:
     assert {law.py_func.__name__ for law in catalogue.ARBITRATION} == {n for n in arbitration.__all__ if n.islower()}
     kinds = {kind for kind, row in arbitration.ARBITRATIONS.items() if row.__module__.startswith("flockenv.")}
-    assert {row.kind for row in catalogue.ARBITRATIONS} == kinds
+    assert {row.kind for row in (*catalogue.ARBITRATIONS, *catalogue.RECALLING)} == kinds
 
 
 def test_every_space_has_a_row() -> None:

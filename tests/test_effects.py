@@ -48,8 +48,10 @@ EVERY_ROW = pytest.mark.parametrize("row", EFFECTS, ids=lambda row: row.name)
 """For tests that compile nothing."""
 
 
-ELSEWHERE = {"flockenv.effects.fields", "flockenv.effects.tether", "flockenv.effects.attraction"}
-"""Effects of these files have quick tests in test_fields.py, test_closed_forms.py and test_springs.py."""
+ELSEWHERE = {
+    "flockenv.effects.fields", "flockenv.effects.tether", "flockenv.effects.attraction", "flockenv.effects.urges",
+}  # fmt: skip
+"""Effects of these files have quick tests in test_fields.py, test_closed_forms.py, test_springs.py, test_school.py."""
 
 
 def among(rows: Iterable[EffectRow]) -> pytest.MarkDecorator:
@@ -455,7 +457,7 @@ def test_an_idle_effect_is_an_absent_one(row: EffectRow, dimension: int) -> None
 def test_it_calls_for_what_it_says_and_for_nothing_else(row: EffectRow, dimension: int) -> None:
     scene = scene_under(row, dimension)
     end = scene.run(scene.start(3, worlds=2), 10)
-    agents, asks = scene.agents, row.effect.calls_for()
+    agents, asks = scene.agents, {what for effect in scene.effects for what in effect.calls_for()}
     assert end.counted("evaluations") == 2 * 10
     assert end.counted("neighbour_queries") == (2 * 10 if "neighbour query" in asks else 0)
     assert end.counted("pairs") == (2 * 10 * agents * agents if {"neighbour query", "all others"} & {*asks} else 0)

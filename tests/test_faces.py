@@ -6,7 +6,7 @@ import pettingzoo
 import pytest
 
 from flockenv.sb3 import WorldVecEnv
-from flockenv.tasks import Crossing, Evade, Flock, Herd, Obstacles, Pursuit
+from flockenv.tasks import Crossing, Evade, Flock, Herd, Obstacles, Pursuit, School
 from flockenv.world import World
 
 SEED, LIMIT, STEPS = 21, 15, 40
@@ -17,6 +17,7 @@ ALONE = {
     "Evade": (Evade(), {}),
     "Herd": (Herd(), {}),
     "Crossing": (Crossing(agents=8, learners=1), {"agents": 8}),
+    "School": (School(learners=1, metabolism=0.4), {"metabolism": 0.4}),
 }
 """Per id: a task with one learner, and the parameters with which make() gives just that task."""
 
@@ -152,11 +153,15 @@ def test_many_learners_through_every_face_that_takes_them():
     assert through_turns("flockenv/Flock-v0", parameters, actions) == expected
 
 
-def test_a_game_in_which_agents_leave():
-    task = Pursuit(pursuers=3, evaders=2, sides="both")
-    actions = sequence(task)
-    parallel = through_parallel("flockenv/Pursuit-v0", {}, actions)
-    assert parallel == through_turns("flockenv/Pursuit-v0", {}, actions)
+@pytest.mark.parametrize(
+    ("task", "parameters"),
+    [(Pursuit(pursuers=3, evaders=2, sides="both"), {}), (School(metabolism=0.4), {"metabolism": 0.4})],
+    ids=["pursuit", "school"],
+)
+def test_a_game_in_which_agents_leave(task, parameters):
+    actions, env_id = sequence(task), f"flockenv/{type(task).__name__}-v0"
+    parallel = through_parallel(env_id, parameters, actions)
+    assert parallel == through_turns(env_id, parameters, actions)
     for log, whole in zip(parallel, through_world(task, actions), strict=True):
         # The World goes on to write about an agent that left; the others say nothing about it.
         assert [e for e in whole if e in log] == log

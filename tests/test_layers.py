@@ -18,7 +18,7 @@ ROOT = Path(__file__).resolve().parent.parent
 LAYERS = (
     {"divergence", "terminal", "refusals", "outputs", "recycle", "crew", "compilation", "inlining", "frontend"},
     {"records", "vec", "elementary", "noise", "kernels", "targets"},
-    {"state", "space", "steering", "arbitration", "vehicle", "appearance", "spread"},
+    {"state", "space", "steering", "arbitration", "vehicle", "appearance", "spread", "urges"},
     {"neighbours", "shapes", "grid", "eikonal", "orca", "polyline", "rows", "networks", "elements", "tree"},
     {"effects", "integrators", "constraints", "population", "spawn", "sweep", "stability", "rounding", "ways"},
     {"behaviours"},

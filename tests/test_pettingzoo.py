@@ -12,7 +12,7 @@ import pytest
 from gymnasium.error import ResetNeeded
 from gymnasium.utils.env_checker import data_equivalence
 
-from flockenv.envs import crossing_v0, flock_v0, pursuit_v0
+from flockenv.envs import crossing_v0, flock_v0, pursuit_v0, school_v0
 
 with warnings.catch_warnings():
     warnings.simplefilter("ignore", DeprecationWarning)  # on import it loads its own example the deprecated way
@@ -26,10 +26,11 @@ with warnings.catch_warnings():
         state_test,
     )
 
-MODULES = (crossing_v0, flock_v0, pursuit_v0)
-CROSSING, FLOCK, PURSUIT = "flockenv/Crossing-v0", "flockenv/Flock-v0", "flockenv/Pursuit-v0"
-IDS = (CROSSING, FLOCK, PURSUIT)
-SMALL = {CROSSING: {"agents": 5}, FLOCK: {"agents": 6}, PURSUIT: {}}
+MODULES = (crossing_v0, flock_v0, pursuit_v0, school_v0)
+CROSSING, FLOCK = "flockenv/Crossing-v0", "flockenv/Flock-v0"
+PURSUIT, SCHOOL = "flockenv/Pursuit-v0", "flockenv/School-v0"
+IDS = (CROSSING, FLOCK, PURSUIT, SCHOOL)
+SMALL = {CROSSING: {"agents": 5}, FLOCK: {"agents": 6}, PURSUIT: {}, SCHOOL: {"metabolism": 0.2}}
 
 
 @pytest.fixture(autouse=True)

@@ -24,7 +24,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecCheckNan, VecMonito
 from agents import reynolds
 from flockenv.envs.registration import SINGLE
 from flockenv.sb3 import NOTHING, WorldVecEnv, load_sb3_zip
-from flockenv.tasks import TASKS, Flock, Pursuit
+from flockenv.tasks import TASKS, Flock, Pursuit, School
 from flockenv.world import World
 
 torch.set_num_threads(1)
@@ -258,6 +258,26 @@ def test_time_limits_are_bootstrapped():
 def test_who_leaves_one_by_one_is_refused():
     with pytest.raises(ValueError, match=r"^[^\n]*pettingzoo[^\n]*$"):
         WorldVecEnv(Pursuit(pursuers=3, evaders=2, sides="both"))
+
+
+def test_who_leaves_is_done_and_paid_nothing_until_the_world_begins_anew():
+    task = School(metabolism=0.1, start_hunger=0.6)
+    env, world = WorldVecEnv(task, 3, time_limit=60, leaving=True), World(task, 3, time_limit=60)
+    env.seed(2)
+    env.reset()
+    world.reset(seeds=2)
+    begun, gone = 0, np.zeros((3, 8), bool)
+    for action in rows(env, 70):
+        _, reward, done, infos = env.step(action)
+        step = world.step(action.reshape(3, 8, -1))
+        assert not reward.reshape(3, 8)[gone].any()
+        np.testing.assert_array_equal(done.reshape(3, 8), step.terminated | step.ended[:, None])
+        gone = step.terminated & ~step.ended[:, None]
+        for k in np.flatnonzero(np.repeat(step.ended, 8)):
+            assert infos[k]["TimeLimit.truncated"] == (step.truncated[k // 8] and not step.terminated.flat[k])
+        begun += step.ended.sum()
+        world.reset(mask=step.ended)
+    assert begun >= 3
 
 
 @pytest.mark.parametrize("clone", [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))])

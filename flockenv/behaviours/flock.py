@@ -81,12 +81,13 @@ class _FlockRule(Effect):
     nearest: int | None = Field(
         default=None, ge=1, le=32, description="topological: only so many nearest ones of those count; none = all"
     )
+    group: int | None = Field(default=None, ge=0, description="who counts as a neighbour: this group; none = all")
     occluded: bool = Field(default=False, description="whom an obstacle hides is not seen")
 
     @property
     def sight(self) -> Sight:
-        """Radius, field of view, how many."""
-        return Sight(self.radius, self.fov, self.nearest, occluded=self.occluded)
+        """Radius, field of view, how many, who."""
+        return Sight(self.radius, self.fov, self.nearest, self.group, self.occluded)
 
     def parameters(self) -> dict[str, float | Vec]:
         """The weight: who is seen is the sweep's business."""
@@ -111,7 +112,9 @@ dt: 0.02
     @property
     def conserves_momentum(self) -> bool:  # type: ignore[override]  # a rule with a view cone is not mutual
         """True with eyes all around and for everybody near: then everybody pushes back as he is pushed."""
-        return self.fov >= 360.0 and self.nearest is None  # who is hidden from me does not see me either
+        return (
+            self.fov >= 360.0 and self.nearest is None and self.group is None
+        )  # who is hidden from me does not see me either
 
     def sums(self, dimension: int) -> int:
         """A vector."""

@@ -25,13 +25,15 @@ from flockenv.effects.routes import Door, Routes  # noqa: E402
 from flockenv.effects.speed_limit import SpeedLimit  # noqa: E402
 from flockenv.effects.springs import AngularSprings, Springs  # noqa: E402
 from flockenv.effects.tether import Swing, Tether  # noqa: E402
+from flockenv.effects.urges import Fear, Grazing, Intention, Libido, Metabolism, Predation  # noqa: E402
 from flockenv.effects.vicsek import Vicsek  # noqa: E402
 from flockenv.effects.wall import WallRepulsion  # noqa: E402
 from flockenv.effects.way import Way  # noqa: E402
 
 __all__ = [
     "EFFECTS", "Aim", "AngularSprings", "Antipode", "Attraction", "Carried", "Contact", "Course", "Door", "Drag",
-    "Effect", "Elastic", "Far", "Fluctuation", "Goal", "Gravitation", "Gravity", "InverseSquare", "Journey", "Me",
-    "ObstacleContact", "Other", "Pressure", "QuadraticDrag", "Routes", "Sight", "Sink", "Source", "SpeedLimit",
-    "Springs", "Stage", "Swing", "Tether", "Uniform", "Vicsek", "Vortex", "WallRepulsion", "Way", "Wind",
+    "Effect", "Elastic", "Far", "Fear", "Fluctuation", "Goal", "Gravitation", "Gravity", "Grazing", "Intention",
+    "InverseSquare", "Journey", "Libido", "Me", "Metabolism", "ObstacleContact", "Other", "Predation", "Pressure",
+    "QuadraticDrag", "Routes", "Sight", "Sink", "Source", "SpeedLimit", "Springs", "Stage", "Swing", "Tether",
+    "Uniform", "Vicsek", "Vortex", "WallRepulsion", "Way", "Wind",
 ]  # fmt: skip

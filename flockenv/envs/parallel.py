@@ -26,10 +26,13 @@ from flockenv.envs.face import (
     render_fps,
 )
 from flockenv.refusals import nearest
-from flockenv.tasks import Crossing, Flock, Herd, Pursuit, Task
+from flockenv.tasks import Crossing, Flock, Herd, Pursuit, School, Task
 from flockenv.world import Step, World
 
-__all__ = ["CrossingParallelEnv", "FlockParallelEnv", "HerdParallelEnv", "PursuitParallelEnv", "WorldParallelEnv"]
+__all__ = [
+    "CrossingParallelEnv", "FlockParallelEnv", "HerdParallelEnv", "PursuitParallelEnv", "SchoolParallelEnv",
+    "WorldParallelEnv",
+]  # fmt: skip
 
 Named = dict[str, Any]
 
@@ -259,3 +262,9 @@ class HerdParallelEnv(WorldParallelEnv):
 
     task_type = Herd
     fixed: ClassVar[dict[str, Any]] = {"dogs": 2}
+
+
+class SchoolParallelEnv(WorldParallelEnv):
+    """A school in which every fish is an agent, and leaves when caught or starved (learners=k: the first k are)."""
+
+    task_type = School

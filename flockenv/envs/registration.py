@@ -17,6 +17,7 @@ HORIZONS = {
     "Crossing": 200,
     "Evade": 300,
     "PathFollow": 300,
+    "School": 400,
 }
 """Time limit of an episode in control steps, by name: `Task.horizon`, repeated here so that no task is imported."""
 
@@ -28,6 +29,7 @@ PARALLEL = {
     "flockenv/Flock-v0": "flock_v0",
     "flockenv/Herd-v0": "herd_v0",
     "flockenv/Pursuit-v0": "pursuit_v0",
+    "flockenv/School-v0": "school_v0",
 }
 """Ids for pettingzoo.make("parallel" or "aec", ...), and the module in flockenv.envs that builds each."""
 

@@ -23,7 +23,7 @@ from flockenv.envs.face import (
     render_fps,
 )
 from flockenv.envs.page import page
-from flockenv.tasks import Crossing, Evade, Flock, Herd, Obstacles, PathFollow, Pursuit, Task
+from flockenv.tasks import Crossing, Evade, Flock, Herd, Obstacles, PathFollow, Pursuit, School, Task
 from flockenv.world import Step, World
 
 __all__ = [
@@ -34,6 +34,7 @@ __all__ = [
     "ObstaclesEnv",
     "PathFollowEnv",
     "PursuitEnv",
+    "SchoolEnv",
     "SingleEnv",
     "one_learner",
 ]
@@ -182,3 +183,11 @@ class EvadeEnv(SingleEnv):
 
     task_type = Evade
     history = "v0: first version (flockenv 0.1.0)."
+
+
+class SchoolEnv(SingleEnv):
+    """A fish lives among scripted fish, food that grows, and a scripted hunter."""
+
+    task_type = School
+    fixed: ClassVar[dict[str, Any]] = {"learners": 1}
+    history = "v0: first version (flockenv 0.2.0)."

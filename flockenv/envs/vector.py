@@ -31,7 +31,7 @@ from flockenv.envs.face import (
     together,
 )
 from flockenv.refusals import nearest
-from flockenv.tasks import Crossing, Evade, Flock, Herd, Obstacles, PathFollow, Pursuit, Task
+from flockenv.tasks import Crossing, Evade, Flock, Herd, Obstacles, PathFollow, Pursuit, School, Task
 from flockenv.world import Step, World
 
 __all__ = [
@@ -42,6 +42,7 @@ __all__ = [
     "ObstaclesVectorEnv",
     "PathFollowVectorEnv",
     "PursuitVectorEnv",
+    "SchoolVectorEnv",
     "WorldsEnv",
 ]
 
@@ -375,3 +376,10 @@ class EvadeVectorEnv(WorldsEnv):
     """Evaders, one per world; the page is that of flockenv.envs.single.EvadeEnv."""
 
     task_type = Evade
+
+
+class SchoolVectorEnv(WorldsEnv):
+    """Fish in schools, one learner per world; the page is that of flockenv.envs.single.SchoolEnv."""
+
+    task_type = School
+    fixed: ClassVar[dict[str, Any]] = {"learners": 1}

@@ -10,9 +10,9 @@ from flockenv.population.emitters import Burst, Emitter
 from flockenv.population.members import POPULATION, Member
 from flockenv.population.places import PLACES, BoxPlace, Clearing, Disc, Place, Point, Segment, Surface
 from flockenv.population.settle import beget, settler
-from flockenv.population.sinks import Ageing, Crowding, Decay, Drain, Leaving
+from flockenv.population.sinks import Ageing, Crowding, Decay, Drain, Leaving, Threshold
 
 __all__ = [
     "PLACES", "POPULATION", "Ageing", "BoxPlace", "Burst", "Clearing", "Crowding", "Decay", "Disc", "Drain", "Emitter",
-    "Leaving", "Member", "Place", "Point", "Segment", "Surface", "beget", "settler",
+    "Leaving", "Member", "Place", "Point", "Segment", "Surface", "Threshold", "beget", "settler",
 ]  # fmt: skip

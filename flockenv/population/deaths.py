@@ -20,7 +20,7 @@ from flockenv.shapes.every import hit_shape, nearest_shape
 from flockenv.shapes.head import shift_of
 from flockenv.vec import add, norm, sub, unit
 
-__all__ = ["crowding", "drain", "passing"]
+__all__ = ["crowding", "drain", "passing", "reaching"]
 
 DECAY = 2_000_000
 """Channel of the draws of the first sink; the next has the next."""
@@ -129,4 +129,13 @@ def crowding(
             doomed[i] = count_near(x, b, place, row[3], most, period, grid, start, order, born, identity, i) > most
         for i in range(low, high):
             if doomed[i]:
+                _die(b, i, v, alive, work)
+
+
+@kernel
+def reaching(numbers: Any, level: float, slots: Any, v: Any, alive: Any, work: Any, first: int, end: int) -> None:
+    """Let those die in whom a number, numbers (B, N), has come to a level; slots (first, end)."""
+    for b in range(first, end):
+        for i in range(slots[0], slots[1]):
+            if alive[b, i] and numbers[b, i] >= level:
                 _die(b, i, v, alive, work)

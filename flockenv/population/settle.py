@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 
 from flockenv.kernels import entry
 from flockenv.population.births import PLACE, births
-from flockenv.population.deaths import crowding, drain, passing
+from flockenv.population.deaths import crowding, drain, passing, reaching
 from flockenv.population.emitters import Emitter
 from flockenv.population.places import Clearing, Surface
-from flockenv.population.sinks import Crowding, Drain, Sink
+from flockenv.population.sinks import Crowding, Drain, Sink, Threshold
 from flockenv.shapes.table import packed
 from flockenv.space import Box
 from flockenv.state import Floats, State
@@ -143,6 +143,15 @@ def _crowding(scene: Any, sink: Crowding, channel: int, scratch: _Scratch) -> Pa
     return part
 
 
+def _reaching(scene: Any, sink: Threshold) -> Part:
+    kernel, slots, which = entry(reaching), _slots(scene, sink), scene.parts.inner.index(sink.of)
+
+    def part(x0: Floats, s: State, first: int, end: int) -> None:
+        kernel(s.inner[which], sink.level, slots, s.v, s.alive, s.work, first, end)
+
+    return part
+
+
 def _asks(scene: Any) -> bool:
     """Does anybody in a population want to know who is near whom?"""
     places = [member.place for member in scene.population if isinstance(member, Emitter)]
@@ -158,7 +167,7 @@ def _parts(scene: Any) -> list[Part]:
     simple: list[Sink] = []
     sinks = [member for member in scene.population if isinstance(member, Sink)]
     for k, sink in enumerate([*sinks, None]):
-        if sink is not None and not isinstance(sink, (Drain, Crowding)):
+        if sink is not None and not isinstance(sink, (Drain, Crowding, Threshold)):
             simple.append(sink)
             continue
         if simple or (mortal and k == len(sinks)):
@@ -166,6 +175,8 @@ def _parts(scene: Any) -> list[Part]:
             mortal, simple = False, []
         if isinstance(sink, Drain):
             found.append(_drain(scene, sink))
+        elif isinstance(sink, Threshold):
+            found.append(_reaching(scene, sink))
         elif isinstance(sink, Crowding):
             found.append(_crowding(scene, sink, k, scratch))
     return [*found, *([_births(scene, scratch)] if emits else [])]

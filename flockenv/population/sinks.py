@@ -11,7 +11,7 @@ from flockenv.population.places import Vector, in_space, ordered
 from flockenv.shapes import AnyShape
 from flockenv.space import Torus
 
-__all__ = ["Ageing", "Crowding", "Decay", "Drain", "Leaving", "Sink"]
+__all__ = ["Ageing", "Crowding", "Decay", "Drain", "Leaving", "Sink", "Threshold"]
 
 
 class Sink(Member):
@@ -137,3 +137,23 @@ class Crowding(Sink):
                 f"radius = {self.radius:g}: at most half of the torus's shortest edge, "
                 f"{min(scene.space.size) / 2:g} m, is allowed"
             )
+
+
+class Threshold(Sink):
+    """Who has come to a level of something that goes on inside him dies: starved at a hunger of 1, caught."""
+
+    kind: Literal["threshold"] = "threshold"
+    code: ClassVar[int] = 5
+    of: str = Field(min_length=1, description="name of the number, which some effect keeps")
+    level: float = Field(default=1.0, description="at which, or above which, he dies")
+
+    def row(self) -> list[float]:
+        """The level."""
+        return [self.level]
+
+    def check(self, scene: Any) -> None:
+        """Refuse a number that nobody keeps."""
+        super().check(scene)
+        if self.of not in scene.parts.inner:
+            kept = ", ".join(scene.parts.inner) or "nothing"
+            raise ValueError(f"of = {self.of!r}: no effect of this scene keeps it; they keep {kept}")

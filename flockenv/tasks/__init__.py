@@ -18,6 +18,7 @@ from flockenv.tasks.herd import Herd  # noqa: E402
 from flockenv.tasks.obstacles import Obstacles  # noqa: E402
 from flockenv.tasks.path_follow import PathFollow  # noqa: E402
 from flockenv.tasks.pursuit import Pursuit  # noqa: E402
+from flockenv.tasks.school import School  # noqa: E402
 
 __all__ = [
     "TASKS",
@@ -30,6 +31,7 @@ __all__ = [
     "Obstacles",
     "PathFollow",
     "Pursuit",
+    "School",
     "Slot",
     "Task",
 ]

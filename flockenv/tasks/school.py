@@ -1,0 +1,529 @@
+"""School: live long and well fed, as a fish among fish, food that grows, and a hunter that must eat, too."""
+
+from __future__ import annotations
+
+import functools
+import math
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, model_validator
+
+from flockenv import arbitration, steering, urges
+from flockenv.effects.base import in_view
+from flockenv.kernels import Vec, kernel
+from flockenv.noise import smooth, uniform
+from flockenv.scene import Group, Scene
+from flockenv.snapshot import Mark
+from flockenv.space import Box
+from flockenv.state import State
+from flockenv.tasks.base import Frame, Measured, Task
+from flockenv.tasks.layout import Layout, Slot
+from flockenv.tasks.sight import clip, place_of, velocity_of
+from flockenv.vec import add, dot, norm, scale, sub, unit
+
+__all__ = ["School"]
+
+_TRIES = 64
+_GAIN = 5.0  # kg/s: a scripted fish has the velocity that it wants within 0.2 s
+_MARGIN = 0.5  # m, that the scripted keep to walls
+_ESCAPE, _SCHOOL, _NEED = 0.4, 0.15, 0.5  # fear above which they flee, and join the others; hunger above which they eat
+_CALM, _CONTENT = 0.1, 0.3  # how much less fear, or hunger, ends it
+HUNGER, FEAR, FOOD, EATEN, INTENT, FATE = range(6)
+"""Rows of the memory: 0 to 1; 0 to 1; units of food, of patches; units of food in this step; a number of INTENTIONS;
+what became of a fish in this step, see below."""
+
+CAUGHT, STARVED = 1, 2
+
+
+@kernel
+def spawn(p: Any, frame: Frame) -> None:
+    """Fish anywhere, patches of food apart from each other, hunters `start_distance` from all fish; all at rest."""
+    frame.vel[:, :] = 0.0
+    frame.memory[:, :] = 0.0
+    fish, foes, n = int(p.fish), int(p.fish + p.hunters), frame.pos.shape[1]
+    for i in range(n):
+        edge = 2.5 if i >= foes else 1.0
+        for t in range(_TRIES):
+            for k in range(2):
+                frame.pos[k, i] = edge + (p.size - 2.0 * edge) * uniform(frame.key, t, i, k)
+            if i >= foes:
+                clear = _clear(frame, i, foes, i, p.size / (1.0 + p.patches))
+            elif i >= fish:
+                clear = _clear(frame, i, 0, fish, p.start_distance)
+            else:
+                clear = _clear(frame, i, 0, i, 4.0 * frame.radius[i])
+            if clear:
+                break
+        if i < foes:
+            frame.memory[HUNGER, i] = p.start_hunger * (0.5 + uniform(frame.key, 0, i, 2))
+        else:
+            frame.memory[FOOD, i] = p.capacity
+
+
+@kernel
+def _clear(frame: Frame, i: int, first: int, end: int, distance: float) -> bool:
+    """Is agent i at least this far from those of [first, end)?"""
+    for j in range(first, end):  # noqa: SIM110  # there are no generators in compiled code
+        if norm(_to(frame, i, j)) < distance:
+            return False
+    return True
+
+
+@kernel
+def _to(frame: Frame, i: int, j: int) -> Vec:
+    """Return the offset of agent j from agent i, m."""
+    return sub(place_of(frame, j), place_of(frame, i))
+
+
+@kernel
+def _sees(p: Any, frame: Frame, i: int, j: int) -> bool:
+    """Does fish i see agent j: within sight, and not in the blind angle behind it?"""
+    to = _to(frame, i, j)
+    square = dot(to, to)
+    inside: bool = square < p.sight * p.sight and in_view(p.cone, unit(velocity_of(frame, i)), to, square)
+    return inside
+
+
+@kernel
+def _next_seen(p: Any, frame: Frame, i: int, first: int, end: int, last: int, past: float) -> tuple[int, float]:
+    """Return whom of [first, end) fish i sees nearest after `last`, equal distances by number, and how far; or -1."""
+    best, who = np.inf, -1
+    for j in range(first, end):
+        distance = norm(_to(frame, i, j))
+        later = distance > past or (distance == past and j > last)
+        if j != i and frame.alive[j] and later and distance < best and _sees(p, frame, i, j):
+            best, who = distance, j
+    return who, best
+
+
+# --- who is scripted --------------------------------------------------------------------------------------------------
+
+
+@kernel
+def drive(p: Any, frame: Frame, action: Any, force: Any) -> None:
+    """Learners push where their action says; other fish follow `_fish`, hunters `_hunter`."""
+    fish, foes = int(p.fish), int(p.fish + p.hunters)
+    for i in range(frame.pos.shape[1]):
+        if not frame.alive[i] or i >= foes:
+            force[0, i], force[1, i] = 0.0, 0.0
+        elif i < action.shape[0]:
+            for k in range(2):
+                force[k, i] = action[i, k] * frame.max_force[i]
+        else:
+            wish = _fish(p, frame, i) if i < fish else _hunter(p, frame, i)
+            velocity, top = velocity_of(frame, i), np.float64(frame.max_speed[i])
+            here = place_of(frame, i)
+            low, high = sub(here, (_MARGIN, _MARGIN)), sub((p.size - _MARGIN, p.size - _MARGIN), here)
+            inside = scale(steering.contain(low, high, velocity, top, 0.3), _GAIN)
+            both = arbitration.allocate((inside, _apart(frame, i), wish), np.float64(frame.max_force[i]))
+            force[0, i], force[1, i] = both[0], both[1]
+
+
+@kernel
+def _apart(frame: Frame, i: int) -> Vec:
+    """Keep clear of others of one's kind who are nearer than three radii."""
+    push: Vec = (0.0, 0.0)
+    for j in range(frame.pos.shape[1]):
+        to, mine = _to(frame, i, j), frame.radius[i]
+        if j != i and frame.alive[j] and frame.radius[j] == mine and norm(to) < 3.0 * mine:
+            push = add(push, steering.separate(to, (1.0, 0.0) if j < i else (-1.0, 0.0)))
+    return push
+
+
+@kernel
+def _roam(frame: Frame, i: int, time: float, speed: float) -> Vec:
+    """Wander (Reynolds 1999), at this speed."""
+    velocity = velocity_of(frame, i)
+    begin = 2.0 * math.pi * uniform(frame.key, 0, i, 3)
+    way: Vec = (math.cos(begin), math.sin(begin))
+    if velocity[0] != 0.0 or velocity[1] != 0.0:
+        way = velocity
+    aside: Vec = (0.0, np.float64(smooth(frame.key, time, i, 4)))
+    wanted = add(steering.wander(aside, way, speed, 1.0), way)
+    return scale(sub(wanted, velocity), 2.0)
+
+
+@kernel
+def _fish(p: Any, frame: Frame, i: int) -> Vec:
+    """What a scripted fish wants in its state: evade, forage, keep to the school, or wander."""
+    velocity, top = velocity_of(frame, i), np.float64(frame.max_speed[i])
+    fish, foes, intent = int(p.fish), int(p.fish + p.hunters), frame.memory[INTENT, i]
+    if intent == urges.ESCAPE:
+        who, distance = _next_seen(p, frame, i, fish, foes, -1, -1.0)
+        if who >= 0:
+            ahead = min(distance / p.hunter_speed, 0.5)
+            return scale(steering.evade(_to(frame, i, who), velocity, velocity_of(frame, who), top, ahead), _GAIN)
+    if intent == urges.EAT:
+        who, _ = _next_seen(p, frame, i, foes, frame.pos.shape[1], -1, -1.0)
+        if who >= 0:
+            return scale(steering.arrive(_to(frame, i, who), velocity, top, 1.0), _GAIN)
+    if intent == urges.SCHOOL:
+        count = 0.0
+        centre: Vec = (0.0, 0.0)
+        course: Vec = (0.0, 0.0)
+        for j in range(fish):
+            if j != i and frame.alive[j] and _sees(p, frame, i, j):
+                count += 1.0
+                centre, course = add(centre, _to(frame, i, j)), add(course, velocity_of(frame, j))
+        if count > 0.0:
+            agree = steering.align(velocity, scale(course, 1.0 / count))
+            return add(scale(agree, 2.0), scale(centre, 1.0 / count))
+    return _roam(frame, i, 0.5 * frame.step * p.control_dt, 0.5 * top)
+
+
+@kernel
+def _hunter(p: Any, frame: Frame, i: int) -> Vec:
+    """A hungry hunter pursues the nearest fish in its sight, which is all around; else it wanders, slowly."""
+    best, who = p.hunter_sight, -1
+    for j in range(int(p.fish)):
+        distance = norm(_to(frame, i, j))
+        if frame.alive[j] and distance < best:
+            best, who = distance, j
+    velocity, top = velocity_of(frame, i), np.float64(frame.max_speed[i])
+    if frame.memory[INTENT, i] == urges.EAT and who >= 0:
+        to, theirs = _to(frame, i, who), velocity_of(frame, who)
+        ahead = min(steering.interception_time(to, theirs, top), 1.0)
+        return scale(steering.pursue(to, velocity, theirs, top, ahead), _GAIN)
+    return _roam(frame, i, 0.5 * frame.step * p.control_dt, 0.4 * top)
+
+
+# --- what goes on inside ----------------------------------------------------------------------------------------------
+
+
+@kernel
+def keep(p: Any, before: Frame, after: Frame) -> None:
+    """Food grows and is eaten, fish are caught, everybody gets hungrier, afraid or calm, and knows what it wants.
+
+    Whatever passes between two is found from both sides, from the same instant, before anything changes.
+    """
+    foes, n = int(p.fish + p.hunters), after.pos.shape[1]
+    for i in range(n):
+        after.memory[EATEN, i], after.memory[FATE, i] = 0.0, 0.0
+    for i in range(int(p.fish)):
+        if before.alive[i]:
+            _graze(p, after, i)
+            _face_hunters(p, after, i)
+    for i in range(foes):
+        if before.alive[i]:
+            _digest(p, after, i)
+    for i in range(foes):
+        if before.alive[i]:
+            _intend(after, i)
+    for j in range(foes, n):
+        grown = urges.regrown(np.float64(after.memory[FOOD, j]), p.growth, p.capacity, p.control_dt)
+        after.memory[FOOD, j] = grown - after.memory[EATEN, j]
+
+
+@kernel
+def _graze(p: Any, frame: Frame, i: int) -> None:
+    """Count what fish i eats of each patch that it is at: to it, and to the patch."""
+    hunger = np.float64(frame.memory[HUNGER, i])
+    for j in range(int(p.fish + p.hunters), frame.pos.shape[1]):
+        if norm(_to(frame, i, j)) < p.reach:
+            taken = urges.bite(np.float64(frame.memory[FOOD, j]), hunger, p.grazing, p.control_dt)
+            frame.memory[EATEN, i] += taken
+            frame.memory[EATEN, j] += taken
+
+
+@kernel
+def _has(p: Any, frame: Frame, j: int, i: int) -> bool:
+    """Has hunter j, which hunts, got fish i?"""
+    return bool(frame.memory[INTENT, j] == urges.EAT and norm(_to(frame, j, i)) <= p.capture_distance)
+
+
+@kernel
+def _face_hunters(p: Any, frame: Frame, i: int) -> None:
+    """Fear of the hunters that fish i sees, and what is left of before; is it caught?"""
+    felt = 0.0
+    for j in range(int(p.fish), int(p.fish + p.hunters)):
+        if _sees(p, frame, i, j):
+            felt += urges.fright(norm(_to(frame, i, j)), p.fear_distance)
+        if _has(p, frame, j, i):
+            frame.memory[FATE, i] = CAUGHT
+    frame.memory[FEAR, i] = urges.calmed(np.float64(frame.memory[FEAR, i]), min(felt, 1.0), p.fear_memory, p.control_dt)
+
+
+@kernel
+def _intend(frame: Frame, i: int) -> None:
+    """What fish or hunter i is up to now."""
+    now, hunger = np.float64(frame.memory[INTENT, i]), np.float64(frame.memory[HUNGER, i])
+    fear = np.float64(frame.memory[FEAR, i])
+    frame.memory[INTENT, i] = urges.intention(now, hunger, 0.0, fear, _ESCAPE, _SCHOOL, _NEED, _CALM, _CONTENT)
+
+
+@kernel
+def _digest(p: Any, frame: Frame, i: int) -> None:
+    """Hunger of fish or hunter i after this step: of time and effort, less what it has eaten."""
+    hunts = i >= int(p.fish)
+    pace = norm(velocity_of(frame, i)) / np.float64(frame.max_speed[i])
+    rate = p.hunter_metabolism if hunts else p.metabolism
+    hunger = np.float64(frame.memory[HUNGER, i])
+    less = np.float64(frame.memory[EATEN, i])
+    if hunts:
+        for j in range(int(p.fish)):
+            less += p.meal if frame.memory[FATE, j] == CAUGHT and _has(p, frame, i, j) else 0.0
+    later = urges.hungrier(hunger, rate, p.effort, pace, p.control_dt)
+    frame.memory[HUNGER, i] = max(later - less, 0.0)
+    if not hunts and later - less >= 1.0 and frame.memory[FATE, i] == 0.0:
+        frame.memory[FATE, i] = STARVED
+
+
+# --- what is paid, and what ends --------------------------------------------------------------------------------------
+
+
+@kernel
+def reward(p: Any, before: Frame, after: Frame, action: Any, terms: Any) -> None:
+    """Terms: alive, fed, dead; who is out is paid nothing."""
+    for i in range(terms.shape[0]):
+        lives = before.alive[i] and after.memory[FATE, i] == 0.0
+        terms[i, 0] = p.alive_reward * p.control_dt if lives else 0.0
+        terms[i, 1] = p.fed_reward * (1.0 - after.memory[HUNGER, i]) * p.control_dt if lives else 0.0
+        terms[i, 2] = -p.death_cost if before.alive[i] and not lives else 0.0
+
+
+@kernel
+def ended(p: Any, before: Frame, after: Frame, over: Any) -> bool:
+    """Who is caught or starved is out. As long as half of the learners live, the aim holds."""
+    left = 0
+    for i in range(int(p.fish)):
+        out = not before.alive[i] or after.memory[FATE, i] != 0.0
+        after.alive[i] = not out
+        if i < over.shape[0]:
+            over[i] = out
+            left += 0 if out else 1
+    return bool(2 * left >= over.shape[0])
+
+
+@kernel
+def measure(p: Any, before: Frame, after: Frame, numbers: Any) -> None:
+    """Of the learners: share alive; hunger of those, summed; food eaten; shares that were caught, and starved, now."""
+    learners = int(p.learners)
+    for k in range(5):
+        numbers[k] = 0.0
+    for i in range(learners):
+        if after.alive[i]:
+            numbers[0] += 1.0 / learners
+            numbers[1] += after.memory[HUNGER, i] / learners
+        if before.alive[i]:
+            numbers[2] += after.memory[EATEN, i] / learners
+            numbers[3] += 1.0 / learners if after.memory[FATE, i] == CAUGHT else 0.0
+            numbers[4] += 1.0 / learners if after.memory[FATE, i] == STARVED else 0.0
+
+
+# --- what is seen -----------------------------------------------------------------------------------------------------
+
+
+@kernel
+def observe(p: Any, frame: Frame, rows: Any) -> None:
+    """Own velocity, walls, hunger, fear; hunters, food and fish in sight, nearest first.
+
+    Who is out sees nothing but a hunger of 1, at no distance from any wall: no row of a living fish is like it.
+    """
+    fish, foes, n = int(p.fish), int(p.fish + p.hunters), frame.pos.shape[1]
+    for i in range(rows.shape[0]):
+        row = rows[i]
+        for c in range(row.shape[0]):
+            row[c] = 0.0
+        if not frame.alive[i]:
+            row[6] = 1.0
+            continue
+        for k in range(2):
+            row[k] = clip(frame.vel[k, i] / p.fish_speed)
+            row[2 + k] = clip(frame.pos[k, i] / p.size)
+            row[4 + k] = clip((p.size - frame.pos[k, i]) / p.size)
+        row[6], row[7] = frame.memory[HUNGER, i], frame.memory[FEAR, i]
+        at = _show(p, frame, i, fish, foes, int(p.hunters), row, 8)
+        at = _show(p, frame, i, foes, n, int(p.food_seen), row, at)
+        _show(p, frame, i, 0, fish, int(p.fish_seen), row, at)
+
+
+@kernel
+def _show(p: Any, frame: Frame, i: int, first: int, end: int, slots: int, row: Any, at: int) -> int:
+    """Write whom of [first, end) fish i sees: offset, bearing, closeness, velocity, and presence or amount.
+
+    Returns the place after them.
+    """
+    last, past = -1, -1.0
+    for s in range(slots):
+        who, distance = _next_seen(p, frame, i, first, end, last, past)
+        if who < 0:
+            break
+        to, way = _to(frame, i, who), unit(_to(frame, i, who))
+        for k in range(2):
+            row[at + 2 * s + k] = clip(to[k] / p.sight)
+            row[at + 2 * slots + 2 * s + k] = way[k]
+            row[at + 4 * slots + 2 * s + k] = clip(frame.vel[k, who] / p.hunter_speed)
+        row[at + 6 * slots + s] = max(1.0 - distance / p.near, 0.0)
+        row[at + 7 * slots + s] = 1.0 if end < frame.pos.shape[1] else min(frame.memory[FOOD, who] / p.capacity, 1.0)
+        last, past = who, distance
+    return at + 8 * slots
+
+
+class School(Task):
+    """Fish with one shared policy (or one among scripted fish) live in a tank with patches of food and a hunter.
+
+    Hunger grows with time and effort; who swims at a patch eats of it, and it grows again, the faster the less is
+    missing. A fish sees 300 degrees. A hunter that is hungry pursues the nearest fish, faster than that, but it turns
+    more slowly; fed, it leaves them alone for a while. To be caught or starved ends it for that fish; the others go on.
+    What goes on inside follows Tu and Terzopoulos (1994; see flockenv.urges), and the scripted fish are their state
+    machine: flee, keep to the school, forage, wander.
+    """
+
+    name: ClassVar[str] = "school"
+    terms: ClassVar[tuple[str, ...]] = ("alive", "fed", "dead")
+    metric_names: ClassVar[tuple[str, ...]] = ("survived", "lifetime", "hunger", "eaten", "caught", "starved")
+    measures: ClassVar[tuple[str, ...]] = ("alive", "hunger", "eaten", "caught", "starved")
+    memory: ClassVar[int] = 6
+    keeps: ClassVar[bool] = True
+
+    fish: int = Field(default=8, ge=1, le=64, description="how many fish there are")
+    learners: int = Field(
+        default_factory=lambda given: given.get("fish", 8), ge=1,
+        description="how many of them learn (default: all); the others follow a script",
+    )  # fmt: skip
+    hunters: int = Field(default=1, ge=1, le=8, description="how many hunt them")
+    patches: int = Field(default=4, ge=1, le=16, description="of food")
+    horizon: int = Field(default=400, ge=1, description="decisions until the time limit (truncation)")
+    size: float = Field(default=24.0, gt=10, description="m, edge of the tank")
+    start_distance: float = Field(default=6.0, ge=0, description="m, between hunters and fish at the start")
+    fish_speed: float = Field(default=2.0, gt=0, description="m/s")
+    fish_force: float = Field(default=8.0, gt=0, description="N; the mass is 1 kg")
+    hunter_speed: float = Field(default=2.4, gt=0, description="m/s")
+    hunter_force: float = Field(default=2.5, gt=0, description="N; the mass is 1 kg")
+    hunter_sight: float = Field(default=12.0, gt=0, description="m, all around")
+    hunter_metabolism: float = Field(default=0.04, ge=0, description="1/s, hunger of a hunter at rest; hunts above 0.5")
+    meal: float = Field(default=0.8, ge=0, le=1, description="hunger that a fish takes off a hunter")
+    capture_distance: float = Field(default=0.5, gt=0, description="m between centres")
+    sight: float = Field(default=10.0, gt=0, description="m, a fish sees others and food within this")
+    fov: float = Field(default=300.0, gt=0, le=360, description="degrees, full angle of what a fish sees")
+    near: float = Field(default=5.0, gt=0, description="m, within which closeness is seen")
+    food_seen: int = Field(default=3, ge=1, le=16, description="how many patches a fish tells apart, nearest first")
+    fish_seen: int = Field(default=3, ge=0, le=16, description="how many others")
+    start_hunger: float = Field(default=0.4, gt=0, le=0.6, description="0 full, 1 starved; up to half more or less")
+    metabolism: float = Field(default=0.02, ge=0, description="1/s, hunger of a fish at rest")
+    effort: float = Field(default=0.02, ge=0, description="1/s more at top speed; goes with its square")
+    reach: float = Field(default=1.0, gt=0, description="m, who is nearer to a patch's centre eats")
+    grazing: float = Field(default=0.5, ge=0, description="1/s, share of a patch that one eats who is starved")
+    growth: float = Field(default=0.25, ge=0, description="1/s, of food")
+    capacity: float = Field(default=1.5, gt=0, description="fish from starved to full, that a patch feeds")
+    fear_distance: float = Field(default=1.0, gt=0, description="m, within which fear of a hunter is 1")
+    fear_memory: float = Field(default=2.0, gt=0, description="s, over which fear falls to 1/e")
+    alive_reward: float = Field(default=0.5, ge=0, description="per s")
+    fed_reward: float = Field(default=0.5, ge=0, description="per s with no hunger at all")
+    death_cost: float = Field(default=10.0, ge=0, description="once")
+
+    @model_validator(mode="after")
+    def _fitting(self) -> School:
+        """Refuse more learners than fish, a start that is out of reach, and meals that are larger than the patch."""
+        if self.learners > self.fish:
+            raise ValueError(f"learners = {self.learners}: there are only {self.fish} fish")
+        if self.start_distance > self.size / 2:
+            raise ValueError(f"start_distance = {self.start_distance:g}: at most size / 2 = {self.size / 2:g} m")
+        if self.grazing * self.control_dt * self.fish > 1:
+            raise ValueError(
+                f"grazing = {self.grazing:g}: {self.fish} fish could eat more than there is in a decision; at most "
+                f"{1 / (self.control_dt * self.fish):g} 1/s is allowed"
+            )
+        return self
+
+    @property
+    def agents(self) -> int:
+        """Fish, hunters and patches."""
+        return self.fish + self.hunters + self.patches
+
+    @property
+    def agent_names(self) -> tuple[str, ...]:
+        """fish_0 ..."""
+        return tuple(f"fish_{i}" for i in range(self.learners))
+
+    @property
+    def ends_together(self) -> bool:
+        """Several leave one by one."""
+        return self.learners == 1
+
+    @functools.cached_property
+    def scene(self) -> Scene:
+        """A walled square; nothing acts but what fish and hunters want."""
+        fish: dict[str, Any] = {"radius": 0.2, "max_speed": self.fish_speed, "max_force": self.fish_force}
+        groups = [Group(count=self.learners, role="learner", **fish)]
+        if self.fish > self.learners:
+            groups.append(Group(count=self.fish - self.learners, role="flockmate", **fish))
+        groups.append(
+            Group(
+                count=self.hunters, radius=0.4, max_speed=self.hunter_speed, max_force=self.hunter_force, role="pursuer"
+            )
+        )
+        groups.append(Group(count=self.patches, radius=0.1, max_speed=1.0, max_force=0.0))
+        return Scene(
+            space=Box(size=(self.size, self.size)),
+            groups=tuple(groups),
+            integrator=self.integrator,
+            dt=self.dt,
+            dtype=self.dtype,
+        )
+
+    def parameters(self) -> dict[str, float]:
+        """The fields, and what follows from them."""
+        ahead = math.cos(math.radians(self.fov / 2))
+        return super().parameters() | {"cone": ahead * abs(ahead)}
+
+    @functools.cached_property
+    def layout(self) -> Layout:
+        """Axes are the tank's; offsets are relative to the fish; zeros where nobody is seen."""
+        slots = [
+            Slot("velocity", (2,), self.fish_speed, "m/s", "own velocity (x, y)"),
+            Slot("to_low", (2,), self.size, "m", "distance to the walls at x = 0 and y = 0", low=0.0),
+            Slot("to_high", (2,), self.size, "m", "distance to the walls at x = size and y = size", low=0.0),
+            Slot("hunger", (), 1.0, "1", "0 full, 1 starved", low=0.0),
+            Slot("fear", (), 1.0, "1", "min(fear_distance / distance, 1) of hunters in sight; fades", low=0.0),
+        ]
+        last = {
+            "hunters": ("present", 1.0, "1", "1 where there is one, else 0"),
+            "food": ("amount", self.capacity, "fish", "what is left there"),
+            "mates": ("present", 1.0, "1", "1 where there is one, else 0"),
+        }
+        counts = {"hunters": self.hunters, "food": self.food_seen, "mates": self.fish_seen}
+        for name, (what, unit_, of, meaning) in last.items():
+            n, one = counts[name], name.removesuffix("s")
+            slots += [
+                Slot(name, (n, 2), self.sight, "m", f"offsets of the {name} in sight, nearest first"),
+                Slot(f"{one}_bearing", (n, 2), 1.0, "1", "unit vectors towards them"),
+                Slot(f"{one}_velocity", (n, 2), self.hunter_speed, "m/s", "their velocities"),
+                Slot(f"{one}_closeness", (n,), 1.0, "1", "1 - distance / near; 0 beyond", low=0.0),
+                Slot(f"{one}_{what}", (n,), unit_, of, meaning, low=0.0),
+            ]
+        return Layout(tuple(slots))
+
+    @functools.cached_property
+    def action_layout(self) -> Layout:
+        """A force, in the tank's axes."""
+        meaning = "force (x, y) / max_force, shortened to length 1"
+        return Layout((Slot("force", (2,), self.fish_force, "N", meaning),))
+
+    def metrics(self, sums: Measured, last: Measured, steps: NDArray[np.int64]) -> dict[str, NDArray[np.float64]]:
+        """Share of the learners alive; s that they lived, on average; mean hunger while they did; food eaten by each.
+
+        And which share was caught, and which starved.
+        """
+        return {
+            "survived": last["alive"],
+            "lifetime": sums["alive"] * self.control_dt,
+            "hunger": np.where(sums["alive"] > 0, sums["hunger"] / np.maximum(sums["alive"], 1e-12), np.nan),
+            "eaten": sums["eaten"],
+            "caught": sums["caught"],
+            "starved": sums["starved"],
+        }
+
+    def marks(self, state: State, memory: NDArray[np.float64], world: int) -> tuple[Mark, ...]:
+        """The patches; their area is what is left."""
+        first = self.fish + self.hunters
+        return tuple(
+            Mark("goal", state.pos[world, j], np.zeros(2), self._shown(float(memory[FOOD, world, j])))
+            for j in range(first, self.agents)
+        )
+
+    def _shown(self, amount: float) -> float:
+        """Return the radius at which a patch is drawn, m."""
+        return self.reach * math.sqrt(min(max(amount / self.capacity, 0.01), 1.0))

@@ -1,0 +1,91 @@
+"""Hunger, libido, fear, and what they make an animal intend: laws for scenes, tasks and players alike.
+
+After Tu and Terzopoulos, "Artificial Fishes" (SIGGRAPH 1994). Theirs are: hunger H = 1 - n / a, of which the food n in
+the stomach is digested at a constant rate (`hungrier`, as a rate of change); libido L = s(t) (1 - H) with s growing
+evenly since the last mating (`desire`); fear of one predator min(D0 / d, 1), of all of them the sum, at most 1
+(`fright`); and the order in which intentions are looked for: collision, then fear (above one level flee, above a lower
+one school), then the larger of hunger and libido above a level, then wander (`intention`). Ours are: effort makes
+hungry, fear fades instead of ending at once, who eats takes his share by mass action and food grows logistically
+(Verhulst 1838), and levels are lower for who is already at it, where they keep their intention by a memory of the last.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from flockenv.kernels import law, like
+
+__all__ = [
+    "EAT", "ESCAPE", "INTENTIONS", "MATE", "SCHOOL", "WANDER", "bite", "calmed", "desire", "fright", "hungrier",
+    "intention", "regrown",
+]  # fmt: skip
+
+INTENTIONS = ("wander", "school", "mate", "eat", "escape")
+"""What one may intend; what is kept is the number of it."""
+
+WANDER, SCHOOL, MATE, EAT, ESCAPE = range(5)
+
+
+@law
+def hungrier(hunger: float, rate: float, effort: float, pace: float, seconds: float) -> float:
+    """Return hunger, 0 (full) to 1 (starved), after some seconds: dH/dt = rate + effort pace^2, 1/s.
+
+    `pace` is speed over max_speed.
+    """
+    one = like(hunger, 1.0)
+    later = hunger + (rate + effort * pace * pace) * seconds
+    return later if later < one else one
+
+
+@law
+def bite(amount: float, hunger: float, rate: float, seconds: float) -> float:
+    """Return what is eaten of an amount, in its unit: rate x amount x hunger, 1/s; of sums of either it is the sum."""
+    return rate * amount * hunger * seconds
+
+
+@law
+def regrown(amount: float, growth: float, capacity: float, seconds: float) -> float:
+    """Return an amount after logistic growth da/dt = r a (1 - a / K): its closed form, whatever the step."""
+    share = amount / capacity
+    return amount / (share + (like(amount, 1.0) - share) * np.exp(-growth * seconds))  # type: ignore[no-any-return]
+
+
+@law
+def desire(urge: float, hunger: float) -> float:
+    """Return libido, L = min(s (1 - H), 1): love after dinner."""
+    one = like(urge, 1.0)
+    libido = urge * (one - hunger)
+    return libido if libido < one else one
+
+
+@law
+def fright(distance: float, span: float) -> float:
+    """Return the fear of one predator in sight, min(D0 / d, 1); `span` is D0, m."""
+    return span / distance if distance > span else (like(span, 1.0) if span > like(span, 0.0) else span)
+
+
+@law
+def calmed(fear: float, felt: float, memory: float, seconds: float) -> float:
+    """Return fear: what is felt now, or what is left of before, exp(-t / memory), if that is more."""
+    left = fear * np.exp(-seconds / memory)
+    return felt if felt > left else left
+
+
+@law
+def intention(
+    now: float, hunger: float, libido: float, fear: float, escape: float, school: float, need: float, calm: float,
+    content: float,
+) -> float:  # fmt: skip
+    """Return the number of what one intends, of INTENTIONS: fear first, then the larger of two needs, else wander.
+
+    `escape` and `school`: levels of fear; `need`: of hunger and libido. Who is at it goes on until it is `calm` less
+    (fear) or `content` less (needs); so, too, one need takes over from another only if it is larger by `content`.
+    """
+    o, e = like(fear, 0.0), like(fear, 1.0)
+    eat, mate = like(fear, EAT), like(fear, MATE)
+    flees = fear > escape - (calm if now == like(fear, ESCAPE) else o)
+    joins = fear > school - (calm if now == like(fear, SCHOOL) else o)
+    to_eat, to_mate = hunger + (content if now == eat else o), libido + (content if now == mate else o)
+    calls = eat if to_eat >= to_mate else mate
+    wants = calls if (to_eat if to_eat >= to_mate else to_mate) > need else o
+    return like(fear, ESCAPE) if flees else (e if joins else wants)
