@@ -12,6 +12,7 @@ for _module in pkgutil.iter_modules(__path__):
     importlib.import_module(f"{__name__}.{_module.name}")
 
 from flockenv.tasks.crossing import Crossing  # noqa: E402  # after the folder has been walked
+from flockenv.tasks.crowd_nav import CrowdNav  # noqa: E402
 from flockenv.tasks.evade import Evade  # noqa: E402  # after the folder has been walked
 from flockenv.tasks.flock import Flock  # noqa: E402
 from flockenv.tasks.herd import Herd  # noqa: E402
@@ -22,6 +23,7 @@ from flockenv.tasks.pursuit import Pursuit  # noqa: E402
 __all__ = [
     "TASKS",
     "Crossing",
+    "CrowdNav",
     "Evade",
     "Flock",
     "Frame",
