@@ -58,6 +58,13 @@ RANGES: dict[str, dict[str, tuple[float, float]]] = {
         "time": (0.05, 0.8), "lead": (0.1, 0.8), "tube": (0.0, 1.0), "keep": (0.3, 0.99), "speed": (0.5, 1.0),
         "grip": (0.3, 2.5), "early": (0.2, 1.5), "brake": (0.0, 12.0), "gain": (1.0, 12.0),
     },
+    "bottleneck": {
+        "tau": (0.1, 1.5), "speed": (0.2, 1.0), "strength": (0.0, 4000.0), "decay": (0.02, 0.5), "walls": (0.0, 4000.0),
+    },
+    "crowd_nav": {
+        "tau": (0.15, 1.0), "speed": (0.5, 1.0), "strength": (0.5, 20.0), "importance": (0.0, 4.0),
+        "gamma": (0.05, 1.5), "angular": (0.0, 6.0), "forward": (0.0, 6.0), "bias": (0.0, 0.5),
+    },
 }  # fmt: skip
 """Where each parameter is looked for."""
 

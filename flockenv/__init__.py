@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from flockenv.tasks import (
         TASKS,
         Crossing,
+        CrowdNav,
         Evade,
         Flock,
         Herd,
@@ -39,6 +40,7 @@ __all__ = [
     "TASKS",
     "Body",
     "Crossing",
+    "CrowdNav",
     "Evade",
     "Flock",
     "Herd",
@@ -61,6 +63,7 @@ _HOME = {
     "State": "state",
     "TASKS": "tasks",
     "Crossing": "tasks",
+    "CrowdNav": "tasks",
     "Evade": "tasks",
     "Flock": "tasks",
     "Herd": "tasks",

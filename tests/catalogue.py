@@ -116,7 +116,7 @@ from flockenv.shapes import Circle
 from flockenv.space import Box, Plane, Space, Torus
 from flockenv.spawn import Spawn
 from flockenv.steer import Steer
-from flockenv.tasks import Crossing, Flock, Herd, Obstacles, PathFollow, Pursuit, Task
+from flockenv.tasks import Crossing, CrowdNav, Flock, Herd, Obstacles, PathFollow, Pursuit, Task
 from flockenv.tasks import Evade as EvadeTask
 
 Array = NDArray[np.float64]
@@ -481,6 +481,7 @@ TASKS = (
     TaskRow(Flock(learners=1), "_single"),
     TaskRow(Crossing()),
     TaskRow(Crossing(agents=8, learners=1), "_single"),
+    TaskRow(CrowdNav()),
     TaskRow(EvadeTask()),
     TaskRow(PathFollow()),
     TaskRow(Herd()),

@@ -6,7 +6,7 @@ import pettingzoo
 import pytest
 
 from flockenv.sb3 import WorldVecEnv
-from flockenv.tasks import Crossing, Evade, Flock, Herd, Obstacles, Pursuit
+from flockenv.tasks import Crossing, CrowdNav, Evade, Flock, Herd, Obstacles, Pursuit
 from flockenv.world import World
 
 SEED, LIMIT, STEPS = 21, 15, 40
@@ -15,6 +15,7 @@ ALONE = {
     "Obstacles": (Obstacles(), {}),
     "Flock": (Flock(agents=8, learners=1), {"agents": 8}),
     "Evade": (Evade(), {}),
+    "CrowdNav": (CrowdNav(goal_radius=11.8), {"goal_radius": 11.8}),
     "Herd": (Herd(), {}),
     "Crossing": (Crossing(agents=8, learners=1), {"agents": 8}),
 }

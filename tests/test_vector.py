@@ -24,6 +24,7 @@ EASY = {
     "flockenv/Herd-v0": {"pen_radius": 20.5},
     "flockenv/Crossing-v0": {"goal_radius": 11.8},
     "flockenv/PathFollow-v0": {"lost_distance": 1.5, "max_force": 2.5},
+    "flockenv/CrowdNav-v0": {"goal_radius": 11.8},
     "flockenv/Flock-v0": {},  # nobody ever terminates there
 }
 """Parameters under which random actions sometimes end an episode, and the clock ends the others."""

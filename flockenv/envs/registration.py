@@ -17,6 +17,7 @@ HORIZONS = {
     "Crossing": 200,
     "Evade": 300,
     "PathFollow": 300,
+    "CrowdNav": 250,
 }
 """Time limit of an episode in control steps, by name: `Task.horizon`, repeated here so that no task is imported."""
 

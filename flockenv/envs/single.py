@@ -23,11 +23,12 @@ from flockenv.envs.face import (
     render_fps,
 )
 from flockenv.envs.page import page
-from flockenv.tasks import Crossing, Evade, Flock, Herd, Obstacles, PathFollow, Pursuit, Task
+from flockenv.tasks import Crossing, CrowdNav, Evade, Flock, Herd, Obstacles, PathFollow, Pursuit, Task
 from flockenv.world import Step, World
 
 __all__ = [
     "CrossingEnv",
+    "CrowdNavEnv",
     "EvadeEnv",
     "FlockEnv",
     "HerdEnv",
@@ -182,3 +183,10 @@ class EvadeEnv(SingleEnv):
 
     task_type = Evade
     history = "v0: first version (flockenv 0.1.0)."
+
+
+class CrowdNavEnv(SingleEnv):
+    """A robot crosses a crowd of pedestrians who swap places under a social force, and must touch nobody."""
+
+    task_type = CrowdNav
+    history = "v0: first version (flockenv 0.2.0)."

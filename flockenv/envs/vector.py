@@ -31,11 +31,12 @@ from flockenv.envs.face import (
     together,
 )
 from flockenv.refusals import nearest
-from flockenv.tasks import Crossing, Evade, Flock, Herd, Obstacles, PathFollow, Pursuit, Task
+from flockenv.tasks import Crossing, CrowdNav, Evade, Flock, Herd, Obstacles, PathFollow, Pursuit, Task
 from flockenv.world import Step, World
 
 __all__ = [
     "CrossingVectorEnv",
+    "CrowdNavVectorEnv",
     "EvadeVectorEnv",
     "FlockVectorEnv",
     "HerdVectorEnv",
@@ -375,3 +376,9 @@ class EvadeVectorEnv(WorldsEnv):
     """Evaders, one per world; the page is that of flockenv.envs.single.EvadeEnv."""
 
     task_type = Evade
+
+
+class CrowdNavVectorEnv(WorldsEnv):
+    """Robots, one per world; the page is that of flockenv.envs.single.CrowdNavEnv."""
+
+    task_type = CrowdNav
