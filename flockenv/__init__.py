@@ -22,6 +22,8 @@ if TYPE_CHECKING:
     from flockenv.state import Body, State
     from flockenv.tasks import (
         TASKS,
+        Corridor,
+        Bottleneck,
         Crossing,
         CrowdNav,
         Evade,
@@ -39,6 +41,8 @@ __version__ = "0.1.0"
 __all__ = [
     "TASKS",
     "Body",
+    "Corridor",
+    "Bottleneck",
     "Crossing",
     "CrowdNav",
     "Evade",
@@ -62,6 +66,8 @@ _HOME = {
     "Body": "state",
     "State": "state",
     "TASKS": "tasks",
+    "Corridor": "tasks",
+    "Bottleneck": "tasks",
     "Crossing": "tasks",
     "CrowdNav": "tasks",
     "Evade": "tasks",

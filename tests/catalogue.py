@@ -116,7 +116,18 @@ from flockenv.shapes import Circle
 from flockenv.space import Box, Plane, Space, Torus
 from flockenv.spawn import Spawn
 from flockenv.steer import Steer
-from flockenv.tasks import Crossing, CrowdNav, Flock, Herd, Obstacles, PathFollow, Pursuit, Task
+from flockenv.tasks import (
+    Bottleneck,
+    Corridor,
+    Crossing,
+    CrowdNav,
+    Flock,
+    Herd,
+    Obstacles,
+    PathFollow,
+    Pursuit,
+    Task,
+)
 from flockenv.tasks import Evade as EvadeTask
 
 Array = NDArray[np.float64]
@@ -482,6 +493,10 @@ TASKS = (
     TaskRow(Crossing()),
     TaskRow(Crossing(agents=8, learners=1), "_single"),
     TaskRow(CrowdNav()),
+    TaskRow(Corridor()),
+    TaskRow(Corridor(people=8, learners=1), "_single"),
+    TaskRow(Bottleneck()),
+    TaskRow(Bottleneck(people=8, learners=1), "_single"),
     TaskRow(EvadeTask()),
     TaskRow(PathFollow()),
     TaskRow(Herd()),

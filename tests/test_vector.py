@@ -24,6 +24,8 @@ EASY = {
     "flockenv/Herd-v0": {"pen_radius": 20.5},
     "flockenv/Crossing-v0": {"goal_radius": 11.8},
     "flockenv/PathFollow-v0": {"lost_distance": 1.5, "max_force": 2.5},
+    "flockenv/Bottleneck-v0": {"people": 4, "room": 2.0, "clear": 0.0, "width": 1.8},
+    "flockenv/Corridor-v0": {},  # nor there
     "flockenv/CrowdNav-v0": {"goal_radius": 11.8},
     "flockenv/Flock-v0": {},  # nobody ever terminates there
 }

@@ -70,7 +70,9 @@ effects:
     def parameters(self) -> dict[str, float | Vec]:
         """Where, how strong, how far, how long."""
         fading = 0.0 if self.fades is None else 1 / self.fades
-        numbers = {name: float(getattr(self, name)) for name in ("strength", "acceleration", "decay", "since", "radius")}
+        numbers = {
+            name: float(getattr(self, name)) for name in ("strength", "acceleration", "decay", "since", "radius")
+        }
         return {"target": self.target, "fading": fading, **numbers}
 
 

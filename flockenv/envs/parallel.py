@@ -26,10 +26,18 @@ from flockenv.envs.face import (
     render_fps,
 )
 from flockenv.refusals import nearest
-from flockenv.tasks import Crossing, Flock, Herd, Pursuit, Task
+from flockenv.tasks import Bottleneck, Corridor, Crossing, Flock, Herd, Pursuit, Task
 from flockenv.world import Step, World
 
-__all__ = ["CrossingParallelEnv", "FlockParallelEnv", "HerdParallelEnv", "PursuitParallelEnv", "WorldParallelEnv"]
+__all__ = [
+    "BottleneckParallelEnv",
+    "CorridorParallelEnv",
+    "CrossingParallelEnv",
+    "FlockParallelEnv",
+    "HerdParallelEnv",
+    "PursuitParallelEnv",
+    "WorldParallelEnv",
+]
 
 Named = dict[str, Any]
 
@@ -259,3 +267,15 @@ class HerdParallelEnv(WorldParallelEnv):
 
     task_type = Herd
     fixed: ClassVar[dict[str, Any]] = {"dogs": 2}
+
+
+class CorridorParallelEnv(WorldParallelEnv):
+    """Two streams in one corridor, all of them agents (learners=k: only the first k are)."""
+
+    task_type = Corridor
+
+
+class BottleneckParallelEnv(WorldParallelEnv):
+    """Everybody leaves a room through one door, all of them agents; who is out leaves (learners=k: the first k are)."""
+
+    task_type = Bottleneck

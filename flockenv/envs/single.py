@@ -23,10 +23,24 @@ from flockenv.envs.face import (
     render_fps,
 )
 from flockenv.envs.page import page
-from flockenv.tasks import Crossing, CrowdNav, Evade, Flock, Herd, Obstacles, PathFollow, Pursuit, Task
+from flockenv.tasks import (
+    Bottleneck,
+    Corridor,
+    Crossing,
+    CrowdNav,
+    Evade,
+    Flock,
+    Herd,
+    Obstacles,
+    PathFollow,
+    Pursuit,
+    Task,
+)
 from flockenv.world import Step, World
 
 __all__ = [
+    "BottleneckEnv",
+    "CorridorEnv",
     "CrossingEnv",
     "CrowdNavEnv",
     "EvadeEnv",
@@ -189,4 +203,20 @@ class CrowdNavEnv(SingleEnv):
     """A robot crosses a crowd of pedestrians who swap places under a social force, and must touch nobody."""
 
     task_type = CrowdNav
+    history = "v0: first version (flockenv 0.2.0)."
+
+
+class CorridorEnv(SingleEnv):
+    """One walker in a corridor among two streams of scripted ones."""
+
+    task_type = Corridor
+    fixed: ClassVar[dict[str, Any]] = {"learners": 1}
+    history = "v0: first version (flockenv 0.2.0)."
+
+
+class BottleneckEnv(SingleEnv):
+    """One person leaves a room through a door that scripted others want to leave by too."""
+
+    task_type = Bottleneck
+    fixed: ClassVar[dict[str, Any]] = {"learners": 1}
     history = "v0: first version (flockenv 0.2.0)."

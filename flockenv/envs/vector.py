@@ -31,10 +31,24 @@ from flockenv.envs.face import (
     together,
 )
 from flockenv.refusals import nearest
-from flockenv.tasks import Crossing, CrowdNav, Evade, Flock, Herd, Obstacles, PathFollow, Pursuit, Task
+from flockenv.tasks import (
+    Bottleneck,
+    Corridor,
+    Crossing,
+    CrowdNav,
+    Evade,
+    Flock,
+    Herd,
+    Obstacles,
+    PathFollow,
+    Pursuit,
+    Task,
+)
 from flockenv.world import Step, World
 
 __all__ = [
+    "BottleneckVectorEnv",
+    "CorridorVectorEnv",
     "CrossingVectorEnv",
     "CrowdNavVectorEnv",
     "EvadeVectorEnv",
@@ -382,3 +396,17 @@ class CrowdNavVectorEnv(WorldsEnv):
     """Robots, one per world; the page is that of flockenv.envs.single.CrowdNavEnv."""
 
     task_type = CrowdNav
+
+
+class CorridorVectorEnv(WorldsEnv):
+    """Walkers in corridors, one per world or `learners=` several; the page is that of flockenv.envs.single.CorridorEnv."""
+
+    task_type = Corridor
+    fixed: ClassVar[dict[str, Any]] = {"learners": 1}
+
+
+class BottleneckVectorEnv(WorldsEnv):
+    """People who leave rooms, one per world, or `learners=` several with `together=True`; see single.BottleneckEnv."""
+
+    task_type = Bottleneck
+    fixed: ClassVar[dict[str, Any]] = {"learners": 1}

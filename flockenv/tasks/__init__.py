@@ -12,6 +12,7 @@ for _module in pkgutil.iter_modules(__path__):
     importlib.import_module(f"{__name__}.{_module.name}")
 
 from flockenv.tasks.bottleneck import Bottleneck  # noqa: E402  # after the folder has been walked
+from flockenv.tasks.corridor import Corridor  # noqa: E402
 from flockenv.tasks.crossing import Crossing  # noqa: E402  # after the folder has been walked
 from flockenv.tasks.crowd_nav import CrowdNav  # noqa: E402
 from flockenv.tasks.evade import Evade  # noqa: E402  # after the folder has been walked
@@ -24,6 +25,7 @@ from flockenv.tasks.pursuit import Pursuit  # noqa: E402
 __all__ = [
     "TASKS",
     "Bottleneck",
+    "Corridor",
     "Crossing",
     "CrowdNav",
     "Evade",

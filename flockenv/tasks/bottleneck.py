@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
+from flockenv import steering
 from flockenv.effects import Contact, ObstacleContact
 from flockenv.kernels import kernel, like
 from flockenv.noise import uniform
@@ -22,7 +23,8 @@ from flockenv.state import State
 from flockenv.sweep import Look
 from flockenv.tasks.base import Frame, Measured, Task
 from flockenv.tasks.layout import Layout, Slot
-from flockenv.tasks.sight import clip, put
+from flockenv.tasks.sight import clip, place_of, put, velocity_of
+from flockenv.vec import add, norm, scale, sub, unit
 
 __all__ = ["Bottleneck"]
 
@@ -51,10 +53,29 @@ def spawn(p: Any, frame: Frame) -> None:
 
 @kernel
 def drive(p: Any, frame: Frame, action: Any, force: Any) -> None:
-    """Everybody pushes where his action says, along the walls' axes."""
+    """Learners push where their action says, along the walls' axes; the others follow `_walker`."""
     for i in range(frame.pos.shape[1]):
-        force[0, i] = action[i, 0] * frame.max_force[i]
-        force[1, i] = action[i, 1] * frame.max_force[i]
+        if i < action.shape[0]:
+            force[0, i] = action[i, 0] * frame.max_force[i]
+            force[1, i] = action[i, 1] * frame.max_force[i]
+        else:
+            _walker(p, frame, i, force)
+
+
+@kernel
+def _walker(p: Any, frame: Frame, i: int, force: Any) -> None:
+    """A scripted person: to the door at 1.34 m/s or less, and off others, as in Helbing, Farkas and Vicsek 2000."""
+    velocity, top = velocity_of(frame, i), min(1.34, p.max_speed)
+    y, fits = 0.5 * p.room - np.float64(frame.pos[1, i]), max(0.5 * p.width - 1.2 * _RADIUS, 0.0)
+    aside = y - min(max(y, -fits), fits)
+    way = unit((max(p.room - np.float64(frame.pos[0, i]), 0.0) + 0.1, aside))
+    wish = scale(sub(scale(way, top), velocity), _MASS / 0.5)
+    for j in range(frame.pos.shape[1]):
+        to = sub(place_of(frame, j), place_of(frame, i))
+        if j != i and frame.alive[j] and norm(to) < p.sight:
+            tie = (1.0, 0.0) if j < i else (-1.0, 0.0)
+            wish = add(wish, scale(steering.repulsion(to, tie, 2.0 * _RADIUS, 0.08), 2000.0))
+    force[0, i], force[1, i] = wish[0], wish[1]
 
 
 @kernel
@@ -112,22 +133,28 @@ def reward(p: Any, before: Frame, after: Frame, action: Any, terms: Any) -> None
 
 @kernel
 def ended(p: Any, before: Frame, after: Frame, over: Any) -> bool:
-    """Who is through the door is out; everybody out, and nobody ever hurt: success."""
+    """Who is through the door is out; all learners out, and none of them ever hurt: success."""
     everybody, unhurt = True, True
-    for i in range(over.shape[0]):
-        over[i] = after.memory[2, i] > 0.0
-        everybody &= over[i]
-        unhurt &= after.memory[1, i] <= p.limit
+    for i in range(after.pos.shape[1]):
+        out = bool(after.memory[2, i] > 0.0)
+        after.alive[i] = after.alive[i] and not out
+        if i < over.shape[0]:
+            over[i] = out
+            everybody &= out
+            unhurt &= bool(after.memory[1, i] <= p.limit)
+    if p.together > 0.0:
+        for i in range(over.shape[0]):
+            over[i] = everybody
     return everybody and unhurt
 
 
 @kernel
 def measure(p: Any, before: Frame, after: Frame, numbers: Any) -> None:
-    """How many are out; when the first and the last of them left, s; most pressure so far, N/m; who touches, hurts, s.
+    """Learners out; when the first and the last of them left, s; most pressure so far, N/m; in touch, and hurt, s.
 
-    The last two: the time, on average over all, in which somebody or the wall was touched, and in which it hurt.
+    The last two: the time, on average over them, in which somebody or the wall was touched, and in which it hurt.
     """
-    n = after.pos.shape[1]
+    n = int(p.learners)
     out, first, latest, most, touched, hurt = 0.0, np.inf, 0.0, 0.0, 0.0, 0.0
     for i in range(n):
         if after.memory[2, i] > 0.0:
@@ -149,6 +176,8 @@ def observe(p: Any, frame: Frame, rows: Any) -> None:
         row = rows[i]
         for c in range(rows.shape[1]):
             row[np.uint64(c)] = 0.0
+        if not frame.alive[i]:
+            continue
         x, y = p.room - frame.pos[0, i], half - frame.pos[1, i]
         put(row, 0, (clip(frame.vel[0, i] / p.max_speed), clip(frame.vel[1, i] / p.max_speed)))
         put(row, 2, (clip(x / p.room), clip(y / p.room)))
@@ -171,11 +200,14 @@ def observe(p: Any, frame: Frame, rows: Any) -> None:
 class Bottleneck(Task):
     """N people leave a room through one door; who is through is out, and the others go on. One policy for all.
 
+    Who is out leaves the game. With `together` he stays in it, out of the world, paid nothing and shown zeros, until
+    all are out: vector environments want learners that end together, and learn from the same returns.
+
     Bodies and walls are those of Helbing, Farkas and Vicsek 2000 (Nature 407:487): k = 1.2e5 kg/s^2, sliding friction
     kappa = 2.4e5 kg/(m s), 80 kg; damped (ours), because people do not bounce. Somebody is hurt, as there, where the
     forces that press on him are more than 1600 N for each metre of his circumference: 2.5 kN in all. Elastic forces of
     other bodies and of the wall with the door count; the other walls are hard and press on nobody. Everybody is paid
-    for himself. All out, and nobody ever hurt, is success.
+    for himself. All out, and none of them ever hurt, is success. Who does not learn walks by the forces of 2000.
     """
 
     name: ClassVar[str] = "bottleneck"
@@ -189,7 +221,12 @@ class Bottleneck(Task):
 
     dt: float = Field(default=0.01, gt=0, description="s, one physics step: bodies are stiff")
     horizon: int = Field(default=300, ge=1, description="decisions until the time limit (truncation)")
-    people: int = Field(default=20, ge=1, le=400, description="how many want to leave; all of them learn")
+    people: int = Field(default=20, ge=1, le=400, description="how many want to leave")
+    learners: int = Field(
+        default_factory=lambda given: given.get("people", 20), ge=1,
+        description="how many of them learn (default: all); the others follow a script",
+    )  # fmt: skip
+    together: bool = Field(default=False, description="do learners who are out wait until all are?")
     room: float = Field(default=6.0, gt=1, description="m, edge of the room")
     width: float = Field(default=1.0, gt=0.5, description="m, of the door; bodies are 0.5 m wide")
     clear: float = Field(default=1.5, ge=0, description="m before the door, in which nobody begins")
@@ -208,7 +245,9 @@ class Bottleneck(Task):
 
     @model_validator(mode="after")
     def _room_for_all(self) -> Bottleneck:
-        """Refuse a door that is wider than its wall, and more people than have room."""
+        """Refuse more learners than people, a door that is wider than its wall, and more people than have room."""
+        if self.learners > self.people:
+            raise ValueError(f"learners = {self.learners}: there are only {self.people} people")
         if self.width >= self.room:
             raise ValueError(f"width = {self.width:g} m: the wall has {self.room:g} m")
         if self.clear >= self.room - 1.0:
@@ -230,37 +269,33 @@ class Bottleneck(Task):
         return super().parameters() | {"columns": float(columns), "rows": float(rows)}
 
     @property
-    def learners(self) -> int:
-        """All of them."""
-        return self.people
-
-    @property
     def agents(self) -> int:
         """Everybody."""
         return self.people
 
     @property
     def ends_together(self) -> bool:
-        """Who is out is out."""
-        return False
+        """Who is out is out, unless he waits, or is the only one."""
+        return self.together or self.learners == 1
 
     @property
     def agent_names(self) -> tuple[str, ...]:
         """person_0 ..."""
-        return tuple(f"person_{i}" for i in range(self.people))
+        return tuple(f"person_{i}" for i in range(self.learners))
 
     @functools.cached_property
     def scene(self) -> Scene:
         """A room with a door in one wall, and stiff bodies."""
         low, high = 0.5 * (self.room - self.width), 0.5 * (self.room + self.width)
         solid = {"stiffness": _STIFFNESS, "friction": _FRICTION, "ratio": _RATIO}
-        everybody = Group(
-            count=self.people, mass=_MASS, radius=_RADIUS, max_speed=self.max_speed, max_force=self.max_force,
-            role="learner", spawn=Spawn(low=(0.0, 0.0), high=(self.room, self.room)),
-        )  # fmt: skip
+        limits: dict[str, Any] = {"max_speed": self.max_speed, "max_force": self.max_force}
+        limits |= {"mass": _MASS, "radius": _RADIUS, "spawn": Spawn(low=(0.0, 0.0), high=(self.room, self.room))}
+        groups = [Group(count=self.learners, role="learner", **limits)]
+        if self.people > self.learners:
+            groups.append(Group(count=self.people - self.learners, role="agent", **limits))
         return Scene(
             space=Box(size=(self.room + _BEYOND, self.room)),
-            groups=(everybody,),
+            groups=tuple(groups),
             obstacles=(
                 Wall(vertices=((self.room, 0.0), (self.room, low))),
                 Wall(vertices=((self.room, high), (self.room, self.room))),
@@ -307,8 +342,8 @@ class Bottleneck(Task):
         out, span = last["out"], last["latest"] - last["first"]
         flows = (out >= 2) & (span > 0)
         return {
-            "share_out": out / self.people,
-            "evacuation_time": np.where(out >= self.people, last["latest"], np.nan),
+            "share_out": out / self.learners,
+            "evacuation_time": np.where(out >= self.learners, last["latest"], np.nan),
             "specific_flow": np.where(flows, (out - 1) / np.where(flows, span, 1.0) / self.width, np.nan),
             "contact_time": sums["touched"],
             "most_pressure": last["most"],
