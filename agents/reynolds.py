@@ -479,7 +479,7 @@ def bottleneck(see: Any, task: Bottleneck, p: BottleneckRules) -> np.ndarray:
 
 
 def _to_opening(see: Any, task: Bottleneck) -> np.ndarray:
-    """Return the unit vectors to the nearest place of the door where a body fits; straight on where one is before it."""
+    """Return the unit vectors to the nearest place of the door where a body fits; straight on before it."""
     half = max(task.width / 2 - 1.2 * _PERSON, 0.0)
     aside = see.door[:, 1] - np.clip(see.door[:, 1], -half, half)
     way = np.stack([np.maximum(see.door[:, 0], 0.0) + 0.1, aside], axis=-1)

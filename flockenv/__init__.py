@@ -22,8 +22,8 @@ if TYPE_CHECKING:
     from flockenv.state import Body, State
     from flockenv.tasks import (
         TASKS,
-        Corridor,
         Bottleneck,
+        Corridor,
         Crossing,
         CrowdNav,
         Evade,
@@ -41,8 +41,8 @@ __version__ = "0.1.0"
 __all__ = [
     "TASKS",
     "Body",
-    "Corridor",
     "Bottleneck",
+    "Corridor",
     "Crossing",
     "CrowdNav",
     "Evade",

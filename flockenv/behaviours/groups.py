@@ -11,7 +11,7 @@ from pydantic import Field
 
 from flockenv import steering
 from flockenv.behaviours.social import Social, size_of
-from flockenv.effects.base import Effect, Me, Other, Sight, Vector, demand_group
+from flockenv.effects.base import Effect, Me, Other, Sight, Vector
 from flockenv.elementary import exp
 from flockenv.kernels import Vec, law, like
 from flockenv.vec import add, norm, scale, select, sub, unit, zero
@@ -104,11 +104,16 @@ class Friends(Social):
 dt: 0.02
 groups:
   - {count: 4, mass: 80, radius: 0.25, desired_speed: 1.3, spawn: {low: [-6, -3], high: [-3, 3]}}
-  - {count: 1, mass: 80, radius: 0.25, role: learner, spawn: {low: [0, 2.5], high: [0, 2.5]}}
+  - count: 1
+    mass: 80
+    radius: 0.25
+    desired_speed: 1.3
+    role: learner
+    spawn: {low: [0, 2.5], high: [0, 2.5]}
 effects:
   - {kind: course, group: 0, direction: [1, 0]}
-  - {kind: steer, group: 0, arbitration: {kind: blend}, behaviours: [{kind: driving, tau: 0.5},
-     {kind: friends, group: 1, acceleration: 4, decay: 3, fades: 4, radius: 10}]}
+  - {kind: driving, tau: 0.5}
+  - {kind: steer, group: 0, behaviours: [{kind: friends, group: 1, acceleration: 4, decay: 3, fades: 4, radius: 10}]}
   - {kind: circular_repulsion, strength: 2000, decay: 0.08, radius: 3}
 """
 
@@ -205,11 +210,3 @@ effects:
     def sums(self, dimension: int) -> int:
         """How many others, where, and away from those who are too near."""
         return 1 + 2 * dimension
-
-    def check(self, scene: Any) -> None:
-        """Refuse a group that is not there, and parties larger than it."""
-        demand_group("group", self.group, scene.groups)
-        size = scene.groups[self.group].size
-        if self.party > size:
-            raise ValueError(f"party = {self.party}: groups[{self.group}] has {size} agents")
-        super().check(scene)

@@ -1,4 +1,4 @@
-"""Bottleneck for PettingZoo, module style: env() by turns, parallel_env() all at once, raw_env the class behind both."""
+"""Bottleneck for PettingZoo, module style: env() by turns, parallel_env() all at once, raw_env the class behind."""
 
 from __future__ import annotations
 

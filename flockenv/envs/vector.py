@@ -399,7 +399,7 @@ class CrowdNavVectorEnv(WorldsEnv):
 
 
 class CorridorVectorEnv(WorldsEnv):
-    """Walkers in corridors, one per world or `learners=` several; the page is that of flockenv.envs.single.CorridorEnv."""
+    """Walkers in corridors, one per world or `learners=` several; the page is that of single.CorridorEnv."""
 
     task_type = Corridor
     fixed: ClassVar[dict[str, Any]] = {"learners": 1}

@@ -336,8 +336,8 @@ class Bottleneck(Task):
 
     def metrics(self, sums: Measured, last: Measured, steps: NDArray[np.int64]) -> dict[str, NDArray[np.float64]]:
         """Share that is out; s until the last was (NaN if not all are); persons per s and m of door between the first
-        and the last out (NaN before two are); s in touch, each, on average; most pressure on anybody, N/m; s in which it
-        hurt, each, on average.
+        and the last out (NaN before two are); s in touch, each, on average; most pressure on anybody, N/m; s in which
+        it hurt, each, on average.
         """  # fmt: skip
         out, span = last["out"], last["latest"] - last["first"]
         flows = (out >= 2) & (span > 0)

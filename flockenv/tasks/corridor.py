@@ -191,8 +191,8 @@ class Corridor(Task):
 
     Everybody has a desired speed of his own, N(1.34, 0.26) m/s, and is paid for getting along so fast, not faster.
     Nobody is stopped by a touch; it costs as long as it lasts. Walls are solid. All learn, with one policy (those who
-    do not walk by the forces of Moussaid et al. 2009), and see everything in the frame of their own way; so what looks like keeping right, or lanes, is their doing. Nobody
-    terminates.
+    do not walk by the forces of Moussaid et al. 2009), and see everything in the frame of their own way; so what looks
+    like keeping right, or lanes, is their doing. Nobody terminates.
     """
 
     name: ClassVar[str] = "corridor"

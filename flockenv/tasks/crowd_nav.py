@@ -228,7 +228,7 @@ class CrowdNav(Task):
 
     @functools.cached_property
     def scene(self) -> Scene:
-        """A plane; the crowd wants to get across the circle, and keeps off each other, and off the robot if it sees it."""
+        """A plane; the crowd wants to get across the circle, off each other, and off the robot if it sees it."""
         around = Spawn(low=(-self.circle, -self.circle), high=(self.circle, self.circle))  # before an episode begins
         robot = {"radius": _RADIUS, "max_speed": self.max_speed, "max_force": self.max_force, "role": "learner"}
         seen = {"radius": self.sight, "group": None if self.visible else 1}
@@ -278,8 +278,8 @@ class CrowdNav(Task):
         return Layout((Slot("force", (2,), self.max_force, "N", meaning),))
 
     def metrics(self, sums: Measured, last: Measured, steps: NDArray[np.int64]) -> dict[str, NDArray[np.float64]]:
-        """Did it touch somebody; neither that nor there; s to the goal (NaN if not there); path, m; least gap so far, m;
-        share of the time nearer than is comfortable.
+        """Did it touch somebody; neither that nor there; s to the goal (NaN if not there); path, m; least gap, m; share
+        of the time nearer than is comfortable.
         """  # fmt: skip
         time = steps * self.control_dt
         return {
