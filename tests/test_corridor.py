@@ -43,13 +43,13 @@ def test_people_begin_in_the_corridor_half_of_them_each_way_and_not_in_each_othe
     assert len(np.unique(pos[:, 0, 0].round(1))) > 40  # cells are drawn anew
 
 
-def test_getting_along_pays_up_to_the_desired_speed_and_a_touch_costs_both() -> None:
+def test_getting_along_pays_most_at_the_desired_speed_and_a_touch_costs_both() -> None:
     world = walk([(2, 1), (6, 1), (6.4, 1), (10, 2)], [(0.67, 0), (1.9, 0), (0.67, 0), (-0.67, 0)])
     pace = world._memory[1, 0].copy()
     step = act(world)
     terms = [paid(world, step, i) for i in range(4)]
     for i, speed in enumerate((0.67, 1.9, -0.67, 0.67)):
-        assert terms[i]["along"] == pytest.approx(0.1 * min(speed / pace[i], 1))
+        assert terms[i]["along"] == pytest.approx(0.1 * (1 - abs(speed / pace[i] - 1)))
     assert [t["touch"] for t in terms] == pytest.approx([0, -0.5, -0.5, 0])
     assert paid(world, act(world, (0.6, 0.8)))["effort"] == pytest.approx(-0.1 * 0.1)
 

@@ -90,6 +90,12 @@ def _share(frame: Frame, i: int) -> float:
 
 
 @kernel
+def _suited(frame: Frame, i: int) -> float:
+    """Return 1 at one's desired speed; less, by the share that it is missed by, both below and above."""
+    return 1.0 - abs(_share(frame, i) - 1.0)
+
+
+@kernel
 def _touches(frame: Frame, i: int) -> float:
     """Return how many agent i touches."""
     touches = 0.0
@@ -100,10 +106,10 @@ def _touches(frame: Frame, i: int) -> float:
 
 @kernel
 def reward(p: Any, before: Frame, after: Frame, action: Any, terms: Any) -> None:
-    """Terms: along (at most as fast as one would like), touch, effort."""
+    """Terms: along (as fast as one would like, no faster), touch, effort."""
     for i in range(terms.shape[0]):
         push = action[i, 0] * action[i, 0] + action[i, 1] * action[i, 1]
-        terms[i, 0] = p.along_reward * min(_share(after, i), 1.0) * p.control_dt
+        terms[i, 0] = p.along_reward * _suited(after, i) * p.control_dt
         terms[i, 1] = -p.touch_cost * _touches(after, i) * p.control_dt
         terms[i, 2] = -p.effort_cost * min(push, 1.0) * p.control_dt
 
@@ -131,11 +137,11 @@ def _order(p: Any, frame: Frame) -> float:
 
 @kernel
 def ended(p: Any, before: Frame, after: Frame, over: Any) -> bool:
-    """Never over before the time limit. The aim holds now if all get along, and nobody touches."""
+    """Never over before the time limit. The aim holds now if learners get along, and do not touch."""
     n = over.shape[0]
     share, touches = 0.0, 0.0
     for i in range(n):
-        share += min(_share(after, i), 1.0)
+        share += _suited(after, i)
         touches += _touches(after, i)
     return bool(share > p.aim * n and touches == 0.0)
 
@@ -189,7 +195,7 @@ def observe(p: Any, frame: Frame, rows: Any) -> None:
 class Corridor(Task):
     """Two streams of people walk in one corridor, against each other, for ever: along it, the world is a ring.
 
-    Everybody has a desired speed of his own, N(1.34, 0.26) m/s, and is paid for getting along so fast, not faster.
+    Everybody has a desired speed of his own, N(1.34, 0.26) m/s, and is paid for getting along so fast, no faster.
     Nobody is stopped by a touch; it costs as long as it lasts. Walls are solid. All learn, with one policy (those who
     do not walk by the forces of Moussaid et al. 2009), and see everything in the frame of their own way; so what looks
     like keeping right, or lanes, is their doing. Nobody terminates.
@@ -217,8 +223,8 @@ class Corridor(Task):
     sight: float = Field(default=4.0, gt=0, description="m, others are seen within this")
     neighbours: int = Field(default=8, ge=1, le=32, description="how many others are seen, nearest first")
     near: float = Field(default=0.75, gt=0, description="m between bodies, within which closeness is seen")
-    aim: float = Field(default=0.9, ge=0, le=1, description="share of the desired speed that is success, on average")
-    along_reward: float = Field(default=1.0, ge=0, description="per s at the desired speed")
+    aim: float = Field(default=0.9, ge=0, le=1, description="how near the desired speeds is success: 1 = at them")
+    along_reward: float = Field(default=1.0, ge=0, description="per s at the desired speed, less by the share it is missed by")
     touch_cost: float = Field(default=5.0, ge=0, description="per s and person touched")
     effort_cost: float = Field(default=0.1, ge=0, description="per s at full force")
 
