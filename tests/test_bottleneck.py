@@ -63,7 +63,7 @@ def test_what_presses_is_the_force_over_the_circumference_and_above_the_limit_it
         for i in range(4):
             terms = paid(world, step, i)
             assert terms["pressed"] == pytest.approx(-2 * 0.1 * min(expected[i] / 1600, 1), rel=1e-9)
-            assert terms["hurt"] == (-1 if expected[i] > 1600 else 0)
+            assert terms["hurt"] == (-5 if expected[i] > 1600 else 0)
         hurt += 0.1 * np.mean(expected > 1600)
     assert expected[0] == pytest.approx((3 * 600 + 2 * 600) / ROUND, rel=0.05)  # the wall, and both behind him
     assert expected[2] == pytest.approx(600 / ROUND, rel=0.05)

@@ -240,7 +240,7 @@ class Bottleneck(Task):
     progress_reward: float = Field(default=0.5, ge=0, description="per m nearer to the door")
     out_reward: float = Field(default=5.0, ge=0, description="for getting out")
     press_cost: float = Field(default=2.0, ge=0, description="per s at the limit of pressure, less in proportion")
-    hurt_cost: float = Field(default=10.0, ge=0, description="per s above the limit")
+    hurt_cost: float = Field(default=50.0, ge=0, description="per s above the limit")
     time_cost: float = Field(default=0.5, ge=0, description="per s in the room")
 
     @model_validator(mode="after")
