@@ -112,7 +112,7 @@ def test_who_waits_for_the_others_is_out_of_the_world_too() -> None:
     for _ in range(5):
         one, other = act(world, (0.3, 0.1)), act(waiting, (0.3, 0.1))
         np.testing.assert_array_equal(one.terms, other.terms)
-        np.testing.assert_array_equal(world.state.alive, waiting.state.alive)
+        np.testing.assert_array_equal(world.state.pos[:, 1:], waiting.state.pos[:, 1:])
         assert not other.terminated.any()
         assert not other.observation[0, 0].any()
     waiting.state.pos[0, 1:] = (6.2, 2.9), (6.2, 3.5)

@@ -53,8 +53,12 @@ def spawn(p: Any, frame: Frame) -> None:
 
 @kernel
 def drive(p: Any, frame: Frame, action: Any, force: Any) -> None:
-    """Learners push where their action says, along the walls' axes; the others follow `_walker`."""
+    """Learners push where their action says, along the walls' axes; the others follow `_walker`.
+
+    Who has left in the decision before is taken out of the world now: what was seen then is what there was.
+    """
     for i in range(frame.pos.shape[1]):
+        frame.alive[i] = frame.alive[i] and frame.memory[2, i] < 1.0
         if i < action.shape[0]:
             force[0, i] = action[i, 0] * frame.max_force[i]
             force[1, i] = action[i, 1] * frame.max_force[i]
@@ -99,13 +103,15 @@ def _pressure(p: Any, frame: Frame, i: int) -> float:
 
 @kernel
 def keep(p: Any, before: Frame, after: Frame) -> None:
-    """Remember what presses now, the most so far, N/m; who is out (1), and since when, s."""
+    """Remember what presses now, the most so far, N/m; who left now (1), or before (2), and when, s."""
     for i in range(after.pos.shape[1]):
-        inside = before.alive[i]
+        inside = after.memory[2, i] < 1.0
         now = _pressure(p, after, i) if inside else 0.0
         after.memory[0, i] = now
         after.memory[1, i] = max(np.float64(after.memory[1, i]), now)
-        if inside and after.pos[0, i] > p.room + _RADIUS:
+        if not inside:
+            after.memory[2, i] = 2.0
+        elif after.pos[0, i] > p.room + _RADIUS:
             after.memory[2, i], after.memory[3, i] = 1.0, after.step * p.control_dt
 
 
@@ -122,10 +128,10 @@ def reward(p: Any, before: Frame, after: Frame, action: Any, terms: Any) -> None
     for i in range(terms.shape[0]):
         for k in range(5):
             terms[i, k] = 0.0
-        if before.alive[i]:
+        if after.memory[2, i] < 2.0:
             pressure = np.float64(after.memory[0, i])
             terms[i, 0] = p.progress_reward * (_left(p, before, i) - _left(p, after, i))
-            terms[i, 1] = p.out_reward * after.memory[2, i]
+            terms[i, 1] = p.out_reward if after.memory[2, i] > 0.0 else 0.0
             terms[i, 2] = -p.press_cost * min(pressure / p.limit, 1.0) * p.control_dt
             terms[i, 3] = -p.hurt_cost * p.control_dt if pressure > p.limit else 0.0
             terms[i, 4] = -p.time_cost * p.control_dt
@@ -135,13 +141,11 @@ def reward(p: Any, before: Frame, after: Frame, action: Any, terms: Any) -> None
 def ended(p: Any, before: Frame, after: Frame, over: Any) -> bool:
     """Who is through the door is out; all learners out, and none of them ever hurt: success."""
     everybody, unhurt = True, True
-    for i in range(after.pos.shape[1]):
+    for i in range(over.shape[0]):
         out = bool(after.memory[2, i] > 0.0)
-        after.alive[i] = after.alive[i] and not out
-        if i < over.shape[0]:
-            over[i] = out
-            everybody &= out
-            unhurt &= bool(after.memory[1, i] <= p.limit)
+        over[i] = out
+        everybody &= out
+        unhurt &= bool(after.memory[1, i] <= p.limit)
     if p.together > 0.0:
         for i in range(over.shape[0]):
             over[i] = everybody
@@ -176,7 +180,7 @@ def observe(p: Any, frame: Frame, rows: Any) -> None:
         row = rows[i]
         for c in range(rows.shape[1]):
             row[np.uint64(c)] = 0.0
-        if not frame.alive[i]:
+        if frame.memory[2, i] > 0.0:
             continue
         x, y = p.room - frame.pos[0, i], half - frame.pos[1, i]
         put(row, 0, (clip(frame.vel[0, i] / p.max_speed), clip(frame.vel[1, i] / p.max_speed)))
