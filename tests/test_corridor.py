@@ -22,7 +22,7 @@ HORIZON = 10
 def walk(places: Any, velocities: Any = 0.0, **more: Any) -> World:
     """People at places (along the corridor, across it), the first half of them on their way to the right."""
     world = world_of(Corridor(people=len(places), horizon=HORIZON, **more))
-    place(world, np.array(places, float) + [0.0, 1.0], velocities)
+    place(world, np.add(places, [0.0, 1.0]), velocities)
     return world
 
 

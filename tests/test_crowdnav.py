@@ -17,7 +17,7 @@ from tests.test_tasks import act, paid, place, random_actions, world_of
 
 
 def meeting(offset: Any, velocity: Any = (0.0, 0.0), **more: Any) -> World:
-    """The robot 3 m before its goal, at a velocity (along, left), a pedestrian where he wants to be, and one far away."""
+    """The robot 3 m before its goal, a pedestrian where he wants to be, and one far away; vectors are (along, left)."""
     world = world_of(CrowdNav(people=2, **more))
     goal, course = world._memory[:2, 0, 0].copy(), world._memory[2:4, 0, 0].copy()
     axes = np.array([course, [-course[1], course[0]]])

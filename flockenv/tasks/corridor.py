@@ -224,7 +224,7 @@ class Corridor(Task):
     neighbours: int = Field(default=8, ge=1, le=32, description="how many others are seen, nearest first")
     near: float = Field(default=0.75, gt=0, description="m between bodies, within which closeness is seen")
     aim: float = Field(default=0.9, ge=0, le=1, description="how near the desired speeds is success: 1 = at them")
-    along_reward: float = Field(default=1.0, ge=0, description="per s at the desired speed, less by the share it is missed by")
+    along_reward: float = Field(default=1.0, ge=0, description="per s at the desired speed; less by what is missed")
     touch_cost: float = Field(default=5.0, ge=0, description="per s and person touched")
     effort_cost: float = Field(default=0.1, ge=0, description="per s at full force")
 
