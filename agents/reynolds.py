@@ -22,7 +22,20 @@ from flockenv import arbitration, shapes, steering, urges
 from flockenv.grants import reconcile
 from flockenv.orca import orca
 from flockenv.rows import rows
-from flockenv.tasks import Crossing, Evade, Flock, Herd, Obstacles, PathFollow, Pursuit, School, Task
+from flockenv.tasks import (
+    Bottleneck,
+    Corridor,
+    Crossing,
+    CrowdNav,
+    Evade,
+    Flock,
+    Herd,
+    Obstacles,
+    PathFollow,
+    Pursuit,
+    School,
+    Task,
+)
 
 __all__ = ["PLAYERS", "RULES", "Reynolds", "player", "tuned"]
 
@@ -39,6 +52,8 @@ ray_hit = rows(shapes.ray_hit)
 herd_from = rows(steering.herd_from)
 follow_path = rows(steering.follow_path)
 intention, wander = rows(urges.intention), rows(steering.wander)
+repulsion, queue_gap, queue = rows(steering.repulsion), rows(steering.queue_gap), rows(steering.queue)
+sidestep, collision_distance = rows(steering.sidestep), rows(steering.collision_distance)
 
 
 # --- Pursuit: seek where the quarry will be, but never beyond the walls it cannot pass ------------------------------
@@ -350,6 +365,218 @@ _FINE = 5
 """Places between two points of the track that are seen, among which the nearest is."""
 
 
+# --- CrowdNav: social force, ORCA, and the two rules of Moussaid et al. -----------------------------------------------
+
+
+@dataclass(frozen=True)
+class CrowdNavRules:
+    """Textbook: Moussaid et al. 2009, as the pedestrians themselves."""
+
+    tau: float = 0.54  # s, relaxation time
+    speed: float = 1.0  # share of the top speed that is wanted
+    strength: float = 4.5  # A, m/s^2
+    importance: float = 2.0  # lambda, s/m, of velocities against positions
+    gamma: float = 0.35  # s, the range of the force per m/s of what closes in
+    angular: float = 2.0  # n, 1/m, of turning
+    forward: float = 3.0  # n', 1/m, of slowing down
+    bias: float = 0.005  # eps, 1/m, to the right
+
+
+def crowd_nav(see: Any, task: CrowdNav, p: CrowdNavRules) -> np.ndarray:
+    """Drive to the goal, slow down before others and pass them on one side; vectors are (along the course, left)."""
+    own = see.velocity[:, None]
+    wish = sidestep(
+        see.neighbours, own, own + see.neighbour_velocity, np.array([1.0, 0.0]), p.importance, p.gamma, p.angular,
+        p.forward, p.bias,
+    )  # fmt: skip
+    way = see.goal / np.maximum(np.linalg.norm(see.goal, axis=-1), 1e-9)[:, None]
+    push = p.strength * np.sum(wish * see.neighbour_present[..., None], axis=1)
+    return (p.speed * task.max_speed * way - see.velocity) / p.tau + push
+
+
+@dataclass(frozen=True)
+class RobotOrcaRules:
+    """As published, but for the share: whom nobody sees must do all there is to do."""
+
+    horizon: float = 2.0  # s, for so long the velocity must be free
+    margin: float = 0.1  # m, clearance for what inertia delays
+    turn: float = 0.0  # rad, a wish that is not free is turned right by this
+    gain: float = 10.0  # kg/s: within a decision
+    share: float = 1.0  # of the change that is its own where it is not seen; a half where it is
+
+
+def orca_crowd_nav(see: Any, task: CrowdNav, p: RobotOrcaRules) -> np.ndarray:
+    """Optimal reciprocal collision avoidance (van den Berg et al. 2011) on the way to the goal."""
+    wish = seek(see.goal, np.zeros_like(see.goal), task.max_speed)
+    others = see.velocity[:, None] + see.neighbour_velocity
+    radius = np.where(see.neighbour_present > 0, _PEDESTRIAN + p.margin, -1.0)[..., None]
+    share = np.full_like(radius, 0.5 if task.visible else p.share)
+    seen = np.concatenate([see.neighbours, others, radius, share], axis=-1)
+    change = keep_clear(
+        see.velocity, wish, _ROBOT, task.max_speed, p.horizon, task.control_dt, p.turn, seen.reshape(len(seen), -1)
+    )
+    return p.gain * change
+
+
+@dataclass(frozen=True)
+class HeuristicsRules:
+    """As published; it sees no further than it is shown."""
+
+    tau: float = 0.5  # s, relaxation time, and the time that it keeps to what is ahead
+    reach: float = 10.0  # d_max, m
+    view: float = 75.0  # degrees to either side of where it goes
+    margin: float = 0.0  # m, clearance
+
+
+def heuristics_crowd_nav(see: Any, task: CrowdNav, p: HeuristicsRules) -> np.ndarray:
+    """Look where the way is free, and go no faster than is safe (Moussaid, Helbing and Theraulaz 2011)."""
+    aim = see.goal / np.maximum(np.linalg.norm(see.goal, axis=-1), 1e-9)[:, None]
+    speed = np.linalg.norm(see.velocity, axis=-1)[:, None]
+    gaze = np.where(speed > 0.05, see.velocity / np.maximum(speed, 1e-9), aim)
+    turn = np.radians(np.linspace(-p.view, p.view, 31))
+    cosine, sine = np.cos(turn), np.sin(turn)
+    ways = np.stack([gaze[:, :1] * cosine - gaze[:, 1:] * sine, gaze[:, :1] * sine + gaze[:, 1:] * cosine], axis=-1)
+    ways = np.concatenate([aim[:, None], ways], axis=1)  # the aim first: of what is as good, what it wants
+    seen, moving = see.neighbour_present[:, :, None] > 0, see.velocity[:, None] + see.neighbour_velocity
+    clearance, one = _ROBOT + _PEDESTRIAN + p.margin, ways[:, None]
+    free = collision_distance(one, see.neighbours[:, :, None], moving[:, :, None], clearance, task.max_speed)
+    free = np.where(seen, free, np.inf).min(axis=1).clip(max=p.reach)
+    now = collision_distance(one, see.neighbours[:, :, None], np.zeros(2), clearance, 1.0)
+    now = np.where(seen, now, np.inf).min(axis=1)
+    left = p.reach**2 + free**2 - 2.0 * p.reach * free * np.sum(ways * aim[:, None], axis=-1)
+    row, best = np.arange(len(left)), np.argmin(left, axis=1)
+    safe = np.minimum(task.max_speed, now[row, best] / p.tau)[:, None]
+    return (safe * ways[row, best] - see.velocity) / p.tau
+
+
+_ROBOT, _PEDESTRIAN = 0.3, 0.25
+"""Radii of the robot and of a pedestrian, m."""
+
+
+# --- Bottleneck: push, as in 2000; or queue ---------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class BottleneckRules:
+    """Textbook: Helbing, Farkas and Vicsek 2000; bodies and walls themselves are the scene's."""
+
+    tau: float = 0.5  # s, relaxation time
+    speed: float = 1.0  # share of the top speed that is wanted
+    strength: float = 2000.0  # A, N
+    decay: float = 0.08  # B, m
+    walls: float = 2000.0  # A of walls, N
+
+
+def bottleneck(see: Any, task: Bottleneck, p: BottleneckRules) -> np.ndarray:
+    """Drive to the door, and be pushed off by others and by walls, exponentially."""
+    drive = 80.0 * (p.speed * task.max_speed * _to_opening(see, task) - see.velocity) / p.tau
+    tie = np.array([1.0, 0.0])
+    push = p.strength * repulsion(see.neighbours, tie, 2 * _PERSON, p.decay) * see.neighbour_present[..., None]
+    x, y, half = see.door[:, 0], see.door[:, 1], task.width / 2
+    points = [
+        np.stack([x, np.minimum(y - half, 0.0)], axis=-1), np.stack([x, np.maximum(y + half, 0.0)], axis=-1),
+        np.stack([0.0 * x, -see.to_sides[:, 0]], axis=-1), np.stack([0.0 * x, see.to_sides[:, 1]], axis=-1),
+    ]  # fmt: skip
+    off = p.walls * repulsion(np.stack(points, axis=1), tie, _PERSON, p.decay)
+    return drive + push.sum(axis=1) + off.sum(axis=1)
+
+
+def _to_opening(see: Any, task: Bottleneck) -> np.ndarray:
+    """Return the unit vectors to the nearest place of the door where a body fits; straight on before it."""
+    half = max(task.width / 2 - 1.2 * _PERSON, 0.0)
+    aside = see.door[:, 1] - np.clip(see.door[:, 1], -half, half)
+    way = np.stack([np.maximum(see.door[:, 0], 0.0) + 0.1, aside], axis=-1)
+    return way / np.linalg.norm(way, axis=-1)[:, None]
+
+
+@dataclass(frozen=True)
+class QueueingRules:
+    """Reynolds' queue, with the headway of Tordeux, Chraibi and Seyfried 2016."""
+
+    headway: float = 1.0  # s
+    margin: float = 0.05  # m, clearance
+    gain: float = 8.0  # 1/s: at least 4 / headway
+    apart: float = 40.0  # N m, separation
+    radius: float = 0.8  # m, between centres, within which it acts
+
+
+def queueing(see: Any, task: Bottleneck, p: QueueingRules) -> np.ndarray:
+    """Go to the door as fast as the gap ahead allows, and keep a little apart."""
+    way, present = _to_opening(see, task), see.neighbour_present > 0
+    others = see.velocity[:, None] + see.neighbour_velocity
+    gap = queue_gap(way[:, None], see.neighbours, others, 2 * _PERSON + p.margin, task.max_speed)
+    gap = np.where(present, gap, np.inf).min(axis=1).clip(max=1e3)
+    near = present & (np.linalg.norm(see.neighbours, axis=-1) < p.radius)
+    push = p.apart * np.sum(separate(see.neighbours, np.array([1.0, 0.0])) * near[..., None], axis=1)
+    return 80.0 * p.gain * queue(way, see.velocity, gap, task.max_speed, p.headway) + push
+
+
+_PERSON = 0.25
+"""Radius of somebody in the room, m."""
+
+
+# --- Corridor: slow down before others, and pass them on one side -----------------------------------------------------
+
+
+@dataclass(frozen=True)
+class CorridorRules:
+    """Textbook: Moussaid et al. 2009, with its bias to the right, and its walls."""
+
+    tau: float = 0.54  # s, relaxation time
+    strength: float = 4.5  # A, m/s^2
+    importance: float = 2.0  # lambda, s/m, of velocities against positions
+    gamma: float = 0.35  # s, the range of the force per m/s of what closes in
+    angular: float = 2.0  # n, 1/m, of turning
+    forward: float = 3.0  # n', 1/m, of slowing down
+    bias: float = 0.005  # eps, 1/m, to the right
+    walls: float = 3.0  # a, m/s^2
+    wall_decay: float = 0.1  # b, m
+
+
+def corridor(see: Any, task: Corridor, p: CorridorRules) -> np.ndarray:
+    """Drive at the desired speed, off others and off walls; vectors are (along one's way, to its left)."""
+    own = see.velocity[:, None]
+    wish = sidestep(
+        see.neighbours, own, own + see.neighbour_velocity, np.array([1.0, 0.0]), p.importance, p.gamma, p.angular,
+        p.forward, p.bias,
+    )  # fmt: skip
+    push = p.strength * np.sum(wish * see.neighbour_present[..., None], axis=1)
+    return (_ahead(see) - see.velocity) / p.tau + push + _off_walls(see, p.walls, p.wall_decay)
+
+
+def _ahead(see: Any) -> np.ndarray:
+    """Return the velocities that are wanted, m/s."""
+    return np.stack([see.desired_speed, 0.0 * see.desired_speed], axis=-1)
+
+
+def _off_walls(see: Any, strength: float, decay: float) -> np.ndarray:
+    """Return the push off both walls, a exp(-d / b), d from the body's centre."""
+    push = strength * (np.exp(-see.walls[:, 1] / decay) - np.exp(-see.walls[:, 0] / decay))
+    return np.stack([0.0 * push, push], axis=-1)
+
+
+@dataclass(frozen=True)
+class CorridorOrcaRules:
+    """As published, both take half; a wish that is not free is turned right."""
+
+    horizon: float = 2.0  # s, for so long the velocity must be free
+    margin: float = 0.05  # m, clearance for what inertia delays
+    turn: float = 0.3  # rad, a wish that is not free is turned right by this
+    gain: float = 10.0  # kg/s: within a decision
+
+
+def orca_corridor(see: Any, task: Corridor, p: CorridorOrcaRules) -> np.ndarray:
+    """Optimal reciprocal collision avoidance (van den Berg et al. 2011) along the corridor; walls are no neighbours."""
+    others = see.velocity[:, None] + see.neighbour_velocity
+    radius = np.where(see.neighbour_present > 0, _PERSON + p.margin, -1.0)[..., None]
+    seen = np.concatenate([see.neighbours, others, radius, np.full_like(radius, 0.5)], axis=-1)
+    change = keep_clear(
+        see.velocity, _ahead(see), _PERSON, task.max_speed, p.horizon, task.control_dt, p.turn,
+        seen.reshape(len(seen), -1),
+    )  # fmt: skip
+    return p.gain * change + _off_walls(see, 3.0, 0.1)
+
+
 # --- School: a state machine: flee, join the others, eat, or wander; keep off walls and each other always -------------
 
 
@@ -425,11 +652,20 @@ RULES: dict[str, tuple[Callable[..., np.ndarray], type]] = {
     "herd": (herd, HerdRules),
     "path_follow": (path_follow, PathFollowRules),
     "school": (school, SchoolRules),
+    "crowd_nav": (crowd_nav, CrowdNavRules),
+    "bottleneck": (bottleneck, BottleneckRules),
+    "corridor": (corridor, CorridorRules),
 }
 """What the player "reynolds" does in each task, and its parameters."""
 
 PLAYERS: dict[str, dict[str, tuple[Callable[..., np.ndarray], type]]] = {
-    "orca": {"crossing": (orca_crossing, OrcaRules)},
+    "orca": {
+        "crossing": (orca_crossing, OrcaRules),
+        "crowd_nav": (orca_crowd_nav, RobotOrcaRules),
+        "corridor": (orca_corridor, CorridorOrcaRules),
+    },
+    "heuristics": {"crowd_nav": (heuristics_crowd_nav, HeuristicsRules)},
+    "queueing": {"bottleneck": (queueing, QueueingRules)},
 }
 """Other hand-written players by name, for those tasks that have one."""
 

@@ -64,6 +64,18 @@ RANGES: dict[str, dict[str, tuple[float, float]]] = {
         "forage": (1.0, 8.0), "rich": (0.0, 20.0), "match": (0.0, 5.0), "centre": (0.0, 3.0), "pace": (0.1, 1.0),
         "turn": (0.0, 1.0),
     },
+    "bottleneck": {
+        "tau": (0.1, 1.5), "speed": (0.2, 1.0), "strength": (0.0, 4000.0), "decay": (0.02, 0.5), "walls": (0.0, 4000.0),
+    },
+    "corridor": {
+        "tau": (0.1, 1.5), "strength": (0.0, 20.0), "importance": (0.0, 4.0), "gamma": (0.05, 1.5),
+        "angular": (0.0, 6.0), "forward": (0.0, 6.0), "bias": (0.0, 0.5), "walls": (0.0, 20.0),
+        "wall_decay": (0.02, 0.5),
+    },
+    "crowd_nav": {
+        "tau": (0.15, 1.0), "speed": (0.5, 1.0), "strength": (0.5, 20.0), "importance": (0.0, 4.0),
+        "gamma": (0.05, 1.5), "angular": (0.0, 6.0), "forward": (0.0, 6.0), "bias": (0.0, 0.5),
+    },
 }  # fmt: skip
 """Where each parameter is looked for."""
 

@@ -22,7 +22,10 @@ if TYPE_CHECKING:
     from flockenv.state import Body, State
     from flockenv.tasks import (
         TASKS,
+        Bottleneck,
+        Corridor,
         Crossing,
+        CrowdNav,
         Evade,
         Flock,
         Herd,
@@ -39,7 +42,10 @@ __version__ = "0.1.0"
 __all__ = [
     "TASKS",
     "Body",
+    "Bottleneck",
+    "Corridor",
     "Crossing",
+    "CrowdNav",
     "Evade",
     "Flock",
     "Herd",
@@ -62,7 +68,10 @@ _HOME = {
     "Body": "state",
     "State": "state",
     "TASKS": "tasks",
+    "Corridor": "tasks",
+    "Bottleneck": "tasks",
     "Crossing": "tasks",
+    "CrowdNav": "tasks",
     "Evade": "tasks",
     "Flock": "tasks",
     "Herd": "tasks",

@@ -139,7 +139,19 @@ from flockenv.space import Box, Plane, Space, Torus
 from flockenv.spawn import Spawn
 from flockenv.steer import Steer
 from flockenv.targets import Target
-from flockenv.tasks import Crossing, Flock, Herd, Obstacles, PathFollow, Pursuit, School, Task
+from flockenv.tasks import (
+    Bottleneck,
+    Corridor,
+    Crossing,
+    CrowdNav,
+    Flock,
+    Herd,
+    Obstacles,
+    PathFollow,
+    Pursuit,
+    School,
+    Task,
+)
 from flockenv.tasks import Evade as EvadeTask
 
 Array = NDArray[np.float64]
@@ -564,6 +576,11 @@ TASKS = (
     TaskRow(Flock(learners=1), "_single"),
     TaskRow(Crossing()),
     TaskRow(Crossing(agents=8, learners=1), "_single"),
+    TaskRow(CrowdNav()),
+    TaskRow(Corridor()),
+    TaskRow(Corridor(people=8, learners=1), "_single"),
+    TaskRow(Bottleneck()),
+    TaskRow(Bottleneck(people=8, learners=1), "_single"),
     TaskRow(EvadeTask()),
     TaskRow(PathFollow()),
     TaskRow(Herd()),

@@ -6,7 +6,7 @@ import pettingzoo
 import pytest
 
 from flockenv.sb3 import WorldVecEnv
-from flockenv.tasks import Crossing, Evade, Flock, Herd, Obstacles, Pursuit, School
+from flockenv.tasks import Bottleneck, Corridor, Crossing, CrowdNav, Evade, Flock, Herd, Obstacles, Pursuit, School
 from flockenv.world import World
 
 SEED, LIMIT, STEPS = 21, 15, 40
@@ -15,6 +15,9 @@ ALONE = {
     "Obstacles": (Obstacles(), {}),
     "Flock": (Flock(agents=8, learners=1), {"agents": 8}),
     "Evade": (Evade(), {}),
+    "Corridor": (Corridor(people=8, learners=1), {"people": 8}),
+    "Bottleneck": (Bottleneck(people=8, learners=1), {"people": 8}),
+    "CrowdNav": (CrowdNav(goal_radius=11.8), {"goal_radius": 11.8}),
     "Herd": (Herd(), {}),
     "Crossing": (Crossing(agents=8, learners=1), {"agents": 8}),
     "School": (School(learners=1, metabolism=0.4), {"metabolism": 0.4}),
@@ -138,6 +141,7 @@ def test_one_learner_through_every_face(name):
     if name in (alone := {
         "Pursuit": {"pursuers": 1, "evaders": 1, "sides": "pursuers"}, "Flock": {"agents": 8, "learners": 1},
         "Herd": {"dogs": 1}, "Crossing": {"agents": 8, "learners": 1},
+        "Corridor": {"people": 8, "learners": 1}, "Bottleneck": {"people": 8, "learners": 1},
     }):  # fmt: skip
         assert through_parallel(env_id, alone[name], actions) == expected
         assert through_turns(env_id, alone[name], actions) == expected

@@ -25,6 +25,9 @@ EASY = {
     "flockenv/Crossing-v0": {"goal_radius": 11.8},
     "flockenv/PathFollow-v0": {"lost_distance": 1.5, "max_force": 2.5},
     "flockenv/School-v0": {"start_hunger": 0.6, "metabolism": 0.15},
+    "flockenv/Bottleneck-v0": {"people": 4, "room": 2.0, "clear": 0.0, "width": 1.8},
+    "flockenv/Corridor-v0": {},  # nor there
+    "flockenv/CrowdNav-v0": {"goal_radius": 11.8},
     "flockenv/Flock-v0": {},  # nobody ever terminates there
 }
 """Parameters under which random actions sometimes end an episode, and the clock ends the others."""

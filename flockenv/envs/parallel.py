@@ -26,12 +26,12 @@ from flockenv.envs.face import (
     render_fps,
 )
 from flockenv.refusals import nearest
-from flockenv.tasks import Crossing, Flock, Herd, Pursuit, School, Task
+from flockenv.tasks import Bottleneck, Corridor, Crossing, Flock, Herd, Pursuit, School, Task
 from flockenv.world import Step, World
 
 __all__ = [
-    "CrossingParallelEnv", "FlockParallelEnv", "HerdParallelEnv", "PursuitParallelEnv", "SchoolParallelEnv",
-    "WorldParallelEnv",
+    "BottleneckParallelEnv", "CorridorParallelEnv", "CrossingParallelEnv", "FlockParallelEnv", "HerdParallelEnv",
+    "PursuitParallelEnv", "SchoolParallelEnv", "WorldParallelEnv",
 ]  # fmt: skip
 
 Named = dict[str, Any]
@@ -268,3 +268,15 @@ class SchoolParallelEnv(WorldParallelEnv):
     """A school in which every fish is an agent, and leaves when caught or starved (learners=k: the first k are)."""
 
     task_type = School
+
+
+class CorridorParallelEnv(WorldParallelEnv):
+    """Two streams in one corridor, all of them agents (learners=k: only the first k are)."""
+
+    task_type = Corridor
+
+
+class BottleneckParallelEnv(WorldParallelEnv):
+    """Everybody leaves a room through one door, all of them agents; who is out leaves (learners=k: the first k are)."""
+
+    task_type = Bottleneck

@@ -18,6 +18,9 @@ HORIZONS = {
     "Evade": 300,
     "PathFollow": 300,
     "School": 400,
+    "CrowdNav": 250,
+    "Corridor": 300,
+    "Bottleneck": 300,
 }
 """Time limit of an episode in control steps, by name: `Task.horizon`, repeated here so that no task is imported."""
 
@@ -25,6 +28,8 @@ SINGLE = tuple(f"flockenv/{name}-v0" for name in HORIZONS)
 """Ids for gymnasium.make and gymnasium.make_vec: one learner, everybody else is scripted."""
 
 PARALLEL = {
+    "flockenv/Bottleneck-v0": "bottleneck_v0",
+    "flockenv/Corridor-v0": "corridor_v0",
     "flockenv/Crossing-v0": "crossing_v0",
     "flockenv/Flock-v0": "flock_v0",
     "flockenv/Herd-v0": "herd_v0",

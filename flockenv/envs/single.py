@@ -23,11 +23,27 @@ from flockenv.envs.face import (
     render_fps,
 )
 from flockenv.envs.page import page
-from flockenv.tasks import Crossing, Evade, Flock, Herd, Obstacles, PathFollow, Pursuit, School, Task
+from flockenv.tasks import (
+    Bottleneck,
+    Corridor,
+    Crossing,
+    CrowdNav,
+    Evade,
+    Flock,
+    Herd,
+    Obstacles,
+    PathFollow,
+    Pursuit,
+    School,
+    Task,
+)
 from flockenv.world import Step, World
 
 __all__ = [
+    "BottleneckEnv",
+    "CorridorEnv",
     "CrossingEnv",
+    "CrowdNavEnv",
     "EvadeEnv",
     "FlockEnv",
     "HerdEnv",
@@ -189,5 +205,26 @@ class SchoolEnv(SingleEnv):
     """A fish lives among scripted fish, food that grows, and a scripted hunter."""
 
     task_type = School
+
+
+class CrowdNavEnv(SingleEnv):
+    """A robot crosses a crowd of pedestrians who swap places under a social force, and must touch nobody."""
+
+    task_type = CrowdNav
+    history = "v0: first version (flockenv 0.2.0)."
+
+
+class CorridorEnv(SingleEnv):
+    """One walker in a corridor among two streams of scripted ones."""
+
+    task_type = Corridor
+    fixed: ClassVar[dict[str, Any]] = {"learners": 1}
+    history = "v0: first version (flockenv 0.2.0)."
+
+
+class BottleneckEnv(SingleEnv):
+    """One person leaves a room through a door that scripted others want to leave by too."""
+
+    task_type = Bottleneck
     fixed: ClassVar[dict[str, Any]] = {"learners": 1}
     history = "v0: first version (flockenv 0.2.0)."

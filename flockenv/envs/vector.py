@@ -31,11 +31,27 @@ from flockenv.envs.face import (
     together,
 )
 from flockenv.refusals import nearest
-from flockenv.tasks import Crossing, Evade, Flock, Herd, Obstacles, PathFollow, Pursuit, School, Task
+from flockenv.tasks import (
+    Bottleneck,
+    Corridor,
+    Crossing,
+    CrowdNav,
+    Evade,
+    Flock,
+    Herd,
+    Obstacles,
+    PathFollow,
+    Pursuit,
+    School,
+    Task,
+)
 from flockenv.world import Step, World
 
 __all__ = [
+    "BottleneckVectorEnv",
+    "CorridorVectorEnv",
     "CrossingVectorEnv",
+    "CrowdNavVectorEnv",
     "EvadeVectorEnv",
     "FlockVectorEnv",
     "HerdVectorEnv",
@@ -382,4 +398,23 @@ class SchoolVectorEnv(WorldsEnv):
     """Fish in schools, one learner per world; the page is that of flockenv.envs.single.SchoolEnv."""
 
     task_type = School
+
+
+class CrowdNavVectorEnv(WorldsEnv):
+    """Robots, one per world; the page is that of flockenv.envs.single.CrowdNavEnv."""
+
+    task_type = CrowdNav
+
+
+class CorridorVectorEnv(WorldsEnv):
+    """Walkers in corridors, one per world or `learners=` several; the page is that of single.CorridorEnv."""
+
+    task_type = Corridor
+    fixed: ClassVar[dict[str, Any]] = {"learners": 1}
+
+
+class BottleneckVectorEnv(WorldsEnv):
+    """People who leave rooms, one per world, or `learners=` several with `together=True`; see single.BottleneckEnv."""
+
+    task_type = Bottleneck
     fixed: ClassVar[dict[str, Any]] = {"learners": 1}

@@ -11,7 +11,10 @@ from flockenv.tasks.layout import Layout, Slot
 for _module in pkgutil.iter_modules(__path__):
     importlib.import_module(f"{__name__}.{_module.name}")
 
+from flockenv.tasks.bottleneck import Bottleneck  # noqa: E402  # after the folder has been walked
+from flockenv.tasks.corridor import Corridor  # noqa: E402
 from flockenv.tasks.crossing import Crossing  # noqa: E402  # after the folder has been walked
+from flockenv.tasks.crowd_nav import CrowdNav  # noqa: E402
 from flockenv.tasks.evade import Evade  # noqa: E402  # after the folder has been walked
 from flockenv.tasks.flock import Flock  # noqa: E402
 from flockenv.tasks.herd import Herd  # noqa: E402
@@ -22,7 +25,10 @@ from flockenv.tasks.school import School  # noqa: E402
 
 __all__ = [
     "TASKS",
+    "Bottleneck",
+    "Corridor",
     "Crossing",
+    "CrowdNav",
     "Evade",
     "Flock",
     "Frame",

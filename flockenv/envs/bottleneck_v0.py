@@ -1,0 +1,26 @@
+"""Bottleneck for PettingZoo, module style: env() by turns, parallel_env() all at once, raw_env the class behind."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from pettingzoo import AECEnv
+
+from flockenv.envs.aec import by_turns
+from flockenv.envs.parallel import BottleneckParallelEnv
+
+__all__ = ["env", "parallel_env", "raw_env"]
+
+raw_env = BottleneckParallelEnv
+
+
+def parallel_env(
+    max_cycles: int | None = None, render_mode: str | None = None, **parameters: Any
+) -> BottleneckParallelEnv:
+    """Make the parallel environment; the parameters are those of flockenv.tasks.Bottleneck."""
+    return BottleneckParallelEnv(max_cycles, render_mode, **parameters)
+
+
+def env(max_cycles: int | None = None, render_mode: str | None = None, **parameters: Any) -> AECEnv[str, Any, Any]:
+    """Make the turn-based environment (AEC); the parameters are those of flockenv.tasks.Bottleneck."""
+    return by_turns(parallel_env(max_cycles, render_mode, **parameters))

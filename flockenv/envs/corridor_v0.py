@@ -1,0 +1,26 @@
+"""Corridor for PettingZoo, module style: env() by turns, parallel_env() all at once, raw_env the class behind both."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from pettingzoo import AECEnv
+
+from flockenv.envs.aec import by_turns
+from flockenv.envs.parallel import CorridorParallelEnv
+
+__all__ = ["env", "parallel_env", "raw_env"]
+
+raw_env = CorridorParallelEnv
+
+
+def parallel_env(
+    max_cycles: int | None = None, render_mode: str | None = None, **parameters: Any
+) -> CorridorParallelEnv:
+    """Make the parallel environment; the parameters are those of flockenv.tasks.Corridor."""
+    return CorridorParallelEnv(max_cycles, render_mode, **parameters)
+
+
+def env(max_cycles: int | None = None, render_mode: str | None = None, **parameters: Any) -> AECEnv[str, Any, Any]:
+    """Make the turn-based environment (AEC); the parameters are those of flockenv.tasks.Corridor."""
+    return by_turns(parallel_env(max_cycles, render_mode, **parameters))

@@ -1,0 +1,322 @@
+"""Corridor: two streams of people in one corridor, each against the other; who keeps lanes gets along."""
+
+from __future__ import annotations
+
+import functools
+import math
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, model_validator
+
+from flockenv import steering
+from flockenv.effects import ObstacleContact
+from flockenv.kernels import kernel, like
+from flockenv.noise import normal, uniform
+from flockenv.scene import Group, Scene
+from flockenv.shapes import Wall
+from flockenv.space import Torus
+from flockenv.spawn import Spawn
+from flockenv.state import State
+from flockenv.sweep import Look
+from flockenv.tasks.base import Frame, Measured, Task
+from flockenv.tasks.layout import Layout, Slot
+from flockenv.tasks.sight import offset, put, turned, velocity_of
+from flockenv.vec import add, norm, scale, sub
+
+__all__ = ["Corridor"]
+
+_RADIUS = 0.25  # m, of everybody
+_WALL = 1.0  # m, where the lower wall is
+
+
+@kernel
+def spawn(p: Any, frame: Frame) -> None:
+    """At rest, everybody in a cell of his own, drawn at random; the first half wants to the right, the others left.
+
+    Memory: the way to go (+-1), the desired speed, m/s.
+    """
+    n, columns, rows = frame.pos.shape[1], int(p.columns), int(p.rows)
+    for i in range(n):
+        frame.memory[0, i] = i
+    for i in range(n - 1, 0, -1):  # the cells are shuffled (Fisher and Yates)
+        j = int((i + 1) * uniform(frame.key, 0, i, 3))
+        frame.memory[0, i], frame.memory[0, j] = frame.memory[0, j], frame.memory[0, i]
+    wide, high = p.length / columns, p.width / rows
+    for i in range(n):
+        cell = int(frame.memory[0, i])
+        free_x, free_y = wide - 2.0 * _RADIUS, high - 2.0 * _RADIUS
+        frame.pos[0, i] = (cell % columns) * wide + _RADIUS + free_x * uniform(frame.key, 0, i, 0)
+        frame.pos[1, i] = _WALL + (cell // columns) * high + _RADIUS + free_y * uniform(frame.key, 0, i, 1)
+        frame.vel[0, i], frame.vel[1, i] = 0.0, 0.0
+        pace = p.desired_speed + p.spread * normal(frame.key, 0, i, 2)
+        frame.memory[0, i] = 1.0 if 2 * i < n else -1.0
+        frame.memory[1, i] = min(max(pace, 0.5 * p.desired_speed), 1.5 * p.desired_speed)
+
+
+@kernel
+def drive(p: Any, frame: Frame, action: Any, force: Any) -> None:
+    """Learners push where their action says: (along their way, to its left); the others follow `_walker`."""
+    for i in range(frame.pos.shape[1]):
+        way = np.float64(frame.memory[0, i])
+        if i < action.shape[0]:
+            force[0, i], force[1, i] = way * action[i, 0] * frame.max_force[i], way * action[i, 1] * frame.max_force[i]
+        else:
+            _walker(p, frame, i, force)
+
+
+@kernel
+def _walker(p: Any, frame: Frame, i: int, force: Any) -> None:
+    """A scripted walker: at his desired speed, aside of others and off walls, as in Moussaid et al. 2009."""
+    velocity, y = velocity_of(frame, i), np.float64(frame.pos[1, i]) - _WALL
+    wanted = (np.float64(frame.memory[0, i] * frame.memory[1, i]), 0.0)
+    off = 3.0 * (math.exp(-max(y, 0.0) / 0.1) - math.exp(-max(p.width - y, 0.0) / 0.1))
+    wish = add(scale(sub(wanted, velocity), 1.0 / 0.54), (0.0, off))
+    for j in range(frame.pos.shape[1]):
+        x = offset(np.float64(frame.pos[0, i]), np.float64(frame.pos[0, j]), p.length)
+        to = (x, np.float64(frame.pos[1, j] - frame.pos[1, i]))
+        if j != i and norm(to) < p.sight:
+            tie = (1.0, 0.0) if j < i else (-1.0, 0.0)
+            aside = steering.sidestep(to, velocity, velocity_of(frame, j), tie, 2.0, 0.35, 2.0, 3.0, 0.005)
+            wish = add(wish, scale(aside, 4.5))
+    force[0, i], force[1, i] = wish[0], wish[1]
+
+
+@kernel
+def _share(frame: Frame, i: int) -> float:
+    """Return how fast agent i gets along, as a share of his desired speed."""
+    return np.float64(frame.vel[0, i]) * np.float64(frame.memory[0, i]) / np.float64(frame.memory[1, i])
+
+
+@kernel
+def _suited(frame: Frame, i: int) -> float:
+    """Return 1 at one's desired speed; less, by the share that it is missed by, both below and above."""
+    return 1.0 - abs(_share(frame, i) - 1.0)
+
+
+@kernel
+def _touches(frame: Frame, i: int) -> float:
+    """Return how many agent i touches."""
+    touches = 0.0
+    for s in range(frame.near_count[i]):
+        touches += 1.0 if frame.near_square[s, i] < 4.0 * _RADIUS * _RADIUS else 0.0
+    return touches
+
+
+@kernel
+def reward(p: Any, before: Frame, after: Frame, action: Any, terms: Any) -> None:
+    """Terms: along (as fast as one would like, no faster), touch, effort."""
+    for i in range(terms.shape[0]):
+        push = action[i, 0] * action[i, 0] + action[i, 1] * action[i, 1]
+        terms[i, 0] = p.along_reward * _suited(after, i) * p.control_dt
+        terms[i, 1] = -p.touch_cost * _touches(after, i) * p.control_dt
+        terms[i, 2] = -p.effort_cost * min(push, 1.0) * p.control_dt
+
+
+@kernel
+def _order(p: Any, frame: Frame) -> float:
+    """Return the lane order: in rows along the corridor, of pairs in one row, same ways minus opposite ways.
+
+    Of n people in a row with a sum of ways D that is (D^2 - n) / (n^2 - n), both summed over rows: the order of
+    Feliciani and Nishinari 2016, mean (D / n)^2, less what it is by chance, 1 / n. Without pairs it is 0.
+    """
+    rows = int(p.lane_rows)
+    same, pairs = 0.0, 0.0
+    for r in range(rows):
+        ways, n = 0.0, 0.0
+        for i in range(frame.pos.shape[1]):
+            row = int((np.float64(frame.pos[1, i]) - _WALL) * rows / p.width)
+            if min(max(row, 0), rows - 1) == r:
+                ways += frame.memory[0, i]
+                n += 1.0
+        same += ways * ways - n
+        pairs += n * n - n
+    return same / pairs if pairs > 0.0 else 0.0
+
+
+@kernel
+def ended(p: Any, before: Frame, after: Frame, over: Any) -> bool:
+    """Never over before the time limit. The aim holds now if learners get along, and do not touch."""
+    n = over.shape[0]
+    share, touches = 0.0, 0.0
+    for i in range(n):
+        share += _suited(after, i)
+        touches += _touches(after, i)
+    return bool(share > p.aim * n and touches == 0.0)
+
+
+@kernel
+def measure(p: Any, before: Frame, after: Frame, numbers: Any) -> None:
+    """Of learners: speed along the way over the desired one; touches that began. Lane order in the second half."""
+    n, length = int(p.learners), p.length
+    share, began = 0.0, 0.0
+    for i in range(n):
+        share += _share(after, i) / n
+        for s in range(after.near_count[i]):
+            if after.near_square[s, i] >= 4.0 * _RADIUS * _RADIUS:
+                break
+            j = after.near_who[s, i]
+            x = offset(np.float64(before.pos[0, i]), np.float64(before.pos[0, j]), length)
+            y = np.float64(before.pos[1, j] - before.pos[1, i])
+            both = 0.5 if j < n else 1.0  # of a pair of learners each counts a half
+            began += both if x * x + y * y >= 4.0 * _RADIUS * _RADIUS else 0.0
+    late = 2 * after.step > p.horizon
+    numbers[0], numbers[1] = share, began
+    numbers[2], numbers[3] = _order(p, after) if late else 0.0, 1.0 if late else 0.0
+
+
+@kernel
+def observe(p: Any, frame: Frame, rows: Any) -> None:
+    """All as (along one's way, to its left): own velocity, desired speed, walls, the nearest others."""
+    slots, one = int(p.neighbours), like(p.sight, 1.0)
+    for i in range(rows.shape[0]):
+        row = rows[i]
+        for c in range(rows.shape[1]):
+            row[np.uint64(c)] = 0.0
+        way = (frame.memory[0, i], like(frame.memory[0, i], 0.0))
+        low, high = frame.pos[1, i] - _WALL, _WALL + p.width - frame.pos[1, i]
+        left, right = (high, low) if frame.memory[0, i] > 0.0 else (low, high)
+        put(row, 0, turned((frame.vel[0, i], frame.vel[1, i]), way, one / p.max_speed))
+        row[np.uint64(2)] = min(frame.memory[1, i] / p.max_speed, one)
+        put(row, 3, (min(max(left / p.width, 0.0), 1.0), min(max(right / p.width, 0.0), 1.0)))
+        for s in range(frame.near_count[i]):
+            j = np.uint64(frame.near_who[s, i])
+            x, y = offset(frame.pos[0, i], frame.pos[0, j], p.length), frame.pos[1, j] - frame.pos[1, i]
+            relative = (frame.vel[0, j] - frame.vel[0, i], frame.vel[1, j] - frame.vel[1, i])
+            distance = max(math.sqrt(x * x + y * y), 1e-9)
+            share = min(max(1.0 - (distance - 2.0 * _RADIUS) / p.near, 0.0), 1.0) / distance
+            put(row, 5 + 2 * s, turned((x, y), way, one / p.sight))
+            put(row, 5 + 2 * slots + 2 * s, turned(relative, way, 0.5 * one / p.max_speed))
+            put(row, 5 + 4 * slots + 2 * s, turned((x, y), way, share))
+            row[np.uint64(5 + 6 * slots + s)] = 1.0
+
+
+class Corridor(Task):
+    """Two streams of people walk in one corridor, against each other, for ever: along it, the world is a ring.
+
+    Everybody has a desired speed of his own, N(1.34, 0.26) m/s, and is paid for getting along so fast, no faster.
+    Nobody is stopped by a touch; it costs as long as it lasts. Walls are solid. All learn, with one policy (those who
+    do not walk by the forces of Moussaid et al. 2009), and see everything in the frame of their own way; so what looks
+    like keeping right, or lanes, is their doing. Nobody terminates.
+    """
+
+    name: ClassVar[str] = "corridor"
+    terms: ClassVar[tuple[str, ...]] = ("along", "touch", "effort")
+    metric_names: ClassVar[tuple[str, ...]] = ("speed", "collisions", "lane_order")
+    measures: ClassVar[tuple[str, ...]] = ("share", "touches", "order", "late")
+    memory: ClassVar[int] = 2
+
+    people: int = Field(default=24, ge=2, le=1000, description="how many walk, half of them each way")
+    learners: int = Field(
+        default_factory=lambda given: given.get("people", 24), ge=1,
+        description="how many of them learn (default: all); the others follow a script",
+    )  # fmt: skip
+    horizon: int = Field(default=300, ge=1, description="decisions until the time limit (truncation)")
+    length: float = Field(default=12.0, gt=1, description="m, after which the corridor begins anew")
+    width: float = Field(default=3.0, gt=0.6, description="m, between the walls")
+    lane_rows: int = Field(default=6, ge=1, description="into how many rows the width is cut to measure lane order")
+    desired_speed: float = Field(default=1.34, gt=0, description="m/s, mean")
+    spread: float = Field(default=0.26, ge=0, description="m/s, standard deviation of desired speeds")
+    max_speed: float = Field(default=2.0, gt=0, description="m/s")
+    max_force: float = Field(default=5.0, gt=0, description="N; the mass is 1 kg")
+    sight: float = Field(default=4.0, gt=0, description="m, others are seen within this")
+    neighbours: int = Field(default=8, ge=1, le=32, description="how many others are seen, nearest first")
+    near: float = Field(default=0.75, gt=0, description="m between bodies, within which closeness is seen")
+    aim: float = Field(default=0.9, ge=0, le=1, description="how near the desired speeds is success: 1 = at them")
+    along_reward: float = Field(default=1.0, ge=0, description="per s at the desired speed; less by what is missed")
+    touch_cost: float = Field(default=5.0, ge=0, description="per s and person touched")
+    effort_cost: float = Field(default=0.1, ge=0, description="per s at full force")
+
+    @model_validator(mode="after")
+    def _room(self) -> Corridor:
+        """Refuse more learners than people, more people than have room, and a sight that reaches around the ring."""
+        if self.learners > self.people:
+            raise ValueError(f"learners = {self.learners}: there are only {self.people} people")
+        columns, rows = self.cells
+        if min(self.length / columns, self.width / rows) < 2 * _RADIUS:
+            raise ValueError(f"people = {self.people}: have no room in {self.length:g} m x {self.width:g} m")
+        if self.sight > self.length / 2:
+            raise ValueError(f"sight = {self.sight:g} m: at most length / 2 = {self.length / 2:g} m is allowed")
+        return self
+
+    @property
+    def cells(self) -> tuple[int, int]:
+        """In how many columns and rows they begin."""
+        rows = max(1, round(math.sqrt(self.people * self.width / self.length)))
+        return -(-self.people // rows), rows
+
+    def parameters(self) -> dict[str, float]:
+        """The fields, and where people begin."""
+        columns, rows = self.cells
+        return super().parameters() | {"columns": float(columns), "rows": float(rows)}
+
+    @property
+    def agents(self) -> int:
+        """Everybody."""
+        return self.people
+
+    @property
+    def agent_names(self) -> tuple[str, ...]:
+        """walker_0 ..."""
+        return tuple(f"walker_{i}" for i in range(self.learners))
+
+    @functools.cached_property
+    def scene(self) -> Scene:
+        """A ring with two walls along it; nothing acts on people but walls and what they want."""
+        high, half = _WALL + self.width, self.length / 2
+        limits: dict[str, Any] = {"max_speed": self.max_speed, "max_force": self.max_force, "radius": _RADIUS}
+        limits["spawn"] = Spawn(low=(0.0, _WALL), high=(self.length, high))
+        groups = [Group(count=self.learners, role="learner", **limits)]
+        if self.people > self.learners:
+            groups.append(Group(count=self.people - self.learners, role="agent", **limits))
+        return Scene(
+            space=Torus(size=(self.length, max(high + _WALL, 2.0 * self.sight))),
+            groups=tuple(groups),
+            obstacles=tuple(  # no piece is longer than half of the ring
+                Wall(vertices=((x, y), (x + half, y))) for y in (_WALL, high) for x in (0.0, half)
+            ),
+            effects=(ObstacleContact(stiffness=200.0, ratio=0.5),),
+            integrator=self.integrator,
+            dt=self.dt,
+            dtype=self.dtype,
+        )
+
+    @property
+    def look(self) -> Look:
+        """The nearest others."""
+        return Look(self.sight, self.neighbours)
+
+    @functools.cached_property
+    def layout(self) -> Layout:
+        """Every vector is (along one's way, to its left)."""
+        n = self.neighbours
+        close = "unit vectors towards them x (1 - gap between bodies / near), 0 beyond"
+        return Layout((
+            Slot("velocity", (2,), self.max_speed, "m/s", "own velocity (along one's way, to its left)"),
+            Slot("desired_speed", (), self.max_speed, "m/s", "how fast one would like to go", low=0.0),
+            Slot("walls", (2,), self.width, "m", "distance to the wall on the left, and on the right", low=0.0),
+            Slot("neighbours", (n, 2), self.sight, "m", "offsets of the nearest others, nearest first"),
+            Slot("neighbour_velocity", (n, 2), 2 * self.max_speed, "m/s", "their velocities minus one's own"),
+            Slot("crowding", (n, 2), 1.0, "1", close),
+            Slot("neighbour_present", (n,), 1.0, "1", "1 where there is one, else 0 (and zeros elsewhere)", low=0.0),
+        ))  # fmt: skip
+
+    @functools.cached_property
+    def action_layout(self) -> Layout:
+        """A force in the frame of one's way."""
+        meaning = "force (along one's way, to its left) / max_force, shortened to length 1"
+        return Layout((Slot("force", (2,), self.max_force, "N", meaning),))
+
+    def metrics(self, sums: Measured, last: Measured, steps: NDArray[np.int64]) -> dict[str, NDArray[np.float64]]:
+        """Speed along the way over the desired one; touches that began; lane order in the second half (NaN before)."""
+        late = sums["late"]
+        return {
+            "speed": sums["share"] / np.maximum(steps, 1),
+            "collisions": sums["touches"],
+            "lane_order": np.where(late > 0, sums["order"] / np.maximum(late, 1.0), np.nan),
+        }
+
+    def view(self, state: State, world: int) -> tuple[tuple[float, ...], tuple[float, ...]]:
+        """The corridor."""
+        return (0.0, 0.0), (self.length, self.width + 2 * _WALL)

@@ -1,0 +1,301 @@
+"""CrowdNav: one robot through a crowd of pedestrians who swap places across a circle under social forces."""
+
+from __future__ import annotations
+
+import functools
+import math
+from typing import Any, ClassVar, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, model_validator
+
+from flockenv.arbitration import Blend
+from flockenv.behaviours.social import Social
+from flockenv.effects.aims import Antipode
+from flockenv.kernels import kernel, like
+from flockenv.noise import uniform
+from flockenv.presets import PRESETS
+from flockenv.scene import Group, Scene
+from flockenv.snapshot import Mark
+from flockenv.space import Plane
+from flockenv.spawn import Spawn
+from flockenv.state import State
+from flockenv.steer import Steer
+from flockenv.sweep import Look
+from flockenv.tasks.base import Frame, Measured, Task
+from flockenv.tasks.layout import Layout, Slot
+from flockenv.tasks.sight import clip, put, turned
+
+__all__ = ["CrowdNav"]
+
+Crowd = Literal[
+    "moussaid_2009", "helbing_molnar_1995", "johansson_2007_circular", "johansson_2007_elliptical_1",
+    "johansson_2007_elliptical_2",
+]  # fmt: skip
+"""Those of `flockenv.presets` that need no stiff bodies."""
+
+_RADIUS = 0.3  # m, of the robot, as in CrowdNav
+_NOBODY = 1e3  # m, to the nearest where there is nobody
+
+
+@kernel
+def spawn(p: Any, frame: Frame) -> None:
+    """Evenly around a circle, each a little off his place and at rest; the robot's goal is the opposite point."""
+    n = frame.pos.shape[1]
+    first = 2.0 * math.pi * uniform(frame.key, 0, 9999, 0)
+    for i in range(n):
+        off = p.jitter * (2.0 * uniform(frame.key, 0, i, 0) - 1.0)
+        angle = first + 2.0 * math.pi * (i + off) / n
+        r = p.circle * (1.0 + 0.05 * p.jitter * (2.0 * uniform(frame.key, 0, i, 1) - 1.0))
+        c, s = math.cos(angle), math.sin(angle)
+        frame.pos[0, i], frame.pos[1, i] = r * c, r * s
+        frame.vel[0, i], frame.vel[1, i] = 0.0, 0.0
+        frame.memory[0, i], frame.memory[1, i] = -r * c, -r * s
+        frame.memory[2, i], frame.memory[3, i] = -c, -s
+        frame.memory[4, i], frame.memory[5, i] = _NOBODY, _NOBODY
+
+
+@kernel
+def drive(p: Any, frame: Frame, action: Any, force: Any) -> None:
+    """The robot pushes where its action says, in the frame of its course; what pedestrians want is the scene's."""
+    hx, hy = frame.memory[2, 0], frame.memory[3, 0]
+    along, left = action[0, 0] * frame.max_force[0], action[0, 1] * frame.max_force[0]
+    force[0, 0], force[1, 0] = along * hx - left * hy, along * hy + left * hx
+    for i in range(1, frame.pos.shape[1]):
+        force[0, i], force[1, i] = 0.0, 0.0
+
+
+@kernel
+def keep(p: Any, before: Frame, after: Frame) -> None:
+    """Remember how near a pedestrian came in this decision, between surfaces along the way, and so far in all, m."""
+    least = np.float64(_NOBODY)
+    for j in range(1, after.pos.shape[1]):
+        x, y = np.float64(before.pos[0, j] - before.pos[0, 0]), np.float64(before.pos[1, j] - before.pos[1, 0])
+        dx = np.float64(after.pos[0, j] - after.pos[0, 0]) - x
+        dy = np.float64(after.pos[1, j] - after.pos[1, 0]) - y
+        square = dx * dx + dy * dy
+        share = min(max(-(x * dx + y * dy) / square, 0.0), 1.0) if square > 0.0 else 0.0
+        distance = math.hypot(x + share * dx, y + share * dy)
+        least = min(least, distance - np.float64(after.radius[0] + after.radius[j]))
+    after.memory[4, 0] = least
+    after.memory[5, 0] = min(least, np.float64(after.memory[5, 0]))
+
+
+@kernel
+def _to_goal(frame: Frame) -> tuple[float, float]:
+    """Return the robot's way to its goal, m."""
+    return frame.memory[0, 0] - np.float64(frame.pos[0, 0]), frame.memory[1, 0] - np.float64(frame.pos[1, 0])
+
+
+@kernel
+def _left(frame: Frame) -> float:
+    """Return how far it is to the goal, m."""
+    x, y = _to_goal(frame)
+    return math.sqrt(x * x + y * y)
+
+
+@kernel
+def _collides(after: Frame) -> bool:
+    """Has it touched somebody in this decision?"""
+    return bool(after.memory[4, 0] < 0.0)
+
+
+@kernel
+def _arrives(p: Any, after: Frame) -> bool:
+    """Is it at its goal, without having touched somebody in this decision?"""
+    return bool(_left(after) <= p.goal_radius) and not _collides(after)
+
+
+@kernel
+def reward(p: Any, before: Frame, after: Frame, action: Any, terms: Any) -> None:
+    """Terms: progress, success, collision, discomfort, time."""
+    gap = np.float64(after.memory[4, 0])
+    terms[0, 0] = p.progress_reward * (_left(before) - _left(after))
+    terms[0, 1] = p.success_reward if _arrives(p, after) else 0.0
+    terms[0, 2] = -p.collision_cost if gap < 0.0 else 0.0
+    near = p.comfort_distance - gap if gap >= 0.0 else 0.0
+    terms[0, 3] = -p.discomfort_cost * max(near, 0.0) * p.control_dt
+    terms[0, 4] = -p.time_cost * p.control_dt
+
+
+@kernel
+def ended(p: Any, before: Frame, after: Frame, over: Any) -> bool:
+    """A touch ends it, and so does the goal: that is success."""
+    success = _arrives(p, after)
+    over[0] = success or _collides(after)
+    return success
+
+
+@kernel
+def measure(p: Any, before: Frame, after: Frame, numbers: Any) -> None:
+    """Does it touch now; is it there; path, m; least gap so far, m; too near, without a touch, s."""
+    gap = np.float64(after.memory[4, 0])
+    numbers[0] = 1.0 if gap < 0.0 else 0.0
+    numbers[1] = 1.0 if _arrives(p, after) else 0.0
+    numbers[2] = math.hypot(after.pos[0, 0] - before.pos[0, 0], after.pos[1, 0] - before.pos[1, 0])
+    numbers[3] = after.memory[5, 0]
+    numbers[4] = p.control_dt if 0.0 <= gap < p.comfort_distance else 0.0
+
+
+@kernel
+def observe(p: Any, frame: Frame, rows: Any) -> None:
+    """All in the frame of the course: (along, left). Own velocity, the way to the goal, the nearest pedestrians."""
+    slots, one = int(p.neighbours), like(p.sight, 1.0)
+    row, course = rows[0], (frame.memory[2, 0], frame.memory[3, 0])
+    put(row, 0, turned((frame.vel[0, 0], frame.vel[1, 0]), course, one / p.max_speed))
+    put(row, 2, turned(_to_goal(frame), course, one / (3.0 * p.circle)))
+    for c in range(4, rows.shape[1]):
+        row[np.uint64(c)] = 0.0
+    for s in range(frame.near_count[0]):
+        j = np.uint64(frame.near_who[s, 0])
+        to = (frame.pos[0, j] - frame.pos[0, 0], frame.pos[1, j] - frame.pos[1, 0])
+        relative = (frame.vel[0, j] - frame.vel[0, 0], frame.vel[1, j] - frame.vel[1, 0])
+        distance = max(math.sqrt(to[0] * to[0] + to[1] * to[1]), 1e-9)
+        gap = distance - frame.radius[0] - frame.radius[j]
+        closeness = min(max(1.0 - gap / p.near, 0.0), 1.0)
+        put(row, 4 + 2 * s, turned(to, course, one / p.sight))
+        put(row, 4 + 2 * slots + 2 * s, turned(relative, course, 0.25 * one / p.max_speed))
+        put(row, 4 + 4 * slots + 2 * s, turned(to, course, closeness / distance))
+        row[np.uint64(4 + 6 * slots + s)] = clip(one)
+
+
+class CrowdNav(Task):
+    """One robot crosses a circle on which pedestrians swap places, under a social force; it must not touch anybody.
+
+    The crowd is that of Moussaid et al. 2009, desired speeds N(1.29, 0.19) m/s, or another of `flockenv.presets` as
+    published: who has bodies of 0.5 m keeps 0.4 m between centres there in the middle of a circle of 12, while those of
+    1995 and 2007 walk into each other, with 0.1 m and less. By default it does not see the robot (`visible`), as
+    in the tests of CrowdNav (Chen et al. 2019, arXiv 1809.08835), so that nobody makes way and the robot cannot count
+    on it. Everything it sees is relative to itself and turned into the frame of its course, from start to goal.
+    Rewards are those of Chen et al. times 20: success 1, collision -0.25, and -0.5 per s and metre that the nearest is
+    nearer than 0.2 m; a reward of progress and a cost of time, ours, stand for their imitation and their discount. A
+    touch ends it: distances are those between bodies along the way of a decision, not only at its end.
+    """
+
+    name: ClassVar[str] = "crowd_nav"
+    terms: ClassVar[tuple[str, ...]] = ("progress", "success", "collision", "discomfort", "time")
+    metric_names: ClassVar[tuple[str, ...]] = (
+        "collided", "timed_out", "time_to_goal", "path_length", "least_gap", "discomfort",
+    )  # fmt: skip
+    measures: ClassVar[tuple[str, ...]] = ("touch", "there", "walked", "gap", "near")
+    memory: ClassVar[int] = 6
+    keeps: ClassVar[bool] = True
+
+    horizon: int = Field(default=250, ge=1, description="decisions until the time limit (truncation)")
+    people: int = Field(default=10, ge=1, le=200, description="how many pedestrians")
+    visible: bool = Field(default=False, description="does the crowd see the robot?")
+    crowd: Crowd = Field(default="moussaid_2009", description="the social force of the crowd, as published")
+    circle: float = Field(default=6.0, gt=0, description="m, radius of the circle")
+    jitter: float = Field(default=0.35, ge=0, le=0.5, description="how far off his place one starts, in gaps")
+    max_speed: float = Field(default=1.34, gt=0, description="m/s, of the robot")
+    max_force: float = Field(default=5.0, gt=0, description="N, of the robot; its mass is 1 kg")
+    goal_radius: float = Field(default=0.3, gt=0, description="m, nearer to its goal than this it is there")
+    sight: float = Field(default=5.0, gt=0, description="m, pedestrians are seen within this, by each other too")
+    neighbours: int = Field(default=6, ge=1, le=32, description="how many are seen, nearest first")
+    near: float = Field(default=1.5, gt=0, description="m between bodies, within which closeness is seen")
+    comfort_distance: float = Field(default=0.2, gt=0, description="m between bodies, below which it is discomfort")
+    progress_reward: float = Field(default=0.5, ge=0, description="per m nearer to the goal")
+    success_reward: float = Field(default=20.0, ge=0, description="at the goal")
+    collision_cost: float = Field(default=5.0, ge=0, description="for a touch")
+    discomfort_cost: float = Field(default=10.0, ge=0, description="per s and m below the comfort distance")
+    time_cost: float = Field(default=0.2, ge=0, description="per s")
+
+    @model_validator(mode="after")
+    def _enough(self) -> CrowdNav:
+        """Refuse more people than have room on the circle."""
+        n = self.people + 1
+        room = 2 * math.pi * self.circle * (1 - 2 * self.jitter) / n
+        if room < 0.8:
+            least = 0.8 * n / (2 * math.pi * (1 - 2 * self.jitter)) if self.jitter < 0.5 else math.inf
+            raise ValueError(f"circle = {self.circle:g} m has no room for {n} agents; at least {least:.3g}")
+        return self
+
+    @property
+    def learners(self) -> int:
+        """One."""
+        return 1
+
+    @property
+    def agents(self) -> int:
+        """The robot and the crowd."""
+        return 1 + self.people
+
+    @property
+    def agent_names(self) -> tuple[str, ...]:
+        """robot_0."""
+        return ("robot_0",)
+
+    @functools.cached_property
+    def scene(self) -> Scene:
+        """A plane; the crowd wants to get across the circle, off each other, and off the robot if it sees it."""
+        around = Spawn(low=(-self.circle, -self.circle), high=(self.circle, self.circle))  # before an episode begins
+        robot = {"radius": _RADIUS, "max_speed": self.max_speed, "max_force": self.max_force, "role": "learner"}
+        seen = {"radius": self.sight, "group": None if self.visible else 1}
+        wishes = tuple(  # there are no walls
+            wish.model_copy(update=seen) if isinstance(wish, Social) else wish
+            for wish in PRESETS[self.crowd].wishes(False, 1)
+            if wish.obstacle_law is None
+        )
+        return Scene(
+            space=Plane(),
+            groups=(
+                Group(count=1, spawn=around, **robot),
+                Group(count=self.people, spawn=around, **PRESETS[self.crowd].people),
+            ),
+            effects=(
+                Antipode(centre=(0.0, 0.0), group=1),
+                Steer(group=1, arbitration=Blend(), behaviours=wishes),
+            ),
+            integrator=self.integrator,
+            dt=self.dt,
+            dtype=self.dtype,
+        )
+
+    @property
+    def look(self) -> Look:
+        """The nearest pedestrians."""
+        return Look(self.sight, self.neighbours)
+
+    @functools.cached_property
+    def layout(self) -> Layout:
+        """Every vector is (along the course, to its left)."""
+        n = self.neighbours
+        close = "unit vectors towards them x (1 - gap between bodies / near), 0 beyond"
+        return Layout((
+            Slot("velocity", (2,), self.max_speed, "m/s", "own velocity (along the course, to its left)"),
+            Slot("goal", (2,), 3 * self.circle, "m", "the way to the goal"),
+            Slot("neighbours", (n, 2), self.sight, "m", "offsets of the nearest pedestrians, nearest first"),
+            Slot("neighbour_velocity", (n, 2), 4 * self.max_speed, "m/s", "their velocities minus one's own"),
+            Slot("crowding", (n, 2), 1.0, "1", close),
+            Slot("neighbour_present", (n,), 1.0, "1", "1 where there is one, else 0 (and zeros elsewhere)", low=0.0),
+        ))  # fmt: skip
+
+    @functools.cached_property
+    def action_layout(self) -> Layout:
+        """A force in the frame of the course."""
+        meaning = "force (along the course, to its left) / max_force, shortened to length 1"
+        return Layout((Slot("force", (2,), self.max_force, "N", meaning),))
+
+    def metrics(self, sums: Measured, last: Measured, steps: NDArray[np.int64]) -> dict[str, NDArray[np.float64]]:
+        """Did it touch somebody; neither that nor there; s to the goal (NaN if not there); path, m; least gap, m; share
+        of the time nearer than is comfortable.
+        """  # fmt: skip
+        time = steps * self.control_dt
+        return {
+            "collided": last["touch"],
+            "timed_out": np.where(steps > 0, 1.0 - last["touch"] - last["there"], 0.0),
+            "time_to_goal": np.where(last["there"] > 0, time, np.nan),
+            "path_length": sums["walked"],
+            "least_gap": np.where(steps > 0, last["gap"], np.nan),
+            "discomfort": sums["near"] / np.maximum(time, self.control_dt),
+        }
+
+    def marks(self, state: State, memory: NDArray[np.float64], world: int) -> tuple[Mark, ...]:
+        """The robot's goal."""
+        return (Mark("goal", memory[:2, world, 0], np.zeros(2), self.goal_radius),)
+
+    def view(self, state: State, world: int) -> tuple[tuple[float, ...], tuple[float, ...]]:
+        """The circle, and some room around it."""
+        edge = 1.3 * self.circle
+        return (-edge, -edge), (edge, edge)

@@ -1,0 +1,168 @@
+"""Corridor: what is paid and measured, by hand, and whether players keep lanes."""
+
+from __future__ import annotations
+
+import itertools
+from typing import Any
+
+import numpy as np
+import pytest
+
+from agents import reynolds
+from agents.experiment import WEIGHTS
+from flockenv.evaluation import rollout, worlds_for
+from flockenv.policy import MlpPolicy, RandomPolicy
+from flockenv.tasks import Corridor
+from flockenv.world import World
+from tests.test_tasks import act, paid, place, random_actions, world_of
+
+HORIZON = 10
+
+
+def walk(places: Any, velocities: Any = 0.0, **more: Any) -> World:
+    """People at places (along the corridor, across it), the first half of them on their way to the right."""
+    world = world_of(Corridor(people=len(places), horizon=HORIZON, **more))
+    place(world, np.add(places, [0.0, 1.0]), velocities)
+    return world
+
+
+def test_people_begin_in_the_corridor_half_of_them_each_way_and_not_in_each_other() -> None:
+    world = World(Corridor(), 100)
+    world.reset(3)
+    pos, way, pace = world.state.pos, world._memory[0], world._memory[1]
+    assert (way[:, :12] == 1).all()
+    assert (way[:, 12:] == -1).all()
+    assert (pos[..., 1] >= 1.25).all()
+    assert (pos[..., 1] <= 3.75).all()
+    x = pos[:, :, None, 0] - pos[:, None, :, 0]
+    x -= 12 * np.round(x / 12)
+    gaps = np.hypot(x, pos[:, :, None, 1] - pos[:, None, :, 1]) + 9 * np.eye(24)
+    assert gaps.min() >= 0.5
+    assert pace.mean() == pytest.approx(1.34, abs=0.02)
+    assert pace.std() == pytest.approx(0.26, abs=0.02)
+    assert len(np.unique(pos[:, 0, 0].round(1))) > 40  # cells are drawn anew
+
+
+def test_getting_along_pays_most_at_the_desired_speed_and_a_touch_costs_both() -> None:
+    world = walk([(2, 1), (6, 1), (6.4, 1), (10, 2)], [(0.67, 0), (1.9, 0), (0.67, 0), (-0.67, 0)])
+    pace = world._memory[1, 0].copy()
+    step = act(world)
+    terms = [paid(world, step, i) for i in range(4)]
+    for i, speed in enumerate((0.67, 1.9, -0.67, 0.67)):
+        assert terms[i]["along"] == pytest.approx(0.1 * (1 - abs(speed / pace[i] - 1)))
+    assert [t["touch"] for t in terms] == pytest.approx([0, -0.5, -0.5, 0])
+    assert paid(world, act(world, (0.6, 0.8)))["effort"] == pytest.approx(-0.1 * 0.1)
+
+
+def test_a_touch_counts_once_also_around_the_ring() -> None:
+    world = walk([(11.9, 1), (0.5, 1)], [(1.5, 0), (0, 0)])  # 0.6 m apart, 0.45 m after a decision
+    act(world)
+    assert world.measure()["collisions"] == 1
+    act(world)
+    assert world.measure()["collisions"] == 1
+
+
+def order_of(rows: Any, ways: Any) -> float:
+    """Of all pairs in one row, same ways minus opposite ways, over all pairs: by counting."""
+    pairs = [(i, j) for i, j in itertools.combinations(range(len(rows)), 2) if rows[i] == rows[j]]
+    return sum(ways[i] * ways[j] for i, j in pairs) / len(pairs) if pairs else 0.0
+
+
+def test_lane_order_is_that_of_pairs_in_a_row() -> None:
+    rng = np.random.default_rng(0)
+    for _ in range(5):
+        places = np.stack([rng.uniform(0, 12, 24), rng.uniform(0.3, 2.7, 24)], axis=1)
+        world = walk(places)
+        world.steps[:] = HORIZON - 1
+        act(world)
+        rows = np.floor(places[:, 1] / 0.5)
+        assert world.measure()["lane_order"] == pytest.approx(order_of(rows, world._memory[0, 0]), abs=1e-9)
+    lanes = np.stack([np.tile(np.arange(12.0), 2), np.repeat([0.75, 2.25], 12)], axis=1)
+    world = walk(lanes)
+    act(world)
+    assert np.isnan(world.measure()["lane_order"])  # of the second half alone
+    world.steps[:] = HORIZON - 1
+    act(world)
+    assert world.measure()["lane_order"] == 1
+
+
+def test_lane_order_of_people_at_random_is_nothing() -> None:
+    """Of 12 + 12 people, -1/23 in the mean: who is met is taken from the others."""
+    world = World(Corridor(), 400)
+    world.reset(0)
+    world.steps[:] = 299
+    world.step(np.zeros((400, 24, 2)))
+    order = world.measure()["lane_order"]
+    assert order.mean() == pytest.approx(-1 / 23, abs=4 * order.std() / 20)
+
+
+def test_walls_are_solid() -> None:
+    world = world_of(Corridor(), worlds=8)
+    for _ in range(60):
+        world.step(np.broadcast_to([0.0, 1.0], (8, 24, 2)))
+    y = world.state.pos[..., 1] - 1.0
+    assert (y[:, :12] > 2.5).all()  # left of who goes right
+    assert (y[:, 12:] < 0.5).all()
+    assert y.min() > 0.15
+    assert y.max() < 2.85
+
+
+def test_both_ways_see_and_are_paid_the_same() -> None:
+    """The corridor turned by half a turn: who is on the other way is shown what the first was."""
+    places = np.array([(2.0, 0.7), (5.0, 1.4), (3.1, 1.0), (6.4, 2.2)])
+    turned = ([12.0, 3.0] - places)[[2, 3, 0, 1]]
+    worlds = [walk(places), walk(turned)]
+    worlds[1]._memory[1] = worlds[0]._memory[1][:, [2, 3, 0, 1]]
+    actions = np.random.default_rng(1).uniform(-1, 1, (1, 4, 2))
+    for _ in range(8):
+        one, other = worlds[0].step(actions), worlds[1].step(actions[:, [2, 3, 0, 1]])
+        np.testing.assert_allclose(one.observation[:, [2, 3, 0, 1]], other.observation, atol=2e-6)
+        np.testing.assert_allclose(one.terms[:, [2, 3, 0, 1]], other.terms, atol=1e-9)
+
+
+def test_rewards_do_not_touch_what_happens() -> None:
+    worlds = world_of(Corridor()), world_of(Corridor(along_reward=0, touch_cost=0, effort_cost=0))
+    for actions in random_actions(worlds[0], 40):
+        for world in worlds:
+            step = world.step(actions)
+        assert not step.reward.any()
+    np.testing.assert_array_equal(worlds[0].state.pos, worlds[1].state.pos)
+
+
+def test_players_keep_lanes_and_random_ones_do_not() -> None:
+    task, first = Corridor(), worlds_for("tuning", 7, 12)
+    players = {
+        "random": RandomPolicy(2, 0),
+        "force": reynolds.player(task, textbook=True),
+        "orca": reynolds.player(task, name="orca"),
+        "ppo": MlpPolicy.load(WEIGHTS / "corridor.safetensors", task),
+    }
+    episodes = {name: rollout(task, player, 12, first) for name, player in players.items()}
+    order = {name: played.metrics["lane_order"].mean() for name, played in episodes.items()}
+    assert abs(order["random"]) < 0.15
+    assert order["force"] > 0.25
+    assert order["orca"] > 0.9
+    assert order["ppo"] > 0.5
+    for name in ("force", "orca", "ppo"):
+        assert episodes[name].metrics["speed"].mean() > 0.8
+
+
+def test_scripted_walkers_get_along() -> None:
+    world = World(Corridor(learners=1), 8)
+    world.reset(2)
+    for _ in range(150):
+        world.step(np.zeros((8, 1, 2)))
+    along = world.state.vel[:, 1:, 0] * world._memory[0, :, 1:] / world._memory[1, :, 1:]
+    assert along.mean() > 0.8
+
+
+@pytest.mark.parametrize(
+    ("fields", "said"),
+    [({"people": 1}, "people = 1"), ({"people": 150}, "people = 150"), ({"sight": 7.0}, "sight = 7"),
+     ({"people": 4, "learners": 5}, "learners = 5")],
+)  # fmt: skip
+def test_what_it_cannot_be_is_refused_in_one_line(fields: dict[str, Any], said: str) -> None:
+    with pytest.raises(ValueError, match=r".") as caught:
+        Corridor(**fields)
+    assert said in str(caught.value)
+    assert "\n" not in str(caught.value)
