@@ -91,6 +91,7 @@ from flockenv.effects import (
     Swing,
     Tether,
     Uniform,
+    Vicsek,
     Vortex,
     WallRepulsion,
     Wind,
@@ -334,6 +335,9 @@ EFFECTS = (
     EffectRow(SpeedLimit(speed=1.2, strength=0.8)),
     EffectRow(Fluctuation(strength=0.8), obeys=frozenset({"translation"})),  # to each his own, along the axes
     EffectRow(Pressure(strength=1.5, density=1, radius=1.35)),
+    EffectRow(  # to each his own error, to the same side in a mirror
+        Vicsek(speed=1.2, radius=2.5, noise=1, step=0.05), obeys=frozenset({"translation", "rotation"}), dimensions=(2,)
+    ),
     EffectRow(Separation(weight=1.3, radius=2.5)),
     EffectRow(Separation(weight=1.3, radius=2.5, fov=200, nearest=3)),
     EffectRow(Alignment(weight=0.7, radius=3, fov=270)),

@@ -3,20 +3,13 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
+from flockenv.measures.order import nearest_distances, polarisation
 from flockenv.scene import Scene
 from flockenv.shapes import clear_of
-from flockenv.space import Space, Torus
 from flockenv.state import State
 
-__all__ = ["MEASURES", "measure", "nearest_distances", "polarisation"]
-
-Floats = NDArray[np.float64]
-
-FARTHEST = 1e150
-"""m: the square of a longer way is no number any more."""
+__all__ = ["MEASURES", "measure"]
 
 MEASURES = {
     "agents": "alive",
@@ -53,33 +46,3 @@ def _measure(scene: Scene, state: State, world: int) -> dict[str, float]:
         "nearest_neighbour": float(nearest.mean()) if len(pos) > 1 else np.nan,
         "contacts": float(touching.sum()),
     }
-
-
-def polarisation(vel: Floats) -> float:
-    """Return |mean of v_i / |v_i|| over velocities (N, D): 1 if all head the same way; NaN if nobody moves.
-
-    Source: Vicsek et al. 1995, Phys. Rev. Lett. 75, 1226.
-    """
-    speed = np.linalg.norm(vel, axis=1)
-    moving = speed > 0
-    if not moving.any():
-        return np.nan
-    return float(np.linalg.norm((vel[moving] / speed[moving, None]).mean(axis=0)))
-
-
-def nearest_distances(pos: Floats, space: Space) -> tuple[Floats, NDArray[np.intp]]:
-    """Return for each of (N, D) points, m, the distance to its nearest neighbour, m, and who that is.
-
-    A lone point, or one further out than squares can be taken, is infinitely far from its nearest neighbour, itself.
-    """
-    distance, nearest = np.full(len(pos), np.inf), np.arange(len(pos))
-    here = np.flatnonzero((np.abs(pos) < FARTHEST).all(axis=1))
-    if len(here) < 2:
-        return distance, nearest
-    inside = space.wrap(pos[here])
-    found, who = cKDTree(inside, boxsize=space.size if isinstance(space, Torus) else None).query(inside, k=2)
-    # Of two points in one place each may be found first: whoever is not me is my neighbour.
-    rows = np.arange(len(here))
-    column = np.where(who[:, 0] == rows, 1, 0)
-    distance[here], nearest[here] = found[rows, column], here[who[rows, column]]
-    return distance, nearest

@@ -1,0 +1,65 @@
+"""Many runs of one scene: a mean with its interval, and whether order is above its null."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+__all__ = ["Above", "Mean", "above_null", "mean_of_runs"]
+
+Floats = NDArray[np.float64]
+
+RESAMPLES = 10_000
+
+
+class Mean(NamedTuple):
+    """A mean over runs, with its 95 % interval."""
+
+    runs: int
+    mean: float
+    low: float  # NaN of one run
+    high: float
+
+
+class Above(NamedTuple):
+    """How far runs are above their own nulls."""
+
+    runs: int
+    excess: float  # mean of value - null
+    low: float  # its 95 % interval
+    high: float
+
+    @property
+    def holds(self) -> bool:
+        """Is the whole interval above 0?"""
+        return self.low > 0
+
+
+def mean_of_runs(values: ArrayLike, seed: int = 0) -> Mean:
+    """Return the mean of one number per run, (R,), with its 95 % bootstrap interval; runs of NaN are left out."""
+    given = np.asarray(values, np.float64)
+    x = given[np.isfinite(given)]
+    if len(x) < 2:
+        return Mean(len(x), float(x.mean()) if len(x) else np.nan, np.nan, np.nan)
+    drawn = x[np.random.default_rng(seed).integers(len(x), size=(RESAMPLES, len(x)))].mean(axis=1)
+    low, high = np.quantile(drawn, (0.025, 0.975))
+    return Mean(len(x), float(x.mean()), float(low), float(high))
+
+
+def above_null(values: ArrayLike, nulls: ArrayLike, seed: int = 0) -> Above:
+    """Return how far an order, one number per run (R,), is above what chance makes of the same run, (R,).
+
+    For lanes `Lanes.order` against `Lanes.null`, for a door `Bursts.length` against `Bursts.null_length`: pairs, so
+    what differs from run to run (how many, where) is in neither. A run without a null (NaN) is left out. It holds, with
+    95 % confidence, if the interval lies above 0. Raises ValueError, of one line, if both are not as many, or fewer
+    than 5 have a null: an interval of four runs is none.
+    """
+    order, null = np.asarray(values, np.float64), np.asarray(nulls, np.float64)
+    if order.shape != null.shape or order.ndim != 1:
+        raise ValueError(f"values of shape {order.shape}, nulls of {null.shape}: must be one of each for each run")
+    excess = mean_of_runs(order - null, seed)
+    if excess.runs < 5:
+        raise ValueError(f"values: {excess.runs} runs with a null, at least 5 are needed for an interval")
+    return Above(excess.runs, excess.mean, excess.low, excess.high)

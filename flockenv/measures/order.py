@@ -1,0 +1,107 @@
+"""Order of a flock at one instant: does it fly one way, turn around its middle, keep together, and how near."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
+
+from flockenv.space import Space, Torus
+
+__all__ = [
+    "centre", "cohesion_radius", "components", "group_momentum", "milling", "nearest_distances", "polarisation",
+]  # fmt: skip
+
+Floats = NDArray[np.float64]
+
+FARTHEST = 1e150
+"""m: the square of a longer way is no number any more."""
+
+
+def polarisation(vel: Floats) -> float:
+    """Return |mean of v_i / |v_i|| over velocities (N, D): 1 if all head the same way; NaN if nobody moves.
+
+    Source: Vicsek et al. 1995, Phys. Rev. Lett. 75, 1226.
+    """
+    speed = np.linalg.norm(vel, axis=1)
+    moving = speed > 0
+    if not moving.any():
+        return np.nan
+    return float(np.linalg.norm((vel[moving] / speed[moving, None]).mean(axis=0)))
+
+
+def milling(pos: Floats, vel: Floats, space: Space) -> float:
+    """Return |mean of unit(x_i - centre) x unit(v_i)|, positions and velocities (N, D): 1 if all circle one way.
+
+    NaN if nobody moves off the centre. Source: Couzin et al. 2002, J. theor. Biol. 218, 1, who call it the angular
+    momentum of the group.
+    """
+    out = space.displacement(centre(pos, space), pos) if len(pos) else pos
+    far, speed = np.linalg.norm(out, axis=1), np.linalg.norm(vel, axis=1)
+    some = (far > 0) & (speed > 0)
+    if not some.any():
+        return np.nan
+    r, v = out[some] / far[some, None], vel[some] / speed[some, None]
+    turn = np.cross(r, v) if pos.shape[1] == 3 else (r[:, 0] * v[:, 1] - r[:, 1] * v[:, 0])[:, None]
+    return float(np.linalg.norm(turn.mean(axis=0)))
+
+
+def group_momentum(vel: Floats, mass: ArrayLike) -> float:
+    """Return |sum of m_i v_i|, kg m/s, of velocities (N, D), m/s, and masses (N,), kg; infinite ones have none."""
+    weight = np.asarray(mass, np.float64)
+    free = np.isfinite(weight)
+    return float(np.linalg.norm((vel[free] * weight[free, None]).sum(axis=0)))
+
+
+def centre(pos: Floats, space: Space) -> Floats:
+    """Return the middle of positions (N, D), m, (D,); on a torus by the directions in which they lie on its circles.
+
+    Source of the latter: Bai & Breen 2008, J. Graph. Tools 13, 53.
+    """
+    if not isinstance(space, Torus):
+        return np.asarray(pos.mean(axis=0), np.float64)
+    size = np.asarray(space.size)
+    angle = 2 * np.pi * pos / size
+    return np.asarray(np.arctan2(np.sin(angle).mean(axis=0), np.cos(angle).mean(axis=0)) / (2 * np.pi) * size % size)
+
+
+def cohesion_radius(pos: Floats, space: Space) -> float:
+    """Return the mean distance of positions (N, D) from their centre, m; NaN of nobody."""
+    if not len(pos):
+        return np.nan
+    return float(np.linalg.norm(space.displacement(centre(pos, space), pos), axis=1).mean())
+
+
+def components(pos: Floats, reach: float, space: Space) -> int:
+    """Return how many groups there are of whom each is within `reach`, m, of another of his group; positions (N, D), m.
+
+    Raises ValueError, of one line, for a reach that is not positive, or, on a torus, goes around it.
+    """
+    longest = min(space.size) / 2 if isinstance(space, Torus) else np.inf
+    if not 0 < reach <= longest:
+        raise ValueError(f"reach = {reach:g} m: must be > 0" + (f" and <= {longest:g}" if longest < np.inf else ""))
+    inside = space.wrap(pos)
+    tree = cKDTree(inside, boxsize=space.size if isinstance(space, Torus) else None)
+    i, j = tree.query_pairs(reach, output_type="ndarray").reshape(-1, 2).T
+    graph = coo_array((np.ones(len(i)), (i, j)), shape=(len(pos), len(pos)))
+    return int(connected_components(graph, directed=False, return_labels=False)) if len(pos) else 0
+
+
+def nearest_distances(pos: Floats, space: Space) -> tuple[Floats, NDArray[np.intp]]:
+    """Return for each of (N, D) points, m, the distance to its nearest neighbour, m, and who that is.
+
+    A lone point, or one further out than squares can be taken, is infinitely far from its nearest neighbour, itself.
+    """
+    distance, nearest = np.full(len(pos), np.inf), np.arange(len(pos))
+    here = np.flatnonzero((np.abs(pos) < FARTHEST).all(axis=1))
+    if len(here) < 2:
+        return distance, nearest
+    inside = space.wrap(pos[here])
+    found, who = cKDTree(inside, boxsize=space.size if isinstance(space, Torus) else None).query(inside, k=2)
+    # Of two points in one place each may be found first: whoever is not me is my neighbour.
+    rows = np.arange(len(here))
+    column = np.where(who[:, 0] == rows, 1, 0)
+    distance[here], nearest[here] = found[rows, column], here[who[rows, column]]
+    return distance, nearest

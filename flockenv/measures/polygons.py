@@ -1,0 +1,101 @@
+"""Polygons of the plane that areas are measured with: refused if they are none, cut by lines, and what lies in them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from flockenv.refusals import shown
+from flockenv.shapes.outlines import area, crossing
+
+__all__ = ["Corners", "checked", "contains", "convex", "cut", "cut_by", "rectangle", "size"]
+
+Floats = NDArray[np.float64]
+Corners = list[tuple[float, float]]
+"""A polygon while it is cut: plain numbers, for there are few of them and many polygons."""
+
+
+def checked(name: str, polygon: ArrayLike, is_convex: bool = False) -> Floats:
+    """Return a polygon (n, 2), m, counter-clockwise; ValueError, of one line, for what encloses no area, or crosses."""
+    vertices = np.asarray(polygon, np.float64)
+    if vertices.ndim != 2 or vertices.shape[1:] != (2,) or len(vertices) < 3 or not np.isfinite(vertices).all():
+        raise ValueError(f"{name} = {shown(vertices.tolist())}: must be at least three corners (x, y), all finite")
+    if area(vertices) == 0 or crossing(vertices) is not None:
+        raise ValueError(f"{name} = {shown(vertices.tolist())}: must enclose an area, and its edges must not cross")
+    vertices = vertices if area(vertices) > 0 else vertices[::-1].copy()
+    if is_convex and not convex(vertices):
+        raise ValueError(f"{name} = {shown(vertices.tolist())}: must be convex")
+    return vertices
+
+
+def rectangle(low: Sequence[float] | Floats, high: Sequence[float] | Floats) -> Floats:
+    """Return the corners of a rectangle along the axes, (4, 2), counter-clockwise."""
+    return np.array([(low[0], low[1]), (high[0], low[1]), (high[0], high[1]), (low[0], high[1])], np.float64)
+
+
+def convex(polygon: Floats) -> bool:
+    """Is a counter-clockwise polygon (n, 2) convex?"""
+    edges = np.roll(polygon, -1, axis=0) - polygon
+    after = np.roll(edges, -1, axis=0)
+    turns = edges[:, 0] * after[:, 1] - edges[:, 1] * after[:, 0]
+    return bool((turns >= -1e-12 * np.abs(turns).max()).all())
+
+
+def contains(polygon: Floats, points: Floats) -> NDArray[np.bool_]:
+    """Return which of some points (..., 2) lie in a polygon (n, 2), by how often a ray from each crosses its edges.
+
+    Of two polygons that share an edge one contains a point on it.
+    """
+    x, y = points[..., 0], points[..., 1]
+    inside = np.zeros(points.shape[:-1], np.bool_)
+    for (x0, y0), (x1, y1) in zip(polygon, np.roll(polygon, -1, axis=0), strict=True):
+        if y0 != y1:
+            inside ^= ((y0 <= y) != (y1 <= y)) & (x < x0 + (y - y0) * (x1 - x0) / (y1 - y0))
+    return inside
+
+
+def cut(corners: Corners, nx: float, ny: float, bound: float) -> Corners:
+    """Return what of a polygon lies where nx x + ny y <= bound.
+
+    Source: Sutherland & Hodgman 1974, Comm. ACM 17, 32. Of a polygon that is not convex the parts that remain hang
+    together by edges of no width; its area is right.
+    """
+    kept: Corners = []
+    if not corners:
+        return kept
+    x0, y0 = corners[-1]
+    before = nx * x0 + ny * y0 - bound
+    for x1, y1 in corners:
+        here = nx * x1 + ny * y1 - bound
+        if (here > 0) != (before > 0):
+            t = before / (before - here)
+            kept.append((x0 + t * (x1 - x0), y0 + t * (y1 - y0)))
+        if here <= 0:
+            kept.append((x1, y1))
+        x0, y0, before = x1, y1, here
+    return kept
+
+
+def cut_by(corners: Corners, clip: Corners) -> Corners:
+    """Return what of a polygon lies in a convex one, which runs counter-clockwise."""
+    x0, y0 = clip[-1]
+    for x1, y1 in clip:
+        nx, ny = y1 - y0, x0 - x1  # to the right of the edge is outside
+        if nx or ny:
+            corners = cut(corners, nx, ny, nx * x0 + ny * y0)
+        x0, y0 = x1, y1
+    return corners
+
+
+def size(corners: Corners) -> float:
+    """Return the area of a counter-clockwise polygon, m^2."""
+    if len(corners) < 3:
+        return 0.0
+    total, (x0, y0) = 0.0, corners[-1]
+    bx, by = corners[0]  # from a corner of its own: far from the origin nothing cancels
+    for x1, y1 in corners:
+        total += (x0 - bx) * (y1 - by) - (x1 - bx) * (y0 - by)
+        x0, y0 = x1, y1
+    return 0.5 * total

@@ -1,0 +1,119 @@
+"""What a model of people should not do: bodies in one another, going backward; and how often they collide."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.spatial import cKDTree
+
+from flockenv.space import Space, Torus
+
+__all__ = ["Proportion", "collision_rate", "oscillation_proportion", "overlap_area", "overlap_proportion", "touching"]
+
+Floats = NDArray[np.float64]
+
+
+class Proportion(NamedTuple):
+    """How much, where it happens; and how often it does."""
+
+    mean: float  # over those cases where it is not 0; 0 if there is none
+    share: float  # of the cases, where it is not 0; NaN if nobody was looked at
+
+
+def overlap_area(distance: ArrayLike, first: ArrayLike, second: ArrayLike) -> Floats:
+    """Return the area that two discs share, m^2, whose centres are so far apart, of these radii, m."""
+    d, a, b = np.broadcast_arrays(*(np.asarray(each, np.float64) for each in (distance, first, second)))
+    small, large = np.minimum(a, b), np.maximum(a, b)
+    # half angles of the two segments, from sides of the triangle between the centres and where the circles cross
+    with np.errstate(divide="ignore", invalid="ignore"):
+        one = np.arccos(np.clip((d**2 + a**2 - b**2) / (2 * d * a), -1, 1))
+        other = np.arccos(np.clip((d**2 + b**2 - a**2) / (2 * d * b), -1, 1))
+        lens = a**2 * (one - np.sin(2 * one) / 2) + b**2 * (other - np.sin(2 * other) / 2)
+    return np.asarray(np.where(d >= a + b, 0.0, np.where(d <= large - small, np.pi * small**2, lens)))
+
+
+def touching(pos: Floats, radius: Floats, space: Space) -> tuple[NDArray[np.int64], Floats]:
+    """Return the pairs of discs (N, D), m, that overlap, (P, 2), the lesser number first, and how far apart, (P,) m."""
+    if len(pos) < 2 or not radius.max() > 0:
+        return np.zeros((0, 2), np.int64), np.zeros(0)
+    tree = cKDTree(space.wrap(pos), boxsize=space.size if isinstance(space, Torus) else None)
+    pairs = tree.query_pairs(2 * float(radius.max()), output_type="ndarray").astype(np.int64).reshape(-1, 2)
+    far = np.linalg.norm(space.displacement(pos[pairs[:, 0]], pos[pairs[:, 1]]), axis=1)
+    near = far < radius[pairs[:, 0]] + radius[pairs[:, 1]]
+    return pairs[near], far[near]
+
+
+def overlap_proportion(pos: ArrayLike, radius: ArrayLike, space: Space, alive: ArrayLike | None = None) -> Proportion:
+    """Return how much bodies lie in one another: the mean of A_ij / min(A_i, A_j) over all pairs that overlap.
+
+    pos (T, N, 2) m; radius (N,) m; alive (T, N). `mean` is 0 where no two ever overlap, 1 where one always lies in the
+    other; `share` is how many of all agent-instants are in a pair that overlaps.
+    Source: Chraibi, Seyfried, Schadschneider 2010, Phys. Rev. E 82, 046111 (arXiv 1008.4297), there of ellipses.
+    """
+    total, many, seen, people = 0.0, 0, 0, 0
+    for where, size, _ in _instants(pos, radius, alive):
+        pairs, far = touching(where, size, space)
+        a, b = size[pairs[:, 0]], size[pairs[:, 1]]
+        least = np.pi * np.minimum(a, b) ** 2
+        # a point in a body lies in it whole
+        total += float(np.where(least > 0, overlap_area(far, a, b) / np.where(least > 0, least, 1), 1.0).sum())
+        many += len(pairs)
+        seen += len(np.unique(pairs))
+        people += len(where)
+    return Proportion(total / many if many else 0.0, seen / people if people else np.nan)
+
+
+def oscillation_proportion(vel: ArrayLike, desired: ArrayLike, alive: ArrayLike | None = None) -> Proportion:
+    """Return how strongly people move backward: the mean of S = -v . v0 / |v0|^2 where that is > 0.
+
+    vel (T, N, D) and desired (N, D) or (T, N, D), m/s: v0 with its speed; who wants to go nowhere is not looked at.
+    alive (T, N). `mean` is 0 where nobody ever moves backward, 1 where he does so as fast as he would walk; `share` is
+    how many of all agent-instants it happens in. Forces that oscillate do it again and again (Kretz, arXiv 1507.02566).
+    Source: Chraibi, Seyfried, Schadschneider 2010, Phys. Rev. E 82, 046111, S = (|s| - s) / 2 with s = v . v0 / |v0|^2.
+    """
+    v = np.asarray(vel, np.float64)
+    wish = np.broadcast_to(np.asarray(desired, np.float64), v.shape)
+    square = (wish**2).sum(axis=-1)
+    here = square > 0
+    if alive is not None:
+        here = here & np.asarray(alive, np.bool_)
+    s = (v * wish).sum(axis=-1)[here] / square[here]
+    back = -s[s < 0]
+    return Proportion(float(back.mean()) if len(back) else 0.0, len(back) / len(s) if len(s) else np.nan)
+
+
+def collision_rate(
+    time: ArrayLike, pos: ArrayLike, radius: ArrayLike, space: Space, alive: ArrayLike | None = None
+) -> float:
+    """Return how often two begin to touch, per agent and second: 2 pairs that did not at the instant before / (N T).
+
+    time (T,) s; pos (T, N, D) m; radius (N,) m; alive (T, N). Who touched at the first instant has not begun to; what
+    begins and ends between two instants is not seen. NaN of fewer than two instants, or of nobody.
+    """
+    when = np.asarray(time, np.float64)
+    before: set[int] | None = None
+    began, lived, count = 0, 0.0, len(np.asarray(radius))
+    for k, (where, size, who) in enumerate(_instants(pos, radius, alive)):
+        pairs = who[touching(where, size, space)[0]]
+        now = set((pairs[:, 0] * count + pairs[:, 1]).tolist())
+        if before is not None:
+            began += len(now - before)
+            lived += len(where) * float(when[k] - when[k - 1])
+        before = now
+    return 2 * began / lived if lived > 0 else np.nan
+
+
+def _instants(
+    pos: ArrayLike, radius: ArrayLike, alive: ArrayLike | None
+) -> Iterator[tuple[Floats, Floats, NDArray[np.intp]]]:
+    """Return positions, radii and numbers of those who are there, at instant after instant."""
+    where, size = np.asarray(pos), np.asarray(radius, np.float64)
+    if where.ndim != 3 or size.shape != where.shape[1:2]:
+        raise ValueError(f"pos: of shape {where.shape}, radius of {size.shape}: must be (T, N, D) and (N,)")
+    there = np.ones(where.shape[:2], np.bool_) if alive is None else np.asarray(alive, np.bool_)
+    for now, some in zip(where, there, strict=True):
+        here = np.flatnonzero(some & np.isfinite(now).all(axis=1))
+        yield np.asarray(now[here], np.float64), size[here], here

@@ -1,0 +1,194 @@
+"""Density by counting and by Voronoi cells, the fundamental diagram, and its references."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from flockenv.measures import (
+    JUELICH,
+    classical_density,
+    diagram,
+    from_weidmann,
+    in_juelich,
+    required_length,
+    single_file_density,
+    single_file_speed,
+    speed_in_area,
+    voronoi,
+    voronoi_density,
+    voronoi_speed,
+    weidmann_flow,
+    weidmann_speed,
+)
+from flockenv.measures.polygons import checked, contains, cut_by, rectangle, size
+
+SQUARE = rectangle((0, 0), (10, 10))
+NOTCHED = np.array([(0, 0), (10, 0), (10, 10), (6, 10), (6, 4), (4, 4), (4, 10), (0, 10)], float)  # 100 - 12 m^2
+
+
+def lattice(spacing: float, high: float = 10.0) -> np.ndarray:
+    x = np.arange(spacing / 2, high, spacing)
+    return np.stack(np.meshgrid(x, x), axis=-1).reshape(-1, 2)
+
+
+def hexagonal(spacing: float, high: float) -> np.ndarray:
+    """Rows in which everybody is between two of the next row."""
+    rows = round(high / (spacing * math.sqrt(3) / 2) / 2) * 2
+    step = high / rows
+    x = np.arange(0, high, spacing) + spacing / 4
+    return np.concatenate(
+        [np.stack(np.broadcast_arrays((x + spacing / 2 * (r % 2)) % high, (r + 0.5) * step), -1) for r in range(rows)]
+    )
+
+
+# --- areas ------------------------------------------------------------------------------------------------------------
+
+
+def test_a_square_lattice_has_the_density_of_its_cells() -> None:
+    """1 / a^2 for cells; counting gives it only where the area ends between two rows."""
+    pos = lattice(0.5)
+    room = voronoi(pos, SQUARE, rectangle((3.1, 3.3), (6.2, 6.9)))
+    assert room.cell == pytest.approx(np.full(400, 0.25), rel=1e-12)
+    assert room.inside.sum() == pytest.approx(3.1 * 3.6, rel=1e-12)
+    assert voronoi_density(room) == pytest.approx(4.0, rel=1e-12)
+    assert classical_density(pos[None], rectangle((3, 3), (6, 6))) == pytest.approx([4.0])
+    assert classical_density(pos[None], rectangle((3.2, 3.2), (6.2, 6.2))) == pytest.approx([4.0])
+    assert classical_density(pos[None], rectangle((3.2, 3.2), (6.3, 6.3)))[0] != pytest.approx(4.0)
+
+
+def test_a_triangular_lattice_on_a_torus_has_no_edge() -> None:
+    pos = hexagonal(0.5, 4.0)
+    room = voronoi(pos, rectangle((0, 0), (4, 4)), period=(4.0, 4.0))
+    assert room.cell == pytest.approx(np.full(len(pos), 16 / len(pos)), rel=1e-9)
+    cut = voronoi(pos, rectangle((0, 0), (4, 4)))
+    assert cut.cell.sum() == pytest.approx(16)
+    assert cut.cell.std() > 0.01  # at the edge cells end
+
+
+@pytest.mark.parametrize(("walkable", "whole"), [(SQUARE, 100.0), (NOTCHED, 88.0), (NOTCHED[::-1], 88.0)])
+@pytest.mark.parametrize("many", [1, 2, 3, 40])
+def test_cells_share_all_that_is_walkable(walkable: np.ndarray, whole: float, many: int) -> None:
+    pos = np.random.default_rng(many).uniform(0, 4, (many, 2))
+    room = voronoi(pos, walkable)
+    assert room.cell.sum() == pytest.approx(whole, rel=1e-12)
+    assert (room.cell > 0).all()
+    assert voronoi_density(room) == pytest.approx(many / whole)
+    hole = rectangle((7, 1), (9, 2))
+    assert voronoi(pos, walkable, holes=[hole]).cell.sum() == pytest.approx(whole - 2, rel=1e-12)
+
+
+@given(seed=st.integers(0, 1000), many=st.integers(1, 12))
+def test_a_cell_is_what_is_nearest_to_him(seed: int, many: int) -> None:
+    """Against counting: of 20,000 places in a notched square those that are nearest to each; on a torus too."""
+    rng = np.random.default_rng(seed)
+    pos = rng.uniform(0, 4, (many, 2))
+    places = rng.uniform(0, 10, (20_000, 2))
+    for walkable, period in ((NOTCHED, (0.0, 0.0)), (SQUARE, (10.0, 10.0)), (SQUARE, (10.0, 0.0))):
+        way = places[:, None] - pos
+        wide = np.where(np.array(period) > 0, period, np.inf)
+        way -= np.array(period) * np.round(way / wide)
+        nearest = np.argmin((way**2).sum(-1), axis=1)
+        on = contains(walkable, places)
+        share = np.bincount(nearest[on], minlength=many) / 200
+        room = voronoi(pos, walkable, period=period)
+        assert room.cell == pytest.approx(share, abs=5 * 0.36)  # five deviations of such a count
+        assert room.cell.sum() == pytest.approx(size([tuple(c) for c in walkable.tolist()]))  # type: ignore[misc]
+
+
+def test_those_in_one_place_share_a_cell_and_those_outside_have_none() -> None:
+    room = voronoi([[2, 5], [2, 5], [7, 5], [20, 5]], SQUARE)
+    assert room.cell == pytest.approx([22.5, 22.5, 55, math.nan], nan_ok=True)
+    assert voronoi_density(room) == pytest.approx(0.03)
+    nobody = voronoi(np.zeros((0, 2)), SQUARE)
+    assert voronoi_density(nobody) == 0
+    assert math.isnan(voronoi_speed(nobody, np.zeros(0)))
+
+
+def test_speed_by_area_weighs_by_room() -> None:
+    """One has 3/4 of the square and walks 1 m/s, one has 1/4 and stands."""
+    pos, vel = np.array([[5.0, 5.0], [10.0 - 1e-9, 5.0]]), np.array([[1.0, 0], [0, 0]])
+    room = voronoi(pos, SQUARE)
+    assert voronoi_speed(room, np.linalg.norm(vel, axis=1)) == pytest.approx(0.75)
+    assert speed_in_area(pos[None], vel[None], SQUARE) == pytest.approx([0.5])
+    assert speed_in_area(pos[None], vel[None], SQUARE, along=(-1, 1)) == pytest.approx([-math.sqrt(0.125)])
+    assert np.isnan(speed_in_area(pos[None], vel[None], SQUARE, alive=np.zeros((1, 2)))).all()
+
+
+@pytest.mark.parametrize(
+    ("polygon", "said"),
+    [
+        ([(0, 0), (1, 1)], "at least three corners"),
+        ([(0, 0), (1, 0), (math.nan, 1)], "all finite"),
+        ([(0, 0), (1, 0), (2, 0)], "must enclose an area"),
+        ([(0, 0), (1, 1), (1, 0), (0, 1)], "must not cross"),
+    ],
+)
+def test_what_is_no_area_is_refused_in_one_line(polygon: list[tuple[float, float]], said: str) -> None:
+    for call in (lambda: classical_density(np.zeros((1, 1, 2)), polygon), lambda: voronoi(np.zeros((1, 2)), polygon)):
+        with pytest.raises(ValueError, match=said) as caught:
+            call()
+        assert "\n" not in str(caught.value)
+    with pytest.raises(ValueError, match=r"area = .*: must be convex"):
+        voronoi(np.zeros((1, 2)), SQUARE, NOTCHED)
+    with pytest.raises(ValueError, match="areas are of the plane"):
+        classical_density(np.zeros((1, 1, 3)), SQUARE)
+
+
+def test_polygons_are_cut_by_convex_ones() -> None:
+    """A triangle and a square whose common area is known; nothing in common; the same."""
+    triangle = [(0.0, 0.0), (4.0, 0.0), (0.0, 4.0)]
+    square = [(1.0, 1.0), (3.0, 1.0), (3.0, 3.0), (1.0, 3.0)]
+    assert size(cut_by(triangle, square)) == pytest.approx(2.0)
+    assert size(cut_by(square, triangle)) == pytest.approx(2.0)
+    assert size(cut_by(triangle, [(9.0, 9.0), (10.0, 9.0), (9.0, 10.0)])) == 0
+    assert size(cut_by(square, square)) == pytest.approx(4.0)
+    assert checked("a", triangle[::-1]).tolist() == [list(c) for c in triangle]
+
+
+# --- the fundamental diagram ------------------------------------------------------------------------------------------
+
+
+def test_weidmanns_curve_is_that_of_the_table() -> None:
+    assert weidmann_speed([0.5, 1, 2, 3, 4]) == pytest.approx([1.298, 1.058, 0.606, 0.331, 0.156], abs=5e-4)
+    assert weidmann_speed([0, 5.4, 8]) == pytest.approx([1.34, 0, 0])
+    rho = np.linspace(0, 5.4, 5401)
+    most = int(np.argmax(weidmann_flow(rho)))
+    assert (rho[most], weidmann_flow(rho)[most]) == pytest.approx((1.75, 1.225), abs=6e-3)
+    with pytest.raises(ValueError, match="density = -1 per"):
+        weidmann_speed(-1.0)
+
+
+def test_single_file_is_seyfrieds_line() -> None:
+    assert single_file_speed([1, 1.5, 2, 5]) == pytest.approx([0.604, 0.289, 0.132, 0], abs=5e-4)
+    assert required_length(single_file_speed(1.5)) == pytest.approx(1 / 1.5)
+    assert single_file_density([0.5, 9.5, 4.5], 10) == pytest.approx([1 / 4, 1, 1 / 5])
+    assert single_file_density([3], 10) == pytest.approx([0.1])
+
+
+def test_a_crowd_that_walks_as_juelichs_is_in_all_bins_and_below_weidmann() -> None:
+    rng = np.random.default_rng(0)
+    low, high, mean, spread = (np.repeat(column, 500) for column in np.array(JUELICH).T)
+    rho, v = rng.uniform(low, high), rng.normal(mean, 0.5 * spread)
+    assert in_juelich(rho, v) == 1
+    assert in_juelich(rho, v + 0.3) == 0
+    off = from_weidmann(rho, v)
+    assert off.samples == 2500
+    assert -0.25 < off.mean < -0.1  # numerics.md A3: real corridors lie below it
+    assert from_weidmann(rho, weidmann_speed(rho))[1:3] == pytest.approx((0, 0), abs=1e-12)
+    assert from_weidmann(rho, weidmann_speed(rho) + 0.2).worst == pytest.approx(0.2, abs=0.01)
+    assert math.isnan(in_juelich([0.1], [1.0]))
+    assert from_weidmann([0.1], [1.0])[0] == 0
+
+
+def test_bins_hold_what_they_should() -> None:
+    found = diagram([0.2, 0.7, 0.8, 0.9, 9.0], [1.3, 1.0, 0.8, math.nan, 1.0])
+    assert [b.samples for b in found] == [1, 2, 0, 0, 0, 0, 0, 0]
+    assert found[1][3:] == pytest.approx((0.75, 0.9, 0.1, (0.7 + 0.64) / 2))
+    assert math.isnan(found[2].speed)
+    with pytest.raises(ValueError, match="density has 1 samples, speed 2"):
+        diagram([1], [1, 2])
