@@ -16,7 +16,7 @@ ROOT = Path(__file__).resolve().parent.parent
 
 LAYERS = (
     {"divergence", "terminal", "refusals", "outputs", "recycle", "crew", "compilation", "inlining", "frontend"},
-    {"records", "vec", "noise", "kernels"},
+    {"records", "vec", "elementary", "noise", "kernels"},
     {"state", "space", "steering", "arbitration", "vehicle", "appearance", "spread"},
     {"neighbours", "shapes", "grid", "eikonal", "orca", "polyline", "rows", "networks", "elements", "tree"},
     {"effects", "integrators", "constraints", "population", "spawn", "sweep", "stability", "rounding"},

@@ -24,19 +24,23 @@ from flockenv.behaviours.crowd import Explore, Forage, Queue, UnalignedAvoidance
 from flockenv.behaviours.driving import Driving  # noqa: E402
 from flockenv.behaviours.flock import Alignment, Cohesion, Separation  # noqa: E402
 from flockenv.behaviours.goals import Arrive, Dock, Face, Flee, Seek, TargetSpeed  # noqa: E402
+from flockenv.behaviours.groups import Friends, Interest, WalkingGroup  # noqa: E402
+from flockenv.behaviours.heuristics import Heuristics  # noqa: E402
 from flockenv.behaviours.hide import Hide  # noqa: E402
+from flockenv.behaviours.keep_off import ObstacleRepulsion  # noqa: E402
 from flockenv.behaviours.orca import Orca  # noqa: E402
 from flockenv.behaviours.paths import FollowFlow, FollowPath, StayOnPath  # noqa: E402
+from flockenv.behaviours.social import CircularRepulsion, EllipticalRepulsion, Sidestep  # noqa: E402
 from flockenv.behaviours.walls import Contain, FollowWall  # noqa: E402
 from flockenv.behaviours.wander import Wander  # noqa: E402
 from flockenv.behaviours.way import FollowWay  # noqa: E402
 
 __all__ = [
-    "BEHAVIOURS", "Alignment", "Arrive", "AvoidObstacles", "Cohesion", "Contain", "Dock", "Driving", "Evade", "Explore",
-    "Face", "Flee", "FollowFlow", "FollowLeader", "FollowPath", "FollowWall", "FollowWay", "Forage", "ForceField",
-    "Formation", "Hide", "Interpose", "MatchVelocity", "OffsetPursue", "Orca", "Pursue",
-    "Queue", "Seek", "Separation", "Shadow", "StayOnPath", "TargetSpeed", "UnalignedAvoidance", "Wander",
-    "Whiskers",
+    "BEHAVIOURS", "Alignment", "Arrive", "AvoidObstacles", "CircularRepulsion", "Cohesion", "Contain", "Dock",
+    "Driving", "EllipticalRepulsion", "Evade", "Explore", "Face", "Flee", "FollowFlow", "FollowLeader", "FollowPath", "FollowWall",
+    "FollowWay", "Forage", "ForceField", "Formation", "Friends", "Heuristics", "Hide", "Interest", "Interpose",
+    "MatchVelocity", "ObstacleRepulsion", "OffsetPursue", "Orca", "Pursue", "Queue", "Seek", "Separation", "Shadow",
+    "Sidestep", "StayOnPath", "TargetSpeed", "UnalignedAvoidance", "WalkingGroup", "Wander", "Whiskers",
 ]  # fmt: skip
 
 BEHAVIOURS: dict[str, type[Effect]] = {kind: effect for kind, effect in EFFECTS.items() if effect.steering}

@@ -27,7 +27,8 @@ An effect is of one or more of three forms, each a law for one agent:
   first if it went along the unit vector `direction`. With an `obstacle_from(p, me) -> offset` it is met as from that
   place, so far from the agent, instead of from where the agent is. With an `obstacle_reach(p, me) -> m` it says that
   its law leaves acc as it is wherever the surface is farther than this from the agent: long shapes that lie beyond are
-  not looked at. Of an effect with a pair law too, `finish_law` gives
+  not looked at. With `obstacle_pieces` it meets walls, polygons and rooms side after side: each by its nearest place,
+  a corner once, see shapes/chain.py. Of an effect with a pair law too, `finish_law` gives
   no force but what it has found out about others, a vector that is told to `obstacle_start(p, me, told)` (hide). With
   no start of its own it meets circles alone, goes before a fold over neighbours and hands over to it, so that both are
   judged together (orca).
@@ -223,6 +224,8 @@ class Effect(Record):
     obstacle_ray: ClassVar[str | None] = None
     obstacle_from: ClassVar[str | None] = None
     obstacle_reach: ClassVar[str | None] = None
+    obstacle_pieces: ClassVar[bool] = False
+    """Are walls, polygons and rooms met side after side, each by its nearest place, instead of by one place?"""
     linear_drag: ClassVar[str | None] = None
     """Name of the parameter c, kg/s, of an own_law that is -c (v - medium): a method may treat it by itself."""
     weighs_mass: ClassVar[bool] = True
@@ -261,6 +264,11 @@ class Effect(Record):
     def reach(self) -> float:
         """How far it looks for neighbours, m; 0 if it does not."""
         return self.sight.radius if self.sight else 0.0
+
+    @property
+    def occluded_obstacles(self) -> bool:
+        """Does its obstacle law meet only what no other obstacle hides?"""
+        return False
 
     @property
     def joined(self) -> bool:

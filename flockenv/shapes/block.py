@@ -19,7 +19,7 @@ from flockenv.vec import add, axis, dot, norm, scale, select, sub, unit
 
 __all__ = [
     "box_hit", "box_nearest", "half_edges", "hit_block", "hit_half_space", "nearest_block", "nearest_half_space",
-    "turned",
+    "turned", "turned_back",
 ]  # fmt: skip
 
 
@@ -44,7 +44,8 @@ def turned(table: Any, at: int, x: Vec) -> Vec:
 
 
 @law
-def _turned_back(table: Any, at: int, y: Vec) -> Vec:
+def turned_back(table: Any, at: int, y: Vec) -> Vec:
+    """Return y, which is in the frame of a block's axes, in that of the world."""
     out = add(scale(_axis(table, at, 0, y), y[0]), scale(_axis(table, at, 1, y), y[1]))
     if len(y) == 2:
         return out
@@ -147,7 +148,7 @@ def _rounded_cube(y: Vec, d: Vec, h: Vec, r: float) -> float:
 def nearest_block(table: Any, at: int, x: Vec) -> tuple[float, Vec]:
     """Return the distance to the surface, m (negative inside), and the outward unit normal at its nearest point."""
     gap, normal = box_nearest(turned(table, at, x), half_edges(table, at, x))
-    return gap, _turned_back(table, at, normal)
+    return gap, turned_back(table, at, normal)
 
 
 @law

@@ -2,7 +2,7 @@
 
 A chain is some numbers of a table: a head (see head.py), how many vertices there are, how far around the line
 it is thick (m), 1 if the last vertex is joined to the first and what lies within is solid; then the vertices, relative
-to the anchor. A chain of one vertex is a circle or sphere. `x` is where the agent is, relative to the anchor.
+to the anchor; of a line that is not closed, two ends (see joints.py). A chain of one vertex is a circle or sphere. `x` is where the agent is, relative to the anchor.
 """
 
 from __future__ import annotations
@@ -16,7 +16,10 @@ from flockenv.shapes.head import body_of, bound_of, vector_at
 from flockenv.shapes.round import ray_hit
 from flockenv.vec import add, axis, dot, perpendicular, scale, select, sub, unit
 
-__all__ = ["crosses", "hit_chain", "nearest_chain", "segment_hit", "segment_share", "vertex"]
+__all__ = [
+    "crosses", "end_acts", "hit_chain", "nearest_chain", "piece_chain", "piece_facing", "pieces_chain",
+    "segment_hit", "segment_share", "vertex",
+]  # fmt: skip
 
 
 @law
@@ -128,3 +131,81 @@ def hit_chain(table: Any, at: int, x: Vec, direction: Vec, clearance: float) -> 
         best = here if here < best else best
         inside = inside != (closed & crosses(x, a, b))
     return like(best, 0.0) if inside else best
+
+
+# --- piece by piece ---------------------------------------------------------------------------------------------------
+
+
+@law
+def pieces_chain(table: Any, at: int, x: Vec, gap: float) -> int:
+    """Return how many pieces a chain is met in by one who is `gap` m from it: one where he is inside a solid one."""
+    body = body_of(at, x)
+    count = np.int64(table[body])
+    closed = table[body + 2] > like(gap, 0.0)
+    edges = count if closed else max(count - 1, 1)
+    return 1 if closed & (gap < like(gap, 0.0)) else edges  # type: ignore[return-value]  # a whole number
+
+
+@law
+def _shares(table: Any, at: int, j: int, x: Vec) -> bool:
+    """Does the corner at the beginning of edge j, which is nearest to that edge, act: is it nearest to all there?"""
+    body = body_of(at, x)
+    count: Any = np.int64(table[body])
+    closed = table[body + 2] > like(x[0], 0.0)
+    before = j - 1 if j > 0 else count - 1
+    if (j > 0) | closed:
+        corner = vertex(table, at, j, x)
+        return dot(sub(x, corner), sub(vertex(table, at, before, x), corner)) <= like(x[0], 0.0)
+    return end_acts(table, at, 0, x)
+
+
+@law
+def end_acts(table: Any, at: int, which: int, x: Vec) -> bool:
+    """Does the first (0) or last (1) end of an open chain act on x, to which it is nearest of its own piece?"""
+    body = body_of(at, x)
+    count: Any = np.int64(table[body])
+    place = body + 3 + len(x) * count + which * (1 + len(x))
+    corner = vertex(table, at, 0 if which == 0 else count - 1, x)
+    code = table[place]
+    nearest = dot(sub(x, corner), vector_at(table, place + 1, x)) <= like(code, 0.0)
+    return (code < like(code, 0.5)) | ((code < like(code, 1.5)) & nearest)
+
+
+@law
+def piece_chain(table: Any, at: int, j: int, x: Vec, gap: float, out: Vec) -> tuple[float, Vec, bool]:
+    """Return the distance to piece j, m, the unit normal there, and whether it acts by itself; see `piece_facing`."""
+    return piece_facing(table, at, j, x, gap, out, like(gap, 1.0))
+
+
+@law
+def piece_facing(table: Any, at: int, j: int, x: Vec, gap: float, out: Vec, facing: float) -> tuple[float, Vec, bool]:
+    """Return the distance to piece j, m, the unit normal there, and whether it acts by itself.
+
+    A piece acts by the foot of the perpendicular on it; a corner, where it is nearest to all pieces that meet there,
+    once; of a polygon, the sides that face x. So a wall is the same however it is cut. gap, out: of the nearest place
+    of the whole chain, which is all that counts within a solid one. facing: 1 of solids, -1 of hollow ones.
+    """
+    body = body_of(at, x)
+    count: Any = np.int64(table[body])
+    radius = table[body + 1]
+    o, e = like(radius, 0.0), like(radius, 1.0)
+    closed = table[body + 2] > o
+    if (count < 2) | (closed & (gap < o)):
+        return gap, out, True
+    last = j + 1 >= count
+    a = vertex(table, at, j, x)
+    b = vertex(table, at, 0 if last else j + 1, x)
+    along = sub(b, a)
+    share = segment_share(x, a, b)
+    off = sub(x, add(a, scale(along, share)))
+    square = dot(off, off)
+    side = perpendicular(unit(along))
+    faces = (dot(off, side) * facing >= o) | (share <= o) | (share >= e)
+    acts = (share > o) & (share < e)
+    if share <= o:
+        acts = _shares(table, at, j, x)
+    elif share >= e:
+        acts = (not closed) & (j + 2 >= count) & end_acts(table, at, 1, x)
+    apart = square > like(square, 1e-24)
+    normal = select(apart, unit(off), scale(side, facing))
+    return np.sqrt(square) - radius, normal, acts & (faces | (not closed))

@@ -14,15 +14,16 @@ import numpy as np
 
 from flockenv.grid import sample
 from flockenv.kernels import Vec, law, like
-from flockenv.shapes.block import half_edges, nearest_block, turned
-from flockenv.shapes.chain import crosses, nearest_chain, segment_hit, segment_share, vertex
+from flockenv.shapes.block import half_edges, nearest_block, turned, turned_back
+from flockenv.shapes.chain import crosses, nearest_chain, piece_facing, segment_hit, segment_share, vertex
 from flockenv.shapes.field import STEPS, nearest_distance_field, on_grid
 from flockenv.shapes.head import body_of
-from flockenv.vec import add, dot, norm, scale, sub, unit
+from flockenv.vec import add, axis, dot, norm, scale, sub, unit
 
 __all__ = [
     "hit_hollow_block", "hit_hollow_chain", "hit_hollow_distance_field", "nearest_hollow_block", "nearest_hollow_chain",
-    "nearest_hollow_distance_field",
+    "nearest_hollow_distance_field", "piece_hollow_block", "piece_hollow_chain", "pieces_hollow_block",
+    "pieces_hollow_chain",
 ]  # fmt: skip
 
 
@@ -156,3 +157,45 @@ def hit_hollow_distance_field(table: Any, at: int, x: Vec, direction: Vec, clear
             break
         way += room * most
     return way if room < near else like(clearance, np.inf)
+
+
+# --- piece by piece ---------------------------------------------------------------------------------------------------
+
+
+@law
+def pieces_hollow_chain(table: Any, at: int, x: Vec, gap: float) -> int:
+    """Return how many pieces it is met in: the sides of a polygon from within, else one."""
+    body = body_of(at, x)
+    o = like(gap, 0.0)
+    return np.int64(table[body]) if (table[body + 2] > o) & (gap >= o) else 1  # type: ignore[return-value]
+
+
+@law
+def piece_hollow_chain(table: Any, at: int, j: int, x: Vec, gap: float, out: Vec) -> tuple[float, Vec, bool]:
+    """Return the distance to side j of a room, m, the unit normal that leads into it, and whether it acts by itself."""
+    body = body_of(at, x)
+    o = like(gap, 0.0)
+    if (table[body + 2] > o) & (gap >= o):
+        # within it the chain's own distances are negative: 0 is not, and so all of its sides are met
+        return piece_facing(table, at, j, x, o, out, like(gap, -1.0))
+    return gap, out, True
+
+
+@law
+def pieces_hollow_block(table: Any, at: int, x: Vec, gap: float) -> int:
+    """Return how many faces it is met by: all from within, else one."""
+    return 2 * len(x) if gap >= like(gap, 0.0) else 1
+
+
+@law
+def piece_hollow_block(table: Any, at: int, j: int, x: Vec, gap: float, out: Vec) -> tuple[float, Vec, bool]:
+    """Return the distance to face j of a room, m, and the unit normal that leads into it; every face acts."""
+    o, e = like(gap, 0.0), like(gap, 1.0)
+    y, h = turned(table, at, x), half_edges(table, at, x)
+    k, sign = j // 2, e if j % 2 == 0 else -e
+    depth = h[0] - sign * y[0] if k == 0 else h[1] - sign * y[1]
+    if len(x) == 3:
+        depth = depth if k < 2 else h[2] - sign * y[2]
+    if gap >= o:
+        return depth, scale(turned_back(table, at, axis(x, k)), -sign), True
+    return gap, out, True

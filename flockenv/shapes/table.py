@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from flockenv.kernels import load
+from flockenv.shapes.joints import joints
 
 __all__ = ["FORMS", "Floats", "hits", "nearest", "packed"]
 
@@ -36,8 +37,13 @@ UP = 1 + 1e-6
 """Bounds in a row are larger by this: whoever is beyond one is clear of the shape, however single precision rounds."""
 
 
-def packed(shapes: Sequence[Any], dimension: int, first: int = 0) -> tuple[Floats, dict[str, tuple[int, int]]]:
-    """Return the table of some shapes, numbered from `first`, and for each form there is: (where, how many)."""
+def packed(
+    shapes: Sequence[Any], dimension: int, first: int = 0, period: Floats | None = None
+) -> tuple[Floats, dict[str, tuple[int, int]]]:
+    """Return the table of some shapes, numbered from `first`, and for each form there is: (where, how many).
+
+    period: the edges of a torus, m, around which walls may be joined.
+    """
     rows: list[Floats] = []
     where: dict[str, tuple[int, int]] = {}
     at = 0
@@ -46,7 +52,10 @@ def packed(shapes: Sequence[Any], dimension: int, first: int = 0) -> tuple[Float
         if mine:
             where[form] = (at, len(mine))
         for who, shape in mine:
-            row = np.concatenate([[0.0, who], _head(shape, number), shape.row(dimension)])
+            body = list(shape.row(dimension))
+            if form == "chain" and not body[2]:
+                body += joints(shapes, who - first, period)
+            row = np.concatenate([[0.0, who], _head(shape, number), body])
             row[0] = len(row)
             rows.append(row)
             at += len(row)

@@ -17,6 +17,12 @@ __all__ = ["blocked", "obstacle_imports", "obstacles"]
 
 CIRCLE = "circle"
 
+PIECED = ("chain", "hollow_chain", "hollow_block")
+"""Forms that a law may meet piece by piece: side after side."""
+
+SHORT = 1 - 1e-6
+"""Share of the way to a surface on which nothing may stand, if it is to be seen: not the surface itself."""
+
 
 def obstacle_imports(parts: Parts) -> list[str]:
     """Write what folds over obstacles, and who is hidden by them, are made of."""
@@ -30,9 +36,10 @@ def obstacle_imports(parts: Parts) -> list[str]:
         "from flockenv.steering.around import threat",
         *([f"from flockenv.shapes.head import {', '.join(asked)}"] if asked else []),
     ]
-    return lines + [
-        f"from {module} import hit_{form}, nearest_{form}" for form, module in FORMS.items() if form in parts.shaped[1]
-    ]
+    forms = [(form, module) for form, module in FORMS.items() if form in parts.shaped[1]]
+    lines += [f"from {module} import hit_{form}, nearest_{form}" for form, module in forms]
+    cut = [(form, module) for form, module in forms if form in PIECED and any(e.obstacle_pieces for e in parts.effects)]
+    return lines + [f"from {module} import piece_{form}, pieces_{form}" for form, module in cut]
 
 
 def obstacles(parts: Parts, me: list[str], found_out: Callable[[int], str]) -> list[str]:
@@ -102,10 +109,48 @@ def _meet(parts: Parts, asking: list[tuple[int, list[str]]], form: str) -> list[
         for j in range(effect.rays(parts.dimension) if effect.obstacle_ray else 1):
             vel = "glide" if parts.moving and form != CIRCLE else "zero(x)"
             from_ = k if effect.obstacle_from else None
+            if effect.obstacle_pieces and form in PIECED:
+                lines += _by_pieces(parts, k, slots, form, vel)
+                continue
             lines += _touched(form, k, j, vel) if effect.obstacle_ray else _near(form, from_, vel)
             lines.append(f"found = obstacle_law_{k}(p{k}, me, it, ({', '.join(slots)},))")
-            lines += [f"{s} = found[{i}]" for i, s in enumerate(slots)]
+            lines += _kept(slots, _seen(parts, "it.gap", "it.normal") if effect.occluded_obstacles else "")
     return lines
+
+
+def _kept(slots: list[str], when: str) -> list[str]:
+    """Write how a fold goes on, always or under a condition."""
+    if not when:
+        return [f"{s} = found[{i}]" for i, s in enumerate(slots)]
+    return [f"acts = {when}", *(f"{s} = found[{i}] if acts else {s}" for i, s in enumerate(slots))]
+
+
+def _seen(parts: Parts, gap: str, normal: str) -> str:
+    """Write whether nothing stands in the way to the place of a surface that is nearest to x."""
+    when = "time, " if parts.moving else ""
+    way = f"scale({normal}, -{gap} * like({gap}, {SHORT!r}))"
+    return (
+        f"({gap} <= like({gap}, 0.0)) or "
+        f"not blocked(obstacle_x, obstacle_radius, params, size, b, {when}x, {way})"
+    )
+
+
+def _by_pieces(parts: Parts, k: int, slots: list[str], form: str, vel: str) -> list[str]:
+    """Write how a law meets a shape side after side: the nearest place of each that acts by itself."""
+    body = f"{vel}, like(far, 0.0), zero(x), far, side, like(far, np.inf), zero(x)"
+    seen = f" and ({_seen(parts, 'far', 'side')})" if parts.effects[k].occluded_obstacles else ""
+    met = [
+        "to = touched_offset(zero(x), like(far, 0.0), side, far, far)",
+        f"it = Obstacle(params[at_ + 1], to, dot(to, to), {body})",
+        f"found = obstacle_law_{k}(p{k}, me, it, ({', '.join(slots)},))",
+        *_kept(slots, ""),
+    ]
+    return [
+        f"for piece in range(pieces_{form}(params, at_, y, gap)):",
+        f"    far, side, acts = piece_{form}(params, at_, piece, y, gap, out)",
+        f"    if acts{seen}:",
+        *indented_lines(met, 8),
+    ]
 
 
 def _near(form: str, k: int | None, vel: str) -> list[str]:

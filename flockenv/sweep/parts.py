@@ -106,7 +106,10 @@ class Parts:
     @functools.cached_property
     def shaped(self) -> tuple[NDArray[np.float64], dict[str, tuple[int, int]]]:
         """The table of shapes that are not in the state, and the forms there are: where each begins, how many."""
-        return packed(self.shapes, self.dimension, self.circles) if self.meets_obstacles else (np.zeros(0), {})
+        if not self.meets_obstacles:
+            return np.zeros(0), {}
+        period = np.array(self.space.extent(self.dimension)) if self.space.periodic else None
+        return packed(self.shapes, self.dimension, self.circles, period)
 
     @property
     def moving(self) -> bool:
@@ -131,8 +134,8 @@ class Parts:
 
     @property
     def occludes(self) -> bool:
-        """Is anybody hidden by obstacles?"""
-        return any(sight.occluded for sight in self.sights)
+        """Is anybody, or any obstacle, hidden by obstacles?"""
+        return any(sight.occluded for sight in self.sights) or any(e.occluded_obstacles for e in self.effects)
 
     @functools.cached_property
     def bonded(self) -> list[tuple[int, Effect]]:

@@ -1,0 +1,213 @@
+"""People who belong together, and what draws them: walking groups, friends, windows and performers."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any, ClassVar, Literal
+
+import numpy as np
+from pydantic import Field
+
+from flockenv import steering
+from flockenv.behaviours.social import Social, size_of
+from flockenv.effects.base import Effect, Me, Other, Sight, Vector, demand_group
+from flockenv.elementary import exp
+from flockenv.kernels import Vec, law, like
+from flockenv.vec import add, norm, scale, select, sub, unit, zero
+
+__all__ = ["Friends", "Interest", "WalkingGroup"]
+
+
+# --- what draws -------------------------------------------------------------------------------------------------------
+
+
+@law
+def faded(p: Any, time: float) -> float:
+    """What is left of an interest that began at `since`: exp(-(t - t0) / T), 0 before."""
+    o = like(time, 0.0)
+    age = time - p.since
+    return exp(-age * p.fading) if age >= o else o
+
+
+@law
+def drawn_there(p: Any, me: Me) -> Vec:
+    """A exp(-d / B) exp(-(t - t0) / T) towards the place."""
+    pull = scale(steering.draw(sub(p.target, me.pos), p.decay), size_of(p, me) * faded(p, me.time))
+    near = norm(sub(p.target, me.pos)) < p.radius
+    return select(near, pull, zero(me.pos))
+
+
+class Interest(Effect):
+    """Drawn to a place, as to a window or a performer, less and less: F = A exp(-d / B) exp(-(t - t0) / T) n.
+
+    -grad W of a potential that grows with the distance and fades with time, as Helbing and Molnar 1995 ask for
+    (equation 7); the form is ours, they give none, and no numbers.
+    """
+
+    kind: Literal["interest"] = "interest"
+    target: Vector = Field(description="m, what is interesting")
+    strength: float = Field(default=0.0, ge=0, description="A, N")
+    acceleration: float = Field(default=0.0, ge=0, description="A, m/s^2: the force is that times its own mass")
+    decay: float = Field(gt=0, description="B, m, over which the pull falls to 1/e")
+    fades: float | None = Field(default=None, gt=0, description="T, s, in which interest falls to 1/e; none = it stays")
+    since: float = Field(default=0.0, ge=0, description="t0, s, when it begins")
+    radius: float = Field(default=20.0, gt=0, description="m, from further away it does not draw")
+    steering: ClassVar[bool] = True
+    strengths: ClassVar[tuple[str, ...]] = ("strength", "acceleration")
+    places: ClassVar[tuple[str, ...]] = ("target",)
+    own_law: ClassVar[str | None] = "drawn_there"
+    demo: ClassVar[str | None] = """
+dt: 0.02
+groups: [{count: 5, mass: 80, radius: 0.25, desired_speed: 1.3, spawn: {low: [-6, -2], high: [-3, 2]}}]
+effects:
+  - {kind: course, direction: [1, 0]}
+  - {kind: driving, tau: 0.5}
+  - {kind: circular_repulsion, strength: 2000, decay: 0.08, radius: 3}
+  - {kind: interest, target: [0, 3], acceleration: 4, decay: 3, fades: 4}
+"""
+
+    def parameters(self) -> dict[str, float | Vec]:
+        """Where, how strong, how far, how long."""
+        fading = 0.0 if self.fades is None else 1 / self.fades
+        numbers = {name: float(getattr(self, name)) for name in ("strength", "acceleration", "decay", "since", "radius")}
+        return {"target": self.target, "fading": fading, **numbers}
+
+
+@law
+def drawn_together(p: Any, me: Me, other: Other) -> Vec:
+    """A exp(-d / B) towards him."""
+    return steering.draw(other.offset, p.decay)
+
+
+@law
+def as_friends(p: Any, me: Me, sums: Vec) -> Vec:
+    """A exp(-(t - t0) / T) times the sum."""
+    return scale(sums, size_of(p, me) * faded(p, me.time))
+
+
+class Friends(Social):
+    """Drawn to those of a group, less and less: F = A exp(-(t - t0) / T) sum exp(-d / B) n.
+
+    The attraction of Helbing and Molnar 1995 (equation 7) to friends; form and numbers are ours, see `interest`.
+    """
+
+    kind: Literal["friends"] = "friends"
+    decay: float = Field(gt=0, description="B, m, over which the pull falls to 1/e")
+    fades: float | None = Field(default=None, gt=0, description="T, s, in which interest falls to 1/e; none = it stays")
+    since: float = Field(default=0.0, ge=0, description="t0, s, when it begins")
+    pair_law: ClassVar[str | None] = "drawn_together"
+    finish_law: ClassVar[str | None] = "as_friends"
+    demo: ClassVar[str | None] = """
+dt: 0.02
+groups:
+  - {count: 4, mass: 80, radius: 0.25, desired_speed: 1.3, spawn: {low: [-6, -3], high: [-3, 3]}}
+  - {count: 1, mass: 80, radius: 0.25, role: learner, spawn: {low: [0, 2.5], high: [0, 2.5]}}
+effects:
+  - {kind: course, group: 0, direction: [1, 0]}
+  - {kind: steer, group: 0, arbitration: {kind: blend}, behaviours: [{kind: driving, tau: 0.5},
+     {kind: friends, group: 1, acceleration: 4, decay: 3, fades: 4, radius: 10}]}
+  - {kind: circular_repulsion, strength: 2000, decay: 0.08, radius: 3}
+"""
+
+    def parameters(self) -> dict[str, float | Vec]:
+        """How strong, how far, how long."""
+        fading = 0.0 if self.fades is None else 1 / self.fades
+        return {**super().parameters(), "decay": self.decay, "since": self.since, "fading": fading}
+
+
+# --- walking groups ---------------------------------------------------------------------------------------------------
+
+
+@law
+def _party(p: Any, who: float) -> float:
+    """Which of the parties of the group somebody belongs to; negative, or beyond the last, of who is in none."""
+    return np.floor((who - p.first) / p.party)  # type: ignore[no-any-return]
+
+
+@law
+def of_the_party(p: Any, me: Me, other: Other) -> Vec:
+    """Where he is, that he is one, and which way is away from him if he is too near; 0 of who is of another party."""
+    o, e = like(other.square, 0.0), like(other.square, 1.0)
+    mine = _party(p, me.who) == _party(p, other.who)
+    near = mine & (other.square < p.distance * p.distance)
+    apart = other.square > like(other.square, 1e-30)
+    away = unit(select(apart, scale(other.offset, -e), sub(me.tie, other.tie)))
+    none = zero(other.offset)
+    return (e if mine else o,) + select(mine, other.offset, none) + select(near, away, none)  # noqa: RUF005
+
+
+@law
+def as_a_party(p: Any, me: Me, sums: Vec) -> Vec:
+    """m (-beta1 alpha v + beta2 q_A U + beta3 sum q_R W)."""
+    o, e = like(me.mass, 0.0), like(me.mass, 1.0)
+    others = sums[0]
+    to: Vec
+    away: Vec
+    if len(sums) == 5:
+        to, away = (sums[1], sums[2]), (sums[3], sums[4])
+    else:
+        to, away = (sums[1], sums[2], sums[3]), (sums[4], sums[5], sums[6])
+    centre = scale(to, e / (others + e))  # of all of the party, itself too
+    alpha = steering.gaze_turn(me.heading, to, p.view)
+    far = norm(centre) > others * like(me.mass, 0.5)  # (N - 1) / 2 m
+    wish = add(scale(me.vel, -p.gaze * alpha), scale(unit(centre), p.cohesion if far else o))
+    return select(others > o, scale(add(wish, scale(away, p.repulsion)), me.mass), zero(me.vel))
+
+
+class WalkingGroup(Effect):
+    """Walk in small parties of a group: those of numbers 0 to `party` - 1 are one, the next are another, and so on.
+
+    Moussaid et al. 2010: F = m (-beta1 alpha v + beta2 q_A U + beta3 sum q_R W). alpha is by how much it must turn its
+    head to see the others' centre, U leads to the centre of the party, if that is further than (N - 1) / 2 m (N
+    members), and W away from each who is nearer than `distance`. It comes beside a repulsion from everybody.
+    """
+
+    kind: Literal["walking_group"] = "walking_group"
+    group: int = Field(ge=0, strict=True, description="the group whose agents walk in parties")
+    party: int = Field(ge=2, strict=True, description="N, how many are a party; the last may be smaller")
+    gaze: float = Field(default=4.0, ge=0, description="beta1, 1/(s rad), braking to see the others")
+    cohesion: float = Field(default=3.0, ge=0, description="beta2, m/s^2, to the centre")
+    repulsion: float = Field(default=1.0, ge=0, description="beta3, m/s^2, from each of the party who is too near")
+    distance: float = Field(default=0.8, gt=0, description="m between centres, nearer is too near")
+    fov: float = Field(default=180.0, gt=0, le=360, description="degrees, full angle that is seen without turning")
+    radius: float = Field(default=20.0, gt=0, description="m, whoever is further away is lost")
+    steering: ClassVar[bool] = True
+    strengths: ClassVar[tuple[str, ...]] = ("gaze", "cohesion", "repulsion")
+    pair_law: ClassVar[str | None] = "of_the_party"
+    finish_law: ClassVar[str | None] = "as_a_party"
+    demo: ClassVar[str | None] = """
+dt: 0.02
+groups: [{count: 9, mass: 80, radius: 0.25, desired_speed: 1.2, spawn: {low: [-6, -4], high: [-3, 4]}}]
+effects:
+  - {kind: course, direction: [1, 0]}
+  - {kind: driving, tau: 0.5}
+  - {kind: sidestep, acceleration: 4.5, radius: 8}
+  - {kind: walking_group, group: 0, party: 3}
+"""
+
+    @property
+    def sight(self) -> Sight:
+        """Those of the group, all around."""
+        return Sight(self.radius, group=self.group)
+
+    def parameters(self) -> dict[str, float | Vec]:
+        """beta1 to beta3, and who belongs together."""
+        names = ("party", "gaze", "cohesion", "repulsion", "distance")
+        return {"view": math.radians(self.fov) / 2, **{name: float(getattr(self, name)) for name in names}}
+
+    def members(self, starts: Sequence[int]) -> dict[str, float]:
+        """The first agent of the group."""
+        return {"first": float(starts[self.group])}
+
+    def sums(self, dimension: int) -> int:
+        """How many others, where, and away from those who are too near."""
+        return 1 + 2 * dimension
+
+    def check(self, scene: Any) -> None:
+        """Refuse a group that is not there, and parties larger than it."""
+        demand_group("group", self.group, scene.groups)
+        size = scene.groups[self.group].size
+        if self.party > size:
+            raise ValueError(f"party = {self.party}: groups[{self.group}] has {size} agents")
+        super().check(scene)

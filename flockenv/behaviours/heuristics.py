@@ -1,0 +1,273 @@
+"""Two simple rules instead of forces: look where the way is free, and go no faster than is safe (Moussaid et al. 2011)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any, ClassVar, Literal
+
+import numpy as np
+from numba.extending import overload
+from numpy.typing import NDArray
+from pydantic import Field
+
+from flockenv import steering
+from flockenv.effects.base import Effect, Me, Other, Sight, all_masses, demand_group
+from flockenv.kernels import OPTIONS, Vec, law, like, stacked
+from flockenv.shapes.chain import segment_hit, segment_share
+from flockenv.vec import add, dot, norm, scale, select, sub, unit, zero
+
+__all__ = ["DIRECTIONS", "Heuristics"]
+
+Floats = NDArray[np.float64]
+
+DIRECTIONS = 31
+"""Directions that are looked at within the field of view, from the rightmost to the leftmost; the aim is one more."""
+
+SIDES = ("wall", "capsule", "polygon", "block", "half_space")
+"""Kinds of obstacles whose sides are straight."""
+
+ENDLESS = 1e4
+"""m, half the length of the line that stands for the surface of a half-space."""
+
+
+@law
+def turned_by(way: Vec, cosine: float, sine: float) -> Vec:
+    """Return the vector, turned to the left."""
+    return (way[0] * cosine - way[1] * sine, way[0] * sine + way[1] * cosine)
+
+
+def nearer(
+    found: Vec, way: Vec, aim: Vec, cosine: float, sine: float, offset: Vec, velocity: Vec, clearance: float,
+    speed: float,
+) -> Vec:  # fmt: skip
+    """Return, of all directions, how far one may go: on to meet who goes on, and to where he is now; the less of both.
+
+    found: DIRECTIONS distances, that along the aim, and as many again. way: the rightmost direction.
+    """
+    raise TypeError("it is a part of kernels")
+
+
+@overload(nearer, jit_options=OPTIONS)
+def _nearer(found, way, aim, cosine, sine, offset, velocity, clearance, speed):  # type: ignore[no-untyped-def]
+    """Written out, so that lanes lie side by side."""
+    count = DIRECTIONS + 1
+    lines = [
+        "def all_ways(found, way, aim, cosine, sine, offset, velocity, clearance, speed):",
+        "    still, one = zero(velocity), like(speed, 1.0)",
+    ]
+    for k in range(count):
+        u = "way" if k < DIRECTIONS else "aim"
+        lines += [
+            f"    m{k} = distance({u}, offset, velocity, clearance, speed)",
+            f"    m{k} = m{k} if m{k} < found[{k}] else found[{k}]",
+            f"    s{k} = distance({u}, offset, still, clearance, one)",
+            f"    s{k} = s{k} if s{k} < found[{count + k}] else found[{count + k}]",
+        ]
+        if k < DIRECTIONS - 1:
+            lines.append("    way = turned_by(way, cosine, sine)")
+    lines.append(f"    return ({', '.join(f'{name}{k}' for name in 'ms' for k in range(count))})")
+    made: dict[str, Any] = {
+        "zero": zero, "like": like, "turned_by": turned_by, "distance": steering.collision_distance
+    }  # fmt: skip
+    exec("\n".join(lines), made)  # noqa: S102  # how many directions there are is a constant
+    return made["all_ways"]
+
+
+def unseen(far: float) -> Vec:
+    """Return as many infinite distances as there are."""
+    raise TypeError("it is a part of kernels")
+
+
+@overload(unseen, jit_options=OPTIONS)
+def _unseen(far):  # type: ignore[no-untyped-def]
+    made: dict[str, Any] = {}
+    exec(f"def none(far):\n    return ({'far, ' * (2 * DIRECTIONS + 2)})", made)  # noqa: S102
+    return made["none"]
+
+
+@law
+def all_free(p: Any, me: Me) -> Vec:
+    """Nobody in the way yet."""
+    return unseen(like(me.radius, np.inf))
+
+
+@law
+def _view(p: Any, me: Me) -> tuple[Vec, Vec]:
+    """Return the rightmost direction that it sees, and where it wants to go; who stands looks where he wants to go."""
+    aim = unit(me.aim)
+    moves = dot(me.heading, me.heading) > like(me.radius, 0.0)
+    return turned_by(select(moves, me.heading, aim), p.edge_cosine, -p.edge_sine), aim
+
+
+@law
+def in_the_way(p: Any, me: Me, other: Other, acc: Vec) -> Vec:
+    """How far each way is free of one more."""
+    way, aim = _view(p, me)
+    room = me.radius + other.radius
+    return nearer(acc, way, aim, p.cosine, p.sine, other.offset, other.vel, room, me.desired_speed)
+
+
+@law
+def round_in_the_way(p: Any, me: Me, other: Other, acc: Vec) -> Vec:
+    """How far each way is free of a round obstacle, which stands."""
+    way, aim = _view(p, me)
+    room = me.radius + other.radius
+    return nearer(acc, way, aim, p.cosine, p.sine, other.offset, zero(me.vel), room, me.desired_speed)
+
+
+@law
+def until_a_wall(p: Any, me: Me, way: Vec, reach: float) -> float:
+    """Return how far its body goes until it touches a straight side, m; inf if that is further than `reach`.
+
+    A side that it touches already is in no way that leads off it.
+
+    The table: the edges of a torus, 0 without one, then of each side its ends (4) and half its thickness, m.
+    """
+    o, half = like(reach, 0.0), like(reach, 0.5)
+    best = like(reach, np.inf)
+    for k in range((len(p.table) - 2) // 5):
+        at = 2 + 5 * k
+        a, b = (p.table[at], p.table[at + 1]), (p.table[at + 2], p.table[at + 3])
+        wide, high = p.table[0], p.table[1]
+        x, y = me.pos[0] - half * (a[0] + b[0]), me.pos[1] - half * (a[1] + b[1])
+        x = wide * np.floor(x / wide + half) if wide > o else o
+        y = high * np.floor(y / high + half) if high > o else o
+        spot, room = sub(me.pos, (x, y)), me.radius + p.table[at + 4]
+        off = sub(spot, add(a, scale(sub(b, a), segment_share(spot, a, b))))
+        leaves = (dot(off, off) < room * room) & (dot(off, way) >= o)
+        here = segment_hit(spot, way, a, b, room)
+        best = here if (here < best) & (here < reach) & (not leaves) else best
+    return best
+
+
+@law
+def chosen_way(p: Any, me: Me, acc: Vec) -> Vec:
+    """F = m (v_des e(alpha) - v) / tau, alpha where d(alpha) is least; of two ways as good, the right one."""
+    free = stacked(acc)
+    count = DIRECTIONS + 1
+    e, o = like(me.radius, 1.0), like(me.radius, 0.0)
+    way, aim = _view(p, me)
+    eager = norm(me.aim)
+    moves = dot(me.heading, me.heading) > o
+    sees = (dot(me.heading, aim) >= p.edge_cosine) | (not moves)
+    best, chosen, ahead = like(me.radius, np.inf), zero(me.vel), o
+    for j in range(count):
+        k = DIRECTIONS if j == 0 else j - 1  # the aim first: of what is as good, what it wants
+        u = aim if j == 0 else way
+        if (k < DIRECTIONS) | sees:
+            wall = until_a_wall(p, me, u, p.radius)
+            f = min(min(free[k], wall), p.radius)
+            d = p.radius * p.radius + f * f - (f + f) * p.radius * dot(aim, u)
+            better = d < best
+            best, chosen = d if better else best, select(better, u, chosen)
+            ahead = min(free[count + k], wall) if better else ahead
+        if j > 0:
+            way = turned_by(way, p.cosine, p.sine)
+    speed = min(me.desired_speed * min(eager, e), ahead / p.tau)
+    return scale(sub(scale(chosen, speed), me.vel), p.weight * me.mass / p.tau)
+
+
+class Heuristics(Effect):
+    """Take the most direct way that is free, as fast as is safe: F = m (v_des e(alpha) - v) / tau, and no other force.
+
+    Moussaid, Helbing and Theraulaz 2011. alpha lies within `view` to either side of where it goes, and is where
+    d^2 = d_max^2 + f^2 - 2 d_max f cos(alpha_0 - alpha) is least: f(alpha) is how far it comes at its desired speed
+    until it touches somebody who goes on, or a wall; at most d_max. v_des = min(v0, d_h / tau), d_h how far whoever or
+    whatever is first in that direction is now. Bodies that touch are `contact` (k = 5e3 kg/s^2) and `obstacle_contact`.
+
+    31 directions are looked at, and that of the aim (me.aim): the paper's alpha is continuous, ours is within 2.5
+    degrees at 75. It stands for `driving`: give one or the other. In a plane, among walls that stand still.
+    """
+
+    kind: Literal["heuristics"] = "heuristics"
+    weight: float = Field(default=1.0, ge=0, description="a factor, 1 as published")
+    tau: float = Field(default=0.5, gt=0, description="s, relaxation time, and the time that it keeps to what is ahead")
+    radius: float = Field(default=10.0, gt=0, description="d_max, m, how far it sees")
+    view: float = Field(default=75.0, gt=0, le=180, description="phi, degrees to either side")
+    group: int | None = Field(default=None, ge=0, description="whom it sees; none = all")
+    steering: ClassVar[bool] = True
+    tabled: ClassVar[bool] = True
+    pair_start: ClassVar[str | None] = "all_free"
+    pair_law: ClassVar[str | None] = "in_the_way"
+    obstacle_law: ClassVar[str | None] = "round_in_the_way"
+    finish_law: ClassVar[str | None] = "chosen_way"
+    demo: ClassVar[str | None] = """
+dt: 0.05
+groups:
+  - {count: 4, mass: 80, radius: 0.25, desired_speed: 1.3, spawn: {low: [-6, -1.5], high: [-3, 1.5]}}
+  - {count: 4, mass: 80, radius: 0.25, desired_speed: 1.3, spawn: {low: [3, -1.5], high: [6, 1.5]}}
+obstacles:
+  - {kind: wall, vertices: [[-9, 2], [9, 2]]}
+  - {kind: wall, vertices: [[-9, -2], [9, -2]]}
+  - {centre: [0, 0], radius: 0.4}
+effects:
+  - {kind: course, group: 0, direction: [1, 0]}
+  - {kind: course, group: 1, direction: [-1, 0]}
+  - {kind: heuristics}
+  - {kind: contact, stiffness: 5000, radius: 0.5}
+  - {kind: obstacle_contact, stiffness: 5000}
+"""
+
+    @property
+    def sight(self) -> Sight:
+        """As far as it sees, all around: who comes from behind may be met too."""
+        return Sight(self.radius, group=self.group)
+
+    def parameters(self) -> dict[str, float | Vec]:
+        """How fast, how far, and by how much one direction is turned from the next."""
+        edge = math.radians(self.view)
+        step = 2 * edge / (DIRECTIONS - 1)
+        return {
+            "weight": self.weight, "tau": self.tau, "radius": self.radius,
+            "edge_cosine": math.cos(edge), "edge_sine": math.sin(edge),
+            "cosine": math.cos(step), "sine": math.sin(step),
+        }  # fmt: skip
+
+    def table(self, scene: Any) -> Floats:
+        """The edges of a torus, and every straight side that stands."""
+        size = scene.space.size if scene.space.periodic else (0.0, 0.0)
+        sides = [side for shape in scene.shapes for side in _sides(shape)]
+        return np.array([*size, *(number for side in sides for number in side)])
+
+    def check(self, scene: Any) -> None:
+        """Refuse space, obstacles whose sides are not straight or that move, and those without a desired speed."""
+        if scene.dimension != 2:
+            raise ValueError(f"kind = heuristics: dimension = {scene.dimension}, must be 2")
+        demand_group("group", self.group, scene.groups)
+        for k, shape in enumerate(scene.obstacles):
+            if shape.in_state:
+                continue
+            if shape.moves or shape.kind not in SIDES or (shape.kind == "capsule" and shape.is_hollow):
+                what = "moves" if shape.moves else "is not made of straight sides"
+                raise ValueError(
+                    f"kind = heuristics: obstacles[{k}].kind = {shape.kind} {what}; circles and {', '.join(SIDES)} "
+                    "that stand still are seen"
+                )
+        super().check(scene)
+
+    def lookahead(self, speed: float) -> float:
+        """As far as it sees."""
+        return self.radius
+
+    def sums(self, dimension: int) -> int:
+        """How far every direction, and the aim, are free: of those who go on, and as they are now."""
+        return 2 * DIRECTIONS + 2
+
+    def rates(self, groups: Sequence[Any], dimension: int) -> tuple[Floats, Floats]:
+        """No oscillation, and damping of 1 / tau."""
+        n = len(all_masses(groups, dimension))
+        return np.zeros(n), np.full(n, self.weight / self.tau)
+
+
+def _sides(shape: Any) -> list[list[float]]:
+    """Return the straight sides of an obstacle, (5,) m each: both ends, and half the thickness."""
+    if shape.kind in ("wall", "capsule"):
+        corners, around = shape.corners
+        return [[*a, *b, around] for a, b in zip(corners[:-1].tolist(), corners[1:].tolist(), strict=True)]
+    if shape.kind == "half_space":
+        point, normal = np.array(shape.point), np.array(shape.direction) / math.hypot(*shape.direction)
+        along = ENDLESS * np.array([-normal[1], normal[0]])
+        return [[*(point - along), *(point + along), 0.0]]
+    ring = shape.polygons(*shape.extremes[[0, 0]])[0]
+    return [[*a, *b, 0.0] for a, b in zip(ring, np.roll(ring, -1, axis=0), strict=True)]

@@ -1,0 +1,184 @@
+"""Social forces: what pedestrians do about each other and about walls, one law each, as accelerations or as shares.
+
+Sources: Helbing and Molnar 1995 (Phys. Rev. E 51:4282); Helbing, Farkas and Vicsek 2000 (Nature 407:487); Johansson,
+Helbing and Shukla 2007 (arXiv 0810.4587); Moussaid et al. 2009 (Proc. R. Soc. B 276:2755), 2010 (PLoS ONE 5:e10047) and
+2011 (PNAS 108:6884). docs/social_forces.md has their values, and where they disagree.
+
+`offset` is other minus self, everywhere: who is repelled goes against it. `aim` is the unit vector of where one wants
+to go. `tie` is a unit vector, opposite for the other one, by which two who are in one place part.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from flockenv.elementary import atan2, exp
+from flockenv.kernels import Vec, law, like
+from flockenv.vec import add, cross, dot, lateral, norm, scale, select, sub, unit
+
+__all__ = [
+    "collision_distance",
+    "draw",
+    "elliptical_repulsion",
+    "gaze_turn",
+    "in_cone",
+    "looking",
+    "repulsion",
+    "sidestep",
+    "view_weight",
+]
+
+ONE_PLACE = 1e-30
+"""m^2: nearer than 1e-15 m is one place."""
+
+NO_SIDE = 1e-14
+"""Below this square two directions that nearly cancel have no sum that means anything."""
+
+
+@law
+def looking(aim: Vec, heading: Vec) -> Vec:
+    """Return where somebody looks: where he wants to go, or if he says nothing where he goes; 0 if he does neither."""
+    return select(dot(aim, aim) > like(aim[0], 0.0), unit(aim), heading)
+
+
+@law
+def view_weight(way: Vec, offset: Vec, least: float) -> float:
+    """Return lambda + (1 - lambda)(1 + cos phi) / 2: 1 for who is straight ahead on the `way`, lambda for who is behind.
+
+    phi lies between the way and `offset`, which leads to the other (Johansson, Helbing and Shukla 2007, where cos phi
+    is -n . e with n from the other to me). Without a way, and in one place, it is 1: he is seen as well as anybody.
+    """
+    e, half = like(least, 1.0), like(least, 0.5)
+    long = dot(offset, offset) * dot(way, way)
+    some = long > like(least, 0.0)
+    cosine = dot(way, offset) / np.sqrt(long) if some else e
+    return least + (e - least) * half * (e + cosine)
+
+
+@law
+def in_cone(way: Vec, force: Vec, cosine: float, outside: float) -> float:
+    """Return 1 if what a repulsive `force` comes from is within the field of view, else `outside`; 1 without a way.
+
+    w = 1 if e . (-f) >= |f| cos phi, else c; 2 phi is the full angle (Helbing and Molnar 1995, equation 8).
+    """
+    ahead = -dot(way, force)
+    seen = (ahead >= norm(force) * cosine) | (dot(way, way) <= like(cosine, 0.0))
+    return like(cosine, 1.0) if seen else outside
+
+
+@law
+def repulsion(offset: Vec, tie: Vec, size: float, decay: float) -> Vec:
+    """Away from the other, exp((size - d) / B): 1 where d is `size`, the sum of both radii, or 0 (of distances alone).
+
+    Helbing, Farkas and Vicsek 2000; the circular specification of Johansson, Helbing and Shukla 2007.
+    """
+    square = dot(offset, offset)
+    apart = square > like(square, ONE_PLACE)
+    away = select(apart, scale(offset, like(square, -1.0)), tie)
+    return scale(unit(away), exp((size - np.sqrt(square)) / decay))
+
+
+@law
+def elliptical_repulsion(offset: Vec, step: Vec, tie: Vec, decay: float) -> Vec:
+    """-B grad exp(-b / B): away from the other and from where his `step` y leads; times A it is an acceleration.
+
+    b = sqrt((|d| + |d - y|)^2 - |y|^2) / 2 is the smaller half axis of the ellipse through me with foci where he is and
+    where his step leads, d from him to me. y is his own step, v_j dt (Helbing and Molnar 1995; elliptical I of
+    Johansson et al. 2007), or that relative to me, (v_j - v_i) dt (elliptical II). In the form that does not cancel:
+    b = sqrt(p q) |u + w| / 2 and grad b = (p + q) / (2 sqrt(p q)) unit(u + w), with p u = d and q w = d - y.
+
+    It has no side where I stand in the way of his step, and grows as 1 / sqrt(q) at its end: there a tie says where to,
+    and (p + q) / (2 sqrt(p q)) is at most 500.
+    """
+    o, e, half = like(decay, 0.0), like(decay, 1.0), like(decay, 0.5)
+    d = scale(offset, -e)
+    ahead = sub(d, step)
+    p, q = norm(d), norm(ahead)
+    sides = add(unit(d), unit(ahead))
+    square = dot(sides, sides)
+    mean = np.sqrt(p * q)
+    b = half * mean * np.sqrt(square)
+    floor = like(decay, 1e-3) * (p + q)
+    ratio = half * (p + q) / (mean if mean > floor else floor)
+    across = lateral(tie, unit(step))
+    there = p * p > like(decay, ONE_PLACE)
+    out = select(square > like(decay, NO_SIDE), unit(sides), unit(across))
+    # in one place he is all around: as strong as with no step at all
+    away = select(there, scale(out, ratio), unit(tie))
+    return scale(away, exp(-(b if there else o) / decay))
+
+
+@law
+def sidestep(
+    offset: Vec, velocity: Vec, other_velocity: Vec, tie: Vec,
+    importance: float, gamma: float, angular: float, forward: float, bias: float,
+) -> Vec:  # fmt: skip
+    """Slow down before somebody, and turn to one side of him; times A it is an acceleration. In a plane.
+
+    D = lambda (v_i - v_j) + e, with e from me to him, t = unit(D), B = gamma |D|; theta is the angle from t to e in
+    (-pi, pi], positive if he is to the left of t; -exp(-d / B - (n' B theta)^2) along t, and away from his side,
+    exp(-d / B - (n B theta)^2) across it. The side bias theta + B eps, wrapped again, decides for the right where he is
+    dead ahead (Moussaid et al. 2009, equations 4 to 7).
+
+    importance: lambda, s/m; gamma: s (B = gamma |D| m); angular: n; forward: n'; bias: eps.
+    """
+    o, e = like(gamma, 0.0), like(gamma, 1.0)
+    square = dot(offset, offset)
+    distance = np.sqrt(square)
+    towards = unit(select(square > like(square, ONE_PLACE), offset, tie))
+    d = add(scale(sub(velocity, other_velocity), importance), towards)
+    t, size = unit(d), norm(d)
+    least = like(gamma, 1e-6)
+    b = gamma * size
+    b = b if b > least else least
+    left = (-t[1], t[0])
+    theta = atan2(dot(left, towards), dot(t, towards)) + b * bias
+    pi = like(gamma, np.pi)
+    theta = theta - (pi + pi) if theta > pi else theta
+    turn, slow = angular * b * theta, forward * b * theta
+    near = distance / b
+    side = e if theta > o else (-e if theta < o else o)
+    along, across = -exp(-near - slow * slow), -side * exp(-near - turn * turn)
+    return add(scale(t, along), scale(left, across))
+
+
+@law
+def draw(offset: Vec, decay: float) -> Vec:
+    """Towards a thing, exp(-d / B): times A the pull of a potential that grows with the distance, up to A B far away.
+
+    Helbing and Molnar 1995 ask for such a one, W(d, t), and give no form: this is ours.
+    """
+    return scale(unit(offset), exp(-norm(offset) / decay))
+
+
+@law
+def gaze_turn(heading: Vec, offset: Vec, half: float) -> float:
+    """Return by which angle the head must turn to see what is at `offset`, rad: what it is beyond `half` the view.
+
+    Moussaid et al. 2010, alpha of the gaze; 0 at standstill.
+    """
+    o = like(half, 0.0)
+    if len(offset) == 2:
+        turn = heading[0] * offset[1] - heading[1] * offset[0]
+        aside = abs(turn)
+    else:
+        aside = norm(cross(heading, offset))
+    angle = atan2(aside, dot(heading, offset)) - half
+    return angle if (angle > o) & (dot(heading, heading) > o) else o
+
+
+@law
+def collision_distance(way: Vec, offset: Vec, other_velocity: Vec, clearance: float, speed: float) -> float:
+    """Return how far somebody walks on the unit vector `way` at `speed` until he touches another who goes on; or inf.
+
+    The smallest t >= 0 with |x_j + v_j t - v t way| = clearance, times v (f(alpha) of Moussaid, Helbing and Theraulaz
+    2011); 0 for two who overlap and come nearer.
+    """
+    o, far = like(speed, 0.0), like(speed, np.inf)
+    closing = sub(scale(way, speed), other_velocity)
+    a, b, c = dot(closing, closing), dot(offset, closing), dot(offset, offset) - clearance * clearance
+    room = b * b - a * c
+    meets = (b > o) & (room >= o)
+    below = b + np.sqrt(room if room > o else o)
+    time = c / (below if below > o else like(speed, 1.0))
+    return speed * (time if time > o else o) if meets else far
