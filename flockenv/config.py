@@ -17,6 +17,7 @@ from typing import Any, TypeVar
 import yaml
 from pydantic import BaseModel, ValidationError
 
+from flockenv.presets import Preset, expanded
 from flockenv.refusals import KeyPath, key_path, nearest, refusals, shown, steps_of
 from flockenv.scene import Scene
 
@@ -47,7 +48,12 @@ def dump_scene(scene: Scene) -> str:
 
 def schema(model: type[BaseModel] = Scene) -> dict[str, Any]:
     """Return the JSON Schema of a model, for editors that complete and check YAML."""
-    return {"$schema": "https://json-schema.org/draft/2020-12/schema", **model.model_json_schema()}
+    out = {"$schema": "https://json-schema.org/draft/2020-12/schema", **model.model_json_schema()}
+    if model is Scene:  # a file may name a preset where effects are listed
+        listed = out["properties"]["effects"]
+        listed["items"] = {"anyOf": [listed["items"], {"$ref": "#/$defs/Preset"}]}
+        out["$defs"]["Preset"] = Preset.model_json_schema()
+    return out
 
 
 def load(source: str | Path, model: type[M]) -> M:
@@ -58,12 +64,20 @@ def load(source: str | Path, model: type[M]) -> M:
     """
     name, text = _read(source)
     reader = _Reader(name, text)
-    data = reader.document()
+    try:
+        data, origins = expanded(reader.document())
+    except ConfigError:
+        raise
+    except ValueError as error:
+        raise ConfigError(f"{name}:{reader.line(steps_of(str(error)))}: {error}") from None
     try:
         # Through JSON, because strict then takes a list for a tuple and 1 for 1.0, and still no "1" for 1.
         return model.model_validate_json(json.dumps(data), strict=True)
     except ValidationError as error:
-        wrong = sorted((reader.line(r.path or steps_of(str(r))), str(r)) for r in refusals(error, model, data))
+        wrong = sorted(
+            (reader.line(origins.path(r.path or steps_of(str(r)))), origins.text(str(r)))
+            for r in refusals(error, model, data)
+        )
     lines = [f"{name}:{line}: {text}" for line, text in wrong[:MAX_LINES]]
     more = [f"{name}: and more mistakes"] if len(wrong) > MAX_LINES else []
     raise ConfigError("\n".join(lines + more))

@@ -272,7 +272,7 @@ def contact_limit(method: Integrator) -> float:
 
 
 def check_contact(scene: Scene) -> None:
-    """Warn where bodies that should bounce are in contact for too few steps, naming the limit."""
+    """Warn where bodies that should bounce are in contact for too few steps, naming the limit, and what comes of it."""
     for k, effect in enumerate(scene.effects):
         found = effect.rates(scene.groups, scene.dimension) if effect.contact else None
         if found is None or (effect.obstacle_law and not scene.obstacles):
@@ -285,8 +285,21 @@ def check_contact(scene: Scene) -> None:
             message = (
                 f"dt = {scene.dt:g} s: effects[{k}].{effect.kind} lasts {lasts:.3g} s at agent {agent}; bodies come "
                 f"out of it at the right speed with {scene.integrator.kind} if dt is at most {most:.3g} s"
+                f"{_what_comes_of_it(scene, float(frequency[agent]), agent)}"
             )
             warnings.warn(message, CoarseContactWarning, stacklevel=2)
+
+
+def _what_comes_of_it(scene: Scene, frequency: float, agent: int) -> str:
+    """Say how much faster bodies come out of an undamped contact at this dt, and from where on it is unstable."""
+    method, y = scene.integrator, scene.dt * frequency
+    if method.adaptive:
+        return ""
+    rates = [each.of(agent) for _, each in _found(scene)]
+    most = _limit_of(method, frequency**2, sum(damping for _, damping, _ in rates), sum(told for _, _, told in rates))
+    back = float(growth(method, np.array([y]), 0.0)[0]) ** (math.pi / y)
+    text = f"; at this dt {back:.3g} times as fast as they went in" if abs(math.log(back)) > math.log(OFF) else ""
+    return text + (f"; bodies that stay in it do not come to rest above {most:.3g} s" if scene.dt > most else "")
 
 
 def check_lookahead(scene: Scene) -> None:

@@ -6,10 +6,13 @@ Steer(group=0, arbitration=Allocation(), behaviours=(AvoidObstacles(weight=8), W
 from __future__ import annotations
 
 import functools
+import itertools
 import operator
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
+import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field, WrapValidator, model_validator
 
 from flockenv.arbitration import Allocation, AnyArbitration, Arbitration
@@ -77,6 +80,18 @@ class Steer(Effect):
         """Whom it steers: [first, end)."""
         first, end = (0, starts[-1]) if self.group is None else starts[self.group : self.group + 2]
         return {"first": float(first), "end": float(end)}
+
+    def rates(self, groups: Sequence[Any], dimension: int) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
+        """The sum of those of its behaviours that know theirs, for those whom it steers: as if all had all they ask."""
+        found = [each for behaviour in self.behaviours if (each := behaviour.rates(groups, dimension)) is not None]
+        if not found:
+            return None
+        starts = (0, *itertools.accumulate(group.size for group in groups))
+        ends = self.members(starts)
+        mine = np.arange(starts[-1])
+        mine = (mine >= ends["first"]) & (mine < ends["end"])
+        square, damping = (np.where(mine, sum(each[k] for each in found), 0.0) for k in range(2))
+        return square, damping
 
     def idle(self) -> Effect:
         """Return the same behaviours, all of them idle."""

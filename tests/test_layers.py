@@ -21,7 +21,7 @@ LAYERS = (
     {"neighbours", "shapes", "grid", "eikonal", "orca", "polyline", "rows", "networks", "elements", "tree"},
     {"effects", "integrators", "constraints", "population", "spawn", "sweep", "stability", "rounding"},
     {"behaviours"},
-    {"steer"},
+    {"steer", "presets"},
     {"snapshot", "implicit", "workspace", "scene", "config", "measures", "grants", "explanation"},
     {"tasks", "world", "policy"},
     {"envs", "sb3", "evaluation", "accuracy", "stress", "experiments", "render", "trajectory"},

@@ -149,7 +149,7 @@ def as_a_party(p: Any, me: Me, sums: Vec) -> Vec:
     else:
         to, away = (sums[1], sums[2], sums[3]), (sums[4], sums[5], sums[6])
     centre = scale(to, e / (others + e))  # of all of the party, itself too
-    alpha = steering.gaze_turn(me.heading, to, p.view)
+    alpha = steering.gaze_turn(me.heading, to, p.edge)
     far = norm(centre) > others * like(me.mass, 0.5)  # (N - 1) / 2 m
     wish = add(scale(me.vel, -p.gaze * alpha), scale(unit(centre), p.cohesion if far else o))
     return select(others > o, scale(add(wish, scale(away, p.repulsion)), me.mass), zero(me.vel))
@@ -194,7 +194,7 @@ effects:
     def parameters(self) -> dict[str, float | Vec]:
         """beta1 to beta3, and who belongs together."""
         names = ("party", "gaze", "cohesion", "repulsion", "distance")
-        return {"view": math.radians(self.fov) / 2, **{name: float(getattr(self, name)) for name in names}}
+        return {"edge": math.radians(self.fov) / 2, **{name: float(getattr(self, name)) for name in names}}
 
     def members(self, starts: Sequence[int]) -> dict[str, float]:
         """The first agent of the group."""

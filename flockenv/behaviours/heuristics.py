@@ -193,7 +193,7 @@ class Heuristics(Effect):
     obstacle_law: ClassVar[str | None] = "round_in_the_way"
     finish_law: ClassVar[str | None] = "chosen_way"
     demo: ClassVar[str | None] = """
-dt: 0.05
+dt: 0.01
 groups:
   - {count: 4, mass: 80, radius: 0.25, desired_speed: 1.3, spawn: {low: [-6, -1.5], high: [-3, 1.5]}}
   - {count: 4, mass: 80, radius: 0.25, desired_speed: 1.3, spawn: {low: [3, -1.5], high: [6, 1.5]}}

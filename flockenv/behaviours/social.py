@@ -149,7 +149,7 @@ def pushed_by_ellipse(p: Any, me: Me, other: Other) -> Vec:
     step = scale(sub(other.vel, scale(me.vel, p.relative)), p.step)
     push = steering.elliptical_repulsion(other.offset, step, sub(me.tie, other.tie), p.decay)
     way = steering.looking(me.aim, me.heading)
-    weight = steering.view_weight(way, other.offset, p.anisotropy) * steering.in_cone(way, push, p.view, p.outside)
+    weight = steering.view_weight(way, other.offset, p.anisotropy) * steering.in_cone(way, push, p.edge, p.outside)
     return limit(scale(push, weight * size_of(p, me)), p.most)
 
 
@@ -178,7 +178,7 @@ class EllipticalRepulsion(Social):
         """A, B, the step, and how much who is where counts."""
         shape = {
             "decay": self.decay, "step": self.step, "relative": float(self.relative), "anisotropy": self.anisotropy,
-            "view": math.cos(math.radians(self.fov) / 2) if self.fov < 360 else -2.0, "outside": self.outside,
+            "edge": math.cos(math.radians(self.fov) / 2) if self.fov < 360 else -2.0, "outside": self.outside,
         }  # fmt: skip
         return {**super().parameters(), **shape}
 

@@ -1,0 +1,306 @@
+"""Published models of pedestrians by name, with the values of their papers: a name becomes effects of a scene.
+
+preset("helbing_farkas_vicsek_2000")  # a tuple of effects; in a file, an item of `effects`: {preset: helbing_2000}
+
+A model says how one walks, not where to: aims (`goal`, `course`, a journey) come beside it. People are the scene's
+groups: `Group(count=100, **PRESETS[name].people)` has the masses, radii and speeds of the paper.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from pydantic import Field, ValidationError
+
+from flockenv.arbitration import Blend
+from flockenv.behaviours import (
+    CircularRepulsion,
+    Driving,
+    EllipticalRepulsion,
+    Heuristics,
+    ObstacleRepulsion,
+    Sidestep,
+    WalkingGroup,
+)
+from flockenv.effects import Contact, Effect, ObstacleContact
+from flockenv.records import Record
+from flockenv.refusals import KeyPath, key_path, nearest, refusals, shown, steps_of
+from flockenv.spread import Spread
+from flockenv.steer import Steer
+
+__all__ = ["ALIASES", "PRESETS", "Model", "Preset", "expanded", "preset"]
+
+WIDEST = 1.0
+"""m between centres, within which two bodies may touch: people of up to 1 m across."""
+
+
+@dataclass(frozen=True)
+class Model:
+    """A published model: what each wants, what bodies do, who people are, and where the numbers are from."""
+
+    source: str
+    wishes: Callable[[bool, int | None], tuple[Effect, ...]] = field(repr=False)
+    """(do walls hide? whose wishes, where parties need to know) -> behaviours."""
+    bodies: tuple[Effect, ...] = ()
+    people: Mapping[str, Any] = field(default_factory=dict)
+    """Fields of a `Group`, as the paper has them."""
+    symbols: Mapping[str, str] = field(default_factory=dict)
+    """The paper's symbols and values."""
+    note: str = ""
+    """What is ours, what is recalled and not seen, what the paper leaves open."""
+
+
+def _helbing_molnar_1995(hidden: bool, group: int | None) -> tuple[Effect, ...]:
+    return (
+        Driving(tau=0.5),
+        EllipticalRepulsion(
+            acceleration=7.0, decay=0.3, step=2.0, fov=200.0, outside=0.5, radius=5.0, occluded=hidden
+        ),
+        ObstacleRepulsion(acceleration=50.0, decay=0.2, bodies=False, radius=3.0, occluded=hidden),
+    )
+
+
+def _helbing_farkas_vicsek_2000(hidden: bool, group: int | None) -> tuple[Effect, ...]:
+    return (
+        Driving(tau=0.5),
+        CircularRepulsion(strength=2000.0, decay=0.08, radius=2.0, occluded=hidden),
+        ObstacleRepulsion(strength=2000.0, decay=0.08, radius=2.0, occluded=hidden),
+    )
+
+
+def _johansson_2007(repulsion: Callable[[bool], Effect]) -> Callable[[bool, int | None], tuple[Effect, ...]]:
+    def wishes(hidden: bool, group: int | None) -> tuple[Effect, ...]:
+        wall = ObstacleRepulsion(acceleration=50.0, decay=0.2, bodies=False, radius=3.0, occluded=hidden)
+        return (Driving(tau=0.5), repulsion(hidden), wall)
+
+    return wishes
+
+
+def _moussaid_2009(hidden: bool, group: int | None) -> tuple[Effect, ...]:
+    return (
+        Driving(tau=0.54),
+        Sidestep(acceleration=4.5, radius=8.0, occluded=hidden),
+        ObstacleRepulsion(acceleration=3.0, decay=0.1, bodies=False, radius=2.0, occluded=hidden),
+    )
+
+
+def _moussaid_2010(hidden: bool, group: int | None) -> tuple[Effect, ...]:
+    return (*_moussaid_2009(hidden, group), WalkingGroup(group=group or 0, party=3))
+
+
+def _moussaid_2011(hidden: bool, group: int | None) -> tuple[Effect, ...]:
+    return (Heuristics(tau=0.5, radius=10.0, view=75.0),)
+
+
+_WALKERS = {"mass": 80.0, "radius": 0.25, "desired_speed": Spread(mean=1.34, sd=0.26, low=0.3), "haste": 1.3}
+
+_2007 = "Johansson, Helbing, Shukla, Adv. Complex Systems 10:271, 2007 (arXiv 0810.4587)"
+_2007_NOTE = "the fit has no walls and no tau of its own: those are of 1995 (U0 = 10 m^2/s^2, R = .2 m, tau = .5 s)"
+
+PRESETS: dict[str, Model] = {
+    "helbing_molnar_1995": Model(
+        "Helbing, Molnar, Phys. Rev. E 51:4282, 1995",
+        _helbing_molnar_1995,
+        people=_WALKERS,
+        symbols={
+            "V0": "2.1 m^2/s^2", "sigma": ".3 m", "U0": "10 m^2/s^2", "R": ".2 m", "2 phi": "200 degrees", "c": ".5",
+            "dt": "2 s", "tau": ".5 s", "v0": "N(1.34, .26) m/s", "v_max": "1.3 v0",
+        },
+        note="v_max is the group's `haste`; the step is v_j dt, of what the other does and not of what he would like",
+    ),
+    "helbing_farkas_vicsek_2000": Model(
+        "Helbing, Farkas, Vicsek, Nature 407:487, 2000",
+        _helbing_farkas_vicsek_2000,
+        bodies=(
+            Contact(stiffness=1.2e5, friction=2.4e5, radius=WIDEST),
+            ObstacleContact(stiffness=1.2e5, friction=2.4e5),
+        ),
+        people={"mass": 80.0, "radius": Spread(low=0.25, high=0.35), "desired_speed": 1.0},
+        symbols={
+            "A": "2000 N", "B": ".08 m", "k": "1.2e5 kg/s^2", "kappa": "2.4e5 kg/(m s)", "tau": ".5 s", "m": "80 kg",
+            "2 r": "U[.5, .7] m", "v0": ".6, 1, 1.5, up to 5 and more m/s (relaxed, normal, nervous, panic)",
+        },
+        note="no view weight: it sees behind as well as ahead. Stiff: explicit Euler takes dt < 1 ms",
+    ),
+    "johansson_2007_circular": Model(
+        _2007,
+        _johansson_2007(
+            lambda hidden: CircularRepulsion(
+                acceleration=0.42, decay=1.65, bodies=False, anisotropy=0.12, radius=12.0, occluded=hidden
+            )
+        ),
+        people=_WALKERS,
+        symbols={"A": ".42 +- .26 m/s^2", "B": "1.65 +- 1.01 m", "lambda": ".12 +- .07"},
+        note=_2007_NOTE,
+    ),
+    "johansson_2007_elliptical_1": Model(
+        _2007,
+        _johansson_2007(
+            lambda hidden: EllipticalRepulsion(
+                acceleration=0.11, decay=1.19, step=0.5, anisotropy=0.16, radius=10.0, occluded=hidden
+            )
+        ),
+        people=_WALKERS,
+        symbols={"A": ".11 +- .01 m/s^2", "B": "1.19 +- .45 m", "lambda": ".16 +- .04", "dt": ".5 s"},
+        note=_2007_NOTE + "; dt is Menge's",
+    ),
+    "johansson_2007_elliptical_2": Model(
+        _2007,
+        _johansson_2007(
+            lambda hidden: EllipticalRepulsion(
+                acceleration=0.04, decay=3.22, step=0.5, relative=True, anisotropy=0.06, radius=15.0, occluded=hidden
+            )
+        ),
+        people=_WALKERS,
+        symbols={"A": ".04 +- .01 m/s^2", "B": "3.22 +- .67 m", "lambda": ".06 +- .04", "dt": ".5 s"},
+        note=_2007_NOTE,
+    ),
+    "moussaid_2009": Model(
+        "Moussaid et al., Proc. R. Soc. B 276:2755, 2009",
+        _moussaid_2009,
+        people={"mass": 80.0, "radius": 0.25, "desired_speed": Spread(mean=1.29, sd=0.19, low=0.3)},
+        symbols={
+            "A": "4.5 +- .3 m/s^2", "gamma": ".35 +- .01 s", "n": "2.0 +- .1", "n'": "3.0 +- .7",
+            "lambda": "2.0 +- .2 s/m", "tau": ".54 +- .05 s", "v0": "1.29 +- .19 m/s", "a": "3 m/s^2", "b": ".1 m",
+        },
+        note="A, tau, v0, the wall's a and b, and the bias eps = .005 are recalled, not seen in the paper",
+    ),
+    "moussaid_2010_groups": Model(
+        "Moussaid et al., PLoS ONE 5:e10047, 2010",
+        _moussaid_2010,
+        people={"mass": 80.0, "radius": 0.25, "desired_speed": Spread(mean=1.29, sd=0.19, low=0.3)},
+        symbols={"beta1": "4", "beta2": "3", "beta3": "1", "d0": ".8 m", "N": "3"},
+        note="beta1 to beta3 are recalled (PySocialForce has 4, 3, 1, in older versions 3, 2, 1), and so is d0; the "
+        "forces on everybody else are those of 2009",
+    ),
+    "moussaid_2011": Model(
+        "Moussaid, Helbing, Theraulaz, PNAS 108:6884, 2011",
+        _moussaid_2011,
+        bodies=(Contact(stiffness=5e3, radius=WIDEST), ObstacleContact(stiffness=5e3)),
+        people={"mass": Spread(low=60.0, high=100.0), "radius": Spread(low=60 / 320, high=100 / 320),
+                "desired_speed": Spread(mean=1.3, sd=0.2, low=0.3)},
+        symbols={
+            "tau": ".5 s", "phi": "75 degrees", "d_max": "10 m", "k": "5e3 kg/s^2", "m": "U[60, 100] kg",
+            "r": "m / 320", "v0": "N(1.3, .2) m/s",
+        },
+    ),
+}  # fmt: skip
+
+ALIASES = {
+    "helbing_1995": "helbing_molnar_1995",
+    "helbing_2000": "helbing_farkas_vicsek_2000",
+    "moussaid_2010": "moussaid_2010_groups",
+}
+"""Shorter names."""
+
+
+def _model(name: str) -> Model:
+    full = ALIASES.get(name, name)
+    if full not in PRESETS:
+        raise ValueError(
+            f"preset = {shown(name)}: unknown{nearest(name, [*PRESETS, *ALIASES]) or ';'} allowed: {', '.join(PRESETS)}"
+        )
+    return PRESETS[full]
+
+
+def preset(
+    name: str, group: int | None = None, contacts: bool = True, occluded: bool = False
+) -> tuple[Effect, ...]:
+    """Return the effects of a published model: what a group wants (none = everybody), and what bodies do.
+
+    Bodies touch each other whoever they belong to: of two presets for two groups give one `contacts=False`. occluded:
+    do walls hide people, and walls? Raises ValueError, of one line, for a name that there is not.
+    """
+    model = _model(name)
+    wishes = model.wishes(occluded, group)
+    bodies = model.bodies if contacts else ()
+    if group is None:
+        return (*wishes, *bodies)
+    return (Steer(group=group, arbitration=Blend(), behaviours=wishes), *bodies)
+
+
+class Preset(Record):
+    """An item of a file's `effects` that stands for the effects of a published model."""
+
+    preset: str = Field(description=f"its name: {', '.join(PRESETS)}", json_schema_extra={"enum": [*PRESETS, *ALIASES]})
+    group: int | None = Field(default=None, ge=0, description="whose wishes; none = everybody's")
+    contacts: bool = Field(default=True, description="do bodies touch as the model says? They do so once, for all")
+    occluded: bool = Field(default=False, description="do walls hide people and walls?")
+
+    def effects(self) -> tuple[Effect, ...]:
+        """What it stands for."""
+        return preset(self.preset, self.group, self.contacts, self.occluded)
+
+
+# --- in a file --------------------------------------------------------------------------------------------------------
+
+
+class Origins(dict[KeyPath, list[int]]):
+    """Where the items of a file's lists of effects come from: for each list, the place of each in the file."""
+
+    def path(self, path: KeyPath) -> KeyPath:
+        """Return where in the file something stands."""
+        for k in range(1, len(path)):
+            step = path[k]
+            if path[:k] in self and isinstance(step, int) and step < len(self[path[:k]]):
+                return (*path[:k], self[path[:k]][step], *path[k + 1 :])
+        return path
+
+    def text(self, text: str) -> str:
+        """Return a message that begins with a key path, with the path in the file."""
+        path = steps_of(text)
+        for k in range(len(path), 0, -1):
+            before, after = key_path(path[:k]), key_path(self.path(path[:k]))
+            if text.startswith(before) and before != after:
+                return after + text[len(before) :]
+        return text
+
+
+def expanded(data: Any) -> tuple[Any, Origins]:
+    """Return what a file says with every preset in a list of effects replaced by its effects, and where they are from.
+
+    What two presets say alike of bodies is said once. Raises ValueError that begins with the key path.
+    """
+    origins = Origins()
+    return _expanded(data, (), origins), origins
+
+
+def _expanded(value: Any, path: KeyPath, origins: Origins) -> Any:
+    if isinstance(value, dict):
+        return {key: _expanded(inner, (*path, key), origins) for key, inner in value.items()}
+    if not isinstance(value, list):
+        return value
+    if not path or path[-1] != "effects" or not any(isinstance(item, dict) and "preset" in item for item in value):
+        return [_expanded(item, (*path, k), origins) for k, item in enumerate(value)]
+    out: list[Any] = []
+    origins[path] = []
+    bodies: list[Any] = []
+    for k, item in enumerate(value):
+        found = [item]
+        if isinstance(item, dict) and "preset" in item:
+            found = [effect.model_dump(mode="json") for effect in _read(item, (*path, k)).effects()]
+            touching = [each for each in found if each["kind"] in ("contact", "obstacle_contact")]
+            if touching and bodies and touching != bodies:
+                raise ValueError(
+                    f"{key_path((*path, k))}.preset = {item['preset']}: its bodies touch otherwise than those of a "
+                    "preset before it; give contacts: false to one of them"
+                )
+            found = [each for each in found if each not in bodies]
+            bodies = touching or bodies
+        out += found
+        origins[path] += [k] * len(found)
+    return out
+
+
+def _read(item: dict[str, Any], path: KeyPath) -> Preset:
+    """Return an item of a file as a preset; ValueError that begins with its key path."""
+    try:
+        out = Preset.model_validate(item, strict=True)
+        _model(out.preset)
+        return out
+    except ValidationError as error:
+        raise ValueError(f"{key_path(path)}.{refusals(error, Preset, item)[0]}") from None
+    except ValueError as error:
+        raise ValueError(f"{key_path(path)}.{error}") from None
