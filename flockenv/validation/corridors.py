@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from flockenv.divergence import SimulationDiverged
 from flockenv.effects import Course
 from flockenv.measures import above_null, classical_density, lanes, single_file_speed, speed_in_area, weidmann_speed
 from flockenv.scene import Scene
@@ -17,7 +18,7 @@ from flockenv.space import Torus
 from flockenv.spawn import Spawn
 from flockenv.state import State
 from flockenv.validation.case import Case, Value
-from flockenv.validation.walk import Floats, people, scene_of, wall, walked
+from flockenv.validation.walk import STEPS, Floats, people, scene_of, wall, walked
 
 __all__ = ["CORRIDORS", "endless", "lined_up"]
 
@@ -29,21 +30,26 @@ DENSITIES = (0.5, 1.0, 1.5, 2.0, 2.5, 3.0, 4.0)
 ALONG = (0.5, 0.75, 1.0, 1.25, 1.5, 1.75)
 """1/m^2, and 1/m in single file."""
 
-SECONDS, DROPPED = 60.0, 20.0
+DENSE = {"helbing_farkas_vicsek_2000": 0.001}
+"""s, one step where bodies lie in each other from the start: those of 2000 are .6 m across, and 3 per m^2 fill .85."""
+
+SECONDS, DROPPED = 40.0, 15.0
 LANE_SEEDS, LANE_SECONDS, LANE_LAST = 20, 90.0, 30.0
 EACH_WAY = 40
 
 
 def endless(
-    name: str, counts: tuple[int, int], length: float = EDGE, width: float = WIDTH, ways: tuple[int, int] = (1, -1)
-) -> Scene:
-    """Return two groups in a corridor without ends, each going its way along it."""
+    name: str, counts: tuple[int, int], length: float = EDGE, width: float = WIDTH, ways: tuple[int, int] = (1, -1),
+    dense: bool = False,
+) -> Scene:  # fmt: skip
+    """Return two groups in a corridor without ends, each going its way along it; dense: with bodies that overlap."""
     middle = EDGE / 2
-    low, high = (0.0, middle - width / 2 + 0.4), (length, middle + width / 2 - 0.4)
+    low, high = (0.0, middle - width / 4), (length, middle + width / 4)
     groups = [people(name, count, low, high, spawn=Spawn(low=low, high=high)) for count in counts]
     aims = [Course(group=k, direction=(way, 0)) for k, way in enumerate(ways)]
     return scene_of(
         name, groups, aims, space=Torus(size=(length, EDGE)), obstacles=_sides(length, middle, width),
+        dt=(DENSE if dense else STEPS).get(name, 0.02),
     )  # fmt: skip
 
 
@@ -73,14 +79,19 @@ def lined_up(scene: Scene, length: float, width: float, worlds: int = 1, seed: i
 
 
 def rimea_4(name: str) -> Value:
-    """The fundamental diagram: densities of .5 to 4 per m^2, all go the same way, the last 40 of 60 s."""
+    """The fundamental diagram: densities of .5 to 4 per m^2, all go the same way, the last 25 of 40 s."""
     cloud: dict[str, list[float]] = {"density": [], "speed": []}
     means = []
     for density in DENSITIES:
         count = max(100, round(density * EDGE * WIDTH))
         length = count / (density * WIDTH)
-        scene = endless(name, (count // 2, count - count // 2), length, WIDTH, (1, 1))
-        run = walked(scene, SECONDS, every=1.0, begin=lined_up(scene, length, WIDTH))
+        scene = endless(name, (count // 2, count - count // 2), length, WIDTH, (1, 1), density > 2)
+        try:
+            run = walked(scene, SECONDS, every=1.0, begin=lined_up(scene, length, WIDTH))
+        except SimulationDiverged:
+            if density <= 3.0:
+                raise
+            continue  # bodies of .6 m do not fit: beyond the bound it is said, not judged
         late = run.time > DROPPED
         pos, vel = run.pos[late, 0], run.vel[late, 0]
         means.append(float(vel[..., 0].mean()))
@@ -88,12 +99,13 @@ def rimea_4(name: str) -> Value:
             area = _area(length * (k + 0.5) / 3)
             cloud["density"] += classical_density(pos[::4], area).tolist()
             cloud["speed"] += speed_in_area(pos[::4], vel[::4], area, along=(1, 0)).tolist()
-    rho, v = np.array(DENSITIES), np.array(means)
+    rho, v = np.array(DENSITIES[: len(means)]), np.array(means)
     within = rho <= 3.0
     off = v[within] - weidmann_speed(rho[within])
     falls = bool((np.diff(v[within]) < 0).all())
     worst = float(off[np.abs(off).argmax()])
     note = f"v = {_listed(v)} m/s at {_listed(rho)} per m^2; {'falls' if falls else 'does not fall everywhere'}"
+    note += "" if len(means) == len(DENSITIES) else "; diverges at 4 per m^2"
     series = {**cloud, "densities": rho.tolist(), "speeds": v.tolist()}
     return Value(worst, falls and abs(worst) <= 0.25, note, series)
 
@@ -109,7 +121,7 @@ def rimea_16(name: str) -> Value:
     means = []
     for density in ALONG:
         count = round(density * EDGE)
-        scene = endless(name, (count // 2, count - count // 2), EDGE, 0.8, (1, 1))
+        scene = endless(name, (count // 2, count - count // 2), EDGE, 0.8, (1, 1), density > 1.25)
         run = walked(scene, SECONDS, every=1.0, begin=lined_up(scene, EDGE, 0.8 / 4))
         means.append(float(run.vel[run.time > DROPPED, 0, :, 0].mean()))
     rho, v = np.array(ALONG), np.array(means)
