@@ -34,7 +34,7 @@ DENSE = {"helbing_farkas_vicsek_2000": 0.001}
 """s, one step where bodies lie in each other from the start: those of 2000 are .6 m across, and 3 per m^2 fill .85."""
 
 SECONDS, DROPPED = 40.0, 15.0
-LANE_SEEDS, LANE_SECONDS, LANE_LAST = 20, 90.0, 30.0
+LANE_SEEDS, LANE_SECONDS, LANE_LAST = 20, 60.0, 20.0
 EACH_WAY = 40
 
 
