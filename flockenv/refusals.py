@@ -229,9 +229,15 @@ def _step_down(path: KeyPath, schema: Schema, data: object) -> Schema:
     place: Any = data
     for step in path:
         node = _pick(node, place, schema)
-        node = _item(node, step) if isinstance(step, int) else node.get("properties", {}).get(step, {})
+        node = _item(node, step) if isinstance(step, int) else _member(node, step)
         place = _child(place, step)
     return node
+
+
+def _member(node: Schema, name: str) -> Schema:
+    """Return the schema of one key of a block; of a block with any keys, that of all of them."""
+    found: Schema | bool = node.get("properties", {}).get(name, node.get("additionalProperties", {}))
+    return found if isinstance(found, dict) else {}
 
 
 def _item(node: Schema, index: int) -> Schema:

@@ -117,14 +117,17 @@ def _demand_one_piece(out: State) -> None:
 
 
 class Group(Record):
-    """Some agents of a kind: so many that are on their own, or a network of them; there `mass` is the mean."""
+    """Some agents of a kind: so many that are on their own, or a network of them; there `mass` is the mean.
+
+    Mass, radius and desired_speed are a number, or a `Spread` of numbers that differ from one to the next.
+    """
 
     count: int | None = Field(default=None, ge=1, description="how many")
     network: AnyNetwork | None = Field(default=None, description="particles that are tied to each other, and where")
-    mass: PositiveSpread = Field(default=1.0, description="kg; or how it is spread")
-    radius: Annotated[float, Field(ge=0)] | Spread = Field(default=0.1, description="m; or how it is spread")
+    mass: PositiveSpread = Field(default=1.0, description="kg")
+    radius: Annotated[float, Field(ge=0)] | Spread = Field(default=0.1, description="m")
     desired_speed: PositiveSpread | None = Field(
-        default=None, description="m/s, how fast each would like to go, or how that is spread; see driving"
+        default=None, description="m/s, how fast it would like to go; see driving"
     )
     max_speed: float | None = Field(default=None, gt=0, description="m/s; none = no limit")
     haste: float | None = Field(

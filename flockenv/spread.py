@@ -13,6 +13,9 @@ from flockenv.records import Record
 
 __all__ = ["Spread", "drawn", "largest"]
 
+MOST = 10_000_000
+"""Of whom numbers are drawn to find the largest: more agents are refused anyhow."""
+
 
 class Spread(Record):
     """Uniform from `low` to `high`; with `mean` and `sd` normal, and cut off at `low` and `high`."""
@@ -67,5 +70,7 @@ def drawn(value: float | Spread, count: int, channel: int) -> NDArray[np.float64
 
 
 def largest(value: float | Spread, count: int, channel: int) -> float:
-    """Return the largest of these numbers."""
-    return float(drawn(value, count, channel).max())
+    """Return what none of these numbers is above; nothing is allocated for numbers that are all the same."""
+    if not isinstance(value, Spread):
+        return float(value)
+    return value.most if math.isfinite(value.most) else float(drawn(value, min(count, MOST), channel).max())

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from flockenv.refusals import nearest, shown
+from flockenv.refusals import shown
 from flockenv.terminal import INTERRUPTED, EarlyEnd, Force, Seed, new_console, progress_bar, relative, show_table
 
 if TYPE_CHECKING:
@@ -198,23 +198,22 @@ def _known(numbers: Path) -> Results | None:
 
 
 def experiment(
-    name: Annotated[str, typer.Argument(metavar="NAME", help="Which; a name that is not known shows all of them.")],
+    plan: Annotated[str, typer.Argument(metavar="PLAN.yaml", help="Cases and variants: see configs/experiments.")],
     out: Annotated[
         str | None, typer.Option(metavar="X.json|X.png", help="Write the numbers; a picture has X.json beside it.")
     ] = None,
     force: Force = False,
 ) -> None:
     """Run an experiment about steering: a table of what was measured, and a picture of where everybody went."""
-    from flockenv.experiments import EXPERIMENTS, run
+    from flockenv.config import load
+    from flockenv.experiments import Plan, experiment_of, run
     from flockenv.outputs import checked_file
     from flockenv.render.trials import write_trials
 
-    if name not in EXPERIMENTS:
-        raise ValueError(f"{shown(name)}: no such experiment{nearest(name, EXPERIMENTS)} ({', '.join(EXPERIMENTS)})")
     path = checked_file(out, [".json", ".png"], force) if out is not None else None
     if path is not None and path.suffix.lower() == ".png":
         checked_file(str(path.with_suffix(".json")), [".json"], force)
-    chosen = EXPERIMENTS[name]
+    chosen = experiment_of(load(Path(plan), Plan))
     with progress_bar(chosen.title, len(chosen.cases) * len(chosen.variants), "trials") as advance:
         results, trials = run(chosen, advance)
     console = new_console()

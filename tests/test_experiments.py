@@ -10,18 +10,33 @@ import numpy as np
 import pytest
 
 from flockenv.cli import main
-from flockenv.config import load_scene
-from flockenv.experiments import EXPERIMENTS, Results, arbitration, run
-from flockenv.experiments.arbitration import CASES, EXPERIMENT, VARIANTS
-from flockenv.experiments.base import Experiment, Trial
+from flockenv.config import ConfigError, load
+from flockenv.experiments import Plan, Results, arbitration, experiment_of, run
 from tests import catalogue
+
+PLANS = Path(__file__).parent.parent / "configs" / "experiments"
+
+
+@pytest.mark.parametrize("path", sorted(PLANS.glob("*.yaml")), ids=lambda path: path.stem)
+def test_every_plan_can_be_run_and_is_named_as_what_it_measures(path: Path) -> None:
+    plan = load(path, Plan)
+    experiment = experiment_of(plan)  # builds every scene
+    assert (experiment.name, experiment.variants) == (path.stem, tuple(plan.variants))
 
 
 def test_every_arbitration_is_tried_in_every_conflict() -> None:
-    assert list(VARIANTS) == [a.kind for a in catalogue.ARBITRATIONS] == list(EXPERIMENT.variants)
-    for case in CASES:
-        assert arbitration.scene_of(case, "blend").effects[0].arbitration.kind == "blend"  # type: ignore[attr-defined]
-    assert EXPERIMENTS["arbitration"] is EXPERIMENT
+    plan = load(PLANS / "arbitration.yaml", Plan)
+    assert list(plan.variants) == [a.kind for a in catalogue.ARBITRATIONS]
+    for case in plan.cases:
+        for variant in plan.variants:
+            assert plan.scene_of(case, variant).effects[0].arbitration.kind == variant  # type: ignore[attr-defined]
+
+
+def test_the_global_way_leads_to_what_was_sought() -> None:
+    plan = load(PLANS / "avoidance.yaml", Plan)
+    avoid, way = plan.scene_of("U trap", "to avoid, global way").effects[0].wishes
+    assert (avoid.kind, way.kind, way.target) == ("avoid_obstacles", "follow_way", (12, 0))  # type: ignore[attr-defined]
+    assert [wish.kind for wish in plan.scene_of("U trap", "whiskers").effects[0].wishes] == ["whiskers", "seek"]
 
 
 def test_numbers_about_contacts_and_grants() -> None:
@@ -33,48 +48,73 @@ def test_numbers_about_contacts_and_grants() -> None:
 @pytest.mark.slow
 def test_what_the_experiment_shows() -> None:
     """A blend runs into what it is warned of, where wishes cancel and in an emergency; an ordered budget does not."""
-    results, trials = run(EXPERIMENT)
-    assert len(trials) == len(CASES) * len(VARIANTS)
+    plan = load(PLANS / "arbitration.yaml", Plan)
+    results, trials = run(experiment_of(plan))
+    assert len(trials) == len(plan.cases) * len(plan.variants)
     assert results.at("cancelling", "blend")["collisions"] == 1.0
     emergency = results.at("emergency", "blend")["collisions"]
     assert emergency is not None
     assert emergency > 0.5
-    for case in CASES:
+    for case in plan.cases:
         for variant in ("priority", "allocation", "running_sum", "context"):
             assert results.at(case, variant)["collisions"] == 0.0
             assert results.at(case, variant)["share avoid_obstacles"] == pytest.approx(1, abs=0.05)
-    chatter = {v: results.at("cancelling", v)["switches"] for v in VARIANTS}
+    chatter = {v: results.at("cancelling", v)["switches"] for v in plan.variants}
     assert chatter["priority"] > 1.5 * chatter["allocation"]  # type: ignore[operator]  # numbers, both
     assert results.at("emergency", "allocation")["share seek"] < 0.7  # type: ignore[operator]
     assert Results.model_validate_json(results.model_dump_json()) == results
 
 
-def small() -> Experiment:
-    """One that costs nothing, with an obstacle to draw."""
-    scene = load_scene(CASES["chatter"][2])
-    path = np.linspace((-6, 0), (6, 1), 20)[:, None]
+SMALL = """
+measure: avoidance
+title: A small one
+worlds: 1
+cases:
+  ahead:
+    what: nothing much
+    seconds: 0.2
+    scene:
+      groups: [{count: 1, radius: 0.2, max_speed: 2, max_force: 12, spawn: {low: [0, 0], high: [0, 0]}}]
+      effects: [{kind: steer, behaviours: [{kind: seek, weight: 4, target: [12, 0]}]}]
+      obstacles: [{centre: [6, 0], radius: 1}]
+variants:
+  straight: {}
+"""
 
-    def trial(case: str, variant: str) -> Trial:
-        return Trial({"collisions": 1.0 if variant == "a" else float("nan")}, scene, path)
 
-    return Experiment("small", "A small one", {"x": "nothing"}, ("a", "b"), {"collisions": "-"}, ("collisions",), trial)
-
-
-def test_the_command_writes_table_numbers_and_picture(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setitem(EXPERIMENTS, "small", small())
+def test_the_command_writes_table_numbers_and_picture(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    plan = tmp_path / "small.yaml"
+    plan.write_text(SMALL)
     out = tmp_path / "x.png"
-    assert main(["experiment", "small", "--out", str(out)]) == 0
+    assert main(["experiment", str(plan), "--out", str(out)]) == 0
     said = capsys.readouterr().out
     assert "A small one" in said
     found: dict[str, Any] = json.loads(out.with_suffix(".json").read_text())
-    assert [cell["numbers"]["collisions"] for cell in found["cells"]] == [1.0, None]
+    assert [cell["numbers"]["arrived"] for cell in found["cells"]] == [0.0]
+    assert [cell["numbers"]["time"] for cell in found["cells"]] == [None]
     first = out.read_bytes()
     assert first[:4] == b"\x89PNG"
-    assert main(["experiment", "small", "--out", str(out), "--force"]) == 0
+    assert main(["experiment", str(plan), "--out", str(out), "--force"]) == 0
     assert out.read_bytes() == first
     capsys.readouterr()
-    assert main(["experiment", "small", "--out", str(out)]) == 2
-    assert main(["experiment", "smal"]) == 2
-    assert "smal: no such experiment, did you mean `small`?" in capsys.readouterr().err.replace("'", "")
+    assert main(["experiment", str(plan), "--out", str(out)]) == 2
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("kind: seek, weight: 4, target: [12, 0]", "kind: wander, weight: 4", "seek among its behaviours"),
+        ("measure: avoidance", "measure: beauty", "measure"),
+        ("obstacles: [{centre: [6, 0], radius: 1}]", "obstacles: []", "must not be empty"),
+        ("straight: {}", "straight: {furst: []}", "first"),
+    ],
+)
+def test_a_plan_that_makes_no_sense_is_refused(old: str, new: str, message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        load(SMALL.replace(old, new), Plan)
+
+
+def test_who_is_fast_without_limit_loses_no_share_of_it() -> None:
+    limitless = SMALL.replace("max_speed: 2, ", "").replace("weight: 4,", "weight: 4, speed: 2,")
+    with pytest.raises(ValueError, match=r"cases.ahead.scene.groups\[0\].max_speed = None: give m/s"):
+        run(experiment_of(load(limitless, Plan)))

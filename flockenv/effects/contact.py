@@ -201,7 +201,7 @@ class Contact(_Solid):
     def check(self, scene: Any) -> None:
         """Refuse a radius at which two bodies overlap already."""
         super().check(scene)
-        radii = sorted(r for group in scene.groups for r in np.sort(group.radii)[-2:])
+        radii = sorted(r for group in scene.groups for r in (group.widest,) * min(group.size, 2))
         if len(radii) > 1 and self.radius < radii[-1] + radii[-2]:
             raise ValueError(
                 f"radius = {self.radius:g}: two bodies touch at up to {radii[-1] + radii[-2]:g} m; at least that is "

@@ -1,20 +1,12 @@
-"""Experiments: questions about steering, each a command that prints a table and draws a picture.
+"""Experiments: questions about steering, each a file of scenes and variants, of which a table and a picture are made.
 
-To add one: a file with an `EXPERIMENT`; `flockenv experiment NAME` finds it here.
+To ask another one, write a plan (configs/experiments/). To measure something else: a file here with COLUMNS, SHOWN and
+`trial(plan, case, variant)`, and its name in `Plan.measure`.
 """
 
 from __future__ import annotations
 
-import importlib
-import pkgutil
+from flockenv.experiments.base import Cell, Experiment, Results, Trial, experiment_of, run
+from flockenv.experiments.plan import Case, Plan, Variant
 
-from flockenv.experiments.base import Cell, Experiment, Results, Trial, run
-
-__all__ = ["EXPERIMENTS", "Cell", "Experiment", "Results", "Trial", "run"]
-
-_modules = [importlib.import_module(f"{__name__}.{module.name}") for module in pkgutil.iter_modules(__path__)]
-
-EXPERIMENTS: dict[str, Experiment] = {
-    module.EXPERIMENT.name: module.EXPERIMENT for module in _modules if hasattr(module, "EXPERIMENT")
-}
-"""Every experiment by its name."""
+__all__ = ["Case", "Cell", "Experiment", "Plan", "Results", "Trial", "Variant", "experiment_of", "run"]

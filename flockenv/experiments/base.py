@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import functools
 import hashlib
+import importlib
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -11,12 +13,13 @@ from typing import NamedTuple
 import numpy as np
 from pydantic import Field
 
+from flockenv.experiments.plan import Plan
 from flockenv.kernels import laws_digest
 from flockenv.records import Record
 from flockenv.scene import Scene
 from flockenv.state import Floats, State
 
-__all__ = ["Cell", "Experiment", "Results", "Trial", "depth", "run"]
+__all__ = ["Cell", "Experiment", "Results", "Trial", "depth", "experiment_of", "run"]
 
 
 class Trial(NamedTuple):
@@ -76,6 +79,23 @@ def depth(scene: Scene, state: State) -> Floats:
     return np.asarray(scene.body.radius - gap)
 
 
+def experiment_of(plan: Plan) -> Experiment:
+    """Return what a plan is about, ready to be run; ValueError, of one line, if one of its scenes cannot be built."""
+    measure = importlib.import_module(f"flockenv.experiments.{plan.measure}")
+    for case in plan.cases:
+        for variant in plan.variants:
+            try:
+                plan.scene_of(case, variant)
+            except ValueError as error:
+                raise ValueError(f"cases.{case} with variants.{variant}: {error}") from None
+    more = measure.more_columns(plan) if hasattr(measure, "more_columns") else {}
+    return Experiment(
+        name=plan.measure, title=plan.title, cases={name: case.what for name, case in plan.cases.items()},
+        variants=tuple(plan.variants), columns={**measure.COLUMNS, **more}, shown=measure.SHOWN,
+        trial=functools.partial(measure.trial, plan),
+    )  # fmt: skip
+
+
 def run(
     experiment: Experiment, progress: Callable[[int], None] = lambda done: None
 ) -> tuple[Results, dict[tuple[str, str], Trial]]:
@@ -99,4 +119,5 @@ def run(
 
 def _known(numbers: Mapping[str, float], columns: Sequence[str]) -> dict[str, float | None]:
     """Return the numbers in the order of the columns; none for what is no number."""
-    return {name: float(numbers[name]) if math.isfinite(numbers[name]) else None for name in columns}
+    found = {name: numbers.get(name, math.nan) for name in columns}
+    return {name: float(x) if math.isfinite(x) else None for name, x in found.items()}

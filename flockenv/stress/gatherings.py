@@ -9,20 +9,22 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from flockenv.behaviours import UnalignedAvoidance
+from flockenv.arbitration import Allocation, Blend
+from flockenv.behaviours import AvoidObstacles, ForceField, Seek, UnalignedAvoidance
 from flockenv.constraints import Collisions
 from flockenv.crew import threads, use_threads
-from flockenv.experiments.avoidance import scene_of
 from flockenv.integrators import Integrator
 from flockenv.scene import Group, Scene
-from flockenv.shapes import Block
+from flockenv.shapes import Block, Circle, Polygon
 from flockenv.spawn import Spawn
+from flockenv.steer import Steer
 from flockenv.stress.case import Case, Value
 from flockenv.stress.solids import Response, batch, overlap, per_response, solid
 
 __all__ = ["GATHERINGS"]
 
 R = 0.25
+WALL = ((-3.0, -0.6), (-3.0, -2.0), (15.0, -2.0), (15.0, -0.6))
 ONE = ("semi_implicit_euler",)
 """What is asked here hangs by the steering and the response, not by the method: one is tried."""
 
@@ -70,7 +72,7 @@ def stalls(method: Integrator) -> Value:
     """An obstacle exactly ahead: a field of force stalls before it, steering to avoid passes (Reynolds 1988)."""
     ends, aside = [], []
     for variant in ("force field", "to avoid"):
-        scene = _under(scene_of("dead ahead", variant), method)
+        scene = _heading_for((Circle(centre=(6, 0), radius=1),), variant, method)
         end = scene.run(scene.start(0).with_motion(np.zeros((1, 1, 2)), np.zeros((1, 1, 2))), 600)
         ends.append(float(end.pos[0, 0, 0]))
         aside.append(float(np.abs(end.pos[0, 0, 1])))
@@ -85,7 +87,7 @@ def along_a_wall(method: Integrator) -> Value:
     """Parallel to a wall, .4 m beside it: steering to avoid feels nothing across, exactly; a field of force does."""
     forces = []
     for variant in ("to avoid", "force field"):
-        scene = _under(scene_of("along a wall", variant), method)
+        scene = _heading_for((Polygon(vertices=WALL),), variant, method)
         state = scene.start(0).with_motion(np.array([[[0.0, 0.0]]]), np.array([[[2.0, 0.0]]]))
         worst = 0.0
         for _ in range(200):
@@ -93,6 +95,16 @@ def along_a_wall(method: Integrator) -> Value:
             state = scene.step(state)
         forces.append(worst)
     return Value(forces[0], forces[0] == 0.0, f"across: {forces[0]:g} m/s^2; a field of force {forces[1]:.2g} m/s^2")
+
+
+def _heading_for(obstacles: tuple[Circle | Polygon, ...], variant: str, method: Integrator) -> Scene:
+    """Return one who heads for a place 12 m ahead and avoids obstacles; configs/experiments/avoidance.yaml has more."""
+    seek = Seek(weight=4, target=(12, 0))
+    steer = Steer(behaviours=(AvoidObstacles(weight=12, horizon=1, margin=0.05), seek), arbitration=Allocation())
+    if variant == "force field":
+        steer = Steer(behaviours=(ForceField(weight=2, range=2), seek), arbitration=Blend())
+    group = Group(count=1, radius=0.2, max_speed=2, max_force=12, role="learner", spawn=Spawn(low=(0, 0), high=(0, 0)))
+    return Scene(groups=(group,), effects=(steer,), obstacles=obstacles, dt=0.02, integrator=method)
 
 
 def _under(scene: Scene, method: Integrator) -> Scene:
