@@ -151,7 +151,8 @@ def lanes_of(name: str) -> Value:
         f"excess {above.low:.3f} to {above.high:.3f}; p < .05 in {sum(f.p < 0.05 for f in found)} of {LANE_SEEDS}; "
         f"{speed:.2f} m/s forward"
     )
-    series: dict[str, Any] = {"x": run.pos[-1, 0, :, 0].tolist(), "y": run.pos[-1, 0, :, 1].tolist()}
+    x, y = run.pos[-5:, 0].reshape(-1, 2).T.round(2).tolist()
+    series: dict[str, Any] = {"x": x, "y": y}
     return Value(above.excess, above.low > 0, note, series)
 
 
