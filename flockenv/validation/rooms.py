@@ -1,7 +1,6 @@
 """Cases of rooms, doors, corners and bottlenecks, and the scenes they are about.
 
-All have two groups, each with a way to where it goes, and differ in numbers alone: a preset's kernel is compiled once
-for many people and once for few.
+All have two groups, each with a way to where it goes, and differ in numbers alone: a preset's kernel is compiled once.
 """
 
 from __future__ import annotations
@@ -12,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from flockenv.effects import Way
+from flockenv.neighbours import FEWEST_AGENTS
 from flockenv.population import Leaving
 from flockenv.population.members import Member
 from flockenv.scene import Group, Scene
@@ -50,23 +50,32 @@ def nobody_left(state: State) -> bool:
     return not bool(state.alive.any())
 
 
-def _nobody(name: str, at: Point) -> Group:
-    """Return the second group of a scene that has one: one person, who does not live."""
-    spawn = Spawn(low=at, high=at)
-    return people(name, 1, at, at, alive=0, spawn=spawn, desired_speed=1.0)
+def _nobody(name: str, at: Point, count: int) -> Group:
+    """Return the second group of a scene that has one: people who do not live."""
+    return people(name, count, at, at, alive=0, spawn=Spawn(low=at, high=at), desired_speed=1.0)
+
+
+def _with_nobody(group: Group, more: int) -> Group:
+    """Return a group with more places, in which nobody lives."""
+    return group.model_copy(update={"count": group.size + more, "alive": group.size if group.alive is None else group.alive})
 
 
 def _scene(
     name: str, groups: Sequence[Group], ways: Sequence[Sequence[Target]], walls: Sequence[Wall],
     sinks: Sequence[Member], spacing: float = SPACING, **fields: Any,
 ) -> Scene:  # fmt: skip
-    """Return a scene of two groups, each with its way; of one, the second is nobody and goes where the first goes."""
-    everybody, goals = list(groups), list(ways)
+    """Return a scene of two groups, each with its way; of one, the second is nobody and goes where the first goes.
+
+    Nobody is as many as make it a large scene: so few and many share a kernel.
+    """
+    everybody, goals = list(groups), [*ways, ways[0]][:2]
+    low = groups[0].spawn.low
+    assert low is not None
+    missing = max(1, FEWEST_AGENTS - sum(group.size for group in groups))
     if len(groups) == 1:
-        low = groups[0].spawn.low
-        assert low is not None
-        everybody.append(_nobody(name, (low[0] + 0.5, low[1] + 0.5)))
-        goals.append(ways[0])
+        everybody.append(_nobody(name, (low[0] + 0.5, low[1] + 0.5), missing))
+    elif missing > 1:
+        everybody[1] = _with_nobody(everybody[1], missing)
     aims = [towards(k, *targets, spacing=spacing) for k, targets in enumerate(goals)]
     return scene_of(name, everybody, aims, obstacles=tuple(walls), population=tuple(sinks), hiding=True, **fields)
 
@@ -184,5 +193,7 @@ def many_rooms(name: str) -> tuple[Scene, State]:
     ways = [[beside((26.0, -1.0), (27.0, 1.0))], [beside((-3.0, -1.0), (-2.0, 1.0))]]
     out = Leaving(low=(-1.0, -6.0), high=(25.0, 6.0))
     scene = _scene(name, groups, ways, walls, [out])
-    pos = np.array(places[:15] + places[16:24])[None]
-    return scene, scene.start(0).with_motion(pos, np.zeros_like(pos))
+    begin = scene.start(0)
+    pos = np.array(begin.pos)
+    pos[0, :23] = places[:15] + places[16:24]
+    return scene, begin.with_motion(pos, np.zeros_like(pos))

@@ -23,8 +23,8 @@ Floats = NDArray[np.float64]
 WEIDMANN = Spread(mean=1.34, sd=0.26, low=0.3)
 """m/s, how fast pedestrians would like to go (Weidmann 1993): of everybody, unless a case says otherwise."""
 
-STEPS = {"helbing_farkas_vicsek_2000": 0.0025}
-"""s, one step of a preset whose bodies rub: 13 cm of two bodies' overlap, kappa d 2 / m < 2 / dt; of all others .02."""
+STEPS = {"helbing_farkas_vicsek_2000": 0.005}
+"""s, one step of a preset whose bodies rub: 6 cm of two bodies' overlap, kappa d 2 / m < 2 / dt; of all others .02."""
 
 
 class Walk(NamedTuple):
