@@ -83,7 +83,7 @@ def exp(x: float) -> float:
     p = p * r + like(x, 1 / 2)
     p = p * r + like(x, 1.0)
     p = p * r + like(x, 1.0)
-    return like(x, 0.0) if x < -most else p * _two_to(k)  # type: ignore[no-any-return]
+    return like(x, 0.0) if x < -most else p * _two_to(k)
 
 
 @law

@@ -55,9 +55,7 @@ class Model:
 def _helbing_molnar_1995(hidden: bool, group: int | None) -> tuple[Effect, ...]:
     return (
         Driving(tau=0.5),
-        EllipticalRepulsion(
-            acceleration=7.0, decay=0.3, step=2.0, fov=200.0, outside=0.5, radius=5.0, occluded=hidden
-        ),
+        EllipticalRepulsion(acceleration=7.0, decay=0.3, step=2.0, fov=200.0, outside=0.5, radius=5.0, occluded=hidden),
         ObstacleRepulsion(acceleration=50.0, decay=0.2, bodies=False, radius=3.0, occluded=hidden),
     )
 
@@ -205,9 +203,7 @@ def _model(name: str) -> Model:
     return PRESETS[full]
 
 
-def preset(
-    name: str, group: int | None = None, contacts: bool = True, occluded: bool = False
-) -> tuple[Effect, ...]:
+def preset(name: str, group: int | None = None, contacts: bool = True, occluded: bool = False) -> tuple[Effect, ...]:
     """Return the effects of a published model: what a group wants (none = everybody), and what bodies do.
 
     Bodies touch each other whoever they belong to: of two presets for two groups give one `contacts=False`. occluded:

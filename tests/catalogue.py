@@ -33,10 +33,12 @@ from flockenv.behaviours import (
     Alignment,
     Arrive,
     AvoidObstacles,
+    CircularRepulsion,
     Cohesion,
     Contain,
     Dock,
     Driving,
+    EllipticalRepulsion,
     Evade,
     Explore,
     Face,
@@ -49,9 +51,13 @@ from flockenv.behaviours import (
     Forage,
     ForceField,
     Formation,
+    Friends,
+    Heuristics,
     Hide,
+    Interest,
     Interpose,
     MatchVelocity,
+    ObstacleRepulsion,
     OffsetPursue,
     Orca,
     Pursue,
@@ -59,9 +65,11 @@ from flockenv.behaviours import (
     Seek,
     Separation,
     Shadow,
+    Sidestep,
     StayOnPath,
     TargetSpeed,
     UnalignedAvoidance,
+    WalkingGroup,
     Wander,
     Whiskers,
 )
@@ -198,6 +206,19 @@ STEERING = (
     Law(steering.follow_path, ("positive", "positive", "vector", "vector", "positive"), "vector"),
     Law(steering.follow_flow, ("vector", "vector"), "vector"),
     Law(steering.contain, ("walls", "walls", "vector", "positive", "positive"), "vector", turns="none", mirrors=False),
+    Law(steering.looking, ("heading", "heading"), "vector"),
+    Law(steering.view_weight, ("heading", "vector", "positive"), "positive"),
+    Law(steering.in_cone, ("heading", "vector", "positive", "positive"), "positive"),
+    Law(steering.repulsion, ("vector", "heading", "positive", "length"), "vector"),
+    Law(steering.elliptical_repulsion, ("vector", "vector", "heading", "length"), "vector"),
+    # it passes everybody on the same side
+    Law(
+        steering.sidestep, ("vector", "vector", "vector", "heading", *("positive",) * 5), "vector", turns="upright",
+        mirrors=False,
+    ),
+    Law(steering.draw, ("vector", "length"), "vector"),
+    Law(steering.gaze_turn, ("heading", "vector", "positive"), "positive"),
+    Law(steering.collision_distance, ("heading", "vector", "vector", "positive", "positive"), "positive"),
     Law(steering.heed, ("vector",) * 5 + ("positive",) * 5, "vector"),
     Law(steering.behind, ("vector", "vector", "length"), "vector"),
     Law(steering.herd_from, ("vector", "vector", "vector", "length", "positive", "positive"), "vector"),
@@ -411,6 +432,27 @@ EFFECTS = (
     ),
     EffectRow(Gravitation(constant=0.3, softening=0.5)),  # of few the sum is exact; of many, see test_gravitation.py
     EffectRow(InverseSquare(strength=-0.4, softening=0.3), signed=("strength",)),
+    EffectRow(CircularRepulsion(strength=2, decay=0.8, anisotropy=0.3, radius=2.5), family="social"),
+    EffectRow(
+        EllipticalRepulsion(
+            acceleration=1.5, decay=0.8, step=0.7, relative=True, anisotropy=0.4, fov=200, outside=0.5, radius=2.5
+        ),
+        family="social",
+    ),
+    EffectRow(  # it keeps right
+        Sidestep(acceleration=2, radius=2.5, bias=0.1), obeys=UPRIGHT | {"rotation"}, family="social"
+    ),
+    EffectRow(ObstacleRepulsion(strength=3, decay=0.9), family="around"),
+    EffectRow(Interest(target=CENTRE, strength=1, decay=2, fades=5), family="goals"),
+    EffectRow(Friends(group=0, strength=1, decay=2, fades=5, radius=2.5), family="social"),
+    EffectRow(  # who belongs together is a matter of numbers
+        WalkingGroup(group=0, party=3, radius=2.5), obeys=frozenset({"translation", "rotation", "mirror"}),
+        family="social",
+    ),
+    EffectRow(  # of two ways as good it takes the right one
+        Heuristics(radius=2.5), beside=(Goal(target=CENTRE, slow_radius=2),),
+        obeys=frozenset({"translation", "rotation", "relabelling"}), dimensions=(2,),
+    ),
     # everybody is tied to somebody else; see `tied`
     EffectRow(Springs(stiffness=3, damping=0.2), obeys=frozenset({"translation", "rotation", "mirror"})),
     EffectRow(

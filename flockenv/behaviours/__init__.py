@@ -37,10 +37,10 @@ from flockenv.behaviours.way import FollowWay  # noqa: E402
 
 __all__ = [
     "BEHAVIOURS", "Alignment", "Arrive", "AvoidObstacles", "CircularRepulsion", "Cohesion", "Contain", "Dock",
-    "Driving", "EllipticalRepulsion", "Evade", "Explore", "Face", "Flee", "FollowFlow", "FollowLeader", "FollowPath", "FollowWall",
-    "FollowWay", "Forage", "ForceField", "Formation", "Friends", "Heuristics", "Hide", "Interest", "Interpose",
-    "MatchVelocity", "ObstacleRepulsion", "OffsetPursue", "Orca", "Pursue", "Queue", "Seek", "Separation", "Shadow",
-    "Sidestep", "StayOnPath", "TargetSpeed", "UnalignedAvoidance", "WalkingGroup", "Wander", "Whiskers",
+    "Driving", "EllipticalRepulsion", "Evade", "Explore", "Face", "Flee", "FollowFlow", "FollowLeader", "FollowPath",
+    "FollowWall", "FollowWay", "Forage", "ForceField", "Formation", "Friends", "Heuristics", "Hide", "Interest",
+    "Interpose", "MatchVelocity", "ObstacleRepulsion", "OffsetPursue", "Orca", "Pursue", "Queue", "Seek", "Separation",
+    "Shadow", "Sidestep", "StayOnPath", "TargetSpeed", "UnalignedAvoidance", "WalkingGroup", "Wander", "Whiskers",
 ]  # fmt: skip
 
 BEHAVIOURS: dict[str, type[Effect]] = {kind: effect for kind, effect in EFFECTS.items() if effect.steering}

@@ -11,7 +11,7 @@ from pydantic import Field
 
 from flockenv import steering
 from flockenv.behaviours.social import Social, size_of
-from flockenv.effects.base import Effect, Me, Other, Sight, Vector, demand_group
+from flockenv.effects.base import Effect, Me, Other, Sight, Vector
 from flockenv.elementary import exp
 from flockenv.kernels import Vec, law, like
 from flockenv.vec import add, norm, scale, select, sub, unit, zero
@@ -70,7 +70,9 @@ effects:
     def parameters(self) -> dict[str, float | Vec]:
         """Where, how strong, how far, how long."""
         fading = 0.0 if self.fades is None else 1 / self.fades
-        numbers = {name: float(getattr(self, name)) for name in ("strength", "acceleration", "decay", "since", "radius")}
+        numbers = {
+            name: float(getattr(self, name)) for name in ("strength", "acceleration", "decay", "since", "radius")
+        }
         return {"target": self.target, "fading": fading, **numbers}
 
 
@@ -203,11 +205,3 @@ effects:
     def sums(self, dimension: int) -> int:
         """How many others, where, and away from those who are too near."""
         return 1 + 2 * dimension
-
-    def check(self, scene: Any) -> None:
-        """Refuse a group that is not there, and parties larger than it."""
-        demand_group("group", self.group, scene.groups)
-        size = scene.groups[self.group].size
-        if self.party > size:
-            raise ValueError(f"party = {self.party}: groups[{self.group}] has {size} agents")
-        super().check(scene)

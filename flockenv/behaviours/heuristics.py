@@ -1,4 +1,4 @@
-"""Two simple rules instead of forces: look where the way is free, and go no faster than is safe (Moussaid et al. 2011)."""
+"""Two rules instead of forces: look where the way is free, and go no faster than is safe: Moussaid et al. 2011."""
 
 from __future__ import annotations
 

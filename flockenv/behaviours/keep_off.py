@@ -1,4 +1,4 @@
-"""Keep off walls: a repulsion that falls exponentially with the distance, summed over all sides of what stands around."""
+"""Keep off walls: a repulsion that falls exponentially with the distance, summed over all sides around."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def nowhere(p: Any, me: Me) -> Vec:
 def pushed_off(p: Any, me: Me, other: Obstacle, acc: Vec) -> Vec:
     """A exp((r_i - d) / B) n, within reach."""
     force = (p.strength + me.mass * p.acceleration) * exp((p.bodies * me.radius - other.gap) / p.decay)
-    force = force if force < p.most else p.most
+    force = force if force < p.bound else p.bound
     return select(other.gap < p.radius, add(acc, scale(other.normal, force)), acc)
 
 
@@ -99,7 +99,7 @@ effects:
         """A, B, whose surface, and how far it looks."""
         return {
             "strength": self.strength, "acceleration": self.acceleration, "decay": self.decay,
-            "bodies": float(self.bodies), "radius": self.radius, "most": math.inf if self.most is None else self.most,
+            "bodies": float(self.bodies), "radius": self.radius, "bound": math.inf if self.most is None else self.most,
         }  # fmt: skip
 
     def folded(self, dimension: int) -> int:
@@ -107,7 +107,7 @@ effects:
         return dimension
 
     def rates(self, groups: Sequence[Any], dimension: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """w^2 = A / (m B) where a body touches a wall (or, of distances alone, its centre does); deeper it is steeper."""
+        """w^2 = A / (m B) where a body touches a wall (of distances alone, its centre does); deeper it is steeper."""
         mass = all_masses(groups, dimension)
         square = (self.strength / mass + np.where(np.isfinite(mass), self.acceleration, 0.0)) / self.decay
         return square, np.zeros(len(mass))

@@ -75,7 +75,7 @@ class Social(Effect):
     def parameters(self) -> dict[str, float | Vec]:
         """Its strength, and its bound."""
         most = math.inf if self.most is None else self.most
-        return {"strength": self.strength, "acceleration": self.acceleration, "most": most}
+        return {"strength": self.strength, "acceleration": self.acceleration, "bound": most}
 
     def sums(self, dimension: int) -> int:
         """The force so far."""
@@ -107,7 +107,7 @@ def pushed_by_distance(p: Any, me: Me, other: Other) -> Vec:
     touching = p.bodies * (me.radius + other.radius)
     push = steering.repulsion(other.offset, sub(me.tie, other.tie), touching, p.decay)
     weight = steering.view_weight(steering.looking(me.aim, me.heading), other.offset, p.anisotropy)
-    return limit(scale(push, weight * size_of(p, me)), p.most)
+    return limit(scale(push, weight * size_of(p, me)), p.bound)
 
 
 class CircularRepulsion(Social):
@@ -150,7 +150,7 @@ def pushed_by_ellipse(p: Any, me: Me, other: Other) -> Vec:
     push = steering.elliptical_repulsion(other.offset, step, sub(me.tie, other.tie), p.decay)
     way = steering.looking(me.aim, me.heading)
     weight = steering.view_weight(way, other.offset, p.anisotropy) * steering.in_cone(way, push, p.edge, p.outside)
-    return limit(scale(push, weight * size_of(p, me)), p.most)
+    return limit(scale(push, weight * size_of(p, me)), p.bound)
 
 
 class EllipticalRepulsion(Social):
@@ -196,15 +196,15 @@ def stepped_aside(p: Any, me: Me, other: Other) -> Vec:
     wish = steering.sidestep(
         other.offset, me.vel, other.vel, sub(other.tie, me.tie), p.importance, p.gamma, p.angular, p.forward, p.bias
     )
-    return limit(scale(wish, size_of(p, me)), p.most)
+    return limit(scale(wish, size_of(p, me)), p.bound)
 
 
 class Sidestep(Social):
     """Slow down before others and pass them on one side, as was measured (Moussaid et al. 2009, equations 4 to 7).
 
     D = lambda (v_i - v_j) + e_ij, t = unit(D), B = gamma |D|, theta the angle from t to e_ij in (-pi, pi], with B eps
-    added: -A exp(-d / B - (n' B theta)^2) along t, and A exp(-d / B - (n B theta)^2) to the side where he is not. In a
-    plane. eps > 0 keeps right where he is dead ahead; their fit of a side preference differs, see the docs.
+    added: -A exp(-d / B - (n' B theta)^2) along t, and A exp(-d / B - (n B theta)^2) to the side where he is not.
+    eps > 0 keeps right where he is dead ahead. In space it turns in the plane of t and e_ij: that is ours.
     """
 
     kind: Literal["sidestep"] = "sidestep"
@@ -220,9 +220,3 @@ class Sidestep(Social):
         """A, and the numbers of the fit."""
         names = ("importance", "gamma", "angular", "forward", "bias")
         return {**super().parameters(), **{name: float(getattr(self, name)) for name in names}}
-
-    def check(self, scene: Any) -> None:
-        """Refuse space."""
-        if scene.dimension != 2:
-            raise ValueError(f"kind = sidestep: dimension = {scene.dimension}, must be 2: it goes to the left or right")
-        super().check(scene)

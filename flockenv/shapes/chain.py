@@ -2,7 +2,8 @@
 
 A chain is some numbers of a table: a head (see head.py), how many vertices there are, how far around the line
 it is thick (m), 1 if the last vertex is joined to the first and what lies within is solid; then the vertices, relative
-to the anchor; of a line that is not closed, two ends (see joints.py). A chain of one vertex is a circle or sphere. `x` is where the agent is, relative to the anchor.
+to the anchor; of a line that is not closed, two ends (see joints.py). A chain of one vertex is a circle or sphere. `x`
+is where the agent is, relative to the anchor.
 """
 
 from __future__ import annotations
@@ -168,7 +169,8 @@ def end_acts(table: Any, at: int, which: int, x: Vec) -> bool:
     corner = vertex(table, at, 0 if which == 0 else count - 1, x)
     code = table[place]
     nearest = dot(sub(x, corner), vector_at(table, place + 1, x)) <= like(code, 0.0)
-    return (code < like(code, 0.5)) | ((code < like(code, 1.5)) & nearest)
+    acts: bool = (code < like(code, 0.5)) | ((code < like(code, 1.5)) & nearest)
+    return acts
 
 
 @law

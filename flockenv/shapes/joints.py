@@ -46,8 +46,8 @@ def _nearest(place: Floats, points: Floats, period: Floats | None) -> Floats:
 
 def _touching(place: Floats, pieces: Floats, period: Floats | None) -> tuple[bool, Floats | None]:
     """Return whether a place lies within one of the pieces, and the way along the one that it is an end of."""
-    first = _nearest(place, pieces[:, 0], period)
     along = pieces[:, 1] - pieces[:, 0]
+    first = _nearest(place, pieces.mean(axis=1), period) - along / 2  # of the image whose middle is nearest
     square = (along**2).sum(axis=1)
     share = np.clip(-(first * along).sum(axis=1) / np.where(square > 0, square, 1.0), 0.0, 1.0)
     off = np.linalg.norm(first + share[:, None] * along, axis=1)

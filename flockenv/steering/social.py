@@ -14,7 +14,7 @@ import numpy as np
 
 from flockenv.elementary import atan2, exp
 from flockenv.kernels import Vec, law, like
-from flockenv.vec import add, cross, dot, lateral, norm, scale, select, sub, unit
+from flockenv.vec import add, cross, dot, lateral, norm, perpendicular, scale, select, sub, unit
 
 __all__ = [
     "collision_distance",
@@ -43,7 +43,7 @@ def looking(aim: Vec, heading: Vec) -> Vec:
 
 @law
 def view_weight(way: Vec, offset: Vec, least: float) -> float:
-    """Return lambda + (1 - lambda)(1 + cos phi) / 2: 1 for who is straight ahead on the `way`, lambda for who is behind.
+    """Return lambda + (1 - lambda)(1 + cos phi) / 2: 1 for who is straight ahead on the `way`, lambda behind.
 
     phi lies between the way and `offset`, which leads to the other (Johansson, Helbing and Shukla 2007, where cos phi
     is -n . e with n from the other to me). Without a way, and in one place, it is 1: he is seen as well as anybody.
@@ -113,12 +113,12 @@ def sidestep(
     offset: Vec, velocity: Vec, other_velocity: Vec, tie: Vec,
     importance: float, gamma: float, angular: float, forward: float, bias: float,
 ) -> Vec:  # fmt: skip
-    """Slow down before somebody, and turn to one side of him; times A it is an acceleration. In a plane.
+    """Slow down before somebody, and turn to one side of him; times A it is an acceleration.
 
     D = lambda (v_i - v_j) + e, with e from me to him, t = unit(D), B = gamma |D|; theta is the angle from t to e in
     (-pi, pi], positive if he is to the left of t; -exp(-d / B - (n' B theta)^2) along t, and away from his side,
     exp(-d / B - (n B theta)^2) across it. The side bias theta + B eps, wrapped again, decides for the right where he is
-    dead ahead (Moussaid et al. 2009, equations 4 to 7).
+    dead ahead (Moussaid et al. 2009, equations 4 to 7). In space it turns in the plane of t and e: ours.
 
     importance: lambda, s/m; gamma: s (B = gamma |D| m); angular: n; forward: n'; bias: eps.
     """
@@ -131,15 +131,31 @@ def sidestep(
     least = like(gamma, 1e-6)
     b = gamma * size
     b = b if b > least else least
-    left = (-t[1], t[0])
-    theta = atan2(dot(left, towards), dot(t, towards)) + b * bias
+    side, theta = _side_of(towards, t)
+    theta = theta + b * bias
     pi = like(gamma, np.pi)
     theta = theta - (pi + pi) if theta > pi else theta
     turn, slow = angular * b * theta, forward * b * theta
     near = distance / b
-    side = e if theta > o else (-e if theta < o else o)
-    along, across = -exp(-near - slow * slow), -side * exp(-near - turn * turn)
-    return add(scale(t, along), scale(left, across))
+    sign = e if theta > o else (-e if theta < o else o)
+    along, across = -exp(-near - slow * slow), -sign * exp(-near - turn * turn)
+    return add(scale(t, along), scale(side, across))
+
+
+@law
+def _side_of(towards: Vec, t: Vec) -> tuple[Vec, float]:
+    """Return a unit vector across t, and the angle from t towards it: its left in a plane, his side in space.
+
+    In space who is dead ahead is to the left, so that he is passed on the right; and so is anybody if t is 0.
+    """
+    if len(t) == 2:
+        left: Vec = (-t[1], t[0])
+        return left, atan2(dot(left, towards), dot(t, towards))
+    else:
+        aside = lateral(towards, t)
+        noise = like(t[0], NO_SIDE)
+        side = select(dot(aside, aside) > noise, unit(aside), scale(perpendicular(t), like(t[0], -1.0)))
+        return side, atan2(dot(side, towards), dot(t, towards))
 
 
 @law

@@ -129,10 +129,7 @@ def _seen(parts: Parts, gap: str, normal: str) -> str:
     """Write whether nothing stands in the way to the place of a surface that is nearest to x."""
     when = "time, " if parts.moving else ""
     way = f"scale({normal}, -{gap} * like({gap}, {SHORT!r}))"
-    return (
-        f"({gap} <= like({gap}, 0.0)) or "
-        f"not blocked(obstacle_x, obstacle_radius, params, size, b, {when}x, {way})"
-    )
+    return f"({gap} <= like({gap}, 0.0)) or not blocked(obstacle_x, obstacle_radius, params, size, b, {when}x, {way})"
 
 
 def _by_pieces(parts: Parts, k: int, slots: list[str], form: str, vel: str) -> list[str]:
