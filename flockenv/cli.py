@@ -1,6 +1,6 @@
 """flockenv on the command line.
 
-list | run | render | explain | accuracy | stress | experiment | gallery | validate | warmup | schema
+list | run | measure | render | explain | accuracy | stress | experiment | gallery | validate | warmup | schema
 
 Errors are one line on stderr, exit code 2.
 """
@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING, Annotated, Any, get_args
 import typer
 
 import flockenv
+from flockenv.measuring import measure
 from flockenv.refusals import nearest, shown
 from flockenv.studies import accuracy, experiment, gallery, stress
 from flockenv.terminal import (
@@ -252,6 +253,7 @@ def explain(scene: SceneFile) -> None:
     show_table(console, "Left out, because nobody asked for it", ([line] for line in found.left_out), [""])
 
 
+app.command()(measure)
 app.command()(accuracy)
 app.command()(stress)
 app.command()(experiment)

@@ -208,6 +208,7 @@ def experiment(
     from flockenv.config import load
     from flockenv.experiments import Plan, experiment_of, run
     from flockenv.outputs import checked_file
+    from flockenv.render.curves import write_order
     from flockenv.render.trials import write_trials
 
     path = checked_file(out, [".json", ".png"], force) if out is not None else None
@@ -221,7 +222,8 @@ def experiment(
     show_table(console, "Cases", results.cases.items())
     show_table(console, "Columns", results.columns.items())
     if path is not None:
-        _write(path, results, lambda picture: write_trials(picture, chosen, trials))
+        draw = write_trials if chosen.curve is None else write_order
+        _write(path, results, lambda picture: draw(picture, chosen, trials))
         console.print(f"{len(results.cells)} trials in {relative(path)}")
 
 

@@ -24,8 +24,10 @@ LAYERS = (
     {"steer", "presets"},
     {"snapshot", "implicit", "workspace", "scene", "config", "measures", "grants", "explanation"},
     {"tasks", "world", "policy"},
-    {"envs", "sb3", "evaluation", "accuracy", "stress", "experiments", "validation", "render", "trajectory"},
-    {"gallery", "studies", "validating"},
+    {
+        "envs", "sb3", "evaluation", "accuracy", "stress", "experiments", "validation", "render", "trajectory", "survey",
+    },
+    {"gallery", "studies", "measuring", "validating"},
     {"cli"},
     {"agents"},
     {"tests"},

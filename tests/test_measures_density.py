@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from flockenv.measures import (
@@ -82,21 +82,22 @@ def test_cells_share_all_that_is_walkable(walkable: np.ndarray, whole: float, ma
     assert voronoi(pos, walkable, holes=[hole]).cell.sum() == pytest.approx(whole - 2, rel=1e-12)
 
 
+@settings(max_examples=15)
 @given(seed=st.integers(0, 1000), many=st.integers(1, 12))
 def test_a_cell_is_what_is_nearest_to_him(seed: int, many: int) -> None:
     """Against counting: of 20,000 places in a notched square those that are nearest to each; on a torus too."""
     rng = np.random.default_rng(seed)
     pos = rng.uniform(0, 4, (many, 2))
-    places = rng.uniform(0, 10, (20_000, 2))
+    places = rng.uniform(0, 10, (10_000, 2))
     for walkable, period in ((NOTCHED, (0.0, 0.0)), (SQUARE, (10.0, 10.0)), (SQUARE, (10.0, 0.0))):
         way = places[:, None] - pos
         wide = np.where(np.array(period) > 0, period, np.inf)
         way -= np.array(period) * np.round(way / wide)
         nearest = np.argmin((way**2).sum(-1), axis=1)
         on = contains(walkable, places)
-        share = np.bincount(nearest[on], minlength=many) / 200
+        share = np.bincount(nearest[on], minlength=many) / 100
         room = voronoi(pos, walkable, period=period)
-        assert room.cell == pytest.approx(share, abs=5 * 0.36)  # five deviations of such a count
+        assert room.cell == pytest.approx(share, abs=5 * 0.5)  # five deviations of such a count
         assert room.cell.sum() == pytest.approx(size([tuple(c) for c in walkable.tolist()]))  # type: ignore[misc]
 
 

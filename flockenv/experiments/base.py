@@ -41,6 +41,7 @@ class Experiment:
     columns: Mapping[str, str]  # what each number is, with its unit
     shown: tuple[str, ...]  # those of them that stand below a picture
     trial: Callable[[str, str], Trial]  # of a case and a variant
+    curve: tuple[str, str] | None = None  # names of axes: cases are numbers, and the first column is drawn over them
 
 
 class Cell(Record):

@@ -10,6 +10,7 @@ from flockenv.measures.bursts import Bursts, bursts, runs
 from flockenv.measures.chance import Above, Mean, above_null, mean_of_runs
 from flockenv.measures.clogging import Tail, goodness, survival, tail
 from flockenv.measures.density import (
+    Ground,
     Room,
     classical_density,
     speed_in_area,
@@ -49,7 +50,8 @@ from flockenv.measures.proportions import (
 )
 
 __all__ = [
-    "JUELICH", "MEASURES", "Above", "Bursts", "Crossings", "Flow", "Lanes", "Mean", "Proportion", "Room", "Tail",
+    "JUELICH", "MEASURES", "Above", "Bursts", "Crossings", "Flow", "Ground", "Lanes", "Mean", "Proportion", "Room",
+    "Tail",
     "above_null", "band_index", "bursts", "classical_density", "cohesion_radius", "collision_rate", "components",
     "crossings", "cumulative", "diagram", "evacuation_time", "flow", "from_weidmann", "goodness", "group_momentum",
     "in_juelich", "lane_order", "lanes", "last_crossing", "leaving_times", "mean_of_runs", "measure", "milling",

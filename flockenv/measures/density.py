@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import Voronoi
 
-from flockenv.measures.polygons import Corners, checked, contains, cut, cut_by, rectangle, size
+from flockenv.measures.polygons import Corners, checked, contains, convex, cut, cut_by, rectangle, size
 
-__all__ = ["Room", "classical_density", "speed_in_area", "voronoi", "voronoi_density", "voronoi_speed"]
+__all__ = ["Ground", "Room", "classical_density", "speed_in_area", "voronoi", "voronoi_density", "voronoi_speed"]
 
 Floats = NDArray[np.float64]
 
@@ -22,7 +22,7 @@ class Room(NamedTuple):
 
     cell: Floats  # (N,) m^2, the area of his Voronoi cell; NaN for who is not on the walkable area
     inside: Floats  # (N,) m^2, what of it lies in the area that is measured; 0 for those
-    area: float  # m^2, that is measured
+    area: float  # m^2 of what is measured, as far as it is walkable
 
 
 def classical_density(pos: ArrayLike, area: ArrayLike, alive: ArrayLike | None = None) -> Floats:
@@ -70,22 +70,52 @@ def voronoi(
     walls. area: a convex polygon that is measured, all of the walkable area by default. period: (Lx, Ly) m, 0 = none:
     the world goes on with itself after so much, and `walkable` is one period of it. Who is outside of `walkable` has no
     cell and takes no room. Those in one place share a cell.
-    Raises ValueError, of one line, for polygons that are none, and for an area that is not convex.
+    Raises ValueError, of one line, for polygons that are none, for an area that is not convex, or not walkable.
     Source: Steffen & Seyfried 2010, Physica A 389, 1902. Cells by scipy's Qhull, cut by half-planes.
     """
-    walk = checked("walkable", walkable)
-    target = walk if area is None else checked("area", area, is_convex=True)
-    gaps = [_corners(checked(f"holes[{k}]", hole)) for k, hole in enumerate(holes)]
-    points = _flat(pos)
-    here = np.flatnonzero(contains(walk, points)) if len(points) else np.zeros(0, np.int64)
-    cell, inside = np.full(len(points), np.nan), np.zeros(len(points))
-    if len(here):
-        places, which, many = np.unique(points[here], axis=0, return_inverse=True, return_counts=True)
-        cells = _cells(places, walk, period)
-        room = _Room(_corners(walk), None if area is None else _corners(target), gaps, period)
-        found = np.array([room.of(each) for each in cells]) / many[:, None]
-        cell[here], inside[here] = found[which.ravel()].T
-    return Room(cell, inside, size(_corners(target)))
+    return Ground.of(walkable, area, holes, period).room(pos)
+
+
+class Ground(NamedTuple):
+    """Where people walk and where they are measured, checked once for many instants."""
+
+    walk: Floats
+    target: Floats | None
+    holes: list[Corners]
+    period: tuple[float, float]
+    area: float  # m^2 of what is measured, as far as it is walkable
+
+    @classmethod
+    def of(
+        cls, walkable: ArrayLike, area: ArrayLike | None = None, holes: Sequence[ArrayLike] = (),
+        period: tuple[float, float] = (0.0, 0.0),
+    ) -> Ground:  # fmt: skip
+        """Return it; see `voronoi`, for what is what, and for what is refused."""
+        walk = checked("walkable", walkable)
+        target = None if area is None else checked("area", area, is_convex=True)
+        gaps = [_corners(checked(f"holes[{k}]", hole)) for k, hole in enumerate(holes)]
+        if target is not None:
+            measured = _Cutter(_corners(walk), None, gaps, period).areas(_corners(target))[0]
+        else:
+            measured = size(_corners(walk)) - sum(
+                size(cut_by(gap, _corners(walk)) if convex(walk) else gap) for gap in gaps
+            )
+        if not measured > 0:
+            raise ValueError("area: nothing of it is walkable")
+        return cls(walk, target, gaps, period, measured)
+
+    def room(self, pos: ArrayLike) -> Room:
+        """Return the cells of people at (N, 2), m."""
+        points = _flat(pos)
+        here = np.flatnonzero(contains(self.walk, points)) if len(points) else np.zeros(0, np.int64)
+        cell, inside = np.full(len(points), np.nan), np.zeros(len(points))
+        if len(here):
+            places, which, many = np.unique(points[here], axis=0, return_inverse=True, return_counts=True)
+            target = None if self.target is None else _corners(self.target)
+            cutter = _Cutter(_corners(self.walk), target, self.holes, self.period)
+            found = np.array([cutter.areas(each) for each in _cells(places, self.walk, self.period)])
+            cell[here], inside[here] = (found / many[:, None])[which.ravel()].T
+        return Room(cell, inside, self.area)
 
 
 def voronoi_density(room: Room) -> float:
@@ -130,7 +160,7 @@ def _box(place: Sequence[float], low: Floats, high: Floats, period: tuple[float,
     return _corners(rectangle(first, last))
 
 
-class _Room(NamedTuple):
+class _Cutter(NamedTuple):
     """What cells are cut to."""
 
     walk: Corners
@@ -138,7 +168,7 @@ class _Room(NamedTuple):
     holes: list[Corners]
     period: tuple[float, float]
 
-    def of(self, cell: Corners) -> tuple[float, float]:
+    def areas(self, cell: Corners) -> tuple[float, float]:
         """Return the area of what of a cell is walkable, and of what of that lies in the target."""
         whole, part = 0.0, 0.0
         for shift in _shifts(self.period):

@@ -15,6 +15,9 @@ __all__ = ["Proportion", "collision_rate", "oscillation_proportion", "overlap_ar
 
 Floats = NDArray[np.float64]
 
+ROUNDING = 1e-6
+"""Of the distance of two who touch: hard bodies lie so near to each other that rounding would decide who overlaps."""
+
 
 class Proportion(NamedTuple):
     """How much, where it happens; and how often it does."""
@@ -35,14 +38,17 @@ def overlap_area(distance: ArrayLike, first: ArrayLike, second: ArrayLike) -> Fl
     return np.asarray(np.where(d >= a + b, 0.0, np.where(d <= large - small, np.pi * small**2, lens)))
 
 
-def touching(pos: Floats, radius: Floats, space: Space) -> tuple[NDArray[np.int64], Floats]:
-    """Return the pairs of discs (N, D), m, that overlap, (P, 2), the lesser number first, and how far apart, (P,) m."""
+def touching(pos: Floats, radius: Floats, space: Space, margin: float = 0.0) -> tuple[NDArray[np.int64], Floats]:
+    """Return the pairs of discs (N, D), m, that overlap, (P, 2), the lesser number first, and how far apart, (P,) m.
+
+    Radii, (N,) m, are larger by a share `margin`, at most .001.
+    """
     if len(pos) < 2 or not radius.max() > 0:
         return np.zeros((0, 2), np.int64), np.zeros(0)
     tree = cKDTree(space.wrap(pos), boxsize=space.size if isinstance(space, Torus) else None)
-    pairs = tree.query_pairs(2 * float(radius.max()), output_type="ndarray").astype(np.int64).reshape(-1, 2)
+    pairs = tree.query_pairs(2.001 * float(radius.max()), output_type="ndarray").astype(np.int64).reshape(-1, 2)
     far = np.linalg.norm(space.displacement(pos[pairs[:, 0]], pos[pairs[:, 1]]), axis=1)
-    near = far < radius[pairs[:, 0]] + radius[pairs[:, 1]]
+    near = far < (radius[pairs[:, 0]] + radius[pairs[:, 1]]) * (1 + margin)
     return pairs[near], far[near]
 
 
@@ -55,7 +61,7 @@ def overlap_proportion(pos: ArrayLike, radius: ArrayLike, space: Space, alive: A
     """
     total, many, seen, people = 0.0, 0, 0, 0
     for where, size, _ in _instants(pos, radius, alive):
-        pairs, far = touching(where, size, space)
+        pairs, far = touching(where, size, space, -ROUNDING)
         a, b = size[pairs[:, 0]], size[pairs[:, 1]]
         least = np.pi * np.minimum(a, b) ** 2
         # a point in a body lies in it whole
@@ -97,7 +103,7 @@ def collision_rate(
     before: set[int] | None = None
     began, lived, count = 0, 0.0, len(np.asarray(radius))
     for k, (where, size, who) in enumerate(_instants(pos, radius, alive)):
-        pairs = who[touching(where, size, space)[0]]
+        pairs = who[touching(where, size, space, ROUNDING)[0]]
         now = set((pairs[:, 0] * count + pairs[:, 1]).tolist())
         if before is not None:
             began += len(now - before)

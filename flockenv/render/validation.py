@@ -122,7 +122,7 @@ def _write_widths(path: Path, found: Sequence[Finding]) -> None:
 
 def _write_lanes(path: Path, found: Sequence[Finding]) -> None:
     """Draw one world of each preset at its end, coloured by direction, with the way of the last seconds."""
-    figure = new_figure(9.6, 1.05 * len(found) + 0.6, "40 + 40 people in a corridor without ends, after a minute")
+    figure = new_figure(9.6, 1.05 * len(found) + 0.6, "48 + 48 people in a corridor without ends, after a minute")
     for finding, axes in zip(found, figure.subplots(len(found), 1, squeeze=False).ravel(), strict=True):
         _draw_lanes(axes, finding)
     save(figure, path)

@@ -1,0 +1,313 @@
+"""`flockenv measure`: a scene is run, once or from several seeds, and what makes sense for it is measured and drawn."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from flockenv.refusals import shown
+from flockenv.terminal import (
+    DIVERGED,
+    INTERRUPTED,
+    EarlyEnd,
+    Force,
+    Seed,
+    new_console,
+    progress_bar,
+    relative,
+    show_table,
+)
+
+if TYPE_CHECKING:
+    from flockenv.measures import Above, Mean
+    from flockenv.scene import Scene
+    from flockenv.survey import Asked, Survey
+    from flockenv.trajectory import Trajectory
+
+__all__ = ["measure"]
+
+FORMAT = 1
+EVERY = 0.1
+"""s, rounded to whole steps: how often positions are kept, unless said otherwise."""
+CELL = 0.5
+"""m and s: what a cell of the picture of density in time is wide, or more of a long run."""
+MOST_CELLS = 400
+
+ABOVE_CHANCE = {"lanes": "lanes by chance", "burst length": "burst length by chance"}
+
+
+def measure(
+    scene: Annotated[str, typer.Argument(metavar="SCENE.yaml", help="A scene; see `flockenv schema` and configs/.")],
+    time: Annotated[float, typer.Option(metavar="S", help="Simulated time in seconds, a whole multiple of dt.")] = 30.0,
+    skip: Annotated[float, typer.Option(metavar="S", help="Seconds of the beginning that do not count.")] = 0.0,
+    line: Annotated[
+        str | None, typer.Option(metavar="X0,Y0,X1,Y1", help="A line in metres; forward is to its right.")
+    ] = None,
+    area: Annotated[
+        str | None,
+        typer.Option(metavar="X0,Y0,X1,Y1", help="Two corners of an area, or all of them [default: a box or torus]."),
+    ] = None,
+    walkable: Annotated[
+        str | None,
+        typer.Option(metavar="X,Y,X,Y,...", help="Where cells end, as the area [default: the region, less obstacles]."),
+    ] = None,
+    every: Annotated[
+        float | None, typer.Option(metavar="S", help="Time between recorded instants in seconds [default: about 0.1].")
+    ] = None,
+    seed: Seed = 0,
+    seeds: Annotated[int, typer.Option(min=1, max=10_000, help="So many runs, from this seed on.")] = 1,
+    json_file: Annotated[str | None, typer.Option("--json", metavar="X.json", help="Write the numbers.")] = None,
+    out: Annotated[str | None, typer.Option(metavar="DIR", help="Write pictures into this folder.")] = None,
+    force: Force = False,
+) -> None:
+    """Run a scene and measure its crowd: flow, density, lanes, bursts, clogging, order; table, JSON and pictures."""
+    from flockenv.config import load_scene
+    from flockenv.outputs import checked_file
+    from flockenv.survey import Asked, combined, survey
+    from flockenv.trajectory import record, whole_steps
+
+    loaded = load_scene(Path(scene))
+    numbers = checked_file(json_file, [".json"], force, "--json") if json_file is not None else None
+    folder = _checked_folder(out, force) if out is not None else None
+    steps = whole_steps("--time", time, loaded.dt, 1)
+    if not (math.isfinite(skip) and 0 <= skip < time):
+        raise ValueError(f"--skip = {skip:g}: must be >= 0 and less than --time = {time:g}")
+    stride = max(1, round(EVERY / loaded.dt)) if every is None else whole_steps("--every", every, loaded.dt, 1)
+    asked = Asked(_line(line), _area("--area", area, True), _area("--walkable", walkable, False), skip)
+    found: list[Survey] = []
+    shown_run: Trajectory | None = None
+    stopped = ""
+    try:
+        for k in range(seeds):
+            title = f"simulating {k + 1}/{seeds}" if seeds > 1 else "simulating"
+            with progress_bar(title, steps, "steps") as progress:
+                run = record(loaded, seed + k, steps, stride, progress)
+            with progress_bar("measuring", 6, "families") as progress:
+                found.append(survey(run, asked, progress))
+            shown_run, stopped = shown_run or run, found[-1].stopped
+            if stopped:
+                break
+    except KeyboardInterrupt:
+        stopped = "interrupted"
+    if shown_run is None:
+        raise KeyboardInterrupt
+    means, above = combined(found), _above(found)
+    _show(loaded, found, means, above, shown_run, stride)
+    if numbers is not None:
+        _write_numbers(numbers, _summary(loaded, asked, found, means, above, shown_run, stride))
+    if folder is not None:
+        drawn = _draw(folder, shown_run, found, asked, Path(scene).stem)
+        new_console().print(f"{', '.join(drawn) or 'no pictures'} in {relative(folder)}")
+    if stopped:
+        text = f"{stopped}; what there is until then is shown"
+        raise EarlyEnd(text, INTERRUPTED if stopped == "interrupted" else DIVERGED)
+
+
+PICTURES = ("flow_density.png", "lanes.png", "gaps.png", "space_time.png")
+
+
+def _checked_folder(text: str, force: bool) -> Path:
+    from flockenv.outputs import checked_file, checked_path
+
+    folder = checked_path(text)
+    if folder.exists() and not folder.is_dir():
+        raise ValueError(f"--out {shown(text)}: is a file; pictures go into a folder")
+    for name in PICTURES:
+        checked_file(str(folder / name), [".png"], force)
+    return folder
+
+
+def _numbers(option: str, text: str) -> list[float]:
+    try:
+        numbers = [float(word) for word in text.split(",")]
+    except ValueError:
+        numbers = []
+    if len(numbers) < 4 or len(numbers) % 2 or not all(map(math.isfinite, numbers)):
+        raise ValueError(f"{option} = {shown(text)}: must be X0,Y0,X1,Y1 in metres, or more corners for an area")
+    return numbers
+
+
+def _line(text: str | None) -> Any:
+    import numpy as np
+
+    if text is None:
+        return None
+    numbers = _numbers("--line", text)
+    if len(numbers) != 4 or numbers[:2] == numbers[2:]:
+        raise ValueError(f"--line = {shown(text)}: must be the two ends of a line, X0,Y0,X1,Y1 in metres")
+    return np.array(numbers).reshape(2, 2)
+
+
+def _area(option: str, text: str | None, is_convex: bool) -> Any:
+    import numpy as np
+
+    from flockenv.measures.polygons import checked, rectangle
+
+    if text is None:
+        return None
+    corners = np.array(_numbers(option, text)).reshape(-1, 2)
+    return checked(option, rectangle(*corners) if len(corners) == 2 else corners, is_convex)
+
+
+def _above(found: Sequence[Survey]) -> dict[str, Above]:
+    """Return what is above chance over at least five runs that have it."""
+    from flockenv.measures import above_null
+
+    out = {}
+    for name, null in ABOVE_CHANCE.items():
+        pairs = [(each.values[name], each.values[null]) for each in found if null in each.values]
+        pairs = [pair for pair in pairs if all(map(math.isfinite, pair))]
+        if len(pairs) >= 5:
+            out[name] = above_null([value for value, _ in pairs], [chance for _, chance in pairs])
+    return out
+
+
+def _text(value: float) -> str:
+    return f"{value:.4g}" if math.isfinite(value) else "-"
+
+
+def _show(
+    scene: Scene, found: Sequence[Survey], means: dict[str, Mean], above: dict[str, Above], run: Trajectory, stride: int
+) -> None:
+    """Print the table; of several runs with 95 % intervals of the means."""
+    from flockenv.survey import UNITS
+
+    console, many = new_console(), len(found)
+    kept = f"positions every {stride * scene.dt:g} s"
+    seeds = f"seed {run.seed}" if many == 1 else f"seeds {run.seed} to {run.seed + many - 1}: means and 95 % intervals"
+    title = f"{scene.agents:,} agents, {float(run.last.time[0]):g} s, {kept}, {seeds}"
+    if many == 1:
+        single = [(name, _text(mean.mean), UNITS[name]) for name, mean in means.items()]
+        show_table(console, title, single, ("measure", "value", ""))
+        return
+    rows = [
+        (name, _text(x.mean), f"{_text(x.low)} to {_text(x.high)}", f"{x.runs}", UNITS[name])
+        for name, x in means.items()
+    ]
+    show_table(console, title, rows, ("measure", "mean", "95 %", "runs", ""))
+    verdicts = [
+        (name, _text(x.excess), f"{_text(x.low)} to {_text(x.high)}", f"{x.runs}", "yes" if x.holds else "no")
+        for name, x in above.items()
+    ]
+    if verdicts:
+        show_table(console, "Above chance?", verdicts, ("measure", "excess", "95 %", "runs", "with 95 % confidence"))
+
+
+def _summary(
+    scene: Scene, asked: Asked, found: Sequence[Survey], means: dict[str, Mean], above: dict[str, Above],
+    run: Trajectory, stride: int,
+) -> dict[str, Any]:  # fmt: skip
+    """Return all that was measured, ready for JSON: what has no meaning is null, never NaN."""
+    from flockenv.survey import UNITS
+
+    def plain(value: float) -> float | None:
+        return value if math.isfinite(value) else None
+
+    corners = {"line": asked.line, "area": asked.area, "walkable": asked.walkable}
+    return {
+        "format": FORMAT,
+        "scene": scene.model_dump(mode="json"),
+        "seeds": [run.seed + k for k in range(len(found))],
+        "time_s": float(run.last.time[0]),
+        "skip_s": asked.skip,
+        "every_s": stride * scene.dt,
+        **{name: None if given is None else given.tolist() for name, given in corners.items()},
+        "stopped": found[-1].stopped,
+        "measures": {
+            name: {
+                "unit": UNITS[name],
+                "mean": plain(x.mean),
+                "low": plain(x.low),
+                "high": plain(x.high),
+                "runs": x.runs,
+            }
+            for name, x in means.items()
+        },
+        "above_chance": {name: {**x._asdict(), "holds": bool(x.holds)} for name, x in above.items()},
+        "by_seed": [{name: plain(value) for name, value in each.values.items()} for each in found],
+        "samples": {
+            "density_per_m2": [plain(float(x)) for each in found for x in each.density],
+            "speed_m_per_s": [plain(float(x)) for each in found for x in each.speed],
+            "gaps_s": [float(x) for each in found for x in each.gaps],
+        },
+    }
+
+
+def _write_numbers(path: Path, summary: dict[str, Any]) -> None:
+    from flockenv.outputs import replacing
+
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with replacing(path) as file:
+        file.write((json.dumps(summary, indent=1, allow_nan=False) + os.linesep).encode())
+    new_console().print(f"numbers in {relative(path)}")
+
+
+def _draw(folder: Path, run: Trajectory, found: Sequence[Survey], asked: Asked, name: str) -> list[str]:
+    """Write the pictures that there is something to draw for; return their names."""
+    import numpy as np
+
+    from flockenv.measures import tail
+    from flockenv.render.crowd import write_flow_density, write_gaps, write_lanes, write_space_time
+
+    folder.mkdir(parents=True, exist_ok=True)
+    drawn = []
+    density, speed, gaps = (np.concatenate([getattr(s, what) for s in found]) for what in ("density", "speed", "gaps"))
+    if np.isfinite(speed).any():
+        write_flow_density(folder / PICTURES[0], density, speed, f"{name}: flow and speed over density")
+        drawn.append(PICTURES[0])
+    if run.scene.dimension == 2:
+        start = next(iter(run.snapshots()))
+        solids = [*start.outlines, *(p for shape in run.scene.circles for p in shape.polygons(start.low, start.high))]
+        alive = run.alive & np.isfinite(run.pos).all(axis=2)
+        write_lanes(
+            folder / PICTURES[1], run.pos.astype(np.float64), alive, found[0].way, (start.low, start.high),
+            f"{name}: who went where (orange along {_pointing(found[0].axis)}, blue against it)",
+            solids, asked.line, asked.area,
+        )  # fmt: skip
+        drawn.append(PICTURES[1])
+    if (gaps > 0).any():
+        write_gaps(folder / PICTURES[2], gaps, tail(gaps), f"{name}: {len(gaps)} gaps between passages")
+        drawn.append(PICTURES[2])
+    if run.scene.dimension == 2 and len(run.step) > 2:
+        time, place, image = _space_time(run, found[0])
+        where = None if asked.line is None else float(asked.line.mean(axis=0) @ found[0].axis)
+        write_space_time(folder / PICTURES[3], time, place, image, f"{name}: density along the way", where)
+        drawn.append(PICTURES[3])
+    return drawn
+
+
+def _pointing(axis: Any) -> str:
+    """Return a direction as text: +x, or by its angle."""
+    names = {(1.0, 0.0): "+x", (0.0, 1.0): "+y", (-1.0, 0.0): "-x", (0.0, -1.0): "-y"}
+    plain = (float(axis[0]) + 0.0, float(axis[1]) + 0.0)
+    return names.get(plain, f"{math.degrees(math.atan2(plain[1], plain[0])):.0f}°")
+
+
+def _space_time(run: Trajectory, found: Survey) -> tuple[Any, Any, Any]:
+    """Return times (T + 1,), places along the axis (X + 1,), and density in each cell between them, (T, X)."""
+    import numpy as np
+
+    alive = run.alive & np.isfinite(run.pos).all(axis=2)
+    k, i = np.nonzero(alive)
+    pos = run.pos[k, i].astype(float)
+    along, across = pos @ found.axis, pos @ np.array([-found.axis[1], found.axis[0]])
+    when = (run.step * run.scene.dt)[k]
+
+    def edges(values: Any, least: float) -> Any:
+        low, high = float(values.min()), float(values.max())
+        many = int(np.clip(np.ceil((high - low) / least), 1, MOST_CELLS))
+        return np.linspace(low, max(high, low + least), many + 1)
+
+    gap = float(np.diff(run.step).max()) * run.scene.dt
+    time, place = edges(when, max(CELL, gap)), edges(along, CELL)
+    people = np.histogram2d(when, along, (time, place))[0]
+    instants = np.histogram(run.step * run.scene.dt, time)[0]
+    width = max(float(across.max() - across.min()), CELL)
+    size = width * (place[1] - place[0])
+    return time, place, people / np.maximum(instants, 1)[:, None] / size

@@ -1,0 +1,234 @@
+"""`flockenv measure` on people whose ways are known, for nothing acts on them; and where things go wrong."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+import flockenv.survey
+from flockenv.cli import main
+from flockenv.config import load_scene
+from flockenv.survey import UNITS, Asked, survey
+from flockenv.trajectory import record
+
+STREAMS = """\
+space: {kind: torus, size: [10, 4]}
+groups:
+  - {count: 40, radius: 0.1, max_speed: 1.2, spawn: {low: [0, 0], high: [10, 1.9], speed: [1.2, 1.2], heading: [1, 0]}}
+  - {count: 40, radius: 0.1, max_speed: 1.2, spawn: {low: [0, 2.1], high: [10, 4], speed: [1.2, 1.2], heading: [-1, 0]}}
+dt: 0.05
+"""
+"""Two streams past each other."""
+
+ROOM = """\
+groups: [{count: 30, radius: 0, spawn: {low: [0, 0], high: [4, 4], speed: [1, 1], heading: [1, 0]}}]
+dt: 0.05
+"""
+"""Thirty who walk to the right, in a plane."""
+
+LINE = ["--line", "5,0,5,4"]
+
+
+@pytest.fixture(autouse=True)
+def in_a_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "streams.yaml").write_text(STREAMS)
+    (tmp_path / "room.yaml").write_text(ROOM)
+
+
+def numbers(path: str = "x.json") -> dict[str, Any]:
+    found: dict[str, Any] = json.loads(Path(path).read_text())
+    return found
+
+
+def values(found: dict[str, Any]) -> dict[str, float]:
+    return {name: math.nan if x["mean"] is None else x["mean"] for name, x in found["measures"].items()}
+
+
+def test_of_two_streams_everything_is_known(capsys: pytest.CaptureFixture[str]) -> None:
+    """24 m in 20 s: everybody comes through the line twice, and .4 of them three times, more or less."""
+    assert main(["measure", "streams.yaml", "--time", "20", "--json", "x.json", "--out", "p", *LINE]) == 0
+    said = capsys.readouterr().out
+    assert "positions every 0.1 s, seed 0" in said
+    assert "Phi, 1 = nobody shares a row" in said
+    scene = load_scene(Path("streams.yaml"))
+    x = scene.start(0).pos[0, :, 0]
+    turns = np.where(
+        np.arange(80) < 40,
+        np.floor((x + 19) / 10) - np.floor((x - 5) / 10),
+        np.ceil((x - 5) / 10) - np.ceil((x - 29) / 10),
+    )
+    found = values(numbers())
+    assert found["forward"] == turns[:40].sum()
+    assert found["backward"] == turns[40:].sum()
+    assert found["specific flow"] == pytest.approx((turns[:40].sum() - turns[40:].sum()) / 20 / 4)
+    assert found["lanes"] == found["band index"] == 1
+    assert found["lanes p"] < 0.05
+    assert found["density"] == pytest.approx(2)
+    assert found["density counted"] == pytest.approx(2)
+    assert found["density times speed"] == pytest.approx(2.4)
+    assert (found["walking speed"], found["speed"]) == pytest.approx((1.2, 1.2))
+    assert found["off Weidmann"] == pytest.approx(1.2 - 0.606, abs=1e-3)
+    assert (found["oscillation"], found["oscillating"], found["polarisation"]) == pytest.approx((0, 0, 0), abs=1e-9)
+    assert "all out" not in found  # they come around again
+    assert set(found) <= set(UNITS)
+    assert sorted(path.name for path in Path("p").iterdir()) == [
+        "flow_density.png", "gaps.png", "lanes.png", "space_time.png",
+    ]  # fmt: skip
+    for path in Path("p").iterdir():
+        with Image.open(path) as picture:
+            assert picture.width > 300
+            assert np.asarray(picture.convert("L")).std() > 5
+
+
+def test_a_room_empties_when_the_last_has_walked_out() -> None:
+    """The line is at x = 6, drawn upward; everybody walks 1 m/s."""
+    assert main(["measure", "room.yaml", "--time", "8", "--json", "x.json", "--line", "6,-1,6,5"]) == 0
+    found = numbers()
+    value = values(found)
+    way = np.sort(6 - load_scene(Path("room.yaml")).start(0).pos[0, :, 0])
+    assert value["out"] == 30
+    assert value["all out"] == pytest.approx(way[-1])
+    assert value["95 % out"] == pytest.approx(way[28])
+    assert value["passing"] == pytest.approx(29 / (way[-1] - way[0]))
+    assert sorted(found["samples"]["gaps_s"]) == pytest.approx(np.sort(np.diff(way)), abs=1e-9)
+    assert "density" not in value  # of a plane, unless an area is asked for
+    assert "lanes" not in value  # all walk one way
+    assert "overlap" not in value  # of points
+    assert main(["measure", "room.yaml", "--time", "3", "--json", "x.json", "--force", "--line", "6,-1,6,5"]) == 0
+    assert numbers()["measures"]["all out"]["mean"] is None  # not yet
+    # in an area in the way, cells end where walls would be: those who are in 4 m x 4 m share them, at the start
+    assert main([
+        "measure", "room.yaml", "--time", "0.05", "--json", "x.json", "--force", "--walkable", "0,0,4,4", "--area",
+        "0,0,4,4",
+    ]) == 0  # fmt: skip
+    assert values(numbers())["density"] == pytest.approx(30 / 16, rel=0.1)
+
+
+def test_of_the_beginning_as_much_is_skipped_as_asked_for() -> None:
+    assert main(["measure", "room.yaml", "--time", "8", "--skip", "4", "--json", "x.json", "--line", "6,-1,6,5"]) == 0
+    way = 6 - load_scene(Path("room.yaml")).start(0).pos[0, :, 0]
+    assert values(numbers())["forward"] == (way >= 4).sum()
+    assert values(numbers())["flow"] == pytest.approx((way >= 4).sum() / 4)
+    assert values(numbers())["out"] == 30
+
+
+def test_many_seeds_have_intervals_and_are_held_against_chance(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["measure", "streams.yaml", "--time", "2", "--seeds", "5", "--seed", "3", "--json", "x.json"]) == 0
+    said = capsys.readouterr().out
+    assert "seeds 3 to 7: means and 95 % intervals" in said
+    assert "Above chance?" in said
+    found = numbers()
+    assert found["seeds"] == [3, 4, 5, 6, 7]
+    assert found["above_chance"]["lanes"]["holds"] is True
+    near = [row["nearest neighbour"] for row in found["by_seed"]]
+    assert len(set(near)) == 5
+    mean = found["measures"]["nearest neighbour"]
+    assert mean["mean"] == pytest.approx(np.mean(near))
+    assert mean["low"] < mean["mean"] < mean["high"]
+
+
+def test_the_same_seed_is_the_same_picture() -> None:
+    for name in ("a", "b"):
+        assert main(["measure", "streams.yaml", "--time", "2", "--out", name, *LINE]) == 0
+    for path in Path("a").iterdir():
+        assert path.read_bytes() == (Path("b") / path.name).read_bytes()
+
+
+def test_interrupted_it_shows_what_there_is(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def interrupted(run: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(flockenv.survey, "_lanes", interrupted)
+    command = ["measure", "streams.yaml", "--time", "2", "--seeds", "3", "--json", "x.json", "--out", "p", *LINE]
+    assert main(command) == 130
+    captured = capsys.readouterr()
+    assert "interrupted; what there is until then is shown" in captured.err
+    assert "density times speed" in captured.out
+    assert "nearest neighbour" not in captured.out
+    found = numbers()
+    assert (found["stopped"], found["seeds"]) == ("interrupted", [0])
+    assert (Path("p") / "lanes.png").exists()
+
+
+def test_a_run_that_ends_early_is_measured_until_then(capsys: pytest.CaptureFixture[str]) -> None:
+    """An attraction of 1e300 N throws somebody out of all numbers."""
+    Path("bad.yaml").write_text(STREAMS.replace("dt:", "effects: [{kind: gravity, acceleration: [1e308, 0]}]\ndt:"))
+    assert main(["measure", "bad.yaml", "--time", "2"]) == 1
+    captured = capsys.readouterr()
+    assert "what there is until then is shown" in captured.err
+    assert "agents " in captured.out
+
+
+def test_space_has_no_lines_but_has_order() -> None:
+    Path("space.yaml").write_text(
+        "dimension: 3\nspace: {kind: torus, size: [9, 9, 9]}\n"
+        "groups: [{count: 9, spawn: {speed: [1, 1], heading: [0, 0, 1]}}]\n"
+    )
+    assert main(["measure", "space.yaml", "--time", "1", "--json", "x.json"]) == 0
+    assert values(numbers())["polarisation"] == pytest.approx(1)
+    assert "density" not in values(numbers())
+
+
+def test_an_obstacle_takes_room() -> None:
+    """Half a box is a block: who is in the other half has half the room."""
+    Path("half.yaml").write_text(
+        "space: {kind: box, size: [4, 4]}\ngroups: [{count: 8, radius: 0, spawn: {low: [0, 0], high: [1.9, 3.9]}}]\n"
+        "obstacles: [{kind: polygon, vertices: [[2, 0], [4, 0], [4, 4], [2, 4]]}]\ndt: 0.05\n"
+    )
+    run = record(load_scene(Path("half.yaml")), 0, 2, 1)
+    assert survey(run, Asked()).values["density"] == pytest.approx(1)  # 8 in 8 m^2 that are walkable
+    left = np.array([(0, 0), (2, 0), (2, 4), (0, 4)], float)
+    assert survey(run, Asked(area=left)).values["density"] == pytest.approx(1)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        ("room.yaml --time 0", "--time = 0 s: must be a whole multiple of dt = 0.05 s, say 0.05 or 0.1"),
+        ("room.yaml --time 1 --skip 1", "--skip = 1: must be >= 0 and less than --time = 1"),
+        ("room.yaml --line 1,2,3", "--line = '1,2,3': must be X0,Y0,X1,Y1 in metres"),
+        ("room.yaml --line 1,2,1,2", "--line = '1,2,1,2': must be the two ends of a line"),
+        ("room.yaml --line 1,2,x,2", "--line = '1,2,x,2': must be X0,Y0,X1,Y1 in metres"),
+        ("room.yaml --area 0,0,1,0,2,0", "--area = "),
+        (
+            "room.yaml --area 0,0,4,0,1,1,0,4",
+            "--area = [[0.0, 0.0], [4.0, 0.0], [1.0, 1.0], [0.0, 4.0]]: must be convex",
+        ),
+        ("room.yaml --time 1e9 --every 0.05", "20,000,000,001 instants of 30 agents need about"),
+        ("room.yaml --json x.yaml", "--json 'x.yaml': must end in .json"),
+        ("room.yaml --out room.yaml", "--out 'room.yaml': "),
+        ("room.yaml --out ../p", "--out '../p': must not go up with '..'"),
+        ("room.yaml --seeds 0", "Invalid value for '--seeds'"),
+        ("rom.yaml", "rom.yaml: no such file, did you mean `room.yaml`?"),
+        ("cube.yaml --time 1 --line 0,0,1,0", "dimension = 3: lines and areas are of the plane"),
+    ],
+)
+def test_a_mistake_is_one_line_and_writes_nothing(
+    arguments: str, said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    Path("cube.yaml").write_text(
+        "dimension: 3\ngroups: [{count: 1, spawn: {low: [0, 0, 0], high: [1, 1, 1]}}]\ndt: 0.05\n"
+    )
+    before = sorted(path.name for path in tmp_path.iterdir())
+    assert main(["measure", *arguments.split(" ")]) == 2
+    captured = capsys.readouterr()
+    assert captured.err.startswith(f"flockenv: {said}"), captured.err
+    assert len(captured.err.splitlines()) == 1
+    assert captured.out == ""
+    assert sorted(path.name for path in tmp_path.iterdir()) == before
+
+
+def test_what_is_there_is_overwritten_only_by_force() -> None:
+    Path("p").mkdir()
+    (Path("p") / "lanes.png").write_text("mine")
+    assert main(["measure", "room.yaml", "--time", "1", "--out", "p"]) == 2
+    assert (Path("p") / "lanes.png").read_text() == "mine"

@@ -1,0 +1,112 @@
+"""Vicsek's flock: the map of one step to the last digit, and its curve of order over noise (numerics.md A14)."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from flockenv.config import load_scene
+from flockenv.effects import Vicsek
+from flockenv.effects.vicsek import CHANNEL
+from flockenv.experiments.vicsek import SEEN, bound, order, scene_of
+from flockenv.integrators import ExplicitEuler, Heun, SemiImplicitEuler
+from flockenv.noise import _mix
+from flockenv.scene import Group, Scene
+from flockenv.space import Torus
+from flockenv.spawn import Spawn
+from flockenv.state import State
+from tests.catalogue import Array
+
+ROOT = Path(__file__).resolve().parent.parent
+
+
+def flock(noise: float, count: int = 400, **fields: object) -> Scene:
+    """So many at Vicsek's density."""
+    return scene_of(noise, count).model_copy(update=fields)
+
+
+def test_the_scene_of_configs_is_the_experiments() -> None:
+    assert load_scene(ROOT / "configs" / "vicsek.yaml") == scene_of(1.0)
+
+
+def drawn_for(key: int, step: int, agent: int) -> float:
+    """What `noise.uniform` draws, in Python's whole numbers."""
+    return float(_mix(_mix(_mix(key, step), agent), CHANNEL) >> 11) * 2.0**-53
+
+
+def mapped(scene: Scene, state: State) -> tuple[Array, Array]:
+    """Positions and velocities after one update of the paper, in numpy: everybody asks everybody."""
+    effect = scene.effects[0]
+    assert isinstance(effect, Vicsek)
+    x, v = state.pos[0], state.vel[0]
+    near = (scene.space.displacement(x[:, None], x[None]) ** 2).sum(-1) < effect.radius**2
+    course = np.arctan2(*(near @ v).T[::-1])
+    drawn = [drawn_for(int(state.key[0]), int(state.tick[0]), i) for i in range(len(x))]
+    angle = course + effect.noise * (np.array(drawn) - 0.5)
+    then = effect.speed * np.stack([np.cos(angle), np.sin(angle)], -1)
+    moves = v if isinstance(scene.integrator, ExplicitEuler) else then
+    return scene.space.wrap(x + scene.dt * moves), then
+
+
+@pytest.mark.parametrize("method", [ExplicitEuler(), SemiImplicitEuler()], ids=lambda m: m.kind)
+def test_a_step_is_the_papers_map(method: ExplicitEuler | SemiImplicitEuler) -> None:
+    """Five steps, each from the one before: sums of the same velocities, the same errors, to rounding."""
+    scene = flock(2.0, integrator=method)
+    state = scene.start(7)
+    for _ in range(5):
+        pos, vel = mapped(scene, state)
+        state = scene.step(state)
+        np.testing.assert_allclose(state.vel[0], vel, atol=1e-14)
+        np.testing.assert_allclose(scene.space.displacement(state.pos[0], pos), 0, atol=1e-12)
+    assert np.linalg.norm(state.vel[0], axis=1) == pytest.approx(np.full(400, 0.03), rel=1e-12)
+
+
+def test_without_noise_neighbours_agree_and_the_lone_fly_on() -> None:
+    scene = flock(0.0, count=100)
+    state = scene.start(0)
+    x, v = np.array(state.pos), np.array(state.vel)
+    x[0, :3] = [(1, 1), (1.5, 1), (1, 1.5)]
+    x[0, 3:] = [(3 + 0.001 * k, 3) for k in range(97)]
+    v[0, :2], v[0, 2] = 0, (0.03, 0)
+    v[0, 3:] = [(0.03, 0), *[(0, 0.03)] * 96]
+    state = scene.step(state.with_motion(x, v))
+    np.testing.assert_allclose(state.vel[0, :3], np.tile([0.03, 0], (3, 1)), atol=1e-16)
+    mean = np.array([1, 96]) / math.hypot(1, 96)
+    np.testing.assert_allclose(state.vel[0, 3:], np.tile(0.03 * mean, (97, 1)), atol=1e-15)
+    alone = flock(0.0, groups=(Group(count=1, spawn=Spawn(speed=(0.03, 0.03))),))
+    start = alone.start(1)
+    np.testing.assert_allclose(alone.run(start, 10).vel, start.vel, rtol=1e-12)
+    rest = alone.step(start.with_motion(start.pos, 0 * start.vel))
+    assert (rest.vel == 0).all()  # and is not torn anywhere
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"integrator": Heun()}, "kind = vicsek: is a map from step to step, integrator.kind = heun"),
+        ({"dt": 0.5}, r"step = 1: dt = 0\.5 s, must be the same"),
+        ({"dimension": 3, "space": Torus(size=(9.0, 9.0, 9.0))}, "kind = vicsek: dimension = 3, must be 2"),
+    ],
+)
+def test_what_is_no_step_of_the_map_is_refused_in_one_line(change: dict[str, object], said: str) -> None:
+    given = {"space": Torus(size=(9.0, 9.0)), "integrator": ExplicitEuler(), "dt": 1.0, **change}
+    effect = Vicsek(speed=0.03, radius=1, noise=1)
+    with pytest.raises(ValueError, match=rf"effects\[0\]\.{said}") as caught:
+        Scene(groups=(Group(count=3, spawn=Spawn()),), effects=(effect,), **given)  # type: ignore[arg-type]
+    assert "\n" not in str(caught.value)
+
+
+def test_noise_takes_order_away() -> None:
+    found = [order(flock(noise), 1000, 300).mean() for noise in (0.1, 2.0, 2 * math.pi)]
+    assert found == pytest.approx([0.9994, 0.779, 0.044], abs=0.1)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("noise", SEEN)
+def test_the_curve_is_vicseks(noise: float) -> None:
+    found = float(order(flock(noise), 5000, 20_000, worlds=8).mean())
+    assert found == pytest.approx(SEEN[noise], abs=0.04)
+    assert found <= bound(noise, 400) + 0.001  # without order it is the bound, on average
