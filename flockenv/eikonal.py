@@ -6,18 +6,22 @@ equations" (Math. Comp. 2005); first order in the spacing.
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from flockenv.grid import packed, points_of
 from flockenv.kernels import entry, kernel
 from flockenv.shapes import Shape
+from flockenv.shapes.table import nearest
+from flockenv.targets import Target
 
-__all__ = ["distances_around", "way_table"]
+__all__ = ["Start", "distances_around", "free_part", "way_table"]
 
 Floats = NDArray[np.float64]
 ROUNDS = 200
@@ -81,52 +85,135 @@ def distances_around(free: NDArray[np.bool_], spacing: float, begin: Floats) -> 
     return u.reshape(free.shape)
 
 
-def way_table(
-    shapes: Sequence[Shape], goal: Sequence[float], low: Sequence[float], high: Sequence[float], spacing: float,
-    clearance: float,
-) -> Floats:  # fmt: skip
-    """Return a grid (see grid.py) whose points have 1 + D numbers: the way to the goal, m, and its first direction.
+class Ground(NamedTuple):
+    """A grid over a place with obstacles."""
 
-    The way of a body's centre that keeps `clearance` from all shapes. Where no way leads, in an obstacle too, the
-    direction is away from the nearest surface, and the way as long as the longest. ValueError, in one line, if the goal
-    is not free or outside the grid.
-    """
-    shown = tuple(map(float, goal))
+    low: tuple[float, ...]  # m, its lowest corner
+    spacing: float  # m
+    points: Floats  # (nx, ny[, nz], D) m
+    gap: Floats  # (nx, ny[, nz]) m, how far the nearest obstacle is
+    out: Floats  # (nx, ny[, nz], D) the way out of it
+
+
+class Start(NamedTuple):
+    """Where somebody begins, who must get to a target."""
+
+    name: str
+    low: Floats  # (D,) m
+    high: Floats  # (D,) m
+
+
+@functools.lru_cache(maxsize=2)
+def ground(shapes: tuple[Shape, ...], low: tuple[float, ...], high: tuple[float, ...], spacing: float) -> Ground:
+    """Return the grid of a region, and how far its points are from obstacles: the same for every target."""
     counts = [1 + math.ceil((b - a) / spacing - 1e-9) for a, b in zip(low, high, strict=True)]
     points = points_of(low, spacing, counts)
-    gap = np.min([shape.gap(points) for shape in shapes], axis=0) if shapes else np.full(points.shape[:-1], np.inf)
-    out = _directions_out(shapes, points)
-    straight = np.linalg.norm(points - np.asarray(goal), axis=-1)
-    if any(not a <= x <= b for a, x, b in zip(low, goal, high, strict=True)):
-        raise ValueError(f"target = {shown}: is outside the grid, {tuple(low)} to {tuple(high)} m")
-    free = gap >= clearance
-    sight = np.maximum(NEAR * spacing, 1.0001 * spacing * math.sqrt(len(goal)))
-    goal_gap = min((float(shape.gap(goal)) for shape in shapes), default=math.inf)
-    if goal_gap < clearance:
-        raise ValueError(f"target = {shown}: is {goal_gap:.3g} m from an obstacle, must be at least {clearance:g} m")
-    # straight lines count where nothing can be between: nearer than the nearest obstacle
-    known = np.where(straight <= min(sight, goal_gap - clearance + spacing * math.sqrt(len(goal))), straight, np.inf)
-    u = distances_around(free, spacing, np.where(free, known, np.inf))
+    return Ground(low, spacing, points, *_nearest_surface(shapes, points))
+
+
+def way_table(
+    shapes: Sequence[Shape], targets: Sequence[Target], low: Sequence[float], high: Sequence[float], spacing: float,
+    clearance: float, names: Sequence[str] = ("target",), starts: Sequence[Start] = (),
+) -> Floats:  # fmt: skip
+    """Return the ways to the nearest of some targets as a grid (see grid.py): the length, m, and the first direction.
+
+    The way of a body's centre that keeps `clearance` from all shapes. Where no way leads, in an obstacle too, the
+    direction is away from the nearest surface, and the way as long as the longest. ValueError, in one line, if a target
+    is not free or outside the grid, which its name begins with, or if from one of `starts` no way leads to any.
+    """
+    found = ground(tuple(shapes), tuple(map(float, low)), tuple(map(float, high)), spacing)
+    begin, towards = np.full(found.gap.shape, np.inf), np.zeros_like(found.points)
+    for name, target in zip(names, targets, strict=True):
+        _begin_at(found, shapes, target, clearance, name, high, begin, towards)
+    free = found.gap >= clearance
+    near = np.any(towards != 0, axis=-1) | (begin == 0)
+    u = distances_around(free, spacing, begin)
     reached = np.isfinite(u)
-    if not reached.any():
-        raise ValueError(f"target = {shown}: no point of the grid beside it is free; use a smaller spacing")
-    way = -_slopes(u, spacing)
-    near = (straight <= 2 * spacing)[..., None]
-    way = np.where(near, (np.asarray(goal) - points), way)
+    for start in starts:
+        room = np.all((found.points >= start.low - spacing) & (found.points <= start.high + spacing), axis=-1) & free
+        if room.any() and not (room & reached).any():
+            shown = " or ".join(target.shown for target in targets)
+            raise ValueError(
+                f"{names[0]} = {shown}: no way leads there from {start.name}, {clearance:g} m clear of all"
+            )
+    way = np.where(near[..., None], towards, -_slopes(u, spacing))
     size = np.linalg.norm(way, axis=-1, keepdims=True)
-    way = np.where(reached[..., None], way / np.where(size > 0, size, 1), out)
+    way = np.where(reached[..., None], way / np.where(size > 0, size, 1), found.out)
     length = np.where(reached, u, u[reached].max())
-    return packed(np.concatenate([length[..., None], way], axis=-1), low, spacing)
+    return packed(np.concatenate([length[..., None], way], axis=-1), found.low, spacing)
 
 
-def _directions_out(shapes: Sequence[Shape], points: Floats) -> Floats:
-    """Return the normal of the nearest surface at each point."""
-    best, out = np.full(points.shape[:-1], np.inf), np.zeros_like(points)
+def free_part(
+    shapes: Sequence[Shape], target: Target, name: str, spacing: float, clearance: float
+) -> tuple[Target, Floats, Floats]:
+    """Return a target without what of it is nearer than `clearance` to a shape, and places of it: where, how clear.
+
+    Of a door the part between the jambs, of a box all: who is not in the way there is seen at the places, (S, D) m and
+    (S,) m. ValueError, in one line, if nothing is left.
+    """
+    samples = target.samples(spacing)
+    gap = np.min([shape.gap(samples) for shape in shapes], axis=0) if shapes else np.full(len(samples), np.inf)
+    free = gap >= clearance
+    if not free.any():
+        where = "" if len(samples) == 1 else "at most "
+        raise ValueError(
+            f"{name} = {target.shown}: is {where}{gap.max():.3g} m from an obstacle, must be at least {clearance:g} m"
+        )
+    if target.ends is not None and not free.all():
+        core = samples[: target.count(spacing)][free[: target.count(spacing)]]
+        ends = (tuple(core[0].tolist()), tuple(core[-1].tolist())) if len(core) else target.ends
+        change = {"at": ends[0], "ends": None} if ends[0] == ends[1] else {"ends": ends}
+        target = target.model_copy(update=change)
+    return target, samples[free], gap[free]
+
+
+def _begin_at(
+    found: Ground, shapes: Sequence[Shape], whole: Target, clearance: float, name: str, high: Sequence[float],
+    begin: Floats, towards: Floats,
+) -> None:  # fmt: skip
+    """Write the distances of the points about a target, and the straight way to it from those that are very near.
+
+    Straight lines count where nothing can be between: nearer than the nearest obstacle.
+    """
+    spacing, d = found.spacing, whole.dimension
+    if (whole.extremes[0] < found.low).any() or (whole.extremes[1] > high).any():
+        raise ValueError(f"{name} = {whole.shown}: is outside the grid, {found.low} to {tuple(high)} m")
+    sight = np.maximum(NEAR * spacing, 1.0001 * spacing * math.sqrt(d))
+    target, places, gap = free_part(shapes, whole, name, spacing, clearance)
+    first = np.maximum(np.floor((target.extremes[0] - sight - found.low) / spacing), 0).astype(int)
+    last = np.ceil((target.extremes[1] + sight - found.low) / spacing).astype(int) + 1
+    here = tuple(slice(a, b) for a, b in zip(first, last, strict=True))
+    points, free = found.points[here], found.gap[here] >= clearance
+    nearby = cKDTree(places).query(points)[1]
+    to = target.offset(points)
+    straight = np.linalg.norm(to, axis=-1)
+    reach = np.minimum(sight, gap[nearby] - clearance + spacing * math.sqrt(d))
+    known = free & (np.linalg.norm(places[nearby] - points, axis=-1) <= reach)
+    if not known.any():
+        raise ValueError(f"{name} = {whole.shown}: no point of the grid beside it is free; use a smaller spacing")
+    nearer = known & (straight < begin[here])
+    begin[here] = np.where(nearer, straight, begin[here])
+    close = nearer & (straight <= 2 * spacing)
+    towards[here] = np.where(nearer[..., None], np.where(close[..., None], to, 0), towards[here])
+
+
+def _nearest_surface(shapes: Sequence[Shape], points: Floats) -> tuple[Floats, Floats]:
+    """Return how far the nearest surface is from each point of a grid, and its normal.
+
+    A shape is asked only where the box around it is nearer than what was found before.
+    """
+    d = points.shape[-1]
+    flat, lead = points.reshape(-1, d), points.shape[:-1]
+    best, out = np.full(len(flat), np.inf), np.zeros_like(flat)
+    axes = [np.moveaxis(points[..., k], k, 0).reshape(lead[k], -1)[:, 0] for k in range(d)]
     for shape in shapes:
-        gap = shape.gap(points)
-        nearer = gap < best
-        best, out = np.where(nearer, gap, best), np.where(nearer[..., None], shape.normal(points), out)
-    return out
+        to = [np.maximum(abs(x - c) - h, 0) ** 2 for x, c, h in zip(axes, *shape.bound[:2], strict=True)]
+        box = functools.reduce(np.add.outer, to).reshape(-1)
+        here = np.flatnonzero(box <= (np.maximum(best, 0) + 1e-9) ** 2)
+        gap, normal = nearest(shape, flat[here])
+        nearer = gap < best[here]
+        best[here[nearer]], out[here[nearer]] = gap[nearer], normal[nearer]
+    return best.reshape(lead), out.reshape(points.shape)
 
 
 def _slopes(u: Floats, spacing: float) -> Floats:

@@ -102,6 +102,7 @@ from flockenv.effects import (
     Vicsek,
     Vortex,
     WallRepulsion,
+    Way,
     Wind,
 )
 from flockenv.integrators import (
@@ -125,6 +126,7 @@ from flockenv.shapes import Circle
 from flockenv.space import Box, Plane, Space, Torus
 from flockenv.spawn import Spawn
 from flockenv.steer import Steer
+from flockenv.targets import Target
 from flockenv.tasks import Crossing, Flock, Herd, Obstacles, PathFollow, Pursuit, Task
 from flockenv.tasks import Evade as EvadeTask
 
@@ -350,6 +352,10 @@ EFFECTS = (
         Antipode(centre=CENTRE[:2]), beside=(DRIVING,), dimensions=(2,), obeys=frozenset()
     ),
     EffectRow(DRIVING, beside=(Goal(target=CENTRE, slow_radius=2),)),
+    EffectRow(  # its grid lies along the axes
+        Way(targets=(Target(at=(3.0, 5.5)),), clearance=0.1, spacing=0.3, margin=1), beside=(DRIVING,),
+        dimensions=(2,), obeys=frozenset({"relabelling"}),
+    ),
     EffectRow(WallRepulsion(point=CENTRE, normal=(1.2, -0.7, 0.9), strength=2, decay=1.5)),
     EffectRow(ObstacleContact(stiffness=30, damping=4, friction=8, coulomb=0.6, most=5)),
     EffectRow(Contact(stiffness=20, ratio=0.3, damping=0.1, friction=6, coulomb=0.5, most=4, radius=0.5)),

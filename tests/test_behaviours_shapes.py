@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from flockenv import ways as way_module
 from flockenv.behaviours import (
     AvoidObstacles,
     Cohesion,
@@ -19,13 +20,13 @@ from flockenv.behaviours import (
     Seek,
     Whiskers,
 )
-from flockenv.behaviours import way as way_module
 from flockenv.eikonal import way_table
 from flockenv.grid import sampled
 from flockenv.scene import Group, Scene
 from flockenv.shapes import Block, Capsule, Circle, HalfSpace, Polygon, Shape, Wall
 from flockenv.spawn import Spawn
 from flockenv.steer import Steer
+from flockenv.targets import Target
 
 UNDER = (
     AvoidObstacles(weight=8, horizon=2, margin=0.1),
@@ -323,7 +324,7 @@ def test_the_way_around_a_circle_is_tangents_and_an_arc() -> None:
     arc = np.arccos(np.clip(x @ goal / (d * 3), -1, 1)) - np.arccos(1 / d) - math.acos(1 / 3)
     exact = np.where(arc <= 0, np.linalg.norm(x - goal, axis=1), np.sqrt(d**2 - 1) + math.sqrt(8) + arc)
     for spacing in (0.2, 0.1, 0.05):
-        table = way_table([Circle(centre=(0, 0), radius=1.0)], goal, (-5, -5), (5, 5), spacing, 0.0)
+        table = way_table([Circle(centre=(0, 0), radius=1.0)], [Target(at=goal)], (-5, -5), (5, 5), spacing, 0.0)
         errors.append(np.abs(sampled(table, x)[:, 0] - exact).mean())
     assert errors[2] < 0.05
     assert errors[0] > 1.4 * errors[1] > 1.4 * 1.4 * errors[2]
@@ -331,7 +332,7 @@ def test_the_way_around_a_circle_is_tangents_and_an_arc() -> None:
 
 def test_in_free_space_the_way_is_straight() -> None:
     goal = np.array([1.0, 2.0, 0.5])
-    table = way_table([], goal, (-2, -2, -2), (3, 4, 3), 0.25, 0.0)
+    table = way_table([], [Target(at=goal)], (-2, -2, -2), (3, 4, 3), 0.25, 0.0)
     x = np.random.default_rng(1).uniform(-1.5, 2.5, (200, 3))
     found = sampled(table, x)
     straight = goal - x

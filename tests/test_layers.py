@@ -16,10 +16,10 @@ ROOT = Path(__file__).resolve().parent.parent
 
 LAYERS = (
     {"divergence", "terminal", "refusals", "outputs", "recycle", "crew", "compilation", "inlining", "frontend"},
-    {"records", "vec", "elementary", "noise", "kernels"},
+    {"records", "vec", "elementary", "noise", "kernels", "targets"},
     {"state", "space", "steering", "arbitration", "vehicle", "appearance", "spread"},
     {"neighbours", "shapes", "grid", "eikonal", "orca", "polyline", "rows", "networks", "elements", "tree"},
-    {"effects", "integrators", "constraints", "population", "spawn", "sweep", "stability", "rounding"},
+    {"effects", "integrators", "constraints", "population", "spawn", "sweep", "stability", "rounding", "ways"},
     {"behaviours"},
     {"steer", "presets"},
     {"snapshot", "implicit", "workspace", "scene", "config", "measures", "grants", "explanation"},

@@ -10,12 +10,10 @@ from pydantic import Field
 
 from flockenv.behaviours.base import Moving, top_speed
 from flockenv.effects.base import Me, Vector
-from flockenv.eikonal import way_table
-from flockenv.grid import MOST_POINTS, covers, sample, sample_vector
 from flockenv.kernels import Vec, law, like
-from flockenv.shapes import Shape
-from flockenv.space import Torus
-from flockenv.vec import norm, scale, select, sub, unit
+from flockenv.targets import Target
+from flockenv.vec import norm, scale, sub
+from flockenv.ways import check_ways, region, way_ahead, ways_to
 
 __all__ = ["FollowWay"]
 
@@ -24,9 +22,7 @@ __all__ = ["FollowWay"]
 def follow_way(p: Any, me: Me) -> Vec:
     """F = w (V e - v), e downhill the length of the way; slower over the last `slow_radius`."""
     straight = sub(p.target, me.pos)
-    here = covers(p.table, me.pos)
-    length = sample(p.table, me.pos, 0) if here else norm(straight)
-    direction = unit(select(here, sample_vector(p.table, me.pos, 1), straight))
+    length, direction = way_ahead(p.table, me.pos, straight)
     near = norm(straight)
     length = near if near < length else length
     ramp = length / p.slow_radius
@@ -68,35 +64,18 @@ effects:
             "speed": self.limit, "weight": self.weight, "target": self.target, "slow_radius": self.slow_radius,
         }  # fmt: skip
 
-    def region(self, scene: Any) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return the corners of the grid: a box's own, or all that there is and a margin around it."""
-        size = getattr(scene.space, "size", None)
-        if size is not None:
-            return np.zeros(scene.dimension), np.array(size, float)
-        places = [np.array([self.target])]
-        places += [np.asarray(shape.extremes) for shape in scene.obstacles]
-        for group in scene.groups:
-            corners = (group.spawn.low, group.spawn.high)
-            places.append(np.array(corners) if group.network is None else group.network.points(scene.dimension))
-        every = np.concatenate(places)
-        return every.min(axis=0) - self.margin, every.max(axis=0) + self.margin
+    @property
+    def _given(self) -> tuple[tuple[Target], tuple[str]]:
+        """Where to, and by which name that was given."""
+        return (Target(at=self.target),), ("target",)
 
     def table(self, scene: Any) -> NDArray[np.float64]:
         """The grid of ways."""
-        low, high = self.region(scene)
-        shapes: list[Shape] = list(scene.obstacles)
-        return way_table(shapes, self.target, low.tolist(), high.tolist(), self.spacing, self.clearance)
+        corners = region(scene, self._given[0], self.margin)
+        return ways_to(scene, *self._given, corners, self.spacing, self.clearance)
 
     def check(self, scene: Any) -> None:
         """Refuse a torus, obstacles that move, a grid too large, and a target that is in an obstacle."""
         super().check(scene)
-        for k, shape in enumerate(scene.obstacles):
-            if shape.moves:
-                raise ValueError(f"kind = follow_way: its way is found once, and obstacles[{k}] moves")
-        if isinstance(scene.space, Torus):
-            raise ValueError("kind = follow_way: on a torus ways lead around; only a plane or a box is allowed")
-        low, high = self.region(scene)
-        points = float(np.prod((high - low) / self.spacing + 1))
-        if points > MOST_POINTS:
-            raise ValueError(f"spacing = {self.spacing:g}: {points:,.0f} points, at most {MOST_POINTS:,} are allowed")
+        check_ways(scene, self.kind, *self._given, self.margin, self.spacing, self.clearance)
         scene.table_of(self)

@@ -25,10 +25,11 @@ from flockenv.effects.springs import AngularSprings, Springs  # noqa: E402
 from flockenv.effects.tether import Swing, Tether  # noqa: E402
 from flockenv.effects.vicsek import Vicsek  # noqa: E402
 from flockenv.effects.wall import WallRepulsion  # noqa: E402
+from flockenv.effects.way import Way  # noqa: E402
 
 __all__ = [
     "EFFECTS", "Aim", "AngularSprings", "Antipode", "Attraction", "Carried", "Contact", "Course", "Drag", "Effect",
     "Elastic", "Far", "Fluctuation", "Goal", "Gravitation", "Gravity", "InverseSquare", "Me", "ObstacleContact",
     "Other", "Pressure", "QuadraticDrag", "Sight", "Sink", "Source", "SpeedLimit", "Springs", "Swing", "Tether",
-    "Uniform", "Vicsek", "Vortex", "WallRepulsion", "Wind",
+    "Uniform", "Vicsek", "Vortex", "WallRepulsion", "Way", "Wind",
 ]  # fmt: skip

@@ -1,0 +1,174 @@
+"""Places to go to: a point, a door (a segment) or a region (a box), as a record and as numbers that laws read."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Annotated, Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from pydantic import Field, model_validator
+
+from flockenv.kernels import Vec, law, like
+from flockenv.records import Record
+from flockenv.vec import dot, norm, scale, select
+
+__all__ = ["Target", "row_size", "rows_of", "to_any", "to_target"]
+
+Floats = NDArray[np.float64]
+Place = Annotated[tuple[Annotated[float, Field(strict=True)], ...], Field(min_length=2, max_length=3)]
+
+
+class Target(Record):
+    """A place to go to: a point `at`, a door between two `ends`, or a box from `low` to `high`; all within `radius`."""
+
+    at: Place | None = Field(default=None, description="m, a point")
+    ends: tuple[Place, Place] | None = Field(default=None, description="m, where a door ends")
+    low: Place | None = Field(default=None, description="m, lower corner of a box along the axes")
+    high: Place | None = Field(default=None, description="m, its upper corner")
+    radius: float = Field(default=0.0, ge=0, description="m, whatever is this near belongs to it")
+
+    @model_validator(mode="after")
+    def _one_of_three(self) -> Target:
+        """Refuse what is none, or more than one, of the three."""
+        box = self.low is not None or self.high is not None
+        if (self.at is not None) + (self.ends is not None) + box != 1 or (self.low is None) != (self.high is None):
+            raise ValueError("at: give one of at, ends, or low and high")
+        if len({len(place) for place in self._places}) != 1:
+            raise ValueError(f"{self._word} = {self.shown}: both must have as many numbers")
+        if self.ends is not None and self.ends[0] == self.ends[1]:
+            raise ValueError(f"ends = {self.shown}: is a point; give at")
+        if box and any(a > b for a, b in zip(*self._places, strict=True)):
+            raise ValueError(f"low = {self.low}: must not be above high = {self.high}")
+        return self
+
+    @property
+    def _places(self) -> tuple[tuple[float, ...], ...]:
+        """The places that it was given by."""
+        found = (self.at, *(self.ends or ()), self.low, self.high)
+        return tuple(place for place in found if place is not None)
+
+    @property
+    def _word(self) -> str:
+        """By which of its fields it was given."""
+        return "at" if self.at is not None else "ends" if self.ends is not None else "low, high"
+
+    @property
+    def shown(self) -> str:
+        """The places, as errors show them."""
+        return ", ".join(str(place) for place in self._places)
+
+    @property
+    def dimension(self) -> int:
+        """In how many dimensions it lies."""
+        return len(self._places[0])
+
+    @property
+    def length(self) -> float:
+        """From one end of a door to the other, m; 0 of what is none."""
+        return float(np.linalg.norm(np.subtract(*self.ends))) if self.ends else 0.0
+
+    @property
+    def extremes(self) -> Floats:
+        """Places that everything of it lies between, (2, D) m."""
+        places = np.array(self._places)
+        return np.array([places.min(axis=0) - self.radius, places.max(axis=0) + self.radius])
+
+    @property
+    def row(self) -> list[float]:
+        """Its numbers, as laws read them: first end (D), the way to the other (D), half the edges (D), radius."""
+        places = np.array(self._places)
+        box, d = self.low is not None, self.dimension
+        begin = places.mean(axis=0) if box else places[0]
+        along = places[-1] - places[0] if self.ends else np.zeros(d)
+        half = (places[1] - places[0]) / 2 if box else np.zeros(d)
+        return [*begin, *along, *half, self.radius]
+
+    def offset(self, points: ArrayLike) -> Floats:
+        """Return the straight way from points (..., D) to its nearest one, (..., D) m; 0 within it."""
+        x, d, row = np.asarray(points, np.float64), self.dimension, np.array(self.row)
+        begin, along, half = row[:d], row[d : 2 * d], row[2 * d : 3 * d]
+        to = begin - x
+        if self.ends:
+            share = np.clip(-(to @ along) / (along @ along), 0, 1)
+            to = to + share[..., None] * along
+        to = np.sign(to) * np.maximum(np.abs(to) - half, 0)
+        if not self.radius:
+            return np.asarray(to)
+        far = np.linalg.norm(to, axis=-1, keepdims=True)
+        return np.asarray(to * np.maximum(far - self.radius, 0) / np.where(far > 0, far, 1))
+
+    def count(self, spacing: float) -> int:
+        """Return how many samples lie along it; the first ones."""
+        return 1 + int(np.ceil(4 * self.length / spacing - 1e-9))
+
+    def samples(self, spacing: float) -> Floats:
+        """Return places of it, (S, D) m: nowhere in it is further from one than about half the spacing."""
+        d, row = self.dimension, np.array(self.row)
+        core = row[:d] + np.linspace(0, 1, self.count(spacing))[:, None] * row[d : 2 * d]
+        if self.low is None and not self.radius:
+            return np.asarray(core)
+        low, high = self.extremes
+        axes = [np.linspace(a, b, 1 + int(np.ceil((b - a) / spacing - 1e-9))) for a, b in zip(low, high, strict=True)]
+        grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, d)
+        inside = np.linalg.norm(self.offset(grid), axis=1) <= 1e-9
+        return np.concatenate([core, grid[inside]])
+
+
+def row_size(dimension: int) -> int:
+    """Return how many numbers a target's row has."""
+    return 3 * dimension + 1
+
+
+def rows_of(targets: Sequence[Target]) -> Floats:
+    """Return the rows of some targets, (T, 3 D + 1)."""
+    return np.array([target.row for target in targets])
+
+
+@law
+def _beyond(x: float, half: float) -> float:
+    """Return how far x is beyond [-half, half]."""
+    return x - half if x > half else (x + half if x < -half else like(x, 0.0))
+
+
+@law
+def _within(offset: Vec, radius: float) -> Vec:
+    """Return an offset that ends a radius earlier; 0 if that is behind its beginning."""
+    length = norm(offset)
+    return scale(offset, (length - radius) / length if length > radius else like(radius, 0.0))
+
+
+@law
+def _share(to_along: float, square: float) -> float:
+    """Return which part of the way along a door is nearest, 0 to 1."""
+    o, e = like(square, 0.0), like(square, 1.0)
+    s = -to_along / square if square > o else o
+    return o if s < o else (e if s > e else s)
+
+
+@law
+def to_target(table: Any, at: int, x: Vec) -> Vec:
+    """Return the straight way from x to the nearest point of the target whose row begins at `at`; 0 within it."""
+    if len(x) == 2:
+        a, b, u, v = table[at] - x[0], table[at + 1] - x[1], table[at + 2], table[at + 3]
+        s = _share(a * u + b * v, u * u + v * v)
+        to: Vec = (_beyond(a + s * u, table[at + 4]), _beyond(b + s * v, table[at + 5]))
+        return _within(to, table[at + 6])
+    else:
+        a, b, c = table[at] - x[0], table[at + 1] - x[1], table[at + 2] - x[2]
+        u, v, w = table[at + 3], table[at + 4], table[at + 5]
+        s = _share(a * u + b * v + c * w, u * u + v * v + w * w)
+        beyond = (_beyond(a + s * u, table[at + 6]), _beyond(b + s * v, table[at + 7]))
+        to = beyond + (_beyond(c + s * w, table[at + 8]),)  # noqa: RUF005  # numba joins tuples, but unpacks none
+        return _within(to, table[at + 9])
+
+
+@law
+def to_any(table: Any, at: int, count: Any, x: Vec) -> Vec:
+    """Return the straight way from x to the nearest of `count` targets whose rows begin at `at`."""
+    best = to_target(table, at, x)
+    size = 3 * len(x) + 1
+    for k in range(1, count):
+        to = to_target(table, at + k * size, x)
+        best = select(dot(to, to) < dot(best, best), to, best)
+    return best

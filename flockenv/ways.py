@@ -1,0 +1,123 @@
+"""Ways around all obstacles of a scene, for behaviours, aims, journeys and routes: where the grid lies, what it says.
+
+One grid (eikonal.way_table) serves everybody who goes to the same targets; laws ask it by `way_ahead`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flockenv.eikonal import Start, free_part, way_table
+from flockenv.grid import MOST_POINTS, covers, sample, sample_vector
+from flockenv.kernels import Vec, law
+from flockenv.space import Torus
+from flockenv.targets import Target, to_any
+from flockenv.vec import norm, select, unit
+
+__all__ = ["check_ways", "region", "starts_of", "towards", "way_ahead", "way_block", "ways_to"]
+
+Floats = NDArray[np.float64]
+
+
+@law
+def way_ahead(table: Any, x: Vec, straight: Vec) -> tuple[float, Vec]:
+    """Return how long the way from x is, m, and its first direction; beyond the grid it is the straight one."""
+    here = covers(table, x)
+    length = sample(table, x, 0) if here else norm(straight)
+    direction = unit(select(here, sample_vector(table, x, 1), straight))
+    return length, direction
+
+
+@law
+def towards(table: Any, x: Vec) -> tuple[float, Vec]:
+    """Return how long the way to the nearest target of a block is, m, and its first direction; 0 and 0 within it.
+
+    A block (see `way_block`) is how many targets there are, how far away the straight way to them is right, m, a row
+    for each of them, and a grid.
+    """
+    count, size = np.int64(table[0]), 3 * len(x) + 1
+    straight = to_any(table, 2, count, x)
+    length, direction = way_ahead(table[2 + count * size :], x, straight)
+    near = norm(straight)
+    close = near <= table[1]
+    return near if close else length, select(close, unit(straight), direction)
+
+
+def region(scene: Any, targets: Sequence[Target], margin: float) -> tuple[Floats, Floats]:
+    """Return the corners of the grid: a box's own, or all that there is and a margin around it."""
+    size = getattr(scene.space, "size", None)
+    if size is not None:
+        return np.zeros(scene.dimension), np.array(size, float)
+    places = [target.extremes for target in targets]
+    places += [np.asarray(shape.extremes) for shape in scene.obstacles]
+    places += [np.asarray(member.place.extremes) for member in scene.population if hasattr(member, "place")]
+    for k, group in enumerate(scene.groups):
+        if group.network is not None:
+            places.append(group.network.points(scene.dimension))
+        elif group.spawn.low is not None or scene.living[k]:
+            places.append(np.array((group.spawn.low, group.spawn.high)))
+    every = np.concatenate(places)
+    return every.min(axis=0) - margin, every.max(axis=0) + margin
+
+
+def starts_of(scene: Any, which: int | None) -> list[Start]:
+    """Return where those of a group begin, or those of all; of a network, or of those who are born later, nothing."""
+    size = getattr(scene.space, "size", None)
+    found = []
+    for k, group in enumerate(scene.groups):
+        low, high = group.spawn.low or (0.0,) * scene.dimension, group.spawn.high or size
+        if which in (None, k) and group.network is None and scene.living[k] and high is not None:
+            found.append(Start(f"groups[{k}]", np.array(low, float), np.array(high, float)))
+    return found
+
+
+def ways_to(
+    scene: Any, targets: Sequence[Target], names: Sequence[str], corners: tuple[Floats, Floats], spacing: float,
+    clearance: float, starts: Sequence[Start] = (),
+) -> Floats:  # fmt: skip
+    """Return the grid of ways to the nearest of some targets."""
+    low, high = (corner.tolist() for corner in corners)
+    return way_table(list(scene.obstacles), targets, low, high, spacing, clearance, names, starts)
+
+
+def way_block(
+    scene: Any, targets: Sequence[Target], names: Sequence[str], corners: tuple[Floats, Floats], spacing: float,
+    clearance: float, starts: Sequence[Start] = (),
+) -> Floats:  # fmt: skip
+    """Return what `towards` reads: the targets, as far as somebody can get there, and the grid of ways to them.
+
+    Nearer to a target than the nearest obstacle is, and than a cell of the grid, the straight way is taken.
+    """
+    grid = ways_to(scene, targets, names, corners, spacing, clearance, starts)
+    free = [free_part(scene.obstacles, *given, spacing, clearance) for given in zip(targets, names, strict=True)]
+    direct = min([spacing, *(float(gap.min()) for _, _, gap in free)])
+    rows = [target.row for target, _, _ in free]
+    return np.concatenate([[len(targets), direct], np.ravel(rows), grid])
+
+
+def check_ways(
+    scene: Any, kind: str, targets: Sequence[Target], names: Sequence[str], margin: float, spacing: float,
+    clearance: float,
+) -> None:  # fmt: skip
+    """Refuse what no way can be found for: a torus, obstacles that move, walls that a grid misses, too large a grid."""
+    for name, target in zip(names, targets, strict=True):
+        if target.dimension != scene.dimension:
+            raise ValueError(f"{name} = {target.shown}: dimension = {scene.dimension}")
+    for k, shape in enumerate(scene.obstacles):
+        if shape.moves:
+            raise ValueError(f"kind = {kind}: its way is found once, and obstacles[{k}] moves")
+        if shape.kind in ("wall", "capsule") and spacing >= 2 * (clearance + shape.radius):
+            raise ValueError(
+                f"spacing = {spacing:g}: must be below {2 * (clearance + shape.radius):g} m, twice clearance and "
+                f"radius of obstacles[{k}], or ways lead through it"
+            )
+    if isinstance(scene.space, Torus):
+        raise ValueError(f"kind = {kind}: on a torus ways lead around; only a plane or a box is allowed")
+    low, high = region(scene, targets, margin)
+    points = float(np.prod((high - low) / spacing + 1))
+    if points > MOST_POINTS:
+        raise ValueError(f"spacing = {spacing:g}: {points:,.0f} points, at most {MOST_POINTS:,} are allowed")
