@@ -83,7 +83,7 @@ def rimea_6(name: str) -> Value:
     run = walked(scene, 90, until=nobody_left)
     took, through = _left(run), _beyond_walls(scene, run)
     late = int(run.alive[-1].sum())
-    note = f"{through} times through a wall" + (f"; {late} of 20 still in after 90 s" if late else "")
+    note = f"{through} times through a wall" + (f"; {late} of 20 stuck" if late else "")
     return Value(took, took < 60 and through == 0, note)
 
 
@@ -98,7 +98,7 @@ def rimea_15(name: str) -> Value:
         run = walked(scene, 150, until=nobody_left)
         inside = int(run.alive[-1].sum())
         times.append(_left(run))
-        note += f"{what} {times[-1]:.1f} s, " if not inside else f"{what}: {inside} of 100 still in after 150 s, "
+        note += f"{what} {times[-1]:.1f} s, " if not inside else f"{what}: {inside} of 100 stuck, "
     short, around, long = times
     return Value(around, short <= around <= long, note.rstrip(", "))
 
@@ -113,7 +113,7 @@ def rimea_9(name: str) -> Value:
         run = walked(public_room(name, 1000, doors), longest, every=0.5, until=nobody_left)
         times.append(_left(run))
         inside = int(run.alive[-1].sum())
-        note += f"{doors} doors {times[-1]:.1f} s; " if not inside else f"{doors} doors: {inside} in after {longest} s; "
+        note += f"{doors} doors {times[-1]:.1f} s; " if not inside else f"{doors} doors: {inside} stuck; "
     ratio = times[1] / times[0]
     return Value(ratio, 1.6 <= ratio <= 2.4, note.rstrip("; "))
 
@@ -162,7 +162,7 @@ def nist_3_1(name: str) -> Value:
         here = np.flatnonzero(run.alive[:, 0, k])[-1]
         right[k] = run.alive[-1, 0, k] == 0 and (run.pos[here, 0, k, 0] > 12) == (k < 15)
     share, inside = 100 * float(right.mean()), int(run.alive[-1].sum())
-    note = f"the last after {_left(run):.1f} s" if not inside else f"{inside} still in after 120 s"
+    note = f"the last after {_left(run):.1f} s" if not inside else f"{inside} stuck"
     wrong = 23 - inside - int(right.sum())
     return Value(share, share == 100, f"{note}; {wrong} by the other exit; {_beyond_walls(scene, run)} times through a wall")
 
@@ -198,7 +198,7 @@ def nist_5_2(name: str) -> Value:
 
 
 def nist_2_8(name: str) -> Value:
-    """100 people through a corridor against 0, 10, 50 and 100: how many come through in 400 s."""
+    """100 people through a corridor against 0, 10, 50 and 100: how many come through."""
     done, last = [], []
     for back in (0, 10, 50, 100):
         scene = counterflow(name, 100, back)
@@ -253,7 +253,7 @@ def faster_is_slower(name: str) -> Value:
         highs.append(float(np.quantile(times, 0.75)))
     best = FASTER[int(np.argmin(medians))]
     note = ", ".join(f"{v:g} m/s {t:.0f} s" for v, t in zip(FASTER, medians, strict=True))
-    note += f"; medians of {FASTER_SEEDS} seeds, {stuck} runs not over after 300 s"
+    note += f"; medians of {FASTER_SEEDS} seeds, {stuck} runs with somebody stuck"
     series = {"speed": list(FASTER), "time": medians, "low": lows, "high": highs}
     return Value(best, None, note, series)
 

@@ -77,7 +77,7 @@ def _scene(
     elif missing > 1:
         everybody[1] = _with_nobody(everybody[1], missing)
     aims = [towards(k, *targets, spacing=spacing) for k, targets in enumerate(goals)]
-    return scene_of(name, everybody, aims, obstacles=tuple(walls), population=tuple(sinks), hiding=True, **fields)
+    return scene_of(name, everybody, aims, obstacles=tuple(walls), population=tuple(sinks), **fields)
 
 
 def gated(x: float, low: float, high: float, *doors: tuple[float, float]) -> tuple[Wall, ...]:

@@ -23,8 +23,11 @@ Floats = NDArray[np.float64]
 WEIDMANN = Spread(mean=1.34, sd=0.26, low=0.3)
 """m/s, how fast pedestrians would like to go (Weidmann 1993): of everybody, unless a case says otherwise."""
 
-STEPS = {"helbing_farkas_vicsek_2000": 0.005}
-"""s, one step of a preset whose bodies rub: 6 cm of two bodies' overlap, kappa d 2 / m < 2 / dt; of all others .02."""
+STEPS = {"helbing_farkas_vicsek_2000": 0.005, "moussaid_2011": 0.05}
+"""s, one step. Of bodies that rub: 6 cm of two bodies' overlap, kappa d 2 / m < 2 / dt; of all others .02."""
+
+PATIENCE = 60.0
+"""s, after which those who are left are stuck, if nobody came out in that time."""
 
 
 class Walk(NamedTuple):
@@ -79,23 +82,24 @@ def lane(length: float, width: float, begin: float = 0.0) -> tuple[Wall, ...]:
 
 def scene_of(name: str, groups: Sequence[Group], aims: Sequence[Effect], **fields: Any) -> Scene:
     """Return a scene of people of a preset, who know where they want to go."""
-    walled = bool(fields.pop("hiding", False))
     fields = {"dt": STEPS.get(name, 0.02), **fields}
-    return Scene(groups=tuple(groups), effects=(*aims, *preset(name, occluded=walled)), **fields)
+    return Scene(groups=tuple(groups), effects=(*aims, *preset(name)), **fields)
 
 
 def walked(
     scene: Scene, seconds: float, *, seed: int = 0, worlds: int = 1, every: float = 0.1,
     until: Callable[[State], bool] | None = None, begin: State | None = None,
 ) -> Walk:  # fmt: skip
-    """Run a scene for so many seconds, or until something is so, and keep an instant every so many."""
+    """Run a scene for so many seconds and keep an instant every so many; `until` something is so, or all are stuck."""
     state = scene.start(seed, worlds) if begin is None else begin
     stride = max(1, round(every / scene.dt))
-    kept = [state]
+    kept, living, since = [state], int(state.alive.sum()), 0.0
     for _ in range(round(seconds / (stride * scene.dt))):
         state = scene.step(state, steps=stride)
         kept.append(state)
-        if until is not None and until(state):
+        now, many = float(state.time[0]), int(state.alive.sum())
+        living, since = (many, now) if many < living else (living, since)
+        if until is not None and (until(state) or now - since > PATIENCE):
             break
     time = np.array([float(s.time[0]) for s in kept])
     arrays = (np.array([np.array(getattr(s, name)) for s in kept]) for name in ("pos", "vel", "alive"))
