@@ -28,7 +28,7 @@ def validate(
     ] = None,
     force: Force = False,
 ) -> None:
-    """Try published models of pedestrians in the scenes of RiMEA and NIST, and show value, bound and verdict of each."""
+    """Try published models of pedestrians in the scenes of RiMEA and NIST: value, bound and verdict of each."""
     from flockenv.outputs import checked_file
     from flockenv.validation import CASES, VERDICTS, cases_named, presets_named, run, trials
 
@@ -56,7 +56,9 @@ def validate(
     else:
         console = new_console()
         show_table(console, "Crowds", asked.rows(), ("case", "", "bound", *asked.presets))
-        show_table(console, "What came of each", [(f.case, f.preset, f.verdict, f.note) for f in asked.findings], [""] * 4)
+        show_table(
+            console, "What came of each", [(f.case, f.preset, f.verdict, f.note) for f in asked.findings], [""] * 4
+        )
         show_table(console, "Verdicts", VERDICTS.items())
     if path is not None:
         _write(path, found)

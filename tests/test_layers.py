@@ -25,7 +25,8 @@ LAYERS = (
     {"snapshot", "implicit", "workspace", "scene", "config", "measures", "grants", "explanation"},
     {"tasks", "world", "policy"},
     {
-        "envs", "sb3", "evaluation", "accuracy", "stress", "experiments", "validation", "render", "trajectory", "survey",
+        "envs", "sb3", "evaluation", "accuracy", "stress", "experiments", "validation", "render", "trajectory",
+        "survey",
     },
     {"gallery", "studies", "measuring", "validating"},
     {"cli"},

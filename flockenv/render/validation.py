@@ -108,7 +108,9 @@ def _write_widths(path: Path, found: Sequence[Finding]) -> None:
         )  # fmt: skip
     widths = np.array([0.7, 1.3])
     axes.plot(widths, 1.9 * widths, color=FAINT, lw=1, ls=(0, (4, 3)), label="J = 1.9 w", zorder=2)
-    axes.plot(widths, float(weidmann_flow(1.75)) * widths, color=FAINT, lw=1, ls=":", label="Weidmann's largest", zorder=2)
+    axes.plot(
+        widths, float(weidmann_flow(1.75)) * widths, color=FAINT, lw=1, ls=":", label="Weidmann's largest", zorder=2
+    )
     for finding in found:
         axes.plot(
             _numbers(finding, "width"), _numbers(finding, "flow"), marker=_mark(finding.preset), ms=5, lw=1,
@@ -144,7 +146,9 @@ def _draw_lanes(axes: Axes, finding: Finding) -> None:
     axes.set_ylim(EDGE / 2 - WIDTH / 2 - 0.1, EDGE / 2 + WIDTH / 2 + 0.1)
     axes.set_xticks([])
     axes.set_yticks([])
-    axes.set_title(f"{_short(finding.preset)}: {finding.verdict}, {finding.note.split(';')[0]}", fontsize=7.5, color=INK)
+    axes.set_title(
+        f"{_short(finding.preset)}: {finding.verdict}, {finding.note.split(';')[0]}", fontsize=7.5, color=INK
+    )
     for spine in axes.spines.values():
         spine.set_color(GRID)
 

@@ -36,5 +36,7 @@ def presets_named(names: list[str]) -> tuple[str, ...]:
 
     for name in names:
         if name not in PRESETS and name not in ALIASES:
-            raise ValueError(f"--preset = {shown(name)}: unknown{nearest(name, [*PRESETS, *ALIASES])}; {', '.join(PRESETS)}")
+            raise ValueError(
+                f"--preset = {shown(name)}: unknown{nearest(name, [*PRESETS, *ALIASES])}; {', '.join(PRESETS)}"
+            )
     return tuple(dict.fromkeys(ALIASES.get(name, name) for name in names)) or VALIDATED

@@ -15,7 +15,7 @@ from flockenv.scene import Scene
 from flockenv.spawn import Spawn
 from flockenv.spread import Spread
 from flockenv.validation.case import Case, Value
-from flockenv.validation.walk import Floats, lane, people, scene_of, wall, walked
+from flockenv.validation.walk import Floats, lane, people, scene_of, walked, wall
 
 __all__ = ["ALONE", "corridor", "crossing_time"]
 

@@ -5,6 +5,7 @@ A torus, so wide that no force reaches around it; along its middle a corridor.
 
 from __future__ import annotations
 
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -18,7 +19,7 @@ from flockenv.space import Torus
 from flockenv.spawn import Spawn
 from flockenv.state import State
 from flockenv.validation.case import Case, Value
-from flockenv.validation.walk import STEPS, Floats, people, scene_of, wall, walked
+from flockenv.validation.walk import STEPS, Floats, people, scene_of, walked, wall
 
 __all__ = ["CORRIDORS", "endless", "lined_up"]
 
@@ -63,7 +64,7 @@ def _sides(length: float, middle: float, width: float) -> tuple[Wall, ...]:
     return tuple(
         wall((float(a), middle + side * width / 2), (float(b), middle + side * width / 2))
         for side in (-1, 1)
-        for a, b in zip(cuts[:-1], cuts[1:], strict=True)
+        for a, b in pairwise(cuts)
     )
 
 

@@ -16,12 +16,12 @@ tests, as far as they are flat. Parameters are the published ones and were fixed
 a model misses, the table shows by how much. `flockenv validate --out docs/crowds.md --force` makes this page, the
 numbers beside it and the pictures; `flockenv validate "rimea 12" --preset helbing_2000` is one cell.
 
-What is ours: who wants to go where is found on a grid around all walls (`way`, .3 m clear of them). Walls do not hide people
-(`occluded: false`, the presets' default: to ask takes 20 times as long). Desired speeds are Weidmann's N(1.34, .26) m/s unless a case says otherwise; masses and
-radii are a preset's own. One step is .02 s, of the preset of 2011 .05 s, of 2000 .005 s (its friction over 6 cm of two
-bodies' overlap; .0025 s in the room of its paper, .001 s where bodies lie in each other from the start). Where nobody
-came out for 60 s, those who are left are stuck. Walls are lines without thickness; whoever's centre
-went to their other side "went through".
+What is ours: who wants to go where is found on a grid around all walls (`way`, .3 m clear of them). Walls do not hide
+people (`occluded: false`, the presets' default: to ask takes 20 times as long). Desired speeds are Weidmann's
+N(1.34, .26) m/s unless a case says otherwise; masses and radii are a preset's own. One step is .02 s, of the preset of
+2011 .05 s, of 2000 .005 s (its friction over 6 cm of two bodies' overlap; .0025 s in the room of its paper, .001 s
+where bodies lie in each other from the start). Where nobody came out for 60 s, those who are left are stuck. Walls are
+lines without thickness; whoever's centre went to their other side "went through". An empty cell was not tried.
 """
 
 PICTURES = {
@@ -54,7 +54,9 @@ def page(results: Results, pictures: str, drawn: Sequence[str]) -> str:
 
 
 def _table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
-    return ["| " + " | ".join(row) + " |" for row in (header, ["---"] * len(header), *(map(_cell, row) for row in rows))]
+    return [
+        "| " + " | ".join(row) + " |" for row in (header, ["---"] * len(header), *(map(_cell, row) for row in rows))
+    ]
 
 
 def _cell(text: str) -> str:

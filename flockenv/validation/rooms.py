@@ -22,8 +22,8 @@ from flockenv.targets import Target
 from flockenv.validation.walk import people, scene_of, wall
 
 __all__ = [
-    "beside", "bottleneck", "corner", "counterflow", "door_between", "gated", "many_rooms", "nobody_left", "public_room",
-    "room", "straight", "towards",
+    "beside", "bottleneck", "corner", "counterflow", "door_between", "gated", "many_rooms", "nobody_left",
+    "public_room", "room", "straight", "towards",
 ]  # fmt: skip
 
 CLEARANCE, SPACING = 0.3, 0.1
@@ -57,7 +57,9 @@ def _nobody(name: str, at: Point, count: int) -> Group:
 
 def _with_nobody(group: Group, more: int) -> Group:
     """Return a group with more places, in which nobody lives."""
-    return group.model_copy(update={"count": group.size + more, "alive": group.size if group.alive is None else group.alive})
+    return group.model_copy(
+        update={"count": group.size + more, "alive": group.size if group.alive is None else group.alive}
+    )
 
 
 def _scene(
@@ -99,7 +101,7 @@ def room(name: str, count: int, size: Point, door: float, speed: Any = None, see
 
 
 def bottleneck(name: str, width: float, count: int = 150, long: float = 5.0) -> Scene:
-    """Return two rooms of 10 x 10 m, one full, and a passage of some width between them; the exit is as wide (RiMEA 12)."""
+    """Return two rooms of 10 x 10 m, one full, a passage of some width between, and an exit as wide (RiMEA 12)."""
     half, end = width / 2, long + 10.0
     walls = (
         wall((0.0, half), (0.0, 5.0), (-10.0, 5.0), (-10.0, -5.0), (0.0, -5.0), (0.0, -half), (long, -half),
@@ -132,7 +134,7 @@ def straight(name: str, count: int, width: float, length: float, begin: float) -
 
 
 def counterflow(name: str, there: int, back: int) -> Scene:
-    """Return two rooms of 10 x 10 m with a corridor of 2 x 10 m between, and people who want to the other (NIST 2.8)."""
+    """Return two rooms of 10 x 10 m, a corridor of 2 x 10 m between, people who want to the other (NIST 2.8)."""
     walls = (
         wall((-5.0, 1.0), (-5.0, 5.0), (-15.0, 5.0), (-15.0, -5.0), (-5.0, -5.0), (-5.0, -1.0), (5.0, -1.0),
              (5.0, -5.0), (15.0, -5.0), (15.0, 5.0), (5.0, 5.0), (5.0, 1.0), (-5.0, 1.0)),
@@ -146,7 +148,7 @@ def counterflow(name: str, there: int, back: int) -> Scene:
 
 
 def door_between(name: str, each: int, door: float) -> Scene:
-    """Return two halves of a room of 16 x 8 m, and people in both who want through a door in the middle to the other."""
+    """Return two halves of a room of 16 x 8 m, and people in both who want through a door to the other."""
     walls = (
         wall((-8.0, -4.0), (8.0, -4.0), (8.0, 4.0), (-8.0, 4.0), (-8.0, -4.0)),
         *gated(0.0, -4.0, 4.0, (-door / 2, door / 2)),
@@ -158,7 +160,7 @@ def door_between(name: str, each: int, door: float) -> Scene:
 
 
 def public_room(name: str, count: int, doors: int) -> Scene:
-    """Return people in a room of 30 x 20 m with four doors of 1 m in its long walls, or only the lower two (RiMEA 9)."""
+    """Return people in a room of 30 x 20 m, four doors of 1 m in its long walls, or the lower two (RiMEA 9)."""
     at = (-7.5, 7.5)
     cuts = (-15.0, at[0] - 0.5, at[0] + 0.5, at[1] - 0.5, at[1] + 0.5, 15.0)
     low = tuple(wall((a, -10.0), (b, -10.0)) for a, b in zip(cuts[::2], cuts[1::2], strict=True))

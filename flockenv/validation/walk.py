@@ -16,7 +16,7 @@ from flockenv.spawn import Spawn
 from flockenv.spread import Spread
 from flockenv.state import State
 
-__all__ = ["STEPS", "WEIDMANN", "Walk", "lane", "people", "scene_of", "wall", "walked"]
+__all__ = ["STEPS", "WEIDMANN", "Walk", "lane", "people", "scene_of", "walked", "wall"]
 
 Floats = NDArray[np.float64]
 
