@@ -1,6 +1,7 @@
 """flockenv's side of every comparison: run by the Python that flockenv is installed in."""
 
 import math
+import warnings
 from itertools import cycle
 from typing import Any
 
@@ -122,10 +123,64 @@ def like_mesa(agents: int) -> Case:
     return boids(agents, 100 * math.sqrt(agents / 100), 10.0, 2.0, "")
 
 
-def like_crowd(agents: int, reach: float) -> Case:
-    """A person per square metre."""
-    about = ". ANOTHER LAW: flockenv has no social force yet; same number and density"
-    return boids(agents, math.sqrt(agents), reach, min(1.0, reach), about)
+def social_corridor(agents: int) -> Case:
+    """A crowd under the preset of 2000 in a corridor of 300 m, a person per square metre at first."""
+    from flockenv.effects import Course
+    from flockenv.presets import preset
+    from flockenv.scene import Group, Scene
+    from flockenv.shapes import Polygon
+    from flockenv.spawn import Spawn
+
+    wide, long = 32.0, 300.0  # m
+    people = Group(
+        count=agents, mass=80.0, radius=0.3, desired_speed=0.8,
+        spawn=Spawn(low=(1.0, 1.0), high=(1.0 + agents * wide / 1000, wide - 1.0), spacing=0.95, jitter=0.1),
+    )  # fmt: skip
+    effects = tuple(
+        effect.model_copy(update={"radius": 2.5}) if effect.steering and hasattr(effect, "radius") else effect
+        for effect in preset("helbing_farkas_vicsek_2000")
+    )
+    room = Polygon(vertices=((0, 0), (long, 0), (long, wide), (0, wide)), hollow=True)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # contacts last for 6 steps, as on the other side
+        scene = Scene(groups=(people,), effects=(Course(direction=(1, 0)), *effects), obstacles=(room,), dt=0.01)
+    does = (
+        f"social force model, one crowd of {agents} people, 1 per m2 at first, float64, dt 0.01 s, semi-implicit: "
+        "repulsion, body force and friction within 2.5 m, four walls, one way to go; no observations, no rewards"
+    )
+    return _walking(scene, does)
+
+
+def social_field(agents: int) -> Case:
+    """A crowd under the preset of 2009 in the open, a person per square metre at first, all the same way."""
+    from flockenv.effects import Course
+    from flockenv.presets import preset
+    from flockenv.scene import Group, Scene
+    from flockenv.spawn import Spawn
+
+    edge = math.sqrt(agents)
+    people = Group(
+        count=agents, mass=80.0, radius=0.25, desired_speed=1.3, spawn=Spawn(low=(0.0, 0.0), high=(edge, edge))
+    )
+    scene = Scene(groups=(people,), effects=(Course(direction=(1, 0)), *preset("moussaid_2009")), dt=0.02)
+    does = (
+        f"social force of Moussaid 2009, one crowd of {agents} people, 1 per m2 at first, float64: turning and slowing "
+        "down for all within 8 m, no walls; no observations, no rewards"
+    )
+    return _walking(scene, does)
+
+
+def _walking(scene: Any, does: str) -> Case:
+    """Step a crowd, and begin again after 2,000 steps, before it piles up or is gone (that is timed too)."""
+    start = scene.start(seed=0)
+    state = scene.step(start)
+
+    def step() -> None:
+        scene.step(state, out=state)
+        if state.tick[0] % 2000 == 0:
+            state.x[...], state.v[...] = start.x, start.v
+
+    return Case(step, scene.agents, does)
 
 
 CASES = {
@@ -138,9 +193,9 @@ CASES = {
     "parallel_pursuit": lambda threads: pursuit_parallel(8, 30),
     "boids_100": lambda threads: like_mesa(100),
     "boids_300": lambda threads: like_mesa(300),
-    "crowd_1000": lambda threads: like_crowd(1000, 2.5),
-    "crowd_100": lambda threads: like_crowd(100, 0.4999 * math.sqrt(100)),
-    "crowd_500": lambda threads: like_crowd(500, 0.4999 * math.sqrt(500)),
+    "crowd_1000": lambda threads: social_corridor(1000),
+    "crowd_100": lambda threads: social_field(100),
+    "crowd_500": lambda threads: social_field(500),
 }
 
 if __name__ == "__main__":

@@ -104,11 +104,16 @@ class Friends(Social):
 dt: 0.02
 groups:
   - {count: 4, mass: 80, radius: 0.25, desired_speed: 1.3, spawn: {low: [-6, -3], high: [-3, 3]}}
-  - {count: 1, mass: 80, radius: 0.25, role: learner, spawn: {low: [0, 2.5], high: [0, 2.5]}}
+  - count: 1
+    mass: 80
+    radius: 0.25
+    desired_speed: 1.3
+    role: learner
+    spawn: {low: [0, 2.5], high: [0, 2.5]}
 effects:
   - {kind: course, group: 0, direction: [1, 0]}
-  - {kind: steer, group: 0, arbitration: {kind: blend}, behaviours: [{kind: driving, tau: 0.5},
-     {kind: friends, group: 1, acceleration: 4, decay: 3, fades: 4, radius: 10}]}
+  - {kind: driving, tau: 0.5}
+  - {kind: steer, group: 0, behaviours: [{kind: friends, group: 1, acceleration: 4, decay: 3, fades: 4, radius: 10}]}
   - {kind: circular_repulsion, strength: 2000, decay: 0.08, radius: 3}
 """
 

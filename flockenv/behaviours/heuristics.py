@@ -159,7 +159,7 @@ def chosen_way(p: Any, me: Me, acc: Vec) -> Vec:
             wall = until_a_wall(p, me, u, p.radius)
             f = min(min(free[k], wall), p.radius)
             d = p.radius * p.radius + f * f - (f + f) * p.radius * dot(aim, u)
-            better = d < best
+            better = d < best - like(d, 1e-6) * p.radius * p.radius  # what rounding tells apart is as good
             best, chosen = d if better else best, select(better, u, chosen)
             ahead = min(free[count + k], wall) if better else ahead
         if j > 0:
@@ -193,7 +193,7 @@ class Heuristics(Effect):
     obstacle_law: ClassVar[str | None] = "round_in_the_way"
     finish_law: ClassVar[str | None] = "chosen_way"
     demo: ClassVar[str | None] = """
-dt: 0.01
+dt: 0.005
 groups:
   - {count: 4, mass: 80, radius: 0.25, desired_speed: 1.3, spawn: {low: [-6, -1.5], high: [-3, 1.5]}}
   - {count: 4, mass: 80, radius: 0.25, desired_speed: 1.3, spawn: {low: [3, -1.5], high: [6, 1.5]}}

@@ -1,0 +1,112 @@
+"""Crowds of 1,000 under each published social force, and beside JuPedSim: `python -m benchmarks.crowd`.
+
+A person per square metre, half of them walking either way on a torus, so that a crowd stays as dense as it was. Then a
+minute of a crowd's time at dt = 0.01 s, on one thread and on two. JuPedSim's social force model runs in turns with ours
+if it is installed (`python -m benchmarks.peers --install jupedsim`), each in a process of its own.
+"""
+
+from __future__ import annotations
+
+import math
+import sys
+import warnings
+from pathlib import Path
+from time import perf_counter
+from typing import Annotated
+
+import typer
+
+from benchmarks.measure import Bench, Contestant, Out, Quick, Rounds, command_line, number
+from benchmarks.peers import CACHE, DONE, SAMPLE, PeerError, python_of, running
+from benchmarks.scenes import stepping
+from flockenv.crew import use_threads
+from flockenv.effects import Course
+from flockenv.presets import PRESETS, preset
+from flockenv.scene import Group, Scene
+from flockenv.space import Torus
+from flockenv.spawn import Spawn
+
+__all__ = ["crowd"]
+
+PEOPLE, SECONDS, DT = 1000, 60.0, 0.01
+
+
+def crowd(name: str, people: int = PEOPLE, dtype: str = "float64") -> Scene:
+    """Two streams of a published model on a torus, a person per square metre."""
+    edge = math.sqrt(people)
+    group = Group(
+        count=people // 2, mass=80.0, radius=0.25, desired_speed=1.3, haste=1.3,
+        spawn=Spawn(low=(0.0, 0.0), high=(edge, edge), spacing=0.9, jitter=0.1),
+    )  # fmt: skip
+    ways = (Course(direction=(1, 0), group=0), Course(direction=(-1, 0), group=1))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # contacts of 2000 last for 6 steps
+        effects = (*ways, *preset(name))
+        return Scene(space=Torus(size=(edge, edge)), groups=(group, group), effects=effects, dt=DT, dtype=dtype)
+
+
+def _models(bench: Bench, dtype: str) -> None:
+    """Race all models, as they are after a second."""
+    contestants = []
+    for name in PRESETS:
+        scene = crowd(name, dtype=dtype)
+        start = scene.run(scene.start(0), 100)
+        met = scene.step(start).counted("pairs") - start.counted("pairs")
+        note = f"each looks at {number(met / PEOPLE)} others"
+        contestants.append(Contestant(name, stepping(scene, start, 1), PEOPLE, note=note))
+    bench.race(f"{PEOPLE:,} people, {dtype}", contestants, baseline="helbing_farkas_vicsek_2000")
+
+
+def _a_minute(bench: Bench, name: str) -> None:
+    """Say how long a minute of a crowd's time takes."""
+    scene, said = crowd(name), []
+    start = scene.run(scene.start(0), 100)
+    for threads in (1, 2):
+        use_threads(threads)
+        began = perf_counter()
+        scene.run(start, round(SECONDS / DT))
+        said.append(f"{perf_counter() - began:.1f} s on {threads} thread{'s' * (threads > 1)}")
+    use_threads(1)
+    bench.note(f"{PEOPLE:,} people for {SECONDS:g} s at dt = {DT:g} s, {name}: {', '.join(said)}.")
+
+
+def _beside_jupedsim(bench: Bench, cache: Path) -> None:
+    """Race a corridor of 1,000 people under the model of 2000, turn by turn."""
+    python = python_of(cache / "jupedsim")
+    if not (cache / "jupedsim" / DONE).is_file() or not python.exists():
+        bench.note("JuPedSim is not installed: python -m benchmarks.peers --install jupedsim")
+        return
+    try:
+        with (
+            running("jupedsim", python, "run_jupedsim.py", "crowd", 1, SAMPLE) as theirs,
+            running("flockenv", Path(sys.executable), "run_ours.py", "crowd_1000", 1, SAMPLE) as ours,
+        ):
+            results = bench.race("corridor, 1,000 people, 2000", [theirs, ours], baseline="jupedsim")
+        if results[1].ratio:
+            bench.note(f"flockenv's rate over JuPedSim's, one thread each: {number(results[1].ratio)}.")
+    except PeerError as error:
+        bench.note(str(error))
+
+
+def main(
+    single: Annotated[bool, typer.Option("--single", help="float32 too, not only float64.")] = False,
+    minute: Annotated[bool, typer.Option(help="Run a minute of the crowd's time too.")] = True,
+    models: Annotated[bool, typer.Option(help="Race all models.")] = True,
+    cache: Annotated[Path, typer.Option(help="Where the virtual environments of peers live.")] = CACHE,
+    quick: Quick = False,
+    rounds: Rounds = None,
+    out: Out = None,
+) -> None:
+    """Measure crowds."""
+    with Bench("crowd", quick, rounds, out) as bench:
+        _beside_jupedsim(bench, cache.expanduser())
+        if minute:
+            for name in ("helbing_farkas_vicsek_2000", "helbing_molnar_1995"):
+                _a_minute(bench, name)
+        for dtype in ("float64", "float32") if single else ("float64",):
+            if models:
+                _models(bench, dtype)
+
+
+if __name__ == "__main__":
+    command_line(main)()
