@@ -252,8 +252,9 @@ def _draw(folder: Path, run: Trajectory, found: Sequence[Survey], asked: Asked, 
     """Write the pictures that there is something to draw for; return their names."""
     import numpy as np
 
-    from flockenv.measures import tail
+    from flockenv.measures import goodness, tail
     from flockenv.render.crowd import write_flow_density, write_gaps, write_lanes, write_space_time
+    from flockenv.survey import SAMPLES
 
     folder.mkdir(parents=True, exist_ok=True)
     drawn = []
@@ -266,13 +267,15 @@ def _draw(folder: Path, run: Trajectory, found: Sequence[Survey], asked: Asked, 
         solids = [*start.outlines, *(p for shape in run.scene.circles for p in shape.polygons(start.low, start.high))]
         alive = run.alive & np.isfinite(run.pos).all(axis=2)
         write_lanes(
-            folder / PICTURES[1], run.pos.astype(np.float64), alive, found[0].way, (start.low, start.high),
+            folder / PICTURES[1], run.pos, alive, found[0].way, (start.low, start.high),
             f"{name}: who went where (orange along {_pointing(found[0].axis)}, blue against it)",
             solids, asked.line, asked.area,
         )  # fmt: skip
         drawn.append(PICTURES[1])
     if (gaps > 0).any():
-        write_gaps(folder / PICTURES[2], gaps, tail(gaps), f"{name}: {len(gaps)} gaps between passages")
+        fit = tail(gaps)
+        title = f"{name}: {len(gaps)} gaps between passages"
+        write_gaps(folder / PICTURES[2], gaps, fit, goodness(gaps, fit, SAMPLES), title)
         drawn.append(PICTURES[2])
     if run.scene.dimension == 2 and len(run.step) > 2:
         time, place, image = _space_time(run, found[0])

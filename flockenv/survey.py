@@ -24,6 +24,12 @@ Floats = NDArray[np.float64]
 INSTANTS = 200
 """At so many instants of a run, evenly, cells, lanes and order are looked at."""
 
+MOST_DEALT = 20_000_000
+"""Directions that are dealt out anew, in all, for the null of lanes."""
+
+SAMPLES = 100
+"""So many samples of a power law are drawn, to see whether gaps are of one."""
+
 UNITS = {
     "agents": "alive, mean",
     "speed": "m/s, mean",
@@ -31,11 +37,13 @@ UNITS = {
     "backward": "crossed it to its left",
     "flow": "1/s, forward less backward",
     "specific flow": "1/(m s), the same per width of the line",
+    "both ways": "1/(m s), forward and backward added",
     "passing": "1/s, forward, from the first to the last: J",
     "time gap": "s, mean between two who go forward",
     "tail exponent": "alpha of p(gap) ~ gap^-alpha; > 2 flows, <= 2 clogs",
     "tail error": "its standard error",
     "tail start": "s, where the power law begins",
+    "tail p": "how often a power law looks less like one; below .1 it is none",
     "bursts": "runs of crossings one way",
     "burst length": "crossings in a burst, mean",
     "burst length by chance": "the same of a coin",
@@ -224,13 +232,16 @@ def _flow(run: _Run) -> Part:
     lasted = float(run.time[-1] - run.time[run.first])
     values: dict[str, float] = {}
     if lasted > 0:
-        through = m.flow(found, float(np.hypot(*(line[1] - line[0]))), lasted)
+        width = float(np.hypot(*(line[1] - line[0])))
+        through = m.flow(found, width, lasted)
         names = ("forward", "backward", "flow", "specific flow", "passing")
         values |= dict(zip(names, map(float, through), strict=True))
+        values["both ways"] = len(found.time) / lasted / width
     gaps = m.time_gaps(found)
     fit, burst = m.tail(gaps), m.bursts(found.sign)
     values |= {
         "time gap": _mean(gaps.tolist()), "tail exponent": fit.alpha, "tail error": fit.error, "tail start": fit.start,
+        "tail p": m.goodness(gaps, fit, SAMPLES),
     }  # fmt: skip
     if {*found.sign.tolist()} == {1, -1}:
         values |= {
@@ -290,7 +301,8 @@ def _lanes(run: _Run) -> Part:
         return {}, {}
     y = pos @ across
     low, high = float(y[here].min()), float(y[here].max())
-    found = m.lanes(y, run.way, low, high + 1e-9 * (1 + abs(high)), here)
+    deals = min(400, max(50, MOST_DEALT // y.shape[1]))
+    found = m.lanes(y, run.way, low, high + 1e-9 * (1 + abs(high)), here, deals=deals)
     return {"lanes": found.order, "lanes by chance": found.null, "lanes p": found.p, "band index": found.bands}, {}
 
 

@@ -242,6 +242,7 @@ def test_when_everybody_is_out() -> None:
     assert evacuation_time(left) == 5.0
     assert evacuation_time(left, 0.95) == 5.0
     assert evacuation_time(left, 0.9) == 4.5
+    assert evacuation_time(left, 0.93) == 5.0  # more than 18 of 20 are 19
     inside[:, 19], inside[:, 18] = True, False
     left = leaving_times(0.5 * np.arange(11), inside)
     assert np.isnan(left[[18, 19]]).all()  # never was inside; still is

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from pathlib import Path
 from typing import Any
 
@@ -53,9 +54,12 @@ def values(found: dict[str, Any]) -> dict[str, float]:
 
 def test_of_two_streams_everything_is_known(capsys: pytest.CaptureFixture[str]) -> None:
     """24 m in 20 s: everybody comes through the line twice, and .4 of them three times, more or less."""
-    assert main(["measure", "streams.yaml", "--time", "20", "--json", "x.json", "--out", "p", *LINE]) == 0
+    assert (
+        main(["measure", "streams.yaml", "--time", "20", "--every", "0.4", "--json", "x.json", "--out", "p", *LINE])
+        == 0
+    )
     said = capsys.readouterr().out
-    assert "positions every 0.1 s, seed 0" in said
+    assert "positions every 0.4 s, seed 0" in said
     assert "Phi, 1 = nobody shares a row" in said
     scene = load_scene(Path("streams.yaml"))
     x = scene.start(0).pos[0, :, 0]
@@ -68,6 +72,7 @@ def test_of_two_streams_everything_is_known(capsys: pytest.CaptureFixture[str]) 
     assert found["forward"] == turns[:40].sum()
     assert found["backward"] == turns[40:].sum()
     assert found["specific flow"] == pytest.approx((turns[:40].sum() - turns[40:].sum()) / 20 / 4)
+    assert found["both ways"] == pytest.approx(turns.sum() / 20 / 4)
     assert found["lanes"] == found["band index"] == 1
     assert found["lanes p"] < 0.05
     assert found["density"] == pytest.approx(2)
@@ -120,7 +125,7 @@ def test_of_the_beginning_as_much_is_skipped_as_asked_for() -> None:
 
 
 def test_many_seeds_have_intervals_and_are_held_against_chance(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["measure", "streams.yaml", "--time", "2", "--seeds", "5", "--seed", "3", "--json", "x.json"]) == 0
+    assert main(["measure", "streams.yaml", "--time", "1", "--seeds", "5", "--seed", "3", "--json", "x.json"]) == 0
     said = capsys.readouterr().out
     assert "seeds 3 to 7: means and 95 % intervals" in said
     assert "Above chance?" in said
@@ -136,7 +141,7 @@ def test_many_seeds_have_intervals_and_are_held_against_chance(capsys: pytest.Ca
 
 def test_the_same_seed_is_the_same_picture() -> None:
     for name in ("a", "b"):
-        assert main(["measure", "streams.yaml", "--time", "2", "--out", name, *LINE]) == 0
+        assert main(["measure", "streams.yaml", "--time", "1", "--out", name, *LINE]) == 0
     for path in Path("a").iterdir():
         assert path.read_bytes() == (Path("b") / path.name).read_bytes()
 
@@ -232,3 +237,25 @@ def test_what_is_there_is_overwritten_only_by_force() -> None:
     (Path("p") / "lanes.png").write_text("mine")
     assert main(["measure", "room.yaml", "--time", "1", "--out", "p"]) == 2
     assert (Path("p") / "lanes.png").read_text() == "mine"
+
+
+def test_the_page_of_measures_shows_what_there_is() -> None:
+    """Its pictures are there and small, the commands it gives exist, and each scene in them is one."""
+    root = Path(__file__).resolve().parent.parent
+    page = (root / "docs" / "measures.md").read_text()
+    pictures = re.findall(r"!\[[^\]]*\]\((measures/\w+\.png)\)", page)
+    assert len(pictures) == 5
+    assert all(1000 < (root / "docs" / name).stat().st_size < 100_000 for name in pictures)
+    scenes = re.findall(r"flockenv measure (configs/\w+\.yaml) ", page)
+    assert len(scenes) == 2
+    for scene in scenes:
+        load_scene(root / scene)
+
+
+def test_a_run_of_one_instant_is_measured_as_far_as_it_goes() -> None:
+    run = record(load_scene(Path("streams.yaml")), 0, 0, 1)
+    found = survey(run, Asked(line=np.array([(5.0, 0.0), (5.0, 4.0)]))).values
+    assert found["density"] == pytest.approx(2)
+    assert found["lanes"] == 1
+    assert "flow" not in found
+    assert math.isnan(found["collisions"])

@@ -105,8 +105,15 @@ def test_noise_takes_order_away() -> None:
 
 
 @pytest.mark.slow
+def test_with_the_old_velocity_there_is_more_order_near_the_transition() -> None:
+    """.28 and not .20 at eta = 4: a loop in numpy with draws of its own found .29 (.32, .27) and .21 (.208, .209)."""
+    found = float(order(flock(4.0, integrator=ExplicitEuler()), 3000, 8000).mean())
+    assert found == pytest.approx(0.282, abs=0.035)
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("noise", SEEN)
 def test_the_curve_is_vicseks(noise: float) -> None:
-    found = float(order(flock(noise), 5000, 20_000, worlds=8).mean())
+    found = float(order(flock(noise), 3000, 8000).mean())
     assert found == pytest.approx(SEEN[noise], abs=0.04)
     assert found <= bound(noise, 400) + 0.001  # without order it is the bound, on average

@@ -174,6 +174,8 @@ class _Cutter(NamedTuple):
         for shift in _shifts(self.period):
             dx, dy = shift[0] * self.period[0], shift[1] * self.period[1]
             there = [(x + dx, y + dy) for x, y in cell]
+            if _apart(there, self.walk):
+                continue
             here = self._walkable(there)
             whole += here
             part += here if self.target is None else self._walkable(cut_by(there, self.target))
@@ -184,7 +186,15 @@ class _Cutter(NamedTuple):
         if len(cell) < 3:
             return 0.0
         inside = size(cut_by(self.walk, cell))
-        return inside - sum(size(cut_by(hole, cell)) for hole in self.holes) if inside > 0 else 0.0
+        return inside - sum(size(cut_by(hole, cell)) for hole in self.holes if not _apart(hole, cell))
+
+
+def _apart(a: Corners, b: Corners) -> bool:
+    """Is one of two polygons wholly beside, above or below the other? Most are, and need not be cut."""
+    return (
+        max(a)[0] <= min(b)[0] or max(b)[0] <= min(a)[0]
+        or max(y for _, y in a) <= min(y for _, y in b) or max(y for _, y in b) <= min(y for _, y in a)
+    )  # fmt: skip
 
 
 def _shifts(period: tuple[float, float]) -> list[tuple[int, int]]:

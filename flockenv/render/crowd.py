@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -54,7 +54,8 @@ def write_flow_density(path: str | Path, density: Floats, speed: Floats, title: 
 
 
 def write_lanes(
-    path: str | Path, pos: Floats, alive: NDArray[np.bool_], way: NDArray[np.int64], region: tuple[Floats, Floats],
+    path: str | Path, pos: NDArray[np.floating[Any]], alive: NDArray[np.bool_],
+    way: NDArray[np.int64], region: tuple[Floats, Floats],
     title: str, solids: Sequence[Floats] = (), line: Floats | None = None, area: Floats | None = None,
 ) -> None:  # fmt: skip
     """Draw where everybody went, (T, N, 2) m, in the colour of his way (N,), and a dot where he is at the end.
@@ -70,7 +71,7 @@ def write_lanes(
     every = -(-pos.shape[0] // MOST_POINTS)
     jump = 0.5 * np.array([wide, tall])
     for k in range(0, pos.shape[1], -(-pos.shape[1] // MOST_WAYS)):
-        places = np.where(alive[:, k, None], pos[:, k], np.nan)[::every]
+        places = np.where(alive[::every, k, None], pos[::every, k], np.nan).astype(np.float64)
         far = (np.abs(np.diff(places, axis=0)) > jump).any(axis=1)
         places = np.insert(places, np.flatnonzero(far) + 1, np.nan, axis=0)
         axes.plot(*places.T, color=_colour(int(way[k])), lw=0.6, alpha=0.5, zorder=2)
@@ -90,8 +91,11 @@ def write_lanes(
     save(figure, path)
 
 
-def write_gaps(path: str | Path, gaps: Floats, fit: Tail, title: str) -> None:
-    """Draw the survival of gaps (G,), s, both axes logarithmic, with the power law of their tail; needs one gap > 0."""
+def write_gaps(path: str | Path, gaps: Floats, fit: Tail, p: float, title: str) -> None:
+    """Draw the survival of gaps (G,), s, both axes logarithmic, with the power law of their tail; needs one gap > 0.
+
+    p: how well the gaps fit it, see `measures.goodness`.
+    """
     figure = new_figure(5.6, 4.4, title)
     axes = figure.subplots()
     times, share = survival(gaps[gaps > 0])
@@ -100,7 +104,8 @@ def write_gaps(path: str | Path, gaps: Floats, fit: Tail, title: str) -> None:
     if np.isfinite(fit.alpha):
         tail = np.geomspace(fit.start, max(times[-1], 1.2 * fit.start), 50)
         at = float((times >= fit.start).mean())
-        label = f"α = {fit.alpha:.2f} ± {fit.error:.2f}, from {fit.start:.2g} s on: {fit.verdict}"
+        said = fit.verdict if p >= 0.1 else "no power law"
+        label = f"α = {fit.alpha:.2f} ± {fit.error:.2f}, from {fit.start:.2g} s on, p = {p:.2g}: {said}"
         axes.plot(tail, at * (tail / fit.start) ** (1 - fit.alpha), color=FORWARD, lw=2, label=label, zorder=4)
         limit = at * (tail / fit.start) ** -1.0
         axes.plot(tail, limit, color=FAINT, lw=1, ls=(0, (4, 3)), label="α = 2: the mean gap diverges", zorder=2)
@@ -119,7 +124,9 @@ def write_space_time(
     figure = new_figure(7.6, 4.2, title)
     axes = figure.subplots()
     mesh = axes.pcolormesh(time, place, density.T, cmap="viridis", vmin=0, rasterized=True)
-    bar = figure.colorbar(mesh, ax=axes, label="density, 1/m²", pad=0.02)
+    bar = figure.colorbar(mesh, ax=axes, pad=0.02)
+    bar.set_label("density, 1/m²", fontsize=9, color=FAINT)
+    bar.ax.tick_params(length=0, labelsize=8, labelcolor=INK)
     bar.outline.set_visible(False)
     if where is not None:
         axes.axhline(where, color="white", lw=1.2, ls=(0, (4, 3)))
