@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Annotated, Any
 
 import numpy as np
@@ -13,7 +12,7 @@ from flockenv.kernels import Vec, law, like
 from flockenv.records import Record
 from flockenv.vec import dot, norm, scale, select
 
-__all__ = ["Target", "row_size", "rows_of", "to_any", "to_target"]
+__all__ = ["Target", "passed", "row_size", "to_any", "to_target"]
 
 Floats = NDArray[np.float64]
 Place = Annotated[tuple[Annotated[float, Field(strict=True)], ...], Field(min_length=2, max_length=3)]
@@ -57,6 +56,11 @@ class Target(Record):
     def shown(self) -> str:
         """The places, as errors show them."""
         return ", ".join(str(place) for place in self._places)
+
+    @property
+    def place(self) -> dict[str, Any]:
+        """The fields that say where it is, and nothing else of it."""
+        return {name: getattr(self, name) for name in Target.model_fields}
 
     @property
     def dimension(self) -> int:
@@ -120,11 +124,6 @@ def row_size(dimension: int) -> int:
     return 3 * dimension + 1
 
 
-def rows_of(targets: Sequence[Target]) -> Floats:
-    """Return the rows of some targets, (T, 3 D + 1)."""
-    return np.array([target.row for target in targets])
-
-
 @law
 def _beyond(x: float, half: float) -> float:
     """Return how far x is beyond [-half, half]."""
@@ -172,3 +171,18 @@ def to_any(table: Any, at: int, count: Any, x: Vec) -> Vec:
         to = to_target(table, at + k * size, x)
         best = select(dot(to, to) < dot(best, best), to, best)
     return best
+
+
+@law
+def passed(table: Any, at: int, was: Vec, now: Vec) -> bool:
+    """Has who was here come into the target whose row begins at `at`, or across it if it is a door? In the plane."""
+    to = to_target(table, at, now)
+    a, b, u, v = table[at], table[at + 1], table[at + 2], table[at + 3]
+    o = like(now[0], 0.0)
+    before = u * (was[1] - b) - v * (was[0] - a)
+    after = u * (now[1] - b) - v * (now[0] - a)
+    part = before / (before - after) if before != after else o
+    x, y = was[0] + part * (now[0] - was[0]) - a, was[1] + part * (now[1] - was[1]) - b
+    along, square = x * u + y * v, u * u + v * v
+    across = (before * after <= o) & (before != after) & (along >= o) & (along <= square) & (square > o)
+    return (dot(to, to) <= o) | across

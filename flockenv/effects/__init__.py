@@ -19,6 +19,7 @@ from flockenv.effects.fields import Carried, Sink, Source, Uniform, Vortex, Wind
 from flockenv.effects.fluctuation import Fluctuation  # noqa: E402
 from flockenv.effects.gravitation import Gravitation, InverseSquare  # noqa: E402
 from flockenv.effects.gravity import Gravity  # noqa: E402
+from flockenv.effects.journey import Journey, Stage  # noqa: E402
 from flockenv.effects.pressure import Pressure  # noqa: E402
 from flockenv.effects.speed_limit import SpeedLimit  # noqa: E402
 from flockenv.effects.springs import AngularSprings, Springs  # noqa: E402
@@ -29,7 +30,7 @@ from flockenv.effects.way import Way  # noqa: E402
 
 __all__ = [
     "EFFECTS", "Aim", "AngularSprings", "Antipode", "Attraction", "Carried", "Contact", "Course", "Drag", "Effect",
-    "Elastic", "Far", "Fluctuation", "Goal", "Gravitation", "Gravity", "InverseSquare", "Me", "ObstacleContact",
-    "Other", "Pressure", "QuadraticDrag", "Sight", "Sink", "Source", "SpeedLimit", "Springs", "Swing", "Tether",
-    "Uniform", "Vicsek", "Vortex", "WallRepulsion", "Way", "Wind",
+    "Elastic", "Far", "Fluctuation", "Goal", "Gravitation", "Gravity", "InverseSquare", "Journey", "Me",
+    "ObstacleContact", "Other", "Pressure", "QuadraticDrag", "Sight", "Sink", "Source", "SpeedLimit", "Springs",
+    "Stage", "Swing", "Tether", "Uniform", "Vicsek", "Vortex", "WallRepulsion", "Way", "Wind",
 ]  # fmt: skip

@@ -54,8 +54,22 @@ class Around(Aim):
     def check(self, scene: Any) -> None:
         """Refuse a torus, obstacles that move, too large a grid, targets in obstacles, or that no way leads to."""
         super().check(scene)
+        if self.keeps:
+            _alone(self, scene)
         check_ways(scene, self.kind, *self.goals, self.margin, self.spacing, self.clearance)
         scene.table_of(self)
+
+
+def _alone(effect: Aim, scene: Any) -> None:
+    """Refuse another effect that keeps the same numbers of the same agents: changes would add up."""
+    first, end = effect.members(scene.starts).values()
+    for k, other in enumerate(scene.effects):
+        if isinstance(other, Around) and other is not effect and set(effect.keeps) & set(other.keeps):
+            theirs = other.members(scene.starts)
+            if theirs["first"] < end and first < theirs["end"]:
+                raise ValueError(
+                    f"group = {effect.group}: effects[{k}], a {other.kind}, says too where some of them go"
+                )
 
 
 class Way(Around):

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.stats import kstest
 
-from flockenv.effects import Course
+from flockenv.effects import Course, Journey, Stage
 from flockenv.scene import Scene
 from flockenv.spawn import Spawn
 from flockenv.spread import Spread
@@ -78,6 +78,17 @@ def turned(name: str) -> Value:
     return Value(off, off <= 0.1, f"{took[1]:.4f} s; not turned {took[0]:.4f} s, difference {took[1] - took[0]:.1g} s")
 
 
+def way_points(name: str) -> Value:
+    """10 m at 1 m/s by four gates on the way, one after another, from 1 m/s on."""
+    begin = (0.0, 0.0)
+    spawn = Spawn(low=begin, high=begin, speed=(1.0, 1.0), heading=(1.0, 0.0))
+    one = people(name, 1, begin, begin, desired_speed=1.0, spawn=spawn)
+    gates = tuple(Stage(ends=((x, -0.8), (x, 0.8))) for x in (2.5, 5.0, 7.5, 10.0))
+    scene = scene_of(name, [one], [Journey(stages=gates, then="leave")], obstacles=lane(20, 2.0, -5.0))
+    took = crossing_time(*_along(scene, 15), 10.0)
+    return Value(took, abs(took - 10.0) <= 0.1, f"{took:.3f} s")
+
+
 def _free_speeds(name: str, spreads: Sequence[Spread], counts: Sequence[int]) -> list[Floats]:
     """Return the speeds of some groups after 6 s, everybody 20 m from everybody else, m/s."""
     groups, done = [], 0.0
@@ -112,6 +123,7 @@ ALONE = (
     Case("rimea 1", "40 m of corridor at 1.33 m/s, s", "26-34 s", rimea_1),
     Case("nist 2.1", "speed in a corridor, at 1 m/s", "1.00 +- .05 m/s", nist_2_1),
     Case("juelich 2", "10 m at 1 m/s, turned by 45 degrees: off by, s", "<= .1 s", turned),
+    Case("juelich 6", "10 m at 1 m/s by four way-points, s", "10 +- .1 s", way_points),
     Case("rimea 7", "50 adults by age: beyond the table by, m/s", "<= .03 m/s", rimea_7),
     Case("nist 2.4", "100 speeds of N(1.2, .2): p of Kolmogorov-Smirnov", "> .05", nist_2_4),
 )
