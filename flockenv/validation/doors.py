@@ -5,14 +5,13 @@ Names and bounds: shared/reference/numerics.md, sections 1.1, 1.2 and 4 (RiMEA, 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from itertools import pairwise
 from typing import Any
 
 import numpy as np
 
-from flockenv.divergence import SimulationDiverged
-from flockenv.integrators import DormandPrince, SemiImplicitEuler
+from flockenv.integrators import DormandPrince, Integrator, SemiImplicitEuler
 from flockenv.measures import Crossings, above_null, bursts, classical_density, crossings, flow
 from flockenv.scene import Scene
 from flockenv.state import State
@@ -38,10 +37,10 @@ DATA = {0.8: (1.29, 1.46), 1.0: (1.71, 2.02), 1.2: (2.03, 2.36)}
 WIDTHS = tuple(DATA)
 SEEDS = 3
 NERVOUS = "helbing_farkas_vicsek_2000"
-FASTER = (1.0, 1.5, 2.0, 3.0, 5.0)
+FASTER = (1.0, 1.5, 2.0, 3.0)
 """m/s, desired speeds of those who want out of a room."""
 
-FASTER_SEEDS = 5
+FASTER_SEEDS = 4
 BURST_SEEDS = 20
 
 
@@ -248,7 +247,7 @@ def faster_is_slower(name: str) -> Value:
     """200 people, 15 x 15 m, a door of 1 m: how long they take, by how fast they would like to go."""
     medians, lows, highs, stuck = [], [], [], 0
     for speed in FASTER:
-        scene = room(name, 200, (15.0, 15.0), 1.0, speed, dt=0.0025)
+        scene = room(name, 200, (15.0, 15.0), 1.0, speed)
         run = walked(scene, 300, worlds=FASTER_SEEDS, every=0.5, until=nobody_left)
         times = np.array([_left(run, b) for b in range(FASTER_SEEDS)])
         stuck += int(np.isnan(times).sum())
@@ -263,26 +262,23 @@ def faster_is_slower(name: str) -> Value:
     return Value(best, None, note, series)
 
 
-def ten_minutes(name: str) -> Value:
-    """200 people push against a shut door for ten minutes, by fixed and by adaptive steps: everything stays finite."""
-    notes, finite = [], True
-    for method, dt in ((SemiImplicitEuler(), 0.0025), (DormandPrince(), 0.01)):
+def pressed(method: Integrator, dt: float) -> Callable[[str], Value]:
+    """Return the trial of 200 people who push against a shut door for ten minutes: everything stays finite."""
+
+    def trial(name: str) -> Value:
         scene = room(name, 200, (15.0, 15.0), 0.02, 1.5, integrator=method, dt=dt)
         state = scene.start(0)
-        try:
-            for _ in range(10):
-                state = scene.step(state, steps=round(60 / dt))
-        except SimulationDiverged as error:
-            finite = False
-            notes.append(f"{method.kind}: {error}")
-            continue
-        notes.append(f"{method.kind}, dt = {dt:g}: {float(state.time[0]):.0f} s, fastest {_fastest(state):.2f} m/s")
-        finite &= bool(np.isfinite(state.x).all())
-    return Value(600.0 if finite else np.nan, finite, "; ".join(notes))
+        for _ in range(10):
+            state = scene.step(state, steps=round(60 / dt))
+        inside = int(((state.pos[0, :200, 0] < 0) & state.alive[0, :200]).sum())
+        note = f"{method.kind}, steps of {dt:g} s: fastest {_fastest(state):.2f} m/s, {inside} of 200 still in the room"
+        return Value(float(state.time[0]), bool(np.isfinite(state.x).all()), note)
+
+    return trial
 
 
 def _fastest(state: State) -> float:
-    return float(np.linalg.norm(state.vel, axis=-1).max())
+    return float(np.linalg.norm(state.vel[state.alive], axis=-1).max())
 
 
 DOORS = (
@@ -298,5 +294,18 @@ DOORS = (
     Case("nist 5.2", "flow by a door of 1 m, /(m s)", "against IMO's 1.33", nist_5_2),
     Case("bursts", "48 + 48 through a door: bursts above a coin's", "> 0 with 95 %, 20 seeds", door_bursts),
     Case("faster is slower", "200 people, door of 1 m: quickest at, m/s", "reported", faster_is_slower, (NERVOUS,)),
-    Case("ten minutes", "200 people, shut door: finite for, s", "600 s, two methods", ten_minutes, (NERVOUS,)),
+    Case(
+        "pressed fixed",
+        "200 people, shut door, semi-implicit: finite for, s",
+        "600 s",
+        pressed(SemiImplicitEuler(), 0.005),
+        (NERVOUS,),
+    ),
+    Case(
+        "pressed adaptive",
+        "200 people, shut door, Dormand-Prince: finite for, s",
+        "600 s",
+        pressed(DormandPrince(), 0.01),
+        (NERVOUS,),
+    ),
 )

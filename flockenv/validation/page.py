@@ -19,7 +19,7 @@ numbers beside it and the pictures; `flockenv validate "rimea 12" --preset helbi
 What is ours: who wants to go where is found on a grid around all walls (`way`, .3 m clear of them). Walls do not hide
 people (`occluded: false`, the presets' default: to ask takes 20 times as long). Desired speeds are Weidmann's
 N(1.34, .26) m/s unless a case says otherwise; masses and radii are a preset's own. One step is .02 s, of the preset of
-2011 .05 s, of 2000 .005 s (its friction over 6 cm of two bodies' overlap; .0025 s in the room of its paper, .001 s
+2011 .05 s, of 2000 .005 s (its friction over 6 cm of two bodies' overlap; .001 s
 where bodies lie in each other from the start). Where nobody came out for 60 s, those who are left are stuck. Walls are
 lines without thickness; whoever's centre went to their other side "went through". An empty cell was not tried.
 """
