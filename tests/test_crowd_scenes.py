@@ -146,6 +146,29 @@ def test_names_that_are_unknown_are_refused_with_the_nearest(capsys: pytest.Capt
     assert "--preset = 'helbing_2001': unknown, did you mean" in capsys.readouterr().err
 
 
+def test_the_command_writes_a_page_and_goes_on_where_it_was(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    calls: list[str] = []
+
+    def trial(name: str) -> Value:
+        calls.append(name)
+        return Value(0.5, False, "half of it")
+
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("flockenv.validation.CASES", (Case("lanes", "made up", "> 1", trial),))
+    for _ in range(2):
+        assert main(["validate", "--preset", "helbing_2000", "--out", "crowds.md"]) == 0
+    assert calls == [NERVOUS]
+    assert "0.5 MISSES" in capsys.readouterr().out
+    assert "half of it" in Path("crowds.md").read_text()
+    assert main(["validate", "--preset", "moussaid_2009", "--json"]) == 0
+    assert Results.model_validate_json(capsys.readouterr().out).findings[0].verdict == "misses"
+    Path("mine.json").write_text("{}")
+    assert main(["validate", "--out", "mine.json"]) == 2
+    assert "holds no findings of crowds" in capsys.readouterr().err
+
+
 def test_when_somebody_was_somewhere_and_when_he_left() -> None:
     time = np.array([0.0, 1.0, 2.0])
     assert crossing_time(time, np.array([0.0, 1.0, 3.0]), 2.0) == 1.5
