@@ -89,15 +89,19 @@ def gated(x: float, low: float, high: float, *doors: tuple[float, float]) -> tup
 
 
 def room(name: str, count: int, size: Point, door: float, speed: Any = None, seed: int = 0, **fields: Any) -> Scene:
-    """Return people in a room whose right wall, at x = 0, has a door in its middle; who is 2 m out is gone."""
+    """Return people in a room whose right wall, at x = 0, has a door in its middle; who is 2 m out is gone.
+
+    A door of 0 m is shut: they press against where it is.
+    """
     wide, high = size[0], size[1] / 2
     walls = (
         wall((0.0, high), (-wide, high), (-wide, -high), (0.0, -high)), *gated(0.0, -high, high, (-door / 2, door / 2)),
     )  # fmt: skip
+    goal = beside((2.5, -2.0), (3.5, 2.0)) if door else beside((-0.35, -0.5), (-0.35, 0.5))
     changes = {} if speed is None else {"desired_speed": speed}
     group = people(name, count, (-wide + 0.1, -high + 0.1), (-0.3, high - 0.1), **changes)
     out = Leaving(low=(-wide - 1, -high - 1), high=(2.0, high + 1))
-    return _scene(name, [group], [[beside((2.5, -2.0), (3.5, 2.0))]], walls, [out], **fields)
+    return _scene(name, [group], [[goal]], walls, [out], **fields)
 
 
 def bottleneck(name: str, width: float, count: int = 150, long: float = 5.0) -> Scene:
