@@ -37,7 +37,7 @@ REMARKS = {
     ".1 m, recalled and not seen in the paper) do not hold: after 30 s at 3 per m^2, 190 of 384 were outside.",
     "rimea 12": "J is of the middle of the passage, from the first to the last of 150, medians of three runs. Both "
     "jambs push who is in between, with 2 kN where a body of 2000 touches: who is .7 m across hardly passes .8 m.",
-    "rimea 15": "The last to arrive decides, who would like to walk as slowly as .5 m/s.",
+    "rimea 15": "The last to arrive decides, who would like to walk at .46 m/s.",
     "rimea 16": "RiMEA's envelope is not in our sources; the line is Seyfried's, d = .36 + 1.06 v.",
     "nist 3.1": "Doors of .9 m: see RiMEA 12 for whom they stop. Who is stuck counts as not having left.",
     "lanes": "The null is a permutation test of every run: directions are dealt out anew among the same people.",
