@@ -128,8 +128,13 @@ def test_verdicts(trial: Any, verdict: str, cell: str) -> None:
 
 
 def test_what_is_known_is_not_tried_again_unless_sources_changed() -> None:
-    calls = []
-    case = Case("x", "made up", "none", lambda name: Value(float(len(calls) if not calls.append(name) else 0), None))
+    calls: list[str] = []
+
+    def trial(name: str) -> Value:
+        calls.append(name)
+        return Value(1.0, None)
+
+    case = Case("x", "made up", "none", trial)
     once = run((case,), (NERVOUS,))
     assert run((case,), (NERVOUS,), once) == once
     run((case,), (NERVOUS,), once.model_copy(update={"sources": "others"}))

@@ -102,5 +102,5 @@ def walked(
         if until is not None and (until(state) or now - since > PATIENCE):
             break
     time = np.array([float(s.time[0]) for s in kept])
-    arrays = (np.array([np.array(getattr(s, name)) for s in kept]) for name in ("pos", "vel", "alive"))
-    return Walk(time, *arrays, np.asarray(scene.body.radius, np.float64), state)
+    pos, vel, alive = (np.array([np.array(getattr(s, name)) for s in kept]) for name in ("pos", "vel", "alive"))
+    return Walk(time, pos, vel, alive, np.asarray(scene.body.radius, np.float64), state)
