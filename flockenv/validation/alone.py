@@ -8,7 +8,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from scipy.stats import kstest
 
 from flockenv.effects import Course, Journey, Stage
 from flockenv.scene import Scene
@@ -112,6 +111,8 @@ def rimea_7(name: str) -> Value:
 
 def nist_2_4(name: str) -> Value:
     """100 people whose speeds are normal, 1.2 +- .2 m/s: whether those they walk at are."""
+    from scipy.stats import kstest  # it looks for torch, and takes half a second
+
     speeds = np.concatenate([
         _free_speeds(name, [Spread(mean=1.2, sd=0.2, seed=seed)], (50,))[0] for seed in (0, 1)
     ])  # fmt: skip

@@ -19,9 +19,10 @@ numbers beside it and the pictures; `flockenv validate "rimea 12" --preset helbi
 What is ours: who wants to go where is found on a grid around all walls (`way`, .3 m clear of them). Walls do not hide
 people (`occluded: false`, the presets' default: to ask takes 20 times as long). Desired speeds are Weidmann's
 N(1.34, .26) m/s unless a case says otherwise; masses and radii are a preset's own. One step is .02 s, of the preset of
-2011 .05 s, of 2000 .005 s (its friction over 6 cm of two bodies' overlap; .001 s
-where bodies lie in each other from the start). Where nobody came out for 60 s, those who are left are stuck. Walls are
-lines without thickness; whoever's centre went to their other side "went through". An empty cell was not tried.
+2011 .05 s, of 2000 .005 s (its friction over 6 cm of two bodies' overlap; .0025 s where
+people hurry, .001 s where bodies lie in each other from the start). Where nobody came out for 60 s, those who are left
+are stuck. Walls are lines without thickness; whoever's centre went to their other side "went through". An empty cell
+was not tried. Seconds are of a machine shared by many: they say little.
 """
 
 PICTURES = {
@@ -40,9 +41,11 @@ REMARKS = {
     "rimea 15": "The last to arrive decides, who would like to walk at .46 m/s.",
     "rimea 16": "RiMEA's envelope is not in our sources; the line is Seyfried's, d = .36 + 1.06 v.",
     "nist 3.1": "Doors of .9 m: see RiMEA 12 for whom they stop. Who is stuck counts as not having left.",
+    "rimea 9": "The last of 1000 decides: a single one who is stuck makes it a miss without a number.",
     "lanes": "The null is a permutation test of every run: directions are dealt out anew among the same people.",
     "bursts": "Crossings until the last of whichever side is done first; the null is a coin with as many heads.",
-    "faster is slower": "Fewer seeds and speeds than the 20 of the protocol: a trend, not a test.",
+    "faster is slower": "Steps of .0025 s: at .005 s and 3 m/s bodies are thrown through walls, and the room is empty "
+    "after 16 s. Fewer seeds than the 20 of the protocol: a trend, not a test.",
 }
 """What is to be known of a case beside its numbers."""
 
