@@ -129,7 +129,7 @@ def rimea_12(name: str) -> Value:
             leave.append(flow(_through(run, 15.0, width / 2, b), width, run.time[-1]).passing)
             ahead.append(float(np.median(_density(run, ((-2.0, -1.0), (0.0, 1.0)), b)[50:300])))
             behind.append(float(np.median(_density(run, ((13.0, -1.0), (15.0, 1.0)), b)[50:300])))
-        found.append(float(np.median(entry)))
+        found.append(float(np.nan_to_num(np.median(entry))))  # who does not come through is no flow
         jams &= bool(np.median(ahead) > np.median(behind) and np.median(entry) - np.median(leave) >= -0.05)
         stuck = int(run.alive[-1].sum())
         notes.append(
