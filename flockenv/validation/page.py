@@ -37,7 +37,8 @@ REMARKS = {
     "who is behind counts half of who is ahead, so a dense crowd is pushed backwards. The walls of 2009 (3 m/s^2 over "
     ".1 m, recalled and not seen in the paper) do not hold: after 30 s at 3 per m^2, 190 of 384 were outside.",
     "rimea 12": "J is of the middle of the passage, from the first to the last of 150, medians of three runs. Both "
-    "jambs push who is in between, with 2 kN where a body of 2000 touches: who is .7 m across hardly passes .8 m. The flows of 2009 lie on the data, but its walls do not hold: of 150 (one run, "
+    "jambs push who is in between, with 2 kN where a body of 2000 touches: who is .7 m across hardly passes .8 m. "
+    "The flows of 2009 lie on the data, but its walls do not hold: of 150 (one run, "
     "1 m) 69 came by the passage, and 87 times somebody went through a wall. What it passes at doors is to be read so.",
     "rimea 15": "The last to arrive decides, who would like to walk at .46 m/s.",
     "rimea 16": "RiMEA's envelope is not in our sources; the line is Seyfried's, d = .36 + 1.06 v.",
