@@ -1,6 +1,6 @@
 """flockenv on the command line.
 
-list | run | measure | render | explain | accuracy | stress | experiment | gallery | warmup | schema
+list | run | measure | render | explain | accuracy | stress | experiment | gallery | validate | warmup | schema
 
 Errors are one line on stderr, exit code 2.
 """
@@ -38,6 +38,7 @@ from flockenv.terminal import (
     relative,
     show_table,
 )  # fmt: skip
+from flockenv.validating import validate
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -257,6 +258,7 @@ app.command()(accuracy)
 app.command()(stress)
 app.command()(experiment)
 app.command()(gallery)
+app.command()(validate)
 
 
 @app.command()

@@ -71,7 +71,20 @@ def test_schema_is_json_and_the_one_of_scenes(capsys: pytest.CaptureFixture[str]
 
 
 @pytest.mark.parametrize(
-    "command", ["list", "run", "measure", "render", "explain", "accuracy", "stress", "experiment", "gallery", "schema"]
+    "command",
+    [
+        "list",
+        "run",
+        "measure",
+        "render",
+        "explain",
+        "accuracy",
+        "stress",
+        "experiment",
+        "gallery",
+        "validate",
+        "schema",
+    ],
 )
 def test_every_command_has_a_page_of_help(command: str) -> None:
     done = CliRunner().invoke(app, [command, "--help"])

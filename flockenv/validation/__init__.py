@@ -1,0 +1,42 @@
+"""Validation: scenes that models of pedestrians are tried in, with every preset, each with a bound, a value, a verdict.
+
+from flockenv.validation import CASES, run
+results = run(CASES, ("helbing_farkas_vicsek_2000",))
+
+Names and bounds are those of RiMEA, NIST TN 1822 and JuPedSim's tests, as shared/reference/numerics.md has them; values
+of presets are the published ones. A miss is a verdict and not an error.
+"""
+
+from __future__ import annotations
+
+from flockenv.presets import PRESETS
+from flockenv.refusals import nearest, shown
+from flockenv.validation.alone import ALONE
+from flockenv.validation.case import Case, Value
+from flockenv.validation.corridors import CORRIDORS
+from flockenv.validation.doors import DOORS
+from flockenv.validation.results import VERDICTS, Finding, Results
+from flockenv.validation.run import cases_named, fingerprint, run, trials
+
+__all__ = [
+    "CASES", "VALIDATED", "VERDICTS", "Case", "Finding", "Results", "Value", "cases_named", "fingerprint",
+    "presets_named", "run", "trials",
+]  # fmt: skip
+
+CASES: tuple[Case, ...] = (*ALONE, *CORRIDORS, *DOORS)
+"""Every case."""
+
+VALIDATED = tuple(name for name in PRESETS if name != "moussaid_2010_groups")
+"""Every preset that says how everybody walks: the groups of 2010 are its 2009 and what keeps parties together."""
+
+
+def presets_named(names: list[str]) -> tuple[str, ...]:
+    """Return the presets of some names, all for none; ValueError with the nearest name for an unknown one."""
+    from flockenv.presets import ALIASES
+
+    for name in names:
+        if name not in PRESETS and name not in ALIASES:
+            raise ValueError(
+                f"--preset = {shown(name)}: unknown{nearest(name, [*PRESETS, *ALIASES])}; {', '.join(PRESETS)}"
+            )
+    return tuple(dict.fromkeys(ALIASES.get(name, name) for name in names)) or VALIDATED

@@ -1,0 +1,162 @@
+"""Cases of corridors without ends: the fundamental diagram, in two and in one dimension, and lanes.
+
+A torus, so wide that no force reaches around it; along its middle a corridor.
+"""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+
+from flockenv.effects import Course
+from flockenv.measures import above_null, classical_density, lanes, single_file_speed, speed_in_area, weidmann_speed
+from flockenv.neighbours import FEWEST_AGENTS
+from flockenv.scene import Scene
+from flockenv.shapes import Wall
+from flockenv.space import Torus
+from flockenv.spawn import Spawn
+from flockenv.state import State
+from flockenv.validation.case import Case, Value
+from flockenv.validation.walk import STEPS, Floats, people, scene_of, walked, wall
+
+__all__ = ["CORRIDORS", "endless", "lined_up"]
+
+EDGE = 32.0
+"""m, of the torus across the corridor, and its least length: the widest sight of a preset is 15 m."""
+
+WIDTH = 4.0
+DENSITIES = (0.5, 1.0, 1.5, 2.0, 2.5, 3.0)
+ALONG = (0.5, 0.75, 1.0, 1.25, 1.5, 1.75)
+"""1/m^2, and 1/m in single file."""
+
+DENSE = {"helbing_farkas_vicsek_2000": 0.001}
+"""s, one step where bodies lie in each other from the start: those of 2000 are .6 m across, and 3 per m^2 fill .85."""
+
+SECONDS, DROPPED = 30.0, 12.0
+LANE_SEEDS, LANE_SECONDS, LANE_LAST = 20, 60.0, 20.0
+EACH_WAY = 48
+
+
+def endless(
+    name: str, counts: tuple[int, int], length: float = EDGE, width: float = WIDTH, ways: tuple[int, int] = (1, -1),
+    dense: bool = False,
+) -> Scene:  # fmt: skip
+    """Return two groups in a corridor without ends, each going its way along it; dense: with bodies that overlap."""
+    middle = EDGE / 2
+    low, high = (0.0, middle - width / 4), (length, middle + width / 4)
+    spawn, nobody = Spawn(low=low, high=high), max(0, FEWEST_AGENTS - sum(counts))
+    groups = [
+        people(name, count + more, low, high, spawn=spawn, alive=count)
+        for count, more in zip(counts, (0, nobody), strict=True)
+    ]  # fmt: skip
+    aims = [Course(group=k, direction=(way, 0)) for k, way in enumerate(ways)]
+    return scene_of(
+        name, groups, aims, space=Torus(size=(length, EDGE)), obstacles=_sides(length, middle, width),
+        dt=(DENSE if dense else STEPS).get(name, 0.02),
+    )  # fmt: skip
+
+
+def _sides(length: float, middle: float, width: float) -> tuple[Wall, ...]:
+    """Return both walls, in thirds: on a torus a shape may not be longer than half of it."""
+    cuts = np.linspace(0.0, length, 4)
+    return tuple(
+        wall((float(a), middle + side * width / 2), (float(b), middle + side * width / 2))
+        for side in (-1, 1)
+        for a, b in pairwise(cuts)
+    )
+
+
+def lined_up(scene: Scene, length: float, width: float, worlds: int = 1, seed: int = 0) -> State:
+    """Return a start on a grid that fills the corridor, everybody at rest, who is where drawn anew for each world."""
+    count = sum(scene.living)
+    rows = max(1, round(np.sqrt(count * width / length)))
+    columns = -(-count // rows)
+    k = np.arange(count)
+    x = (k // rows + 0.5) * length / columns
+    y = EDGE / 2 - width / 2 + (k % rows + 0.5) * width / rows
+    begin = scene.start(seed, worlds)
+    grid, pos = np.stack([x, y], axis=1), np.array(begin.pos)
+    for b in range(worlds):
+        rng = np.random.default_rng([seed, b])
+        pos[b, :count] = grid[rng.permutation(count)] + rng.uniform(-0.02, 0.02, (count, 2))
+    return begin.with_motion(pos, np.zeros_like(pos))
+
+
+def rimea_4(name: str) -> Value:
+    """The fundamental diagram: densities of .5 to 3 per m^2, all go the same way, the last 18 of 30 s."""
+    cloud: dict[str, list[float]] = {"density": [], "speed": []}
+    means = []
+    for density in DENSITIES:
+        count = max(100, round(density * EDGE * WIDTH))
+        length = count / (density * WIDTH)
+        scene = endless(name, (count // 2, count - count // 2), length, WIDTH, (1, 1), density > 2)
+        run = walked(scene, SECONDS, every=1.0, begin=lined_up(scene, length, WIDTH))
+        late = run.time > DROPPED
+        pos, vel = run.pos[late, 0], run.vel[late, 0]
+        means.append(float(vel[..., 0].mean()))
+        for k in range(3):
+            area = _area(length * (k + 0.5) / 3)
+            cloud["density"] += classical_density(pos[::4], area).tolist()
+            cloud["speed"] += speed_in_area(pos[::4], vel[::4], area, along=(1, 0)).tolist()
+    rho, v = np.array(DENSITIES), np.array(means)
+    off = v - weidmann_speed(rho)
+    falls = bool((np.diff(v) < 0).all())
+    worst = float(off[np.abs(off).argmax()])
+    note = f"v = {_listed(v)} m/s at {_listed(rho)} per m^2; {'falls' if falls else 'does not fall everywhere'}"
+    series = {**cloud, "densities": rho.tolist(), "speeds": v.tolist()}
+    return Value(worst, falls and abs(worst) <= 0.25, note, series)
+
+
+def _area(x: float) -> list[tuple[float, float]]:
+    """Return the corners of 4 x 4 m of corridor."""
+    low, high = EDGE / 2 - WIDTH / 2, EDGE / 2 + WIDTH / 2
+    return [(x - 2, low), (x + 2, low), (x + 2, high), (x - 2, high)]
+
+
+def rimea_16(name: str) -> Value:
+    """Single file: a corridor of .8 m, .5 to 1.75 people per m of it."""
+    means = []
+    for density in ALONG:
+        count = round(density * EDGE)
+        scene = endless(name, (count // 2, count - count // 2), EDGE, 0.8, (1, 1), density > 1.25)
+        run = walked(scene, SECONDS, every=1.0, begin=lined_up(scene, EDGE, 0.8 / 4))
+        means.append(float(run.vel[run.time > DROPPED, 0, :count, 0].mean()))
+    rho, v = np.array(ALONG), np.array(means)
+    off = v - np.minimum(single_file_speed(rho), 1.34)
+    worst = float(off[np.abs(off).argmax()])
+    falls = bool((np.diff(v) < 0).all())
+    note = f"v = {_listed(v)} m/s at {_listed(rho)} per m; {'falls' if falls else 'does not fall everywhere'}"
+    return Value(worst, falls and abs(worst) <= 0.25, note, {"densities": rho.tolist(), "speeds": v.tolist()})
+
+
+def _listed(values: Floats) -> str:
+    return ", ".join(f"{x:.2f}" for x in values)
+
+
+def lanes_of(name: str) -> Value:
+    """48 people each way in a corridor 4 m wide: order above its permutation null, over 20 seeds."""
+    scene = endless(name, (EACH_WAY, EACH_WAY))
+    run = walked(scene, LANE_SECONDS, worlds=LANE_SEEDS, every=1.0, begin=lined_up(scene, EDGE, WIDTH, LANE_SEEDS))
+    late = run.time > LANE_SECONDS - LANE_LAST
+    way = np.repeat([1.0, -1.0], EACH_WAY)
+    low, high = EDGE / 2 - WIDTH / 2, EDGE / 2 + WIDTH / 2
+    found = [lanes(run.pos[late, b, :, 1], way, low, high, deals=100) for b in range(LANE_SEEDS)]
+    above = above_null([f.order for f in found], [f.null for f in found])
+    speed = float((run.vel[late][..., 0] * way).mean())
+    note = (
+        f"order {np.mean([f.order for f in found]):.3f}, null {np.mean([f.null for f in found]):.3f}; 95 % of the "
+        f"excess {above.low:.3f} to {above.high:.3f}; p < .05 in {sum(f.p < 0.05 for f in found)} of {LANE_SEEDS}; "
+        f"{speed:.2f} m/s forward"
+    )
+    x, y = run.pos[-5:, 0].reshape(-1, 2).T.round(2).tolist()
+    series: dict[str, Any] = {"x": x, "y": y}
+    return Value(above.excess, above.low > 0, note, series)
+
+
+CORRIDORS = (
+    Case("rimea 4", "fundamental diagram: furthest from Weidmann, m/s", "falls; within .25 for .5-3 /m2", rimea_4),
+    Case("rimea 16", "single file: furthest from Seyfried 2005, m/s", "falls; within .25", rimea_16),
+    Case("lanes", "48 + 48 in a corridor: order above its null", "> 0 with 95 %, 20 seeds", lanes_of),
+)

@@ -1,0 +1,106 @@
+"""People of a preset, scenes they walk in, and what is kept of a run: instants of all its worlds."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flockenv.effects import Effect
+from flockenv.presets import PRESETS, preset
+from flockenv.scene import Group, Scene
+from flockenv.shapes import Wall
+from flockenv.spawn import Spawn
+from flockenv.spread import Spread
+from flockenv.state import State
+
+__all__ = ["STEPS", "WEIDMANN", "Walk", "lane", "people", "scene_of", "walked", "wall"]
+
+Floats = NDArray[np.float64]
+
+WEIDMANN = Spread(mean=1.34, sd=0.26, low=0.3)
+"""m/s, how fast pedestrians would like to go (Weidmann 1993): of everybody, unless a case says otherwise."""
+
+STEPS = {"helbing_farkas_vicsek_2000": 0.005, "moussaid_2011": 0.05}
+"""s, one step. Of bodies that rub: 6 cm of two bodies' overlap, kappa d 2 / m < 2 / dt; of all others .02."""
+
+PATIENCE = 60.0
+"""s, after which those who are left are stuck, if nobody came out in that time."""
+
+
+class Walk(NamedTuple):
+    """T instants of B worlds."""
+
+    time: Floats  # (T,) s
+    pos: Floats  # (T, B, N, 2) m
+    vel: Floats  # (T, B, N, 2) m/s
+    alive: NDArray[np.bool_]  # (T, B, N)
+    radius: Floats  # (N,) m
+    last: State
+
+    def gone(self, world: int = 0) -> Floats:
+        """Return when each was there last, (N,) s; NaN of who still is at the end."""
+        here = self.alive[:, world]
+        last = len(here) - 1 - here[::-1].argmax(axis=0)
+        return np.where(here[-1] | ~here.any(axis=0), np.nan, self.time[np.minimum(last + 1, len(here) - 1)])
+
+
+def people(name: str, count: int, low: Sequence[float], high: Sequence[float], **changes: Any) -> Group:
+    """Return a group of people of a preset who begin between two corners, m, at rest and nobody in another.
+
+    Masses and radii are the preset's; speeds are Weidmann's, or those that are given.
+    """
+    fields = {**PRESETS[name].people, "desired_speed": WEIDMANN, **changes}
+    widest = Group(count=count, **fields).widest
+    spacing = fields.pop("spacing", None)
+    if "spawn" not in fields:
+        fields["spawn"] = _apart(count, low, high, widest) if spacing is None else Spawn(low=low, high=high, **spacing)
+    return Group(count=count, **fields)
+
+
+def _apart(count: int, low: Sequence[float], high: Sequence[float], widest: float) -> Spawn:
+    """Return the widest grid of cells that has room for so many, each anywhere in the middle of his own."""
+    wide, deep = (b - a for a, b in zip(low, high, strict=True))
+    spacing = np.sqrt(wide * deep / count)
+    while int(wide / spacing + 1e-9) * int(deep / spacing + 1e-9) < count:
+        spacing *= 0.995
+    jitter = max(0.0, (spacing / 2 - widest) * 0.9)
+    return Spawn(low=tuple(low), high=tuple(high), spacing=float(spacing), jitter=float(jitter))
+
+
+def wall(*vertices: tuple[float, float]) -> Wall:
+    """Return a thin wall."""
+    return Wall(vertices=vertices)
+
+
+def lane(length: float, width: float, begin: float = 0.0) -> tuple[Wall, ...]:
+    """Return the two walls of a corridor along x, m, around y = 0."""
+    return tuple(wall((begin, side * width / 2), (begin + length, side * width / 2)) for side in (-1, 1))
+
+
+def scene_of(name: str, groups: Sequence[Group], aims: Sequence[Effect], **fields: Any) -> Scene:
+    """Return a scene of people of a preset, who know where they want to go."""
+    fields = {"dt": STEPS.get(name, 0.02), **fields}
+    return Scene(groups=tuple(groups), effects=(*aims, *preset(name)), **fields)
+
+
+def walked(
+    scene: Scene, seconds: float, *, seed: int = 0, worlds: int = 1, every: float = 0.1,
+    until: Callable[[State], bool] | None = None, begin: State | None = None,
+) -> Walk:  # fmt: skip
+    """Run a scene for so many seconds and keep an instant every so many; `until` something is so, or all are stuck."""
+    state = scene.start(seed, worlds) if begin is None else begin
+    stride = max(1, round(every / scene.dt))
+    kept, living, since = [state], int(state.alive.sum()), 0.0
+    for _ in range(round(seconds / (stride * scene.dt))):
+        state = scene.step(state, steps=stride)
+        kept.append(state)
+        now, many = float(state.time[0]), int(state.alive.sum())
+        living, since = (many, now) if many < living else (living, since)
+        if until is not None and (until(state) or now - since > PATIENCE):
+            break
+    time = np.array([float(s.time[0]) for s in kept])
+    pos, vel, alive = (np.array([np.array(getattr(s, name)) for s in kept]) for name in ("pos", "vel", "alive"))
+    return Walk(time, pos, vel, alive, np.asarray(scene.body.radius, np.float64), state)

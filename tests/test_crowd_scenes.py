@@ -1,0 +1,231 @@
+"""Scenes of crowds: bounds of RiMEA and NIST that hold, verdicts, the page, and the scenes in configs/."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from flockenv.cli import main
+from flockenv.config import load_scene
+from flockenv.divergence import SimulationDiverged
+from flockenv.render.validation import write_pictures
+from flockenv.scene import Scene
+from flockenv.validation import CASES, VALIDATED, Case, Finding, Results, Value, cases_named, presets_named, run
+from flockenv.validation.alone import corridor, crossing_time
+from flockenv.validation.case import quietly
+from flockenv.validation.corridors import DENSITIES, EACH_WAY
+from flockenv.validation.doors import DATA, _off
+from flockenv.validation.page import page
+from flockenv.validation.rooms import bottleneck, corner, room
+from flockenv.validation.walk import Walk, walked
+
+ROOT = Path(__file__).parent.parent
+NERVOUS = "helbing_farkas_vicsek_2000"
+CONFIGS = sorted((ROOT / "configs").glob("crowd_*.yaml"))
+slow = pytest.mark.slow
+
+
+def found(name: str, preset: str = NERVOUS) -> Finding:
+    return run(cases_named(CASES, (name,)), (preset,)).findings[0]
+
+
+# --- people walk ------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["rimea 1", "nist 2.1", "juelich 2", "rimea 7"])
+def test_who_walks_alone_walks_as_fast_as_guidelines_ask(name: str) -> None:
+    finding = found(name)
+    assert finding.verdict == "pass", finding.note
+
+
+def test_who_wants_to_walk_slower_is_later_than_rimea_1_allows() -> None:
+    with quietly():
+        run_ = walked(corridor(NERVOUS, 1.1, length=40), 60)
+    assert crossing_time(run_.time, run_.pos[:, 0, 0, 0], 40.0) == pytest.approx(40 / 1.1 + 0.5, abs=0.02)
+
+
+def test_twenty_people_come_around_a_corner_and_through_no_wall() -> None:
+    finding = found("rimea 6")
+    assert finding.verdict == "pass", finding.note
+    assert finding.note == "0 times through a wall"
+
+
+@slow
+@pytest.mark.parametrize("name", ["lanes", "nist 5.1", "rimea 15"])
+def test_what_the_preset_of_2000_holds(name: str) -> None:
+    finding = found(name)
+    assert finding.verdict == "pass", finding.note
+
+
+@slow
+@pytest.mark.parametrize("path", CONFIGS, ids=lambda path: path.stem)
+def test_scenes_of_crowds_run(path: Path) -> None:
+    with quietly():
+        scene = load_scene(path)
+        start = scene.start(0)
+        end = scene.run(start, round(2.0 / scene.dt))
+    here = start.alive[0] & end.alive[0]
+    moved = np.linalg.norm(end.pos[0] - start.pos[0], axis=1)[here]
+    assert np.isfinite(end.pos).all()
+    assert np.median(moved) > 0.3
+
+
+# --- configs say what cases say ---------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("name", "built"),
+    [
+        ("crowd_bottleneck", lambda: bottleneck(NERVOUS, 1.0)),
+        ("crowd_corner", lambda: corner(NERVOUS, 20, 2.0, 10.0, 8.0)),
+        ("crowd_room", lambda: room(NERVOUS, 200, (15.0, 15.0), 1.0, 1.5)),
+    ],
+)
+def test_configs_are_the_scenes_of_the_cases(name: str, built: Any) -> None:
+    with quietly():
+        said, made = load_scene(ROOT / "configs" / f"{name}.yaml"), built()
+    assert _walls(said) == _walls(made)
+    assert said.groups[0].size == made.groups[0].size
+    assert [effect for effect in said.effects if effect.kind != "way"] == [e for e in made.effects if e.kind != "way"]
+    assert said.effects[0] == made.effects[0]
+
+
+def _walls(scene: Scene) -> set[tuple[tuple[float, ...], tuple[float, ...]]]:
+    """Every straight side, its ends in order."""
+    sides = [(a, b) for shape in scene.shapes for a, b in zip(shape.vertices, shape.vertices[1:], strict=False)]  # type: ignore[attr-defined]
+    return {tuple(sorted((tuple(map(float, a)), tuple(map(float, b))))) for a, b in sides}  # type: ignore[misc]
+
+
+# --- verdicts, names, the page ----------------------------------------------------------------------------------------
+
+
+def tried(trial: Any) -> Finding:
+    return run((Case("x", "made up", "none", trial),), (NERVOUS,)).findings[0]
+
+
+def _raise(error: Exception) -> Value:
+    raise error
+
+
+@pytest.mark.parametrize(
+    ("trial", "verdict", "cell"),
+    [
+        (lambda _: Value(1.5, True), "pass", "1.5 ok"),
+        (lambda _: Value(1.5, False), "misses", "1.5 MISSES"),
+        (lambda _: Value(1.5, None), "reported", "1.5"),
+        (lambda _: Value(math.nan, False), "misses", "MISSES"),
+        (lambda _: _raise(ValueError("spacing = 1: no room")), "refused", "refused"),
+        (lambda _: _raise(SimulationDiverged(0, 0, 1, 0.1, None, 0.1, "heun")), "diverges", "diverges"),
+    ],
+)
+def test_verdicts(trial: Any, verdict: str, cell: str) -> None:
+    finding = tried(trial)
+    assert (finding.verdict, finding.cell) == (verdict, cell)
+
+
+def test_what_is_known_is_not_tried_again_unless_sources_changed() -> None:
+    calls: list[str] = []
+
+    def trial(name: str) -> Value:
+        calls.append(name)
+        return Value(1.0, None)
+
+    case = Case("x", "made up", "none", trial)
+    once = run((case,), (NERVOUS,))
+    assert run((case,), (NERVOUS,), once) == once
+    run((case,), (NERVOUS,), once.model_copy(update={"sources": "others"}))
+    assert calls == [NERVOUS] * 2
+
+
+def test_names_that_are_unknown_are_refused_with_the_nearest(capsys: pytest.CaptureFixture[str]) -> None:
+    assert [case.name for case in cases_named(CASES, ("juelich",))] == ["juelich 2", "juelich 6"]
+    assert presets_named(["helbing_2000"]) == (NERVOUS,)
+    assert presets_named([]) == VALIDATED
+    assert main(["validate", "rimea 21"]) == 2
+    assert "case 'rimea 21': unknown" in capsys.readouterr().err
+    assert main(["validate", "rimea 1", "--preset", "helbing_2001"]) == 2
+    assert "--preset = 'helbing_2001': unknown, did you mean" in capsys.readouterr().err
+
+
+def test_the_command_writes_a_page_and_goes_on_where_it_was(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    calls: list[str] = []
+
+    def trial(name: str) -> Value:
+        calls.append(name)
+        return Value(0.5, False, "half of it")
+
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("flockenv.validation.CASES", (Case("lanes", "made up", "> 1", trial),))
+    for _ in range(2):
+        assert main(["validate", "--preset", "helbing_2000", "--out", "crowds.md"]) == 0
+    assert calls == [NERVOUS]
+    assert "0.5 MISSES" in capsys.readouterr().out
+    assert "half of it" in Path("crowds.md").read_text()
+    assert main(["validate", "--preset", "moussaid_2009", "--json"]) == 0
+    assert Results.model_validate_json(capsys.readouterr().out).findings[0].verdict == "misses"
+    Path("mine.json").write_text("{}")
+    assert main(["validate", "--out", "mine.json"]) == 2
+    assert "holds no findings of crowds" in capsys.readouterr().err
+
+
+def test_when_somebody_was_somewhere_and_when_he_left() -> None:
+    time = np.array([0.0, 1.0, 2.0])
+    assert crossing_time(time, np.array([0.0, 1.0, 3.0]), 2.0) == 1.5
+    assert math.isnan(crossing_time(time, np.array([0.0, 1.0, 3.0]), 4.0))
+    alive = np.array([[[True, True, False]], [[True, True, False]], [[False, True, False]]])
+    none = np.zeros((3, 1, 3, 2))
+    gone = Walk(time, none, none, alive, np.zeros(3), None).gone()  # type: ignore[arg-type]
+    np.testing.assert_array_equal(gone, [2.0, np.nan, np.nan])
+
+
+def test_a_flow_is_off_by_what_it_is_outside_of_its_band() -> None:
+    assert _off(1.8, DATA[1.0]) == 0
+    assert _off(0.9 * 1.71, DATA[1.0]) == pytest.approx(-0.1)
+    assert _off(1.2 * 2.02, DATA[1.0]) == pytest.approx(0.2)
+
+
+def made_up() -> Results:
+    cloud = {"density": (0.5, 1.0), "speed": (1.2, None), "densities": DENSITIES, "speeds": (1.0,) * len(DENSITIES)}
+    spots = tuple(float(k % 32) for k in range(5 * 2 * EACH_WAY))
+    series: dict[str, Any] = {
+        "rimea 4": cloud, "rimea 12": {"width": (0.8, 1.0, 1.2), "flow": (1.4, 1.8, 2.2)},
+        "lanes": {"x": spots, "y": spots},
+        "faster is slower": {"speed": (1.0, 2.0), "time": (90.0, 120.0), "low": (80.0, 100.0), "high": (95.0, 130.0)},
+    }  # fmt: skip
+    return Results(
+        findings=tuple(
+            Finding(case=name, title="t", preset=NERVOUS, bound="b", value=1.0, verdict="pass", note="a | b", seconds=1,
+                    series=numbers)
+            for name, numbers in series.items()
+        )
+    )  # fmt: skip
+
+
+def test_the_page_shows_every_finding_and_every_picture(tmp_path: Path) -> None:
+    results = made_up()
+    drawn = write_pictures(tmp_path, results)
+    assert [path.name for path in drawn] == [
+        "fundamental_diagram.png", "bottleneck.png", "lanes.png", "faster_is_slower.png",
+    ]  # fmt: skip
+    assert all(path.stat().st_size > 5000 for path in drawn)
+    text = page(results, "crowds", [path.stem for path in drawn])
+    assert "| lanes | t | b | 1 ok |" in text
+    assert "a \\| b" in text
+    assert "![bottleneck](crowds/bottleneck.png)" in text
+
+
+def test_the_page_in_docs_is_that_of_its_numbers() -> None:
+    """If this fails: flockenv validate --out docs/crowds.md."""
+    results = Results.model_validate_json((ROOT / "docs" / "crowds.json").read_text())
+    drawn = [
+        name for name in ("fundamental_diagram", "bottleneck", "lanes", "faster_is_slower")
+        if (ROOT / "docs" / "crowds" / f"{name}.png").exists()
+    ]  # fmt: skip
+    assert (ROOT / "docs" / "crowds.md").read_text() == page(results, "crowds", drawn)
+    assert {case.name for case in CASES} >= set(results.cases)
