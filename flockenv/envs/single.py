@@ -205,6 +205,8 @@ class SchoolEnv(SingleEnv):
     """A fish lives among scripted fish, food that grows, and a scripted hunter."""
 
     task_type = School
+    fixed: ClassVar[dict[str, Any]] = {"learners": 1}
+    history = "v0: first version (flockenv 0.2.0)."
 
 
 class CrowdNavEnv(SingleEnv):

@@ -398,6 +398,7 @@ class SchoolVectorEnv(WorldsEnv):
     """Fish in schools, one learner per world; the page is that of flockenv.envs.single.SchoolEnv."""
 
     task_type = School
+    fixed: ClassVar[dict[str, Any]] = {"learners": 1}
 
 
 class CrowdNavVectorEnv(WorldsEnv):
