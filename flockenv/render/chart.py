@@ -23,6 +23,9 @@ __all__ = ["COLOURS", "FAINT", "GRID", "INK", "Column", "Row", "draw_chart", "wr
 INK, FAINT, GRID = "#22272e", "#6b7480", "#e4e7eb"
 COLOURS = ("#D55E00", "#0072B2", "#E69F00", "#009E73", "#CC79A7", "#56B4E9")
 """Okabe and Ito's palette, which readers with any colour vision tell apart."""
+ABREAST = 4
+"""Tasks beside each other, at most: more go below."""
+
 FIXED = {"random": "#8a929c", "textbook": "#E69F00", "reynolds": "#0072B2", "ppo": "#D55E00"}
 
 
@@ -65,23 +68,44 @@ def draw_chart(columns: Sequence[Column], title: str, note: str = "") -> Figure:
     from matplotlib.figure import Figure
     from matplotlib.layout_engine import ConstrainedLayoutEngine
 
-    players, pairs = max(len(c.rows) for c in columns), max(len(c.pairs) for c in columns)
-    heights = [0.62 * players + 0.5, 0.34 * players + 0.4] + [0.34 * pairs + 0.4] * (pairs > 0)
-    size = (1.2 + 4.2 * len(columns), sum(heights) + 0.85 * len(heights) + 1.0)
+    wide = -(-len(columns) // -(-len(columns) // ABREAST))  # bands of equal width, but for the last
+    bands = [columns[k : k + wide] for k in range(0, len(columns), wide)]
+    heights = [h for band in bands for h in _heights(band)]
+    size = (1.2 + 4.2 * wide, sum(heights) + 0.85 * len(heights) + 1.0)
     figure = Figure(figsize=size, facecolor="white", layout=ConstrainedLayoutEngine(w_pad=0.12, h_pad=0.08))
     FigureCanvasAgg(figure)
-    grid = figure.subplots(len(heights), len(columns), squeeze=False, height_ratios=heights)
+    grid = figure.subplots(len(heights), wide, squeeze=False, height_ratios=heights)
     colours = _colours([row.name for column in columns for row in column.rows])
-    for k, column in enumerate(columns):
-        _scores(grid[0, k], column, colours)
-        _success(grid[1, k], column, colours)
-        if pairs:
-            _differences(grid[2, k], column)
-        for axes in grid[:, k]:
-            _plain(axes)
+    first = 0
+    for band in bands:
+        rows = grid[first : first + len(_heights(band))]
+        for k in range(wide):
+            _draw_column(list(rows[:, k]), band[k] if k < len(band) else None, colours)
+        first += len(rows)
     figure.suptitle(title, x=0.01, ha="left", fontsize=15, fontweight="bold", color=INK)
     figure.supxlabel(note, x=0.01, ha="left", fontsize=8.5, color=FAINT)
     return figure
+
+
+def _heights(band: Sequence[Column]) -> list[float]:
+    """Return how high the plots of some tasks beside each other are, inches: scores, success, differences if any."""
+    players, pairs = max(len(c.rows) for c in band), max(len(c.pairs) for c in band)
+    return [0.62 * players + 0.5, 0.34 * players + 0.4] + [0.34 * pairs + 0.4] * (pairs > 0)
+
+
+def _draw_column(plots: Sequence[Axes], column: Column | None, colours: Mapping[str, str]) -> None:
+    """Draw one task, from top to bottom; nothing where the last band has no more."""
+    for axes in plots:
+        if column is None:
+            axes.set_axis_off()
+    if column is None:
+        return
+    _scores(plots[0], column, colours)
+    _success(plots[1], column, colours)
+    if len(plots) > 2:
+        _differences(plots[2], column)
+    for axes in plots:
+        _plain(axes)
 
 
 def _colours(names: Sequence[str]) -> dict[str, str]:

@@ -1,0 +1,78 @@
+"""Bottleneck: push, as in 2000; or queue."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from flockenv import steering
+from flockenv.rows import rows
+from flockenv.tasks import Bottleneck
+
+__all__ = ["BottleneckRules", "QueueingRules", "bottleneck", "queueing"]
+
+queue = rows(steering.queue)
+queue_gap = rows(steering.queue_gap)
+repulsion = rows(steering.repulsion)
+separate = rows(steering.separate)
+
+
+@dataclass(frozen=True)
+class BottleneckRules:
+    """Textbook: Helbing, Farkas and Vicsek 2000; bodies and walls themselves are the scene's."""
+
+    tau: float = 0.5  # s, relaxation time
+    speed: float = 1.0  # share of the top speed that is wanted
+    strength: float = 2000.0  # A, N
+    decay: float = 0.08  # B, m
+    walls: float = 2000.0  # A of walls, N
+
+
+def bottleneck(see: Any, task: Bottleneck, p: BottleneckRules) -> np.ndarray:
+    """Drive to the door, and be pushed off by others and by walls, exponentially."""
+    drive = 80.0 * (p.speed * task.max_speed * _to_opening(see, task) - see.velocity) / p.tau
+    tie = np.array([1.0, 0.0])
+    push = p.strength * repulsion(see.neighbours, tie, 2 * _PERSON, p.decay) * see.neighbour_present[..., None]
+    x, y, half = see.door[:, 0], see.door[:, 1], task.width / 2
+    points = [
+        np.stack([x, np.minimum(y - half, 0.0)], axis=-1), np.stack([x, np.maximum(y + half, 0.0)], axis=-1),
+        np.stack([0.0 * x, -see.to_sides[:, 0]], axis=-1), np.stack([0.0 * x, see.to_sides[:, 1]], axis=-1),
+    ]  # fmt: skip
+    off = p.walls * repulsion(np.stack(points, axis=1), tie, _PERSON, p.decay)
+    return drive + push.sum(axis=1) + off.sum(axis=1)
+
+
+def _to_opening(see: Any, task: Bottleneck) -> np.ndarray:
+    """Return the unit vectors to the nearest place of the door where a body fits; straight on before it."""
+    half = max(task.width / 2 - 1.2 * _PERSON, 0.0)
+    aside = see.door[:, 1] - np.clip(see.door[:, 1], -half, half)
+    way = np.stack([np.maximum(see.door[:, 0], 0.0) + 0.1, aside], axis=-1)
+    return way / np.linalg.norm(way, axis=-1)[:, None]
+
+
+@dataclass(frozen=True)
+class QueueingRules:
+    """Reynolds' queue, with the headway of Tordeux, Chraibi and Seyfried 2016."""
+
+    headway: float = 1.0  # s
+    margin: float = 0.05  # m, clearance
+    gain: float = 8.0  # 1/s: at least 4 / headway
+    apart: float = 40.0  # N m, separation
+    radius: float = 0.8  # m, between centres, within which it acts
+
+
+def queueing(see: Any, task: Bottleneck, p: QueueingRules) -> np.ndarray:
+    """Go to the door as fast as the gap ahead allows, and keep a little apart."""
+    way, present = _to_opening(see, task), see.neighbour_present > 0
+    others = see.velocity[:, None] + see.neighbour_velocity
+    gap = queue_gap(way[:, None], see.neighbours, others, 2 * _PERSON + p.margin, task.max_speed)
+    gap = np.where(present, gap, np.inf).min(axis=1).clip(max=1e3)
+    near = present & (np.linalg.norm(see.neighbours, axis=-1) < p.radius)
+    push = p.apart * np.sum(separate(see.neighbours, np.array([1.0, 0.0])) * near[..., None], axis=1)
+    return 80.0 * p.gain * queue(way, see.velocity, gap, task.max_speed, p.headway) + push
+
+
+_PERSON = 0.25
+"""Radius of somebody in the room, m."""

@@ -1,0 +1,80 @@
+"""Corridor: slow down before others, and pass them on one side."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from flockenv import steering
+from flockenv.orca import orca
+from flockenv.rows import rows
+from flockenv.tasks import Corridor
+
+__all__ = ["CorridorOrcaRules", "CorridorRules", "corridor", "orca_corridor"]
+
+keep_clear = rows(orca)
+sidestep = rows(steering.sidestep)
+
+_PERSON = 0.25
+"""Radius of a person, m."""
+
+
+@dataclass(frozen=True)
+class CorridorRules:
+    """Textbook: Moussaid et al. 2009, with its bias to the right, and its walls."""
+
+    tau: float = 0.54  # s, relaxation time
+    strength: float = 4.5  # A, m/s^2
+    importance: float = 2.0  # lambda, s/m, of velocities against positions
+    gamma: float = 0.35  # s, the range of the force per m/s of what closes in
+    angular: float = 2.0  # n, 1/m, of turning
+    forward: float = 3.0  # n', 1/m, of slowing down
+    bias: float = 0.005  # eps, 1/m, to the right
+    walls: float = 3.0  # a, m/s^2
+    wall_decay: float = 0.1  # b, m
+
+
+def corridor(see: Any, task: Corridor, p: CorridorRules) -> np.ndarray:
+    """Drive at the desired speed, off others and off walls; vectors are (along one's way, to its left)."""
+    own = see.velocity[:, None]
+    wish = sidestep(
+        see.neighbours, own, own + see.neighbour_velocity, np.array([1.0, 0.0]), p.importance, p.gamma, p.angular,
+        p.forward, p.bias,
+    )  # fmt: skip
+    push = p.strength * np.sum(wish * see.neighbour_present[..., None], axis=1)
+    return (_ahead(see) - see.velocity) / p.tau + push + _off_walls(see, p.walls, p.wall_decay)
+
+
+def _ahead(see: Any) -> np.ndarray:
+    """Return the velocities that are wanted, m/s."""
+    return np.stack([see.desired_speed, 0.0 * see.desired_speed], axis=-1)
+
+
+def _off_walls(see: Any, strength: float, decay: float) -> np.ndarray:
+    """Return the push off both walls, a exp(-d / b), d from the body's centre."""
+    push = strength * (np.exp(-see.walls[:, 1] / decay) - np.exp(-see.walls[:, 0] / decay))
+    return np.stack([0.0 * push, push], axis=-1)
+
+
+@dataclass(frozen=True)
+class CorridorOrcaRules:
+    """As published, both take half; a wish that is not free is turned right."""
+
+    horizon: float = 2.0  # s, for so long the velocity must be free
+    margin: float = 0.05  # m, clearance for what inertia delays
+    turn: float = 0.3  # rad, a wish that is not free is turned right by this
+    gain: float = 10.0  # kg/s: within a decision
+
+
+def orca_corridor(see: Any, task: Corridor, p: CorridorOrcaRules) -> np.ndarray:
+    """Optimal reciprocal collision avoidance (van den Berg et al. 2011) along the corridor; walls are no neighbours."""
+    others = see.velocity[:, None] + see.neighbour_velocity
+    radius = np.where(see.neighbour_present > 0, _PERSON + p.margin, -1.0)[..., None]
+    seen = np.concatenate([see.neighbours, others, radius, np.full_like(radius, 0.5)], axis=-1)
+    change = keep_clear(
+        see.velocity, _ahead(see), _PERSON, task.max_speed, p.horizon, task.control_dt, p.turn,
+        seen.reshape(len(seen), -1),
+    )  # fmt: skip
+    return p.gain * change + _off_walls(see, 3.0, 0.1)

@@ -1,0 +1,80 @@
+"""Crossing: give way to whom one would meet first, and go on."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from flockenv import arbitration, steering
+from flockenv.orca import orca
+from flockenv.rows import rows
+from flockenv.tasks import Crossing
+
+__all__ = ["CrossingRules", "OrcaRules", "crossing", "orca_crossing"]
+
+allocate = rows(arbitration.allocate)
+arrive = rows(steering.arrive)
+give_way = rows(steering.give_way)
+keep_clear = rows(orca)
+separate = rows(steering.separate)
+unaligned_threat = rows(steering.unaligned_threat)
+
+
+@dataclass(frozen=True)
+class CrossingRules:
+    """Textbook: look three seconds ahead, give way with all the force there is, arrive with the rest."""
+
+    horizon: float = 3.0  # s, how far ahead a meeting counts
+    margin: float = 0.2  # m, clearance beyond the touching distance
+    evade: float = 5.0  # N, strength of an evasion
+    urgency: float = 0.0  # 0: evade with full strength however far ahead; 1: in proportion to nearness in time
+    radius: float = 1.0  # m, neighbours nearer than this push
+    apart: float = 0.0  # N m, separation
+    gain: float = 2.0  # kg/s towards the goal
+    speed: float = 1.0  # share of the top speed that is wanted
+    slow_radius: float = 0.8  # m, slow down within this of the goal
+
+
+def crossing(see: Any, task: Crossing, p: CrossingRules) -> np.ndarray:
+    """Unaligned collision avoidance (Reynolds 1999), then arrive; vectors are (along the course, to its left)."""
+    own = see.velocity[:, None]
+    others = own + see.neighbour_velocity
+    time = unaligned_threat(see.neighbours, own, others, 0.6 + p.margin, p.horizon)
+    time = np.where(see.neighbour_present > 0, time, np.inf)
+    row, first = np.arange(len(time)), np.argmin(time, axis=1)
+    soonest = time[row, first]
+    danger = np.isfinite(soonest)
+    nearness = 1.0 - np.where(danger, soonest, p.horizon) / p.horizon
+    strength = p.evade * (1.0 - p.urgency * (1.0 - nearness)) * danger
+    away = give_way(see.neighbours[row, first], see.velocity, others[row, first], np.where(danger, soonest, 0.0), 1.0)
+    near = see.neighbour_present * (np.linalg.norm(see.neighbours, axis=-1) < p.radius)
+    push = p.apart * np.sum(separate(see.neighbours, np.array([1.0, 0.0])) * near[..., None], axis=1)
+    course = p.gain * arrive(see.goal, see.velocity, p.speed * task.max_speed, p.slow_radius)
+    return allocate(np.stack([away * strength[:, None], push, course], axis=1), task.max_force)
+
+
+@dataclass(frozen=True)
+class OrcaRules:
+    """As published, both take half; a wish that is not free is turned right, or twelve wait for each other."""
+
+    horizon: float = 2.0  # s, for so long the velocity must be free
+    margin: float = 0.1  # m, clearance for what inertia delays
+    turn: float = 0.3  # rad, a wish that is not free is turned right by this
+    gain: float = 10.0  # kg/s: within a decision
+    slow_radius: float = 1.0  # m, slow down within this of the goal
+
+
+def orca_crossing(see: Any, task: Crossing, p: OrcaRules) -> np.ndarray:
+    """Optimal reciprocal collision avoidance (van den Berg et al. 2011) on the way to the goal."""
+    still = np.zeros_like(see.goal)
+    wish = arrive(see.goal, still, task.max_speed, p.slow_radius)
+    others = see.velocity[:, None] + see.neighbour_velocity
+    present = see.neighbour_present > 0
+    radius = np.where(present, 0.3 + p.margin, -1.0)[..., None]
+    seen = np.concatenate([see.neighbours, others, radius, np.full_like(radius, 0.5)], axis=-1)
+    change = keep_clear(
+        see.velocity, wish, 0.3, task.max_speed, p.horizon, task.control_dt, p.turn, seen.reshape(len(seen), -1)
+    )
+    return p.gain * change

@@ -1,0 +1,105 @@
+"""CrowdNav: social force, ORCA, and the two rules of Moussaid et al."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from flockenv import steering
+from flockenv.orca import orca
+from flockenv.rows import rows
+from flockenv.tasks import CrowdNav
+
+__all__ = ["CrowdNavRules", "HeuristicsRules", "RobotOrcaRules", "crowd_nav", "heuristics_crowd_nav", "orca_crowd_nav"]
+
+collision_distance = rows(steering.collision_distance)
+keep_clear = rows(orca)
+seek = rows(steering.seek)
+sidestep = rows(steering.sidestep)
+
+
+@dataclass(frozen=True)
+class CrowdNavRules:
+    """Textbook: Moussaid et al. 2009, as the pedestrians themselves."""
+
+    tau: float = 0.54  # s, relaxation time
+    speed: float = 1.0  # share of the top speed that is wanted
+    strength: float = 4.5  # A, m/s^2
+    importance: float = 2.0  # lambda, s/m, of velocities against positions
+    gamma: float = 0.35  # s, the range of the force per m/s of what closes in
+    angular: float = 2.0  # n, 1/m, of turning
+    forward: float = 3.0  # n', 1/m, of slowing down
+    bias: float = 0.005  # eps, 1/m, to the right
+
+
+def crowd_nav(see: Any, task: CrowdNav, p: CrowdNavRules) -> np.ndarray:
+    """Drive to the goal, slow down before others and pass them on one side; vectors are (along the course, left)."""
+    own = see.velocity[:, None]
+    wish = sidestep(
+        see.neighbours, own, own + see.neighbour_velocity, np.array([1.0, 0.0]), p.importance, p.gamma, p.angular,
+        p.forward, p.bias,
+    )  # fmt: skip
+    way = see.goal / np.maximum(np.linalg.norm(see.goal, axis=-1), 1e-9)[:, None]
+    push = p.strength * np.sum(wish * see.neighbour_present[..., None], axis=1)
+    return (p.speed * task.max_speed * way - see.velocity) / p.tau + push
+
+
+@dataclass(frozen=True)
+class RobotOrcaRules:
+    """As published, but for the share: whom nobody sees must do all there is to do."""
+
+    horizon: float = 2.0  # s, for so long the velocity must be free
+    margin: float = 0.1  # m, clearance for what inertia delays
+    turn: float = 0.0  # rad, a wish that is not free is turned right by this
+    gain: float = 10.0  # kg/s: within a decision
+    share: float = 1.0  # of the change that is its own where it is not seen; a half where it is
+
+
+def orca_crowd_nav(see: Any, task: CrowdNav, p: RobotOrcaRules) -> np.ndarray:
+    """Optimal reciprocal collision avoidance (van den Berg et al. 2011) on the way to the goal."""
+    wish = seek(see.goal, np.zeros_like(see.goal), task.max_speed)
+    others = see.velocity[:, None] + see.neighbour_velocity
+    radius = np.where(see.neighbour_present > 0, _PEDESTRIAN + p.margin, -1.0)[..., None]
+    share = np.full_like(radius, 0.5 if task.visible else p.share)
+    seen = np.concatenate([see.neighbours, others, radius, share], axis=-1)
+    change = keep_clear(
+        see.velocity, wish, _ROBOT, task.max_speed, p.horizon, task.control_dt, p.turn, seen.reshape(len(seen), -1)
+    )
+    return p.gain * change
+
+
+@dataclass(frozen=True)
+class HeuristicsRules:
+    """As published; it sees no further than it is shown."""
+
+    tau: float = 0.5  # s, relaxation time, and the time that it keeps to what is ahead
+    reach: float = 10.0  # d_max, m
+    view: float = 75.0  # degrees to either side of where it goes
+    margin: float = 0.0  # m, clearance
+
+
+def heuristics_crowd_nav(see: Any, task: CrowdNav, p: HeuristicsRules) -> np.ndarray:
+    """Look where the way is free, and go no faster than is safe (Moussaid, Helbing and Theraulaz 2011)."""
+    aim = see.goal / np.maximum(np.linalg.norm(see.goal, axis=-1), 1e-9)[:, None]
+    speed = np.linalg.norm(see.velocity, axis=-1)[:, None]
+    gaze = np.where(speed > 0.05, see.velocity / np.maximum(speed, 1e-9), aim)
+    turn = np.radians(np.linspace(-p.view, p.view, 31))
+    cosine, sine = np.cos(turn), np.sin(turn)
+    ways = np.stack([gaze[:, :1] * cosine - gaze[:, 1:] * sine, gaze[:, :1] * sine + gaze[:, 1:] * cosine], axis=-1)
+    ways = np.concatenate([aim[:, None], ways], axis=1)  # the aim first: of what is as good, what it wants
+    seen, moving = see.neighbour_present[:, :, None] > 0, see.velocity[:, None] + see.neighbour_velocity
+    clearance, one = _ROBOT + _PEDESTRIAN + p.margin, ways[:, None]
+    free = collision_distance(one, see.neighbours[:, :, None], moving[:, :, None], clearance, task.max_speed)
+    free = np.where(seen, free, np.inf).min(axis=1).clip(max=p.reach)
+    now = collision_distance(one, see.neighbours[:, :, None], np.zeros(2), clearance, 1.0)
+    now = np.where(seen, now, np.inf).min(axis=1)
+    left = p.reach**2 + free**2 - 2.0 * p.reach * free * np.sum(ways * aim[:, None], axis=-1)
+    row, best = np.arange(len(left)), np.argmin(left, axis=1)
+    safe = np.minimum(task.max_speed, now[row, best] / p.tau)[:, None]
+    return (safe * ways[row, best] - see.velocity) / p.tau
+
+
+_ROBOT, _PEDESTRIAN = 0.3, 0.25
+"""Radii of the robot and of a pedestrian, m."""

@@ -1,0 +1,81 @@
+"""Evade: around what is in the way, off the walls, away from pursuers, into cover."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from flockenv import arbitration, shapes, steering
+from flockenv.rows import rows
+from flockenv.tasks import Evade
+
+__all__ = ["EvadeRules", "evade"]
+
+allocate = rows(arbitration.allocate)
+arrive = rows(steering.arrive)
+avoid = rows(steering.avoid)
+contain = rows(steering.contain)
+evade_from = rows(steering.evade)
+hiding_place = rows(steering.hiding_place)
+ray_hit = rows(shapes.ray_hit)
+threat = rows(steering.threat)
+
+
+@dataclass(frozen=True)
+class EvadeRules:
+    """Textbook: evade whoever is near, hide from the nearest otherwise (Reynolds 1999), in order of priority."""
+
+    horizon: float = 1.0  # s, how far ahead cover counts that is in the way
+    avoid: float = 5.0  # kg/s, strength of steering around it
+    wall: float = 0.5  # s, how far ahead walls count
+    alarm: float = 10.0  # m, within which a pursuer is evaded: as far as it sees
+    predict: float = 0.5  # s, how far ahead a pursuer is predicted at most
+    evade: float = 5.0  # kg/s, strength of an evasion
+    crowd: float = 1.0  # how much farther pursuers count beside the nearest; 0: he alone
+    middle: float = 0.2  # N/m towards the middle of the field while evading
+    margin: float = 1.0  # m, behind cover
+    danger: float = 0.0  # m added to the way to a hiding place per m that a pursuer is nearer to it than 10 m
+    exposed: float = 0.0  # m added to it for each pursuer that sees that place
+    hide: float = 3.0  # kg/s, towards the hiding place
+
+
+def evade(see: Any, task: Evade, p: EvadeRules) -> np.ndarray:
+    """Avoid, contain, evade, hide: allocation in that order (Reynolds 1987)."""
+    top, row = task.evader_speed, np.arange(len(see.velocity))
+    speed = np.linalg.norm(see.velocity, axis=-1)
+    forward = see.velocity / np.maximum(speed, 1e-9)[:, None]
+    there, clearance = see.cover_radius > 0, see.cover_radius + 0.4
+    hit = np.where(there, threat(forward[:, None], see.cover, clearance, (speed * p.horizon)[:, None]), np.inf)
+    first = np.argmin(hit, axis=1)
+    aside = p.avoid * avoid(forward, see.cover[row, first], clearance[row, first], top)
+    aside *= np.isfinite(hit[row, first])[:, None]
+    inside = 5.0 * contain(see.to_low - 0.5, see.to_high - 0.5, see.velocity, top, p.wall)
+
+    distance = np.linalg.norm(see.pursuers, axis=-1)
+    time = np.minimum(distance / task.pursuer_speed, p.predict)
+    flight = evade_from(see.pursuers, see.velocity[:, None], see.pursuer_velocity, top, time)
+    rank = np.where(np.arange(distance.shape[1]) == 0, 1.0, p.crowd)
+    weight = rank * (distance < p.alarm) / np.maximum(distance, 0.1) ** 2
+    away = p.evade * np.sum(flight * weight[..., None], axis=1) / np.maximum(weight.sum(axis=1), 1e-9)[:, None]
+    near = (weight.sum(axis=1) > 0)[:, None]
+    away += p.middle * (see.to_high - see.to_low) / 2 * near
+
+    places = hiding_place(see.cover, see.cover_radius, p.margin, see.pursuers[:, :1])
+    theirs = np.linalg.norm(places[:, :, None] - see.pursuers[:, None], axis=-1).min(axis=-1)
+    way = np.linalg.norm(places, axis=-1) + p.danger * np.maximum(10.0 - theirs, 0.0)
+    way += p.exposed * _watchers(places, see)
+    soonest = np.argmin(np.where(there, way, np.inf), axis=1)
+    hidden = p.hide * arrive(places[row, soonest], see.velocity, top, 0.5) * there.any(axis=1)[:, None]
+    return allocate(np.stack([aside, inside, away, hidden], axis=1), task.evader_force)
+
+
+def _watchers(places: np.ndarray, see: Any) -> np.ndarray:
+    """Return how many pursuers have no cover between themselves and each of the places (R, K)."""
+    ways = places[:, :, None] - see.pursuers[:, None]
+    length = np.linalg.norm(ways, axis=-1)
+    stones = (see.cover[:, None, :] - see.pursuers[:, :, None])[:, None]
+    hit = ray_hit(stones, (ways / np.maximum(length, 1e-9)[..., None])[..., None, :], see.cover_radius[:, None, None])
+    hit = np.where(see.cover_radius[:, None, None] > 0, hit, np.inf)
+    return np.sum(hit.min(axis=-1) > length, axis=-1)

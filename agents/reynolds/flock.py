@@ -1,0 +1,59 @@
+"""Flock: avoid, keep apart, fly as the others do, stay with them, and on course."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from flockenv import arbitration, steering
+from flockenv.rows import rows
+from flockenv.tasks import Flock
+
+__all__ = ["FlockRules", "flock"]
+
+align = rows(steering.align)
+allocate = rows(arbitration.allocate)
+avoid = rows(steering.avoid)
+separate = rows(steering.separate)
+threat = rows(steering.threat)
+
+
+@dataclass(frozen=True)
+class FlockRules:
+    """Textbook: Reynolds' order of 1987, collision avoidance first, then matching velocity, then centring."""
+
+    horizon: float = 2.0  # s, look-ahead for obstacles
+    margin: float = 0.3  # m, clearance from obstacles
+    evade: float = 5.0  # kg/s, strength of an evasion
+    radius: float = 1.5  # m, neighbours nearer than this push
+    apart: float = 2.0  # N m, separation
+    match: float = 1.5  # kg/s, alignment
+    centre: float = 0.3  # N/m, cohesion
+    course: float = 2.0  # kg/s, towards the cruising velocity
+    blend: float = 0.0  # 0: allocate in order; 1: sum up
+
+
+def flock(see: Any, task: Flock, p: FlockRules) -> np.ndarray:
+    """Avoid, separate, align, cohere, follow the heading; vectors are (along the heading, to its left)."""
+    speed = np.linalg.norm(see.velocity, axis=-1)
+    forward = see.velocity / np.maximum(speed, 1e-9)[:, None]
+    clearance = see.obstacle_radius + 0.3 + p.margin
+    distance = threat(forward[:, None], see.obstacles, clearance, (speed * p.horizon)[:, None])
+    distance = np.where(see.obstacle_radius > 0, distance, np.inf)
+    first, row = np.argmin(distance, axis=1), np.arange(len(speed))
+    around = avoid(forward, see.obstacles[row, first], clearance[row, first], task.max_speed)
+    evasion = p.evade * around * np.isfinite(distance[row, first])[:, None]
+
+    here = see.neighbour_present
+    count = np.maximum(here.sum(axis=1), 1.0)[:, None]
+    near = here * (np.linalg.norm(see.neighbours, axis=-1) < p.radius)
+    push = p.apart * np.sum(separate(see.neighbours, np.array([1.0, 0.0])) * near[..., None], axis=1)
+    mean_velocity = see.velocity + np.sum(see.neighbour_velocity * here[..., None], axis=1) / count
+    match = p.match * align(see.velocity, mean_velocity)
+    centre = p.centre * np.sum(see.neighbours * here[..., None], axis=1) / count
+    course = p.course * (np.array([task.cruise, 0.0]) - see.velocity)
+    ordered = allocate(np.stack([evasion, push, match, centre, course], axis=1), task.max_force)
+    summed = evasion + push + match + centre + course
+    return (1.0 - p.blend) * ordered + p.blend * summed

@@ -1,0 +1,53 @@
+"""Herd: collect who strays, else drive them all from behind."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from flockenv import arbitration, steering
+from flockenv.rows import rows
+from flockenv.tasks import Herd
+
+__all__ = ["HerdRules", "herd"]
+
+allocate = rows(arbitration.allocate)
+arrive = rows(steering.arrive)
+avoid = rows(steering.avoid)
+herd_from = rows(steering.herd_from)
+threat = rows(steering.threat)
+
+
+@dataclass(frozen=True)
+class HerdRules:
+    """Textbook: Strombom et al. 2014; lengths in units of the distance r_a that sheep keep from each other."""
+
+    together: float = 1.0  # times r_a N^(2/3): who is farther from the centre is collected
+    collecting: float = 1.0  # r_a, behind who is collected
+    driving: float = 1.0  # times r_a sqrt(N), behind the centre
+    near: float = 3.0  # r_a, to the nearest sheep: slower within this
+    slow: float = 0.0  # share of the top speed within it
+    gain: float = 5.0  # kg/s, a change of velocity is asked for within 1/gain seconds
+    around: float = 0.0  # kg/s: keep outside a circle about the flock on the way to the place behind it
+    width: float = 1.0  # of that circle, times the distance of the farthest sheep from the centre
+    apart: float = 4.0  # N, away from other dogs, in proportion to nearness within 10 m
+
+
+def herd(see: Any, task: Herd, p: HerdRules) -> np.ndarray:
+    """Go behind who strays, or behind all of them, and stand still near a sheep; vectors are (along, left)."""
+    r, n, top = task.apart_distance, task.sheep, task.dog_speed
+    together, driving = p.together * r * n ** (2 / 3), p.driving * r * n**0.5
+    place = herd_from(see.centre, see.farthest, see.goal, together, p.collecting * r, driving)
+    nearest = np.where(see.sheep_present[:, 0] > 0, np.linalg.norm(see.sheep[:, 0], axis=-1), np.inf)
+    speed = np.where(nearest < p.near * r, p.slow, 1.0) * top
+    course = p.gain * arrive(place, see.velocity, speed, 0.5)
+    way = place / np.maximum(np.linalg.norm(place, axis=-1), 1e-9)[:, None]
+    clearance = p.width * see.stray + 2.0 * r
+    blocked = np.isfinite(threat(way, see.centre, clearance, np.linalg.norm(place, axis=-1)))
+    detour = p.around * avoid(way, see.centre, clearance, top) * blocked[:, None]
+    distance = np.linalg.norm(see.mates, axis=-1)[..., None]
+    push = -see.mates / np.maximum(distance, 1e-9) * np.maximum(1.0 - distance / 10.0, 0.0)
+    mates = p.apart * np.sum(push, axis=1)
+    return allocate(np.stack([mates, detour, course], axis=1), task.dog_force)

@@ -1,0 +1,57 @@
+"""Obstacles: arrive at the goal, around what is in the way."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from flockenv import arbitration, steering
+from flockenv.rows import rows
+from flockenv.tasks import Obstacles
+
+__all__ = ["ObstaclesRules", "obstacles"]
+
+allocate = rows(arbitration.allocate)
+avoid = rows(steering.avoid)
+seek = rows(steering.seek)
+threat = rows(steering.threat)
+
+
+@dataclass(frozen=True)
+class ObstaclesRules:
+    """Textbook: look two seconds ahead, evade with all the force there is, seek with the rest."""
+
+    horizon: float = 2.0  # s, how far ahead a threat counts at the present speed
+    margin: float = 0.2  # m, clearance beyond the touching distance
+    evade: float = 5.0  # kg/s, strength of an evasion
+    urgency: float = 0.0  # 0: evade with full strength at any distance; 1: in proportion to nearness
+    brake: float = 0.0  # kg/s against the speed, in proportion to nearness
+    gain: float = 2.0  # kg/s towards the goal
+    speed: float = 1.0  # share of the top speed that is wanted
+    push: float = 0.0  # N m, repulsion from the nearest surfaces (1/gap), a force field for close quarters
+
+
+def obstacles(see: Any, task: Obstacles, p: ObstaclesRules) -> np.ndarray:
+    """Steer to avoid what the straight path touches first (Reynolds 1999), then seek; allocation as in 1987."""
+    speed = np.linalg.norm(see.velocity, axis=-1)
+    goal_way = see.goal / np.maximum(np.linalg.norm(see.goal, axis=-1), 1e-9)[:, None]
+    forward = np.where(speed[:, None] > 0.05, see.velocity / np.maximum(speed, 1e-9)[:, None], goal_way)
+    reach = np.maximum(speed, 0.5) * p.horizon
+    clearance = see.obstacle_radius + 0.3 + p.margin
+    distance = threat(forward[:, None], see.obstacles, clearance, reach[:, None])
+    distance = np.where(see.obstacle_radius > 0, distance, np.inf)
+    first = np.argmin(distance, axis=1)
+    row = np.arange(len(first))
+    nearest = distance[row, first]
+    danger = np.isfinite(nearest)
+    nearness = 1.0 - np.where(danger, nearest / np.maximum(reach, 1e-9), 1.0)
+    strength = p.evade * (1.0 - p.urgency * (1.0 - nearness)) * danger
+    aside = avoid(forward, see.obstacles[row, first], clearance[row, first], task.max_speed)
+    evasion = aside * strength[:, None] - p.brake * see.velocity * nearness[:, None]
+    away = -see.obstacles / np.maximum(np.linalg.norm(see.obstacles, axis=-1), 1e-9)[..., None]
+    seen = (see.obstacle_radius > 0) & (see.clearance < 1.0)
+    field = p.push * np.sum(away * (seen / np.maximum(see.clearance, 0.05))[..., None], axis=1)
+    course = p.gain * seek(see.goal, see.velocity, p.speed * task.max_speed)
+    return allocate(np.stack([evasion, field, course], axis=1), task.max_force)

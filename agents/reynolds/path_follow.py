@@ -1,0 +1,57 @@
+"""PathFollow: seek the track ahead if the predicted place is off it; brake before a bend."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from flockenv import steering
+from flockenv.rows import rows
+from flockenv.tasks import PathFollow
+
+__all__ = ["PathFollowRules", "path_follow"]
+
+follow_path = rows(steering.follow_path)
+
+
+@dataclass(frozen=True)
+class PathFollowRules:
+    """Textbook: half a second ahead, the whole track is the tube, full speed whatever comes."""
+
+    time: float = 0.5  # s, how far ahead it predicts itself
+    lead: float = 0.5  # s, how far ahead at its present speed the point lies that is sought
+    tube: float = 1.0  # share of the track's width that is left alone
+    keep: float = 0.5  # share of the speed it wants, below which it is sent on
+    speed: float = 1.0  # share of the top speed that is wanted
+    grip: float = 100.0  # share of all the force there is that a bend may ask for; much = never slows down
+    early: float = 1.0  # share of it that braking before a bend counts on
+    brake: float = 0.0  # kg/s against what is too fast
+    gain: float = 5.0  # kg/s, a change of velocity is asked for within 1/gain seconds
+
+
+def path_follow(see: Any, task: PathFollow, p: PathFollowRules) -> np.ndarray:
+    """Follow the path (Reynolds 1999), at a speed that the bends ahead allow; vectors are (along the track, left)."""
+    row, step = np.arange(len(see.left)), task.spacing / _FINE
+    spine = np.concatenate([np.stack([0.0 * see.left, -see.left], axis=-1)[:, None], see.points], axis=1)
+    share = (np.arange(task.ahead * _FINE) / _FINE) % 1.0
+    piece = np.arange(task.ahead * _FINE) // _FINE
+    fine = spine[:, piece] * (1.0 - share)[:, None] + spine[:, piece + 1] * share[:, None]
+    far = task.spacing * np.arange(task.ahead)[None]  # a bend begins a point earlier
+    bend = np.maximum(np.abs(see.curvature), 1e-6)
+    allowed = p.grip * task.max_force / bend + 2.0 * p.early * task.max_force * far
+    top = np.minimum(p.speed * task.max_speed, np.sqrt(allowed.min(axis=1)))
+    speed = np.linalg.norm(see.velocity, axis=-1)
+    gap = np.linalg.norm(fine - p.time * see.velocity[:, None], axis=-1)
+    then = np.argmin(gap, axis=1)
+    gained = then * step - p.keep * top * p.time
+    ahead = p.lead * np.maximum(speed, 0.25 * top)
+    target = fine[row, np.minimum(np.round(ahead / step), task.ahead * _FINE - 1).astype(int)]
+    wish = p.gain * follow_path(gap[row, then] - p.tube * task.half_width, gained, target, see.velocity, top)
+    slower = -p.brake * (np.maximum(speed - top, 0.0) / np.maximum(speed, 1e-9))[:, None] * see.velocity
+    return slower + wish
+
+
+_FINE = 5
+"""Places between two points of the track that are seen, among which the nearest is."""

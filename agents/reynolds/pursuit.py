@@ -1,0 +1,38 @@
+"""Pursuit: seek where the quarry will be, but never beyond the walls it cannot pass."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from flockenv import steering
+from flockenv.rows import rows
+from flockenv.tasks import Pursuit
+
+__all__ = ["PursuitRules", "pursuit"]
+
+arrive = rows(steering.arrive)
+interception_time = rows(steering.interception_time)
+
+
+@dataclass(frozen=True)
+class PursuitRules:
+    """Textbook: exact interception, full force."""
+
+    factor: float = 1.0  # share of the interception time that is looked ahead
+    horizon: float = 10.0  # s, never look further ahead than this
+    margin: float = 0.3  # m, the quarry will not be nearer to a wall than this
+    gain: float = 5.0  # kg/s, a change of velocity is asked for within 1/gain seconds
+    slow_radius: float = 0.01  # m, arrive instead of seek: brake within this distance of the predicted place
+
+
+def pursuit(see: Any, task: Pursuit, p: PursuitRules) -> np.ndarray:
+    """Pursue the nearest opponent (Reynolds 1999) with a bounded exact predictor."""
+    offset, quarry = see.opponents[:, 0], see.opponent_velocity[:, 0]
+    top = task.pursuer_speed
+    time = np.minimum(p.factor * interception_time(offset, quarry, top), p.horizon)
+    ahead = offset + quarry * time[:, None]
+    ahead = np.clip(ahead, p.margin - see.to_low, see.to_high - p.margin)
+    return p.gain * arrive(ahead, see.velocity, top, p.slow_radius)

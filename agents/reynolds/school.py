@@ -1,0 +1,84 @@
+"""School: a state machine: flee, join the others, eat, or wander; keep off walls and each other always."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from flockenv import arbitration, steering, urges
+from flockenv.grants import reconcile
+from flockenv.rows import rows
+from flockenv.tasks import School
+
+__all__ = ["SchoolRules", "school"]
+
+align = rows(steering.align)
+arrive = rows(steering.arrive)
+contain = rows(steering.contain)
+evade_from = rows(steering.evade)
+intention = rows(urges.intention)
+separate = rows(steering.separate)
+wander = rows(steering.wander)
+
+
+@dataclass(frozen=True)
+class SchoolRules:
+    """Textbook: Tu and Terzopoulos 1994, the levels of the scene's own effect `intention`, the nearest food."""
+
+    escape: float = 0.4  # fear above which it flees
+    school: float = 0.15  # fear above which it joins the others
+    need: float = 0.5  # hunger above which it eats
+    calm: float = 0.1  # how much less fear ends either
+    content: float = 0.3  # how much less hunger ends it
+    wall: float = 0.3  # s, how far ahead walls count
+    apart: float = 1.0  # N m, separation from whom it nearly touches
+    predict: float = 0.5  # s, how far ahead a hunter is predicted at most
+    evade: float = 5.0  # kg/s, strength of an evasion
+    middle: float = 0.0  # N/m towards the middle of the tank while it flees
+    forage: float = 5.0  # kg/s, towards food
+    rich: float = 0.0  # m of way that a full patch is worth more than an empty one
+    match: float = 2.0  # kg/s, alignment
+    centre: float = 1.0  # N/m, cohesion
+    pace: float = 0.5  # share of the top speed that it wanders at
+    turn: float = 0.2  # m aside per m ahead, while it wanders
+
+
+_WHEN = arbitration.Intentions(when=("avoid", "avoid", "escape", "school", "eat", "wander"))
+
+
+def school(see: Any, task: School, p: SchoolRules, before: Any, begins: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Choose a state from hunger and fear, with hysteresis, and hear its behaviours; return that state too, (R,)."""
+    count, top, ahead = len(see.velocity), task.fish_speed, np.array([1.0, 0.0])
+    known = before is not None and np.shape(before) == (count,)
+    was = np.where(begins, 0.0, before) if known else np.zeros(count)
+    calm, content = min(p.calm, p.school), min(p.content, p.need)
+    now = intention(was, see.hunger, 0.0, see.fear, max(p.escape, p.school), p.school, p.need, calm, content)
+    hunted = see.hunter_present[:, 0] > 0
+    # in sight there is nobody to flee from, or nothing to eat: go on, and look around
+    some = np.linalg.norm(see.food_bearing, axis=-1) > 0
+    now_heard = np.where((now == urges.ESCAPE) & ~hunted, urges.WANDER, now)
+    now_heard = np.where((now == urges.EAT) & ~some.any(axis=1), urges.WANDER, now_heard)
+    here = see.mate_present
+    now_heard = np.where((now == urges.SCHOOL) & (here.sum(axis=1) == 0), urges.WANDER, now_heard)
+
+    inside = 5.0 * contain(see.to_low - 0.5, see.to_high - 0.5, see.velocity, top, p.wall)
+    near = here * (np.linalg.norm(see.mates, axis=-1) < 0.6)
+    push = p.apart * np.sum(separate(see.mates, ahead) * near[..., None], axis=1)
+    time = np.minimum(np.linalg.norm(see.hunters[:, 0], axis=-1) / task.hunter_speed, p.predict)
+    flight = p.evade * evade_from(see.hunters[:, 0], see.velocity, see.hunter_velocity[:, 0], top, time)
+    flight += p.middle * (see.to_high - see.to_low) / 2
+    many = np.maximum(here.sum(axis=1), 1.0)[:, None]
+    course = np.sum(see.mate_velocity * here[..., None], axis=1) / many
+    centre = np.sum(see.mates * here[..., None], axis=1) / many
+    join = p.match * align(see.velocity, course) + p.centre * centre
+    way = np.linalg.norm(see.food, axis=-1) - p.rich * see.food_amount / task.capacity
+    best = np.argmin(np.where(some, way, np.inf), axis=1)
+    eat = p.forage * arrive(see.food[np.arange(count), best], see.velocity, top, 1.0)
+    still = np.linalg.norm(see.velocity, axis=-1, keepdims=True) < 1e-6
+    heading = np.where(still, ahead, see.velocity)
+    roam = 2.0 * (wander(np.array([0.0, p.turn]), heading, p.pace * top, 1.0) + heading - see.velocity)
+    wishes = np.stack([inside, push, flight, join, eat, roam], axis=1)
+    force, _ = reconcile(_WHEN, wishes, task.fish_force, inner={"intention": now_heard})
+    return force, now
