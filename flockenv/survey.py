@@ -338,7 +338,8 @@ def _bodies(run: _Run) -> Part:
             found = m.overlap_proportion(pos, radius, space, alive)
             values |= {"overlap": found.mean, "overlapping": found.share}
         values["collisions"] = m.collision_rate(run.time[at], run.pos[at], radius, space, run.alive[at])
-    wished = np.asarray(getattr(run.scene.body, "desired_speed", run.scene.body.max_speed), float)
+    body = run.scene.body  # who does not say how fast he would like to go goes as fast as he may
+    wished = np.asarray(np.where(body.desired_speed > 0, body.desired_speed, body.max_speed), float)
     if run.scene.dimension == 2 and np.isfinite(wished).all() and _straight(run):
         desired = (run.way * wished)[:, None] * run.axis
         back = m.oscillation_proportion(run.vel[at], desired, run.alive[at])

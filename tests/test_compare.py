@@ -313,7 +313,7 @@ def test_weights_of_ones_own_play_under_the_name_of_their_file() -> None:
         (("--players", "still.py,sub/still.py"), "two players are called 'still'"),
         (("--players", "model.zip"), "executes the code stored in it"),
         (("--players", "broken.py"), "player 'broken.py': ZeroDivisionError while loading it"),
-        (("--players", "late.py"), "player 'late', task 'crossing': KeyError: 'no'"),
+        (("--players", "late.py"), "player 'late', task 'bottleneck': KeyError: 'no'"),
         (("--worlds", "1"), "--worlds 1: must be from 2"),
         (("--worlds", "0"), "--worlds 0: must be from 2"),
         (("--worlds", "1000000000"), "--worlds 1000000000: must be from 2 to 1000000"),

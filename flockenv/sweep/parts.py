@@ -434,7 +434,8 @@ def _names(effect: Effect, slots: Sequence[str]) -> set[str]:
     """Return every name in the code of some of an effect's laws and of the laws that they call."""
     module = vars(sys.modules[type(effect).__module__])
     laws = [getattr(effect, slot) for slot in slots]
-    todo = [module[law] for law in (*laws, effect.obstacle_law if effect.joined else None) if law]
+    # a law that is missing there is refused where it is imported
+    todo = [module[law] for law in (*laws, effect.obstacle_law if effect.joined else None) if law in module]
     if effect.wishes and slots == LAWS:
         where, law = effect.steer_law
         todo.append(getattr(sys.modules[where], law))

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from flockenv.effects import Effect
+from flockenv.effects import Effect, ObstacleContact
 from flockenv.presets import PRESETS, preset
 from flockenv.scene import Group, Scene
 from flockenv.shapes import Wall
@@ -25,6 +25,9 @@ WEIDMANN = Spread(mean=1.34, sd=0.26, low=0.3)
 
 STEPS = {"helbing_farkas_vicsek_2000": 0.005, "moussaid_2011": 0.05}
 """s, one step. Of bodies that rub: 6 cm of two bodies' overlap, kappa d 2 / m < 2 / dt; of all others .02."""
+
+SOLID = ObstacleContact(stiffness=1.2e5)
+"""Of walls in models that have no bodies, as Helbing, Farkas and Vicsek 2000 have it: or a crowd is pushed through."""
 
 PATIENCE = 60.0
 """s, after which those who are left are stuck, if nobody came out in that time."""
@@ -81,9 +84,11 @@ def lane(length: float, width: float, begin: float = 0.0) -> tuple[Wall, ...]:
 
 
 def scene_of(name: str, groups: Sequence[Group], aims: Sequence[Effect], **fields: Any) -> Scene:
-    """Return a scene of people of a preset, who know where they want to go."""
+    """Return a scene of people of a preset who know where they want to go; bodies do not go through walls."""
     fields = {"dt": STEPS.get(name, 0.02), **fields}
-    return Scene(groups=tuple(groups), effects=(*aims, *preset(name)), **fields)
+    model = preset(name)
+    solid = () if any(isinstance(effect, ObstacleContact) for effect in model) else (SOLID,)
+    return Scene(groups=tuple(groups), effects=(*aims, *model, *solid), **fields)
 
 
 def walked(
