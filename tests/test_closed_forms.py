@@ -285,6 +285,7 @@ def test_explicit_euler_spirals_out_of_a_vortex_as_the_recursion_says() -> None:
     assert math.sqrt(square[-1]) == pytest.approx(1.7057155, abs=5e-8)
 
 
+@pytest.mark.slow
 def test_in_space_a_vortex_turns_about_its_axis() -> None:
     """Right-handed, at the distance from the axis, whatever the height; an axis is a direction of any length."""
     axis, centre = np.array([0.6, 0, 0.8]), np.array([0.5, -0.3, 1.0])

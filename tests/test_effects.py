@@ -50,8 +50,10 @@ EVERY_ROW = pytest.mark.parametrize("row", EFFECTS, ids=lambda row: row.name)
 
 ELSEWHERE = {
     "flockenv.effects.fields", "flockenv.effects.tether", "flockenv.effects.attraction", "flockenv.effects.urges",
+    "flockenv.effects.aims", "flockenv.effects.way", "flockenv.effects.journey", "flockenv.effects.routes",
+    "flockenv.effects.vicsek",
 }  # fmt: skip
-"""Effects of these files have quick tests in test_fields.py, test_closed_forms.py, test_springs.py, test_school.py."""
+"""Effects of these files have quick tests in files of their own: test_fields.py, test_inner.py, test_ways.py, ..."""
 
 
 def among(rows: Iterable[EffectRow]) -> pytest.MarkDecorator:

@@ -71,6 +71,7 @@ def moved(state: State, offset: float) -> State:
     return state.with_motion(np.add(state.pos, (offset, -offset)), state.vel)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("offset", [1e4, 1e7])
 @pytest.mark.parametrize("scene", [flock, chain])
 def test_a_scene_far_from_the_origin_does_the_same_in_double_precision(scene: Any, offset: float) -> None:

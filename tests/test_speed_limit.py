@@ -42,6 +42,7 @@ def curve(hard: float | None) -> Curve:
     return found
 
 
+@pytest.mark.slow
 def test_rk4_keeps_its_order_and_under_the_hard_limit_it_is_of_order_one() -> None:
     """P09, P14: halving the step divides errors by 16, and by 2."""
     smooth, clamped = curve(None), curve(V)

@@ -184,6 +184,7 @@ def test_a_world_that_was_put_in_order_may_shrink_until_there_is_no_grid() -> No
     assert_same(scene.step(start, steps=2), scene.step(scene.step(start)))
 
 
+@pytest.mark.slow
 def test_nan_in_a_world_that_was_put_in_order_names_the_agent_by_its_number() -> None:
     scene, start = crowded(NAMED["torus_single"].make(WORTH_ARRANGING, 140.0))
     start.v[1, 0, 12_345] = np.inf
@@ -258,6 +259,7 @@ def test_whichever_thread_meets_nan_names_the_agent(agent: int, count: int) -> N
     np.testing.assert_array_equal(kept.tick, start.tick)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("count", [1, 2, 3])
 def test_nan_in_a_batch_is_found_in_its_first_world(count: int) -> None:
     scene = NAMED["plane_single"].make(33, 20.0)
@@ -393,6 +395,7 @@ def in_another_process(code: str, **environment: str) -> subprocess.CompletedPro
     )
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="there is no fork here")
 def test_a_forked_child_steps_with_threads_of_its_own() -> None:
     done = in_another_process(FORK)
