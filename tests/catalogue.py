@@ -394,7 +394,7 @@ EFFECTS = (
     EffectRow(LineUp(margin=0.1, radius=2.5), beside=(Goal(target=CENTRE, slow_radius=2),)),
     # what goes on inside moves nobody; tests/test_school.py asks what it is
     EffectRow(Metabolism(rate=0.1, effort=0.1, spread=0.4), family="urges", obeys=frozenset()),
-    EffectRow(Grazing(group=0, other=1, radius=1.0, appetite=0.8), family="urges", obeys=frozenset()),
+    EffectRow(Grazing(group=0, other=1, radius=1.0, rate=0.3, appetite=0.8), family="urges", obeys=frozenset()),
     EffectRow(Predation(group=1, other=0, radius=0.8, meal=0.2), family="urges", obeys=frozenset()),
     EffectRow(Fear(group=0, other=1, radius=2.5), family="urges", obeys=frozenset()),
     EffectRow(Libido(radius=1.0, start=0.4, spread=0.6), family="urges", obeys=frozenset()),

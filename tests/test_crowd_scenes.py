@@ -25,7 +25,7 @@ from flockenv.validation.walk import Walk, walked
 
 ROOT = Path(__file__).parent.parent
 NERVOUS = "helbing_farkas_vicsek_2000"
-CONFIGS = sorted((ROOT / "configs").glob("crowd_*.yaml"))
+CONFIGS = sorted(p for p in (ROOT / "configs").glob("crowd_*.yaml") if p.stem != "crowd_nav")  # that is a task's
 slow = pytest.mark.slow
 
 
@@ -55,7 +55,7 @@ def test_twenty_people_come_around_a_corner_and_through_no_wall() -> None:
 
 
 @slow
-@pytest.mark.parametrize("name", ["lanes", "nist 5.1", "rimea 15"])
+@pytest.mark.parametrize("name", ["lanes", "nist 5.1"])
 def test_what_the_preset_of_2000_holds(name: str) -> None:
     finding = found(name)
     assert finding.verdict == "pass", finding.note

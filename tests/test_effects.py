@@ -283,9 +283,9 @@ def test_in_single_precision_it_conserves_momentum_if_it_says_so(row: EffectRow,
 def test_it_is_finite_where_everybody_is_in_one_place_at_rest(row: EffectRow, dimension: int, count: int) -> None:
     """In an obstacle's very centre, if there are obstacles: nothing has a direction there."""
     spawn = Spawn(low=(0,) * dimension, high=(1,) * dimension)
-    scene = scene_of(
-        *row.company(dimension), dimension=dimension, groups=(Group(count=count, desired_speed=1.2, spawn=spawn),)
-    )
+    group = Group(count=count, desired_speed=1.2, spawn=spawn)
+    groups = (group, group) if row.family == "urges" else (group,)  # fish, and food or hunters
+    scene = scene_of(*row.company(dimension), dimension=dimension, groups=groups)
     state = scene.start(0)
     state.pos[...] = scene.obstacles[0].centre if scene.obstacles else 2.5
     state.vel[...] = 0

@@ -44,6 +44,8 @@ def _drawn(p: Any, me: Any, channel: int) -> float:
 class _Urge(Effect):
     """What these effects share: whom they are about."""
 
+    conserves_momentum: ClassVar[bool] = True  # it pushes nobody
+
     group: int | None = Field(default=None, ge=0, description="who has it; none = everybody")
 
     def members(self, starts: Sequence[int]) -> dict[str, float]:
