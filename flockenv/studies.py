@@ -15,10 +15,12 @@ from flockenv.terminal import INTERRUPTED, EarlyEnd, Force, Seed, new_console, p
 
 if TYPE_CHECKING:
     from flockenv.accuracy import Problem, Report
+    from flockenv.findings import Results
     from flockenv.records import Record
-    from flockenv.stress import Results
 
-__all__ = ["accuracy", "experiment", "gallery", "stress"]
+    Run = Callable[[Results | None, Callable[[int], None], Callable[[Results], None]], Results]
+
+__all__ = ["accuracy", "experiment", "gallery", "stored", "stress", "try_all", "write_numbers"]
 
 
 def accuracy(
@@ -102,13 +104,54 @@ def _problem(file: str, seconds: float | None, steps: str, dts: str, seed: int) 
 
 def _write(path: Path, numbers: Record, draw: Callable[[Path], None]) -> None:
     """Write numbers as JSON, and a picture of them if that was asked for."""
+    write_numbers(path, numbers)
+    if path.suffix.lower() == ".png":
+        draw(path)
+
+
+def write_numbers(path: Path, numbers: Record) -> None:
+    """Write numbers as JSON: whole or not at all, whatever a path ends in."""
     from flockenv.outputs import replacing
 
     path.parent.mkdir(parents=True, exist_ok=True)
     with replacing(path.with_suffix(".json")) as file:
         file.write((numbers.model_dump_json(indent=1) + "\n").encode())
-    if path.suffix.lower() == ".png":
-        draw(path)
+
+
+def stored(path: Path | None, what: str, sources: str) -> Results | None:
+    """Return the findings beside a path, none if there are none; ValueError if they are others, or of other sources."""
+    from flockenv.findings import Results
+
+    numbers = None if path is None else path.with_suffix(".json")
+    if numbers is None or not numbers.exists():
+        return None
+    try:
+        found = Results.model_validate_json(numbers.read_text(encoding="utf-8"))
+    except ValueError:
+        raise ValueError(f"--out: {numbers.name} holds no findings of {what}; --force overwrites it") from None
+    if found.sources != sources:
+        count = len(found.findings)
+        raise ValueError(f"--out: {numbers.name} holds {count} findings of other sources; --force begins anew")
+    return found
+
+
+def try_all(what: str, count: int, path: Path | None, known: Results | None, run: Run) -> tuple[Results, bool]:
+    """Try what is not known yet, and write all there is after every trial; return that, and whether it was stopped."""
+    found = known
+
+    def keep(results: Results) -> None:
+        nonlocal found
+        found = results
+        if path is not None:
+            write_numbers(path, results)
+
+    try:
+        with progress_bar(what, count, "trials") as advance:
+            return run(known, advance, keep), False
+    except KeyboardInterrupt:
+        if found is None:
+            raise
+        return found, True
 
 
 def _draw_precision(reports: Sequence[Report], path: Path) -> None:
@@ -153,52 +196,26 @@ def stress(
     """Try every hard case under every integrator, and show value, bound and verdict of each."""
     from flockenv.integrators import methods_named
     from flockenv.outputs import checked_file
-    from flockenv.stress import CASES, VERDICTS, cases_named, run, trials, usual_methods
+    from flockenv.stress import CASES, cases_named, fingerprint, run, trials, usual_methods
 
     path = checked_file(out, [".json", ".png"], True) if out is not None else None
     todo = cases_named(CASES, _words(cases))
     under = methods_named(_words(methods)) if methods else usual_methods()
-    found = None if path is None or force else _known(path.with_suffix(".json"))
-
-    def keep(results: Results) -> None:
-        nonlocal found
-        found = results
-        if path is not None:
-            _write(path.with_suffix(".json"), results, lambda _: None)
-
-    stopped = False
-    try:
-        with progress_bar("hard cases", trials(todo, under), "trials") as advance:
-            found = run(todo, under, found, advance, keep)
-    except KeyboardInterrupt:
-        if found is None:
-            raise
-        stopped = True
-    asked = found.only({case.name for case in todo}, {method.kind for method in under})
+    kinds = [method.kind for method in under]
+    known = None if force else stored(path, "hard cases", fingerprint())
+    found, stopped = try_all("hard cases", trials(todo, kinds), path, known, lambda *given: run(todo, under, *given))
+    asked = found.only({case.name for case in todo}, kinds)
     console = new_console()
-    show_table(console, "Hard cases", asked.rows(), ("case", "scene", "bound", *asked.methods))
-    if notes := [(f.case, f.method, f.verdict, f.note) for f in asked.findings if f.verdict != "pass"]:
+    show_table(console, "Hard cases", asked.rows(), ("case", "scene", "bound", *asked.unders))
+    if notes := [(f.case, f.under, f.verdict, f.note) for f in asked.findings if f.verdict != "pass"]:
         show_table(console, "What is not simply within its bound", notes, ("case", "method", "", ""))
-    show_table(console, "Verdicts", VERDICTS.items())
+    show_table(console, "Verdicts", asked.legend())
     if path is not None:
         _write(path, found, functools.partial(_draw_verdicts, found))
-        console.print(f"{relative(path)} holds {len(found.findings)} of {trials(CASES, usual_methods())} findings")
+        every = trials(CASES, [method.kind for method in usual_methods()])
+        console.print(f"{relative(path)} holds {len(found.findings)} of {every} findings")
     if stopped:
         raise EarlyEnd("interrupted; what was done is shown, the same command goes on", INTERRUPTED)
-
-
-def _known(numbers: Path) -> Results | None:
-    """Return what a file says already, none if it is not there; ValueError if it says something else, or once did."""
-    from flockenv.stress import Results, fingerprint
-
-    try:
-        found = Results.model_validate_json(numbers.read_text(encoding="utf-8")) if numbers.exists() else None
-    except ValueError:
-        raise ValueError(f"--out: {numbers.name} holds no findings of hard cases; --force overwrites it") from None
-    if found is not None and found.sources != fingerprint():
-        count = len(found.findings)
-        raise ValueError(f"--out: {numbers.name} holds {count} findings of other sources; --force begins anew")
-    return found
 
 
 def experiment(

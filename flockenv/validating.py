@@ -7,10 +7,11 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from flockenv.terminal import INTERRUPTED, EarlyEnd, Force, new_console, progress_bar, relative, show_table
+from flockenv.studies import stored, try_all, write_numbers
+from flockenv.terminal import INTERRUPTED, EarlyEnd, Force, new_console, relative, show_table
 
 if TYPE_CHECKING:
-    from flockenv.validation import Results
+    from flockenv.findings import Results
 
 __all__ = ["validate"]
 
@@ -30,36 +31,22 @@ def validate(
 ) -> None:
     """Try published models of pedestrians in the scenes of RiMEA and NIST: value, bound and verdict of each."""
     from flockenv.outputs import checked_file
-    from flockenv.validation import CASES, VERDICTS, cases_named, presets_named, run, trials
+    from flockenv.validation import CASES, cases_named, fingerprint, presets_named, run, trials
 
     path = checked_file(out, [".json", ".md"], True) if out is not None else None
     todo, under = cases_named(CASES, cases or []), presets_named(preset or [])
-    found = None if path is None or force else _known(path.with_suffix(".json"))
-
-    def keep(results: Results) -> None:
-        nonlocal found
-        found = results
-        if path is not None:
-            _write(path.with_suffix(".json"), results)
-
-    stopped = False
-    try:
-        with progress_bar("crowds", trials(todo, under), "trials") as advance:
-            found = run(todo, under, found, advance, keep)
-    except KeyboardInterrupt:
-        if found is None:
-            raise
-        stopped = True
+    known = None if force else stored(path, "crowds", fingerprint())
+    found, stopped = try_all("crowds", trials(todo, under), path, known, lambda *given: run(todo, under, *given))
     asked = found.only({case.name for case in todo}, set(under))
     if as_json:
         print(asked.model_dump_json(indent=1))
     else:
         console = new_console()
-        show_table(console, "Crowds", asked.rows(), ("case", "", "bound", *asked.presets))
+        show_table(console, "Crowds", asked.rows(3), ("case", "", "bound", *asked.unders))
         show_table(
-            console, "What came of each", [(f.case, f.preset, f.verdict, f.note) for f in asked.findings], [""] * 4
+            console, "What came of each", [(f.case, f.under, f.verdict, f.note) for f in asked.findings], [""] * 4
         )
-        show_table(console, "Verdicts", VERDICTS.items())
+        show_table(console, "Verdicts", asked.legend())
     if path is not None:
         _write(path, found)
         if not as_json:
@@ -68,24 +55,11 @@ def validate(
         raise EarlyEnd("interrupted; what was done is shown, the same command goes on", INTERRUPTED)
 
 
-def _known(numbers: Path) -> Results | None:
-    """Return what a file says already, none if it is not there; ValueError if it says something else."""
-    from flockenv.validation import Results
-
-    try:
-        return Results.model_validate_json(numbers.read_text(encoding="utf-8")) if numbers.exists() else None
-    except ValueError:
-        raise ValueError(f"--out: {numbers.name} holds no findings of crowds; --force overwrites it") from None
-
-
 def _write(path: Path, results: Results) -> None:
     """Write the findings as JSON; of a page that, the page, and its pictures."""
-    from flockenv.outputs import replacing
-
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with replacing(path.with_suffix(".json")) as file:
-        file.write((results.model_dump_json(indent=1) + "\n").encode())
+    write_numbers(path, results)
     if path.suffix.lower() == ".md":
+        from flockenv.outputs import replacing
         from flockenv.render.validation import write_pictures
         from flockenv.validation.page import page
 

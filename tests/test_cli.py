@@ -330,7 +330,7 @@ def test_stress_goes_on_where_it_was_and_loses_nothing(tried: list[str], capsys:
     assert main(["stress", "--methods", "rk4,heun", "--cases", "X02", "--out", "hard.json"]) == 0
     assert tried == ["X01 rk4", "X02 rk4", "X02 heun"]
     kept = json.loads(Path("hard.json").read_text())
-    assert sorted(f"{f['case']} {f['method']}" for f in kept["findings"]) == sorted(tried)
+    assert sorted(f"{f['case']} {f['under']}" for f in kept["findings"]) == sorted(tried)
     kept["sources"] = "those of yesterday"
     Path("hard.json").write_text(json.dumps(kept))
     tried.clear()

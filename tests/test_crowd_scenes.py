@@ -11,7 +11,6 @@ import pytest
 
 from flockenv.cli import main
 from flockenv.config import load_scene
-from flockenv.divergence import SimulationDiverged
 from flockenv.render.validation import write_pictures
 from flockenv.scene import Scene
 from flockenv.validation import CASES, VALIDATED, Case, Finding, Results, Value, cases_named, presets_named, run
@@ -103,44 +102,6 @@ def _walls(scene: Scene) -> set[tuple[tuple[float, ...], tuple[float, ...]]]:
 # --- verdicts, names, the page ----------------------------------------------------------------------------------------
 
 
-def tried(trial: Any) -> Finding:
-    return run((Case("x", "made up", "none", trial),), (NERVOUS,)).findings[0]
-
-
-def _raise(error: Exception) -> Value:
-    raise error
-
-
-@pytest.mark.parametrize(
-    ("trial", "verdict", "cell"),
-    [
-        (lambda _: Value(1.5, True), "pass", "1.5 ok"),
-        (lambda _: Value(1.5, False), "misses", "1.5 MISSES"),
-        (lambda _: Value(1.5, None), "reported", "1.5"),
-        (lambda _: Value(math.nan, False), "misses", "MISSES"),
-        (lambda _: _raise(ValueError("spacing = 1: no room")), "refused", "refused"),
-        (lambda _: _raise(SimulationDiverged(0, 0, 1, 0.1, None, 0.1, "heun")), "diverges", "diverges"),
-    ],
-)
-def test_verdicts(trial: Any, verdict: str, cell: str) -> None:
-    finding = tried(trial)
-    assert (finding.verdict, finding.cell) == (verdict, cell)
-
-
-def test_what_is_known_is_not_tried_again_unless_sources_changed() -> None:
-    calls: list[str] = []
-
-    def trial(name: str) -> Value:
-        calls.append(name)
-        return Value(1.0, None)
-
-    case = Case("x", "made up", "none", trial)
-    once = run((case,), (NERVOUS,))
-    assert run((case,), (NERVOUS,), once) == once
-    run((case,), (NERVOUS,), once.model_copy(update={"sources": "others"}))
-    assert calls == [NERVOUS] * 2
-
-
 def test_names_that_are_unknown_are_refused_with_the_nearest(capsys: pytest.CaptureFixture[str]) -> None:
     assert [case.name for case in cases_named(CASES, ("juelich",))] == ["juelich 2", "juelich 6"]
     assert presets_named(["helbing_2000"]) == (NERVOUS,)
@@ -165,10 +126,15 @@ def test_the_command_writes_a_page_and_goes_on_where_it_was(
     for _ in range(2):
         assert main(["validate", "--preset", "helbing_2000", "--out", "crowds.md"]) == 0
     assert calls == [NERVOUS]
-    assert "0.5 MISSES" in capsys.readouterr().out
+    assert "0.5 FAILS" in capsys.readouterr().out
     assert "half of it" in Path("crowds.md").read_text()
     assert main(["validate", "--preset", "moussaid_2009", "--json"]) == 0
-    assert Results.model_validate_json(capsys.readouterr().out).findings[0].verdict == "misses"
+    assert Results.model_validate_json(capsys.readouterr().out).findings[0].verdict == "fails"
+    others = Results.model_validate_json(Path("crowds.json").read_text()).model_copy(update={"sources": "others"})
+    Path("crowds.json").write_text(others.model_dump_json())
+    assert main(["validate", "--preset", "helbing_2000", "--out", "crowds.md"]) == 2
+    assert "crowds.json holds 1 findings of other sources; --force begins anew" in capsys.readouterr().err
+    assert Results.model_validate_json(Path("crowds.json").read_text()) == others
     Path("mine.json").write_text("{}")
     assert main(["validate", "--out", "mine.json"]) == 2
     assert "holds no findings of crowds" in capsys.readouterr().err
@@ -200,7 +166,7 @@ def made_up() -> Results:
     }  # fmt: skip
     return Results(
         findings=tuple(
-            Finding(case=name, title="t", preset=NERVOUS, bound="b", value=1.0, verdict="pass", note="a | b", seconds=1,
+            Finding(case=name, title="t", under=NERVOUS, bound="b", value=1.0, verdict="pass", note="a | b", seconds=1,
                     series=numbers)
             for name, numbers in series.items()
         )

@@ -23,7 +23,7 @@ LAYERS = (
     {"effects", "integrators", "constraints", "population", "spawn", "sweep", "stability", "rounding", "ways"},
     {"behaviours"},
     {"steer", "presets"},
-    {"snapshot", "implicit", "workspace", "scene", "config", "measures", "grants", "explanation"},
+    {"snapshot", "implicit", "workspace", "scene", "config", "measures", "grants", "explanation", "findings"},
     {"tasks", "world", "policy"},
     {
         "envs",

@@ -76,10 +76,12 @@ def test_what_a_trial_returns_or_raises_is_its_verdict() -> None:
         (raised(diverged), "diverges", None, str(diverged)),
         (lambda method: Value(math.inf, True), "pass", None, ""),
         (lambda method: Value(math.nan, False), "fails", None, ""),
+        (lambda method: Value(0.5, None, "fine"), "reported", 0.5, "fine"),
+        (warned(Value(0.5, None)), "reported", 0.5, "dt = 1 s: too long"),
     ):
         finding = tried(trial)
         assert (finding.verdict, finding.value, finding.note) == (verdict, value, note)
-        assert (finding.case, finding.title, finding.bound, finding.method) == (
+        assert (finding.case, finding.title, finding.bound, finding.under) == (
             "X01", "made up", "none", "semi_implicit_euler",
         )  # fmt: skip
         assert finding.seconds >= 0
@@ -119,13 +121,13 @@ def test_findings_that_are_known_are_not_tried_again() -> None:
     assert told == [0, 1, 2, 3]
     assert [len(results.findings) for results in kept] == [1, 2, 3, 4]
     assert kept[-1] == whole
-    assert [(f.case, f.method) for f in whole.findings] == [
+    assert [(f.case, f.under) for f in whole.findings] == [
         ("A", "semi_implicit_euler"), ("A", "rk4"), ("B", "semi_implicit_euler"), ("B", "rk4"),
     ]  # fmt: skip
     calls.clear()
     again = run(cases, methods, known=kept[2])
     assert calls == [("B", "rk4")]
-    assert [f.cell for f in again.findings] == [f.cell for f in whole.findings]
+    assert [f.cell() for f in again.findings] == [f.cell() for f in whole.findings]
     assert run(cases, methods, known=whole) == whole
 
 
@@ -152,11 +154,15 @@ def test_results_are_a_table_and_json() -> None:
         findings=(
             tried(lambda method: Value(0.123456, True, "so")), tried(raised(ValueError("no")), RK4()),
             tried(lambda method: Value(math.inf, True), Heun()),
+            tried(lambda method: Value(0.123456, None), ExplicitEuler()),
+            tried(lambda method: Value(0.123456, False), VelocityVerlet()),
         )
     )  # fmt: skip
-    assert results.methods == ["semi_implicit_euler", "rk4", "heun"]
+    assert results.unders == ["semi_implicit_euler", "rk4", "heun", "explicit_euler", "velocity_verlet"]
     assert results.cases == ["X01"]
-    assert results.rows() == [["X01", "made up", "none", "0.12 ok", "refused", "ok"]]
+    assert results.rows() == [["X01", "made up", "none", "0.12 ok", "refused", "ok", "0.12", "0.12 FAILS"]]
+    assert results.rows(3)[0][3] == "0.123 ok"
+    assert [verdict for verdict, _ in results.legend()] == ["pass", "reported", "refused", "fails"]
     assert results.at("X01", "rk4") is results.findings[1]
     assert results.at("X01", "midpoint") is None
     assert Results.model_validate_json(results.model_dump_json()) == results

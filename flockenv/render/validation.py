@@ -74,15 +74,15 @@ def _write_diagrams(path: Path, found: Sequence[Finding]) -> None:
         axes.fill_between(inside, speed - 0.25, speed + 0.25, color=GRID, zorder=1, label="within .25 m/s")
         axes.plot(curve, weidmann_speed(curve), color=INK, lw=1.2, zorder=2, label="Weidmann 1993")
         axes.scatter(
-            _numbers(finding, "density"), _numbers(finding, "speed"), s=5, color=_tone(finding.preset), alpha=0.25,
+            _numbers(finding, "density"), _numbers(finding, "speed"), s=5, color=_tone(finding.under), alpha=0.25,
             linewidths=0, zorder=3,
         )  # fmt: skip
         axes.plot(
-            _numbers(finding, "densities"), _numbers(finding, "speeds"), "o-", color=_tone(finding.preset), ms=4, lw=1,
+            _numbers(finding, "densities"), _numbers(finding, "speeds"), "o-", color=_tone(finding.under), ms=4, lw=1,
             zorder=4, label="means",
         )  # fmt: skip
         named(axes, "density, 1/m²", "speed forward, m/s")
-        axes.set_title(f"{_short(finding.preset)}: {finding.verdict}", fontsize=8, color=INK)
+        axes.set_title(f"{_short(finding.under)}: {finding.verdict}", fontsize=8, color=INK)
         axes.set_xlim(0, 5.4)
         axes.set_ylim(-0.6, 1.7)
     grid[0, 0].legend(fontsize=6.5, frameon=False, loc="upper right")
@@ -113,8 +113,8 @@ def _write_widths(path: Path, found: Sequence[Finding]) -> None:
     )
     for finding in found:
         axes.plot(
-            _numbers(finding, "width"), _numbers(finding, "flow"), marker=_mark(finding.preset), ms=5, lw=1,
-            color=_tone(finding.preset), label=_short(finding.preset), zorder=3,
+            _numbers(finding, "width"), _numbers(finding, "flow"), marker=_mark(finding.under), ms=5, lw=1,
+            color=_tone(finding.under), label=_short(finding.under), zorder=3,
         )  # fmt: skip
     named(axes, "width, m", "flow, 1/s")
     axes.set_ylim(bottom=0)
@@ -146,9 +146,7 @@ def _draw_lanes(axes: Axes, finding: Finding) -> None:
     axes.set_ylim(EDGE / 2 - WIDTH / 2 - 0.1, EDGE / 2 + WIDTH / 2 + 0.1)
     axes.set_xticks([])
     axes.set_yticks([])
-    axes.set_title(
-        f"{_short(finding.preset)}: {finding.verdict}, {finding.note.split(';')[0]}", fontsize=7.5, color=INK
-    )
+    axes.set_title(f"{_short(finding.under)}: {finding.verdict}, {finding.note.split(';')[0]}", fontsize=7.5, color=INK)
     for spine in axes.spines.values():
         spine.set_color(GRID)
 
@@ -160,8 +158,8 @@ def _write_haste(path: Path, found: Sequence[Finding]) -> None:
     for finding in found:
         speed, time, low, high = (_numbers(finding, name) for name in ("speed", "time", "low", "high"))
         axes.errorbar(
-            speed, time, (time - low, high - time), fmt="o-", color=_tone(finding.preset), ms=4, lw=1.2, capsize=2,
-            label=_short(finding.preset),
+            speed, time, (time - low, high - time), fmt="o-", color=_tone(finding.under), ms=4, lw=1.2, capsize=2,
+            label=_short(finding.under),
         )  # fmt: skip
     named(axes, "desired speed, m/s", "until all are out, s")
     axes.set_ylim(bottom=0)

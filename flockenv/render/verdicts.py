@@ -11,7 +11,7 @@ from flockenv.render.chart import INK
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from flockenv.stress.results import Results, Verdict
+    from flockenv.findings import Results, Verdict
 
 __all__ = ["draw_verdicts", "write_verdicts"]
 
@@ -36,7 +36,7 @@ def draw_verdicts(results: Results) -> Figure:
     from matplotlib.figure import Figure
     from matplotlib.patches import Rectangle
 
-    cases, methods = results.cases, results.methods
+    cases, methods = results.cases, results.unders
     wide, left = 1.15, 5.6
     figure = Figure(figsize=(left + wide * len(methods), 1.7 + 0.36 * len(cases)), facecolor="white")
     FigureCanvasAgg(figure)
@@ -59,5 +59,5 @@ def draw_verdicts(results: Results) -> Figure:
                 continue
             x = left + wide * k
             axes.add_patch(Rectangle((x + 0.02, y + 0.02), wide - 0.04, 0.32, color=FILL[finding.verdict], linewidth=0))
-            axes.text(x + wide / 2, y + 0.18, finding.cell, fontsize=7, ha="center", va="center", color=INK)
+            axes.text(x + wide / 2, y + 0.18, finding.cell(), fontsize=7, ha="center", va="center", color=INK)
     return figure

@@ -11,16 +11,15 @@ word.
 
 from __future__ import annotations
 
+from flockenv.findings import VERDICTS, Case, Finding, Results, Value, cases_named, trials
 from flockenv.stress.bodies import BODIES
 from flockenv.stress.bonded import BONDED
-from flockenv.stress.case import Case, Value
 from flockenv.stress.contacts import CONTACTS
 from flockenv.stress.crowds import CROWDS
 from flockenv.stress.gatherings import GATHERINGS
 from flockenv.stress.heaps import HEAPS
 from flockenv.stress.impacts import IMPACTS
-from flockenv.stress.results import VERDICTS, Finding, Results
-from flockenv.stress.run import cases_named, fingerprint, run, trials, usual_methods
+from flockenv.stress.run import fingerprint, run, usual_methods
 
 __all__ = [
     "CASES", "VERDICTS", "Case", "Finding", "Results", "Value", "cases_named", "fingerprint", "run", "trials",

@@ -10,11 +10,11 @@ from collections.abc import Callable
 import numpy as np
 
 from flockenv.effects import Gravity, Springs
+from flockenv.findings import Case, Value
 from flockenv.integrators import Integrator
 from flockenv.networks import Cloth, Network, Rope
 from flockenv.scene import Group, Scene
 from flockenv.state import State
-from flockenv.stress.case import Case, Value
 
 __all__ = ["BONDED"]
 

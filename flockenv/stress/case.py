@@ -1,49 +1,22 @@
-"""Case: a hard scene as a function of the method that is to survive it."""
+"""What hard cases share: a start by hand, and warnings that are asked for."""
 
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from flockenv.integrators import Integrator
 from flockenv.scene import Scene
 from flockenv.stability import CoarseContactWarning, UnstableStepWarning
 from flockenv.state import State
 
-__all__ = ["TOO_LONG", "Case", "Value", "quietly", "started"]
+__all__ = ["TOO_LONG", "quietly", "started"]
 
 TOO_LONG = (UnstableStepWarning, CoarseContactWarning)
 """What says that a step is too long."""
-
-
-@dataclass(frozen=True)
-class Value:
-    """What a case came to, and whether that is within its bound."""
-
-    number: float
-    holds: bool
-    note: str = ""
-
-
-@dataclass(frozen=True)
-class Case:
-    """A hard scene: its name in numerics.md, what happens in it, what is demanded, and how it is tried."""
-
-    name: str
-    title: str
-    bound: str
-    trial: Callable[[Integrator], Value]
-    methods: tuple[str, ...] = ()
-    """Kinds of methods that it is tried under; none = all."""
-
-    def under(self, method: Integrator) -> bool:
-        """Is it tried under a method?"""
-        return not self.methods or method.kind in self.methods
 
 
 def started(scene: Scene, pos: Any, vel: Any) -> State:

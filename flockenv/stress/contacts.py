@@ -15,12 +15,13 @@ from numpy.typing import NDArray
 
 from flockenv.divergence import SimulationDiverged
 from flockenv.effects import Contact, ObstacleContact
+from flockenv.findings import Case, Value
 from flockenv.integrators import Integrator
 from flockenv.scene import Group, Scene
 from flockenv.spawn import Spawn
 from flockenv.stability import CoarseContactWarning, contact_limit
 from flockenv.state import State
-from flockenv.stress.case import TOO_LONG, Case, Value, quietly, started
+from flockenv.stress.case import TOO_LONG, quietly, started
 
 __all__ = ["CONTACTS", "DTS", "Hit", "hits"]
 

@@ -13,12 +13,12 @@ from flockenv.arbitration import Allocation, Blend
 from flockenv.behaviours import AvoidObstacles, ForceField, Seek, UnalignedAvoidance
 from flockenv.constraints import Collisions
 from flockenv.crew import threads, use_threads
+from flockenv.findings import Case, Value
 from flockenv.integrators import Integrator
 from flockenv.scene import Group, Scene
 from flockenv.shapes import Block, Circle, Polygon
 from flockenv.spawn import Spawn
 from flockenv.steer import Steer
-from flockenv.stress.case import Case, Value
 from flockenv.stress.solids import Response, batch, overlap, per_response, solid
 
 __all__ = ["GATHERINGS"]

@@ -10,9 +10,9 @@ import math
 
 import numpy as np
 
+from flockenv.findings import Value
 from flockenv.integrators import Integrator
 from flockenv.shapes import HalfSpace, Wall
-from flockenv.stress.case import Value
 from flockenv.stress.solids import Floats, G, Response, batch, overlap, per_response, solid
 
 __all__ = ["HEAPS", "funnel"]

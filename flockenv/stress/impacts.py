@@ -10,12 +10,12 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from flockenv.findings import Value
 from flockenv.integrators import Integrator
 from flockenv.scene import Scene
 from flockenv.shapes import Block, HalfSpace, Shape, Wall
 from flockenv.spawn import Spawn
 from flockenv.state import State
-from flockenv.stress.case import Value
 from flockenv.stress.solids import Floats, G, Response, batch, overlap, per_response, solid
 
 __all__ = ["IMPACTS"]

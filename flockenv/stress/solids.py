@@ -13,12 +13,12 @@ from numpy.typing import NDArray
 
 from flockenv.constraints import Collisions
 from flockenv.effects import Gravity
+from flockenv.findings import Case, Value
 from flockenv.integrators import Integrator
 from flockenv.scene import Group, Scene
 from flockenv.shapes import Shape
 from flockenv.spawn import Spawn
 from flockenv.state import State
-from flockenv.stress.case import Case, Value
 
 __all__ = ["RESPONSES", "Floats", "G", "Response", "batch", "overlap", "per_response", "solid"]
 

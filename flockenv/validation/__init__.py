@@ -9,14 +9,13 @@ of presets are the published ones. A miss is a verdict and not an error.
 
 from __future__ import annotations
 
+from flockenv.findings import VERDICTS, Case, Finding, Results, Value, cases_named, trials
 from flockenv.presets import PRESETS
 from flockenv.refusals import nearest, shown
 from flockenv.validation.alone import ALONE
-from flockenv.validation.case import Case, Value
 from flockenv.validation.corridors import CORRIDORS
 from flockenv.validation.doors import DOORS
-from flockenv.validation.results import VERDICTS, Finding, Results
-from flockenv.validation.run import cases_named, fingerprint, run, trials
+from flockenv.validation.run import fingerprint, run
 
 __all__ = [
     "CASES", "VALIDATED", "VERDICTS", "Case", "Finding", "Results", "Value", "cases_named", "fingerprint",

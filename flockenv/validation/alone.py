@@ -10,10 +10,10 @@ from collections.abc import Sequence
 import numpy as np
 
 from flockenv.effects import Course, Journey, Stage
+from flockenv.findings import Case, Value
 from flockenv.scene import Scene
 from flockenv.spawn import Spawn
 from flockenv.spread import Spread
-from flockenv.validation.case import Case, Value
 from flockenv.validation.walk import Floats, lane, people, scene_of, walked, wall
 
 __all__ = ["ALONE", "corridor", "crossing_time"]

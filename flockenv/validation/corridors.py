@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from flockenv.effects import Course
+from flockenv.findings import Case, Value
 from flockenv.measures import above_null, classical_density, lanes, single_file_speed, speed_in_area, weidmann_speed
 from flockenv.neighbours import FEWEST_AGENTS
 from flockenv.scene import Scene
@@ -18,7 +19,6 @@ from flockenv.shapes import Wall
 from flockenv.space import Torus
 from flockenv.spawn import Spawn
 from flockenv.state import State
-from flockenv.validation.case import Case, Value
 from flockenv.validation.walk import STEPS, Floats, people, scene_of, walked, wall
 
 __all__ = ["CORRIDORS", "endless", "lined_up"]

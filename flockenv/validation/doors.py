@@ -11,11 +11,11 @@ from typing import Any
 
 import numpy as np
 
+from flockenv.findings import Case, Value
 from flockenv.integrators import DormandPrince, Integrator, SemiImplicitEuler
 from flockenv.measures import Crossings, above_null, bursts, classical_density, crossings, flow
 from flockenv.scene import Scene
 from flockenv.state import State
-from flockenv.validation.case import Case, Value
 from flockenv.validation.rooms import (
     bottleneck,
     corner,

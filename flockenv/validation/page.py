@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from flockenv.findings import Results
 from flockenv.presets import PRESETS
-from flockenv.validation.results import VERDICTS, Results
 
 __all__ = ["page"]
 
@@ -57,9 +57,9 @@ REMARKS = {
 def page(results: Results, pictures: str, drawn: Sequence[str]) -> str:
     """Return the page; `drawn` are the names of the pictures in the folder `pictures` beside it."""
     lines = [INTRODUCTION, "## Table", ""]
-    names = [preset.replace("_", " ") for preset in results.presets]
-    lines += _table(["case", "", "bound", *names], results.rows())
-    lines += ["", *(f"* {verdict}: {text}." for verdict, text in VERDICTS.items()), ""]
+    names = [preset.replace("_", " ") for preset in results.unders]
+    lines += _table(["case", "", "bound", *names], results.rows(3))
+    lines += ["", *(f"* {verdict}: {text}." for verdict, text in results.legend()), ""]
     for name in drawn:
         lines += [f"![{name.replace('_', ' ')}]({pictures}/{name}.png)", "", PICTURES.get(name, ""), ""]
     lines += ["## What came of each", ""]
@@ -68,11 +68,11 @@ def page(results: Results, pictures: str, drawn: Sequence[str]) -> str:
         lines += [f"### {case}: {found[0].title}", "", f"Bound: {found[0].bound}.", ""]
         lines += [REMARKS[case], ""] if case in REMARKS else []
         lines += _table(["preset", "value", "", "s"], [
-            [f.preset, f.cell, f.note, f"{f.seconds:.0f}"] for f in found
+            [f.under, f.cell(3), f.note, f"{f.seconds:.0f}"] for f in found
         ])  # fmt: skip
         lines.append("")
     lines += ["## Presets", ""]
-    lines += _table(["preset", "source"], [[name, PRESETS[name].source] for name in results.presets])
+    lines += _table(["preset", "source"], [[name, PRESETS[name].source] for name in results.unders])
     return "\n".join(lines) + "\n"
 
 
