@@ -27,23 +27,23 @@ from flockenv.crew import share, threads
 from flockenv.divergence import SimulationDiverged
 from flockenv.effects import EFFECTS, Effect
 from flockenv.effects.base import all_masses
+from flockenv.group import Group
 from flockenv.implicit import coupling_of, solve_steps
 from flockenv.integrators import INTEGRATORS, Adaptive, ImplicitEuler, Integrator, SemiImplicitEuler
 from flockenv.integrators.newton import Coupling
-from flockenv.kernels import entry, load
+from flockenv.kernels import load
 from flockenv.neighbours import FEWEST_AGENTS, WORTH_ARRANGING
-from flockenv.networks import EDGE, AnyNetwork
+from flockenv.networks import EDGE
 from flockenv.noise import MASK, key_of
+from flockenv.placing import cells_of, place_groups
 from flockenv.population import POPULATION, Emitter, Member, beget
 from flockenv.population import settler as population_settler
 from flockenv.population.settle import NUMBERS as POPULATION_NUMBERS
 from flockenv.records import Record, keep
 from flockenv.rounding import check_places
-from flockenv.shapes import AnyShape, Circle, HalfSpace, Shape, clear_of
+from flockenv.shapes import AnyShape, Circle, HalfSpace, Shape
 from flockenv.snapshot import Mark, Snapshot
 from flockenv.space import AnySpace, Box, Plane, Torus
-from flockenv.spawn import Spawn, cells, scatter
-from flockenv.spread import Spread, drawn, largest
 from flockenv.stability import check_contact, check_dt, check_lookahead
 from flockenv.state import Body, Floats, State
 from flockenv.steer import EVERY_EFFECT
@@ -57,9 +57,6 @@ WORTH_SHARING = 4096
 """Agent-steps below which a second thread costs more than it brings: handing work over takes about 20 us."""
 
 SYNC, STAGES = SHARED.split(", ").index("sync"), SHARED.split(", ").index("stages")
-
-ROUNDS = 256
-"""How often who would begin in an obstacle that is no circle is drawn anew."""
 
 EXACT = 2**24
 """Whole numbers, and so numbers of agents, that float32 tells apart."""
@@ -95,11 +92,6 @@ else:
 TURNING = ("max_turn_rate", "banking")
 """What bodies have only where a group does."""
 
-SIZE, PACE = 0, 1
-"""Channels of what differs within a group: whoever is heavy is wide, but not faster."""
-
-PositiveSpread = Annotated[float, Field(gt=0)] | Spread
-
 
 def _demand_whole(name: str, value: object, least: int, most: int | None = None) -> None:
     """Refuse what is no whole number from `least` to `most`, True included."""
@@ -114,117 +106,6 @@ def _demand_one_piece(out: State) -> None:
     for name, array in (("x", out.x), ("v", out.v)):
         if not array.flags.c_contiguous:
             raise ValueError(f"out.{name} does not lie in one piece (its strides are {array.strides}); use copy()")
-
-
-class Group(Record):
-    """Some agents of a kind: so many that are on their own, or a network of them; there `mass` is the mean.
-
-    Mass, radius and desired_speed are a number, or a `Spread` of numbers that differ from one to the next.
-    """
-
-    count: int | None = Field(default=None, ge=1, description="how many")
-    network: AnyNetwork | None = Field(default=None, description="particles that are tied to each other, and where")
-    mass: PositiveSpread = Field(default=1.0, description="kg")
-    radius: Annotated[float, Field(ge=0)] | Spread = Field(default=0.1, description="m")
-    desired_speed: PositiveSpread | None = Field(
-        default=None, description="m/s, how fast it would like to go; see driving"
-    )
-    max_speed: float | None = Field(default=None, gt=0, description="m/s; none = no limit")
-    haste: float | None = Field(
-        default=None, ge=1, description="max_speed of each as a multiple of its desired_speed, instead of one for all"
-    )
-    max_force: float | None = Field(default=None, ge=0, description="N, what it may ask for; none = no limit")
-    oriented: bool = Field(
-        default=False, description="does it keep its heading (in 3-D an up vector too) while it stands still?"
-    )
-    max_turn_rate: float | None = Field(
-        default=None, gt=0, description="rad/s, how fast its heading turns; none = no limit; oriented if given"
-    )
-    banking: float | None = Field(
-        default=None, gt=0,
-        description="s, in which it leans into its turns (3-D), as far as lateral acceleration against 9.81 m/s^2 "
-        "says; none = it does not; oriented if given",
-    )  # fmt: skip
-    spawn: Spawn = Field(default_factory=Spawn)
-    alive: int | None = Field(
-        default=None, ge=0, description="how many live at the start; none = all, or nobody where an emitter feeds them"
-    )
-    role: Literal["agent", "learner", "pursuer", "evader", "flockmate"] = Field(
-        default="agent", description="what it is in pictures"
-    )
-    appearance: Appearance | None = Field(default=None, description="how it is drawn; none = as its role is")
-
-    @model_validator(mode="after")
-    def _one_or_the_other(self) -> Group:
-        """Refuse a count beside a network, and neither; and a network that nobody knows how to place."""
-        if (self.count is None) == (self.network is None):
-            raise ValueError("count: give either a count or a network")
-        if self.network is not None and (
-            self.spawn.low is not None
-            or self.spawn.spacing is not None
-            or (any(self.spawn.speed) and not self.spawn.heading)
-        ):
-            raise ValueError("spawn: a network is where it says; all it may be given is a speed, with a heading")
-        if self.network is not None and (isinstance(self.mass, Spread) or isinstance(self.radius, Spread)):
-            raise ValueError("mass: of a network it is the mean, and its radius is a number")
-        if self.haste is not None and (self.max_speed is not None or self.desired_speed is None):
-            raise ValueError(f"haste = {self.haste:g}: goes with a desired_speed, and instead of a max_speed")
-        if self.alive is not None and self.network is not None:
-            raise ValueError(f"alive = {self.alive}: all particles of a network live")
-        if self.alive is not None and self.alive > self.size:
-            raise ValueError(f"alive = {self.alive}: at most its count, {self.size}, is allowed")
-        return self
-
-    @property
-    def keeps_heading(self) -> bool:
-        """Has each of them a frame of its own?"""
-        return self.oriented or self.max_turn_rate is not None or self.banking is not None
-
-    @property
-    def size(self) -> int:
-        """How many agents it has."""
-        return self.network.size if self.network is not None else int(self.count or 0)
-
-    @property
-    def radii(self) -> NDArray[np.float64]:
-        """The radius of each agent, (size,) m."""
-        return drawn(self.radius, self.size, SIZE)
-
-    @property
-    def desired_speeds(self) -> NDArray[np.float64]:
-        """How fast each agent would like to go, (size,) m/s; 0 if nobody says."""
-        return drawn(self.desired_speed or 0.0, self.size, PACE)
-
-    @property
-    def max_speeds(self) -> NDArray[np.float64]:
-        """How fast each agent goes at most, (size,) m/s; may be infinite."""
-        if self.haste is not None:
-            return self.haste * self.desired_speeds
-        return np.full(self.size, math.inf if self.max_speed is None else self.max_speed)
-
-    @property
-    def widest(self) -> float:
-        """The largest radius, m."""
-        return largest(self.radius, self.size, SIZE)
-
-    @property
-    def heaviest(self) -> float:
-        """The largest mass, kg; of a network the mean."""
-        return largest(self.mass, self.size, SIZE)
-
-    @property
-    def fastest(self) -> float | None:
-        """The largest max_speed, m/s; none without a limit."""
-        return self.max_speed if self.haste is None else float(self.max_speeds.max())
-
-    def masses(self, dimension: int) -> NDArray[np.float64]:
-        """Return the mass of each agent, (size,) kg; infinite where a network pins one."""
-        if self.network is None:
-            return drawn(self.mass, self.size, SIZE)
-        assert not isinstance(self.mass, Spread)
-        out = self.network.masses(self.mass * self.size, dimension)
-        out[self.network.pins()] = np.inf
-        return out
 
 
 class Scene(Record):
@@ -494,6 +375,11 @@ class Scene(Record):
     def _params(self) -> Floats:
         return self.parts.given()
 
+    @functools.cached_property
+    def _cells(self) -> tuple[Floats | None, ...]:
+        """Where those of each group begin that have a cell each, (size, D) m; none for others."""
+        return cells_of(self)
+
     # --- running ----------------------------------------------------------------------------------------------------
 
     def start(self, seed: int, worlds: int = 1) -> State:
@@ -512,10 +398,7 @@ class Scene(Record):
         for m, obstacle in enumerate(self.circles):
             state.obstacles.centre[:, m] = obstacle.centre
             state.obstacle_radius[:, m] = obstacle.radius
-        for b in range(worlds):
-            self._scatter(state, b)
-        self._bury(state)
-        self._face(state)
+        place_groups(self, state, self._cells)
         beget(self, state)
         self._begin(state, np.ones_like(state.alive))
         return state
@@ -523,7 +406,7 @@ class Scene(Record):
     def _begin(self, state: State, fresh: NDArray[np.bool_]) -> None:
         """Write what goes on inside those who come into being, (B, N)."""
         if self.parts.inner and fresh.any():
-            self._beginner(
+            self._kernels.begin(
                 state.x, state.v, *state.carried, state.key, state.tick, self._params, self._dt, fresh,
                 *self._workspaces(1, 1)[0].of(0),
             )  # fmt: skip
@@ -534,88 +417,6 @@ class Scene(Record):
             raise ValueError(f"{name!r}: no effect keeps it; those of this scene keep {self.parts.inner or 'nothing'}")
         found: Floats = state.inner[self.parts.inner.index(name)]
         return found
-
-    def _bury(self, state: State) -> None:
-        """Let those be dead who do not live at the start: nobody, where they may be born."""
-        for k, (first, alive) in enumerate(zip(self.starts, self.living, strict=False)):
-            dead = slice(first + alive, self.starts[k + 1])
-            feeding = [member for member in self.population if isinstance(member, Emitter) and member.feeds(k)]
-            state.alive[:, dead], state.vel[:, dead] = False, 0
-            if self.population:
-                state.identity[:, dead] = -1
-            if feeding:
-                state.pos[:, dead] = feeding[0].place.extremes.mean(axis=0)
-
-    def _face(self, state: State) -> None:
-        """Write where everybody faces in the beginning: whither he flies, or as his group's heading says."""
-        for first, group in zip(self.starts, self.groups, strict=False):
-            if self.parts.oriented and group.spawn.heading is not None:
-                heading = np.asarray(group.spawn.heading, float)
-                state.heading[:, first : first + group.size] = heading / np.linalg.norm(heading)
-        state.face()
-
-    def _scatter(self, state: State, b: int) -> None:
-        place, first, d = entry(scatter), 0, self.dimension
-        period = np.array(self.space.extent(d) if self.space.periodic else (0.0,) * d, float)
-        for k, group in enumerate(self.groups):
-            spawn = group.spawn
-            if group.network is not None:
-                self._place(state, b, first, group)
-                first += group.size
-                continue
-            middles = self._cells[k]
-            low, high = (np.array(corner, float) for corner in self._corners(spawn))
-            if middles is not None:
-                low, high = np.full(d, -spawn.jitter), np.full(d, spawn.jitter)
-            heading = np.array(spawn.heading if spawn.heading is not None else (0.0,) * d, float)
-            tried = np.zeros(self.agents, np.int64)
-            mine = slice(first, first + group.size)
-            looked = 0 if middles is not None else len(self.circles)  # a cell has been found clear of all of them
-            for _ in range(ROUNDS if self.shapes else 1):
-                place(
-                    state.key[b], state.x[:, b], state.v[:, b], self.body.radius, first, first + group.size, low, high,
-                    *spawn.speed, heading, state.obstacle_x[:, b, :looked], state.obstacle_radius[b, :looked],
-                    period, np.zeros(d), tried,
-                )  # fmt: skip
-                if middles is not None:
-                    state.pos[b, mine] += middles
-                    break
-                inside = clear_of(self.shapes, np.array(state.pos[b, mine], np.float64), period) < group.radii
-                if not inside.any():
-                    break
-                tried[mine] += inside
-            first += group.size
-
-    def _corners(self, spawn: Spawn) -> tuple[Sequence[float], Sequence[float]]:
-        """Return the box that agents begin in, m."""
-        d = self.dimension
-        return spawn.low or (0.0,) * d, spawn.high or self.space.extent(d)
-
-    @functools.cached_property
-    def _cells(self) -> tuple[Floats | None, ...]:
-        """Where those of each group begin that have a cell each, (size, D) m; none for others."""
-        period = np.array(self.space.extent(self.dimension) if self.space.periodic else (0.0,) * self.dimension, float)
-        found: list[Floats | None] = []
-        for k, group in enumerate(self.groups):
-            if group.spawn.spacing is None:
-                found.append(None)
-                continue
-            try:
-                box = self._corners(group.spawn)
-                found.append(cells(group.spawn, *box, group.size, group.widest, self.obstacles, period))
-            except ValueError as error:
-                raise ValueError(f"groups[{k}].spawn.{error}") from None
-        return tuple(found)
-
-    def _place(self, state: State, b: int, first: int, group: Group) -> None:
-        """Write where the particles of a network begin, and how fast they all fly."""
-        assert group.network is not None
-        mine = slice(first, first + group.size)
-        state.pos[b, mine] = group.network.points(self.dimension)
-        if group.spawn.heading is not None:
-            heading = np.asarray(group.spawn.heading, float)
-            state.vel[b, mine] = group.spawn.speed[0] * heading / np.linalg.norm(heading)
-            state.vel[b, first + group.network.pins()] = 0
 
     def step(self, state: State, drive: ArrayLike | None = None, out: State | None = None, steps: int = 1) -> State:
         """Advance every world by `steps` physics steps under a constant drive.
@@ -727,14 +528,15 @@ class Scene(Record):
         """Step in place and mend the end of each step; a world in which that fails stays as it was, whole."""
         kept, x0, v0 = self._remembered(state)
         begun, failed = state.tick.copy(), np.zeros(len(state.tick), np.bool_)
-        found = (-1, -1)
+        found, births = (-1, -1), bool(self.population and self.parts.inner)
         for step in range(steps):
             if self._looks_back:
                 x0[...], v0[...] = state.x, state.v
             moved = self._moved(state, drive, 1)
-            who = state.identity.copy() if self.parts.inner else state.identity
+            who = state.identity.copy() if births else None
             mended = self._mended(x0, v0, state)
-            self._begin(state, state.identity != who if self.population else np.zeros_like(state.alive))
+            if who is not None:
+                self._begin(state, state.identity != who)
             failed |= state.tick != begun + step + 1
             failed[[world for world, _ in mended]] = True
             found = min([f for f in (moved, *mended) if f[0] >= 0], default=found) if found[0] < 0 else found
@@ -789,6 +591,7 @@ class Scene(Record):
         Threads take worlds apart, or, of a large world, its agents.
         """
         worlds, agents, _ = state.shape
+        move = self._kernels.step
         crew = threads() if worlds * agents * steps >= WORTH_SHARING else 1
         team = crew if worlds < crew and agents >= WORTH_SHARING and not self.integrator.adaptive else 1
         crew = crew if team > 1 else min(crew, worlds)
@@ -797,12 +600,12 @@ class Scene(Record):
             state.obstacle_radius, state.work, drive, self._params, self._dt, steps,
         )  # fmt: skip
         if crew == 1:
-            return self._kernel(*arrays, 0, worlds, 0, 1, *self._workspaces(1, 1)[0].of(0))  # type: ignore[no-any-return]
+            return move(*arrays, 0, worlds, 0, 1, *self._workspaces(1, 1)[0].of(0))  # type: ignore[no-any-return]
         spaces = self._workspaces(crew // team, team)
         spaces[0].shared[SYNC][:] = 0
         found = share([
             functools.partial(
-                self._kernel, *arrays, *((0, worlds) if team > 1 else (worlds * k // crew, worlds * (k + 1) // crew)),
+                move, *arrays, *((0, worlds) if team > 1 else (worlds * k // crew, worlds * (k + 1) // crew)),
                 k % team, team, *spaces[k // team].of(k % team),
             )
             for k in range(crew)
@@ -859,12 +662,8 @@ class Scene(Record):
         return load("field", field_source(plain)).field
 
     @functools.cached_property
-    def _kernel(self) -> Any:
-        return load("scene", scene_source(self.parts)).step
-
-    @functools.cached_property
-    def _beginner(self) -> Any:
-        return load("scene", scene_source(self.parts)).begin
+    def _kernels(self) -> Any:
+        return load("scene", scene_source(self.parts))
 
     def _workspaces(self, count: int, team: int) -> list[Workspace]:
         """Return scratch of this thread's own: two threads may step one scene at the same time."""

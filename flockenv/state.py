@@ -81,7 +81,7 @@ class State:
     obstacle_radius: Floats  # (B, M) m
     work: NDArray[np.int64]  # (B, len(WORK)) counters, see WORK
     frame: Floats  # (F, B, N) unit vectors: where everybody faces, in space which way is up; F = 0 if nobody keeps that
-    inner: Floats  # (K, B, N) what goes on inside everybody: the numbers that effects keep, see Scene.kept
+    inner: Floats  # (K, B, N) what goes on inside everybody: the numbers that effects keep, see Scene.inner
     identity: NDArray[np.int64]  # (B, N) who is in this slot, or was last, -1 = nobody; (B, 0) without a population
     born: NDArray[np.float64]  # (B, N) s, since when; (B, 0) without a population
     dies: NDArray[np.float64]  # (B, N) s, when its own lifetime ends, inf = never; (B, 0) without a population

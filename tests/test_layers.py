@@ -22,7 +22,7 @@ LAYERS = (
     {"neighbours", "shapes", "grid", "eikonal", "orca", "polyline", "rows", "networks", "elements", "tree"},
     {"effects", "integrators", "constraints", "population", "spawn", "sweep", "stability", "rounding", "ways"},
     {"behaviours"},
-    {"steer", "presets"},
+    {"steer", "presets", "group", "placing"},
     {"snapshot", "implicit", "workspace", "scene", "config", "measures", "grants", "explanation", "findings"},
     {"tasks", "world", "policy"},
     {

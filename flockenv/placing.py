@@ -1,0 +1,126 @@
+"""Where everybody begins: group after group, as their spawns and networks say, clear of what is in the way."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flockenv.kernels import entry
+from flockenv.population import Emitter
+from flockenv.shapes import clear_of
+from flockenv.spawn import Spawn, cells, scatter
+from flockenv.state import Floats, State
+
+if TYPE_CHECKING:
+    from flockenv.group import Group
+    from flockenv.scene import Scene
+
+__all__ = ["cells_of", "place_groups"]
+
+Cells = tuple[Floats | None, ...]
+
+ROUNDS = 256
+"""How often who would begin in an obstacle that is no circle is drawn anew."""
+
+
+def cells_of(scene: Scene) -> Cells:
+    """Return where those of each group begin that have a cell each, (size, D) m; none for others.
+
+    ValueError that names the group and the field if they have no room.
+    """
+    return tuple(
+        None if group.spawn.spacing is None else _cells(scene, k, group) for k, group in enumerate(scene.groups)
+    )
+
+
+def place_groups(scene: Scene, state: State, middles: Cells) -> None:
+    """Write where everybody of a state's first instant is, how fast he moves, where he faces, and who does not live.
+
+    middles: those of `cells_of`.
+    """
+    for b in range(len(state.key)):
+        for first, group, mine in zip(scene.starts, scene.groups, middles, strict=False):
+            if group.network is not None:
+                _tie(scene, state, b, first, group)
+            else:
+                _scatter(scene, state, b, first, group, mine)
+    _bury(scene, state)
+    _face(scene, state)
+
+
+def _period(scene: Scene) -> NDArray[np.float64]:
+    """Return the edges of a torus, (D,) m; zeros for what is none."""
+    return np.array(scene.space.extent(scene.dimension) if scene.space.periodic else (0.0,) * scene.dimension, float)
+
+
+def _corners(scene: Scene, spawn: Spawn) -> tuple[Sequence[float], Sequence[float]]:
+    """Return the box that agents begin in, m."""
+    return spawn.low or (0.0,) * scene.dimension, spawn.high or scene.space.extent(scene.dimension)
+
+
+def _cells(scene: Scene, k: int, group: Group) -> Floats:
+    """Return the middles of a group's cells, (size, D) m."""
+    try:
+        box = _corners(scene, group.spawn)
+        return cells(group.spawn, *box, group.size, group.widest, scene.obstacles, _period(scene))
+    except ValueError as error:
+        raise ValueError(f"groups[{k}].spawn.{error}") from None
+
+
+def _scatter(scene: Scene, state: State, b: int, first: int, group: Group, middles: Floats | None) -> None:
+    """Write where a group begins in one world: anywhere in its box, or each near the middle of its cell."""
+    spawn, d, period = group.spawn, scene.dimension, _period(scene)
+    low, high = (np.array(corner, float) for corner in _corners(scene, spawn))
+    if middles is not None:
+        low, high = np.full(d, -spawn.jitter), np.full(d, spawn.jitter)
+    heading = np.array(spawn.heading if spawn.heading is not None else (0.0,) * d, float)
+    tried, mine = np.zeros(scene.agents, np.int64), slice(first, first + group.size)
+    looked = 0 if middles is not None else len(scene.circles)  # a cell has been found clear of all of them
+    for _ in range(ROUNDS if scene.shapes else 1):
+        entry(scatter)(
+            state.key[b], state.x[:, b], state.v[:, b], scene.body.radius, mine.start, mine.stop, low, high,
+            *spawn.speed, heading, state.obstacle_x[:, b, :looked], state.obstacle_radius[b, :looked],
+            period, np.zeros(d), tried,
+        )  # fmt: skip
+        if middles is not None:
+            state.pos[b, mine] += middles
+            return
+        inside = clear_of(scene.shapes, np.array(state.pos[b, mine], np.float64), period) < group.radii
+        if not inside.any():
+            return
+        tried[mine] += inside
+
+
+def _tie(scene: Scene, state: State, b: int, first: int, group: Group) -> None:
+    """Write where the particles of a network begin in one world, and how fast they all fly."""
+    assert group.network is not None
+    mine = slice(first, first + group.size)
+    state.pos[b, mine] = group.network.points(scene.dimension)
+    if group.spawn.heading is not None:
+        heading = np.asarray(group.spawn.heading, float)
+        state.vel[b, mine] = group.spawn.speed[0] * heading / np.linalg.norm(heading)
+        state.vel[b, first + group.network.pins()] = 0
+
+
+def _bury(scene: Scene, state: State) -> None:
+    """Let those be dead who do not live at the start: nobody, where they may be born."""
+    for k, (first, alive) in enumerate(zip(scene.starts, scene.living, strict=False)):
+        dead = slice(first + alive, scene.starts[k + 1])
+        feeding = [member for member in scene.population if isinstance(member, Emitter) and member.feeds(k)]
+        state.alive[:, dead], state.vel[:, dead] = False, 0
+        if scene.population:
+            state.identity[:, dead] = -1
+        if feeding:
+            state.pos[:, dead] = feeding[0].place.extremes.mean(axis=0)
+
+
+def _face(scene: Scene, state: State) -> None:
+    """Write where everybody faces in the beginning: whither he flies, or as his group's heading says."""
+    for first, group in zip(scene.starts, scene.groups, strict=False):
+        if scene.parts.oriented and group.spawn.heading is not None:
+            heading = np.asarray(group.spawn.heading, float)
+            state.heading[:, first : first + group.size] = heading / np.linalg.norm(heading)
+    state.face()
