@@ -51,6 +51,12 @@ class Model:
     note: str = ""
     """What is ours, what is recalled and not seen, what the paper leaves open."""
 
+    @property
+    def numbers(self) -> dict[str, float]:
+        """The numbers of what each wants, as kind_field: driving_tau, sidestep_gamma."""
+        fields = ((wish.kind, *item) for wish in self.wishes(False, None) for item in wish)
+        return {f"{kind}_{name}": value for kind, name, value in fields if isinstance(value, float)}
+
 
 def _helbing_molnar_1995(hidden: bool, group: int | None) -> tuple[Effect, ...]:
     return (

@@ -7,14 +7,13 @@ from typing import Any
 
 import numpy as np
 
+from agents.reynolds.keep_clear import keep_clear
 from flockenv import steering
-from flockenv.orca import orca
 from flockenv.rows import rows
 from flockenv.tasks import Corridor
 
 __all__ = ["CorridorOrcaRules", "CorridorRules", "corridor", "orca_corridor"]
 
-keep_clear = rows(orca)
 sidestep = rows(steering.sidestep)
 
 _PERSON = 0.25
@@ -70,11 +69,4 @@ class CorridorOrcaRules:
 
 def orca_corridor(see: Any, task: Corridor, p: CorridorOrcaRules) -> np.ndarray:
     """Optimal reciprocal collision avoidance (van den Berg et al. 2011) along the corridor; walls are no neighbours."""
-    others = see.velocity[:, None] + see.neighbour_velocity
-    radius = np.where(see.neighbour_present > 0, _PERSON + p.margin, -1.0)[..., None]
-    seen = np.concatenate([see.neighbours, others, radius, np.full_like(radius, 0.5)], axis=-1)
-    change = keep_clear(
-        see.velocity, _ahead(see), _PERSON, task.max_speed, p.horizon, task.control_dt, p.turn,
-        seen.reshape(len(seen), -1),
-    )  # fmt: skip
-    return p.gain * change + _off_walls(see, 3.0, 0.1)
+    return keep_clear(see, task, p, _ahead(see), _PERSON, _PERSON, 0.5) + _off_walls(see, 3.0, 0.1)

@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
+from agents.reynolds.keep_clear import keep_clear
 from flockenv import arbitration, steering
-from flockenv.orca import orca
 from flockenv.rows import rows
 from flockenv.tasks import Crossing
 
@@ -17,7 +17,6 @@ __all__ = ["CrossingRules", "OrcaRules", "crossing", "orca_crossing"]
 allocate = rows(arbitration.allocate)
 arrive = rows(steering.arrive)
 give_way = rows(steering.give_way)
-keep_clear = rows(orca)
 separate = rows(steering.separate)
 unaligned_threat = rows(steering.unaligned_threat)
 
@@ -41,7 +40,7 @@ def crossing(see: Any, task: Crossing, p: CrossingRules) -> np.ndarray:
     """Unaligned collision avoidance (Reynolds 1999), then arrive; vectors are (along the course, to its left)."""
     own = see.velocity[:, None]
     others = own + see.neighbour_velocity
-    time = unaligned_threat(see.neighbours, own, others, 0.6 + p.margin, p.horizon)
+    time = unaligned_threat(see.neighbours, own, others, 2 * _WALKER + p.margin, p.horizon)
     time = np.where(see.neighbour_present > 0, time, np.inf)
     row, first = np.arange(len(time)), np.argmin(time, axis=1)
     soonest = time[row, first]
@@ -70,11 +69,8 @@ def orca_crossing(see: Any, task: Crossing, p: OrcaRules) -> np.ndarray:
     """Optimal reciprocal collision avoidance (van den Berg et al. 2011) on the way to the goal."""
     still = np.zeros_like(see.goal)
     wish = arrive(see.goal, still, task.max_speed, p.slow_radius)
-    others = see.velocity[:, None] + see.neighbour_velocity
-    present = see.neighbour_present > 0
-    radius = np.where(present, 0.3 + p.margin, -1.0)[..., None]
-    seen = np.concatenate([see.neighbours, others, radius, np.full_like(radius, 0.5)], axis=-1)
-    change = keep_clear(
-        see.velocity, wish, 0.3, task.max_speed, p.horizon, task.control_dt, p.turn, seen.reshape(len(seen), -1)
-    )
-    return p.gain * change
+    return keep_clear(see, task, p, wish, _WALKER, _WALKER, 0.5)
+
+
+_WALKER = 0.3
+"""Radius of a walker, m."""

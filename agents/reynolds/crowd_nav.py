@@ -7,15 +7,14 @@ from typing import Any
 
 import numpy as np
 
+from agents.reynolds.keep_clear import keep_clear
 from flockenv import steering
-from flockenv.orca import orca
 from flockenv.rows import rows
 from flockenv.tasks import CrowdNav
 
 __all__ = ["CrowdNavRules", "HeuristicsRules", "RobotOrcaRules", "crowd_nav", "heuristics_crowd_nav", "orca_crowd_nav"]
 
 collision_distance = rows(steering.collision_distance)
-keep_clear = rows(orca)
 seek = rows(steering.seek)
 sidestep = rows(steering.sidestep)
 
@@ -60,14 +59,7 @@ class RobotOrcaRules:
 def orca_crowd_nav(see: Any, task: CrowdNav, p: RobotOrcaRules) -> np.ndarray:
     """Optimal reciprocal collision avoidance (van den Berg et al. 2011) on the way to the goal."""
     wish = seek(see.goal, np.zeros_like(see.goal), task.max_speed)
-    others = see.velocity[:, None] + see.neighbour_velocity
-    radius = np.where(see.neighbour_present > 0, _PEDESTRIAN + p.margin, -1.0)[..., None]
-    share = np.full_like(radius, 0.5 if task.visible else p.share)
-    seen = np.concatenate([see.neighbours, others, radius, share], axis=-1)
-    change = keep_clear(
-        see.velocity, wish, _ROBOT, task.max_speed, p.horizon, task.control_dt, p.turn, seen.reshape(len(seen), -1)
-    )
-    return p.gain * change
+    return keep_clear(see, task, p, wish, _ROBOT, _PEDESTRIAN, 0.5 if task.visible else p.share)
 
 
 @dataclass(frozen=True)

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
-from typing import Any, ClassVar, Literal, Self
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field, model_validator
+from pydantic import Field
 
-from flockenv.effects.base import Effect, Me, Obstacle, all_masses
+from flockenv.behaviours.push import Push
+from flockenv.effects.base import Me, Obstacle, all_masses
 from flockenv.elementary import exp
 from flockenv.kernels import Vec, law
 from flockenv.vec import add, scale, select, zero
@@ -44,7 +44,7 @@ def all_sides(p: Any, me: Me, acc: Vec) -> Vec:
     return acc
 
 
-class ObstacleRepulsion(Effect):
+class ObstacleRepulsion(Push):
     """Keep off every wall: F = A exp((r_i - d) / B) n, d from the body's centre; r_i its radius, or 0.
 
     Helbing and Molnar 1995: -grad U0 exp(-d / R), so A = U0 / R in m/s^2, B = R, `bodies: false`. Helbing, Farkas and
@@ -56,15 +56,10 @@ class ObstacleRepulsion(Effect):
     """
 
     kind: Literal["obstacle_repulsion"] = "obstacle_repulsion"
-    strength: float = Field(default=0.0, ge=0, description="A, N")
-    acceleration: float = Field(default=0.0, ge=0, description="A, m/s^2: the force is that times its own mass")
     decay: float = Field(gt=0, description="B, m, over which the force falls to 1/e")
     bodies: bool = Field(default=True, description="is the distance that from the body's surface, not its centre?")
     radius: float = Field(default=3.0, gt=0, description="m from its centre, beyond which walls do nothing")
-    most: float | None = Field(default=None, gt=0, description="N, that one side does at most")
     occluded: bool = Field(default=False, description="do only sides push that no other obstacle hides?")
-    steering: ClassVar[bool] = True
-    strengths: ClassVar[tuple[str, ...]] = ("strength", "acceleration")
     obstacle_pieces: ClassVar[bool] = True
     obstacle_start: ClassVar[str | None] = "nowhere"
     obstacle_law: ClassVar[str | None] = "pushed_off"
@@ -83,13 +78,6 @@ effects:
   - {kind: obstacle_repulsion, strength: 2000, decay: 0.08}
 """
 
-    @model_validator(mode="after")
-    def _does_something(self) -> Self:
-        """Refuse one whose strength was forgotten; 0 is allowed where it is said."""
-        if not {"strength", "acceleration"} & self.model_fields_set:
-            raise ValueError("strength: missing; give strength, N, or acceleration, m/s^2")
-        return self
-
     @property
     def occluded_obstacles(self) -> bool:
         """Whether walls hide walls."""
@@ -97,10 +85,8 @@ effects:
 
     def parameters(self) -> dict[str, float | Vec]:
         """A, B, whose surface, and how far it looks."""
-        return {
-            "strength": self.strength, "acceleration": self.acceleration, "decay": self.decay,
-            "bodies": float(self.bodies), "radius": self.radius, "bound": math.inf if self.most is None else self.most,
-        }  # fmt: skip
+        about = {"decay": self.decay, "bodies": float(self.bodies), "radius": self.radius}
+        return {**super().parameters(), **about}
 
     def folded(self, dimension: int) -> int:
         """The force so far."""

@@ -7,14 +7,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any, ClassVar, Literal, Self
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field, model_validator
+from pydantic import Field
 
 from flockenv import steering
-from flockenv.effects.base import Effect, Me, Other, Sight, all_masses, demand_group
+from flockenv.behaviours.push import Push
+from flockenv.effects.base import Me, Other, Sight, all_masses, demand_group
 from flockenv.elementary import exp
 from flockenv.kernels import Vec, law, like
 from flockenv.steering import social
@@ -49,37 +50,18 @@ def size_of(p: Any, me: Me) -> float:
     return p.strength + me.mass * p.acceleration  # type: ignore[no-any-return]
 
 
-class Social(Effect):
-    """What forces between pedestrians have in common: A in newtons, or in m/s^2 for everybody's own mass; or both."""
+class Social(Push):
+    """What forces between pedestrians have in common: how strong they are, whom they are about, who is seen."""
 
-    strength: float = Field(default=0.0, ge=0, description="A, N")
-    acceleration: float = Field(default=0.0, ge=0, description="A, m/s^2: the force is that times its own mass")
-    most: float | None = Field(
-        default=None, gt=0, description="N, that one of those it is about does at most, before it is weighed"
-    )
     radius: float = Field(gt=0, description="m, who is further away is not looked at")
     group: int | None = Field(default=None, ge=0, description="whom it is about; none = all")
     occluded: bool = Field(default=False, description="whom an obstacle hides does nothing")
-    steering: ClassVar[bool] = True
-    strengths: ClassVar[tuple[str, ...]] = ("strength", "acceleration")
     finish_law: ClassVar[str | None] = "as_felt"
-
-    @model_validator(mode="after")
-    def _does_something(self) -> Self:
-        """Refuse one whose strength was forgotten; 0 is allowed where it is said."""
-        if not {"strength", "acceleration"} & self.model_fields_set:
-            raise ValueError("strength: missing; give strength, N, or acceleration, m/s^2")
-        return self
 
     @property
     def sight(self) -> Sight:
         """Radius, whom, and whether walls hide them."""
         return Sight(self.radius, group=self.group, occluded=self.occluded)
-
-    def parameters(self) -> dict[str, float | Vec]:
-        """Its strength, and its bound."""
-        most = math.inf if self.most is None else self.most
-        return {"strength": self.strength, "acceleration": self.acceleration, "bound": most}
 
     def sums(self, dimension: int) -> int:
         """The force so far."""

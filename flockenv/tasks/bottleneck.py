@@ -14,6 +14,7 @@ from flockenv import steering
 from flockenv.effects import Contact, ObstacleContact
 from flockenv.kernels import kernel, like
 from flockenv.noise import uniform
+from flockenv.presets import PRESETS
 from flockenv.scene import Group, Scene
 from flockenv.shapes import Wall
 from flockenv.snapshot import Mark
@@ -23,15 +24,14 @@ from flockenv.state import State
 from flockenv.sweep import Look
 from flockenv.tasks.base import Frame, Measured, Task
 from flockenv.tasks.layout import Layout, Slot
-from flockenv.tasks.sight import clip, place_of, put, velocity_of
+from flockenv.tasks.sight import clip, neighbour_slots, place_of, put, put_crowding, put_neighbour, velocity_of
 from flockenv.vec import add, norm, scale, sub, unit
 
 __all__ = ["Bottleneck"]
 
 _RADIUS = 0.25  # m, of everybody
-_MASS = 80.0  # kg
-_STIFFNESS = 1.2e5  # k, N/m, of bodies: Helbing, Farkas and Vicsek 2000
-_FRICTION = 2.4e5  # kappa, kg/(m s)
+_MODEL = PRESETS["helbing_farkas_vicsek_2000"]
+_MASS, _STIFFNESS, _FRICTION = 80.0, 1.2e5, 2.4e5  # kg; k, N/m, and kappa, kg/(m s), of bodies: those of the model
 _RATIO = 0.3  # damping as a share of what is critical: ours, people do not bounce
 _BEYOND = 1.5  # m of floor beyond the door
 
@@ -73,12 +73,13 @@ def _walker(p: Any, frame: Frame, i: int, force: Any) -> None:
     y, fits = 0.5 * p.room - np.float64(frame.pos[1, i]), max(0.5 * p.width - 1.2 * _RADIUS, 0.0)
     aside = y - min(max(y, -fits), fits)
     way = unit((max(p.room - np.float64(frame.pos[0, i]), 0.0) + 0.1, aside))
-    wish = scale(sub(scale(way, top), velocity), _MASS / 0.5)
+    wish = scale(sub(scale(way, top), velocity), _MASS / p.driving_tau)
     for j in range(frame.pos.shape[1]):
         to = sub(place_of(frame, j), place_of(frame, i))
         if j != i and frame.alive[j] and norm(to) < p.sight:
             tie = (1.0, 0.0) if j < i else (-1.0, 0.0)
-            wish = add(wish, scale(steering.repulsion(to, tie, 2.0 * _RADIUS, 0.08), 2000.0))
+            push = steering.repulsion(to, tie, 2.0 * _RADIUS, p.circular_repulsion_decay)
+            wish = add(wish, scale(push, p.circular_repulsion_strength))
     force[0, i], force[1, i] = wish[0], wish[1]
 
 
@@ -175,7 +176,7 @@ def measure(p: Any, before: Frame, after: Frame, numbers: Any) -> None:
 def observe(p: Any, frame: Frame, rows: Any) -> None:
     """Own velocity, the way to the door on two scales, walls, what presses, the nearest others."""
     slots, one = int(p.neighbours), like(p.sight, 1.0)
-    half = 0.5 * p.room
+    half, axis = 0.5 * p.room, (one, like(one, 0.0))
     for i in range(rows.shape[0]):
         row = rows[i]
         for c in range(rows.shape[1]):
@@ -193,11 +194,8 @@ def observe(p: Any, frame: Frame, rows: Any) -> None:
             to = (frame.pos[0, j] - frame.pos[0, i], frame.pos[1, j] - frame.pos[1, i])
             relative = (frame.vel[0, j] - frame.vel[0, i], frame.vel[1, j] - frame.vel[1, i])
             distance = max(math.sqrt(to[0] * to[0] + to[1] * to[1]), 1e-9)
-            share = min(max(1.0 - (distance - 2.0 * _RADIUS) / p.near, 0.0), 1.0) / distance
-            speed = 0.5 * one / p.max_speed
-            put(row, 9 + 2 * s, (clip(to[0] / p.sight), clip(to[1] / p.sight)))
-            put(row, 9 + 2 * slots + 2 * s, (clip(relative[0] * speed), clip(relative[1] * speed)))
-            put(row, 9 + 4 * slots + 2 * s, (clip(to[0] * share), clip(to[1] * share)))
+            put_neighbour(row, 9, slots, s, to, relative, axis, one / p.sight, 0.5 * one / p.max_speed)
+            put_crowding(row, 9, slots, s, to, axis, distance, distance - 2.0 * _RADIUS, p.near)
             row[np.uint64(9 + 6 * slots + s)] = 1.0
 
 
@@ -268,9 +266,10 @@ class Bottleneck(Task):
         return columns, -(-self.people // columns)
 
     def parameters(self) -> dict[str, float]:
-        """The fields, and where people begin."""
+        """The fields, where people begin, and how those walk who do not learn."""
         columns, rows = self.cells
-        return super().parameters() | {"columns": float(columns), "rows": float(rows)}
+        begin = {"columns": float(columns), "rows": float(rows)}
+        return super().parameters() | begin | _MODEL.numbers
 
     @property
     def agents(self) -> int:
@@ -318,18 +317,13 @@ class Bottleneck(Task):
     @functools.cached_property
     def layout(self) -> Layout:
         """Axes are the room's; the door is in the wall that x points to."""
-        n = self.neighbours
-        close = "unit vectors towards them x (1 - gap between bodies / near), 0 beyond"
         return Layout((
             Slot("velocity", (2,), self.max_speed, "m/s", "own velocity (x, y)"),
             Slot("door", (2,), self.room, "m", "offset of the middle of the door"),
             Slot("door_near", (2,), self.close, "m", "the same on a fine scale, cut off beyond it"),
             Slot("to_sides", (2,), self.room, "m", "distance to the walls at y = 0 and y = room", low=0.0),
             Slot("pressure", (), self.limit, "N/m", "what presses, over the circumference", low=0.0),
-            Slot("neighbours", (n, 2), self.sight, "m", "offsets of the nearest others, nearest first"),
-            Slot("neighbour_velocity", (n, 2), 2 * self.max_speed, "m/s", "their velocities minus one's own"),
-            Slot("crowding", (n, 2), 1.0, "1", close),
-            Slot("neighbour_present", (n,), 1.0, "1", "1 where there is one, else 0 (and zeros elsewhere)", low=0.0),
+            *neighbour_slots(self.neighbours, self.sight, 2 * self.max_speed, "others", crowding=True),
         ))  # fmt: skip
 
     @functools.cached_property

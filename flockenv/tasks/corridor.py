@@ -14,6 +14,7 @@ from flockenv import steering
 from flockenv.effects import ObstacleContact
 from flockenv.kernels import kernel, like
 from flockenv.noise import normal, uniform
+from flockenv.presets import PRESETS
 from flockenv.scene import Group, Scene
 from flockenv.shapes import Wall
 from flockenv.space import Torus
@@ -22,7 +23,7 @@ from flockenv.state import State
 from flockenv.sweep import Look
 from flockenv.tasks.base import Frame, Measured, Task
 from flockenv.tasks.layout import Layout, Slot
-from flockenv.tasks.sight import offset, put, turned, velocity_of
+from flockenv.tasks.sight import neighbour_slots, offset, put, put_crowding, put_neighbour, turned, velocity_of
 from flockenv.vec import add, norm, scale, sub
 
 __all__ = ["Corridor"]
@@ -71,15 +72,21 @@ def _walker(p: Any, frame: Frame, i: int, force: Any) -> None:
     """A scripted walker: at his desired speed, aside of others and off walls, as in Moussaid et al. 2009."""
     velocity, y = velocity_of(frame, i), np.float64(frame.pos[1, i]) - _WALL
     wanted = (np.float64(frame.memory[0, i] * frame.memory[1, i]), 0.0)
-    off = 3.0 * (math.exp(-max(y, 0.0) / 0.1) - math.exp(-max(p.width - y, 0.0) / 0.1))
-    wish = add(scale(sub(wanted, velocity), 1.0 / 0.54), (0.0, off))
+    decay = p.obstacle_repulsion_decay
+    off = p.obstacle_repulsion_acceleration * (
+        math.exp(-max(y, 0.0) / decay) - math.exp(-max(p.width - y, 0.0) / decay)
+    )
+    wish = add(scale(sub(wanted, velocity), 1.0 / p.driving_tau), (0.0, off))
     for j in range(frame.pos.shape[1]):
         x = offset(np.float64(frame.pos[0, i]), np.float64(frame.pos[0, j]), p.length)
         to = (x, np.float64(frame.pos[1, j] - frame.pos[1, i]))
         if j != i and norm(to) < p.sight:
             tie = (1.0, 0.0) if j < i else (-1.0, 0.0)
-            aside = steering.sidestep(to, velocity, velocity_of(frame, j), tie, 2.0, 0.35, 2.0, 3.0, 0.005)
-            wish = add(wish, scale(aside, 4.5))
+            aside = steering.sidestep(
+                to, velocity, velocity_of(frame, j), tie, p.sidestep_importance, p.sidestep_gamma, p.sidestep_angular,
+                p.sidestep_forward, p.sidestep_bias,
+            )  # fmt: skip
+            wish = add(wish, scale(aside, p.sidestep_acceleration))
     force[0, i], force[1, i] = wish[0], wish[1]
 
 
@@ -185,10 +192,8 @@ def observe(p: Any, frame: Frame, rows: Any) -> None:
             x, y = offset(frame.pos[0, i], frame.pos[0, j], p.length), frame.pos[1, j] - frame.pos[1, i]
             relative = (frame.vel[0, j] - frame.vel[0, i], frame.vel[1, j] - frame.vel[1, i])
             distance = max(math.sqrt(x * x + y * y), 1e-9)
-            share = min(max(1.0 - (distance - 2.0 * _RADIUS) / p.near, 0.0), 1.0) / distance
-            put(row, 5 + 2 * s, turned((x, y), way, one / p.sight))
-            put(row, 5 + 2 * slots + 2 * s, turned(relative, way, 0.5 * one / p.max_speed))
-            put(row, 5 + 4 * slots + 2 * s, turned((x, y), way, share))
+            put_neighbour(row, 5, slots, s, (x, y), relative, way, one / p.sight, 0.5 * one / p.max_speed)
+            put_crowding(row, 5, slots, s, (x, y), way, distance, distance - 2.0 * _RADIUS, p.near)
             row[np.uint64(5 + 6 * slots + s)] = 1.0
 
 
@@ -247,9 +252,10 @@ class Corridor(Task):
         return -(-self.people // rows), rows
 
     def parameters(self) -> dict[str, float]:
-        """The fields, and where people begin."""
+        """The fields, where people begin, and how those walk who do not learn."""
         columns, rows = self.cells
-        return super().parameters() | {"columns": float(columns), "rows": float(rows)}
+        begin = {"columns": float(columns), "rows": float(rows)}
+        return super().parameters() | begin | PRESETS["moussaid_2009"].numbers
 
     @property
     def agents(self) -> int:
@@ -290,16 +296,11 @@ class Corridor(Task):
     @functools.cached_property
     def layout(self) -> Layout:
         """Every vector is (along one's way, to its left)."""
-        n = self.neighbours
-        close = "unit vectors towards them x (1 - gap between bodies / near), 0 beyond"
         return Layout((
             Slot("velocity", (2,), self.max_speed, "m/s", "own velocity (along one's way, to its left)"),
             Slot("desired_speed", (), self.max_speed, "m/s", "how fast one would like to go", low=0.0),
             Slot("walls", (2,), self.width, "m", "distance to the wall on the left, and on the right", low=0.0),
-            Slot("neighbours", (n, 2), self.sight, "m", "offsets of the nearest others, nearest first"),
-            Slot("neighbour_velocity", (n, 2), 2 * self.max_speed, "m/s", "their velocities minus one's own"),
-            Slot("crowding", (n, 2), 1.0, "1", close),
-            Slot("neighbour_present", (n,), 1.0, "1", "1 where there is one, else 0 (and zeros elsewhere)", low=0.0),
+            *neighbour_slots(self.neighbours, self.sight, 2 * self.max_speed, "others", crowding=True),
         ))  # fmt: skip
 
     @functools.cached_property

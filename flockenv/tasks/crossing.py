@@ -21,7 +21,7 @@ from flockenv.state import State
 from flockenv.sweep import Look
 from flockenv.tasks.base import Frame, Measured, Task
 from flockenv.tasks.layout import Layout, Slot
-from flockenv.tasks.sight import put, turned
+from flockenv.tasks.sight import neighbour_slots, put, put_neighbour, turned
 
 __all__ = ["Crossing"]
 
@@ -181,8 +181,7 @@ def observe(p: Any, frame: Frame, rows: Any) -> None:
             j = np.uint64(frame.near_who[s, i])
             to = (frame.pos[0, j] - frame.pos[0, i], frame.pos[1, j] - frame.pos[1, i])
             relative = (frame.vel[0, j] - frame.vel[0, i], frame.vel[1, j] - frame.vel[1, i])
-            put(row, 4 + 2 * s, turned(to, course, one / p.sight))
-            put(row, 4 + 2 * slots + 2 * s, turned(relative, course, 0.5 * one / p.max_speed))
+            put_neighbour(row, 4, slots, s, to, relative, course, one / p.sight, 0.5 * one / p.max_speed)
             row[np.uint64(4 + 4 * slots + s)] = 1.0
 
 
@@ -253,13 +252,10 @@ class Crossing(Task):
     @functools.cached_property
     def layout(self) -> Layout:
         """Every vector is (along the course, to its left)."""
-        n = self.neighbours
         return Layout((
             Slot("velocity", (2,), self.max_speed, "m/s", "own velocity (along the course, to its left)"),
             Slot("goal", (2,), 3 * self.circle, "m", "the way to the goal"),
-            Slot("neighbours", (n, 2), self.sight, "m", "offsets of the nearest neighbours, nearest first"),
-            Slot("neighbour_velocity", (n, 2), 2 * self.max_speed, "m/s", "their velocities minus one's own"),
-            Slot("neighbour_present", (n,), 1.0, "1", "1 where there is one, else 0 (and zeros elsewhere)", low=0.0),
+            *neighbour_slots(self.neighbours, self.sight, 2 * self.max_speed, "neighbours", crowding=False),
         ))  # fmt: skip
 
     @functools.cached_property

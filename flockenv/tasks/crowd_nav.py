@@ -25,7 +25,7 @@ from flockenv.steer import Steer
 from flockenv.sweep import Look
 from flockenv.tasks.base import Frame, Measured, Task
 from flockenv.tasks.layout import Layout, Slot
-from flockenv.tasks.sight import clip, put, turned
+from flockenv.tasks.sight import clip, neighbour_slots, put, put_crowding, put_neighbour, turned
 
 __all__ = ["CrowdNav"]
 
@@ -153,10 +153,8 @@ def observe(p: Any, frame: Frame, rows: Any) -> None:
         relative = (frame.vel[0, j] - frame.vel[0, 0], frame.vel[1, j] - frame.vel[1, 0])
         distance = max(math.sqrt(to[0] * to[0] + to[1] * to[1]), 1e-9)
         gap = distance - frame.radius[0] - frame.radius[j]
-        closeness = min(max(1.0 - gap / p.near, 0.0), 1.0)
-        put(row, 4 + 2 * s, turned(to, course, one / p.sight))
-        put(row, 4 + 2 * slots + 2 * s, turned(relative, course, 0.25 * one / p.max_speed))
-        put(row, 4 + 4 * slots + 2 * s, turned(to, course, closeness / distance))
+        put_neighbour(row, 4, slots, s, to, relative, course, one / p.sight, 0.25 * one / p.max_speed)
+        put_crowding(row, 4, slots, s, to, course, distance, gap, p.near)
         row[np.uint64(4 + 6 * slots + s)] = clip(one)
 
 
@@ -260,15 +258,10 @@ class CrowdNav(Task):
     @functools.cached_property
     def layout(self) -> Layout:
         """Every vector is (along the course, to its left)."""
-        n = self.neighbours
-        close = "unit vectors towards them x (1 - gap between bodies / near), 0 beyond"
         return Layout((
             Slot("velocity", (2,), self.max_speed, "m/s", "own velocity (along the course, to its left)"),
             Slot("goal", (2,), 3 * self.circle, "m", "the way to the goal"),
-            Slot("neighbours", (n, 2), self.sight, "m", "offsets of the nearest pedestrians, nearest first"),
-            Slot("neighbour_velocity", (n, 2), 4 * self.max_speed, "m/s", "their velocities minus one's own"),
-            Slot("crowding", (n, 2), 1.0, "1", close),
-            Slot("neighbour_present", (n,), 1.0, "1", "1 where there is one, else 0 (and zeros elsewhere)", low=0.0),
+            *neighbour_slots(self.neighbours, self.sight, 4 * self.max_speed, "pedestrians", crowding=True),
         ))  # fmt: skip
 
     @functools.cached_property

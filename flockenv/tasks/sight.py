@@ -9,8 +9,12 @@ import numpy as np
 
 from flockenv.kernels import Vec, kernel, like
 from flockenv.shapes import ray_hit
+from flockenv.tasks.layout import Slot
 
-__all__ = ["block_ways", "clip", "compass", "leaves_gap", "offset", "place_of", "put", "turned", "velocity_of"]
+__all__ = [
+    "block_ways", "clip", "compass", "leaves_gap", "neighbour_slots", "offset", "place_of", "put", "put_crowding",
+    "put_neighbour", "turned", "velocity_of",
+]  # fmt: skip
 
 
 @kernel
@@ -62,6 +66,41 @@ def put(row: Any, at: int, vector: Any) -> None:
     """Write two numbers into a row from place `at` on (counted without a sign, see block_ways)."""
     row[np.uint64(at)] = vector[0]
     row[np.uint64(at + 1)] = vector[1]
+
+
+@kernel
+def put_neighbour(
+    row: Any, at: int, slots: int, s: int, to: Any, relative: Any, ahead: Any, near_by: float, pace: float
+) -> None:
+    """Write where the s-th nearest is and how fast it moves against oneself, x near_by, 1/m, and pace, s/m.
+
+    The blocks of `neighbour_slots` begin at `at`; vectors are turned so that `ahead`, a unit vector, is the first axis.
+    """
+    put(row, at + 2 * s, turned(to, ahead, near_by))
+    put(row, at + 2 * slots + 2 * s, turned(relative, ahead, pace))
+
+
+@kernel
+def put_crowding(
+    row: Any, at: int, slots: int, s: int, to: Any, ahead: Any, distance: float, gap: float, near: float
+) -> None:
+    """Write the way to the s-th nearest, the longer the smaller the gap between bodies is, m; 0 from `near` on."""
+    share = min(max(1.0 - gap / near, 0.0), 1.0) / distance
+    put(row, at + 4 * slots + 2 * s, turned(to, ahead, share))
+
+
+def neighbour_slots(count: int, sight: float, most_relative: float, who: str, crowding: bool) -> tuple[Slot, ...]:
+    """Return what a row says of the nearest few: `most_relative` m/s is the unit of their velocities against one's own.
+
+    crowding: are there unit vectors that grow where bodies are near, too?
+    """
+    close = "unit vectors towards them x (1 - gap between bodies / near), 0 beyond"
+    return (
+        Slot("neighbours", (count, 2), sight, "m", f"offsets of the nearest {who}, nearest first"),
+        Slot("neighbour_velocity", (count, 2), most_relative, "m/s", "their velocities minus one's own"),
+        *((Slot("crowding", (count, 2), 1.0, "1", close),) if crowding else ()),
+        Slot("neighbour_present", (count,), 1.0, "1", "1 where there is one, else 0 (and zeros elsewhere)", low=0.0),
+    )
 
 
 def compass(rays: int) -> tuple[float, ...]:
