@@ -13,6 +13,7 @@ from typer.testing import CliRunner
 
 from agents import tune
 from agents.experiment import AS_CONFIGURED, CONFIGS, WEIGHTS, Experiment, PpoSettings, load_experiment
+from agents.imitate import imitate, shown
 from agents.reynolds import RULES, player, tuned
 from flockenv.crew import threads
 from flockenv.evaluation import compare, rollout, worlds_for
@@ -295,3 +296,23 @@ def test_bad_settings_are_one_line(tmp_path: Path) -> None:
         Experiment(task="pursiut").build()
     with pytest.raises(ValueError, match="PpoSettings: steps = 0"):
         PpoSettings(steps=0)
+
+
+# --- imitation --------------------------------------------------------------------------------------------------------
+
+
+def test_a_network_that_is_taught_longer_answers_more_as_the_rules_do() -> None:
+    experiment = Experiment(task="pursuit", ppo={**TINY, "evaluate_worlds": 16})
+    little, more = (imitate(experiment, worlds=4, updates=updates) for updates in (1, 300))
+    assert little.rules == more.rules and little.rows == more.rows > 0
+    assert more.missed < 0.5 * little.missed
+    assert more.network > little.network
+
+
+def test_rows_are_shown_until_an_episode_is_over() -> None:
+    task = load_experiment(CONFIGS / "pursuit.yaml").build()
+    rules = player(task)
+    rows, answers = shown(task, rules, 6)
+    episodes = rollout(task, rules, 6, worlds_for("training", 0, 6))
+    assert len(rows) == len(answers) == episodes.lengths.sum() * task.learners
+    np.testing.assert_allclose(answers, rules.predict(rows.numpy())[0], atol=1e-6)
