@@ -263,6 +263,23 @@ def test_a_contact_of_too_few_steps_is_warned_of_and_the_limit_named() -> None:
     assert warned(bodies(dt=1.01 * most, ratio=0.3)) == []  # it is not there to bounce
 
 
+def test_nobody_is_looked_at_further_away_than_the_widest_two_touch() -> None:
+    """Whatever radius is given: of 900 bodies, one in ten twice as wide, each meets as few, and forces are the same."""
+    spawn = {"low": (0.0, 0.0), "high": (30.0, 30.0), "speed": (0.0, 1.0)}
+    groups = [{"count": 810, "radius": 0.3, "spawn": spawn}, {"count": 90, "radius": 0.6, "spawn": spawn}]
+    found = []
+    for radius in (1.2, 8.0):
+        contact = {"kind": "contact", "stiffness": 10.0, "ratio": 0.3, "friction": 3.0, "radius": radius}
+        scene = Scene.model_validate({"groups": groups, "effects": [contact]})
+        state = scene.start(3)
+        found.append((scene.step(state).counted("pairs"), scene.acceleration(state)))
+    assert found[0][0] == found[1][0] < 0.3 * 900**2
+    np.testing.assert_array_equal(found[0][1], found[1][1])
+    pos, radius = state.pos[0], scene.body.radius
+    gap = np.linalg.norm(pos[:, None] - pos, axis=-1) - radius[:, None] - radius + 100.0 * np.eye(900)
+    np.testing.assert_array_equal((found[0][1][0] != 0).any(axis=-1), (gap < 0).any(axis=1))
+
+
 def test_a_radius_at_which_bodies_overlap_already_is_refused() -> None:
     with pytest.raises(ValueError, match=r"effects\[0\].radius = 0.5: .* 0.6 m; at least that is allowed") as caught:
         bodies().with_effects(Contact(stiffness=1.0, radius=0.5))

@@ -1,14 +1,16 @@
 """The one sweep that all pair laws share: a block of sorted agents meets its candidates, lane beside lane.
 
-Every pair law is evaluated for every candidate, and its sums keep what it says of those in sight. A topological sight
-needs a pass before that one, which finds how far its k nearest are. `look` meets its candidates in the same way.
+Every pair law is evaluated for every candidate, and its sums keep what it says of those in sight; but contacts only of
+candidates whom some agent of the block may touch, for these are few. A topological sight needs a pass before that one,
+which finds how far its k nearest are. `look` meets its candidates in the same way.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 
-from flockenv.sweep.parts import Parts, record_of, sight_of, sorted_at
+from flockenv.effects.base import Sight
+from flockenv.sweep.parts import Parts, record_of, sorted_at
 from flockenv.sweep.query import query, walk
 from flockenv.sweep.text import Slots, given, indented, indented_lines, nearest_image, place_of, tuple_of
 
@@ -89,7 +91,7 @@ def _sum_up(parts: Parts) -> list[str]:
     return [
         "for r in range(found):",
         "    met += (ranges[r, 1] - ranges[r, 0]) * (upto - at)",
-        *indented_lines(meet_range(parts, parts.fields, _meet(parts)), 4),
+        *indented_lines(meet_range(parts, parts.fields, _meet(parts, False), _meet(parts, True)), 4),
         f"for l in range(np.uint64({parts.width})):",
         indented(_finish(parts), 4),
         f"if nx == 0 and present == n{' and not arranged' * parts.sorts}:  # they are felt as the lanes lie",
@@ -103,14 +105,18 @@ def _sum_up(parts: Parts) -> list[str]:
     ]
 
 
-def _meet(parts: Parts) -> list[str]:
-    """Write what one candidate adds to the sums of the lanes that see it."""
-    slot, lines = Slots(parts), _ahead(parts)
+def _meet(parts: Parts, touch: bool) -> list[str]:
+    """Write what one candidate adds to the sums of the lanes that see it: by contacts, or by all other laws."""
+    laws = [(k, e) for k, e in parts.pairs if e.contact == touch]
+    asked = dict.fromkeys(parts.sight_of(effect) for _, effect in laws)
+    slot, lines = Slots(parts), _ahead(parts) if laws and not touch else []
     for q, sight in enumerate(parts.sights):
+        if sight not in asked:
+            continue
         cut = f" & (square <= {slot(f'near{q}_{sight.nearest - 1}')})" if sight.nearest else ""
         lines.append(f"seen{q} = ({_seen(parts, q)}){cut}" if sight.occluded else f"seen{q} = {_seen(parts, q)}{cut}")
-    for k, effect in parts.pairs:
-        q, slots = parts.sights.index(sight_of(effect)), slot.all(f"c{k}_")
+    for k, effect in laws:
+        q, slots = parts.sights.index(parts.sight_of(effect)), slot.all(f"c{k}_")
         if effect.pair_start:
             lines.append(f"says = pair_law_{k}(p{k}, me, it, ({', '.join(slots)},))")
             lines += [f"{s} = says[{j}] if seen{q} else {s}" for j, s in enumerate(slots)]
@@ -158,21 +164,35 @@ def _ahead(parts: Parts) -> list[str]:
     ]
 
 
-def meet_range(parts: Parts, fields: list[str], lines: list[str]) -> list[str]:
-    """Write the loop over the candidates of range r. Only around the edge of a periodic box are images sought."""
+def meet_range(parts: Parts, fields: list[str], lines: list[str], touch: list[str] | None = None) -> list[str]:
+    """Write the loop over the candidates of range r; `touch` is for those whom some lane may touch.
+
+    Only around the edge of a periodic box are images sought.
+    """
     square = "exact_dot(to, to)" if any(s.nearest for s in parts.sights) else "dot(to, to)"
     wrapped, plain = "offset_to(size, me.pos, xj)", "sub(xj, me.pos)"
 
+    near = [q for q, sight in enumerate(parts.sights) if touch and sight in _touching(parts)]
+
+    def over_lanes(offset: str, each: list[str]) -> list[str]:
+        return [
+            f"for l in range(np.uint64({parts.width})):",
+            indented([_me(parts, fields), "other = own != number[l]", f"to = {offset}", f"square = {square}"], 4),
+            "    it = Other(aj, to, square, vj, rj, tj, mj, nj)",
+            indented(each, 4),
+        ]
+
     def loop(offset: str) -> list[str]:
+        some = [f"touch |= other & (square < within{q})" for q in near]
         return [
             "j, last = np.uint64(ranges[r, 0]), np.uint64(ranges[r, 1])",
             "while j < last:",
             *indented_lines(_candidate(parts, fields), 4),
             "    own, o = np.int32(j - block), like(reach, -0.0)",
-            f"    for l in range(np.uint64({parts.width})):",
-            indented([_me(parts, fields), "other = own != number[l]", f"to = {offset}", f"square = {square}"], 8),
-            "        it = Other(aj, to, square, vj, rj, tj, mj, nj)",
-            indented(lines, 8),
+            *["    touch = False"] * bool(near),
+            *indented_lines(over_lanes(offset, [*lines, *some]), 4),
+            *["    if touch:"] * bool(near),
+            *indented_lines(over_lanes(offset, touch) if touch and near else [], 8),
             "    j += np.uint64(1)",
         ]
 
@@ -181,6 +201,11 @@ def meet_range(parts: Parts, fields: list[str], lines: list[str]) -> list[str]:
     if not parts.sorts:
         return loop(wrapped)
     return ["if ranges[r, 2] > 0:", *indented_lines(loop(wrapped), 4), "else:", *indented_lines(loop(plain), 4)]
+
+
+def _touching(parts: Parts) -> set[Sight]:
+    """Return the sights of contacts."""
+    return {parts.sight_of(effect) for _, effect in parts.pairs if effect.contact}
 
 
 def _candidate(parts: Parts, fields: list[str]) -> list[str]:

@@ -24,7 +24,7 @@ from flockenv.kernels import LINE
 from flockenv.shapes import packed
 from flockenv.space import Space
 
-__all__ = ["LAWS", "SMALL_STRIDE", "Look", "Parts", "flattened", "record_of", "sight_of", "sorted_at", "view_of"]
+__all__ = ["LAWS", "SMALL_STRIDE", "Look", "Parts", "flattened", "record_of", "sorted_at", "view_of"]
 
 SMALL_STRIDE = 128
 """Places in a row of sorted agents where there are too few to be sorted by cell: their blocks, and one more."""
@@ -74,6 +74,8 @@ class Parts:
     """Obstacles that are not in the state: the source depends on their forms, and on whether any of them moves."""
     circles: int = 0
     """How many obstacles come before them."""
+    touching: float = field(default=math.inf, compare=False)
+    """m, the radii of two that are widest: who is further away is in nobody's contact."""
     tables: tuple[NDArray[np.float64], ...] = field(default=(), compare=False)
     """What the laws of each tabled effect look up, in order: numbers alone, too."""
 
@@ -165,7 +167,13 @@ class Parts:
     @functools.cached_property
     def sights(self) -> list[Sight]:
         """The different ways in which pair laws look around; laws that see the same share the test."""
-        return list(dict.fromkeys(sight_of(e) for _, e in self.pairs))
+        return list(dict.fromkeys(self.sight_of(e) for _, e in self.pairs))
+
+    def sight_of(self, effect: Effect) -> Sight:
+        """Return whom the pair law of an effect sees: of contacts, who can touch."""
+        sight = effect.sight
+        assert sight is not None, f"{type(effect).__name__} has a pair law and no sight"
+        return sight._replace(radius=min(sight.radius, self.touching)) if effect.contact else sight
 
     @property
     def reach(self) -> float:
@@ -412,13 +420,6 @@ def sorted_at(parts: Parts, row: int, place: str) -> str:
 def record_of(fields: list[str]) -> list[str]:
     """Return what is written of an agent when it is put into its cell; headings follow from velocities."""
     return ["cell", "place"] + [f for f in fields if f[0] != "h"]
-
-
-def sight_of(effect: Effect) -> Sight:
-    """Return whom the pair law of an effect sees."""
-    sight = effect.sight
-    assert sight is not None, f"{type(effect).__name__} has a pair law and no sight"
-    return sight
 
 
 def view_of(fov: float) -> float:
