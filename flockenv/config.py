@@ -6,12 +6,14 @@ It builds numbers, words, lists and blocks, and never an object, whatever tag a 
 
 from __future__ import annotations
 
+import functools
 import json
 import math
 import re
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from decimal import Decimal
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, TypeVar
 
 import yaml
@@ -41,9 +43,24 @@ def load_scene(source: str | Path) -> Scene:
     return load(source, Scene)
 
 
-def dump_scene(scene: Scene) -> str:
-    """Return the scene as YAML text that reads back as an equal scene."""
-    return dump(scene)
+def dump_scene(scene: Scene, models: Sequence[str] = (), brief: bool = False) -> str:
+    """Return the scene as YAML text that reads back as an equal scene.
+
+    models: presets to write by name, where all their effects follow each other in the scene; brief: see `dump`.
+    """
+    return dump(scene, brief, {"effects": functools.partial(_by_name, scene, models)} if models else {})
+
+
+def _by_name(scene: Scene, models: Sequence[str], effects: list[Any]) -> list[Any]:
+    """Return the effects of a scene as they are written, with those of presets by the preset's name."""
+    out = list(effects)
+    for name in models:
+        stands_for = Preset(preset=name).effects()
+        for k in range(len(out) - len(stands_for), -1, -1):
+            if scene.effects[k : k + len(stands_for)] == stands_for:
+                out[k : k + len(stands_for)] = [{"preset": name}]
+                break
+    return out
 
 
 def schema(model: type[BaseModel] = Scene) -> dict[str, Any]:
@@ -83,14 +100,18 @@ def load(source: str | Path, model: type[M]) -> M:
     raise ConfigError("\n".join(lines + more))
 
 
-def dump(record: BaseModel) -> str:
+def dump(
+    record: BaseModel, brief: bool = False, written: Mapping[str, Callable[[Any], Any]] = MappingProxyType({})
+) -> str:
     """Return the record as YAML text; raises ConfigError if that text would not read back as an equal record.
 
-    Every field is written, defaults too, so that a file keeps its meaning when a default changes. The exception is a
-    field without limit (infinity), which YAML readers disagree about: it is left out where that is the default.
+    Every field is written, defaults too, so that a file keeps its meaning when a default changes; `brief`: only what is
+    no default, for people to read. What has no limit (infinity), about which YAML readers disagree, is left out where
+    that is the default. `written` says how else some of its fields are written, by name.
     """
+    data = _finite(_brief(record) if brief else record.model_dump())
     text: str = yaml.dump(
-        _finite(record.model_dump()),
+        {name: written[name](value) if name in written else value for name, value in data.items()},
         Dumper=_Dumper,
         sort_keys=False,
         default_flow_style=None,
@@ -104,6 +125,15 @@ def dump(record: BaseModel) -> str:
     if not same:
         raise ConfigError(f"{type(record).__name__} cannot be written as YAML: its text reads back as another record")
     return text
+
+
+def _brief(value: Any) -> Any:
+    """Return a record's fields that are no defaults, and what kind it is; so for the records within it."""
+    if isinstance(value, BaseModel):
+        usual = {name: f.get_default(call_default_factory=True) for name, f in type(value).model_fields.items()}
+        given = {name: getattr(value, name) for name in usual}
+        return {name: _brief(each) for name, each in given.items() if name == "kind" or each != usual[name]}
+    return [_brief(each) for each in value] if isinstance(value, (list, tuple)) else value
 
 
 def _finite(value: Any) -> Any:

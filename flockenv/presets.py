@@ -54,8 +54,9 @@ class Model:
     @property
     def numbers(self) -> dict[str, float]:
         """The numbers of what each wants, as kind_field: driving_tau, sidestep_gamma."""
-        fields = ((wish.kind, *item) for wish in self.wishes(False, None) for item in wish)
-        return {f"{kind}_{name}": value for kind, name, value in fields if isinstance(value, float)}
+        wishes = self.wishes(False, None)
+        fields = {f"{wish.kind}_{name}": getattr(wish, name) for wish in wishes for name in type(wish).model_fields}
+        return {name: value for name, value in fields.items() if isinstance(value, float)}
 
 
 def _helbing_molnar_1995(hidden: bool, group: int | None) -> tuple[Effect, ...]:

@@ -11,7 +11,9 @@ from flockenv.studies import stored, try_all, write_numbers
 from flockenv.terminal import INTERRUPTED, EarlyEnd, Force, new_console, relative, show_table
 
 if TYPE_CHECKING:
-    from flockenv.findings import Results
+    from collections.abc import Sequence
+
+    from flockenv.findings import Case, Results
 
 __all__ = ["validate"]
 
@@ -27,6 +29,9 @@ def validate(
     out: Annotated[
         str | None, typer.Option(metavar="X.md|X.json", help="Write the page, X.json beside it, pictures into X/.")
     ] = None,
+    scenes: Annotated[
+        str | None, typer.Option(metavar="FOLDER", help="Write the cases' scenes as YAML into it, and try nothing.")
+    ] = None,
     force: Force = False,
 ) -> None:
     """Try published models of pedestrians in the scenes of RiMEA and NIST: value, bound and verdict of each."""
@@ -35,6 +40,9 @@ def validate(
 
     path = checked_file(out, [".json", ".md"], True) if out is not None else None
     todo, under = cases_named(CASES, cases or []), presets_named(preset or [])
+    if scenes is not None:
+        _write_scenes(scenes, force, todo, under)
+        return
     known = None if force else stored(path, "crowds", fingerprint())
     found, stopped = try_all("crowds", trials(todo, under), path, known, lambda *given: run(todo, under, *given))
     asked = found.only({case.name for case in todo}, set(under))
@@ -53,6 +61,16 @@ def validate(
             new_console().print(f"{relative(path)} holds {len(found.findings)} findings")
     if stopped:
         raise EarlyEnd("interrupted; what was done is shown, the same command goes on", INTERRUPTED)
+
+
+def _write_scenes(folder: str, force: bool, cases: Sequence[Case], presets: Sequence[str]) -> None:
+    """Write the scenes of some cases, and say how many."""
+    from flockenv.outputs import checked_path
+    from flockenv.validation.scenes import write_scenes
+
+    path = checked_path(folder, "--scenes")
+    written = write_scenes(path, cases, presets, force)
+    new_console().print(f"{relative(path)} holds {len(written)} scenes")
 
 
 def _write(path: Path, results: Results) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import warnings
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -16,6 +17,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from flockenv.config import MAX_BYTES, ConfigError, dump, dump_scene, load, load_scene, schema
 from flockenv.effects import EFFECTS, Drag
 from flockenv.integrators import INTEGRATORS, RK4
+from flockenv.presets import preset
 from flockenv.scene import Group, Scene
 from flockenv.space import Box, Torus
 from flockenv.spawn import Spawn
@@ -152,6 +154,33 @@ def test_what_is_written_reads_back_exactly(record: Anything) -> None:
         again = load(text, Anything)
         assert again == record
         assert math.copysign(1, again.number) == math.copysign(1, record.number)
+
+
+@pytest.mark.parametrize("path", SCENES, ids=lambda path: path.stem)
+def test_in_brief_a_scene_says_no_default_and_is_the_same(path: Path) -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        scene = load_scene(path)
+        text = dump_scene(scene, brief=True)
+        assert load_scene(text) == scene
+    assert len(text) < len(dump_scene(scene))
+    assert "null" not in text
+
+
+def test_models_are_written_by_name_where_all_of_them_is_there() -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        people = Group(count=2, mass=80.0, radius=0.3, desired_speed=1.0, spawn=Spawn(low=(0, 0), high=(9, 9)))
+        model = preset("helbing_2000")
+        whole = Scene(groups=(people,), effects=(Drag(rate=0.1), *model, Drag(rate=0.2)), dt=0.001)
+        part = whole.with_effects(*model[1:])
+        for scene, by_name in ((whole, True), (part, False)):
+            text = dump_scene(scene, ["moussaid_2009", "helbing_2000"])
+            assert load_scene(text) == scene
+            assert ("preset: helbing_2000" in text) == by_name and ("circular_repulsion" in text) != by_name
+    assert [next(iter(e.values())) for e in yaml.safe_load(dump_scene(whole, ["helbing_2000"]))["effects"]] == [
+        "drag", "helbing_2000", "drag",
+    ]  # fmt: skip
 
 
 @given(

@@ -20,6 +20,7 @@ from flockenv.validation.corridors import DENSITIES, EACH_WAY
 from flockenv.validation.doors import DATA, _off
 from flockenv.validation.page import page
 from flockenv.validation.rooms import bottleneck, corner, room
+from flockenv.validation.scenes import SCENES
 from flockenv.validation.walk import Walk, walked
 
 ROOT = Path(__file__).parent.parent
@@ -91,6 +92,47 @@ def test_configs_are_the_scenes_of_the_cases(name: str, built: Any) -> None:
     assert said.groups[0].size == made.groups[0].size
     assert [effect for effect in said.effects if effect.kind != "way"] == [e for e in made.effects if e.kind != "way"]
     assert said.effects[0] == made.effects[0]
+
+
+@pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
+def test_files_of_scenes_are_what_cases_try(case: Case) -> None:
+    """If this fails: flockenv validate --preset helbing_2000 --scenes configs/crowds --force."""
+    for which, built in SCENES[case.name].items():
+        file = ROOT / "configs" / "crowds" / f"{'_'.join([*case.name.split(), *which.split()])}.yaml"
+        with quietly():
+            assert load_scene(file) == built(NERVOUS)
+
+
+def test_there_is_no_other_file_of_scenes() -> None:
+    assert len(list((ROOT / "configs" / "crowds").iterdir())) == sum(len(SCENES[case.name]) for case in CASES)
+
+
+def test_scenes_are_written_with_their_model_by_name_and_never_over_others(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert main(["validate", "juelich", "--preset", "moussaid_2009", "--scenes", "mine"]) == 0
+    assert "mine holds 3 scenes" in capsys.readouterr().out
+    text = Path("mine/juelich_2_turned.yaml").read_text()
+    assert "- {preset: moussaid_2009}" in text and "sidestep" not in text
+    Path("mine/juelich_6.yaml").write_text("precious")
+    Path("mine/juelich_2_turned.yaml").unlink()
+    assert main(["validate", "juelich", "--preset", "moussaid_2009", "--scenes", "mine"]) == 2
+    assert "juelich_2_straight.yaml exists already" in capsys.readouterr().err
+    assert not Path("mine/juelich_2_turned.yaml").exists() and Path("mine/juelich_6.yaml").read_text() == "precious"
+    both = ["--preset", "moussaid_2009", "--preset", "helbing_1995"]
+    assert main(["validate", "rimea 6", *both, "--scenes", "several"]) == 0
+    assert sorted(path.parent.name for path in Path("several").rglob("*.yaml")) == [
+        "helbing_molnar_1995", "moussaid_2009",
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize("case", [c for c in CASES if not c.only], ids=lambda case: case.name)
+@pytest.mark.parametrize("preset", VALIDATED)
+def test_every_scene_can_be_built_with_every_preset(preset: str, case: Case) -> None:
+    with quietly():
+        for built in SCENES[case.name].values():
+            assert sum(built(preset).living) > 0
 
 
 def _walls(scene: Scene) -> set[tuple[tuple[float, ...], tuple[float, ...]]]:

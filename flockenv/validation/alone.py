@@ -6,6 +6,7 @@ Names and bounds: shared/reference/numerics.md, sections 1.1 to 1.3 (RiMEA, NIST
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 
 import numpy as np
 
@@ -14,12 +15,15 @@ from flockenv.findings import Case, Value
 from flockenv.scene import Scene
 from flockenv.spawn import Spawn
 from flockenv.spread import Spread
-from flockenv.validation.walk import Floats, lane, people, scene_of, walked, wall
+from flockenv.validation.walk import Floats, Scenes, lane, people, scene_of, walked, wall
 
-__all__ = ["ALONE", "corridor", "crossing_time"]
+__all__ = ["ALONE", "SCENES", "corridor", "crossing_time"]
 
 TABLE = ((0.58, 1.61), (1.41, 1.54), (0.68, 1.41), (0.46, 0.76))
 """m/s, from and to: below 30 years, 30 to 50, above, and the handicapped (RiMEA 7, by Weidmann's table)."""
+
+AGES = (13, 13, 12, 12)
+"""How many of each."""
 
 
 def corridor(name: str, speed: float, *, length: float, degrees: float = 0.0, moving: bool = False) -> Scene:
@@ -35,6 +39,42 @@ def corridor(name: str, speed: float, *, length: float, degrees: float = 0.0, mo
     one = people(name, 1, begin, begin, desired_speed=speed, spawn=spawn)
     walls = tuple(wall(*(turned(*vertex) for vertex in side.vertices)) for side in lane(length + 10, 2.0, -5.0))
     return scene_of(name, [one], [Course(direction=turned(1.0, 0.0))], obstacles=walls)
+
+
+def gated_lane(name: str) -> Scene:
+    """Return one person in a corridor who goes by four gates on the way, one after another."""
+    begin = (0.0, 0.0)
+    spawn = Spawn(low=begin, high=begin, speed=(1.0, 1.0), heading=(1.0, 0.0))
+    one = people(name, 1, begin, begin, desired_speed=1.0, spawn=spawn)
+    gates = tuple(Stage(ends=((x, -0.8), (x, 0.8))) for x in (2.5, 5.0, 7.5, 10.0))
+    return scene_of(name, [one], [Journey(stages=gates, then="leave")], obstacles=lane(20, 2.0, -5.0))
+
+
+def free(name: str, spreads: Sequence[Spread], counts: Sequence[int]) -> Scene:
+    """Return some groups who go along x, everybody 20 m from everybody else."""
+    groups, done = [], 0.0
+    for spread, count in zip(spreads, counts, strict=True):
+        spawn = Spawn(low=(0.0, done), high=(20.0, done + 20.0 * count), spacing=20.0)
+        groups.append(people(name, count, (0, 0), (1, 1), desired_speed=spread, spawn=spawn))
+        done += 20.0 * count
+    aside = (wall((-500, -100), (500, -100)),)
+    return scene_of(name, groups, [Course(direction=(1, 0))], obstacles=aside)
+
+
+SCENES: Scenes = {
+    "rimea 1": {"": partial(corridor, speed=1.33, length=40)},
+    "nist 2.1": {"": partial(corridor, speed=1.0, length=60)},
+    "juelich 2": {
+        "straight": partial(corridor, speed=1.0, length=10, moving=True),
+        "turned": partial(corridor, speed=1.0, length=10, degrees=45.0, moving=True),
+    },
+    "juelich 6": {"": gated_lane},
+    "rimea 7": {"": partial(free, spreads=[Spread(low=a, high=b) for a, b in TABLE], counts=AGES)},
+    "nist 2.4": {
+        f"seed {seed}": partial(free, spreads=[Spread(mean=1.2, sd=0.2, seed=seed)], counts=(50,)) for seed in (0, 1)
+    },
+}
+"""By case, and by what differs from scene to scene: what builds it of a preset's name."""
 
 
 def crossing_time(time: Floats, along: Floats, distance: float) -> float:
@@ -57,53 +97,40 @@ def _along(scene: Scene, seconds: float, degrees: float = 0.0) -> tuple[Floats, 
 
 def rimea_1(name: str) -> Value:
     """40 m at 1.33 m/s, from rest."""
-    took = crossing_time(*_along(corridor(name, 1.33, length=40), 60), 40.0)
+    took = crossing_time(*_along(SCENES["rimea 1"][""](name), 60), 40.0)
     return Value(took, 26.0 <= took <= 34.0, f"{took:.2f} s")
 
 
 def nist_2_1(name: str) -> Value:
     """The speed over 40 m, after 10 m."""
-    time, along = _along(corridor(name, 1.0, length=60), 70)
+    time, along = _along(SCENES["nist 2.1"][""](name), 70)
     speed = 40.0 / (crossing_time(time, along, 50.0) - crossing_time(time, along, 10.0))
     return Value(speed, abs(speed - 1.0) <= 0.05, f"{speed:.4f} m/s")
 
 
 def turned(name: str) -> Value:
     """10 m at 1 m/s, in a corridor at 45 degrees, and in one that is not turned."""
-    took = [
-        crossing_time(*_along(corridor(name, 1.0, length=10, degrees=a, moving=True), 15, a), 10.0) for a in (0.0, 45.0)
-    ]
+    built = SCENES["juelich 2"]
+    took = [crossing_time(*_along(built[how](name), 15, a), 10.0) for how, a in (("straight", 0.0), ("turned", 45.0))]
     off = abs(took[1] - 10.0)
     return Value(off, off <= 0.1, f"{took[1]:.4f} s; not turned {took[0]:.4f} s, difference {took[1] - took[0]:.1g} s")
 
 
 def way_points(name: str) -> Value:
     """10 m at 1 m/s by four gates on the way, one after another, from 1 m/s on."""
-    begin = (0.0, 0.0)
-    spawn = Spawn(low=begin, high=begin, speed=(1.0, 1.0), heading=(1.0, 0.0))
-    one = people(name, 1, begin, begin, desired_speed=1.0, spawn=spawn)
-    gates = tuple(Stage(ends=((x, -0.8), (x, 0.8))) for x in (2.5, 5.0, 7.5, 10.0))
-    scene = scene_of(name, [one], [Journey(stages=gates, then="leave")], obstacles=lane(20, 2.0, -5.0))
-    took = crossing_time(*_along(scene, 15), 10.0)
+    took = crossing_time(*_along(SCENES["juelich 6"][""](name), 15), 10.0)
     return Value(took, abs(took - 10.0) <= 0.1, f"{took:.3f} s")
 
 
-def _free_speeds(name: str, spreads: Sequence[Spread], counts: Sequence[int]) -> list[Floats]:
-    """Return the speeds of some groups after 6 s, everybody 20 m from everybody else, m/s."""
-    groups, done = [], 0.0
-    for spread, count in zip(spreads, counts, strict=True):
-        spawn = Spawn(low=(0.0, done), high=(20.0, done + 20.0 * count), spacing=20.0)
-        groups.append(people(name, count, (0, 0), (1, 1), desired_speed=spread, spawn=spawn))
-        done += 20.0 * count
-    aside = (wall((-500, -100), (500, -100)),)
-    scene = scene_of(name, groups, [Course(direction=(1, 0))], obstacles=aside)
+def _free_speeds(scene: Scene) -> Floats:
+    """Return everybody's speed after 6 s, m/s."""
     end = scene.run(scene.start(0), round(6 / scene.dt))
-    return np.split(np.linalg.norm(end.vel[0], axis=1), np.cumsum(counts)[:-1])
+    return np.asarray(np.linalg.norm(end.vel[0], axis=1))
 
 
 def rimea_7(name: str) -> Value:
     """50 adults, by age: each walks as fast as his age says."""
-    found = _free_speeds(name, [Spread(low=a, high=b) for a, b in TABLE], (13, 13, 12, 12))
+    found = np.split(_free_speeds(SCENES["rimea 7"][""](name)), np.cumsum(AGES)[:-1])
     off = max(max(a - v.min(), v.max() - b, 0.0) for v, (a, b) in zip(found, TABLE, strict=True))
     ranges = ", ".join(f"{v.min():.2f}-{v.max():.2f}" for v in found)
     return Value(off, off <= 0.03, f"m/s by age: {ranges}")
@@ -113,9 +140,7 @@ def nist_2_4(name: str) -> Value:
     """100 people whose speeds are normal, 1.2 +- .2 m/s: whether those they walk at are."""
     from scipy.stats import kstest  # it looks for torch, and takes half a second
 
-    speeds = np.concatenate([
-        _free_speeds(name, [Spread(mean=1.2, sd=0.2, seed=seed)], (50,))[0] for seed in (0, 1)
-    ])  # fmt: skip
+    speeds = np.concatenate([_free_speeds(built(name)) for built in SCENES["nist 2.4"].values()])
     p = float(kstest(speeds, "norm", args=(1.2, 0.2)).pvalue)
     return Value(p, p > 0.05, f"mean {speeds.mean():.3f}, deviation {speeds.std(ddof=1):.3f} m/s")
 

@@ -5,6 +5,7 @@ A torus, so wide that no force reaches around it; along its middle a corridor.
 
 from __future__ import annotations
 
+from functools import partial
 from itertools import pairwise
 from typing import Any
 
@@ -19,9 +20,9 @@ from flockenv.shapes import Wall
 from flockenv.space import Torus
 from flockenv.spawn import Spawn
 from flockenv.state import State
-from flockenv.validation.walk import STEPS, Floats, people, scene_of, walked, wall
+from flockenv.validation.walk import STEPS, Floats, Scenes, nobody, people, scene_of, walked, wall
 
-__all__ = ["CORRIDORS", "endless", "lined_up"]
+__all__ = ["CORRIDORS", "SCENES", "endless", "lined_up"]
 
 EDGE = 32.0
 """m, of the torus across the corridor, and its least length: the widest sight of a preset is 15 m."""
@@ -43,14 +44,20 @@ def endless(
     name: str, counts: tuple[int, int], length: float = EDGE, width: float = WIDTH, ways: tuple[int, int] = (1, -1),
     dense: bool = False,
 ) -> Scene:  # fmt: skip
-    """Return two groups in a corridor without ends, each going its way along it; dense: with bodies that overlap."""
-    middle = EDGE / 2
-    low, high = (0.0, middle - width / 4), (length, middle + width / 4)
-    spawn, nobody = Spawn(low=low, high=high), max(0, FEWEST_AGENTS - sum(counts))
-    groups = [
-        people(name, count + more, low, high, spawn=spawn, alive=count)
-        for count, more in zip(counts, (0, nobody), strict=True)
-    ]  # fmt: skip
+    """Return two groups in a corridor without ends, each going its way along it; dense: with bodies that overlap.
+
+    Each begins in a half of its own; `lined_up` mixes them.
+    """
+    middle, half = EDGE / 2, length / 2
+    groups = []
+    for k, count in enumerate(counts):
+        file = half / count  # each has so much of the length, if they walk one behind the other
+        beside = 0.3 if width > 1 else (width - file) / 2  # m, from the walls to where cells begin
+        low, high = (k * half, middle - width / 2 + beside), ((k + 1) * half, middle + width / 2 - beside)
+        cells = {"spawn": Spawn(low=low, high=high, spacing=file)} if width <= 1 and not dense else {}
+        groups.append(people(name, count, low, high, **cells))
+    if sum(counts) < FEWEST_AGENTS:  # so few and many share a kernel
+        groups.append(nobody(name, (half, middle), FEWEST_AGENTS - sum(counts)))
     aims = [Course(group=k, direction=(way, 0)) for k, way in enumerate(ways)]
     return scene_of(
         name, groups, aims, space=Torus(size=(length, EDGE)), obstacles=_sides(length, middle, width),
@@ -84,14 +91,33 @@ def lined_up(scene: Scene, length: float, width: float, worlds: int = 1, seed: i
     return begin.with_motion(pos, np.zeros_like(pos))
 
 
+def _flowing(name: str, density: float) -> Scene:
+    """Return a crowd of some density, 1/m^2, all of whom go the same way."""
+    count = max(100, round(density * EDGE * WIDTH))
+    return endless(name, (count // 2, count - count // 2), count / (density * WIDTH), WIDTH, (1, 1), density > 2)
+
+
+def _in_file(name: str, density: float) -> Scene:
+    """Return people in single file, so many per m."""
+    count = round(density * EDGE)
+    return endless(name, (count // 2, count - count // 2), EDGE, 0.8, (1, 1), density > 1.25)
+
+
+SCENES: Scenes = {
+    "rimea 4": {f"{density:g} per m2": partial(_flowing, density=density) for density in DENSITIES},
+    "rimea 16": {f"{density:g} per m": partial(_in_file, density=density) for density in ALONG},
+    "lanes": {"": partial(endless, counts=(EACH_WAY, EACH_WAY))},
+}
+"""By case, and by what differs from scene to scene: what builds it of a preset's name."""
+
+
 def rimea_4(name: str) -> Value:
     """The fundamental diagram: densities of .5 to 3 per m^2, all go the same way, the last 18 of 30 s."""
     cloud: dict[str, list[float]] = {"density": [], "speed": []}
     means = []
-    for density in DENSITIES:
-        count = max(100, round(density * EDGE * WIDTH))
-        length = count / (density * WIDTH)
-        scene = endless(name, (count // 2, count - count // 2), length, WIDTH, (1, 1), density > 2)
+    for built in SCENES["rimea 4"].values():
+        scene = built(name)
+        length = scene.space.extent(2)[0]
         run = walked(scene, SECONDS, every=1.0, begin=lined_up(scene, length, WIDTH))
         late = run.time > DROPPED
         pos, vel = run.pos[late, 0], run.vel[late, 0]
@@ -118,9 +144,9 @@ def _area(x: float) -> list[tuple[float, float]]:
 def rimea_16(name: str) -> Value:
     """Single file: a corridor of .8 m, .5 to 1.75 people per m of it."""
     means = []
-    for density in ALONG:
-        count = round(density * EDGE)
-        scene = endless(name, (count // 2, count - count // 2), EDGE, 0.8, (1, 1), density > 1.25)
+    for built in SCENES["rimea 16"].values():
+        scene = built(name)
+        count = sum(scene.living)
         run = walked(scene, SECONDS, every=1.0, begin=lined_up(scene, EDGE, 0.8 / 4))
         means.append(float(run.vel[run.time > DROPPED, 0, :count, 0].mean()))
     rho, v = np.array(ALONG), np.array(means)
@@ -137,7 +163,7 @@ def _listed(values: Floats) -> str:
 
 def lanes_of(name: str) -> Value:
     """48 people each way in a corridor 4 m wide: order above its permutation null, over 20 seeds."""
-    scene = endless(name, (EACH_WAY, EACH_WAY))
+    scene = SCENES["lanes"][""](name)
     run = walked(scene, LANE_SECONDS, worlds=LANE_SEEDS, every=1.0, begin=lined_up(scene, EDGE, WIDTH, LANE_SEEDS))
     late = run.time > LANE_SECONDS - LANE_LAST
     way = np.repeat([1.0, -1.0], EACH_WAY)

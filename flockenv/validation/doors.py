@@ -6,6 +6,7 @@ Names and bounds: shared/reference/numerics.md, sections 1.1, 1.2 and 4 (RiMEA, 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import partial
 from itertools import pairwise
 from typing import Any
 
@@ -27,9 +28,9 @@ from flockenv.validation.rooms import (
     room,
     straight,
 )
-from flockenv.validation.walk import Floats, Walk, walked
+from flockenv.validation.walk import Floats, Scenes, Walk, walked
 
-__all__ = ["DATA", "DOORS", "FASTER", "WIDTHS"]
+__all__ = ["DATA", "DOORS", "SCENES", "WIDTHS"]
 
 DATA = {0.8: (1.29, 1.46), 1.0: (1.71, 2.02), 1.2: (2.03, 2.36)}
 """1/s, from and to, by the width of a long bottleneck, m: three experiments (JuPedSim's validation, test 13)."""
@@ -40,8 +41,40 @@ NERVOUS = "helbing_farkas_vicsek_2000"
 FASTER = (1.0, 1.5, 2.0, 3.0, 5.0)
 """m/s, desired speeds of those who want out of a room."""
 
-FASTER_SEEDS = 4
+FASTER_SEEDS = 20
 BURST_SEEDS = 20
+
+
+AGAINST = (0, 10, 50, 100)
+"""How many come against 100 (NIST 2.8)."""
+
+
+def _room_of_2000(name: str, speed: float) -> Scene:
+    return room(name, 200, (15.0, 15.0), 1.0, speed, dt=0.0025)
+
+
+def _shut(name: str, method: Integrator, dt: float) -> Scene:
+    return room(name, 200, (15.0, 15.0), 0.0, 1.5, integrator=method, dt=dt)
+
+
+SCENES: Scenes = {
+    "rimea 6": {"": lambda name: corner(name, 20, 2.0, 10.0, 8.0)},
+    "rimea 15": {
+        "short": lambda name: straight(name, 100, 4.0, 36.0, 16.0),
+        "corner": lambda name: corner(name, 100, 4.0, 18.0, 16.0),
+        "long": lambda name: straight(name, 100, 4.0, 44.0, 16.0),
+    },
+    "rimea 9": {f"{doors} doors": partial(public_room, count=1000, doors=doors) for doors in (4, 2)},
+    "rimea 12": {f"{width:g} m": partial(bottleneck, width=width) for width in WIDTHS},
+    "nist 2.8": {f"against {back}": partial(counterflow, there=100, back=back) for back in AGAINST},
+    "nist 3.1": {"": many_rooms},
+    "nist 5.1": {"": lambda name: room(name, 100, (10.0, 6.0), 1.0)},
+    "bursts": {"": lambda name: door_between(name, 48, 1.0)},
+    "faster is slower": {f"{speed:g} m per s": partial(_room_of_2000, speed=speed) for speed in FASTER},
+    "pressed fixed": {"": partial(_shut, method=SemiImplicitEuler(), dt=0.005)},
+    "pressed adaptive": {"": partial(_shut, method=DormandPrince(), dt=0.01)},
+}
+"""By case, and by what differs from scene to scene: what builds it of a preset's name."""
 
 
 def _through(run: Walk, x: float, half: float, world: int = 0) -> Crossings:
@@ -78,7 +111,7 @@ def _beyond_walls(scene: Scene, run: Walk) -> int:
 
 def rimea_6(name: str) -> Value:
     """20 people around a left corner: all out within 60 s, and nobody through a wall."""
-    scene = corner(name, 20, 2.0, 10.0, 8.0)
+    scene = SCENES["rimea 6"][""](name)
     run = walked(scene, 90, until=nobody_left)
     took, through = _left(run), _beyond_walls(scene, run)
     late = int(run.alive[-1].sum())
@@ -88,13 +121,9 @@ def rimea_6(name: str) -> Value:
 
 def rimea_15(name: str) -> Value:
     """A crowd around a corner, and along corridors as long as its inner and its outer way."""
-    width, arm, begin = 4.0, 18.0, 16.0
     times, note = [], ""
-    for what, scene in zip(("short", "corner", "long"), (
-        straight(name, 100, width, 2 * arm, begin), corner(name, 100, width, arm, begin),
-        straight(name, 100, width, 2 * (arm + width), begin),
-    ), strict=True):  # fmt: skip
-        run = walked(scene, 150, until=nobody_left)
+    for what, built in SCENES["rimea 15"].items():
+        run = walked(built(name), 150, until=nobody_left)
         inside = int(run.alive[-1].sum())
         times.append(_left(run))
         note += f"{what} {times[-1]:.1f} s, " if not inside else f"{what}: {inside} of 100 stuck, "
@@ -108,11 +137,11 @@ def rimea_15(name: str) -> Value:
 def rimea_9(name: str) -> Value:
     """1000 people out of a public room by four doors, and by two."""
     times, note = [], ""
-    for doors, longest in ((4, 400.0), (2, 800.0)):
-        run = walked(public_room(name, 1000, doors), longest, every=0.5, until=nobody_left)
+    for (doors, built), longest in zip(SCENES["rimea 9"].items(), (400.0, 800.0), strict=True):
+        run = walked(built(name), longest, every=0.5, until=nobody_left)
         times.append(_left(run))
         inside = int(run.alive[-1].sum())
-        note += f"{doors} doors {times[-1]:.1f} s; " if not inside else f"{doors} doors: {inside} stuck; "
+        note += f"{doors} {times[-1]:.1f} s; " if not inside else f"{doors}: {inside} stuck; "
     ratio = times[1] / times[0]
     return Value(ratio, 1.6 <= ratio <= 2.4, note.rstrip("; "))
 
@@ -120,8 +149,8 @@ def rimea_9(name: str) -> Value:
 def rimea_12(name: str) -> Value:
     """150 people through a passage of 5 m, .8, 1.0 and 1.2 m wide: the flow, against measured ones."""
     found, jams, notes, through = [], True, [], 0
-    for width in WIDTHS:
-        scene = bottleneck(name, width)
+    for width, built in zip(WIDTHS, SCENES["rimea 12"].values(), strict=True):
+        scene = built(name)
         run = walked(scene, 300, worlds=SEEDS, until=nobody_left)
         entry, leave, ahead, behind = [], [], [], []
         for b in range(SEEDS):
@@ -155,8 +184,8 @@ def _off(flow_: float, band: tuple[float, float]) -> float:
 
 def nist_3_1(name: str) -> Value:
     """23 people in 12 rooms, two exits: who leaves by the one he was told."""
-    scene, begin = many_rooms(name)
-    run = walked(scene, 120, begin=begin, until=nobody_left)
+    scene = SCENES["nist 3.1"][""](name)
+    run = walked(scene, 120, until=nobody_left)
     right = np.zeros(23)
     for k in range(23):
         here = np.flatnonzero(run.alive[:, 0, k])[-1]
@@ -174,7 +203,7 @@ def nist_5(name: str) -> tuple[Walk, float]:
 
     The room is 10 x 6 m: into 8 x 5 m, NIST's and IMO's, 100 bodies .7 m across do not go.
     """
-    run = walked(room(name, 100, (10.0, 6.0), 1.0), 200, until=nobody_left)
+    run = walked(SCENES["nist 5.1"][""](name), 200, until=nobody_left)
     return run, _left(run)
 
 
@@ -205,9 +234,8 @@ def nist_5_2(name: str) -> Value:
 def nist_2_8(name: str) -> Value:
     """100 people through a corridor against 0, 10, 50 and 100: how many come through."""
     done, last = [], []
-    for back in (0, 10, 50, 100):
-        scene = counterflow(name, 100, back)
-        run = walked(scene, 400, every=0.5, until=nobody_left)
+    for built in SCENES["nist 2.8"].values():
+        run = walked(built(name), 400, every=0.5, until=nobody_left)
         gone = run.gone()[:100]
         done.append(int(np.isfinite(gone).sum()))
         last.append(float(np.nanmax(gone)) if done[-1] else float("nan"))
@@ -218,7 +246,7 @@ def nist_2_8(name: str) -> Value:
 
 def door_bursts(name: str) -> Value:
     """48 people each way through a door of 1 m: bursts longer than those of a coin, over 20 seeds."""
-    scene = door_between(name, 48, 1.0)
+    scene = SCENES["bursts"][""](name)
     run = walked(scene, 120, worlds=BURST_SEEDS, every=0.2, until=nobody_left)
     found, nulls, through, stuck = [], [], 0, 0
     for b in range(BURST_SEEDS):
@@ -247,9 +275,8 @@ def door_bursts(name: str) -> Value:
 def faster_is_slower(name: str) -> Value:
     """200 people, 15 x 15 m, a door of 1 m: how long they take, by how fast they would like to go."""
     medians, lows, highs, stuck = [], [], [], 0
-    for speed in FASTER:
-        scene = room(name, 200, (15.0, 15.0), 1.0, speed, dt=0.0025)
-        run = walked(scene, 300, worlds=FASTER_SEEDS, every=0.5, until=nobody_left)
+    for built in SCENES["faster is slower"].values():
+        run = walked(built(name), 300, worlds=FASTER_SEEDS, every=0.5, until=nobody_left)
         times = np.array([_left(run, b) for b in range(FASTER_SEEDS)])
         stuck += int(np.isnan(times).sum())
         times = np.where(np.isnan(times), run.time[-1], times)
@@ -263,16 +290,18 @@ def faster_is_slower(name: str) -> Value:
     return Value(best, None, note, series)
 
 
-def pressed(method: Integrator, dt: float) -> Callable[[str], Value]:
+def pressed(how: str) -> Callable[[str], Value]:
     """Return the trial of 200 people who push against a shut door for ten minutes: everything stays finite."""
 
     def trial(name: str) -> Value:
-        scene = room(name, 200, (15.0, 15.0), 0.0, 1.5, integrator=method, dt=dt)
-        state = scene.start(0)
+        scene = SCENES[f"pressed {how}"][""](name)
+        state, dt = scene.start(0), scene.dt
         for _ in range(10):
             state = scene.step(state, steps=round(60 / dt))
         inside = int(((state.pos[0, :200, 0] < 0) & state.alive[0, :200]).sum())
-        note = f"{method.kind}, steps of {dt:g} s: fastest {_fastest(state):.2f} m/s, {inside} of 200 still in the room"
+        note = (
+            f"{scene.integrator.kind}, steps of {dt:g} s: fastest {_fastest(state):.2f} m/s, {inside} of 200 still in"
+        )
         return Value(float(state.time[0]), bool(np.isfinite(state.x).all()), note)
 
     return trial
@@ -302,14 +331,14 @@ DOORS = (
         "pressed fixed",
         "200 people, shut door, semi-implicit: finite for, s",
         "600 s",
-        pressed(SemiImplicitEuler(), 0.005),
+        pressed("fixed"),
         (NERVOUS,),
     ),
     Case(
         "pressed adaptive",
         "200 people, shut door, Dormand-Prince: finite for, s",
         "600 s",
-        pressed(DormandPrince(), 0.01),
+        pressed("adaptive"),
         (NERVOUS,),
     ),
 )

@@ -14,7 +14,8 @@ INTRODUCTION = """# Crowds, validated
 Models of pedestrians by name ([presets](../flockenv/presets.py)), in the scenes of RiMEA, NIST TN 1822 and JuPedSim's
 tests, as far as they are flat. Parameters are the published ones and were fixed before these numbers were seen; where
 a model misses, the table shows by how much. `flockenv validate --out docs/crowds.md --force` makes this page, the
-numbers beside it and the pictures; `flockenv validate "rimea 12" --preset helbing_2000` is one cell.
+numbers beside it and the pictures; `flockenv validate "rimea 12" --preset helbing_2000` is one cell. The scenes are in
+[configs/crowds](../configs/crowds), with the preset of 2000; `--preset moussaid_2009 --scenes FOLDER` writes others.
 
 What is ours: who wants to go where is found on a grid around all walls (`way`, .3 m clear of them). Walls do not hide
 people (`occluded: false`, the presets' default: to ask takes 20 times as long). Desired speeds are Weidmann's
@@ -49,7 +50,7 @@ REMARKS = {
     "lanes": "The null is a permutation test of every run: directions are dealt out anew among the same people.",
     "bursts": "Crossings until the last of whichever side is done first; the null is a coin with as many heads.",
     "faster is slower": "Steps of .0025 s: at .005 s and 3 m/s bodies are thrown through walls, and the room is empty "
-    "after 16 s. Fewer seeds than the 20 of the protocol: a trend, not a test.",
+    "after 16 s.",
 }
 """What is to be known of a case beside its numbers."""
 

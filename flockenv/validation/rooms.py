@@ -8,8 +8,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-import numpy as np
-
 from flockenv.effects import Way
 from flockenv.neighbours import FEWEST_AGENTS
 from flockenv.population import Leaving
@@ -19,7 +17,7 @@ from flockenv.shapes import Wall
 from flockenv.spawn import Spawn
 from flockenv.state import State
 from flockenv.targets import Target
-from flockenv.validation.walk import people, scene_of, wall
+from flockenv.validation.walk import nobody, people, scene_of, wall
 
 __all__ = [
     "beside", "bottleneck", "corner", "counterflow", "door_between", "gated", "many_rooms", "nobody_left",
@@ -50,23 +48,11 @@ def nobody_left(state: State) -> bool:
     return not bool(state.alive.any())
 
 
-def _nobody(name: str, at: Point, count: int) -> Group:
-    """Return the second group of a scene that has one: people who do not live."""
-    return people(name, count, at, at, alive=0, spawn=Spawn(low=at, high=at), desired_speed=1.0)
-
-
-def _with_nobody(group: Group, more: int) -> Group:
-    """Return a group with more places, in which nobody lives."""
-    return group.model_copy(
-        update={"count": group.size + more, "alive": group.size if group.alive is None else group.alive}
-    )
-
-
 def _scene(
     name: str, groups: Sequence[Group], ways: Sequence[Sequence[Target]], walls: Sequence[Wall],
     sinks: Sequence[Member], spacing: float = SPACING, **fields: Any,
 ) -> Scene:  # fmt: skip
-    """Return a scene of two groups, each with its way; of one, the second is nobody and goes where the first goes.
+    """Return a scene of two groups, each with its way; where there is one, the second is nobody and goes the same way.
 
     Nobody is as many as make it a large scene: so few and many share a kernel.
     """
@@ -74,10 +60,8 @@ def _scene(
     low = groups[0].spawn.low
     assert low is not None
     missing = max(1, FEWEST_AGENTS - sum(group.size for group in groups))
-    if len(groups) == 1:
-        everybody.append(_nobody(name, (low[0] + 0.5, low[1] + 0.5), missing))
-    elif missing > 1:
-        everybody[1] = _with_nobody(everybody[1], missing)
+    if len(groups) == 1 or missing > 1:
+        everybody.append(nobody(name, (low[0] + 0.5, low[1] + 0.5), missing))
     aims = [towards(k, *targets, spacing=spacing) for k, targets in enumerate(goals)]
     return scene_of(name, everybody, aims, obstacles=tuple(walls), population=tuple(sinks), **fields)
 
@@ -178,28 +162,22 @@ def public_room(name: str, count: int, doors: int) -> Scene:
     return _scene(name, [group], [ways], [*low, *high, *sides], [out], spacing=0.15)
 
 
-def many_rooms(name: str) -> tuple[Scene, State]:
-    """Return 12 rooms of 4 x 4 m along a corridor with an exit at either end, 23 people, and where they begin.
+def many_rooms(name: str) -> Scene:
+    """Return 12 rooms of 4 x 4 m along a corridor with an exit at either end, and 23 people, two in a room.
 
-    Those of the first eight rooms, 15, are to leave by the right exit, those of the others, 8, by the left (RiMEA 10).
+    Those of the last eight rooms, 15, are to leave by the right exit, those of the others, 8, by the left (RiMEA 10).
     """
     walls: list[Wall] = []
-    places: list[Point] = []
     for side in (-1, 1):
         cuts = [0.0, *(x for k in range(6) for x in (4 * k + 1.55, 4 * k + 2.45)), 24.0]
         walls += [wall((a, side), (b, side)) for a, b in zip(cuts[::2], cuts[1::2], strict=True)]
         walls += [wall((4.0 * k, side * 1.0), (4.0 * k, side * 5.0)) for k in range(7)]
         walls += [wall((0.0, side * 5.0), (24.0, side * 5.0))]
-    rooms = [(4 * k + 2.0, side * 3.0) for k in (5, 4, 3, 2, 1, 0) for side in (-1, 1)]
-    for x, y in rooms:
-        places += [(x - 1.0, y), (x + 1.0, y)]
-    sizes = (15, 8)
-    inside = Spawn(low=(0.5, -0.2), high=(23.5, 0.2))
-    groups = [people(name, count, (0, 0), (1, 1), spawn=inside) for count in sizes]
+    # cells of 2 m: those in the corridor lie in its walls, all others are a place in a room
+    begin = [Spawn(low=(x, -4.0), high=(x + wide, 4.0), spacing=2.0) for x, wide in ((8.0, 16.0), (0.0, 8.0))]
+    groups = [
+        people(name, count, spawn.low or (), spawn.high or (), spawn=spawn)
+        for count, spawn in zip((15, 8), begin, strict=True)
+    ]
     ways = [[beside((26.0, -1.0), (27.0, 1.0))], [beside((-3.0, -1.0), (-2.0, 1.0))]]
-    out = Leaving(low=(-1.0, -6.0), high=(25.0, 6.0))
-    scene = _scene(name, groups, ways, walls, [out])
-    begin = scene.start(0)
-    pos = np.array(begin.pos)
-    pos[0, :23] = places[:15] + places[16:24]
-    return scene, begin.with_motion(pos, np.zeros_like(pos))
+    return _scene(name, groups, ways, walls, [Leaving(low=(-1.0, -6.0), high=(25.0, 6.0))])

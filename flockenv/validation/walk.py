@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -16,9 +16,10 @@ from flockenv.spawn import Spawn
 from flockenv.spread import Spread
 from flockenv.state import State
 
-__all__ = ["STEPS", "WEIDMANN", "Walk", "lane", "people", "scene_of", "walked", "wall"]
+__all__ = ["STEPS", "WEIDMANN", "Scenes", "Walk", "lane", "nobody", "people", "scene_of", "walked", "wall"]
 
 Floats = NDArray[np.float64]
+Scenes = Mapping[str, Mapping[str, Callable[[str], Scene]]]
 
 WEIDMANN = Spread(mean=1.34, sd=0.26, low=0.3)
 """m/s, how fast pedestrians would like to go (Weidmann 1993): of everybody, unless a case says otherwise."""
@@ -56,21 +57,29 @@ def people(name: str, count: int, low: Sequence[float], high: Sequence[float], *
     Masses and radii are the preset's; speeds are Weidmann's, or those that are given.
     """
     fields = {**PRESETS[name].people, "desired_speed": WEIDMANN, **changes}
-    widest = Group(count=count, **fields).widest
-    spacing = fields.pop("spacing", None)
     if "spawn" not in fields:
-        fields["spawn"] = _apart(count, low, high, widest) if spacing is None else Spawn(low=low, high=high, **spacing)
+        fields["spawn"] = _apart(count, low, high, Group(count=count, **fields).widest)
     return Group(count=count, **fields)
 
 
 def _apart(count: int, low: Sequence[float], high: Sequence[float], widest: float) -> Spawn:
-    """Return the widest grid of cells that has room for so many, each anywhere in the middle of his own."""
+    """Return the widest grid of cells that has room for so many, each anywhere in the middle of his own.
+
+    Where bodies are wider than such cells, they begin anywhere, in each other too.
+    """
     wide, deep = (b - a for a, b in zip(low, high, strict=True))
     spacing = np.sqrt(wide * deep / count)
     while int(wide / spacing + 1e-9) * int(deep / spacing + 1e-9) < count:
         spacing *= 0.995
+    if spacing < 2 * widest:
+        return Spawn(low=tuple(low), high=tuple(high))
     jitter = max(0.0, (spacing / 2 - widest) * 0.9)
     return Spawn(low=tuple(low), high=tuple(high), spacing=float(spacing), jitter=float(jitter))
+
+
+def nobody(name: str, at: tuple[float, float], count: int) -> Group:
+    """Return a group of people who do not live."""
+    return people(name, count, at, at, alive=0, spawn=Spawn(low=at, high=at), desired_speed=1.0)
 
 
 def wall(*vertices: tuple[float, float]) -> Wall:

@@ -1,0 +1,55 @@
+"""The scenes of the cases as files: `flockenv validate "rimea 12" --preset moussaid_2009 --scenes configs/crowds`.
+
+They are the ones that are tried; where a trial mixes those who begin in two halves of a corridor, a file does not.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from flockenv.config import dump_scene
+from flockenv.findings import Case
+from flockenv.outputs import replacing
+from flockenv.validation import alone, corridors, doors
+from flockenv.validation.case import quietly
+from flockenv.validation.walk import Scenes
+
+__all__ = ["SCENES", "write_scenes"]
+
+SCENES: Scenes = {**alone.SCENES, **corridors.SCENES, **doors.SCENES, "nist 5.2": doors.SCENES["nist 5.1"]}
+"""By case, and by what differs from scene to scene: what builds it of a preset's name."""
+
+
+def write_scenes(folder: Path, cases: Sequence[Case], presets: Sequence[str], force: bool = False) -> list[Path]:
+    """Write the scenes of some cases with some presets, a YAML file each; of several presets a folder each.
+
+    Returns their paths. ValueError, before anything is written, if one is there already and `force` is not given.
+    """
+    todo = [
+        (_inside(folder, presets, name) / f"{'_'.join([*case.name.split(), *which.split()])}.yaml", case, name, built)
+        for name in presets
+        for case in cases
+        if case.under(name)
+        for which, built in SCENES[case.name].items()
+    ]
+    there = [path for path, *_ in todo if path.exists()]
+    if there and not force:
+        raise ValueError(f"--scenes: {there[0].name} exists already in {there[0].parent}; --force overwrites it")
+    for path, case, name, built in todo:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with quietly():
+            text = dump_scene(built(name), [name], brief=True)
+        with replacing(path) as file:
+            file.write(f"{_head(case, path)}{text}".encode())
+    return [path for path, *_ in todo]
+
+
+def _inside(folder: Path, presets: Sequence[str], name: str) -> Path:
+    return folder / name if len(presets) > 1 else folder
+
+
+def _head(case: Case, path: Path) -> str:
+    """Return what a file says first: what is demanded of the scene, and how it is looked at."""
+    about = f"# {case.name}: {case.title}; demanded: {case.bound}."
+    return f"{about}\n#   flockenv render {path.name} --duration 30 --out {path.stem}.gif\n"
