@@ -120,7 +120,8 @@ class _Timer:
 def _calls(scene: Scene, k: int) -> tuple[str, ...]:
     effect = scene.effects[k]
     how = "tree" if (k, effect) in scene.parts.treed else "direct"
-    more = {"neighbour query": f" within {effect.reach:g} m", "all others": f" ({how})"}
+    within = f" within {effect.reach:g} m" if effect.reach else ""
+    more = {"neighbour query": within, "all others": f" ({how})"}
     return tuple(what + more.get(what, "") for what in effect.calls_for())
 
 

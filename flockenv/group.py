@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field, model_validator
+from pydantic import AfterValidator, Field, model_validator
 
 from flockenv.appearance import Appearance
 from flockenv.networks import AnyNetwork
@@ -20,7 +20,15 @@ __all__ = ["Group"]
 SIZE, PACE = 0, 1
 """Channels of what differs within a group: whoever is heavy is wide, but not faster."""
 
-PositiveSpread = Annotated[float, Field(gt=0)] | Spread
+
+def _above_0(spread: Spread) -> Spread:
+    """Refuse numbers that are all 0."""
+    if spread.most <= 0 or (spread.mean == 0 and spread.sd == 0):
+        raise ValueError("all of them would be 0; must be above 0")
+    return spread
+
+
+PositiveSpread = Annotated[float, Field(gt=0)] | Annotated[Spread, AfterValidator(_above_0)]
 
 
 class Group(Record):

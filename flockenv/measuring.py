@@ -303,7 +303,7 @@ def _space_time(run: Trajectory, found: Survey) -> tuple[Any, Any, Any]:
     when = (run.step * run.scene.dt)[k]
 
     def edges(values: Any, least: float) -> Any:
-        low, high = float(values.min()), float(values.max())
+        low, high = (float(values.min()), float(values.max())) if len(values) else (0.0, 0.0)
         many = int(np.clip(np.ceil((high - low) / least), 1, MOST_CELLS))
         return np.linspace(low, max(high, low + least), many + 1)
 
@@ -311,6 +311,6 @@ def _space_time(run: Trajectory, found: Survey) -> tuple[Any, Any, Any]:
     time, place = edges(when, max(CELL, gap)), edges(along, CELL)
     people = np.histogram2d(when, along, (time, place))[0]
     instants = np.histogram(run.step * run.scene.dt, time)[0]
-    width = max(float(across.max() - across.min()), CELL)
+    width = max(float(np.ptp(across)), CELL) if len(across) else CELL
     size = width * (place[1] - place[0])
     return time, place, people / np.maximum(instants, 1)[:, None] / size

@@ -32,9 +32,6 @@ from flockenv.steer import Steer
 
 __all__ = ["ALIASES", "PRESETS", "Model", "Preset", "expanded", "preset"]
 
-WIDEST = 1.0
-"""m between centres, within which two bodies may touch: people of up to 1 m across."""
-
 
 @dataclass(frozen=True)
 class Model:
@@ -92,7 +89,7 @@ def _moussaid_2009(hidden: bool, group: int | None) -> tuple[Effect, ...]:
 
 
 def _moussaid_2010(hidden: bool, group: int | None) -> tuple[Effect, ...]:
-    return (*_moussaid_2009(hidden, group), WalkingGroup(group=group or 0, party=3))
+    return (*_moussaid_2009(hidden, group), WalkingGroup(group=group, party=3))
 
 
 def _moussaid_2011(hidden: bool, group: int | None) -> tuple[Effect, ...]:
@@ -119,7 +116,7 @@ PRESETS: dict[str, Model] = {
         "Helbing, Farkas, Vicsek, Nature 407:487, 2000",
         _helbing_farkas_vicsek_2000,
         bodies=(
-            Contact(stiffness=1.2e5, friction=2.4e5, radius=WIDEST),
+            Contact(stiffness=1.2e5, friction=2.4e5),
             ObstacleContact(stiffness=1.2e5, friction=2.4e5),
         ),
         people={"mass": 80.0, "radius": Spread(low=0.25, high=0.35), "desired_speed": 1.0},
@@ -183,7 +180,7 @@ PRESETS: dict[str, Model] = {
     "moussaid_2011": Model(
         "Moussaid, Helbing, Theraulaz, PNAS 108:6884, 2011",
         _moussaid_2011,
-        bodies=(Contact(stiffness=5e3, radius=WIDEST), ObstacleContact(stiffness=5e3)),
+        bodies=(Contact(stiffness=5e3), ObstacleContact(stiffness=5e3)),
         people={"mass": Spread(low=60.0, high=100.0), "radius": Spread(low=60 / 320, high=100 / 320),
                 "desired_speed": Spread(mean=1.3, sd=0.2, low=0.3)},
         symbols={

@@ -190,8 +190,9 @@ def _found(scene: Scene) -> list[tuple[str, _Rates]]:
     """Return the kinds of those effects that know how stiff they are, and how stiff that is."""
     out = []
     for k, effect in enumerate(scene.effects):
+        acting = effect if scene.obstacles else effect.in_the_open()
         try:
-            found = effect.rates(scene.groups, scene.dimension)
+            found = acting.rates(scene.groups, scene.dimension) if acting is not None else None
         except ValueError as error:
             raise ValueError(f"effects[{k}].{error}") from None
         if found is not None:
@@ -274,8 +275,9 @@ def contact_limit(method: Integrator) -> float:
 def check_contact(scene: Scene) -> None:
     """Warn where bodies that should bounce are in contact for too few steps, naming the limit, and what comes of it."""
     for k, effect in enumerate(scene.effects):
-        found = effect.rates(scene.groups, scene.dimension) if effect.contact else None
-        if found is None or (effect.obstacle_law and not scene.obstacles):
+        acting = effect if scene.obstacles else effect.in_the_open()
+        found = acting.rates(scene.groups, scene.dimension) if acting is not None and effect.contact else None
+        if found is None:
             continue
         frequency = np.sqrt(found[0])
         frequency[found[1] > 2 * BOUNCY * frequency] = 0.0

@@ -93,6 +93,11 @@ class Steer(Effect):
         square, damping = (np.where(mine, sum(each[k] for each in found), 0.0) for k in range(2))
         return square, damping
 
+    def in_the_open(self) -> Effect | None:
+        """Return it with those of its behaviours that act where there are no obstacles."""
+        left = tuple(behaviour for behaviour in self.behaviours if behaviour.in_the_open() is not None)
+        return self.model_copy(update={"behaviours": left}) if left else None
+
     def idle(self) -> Effect:
         """Return the same behaviours, all of them idle."""
         return self.model_copy(update={"behaviours": tuple(behaviour.idle() for behaviour in self.behaviours)})

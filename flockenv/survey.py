@@ -181,8 +181,6 @@ class _Run:
             walk = rectangle(self.low, self.high)
         solid = [s for s in self.scene.obstacles if not (s.is_hollow or s.moves)]
         holes = [polygon for s in solid for polygon in s.polygons(self.low, self.high)]
-        if len(walk) > 4:  # of a shape of its own: what is solid around it is none of its obstacles
-            holes = [hole for hole in holes if contains(walk, hole.mean(axis=0))]
         return m.Ground.of(walk, self.area, holes, self.period)
 
     def instants(self) -> list[int]:

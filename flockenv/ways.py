@@ -110,10 +110,14 @@ def check_ways(
     for k, shape in enumerate(scene.obstacles):
         if shape.moves:
             raise ValueError(f"kind = {kind}: its way is found once, and obstacles[{k}] moves")
-        if shape.kind in ("wall", "capsule") and spacing >= 2 * (clearance + shape.radius):
+        thick = shape.thickness
+        if spacing >= 2 * clearance + thick:
             raise ValueError(
-                f"spacing = {spacing:g}: must be below {2 * (clearance + shape.radius):g} m, twice clearance and "
-                f"radius of obstacles[{k}], or ways lead through it"
+                f"spacing = {spacing:g}: ways lead through obstacles[{k}], {thick:g} m thick, unless a clearance of "
+                f"more than {(spacing - thick) / 2:g} m or a spacing of less than {2 * clearance + thick:g} m is given"
+                if clearance or thick
+                else f"clearance = 0: ways lead through obstacles[{k}], a line; more than half of the spacing, "
+                f"{spacing / 2:g} m, is allowed"
             )
     if isinstance(scene.space, Torus):
         raise ValueError(f"kind = {kind}: on a torus ways lead around; only a plane or a box is allowed")

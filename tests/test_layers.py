@@ -197,7 +197,7 @@ def test_a_planted_fault_is_found(tmp_path: Path, file: str, planted: str, fault
     ],
 )
 def test_a_glance_at_the_library_loads_nothing_heavy(statement: str) -> None:
-    heavy = ["torch", "stable_baselines3", "matplotlib", "numba", "scipy", "pygame"]
+    heavy = ["torch", "stable_baselines3", "matplotlib", "numba", "scipy", "shapely", "pygame"]
     code = f"{statement}\nimport sys; print(sorted(set({heavy}) & set(sys.modules)))"
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
     assert done.stdout.splitlines()[-1] == "[]"

@@ -25,7 +25,8 @@ from flockenv.measures import (
     weidmann_flow,
     weidmann_speed,
 )
-from flockenv.measures.polygons import checked, contains, cut_by, rectangle, size
+from flockenv.measures.polygons import contains, rectangle
+from flockenv.shapes.outlines import area
 
 SQUARE = rectangle((0, 0), (10, 10))
 NOTCHED = np.array([(0, 0), (10, 0), (10, 10), (6, 10), (6, 4), (4, 4), (4, 10), (0, 10)], float)  # 100 - 12 m^2
@@ -98,7 +99,7 @@ def test_a_cell_is_what_is_nearest_to_him(seed: int, many: int) -> None:
         share = np.bincount(nearest[on], minlength=many) / 100
         room = voronoi(pos, walkable, period=period)
         assert room.cell == pytest.approx(share, abs=5 * 0.5)  # five deviations of such a count
-        assert room.cell.sum() == pytest.approx(size([tuple(c) for c in walkable.tolist()]))  # type: ignore[misc]
+        assert room.cell.sum() == pytest.approx(area(walkable))
 
 
 def test_those_in_one_place_share_a_cell_and_those_outside_have_none() -> None:
@@ -140,15 +141,35 @@ def test_what_is_no_area_is_refused_in_one_line(polygon: list[tuple[float, float
         classical_density(np.zeros((1, 1, 3)), SQUARE)
 
 
-def test_polygons_are_cut_by_convex_ones() -> None:
-    """A triangle and a square whose common area is known; nothing in common; the same."""
-    triangle = [(0.0, 0.0), (4.0, 0.0), (0.0, 4.0)]
-    square = [(1.0, 1.0), (3.0, 1.0), (3.0, 3.0), (1.0, 3.0)]
-    assert size(cut_by(triangle, square)) == pytest.approx(2.0)
-    assert size(cut_by(square, triangle)) == pytest.approx(2.0)
-    assert size(cut_by(triangle, [(9.0, 9.0), (10.0, 9.0), (9.0, 10.0)])) == 0
-    assert size(cut_by(square, square)) == pytest.approx(4.0)
-    assert checked("a", triangle[::-1]).tolist() == [list(c) for c in triangle]
+def test_what_lies_outside_of_the_walkable_area_takes_nothing_of_it() -> None:
+    """A hole that touches a diamond from outside, and one that it only half holds."""
+    diamond = [(5, 0), (10, 5), (5, 10), (0, 5)]
+    person = [[5.0, 5.0]]
+    assert voronoi(person, diamond, holes=[rectangle((0, 0), (2, 2))]).cell == pytest.approx([50])
+    half = rectangle((-1, 4), (2, 6))  # of it a triangle of 1 m and a strip of 1 m lie inside
+    room = voronoi(person, diamond, holes=[half])
+    assert room.cell == pytest.approx([room.area]) == pytest.approx([50 - 1 - 2])
+
+
+def test_holes_that_overlap_are_taken_away_once() -> None:
+    corner = [rectangle((0, 0), (6, 2)), rectangle((0, 0), (2, 6))]
+    room = voronoi([[5.0, 5.0]], SQUARE, holes=corner)
+    assert room.area == pytest.approx(100 - 12 - 12 + 4) and room.cell == pytest.approx([80])
+    window = voronoi([[5.0, 5.0]], SQUARE, rectangle((1.5, 1.5), (2.5, 2.5)), corner)
+    assert window.area == pytest.approx(0.25) and window.inside == pytest.approx([0.25])
+
+
+def test_on_a_torus_a_hole_is_as_large_wherever_it_is() -> None:
+    rng = np.random.default_rng(4)
+    pos = rng.uniform(0, 10, (20, 2))
+    found = []
+    for move in (0.0, 5.0):
+        walls = rectangle((3 + move, 3 + move), (7 + move, 7 + move)) - (10.0 if move else 0.0)
+        room = voronoi((pos + move) % 10, SQUARE, holes=[walls], period=(10.0, 10.0))
+        assert room.area == pytest.approx(84) and room.cell.sum() == pytest.approx(84)
+        assert room.inside == pytest.approx(room.cell)
+        found.append(room.cell)
+    assert found[0] == pytest.approx(found[1])
 
 
 # --- the fundamental diagram ------------------------------------------------------------------------------------------

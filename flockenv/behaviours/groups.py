@@ -14,7 +14,7 @@ from flockenv.behaviours.social import Social, size_of
 from flockenv.effects.base import Effect, Me, Other, Sight, Vector
 from flockenv.elementary import exp
 from flockenv.kernels import Vec, law, like
-from flockenv.vec import add, norm, scale, select, sub, unit, zero
+from flockenv.vec import add, limit, norm, scale, select, sub, unit, zero
 
 __all__ = ["Friends", "Interest", "WalkingGroup"]
 
@@ -78,8 +78,8 @@ effects:
 
 @law
 def drawn_together(p: Any, me: Me, other: Other) -> Vec:
-    """A exp(-d / B) towards him."""
-    return steering.draw(other.offset, p.decay)
+    """exp(-d / B) towards him, and A times that no more than the bound."""
+    return limit(steering.draw(other.offset, p.decay), p.bound / size_of(p, me))
 
 
 @law
@@ -128,7 +128,7 @@ effects:
 
 @law
 def _party(p: Any, who: float) -> float:
-    """Which of the parties of the group somebody belongs to; negative, or beyond the last, of who is in none."""
+    """Which of the parties somebody of the group belongs to."""
     return np.floor((who - p.first) / p.party)  # type: ignore[no-any-return]
 
 
@@ -159,7 +159,8 @@ def as_a_party(p: Any, me: Me, sums: Vec) -> Vec:
     alpha = steering.gaze_turn(me.heading, to, p.edge)
     far = norm(centre) > others * like(me.mass, 0.5)  # (N - 1) / 2 m
     wish = add(scale(me.vel, -p.gaze * alpha), scale(unit(centre), p.cohesion if far else o))
-    return select(others > o, scale(add(wish, scale(away, p.repulsion)), me.mass), zero(me.vel))
+    has = (others > o) & (me.who >= p.first) & (me.who < p.end)
+    return select(has, scale(add(wish, scale(away, p.repulsion)), me.mass), zero(me.vel))
 
 
 class WalkingGroup(Effect):
@@ -171,7 +172,9 @@ class WalkingGroup(Effect):
     """
 
     kind: Literal["walking_group"] = "walking_group"
-    group: int = Field(ge=0, strict=True, description="the group whose agents walk in parties")
+    group: int | None = Field(
+        default=None, ge=0, strict=True, description="whose agents walk in parties; none = all, counted through"
+    )
     party: int = Field(ge=2, strict=True, description="N, how many are a party; the last may be smaller")
     gaze: float = Field(default=4.0, ge=0, description="beta1, 1/(s rad), braking to see the others")
     cohesion: float = Field(default=3.0, ge=0, description="beta2, m/s^2, to the centre")
@@ -204,8 +207,9 @@ effects:
         return {"edge": math.radians(self.fov) / 2, **{name: float(getattr(self, name)) for name in names}}
 
     def members(self, starts: Sequence[int]) -> dict[str, float]:
-        """The first agent of the group."""
-        return {"first": float(starts[self.group])}
+        """The first agent of the group, and the first after it."""
+        first, end = (0, starts[-1]) if self.group is None else starts[self.group : self.group + 2]
+        return {"first": float(first), "end": float(end)}
 
     def sums(self, dimension: int) -> int:
         """How many others, where, and away from those who are too near."""

@@ -274,6 +274,10 @@ class Effect(Record):
         """Does its obstacle law meet only what no other obstacle hides?"""
         return False
 
+    def in_the_open(self) -> Effect | None:
+        """Return what of it acts where there are no obstacles; none if nothing does."""
+        return None if self.obstacle_law is not None and self.pair_law is None else self
+
     @property
     def joined(self) -> bool:
         """Is it one fold over obstacles and neighbours?"""

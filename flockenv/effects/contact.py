@@ -184,7 +184,9 @@ class Contact(_Solid):
     """
 
     kind: Literal["contact"] = "contact"
-    radius: float = Field(gt=0, description="m, who is nearer is looked at: at least the radii of two that may touch")
+    radius: float | None = Field(
+        default=None, gt=0, description="m, who is nearer is looked at; none = as far as any two touch"
+    )
     pair_law: ClassVar[str | None] = "pushed_apart"
     finish_law: ClassVar[str | None] = "contacts"
     conserves_momentum: ClassVar[bool] = True
@@ -192,20 +194,30 @@ class Contact(_Solid):
     @property
     def sight(self) -> Sight:
         """All around."""
-        return Sight(self.radius)
+        return Sight(math.inf if self.radius is None else self.radius)  # a scene knows how far two touch
+
+    @property
+    def reach(self) -> float:
+        """How far it is said to look, m; 0 if it is for bodies to say."""
+        return self.radius or 0.0
 
     def sums(self, dimension: int) -> int:
         """The force so far."""
         return dimension
 
     def check(self, scene: Any) -> None:
-        """Refuse a radius at which two bodies overlap already."""
+        """Refuse a radius at which two bodies overlap already, and bodies that touch around a torus."""
         super().check(scene)
         radii = sorted(r for group in scene.groups for r in (group.widest,) * min(group.size, 2))
-        if len(radii) > 1 and self.radius < radii[-1] + radii[-2]:
+        touch = sum(radii[-2:]) if len(radii) > 1 else 0.0
+        if self.radius is not None and self.radius < touch:
             raise ValueError(
-                f"radius = {self.radius:g}: two bodies touch at up to {radii[-1] + radii[-2]:g} m; at least that is "
-                "allowed"
+                f"radius = {self.radius:g}: two bodies touch at up to {touch:g} m; at least that is allowed"
+            )
+        if scene.space.periodic and touch > min(scene.space.size) / 2:
+            raise ValueError(
+                f"kind = {self.kind}: two bodies touch at up to {touch:g} m; at most half the torus's shortest edge, "
+                f"{min(scene.space.size) / 2:g} m, is allowed"
             )
 
     def rates(self, groups: Sequence[Any], dimension: int) -> tuple[Floats, Floats]:

@@ -54,7 +54,8 @@ def tail(gaps: ArrayLike, start: float | None = None) -> Tail:
     that at which fit and gaps are nearest (Kolmogorov and Smirnov), with 10 or more gaps left.
     alpha <= 2 is a clogged door: the mean gap, the integral of t p(t), does not exist. That is so for the exponent of
     the density; of the survival alone the same limit is 1.
-    Raises ValueError, of one line, for gaps that are negative or not finite; gaps of 0 are in no tail.
+    Raises ValueError, of one line, for gaps that are negative or not finite, or a start that is not above 0; gaps of 0
+    are in no tail.
     Source: Clauset, Shalizi, Newman 2009, SIAM Review 51, 661, eqs. 3.1, 3.2, 3.9; the transition: Zuriguel et al.
     2014, Sci. Rep. 4, 7324.
     """
@@ -62,6 +63,8 @@ def tail(gaps: ArrayLike, start: float | None = None) -> Tail:
     ordered = ordered[ordered > 0]
     none = Tail(np.nan, np.nan, np.nan, 0, np.nan)
     if start is not None:
+        if not (start > 0 and np.isfinite(start)):
+            raise ValueError(f"start = {start:g}: must be a finite time above 0, s: a power law has no mass at 0")
         return _fitted(ordered[ordered >= start], start) or none
     starts = np.unique(ordered[: max(0, len(ordered) - LEAST + 1)])
     if len(starts) > MOST_STARTS:

@@ -7,10 +7,13 @@ from itertools import product
 from typing import NamedTuple
 
 import numpy as np
+import shapely
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import Voronoi
+from shapely.geometry import Polygon
+from shapely.geometry.base import BaseGeometry
 
-from flockenv.measures.polygons import Corners, checked, contains, convex, cut, cut_by, rectangle, size
+from flockenv.measures.polygons import Corners, checked, contains, cut, rectangle
 
 __all__ = ["Ground", "Room", "classical_density", "speed_in_area", "voronoi", "voronoi_density", "voronoi_speed"]
 
@@ -39,7 +42,7 @@ def classical_density(pos: ArrayLike, area: ArrayLike, alive: ArrayLike | None =
     inside = contains(corners, _flat(pos))
     if alive is not None:
         inside = inside & np.asarray(alive, np.bool_)
-    return np.asarray(inside.sum(axis=-1) / size(_corners(corners)), np.float64)
+    return np.asarray(inside.sum(axis=-1) / Polygon(corners).area, np.float64)
 
 
 def speed_in_area(
@@ -68,13 +71,13 @@ def voronoi(
 ) -> Room:
     """Return the Voronoi cell of everybody at one instant: all that is nearer to him than to anybody else.
 
-    pos (N, 2) m. Cells are cut to the polygon `walkable` (n, 2) m, which need not be convex, less the polygons `holes`
-    in it, which do not overlap: obstacles. What of a cell lies behind a wall counts too, so a walkable area must end at
-    walls. area: a convex polygon that is measured, all of the walkable area by default. period: (Lx, Ly) m, 0 = none:
-    the world goes on with itself after so much, and `walkable` is one period of it. Who is outside of `walkable` has no
-    cell and takes no room. Those in one place share a cell.
+    pos (N, 2) m. Cells are cut to the polygon `walkable` (n, 2) m, which need not be convex, less the polygons `holes`:
+    obstacles, wherever they lie and however they overlap. What of a cell lies behind a wall counts too, so a walkable
+    area must end at walls. area: a convex polygon that is measured, all of the walkable area by default. period:
+    (Lx, Ly) m, 0 = none: the world goes on with itself after so much, and `walkable` is one period of it. Who is
+    outside of `walkable` has no cell and takes no room. Those in one place share a cell.
     Raises ValueError, of one line, for polygons that are none, for an area that is not convex, or not walkable.
-    Source: Steffen & Seyfried 2010, Physica A 389, 1902. Cells by scipy's Qhull, cut by half-planes.
+    Source: Steffen & Seyfried 2010, Physica A 389, 1902. Cells by scipy's Qhull, areas by shapely's GEOS.
     """
     return Ground.of(walkable, area, holes, period).room(pos)
 
@@ -83,10 +86,10 @@ class Ground(NamedTuple):
     """Where people walk and where they are measured, checked once for many instants."""
 
     walk: Floats
-    target: Floats | None
-    holes: list[Corners]
+    free: BaseGeometry  # what of it is walkable
+    target: BaseGeometry  # what of that is measured
     period: tuple[float, float]
-    area: float  # m^2 of what is measured, as far as it is walkable
+    area: float  # m^2 of what is measured
 
     @classmethod
     def of(
@@ -95,17 +98,13 @@ class Ground(NamedTuple):
     ) -> Ground:  # fmt: skip
         """Return it; see `voronoi`, for what is what, and for what is refused."""
         walk = checked("walkable", walkable)
-        target = None if area is None else checked("area", area, is_convex=True)
-        gaps = [_corners(checked(f"holes[{k}]", hole)) for k, hole in enumerate(holes)]
-        if target is not None:
-            measured = _Cutter(_corners(walk), None, gaps, period).areas(_corners(target))[0]
-        else:
-            measured = size(_corners(walk)) - sum(
-                size(cut_by(gap, _corners(walk)) if convex(walk) else gap) for gap in gaps
-            )
-        if not measured > 0:
+        polygon = None if area is None else checked("area", area, is_convex=True)
+        solid = [checked(f"holes[{k}]", hole) for k, hole in enumerate(holes)]
+        free = Polygon(walk).difference(_everywhere(solid, period))
+        target = free if polygon is None else free.intersection(_everywhere([polygon], period))
+        if not target.area > 0:
             raise ValueError("area: nothing of it is walkable")
-        return cls(walk, target, gaps, period, measured)
+        return cls(walk, free, target, period, float(target.area))
 
     def room(self, pos: ArrayLike) -> Room:
         """Return the cells of people at (N, 2), m."""
@@ -114,11 +113,27 @@ class Ground(NamedTuple):
         cell, inside = np.full(len(points), np.nan), np.zeros(len(points))
         if len(here):
             places, which, many = np.unique(points[here], axis=0, return_inverse=True, return_counts=True)
-            target = None if self.target is None else _corners(self.target)
-            cutter = _Cutter(_corners(self.walk), target, self.holes, self.period)
-            found = np.array([cutter.areas(each) for each in _cells(places, self.walk, self.period)])
-            cell[here], inside[here] = (found / many[:, None])[which.ravel()].T
+            cells = _cells(places, self.walk, self.period)
+            whole, part = (_shared(cells, ground, self.period) / many for ground in (self.free, self.target))
+            cell[here], inside[here] = whole[which.ravel()], part[which.ravel()]
         return Room(cell, inside, self.area)
+
+
+def _everywhere(polygons: Sequence[Floats], period: tuple[float, float]) -> BaseGeometry:
+    """Return what polygons cover together, images of a world that goes on with itself included."""
+    steps = np.array(_shifts(period)) * period
+    return shapely.union_all([Polygon(polygon + step) for polygon in polygons for step in steps])
+
+
+def _shared(cells: Sequence[Corners], ground: BaseGeometry, period: tuple[float, float]) -> Floats:
+    """Return how much of each convex cell, or of its images, lies on some ground, (N,) m^2."""
+    places = np.concatenate([np.array(cell).reshape(-1, 2) for cell in cells])
+    which = np.repeat(np.arange(len(cells)), [len(cell) for cell in cells])
+    found = np.zeros(len(cells))
+    for shift in _shifts(period):
+        there = shapely.convex_hull(shapely.multipoints(places + np.multiply(shift, period), indices=which))
+        found += shapely.area(shapely.intersection(there, ground))
+    return found
 
 
 def voronoi_density(room: Room) -> float:
@@ -180,43 +195,6 @@ def _box(place: Sequence[float], low: Floats, high: Floats, period: tuple[float,
     first = [x - length / 2 if length else a for x, length, a in zip(place, period, low.tolist(), strict=True)]
     last = [x + length / 2 if length else b for x, length, b in zip(place, period, high.tolist(), strict=True)]
     return _corners(rectangle(first, last))
-
-
-class _Cutter(NamedTuple):
-    """What cells are cut to."""
-
-    walk: Corners
-    target: Corners | None
-    holes: list[Corners]
-    period: tuple[float, float]
-
-    def areas(self, cell: Corners) -> tuple[float, float]:
-        """Return the area of what of a cell is walkable, and of what of that lies in the target."""
-        whole, part = 0.0, 0.0
-        for shift in _shifts(self.period):
-            dx, dy = shift[0] * self.period[0], shift[1] * self.period[1]
-            there = [(x + dx, y + dy) for x, y in cell]
-            if _apart(there, self.walk):
-                continue
-            here = self._walkable(there)
-            whole += here
-            part += here if self.target is None else self._walkable(cut_by(there, self.target))
-        return whole, part
-
-    def _walkable(self, cell: Corners) -> float:
-        """Return the walkable area of a convex polygon, m^2."""
-        if len(cell) < 3:
-            return 0.0
-        inside = size(cut_by(self.walk, cell))
-        return inside - sum(size(cut_by(hole, cell)) for hole in self.holes if not _apart(hole, cell))
-
-
-def _apart(a: Corners, b: Corners) -> bool:
-    """Is one of two polygons wholly beside, above or below the other? Most are, and need not be cut."""
-    return (
-        max(a)[0] <= min(b)[0] or max(b)[0] <= min(a)[0]
-        or max(y for _, y in a) <= min(y for _, y in b) or max(y for _, y in b) <= min(y for _, y in a)
-    )  # fmt: skip
 
 
 def _shifts(period: tuple[float, float]) -> list[tuple[int, int]]:

@@ -120,10 +120,13 @@ def diagram(density: ArrayLike, speed: ArrayLike, edges: ArrayLike | None = None
 def from_weidmann(density: ArrayLike, speed: ArrayLike, low: float = 0.5, high: float = 3.0) -> Deviation:
     """Return how far speeds (S,) are from Weidmann's at densities (S,) between low and high, 1/m^2; NaN of no sample.
 
-    `worst` is over means of bins half a person per m^2 wide. A model is near enough if it stays below .25 m/s: real
-    corridors are .15 m/s below the curve (JuPedSim's validation of ug-180).
+    `worst` is over means of bins half a person per m^2 wide, the last as wide as is left. A model is near enough if it
+    stays below .25 m/s: real corridors are .15 m/s below the curve (JuPedSim's validation of ug-180). Raises
+    ValueError, of one line, for bounds that leave nothing between them.
     """
-    bins = [b for b in diagram(density, speed, np.arange(low, high + 0.25, 0.5)) if b.samples]
+    if not 0 <= low < high:
+        raise ValueError(f"low = {low:g}: must be at least 0 and below high = {high:g}")
+    bins = [b for b in diagram(density, speed, [*np.arange(low, high - 1e-9, 0.5), high]) if b.samples]
     rho, v = (np.asarray(each, np.float64).ravel() for each in (density, speed))
     here = (rho >= low) & (rho < high) & np.isfinite(v)
     if not here.any():

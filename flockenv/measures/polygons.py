@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 from flockenv.refusals import shown
 from flockenv.shapes.outlines import area, crossing
 
-__all__ = ["Corners", "checked", "contains", "convex", "cut", "cut_by", "rectangle", "size"]
+__all__ = ["Corners", "checked", "contains", "convex", "cut", "rectangle"]
 
 Floats = NDArray[np.float64]
 Corners = list[tuple[float, float]]
@@ -57,10 +57,9 @@ def contains(polygon: Floats, points: Floats) -> NDArray[np.bool_]:
 
 
 def cut(corners: Corners, nx: float, ny: float, bound: float) -> Corners:
-    """Return what of a polygon lies where nx x + ny y <= bound.
+    """Return what of a convex polygon lies where nx x + ny y <= bound.
 
-    Source: Sutherland & Hodgman 1974, Comm. ACM 17, 32. Of a polygon that is not convex the parts that remain hang
-    together by edges of no width; its area is right.
+    Source: Sutherland & Hodgman 1974, Comm. ACM 17, 32.
     """
     kept: Corners = []
     if not corners:
@@ -76,26 +75,3 @@ def cut(corners: Corners, nx: float, ny: float, bound: float) -> Corners:
             kept.append((x1, y1))
         x0, y0, before = x1, y1, here
     return kept
-
-
-def cut_by(corners: Corners, clip: Corners) -> Corners:
-    """Return what of a polygon lies in a convex one, which runs counter-clockwise."""
-    x0, y0 = clip[-1]
-    for x1, y1 in clip:
-        nx, ny = y1 - y0, x0 - x1  # to the right of the edge is outside
-        if nx or ny:
-            corners = cut(corners, nx, ny, nx * x0 + ny * y0)
-        x0, y0 = x1, y1
-    return corners
-
-
-def size(corners: Corners) -> float:
-    """Return the area of a counter-clockwise polygon, m^2."""
-    if len(corners) < 3:
-        return 0.0
-    total, (x0, y0) = 0.0, corners[-1]
-    bx, by = corners[0]  # from a corner of its own: far from the origin nothing cancels
-    for x1, y1 in corners:
-        total += (x0 - bx) * (y1 - by) - (x1 - bx) * (y0 - by)
-        x0, y0 = x1, y1
-    return 0.5 * total

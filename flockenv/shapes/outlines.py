@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["area", "around", "band", "behind", "crossing", "hull", "silhouette", "strips"]
+__all__ = ["area", "around", "band", "behind", "crossing", "hull", "silhouette", "strips", "width"]
 
 Floats = NDArray[np.float64]
 ROUND = 48
@@ -63,6 +63,18 @@ def hull(points: Floats) -> Floats:
             chain.append(p)
         half.append(chain[:-1])
     return np.array(half[0] + half[1])
+
+
+def width(polygon: Floats) -> float:
+    """Return the least distance of two parallel lines with a convex polygon (n, 2) between them, m; 0 of others."""
+    edges = np.roll(polygon, -1, axis=0) - polygon
+    after = np.roll(edges, -1, axis=0)
+    turns = edges[:, 0] * after[:, 1] - edges[:, 1] * after[:, 0]
+    if turns.min() * turns.max() < 0:
+        return 0.0
+    normal = np.stack([edges[:, 1], -edges[:, 0]], axis=1) / np.linalg.norm(edges, axis=1, keepdims=True)
+    along = polygon @ normal.T  # (n, edges)
+    return float(np.ptp(along, axis=0).min())
 
 
 def around(points: Floats, radius: float) -> Floats:

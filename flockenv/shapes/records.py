@@ -71,6 +71,15 @@ class Shape(Record):
         return False
 
     @property
+    def thickness(self) -> float:
+        """How thick it is where it is thinnest, m, or less: 0 of a line, and where nobody knows."""
+        return math.inf if self.is_hollow else self._thickness
+
+    @property
+    def _thickness(self) -> float:
+        return 0.0
+
+    @property
     def form(self) -> str:
         """By which laws it is met; see shapes/table.py."""
         return f"hollow_{self.laws}" if self.is_hollow else self.laws
@@ -201,6 +210,10 @@ class Circle(Closed):
         return not (self.moves or self.hollow)
 
     @property
+    def _thickness(self) -> float:
+        return 2 * self.radius
+
+    @property
     def anchor(self) -> tuple[float, ...]:
         """Its centre."""
         return self.centre
@@ -240,6 +253,10 @@ class Wall(Shape):
     def dimension(self) -> int:
         """As many as its first vertex has numbers."""
         return len(self.vertices[0])
+
+    @property
+    def _thickness(self) -> float:
+        return 2 * self.radius
 
     @property
     def anchor(self) -> tuple[float, ...]:
@@ -299,6 +316,10 @@ class Capsule(Closed):
         return self._wall.corners
 
     @property
+    def _thickness(self) -> float:
+        return 2 * self.radius
+
+    @property
     def anchor(self) -> tuple[float, ...]:
         """The middle."""
         return _middle((self.start, self.end))
@@ -334,6 +355,10 @@ class Polygon(Closed):
         if outlines.area(np.array(self.vertices)) == 0:
             raise ValueError("vertices: enclose no area")
         return self
+
+    @property
+    def _thickness(self) -> float:
+        return outlines.width(np.array(self.vertices))
 
     @property
     def anchor(self) -> tuple[float, ...]:
@@ -386,6 +411,10 @@ class Block(Closed):
         return self
 
     @property
+    def _thickness(self) -> float:
+        return min(self.size)
+
+    @property
     def anchor(self) -> tuple[float, ...]:
         """Its centre."""
         return self.centre
@@ -435,6 +464,10 @@ class HalfSpace(Shape):
         if not 1e-15 <= math.hypot(*self.direction) <= 1e15:
             raise ValueError(f"direction = {self.direction}: not all 0 (from 1e-15 to 1e15 long)")
         return self
+
+    @property
+    def _thickness(self) -> float:
+        return math.inf
 
     @property
     def anchor(self) -> tuple[float, ...]:

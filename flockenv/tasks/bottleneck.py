@@ -209,7 +209,8 @@ class Bottleneck(Task):
     kappa = 2.4e5 kg/(m s), 80 kg; damped (ours), because people do not bounce. Somebody is hurt, as there, where the
     forces that press on him are more than 1600 N for each metre of his circumference: 2.5 kN in all. Elastic forces of
     other bodies and of the wall with the door count; the other walls are hard and press on nobody. Everybody is paid
-    for himself. All out, and none of them ever hurt, is success. Who does not learn walks by the forces of 2000.
+    for himself. All out, and none of them ever hurt, is success. Who does not learn walks by the forces of 2000 between
+    people; walls stop him as bodies do.
     """
 
     name: ClassVar[str] = "bottleneck"

@@ -185,7 +185,7 @@ class CrowdNav(Task):
     visible: bool = Field(default=False, description="does the crowd see the robot?")
     crowd: Crowd = Field(default="moussaid_2009", description="the social force of the crowd, as published")
     circle: float = Field(default=6.0, gt=0, description="m, radius of the circle")
-    jitter: float = Field(default=0.35, ge=0, le=0.5, description="how far off his place one starts, in gaps")
+    jitter: float = Field(default=0.35, ge=0, lt=0.5, description="how far off his place one starts, in gaps")
     max_speed: float = Field(default=1.34, gt=0, description="m/s, of the robot")
     max_force: float = Field(default=5.0, gt=0, description="N, of the robot; its mass is 1 kg")
     goal_radius: float = Field(default=0.3, gt=0, description="m, nearer to its goal than this it is there")
@@ -205,7 +205,7 @@ class CrowdNav(Task):
         n = self.people + 1
         room = 2 * math.pi * self.circle * (1 - 2 * self.jitter) / n
         if room < 0.8:
-            least = 0.8 * n / (2 * math.pi * (1 - 2 * self.jitter)) if self.jitter < 0.5 else math.inf
+            least = 0.8 * n / (2 * math.pi * (1 - 2 * self.jitter))
             raise ValueError(f"circle = {self.circle:g} m has no room for {n} agents; at least {least:.3g}")
         return self
 

@@ -46,7 +46,8 @@ REMARKS = {
     "rimea 15": "The last to arrive decides, who would like to walk at .46 m/s.",
     "rimea 16": "RiMEA's envelope is not in our sources; the line is Seyfried's, d = .36 + 1.06 v.",
     "nist 3.1": "Doors of .9 m: see RiMEA 12 for whom they stop. Who is stuck counts as not having left.",
-    "rimea 9": "The last of 1000 decides: a single one who is stuck makes it a miss without a number.",
+    "rimea 9": "The last of 1000 decides: a single one who is stuck makes it a miss without a number. When 95 % are "
+    "out is said, too, and decides nothing.",
     "lanes": "The null is a permutation test of every run: directions are dealt out anew among the same people.",
     "bursts": "Crossings until the last of whichever side is done first; the null is a coin with as many heads.",
     "faster is slower": "Steps of .0025 s: at .005 s and 3 m/s bodies are thrown through walls, and the room is empty "
