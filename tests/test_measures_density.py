@@ -148,7 +148,7 @@ def test_what_lies_outside_of_the_walkable_area_takes_nothing_of_it() -> None:
     assert voronoi(person, diamond, holes=[rectangle((0, 0), (2, 2))]).cell == pytest.approx([50])
     half = rectangle((-1, 4), (2, 6))  # of it a triangle of 1 m and a strip of 1 m lie inside
     room = voronoi(person, diamond, holes=[half])
-    assert room.cell == pytest.approx([room.area]) == pytest.approx([50 - 1 - 2])
+    assert room.cell == pytest.approx([50 - 1 - 2]) and room.area == pytest.approx(47)
 
 
 def test_holes_that_overlap_are_taken_away_once() -> None:
@@ -205,6 +205,15 @@ def test_a_crowd_that_walks_as_juelichs_is_in_all_bins_and_below_weidmann() -> N
     assert from_weidmann(rho, weidmann_speed(rho) + 0.2).worst == pytest.approx(0.2, abs=0.01)
     assert math.isnan(in_juelich([0.1], [1.0]))
     assert from_weidmann([0.1], [1.0])[0] == 0
+
+
+def test_whatever_the_bounds_are_nothing_beyond_them_counts() -> None:
+    one = from_weidmann([0.55, 0.6], [1.0, 1.1], 0.5, 0.7)
+    assert one.samples == 2 and one.worst == pytest.approx(1.05 - weidmann_speed([0.575])[0])
+    far = from_weidmann([0.6, 0.95], [weidmann_speed([0.6])[0], 9.0], 0.5, 0.9)
+    assert far.samples == 1 and far.worst == pytest.approx(0, abs=1e-12)
+    with pytest.raises(ValueError, match=r"low = 2: must be at least 0 and below high = 1"):
+        from_weidmann([0.5], [1.0], 2.0, 1.0)
 
 
 def test_bins_hold_what_they_should() -> None:

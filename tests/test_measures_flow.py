@@ -232,6 +232,9 @@ def test_survival_and_gaps_that_are_none() -> None:
     for bad in ([-1.0], [math.inf], [math.nan]):
         with pytest.raises(ValueError, match="gaps: must be a list of finite times"):
             tail(bad)
+    for start in (0.0, -1.0, math.nan):
+        with pytest.raises(ValueError, match="must be a finite time above 0"):
+            tail(np.arange(1.0, 99.0), start=start)
 
 
 # --- evacuation -------------------------------------------------------------------------------------------------------

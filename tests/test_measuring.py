@@ -259,3 +259,8 @@ def test_a_run_of_one_instant_is_measured_as_far_as_it_goes() -> None:
     assert found["lanes"] == 1
     assert "flow" not in found
     assert math.isnan(found["collisions"])
+
+
+def test_a_run_in_which_nobody_lives_has_pictures_too() -> None:
+    Path("empty.yaml").write_text(Path("streams.yaml").read_text().replace("{count:", "{alive: 0, count:"))
+    assert main(["measure", "empty.yaml", "--time", "1", "--line", "5,0,5,4", "--out", "empty"]) == 0

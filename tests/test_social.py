@@ -260,6 +260,29 @@ def test_parties_keep_together_see_each_other_and_do_not_touch() -> None:
     assert np.allclose(file, [[-4 * np.pi / 2, 0], [0, 0]])  # who is ahead must turn by 90 degrees more, and brakes
 
 
+def test_who_is_of_another_group_is_in_no_party_and_the_last_may_be_smaller() -> None:
+    """Groups of 2 and 1, parties of 3: the third is not drawn into a party of two."""
+    body: dict[str, Any] = {"mass": 80.0, "radius": 0.25, "spawn": Spawn(low=(0, 0), high=(9, 9))}
+    where, far = [[0.0, 0.0], [0.0, 4.0], [5.0, 0.0]], []
+    for which, many in ((0, 2), (None, 3)):
+        scene = Scene(
+            groups=(Group(count=2, **body), Group(count=1, **body)),
+            effects=(WalkingGroup(group=which, party=3, radius=20, gaze=0),),
+        )
+        state = scene.start(0).with_motion(np.array([where]), np.zeros((1, 3, 2)))
+        far.append(np.linalg.norm(scene.acceleration(state)[0], axis=1))
+        assert (far[-1] > 0.5).sum() == many
+    assert far[0][2] == 0
+
+
+def test_friends_draw_no_more_than_most() -> None:
+    here = [[0.0, 0.0], [1.0, 0.0]]
+    free, bounded = (
+        pushed(crowd(Friends(group=0, strength=80, decay=1, radius=20, most=most)), here)[0, 0] for most in (None, 8)
+    )
+    assert free == pytest.approx(math.exp(-1), rel=1e-4) and bounded == pytest.approx(0.1, rel=1e-4)
+
+
 def test_a_scene_that_is_turned_does_the_turned_thing() -> None:
     rng = np.random.default_rng(5)
     pos, vel = rng.uniform(-2, 2, (24, 2)), rng.normal(size=(24, 2))
@@ -539,6 +562,28 @@ def test_explicit_euler_at_10_ms_is_told_its_real_limit_and_what_comes_of_it() -
 def suggest_dt_of(count: int) -> float:
     """The largest stable step of explicit Euler."""
     return suggest_dt(panic(count, dt=1e-5, integrator=ExplicitEuler())).dt
+
+
+@pytest.mark.parametrize("group", [None, 0])
+def test_without_obstacles_what_keeps_off_them_bounds_no_step(group: int | None) -> None:
+    """Of two people alone: contact and repulsion, each twice as stiff between two."""
+    w2, sinks = 1.2e5 / 80, 2000 / 0.08 / 80
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        scene = panic(2, group=group, dt=1e-5, integrator=ExplicitEuler()).model_copy(update={"obstacles": ()})
+    assert suggest_dt(scene).dt == pytest.approx(2 / (2 * w2 + 2 * sinks), rel=0.01)
+
+
+def test_people_of_any_width_walk_by_a_preset_with_bodies() -> None:
+    """However wide they are, two who touch feel it."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        scene = Scene(
+            groups=(Group(count=2, mass=80, radius=0.9, desired_speed=1, spawn=Spawn(low=(0, 0), high=(9, 9))),),
+            effects=preset("helbing_2000"), dt=1e-4,
+        )  # fmt: skip
+        told = scene.acceleration(scene.start(0).with_motion(np.array([[[0.0, 0], [1.5, 0]]]), np.zeros((1, 2, 2))))
+    assert -told[0, 0, 0] == pytest.approx((2000 * math.exp(0.3 / 0.08) + 1.2e5 * 0.3) / 80, rel=1e-3)
 
 
 def test_semi_implicit_euler_at_10_ms_is_stable_whoever_steers() -> None:

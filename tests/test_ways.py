@@ -16,7 +16,8 @@ from flockenv.eikonal import ground
 from flockenv.population import Drain, Emitter
 from flockenv.population.places import Point
 from flockenv.scene import Group, Scene
-from flockenv.shapes import Circle, Wall
+from flockenv.shapes import Block, Circle, HalfSpace, Polygon, Wall
+from flockenv.space import Box
 from flockenv.spawn import Spawn
 from flockenv.spread import Spread
 from flockenv.steer import Steer
@@ -355,7 +356,7 @@ DOOR = Door(ends=LEFT)
             r"targets\[1\] = .*: is at most -0.1 m",
         ),
         (lambda: Way(targets=(Target(at=(1, 2, 3)),)), r"targets\[0\] = \(1.0, 2.0, 3.0\): dimension = 2"),
-        (lambda: Way(targets=(Target(at=(3, 3)),), clearance=0.1, spacing=0.5), "must be below 0.4 m, twice clearance"),
+        (lambda: Way(targets=(Target(at=(3, 3)),), clearance=0.1, spacing=0.5), "spacing = 0.5: ways lead through"),
         (lambda: Way(targets=(Target(at=(3, 3)),), group=4), "group = 4: there are 1 groups"),
         (
             lambda: Way(targets=(Target(at=(12, 3)),), clearance=1.0),
@@ -379,3 +380,40 @@ def test_two_journeys_of_one_group_are_refused_and_so_is_a_choice_without_a_spee
     slow = Group(count=1, spawn=Spawn(low=(2, 2), high=(3, 3)))
     with pytest.raises(ValueError, match=r"groups\[0\].desired_speed = None: give m/s"):
         Scene(groups=(slow,), obstacles=ROOM, effects=(Routes(doors=(DOOR,)),))
+
+
+def thin(x: float = 5.0, wide: float = 0.05) -> Polygon:
+    return Polygon(vertices=((x, 0), (x + wide, 0), (x + wide, 5), (x, 5)))
+
+
+@pytest.mark.parametrize(
+    ("shapes", "clearance", "said"),
+    [
+        ((thin(),), 0.0, r"obstacles\[0\], 0.05 m thick, unless a clearance of more than 0.075 m or a spacing of less"),
+        ((thin(),), 0.01, "unless a clearance of more than 0.075 m"),
+        (tuple(Circle(centre=(5, 0.06 + 0.12 * k), radius=0.06) for k in range(40)), 0.0, "0.12 m thick"),
+        ((Wall(vertices=((5, 0), (5, 5))),), 0.0, r"clearance = 0: ways lead through obstacles\[0\], a line"),
+        ((Block(centre=(5, 2.5), size=(0.1, 5)),), 0.04, "0.1 m thick"),
+    ],
+)
+def test_no_way_leads_through_what_a_grid_may_miss(shapes: Any, clearance: float, said: str) -> None:
+    people = walkers(1, (1, 1), (1, 1))
+    with pytest.raises(ValueError, match=said) as error:
+        Scene(
+            space=Box(size=(10, 6)), groups=(people,), obstacles=shapes,
+            effects=(Way(targets=(Target(at=(9, 1)),), clearance=clearance),),
+        )  # fmt: skip
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("shape", "thick"),
+    [
+        (thin(wide=0.4), 0.4), (Polygon(vertices=((0, 0), (4, 0), (0, 3))), 2.4), (Circle(centre=(0, 0), radius=2), 4),
+        (Polygon(vertices=((0, 0), (4, 0), (4, 1), (1, 1), (1, 4), (0, 4))), 0), (Block(centre=(0, 0), size=(3, 1)), 1),
+        (HalfSpace(point=(0, 0), direction=(1, 0)), math.inf),
+        (Wall(vertices=((0, 0), (1, 0)), radius=0.1), 0.2),
+    ],
+)  # fmt: skip
+def test_how_thick_shapes_are_where_they_are_thinnest(shape: Any, thick: float) -> None:
+    assert shape.thickness == pytest.approx(thick)
