@@ -43,7 +43,8 @@ def mean_of_runs(values: ArrayLike, seed: int = 0) -> Mean:
     x = given[np.isfinite(given)]
     if len(x) < 2:
         return Mean(len(x), float(x.mean()) if len(x) else np.nan, np.nan, np.nan)
-    drawn = x[np.random.default_rng(seed).integers(len(x), size=(RESAMPLES, len(x)))].mean(axis=1)
+    rng = np.random.default_rng(seed)
+    drawn = [x[rng.integers(len(x), size=len(x))].mean() for _ in range(RESAMPLES)]  # one by one: runs may be many
     low, high = np.quantile(drawn, (0.025, 0.975))
     return Mean(len(x), float(x.mean()), float(low), float(high))
 
