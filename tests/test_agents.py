@@ -301,6 +301,7 @@ def test_bad_settings_are_one_line(tmp_path: Path) -> None:
 # --- imitation --------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_network_that_is_taught_longer_answers_more_as_the_rules_do() -> None:
     experiment = Experiment(task="pursuit", ppo={**TINY, "evaluate_worlds": 16})
     little, more = (imitate(experiment, worlds=4, updates=updates) for updates in (1, 300))

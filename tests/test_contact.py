@@ -263,6 +263,7 @@ def test_a_contact_of_too_few_steps_is_warned_of_and_the_limit_named() -> None:
     assert warned(bodies(dt=1.01 * most, ratio=0.3)) == []  # it is not there to bounce
 
 
+@pytest.mark.slow
 def test_nobody_is_looked_at_further_away_than_the_widest_two_touch() -> None:
     """Whatever radius is given: of 900 bodies, one in ten twice as wide, each meets as few, and forces are the same."""
     spawn = {"low": (0.0, 0.0), "high": (30.0, 30.0), "speed": (0.0, 1.0)}

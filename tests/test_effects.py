@@ -67,6 +67,7 @@ def _slow(row: EffectRow) -> bool:
     return elsewhere and row.effect.kind not in {*AMONG_ALL, "steer"}
 
 
+SLOW = pytest.mark.slow
 ROWS = among(EFFECTS)
 
 
@@ -219,12 +220,12 @@ def test_the_dead_are_not_there(row: EffectRow, dimension: int) -> None:
 
 
 def singly(rows: Iterable[EffectRow], changes: tuple[str, ...] = ("",)) -> pytest.MarkDecorator:
-    """Rows, dimensions and what they obey, in single precision; in space those alone that share a kernel.
+    """Rows, dimensions and what they obey, in single precision; in space, and quickly, those alone that share a kernel.
 
     What float32 can break is a constant that makes it float64, or a threshold: no other in space than in the plane.
     """
     given = [
-        pytest.param(row, d, *filter(None, [change]), marks=pytest.mark.slow if d == 3 or _slow(row) else ())
+        pytest.param(row, d, *filter(None, [change]), marks=() if d == 2 and row.effect.kind in AMONG_ALL else SLOW)
         for row in rows
         for d in (2, 3)
         for change in changes

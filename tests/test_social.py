@@ -260,6 +260,7 @@ def test_parties_keep_together_see_each_other_and_do_not_touch() -> None:
     assert np.allclose(file, [[-4 * np.pi / 2, 0], [0, 0]])  # who is ahead must turn by 90 degrees more, and brakes
 
 
+@pytest.mark.slow
 def test_who_is_of_another_group_is_in_no_party_and_the_last_may_be_smaller() -> None:
     """Groups of 2 and 1, parties of 3: the third is not drawn into a party of two."""
     body: dict[str, Any] = {"mass": 80.0, "radius": 0.25, "spawn": Spawn(low=(0, 0), high=(9, 9))}
@@ -574,6 +575,7 @@ def test_without_obstacles_what_keeps_off_them_bounds_no_step(group: int | None)
     assert suggest_dt(scene).dt == pytest.approx(2 / (2 * w2 + 2 * sinks), rel=0.01)
 
 
+@pytest.mark.slow
 def test_people_of_any_width_walk_by_a_preset_with_bodies() -> None:
     """However wide they are, two who touch feel it."""
     with warnings.catch_warnings():
