@@ -21,6 +21,8 @@ hypothesis.settings.load_profile("flockenv")
 
 
 RARE = {
+    "torus_3",
+    "torus_single",
     "torus_single_rk4",
     "plane_single",
     "plane_3_single",

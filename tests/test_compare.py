@@ -439,6 +439,7 @@ assert result.exit_code == 0, result.output
 """
 
 
+@pytest.mark.slow
 def test_comparing_needs_no_torch() -> None:
     arguments = ["--players", "random,textbook,reynolds", "--worlds", "2", "--smoke", "--out", str(Path.cwd() / "out")]
     subprocess.run([sys.executable, "-c", NO_TORCH, *arguments], check=True, cwd=ROOT)

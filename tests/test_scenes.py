@@ -75,6 +75,7 @@ def test_in_no_scene_does_anybody_overlap_or_get_out(name: str) -> None:
     assert state.counted("impacts") > 0
 
 
+@pytest.mark.slow
 def test_particles_in_a_sphere_keep_their_energy() -> None:
     scene = scene_of("sphere")
     start = scene.start(1)

@@ -51,6 +51,7 @@ def mapped(scene: Scene, state: State) -> tuple[Array, Array]:
     return scene.space.wrap(x + scene.dt * moves), then
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", [ExplicitEuler(), SemiImplicitEuler()], ids=lambda m: m.kind)
 def test_a_step_is_the_papers_map(method: ExplicitEuler | SemiImplicitEuler) -> None:
     """Five steps, each from the one before: sums of the same velocities, the same errors, to rounding."""
