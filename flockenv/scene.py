@@ -336,15 +336,14 @@ class Scene(Record):
             oriented=any(group.keeps_heading for group in self.groups),
             turns=any(group.max_turn_rate is not None for group in self.groups),
             leans=any(group.banking is not None for group in self.groups),
-            starts=self.starts, shapes=self.shapes, circles=len(self.circles), touching=self._touching,
+            starts=self.starts, shapes=self.shapes, circles=len(self.circles), touching=1.001 * self.touching or 1e-300,
             tables=tuple(self.table_of(effect) for effect in effects if effect.tabled),
         )  # fmt: skip
 
     @property
-    def _touching(self) -> float:
-        """The radii of two that are widest, m, and a little more: who is further apart does not touch."""
-        radii = sorted(group.widest for group in self.groups for _ in range(min(group.size, 2)))
-        return 1.001 * sum(radii[-2:]) or 1e-300
+    def touching(self) -> float:
+        """The radii of the two that are widest, m: who are further apart do not touch."""
+        return sum(sorted(group.widest for group in self.groups for _ in range(min(group.size, 2)))[-2:])
 
     def table_of(self, effect: Effect) -> NDArray[np.float64]:
         """Return the numbers that the laws of a tabled effect look up: made once, whoever asks first."""

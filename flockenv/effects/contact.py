@@ -208,8 +208,7 @@ class Contact(_Solid):
     def check(self, scene: Any) -> None:
         """Refuse a radius at which two bodies overlap already, and bodies that touch around a torus."""
         super().check(scene)
-        radii = sorted(r for group in scene.groups for r in (group.widest,) * min(group.size, 2))
-        touch = sum(radii[-2:]) if len(radii) > 1 else 0.0
+        touch = scene.touching if scene.agents > 1 else 0.0
         if self.radius is not None and self.radius < touch:
             raise ValueError(
                 f"radius = {self.radius:g}: two bodies touch at up to {touch:g} m; at least that is allowed"

@@ -75,7 +75,7 @@ class Parts:
     circles: int = 0
     """How many obstacles come before them."""
     touching: float = field(default=math.inf, compare=False)
-    """m, the radii of two that are widest: who is further away is in nobody's contact."""
+    """m, the radii of the two that are widest, and a little more: who is further away is in nobody's contact."""
     tables: tuple[NDArray[np.float64], ...] = field(default=(), compare=False)
     """What the laws of each tabled effect look up, in order: numbers alone, too."""
 
