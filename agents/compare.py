@@ -6,20 +6,20 @@ Writes results.json, table.md, comparison.png and replay.html. Needs no torch: l
 from __future__ import annotations
 
 import functools
-import hashlib
-import json
 import os
 import platform
 import re
+import signal
 import subprocess
-import sys
 import tempfile
+import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import BrokenExecutor, ProcessPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib import metadata
 from itertools import product
-from multiprocessing import get_context
+from multiprocessing import active_children, get_context
 from pathlib import Path
 from time import perf_counter
 from typing import Annotated, Any
@@ -34,7 +34,6 @@ from agents.experiment import CONFIGS, WEIGHTS, Experiment, load_experiment
 from agents.reynolds import PLAYERS as OTHERS
 from agents.reynolds import player as hand_written
 from flockenv.evaluation import WORLDS_PER_SEED, Episodes, rollout, task_digest, worlds_for
-from flockenv.kernels import cache_folder, laws_digest
 from flockenv.outputs import checked_path
 from flockenv.policy import MlpPolicy, Policy, RandomPolicy, load_player
 from flockenv.refusals import nearest, shown
@@ -51,6 +50,7 @@ PLAYERS = ("random", "textbook", *OTHERS, "reynolds", "ppo")
 
 WORLDS, SMOKE_WORLDS = 256, 16
 RESAMPLES, SMOKE_RESAMPLES = 10_000, 1_000
+TOLD_EVERY = 0.1  # s, between news of one player's progress from another process
 RECORDED = 0  # the world in the replay: the first, not one that somebody picked
 PACKAGES = ("numpy", "scipy", "numba", "gymnasium", "pettingzoo")
 FILES = ("results.json", "table.md", "comparison.png", "replay.html")
@@ -114,6 +114,9 @@ def compare(
 ) -> tuple[report.Results, dict[str, dict[str, Episodes]]]:
     """Play every task with every player in the same worlds; return the results as plain data, and the episodes.
 
+    From 256 worlds on, tasks are played side by side, by a process for each core: a script that calls this then needs
+    `if __name__ == "__main__":`, as for anything that starts processes.
+
     Raises:
         ValueError: one line: a player that cannot be had (before anything is played), or that fails while playing.
     """
@@ -129,20 +132,26 @@ def compare(
     alone = next((name for name, playing in plays.items() if not playing), None)
     if alone is not None:
         raise ValueError(f"task {alone!r}: nobody plays it; in other tasks alone: {', '.join(OTHERS)}")
-    with _compiled_ahead(plays, tasks, worlds):
-        episodes = {task.name: _play(task, plays[task.name], worlds, first, advance) for task in tasks}
+    jobs = [
+        _Job(
+            task,
+            [player for player in players if player.name in plays[task.name]],
+            worlds,
+            seed,
+            resamples,
+            trust_pickle,
+        )
+        for task in tasks
+    ]
+    played = dict(zip((task.name for task in tasks), _all(jobs, plays, advance), strict=True))
+    episodes = {name: each for name, (each, _) in played.items()}
     results: report.Results = {
         "seed": seed,
         "worlds": worlds,
         "world_seeds": {"block": "evaluation", "first": first, "last": first + worlds - 1},
         "bootstrap": {"resamples": resamples, "seed": seed, "interval": "95 % percentile; proportions: 95 % Wilson"},
         "players": {player.name: player.spec for player in players},
-        "tasks": {
-            task.name: report.task_results(
-                task_digest(task), episodes[task.name], _costs(task, plays[task.name]), resamples, seed
-            )
-            for task in tasks
-        },
+        "tasks": {name: about for name, (_, about) in played.items()},
         **provenance(),
     }
     results["wall_time_s"] = perf_counter() - began
@@ -161,54 +170,109 @@ def _sits_out(player: Player, task: Task, tasks: Sequence[Task]) -> bool:
     return of is not None and task.name not in of and any(other.name in of for other in tasks)
 
 
-@contextmanager
-def _compiled_ahead(plays: Plays, tasks: Sequence[Task], worlds: int) -> Iterator[None]:
-    """While tasks are played from the first on, let a second process compile what they need from the last on.
+@dataclass(frozen=True)
+class _Job:
+    """One task: who plays it, in how many worlds, and what is asked of the scores."""
 
-    Where this was done before with the same laws, tasks and players, everything is on the disk, and nothing is started.
-    """
-    ours = {task.name: [name for name in plays[task.name] if name in PLAYERS] for task in tasks}
-    done = _compiled_marker(tasks, ours)
-    if len(tasks) < 2 or worlds < WORLDS or (os.cpu_count() or 1) < 2 or done.exists():
+    task: Task
+    players: Sequence[Player]
+    worlds: int
+    seed: int
+    resamples: int
+    trust_pickle: bool
+
+    @property
+    def first(self) -> int:
+        """The seed of its first world."""
+        return worlds_for("evaluation", self.seed, self.worlds)
+
+
+Played = tuple[dict[str, Episodes], report.Results]
+
+
+def _all(jobs: Sequence[_Job], plays: Plays, advance: Advance) -> Iterator[Played]:
+    """Yield what came of every job: worked off side by side, a process for each core, where that is worth a process."""
+    cores = min(os.cpu_count() or 1, len(jobs))
+    if cores < 2 or jobs[0].worlds < WORLDS:
+        yield from (_play(job, plays[job.task.name], advance) for job in jobs)
+        return
+    context = get_context("spawn")
+    told: Any = context.SimpleQueue()
+    listener = threading.Thread(target=_pass_on, args=(told, advance), daemon=True)
+    listener.start()
+    others = active_children()
+    with ProcessPoolExecutor(cores, context, _begin_work, (told,)) as pool:
+        try:
+            with _interrupts_held():  # whoever is started now never hears of Ctrl-C
+                played = pool.map(_work, jobs)
+            yield from played
+        except BaseException as error:
+            for process in active_children():
+                if process not in others:
+                    process.terminate()
+            if isinstance(error, BrokenExecutor):
+                raise OSError("a process that plays a task was ended from outside; is there enough memory?") from None
+            raise
+    told.put(None)
+    listener.join()
+
+
+@contextmanager
+def _interrupts_held() -> Iterator[None]:
+    """Let Ctrl-C wait for a moment, where the system can."""
+    if not hasattr(signal, "pthread_sigmask"):
         yield
         return
-    child = get_context("spawn").Process(target=_compile, args=([*tasks][::-1], ours), daemon=True)
-    child.start()
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         yield
-        done.touch()
     finally:
-        child.terminate()
-        child.join()
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
-def _compiled_marker(tasks: Sequence[Task], names: Mapping[str, Sequence[str]]) -> Path:
-    """Return the file that says: these players of these tasks have been compiled with these laws."""
-    played = sorted([task_digest(task), *sorted(names[task.name])] for task in tasks)
-    said = json.dumps([laws_digest(), played])
-    return cache_folder() / f"compared_{hashlib.sha256(said.encode()).hexdigest()[:20]}"
+def _pass_on(told: Any, advance: Advance) -> None:
+    """Show what other processes tell of their progress, until there is no more."""
+    while (news := told.get()) is not None:
+        advance(*news)
 
 
-def _compile(tasks: Sequence[Task], names: Mapping[str, Sequence[str]]) -> None:
-    """Let the players of each task play a world of it, unseen."""
-    sys.stderr = open(os.devnull, "w")  # noqa: SIM115  # for as long as this process lives
-    known, first = known_players(0), worlds_for("tuning", 0, 1)
-    for task in tasks:
-        for name in names[task.name]:
-            rollout(task, known[name](task), 1, first)
+_told: Any = None  # in a process that plays for another one: where its progress is told
 
 
-def _play(task: Task, policies: Mapping[str, Policy], worlds: int, first: int, advance: Advance) -> dict[str, Episodes]:
-    """Let every player play the same worlds of one task."""
-    episodes = {}
+def _begin_work(told: Any) -> None:
+    """Get ready in a process that plays for another one; Ctrl-C is for that one."""
+    global _told
+    _told = told
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+
+def _work(job: _Job) -> Played:
+    """Do a job in a process that plays for another one; the players are made anew from what was asked for."""
+    last = [0.0]
+
+    def advance(*news: Any) -> None:
+        done, most = news[2:]
+        if done in (1, most) or perf_counter() - last[0] > TOLD_EVERY:
+            last[0] = perf_counter()
+            _told.put(news)
+
+    known = known_players(job.seed)
+    policies = {p.name: load_player(p.spec, job.task, known, job.trust_pickle) for p in job.players}
+    return _play(job, policies, advance)
+
+
+def _play(job: _Job, policies: Mapping[str, Policy], advance: Advance) -> Played:
+    """Let every player play the same worlds of one task; return their episodes, and what they come to."""
+    task, episodes = job.task, {}
     for name, policy in policies.items():
 
         def progress(done: int, most: int, name: str = name) -> None:
             advance(task.name, name, done, most)
 
         with blaming(name, task):
-            episodes[name] = rollout(task, policy, worlds, first, record=RECORDED, progress=progress)
-    return episodes
+            episodes[name] = rollout(task, policy, job.worlds, job.first, record=RECORDED, progress=progress)
+    costs = _costs(task, policies)
+    return episodes, report.task_results(task_digest(task), episodes, costs, job.resamples, job.seed)
 
 
 @contextmanager

@@ -5,8 +5,10 @@ from __future__ import annotations
 import json
 import os
 import re
+import signal
 import subprocess
 import sys
+import time
 from io import StringIO
 from pathlib import Path
 from types import SimpleNamespace
@@ -133,34 +135,78 @@ def test_the_sentence_does_not_hide_that_rules_win_or_that_nobody_does() -> None
     assert level.startswith("toy: ppo and reynolds are level: difference 0.000")
 
 
-def test_what_was_compiled_is_known_by_its_tasks_and_players() -> None:
-    """Whoever compared one task has not compiled the others, nor what other players or other settings take."""
-    pursuit, obstacles, all_ = TASKS["pursuit"](), TASKS["obstacles"](), ["random", "reynolds"]
-    asked = [
-        ([pursuit], {"pursuit": all_}),
-        ([pursuit, obstacles], {"pursuit": all_, "obstacles": all_}),
-        ([pursuit, obstacles], {"pursuit": all_, "obstacles": ["random"]}),
-        ([pursuit, TASKS["obstacles"](size=21.0)], {"pursuit": all_, "obstacles": all_}),
-    ]
-    marks = [comparison._compiled_marker(tasks, names) for tasks, names in asked]
-    assert len(set(marks)) == len(marks)
-    assert comparison._compiled_marker(*asked[1]) == marks[1]
+@pytest.fixture
+def side_by_side(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two worlds are enough to be worth a process for each of two cores."""
+    monkeypatch.setattr(comparison, "WORLDS", 2)
+    monkeypatch.setattr(comparison.os, "cpu_count", lambda: 2)
 
 
-def test_a_second_comparison_of_the_same_compiles_nothing_ahead(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_side_by_side_everything_is_the_same_and_progress_is_told(
+    side_by_side: None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     tasks = [TASKS["pursuit"](), TASKS["obstacles"]()]
-    plays = {"pursuit": {"random": None, "mine": None}, "obstacles": {"random": None}}
-    started: list[Any] = []
-    child = SimpleNamespace(start=lambda: started.append(1), terminate=lambda: None, join=lambda: None)
-    monkeypatch.setattr(comparison, "cache_folder", lambda: tmp_path)
-    monkeypatch.setattr(comparison.os, "cpu_count", lambda: 2)
-    monkeypatch.setattr(comparison, "get_context", lambda _: SimpleNamespace(Process=lambda **_: child))
-    for asked, expected in ((tasks[:1], 0), (tasks, 1), (tasks, 1), (tasks[::-1], 1)):
-        with comparison._compiled_ahead(plays, asked, comparison.WORLDS):  # type: ignore[arg-type]  # nobody plays
-            pass
-        assert len(started) == expected
+    field = comparison.field_of(["random", "reynolds"])
+    told: list[tuple[str, str, int, int]] = []
+    both, films = comparison.compare(tasks, field, 2, resamples=100, advance=lambda *news: told.append(news))
+    monkeypatch.setattr(comparison.os, "cpu_count", lambda: 1)
+    alone, _ = comparison.compare(tasks, field, 2, resamples=100)
+    assert list(both["tasks"]) == ["pursuit", "obstacles"]
+    for name, about in alone["tasks"].items():
+        assert both["tasks"][name]["pairs"] == about["pairs"]
+        for who, numbers in about["players"].items():
+            other = both["tasks"][name]["players"][who]
+            same = {key for key in numbers if not key.startswith("microseconds")}
+            assert {key: other[key] for key in same} == {key: numbers[key] for key in same}
+            assert films[name][who].recording is not None
+    assert {(task, player) for task, player, _, _ in told} == {
+        (task, player) for task in ("pursuit", "obstacles") for player in ("random", "reynolds")
+    }
+
+
+def test_side_by_side_a_player_that_fails_is_named(side_by_side: None) -> None:
+    Path("odd.py").write_text("def predict(observation):\n    raise RuntimeError('no idea')\n")
+    line = run("--tasks", "pursuit,obstacles", "--players", "odd.py", "--worlds", "2", code=2).stderr
+    assert "player 'odd', task 'pursuit': RuntimeError: no idea" in line and not Path("results").exists()
+
+
+def test_a_process_that_ends_by_itself_is_told_and_nothing_hangs(side_by_side: None) -> None:
+    Path("gone.py").write_text("import os\n\ndef predict(observation):\n    os._exit(3)\n")
+    line = run("--tasks", "pursuit,obstacles", "--players", "gone.py", "--worlds", "2", code=2).stderr
+    assert "a process that plays a task was ended from outside" in line and not Path("results").exists()
+
+
+def _hears_interrupts() -> None:
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # a test run in the background ignores them, for all below
+
+
+def _has_members(group: int) -> bool:
+    try:
+        os.killpg(group, 0)
+    except ProcessLookupError:
+        return False
+    return True
+
+
+@pytest.mark.slow
+def test_ctrl_c_ends_every_process() -> None:
+    """The signal goes to the whole group, as from a terminal; those who play for others say nothing of it."""
+    command = [sys.executable, "-m", "agents.compare", "--tasks", "pursuit,obstacles", "--players", "random,reynolds"]
+    process = subprocess.Popen(
+        [*command, "--out", str(Path.cwd() / "out")], cwd=ROOT, text=True, stderr=subprocess.PIPE,
+        stdout=subprocess.DEVNULL, start_new_session=True, preexec_fn=_hears_interrupts,
+    )  # fmt: skip
+    assert process.stderr is not None
+    assert "plays" in process.stderr.readline()
+    os.killpg(process.pid, signal.SIGINT)
+    _, said = process.communicate(timeout=60)
+    assert process.returncode == 130
+    assert said.splitlines()[-1] == "compare: interrupted, nothing written" and "Traceback" not in said
+    assert not Path("out").exists()
+    until = time.monotonic() + 10
+    while _has_members(process.pid):
+        assert time.monotonic() < until, "somebody plays on"
+        time.sleep(0.05)
 
 
 def test_without_ppo_the_two_best_are_compared_and_one_alone_is_not() -> None:
@@ -373,7 +419,7 @@ def test_an_interrupt_leaves_nothing_and_says_so(monkeypatch: pytest.MonkeyPatch
         raise KeyboardInterrupt
 
     monkeypatch.setattr(comparison, "rollout", interrupted)
-    result = run("--players", "random", code=130)
+    result = run("--players", "random", "--worlds", "2", code=130)
     assert "interrupted, nothing written" in result.stderr
     assert not Path("results").exists()
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Sequence
 from typing import Any
@@ -58,7 +59,10 @@ def hull(points: Floats) -> Floats:
     for run in (ordered, ordered[::-1]):
         chain: list[tuple[float, float]] = []
         for p in run:
-            while len(chain) > 1 and _turn(np.array(chain[-2]), np.array(chain[-1]), np.array(p)) <= 0:
+            while len(chain) > 1:
+                (ax, ay), (bx, by) = chain[-2:]
+                if (bx - ax) * (p[1] - ay) - (by - ay) * (p[0] - ax) > 0:
+                    break
                 chain.pop()
             chain.append(p)
         half.append(chain[:-1])
@@ -79,6 +83,12 @@ def width(polygon: Floats) -> float:
 
 def around(points: Floats, radius: float) -> Floats:
     """Return all that is within `radius` of the convex hull of one or two points (n, 2), as a polygon."""
+    return _around(tuple(map(tuple, points.tolist())), radius).copy()
+
+
+@functools.lru_cache(maxsize=1024)  # a film asks for the same walls in every picture
+def _around(places: tuple[tuple[float, ...], ...], radius: float) -> Floats:
+    points = np.array(places)
     turn = np.linspace(0, 2 * np.pi, ROUND, endpoint=False)
     ring = radius * np.stack([np.cos(turn), np.sin(turn)], axis=1)
     return hull((points[:, None] + ring).reshape(-1, 2))

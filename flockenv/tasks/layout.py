@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import functools
 import hashlib
+import math
 from dataclasses import dataclass
 from types import SimpleNamespace
 from typing import Any
@@ -27,7 +29,7 @@ class Slot:
     @property
     def size(self) -> int:
         """How many numbers it takes."""
-        return int(np.prod(self.shape, dtype=int))
+        return math.prod(self.shape)
 
 
 @dataclass(frozen=True)
@@ -36,7 +38,7 @@ class Layout:
 
     slots: tuple[Slot, ...]
 
-    @property
+    @functools.cached_property
     def size(self) -> int:
         """Length of a row."""
         return sum(slot.size for slot in self.slots)
