@@ -48,6 +48,7 @@ class PpoSettings(Record):
     entropy: float = Field(default=0.0, ge=0, description="weight of the entropy bonus")
     log_std: float = Field(default=-0.5, description="logarithm of the first standard deviation of actions")
     reward_scale: float = Field(default=0.1, gt=0, description="rewards are multiplied by this while learning")
+    team: bool = Field(default=False, description="everybody is paid the mean of his world, to the world's end")
     stagger: bool = Field(default=False, description="begin worlds at different times of their first episode")
     hidden: tuple[int, ...] = Field(default=(64, 64), min_length=1, description="units per layer")
     activation: str = Field(default="relu", pattern="^(relu|tanh)$", description="relu or tanh")

@@ -47,12 +47,14 @@ class ForLearning(VecEnvWrapper):
 
     Rewards times a constant keep the value loss near 1, so that clipping gradients does not starve the policy. And
     where only the time limit ends an episode, worlds that began together would show every update one phase alone;
-    staggered, their first episodes end one after another.
+    staggered, their first episodes end one after another. As a team, everybody is paid what all of a world are paid on
+    average, to the end of the world and not of himself: what comes after a death is part of what led to it (posthumous
+    credit, Cohen et al. 2022, arXiv 2111.05992).
     """
 
-    def __init__(self, venv: WorldVecEnv, scale: float, stagger: bool) -> None:
+    def __init__(self, venv: WorldVecEnv, scale: float, stagger: bool, team: bool = False) -> None:
         super().__init__(venv)
-        self.scale, self.stagger = scale, stagger
+        self.scale, self.stagger, self.team = scale, stagger, team
 
     def reset(self) -> np.ndarray:
         """Begin; staggered, each world with another part of its first episode behind it."""
@@ -63,8 +65,12 @@ class ForLearning(VecEnvWrapper):
         return observation
 
     def step_wait(self) -> Any:
-        """Scale what is paid."""
+        """Scale what is paid, and share it in a team."""
         observation, reward, done, infos = self.venv.step_wait()
+        if self.team:
+            world: World = self.venv.world
+            reward = np.repeat(reward.reshape(world.worlds, -1).mean(axis=1), world.learners)
+            done = np.array([bool(info) for info in infos])  # told of those whose world has ended, and of nobody else
         return observation, reward * self.scale, done, infos
 
 
@@ -121,7 +127,8 @@ def build(task: Task, p: PpoSettings, tensorboard: str | None) -> PPO:
     """Make the worlds and the model; how many threads they use is for `on_threads` to say."""
     torch.manual_seed(p.seed)
     learned = task.model_copy(update={"dtype": p.dtype})
-    worlds = ForLearning(WorldVecEnv(learned, p.worlds, leaving=not task.ends_together), p.reward_scale, p.stagger)
+    rows = WorldVecEnv(learned, p.worlds, leaving=not task.ends_together)
+    worlds = ForLearning(rows, p.reward_scale, p.stagger, p.team)
     model = PPO(
         "MlpPolicy",
         worlds,

@@ -14,11 +14,13 @@ from typer.testing import CliRunner
 from agents import tune
 from agents.experiment import AS_CONFIGURED, CONFIGS, WEIGHTS, Experiment, PpoSettings, load_experiment
 from agents.imitate import imitate, shown
+from agents.ppo import ForLearning
 from agents.reynolds import RULES, player, tuned
 from flockenv.crew import threads
 from flockenv.evaluation import compare, rollout, worlds_for
 from flockenv.policy import MlpPolicy, RandomPolicy
-from flockenv.tasks import TASKS
+from flockenv.sb3 import WorldVecEnv
+from flockenv.tasks import TASKS, School
 
 ROOT = CONFIGS.parent
 TINY = {"worlds": 16, "rollout": 16, "minibatch": 64, "epochs": 1, "evaluate_every": 512, "evaluate_worlds": 4}
@@ -308,6 +310,29 @@ def test_a_network_that_is_taught_longer_answers_more_as_the_rules_do() -> None:
     assert little.rules == more.rules and little.rows == more.rows > 0
     assert more.missed < 0.5 * little.missed
     assert more.network > little.network
+
+
+def test_a_team_is_paid_the_mean_of_its_world_to_its_end() -> None:
+    """Three fish that starve one after another: alone each row ends with its fish, as a team with the world."""
+    task = School(fish=3, horizon=40, start_hunger=0.6, metabolism=0.4)
+    rows = {
+        team: ForLearning(WorldVecEnv(task, 2, leaving=True), 0.1, stagger=False, team=team) for team in (False, True)
+    }
+    still, ends = np.zeros((6, 2), np.float32), {False: [], True: []}
+    for venv in rows.values():
+        venv.seed(5)
+        venv.reset()
+    for _ in range(task.horizon):
+        (_, own, own_done, _), (_, shared, shared_done, infos) = rows[False].step(still), rows[True].step(still)
+        np.testing.assert_allclose(shared.reshape(2, 3), np.repeat(own.reshape(2, 3).mean(axis=1), 3).reshape(2, 3))
+        ends[False].append(own_done)
+        ends[True].append(shared_done)
+        assert all(bool(info) == over for info, over in zip(infos, shared_done, strict=True))
+        if shared_done.any():
+            break
+    alone, together = np.array(ends[False]), np.array(ends[True])
+    assert alone[:-1].any() and not together[:-1].any()  # somebody was out before the world was over
+    assert together[-1].reshape(2, 3).any(axis=1).tolist() == together[-1].reshape(2, 3).all(axis=1).tolist()
 
 
 def test_rows_are_shown_until_an_episode_is_over() -> None:

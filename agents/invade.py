@@ -1,0 +1,198 @@
+"""Who gains by playing otherwise than all others? `python -m agents.invade configs/school.yaml`.
+
+The comparison lets everybody in a world play alike. Here one agent of each world plays one policy, and all others
+another: where a policy does best among those who do not have it, and all are worse off when all have it, no learner
+that is paid for itself stays with the better one (a prisoner's dilemma; who invades whom: Maynard Smith and Price 1973,
+Nature 246, 15).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import combinations
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import typer
+from numpy.typing import NDArray
+from rich.console import Console
+from rich.progress import Progress
+from rich.table import Table
+
+from agents.compare import field_of, known_players, split
+from agents.experiment import load_experiment, one_line_errors
+from agents.reynolds import PLAYERS as OTHERS
+from flockenv.evaluation import Episodes, Interval, bootstrap, compare, rollout, worlds_for
+from flockenv.policy import Policy, load_player
+from flockenv.snapshot import Snapshot
+from flockenv.tasks import Task
+from flockenv.world import Step, World
+
+__all__ = ["Among", "Payoffs", "app", "invade"]
+
+app = typer.Typer(add_completion=False, rich_markup_mode=None, pretty_exceptions_enable=False)
+console = Console(stderr=True)
+
+WORLDS = 256
+
+
+class Among:
+    """Worlds as one agent of each meets them, (B, 1, O): all others play `others`.
+
+    In world k it is learner k % L, so that every seat counts alike. For it a world is over when it is out.
+    """
+
+    def __init__(self, task: Task, worlds: int, time_limit: int, others: Policy) -> None:
+        self._world, self._others = World(task, worlds, time_limit), others
+        seats = np.arange(worlds) % task.learners
+        self._mine = np.arange(task.learners) == seats[:, None]  # (B, L)
+        self._state: Any = None
+        self._begins = True
+
+    def reset(self, seeds: int) -> NDArray[np.float32]:
+        """Begin, and return what the one sees."""
+        self._seen, self._begins = self._world.reset(seeds), True
+        return self._seen[self._mine][:, None]
+
+    def step(self, actions: NDArray[Any]) -> Step:
+        """Let everybody act, the one by `actions` (B, 1, A); return what it sees and is paid."""
+        rows = self._seen[~self._mine]
+        theirs, self._state = self._others.predict(rows, self._state, np.full(len(rows), self._begins), True)
+        everybody = np.empty((*self._mine.shape, actions.shape[-1]))
+        everybody[self._mine], everybody[~self._mine] = actions[:, 0], theirs
+        step, self._begins = self._world.step(everybody), False
+        self._seen = step.observation
+        names = ("observation", "reward", "terms", "terminated", "alive")
+        return step._replace(**{name: getattr(step, name)[self._mine][:, None] for name in names})
+
+    def measure(self) -> Mapping[str, NDArray[np.float64]]:
+        """Metrics of whole worlds."""
+        return self._world.measure()
+
+    def snapshot(self, world: int = 0) -> Snapshot:
+        """Return one world at this instant."""
+        return self._world.snapshot(world)
+
+
+@dataclass(frozen=True)
+class Payoffs:
+    """What one agent comes to with each policy, among others of each: `of[one, others]`."""
+
+    task: str
+    players: tuple[str, ...]
+    of: Mapping[tuple[str, str], Episodes]
+
+    def mean(self, one: str, others: str) -> Interval:
+        """Return the mean return of an agent that plays `one` among `others`."""
+        return bootstrap(self.of[one, others].returns, "mean")
+
+    def gain(self, one: str, others: str) -> Interval:
+        """Return what one has more who plays `one` among `others` than who plays as they do, in the same worlds."""
+        return compare(self.of[one, others], self.of[others, others]).difference
+
+    def verdict(self, a: str, b: str) -> str:
+        """Say in a line what changing sides brings whoever does it alone, and what it comes to when all do."""
+        a, b = sorted((a, b), key=lambda name: self.mean(name, name).value)
+        into, back = self.gain(a, b), self.gain(b, a)
+        whole = compare(self.of[a, a], self.of[b, b]).difference
+        said = (
+            f"{a} among {b}: {_signed(into)} for who changes; {b} among {a}: {_signed(back)}; all {a}: {_signed(whole)}"
+        )
+        if into.low > 0 and back.high < 0 and whole.high < 0:
+            return f"{said}: a prisoner's dilemma, everybody does better with {a} and all together with {b}"
+        if into.high < 0 and back.low > 0:
+            return f"{said}: {b} is the better answer to both"
+        if into.high < 0 and back.high < 0:
+            return f"{said}: either is best among its own kind"
+        if into.low > 0 and back.low > 0:
+            return f"{said}: either does better among the other kind"
+        return f"{said}: not decided in these worlds"
+
+
+def _signed(interval: Interval) -> str:
+    return f"{interval.value:+.2f} [{interval.low:+.2f}, {interval.high:+.2f}]"
+
+
+def invade(
+    task: Task,
+    players: Mapping[str, Callable[[Task], Policy]],
+    worlds: int = WORLDS,
+    seed: int = 0,
+    advance: Callable[[], None] = lambda: None,
+) -> Payoffs:
+    """Let one agent of each world play every policy, among others of every policy, in the same evaluation worlds.
+
+    Args:
+        task: with at least two learners in a world.
+        players: name -> makes that policy; each rollout has one of its own, since a policy may remember.
+        worlds: in how many.
+        seed: which of them, as in the comparison.
+        advance: called after each rollout.
+
+    Raises:
+        ValueError: one line: nobody to be among.
+    """
+    if task.learners < 2:
+        raise ValueError(f"task {task.name!r}: one learner alone in each world, with nobody to play otherwise than")
+    first, of = worlds_for("evaluation", seed, worlds), {}
+    for others, theirs in players.items():
+        for one, mine in players.items():
+
+            def make(task: Task, worlds: int, limit: int, theirs: Callable[[Task], Policy] = theirs) -> Among:
+                return Among(task, worlds, limit, theirs(task))
+
+            of[one, others] = rollout(task, mine(task), worlds, first, make_world=make)
+            advance()
+    return Payoffs(task.name, tuple(players), of)
+
+
+def table_of(payoffs: Payoffs) -> Table:
+    """Return the payoffs: a row for who is alone, a column for all others."""
+    table = Table("", *payoffs.players)
+    for one in payoffs.players:
+        table.add_row(one, *(str(payoffs.mean(one, others)) for others in payoffs.players))
+    return table
+
+
+@app.command()
+def main(
+    configs: Annotated[list[Path], typer.Argument(help="experiments, such as configs/school.yaml")],
+    players: Annotated[
+        list[str] | None, typer.Option(help="by comma or repeated; [reynolds, ppo, and others written for the task]")
+    ] = None,
+    worlds: Annotated[int, typer.Option(min=2, help="evaluation worlds")] = WORLDS,
+    seed: Annotated[int, typer.Option(min=0, max=999, help="which of them")] = 0,
+) -> None:
+    """Say who gains by playing otherwise than all others of a world."""
+    with one_line_errors():
+        tasks = [load_experiment(config).build() for config in configs]
+        known = known_players(seed)
+        fields = [_makers(task, split(players), known) for task in tasks]
+        out = Console(highlight=False)
+        if not out.is_terminal:
+            out = Console(highlight=False, width=200)  # a pipe has no width
+        for task, field in zip(tasks, fields, strict=True):
+            with Progress(console=console, transient=True) as progress:
+                bar = progress.add_task(task.name, total=len(field) ** 2)
+                found = invade(task, field, worlds, seed, lambda: progress.advance(bar))  # noqa: B023  # called at once
+            out.print(f"{task.name}: mean return of one who plays the row, among those who play the column")
+            out.print(table_of(found))
+            for pair in combinations(found.players, 2):
+                out.print(found.verdict(*pair), markup=False)
+
+
+def _makers(
+    task: Task, asked: Sequence[str], known: Mapping[str, Callable[[Task], Policy]]
+) -> dict[str, Callable[[Task], Policy]]:
+    """Return how each player of a task is made, by name; whoever cannot be had is refused before anything is played."""
+    specs = asked or [*(name for name, of in OTHERS.items() if task.name in of), "reynolds", "ppo"]
+    field = {player.name: player.spec for player in field_of(specs)}
+    for spec in field.values():
+        load_player(spec, task, known)
+    return {name: lambda task, spec=spec: load_player(spec, task, known) for name, spec in field.items()}  # type: ignore[misc]
+
+
+if __name__ == "__main__":
+    app()

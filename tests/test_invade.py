@@ -1,0 +1,128 @@
+"""Who gains by playing otherwise: one agent among others, its seat and its end, and what is said of the payoffs."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from agents import invade as invasion
+from flockenv.evaluation import Episodes, rollout, worlds_for
+from flockenv.policy import RandomPolicy
+from flockenv.tasks import Flock, School
+from flockenv.world import World
+
+FISH, WORLDS = 3, 7
+TASK = School(fish=FISH, horizon=60, start_hunger=0.6, metabolism=0.2)  # they starve in time
+
+
+class Steady:
+    """Pushes the same way for ever, and remembers how often it was asked."""
+
+    def __init__(self, push: float) -> None:
+        self.push = push
+
+    def predict(
+        self, observation: Any, state: Any = None, episode_start: Any = None, deterministic: bool = True
+    ) -> tuple[Any, Any]:
+        asked = np.zeros(len(observation)) if state is None or episode_start.all() else state
+        action = np.zeros((len(observation), 2), np.float32)
+        action[:, 0] = self.push * np.cos(asked)
+        return action, asked + 1
+
+
+def returns_of_seats(actions: Any) -> Any:
+    """Return what learner k % L of world k is paid until it is out, where learner i pushes by `actions(t)[k, i]`."""
+    world = World(TASK, WORLDS, TASK.horizon)
+    world.reset(worlds_for("evaluation", 0, WORLDS))
+    seats, paid, lives = np.arange(WORLDS) % FISH, np.zeros(WORLDS), np.ones(WORLDS, np.bool_)
+    for t in range(TASK.horizon):
+        step = world.step(actions(t))
+        paid += np.where(lives, step.reward[np.arange(WORLDS), seats], 0.0)
+        lives &= ~step.terminated[np.arange(WORLDS), seats]
+    return paid
+
+
+@pytest.mark.parametrize("theirs", [0.2, -0.8])
+def test_one_plays_alone_in_its_seat_and_is_paid_until_it_is_out(theirs: float) -> None:
+    def actions(t: int) -> Any:
+        push = np.full((WORLDS, FISH, 2), theirs * np.cos(t))
+        push[np.arange(WORLDS), np.arange(WORLDS) % FISH] = 0.2 * np.cos(t)
+        push[..., 1] = 0.0
+        return push.astype(np.float32)
+
+    first = worlds_for("evaluation", 0, WORLDS)
+    made = lambda task, worlds, limit: invasion.Among(task, worlds, limit, Steady(theirs))  # noqa: E731
+    alone = rollout(TASK, Steady(0.2), WORLDS, first, make_world=made)
+    np.testing.assert_allclose(alone.returns, returns_of_seats(actions), rtol=0, atol=1e-12)
+    assert (alone.lengths < TASK.horizon).any()  # somebody was out before the others
+
+
+def test_one_of_many_changes_what_the_others_meet() -> None:
+    field = {"calm": lambda task: Steady(0.0), "wild": lambda task: RandomPolicy(2, 0)}
+    told: list[int] = []
+    flock = Flock(agents=3, horizon=10)
+    payoffs = invasion.invade(flock, field, WORLDS, advance=lambda: told.append(1))  # type: ignore[arg-type]
+    assert len(told) == 4 and payoffs.players == ("calm", "wild")
+    assert not np.array_equal(payoffs.of["calm", "calm"].returns, payoffs.of["calm", "wild"].returns)
+    assert not np.array_equal(payoffs.of["calm", "calm"].returns, payoffs.of["wild", "calm"].returns)
+    again = invasion.invade(flock, field, WORLDS)  # type: ignore[arg-type]
+    assert all(np.array_equal(payoffs.of[key].returns, again.of[key].returns) for key in payoffs.of)
+    assert [column.header for column in invasion.table_of(payoffs).columns] == ["", "calm", "wild"]
+
+
+def made_up(aa: float, ab: float, ba: float, bb: float, noise: float = 0.1) -> invasion.Payoffs:
+    """Payoffs of `a` among `a`, of `a` among `b`, and so on, with a little luck of worlds."""
+    values = {("a", "a"): aa, ("a", "b"): ab, ("b", "a"): ba, ("b", "b"): bb}
+    luck = np.random.default_rng(0)
+
+    def episodes(value: float) -> Episodes:
+        returns = value + noise * luck.normal(size=40)
+        return Episodes(
+            "toy", "same", 0, 10, returns, returns > 0, np.full(40, 10), {}, {}, microseconds=1.0, latency=1.0
+        )
+
+    return invasion.Payoffs("toy", ("a", "b"), {key: episodes(value) for key, value in values.items()})
+
+
+@pytest.mark.parametrize(
+    ("payoffs", "says"),
+    [
+        (made_up(1, 5, 0, 3), "a prisoner's dilemma, everybody does better with a and all together with b"),
+        (made_up(3, 0, 5, 1), "a prisoner's dilemma, everybody does better with b and all together with a"),
+        (made_up(1, 2, 4, 5), "b is the better answer to both"),
+        (made_up(3, 0, 0, 5), "either is best among its own kind"),
+        (made_up(1, 5, 5, 3), "either does better among the other kind"),
+        (made_up(1, 1, 1, 1), "not decided in these worlds"),
+    ],
+)
+def test_the_verdict_follows_from_the_payoffs(payoffs: invasion.Payoffs, says: str) -> None:
+    assert payoffs.verdict("a", "b").endswith(says)
+    assert payoffs.verdict("b", "a") == payoffs.verdict("a", "b")
+    assert payoffs.mean("a", "b").low < payoffs.of["a", "b"].returns.mean() < payoffs.mean("a", "b").high
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["configs/pursuit.yaml"], "task 'pursuit': one learner alone in each world, with nobody to play otherwise"),
+        (["configs/school.yaml", "--players", "ppo,nobody"], "player 'nobody': unknown"),
+        (["configs/school.yaml", "--players", "orca"], "no hand-written player 'orca' for 'school'"),
+        (["configs/no.yaml"], "configs/no.yaml"),
+    ],
+)
+def test_what_cannot_be_played_is_refused_in_one_line(arguments: list[str], message: str) -> None:
+    result = CliRunner().invoke(invasion.app, [*arguments, "--worlds", "2"])
+    assert result.exit_code == 2
+    assert message in result.stderr and len(result.stderr.strip().splitlines()) == 1
+
+
+def test_it_prints_a_table_and_a_sentence_for_each_pair() -> None:
+    result = CliRunner().invoke(
+        invasion.app, ["configs/school.yaml", "--players", "textbook,reynolds", "--worlds", "8"]
+    )
+    assert result.exit_code == 0, result.output
+    assert "school: mean return of one who plays the row, among those who play the column" in result.stdout
+    assert "reynolds among textbook: " in result.stdout and "textbook among reynolds: " in result.stdout
