@@ -32,9 +32,12 @@ RARE = {
 }
 """Kernels of catalogue.Variant that only slow tests compile."""
 
+RARE_METHODS = {"averaged_velocity", "midpoint", "heun", "exponential_drag", "adaptive_rk4", "implicit_midpoint"}
+"""Methods whose kernels only slow tests compile; in Python they are quick, but for the implicit ones."""
+
 IN_SPACE_SLOW = {
     "test_behaviours_crowd", "test_behaviours_goals", "test_behaviours_paths", "test_behaviours_shapes", "test_effects",
-    "test_fields", "test_springs", "test_steering",
+    "test_fields", "test_neighbours", "test_springs", "test_steering",
 }  # fmt: skip
 """Where a law is written once for the plane and for space: quick tests try the plane."""
 
@@ -46,8 +49,14 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
         given = getattr(getattr(item, "callspec", None), "params", {})
         named = [getattr(value, "name", value) for value in given.values()]
         in_space = given.get("dimension") == 3 and item.path.stem in IN_SPACE_SLOW
-        if any(isinstance(name, str) and name in RARE for name in named) or in_space:
+        if any(isinstance(name, str) and name in RARE for name in named) or in_space or _of_a_rare_method(given):
             item.add_marker(pytest.mark.slow)
+
+
+def _of_a_rare_method(given: dict[str, Any]) -> bool:
+    """Does it compile one, or solve an implicit one's equations in Python?"""
+    kind, way = getattr(getattr(given.get("row"), "method", None), "kind", ""), given.get("way")
+    return kind in RARE_METHODS and way is None if way != "python" else kind.startswith("implicit")
 
 
 @pytest.fixture(scope="module")  # and forgotten afterwards: other files count the effects there are

@@ -239,6 +239,7 @@ def test_steer_of_one_behaviour_under_blend_is_the_behaviour() -> None:
     np.testing.assert_array_equal(ends[0].v, ends[1].v)
 
 
+@pytest.mark.slow
 def test_steer_leaves_other_groups_alone_and_grants_what_it_says() -> None:
     steer = Steer(group=1, behaviours=(AVOID, SEPARATION), arbitration=Allocation())
     scene = crowd(steer)

@@ -36,7 +36,7 @@ def found(name: str, preset: str = NERVOUS) -> Finding:
 # --- people walk ------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", ["rimea 1", "nist 2.1", "juelich 2", "rimea 7"])
+@pytest.mark.parametrize("name", [pytest.param("rimea 1", marks=slow), "nist 2.1", "juelich 2", "rimea 7"])
 def test_who_walks_alone_walks_as_fast_as_guidelines_ask(name: str) -> None:
     finding = found(name)
     assert finding.verdict == "pass", finding.note
@@ -48,6 +48,7 @@ def test_who_wants_to_walk_slower_is_later_than_rimea_1_allows() -> None:
     assert crossing_time(run_.time, run_.pos[:, 0, 0, 0], 40.0) == pytest.approx(40 / 1.1 + 0.5, abs=0.02)
 
 
+@pytest.mark.slow
 def test_twenty_people_come_around_a_corner_and_through_no_wall() -> None:
     finding = found("rimea 6")
     assert finding.verdict == "pass", finding.note

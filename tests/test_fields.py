@@ -137,6 +137,7 @@ def test_fluctuations_do_not_depend_on_the_step() -> None:
         assert abs(end.vel.mean()) < 4 * s / m * math.sqrt(seconds / 20_000)
 
 
+@pytest.mark.slow
 def test_with_drag_fluctuations_come_to_an_equilibrium() -> None:
     """var v = s^2 / (2 c m) per direction, and in the long run x diffuses: var x = 2 D t + ..., D = s^2 / (2 c^2).
 

@@ -74,7 +74,7 @@ def warm(count: int, size: float) -> Scene:
     return Scene(space=Torus(size=(size, size)), dt=0.01, groups=(group,), effects=(Warmth(kind="warmth"),))
 
 
-@pytest.mark.parametrize(("count", "size"), [(30, 5.0), (2**14, 90.0)])
+@pytest.mark.parametrize(("count", "size"), [(30, 5.0), pytest.param(2**14, 90.0, marks=pytest.mark.slow)])
 def test_what_is_kept_follows_neighbours_and_not_the_order_threads_or_calls(count: int, size: float) -> None:
     scene = warm(count, size)
     start = scene.start(3, 2)

@@ -61,6 +61,7 @@ def test_the_order_is_the_declared_one(row: IntegratorRow, way: str, tether: Any
     assert measured == pytest.approx(row.method.order_with_drag, abs=0.2)
 
 
+@pytest.mark.slow
 @METHODS
 def test_the_order_without_damping_is_the_declared_one(row: IntegratorRow, tether: Any) -> None:
     seconds = 0.7 * PERIOD

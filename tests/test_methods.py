@@ -36,7 +36,9 @@ from flockenv.state import State, blank
 from tests.catalogue import INTEGRATORS, Array, IntegratorRow
 from tests.motion import METHODS, V0, WAYS, X0, at_start, first_of, motion, order, tethered
 
-ADAPTIVE = pytest.mark.parametrize("kind", [AdaptiveRK4, DormandPrince], ids=lambda kind: kind.__name__)
+ADAPTIVE = pytest.mark.parametrize(
+    "kind", [pytest.param(AdaptiveRK4, marks=pytest.mark.slow), DormandPrince], ids=lambda kind: kind.__name__
+)
 HERE = Spawn(low=(0, 0), high=(1, 1))
 
 
@@ -237,7 +239,11 @@ def test_a_tolerance_a_thousand_times_smaller_pays(kind: type[Integrator], tethe
 
 @pytest.mark.parametrize(
     ("method", "energy", "spin"),
-    [(VelocityVerlet(), 4e-4, 1e-11), (RK4(), 3e-7, 1e-7), (SemiImplicitEuler(), 2e-2, 1e-11)],
+    [
+        pytest.param(VelocityVerlet(), 4e-4, 1e-11, marks=pytest.mark.slow),
+        pytest.param(RK4(), 3e-7, 1e-7, marks=pytest.mark.slow),
+        (SemiImplicitEuler(), 2e-2, 1e-11),
+    ],
     ids=lambda value: getattr(value, "kind", None),
 )
 def test_a_hundred_orbits_keep_what_they_keep(method: Integrator, energy: float, spin: float, tether: Any) -> None:

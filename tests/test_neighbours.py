@@ -179,7 +179,7 @@ def test_rules_of_different_radii_share_the_widest_query() -> None:
     assert alone.counted("pairs") == after.counted("pairs")  # a law that looks less far adds nothing to the query
 
 
-@pytest.mark.parametrize("count", [50, 700])
+@pytest.mark.parametrize("count", [50, pytest.param(700, marks=pytest.mark.slow)])
 def test_an_effect_that_is_not_listed_changes_no_bits_and_no_counters(count: int) -> None:
     """The three rules alone are what they are among others that weigh nothing."""
     space = Torus(size=(14.0, 11.0))
@@ -271,6 +271,7 @@ def test_elongated_crowds(size: Any) -> None:
     assert_as_expected((rules(1.0)[0],), uniform(300, size), None)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("size", [(1000.0, 1e-3, 1e-3), (1e-3, 300.0, 300.0), (1e-3, 1e-3, 1e5)])
 def test_elongated_crowds_in_space(size: Any) -> None:
     assert_as_expected((rules(1.0)[0],), uniform(300, size), None)

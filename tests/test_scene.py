@@ -108,7 +108,13 @@ def test_with_a_spacing_nobody_starts_in_anybody_or_in_an_obstacle(dimension: in
 # --- steps ------------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("scene", [crowd(), scene_of(Drag(rate=0.4), integrator=RK4(), dt=0.02)], ids=["crowd", "rk4"])
+@pytest.mark.parametrize(
+    "scene",
+    [
+        pytest.param(crowd(), id="crowd", marks=pytest.mark.slow),
+        pytest.param(scene_of(Drag(rate=0.4), integrator=RK4(), dt=0.02), id="rk4"),
+    ],
+)
 def test_a_run_split_in_two_is_the_same_run(scene: Scene) -> None:
     start = scene.start(1, worlds=2)
     together = scene.run(start, 30)
@@ -600,6 +606,7 @@ print((scene.step(start).vel - start.vel)[0, 0, 0] / start.pos[0, 0, 0])
 """
 
 
+@pytest.mark.slow
 def test_an_edited_law_is_compiled_anew_in_the_next_process(tmp_path: Path) -> None:
     """numba alone would go on with the machine code of the old law: it watches the file that calls, not the law."""
     found = []

@@ -186,6 +186,7 @@ def test_a_collision_is_foreseen_where_both_go_on() -> None:
 # --- signs ------------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_friction_against_a_wall_never_adds_kinetic_energy() -> None:
     """-kappa d (v . t) t; JuPedSim adds it (peers.md 2.6)."""
     scene = crowd(ObstacleContact(stiffness=0, friction=2.4e5), count=40, walls=(Wall(vertices=((0, -90), (0, 90))),))

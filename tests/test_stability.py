@@ -203,7 +203,9 @@ LINEAR: dict[str, tuple[Network, tuple[Effect, ...], float]] = {
 """A network of .1 kg each, effects, and which share of the true limit is suggested at least."""
 
 
-@pytest.mark.parametrize("name", LINEAR)
+@pytest.mark.parametrize(
+    "name", [n if n in ("chain", "triangles") else pytest.param(n, marks=pytest.mark.slow) for n in LINEAR]
+)
 def test_the_suggested_step_is_at_most_the_true_limit_and_not_far_below(name: str) -> None:
     """P02: at most the limit, at least half of it; where damping is bounded as well, about a third."""
     net, effects, least = LINEAR[name]

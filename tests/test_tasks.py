@@ -109,6 +109,7 @@ def test_a_task_plays_with_the_method_it_is_given_and_shows_the_same_to_policies
     assert task_source(task) != task_source(row.task)
 
 
+@pytest.mark.slow
 def test_a_method_of_second_order_takes_a_constant_force_exactly_and_the_default_one_does_not() -> None:
     moved = {}
     for task in (Pursuit(), Pursuit(integrator=Midpoint())):

@@ -133,6 +133,7 @@ def test_a_team_takes_the_very_step_that_one_thread_takes(large: Large, dead: fl
     assert not np.array_equal(expected.x, start.x)
 
 
+@pytest.mark.slow
 def test_a_team_goes_through_the_worlds_of_a_small_batch_of_large_ones(shared: list[int]) -> None:
     scene = NAMED["torus_single"].make(4200, 60.0)
     start = started(scene, worlds=2)

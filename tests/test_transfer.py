@@ -93,6 +93,7 @@ def test_the_trained_setting_scores_what_the_comparison_says_bit_for_bit_and_aga
     assert results()["world_seeds"]["first"] == said["world_seeds"]["first"]
 
 
+@pytest.mark.slow
 def test_methods_of_second_order_err_less_and_the_costs_are_told() -> None:
     run(*TINY, "--players", "reynolds", "--methods", "semi_implicit_euler,midpoint", "--substeps", "1,4")
     found = results()["tasks"]["pursuit"]["settings"]

@@ -65,6 +65,7 @@ def test_a_step_is_the_papers_map(method: ExplicitEuler | SemiImplicitEuler) -> 
     assert np.linalg.norm(state.vel[0], axis=1) == pytest.approx(np.full(400, 0.03), rel=1e-12)
 
 
+@pytest.mark.slow
 def test_without_noise_neighbours_agree_and_the_lone_fly_on() -> None:
     scene = flock(0.0, count=100)
     state = scene.start(0)

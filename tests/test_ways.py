@@ -213,6 +213,7 @@ def waiting(count: int, doors: tuple[Door, ...], at: Any, **more: Any) -> Array:
 EQUAL = (Door(ends=LEFT, width=1.0), Door(ends=RIGHT, width=1.0))
 
 
+@pytest.mark.slow
 def test_of_two_equal_doors_half_take_each_and_of_unequal_ones_as_computed() -> None:
     """All stand in one place, so that half of those of a door are ahead: L1 + n1 / (2 J w1) = L2 + n2 / (2 J w2)."""
     more = {"flow": 1.9, "hysteresis": 0.0}

@@ -507,6 +507,7 @@ def test_a_snapshot_is_a_picture_of_one_world(row: TaskRow) -> None:
     np.testing.assert_array_equal(picture.pos, kept)
 
 
+@pytest.mark.slow
 def test_a_large_flock_looks_around_through_cells() -> None:
     """Its nearest are those that everybody against everybody finds."""
     task = Flock(agents=130, learners=130, size=60.0)
