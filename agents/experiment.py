@@ -49,6 +49,10 @@ class PpoSettings(Record):
     log_std: float = Field(default=-0.5, description="logarithm of the first standard deviation of actions")
     reward_scale: float = Field(default=0.1, gt=0, description="rewards are multiplied by this while learning")
     team: bool = Field(default=False, description="everybody is paid the mean of his world, to the world's end")
+    taught: int = Field(
+        default=0, ge=0, description="gradient steps in which it first learns what the tuned rules answer"
+    )
+    critic_first: int = Field(default=0, ge=0, description="agent-steps in which only the critic learns, after that")
     stagger: bool = Field(default=False, description="begin worlds at different times of their first episode")
     hidden: tuple[int, ...] = Field(default=(64, 64), min_length=1, description="units per layer")
     activation: str = Field(default="relu", pattern="^(relu|tanh)$", description="relu or tanh")

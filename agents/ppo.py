@@ -28,6 +28,8 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import VecEnvWrapper
 
 from agents.experiment import WEIGHTS, Experiment, PpoSettings, load_experiment, one_line_errors
+from agents.reynolds import player
+from agents.teach import teach
 from flockenv.crew import threads, use_threads
 from flockenv.evaluation import rollout, worlds_for
 from flockenv.policy import MlpPolicy, save_policy
@@ -173,6 +175,10 @@ class Watch(BaseCallback):
         return True
 
     def _on_rollout_end(self) -> None:
+        policy = self.model.policy
+        for part in (policy.mlp_extractor.policy_net, policy.action_net):
+            part.requires_grad_(self.num_timesteps > self.p.critic_first)
+        policy.log_std.requires_grad_(self.num_timesteps > self.p.critic_first)
         self.run.steps = self.num_timesteps
         self.progress.update(self.bar, completed=min(self.num_timesteps, self.p.steps))
         due = len(self.run.curve) * self.p.evaluate_every
@@ -240,6 +246,15 @@ def _numbers(block: dict[str, Any], path: KeyPath = ()) -> Iterator[tuple[str, A
             yield key_path((*path, key)), value
 
 
+def _teach(model: PPO, task: Task, p: PpoSettings) -> None:
+    """Let the network first learn what the tuned rules answer, if it is to."""
+    if p.taught == 0:
+        return
+    with on_threads(p.threads), Progress(console=console, transient=True) as progress:
+        bar = progress.add_task(f"{task.name}: is taught", total=p.taught)
+        teach(model, task, player(task), p.taught, advance=lambda n: progress.advance(bar, n))
+
+
 def resume(folder: Path, model: PPO, run: Run) -> None:
     """Read a checkpoint's networks back into the model."""
     model.policy.load_state_dict(torch.load(folder / "policy.pt", weights_only=True))
@@ -262,6 +277,7 @@ def train(experiment: Experiment, folder: Path, go_on: bool = False, tensorboard
         resume(folder, model, run)
     else:
         run = Run(recipe_of(experiment))
+        _teach(model, task, p)
         (folder / "run.json").unlink(missing_ok=True)  # what is there is overwritten file by file
     columns = (
         TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TimeRemainingColumn(),

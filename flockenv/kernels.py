@@ -30,6 +30,7 @@ from numba.np import arrayobj
 
 from flockenv import compilation  # noqa: F401  # tells how long compiling takes
 from flockenv.inlining import Inlined
+from flockenv.turns import OneAtATime
 
 __all__ = [
     "FAST",
@@ -302,6 +303,11 @@ def load(name: str, source: str) -> ModuleType:
     module = importlib.util.module_from_spec(spec)
     sys.modules[qualified] = module
     spec.loader.exec_module(module)
+    locks = folder / "locks"
+    locks.mkdir(exist_ok=True)
+    for function in vars(module).values():
+        if hasattr(function, "py_func") and function.py_func.__module__ == qualified:  # an entry point, of this file
+            function._cache = OneAtATime(function._cache, locks / f"{path.stem}_{function.__name__}.lock")
     return module
 
 

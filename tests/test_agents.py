@@ -13,9 +13,10 @@ from typer.testing import CliRunner
 
 from agents import tune
 from agents.experiment import AS_CONFIGURED, CONFIGS, WEIGHTS, Experiment, PpoSettings, load_experiment
-from agents.imitate import imitate, shown
+from agents.imitate import imitate
 from agents.ppo import ForLearning
 from agents.reynolds import RULES, player, tuned
+from agents.teach import shown
 from flockenv.crew import threads
 from flockenv.evaluation import compare, rollout, worlds_for
 from flockenv.policy import MlpPolicy, RandomPolicy
@@ -333,6 +334,28 @@ def test_a_team_is_paid_the_mean_of_its_world_to_its_end() -> None:
     alone, together = np.array(ends[False]), np.array(ends[True])
     assert alone[:-1].any() and not together[:-1].any()  # somebody was out before the world was over
     assert together[-1].reshape(2, 3).any(axis=1).tolist() == together[-1].reshape(2, 3).all(axis=1).tolist()
+
+
+def test_a_taught_actor_waits_for_its_critic(tmp_path: Path) -> None:
+    """What is exported is the network as it was taught, for as long as only the critic learns."""
+    from agents import ppo
+
+    def weights(**changes: Any) -> Any:
+        settings = {**TINY, "steps": 1024, "threads": 1, "taught": 5, **changes}
+        experiment = Experiment(task="pursuit", ppo=PpoSettings(**settings))
+        ppo.train(experiment, tmp_path / "run")
+        state = ppo.torch.load(tmp_path / "run" / "policy.pt", weights_only=True)
+        return {name: tensor.numpy() for name, tensor in state.items()}
+
+    waits, faster, learns = weights(critic_first=1024), weights(critic_first=1024, learning_rate=0.01), weights()
+    untaught = weights(critic_first=1024, taught=0)
+    actor = [name for name in waits if "policy_net" in name or "action_net" in name or name == "log_std"]
+    assert len(actor) == 7
+    for name in actor:
+        np.testing.assert_array_equal(waits[name], faster[name])
+        assert not np.array_equal(waits[name], learns[name])
+    assert not np.array_equal(waits["value_net.weight"], faster["value_net.weight"])
+    assert not np.array_equal(waits["action_net.weight"], untaught["action_net.weight"])
 
 
 def test_rows_are_shown_until_an_episode_is_over() -> None:

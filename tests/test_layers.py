@@ -16,7 +16,18 @@ import pytest
 ROOT = Path(__file__).resolve().parent.parent
 
 LAYERS = (
-    {"divergence", "terminal", "refusals", "outputs", "recycle", "crew", "compilation", "inlining", "frontend"},
+    {
+        "divergence",
+        "terminal",
+        "refusals",
+        "outputs",
+        "recycle",
+        "crew",
+        "compilation",
+        "inlining",
+        "frontend",
+        "turns",
+    },
     {"records", "vec", "elementary", "noise", "kernels", "targets"},
     {"state", "space", "steering", "arbitration", "vehicle", "appearance", "spread", "urges"},
     {"neighbours", "shapes", "grid", "eikonal", "orca", "polyline", "rows", "networks", "elements", "tree"},

@@ -60,7 +60,7 @@ def test_the_environment_needs_no_torch(metadata: Message) -> None:
     base = {re.split(r"[\s<>=!~;\[]", line)[0].lower() for line in needed if "extra ==" not in line}
     assert base == {
         *("numpy", "scipy", "numba", "gymnasium", "pettingzoo", "pydantic", "pyyaml", "typer", "rich"),
-        *("matplotlib", "pillow", "safetensors", "shapely"),
+        *("matplotlib", "pillow", "safetensors", "shapely", "filelock"),
     }
     assert set(metadata.get_all("Provides-Extra") or []) == {"train", "test", "render", "docs"}
     assert "gymnasium<2,>=1.2" in needed

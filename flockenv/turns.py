@@ -1,0 +1,49 @@
+"""One process compiles a kernel, the others wait for what it writes: a dozen workers start as fast as one.
+
+numba lets every process that misses a kernel on the disk compile it. Workers of a vectorised environment, or of a test
+run, all miss the same ones at the same time.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from filelock import FileLock, Timeout
+
+__all__ = ["PATIENCE", "OneAtATime"]
+
+PATIENCE = 120.0
+"""Seconds that somebody else's compilation is waited for; whoever stopped in the middle of one keeps nobody longer."""
+
+
+class OneAtATime:
+    """A function's cache on the disk, of which one process at a time may have missed an entry."""
+
+    def __init__(self, cache: Any, lock: Path, patience: float = PATIENCE) -> None:
+        self._cache, self._lock = cache, FileLock(lock, timeout=patience)
+
+    def load_overload(self, signature: Any, context: Any) -> Any:
+        """Return what is on the disk, if need be as soon as another process has written it; None: it is up to you."""
+        self._lock.release(force=True)  # of a compilation that failed
+        found = self._cache.load_overload(signature, context)
+        if found is not None:
+            return found
+        try:
+            self._lock.acquire()
+        except (Timeout, OSError):  # where nothing can be locked, each compiles for himself
+            return None
+        found = self._cache.load_overload(signature, context)
+        if found is not None:
+            self._lock.release()
+        return found
+
+    def save_overload(self, signature: Any, compiled: Any) -> None:
+        """Write what was compiled, and let others read it."""
+        try:
+            self._cache.save_overload(signature, compiled)
+        finally:
+            self._lock.release(force=True)
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._cache, name)
