@@ -108,7 +108,9 @@ def _curves(axes: Axes, task: str, numbers: Numbers) -> None:
     level = best if rules is None else rules
     if rules is not None:
         axes.axhline(rules, color=INK, linewidth=1, linestyle=(0, (4, 3)), label=f"the rules, tuned: {rules:.2f}")
-    room = max(0.15 * abs(level), 4 * abs(best - level))  # what happens near the rules is what matters
+    worst = min(max(point["mean"] for point in curve) for curve in curves.values())
+    # what happens near the rules is what matters, and what every setting comes to is seen
+    room = max(0.15 * abs(level), 4 * abs(best - level), 1.5 * (level - worst))
     axes.set_ylim(level - room, max(best, level) + 0.25 * room)
     axes.set_title(task, loc="left", fontsize=12, fontweight="bold", color=INK)
     axes.set_xlabel("seconds of training")
@@ -117,7 +119,7 @@ def _curves(axes: Axes, task: str, numbers: Numbers) -> None:
     axes.grid(color=GRID, linewidth=0.8)
     for side in ("top", "right"):
         axes.spines[side].set_visible(False)
-    axes.legend(fontsize=8, edgecolor="none", loc="lower right")
+    axes.legend(fontsize=8, edgecolor="none", loc="best")
 
 
 @app.command()

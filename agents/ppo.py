@@ -73,6 +73,11 @@ class ForLearning(VecEnvWrapper):
             world: World = self.venv.world
             reward = np.repeat(reward.reshape(world.worlds, -1).mean(axis=1), world.learners)
             done = np.array([bool(info) for info in infos])  # told of those whose world has ended, and of nobody else
+            for row in np.flatnonzero(done[:: world.learners]) * world.learners:
+                ended = infos[row : row + world.learners]
+                cut = any(info["TimeLimit.truncated"] for info in ended)  # for those who are out as for those who live
+                for info in ended:
+                    info["TimeLimit.truncated"] = cut
         return observation, reward * self.scale, done, infos
 
 

@@ -29,7 +29,8 @@ worlds, and no player was trained or tuned on one of them. IQM (the mean without
 worlds), mean and differences: 95 % percentile bootstrap over worlds; success and "scores higher" (ties count half):
 95 % Wilson. A difference is the mean over worlds, so rare disasters count in it, unlike in the IQM. There is one
 trained policy per task: the intervals speak of the luck of worlds, not of the luck of training, which hand-written
-players have none of. µs: per decision, all worlds at once / one row alone (medians)."""
+players have none of. µs: per decision, all worlds at once / one row alone (medians; in a large comparison other cores
+play other tasks meanwhile)."""
 
 
 def task_results(

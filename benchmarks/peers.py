@@ -73,7 +73,18 @@ PAIRS = (
     Pair("jupedsim", "crowd", "crowd_1000"),
     Pair("pysocialforce", "crowd_100", "crowd_100"),
     Pair("pysocialforce", "crowd_500", "crowd_500"),
+    *(
+        Pair(peer, case, "flock_vector")
+        for peer, case in (
+            ("vmas", "flocking_4"),
+            ("vmas", "flocking_32"),
+            ("mpe2", "spread"),
+            ("mesa", "boids_100"),
+            ("sisl", "pursuit"),
+        )
+    ),
 )
+"""The last are what somebody meets who changes to flockenv for its speed: ours in many worlds, theirs as they come."""
 
 
 class PeerError(Exception):
@@ -243,7 +254,7 @@ def _noting(bench: Bench, work: Any) -> None:
 
 def _race(bench: Bench, pair: Pair, cache: Path, threads: int) -> None:
     """Measure one pair; ratios are flockenv's rate over the peer's."""
-    title = f"{pair.peer} {pair.case}"
+    title = f"{pair.peer} {pair.case}" + " (against many worlds)" * (pair.ours == "flock_vector")
     script = f"run_{pair.peer}.py"
     seconds = QUICK_SAMPLE if bench.quick else SAMPLE
     typer.echo(f"starting {title}", err=True)

@@ -138,6 +138,7 @@ def _fail(*_: object, **__: object) -> None:
     raise AssertionError("nothing is to be trained")
 
 
+@pytest.mark.slow
 def test_training_that_was_interrupted_goes_on_and_a_finished_one_is_left_alone(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -261,13 +262,14 @@ def test_curves_are_of_one_config_a_task_and_a_picture_is_a_png(tmp_path: Path) 
 
 def test_the_stored_curves_are_of_the_settings_in_the_configs() -> None:
     """Threads aside, which change how long it took. If this fails: docs/players.md says how they are made."""
-    stored = json.loads((ROOT / "docs" / "learning.json").read_text(encoding="utf-8"))
+    files = [ROOT / "docs" / name for name in ("learning.json", "learning_school.json")]
+    stored = {task: numbers for file in files for task, numbers in json.loads(file.read_text(encoding="utf-8")).items()}
     assert stored.keys() == {name for name in TASKS if load_experiment(CONFIGS / f"{name}.yaml").curves}
     for name, numbers in stored.items():
         experiment = load_experiment(CONFIGS / f"{name}.yaml")
         assert numbers["rules"] == experiment.reynolds.found["tuning_mean"]
         kept = {setting: PpoSettings(**{**row["ppo"], "threads": 2}) for setting, row in numbers["settings"].items()}
-        assert kept == experiment.settings()
+        assert kept == {setting: p.model_copy(update={"threads": 2}) for setting, p in experiment.settings().items()}
 
 
 def test_training_leaves_the_number_of_threads_as_it_was(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -334,6 +336,22 @@ def test_a_team_is_paid_the_mean_of_its_world_to_its_end() -> None:
     alone, together = np.array(ends[False]), np.array(ends[True])
     assert alone[:-1].any() and not together[:-1].any()  # somebody was out before the world was over
     assert together[-1].reshape(2, 3).any(axis=1).tolist() == together[-1].reshape(2, 3).all(axis=1).tolist()
+
+
+def test_a_time_limit_cuts_off_a_team_with_those_who_are_out() -> None:
+    """What comes after it is worth something to everybody: none of a team's rows ends as a death does."""
+    task = School(fish=3, horizon=8, start_hunger=0.6, metabolism=0.4)
+    told = {}
+    for team in (False, True):
+        venv = ForLearning(WorldVecEnv(task, 4, leaving=True), 0.1, stagger=False, team=team)
+        venv.seed(5)
+        venv.reset()
+        for _ in range(task.horizon):
+            infos = venv.step(np.zeros((12, 2), np.float32))[3]
+        told[team] = np.array([info["TimeLimit.truncated"] for info in infos]).reshape(4, 3)
+    mixed = told[False].any(axis=1) & ~told[False].all(axis=1)
+    assert mixed.any()  # somebody was out, and somebody was not
+    np.testing.assert_array_equal(told[True], np.repeat(told[False].any(axis=1)[:, None], 3, axis=1))
 
 
 def test_a_taught_actor_waits_for_its_critic(tmp_path: Path) -> None:

@@ -168,6 +168,7 @@ MEETINGS = {  # positions and velocities about (100, 100); the targets lie far a
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", MEETINGS)
 @pytest.mark.parametrize("radii", [(0.3, 0.3), (0.1, 0.9), (0.9, 0.1)])
 def test_two_who_would_run_into_each_other_do_not(case: str, radii: tuple[float, float]) -> None:
@@ -250,6 +251,7 @@ def test_a_queue_stops_behind_who_stops_and_closes_up_exponentially() -> None:
     assert np.abs(start.vel[0, :4]).max() < 0.01
 
 
+@pytest.mark.slow
 def test_a_gap_in_a_queue_is_between_bodies_of_either_size() -> None:
     """A small one stops the margin short of a large one that stands, not of one of its own size (formulas.md 1.4)."""
     small, large = bodies(1, radius=0.1), bodies(1, radius=0.9)

@@ -437,6 +437,7 @@ SCREENS: dict[str, tuple[Shape, ...]] = {
 """What stands between me and whom is at (2, 0), beside the way to him, beyond him, and behind me."""
 
 
+@pytest.mark.slow
 def test_who_is_hidden_is_not_the_nearest() -> None:
     """A behaviour about the nearest one is about the nearest that it sees: who is hidden takes nobody's place."""
     group = Group(count=3, radius=0.05, spawn=Spawn(low=(0, 0), high=(0, 0)))

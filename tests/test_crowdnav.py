@@ -112,6 +112,7 @@ def crowds(**fields: Any) -> list[np.ndarray]:
     return found
 
 
+@pytest.mark.slow
 def test_an_invisible_robot_does_not_change_the_crowd_and_a_visible_one_does() -> None:
     still, through = crowds()
     np.testing.assert_array_equal(still, through)

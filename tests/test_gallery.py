@@ -40,6 +40,7 @@ def test_the_page_in_docs_is_the_one_of_the_behaviours() -> None:
     assert {path.stem for path in (DOCS / "behaviours").glob("*.png")} == set(BEHAVIOURS)
 
 
+@pytest.mark.slow
 def test_a_gallery_is_a_page_and_its_pictures(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

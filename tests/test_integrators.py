@@ -275,6 +275,7 @@ def test_of_a_team_each_writes_his_own_part_alone(row: IntegratorRow) -> None:
         np.testing.assert_array_equal(whole, once)
 
 
+@pytest.mark.slow
 def test_halving_the_step_brings_the_methods_together(tether: Any) -> None:
     seconds = 0.7 * PERIOD
     end, gaps = oscillator(tether, "compiled"), []

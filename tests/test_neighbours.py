@@ -220,6 +220,7 @@ def test_awkward_toruses(size: Any) -> None:
     assert_as_expected(rules(1.0, fov=200), uniform(300, size), Torus(size=size))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("size", [(2.0, 2.0, 2.0), (3.0031, 3.0031, 3.0031), (4.01, 3.01, 30.0), (60.0, 3.1, 3.1)])
 def test_awkward_toruses_in_space(size: Any) -> None:
     assert_as_expected(rules(1.0, fov=200), uniform(300, size), Torus(size=size))

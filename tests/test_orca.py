@@ -259,6 +259,7 @@ def least_gaps(scene: Scene, state: Any, steps: int) -> tuple[float, float, Any]
     return agents, stones, state
 
 
+@pytest.mark.slow
 def test_in_a_scene_agents_without_inertia_never_touch_and_pass_round_obstacles() -> None:
     stones = ({"centre": (5.0, 0.05), "radius": 1.0}, {"centre": (8.0, -2.0), "radius": 0.7})
     scene = walkers(obstacles=stones)

@@ -257,6 +257,7 @@ def test_motion_far_from_the_origin_is_the_same_motion(far: float) -> None:
     np.testing.assert_allclose(scene.run(away, 40).pos - far, scene.run(start, 40).pos, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_single_precision_is_the_same_scene_in_single_precision() -> None:
     single, double = everything(2, dtype="float32"), everything(2)
     start = single.start(3, worlds=2)
@@ -526,6 +527,7 @@ def crowd_of(count: int, **fields: Any) -> Scene:
     return scene_of(Separation(weight=1, radius=1), groups=(Group(count=count, max_speed=3, spawn=spawn),), **fields)
 
 
+@pytest.mark.slow
 def test_who_is_inside_a_torus_stays_where_he_is() -> None:
     """59.999996 / 60 rounds to 1 in single precision: an agent there must not be carried round at each call."""
     scene = crowd_of(200, space=Torus(size=(60, 60)), dtype="float32")

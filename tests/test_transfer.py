@@ -108,6 +108,7 @@ def test_methods_of_second_order_err_less_and_the_costs_are_told() -> None:
     assert all(differences.values())
 
 
+@pytest.mark.slow
 def test_float32_plays_the_same_worlds() -> None:
     run(*TINY, "--players", "reynolds", "--methods", "semi_implicit_euler:float32", "--substeps", "2")
     other = results()["tasks"]["pursuit"]["settings"]["semi_implicit_euler float32 /2"]

@@ -101,6 +101,7 @@ def test_what_is_no_step_of_the_map_is_refused_in_one_line(change: dict[str, obj
     assert "\n" not in str(caught.value)
 
 
+@pytest.mark.slow
 def test_noise_takes_order_away() -> None:
     found = [order(flock(noise), 1000, 300).mean() for noise in (0.1, 2.0, 2 * math.pi)]
     assert found == pytest.approx([0.9994, 0.779, 0.044], abs=0.1)

@@ -223,6 +223,7 @@ def test_of_two_equal_doors_half_take_each_and_of_unequal_ones_as_computed() -> 
     assert abs((waiting(60, wide, (5, 3), **more) == 1).sum() - 40) <= 3
 
 
+@pytest.mark.slow
 def test_who_has_decided_stays_with_it_unless_another_door_is_quicker_by_the_hysteresis() -> None:
     """Nine people 4.4 m from one door, 5.6 m from the other: 4.4 + 4 / 1.9 s against 5.6 s is 14 % more."""
     assert (waiting(9, EQUAL, (4.4, 3), hysteresis=0.3) == 0).all()

@@ -25,6 +25,26 @@ def flock_batch(agents: int) -> Case:
     return _batch(World(task, WORLDS, HORIZON), np.random.default_rng(0), does)
 
 
+def flock_vector(threads: int) -> Case:
+    """The Flock task as gymnasium's VectorEnv, every agent of 1024 worlds a row of it, in float32."""
+    import numpy as np
+
+    from flockenv.crew import use_threads
+    from flockenv.envs.vector import FlockVectorEnv
+
+    use_threads(threads)
+    agents, rows = 32, WORLDS * 32
+    env = FlockVectorEnv(rows, HORIZON, agents=agents, learners=agents, dtype="float32")
+    env.reset(seed=0)
+    actions = cycle(np.random.default_rng(0).uniform(-1, 1, (DRAWS, rows, 2)).astype(np.float32))
+    task = env.task
+    does = (
+        f"Flock as a VectorEnv, {WORLDS} worlds x {agents} learners, {task.obstacle_slots} obstacles, float32: drives "
+        f"in {task.substeps} substeps; {task.layout.size} observations each, 6 reward terms, metrics, resets"
+    )
+    return Case(lambda: env.step(next(actions)), rows, does)
+
+
 def pursuit_batch(threads: int) -> Case:
     """The Pursuit task in 1024 worlds: three chase one, all four learn, through World.step."""
     import numpy as np
@@ -186,6 +206,7 @@ CASES = {
     "flock_4": lambda threads: flock_batch(4),
     "flock_3": lambda threads: flock_batch(3),
     "flock_32": lambda threads: flock_batch(32),
+    "flock_vector": flock_vector,
     "pursuit": pursuit_batch,
     "parallel_flock": flock_parallel,
     "parallel_tag": lambda threads: pursuit_parallel(3, 1),
