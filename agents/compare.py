@@ -14,12 +14,13 @@ import subprocess
 import tempfile
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import BrokenExecutor, ProcessPoolExecutor
+from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Future, ProcessPoolExecutor, wait
 from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib import metadata
 from itertools import product
 from multiprocessing import active_children, get_context
+from multiprocessing.connection import Connection
 from pathlib import Path
 from time import perf_counter
 from typing import Annotated, Any
@@ -33,6 +34,7 @@ from agents import report
 from agents.experiment import CONFIGS, WEIGHTS, Experiment, load_experiment
 from agents.reynolds import PLAYERS as OTHERS
 from agents.reynolds import player as hand_written
+from flockenv.crew import use_threads
 from flockenv.evaluation import WORLDS_PER_SEED, Episodes, rollout, task_digest, worlds_for
 from flockenv.outputs import checked_path
 from flockenv.policy import MlpPolicy, Policy, RandomPolicy, load_player
@@ -115,7 +117,7 @@ def compare(
     """Play every task with every player in the same worlds; return the results as plain data, and the episodes.
 
     From 256 worlds on, tasks are played side by side, by a process for each core: a script that calls this then needs
-    `if __name__ == "__main__":`, as for anything that starts processes.
+    `if __name__ == "__main__":`, as for anything that starts processes. `advance` is called by another thread then.
 
     Raises:
         ValueError: one line: a player that cannot be had (before anything is played), or that fails while playing.
@@ -197,29 +199,63 @@ def _all(jobs: Sequence[_Job], plays: Plays, advance: Advance) -> Iterator[Playe
         yield from (_play(job, plays[job.task.name], advance) for job in jobs)
         return
     context = get_context("spawn")
-    told: Any = context.SimpleQueue()
-    listener = threading.Thread(target=_pass_on, args=(told, advance), daemon=True)
-    listener.start()
-    others = active_children()
-    with ProcessPoolExecutor(cores, context, _begin_work, (told,)) as pool:
-        try:
-            with _interrupts_held():  # whoever is started now never hears of Ctrl-C
-                played = pool.map(_work, jobs)
-            yield from played
-        except BaseException as error:
-            for process in active_children():
-                if process not in others:
-                    process.terminate()
-            if isinstance(error, BrokenExecutor):
+    with _heard(context, advance) as (mouth, turn, trouble):
+        others = active_children()
+        with ProcessPoolExecutor(cores, context, _begin_work, (mouth, turn)) as pool:
+            with _interrupts_held():
+                at_work = [pool.submit(_work, job) for job in jobs]
+            workers = [process for process in active_children() if process not in others]
+            try:
+                for working in at_work:
+                    wait((working, trouble), return_when=FIRST_COMPLETED)
+                    if trouble.done():
+                        break
+                    yield working.result()
+            except BrokenExecutor:
                 raise OSError("a process that plays a task was ended from outside; is there enough memory?") from None
-            raise
-    told.put(None)
-    listener.join()
+            finally:  # nobody plays on for nothing
+                if not all(working.done() for working in at_work):
+                    for process in workers:
+                        process.terminate()
+    if trouble.done():
+        trouble.result()
+
+
+@contextmanager
+def _heard(context: Any, advance: Advance) -> Iterator[tuple[Connection, Any, Future[None]]]:
+    """Have what other processes tell of their progress passed on to `advance`, by a thread of its own.
+
+    Yields where they tell it, the lock that says whose turn it is to speak, and what has an error of `advance`, if it
+    raised one; after that nothing more is passed on.
+    """
+    ear, mouth = context.Pipe(duplex=False)
+    trouble: Future[None] = Future()
+
+    def listen() -> None:
+        while True:
+            try:
+                news = ear.recv()
+            except (EOFError, OSError):  # nobody is left who could say a word, or finish one
+                return
+            try:
+                if not trouble.done():
+                    advance(*news)
+            except BaseException as error:
+                trouble.set_exception(error)
+
+    listener = threading.Thread(target=listen, daemon=True)
+    listener.start()
+    try:
+        yield mouth, context.Lock(), trouble
+    finally:
+        mouth.close()
+        listener.join()
+        ear.close()
 
 
 @contextmanager
 def _interrupts_held() -> Iterator[None]:
-    """Let Ctrl-C wait for a moment, where the system can."""
+    """Let whoever is started now never hear of Ctrl-C, where the system can: what this thread holds back, he does."""
     if not hasattr(signal, "pthread_sigmask"):
         yield
         return
@@ -230,20 +266,21 @@ def _interrupts_held() -> Iterator[None]:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
-def _pass_on(told: Any, advance: Advance) -> None:
-    """Show what other processes tell of their progress, until there is no more."""
-    while (news := told.get()) is not None:
-        advance(*news)
+_tell: Callable[[Any], None]
+"""In a process that plays for another one: how its progress is told."""
 
 
-_told: Any = None  # in a process that plays for another one: where its progress is told
+def _begin_work(mouth: Connection, turn: Any) -> None:
+    """Get ready in a process that plays for another one, beside others like it; Ctrl-C is for that one."""
+    global _tell
 
+    def tell(news: Any) -> None:
+        with turn:
+            mouth.send(news)
 
-def _begin_work(told: Any) -> None:
-    """Get ready in a process that plays for another one; Ctrl-C is for that one."""
-    global _told
-    _told = told
+    _tell = tell
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    use_threads(1)
 
 
 def _work(job: _Job) -> Played:
@@ -254,7 +291,7 @@ def _work(job: _Job) -> Played:
         done, most = news[2:]
         if done in (1, most) or perf_counter() - last[0] > TOLD_EVERY:
             last[0] = perf_counter()
-            _told.put(news)
+            _tell(news)
 
     known = known_players(job.seed)
     policies = {p.name: load_player(p.spec, job.task, known, job.trust_pickle) for p in job.players}

@@ -21,7 +21,7 @@ from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
 
-from agents.compare import field_of, known_players, split
+from agents.compare import blaming, field_of, known_players, split
 from agents.experiment import load_experiment, one_line_errors
 from agents.reynolds import PLAYERS as OTHERS
 from flockenv.evaluation import Episodes, Interval, bootstrap, compare, rollout, worlds_for
@@ -41,7 +41,8 @@ WORLDS = 256
 class Among:
     """Worlds as one agent of each meets them, (B, 1, O): all others play `others`.
 
-    In world k it is learner k % L, so that every seat counts alike. For it a world is over when it is out.
+    In world k it is learner k % L, so that every seat counts alike where L divides B, and nearly elsewhere. For it a
+    world is over when it is out.
     """
 
     def __init__(self, task: Task, worlds: int, time_limit: int, others: Policy) -> None:
@@ -60,6 +61,8 @@ class Among:
         """Let everybody act, the one by `actions` (B, 1, A); return what it sees and is paid."""
         rows = self._seen[~self._mine]
         theirs, self._state = self._others.predict(rows, self._state, np.full(len(rows), self._begins), True)
+        if np.shape(theirs) != (len(rows), actions.shape[-1]):
+            raise ValueError(f"others' actions have shape {np.shape(theirs)}, must be {(len(rows), actions.shape[-1])}")
         everybody = np.empty((*self._mine.shape, actions.shape[-1]))
         everybody[self._mine], everybody[~self._mine] = actions[:, 0], theirs
         step, self._begins = self._world.step(everybody), False
@@ -108,6 +111,8 @@ class Payoffs:
             return f"{said}: either is best among its own kind"
         if into.low > 0 and back.low > 0:
             return f"{said}: either does better among the other kind"
+        if into.low > 0 and back.high < 0:
+            return f"{said}: {a} is the better answer to both"
         return f"{said}: not decided in these worlds"
 
 
@@ -132,7 +137,7 @@ def invade(
         advance: called after each rollout.
 
     Raises:
-        ValueError: one line: nobody to be among.
+        ValueError: one line: nobody to be among, or a player that fails.
     """
     if task.learners < 2:
         raise ValueError(f"task {task.name!r}: one learner alone in each world, with nobody to play otherwise than")
@@ -143,7 +148,8 @@ def invade(
             def make(task: Task, worlds: int, limit: int, theirs: Callable[[Task], Policy] = theirs) -> Among:
                 return Among(task, worlds, limit, theirs(task))
 
-            of[one, others] = rollout(task, mine(task), worlds, first, make_world=make)
+            with blaming(f"{one} among {others}", task):
+                of[one, others] = rollout(task, mine(task), worlds, first, make_world=make)
             advance()
     return Payoffs(task.name, tuple(players), of)
 
@@ -164,12 +170,15 @@ def main(
     ] = None,
     worlds: Annotated[int, typer.Option(min=2, help="evaluation worlds")] = WORLDS,
     seed: Annotated[int, typer.Option(min=0, max=999, help="which of them")] = 0,
+    trust_pickle: Annotated[
+        bool, typer.Option("--trust-pickle", help="load Stable-Baselines3 zips too: executes the code in them")
+    ] = False,
 ) -> None:
     """Say who gains by playing otherwise than all others of a world."""
     with one_line_errors():
         tasks = [load_experiment(config).build() for config in configs]
         known = known_players(seed)
-        fields = [_makers(task, split(players), known) for task in tasks]
+        fields = [_makers(task, split(players), known, trust_pickle) for task in tasks]
         out = Console(highlight=False)
         if not out.is_terminal:
             out = Console(highlight=False, width=200)  # a pipe has no width
@@ -184,14 +193,23 @@ def main(
 
 
 def _makers(
-    task: Task, asked: Sequence[str], known: Mapping[str, Callable[[Task], Policy]]
+    task: Task, asked: Sequence[str], known: Mapping[str, Callable[[Task], Policy]], trust_pickle: bool
 ) -> dict[str, Callable[[Task], Policy]]:
     """Return how each player of a task is made, by name; whoever cannot be had is refused before anything is played."""
     specs = asked or [*(name for name, of in OTHERS.items() if task.name in of), "reynolds", "ppo"]
     field = {player.name: player.spec for player in field_of(specs)}
-    for spec in field.values():
-        load_player(spec, task, known)
-    return {name: lambda task, spec=spec: load_player(spec, task, known) for name, spec in field.items()}  # type: ignore[misc]
+
+    def maker(name: str, spec: str) -> Callable[[Task], Policy]:
+        def make(task: Task) -> Policy:
+            with blaming(name, task, ValueError):  # those of load_player name the player themselves
+                return load_player(spec, task, known, trust_pickle)
+
+        return make
+
+    makers = {name: maker(name, spec) for name, spec in field.items()}
+    for make in makers.values():
+        make(task)
+    return makers
 
 
 if __name__ == "__main__":

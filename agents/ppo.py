@@ -28,7 +28,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import VecEnvWrapper
 
 from agents.experiment import WEIGHTS, Experiment, PpoSettings, load_experiment, one_line_errors
-from agents.reynolds import player
+from agents.reynolds import as_dict, player
 from agents.teach import teach
 from flockenv.crew import threads, use_threads
 from flockenv.evaluation import rollout, worlds_for
@@ -88,6 +88,8 @@ class OtherRecipe(ValueError):  # noqa: N818  # whoever begins anew then has see
 def recipe_of(experiment: Experiment) -> dict[str, Any]:
     """Return all that training depends on: with another value anywhere it is another training."""
     told = experiment.model_dump(mode="json", include={"task", "arguments", "ppo"})
+    if experiment.ppo.taught:
+        told["rules"] = as_dict(player(experiment.build()).rules)  # who taught it
     return {**told, "layout": experiment.build().layout.digest}
 
 
@@ -97,7 +99,7 @@ class Run:
 
     recipe: dict[str, Any]
     steps: int = 0
-    wall: float = 0.0  # s
+    wall: float = 0.0  # s, with what teaching took
     curve: list[dict[str, float]] = field(default_factory=list)
     best: float = -np.inf
     tensors: dict[str, np.ndarray] = field(default_factory=dict)
@@ -251,13 +253,15 @@ def _numbers(block: dict[str, Any], path: KeyPath = ()) -> Iterator[tuple[str, A
             yield key_path((*path, key)), value
 
 
-def _teach(model: PPO, task: Task, p: PpoSettings) -> None:
-    """Let the network first learn what the tuned rules answer, if it is to."""
+def _teach(model: PPO, task: Task, p: PpoSettings) -> float:
+    """Let the network first learn what the tuned rules answer, if it is to; return the seconds that took."""
     if p.taught == 0:
-        return
+        return 0.0
+    began = time.perf_counter()
     with on_threads(p.threads), Progress(console=console, transient=True) as progress:
         bar = progress.add_task(f"{task.name}: is taught", total=p.taught)
         teach(model, task, player(task), p.taught, advance=lambda n: progress.advance(bar, n))
+    return time.perf_counter() - began
 
 
 def resume(folder: Path, model: PPO, run: Run) -> None:
@@ -277,13 +281,13 @@ def train(experiment: Experiment, folder: Path, go_on: bool = False, tensorboard
     run = checkpointed(experiment, folder) if go_on else None
     if run is not None and run.steps >= p.steps:
         return run
+    if run is None:
+        (folder / "run.json").unlink(missing_ok=True)  # what is there is overwritten file by file
     model = build(task, p, tensorboard)
     if run is not None:
         resume(folder, model, run)
     else:
-        run = Run(recipe_of(experiment))
-        _teach(model, task, p)
-        (folder / "run.json").unlink(missing_ok=True)  # what is there is overwritten file by file
+        run = Run(recipe_of(experiment), wall=_teach(model, task, p))
     columns = (
         TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TimeRemainingColumn(),
         TextColumn("{task.fields[score]}"),
@@ -303,7 +307,7 @@ def export(run: Run, path: Path) -> None:
     """Write the best policy with its recipe: everything that is needed to make it again."""
     recipe = run.recipe
     card = {
-        **{key: recipe[key] for key in ("task", "arguments", "layout")},
+        **{key: recipe[key] for key in ("task", "arguments", "layout", "rules") if key in recipe},
         "activation": recipe["ppo"]["activation"],
         "algorithm": "PPO (stable-baselines3)",
         "recipe": {"command": f"python -m agents.ppo configs/{recipe['task']}.yaml", "ppo": recipe["ppo"]},
@@ -340,7 +344,9 @@ def main(
     try:
         run = train(experiment, runs / task.name, go_on, tensorboard)
     except KeyboardInterrupt:
-        console.print(f"interrupted; checkpoint in {runs / task.name}, go on with --resume")
+        kept = (runs / task.name / "run.json").exists()
+        news = f"checkpoint in {runs / task.name}, go on with --resume" if kept else "before there was anything to keep"
+        console.print(f"interrupted; {news}")
         raise typer.Exit(130) from None
     export(run, target)
     best = f"mean return {run.best:.3f} on the tuning worlds"

@@ -6,6 +6,7 @@ run, all miss the same ones at the same time.
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +22,15 @@ class OneAtATime:
     """A function's cache on the disk, of which one process at a time may have missed an entry."""
 
     def __init__(self, cache: Any, lock: Path, patience: float = PATIENCE) -> None:
-        self._cache, self._lock = cache, FileLock(lock, timeout=patience)
+        self._cache, self._path, self._patience = cache, lock, patience
+        self._process, self._made = os.getpid(), FileLock(lock, timeout=patience)
+
+    @property
+    def _lock(self) -> FileLock:
+        """The lock as this process has it: one that a fork has inherited is nobody's."""
+        if self._process != os.getpid():
+            self._process, self._made = os.getpid(), FileLock(self._path, timeout=self._patience)
+        return self._made
 
     def load_overload(self, signature: Any, context: Any) -> Any:
         """Return what is on the disk, if need be as soon as another process has written it; None: it is up to you."""

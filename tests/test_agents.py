@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -15,7 +16,7 @@ from agents import tune
 from agents.experiment import AS_CONFIGURED, CONFIGS, WEIGHTS, Experiment, PpoSettings, load_experiment
 from agents.imitate import imitate
 from agents.ppo import ForLearning
-from agents.reynolds import RULES, player, tuned
+from agents.reynolds import RULES, as_dict, player, tuned
 from agents.teach import shown
 from flockenv.crew import threads
 from flockenv.evaluation import compare, rollout, worlds_for
@@ -366,14 +367,52 @@ def test_a_taught_actor_waits_for_its_critic(tmp_path: Path) -> None:
         return {name: tensor.numpy() for name, tensor in state.items()}
 
     waits, faster, learns = weights(critic_first=1024), weights(critic_first=1024, learning_rate=0.01), weights()
-    untaught = weights(critic_first=1024, taught=0)
+    untaught, thaws = weights(critic_first=1024, taught=0), weights(critic_first=512)
     actor = [name for name in waits if "policy_net" in name or "action_net" in name or name == "log_std"]
     assert len(actor) == 7
     for name in actor:
         np.testing.assert_array_equal(waits[name], faster[name])
         assert not np.array_equal(waits[name], learns[name])
+        assert not np.array_equal(waits[name], thaws[name]) and not np.array_equal(learns[name], thaws[name])
     assert not np.array_equal(waits["value_net.weight"], faster["value_net.weight"])
     assert not np.array_equal(waits["action_net.weight"], untaught["action_net.weight"])
+
+
+def test_a_run_that_is_taught_remembers_its_teacher_and_its_time(tmp_path: Path) -> None:
+    from agents import ppo
+
+    taught = Experiment(task="pursuit", ppo=PpoSettings(**TINY, steps=1024, taught=5, critic_first=1024))
+    _interrupt(taught, tmp_path)  # when it had been taught
+    begun = ppo.checkpointed(taught, tmp_path)
+    assert begun is not None and begun.recipe["rules"] == as_dict(player(taught.build()).rules)
+    assert "rules" not in ppo.recipe_of(PURSUIT)
+    kept = ppo.torch.load(tmp_path / "policy.pt", weights_only=True)
+    ppo.train(taught, tmp_path, go_on=True)  # not taught again, and still the critic's turn
+    found = ppo.torch.load(tmp_path / "policy.pt", weights_only=True)
+    for name in ("action_net.weight", "mlp_extractor.policy_net.0.weight", "log_std"):
+        np.testing.assert_array_equal(found[name], kept[name])
+    assert not np.array_equal(found["value_net.weight"], kept["value_net.weight"])
+    moments = iter((0.0, 100.0, *np.linspace(100.0, 101.0, 500)))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(ppo, "time", SimpleNamespace(perf_counter=lambda: next(moments)))
+        assert ppo.train(taught, tmp_path / "timed").curve[0]["seconds"] >= 100
+
+
+def test_ctrl_c_while_it_is_taught_leaves_no_checkpoint_of_another_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from agents import ppo
+
+    def interrupted(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    (tmp_path / "p.yaml").write_text(f"task: pursuit\nppo: {json.dumps(TINY | {'taught': 5})}\n", encoding="utf-8")
+    (tmp_path / "runs" / "pursuit").mkdir(parents=True)
+    (tmp_path / "runs" / "pursuit" / "run.json").write_text("{}", encoding="utf-8")
+    monkeypatch.setattr(ppo, "teach", interrupted)
+    result = CliRunner().invoke(ppo.app, [str(tmp_path / "p.yaml"), "--runs", str(tmp_path / "runs")])
+    assert result.exit_code == 130 and "before there was anything to keep" in result.stderr
+    assert not (tmp_path / "runs" / "pursuit" / "run.json").exists()
 
 
 def test_rows_are_shown_until_an_episode_is_over() -> None:

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import json
+import multiprocessing
 import os
 import re
 import signal
 import subprocess
 import sys
+import threading
 import time
 from io import StringIO
 from pathlib import Path
@@ -168,6 +170,36 @@ def test_side_by_side_a_player_that_fails_is_named(side_by_side: None) -> None:
     Path("odd.py").write_text("def predict(observation):\n    raise RuntimeError('no idea')\n")
     line = run("--tasks", "pursuit,obstacles", "--players", "odd.py", "--worlds", "2", code=2).stderr
     assert "player 'odd', task 'pursuit': RuntimeError: no idea" in line and not Path("results").exists()
+
+
+def test_side_by_side_the_first_failure_ends_all_that_was_to_come(
+    side_by_side: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """More jobs than a pool hands out at once; none of its threads may die of what it then finds."""
+    died: list[Any] = []
+    monkeypatch.setattr(threading, "excepthook", died.append)
+    Path("odd.py").write_text("def predict(observation):\n    raise RuntimeError('no idea')\n")
+    names = ",".join(TASKS)
+    line = run("--tasks", names, "--players", "odd.py", "--worlds", "2", code=2).stderr
+    assert line.strip().endswith("RuntimeError: no idea") and not died
+    assert not multiprocessing.active_children()
+
+
+def test_side_by_side_an_error_in_what_shows_progress_is_raised(
+    side_by_side: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    died: list[Any] = []
+    monkeypatch.setattr(threading, "excepthook", died.append)
+    tasks, told = [task() for task in TASKS.values()], []
+
+    def advance(*news: Any) -> None:
+        told.append(news)
+        raise RuntimeError("enough")
+
+    with pytest.raises(RuntimeError, match="enough"):
+        comparison.compare(tasks, comparison.field_of(["random"]), 2, resamples=100, advance=advance)
+    assert len(told) == 1 and not died
+    assert not multiprocessing.active_children()
 
 
 def test_a_process_that_ends_by_itself_is_told_and_nothing_hangs(side_by_side: None) -> None:
@@ -471,6 +503,7 @@ def test_the_task_is_the_one_that_its_config_describes(elsewhere: Path, monkeypa
 
 NO_TORCH = """
 import sys
+import threading
 
 class Refuse:  # not sys.modules["torch"] = None, which scipy takes for a torch
     def find_spec(self, name, path=None, target=None):

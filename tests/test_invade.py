@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -95,6 +96,7 @@ def made_up(aa: float, ab: float, ba: float, bb: float, noise: float = 0.1) -> i
         (made_up(1, 2, 4, 5), "b is the better answer to both"),
         (made_up(3, 0, 0, 5), "either is best among its own kind"),
         (made_up(1, 5, 5, 3), "either does better among the other kind"),
+        (made_up(1, 5, -3, 1), "a is the better answer to both"),
         (made_up(1, 1, 1, 1), "not decided in these worlds"),
     ],
 )
@@ -117,6 +119,25 @@ def test_what_cannot_be_played_is_refused_in_one_line(arguments: list[str], mess
     result = CliRunner().invoke(invasion.app, [*arguments, "--worlds", "2"])
     assert result.exit_code == 2
     assert message in result.stderr and len(result.stderr.strip().splitlines()) == 1
+
+
+@pytest.mark.parametrize(
+    ("code", "message"),
+    [
+        (
+            "return np.zeros((len(observation), 2 + (len(observation) > 2))), None",
+            "mine among mine', task 'school': ValueError: others' actions have shape (14, 3), must be (14, 2)",
+        ),
+        ("return observation[:, 10_000], None", "IndexError: "),
+    ],
+)
+def test_somebody_who_fails_among_others_is_named(tmp_path: Path, code: str, message: str) -> None:
+    lines = ("import numpy as np", "def predict(observation, state=None, episode_start=None, deterministic=True):")
+    (tmp_path / "mine.py").write_text("\n".join((*lines, f"    {code}", "")), encoding="utf-8")
+    arguments = ["configs/school.yaml", "--players", str(tmp_path / "mine.py"), "--worlds", "2"]
+    result = CliRunner().invoke(invasion.app, arguments)
+    assert result.exit_code == 2, result.output
+    assert message in result.stderr and "mine" in result.stderr and len(result.stderr.strip().splitlines()) == 1
 
 
 def test_it_prints_a_table_and_a_sentence_for_each_pair() -> None:

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from filelock import FileLock, Timeout
 
 from flockenv.turns import OneAtATime
 
@@ -89,6 +90,31 @@ def test_what_is_there_is_read_without_waiting(tmp_path: Path) -> None:
     second.save_overload("f8", "code")
     assert first.load_overload("f4", None) is None
     assert second.load_overload("f8", None) == "code"
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="nobody forks here")
+@pytest.mark.parametrize("busy", [False, True], ids=["idle", "compiling"])
+def test_a_forked_process_has_a_lock_of_its_own(tmp_path: Path, busy: bool) -> None:
+    """As gymnasium's AsyncVectorEnv forks, with what its parent has begun to use."""
+    first, _ = two(tmp_path, patience=0.2)
+    if busy:
+        assert first.load_overload("f8", None) is None
+    child = os.fork()
+    if child == 0:
+        code = 1
+        try:
+            assert first.load_overload("f8", None) is None
+            first.save_overload("f8", "code")
+            code = 0
+        finally:
+            os._exit(code)
+    assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0
+    if not busy:
+        assert first.load_overload("f8", None) is None
+    with pytest.raises(Timeout):
+        FileLock(tmp_path / "a.lock", timeout=0).acquire()  # the child's end has freed nothing of its parent's
+    first.save_overload("f8", "code")
+    FileLock(tmp_path / "a.lock", timeout=0).acquire()
 
 
 @pytest.mark.slow
