@@ -42,7 +42,7 @@ def refusals(error: ValidationError, model: type[BaseModel], data: object) -> li
     One mistake may be several errors to pydantic: one for each member of a union, one for the key that is missing
     because it is misspelt, one for a list that is too short without its bad items. The clearest speaks for all.
     """
-    schema = model.model_json_schema()
+    schema = _schema_of(model)
     found: dict[KeyPath, ErrorDetails] = {}
     for detail in error.errors(include_url=False)[:MOST]:
         found.setdefault(_path_in(data, detail), detail)
@@ -54,6 +54,18 @@ def refusals(error: ValidationError, model: type[BaseModel], data: object) -> li
         for path, detail in found.items()
         if path not in echoes.get(detail["type"], ())
     ]
+
+
+_schemas: dict[type[BaseModel], tuple[object, Schema]] = {}
+
+
+def _schema_of(model: type[BaseModel]) -> Schema:
+    """Return a model's JSON schema, made once, and anew when a kind was added to one of its unions."""
+    core = model.__pydantic_core_schema__
+    made = _schemas.get(model)
+    if made is None or made[0] is not core:
+        made = _schemas[model] = (core, model.model_json_schema())
+    return made[1]
 
 
 def _meant(path: KeyPath, schema: Schema, data: object) -> KeyPath:

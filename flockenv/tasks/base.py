@@ -77,6 +77,8 @@ class Task(Record):
     metric_names: ClassVar[tuple[str, ...]]
     measures: ClassVar[tuple[str, ...]]
     """Names of the numbers that `measure` writes each step."""
+    counts: ClassVar[tuple[str, ...]] = ()
+    """Parameters to which loops of its kernels count, written into the source: faster, and another value is another one."""
     memory: ClassVar[int] = 0
     """Numbers kept per agent between steps."""
     keeps: ClassVar[bool] = False
@@ -202,7 +204,10 @@ def task_source(task: Task) -> str:
     """Return the source of a task's kernel: its scene's, and one entry point, `play`."""
     d = task.scene.dimension
     names = list(task.parameters())
-    values = ", ".join(f"numbers[{k}]" for k in range(len(names)))
+    values = ", ".join(
+        f"np.{task.scene.dtype}({value!r})" if name in task.counts else f"numbers[{k}]"
+        for k, (name, value) in enumerate(task.parameters().items())
+    )
     frame = (
         "Frame({x}, {v}, {alive}, obstacle_x[:, b], obstacle_radius[b], memory[:, b], key[b], steps[b], "
         "radius, max_speed, max_force, {near}, table)"

@@ -306,6 +306,7 @@ class Flock(Task):
     terms: ClassVar[tuple[str, ...]] = ("progress", "alignment", "spacing", "together", "touch", "obstacle")
     metric_names: ClassVar[tuple[str, ...]] = ("polarisation", "nearest_neighbour", "collisions", "speed_along")
     measures: ClassVar[tuple[str, ...]] = ("polarisation", "nearest", "touches", "along")
+    counts: ClassVar[tuple[str, ...]] = ("neighbours", "obstacles_seen", "rays")
     memory: ClassVar[int] = 2
 
     agents: int = Field(default=24, ge=1, le=100_000, description="how many fly")
