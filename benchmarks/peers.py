@@ -1,4 +1,6 @@
-"""Other packages and flockenv, turn by turn at the same number of agents: `python -m benchmarks.peers`.
+"""Other packages and flockenv, turn by turn: `python -m benchmarks.peers`.
+
+Pairs have the same number of agents, but for those "against many worlds".
 
 Every package lives in a virtual environment of its own below ~/.cache/flockenv-peers, made when asked for
 (`--install vmas,mesa`, or `--install all`: about 5 GB), and is run by a script of benchmarks/peers_scripts in a process

@@ -151,6 +151,7 @@ def test_references_agree_with_each_other() -> None:
         assert other.error < 1e-10
 
 
+@pytest.mark.slow
 def test_scipy_sees_the_time_and_the_flow() -> None:
     for name in ("forced", "tracer"):
         known = one(name)
@@ -219,6 +220,7 @@ def test_energy_is_off_by_the_book() -> None:
         assert point.momentum is None  # a spring to a fixed point takes it
 
 
+@pytest.mark.slow
 def test_what_diverges_has_no_errors_and_spoils_nothing() -> None:
     """Steps of h w = 15, which the scene itself refuses, beside good ones."""
     problem = sprung(900.0, 20.0, (40, 20480))
@@ -501,6 +503,7 @@ def test_times_are_whole_parts_of_every_run() -> None:
     assert problems.INSTANTS == 16
 
 
+@pytest.mark.slow
 def test_methods_that_solve_equations_are_measured_when_asked_for() -> None:
     usual: tuple[Integrator, ...] = usual_methods()
     assert not any(method.solves for method in usual) and RK4() in usual

@@ -25,19 +25,27 @@ from flockenv.sb3 import WorldVecEnv
 from flockenv.tasks import TASKS, School
 
 ROOT = CONFIGS.parent
-TINY = {"worlds": 16, "rollout": 16, "minibatch": 64, "epochs": 1, "evaluate_every": 512, "evaluate_worlds": 4}
+TINY = {
+    "worlds": 16,
+    "rollout": 16,
+    "minibatch": 64,
+    "epochs": 1,
+    "evaluate_every": 512,
+    "evaluate_worlds": 4,
+    "dtype": "float64",
+}
 
 
 @pytest.mark.parametrize("name", sorted(TASKS))
 def test_both_hand_written_players_are_far_above_random(name: str) -> None:
     task = load_experiment(CONFIGS / f"{name}.yaml").build()
-    first = worlds_for("tuning", 7, 24)
-    random = rollout(task, RandomPolicy(task.action_layout.size, 0), 24, first)
+    first = worlds_for("tuning", 7, 12)
+    random = rollout(task, RandomPolicy(task.action_layout.size, 0), 12, first)
     for textbook, margin in (
         (True, 1 if name == "crowd_nav" else 3),
         (False, 10),
     ):  # the text goes too fast for a narrow track, and into a crowd that does not see it; whoever tunes it does not
-        rules = rollout(task, player(task, textbook=textbook), 24, first)
+        rules = rollout(task, player(task, textbook=textbook), 12, first)
         assert compare(rules, random).difference.low > margin
 
 

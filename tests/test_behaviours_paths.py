@@ -249,6 +249,7 @@ def on_torus(path: Any) -> Scene:
     )  # fmt: skip
 
 
+@pytest.mark.slow
 def test_on_a_torus_a_path_may_go_round_it() -> None:
     path = FollowPath(weight=5, points=((2, 11.5), (9, 11.5), (16, 11.5)), closed=True, radius=0.3, speed=2, time=0.5)
     scene = on_torus(path)
@@ -271,6 +272,7 @@ def kept(path: StayOnPath, count: int = 1, space: Space | None = None, **fields:
     return Scene(space=space or Plane(), groups=groups, effects=(path,), dt=0.02, **fields)
 
 
+@pytest.mark.slow
 def test_it_stays_in_the_tube_whichever_way() -> None:
     """Twenty from the spine in all directions; the closed form of a wish; nothing if the predicted place is inside."""
     path = StayOnPath(weight=6, points=((-100, 3), (100, 3)), radius=1, speed=2, time=0.5)
@@ -309,6 +311,7 @@ def flown(flow: FollowFlow, **fields: Any) -> Scene:
     return Scene(groups=groups, effects=(flow,), **({"dt": 0.002} | fields))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("time", [0.0, 0.5])
 def test_a_linear_field_is_followed_as_the_exact_solution_says(time: float) -> None:
     """m x'' = w (A (x + T v - c) - v), solved by a matrix exponential."""

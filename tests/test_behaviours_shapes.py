@@ -152,6 +152,7 @@ def test_whoever_is_inside_is_led_straight_out() -> None:
         assert wish(FIELD, obstacles=(shape,))[1] < 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("effect", UNDER[:4])
 def test_it_is_finite_in_the_middle_at_rest_and_head_on(effect: Any) -> None:
     for shape in (*SOLIDS.values(), WALL, L):
@@ -284,7 +285,12 @@ def test_head_on_it_brakes_and_keeps_right() -> None:
 
 
 @pytest.mark.parametrize(
-    "within", [ROOM, Circle(centre=(4, 4), radius=3.5), Block(centre=(4, 4), size=(7, 6), turn=30)]
+    "within",
+    [
+        ROOM,
+        pytest.param(Circle(centre=(4, 4), radius=3.5), marks=pytest.mark.slow),
+        pytest.param(Block(centre=(4, 4), size=(7, 6), turn=30), marks=pytest.mark.slow),
+    ],
 )
 def test_nobody_leaves(within: Shape) -> None:
     made = contained(within, (4, 3), (2, 0), count=60)
@@ -369,6 +375,7 @@ def test_in_a_u_local_steering_is_caught_and_the_global_way_leads_around() -> No
     assert clear > 0.2
 
 
+@pytest.mark.slow
 def test_it_stops_at_its_target_and_beyond_the_grid_goes_straight() -> None:
     way = FollowWay(weight=4, target=(3, 0), margin=1)
     group = Group(count=1, radius=0.1, max_speed=2, spawn=Spawn(low=(0, 0), high=(0, 0)))
@@ -412,6 +419,7 @@ def test_a_way_that_cannot_be_is_refused(change: Any, text: str) -> None:
 # --- who is hidden ----------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["circle", "block", "wall"])
 def test_nobody_is_drawn_to_whom_an_obstacle_hides(kind: str) -> None:
     """formulas.md: forces are not applied if there are obstacles in the way."""

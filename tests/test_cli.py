@@ -210,6 +210,7 @@ def test_an_interrupted_run_keeps_what_was_done_and_leaves_with_130(tmp_path: Pa
     assert sorted(p.name for p in tmp_path.iterdir()) == ["t.json", "t.npz", "tiny.yaml"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("moment", ["simulating", "drawing"])
 def test_an_interrupted_picture_is_not_written(moment: str, tmp_path: Path) -> None:
     done = interrupted(moment, "render", "tiny.yaml", "--duration", "10", "--out", "t.gif")
@@ -255,6 +256,7 @@ def test_a_task_under_a_player_of_ones_own() -> None:
 # --- explain ----------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_explain_says_what_is_called_for_and_what_was_left_out(capsys: pytest.CaptureFixture[str]) -> None:
     Path("flock.yaml").write_text(FLOCK)
     assert main(["explain", "flock.yaml"]) == 0

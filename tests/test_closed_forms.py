@@ -177,6 +177,7 @@ def test_a_vortex_does_work_in_every_turn_and_the_others_none(field: Any, turn: 
     assert work == pytest.approx(turn * 2 * np.pi * r * PHI / (PHI / MOST + r**2), abs=1e-12)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dimension", [2, 3])
 def test_forces_are_the_slopes_of_the_potentials_that_effects_state(dimension: int) -> None:
     """All that have one, together: F . dx = -dU for any small way; a medium, a vortex and what swings state none."""
@@ -262,6 +263,7 @@ def tracer(method: Integrator, dt: float, **fields: Any) -> Scene:
     return body((Vortex(strength=PHI, **vortex), Carried()), method, dt, dimension=dimension)
 
 
+@pytest.mark.slow
 def test_a_tracer_goes_around_a_vortex_in_the_time_of_the_formula() -> None:
     """numerics.md, N16: RK4, ten turns of 200 steps, |dr / r| <= 1e-6; a turn takes 6.936637 s."""
     assert pytest.approx(6.936637, abs=5e-7) == TURN

@@ -171,6 +171,7 @@ def test_on_an_incline_it_sticks_up_to_the_angle_of_friction(response: str) -> N
             assert abs(moved / (pull / 2) - 1) < (1e-9 if response in IN_TIME else 0.0101)  # half a step of Euler's
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("response", EXACT)
 @pytest.mark.parametrize("method", [VelocityVerlet(), RK4()], ids=lambda m: m.kind)
 def test_what_rests_creeps_under_no_method(response: str, method: Integrator) -> None:
@@ -218,8 +219,8 @@ AIMED = [(phase / 16, math.radians(-40 + 80 * k / 7)) for phase in range(16) for
         (Wall(vertices=((0.0, -100.0), (0.0, 100.0)), velocity=(-30.0, 0.0)), 0.0, (-9.0, 0.0)),
         (Block(centre=(0.05, 0.0), size=(0.1, 200.0)), 0.0, (-2.0, 0.0)),
         (Wall(vertices=((0.0, -50.0), (0.0, 0.0), (-50.0, 0.0))), 45.0, (-0.2, -0.2)),
-        (Polygon(vertices=((-50.0, 0.0), (0.0, 0.0), (0.0, -50.0), (1.0, -50.0), (1.0, 1.0), (-50.0, 1.0))), 45.0,
-         (-0.2, -0.2)),
+        pytest.param(Polygon(vertices=((-50.0, 0.0), (0.0, 0.0), (0.0, -50.0), (1.0, -50.0), (1.0, 1.0), (-50.0, 1.0))),
+                     45.0, (-0.2, -0.2), marks=pytest.mark.slow),
     ],
     ids=["wall", "moving wall", "block", "corner of walls", "corner of a polygon"],
 )  # fmt: skip
@@ -330,6 +331,7 @@ def test_it_is_the_same_far_away(response: str, offset: float) -> None:
     assert near.run(a, steps).counted("impacts") > 10
 
 
+@pytest.mark.slow
 def test_worlds_and_threads_do_not_know_of_each_other() -> None:
     of, state = gas("earliest", 0.8, obstacles=walls())
     batch = of.start(0, worlds=120)

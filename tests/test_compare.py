@@ -185,6 +185,7 @@ def test_side_by_side_the_first_failure_ends_all_that_was_to_come(
     assert not multiprocessing.active_children()
 
 
+@pytest.mark.slow
 def test_side_by_side_an_error_in_what_shows_progress_is_raised(
     side_by_side: None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -202,6 +203,7 @@ def test_side_by_side_an_error_in_what_shows_progress_is_raised(
     assert not multiprocessing.active_children()
 
 
+@pytest.mark.slow
 def test_a_process_that_ends_by_itself_is_told_and_nothing_hangs(side_by_side: None) -> None:
     Path("gone.py").write_text("import os\n\ndef predict(observation):\n    os._exit(3)\n")
     line = run("--tasks", "pursuit,obstacles", "--players", "gone.py", "--worlds", "2", code=2).stderr

@@ -362,6 +362,7 @@ class Well(Effect):
 """
 
 
+@pytest.mark.slow
 def test_where_nobody_lives_a_law_may_be_infinite(tmp_path: Path) -> None:
     """Lanes beyond the last agent lie in the origin, and so does somebody dead: neither is anybody's NaN."""
     with users_module(tmp_path, WELL, "wells") as laws:

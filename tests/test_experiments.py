@@ -89,6 +89,7 @@ variants:
 """
 
 
+@pytest.mark.slow
 def test_the_command_writes_table_numbers_and_picture(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     plan = tmp_path / "small.yaml"
     plan.write_text(SMALL)

@@ -43,6 +43,7 @@ def scene_of(*effects: Effect, count: int = 1, dimension: int = 2, mass: float =
 # --- in time ----------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_field_may_swing_in_time() -> None:
     """m v' = F cos(w t + phase): v and x are its integrals; stages of a method ask at their own instants."""
     scene = scene_of(Uniform(strength=(3, -1), period=0.7, phase=0.4), mass=1.5)
@@ -55,6 +56,7 @@ def test_a_field_may_swing_in_time() -> None:
     np.testing.assert_allclose((end.pos - start.pos)[0, 0], a * way, atol=1e-8)
 
 
+@pytest.mark.slow
 def test_gusts_rise_and_fall_within_a_period() -> None:
     """x of a tracer is the integral of U + G (1 - cos w t) / 2."""
     scene = scene_of(Wind(velocity=(2, 0), gust=(1, 3), period=0.8), Carried())
@@ -75,6 +77,7 @@ def test_what_is_steady_knows_no_time() -> None:
 # --- media ------------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_to_be_dragged_and_to_be_carried_are_two_models() -> None:
     """Dragged from rest v = u (1 - exp(-c t / m)), and x lags behind u t by u m / c; carried x = u t, and v stays 0."""
     medium, u = Uniform(strength=(2, 1), acts="medium"), np.array([2, 1])
@@ -90,12 +93,14 @@ def test_to_be_dragged_and_to_be_carried_are_two_models() -> None:
     np.testing.assert_allclose(ends[2], (u * 0, u * 0.75), rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_media_are_summed() -> None:
     scene = scene_of(Uniform(strength=(2, 1), acts="medium"), Wind(velocity=(-1.5, 3)), Carried())
     start = scene.start(0)
     np.testing.assert_allclose((scene.run(start, 100).pos - start.pos)[0, 0], (0.5, 4), rtol=1e-12)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dimension", [2, 3])
 def test_on_a_torus_the_nearest_image_of_a_centre_acts(dimension: int) -> None:
     """As in a plane with the centre there, whichever way around is shorter."""
@@ -157,6 +162,7 @@ def test_with_drag_fluctuations_come_to_an_equilibrium() -> None:
         assert (late.vel**4).mean() / late.vel.var() ** 2 == pytest.approx(3, rel=0.1)  # normal
 
 
+@pytest.mark.slow
 def test_a_kick_is_a_function_of_seed_world_step_and_agent() -> None:
     scene = scene_of(Fluctuation(strength=1), Drag(rate=0), count=200)
     start = scene.start(4, worlds=3)

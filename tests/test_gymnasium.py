@@ -225,6 +225,7 @@ def test_a_thousand_steps_replay_bit_for_bit(env_id):
     assert digest(env_id) == digest(env_id)
 
 
+@pytest.mark.slow
 def test_a_thousand_steps_replay_in_another_process():
     # Another hash seed and a fresh interpreter: nothing may depend on either.
     code = (
@@ -310,6 +311,7 @@ def test_envs_in_threads_do_not_disturb_each_other():
     assert logs == alone
 
 
+@pytest.mark.slow
 def test_spawned_workers_play_the_same_worlds():
     env_id, options = "flockenv:flockenv/Pursuit-v0", {"num_envs": 2, "max_episode_steps": 15}
     far = gymnasium.make_vec(env_id, vectorization_mode="async", vector_kwargs={"context": "spawn"}, **options)

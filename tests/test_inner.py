@@ -112,6 +112,7 @@ def test_an_antipode_is_kept_from_the_start_and_reached() -> None:
     np.testing.assert_array_equal(scene.inner(end, "goal_x"), 4 - start.pos[..., 0])
 
 
+@pytest.mark.slow
 def test_driving_relaxes_to_the_desired_speed_of_each() -> None:
     group = WALKERS.model_copy(update={"desired_speed": Spread(mean=1.34, sd=0.26, low=0.5)})
     scene = Scene(groups=(group, WALKERS), effects=(Course(group=0, direction=(3, 4)), Driving(tau=0.5)), dt=1e-3)

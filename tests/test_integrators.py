@@ -176,6 +176,7 @@ def test_a_constant_force_leads_along_a_parabola(row: IntegratorRow) -> None:
     np.testing.assert_allclose(state.vel, V0 + g * 2, rtol=1e-13)
 
 
+@pytest.mark.slow
 def test_energy_after_a_hundred_periods_is_the_table_s(tether: Any) -> None:
     """100 steps per period (numerics.md 3.1): 1.29272e17 explicit, 0.9999915 RK4, within 3.3 % semi-implicit."""
     w = 2 * math.pi

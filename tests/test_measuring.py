@@ -124,6 +124,7 @@ def test_of_the_beginning_as_much_is_skipped_as_asked_for() -> None:
     assert values(numbers())["out"] == 30
 
 
+@pytest.mark.slow
 def test_many_seeds_have_intervals_and_are_held_against_chance(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["measure", "streams.yaml", "--time", "1", "--seeds", "5", "--seed", "3", "--json", "x.json"]) == 0
     said = capsys.readouterr().out
@@ -139,6 +140,7 @@ def test_many_seeds_have_intervals_and_are_held_against_chance(capsys: pytest.Ca
     assert mean["low"] < mean["mean"] < mean["high"]
 
 
+@pytest.mark.slow
 def test_the_same_seed_is_the_same_picture() -> None:
     for name in ("a", "b"):
         assert main(["measure", "streams.yaml", "--time", "1", "--out", name, *LINE]) == 0

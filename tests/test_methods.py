@@ -74,7 +74,9 @@ PROBLEMS: dict[str, tuple[dict[str, float], Callable[[float], tuple[float, float
 
 @WAYS
 @METHODS
-@pytest.mark.parametrize("problem", PROBLEMS)
+@pytest.mark.parametrize(
+    "problem", ["forced", *(pytest.param(name, marks=pytest.mark.slow) for name in ("pendulum", "projectile"))]
+)
 def test_the_order_is_the_declared_one_wherever_time_enters(
     problem: str, row: IntegratorRow, way: str, tether: Any
 ) -> None:
@@ -107,6 +109,7 @@ def test_heun_and_midpoint_differ_where_time_enters(tether: Any) -> None:
     np.testing.assert_allclose(ends[0], ends[1], rtol=1e-12)
 
 
+@pytest.mark.slow
 @METHODS
 def test_a_medium_carries_to_the_order_of_the_method(row: IntegratorRow) -> None:
     """x' = v + u with u = -x / 2 + 5 cos 2t and v at rest: what a flow adds is as good as what velocities do."""
@@ -321,6 +324,7 @@ def test_drag_beside_other_forces_keeps_the_order(way: str, tether: Any) -> None
     assert order(end, ExponentialDrag(), (x, v), seconds, 10) == pytest.approx(2, abs=0.2)
 
 
+@pytest.mark.slow
 def test_drag_is_shared_among_agents_by_their_mass(tether: Any) -> None:
     """kappa = c / m of everybody: two drags, 20 agents of two masses."""
     from flockenv.effects import Drag
@@ -479,6 +483,7 @@ def test_a_step_below_the_least_is_refused(kind: type[Integrator], tether: Any) 
             kind(**{name: value})
 
 
+@pytest.mark.slow
 @ADAPTIVE
 def test_single_precision_does_not_ask_for_more_than_it_has(kind: type[Integrator], tether: Any) -> None:
     """A tolerance below rounding: the steps are those of rounding, and nobody is given up."""

@@ -91,6 +91,7 @@ SHAPES: tuple[Any, ...] = (
 TIMES = (0.0, 1.7, 40.2)
 
 
+@pytest.mark.slow
 def test_a_law_meets_it_where_it_is_at_the_time_of_its_world_and_feels_how_fast_it_comes() -> None:
     """k d - c (v - u).n of every shape, displaced by v t + a sin(2 pi t / T + phase); on a torus its nearest image."""
     scene = Scene(
@@ -116,6 +117,7 @@ def test_a_law_meets_it_where_it_is_at_the_time_of_its_world_and_feels_how_fast_
     assert state.counted("obstacle_tests") == 3 * 94 * len(SHAPES), "what is out of reach is counted, too"
 
 
+@pytest.mark.slow
 def test_what_moves_between_two_hides_them_from_each_other_while_it_is_there() -> None:
     """A wall goes by at 1 m/s; from 1.5 to 2.5 s it stands between them."""
     wall = Block(centre=(-2, 0), size=(1, 0.2), velocity=(1, 0))

@@ -324,6 +324,7 @@ def test_exactly_at_the_radius_is_outside() -> None:
         np.testing.assert_allclose(found, [[push, 0], [-push, 0]])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("count", [50, 200])
 def test_everybody_in_one_place(count: int) -> None:
     """Two velocities, one place: everybody's neighbours are all the others."""

@@ -163,6 +163,7 @@ def test_a_hinge_whose_arms_have_no_length_says_nothing(dimension: int) -> None:
     np.testing.assert_array_equal(world.acceleration(state), 0)
 
 
+@pytest.mark.slow
 def test_a_hinge_finds_its_rest_angle_from_both_sides() -> None:
     """In the plane an angle has a sign: a corner that is pushed through straight comes back to its own side."""
     corner = Mesh(vertices=((1, 0), (0, 0), (0, 1)), pairs=((0, 1), (1, 2)), angles=((0, 1, 2),))
@@ -325,6 +326,7 @@ def test_threads_and_batches_make_no_difference(dimension: int) -> None:
     np.testing.assert_array_equal(world.run(world.run(start, 2), 3).x, found[0].x)
 
 
+@pytest.mark.slow
 def test_bonds_act_around_the_edge_of_a_torus() -> None:
     rope = Rope(links=4, start=(8.9, 5.0), length=0.4, stretch=1.2)
     plain = scene(rope, Springs(stiffness=50))
@@ -383,6 +385,7 @@ def test_what_does_not_suit_is_refused_in_one_line(number: int) -> None:
     assert "\n" not in str(caught.value)
 
 
+@pytest.mark.slow
 def test_a_free_body_slows_down_by_alpha() -> None:
     """Rayleigh's alpha is a drag of each particle's own mass: a free body under it slows down by exp(-alpha t)."""
     world = scene(Rope(links=2, length=1.0), Elastic(young=1e3, alpha=0.5), integrator=RK4())

@@ -75,6 +75,7 @@ def test_a_heading_is_kept_at_rest(dimension: int) -> None:
     assert not plain.start(1).with_motion(state.pos, state.vel).heading.any()
 
 
+@pytest.mark.slow
 @DIMENSIONS
 def test_who_stands_looks_where_it_last_went(dimension: int) -> None:
     """The field of view of laws about neighbours is that of the kept heading: what is behind is not seen."""
@@ -186,6 +187,7 @@ def test_a_wide_limit_changes_nothing() -> None:
         np.testing.assert_array_equal(end.v, ends[0].v)
 
 
+@pytest.mark.slow
 def test_each_group_has_its_own_rate_and_a_wall_turns_anybody() -> None:
     """A bounce is no turn of one's own: the heading follows it at once."""
     still = Spawn(low=(4, 4), high=(6, 6), speed=(1, 1), heading=(1, 0))
@@ -228,6 +230,7 @@ def test_the_basis_stays_right_handed(dtype: str) -> None:
         )
 
 
+@pytest.mark.slow
 def test_up_is_up_for_who_flies_level_and_survives_a_climb() -> None:
     scene = vehicles(3, (Drag(rate=0.0),), oriented=True)
     state = scene.start(0)

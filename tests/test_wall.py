@@ -27,6 +27,7 @@ def approach(speed: float, tau: float, decay: float, strength: float, normal: An
     return Scene(groups=(group,), effects=effects, integrator=RK4(), dt=0.002)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("speed", "tau", "decay", "oscillates"),
     [(0.8, 0.5, 0.08, True), (1.34, 0.05, 0.5, False), (1.0, 0.05, 0.2, False), (1.0, 0.2, 0.1, True)],
@@ -52,6 +53,7 @@ def test_whether_somebody_swings_before_a_wall_is_a_matter_of_the_model(
     assert state.pos[0, 0, 1] == 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dtype", ["float64", "float32"])
 def test_the_force_is_the_formula_on_both_sides_and_the_gradient_of_its_potential(dtype: str) -> None:
     wall = WallRepulsion(point=(5.0, -3.0), normal=(-3.0, 4.0), strength=70.0, decay=0.8)

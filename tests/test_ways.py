@@ -318,6 +318,7 @@ def passing(second: Group, both: bool) -> Array:
     return np.array(path)
 
 
+@pytest.mark.slow
 def test_somebody_who_stands_is_passed_and_two_who_meet_head_on_both_keep_right() -> None:
     """JuPedSim's T4 and T12: no overlap; who stands and does not care stays; two are each other's mirror image."""
     path = passing(walkers(1, (0, 0), (0, 0), max_force=0), both=False)

@@ -78,7 +78,7 @@ class Task(Record):
     measures: ClassVar[tuple[str, ...]]
     """Names of the numbers that `measure` writes each step."""
     counts: ClassVar[tuple[str, ...]] = ()
-    """Parameters to which loops of its kernels count, written into the source: faster, and another value is another one."""
+    """Parameters to which loops of its kernels count, written into them: faster; another value is another kernel."""
     memory: ClassVar[int] = 0
     """Numbers kept per agent between steps."""
     keeps: ClassVar[bool] = False
