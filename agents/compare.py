@@ -34,7 +34,6 @@ from agents import report
 from agents.experiment import CONFIGS, WEIGHTS, Experiment, load_experiment
 from agents.reynolds import PLAYERS as OTHERS
 from agents.reynolds import player as hand_written
-from flockenv.crew import use_threads
 from flockenv.evaluation import WORLDS_PER_SEED, Episodes, rollout, task_digest, worlds_for
 from flockenv.outputs import checked_path
 from flockenv.policy import MlpPolicy, Policy, RandomPolicy, load_player
@@ -201,11 +200,11 @@ def _all(jobs: Sequence[_Job], plays: Plays, advance: Advance) -> Iterator[Playe
     context = get_context("spawn")
     with _heard(context, advance) as (mouth, turn, trouble):
         others = active_children()
+        at_work: list[Future[Played]] = []
         with ProcessPoolExecutor(cores, context, _begin_work, (mouth, turn)) as pool:
-            with _interrupts_held():
-                at_work = [pool.submit(_work, job) for job in jobs]
-            workers = [process for process in active_children() if process not in others]
             try:
+                with _interrupts_held():
+                    at_work += [pool.submit(_work, job) for job in jobs]
                 for working in at_work:
                     wait((working, trouble), return_when=FIRST_COMPLETED)
                     if trouble.done():
@@ -213,10 +212,11 @@ def _all(jobs: Sequence[_Job], plays: Plays, advance: Advance) -> Iterator[Playe
                     yield working.result()
             except BrokenExecutor:
                 raise OSError("a process that plays a task was ended from outside; is there enough memory?") from None
-            finally:  # nobody plays on for nothing
-                if not all(working.done() for working in at_work):
-                    for process in workers:
-                        process.terminate()
+            finally:
+                if len(at_work) < len(jobs) or not all(working.done() for working in at_work):
+                    for process in active_children():  # nobody plays on for nothing
+                        if process not in others:
+                            process.terminate()
     if trouble.done():
         trouble.result()
 
@@ -235,7 +235,9 @@ def _heard(context: Any, advance: Advance) -> Iterator[tuple[Connection, Any, Fu
         while True:
             try:
                 news = ear.recv()
-            except (EOFError, OSError):  # nobody is left who could say a word, or finish one
+            except Exception:  # nobody is left who could say a word, or finish one
+                return
+            if news is None:
                 return
             try:
                 if not trouble.done():
@@ -248,6 +250,7 @@ def _heard(context: Any, advance: Advance) -> Iterator[tuple[Connection, Any, Fu
     try:
         yield mouth, context.Lock(), trouble
     finally:
+        mouth.send(None)  # closing tells him too, but where a process never took its end of the pipe
         mouth.close()
         listener.join()
         ear.close()
@@ -280,7 +283,6 @@ def _begin_work(mouth: Connection, turn: Any) -> None:
 
     _tell = tell
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    use_threads(1)
 
 
 def _work(job: _Job) -> Played:

@@ -244,6 +244,14 @@ def checkpointed(experiment: Experiment, folder: Path) -> Run | None:
         return Run(**notes, tensors={name: best[name] for name in best.files})
 
 
+def _kept(experiment: Experiment, folder: Path) -> bool:
+    """Is there something to go on from?"""
+    try:
+        return checkpointed(experiment, folder) is not None
+    except OtherRecipe:
+        return False
+
+
 def _numbers(block: dict[str, Any], path: KeyPath = ()) -> Iterator[tuple[str, Any]]:
     """Yield every value of nested blocks by its key path."""
     for key, value in block.items():
@@ -281,13 +289,12 @@ def train(experiment: Experiment, folder: Path, go_on: bool = False, tensorboard
     run = checkpointed(experiment, folder) if go_on else None
     if run is not None and run.steps >= p.steps:
         return run
-    if run is None:
-        (folder / "run.json").unlink(missing_ok=True)  # what is there is overwritten file by file
     model = build(task, p, tensorboard)
     if run is not None:
         resume(folder, model, run)
     else:
         run = Run(recipe_of(experiment), wall=_teach(model, task, p))
+        (folder / "run.json").unlink(missing_ok=True)  # what is there is overwritten file by file
     columns = (
         TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TimeRemainingColumn(),
         TextColumn("{task.fields[score]}"),
@@ -344,9 +351,8 @@ def main(
     try:
         run = train(experiment, runs / task.name, go_on, tensorboard)
     except KeyboardInterrupt:
-        kept = (runs / task.name / "run.json").exists()
-        news = f"checkpoint in {runs / task.name}, go on with --resume" if kept else "before there was anything to keep"
-        console.print(f"interrupted; {news}")
+        kept = f"checkpoint in {runs / task.name}, go on with --resume"
+        console.print(f"interrupted; {kept if _kept(experiment, runs / task.name) else 'nothing was learnt yet'}")
         raise typer.Exit(130) from None
     export(run, target)
     best = f"mean return {run.best:.3f} on the tuning worlds"

@@ -23,14 +23,18 @@ class OneAtATime:
 
     def __init__(self, cache: Any, lock: Path, patience: float = PATIENCE) -> None:
         self._cache, self._path, self._patience = cache, lock, patience
-        self._process, self._made = os.getpid(), FileLock(lock, timeout=patience)
+        self._made = {os.getpid(): self._make()}
+
+    def _make(self) -> FileLock:
+        # of all threads: numba compiles in one at a time, and the next one may have to let go of what another left
+        return FileLock(self._path, timeout=self._patience, thread_local=False)
 
     @property
     def _lock(self) -> FileLock:
-        """The lock as this process has it: one that a fork has inherited is nobody's."""
-        if self._process != os.getpid():
-            self._process, self._made = os.getpid(), FileLock(self._path, timeout=self._patience)
-        return self._made
+        """The lock as this process has it. One that a fork has inherited is left alone: to drop it might free it."""
+        if os.getpid() not in self._made:
+            self._made[os.getpid()] = self._make()
+        return self._made[os.getpid()]
 
     def load_overload(self, signature: Any, context: Any) -> Any:
         """Return what is on the disk, if need be as soon as another process has written it; None: it is up to you."""

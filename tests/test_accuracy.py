@@ -165,6 +165,7 @@ def test_a_limit_that_does_not_act_leaves_the_better_reference() -> None:
     assert references.find_reference(sprung(40.0, 0.7, max_speed=20.0)).kind == "DOP853"
 
 
+@pytest.mark.slow
 def test_growth_is_that_of_the_law() -> None:
     """Near the top a pendulum falls as exp(2 pi t), and so does a difference."""
     found = references.find_sensitivity(swinging(math.pi, 1.5))
@@ -175,6 +176,7 @@ def test_growth_is_that_of_the_law() -> None:
     assert references.find_sensitivity(one("damped")).growth < 2
 
 
+@pytest.mark.slow
 def test_a_horizon_beyond_what_anybody_can_tell_is_refused() -> None:
     with pytest.raises(ValueError, match=r"seconds = 5: too long a horizon, .* try [\d.]+ s") as caught:
         measure(swinging(math.pi - 1e-9, 5.0), METHODS)
@@ -200,6 +202,7 @@ def assert_evaluations(damped: Report, methods: Sequence[Integrator]) -> None:
             assert [p.evaluations for p in points] == [n * method.evaluations for n in one("damped").steps]
 
 
+@pytest.mark.slow
 def test_no_tolerance_is_asked_for_that_costs_more_than_the_finest_fixed_steps() -> None:
     """Where forces jump to and fro, a tenth of the tolerance is ten times the steps: there would be no end of it."""
     few = replace(one("damped"), steps=(8,))
@@ -352,6 +355,7 @@ class _Stop:
             raise KeyboardInterrupt
 
 
+@pytest.mark.slow
 def test_an_interrupted_run_keeps_what_was_done() -> None:
     whole = measure(one("damped"), METHODS, repetitions=0)
     early = measure(one("damped"), METHODS, repetitions=0, progress=_Stop(50))

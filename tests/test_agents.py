@@ -406,7 +406,7 @@ def test_a_run_that_is_taught_remembers_its_teacher_and_its_time(tmp_path: Path)
         assert ppo.train(taught, tmp_path / "timed").curve[0]["seconds"] >= 100
 
 
-def test_ctrl_c_while_it_is_taught_leaves_no_checkpoint_of_another_run(
+def test_ctrl_c_while_it_is_taught_claims_no_checkpoint_and_loses_none(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     from agents import ppo
@@ -415,12 +415,11 @@ def test_ctrl_c_while_it_is_taught_leaves_no_checkpoint_of_another_run(
         raise KeyboardInterrupt
 
     (tmp_path / "p.yaml").write_text(f"task: pursuit\nppo: {json.dumps(TINY | {'taught': 5})}\n", encoding="utf-8")
-    (tmp_path / "runs" / "pursuit").mkdir(parents=True)
-    (tmp_path / "runs" / "pursuit" / "run.json").write_text("{}", encoding="utf-8")
+    _interrupt(PURSUIT, tmp_path / "runs" / "pursuit")  # of another recipe
     monkeypatch.setattr(ppo, "teach", interrupted)
     result = CliRunner().invoke(ppo.app, [str(tmp_path / "p.yaml"), "--runs", str(tmp_path / "runs")])
-    assert result.exit_code == 130 and "before there was anything to keep" in result.stderr
-    assert not (tmp_path / "runs" / "pursuit" / "run.json").exists()
+    assert result.exit_code == 130 and "nothing was learnt yet" in result.stderr
+    assert ppo.checkpointed(PURSUIT, tmp_path / "runs" / "pursuit") is not None
 
 
 def test_rows_are_shown_until_an_episode_is_over() -> None:

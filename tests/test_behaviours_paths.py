@@ -325,6 +325,7 @@ def test_a_linear_field_is_followed_as_the_exact_solution_says(time: float) -> N
     np.testing.assert_allclose(end.vel[0, 0], exact[2:], atol=3e-3)
 
 
+@pytest.mark.slow
 def test_outside_the_grid_it_asks_for_nothing() -> None:
     """The grid reaches from -5 to 15 and from -3.5 to 11.5; what counts is the predicted place."""
     scene = flown(whirl(time=0.5))
@@ -335,6 +336,7 @@ def test_outside_the_grid_it_asks_for_nothing() -> None:
     assert not push(scene, (14.8, 11.6), (0, 0)).any()
 
 
+@pytest.mark.slow
 def test_on_a_torus_the_nearest_grid_is_followed() -> None:
     flow = FollowFlow(
         weight=2, centre=(0.5, 0.0), spacing=4, counts=(2, 2), velocities=((1, 0.5), (1, 0), (1, 0), (1, 0)), time=0

@@ -269,6 +269,7 @@ def contained(within: Shape, at: Any, v: Any, count: int = 1) -> Scene:
     return Scene(groups=(group,), effects=(Contain(weight=6, within=within, time=1.0),), dt=0.02)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("within", [ROOM, Block(centre=(4, 4), size=(8, 8))])
 def test_it_asks_for_nothing_while_the_place_ahead_is_inside(within: Shape) -> None:
     still_inside, leaving = contained(within, (4, 3), (1.7, 0)), contained(within, (6, 3), (1.9, 0))

@@ -289,6 +289,7 @@ def test_explain_says_who_sets_the_largest_step() -> None:
     )
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("default")
 def test_a_warning_is_one_line_without_a_place_in_our_sources(capsys: pytest.CaptureFixture[str]) -> None:
     held = TINY.replace("{kind: drag, rate: 0.5}", "{kind: tether, centre: [0, 0], stiffness: 100}")

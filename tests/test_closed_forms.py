@@ -162,6 +162,7 @@ def test_from_rest_a_source_drives_to_the_speed_of_the_formula() -> None:
     assert left < 0.001
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("field", "turn"), [(Vortex, 1), (Source, 0), (Sink, 0)])
 @pytest.mark.parametrize("r", [0.3, 1.2, 4.0])
 def test_a_vortex_does_work_in_every_turn_and_the_others_none(field: Any, turn: int, r: float) -> None:
@@ -276,6 +277,7 @@ def test_a_tracer_goes_around_a_vortex_in_the_time_of_the_formula() -> None:
     np.testing.assert_array_equal(v, 0)
 
 
+@pytest.mark.slow
 def test_explicit_euler_spirals_out_of_a_vortex_as_the_recursion_says() -> None:
     """r^2 <- r^2 + h^2 W(r)^2, to 1e-10: after 1000 steps of 0.05 s r = 1.7057155 m."""
     scene = tracer(ExplicitEuler(), 0.05)

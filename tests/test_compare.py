@@ -144,6 +144,7 @@ def side_by_side(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(comparison.os, "cpu_count", lambda: 2)
 
 
+@pytest.mark.slow
 def test_side_by_side_everything_is_the_same_and_progress_is_told(
     side_by_side: None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -505,7 +506,6 @@ def test_the_task_is_the_one_that_its_config_describes(elsewhere: Path, monkeypa
 
 NO_TORCH = """
 import sys
-import threading
 
 class Refuse:  # not sys.modules["torch"] = None, which scipy takes for a torch
     def find_spec(self, name, path=None, target=None):

@@ -129,7 +129,9 @@ def test_scenes_are_written_with_their_model_by_name_and_never_over_others(
 
 
 @pytest.mark.parametrize("case", [c for c in CASES if not c.only], ids=lambda case: case.name)
-@pytest.mark.parametrize("preset", VALIDATED)
+@pytest.mark.parametrize(
+    "preset", [VALIDATED[0], *(pytest.param(name, marks=pytest.mark.slow) for name in VALIDATED[1:])]
+)
 def test_every_scene_can_be_built_with_every_preset(preset: str, case: Case) -> None:
     with quietly():
         for built in SCENES[case.name].values():

@@ -204,6 +204,7 @@ def test_bad_rates_are_refused() -> None:
         scene.rates(state, times=[0.0, np.nan])
 
 
+@pytest.mark.slow
 def test_a_medium_that_carries_is_in_the_rates() -> None:
     effects = Vortex(strength=2.0, centre=(1.0, 1.0), maximum=3.0, acts="medium"), Wind(velocity=(1.0, 0.0)), Carried()
     scene = Scene(groups=(Group(count=3, spawn=HERE),), effects=effects, dt=0.01)

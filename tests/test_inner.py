@@ -123,6 +123,7 @@ def test_driving_relaxes_to_the_desired_speed_of_each() -> None:
     np.testing.assert_array_equal(state.vel[0, 6:], 0)  # nobody told them where to go
 
 
+@pytest.mark.slow
 def test_a_goal_is_reached_at_rest_and_on_a_torus_the_short_way() -> None:
     walkers = WALKERS.model_copy(update={"count": 1, "spawn": Spawn(low=(9, 5), high=(9.01, 5))})
     scene = Scene(space=Torus(size=(10, 10)), groups=(walkers,), effects=(Goal(target=(1, 5)), Driving()), dt=0.02)

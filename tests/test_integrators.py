@@ -81,6 +81,7 @@ def test_the_orders_are_those_of_the_table() -> None:
     assert {name: orders[name] for name in promised} == promised
 
 
+@pytest.mark.slow
 def test_a_speed_limit_takes_the_order_away(tether: Any) -> None:
     """numerics.md, P09: nobody may read "order 4" off a scene with a clamp after each step."""
     end = oscillator(tether, "compiled", max_speed=0.9)
@@ -89,6 +90,7 @@ def test_a_speed_limit_takes_the_order_away(tether: Any) -> None:
     assert 0.7 < measured < 2.5
 
 
+@pytest.mark.slow
 @METHODS
 def test_both_ways_take_the_same_steps(row: IntegratorRow, tether: Any) -> None:
     ends = [motion(oscillator(tether, way)(row.method, 0.05, 100)) for way in ("python", "compiled")]
@@ -143,6 +145,7 @@ def test_semi_implicit_euler_keeps_its_invariant(way: str, steps: int, tether: A
         assert v * v + w * w * x * x - h * w * w * x * v == pytest.approx(start, rel=1e-12)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("way", "steps"), [("python", 3000), ("compiled", 100_000)])
 def test_velocity_verlet_keeps_its_invariant(way: str, steps: int, tether: Any) -> None:
     """v^2 + w^2 x^2 (1 - h^2 w^2 / 4) does not change at all (numerics.md 3.2)."""

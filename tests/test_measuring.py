@@ -166,6 +166,7 @@ def test_interrupted_it_shows_what_there_is(
     assert (Path("p") / "lanes.png").exists()
 
 
+@pytest.mark.slow
 def test_a_run_that_ends_early_is_measured_until_then(capsys: pytest.CaptureFixture[str]) -> None:
     """An attraction of 1e300 N throws somebody out of all numbers."""
     Path("bad.yaml").write_text(STREAMS.replace("dt:", "effects: [{kind: gravity, acceleration: [1e308, 0]}]\ndt:"))
@@ -175,6 +176,7 @@ def test_a_run_that_ends_early_is_measured_until_then(capsys: pytest.CaptureFixt
     assert "agents " in captured.out
 
 
+@pytest.mark.slow
 def test_space_has_no_lines_but_has_order() -> None:
     Path("space.yaml").write_text(
         "dimension: 3\nspace: {kind: torus, size: [9, 9, 9]}\n"

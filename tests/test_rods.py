@@ -60,6 +60,7 @@ def lengths(state: State) -> Array:
 # --- closed forms ---------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_pendulum_keeps_its_length_its_energy_and_its_period() -> None:
     """Of a small swing 2 pi sqrt(l / g), of a large one 4 sqrt(l / g) K(sin^2(a / 2)); over 100 periods and more."""
     angles, dt = np.array([0.02, 1.0, 2.5]), 0.01

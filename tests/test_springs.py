@@ -188,6 +188,7 @@ def test_the_dead_hold_nobody(dimension: int) -> None:
     np.testing.assert_allclose(found[2], -found[3])
 
 
+@pytest.mark.slow
 def test_what_is_pinned_stays_where_it_is() -> None:
     world = scene(cloth(3, pinned=("top",)), Springs(stiffness=300), Gravity(acceleration=(0, 0, -9.81)), dimension=3)
     start = world.start(0)

@@ -96,6 +96,33 @@ def test_a_task_is_a_value_and_names_what_it_has(row: TaskRow) -> None:
     assert len(slots) == len(set(slots))
     assert task.layout.size == sum(slot.size for slot in task.layout.slots)
     assert all(slot.meaning and slot.unit for slot in (*task.layout.slots, *task.action_layout.slots))
+    assert set(row.task.counts) <= row.task.parameters().keys()
+
+
+def test_a_kernel_knows_what_its_loops_count_to_and_no_other_number() -> None:
+    source = task_source(Flock())
+    for name in Flock.counts:
+        assert task_source(Flock(**{name: 5})) != source
+    assert task_source(Flock(touch_cost=3.0, sight=7.0, obstacle_count=2)) == source
+
+
+def test_what_is_counted_to_is_the_same_written_out_or_given(monkeypatch: pytest.MonkeyPatch) -> None:
+    """In single precision, in which policies learn: a number of the wrong kind would promote what it meets."""
+    task = Flock(agents=5, neighbours=3, obstacles_seen=1, rays=8, dtype="float32")
+    ends = []
+    for counts in (Flock.counts, ()):
+        monkeypatch.setattr(Flock, "counts", counts)
+        world = world_of(task, worlds=3)
+        steps = [world.step(actions) for actions in random_actions(world, 40)]
+        ends.append((np.array([s.observation for s in steps]), np.array([s.terms for s in steps])))
+    for ours, theirs in zip(*ends, strict=True):
+        np.testing.assert_array_equal(ours, theirs)
+
+
+def test_a_count_that_is_no_parameter_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Flock, "counts", ("ray",))
+    with pytest.raises(TypeError, match=r"Flock\.counts: 'ray' is none of its parameters: .*rays"):
+        task_source(Flock())
 
 
 @EVERY

@@ -119,6 +119,7 @@ def test_float32_plays_the_same_worlds() -> None:
 # --- what is kept
 
 
+@pytest.mark.slow
 def test_the_same_command_goes_on_after_an_interruption_and_plays_nothing_twice(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -142,6 +143,7 @@ def test_the_same_command_goes_on_after_an_interruption_and_plays_nothing_twice(
     assert after["tasks"] == before["tasks"]  # times too: no round is run twice
 
 
+@pytest.mark.slow
 def test_more_rounds_are_added_to_those_that_are_kept() -> None:
     run(*TINY, *TRAINED, "--players", "random")
     [path] = KEPT.rglob("clock-*.json")
@@ -152,6 +154,7 @@ def test_more_rounds_are_added_to_those_that_are_kept() -> None:
     assert len(rounds) == 3
 
 
+@pytest.mark.slow
 def test_a_player_that_has_changed_plays_anew(monkeypatch: pytest.MonkeyPatch) -> None:
     counted = Counted(monkeypatch)
     asked = (*TINY, *TRAINED, "--players", "mine.py")
@@ -263,6 +266,7 @@ def test_the_picture_is_centred_on_the_trained_setting() -> None:
 # --- the command line
 
 
+@pytest.mark.slow
 def test_all_files_come_out_of_one_run() -> None:
     result = run(*TINY, *TRAINED, "--players", "random,reynolds", "--out", "here/out")
     assert sorted(path.name for path in Path("here/out").iterdir()) == FILES

@@ -62,6 +62,16 @@ def test_who_comes_second_waits_for_what_the_first_writes(tmp_path: Path) -> Non
     assert first.name == "a function"
 
 
+def test_a_compilation_that_fails_in_another_thread_holds_nobody_up(tmp_path: Path) -> None:
+    first, _ = two(tmp_path, patience=0.2)
+    failed = threading.Thread(target=first.load_overload, args=("f8", None))
+    failed.start()
+    failed.join()
+    assert first.load_overload("f4", None) is None
+    first.save_overload("f4", "code")
+    FileLock(tmp_path / "a.lock", timeout=0).acquire()
+
+
 @pytest.mark.parametrize("how", ["the compiler raises", "the disk is full"])
 def test_a_compilation_that_fails_holds_nobody_up(tmp_path: Path, how: str) -> None:
     first, second = two(tmp_path)

@@ -102,6 +102,7 @@ def test_a_row_of_sixteen_is_that_world_alone(env_id):
     for k, env in zip(picked, alone, strict=True):
         np.testing.assert_array_equal(env.reset(seed=100 + k)[0][0], first[k])
     together = [many.step(action)[:4] for action in actions]
+    assert not np.shares_memory(together[0][0], together[1][0])
     for k, env in zip(picked, alone, strict=True):
         by_itself = [env.step(action[k : k + 1])[:4] for action in actions]
         for a, b in zip(zip(*by_itself, strict=True), zip(*together, strict=True), strict=True):

@@ -305,6 +305,7 @@ def test_worlds_of_a_batch_calls_of_one_step_and_threads_give_the_same_bits(coun
     np.testing.assert_array_equal(copy.frame, alone.frame)
 
 
+@pytest.mark.slow
 def test_the_dead_and_worlds_that_diverge_keep_their_heading() -> None:
     scene = vehicles(2, (Drag(rate=0.0),), max_turn_rate=1.0)
     state = scene.start(1, worlds=2)

@@ -53,8 +53,7 @@ def test_whether_somebody_swings_before_a_wall_is_a_matter_of_the_model(
     assert state.pos[0, 0, 1] == 0
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("dtype", ["float64", "float32"])
+@pytest.mark.parametrize("dtype", ["float64", pytest.param("float32", marks=pytest.mark.slow)])
 def test_the_force_is_the_formula_on_both_sides_and_the_gradient_of_its_potential(dtype: str) -> None:
     wall = WallRepulsion(point=(5.0, -3.0), normal=(-3.0, 4.0), strength=70.0, decay=0.8)
     spawn = Spawn(low=(3, -4), high=(6, -2))

@@ -230,6 +230,7 @@ def test_who_has_decided_stays_with_it_unless_another_door_is_quicker_by_the_hys
     assert 0 < (waiting(9, EQUAL, (4.4, 3), hysteresis=0.0) == 1).sum() < 5
 
 
+@pytest.mark.slow
 def test_an_assigned_door_is_used_by_everybody_and_all_get_out_for_any_threads() -> None:
     groups = (walkers(20, (1, 1), (9, 5)), walkers(20, (1, 1), (9, 5)))
     doors = (Door(ends=LEFT),), (Door(ends=RIGHT),)
@@ -248,6 +249,7 @@ def test_an_assigned_door_is_used_by_everybody_and_all_get_out_for_any_threads()
     np.testing.assert_array_equal(again.inner, end.inner)
 
 
+@pytest.mark.slow
 def test_a_group_in_another_order_goes_the_same_ways() -> None:
     """Who is where decides, not his number: but of the times at which decisions fall, which are each one's own."""
     routes = tuple(Routes(group=k, doors=EQUAL, spacing=0.1, period=0.02) for k in range(2))
@@ -285,6 +287,7 @@ def test_routes_of_a_large_crowd_do_not_depend_on_threads_or_calls() -> None:
 # --- in line, and past each other -------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_who_lines_up_stops_behind_whoever_is_ahead() -> None:
     """The first does not walk, and the others come to rest a margin behind each other."""
     groups = (walkers(1, (1, 3), (1, 3)), walkers(2, (4, 3), (6, 3)))
