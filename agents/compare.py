@@ -199,12 +199,13 @@ def _all(jobs: Sequence[_Job], plays: Plays, advance: Advance) -> Iterator[Playe
         return
     context = get_context("spawn")
     with _heard(context, advance) as (mouth, turn, trouble):
-        others = active_children()
+        others, workers = active_children(), []
         at_work: list[Future[Played]] = []
         with ProcessPoolExecutor(cores, context, _begin_work, (mouth, turn)) as pool:
             try:
                 with _interrupts_held():
                     at_work += [pool.submit(_work, job) for job in jobs]
+                    workers += [process for process in active_children() if process not in others]
                 for working in at_work:
                     wait((working, trouble), return_when=FIRST_COMPLETED)
                     if trouble.done():
@@ -214,9 +215,8 @@ def _all(jobs: Sequence[_Job], plays: Plays, advance: Advance) -> Iterator[Playe
                 raise OSError("a process that plays a task was ended from outside; is there enough memory?") from None
             finally:
                 if len(at_work) < len(jobs) or not all(working.done() for working in at_work):
-                    for process in active_children():  # nobody plays on for nothing
-                        if process not in others:
-                            process.terminate()
+                    for process in workers:  # nobody plays on for nothing
+                        process.terminate()
     if trouble.done():
         trouble.result()
 

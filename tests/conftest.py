@@ -29,8 +29,12 @@ RARE = {
     "nearest_plane_3",
     "nearest_torus_single",
     "nearest_torus_3",
+    "alignment_cone",
+    "cohesion_cone",
+    "angular_springs",
+    "elastic",
 }
-"""Kernels of catalogue.Variant that only slow tests compile."""
+"""Kernels of catalogue.Variant, and effects like others, that only slow tests compile."""
 
 RARE_METHODS = {"averaged_velocity", "midpoint", "heun", "exponential_drag", "adaptive_rk4", "implicit_midpoint"}
 """Methods whose kernels only slow tests compile; in Python they are quick, but for the implicit ones."""

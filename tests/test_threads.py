@@ -234,7 +234,7 @@ def test_worlds_divided_among_threads_are_the_same_worlds(variant: Variant, coun
 
 def test_little_work_is_not_shared(shared: list[int]) -> None:
     use_threads(2)
-    scene = NAMED["torus_single"].make(64, 20.0)
+    scene = NAMED["torus"].make(64, 20.0)
     scene.run(scene.start(0, worlds=8), 1)
     assert shared == []
     scene.run(scene.start(0, worlds=8), 8)
@@ -247,7 +247,7 @@ def test_little_work_is_not_shared(shared: list[int]) -> None:
 @pytest.mark.parametrize("count", [1, 2, 3])
 @pytest.mark.parametrize("agent", [0, 1, 1700, 3333, 4998])
 def test_whichever_thread_meets_nan_names_the_agent(agent: int, count: int) -> None:
-    scene = NAMED["plane_single"].make(4999, 60.0)
+    scene = NAMED["torus"].make(4999, 60.0)
     start = scene.start(0)
     start.pos[0, agent, 1] = np.nan
     kept = start.copy()
