@@ -31,8 +31,6 @@ RARE = {
     "nearest_torus_3",
     "alignment_cone",
     "cohesion_cone",
-    "angular_springs",
-    "elastic",
 }
 """Kernels of catalogue.Variant, and effects like others, that only slow tests compile."""
 
