@@ -440,6 +440,7 @@ def in_a_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
+@pytest.mark.slow
 def test_accuracy_of_a_scene_on_the_command_line(in_a_folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     asked = ["accuracy", "tiny.yaml", "--methods", "rk4,heun", "--repetitions", "1", "--out", "deep/a.png"]
     assert main(asked) == 0

@@ -123,6 +123,7 @@ def test_a_path_has_the_dimension_of_its_scene() -> None:
 # --- path following ---------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_on_its_way_in_the_tube_it_is_let_alone() -> None:
     """Exactly 0 where the predicted place is in the tube and further along; in the wrong direction it is not."""
     there, back = traffic(STRAIGHT), traffic(STRAIGHT.model_copy(update={"way": -1}))

@@ -148,6 +148,7 @@ def test_every_says_how_often_an_instant_is_kept_and_the_last_always_is() -> Non
     assert np.load("t.npz")["time"] == pytest.approx([0, 0.2, 0.4, 0.5])
 
 
+@pytest.mark.slow
 def test_a_scene_without_neighbour_effects_makes_no_query_and_one_with_them_one_per_step(
     capsys: pytest.CaptureFixture[str],
 ) -> None:

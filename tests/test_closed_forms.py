@@ -66,7 +66,8 @@ def falling(method: Integrator, dt: float, linear: float = 0.0, quadratic: float
 
 
 METHODS = pytest.mark.parametrize(
-    ("method", "precision"), [(SemiImplicitEuler(), 0.13), (VelocityVerlet(), 1e-4), (RK4(), 1e-9)],
+    ("method", "precision"),
+    [(SemiImplicitEuler(), 0.13), pytest.param(VelocityVerlet(), 1e-4, marks=pytest.mark.slow), (RK4(), 1e-9)],
     ids=lambda value: getattr(value, "kind", ""),
 )  # fmt: skip
 """A method of order 1, 2 and 4, and its error in a few hundred steps."""
@@ -223,7 +224,9 @@ def orbit(method: Integrator, turns: int) -> tuple[Array, Array, Array]:
     return (v**2).sum(axis=1) / 2 - 1 / r, spin, np.degrees(np.arctan2(vector[:, 1], vector[:, 0]))
 
 
-@pytest.mark.parametrize("name", KEPLER)
+@pytest.mark.parametrize(
+    "name", [name if name == "velocity_verlet" else pytest.param(name, marks=pytest.mark.slow) for name in KEPLER]
+)
 def test_kepler_s_orbit_keeps_what_the_method_should(name: str) -> None:
     method, energy_bound, spin_bound, shift = KEPLER[name]
     energy, spin, perihelion = orbit(method, 100)

@@ -54,7 +54,11 @@ def diverged(call: Any) -> SimulationDiverged:
 # --- who is named -----------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("method", [SemiImplicitEuler(), ImplicitEuler()], ids=lambda method: method.kind)
+@pytest.mark.parametrize(
+    "method",
+    [SemiImplicitEuler(), pytest.param(ImplicitEuler(), marks=pytest.mark.slow)],
+    ids=lambda method: method.kind,
+)
 def test_the_guilty_effect_is_named(method: Integrator) -> None:
     """Of six: the one whose force on that agent is the largest, or no number."""
     for who, far, fast, kind in (

@@ -74,6 +74,7 @@ def warm(count: int, size: float) -> Scene:
     return Scene(space=Torus(size=(size, size)), dt=0.01, groups=(group,), effects=(Warmth(kind="warmth"),))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("count", "size"), [(30, 5.0), pytest.param(2**14, 90.0, marks=pytest.mark.slow)])
 def test_what_is_kept_follows_neighbours_and_not_the_order_threads_or_calls(count: int, size: float) -> None:
     scene = warm(count, size)
@@ -104,6 +105,7 @@ def test_what_is_kept_follows_neighbours_and_not_the_order_threads_or_calls(coun
 WALKERS = Group(count=6, radius=0.2, mass=70, desired_speed=1.3, spawn=Spawn(low=(0, 0), high=(4, 4)))
 
 
+@pytest.mark.slow
 def test_an_antipode_is_kept_from_the_start_and_reached() -> None:
     scene = Scene(groups=(WALKERS,), effects=(Antipode(centre=(2, 2)), Driving()), dt=0.02)
     start = scene.start(0)

@@ -230,6 +230,7 @@ def test_a_narrow_orbit_costs_what_the_table_says(
         )
 
 
+@pytest.mark.slow
 @ADAPTIVE
 def test_a_tolerance_a_thousand_times_smaller_pays(kind: type[Integrator], tether: Any) -> None:
     for aphelion in (False, True):

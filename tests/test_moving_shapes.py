@@ -44,6 +44,7 @@ def bodies(*shapes: Shape, radius: float = 0.3, stiffness: float = 50, damping: 
     )  # fmt: skip
 
 
+@pytest.mark.slow
 def test_a_shape_that_moves_is_a_shape_at_rest_that_everybody_moves_against() -> None:
     """Galilei: (shape at u, bodies at v) is (shape at rest, bodies at v - u), seen from a frame that moves with u."""
     shapes = (

@@ -273,6 +273,7 @@ def test_in_a_scene_agents_without_inertia_never_touch_and_pass_round_obstacles(
     assert (np.linalg.norm(end.vel[0], axis=1) <= 1.2 * 1.2 + 1e-9).all()
 
 
+@pytest.mark.slow
 def test_in_a_scene_a_free_agent_goes_as_it_wishes_and_arrives() -> None:
     scene = walkers(1, target=(6.0, 2.0), slow_radius=0.5)
     start = scene.start(0)

@@ -29,6 +29,7 @@ def test_a_changed_copy_is_checked_like_a_new_one() -> None:
         SCENE.model_copy(update={"dt": -1})
 
 
+@pytest.mark.slow
 def test_copies_are_the_record_itself_even_after_use() -> None:
     SCENE.step(SCENE.start(0))
     assert copy.copy(SCENE) is SCENE

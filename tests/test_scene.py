@@ -537,6 +537,7 @@ def test_who_is_inside_a_torus_stays_where_he_is() -> None:
     np.testing.assert_array_equal(scene.step(state).x[:, 0, 0], state.x[:, 0, 0])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("axis", [0, 1])
 def test_agents_on_a_line_do_not_all_meet(axis: int) -> None:
     scene = crowd_of(2000, space=Plane())

@@ -106,6 +106,7 @@ def test_a_kernel_knows_what_its_loops_count_to_and_no_other_number() -> None:
     assert task_source(Flock(touch_cost=3.0, sight=7.0, obstacle_count=2)) == source
 
 
+@pytest.mark.slow
 def test_what_is_counted_to_is_the_same_written_out_or_given(monkeypatch: pytest.MonkeyPatch) -> None:
     """In single precision, in which policies learn: a number of the wrong kind would promote what it meets."""
     task = Flock(agents=5, neighbours=3, obstacles_seen=1, rays=8, dtype="float32")

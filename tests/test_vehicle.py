@@ -283,6 +283,7 @@ def crowded(count: int, **group: Any) -> Scene:
     return Scene(space=Torus(size=(edge, edge)), groups=groups, effects=effects, dt=0.05)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("count", [40, pytest.param(9000, marks=pytest.mark.slow)])
 def test_worlds_of_a_batch_calls_of_one_step_and_threads_give_the_same_bits(count: int) -> None:
     scene = crowded(count, max_turn_rate=1.0)
