@@ -29,10 +29,14 @@ RARE = {
     "nearest_plane_3",
     "nearest_torus_single",
     "nearest_torus_3",
-    "alignment_cone",
-    "cohesion_cone",
 }
-"""Kernels of catalogue.Variant, and effects like others, that only slow tests compile."""
+"""Kernels of catalogue.Variant that only slow tests compile."""
+
+RARE_EFFECTS = {
+    "alignment_cone", "cohesion_cone", "angular_springs", "elastic", "inverse_square", "quadratic_drag", "carried",
+    "wind", "obstacle_contact", "gravity",
+}  # fmt: skip
+"""Effects whose symmetries only slow tests try: each is a kernel, and each has quick tests of its own elsewhere."""
 
 RARE_METHODS = {"averaged_velocity", "midpoint", "heun", "exponential_drag", "adaptive_rk4", "implicit_midpoint"}
 """Methods whose kernels only slow tests compile; in Python they are quick, but for the implicit ones."""
@@ -51,7 +55,8 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
         given = getattr(getattr(item, "callspec", None), "params", {})
         named = [getattr(value, "name", value) for value in given.values()]
         in_space = given.get("dimension") == 3 and item.path.stem in IN_SPACE_SLOW
-        if any(isinstance(name, str) and name in RARE for name in named) or in_space or _of_a_rare_method(given):
+        rare = RARE | RARE_EFFECTS if item.path.stem == "test_effects" else RARE
+        if any(isinstance(name, str) and name in rare for name in named) or in_space or _of_a_rare_method(given):
             item.add_marker(pytest.mark.slow)
 
 
