@@ -9,18 +9,13 @@ import functools
 import os
 import platform
 import re
-import signal
 import subprocess
 import tempfile
-import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Future, ProcessPoolExecutor, wait
 from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib import metadata
 from itertools import product
-from multiprocessing import active_children, get_context
-from multiprocessing.connection import Connection
 from pathlib import Path
 from time import perf_counter
 from typing import Annotated, Any
@@ -32,6 +27,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 import flockenv
 from agents import report
 from agents.experiment import CONFIGS, WEIGHTS, Experiment, load_experiment
+from agents.processes import Tell, side_by_side
 from agents.reynolds import PLAYERS as OTHERS
 from agents.reynolds import player as hand_written
 from flockenv.evaluation import WORLDS_PER_SEED, Episodes, rollout, task_digest, worlds_for
@@ -78,6 +74,11 @@ class Player:
         if not NAME.fullmatch(name):
             raise ValueError(f"--players {shown(spec)}: a name is up to 40 letters, digits and _ . + -")
         return cls(spec, name)
+
+    def policy(self, task: Task, known: Mapping[str, Callable[[Task], Policy]], trust_pickle: bool = False) -> Policy:
+        """Return it, ready to play a task; ValueError: one line that names it."""
+        with blaming(self.name, task, ValueError):  # those of load_player name the player themselves
+            return load_player(self.spec, task, known, trust_pickle)
 
 
 def known_players(seed: int) -> dict[str, Callable[[Task], Policy]]:
@@ -128,8 +129,7 @@ def compare(
     for task, player in product(tasks, players):
         if _sits_out(player, task, tasks):
             continue
-        with blaming(player.name, task, ValueError):  # those of load_player name the player themselves
-            plays[task.name][player.name] = load_player(player.spec, task, known, trust_pickle)
+        plays[task.name][player.name] = player.policy(task, known, trust_pickle)
     alone = next((name for name, playing in plays.items() if not playing), None)
     if alone is not None:
         raise ValueError(f"task {alone!r}: nobody plays it; in other tasks alone: {', '.join(OTHERS)}")
@@ -195,97 +195,11 @@ def _all(jobs: Sequence[_Job], plays: Plays, advance: Advance) -> Iterator[Playe
     """Yield what came of every job: worked off side by side, a process for each core, where that is worth a process."""
     cores = min(os.cpu_count() or 1, len(jobs))
     if cores < 2 or jobs[0].worlds < WORLDS:
-        yield from (_play(job, plays[job.task.name], advance) for job in jobs)
-        return
-    context = get_context("spawn")
-    with _heard(context, advance) as (mouth, turn, trouble):
-        others, workers = active_children(), []
-        at_work: list[Future[Played]] = []
-        with ProcessPoolExecutor(cores, context, _begin_work, (mouth, turn)) as pool:
-            try:
-                with _interrupts_held():
-                    at_work += [pool.submit(_work, job) for job in jobs]
-                    workers += [process for process in active_children() if process not in others]
-                for working in at_work:
-                    wait((working, trouble), return_when=FIRST_COMPLETED)
-                    if trouble.done():
-                        break
-                    yield working.result()
-            except BrokenExecutor:
-                raise OSError("a process that plays a task was ended from outside; is there enough memory?") from None
-            finally:
-                if len(at_work) < len(jobs) or not all(working.done() for working in at_work):
-                    for process in workers:  # nobody plays on for nothing
-                        process.terminate()
-    if trouble.done():
-        trouble.result()
+        return (_play(job, plays[job.task.name], advance) for job in jobs)
+    return side_by_side(_work, jobs, cores, advance)
 
 
-@contextmanager
-def _heard(context: Any, advance: Advance) -> Iterator[tuple[Connection, Any, Future[None]]]:
-    """Have what other processes tell of their progress passed on to `advance`, by a thread of its own.
-
-    Yields where they tell it, the lock that says whose turn it is to speak, and what has an error of `advance`, if it
-    raised one; after that nothing more is passed on.
-    """
-    ear, mouth = context.Pipe(duplex=False)
-    trouble: Future[None] = Future()
-
-    def listen() -> None:
-        while True:
-            try:
-                news = ear.recv()
-            except Exception:  # nobody is left who could say a word, or finish one
-                return
-            if news is None:
-                return
-            try:
-                if not trouble.done():
-                    advance(*news)
-            except BaseException as error:
-                trouble.set_exception(error)
-
-    listener = threading.Thread(target=listen, daemon=True)
-    listener.start()
-    try:
-        yield mouth, context.Lock(), trouble
-    finally:
-        mouth.send(None)  # closing tells him too, but where a process never took its end of the pipe
-        mouth.close()
-        listener.join()
-        ear.close()
-
-
-@contextmanager
-def _interrupts_held() -> Iterator[None]:
-    """Let whoever is started now never hear of Ctrl-C, where the system can: what this thread holds back, he does."""
-    if not hasattr(signal, "pthread_sigmask"):
-        yield
-        return
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
-
-
-_tell: Callable[[Any], None]
-"""In a process that plays for another one: how its progress is told."""
-
-
-def _begin_work(mouth: Connection, turn: Any) -> None:
-    """Get ready in a process that plays for another one, beside others like it; Ctrl-C is for that one."""
-    global _tell
-
-    def tell(news: Any) -> None:
-        with turn:
-            mouth.send(news)
-
-    _tell = tell
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-
-
-def _work(job: _Job) -> Played:
+def _work(job: _Job, tell: Tell) -> Played:
     """Do a job in a process that plays for another one; the players are made anew from what was asked for."""
     last = [0.0]
 
@@ -293,10 +207,11 @@ def _work(job: _Job) -> Played:
         done, most = news[2:]
         if done in (1, most) or perf_counter() - last[0] > TOLD_EVERY:
             last[0] = perf_counter()
-            _tell(news)
+            tell(*news)
 
+    tell(job.task.name, job.players[0].name, 0, job.task.horizon)  # somebody is at it, though he may compile first
     known = known_players(job.seed)
-    policies = {p.name: load_player(p.spec, job.task, known, job.trust_pickle) for p in job.players}
+    policies = {player.name: player.policy(job.task, known, job.trust_pickle) for player in job.players}
     return _play(job, policies, advance)
 
 

@@ -8,6 +8,7 @@ Nature 246, 15).
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
@@ -25,7 +26,7 @@ from agents.compare import blaming, field_of, known_players, split
 from agents.experiment import load_experiment, one_line_errors
 from agents.reynolds import PLAYERS as OTHERS
 from flockenv.evaluation import Episodes, Interval, bootstrap, compare, rollout, worlds_for
-from flockenv.policy import Policy, load_player
+from flockenv.policy import Policy
 from flockenv.snapshot import Snapshot
 from flockenv.tasks import Task
 from flockenv.world import Step, World
@@ -197,16 +198,10 @@ def _makers(
 ) -> dict[str, Callable[[Task], Policy]]:
     """Return how each player of a task is made, by name; whoever cannot be had is refused before anything is played."""
     specs = asked or [*(name for name, of in OTHERS.items() if task.name in of), "reynolds", "ppo"]
-    field = {player.name: player.spec for player in field_of(specs)}
-
-    def maker(name: str, spec: str) -> Callable[[Task], Policy]:
-        def make(task: Task) -> Policy:
-            with blaming(name, task, ValueError):  # those of load_player name the player themselves
-                return load_player(spec, task, known, trust_pickle)
-
-        return make
-
-    makers = {name: maker(name, spec) for name, spec in field.items()}
+    makers = {
+        player.name: functools.partial(player.policy, known=known, trust_pickle=trust_pickle)
+        for player in field_of(specs)
+    }
     for make in makers.values():
         make(task)
     return makers

@@ -87,10 +87,10 @@ class OtherRecipe(ValueError):  # noqa: N818  # whoever begins anew then has see
 
 def recipe_of(experiment: Experiment) -> dict[str, Any]:
     """Return all that training depends on: with another value anywhere it is another training."""
-    told = experiment.model_dump(mode="json", include={"task", "arguments", "ppo"})
+    task, told = experiment.build(), experiment.model_dump(mode="json", include={"task", "arguments", "ppo"})
     if experiment.ppo.taught:
-        told["rules"] = as_dict(player(experiment.build()).rules)  # who taught it
-    return {**told, "layout": experiment.build().layout.digest}
+        told["rules"] = as_dict(player(task).rules)  # who taught it
+    return {**told, "layout": task.layout.digest}
 
 
 @dataclass
@@ -293,7 +293,8 @@ def train(experiment: Experiment, folder: Path, go_on: bool = False, tensorboard
     if run is not None:
         resume(folder, model, run)
     else:
-        run = Run(recipe_of(experiment), wall=_teach(model, task, p))
+        run = Run(recipe_of(experiment))
+        run.wall = _teach(model, task, p)
         (folder / "run.json").unlink(missing_ok=True)  # what is there is overwritten file by file
     columns = (
         TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TimeRemainingColumn(),

@@ -9,7 +9,6 @@ command goes on after an interruption and plays nothing twice. Writes transfer.j
 from __future__ import annotations
 
 import os
-import signal
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from itertools import product
@@ -25,7 +24,6 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from agents import report, transfer_report
 from agents.compare import (
     PLAYERS,
-    blaming,
     deliver,
     experiment_of,
     field_of,
@@ -35,6 +33,7 @@ from agents.compare import (
     split,
     write_text,
 )
+from agents.processes import quietly
 from agents.transfer_cells import (
     KEPT,
     Plan,
@@ -157,8 +156,7 @@ def _measured(plans: Sequence[Plan], workers: int) -> report.Results:
     """Play what is missing, run the clock, and return everything as plain data."""
     began = perf_counter()
     for plan, player in product(plans, plans[0].players):
-        with blaming(player.name, plan.task, ValueError):
-            plan.policy(player, plan.task)  # whoever cannot be had is refused before anybody plays
+        plan.policy(player, plan.task)  # whoever cannot be had is refused before anybody plays
     missing, rounds = [job for plan in plans for job in jobs(plan)], rounds_missing(plans)
     steps = sum(len(settings) * len(plan.players) for plan, settings in missing) + len(rounds) * len(plans)
     with _bar(steps) as advance:
@@ -195,14 +193,8 @@ def _crew(processes: int, work: Sequence[Any]) -> Iterator[Callable[[Any, Iterab
         yield map
         return
     count = min(processes, len(work))
-    with get_context("spawn").Pool(count, _quietly, maxtasksperchild=1 if processes == 1 else None) as pool:
+    with get_context("spawn").Pool(count, quietly, maxtasksperchild=1 if processes == 1 else None) as pool:
         yield pool.imap_unordered
-
-
-def _quietly() -> None:
-    """Leave Ctrl-C, and what is said about compiling, to the process that people talk to."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    os.environ["FLOCKENV_QUIET"] = "1"
 
 
 @contextmanager

@@ -22,7 +22,7 @@ from flockenv.evaluation import rollout, task_digest, worlds_for
 from flockenv.integrators import RK4
 from flockenv.kernels import load
 from flockenv.outputs import replacing
-from flockenv.policy import Policy, load_player
+from flockenv.policy import Policy
 from flockenv.tasks import Task
 from flockenv.tasks.base import task_source
 from flockenv.world import World
@@ -70,7 +70,7 @@ class Plan:
 
     def policy(self, player: Player, task: Task) -> Policy:
         """Return a player that has decided nothing yet."""
-        return load_player(player.spec, task, known_players(self.seed), self.trust_pickle)
+        return player.policy(task, known_players(self.seed), self.trust_pickle)
 
 
 Job = tuple[Plan, tuple[Setting, ...]]

@@ -25,15 +25,7 @@ from flockenv.sb3 import WorldVecEnv
 from flockenv.tasks import TASKS, School
 
 ROOT = CONFIGS.parent
-TINY = {
-    "worlds": 16,
-    "rollout": 16,
-    "minibatch": 64,
-    "epochs": 1,
-    "evaluate_every": 512,
-    "evaluate_worlds": 4,
-    "dtype": "float64",
-}
+TINY = {"worlds": 16, "rollout": 16, "minibatch": 64, "epochs": 1, "evaluate_every": 512, "evaluate_worlds": 4}
 
 
 @pytest.mark.parametrize("name", sorted(TASKS))

@@ -56,7 +56,6 @@ def test_a_field_may_swing_in_time() -> None:
     np.testing.assert_allclose((end.pos - start.pos)[0, 0], a * way, atol=1e-8)
 
 
-@pytest.mark.slow
 def test_gusts_rise_and_fall_within_a_period() -> None:
     """x of a tracer is the integral of U + G (1 - cos w t) / 2."""
     scene = scene_of(Wind(velocity=(2, 0), gust=(1, 3), period=0.8), Carried())

@@ -203,13 +203,13 @@ REFUSED = -2
 def task_source(task: Task) -> str:
     """Return the source of a task's kernel: its scene's, and one entry point, `play`."""
     d = task.scene.dimension
-    names = list(task.parameters())
+    names = task.parameters()
     unknown = [name for name in task.counts if name not in names]
     if unknown:
         raise TypeError(f"{type(task).__name__}.counts: {unknown[0]!r} is none of its parameters: {', '.join(names)}")
     values = ", ".join(
         f"np.{task.scene.dtype}({value!r})" if name in task.counts else f"numbers[{k}]"
-        for k, (name, value) in enumerate(task.parameters().items())
+        for k, (name, value) in enumerate(names.items())
     )
     frame = (
         "Frame({x}, {v}, {alive}, obstacle_x[:, b], obstacle_radius[b], memory[:, b], key[b], steps[b], "

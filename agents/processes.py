@@ -1,0 +1,132 @@
+"""The same work on many things, side by side: a few processes take one after another, and tell how far they are."""
+
+from __future__ import annotations
+
+import os
+import signal
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Future, ProcessPoolExecutor, wait
+from contextlib import contextmanager
+from multiprocessing import active_children, get_context
+from multiprocessing.connection import Connection
+from typing import Any, TypeVar
+
+__all__ = ["Tell", "quietly", "side_by_side"]
+
+Job = TypeVar("Job")
+Done = TypeVar("Done")
+
+Tell = Callable[..., None]
+"""Called with news, whatever they are."""
+
+
+def side_by_side(work: Callable[[Job, Tell], Done], jobs: Sequence[Job], processes: int, tell: Tell) -> Iterator[Done]:
+    """Yield what comes of every job, in their order, worked off by so many processes.
+
+    Args:
+        work: a function of a module (it is found by name there), called with a job and with whom to tell news.
+        jobs: what it is called with; they and what comes of them travel between processes.
+        processes: how many; each is started anew, so a script needs `if __name__ == "__main__":`.
+        tell: called with the news of all of them, by another thread; no more once it has raised something.
+
+    Raises:
+        OSError: a process was ended from outside.
+        Exception: the first that `work` or `tell` raises. Then, and on Ctrl-C, nobody works on.
+    """
+    context = get_context("spawn")
+    with _heard(context, tell) as (mouth, turn, trouble):
+        others, workers = active_children(), []
+        at_work: list[Future[Done]] = []
+        with ProcessPoolExecutor(processes, context, _begin, (mouth, turn)) as pool:
+            try:
+                with _interrupts_held():
+                    at_work += [pool.submit(_work, work, job) for job in jobs]
+                    workers += [process for process in active_children() if process not in others]
+                for working in at_work:
+                    wait((working, trouble), return_when=FIRST_COMPLETED)
+                    if trouble.done():
+                        break
+                    yield working.result()
+            except BrokenExecutor:
+                raise OSError("one of the processes was ended from outside; is there enough memory?") from None
+            finally:
+                if len(at_work) < len(jobs) or not all(working.done() for working in at_work):
+                    for process in workers:
+                        process.terminate()
+    if trouble.done():
+        trouble.result()
+
+
+@contextmanager
+def _heard(context: Any, tell: Tell) -> Iterator[tuple[Connection, Any, Future[None]]]:
+    """Have what other processes tell passed on by a thread of its own.
+
+    Yields where they tell it, the lock that says whose turn it is to speak, and what has an error of `tell`, if it
+    raised one; after that nothing more is passed on.
+    """
+    ear, mouth = context.Pipe(duplex=False)
+    trouble: Future[None] = Future()
+
+    def listen() -> None:
+        while True:
+            try:
+                news = ear.recv()
+            except Exception:  # nobody is left who could say a word, or finish one
+                return
+            if news is None:
+                return
+            try:
+                if not trouble.done():
+                    tell(*news)
+            except BaseException as error:
+                trouble.set_exception(error)
+
+    listener = threading.Thread(target=listen, daemon=True)
+    listener.start()
+    try:
+        yield mouth, context.Lock(), trouble
+    finally:
+        mouth.send(None)  # closing tells him too, but where a process never took its end of the pipe
+        mouth.close()
+        listener.join()
+        ear.close()
+
+
+@contextmanager
+def _interrupts_held() -> Iterator[None]:
+    """Let whoever is started now never hear of Ctrl-C, where the system can: what this thread holds back, he does."""
+    if not hasattr(signal, "pthread_sigmask"):
+        yield
+        return
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+_tell: Tell
+"""In a process that works for another one: how it tells news."""
+
+
+def _begin(mouth: Connection, turn: Any) -> None:
+    """Get ready in a process that works for another one, beside others like it."""
+    global _tell
+
+    def tell(*news: Any) -> None:
+        with turn:
+            mouth.send(news)
+
+    _tell = tell
+    quietly()
+
+
+def quietly() -> None:
+    """Leave Ctrl-C, and what is said about compiling, to the process that people talk to."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    os.environ["FLOCKENV_QUIET"] = "1"
+
+
+def _work(work: Callable[[Job, Tell], Done], job: Job) -> Done:
+    return work(job, _tell)
