@@ -47,7 +47,7 @@ from flockenv.space import AnySpace, Box, Plane, Torus
 from flockenv.stability import check_contact, check_dt, check_lookahead
 from flockenv.state import Body, Floats, State
 from flockenv.steer import EVERY_EFFECT
-from flockenv.sweep import SHARED, Parts, Table, field_source, flattened, pack, scene_source
+from flockenv.sweep import Parts, Table, field_source, flattened, pack, scene_source
 from flockenv.tree import MOST_DIRECT, tree_sizes
 from flockenv.workspace import Workspace
 
@@ -55,8 +55,6 @@ __all__ = ["Group", "Scene"]
 
 WORTH_SHARING = 4096
 """Agent-steps below which a second thread costs more than it brings: handing work over takes about 20 us."""
-
-SYNC, STAGES = SHARED.split(", ").index("sync"), SHARED.split(", ").index("stages")
 
 EXACT = 2**24
 """Whole numbers, and so numbers of agents, that float32 tells apart."""
@@ -413,7 +411,7 @@ class Scene(Record):
         if self.parts.inner and fresh.any():
             self._kernels.begin(
                 state.x, state.v, *state.carried, state.key, state.tick, self._params, self._dt, fresh,
-                *self._workspaces(1, 1)[0].of(0),
+                *self._workspaces(1, 1)[0].of(0, self._kernels.SCRATCH),
             )  # fmt: skip
 
     def inner(self, state: State, name: str) -> Floats:
@@ -500,9 +498,10 @@ class Scene(Record):
         if given.shape not in ((), (b,)) or not np.isfinite(given).all():
             raise ValueError(f"times is {times!r}, must be a finite number for each of {b} worlds, or one for all")
         when = np.ascontiguousarray(np.broadcast_to(given, b), self.dtype)
-        self._field(
+        self._accelerations.field(
             state.x, state.v, *state.carried, state.alive, state.key, state.obstacle_x, state.obstacle_radius,
-            state.work, self._drive(drive, state), self._params, when, acc, flow, *self._workspaces(1, 1)[0].of(0),
+            state.work, self._drive(drive, state), self._params, when, acc, flow,
+            *self._workspaces(1, 1)[0].of(0, self._accelerations.SCRATCH),
         )  # fmt: skip
         return acc.transpose(1, 2, 0), flow.transpose(1, 2, 0) if self.parts.flows else None
 
@@ -517,7 +516,7 @@ class Scene(Record):
     def _take_over(self, state: State, world: int, x: Floats, v: Floats) -> tuple[int, int]:
         """Let the kernel end a step whose positions and velocities, (D, N), were solved for: limits, space, time."""
         width, (_, n) = self.parts.width, x.shape
-        stages = self._workspaces(1, 1)[0].shared[STAGES]
+        stages = self._workspaces(1, 1)[0].arrays["stages"]
         for row, solved in zip(stages, (x, v), strict=True):
             padded = np.zeros((self.dimension, -(-n // width) * width), self.dtype)
             padded[:, :n] = solved
@@ -596,7 +595,7 @@ class Scene(Record):
         Threads take worlds apart, or, of a large world, its agents.
         """
         worlds, agents, _ = state.shape
-        move = self._kernels.step
+        move, scratch = self._kernels.step, self._kernels.SCRATCH
         crew = threads() if worlds * agents * steps >= WORTH_SHARING else 1
         team = crew if worlds < crew and agents >= WORTH_SHARING and not self.integrator.adaptive else 1
         crew = crew if team > 1 else min(crew, worlds)
@@ -605,13 +604,14 @@ class Scene(Record):
             state.obstacle_radius, state.work, drive, self._params, self._dt, steps,
         )  # fmt: skip
         if crew == 1:
-            return move(*arrays, 0, worlds, 0, 1, *self._workspaces(1, 1)[0].of(0))  # type: ignore[no-any-return]
+            only = self._workspaces(1, 1)[0]
+            return move(*arrays, 0, worlds, 0, 1, *only.of(0, scratch))  # type: ignore[no-any-return]
         spaces = self._workspaces(crew // team, team)
-        spaces[0].shared[SYNC][:] = 0
+        spaces[0].arrays["sync"][:] = 0
         found = share([
             functools.partial(
                 move, *arrays, *((0, worlds) if team > 1 else (worlds * k // crew, worlds * (k + 1) // crew)),
-                k % team, team, *spaces[k // team].of(k % team),
+                k % team, team, *spaces[k // team].of(k % team, scratch),
             )
             for k in range(crew)
         ])  # fmt: skip
@@ -662,9 +662,9 @@ class Scene(Record):
         return np.dtype(self.dtype).type(self.dt)
 
     @functools.cached_property
-    def _field(self) -> Any:
+    def _accelerations(self) -> Any:
         plain = dataclasses.replace(self.parts, integrator=SemiImplicitEuler())  # the method makes no difference
-        return load("field", field_source(plain)).field
+        return load("field", field_source(plain))
 
     @functools.cached_property
     def _kernels(self) -> Any:

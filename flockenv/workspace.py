@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import mmap
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -14,7 +14,7 @@ from flockenv.effects.base import ties
 from flockenv.kernels import LINE
 from flockenv.neighbours import MAX_RANGES, WORTH_ARRANGING
 from flockenv.state import Body
-from flockenv.sweep import SHARED, SMALL_STRIDE, Parts, Table
+from flockenv.sweep import SMALL_STRIDE, Parts, Table
 from flockenv.tree import BUCKETS, LEVELS, tree_sizes
 
 __all__ = ["Workspace"]
@@ -30,12 +30,13 @@ GAP = 5 * LINE
 class Workspace:
     """Scratch of a team of threads that step one world: what a step writes and nobody reads afterwards."""
 
-    shared: tuple[NDArray[Any], ...]
-    own: tuple[tuple[NDArray[Any], NDArray[Any]], ...]  # lanes and ranges of each thread
+    arrays: dict[str, NDArray[Any]]
+    own: tuple[dict[str, NDArray[Any]], ...]  # lanes and ranges of each thread
+    _given: dict[tuple[int, str], tuple[NDArray[Any], ...]] = field(default_factory=dict)
 
     @classmethod
     def allocate(cls, parts: Parts, body: Body, table: Table, team: int = 1) -> Workspace:
-        """Return scratch for the sweep, the query and the integrator, in the order of sweep.SHARED."""
+        """Return scratch for the sweep, the query and the integrator, by the names of sweep.SHARED."""
         d, agents, dtype = parts.dimension, len(body.mass), body.mass.dtype
         width = parts.width
         padded = -(-agents // width) * width
@@ -84,12 +85,15 @@ class Workspace:
         arrays["number"] = np.arange(width, dtype=np.int32)
         arrays |= {"bond_place": table.place, "bond_number": table.number, "bond_start": table.start}
         lanes = {"lanes": (len(parts.slots) * width, np.dtype(dtype))}
-        own = tuple((_zeros(lanes)["lanes"], np.zeros((MAX_RANGES, 3), np.int64)) for _ in range(team))
-        return cls(tuple(arrays[name] for name in SHARED.split(", ")[:-2]), own)
+        own = tuple(_zeros(lanes) | {"ranges": np.zeros((MAX_RANGES, 3), np.int64)} for _ in range(team))
+        return cls(arrays, own)
 
-    def of(self, rank: int) -> tuple[NDArray[Any], ...]:
-        """Return the arrays that one of the team is given."""
-        return (*self.shared, *self.own[rank])
+    def of(self, rank: int, names: str) -> tuple[NDArray[Any], ...]:
+        """Return what one of the team is given: the arrays of these names, "pos, vel, ..."."""
+        if (rank, names) not in self._given:
+            arrays = self.arrays | self.own[rank]
+            self._given[rank, names] = tuple(arrays[name] for name in names.split(", "))
+        return self._given[rank, names]
 
 
 def _zeros(wanted: Mapping[str, tuple[int | tuple[int, ...], np.dtype[Any]]]) -> dict[str, NDArray[Any]]:

@@ -131,7 +131,8 @@ class World:
             for many in (look.agents, look.obstacles)
             for shape, kind in (((many, padded), real), ((many, padded), np.int32), ((padded,), np.int32))
         ]
-        return decision, (*near, *Workspace.allocate(task.parts, scene.body, pack(task.parts, n, scene.groups)).of(0))
+        space = Workspace.allocate(task.parts, scene.body, pack(task.parts, n, scene.groups))
+        return decision, (*near, *space.of(0, self._kernel.SCRATCH))
 
     def __getstate__(self) -> dict[str, Any]:
         """Pickle what cannot be made anew."""

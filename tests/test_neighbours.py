@@ -136,11 +136,14 @@ def uniform(count: int, size: Any, seed: int = 0) -> Array:
     return np.random.default_rng(seed).random((count, len(size))) * size
 
 
+@pytest.mark.parametrize("alone", [False, pytest.param(True, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("rule", [0, 1, 2])
 @pytest.mark.parametrize("count", [50, 95, 96, 400, 3000])
-def test_in_a_plane_every_rule_meets_exactly_its_neighbours(rule: int, count: int) -> None:
+def test_in_a_plane_every_rule_meets_exactly_its_neighbours(rule: int, count: int, alone: bool) -> None:
+    """In a kernel of its own, or beside two that weigh nothing."""
     edge = math.sqrt(count / 4)
-    after = assert_as_expected((rules(1.0)[rule],), uniform(count, (edge, edge)) - 3.0, None)
+    effects = (rules(1.0)[rule],) if alone else rules(1.0, chosen=rule)
+    after = assert_as_expected(effects, uniform(count, (edge, edge)) - 3.0, None)
     met = after.counted("pairs") / count**2
     assert met == 1 if count < 96 else met < {96: 1.01, 400: 0.5, 3000: 0.06}[count]  # a grid was used at all
 

@@ -24,7 +24,6 @@ from flockenv.shapes import Block, Circle
 from flockenv.space import Box, Plane, Space, Torus
 from flockenv.spawn import Spawn
 from flockenv.state import State
-from flockenv.sweep import SHARED
 from flockenv.workspace import Workspace
 from tests.catalogue import INTEGRATORS, TETHER, VARIANTS, Array, Variant, everything, scene_of, users_module
 
@@ -471,8 +470,8 @@ def test_a_bad_start_is_refused_in_one_line(call: Any, said: str) -> None:
 def taken(scene: Scene) -> int:
     """Bytes of a state of one world, the bodies, and the scratch of one thread."""
     state, scratch = scene.start(0), Workspace.allocate(scene.parts, scene.body, scene.table)
-    own = [array for arrays in scratch.own for array in arrays]
-    arrays = [*(getattr(state, name) for name in ARRAYS), *scene.body.arrays(), *scratch.shared, *own]
+    own = [array for arrays in scratch.own for array in arrays.values()]
+    arrays = [*(getattr(state, name) for name in ARRAYS), *scene.body.arrays(), *scratch.arrays.values(), *own]
     return sum(array.nbytes for array in arrays)
 
 
@@ -500,12 +499,12 @@ def test_a_scene_of_gravity_alone_takes_memory_for_nothing_else() -> None:
     """No neighbours, bonds, tree, medium, walls: none of their arrays grows with the agents, and nothing is counted."""
     gravity = Gravity(acceleration=(0, -9.81))
     scenes = [scene_of(gravity, groups=(Group(count=n, spawn=Spawn(low=(0, 0), high=(9, 9))),)) for n in (160, 1600)]
-    few, many = (
-        dict(zip(SHARED.split(", "), Workspace.allocate(s.parts, s.body, s.table).of(0), strict=True)) for s in scenes
-    )
+    few, many = (Workspace.allocate(s.parts, s.body, s.table).arrays for s in scenes)
     growing = {name for name in few if many[name].size > few[name].size}
     body = {"mass", "radius", "max_speed", "max_force", "living", "ident"}
     assert growing == {"pos", "vel", "origin", "stages", "want"} | body
+    handed = set(scenes[0]._kernels.SCRATCH.split(", "))
+    assert growing < handed < growing | {"frame", "tally", "sync", "lanes"}  # of agents, threads, and who is not finite
     start = scenes[0].start(0)
     end = scenes[0].step(start, steps=3)
     assert end.counted("evaluations") == 3

@@ -331,8 +331,8 @@ def test_who_keeps_no_heading_pays_nothing() -> None:
     assert "turned(" not in scene_source(kept.parts).split("FAST =")[1]
     assert plain.bytes_per_world() < kept.bytes_per_world()
     scratch = Workspace.allocate(plain.parts, plain.body, plain.table)
-    assert sum(a.nbytes for a in scratch.shared) < sum(
-        a.nbytes for a in Workspace.allocate(kept.parts, kept.body, kept.table).shared
+    assert sum(a.nbytes for a in scratch.arrays.values()) < sum(
+        a.nbytes for a in Workspace.allocate(kept.parts, kept.body, kept.table).arrays.values()
     )
 
 

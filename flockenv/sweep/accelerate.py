@@ -23,6 +23,7 @@ from flockenv.sweep.text import (
     lane,
     lanes_of,
     nearest_images,
+    needed,
     tuple_of,
 )
 
@@ -33,20 +34,30 @@ def accelerate(parts: Parts) -> str:
     """Return the source of `accelerate`: pair laws first, then each agent by itself, block after block."""
     d = parts.dimension
     me = ["i = row + l", f"x, v = {lanes_of(parts, 'pos')}, {lanes_of(parts, 'vel')}", f"me = {alone(parts)}"]
+    read = [*frame_views(parts), *parameters(parts)]
+    sensing = [*_aim(parts), *pairs(parts), *far(parts), *bonds(parts)]
+    folding = obstacles(parts, me, lambda k: felt_as(parts, f"n{k}_"))
+    responding = [
+        *me,
+        "o = zero(x)",
+        f"s, f = {lanes_of(parts, 'want')}, o",
+        *(f"{parts.target(k)} = o" for k in parts.wishes),
+        *nearest_images(parts, list(enumerate(parts.effects))),
+        *_medium(parts),
+        *_own(parts),
+        *_felt(parts),
+        *_reconcile(parts),
+    ]
     return f'''
 
 @kernel
 def sense(context, pos, vel, time):
     """Write what this thread's agents of one world feel from others, at this instant, whatever law it is by."""
     {CONTEXT} = context
-{indented(frame_views(parts), 4)}
-{indented(parameters(parts), 4)}
+{indented(needed(read, sensing), 4)}
     if rank == 0:
         work[b, 0] += 1
-{indented(_aim(parts), 4)}
-{indented(pairs(parts), 4)}
-{indented(far(parts), 4)}
-{indented(bonds(parts), 4)}
+{indented(sensing, 4)}
 
 
 @kernel
@@ -54,21 +65,12 @@ def respond(around, pos, vel, time, acc):
     """Acceleration of the agents of some of this thread's blocks, m/s^2, once all is sensed."""
     context, first_, end_ = around
     {CONTEXT} = context
-{indented(frame_views(parts), 4)}
-{indented(parameters(parts), 4)}
+{indented(needed(read, [*folding, *responding, *_carry(parts)]), 4)}
     for block in range(np.uint64(first_), np.uint64(end_)):
         base, row = block * np.uint64({d * parts.width}), block * np.uint64({parts.width})
-{indented(obstacles(parts, me, lambda k: felt_as(parts, f"n{k}_")), 8)}
+{indented(folding, 8)}
         for l in range(np.uint64({parts.width})):
-{indented(me, 12)}
-            o = zero(x)
-            s, f = {lanes_of(parts, "want")}, o
-{indented([f"{parts.target(k)} = o" for k in parts.wishes], 12)}
-{indented(nearest_images(parts, list(enumerate(parts.effects))), 12)}
-{indented(_medium(parts), 12)}
-{indented(_own(parts), 12)}
-{indented(_felt(parts), 12)}
-{indented(_reconcile(parts), 12)}
+{indented(responding, 12)}
             s = limit(s, max_force[i])
             # a choice, not a factor of 0: a law may be infinite where the dead, what is held in place (by an infinite
             # mass) and the lanes beyond the last agent lie

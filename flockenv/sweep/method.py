@@ -8,7 +8,7 @@ import inspect
 from flockenv.integrators.base import PROVIDED, SUBSTEPS
 from flockenv.sweep.accelerate import parameters
 from flockenv.sweep.parts import Parts
-from flockenv.sweep.text import CONTEXT, indented
+from flockenv.sweep.text import CONTEXT, indented, needed
 
 __all__ = ["method", "method_imports"]
 
@@ -61,7 +61,7 @@ def _damping(parts: Parts) -> str:
 def damping(around, rate, begin, until):
     """The sum of all linear drags of every coordinate, 1/s."""
     {CONTEXT} = around[0]
-{indented(parameters(parts), 4)}
+{indented(needed(parameters(parts), rates), 4)}
     c = {" + ".join(rates) or "like(mass[0], 0.0)"}
     for block in range(np.uint64(begin // {d * w}), np.uint64(until // {d * w})):
         base, row = block * np.uint64({d * w}), block * np.uint64({w})

@@ -6,13 +6,16 @@ lanes would stay scalar.
 
 from __future__ import annotations
 
+import re
+from collections.abc import Sequence
+
 from flockenv.effects.base import Effect
 from flockenv.kernels import LINE
 from flockenv.sweep.parts import Parts
 
 __all__ = [
     "CONTEXT", "SHARED", "Slots", "alone", "copied", "frame_views", "given", "indented", "indented_lines", "inner_of",
-    "lane", "lanes_of", "nearest_image", "nearest_images", "place_of", "tuple_of",
+    "lane", "lanes_of", "nearest_image", "nearest_images", "needed", "place_of", "tuple_of",
 ]  # fmt: skip
 
 _READ = (
@@ -21,7 +24,8 @@ _READ = (
     "tree_place, tree_digit, tree_leaf, tree_node, tree_near, number, lanes, ranges"
 )
 SHARED = f"pos, vel, origin, stages, {_READ}"
-"""Scratch of one world in progress, in order; see workspace.Workspace. The last two belong to one thread."""
+"""Scratch of one world in progress, in order; see workspace.Workspace. The last two belong to one thread. Of these
+and the next, a source keeps what it names (`handed.trimmed`)."""
 
 CONTEXT = f"obstacle_x, obstacle_radius, work, params, key, b, n, present, arranged, first, end, rank, team, {_READ}"
 """What an acceleration is given beside positions and velocities, in order."""
@@ -90,6 +94,18 @@ def frame_views(parts: Parts) -> list[str]:
     vectors = [f"{name} = frame[{k} * len(pos) :]" for k, name in enumerate(blocks)]
     begin, each = f"{len(blocks)} * len(pos)", f"len(pos) // {parts.dimension}"
     return vectors + [f"{name} = frame[{begin} + {k} * {each} :]" for k, name in enumerate(numbers)]
+
+
+def needed(lines: Sequence[str], body: Sequence[str]) -> list[str]:
+    """Leave away those of some lines `name, other = value` that name nothing which the body, or a later one, reads."""
+    kept: list[str] = []
+    read = set(re.findall(r"\w+", "\n".join(body)))
+    for line in reversed(lines):
+        names, _, value = line.partition(" = ")
+        if read.intersection(names.split(", ")):
+            kept.insert(0, line)
+            read.update(re.findall(r"\w+", value))
+    return kept
 
 
 def copied(parts: Parts, to: str, at: str, source: str, place: str) -> list[str]:

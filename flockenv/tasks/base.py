@@ -224,10 +224,7 @@ def task_source(task: Task) -> str:
         f"x, v, {task.parts.frame_argument}alive, tick, obstacle_x, obstacle_radius, work, key, memory, steps, params, "
         "numbers, table"
     )
-    return (
-        scene_source(task.parts)
-        + look_source(task.parts)
-        + f'''
+    play = f'''
 
 from flockenv.tasks.base import Frame
 from flockenv.vehicle import face
@@ -315,4 +312,4 @@ def play(
         observe(p, now, rows[b])
     return broken, who
 '''
-    )
+    return scene_source(task.parts, look_source(task.parts) + play)
