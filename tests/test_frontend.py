@@ -10,10 +10,11 @@ from typing import Any
 import numba
 import numpy as np
 import pytest
+from llvmlite.binding import get_host_cpu_features
 
 from flockenv import frontend
 from flockenv.inlining import Whole
-from flockenv.kernels import law, load
+from flockenv.kernels import law, load, unaliased
 from flockenv.sweep.source import scene_source
 from flockenv.vec import add, dot, scale
 from tests.catalogue import EFFECTS, scene_under
@@ -99,6 +100,22 @@ def machine_code(pipeline: Any) -> str:
 def test_the_machine_code_is_what_numba_makes_on_its_own() -> None:
     assert machine_code(Whole) == machine_code(None)
     assert machine_code(Whole).count("\n") > 50
+
+
+def doubled(x: Any) -> None:
+    unaliased()
+    for k in range(len(x)):
+        x[k] = x[k] + x[k]
+
+
+def test_an_entry_point_may_use_the_widest_registers_there_are() -> None:
+    compiled: Any = numba.njit(pipeline_class=Whole, _nrt=False)(doubled)
+    x = np.arange(100.0)
+    compiled(x)
+    np.testing.assert_array_equal(x, 2 * np.arange(100.0))
+    assert '"prefer-vector-width"="512"' in next(iter(compiled.inspect_llvm().values()))
+    if get_host_cpu_features().get("avx512f"):
+        assert "zmm" in next(iter(compiled.inspect_asm().values()))
 
 
 def test_closures_comprehensions_and_reductions_are_still_inlined() -> None:
