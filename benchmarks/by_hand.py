@@ -16,6 +16,7 @@ import numpy as np
 from numba import njit
 
 from flockenv.effects.base import ties
+from flockenv.inlining import Inlined, Whole
 from flockenv.kernels import like, unaliased
 from flockenv.scene import Scene
 from flockenv.state import State
@@ -23,7 +24,7 @@ from flockenv.state import State
 __all__ = ["MIXES", "by_hand"]
 
 FAST: dict[str, Any] = {"fastmath": {"contract"}, "error_model": "numpy", "nogil": True, "_nrt": False}
-PARTS: dict[str, Any] = {"forceinline": True, **FAST}
+PARTS: dict[str, Any] = {"forceinline": True, "pipeline_class": Inlined, **FAST}  # loops made vectors where they run
 WIDTH = 16  # lanes
 ROWS = 9  # of scratch: x, y, vx, vy, the wish, who lives, and where to from somebody in the same place
 
@@ -250,7 +251,7 @@ def _kernel(mix: str, width: int) -> Any:
     """Return the compiled step of a mix."""
     wish, move = MIXES[mix](width), _move(width)
 
-    @njit(**FAST)
+    @njit(pipeline_class=Whole, **FAST)
     def step(x, v, alive, drive, body, work, p, dt, steps, now, want, sums, number):
         unaliased()
         n = x.shape[2]

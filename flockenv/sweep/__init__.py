@@ -11,7 +11,7 @@ scratch array and stay in vector registers.
 The files, as a source is put together: `parts` says what it depends on, `text` holds the smallest pieces of it;
 `query` sorts the agents and walks their blocks, `pairs` lets a block meet its candidates, `far` everybody, `bonds` its
 partners; `accelerate` is the sum of all laws, `method` the integrator, `step` advances worlds by it, `source` is the
-whole file; `look` is what tasks add to it.
+whole file, and `handed` leaves its functions the scratch that they name; `look` is what tasks add to it.
 """
 
 from __future__ import annotations
