@@ -84,7 +84,6 @@ def placed(scene: Scene, *places: Any, worlds: int = 1, velocity: Any = 0.0) -> 
 # --- closed forms -----------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.slow
 def test_hunger_grows_with_time_and_effort_and_stops_at_starved() -> None:
     scene = tank(mortal=False, force=0.0)
     state = placed(scene, velocity=(1.0, 0.0))  # half of max_speed, and nobody can change that
@@ -98,7 +97,6 @@ def test_hunger_grows_with_time_and_effort_and_stops_at_starved() -> None:
     np.testing.assert_array_equal(scene.inner(state, "hunger")[0, FISH + HUNTERS :], 0)
 
 
-@pytest.mark.slow
 def test_food_grows_as_verhulst_says_whatever_the_step() -> None:
     scene = tank(force=0.0)
     state = scene.run(placed(scene), 200)
@@ -108,7 +106,6 @@ def test_food_grows_as_verhulst_says_whatever_the_step() -> None:
     np.testing.assert_array_equal(scene.inner(state, "food")[0, :-PATCHES], 0)
 
 
-@pytest.mark.slow
 def test_what_fish_eat_is_what_food_loses_and_takes_their_hunger() -> None:
     scene = tank(mortal=False, force=0.0, grazing={"growth": 0.0}, hungry={"rate": 0.0, "effort": 0.0})
     # two at the first patch, one between both, one beside; the first patch has most of it eaten
@@ -123,7 +120,6 @@ def test_what_fish_eat_is_what_food_loses_and_takes_their_hunger() -> None:
     np.testing.assert_array_equal(eaten[0, 3:], 0)
 
 
-@pytest.mark.slow
 def test_fear_is_of_what_is_seen_and_fades() -> None:
     scene = tank(mortal=False, force=0.0, predation={"meal": 0.0})
     hunters = [(0, 0), (0, 3)]
@@ -140,7 +136,6 @@ def test_fear_is_of_what_is_seen_and_fades() -> None:
     np.testing.assert_allclose(scene.inner(state, "fear")[0, 0], 0.9 * np.exp(-2 / 3), rtol=1e-6)
 
 
-@pytest.mark.slow
 def test_two_who_would_mate_and_one_who_is_hungry_does_not() -> None:
     scene = tank(mortal=False, force=0.0, hungry={"rate": 0.0, "effort": 0.0, "start": 0.2, "spread": 0.0})
     state = placed(scene, [(0, 0), (0.5, 0), (0, 9), (0.5, 9)])
@@ -154,7 +149,6 @@ def test_two_who_would_mate_and_one_who_is_hungry_does_not() -> None:
     np.testing.assert_allclose(urge[2:], 0.05 * 202 * 0.05, rtol=1e-12)
 
 
-@pytest.mark.slow
 def test_who_is_caught_or_starved_dies_and_feeds_a_hunter_who_then_lets_go() -> None:
     hungry = {"rate": 0.02, "effort": 0.0, "start": 0.5, "spread": 0.0}
     scene = tank(force=0.0, hungry=hungry, predation={"meal": 0.6})
@@ -208,7 +202,6 @@ def test_only_what_is_always_heard_and_the_state_s_own_behaviours_are_granted() 
         Steer(arbitration=Intentions(when=("eat",)), behaviours=(Wander(weight=1), Wander(weight=2)))
 
 
-@pytest.mark.slow
 def test_fish_flee_what_they_see_and_not_what_they_do_not() -> None:
     scene = tank(mortal=False, predation={"meal": 0.0}, hungry={"start": 0.2, "spread": 0.0})
     state = placed(scene, [(3, 0), (-3, 0)], [(0, 0)], velocity=(-0.5, 0.0))  # one heads for it, one away from it
@@ -232,7 +225,6 @@ def test_what_is_granted_is_told() -> None:
     assert share[1, 5] > 0
 
 
-@pytest.mark.slow
 def test_the_hungry_eat_and_neither_order_batch_nor_threads_matter() -> None:
     scene = tank()
     near = [(0.3 * k, 0.4 * (k % 2)) for k in range(FISH)]
