@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from flockenv import state as states
+from flockenv.abreast import apart
 from flockenv.crew import share, threads
 from flockenv.kernels import load
 from flockenv.noise import MASK, keys_of
@@ -44,7 +45,7 @@ class Step(NamedTuple):
 
     observation: Rows  # (B, L, O)
     reward: NDArray[np.float64]  # (B, L)
-    terms: NDArray[np.float64]  # (B, L, K), reward = sum over K
+    terms: NDArray[np.float64]  # (B, L, K), reward = sum over K; each term in one piece
     terminated: NDArray[np.bool_]  # (B, L)
     truncated: NDArray[np.bool_]  # (B,) the time limit, nothing else
     success: NDArray[np.bool_]  # (B,)
@@ -83,7 +84,7 @@ class World:
             scene.parts.frame_rows, inner_rows=len(scene.parts.inner),
         )  # fmt: skip
         self.steps: Final = np.zeros(self.worlds, np.int64)
-        self.paid: Final = np.zeros((self.worlds, self.learners, len(task.terms)))  # terms, summed over the episode
+        self._paid: Final = np.zeros((len(task.terms), self.worlds, self.learners))
         self._memory: Final = np.zeros((task.memory, self.worlds, self.agents), scene.dtype)
         self._sums: Final = np.zeros((self.worlds, len(task.measures)))
         self._last: Final = np.zeros((self.worlds, len(task.measures)))
@@ -104,13 +105,13 @@ class World:
         )  # fmt: skip
         self._clock = (np.dtype(real).type(scene.dt), task.substeps, not task.ends_together)
         self._scratch = [self._allocate()]
-        self._kept = (self._last, self._sums, self.paid)
+        self._kept = (self._last, self._sums, self._paid)
         self._measured = [dict(zip(task.measures, a.T, strict=True)) for a in (self._sums, self._last)]
         fields = (
-            ((b, i, self.observation_size), np.float32), ((b, i), float), ((b, i, len(task.terms)), float),
+            ((b, i, self.observation_size), np.float32), ((b, i), float), ((len(task.terms), b, i), float),
             ((b, i), bool), ((b,), bool), ((b,), bool), ((b, i), bool),
         )  # fmt: skip
-        self._shapes = tuple(shape for shape, _ in fields)  # of a Step
+        self._shapes = tuple(shape for shape, _ in fields)  # of a Step, whose terms lie one after the other
         self._dtypes = tuple(np.dtype(kind) for _, kind in fields)
         self._everywhere = np.ones(b, np.bool_)
         self._untold = tuple(np.empty(shape, kind) for shape, kind in fields[1:])  # what a reset says nothing of
@@ -122,10 +123,13 @@ class World:
         task, scene, n = self.task, self.task.scene, self.agents
         d, real, look = scene.dimension, scene.dtype, task.look or Look(0.0)
         padded = -(-n // task.parts.width) * task.parts.width
-        decision = (
+        decision: tuple[NDArray[Any], ...] = (
             np.zeros((d, 1, n), real), np.zeros((d, n), real), np.zeros((d, n), real), np.zeros(n, np.bool_),
-            np.zeros((self.learners, self.action_size)),
+            np.zeros((self.action_size + len(task.terms)) * apart(self.learners)),
         )  # fmt: skip
+        if task.abreast:
+            beside = np.zeros(task.abreast * apart(self.learners), np.float32)
+            decision += (np.zeros((2 * d + task.memory + 1, padded), real), beside)
         near = [
             np.zeros(shape, kind)
             for many in (look.agents, look.obstacles)
@@ -173,11 +177,8 @@ class World:
             raise ValueError(f"into has shape {into.shape} and type {into.dtype}, expected {self._shapes[0]} float32")
         self._seed(seeds, rows)
         observation: Rows = self._empty(self._shapes[0], self._dtypes[0]) if into is None else into
-        decision, rest = self._scratch[0]
-        self._kernel.play(
-            False, rows, into is None, False, 0, self.worlds, self._actions, *self._worlds, *self._clock, 0,
-            *decision, *rest, *self._kept, observation, *self._untold,
-        )  # fmt: skip
+        begun = self.worlds if into is None else int(np.count_nonzero(rows))
+        self._play((False, rows, into is None), begun, 0, (observation, *self._untold))
         for numbers in (self._sums, self._last, self.paid):
             numbers[rows] = 0
         return observation
@@ -211,36 +212,47 @@ class World:
         """The seed of each world; empty before the first reset."""
         return () if self._seeds is None else tuple(self._seeds.tolist())
 
+    @property
+    def paid(self) -> NDArray[np.float64]:
+        """(B, L, K): terms, summed over the episode; a view of what is counted."""
+        return self._paid.transpose(1, 2, 0)
+
     def step(self, actions: ArrayLike) -> Step:
         """Let everybody act for control_dt; actions (B, L, A), clipped to [-1, 1]."""
         if self._seeds is None:
             raise RuntimeError("step before the first reset: call reset() first")
         self._take(actions)
-        step = Step(*map(self._empty, self._shapes, self._dtypes))
+        rows, reward, terms, over, late, success, present = told = tuple(map(self._empty, self._shapes, self._dtypes))
         limit = _NEVER if self.time_limit is None else min(int(self.time_limit), _NEVER)
-        world, who = self._decide(limit, step)
+        world, who = self._play((True, self._everywhere, True), self.worlds, limit, told)
         if world == REFUSED:
             self._refuse()
         if world >= 0:
             raise FloatingPointError(f"world {world}, agent {who}: not finite at t = {self.state.time[world]:g} s")
-        return step
+        return Step(rows, reward, terms.transpose(1, 2, 0), over, late, success, present)
 
-    def _decide(self, limit: int, step: Step) -> tuple[int, int]:
-        """Let all worlds take one decision, by several threads if that pays; return who is not finite, or (-1, -1)."""
-        crew = min(threads(), self.worlds) if self.worlds * self.agents * self.task.substeps >= WORTH_SHARING else 1
+    def _play(
+        self, what: tuple[bool, NDArray[np.bool_], bool], busy: int, limit: int, told: tuple[NDArray[Any], ...]
+    ) -> tuple[int, int]:
+        """Let worlds decide or begin, by several threads if so many `busy` worlds are worth it.
+
+        what: acting; which worlds begin if not; is everybody observed? Return who is not finite, or (-1, -1).
+        """
+        acting = what[0]
+        crew = min(threads(), busy) if busy * self.agents * self.task.substeps >= WORTH_SHARING else 1
         while len(self._scratch) < crew:
             self._scratch.append(self._allocate())
 
         def part(k: int, check: bool, first: int, end: int) -> tuple[int, int]:
             decision, rest = self._scratch[k]
             return self._kernel.play(  # type: ignore[no-any-return]
-                True, self._everywhere, True, check, first, end, self._actions, *self._worlds, *self._clock, limit,
-                *decision, *rest, *self._kept, *step,
+                *what, check, first, end, self._actions, *self._worlds, *self._clock, limit,
+                *decision, *rest, *self._kept, *told,
             )  # fmt: skip
 
         if crew == 1:
-            return part(0, True, 0, self.worlds)
-        if not np.isfinite(self._actions).all():  # nobody moves before all were looked at
+            return part(0, acting, 0, self.worlds)
+        if acting and not np.isfinite(self._actions).all():  # nobody moves before all were looked at
             return REFUSED, 0
         portions = min(crew * PORTIONS, self.worlds)
         turn = itertools.count()  # whoever is done takes the next: threads do not begin at the same time

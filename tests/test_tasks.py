@@ -101,14 +101,15 @@ def test_a_task_is_a_value_and_names_what_it_has(row: TaskRow) -> None:
 
 def test_a_kernel_knows_what_its_loops_count_to_and_no_other_number() -> None:
     source = task_source(Flock())
-    for name in Flock.counts:
+    for name in ("neighbours", "obstacles_seen", "rays"):
         assert task_source(Flock(**{name: 5})) != source
+    assert task_source(Flock(agents=5)) != source == task_source(Flock(agents=40))  # 4 others at most are listed
     assert task_source(Flock(touch_cost=3.0, sight=7.0, obstacle_count=2)) == source
 
 
 @pytest.mark.slow
 def test_what_is_counted_to_is_the_same_written_out_or_given(monkeypatch: pytest.MonkeyPatch) -> None:
-    """In single precision, in which policies learn: a number of the wrong kind would promote what it meets."""
+    """In single precision. Norms are fused one way or the other, so last bits of terms may differ."""
     task = Flock(agents=5, neighbours=3, obstacles_seen=1, rays=8, dtype="float32")
     ends = []
     for counts in (Flock.counts, ()):
@@ -116,8 +117,9 @@ def test_what_is_counted_to_is_the_same_written_out_or_given(monkeypatch: pytest
         world = world_of(task, worlds=3)
         steps = [world.step(actions) for actions in random_actions(world, 40)]
         ends.append((np.array([s.observation for s in steps]), np.array([s.terms for s in steps])))
-    for ours, theirs in zip(*ends, strict=True):
-        np.testing.assert_array_equal(ours, theirs)
+    (seen, terms), (seen_too, terms_too) = ends
+    np.testing.assert_array_equal(seen, seen_too)
+    np.testing.assert_allclose(terms, terms_too, rtol=1e-6, atol=1e-9)
 
 
 def test_a_count_that_is_no_parameter_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -222,6 +224,8 @@ for name, task, before, after, action, terms, observation in pickle.load(open(sy
     module.reward(p, before, after._replace(alive=before.alive), action, found)
     module.ended(p, before, after._replace(alive=after.alive.copy()), np.zeros(len(terms), bool))
     module.measure(p, before, after, np.zeros(len(task.measures)))
+    if task.abreast:
+        module.abreast(p, after, rows[:, : task.abreast])
     module.observe(p, after, rows)
     np.testing.assert_allclose(found, terms, rtol=1e-9, atol=1e-9, err_msg=name)
     np.testing.assert_allclose(rows, observation, atol=2e-6, err_msg=name)
@@ -622,6 +626,26 @@ def test_a_boid_alone_pays_for_it() -> None:
     _, a, _ = pair(15.0, (2, 0), (2, 0))
     assert a["together"] == pytest.approx(-0.5 * 0.1)
     assert a["alignment"] == pytest.approx(-0.5 * 0.1)
+
+
+def test_a_boid_that_is_absent_is_neither_seen_nor_paid_for_touching() -> None:
+    """The lists of the decision before, when it touched, are not read again."""
+    world, a, b = pair(0.5, (1, 0), (1, 0))
+    assert a["touch"] == b["touch"] < 0
+    world.state.alive[0, 1] = False
+    step = act(world)
+    for learner in (0, 1):
+        assert paid(world, step, learner)["touch"] == 0
+        assert paid(world, step, learner)["together"] == pytest.approx(-0.5 * 0.1)
+    assert not world.task.layout.unpack(step.observation).neighbour_present.any()
+
+
+def test_few_learners_see_what_many_see() -> None:
+    """Rows of sixteen agents and more are made of squares, of fewer one number after the other."""
+    whole = World(Flock(agents=24), 2).reset(5)
+    for learners in (1, 15, 16, 17, 23):
+        part = World(Flock(agents=24, learners=learners), 2).reset(5)
+        np.testing.assert_array_equal(part, whole[:, :learners])
 
 
 def test_a_boid_in_an_obstacle_pays() -> None:

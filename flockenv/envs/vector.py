@@ -252,8 +252,8 @@ class WorldsEnv(VectorEnv[Rows, Rows, Rows]):
 
     def _columns(self, result: Step) -> tuple[Info, dict[str, Mask]]:
         """Return what is told of every row, and of which rows a metric has no value yet (and zero in its place)."""
-        terms = result.terms.reshape(self.num_envs, -1)
-        columns: Info = {"terms": {name: terms[:, k] for k, name in enumerate(self.task.terms)}}
+        terms = {name: result.terms[..., k].reshape(-1) for k, name in enumerate(self.task.terms)}
+        columns: Info = {"terms": terms}
         columns["is_success"] = self._rows(result.success)
         lacks = {}
         for name, column in self.world.measure().items():

@@ -24,7 +24,10 @@ def look(
     x_, alive, obstacle_x, obstacle_radius, b, params,
     near_square, near_who, near_count, obstacle_gap, obstacle_who, obstacle_count, {SHARED},
 ):
-    """Write, for every agent of world b, the nearest agents (K, N) and obstacles (J, N), and how many (N,)."""
+    """Write, for every agent of world b, the nearest agents (K, N) and obstacles (J, N), and how many (N,).
+
+    Where there is none, it is infinitely far, and somebody's number stands there.
+    """
     n, rank, team = x_.shape[2], 0, 1
     first, end = 0, (n + {parts.width - 1}) // {parts.width}
     size, reach, within = {tuple_of("params[#]", parts.dimension)}, params[{at}], params[{at + 1}]
@@ -32,8 +35,10 @@ def look(
     for i in range(n):
         present += alive[b, i]
         living[i] = alive[b, i]
+    for i in range(n if present < n else 0):  # who is absent is not asked, and everybody's obstacles are told
         near_count[i] = 0
-        obstacle_count[i] = 0
+        for k in range(near_square.shape[0]):
+            near_square[k, i] = np.inf
     into_blocks(pos, x_, b, n, first, end)
 {indented([*_look_at_agents(parts), *_look_at_obstacles(parts)], 4)}
 '''

@@ -1,16 +1,21 @@
 """Task: what is seen, what is paid, when it ends; functions of frames, over a scene that knows nothing of them.
 
-A task is one file: a frozen record whose fields are the keyword arguments of `make`, and six kernels, or seven, over
-one world:
+A task is one file: a frozen record whose fields are the keyword arguments of `make`, and six kernels, or up to eight,
+over one world:
 
 * `spawn(p, frame)` writes the first positions, velocities, obstacles and memory from the world's key;
 * `drive(p, frame, action, force)` turns actions (L, A) into forces asked for (D, N) N, of scripted agents too;
 * `keep(p, before, after)`, of a task that `keeps` alone, writes into the memory what the others read of this step;
-* `reward(p, before, after, action, terms)` writes the named terms (L, K) and nothing else, as a test checks;
+* `reward(p, before, after, action, terms)` writes the named terms (L, K), each of which lies in one piece, and nothing
+  else, as a test checks;
 * `ended(p, before, after, over) -> success` writes which learners are over (L,), may take agents out of `after.alive`,
   and says whether the aim is reached;
 * `measure(p, before, after, numbers)` writes what this step adds to the domain metrics (Q,);
-* `observe(p, frame, rows)` writes the observation rows (L, O).
+* `abreast(p, frame, columns)`, of a task with numbers `abreast` alone, writes the first so many numbers of all rows,
+  (L, abreast), of which the same number of all agents lies together: loops over agents become vector code. So that
+  none is left over, L is rounded up there and in that task's `reward`; for agents that are not there the frame holds
+  anything, and nobody looks at what follows from it;
+* `observe(p, frame, rows)` writes the observation rows (L, O), or what of them `abreast` left.
 
 `p` holds the task's `parameters()` by name. Learners are the first L agents of a world. Who is near whom is found once
 for all of them, by the same query as a scene's effects, if the task says what it wants to know: its `look`.
@@ -27,6 +32,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
+from flockenv.abreast import apart
 from flockenv.integrators import INTEGRATORS, SemiImplicitEuler
 from flockenv.records import Record
 from flockenv.scene import AnyIntegrator, Scene
@@ -59,10 +65,10 @@ class Frame(NamedTuple):
     max_speed: Any  # (N,) m/s
     max_force: Any  # (N,) N
     # What is near, as the task's `look` asks for it; not in the frame of `before`, whose arrays are empty.
-    near_square: Any  # (K, N) m^2, distances to the nearest agents squared, nearest first
-    near_who: Any  # (K, N) which they are
+    near_square: Any  # (K, N) m^2, distances to the nearest agents squared, nearest first; inf: none
+    near_who: Any  # (K, N) which they are; where there is none, somebody
     near_count: Any  # (N,) how many there are within sight
-    obstacle_gap: Any  # (J, N) m, distances to the surfaces of the nearest obstacles, nearest first
+    obstacle_gap: Any  # (J, N) m, distances to the surfaces of the nearest obstacles; inf: none
     obstacle_who: Any  # (J, N)
     obstacle_count: Any  # (N,)
     table: Any  # (T,) the task's table()
@@ -144,6 +150,11 @@ class Task(Record):
         raise TypeError(f"{type(self).__name__} must lay out its action")
 
     @property
+    def abreast(self) -> int:
+        """How many of a row's first numbers its kernel `abreast` writes; 0 = it has none."""
+        return 0
+
+    @property
     def obstacle_slots(self) -> int:
         """M: obstacles a world may have."""
         return 0
@@ -200,6 +211,17 @@ REFUSED = -2
 """The world that `play` names if an action is no number."""
 
 
+def _frame(
+    x: str = "x[:, b]", v: str = "v[:, b]", alive: str = "alive[b]", memory: str = "memory[:, b]",
+    radius: str = "radius", near: str = NEAR,
+) -> str:  # fmt: skip
+    """Write the frame of world b."""
+    return (
+        f"Frame({x}, {v}, {alive}, obstacle_x[:, b], obstacle_radius[b], {memory}, key[b], steps[b], {radius}, "
+        f"max_speed, max_force, {near}, table)"
+    )
+
+
 def task_source(task: Task) -> str:
     """Return the source of a task's kernel: its scene's, and one entry point, `play`."""
     d = task.scene.dimension
@@ -211,14 +233,13 @@ def task_source(task: Task) -> str:
         f"np.{task.scene.dtype}({value!r})" if name in task.counts else f"numbers[{k}]"
         for k, (name, value) in enumerate(names.items())
     )
-    frame = (
-        "Frame({x}, {v}, {alive}, obstacle_x[:, b], obstacle_radius[b], memory[:, b], key[b], steps[b], "
-        "radius, max_speed, max_force, {near}, table)"
-    )
-    now = frame.format(x="x[:, b]", v="v[:, b]", alive="alive[b]", near=NEAR)
-    empty = ", ".join(f"{name}[:0]" for name in NEAR.split(", "))
-    then = frame.format(x="x0", v="v0", alive="alive0", near=empty)
+    now, empty = _frame(), ", ".join(f"{name}[:0]" for name in NEAR.split(", "))
+    then = _frame(x="x0", v="v0", alive="alive0", near=empty)
     look = f"look(x, alive, obstacle_x, obstacle_radius, b, params, {NEAR}, {SHARED})" if task.look else "pass"
+    size, far = task.action_layout.size, apart(task.learners)
+    fetches = [f"fetch(rows[b], {k}, 4)" if task.abreast else "pass" for k in range(4)]
+    widen, show = _lanes(task) if task.abreast else ("rounded, wide = over.shape[1], now", "pass")
+    optional = [*["keep"] * task.keeps, *["abreast"] * (task.abreast > 0)]
     begin_inner = f"begin_inner(x, v, {task.parts.frame_argument}key, tick, params, dt, alive, b, {SHARED})"
     worlds = (
         f"x, v, {task.parts.frame_argument}alive, tick, obstacle_x, obstacle_radius, work, key, memory, steps, params, "
@@ -226,9 +247,10 @@ def task_source(task: Task) -> str:
     )
     play = f'''
 
+from flockenv.abreast import columns, fetch, into_rows, packed
 from flockenv.tasks.base import Frame
 from flockenv.vehicle import face
-from {type(task).__module__} import {", ".join([*_KERNELS, *["keep"] * task.keeps])}
+from {type(task).__module__} import {", ".join([*_KERNELS, *optional])}
 
 P = namedtuple("P", {" ".join(names)!r})
 
@@ -236,7 +258,7 @@ P = namedtuple("P", {" ".join(names)!r})
 @njit(cache=True, **FAST)
 def play(
     acting, mask, everyone, check, from_world, to_world, actions, {worlds}, dt, count, mortal, limit,
-    force, x0, v0, alive0, action, {NEAR}, {SHARED},
+    force, x0, v0, alive0, decided, {"own, beside, " if task.abreast else ""}{NEAR}, {SHARED},
     measured, sums, paid, rows, payment, terms, over, late, success, present,
 ):
     """Let worlds [from_world, to_world) take a decision, or begin an episode where `mask` says so; and observe them.
@@ -246,10 +268,11 @@ def play(
     and an action is no number. Beginning, it observes the worlds that begin, or everyone.
     """
     unaliased()
-    good = True
+    x, v, memory, obstacle_x = packed(x), packed(v), packed(memory), packed(obstacle_x)
+    action, good = columns(decided, actions.shape[1], {size}, {far}), True
     for b in range(from_world, to_world if acting and check else from_world):
         for i in range(actions.shape[1]):
-            for k in range(actions.shape[2]):
+            for k in range(np.uint64({size})):
                 good &= finite(actions[b, i, k])
     if not good:
         return {REFUSED}, 0
@@ -277,9 +300,10 @@ def play(
                 alive0[i] = alive[b, i]
             for i in range(actions.shape[1]):
                 over[b, i] = False
-                for k in range(actions.shape[2]):
+                for k in range(np.uint64({size})):
                     action[i, k] = min(max(actions[b, i, k], -1.0), 1.0)
             drive(p, {now}, action, force[:, 0])
+            {fetches[0]}  # here and there, for it is written at the end
             into_blocks(want, force, np.int64(0), n, np.int64(0), blocks)
             bad = step_world(
                 x, v, {task.parts.frame_argument}alive, tick, key, obstacle_x, obstacle_radius, work, params, dt,
@@ -289,12 +313,18 @@ def play(
                 broken, who = b, bad
             tick[b] += count if bad < 0 else 0
             steps[b] += 1
+        if acting:
+            {fetches[1]}
         {look}
         now = {now}
+        before = {then}
+        {"if acting: keep(p, before, now)" if task.keeps else "pass"}
+        {widen}
         if acting:
-            before = {then}
-            {"keep(p, before, now)" if task.keeps else "pass"}
-            reward(p, before, now, action, terms[b])
+            {fetches[2]}
+            earns = columns(decided[{size * far} :], rounded, {len(task.terms)}, {far})
+            reward(p, before, wide, action, earns)
+            {fetches[3]}
             success[b] = ended(p, before, now, over[b])
             measure(p, before, now, measured[b])
             late[b] = steps[b] >= limit
@@ -304,12 +334,34 @@ def play(
                 if mortal and over[b, i]:
                     alive[b, i] = False
                 present[b, i] = alive[b, i]
-                total = 0.0
-                for k in range(terms.shape[2]):
-                    total += terms[b, i, k]
-                    paid[b, i, k] += terms[b, i, k]
-                payment[b, i] = total
+            for k in range(terms.shape[0]):
+                for i in range(np.uint64(over.shape[1])):
+                    terms[k, b, i] = earns[i, k]
+                    paid[k, b, i] += earns[i, k]
+                    payment[b, i] = earns[i, k] + (payment[b, i] if k > 0 else 0.0)
+        {show}
         observe(p, now, rows[b])
     return broken, who
 '''
     return scene_source(task.parts, look_source(task.parts) + play)
+
+
+def _lanes(task: Task) -> tuple[str, str]:
+    """Write the frame of a task that shows agents side by side, and what makes rows of what it shows.
+
+    It goes on beyond the last agent, up to whole registers: loops over agents have no rest that goes one by one.
+    """
+    d, width, far = task.scene.dimension, task.parts.width, apart(task.learners)
+    memory, radius = 2 * d, 2 * d + task.memory
+    wide = _frame(f"own[:{d}]", f"own[{d}:{memory}]", memory=f"own[{memory}:{radius}]", radius=f"own[{radius}]")
+    widen = f"""rounded = np.uint64(over.shape[1] + {width - 1}) // np.uint64({width}) * np.uint64({width})
+        for i in range(n):
+            for k in range({d}):
+                own[k, i], own[{d} + k, i] = x[k, b, i], v[k, b, i]
+            for k in range({task.memory}):
+                own[{memory} + k, i] = memory[k, b, i]
+            own[{radius}, i] = radius[i]
+        wide = {wide}"""
+    show = f"""abreast(p, wide, columns(beside, rounded, {task.abreast}, {far}))
+        into_rows(rows[b], beside, {task.abreast}, {far})"""
+    return widen, show

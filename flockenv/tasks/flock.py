@@ -20,7 +20,7 @@ from flockenv.state import State
 from flockenv.sweep import Look
 from flockenv.tasks.base import Frame, Measured, Task
 from flockenv.tasks.layout import Layout, Slot
-from flockenv.tasks.sight import block_ways, compass, offset, put, turned
+from flockenv.tasks.sight import block_ways, compass, offset, turned
 from flockenv.vec import norm, scale, sub, unit
 
 __all__ = ["Flock"]
@@ -158,34 +158,29 @@ def reward(p: Any, before: Frame, after: Frame, action: Any, terms: Any) -> None
     """Terms: progress, alignment, spacing, together, touch, obstacle; each judged of the world after the step."""
     one, o = like(p.sight, 1.0), like(p.sight, 0.0)
     per_cruise, per_spacing, per_slot = one / p.cruise, one / p.spacing, one / p.neighbours
-    for i in range(terms.shape[0]):
+    for i in range(np.uint64(terms.shape[0])):  # no branch in it: agents side by side
         v = (after.vel[0, i], after.vel[1, i])
         along = v[0] * like(one, after.memory[0, i]) + v[1] * like(one, after.memory[1, i])
         found = after.near_count[i]
-        mean, touches = (o, o), o
-        for s in range(found):
-            j = np.uint64(after.near_who[s, i])
-            mean = (mean[0] + after.vel[0, j], mean[1] + after.vel[1, j])
+        mean, touches, inside = (o, o), o, o
+        for s in range(np.uint64(p.listed)):
+            j, there = np.uint64(after.near_who[s, i]), s < np.uint64(found)
+            vx, vy = after.vel[0, j], after.vel[1, j]
+            mean = (mean[0] + (vx if there else o), mean[1] + (vy if there else o))
             contact = after.radius[i] + after.radius[j]
             touches += one if after.near_square[s, i] < contact * contact else o
-        disagree = norm(sub(v, scale(mean, one / like(one, max(found, 1))))) * per_cruise if found > 0 else one
+        for s in range(np.uint64(p.obstacles_seen)):
+            inside += one if after.obstacle_gap[s, i] < after.radius[i] else o
+        seen = like(one, found)
+        disagree = norm(sub(v, scale(mean, one / max(seen, one)))) * per_cruise if found > 0 else one
         gap = np.sqrt(after.near_square[0, i]) if found > 0 else p.sight
         off_speed, off_place = abs(along - p.cruise) * per_cruise, abs(gap - p.spacing) * per_spacing
         terms[i, 0] = p.progress_reward * (one - min(off_speed, one)) * p.control_dt
         terms[i, 1] = -p.alignment_cost * min(disagree, one) * p.control_dt
         terms[i, 2] = -p.spacing_cost * min(off_place, one) * p.control_dt
-        terms[i, 3] = -p.loneliness_cost * (one - like(one, found) * per_slot) * p.control_dt
+        terms[i, 3] = -p.loneliness_cost * (one - seen * per_slot) * p.control_dt
         terms[i, 4] = -p.touch_cost * touches * p.control_dt
-        terms[i, 5] = -p.obstacle_cost * _inside(after, i) * p.control_dt
-
-
-@kernel
-def _inside(frame: Frame, i: int) -> float:
-    """Return how many obstacles agent i touches, of the nearest ones."""
-    touches = 0.0
-    for s in range(frame.obstacle_count[i]):
-        touches += 1.0 if frame.obstacle_gap[s, i] < frame.radius[i] else 0.0
-    return touches
+        terms[i, 5] = -p.obstacle_cost * inside * p.control_dt
 
 
 @kernel
@@ -214,13 +209,16 @@ def _order(frame: Frame) -> tuple[float, float]:
 def _anybody_touches(frame: Frame) -> bool:
     """Is anybody's nearest neighbour, or nearest obstacle, so near that they touch?"""
     touching = False
-    for i in range(frame.pos.shape[1]):
-        if frame.near_count[i] > 0:
-            contact = frame.radius[i] + frame.radius[frame.near_who[0, i]]
-            touching |= frame.near_square[0, i] < contact * contact
-        if frame.obstacle_count[i] > 0:
-            touching |= frame.obstacle_gap[0, i] < frame.radius[i]
+    for i in range(np.uint64(frame.pos.shape[1])):
+        touching |= _touches(frame, i)
     return touching
+
+
+@kernel
+def _touches(frame: Frame, i: int) -> Any:
+    """Does agent i touch its nearest neighbour, or the nearest obstacle? Where there is none, it is infinitely far."""
+    contact = frame.radius[i] + frame.radius[np.uint64(frame.near_who[0, i])]
+    return (frame.near_square[0, i] < contact * contact) | (frame.obstacle_gap[0, i] < frame.radius[i])
 
 
 @kernel
@@ -229,8 +227,10 @@ def measure(p: Any, before: Frame, after: Frame, numbers: Any) -> None:
     numbers[0], numbers[3] = _order(after)
     n = after.pos.shape[1]
     nearest, began = 0.0, 0.0
-    for i in range(n):
+    for i in range(np.uint64(n)):
         nearest += math.sqrt(after.near_square[0, i]) if after.near_count[i] > 0 else p.sight
+        if not _touches(after, i):
+            continue
         for s in range(after.near_count[i]):
             j = after.near_who[s, i]
             contact = after.radius[i] + after.radius[j]
@@ -253,46 +253,91 @@ def _touched(p: Any, frame: Frame, i: int, x: float, y: float, contact: float) -
 
 
 @kernel
-def observe(p: Any, frame: Frame, rows: Any) -> None:
-    """All in the frame of the heading: (along, left). Own velocity, nearest neighbours and obstacles, free ways."""
-    slots, seen = int(p.neighbours), int(p.obstacles_seen)
-    obstacles, ways = 2 + 7 * slots, 2 + 7 * slots + 3 * seen
-    one = like(p.sight, 1.0)
+def abreast(p: Any, frame: Frame, columns: Any) -> None:
+    """All in the frame of the heading: (along, left). Own velocity, nearest neighbours, nearest obstacles."""
+    n, one = np.uint64(columns.shape[0]), like(p.sight, 1.0)
+    slots, listed, seen = np.uint64(p.neighbours), np.uint64(p.listed), np.uint64(p.obstacles_seen)
+    two, seven = np.uint64(2), np.uint64(7)
     scales = (one / p.sight, like(one, 0.5) / p.max_speed, one / p.spacing)
-    for i in range(rows.shape[0]):
-        row = rows[i]
-        heading = (like(one, frame.memory[0, i]), like(one, frame.memory[1, i]))
-        put(row, 0, turned((frame.vel[0, i], frame.vel[1, i]), heading, like(one, 2.0) * scales[1]))
-        for c in range(2, ways):
-            row[np.uint64(c)] = 0.0
-        for c in range(ways, rows.shape[1]):
-            row[np.uint64(c)] = 1.0
-        for s in range(frame.near_count[i]):
-            _show_neighbour(p, frame, i, s, slots, heading, scales, row)
-        for s in range(frame.obstacle_count[i]):
-            m = np.uint64(frame.obstacle_who[s, i])
-            dx = offset(frame.pos[0, i], frame.centre[0, m], p.size)
-            dy = offset(frame.pos[1, i], frame.centre[1, m], p.size)
-            put(row, obstacles + 2 * s, turned((dx, dy), heading, one / (p.sight + p.greatest_radius)))
-            row[obstacles + 2 * seen + s] = frame.rho[m] / p.greatest_radius
-            clearance = frame.rho[m] + frame.radius[i]
-            block_ways(row, ways, int(p.rays), frame.table, (dx, dy), heading, clearance, p.sight)
+    for i in range(n):
+        own = turned((frame.vel[0, i], frame.vel[1, i]), _heading(p, frame, i), like(one, 2.0) * scales[1])
+        columns[i, 0], columns[i, 1] = own[0], own[1]
+    for s in range(listed):
+        for i in range(n):
+            _show_neighbour(p, frame, i, s, slots, scales, columns)
+    for s in range(seen):
+        for i in range(n):
+            _show_obstacle(p, frame, i, s, two + seven * slots, seen, columns)
 
 
 @kernel
-def _show_neighbour(p: Any, frame: Frame, i: int, s: int, slots: int, heading: Any, scales: Any, row: Any) -> None:
-    """Write what agent i sees of its s-th nearest neighbour: offset, relative velocity, presence, crowding."""
-    j = np.uint64(frame.near_who[s, i])
+def _heading(p: Any, frame: Frame, i: int) -> Any:
+    """Return the heading, in the precision of the scene."""
+    return (like(p.sight, frame.memory[0, i]), like(p.sight, frame.memory[1, i]))
+
+
+@kernel
+def _show_neighbour(p: Any, frame: Frame, i: int, s: int, slots: Any, scales: Any, columns: Any) -> None:
+    """Write what agent i sees of its s-th nearest neighbour: offset, relative velocity, presence, crowding.
+
+    Zeros if there is none. All is worked out for whoever stands in the list; that is somebody's number in any case.
+    """
+    o, one, two, heading = like(p.sight, 0.0), like(p.sight, 1.0), np.uint64(2), _heading(p, frame, i)
+    j, there = np.uint64(frame.near_who[s, i]), s < np.uint64(frame.near_count[i])
     to = (offset(frame.pos[0, i], frame.pos[0, j], p.size), offset(frame.pos[1, i], frame.pos[1, j], p.size))
-    put(row, 2 + 2 * s, turned(to, heading, scales[0]))
     relative = (frame.vel[0, j] - frame.vel[0, i], frame.vel[1, j] - frame.vel[1, i])
-    put(row, 2 + 2 * slots + 2 * s, turned(relative, heading, scales[1]))
-    row[np.uint64(2 + 4 * slots + s)] = 1.0
-    o, one = like(scales[0], 0.0), like(scales[0], 1.0)
     distance = np.sqrt(frame.near_square[s, i])
     closeness = one - distance * scales[2]
     crowded = (closeness > o) & (distance > o)
-    put(row, 2 + 5 * slots + 2 * s, turned(to, heading, closeness / distance if crowded else o))
+    _put_if(there, columns, i, two + two * s, turned(to, heading, scales[0]))
+    _put_if(there, columns, i, two + two * slots + two * s, turned(relative, heading, scales[1]))
+    columns[i, two + np.uint64(4) * slots + s] = one if there else o
+    crowding = turned(to, heading, closeness / distance if crowded else o)
+    _put_if(there, columns, i, two + np.uint64(5) * slots + two * s, crowding)
+
+
+@kernel
+def _show_obstacle(p: Any, frame: Frame, i: int, s: int, at: Any, seen: Any, columns: Any) -> None:
+    """Write what agent i sees of the s-th nearest obstacle, from column `at` on: offset, radius; or zeros."""
+    o, there = like(p.sight, 0.0), s < np.uint64(frame.obstacle_count[i])
+    centre, rho = _obstacle(frame, i, s) if there else ((o, o), o)
+    to = (offset(frame.pos[0, i], centre[0], p.size), offset(frame.pos[1, i], centre[1], p.size))
+    vector = turned(to, _heading(p, frame, i), like(o, 1.0) / (p.sight + p.greatest_radius))
+    _put_if(there, columns, i, at + np.uint64(2) * s, vector)
+    columns[i, at + np.uint64(2) * seen + s] = rho / p.greatest_radius
+
+
+@kernel
+def _obstacle(frame: Frame, i: int, s: int) -> Any:
+    """Return centre and radius of the s-th nearest obstacle of agent i."""
+    m = np.uint64(frame.obstacle_who[s, i])
+    return (frame.centre[0, m], frame.centre[1, m]), frame.rho[m]
+
+
+@kernel
+def _put_if(there: Any, columns: Any, i: int, at: Any, vector: Any) -> None:
+    """Write two numbers of agent i from column `at` on, or zeros."""
+    o = like(vector[0], 0.0)
+    columns[i, at] = vector[0] if there else o
+    columns[i, at + np.uint64(1)] = vector[1] if there else o
+
+
+@kernel
+def observe(p: Any, frame: Frame, rows: Any) -> None:
+    """Free ways, anticlockwise from the heading, after what stands abreast; and zeros where nobody can be listed."""
+    slots, listed, ways = int(p.neighbours), int(p.listed), rows.shape[1] - int(p.rays)
+    for i in range(rows.shape[0]):
+        row = rows[i]
+        for c in range(np.uint64(p.rays)):
+            row[np.uint64(ways) + c] = 1.0
+        for first, width in ((2, 2), (2 + 2 * slots, 2), (2 + 4 * slots, 1), (2 + 5 * slots, 2)):
+            for c in range(first + width * listed, first + width * slots):
+                row[np.uint64(c)] = 0.0
+        for s in range(frame.obstacle_count[i]):
+            centre, rho = _obstacle(frame, i, s)
+            to = (offset(frame.pos[0, i], centre[0], p.size), offset(frame.pos[1, i], centre[1], p.size))
+            heading, clearance = _heading(p, frame, i), rho + frame.radius[i]
+            block_ways(row, ways, int(p.rays), frame.table, to, heading, clearance, p.sight)
 
 
 class Flock(Task):
@@ -306,7 +351,7 @@ class Flock(Task):
     terms: ClassVar[tuple[str, ...]] = ("progress", "alignment", "spacing", "together", "touch", "obstacle")
     metric_names: ClassVar[tuple[str, ...]] = ("polarisation", "nearest_neighbour", "collisions", "speed_along")
     measures: ClassVar[tuple[str, ...]] = ("polarisation", "nearest", "touches", "along")
-    counts: ClassVar[tuple[str, ...]] = ("neighbours", "obstacles_seen", "rays")
+    counts: ClassVar[tuple[str, ...]] = ("neighbours", "listed", "obstacles_seen", "rays")
     memory: ClassVar[int] = 2
 
     agents: int = Field(default=24, ge=1, le=100_000, description="how many fly")
@@ -357,6 +402,11 @@ class Flock(Task):
         return tuple(f"boid_{i}" for i in range(self.learners))
 
     @property
+    def abreast(self) -> int:
+        """All but the free ways."""
+        return self.layout.size - self.rays
+
+    @property
     def obstacle_slots(self) -> int:
         """As many as are drawn."""
         return self.obstacle_count
@@ -377,9 +427,18 @@ class Flock(Task):
         )
 
     @property
+    def _listed(self) -> int:
+        """How many neighbours there can be at most; a list of one is kept for a boid alone, too."""
+        return min(self.neighbours, max(self.agents - 1, 1))
+
+    def parameters(self) -> dict[str, float]:
+        """The fields, and how long lists of neighbours are."""
+        return {**super().parameters(), "listed": float(self._listed)}
+
+    @property
     def look(self) -> Look:
         """The nearest flockmates and obstacles."""
-        return Look(self.sight, self.neighbours, self.obstacles_seen)
+        return Look(self.sight, self._listed, self.obstacles_seen)
 
     def table(self) -> tuple[float, ...]:
         """The directions of the rays."""
