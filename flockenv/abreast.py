@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from llvmlite import ir  # type: ignore[import-untyped]
 from numba.core import cgutils, types
+from numba.core.errors import TypingError
 from numba.extending import intrinsic
 from numba.np import arrayobj
 
@@ -30,6 +31,12 @@ def apart(count: int) -> int:
     its own; and no power of two, whose multiples share a place in the cache.
     """
     return max(64, 1 << (count - 1).bit_length()) + SIDE
+
+
+def _in_one_piece(array: Any) -> None:
+    """Refuse to compile for an array whose numbers need not lie side by side."""
+    if array.layout != "C":
+        raise TypingError(f"{array} must lie in one piece")
 
 
 def _array(context: Any, builder: Any, kind: Any, value: Any = None) -> Any:
@@ -56,6 +63,7 @@ def _packed(typing_context: Any, array: Any) -> Any:
 
     A view of one world (D, B, N) -> (D, N) takes its strides from it, and its agents are known to lie side by side.
     """
+    _in_one_piece(array)
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         old = _array(context, builder, array, arguments[0])
@@ -133,6 +141,8 @@ def _turned_square(
 
     The first `many` rows of them are written.
     """
+    _in_one_piece(to)
+    _in_one_piece(source)
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         vector = ir.VectorType(context.get_data_type(to.dtype), SIDE)

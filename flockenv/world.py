@@ -175,6 +175,8 @@ class World:
             raise RuntimeError("the first reset must begin every world: no mask yet")
         if into is not None and (into.shape, into.dtype) != (self._shapes[0], self._dtypes[0]):
             raise ValueError(f"into has shape {into.shape} and type {into.dtype}, expected {self._shapes[0]} float32")
+        if into is not None and not into.flags.carray:
+            raise ValueError("into must be writable and in one piece: the observations of a step, no part of them")
         self._seed(seeds, rows)
         observation: Rows = self._empty(self._shapes[0], self._dtypes[0]) if into is None else into
         begun = self.worlds if into is None else int(np.count_nonzero(rows))

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 from numba import njit
+from numba.core.errors import TypingError
 
 from flockenv.abreast import SIDE, apart, columns, into_rows, packed
 
@@ -49,6 +50,13 @@ def test_columns_have_room_and_do_not_lie_a_power_of_two_apart() -> None:
         assert agents <= distance <= max(2 * agents, 64) + SIDE
         assert distance & (distance - 1) and distance % SIDE == 0
     assert apart(24) == apart(32) == apart(64)  # one kernel for all of them
+
+
+def test_an_array_with_gaps_is_not_compiled_for() -> None:
+    with pytest.raises(TypingError, match="one piece"):
+        turned(np.zeros((20, 40), np.float32)[:, :20], np.zeros(20 * apart(20), np.float32), 20, apart(20))
+    with pytest.raises(TypingError, match="one piece"):
+        strides(np.zeros((2, 5, 8))[:, :, ::2], 3)
 
 
 def test_a_packed_array_is_the_same_array() -> None:

@@ -14,7 +14,7 @@ import pytest
 
 import flockenv
 from flockenv.integrators import RK4, Midpoint, SemiImplicitEuler
-from flockenv.tasks import TASKS, Flock, Obstacles, Pursuit, Task
+from flockenv.tasks import TASKS, Crossing, Flock, Obstacles, Pursuit, Task
 from flockenv.tasks.base import NEAR, task_source
 from flockenv.world import Step, World
 from tests.catalogue import TASKS as ROWS
@@ -120,6 +120,16 @@ def test_what_is_counted_to_is_the_same_written_out_or_given(monkeypatch: pytest
     (seen, terms), (seen_too, terms_too) = ends
     np.testing.assert_array_equal(seen, seen_too)
     np.testing.assert_allclose(terms, terms_too, rtol=1e-6, atol=1e-9)
+
+
+def test_a_task_without_terms_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Pursuit, "terms", ())
+    with pytest.raises(TypeError, match=r"Pursuit\.terms is empty"):
+        task_source(Pursuit())
+
+
+def test_a_kernel_without_lanes_is_the_same_for_any_number_of_learners() -> None:
+    assert task_source(Crossing(agents=70, circle=20)) == task_source(Crossing(agents=60, circle=20))
 
 
 def test_a_count_that_is_no_parameter_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -13,8 +13,9 @@ over one world:
 * `measure(p, before, after, numbers)` writes what this step adds to the domain metrics (Q,);
 * `abreast(p, frame, columns)`, of a task with numbers `abreast` alone, writes the first so many numbers of all rows,
   (L, abreast), of which the same number of all agents lies together: loops over agents become vector code. So that
-  none is left over, L is rounded up there and in that task's `reward`; for agents that are not there the frame holds
-  anything, and nobody looks at what follows from it;
+  none is left over, L is rounded up there and in that task's `reward`. `pos`, `vel`, `memory`, `radius`, the limits and
+  what is near hold anything for agents that are not there, and nobody looks at what follows from it; `alive`, `before`
+  and `action` end with the last agent. The frame is a copy: what `ended` writes into the memory is not seen;
 * `observe(p, frame, rows)` writes the observation rows (L, O), or what of them `abreast` left.
 
 `p` holds the task's `parameters()` by name. Learners are the first L agents of a world. Who is near whom is found once
@@ -229,6 +230,8 @@ def task_source(task: Task) -> str:
     unknown = [name for name in task.counts if name not in names]
     if unknown:
         raise TypeError(f"{type(task).__name__}.counts: {unknown[0]!r} is none of its parameters: {', '.join(names)}")
+    if not task.terms:
+        raise TypeError(f"{type(task).__name__}.terms is empty: a reward is the sum of at least one term")
     values = ", ".join(
         f"np.{task.scene.dtype}({value!r})" if name in task.counts else f"numbers[{k}]"
         for k, (name, value) in enumerate(names.items())
@@ -236,7 +239,7 @@ def task_source(task: Task) -> str:
     now, empty = _frame(), ", ".join(f"{name}[:0]" for name in NEAR.split(", "))
     then = _frame(x="x0", v="v0", alive="alive0", near=empty)
     look = f"look(x, alive, obstacle_x, obstacle_radius, b, params, {NEAR}, {SHARED})" if task.look else "pass"
-    size, far = task.action_layout.size, apart(task.learners)
+    size, far = task.action_layout.size, apart(task.learners) if task.abreast else "actions.shape[1]"
     fetches = [f"fetch(rows[b], {k}, 4)" if task.abreast else "pass" for k in range(4)]
     widen, show = _lanes(task) if task.abreast else ("rounded, wide = over.shape[1], now", "pass")
     optional = [*["keep"] * task.keeps, *["abreast"] * (task.abreast > 0)]
@@ -322,7 +325,7 @@ def play(
         {widen}
         if acting:
             {fetches[2]}
-            earns = columns(decided[{size * far} :], rounded, {len(task.terms)}, {far})
+            earns = columns(decided[{size} * {far} :], rounded, {len(task.terms)}, {far})
             reward(p, before, wide, action, earns)
             {fetches[3]}
             success[b] = ended(p, before, now, over[b])
