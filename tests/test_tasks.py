@@ -109,7 +109,10 @@ def test_a_kernel_knows_what_its_loops_count_to_and_no_other_number() -> None:
 
 @pytest.mark.slow
 def test_what_is_counted_to_is_the_same_written_out_or_given(monkeypatch: pytest.MonkeyPatch) -> None:
-    """In single precision. Norms are fused one way or the other, so last bits of terms may differ."""
+    """In single precision, in which policies learn: a number of the wrong kind would promote what it meets.
+
+    The norm in `alignment` is fused one way or the other, so its last bit may differ.
+    """
     task = Flock(agents=5, neighbours=3, obstacles_seen=1, rays=8, dtype="float32")
     ends = []
     for counts in (Flock.counts, ()):
@@ -119,7 +122,9 @@ def test_what_is_counted_to_is_the_same_written_out_or_given(monkeypatch: pytest
         ends.append((np.array([s.observation for s in steps]), np.array([s.terms for s in steps])))
     (seen, terms), (seen_too, terms_too) = ends
     np.testing.assert_array_equal(seen, seen_too)
-    np.testing.assert_allclose(terms, terms_too, rtol=1e-6, atol=1e-9)
+    fused = Flock.terms.index("alignment")
+    np.testing.assert_array_equal(np.delete(terms, fused, -1), np.delete(terms_too, fused, -1))
+    np.testing.assert_allclose(terms[..., fused], terms_too[..., fused], rtol=2e-7, atol=1e-9)
 
 
 def test_a_task_without_terms_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -651,7 +656,7 @@ def test_a_boid_that_is_absent_is_neither_seen_nor_paid_for_touching() -> None:
 
 
 def test_few_learners_see_what_many_see() -> None:
-    """Rows of sixteen agents and more are made of squares, of fewer one number after the other."""
+    """Of a square of sixteen rows only those are written that there are agents for."""
     whole = World(Flock(agents=24), 2).reset(5)
     for learners in (1, 15, 16, 17, 23):
         part = World(Flock(agents=24, learners=learners), 2).reset(5)

@@ -26,7 +26,7 @@ def look(
 ):
     """Write, for every agent of world b, the nearest agents (K, N) and obstacles (J, N), and how many (N,).
 
-    Where there is none, it is infinitely far, and some number from 0 stands there, of agents one that there is.
+    Where there is none, it is infinitely far, and some number stands there: of agents, one that exists.
     """
     n, rank, team = x_.shape[2], 0, 1
     first, end = 0, (n + {parts.width - 1}) // {parts.width}

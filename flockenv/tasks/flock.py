@@ -327,7 +327,7 @@ def observe(p: Any, frame: Frame, rows: Any) -> None:
     """Free ways, anticlockwise from the heading, after what stands abreast; and zeros where nobody can be listed."""
     slots, listed, ways = int(p.neighbours), int(p.listed), rows.shape[1] - int(p.rays)
     for i in range(rows.shape[0]):
-        row = rows[i]
+        row, heading = rows[i], _heading(p, frame, i)
         for c in range(np.uint64(p.rays)):
             row[np.uint64(ways) + c] = 1.0
         for first, width in ((2, 2), (2 + 2 * slots, 2), (2 + 4 * slots, 1), (2 + 5 * slots, 2)):
@@ -336,8 +336,7 @@ def observe(p: Any, frame: Frame, rows: Any) -> None:
         for s in range(frame.obstacle_count[i]):
             centre, rho = _obstacle(frame, i, s)
             to = (offset(frame.pos[0, i], centre[0], p.size), offset(frame.pos[1, i], centre[1], p.size))
-            heading, clearance = _heading(p, frame, i), rho + frame.radius[i]
-            block_ways(row, ways, int(p.rays), frame.table, to, heading, clearance, p.sight)
+            block_ways(row, ways, int(p.rays), frame.table, to, heading, rho + frame.radius[i], p.sight)
 
 
 class Flock(Task):
