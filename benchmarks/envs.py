@@ -174,10 +174,11 @@ def _flocks(bench: Bench, threads: Sequence[int]) -> None:
 
     rows = WORLDS * LEARNERS
     contestants = []
-    for dtype in ("float64", "float32"):
-        env = FlockVectorEnv(rows, Flock().horizon, agents=LEARNERS, learners=LEARNERS, dtype=dtype)
-        step = _rows(env, rows)
-        names = {count: f"{dtype}, {count} thread{'s' * (count > 1)}" for count in threads}
+    flock: dict[str, Any] = {"max_episode_steps": Flock().horizon, "agents": LEARNERS, "learners": LEARNERS}
+    for dtype, infos in (("float64", "steps"), ("float32", "steps"), ("float32", "ends")):
+        step = _rows(FlockVectorEnv(rows, dtype=dtype, infos=infos, **flock), rows)
+        kind = dtype if infos == "steps" else f"{dtype}, infos of ends"
+        names = {count: f"{kind}, {count} thread{'s' * (count > 1)}" for count in threads}
         contestants += [Contestant(name, _on(count, step), rows) for count, name in names.items()]
     title = f"Flock as a VectorEnv, {WORLDS} worlds x {LEARNERS} learners"
     bench.race(title, contestants, baseline="float64, 1 thread")

@@ -16,7 +16,7 @@ from numba.core.errors import TypingError
 from numba.extending import intrinsic
 from numba.np import arrayobj
 
-from flockenv.kernels import LINE, kernel
+from flockenv.kernels import LINE, asked, kernel
 
 __all__ = ["apart", "columns", "fetch", "into_rows", "packed"]
 
@@ -108,12 +108,7 @@ def _fetch(typing_context: Any, array: Any, part: Any, parts: Any) -> Any:
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         old = _array(context, builder, array, arguments[0])
-        word, byte = old.nitems.type, ir.IntType(8)
-        flag = ir.IntType(32)
-        declare: Any = cgutils.get_or_insert_function
-        ask = declare(
-            builder.module, ir.FunctionType(ir.VoidType(), [byte.as_pointer(), flag, flag, flag]), "llvm.prefetch.p0i8"
-        )
+        word = old.nitems.type
         n, m = (
             context.cast(builder, a, kind, types.intp)
             for a, kind in zip(arguments[1:], signature.args[1:], strict=True)
@@ -122,10 +117,10 @@ def _fetch(typing_context: Any, array: Any, part: Any, parts: Any) -> Any:
         lines = builder.udiv(builder.mul(old.nitems, old.itemsize), line)
         length = builder.mul(builder.add(builder.udiv(lines, m), ir.Constant(word, 1)), line)
         first = builder.mul(length, n)
-        data = builder.bitcast(old.data, byte.as_pointer())
+        data = builder.bitcast(old.data, ir.IntType(8).as_pointer())
         each: Any = cgutils.for_range_slice
         with each(builder, first, builder.add(first, length), line) as (at, _):
-            builder.call(ask, [builder.gep(data, [at]), flag(1), flag(3), flag(1)])  # to write; near; data
+            asked(builder, builder.gep(data, [at]))
         return context.get_dummy_value()
 
     return types.void(array, part, parts), generate

@@ -38,6 +38,8 @@ __all__ = [
     "OPTIONS",
     "Numbers",
     "Vec",
+    "ask_for",
+    "asked",
     "cache_folder",
     "copy_line",
     "entry",
@@ -195,6 +197,33 @@ def _copy_line(typing_context: Any, to: Any, at: Any, source: Any, place: Any) -
 
 
 copy_line: Any = intrinsic(_copy_line)
+
+
+def asked(builder: Any, address: Any) -> None:
+    """Generate what asks for the line of memory at an address, to write into it; of no memory it asks for nothing."""
+    byte, flag = ir.IntType(8).as_pointer(), ir.IntType(32)
+    declare: Any = cgutils.get_or_insert_function
+    kind = ir.FunctionType(ir.VoidType(), [byte, flag, flag, flag])
+    prefetch = declare(builder.module, kind, "llvm.prefetch.p0i8")
+    builder.call(prefetch, [builder.bitcast(address, byte), flag(1), flag(3), flag(1)])  # to write; near; data
+
+
+def _ask_for(typing_context: Any, array: Any, place: Any) -> Any:
+    """Ask for the line of memory around array[place], or the place of so many numbers in all, to be written soon.
+
+    Places that are read and written in no order are waited for one after the other; asked for in good time, together.
+    """
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        make: Any = arrayobj.make_array
+        data = make(signature.args[0])(context, builder, arguments[0]).data
+        asked(builder, builder.gep(data, [arguments[1]]))
+        return context.get_dummy_value()
+
+    return types.void(array, types.uint64), generate
+
+
+ask_for: Any = intrinsic(_ask_for)
 
 
 def _stacked(typing_context: Any, numbers: Any) -> Any:

@@ -18,8 +18,8 @@ from flockenv.kernels import kernel, wait_for_team
 from flockenv.space import torus_confine
 
 __all__ = [
-    "FEWEST_AGENTS", "FINEST", "MAX_RANGES", "WORTH_ARRANGING", "candidates", "count_cells", "grid_of", "order_records",
-    "row_of",
+    "DISTANT", "FEWEST_AGENTS", "FINEST", "MAX_RANGES", "WORTH_ARRANGING", "candidates", "count_cells", "grid_of",
+    "order_records", "row_of",
 ]  # fmt: skip
 
 MAX_RANGES = 27
@@ -30,6 +30,9 @@ FEWEST_AGENTS = 96
 
 WORTH_ARRANGING = 2**14
 """Agents from which on a call of several steps puts them in order first: fewer lie in the nearest caches anyway."""
+
+DISTANT = 2**13
+"""Agents from which on the places of records are asked for in good time: fewer lie in the nearest caches anyway."""
 
 FINEST = 3
 """Cells along x that a reach spans at most: a row is cut finely, so that a block meets few agents out of its reach."""

@@ -54,7 +54,7 @@ class Workspace:
             "frame": max(padded * parts.framed + parts.counters, 1),
             "felt": max(swept * d * len(parts.targets), 1),
             "sorted_": parts.rows * (swept + width if parts.sorts else SMALL_STRIDE),
-            "records": (swept if sorts else 1) * parts.numbers,
+            "records": (swept + 2 * width if sorts else 1) * parts.numbers,
             "luggage": carried * parts.luggage_size,
         }
         real |= {name: size if parts.treed else 1 for name, size in tree_sizes(agents, width, d, team).items()}

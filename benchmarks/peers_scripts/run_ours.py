@@ -34,13 +34,14 @@ def flock_vector(threads: int) -> Case:
 
     use_threads(threads)
     agents, rows = 32, WORLDS * 32
-    env = FlockVectorEnv(rows, HORIZON, agents=agents, learners=agents, dtype="float32")
+    env = FlockVectorEnv(rows, HORIZON, infos="ends", agents=agents, learners=agents, dtype="float32")
     env.reset(seed=0)
     actions = cycle(np.random.default_rng(0).uniform(-1, 1, (DRAWS, rows, 2)).astype(np.float32))
     task = env.task
     does = (
         f"Flock as a VectorEnv, {WORLDS} worlds x {agents} learners, {task.obstacle_slots} obstacles, float32: drives "
-        f"in {task.substeps} substeps; {task.layout.size} observations each, 6 reward terms, metrics, resets"
+        f"in {task.substeps} substeps; {task.layout.size} observations each, 6 reward terms, metrics, infos of "
+        "episodes that end, resets"
     )
     return Case(lambda: env.step(next(actions)), rows, does)
 

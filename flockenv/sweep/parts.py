@@ -398,6 +398,7 @@ class Parts:
         ]
         runs += [("reach", int(bool(self.bounded)))]
         runs += [("square", look.agents), ("place", look.agents), ("gap", look.obstacles), ("which", look.obstacles)]
+        runs += [("inside", d * (self.sweeps and self.sorts and self.space.periodic))]
         names = [f"{name}{j}" for name, many in runs for j in range(many)]
         return {name: place for place, name in enumerate([*names, "bad"])}
 

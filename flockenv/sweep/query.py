@@ -7,8 +7,9 @@ together, each its own agents, and each then walks through its own share of the 
 
 from __future__ import annotations
 
+from flockenv.neighbours import DISTANT
 from flockenv.sweep.parts import SMALL_STRIDE, Parts, record_of, sorted_at
-from flockenv.sweep.text import copied, indented, indented_lines, place_of, tuple_of
+from flockenv.sweep.text import Slots, copied, indented, indented_lines, lanes_of, place_of
 
 __all__ = ["counted", "query", "walk"]
 
@@ -42,7 +43,7 @@ def _value(parts: Parts, field: str, place: str) -> str:
     if field[1:].isdigit():
         array = _ARRAYS[field[0]]
         return f"{array}[{place} + np.uint64({int(field[1:]) * parts.width})]"
-    return {"who": "ident[i]", "place": "like(mass[0], i)", "cell": "like(mass[0], cell[i])"}.get(field, f"{field}[i]")
+    return "ident[i]" if field == "who" else f"{field}[i]"
 
 
 def _derived(parts: Parts, fields: list[str], at: str) -> list[str]:
@@ -72,7 +73,7 @@ def _fill(parts: Parts, fields: list[str]) -> list[str]:
         f"        for block in range((n + {w - 1}) // {w}):",
         f"            base, row = np.uint64(block * {d * w}), np.uint64(block * {w})",
         indented(_lines(parts, fields), 12),
-        *indented_lines(_headings(parts, fields), 12),
+        *indented_lines(_headings(parts, fields, "row"), 12),
         "    else:",
         *indented_lines(_one_by_one(parts, [*direct, *_derived(parts, fields, "at")]), 8),
     ]
@@ -90,11 +91,11 @@ def _lines(parts: Parts, fields: list[str]) -> list[str]:
     return out
 
 
-def _headings(parts: Parts, fields: list[str]) -> list[str]:
-    """Write the headings of a block, if any law asks for them."""
+def _headings(parts: Parts, fields: list[str], first: str) -> list[str]:
+    """Write the headings of sorted agents from the first of a block on, if any law asks for them."""
     if "h0" not in fields:
         return []
-    return [f"for l in range(np.uint64({parts.width})):", indented(_derived(parts, fields, "row + l"), 4)]
+    return [f"for l in range(np.uint64({parts.width})):", indented(_derived(parts, fields, f"{first} + l"), 4)]
 
 
 def _one_by_one(parts: Parts, lines: list[str]) -> list[str]:
@@ -120,38 +121,64 @@ def _one_by_one(parts: Parts, lines: list[str]) -> list[str]:
 def _sort(parts: Parts, fields: list[str], inside: bool) -> list[str]:
     """Write how agents are put into their cells: whole records first, so that each is one distant place in memory."""
     d, w, record = parts.dimension, parts.width, record_of(fields)
-    row = {f: k for k, f in enumerate(fields)}
-    place = []
+    row, numbers = {f: k for k, f in enumerate(fields)}, record[2:]
     wraps = parts.space.periodic and not inside
-    if wraps:
-        x = tuple_of(f"pos[place + np.uint64(# * {w})]", d)
-        place.append(f"inside, _ = confine(size, radius[i], {x}, {x})")
-    for j, f in enumerate(record):
-        value = f"inside[{f[1:]}]" if wraps and f[0] == "x" and f[1:].isdigit() else _value(parts, f, "place")
-        place.append(f"records[to + np.uint64({j})] = {value}")
-    spread = [
-        f"{sorted_at(parts, row[f], 'at')} = records[base + np.uint64({j})]" for j, f in enumerate(record) if f in row
-    ]
+    lanes = [_lanes(parts, f, wraps) for f in numbers]
+    sources, places = (", ".join(each) for each in zip(*lanes, strict=True))
+    spread = [f"order[at] = np.int32(records[base + np.uint64({record.index('place')})])"]
+    spread += [f"{sorted_at(parts, row[f], 'at')} = records[base + np.uint64({2 + j})]" for j, f in enumerate(numbers)]
     return [
-        f"for i in range(np.uint64(first * {w}), np.uint64(min(end * {w}, n))):",
-        "    c = cell[i]",
-        "    if c >= 0:",
-        f"        place = {place_of(parts, d)}",
-        "        to = offset[rank, np.uint64(c)]",
-        "        offset[rank, np.uint64(c)] = to + 1",
-        f"        to = np.uint64(to) * np.uint64({len(record)})",
-        indented(place, 8),
+        "for block in range(np.uint64(first), np.uint64(end)):",
+        f"    base, row = block * np.uint64({d * w}), block * np.uint64({w})",
+        f"    if n >= {DISTANT} and not arranged:  # a distant place for each: asked for in good time",
+        f"        later = np.uint64(min(block + np.uint64(2), np.uint64(end - 1)) * np.uint64({w}))",
+        f"        for l in range(np.uint64({w})):",
+        "            there = np.uint64(offset[rank, np.uint64(max(cell[later + l], np.int32(0)))])",
+        f"            ask_for(records, there * np.uint64({len(record)}))",
+        *(_confined(parts) if wraps else []),
+        f"    put_records(records, ({sources},), ({places},), {w}, cell, row, offset[rank], np.uint64(n))",
         "wait_for_team(sync, team)",
         "rows = shape[1] * shape[2]",
+        "edge = np.uint64(start[rows * (rank + 1) // team * nx])",
         "for line in range(rows * rank // team, rows * (rank + 1) // team):  # a row at a time stays in the cache",
         "    mine, beyond = np.int64(start[line * nx]), np.int64(start[(line + 1) * nx])",
         "    if arranged:  # agents come in the order of their places, and are to be in the order of their numbers",
         f"        order_records(records, ident, {len(record)}, mine, beyond)",
-        "    for at in range(np.uint64(mine), np.uint64(beyond)):",
+        "    at, last = np.uint64(mine), np.uint64(beyond)",
+        f"    while at < last and at + np.uint64({w}) <= edge:  # of the next row, it is written again",
+        f"        out_of_records(sorted_, ({_places(parts, row, numbers)}), order, at, {w}, records)",
+        *indented_lines(_headings(parts, fields, "at"), 8),
+        f"        at += np.uint64({w})",
+        "    while at < last:",
         f"        base = at * np.uint64({len(record)})",
-        f"        order[at] = np.int32(records[base + np.uint64({record.index('place')})])",
         indented(spread + _derived(parts, fields, "at"), 8),
+        "        at += np.uint64(1)",
     ]
+
+
+def _lanes(parts: Parts, field: str, wraps: bool) -> tuple[str, str]:
+    """Write in which array a field of a block's agents lies side by side, and from which place on."""
+    if not field[1:].isdigit():
+        return ("ident" if field == "who" else field), "row"
+    k = int(field[1:])
+    if wraps and field[0] == "x":
+        return "lanes", f"np.uint64({parts.slots[f'inside{k}'] * parts.width})"
+    return _ARRAYS[field[0]], f"base + np.uint64({k * parts.width})"
+
+
+def _confined(parts: Parts) -> list[str]:
+    """Write where the agents of a block are that a stage of a method may have brought out of a periodic box."""
+    x, slot = lanes_of(parts, "pos"), Slots(parts)
+    return [
+        f"    for l in range(np.uint64({parts.width})):",
+        f"        inside, _ = confine(size, radius[row + l], {x}, {x})",
+        *(f"        {slot(f'inside{k}')} = inside[{k}]" for k in range(parts.dimension)),
+    ]
+
+
+def _places(parts: Parts, row: dict[str, int], numbers: list[str]) -> str:
+    """Write where the numbers of sorted agents from `at` on go, a row each."""
+    return "".join(f"np.uint64({row[f]}) * stride + at, " for f in numbers)
 
 
 def walk(parts: Parts, lines: list[str]) -> list[str]:

@@ -112,9 +112,9 @@ def step_world(
 {indented([*frame_views(parts), *kept_frame(parts, from_state=True), *kept_inner(parts, from_state=True)], 4)}
 {indented(_confine(parts), 4)}
 {indented(move_in(parts), 4)}
-{indented(_remember(parts), 4)}
     context = ({CONTEXT})
     far, begun = like(dt, np.inf), tick[b]
+    {"earlier = origin[len(pos):]" if parts.bounces else "pass"}
     counted_ = {kept}
 {indented(_parameters(parts), 4)}
     for l in range(np.uint64({parts.width})):
@@ -167,12 +167,13 @@ def _advance(parts: Parts) -> list[str]:
     if parts.integrator.evaluations != 1:
         advance = f"advance((context, first, end), pos, vel, {flow}, time, dt, stages, first * {size}, end * {size})"
         told = ["sense(context, pos, vel, time)"] * (parts.inner != () and parts.integrator.solves)
-        return [*_count(parts), *told, advance, *_bound(parts, "first", "end")]
+        return [*_count(parts), *told, *_remember(parts, "first", "end"), advance, *_bound(parts, "first", "end")]
     return [
         *_count(parts),
         "sense(context, pos, vel, time)",
         f"for begin in range(first, end, {PART}):",
         f"    until = min(begin + {PART}, end)",
+        *indented_lines(_remember(parts, "begin", "until"), 4),
         f"    advance((context, begin, until), pos, vel, {flow}, time, dt, stages, begin * {size}, until * {size})",
         *indented_lines(_bound(parts, "begin", "until"), 4),
     ]
@@ -208,13 +209,14 @@ def _count(parts: Parts) -> list[str]:
 def _bound(parts: Parts, first: str, end: str) -> list[str]:
     """Write what happens to the agents of some blocks after the method: limits, the space, and who is not finite."""
     bad = Slots(parts)("bad")
-    stored = (("pos", "x"), ("vel", "v"), ("origin", "x"), *([("earlier", "v")] if parts.bounces else []))
+    stored = (("pos", "x"), ("vel", "v"))
     return [
         f"for block in range(np.uint64({first}), np.uint64({end})):",
         f"    base, row = block * np.uint64({parts.dimension * parts.width}), block * np.uint64({parts.width})",
+        f"    past = base - np.uint64(({first} - first) * {parts.dimension * parts.width})",
         f"    for l in range(np.uint64({parts.width})):",
         "        i = row + l",
-        f"        was, x, v = {lanes_of(parts, 'origin')}, {lanes_of(parts, 'pos')}, {lanes_of(parts, 'vel')}",
+        f"        was, x, v = {_before(parts, 'origin')}, {lanes_of(parts, 'pos')}, {lanes_of(parts, 'vel')}",
         *indented_lines(_kick(parts), 8),
         "        where = far if finite(dot(x, x) + dot(v, v)) else ident[i]",
         f"        {bad} = where if where < {bad} else {bad}",
@@ -264,15 +266,23 @@ def _face(parts: Parts) -> list[str]:
     return lines + [f"{lane(parts, 'above', k)} = up[{k}]" for k in range(parts.dimension)]
 
 
-def _remember(parts: Parts) -> list[str]:
-    """Write how positions before the step are kept; behind them, where bodies bounce, velocities."""
+def _remember(parts: Parts, first: str, end: str) -> list[str]:
+    """Write how positions before the step are kept, where bodies bounce velocities too.
+
+    A part after the other, each at the same place, which stays in the nearest cache.
+    """
     size = parts.dimension * parts.width
     return [
-        *(["earlier = origin[len(pos):]"] if parts.bounces else []),
-        f"for i in range(np.uint64(first * {size}), np.uint64(end * {size})):",
-        "    origin[i] = pos[i]",
-        *(["    earlier[i] = vel[i]"] if parts.bounces else []),
+        f"past = np.uint64(({first} - first) * {size})",
+        f"for i in range(np.uint64({first} * {size}), np.uint64({end} * {size})):",
+        "    origin[i - past] = pos[i]",
+        *(["    earlier[i - past] = vel[i]"] if parts.bounces else []),
     ]
+
+
+def _before(parts: Parts, array: str) -> str:
+    """Write a vector of lane l as it was kept before the step."""
+    return lanes_of(parts, array).replace("base", "past")
 
 
 def _stay_inside(parts: Parts) -> list[str]:
@@ -281,7 +291,7 @@ def _stay_inside(parts: Parts) -> list[str]:
     if not parts.bounces:
         return [f"x, v = confine(size, radius[i], x, {limited})"]
     restitution = f"params[{parts.last_numbers('space')}]"
-    before = f"scale({lanes_of(parts, 'earlier')}, living[i])"
+    before = f"scale({_before(parts, 'earlier')}, living[i])"
     return [
         f"x, v = bounce(size, radius[i], {restitution}, dt, was, {before}, x, {limited})",
         "v = limit(v, max_speed[i])",

@@ -1,0 +1,185 @@
+"""Records of agents, written and read a block at a time: lanes of numbers become records by shuffles, and back.
+
+What is sorted of an agent is one record, so that it is one distant place in memory; what is computed of it lies in
+lanes, a number of many agents side by side.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import numba
+from llvmlite import ir  # type: ignore[import-untyped]
+from numba.core import types
+from numba.extending import intrinsic
+from numba.np import arrayobj
+
+from flockenv.kernels import LINE
+
+__all__ = ["out_of_records", "put_records"]
+
+Vectors = list[Any]
+_several: Any = types.UniTuple
+
+
+def _whole(length: int) -> int:
+    """Return the next power of two: so many rows are transposed."""
+    return 1 << (length - 1).bit_length()
+
+
+def _transposed(builder: Any, rows: Vectors) -> Vectors:
+    """Return P vectors of W numbers, both powers of two, as the P numbers of lane 0, then those of lane 1, and so on.
+
+    Laid end to end, the first half riffled with the second: log2 P such shuffles, and every number is where it belongs.
+    """
+    half, width = len(rows) // 2, rows[0].type.count
+    first = [k // 2 + (k % 2) * width for k in range(width)]
+    masks = [_mask(first), _mask([k + width // 2 for k in first])]
+    for _ in range(len(rows).bit_length() - 1):
+        pairs = zip(rows[:half], rows[half:], strict=True)
+        rows = [builder.shuffle_vector(*pair, mask) for pair in pairs for mask in masks]
+    return rows
+
+
+def _restored(builder: Any, rows: Vectors) -> Vectors:
+    """Undo `_transposed`."""
+    width = rows[0].type.count
+    masks = [_mask([2 * k + odd for k in range(width)]) for odd in (0, 1)]
+    for _ in range(len(rows).bit_length() - 1):
+        rows = [builder.shuffle_vector(*rows[k : k + 2], mask) for mask in masks for k in range(0, len(rows), 2)]
+    return rows
+
+
+def _mask(places: list[int]) -> Any:
+    return ir.Constant(ir.VectorType(ir.IntType(32), len(places)), places)
+
+
+def _part(builder: Any, vector: Any, first: int, count: int) -> Any:
+    """Return so many numbers of a vector."""
+    return builder.shuffle_vector(vector, vector, _mask([first + k for k in range(count)]))
+
+
+def _pointer(builder: Any, data: Any, place: Any, kind: Any) -> Any:
+    return builder.bitcast(builder.gep(data, [place]), kind.as_pointer())
+
+
+def _data(context: Any, builder: Any, kind: Any, value: Any) -> Any:
+    """Return where the first number of an array lies."""
+    make: Any = arrayobj.make_array
+    return make(kind)(context, builder, value).data
+
+
+def _width(width: Any) -> int:
+    """Return a number that is written into the source; numba tries again with it if it did not hand it over."""
+    if not isinstance(width, types.IntegerLiteral):
+        raise numba.TypingError(f"width: {width}, must be written as a number")
+    return int(width.literal_value)
+
+
+def _put_records(
+    typing_context: Any, records: Any, sources: Any, places: Any, width: Any, cell: Any, first: Any, offset: Any,
+    spare: Any,
+) -> Any:  # fmt: skip
+    """Write the records of `width` agents from `first` on, each to the next place of its cell; count those places on.
+
+    A record is its cell, its agent, and a number out of each of the sources, where those of all these agents lie side
+    by side from a place on. cell: int32, -1 for who has none: his is written to place `spare`, behind all others.
+    offset: int32, the next place of each cell. Everything lies in one piece.
+    """
+    wide, many = _width(width), 2 + sources.count
+    size = _whole(many)
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        to, cells, offsets = (_data(context, builder, signature.args[k], arguments[k]) for k in (0, 4, 6))
+        array, real = signature.args[1].dtype, context.get_data_type(signature.args[0].dtype)
+        itemsize = context.get_abi_sizeof(real)
+        side = min(wide, LINE // itemsize)  # lanes of a register
+        vector, word, whole = ir.VectorType(real, side), ir.IntType(64), ir.IntType(32)
+        several = ir.VectorType(whole, side)
+
+        def rows(begin: int) -> Iterator[Any]:
+            here = builder.add(arguments[5], word(begin))
+            yield builder.sitofp(builder.load(_pointer(builder, cells, here, several), align=4), vector)
+            agent = builder.insert_element(ir.Constant(several, ir.Undefined), builder.trunc(here, whole), whole(0))
+            agents = builder.shuffle_vector(agent, agent, _mask([0] * side))
+            yield builder.sitofp(builder.add(agents, _mask(list(range(side)))), vector)
+            for k in range(sources.count):
+                data = _data(context, builder, array, builder.extract_value(arguments[1], k))
+                place = builder.add(builder.extract_value(arguments[2], k), word(begin))
+                yield builder.load(_pointer(builder, data, place, vector), align=itemsize)
+            for _ in range(many, size):
+                yield ir.Constant(vector, ir.Undefined)
+
+        flat: Vectors = []
+        for begin in range(0, wide, side):
+            flat += _transposed(builder, list(rows(begin)))
+        starts = []  # all of them before anything is written to where they say: no place is waited for by the next
+        for k in range(wide):
+            c = builder.load(builder.gep(cells, [builder.add(arguments[5], word(k))]))
+            none = builder.icmp_signed("<", c, whole(0))
+            there = builder.gep(offsets, [builder.zext(builder.select(none, whole(0), c), word)])
+            place = builder.load(there)
+            builder.store(builder.add(place, builder.zext(builder.not_(none), whole)), there)
+            place = builder.select(none, builder.trunc(arguments[7], whole), place)
+            starts.append(builder.mul(builder.zext(place, word), word(many)))
+        for k, start in enumerate(starts):
+            for done in range(0, many, side):  # a record may be longer than a register
+                count, at = min(many - done, side), k * size + done
+                part = _part(builder, flat[at // side], at % side, count)
+                where = _pointer(builder, to, builder.add(start, word(done)), part.type)
+                builder.store(part, where, align=itemsize)
+        return context.get_dummy_value()
+
+    numbers = _several(types.uint64, sources.count)
+    return types.void(records, sources, numbers, width, cell, types.uint64, offset, types.uint64), generate
+
+
+put_records: Any = intrinsic(_put_records)
+
+
+def _out_of_records(
+    typing_context: Any, numbers: Any, places: Any, order: Any, at: Any, width: Any, records: Any
+) -> Any:  # fmt: skip
+    """Read the records `at` and on of `width` agents: which agents they are, into `order`, and their numbers.
+
+    Those go side by side to the places of `numbers`, which is one for each number of a record; cells go nowhere. Behind
+    the last record there must be room for another, up to the next power of two of its length.
+    """
+    wide, many = _width(width), 2 + places.count
+    size = _whole(many)
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        to, who, source = (_data(context, builder, signature.args[k], arguments[k]) for k in (0, 2, 5))
+        real, word = context.get_data_type(signature.args[0].dtype), ir.IntType(64)
+        itemsize = context.get_abi_sizeof(real)
+        side = min(wide, LINE // itemsize)  # lanes of a register
+        vector, several = ir.VectorType(real, side), ir.VectorType(ir.IntType(32), side)
+
+        def piece(lane: int, done: int, count: int) -> Any:
+            start = builder.mul(builder.add(arguments[3], word(lane)), word(many))
+            place = builder.add(start, word(done))
+            return builder.load(_pointer(builder, source, place, ir.VectorType(real, count)), align=itemsize)
+
+        for first in range(0, wide, side):
+            flat = []
+            for k in range(size):  # which numbers come into a register, of one record or of several
+                lane, done = divmod(k * side, size)
+                parts = [piece(first + lane + j, done, min(size, side)) for j in range(max(1, side // size))]
+                while len(parts) > 1:
+                    both = _mask(list(range(2 * parts[0].type.count)))
+                    parts = [builder.shuffle_vector(*parts[j : j + 2], both) for j in range(0, len(parts), 2)]
+                flat.append(parts[0])
+            _, agents, *rows = _restored(builder, flat)[:many]
+            here = builder.add(arguments[3], word(first))
+            builder.store(builder.fptosi(agents, several), _pointer(builder, who, here, several), align=4)
+            for k, row in enumerate(rows):
+                place = builder.add(builder.extract_value(arguments[1], k), word(first))
+                builder.store(row, _pointer(builder, to, place, vector), align=itemsize)
+        return context.get_dummy_value()
+
+    numbered = _several(types.uint64, places.count)
+    return types.void(numbers, numbered, order, types.uint64, width, records), generate
+
+
+out_of_records: Any = intrinsic(_out_of_records)

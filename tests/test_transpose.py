@@ -1,0 +1,63 @@
+"""Blocks of lanes and records: numpy's transpose, of every length, in either precision."""
+
+from typing import Any
+
+import numba
+import numpy as np
+import pytest
+
+from flockenv.transpose import out_of_records, put_records
+
+LENGTHS = [3, 5, 6, 8, 9, 16, 17, 20]
+
+
+def compiled(length: int, width: int) -> Any:
+    """Return both as functions of arrays, for records of that length."""
+    numbers = range(length - 2)
+    sources, places = "lanes, " * len(numbers), "".join(f"np.uint64(at + {k * width}), " for k in numbers)
+    made: dict[str, Any] = {"np": np, "put_records": put_records, "out_of_records": out_of_records}
+    exec(  # noqa: S102  # how many sources there are is a type's
+        "def put(records, lanes, at, cell, first, offset, spare):\n"
+        f"    put_records(records, ({sources}), ({places}), {width}, cell, np.uint64(first), offset, np.uint64(spare)"
+        ")\n"
+        "def take(lanes, at, order, first, records):\n"
+        f"    out_of_records(lanes, ({places}), order, np.uint64(first), {width}, records)\n",
+        made,
+    )
+    return numba.njit(made["put"]), numba.njit(made["take"])
+
+
+@pytest.mark.parametrize("length", LENGTHS)
+@pytest.mark.parametrize(("dtype", "width"), [("float32", 16), ("float64", 8), ("float64", 16)])
+def test_records_are_transposed_lanes(dtype: str, width: int, length: int) -> None:
+    put, take = compiled(length, width)
+    rng, n, rows = np.random.default_rng(length), 3 * width, 1 << (length - 1).bit_length()
+    lanes = rng.random(length * width).astype(dtype)  # two rows that are none of theirs, then numbers
+    cell, begin = rng.integers(-1, 4, n).astype(np.int32), np.arange(4, dtype=np.int32) * (n // 4)
+    cell[width + 1] = -1  # whose record comes to the spare place
+    records = np.full((n + 1) * length + rows, -7, dtype)
+    offset, expected = begin.copy(), np.full((n, length), -7, dtype)
+    put(records, lanes, 2 * width, cell, width, offset, n)
+    for lane, c in enumerate(cell[width : 2 * width]):  # the second block
+        if c >= 0:
+            expected[begin[c]] = [c, width + lane, *lanes.reshape(length, width)[2:, lane]]
+            begin[c] += 1
+    np.testing.assert_array_equal(records[: n * length].reshape(n, length), expected)
+    np.testing.assert_array_equal(offset, begin)
+    records = rng.random(len(records)).astype(dtype)
+    several = records[3 * length : (3 + width) * length].reshape(width, length)
+    several[:, 1] = rng.integers(0, 2**24, width)
+    before, order = lanes.copy(), np.full(n, -1, np.int32)
+    take(lanes, 2 * width, order, 3, records)
+    np.testing.assert_array_equal(lanes.reshape(length, width)[2:], several[:, 2:].T)
+    np.testing.assert_array_equal(lanes[: 2 * width], before[: 2 * width])
+    np.testing.assert_array_equal(order, [-1] * 3 + several[:, 1].astype(int).tolist() + [-1] * (n - width - 3))
+
+
+def test_a_width_is_written_as_a_number() -> None:
+    @numba.njit
+    def take(numbers, order, records, width):
+        out_of_records(numbers, (np.uint64(0),), order, np.uint64(0), width, records)
+
+    with pytest.raises(numba.TypingError, match="must be written as a number"):
+        take(np.zeros(64), np.zeros(64, np.int32), np.zeros(64), 8)
