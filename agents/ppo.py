@@ -25,6 +25,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from stable_baselines3 import PPO
 from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.vec_env import VecEnvWrapper
 
 from agents.experiment import WEIGHTS, Experiment, PpoSettings, load_experiment, one_line_errors
@@ -158,6 +159,8 @@ def build(task: Task, p: PpoSettings, tensorboard: str | None) -> PPO:
             "log_std_init": p.log_std,
         },
     )
+    if tensorboard is None:
+        model.set_logger(Logger(folder=None, output_formats=[]))  # its own leaves an empty folder behind
     worlds.seed(worlds_for("training", p.seed, p.worlds))
     return model
 

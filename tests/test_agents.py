@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import tempfile
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -106,13 +107,17 @@ PURSUIT = Experiment(task="pursuit", ppo={**TINY, "steps": 1024})
 
 
 @pytest.mark.slow
-def test_training_is_repeatable_and_exports(tmp_path: Path) -> None:
+def test_training_is_repeatable_and_exports(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     from agents import ppo
 
+    temporary = tmp_path / "temporary"
+    temporary.mkdir()
+    monkeypatch.setattr(tempfile, "tempdir", str(temporary))
     once, twice = (ppo.train(PURSUIT, tmp_path / name) for name in "ab")
     assert once.tensors.keys() == twice.tensors.keys()
     for name, tensor in once.tensors.items():
         np.testing.assert_array_equal(tensor, twice.tensors[name])
+    assert not any(temporary.glob("SB3*")), "no folder of a logger that logs nothing"
     ppo.export(once, tmp_path / "p.safetensors")
     policy = MlpPolicy.load(tmp_path / "p.safetensors", PURSUIT.build())
     assert policy.observation_size == PURSUIT.build().layout.size
