@@ -82,7 +82,7 @@ class WorldsEnv(VectorEnv[Rows, Rows, Rows]):
             `info["final_info"]` hold the end), in the next step, or never (`reset(options={"reset_mask": mask})`).
         render_mode: "rgb_array" or None.
         infos: "steps" tells of every row after every step, as single environments do; "ends" only of episodes that
-            end, how they ended, and of those that begin, their seeds: a tenth faster with many rows.
+            end, how they ended, and of those that begin, their seeds: faster with many rows.
         parameters: those of the task.
     """
 
