@@ -57,6 +57,19 @@ def test_the_shipped_policy_is_far_above_random_and_its_card_is_complete(name: s
 
 
 @pytest.mark.parametrize("name", sorted(TASKS))
+def test_the_page_says_when_the_rules_were_passed(name: str) -> None:
+    """In the words of the policy's card, and of what the search found."""
+    card = json.loads((WEIGHTS / f"{name}.json").read_text(encoding="utf-8"))
+    rules = load_experiment(CONFIGS / f"{name}.yaml").reynolds.found["tuning_mean"]
+    past = next((point for point in card["curve"] if point["mean"] > rules), None)
+    cells = (
+        [f"{past['mean']:.2f}", f"{past['seconds']:.0f}", f"{past['steps'] / 1e6:.1f} M"] if past else ["never", "", ""]
+    )
+    row = " | ".join([f"| {name}", f"{rules:.2f}", *cells, f"{card['wall_time_s']:.0f} |"]).replace("|  ", "| ")
+    assert row in (ROOT / "docs" / "players.md").read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize("name", sorted(TASKS))
 def test_a_player_answers_one_row_as_it_answers_many(name: str) -> None:
     task = TASKS[name]()
     rows = np.random.default_rng(0).uniform(-1, 1, (5, task.layout.size)).astype(np.float32)
