@@ -50,6 +50,7 @@ __all__ = [
     "like",
     "load",
     "replaced",
+    "settled",
     "shared",
     "stacked",
     "unaliased",
@@ -344,6 +345,16 @@ def load(name: str, source: str) -> ModuleType:
         if hasattr(function, "py_func") and function.py_func.__module__ == qualified:  # an entry point, of this file
             function._cache = OneAtATime(function._cache, locks / f"{path.stem}_{function.__name__}.lock")
     return module
+
+
+def settled(function: Any) -> Callable[..., Any]:
+    """Return an entry point that was called, without numba's look at the type of every argument: half of a short call.
+
+    For a caller whose arguments have the same types each time, arrays in one piece: nobody asks any more. One that was
+    called with several types is returned as it is.
+    """
+    compiled = list(function.overloads.values())
+    return compiled[0].entry_point if len(compiled) == 1 else function  # type: ignore[no-any-return]
 
 
 @functools.cache

@@ -597,7 +597,8 @@ class Scene(Record):
         worlds, agents, _ = state.shape
         move, scratch = self._kernels.step, self._kernels.SCRATCH
         crew = threads() if worlds * agents * steps >= WORTH_SHARING else 1
-        team = crew if worlds < crew and agents >= WORTH_SHARING and not self.integrator.adaptive else 1
+        alone = self.integrator.adaptive or self.integrator.solves  # what was solved for lies in one thread's scratch
+        team = crew if worlds < crew and agents >= WORTH_SHARING and not alone else 1
         crew = crew if team > 1 else min(crew, worlds)
         arrays = (
             state.x, state.v, *state.carried, state.alive, state.tick, state.key, state.obstacle_x,

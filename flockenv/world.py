@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from flockenv import state as states
 from flockenv.abreast import apart
 from flockenv.crew import share, threads
-from flockenv.kernels import load
+from flockenv.kernels import load, settled
 from flockenv.noise import MASK, keys_of
 from flockenv.recycle import Recycler
 from flockenv.scene import MEMORY_LIMIT, WORTH_SHARING
@@ -96,6 +96,7 @@ class World:
         """Make what follows from the task: kernel, scratch, and what every step is given."""
         scene, task, s = self.task.scene, self.task, self.state
         self._kernel = load(f"task_{task.name}", task_source(task))
+        self._enter = self._kernel.play
         b, i, real = self.worlds, self.learners, scene.dtype
         self._actions = np.zeros((b, i, self.action_size))
         numbers = (task.parts.given(), list(task.parameters().values()), task.table() or (0.0,))
@@ -141,8 +142,8 @@ class World:
     def __getstate__(self) -> dict[str, Any]:
         """Pickle what cannot be made anew."""
         made = (
-            "_kernel", "_actions", "_worlds", "_clock", "_scratch", "_kept", "_measured", "_shapes", "_dtypes",
-            "_everywhere", "_untold", "_empty",
+            "_kernel", "_enter", "_actions", "_worlds", "_clock", "_scratch", "_kept", "_measured", "_shapes",
+            "_dtypes", "_everywhere", "_untold", "_empty",
         )  # fmt: skip
         return {name: value for name, value in vars(self).items() if name not in made}
 
@@ -168,7 +169,7 @@ class World:
         same seeds (a first one without seeds draws them from the system). mask (B,): only these worlds begin anew.
         into: the observations of the step before, in which the worlds that begin are to be written; none = a new array.
         """
-        rows = np.ones(self.worlds, np.bool_) if mask is None else np.asarray(mask)
+        rows = np.ones(self.worlds, np.bool_) if mask is None else np.array(mask)
         if rows.shape != (self.worlds,) or rows.dtype != np.bool_:
             raise ValueError(f"mask has shape {rows.shape} and type {rows.dtype}, expected ({self.worlds},) bool")
         if self._seeds is None and not rows.all():
@@ -181,6 +182,7 @@ class World:
         observation: Rows = self._empty(self._shapes[0], self._dtypes[0]) if into is None else into
         begun = self.worlds if into is None else int(np.count_nonzero(rows))
         self._play((False, rows, into is None), begun, 0, (observation, *self._untold))
+        self._enter = settled(self._kernel.play)  # types stay what they were in this call
         for numbers in (self._sums, self._last, self.paid):
             numbers[rows] = 0
         return observation
@@ -247,7 +249,7 @@ class World:
 
         def part(k: int, check: bool, first: int, end: int) -> tuple[int, int]:
             decision, rest = self._scratch[k]
-            return self._kernel.play(  # type: ignore[no-any-return]
+            return self._enter(  # type: ignore[no-any-return]
                 *what, check, first, end, self._actions, *self._worlds, *self._clock, limit,
                 *decision, *rest, *self._kept, *told,
             )  # fmt: skip

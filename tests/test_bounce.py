@@ -9,7 +9,7 @@ import pytest
 
 from flockenv.crew import use_threads
 from flockenv.effects import Gravity
-from flockenv.integrators import RK4, SemiImplicitEuler
+from flockenv.integrators import RK4, Integrator, SemiImplicitEuler
 from flockenv.scene import Group, Scene
 from flockenv.space import Box
 from flockenv.spawn import Spawn
@@ -230,6 +230,19 @@ def test_a_world_of_a_batch_and_a_team_of_threads_give_the_same_bits() -> None:
     np.testing.assert_array_equal(after.x, before.x)
     np.testing.assert_array_equal(after.v, before.v)
     np.testing.assert_array_equal(apart.v, before.v)
+
+
+@pytest.mark.parametrize("method", [RK4(), SemiImplicitEuler()], ids=lambda method: method.kind)
+def test_many_bodies_bounce_as_few_of_them_do(method: Integrator) -> None:
+    many, few = (hall(count=count, e=0.9, integrator=method) for count in (2000, 50))
+    rng = np.random.default_rng(2)
+    pos, vel = rng.uniform(0, 3, (2000, 2)), rng.normal(size=(2000, 2)) * 5
+    end = many.run(at(many, pos, vel), 60)
+    for first in range(0, 2000, 50):
+        some = slice(first, first + 50)
+        alone = few.run(at(few, pos[some], vel[some]), 60)
+        np.testing.assert_array_equal(end.pos[0, some], alone.pos[0])
+        np.testing.assert_array_equal(end.vel[0, some], alone.vel[0])
 
 
 @pytest.mark.parametrize(("dtype", "widest"), [("float64", 150), ("float32", 18)])

@@ -1,10 +1,13 @@
 """All faces are views of one World: one sequence of actions through each of them gives the same numbers."""
 
+import enum
+
 import gymnasium
 import numpy as np
 import pettingzoo
 import pytest
 
+from flockenv.envs.face import named, told
 from flockenv.sb3 import WorldVecEnv
 from flockenv.tasks import Bottleneck, Corridor, Crossing, CrowdNav, Evade, Flock, Herd, Obstacles, Pursuit, School
 from flockenv.world import World
@@ -169,3 +172,17 @@ def test_a_game_in_which_agents_leave(task, parameters):
     for log, whole in zip(parallel, through_world(task, actions), strict=True):
         # The World goes on to write about an agent that left; the others say nothing about it.
         assert [e for e in whole if e in log] == log
+
+
+class Odd(enum.StrEnum):
+    QUOTED = "it's {a}\n\\"
+    PLAIN = "plain"
+
+
+@pytest.mark.parametrize("names", [["a", "b"], (Odd.QUOTED, Odd.PLAIN), (np.str_("a"), "class"), ("n1", "agents")])
+def test_numbers_are_told_by_whatever_names_they_have(names):
+    rows = np.arange(6.0).reshape(3, 2)
+    expected = [dict(zip(map(str, names), row, strict=True)) for row in rows.tolist()]
+    assert list(named(names, rows)) == expected
+    infos = told(*names)(["x", "y", "z"], rows.T.tolist(), True)
+    assert infos == {who: {"terms": its, "is_success": True} for who, its in zip("xyz", expected, strict=True)}

@@ -25,9 +25,12 @@ import flockenv.scene as scenes
 from flockenv import crew
 from flockenv.behaviours import Separation
 from flockenv.crew import share, threads, use_threads
+from flockenv.effects import Drag
+from flockenv.integrators import ImplicitEuler
 from flockenv.kernels import cache_folder
 from flockenv.neighbours import WORTH_ARRANGING
 from flockenv.scene import Group, Scene
+from flockenv.space import Box
 from flockenv.spawn import Spawn
 from flockenv.state import State
 from tests.catalogue import VARIANTS, Variant
@@ -134,6 +137,22 @@ def test_a_team_takes_the_very_step_that_one_thread_takes(large: Large, dead: fl
 
 
 @pytest.mark.slow
+def test_an_implicit_step_of_a_large_world_is_the_same_for_any_number_of_threads() -> None:
+    scene = Scene(
+        space=Box(size=(60.0, 60.0)),
+        effects=(Drag(rate=0.4),),
+        integrator=ImplicitEuler(),
+        groups=(Group(count=4200, max_speed=1.3, spawn=Spawn(speed=(0.2, 1.5))),),
+        dt=0.05,
+    )
+    start = started(scene, worlds=2)
+    expected = scene.run(start, 3)
+    assert not np.array_equal(expected.x, start.x)
+    for count in (2, 3):
+        use_threads(count)
+        assert_same(scene.run(start, 3), expected)
+
+
 def test_a_team_goes_through_the_worlds_of_a_small_batch_of_large_ones(shared: list[int]) -> None:
     scene = NAMED["torus_single"].make(4200, 60.0)
     start = started(scene, worlds=2)

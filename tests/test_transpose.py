@@ -43,6 +43,7 @@ def test_records_are_transposed_lanes(dtype: str, width: int, length: int) -> No
             expected[begin[c]] = [c, width + lane, *lanes.reshape(length, width)[2:, lane]]
             begin[c] += 1
     np.testing.assert_array_equal(records[: n * length].reshape(n, length), expected)
+    np.testing.assert_array_equal(records[(n + 1) * length :], -7)  # behind the spare place nothing is written
     np.testing.assert_array_equal(offset, begin)
     records = rng.random(len(records)).astype(dtype)
     several = records[3 * length : (3 + width) * length].reshape(width, length)

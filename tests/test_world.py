@@ -205,6 +205,22 @@ def test_a_masked_reset_touches_the_masked_worlds_only(row: TaskRow) -> None:
     np.testing.assert_array_equal(seen[0], World(row.task).reset(1)[0])
 
 
+@pytest.mark.parametrize("first", [False, True])
+def test_a_mask_may_lie_in_memory_as_it_likes_and_nothing_compiles_anew(first: bool) -> None:
+    task = TASKS[0].task
+    world, other = World(task, 4), World(task, 4)
+    for w in (world, other):
+        w.reset(20)
+    mask, stretched = np.array([first, True, False, not first]), np.zeros(8, bool)
+    stretched[::2] = mask
+    fixed = mask.copy()
+    fixed.flags.writeable = False
+    for strange in (stretched[::2], fixed, mask[::-1].copy()[::-1]):
+        np.testing.assert_array_equal(world.reset(mask=strange), other.reset(mask=mask))
+        assert_same(everything(world), everything(other))
+    assert len(world._kernel.play.overloads) == 1
+
+
 @EVERY
 def test_a_reset_into_given_observations_writes_the_masked_worlds_only(row: TaskRow) -> None:
     world, other = World(row.task, 4), World(row.task, 4)

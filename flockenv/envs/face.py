@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import operator
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -32,6 +32,7 @@ __all__ = [
     "observation_space",
     "render_fps",
     "together",
+    "told",
 ]
 
 Rows = NDArray[Any]
@@ -72,21 +73,40 @@ def action_space(task: Task) -> Box:
     return Box(-1.0, 1.0, (task.action_layout.size,), np.float32)
 
 
-def named(names: tuple[str, ...], rows: Rows) -> Iterator[dict[str, float]]:
+def named(names: Sequence[str], rows: Rows) -> Iterator[dict[str, float]]:
     """Make a dictionary of each row of numbers, (R, K), by name.
 
     Column by column, and one row at a time: a list for every row would wake the garbage collector.
     """
-    return map(_by_name(names), *rows.T.tolist())
+    return map(_named(*names), *rows.T.tolist())
 
 
 @functools.cache
-def _by_name(names: tuple[str, ...]) -> Callable[..., dict[str, float]]:
+def _named(*names: str) -> Callable[..., dict[str, float]]:
     """Return a function of as many numbers as names: a display, written out, takes half as long as dict(zip(...))."""
-    numbers = [f"n{k}" for k in range(len(names))]
-    pairs = ", ".join(f"{name!r}: {number}" for name, number in zip(names, numbers, strict=True))
-    made: Callable[..., dict[str, float]] = eval(f"lambda {', '.join(numbers)}: {{{pairs}}}")  # noqa: S307  # reprs alone
+    numbers, display = _written_out(names)
+    made: Callable[..., dict[str, float]] = eval(f"lambda {numbers}: {display}")  # noqa: S307  # reprs alone
     return made
+
+
+@functools.cache
+def told(*terms: str) -> Callable[..., dict[str, dict[str, Any]]]:
+    """Return a function of agents, numbers (one column for each term) and success, that makes everybody's info.
+
+    Written out in one piece it takes half as long as a call for every agent.
+    """
+    numbers, display = _written_out(terms)
+    info = f"{{'terms': {display}, 'is_success': success}}"
+    source = f"lambda agents, columns, success: {{agent: {info} for agent, {numbers} in zip(agents, *columns)}}"
+    made: Callable[..., dict[str, dict[str, Any]]] = eval(source)  # noqa: S307  # reprs alone
+    return made
+
+
+def _written_out(names: Sequence[str]) -> tuple[str, str]:
+    """Write numbers, as many as names, and the dictionary of them."""
+    numbers = [f"n{k}" for k in range(len(names))]
+    pairs = (f"{str.__str__(name)!r}: {number}" for name, number in zip(names, numbers, strict=True))
+    return ", ".join(numbers), f"{{{', '.join(pairs)}}}"
 
 
 def render_fps(task: Task) -> int:

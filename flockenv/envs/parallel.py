@@ -21,9 +21,9 @@ from flockenv.envs.face import (
     build,
     checked_options,
     checked_seed,
-    named,
     observation_space,
     render_fps,
+    told,
 )
 from flockenv.refusals import nearest
 from flockenv.tasks import Bottleneck, Corridor, Crossing, Flock, Herd, Pursuit, School, Task
@@ -182,9 +182,15 @@ class WorldParallelEnv(ParallelEnv[str, Rows, Rows]):  # type: ignore[misc]  # p
 
     def _infos(self, result: Step, over: bool) -> dict[str, Named]:
         """Return reward terms and success by agent, with the metrics of the world when its episode is over."""
-        terms = self._named(list(named(self.task.terms, result.terms[0])))
-        about = {"is_success": result.success.item(), **(self.world.metrics() if over else {})}
-        return {name: {"terms": its, **about} for name, its in terms.items()}
+        terms = result.terms[0]
+        if len(self._live) < len(terms):
+            terms = terms[list(self._live.values())]
+        infos = told(*self.task.terms)(self._live, terms.T.tolist(), result.success.item())
+        if over:
+            metrics = self.world.metrics()
+            for info in infos.values():
+                info.update(metrics)
+        return infos
 
     @functools.cached_property
     def state_space(self) -> Box:

@@ -1,7 +1,7 @@
 """Gymnasium's vector environments: many worlds in one array program, without subprocesses or a loop over worlds.
 
 They behave as gymnasium's SyncVectorEnv over the single environments does, number for number and info for info (a test
-compares the two), in each of the three ways to begin anew.
+compares the two), in each of the three ways to begin anew; who asks for infos of ends is told of those alone.
 """
 
 from __future__ import annotations
