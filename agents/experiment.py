@@ -49,9 +49,6 @@ class PpoSettings(Record):
     log_std: float = Field(default=-0.5, description="logarithm of the first standard deviation of actions")
     reward_scale: float = Field(default=0.1, gt=0, description="rewards are multiplied by this while learning")
     team: bool = Field(default=False, description="everybody is paid the mean of his world, to the world's end")
-    central_critic: bool = Field(
-        default=False, description="the critic is shown what all of its world see, who is scripted, and their memory"
-    )
     taught: int = Field(
         default=0, ge=0, description="gradient steps in which it first learns what the tuned rules answer"
     )

@@ -28,7 +28,6 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.vec_env import VecEnvWrapper
 
-from agents.central import CentralPolicy, CentralVecEnv
 from agents.experiment import WEIGHTS, Experiment, PpoSettings, load_experiment, one_line_errors
 from agents.reynolds import as_dict, player
 from agents.teach import teach
@@ -138,11 +137,10 @@ def build(task: Task, p: PpoSettings, tensorboard: str | None) -> PPO:
     """Make the worlds and the model; how many threads they use is for `on_threads` to say."""
     torch.manual_seed(p.seed)
     learned = task.model_copy(update={"dtype": p.dtype})
-    shows = CentralVecEnv if p.central_critic else WorldVecEnv
-    rows = shows(learned, p.worlds, leaving=not task.ends_together)
+    rows = WorldVecEnv(learned, p.worlds, leaving=not task.ends_together)
     worlds = ForLearning(rows, p.reward_scale, p.stagger, p.team)
     model = PPO(
-        CentralPolicy if p.central_critic else "MlpPolicy",
+        "MlpPolicy",
         worlds,
         n_steps=p.rollout,
         batch_size=p.minibatch,
@@ -159,7 +157,6 @@ def build(task: Task, p: PpoSettings, tensorboard: str | None) -> PPO:
             "net_arch": {"pi": list(p.hidden), "vf": list(p.hidden)},
             "activation_fn": {"relu": torch.nn.ReLU, "tanh": torch.nn.Tanh}[p.activation],
             "log_std_init": p.log_std,
-            **({"seen": task.layout.size} if p.central_critic else {}),
         },
     )
     if tensorboard is None:
