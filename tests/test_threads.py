@@ -153,6 +153,7 @@ def test_an_implicit_step_of_a_large_world_is_the_same_for_any_number_of_threads
         assert_same(scene.run(start, 3), expected)
 
 
+@pytest.mark.slow
 def test_a_team_goes_through_the_worlds_of_a_small_batch_of_large_ones(shared: list[int]) -> None:
     scene = NAMED["torus_single"].make(4200, 60.0)
     start = started(scene, worlds=2)
