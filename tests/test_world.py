@@ -5,11 +5,13 @@ from __future__ import annotations
 import copy
 import pickle
 from concurrent.futures import ThreadPoolExecutor
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 
+from flockenv.kernels import settled
 from flockenv.noise import key_of, keys_of
 from flockenv.tasks import Flock, Obstacles, Pursuit
 from flockenv.world import Step, World
@@ -205,6 +207,27 @@ def test_a_masked_reset_touches_the_masked_worlds_only(row: TaskRow) -> None:
     np.testing.assert_array_equal(seen[0], World(row.task).reset(1)[0])
 
 
+@pytest.fixture
+def looking(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let numba look at the types of every call, so that it would compile for other ones."""
+    monkeypatch.setattr("flockenv.world.settled", lambda function: function)
+
+
+def test_a_world_that_was_reset_calls_its_kernel_without_a_look_at_types() -> None:
+    world = World(Pursuit(), 2)
+    world.reset(1)
+    play = world._kernel.play
+    assert world._enter is settled(play) is not play
+    again = copy.deepcopy(world)
+    assert again._enter is play
+    for a in actions_for(world, 3):
+        np.testing.assert_array_equal(world.step(a).observation, again.step(a).observation)
+    for several in (0, 2):
+        function = SimpleNamespace(overloads=dict.fromkeys(range(several)))
+        assert settled(function) is function
+
+
+@pytest.mark.usefixtures("looking")
 @pytest.mark.parametrize("first", [False, True])
 def test_a_mask_may_lie_in_memory_as_it_likes_and_nothing_compiles_anew(first: bool) -> None:
     task = TASKS[0].task
@@ -281,6 +304,7 @@ def test_keys_of_many_worlds_are_the_keys_of_each() -> None:
 
 
 @EVERY
+@pytest.mark.usefixtures("looking")
 def test_time_limits_truncate_and_never_terminate(row: TaskRow) -> None:
     world = World(row.task, 2, time_limit=5)
     world.reset(3)
@@ -411,6 +435,7 @@ def test_actions_beyond_the_bounds_are_the_bounds(row: TaskRow) -> None:
         assert_same(end, ends[0])
 
 
+@pytest.mark.usefixtures("looking")
 def test_whatever_holds_the_numbers_they_are_the_same_numbers() -> None:
     values = np.array([[[0.5, -0.25]], [[-1.0, 1.0]]])
     wide = np.zeros((2, 1, 4))
