@@ -184,5 +184,5 @@ def test_numbers_are_told_by_whatever_names_they_have(names):
     rows = np.arange(6.0).reshape(3, 2)
     expected = [dict(zip(map(str, names), row, strict=True)) for row in rows.tolist()]
     assert list(named(names, rows)) == expected
-    infos = told(*names)(["x", "y", "z"], rows.T.tolist(), True)
+    infos = told(names, ["x", "y", "z"], rows, True)
     assert infos == {who: {"terms": its, "is_success": True} for who, its in zip("xyz", expected, strict=True)}

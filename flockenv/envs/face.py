@@ -89,12 +89,14 @@ def _named(*names: str) -> Callable[..., dict[str, float]]:
     return made
 
 
-@functools.cache
-def told(*terms: str) -> Callable[..., dict[str, dict[str, Any]]]:
-    """Return a function of agents, numbers (one column for each term) and success, that makes everybody's info.
+def told(terms: Sequence[str], agents: Iterable[str], rows: Rows, success: bool) -> dict[str, dict[str, Any]]:
+    """Make everybody's info, by agent: terms of his row of numbers, (R, K), by name, and whether it is a success."""
+    return _told(*terms)(agents, rows.T.tolist(), success)
 
-    Written out in one piece it takes half as long as a call for every agent.
-    """
+
+@functools.cache
+def _told(*terms: str) -> Callable[..., dict[str, dict[str, Any]]]:
+    """Return a function of agents, columns and success; in one piece it takes half as long as a call for every row."""
     numbers, display = _written_out(terms)
     info = f"{{'terms': {display}, 'is_success': success}}"
     source = f"lambda agents, columns, success: {{agent: {info} for agent, {numbers} in zip(agents, *columns)}}"

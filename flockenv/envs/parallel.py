@@ -185,7 +185,7 @@ class WorldParallelEnv(ParallelEnv[str, Rows, Rows]):  # type: ignore[misc]  # p
         terms = result.terms[0]
         if len(self._live) < len(terms):
             terms = terms[list(self._live.values())]
-        infos = told(*self.task.terms)(self._live, terms.T.tolist(), result.success.item())
+        infos = told(self.task.terms, self._live, terms, result.success.item())
         if over:
             metrics = self.world.metrics()
             for info in infos.values():
