@@ -18,10 +18,13 @@ from numba.np import arrayobj
 
 from flockenv.kernels import LINE, asked, kernel
 
-__all__ = ["apart", "columns", "fetch", "into_rows", "packed"]
+__all__ = ["PAIR", "SIDE", "apart", "columns", "fetch", "into_rows", "packed", "take"]
 
 SIDE = LINE // 4
 """Single precision numbers in a vector register: squares of as many rows and columns are turned at once."""
+
+PAIR = 2 * SIDE
+"""Agents up to a multiple of which arrays go on that are shown side by side, whoever is there."""
 
 
 def apart(count: int) -> int:
@@ -127,6 +130,95 @@ def _fetch(typing_context: Any, array: Any, part: Any, parts: Any) -> Any:
 
 
 fetch: Any = intrinsic(_fetch)
+
+
+def _looks_up(typing_context: Any, table: Any) -> Any:
+    """Say whether this machine looks numbers of such an array up in registers, `_pick`; a constant of machine code."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        return context.get_constant(types.boolean, _permutes(context))
+
+    return types.boolean(table), generate
+
+
+_looked_up: Any = intrinsic(_looks_up)
+
+
+def _permutes(context: Any) -> bool:
+    """Has the processor that is compiled for AVX-512?"""
+    return "+avx512f" in getattr(context.codegen(), "_tm_features", "").split(",")
+
+
+def _picks(
+    typing_context: Any, to: Any, at: Any, table: Any, first: Any, count: Any, who: Any, place: Any
+) -> Any:  # fmt: skip
+    """Write a register of numbers from to[at] on: those that the int32 from who[place] on name, of a table of `count`.
+
+    The table begins at table[first], may be read in whole pairs of registers, and is looked up a pair at a time. All
+    lies in one piece, and places are counted through. Where `_permutes` says no, nothing is written.
+    """
+    for array in (to, table, who):
+        _in_one_piece(array)
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        if not _permutes(context):
+            return context.get_dummy_value()
+        number = context.get_data_type(to.dtype)
+        size = context.get_abi_sizeof(number)
+        lanes, whole, word = LINE // size, ir.IntType(8 * size), ir.IntType(64)
+        vector, index = ir.VectorType(number, lanes), ir.VectorType(whole, lanes)
+        declare: Any = cgutils.get_or_insert_function
+        name = f"llvm.x86.avx512.vpermi2var.p{'s' if size == 4 else 'd'}.512"
+        permuted = declare(builder.module, ir.FunctionType(vector, [vector, index, vector]), name)
+
+        def pointer(k: int, here: Any, kind: Any = vector) -> Any:
+            data = _array(context, builder, signature.args[k], arguments[k]).data
+            return builder.bitcast(builder.gep(data, [here]), kind.as_pointer())
+
+        named = builder.load(pointer(5, arguments[6], ir.VectorType(ir.IntType(32), lanes)), align=4)
+        named = named if size == 4 else builder.sext(named, index)
+
+        def looked_up(begin: Any) -> Any:
+            here = [builder.add(arguments[3], builder.add(begin, word(k))) for k in (0, lanes)]
+            low, high = (builder.load(pointer(2, each), align=size) for each in here)
+            return builder.call(permuted, [low, named, high])
+
+        on_stack: Any = cgutils.alloca_once_value
+        found = on_stack(builder, looked_up(word(0)))  # of a number, the last bits are looked at
+        pairs: Any = cgutils.for_range_slice
+        with pairs(builder, word(2 * lanes), arguments[4], word(2 * lanes)) as (begin, _):
+            edge = builder.insert_element(ir.Constant(index, ir.Undefined), builder.trunc(begin, whole), word(0))
+            edges = builder.shuffle_vector(edge, edge, ir.Constant(ir.VectorType(ir.IntType(32), lanes), [0] * lanes))
+            here = builder.icmp_unsigned(">=", named, edges)
+            builder.store(builder.select(here, looked_up(begin), builder.load(found)), found)
+        builder.store(builder.load(found), pointer(0, arguments[1]), align=size)
+        return context.get_dummy_value()
+
+    return types.void(to, types.uint64, table, types.uint64, types.uint64, who, types.uint64), generate
+
+
+_pick: Any = intrinsic(_picks)
+
+
+@kernel
+def take(to: Any, table: Any, who: Any, count: int) -> None:
+    """Write into to (R, K, N) what the first R rows of a table (.., N') of `count` agents say of those listed, (K, N).
+
+    N and N' are multiples of PAIR, and whom the lists name beyond the last agent is below `count`, too. While a row of
+    the table is a few registers long, a register of agents is looked up in it at once (with AVX-512).
+    """
+    many, listed, n = np.uint64(to.shape[0]), np.uint64(who.shape[0]), np.uint64(who.shape[1])
+    lanes, length = np.uint64(LINE // to.itemsize), np.uint64(table.shape[1])
+    if _looked_up(table) and np.uint64(count) <= np.uint64(8) * lanes:
+        for i in range(np.uint64(0), n, lanes):
+            for s in range(listed):
+                for r in range(many):
+                    _pick(to, (r * listed + s) * n + i, table, r * length, np.uint64(count), who, s * n + i)
+    else:
+        for r in range(many):
+            for s in range(listed):
+                for i in range(n):
+                    to[r, s, i] = table[r, np.uint64(who[s, i])]
 
 
 def _turned_square(

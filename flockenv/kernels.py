@@ -22,6 +22,7 @@ from types import ModuleType
 from typing import Any, TypeVar, cast
 
 import numba
+import numpy as np
 from llvmlite import ir  # type: ignore[import-untyped]
 from numba.core import cgutils, types
 from numba.cpython.unsafe.tuple import tuple_setitem
@@ -252,6 +253,8 @@ def _stacked(typing_context: Any, numbers: Any) -> Any:
 
 
 stacked: Any = intrinsic(_stacked)
+if numba.config.DISABLE_JIT:  # type: ignore[attr-defined]  # laws run in plain Python, too, for whoever debugs them
+    stacked = np.array
 
 _PATIENCE = 2000  # rounds of waiting before the core is offered to somebody else
 

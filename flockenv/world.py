@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from flockenv import state as states
-from flockenv.abreast import apart
+from flockenv.abreast import PAIR, apart
 from flockenv.crew import share, threads
 from flockenv.kernels import load, settled
 from flockenv.noise import MASK, keys_of
@@ -123,14 +123,16 @@ class World:
         """Return the scratch of one thread: of a decision, and of looking around and stepping."""
         task, scene, n = self.task, self.task.scene, self.agents
         d, real, look = scene.dimension, scene.dtype, task.look or Look(0.0)
-        padded = -(-n // task.parts.width) * task.parts.width
+        lanes = PAIR if task.abreast else task.parts.width
+        padded = -(-n // lanes) * lanes
         decision: tuple[NDArray[Any], ...] = (
             np.zeros((d, 1, n), real), np.zeros((d, n), real), np.zeros((d, n), real), np.zeros(n, np.bool_),
             np.zeros((self.action_size + len(task.terms)) * apart(self.learners)),
         )  # fmt: skip
         if task.abreast:
             beside = np.zeros(task.abreast * apart(self.learners), np.float32)
-            decision += (np.zeros((2 * d + task.memory + 1, padded), real), beside)
+            own, nearby = (2 * d + 1 + task.memory, padded), (2 * d + 1, look.agents, padded)
+            decision += (np.zeros(own, real), np.zeros(nearby, real), beside)
         near = [
             np.zeros(shape, kind)
             for many in (look.agents, look.obstacles)

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -9,7 +13,7 @@ import pytest
 from numba import njit
 from numba.core.errors import TypingError
 
-from flockenv.abreast import SIDE, apart, columns, into_rows, packed
+from flockenv.abreast import PAIR, SIDE, apart, columns, into_rows, packed, take
 
 
 @njit
@@ -65,3 +69,52 @@ def test_a_packed_array_is_the_same_array() -> None:
     assert whole == array.strides
     assert one == array[:, 3].strides
     np.testing.assert_array_equal(held, array[:, 3])
+
+
+@njit
+def taken(to: Any, table: Any, who: Any, count: int) -> None:
+    """Call it as a kernel does."""
+    take(to, table, who, count)
+
+
+@pytest.mark.parametrize("real", ["float32", "float64"])
+@pytest.mark.parametrize("count", [1, 2, 15, 16, 17, 31, 32, 33, 63, 64, 65, 100, 128, 129, 300])
+def test_what_is_taken_is_what_the_listed_say(count: int, real: str) -> None:
+    """Tables of one pair of registers, of several, and of more than are looked up."""
+    long, many, listed = -(-count // PAIR) * PAIR, 3, 2
+    rng = np.random.default_rng(count)
+    table = rng.normal(size=(many + 1, long)).astype(real)
+    table[:, count:] = np.nan
+    who = rng.integers(0, count, (listed, long)).astype(np.int32)
+    who[0, 0], who[-1, -1] = count - 1, 0
+    room = np.full((3, many, listed, long), -7, real)
+    taken(room[1], table, who, count)
+    np.testing.assert_array_equal(room[1], table[:many][:, who])
+    assert (room[[0, 2]] == -7).all()
+
+
+ONE_BY_ONE = """
+import numpy as np
+from flockenv.tasks import Flock
+from flockenv.world import World
+world = World(Flock(agents=24, dtype="float32"), 3)
+world.reset(0)
+for actions in np.random.default_rng(0).uniform(-1, 1, (20, 3, 24, 2)):
+    step = world.step(actions)
+print(float(np.abs(step.observation).sum()), step.terms.sum().round(6), world.state.x.sum())
+"""
+
+
+@pytest.mark.slow
+def test_a_processor_without_avx_512_takes_them_one_by_one(tmp_path: Path) -> None:
+    """The same flock on this processor, and compiled for one that any x86-64 is."""
+    said = []
+    for name in ("", "x86-64-v2"):
+        chosen = {"NUMBA_CPU_NAME": name, "NUMBA_CPU_FEATURES": ""} if name else {}
+        done = subprocess.run(
+            [sys.executable, "-c", ONE_BY_ONE],
+            env={**os.environ, **chosen, "FLOCKENV_CACHE": str(tmp_path / (name or "own"))},
+            capture_output=True, text=True, check=True,
+        )  # fmt: skip
+        said.append([float(word) for word in done.stdout.split()])
+    assert said[0] == pytest.approx(said[1], rel=1e-5)

@@ -180,6 +180,8 @@ def interrupted(moment: str, *arguments: str) -> subprocess.CompletedProcess[str
 import contextlib, os, signal, sys
 from flockenv import cli
 
+signal.signal(signal.SIGINT, signal.default_int_handler)  # a test run in the background ignores them, for all below
+
 @contextlib.contextmanager
 def progress(title, total, unit):
     def show(done):

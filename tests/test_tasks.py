@@ -253,9 +253,14 @@ def frame(world: World) -> list[Any]:
     s, scene = world.state, world.task.scene
     arrays = [s.x[:, 0], s.v[:, 0], s.alive[0], s.obstacle_x[:, 0], s.obstacle_radius[0], world._memory[:, 0]]
     body = [scene.body.radius, scene.body.max_speed, scene.body.max_force]
-    near = [array.copy() for array in world._scratch[0][1][: len(NEAR.split(", "))]]  # of the last world looked at
+    decision, rest = world._scratch[0]  # of the last world looked at
+    near, d = [*rest[: len(NEAR.split(", "))], *[np.zeros(0)] * 3], scene.dimension
+    if world.task.abreast:
+        own, nearby = decision[-3:-1]
+        arrays[:2], arrays[5], body[0] = (own[:d], own[d : 2 * d]), own[2 * d + 1 :], own[2 * d]
+        near[-3:] = nearby[:d], nearby[d : 2 * d], nearby[2 * d]
     table = np.array(world.task.table())
-    return [*(a.copy() for a in arrays), int(s.key[0]), int(world.steps[0]), *body, *near, table]
+    return [*(a.copy() for a in arrays), int(s.key[0]), int(world.steps[0]), *body, *(a.copy() for a in near), table]
 
 
 def test_reward_and_observation_touch_nothing(tmp_path: Path) -> None:

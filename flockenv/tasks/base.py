@@ -13,9 +13,10 @@ over one world:
 * `measure(p, before, after, numbers)` writes what this step adds to the domain metrics (Q,);
 * `abreast(p, frame, columns)`, of a task with numbers `abreast` alone, writes the first so many numbers of all rows,
   (L, abreast), of which the same number of all agents lies together: loops over agents become vector code. So that
-  none is left over, L is rounded up there and in that task's `reward`. `pos`, `vel`, `memory`, `radius`, the limits and
-  what is near hold anything for agents that are not there, and nobody looks at what follows from it; `alive`, `before`
-  and `action` end with the last agent. The frame is a copy: what `ended` writes into the memory is not seen;
+  none is left over, L is rounded up there and in that task's `reward`, and in what it and that task's `reward`, `ended`
+  and `measure` see, `pos`, `vel`, `memory`, `radius` and what is near go on beyond the last agent, up to a multiple of
+  `abreast.PAIR`, and hold anything there: nobody looks at what follows from it. `alive`, `before` and `action` end with
+  the last agent. The frame is a copy: what `ended` writes into the memory is not seen;
 * `observe(p, frame, rows)` writes the observation rows (L, O), or what of them `abreast` left.
 
 `p` holds the task's `parameters()` by name. Learners are the first L agents of a world. Who is near whom is found once
@@ -40,6 +41,7 @@ from flockenv.scene import AnyIntegrator, Scene
 from flockenv.snapshot import Mark
 from flockenv.state import State
 from flockenv.sweep import SHARED, Look, Parts, look_source, scene_source
+from flockenv.sweep.text import indented_lines
 from flockenv.tasks.layout import Layout
 
 __all__ = ["NEAR", "REFUSED", "TASKS", "Frame", "Measured", "Task", "task_source"]
@@ -72,6 +74,10 @@ class Frame(NamedTuple):
     obstacle_gap: Any  # (J, N) m, distances to the surfaces of the nearest obstacles; inf: none
     obstacle_who: Any  # (J, N)
     obstacle_count: Any  # (N,)
+    # Where the nearest agents are, how they move, how large they are; in tasks with numbers `abreast`, else empty.
+    near_pos: Any  # (D, K, N) m
+    near_vel: Any  # (D, K, N) m/s
+    near_radius: Any  # (K, N) m
     table: Any  # (T,) the task's table()
 
 
@@ -214,12 +220,12 @@ REFUSED = -2
 
 def _frame(
     x: str = "x[:, b]", v: str = "v[:, b]", alive: str = "alive[b]", memory: str = "memory[:, b]",
-    radius: str = "radius", near: str = NEAR,
+    radius: str = "radius", near: str = NEAR, nearby: str = ", ".join(["near_square[:0]"] * 3),
 ) -> str:  # fmt: skip
     """Write the frame of world b."""
     return (
         f"Frame({x}, {v}, {alive}, obstacle_x[:, b], obstacle_radius[b], {memory}, key[b], steps[b], {radius}, "
-        f"max_speed, max_force, {near}, table)"
+        f"max_speed, max_force, {near}, {nearby}, table)"
     )
 
 
@@ -241,6 +247,8 @@ def task_source(task: Task) -> str:
     look = f"look(x, alive, obstacle_x, obstacle_radius, b, params, {NEAR}, {SHARED})" if task.look else "pass"
     size, far = task.action_layout.size, apart(task.learners) if task.abreast else "actions.shape[1]"
     fetches = [f"fetch(rows[b], {k}, 4)" if task.abreast else "pass" for k in range(4)]
+    counted = [f"for k in range({len(task.terms)}):", "    fetch(paid[k, b], 0, 1)", "    fetch(terms[k, b], 0, 1)"]
+    counts = "\n".join(indented_lines([*counted, "fetch(payment[b], 0, 1)"], 12)) if task.abreast else ""
     widen, show = _lanes(task) if task.abreast else ("rounded, wide = over.shape[1], now", "pass")
     optional = [*["keep"] * task.keeps, *["abreast"] * (task.abreast > 0)]
     begin_inner = f"begin_inner(x, v, {task.parts.frame_argument}key, tick, params, dt, alive, b, {SHARED})"
@@ -250,7 +258,7 @@ def task_source(task: Task) -> str:
     )
     play = f'''
 
-from flockenv.abreast import columns, fetch, into_rows, packed
+from flockenv.abreast import columns, fetch, into_rows, packed, take
 from flockenv.tasks.base import Frame
 from flockenv.vehicle import face
 from {type(task).__module__} import {", ".join([*_KERNELS, *optional])}
@@ -261,7 +269,7 @@ P = namedtuple("P", {" ".join(names)!r})
 @njit(cache=True, **FAST)
 def play(
     acting, mask, everyone, check, from_world, to_world, actions, {worlds}, dt, count, mortal, limit,
-    force, x0, v0, alive0, decided, {"own, beside, " if task.abreast else ""}{NEAR}, {SHARED},
+    force, x0, v0, alive0, decided, {"own, nearby, beside, " if task.abreast else ""}{NEAR}, {SHARED},
     measured, sums, paid, rows, payment, terms, over, late, success, present,
 ):
     """Let worlds [from_world, to_world) take a decision, or begin an episode where `mask` says so; and observe them.
@@ -272,6 +280,7 @@ def play(
     """
     unaliased()
     x, v, memory, obstacle_x = packed(x), packed(v), packed(memory), packed(obstacle_x)
+    {"force = packed(force)" if task.abreast else "pass"}
     action, good = columns(decided, actions.shape[1], {size}, {far}), True
     for b in range(from_world, to_world if acting and check else from_world):
         for i in range(actions.shape[1]):
@@ -318,6 +327,7 @@ def play(
             steps[b] += 1
         if acting:
             {fetches[1]}
+{counts}
         {look}
         now = {now}
         before = {then}
@@ -328,8 +338,13 @@ def play(
             earns = columns(decided[{size} * {far} :], rounded, {len(task.terms)}, {far})
             reward(p, before, wide, action, earns)
             {fetches[3]}
-            success[b] = ended(p, before, now, over[b])
-            measure(p, before, now, measured[b])
+            after = min(b + 1, to_world - 1)  # asked for in good time: the next world is read soon
+            for k in range({d}):
+                fetch(x[k, after], 0, 1)
+                fetch(v[k, after], 0, 1)
+            fetch(actions[after], 0, 1)
+            success[b] = ended(p, before, wide, over[b])
+            measure(p, before, wide, measured[b])
             late[b] = steps[b] >= limit
             for k in range(sums.shape[1]):
                 sums[b, k] += measured[b, k]
@@ -355,8 +370,9 @@ def _lanes(task: Task) -> tuple[str, str]:
     It goes on beyond the last agent, up to whole registers: loops over agents have no rest that goes one by one.
     """
     d, width, far = task.scene.dimension, task.parts.width, apart(task.learners)
-    memory, radius = 2 * d, 2 * d + task.memory
-    wide = _frame(f"own[:{d}]", f"own[{d}:{memory}]", memory=f"own[{memory}:{radius}]", radius=f"own[{radius}]")
+    radius, memory = 2 * d, 2 * d + 1
+    nearby = f"nearby[:{d}], nearby[{d}:{radius}], nearby[{radius}]"
+    wide = _frame(f"own[:{d}]", f"own[{d}:{radius}]", "alive[b]", f"own[{memory}:]", f"own[{radius}]", NEAR, nearby)
     widen = f"""rounded = np.uint64(over.shape[1] + {width - 1}) // np.uint64({width}) * np.uint64({width})
         for i in range(n):
             for k in range({d}):
@@ -364,6 +380,7 @@ def _lanes(task: Task) -> tuple[str, str]:
             for k in range({task.memory}):
                 own[{memory} + k, i] = memory[k, b, i]
             own[{radius}, i] = radius[i]
+        take(nearby, own, near_who, n)
         wide = {wide}"""
     show = f"""abreast(p, wide, columns(beside, rounded, {task.abreast}, {far}))
         into_rows(rows[b], beside, {task.abreast}, {far})"""

@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from flockenv import arbitration, steering
-from flockenv.kernels import kernel, like
+from flockenv.abreast import SIDE
+from flockenv.kernels import kernel, like, stacked
 from flockenv.noise import uniform
 from flockenv.scene import Group, Scene
 from flockenv.snapshot import Mark
@@ -79,14 +80,13 @@ def _fits(p: Any, frame: Frame, m: int, x: float, y: float, rho: float) -> bool:
 @kernel
 def drive(p: Any, frame: Frame, action: Any, force: Any) -> None:
     """Learners push where their action says, in the frame of the heading; flockmates follow `_flockmate`."""
-    for i in range(frame.pos.shape[1]):
+    for i in range(np.uint64(action.shape[0])):  # no branch in it: agents side by side
         hx, hy = frame.memory[0, i], frame.memory[1, i]
-        if i < action.shape[0]:
-            along, left = action[i, 0] * frame.max_force[i], action[i, 1] * frame.max_force[i]
-            force[0, i] = along * hx - left * hy
-            force[1, i] = along * hy + left * hx
-        else:
-            _flockmate(p, frame, i, force)
+        along, left = action[i, 0] * frame.max_force[i], action[i, 1] * frame.max_force[i]
+        force[0, i] = along * hx - left * hy
+        force[1, i] = along * hy + left * hx
+    for i in range(action.shape[0], frame.pos.shape[1]):
+        _flockmate(p, frame, i, force)
 
 
 @kernel
@@ -164,10 +164,10 @@ def reward(p: Any, before: Frame, after: Frame, action: Any, terms: Any) -> None
         found = after.near_count[i]
         mean, touches, inside = (o, o), o, o
         for s in range(np.uint64(p.listed)):
-            j, there = np.uint64(after.near_who[s, i]), s < np.uint64(found)
-            vx, vy = after.vel[0, j], after.vel[1, j]
+            there = s < np.uint64(found)
+            vx, vy = after.near_vel[0, s, i], after.near_vel[1, s, i]
             mean = (mean[0] + (vx if there else o), mean[1] + (vy if there else o))
-            contact = after.radius[i] + after.radius[j]
+            contact = after.radius[i] + after.near_radius[s, i]
             touches += one if after.near_square[s, i] < contact * contact else o
         for s in range(np.uint64(p.obstacles_seen)):
             inside += one if after.obstacle_gap[s, i] < after.radius[i] else o
@@ -190,26 +190,36 @@ def ended(p: Any, before: Frame, after: Frame, over: Any) -> bool:
     return polarisation > 0.9 and along > 0.8 * p.cruise and not _anybody_touches(after)
 
 
+_ZEROS = (0.0,) * SIDE
+"""A sum for each lane, so that agents are added side by side; the order is the same on every machine."""
+
+
 @kernel
 def _order(frame: Frame) -> tuple[float, float]:
     """Return the polarisation, and the mean speed along the heading, m/s."""
-    n = frame.pos.shape[1]
-    ux, uy, along = 0.0, 0.0, 0.0
-    for i in range(n):
-        vx, vy = np.float64(frame.vel[0, i]), np.float64(frame.vel[1, i])
-        speed = math.sqrt(vx * vx + vy * vy)
-        share = 1.0 / speed if speed > 1e-12 else 0.0
-        ux += vx * share
-        uy += vy * share
-        along += vx * frame.memory[0, i] + vy * frame.memory[1, i]
-    return math.sqrt(ux * ux + uy * uy) / n, along / n
+    n, lanes = np.uint64(frame.alive.shape[0]), np.uint64(SIDE)
+    o, one, least = like(frame.vel[0, 0], 0.0), like(frame.vel[0, 0], 1.0), like(frame.vel[0, 0], 1e-12)
+    ux, uy, along = stacked(_ZEROS), stacked(_ZEROS), stacked(_ZEROS)
+    for first in range(np.uint64(0), n, lanes):
+        for k in range(lanes):
+            i = np.uint64(first + k)
+            there, vx, vy = i < n, frame.vel[0, i], frame.vel[1, i]
+            speed = np.sqrt(vx * vx + vy * vy)
+            share = one / speed if there & (speed > least) else o
+            ux[k] += vx * share
+            uy[k] += vy * share
+            along[k] += vx * frame.memory[0, i] + vy * frame.memory[1, i] if there else o
+    sum_x, sum_y, sum_along = 0.0, 0.0, 0.0
+    for k in range(lanes):
+        sum_x, sum_y, sum_along = sum_x + ux[k], sum_y + uy[k], sum_along + along[k]
+    return math.sqrt(sum_x * sum_x + sum_y * sum_y) / n, sum_along / n
 
 
 @kernel
 def _anybody_touches(frame: Frame) -> bool:
     """Is anybody's nearest neighbour, or nearest obstacle, so near that they touch?"""
     touching = False
-    for i in range(np.uint64(frame.pos.shape[1])):
+    for i in range(np.uint64(frame.alive.shape[0])):
         touching |= _touches(frame, i)
     return touching
 
@@ -217,7 +227,7 @@ def _anybody_touches(frame: Frame) -> bool:
 @kernel
 def _touches(frame: Frame, i: int) -> Any:
     """Does agent i touch its nearest neighbour, or the nearest obstacle? Where there is none, it is infinitely far."""
-    contact = frame.radius[i] + frame.radius[np.uint64(frame.near_who[0, i])]
+    contact = frame.radius[i] + frame.near_radius[0, i]
     return (frame.near_square[0, i] < contact * contact) | (frame.obstacle_gap[0, i] < frame.radius[i])
 
 
@@ -225,10 +235,30 @@ def _touches(frame: Frame, i: int) -> Any:
 def measure(p: Any, before: Frame, after: Frame, numbers: Any) -> None:
     """Polarisation; mean distance of the nearest in sight, m; touches that began just now; mean speed along, m/s."""
     numbers[0], numbers[3] = _order(after)
-    n = after.pos.shape[1]
-    nearest, began = 0.0, 0.0
-    for i in range(np.uint64(n)):
-        nearest += math.sqrt(after.near_square[0, i]) if after.near_count[i] > 0 else p.sight
+    numbers[1] = _nearest(p, after)
+    numbers[2] = _began(p, before, after) if _anybody_touches(after) else 0.0
+
+
+@kernel
+def _nearest(p: Any, frame: Frame) -> float:
+    """Return the mean distance of the nearest neighbour, m; the sight where there is none."""
+    n, lanes, sums = np.uint64(frame.alive.shape[0]), np.uint64(SIDE), stacked(_ZEROS)
+    for first in range(np.uint64(0), n, lanes):
+        for k in range(lanes):
+            i = np.uint64(first + k)
+            distance = np.sqrt(frame.near_square[0, i]) if frame.near_count[i] > 0 else p.sight
+            sums[k] += distance if i < n else like(distance, 0.0)
+    mean = 0.0
+    for k in range(lanes):
+        mean += sums[k]
+    return mean / n
+
+
+@kernel
+def _began(p: Any, before: Frame, after: Frame) -> float:
+    """Return how many touches began just now, of two agents, or of one and an obstacle."""
+    began = 0.0
+    for i in range(after.alive.shape[0]):
         if not _touches(after, i):
             continue
         for s in range(after.near_count[i]):
@@ -242,7 +272,7 @@ def measure(p: Any, before: Frame, after: Frame, numbers: Any) -> None:
             if after.obstacle_gap[s, i] < after.radius[i]:
                 clearance = after.rho[m] + after.radius[i]
                 began += 0.0 if _touched(p, before, i, after.centre[0, m], after.centre[1, m], clearance) else 1.0
-    numbers[1], numbers[2] = nearest / n, began
+    return began
 
 
 @kernel
@@ -283,9 +313,10 @@ def _show_neighbour(p: Any, frame: Frame, i: int, s: int, slots: Any, scales: An
     Zeros if there is none. All is worked out for whoever stands in the list; that is somebody's number in any case.
     """
     o, one, two, heading = like(p.sight, 0.0), like(p.sight, 1.0), np.uint64(2), _heading(p, frame, i)
-    j, there = np.uint64(frame.near_who[s, i]), s < np.uint64(frame.near_count[i])
-    to = (offset(frame.pos[0, i], frame.pos[0, j], p.size), offset(frame.pos[1, i], frame.pos[1, j], p.size))
-    relative = (frame.vel[0, j] - frame.vel[0, i], frame.vel[1, j] - frame.vel[1, i])
+    there = s < np.uint64(frame.near_count[i])
+    x, y = frame.near_pos[0, s, i], frame.near_pos[1, s, i]
+    to = (offset(frame.pos[0, i], x, p.size), offset(frame.pos[1, i], y, p.size))
+    relative = (frame.near_vel[0, s, i] - frame.vel[0, i], frame.near_vel[1, s, i] - frame.vel[1, i])
     distance = np.sqrt(frame.near_square[s, i])
     closeness = one - distance * scales[2]
     crowded = (closeness > o) & (distance > o)
