@@ -336,8 +336,7 @@ def _put_final(info: Info, seen: NDArray[np.float32], columns: Info, mask: Mask,
     """Enter how the rows that ended ended: what they saw last as objects, what is told of them as columns."""
     rows = np.flatnonzero(mask)
     last = np.full(len(mask), None, object)
-    for row, own in zip(rows.tolist(), seen.reshape(len(rows), -1), strict=True):
-        last[row] = own
+    last[rows] = np.fromiter(seen.reshape(len(rows), -1), object, len(rows))
     final: Info = {}
     _put(final, _only(columns, rows), mask, lacks)
     info["final_obs"], info["_final_obs"] = last, mask.copy()
