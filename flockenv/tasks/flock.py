@@ -61,7 +61,8 @@ def spawn(p: Any, frame: Frame) -> None:
 def _clear(frame: Frame, i: int, distance: float) -> bool:
     """Is agent i at least this far from those placed before it?"""
     for j in range(i):
-        if math.hypot(frame.pos[0, j] - frame.pos[0, i], frame.pos[1, j] - frame.pos[1, i]) < distance:
+        dx, dy = frame.pos[0, j] - frame.pos[0, i], frame.pos[1, j] - frame.pos[1, i]
+        if math.sqrt(dx * dx + dy * dy) < distance:
             return False
     return True
 

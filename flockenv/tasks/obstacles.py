@@ -66,7 +66,8 @@ def _touches(before: Frame, after: Frame) -> bool:
         if after.rho[m] > 0.0:
             cx, cy = after.centre[0, m] - x, after.centre[1, m] - y
             share = min(max((cx * dx + cy * dy) / way, 0.0), 1.0) if way > 0.0 else 0.0
-            if math.hypot(cx - share * dx, cy - share * dy) < after.rho[m] + after.radius[0]:
+            off_x, off_y = cx - share * dx, cy - share * dy
+            if math.sqrt(off_x * off_x + off_y * off_y) < after.rho[m] + after.radius[0]:
                 return True
     return False
 

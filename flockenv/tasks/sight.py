@@ -10,6 +10,7 @@ import numpy as np
 from flockenv.kernels import Vec, kernel, like
 from flockenv.shapes import ray_hit
 from flockenv.tasks.layout import Slot
+from flockenv.vec import dot
 
 __all__ = [
     "block_ways", "clip", "compass", "leaves_gap", "neighbour_slots", "offset", "place_of", "put", "put_crowding",
@@ -55,7 +56,8 @@ def velocity_of(frame: Any, i: int) -> Vec:
 def leaves_gap(p: Any, frame: Any, m: int, x: float, y: float, rho: float) -> bool:
     """Does obstacle m, a circle of radius rho here, leave a gap of `min_gap` to those before it?"""
     for k in range(m):
-        distance = math.hypot(frame.centre[0, k] - x, frame.centre[1, k] - y)
+        dx, dy = frame.centre[0, k] - x, frame.centre[1, k] - y
+        distance = math.sqrt(dx * dx + dy * dy)
         if frame.rho[k] > 0.0 and distance < frame.rho[k] + rho + p.min_gap:
             return False
     return True
@@ -111,10 +113,12 @@ def compass(rays: int) -> tuple[float, ...]:
 
 @kernel
 def block_ways(row: Any, at: int, rays: int, table: Any, to: Any, ahead: Any, clearance: float, sight: float) -> None:
-    """Shorten the free ways in row[at : at + rays], in units of `sight` m, by an obstacle at `to` m.
+    """Shorten the free ways in row[at : at + rays], in units of `sight` m, by an obstacle at `to` m, if it is in sight.
 
     Ways lead in the directions of `compass`, turned so that the first is `ahead`, a unit vector; `table` is it.
     """
+    if dot(to, to) >= (sight + clearance) * (sight + clearance):
+        return
     here = (to[0] * ahead[0] + to[1] * ahead[1], to[1] * ahead[0] - to[0] * ahead[1])
     share = like(sight, 1.0) / sight
     sines, row_at = np.uint64(rays), np.uint64(at)
