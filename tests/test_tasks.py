@@ -7,14 +7,15 @@ import pickle
 import subprocess
 import sys
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
+from numba import njit
 
 import flockenv
 from flockenv.integrators import RK4, Midpoint, SemiImplicitEuler
-from flockenv.tasks import TASKS, Crossing, Flock, Obstacles, Pursuit, Task
+from flockenv.tasks import TASKS, Crossing, Flock, Obstacles, Pursuit, Task, flock
 from flockenv.tasks.base import NEAR, task_source
 from flockenv.world import Step, World
 from tests.catalogue import TASKS as ROWS
@@ -740,6 +741,44 @@ def test_scripted_flockmates_flock() -> None:
     assert along.mean() > 1.4
     polarisation = np.linalg.norm((v / np.linalg.norm(v, axis=2, keepdims=True)).mean(axis=1), axis=1)
     assert polarisation.mean() > 0.8
+
+
+class Seen(NamedTuple):
+    """What of a frame a scripted flockmate looks at for its neighbours."""
+
+    pos: Any
+    alive: Any
+
+
+class Wanted(NamedTuple):
+    """And of what a task gives."""
+
+    neighbours: float
+    sight: float
+    size: float
+
+
+@njit
+def heeded(p: Wanted, frame: Seen, i: int, squares: Any, who: Any) -> Any:
+    """Call it as a kernel does."""
+    return flock._list_nearest(p, frame, i, squares, who)
+
+
+@pytest.mark.parametrize("neighbours", [1, 2, 6, 32])
+@pytest.mark.parametrize("agents", [1, 2, 7, 60])
+def test_a_scripted_flockmate_heeds_the_nearest(agents: int, neighbours: int) -> None:
+    """On a lattice, so that many are equally far: those come by number. Around the edge, too."""
+    rng = np.random.default_rng(agents)
+    frame = Seen(rng.integers(0, 8, (2, agents)) * 1.0, rng.random(agents) < 0.8)
+    for i in range(agents):
+        offset = (frame.pos - frame.pos[:, i, None] + 4) % 8 - 4
+        square = (offset**2).sum(axis=0)
+        square[~frame.alive | (np.arange(agents) == i) | (square >= 9.0)] = np.inf
+        expected = [j for j in np.argsort(square, kind="stable") if square[j] < np.inf][:neighbours]
+        squares, who = np.full(32, np.inf), np.zeros(32, np.uint64)
+        found = int(heeded(Wanted(float(neighbours), 3.0, 8.0), frame, i, squares, who))
+        assert who[:found].tolist() == expected
+        assert squares[:found].tolist() == square[expected].tolist()
 
 
 def test_a_flock_begins_untouched() -> None:

@@ -90,28 +90,30 @@ def drive(p: Any, frame: Frame, action: Any, force: Any) -> None:
         _flockmate(p, frame, i, force)
 
 
+_MOST = 32  # neighbours that are heeded at most
+_FAR, _NOBODY = (math.inf,) * _MOST, (np.uint64(0),) * _MOST
+
+
 @kernel
 def _flockmate(p: Any, frame: Frame, i: int, force: Any) -> None:
     """A scripted member: avoid obstacles, separate, align, cohere, follow the heading, by prioritised allocation.
 
-    It heeds the `neighbours` nearest within sight; who is nearest is searched for it alone, one after another.
+    It heeds the `neighbours` nearest within sight.
     """
     x, y = frame.pos[0, i], frame.pos[1, i]
     v = (np.float64(frame.vel[0, i]), np.float64(frame.vel[1, i]))
+    squares, who = stacked(_FAR), stacked(_NOBODY)
+    found = _list_nearest(p, frame, i, squares, who)
     push, sum_v, centre = (0.0, 0.0), (0.0, 0.0), (0.0, 0.0)
-    found, last, last_square = 0, -1, -1.0
-    for _ in range(int(p.neighbours)):
-        j, square = _next_nearest(p, frame, i, last, last_square)
-        if j < 0:
-            break
-        found, last, last_square = found + 1, j, square
+    for s in range(found):
+        j, square = who[s], squares[s]
         d = (np.float64(offset(x, frame.pos[0, j], p.size)), np.float64(offset(y, frame.pos[1, j], p.size)))
         one = steering.separate(d, (1.0, 0.0))
         near = 1.0 if math.sqrt(square) < p.spacing else 0.0
         push = (push[0] + near * one[0], push[1] + near * one[1])
         sum_v = (sum_v[0] + frame.vel[0, j], sum_v[1] + frame.vel[1, j])
         centre = (centre[0] + d[0], centre[1] + d[1])
-    share = 1.0 / max(found, 1)
+    share = 1.0 / max(np.float64(found), 1.0)
     agree = steering.align(v, scale(sum_v, share)) if found > 0 else (0.0, 0.0)
     course = (p.cruise * frame.memory[0, i] - v[0], p.cruise * frame.memory[1, i] - v[1])
     around = _around(p, frame, i, v)
@@ -121,17 +123,21 @@ def _flockmate(p: Any, frame: Frame, i: int, force: Any) -> None:
 
 
 @kernel
-def _next_nearest(p: Any, frame: Frame, i: int, last: int, last_square: float) -> tuple[int, float]:
-    """Return who is nearest to agent i within sight after `last`, equal distances by number, and the square; or -1."""
-    best, who = np.float64(p.sight * p.sight), -1
-    for j in range(frame.pos.shape[1]):
+def _list_nearest(p: Any, frame: Frame, i: int, squares: Any, who: Any) -> Any:
+    """List the nearest within sight of agent i, equal distances by number, and their squares; return how many."""
+    one, found, last = np.uint64(1), np.uint64(0), np.uint64(p.neighbours) - np.uint64(1)
+    for j in range(np.uint64(frame.pos.shape[1])):
         dx = offset(frame.pos[0, i], frame.pos[0, j], p.size)
         dy = offset(frame.pos[1, i], frame.pos[1, j], p.size)
         square = np.float64(dx * dx + dy * dy)
-        beyond = square > last_square or (square == last_square and j > last)
-        if j != i and frame.alive[j] and beyond and square < best:
-            best, who = square, j
-    return who, best
+        if j != np.uint64(i) and frame.alive[j] and square < min(np.float64(p.sight * p.sight), squares[last]):
+            place = last
+            while place > 0 and square < squares[place - one]:
+                squares[place], who[place] = squares[place - one], who[place - one]
+                place -= one
+            squares[place], who[place] = square, j
+            found = min(found + one, last + one)
+    return found
 
 
 @kernel
@@ -400,7 +406,7 @@ class Flock(Task):
     max_force: float = Field(default=4.0, gt=0, description="N; the mass is 1 kg")
     spacing: float = Field(default=1.5, gt=0, description="m, wanted distance of the nearest neighbour")
     sight: float = Field(default=6.0, gt=0, description="m, neighbours and obstacles are seen within this")
-    neighbours: int = Field(default=6, ge=1, le=32, description="how many neighbours are seen, nearest first")
+    neighbours: int = Field(default=6, ge=1, le=_MOST, description="how many neighbours are seen, nearest first")
     obstacles_seen: int = Field(default=2, ge=1, le=32, description="how many are seen, nearest surface first")
     rays: int = Field(default=16, ge=1, le=128, description="directions in which the way clear of obstacles is seen")
     progress_reward: float = Field(default=1.0, ge=0, description="per s at cruising speed along the heading")
