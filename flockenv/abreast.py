@@ -103,7 +103,7 @@ columns: Any = intrinsic(_columns)
 
 
 def _fetch(typing_context: Any, array: Any, part: Any, parts: Any) -> Any:
-    """Ask for the memory of one of so many parts of an array in one piece, which will be written soon.
+    """Ask for the memory of one of so many parts of an array in one piece, which is needed soon.
 
     Rows are written at a stretch, and a store waits for a line of memory that is not at hand. Asked for all at once,
     they would be waited for just so: what asks has room for a dozen lines.
@@ -132,20 +132,20 @@ def _fetch(typing_context: Any, array: Any, part: Any, parts: Any) -> Any:
 fetch: Any = intrinsic(_fetch)
 
 
-def _looks_up(typing_context: Any, table: Any) -> Any:
-    """Say whether this machine looks numbers of such an array up in registers, `_pick`; a constant of machine code."""
+def _looks_up(typing_context: Any) -> Any:
+    """Say whether numbers are looked up in registers, `_pick`; a constant of machine code."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         return context.get_constant(types.boolean, _permutes(context))
 
-    return types.boolean(table), generate
+    return types.boolean(), generate
 
 
 _looked_up: Any = intrinsic(_looks_up)
 
 
 def _permutes(context: Any) -> bool:
-    """Has the processor that is compiled for AVX-512?"""
+    """Is machine code made for a processor with AVX-512?"""
     return "+avx512f" in getattr(context.codegen(), "_tm_features", "").split(",")
 
 
@@ -209,7 +209,7 @@ def take(to: Any, table: Any, who: Any, count: int) -> None:
     """
     many, listed, n = np.uint64(to.shape[0]), np.uint64(who.shape[0]), np.uint64(who.shape[1])
     lanes, length = np.uint64(LINE // to.itemsize), np.uint64(table.shape[1])
-    if _looked_up(table) and np.uint64(count) <= np.uint64(8) * lanes:
+    if _looked_up() and np.uint64(count) <= np.uint64(8) * lanes:
         for i in range(np.uint64(0), n, lanes):
             for s in range(listed):
                 for r in range(many):

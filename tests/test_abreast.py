@@ -8,6 +8,8 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import llvmlite.binding as llvm
+import numba
 import numpy as np
 import pytest
 from numba import njit
@@ -91,6 +93,19 @@ def test_what_is_taken_is_what_the_listed_say(count: int, real: str) -> None:
     taken(room[1], table, who, count)
     np.testing.assert_array_equal(room[1], table[:many][:, who])
     assert (room[[0, 2]] == -7).all()
+
+
+def test_numbers_are_looked_up_in_registers_where_that_can_be() -> None:
+    """The register form would vanish unseen: results are the same."""
+    features = llvm.get_host_cpu_features()
+    if not features.get("avx512f") or numba.config.CPU_NAME or numba.config.CPU_FEATURES:  # type: ignore[attr-defined]
+        pytest.skip("machine code is made for a processor without AVX-512, or for another one")
+    for real in (np.float32, np.float64):
+        room, table = np.zeros((3, 2, PAIR), real), np.zeros((3, PAIR), real)
+        taken(room, table, np.zeros((2, PAIR), np.int32), PAIR)
+    made = taken.inspect_asm()
+    assert len(made) >= 2
+    assert all("vpermt2p" in text or "vpermi2p" in text for text in made.values())
 
 
 ONE_BY_ONE = """

@@ -14,6 +14,7 @@ import pytest
 from numba import njit
 
 import flockenv
+from flockenv.abreast import PAIR
 from flockenv.integrators import RK4, Midpoint, SemiImplicitEuler
 from flockenv.tasks import TASKS, Crossing, Flock, Obstacles, Pursuit, Task, flock
 from flockenv.tasks.base import NEAR, task_source
@@ -741,6 +742,26 @@ def test_scripted_flockmates_flock() -> None:
     assert along.mean() > 1.4
     polarisation = np.linalg.norm((v / np.linalg.norm(v, axis=2, keepdims=True)).mean(axis=1), axis=1)
     assert polarisation.mean() > 0.8
+
+
+@pytest.mark.parametrize("dtype", ["float32", "float64"])
+@pytest.mark.parametrize("agents", [1, 17, 33])
+def test_what_lies_beyond_the_last_agent_is_nobodys_business(agents: int, dtype: str) -> None:
+    """Where flocks are shown side by side arrays go on; what is there makes no difference."""
+    told = []
+    for beyond in (0.0, np.nan):
+        world = world_of(Flock(agents=agents, dtype=dtype), worlds=3)
+        own, nearby = world._scratch[0][0][-3:-1]
+        said = []
+        for actions in random_actions(world, 5):
+            own[:, agents:], nearby[..., agents:] = beyond, beyond
+            step = world.step(actions)
+            said += [step.observation, step.terms, step.success, *(world.measure().values())]
+        assert np.isnan(own[:, agents:]).all() == np.isnan(beyond) or agents % PAIR == 0
+        told.append(said)
+    for one, other in zip(*told, strict=True):
+        np.testing.assert_array_equal(one, other)
+        assert np.isfinite(one).all()
 
 
 class Seen(NamedTuple):

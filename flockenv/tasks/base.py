@@ -15,8 +15,9 @@ over one world:
   (L, abreast), of which the same number of all agents lies together: loops over agents become vector code. So that
   none is left over, L is rounded up there and in that task's `reward`, and in what it and that task's `reward`, `ended`
   and `measure` see, `pos`, `vel`, `memory`, `radius` and what is near go on beyond the last agent, up to a multiple of
-  `abreast.PAIR`, and hold anything there: nobody looks at what follows from it. `alive`, `before` and `action` end with
-  the last agent. The frame is a copy: what `ended` writes into the memory is not seen;
+  `abreast.PAIR`, and hold anything there: nobody may look at what follows from it. `alive`, the limits, `before` and
+  `action` end with the last agent. The frame is a copy: such a task's `ended` writes `over` and `after.alive` alone, and
+  what is to be remembered, `keep` does;
 * `observe(p, frame, rows)` writes the observation rows (L, O), or what of them `abreast` left.
 
 `p` holds the task's `parameters()` by name. Learners are the first L agents of a world. Who is near whom is found once
@@ -74,7 +75,8 @@ class Frame(NamedTuple):
     obstacle_gap: Any  # (J, N) m, distances to the surfaces of the nearest obstacles; inf: none
     obstacle_who: Any  # (J, N)
     obstacle_count: Any  # (N,)
-    # Where the nearest agents are, how they move, how large they are; in tasks with numbers `abreast`, else empty.
+    # Where the nearest agents are, how they move, how large they are: in tasks with numbers `abreast`, for what writes
+    # these and for `reward`, `ended` and `measure`; else empty.
     near_pos: Any  # (D, K, N) m
     near_vel: Any  # (D, K, N) m/s
     near_radius: Any  # (K, N) m
@@ -247,8 +249,8 @@ def task_source(task: Task) -> str:
     look = f"look(x, alive, obstacle_x, obstacle_radius, b, params, {NEAR}, {SHARED})" if task.look else "pass"
     size, far = task.action_layout.size, apart(task.learners) if task.abreast else "actions.shape[1]"
     fetches = [f"fetch(rows[b], {k}, 4)" if task.abreast else "pass" for k in range(4)]
-    counted = [f"for k in range({len(task.terms)}):", "    fetch(paid[k, b], 0, 1)", "    fetch(terms[k, b], 0, 1)"]
-    counts = "\n".join(indented_lines([*counted, "fetch(payment[b], 0, 1)"], 12)) if task.abreast else ""
+    sums = [f"for k in range({len(task.terms)}):", "    fetch(paid[k, b], 0, 1)", "    fetch(terms[k, b], 0, 1)"]
+    fetch_sums = "\n".join(indented_lines([*sums, "fetch(payment[b], 0, 1)"], 12)) if task.abreast else ""
     widen, show = _lanes(task) if task.abreast else ("rounded, wide = over.shape[1], now", "pass")
     optional = [*["keep"] * task.keeps, *["abreast"] * (task.abreast > 0)]
     begin_inner = f"begin_inner(x, v, {task.parts.frame_argument}key, tick, params, dt, alive, b, {SHARED})"
@@ -327,7 +329,7 @@ def play(
             steps[b] += 1
         if acting:
             {fetches[1]}
-{counts}
+{fetch_sums}
         {look}
         now = {now}
         before = {then}
@@ -338,11 +340,11 @@ def play(
             earns = columns(decided[{size} * {far} :], rounded, {len(task.terms)}, {far})
             reward(p, before, wide, action, earns)
             {fetches[3]}
-            after = min(b + 1, to_world - 1)  # asked for in good time: the next world is read soon
+            following = min(b + 1, to_world - 1)  # asked for in good time: that world is the next
             for k in range({d}):
-                fetch(x[k, after], 0, 1)
-                fetch(v[k, after], 0, 1)
-            fetch(actions[after], 0, 1)
+                fetch(x[k, following], 0, 1)
+                fetch(v[k, following], 0, 1)
+            fetch(actions[following], 0, 1)
             success[b] = ended(p, before, wide, over[b])
             measure(p, before, wide, measured[b])
             late[b] = steps[b] >= limit

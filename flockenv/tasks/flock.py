@@ -213,8 +213,8 @@ def _order(frame: Frame) -> tuple[float, float]:
             there, vx, vy = i < n, frame.vel[0, i], frame.vel[1, i]
             speed = np.sqrt(vx * vx + vy * vy)
             share = one / speed if there & (speed > least) else o
-            ux[k] += vx * share
-            uy[k] += vy * share
+            ux[k] += vx * share if there else o
+            uy[k] += vy * share if there else o
             along[k] += vx * frame.memory[0, i] + vy * frame.memory[1, i] if there else o
     sum_x, sum_y, sum_along = 0.0, 0.0, 0.0
     for k in range(lanes):
