@@ -16,8 +16,8 @@ over one world:
   none is left over, L is rounded up there and in that task's `reward`, and in what it and that task's `reward`, `ended`
   and `measure` see, `pos`, `vel`, `memory`, `radius` and what is near go on beyond the last agent, up to a multiple of
   `abreast.PAIR`, and hold anything there: nobody may look at what follows from it. `alive`, the limits, `before` and
-  `action` end with the last agent. The frame is a copy: such a task's `ended` writes `over` and `after.alive` alone, and
-  what is to be remembered, `keep` does;
+  `action` end with the last agent. The frame is a copy: such a task's `ended` writes `over` and `after.alive` alone;
+  what is to be remembered is for `keep`;
 * `observe(p, frame, rows)` writes the observation rows (L, O), or what of them `abreast` left.
 
 `p` holds the task's `parameters()` by name. Learners are the first L agents of a world. Who is near whom is found once
