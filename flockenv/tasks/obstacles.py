@@ -33,6 +33,7 @@ def spawn(p: Any, frame: Frame) -> None:
     frame.memory[0, 0] = p.size - 1.5
     frame.memory[1, 0] = 2.0 + (p.size - 4.0) * uniform(frame.key, 0, 0, 1)
     frame.memory[2, 0] = math.hypot(frame.memory[0, 0] - frame.pos[0, 0], frame.memory[1, 0] - frame.pos[1, 0])
+    frame.memory[3, 0] = 0.0
     for m in range(frame.rho.shape[0]):
         frame.rho[m] = 0.0
         for t in range(32):
@@ -73,9 +74,15 @@ def _touches(before: Frame, after: Frame) -> bool:
 
 
 @kernel
+def keep(p: Any, before: Frame, after: Frame) -> None:
+    """Remember whether an obstacle was touched in this decision: looked for once, asked for by three."""
+    after.memory[3, 0] = 1.0 if _touches(before, after) else 0.0
+
+
+@kernel
 def reward(p: Any, before: Frame, after: Frame, action: Any, terms: Any) -> None:
     """Terms: progress, goal, touch, time."""
-    touch = _touches(before, after)
+    touch = after.memory[3, 0] > 0.0
     there = not touch and _to_goal(after) <= p.goal_radius
     terms[0, 0] = p.progress_reward * (_to_goal(before) - _to_goal(after))
     terms[0, 1] = p.goal_reward if there else 0.0
@@ -86,7 +93,7 @@ def reward(p: Any, before: Frame, after: Frame, action: Any, terms: Any) -> None
 @kernel
 def ended(p: Any, before: Frame, after: Frame, over: Any) -> bool:
     """A touch ends it, and so does the goal, which is success."""
-    touch = _touches(before, after)
+    touch = after.memory[3, 0] > 0.0
     there = not touch and _to_goal(after) <= p.goal_radius
     over[0] = touch or there
     return there
@@ -96,7 +103,7 @@ def ended(p: Any, before: Frame, after: Frame, over: Any) -> bool:
 def measure(p: Any, before: Frame, after: Frame, numbers: Any) -> None:
     """Path, m; touches; distance left, m; straight distance at the start, m."""
     numbers[0] = math.hypot(after.pos[0, 0] - before.pos[0, 0], after.pos[1, 0] - before.pos[1, 0])
-    numbers[1] = 1.0 if _touches(before, after) else 0.0
+    numbers[1] = after.memory[3, 0]
     numbers[2] = _to_goal(after)
     numbers[3] = after.memory[2, 0]
 
@@ -140,7 +147,8 @@ class Obstacles(Task):
     terms: ClassVar[tuple[str, ...]] = ("progress", "goal", "touch", "time")
     metric_names: ClassVar[tuple[str, ...]] = ("time_to_goal", "collisions", "path_efficiency")
     measures: ClassVar[tuple[str, ...]] = ("path", "touch", "left", "straight")
-    memory: ClassVar[int] = 3
+    memory: ClassVar[int] = 4
+    keeps: ClassVar[bool] = True
 
     horizon: int = Field(default=250, ge=1, description="decisions until the time limit (truncation)")
     size: float = Field(default=24.0, gt=10, description="m, edge of the square")
