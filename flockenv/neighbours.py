@@ -215,26 +215,40 @@ def _key(records: Any, ident: Any, at: Any) -> Any:
 
 
 @kernel
-def order_records(records: Any, ident: Any, length: int, first: int, end: int) -> None:
+def order_records(records: Any, ident: Any, length: int, first: int, end: int, late: Ints) -> None:
     """Put the records [first, end), so long and in the order of their cells, in the order of numbers within each.
 
-    Records begin with their cell and their place, and ident has the numbers by place. Most are where they belong: one
-    comparison each.
+    Records begin with their cell and their place, and ident has the numbers by place. Most are where they belong: who
+    comes after somebody he should precede is listed first, without a branch, which would often be guessed wrong. late:
+    room for that list.
     """
     if first >= end:
         return
-    size = np.uint64(length)
+    size, count, last = np.uint64(length), np.uint64(0), np.uint64(end)
     before = _key(records, ident, np.uint64(first) * size)
-    for k in range(np.uint64(first) + np.uint64(1), np.uint64(end)):
+    for k in range(np.uint64(first) + np.uint64(1), last):
+        key = _key(records, ident, k * size)
+        late[count] = np.int32(k)
+        count += np.uint64(1) if key < before else np.uint64(0)
+        before = key
+    for m in range(count):
+        _settle(records, ident, size, np.uint64(first), last, np.uint64(late[m]))
+
+
+@kernel
+def _settle(records: Any, ident: Any, size: Any, first: Any, end: Any, k: Any) -> None:
+    """Bring record k back to where it belongs, and those behind it, until one is there already."""
+    later = _key(records, ident, k * size - size) > _key(records, ident, k * size)
+    while later:
         at = k * size
         key = _key(records, ident, at)
-        if key >= before:
-            before = key
-            continue
-        while at > np.uint64(first) * size and _key(records, ident, at - size) > _key(records, ident, at):
+        while later:
             for m in range(at, at + size):
                 records[m - size], records[m] = records[m], records[m - size]
             at -= size
+            later = at > first * size and _key(records, ident, at - size) > key
+        k += np.uint64(1)
+        later = k < end and _key(records, ident, k * size - size) > _key(records, ident, k * size)
 
 
 @kernel

@@ -17,7 +17,7 @@ from numba.np import arrayobj
 
 from flockenv.kernels import LINE
 
-__all__ = ["out_of_records", "put_records"]
+__all__ = ["out_of_records", "put_lines", "put_records"]
 
 Vectors = list[Any]
 _several: Any = types.UniTuple
@@ -138,26 +138,70 @@ def _put_records(
 put_records: Any = intrinsic(_put_records)
 
 
-def _out_of_records(
-    typing_context: Any, numbers: Any, places: Any, order: Any, at: Any, width: Any, records: Any
+def _put_lines(
+    typing_context: Any, lines: Any, sources: Any, places: Any, width: Any, to: Any, first: Any, length: Any, spare: Any
 ) -> Any:  # fmt: skip
-    """Read the records `at` and on of `width` agents: which agents they are, into `order`, and their numbers.
+    """Write the numbers of `width` agents from `first` on, one out of each of the sources, as whole lines of memory.
 
-    Those go side by side to the places of `numbers`, which is one for each number of a record; cells go nowhere. Behind
-    the last record there must be room for another, up to the next power of two of its length.
+    As `_put_records` does, but a piece is `length` numbers, whole lines that begin where lines do, and it comes to
+    place `to` (int32, counted in pieces; -1 for place `spare`); behind the last source stands anything. Lines go past
+    the caches: each is far from the next, and must not be read before it is written.
     """
-    wide, many = _width(width), 2 + places.count
+    wide, many, piece = _width(width), sources.count, _width(length)
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        data, where = (_data(context, builder, signature.args[k], arguments[k]) for k in (0, 4))
+        array, real = signature.args[1].dtype, context.get_data_type(signature.args[0].dtype)
+        itemsize = context.get_abi_sizeof(real)
+        side = LINE // itemsize
+        size = max(_whole(many), side)
+        vector, word = ir.VectorType(real, side), ir.IntType(64)
+
+        def row(k: int, begin: int) -> Any:
+            if k >= many:
+                return ir.Constant(vector, ir.Undefined)
+            source = _data(context, builder, array, builder.extract_value(arguments[1], k))
+            place = builder.add(builder.extract_value(arguments[2], k), word(begin))
+            return builder.load(_pointer(builder, source, place, vector), align=itemsize)
+
+        for begin in range(0, wide, side):
+            flat = _transposed(builder, [row(k, begin) for k in range(size)])
+            for lane in range(side):
+                here = builder.add(arguments[5], word(begin + lane))
+                place = builder.sext(builder.load(builder.gep(where, [here])), word)
+                place = builder.select(builder.icmp_signed("<", place, word(0)), arguments[7], place)
+                start = builder.mul(place, word(piece))
+                for done in range(0, piece, side):
+                    pointer = _pointer(builder, data, builder.add(start, word(done)), vector)
+                    stored = builder.store(flat[(lane * size + done) // side], pointer, align=LINE)
+                    stored.set_metadata("nontemporal", builder.module.add_metadata([ir.IntType(32)(1)]))
+        return context.get_dummy_value()
+
+    numbers = _several(types.uint64, sources.count)
+    return types.void(lines, sources, numbers, width, to, types.uint64, length, types.uint64), generate
+
+
+put_lines: Any = intrinsic(_put_lines)
+
+
+def _out_of_records(typing_context: Any, numbers: Any, places: Any, at: Any, width: Any, records: Any) -> Any:
+    """Read the records `at` and on of `width` agents, number by number, each from its place of `numbers` on.
+
+    Of a record, its cell goes nowhere; there is a place for its agent, and for every number behind. Behind the last
+    record there must be room for another, up to the next power of two of its length.
+    """
+    wide, many = _width(width), 1 + places.count
     size = _whole(many)
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        to, who, source = (_data(context, builder, signature.args[k], arguments[k]) for k in (0, 2, 5))
+        to, source = (_data(context, builder, signature.args[k], arguments[k]) for k in (0, 4))
         real, word = context.get_data_type(signature.args[0].dtype), ir.IntType(64)
         itemsize = context.get_abi_sizeof(real)
         side = min(wide, LINE // itemsize)  # lanes of a register
-        vector, several = ir.VectorType(real, side), ir.VectorType(ir.IntType(32), side)
+        vector = ir.VectorType(real, side)
 
         def piece(lane: int, done: int, count: int) -> Any:
-            start = builder.mul(builder.add(arguments[3], word(lane)), word(many))
+            start = builder.mul(builder.add(arguments[2], word(lane)), word(many))
             place = builder.add(start, word(done))
             return builder.load(_pointer(builder, source, place, ir.VectorType(real, count)), align=itemsize)
 
@@ -170,16 +214,13 @@ def _out_of_records(
                     both = _mask(list(range(2 * parts[0].type.count)))
                     parts = [builder.shuffle_vector(*parts[j : j + 2], both) for j in range(0, len(parts), 2)]
                 flat.append(parts[0])
-            _, agents, *rows = _restored(builder, flat)[:many]
-            here = builder.add(arguments[3], word(first))
-            builder.store(builder.fptosi(agents, several), _pointer(builder, who, here, several), align=4)
-            for k, row in enumerate(rows):
+            for k, row in enumerate(_restored(builder, flat)[1:many]):
                 place = builder.add(builder.extract_value(arguments[1], k), word(first))
                 builder.store(row, _pointer(builder, to, place, vector), align=itemsize)
         return context.get_dummy_value()
 
     numbered = _several(types.uint64, places.count)
-    return types.void(numbers, numbered, order, types.uint64, width, records), generate
+    return types.void(numbers, numbered, types.uint64, width, records), generate
 
 
 out_of_records: Any = intrinsic(_out_of_records)

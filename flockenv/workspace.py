@@ -53,13 +53,13 @@ class Workspace:
             "carrying": padded * d if parts.flows else 1,
             "frame": max(padded * parts.framed + parts.counters, 1),
             "felt": max(swept * d * len(parts.targets), 1),
-            "sorted_": parts.rows * (swept + width if parts.sorts else SMALL_STRIDE),
+            "sorted_": 1 if sorts else parts.rows * SMALL_STRIDE,
             "records": (swept + 2 * width if sorts else 1) * parts.numbers,
-            "luggage": carried * parts.luggage_size,
+            "luggage": (carried + 1) * parts.luggage_size,
         }
         real |= {name: size if parts.treed else 1 for name, size in tree_sizes(agents, width, d, team).items()}
         whole = {
-            "order": (swept + width,),
+            "order": (1 if sorts else swept,),
             "cell": (padded if sorts else 1,),
             "start": (cells + 1,),
             "offset": (team, cells),

@@ -6,7 +6,8 @@ import numba
 import numpy as np
 import pytest
 
-from flockenv.transpose import out_of_records, put_records
+from flockenv.kernels import LINE
+from flockenv.transpose import out_of_records, put_lines, put_records
 
 LENGTHS = [3, 5, 6, 8, 9, 16, 17, 20]
 
@@ -15,13 +16,14 @@ def compiled(length: int, width: int) -> Any:
     """Return both as functions of arrays, for records of that length."""
     numbers = range(length - 2)
     sources, places = "lanes, " * len(numbers), "".join(f"np.uint64(at + {k * width}), " for k in numbers)
+    taken = "".join(f"np.uint64(at + {k * width}), " for k in range(-1, length - 2))
     made: dict[str, Any] = {"np": np, "put_records": put_records, "out_of_records": out_of_records}
     exec(  # noqa: S102  # how many sources there are is a type's
         "def put(records, lanes, at, cell, first, offset, spare):\n"
         f"    put_records(records, ({sources}), ({places}), {width}, cell, np.uint64(first), offset, np.uint64(spare)"
         ")\n"
-        "def take(lanes, at, order, first, records):\n"
-        f"    out_of_records(lanes, ({places}), order, np.uint64(first), {width}, records)\n",
+        "def take(lanes, at, first, records):\n"
+        f"    out_of_records(lanes, ({taken}), np.uint64(first), {width}, records)\n",
         made,
     )
     return numba.njit(made["put"]), numba.njit(made["take"])
@@ -48,17 +50,45 @@ def test_records_are_transposed_lanes(dtype: str, width: int, length: int) -> No
     records = rng.random(len(records)).astype(dtype)
     several = records[3 * length : (3 + width) * length].reshape(width, length)
     several[:, 1] = rng.integers(0, 2**24, width)
-    before, order = lanes.copy(), np.full(n, -1, np.int32)
-    take(lanes, 2 * width, order, 3, records)
-    np.testing.assert_array_equal(lanes.reshape(length, width)[2:], several[:, 2:].T)
-    np.testing.assert_array_equal(lanes[: 2 * width], before[: 2 * width])
-    np.testing.assert_array_equal(order, [-1] * 3 + several[:, 1].astype(int).tolist() + [-1] * (n - width - 3))
+    before = lanes.copy()
+    take(lanes, 2 * width, 3, records)
+    np.testing.assert_array_equal(lanes.reshape(length, width)[1:], several[:, 1:].T)  # the agent, and its numbers
+    np.testing.assert_array_equal(lanes[:width], before[:width])
+
+
+@pytest.mark.parametrize("count", [1, 3, 8, 11, 16, 19, 33])
+@pytest.mark.parametrize(("dtype", "width"), [("float32", 16), ("float64", 8), ("float64", 16)])
+def test_lines_are_transposed_lanes_too(dtype: str, width: int, count: int) -> None:
+    side = LINE // np.dtype(dtype).itemsize
+    length = max(-(-count // side) * side, side)
+    sources, places = "lanes, " * count, "".join(f"np.uint64(at + {k * width}), " for k in range(count))
+    made: dict[str, Any] = {"np": np, "put_lines": put_lines}
+    exec(  # noqa: S102  # how many sources there are is a type's
+        "def put(lines, lanes, at, to, first, spare):\n"
+        f"    put_lines(lines, ({sources}), ({places}), {width}, to, np.uint64(first), {length}, np.uint64(spare))\n",
+        made,
+    )
+    rng, n = np.random.default_rng(count), 3 * width
+    raw = np.full((n + 2) * length + side, -7, dtype)
+    begin = -raw.ctypes.data % LINE // raw.itemsize
+    lines = raw[begin : begin + (n + 1) * length]
+    lanes = rng.random((count + 1) * width).astype(dtype)
+    to = rng.permutation(n).astype(np.int32)
+    to[width + 2] = -1  # whose numbers come to the spare place
+    numba.njit(made["put"])(lines, lanes, width, to, width, n)
+    told = lines.reshape(n + 1, length)
+    here = to[width : 2 * width]
+    np.testing.assert_array_equal(told[here, :count], lanes.reshape(count + 1, width)[1:].T)
+    others = np.setdiff1d(np.arange(n), here)
+    np.testing.assert_array_equal(told[others], -7)
+    np.testing.assert_array_equal(raw[:begin], -7)
+    np.testing.assert_array_equal(raw[begin + (n + 1) * length :], -7)
 
 
 def test_a_width_is_written_as_a_number() -> None:
     @numba.njit
-    def take(numbers, order, records, width):
-        out_of_records(numbers, (np.uint64(0),), order, np.uint64(0), width, records)
+    def take(numbers, records, width):
+        out_of_records(numbers, (np.uint64(0),), np.uint64(0), width, records)
 
     with pytest.raises(numba.TypingError, match="must be written as a number"):
-        take(np.zeros(64), np.zeros(64, np.int32), np.zeros(64), 8)
+        take(np.zeros(64), np.zeros(64), 8)

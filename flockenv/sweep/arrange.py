@@ -15,26 +15,19 @@ from flockenv.sweep.text import indented, place_of
 
 __all__ = ["go_home", "move_in"]
 
-AHEAD = 16
-"""Agents between asking for a place in memory and writing there."""
-
 
 def move_in(parts: Parts) -> list[str]:
     """Write how agents move to where their cells come, if that is worth it; sets `arranged`."""
     if not parts.arranges:
         return ["arranged = False"]
-    cell = ["c = np.uint64(cell[i])", "to = np.uint64(offset[rank, c])", "offset[rank, c] += 1"]
-    soon = [
-        f"ask_for(offset[rank], np.uint64(cell[min(i + np.uint64({2 * AHEAD}), last)]))",
-        f"then = np.uint64(offset[rank, np.uint64(cell[min(i + np.uint64({AHEAD}), last)])])",
-    ]
+    to = ["c = np.uint64(cell[i])", "cell[i] = offset[rank, c]", "offset[rank, c] += 1"]
     return [
         "arranged = False",
         f"if count > 1 and n >= {WORTH_ARRANGING} and present == n:",
         f"    shape = {counted(parts, parts.confines)}",
         "    arranged = shape[0] > 0",
         "if arranged:",
-        indented(_carry(parts, soon, cell), 4),
+        indented(_carry(parts, to), 4),
     ]
 
 
@@ -42,31 +35,29 @@ def go_home(parts: Parts) -> list[str]:
     """Write how agents move back to where their numbers say."""
     if not parts.arranges:
         return []
-    soon, home = [f"then = np.uint64(ident[min(i + np.uint64({AHEAD}), last)])"], ["to = np.uint64(ident[i])"]
-    return ["if arranged:", indented(_carry(parts, soon, home), 4)]
+    return ["if arranged:", indented(_carry(parts, ["cell[i] = np.int32(ident[i])"]), 4)]
 
 
-def _carry(parts: Parts, soon: list[str], to: list[str]) -> list[str]:
+def _carry(parts: Parts, to: list[str]) -> list[str]:
     """Write how this thread's agents pack, all of them are carried, and its new ones unpack.
 
-    They go to distant places, in no order: `soon` finds which one a later agent goes `then`, about, so that its memory
-    can be asked for.
+    What is packed goes to distant places, in no order; `to` writes where into `cell`, in which nobody is -1.
     """
-    w, count = parts.width, parts.luggage_size
-    packed = [_place(parts, field) for field in parts.luggage]
-    each = f"for i in range(np.uint64(first * {w}), np.uint64(min(end * {w}, n))):"
-    place = f"    place = {place_of(parts, parts.dimension)}"
+    d, w, count = parts.dimension, parts.width, parts.luggage_size
+    listing = list(enumerate(parts.luggage))
+    fields = [field.partition(" ") for field in parts.luggage]
+    sources = "".join(f"{name}, " for name, _, _ in fields)
+    places = "".join(f"base + np.uint64({int(axis) * w}), " if axis else "row, " for _, _, axis in fields)
     return [
-        f"last = np.uint64(min(end * {w}, n) - 1)",
-        each,
-        indented([*soon, f"ask_for(luggage, then * np.uint64({count}))"], 4),
-        place,
-        indented([*to, f"to *= np.uint64({count})"], 4),
-        indented([f"luggage[to + np.uint64({k})] = {x}" for k, x in enumerate(packed)], 4),
+        "for block in range(np.uint64(first), np.uint64(end)):",
+        f"    base, row = block * np.uint64({d * w}), block * np.uint64({w})",
+        f"    for i in range(row, min(row + np.uint64({w}), np.uint64(n))):",
+        indented(to, 8),
+        f"    put_lines(luggage, ({sources}), ({places}), {w}, cell, row, {count}, np.uint64(n))",
         "wait_for_team(sync, team)",
-        each,
-        place,
-        indented([f"{x} = luggage[i * np.uint64({count}) + np.uint64({k})]" for k, x in enumerate(packed)], 4),
+        f"for i in range(np.uint64(first * {w}), np.uint64(min(end * {w}, n))):",
+        f"    place = {place_of(parts, d)}",
+        *(f"    {_place(parts, f)} = luggage[i * np.uint64({count}) + np.uint64({k})]" for k, f in listing),
     ]
 
 

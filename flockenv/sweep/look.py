@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from flockenv.sweep.pairs import meet_range
 from flockenv.sweep.parts import Parts
-from flockenv.sweep.query import query, walk
+from flockenv.sweep.query import listed, listed_at, query, walk
 from flockenv.sweep.text import SHARED, Slots, indented, indented_lines, lanes_of, tuple_of
 
 __all__ = ["look_source"]
@@ -61,9 +61,9 @@ def _look_at_agents(parts: Parts) -> list[str]:
         "if nx == 0 and present == n:  # sorted by number: the lists lie as the lanes do",
         *_tell(slot, many, lanes, agent="block + l", who="np.int32(#)"),
         "else:",
-        *_tell(slot, many, "np.uint64(upto - at)", agent="np.uint64(order[block + l])", who="order[np.uint64(#)]"),
+        *_tell(slot, many, "np.uint64(upto - at)", agent=listed(parts), who=listed_at(parts, parts.seen_fields)),
     ]
-    return [*query(parts, parts.seen_fields), *walk(parts, block)]
+    return [*query(parts, parts.seen_fields), *walk(parts, parts.seen_fields, block)]
 
 
 def _tell(slot: Slots, many: int, lanes: str, agent: str, who: str) -> list[str]:

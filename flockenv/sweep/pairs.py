@@ -11,7 +11,7 @@ from collections.abc import Callable, Mapping
 
 from flockenv.effects.base import Sight
 from flockenv.sweep.parts import Parts, record_of, sorted_at
-from flockenv.sweep.query import query, walk
+from flockenv.sweep.query import listed, query, walk
 from flockenv.sweep.text import Slots, given, indented, indented_lines, nearest_image, place_of, tuple_of
 
 __all__ = ["meet_range", "pairs"]
@@ -28,7 +28,7 @@ def pairs(parts: Parts) -> list[str]:
         "    work[b, 1] += 1",
         *["    work[b, 3] += n * obstacle_radius.shape[1]" for _, e in parts.pairs if e.joined],
         *query(parts, parts.fields, parts.confines),
-        *walk(parts, [*_clear(parts), *_select_nearest(parts), *_sum_up(parts)]),
+        *walk(parts, parts.fields, [*_clear(parts), *_select_nearest(parts), *_sum_up(parts)]),
         "tally[rank] = met",
         "wait_for_team(sync, team)  # what is felt was written by others",
         "if rank == 0:",
@@ -99,7 +99,7 @@ def _sum_up(parts: Parts) -> list[str]:
         indented([f"felt[block * np.uint64({r}) + np.uint64({j * w}) + l] = {s}" for j, s in enumerate(sums)], 8),
         "else:",
         "    for l in range(np.uint64(upto - at)):",
-        "        i = np.uint64(order[block + l])",
+        f"        i = {listed(parts)}",
         f"        place = {place_of(parts, r)}",
         indented([f"felt[place + np.uint64({j * w})] = {s}" for j, s in enumerate(sums)], 8),
     ]
@@ -214,7 +214,7 @@ def _candidate(parts: Parts, fields: list[str]) -> list[str]:
 
     def number(name: str) -> str:
         if not parts.sorts:
-            return sorted_at(parts, row[name], "j")
+            return sorted_at(row[name], "j")
         return f"records[j * np.uint64({len(record)}) + np.uint64({record.index(name)})]"
 
     def vector(letter: str) -> str:
@@ -239,10 +239,12 @@ def _inner(parts: Parts, row: Mapping[str, int], number: Callable[[str], str]) -
 
 def _me(parts: Parts, fields: list[str]) -> str:
     """Write the agent in lane l of a block as the laws see it; what no law reads is left out."""
-    row = {f: k for k, f in enumerate(fields)}
+    row, slot = {f: k for k, f in enumerate(fields)}, Slots(parts)
 
     def number(name: str) -> str:
-        return sorted_at(parts, row[name], "block + l") if name in row else "reach"
+        if name not in row:
+            return "reach"
+        return slot(f"mine{row[name]}") if parts.sorts else sorted_at(row[name], "block + l")
 
     def vector(letter: str) -> str:
         if f"{letter}0" not in row:

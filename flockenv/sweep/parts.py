@@ -318,7 +318,7 @@ class Parts:
 
     @property
     def rows(self) -> int:
-        """Rows of sorted agents that scratch must have."""
+        """Rows of numbers of agents that are listed, or are the block's own, that scratch must have."""
         return max(len(self.fields) if self.pairs else 0, self.dimension if self.look else 0, 1)
 
     @property
@@ -398,7 +398,8 @@ class Parts:
         ]
         runs += [("reach", int(bool(self.bounded)))]
         runs += [("square", look.agents), ("place", look.agents), ("gap", look.obstacles), ("which", look.obstacles)]
-        runs += [("inside", d * (self.sweeps and self.sorts and self.space.periodic))]
+        if self.sweeps and self.sorts:
+            runs += [("inside", d * self.space.periodic), ("home", 1), ("mine", self.rows)]
         names = [f"{name}{j}" for name, many in runs for j in range(many)]
         return {name: place for place, name in enumerate([*names, "bad"])}
 
@@ -408,13 +409,11 @@ def flattened(effects: Sequence[Effect]) -> tuple[Effect, ...]:
     return tuple(each for effect in effects for each in (*effect.wishes, effect))
 
 
-def sorted_at(parts: Parts, row: int, place: str) -> str:
-    """Write a number of the sorted agent at `place`, which is counted without a sign.
+def sorted_at(row: int, place: str) -> str:
+    """Write a number of an agent of a small scene, listed at `place`, which is counted without a sign.
 
-    Rows of a small scene are a constant distance apart, so that a candidate is one address and not one per number.
+    Rows are a constant distance apart, so that a candidate is one address and not one per number.
     """
-    if parts.sorts:
-        return f"sorted_[np.uint64({row}) * stride + {place}]"
     return f"sorted_[np.uint64({row * SMALL_STRIDE}) + {place}]"
 
 

@@ -11,7 +11,7 @@ from flockenv.neighbours import DISTANT
 from flockenv.sweep.parts import SMALL_STRIDE, Parts, record_of, sorted_at
 from flockenv.sweep.text import Slots, copied, indented, indented_lines, lanes_of, place_of
 
-__all__ = ["counted", "query", "walk"]
+__all__ = ["counted", "listed", "listed_at", "query", "walk"]
 
 _ARRAYS = {"x": "pos", "v": "vel", "t": "tie", "d": "facing", "a": "aiming"}
 
@@ -21,10 +21,10 @@ def query(parts: Parts, fields: list[str], inside: bool = False) -> list[str]:
     return [
         f"periodic, shape = {parts.space.periodic}, (0, 0, 0, 0)",
         "wait_for_team(sync, team)  # positions are everybody's",
-        *(["stride = np.uint64(order.shape[0])", f"shape = {counted(parts, inside)}"] if parts.sorts else []),
+        *([f"shape = {counted(parts, inside)}"] if parts.sorts else []),
         "nx = shape[0]",
         "if nx == 0:",
-        indented(_fill(parts, fields), 4),
+        indented(_enter(parts, fields) if parts.sorts else _fill(parts, fields), 4),
         *(["else:", indented(_sort(parts, fields, inside), 4)] if parts.sorts else []),
         "wait_for_team(sync, team)",
     ]
@@ -38,44 +38,51 @@ def counted(parts: Parts, inside: bool) -> str:
     )
 
 
+def listed(parts: Parts) -> str:
+    """Write which agent is in lane l of a block."""
+    return f"np.uint64({Slots(parts)('home0')})" if parts.sorts else "np.uint64(order[block + l])"
+
+
+def listed_at(parts: Parts, fields: list[str]) -> str:
+    """Write which agent is the one at place `#`."""
+    if not parts.sorts:
+        return "order[np.uint64(#)]"
+    record = record_of(fields)
+    return f"np.int32(records[np.uint64(#) * np.uint64({len(record)}) + np.uint64({record.index('place')})])"
+
+
 def _value(parts: Parts, field: str, place: str) -> str:
     """Write what a field of agent i is; `place` is where its first coordinate lies."""
     if field[1:].isdigit():
         array = _ARRAYS[field[0]]
         return f"{array}[{place} + np.uint64({int(field[1:]) * parts.width})]"
-    return "ident[i]" if field == "who" else f"{field}[i]"
+    return {"who": "ident[i]", "place": "i"}.get(field, f"{field}[i]")
 
 
-def _derived(parts: Parts, fields: list[str], at: str) -> list[str]:
-    """Write the rows of sorted agent `at` that follow from others: headings."""
-    d, row = parts.dimension, {f: k for k, f in enumerate(fields)}
-    lines = []
-    if "h0" in row:
-        lines.append("h = unit((" + ", ".join(sorted_at(parts, row[f"v{k}"], at) for k in range(d)) + "))")
-        lines += [f"{sorted_at(parts, row[f'h{k}'], at)} = h[{k}]" for k in range(d)]
-    return lines
+def _headings(parts: Parts, numbers: dict[str, str]) -> list[str]:
+    """Write the headings of an agent whose other numbers lie there, if any law asks for them."""
+    if "h0" not in numbers:
+        return []
+    axes = range(parts.dimension)
+    return [f"h = unit(({', '.join(numbers[f'v{k}'] for k in axes)}))", *(f"{numbers[f'h{k}']} = h[{k}]" for k in axes)]
 
 
 def _fill(parts: Parts, fields: list[str]) -> list[str]:
-    """Write how the living are listed by number, for brute force: by one of a team."""
-    d, w, record = parts.dimension, parts.width, record_of(fields)
-    rows = [(sorted_at(parts, r, "#"), f) for r, f in enumerate(fields) if f[0] != "h"]
-    direct = [f"{to.replace('#', 'at')} = {_value(parts, f, 'place')}" for to, f in rows]
-    if parts.sorts:  # candidates are read from records; places and cells of theirs are not
-        kept = [(j, f) for j, f in enumerate(record) if f in fields]
-        direct += [
-            f"records[at * np.uint64({len(record)}) + np.uint64({j})] = {_value(parts, f, 'place')}" for j, f in kept
-        ]
-        return ["if rank == 0:", *indented_lines(_one_by_one(parts, [*direct, *_derived(parts, fields, "at")]), 4)]
+    """Write how the living of a small scene are listed by number, a row for each number: by one of a team."""
+    d, w = parts.dimension, parts.width
+    one = {f: sorted_at(k, "at") for k, f in enumerate(fields)}
+    many = {f: sorted_at(k, "(row + l)") for k, f in enumerate(fields)}
+    each = ["order[at] = i", *(f"{to} = {_value(parts, f, 'place')}" for f, to in one.items() if f[0] != "h")]
     return [
         "if rank == 0:",
         "    if present == n:",
         f"        for block in range((n + {w - 1}) // {w}):",
         f"            base, row = np.uint64(block * {d * w}), np.uint64(block * {w})",
         indented(_lines(parts, fields), 12),
-        *indented_lines(_headings(parts, fields, "row"), 12),
+        *([f"            for l in range(np.uint64({w})):"] if "h0" in fields else []),
+        *indented_lines(_headings(parts, many), 16),
         "    else:",
-        *indented_lines(_one_by_one(parts, [*direct, *_derived(parts, fields, "at")]), 8),
+        *indented_lines(_one_by_one(parts, "number_", [*each, *_headings(parts, one)]), 8),
     ]
 
 
@@ -91,68 +98,58 @@ def _lines(parts: Parts, fields: list[str]) -> list[str]:
     return out
 
 
-def _headings(parts: Parts, fields: list[str], first: str) -> list[str]:
-    """Write the headings of sorted agents from the first of a block on, if any law asks for them."""
-    if "h0" not in fields:
-        return []
-    return [f"for l in range(np.uint64({parts.width})):", indented(_derived(parts, fields, f"{first} + l"), 4)]
-
-
-def _one_by_one(parts: Parts, lines: list[str]) -> list[str]:
-    """Write how the living are listed one after another."""
-    by_number = [
-        "if arranged:  # everybody lives, and is not where his number says",
-        "    for i in range(np.uint64(n)):",
-        "        order[np.uint64(ident[i])] = i",
+def _enter(parts: Parts, fields: list[str]) -> list[str]:
+    """Write how the living of a large scene are entered by number, a record each, for brute force: by one of a team."""
+    record = record_of(fields)
+    each = [
+        f"records[at * np.uint64({len(record)}) + np.uint64({j})] = {_value(parts, f, 'place')}"
+        for j, f in enumerate(record)
+        if f != "cell"
     ]
     return [
-        *(by_number if parts.sorts else []),
+        "if rank == 0:",
+        "    if arranged:  # everybody lives, and is not where his number says",
+        "        for i in range(np.uint64(n)):",
+        "            cell[np.uint64(ident[i])] = i",
+        *indented_lines(_one_by_one(parts, "np.uint64(cell[number_]) if arranged else number_", each), 4),
+    ]
+
+
+def _one_by_one(parts: Parts, who: str, lines: list[str]) -> list[str]:
+    """Write how the living are listed one after another, by number; which agent has a number is handed over."""
+    return [
         "at = np.uint64(0)",
         "for number_ in range(np.uint64(n)):",
-        "    i = np.uint64(order[number_]) if arranged else number_" if parts.sorts else "    i = number_",
+        f"    i = {who}",
         "    if living[i] > 0:",
         f"        place = {place_of(parts, parts.dimension)}",
-        "        order[at] = i",
         indented(lines, 8),
         "        at += np.uint64(1)",
     ]
 
 
 def _sort(parts: Parts, fields: list[str], inside: bool) -> list[str]:
-    """Write how agents are put into their cells: whole records first, so that each is one distant place in memory."""
+    """Write how agents are put into their cells: as whole records, so that each is one distant place in memory."""
     d, w, record = parts.dimension, parts.width, record_of(fields)
-    row, numbers = {f: k for k, f in enumerate(fields)}, record[2:]
     wraps = parts.space.periodic and not inside
-    lanes = [_lanes(parts, f, wraps) for f in numbers]
+    lanes = [_lanes(parts, f, wraps) for f in record[2:]]
     sources, places = (", ".join(each) for each in zip(*lanes, strict=True))
-    spread = [f"order[at] = np.int32(records[base + np.uint64({record.index('place')})])"]
-    spread += [f"{sorted_at(parts, row[f], 'at')} = records[base + np.uint64({2 + j})]" for j, f in enumerate(numbers)]
     return [
         "for block in range(np.uint64(first), np.uint64(end)):",
         f"    base, row = block * np.uint64({d * w}), block * np.uint64({w})",
-        f"    if n >= {DISTANT} and not arranged:  # a distant place for each: asked for in good time",
+        f"    if n >= {DISTANT}:  # a distant place for each: asked for in good time",
         f"        later = np.uint64(min(block + np.uint64(2), np.uint64(end - 1)) * np.uint64({w}))",
         f"        for l in range(np.uint64({w})):",
         "            there = np.uint64(offset[rank, np.uint64(max(cell[later + l], np.int32(0)))])",
         f"            ask_for(records, there * np.uint64({len(record)}))",
         *(_confined(parts) if wraps else []),
         f"    put_records(records, ({sources},), ({places},), {w}, cell, row, offset[rank], np.uint64(n))",
-        "wait_for_team(sync, team)",
-        "rows = shape[1] * shape[2]",
-        "edge = np.uint64(start[rows * (rank + 1) // team * nx])",
-        "for line in range(rows * rank // team, rows * (rank + 1) // team):  # a row at a time stays in the cache",
-        "    mine, beyond = np.int64(start[line * nx]), np.int64(start[(line + 1) * nx])",
-        "    if arranged:  # agents come in the order of their places, and are to be in the order of their numbers",
-        f"        order_records(records, ident, {len(record)}, mine, beyond)",
-        "    at, last = np.uint64(mine), np.uint64(beyond)",
-        f"    while at < last and at + np.uint64({w}) <= edge:  # of the next row, it is written again",
-        f"        out_of_records(sorted_, ({_places(parts, row, numbers)}), order, at, {w}, records)",
-        *indented_lines(_headings(parts, fields, "at"), 8),
-        f"        at += np.uint64({w})",
-        "    while at < last:",
-        f"        base = at * np.uint64({len(record)})",
-        indented(spread + _derived(parts, fields, "at"), 8),
-        "        at += np.uint64(1)",
+        "if arranged:  # agents came in the order of their places, and are to be in the order of their numbers",
+        "    wait_for_team(sync, team)",
+        "    rows = shape[1] * shape[2]",
+        "    for line in range(rows * rank // team, rows * (rank + 1) // team):  # a row at a time stays in the cache",
+        "        mine, beyond = np.int64(start[line * nx]), np.int64(start[(line + 1) * nx])",
+        f"        order_records(records, ident, {len(record)}, mine, beyond, offset[rank])",
     ]
 
 
@@ -176,13 +173,25 @@ def _confined(parts: Parts) -> list[str]:
     ]
 
 
-def _places(parts: Parts, row: dict[str, int], numbers: list[str]) -> str:
-    """Write where the numbers of sorted agents from `at` on go, a row each."""
-    return "".join(f"np.uint64({row[f]}) * stride + at, " for f in numbers)
+def _take(parts: Parts, fields: list[str]) -> list[str]:
+    """Write how the records of a block become lanes: its own numbers, which its laws then read."""
+    if not parts.sorts:
+        return []
+    w, slot = parts.width, Slots(parts)
+    mine = {f: slot(f"mine{k}") for k, f in enumerate(fields)}
+    places = [parts.slots["home0"], *(parts.slots[f"mine{fields.index(f)}"] for f in record_of(fields)[2:])]
+    return [
+        f"out_of_records(lanes, ({', '.join(f'np.uint64({k * w})' for k in places)},), block, {w}, records)",
+        *([f"for l in range(np.uint64({w})):"] if "h0" in fields else []),
+        *indented_lines(_headings(parts, mine), 4),
+    ]
 
 
-def walk(parts: Parts, lines: list[str]) -> list[str]:
-    """Write the loop over this thread's blocks of sorted agents: [at, upto) is one, `found` ranges may be near it."""
+def walk(parts: Parts, fields: list[str], lines: list[str]) -> list[str]:
+    """Write the loop over this thread's blocks of sorted agents: [at, upto) is one, `found` ranges may be near it.
+
+    Of each agent these fields have been sorted.
+    """
     w = parts.width
     by_number = [
         f"blocks = (present + {w - 1}) // {w}",
@@ -213,6 +222,6 @@ def walk(parts: Parts, lines: list[str]) -> list[str]:
         f"        upto = min(at + {w}, np.int64(start[(line + 1) * nx]))",
         "        found, spot = candidates(at, upto, line, max(spot, line * nx), shape, start, periodic, ranges)",
         "    block = np.uint64(at)",
-        *indented_lines(lines, 4),
+        *indented_lines([*_take(parts, fields), *lines], 4),
         "    at = upto",
     ]

@@ -90,7 +90,7 @@ def _imports(parts: Parts) -> str:
         f"from flockenv.space import {parts.space.offset_law} as offset_to, {parts.space.confine_law} as confine",
         *([f"from flockenv.space import {parts.space.bounce_law} as bounce"] if parts.bounces else []),
         "from flockenv.noise import normal as standard_normal",
-        *(["from flockenv.transpose import out_of_records, put_records"] if parts.sweeps and parts.sorts else []),
+        *(["from flockenv.transpose import out_of_records, put_lines, put_records"] * (parts.sweeps and parts.sorts)),
         "from flockenv.vec import add, dot, exact_dot, limit, norm, scale, select, sub, unit, zero",
         *(["from flockenv.vehicle import faced, held, leant, raised, turned"] if parts.oriented else []),
         *tree_imports(parts),
