@@ -286,10 +286,9 @@ class Scene(Record):
         whole = 1
         if parts.sweeps:
             reals += d * (len(parts.targets) + 1)
-            whole += 4
+            whole += 3 * 4 if parts.sorts else 4
         if parts.sweeps and parts.sorts:
-            reals += parts.rows + parts.numbers
-            whole += 3 * 4
+            reals += parts.numbers
         reals += d * (parts.pulls + parts.flows + parts.bounces)
         reals += parts.frame_rows + len(parts.inner) + parts.framed
         if parts.treed:
