@@ -44,10 +44,10 @@ def _carry(parts: Parts, to: list[str]) -> list[str]:
     What is packed goes to distant places, in no order; `to` writes where into `cell`, in which nobody is -1.
     """
     d, w, count = parts.dimension, parts.width, parts.luggage_size
-    listing = list(enumerate(parts.luggage))
-    fields = [field.partition(" ") for field in parts.luggage]
-    sources = "".join(f"{name}, " for name, _, _ in fields)
-    places = "".join(f"base + np.uint64({int(axis) * w}), " if axis else "row, " for _, _, axis in fields)
+    luggage = [field.partition(" ") for field in parts.luggage]  # an array, and of vectors which axis
+    sources = "".join(f"{name}, " for name, _, _ in luggage)
+    places = "".join(f"base + np.uint64({int(axis) * w}), " if axis else "row, " for _, _, axis in luggage)
+    unpacked = (f"{name}[place + np.uint64({int(axis) * w})]" if axis else f"{name}[i]" for name, _, axis in luggage)
     return [
         "for block in range(np.uint64(first), np.uint64(end)):",
         f"    base, row = block * np.uint64({d * w}), block * np.uint64({w})",
@@ -57,11 +57,5 @@ def _carry(parts: Parts, to: list[str]) -> list[str]:
         "wait_for_team(sync, team)",
         f"for i in range(np.uint64(first * {w}), np.uint64(min(end * {w}, n))):",
         f"    place = {place_of(parts, d)}",
-        *(f"    {_place(parts, f)} = luggage[i * np.uint64({count}) + np.uint64({k})]" for k, f in listing),
+        *(f"    {to} = luggage[i * np.uint64({count}) + np.uint64({k})]" for k, to in enumerate(unpacked)),
     ]
-
-
-def _place(parts: Parts, field: str) -> str:
-    """Write where a number of agent i lies."""
-    name, _, axis = field.partition(" ")
-    return f"{name}[place + np.uint64({int(axis) * parts.width})]" if axis else f"{name}[i]"

@@ -37,5 +37,6 @@ def trimmed(source: str) -> str:
 
 
 def _words(text: str) -> set[str]:
-    """Return all words of a text but those of the lists themselves."""
-    return set(re.findall(r"\w+", text.replace(CONTEXT, "").replace(SHARED, "")))
+    """Return all words of a text's code but those of the lists themselves; a comment needs no array."""
+    code = re.sub(r"#.*", "", text.replace(CONTEXT, "").replace(SHARED, ""))
+    return set(re.findall(r"\w+", code))

@@ -298,7 +298,7 @@ class Parts:
 
     @functools.cached_property
     def fields(self) -> list[str]:
-        """What is sorted of each agent, a row each: what the pair laws read, found from the names in their code."""
+        """What is sorted of each agent: what the pair laws read, found from the names in their code."""
         names = set().union(*(_names(e, _OF_PAIRS) for _, e in self.pairs))
         if any(sight.fov < 360 for sight in self.sights):
             names.add("heading")

@@ -1,8 +1,9 @@
 """The query: how the living agents are sorted, once per instant, and how their blocks are walked through.
 
 In a small scene, and where a grid would have too few cells, they are listed by number and everybody is a candidate;
-else they are sorted by cell. What is sorted of each agent are its `fields`, a row each. A team of threads sorts
-together, each its own agents, and each then walks through its own share of the sorted blocks.
+else they are sorted by cell. What is sorted of each agent are its `fields`: as a record of its own, and in small scenes
+as a row each. A team of threads sorts together, each its own agents, and each then walks through its own share of the
+sorted blocks.
 """
 
 from __future__ import annotations
