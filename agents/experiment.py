@@ -48,7 +48,11 @@ class PpoSettings(Record):
     entropy: float = Field(default=0.0, ge=0, description="weight of the entropy bonus")
     log_std: float = Field(default=-0.5, description="logarithm of the first standard deviation of actions")
     reward_scale: float = Field(default=0.1, gt=0, description="rewards are multiplied by this while learning")
-    team: bool = Field(default=False, description="everybody is paid the mean of his world, to the world's end")
+    hold: int = Field(default=1, ge=1, le=100, description="decisions of the world for which it keeps to an action")
+    care: float = Field(default=0.0, ge=0, le=1, description="what others of his world count for a learner; he is 1")
+    central_critic: bool = Field(
+        default=False, description="the critic is shown what all of its world see on average, and the task's memory"
+    )
     taught: int = Field(
         default=0, ge=0, description="gradient steps in which it first learns what the tuned rules answer"
     )

@@ -28,6 +28,8 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.vec_env import VecEnvWrapper
 
+from agents.central import CentralPolicy, CentralVecEnv
+from agents.credit import CaringBuffer
 from agents.experiment import WEIGHTS, Experiment, PpoSettings, load_experiment, one_line_errors
 from agents.reynolds import as_dict, player
 from agents.teach import teach
@@ -46,18 +48,19 @@ console = Console(stderr=True)
 
 
 class ForLearning(VecEnvWrapper):
-    """What learning likes: small rewards, and worlds that are not all in the same phase of their episodes.
+    """What learning likes: small rewards, actions that tell, and worlds in different phases of their episodes.
 
     Rewards times a constant keep the value loss near 1, so that clipping gradients does not starve the policy. And
     where only the time limit ends an episode, worlds that began together would show every update one phase alone;
-    staggered, their first episodes end one after another. As a team, everybody is paid what all of a world are paid on
-    average, to the end of the world and not of himself: what comes after a death is part of what led to it (posthumous
-    credit, Cohen et al. 2022, arXiv 2111.05992).
+    staggered, their first episodes end one after another. What one noisy decision in ten per second changes is lost
+    among the others; `hold` keeps to each for so many, and pays what they are paid together (Mnih et al. 2015). Where
+    an episode ends among them, what the next one is paid until there is another decision is left out.
     """
 
-    def __init__(self, venv: WorldVecEnv, scale: float, stagger: bool, team: bool = False) -> None:
+    def __init__(self, venv: WorldVecEnv, scale: float, stagger: bool, hold: int = 1) -> None:
         super().__init__(venv)
-        self.scale, self.stagger, self.team = scale, stagger, team
+        self.scale, self.stagger, self.hold = scale, stagger, hold
+        self.here = np.ones(venv.num_envs, np.bool_)  # who was when the last step began
 
     def reset(self) -> np.ndarray:
         """Begin; staggered, each world with another part of its first episode behind it."""
@@ -67,18 +70,23 @@ class ForLearning(VecEnvWrapper):
             world.steps[:] = np.arange(world.worlds) * world.task.horizon // world.worlds
         return observation
 
+    def step_async(self, actions: np.ndarray) -> None:
+        """Take an action for every row."""
+        world: World = self.venv.world
+        self.here = world.state.alive[:, : world.learners].reshape(-1).copy()
+        self.actions = actions
+        self.venv.step_async(actions)
+
     def step_wait(self) -> Any:
-        """Scale what is paid, and share it in a team."""
+        """Act for `hold` decisions of the world, and scale what is paid."""
         observation, reward, done, infos = self.venv.step_wait()
-        if self.team:
-            world: World = self.venv.world
-            reward = np.repeat(reward.reshape(world.worlds, -1).mean(axis=1), world.learners)
-            done = np.array([bool(info) for info in infos])  # told of those whose world has ended, and of nobody else
-            for row in np.flatnonzero(done[:: world.learners]) * world.learners:
-                ended = infos[row : row + world.learners]
-                cut = any(info["TimeLimit.truncated"] for info in ended)  # for those who are out as for those who live
-                for info in ended:
-                    info["TimeLimit.truncated"] = cut
+        for _ in range(self.hold - 1):
+            self.venv.step_async(self.actions)
+            observation, more, over, told = self.venv.step_wait()
+            reward += np.where(done, 0.0, more)
+            if any(told[:: self.venv.world.learners]):  # all rows of a world are told of its end
+                infos = [new or before for new, before in zip(told, infos, strict=True)]
+            done = done | over
         return observation, reward * self.scale, done, infos
 
 
@@ -137,10 +145,10 @@ def build(task: Task, p: PpoSettings, tensorboard: str | None) -> PPO:
     """Make the worlds and the model; how many threads they use is for `on_threads` to say."""
     torch.manual_seed(p.seed)
     learned = task.model_copy(update={"dtype": p.dtype})
-    rows = WorldVecEnv(learned, p.worlds, leaving=not task.ends_together)
-    worlds = ForLearning(rows, p.reward_scale, p.stagger, p.team)
+    shows = CentralVecEnv if p.central_critic else WorldVecEnv
+    worlds = ForLearning(shows(learned, p.worlds, leaving=not task.ends_together), p.reward_scale, p.stagger, p.hold)
     model = PPO(
-        "MlpPolicy",
+        CentralPolicy if p.central_critic else "MlpPolicy",
         worlds,
         n_steps=p.rollout,
         batch_size=p.minibatch,
@@ -157,7 +165,10 @@ def build(task: Task, p: PpoSettings, tensorboard: str | None) -> PPO:
             "net_arch": {"pi": list(p.hidden), "vf": list(p.hidden)},
             "activation_fn": {"relu": torch.nn.ReLU, "tanh": torch.nn.Tanh}[p.activation],
             "log_std_init": p.log_std,
+            **({"seen": task.layout.size} if p.central_critic else {}),
         },
+        rollout_buffer_class=CaringBuffer if p.care else None,
+        rollout_buffer_kwargs={"worlds": worlds, "learners": task.learners, "care": p.care} if p.care else None,
     )
     if tensorboard is None:
         model.set_logger(Logger(folder=None, output_formats=[]))  # its own leaves an empty folder behind
@@ -185,20 +196,20 @@ class Watch(BaseCallback):
         return True
 
     def _on_rollout_end(self) -> None:
-        policy = self.model.policy
+        self.run.steps = self.num_timesteps * self.p.hold
+        policy, waits = self.model.policy, self.run.steps <= self.p.critic_first
         for part in (policy.mlp_extractor.policy_net, policy.action_net):
-            part.requires_grad_(self.num_timesteps > self.p.critic_first)
-        policy.log_std.requires_grad_(self.num_timesteps > self.p.critic_first)
-        self.run.steps = self.num_timesteps
-        self.progress.update(self.bar, completed=min(self.num_timesteps, self.p.steps))
+            part.requires_grad_(not waits)
+        policy.log_std.requires_grad_(not waits)
+        self.progress.update(self.bar, completed=min(self.run.steps, self.p.steps))
         due = len(self.run.curve) * self.p.evaluate_every
-        if self.num_timesteps >= due:
+        if self.run.steps >= due:
             self.point()
 
     def point(self) -> None:
         """Measure the policy of the moment, keep it if it is the best so far, and write a checkpoint."""
         self.run.wall = self.before + time.perf_counter() - self.since
-        self.run.steps = self.num_timesteps
+        self.run.steps = self.num_timesteps * self.p.hold
         tensors = tensors_of(self.model)
         result, success = score(self.task, self.p, tensors)
         seconds = round(self.run.wall, 1)
@@ -275,11 +286,11 @@ def _teach(model: PPO, task: Task, p: PpoSettings) -> float:
     return time.perf_counter() - began
 
 
-def resume(folder: Path, model: PPO, run: Run) -> None:
+def resume(folder: Path, model: PPO, run: Run, p: PpoSettings) -> None:
     """Read a checkpoint's networks back into the model."""
     model.policy.load_state_dict(torch.load(folder / "policy.pt", weights_only=True))
     model.policy.optimizer.load_state_dict(torch.load(folder / "optimizer.pt", weights_only=True))
-    model.num_timesteps = run.steps
+    model.num_timesteps = run.steps // p.hold
 
 
 def train(experiment: Experiment, folder: Path, go_on: bool = False, tensorboard: str | None = None) -> Run:
@@ -294,7 +305,7 @@ def train(experiment: Experiment, folder: Path, go_on: bool = False, tensorboard
         return run
     model = build(task, p, tensorboard)
     if run is not None:
-        resume(folder, model, run)
+        resume(folder, model, run, p)
     else:
         run = Run(recipe_of(experiment))
         run.wall = _teach(model, task, p)
@@ -306,7 +317,12 @@ def train(experiment: Experiment, folder: Path, go_on: bool = False, tensorboard
     with on_threads(p.threads), Progress(*columns, console=console) as progress:
         watch = Watch(task, p, run, folder, progress)
         try:
-            model.learn(p.steps - run.steps, callback=watch, reset_num_timesteps=run.steps == 0, log_interval=None)
+            model.learn(
+                -(-(p.steps - run.steps) // p.hold),
+                callback=watch,
+                reset_num_timesteps=run.steps == 0,
+                log_interval=None,
+            )
             watch.point()
         except KeyboardInterrupt:
             watch.point()

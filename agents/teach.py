@@ -1,4 +1,4 @@
-"""Teach a network what the tuned rules of a task answer: behaviour cloning, by squared errors."""
+"""Teach a network what the tuned rules of a task answer, where it comes to by itself: DAgger (Ross et al. 2011)."""
 
 from __future__ import annotations
 
@@ -15,44 +15,62 @@ from flockenv.world import World
 
 __all__ = ["shown", "teach"]
 
+Answers = Callable[[torch.Tensor], torch.Tensor]
+
 MINIBATCH, RATE = 2048, 2e-3
-WORLDS = 96
+WORLDS, ROUNDS = 96, 4
 
 
-def shown(task: Task, rules: Reynolds, worlds: int) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return what rules saw in one episode of each of so many training worlds, (rows, size), and what they answered."""
+def shown(
+    task: Task, rules: Reynolds, worlds: int, who: Answers | None = None, first: int = 0
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Return what was seen in one episode of each of so many training worlds, (rows, size), and what rules answer.
+
+    who: what acts; the rules themselves if it is nothing. first: how many training worlds come before these.
+    """
     world, state = World(task, worlds, task.horizon), None
-    seen = world.reset(worlds_for("training", 0, worlds))
-    playing, first = np.ones((worlds, task.learners), np.bool_), True
+    seen = world.reset(worlds_for("training", 0, first + worlds) + first)
+    playing, begins = np.ones((worlds, task.learners), np.bool_), True
     rows, answers = [], []
     while playing.any():
         given = seen.reshape(-1, task.layout.size)
-        actions, state = rules.predict(given, state, np.full(len(given), first))
+        actions, state = rules.predict(given, state, np.full(len(given), begins))
         rows.append(given[playing.ravel()])
         answers.append(np.asarray(actions, np.float32)[playing.ravel()])
+        if who is not None:
+            with torch.no_grad():
+                actions = who(torch.from_numpy(given)).numpy()
         step = world.step(actions.reshape(worlds, task.learners, -1))
-        seen, first = step.observation, False
+        seen, begins = step.observation, False
         playing &= ~(step.terminated | step.truncated[:, None])
     return torch.from_numpy(np.concatenate(rows)), torch.from_numpy(np.concatenate(answers))
 
 
 def teach(
     model: PPO, task: Task, rules: Reynolds, updates: int, worlds: int = WORLDS,
-    advance: Callable[[int], None] = lambda n: None,
+    advance: Callable[[int], None] = lambda n: None, rounds: int = ROUNDS,
 ) -> tuple[int, float]:  # fmt: skip
     """Teach PPO's actor what rules answer in so many training worlds, by so many gradient steps of 2,048 rows.
 
+    First of what rules meet, then, round by round, of what the actor met too, each time in as many other worlds.
     Returns how many rows there were, and what is missed in the end: mean square of its answers' errors, over the
     variance of the rules' answers. advance: called with 1 after every gradient step.
     """
+
+    def answer(rows: torch.Tensor) -> torch.Tensor:
+        return model.policy.get_distribution(rows).mode()
+
     rows, answers = shown(task, rules, worlds)
     optimiser = torch.optim.Adam(model.policy.parameters(), RATE)
     loss = torch.zeros(())
     for k in range(updates):
+        if k * rounds // updates > (k - 1) * rounds // updates >= 0:  # a round later than the gradient step before
+            met = shown(task, rules, worlds, answer, worlds * (k * rounds // updates))
+            rows, answers = (torch.cat(both) for both in zip((rows, answers), met, strict=True))
         for group in optimiser.param_groups:
             group["lr"] = RATE * (1.0 - 0.95 * k / updates)
         some = torch.randint(len(rows), (MINIBATCH,))
-        loss = ((model.policy.get_distribution(rows[some]).mode() - answers[some]) ** 2).mean()
+        loss = ((answer(rows[some]) - answers[some]) ** 2).mean()
         optimiser.zero_grad()
         loss.backward()
         optimiser.step()

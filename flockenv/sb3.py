@@ -139,7 +139,7 @@ class WorldVecEnv(VecEnv):
         learners, of_world = self.task.learners, self._ends(result, worlds)
         rows = (worlds[:, None] * learners + np.arange(learners)).ravel().tolist()
         paid = named(self.task.terms, self.world.paid[worlds].reshape(len(rows), -1))
-        seen, over = self._rows(result.observation[worlds]), result.terminated.reshape(-1).tolist()
+        seen, over = self._rows(result.observation[worlds], worlds), result.terminated.reshape(-1).tolist()
         for k, (row, terms, last) in enumerate(zip(rows, paid, seen, strict=True)):
             infos[row] = info = of_world[k // learners].copy()
             info["terms"], info["terminal_observation"] = terms, last
@@ -152,7 +152,8 @@ class WorldVecEnv(VecEnv):
         ends = (dict(zip(columns, values, strict=True)) for values in zip(*columns.values(), strict=True))
         return [{name: value for name, value in end.items() if value == value} for end in ends]  # NaN: no value
 
-    def _rows(self, observation: NDArray[np.float32]) -> NDArray[np.float32]:
+    def _rows(self, observation: NDArray[np.float32], worlds: Any = slice(None)) -> NDArray[np.float32]:
+        """Return a row for each learner of these worlds, (B, L, O); one who shows more than that does it here."""
         return observation.reshape(-1, self.task.layout.size)
 
     def close(self) -> None:

@@ -219,6 +219,11 @@ class World:
         return () if self._seeds is None else tuple(self._seeds.tolist())
 
     @property
+    def memory(self) -> NDArray[Any]:
+        """(B, M, N): what the task keeps of everybody beside the state, such as hunger; a view of what is kept."""
+        return self._memory.transpose(1, 0, 2)
+
+    @property
     def paid(self) -> NDArray[np.float64]:
         """(B, L, K): terms, summed over the episode; a view of what is counted."""
         return self._paid.transpose(1, 2, 0)

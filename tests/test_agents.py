@@ -10,10 +10,13 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 import yaml
+from stable_baselines3.common.buffers import RolloutBuffer
 from typer.testing import CliRunner
 
 from agents import tune
+from agents.credit import CaringBuffer
 from agents.experiment import AS_CONFIGURED, CONFIGS, WEIGHTS, Experiment, PpoSettings, load_experiment
 from agents.imitate import imitate
 from agents.ppo import ForLearning
@@ -23,7 +26,8 @@ from flockenv.crew import threads
 from flockenv.evaluation import compare, rollout, worlds_for
 from flockenv.policy import MlpPolicy, RandomPolicy
 from flockenv.sb3 import WorldVecEnv
-from flockenv.tasks import TASKS, School
+from flockenv.tasks import TASKS, School, Task
+from flockenv.world import World
 
 ROOT = CONFIGS.parent
 TINY = {"worlds": 16, "rollout": 16, "minibatch": 64, "epochs": 1, "evaluate_every": 512, "evaluate_worlds": 4}
@@ -329,48 +333,99 @@ def test_bad_settings_are_one_line(tmp_path: Path) -> None:
 def test_a_network_that_is_taught_longer_answers_more_as_the_rules_do() -> None:
     experiment = Experiment(task="pursuit", ppo={**TINY, "evaluate_worlds": 16})
     little, more = (imitate(experiment, worlds=4, updates=updates) for updates in (1, 300))
-    assert little.rules == more.rules and little.rows == more.rows > 0
+    assert little.rules == more.rules and more.rows > 4 * little.rows > 0  # of rounds in which the network acted
     assert more.missed < 0.5 * little.missed
     assert more.network > little.network
 
 
-def test_a_team_is_paid_the_mean_of_its_world_to_its_end() -> None:
-    """Three fish that starve one after another: alone each row ends with its fish, as a team with the world."""
-    task = School(fish=3, horizon=40, start_hunger=0.6, metabolism=0.4)
-    rows = {
-        team: ForLearning(WorldVecEnv(task, 2, leaving=True), 0.1, stagger=False, team=team) for team in (False, True)
-    }
-    still, ends = np.zeros((6, 2), np.float32), {False: [], True: []}
-    for venv in rows.values():
-        venv.seed(5)
-        venv.reset()
-    for _ in range(task.horizon):
-        (_, own, own_done, _), (_, shared, shared_done, infos) = rows[False].step(still), rows[True].step(still)
-        np.testing.assert_allclose(shared.reshape(2, 3), np.repeat(own.reshape(2, 3).mean(axis=1), 3).reshape(2, 3))
-        ends[False].append(own_done)
-        ends[True].append(shared_done)
-        assert all(bool(info) == over for info, over in zip(infos, shared_done, strict=True))
-        if shared_done.any():
-            break
-    alone, together = np.array(ends[False]), np.array(ends[True])
-    assert alone[:-1].any() and not together[:-1].any()  # somebody was out before the world was over
-    assert together[-1].reshape(2, 3).any(axis=1).tolist() == together[-1].reshape(2, 3).all(axis=1).tolist()
+def test_rules_say_what_they_would_do_where_somebody_else_comes_to() -> None:
+    """Who stays where he is sees what a world shows of that, from the world that comes after so many others."""
+    task = School(fish=3, horizon=20)
+    rules = player(task)
+    rows, answers = shown(task, rules, 2, lambda rows: torch.zeros(len(rows), 2), first=5)
+    world, state = World(task, 2, task.horizon), None
+    seen, first = world.reset(worlds_for("training") + 5), True
+    for step in range(20):
+        here = slice(6 * step, 6 * step + 6)
+        expected, state = rules.predict(seen.reshape(6, -1), state, np.full(6, first))
+        np.testing.assert_array_equal(rows[here].numpy(), seen.reshape(6, -1))
+        np.testing.assert_array_equal(answers[here].numpy(), np.asarray(expected, np.float32))
+        seen, first = world.step(np.zeros((2, 3, 2))).observation, False
+    assert len(rows) == len(answers) == 120  # nobody starves so soon
 
 
-def test_a_time_limit_cuts_off_a_team_with_those_who_are_out() -> None:
-    """What comes after it is worth something to everybody: none of a team's rows ends as a death does."""
-    task = School(fish=3, horizon=8, start_hunger=0.6, metabolism=0.4)
-    told = {}
-    for team in (False, True):
-        venv = ForLearning(WorldVecEnv(task, 4, leaving=True), 0.1, stagger=False, team=team)
-        venv.seed(5)
-        venv.reset()
-        for _ in range(task.horizon):
-            infos = venv.step(np.zeros((12, 2), np.float32))[3]
-        told[team] = np.array([info["TimeLimit.truncated"] for info in infos]).reshape(4, 3)
-    mixed = told[False].any(axis=1) & ~told[False].all(axis=1)
-    assert mixed.any()  # somebody was out, and somebody was not
-    np.testing.assert_array_equal(told[True], np.repeat(told[False].any(axis=1)[:, None], 3, axis=1))
+HUNGRY = School(fish=3, horizon=40, start_hunger=0.6, metabolism=0.4)
+"""Three fish that starve one after another."""
+
+
+def for_learning(task: Task, worlds: int, **changes: Any) -> ForLearning:
+    venv = ForLearning(WorldVecEnv(task, worlds, leaving=True), 1.0, stagger=False, **changes)
+    venv.seed(5)
+    venv.reset()
+    return venv
+
+
+def test_an_action_that_is_held_is_paid_what_its_decisions_are_paid_until_an_episode_ends() -> None:
+    """Each row: the sum to its own end, the last of the ends that are told, and what is seen then."""
+    held, each = for_learning(HUNGRY, 2, hold=3), for_learning(HUNGRY, 2)
+    rng, ends, deaths = np.random.default_rng(2), 0, 0
+    for _ in range(30):
+        actions = rng.uniform(-1, 1, (6, 2))
+        seen, reward, done, infos = held.step(actions)
+        sums, over = np.zeros(6), np.zeros(6, np.bool_)
+        told: list[dict[str, Any]] = [{}] * 6
+        for _ in range(3):
+            last, paid, ended, news = each.step(actions)
+            sums, over = sums + np.where(over, 0.0, paid), over | ended
+            told = [dict(new) or before for new, before in zip(news, told, strict=True)]
+        np.testing.assert_array_equal(seen, last)
+        np.testing.assert_allclose(reward, sums, rtol=0, atol=1e-12)
+        np.testing.assert_array_equal(done, over)
+        assert [info.get("terms") for info in infos] == [t.get("terms") for t in told]
+        ends += sum(bool(info) for info in infos)
+        deaths += int(done.any() and not done.all())
+    assert ends >= 6 and deaths  # worlds ended, and somebody was out before that
+
+
+@pytest.mark.parametrize("care", [0.25, 1.0])
+def test_who_cares_is_credited_with_what_becomes_of_the_others_of_his_world(care: float) -> None:
+    """Advantages by hand: of each row by SB3's plain buffer, then summed over each world's rows that were there."""
+    steps, rows = 40, 6
+    worlds = for_learning(HUNGRY, 2)
+    space = (worlds.observation_space, worlds.action_space, "cpu", 0.9, 0.95, rows)
+    plain, caring = (
+        RolloutBuffer(steps, *space),
+        CaringBuffer(steps, *space, worlds=worlds, learners=3, care=care),
+    )
+    rng, start, here = np.random.default_rng(3), np.ones(rows), []
+    for _ in range(steps):
+        here.append(worlds.venv.world.state.alive[:, :3].reshape(-1).copy())
+        action, value = rng.uniform(-1, 1, (rows, 2)), torch.from_numpy(rng.standard_normal(rows))
+        seen, reward, done, _ = worlds.step(action)
+        for buffer in (plain, caring):
+            buffer.add(seen, action, reward, start, value, torch.zeros(rows))
+        start = done
+    for buffer in (plain, caring):
+        buffer.compute_returns_and_advantage(torch.zeros(rows), start)
+    np.testing.assert_array_equal(caring.returns, plain.returns)  # critics learn what becomes of oneself
+    there = np.array(here)
+    assert there.any(axis=1).all() and not there.all()
+    for t in range(steps):
+        for i in range(rows):
+            mates = [j for j in range(rows) if j // 3 == i // 3 and j != i and there[t, j]]
+            expected = plain.advantages[t, i] + care * sum(plain.advantages[t, j] for j in mates)
+            got = caring.advantages[t, i]
+            assert got == (pytest.approx(expected, rel=1e-5, abs=1e-6) if there[t, i] else 0.0)
+
+
+def test_held_actions_count_as_the_decisions_that_they_are(tmp_path: Path) -> None:
+    from agents import ppo
+
+    settings = PpoSettings(**{**TINY, "steps": 1536, "evaluate_every": 768, "threads": 1, "hold": 3})
+    whole = ppo.train(Experiment(task="pursuit", ppo=settings), tmp_path / "run")
+    rows = settings.worlds * settings.rollout * 3
+    assert [point["steps"] % rows for point in whole.curve] == [0] * len(whole.curve)
+    assert whole.steps >= 1536 > whole.steps - rows
 
 
 def test_a_taught_actor_waits_for_its_critic(tmp_path: Path) -> None:

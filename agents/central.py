@@ -1,0 +1,78 @@
+"""A critic that sees more than its actor: trained together, played alone (Lowe et al. 2017; Yu et al. 2022, MAPPO).
+
+What becomes of a learner depends on what it does not see: how hungry the hunter is, how many are left. An actor must do
+without; a critic, which nobody needs afterwards, need not, and what it explains is noise no longer.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+from gymnasium.spaces import Box
+from numpy.typing import NDArray
+from stable_baselines3.common.policies import ActorCriticPolicy
+from stable_baselines3.common.torch_layers import MlpExtractor
+
+from flockenv.sb3 import WorldVecEnv
+
+__all__ = ["CentralPolicy", "CentralVecEnv"]
+
+Rows = NDArray[np.float32]
+
+
+class CentralVecEnv(WorldVecEnv):
+    """Rows of what a learner sees, and behind it what its critic is shown besides; see WorldVecEnv.
+
+    That is what those learners who are still there see on average, which share of them is, what share of its time the
+    world has behind it, and the memory that the task keeps of everybody who is no learner.
+    """
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
+        world = self.world
+        numbers = 2 * world.observation_size + 2 + world.task.memory * (world.agents - world.learners)
+        self.observation_space = Box(-np.inf, np.inf, (numbers,), np.float32)
+
+    def _rows(self, observation: Rows, worlds: Any = slice(None)) -> Rows:
+        world, count, n = self.world, len(observation), self.world.learners
+        here = world.state.alive[worlds, :n, None]
+        left = here.sum(axis=1)
+        mean = (observation * here).sum(axis=1) / np.maximum(left, 1)
+        gone = world.steps[worlds, None] / (world.time_limit or world.task.horizon)
+        shared = np.concatenate([mean, left / n, gone, world.memory[worlds, :, n:].reshape(count, -1)], axis=1)
+        whole = np.concatenate([observation, np.repeat(shared[:, None], n, axis=1)], axis=2, dtype=np.float32)
+        return whole.reshape(count * n, -1)
+
+
+class _Extractor(MlpExtractor):
+    """SB3's two networks, of which the actor's is fed with the first `seen` numbers alone."""
+
+    def __init__(self, seen: int, *args: Any, **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
+        self.seen = seen
+        first = self.policy_net[0]
+        self.policy_net[0] = torch.nn.Linear(seen, first.out_features, device=first.weight.device)
+
+    def forward_actor(self, features: torch.Tensor) -> torch.Tensor:
+        """Return what the actor makes of what a learner sees."""
+        return super().forward_actor(features[..., : self.seen])
+
+
+class CentralPolicy(ActorCriticPolicy):
+    """SB3's policy for such rows.
+
+    Args:
+        seen: how many numbers of a row the actor is shown, which may also be given alone to whatever acts; the critic
+            needs the whole row.
+    """
+
+    def __init__(self, *args: Any, seen: int, **kwargs: Any) -> None:
+        self.seen = seen
+        super().__init__(*args, **kwargs)
+
+    def _build_mlp_extractor(self) -> None:
+        self.mlp_extractor = _Extractor(
+            self.seen, self.features_dim, net_arch=self.net_arch, activation_fn=self.activation_fn, device=self.device
+        )
