@@ -21,7 +21,8 @@ __all__ = ["CaringBuffer"]
 class CaringBuffer(RolloutBuffer):
     """SB3's rollouts, in which a learner's advantage is his own and that of the others of his world, times `care`.
 
-    What an action does to others when its own learner is out counts too; rows of who is out teach an actor nothing.
+    What an action does to others when its own learner is out counts too. Who is out does nothing: his rows have no
+    advantage, before SB3 takes away the mean of a minibatch.
 
     Args:
         worlds: whose rows these are; `worlds.here`, (rows,) bool, says who was there when the last step began.

@@ -38,11 +38,11 @@ class PpoSettings(Record):
 
     steps: int = Field(default=20_000_000, ge=1, description="agent-steps in all")
     worlds: int = Field(default=2048, ge=1, description="worlds stepped together; rows = worlds x learners")
-    rollout: int = Field(default=32, ge=1, description="decisions per update")
+    rollout: int = Field(default=32, ge=1, description="actions per row and update")
     minibatch: int = Field(default=8192, ge=1, description="rows")
     epochs: int = Field(default=4, ge=1, description="passes over a rollout")
     learning_rate: float = Field(default=2e-3, gt=0, description="at the start; falls linearly to a tenth")
-    gamma: float = Field(default=0.99, gt=0, le=1, description="discount per decision")
+    gamma: float = Field(default=0.99, gt=0, le=1, description="discount per action, held or not")
     gae_lambda: float = Field(default=0.95, ge=0, le=1, description="of the advantage estimate")
     clip: float = Field(default=0.2, gt=0, description="PPO's clip range")
     entropy: float = Field(default=0.0, ge=0, description="weight of the entropy bonus")
@@ -51,7 +51,8 @@ class PpoSettings(Record):
     hold: int = Field(default=1, ge=1, le=100, description="decisions of the world for which it keeps to an action")
     care: float = Field(default=0.0, ge=0, le=1, description="what others of his world count for a learner; he is 1")
     central_critic: bool = Field(
-        default=False, description="the critic is shown what all of its world see on average, and the task's memory"
+        default=False,
+        description="the critic is shown what all of its world see on average, and memories of who does not learn",
     )
     taught: int = Field(
         default=0, ge=0, description="gradient steps in which it first learns what the tuned rules answer"

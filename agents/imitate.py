@@ -41,7 +41,7 @@ class Imitation:
 def imitate(
     experiment: Experiment, worlds: int = WORLDS, updates: int = 6000, advance: Callable[[int], None] = lambda n: None
 ) -> Imitation:
-    """Teach PPO's actor what the tuned rules answer in so many training worlds; let both play the tuning worlds."""
+    """Teach PPO's actor what tuned rules answer, in so many training worlds a round; let both play tuning worlds."""
     task, p = experiment.build(), experiment.ppo
     rules = player(task)
     with on_threads(p.threads):
@@ -55,7 +55,9 @@ def imitate(
 @app.command()
 def main(
     config: Annotated[Path, typer.Argument(help="an experiment, such as configs/school.yaml")],
-    worlds: Annotated[int, typer.Option(min=1, help="training worlds in which rules are watched")] = WORLDS,
+    worlds: Annotated[
+        int, typer.Option(min=1, help="training worlds of each of four rounds; rules act in the first")
+    ] = WORLDS,
     updates: Annotated[int, typer.Option(min=1, help="gradient steps, each of 2,048 rows")] = 6000,
 ) -> None:
     """Say how well a network of PPO's size plays that was taught by the tuned rules."""

@@ -85,7 +85,7 @@ class ForLearning(VecEnvWrapper):
             observation, more, over, told = self.venv.step_wait()
             reward += np.where(done, 0.0, more)
             if any(told[:: self.venv.world.learners]):  # all rows of a world are told of its end
-                infos = [new or before for new, before in zip(told, infos, strict=True)]
+                infos = [before or new for before, new in zip(infos, told, strict=True)]
             done = done | over
         return observation, reward * self.scale, done, infos
 
@@ -153,7 +153,7 @@ def build(task: Task, p: PpoSettings, tensorboard: str | None) -> PPO:
         n_steps=p.rollout,
         batch_size=p.minibatch,
         n_epochs=p.epochs,
-        learning_rate=lambda left: p.learning_rate * (0.1 + 0.9 * left),
+        learning_rate=lambda left: p.learning_rate * max(0.1 + 0.9 * left, 0.05),  # the last rollout may go beyond
         gamma=p.gamma,
         gae_lambda=p.gae_lambda,
         clip_range=p.clip,

@@ -365,26 +365,42 @@ def for_learning(task: Task, worlds: int, **changes: Any) -> ForLearning:
     return venv
 
 
-def test_an_action_that_is_held_is_paid_what_its_decisions_are_paid_until_an_episode_ends() -> None:
-    """Each row: the sum to its own end, the last of the ends that are told, and what is seen then."""
-    held, each = for_learning(HUNGRY, 2, hold=3), for_learning(HUNGRY, 2)
-    rng, ends, deaths = np.random.default_rng(2), 0, 0
+@pytest.mark.parametrize(("task", "hold"), [(HUNGRY, 3), (School(fish=3, horizon=2), 5)], ids=["deaths", "short"])
+def test_an_action_that_is_held_is_paid_what_its_decisions_are_paid_until_an_episode_ends(
+    task: School, hold: int
+) -> None:
+    """Each row: the sum to its own end, what the first end of its world was, and what is seen in the end."""
+    held, each = for_learning(task, 2, hold=hold), for_learning(task, 2).venv
+    rng, ends, alone = np.random.default_rng(2), 0, 0
     for _ in range(30):
         actions = rng.uniform(-1, 1, (6, 2))
         seen, reward, done, infos = held.step(actions)
         sums, over = np.zeros(6), np.zeros(6, np.bool_)
         told: list[dict[str, Any]] = [{}] * 6
-        for _ in range(3):
+        for _ in range(hold):
             last, paid, ended, news = each.step(actions)
             sums, over = sums + np.where(over, 0.0, paid), over | ended
-            told = [dict(new) or before for new, before in zip(news, told, strict=True)]
+            told = [before or dict(new) for new, before in zip(news, told, strict=True)]
         np.testing.assert_array_equal(seen, last)
         np.testing.assert_allclose(reward, sums, rtol=0, atol=1e-12)
         np.testing.assert_array_equal(done, over)
-        assert [info.get("terms") for info in infos] == [t.get("terms") for t in told]
+        for row in range(6):
+            assert infos[row].keys() == told[row].keys()
+            for key in infos[row]:
+                np.testing.assert_array_equal(infos[row][key], told[row][key])
         ends += sum(bool(info) for info in infos)
-        deaths += int(done.any() and not done.all())
-    assert ends >= 6 and deaths  # worlds ended, and somebody was out before that
+        alone += sum(bool(out) and not info for out, info in zip(done, infos, strict=True))
+    assert ends >= 6 and (alone > 0) == (task is HUNGRY)  # worlds ended, and somebody was out before that
+
+
+def test_a_rollout_that_goes_beyond_the_budget_does_not_learn_backwards() -> None:
+    """SB3 says then that less than nothing is left."""
+    from agents import ppo
+
+    task = HUNGRY
+    model = ppo.build(task, PpoSettings(**TINY, steps=1, threads=1), None)
+    assert model.lr_schedule(1.0) == pytest.approx(2e-3) and model.lr_schedule(0.0) == pytest.approx(2e-4)
+    assert model.lr_schedule(-5.0) == pytest.approx(1e-4)
 
 
 @pytest.mark.parametrize("care", [0.25, 1.0])

@@ -33,32 +33,39 @@ def besides(world: World, seen: Any, b: int) -> list[float]:
 
 
 def test_behind_what_a_learner_sees_stands_what_only_its_critic_is_shown() -> None:
-    plain, central = (kind(SCHOOL, 2, time_limit=6, leaving=True) for kind in (WorldVecEnv, CentralVecEnv))
-    lone, size, ended, left = World(SCHOOL, 2, time_limit=6), SCHOOL.layout.size, False, set()
+    """As a lone world has it: of who goes on, as the next episode begins, and of who ended, as the last one did."""
+    plain, central = (kind(SCHOOL, 3, time_limit=6, leaving=True) for kind in (WorldVecEnv, CentralVecEnv))
+    lone, size, shares, ends = World(SCHOOL, 3, time_limit=6), SCHOOL.layout.size, set(), []
     for env in (plain, central):
         env.seed(5)
     lone.reset(5)
     assert central.observation_space.shape == (2 * size + 2 + 3 * SCHOOL.memory,)
     np.testing.assert_array_equal(central.reset()[:, :size], plain.reset())
-    for actions in actions_for(SCHOOL, 2, 9):
+    for world in (plain.world, central.world, lone):
+        world.steps[:] = (0, 2, 3)
+    for actions in actions_for(SCHOOL, 3, 14):
         rows, reward, done, infos = central.step(actions)
         told, paid, over, others = plain.step(actions)
         np.testing.assert_array_equal(rows[:, :size], told)
         np.testing.assert_array_equal(reward, paid)
         np.testing.assert_array_equal(done, over)
-        step = lone.step(actions.reshape(2, 3, -1))
-        last = [info.get("terminal_observation") for info in infos]
-        for row in range(6):
+        step = lone.step(actions.reshape(3, 3, -1))
+        seen = step.observation.copy()
+        for row in range(9):
             b, i = divmod(row, 3)
-            here = rows[row] if last[row] is None else last[row]  # as its world ended, not as the next one begins
-            if not ended:
-                expected = [*step.observation[b, i].tolist(), *besides(lone, step.observation, b)]
-                left.add(expected[2 * size])
-                np.testing.assert_allclose(here, expected, rtol=1e-6, atol=1e-6)
-            if last[row] is not None:
-                np.testing.assert_array_equal(here[:size], others[row]["terminal_observation"])
-        ended |= any(info is not None for info in last)
-    assert ended and len(left) > 2  # shares of fish that were there
+            if step.ended[b]:
+                last = infos[row]["terminal_observation"]
+                np.testing.assert_array_equal(last[:size], others[row]["terminal_observation"])
+                np.testing.assert_allclose(last, [*seen[b, i].tolist(), *besides(lone, seen, b)], rtol=1e-6, atol=1e-6)
+        ends.append(tuple(step.ended.tolist()))
+        if step.ended.any():
+            lone.reset(mask=step.ended, into=seen)
+        for row in range(9):
+            b, i = divmod(row, 3)
+            expected = [*seen[b, i].tolist(), *besides(lone, seen, b)]
+            shares.add(expected[2 * size])
+            np.testing.assert_allclose(rows[row], expected, rtol=1e-6, atol=1e-6)
+    assert any(any(which) and not all(which) for which in ends) and len(shares) > 2
 
 
 @pytest.mark.parametrize("task", [Flock(agents=4), Herd(sheep=5, dogs=2)], ids=lambda task: task.name)
@@ -95,10 +102,43 @@ def test_an_actor_is_blind_to_what_its_critic_sees_and_is_what_is_exported() -> 
     np.testing.assert_allclose(answers, np.clip(acts[0], -1, 1), rtol=1e-5, atol=1e-6)
 
 
-def test_a_central_critic_trains_is_taught_and_goes_on(tmp_path: Path) -> None:
-    experiment = settings(taught=3, critic_first=64)
-    whole = ppo.train(experiment, tmp_path)
-    assert [point["steps"] for point in whole.curve] == [192, 384, 384]
-    assert ppo.train(experiment, tmp_path, go_on=True).curve == whole.curve  # it is finished
+def test_what_a_central_critic_and_held_actions_came_to_goes_on_after_an_interruption(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Decisions are counted on, the networks are those of before, and it is still only the critic that learns."""
+    update = 4 * 3 * 16 * 3
+    changes = {"taught": 3, "critic_first": 4 * update, "hold": 3, "steps": 3 * update, "evaluate_every": update}
+    experiment = settings(**changes)
+    write = ppo.checkpoint
+
+    def interrupted(*given: Any) -> None:
+        write(*given)
+        raise KeyboardInterrupt
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(ppo, "checkpoint", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            ppo.train(experiment, tmp_path)
+    begun = ppo.checkpointed(experiment, tmp_path)
+    assert begun is not None and begun.steps == update
+    kept = torch.load(tmp_path / "policy.pt", weights_only=True)
+    counted, resume = [], ppo.resume
+
+    def watched(folder: Path, model: Any, *given: Any) -> None:
+        resume(folder, model, *given)
+        counted.append(model.num_timesteps)
+
+    monkeypatch.setattr(ppo, "resume", watched)
+    run = ppo.train(experiment, tmp_path, go_on=True)
+    assert counted == [update // 3] and run.steps == 3 * update
+    assert [point["steps"] for point in run.curve] == [update, update, 2 * update, 3 * update, 3 * update]
+    found = torch.load(tmp_path / "policy.pt", weights_only=True)
+    for name in ("action_net.weight", "mlp_extractor.policy_net.0.weight", "log_std"):
+        np.testing.assert_array_equal(found[name], kept[name])
+    assert not np.array_equal(found["value_net.weight"], kept["value_net.weight"])
+    thawed = ppo.train(settings(**{**changes, "critic_first": update}), tmp_path / "other")
+    assert thawed.steps == 3 * update
+    found = torch.load(tmp_path / "other" / "policy.pt", weights_only=True)
+    assert not np.array_equal(found["action_net.weight"], kept["action_net.weight"])
     with pytest.raises(ppo.OtherRecipe, match=r"central_critic = False: the checkpoint in .* with True"):
-        ppo.train(settings(taught=3, critic_first=64, central_critic=False), tmp_path, go_on=True)
+        ppo.train(settings(**changes, central_critic=False), tmp_path, go_on=True)
