@@ -60,7 +60,7 @@ class ForLearning(VecEnvWrapper):
     def __init__(self, venv: WorldVecEnv, scale: float, stagger: bool, hold: int = 1) -> None:
         super().__init__(venv)
         self.scale, self.stagger, self.hold = scale, stagger, hold
-        self.here = np.ones(venv.num_envs, np.bool_)  # who was when the last step began
+        self.here = np.ones(venv.num_envs, np.bool_)  # who was there when the last step began
 
     def reset(self) -> np.ndarray:
         """Begin; staggered, each world with another part of its first episode behind it."""

@@ -57,5 +57,5 @@ def _carry(parts: Parts, to: list[str]) -> list[str]:
         "wait_for_team(sync, team)",
         f"for i in range(np.uint64(first * {w}), np.uint64(min(end * {w}, n))):",
         f"    place = {place_of(parts, d)}",
-        *(f"    {to} = luggage[i * np.uint64({count}) + np.uint64({k})]" for k, to in enumerate(unpacked)),
+        *(f"    {mine} = luggage[i * np.uint64({count}) + np.uint64({k})]" for k, mine in enumerate(unpacked)),
     ]
