@@ -147,6 +147,10 @@ def build(task: Task, p: PpoSettings, tensorboard: str | None) -> PPO:
     learned = task.model_copy(update={"dtype": p.dtype})
     shows = CentralVecEnv if p.central_critic else WorldVecEnv
     worlds = ForLearning(shows(learned, p.worlds, leaving=not task.ends_together), p.reward_scale, p.stagger, p.hold)
+    caring: dict[str, Any] = {}
+    if p.care:
+        caring["rollout_buffer_class"] = CaringBuffer
+        caring["rollout_buffer_kwargs"] = {"worlds": worlds, "learners": task.learners, "care": p.care}
     model = PPO(
         CentralPolicy if p.central_critic else "MlpPolicy",
         worlds,
@@ -167,8 +171,7 @@ def build(task: Task, p: PpoSettings, tensorboard: str | None) -> PPO:
             "log_std_init": p.log_std,
             **({"seen": task.layout.size} if p.central_critic else {}),
         },
-        rollout_buffer_class=CaringBuffer if p.care else None,
-        rollout_buffer_kwargs={"worlds": worlds, "learners": task.learners, "care": p.care} if p.care else None,
+        **caring,
     )
     if tensorboard is None:
         model.set_logger(Logger(folder=None, output_formats=[]))  # its own leaves an empty folder behind

@@ -48,11 +48,11 @@ def shown(
 
 def teach(
     model: PPO, task: Task, rules: Reynolds, updates: int, worlds: int = WORLDS,
-    advance: Callable[[int], None] = lambda n: None, rounds: int = ROUNDS,
+    advance: Callable[[int], None] = lambda n: None,
 ) -> tuple[int, float]:  # fmt: skip
-    """Teach PPO's actor what rules answer in so many training worlds, by so many gradient steps of 2,048 rows.
+    """Teach PPO's actor what rules answer, by so many gradient steps of 2,048 rows in four rounds.
 
-    First of what rules meet, then, round by round, of what the actor met too, each time in as many other worlds.
+    First of what rules meet in so many training worlds, then, round by round, of what the actor meets in as many more.
     Returns how many rows there were, and what is missed in the end: mean square of its answers' errors, over the
     variance of the rules' answers. advance: called with 1 after every gradient step.
     """
@@ -63,10 +63,11 @@ def teach(
     rows, answers = shown(task, rules, worlds)
     optimiser = torch.optim.Adam(model.policy.parameters(), RATE)
     loss = torch.zeros(())
+    begins = {-(-updates * turn // ROUNDS): turn for turn in range(1, ROUNDS)}
     for k in range(updates):
-        if k * rounds // updates > (k - 1) * rounds // updates >= 0:  # a round later than the gradient step before
-            met = shown(task, rules, worlds, answer, worlds * (k * rounds // updates))
-            rows, answers = (torch.cat(both) for both in zip((rows, answers), met, strict=True))
+        if k in begins:
+            met = shown(task, rules, worlds, answer, first=worlds * begins[k])
+            rows, answers = torch.cat([rows, met[0]]), torch.cat([answers, met[1]])
         for group in optimiser.param_groups:
             group["lr"] = RATE * (1.0 - 0.95 * k / updates)
         some = torch.randint(len(rows), (MINIBATCH,))

@@ -28,6 +28,7 @@ from flockenv.policy import MlpPolicy, RandomPolicy
 from flockenv.sb3 import WorldVecEnv
 from flockenv.tasks import TASKS, School, Task
 from flockenv.world import World
+from tests.training import interrupt
 
 ROOT = CONFIGS.parent
 TINY = {"worlds": 16, "rollout": 16, "minibatch": 64, "epochs": 1, "evaluate_every": 512, "evaluate_worlds": 4}
@@ -141,22 +142,6 @@ def test_training_is_repeatable_and_exports(tmp_path: Path, monkeypatch: pytest.
     assert policy.card["recipe"]["ppo"] == PURSUIT.ppo.model_dump(mode="json")
 
 
-def _interrupt(experiment: Experiment, folder: Path) -> None:
-    """Train, and press Ctrl-C at the first point of the curve."""
-    from agents import ppo
-
-    write = ppo.checkpoint
-
-    def interrupted(*given: Any) -> None:
-        write(*given)
-        raise KeyboardInterrupt
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(ppo, "checkpoint", interrupted)
-        with pytest.raises(KeyboardInterrupt):
-            ppo.train(experiment, folder)
-
-
 def _fail(*_: object, **__: object) -> None:
     raise AssertionError("nothing is to be trained")
 
@@ -167,7 +152,7 @@ def test_training_that_was_interrupted_goes_on_and_a_finished_one_is_left_alone(
 ) -> None:
     from agents import ppo
 
-    _interrupt(PURSUIT, tmp_path)
+    interrupt(PURSUIT, tmp_path)
     begun = ppo.checkpointed(PURSUIT, tmp_path)
     assert begun is not None and 0 < begun.steps < 1024
     run = ppo.train(PURSUIT, tmp_path, go_on=True)
@@ -188,7 +173,7 @@ def test_training_does_not_go_on_with_another_recipe(tmp_path: Path, change: dic
     from agents import ppo
 
     folder = tmp_path / "runs" / "pursuit"
-    _interrupt(PURSUIT, folder)
+    interrupt(PURSUIT, folder)
     config = tmp_path / "pursuit.yaml"
     config.write_text(yaml.safe_dump({"task": "pursuit", "ppo": {**TINY, "steps": 1024}, **change}), encoding="utf-8")
     given = [str(config), "--runs", str(tmp_path / "runs"), "--resume", "--out", str(tmp_path / "p.safetensors")]
@@ -225,7 +210,7 @@ def test_curves_train_every_setting_once_and_draw_them(tmp_path: Path, monkeypat
     from agents.curves import draw
 
     experiment = Experiment(task="pursuit", ppo={**TINY, "steps": 512}, curves={"two epochs": {"epochs": 2}})
-    _interrupt(experiment, tmp_path / "runs" / "pursuit" / AS_CONFIGURED)
+    interrupt(experiment, tmp_path / "runs" / "pursuit" / AS_CONFIGURED)
     said = _curves(tmp_path)
     assert "pursuit, as configured: 1 epoch, minibatch 64, rate 0.002: goes on after 256 steps\n" in said
     assert "pursuit, two epochs: 2 epochs, minibatch 64, rate 0.002: begins\n" in said
@@ -471,7 +456,7 @@ def test_a_run_that_is_taught_remembers_its_teacher_and_its_time(tmp_path: Path)
     from agents import ppo
 
     taught = Experiment(task="pursuit", ppo=PpoSettings(**TINY, steps=1024, taught=5, critic_first=1024))
-    _interrupt(taught, tmp_path)  # when it had been taught
+    interrupt(taught, tmp_path)  # when it had been taught
     begun = ppo.checkpointed(taught, tmp_path)
     assert begun is not None and begun.recipe["rules"] == as_dict(player(taught.build()).rules)
     assert "rules" not in ppo.recipe_of(PURSUIT)
@@ -496,7 +481,7 @@ def test_ctrl_c_while_it_is_taught_claims_no_checkpoint_and_loses_none(
         raise KeyboardInterrupt
 
     (tmp_path / "p.yaml").write_text(f"task: pursuit\nppo: {json.dumps(TINY | {'taught': 5})}\n", encoding="utf-8")
-    _interrupt(PURSUIT, tmp_path / "runs" / "pursuit")  # of another recipe
+    interrupt(PURSUIT, tmp_path / "runs" / "pursuit")  # of another recipe
     monkeypatch.setattr(ppo, "teach", interrupted)
     result = CliRunner().invoke(ppo.app, [str(tmp_path / "p.yaml"), "--runs", str(tmp_path / "runs")])
     assert result.exit_code == 130 and "nothing was learnt yet" in result.stderr

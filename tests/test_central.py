@@ -14,6 +14,7 @@ from flockenv.policy import MlpPolicy
 from flockenv.sb3 import WorldVecEnv
 from flockenv.tasks import Flock, Herd, School, Task
 from flockenv.world import World
+from tests.training import interrupt
 
 SCHOOL = School(fish=3, hunters=1, patches=2, start_hunger=0.6, metabolism=0.8)  # fish starve one after another
 
@@ -109,16 +110,7 @@ def test_what_a_central_critic_and_held_actions_came_to_goes_on_after_an_interru
     update = 4 * 3 * 16 * 3
     changes = {"taught": 3, "critic_first": 4 * update, "hold": 3, "steps": 3 * update, "evaluate_every": update}
     experiment = settings(**changes)
-    write = ppo.checkpoint
-
-    def interrupted(*given: Any) -> None:
-        write(*given)
-        raise KeyboardInterrupt
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(ppo, "checkpoint", interrupted)
-        with pytest.raises(KeyboardInterrupt):
-            ppo.train(experiment, tmp_path)
+    interrupt(experiment, tmp_path)
     begun = ppo.checkpointed(experiment, tmp_path)
     assert begun is not None and begun.steps == update
     kept = torch.load(tmp_path / "policy.pt", weights_only=True)
