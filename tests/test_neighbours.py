@@ -241,23 +241,36 @@ def test_a_query_writes_into_its_own_arrays_only(size: Any, dimension: int) -> N
         at = i // lanes * lanes * dimension + i % lanes
         pos[at : at + dimension * lanes : lanes] = x[i]
     lengths = {"cell": blocks * lanes, "start": n + 1, "offset": n}
-    for periodic in (False, True):
+
+    def counted(periodic: bool, handful: int) -> tuple[Any, Array]:
         whole = {name: np.full(length + guard, -7, np.int32) for name, length in lengths.items()}
         cell, start, offset = (whole[name][:length] for name, length in lengths.items())
         box = tuple(float(edge) for edge in size[:dimension])
         shape = entry(count_cells)(
             pos, living, 0, blocks, lanes, 0, 1, np.zeros(8, np.int64), np.zeros((1, 6)), box, 0.4, periodic,
-            periodic, n, cell, start, offset[None],
+            periodic, n, handful, cell, start, offset[None],
         )  # fmt: skip
         for name, length in lengths.items():
             assert (whole[name][length:] == -7).all(), f"{name} is too short for {shape} cells"
         cells = math.prod(shape[:3])
-        assert cells <= n
         if cells:
+            many = max(1, handful * cells // n)
+            cells = -(-cells // many)
             np.testing.assert_array_equal(np.diff(start[: cells + 1]), np.bincount(cell[:n], minlength=cells))
             np.testing.assert_array_equal(offset[:cells], start[:cells])
             assert (cell[n:] == -1).all()
             assert start[cells] == n
+        return shape, cell
+
+    for periodic in (False, True):
+        shape, cell = counted(periodic, handful=0)
+        cells = math.prod(shape[:3])
+        assert cells <= n
+        for handful in (1, 16, 10**6):  # cells in a row count as one, as many as so many agents take
+            again, joined = counted(periodic, handful)
+            assert again == shape
+            if cells:
+                np.testing.assert_array_equal(joined, cell // max(1, handful * cells // n))
 
 
 @pytest.mark.parametrize(

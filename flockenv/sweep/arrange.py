@@ -2,13 +2,14 @@
 
 Agents are numbered by whoever made the scene, and neighbours by number lie anywhere in space: sorting them by cell is
 one distant place in memory per agent and step. So at the beginning of a call all that is known of an agent moves to
-where its cell comes; each step then sorts what is nearly sorted; and at the end everybody goes home. `ident` says who
-is where in between. Sums do not notice: within a cell agents are met in the order of their numbers all the same.
+where its cell comes, or the handful of cells that it lies in; each step then sorts what is nearly sorted; and at the
+end everybody goes home. `ident` says who is where in between. Sums do not notice: within a cell agents are met in the
+order of their numbers all the same.
 """
 
 from __future__ import annotations
 
-from flockenv.neighbours import WORTH_ARRANGING
+from flockenv.neighbours import HANDFUL, WORTH_ARRANGING
 from flockenv.sweep.parts import Parts
 from flockenv.sweep.query import counted
 from flockenv.sweep.text import indented, place_of
@@ -24,7 +25,7 @@ def move_in(parts: Parts) -> list[str]:
     return [
         "arranged = False",
         f"if count > 1 and n >= {WORTH_ARRANGING} and present == n:",
-        f"    shape = {counted(parts, parts.confines)}",
+        f"    shape = {counted(parts, parts.confines, HANDFUL)}",
         "    arranged = shape[0] > 0",
         "if arranged:",
         indented(_carry(parts, to), 4),

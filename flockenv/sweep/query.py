@@ -31,11 +31,11 @@ def query(parts: Parts, fields: list[str], inside: bool = False) -> list[str]:
     ]
 
 
-def counted(parts: Parts, inside: bool) -> str:
-    """Write how many cells there are per axis, once every agent's has been found."""
+def counted(parts: Parts, inside: bool, handful: int = 0) -> str:
+    """Write how many cells there are per axis, once every agent's has been found; see `count_cells`."""
     return (
         f"count_cells(pos, living, first, end, {parts.width}, rank, team, sync, bounds, size, reach, "
-        f"{parts.space.periodic}, {parts.space.periodic and not inside}, n, cell, start, offset)"
+        f"{parts.space.periodic}, {parts.space.periodic and not inside}, n, {handful}, cell, start, offset)"
     )
 
 
