@@ -2,7 +2,7 @@
 
 Agents are numbered by whoever made the scene, and neighbours by number lie anywhere in space: sorting them by cell is
 one distant place in memory per agent and step. So at the beginning of a call all that is known of an agent moves to
-where its cell comes, or the handful of cells that it lies in; each step then sorts what is nearly sorted; and at the
+where the handful of cells comes that it is in; each step then sorts what is nearly sorted; and at the
 end everybody goes home. `ident` says who is where in between. Sums do not notice: within a cell agents are met in the
 order of their numbers all the same.
 """
