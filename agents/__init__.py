@@ -1,1 +1,8 @@
 """The workbench: the players, what trains and tunes them, and the comparison; run from a checkout, not installed."""
+
+import os
+
+# Torch's threads spin for some milliseconds before they sleep: on two cores, where the worlds' second thread would run.
+# This is a tenth of a millisecond, and after a forward pass a step of Flock takes 1 / 1.7 of the time. OpenMP reads it
+# when torch is imported; whoever has set it is heard.
+os.environ.setdefault("GOMP_SPINCOUNT", "10000")

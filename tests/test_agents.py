@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import json
+import os
+import subprocess
+import sys
 import tempfile
 from pathlib import Path
 from types import SimpleNamespace
@@ -32,6 +35,14 @@ from tests.training import interrupt
 
 ROOT = CONFIGS.parent
 TINY = {"worlds": 16, "rollout": 16, "minibatch": 64, "epochs": 1, "evaluate_every": 512, "evaluate_worlds": 4}
+
+
+@pytest.mark.parametrize(("given", "heard"), [({}, "10000"), ({"GOMP_SPINCOUNT": "77"}, "77")])
+def test_torch_is_told_to_spin_briefly_before_it_is_imported(given: dict[str, str], heard: str) -> None:
+    before = {name: value for name, value in os.environ.items() if name != "GOMP_SPINCOUNT"}
+    code = "import agents, os, sys; print(os.environ['GOMP_SPINCOUNT'], 'torch' in sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], env=before | given, cwd=ROOT, capture_output=True, text=True)
+    assert done.stdout.split() == [heard, "False"], done.stderr
 
 
 @pytest.mark.parametrize("name", sorted(TASKS))
