@@ -3,6 +3,7 @@
 import os
 
 # Torch's threads spin for some milliseconds before they sleep: on two cores, where the worlds' second thread would run.
-# This is a tenth of a millisecond, and after a forward pass a step of Flock takes 1 / 1.7 of the time. OpenMP reads it
-# when torch is imported; whoever has set it is heard.
-os.environ.setdefault("GOMP_SPINCOUNT", "10000")
+# So many rounds are a quarter of a millisecond, and after a forward pass a step of Flock takes 1 / 1.7 of the time.
+# OpenMP reads it when torch is imported; who has said how threads wait is heard.
+if "OMP_WAIT_POLICY" not in os.environ:
+    os.environ.setdefault("GOMP_SPINCOUNT", "10000")

@@ -46,7 +46,10 @@ __all__ = [
 ROOT = Path(__file__).resolve().parent.parent
 FOLDER = Path("results/benchmarks")
 PACKAGES = ("numpy", "numba", "llvmlite", "gymnasium", "pettingzoo", "stable-baselines3", "torch")
-VARIABLES = ("NUMBA_NUM_THREADS", "OMP_NUM_THREADS", "MALLOC_MMAP_THRESHOLD_", "MALLOC_TRIM_THRESHOLD_")
+VARIABLES = (
+    "NUMBA_NUM_THREADS", "OMP_NUM_THREADS", "OMP_WAIT_POLICY", "GOMP_SPINCOUNT", "MALLOC_MMAP_THRESHOLD_",
+    "MALLOC_TRIM_THRESHOLD_",
+)  # fmt: skip
 QUARTERS = (0.25, 0.5, 0.75)
 INTERRUPTED = 130  # exit code of a program that Ctrl-C ended
 

@@ -35,8 +35,8 @@ DISTANT = 2**13
 """Agents from which on the places of records are asked for in good time: fewer lie in the nearest caches anyway."""
 
 HANDFUL = 16
-"""Agents that lie by number, not by cell, where a world is put in order: who then changes cells is seldom out of turn,
-and what is near in space is near in memory all the same. 4 and 32 are hardly slower, 1 and 128 are."""
+"""Agents that lie by number, not by cell, where a world is put in order: of those who then change cells about half as
+many come out of turn, and what is near in space is near in memory all the same. 8 and 32 are hardly slower."""
 
 FINEST = 3
 """Cells along x that a reach spans at most: a row is cut finely, so that a block meets few agents out of its reach."""
@@ -172,7 +172,7 @@ def _find_cells(
 
 @kernel
 def _join(cell: Ints, first: int, end: int, many: int) -> None:
-    """Let so many cells in a row count as one, for these agents."""
+    """Let so many consecutive cells count as one, for these agents."""
     for i in range(np.uint64(first), np.uint64(end)):
         cell[i] = np.int32(cell[i] // many)  # -1 stays -1
 
@@ -185,8 +185,8 @@ def count_cells(
     """Find the cell of every agent, and where in sorted order each cell begins; return the cells as grid_of does.
 
     pos: blocks of (D, lanes) m, to be brought into a periodic box first if it `wraps`; living (agents, padded) 0 or 1;
-    [first, end): this thread's blocks; capacity: most
-    cells; handful: 0, or about so many agents are to share a cell: as many cells in a row as that takes count as one.
+    [first, end): this thread's blocks; capacity: most cells; handful: 0, or how many agents are to share a cell in the
+    mean: as many consecutive cells as that takes count as one in all that is written (`candidates` reads cells alone).
     Writes cell (agents, padded), -1 for the dead; start (capacity + 1,): first sorted agent of each cell;
     offset (team, capacity): where this thread puts its next agent of each cell. Returns zeros for brute force.
     """

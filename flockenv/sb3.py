@@ -1,4 +1,8 @@
-"""Stable-Baselines3's face: every learner of every world is one row of a VecEnv, without subprocesses or SuperSuit."""
+"""Stable-Baselines3's face: every learner of every world is one row of a VecEnv, without subprocesses or SuperSuit.
+
+Worlds on several threads and torch share the cores: on few of them, GOMP_SPINCOUNT=10000 in the environment keeps
+torch's threads from spinning where the worlds' would run (docs/performance.md, Training).
+"""
 
 from __future__ import annotations
 

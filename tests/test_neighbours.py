@@ -229,13 +229,15 @@ def test_awkward_toruses_in_space(size: Any) -> None:
     assert_as_expected(rules(1.0, fov=200), uniform(300, size), Torus(size=size))
 
 
+@pytest.mark.parametrize("absent", [0, 60])
 @pytest.mark.parametrize("dimension", [2, 3])
 @pytest.mark.parametrize("size", [(1e3, 1e-3, 1e-3), (1e-3, 1e4, 1e-3), (1e6, 1e6, 1.0), (50.0, 50.0, 50.0), (1, 1, 1)])
-def test_a_query_writes_into_its_own_arrays_only(size: Any, dimension: int) -> None:
+def test_a_query_writes_into_its_own_arrays_only(size: Any, dimension: int, absent: int) -> None:
     """With guards behind every array: more cells than there is room for would show there."""
     n, lanes, guard = 200, 16, 100_000
     blocks = -(-n // lanes)
     pos, living = np.zeros(blocks * lanes * dimension), np.r_[np.ones(n), np.zeros(blocks * lanes - n)]
+    living[np.random.default_rng(0).permutation(n)[:absent]] = 0
     x = uniform(n, size[:dimension])
     for i in range(n):
         at = i // lanes * lanes * dimension + i % lanes
@@ -256,17 +258,18 @@ def test_a_query_writes_into_its_own_arrays_only(size: Any, dimension: int) -> N
         if cells:
             many = max(1, handful * cells // n)
             cells = -(-cells // many)
-            np.testing.assert_array_equal(np.diff(start[: cells + 1]), np.bincount(cell[:n], minlength=cells))
+            sizes = np.bincount(cell[cell >= 0], minlength=cells)
+            np.testing.assert_array_equal(np.diff(start[: cells + 1]), sizes)
             np.testing.assert_array_equal(offset[:cells], start[:cells])
-            assert (cell[n:] == -1).all()
-            assert start[cells] == n
+            np.testing.assert_array_equal(cell == -1, living == 0)
+            assert start[0] == 0
         return shape, cell
 
     for periodic in (False, True):
         shape, cell = counted(periodic, handful=0)
         cells = math.prod(shape[:3])
         assert cells <= n
-        for handful in (1, 16, 10**6):  # cells in a row count as one, as many as so many agents take
+        for handful in (1, 16, 10**6):  # consecutive cells count as one, as many as so many agents take
             again, joined = counted(periodic, handful)
             assert again == shape
             if cells:

@@ -2,9 +2,9 @@
 
 Agents are numbered by whoever made the scene, and neighbours by number lie anywhere in space: sorting them by cell is
 one distant place in memory per agent and step. So at the beginning of a call all that is known of an agent moves to
-where the handful of cells comes that it is in; each step then sorts what is nearly sorted; and at the
-end everybody goes home. `ident` says who is where in between. Sums do not notice: within a cell agents are met in the
-order of their numbers all the same.
+where its cell comes, roughly: a handful of cells at a time, by number within. Each step then sorts what is nearly
+sorted; and at the end everybody goes home. `ident` says who is where in between. Sums do not notice: within a cell
+agents are met in the order of their numbers all the same.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ __all__ = ["go_home", "move_in"]
 
 
 def move_in(parts: Parts) -> list[str]:
-    """Write how agents move to where their cells come, if that is worth it; sets `arranged`."""
+    """Write how agents move to where their handfuls of cells come, if that is worth it; sets `arranged`."""
     if not parts.arranges:
         return ["arranged = False"]
     to = ["c = np.uint64(cell[i])", "cell[i] = offset[rank, c]", "offset[rank, c] += 1"]
