@@ -121,14 +121,20 @@ class Turns(Contestant):
 
 
 @contextmanager
-def running(name: str, python: Path, script: str, case: str, threads: int, seconds: float) -> Iterator[Turns]:
-    """Start a script and wait until it is ready; stop it in the end. Raises PeerError in one line if it fails."""
+def running(
+    name: str, python: Path, script: str, case: str, threads: int, seconds: float,
+    variables: Mapping[str, str] | None = None,
+) -> Iterator[Turns]:  # fmt: skip
+    """Start a script and wait until it is ready; stop it in the end. Raises PeerError in one line if it fails.
+
+    variables: of its environment, beside those that every script has.
+    """
     command = [str(python), str(SCRIPTS / script), case, "--threads", str(threads), "--turns"]
     with tempfile.TemporaryDirectory() as folder, Path(folder, "stderr").open("w+", encoding="utf-8") as errors:
         try:
             process = subprocess.Popen(
                 command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=errors, text=True,
-                env=_environment(threads),
+                env=_environment(threads) | dict(variables or {}),
                 cwd=folder,  # PySocialForce writes a log where it is run
                 start_new_session=True,  # Ctrl-C is for us alone: we end it, when this sample is thrown away
             )  # fmt: skip

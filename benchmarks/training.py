@@ -3,15 +3,17 @@
 The tasks and settings of configs/*.yaml, built as agents.ppo builds them, and a few settings beside them, among these
 what Stable-Baselines3 has by default. Contestants take turns of some rollouts and updates each; the clock is read
 around env.step, the policy's forward pass, the whole rollout, and, in the update, the loss, the gradient and the
-optimizer. What is left is Stable-Baselines3's own Python: copies, batches, clipping of gradients.
+optimizer. What is left is Stable-Baselines3's own Python: copies, batches, clipping of gradients. Before that, in
+processes of their own: a forward pass and a step of many worlds, by how long torch's threads spin (agents/__init__.py).
 """
 
 from __future__ import annotations
 
 import statistics
+import sys
 from collections import defaultdict
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from time import perf_counter, process_time
@@ -21,6 +23,7 @@ import typer
 
 from agents.experiment import CONFIGS, PpoSettings, load_experiment
 from benchmarks.measure import Bench, Contestant, Numbers, Out, Quick, Result, Rounds, Sample, command_line, number
+from benchmarks.peers import PeerError, running
 from flockenv.tasks import Task
 
 __all__ = ["EXPERIMENTS", "Learning", "settings"]
@@ -28,6 +31,7 @@ __all__ = ["EXPERIMENTS", "Learning", "settings"]
 EXPERIMENTS = ("pursuit", "obstacles", "flock")
 SECONDS, QUICK_SECONDS = 4.0, 1.0  # s, a turn lasts at least
 ROUNDS, QUICK_ROUNDS = 3, 1
+SPINS = ("300000", "10000", "0")  # rounds: libgomp's own, what agents asks for, none
 SB3_ROWS = 8  # environments that somebody with the defaults may have
 
 
@@ -144,6 +148,22 @@ def _race(bench: Bench, name: str, seconds: float) -> None:
     _shares(bench, name, bench.race(f"PPO on {name}", contestants, baseline="as configured"), contestants)
 
 
+def _spinning(bench: Bench, seconds: float) -> None:
+    """Race forward passes and steps of Flock on two threads, by how long torch's threads spin before they sleep."""
+    script, case = "run_ours.py", "flock_after_a_pass"
+    try:
+        with ExitStack() as stack:
+            contestants = []
+            for spins in SPINS:
+                environment = {"GOMP_SPINCOUNT": spins}
+                side = running(f"{spins} rounds", Path(sys.executable), script, case, 2, seconds, environment)
+                contestants.append(stack.enter_context(side))
+            title = "a forward pass and a step of Flock, 2 threads, by how long torch's spin"
+            bench.race(title, contestants, baseline=contestants[0].name)
+    except PeerError as error:
+        bench.note(str(error))
+
+
 def _said(p: PpoSettings, task: Task) -> str:
     """Return a setting in words."""
     rows = p.worlds * task.learners
@@ -196,9 +216,12 @@ def main(
         raise typer.BadParameter(f"--only {only!r}: unknown; allowed: {', '.join(EXPERIMENTS)}")
     turns = rounds or (QUICK_ROUNDS if quick else ROUNDS)
     with Bench("training", quick, turns, out, unit="k agent-steps/s", scale=1e3) as bench:
+        turn = seconds or (QUICK_SECONDS if quick else SECONDS)
+        if not only:
+            _spinning(bench, turn)
         for name in EXPERIMENTS:
             if only in ("", name) and Path(CONFIGS / f"{name}.yaml").exists():
-                _race(bench, name, seconds or (QUICK_SECONDS if quick else SECONDS))
+                _race(bench, name, turn)
         _summary(bench)
         bench.note("End to end: rollouts and updates. Torch and the worlds use as many threads as the setting says.")
 

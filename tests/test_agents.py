@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
-import subprocess
-import sys
 import tempfile
 from pathlib import Path
 from types import SimpleNamespace
@@ -35,19 +32,6 @@ from tests.training import interrupt
 
 ROOT = CONFIGS.parent
 TINY = {"worlds": 16, "rollout": 16, "minibatch": 64, "epochs": 1, "evaluate_every": 512, "evaluate_worlds": 4}
-
-
-@pytest.mark.skipif(sys.platform != "linux", reason="torch has another OpenMP there")
-@pytest.mark.parametrize(
-    ("given", "heard"), [({}, "10000"), ({"GOMP_SPINCOUNT": "77"}, "77"), ({"OMP_WAIT_POLICY": "passive"}, "0")]
-)
-def test_torch_spins_briefly_unless_somebody_has_said_how_threads_wait(given: dict[str, str], heard: str) -> None:
-    ours = ("GOMP_SPINCOUNT", "OMP_WAIT_POLICY")
-    before = {name: value for name, value in os.environ.items() if name not in ours}
-    env = before | given | {"OMP_DISPLAY_ENV": "verbose"}
-    command = [sys.executable, "-c", "import agents.ppo"]
-    done = subprocess.run(command, env=env, cwd=ROOT, capture_output=True, text=True)
-    assert f"GOMP_SPINCOUNT = '{heard}'" in done.stderr
 
 
 @pytest.mark.parametrize("name", sorted(TASKS))

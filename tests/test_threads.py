@@ -454,3 +454,12 @@ def test_the_environment_says_how_many_threads() -> None:
     refused = in_another_process(code, FLOCKENV_THREADS="many")
     assert refused.returncode != 0
     assert refused.stderr.splitlines()[-1].startswith("ValueError: FLOCKENV_THREADS is 'many'")
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="torch has another OpenMP there")
+@pytest.mark.parametrize(
+    ("given", "heard"), [({}, "10000"), ({"GOMP_SPINCOUNT": "77"}, "77"), ({"OMP_WAIT_POLICY": "passive"}, "0")]
+)
+def test_torch_spins_briefly_unless_somebody_has_said_how_threads_wait(given: dict[str, str], heard: str) -> None:
+    told = in_another_process("import agents, torch", OMP_DISPLAY_ENV="verbose", **given)
+    assert f"GOMP_SPINCOUNT = '{heard}'" in told.stderr

@@ -46,6 +46,25 @@ def flock_vector(threads: int) -> Case:
     return Case(lambda: env.step(next(actions)), rows, does)
 
 
+def flock_after_a_pass(threads: int) -> Case:
+    """The same, and before every step what a policy of two layers of 64 answers to as many rows."""
+    import torch
+
+    from flockenv.tasks import Flock
+
+    torch.set_num_threads(threads)
+    case, seen = flock_vector(threads), Flock(agents=32, learners=32).layout.size
+    hidden = [torch.nn.Linear(seen, 64), torch.nn.Tanh(), torch.nn.Linear(64, 64), torch.nn.Tanh()]
+    network, rows = torch.nn.Sequential(*hidden, torch.nn.Linear(64, 2)), torch.zeros(WORLDS * 32, seen)
+
+    def step() -> None:
+        with torch.no_grad():
+            network(rows)
+        case.step()
+
+    return case._replace(step=step, does=f"a forward pass of torch, {seen}-64-64-2, over all rows; then {case.does}")
+
+
 def pursuit_batch(threads: int) -> Case:
     """The Pursuit task in 1024 worlds: three chase one, all four learn, through World.step."""
     import numpy as np
@@ -208,6 +227,7 @@ CASES = {
     "flock_3": lambda threads: flock_batch(3),
     "flock_32": lambda threads: flock_batch(32),
     "flock_vector": flock_vector,
+    "flock_after_a_pass": flock_after_a_pass,
     "pursuit": pursuit_batch,
     "parallel_flock": flock_parallel,
     "parallel_tag": lambda threads: pursuit_parallel(3, 1),
