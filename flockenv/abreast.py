@@ -12,13 +12,13 @@ from typing import Any
 import numpy as np
 from llvmlite import ir  # type: ignore[import-untyped]
 from numba.core import cgutils, types
-from numba.core.errors import TypingError
 from numba.extending import intrinsic
 from numba.np import arrayobj
 
-from flockenv.kernels import LINE, asked, kernel
+from flockenv.kernels import LINE, kernel
+from flockenv.lines import array_of, in_one_piece
 
-__all__ = ["PAIR", "SIDE", "apart", "columns", "fetch", "into_rows", "packed", "take"]
+__all__ = ["PAIR", "SIDE", "apart", "columns", "into_rows", "packed", "take"]
 
 SIDE = LINE // 4
 """Single precision numbers in a vector register: squares of as many rows and columns are turned at once."""
@@ -36,22 +36,10 @@ def apart(count: int) -> int:
     return max(64, 1 << (count - 1).bit_length()) + SIDE
 
 
-def _in_one_piece(array: Any) -> None:
-    """Refuse to compile for an array whose numbers need not lie side by side."""
-    if array.layout != "C":
-        raise TypingError(f"{array} must lie in one piece")
-
-
-def _array(context: Any, builder: Any, kind: Any, value: Any = None) -> Any:
-    """Return numba's structure of an array, of this value if there is one."""
-    make: Any = arrayobj.make_array
-    return make(kind)(context, builder, value) if value is not None else make(kind)(context, builder)
-
-
 def _shown(context: Any, builder: Any, kind: Any, old: Any, shape: Any, strides: Any) -> Any:
     """Return the memory of an array under another shape."""
     fill: Any = arrayobj.populate_array
-    new = _array(context, builder, kind)
+    new = array_of(context, builder, kind)
     fill(new, data=old.data, shape=shape, strides=strides, itemsize=old.itemsize, meminfo=None)
     return new._getvalue()
 
@@ -66,10 +54,10 @@ def _packed(typing_context: Any, array: Any) -> Any:
 
     A view of one world (D, B, N) -> (D, N) takes its strides from it, and its agents are known to lie side by side.
     """
-    _in_one_piece(array)
+    in_one_piece(array)
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        old = _array(context, builder, array, arguments[0])
+        old = array_of(context, builder, array, arguments[0])
         unpack: Any = cgutils.unpack_tuple
         shape = unpack(builder, old.shape, array.ndim)
         strides = [_bytes(context, array)]
@@ -88,7 +76,7 @@ def _columns(typing_context: Any, flat: Any, count: Any, many: Any, distance: An
     view = types.Array(flat.dtype, 2, "A")
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        old = _array(context, builder, flat, arguments[0])
+        old = array_of(context, builder, flat, arguments[0])
         n, m, step = (
             context.cast(builder, a, kind, types.intp)
             for a, kind in zip(arguments[1:], signature.args[1:], strict=True)
@@ -100,36 +88,6 @@ def _columns(typing_context: Any, flat: Any, count: Any, many: Any, distance: An
 
 
 columns: Any = intrinsic(_columns)
-
-
-def _fetch(typing_context: Any, array: Any, part: Any, parts: Any) -> Any:
-    """Ask for the memory of one of so many parts of an array in one piece, which is needed soon.
-
-    Rows are written at a stretch, and a store waits for a line of memory that is not at hand. Asked for all at once,
-    they would be waited for just so: what asks has room for a dozen lines.
-    """
-
-    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        old = _array(context, builder, array, arguments[0])
-        word = old.nitems.type
-        n, m = (
-            context.cast(builder, a, kind, types.intp)
-            for a, kind in zip(arguments[1:], signature.args[1:], strict=True)
-        )
-        line = ir.Constant(word, LINE)
-        lines = builder.udiv(builder.mul(old.nitems, old.itemsize), line)
-        length = builder.mul(builder.add(builder.udiv(lines, m), ir.Constant(word, 1)), line)
-        first = builder.mul(length, n)
-        data = builder.bitcast(old.data, ir.IntType(8).as_pointer())
-        each: Any = cgutils.for_range_slice
-        with each(builder, first, builder.add(first, length), line) as (at, _):
-            asked(builder, builder.gep(data, [at]))
-        return context.get_dummy_value()
-
-    return types.void(array, part, parts), generate
-
-
-fetch: Any = intrinsic(_fetch)
 
 
 def _looks_up(typing_context: Any) -> Any:
@@ -158,7 +116,7 @@ def _picks(
     lies in one piece, and places are counted through. Where `_permutes` says no, nothing is written.
     """
     for array in (to, table, who):
-        _in_one_piece(array)
+        in_one_piece(array)
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         if not _permutes(context):
@@ -172,7 +130,7 @@ def _picks(
         permuted = declare(builder.module, ir.FunctionType(vector, [vector, index, vector]), name)
 
         def pointer(k: int, here: Any, kind: Any = vector) -> Any:
-            data = _array(context, builder, signature.args[k], arguments[k]).data
+            data = array_of(context, builder, signature.args[k], arguments[k]).data
             return builder.bitcast(builder.gep(data, [here]), kind.as_pointer())
 
         named = builder.load(pointer(5, arguments[6], ir.VectorType(ir.IntType(32), lanes)), align=4)
@@ -228,12 +186,12 @@ def _turned_square(
 
     The first `many` rows of them are written.
     """
-    _in_one_piece(to)
-    _in_one_piece(source)
+    in_one_piece(to)
+    in_one_piece(source)
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         vector = ir.VectorType(context.get_data_type(to.dtype), SIDE)
-        targets, sources = (_array(context, builder, kind, arguments[k]).data for k, kind in ((0, to), (4, source)))
+        targets, sources = (array_of(context, builder, kind, arguments[k]).data for k, kind in ((0, to), (4, source)))
 
         def line(base: Any, k: int, first: Any, step: Any) -> Any:
             here = builder.add(first, builder.mul(step, ir.Constant(step.type, k)))

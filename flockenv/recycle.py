@@ -6,6 +6,7 @@ has to find, fill with zeros and map; an array that was let go of is at hand, an
 
 from __future__ import annotations
 
+import math
 import sys
 from typing import Any
 
@@ -15,14 +16,16 @@ from numpy.typing import NDArray
 __all__ = ["Recycler"]
 
 Key = tuple[tuple[int, ...], np.dtype[Any]]
+Memory = tuple[NDArray[np.uint8], int]
+"""Bytes, and where in them an array begins."""
 
 
-def _holders(kept: list[NDArray[Any]], k: int) -> int:
-    """Return how many hold an array, the list included; views and tensors hold the array whose memory they show."""
-    return sys.getrefcount(kept[k])
+def _holders(kept: list[Memory], k: int) -> int:
+    """Return how many hold a memory, the list included; views and tensors hold the array whose memory they show."""
+    return sys.getrefcount(kept[k][0])
 
 
-_NOBODY = _holders([np.empty(0)], 0)
+_NOBODY = _holders([(np.empty(0, np.uint8), 0)], 0)
 """What is counted when only the list holds it; asked and not written down, for Pythons count differently."""
 
 
@@ -32,18 +35,22 @@ class Recycler:
     Not for several threads at once; whoever has an array may let go of it in any thread.
     """
 
-    def __init__(self, keep: int = 4) -> None:
-        """keep: how many arrays of a shape and type to remember; one more that is asked for is simply new."""
-        self.keep = keep
-        self._kept: dict[Key, list[NDArray[Any]]] = {}
+    def __init__(self, keep: int = 4, line: int = 1) -> None:
+        """Remember up to `keep` arrays of a shape and type; one more that is asked for is simply new.
+
+        line: of so many bytes is an address a multiple at which an array begins.
+        """
+        self.keep, self.line = keep, line
+        self._kept: dict[Key, list[Memory]] = {}
 
     def empty(self, shape: tuple[int, ...], dtype: np.dtype[Any]) -> NDArray[Any]:
-        """Return an array whose content is anything; a view of ours, so that its flags and shape are the caller's."""
+        """Return an array whose content is anything, and whose memory is not its own."""
         kept = self._kept.setdefault((shape, dtype), [])
         for k in range(len(kept)):
             if _holders(kept, k) == _NOBODY:
-                return kept[k].view()
-        array = np.empty(shape, dtype)
+                return np.ndarray(shape, dtype, *kept[k])
+        room = np.empty(math.prod(shape) * dtype.itemsize + self.line, np.uint8)
+        memory = room, -room.__array_interface__["data"][0] % self.line
         if len(kept) < self.keep:
-            kept.append(array)
-        return array.view()
+            kept.append(memory)
+        return np.ndarray(shape, dtype, *memory)

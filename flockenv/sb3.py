@@ -129,7 +129,7 @@ class WorldVecEnv(VecEnv):
         actions, self._actions = self._actions, None
         if actions is None:
             raise ResetNeeded("step_wait: there are no actions; call step_async(actions) first")
-        result = self.world.step(actions)
+        result = self.world.step(actions, terms="ends")
         ended = result.truncated | result.terminated.all(axis=1)
         infos: list[Info] = [NOTHING] * self.num_envs
         if ended.any():

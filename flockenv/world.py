@@ -8,7 +8,7 @@ import itertools
 import math
 import secrets
 from collections.abc import Sequence
-from typing import Any, Final, NamedTuple, NoReturn
+from typing import Any, Final, Literal, NamedTuple, NoReturn
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -16,9 +16,10 @@ from numpy.typing import ArrayLike, NDArray
 from flockenv import state as states
 from flockenv.abreast import PAIR, apart
 from flockenv.crew import share, threads
-from flockenv.kernels import load, settled
+from flockenv.kernels import LINE, load, settled
 from flockenv.noise import MASK, keys_of
 from flockenv.recycle import Recycler
+from flockenv.refusals import nearest
 from flockenv.scene import MEMORY_LIMIT, WORTH_SHARING
 from flockenv.snapshot import Snapshot
 from flockenv.state import State
@@ -37,6 +38,13 @@ PORTIONS = 6
 RECYCLE = 2**18
 """Bytes of observations from which on the memory of results is used again; below, new memory costs less."""
 
+PAST = 2**22
+"""Bytes of observations from which on they are written past the caches, which have no room for them in any case."""
+
+AT_HAND = 2**17
+"""Bytes of observations of a world up to which that is so: they are made in scratch that stays in a core's cache."""
+
+TERMS = ("steps", "ends")
 _NEVER = 2**63 - 1
 
 
@@ -98,14 +106,13 @@ class World:
         self._kernel = load(f"task_{task.name}", task_source(task))
         self._enter = self._kernel.play
         b, i, real = self.worlds, self.learners, scene.dtype
-        self._actions = np.zeros((b, i, self.action_size))
+        self._actions = np.zeros((b, i, self.action_size), real)
         numbers = (task.parts.given(), list(task.parameters().values()), task.table() or (0.0,))
         self._worlds = (
             s.x, s.v, *s.carried, s.alive, s.tick, s.obstacle_x, s.obstacle_radius, s.work, s.key, self._memory,
             self.steps, *(np.array(values, real) for values in numbers),
         )  # fmt: skip
         self._clock = (np.dtype(real).type(scene.dt), task.substeps, not task.ends_together)
-        self._scratch = [self._allocate()]
         self._kept = (self._last, self._sums, self._paid)
         self._measured = [dict(zip(task.measures, a.T, strict=True)) for a in (self._sums, self._last)]
         fields = (
@@ -116,11 +123,13 @@ class World:
         self._dtypes = tuple(np.dtype(kind) for _, kind in fields)
         self._everywhere = np.ones(b, np.bool_)
         self._untold = tuple(np.empty(shape, kind) for shape, kind in fields[1:])  # what a reset says nothing of
-        large = 4 * math.prod(self._shapes[0]) >= RECYCLE
-        self._empty = Recycler().empty if large else np.empty
+        row, size = 4 * math.prod(self._shapes[0][1:]), 4 * math.prod(self._shapes[0])
+        self._past = size >= PAST and row <= AT_HAND
+        self._empty = Recycler(line=LINE).empty if size >= RECYCLE else np.empty
+        self._scratch = [self._allocate()]
 
-    def _allocate(self) -> tuple[tuple[NDArray[Any], ...], tuple[NDArray[Any], ...]]:
-        """Return the scratch of one thread: of a decision, and of looking around and stepping."""
+    def _allocate(self) -> tuple[NDArray[np.float32], tuple[NDArray[Any], ...], tuple[NDArray[Any], ...]]:
+        """Return the scratch of one thread: of rows that go past the caches, of a decision, of stepping and looking."""
         task, scene, n = self.task, self.task.scene, self.agents
         d, real, look = scene.dimension, scene.dtype, task.look or Look(0.0)
         lanes = PAIR if task.abreast else task.parts.width
@@ -139,13 +148,14 @@ class World:
             for shape, kind in (((many, padded), real), ((many, padded), np.int32), ((padded,), np.int32))
         ]
         space = Workspace.allocate(task.parts, scene.body, pack(task.parts, n, scene.groups))
-        return decision, (*near, *space.of(0, self._kernel.SCRATCH))
+        canvas = np.zeros((1, *self._shapes[0][1:]) if self._past else (0, 0, 0), np.float32)
+        return canvas, decision, (*near, *space.of(0, self._kernel.SCRATCH))
 
     def __getstate__(self) -> dict[str, Any]:
         """Pickle what cannot be made anew."""
         made = (
             "_kernel", "_enter", "_actions", "_worlds", "_clock", "_scratch", "_kept", "_measured", "_shapes",
-            "_dtypes", "_everywhere", "_untold", "_empty",
+            "_dtypes", "_everywhere", "_untold", "_empty", "_past",
         )  # fmt: skip
         return {name: value for name, value in vars(self).items() if name not in made}
 
@@ -183,7 +193,7 @@ class World:
         self._seed(seeds, rows)
         observation: Rows = self._empty(self._shapes[0], self._dtypes[0]) if into is None else into
         begun = self.worlds if into is None else int(np.count_nonzero(rows))
-        self._play((False, rows, into is None), begun, 0, (observation, *self._untold))
+        self._play(False, rows, into is None, begun, 0, (observation, *self._untold), self._actions)
         self._enter = settled(self._kernel.play)  # types stay what they were in this call
         for numbers in (self._sums, self._last, self.paid):
             numbers[rows] = 0
@@ -228,42 +238,48 @@ class World:
         """(B, L, K): terms, summed over the episode; a view of what is counted."""
         return self._paid.transpose(1, 2, 0)
 
-    def step(self, actions: ArrayLike) -> Step:
-        """Let everybody act for control_dt; actions (B, L, A), clipped to [-1, 1]."""
+    def step(self, actions: ArrayLike, terms: Literal["steps", "ends"] = "steps") -> Step:
+        """Let everybody act for control_dt; actions (B, L, A), clipped to [-1, 1].
+
+        terms: told after all "steps", or (faster with many worlds) only of worlds in which somebody ends or whose time
+        is over; for others anything stands there.
+        """
         if self._seeds is None:
             raise RuntimeError("step before the first reset: call reset() first")
-        self._take(actions)
-        rows, reward, terms, over, late, success, present = told = tuple(map(self._empty, self._shapes, self._dtypes))
+        if terms not in TERMS:
+            raise ValueError(f"terms: {terms!r} is unknown{nearest(str(terms), TERMS)}; allowed: {', '.join(TERMS)}")
+        taken = self._taken(actions)
+        rows, reward, paid, over, late, success, present = told = tuple(map(self._empty, self._shapes, self._dtypes))
         limit = _NEVER if self.time_limit is None else min(int(self.time_limit), _NEVER)
-        world, who = self._play((True, self._everywhere, True), self.worlds, limit, told)
+        world, who = self._play(True, self._everywhere, terms == "steps", self.worlds, limit, told, taken)
         if world == REFUSED:
-            self._refuse()
+            self._refuse(taken)
         if world >= 0:
             raise FloatingPointError(f"world {world}, agent {who}: not finite at t = {self.state.time[world]:g} s")
-        return Step(rows, reward, terms.transpose(1, 2, 0), over, late, success, present)
+        return Step(rows, reward, paid.transpose(1, 2, 0), over, late, success, present)
 
     def _play(
-        self, what: tuple[bool, NDArray[np.bool_], bool], busy: int, limit: int, told: tuple[NDArray[Any], ...]
-    ) -> tuple[int, int]:
-        """Let worlds decide or begin, by several threads if so many `busy` worlds are worth it.
+        self, acting: bool, mask: NDArray[np.bool_], everyone: bool, busy: int, limit: int,
+        told: tuple[NDArray[Any], ...], actions: NDArray[Any],
+    ) -> tuple[int, int]:  # fmt: skip
+        """Let worlds decide, or begin where the mask says so, by several threads if so many `busy` worlds are worth it.
 
-        what: acting; which worlds begin if not; is everybody observed? Return who is not finite, or (-1, -1).
+        everyone: are all observed where only some begin, and told their terms? Return who is not finite, or (-1, -1).
         """
-        acting = what[0]
         crew = min(threads(), busy) if busy * self.agents * self.task.substeps >= WORTH_SHARING else 1
         while len(self._scratch) < crew:
             self._scratch.append(self._allocate())
 
         def part(k: int, check: bool, first: int, end: int) -> tuple[int, int]:
-            decision, rest = self._scratch[k]
+            canvas, decision, rest = self._scratch[k]
             return self._enter(  # type: ignore[no-any-return]
-                *what, check, first, end, self._actions, *self._worlds, *self._clock, limit,
-                *decision, *rest, *self._kept, *told,
+                acting, mask, everyone, self._past, check, first, end, actions, *self._worlds, *self._clock,
+                limit, canvas if self._past else told[0], *decision, *rest, *self._kept, *told,
             )  # fmt: skip
 
         if crew == 1:
             return part(0, acting, 0, self.worlds)
-        if acting and not np.isfinite(self._actions).all():  # nobody moves before all were looked at
+        if acting and not np.isfinite(actions).all():  # nobody moves before all were looked at
             return REFUSED, 0
         portions = min(crew * PORTIONS, self.worlds)
         turn = itertools.count()  # whoever is done takes the next: threads do not begin at the same time
@@ -277,22 +293,31 @@ class World:
         bad = [found for found in share([functools.partial(several, k) for k in range(crew)]) if found[0] >= 0]
         return min(bad, default=(-1, -1))
 
-    def _take(self, actions: ArrayLike) -> None:
-        """Copy the actions to where the kernel reads them: one type, one compilation; exact for float32."""
-        given = np.asarray(actions)
-        if given.shape != self._actions.shape:
-            expected = f"(worlds, learners, numbers) = {self._actions.shape}"
-            raise ValueError(f"actions have shape {given.shape}, expected {expected}")
+    def _taken(self, actions: ArrayLike) -> NDArray[Any]:
+        """Return the actions as the kernel reads them, in the precision of the scene: one type, one compilation.
+
+        Those that are so already are not copied.
+        """
+        given, kept = np.asarray(actions), self._actions
+        if given.shape != kept.shape:
+            raise ValueError(f"actions have shape {given.shape}, expected (worlds, learners, numbers) = {kept.shape}")
+        if given.dtype == kept.dtype and given.flags.carray:
+            return given
         try:
-            self._actions[...] = given
+            if given.dtype != kept.dtype == np.float32:
+                given = given.astype(float)  # what single precision has no number for is beyond 1, and not infinite
+                given = np.where(np.isfinite(given), np.clip(given, -1, 1), given)
+            kept[...] = given
         except (TypeError, ValueError):
             raise TypeError(f"actions are of type {given.dtype}, expected numbers in [-1, 1]") from None
+        return kept
 
-    def _refuse(self) -> NoReturn:
-        """Say which of the actions taken is no number."""
-        b, i, k = np.argwhere(~np.isfinite(self._actions))[0]
-        name, value = self.task.agent_names[i], self._actions[b, i, k]
-        raise ValueError(f"action {k} of {name} in world {b} is {value}, must be a number in [-1, 1]")
+    def _refuse(self, actions: NDArray[Any]) -> NoReturn:
+        """Say which of the actions is no number."""
+        b, i, k = np.argwhere(~np.isfinite(actions))[0]
+        raise ValueError(
+            f"action {k} of {self.task.agent_names[i]} in world {b} is {actions[b, i, k]}, must be a number in [-1, 1]"
+        )
 
     # --- looking at it ----------------------------------------------------------------------------------------------
 

@@ -28,7 +28,7 @@ LAYERS = (
         "frontend",
         "turns",
     },
-    {"records", "vec", "elementary", "noise", "kernels", "targets", "abreast", "transpose"},
+    {"records", "vec", "elementary", "noise", "kernels", "targets", "abreast", "lines", "transpose"},
     {"state", "space", "steering", "arbitration", "vehicle", "appearance", "spread", "urges"},
     {"neighbours", "shapes", "grid", "eikonal", "orca", "polyline", "rows", "networks", "elements", "tree"},
     {"effects", "integrators", "constraints", "population", "spawn", "sweep", "stability", "rounding", "ways"},

@@ -29,6 +29,18 @@ def test_what_was_let_go_of_is_used_again():
         assert {address(first), address(second)} == places
 
 
+@pytest.mark.parametrize("line", [1, 16, 64, 4096])
+def test_arrays_begin_with_a_line(line):
+    make = Recycler(keep=2, line=line).empty
+    for shape in ((0,), (1,), (3, 5), (1000,)):
+        held = [make(shape, F4) for _ in range(4)]
+        again = {address(array) for array in held[:2]}
+        assert all(address(array) % line == 0 for array in held)
+        assert all(array.flags.carray and array.shape == shape for array in held)
+        del held
+        assert {address(array) for array in [make(shape, F4), make(shape, F4)]} <= again
+
+
 HOLDERS = {
     "array": lambda array: array,
     "view": lambda array: array.reshape(-1)[3:5],

@@ -255,7 +255,7 @@ def frame(world: World) -> list[Any]:
     s, scene = world.state, world.task.scene
     arrays = [s.x[:, 0], s.v[:, 0], s.alive[0], s.obstacle_x[:, 0], s.obstacle_radius[0], world._memory[:, 0]]
     body = [scene.body.radius, scene.body.max_speed, scene.body.max_force]
-    decision, rest = world._scratch[0]  # of the last world looked at
+    _, decision, rest = world._scratch[0]  # of the last world looked at
     near, d = [*rest[: len(NEAR.split(", "))], *[np.zeros(0)] * 3], scene.dimension
     if world.task.abreast:
         own, nearby = decision[-3:-1]
@@ -751,7 +751,7 @@ def test_what_lies_beyond_the_last_agent_is_nobodys_business(agents: int, dtype:
     told = []
     for beyond in (0.0, np.nan):
         world = world_of(Flock(agents=agents, dtype=dtype), worlds=3)
-        own, nearby = world._scratch[0][0][-3:-1]
+        own, nearby = world._scratch[0][1][-3:-1]
         said = []
         for actions in random_actions(world, 5):
             own[:, agents:], nearby[..., agents:] = beyond, beyond

@@ -14,7 +14,7 @@ import pytest
 from flockenv.kernels import settled
 from flockenv.noise import key_of, keys_of
 from flockenv.tasks import Flock, Obstacles, Pursuit
-from flockenv.world import Step, World
+from flockenv.world import AT_HAND, PAST, Step, World
 from tests.catalogue import TASKS, TaskRow
 
 EVERY = pytest.mark.parametrize("row", TASKS, ids=lambda row: row.name)
@@ -113,6 +113,61 @@ def test_nothing_handed_out_is_shared(row: TaskRow, recycled: bool) -> None:
     np.testing.assert_array_equal(given, actions)
     assert_same(everything(world), everything(other))
     assert not np.array_equal(reference.observation, step.observation)
+
+
+@EVERY
+@pytest.mark.usefixtures("recycled")
+def test_what_goes_past_the_caches_is_the_same(row: TaskRow, monkeypatch: pytest.MonkeyPatch) -> None:
+    direct = World(row.task, 5, time_limit=7)
+    monkeypatch.setattr("flockenv.world.PAST", 0)
+    past = World(row.task, 5, time_limit=7)
+    assert (direct._past, past._past) == (False, True)
+    np.testing.assert_array_equal(past.reset(5), direct.reset(5))
+    for k, actions in enumerate(actions_for(direct, 20)):
+        one, other = past.step(actions), direct.step(actions)
+        assert_same(fields(one), fields(other))
+        if one.ended.any():
+            into = [step.observation for step in (one, other)] if k % 2 else [None, None]
+            begun = [world.reset(mask=one.ended, into=at) for world, at in zip((past, direct), into, strict=True)]
+            np.testing.assert_array_equal(*begun)
+    assert_same(everything(past), everything(direct))
+
+
+def test_only_what_is_large_goes_past_the_caches() -> None:
+    """Nor does what is larger than a core's cache: it would go to memory twice."""
+    size = 4 * Obstacles().layout.size
+    few, many = World(Obstacles(), (PAST - 1) // size), World(Obstacles(), -(-PAST // size))
+    assert (few._past, many._past) == (False, True)
+    agents = AT_HAND // (4 * Flock().layout.size) + 1
+    assert not World(Flock(agents=agents, size=400), -(-PAST // (4 * Flock().layout.size * agents)))._past
+
+
+@EVERY
+@pytest.mark.usefixtures("recycled")
+def test_terms_may_be_told_of_ends_alone(row: TaskRow) -> None:
+    every, ends = World(row.task, 4, time_limit=9), World(row.task, 4, time_limit=9)
+    every.reset(5)
+    ends.reset(5)
+    told = 0
+    for actions in actions_for(every, 30):
+        one, other = every.step(actions), ends.step(actions, terms="ends")
+        tells = one.truncated | one.terminated.any(axis=1)
+        told += int(tells.sum())
+        np.testing.assert_array_equal(other.terms[tells], one.terms[tells])
+        assert_same(fields(one), fields(other), but=("terms",))
+        if one.ended.any():
+            np.testing.assert_array_equal(every.reset(mask=one.ended), ends.reset(mask=one.ended))
+    assert told >= 8
+    assert_same(everything(every), everything(ends))
+
+
+def test_terms_are_told_of_steps_or_ends() -> None:
+    world = World(Pursuit())
+    world.reset(0)
+    kept = everything(world)
+    with pytest.raises(ValueError, match=r"terms: 'end' is unknown, did you mean `ends`.*allowed: steps, ends"):
+        world.step(np.zeros((1, 1, 2)), terms="end")  # type: ignore[arg-type]
+    assert_same(everything(world), kept)
 
 
 @EVERY
@@ -433,6 +488,32 @@ def test_actions_beyond_the_bounds_are_the_bounds(row: TaskRow) -> None:
         ends.append(everything(world) | fields(step))
     for end in ends[1:]:
         assert_same(end, ends[0])
+
+
+def test_single_precision_takes_actions_as_they_are_or_rounded() -> None:
+    """Of doubles beyond its range, too, which are beyond the bounds, not infinite; what is infinite is refused."""
+    task = Pursuit(dtype="float32")
+    actions = np.random.default_rng(0).uniform(-1.5, 1.5, (20, 1, 1, 2))
+    actions[3], actions[7, 0, 0, 1] = 1e300, -1e300
+    rounded = np.clip(actions, -1, 1).astype(np.float32)
+    frozen = rounded.copy()
+    frozen.setflags(write=False)
+    ends = []
+    for given in (actions, rounded, frozen, rounded[..., ::-1].copy()[..., ::-1], rounded.tolist()):
+        world = World(task)
+        world.reset(0)
+        for each in given:
+            step = world.step(each)
+        ends.append(everything(world) | fields(step))
+    for end in ends[1:]:
+        assert_same(end, ends[0])
+    assert (rounded == frozen).all()
+    kept = everything(world)
+    for bad in (np.inf, -np.inf, np.nan):
+        for kind in (float, np.float32):
+            with pytest.raises(ValueError, match=f"action 1 of .* in world 0 is {bad}, must be a number"):
+                world.step(np.array([[[1e30, bad]]], kind))
+    assert_same(everything(world), kept)
 
 
 @pytest.mark.usefixtures("looking")

@@ -100,7 +100,7 @@ class WorldsEnv(VectorEnv[Rows, Rows, Rows]):
     ) -> None:
         if infos not in INFOS:
             raise ValueError(f"infos: {infos!r} is unknown{nearest(str(infos), INFOS)}; allowed: {', '.join(INFOS)}")
-        self.infos = infos
+        self.infos: Literal["steps", "ends"] = infos
         self.task = together(build(self.task_type, {**self.fixed, **parameters}, limit="max_episode_steps"))
         self.autoreset_mode = _autoreset(autoreset_mode)
         self._screen = Screen(render_mode, render_fps(self.task), modes=("rgb_array",))
@@ -205,7 +205,7 @@ class WorldsEnv(VectorEnv[Rows, Rows, Rows]):
         """
         begun(self._running, "step")
         resting = self._resting()
-        result = self.world.step(self._blocks(actions, resting))
+        result = self.world.step(self._blocks(actions, resting), terms=self.infos)
         terminated, truncated = result.terminated, result.truncated
         if resting.any():
             terminated[resting], truncated[resting], result.reward[resting] = False, False, 0.0

@@ -248,8 +248,9 @@ def task_source(task: Task) -> str:
     then = _frame(x="x0", v="v0", alive="alive0", near=empty)
     look = f"look(x, alive, obstacle_x, obstacle_radius, b, params, {NEAR}, {SHARED})" if task.look else "pass"
     size, far = task.action_layout.size, apart(task.learners) if task.abreast else "actions.shape[1]"
-    fetches = [f"fetch(rows[b], {k}, 4)" if task.abreast else "pass" for k in range(4)]
-    sums = [f"for k in range({len(task.terms)}):", "    fetch(paid[k, b], 0, 1)", "    fetch(terms[k, b], 0, 1)"]
+    fetches = [f"if not past: fetch(rows[b], {k}, 4)" if task.abreast else "pass" for k in range(4)]
+    told = f"for k in range({len(task.terms)} if everyone else 0):"
+    sums = [f"for k in range({len(task.terms)}):", "    fetch(paid[k, b], 0, 1)", told, "    fetch(terms[k, b], 0, 1)"]
     fetch_sums = "\n".join(indented_lines([*sums, "fetch(payment[b], 0, 1)"], 12)) if task.abreast else ""
     widen, show = _lanes(task) if task.abreast else ("rounded, wide = over.shape[1], now", "pass")
     optional = [*["keep"] * task.keeps, *["abreast"] * (task.abreast > 0)]
@@ -260,7 +261,8 @@ def task_source(task: Task) -> str:
     )
     play = f'''
 
-from flockenv.abreast import columns, fetch, into_rows, packed, take
+from flockenv.abreast import columns, into_rows, packed, take
+from flockenv.lines import fetch, pour, settle
 from flockenv.tasks.base import Frame
 from flockenv.vehicle import face
 from {type(task).__module__} import {", ".join([*_KERNELS, *optional])}
@@ -270,15 +272,17 @@ P = namedtuple("P", {" ".join(names)!r})
 
 @njit(cache=True, **FAST)
 def play(
-    acting, mask, everyone, check, from_world, to_world, actions, {worlds}, dt, count, mortal, limit,
-    force, x0, v0, alive0, decided, {"own, nearby, beside, " if task.abreast else ""}{NEAR}, {SHARED},
+    acting, mask, everyone, past, check, from_world, to_world, actions, {worlds}, dt, count, mortal, limit,
+    canvas, force, x0, v0, alive0, decided, {"own, nearby, beside, " if task.abreast else ""}{NEAR}, {SHARED},
     measured, sums, paid, rows, payment, terms, over, late, success, present,
 ):
     """Let worlds [from_world, to_world) take a decision, or begin an episode where `mask` says so; and observe them.
 
     One entry point for both: what looks around is the larger part of it, and is compiled once. Acting, it returns the
     (world, agent) that is not finite first, or -1s; the world is {REFUSED}, and nothing moves, if `check` is asked for
-    and an action is no number. Beginning, it observes the worlds that begin, or everyone.
+    and an action is no number. Beginning, it observes the worlds that begin, or everyone; acting, it observes everyone,
+    and writes the terms of worlds in which somebody ends, or everyone's. Rows that are to go `past` the caches are made
+    in canvas[0]; if none is, the canvas is where the rows are to be.
     """
     unaliased()
     x, v, memory, obstacle_x = packed(x), packed(v), packed(memory), packed(obstacle_x)
@@ -354,13 +358,23 @@ def play(
                 if mortal and over[b, i]:
                     alive[b, i] = False
                 present[b, i] = alive[b, i]
-            for k in range(terms.shape[0]):
+            told = everyone or late[b]
+            for i in range(over.shape[1]):
+                told |= over[b, i]
+            for k in range(terms.shape[0] if told else 0):
                 for i in range(np.uint64(over.shape[1])):
                     terms[k, b, i] = earns[i, k]
+            for k in range(terms.shape[0]):
+                for i in range(np.uint64(over.shape[1])):
                     paid[k, b, i] += earns[i, k]
                     payment[b, i] = earns[i, k] + (payment[b, i] if k > 0 else 0.0)
+        seen = canvas[0 if past else b]
         {show}
-        observe(p, now, rows[b])
+        observe(p, now, seen)
+        if past:
+            pour(rows, np.uint64(b) * np.uint64(seen.size), seen)
+    if past:
+        settle()
     return broken, who
 '''
     return scene_source(task.parts, look_source(task.parts) + play)
@@ -385,5 +399,5 @@ def _lanes(task: Task) -> tuple[str, str]:
         take(nearby, own, near_who, n)
         wide = {wide}"""
     show = f"""abreast(p, wide, columns(beside, rounded, {task.abreast}, {far}))
-        into_rows(rows[b], beside, {task.abreast}, {far})"""
+        into_rows(seen, beside, {task.abreast}, {far})"""
     return widen, show
