@@ -18,7 +18,10 @@ from numba.np import arrayobj
 from flockenv.kernels import LINE, kernel
 from flockenv.lines import array_of, in_one_piece
 
-__all__ = ["PAIR", "SIDE", "apart", "columns", "into_rows", "packed", "take"]
+__all__ = [
+    "PAIR", "SIDE", "apart", "columns", "into_rows", "key_of", "key_read", "key_written", "looked_up", "packed", "pick",
+    "same_key", "tag_of", "take",
+]  # fmt: skip
 
 SIDE = LINE // 4
 """Single precision numbers in a vector register: squares of as many rows and columns are turned at once."""
@@ -91,7 +94,7 @@ columns: Any = intrinsic(_columns)
 
 
 def _looks_up(typing_context: Any) -> Any:
-    """Say whether numbers are looked up in registers, `_pick`; a constant of machine code."""
+    """Say whether numbers are looked up in registers, `pick`; a constant of machine code."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         return context.get_constant(types.boolean, _permutes(context))
@@ -99,7 +102,7 @@ def _looks_up(typing_context: Any) -> Any:
     return types.boolean(), generate
 
 
-_looked_up: Any = intrinsic(_looks_up)
+looked_up: Any = intrinsic(_looks_up)
 
 
 def _permutes(context: Any) -> bool:
@@ -155,7 +158,66 @@ def _picks(
     return types.void(to, types.uint64, table, types.uint64, types.uint64, who, types.uint64), generate
 
 
-_pick: Any = intrinsic(_picks)
+pick: Any = intrinsic(_picks)
+
+
+# A key: a square, in single precision, whose last bits are a place. Of numbers that are not negative the bits are in
+# order as integers, of which a register is compared in half the time; and what is known of one moves with it.
+
+
+def _key_of(typing_context: Any, square: Any, place: Any, tags: Any) -> Any:
+    """Return the key (int32) of a float32 square, not negative, and a place; `tags` has all bits that a place may."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        word = ir.IntType(32)
+        bits = builder.bitcast(arguments[0], word)
+        return builder.or_(builder.and_(bits, builder.not_(arguments[2])), builder.trunc(arguments[1], word))
+
+    return types.int32(types.float32, types.uint64, types.int32), generate
+
+
+def _key_read(typing_context: Any, number: Any) -> Any:
+    """Return the key that lies where a float32 may."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        return builder.bitcast(arguments[0], ir.IntType(32))
+
+    return types.int32(types.float32), generate
+
+
+def _key_written(typing_context: Any, key: Any) -> Any:
+    """Return a key as what lies where a float32 may."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        return builder.bitcast(arguments[0], ir.FloatType())
+
+    return types.float32(types.int32), generate
+
+
+def _tag_of(typing_context: Any, key: Any, tags: Any) -> Any:
+    """Return the place (int32) in a key."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        return builder.and_(*arguments)
+
+    return types.int32(types.int32, types.int32), generate
+
+
+def _same_key(typing_context: Any, one: Any, other: Any, tags: Any) -> Any:
+    """Say whether two keys differ in their places alone: then which square is smaller is not known."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        one, other, tags = arguments
+        return builder.icmp_unsigned("==", builder.or_(one, tags), builder.or_(other, tags))
+
+    return types.boolean(types.int32, types.int32, types.int32), generate
+
+
+key_of: Any = intrinsic(_key_of)
+key_read: Any = intrinsic(_key_read)
+key_written: Any = intrinsic(_key_written)
+tag_of: Any = intrinsic(_tag_of)
+same_key: Any = intrinsic(_same_key)
 
 
 @kernel
@@ -167,11 +229,11 @@ def take(to: Any, table: Any, who: Any, count: int) -> None:
     """
     many, listed, n = np.uint64(to.shape[0]), np.uint64(who.shape[0]), np.uint64(who.shape[1])
     lanes, length = np.uint64(LINE // to.itemsize), np.uint64(table.shape[1])
-    if _looked_up() and np.uint64(count) <= np.uint64(8) * lanes:
+    if looked_up() and np.uint64(count) <= np.uint64(8) * lanes:
         for i in range(np.uint64(0), n, lanes):
             for s in range(listed):
                 for r in range(many):
-                    _pick(to, (r * listed + s) * n + i, table, r * length, np.uint64(count), who, s * n + i)
+                    pick(to, (r * listed + s) * n + i, table, r * length, np.uint64(count), who, s * n + i)
     else:
         for r in range(many):
             for s in range(listed):

@@ -14,7 +14,7 @@ from flockenv.sweep.parts import Parts, record_of, sorted_at
 from flockenv.sweep.query import listed, query, walk
 from flockenv.sweep.text import Slots, given, indented, indented_lines, nearest_image, place_of, tuple_of
 
-__all__ = ["meet_range", "pairs"]
+__all__ = ["me_of", "meet_range", "offset_of", "pairs"]
 
 
 def pairs(parts: Parts) -> list[str]:
@@ -43,7 +43,7 @@ def _clear(parts: Parts) -> list[str]:
     zeros = [f"{s} = 0" for k, e in parts.pairs if not e.pair_start for s in slot.all(f"c{k}_")]
     folds = [(k, slot.all(f"c{k}_")) for k, e in parts.pairs if e.pair_start]
     if folds:
-        zeros += [_me(parts, parts.fields), *_nearest_images(parts)]
+        zeros += [me_of(parts, parts.fields), *_nearest_images(parts)]
     for k, slots in folds:
         zeros.append(f"found_ = pair_start_{k}({given(parts, k)}, me)")
         zeros += _obstacles(parts, k) if parts.effects[k].joined else []
@@ -131,7 +131,7 @@ def _meet(parts: Parts, touch: bool) -> list[str]:
 def _finish(parts: Parts) -> list[str]:
     """Write what a block's sums come to."""
     slot, d = Slots(parts), parts.dimension
-    lines = [_me(parts, parts.fields), *_nearest_images(parts)] + [f"{name} = zero(me.pos)" for name in parts.targets]
+    lines = [me_of(parts, parts.fields), *_nearest_images(parts)] + [f"{name} = zero(me.pos)" for name in parts.targets]
     for k, _ in parts.pairs:
         to = parts.pair_target(k)
         lines.append(f"{to} = add({to}, finish_law_{k}({given(parts, k)}, me, ({', '.join(slot.all(f'c{k}_'))},)))")
@@ -164,20 +164,22 @@ def _ahead(parts: Parts) -> list[str]:
     ]
 
 
-def meet_range(parts: Parts, fields: list[str], lines: list[str], touch: list[str] | None = None) -> list[str]:
+def meet_range(
+    parts: Parts, fields: list[str], lines: list[str], touch: list[str] | None = None, exact: bool = False
+) -> list[str]:
     """Write the loop over the candidates of range r; `touch` is for those whom some lane may touch.
 
-    Only around the edge of a periodic box are images sought.
+    Only around the edge of a periodic box are images sought. exact: squares are worked out in other places, too.
     """
-    square = "exact_dot(to, to)" if any(s.nearest for s in parts.sights) else "dot(to, to)"
-    wrapped, plain = "offset_to(size, me.pos, xj)", "sub(xj, me.pos)"
+    square = "exact_dot(to, to)" if exact or any(s.nearest for s in parts.sights) else "dot(to, to)"
+    wrapped, plain = offset_of(parts, "xj"), "sub(xj, me.pos)"
 
     near = [q for q, sight in enumerate(parts.sights) if touch and sight in _touching(parts)]
 
     def over_lanes(offset: str, each: list[str]) -> list[str]:
         return [
             f"for l in range(np.uint64({parts.width})):",
-            indented([_me(parts, fields), "other = own != number[l]", f"to = {offset}", f"square = {square}"], 4),
+            indented([me_of(parts, fields), "other = own != number[l]", f"to = {offset}", f"square = {square}"], 4),
             "    it = Other(aj, to, square, vj, rj, tj, mj, nj)",
             indented(each, 4),
         ]
@@ -201,6 +203,11 @@ def meet_range(parts: Parts, fields: list[str], lines: list[str], touch: list[st
     if not parts.sorts:
         return loop(wrapped)
     return ["if ranges[r, 2] > 0:", *indented_lines(loop(wrapped), 4), "else:", *indented_lines(loop(plain), 4)]
+
+
+def offset_of(parts: Parts, place: str) -> str:
+    """Write the way from me to a place, the shortest one around a periodic box."""
+    return f"offset_to(size, me.pos, {place})" if parts.space.periodic else f"sub({place}, me.pos)"
 
 
 def _touching(parts: Parts) -> set[Sight]:
@@ -237,7 +244,7 @@ def _inner(parts: Parts, row: Mapping[str, int], number: Callable[[str], str]) -
     return f"Inner({', '.join(number(f'inner{k}') for k in range(len(parts.inner)))})"
 
 
-def _me(parts: Parts, fields: list[str]) -> str:
+def me_of(parts: Parts, fields: list[str]) -> str:
     """Write the agent in lane l of a block as the laws see it; what no law reads is left out."""
     row, slot = {f: k for k, f in enumerate(fields)}, Slots(parts)
 

@@ -96,6 +96,11 @@ class Parts:
         return 2 * one if several and (sums <= 6 or (cone and sums <= 8)) else one
 
     @property
+    def keyed(self) -> bool:
+        """Are lists of the nearest kept as keys, where a processor can look numbers up in registers? See sweep/look."""
+        return self.look is not None and self.look.agents > 1 and not self.sorts and self.itemsize == 4
+
+    @property
     def itemsize(self) -> int:
         """Bytes of a number."""
         return int(np.dtype(self.dtype).itemsize)
@@ -397,7 +402,8 @@ class Parts:
             ("far", d * bool(self.far)),
         ]
         runs += [("reach", int(bool(self.bounded)))]
-        runs += [("square", look.agents), ("place", look.agents), ("gap", look.obstacles), ("which", look.obstacles)]
+        runs += [("square", look.agents + self.keyed), ("place", look.agents), ("picked", d * self.keyed)]
+        runs += [("gap", look.obstacles), ("which", look.obstacles)]
         if self.sweeps and self.sorts:
             runs += [("inside", d * self.space.periodic), ("home", 1), ("mine", self.rows)]
         names = [f"{name}{j}" for name, many in runs for j in range(many)]

@@ -93,6 +93,10 @@ def _imports(parts: Parts) -> str:
         *(["from flockenv.transpose import out_of_records, put_lines, put_records"] * (parts.sweeps and parts.sorts)),
         "from flockenv.vec import add, dot, exact_dot, limit, norm, scale, select, sub, unit, zero",
         *(["from flockenv.vehicle import faced, held, leant, raised, turned"] if parts.oriented else []),
+        *(
+            ["from flockenv.abreast import key_of, key_read, key_written, looked_up, pick, same_key, tag_of"]
+            * parts.keyed
+        ),
         *tree_imports(parts),
         *obstacle_imports(parts),
         method_imports(parts),

@@ -1,0 +1,124 @@
+"""Look: who is nearest, and how near, is what a sort of all squares says, whichever way the lists are kept."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from numba import njit
+
+from flockenv.abreast import key_of, key_read, key_written, same_key, tag_of
+from flockenv.kernels import kernel
+from flockenv.tasks import Flock
+from flockenv.world import World
+
+SIGHT, MIDDLE = 6.0, 20.0
+
+
+def flock(agents: int, neighbours: int, kind: str) -> World:
+    return World(Flock(agents=agents, neighbours=neighbours, obstacle_count=0, dtype=kind))
+
+
+def found(world: World, places: Any) -> tuple[Any, Any, Any]:
+    """Return the lists of a world whose agents are there (N, 2): squares and whom (K, N), how many (N,)."""
+    n = world.agents
+    world.state.x[:, 0] = np.asarray(places).T
+    world.reset(mask=np.zeros(1, bool))  # nobody begins anew: everybody is looked at
+    square, who, count = world._scratch[0][2][:3]
+    return square[:, :n].copy(), who[:, :n].copy(), count[:n].copy()
+
+
+def expected(places: Any, neighbours: int, kind: str) -> tuple[Any, Any, Any]:
+    """All squares (N, N), each operation rounded, and sorted (K, N), how many; nobody is near the edge of the box."""
+    at = np.asarray(places).astype(kind)
+    to = at[None, :, :] - at[:, None, :]
+    square = to[..., 0] * to[..., 0] + to[..., 1] * to[..., 1]
+    np.fill_diagonal(square, np.inf)
+    square[square >= np.dtype(kind).type(SIGHT * SIGHT)] = np.inf
+    nearest = np.sort(square, axis=1)[:, :neighbours].T
+    return square, nearest, (nearest < np.inf).sum(axis=0)
+
+
+def crowd(n: int, rng: np.random.Generator) -> Any:
+    return MIDDLE + rng.normal(size=(n, 2)) * 3
+
+
+def lattice(n: int, rng: np.random.Generator) -> Any:
+    side = int(np.ceil(np.sqrt(n)))
+    order = rng.permutation(n)
+    return MIDDLE - 4 + np.stack(np.divmod(order, side), axis=1)
+
+
+def ring(n: int, rng: np.random.Generator) -> Any:
+    """Everybody is as far from the middle as all others, but for the last bits."""
+    angle = rng.uniform(0, 2 * np.pi, n)
+    places = MIDDLE + 2 * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    places[n // 2] = MIDDLE
+    return places
+
+
+def heap(n: int, rng: np.random.Generator) -> Any:
+    """Everybody stands in one of two places."""
+    return MIDDLE + rng.integers(0, 2, (n, 1)) * np.ones(2)
+
+
+def steppes(n: int, rng: np.random.Generator) -> Any:
+    """Nobody sees anybody, but for a pair."""
+    places = 7.0 * np.stack(np.divmod(np.arange(n), 5), axis=1)[:, ::-1] % 35 + 2
+    return places if n > 25 else np.concatenate([places[:-1], places[:1] + 1])
+
+
+CROWDS = (crowd, lattice, ring, heap, steppes)
+
+
+@pytest.mark.parametrize("kind", ["float32", "float64"])
+@pytest.mark.parametrize("make", CROWDS)
+@pytest.mark.parametrize(("agents", "neighbours"), [(3, 2), (7, 6), (16, 6), (17, 6), (25, 6), (33, 6), (64, 6)])
+def test_the_nearest_are_those_that_a_sort_finds(agents: int, neighbours: int, make: Any, kind: str) -> None:
+    world = flock(agents, neighbours, kind)
+    world.reset(0)
+    rng = np.random.default_rng(agents)
+    for _ in range(20):
+        places = make(agents, rng).astype(kind)
+        squares, who, count = found(world, places)
+        every, wanted, many = expected(places, neighbours, kind)
+        np.testing.assert_array_equal(count, many)
+        if kind == "float32":
+            np.testing.assert_array_equal(squares, wanted)
+        else:  # operations may be fused
+            np.testing.assert_allclose(squares, wanted, rtol=1e-14)
+        assert (who >= 0).all() and (who < agents).all()
+        for i in range(agents):  # of those who are equally far, any is nearest, but each once
+            listed = who[: count[i], i]
+            np.testing.assert_allclose(every[i, listed], wanted[: count[i], i], rtol=0 if kind == "float32" else 1e-14)
+            assert len(set(listed.tolist())) == count[i]
+
+
+def test_who_is_listed_by_keys() -> None:
+    """In single precision, in small worlds; a list of one needs none."""
+    worlds = flock(24, 6, "float32"), flock(24, 1, "float32"), flock(24, 6, "float64"), flock(600, 6, "float32")
+    assert [world.task.parts.keyed for world in worlds] == [True, False, False, False]
+
+
+@kernel
+def _round(square: Any, place: Any, tags: Any) -> Any:
+    """Return the key of a square at a place, what is read of it where it is written, and the place in it."""
+    key = key_of(square, place, tags)
+    return key, key_read(key_written(key)), tag_of(key, tags)
+
+
+def test_keys_are_in_the_order_of_squares_and_know_their_places() -> None:
+    call = njit(lambda square, place, tags: _round(square, np.uint64(place), np.int32(tags)))
+    doubt = njit(lambda one, other, tags: same_key(np.int32(one), np.int32(other), np.int32(tags)))
+    rng = np.random.default_rng(0)
+    squares = np.sort(np.concatenate([[0, 1e-45, 1e-38, 3e38, np.inf], 10.0 ** rng.uniform(-30, 30, 400)])).astype("f4")
+    for tags in (1, 7, 31, 127):
+        places = rng.integers(0, tags + 1, len(squares))
+        keys = np.array([call(s, p, tags) for s, p in zip(squares, places, strict=True)])
+        np.testing.assert_array_equal(keys[:, 0], keys[:, 1])
+        np.testing.assert_array_equal(keys[:, 2], places)
+        same = np.array([doubt(*pair, tags) for pair in zip(keys[:-1, 0], keys[1:, 0], strict=True)])
+        apart = squares.view("i4")[1:] // (tags + 1) != squares.view("i4")[:-1] // (tags + 1)
+        np.testing.assert_array_equal(same, ~apart)
+        assert (np.diff(keys[:, 0])[apart] > 0).all()
