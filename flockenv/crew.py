@@ -2,10 +2,14 @@
 
 One thread unless asked for more: waiting threads spin, and where another process has the second core that costs more
 than it brings. `use_threads(2)`, or FLOCKENV_THREADS=2 in the environment. Results do not depend on the number.
+
+On Linux the other threads keep off the core of the thread that shares its work: woken after a pause, they are put there
+often, and two halves of the work are then done one after the other.
 """
 
 from __future__ import annotations
 
+import ctypes
 import os
 import queue
 import threading
@@ -25,12 +29,55 @@ class _Crew:
         self.desks: list[queue.SimpleQueue[Any]] = [queue.SimpleQueue() for _ in range(count - 1)]
         self.lock = threading.Lock()
         for k, desk in enumerate(self.desks):
-            threading.Thread(target=_work, args=(desk,), daemon=True, name=f"flockenv-{k + 1}").start()
+            threading.Thread(target=_work, args=(desk, count - 1), daemon=True, name=f"flockenv-{k + 1}").start()
 
 
-def _work(desk: queue.SimpleQueue[Any]) -> None:
+def _core() -> int:
+    """Return on which core this thread runs, -1 where the system does not say so or lets no thread be kept off one."""
+    return _asked() if _asked is not None else -1
+
+
+def _how_to_ask() -> Callable[[], int] | None:
+    if not hasattr(os, "sched_setaffinity"):
+        return None
+    try:
+        ask: Callable[[], int] = ctypes.PyDLL(None).sched_getcpu
+    except (AttributeError, OSError, TypeError):
+        return None
+    return ask
+
+
+_asked = _how_to_ask()
+
+
+class _Place:
+    """Where the thread that makes it may run; it is one of so many."""
+
+    def __init__(self, many: int) -> None:
+        self.many, self.off = many, -1
+        self.allowed: set[int] = set()
+        self.kept: set[int] = set()
+
+    def keep_off(self, core: int) -> None:
+        """Run on any core from now on that this thread was given, but on that one; where all have one beside it."""
+        if core == self.off:
+            return
+        try:
+            given = os.sched_getaffinity(0)
+            self.allowed = self.allowed if given == self.kept else given  # somebody else has given it others
+            others = self.allowed - {core}
+            self.kept = others if len(others) >= self.many else self.allowed
+            os.sched_setaffinity(0, self.kept)
+        except OSError:  # forbidden here: it runs where the system likes
+            pass
+        self.off = core
+
+
+def _work(desk: queue.SimpleQueue[Any], many: int) -> None:
+    place = _Place(many)
     while True:
-        job, done = desk.get()
+        job, done, core = desk.get()
+        place.keep_off(core)
         try:
             done.put((job(), None))
         except BaseException as error:
@@ -68,11 +115,11 @@ def share(jobs: Sequence[Callable[[], Any]]) -> list[Any]:
 
     All of them run at once, so they may wait for each other. Returns when all have ended, whatever happens.
     """
-    crew = _crew_of(len(jobs))
+    crew, core = _crew_of(len(jobs)), _core()
     done: list[queue.SimpleQueue[Any]] = [queue.SimpleQueue() for _ in jobs[1:]]
     with crew.lock:  # all desks in one go: two callers whose jobs wait for each other never get in each other's way
         for desk, job, answer in zip(crew.desks, jobs[1:], done, strict=False):
-            desk.put((job, answer))
+            desk.put((job, answer, core))
     try:
         first = jobs[0]()
     finally:

@@ -416,6 +416,67 @@ def in_another_process(code: str, **environment: str) -> subprocess.CompletedPro
     )
 
 
+LINUX = pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="no thread can be kept off a core here")
+
+
+@LINUX
+def test_others_keep_off_the_core_of_who_shares_its_work(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(crew, "_crew", None)
+    cores = os.sched_getaffinity(0)
+    if len(cores) < 2:
+        pytest.skip("one core")
+    assert crew._core() in cores
+    for core in (*cores, *cores):
+        monkeypatch.setattr(crew, "_asked", lambda core=core: core)  # the caller's own is another one any time
+        assert share([lambda: None, lambda: os.sched_getaffinity(0)])[1] == cores - {core}
+    assert os.sched_getaffinity(0) == cores  # the caller's own thread is left alone
+
+
+@LINUX
+def test_threads_run_anywhere_where_there_are_more_of_them_than_cores(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(crew, "_crew", None)
+    cores = os.sched_getaffinity(0)
+    found = share([lambda: os.sched_getaffinity(0)] * (len(cores) + 1))
+    assert found == [cores] * (len(cores) + 1)
+
+
+@LINUX
+def test_where_a_thread_may_run_is_for_others_to_say() -> None:
+    """Whoever says so later is heard; a core beside the caller's is only left where there is one."""
+    cores = os.sched_getaffinity(0)
+    if len(cores) < 2:
+        pytest.skip("one core")
+    one, two = sorted(cores)[:2]
+
+    def move() -> list[set[int]]:
+        place, seen = crew._Place(1), []
+        for core in (one, one, two, -1):
+            place.keep_off(core)
+            seen.append(os.sched_getaffinity(0))
+        os.sched_setaffinity(0, {one})
+        for core in (two, one):
+            place.keep_off(core)
+            seen.append(os.sched_getaffinity(0))
+        return seen
+
+    with ThreadPoolExecutor(1) as pool:
+        seen = pool.submit(move).result()
+    assert seen == [cores - {one}, cores - {one}, cores - {two}, cores, {one}, {one}]
+
+
+def test_a_system_that_keeps_no_thread_off_a_core_is_served_all_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(crew, "_asked", None)
+    assert share([lambda: 1, lambda: 2]) == [1, 2]
+
+    def refuse(*_: Any) -> None:
+        raise PermissionError
+
+    monkeypatch.setattr(crew, "_crew", None)
+    monkeypatch.setattr(crew, "_asked", lambda: 0)
+    monkeypatch.setattr(os, "sched_setaffinity", refuse, raising=False)
+    assert share([lambda: 1, lambda: 2]) == [1, 2]
+
+
 @pytest.mark.slow
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="there is no fork here")
 def test_a_forked_child_steps_with_threads_of_its_own() -> None:
