@@ -253,7 +253,8 @@ def _nearest(p: Any, frame: Frame) -> float:
     for first in range(np.uint64(0), n, lanes):
         for k in range(lanes):
             i = np.uint64(first + k)
-            distance = np.sqrt(frame.near_square[0, i]) if frame.near_count[i] > 0 else p.sight
+            root = np.sqrt(frame.near_square[0, i])
+            distance = root if frame.near_count[i] > 0 else like(root, p.sight)  # no branch: agents side by side
             sums[k] += distance if i < n else like(distance, 0.0)
     mean = 0.0
     for k in range(lanes):
