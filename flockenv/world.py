@@ -249,14 +249,14 @@ class World:
         if terms not in TERMS:
             raise ValueError(f"terms: {terms!r} is unknown{nearest(str(terms), TERMS)}; allowed: {', '.join(TERMS)}")
         taken = self._taken(actions)
-        rows, reward, paid, over, late, success, present = told = tuple(map(self._empty, self._shapes, self._dtypes))
+        rows, reward, earned, over, late, success, present = told = tuple(map(self._empty, self._shapes, self._dtypes))
         limit = _NEVER if self.time_limit is None else min(int(self.time_limit), _NEVER)
         world, who = self._play(True, self._everywhere, terms == "steps", self.worlds, limit, told, taken)
         if world == REFUSED:
             self._refuse(taken)
         if world >= 0:
             raise FloatingPointError(f"world {world}, agent {who}: not finite at t = {self.state.time[world]:g} s")
-        return Step(rows, reward, paid.transpose(1, 2, 0), over, late, success, present)
+        return Step(rows, reward, earned.transpose(1, 2, 0), over, late, success, present)
 
     def _play(
         self, acting: bool, mask: NDArray[np.bool_], everyone: bool, busy: int, limit: int,
