@@ -13,8 +13,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import distance_transform_edt
-from scipy.spatial import cKDTree
 
 from flockenv.grid import packed, points_of
 from flockenv.kernels import entry, kernel
@@ -147,6 +145,8 @@ def way_table(
 
 def _lengths_beside(u: Floats, reached: NDArray[np.bool_], spacing: float, clearance: float) -> Floats:
     """Return lengths everywhere: whoever is pushed against a wall is still as near to his target as he is."""
+    from scipy.ndimage import distance_transform_edt  # here: who looks for no way need not wait for it
+
     far, place = distance_transform_edt(~reached, sampling=spacing, return_indices=True)
     return np.asarray(np.where(far <= clearance + 2 * spacing, u[tuple(place)] + far, u[reached].max()))
 
@@ -192,6 +192,8 @@ def _begin_at(
     last = np.ceil((target.extremes[1] + sight - found.low) / spacing).astype(int) + 1
     here = tuple(slice(a, b) for a, b in zip(first, last, strict=True))
     points, free = found.points[here], found.gap[here] >= clearance
+    from scipy.spatial import cKDTree  # here: who looks for no way need not wait for it
+
     nearby = cKDTree(places).query(points)[1]
     to = target.offset(points)
     straight = np.linalg.norm(to, axis=-1)

@@ -7,7 +7,6 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
-from scipy.special import ndtr, ndtri
 
 from flockenv.records import Record
 
@@ -57,6 +56,8 @@ class Spread(Record):
             return self.least + (self.most - self.least) * share
         if self.sd == 0:
             return np.full(len(share), self.mean)
+        from scipy.special import ndtr, ndtri  # here: most numbers have no spread, and need not wait for it
+
         low, high = (ndtr((bound - self.mean) / self.sd) for bound in (self.least, self.most))
         found = self.mean + self.sd * ndtri(low + (high - low) * share)
         return np.asarray(np.clip(found, self.least, self.most))
