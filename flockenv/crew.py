@@ -9,6 +9,7 @@ often, and two halves of the work are then done one after the other.
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import os
 import queue
@@ -29,7 +30,7 @@ class _Crew:
         self.desks: list[queue.SimpleQueue[Any]] = [queue.SimpleQueue() for _ in range(count - 1)]
         self.lock = threading.Lock()
         for k, desk in enumerate(self.desks):
-            threading.Thread(target=_work, args=(desk, count - 1), daemon=True, name=f"flockenv-{k + 1}").start()
+            threading.Thread(target=_work, args=(desk,), daemon=True, name=f"flockenv-{k + 1}").start()
 
 
 def _core() -> int:
@@ -51,34 +52,27 @@ _asked = _how_to_ask()
 
 
 class _Place:
-    """Where the thread that makes it may run; it is one of so many."""
+    """Where the thread that makes it may run."""
 
-    def __init__(self, many: int) -> None:
-        self.many, self.off = many, -1
-        self.allowed: set[int] = set()
+    def __init__(self) -> None:
         self.kept: set[int] = set()
 
-    def keep_off(self, core: int) -> None:
-        """Run on any core from now on that this thread was given, but on that one; where all have one beside it."""
-        if core == self.off:
-            return
-        try:
-            given = os.sched_getaffinity(0)
-            self.allowed = self.allowed if given == self.kept else given  # somebody else has given it others
-            others = self.allowed - {core}
-            self.kept = others if len(others) >= self.many else self.allowed
-            os.sched_setaffinity(0, self.kept)
-        except OSError:  # forbidden here: it runs where the system likes
-            pass
-        self.off = core
+    def keep_off(self, core: int, cores: set[int], many: int) -> None:
+        """Run on the caller's cores from now on, but not on that one, where `many` threads have one beside it."""
+        others = cores - {core}
+        kept = others if len(others) >= many else cores
+        if kept and kept != self.kept:
+            with contextlib.suppress(OSError):  # forbidden here: it runs where the system likes
+                os.sched_setaffinity(0, kept)
+            self.kept = kept
 
 
-def _work(desk: queue.SimpleQueue[Any], many: int) -> None:
-    place = _Place(many)
+def _work(desk: queue.SimpleQueue[Any]) -> None:
+    place = _Place()
     while True:
-        job, done, core = desk.get()
-        place.keep_off(core)
+        job, done, here = desk.get()
         try:
+            place.keep_off(*here)
             done.put((job(), None))
         except BaseException as error:
             done.put((None, error))
@@ -116,10 +110,11 @@ def share(jobs: Sequence[Callable[[], Any]]) -> list[Any]:
     All of them run at once, so they may wait for each other. Returns when all have ended, whatever happens.
     """
     crew, core = _crew_of(len(jobs)), _core()
+    here = core, os.sched_getaffinity(0) if core >= 0 else set(), len(jobs) - 1  # who is pinned keeps its helpers there
     done: list[queue.SimpleQueue[Any]] = [queue.SimpleQueue() for _ in jobs[1:]]
     with crew.lock:  # all desks in one go: two callers whose jobs wait for each other never get in each other's way
         for desk, job, answer in zip(crew.desks, jobs[1:], done, strict=False):
-            desk.put((job, answer, core))
+            desk.put((job, answer, here))
     try:
         first = jobs[0]()
     finally:

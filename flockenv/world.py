@@ -53,7 +53,7 @@ class Step(NamedTuple):
 
     observation: Rows  # (B, L, O)
     reward: NDArray[np.float64]  # (B, L)
-    terms: NDArray[np.float64]  # (B, L, K), reward = sum over K; each term in one piece
+    terms: NDArray[np.float64]  # (B, L, K), reward = sum over K where told; each term in one piece
     terminated: NDArray[np.bool_]  # (B, L)
     truncated: NDArray[np.bool_]  # (B,) the time limit, nothing else
     success: NDArray[np.bool_]  # (B,)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import threading
 from typing import Any
 
 import numpy as np
@@ -62,17 +61,6 @@ def test_whole_lines_go_past_the_caches_and_a_fence_follows() -> None:
     poured(np.zeros(40, np.float32), 0, np.zeros(40, np.float32))
     texts = poured.inspect_llvm().values()
     assert texts and all("!nontemporal" in text and "fence seq_cst" in text for text in texts)
-
-
-def test_another_thread_sees_all_of_it() -> None:
-    room, seen = np.zeros(100_000, np.float32), []
-    for k in range(1, 20):
-        source = np.full(room.shape, k, np.float32)
-        pouring = threading.Thread(target=poured, args=(room, 0, source))
-        pouring.start()
-        pouring.join()
-        seen.append(bool((room == k).all()))
-    assert all(seen)
 
 
 @njit

@@ -10,7 +10,7 @@ from numba import njit
 
 from flockenv.abreast import key_of, key_read, key_written, same_key, tag_of
 from flockenv.kernels import kernel
-from flockenv.tasks import Flock
+from flockenv.tasks import Bottleneck, Flock
 from flockenv.world import World
 
 SIGHT, MIDDLE = 6.0, 20.0
@@ -93,6 +93,35 @@ def test_the_nearest_are_those_that_a_sort_finds(agents: int, neighbours: int, m
             listed = who[: count[i], i]
             np.testing.assert_allclose(every[i, listed], wanted[: count[i], i], rtol=0 if kind == "float32" else 1e-14)
             assert len(set(listed.tolist())) == count[i]
+
+
+def test_around_the_edge_of_a_periodic_box_the_lists_are_the_same() -> None:
+    """Squares are worked out anew there, too: by the shortest way around."""
+    rng = np.random.default_rng(1)
+    world, size = flock(25, 6, "float32"), 40.0
+    world.reset(0)
+    places = rng.normal(size=(25, 2)) * 3
+    inside = found(world, (places + MIDDLE).astype("f4"))
+    across = found(world, (places % size).astype("f4"))
+    np.testing.assert_allclose(across[0], inside[0], rtol=1e-4)
+    np.testing.assert_array_equal(across[1], inside[1])
+    assert (across[0][1:] >= across[0][:-1]).all()
+
+
+def test_the_absent_are_in_nobodys_list() -> None:
+    """In a kernel that keeps keys when everybody is there."""
+    world = World(Bottleneck(dtype="float32"))
+    assert world.task.parts.keyed
+    world.reset(0)
+    gone = np.arange(0, world.agents, 3)
+    world.state.alive[0, gone] = False
+    world.reset(mask=np.zeros(1, bool))
+    who, count = world._scratch[0][2][1:3]
+    for i in np.setdiff1d(np.arange(world.agents), gone):
+        listed = who[: count[i], i]
+        assert i not in listed
+        assert not np.isin(listed, gone).any()
+    assert count[: world.agents].max() > 0
 
 
 def test_who_is_listed_by_keys() -> None:

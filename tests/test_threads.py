@@ -441,27 +441,37 @@ def test_threads_run_anywhere_where_there_are_more_of_them_than_cores(monkeypatc
 
 
 @LINUX
-def test_where_a_thread_may_run_is_for_others_to_say() -> None:
-    """Whoever says so later is heard; a core beside the caller's is only left where there is one."""
+def test_who_is_pinned_keeps_its_helpers_there(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whatever the helpers were kept to before; and a core of their own is theirs again when the caller has several."""
+    monkeypatch.setattr(crew, "_crew", None)
     cores = os.sched_getaffinity(0)
     if len(cores) < 2:
         pytest.skip("one core")
-    one, two = sorted(cores)[:2]
 
-    def move() -> list[set[int]]:
-        place, seen = crew._Place(1), []
-        for core in (one, one, two, -1):
-            place.keep_off(core)
-            seen.append(os.sched_getaffinity(0))
-        os.sched_setaffinity(0, {one})
-        for core in (two, one):
-            place.keep_off(core)
-            seen.append(os.sched_getaffinity(0))
+    def calls() -> list[set[int]]:
+        seen = []
+        for core in cores:
+            for allowed in (cores, {core}, cores):
+                os.sched_setaffinity(0, allowed)
+                monkeypatch.setattr(crew, "_asked", lambda core=core: core)
+                seen.append(share([lambda: None, lambda: os.sched_getaffinity(0)])[1])
         return seen
 
     with ThreadPoolExecutor(1) as pool:
-        seen = pool.submit(move).result()
-    assert seen == [cores - {one}, cores - {one}, cores - {two}, cores, {one}, {one}]
+        seen = pool.submit(calls).result()
+    assert seen == [found for core in cores for found in (cores - {core}, {core}, cores - {core})]
+
+
+@LINUX
+def test_fewer_threads_than_before_are_kept_off_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(crew, "_crew", None)
+    cores = os.sched_getaffinity(0)
+    if len(cores) < 2:
+        pytest.skip("one core")
+    core = min(cores)
+    monkeypatch.setattr(crew, "_asked", lambda: core)
+    share([lambda: None] * (len(cores) + 2))
+    assert share([lambda: None, lambda: os.sched_getaffinity(0)])[1] == cores - {core}
 
 
 def test_a_system_that_keeps_no_thread_off_a_core_is_served_all_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
