@@ -33,12 +33,8 @@ class _Crew:
             threading.Thread(target=_work, args=(desk,), daemon=True, name=f"flockenv-{k + 1}").start()
 
 
-def _core() -> int:
-    """Return on which core this thread runs, -1 where the system does not say so or lets no thread be kept off one."""
-    return _asked() if _asked is not None else -1
-
-
 def _how_to_ask() -> Callable[[], int] | None:
+    """Return what says on which core a thread runs, if the system says so and lets threads be kept off one."""
     if not hasattr(os, "sched_setaffinity"):
         return None
     try:
@@ -49,6 +45,14 @@ def _how_to_ask() -> Callable[[], int] | None:
 
 
 _asked = _how_to_ask()
+
+
+def _here() -> tuple[int, set[int]]:
+    """Return on which core this thread runs, and on which it may; (-1, none) where the system does not say."""
+    if _asked is not None:
+        with contextlib.suppress(OSError):
+            return _asked(), os.sched_getaffinity(0)
+    return -1, set()
 
 
 class _Place:
@@ -109,8 +113,7 @@ def share(jobs: Sequence[Callable[[], Any]]) -> list[Any]:
 
     All of them run at once, so they may wait for each other. Returns when all have ended, whatever happens.
     """
-    crew, core = _crew_of(len(jobs)), _core()
-    here = core, os.sched_getaffinity(0) if core >= 0 else set(), len(jobs) - 1  # who is pinned keeps its helpers there
+    crew, here = _crew_of(len(jobs)), (*_here(), len(jobs) - 1)  # who is pinned keeps its helpers there
     done: list[queue.SimpleQueue[Any]] = [queue.SimpleQueue() for _ in jobs[1:]]
     with crew.lock:  # all desks in one go: two callers whose jobs wait for each other never get in each other's way
         for desk, job, answer in zip(crew.desks, jobs[1:], done, strict=False):

@@ -17,7 +17,7 @@ from numba.np import arrayobj
 
 from flockenv.kernels import LINE, asked
 
-__all__ = ["array_of", "fetch", "in_one_piece", "pour", "settle"]
+__all__ = ["array_of", "fetch", "in_one_piece", "pour", "put_past", "settle"]
 
 
 def in_one_piece(array: Any) -> None:
@@ -62,6 +62,12 @@ def _fetch(typing_context: Any, array: Any, part: Any, parts: Any) -> Any:
 fetch: Any = intrinsic(_fetch)
 
 
+def put_past(builder: Any, vector: Any, line: Any) -> None:
+    """Generate what writes a line of memory past the caches: all of it, so that nothing is read before."""
+    stored = builder.store(vector, line, align=LINE)
+    stored.set_metadata("nontemporal", builder.module.add_metadata([ir.IntType(32)(1)]))
+
+
 def _poured(typing_context: Any, to: Any, at: Any, source: Any) -> Any:
     """Copy an array into another one, counted through from `at` on, past the caches; both are in one piece.
 
@@ -87,8 +93,7 @@ def _poured(typing_context: Any, to: Any, at: Any, source: Any) -> Any:
         each: Any = cgutils.for_range_slice
         with each(builder, head, tail, word(side)) as (k, _):
             here, there = (builder.bitcast(builder.gep(base, [k]), vector) for base in (old.data, start))
-            stored = builder.store(builder.load(here, align=size), there, align=LINE)
-            stored.set_metadata("nontemporal", builder.module.add_metadata([ir.IntType(32)(1)]))
+            put_past(builder, builder.load(here, align=size), there)
         for begin, end in ((word(0), head), (tail, old.nitems)):
             with each(builder, begin, end, word(1)) as (k, _):
                 builder.store(builder.load(builder.gep(old.data, [k])), builder.gep(start, [k]))

@@ -13,9 +13,9 @@ import numba
 from llvmlite import ir  # type: ignore[import-untyped]
 from numba.core import types
 from numba.extending import intrinsic
-from numba.np import arrayobj
 
 from flockenv.kernels import LINE
+from flockenv.lines import array_of, put_past
 
 __all__ = ["out_of_records", "put_lines", "put_records"]
 
@@ -64,12 +64,6 @@ def _pointer(builder: Any, data: Any, place: Any, kind: Any) -> Any:
     return builder.bitcast(builder.gep(data, [place]), kind.as_pointer())
 
 
-def _data(context: Any, builder: Any, kind: Any, value: Any) -> Any:
-    """Return where the first number of an array lies."""
-    make: Any = arrayobj.make_array
-    return make(kind)(context, builder, value).data
-
-
 def _width(width: Any) -> int:
     """Return a number that is written into the source; numba tries again with it if it did not hand it over."""
     if not isinstance(width, types.IntegerLiteral):
@@ -91,7 +85,7 @@ def _put_records(
     size = _whole(many)
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        to, cells, offsets = (_data(context, builder, signature.args[k], arguments[k]) for k in (0, 4, 6))
+        to, cells, offsets = (array_of(context, builder, signature.args[k], arguments[k]).data for k in (0, 4, 6))
         array, real = signature.args[1].dtype, context.get_data_type(signature.args[0].dtype)
         itemsize = context.get_abi_sizeof(real)
         side = min(wide, LINE // itemsize)  # lanes of a register
@@ -105,7 +99,7 @@ def _put_records(
             agents = builder.shuffle_vector(agent, agent, _mask([0] * side))
             yield builder.sitofp(builder.add(agents, _mask(list(range(side)))), vector)
             for k in range(sources.count):
-                data = _data(context, builder, array, builder.extract_value(arguments[1], k))
+                data = array_of(context, builder, array, builder.extract_value(arguments[1], k)).data
                 place = builder.add(builder.extract_value(arguments[2], k), word(begin))
                 yield builder.load(_pointer(builder, data, place, vector), align=itemsize)
             for _ in range(many, size):
@@ -150,7 +144,7 @@ def _put_lines(
     wide, many, piece = _width(width), sources.count, _width(length)
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        data, where = (_data(context, builder, signature.args[k], arguments[k]) for k in (0, 4))
+        data, where = (array_of(context, builder, signature.args[k], arguments[k]).data for k in (0, 4))
         array, real = signature.args[1].dtype, context.get_data_type(signature.args[0].dtype)
         itemsize = context.get_abi_sizeof(real)
         side = LINE // itemsize
@@ -160,7 +154,7 @@ def _put_lines(
         def row(k: int, begin: int) -> Any:
             if k >= many:
                 return ir.Constant(vector, ir.Undefined)
-            source = _data(context, builder, array, builder.extract_value(arguments[1], k))
+            source = array_of(context, builder, array, builder.extract_value(arguments[1], k)).data
             place = builder.add(builder.extract_value(arguments[2], k), word(begin))
             return builder.load(_pointer(builder, source, place, vector), align=itemsize)
 
@@ -173,8 +167,7 @@ def _put_lines(
                 start = builder.mul(place, word(piece))
                 for done in range(0, piece, side):
                     pointer = _pointer(builder, data, builder.add(start, word(done)), vector)
-                    stored = builder.store(flat[(lane * size + done) // side], pointer, align=LINE)
-                    stored.set_metadata("nontemporal", builder.module.add_metadata([ir.IntType(32)(1)]))
+                    put_past(builder, flat[(lane * size + done) // side], pointer)
         return context.get_dummy_value()
 
     numbers = _several(types.uint64, sources.count)
@@ -194,7 +187,7 @@ def _out_of_records(typing_context: Any, numbers: Any, places: Any, at: Any, wid
     size = _whole(many)
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        to, source = (_data(context, builder, signature.args[k], arguments[k]) for k in (0, 4))
+        to, source = (array_of(context, builder, signature.args[k], arguments[k]).data for k in (0, 4))
         real, word = context.get_data_type(signature.args[0].dtype), ir.IntType(64)
         itemsize = context.get_abi_sizeof(real)
         side = min(wide, LINE // itemsize)  # lanes of a register

@@ -304,10 +304,11 @@ class World:
         if given.dtype == kept.dtype and given.flags.carray:
             return given
         try:
-            if given.dtype != kept.dtype == np.float32:
-                given = given.astype(float)  # what single precision has no number for is beyond 1, and not infinite
-                given = np.where(np.isfinite(given), np.clip(given, -1, 1), given)
-            kept[...] = given
+            with np.errstate(over="ignore"):
+                kept[...] = given
+            if kept.dtype == np.float32 and np.isinf(kept).any():  # what it has no number for is beyond 1, not infinite
+                exact = given.astype(float)
+                kept[...] = np.where(np.isfinite(exact), np.clip(exact, -1, 1), exact)
         except (TypeError, ValueError):
             raise TypeError(f"actions are of type {given.dtype}, expected numbers in [-1, 1]") from None
         return kept

@@ -419,13 +419,24 @@ def in_another_process(code: str, **environment: str) -> subprocess.CompletedPro
 LINUX = pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="no thread can be kept off a core here")
 
 
-@LINUX
-def test_others_keep_off_the_core_of_who_shares_its_work(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.fixture
+def new_crew(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nobody has worked yet, and where it may run nobody has said."""
     monkeypatch.setattr(crew, "_crew", None)
-    cores = os.sched_getaffinity(0)
-    if len(cores) < 2:
+
+
+@pytest.fixture
+def cores(new_crew: None) -> set[int]:
+    """Cores that this thread may run on, two at least."""
+    given = os.sched_getaffinity(0)
+    if len(given) < 2:
         pytest.skip("one core")
-    assert crew._core() in cores
+    return given
+
+
+@LINUX
+def test_others_keep_off_the_core_of_who_shares_its_work(cores: set[int], monkeypatch: pytest.MonkeyPatch) -> None:
+    assert crew._here()[0] in cores
     for core in (*cores, *cores):
         monkeypatch.setattr(crew, "_asked", lambda core=core: core)  # the caller's own is another one any time
         assert share([lambda: None, lambda: os.sched_getaffinity(0)])[1] == cores - {core}
@@ -433,20 +444,16 @@ def test_others_keep_off_the_core_of_who_shares_its_work(monkeypatch: pytest.Mon
 
 
 @LINUX
-def test_threads_run_anywhere_where_there_are_more_of_them_than_cores(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(crew, "_crew", None)
+@pytest.mark.usefixtures("new_crew")
+def test_threads_run_anywhere_where_there_are_more_of_them_than_cores() -> None:
     cores = os.sched_getaffinity(0)
     found = share([lambda: os.sched_getaffinity(0)] * (len(cores) + 1))
     assert found == [cores] * (len(cores) + 1)
 
 
 @LINUX
-def test_who_is_pinned_keeps_its_helpers_there(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_who_is_pinned_keeps_its_helpers_there(cores: set[int], monkeypatch: pytest.MonkeyPatch) -> None:
     """Whatever the helpers were kept to before; and a core of their own is theirs again when the caller has several."""
-    monkeypatch.setattr(crew, "_crew", None)
-    cores = os.sched_getaffinity(0)
-    if len(cores) < 2:
-        pytest.skip("one core")
 
     def calls() -> list[set[int]]:
         seen = []
@@ -463,27 +470,24 @@ def test_who_is_pinned_keeps_its_helpers_there(monkeypatch: pytest.MonkeyPatch) 
 
 
 @LINUX
-def test_fewer_threads_than_before_are_kept_off_again(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(crew, "_crew", None)
-    cores = os.sched_getaffinity(0)
-    if len(cores) < 2:
-        pytest.skip("one core")
+def test_fewer_threads_than_before_are_kept_off_again(cores: set[int], monkeypatch: pytest.MonkeyPatch) -> None:
     core = min(cores)
     monkeypatch.setattr(crew, "_asked", lambda: core)
     share([lambda: None] * (len(cores) + 2))
     assert share([lambda: None, lambda: os.sched_getaffinity(0)])[1] == cores - {core}
 
 
-def test_a_system_that_keeps_no_thread_off_a_core_is_served_all_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(crew, "_asked", None)
-    assert share([lambda: 1, lambda: 2]) == [1, 2]
-
+@pytest.mark.usefixtures("new_crew")
+@pytest.mark.parametrize("forbidden", ["sched_setaffinity", "sched_getaffinity", "to ask"])
+def test_a_system_that_keeps_no_thread_off_a_core_is_served_all_the_same(
+    forbidden: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     def refuse(*_: Any) -> None:
         raise PermissionError
 
-    monkeypatch.setattr(crew, "_crew", None)
-    monkeypatch.setattr(crew, "_asked", lambda: 0)
-    monkeypatch.setattr(os, "sched_setaffinity", refuse, raising=False)
+    monkeypatch.setattr(crew, "_asked", None if forbidden == "to ask" else lambda: 0)
+    for name in ("sched_setaffinity", "sched_getaffinity"):
+        monkeypatch.setattr(os, name, refuse if forbidden == name else lambda *_: {0, 1}, raising=False)
     assert share([lambda: 1, lambda: 2]) == [1, 2]
 
 

@@ -14,6 +14,7 @@ import pytest
 from flockenv.kernels import settled
 from flockenv.noise import key_of, keys_of
 from flockenv.tasks import Flock, Obstacles, Pursuit
+from flockenv.tasks.base import task_source
 from flockenv.world import AT_HAND, PAST, Step, World
 from tests.catalogue import TASKS, TaskRow
 
@@ -131,6 +132,12 @@ def test_what_goes_past_the_caches_is_the_same(row: TaskRow, monkeypatch: pytest
             begun = [world.reset(mask=one.ended, into=at) for world, at in zip((past, direct), into, strict=True)]
             np.testing.assert_array_equal(*begun)
     assert_same(everything(past), everything(direct))
+
+
+def test_other_threads_see_what_went_past_the_caches() -> None:
+    """By a fence at the end; without it results are nearly always the same."""
+    source = task_source(Flock())
+    assert source.index("pour(rows") < source.index("    if past:\n        settle()\n    return")
 
 
 def test_only_what_is_large_goes_past_the_caches() -> None:
