@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import Any, Self
+from typing import Any, ClassVar, Self
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 from pydantic._internal._model_construction import ModelMetaclass  # it has no public name
@@ -69,6 +69,13 @@ class Record(BaseModel, metaclass=_OneLine):
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+    @classmethod
+    def __pydantic_init_subclass__(cls, **options: Any) -> None:
+        """Of what a class variable holds, only types know: pydantic would read it anew for each of its subclasses."""
+        super().__pydantic_init_subclass__(**options)
+        written = vars(cls).get("__annotations__", {})
+        written.update(dict.fromkeys(written.keys() & cls.__class_vars__, ClassVar))
 
     def __str__(self) -> str:
         return repr(self)

@@ -12,6 +12,8 @@ from typing import Any
 
 from filelock import FileLock, Timeout
 
+from flockenv.startup import nothing_to_collect
+
 __all__ = ["PATIENCE", "OneAtATime"]
 
 PATIENCE = 120.0
@@ -39,17 +41,21 @@ class OneAtATime:
     def load_overload(self, signature: Any, context: Any) -> Any:
         """Return what is on the disk, if need be as soon as another process has written it; None: it is up to you."""
         self._lock.release(force=True)  # of a compilation that failed
-        found = self._cache.load_overload(signature, context)
+        found = self._read(signature, context)
         if found is not None:
             return found
         try:
             self._lock.acquire()
         except (Timeout, OSError):  # where nothing can be locked, each compiles for himself
             return None
-        found = self._cache.load_overload(signature, context)
+        found = self._read(signature, context)
         if found is not None:
             self._lock.release()
         return found
+
+    @nothing_to_collect()
+    def _read(self, signature: Any, context: Any) -> Any:
+        return self._cache.load_overload(signature, context)
 
     def save_overload(self, signature: Any, compiled: Any) -> None:
         """Write what was compiled, and let others read it."""

@@ -27,6 +27,7 @@ LAYERS = (
         "inlining",
         "frontend",
         "turns",
+        "startup",
     },
     {"records", "vec", "elementary", "noise", "kernels", "targets", "abreast", "lines", "transpose"},
     {"state", "space", "steering", "arbitration", "vehicle", "appearance", "spread", "urges"},

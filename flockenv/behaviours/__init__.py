@@ -9,15 +9,11 @@ effect their wishes are reconciled by an arbitration.
 
 from __future__ import annotations
 
-import importlib
-import pkgutil
+from flockenv.startup import import_all
 
-from flockenv.effects.base import EFFECTS, Effect
+import_all(__name__, __path__)
 
-for _module in pkgutil.iter_modules(__path__):
-    importlib.import_module(f"{__name__}.{_module.name}")
-
-from flockenv.behaviours.avoid import AvoidObstacles, ForceField, Whiskers  # noqa: E402  # after the folder has been walked
+from flockenv.behaviours.avoid import AvoidObstacles, ForceField, Whiskers  # noqa: E402
 from flockenv.behaviours.chase import Evade, MatchVelocity, OffsetPursue, Pursue, Shadow  # noqa: E402
 from flockenv.behaviours.company import FollowLeader, Formation, Interpose  # noqa: E402
 from flockenv.behaviours.crowd import Explore, Forage, Queue, UnalignedAvoidance  # noqa: E402
@@ -34,6 +30,7 @@ from flockenv.behaviours.social import CircularRepulsion, EllipticalRepulsion, S
 from flockenv.behaviours.walls import Contain, FollowWall  # noqa: E402
 from flockenv.behaviours.wander import Wander  # noqa: E402
 from flockenv.behaviours.way import FollowWay  # noqa: E402
+from flockenv.effects.base import EFFECTS, Effect  # noqa: E402  # after the folder has been walked
 
 __all__ = [
     "BEHAVIOURS", "Alignment", "Arrive", "AvoidObstacles", "CircularRepulsion", "Cohesion", "Contain", "Dock",

@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import importlib
-import pkgutil
+from flockenv.startup import import_all
 
-from flockenv.constraints.base import CONSTRAINTS, Constraint, Settler
+import_all(__name__, __path__)
 
-for _module in pkgutil.iter_modules(__path__):
-    importlib.import_module(f"{__name__}.{_module.name}")
-
-from flockenv.constraints.collisions import Collisions  # noqa: E402  # after the folder has been walked
+from flockenv.constraints.base import CONSTRAINTS, Constraint, Settler  # noqa: E402  # after the folder has been walked
+from flockenv.constraints.collisions import Collisions  # noqa: E402
 from flockenv.constraints.rods import Rods, UnmetWarning  # noqa: E402
 
 __all__ = ["CONSTRAINTS", "Collisions", "Constraint", "Rods", "Settler", "UnmetWarning"]

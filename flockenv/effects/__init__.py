@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-import importlib
-import pkgutil
+from flockenv.startup import import_all
 
-from flockenv.effects.base import EFFECTS, Effect, Far, Me, Other, Sight
+import_all(__name__, __path__)
 
-for _module in pkgutil.iter_modules(__path__):
-    importlib.import_module(f"{__name__}.{_module.name}")
-
-from flockenv.effects.aims import Aim, Antipode, Course, Goal  # noqa: E402  # after the folder has been walked
+from flockenv.effects.aims import Aim, Antipode, Course, Goal  # noqa: E402
 from flockenv.effects.attraction import Attraction  # noqa: E402
+from flockenv.effects.base import EFFECTS, Effect, Far, Me, Other, Sight  # noqa: E402  # after the folder has been walked
 from flockenv.effects.contact import Contact, ObstacleContact  # noqa: E402
 from flockenv.effects.drag import Drag, QuadraticDrag  # noqa: E402
 from flockenv.effects.elastic import Elastic  # noqa: E402

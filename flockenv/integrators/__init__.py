@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-import importlib
-import pkgutil
+from flockenv.startup import import_all
 
-from flockenv.integrators.adaptive import Adaptive
-from flockenv.integrators.base import INTEGRATORS, Integrator, methods_named
+import_all(__name__, __path__)
 
-for _module in pkgutil.iter_modules(__path__):
-    importlib.import_module(f"{__name__}.{_module.name}")
-
-from flockenv.integrators.adaptive_rk4 import AdaptiveRK4  # noqa: E402  # after the folder has been walked
+from flockenv.integrators.adaptive import Adaptive  # noqa: E402  # after the folder has been walked
+from flockenv.integrators.adaptive_rk4 import AdaptiveRK4  # noqa: E402
 from flockenv.integrators.averaged_velocity import AveragedVelocity  # noqa: E402
+from flockenv.integrators.base import INTEGRATORS, Integrator, methods_named  # noqa: E402
 from flockenv.integrators.dormand_prince import DormandPrince  # noqa: E402
 from flockenv.integrators.explicit_euler import ExplicitEuler  # noqa: E402
 from flockenv.integrators.exponential_drag import ExponentialDrag  # noqa: E402

@@ -2,22 +2,19 @@
 
 from __future__ import annotations
 
-import importlib
-import pkgutil
+from flockenv.startup import import_all
 
-from flockenv.tasks.base import TASKS, Frame, Task
-from flockenv.tasks.layout import Layout, Slot
+import_all(__name__, __path__)
 
-for _module in pkgutil.iter_modules(__path__):
-    importlib.import_module(f"{__name__}.{_module.name}")
-
-from flockenv.tasks.bottleneck import Bottleneck  # noqa: E402  # after the folder has been walked
+from flockenv.tasks.base import TASKS, Frame, Task  # noqa: E402  # after the folder has been walked
+from flockenv.tasks.bottleneck import Bottleneck  # noqa: E402
 from flockenv.tasks.corridor import Corridor  # noqa: E402
-from flockenv.tasks.crossing import Crossing  # noqa: E402  # after the folder has been walked
+from flockenv.tasks.crossing import Crossing  # noqa: E402
 from flockenv.tasks.crowd_nav import CrowdNav  # noqa: E402
-from flockenv.tasks.evade import Evade  # noqa: E402  # after the folder has been walked
+from flockenv.tasks.evade import Evade  # noqa: E402
 from flockenv.tasks.flock import Flock  # noqa: E402
 from flockenv.tasks.herd import Herd  # noqa: E402
+from flockenv.tasks.layout import Layout, Slot  # noqa: E402
 from flockenv.tasks.obstacles import Obstacles  # noqa: E402
 from flockenv.tasks.path_follow import PathFollow  # noqa: E402
 from flockenv.tasks.pursuit import Pursuit  # noqa: E402

@@ -1,0 +1,85 @@
+"""What a process does once: folders are imported, kernels are read, and Python looks for no garbage meanwhile."""
+
+from __future__ import annotations
+
+import gc
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, ClassVar
+
+import pytest
+
+from flockenv.records import Record
+from flockenv.startup import import_all, nothing_to_collect
+from flockenv.turns import OneAtATime
+
+
+@pytest.fixture(autouse=True)
+def collecting() -> Iterator[None]:
+    gc.enable()
+    yield
+    gc.enable()
+
+
+def test_garbage_is_looked_for_afterwards_again() -> None:
+    with nothing_to_collect(), nothing_to_collect():
+        assert not gc.isenabled()
+    assert gc.isenabled()
+    with pytest.raises(KeyError), nothing_to_collect():
+        raise KeyError
+    assert gc.isenabled()
+
+
+def test_who_looks_for_no_garbage_does_not_afterwards_either() -> None:
+    gc.disable()
+    with nothing_to_collect():
+        pass
+    assert not gc.isenabled()
+
+
+def test_a_folder_is_imported_without_looking_for_garbage(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = tmp_path / "some_folder"
+    folder.mkdir()
+    (folder / "__init__.py").write_text("")
+    for name in ("one", "two"):
+        (folder / f"{name}.py").write_text("import gc\ncollects = gc.isenabled()\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    import_all("some_folder", [str(folder)])
+    assert [sys.modules.pop(f"some_folder.{name}").collects for name in ("one", "two")] == [False, False]
+    assert gc.isenabled()
+
+
+def test_a_kernel_is_read_without_looking_for_garbage_and_waited_for_with(tmp_path: Path) -> None:
+    class Disk:
+        def load_overload(self, *_: Any) -> None:
+            seen.append(gc.isenabled())
+
+    seen: list[bool] = []
+    cache = OneAtATime(Disk(), tmp_path / "lock")
+    cache.load_overload(None, None)  # once before it is this process's turn to compile, and once in its turn
+    cache._lock.release()
+    assert seen == [False, False]
+    assert gc.isenabled()
+
+
+@pytest.mark.parametrize("module", ["flockenv.tasks", "flockenv.scene", "flockenv.envs.single", "flockenv.sb3"])
+def test_whatever_is_imported_first_python_collects_afterwards(module: str) -> None:
+    code = f"import gc, {module}; assert gc.isenabled(); assert 'pursuit' in __import__('flockenv').TASKS"
+    subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def test_class_variables_are_evaluated_once_and_stay_class_variables() -> None:
+    class Base(Record):
+        shade: ClassVar[str] = "grey"
+        size: float = 1.0
+
+    class Child(Base):
+        weight: float = 2.0
+
+    assert Base.__annotations__["shade"] is ClassVar
+    assert list(Child.model_fields) == ["size", "weight"]
+    assert (Child.shade, Child(weight=3)) == ("grey", Child(size=1.0, weight=3.0))
+    with pytest.raises(ValueError, match="shade"):
+        Child(shade="red")  # type: ignore[call-arg]
