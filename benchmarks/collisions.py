@@ -12,6 +12,7 @@ from typing import Annotated
 import numpy as np
 import typer
 
+from benchmarks.floors import machine, of_scene
 from benchmarks.measure import Bench, Contestant, Out, Quick, Rounds, command_line
 from benchmarks.scenes import stepping
 from flockenv.constraints import Collisions
@@ -65,17 +66,18 @@ def main(
 ) -> None:
     """Measure steps with collisions, by response, against the same without."""
     with Bench("collisions", quick, rounds, out) as bench:
+        most = machine(bench)
         for name, (scene, state) in (("gas", gas(count)), ("heap", heap(min(count, 300)))):
             discs, given = scene.agents, scene.constraints[0]
             bare = scene.model_copy(update={"constraints": ()})
-            pack = [Contestant("none", stepping(bare, state, STEPS), discs * STEPS, note=f"{discs:,} discs")]
+            floor = most.floor(of_scene(bare, state, STEPS)) if most else None  # what collides is not counted
+            pack = [Contestant("none", stepping(bare, state, STEPS), discs * STEPS, floor, f"{discs:,} discs")]
             for response in RESPONSES:
                 kind = scene.model_copy(update={"constraints": (given.model_copy(update={"response": response}),)})
                 after = kind.run(state, 60)
                 hits = (after.counted("impacts") - state.counted("impacts")) / 60
-                pack.append(
-                    Contestant(response, stepping(kind, state, STEPS), discs * STEPS, note=f"{hits:.3g} impacts a step")
-                )
+                step, note = stepping(kind, state, STEPS), f"{hits:.3g} impacts a step"
+                pack.append(Contestant(response, step, discs * STEPS, floor, note))
             for result in bench.race(f"{name} of {discs:,}", pack, baseline="none")[1:]:
                 bench.note(f"{name}, {result.name}: {1e6 * discs / result.rate:,.0f} us per step of {discs:,} discs.")
         bench.note("One thread: a world is not divided among threads by collisions; worlds of a batch are.")

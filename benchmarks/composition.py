@@ -17,11 +17,13 @@ import numpy as np
 import typer
 
 from benchmarks.by_hand import MIXES, by_hand
-from benchmarks.measure import Bench, Contestant, Out, Quick, Result, Rounds, command_line, number
+from benchmarks.floors import Machine, machine, of_scene
+from benchmarks.measure import Bench, Contestant, Floor, Out, Quick, Result, Rounds, command_line, number
 from benchmarks.peers import PeerError, running
 from benchmarks.scenes import WORLD_RADII, crowd, restarting, rules, stepping, world
 from flockenv.crew import use_threads
 from flockenv.scene import Scene
+from flockenv.state import State
 
 __all__ = ["mix_scene"]
 
@@ -41,14 +43,14 @@ def _mixes(effects: Sequence[Any]) -> dict[str, tuple[Any, ...]]:
     }  # fmt: skip
 
 
-def _rules(bench: Bench, title: str, scene: Scene, worlds: int) -> None:
+def _rules(bench: Bench, title: str, scene: Scene, worlds: int, most: Machine | None) -> None:
     """Race rules alone, together, and in sweeps of their own."""
     start = scene.start(0, worlds=worlds)
     work = worlds * scene.agents * STEPS
-    contestants = [
-        Contestant(name, stepping(scene.with_effects(*effects), start, STEPS), work)
-        for name, effects in _mixes(scene.effects).items()
-    ]
+    contestants = []
+    for name, effects in _mixes(scene.effects).items():
+        mix = scene.with_effects(*effects)
+        contestants.append(Contestant(name, stepping(mix, start, STEPS), work, _floor(mix, start, most)))
     alone = [stepping(scene.with_effects(effect), start, STEPS) for effect in scene.effects]
 
     def apart() -> None:
@@ -58,6 +60,10 @@ def _rules(bench: Bench, title: str, scene: Scene, worlds: int) -> None:
     contestants.append(Contestant("three scenes of one each", apart, work))
     results = bench.race(title, contestants, baseline="all three")
     _summed(bench, results)
+
+
+def _floor(scene: Scene, start: State, most: Machine | None) -> Floor | None:
+    return most.floor(of_scene(scene, start, STEPS)) if most else None
 
 
 def _summed(bench: Bench, results: Sequence[Result]) -> None:
@@ -84,7 +90,7 @@ def mix_scene(mix: str, dtype: str) -> Scene:
     return world(dtype).with_effects(*((a, c) if mix == "two" else (a, b, c)))
 
 
-def _by_hand(bench: Bench, mix: str, dtype: str) -> bool:
+def _by_hand(bench: Bench, mix: str, dtype: str, most: Machine | None) -> bool:
     """Race a generated kernel against the one by hand; False where they do not do the same."""
     scene = mix_scene(mix, dtype)
     start = scene.start(0, worlds=WORLDS)
@@ -101,10 +107,10 @@ def _by_hand(bench: Bench, mix: str, dtype: str) -> bool:
         )
         return False
     bench.extra.setdefault("by_hand_apart_m", {})[title] = apart
-    work = WORLDS * scene.agents * STEPS
+    work, floor = WORLDS * scene.agents * STEPS, _floor(scene, start, most)
     contestants = [
-        Contestant("by hand", restarting(start, theirs, step), work),
-        Contestant("generated", stepping(scene, start, STEPS), work),
+        Contestant("by hand", restarting(start, theirs, step), work, floor),
+        Contestant("generated", stepping(scene, start, STEPS), work, floor),
     ]
     bench.race(title, contestants, baseline="by hand")
     return True
@@ -141,9 +147,10 @@ def main(quick: Quick = False, rounds: Rounds = None, out: Out = None) -> None:
     """Measure composed scenes beside single rules, beside kernels by hand, and beside an effect never asked for."""
     use_threads(1)
     with Bench("composition", quick, rounds, out) as bench:
-        _rules(bench, f"rules, {WORLDS} worlds x 32, float32", world("float32"), WORLDS)
-        _rules(bench, f"rules, one world of {CROWD:,}, float32", crowd(CROWD, "float32"), 1)
-        same = [_by_hand(bench, mix, dtype) for dtype in ("float32", "float64") for mix in MIXES]
+        most = machine(bench)
+        _rules(bench, f"rules, {WORLDS} worlds x 32, float32", world("float32"), WORLDS, most)
+        _rules(bench, f"rules, one world of {CROWD:,}, float32", crowd(CROWD, "float32"), 1, most)
+        same = [_by_hand(bench, mix, dtype, most) for dtype in ("float32", "float64") for mix in MIXES]
         _hand_ratios(bench)
         same.append(_unlisted(bench))
         bench.note(f"One thread, 2-D torus; every call begins in the same state and does {STEPS} steps.")

@@ -16,6 +16,7 @@ from typing import Annotated
 
 import typer
 
+from benchmarks.floors import Machine, machine, of_scene
 from benchmarks.measure import Bench, Contestant, Out, Quick, Rounds, command_line, number
 from benchmarks.peers import CACHE, DONE, SAMPLE, PeerError, python_of, running
 from benchmarks.scenes import stepping
@@ -45,7 +46,7 @@ def crowd(name: str, people: int = PEOPLE, dtype: str = "float64") -> Scene:
         return Scene(space=Torus(size=(edge, edge)), groups=(group, group), effects=effects, dt=DT, dtype=dtype)
 
 
-def _models(bench: Bench, dtype: str) -> None:
+def _models(bench: Bench, dtype: str, most: Machine | None) -> None:
     """Race all models, as they are after a second."""
     contestants = []
     for name in PRESETS:
@@ -53,7 +54,8 @@ def _models(bench: Bench, dtype: str) -> None:
         start = scene.run(scene.start(0), 100)
         met = scene.step(start).counted("pairs") - start.counted("pairs")
         note = f"each looks at {number(met / PEOPLE)} others"
-        contestants.append(Contestant(name, stepping(scene, start, 1), PEOPLE, note=note))
+        floor = most.floor(of_scene(scene, start)) if most else None
+        contestants.append(Contestant(name, stepping(scene, start, 1), PEOPLE, floor, note))
     bench.race(f"{PEOPLE:,} people, {dtype}", contestants, baseline="helbing_farkas_vicsek_2000")
 
 
@@ -70,7 +72,7 @@ def _a_minute(bench: Bench, name: str) -> None:
     bench.note(f"{PEOPLE:,} people for {SECONDS:g} s at dt = {DT:g} s, {name}: {', '.join(said)}.")
 
 
-def _beside_jupedsim(bench: Bench, cache: Path) -> None:
+def _beside_jupedsim(bench: Bench, cache: Path, most: Machine | None) -> None:
     """Race a corridor of 1,000 people under the model of 2000, turn by turn."""
     python = python_of(cache / "jupedsim")
     if not (cache / "jupedsim" / DONE).is_file() or not python.exists():
@@ -79,7 +81,7 @@ def _beside_jupedsim(bench: Bench, cache: Path) -> None:
     try:
         with (
             running("jupedsim", python, "run_jupedsim.py", "crowd", 1, SAMPLE) as theirs,
-            running("flockenv", Path(sys.executable), "run_ours.py", "crowd_1000", 1, SAMPLE) as ours,
+            running("flockenv", Path(sys.executable), "run_ours.py", "crowd_1000", 1, SAMPLE, None, most) as ours,
         ):
             results = bench.race("corridor, 1,000 people, 2000", [theirs, ours], baseline="jupedsim")
         if results[1].ratio:
@@ -99,13 +101,14 @@ def main(
 ) -> None:
     """Measure crowds."""
     with Bench("crowd", quick, rounds, out) as bench:
-        _beside_jupedsim(bench, cache.expanduser())
+        most = machine(bench)
+        _beside_jupedsim(bench, cache.expanduser(), most)
         if minute:
             for name in ("helbing_farkas_vicsek_2000", "helbing_molnar_1995"):
                 _a_minute(bench, name)
         for dtype in ("float64", "float32") if single else ("float64",):
             if models:
-                _models(bench, dtype)
+                _models(bench, dtype, most)
 
 
 if __name__ == "__main__":

@@ -2,7 +2,8 @@
 
 World.step, gymnasium.make (and the environment inside its wrappers), make_vec, PettingZoo's parallel and AEC forms, and
 flockenv.sb3.WorldVecEnv: one world, 1024 worlds, and 1024 flocks of 32 learners on one thread and on two. Actions are
-drawn before; worlds that are over begin anew, and that is timed too. World.step is what all the others wrap.
+drawn before; worlds that are over begin anew, and that is timed too. World.step is what all the others wrap. Beside
+each face of one world stands an environment of the same spaces that does nothing: what is left is not ours to save.
 """
 
 from __future__ import annotations
@@ -16,9 +17,11 @@ import gymnasium
 import numpy as np
 import pettingzoo
 import typer
+from gymnasium.envs.registration import EnvSpec
 
 import flockenv  # noqa: F401  # registers the environments
-from benchmarks.measure import Bench, Contestant, Out, Quick, Result, Rounds, command_line, number
+from benchmarks.floors import Machine, machine, of_decisions
+from benchmarks.measure import Bench, Contestant, Floor, Out, Quick, Result, Rounds, command_line, number
 from flockenv.crew import use_threads
 from flockenv.tasks import TASKS, Flock, Task
 from flockenv.world import World
@@ -29,6 +32,7 @@ TASK_IDS = {name: f"flockenv/{name.capitalize()}-v0" for name in ("pursuit", "ob
 DRAWS = 16  # sets of random actions, used in turn
 WORLDS = 1024
 LEARNERS = 32  # of a flock, in the largest race
+NOTHING = "of what does nothing"
 
 Step = Callable[[], object]
 
@@ -110,7 +114,46 @@ def _by_turns(env: Any) -> Step:
     return step
 
 
-def _sb3(bench: Bench, task: Task, worlds: int) -> list[Contestant]:
+class _Nothing(gymnasium.Env[Any, Any]):
+    """An environment in which nothing happens: what Gymnasium's wrappers cost around it, it costs around any."""
+
+    def __init__(self, like: gymnasium.Env[Any, Any]) -> None:
+        self.observation_space, self.action_space = like.observation_space, like.action_space
+        assert self.observation_space.shape is not None
+        self._row = np.zeros(self.observation_space.shape, np.float32)
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        return self._row, {}
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        return self._row, 0.0, False, False, {}
+
+
+def _nothing(like: gymnasium.Env[Any, Any]) -> gymnasium.Env[Any, Any]:
+    """Return it as gymnasium.make makes any."""
+    assert like.spec is not None
+    spec = EnvSpec("Nothing-v0", lambda: _Nothing(like), max_episode_steps=like.spec.max_episode_steps)
+    return gymnasium.make(spec)
+
+
+class _NobodyActs(pettingzoo.ParallelEnv[str, Any, Any]):
+    """The same for PettingZoo: five dictionaries a step, and what lies in them was there before."""
+
+    def __init__(self, like: Any) -> None:
+        self.possible_agents, self.action_space = like.possible_agents, like.action_space
+        self._row = np.zeros(like.observation_space(self.possible_agents[0]).shape, np.float32)
+
+    def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, Any]:
+        self.agents = self.possible_agents
+        return dict.fromkeys(self.agents, self._row), {name: {} for name in self.agents}
+
+    def step(self, actions: Any) -> tuple[Any, Any, Any, Any, Any]:
+        names = self.agents
+        no = dict.fromkeys(names, False)
+        return dict.fromkeys(names, self._row), dict.fromkeys(names, 0.0), no, {**no}, {n: {} for n in names}
+
+
+def _sb3(bench: Bench, task: Task, worlds: int, floor: Floor | None) -> list[Contestant]:
     """Return the face for Stable-Baselines3, if that is installed."""
     try:
         from flockenv.sb3 import WorldVecEnv
@@ -120,55 +163,58 @@ def _sb3(bench: Bench, task: Task, worlds: int) -> list[Contestant]:
             bench.note(note)
         return []
     rows = worlds * task.learners
-    return [Contestant("WorldVecEnv", _rows(WorldVecEnv(task, worlds), rows), rows)]
+    return [Contestant("WorldVecEnv", _rows(WorldVecEnv(task, worlds), rows), rows, floor)]
 
 
 # --- the races ------------------------------------------------------------------------------------------------------
 
 
-def _one_learner(bench: Bench, env_id: str) -> None:
+def _one_learner(bench: Bench, env_id: str, most: Machine | None) -> None:
     """Race the faces of one world with one learner."""
     made = gymnasium.make(env_id)
     task: Task = made.unwrapped.task  # type: ignore[attr-defined]  # our own environment
+    floor = _floor(task, 1, most)
     contestants = [
-        Contestant("World.step", _world(task), 1),
-        Contestant("gymnasium.make", _single(made), 1),
-        Contestant("the same, unwrapped", _single(gymnasium.make(env_id).unwrapped), 1),
-        Contestant("make_vec of 1", _rows(gymnasium.make_vec(env_id, num_envs=1), 1), 1),
-        *_sb3(bench, task, 1),
+        Contestant("World.step", _world(task), 1, floor),
+        Contestant("gymnasium.make", _single(made), 1, floor),
+        Contestant(NOTHING, _single(_nothing(made)), 1),
+        Contestant("the first, unwrapped", _single(gymnasium.make(env_id).unwrapped), 1, floor),
+        Contestant("make_vec of 1", _rows(gymnasium.make_vec(env_id, num_envs=1), 1), 1, floor),
+        *_sb3(bench, task, 1, floor),
     ]
     _microseconds(bench, bench.race(_title(env_id, task, 1), contestants, baseline="World.step"), 1)
 
 
-def _many_learners(bench: Bench, env_id: str) -> None:
+def _many_learners(bench: Bench, env_id: str, most: Machine | None) -> None:
     """Race the faces of one world whose learners all have names."""
     env = pettingzoo.make("parallel", env_id)
     task: Task = env.unwrapped.task
-    work = task.learners
+    work, floor = task.learners, _floor(task, 1, most)
     contestants = [
-        Contestant("World.step", _world(task), work),
-        Contestant("PettingZoo parallel", _parallel(env), work),
-        Contestant("PettingZoo AEC", _by_turns(pettingzoo.make("aec", env_id)), work),
-        *(_sb3(bench, task, 1) if task.ends_together else []),
+        Contestant("World.step", _world(task), work, floor),
+        Contestant("PettingZoo parallel", _parallel(env), work, floor),
+        Contestant(NOTHING, _parallel(_NobodyActs(env)), work),
+        Contestant("PettingZoo AEC", _by_turns(pettingzoo.make("aec", env_id)), work, floor),
+        *(_sb3(bench, task, 1, floor) if task.ends_together else []),
     ]
     _microseconds(bench, bench.race(_title(env_id, task, 1), contestants, baseline="World.step"), work)
 
 
-def _batched(bench: Bench, env_id: str) -> None:
+def _batched(bench: Bench, env_id: str, most: Machine | None) -> None:
     """Race the faces of many worlds with one learner each."""
     vector: Any = gymnasium.make_vec(env_id, num_envs=WORLDS)
     task: Task = vector.unwrapped.task
-    single = task.model_copy(update={"dtype": "float32"})
+    single, floor = task.model_copy(update={"dtype": "float32"}), _floor(task, WORLDS, most)
     contestants = [
-        Contestant("World.step", _world(task, WORLDS), WORLDS),
-        Contestant("World.step, float32", _world(single, WORLDS), WORLDS),
-        Contestant("make_vec", _rows(vector, WORLDS), WORLDS),
-        *_sb3(bench, task, WORLDS),
+        Contestant("World.step", _world(task, WORLDS), WORLDS, floor),
+        Contestant("World.step, float32", _world(single, WORLDS), WORLDS, _floor(single, WORLDS, most)),
+        Contestant("make_vec", _rows(vector, WORLDS), WORLDS, floor),
+        *_sb3(bench, task, WORLDS, floor),
     ]
     bench.race(_title(env_id, task, WORLDS), contestants, baseline="World.step")
 
 
-def _flocks(bench: Bench, threads: Sequence[int]) -> None:
+def _flocks(bench: Bench, threads: Sequence[int], most: Machine | None) -> None:
     """Race 1024 flocks of learners as a vector environment, on one thread and on several."""
     from flockenv.envs.vector import FlockVectorEnv
 
@@ -176,13 +222,19 @@ def _flocks(bench: Bench, threads: Sequence[int]) -> None:
     contestants = []
     flock: dict[str, Any] = {"max_episode_steps": Flock().horizon, "agents": LEARNERS, "learners": LEARNERS}
     for dtype, infos in (("float64", "steps"), ("float32", "steps"), ("float32", "ends")):
-        step = _rows(FlockVectorEnv(rows, dtype=dtype, infos=infos, **flock), rows)
+        env = FlockVectorEnv(rows, dtype=dtype, infos=infos, **flock)
+        step = _rows(env, rows)
         kind = dtype if infos == "steps" else f"{dtype}, infos of ends"
         names = {count: f"{kind}, {count} thread{'s' * (count > 1)}" for count in threads}
-        contestants += [Contestant(name, _on(count, step), rows) for count, name in names.items()]
+        for count, name in names.items():
+            contestants.append(Contestant(name, _on(count, step), rows, _floor(env.task, WORLDS, most, count)))
     title = f"Flock as a VectorEnv, {WORLDS} worlds x {LEARNERS} learners"
     bench.race(title, contestants, baseline="float64, 1 thread")
     use_threads(1)
+
+
+def _floor(task: Task, worlds: int, most: Machine | None, threads: int = 1) -> Floor | None:
+    return most.floor(of_decisions(task, worlds), threads) if most else None
 
 
 def _on(threads: int, step: Step) -> Step:
@@ -212,7 +264,8 @@ def _microseconds(bench: Bench, results: Sequence[Result], work: int) -> None:
     for r in results:
         took = 1e6 * work / r.rate
         more = statistics.median(1e6 * work * (1 / a - 1 / b) for a, b in zip(r.rates, inside.rates, strict=False))
-        said.append(f"{r.name} {number(took)}" + (f" (+{number(more)})" if r is not inside else ""))
+        wraps = r.name not in (inside.name, NOTHING)
+        said.append(f"{r.name} {number(took)}" + (f" (+{number(more)})" if wraps else ""))
     bench.note(f"{inside.race.split(':')[0]}, microseconds per step of the world: {'; '.join(said)}.")
 
 
@@ -228,16 +281,18 @@ def main(
         raise typer.BadParameter(f"--only {only!r}: unknown; allowed: {', '.join(TASK_IDS)}")
     use_threads(1)
     ids = [env_id for name, env_id in TASK_IDS.items() if only in ("", name) and name in TASKS]
+    several = (1,) if threads == 1 else (1, threads)
     with Bench("envs", quick, rounds, out, unit="k agent-steps/s", scale=1e3) as bench:
+        most = machine(bench, *several)
         for env_id in ids:
-            _one_learner(bench, env_id)
+            _one_learner(bench, env_id, most)
         for env_id in ids:
             if env_id in pettingzoo.parallel_registry:
-                _many_learners(bench, env_id)
+                _many_learners(bench, env_id, most)
         for env_id in ids:
-            _batched(bench, env_id)
+            _batched(bench, env_id, most)
         if only in ("", "flock"):
-            _flocks(bench, (1,) if threads == 1 else (1, threads))
+            _flocks(bench, several, most)
         bench.note("Agent-steps are decisions of learners: physics steps within one are not counted. One thread.")
 
 

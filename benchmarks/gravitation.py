@@ -12,6 +12,7 @@ from typing import Annotated
 
 import typer
 
+from benchmarks.floors import Machine, machine, of_scene
 from benchmarks.measure import Bench, Contestant, Out, Quick, Rounds, command_line, number
 from benchmarks.scenes import stepping
 from flockenv.effects import Gravitation
@@ -36,21 +37,22 @@ def cloud(agents: int, dimension: int, dtype: str, opening: float) -> Scene:
     return scene
 
 
-def _contestant(agents: int, dimension: int, dtype: str, opening: float) -> Contestant:
+def _contestant(agents: int, dimension: int, dtype: str, opening: float, most: Machine | None) -> Contestant:
     """Return a scene stepped once a call."""
     scene = cloud(agents, dimension, dtype, opening)
     start = scene.start(0)
     met = scene.step(start).counted("pairs") / agents
     note = f"each meets {number(met)} of {agents:,}"
     name = f"{agents:,}, {'tree' if opening else 'direct'}"
-    return Contestant(name, stepping(scene, start, 1), agents, note=note)
+    floor = most.floor(of_scene(scene, start)) if most else None
+    return Contestant(name, stepping(scene, start, 1), agents, floor, note)
 
 
-def _compare(bench: Bench, dimension: int, dtype: str, largest: int) -> None:
+def _compare(bench: Bench, dimension: int, dtype: str, largest: int, most: Machine | None) -> None:
     """Race the two at every size, and say where they cross."""
     ratios = {}
     for agents in (n for n in AGENTS if n <= largest):
-        pair = [_contestant(agents, dimension, dtype, opening) for opening in (0.0, OPENING)]
+        pair = [_contestant(agents, dimension, dtype, opening, most) for opening in (0.0, OPENING)]
         results = bench.race(f"{agents:,} agents, {dimension}-D, {dtype}", pair, baseline=pair[0].name)
         ratios[agents] = results[1].ratio
     said = "; ".join(f"{agents:,} {number(ratio)}" for agents, ratio in ratios.items() if ratio)
@@ -67,9 +69,10 @@ def main(
 ) -> None:
     """Measure the exact sum and the tree side by side."""
     with Bench("gravitation", quick, rounds, out) as bench:
+        most = machine(bench)
         for dtype in ("float64", "float32") if single else ("float64",):
             for dimension in (2, 3):
-                _compare(bench, dimension, dtype, largest)
+                _compare(bench, dimension, dtype, largest, most)
         bench.note(f"Opening {OPENING:g}. A scene sums exactly up to {MOST_DIRECT:,} agents.")
 
 

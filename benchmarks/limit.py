@@ -3,28 +3,20 @@
 The C (limit.c, limit_kernel.h) knows three rules, a torus and semi-implicit Euler, and nothing else; it is compiled
 here, by gcc -O3 -march=native. Every call of either side begins in the same state and does the same number of steps.
 Before a race both do a few, and where they then disagree there is no race. One thread.
-
-A floor says what no program gets below on this machine: counted vector operations at the pace, and counted bytes at the
-bandwidth, that were measured just before.
 """
 
 from __future__ import annotations
 
 import ctypes
-import shutil
-import subprocess
-import tempfile
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
-from pathlib import Path
-from time import perf_counter
 from typing import Annotated, Any
 
 import numpy as np
 import typer
 
-from benchmarks.measure import Bench, Contestant, Floor, Out, Quick, Rounds, command_line, number
+from benchmarks.floors import Machine, compiled, machine, of_scene
+from benchmarks.measure import Bench, Contestant, Out, Quick, Rounds, command_line, number
 from benchmarks.scenes import crowd, restarting, stepping, world
 from flockenv.behaviours import Alignment, Cohesion, Separation
 from flockenv.crew import use_threads
@@ -32,9 +24,8 @@ from flockenv.effects.base import ties
 from flockenv.scene import Scene
 from flockenv.state import State
 
-__all__ = ["ROWS", "Machine", "Reference", "Row", "disagreement", "reference"]
+__all__ = ["ROWS", "Reference", "Row", "disagreement"]
 
-FLAGS = ("-O3", "-march=native", "-shared", "-fPIC")
 FEW = 5  # steps after which both sides are compared
 CLOSE = {"float64": 1e-9, "float32": 1e-4}  # m, nearly all agents; a single neighbour more or less moves one by 1e-3
 FAR = {"float64": 1e-9, "float32": 2e-2}  # m, everybody
@@ -69,8 +60,8 @@ ROWS = tuple(_rows())
 class Reference:
     """The compiled reference and what it is given."""
 
-    def __init__(self, folder: Path) -> None:
-        self.limit, self.pace = (_compiled(name, folder) for name in ("limit", "pace"))
+    def __init__(self, limit: ctypes.CDLL) -> None:
+        self.limit = limit
 
     def stepper(self, scene: Scene, state: State, steps: int) -> Callable[[], object]:
         """Return a call that advances the arrays of `state` by so many steps, in place."""
@@ -82,12 +73,6 @@ class Reference:
         arguments = (*map(_pointer, (state.x, state.v, apart)), *map(ctypes.c_long, sizes), _pointer(numbers))
         return lambda numbers=numbers, apart=apart: step(*arguments)  # it keeps the memory of these
 
-    def operations_per_second(self, dtype: str) -> float:
-        """Return how many independent operations this machine does at best, each lane of a vector counted."""
-        run = getattr(self.pace, f"operations_{dtype}")
-        run.restype = ctypes.c_long
-        return max(_rate(lambda: run(ctypes.c_long(1_000_000))) for _ in range(10))
-
 
 def _numbers(scene: Scene) -> list[float]:
     """Return what limit_kernel.h calls `rules`, in its order."""
@@ -98,70 +83,8 @@ def _numbers(scene: Scene) -> list[float]:
     return [scene.space.extent(scene.dimension)[0], *radii, *weights, group.max_force, group.max_speed, scene.dt]
 
 
-def _compiled(name: str, folder: Path) -> ctypes.CDLL:
-    """Compile a source of this folder; subprocess.CalledProcessError or OSError where that fails."""
-    library = folder / f"{name}.so"
-    source = Path(__file__).with_name(f"{name}.c")
-    subprocess.run(["gcc", *FLAGS, "-o", str(library), str(source), "-lm"], check=True, capture_output=True, text=True)
-    return ctypes.CDLL(str(library))
-
-
 def _pointer(array: np.ndarray[Any, Any]) -> ctypes.c_void_p:
     return ctypes.c_void_p(array.ctypes.data)
-
-
-@contextmanager
-def reference(bench: Bench) -> Iterator[Reference | None]:
-    """Compile the reference into a temporary folder; say so in one line where that is not possible, and give none."""
-    with tempfile.TemporaryDirectory() as folder:
-        found = None
-        try:
-            if shutil.which("gcc") is None:
-                raise OSError("there is no gcc")
-            found = Reference(Path(folder))
-        except (OSError, subprocess.CalledProcessError) as error:
-            bench.note(f"no C beside flockenv: {(getattr(error, 'stderr', '') or str(error)).strip().splitlines()[-1]}")
-        yield found
-
-
-# --- floors ---------------------------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class Machine:
-    """What this machine does at most, on one core."""
-
-    pace: dict[str, float]  # operations/s by dtype
-    bandwidth: float  # bytes/s, to and from memory
-
-    @classmethod
-    def measured(cls, by: Reference) -> Machine:
-        """Measure it: operations in C, bandwidth by adding to 128 MB in place."""
-        array = np.zeros(2**25, np.float32)
-        bandwidth = max(_rate(lambda: (np.add(array, 1.0, out=array), 2 * array.nbytes)[1]) for _ in range(10))
-        return cls({dtype: by.operations_per_second(dtype) for dtype in ("float32", "float64")}, bandwidth)
-
-    def floor(self, scene: Scene, state: State, candidates: float, steps: int) -> Floor:
-        """Return the floor of three rules, per agent-step."""
-        d, real, images = scene.dimension, np.dtype(scene.dtype).itemsize, state.shape[0] > 1
-        # A candidate: offset, |offset|^2, images (a multiply-add, floor, a multiply-add), 4 comparisons (three radii,
-        # not in one place), a division, and the sums: push, velocity and offset, and two counts.
-        operations = candidates * (2 * d + 3 * d * images + 4 + 1 + 3 * d + 2)
-        passes = 1 / steps if images else 1.0
-        bytes_ = 2 * 2 * d * real * passes
-        pace = self.pace[scene.dtype]
-        why = (
-            f"{operations / candidates:.0f} vector operations for each of {candidates:.1f} candidates at "
-            f"{pace / 1e9:.0f} G lanes/s; x and v read and written once a {'call' if images else 'step'}, "
-            f"{bytes_:.1f} bytes, at {self.bandwidth / 1e9:.0f} GB/s"
-        )
-        return Floor.counted(operations, bytes_, pace, self.bandwidth, why)
-
-
-def _rate(call: Callable[[], float]) -> float:
-    """Return what a call says it did per second."""
-    began = perf_counter()
-    return call() / (perf_counter() - began)
 
 
 # --- the races ------------------------------------------------------------------------------------------------------
@@ -189,14 +112,13 @@ def _agree(bench: Bench, row: Row, scene: Scene, start: State, by: Reference) ->
     return False
 
 
-def _race(bench: Bench, row: Row, by: Reference | None, machine: Machine | None) -> bool:
+def _race(bench: Bench, row: Row, by: Reference | None, most: Machine | None) -> bool:
     """Race one row; False if both sides do not do the same."""
     scene = row.scene()
     start = scene.start(0, worlds=row.worlds)
     if by is not None and not _agree(bench, row, scene, start, by):
         return False
-    candidates = scene.step(start).counted("pairs") / (row.worlds * scene.agents)
-    floor = machine.floor(scene, start, candidates, row.steps) if machine else None
+    floor = most.floor(of_scene(scene, start, row.steps)) if most else None
     work = row.worlds * scene.agents * row.steps
     contestants = [Contestant("flockenv", stepping(scene, start, row.steps), work, floor)]
     if by is not None:
@@ -218,30 +140,21 @@ def main(
     rows = [row for row in ROWS if only in row.title]
     if not rows:
         raise typer.BadParameter(f"--only {only!r}: in no title; titles: {'; '.join(row.title for row in ROWS)}")
-    with Bench("limit", quick, rounds, out) as bench, reference(bench) as by:
-        machine = Machine.measured(by) if by else None
-        same = [_race(bench, row, by, machine) for row in rows]
-        _remarks(bench, machine)
+    with Bench("limit", quick, rounds, out) as bench, compiled(bench, "limit") as libraries:
+        by, most = Reference(libraries[0]) if libraries else None, machine(bench)
+        same = [_race(bench, row, by, most) for row in rows]
+        _remarks(bench, by is not None)
     if not all(same):
         raise typer.Exit(1)
 
 
-def _remarks(bench: Bench, machine: Machine | None) -> None:
-    """Say what was counted, and all ratios in one line."""
+def _remarks(bench: Bench, beside: bool) -> None:
+    """Say what a call does, and all ratios in one line."""
     bench.note(
         "One thread. Every call begins in the same state; 10 steps a call unless a row says otherwise. C keeps the "
         "agents of a large world sorted from step to step of a call."
     )
-    if machine:
-        bench.extra["machine_at_most"] = {"operations_per_second": machine.pace, "bytes_per_second": machine.bandwidth}
-        bench.note(
-            "Floors: 17 vector operations for each candidate that flockenv meets in 2-D (22 in 3-D; 23 and 31 where "
-            "the nearest image is sought) at the pace of independent operations, "
-            + ", ".join(f"{pace / 1e9:.0f} G lanes/s in {dtype}" for dtype, pace in machine.pace.items())
-            + f"; positions and velocities read and written once a step (small worlds: a call) at "
-            f"{machine.bandwidth / 1e9:.0f} GB/s; the slower of the two. No sorting, no overhead."
-        )
-    ratios = [f"{r.race} {number(r.ratio)}" for r in bench.results if r.name == "flockenv" and r.ratio and machine]
+    ratios = [f"{r.race} {number(r.ratio)}" for r in bench.results if r.name == "flockenv" and r.ratio and beside]
     if ratios:
         bench.note(f"flockenv's rate over that of C: {'; '.join(ratios)}.")
 

@@ -378,7 +378,7 @@ def _table(title: str, results: Sequence[Result], unit: str, scale: float) -> Ta
     for r in results:
         low, _, high = (number(q / scale) for q in r.quartiles)
         cells = [r.name, number(r.rate / scale), f"{low}-{high}", _ratio(r)]
-        cells += [f"{r.rate / r.floor.rate:.2f}" if r.floor else ""] * floors
+        cells += [number(r.rate / r.floor.rate) if r.floor else ""] * floors
         cells += ["" if r.cores is None else f"{r.cores:.2f}", *([r.note] if noted else [])]
         table.add_row(*map(escape, cells))
     return table

@@ -27,6 +27,7 @@ from typing import IO, Annotated, Any
 
 import typer
 
+from benchmarks.floors import Machine, Work, machine
 from benchmarks.measure import ROOT, Bench, Contestant, Numbers, Out, Quick, Rounds, Sample, command_line, number
 
 __all__ = ["PAIRS", "PEERS", "PeerError", "Turns", "install", "running"]
@@ -123,11 +124,12 @@ class Turns(Contestant):
 @contextmanager
 def running(
     name: str, python: Path, script: str, case: str, threads: int, seconds: float,
-    variables: Mapping[str, str] | None = None,
+    variables: Mapping[str, str] | None = None, most: Machine | None = None,
 ) -> Iterator[Turns]:  # fmt: skip
     """Start a script and wait until it is ready; stop it in the end. Raises PeerError in one line if it fails.
 
     variables: of its environment, beside those that every script has.
+    most: what the machine does at most: then what a script says of its work becomes its floor.
     """
     command = [str(python), str(SCRIPTS / script), case, "--threads", str(threads), "--turns"]
     with tempfile.TemporaryDirectory() as folder, Path(folder, "stderr").open("w+", encoding="utf-8") as errors:
@@ -143,7 +145,8 @@ def running(
         try:
             about = _answer(name, process)
             versions = ", ".join(f"{package} {version}" for package, version in about["versions"].items())
-            yield Turns(name, lambda: None, 0, None, f"{about['does']} [{versions}]", process, seconds)
+            floor = most.floor(Work(**about["work"]), threads) if most and about["work"] else None
+            yield Turns(name, lambda: None, 0, floor, f"{about['does']} [{versions}]", process, seconds)
         except PeerError as error:
             raise PeerError(f"{error}{_last_line(errors)}") from None
         finally:
@@ -231,13 +234,14 @@ def main(
     cache = cache.expanduser()
     with Bench("peers", quick, rounds, out) as bench:
         bench.extra["threads"] = threads
+        most = machine(bench, threads)
         for peer in wanted:
             typer.echo(f"installing {peer}: {', '.join(PEERS[peer])}", err=True)
             _noting(bench, lambda peer=peer: install(peer, cache))
         present = [peer for peer in asked if (cache / peer / DONE).is_file() and python_of(cache / peer).exists()]
         missing = [peer for peer in asked if peer not in present]
         for pair in (pair for pair in PAIRS if pair.peer in present):
-            _noting(bench, lambda pair=pair: _race(bench, pair, cache, threads))
+            _noting(bench, lambda pair=pair: _race(bench, pair, cache, threads, most))
         if missing:
             bench.note(f"not installed: {', '.join(missing)} (--install {','.join(missing)})")
         _remarks(bench, threads)
@@ -260,7 +264,7 @@ def _noting(bench: Bench, work: Any) -> None:
         bench.note(str(error))
 
 
-def _race(bench: Bench, pair: Pair, cache: Path, threads: int) -> None:
+def _race(bench: Bench, pair: Pair, cache: Path, threads: int, most: Machine | None) -> None:
     """Measure one pair; ratios are flockenv's rate over the peer's."""
     title = f"{pair.peer} {pair.case}" + " (against many worlds)" * (pair.ours == "flock_vector")
     script = f"run_{pair.peer}.py"
@@ -268,7 +272,7 @@ def _race(bench: Bench, pair: Pair, cache: Path, threads: int) -> None:
     typer.echo(f"starting {title}", err=True)
     with (
         running(pair.peer, python_of(cache / pair.peer), script, pair.case, threads, seconds) as theirs,
-        running("flockenv", Path(sys.executable), "run_ours.py", pair.ours, threads, seconds) as ours,
+        running("flockenv", Path(sys.executable), "run_ours.py", pair.ours, threads, seconds, None, most) as ours,
     ):
         bench.race(title, [theirs, ours], baseline=pair.peer)
 

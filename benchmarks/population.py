@@ -11,6 +11,7 @@ from typing import Annotated
 
 import typer
 
+from benchmarks.floors import Machine, machine, of_scene
 from benchmarks.measure import Bench, Contestant, Out, Quick, Rounds, command_line, number
 from benchmarks.scenes import stepping
 from flockenv.effects import Drag, Gravity
@@ -44,7 +45,7 @@ def settled(scene: Scene) -> State:
     return scene.run(scene.start(0), round((LIFETIME + 2.0) / DT))
 
 
-def _contestants(alive: int, dtype: str, dimension: int) -> list[Contestant]:
+def _contestants(alive: int, dtype: str, dimension: int, most: Machine | None) -> list[Contestant]:
     """Return the fountain, one whose particles decay besides, and the same motion without a population."""
     scene = fountain(alive, dtype, dimension, True)
     start = settled(scene)
@@ -53,10 +54,12 @@ def _contestants(alive: int, dtype: str, dimension: int) -> list[Contestant]:
         "count": alive, "spawn": {"low": (0.0,) * dimension, "high": (1.0,) * dimension}}),)})  # fmt: skip
     living = int(start.alive.sum())
     note = f"{living:,} alive, {number(scene.population[0].rate)} born per s"
+    floor = most.floor(of_scene(plain, plain.start(0), STEPS)) if most else None  # birth and death are not counted
+    forever = stepping(plain, plain.start(0), STEPS)
     return [
-        Contestant("no population", stepping(plain, plain.start(0), STEPS), alive * STEPS, note=f"{alive:,} alive"),
-        Contestant("fountain", _going_on(scene, start), living * STEPS, note=note),
-        Contestant("fountain with decay", _going_on(more, start), living * STEPS, note=note),
+        Contestant("no population", forever, alive * STEPS, floor, f"{alive:,} alive"),
+        Contestant("fountain", _going_on(scene, start), living * STEPS, floor, note),
+        Contestant("fountain with decay", _going_on(more, start), living * STEPS, floor, note),
     ]
 
 
@@ -74,9 +77,10 @@ def main(
 ) -> None:
     """Measure particle-steps per second with births and deaths, and without."""
     with Bench("population", quick, rounds, out) as bench:
+        most = machine(bench)
         for dimension in (2, 3):
             for dtype in ("float32", "float64"):
-                pack = _contestants(alive, dtype, dimension)
+                pack = _contestants(alive, dtype, dimension, most)
                 results = bench.race(f"{alive:,} particles, {dimension}-D, {dtype}", pack, baseline=pack[0].name)
                 for result in results[1:]:
                     rate = result.rate

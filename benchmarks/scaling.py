@@ -17,6 +17,7 @@ from typing import Annotated
 
 import typer
 
+from benchmarks.floors import Machine, machine, of_scene
 from benchmarks.measure import ROOT, Bench, Contestant, Out, Quick, Result, Rounds, command_line, number
 from benchmarks.scenes import crowd, stepping, world
 from flockenv.crew import use_threads
@@ -35,17 +36,18 @@ def _steps(agents: int) -> int:
     return min(100, max(10, ENOUGH // agents))
 
 
-def _on(threads: int, scene: Scene, worlds: int, name: str) -> Contestant:
+def _on(threads: int, scene: Scene, worlds: int, name: str, most: Machine | None) -> Contestant:
     """Return a scene stepped by so many threads."""
     agents = worlds * scene.agents
-    steps = _steps(agents)
-    step = stepping(scene, scene.start(0, worlds=worlds), steps)
+    steps, start = _steps(agents), scene.start(0, worlds=worlds)
+    step = stepping(scene, start, steps)
+    floor = most.floor(of_scene(scene, start, steps), threads) if most else None
 
     def call() -> None:
         use_threads(threads)
         step()
 
-    return Contestant(f"{name}, {_threads(threads)}", call, agents * steps)
+    return Contestant(f"{name}, {_threads(threads)}", call, agents * steps, floor)
 
 
 def _threads(threads: int) -> str:
@@ -57,10 +59,10 @@ def _alone(name: str) -> str | None:
     return name.removesuffix(f", {_threads(1)}") if name.endswith(_threads(1)) else None
 
 
-def _by_agents(bench: Bench, dtype: str, threads: Sequence[int], largest: int) -> None:
+def _by_agents(bench: Bench, dtype: str, threads: Sequence[int], largest: int, most: Machine | None) -> None:
     """Race sizes of one world."""
     sizes = [n for n in AGENTS if n <= max(largest, USUAL_AGENTS)]
-    contestants = [_on(t, crowd(n, dtype), 1, f"{n:,}") for n in sizes for t in threads]
+    contestants = [_on(t, crowd(n, dtype), 1, f"{n:,}", most) for n in sizes for t in threads]
     title = f"agents in one world, 15 neighbours each, 2-D, {dtype}"
     results = bench.race(title, contestants, baseline=f"{USUAL_AGENTS:,}, 1 thread")
     costs = [f"{size} {number(1 / r.ratio)}" for r in results if r.ratio and (size := _alone(r.name))]
@@ -68,9 +70,9 @@ def _by_agents(bench: Bench, dtype: str, threads: Sequence[int], largest: int) -
     _speed_ups(bench, results, "agents", dtype)
 
 
-def _by_worlds(bench: Bench, dtype: str, threads: Sequence[int]) -> None:
+def _by_worlds(bench: Bench, dtype: str, threads: Sequence[int], most: Machine | None) -> None:
     """Race numbers of worlds."""
-    contestants = [_on(t, world(dtype), b, f"{b:,}") for b in WORLDS for t in threads]
+    contestants = [_on(t, world(dtype), b, f"{b:,}", most) for b in WORLDS for t in threads]
     results = bench.race(f"worlds of 32 agents, 2-D, {dtype}", contestants, baseline=f"{USUAL_WORLDS:,}, 1 thread")
     _speed_ups(bench, results, "worlds of 32", dtype)
 
@@ -134,9 +136,10 @@ def main(
     """Measure rates against the number of agents, worlds and threads, and memory per agent."""
     several = (1,) if threads == 1 else (1, threads)
     with Bench("scaling", quick, rounds, out) as bench:
+        most = machine(bench, *several)
         for dtype in ("float32", "float64") if double else ("float32",):
-            _by_agents(bench, dtype, several, largest)
-            _by_worlds(bench, dtype, several)
+            _by_agents(bench, dtype, several, largest, most)
+            _by_worlds(bench, dtype, several, most)
             _memory(bench, dtype)
         bench.note(
             f"Every call begins in the same state and does 10 steps, up to 100 where those are below {ENOUGH:,} "

@@ -22,6 +22,7 @@ from typing import Annotated, Any
 import typer
 
 from agents.experiment import CONFIGS, PpoSettings, load_experiment
+from benchmarks.floors import Machine, machine, of_decisions, of_learning
 from benchmarks.measure import Bench, Contestant, Numbers, Out, Quick, Result, Rounds, Sample, command_line, number
 from benchmarks.peers import PeerError, running
 from flockenv.tasks import Task
@@ -32,6 +33,7 @@ EXPERIMENTS = ("pursuit", "obstacles", "flock")
 SECONDS, QUICK_SECONDS = 4.0, 1.0  # s, a turn lasts at least
 ROUNDS, QUICK_ROUNDS = 3, 1
 SPINS = ("300000", "10000", "0")  # rounds: libgomp's own, what agents asks for, none
+MOST_THREADS = 2  # that floors are measured for
 SB3_ROWS = 8  # environments that somebody with the defaults may have
 
 
@@ -135,7 +137,7 @@ def _timed(call: Callable[..., Any], what: str, spent: dict[str, float]) -> Call
 # --- the races ------------------------------------------------------------------------------------------------------
 
 
-def _race(bench: Bench, name: str, seconds: float) -> None:
+def _race(bench: Bench, name: str, seconds: float, most: Machine | None) -> None:
     """Race the settings of one task."""
     from agents.ppo import build
 
@@ -144,7 +146,9 @@ def _race(bench: Bench, name: str, seconds: float) -> None:
     contestants = []
     for title, p in settings(experiment.ppo, task.learners):
         model = build(task, p, None)
-        contestants.append(Learning(title, lambda: None, 0, None, _said(p, task), model, p.threads, seconds))
+        work = of_learning(model.policy, p.epochs, of_decisions(task, p.worlds))
+        floor = most.floor(work, p.threads) if most and p.threads <= MOST_THREADS else None
+        contestants.append(Learning(title, lambda: None, 0, floor, _said(p, task), model, p.threads, seconds))
     _shares(bench, name, bench.race(f"PPO on {name}", contestants, baseline="as configured"), contestants)
 
 
@@ -216,12 +220,12 @@ def main(
         raise typer.BadParameter(f"--only {only!r}: unknown; allowed: {', '.join(EXPERIMENTS)}")
     turns = rounds or (QUICK_ROUNDS if quick else ROUNDS)
     with Bench("training", quick, turns, out, unit="k agent-steps/s", scale=1e3) as bench:
-        turn = seconds or (QUICK_SECONDS if quick else SECONDS)
+        turn, most = seconds or (QUICK_SECONDS if quick else SECONDS), machine(bench, *range(1, MOST_THREADS + 1))
         if not only:
             _spinning(bench, turn)
         for name in EXPERIMENTS:
             if only in ("", name) and Path(CONFIGS / f"{name}.yaml").exists():
-                _race(bench, name, turn)
+                _race(bench, name, turn, most)
         _summary(bench)
         bench.note("End to end: rollouts and updates. Torch and the worlds use as many threads as the setting says.")
 

@@ -29,6 +29,7 @@ def flock_vector(threads: int) -> Case:
     """The Flock task as gymnasium's VectorEnv, every agent of 1024 worlds a row of it, in float32."""
     import numpy as np
 
+    from benchmarks.floors import of_decisions
     from flockenv.crew import use_threads
     from flockenv.envs.vector import FlockVectorEnv
 
@@ -43,7 +44,7 @@ def flock_vector(threads: int) -> Case:
         f"in {task.substeps} substeps; {task.layout.size} observations each, 6 reward terms, metrics, infos of "
         "episodes that end, resets"
     )
-    return Case(lambda: env.step(next(actions)), rows, does)
+    return Case(lambda: env.step(next(actions)), rows, does, of_decisions(task, WORLDS))
 
 
 def flock_after_a_pass(threads: int) -> Case:
@@ -62,7 +63,8 @@ def flock_after_a_pass(threads: int) -> Case:
             network(rows)
         case.step()
 
-    return case._replace(step=step, does=f"a forward pass of torch, {seen}-64-64-2, over all rows; then {case.does}")
+    does = f"a forward pass of torch, {seen}-64-64-2, over all rows; then {case.does}"
+    return case._replace(step=step, does=does, work=None)
 
 
 def pursuit_batch(threads: int) -> Case:
@@ -82,6 +84,8 @@ def pursuit_batch(threads: int) -> Case:
 
 def _batch(world: Any, rng: Any, does: str) -> Case:
     """Step under random actions drawn before, and reset the worlds that are over (that is timed too)."""
+    from benchmarks.floors import of_decisions
+
     world.reset(0)
     actions = cycle(rng.uniform(-1, 1, (DRAWS, world.worlds, world.learners, world.action_size)))
 
@@ -90,7 +94,7 @@ def _batch(world: Any, rng: Any, does: str) -> Case:
         if ended.any():
             world.reset(mask=ended)
 
-    return Case(step, world.worlds * world.learners, does)
+    return Case(step, world.worlds * world.learners, does, of_decisions(world.task, world.worlds))
 
 
 def flock_parallel(threads: int) -> Case:
@@ -120,6 +124,8 @@ def pursuit_parallel(pursuers: int, evaders: int) -> Case:
 
 def _parallel(env: Any, agents: int, does: str) -> Case:
     """Step with actions drawn before, and reset where an episode is over (that is timed too)."""
+    from benchmarks.floors import of_decisions
+
     env.reset(seed=0)
     spaces = {name: env.action_space(name) for name in env.possible_agents}
     actions = cycle([{name: space.sample() for name, space in spaces.items()} for _ in range(DRAWS)])
@@ -130,11 +136,12 @@ def _parallel(env: Any, agents: int, does: str) -> Case:
         if not env.agents:
             env.reset()
 
-    return Case(step, agents, does)
+    return Case(step, agents, does, of_decisions(env.task))
 
 
 def boids(agents: int, edge: float, reach: float, apart: float, about: str) -> Case:
     """One world of boids on a torus, all three rules, through Scene.step in place."""
+    from benchmarks.floors import of_scene
     from flockenv.behaviours import Alignment, Cohesion, Separation
     from flockenv.scene import Group, Scene
     from flockenv.space import Torus
@@ -155,7 +162,7 @@ def boids(agents: int, edge: float, reach: float, apart: float, about: str) -> C
         f"boids, one world x {agents} on a torus {edge:.3g} m wide, {scene.dtype}: separation (radius {apart:g}), "
         f"alignment and cohesion (radius {reach:.3g}), everybody at once; no observations, no rewards{about}"
     )
-    return Case(lambda: scene.step(state, out=state), agents, does)
+    return Case(lambda: scene.step(state, out=state), agents, does, of_scene(scene, state))
 
 
 def like_mesa(agents: int) -> Case:
@@ -211,6 +218,8 @@ def social_field(agents: int) -> Case:
 
 def _walking(scene: Any, does: str) -> Case:
     """Make ten steps per call, and begin again after 2,000, before it piles up or is gone (that is timed too)."""
+    from benchmarks.floors import of_scene
+
     start = scene.start(seed=0)
     state = scene.step(start, steps=10)
 
@@ -219,7 +228,7 @@ def _walking(scene: Any, does: str) -> Case:
         if state.tick[0] % 2000 == 0:
             state.x[...], state.v[...] = start.x, start.v
 
-    return Case(step, 10 * scene.agents, does + "; ten steps a call")
+    return Case(step, 10 * scene.agents, does + "; ten steps a call", of_scene(scene, state, 10))
 
 
 CASES = {

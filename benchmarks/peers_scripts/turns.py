@@ -26,6 +26,7 @@ class Case(NamedTuple):
     step: Callable[[], object]
     agent_steps: float  # per call of `step`
     does: str  # in words: how many, which forces, observations, rewards
+    work: Any = None  # benchmarks.floors.Work of an agent-step, where it was counted
 
 
 def run(cases: Mapping[str, Callable[[int], Case]], *packages: str) -> None:
@@ -43,6 +44,7 @@ def run(cases: Mapping[str, Callable[[int], Case]], *packages: str) -> None:
     case.step()  # whatever compiles, compiles now
     about = {
         "does": case.does,
+        "work": case.work and vars(case.work),
         "versions": {name: version(name) for name in packages},
         "ready_seconds": perf_counter() - began,
     }
