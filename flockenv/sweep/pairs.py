@@ -12,7 +12,7 @@ from collections.abc import Callable, Mapping
 from flockenv.effects.base import Sight
 from flockenv.sweep.parts import Parts, record_of, sorted_at
 from flockenv.sweep.query import listed, query, walk
-from flockenv.sweep.text import Slots, given, indented, indented_lines, nearest_image, place_of, tuple_of
+from flockenv.sweep.text import Slots, copied, given, indented, indented_lines, nearest_image, place_of, tuple_of
 
 __all__ = ["me_of", "meet_range", "offset_of", "pairs"]
 
@@ -86,8 +86,13 @@ def _select_nearest(parts: Parts) -> list[str]:
 def _sum_up(parts: Parts) -> list[str]:
     """Write how a block meets its candidates, and what its sums come to."""
     d, slot = parts.dimension, Slots(parts)
-    sums = [slot(f"g{name}{j}") for name in parts.targets for j in range(d)]
-    r, w = len(sums), parts.width
+    names = [f"g{name}{j}" for name in parts.targets for j in range(d)]
+    r, w = len(names), parts.width
+    as_they_lie = [
+        line
+        for j, name in enumerate(names)
+        for line in copied(parts, "felt", f"block * np.uint64({r}) + np.uint64({j * w})", "lanes", slot.first(name))
+    ]
     return [
         "for r in range(found):",
         "    met += (ranges[r, 1] - ranges[r, 0]) * (upto - at)",
@@ -95,13 +100,12 @@ def _sum_up(parts: Parts) -> list[str]:
         f"for l in range(np.uint64({parts.width})):",
         indented(_finish(parts), 4),
         f"if nx == 0 and present == n{' and not arranged' * parts.sorts}:  # they are felt as the lanes lie",
-        f"    for l in range(np.uint64({w})):",
-        indented([f"felt[block * np.uint64({r}) + np.uint64({j * w}) + l] = {s}" for j, s in enumerate(sums)], 8),
+        *indented_lines(as_they_lie, 4),
         "else:",
         "    for l in range(np.uint64(upto - at)):",
         f"        i = {listed(parts)}",
         f"        place = {place_of(parts, r)}",
-        indented([f"felt[place + np.uint64({j * w})] = {s}" for j, s in enumerate(sums)], 8),
+        indented([f"felt[place + np.uint64({j * w})] = {slot(name)}" for j, name in enumerate(names)], 8),
     ]
 
 

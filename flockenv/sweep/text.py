@@ -133,7 +133,11 @@ class Slots:
 
     def __call__(self, name: str) -> str:
         """Write the place of one number, in lane l."""
-        return f"lanes[np.uint64({self.slots[name] * self.width}) + l]"
+        return f"lanes[{self.first(name)} + l]"
+
+    def first(self, name: str) -> str:
+        """Write where the lanes of one number begin."""
+        return f"np.uint64({self.slots[name] * self.width})"
 
     def all(self, prefix: str) -> list[str]:
         """Write every place whose name begins so, in order."""
