@@ -9,7 +9,6 @@ text: where one of them reads otherwise (another numba), it is left out, and num
 from __future__ import annotations
 
 import functools
-import gc
 import hashlib
 import inspect
 from collections.abc import Callable, Iterator
@@ -33,6 +32,8 @@ from numba.core.compiler_machinery import register_pass
 from numba.core.ir_utils import fixup_var_define_in_scope
 from numba.core.types import containers, functions
 from numba.core.typing import context as typing_context
+
+from flockenv.startup import nothing_to_collect
 
 __all__ = ["SPARED", "TRICKS", "Spared", "Trick", "lighter", "reads_as_known", "spared"]
 
@@ -317,10 +318,8 @@ _depth = 0
 def lighter() -> Iterator[None]:
     """Compile with all that applies, and without looking for garbage: what a kernel leaves behind is 100 MB at most."""
     global _depth
-    with _lock:
-        collects = gc.isenabled()
+    with _lock, nothing_to_collect():
         if _depth == 0:
-            gc.disable()
             for owner, name, _, ours in _replacements():
                 setattr(owner, name, ours)
         _depth += 1
@@ -331,8 +330,6 @@ def lighter() -> Iterator[None]:
             if _depth == 0:
                 for owner, name, numbas, _ in _replacements():
                     setattr(owner, name, numbas)
-                if collects:
-                    gc.enable()
 
 
 # --- passes that find nothing to do -----------------------------------------------------------------------------------

@@ -1,5 +1,9 @@
 """numba's compiler as our functions use it: entry points whole, and what is only ever inlined without machine code.
 
+Loops over lanes, `for l in range(np.uint64(16))` with a number that is written down, stay loops until LLVM comes to
+make vectors of them. It would unroll short ones before, and of what is left it makes vectors seldom: a block of agents
+in float64 had some of its laws once per lane, one after the other.
+
 numba makes machine code, and a wrapper for Python, of every compiled function, and optimises each to the end before it
 optimises its caller. Laws and kernels are parts of an entry point and of nothing else; that work was half of the time a
 scene took to compile. (The steps below are numba's own, less those; they are internals of numba, and tests notice when
@@ -13,8 +17,9 @@ import types
 from typing import Any
 
 import numba
+from llvmlite import ir as llvm  # type: ignore[import-untyped]
 from numba import _dynfunc  # type: ignore[attr-defined]  # compiled
-from numba.core import compiler, compiler_machinery, typed_passes
+from numba.core import analysis, compiler, compiler_machinery, ir, lowering, typed_passes
 
 from flockenv.frontend import lighter, spared
 
@@ -24,6 +29,12 @@ _register: Any = compiler_machinery.register_pass  # numba is untyped
 _Native: Any = typed_passes.NativeLowering
 _Compiler: Any = compiler.CompilerBase
 _Passes: Any = compiler.DefaultPassBuilder
+_Lower: Any = lowering.Lower
+_loops_of: Any = analysis.compute_cfg_from_blocks
+_Value: Any = llvm.values.MDValue
+
+FEWEST_LANES = 4
+"""A loop over fewer is none over lanes."""
 
 
 @functools.cache
@@ -55,11 +66,88 @@ def _finalise_unmade(library: Any) -> None:
     library._finalized = True
 
 
+class _LoopId(_Value):  # type: ignore[misc]
+    """What LLVM knows a loop by: metadata that begins with itself, and equals nothing else."""
+
+    def descr(self, buf: list[str]) -> None:
+        """Write it."""
+        parts = ", ".join(part.get_reference() for part in (self, *self.operands))
+        buf += (f"distinct !{{ {parts} }}", "\n")
+
+    def __eq__(self, other: object) -> bool:
+        return self is other
+
+    def __hash__(self) -> int:
+        return id(self)
+
+
+class _LanesStay(_Lower):  # type: ignore[misc]
+    """Lowering that asks LLVM not to unroll loops over lanes."""
+
+    def lower_function_body(self) -> Any:
+        """Lower, and mark the ways back to the beginnings of such loops."""
+        self._ends: dict[Any, Any] = {}
+        entry = super().lower_function_body()
+        graph = _loops_of(self.blocks)
+        for loop in graph.loops().values():
+            if _lanes(self.func_ir, self.blocks, loop.header) >= FEWEST_LANES:
+                lasts = [self._ends[last] for last, _ in graph.predecessors(loop.header) if last in loop.body]
+                self._keep([last.terminator for last in lasts])
+        return entry
+
+    def lower_block(self, block: Any) -> None:
+        """Lower one, and remember where it ended."""
+        super().lower_block(block)
+        self._ends[next(offset for offset, other in self.blocks.items() if other is block)] = self.builder.basic_block
+
+    def _keep(self, ways_back: list[Any]) -> None:
+        """Mark a loop by the branches to where it begins: it is not unrolled; what vectors are made of it may be."""
+        module = self.module
+
+        def said(text: str, *more: Any) -> Any:
+            return module.add_metadata([llvm.MetaDataString(module, text), *more])
+
+        stay = said("llvm.loop.unroll.disable")
+        then = said("llvm.loop.vectorize.followup_vectorized", said("llvm.loop.isvectorized", llvm.IntType(32)(1)))
+        name = _LoopId(module, [stay, then], name=str(len(module.metadata)))
+        for way_back in ways_back:
+            way_back.set_metadata("llvm.loop", name)
+
+
+def _lanes(code: Any, blocks: Any, header: Any) -> int:
+    """Return how often a loop goes round that is over `range(np.uint64(a number))`; 0 of any other loop."""
+    block = blocks[header]
+    if len(block.body) == 1 and isinstance(block.body[0], ir.Jump):  # numba puts an empty one before
+        block = blocks[block.body[0].target]
+    values = [line.value for line in block.body if isinstance(line, ir.Assign) and isinstance(line.value, ir.Expr)]
+    try:
+        iterator = next(value.value for value in values if value.op == "iternext")
+        over = _called(code, code.get_definition(iterator).value, "range")
+        number = code.get_definition(_called(code, over, "uint64"))
+        return int(number.value) if isinstance(number, (ir.Const, ir.Global, ir.FreeVar)) else 0
+    except (AttributeError, KeyError, StopIteration, TypeError, ValueError):  # KeyError: defined in several places
+        return 0
+
+
+def _called(code: Any, variable: Any, name: str) -> Any:
+    """Return the one argument of the call of that function whose result a variable is; TypeError if it is none."""
+    call = code.get_definition(variable)
+    function = code.get_definition(call.func)
+    if len(call.args) != 1 or name != (function.attr if isinstance(function, ir.Expr) else function.name):
+        raise TypeError
+    return call.args[0]
+
+
 @_register(mutates_CFG=True, analysis_only=False)
 class _Lowering(_Native):  # type: ignore[misc]
     """Lowering without machine code."""
 
     _name = "lowering_to_be_inlined"
+
+    @property
+    def lowering_class(self) -> Any:
+        """Which one lowers."""
+        return _LanesStay
 
     def run_pass(self, state: Any) -> bool:
         """Lower, and register the function for its callers."""

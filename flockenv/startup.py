@@ -15,7 +15,7 @@ __all__ = ["import_all", "nothing_to_collect"]
 def nothing_to_collect() -> Iterator[None]:
     """Keep Python from looking for garbage where nearly all that is made stays: it would walk through it repeatedly.
 
-    It took a seventh of the time until a process's first step. Compiling makes garbage: there it takes as long.
+    It took a seventh of the time until a process's first step.
     """
     collects = gc.isenabled()
     gc.disable()

@@ -83,7 +83,8 @@ def largest(around, squares, begin, until):
     worst, where = like(squares[0], -1.0), np.uint64(begin)
     for block in range(np.uint64(begin // {d * w}), np.uint64(until // {d * w})):
         base = block * np.uint64({d * w})
-        for l in range(np.uint64({w})):
+        for lane in range({w}):  # one after the other: no loop over lanes
+            l = np.uint64(lane)
             found = {" + ".join(f"squares[base + np.uint64({k * w}) + l]" for k in range(d))}
             more = (worst == worst) & ((found > worst) | (found != found))  # the first NaN stays
             worst, where = found if more else worst, base + l if more else where

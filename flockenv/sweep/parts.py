@@ -81,19 +81,9 @@ class Parts:
 
     @functools.cached_property
     def width(self) -> int:
-        """Lanes of a block: agents that one vector register holds.
-
-        Two registers in float64, where that was measured to be faster (benchmarks.composition): a few sums of a flat,
-        small scene, or a view cone, leave enough of the 32. And where everybody meets everybody: of a law as short as
-        those, LLVM unrolls a loop over 8 lanes before it comes to make vectors, and then makes none.
-        """
+        """Lanes of a block: agents that one vector register holds; in float64 two, where laws meet everybody."""
         one = LINE // self.itemsize
-        if self.itemsize == 8 and self.far:
-            return 2 * one
-        several = self.itemsize == 8 and self.dimension == 2 and not self.sorts and bool(self.pairs) and not self.look
-        sums = sum(effect.sums(self.dimension) for _, effect in self.pairs)
-        cone = any(sight.fov < 360 for sight in self.sights) and not any(sight.nearest for sight in self.sights)
-        return 2 * one if several and (sums <= 6 or (cone and sums <= 8)) else one
+        return 2 * one if self.itemsize == 8 and self.far else one
 
     @property
     def keyed(self) -> bool:

@@ -124,7 +124,8 @@ def step_world(
 {indented(_advance(parts), 8)}
 {indented(go_home(parts), 4)}
     worst = far
-    for l in range(np.uint64({parts.width})):
+    for lane in range({parts.width}):  # one after the other: no loop over lanes
+        l = np.uint64(lane)
         worst = min(worst, {bad})
     tally[team + rank] = np.int64(worst) if worst < far else n  # who counts may still be reading the first half
     wait_for_team(sync, team)
