@@ -123,10 +123,10 @@ class _Nothing(gymnasium.Env[Any, Any]):
         self._row = np.zeros(self.observation_space.shape, np.float32)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
-        return self._row, {}
+        return self._row.copy(), {}
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        return self._row, 0.0, False, False, {}
+        return self._row.copy(), 0.0, False, False, {}
 
 
 def _nothing(like: gymnasium.Env[Any, Any]) -> gymnasium.Env[Any, Any]:
