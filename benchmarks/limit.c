@@ -2,9 +2,21 @@
 #include <math.h>
 #include <stdlib.h>
 #include <string.h>
-#ifdef __AVX512F__
+#if defined(__AVX512F__)
 #include <immintrin.h>
+#define BYTES 64
+#define FORM "AVX-512 intrinsics"
+#elif defined(__AVX2__) && defined(__FMA__)
+#include <immintrin.h>
+#define BYTES 32
+#define FORM "AVX2 intrinsics"
+#else
+#define BYTES 16
+#define FORM "vectors of 16 bytes as GCC makes them: no limit on any machine"
 #endif
+
+/* What it is written in on this machine. */
+const char *form(void) { return FORM; }
 
 /* Memory that is kept from call to call, as flockenv keeps its own: for one thread. */
 static void *scratch(int slot, size_t bytes) {
@@ -24,9 +36,13 @@ static void *scratch(int slot, size_t bytes) {
 
 #define REAL float
 #define SUFFIX ps
+#define INTEGER int
+#if BYTES == 64
 #define VECTOR __m512
 #define MASK __mmask16
-#define INTEGER int
+#elif BYTES == 32
+#define VECTOR __m256
+#endif
 #define SQRT sqrtf
 #define FLOOR floorf
 #define D 2
@@ -49,9 +65,13 @@ static void *scratch(int slot, size_t bytes) {
 
 #define REAL double
 #define SUFFIX pd
+#define INTEGER long
+#if BYTES == 64
 #define VECTOR __m512d
 #define MASK __mmask8
-#define INTEGER long
+#elif BYTES == 32
+#define VECTOR __m256d
+#endif
 #define SQRT sqrt
 #define FLOOR floor
 #define D 2

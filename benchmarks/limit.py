@@ -62,6 +62,8 @@ class Reference:
 
     def __init__(self, limit: ctypes.CDLL) -> None:
         self.limit = limit
+        limit.form.restype = ctypes.c_char_p
+        self.form: str = limit.form().decode()  # which intrinsics it is written in here
 
     def stepper(self, scene: Scene, state: State, steps: int) -> Callable[[], object]:
         """Return a call that advances the arrays of `state` by so many steps, in place."""
@@ -143,18 +145,18 @@ def main(
     with Bench("limit", quick, rounds, out) as bench, compiled(bench, "limit") as libraries:
         by, most = Reference(libraries[0]) if libraries else None, machine(bench)
         same = [_race(bench, row, by, most) for row in rows]
-        _remarks(bench, by is not None)
+        _remarks(bench, by)
     if not all(same):
         raise typer.Exit(1)
 
 
-def _remarks(bench: Bench, beside: bool) -> None:
-    """Say what a call does, and all ratios in one line."""
+def _remarks(bench: Bench, by: Reference | None) -> None:
+    """Say what a call does, what C is written in, and all ratios in one line."""
     bench.note(
         "One thread. Every call begins in the same state; 10 steps a call unless a row says otherwise. C keeps the "
-        "agents of a large world sorted from step to step of a call."
+        f"agents of a large world sorted from step to step of a call{f'; it is in {by.form}' if by else ''}."
     )
-    ratios = [f"{r.race} {number(r.ratio)}" for r in bench.results if r.name == "flockenv" and r.ratio and beside]
+    ratios = [f"{r.race} {number(r.ratio)}" for r in bench.results if r.name == "flockenv" and r.ratio and by]
     if ratios:
         bench.note(f"flockenv's rate over that of C: {'; '.join(ratios)}.")
 

@@ -9,56 +9,73 @@
 #define LESS NAME(less)
 #define KEEP NAME(keep)
 #define ADD NAME(add)
-#define TAKE NAME(take)
+#define ONE_MORE NAME(one_more)
 #define W ((long)(sizeof(VEC) / sizeof(REAL)))
-#ifdef __AVX512F__
-typedef VECTOR VEC;
+#if BYTES == 64
+typedef VECTOR VEC, NAME(many);
 typedef MASK NAME(mask);
 static inline VEC ALL(REAL a) { return JOINED(_mm512_set1_, SUFFIX)(a); }
 static inline VEC KEEP(NAME(mask) m, VEC v) { return JOINED(_mm512_maskz_mov_, SUFFIX)(m, v); }
 static inline VEC ADD(NAME(mask) m, VEC a, VEC b) { return JOINED(_mm512_mask_add_, SUFFIX)(a, m, a, b); }
-static inline VEC TAKE(NAME(mask) m, VEC a, VEC b) { return JOINED(_mm512_mask_blend_, SUFFIX)(m, b, a); }
+static inline long NAME(lanes)(NAME(mask) m) { return m; }
 static inline VEC NAME(inverse)(NAME(mask) m, VEC a) { return JOINED(_mm512_maskz_div_, SUFFIX)(m, ALL(1), a); }
 static inline NAME(mask) LESS(VEC a, VEC b) { return JOINED(JOINED(_mm512_cmp_, SUFFIX), _mask)(a, b, _CMP_LT_OQ); }
 static inline VEC NAME(root)(VEC v) { return JOINED(_mm512_sqrt_, SUFFIX)(v); }
 static inline VEC NAME(whole)(VEC v) { return JOINED(_mm512_roundscale_, SUFFIX)(v, _MM_FROUND_TO_NEG_INF); }
-#else /* the same by GCC's own vectors of 64 bytes: right everywhere, and no limit anywhere */
-typedef REAL VEC __attribute__((vector_size(64)));
-typedef INTEGER NAME(mask) __attribute__((vector_size(64)));
+static inline VEC ONE_MORE(NAME(mask) m, VEC a) { return ADD(m, a, ALL(1)); }
+static inline VEC NAME(number)(VEC a) { return a; }
+#else /* a mask is a vector of integers: -1, or 0; and so is what is counted */
+typedef INTEGER NAME(mask) __attribute__((vector_size(BYTES)));
+typedef NAME(mask) NAME(many);
+#if BYTES == 32
+typedef VECTOR VEC;
+static inline VEC ALL(REAL a) { return JOINED(_mm256_set1_, SUFFIX)(a); }
+static inline long NAME(lanes)(NAME(mask) m) { return JOINED(_mm256_movemask_, SUFFIX)((VEC)m); }
+static inline VEC NAME(root)(VEC v) { return JOINED(_mm256_sqrt_, SUFFIX)(v); }
+static inline VEC NAME(whole)(VEC v) { return JOINED(_mm256_floor_, SUFFIX)(v); }
+static inline NAME(mask) LESS(VEC a, VEC b) { return (NAME(mask))JOINED(_mm256_cmp_, SUFFIX)(a, b, _CMP_LT_OQ); }
+#else
+typedef REAL VEC __attribute__((vector_size(BYTES)));
 static inline VEC ALL(REAL a) { VEC v = {0}; return v + a; }
-static inline VEC KEEP(NAME(mask) m, VEC v) { return (VEC)((NAME(mask))v & m); }
-static inline VEC ADD(NAME(mask) m, VEC a, VEC b) { return a + KEEP(m, b); }
-static inline VEC TAKE(NAME(mask) m, VEC a, VEC b) { return KEEP(m, a) + KEEP(~m, b); }
-static inline VEC NAME(inverse)(NAME(mask) m, VEC a) { return KEEP(m, 1 / a); }
-static inline NAME(mask) LESS(VEC a, VEC b) { return a < b; }
+static inline long NAME(lanes)(NAME(mask) m) { long b = 0; for (int l = 0; l < W; l++) b |= (m[l] & 1L) << l; return b; }
 static inline VEC NAME(root)(VEC v) { for (int l = 0; l < W; l++) v[l] = SQRT(v[l]); return v; }
 static inline VEC NAME(whole)(VEC v) { for (int l = 0; l < W; l++) v[l] = FLOOR(v[l]); return v; }
+static inline NAME(mask) LESS(VEC a, VEC b) { return a < b; }
+#endif
+static inline VEC KEEP(NAME(mask) m, VEC v) { return (VEC)((NAME(mask))v & m); }
+static inline VEC ADD(NAME(mask) m, VEC a, VEC b) { return a + KEEP(m, b); }
+static inline VEC NAME(inverse)(NAME(mask) m, VEC a) { return KEEP(m, 1 / a); }
+static inline NAME(mask) ONE_MORE(NAME(mask) m, NAME(mask) a) { return a - m; }
+static inline VEC NAME(number)(NAME(mask) a) { return __builtin_convertvector(a, VEC); }
 #endif
 
-typedef struct { VEC push[D], speed[D], centre[D], mates, company; } NAME(sums);
+typedef struct { VEC push[D], speed[D], centre[D]; NAME(many) mates, company; } NAME(sums);
 typedef struct { VEC x[D], v[D], t[D]; } NAME(block);
 typedef struct { REAL size, apart, agree, near, w_apart, w_agree, w_near, force, speed, dt; } NAME(rules);
 
-/* One candidate against a block, that meets itself too: `image` asks for the nearest periodic image. Agents in one
-   place part along the difference of their ties; oneself has none. */
+/* One candidate against a block: `image` asks for the nearest periodic image. A block meets itself too, in lane `self`
+   (-1 is none). Agents in one place part along the difference of their ties: seldom, so that a branch costs nothing. */
 static inline void NAME(meet)(NAME(sums) *s, const NAME(block) *me, const REAL *xj, const REAL *vj,
-                              const REAL *tj, int image, const NAME(rules) *p) {
-    VEC d[D], square, one = ALL(1);
+                              const REAL *tj, int image, long self, const NAME(rules) *p) {
+    VEC d[D], square;
     for (int k = 0; k < D; k++) {
         d[k] = ALL(xj[k]) - me->x[k];
         if (image) d[k] -= p->size * NAME(whole)(d[k] * (1 / p->size) + (REAL)0.5);
         square = k ? square + d[k] * d[k] : d[k] * d[k];
     }
     NAME(mask) agree = LESS(square, ALL(p->agree * p->agree)), near = LESS(square, ALL(p->near * p->near));
-    NAME(mask) close = LESS(square, ALL(p->apart * p->apart)), apart = LESS(ALL((REAL)1e-30), square);
-    VEC share = -1 / square;
+    NAME(mask) apart = LESS(ALL((REAL)1e-30), square), close = LESS(square, ALL(p->apart * p->apart));
+    VEC share = KEEP(apart & close, -1 / square);
     for (int k = 0; k < D; k++) {
-        s->push[k] = ADD(close, s->push[k], TAKE(apart, d[k] * share, me->t[k] - ALL(tj[k])));
+        s->push[k] += d[k] * share;
         s->speed[k] = ADD(agree, s->speed[k], ALL(vj[k]));
         s->centre[k] = ADD(near, s->centre[k], d[k]);
     }
-    s->mates = ADD(agree, s->mates, one);
-    s->company = ADD(near, s->company, one);
+    s->mates = ONE_MORE(agree, s->mates);
+    s->company = ONE_MORE(near, s->company);
+    NAME(mask) one_place = LESS(square, ALL((REAL)1e-30));
+    if (__builtin_expect(NAME(lanes)(one_place) & ~(self < 0 ? 0L : 1L << self), 0))
+        for (int k = 0; k < D; k++) s->push[k] = ADD(one_place, s->push[k], me->t[k] - ALL(tj[k]));
 }
 
 /* 1 where the square of a length is within a limit, else by how much the length is to be multiplied. */
@@ -83,9 +100,9 @@ static inline NAME(block) NAME(begin)(const REAL *now, long padded, long first, 
 static inline void NAME(move)(const NAME(sums) *s, const NAME(block) *me, const NAME(rules) *p, REAL *next, long padded,
                               long first) {
     VEC one = ALL(1), wish[D], square = ALL(0), fast = ALL(0);
-    NAME(mask) some = LESS(one, s->mates);
-    VEC mates = NAME(inverse)(some, s->mates - one);
-    VEC company = NAME(inverse)(LESS(one, s->company), s->company - one);
+    VEC others = NAME(number)(s->mates) - one, all = NAME(number)(s->company) - one;
+    NAME(mask) some = LESS(ALL(0), others);
+    VEC mates = NAME(inverse)(some, others), company = NAME(inverse)(LESS(ALL(0), all), all);
     for (int k = 0; k < D; k++) {
         VEC agree = (s->speed[k] - me->v[k]) * mates - KEEP(some, me->v[k]);
         wish[k] = p->w_apart * s->push[k] + p->w_agree * agree + p->w_near * (s->centre[k] * company);
@@ -135,7 +152,7 @@ void NAME(worlds)(REAL *restrict x, REAL *restrict v, const REAL *restrict ties,
                         xj[k] = now[k * padded + j], vj[k] = now[(D + k) * padded + j];
                         tj[k] = now[(2 * D + k) * padded + j];
                     }
-                    NAME(meet)(&s, &me, xj, vj, tj, 1, &p);
+                    NAME(meet)(&s, &me, xj, vj, tj, 1, j - first < W ? j - first : -1, &p);
                 }
                 NAME(move)(&s, &me, &p, next, padded, first);
             }
@@ -245,7 +262,7 @@ static __attribute__((noinline)) void NAME(row)(const NAME(grid) *g, long row, c
                         xj[k] = now[k * padded + j] + near[k], vj[k] = now[(D + k) * padded + j];
                         tj[k] = now[(2 * D + k) * padded + j];
                     }
-                    NAME(meet)(&s, &me, xj, vj, tj, 0, &p);
+                    NAME(meet)(&s, &me, xj, vj, tj, 0, j - first < W ? j - first : -1, &p);
                 }
             }
         NAME(move)(&s, &me, &p, g->next, padded, first);
@@ -287,4 +304,4 @@ void NAME(crowd)(REAL *restrict x, REAL *restrict v, const REAL *restrict ties, 
 #undef LESS
 #undef KEEP
 #undef ADD
-#undef TAKE
+#undef ONE_MORE

@@ -19,8 +19,8 @@
 #define CHAINS(do) SIX(do) do(6) do(7) do(8) do(9) do(10) do(11)
 #define COUNT 12
 #else
-#define CHAINS(do) SIX(do)
-#define COUNT 6
+#define CHAINS(do) SIX(do) do(6)
+#define COUNT 7
 #endif
 #define BEGIN(k) vector a##k = some, b##k = some;
 #define GO_ON(k)              \
