@@ -303,6 +303,9 @@ class World:
             raise ValueError(f"actions have shape {given.shape}, expected (worlds, learners, numbers) = {kept.shape}")
         if given.dtype == kept.dtype and given.flags.carray:
             return given
+        if given.dtype == np.float32:  # as spaces sample them, into doubles: each has its number there
+            kept[...] = given
+            return kept
         try:
             with np.errstate(over="ignore"):
                 kept[...] = given
@@ -331,7 +334,7 @@ class World:
 
         NaN would not do: two equal infos would then differ.
         """
-        values = {name: float(column[world]) for name, column in self._metrics().items()}
+        values = {name: float(column.item(world)) for name, column in self._metrics().items()}
         return {name: value for name, value in values.items() if value == value}
 
     def _metrics(self) -> dict[str, NDArray[np.float64]]:

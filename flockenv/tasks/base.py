@@ -121,7 +121,7 @@ class Task(Record):
         if abs(ratio - round(ratio)) > 1e-9 or round(ratio) < 1:
             raise ValueError(f"control_dt = {self.control_dt:g} s is not a whole multiple of dt = {self.dt:g} s")
 
-    @property
+    @functools.cached_property
     def substeps(self) -> int:
         """Physics steps per decision."""
         return round(self.control_dt / self.dt)
