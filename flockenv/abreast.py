@@ -7,6 +7,7 @@ So a task writes columns, one number of all agents after the other, and squares 
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -15,15 +16,22 @@ from numba.core import cgutils, types
 from numba.extending import intrinsic
 from numba.np import arrayobj
 
-from flockenv.kernels import LINE, kernel
+from flockenv import processor
+from flockenv.kernels import LINE, kernel, written
 from flockenv.lines import array_of, in_one_piece
 
 __all__ = [
-    "PAIR", "SIDE", "apart", "columns", "into_rows", "key_of", "key_read", "key_written", "looked_up", "packed", "pick",
-    "same_key", "tag_of", "take",
+    "PAIR", "SIDE", "apart", "columns", "into_rows", "key_of", "key_read", "key_written", "packed", "pick", "same_key",
+    "tag_of", "take",
 ]  # fmt: skip
 
 SIDE = LINE // 4
+"""Single precision numbers in a line, and in the longest vector register: so many agents are shown side by side."""
+
+SHORT = 8
+"""A table of more registers is not looked up in registers."""
+
+SQUARE = processor.REGISTER // 4
 """Single precision numbers in a vector register: squares of as many rows and columns are turned at once."""
 
 PAIR = 2 * SIDE
@@ -93,69 +101,106 @@ def _columns(typing_context: Any, flat: Any, count: Any, many: Any, distance: An
 columns: Any = intrinsic(_columns)
 
 
-def _looks_up(typing_context: Any) -> Any:
-    """Say whether numbers are looked up in registers, `pick`; a constant of machine code."""
+def _lookup(builder: Any, vector: Any, size: int) -> tuple[int, Any]:
+    """Return how many numbers are looked up at once in registers as long as that, and the instruction; 0 if none can.
 
-    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        return context.get_constant(types.boolean, _permutes(context))
+    It takes the last bits of who is named, and one register of a table, or two.
+    """
+    declare: Any = cgutils.get_or_insert_function
+    index = ir.VectorType(ir.IntType(8 * size), vector.count)
+    if "avx512f" in processor.FEATURES and vector.count * size == 64:
+        name = f"llvm.x86.avx512.vpermi2var.p{'s' if size == 4 else 'd'}.512"
+        call = declare(builder.module, ir.FunctionType(vector, [vector, index, vector]), name)
+        return 2 * vector.count, lambda named, table: builder.call(call, [table[0], named, table[1]])
+    if "avx2" in processor.FEATURES and (vector.count, size) == (8, 4):
+        call = declare(builder.module, ir.FunctionType(vector, [vector, index]), "llvm.x86.avx2.permps")
+        return vector.count, lambda named, table: builder.call(call, [table[0], named])
+    return 0, None
 
-    return types.boolean(), generate
+
+def _looked_up(builder: Any, part: Any, named: Any, vector: Any, size: int, count: Any) -> Any:
+    """Generate the look-up of those named in a table whose registers `part` reads: all of it, a PAIR at a time."""
+    step, lookup = _lookup(builder, vector, size)
+    word = ir.IntType(64)
+    named = named if size == 4 else builder.sext(named, ir.VectorType(word, vector.count))
+
+    def edge(begin: Any) -> Any:
+        first = begin if size == 8 else builder.trunc(begin, named.type.element)
+        edge = builder.insert_element(ir.Constant(named.type, ir.Undefined), first, ir.IntType(32)(0))
+        return builder.shuffle_vector(edge, edge, ir.Constant(ir.VectorType(ir.IntType(32), vector.count), None))
+
+    def among(first: Any, found: Any) -> Any:
+        for at in range(0, PAIR, step):
+            begin = builder.add(first, word(at))
+            table = [part(builder.add(begin, word(k)), vector) for k in range(0, step, vector.count)]
+            here = lookup(named, table)
+            found = builder.select(builder.icmp_signed(">=", named, edge(begin)), here, found) if found else here
+        return found
+
+    on_stack: Any = cgutils.alloca_once_value
+    steps: Any = cgutils.for_range_slice
+    found = on_stack(builder, among(word(0), None))
+    with steps(builder, word(PAIR), count, word(PAIR)) as (first, _):
+        builder.store(among(first, builder.load(found)), found)
+    return builder.load(found)
 
 
-looked_up: Any = intrinsic(_looks_up)
-
-
-def _permutes(context: Any) -> bool:
-    """Is machine code made for a processor with AVX-512?"""
-    return "+avx512f" in getattr(context.codegen(), "_tm_features", "").split(",")
+def _read(builder: Any, part: Any, named: Any, vector: Any) -> Any:
+    """Generate what reads those named one by one."""
+    found = ir.Constant(vector, ir.Undefined)
+    for k in range(vector.count):
+        here = builder.zext(builder.extract_element(named, ir.IntType(32)(k)), ir.IntType(64))
+        found = builder.insert_element(found, part(here, vector.element), ir.IntType(32)(k))
+    return found
 
 
 def _picks(
-    typing_context: Any, to: Any, at: Any, table: Any, first: Any, count: Any, who: Any, place: Any
+    typing_context: Any, to: Any, at: Any, beside: Any, table: Any, first: Any, length: Any, many: Any, count: Any,
+    who: Any, place: Any, width: Any,
 ) -> Any:  # fmt: skip
-    """Write a register of numbers from to[at] on: those that the int32 from who[place] on name, of a table of `count`.
+    """Write what `many` rows of a table of `count` agents say of `width` of them: of those that who[place] and on name.
 
-    The table begins at table[first], may be read in whole pairs of registers, and is looked up a pair at a time. All
-    lies in one piece, and places are counted through. Where `_permutes` says no, nothing is written.
+    The first row begins at table[first], the next `length` further, and may be read in whole multiples of PAIR; what it
+    says comes to to[at] and on, then `beside` further. All lies in one piece, and places are counted through. Short
+    rows are looked up in registers, where a processor can do that; else agents are read one by one.
     """
     for array in (to, table, who):
         in_one_piece(array)
+    wide = written(width, "width")
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        if not _permutes(context):
-            return context.get_dummy_value()
-        number = context.get_data_type(to.dtype)
+        number, word = context.get_data_type(to.dtype), ir.IntType(64)
         size = context.get_abi_sizeof(number)
-        lanes, whole, word = LINE // size, ir.IntType(8 * size), ir.IntType(64)
-        vector, index = ir.VectorType(number, lanes), ir.VectorType(whole, lanes)
-        declare: Any = cgutils.get_or_insert_function
-        name = f"llvm.x86.avx512.vpermi2var.p{'s' if size == 4 else 'd'}.512"
-        permuted = declare(builder.module, ir.FunctionType(vector, [vector, index, vector]), name)
+        vector = ir.VectorType(number, min(wide, processor.REGISTER // size))
+        step, _ = _lookup(builder, vector, size)
+        few = builder.icmp_unsigned("<=", arguments[7], word(SHORT * vector.count if step else 0))
+        rows: Any = cgutils.for_range_slice
 
-        def pointer(k: int, here: Any, kind: Any = vector) -> Any:
+        def pointer(k: int, here: Any, kind: Any) -> Any:
             data = array_of(context, builder, signature.args[k], arguments[k]).data
             return builder.bitcast(builder.gep(data, [here]), kind.as_pointer())
 
-        named = builder.load(pointer(5, arguments[6], ir.VectorType(ir.IntType(32), lanes)), align=4)
-        named = named if size == 4 else builder.sext(named, index)
+        def each(begin: int, say: Callable[[Callable[[Any, Any], Any]], Any]) -> None:
+            with rows(builder, word(0), arguments[6], word(1)) as (r, _):
+                row = builder.add(arguments[4], builder.mul(r, arguments[5]))
+                says = say(lambda here, kind: builder.load(pointer(3, builder.add(row, here), kind), align=size))
+                place = builder.add(builder.add(arguments[1], word(begin)), builder.mul(r, arguments[2]))
+                builder.store(says, pointer(0, place, vector), align=size)
 
-        def looked_up(begin: Any) -> Any:
-            here = [builder.add(arguments[3], builder.add(begin, word(k))) for k in (0, lanes)]
-            low, high = (builder.load(pointer(2, each), align=size) for each in here)
-            return builder.call(permuted, [low, named, high])
-
-        on_stack: Any = cgutils.alloca_once_value
-        found = on_stack(builder, looked_up(word(0)))  # of a number, the last bits are looked at
-        pairs: Any = cgutils.for_range_slice
-        with pairs(builder, word(2 * lanes), arguments[4], word(2 * lanes)) as (begin, _):
-            edge = builder.insert_element(ir.Constant(index, ir.Undefined), builder.trunc(begin, whole), word(0))
-            edges = builder.shuffle_vector(edge, edge, ir.Constant(ir.VectorType(ir.IntType(32), lanes), [0] * lanes))
-            here = builder.icmp_unsigned(">=", named, edges)
-            builder.store(builder.select(here, looked_up(begin), builder.load(found)), found)
-        builder.store(builder.load(found), pointer(0, arguments[1]), align=size)
+        for begin in range(0, wide, vector.count):
+            names = ir.VectorType(ir.IntType(32), vector.count)
+            named = builder.load(pointer(8, builder.add(arguments[9], word(begin)), names), align=4)
+            with builder.if_else(few) as (short, long):
+                with short:
+                    if step:
+                        each(begin, lambda part: _looked_up(builder, part, named, vector, size, arguments[7]))  # noqa: B023
+                with long:
+                    each(begin, lambda part: _read(builder, part, named, vector))  # noqa: B023
         return context.get_dummy_value()
 
-    return types.void(to, types.uint64, table, types.uint64, types.uint64, who, types.uint64), generate
+    number = types.uint64
+    given = (to, number, number, table, number, number, number, number, who, number, width)
+    return types.void(*given), generate
 
 
 pick: Any = intrinsic(_picks)
@@ -224,50 +269,44 @@ same_key: Any = intrinsic(_same_key)
 def take(to: Any, table: Any, who: Any, count: int) -> None:
     """Write into to (R, K, N) what the first R rows of a table (.., N') of `count` agents say of those listed, (K, N).
 
-    N and N' are multiples of PAIR, and whom the lists name beyond the last agent is below `count`, too. While a row of
-    the table is a few registers long, a register of agents is looked up in it at once (with AVX-512).
+    N and N' are multiples of PAIR, and whom the lists name beyond the last agent is below `count`, too.
     """
     many, listed, n = np.uint64(to.shape[0]), np.uint64(who.shape[0]), np.uint64(who.shape[1])
-    lanes, length = np.uint64(LINE // to.itemsize), np.uint64(table.shape[1])
-    if looked_up() and np.uint64(count) <= np.uint64(8) * lanes:
-        for i in range(np.uint64(0), n, lanes):
-            for s in range(listed):
-                for r in range(many):
-                    pick(to, (r * listed + s) * n + i, table, r * length, np.uint64(count), who, s * n + i)
-    else:
-        for r in range(many):
-            for s in range(listed):
-                for i in range(n):
-                    to[r, s, i] = table[r, np.uint64(who[s, i])]
+    beside, length, agents = listed * n, np.uint64(table.shape[1]), np.uint64(count)
+    for s in range(listed):
+        for i in range(s * n, s * n + n, np.uint64(SIDE)):
+            pick(to, i, beside, table, np.uint64(0), length, many, agents, who, i, SIDE)
 
 
 def _turned_square(
     typing_context: Any, to: Any, at: Any, across: Any, many: Any, source: Any, place: Any, down: Any
 ) -> Any:
-    """Copy 16 x 16 numbers turned: column k, from `place` + k * `down`, goes to every `across`-th from `at` + k.
+    """Copy a square of numbers turned: column k, from `place` + k * `down`, goes to every `across`-th from `at` + k.
 
-    The first `many` rows of them are written.
+    Its side is SQUARE; the first `many` rows of it are written.
     """
     in_one_piece(to)
     in_one_piece(source)
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        vector = ir.VectorType(context.get_data_type(to.dtype), SIDE)
+        vector = ir.VectorType(context.get_data_type(to.dtype), SQUARE)
         targets, sources = (array_of(context, builder, kind, arguments[k]).data for k, kind in ((0, to), (4, source)))
 
         def line(base: Any, k: int, first: Any, step: Any) -> Any:
             here = builder.add(first, builder.mul(step, ir.Constant(step.type, k)))
             return builder.bitcast(builder.gep(base, [here]), vector.as_pointer())
 
-        numbers = [builder.load(line(sources, k, *arguments[5:]), align=4) for k in range(SIDE)]
-        for s in (1, 2, 4, 8):  # squares of 2 s, made of four squares of s: two change places
-            low = [SIDE + k - s if k & s else k for k in range(SIDE)]
-            high = [SIDE + k if k & s else k + s for k in range(SIDE)]
-            masks = [ir.Constant(ir.VectorType(ir.IntType(32), SIDE), mask) for mask in (low, high)]
-            for r in (r for r in range(SIDE) if not r & s):
+        numbers = [builder.load(line(sources, k, *arguments[5:]), align=4) for k in range(SQUARE)]
+        for s in (
+            1 << k for k in range(SQUARE.bit_length() - 1)
+        ):  # of four squares of s in one of 2 s, two are swapped
+            low = [SQUARE + k - s if k & s else k for k in range(SQUARE)]
+            high = [SQUARE + k if k & s else k + s for k in range(SQUARE)]
+            masks = [ir.Constant(ir.VectorType(ir.IntType(32), SQUARE), mask) for mask in (low, high)]
+            for r in (r for r in range(SQUARE) if not r & s):
                 pair = numbers[r], numbers[r + s]
                 numbers[r], numbers[r + s] = (builder.shuffle_vector(*pair, mask) for mask in masks)
-        for k in range(SIDE):
+        for k in range(SQUARE):
             with builder.if_then(builder.icmp_unsigned(">", arguments[3], ir.Constant(arguments[3].type, k))):
                 builder.store(numbers[k], line(targets, k, *arguments[1:3]), align=4)
         return context.get_dummy_value()
@@ -285,11 +324,11 @@ def into_rows(rows: Any, flat: Any, many: int, distance: int) -> None:
     Squares at the end of a row overlap with those before them: what is copied twice is the same.
     """
     count, size, step = rows.shape[0], np.uint64(rows.shape[1]), np.uint64(distance)
-    if many >= SIDE:
-        for i in range(0, count, SIDE):
+    if many >= SQUARE:
+        for i in range(0, count, SQUARE):
             row, left = np.uint64(i), np.uint64(count - i)
-            for c in range(0, many, SIDE):
-                column = np.uint64(min(c, many - SIDE))
+            for c in range(0, many, SQUARE):
+                column = np.uint64(min(c, many - SQUARE))
                 _turn_square(rows, row * size + column, size, left, flat, column * step + row, step)
     else:
         for i in range(count):

@@ -2,7 +2,8 @@
 
 Loops over lanes, `for l in range(np.uint64(16))` with a number that is written down, stay loops until LLVM comes to
 make vectors of them. It would unroll short ones before, and of what is left it makes vectors seldom: a block of agents
-in float64 had some of its laws once per lane, one after the other.
+in float64 had some of its laws once per lane, one after the other. For the same reason short ones count as loops worth
+the question whether arrays overlap (`_short_loops`).
 
 numba makes machine code, and a wrapper for Python, of every compiled function, and optimises each to the end before it
 optimises its caller. Laws and kernels are parts of an entry point and of nothing else; that work was half of the time a
@@ -14,10 +15,13 @@ from __future__ import annotations
 
 import functools
 import types
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import numba
-from llvmlite import ir as llvm  # type: ignore[import-untyped]
+from llvmlite import binding  # type: ignore[import-untyped]
+from llvmlite import ir as llvm
 from numba import _dynfunc  # type: ignore[attr-defined]  # compiled
 from numba.core import analysis, compiler, compiler_machinery, ir, lowering, typed_passes
 
@@ -35,6 +39,30 @@ _Value: Any = llvm.values.MDValue
 
 FEWEST_LANES = 4
 """A loop over fewer is none over lanes."""
+
+LONG = 16
+"""LLVM's own measure: of a shorter loop it makes no vectors where it must ask whether arrays overlap."""
+
+LLVMS = range(15, 23)
+"""Versions of LLVM that are known to take the option that says so: one that does not know it ends the process."""
+
+_depth = 0
+
+
+@contextmanager
+def _short_loops() -> Iterator[None]:
+    """Have vectors made of short loops, too, while one of our functions compiles: under numba's lock, see `lighter`."""
+    global _depth
+    known = binding.llvm_version_info[0] in LLVMS
+    if known and _depth == 0:
+        binding.set_option("flockenv", f"--vectorizer-min-trip-count={FEWEST_LANES}")
+    _depth += 1
+    try:
+        yield
+    finally:
+        _depth -= 1
+        if known and _depth == 0:
+            binding.set_option("flockenv", f"--vectorizer-min-trip-count={LONG}")
 
 
 @functools.cache
@@ -182,7 +210,7 @@ class Whole(_Compiler):  # type: ignore[misc]
         return passes
 
     def _compile_core(self) -> Any:
-        with lighter():
+        with lighter(), _short_loops():
             return super()._compile_core()
 
 

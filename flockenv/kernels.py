@@ -42,7 +42,7 @@ __all__ = [
     "ask_for",
     "asked",
     "cache_folder",
-    "copy_line",
+    "copy_lanes",
     "entry",
     "finite",
     "kernel",
@@ -57,6 +57,7 @@ __all__ = [
     "unaliased",
     "unfused",
     "wait_for_team",
+    "written",
 ]
 
 F = TypeVar("F", bound=Callable[..., Any])
@@ -142,7 +143,8 @@ def unaliased(typing_context: Any) -> Any:
     of three in a sweep. Whoever calls such an entry point keeps the promise; Scene and World do, by allocating.
 
     Its loops, over lanes of 64 bytes, may use registers of that size: on most of Intel's processors LLVM would halve
-    them, for the sake of code around them.
+    them, for the sake of code around them. And its stack begins where a line of the cache does: else registers that are
+    put there for a while lie across two, in one process and not in the next.
     """
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
@@ -152,6 +154,7 @@ def unaliased(typing_context: Any) -> Any:
         attributes = builder.function.attributes
         if isinstance(attributes, set):  # written as they stand; but `add` of llvmlite's knows none that has a value
             set.add(attributes, f'"prefer-vector-width"="{8 * LINE}"')
+            set.add(attributes, '"stackrealign"')
         return context.get_dummy_value()
 
     return types.void(), generate
@@ -168,25 +171,33 @@ def _add_at_once(typing_context: Any, array: Any, amount: Any) -> Any:
     return types.int64(array, types.int64), generate
 
 
+def written(number: Any, name: str) -> int:
+    """Return a number that a source hands over written down; numba tries again with it if it did not hand it over."""
+    if not isinstance(number, types.IntegerLiteral):
+        raise numba.TypingError(f"{name}: {number}, must be written as a number")
+    return int(number.literal_value)
+
+
 _fetch_add: Any = intrinsic(_add_at_once)  # Any: to numba's stubs an intrinsic that is called never returns
 
 LINE = 64
-"""Bytes of a vector register, and of a line of the cache."""
+"""Bytes of a line of the cache; no vector register is longer."""
 
 
-def _copy_line(typing_context: Any, to: Any, at: Any, source: Any, place: Any) -> Any:
-    """Copy 64 bytes of numbers, from `place` on, to where `at` is: as one vector, whatever becomes of loops.
+def _copy_lanes(typing_context: Any, to: Any, at: Any, source: Any, place: Any, width: Any) -> Any:
+    """Copy `width` numbers, from `place` on, to where `at` is: as one vector, whatever becomes of loops.
 
-    Both arrays have one axis and lie in one piece; places are counted without a sign.
+    Both arrays have one axis and lie in one piece; places are counted without a sign, and the width is written down.
     """
     if to.dtype != source.dtype or (to.layout, source.layout, to.ndim, source.ndim) != ("C", "C", 1, 1):
-        raise numba.TypingError(f"copy_line: {source} into {to}, must be one row of the same numbers, in one piece")
+        raise numba.TypingError(f"copy_lanes: {source} into {to}, must be one row of the same numbers, in one piece")
+    wide = written(width, "width")
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         make: Any = arrayobj.make_array
         number = context.get_data_type(signature.args[0].dtype)
         size = context.get_abi_sizeof(number)
-        vector = ir.VectorType(number, LINE // size).as_pointer()
+        vector = ir.VectorType(number, wide).as_pointer()
 
         def pointer(k: int) -> Any:
             data = make(signature.args[k])(context, builder, arguments[k]).data
@@ -195,10 +206,10 @@ def _copy_line(typing_context: Any, to: Any, at: Any, source: Any, place: Any) -
         builder.store(builder.load(pointer(2), align=size), pointer(0), align=size)
         return context.get_dummy_value()
 
-    return types.void(to, types.uint64, source, types.uint64), generate
+    return types.void(to, types.uint64, source, types.uint64, width), generate
 
 
-copy_line: Any = intrinsic(_copy_line)
+copy_lanes: Any = intrinsic(_copy_lanes)
 
 
 def asked(builder: Any, address: Any) -> None:

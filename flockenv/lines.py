@@ -62,9 +62,12 @@ def _fetch(typing_context: Any, array: Any, part: Any, parts: Any) -> Any:
 fetch: Any = intrinsic(_fetch)
 
 
-def put_past(builder: Any, vector: Any, line: Any) -> None:
-    """Generate what writes a line of memory past the caches: all of it, so that nothing is read before."""
-    stored = builder.store(vector, line, align=LINE)
+def put_past(builder: Any, vector: Any, place: Any, size: int) -> None:
+    """Generate what writes a vector of so many bytes past the caches, to a place whose address is a multiple of that.
+
+    Whoever writes a line of memory writes all of it, so that nothing is read before.
+    """
+    stored = builder.store(vector, place, align=size)
     stored.set_metadata("nontemporal", builder.module.add_metadata([ir.IntType(32)(1)]))
 
 
@@ -93,7 +96,7 @@ def _poured(typing_context: Any, to: Any, at: Any, source: Any) -> Any:
         each: Any = cgutils.for_range_slice
         with each(builder, head, tail, word(side)) as (k, _):
             here, there = (builder.bitcast(builder.gep(base, [k]), vector) for base in (old.data, start))
-            put_past(builder, builder.load(here, align=size), there)
+            put_past(builder, builder.load(here, align=size), there, LINE)
         for begin, end in ((word(0), head), (tail, old.nitems)):
             with each(builder, begin, end, word(1)) as (k, _):
                 builder.store(builder.load(builder.gep(old.data, [k])), builder.gep(start, [k]))

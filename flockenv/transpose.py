@@ -9,12 +9,12 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Any
 
-import numba
 from llvmlite import ir  # type: ignore[import-untyped]
 from numba.core import types
 from numba.extending import intrinsic
 
-from flockenv.kernels import LINE
+from flockenv import processor
+from flockenv.kernels import LINE, written
 from flockenv.lines import array_of, put_past
 
 __all__ = ["out_of_records", "put_lines", "put_records"]
@@ -64,13 +64,6 @@ def _pointer(builder: Any, data: Any, place: Any, kind: Any) -> Any:
     return builder.bitcast(builder.gep(data, [place]), kind.as_pointer())
 
 
-def _width(width: Any) -> int:
-    """Return a number that is written into the source; numba tries again with it if it did not hand it over."""
-    if not isinstance(width, types.IntegerLiteral):
-        raise numba.TypingError(f"width: {width}, must be written as a number")
-    return int(width.literal_value)
-
-
 def _put_records(
     typing_context: Any, records: Any, sources: Any, places: Any, width: Any, cell: Any, first: Any, offset: Any,
     spare: Any,
@@ -81,14 +74,14 @@ def _put_records(
     by side from a place on. cell: int32, -1 for who has none: his is written to place `spare`, behind all others.
     offset: int32, the next place of each cell. Everything lies in one piece.
     """
-    wide, many = _width(width), 2 + sources.count
+    wide, many = written(width, "width"), 2 + sources.count
     size = _whole(many)
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         to, cells, offsets = (array_of(context, builder, signature.args[k], arguments[k]).data for k in (0, 4, 6))
         array, real = signature.args[1].dtype, context.get_data_type(signature.args[0].dtype)
         itemsize = context.get_abi_sizeof(real)
-        side = min(wide, LINE // itemsize)  # lanes of a register
+        side = min(wide, processor.REGISTER // itemsize)  # lanes of a register
         vector, word, whole = ir.VectorType(real, side), ir.IntType(64), ir.IntType(32)
         several = ir.VectorType(whole, side)
 
@@ -141,14 +134,14 @@ def _put_lines(
     place `to` (int32, counted in pieces; -1 for place `spare`); behind the last source stands anything. Lines go past
     the caches: each is far from the next, and must not be read before it is written.
     """
-    wide, many, piece = _width(width), sources.count, _width(length)
+    wide, many, piece = written(width, "width"), sources.count, written(length, "length")
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         data, where = (array_of(context, builder, signature.args[k], arguments[k]).data for k in (0, 4))
         array, real = signature.args[1].dtype, context.get_data_type(signature.args[0].dtype)
         itemsize = context.get_abi_sizeof(real)
-        side = LINE // itemsize
-        size = max(_whole(many), side)
+        side = min(wide, processor.REGISTER // itemsize)
+        size = max(_whole(many), LINE // itemsize)
         vector, word = ir.VectorType(real, side), ir.IntType(64)
 
         def row(k: int, begin: int) -> Any:
@@ -167,7 +160,7 @@ def _put_lines(
                 start = builder.mul(place, word(piece))
                 for done in range(0, piece, side):
                     pointer = _pointer(builder, data, builder.add(start, word(done)), vector)
-                    put_past(builder, flat[(lane * size + done) // side], pointer)
+                    put_past(builder, flat[(lane * size + done) // side], pointer, side * itemsize)
         return context.get_dummy_value()
 
     numbers = _several(types.uint64, sources.count)
@@ -183,14 +176,14 @@ def _out_of_records(typing_context: Any, numbers: Any, places: Any, at: Any, wid
     Of a record, its cell goes nowhere; there is a place for its agent, and for every number behind. Behind the last
     record there must be room for another, up to the next power of two of its length.
     """
-    wide, many = _width(width), 1 + places.count
+    wide, many = written(width, "width"), 1 + places.count
     size = _whole(many)
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         to, source = (array_of(context, builder, signature.args[k], arguments[k]).data for k in (0, 4))
         real, word = context.get_data_type(signature.args[0].dtype), ir.IntType(64)
         itemsize = context.get_abi_sizeof(real)
-        side = min(wide, LINE // itemsize)  # lanes of a register
+        side = min(wide, processor.REGISTER // itemsize)  # lanes of a register
         vector = ir.VectorType(real, side)
 
         def piece(lane: int, done: int, count: int) -> Any:

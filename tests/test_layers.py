@@ -28,6 +28,7 @@ LAYERS = (
         "frontend",
         "turns",
         "startup",
+        "processor",
     },
     {"records", "vec", "elementary", "noise", "kernels", "targets", "abreast", "lines", "transpose"},
     {"state", "space", "steering", "arbitration", "vehicle", "appearance", "spread", "urges"},

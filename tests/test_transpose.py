@@ -10,6 +10,7 @@ from flockenv.kernels import LINE
 from flockenv.transpose import out_of_records, put_lines, put_records
 
 LENGTHS = [3, 5, 6, 8, 9, 16, 17, 20]
+WIDTHS = [("float32", 16), ("float32", 8), ("float64", 8), ("float64", 4), ("float64", 16)]
 
 
 def compiled(length: int, width: int) -> Any:
@@ -30,7 +31,7 @@ def compiled(length: int, width: int) -> Any:
 
 
 @pytest.mark.parametrize("length", LENGTHS)
-@pytest.mark.parametrize(("dtype", "width"), [("float32", 16), ("float64", 8), ("float64", 16)])
+@pytest.mark.parametrize(("dtype", "width"), WIDTHS)
 def test_records_are_transposed_lanes(dtype: str, width: int, length: int) -> None:
     put, take = compiled(length, width)
     rng, n, rows = np.random.default_rng(length), 3 * width, 1 << (length - 1).bit_length()
@@ -57,7 +58,7 @@ def test_records_are_transposed_lanes(dtype: str, width: int, length: int) -> No
 
 
 @pytest.mark.parametrize("count", [1, 3, 8, 11, 16, 19, 33])
-@pytest.mark.parametrize(("dtype", "width"), [("float32", 16), ("float64", 8), ("float64", 16)])
+@pytest.mark.parametrize(("dtype", "width"), WIDTHS)
 def test_lines_are_transposed_lanes_too(dtype: str, width: int, count: int) -> None:
     side = LINE // np.dtype(dtype).itemsize
     length = max(-(-count // side) * side, side)

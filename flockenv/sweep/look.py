@@ -97,7 +97,7 @@ def _keyed(parts: Parts) -> list[str]:
             "far = near if far < near else far",
         ]
     lines = [
-        "sure = present == n and looked_up()",
+        "sure = present == n",
         "if sure:",
         f"    for l in range(np.uint64({w})):",
         *(f"        {place} = np.inf" for place in keys),
@@ -118,12 +118,11 @@ def _keyed(parts: Parts) -> list[str]:
     lines += ["        near_count[i] = count", "    sure = not doubt", "if sure:"]
     for k in range(many):
         picked = [slot(f"picked{j}") for j in range(d)]
-        for j in range(d):
-            at, first = parts.slots[f"picked{j}"] * w, parts.seen_fields.index(f"x{j}") * SMALL_STRIDE
-            lines.append(
-                f"    pick(lanes, np.uint64({at}), sorted_, np.uint64({first}), np.uint64(n), near_who, "
-                f"np.uint64({k}) * np.uint64(near_who.shape[1]) + block)"
-            )
+        at, first = parts.slots["picked0"] * w, parts.seen_fields.index("x0") * SMALL_STRIDE
+        lines.append(
+            f"    pick(lanes, np.uint64({at}), np.uint64({w}), sorted_, np.uint64({first}), np.uint64({SMALL_STRIDE}), "
+            f"np.uint64({d}), np.uint64(n), near_who, np.uint64({k}) * np.uint64(near_who.shape[1]) + block, {w})"
+        )
         lines += [
             f"    for l in range(np.uint64({w})):",
             f"        {me_of(parts, parts.seen_fields)}",

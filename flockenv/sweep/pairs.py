@@ -89,9 +89,8 @@ def _sum_up(parts: Parts) -> list[str]:
     names = [f"g{name}{j}" for name in parts.targets for j in range(d)]
     r, w = len(names), parts.width
     as_they_lie = [
-        line
+        copied(parts, "felt", f"block * np.uint64({r}) + np.uint64({j * w})", "lanes", slot.first(name))
         for j, name in enumerate(names)
-        for line in copied(parts, "felt", f"block * np.uint64({r}) + np.uint64({j * w})", "lanes", slot.first(name))
     ]
     return [
         "for r in range(found):",
@@ -145,9 +144,9 @@ def _finish(parts: Parts) -> list[str]:
 def _seen(parts: Parts, q: int) -> str:
     """Write whether candidate `it` is in sight q: near enough, ahead, and somebody else."""
     sight = parts.sights[q]
-    ahead = "other" if sight.fov >= 360 else f"ahead{_fovs(parts).index(sight.fov)}"
-    member = f" & (aj >= first{q}) & (aj < end{q})" if sight.group is not None else ""
-    open_ = f"{ahead} & (square < within{q}){member}"
+    ahead = [f"ahead{_fovs(parts).index(sight.fov)}"] if sight.fov < 360 else ["other"] * parts.masks
+    member = [f"(aj >= first{q})", f"(aj < end{q})"] if sight.group is not None else []
+    open_ = " & ".join([*ahead, f"({'square' if parts.masks else 'gap'} < within{q})", *member])
     if not sight.occluded:
         return open_
     # whoever is out of sight anyhow is not looked for behind obstacles: here a branch is cheaper than a choice
@@ -164,7 +163,8 @@ def _ahead(parts: Parts) -> list[str]:
     """Write whether the candidate is ahead, once for each field of view."""
     first = {sight.fov: q for q, sight in reversed(list(enumerate(parts.sights)))}
     return [
-        f"ahead{k} = other & in_view(view{first[fov]}, me.heading, to, square)" for k, fov in enumerate(_fovs(parts))
+        f"ahead{k} = {'other & ' * parts.masks}in_view(view{first[fov]}, me.heading, to, square)"
+        for k, fov in enumerate(_fovs(parts))
     ]
 
 
@@ -181,9 +181,12 @@ def meet_range(
     near = [q for q, sight in enumerate(parts.sights) if touch and sight in _touching(parts)]
 
     def over_lanes(offset: str, each: list[str]) -> list[str]:
+        met = [me_of(parts, fields), "other = own != number[l]", f"to = {offset}", f"square = {square}"]
+        if not parts.masks:  # oneself is far away: compared once, and not for every sight
+            met.append("gap = square if other else like(square, np.inf)")
         return [
             f"for l in range(np.uint64({parts.width})):",
-            indented([me_of(parts, fields), "other = own != number[l]", f"to = {offset}", f"square = {square}"], 4),
+            indented(met, 4),
             "    it = Other(aj, to, square, vj, rj, tj, mj, nj)",
             indented(each, 4),
         ]

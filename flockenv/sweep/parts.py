@@ -18,6 +18,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from flockenv import processor
 from flockenv.effects.base import Effect, Sight
 from flockenv.integrators.base import Integrator
 from flockenv.kernels import LINE
@@ -81,9 +82,16 @@ class Parts:
 
     @functools.cached_property
     def width(self) -> int:
-        """Lanes of a block: agents that one vector register holds; in float64 two, where laws meet everybody."""
-        one = LINE // self.itemsize
-        return 2 * one if self.itemsize == 8 and self.far else one
+        """Lanes of a block: agents that one vector register holds.
+
+        Where laws meet everybody, sixteen on any processor: a tree is made of blocks, so results follow from it.
+        """
+        return 16 if self.far else processor.REGISTER // self.itemsize
+
+    @property
+    def masks(self) -> bool:
+        """Is what was compared kept in masks, beside the registers, so that it costs nothing to compare once more?"""
+        return processor.REGISTER == LINE
 
     @property
     def keyed(self) -> bool:
@@ -378,7 +386,8 @@ class Parts:
     @property
     def luggage_size(self) -> int:
         """How many numbers that takes, in whole cache lines."""
-        return -(-len(self.luggage) // self.width) * self.width
+        one = LINE // self.itemsize
+        return -(-len(self.luggage) // one) * one
 
     @functools.cached_property
     def slots(self) -> dict[str, int]:

@@ -93,9 +93,10 @@ def _lines(parts: Parts, fields: list[str]) -> list[str]:
     for r, f in enumerate(fields):
         to = f"np.uint64({r * SMALL_STRIDE}) + row"
         if f[1:].isdigit() and f[0] != "h":
-            out += copied(parts, "sorted_", to, _ARRAYS[f[0]], f"base + np.uint64({int(f[1:]) * parts.width})")
+            place = f"base + np.uint64({int(f[1:]) * parts.width})"
+            out.append(copied(parts, "sorted_", to, _ARRAYS[f[0]], place))
         elif f[0] != "h":
-            out += copied(parts, "sorted_", to, "ident" if f == "who" else f, "row")
+            out.append(copied(parts, "sorted_", to, "ident" if f == "who" else f, "row"))
     return out
 
 

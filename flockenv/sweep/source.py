@@ -85,7 +85,7 @@ def _imports(parts: Parts) -> str:
         "from numba import njit",
         "from flockenv.effects.base import Far, Me, Other, in_view",
         "from flockenv.inlining import Whole",
-        "from flockenv.kernels import ask_for, copy_line, finite, kernel, like, unaliased, wait_for_team",
+        "from flockenv.kernels import ask_for, copy_lanes, finite, kernel, like, unaliased, wait_for_team",
         "from flockenv.neighbours import candidates, count_cells, order_records, row_of",
         f"from flockenv.space import {parts.space.offset_law} as offset_to, {parts.space.confine_law} as confine",
         *([f"from flockenv.space import {parts.space.bounce_law} as bounce"] if parts.bounces else []),
@@ -93,10 +93,7 @@ def _imports(parts: Parts) -> str:
         *(["from flockenv.transpose import out_of_records, put_lines, put_records"] * (parts.sweeps and parts.sorts)),
         "from flockenv.vec import add, dot, exact_dot, limit, norm, scale, select, sub, unit, zero",
         *(["from flockenv.vehicle import faced, held, leant, raised, turned"] if parts.oriented else []),
-        *(
-            ["from flockenv.abreast import key_of, key_read, key_written, looked_up, pick, same_key, tag_of"]
-            * parts.keyed
-        ),
+        *(["from flockenv.abreast import key_of, key_read, key_written, pick, same_key, tag_of"] * parts.keyed),
         *tree_imports(parts),
         *obstacle_imports(parts),
         method_imports(parts),

@@ -54,7 +54,7 @@ def {name}(blocks, array, b, n, first, end):
         for k in range({parts.dimension}):
             base = np.uint64(block * {parts.dimension * w} + k * {w})
             if (block + 1) * {w} <= n:
-{indented(copied(parts, *to, *source), 16)}
+{indented([copied(parts, *to, *source)], 16)}
             else:
                 for l in range(np.uint64(n - block * {w})):
                     {to[0]}[{to[1]} + l] = {source[0]}[{source[1]} + l]

@@ -10,7 +10,6 @@ import re
 from collections.abc import Sequence
 
 from flockenv.effects.base import Effect
-from flockenv.kernels import LINE
 from flockenv.sweep.parts import Parts
 
 __all__ = [
@@ -108,11 +107,9 @@ def needed(lines: Sequence[str], body: Sequence[str]) -> list[str]:
     return kept
 
 
-def copied(parts: Parts, to: str, at: str, source: str, place: str) -> list[str]:
-    """Write how the numbers of a block are copied, a vector at a time."""
-    each = LINE // parts.itemsize
-    more = [""] + [f" + np.uint64({k})" for k in range(each, parts.width, each)]
-    return [f"copy_line({to}, {at}{k}, {source}, {place}{k})" for k in more]
+def copied(parts: Parts, to: str, at: str, source: str, place: str) -> str:
+    """Write how a number of all lanes of a block is copied, a vector at a time."""
+    return f"copy_lanes({to}, {at}, {source}, {place}, {parts.width})"
 
 
 def indented(lines: list[str], indent: int) -> str:

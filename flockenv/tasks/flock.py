@@ -303,9 +303,12 @@ def abreast(p: Any, frame: Frame, columns: Any) -> None:
     for s in range(listed):
         for i in range(n):
             _show_neighbour(p, frame, i, s, slots, scales, columns)
-    for s in range(seen):
+    some = seen if frame.rho.shape[0] > 0 else np.uint64(0)
+    for s in range(some):
         for i in range(n):
             _show_obstacle(p, frame, i, s, two + seven * slots, seen, columns)
+    for c in range(two + seven * slots + np.uint64(3) * some, two + seven * slots + np.uint64(3) * seen):
+        columns[:, c] = like(p.sight, 0.0)
 
 
 @kernel
@@ -337,13 +340,17 @@ def _show_neighbour(p: Any, frame: Frame, i: int, s: int, slots: Any, scales: An
 
 @kernel
 def _show_obstacle(p: Any, frame: Frame, i: int, s: int, at: Any, seen: Any, columns: Any) -> None:
-    """Write what agent i sees of the s-th nearest obstacle, from column `at` on: offset, radius; or zeros."""
-    o, there = like(p.sight, 0.0), s < np.uint64(frame.obstacle_count[i])
-    centre, rho = _obstacle(frame, i, s) if there else ((o, o), o)
+    """Write what agent i sees of the s-th nearest obstacle, from column `at` on: offset, radius; or zeros.
+
+    As with neighbours, there is somebody's number in the list in any case, where there are obstacles at all.
+    """
+    there = s < np.uint64(frame.obstacle_count[i])
+    centre, rho = _obstacle(frame, i, s)
+    o = like(rho, 0.0)
     to = (offset(frame.pos[0, i], centre[0], p.size), offset(frame.pos[1, i], centre[1], p.size))
     vector = turned(to, _heading(p, frame, i), like(o, 1.0) / (p.sight + p.greatest_radius))
     _put_if(there, columns, i, at + np.uint64(2) * s, vector)
-    columns[i, at + np.uint64(2) * seen + s] = rho / p.greatest_radius
+    columns[i, at + np.uint64(2) * seen + s] = rho / p.greatest_radius if there else o
 
 
 @kernel

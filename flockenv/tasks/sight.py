@@ -125,4 +125,6 @@ def block_ways(row: Any, at: int, rays: int, table: Any, to: Any, ahead: Any, cl
     # Counted without a sign: of a signed index numba asks whether it counts from the end, and the loop stays scalar.
     for r in range(np.uint64(rays)):
         hit = np.float32(ray_hit(here, (table[r], table[sines + r]), clearance) * share)
-        row[row_at + r] = min(row[row_at + r], hit)
+        # No way is longer than 1. Of the lesser of two, one of which is there already, LLVM would make a store under a
+        # mask, which takes some processors without AVX-512 forty instructions.
+        row[row_at + r] = min(row[row_at + r], hit, np.float32(1.0))
