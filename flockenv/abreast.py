@@ -1,8 +1,8 @@
 """Agents abreast: the numbers of many agents side by side, in the lanes of vector registers, and rows made of them.
 
-What an agent sees is handed out as a row, but worked out for sixteen agents at a time: a loop over agents whose body
-has no branch becomes vector code, while a loop over one agent's neighbours waits for every guess of how many there are.
-So a task writes columns, one number of all agents after the other, and squares of them are turned into rows.
+What an agent sees is handed out as a row, but worked out for a register of agents at a time: a loop over agents whose
+body has no branch becomes vector code, while a loop over one agent's neighbours waits for every guess of how many there
+are. So a task writes columns, one number of all agents after the other, and squares of them are turned into rows.
 """
 
 from __future__ import annotations
@@ -272,10 +272,15 @@ def take(to: Any, table: Any, who: Any, count: int) -> None:
     N and N' are multiples of PAIR, and whom the lists name beyond the last agent is below `count`, too.
     """
     many, listed, n = np.uint64(to.shape[0]), np.uint64(who.shape[0]), np.uint64(who.shape[1])
-    beside, length, agents = listed * n, np.uint64(table.shape[1]), np.uint64(count)
-    for s in range(listed):
-        for i in range(s * n, s * n + n, np.uint64(SIDE)):
+    if np.uint64(count) <= np.uint64(SHORT * processor.REGISTER // 4):
+        beside, length, agents = listed * n, np.uint64(table.shape[1]), np.uint64(count)
+        for i in range(np.uint64(0), listed * n, np.uint64(SIDE)):
             pick(to, i, beside, table, np.uint64(0), length, many, agents, who, i, SIDE)
+    else:
+        for r in range(many):
+            for s in range(listed):
+                for i in range(n):
+                    to[r, s, i] = table[r, np.uint64(who[s, i])]
 
 
 def _turned_square(
@@ -297,9 +302,8 @@ def _turned_square(
             return builder.bitcast(builder.gep(base, [here]), vector.as_pointer())
 
         numbers = [builder.load(line(sources, k, *arguments[5:]), align=4) for k in range(SQUARE)]
-        for s in (
-            1 << k for k in range(SQUARE.bit_length() - 1)
-        ):  # of four squares of s in one of 2 s, two are swapped
+        sides = [1 << k for k in range(SQUARE.bit_length() - 1)]
+        for s in sides:  # of four squares of s in one of 2 s, two are swapped
             low = [SQUARE + k - s if k & s else k for k in range(SQUARE)]
             high = [SQUARE + k if k & s else k + s for k in range(SQUARE)]
             masks = [ir.Constant(ir.VectorType(ir.IntType(32), SQUARE), mask) for mask in (low, high)]

@@ -29,7 +29,12 @@ from numba.cpython.unsafe.tuple import tuple_setitem
 from numba.extending import intrinsic, overload, register_jitable
 from numba.np import arrayobj
 
-from flockenv import compilation  # noqa: F401  # tells how long compiling takes
+from flockenv import (
+    compilation,  # noqa: F401  # tells how long compiling takes
+    frontend,
+    inlining,
+    processor,
+)
 from flockenv.inlining import Inlined
 from flockenv.turns import OneAtATime
 
@@ -54,6 +59,8 @@ __all__ = [
     "settled",
     "shared",
     "stacked",
+    "tallied",
+    "tally_of",
     "unaliased",
     "unfused",
     "wait_for_team",
@@ -142,9 +149,9 @@ def unaliased(typing_context: Any) -> Any:
     Without it LLVM must assume that a sum it writes may be an input it reads, and keeps both out of registers: a factor
     of three in a sweep. Whoever calls such an entry point keeps the promise; Scene and World do, by allocating.
 
-    Its loops, over lanes of 64 bytes, may use registers of that size: on most of Intel's processors LLVM would halve
-    them, for the sake of code around them. And its stack begins where a line of the cache does: else registers that are
-    put there for a while lie across two, in one process and not in the next.
+    Its loops may use the longest registers there are: on most of Intel's processors LLVM would halve them, for the sake
+    of code around them. And its stack begins where a register may lie (LLVM leaves it at 16 bytes): else one that is
+    put there for a while lies across two lines of the cache, in one process and not in the next.
     """
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
@@ -267,6 +274,32 @@ stacked: Any = intrinsic(_stacked)
 if numba.config.DISABLE_JIT:  # type: ignore[attr-defined]  # laws run in plain Python, too, for whoever debugs them
     stacked = np.array
 
+
+def _tallied(typing_context: Any, number: Any, flag: Any) -> Any:
+    """Return a number whose bits are a count, 0 at the start, with one more counted if the flag is up."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        whole = ir.IntType(8 * context.get_abi_sizeof(arguments[0].type))
+        more = builder.zext(arguments[1], whole)
+        return builder.bitcast(builder.add(builder.bitcast(arguments[0], whole), more), arguments[0].type)
+
+    return number(number, types.boolean), generate
+
+
+def _tally(typing_context: Any, number: Any) -> Any:
+    """Return how many were counted there."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        whole = ir.IntType(8 * context.get_abi_sizeof(arguments[0].type))
+        counted = builder.bitcast(arguments[0], whole)
+        return builder.trunc(counted, ir.IntType(32)) if whole.width > 32 else counted
+
+    return types.int32(number), generate
+
+
+tallied: Any = intrinsic(_tallied)
+tally_of: Any = intrinsic(_tally)
+
 _PATIENCE = 2000  # rounds of waiting before the core is offered to somebody else
 
 _give_way: Any = numba.njit(lambda: 0)
@@ -307,11 +340,15 @@ def cache_folder() -> Path:
 
 @functools.cache
 def laws_digest() -> str:
-    """Digest every source of the package that holds laws: an edit to one means new files, never stale machine code."""
+    """Digest every source of the package that holds laws, or says how code is made of them.
+
+    An edit to one means new files, never stale machine code. Nothing of the machine is in it: results are the same.
+    """
     digest = hashlib.sha256(f"{numba.__version__} {sys.version_info[:2]}".encode())
+    how = [Path(str(module.__file__)) for module in (sys.modules[__name__], inlining, frontend)]
     for path in sorted(Path(__file__).parent.rglob("*.py")):
         text = path.read_bytes()
-        if b"from flockenv.kernels import" in text or path == Path(__file__):
+        if b"from flockenv.kernels import" in text or path in how:
             digest.update(text)
     return digest.hexdigest()
 
@@ -339,7 +376,8 @@ def load(name: str, source: str) -> ModuleType:
 
     The file is written beside its final place and renamed, so that two processes may race.
     """
-    digest = hashlib.sha256((source + laws_digest() + _other_laws(source)).encode()).hexdigest()[:20]
+    told = f"{source}{laws_digest()}{_other_laws(source)}{processor.REGISTER}"
+    digest = hashlib.sha256(told.encode()).hexdigest()[:20]
     folder = cache_folder()
     path = folder / f"{name}_{digest}.py"
     if not path.exists():

@@ -1,10 +1,15 @@
 """The processor that machine code is made for: what it can do, and how many numbers lie side by side in it.
 
-What numba is told of it counts (NUMBA_CPU_NAME, NUMBA_CPU_FEATURES, NUMBA_ENABLE_AVX), for that is what LLVM knows.
-Results are the same bits on every processor that fuses multiplications with additions: lanes do not know of each other.
+What numba is told of it counts (NUMBA_CPU_NAME, NUMBA_CPU_FEATURES, NUMBA_ENABLE_AVX), as far as it is written there:
+what follows from a processor's name alone is not seen. FLOCKENV_REGISTER=32 or 64 says how many bytes lie side by side,
+for whoever wants to know what another processor does. Results are the same bits on every one that fuses multiplications
+with additions: lanes do not know of each other. (How many pairs were met, `State.work`, follows from how many lanes
+there are.)
 """
 
 from __future__ import annotations
+
+import os
 
 import numba
 from numba.core import codegen
@@ -19,8 +24,16 @@ def _features() -> frozenset[str]:
     return frozenset(name[1:] for name in found.split(",") if name.startswith("+"))
 
 
+def _register() -> int:
+    """Return how many bytes lie side by side; ValueError where the environment asks for something else."""
+    told = os.environ.get("FLOCKENV_REGISTER", "")
+    if told not in ("", "32", "64"):
+        raise ValueError(f"FLOCKENV_REGISTER = {told!r}: must be 32 or 64 (bytes side by side), or nothing")
+    return int(told) if told else 64 if "avx512f" in FEATURES else 32
+
+
 FEATURES = _features()
 """What it can do: "avx512f" and "avx2" make a difference here."""
 
-REGISTER = 64 if "avx512f" in FEATURES else 32
+REGISTER = _register()
 """Bytes of numbers side by side: a vector register; without AVX-512 one of AVX2, and elsewhere two of 16 bytes."""

@@ -496,9 +496,11 @@ class Scene(Record):
         given = np.asarray(state.time if times is None else times, float)
         if given.shape not in ((), (b,)) or not np.isfinite(given).all():
             raise ValueError(f"times is {times!r}, must be a finite number for each of {b} worlds, or one for all")
-        when = np.ascontiguousarray(np.broadcast_to(given, b), self.dtype)
+        when, x = np.ascontiguousarray(np.broadcast_to(given, b), self.dtype), state.x
+        if self.parts.confines:  # a step begins so; who is asked where he is may be outside of the box
+            x = np.ascontiguousarray(self.space.wrap(state.pos).transpose(2, 0, 1), self.dtype)
         self._accelerations.field(
-            state.x, state.v, *state.carried, state.alive, state.key, state.obstacle_x, state.obstacle_radius,
+            x, state.v, *state.carried, state.alive, state.key, state.obstacle_x, state.obstacle_radius,
             state.work, self._drive(drive, state), self._params, when, acc, flow,
             *self._workspaces(1, 1)[0].of(0, self._accelerations.SCRATCH),
         )  # fmt: skip

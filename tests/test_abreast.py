@@ -122,7 +122,7 @@ print(float(np.abs(step.observation).sum()), step.terms.sum().round(6), world.st
 
 
 @pytest.mark.slow
-def test_a_processor_without_avx_512_takes_them_one_by_one(tmp_path: Path) -> None:
+def test_a_processor_that_looks_nothing_up_takes_them_one_by_one(tmp_path: Path) -> None:
     """The same flock on this processor, and compiled for one that any x86-64 is."""
     said = []
     for name in ("", "x86-64-v2"):

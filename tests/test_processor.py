@@ -13,11 +13,12 @@ from typing import Any
 import numba
 import numpy as np
 import pytest
+from llvmlite import binding
 
 from flockenv import inlining, processor
 from flockenv.behaviours import Alignment, Cohesion, Separation
 from flockenv.config import load_scene
-from flockenv.effects import Gravitation
+from flockenv.effects import Effect, Gravitation
 from flockenv.group import Group
 from flockenv.inlining import Whole
 from flockenv.kernels import kernel, unaliased
@@ -29,7 +30,8 @@ from flockenv.tasks.sight import block_ways, compass
 from flockenv.world import World
 from tests.catalogue import everything
 
-CONFIGS = Path(__file__).parent.parent / "configs"
+ROOT = Path(__file__).parent.parent
+CONFIGS = ROOT / "configs"
 
 
 def flock(agents: int, dtype: str, **sight: Any) -> Scene:
@@ -41,92 +43,84 @@ def flock(agents: int, dtype: str, **sight: Any) -> Scene:
     )  # fmt: skip
 
 
-def heavy(agents: int) -> Scene:
+def heavy(agents: int, *more: Effect) -> Scene:
     """Everybody pulls everybody, those far away as groups: what a group is must not follow from a register."""
     return Scene(
-        dimension=2, space=Plane(), effects=(Gravitation(constant=1, softening=0.1, opening=0.5),), dt=0.01,
+        dimension=2, space=Plane(), effects=(Gravitation(constant=1, softening=0.1, opening=0.5), *more), dt=0.01,
         groups=(Group(count=agents, spawn=Spawn(low=(0, 0), high=(30, 30))),),
     )  # fmt: skip
 
 
-def stepped(make: Callable[[], Scene], steps: int = 7) -> tuple[Any, ...]:
-    scene = make()
+def stepped(scene: Scene, steps: int) -> dict[str, Any]:
     after = scene.step(scene.start(seed=3), steps=steps)
-    return after.x, after.v, after.alive, scene.parts.width
+    return {"x": after.x, "v": after.v, "alive": after.alive}
 
 
-def played(task: Task, decisions: int = 12) -> tuple[Any, ...]:
+def played(task: Task, decisions: int = 12) -> dict[str, Any]:
     world = World(task, 3)
     world.reset(0)
     rng = np.random.default_rng(0)
     steps = [world.step(rng.uniform(-1, 1, (3, world.learners, world.action_size))) for _ in range(decisions)]
-    seen = [np.stack([getattr(step, name) for step in steps]) for name in ("observation", "reward", "terms")]
-    return (*seen, world.state.x, world.state.v, task.parts.width)
+    seen = {name: np.stack([getattr(step, name) for step in steps]) for name in ("observation", "reward", "terms")}
+    return {**seen, "x": world.state.x, "v": world.state.v}
 
 
-@pytest.fixture
-def both(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
-    """Ask for the same with registers of 64 and of 32 bytes: other sources, the same bits."""
-
-    def compare(run: Callable[[], tuple[Any, ...]], differs: bool = True) -> None:
-        found = []
-        for size in (64, 32):
-            monkeypatch.setattr(processor, "REGISTER", size)
-            found.append(run())
-        (*wide, lanes), (*narrow, fewer) = found
-        assert (lanes, fewer) == ((2 * fewer, lanes // 2) if differs else (16, 16))
-        for a, b in zip(wide, narrow, strict=True):
-            np.testing.assert_array_equal(a, b)
-
-    return compare
-
-
-@pytest.mark.parametrize(
-    ("agents", "dtype"),
-    [(37, "float32"), pytest.param(37, "float64", marks=pytest.mark.slow),
-     pytest.param(900, "float32", marks=pytest.mark.slow), (900, "float64")],
-)  # fmt: skip
-def test_a_flock_has_the_same_bits_in_long_registers_and_short_ones(both: Any, agents: int, dtype: str) -> None:
-    """Few agents, and many, who are sorted by cell, put in order for a call, and moved house."""
-    both(lambda: stepped(lambda: flock(agents, dtype, fov=270)))
+CASES: dict[str, Callable[[], dict[str, Any]]] = {
+    "few": lambda: stepped(flock(37, "float32", fov=270), 7),
+    "few doubles": lambda: stepped(flock(37, "float64", fov=270), 7),
+    "many": lambda: stepped(flock(900, "float32", nearest=4), 7),
+    "many doubles": lambda: stepped(flock(900, "float64"), 7),
+    "so many that they move house": lambda: stepped(flock(20_003, "float32"), 3),
+    "groups met as one": lambda: stepped(heavy(3000), 2),
+    "groups met as one, and neighbours": lambda: stepped(heavy(3000, Separation(weight=1, radius=0.5)), 2),
+    "Flock": lambda: played(Flock(agents=24, dtype="float32")),
+    **{
+        f"all forms, {d}-D, {t}": lambda d=d, t=t: stepped(everything(d, dtype=t), 7)  # type: ignore[misc]
+        for d, t in ((2, "float32"), (3, "float64"))
+    },
+    **{
+        f"{name}.yaml": lambda name=name: stepped(load_scene(CONFIGS / f"{name}.yaml"), 5)  # type: ignore[misc]
+        for name in ("cloth", "crowd_bottleneck", "fish", "snow")
+    },
+    **{f"task {name}": lambda name=name: played(TASKS[name]()) for name in ("bottleneck", "obstacles", "school")},  # type: ignore[misc]
+}
+QUICK = {"few"}
 
 
-@pytest.mark.slow
-def test_a_large_flock_moves_house_in_short_registers_too(both: Any) -> None:
-    both(lambda: stepped(lambda: flock(20_000, "float32"), 3))
+def write(case: str, path: str) -> None:
+    """Do what a case is about, in a process of its own, and leave what came of it."""
+    np.savez(path, **CASES[case](), register=processor.REGISTER)
 
 
-@pytest.mark.slow
-def test_groups_that_are_met_as_one_are_the_same(both: Any) -> None:
-    both(lambda: stepped(lambda: heavy(3000), 2), differs=False)
-
-
-@pytest.mark.slow
-def test_what_is_seen_and_paid_is_the_same(both: Any) -> None:
-    both(lambda: played(Flock(agents=24, dtype="float32")))
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("dtype", ["float32", "float64"])
-@pytest.mark.parametrize("dimension", [2, 3])
-def test_effects_of_all_forms_are_the_same(both: Any, dimension: int, dtype: str) -> None:
-    both(lambda: stepped(lambda: everything(dimension, dtype=dtype)))
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", ["cloth", "crowd_bottleneck", "fish", "flag", "obstacles_flow", "snow", "stampede"])
-def test_scenes_are_the_same(both: Any, name: str) -> None:
-    both(lambda: stepped(lambda: load_scene(CONFIGS / f"{name}.yaml"), 5))
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("dtype", ["float32", "float64"])
-@pytest.mark.parametrize("name", TASKS)
-def test_tasks_are_the_same(both: Any, name: str, dtype: str) -> None:
-    both(lambda: played(TASKS[name](dtype=dtype)))
+@pytest.mark.parametrize("case", [pytest.param(c, marks=() if c in QUICK else pytest.mark.slow) for c in CASES])
+def test_results_are_the_same_in_long_registers_and_in_short_ones(case: str, tmp_path: Path) -> None:
+    found = []
+    for size in ("64", "32"):
+        ask = f"from tests.test_processor import write; write({case!r}, {str(tmp_path / size)!r})"
+        environment = {**os.environ, "FLOCKENV_REGISTER": size}
+        done = subprocess.run(
+            [sys.executable, "-W", "ignore", "-c", ask], env=environment, cwd=ROOT, capture_output=True, text=True
+        )
+        assert done.returncode == 0, done.stderr
+        with np.load(tmp_path / f"{size}.npz") as arrays:
+            found.append(dict(arrays))
+    assert [one.pop("register") for one in found] == [64, 32]
+    wide, narrow = found
+    for name, values in wide.items():
+        np.testing.assert_array_equal(values, narrow[name], err_msg=name)
 
 
 # --- what it is found to be -----------------------------------------------------------------------------------------
+
+
+def test_another_size_is_refused_by_one_line() -> None:
+    environment = {**os.environ, "FLOCKENV_REGISTER": "16"}
+    done = subprocess.run(
+        [sys.executable, "-c", "import flockenv.scene"], env=environment, capture_output=True, text=True
+    )
+    assert done.stderr.rstrip().endswith(
+        "ValueError: FLOCKENV_REGISTER = '16': must be 32 or 64 (bytes side by side), or nothing"
+    )
 
 
 @pytest.mark.parametrize(
@@ -136,7 +130,8 @@ def test_tasks_are_the_same(both: Any, name: str, dtype: str) -> None:
 )  # fmt: skip
 def test_what_numba_is_told_counts(told: dict[str, str], found: str) -> None:
     ask = "from flockenv.processor import *; print(REGISTER, *(name in FEATURES for name in ('avx2', 'avx512f')))"
-    done = subprocess.run([sys.executable, "-c", ask], env={**os.environ, **told}, capture_output=True, text=True)
+    environment = {name: value for name, value in os.environ.items() if name != "FLOCKENV_REGISTER"} | told
+    done = subprocess.run([sys.executable, "-c", ask], env=environment, capture_output=True, text=True)
     assert done.stdout.strip() == found, done.stderr
 
 
@@ -170,7 +165,7 @@ def many_sums() -> Callable[..., None]:
 
 
 @pytest.mark.skipif("avx" not in processor.FEATURES, reason="registers of 16 bytes always lie within a line")
-def test_the_stack_begins_where_a_line_does() -> None:
+def test_the_stack_begins_where_a_register_may_lie() -> None:
     """Else what is put there for a while lies across two lines, in one process and not in the next."""
     x, y = np.arange(5, dtype=np.float32), np.ones(656, np.float32)
     left, machine = code(many_sums(), x, y)
@@ -186,8 +181,9 @@ def short_loop(x: Any, y: Any) -> None:
             y[k, l] = x[k, l] * x[k, l]
 
 
-def test_vectors_are_made_of_short_loops_and_of_nobody_elses(monkeypatch: pytest.MonkeyPatch) -> None:
-    """What LLVM is told for that holds while our functions compile, parts within entry points, and not after."""
+@pytest.mark.skipif(binding.llvm_version_info[0] not in inlining.LLVMS, reason="LLVM is not told: see inlining.LLVMS")
+def test_vectors_are_made_of_short_loops(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What LLVM is told for that is told while our functions compile, parts within entry points, and taken back."""
     told: list[str] = []
     tell = inlining.binding.set_option
     monkeypatch.setattr(inlining.binding, "set_option", lambda name, option: (told.append(option), tell(name, option)))

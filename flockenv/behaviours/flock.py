@@ -14,6 +14,7 @@ from pydantic import Field
 from flockenv import steering
 from flockenv.effects.base import Effect, Me, Other, Sight
 from flockenv.kernels import Vec, law, like
+from flockenv.steering import others
 from flockenv.vec import scale, select, sub, zero
 
 __all__ = ["Alignment", "Cohesion", "Separation"]
@@ -23,6 +24,12 @@ __all__ = ["Alignment", "Cohesion", "Separation"]
 def separation_pair(p: Any, me: Me, other: Other) -> Vec:
     """One push."""
     return steering.separate(other.offset, sub(me.tie, other.tie))
+
+
+@law
+def separation_apart(p: Any, me: Me, other: Other) -> Vec:
+    """The same where the two are not in one place."""
+    return others.push_off(other.offset)
 
 
 @law
@@ -107,6 +114,7 @@ effects:
 dt: 0.02
 """
     pair_law: ClassVar[str | None] = "separation_pair"
+    apart_law: ClassVar[str | None] = "separation_apart"
     finish_law: ClassVar[str | None] = "separation"
 
     @property

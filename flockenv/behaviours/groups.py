@@ -14,6 +14,7 @@ from flockenv.behaviours.social import Social, size_of
 from flockenv.effects.base import Effect, Me, Other, Sight, Vector
 from flockenv.elementary import exp
 from flockenv.kernels import Vec, law, like
+from flockenv.steering.others import ONE_PLACE
 from flockenv.vec import add, limit, norm, scale, select, sub, unit, zero
 
 __all__ = ["Friends", "Interest", "WalkingGroup"]
@@ -138,7 +139,7 @@ def of_the_party(p: Any, me: Me, other: Other) -> Vec:
     o, e = like(other.square, 0.0), like(other.square, 1.0)
     mine = _party(p, me.who) == _party(p, other.who)
     near = mine & (other.square < p.distance * p.distance)
-    apart = other.square > like(other.square, 1e-30)
+    apart = other.square > like(other.square, ONE_PLACE)
     away = unit(select(apart, scale(other.offset, -e), sub(me.tie, other.tie)))
     none = zero(other.offset)
     return (e if mine else o,) + select(mine, other.offset, none) + select(near, away, none)  # noqa: RUF005

@@ -7,7 +7,9 @@ An effect is of one or more of three forms, each a law for one agent:
   agent; and `flow_law(p, me) -> velocity` with which the medium carries it, beside its own velocity;
 * `pair_law(p, me, other) -> sums`, `finish_law(p, me, sums) -> force`: what one neighbour adds to K running sums, and
   the force they make; all pair laws of a scene share one sweep. With a `pair_start(p, me) -> acc` it is a fold instead,
-  `pair_law(p, me, other, acc) -> acc`, over those in sight, in no order that it may rely on;
+  `pair_law(p, me, other, acc) -> acc`, over those in sight, in no order that it may rely on. A law that reads ties may
+  have another form, `apart_law(p, me, other) -> sums`, the same where the two are not in one place (steering.others'
+  ONE_PLACE): if all of a scene that read them have, and all are sums, ties are read of those in one place alone;
 * `far_law(p, me, other) -> force`: of everybody else, however far, of whom groups far away are met as one; `other` is
   a `Far`, and of `me` it may read pos and mass alone; `p.opening` says how large such a group may look;
 * `bond_law(p, me, others, numbers) -> force`: of one of the bonds that the effect's `bonds` lists, each between an
@@ -221,6 +223,7 @@ class Effect(Record):
     """Names of those that its laws read and that other effects keep."""
     pair_start: ClassVar[str | None] = None
     pair_law: ClassVar[str | None] = None
+    apart_law: ClassVar[str | None] = None
     finish_law: ClassVar[str | None] = None
     obstacle_start: ClassVar[str | None] = None
     obstacle_law: ClassVar[str | None] = None

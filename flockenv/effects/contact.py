@@ -12,6 +12,7 @@ from pydantic import Field
 
 from flockenv.effects.base import Effect, Me, Obstacle, Other, Sight, all_masses
 from flockenv.kernels import Vec, law, like
+from flockenv.steering.others import ONE_PLACE
 from flockenv.vec import add, dot, norm, scale, select, sub, unit, zero
 
 __all__ = ["Contact", "ObstacleContact", "restitution"]
@@ -81,7 +82,7 @@ def of_all(p: Any, me: Me, acc: Vec) -> Vec:
 def pushed_apart(p: Any, me: Me, other: Other) -> Vec:
     """What one neighbour does; two in one place part along their ties."""
     e = like(other.square, 1.0)
-    apart = other.square > like(other.square, 1e-30)  # as in steering.separate: nearer than 1e-15 m is one place
+    apart = other.square > like(other.square, ONE_PLACE)
     normal = unit(select(apart, scale(other.offset, -e), sub(me.tie, other.tie)))
     overlap = me.radius + other.radius - np.sqrt(other.square)
     return met(p, normal, overlap, sub(me.vel, other.vel), e / (e / me.mass + e / other.mass))

@@ -9,6 +9,7 @@ from pydantic import Field
 
 from flockenv.effects.base import Effect, Me, Other, Sight
 from flockenv.kernels import Vec, law, like
+from flockenv.steering.others import ONE_PLACE
 from flockenv.vec import scale, select, sub, unit
 
 __all__ = ["Pressure"]
@@ -24,7 +25,7 @@ def pressure_pair(p: Any, me: Me, other: Other) -> Vec:
     rest = p.flat if len(me.pos) == 2 else p.solid
     near = e - square / (p.radius * p.radius)
     push = (rest - square) / (square + rest * like(square, 1 / 64)) * near * near
-    apart = square > like(square, 1e-30)  # as in steering.separate: nearer than 1e-15 m is one place
+    apart = square > like(square, ONE_PLACE)
     return scale(unit(select(apart, scale(other.offset, -e), sub(me.tie, other.tie))), push)
 
 

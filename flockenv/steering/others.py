@@ -23,9 +23,13 @@ __all__ = [
     "opensteer_time",
     "passing_point",
     "pursue",
+    "push_off",
     "separate",
     "shadow",
 ]
+
+ONE_PLACE = 1e-30
+"""m^2: nearer than 1e-15 m is one place. 1 / square must not overflow, in float32 too."""
 
 
 @law
@@ -98,14 +102,21 @@ def evade(offset: Vec, velocity: Vec, pursuer_velocity: Vec, max_speed: float, t
 
 
 @law
+def push_off(offset: Vec) -> Vec:
+    """One neighbour's push where the two are not in one place, 1/m: see `separate`."""
+    square = dot(offset, offset)
+    return scale(offset, like(square, -1.0) / square)
+
+
+@law
 def separate(offset: Vec, tie: Vec) -> Vec:
     """One neighbour's push: away from it, weighted 1/distance, 1/m (Reynolds 1999). Sum over neighbours.
 
     `tie` is the direction to take where the two coincide, a unit vector that is opposite for the other one.
     """
     square = dot(offset, offset)
-    apart = square > like(square, 1e-30)  # nearer than 1e-15 m is one place: 1/square must not overflow, in float32 too
-    return select(apart, scale(offset, like(square, -1.0) / square), tie)
+    apart = square > like(square, ONE_PLACE)
+    return select(apart, push_off(offset), tie)
 
 
 @law

@@ -14,6 +14,7 @@ import numpy as np
 
 from flockenv.elementary import atan2, exp
 from flockenv.kernels import Vec, law, like
+from flockenv.steering.others import ONE_PLACE
 from flockenv.vec import add, cross, dot, lateral, norm, perpendicular, scale, select, sub, unit
 
 __all__ = [
@@ -29,9 +30,6 @@ __all__ = [
     "sidestep",
     "view_weight",
 ]
-
-ONE_PLACE = 1e-30
-"""m^2: nearer than 1e-15 m is one place."""
 
 NO_SIDE = 1e-14
 """Below this square two directions that nearly cancel have no sum that means anything."""

@@ -3,10 +3,10 @@
 What is written depends only on which laws there are, in which space, dimension and integrator, and which of them see
 the same neighbours; numbers are arguments. A law that is not listed leaves no trace: no branch, no buffer, no query.
 
-Agents go side by side in blocks of 16 lanes (8 in float64: what a vector register holds), and every array of a world
-lies in such blocks: the 16 first coordinates of a block, its 16 second ones, and so on. So a loop over the lanes has a
-constant length and constant offsets, and the compiler makes it straight vector code; running sums lie in one small
-scratch array and stay in vector registers.
+Agents go side by side in blocks, as many as a vector register holds (16 with AVX-512, 8 without, in float64 half of
+that), and every array of a world lies in blocks: the first coordinates of one, its second ones, and so on. So a loop
+over the lanes has a constant length and constant offsets, and the compiler makes it straight vector code; running sums
+lie in one small scratch array and stay in vector registers.
 
 The files, as a source is put together: `parts` says what it depends on, `text` holds the smallest pieces of it;
 `query` sorts the agents and walks their blocks, `pairs` lets a block meet its candidates, `far` everybody, `bonds` its

@@ -10,11 +10,21 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 
 from flockenv.effects.base import Sight
+from flockenv.steering.others import ONE_PLACE
 from flockenv.sweep.parts import Parts, record_of, sorted_at
 from flockenv.sweep.query import listed, query, walk
 from flockenv.sweep.text import Slots, copied, given, indented, indented_lines, nearest_image, place_of, tuple_of
 
 __all__ = ["me_of", "meet_range", "offset_of", "pairs"]
+
+SELF = "own != number[l]"
+"""Who is somebody else, of a candidate and a lane."""
+
+ELSEWHERE = f"square > like(square, {ONE_PLACE!r})"
+"""Who is in another place, and so somebody else."""
+
+TOGETHER = f"({SELF}) & (square <= like(square, {ONE_PLACE!r}))"
+"""Who else is in the same place."""
 
 
 def pairs(parts: Parts) -> list[str]:
@@ -41,6 +51,7 @@ def _clear(parts: Parts) -> list[str]:
     """Write how a block's running numbers begin."""
     slot = Slots(parts)
     zeros = [f"{s} = 0" for k, e in parts.pairs if not e.pair_start for s in slot.all(f"c{k}_")]
+    zeros += [f"{s} = 0" for s in slot.all("here")]
     folds = [(k, slot.all(f"c{k}_")) for k, e in parts.pairs if e.pair_start]
     if folds:
         zeros += [me_of(parts, parts.fields), *_nearest_images(parts)]
@@ -92,10 +103,13 @@ def _sum_up(parts: Parts) -> list[str]:
         copied(parts, "felt", f"block * np.uint64({r}) + np.uint64({j * w})", "lanes", slot.first(name))
         for j, name in enumerate(names)
     ]
+    meet, where = _meet(parts, False, parts.parting), ELSEWHERE if parts.parting else SELF
+    counted = [f"{slot('here0')} = tallied({slot('here0')}, not other)"] if parts.parting else []
     return [
         "for r in range(found):",
         "    met += (ranges[r, 1] - ranges[r, 0]) * (upto - at)",
-        *indented_lines(meet_range(parts, parts.fields, _meet(parts, False), _meet(parts, True)), 4),
+        *indented_lines(meet_range(parts, parts.fields, [*meet, *counted], _meet(parts, True), where), 4),
+        *(_meet_in_one_place(parts) if parts.parting else []),
         f"for l in range(np.uint64({parts.width})):",
         indented(_finish(parts), 4),
         f"if nx == 0 and present == n{' and not arranged' * parts.sorts}:  # they are felt as the lanes lie",
@@ -108,8 +122,23 @@ def _sum_up(parts: Parts) -> list[str]:
     ]
 
 
-def _meet(parts: Parts, touch: bool) -> list[str]:
-    """Write what one candidate adds to the sums of the lanes that see it: by contacts, or by all other laws."""
+def _meet_in_one_place(parts: Parts) -> list[str]:
+    """Write how a block meets who is in one place with some of its agents: seldom anybody but each himself."""
+    return [
+        "crowded = False",
+        f"for l in range(np.uint64({parts.width})):",
+        f"    crowded |= tally_of({Slots(parts)('here0')}) > np.int32(1)",
+        "if crowded:",
+        "    for r in range(found):",
+        *indented_lines(meet_range(parts, parts.fields, _meet(parts, False), where=TOGETHER), 8),
+    ]
+
+
+def _meet(parts: Parts, touch: bool, apart: bool = False) -> list[str]:
+    """Write what one candidate adds to the sums of the lanes that see it: by contacts, or by all other laws.
+
+    apart: nobody whom it counts for is in one place with it.
+    """
     laws = [(k, e) for k, e in parts.pairs if e.contact == touch]
     asked = dict.fromkeys(parts.sight_of(effect) for _, effect in laws)
     slot, lines = Slots(parts), _ahead(parts) if laws and not touch else []
@@ -124,7 +153,8 @@ def _meet(parts: Parts, touch: bool) -> list[str]:
             lines.append(f"says = pair_law_{k}(p{k}, me, it, ({', '.join(slots)},))")
             lines += [f"{s} = says[{j}] if seen{q} else {s}" for j, s in enumerate(slots)]
             continue
-        lines.append(f"says = pair_law_{k}(p{k}, me, it)")
+        law = "apart_law" if apart and effect.apart_law else "pair_law"
+        lines.append(f"says = {law}_{k}(p{k}, me, it)")
         # A sum of a choice: of a choice between sums LLVM makes a masked store, and the sum stays in memory. The other
         # choice is -0, which x + -0 leaves as it is for every x: so this becomes one masked addition.
         lines += [f"{s} += says[{j}] if seen{q} else o" for j, s in enumerate(slots)]
@@ -169,11 +199,13 @@ def _ahead(parts: Parts) -> list[str]:
 
 
 def meet_range(
-    parts: Parts, fields: list[str], lines: list[str], touch: list[str] | None = None, exact: bool = False
-) -> list[str]:
+    parts: Parts, fields: list[str], lines: list[str], touch: list[str] | None = None, where: str = SELF,
+    exact: bool = False,
+) -> list[str]:  # fmt: skip
     """Write the loop over the candidates of range r; `touch` is for those whom some lane may touch.
 
-    Only around the edge of a periodic box are images sought. exact: squares are worked out in other places, too.
+    where: who counts at all. Only around the edge of a periodic box are images sought. exact: squares are worked out in
+    other places, too.
     """
     square = "exact_dot(to, to)" if exact or any(s.nearest for s in parts.sights) else "dot(to, to)"
     wrapped, plain = offset_of(parts, "xj"), "sub(xj, me.pos)"
@@ -181,7 +213,7 @@ def meet_range(
     near = [q for q, sight in enumerate(parts.sights) if touch and sight in _touching(parts)]
 
     def over_lanes(offset: str, each: list[str]) -> list[str]:
-        met = [me_of(parts, fields), "other = own != number[l]", f"to = {offset}", f"square = {square}"]
+        met = [me_of(parts, fields), f"to = {offset}", f"square = {square}", f"other = {where}"]
         if not parts.masks:  # oneself is far away: compared once, and not for every sight
             met.append("gap = square if other else like(square, np.inf)")
         return [
@@ -207,7 +239,7 @@ def meet_range(
 
     if not parts.space.periodic:
         return loop(plain)
-    if not parts.sorts:
+    if not parts.sorts or where == TOGETHER:  # what comes seldom has one form: the nearest image of who is near is he
         return loop(wrapped)
     return ["if ranges[r, 2] > 0:", *indented_lines(loop(wrapped), 4), "else:", *indented_lines(loop(plain), 4)]
 

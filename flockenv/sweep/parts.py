@@ -33,8 +33,8 @@ SMALL_STRIDE = 128
 
 LAWS = (
     "own_law", "medium_law", "flow_law", "far_law", "bond_law", "kick_law", "aim_law", "begin_law", "keep_law",
-    "count_law", "pair_start", "pair_law", "finish_law", "obstacle_start", "obstacle_law", "obstacle_finish",
-    "obstacle_ray", "obstacle_from", "obstacle_reach",
+    "count_law", "pair_start", "pair_law", "apart_law", "finish_law", "obstacle_start", "obstacle_law",
+    "obstacle_finish", "obstacle_ray", "obstacle_from", "obstacle_reach",
 )  # fmt: skip
 """The slots that an effect may fill with the name of a law."""
 
@@ -95,7 +95,7 @@ class Parts:
 
     @property
     def keyed(self) -> bool:
-        """Are lists of the nearest kept as keys, where a processor can look numbers up in registers? See sweep/look."""
+        """Are lists of the nearest kept as keys? See sweep/look."""
         return self.look is not None and self.look.agents > 1 and not self.sorts and self.itemsize == 4
 
     @property
@@ -177,6 +177,16 @@ class Parts:
         sight = effect.sight
         assert sight is not None, f"{type(effect).__name__} has a pair law and no sight"
         return sight._replace(radius=min(sight.radius, self.touching)) if effect.contact else sight
+
+    @functools.cached_property
+    def parting(self) -> bool:
+        """Are those in one place met by themselves, if there are any, and all others without looking at ties?
+
+        Where every law that reads ties has another for those elsewhere, and all that is told is added up.
+        """
+        readers = [e for _, e in self.pairs if "tie" in _names(e, _OF_PAIRS)]
+        sums = not any(e.pair_start or e.contact for _, e in self.pairs)
+        return sums and bool(readers) and all(e.apart_law for e in readers)
 
     @property
     def reach(self) -> float:
@@ -400,7 +410,7 @@ class Parts:
             ("bond", d * bool(self.bonded)),
             ("far", d * bool(self.far)),
         ]
-        runs += [("reach", int(bool(self.bounded)))]
+        runs += [("reach", int(bool(self.bounded))), ("here", int(self.parting))]
         runs += [("square", look.agents + self.keyed), ("place", look.agents), ("picked", d * self.keyed)]
         runs += [("gap", look.obstacles), ("which", look.obstacles)]
         if self.sweeps and self.sorts:
@@ -433,7 +443,7 @@ def view_of(fov: float) -> float:
     return cosine * abs(cosine)
 
 
-_OF_PAIRS = ("pair_start", "pair_law", "finish_law")
+_OF_PAIRS = ("pair_start", "pair_law", "apart_law", "finish_law")
 
 
 def _names(effect: Effect, slots: Sequence[str]) -> set[str]:

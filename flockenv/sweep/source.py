@@ -86,6 +86,7 @@ def _imports(parts: Parts) -> str:
         "from flockenv.effects.base import Far, Me, Other, in_view",
         "from flockenv.inlining import Whole",
         "from flockenv.kernels import ask_for, copy_lanes, finite, kernel, like, unaliased, wait_for_team",
+        *(["from flockenv.kernels import tallied, tally_of"] * parts.parting),
         "from flockenv.neighbours import candidates, count_cells, order_records, row_of",
         f"from flockenv.space import {parts.space.offset_law} as offset_to, {parts.space.confine_law} as confine",
         *([f"from flockenv.space import {parts.space.bounce_law} as bounce"] if parts.bounces else []),

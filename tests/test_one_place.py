@@ -1,0 +1,208 @@
+"""Agents in one place: they part along their ties and count as neighbours; whoever is elsewhere is met without ties."""
+
+from __future__ import annotations
+
+import sys
+from collections import namedtuple
+from typing import Any
+
+import numpy as np
+import pytest
+from numba import njit
+
+from flockenv.behaviours import Alignment, Cohesion, Separation
+from flockenv.crew import threads, use_threads
+from flockenv.effects.base import Effect, Me, Other, ties
+from flockenv.group import Group
+from flockenv.scene import Scene
+from flockenv.space import Plane, Torus
+from flockenv.spawn import Spawn
+from flockenv.state import State
+from flockenv.steering.others import ONE_PLACE
+from flockenv.sweep.pairs import pairs
+from tests.catalogue import EFFECTS, scene_under
+
+RULES = (Separation(weight=1.5, radius=1.5), Alignment(weight=0.6, radius=2), Cohesion(weight=0.2, radius=2.5))
+SIZE = 20.0
+STACKS = ((3, 5), (2, 8, 9), (0, 1, 4, 6))  # who is where somebody else is
+
+
+def crowd(
+    count: int, dimension: int, dtype: str, torus: bool, *effects: Effect, drawn: float = 6.0
+) -> tuple[Scene, State]:
+    """Return agents near a corner of the box, some of whom are in one place, and some at its edge."""
+    space = Torus(size=(SIZE,) * dimension) if torus else Plane()
+    spawn = Spawn(low=(0.0,) * dimension, high=(drawn,) * dimension)
+    group = Group(count=count, mass=1, max_speed=100, max_force=1e6, spawn=spawn)
+    scene = Scene(dimension=dimension, space=space, effects=effects or RULES, groups=(group,), dtype=dtype, dt=0.01)
+    state, rng = scene.start(seed=1), np.random.default_rng(count)
+    state.x[:, 0] = rng.uniform(0, drawn, (dimension, count))
+    state.v[:, 0] = rng.uniform(-1, 1, (dimension, count))
+    for stack in STACKS:
+        for who in stack:
+            state.x[:, 0, who] = state.x[:, 0, stack[0]]
+    state.x[:, 0, [0, 1, 4, 6]] = 0.0  # at the corner of the box
+    return scene, state
+
+
+def expected(scene: Scene, state: State) -> Any:
+    """The three rules by the book, agent by agent, in double precision."""
+    x, v, d = state.pos[0].astype(float), state.vel[0].astype(float), scene.dimension
+    tie, out = ties(len(x), d), np.zeros((len(x), d))
+    for i in range(len(x)):
+        to = x - x[i]
+        if isinstance(scene.space, Torus):
+            to -= SIZE * np.round(to / SIZE)
+        square, other = (to**2).sum(axis=1), np.arange(len(x)) != i
+        apart, agree, near = (other & (square < rule.radius**2) for rule in RULES)
+        here, there = apart & (square <= 1e-30), apart & (square > 1e-30)
+        push = (-to[there] / square[there, None]).sum(axis=0) + (tie[i] - tie[here]).sum(axis=0)
+        out[i] = RULES[0].weight * push
+        if agree.any():
+            out[i] += RULES[1].weight * (v[agree].mean(axis=0) - v[i])
+        if near.any():
+            out[i] += RULES[2].weight * to[near].mean(axis=0)
+    return out
+
+
+@pytest.mark.parametrize(
+    ("count", "dimension", "dtype", "torus"),
+    [(10, 2, "float64", False), (33, 2, "float32", True), (700, 2, "float64", True),
+     pytest.param(700, 3, "float32", True, marks=pytest.mark.slow),
+     pytest.param(33, 3, "float64", False, marks=pytest.mark.slow)],
+)  # fmt: skip
+def test_the_three_rules_are_what_they_are_by_the_book(count: int, dimension: int, dtype: str, torus: bool) -> None:
+    scene, state = crowd(count, dimension, dtype, torus, drawn=6.0 if count < 100 else SIZE)
+    assert scene.parts.parting
+    found, by_the_book = scene.acceleration(state)[0], expected(scene, state)
+    close = {"float64": 1e-10, "float32": 2e-5}[dtype] * np.abs(by_the_book).max()
+    np.testing.assert_allclose(found, by_the_book, rtol=0, atol=close)
+    for stack in STACKS:
+        assert len(np.unique(found[list(stack)].round(3), axis=0)) == len(stack)  # they part
+
+
+def test_all_in_one_place_part_with_no_force_left_over() -> None:
+    """More than fill a block."""
+    scene, state = crowd(40, 2, "float64", False, RULES[0])
+    state.x[...] = 3.0
+    found = scene.acceleration(state)[0]
+    tie = ties(40, 2)
+    np.testing.assert_allclose(found, 1.5 * (40 * tie - tie.sum(axis=0)), atol=1e-11)
+    np.testing.assert_allclose(found.sum(axis=0), 0, atol=1e-10)
+
+
+@pytest.mark.parametrize("nearest", [1, 2])
+def test_who_is_in_one_place_is_among_the_nearest(nearest: int) -> None:
+    scene, state = crowd(
+        10, 2, "float64", False, Cohesion(weight=1, radius=9), Separation(weight=1, radius=9, nearest=nearest)
+    )
+    assert scene.parts.parting
+    tie, pull = ties(10, 2), scene.acceleration(state)[0]
+    lone, _ = crowd(10, 2, "float64", False, Cohesion(weight=1, radius=9))
+    push = pull - lone.acceleration(state)[0]
+    pair = STACKS[0]
+    if nearest == 1:
+        np.testing.assert_allclose(push[pair[0]], tie[pair[0]] - tie[pair[1]], atol=1e-12)
+    else:  # of a stack of three, each sees both others and nobody else
+        for who in STACKS[1]:
+            np.testing.assert_allclose(push[who], sum(tie[who] - tie[k] for k in STACKS[1]), atol=1e-12)
+
+
+def test_absent_agents_are_in_nobodys_place() -> None:
+    scene, state = crowd(10, 2, "float64", False)
+    whole = scene.acceleration(state)[0]
+    state.alive[0, 5] = False
+    found = scene.acceleration(state)[0]
+    tie = ties(10, 2)
+    lone, _ = crowd(10, 2, "float64", False, RULES[0])
+    state.alive[0, 5] = True
+    before = lone.acceleration(state)[0, 3]
+    state.alive[0, 5] = False
+    np.testing.assert_allclose(lone.acceleration(state)[0, 3], before - 1.5 * (tie[3] - tie[5]), atol=1e-12)
+    assert (found[5] == 0).all() and (whole[5] != 0).any()
+
+
+def test_ten_steps_in_one_call_are_ten_calls_where_many_are_in_one_place() -> None:
+    scene, state = crowd(700, 2, "float64", True, drawn=SIZE)
+    state.x[:, 0, 100:130] = state.x[:, 0, 100:101]
+    one = scene.step(state, steps=10)
+    for _ in range(10):
+        state = scene.step(state)
+    np.testing.assert_array_equal(one.x, state.x)
+    np.testing.assert_array_equal(one.v, state.v)
+
+
+def test_who_is_outside_of_the_box_is_where_his_image_is() -> None:
+    """Of accelerations that are asked for; a step begins by putting everybody into the box."""
+    scene, state = crowd(700, 2, "float64", True, drawn=SIZE)
+    rng = np.random.default_rng(5)
+    state.x[...] = np.round(state.x * 2**20) / 2**20  # so that images are exact
+    inside = scene.acceleration(state)
+    state.x[:, 0, ::5] += SIZE * rng.integers(-2, 3, state.x[:, 0, ::5].shape)
+    before = state.x.copy()
+    np.testing.assert_array_equal(scene.acceleration(state), inside)
+    np.testing.assert_array_equal(state.x, before)
+
+
+def test_two_threads_and_a_view_cone_change_nothing() -> None:
+    scene, state = crowd(700, 2, "float64", True, Separation(weight=1, radius=1.5, fov=200), drawn=SIZE)
+    state.x[:, 0, 100:130] = state.x[:, 0, 100:101]
+    one = scene.step(state, steps=3)
+    before = threads()
+    use_threads(2)
+    try:
+        two = scene.step(state, steps=3)
+    finally:
+        use_threads(before)
+    np.testing.assert_array_equal(one.x, two.x)
+    np.testing.assert_array_equal(one.v, two.v)
+    assert np.unique(two.x[:, 0, 100:130], axis=1).shape[1] == 30
+
+
+def test_a_block_counts_anew_who_is_in_its_places() -> None:
+    """Else all blocks after the first would go through their candidates twice, and no result would tell."""
+    scene, _ = crowd(10, 2, "float64", False)
+    parts = scene.parts
+    count = f"lanes[np.uint64({parts.slots['here0'] * parts.width}) + l]"
+    text = "\n".join(pairs(parts))
+    assert (
+        text.index(f"{count} = 0")
+        < text.index(f"{count} = tallied({count}, not other)")
+        < text.index(f"tally_of({count})")
+    )
+
+
+WITH_BOTH = [row for row in EFFECTS if row.effect.apart_law is not None]
+
+
+@pytest.mark.parametrize("row", WITH_BOTH, ids=lambda row: row.name)
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_a_law_of_those_elsewhere_is_the_law(row: Any, dimension: int) -> None:
+    """Whatever ties are."""
+    effect = next(e for e in scene_under(row, dimension).parts.effects if e.kind == row.effect.kind)
+    laws = vars(sys.modules[type(effect).__module__])
+    whole, elsewhere = laws[effect.pair_law], laws[effect.apart_law]
+    numbers = effect.parameters()
+    p, rng = namedtuple("P", numbers)(**numbers), np.random.default_rng(0)  # type: ignore[misc]
+
+    @njit(error_model="numpy", fastmath={"contract"})
+    def both(p: Any, me: Any, other: Any) -> Any:
+        return whole(p, me, other), elsewhere(p, me, other)
+
+    def drawn() -> tuple[float, ...]:
+        return tuple(rng.normal(size=dimension).tolist())
+
+    for k in range(20):
+        offset = tuple(x * (1.0, 3e-15)[k % 2] for x in drawn())  # some so near that they are hardly in two places
+        square = sum(x * x for x in offset)
+        assert square > ONE_PLACE
+        me = Me(0.0, drawn(), drawn(), drawn(), 1.0, 0.3, 2.0, 4.0, drawn(), 0.0, drawn(), 0, drawn(), 1.3, ())
+        one, other = both(p, me, Other(1.0, offset, square, drawn(), 0.3, drawn(), 1.0, ()))
+        assert one == other
+
+
+def test_laws_that_know_only_one_form_are_met_as_ever() -> None:
+    assert not crowd(10, 2, "float64", False, RULES[1])[0].parts.parting  # nobody reads ties
+    kinds = {row.effect.kind: row.effect for row in EFFECTS}
+    for kind in ("pressure", "contact"):
+        assert not crowd(10, 2, "float64", False, RULES[0], kinds[kind])[0].parts.parting
