@@ -180,10 +180,14 @@ def _picks(
             data = array_of(context, builder, signature.args[k], arguments[k]).data
             return builder.bitcast(builder.gep(data, [here]), kind.as_pointer())
 
-        def each(begin: int, say: Callable[[Callable[[Any, Any], Any]], Any]) -> None:
+        def each(begin: int, named: Any, say: Callable[..., Any], *more: Any) -> None:
             with rows(builder, word(0), arguments[6], word(1)) as (r, _):
                 row = builder.add(arguments[4], builder.mul(r, arguments[5]))
-                says = say(lambda here, kind: builder.load(pointer(3, builder.add(row, here), kind), align=size))
+
+                def part(here: Any, kind: Any) -> Any:
+                    return builder.load(pointer(3, builder.add(row, here), kind), align=size)
+
+                says = say(builder, part, named, vector, *more)
                 place = builder.add(builder.add(arguments[1], word(begin)), builder.mul(r, arguments[2]))
                 builder.store(says, pointer(0, place, vector), align=size)
 
@@ -193,9 +197,9 @@ def _picks(
             with builder.if_else(few) as (short, long):
                 with short:
                     if step:
-                        each(begin, lambda part: _looked_up(builder, part, named, vector, size, arguments[7]))  # noqa: B023
+                        each(begin, named, _looked_up, size, arguments[7])
                 with long:
-                    each(begin, lambda part: _read(builder, part, named, vector))  # noqa: B023
+                    each(begin, named, _read)
         return context.get_dummy_value()
 
     number = types.uint64

@@ -498,7 +498,8 @@ class Scene(Record):
             raise ValueError(f"times is {times!r}, must be a finite number for each of {b} worlds, or one for all")
         when, x = np.ascontiguousarray(np.broadcast_to(given, b), self.dtype), state.x
         if self.parts.confines:  # a step begins so; who is asked where he is may be outside of the box
-            x = np.ascontiguousarray(self.space.wrap(state.pos).transpose(2, 0, 1), self.dtype)
+            with np.errstate(invalid="ignore"):  # who is infinitely far has no image, and is nobody's neighbour
+                x = np.ascontiguousarray(self.space.wrap(state.pos).transpose(2, 0, 1), self.dtype)
         self._accelerations.field(
             x, state.v, *state.carried, state.alive, state.key, state.obstacle_x, state.obstacle_radius,
             state.work, self._drive(drive, state), self._params, when, acc, flow,

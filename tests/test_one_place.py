@@ -144,6 +144,16 @@ def test_who_is_outside_of_the_box_is_where_his_image_is() -> None:
     np.testing.assert_array_equal(state.x, before)
 
 
+@pytest.mark.parametrize("place", [np.nan, np.inf, -np.inf])
+def test_who_is_nowhere_is_asked_without_a_warning_and_is_nobodys_neighbour(place: float) -> None:
+    scene, state = crowd(700, 2, "float64", True, drawn=SIZE)
+    without = state.copy()
+    without.alive[0, 5] = False
+    state.x[0, 0, 5] = place
+    found, expected_ = (np.delete(scene.acceleration(s)[0], 5, axis=0) for s in (state, without))
+    np.testing.assert_allclose(found, expected_, atol=1e-9 * np.abs(expected_).max())
+
+
 def test_two_threads_and_a_view_cone_change_nothing() -> None:
     scene, state = crowd(700, 2, "float64", True, Separation(weight=1, radius=1.5, fov=200), drawn=SIZE)
     state.x[:, 0, 100:130] = state.x[:, 0, 100:101]
