@@ -7,7 +7,7 @@ import functools
 import itertools
 import math
 import secrets
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, Final, Literal, NamedTuple, NoReturn
 
 import numpy as np
@@ -46,6 +46,7 @@ AT_HAND = 2**17
 
 TERMS = ("steps", "ends")
 _NEVER = 2**63 - 1
+_SINGLE = np.dtype(np.float32)
 
 
 class Step(NamedTuple):
@@ -104,17 +105,10 @@ class World:
         """Make what follows from the task: kernel, scratch, and what every step is given."""
         scene, task, s = self.task.scene, self.task, self.state
         self._kernel = load(f"task_{task.name}", task_source(task))
-        self._enter = self._kernel.play
+        self._enter, self._tell = self._kernel.play, self._kernel.tell
         b, i, real = self.worlds, self.learners, scene.dtype
         self._actions = np.zeros((b, i, self.action_size), real)
         numbers = (task.parts.given(), list(task.parameters().values()), task.table() or (0.0,))
-        self._worlds = (
-            s.x, s.v, *s.carried, s.alive, s.tick, s.obstacle_x, s.obstacle_radius, s.work, s.key, self._memory,
-            self.steps, *(np.array(values, real) for values in numbers),
-        )  # fmt: skip
-        self._clock = (np.dtype(real).type(scene.dt), task.substeps, not task.ends_together)
-        self._kept = (self._last, self._sums, self._paid)
-        self._measured = [dict(zip(task.measures, a.T, strict=True)) for a in (self._sums, self._last)]
         fields = (
             ((b, i, self.observation_size), np.float32), ((b, i), float), ((len(task.terms), b, i), float),
             ((b, i), bool), ((b,), bool), ((b,), bool), ((b, i), bool),
@@ -126,7 +120,22 @@ class World:
         row, size = 4 * math.prod(self._shapes[0][1:]), 4 * math.prod(self._shapes[0])
         self._past = size >= PAST and row <= AT_HAND
         self._empty = Recycler(line=LINE).empty if size >= RECYCLE else np.empty
+        self._always = (
+            s.x, s.v, *s.carried, s.alive, s.tick, s.obstacle_x, s.obstacle_radius, s.work, s.key, self._memory,
+            self.steps, *(np.array(values, real) for values in numbers),
+            np.dtype(real).type(scene.dt), task.substeps, not task.ends_together, self._past,
+            self._last, self._sums, self._paid,
+        )  # fmt: skip
+        self._counted = (self.steps, np.array(numbers[1], float), self._last, self._sums)
         self._scratch = [self._allocate()]
+        self._hire()
+
+    def _hire(self) -> None:
+        """Bind the entry point to what it is given in every call, once for each thread: the scratch is its own."""
+        self._calls: list[Callable[..., tuple[int, int]]] = [
+            functools.partial(self._enter, *self._always, canvas, *decision, *rest)
+            for canvas, decision, rest in self._scratch
+        ]
 
     def _allocate(self) -> tuple[NDArray[np.float32], tuple[NDArray[Any], ...], tuple[NDArray[Any], ...]]:
         """Return the scratch of one thread: of rows that go past the caches, of a decision, of stepping and looking."""
@@ -148,13 +157,13 @@ class World:
             for shape, kind in (((many, padded), real), ((many, padded), np.int32), ((padded,), np.int32))
         ]
         space = Workspace.allocate(task.parts, scene.body, pack(task.parts, n, scene.groups))
-        canvas = np.zeros((1, *self._shapes[0][1:]) if self._past else (0, 0, 0), np.float32)
+        canvas = np.zeros(self._shapes[0][1:] if self._past else (0, 0), np.float32)
         return canvas, decision, (*near, *space.of(0, self._kernel.SCRATCH))
 
     def __getstate__(self) -> dict[str, Any]:
         """Pickle what cannot be made anew."""
         made = (
-            "_kernel", "_enter", "_actions", "_worlds", "_clock", "_scratch", "_kept", "_measured", "_shapes",
+            "_kernel", "_enter", "_tell", "_actions", "_always", "_scratch", "_calls", "_counted", "_shapes",
             "_dtypes", "_everywhere", "_untold", "_empty", "_past",
         )  # fmt: skip
         return {name: value for name, value in vars(self).items() if name not in made}
@@ -194,7 +203,9 @@ class World:
         observation: Rows = self._empty(self._shapes[0], self._dtypes[0]) if into is None else into
         begun = self.worlds if into is None else int(np.count_nonzero(rows))
         self._play(False, rows, into is None, begun, 0, (observation, *self._untold), self._actions)
-        self._enter = settled(self._kernel.play)  # types stay what they were in this call
+        if self._enter is self._kernel.play:
+            self._enter = settled(self._kernel.play)  # types stay what they were in this call
+            self._hire()
         for numbers in (self._sums, self._last, self.paid):
             numbers[rows] = 0
         return observation
@@ -267,27 +278,22 @@ class World:
         everyone: are all observed where only some begin, and told their terms? Return who is not finite, or (-1, -1).
         """
         crew = min(threads(), busy) if busy * self.agents * self.task.substeps >= WORTH_SHARING else 1
-        while len(self._scratch) < crew:
-            self._scratch.append(self._allocate())
-
-        def part(k: int, check: bool, first: int, end: int) -> tuple[int, int]:
-            canvas, decision, rest = self._scratch[k]
-            return self._enter(  # type: ignore[no-any-return]
-                acting, mask, everyone, self._past, check, first, end, actions, *self._worlds, *self._clock,
-                limit, canvas if self._past else told[0], *decision, *rest, *self._kept, *told,
-            )  # fmt: skip
+        if crew > len(self._scratch):
+            self._scratch += [self._allocate() for _ in range(crew - len(self._scratch))]
+            self._hire()
 
         if crew == 1:
-            return part(0, acting, 0, self.worlds)
+            return self._calls[0](acting, mask, everyone, acting, 0, self.worlds, actions, limit, *told)
         if acting and not np.isfinite(actions).all():  # nobody moves before all were looked at
             return REFUSED, 0
         portions = min(crew * PORTIONS, self.worlds)
         turn = itertools.count()  # whoever is done takes the next: threads do not begin at the same time
 
         def several(k: int) -> tuple[int, int]:
-            found = []
+            found, call = [], self._calls[k]
             while (n := next(turn)) < portions:
-                found.append(part(k, False, self.worlds * n // portions, self.worlds * (n + 1) // portions))
+                first, end = self.worlds * n // portions, self.worlds * (n + 1) // portions
+                found.append(call(acting, mask, everyone, False, first, end, actions, limit, *told))
             return min((bad for bad in found if bad[0] >= 0), default=(-1, -1))
 
         bad = [found for found in share([functools.partial(several, k) for k in range(crew)]) if found[0] >= 0]
@@ -303,13 +309,13 @@ class World:
             raise ValueError(f"actions have shape {given.shape}, expected (worlds, learners, numbers) = {kept.shape}")
         if given.dtype == kept.dtype and given.flags.carray:
             return given
-        if given.dtype == np.float32:  # as spaces sample them, into doubles: each has its number there
+        if given.dtype == _SINGLE:  # as spaces sample them, into doubles: each has its number there
             kept[...] = given
             return kept
         try:
             with np.errstate(over="ignore"):
                 kept[...] = given
-            if kept.dtype == np.float32 and np.isinf(kept).any():  # what it has no number for is beyond 1, not infinite
+            if kept.dtype == _SINGLE and np.isinf(kept).any():  # what it has no number for is beyond 1, not infinite
                 exact = given.astype(float)
                 kept[...] = np.where(np.isfinite(exact), np.clip(exact, -1, 1), exact)
         except (TypeError, ValueError):
@@ -327,20 +333,23 @@ class World:
 
     def measure(self) -> dict[str, NDArray[np.float64]]:
         """Domain metrics of the episodes so far, each (B,), by name."""
-        return {name: np.array(column, float) for name, column in self._metrics().items()}
+        return dict(zip(self.task.metric_names, self._told(0, self.worlds), strict=True))
 
     def metrics(self, world: int = 0) -> dict[str, float]:
         """Domain metrics of one world's episode so far, by name; what has no value yet is left out.
 
         NaN would not do: two equal infos would then differ.
         """
-        values = {name: float(column.item(world)) for name, column in self._metrics().items()}
-        return {name: value for name, value in values.items() if value == value}
+        values = self._told(range(self.worlds)[world], 1).ravel().tolist()
+        return {name: value for name, value in zip(self.task.metric_names, values, strict=True) if value == value}
 
-    def _metrics(self) -> dict[str, NDArray[np.float64]]:
-        """Return metrics by name, each (B,), which may be views of what is still counted."""
-        sums, last = self._measured
-        return self.task.metrics(sums, last, self.steps)
+    def _told(self, first: int, worlds: int) -> NDArray[np.float64]:
+        """Return the metrics of so many worlds, (K, B), new."""
+        told = np.empty((len(self.task.metric_names), worlds))
+        self._tell(*self._counted, first, told)
+        if self._tell is self._kernel.tell:
+            self._tell = settled(self._tell)
+        return told
 
     def snapshot(self, world: int = 0) -> Snapshot:
         """Return one world at this instant, for pictures."""

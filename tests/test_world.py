@@ -13,7 +13,7 @@ import pytest
 
 from flockenv.kernels import settled
 from flockenv.noise import key_of, keys_of
-from flockenv.tasks import Flock, Obstacles, Pursuit
+from flockenv.tasks import Crossing, Flock, Obstacles, Pursuit
 from flockenv.tasks.base import task_source
 from flockenv.world import AT_HAND, PAST, Step, World
 from tests.catalogue import TASKS, TaskRow
@@ -355,6 +355,18 @@ def test_metrics_of_one_world_are_those_of_all(row: TaskRow) -> None:
         found = world.metrics(k)
         assert found == {name: column[k] for name, column in columns.items() if not np.isnan(column[k])}
         assert all(type(value) is float for value in found.values())
+    assert world.metrics(-1) == world.metrics(2)
+    for nobody in (3, -4):
+        with pytest.raises(IndexError):
+            world.metrics(nobody)
+
+
+def test_metrics_are_doubles_in_a_world_of_single_precision() -> None:
+    world = World(Crossing(dtype="float32"))
+    world.reset(0)
+    for a in actions_for(world, 7):
+        world.step(a)
+    assert world.metrics()["time_to_goal"] == 7 * 0.1  # and not 7 times the float32 nearest to it
 
 
 def test_keys_of_many_worlds_are_the_keys_of_each() -> None:

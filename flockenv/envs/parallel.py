@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any, ClassVar
 
 import numpy as np
@@ -14,6 +14,7 @@ from pettingzoo import ParallelEnv
 
 from flockenv.envs.face import (
     RENDER_MODES,
+    ByAgent,
     Rows,
     Screen,
     action_space,
@@ -23,7 +24,6 @@ from flockenv.envs.face import (
     checked_seed,
     observation_space,
     render_fps,
-    told,
 )
 from flockenv.refusals import nearest
 from flockenv.tasks import Bottleneck, Corridor, Crossing, Flock, Herd, Pursuit, School, Task
@@ -67,6 +67,7 @@ class WorldParallelEnv(ParallelEnv[str, Rows, Rows]):  # type: ignore[misc]  # p
         self._screen = Screen(render_mode, render_fps(self.task))
         self._observation_spaces = {name: observation_space(self.task) for name in self.possible_agents}
         self._action_spaces = {name: action_space(self.task) for name in self.possible_agents}
+        self._by_agent = ByAgent(self.task.terms, self.possible_agents)
         self._live: dict[str, int] = {}
 
     @property
@@ -106,7 +107,8 @@ class WorldParallelEnv(ParallelEnv[str, Rows, Rows]):  # type: ignore[misc]  # p
         observation = self.world.reset(seeds=seed)[0]
         self._live = {name: i for i, name in enumerate(self.possible_agents)}
         self._show()
-        return self._named(observation), {name: {"seed": self.world.seeds[0]} for name in self._live}
+        seen = dict(zip(self._live, observation, strict=True))
+        return seen, {name: {"seed": self.world.seeds[0]} for name in self._live}
 
     def step(
         self, actions: Mapping[str, Rows]
@@ -119,23 +121,20 @@ class WorldParallelEnv(ParallelEnv[str, Rows, Rows]):  # type: ignore[misc]  # p
         begun(bool(self._live), "step")
         result = self._step(actions)
         present, truncated, terminated = self._live, result.truncated.item(), result.terminated[0].tolist()
-        outcome = (
-            self._named(result.observation[0]),
-            self._named(result.reward[0].tolist()),
-            self._named(terminated),
-            dict.fromkeys(present, truncated),
-            self._infos(result, over=truncated or all(terminated)),
-        )
+        outcome = self._by_agent.of(
+            result.observation[0], result.reward[0].tolist(), terminated, truncated, result.terms[0].T.tolist(),
+            result.success.item(),
+        )  # fmt: skip
+        if len(present) < len(terminated):
+            outcome = tuple({name: values[name] for name in present} for values in outcome)
         if truncated or any(terminated):
+            if truncated or all(terminated):
+                metrics = self.world.metrics()
+                for info in outcome[-1].values():
+                    info.update(metrics)
             self._live = {} if truncated else {name: i for name, i in present.items() if not terminated[i]}
         self._show()
-        return outcome
-
-    def _named(self, values: Sequence[Any] | Rows) -> Named:
-        """Return what is so for every learner, (L, ...), by name for those who live."""
-        if len(self._live) == len(values):
-            return dict(zip(self._live, values, strict=True))
-        return {name: values[i] for name, i in self._live.items()}
+        return outcome  # type: ignore[return-value]  # five dictionaries
 
     def _step(self, actions: Mapping[str, Rows]) -> Step:
         """Let the world act; ValueError names the agent that is at fault, asking one by one only if somebody is."""
@@ -179,18 +178,6 @@ class WorldParallelEnv(ParallelEnv[str, Rows, Rows]):  # type: ignore[misc]  # p
         if not np.isfinite(row).all():
             raise ValueError(f"actions: agent {agent!r} has {row.tolist()}; allowed: numbers, clipped to [-1, 1]")
         return row
-
-    def _infos(self, result: Step, over: bool) -> dict[str, Named]:
-        """Return reward terms and success by agent, with the metrics of the world when its episode is over."""
-        terms = result.terms[0]
-        if len(self._live) < len(terms):
-            terms = terms[list(self._live.values())]
-        infos = told(self.task.terms, self._live, terms, result.success.item())
-        if over:
-            metrics = self.world.metrics()
-            for info in infos.values():
-                info.update(metrics)
-        return infos
 
     @functools.cached_property
     def state_space(self) -> Box:

@@ -1,6 +1,6 @@
 """Task: what is seen, what is paid, when it ends; functions of frames, over a scene that knows nothing of them.
 
-A task is one file: a frozen record whose fields are the keyword arguments of `make`, and six kernels, or up to eight,
+A task is one file: a frozen record whose fields are the keyword arguments of `make`, and seven kernels, or up to nine,
 over one world:
 
 * `spawn(p, frame)` writes the first positions, velocities, obstacles and memory from the world's key;
@@ -10,7 +10,10 @@ over one world:
   else, as a test checks;
 * `ended(p, before, after, over) -> success` writes which learners are over (L,), may take agents out of `after.alive`,
   and says whether the aim is reached;
-* `measure(p, before, after, numbers)` writes what this step adds to the domain metrics (Q,);
+* `measure(p, before, after, numbers)` writes what this step adds to the `measures` (Q,);
+* `metrics(p, sums, last, steps, numbers)` writes the domain metrics of an episode so far, in the order of
+  `metric_names`, from the sums of the measures over its steps and from their last values, by name (sums.path, say), and
+  the number of steps; a metric has no value where none is written. All of it is double precision, `p` too;
 * `abreast(p, frame, columns)`, of a task with numbers `abreast` alone, writes the first so many numbers of all rows,
   (L, abreast), of which the same number of all agents lies together: loops over agents become vector code. So that
   none is left over, L is rounded up there and in that task's `reward`, and in what it and that task's `reward`, `ended`
@@ -27,7 +30,6 @@ for all of them, by the same query as a scene's effects, if the task says what i
 from __future__ import annotations
 
 import functools
-from collections.abc import Mapping
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple
 
@@ -45,10 +47,7 @@ from flockenv.sweep import SHARED, Look, Parts, look_source, scene_source
 from flockenv.sweep.text import indented_lines
 from flockenv.tasks.layout import Layout
 
-__all__ = ["NEAR", "REFUSED", "TASKS", "Frame", "Measured", "Task", "task_source"]
-
-Measured = Mapping[str, NDArray[np.float64]]
-"""Numbers of `measure` by name, each (B,)."""
+__all__ = ["NEAR", "REFUSED", "TASKS", "Frame", "Task", "task_source"]
 
 TASKS: dict[str, type[Task]] = {}
 """Every task by name; a class registers itself when it is defined."""
@@ -90,6 +89,7 @@ class Task(Record):
     terms: ClassVar[tuple[str, ...]]
     """Names of the reward terms, in order."""
     metric_names: ClassVar[tuple[str, ...]]
+    """Names of the numbers that `metrics` writes."""
     measures: ClassVar[tuple[str, ...]]
     """Names of the numbers that `measure` writes each step."""
     counts: ClassVar[tuple[str, ...]] = ()
@@ -197,10 +197,6 @@ class Task(Record):
         numbers = {n: getattr(self, n) for n in type(self).model_fields}
         return {n: float(v) for n, v in numbers.items() if isinstance(v, (int, float))}
 
-    def metrics(self, sums: Measured, last: Measured, steps: NDArray[np.int64]) -> dict[str, NDArray[np.float64]]:
-        """Return domain metrics (B,) of the episodes so far, from the measures' sums over steps and the last ones."""
-        raise TypeError(f"{type(self).__name__} must say how its metrics follow from its measures")
-
     def marks(self, state: State, memory: NDArray[np.float64], world: int) -> tuple[Mark, ...]:
         """Return what a picture should point out."""
         return ()
@@ -211,7 +207,7 @@ class Task(Record):
         return (0.0,) * d, self.scene.space.extent(d)
 
 
-_KERNELS = ("spawn", "drive", "reward", "ended", "measure", "observe")
+_KERNELS = ("spawn", "drive", "reward", "ended", "measure", "metrics", "observe")
 
 NEAR = "near_square, near_who, near_count, obstacle_gap, obstacle_who, obstacle_count"
 """What `look` writes, in order."""
@@ -232,7 +228,7 @@ def _frame(
 
 
 def task_source(task: Task) -> str:
-    """Return the source of a task's kernel: its scene's, and one entry point, `play`."""
+    """Return the source of a task's kernel: its scene's, and two entry points, `play` and `tell`."""
     d = task.scene.dimension
     names = task.parameters()
     unknown = [name for name in task.counts if name not in names]
@@ -268,13 +264,26 @@ from flockenv.vehicle import face
 from {type(task).__module__} import {", ".join([*_KERNELS, *optional])}
 
 P = namedtuple("P", {" ".join(names)!r})
+Measures = namedtuple("Measures", {" ".join(task.measures)!r})
+
+
+@njit(cache=True, **FAST)
+def tell(steps, numbers, last, sums, first, told):
+    """Write the metrics of so many worlds, (K, B), from the first on; NaN: no value. Numbers are P's, as doubles."""
+    unaliased()
+    p = P({values})
+    for k in range(told.shape[1]):
+        b = first + k
+        told[:, k] = np.nan
+        metrics(p, {_measures(task, "sums")}, {_measures(task, "last")}, steps[b], told[:, k])
 
 
 @njit(cache=True, **FAST)
 def play(
-    acting, mask, everyone, past, check, from_world, to_world, actions, {worlds}, dt, count, mortal, limit,
+    {worlds}, dt, count, mortal, past, measured, sums, paid,
     canvas, force, x0, v0, alive0, decided, {"own, nearby, beside, " if task.abreast else ""}{NEAR}, {SHARED},
-    measured, sums, paid, rows, payment, terms, over, late, success, present,
+    acting, mask, everyone, check, from_world, to_world, actions, limit,
+    rows, payment, terms, over, late, success, present,
 ):
     """Let worlds [from_world, to_world) take a decision, or begin an episode where `mask` says so; and observe them.
 
@@ -282,7 +291,7 @@ def play(
     (world, agent) that is not finite first, or -1s; the world is {REFUSED}, and nothing moves, if `check` is asked for
     and an action is no number. Beginning, it observes the worlds that begin, or everyone; acting, it observes everyone,
     and writes the terms of worlds in which somebody ends, or everyone's. Rows that are to go `past` the caches are made
-    in canvas[0]; if none is, the canvas is where the rows are to be.
+    on the canvas.
     """
     unaliased()
     x, v, memory, obstacle_x = packed(x), packed(v), packed(memory), packed(obstacle_x)
@@ -368,7 +377,7 @@ def play(
                 for i in range(np.uint64(over.shape[1])):
                     paid[k, b, i] += earns[i, k]
                     payment[b, i] = earns[i, k] + (payment[b, i] if k > 0 else 0.0)
-        seen = canvas[0 if past else b]
+        seen = canvas if past else rows[b]
         {show}
         observe(p, now, seen)
         if past:
@@ -378,6 +387,11 @@ def play(
     return broken, who
 '''
     return scene_source(task.parts, look_source(task.parts) + play)
+
+
+def _measures(task: Task, array: str) -> str:
+    """Write the measures of world b, by name."""
+    return f"Measures({', '.join(f'{array}[b, {k}]' for k in range(len(task.measures)))})"
 
 
 def _lanes(task: Task) -> tuple[str, str]:

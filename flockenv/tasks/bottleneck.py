@@ -22,7 +22,7 @@ from flockenv.space import Box
 from flockenv.spawn import Spawn
 from flockenv.state import State
 from flockenv.sweep import Look
-from flockenv.tasks.base import Frame, Measured, Task
+from flockenv.tasks.base import Frame, Task
 from flockenv.tasks.layout import Layout, Slot
 from flockenv.tasks.sight import clip, neighbour_slots, place_of, put, put_crowding, put_neighbour, velocity_of
 from flockenv.vec import add, norm, scale, sub, unit
@@ -170,6 +170,20 @@ def measure(p: Any, before: Frame, after: Frame, numbers: Any) -> None:
         touched += p.control_dt / n if after.memory[0, i] > 0.0 else 0.0
         hurt += p.control_dt / n if after.memory[0, i] > p.limit else 0.0
     numbers[0], numbers[1], numbers[2], numbers[3], numbers[4], numbers[5] = out, first, latest, most, touched, hurt
+
+
+@kernel
+def metrics(p: Any, sums: Any, last: Any, steps: int, numbers: Any) -> None:
+    """Share that is out; s until the last was, if all are; persons per s and m of door between the first and the last,
+    once two are out; s in touch, each, on average; most pressure on anybody, N/m; s in which it hurt, each, on average.
+    """  # fmt: skip
+    span = last.latest - last.first
+    numbers[0] = last.out / p.learners
+    if last.out >= p.learners:
+        numbers[1] = last.latest
+    if last.out >= 2 and span > 0:
+        numbers[2] = (last.out - 1) / span / p.width
+    numbers[3], numbers[4], numbers[5] = sums.touched, last.most, sums.hurt
 
 
 @kernel
@@ -332,22 +346,6 @@ class Bottleneck(Task):
         """A force, in the room's axes."""
         meaning = "force (x, y) / max_force, shortened to length 1"
         return Layout((Slot("force", (2,), self.max_force, "N", meaning),))
-
-    def metrics(self, sums: Measured, last: Measured, steps: NDArray[np.int64]) -> dict[str, NDArray[np.float64]]:
-        """Share that is out; s until the last was (NaN if not all are); persons per s and m of door between the first
-        and the last out (NaN before two are); s in touch, each, on average; most pressure on anybody, N/m; s in which
-        it hurt, each, on average.
-        """  # fmt: skip
-        out, span = last["out"], last["latest"] - last["first"]
-        flows = (out >= 2) & (span > 0)
-        return {
-            "share_out": out / self.learners,
-            "evacuation_time": np.where(out >= self.learners, last["latest"], np.nan),
-            "specific_flow": np.where(flows, (out - 1) / np.where(flows, span, 1.0) / self.width, np.nan),
-            "contact_time": sums["touched"],
-            "most_pressure": last["most"],
-            "hurt_time": sums["hurt"],
-        }
 
     def marks(self, state: State, memory: NDArray[np.float64], world: int) -> tuple[Mark, ...]:
         """The door."""

@@ -7,7 +7,6 @@ import math
 from typing import Any, ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from flockenv import steering
@@ -21,7 +20,7 @@ from flockenv.space import Torus
 from flockenv.spawn import Spawn
 from flockenv.state import State
 from flockenv.sweep import Look
-from flockenv.tasks.base import Frame, Measured, Task
+from flockenv.tasks.base import Frame, Task
 from flockenv.tasks.layout import Layout, Slot
 from flockenv.tasks.sight import neighbour_slots, offset, put, put_crowding, put_neighbour, turned, velocity_of
 from flockenv.vec import add, norm, scale, sub
@@ -174,6 +173,15 @@ def measure(p: Any, before: Frame, after: Frame, numbers: Any) -> None:
 
 
 @kernel
+def metrics(p: Any, sums: Any, last: Any, steps: int, numbers: Any) -> None:
+    """Speed along the way over the desired one; touches that began; lane order in the second half, none before."""
+    numbers[0] = sums.share / max(steps, 1)
+    numbers[1] = sums.touches
+    if sums.late > 0:
+        numbers[2] = sums.order / sums.late
+
+
+@kernel
 def observe(p: Any, frame: Frame, rows: Any) -> None:
     """All as (along one's way, to its left): own velocity, desired speed, walls, the nearest others."""
     slots, one = int(p.neighbours), like(p.sight, 1.0)
@@ -308,15 +316,6 @@ class Corridor(Task):
         """A force in the frame of one's way."""
         meaning = "force (along one's way, to its left) / max_force, shortened to length 1"
         return Layout((Slot("force", (2,), self.max_force, "N", meaning),))
-
-    def metrics(self, sums: Measured, last: Measured, steps: NDArray[np.int64]) -> dict[str, NDArray[np.float64]]:
-        """Speed along the way over the desired one; touches that began; lane order in the second half (NaN before)."""
-        late = sums["late"]
-        return {
-            "speed": sums["share"] / np.maximum(steps, 1),
-            "collisions": sums["touches"],
-            "lane_order": np.where(late > 0, sums["order"] / np.maximum(late, 1.0), np.nan),
-        }
 
     def view(self, state: State, world: int) -> tuple[tuple[float, ...], tuple[float, ...]]:
         """The corridor."""

@@ -19,7 +19,7 @@ from flockenv.space import Plane
 from flockenv.spawn import Spawn
 from flockenv.state import State
 from flockenv.sweep import Look
-from flockenv.tasks.base import Frame, Measured, Task
+from flockenv.tasks.base import Frame, Task
 from flockenv.tasks.layout import Layout, Slot
 from flockenv.tasks.sight import neighbour_slots, put, put_neighbour, turned
 
@@ -168,6 +168,15 @@ def measure(p: Any, before: Frame, after: Frame, numbers: Any) -> None:
 
 
 @kernel
+def metrics(p: Any, sums: Any, last: Any, steps: int, numbers: Any) -> None:
+    """Touches that began; mean time away from the goal, s; share there at the end; straight way / way walked."""
+    numbers[0] = sums.touches
+    numbers[1] = (steps - sums.there) * p.control_dt
+    numbers[2] = last.there
+    numbers[3] = sums.gained / max(sums.walked, 1e-9)
+
+
+@kernel
 def observe(p: Any, frame: Frame, rows: Any) -> None:
     """All in the frame of the course: (along, left). Own velocity, the way to the goal, the nearest neighbours."""
     slots, one = int(p.neighbours), like(p.sight, 1.0)
@@ -263,15 +272,6 @@ class Crossing(Task):
         """A force in the frame of the course."""
         meaning = "force (along the course, to its left) / max_force, shortened to length 1"
         return Layout((Slot("force", (2,), self.max_force, "N", meaning),))
-
-    def metrics(self, sums: Measured, last: Measured, steps: NDArray[np.int64]) -> dict[str, NDArray[np.float64]]:
-        """Touches that began; mean time away from the goal, s; share there at the end; straight way / way walked."""
-        return {
-            "collisions": sums["touches"],
-            "time_to_goal": (steps - sums["there"]) * self.control_dt,
-            "arrived": last["there"],
-            "path_efficiency": sums["gained"] / np.maximum(sums["walked"], 1e-9),
-        }
 
     def marks(self, state: State, memory: NDArray[np.float64], world: int) -> tuple[Mark, ...]:
         """The goals."""

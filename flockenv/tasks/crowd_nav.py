@@ -23,7 +23,7 @@ from flockenv.spawn import Spawn
 from flockenv.state import State
 from flockenv.steer import Steer
 from flockenv.sweep import Look
-from flockenv.tasks.base import Frame, Measured, Task
+from flockenv.tasks.base import Frame, Task
 from flockenv.tasks.layout import Layout, Slot
 from flockenv.tasks.sight import clip, neighbour_slots, put, put_crowding, put_neighbour, turned
 
@@ -136,6 +136,22 @@ def measure(p: Any, before: Frame, after: Frame, numbers: Any) -> None:
     numbers[2] = math.hypot(after.pos[0, 0] - before.pos[0, 0], after.pos[1, 0] - before.pos[1, 0])
     numbers[3] = after.memory[5, 0]
     numbers[4] = p.control_dt if 0.0 <= gap < p.comfort_distance else 0.0
+
+
+@kernel
+def metrics(p: Any, sums: Any, last: Any, steps: int, numbers: Any) -> None:
+    """Did it touch somebody; neither that nor there; s to the goal, if it is there; path, m; least gap, m; share of the
+    time nearer than is comfortable.
+    """  # fmt: skip
+    time = steps * p.control_dt
+    numbers[0] = last.touch
+    numbers[1] = 1.0 - last.touch - last.there if steps > 0 else 0.0
+    if last.there > 0:
+        numbers[2] = time
+    numbers[3] = sums.walked
+    if steps > 0:
+        numbers[4] = last.gap
+    numbers[5] = sums.near / max(time, p.control_dt)
 
 
 @kernel
@@ -269,20 +285,6 @@ class CrowdNav(Task):
         """A force in the frame of the course."""
         meaning = "force (along the course, to its left) / max_force, shortened to length 1"
         return Layout((Slot("force", (2,), self.max_force, "N", meaning),))
-
-    def metrics(self, sums: Measured, last: Measured, steps: NDArray[np.int64]) -> dict[str, NDArray[np.float64]]:
-        """Did it touch somebody; neither that nor there; s to the goal (NaN if not there); path, m; least gap, m; share
-        of the time nearer than is comfortable.
-        """  # fmt: skip
-        time = steps * self.control_dt
-        return {
-            "collided": last["touch"],
-            "timed_out": np.where(steps > 0, 1.0 - last["touch"] - last["there"], 0.0),
-            "time_to_goal": np.where(last["there"] > 0, time, np.nan),
-            "path_length": sums["walked"],
-            "least_gap": np.where(steps > 0, last["gap"], np.nan),
-            "discomfort": sums["near"] / np.maximum(time, self.control_dt),
-        }
 
     def marks(self, state: State, memory: NDArray[np.float64], world: int) -> tuple[Mark, ...]:
         """The robot's goal."""

@@ -6,7 +6,6 @@ import functools
 from typing import Any, ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from flockenv import arbitration, steering
@@ -17,7 +16,7 @@ from flockenv.scene import Group, Scene
 from flockenv.shapes import ray_hit
 from flockenv.space import Box
 from flockenv.sweep import Look
-from flockenv.tasks.base import Frame, Measured, Task
+from flockenv.tasks.base import Frame, Task
 from flockenv.tasks.layout import Layout, Slot
 from flockenv.tasks.sight import block_ways, clip, compass, leaves_gap, velocity_of
 from flockenv.vec import add, norm, scale, unit
@@ -211,6 +210,12 @@ def measure(p: Any, before: Frame, after: Frame, numbers: Any) -> None:
 
 
 @kernel
+def metrics(p: Any, sums: Any, last: Any, steps: int, numbers: Any) -> None:
+    """Seconds until it was caught, or now; is it free; seconds in which nobody saw it; nearest pursuer now, m."""
+    numbers[0], numbers[1], numbers[2], numbers[3] = sums.time, 1.0 - last.caught, sums.hidden, last.distance
+
+
+@kernel
 def observe(p: Any, frame: Frame, rows: Any) -> None:
     """Own velocity, walls, pursuers nearest first and whether they see it, the nearest cover, free ways all around."""
     row = rows[0]
@@ -382,12 +387,3 @@ class Evade(Task):
         """A force, in the field's axes."""
         meaning = "force (x, y) / max_force, shortened to length 1"
         return Layout((Slot("force", (2,), self.evader_force, "N", meaning),))
-
-    def metrics(self, sums: Measured, last: Measured, steps: NDArray[np.int64]) -> dict[str, NDArray[np.float64]]:
-        """Seconds until it was caught, or now; is it free; seconds in which nobody saw it; nearest pursuer now, m."""
-        return {
-            "survival_time": sums["time"],
-            "survived": 1.0 - last["caught"],
-            "time_hidden": sums["hidden"],
-            "least_distance": last["distance"],
-        }

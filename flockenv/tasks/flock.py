@@ -19,7 +19,7 @@ from flockenv.snapshot import Mark
 from flockenv.space import Torus
 from flockenv.state import State
 from flockenv.sweep import Look
-from flockenv.tasks.base import Frame, Measured, Task
+from flockenv.tasks.base import Frame, Task
 from flockenv.tasks.layout import Layout, Slot
 from flockenv.tasks.sight import block_ways, compass, offset, turned
 from flockenv.vec import norm, scale, sub, unit
@@ -244,6 +244,14 @@ def measure(p: Any, before: Frame, after: Frame, numbers: Any) -> None:
     numbers[0], numbers[3] = _order(after)
     numbers[1] = _nearest(p, after)
     numbers[2] = _began(p, before, after) if _anybody_touches(after) else 0.0
+
+
+@kernel
+def metrics(p: Any, sums: Any, last: Any, steps: int, numbers: Any) -> None:
+    """Means over the episode: polarisation, nearest neighbour [m], speed along [m/s]; touches that began."""
+    n = max(steps, 1)
+    numbers[0], numbers[1] = sums.polarisation / n, sums.nearest / n
+    numbers[2], numbers[3] = sums.touches, sums.along / n
 
 
 @kernel
@@ -512,16 +520,6 @@ class Flock(Task):
         """A force in the frame of the heading."""
         meaning = "force (along the heading, to its left) / max_force, shortened to length 1"
         return Layout((Slot("force", (2,), self.max_force, "N", meaning),))
-
-    def metrics(self, sums: Measured, last: Measured, steps: NDArray[np.int64]) -> dict[str, NDArray[np.float64]]:
-        """Means over the episode: polarisation, nearest neighbour [m], speed along [m/s]; touches that began."""
-        n = np.maximum(steps, 1)
-        return {
-            "polarisation": sums["polarisation"] / n,
-            "nearest_neighbour": sums["nearest"] / n,
-            "collisions": sums["touches"],
-            "speed_along": sums["along"] / n,
-        }
 
     def marks(self, state: State, memory: NDArray[np.float64], world: int) -> tuple[Mark, ...]:
         """The heading."""

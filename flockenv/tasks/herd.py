@@ -18,7 +18,7 @@ from flockenv.snapshot import Mark
 from flockenv.space import Plane
 from flockenv.spawn import Spawn
 from flockenv.state import State
-from flockenv.tasks.base import Frame, Measured, Task
+from flockenv.tasks.base import Frame, Task
 from flockenv.tasks.layout import Layout, Slot
 from flockenv.tasks.sight import clip, place_of, velocity_of
 from flockenv.vec import add, norm, scale, sub, unit
@@ -206,6 +206,15 @@ def measure(p: Any, before: Frame, after: Frame, numbers: Any) -> None:
 
 
 @kernel
+def metrics(p: Any, sums: Any, last: Any, steps: int, numbers: Any) -> None:
+    """Share of the sheep in the pen; s until all were, if they are; spread now, m; path of a dog, m."""
+    numbers[0] = last.penned
+    if last.penned >= 1.0 and steps > 0:
+        numbers[1] = sums.time
+    numbers[2], numbers[3] = last.spread, sums.path
+
+
+@kernel
 def observe(p: Any, frame: Frame, rows: Any) -> None:
     """In the frame of the course, (along, left): own velocity, pen, flock, who strays, nearest sheep, other dogs."""
     centre, course, pen = _centre(p, frame), _course(p, frame), _pen(frame)
@@ -386,15 +395,6 @@ class Herd(Task):
         """A force in the frame of the course."""
         meaning = "force (along the course, to its left) / max_force, shortened to length 1"
         return Layout((Slot("force", (2,), self.dog_force, "N", meaning),))
-
-    def metrics(self, sums: Measured, last: Measured, steps: NDArray[np.int64]) -> dict[str, NDArray[np.float64]]:
-        """Share of the sheep in the pen; s until all were (NaN if they are not); spread now, m; path of a dog, m."""
-        return {
-            "share_penned": last["penned"],
-            "time_to_pen": np.where((last["penned"] >= 1.0) & (steps > 0), sums["time"], np.nan),
-            "spread": last["spread"],
-            "path_length": sums["path"],
-        }
 
     def marks(self, state: State, memory: NDArray[np.float64], world: int) -> tuple[Mark, ...]:
         """The pen."""

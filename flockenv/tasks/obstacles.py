@@ -17,7 +17,7 @@ from flockenv.snapshot import Mark
 from flockenv.space import Box
 from flockenv.state import State
 from flockenv.sweep import Look
-from flockenv.tasks.base import Frame, Measured, Task
+from flockenv.tasks.base import Frame, Task
 from flockenv.tasks.layout import Layout, Slot
 from flockenv.tasks.sight import block_ways, clip, compass, leaves_gap
 
@@ -106,6 +106,15 @@ def measure(p: Any, before: Frame, after: Frame, numbers: Any) -> None:
     numbers[1] = after.memory[3, 0]
     numbers[2] = _to_goal(after)
     numbers[3] = after.memory[2, 0]
+
+
+@kernel
+def metrics(p: Any, sums: Any, last: Any, steps: int, numbers: Any) -> None:
+    """Seconds to the goal, if it is reached; touches; and metres gained towards the goal per metre run."""
+    if last.left <= p.goal_radius and sums.touch == 0 and steps > 0:
+        numbers[0] = steps * p.control_dt
+    numbers[1] = sums.touch
+    numbers[2] = max(last.straight - last.left, 0.0) / max(sums.path, 1e-9)
 
 
 @kernel
@@ -238,16 +247,6 @@ class Obstacles(Task):
     def action_layout(self) -> Layout:
         """A force, in the field's axes."""
         return Layout((Slot("force", (2,), self.max_force, "N", "force (x, y) / max_force, shortened to length 1"),))
-
-    def metrics(self, sums: Measured, last: Measured, steps: NDArray[np.int64]) -> dict[str, NDArray[np.float64]]:
-        """Seconds to the goal (NaN if not reached), touches, and metres gained towards the goal per metre run."""
-        there = (last["left"] <= self.goal_radius) & (sums["touch"] == 0) & (steps > 0)
-        gained = np.maximum(last["straight"] - last["left"], 0.0)
-        return {
-            "time_to_goal": np.where(there, steps * self.control_dt, np.nan),
-            "collisions": sums["touch"],
-            "path_efficiency": gained / np.maximum(sums["path"], 1e-9),
-        }
 
     def marks(self, state: State, memory: NDArray[np.float64], world: int) -> tuple[Mark, ...]:
         """The goal."""

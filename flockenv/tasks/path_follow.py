@@ -16,7 +16,7 @@ from flockenv.scene import Group, Scene
 from flockenv.snapshot import Mark
 from flockenv.space import Box
 from flockenv.state import State
-from flockenv.tasks.base import Frame, Measured, Task
+from flockenv.tasks.base import Frame, Task
 from flockenv.tasks.layout import Layout, Slot
 from flockenv.tasks.sight import clip
 from flockenv.vec import dot, norm, sub
@@ -192,6 +192,14 @@ def measure(p: Any, before: Frame, after: Frame, numbers: Any) -> None:
 
 
 @kernel
+def metrics(p: Any, sums: Any, last: Any, steps: int, numbers: Any) -> None:
+    """Metres along the track, share of the time off it, metres run per second."""
+    made = max(steps, 1)
+    numbers[0], numbers[1] = sums.gained, sums.off / made
+    numbers[2] = sums.path / (made * p.control_dt)
+
+
+@kernel
 def observe(p: Any, frame: Frame, rows: Any) -> None:
     """All in the frame of the track here: own velocity, how far to the left, the spine ahead and how it bends."""
     i, along = _place(p, frame)
@@ -327,15 +335,6 @@ class PathFollow(Task):
         """A force, in the same frame."""
         said = "force (along the track, to its left) / max_force, shortened to length 1"
         return Layout((Slot("force", (2,), self.max_force, "N", said),))
-
-    def metrics(self, sums: Measured, last: Measured, steps: NDArray[np.int64]) -> dict[str, NDArray[np.float64]]:
-        """Metres along the track, share of the time off it, metres run per second."""
-        made = np.maximum(steps, 1)
-        return {
-            "progress": sums["gained"],
-            "off_track": sums["off"] / made,
-            "mean_speed": sums["path"] / (made * self.control_dt),
-        }
 
     def marks(self, state: State, memory: NDArray[np.float64], world: int) -> tuple[Mark, ...]:
         """The track: a disc of its width at every corner."""

@@ -6,8 +6,6 @@ import functools
 import math
 from typing import Any, ClassVar, Literal
 
-import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
 
 from flockenv import arbitration, steering
@@ -16,7 +14,7 @@ from flockenv.noise import uniform
 from flockenv.scene import Group, Scene
 from flockenv.space import Box
 from flockenv.spawn import direction
-from flockenv.tasks.base import Frame, Measured, Task
+from flockenv.tasks.base import Frame, Task
 from flockenv.tasks.layout import Layout, Slot
 from flockenv.vec import scale
 
@@ -162,6 +160,14 @@ def measure(p: Any, before: Frame, after: Frame, numbers: Any) -> None:
     numbers[1] = best
     numbers[2] = caught
     numbers[3] = p.control_dt if free > 0 else 0.0
+
+
+@kernel
+def metrics(p: Any, sums: Any, last: Any, steps: int, numbers: Any) -> None:
+    """Time of the last capture, s, if nobody is free; path of pursuer 0, m; distance now, m; caught."""
+    if last.captured >= p.evaders:
+        numbers[0] = sums.time
+    numbers[1], numbers[2], numbers[3] = sums.path, last.distance, last.captured
 
 
 @kernel
@@ -328,12 +334,3 @@ class Pursuit(Task):
         """A force, in the field's axes."""
         meaning = "force (x, y) / own max_force, shortened to length 1"
         return Layout((Slot("force", (2,), self.pursuer_force, "N", meaning),))
-
-    def metrics(self, sums: Measured, last: Measured, steps: NDArray[np.int64]) -> dict[str, NDArray[np.float64]]:
-        """Time of the last capture, s (NaN if somebody is free); path of pursuer 0, m; distance now, m; caught."""
-        return {
-            "time_to_capture": np.where(last["captured"] >= self.evaders, sums["time"], np.nan),
-            "path_length": sums["path"],
-            "least_distance": last["distance"],
-            "captured": last["captured"],
-        }

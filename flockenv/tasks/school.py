@@ -18,7 +18,7 @@ from flockenv.scene import Group, Scene
 from flockenv.snapshot import Mark
 from flockenv.space import Box
 from flockenv.state import State
-from flockenv.tasks.base import Frame, Measured, Task
+from flockenv.tasks.base import Frame, Task
 from flockenv.tasks.layout import Layout, Slot
 from flockenv.tasks.sight import clip, place_of, velocity_of
 from flockenv.vec import add, dot, norm, scale, sub, unit
@@ -312,6 +312,18 @@ def measure(p: Any, before: Frame, after: Frame, numbers: Any) -> None:
             numbers[4] += 1.0 / learners if after.memory[FATE, i] == STARVED else 0.0
 
 
+@kernel
+def metrics(p: Any, sums: Any, last: Any, steps: int, numbers: Any) -> None:
+    """Share of the learners alive; s that they lived, on average; mean hunger while they did; food eaten by each.
+
+    And which share was caught, and which starved.
+    """
+    numbers[0], numbers[1] = last.alive, sums.alive * p.control_dt
+    if sums.alive > 0:
+        numbers[2] = sums.hunger / max(sums.alive, 1e-12)
+    numbers[3], numbers[4], numbers[5] = sums.eaten, sums.caught, sums.starved
+
+
 # --- what is seen -----------------------------------------------------------------------------------------------------
 
 
@@ -501,20 +513,6 @@ class School(Task):
         """A force, in the tank's axes."""
         meaning = "force (x, y) / max_force, shortened to length 1"
         return Layout((Slot("force", (2,), self.fish_force, "N", meaning),))
-
-    def metrics(self, sums: Measured, last: Measured, steps: NDArray[np.int64]) -> dict[str, NDArray[np.float64]]:
-        """Share of the learners alive; s that they lived, on average; mean hunger while they did; food eaten by each.
-
-        And which share was caught, and which starved.
-        """
-        return {
-            "survived": last["alive"],
-            "lifetime": sums["alive"] * self.control_dt,
-            "hunger": np.where(sums["alive"] > 0, sums["hunger"] / np.maximum(sums["alive"], 1e-12), np.nan),
-            "eaten": sums["eaten"],
-            "caught": sums["caught"],
-            "starved": sums["starved"],
-        }
 
     def marks(self, state: State, memory: NDArray[np.float64], world: int) -> tuple[Mark, ...]:
         """The patches; their area is what is left."""
