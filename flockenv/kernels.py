@@ -11,6 +11,7 @@ from __future__ import annotations
 import functools
 import hashlib
 import importlib.util
+import inspect
 import math
 import os
 import re
@@ -36,6 +37,7 @@ from flockenv import (
     processor,
 )
 from flockenv.inlining import Inlined
+from flockenv.startup import numba_before_scipy
 from flockenv.turns import OneAtATime
 
 __all__ = [
@@ -89,24 +91,30 @@ OPTIONS: Any = {
 _njit: Any = numba.njit  # numba's stubs do not know `_nrt`
 
 
+def _marked(function: F, **options: Any) -> F:
+    """Mark a part of kernels. numba asks for its signature twice, which takes longer than all else: it is told."""
+    function.__signature__ = inspect.signature(function)  # type: ignore[attr-defined]
+    return cast(F, _njit(**{**OPTIONS, **options})(function))
+
+
 def law(function: F) -> F:
     """Mark a scalar law: branch-free if it can be, inlined into whatever loop calls it, never called on its own."""
-    return cast(F, _njit(**OPTIONS)(function))
+    return _marked(function)
 
 
 def unfused(function: F) -> F:
     """Mark a law that must give the same bits in every loop it is inlined into: no multiply is fused with an add."""
-    return cast(F, _njit(**{**OPTIONS, "fastmath": False})(function))
+    return _marked(function, fastmath=False)
 
 
 def kernel(function: F) -> F:
     """Mark a function over the arrays of one world; compiled as a part of the generated file that calls it."""
-    return cast(F, _njit(**OPTIONS)(function))
+    return _marked(function)
 
 
 def routine(function: F) -> F:
     """Mark a function that a kernel calls from several places, and that is compiled once for all of them."""
-    return cast(F, _njit(**{**OPTIONS, "forceinline": False})(function))
+    return _marked(function, forceinline=False)
 
 
 def shared(function: F) -> F:
@@ -376,6 +384,7 @@ def load(name: str, source: str) -> ModuleType:
 
     The file is written beside its final place and renamed, so that two processes may race.
     """
+    numba_before_scipy()
     told = f"{source}{laws_digest()}{_other_laws(source)}{processor.REGISTER}"
     digest = hashlib.sha256(told.encode()).hexdigest()[:20]
     folder = cache_folder()

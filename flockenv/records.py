@@ -68,7 +68,7 @@ class Record(BaseModel, metaclass=_OneLine):
     An unknown or invalid field is refused at construction with a ValueError of one line that names it.
     """
 
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, defer_build=True)
 
     @classmethod
     def __pydantic_init_subclass__(cls, **options: Any) -> None:

@@ -1,4 +1,4 @@
-"""What a process does once: it imports folders and reads kernels. Nobody looks for garbage meanwhile."""
+"""What a process does once: it imports folders and reads kernels. Nobody looks for garbage meanwhile, nor for scipy."""
 
 from __future__ import annotations
 
@@ -6,9 +6,11 @@ import contextlib
 import gc
 import importlib
 import pkgutil
+import sys
 from collections.abc import Iterable, Iterator
+from typing import Any
 
-__all__ = ["import_all", "nothing_to_collect"]
+__all__ = ["import_all", "nothing_to_collect", "numba_before_scipy"]
 
 
 @contextlib.contextmanager
@@ -31,3 +33,21 @@ def import_all(package: str, path: Iterable[str]) -> None:
     with nothing_to_collect():
         for module in pkgutil.iter_modules(path):
             importlib.import_module(f"{package}.{module.name}")
+
+
+def numba_before_scipy() -> None:
+    """Have numba load what it knows of arrays without scipy.linalg, a tenth of the time until a process's first step.
+
+    It imports scipy.linalg there to see that it can be imported, and does so again where it is used: whoever compiles
+    np.dot has it imported then, or is told that it is not there.
+    """
+    name = "numba.np.arraymath"
+    if name in sys.modules:
+        return
+    linalg: Any = importlib.import_module("numba.np.linalg")
+    asks = linalg.ensure_blas
+    linalg.ensure_blas = lambda: None
+    try:
+        importlib.import_module(name)
+    finally:
+        linalg.ensure_blas = asks

@@ -8,11 +8,12 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
-from typing import Any
-
-from filelock import FileLock, Timeout
+from typing import TYPE_CHECKING, Any
 
 from flockenv.startup import nothing_to_collect
+
+if TYPE_CHECKING:
+    from filelock import FileLock
 
 __all__ = ["PATIENCE", "OneAtATime"]
 
@@ -25,9 +26,11 @@ class OneAtATime:
 
     def __init__(self, cache: Any, lock: Path, patience: float = PATIENCE) -> None:
         self._cache, self._path, self._patience = cache, lock, patience
-        self._made = {os.getpid(): self._make()}
+        self._made: dict[int, FileLock] = {}
 
     def _make(self) -> FileLock:
+        from filelock import FileLock  # here: who only reads need not wait for it
+
         # of all threads: numba compiles in one at a time, and the next one may have to let go of what another left
         return FileLock(self._path, timeout=self._patience, thread_local=False)
 
@@ -40,13 +43,14 @@ class OneAtATime:
 
     def load_overload(self, signature: Any, context: Any) -> Any:
         """Return what is on the disk, if need be as soon as another process has written it; None: it is up to you."""
-        self._lock.release(force=True)  # of a compilation that failed
+        if os.getpid() in self._made:
+            self._lock.release(force=True)  # of a compilation that failed
         found = self._read(signature, context)
         if found is not None:
             return found
         try:
             self._lock.acquire()
-        except (Timeout, OSError):  # where nothing can be locked, each compiles for himself
+        except OSError:  # waited for too long, or nothing can be locked here: each compiles for himself
             return None
         found = self._read(signature, context)
         if found is not None:

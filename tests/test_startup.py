@@ -70,6 +70,23 @@ def test_whatever_is_imported_first_python_collects_afterwards(module: str) -> N
     subprocess.run([sys.executable, "-c", code], check=True)
 
 
+def test_kernels_are_read_without_linear_algebra_and_whoever_needs_it_has_it() -> None:
+    code = """
+import sys
+import numba, numpy as np
+from flockenv.scene import Group, Scene
+from flockenv.space import Torus
+scene = Scene(space=Torus(size=(9.0, 9.0)), groups=(Group(count=2),))
+scene.step(scene.start(0))
+assert "numba.np.arraymath" in sys.modules and "scipy.linalg" not in sys.modules
+a, b = np.arange(9.0).reshape(3, 3), np.arange(3.0)
+assert (numba.njit(lambda a, b: np.dot(a, b))(a, b) == a @ b).all()
+assert (numba.njit(lambda a, b: np.convolve(a, b))(b, b) == np.convolve(b, b)).all()
+assert "scipy.linalg" in sys.modules
+"""
+    subprocess.run([sys.executable, "-c", code], check=True)
+
+
 def test_class_variables_are_evaluated_once_and_stay_class_variables() -> None:
     class Base(Record):
         shade: ClassVar[str] = "grey"
