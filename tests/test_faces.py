@@ -7,7 +7,7 @@ import numpy as np
 import pettingzoo
 import pytest
 
-from flockenv.envs.face import named, told
+from flockenv.envs.face import ByAgent, named
 from flockenv.sb3 import WorldVecEnv
 from flockenv.tasks import Bottleneck, Corridor, Crossing, CrowdNav, Evade, Flock, Herd, Obstacles, Pursuit, School
 from flockenv.world import World
@@ -184,5 +184,5 @@ def test_numbers_are_told_by_whatever_names_they_have(names):
     rows = np.arange(6.0).reshape(3, 2)
     expected = [dict(zip(map(str, names), row, strict=True)) for row in rows.tolist()]
     assert list(named(names, rows)) == expected
-    infos = told(names, ["x", "y", "z"], rows, True)
+    infos = ByAgent(names, ["x", "y", "z"]).of(rows, [0.0] * 3, [False] * 3, False, rows.T.tolist(), True)[-1]
     assert infos == {who: {"terms": its, "is_success": True} for who, its in zip("xyz", expected, strict=True)}
