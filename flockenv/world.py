@@ -145,7 +145,8 @@ class World:
         padded = -(-n // lanes) * lanes
         decision: tuple[NDArray[Any], ...] = (
             np.zeros((d, 1, n), real), np.zeros((d, n), real), np.zeros((d, n), real), np.zeros(n, np.bool_),
-            np.zeros((self.action_size + len(task.terms)) * apart(self.learners)),
+            np.zeros(self.action_size * apart(self.learners)),
+            np.zeros(len(task.terms) * apart(self.learners), real if task.abreast else float),
         )  # fmt: skip
         if task.abreast:
             beside = np.zeros(task.abreast * apart(self.learners), np.float32)

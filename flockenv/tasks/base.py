@@ -281,7 +281,7 @@ def tell(steps, numbers, last, sums, first, told):
 @njit(cache=True, **FAST)
 def play(
     {worlds}, dt, count, mortal, past, measured, sums, paid,
-    canvas, force, x0, v0, alive0, decided, {"own, nearby, beside, " if task.abreast else ""}{NEAR}, {SHARED},
+    canvas, force, x0, v0, alive0, decided, earned, {"own, nearby, beside, " if task.abreast else ""}{NEAR}, {SHARED},
     acting, mask, everyone, check, from_world, to_world, actions, limit,
     rows, payment, terms, over, late, success, present,
 ):
@@ -350,7 +350,7 @@ def play(
         {widen}
         if acting:
             {fetches[2]}
-            earns = columns(decided[{size} * {far} :], rounded, {len(task.terms)}, {far})
+            earns = columns(earned, rounded, {len(task.terms)}, {far})
             reward(p, before, wide, action, earns)
             {fetches[3]}
             following = min(b + 1, to_world - 1)  # asked for in good time: that world is the next

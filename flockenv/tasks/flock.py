@@ -171,7 +171,7 @@ def reward(p: Any, before: Frame, after: Frame, action: Any, terms: Any) -> None
         found = after.near_count[i]
         mean, touches, inside = (o, o), o, o
         for s in range(np.uint64(p.listed)):
-            there = s < np.uint64(found)
+            there = np.int32(s) < found
             vx, vy = after.near_vel[0, s, i], after.near_vel[1, s, i]
             mean = (mean[0] + (vx if there else o), mean[1] + (vy if there else o))
             contact = after.radius[i] + after.near_radius[s, i]
@@ -332,7 +332,7 @@ def _show_neighbour(p: Any, frame: Frame, i: int, s: int, slots: Any, scales: An
     Zeros if there is none. All is worked out for whoever stands in the list; that is somebody's number in any case.
     """
     o, one, two, heading = like(p.sight, 0.0), like(p.sight, 1.0), np.uint64(2), _heading(p, frame, i)
-    there = s < np.uint64(frame.near_count[i])
+    there = np.int32(s) < frame.near_count[i]
     x, y = frame.near_pos[0, s, i], frame.near_pos[1, s, i]
     to = (offset(frame.pos[0, i], x, p.size), offset(frame.pos[1, i], y, p.size))
     relative = (frame.near_vel[0, s, i] - frame.vel[0, i], frame.near_vel[1, s, i] - frame.vel[1, i])
@@ -352,7 +352,7 @@ def _show_obstacle(p: Any, frame: Frame, i: int, s: int, at: Any, seen: Any, col
 
     As with neighbours, there is somebody's number in the list in any case, where there are obstacles at all.
     """
-    there = s < np.uint64(frame.obstacle_count[i])
+    there = np.int32(s) < frame.obstacle_count[i]
     centre, rho = _obstacle(frame, i, s)
     o = like(rho, 0.0)
     to = (offset(frame.pos[0, i], centre[0], p.size), offset(frame.pos[1, i], centre[1], p.size))
