@@ -7,10 +7,13 @@ import gc
 import importlib
 import pkgutil
 import sys
+import threading
 from collections.abc import Iterable, Iterator
 from typing import Any
 
 __all__ = ["import_all", "nothing_to_collect", "numba_before_scipy"]
+
+_one_at_a_time = threading.Lock()
 
 
 @contextlib.contextmanager
@@ -39,15 +42,18 @@ def numba_before_scipy() -> None:
     """Have numba load what it knows of arrays without scipy.linalg, a tenth of the time until a process's first step.
 
     It imports scipy.linalg there to see that it can be imported, and does so again where it is used: whoever compiles
-    np.dot has it imported then, or is told that it is not there.
+    np.dot has it imported then.
     """
     name = "numba.np.arraymath"
     if name in sys.modules:
         return
-    linalg: Any = importlib.import_module("numba.np.linalg")
-    asks = linalg.ensure_blas
-    linalg.ensure_blas = lambda: None
-    try:
-        importlib.import_module(name)
-    finally:
-        linalg.ensure_blas = asks
+    with _one_at_a_time:
+        linalg: Any = importlib.import_module("numba.np.linalg")
+        asks = getattr(linalg, "ensure_blas", None)
+        if name in sys.modules or asks is None:
+            return
+        linalg.ensure_blas = lambda: None
+        try:
+            importlib.import_module(name)
+        finally:
+            linalg.ensure_blas = asks

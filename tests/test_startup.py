@@ -72,8 +72,14 @@ def test_whatever_is_imported_first_python_collects_afterwards(module: str) -> N
 
 def test_kernels_are_read_without_linear_algebra_and_whoever_needs_it_has_it() -> None:
     code = """
-import sys
+import sys, threading
 import numba, numpy as np
+from flockenv.startup import numba_before_scipy
+line = threading.Barrier(4)
+threads = [threading.Thread(target=lambda: (line.wait(), numba_before_scipy())) for _ in range(4)]
+for thread in threads: thread.start()
+for thread in threads: thread.join()
+assert sys.modules["numba.np.linalg"].ensure_blas.__name__ == "ensure_blas"
 from flockenv.scene import Group, Scene
 from flockenv.space import Torus
 scene = Scene(space=Torus(size=(9.0, 9.0)), groups=(Group(count=2),))

@@ -93,7 +93,8 @@ def test_a_task_is_a_value_and_names_what_it_has(row: TaskRow) -> None:
     assert len(task.agent_names) == len(set(task.agent_names)) == task.learners <= task.agents == task.scene.agents
     assert len(task.scene.roles) == task.agents
     world = world_of(task)
-    assert set(world.measure()) == set(task.metric_names)
+    assert list(world.measure()) == list(task.metric_names)
+    assert len(set(task.metric_names)) == len(task.metric_names)
     slots = [slot.name for slot in task.layout.slots]
     assert len(slots) == len(set(slots))
     assert task.layout.size == sum(slot.size for slot in task.layout.slots)
@@ -154,6 +155,13 @@ def test_a_task_plays_with_the_method_it_is_given_and_shows_the_same_to_policies
     assert task.action_layout.digest == row.task.action_layout.digest
     assert task.parameters() == row.task.parameters()
     assert task_source(task) != task_source(row.task)
+
+
+@pytest.mark.parametrize("names", [("path", "class"), ("_x",), ("pa th",), ("path", "path")])
+def test_measures_that_cannot_be_fields_are_refused(names: tuple[str, ...], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Pursuit, "measures", names)
+    with pytest.raises(TypeError, match=rf"Pursuit.measures: '{names[-1]}'"):
+        task_source(Pursuit())
 
 
 @pytest.mark.slow
@@ -228,7 +236,7 @@ from collections import namedtuple
 import numpy as np
 from flockenv.tasks.base import Frame
 
-for name, task, before, after, action, terms, observation in pickle.load(open(sys.argv[1], "rb")):
+for name, task, before, after, action, terms, observation, counted, told in pickle.load(open(sys.argv[1], "rb")):
     module = importlib.import_module(type(task).__module__)
     assert not hasattr(module.reward, "py_func"), "the point is to run the laws in Python"
     numbers = task.parameters()
@@ -241,6 +249,11 @@ for name, task, before, after, action, terms, observation in pickle.load(open(sy
     module.reward(p, before, after._replace(alive=before.alive), action, found)
     module.ended(p, before, after._replace(alive=after.alive.copy()), np.zeros(len(terms), bool))
     module.measure(p, before, after, np.zeros(len(task.measures)))
+    Measures, metrics = namedtuple("Measures", task.measures), np.full(len(task.metric_names), np.nan)
+    for array in counted[:2]:
+        array.flags.writeable = False
+    module.metrics(p, Measures(*counted[0]), Measures(*counted[1]), counted[2], metrics)
+    np.testing.assert_allclose(metrics, told, rtol=1e-12, err_msg=name)
     if task.abreast:
         module.abreast(p, after, rows[:, : task.abreast])
     module.observe(p, after, rows)
@@ -268,7 +281,8 @@ def frame(world: World) -> list[Any]:
 def test_reward_and_observation_touch_nothing(tmp_path: Path) -> None:
     """They run in plain Python, every array of both frames locked against writing, and find what was compiled.
 
-    So do `measure` and `ended`, which may say of who is in the world, and of nothing else.
+    So do `measure` and `ended`, which may say of who is in the world, and of nothing else; and `metrics`, where numpy
+    sees to it that nothing is written beyond their number.
     """
     questions = []
     for row in ROWS:
@@ -276,7 +290,10 @@ def test_reward_and_observation_touch_nothing(tmp_path: Path) -> None:
         for actions in random_actions(world, 30):
             before = frame(world)
             step = world.step(actions)
-            question = (row.name, row.task, before, frame(world), actions[0], step.terms[0], step.observation[0])
+            counted = world._sums[0].copy(), world._last[0].copy(), int(world.steps[0])
+            told = [float(column[0]) for column in world.measure().values()]
+            seen = (actions[0], step.terms[0], step.observation[0])
+            question = (row.name, row.task, before, frame(world), *seen, counted, told)
         questions.append(question)
     (tmp_path / "frames").write_bytes(pickle.dumps(questions))
     source = str(Path(flockenv.__file__).parent.parent)

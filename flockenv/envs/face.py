@@ -112,7 +112,7 @@ class ByAgent:
         return ByAgent, self._about
 
 
-@functools.cache
+@functools.lru_cache(64)
 def _by_agent(terms: tuple[str, ...], agents: tuple[str, ...]) -> Callable[..., tuple[dict[str, Any], ...]]:
     def info(number: str) -> str:
         paid = ", ".join(f"{str.__str__(term)!r}: {number.format(k)}" for k, term in enumerate(terms))

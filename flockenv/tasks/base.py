@@ -30,6 +30,7 @@ for all of them, by the same query as a scene's effects, if the task says what i
 from __future__ import annotations
 
 import functools
+import keyword
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple
 
@@ -236,10 +237,9 @@ def task_source(task: Task) -> str:
         raise TypeError(f"{type(task).__name__}.counts: {unknown[0]!r} is none of its parameters: {', '.join(names)}")
     if not task.terms:
         raise TypeError(f"{type(task).__name__}.terms is empty: a reward is the sum of at least one term")
-    values = ", ".join(
-        f"np.{task.scene.dtype}({value!r})" if name in task.counts else f"numbers[{k}]"
-        for k, (name, value) in enumerate(names.items())
-    )
+    for name in task.measures:
+        if not name.isidentifier() or keyword.iskeyword(name) or name[0] == "_" or task.measures.count(name) > 1:
+            raise TypeError(f"{type(task).__name__}.measures: {name!r} must be a name, as of a field, and there once")
     now, empty = _frame(), ", ".join(f"{name}[:0]" for name in NEAR.split(", "))
     then = _frame(x="x0", v="v0", alive="alive0", near=empty)
     look = f"look(x, alive, obstacle_x, obstacle_radius, b, params, {NEAR}, {SHARED})" if task.look else "pass"
@@ -271,7 +271,7 @@ Measures = namedtuple("Measures", {" ".join(task.measures)!r})
 def tell(steps, numbers, last, sums, first, told):
     """Write the metrics of so many worlds, (K, B), from the first on; NaN: no value. Numbers are P's, as doubles."""
     unaliased()
-    p = P({values})
+    p = P({_values(task, "float64")})
     for k in range(told.shape[1]):
         b = first + k
         told[:, k] = np.nan
@@ -303,7 +303,7 @@ def play(
                 good &= finite(actions[b, i, k])
     if not good:
         return {REFUSED}, 0
-    p = P({values})
+    p = P({_values(task, task.scene.dtype)})
     n = x.shape[2]
     blocks = (n + {task.parts.width - 1}) // {task.parts.width}
     broken, who = -1, -1
@@ -387,6 +387,14 @@ def play(
     return broken, who
 '''
     return scene_source(task.parts, look_source(task.parts) + play)
+
+
+def _values(task: Task, dtype: str) -> str:
+    """Write the parameters of a task; those to which its loops count as what they are."""
+    return ", ".join(
+        f"np.{dtype}({value!r})" if name in task.counts else f"numbers[{k}]"
+        for k, (name, value) in enumerate(task.parameters().items())
+    )
 
 
 def _measures(task: Task, array: str) -> str:
