@@ -288,8 +288,7 @@ def test_steer_is_yaml_and_back(arbitration: Arbitration) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("dimension", [2, 3])
-@PRECISIONS
+@pytest.mark.parametrize(("dtype", "dimension"), [("float32", 2), ("float64", 3)])
 @ALL
 def test_every_arbitration_steers_a_scene(arbitration: Arbitration, dtype: str, dimension: int) -> None:
     """The kernel does what the law says, wherever agents are, on top of each other at rest too."""
