@@ -127,6 +127,7 @@ class World:
             self._last, self._sums, self._paid,
         )  # fmt: skip
         self._counted = (self.steps, np.array(numbers[1], float), self._last, self._sums)
+        self._alone = np.empty((len(task.metric_names), 1))  # metrics of one world
         self._scratch = [self._allocate()]
         self._hire()
 
@@ -164,7 +165,7 @@ class World:
     def __getstate__(self) -> dict[str, Any]:
         """Pickle what cannot be made anew."""
         made = (
-            "_kernel", "_enter", "_tell", "_actions", "_always", "_scratch", "_calls", "_counted", "_shapes",
+            "_kernel", "_enter", "_tell", "_actions", "_always", "_scratch", "_calls", "_counted", "_alone", "_shapes",
             "_dtypes", "_everywhere", "_untold", "_empty", "_past",
         )  # fmt: skip
         return {name: value for name, value in vars(self).items() if name not in made}
@@ -334,23 +335,24 @@ class World:
 
     def measure(self) -> dict[str, NDArray[np.float64]]:
         """Domain metrics of the episodes so far, each (B,), by name."""
-        return dict(zip(self.task.metric_names, self._told(0, self.worlds), strict=True))
+        told = np.empty((len(self.task.metric_names), self.worlds))
+        self._tell_of(0, told)
+        return dict(zip(self.task.metric_names, told, strict=True))
 
     def metrics(self, world: int = 0) -> dict[str, float]:
         """Domain metrics of one world's episode so far, by name; what has no value yet is left out.
 
         NaN would not do: two equal infos would then differ.
         """
-        values = self._told(range(self.worlds)[world], 1).ravel().tolist()
+        self._tell_of(range(self.worlds)[world], self._alone)
+        values = self._alone.ravel().tolist()
         return {name: value for name, value in zip(self.task.metric_names, values, strict=True) if value == value}
 
-    def _told(self, first: int, worlds: int) -> NDArray[np.float64]:
-        """Return the metrics of so many worlds, (K, B), new."""
-        told = np.empty((len(self.task.metric_names), worlds))
+    def _tell_of(self, first: int, told: NDArray[np.float64]) -> None:
+        """Write the metrics of as many worlds as there is room for, (K, B)."""
         self._tell(*self._counted, first, told)
         if self._tell is self._kernel.tell:
             self._tell = settled(self._tell)
-        return told
 
     def snapshot(self, world: int = 0) -> Snapshot:
         """Return one world at this instant, for pictures."""

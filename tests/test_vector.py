@@ -68,14 +68,13 @@ def test_it_is_gymnasium_s_own_vector_of_singles(env_id, mode):
 @pytest.mark.parametrize("mode", MODES)
 def test_a_metric_without_a_value_is_left_out(monkeypatch, mode):
     """NaN would make equal infos unequal; in a batch its mask says which worlds have none."""
-    told, k = World._told, Pursuit.metric_names.index("least_distance")
+    tell_of, k = World._tell_of, Pursuit.metric_names.index("least_distance")
 
-    def sometimes(self, first, worlds):
-        numbers = told(self, first, worlds)
-        numbers[k, numbers[k] >= 8.0] = np.nan
-        return numbers
+    def sometimes(self, first, told):
+        tell_of(self, first, told)
+        told[k, told[k] >= 8.0] = np.nan
 
-    monkeypatch.setattr(World, "_told", sometimes)
+    monkeypatch.setattr(World, "_tell_of", sometimes)
     native = gymnasium.make_vec("flockenv/Pursuit-v0", 4, autoreset_mode=mode, max_episode_steps=30)
     loop = gymnasium.make_vec(
         "flockenv/Pursuit-v0",

@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import warnings
 from collections.abc import Mapping
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NoReturn
 
 import numpy as np
 from gymnasium.spaces import Box
@@ -140,10 +140,14 @@ class WorldParallelEnv(ParallelEnv[str, Rows, Rows]):  # type: ignore[misc]  # p
         """Let the world act; ValueError names the agent that is at fault, asking one by one only if somebody is."""
         if not isinstance(actions, Mapping):
             raise TypeError(f"actions: {type(actions).__name__}, must be a dictionary from agent to action")
-        if actions.keys() != self._live.keys():
+        if [*actions] == [*self._live]:  # in our order, as most hand them in
+            given = [*actions.values()]
+        elif actions.keys() == self._live.keys():
+            given = [actions[name] for name in self._live]
+        else:
             self._refuse_names(actions)
         try:
-            return self.world.step(self._rows([actions[name] for name in self._live]))
+            return self.world.step(self._rows(given))
         except (TypeError, ValueError):
             for name in self._live:
                 self.checked_action(name, actions[name])
@@ -158,7 +162,7 @@ class WorldParallelEnv(ParallelEnv[str, Rows, Rows]):  # type: ignore[misc]  # p
         rows[0, list(self._live.values())] = block
         return rows
 
-    def _refuse_names(self, actions: Mapping[str, Rows]) -> None:
+    def _refuse_names(self, actions: Mapping[str, Rows]) -> NoReturn:
         for name in actions:
             if name not in self._live:
                 reason = "has left the game" if name in self.possible_agents else "is unknown"
