@@ -87,10 +87,13 @@ def named(names: Sequence[str], rows: Rows) -> Iterator[dict[str, float]]:
 def _named(*names: str) -> Callable[..., dict[str, float]]:
     """Return a function of as many numbers as names: a display, written out, takes half as long as dict(zip(...))."""
     numbers = [f"n{k}" for k in range(len(names))]
-    pairs = (f"{str.__str__(name)!r}: {number}" for name, number in zip(names, numbers, strict=True))
-    source = f"lambda {', '.join(numbers)}: {{{', '.join(pairs)}}}"
-    made: Callable[..., dict[str, float]] = eval(source)  # noqa: S307  # reprs alone
+    made: Callable[..., dict[str, float]] = eval(f"lambda {', '.join(numbers)}: {_display(names, numbers)}")  # noqa: S307  # reprs alone
     return made
+
+
+def _display(names: Iterable[str], values: Iterable[str]) -> str:
+    """Write a dictionary of what is written for each name."""
+    return f"{{{', '.join(f'{str.__str__(name)!r}: {value}' for name, value in zip(names, values, strict=True))}}}"
 
 
 class ByAgent:
@@ -114,24 +117,20 @@ class ByAgent:
 
 @functools.lru_cache(64)
 def _by_agent(terms: tuple[str, ...], agents: tuple[str, ...]) -> Callable[..., tuple[dict[str, Any], ...]]:
-    def info(number: str) -> str:
-        paid = ", ".join(f"{str.__str__(term)!r}: {number.format(k)}" for k, term in enumerate(terms))
-        return f"{{'terms': {{{paid}}}, 'is_success': success}}"
+    def info(numbers: Iterable[str]) -> str:
+        return f"{{'terms': {_display(terms, numbers)}, 'is_success': success}}"
 
     if len(agents) <= DISPLAYED:
-        every = range(len(agents))
-        names = [repr(str.__str__(agent)) for agent in agents]
+        many = range(len(agents))
         lists = {"s": "seen", "r": "paid", "o": "over"} | {f"t{k}_": f"terms[{k}]" for k in range(len(terms))}
-        lines = [f"{''.join(f'{one}{i}, ' for i in every)}= {several}" for one, several in lists.items()]
-        shown = [
-            f"{{{', '.join(f'{name}: {value.format(i)}' for i, name in enumerate(names))}}}"
-            for value in ("s{}", "r{}", "o{}", "late")
-        ]
-        told = ", ".join(f"{name}: {info(f't{{}}_{i}')}" for i, name in enumerate(names))
-        lines += [f"return {', '.join(shown)}, {{{told}}}"]
+        each = {one: [f"{one}{i}" for i in many] for one in lists}
+        lines = [f"{', '.join(each[one])}, = {several}" for one, several in lists.items()]
+        infos = [info(each[f"t{k}_"][i] for k in range(len(terms))) for i in many]
+        shown = (each["s"], each["r"], each["o"], ["late"] * len(agents), infos)
+        lines += [f"return {', '.join(_display(agents, values) for values in shown)}"]
     else:
-        numbers = ", ".join(f"n{k}" for k in range(len(terms)))
-        told = f"{{agent: {info('n{}')} for agent, {numbers} in zip(agents, *terms, strict=True)}}"
+        numbers = [f"n{k}" for k in range(len(terms))]
+        told = f"{{agent: {info(numbers)} for agent, {', '.join(numbers)} in zip(agents, *terms, strict=True)}}"
         several = ", ".join(f"dict(zip(agents, {what}, strict=True))" for what in ("seen", "paid", "over"))
         lines = [f"return {several}, dict.fromkeys(agents, late), {told}"]
     made: dict[str, Any] = {"agents": agents}

@@ -230,16 +230,8 @@ def _frame(
 
 def task_source(task: Task) -> str:
     """Return the source of a task's kernel: its scene's, and two entry points, `play` and `tell`."""
-    d = task.scene.dimension
-    names = task.parameters()
-    unknown = [name for name in task.counts if name not in names]
-    if unknown:
-        raise TypeError(f"{type(task).__name__}.counts: {unknown[0]!r} is none of its parameters: {', '.join(names)}")
-    if not task.terms:
-        raise TypeError(f"{type(task).__name__}.terms is empty: a reward is the sum of at least one term")
-    for name in task.measures:
-        if not name.isidentifier() or keyword.iskeyword(name) or name[0] == "_" or task.measures.count(name) > 1:
-            raise TypeError(f"{type(task).__name__}.measures: {name!r} must be a name, as of a field, and there once")
+    d, names = task.scene.dimension, task.parameters()
+    _check(task)
     now, empty = _frame(), ", ".join(f"{name}[:0]" for name in NEAR.split(", "))
     then = _frame(x="x0", v="v0", alive="alive0", near=empty)
     look = f"look(x, alive, obstacle_x, obstacle_radius, b, params, {NEAR}, {SHARED})" if task.look else "pass"
@@ -387,6 +379,19 @@ def play(
     return broken, who
 '''
     return scene_source(task.parts, look_source(task.parts) + play)
+
+
+def _check(task: Task) -> None:
+    """Refuse a task of which no kernel can be written; TypeError."""
+    kind, names = type(task).__name__, task.parameters()
+    unknown = [name for name in task.counts if name not in names]
+    if unknown:
+        raise TypeError(f"{kind}.counts: {unknown[0]!r} is none of its parameters: {', '.join(names)}")
+    if not task.terms:
+        raise TypeError(f"{kind}.terms is empty: a reward is the sum of at least one term")
+    for name in task.measures:
+        if not name.isidentifier() or keyword.iskeyword(name) or name[0] == "_" or task.measures.count(name) > 1:
+            raise TypeError(f"{kind}.measures: {name!r} must be a name, as of a field, and there once")
 
 
 def _values(task: Task, dtype: str) -> str:

@@ -320,7 +320,7 @@ def metrics(p: Any, sums: Any, last: Any, steps: int, numbers: Any) -> None:
     """
     numbers[0], numbers[1] = last.alive, sums.alive * p.control_dt
     if sums.alive > 0:
-        numbers[2] = sums.hunger / max(sums.alive, 1e-12)
+        numbers[2] = sums.hunger / sums.alive
     numbers[3], numbers[4], numbers[5] = sums.eaten, sums.caught, sums.starved
 
 
