@@ -21,8 +21,8 @@ from flockenv.kernels import LINE, kernel, written
 from flockenv.lines import array_of, in_one_piece
 
 __all__ = [
-    "PAIR", "SIDE", "apart", "columns", "into_rows", "key_of", "key_read", "key_written", "packed", "pick", "same_key",
-    "tag_of", "take",
+    "PAIR", "SIDE", "apart", "columns", "in_one_row", "into_rows", "key_of", "key_read", "key_written", "ordered",
+    "packed", "pick", "same_key", "tag_of", "take",
 ]  # fmt: skip
 
 SIDE = LINE // 4
@@ -80,6 +80,21 @@ def _packed(typing_context: Any, array: Any) -> Any:
 
 
 packed: Any = intrinsic(_packed)
+
+
+def _in_one_row(typing_context: Any, array: Any) -> Any:
+    """Show an array in one piece as one row of numbers."""
+    in_one_piece(array)
+    view = types.Array(array.dtype, 1, "C")
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        old = array_of(context, builder, array, arguments[0])
+        return _shown(context, builder, view, old, [old.nitems], [_bytes(context, array)])
+
+    return view(array), generate
+
+
+in_one_row: Any = intrinsic(_in_one_row)
 
 
 def _columns(typing_context: Any, flat: Any, count: Any, many: Any, distance: Any) -> Any:
@@ -211,18 +226,18 @@ pick: Any = intrinsic(_picks)
 
 
 # A key: a square, in single precision, whose last bits are a place. Of numbers that are not negative the bits are in
-# order as integers, of which a register is compared in half the time; and what is known of one moves with it.
+# order as integers without a sign, of which a register is compared in half the time; and what is known of one moves
+# with it. NaN comes after all of them.
 
 
 def _key_of(typing_context: Any, square: Any, place: Any, tags: Any) -> Any:
-    """Return the key (int32) of a float32 square, not negative, and a place; `tags` has all bits that a place may."""
+    """Return the key (uint32) of a float32 square, not negative, and a place; `tags` has all bits that a place may."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        word = ir.IntType(32)
-        bits = builder.bitcast(arguments[0], word)
-        return builder.or_(builder.and_(bits, builder.not_(arguments[2])), builder.trunc(arguments[1], word))
+        bits = builder.bitcast(arguments[0], ir.IntType(32))
+        return builder.or_(builder.and_(bits, builder.not_(arguments[2])), arguments[1])
 
-    return types.int32(types.float32, types.uint64, types.int32), generate
+    return types.uint32(types.float32, types.int32, types.int32), generate
 
 
 def _key_read(typing_context: Any, number: Any) -> Any:
@@ -231,7 +246,7 @@ def _key_read(typing_context: Any, number: Any) -> Any:
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         return builder.bitcast(arguments[0], ir.IntType(32))
 
-    return types.int32(types.float32), generate
+    return types.uint32(types.float32), generate
 
 
 def _key_written(typing_context: Any, key: Any) -> Any:
@@ -240,7 +255,7 @@ def _key_written(typing_context: Any, key: Any) -> Any:
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         return builder.bitcast(arguments[0], ir.FloatType())
 
-    return types.float32(types.int32), generate
+    return types.float32(types.uint32), generate
 
 
 def _tag_of(typing_context: Any, key: Any, tags: Any) -> Any:
@@ -249,7 +264,7 @@ def _tag_of(typing_context: Any, key: Any, tags: Any) -> Any:
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         return builder.and_(*arguments)
 
-    return types.int32(types.int32, types.int32), generate
+    return types.int32(types.uint32, types.int32), generate
 
 
 def _same_key(typing_context: Any, one: Any, other: Any, tags: Any) -> Any:
@@ -259,7 +274,20 @@ def _same_key(typing_context: Any, one: Any, other: Any, tags: Any) -> Any:
         one, other, tags = arguments
         return builder.icmp_unsigned("==", builder.or_(one, tags), builder.or_(other, tags))
 
-    return types.boolean(types.int32, types.int32, types.int32), generate
+    return types.boolean(types.uint32, types.uint32, types.int32), generate
+
+
+def _ordered(typing_context: Any, one: Any, other: Any) -> Any:
+    """Return two keys, the lesser one first."""
+    pair: Any = types.UniTuple
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        one, other = arguments
+        first = builder.icmp_unsigned("<", one, other)
+        both = builder.select(first, one, other), builder.select(first, other, one)
+        return context.make_tuple(builder, signature.return_type, both)
+
+    return pair(types.uint32, 2)(types.uint32, types.uint32), generate
 
 
 key_of: Any = intrinsic(_key_of)
@@ -267,6 +295,7 @@ key_read: Any = intrinsic(_key_read)
 key_written: Any = intrinsic(_key_written)
 tag_of: Any = intrinsic(_tag_of)
 same_key: Any = intrinsic(_same_key)
+ordered: Any = intrinsic(_ordered)
 
 
 @kernel
@@ -314,9 +343,15 @@ def _turned_square(
             for r in (r for r in range(SQUARE) if not r & s):
                 pair = numbers[r], numbers[r + s]
                 numbers[r], numbers[r + s] = (builder.shuffle_vector(*pair, mask) for mask in masks)
-        for k in range(SQUARE):
-            with builder.if_then(builder.icmp_unsigned(">", arguments[3], ir.Constant(arguments[3].type, k))):
-                builder.store(numbers[k], line(targets, k, *arguments[1:3]), align=4)
+        rows, count = arguments[3], arguments[3].type
+        with builder.if_else(builder.icmp_unsigned(">=", rows, count(SQUARE))) as (whole, part):
+            with whole:
+                for k in range(SQUARE):
+                    builder.store(numbers[k], line(targets, k, *arguments[1:3]), align=4)
+            with part:
+                for k in range(SQUARE - 1):
+                    with builder.if_then(builder.icmp_unsigned(">", rows, count(k))):
+                        builder.store(numbers[k], line(targets, k, *arguments[1:3]), align=4)
         return context.get_dummy_value()
 
     return types.void(to, types.uint64, types.uint64, types.uint64, source, types.uint64, types.uint64), generate

@@ -7,17 +7,28 @@ which does, and copied past the caches line by line: nothing is read.
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
+import numpy as np
 from llvmlite import ir  # type: ignore[import-untyped]
 from numba.core import cgutils, types
 from numba.core.errors import TypingError
 from numba.extending import intrinsic
 from numba.np import arrayobj
+from numpy.typing import NDArray
 
 from flockenv.kernels import LINE, asked
 
-__all__ = ["array_of", "fetch", "in_one_piece", "pour", "put_past", "settle"]
+__all__ = ["array_of", "fetch", "in_one_piece", "pour", "put_past", "settle", "zeros"]
+
+
+def zeros(shape: int | tuple[int, ...], dtype: Any = np.float64) -> NDArray[Any]:
+    """Return zeros that begin where a line does: no vector of theirs lies in two of them, in any process."""
+    kind, count = np.dtype(dtype), math.prod(shape) if isinstance(shape, tuple) else shape
+    room = np.zeros(count * kind.itemsize + LINE, np.uint8)
+    first = -room.__array_interface__["data"][0] % LINE
+    return np.ndarray(shape, kind, room, first)
 
 
 def in_one_piece(array: Any) -> None:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 import sys
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -43,14 +44,22 @@ class Recycler:
         self.keep, self.line = keep, line
         self._kept: dict[Key, list[Memory]] = {}
 
-    def empty(self, shape: tuple[int, ...], dtype: np.dtype[Any]) -> NDArray[Any]:
-        """Return an array whose content is anything, and whose memory is not its own."""
+    def maker(self, shape: tuple[int, ...], dtype: np.dtype[Any]) -> Callable[[], NDArray[Any]]:
+        """Return what makes arrays of this shape and type: their content is anything, their memory not their own."""
         kept = self._kept.setdefault((shape, dtype), [])
-        for k in range(len(kept)):
-            if _holders(kept, k) == _NOBODY:
-                return np.ndarray(shape, dtype, *kept[k])
-        room = np.empty(math.prod(shape) * dtype.itemsize + self.line, np.uint8)
-        memory = room, -room.__array_interface__["data"][0] % self.line
-        if len(kept) < self.keep:
-            kept.append(memory)
-        return np.ndarray(shape, dtype, *memory)
+
+        def make() -> NDArray[Any]:
+            for k in range(len(kept)):
+                if _holders(kept, k) == _NOBODY:
+                    return np.ndarray(shape, dtype, *kept[k])
+            room = np.empty(math.prod(shape) * dtype.itemsize + self.line, np.uint8)
+            memory = room, -room.__array_interface__["data"][0] % self.line
+            if len(kept) < self.keep:
+                kept.append(memory)
+            return np.ndarray(shape, dtype, *memory)
+
+        return make
+
+    def empty(self, shape: tuple[int, ...], dtype: np.dtype[Any]) -> NDArray[Any]:
+        """Return such an array."""
+        return self.maker(shape, dtype)()

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from flockenv.kernels import entry
+from flockenv.lines import zeros
 from flockenv.vehicle import face
 
 __all__ = ["COUNTED_BY_KERNELS", "WORK", "Body", "Floats", "Obstacles", "State"]
@@ -230,16 +231,16 @@ def blank(
     """Return a state of zeros, everybody alive: what a spawn writes into; identities are numbers of slots, if kept."""
     slots = agents if population else 0
     return State(
-        x=np.zeros((dimension, worlds, agents), dtype),
-        v=np.zeros((dimension, worlds, agents), dtype),
+        x=zeros((dimension, worlds, agents), dtype),
+        v=zeros((dimension, worlds, agents), dtype),
         alive=np.ones((worlds, agents), np.bool_),
         tick=np.zeros(worlds, np.int64),
         key=np.zeros(worlds, np.uint64),
-        obstacle_x=np.zeros((dimension, worlds, obstacles), dtype),
-        obstacle_radius=np.zeros((worlds, obstacles), dtype),
+        obstacle_x=zeros((dimension, worlds, obstacles), dtype),
+        obstacle_radius=zeros((worlds, obstacles), dtype),
         work=np.zeros((worlds, len(WORK)), np.int64),
-        frame=np.zeros((frame_rows, worlds, agents), dtype),
-        inner=np.zeros((inner_rows, worlds, agents), dtype),
+        frame=zeros((frame_rows, worlds, agents), dtype),
+        inner=zeros((inner_rows, worlds, agents), dtype),
         identity=np.tile(np.arange(slots), (worlds, 1)),
         born=np.zeros((worlds, slots)),
         dies=np.full((worlds, slots), np.inf),

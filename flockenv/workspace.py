@@ -82,7 +82,7 @@ class Workspace:
         if "t0" in parts.fields:
             blocks = ties(padded, d).reshape(-1, width, d).transpose(0, 2, 1)
             arrays["tie"][:] = blocks.reshape(-1)
-        arrays["number"] = np.arange(width, dtype=np.int32)
+        arrays["number"] = np.arange(SMALL_STRIDE, dtype=np.int32)
         arrays |= {"bond_place": table.place, "bond_number": table.number, "bond_start": table.start}
         lanes = {"lanes": (len(parts.slots) * width, np.dtype(dtype))}
         own = tuple(_zeros(lanes) | {"ranges": np.zeros((MAX_RANGES, 3), np.int64)} for _ in range(team))

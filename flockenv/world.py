@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import copy
 import functools
-import itertools
 import math
 import secrets
 from collections.abc import Callable, Sequence
@@ -17,6 +16,7 @@ from flockenv import state as states
 from flockenv.abreast import PAIR, apart
 from flockenv.crew import share, threads
 from flockenv.kernels import LINE, load, settled
+from flockenv.lines import zeros
 from flockenv.noise import MASK, keys_of
 from flockenv.recycle import Recycler
 from flockenv.refusals import nearest
@@ -32,8 +32,8 @@ __all__ = ["Step", "World"]
 
 Rows = NDArray[np.float32]
 
-PORTIONS = 6
-"""Portions per thread in which the worlds of a batch are handed out."""
+LEAST = 24
+"""A portion of worlds that is handed out to a thread is at least one in so many of its share of them."""
 
 RECYCLE = 2**18
 """Bytes of observations from which on the memory of results is used again; below, new memory costs less."""
@@ -93,10 +93,10 @@ class World:
             scene.parts.frame_rows, inner_rows=len(scene.parts.inner),
         )  # fmt: skip
         self.steps: Final = np.zeros(self.worlds, np.int64)
-        self._paid: Final = np.zeros((len(task.terms), self.worlds, self.learners))
-        self._memory: Final = np.zeros((task.memory, self.worlds, self.agents), scene.dtype)
-        self._sums: Final = np.zeros((self.worlds, len(task.measures)))
-        self._last: Final = np.zeros((self.worlds, len(task.measures)))
+        self._paid: Final = zeros((len(task.terms), self.worlds, self.learners))
+        self._memory: Final = zeros((task.memory, self.worlds, self.agents), scene.dtype)
+        self._sums: Final = zeros((self.worlds, len(task.measures)))
+        self._last: Final = zeros((self.worlds, len(task.measures)))
         self._seeds: NDArray[np.uint64] | None = None
         self._episodes = np.zeros(self.worlds, np.uint64)
         self._prepare()
@@ -107,7 +107,7 @@ class World:
         self._kernel = load(f"task_{task.name}", task_source(task))
         self._enter, self._tell = self._kernel.play, self._kernel.tell
         b, i, real = self.worlds, self.learners, scene.dtype
-        self._actions = np.zeros((b, i, self.action_size), real)
+        self._actions = zeros((b, i, self.action_size), real)
         numbers = (task.parts.given(), list(task.parameters().values()), task.table() or (0.0,))
         fields = (
             ((b, i, self.observation_size), np.float32), ((b, i), float), ((len(task.terms), b, i), float),
@@ -119,7 +119,10 @@ class World:
         self._untold = tuple(np.empty(shape, kind) for shape, kind in fields[1:])  # what a reset says nothing of
         row, size = 4 * math.prod(self._shapes[0][1:]), 4 * math.prod(self._shapes[0])
         self._past = size >= PAST and row <= AT_HAND
-        self._empty = Recycler(line=LINE).empty if size >= RECYCLE else np.empty
+        kinds, maker = zip(self._shapes, self._dtypes, strict=True), Recycler(line=LINE).maker
+        self._fresh: tuple[Callable[[], NDArray[Any]], ...] = tuple(
+            maker(*kind) if size >= RECYCLE else functools.partial(np.empty, *kind) for kind in kinds
+        )
         self._always = (
             s.x, s.v, *s.carried, s.alive, s.tick, s.obstacle_x, s.obstacle_radius, s.work, s.key, self._memory,
             self.steps, *(np.array(values, real) for values in numbers),
@@ -145,28 +148,29 @@ class World:
         lanes = PAIR if task.abreast else task.parts.width
         padded = -(-n // lanes) * lanes
         decision: tuple[NDArray[Any], ...] = (
-            np.zeros((d, 1, n), real), np.zeros((d, n), real), np.zeros((d, n), real), np.zeros(n, np.bool_),
-            np.zeros(self.action_size * apart(self.learners)),
-            np.zeros(len(task.terms) * apart(self.learners), real if task.abreast else float),
+            zeros((d, 1, n), real), zeros((d, n), real), zeros((d, n), real), zeros(n, np.bool_),
+            zeros(self.action_size * apart(self.learners), real if task.abreast else float),
+            zeros(len(task.terms) * apart(self.learners), real if task.abreast else float),
         )  # fmt: skip
         if task.abreast:
-            beside = np.zeros(task.abreast * apart(self.learners), np.float32)
-            own, nearby = (2 * d + 1 + task.memory, padded), (2 * d + 1, look.agents, padded)
-            decision += (np.zeros(own, real), np.zeros(nearby, real), beside)
+            beside = zeros(task.abreast * apart(self.learners), np.float32)
+            own, vel = (2 * d + 1 + task.memory, padded), (d, look.agents, padded)
+            decision += (zeros(own, real), zeros(vel, real), zeros((1, look.agents, padded), real), beside)
+            decision[-2][:] = scene.body.radius[0]  # all have it, or it is taken
         near = [
-            np.zeros(shape, kind)
+            zeros(shape, kind)
             for many in (look.agents, look.obstacles)
             for shape, kind in (((many, padded), real), ((many, padded), np.int32), ((padded,), np.int32))
-        ]
+        ] + [zeros((d, look.agents, padded), real)]
         space = Workspace.allocate(task.parts, scene.body, pack(task.parts, n, scene.groups))
-        canvas = np.zeros(self._shapes[0][1:] if self._past else (0, 0), np.float32)
+        canvas = zeros(self._shapes[0][1:] if self._past else (0, 0), np.float32)
         return canvas, decision, (*near, *space.of(0, self._kernel.SCRATCH))
 
     def __getstate__(self) -> dict[str, Any]:
         """Pickle what cannot be made anew."""
         made = (
             "_kernel", "_enter", "_tell", "_actions", "_always", "_scratch", "_calls", "_counted", "_alone", "_shapes",
-            "_dtypes", "_everywhere", "_untold", "_empty", "_past",
+            "_dtypes", "_everywhere", "_untold", "_fresh", "_past",
         )  # fmt: skip
         return {name: value for name, value in vars(self).items() if name not in made}
 
@@ -202,7 +206,7 @@ class World:
         if into is not None and not into.flags.carray:
             raise ValueError("into must be writable and in one piece: the observations of a step, no part of them")
         self._seed(seeds, rows)
-        observation: Rows = self._empty(self._shapes[0], self._dtypes[0]) if into is None else into
+        observation: Rows = self._fresh[0]() if into is None else into
         begun = self.worlds if into is None else int(np.count_nonzero(rows))
         self._play(False, rows, into is None, begun, 0, (observation, *self._untold), self._actions)
         if self._enter is self._kernel.play:
@@ -262,7 +266,7 @@ class World:
         if terms not in TERMS:
             raise ValueError(f"terms: {terms!r} is unknown{nearest(str(terms), TERMS)}; allowed: {', '.join(TERMS)}")
         taken = self._taken(actions)
-        rows, reward, earned, over, late, success, present = told = tuple(map(self._empty, self._shapes, self._dtypes))
+        rows, reward, earned, over, late, success, present = told = tuple([make() for make in self._fresh])
         limit = _NEVER if self.time_limit is None else min(int(self.time_limit), _NEVER)
         world, who = self._play(True, self._everywhere, terms == "steps", self.worlds, limit, told, taken)
         if world == REFUSED:
@@ -286,15 +290,13 @@ class World:
 
         if crew == 1:
             return self._calls[0](acting, mask, everyone, acting, 0, self.worlds, actions, limit, *told)
-        if acting and not np.isfinite(actions).all():  # nobody moves before all were looked at
-            return REFUSED, 0
-        portions = min(crew * PORTIONS, self.worlds)
-        turn = itertools.count()  # whoever is done takes the next: threads do not begin at the same time
+        if acting and self._calls[0](True, mask, everyone, True, 0, 0, actions, limit, *told)[0] == REFUSED:
+            return REFUSED, 0  # nobody moves before all were looked at
+        portions = iter(_portions(self.worlds, crew))  # whoever is done takes the next
 
         def several(k: int) -> tuple[int, int]:
             found, call = [], self._calls[k]
-            while (n := next(turn)) < portions:
-                first, end = self.worlds * n // portions, self.worlds * (n + 1) // portions
+            for first, end in portions:
                 found.append(call(acting, mask, everyone, False, first, end, actions, limit, *told))
             return min((bad for bad in found if bad[0] >= 0), default=(-1, -1))
 
@@ -368,6 +370,20 @@ class World:
             periodic=self.task.scene.space.periodic, title=type(self.task).__name__,
             outlines=self.task.scene.outlines(low, high, float(s.time[world])),
         )  # fmt: skip
+
+
+@functools.cache
+def _portions(worlds: int, crew: int) -> tuple[tuple[int, int], ...]:
+    """Return the portions in which worlds are handed out to a crew: the first and the one after the last of each.
+
+    Each is a thread's share of half of what is left, so that all are done at the same time whoever begins late.
+    """
+    least, at, portions = -(-worlds // (LEAST * crew)), 0, []
+    while at < worlds:
+        end = min(at + max(-(-(worlds - at) // (2 * crew)), least), worlds)
+        portions.append((at, end))
+        at = end
+    return tuple(portions)
 
 
 def _whole(value: object) -> bool:

@@ -15,7 +15,7 @@ from numba import njit
 from numba.core.errors import TypingError
 
 from flockenv import processor
-from flockenv.abreast import PAIR, SIDE, apart, columns, into_rows, packed, take
+from flockenv.abreast import PAIR, SIDE, apart, columns, in_one_row, into_rows, packed, take
 
 
 @njit
@@ -71,6 +71,21 @@ def test_a_packed_array_is_the_same_array() -> None:
     assert whole == array.strides
     assert one == array[:, 3].strides
     np.testing.assert_array_equal(held, array[:, 3])
+
+
+@njit
+def row_of(array: Any) -> tuple[int, Any]:
+    """Return how long it is in one row, and a copy of that."""
+    row = in_one_row(array)
+    return row.shape[0], row.copy()
+
+
+@pytest.mark.parametrize("shape", [(7,), (2, 0, 3), (4, 1), (3, 5, 2)])
+def test_an_array_in_one_row_is_the_same_numbers(shape: tuple[int, ...]) -> None:
+    array = np.random.default_rng(1).normal(size=shape)
+    length, row = row_of(array)
+    assert length == array.size
+    np.testing.assert_array_equal(row, array.ravel())
 
 
 @njit

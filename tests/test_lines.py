@@ -10,7 +10,7 @@ from numba import njit
 from numba.core.errors import TypingError
 
 from flockenv.kernels import LINE
-from flockenv.lines import fetch, pour, settle
+from flockenv.lines import fetch, pour, settle, zeros
 
 
 @njit(nogil=True)
@@ -61,6 +61,18 @@ def test_whole_lines_go_past_the_caches_and_a_fence_follows() -> None:
     poured(np.zeros(40, np.float32), 0, np.zeros(40, np.float32))
     texts = poured.inspect_llvm().values()
     assert texts and all("!nontemporal" in text and "fence seq_cst" in text for text in texts)
+
+
+@pytest.mark.parametrize("kind", [np.float32, np.float64, np.int32])
+def test_zeros_begin_where_a_line_does(kind: Any) -> None:
+    kept = []
+    for shape in (0, 1, 7, (3, 5), (2, 0, 4), (100, 33)):
+        array = zeros(shape, kind)
+        assert (array.shape, array.dtype) == (np.zeros(shape).shape, kind)
+        assert array.ctypes.data % LINE == 0 and array.flags.carray and not array.any()
+        array[...] = 1
+        kept.append(array)
+    assert all((array == 1).all() for array in kept)
 
 
 @njit

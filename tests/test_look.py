@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 from numba import njit
 
-from flockenv.abreast import key_of, key_read, key_written, same_key, tag_of
+from flockenv.abreast import key_of, key_read, key_written, ordered, same_key, tag_of
 from flockenv.kernels import kernel
+from flockenv.sweep.look import ABREAST, merged
 from flockenv.tasks import Bottleneck, Flock
 from flockenv.world import World
 
@@ -89,6 +90,7 @@ def test_the_nearest_are_those_that_a_sort_finds(agents: int, neighbours: int, m
         else:  # operations may be fused
             np.testing.assert_allclose(squares, wanted, rtol=1e-14)
         assert (who >= 0).all() and (who < agents).all()
+        assert (places[who.T] == world._scratch[0][2][6][:, :, :agents].T).all()  # where they are is told, too
         for i in range(agents):  # of those who are equally far, any is nearest, but each once
             listed = who[: count[i], i]
             np.testing.assert_allclose(every[i, listed], wanted[: count[i], i], rtol=0 if kind == "float32" else 1e-14)
@@ -138,8 +140,9 @@ def _round(square: Any, place: Any, tags: Any) -> Any:
 
 
 def test_keys_are_in_the_order_of_squares_and_know_their_places() -> None:
-    call = njit(lambda square, place, tags: _round(square, np.uint64(place), np.int32(tags)))
-    doubt = njit(lambda one, other, tags: same_key(np.int32(one), np.int32(other), np.int32(tags)))
+    call = njit(lambda square, place, tags: _round(square, np.int32(place), np.int32(tags)))
+    doubt = njit(lambda one, other, tags: same_key(np.uint32(one), np.uint32(other), np.int32(tags)))
+    order = njit(lambda one, other: ordered(np.uint32(one), np.uint32(other)))
     rng = np.random.default_rng(0)
     squares = np.sort(np.concatenate([[0, 1e-45, 1e-38, 3e38, np.inf], 10.0 ** rng.uniform(-30, 30, 400)])).astype("f4")
     for tags in (1, 7, 31, 127):
@@ -150,4 +153,25 @@ def test_keys_are_in_the_order_of_squares_and_know_their_places() -> None:
         same = np.array([doubt(*pair, tags) for pair in zip(keys[:-1, 0], keys[1:, 0], strict=True)])
         apart = squares.view("i4")[1:] // (tags + 1) != squares.view("i4")[:-1] // (tags + 1)
         np.testing.assert_array_equal(same, ~apart)
-        assert (np.diff(keys[:, 0])[apart] > 0).all()
+        assert (np.diff(keys[:, 0].astype(int))[apart] > 0).all()
+        for pair in zip(keys[:-1, 0], keys[1:, 0], strict=True):
+            assert order(*pair) == order(*pair[::-1]) == tuple(sorted(pair))
+    nobody = 0xFFFFFFFF  # comes after all of them, and after NaN of either sign
+    for number in (np.inf, np.nan, -np.nan):
+        key = call(np.float32(number), 0, 1)[0]
+        assert call(np.float32(3e38), 1, 1)[0] < key and order(key, nobody) == (key, nobody)
+
+
+@pytest.mark.parametrize("length", range(2, 34))
+def test_the_nearest_stay_in_a_list_and_in_order(length: int) -> None:
+    """What is merged with it, run in Python: whatever its length, and who comes."""
+    text = "\n".join(merged([f"kept[{k}]" for k in range(length)]))
+    rng = np.random.default_rng(length)
+    for most in (3, 1000):
+        kept, every = [most] * length, [most] * length
+        for _ in range(40):
+            come = rng.integers(0, most, ABREAST).tolist()
+            names = {f"come{k}": key for k, key in enumerate(come)} | {"kept": kept}
+            exec(text, {"ordered": lambda *pair: sorted(pair), "key_read": int, "key_written": int}, names)  # noqa: S102
+            every = sorted(every + come)
+            assert kept == every[:length]

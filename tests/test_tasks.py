@@ -247,7 +247,8 @@ for name, task, before, after, action, terms, observation, counted, told in pick
     before, after = Frame(*before), Frame(*after)
     found, rows = np.full(terms.shape, np.nan), np.full(observation.shape, np.nan, np.float32)
     module.reward(p, before, after._replace(alive=before.alive), action, found)
-    module.ended(p, before, after._replace(alive=after.alive.copy()), np.zeros(len(terms), bool))
+    numbers = np.zeros(len(task.measures))
+    module.ended(p, before, after._replace(alive=after.alive.copy()), numbers, np.zeros(len(terms), bool))
     module.measure(p, before, after, np.zeros(len(task.measures)))
     Measures, metrics = namedtuple("Measures", task.measures), np.full(len(task.metric_names), np.nan)
     for array in counted[:2]:
@@ -271,9 +272,9 @@ def frame(world: World) -> list[Any]:
     _, decision, rest = world._scratch[0]  # of the last world looked at
     near, d = [*rest[: len(NEAR.split(", "))], *[np.zeros(0)] * 3], scene.dimension
     if world.task.abreast:
-        own, nearby = decision[-3:-1]
+        own, near_vel, near_radius = decision[-4:-1]
         arrays[:2], arrays[5], body[0] = (own[:d], own[d : 2 * d]), own[2 * d + 1 :], own[2 * d]
-        near[-3:] = nearby[:d], nearby[d : 2 * d], nearby[2 * d]
+        near[-3:] = rest[len(NEAR.split(", "))], near_vel, near_radius[0]
     table = np.array(world.task.table())
     return [*(a.copy() for a in arrays), int(s.key[0]), int(world.steps[0]), *body, *(a.copy() for a in near), table]
 
@@ -768,10 +769,12 @@ def test_what_lies_beyond_the_last_agent_is_nobodys_business(agents: int, dtype:
     told = []
     for beyond in (0.0, np.nan):
         world = world_of(Flock(agents=agents, dtype=dtype), worlds=3)
-        own, nearby = world._scratch[0][1][-3:-1]
+        own, *near = world._scratch[0][1][-4:-1]
+        near.append(world._scratch[0][2][len(NEAR.split(", "))])
         said = []
         for actions in random_actions(world, 5):
-            own[:, agents:], nearby[..., agents:] = beyond, beyond
+            for numbers in (own, *near):
+                numbers[..., agents:] = beyond
             step = world.step(actions)
             said += [step.observation, step.terms, step.success, *(world.measure().values())]
         assert np.isnan(own[:, agents:]).all() == np.isnan(beyond) or agents % PAIR == 0

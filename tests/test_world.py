@@ -15,7 +15,7 @@ from flockenv.kernels import settled
 from flockenv.noise import key_of, keys_of
 from flockenv.tasks import Crossing, Flock, Obstacles, Pursuit
 from flockenv.tasks.base import task_source
-from flockenv.world import AT_HAND, PAST, Step, World
+from flockenv.world import AT_HAND, PAST, Step, World, _portions
 from tests.catalogue import TASKS, TaskRow
 
 EVERY = pytest.mark.parametrize("row", TASKS, ids=lambda row: row.name)
@@ -427,7 +427,7 @@ def test_a_copy_has_memory_of_its_own(copied: Any) -> None:
     world.step(a)
     held = [world.step(b).observation]
     other = copied(world)
-    assert other._empty.__self__ is not world._empty.__self__
+    assert other._fresh[0] is not world._fresh[0]
     assert len(pickle.dumps(world)) < 2 * len(pickle.dumps(World(Flock(agents=32), 64)))  # no results in it
     held += [other.step(a).observation, world.step(a).observation]
     assert not any(np.shares_memory(held[i], held[k]) for i, k in ((0, 1), (0, 2), (1, 2)))
@@ -439,6 +439,18 @@ def test_a_copy_of_a_world_that_was_never_reset_is_one_too() -> None:
     with pytest.raises(RuntimeError, match="reset"):
         other.step(np.zeros((2, 1, 2)))
     other.reset(1)
+
+
+@pytest.mark.parametrize("crew", [1, 2, 3, 16])
+@pytest.mark.parametrize("worlds", [1, 2, 3, 31, 1024, 4097])
+def test_portions_are_all_worlds_and_grow_smaller(worlds: int, crew: int) -> None:
+    portions = np.array(_portions(worlds, crew))
+    first, end = portions.T
+    assert first[0] == 0 and end[-1] == worlds and (first[1:] == end[:-1]).all()
+    size = end - first
+    assert (size > 0).all() and (np.diff(size) <= 0).all()
+    assert len(size) <= 8 * crew + 8
+    assert size[-min(crew, len(size)) :].sum() <= max(worlds / 8, crew)  # nobody waits long for who took the last ones
 
 
 # --- actions ----------------------------------------------------------------------------------------------------------

@@ -6,11 +6,17 @@ It asks the same query as the pair laws, and keeps, for each lane, sorted lists 
 from __future__ import annotations
 
 from flockenv.sweep.pairs import me_of, meet_range, offset_of
-from flockenv.sweep.parts import SMALL_STRIDE, Parts
+from flockenv.sweep.parts import SMALL_STRIDE, Parts, sorted_at
 from flockenv.sweep.query import listed, listed_at, query, walk
 from flockenv.sweep.text import SHARED, Slots, indented, indented_lines, lanes_of, tuple_of
 
-__all__ = ["look_source"]
+__all__ = ["ABREAST", "KEYS", "look_source", "merged"]
+
+KEYS = "key_of, key_read, key_written, ordered, pick, same_key, tag_of"
+"""What is called where lists of the nearest are kept as keys."""
+
+ABREAST = 4
+"""So many candidates at once are put into lists of keys."""
 
 
 def look_source(parts: Parts) -> str:
@@ -22,16 +28,18 @@ def look_source(parts: Parts) -> str:
 @kernel
 def look(
     x_, alive, obstacle_x, obstacle_radius, b, params,
-    near_square, near_who, near_count, obstacle_gap, obstacle_who, obstacle_count, {SHARED},
+    near_square, near_who, near_count, obstacle_gap, obstacle_who, obstacle_count, near_pos, {SHARED},
 ):
     """Write, for every agent of world b, the nearest agents (K, N) and obstacles (J, N), and how many (N,).
 
-    Where there is none, it is infinitely far, and some number stands there: of agents, one that exists.
+    Where there is none, it is infinitely far, and some number stands there: of agents, one that exists. Returns whether
+    it has written where these are, too (D, K, N).
     """
     n, rank, team = x_.shape[2], 0, 1
     first, end = 0, (n + {parts.width - 1}) // {parts.width}
     size, reach, within = {tuple_of("params[#]", parts.dimension)}, params[{at}], params[{at + 1}]
     present, arranged, time, drawn = 0, False, params[0], np.uint64(0)  # nobody asks here what time it is, or draws
+    placed = {parts.keyed}
     for i in range(n):
         present += alive[b, i]
         living[i] = alive[b, i]
@@ -41,6 +49,7 @@ def look(
             near_square[k, i] = np.inf
     into_blocks(pos, x_, b, n, first, end)
 {indented([*_look_at_agents(parts), *_look_at_obstacles(parts)], 4)}
+    return placed
 '''
 
 
@@ -65,44 +74,41 @@ def _look_at_agents(parts: Parts) -> list[str]:
     ]
     if parts.keyed:
         block = [*_keyed(parts), "if not sure:", *indented_lines(block, 4)]
-    return [*_tags(parts), *query(parts, parts.seen_fields), *walk(parts, parts.seen_fields, block)]
+    return [*query(parts, parts.seen_fields), *_tags(parts), *walk(parts, parts.seen_fields, block)]
 
 
 def _tags(parts: Parts) -> list[str]:
-    """Write what keys need to know before."""
+    """Write what keys need to know before, and candidates after the last one: infinitely far, NaN around a box."""
     if not parts.keyed:
         return []
     return [
-        "farthest, room = key_read(np.float32(np.inf)), 1",
+        "nobody, room = np.uint32(0xFFFFFFFF), 1",
         "while room < n:",
         "    room *= 2",
         "tags = np.int32(room - 1)",
+        "edge = key_of(within, np.int32(0), tags)",
+        f"for j in range(np.uint64(n), np.uint64(n + {ABREAST - 1})):",
+        f"    {sorted_at(parts.seen_fields.index('x0'), 'j')} = np.inf",
     ]
 
 
 def _keyed(parts: Parts) -> list[str]:
     """Write how a block keeps lists of keys, one longer than asked for, and tells them if that leaves no doubt.
 
-    A candidate takes two instructions for each place of a list then, not five. Where two neighbours of a list differ in
-    less than the bits that are left of a square, all is found in the other way, once more. Squares are worked out anew.
+    Where two neighbours of a list, or one and the edge of sight, differ in less than the bits that are left of a
+    square, all is found in the other way, once more. Squares are worked out anew.
     """
     assert parts.look is not None
     slot, many, d, w = Slots(parts), parts.look.agents, parts.dimension, parts.width
     keys = [slot(f"square{k}") for k in range(many + 1)]
-    keep = ["far = key_of(square, j, tags) if other & (square < within) else farthest"]
-    for place in keys:
-        keep += [
-            f"near = key_read({place})",
-            f"{place} = key_written(far if far < near else near)",
-            "far = near if far < near else far",
-        ]
     lines = [
         "sure = present == n",
         "if sure:",
         f"    for l in range(np.uint64({w})):",
-        *(f"        {place} = np.inf" for place in keys),
-        "    for r in range(found):",
-        *indented_lines(meet_range(parts, parts.seen_fields, keep, exact=True), 8),
+        *(f"        {place} = key_written(nobody)" for place in keys),
+        f"    for j in range(np.uint64(0), np.uint64(n), np.uint64({ABREAST})):",
+        f"        for l in range(np.uint64({w})):",
+        *indented_lines(_met(parts, keys), 12),
         "    doubt = False",
         f"    for l in range(np.uint64({w})):",
         "        i, count = block + l, np.int32(0)",
@@ -111,26 +117,66 @@ def _keyed(parts: Parts) -> list[str]:
     for k in range(many):
         lines += [
             f"        key, following = following, key_read({keys[k + 1]})",
-            f"        near_who[{k}, i] = tag_of(key, tags)",
-            "        count += 1 if key < farthest else 0",
-            "        doubt |= same_key(key, following, tags) & (following < farthest)",
+            "        near = key < edge",
+            f"        near_who[{k}, i] = tag_of(key, tags) if near else np.int32(0)",
+            "        count += np.int32(1) if near else np.int32(0)",
+            "        doubt |= (near & same_key(key, following, tags)) | same_key(key, edge, tags)",
         ]
-    lines += ["        near_count[i] = count", "    sure = not doubt", "if sure:"]
+    first = parts.seen_fields.index("x0") * SMALL_STRIDE
+    lines += ["        near_count[i] = count", "    sure = not doubt", "placed &= sure", "if sure:"]
+    lines.append("    agents, listed = np.uint64(n), np.uint64(near_who.shape[1])")
+    lines.append(f"    table, length = np.uint64({first}), np.uint64({SMALL_STRIDE})")
     for k in range(many):
-        picked = [slot(f"picked{j}") for j in range(d)]
-        at, first = parts.slots["picked0"] * w, parts.seen_fields.index("x0") * SMALL_STRIDE
-        lines.append(
-            f"    pick(lanes, np.uint64({at}), np.uint64({w}), sorted_, np.uint64({first}), np.uint64({SMALL_STRIDE}), "
-            f"np.uint64({d}), np.uint64(n), near_who, np.uint64({k}) * np.uint64(near_who.shape[1]) + block, {w})"
-        )
+        there = ", ".join(f"near_pos[{j}, {k}, block + l]" for j in range(d))
         lines += [
+            f"    line, beside = np.uint64({k}) * listed + block, np.uint64({many}) * listed",
+            f"    pick(near_pos, line, beside, sorted_, table, length, np.uint64({d}), agents, near_who, line, {w})",
             f"    for l in range(np.uint64({w})):",
             f"        {me_of(parts, parts.seen_fields)}",
-            f"        to = {offset_of(parts, '(' + ', '.join(picked) + ')')}",
-            f"        square = exact_dot(to, to) if key_read({keys[k]}) < farthest else like(within, np.inf)",
-            f"        near_square[{k}, block + l] = square",
+            f"        to = {offset_of(parts, f'({there})')}",
+            "        square = exact_dot(to, to)",
+            f"        near_square[{k}, block + l] = square if key_read({keys[k]}) < edge else like(within, np.inf)",
         ]
     return lines
+
+
+def _met(parts: Parts, keys: list[str]) -> list[str]:
+    """Write how the candidates from j on come into the list of a lane."""
+    row = [sorted_at(parts.seen_fields.index(f"x{k}"), "(j + np.uint64(#))") for k in range(parts.dimension)]
+    lines = [me_of(parts, parts.seen_fields), "mine = number[block + l]"]
+    for c in range(ABREAST):
+        there = ", ".join(place.replace("#", str(c)) for place in row)
+        lines += [
+            f"to, tag = {offset_of(parts, f'({there})')}, number[j + np.uint64({c})]",
+            f"come{c} = key_of(exact_dot(to, to), tag, tags)",
+            f"come{c} = nobody if tag == mine else come{c}",
+        ]
+    return lines + merged(keys)
+
+
+def merged(keys: list[str]) -> list[str]:
+    """Write how the keys come0, come1, ... are put into a list in order, which lies at such places, and stays as long.
+
+    One after the other, into a list of seven, that takes 13 instructions a key, and this 8: they are sorted, the lesser
+    of the list's last and the first of them, and so on, are the nearest, and a row that rises and then falls is in
+    order after as many rounds as its length has bits (Batcher, "Sorting networks and their applications", AFIPS 1968).
+    """
+    many = len(keys)
+    lines = [_in_order(f"come{a}", f"come{b}") for a, b in ((0, 1), (2, 3), (0, 2), (1, 3), (1, 2))]
+    lines += [f"list{k} = key_read({place})" for k, place in enumerate(keys)]
+    lines += [f"list{many - 1 - c} = ordered(list{many - 1 - c}, come{c})[0]" for c in range(min(ABREAST, many))]
+    length = 1 << (many - 1).bit_length()  # as if as many as are missing of that were nearer than everybody
+    half, missing = length // 2, length - many
+    while half:
+        firsts = [k for k in range(missing, length) if not k & half]
+        lines += [_in_order(f"list{k - missing}", f"list{k - missing + half}") for k in firsts]
+        half //= 2
+    return lines + [f"{place} = key_written(list{k})" for k, place in enumerate(keys)]
+
+
+def _in_order(one: str, other: str) -> str:
+    """Write how two keys change places unless the first is the lesser."""
+    return f"{one}, {other} = ordered({one}, {other})"
 
 
 def _tell(slot: Slots, many: int, lanes: str, agent: str, who: str) -> list[str]:

@@ -411,7 +411,7 @@ class Parts:
             ("far", d * bool(self.far)),
         ]
         runs += [("reach", int(bool(self.bounded))), ("here", int(self.parting))]
-        runs += [("square", look.agents + self.keyed), ("place", look.agents), ("picked", d * self.keyed)]
+        runs += [("square", look.agents + self.keyed), ("place", look.agents)]
         runs += [("gap", look.obstacles), ("which", look.obstacles)]
         if self.sweeps and self.sorts:
             runs += [("inside", d * self.space.periodic), ("home", 1), ("mine", self.rows)]

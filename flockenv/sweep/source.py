@@ -8,6 +8,7 @@ from __future__ import annotations
 from flockenv.sweep.accelerate import accelerate
 from flockenv.sweep.far import tree_imports
 from flockenv.sweep.handed import trimmed
+from flockenv.sweep.look import KEYS
 from flockenv.sweep.method import method, method_imports
 from flockenv.sweep.obstacles import blocked, obstacle_imports
 from flockenv.sweep.parts import LAWS, Parts
@@ -94,7 +95,7 @@ def _imports(parts: Parts) -> str:
         *(["from flockenv.transpose import out_of_records, put_lines, put_records"] * (parts.sweeps and parts.sorts)),
         "from flockenv.vec import add, dot, exact_dot, limit, norm, scale, select, sub, unit, zero",
         *(["from flockenv.vehicle import faced, held, leant, raised, turned"] if parts.oriented else []),
-        *(["from flockenv.abreast import key_of, key_read, key_written, pick, same_key, tag_of"] * parts.keyed),
+        *([f"from flockenv.abreast import {KEYS}"] * parts.keyed),
         *tree_imports(parts),
         *obstacle_imports(parts),
         method_imports(parts),

@@ -8,9 +8,9 @@ over one world:
 * `keep(p, before, after)`, of a task that `keeps` alone, writes into the memory what the others read of this step;
 * `reward(p, before, after, action, terms)` writes the named terms (L, K), each of which lies in one piece, and nothing
   else, as a test checks;
-* `ended(p, before, after, over) -> success` writes which learners are over (L,), may take agents out of `after.alive`,
-  and says whether the aim is reached;
-* `measure(p, before, after, numbers)` writes what this step adds to the `measures` (Q,);
+* `ended(p, before, after, numbers, over) -> success` writes which learners are over (L,), may take agents out of
+  `after.alive`, and says whether the aim is reached; of the `measures` (Q,) it may write those that it needs itself;
+* `measure(p, before, after, numbers)` comes next and writes the others: what this step adds to the `measures`;
 * `metrics(p, sums, last, steps, numbers)` writes the domain metrics of an episode so far, in the order of
   `metric_names`, from the sums of the measures over its steps and from their last values, by name (sums.path, say), and
   the number of steps; a metric has no value where none is written. All of it is double precision, `p` too;
@@ -160,6 +160,11 @@ class Task(Record):
         raise TypeError(f"{type(self).__name__} must lay out its action")
 
     @property
+    def alike(self) -> bool:
+        """Are all agents as large as each other?"""
+        return bool(np.ptp(self.scene.body.radius) == 0)
+
+    @property
     def abreast(self) -> int:
         """How many of a row's first numbers its kernel `abreast` writes; 0 = it has none."""
         return 0
@@ -234,9 +239,10 @@ def task_source(task: Task) -> str:
     _check(task)
     now, empty = _frame(), ", ".join(f"{name}[:0]" for name in NEAR.split(", "))
     then = _frame(x="x0", v="v0", alive="alive0", near=empty)
-    look = f"look(x, alive, obstacle_x, obstacle_radius, b, params, {NEAR}, {SHARED})" if task.look else "pass"
+    look = f"placed = look(x, alive, obstacle_x, obstacle_radius, b, params, {NEAR}, near_pos, {SHARED})"
     size, far = task.action_layout.size, apart(task.learners) if task.abreast else "actions.shape[1]"
     fetches = [f"if not past: fetch(rows[b], {k}, 4)" if task.abreast else "pass" for k in range(4)]
+    wide_ones = "own, near_vel, near_radius, beside, " if task.abreast else ""
     told = f"for k in range({len(task.terms)} if everyone else 0):"
     sums = [f"for k in range({len(task.terms)}):", "    fetch(paid[k, b], 0, 1)", told, "    fetch(terms[k, b], 0, 1)"]
     fetch_sums = "\n".join(indented_lines([*sums, "fetch(payment[b], 0, 1)"], 12)) if task.abreast else ""
@@ -249,7 +255,7 @@ def task_source(task: Task) -> str:
     )
     play = f'''
 
-from flockenv.abreast import columns, into_rows, packed, take
+from flockenv.abreast import columns, in_one_row, into_rows, packed, take
 from flockenv.lines import fetch, pour, settle
 from flockenv.tasks.base import Frame
 from flockenv.vehicle import face
@@ -273,7 +279,7 @@ def tell(steps, numbers, last, sums, first, told):
 @njit(cache=True, **FAST)
 def play(
     {worlds}, dt, count, mortal, past, measured, sums, paid,
-    canvas, force, x0, v0, alive0, decided, earned, {"own, nearby, beside, " if task.abreast else ""}{NEAR}, {SHARED},
+    canvas, force, x0, v0, alive0, decided, earned, {wide_ones}{NEAR}, near_pos, {SHARED},
     acting, mask, everyone, check, from_world, to_world, actions, limit,
     rows, payment, terms, over, late, success, present,
 ):
@@ -288,12 +294,11 @@ def play(
     unaliased()
     x, v, memory, obstacle_x = packed(x), packed(v), packed(memory), packed(obstacle_x)
     {"force = packed(force)" if task.abreast else "pass"}
-    action, good = columns(decided, actions.shape[1], {size}, {far}), True
-    for b in range(from_world, to_world if acting and check else from_world):
-        for i in range(actions.shape[1]):
-            for k in range(np.uint64({size})):
-                good &= finite(actions[b, i, k])
-    if not good:
+    action, given, learners = columns(decided, actions.shape[1], {size}, {far}), in_one_row(actions), over.shape[1]
+    refused = np.int32(0)
+    for k in range(np.uint64(given.shape[0] if check else 0)):
+        refused += np.int32(0) if finite(given[k]) else np.int32(1)
+    if refused > np.int32(0):
         return {REFUSED}, 0
     p = P({_values(task, task.scene.dtype)})
     n = x.shape[2]
@@ -317,10 +322,12 @@ def play(
                     v0[k, i] = v[k, b, i]
             for i in range(n):
                 alive0[i] = alive[b, i]
-            for i in range(actions.shape[1]):
-                over[b, i] = False
+            for i in range(np.uint64(learners)):
                 for k in range(np.uint64({size})):
-                    action[i, k] = min(max(actions[b, i, k], -1.0), 1.0)
+                    at = (np.uint64(b) * np.uint64(learners) + i) * np.uint64({size}) + k
+                    action[i, k] = min(max(given[at], like(given[at], -1.0)), like(given[at], 1.0))
+            for i in range(np.uint64(learners)):
+                over[b, i] = False
             drive(p, {now}, action, force[:, 0])
             {fetches[0]}  # here and there, for it is written at the end
             into_blocks(want, force, np.int64(0), n, np.int64(0), blocks)
@@ -335,7 +342,7 @@ def play(
         if acting:
             {fetches[1]}
 {fetch_sums}
-        {look}
+        {look if task.look else "pass"}
         now = {now}
         before = {then}
         {"if acting: keep(p, before, now)" if task.keeps else "pass"}
@@ -350,7 +357,7 @@ def play(
                 fetch(x[k, following], 0, 1)
                 fetch(v[k, following], 0, 1)
             fetch(actions[following], 0, 1)
-            success[b] = ended(p, before, wide, over[b])
+            success[b] = ended(p, before, wide, measured[b], over[b])
             measure(p, before, wide, measured[b])
             late[b] = steps[b] >= limit
             for k in range(sums.shape[1]):
@@ -365,10 +372,13 @@ def play(
             for k in range(terms.shape[0] if told else 0):
                 for i in range(np.uint64(over.shape[1])):
                     terms[k, b, i] = earns[i, k]
-            for k in range(terms.shape[0]):
-                for i in range(np.uint64(over.shape[1])):
+            for i in range(np.uint64(over.shape[1])):
+                whole = np.float64(earns[i, 0])
+                for k in range(np.uint64(1), np.uint64({len(task.terms)})):
+                    whole += earns[i, k]
+                for k in range(np.uint64({len(task.terms)})):
                     paid[k, b, i] += earns[i, k]
-                    payment[b, i] = earns[i, k] + (payment[b, i] if k > 0 else 0.0)
+                payment[b, i] = whole
         seen = canvas if past else rows[b]
         {show}
         observe(p, now, seen)
@@ -414,7 +424,7 @@ def _lanes(task: Task) -> tuple[str, str]:
     """
     d, width, far = task.scene.dimension, task.parts.width, apart(task.learners)
     radius, memory = 2 * d, 2 * d + 1
-    nearby = f"nearby[:{d}], nearby[{d}:{radius}], nearby[{radius}]"
+    nearby = "near_pos, near_vel, near_radius[0]"
     wide = _frame(f"own[:{d}]", f"own[{d}:{radius}]", "alive[b]", f"own[{memory}:]", f"own[{radius}]", NEAR, nearby)
     widen = f"""rounded = np.uint64(over.shape[1] + {width - 1}) // np.uint64({width}) * np.uint64({width})
         for i in range(n):
@@ -423,7 +433,10 @@ def _lanes(task: Task) -> tuple[str, str]:
             for k in range({task.memory}):
                 own[{memory} + k, i] = memory[k, b, i]
             own[{radius}, i] = radius[i]
-        take(nearby, own, near_who, n)
+        if not placed:
+            take(near_pos, own, near_who, n)
+        take(near_vel, own[{d}:], near_who, n)
+        {"pass" if task.alike else f"take(near_radius, own[{radius}:], near_who, n)"}
         wide = {wide}"""
     show = f"""abreast(p, wide, columns(beside, rounded, {task.abreast}, {far}))
         into_rows(seen, beside, {task.abreast}, {far})"""

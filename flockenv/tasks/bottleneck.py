@@ -139,7 +139,7 @@ def reward(p: Any, before: Frame, after: Frame, action: Any, terms: Any) -> None
 
 
 @kernel
-def ended(p: Any, before: Frame, after: Frame, over: Any) -> bool:
+def ended(p: Any, before: Frame, after: Frame, numbers: Any, over: Any) -> bool:
     """Who is through the door is out; all learners out, and none of them ever hurt: success."""
     everybody, unhurt = True, True
     for i in range(over.shape[0]):

@@ -142,7 +142,7 @@ def _order(p: Any, frame: Frame) -> float:
 
 
 @kernel
-def ended(p: Any, before: Frame, after: Frame, over: Any) -> bool:
+def ended(p: Any, before: Frame, after: Frame, numbers: Any, over: Any) -> bool:
     """Never over before the time limit. The aim holds now if learners get along, and do not touch."""
     n = over.shape[0]
     share, touches = 0.0, 0.0

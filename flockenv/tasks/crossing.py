@@ -136,7 +136,7 @@ def reward(p: Any, before: Frame, after: Frame, action: Any, terms: Any) -> None
 
 
 @kernel
-def ended(p: Any, before: Frame, after: Frame, over: Any) -> bool:
+def ended(p: Any, before: Frame, after: Frame, numbers: Any, over: Any) -> bool:
     """Over for all when every learner is at his goal: that is success."""
     there = True
     for i in range(over.shape[0]):

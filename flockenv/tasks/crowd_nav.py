@@ -120,7 +120,7 @@ def reward(p: Any, before: Frame, after: Frame, action: Any, terms: Any) -> None
 
 
 @kernel
-def ended(p: Any, before: Frame, after: Frame, over: Any) -> bool:
+def ended(p: Any, before: Frame, after: Frame, numbers: Any, over: Any) -> bool:
     """A touch ends it, and so does the goal: that is success."""
     success = _arrives(p, after)
     over[0] = success or _collides(after)

@@ -191,7 +191,7 @@ def reward(p: Any, before: Frame, after: Frame, action: Any, terms: Any) -> None
 
 
 @kernel
-def ended(p: Any, before: Frame, after: Frame, over: Any) -> bool:
+def ended(p: Any, before: Frame, after: Frame, numbers: Any, over: Any) -> bool:
     """To be caught ends it; as long as nobody has caught the evader, the aim holds."""
     over[0] = _nearest(after) <= p.capture_distance
     return not over[0]

@@ -191,9 +191,9 @@ def reward(p: Any, before: Frame, after: Frame, action: Any, terms: Any) -> None
 
 
 @kernel
-def ended(p: Any, before: Frame, after: Frame, over: Any) -> bool:
+def ended(p: Any, before: Frame, after: Frame, numbers: Any, over: Any) -> bool:
     """Never over before the time limit. The aim holds now if the flock is aligned, under way, and nobody touches."""
-    polarisation, along = _order(after)
+    polarisation, along = numbers[0], numbers[3] = _order(after)
     return polarisation > 0.9 and along > 0.8 * p.cruise and not _anybody_touches(after)
 
 
@@ -225,10 +225,10 @@ def _order(frame: Frame) -> tuple[float, float]:
 @kernel
 def _anybody_touches(frame: Frame) -> bool:
     """Is anybody's nearest neighbour, or nearest obstacle, so near that they touch?"""
-    touching = False
+    touching = np.int32(0)  # counted: of a question whether there is one LLVM makes a search, agent by agent
     for i in range(np.uint64(frame.alive.shape[0])):
-        touching |= _touches(frame, i)
-    return touching
+        touching += np.int32(1) if _touches(frame, i) else np.int32(0)
+    return bool(touching > np.int32(0))
 
 
 @kernel
@@ -240,8 +240,7 @@ def _touches(frame: Frame, i: int) -> Any:
 
 @kernel
 def measure(p: Any, before: Frame, after: Frame, numbers: Any) -> None:
-    """Polarisation; mean distance of the nearest in sight, m; touches that began just now; mean speed along, m/s."""
-    numbers[0], numbers[3] = _order(after)
+    """Mean distance of the nearest in sight, m; touches that began just now; `ended` writes what order there is."""
     numbers[1] = _nearest(p, after)
     numbers[2] = _began(p, before, after) if _anybody_touches(after) else 0.0
 

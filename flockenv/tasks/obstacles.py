@@ -91,7 +91,7 @@ def reward(p: Any, before: Frame, after: Frame, action: Any, terms: Any) -> None
 
 
 @kernel
-def ended(p: Any, before: Frame, after: Frame, over: Any) -> bool:
+def ended(p: Any, before: Frame, after: Frame, numbers: Any, over: Any) -> bool:
     """A touch ends it, and so does the goal, which is success."""
     touch = after.memory[3, 0] > 0.0
     there = not touch and _to_goal(after) <= p.goal_radius

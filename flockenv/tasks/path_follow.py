@@ -177,7 +177,7 @@ def reward(p: Any, before: Frame, after: Frame, action: Any, terms: Any) -> None
 
 
 @kernel
-def ended(p: Any, before: Frame, after: Frame, over: Any) -> bool:
+def ended(p: Any, before: Frame, after: Frame, numbers: Any, over: Any) -> bool:
     """Who is lost is out; a whole lap, without that, is success."""
     over[0] = abs(_left(p, after)) > p.lost_distance
     return not over[0] and after.memory[_GAINED, 0] >= after.memory[_LENGTH, 0]

@@ -131,7 +131,7 @@ def reward(p: Any, before: Frame, after: Frame, action: Any, terms: Any) -> None
 
 
 @kernel
-def ended(p: Any, before: Frame, after: Frame, over: Any) -> bool:
+def ended(p: Any, before: Frame, after: Frame, numbers: Any, over: Any) -> bool:
     """A caught evader is out; when none is left, everything ends: that is success."""
     pursuers, n = int(p.pursuers), after.pos.shape[1]
     left = 0

@@ -284,7 +284,7 @@ def reward(p: Any, before: Frame, after: Frame, action: Any, terms: Any) -> None
 
 
 @kernel
-def ended(p: Any, before: Frame, after: Frame, over: Any) -> bool:
+def ended(p: Any, before: Frame, after: Frame, numbers: Any, over: Any) -> bool:
     """Who is caught or starved is out. As long as half of the learners live, the aim holds."""
     left = 0
     for i in range(int(p.fish)):
