@@ -117,7 +117,8 @@ class WorldsEnv(VectorEnv[Rows, Rows, Rows]):
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
         self._seeds = np.full(self.world.worlds, NONE, np.int64)
-        self._ended = np.zeros(self.world.worlds, np.bool_)
+        self._nobody = np.zeros(self.world.worlds, np.bool_)
+        self._ended = self._nobody
         self._running = False
 
     def reset(
@@ -207,26 +208,28 @@ class WorldsEnv(VectorEnv[Rows, Rows, Rows]):
         resting = self._resting()
         result = self.world.step(self._blocks(actions, resting), terms=self.infos)
         terminated, truncated = result.terminated, result.truncated
-        if resting.any():
+        if resting is not None:
             terminated[resting], truncated[resting], result.reward[resting] = False, False, 0.0
         self._ended = terminated[:, 0] | truncated
         same_step = self.autoreset_mode is AutoresetMode.SAME_STEP
         info = self._infos(result, self._ended if same_step else resting, final=same_step)
         observation, reward = result.observation.reshape(self.num_envs, -1), result.reward.reshape(-1)
-        return observation, reward, terminated.reshape(-1), self._rows(truncated), info
+        late = self._rows(truncated) if truncated.any() else np.zeros(self.num_envs, np.bool_)
+        return observation, reward, terminated.reshape(-1), late, info
 
-    def _infos(self, result: Step, anew: Mask, final: bool) -> Info:
+    def _infos(self, result: Step, anew: Mask | None, final: bool) -> Info:
         """Tell of every row, or of those that ended; begin the worlds that begin anew, in the result's observations.
 
         final: they have just ended, so tell first how.
         """
         info: Info = {}
-        told = self._told()
-        if not (told | anew).any():
+        told, anew = self._told(), self._nobody if anew is None else anew
+        begin = anew is not self._nobody and bool(anew.any())
+        if not begin and not told.any():
             return info
         columns, lacks = self._columns(result)
         mask = self._rows(anew)
-        if anew.any():
+        if begin:
             if final:
                 _put_final(info, result.observation[anew], columns, mask, lacks)
             self._begin(anew, into=result.observation)
@@ -247,23 +250,23 @@ class WorldsEnv(VectorEnv[Rows, Rows, Rows]):
         _put(info, _only({"seed": self._rows(self._seeds)}, np.flatnonzero(mask)), mask)
         return info
 
-    def _resting(self) -> Mask:
-        """Return the worlds for which this step is their reset; refuse to step one that ended and stays so."""
-        if self.autoreset_mode is AutoresetMode.NEXT_STEP:
+    def _resting(self) -> Mask | None:
+        """Return the worlds for which this step is their reset, if any; refuse to step one that ended and stays so."""
+        if self.autoreset_mode is AutoresetMode.NEXT_STEP and self._ended.any():
             return self._ended
         if self.autoreset_mode is AutoresetMode.DISABLED and self._ended.any():
             raise ResetNeeded(
                 f"step: world {int(self._ended.argmax())} has ended; call reset(options={{'reset_mask': ended}}) first"
             )
-        return np.zeros(self.world.worlds, np.bool_)
+        return None
 
-    def _blocks(self, actions: Rows, resting: Mask) -> Rows:
+    def _blocks(self, actions: Rows, resting: Mask | None) -> Rows:
         """Return the actions by world and learner, (B, L, A), with zeros for who rests."""
         given = np.asarray(actions)
         if given.shape != self.action_space.shape:
             raise ValueError(f"actions: shape {given.shape}, must be {self.action_space.shape}, a row per learner")
         blocks = given.reshape(self.world.worlds, self.task.learners, -1)
-        return np.where(resting[:, None, None], 0.0, blocks) if resting.any() else blocks
+        return blocks if resting is None else np.where(resting[:, None, None], 0.0, blocks)
 
     def _columns(self, result: Step) -> tuple[Info, dict[str, Mask]]:
         """Return what is told of every row, and of which rows a metric has no value yet (and zero in its place)."""
