@@ -2,7 +2,8 @@
 
 2-D, torus, semi-implicit Euler, brute force; the arguments, the checks and the limits are those of a scene. They have
 the form that is fast (agents side by side in the lanes of a vector register, sums in a small scratch array, unsigned
-indices, no aliasing), and each knows nothing but its own mix.
+indices, no aliasing; neighbours are counted in whole numbers, those in one place by a branch), and each knows nothing
+but its own mix.
 """
 
 from __future__ import annotations
@@ -95,48 +96,76 @@ def _rows(width):
     return tuple(np.uint64(k * width) for k in range(10))
 
 
+def _together(width):
+    """Whoever is in one place with somebody: seldom anybody but each himself, so that he is met by a branch."""
+    at = _rows(width)
+
+    @njit(**PARTS)
+    def together(now, sums, counts, number, n, first, three, p):
+        crowded = False
+        for lane in range(np.uint64(width)):
+            crowded |= counts[at[2] + lane] > 1
+        if crowded:
+            for j in range(np.uint64(n)):
+                for lane in range(np.uint64(width)):
+                    i = first + lane
+                    dx = _image(now[0, j] - now[0, i], p[0], like(p[0], 1.0) / p[0])
+                    dy = _image(now[1, j] - now[1, i], p[0], like(p[0], 1.0) / p[0])
+                    square = dx * dx + dy * dy
+                    if np.int32(j - first) != number[lane] and square <= like(square, 1e-30):
+                        sums[at[0] + lane] += now[7, i] - now[7, j]
+                        sums[at[1] + lane] += now[8, i] - now[8, j]
+                        counts[at[1] + lane] += 1
+                        if three:
+                            sums[at[2] + lane] += now[2, j]
+                            sums[at[3] + lane] += now[3, j]
+                            counts[at[0] + lane] += 1
+
+    return together
+
+
 # --- what neighbours come to, by mix --------------------------------------------------------------------------------
 
 
 def _three(width):
     """Separation, alignment and cohesion."""
-    at = _rows(width)
+    at, together = _rows(width), _together(width)
 
     @njit(**PARTS)
-    def wish(now, sums, number, n, blocks, p):
+    def wish(now, sums, counts, number, n, blocks, p):
         size, apart, agree, near, w_apart, w_agree, w_near = p[0], p[1], p[2], p[3], p[4], p[5], p[6]
         zero, one, inverse = like(size, 0.0), like(size, 1.0), like(size, 1.0) / size
         for block in range(blocks):
             first = np.uint64(block * width)
             for k in range(np.uint64(8 * width)):
                 sums[k] = zero
+            for k in range(np.uint64(3 * width)):
+                counts[k] = 0
             for j in range(np.uint64(n)):
-                xj, yj, ux, uy, tx, ty = now[0, j], now[1, j], now[2, j], now[3, j], now[7, j], now[8, j]
-                own = np.int32(j - first)
+                xj, yj, ux, uy = now[0, j], now[1, j], now[2, j], now[3, j]
                 for lane in range(np.uint64(width)):
                     dx = _image(xj - now[0, first + lane], size, inverse)
                     dy = _image(yj - now[1, first + lane], size, inverse)
                     square = dx * dx + dy * dy
-                    other = own != number[lane]
-                    alone = square > like(square, 1e-30)
-                    pushed = other & (square < apart)
-                    share = one / square if alone else zero
-                    push_x = dx * share if alone else tx - now[7, first + lane]
-                    push_y = dy * share if alone else ty - now[8, first + lane]
-                    with_me, by_me = other & (square < agree), other & (square < near)
-                    sums[at[0] + lane] -= push_x if pushed else zero
-                    sums[at[1] + lane] -= push_y if pushed else zero
+                    seen = square > like(square, 1e-30)  # oneself is not
+                    share = -one / square if seen & (square < apart) else zero
+                    with_me, by_me = seen & (square < agree), seen & (square < near)
+                    sums[at[0] + lane] += dx * share
+                    sums[at[1] + lane] += dy * share
                     sums[at[2] + lane] += ux if with_me else zero
                     sums[at[3] + lane] += uy if with_me else zero
-                    sums[at[4] + lane] += one if with_me else zero
+                    counts[at[0] + lane] += 1 if with_me else 0
                     sums[at[5] + lane] += dx if by_me else zero
                     sums[at[6] + lane] += dy if by_me else zero
-                    sums[at[7] + lane] += one if by_me else zero
+                    counts[at[1] + lane] += 1 if by_me else 0
+                    counts[at[2] + lane] += 0 if seen else 1
+            together(now, sums, counts, number, n, first, True, p)
             for lane in range(np.uint64(width)):
                 i = first + lane
-                some = sums[at[4] + lane] > zero
-                mates = one / sums[at[4] + lane] if some else zero
-                company = one / sums[at[7] + lane] if sums[at[7] + lane] > zero else zero
+                some = counts[at[0] + lane] > 0
+                mates = one / like(one, counts[at[0] + lane]) if some else zero
+                many = counts[at[1] + lane]
+                company = one / like(one, many) if many > 0 else zero
                 agree_x = sums[at[2] + lane] * mates - now[2, i] if some else zero
                 agree_y = sums[at[3] + lane] * mates - now[3, i] if some else zero
                 now[4, i] = w_apart * sums[at[0] + lane] + w_agree * agree_x + w_near * (sums[at[5] + lane] * company)
@@ -147,38 +176,38 @@ def _three(width):
 
 def _two(width):
     """Separation and cohesion."""
-    at = _rows(width)
+    at, together = _rows(width), _together(width)
 
     @njit(**PARTS)
-    def wish(now, sums, number, n, blocks, p):
+    def wish(now, sums, counts, number, n, blocks, p):
         size, apart, near, w_apart, w_near = p[0], p[1], p[3], p[4], p[6]
         zero, one, inverse = like(size, 0.0), like(size, 1.0), like(size, 1.0) / size
         for block in range(blocks):
             first = np.uint64(block * width)
             for k in range(np.uint64(5 * width)):
                 sums[k] = zero
+            for k in range(np.uint64(3 * width)):
+                counts[k] = 0
             for j in range(np.uint64(n)):
-                xj, yj, tx, ty = now[0, j], now[1, j], now[7, j], now[8, j]
-                own = np.int32(j - first)
+                xj, yj = now[0, j], now[1, j]
                 for lane in range(np.uint64(width)):
                     dx = _image(xj - now[0, first + lane], size, inverse)
                     dy = _image(yj - now[1, first + lane], size, inverse)
                     square = dx * dx + dy * dy
-                    other = own != number[lane]
-                    alone = square > like(square, 1e-30)
-                    pushed = other & (square < apart)
-                    share = one / square if alone else zero
-                    push_x = dx * share if alone else tx - now[7, first + lane]
-                    push_y = dy * share if alone else ty - now[8, first + lane]
-                    by_me = other & (square < near)
-                    sums[at[0] + lane] -= push_x if pushed else zero
-                    sums[at[1] + lane] -= push_y if pushed else zero
+                    seen = square > like(square, 1e-30)  # oneself is not
+                    share = -one / square if seen & (square < apart) else zero
+                    by_me = seen & (square < near)
+                    sums[at[0] + lane] += dx * share
+                    sums[at[1] + lane] += dy * share
                     sums[at[2] + lane] += dx if by_me else zero
                     sums[at[3] + lane] += dy if by_me else zero
-                    sums[at[4] + lane] += one if by_me else zero
+                    counts[at[1] + lane] += 1 if by_me else 0
+                    counts[at[2] + lane] += 0 if seen else 1
+            together(now, sums, counts, number, n, first, False, p)
             for lane in range(np.uint64(width)):
                 i = first + lane
-                company = one / sums[at[4] + lane] if sums[at[4] + lane] > zero else zero
+                many = counts[at[1] + lane]
+                company = one / like(one, many) if many > 0 else zero
                 now[4, i] = w_apart * sums[at[0] + lane] + w_near * (sums[at[2] + lane] * company)
                 now[5, i] = w_apart * sums[at[1] + lane] + w_near * (sums[at[3] + lane] * company)
 
@@ -187,16 +216,18 @@ def _two(width):
 
 def _seeing(width):
     """Separation, alignment and cohesion, of whom is within a field of view."""
-    at = _rows(width)
+    at, together = _rows(width), _together(width)
 
     @njit(**PARTS)
-    def wish(now, sums, number, n, blocks, p):
+    def wish(now, sums, counts, number, n, blocks, p):
         size, apart, agree, near, w_apart, w_agree, w_near, view = p[0], p[1], p[2], p[3], p[4], p[5], p[6], p[7]
         zero, one, inverse = like(size, 0.0), like(size, 1.0), like(size, 1.0) / size
         for block in range(blocks):
             first = np.uint64(block * width)
             for k in range(np.uint64(8 * width)):
                 sums[k] = zero
+            for k in range(np.uint64(3 * width)):
+                counts[k] = 0
             for lane in range(np.uint64(width)):
                 speed = np.sqrt(
                     now[2, first + lane] * now[2, first + lane] + now[3, first + lane] * now[3, first + lane]
@@ -204,34 +235,33 @@ def _seeing(width):
                 share = one / speed if speed > zero else zero
                 sums[at[8] + lane], sums[at[9] + lane] = now[2, first + lane] * share, now[3, first + lane] * share
             for j in range(np.uint64(n)):
-                xj, yj, ux, uy, tx, ty = now[0, j], now[1, j], now[2, j], now[3, j], now[7, j], now[8, j]
-                own = np.int32(j - first)
+                xj, yj, ux, uy = now[0, j], now[1, j], now[2, j], now[3, j]
                 for lane in range(np.uint64(width)):
                     dx = _image(xj - now[0, first + lane], size, inverse)
                     dy = _image(yj - now[1, first + lane], size, inverse)
                     square = dx * dx + dy * dy
                     ahead = dx * sums[at[8] + lane] + dy * sums[at[9] + lane]
                     still = sums[at[8] + lane] * sums[at[8] + lane] + sums[at[9] + lane] * sums[at[9] + lane] <= zero
-                    seen = (own != number[lane]) & ((ahead * abs(ahead) >= view * square) | still)
                     alone = square > like(square, 1e-30)
-                    pushed = seen & (square < apart)
-                    share = one / square if alone else zero
-                    push_x = dx * share if alone else tx - now[7, first + lane]
-                    push_y = dy * share if alone else ty - now[8, first + lane]
+                    seen = alone & ((ahead * abs(ahead) >= view * square) | still)
+                    share = -one / square if seen & (square < apart) else zero
                     with_me, by_me = seen & (square < agree), seen & (square < near)
-                    sums[at[0] + lane] -= push_x if pushed else zero
-                    sums[at[1] + lane] -= push_y if pushed else zero
+                    sums[at[0] + lane] += dx * share
+                    sums[at[1] + lane] += dy * share
                     sums[at[2] + lane] += ux if with_me else zero
                     sums[at[3] + lane] += uy if with_me else zero
-                    sums[at[4] + lane] += one if with_me else zero
+                    counts[at[0] + lane] += 1 if with_me else 0
                     sums[at[5] + lane] += dx if by_me else zero
                     sums[at[6] + lane] += dy if by_me else zero
-                    sums[at[7] + lane] += one if by_me else zero
+                    counts[at[1] + lane] += 1 if by_me else 0
+                    counts[at[2] + lane] += 0 if alone else 1
+            together(now, sums, counts, number, n, first, True, p)
             for lane in range(np.uint64(width)):
                 i = first + lane
-                some = sums[at[4] + lane] > zero
-                mates = one / sums[at[4] + lane] if some else zero
-                company = one / sums[at[7] + lane] if sums[at[7] + lane] > zero else zero
+                some = counts[at[0] + lane] > 0
+                mates = one / like(one, counts[at[0] + lane]) if some else zero
+                many = counts[at[1] + lane]
+                company = one / like(one, many) if many > 0 else zero
                 agree_x = sums[at[2] + lane] * mates - now[2, i] if some else zero
                 agree_y = sums[at[3] + lane] * mates - now[3, i] if some else zero
                 now[4, i] = w_apart * sums[at[0] + lane] + w_agree * agree_x + w_near * (sums[at[5] + lane] * company)
@@ -251,7 +281,7 @@ def _kernel(mix: str, width: int) -> Any:
     wish, move = MIXES[mix](width), _move(width)
 
     @njit(pipeline_class=Whole, **FAST)
-    def step(x, v, alive, drive, body, work, p, dt, steps, now, want, sums, number):
+    def step(x, v, alive, drive, body, work, p, dt, steps, now, want, sums, counts, number):
         unaliased()
         n = x.shape[2]
         blocks = (n + width - 1) // width
@@ -261,7 +291,7 @@ def _kernel(mix: str, width: int) -> Any:
                 want[1, i] = drive[1, b, i] if drive.shape[1] > 0 else like(dt, 0.0)
             _load(now, x, v, alive, b, n)
             for _ in range(steps):
-                wish(now, sums, number, n, blocks, p)
+                wish(now, sums, counts, number, n, blocks, p)
                 if not move(now, want, body, blocks, p[0], dt):
                     return b
                 work[b, 0] += 1
@@ -290,7 +320,8 @@ def by_hand(mix: str, scene: Scene, state: State, steps: int) -> Callable[[], ob
     now[7:, : scene.agents] = ties(scene.agents, 2).T
     arguments = (
         state.x, state.v, state.alive, np.zeros((2, 0, 0), real), body, state.work, np.array(numbers, real),
-        real.type(scene.dt), steps, now, want, sums, np.arange(width, dtype=np.int32),
+        real.type(scene.dt), steps, now, want, sums, np.zeros(3 * width, f"i{real.itemsize}"),
+        np.arange(width, dtype=np.int32),
     )  # fmt: skip
     kernel = _kernel(mix, width)
     return lambda: kernel(*arguments)

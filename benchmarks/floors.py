@@ -150,7 +150,8 @@ def of_scene(scene: Scene, start: State, steps: int = 1) -> Work:
     each, law = _pair(d, on_torus and pairs >= alive / worlds - 1), 0.0
     for _, effect in scene.parts.pairs:
         seeing = d + 1 if effect.sight.fov < 360 else 0  # along the heading; in view?
-        law += 1 + effect.sums(d) + seeing + (effect.kind in DIVIDING)  # within its radius?
+        told = effect.sums(d) + effect.averages
+        law += 1 + told + seeing + (effect.kind in DIVIDING)  # within its radius?
     law += sum(d + 2 for effect in scene.parts.effects if effect.far_law is not None)  # a root, a division, a sum
     calls = steps if worlds > 1 else 1  # a world of a batch stays in the caches for a call
     moved = 4 * d * np.dtype(scene.dtype).itemsize  # positions and velocities, read and written

@@ -12,8 +12,10 @@ from numba import njit
 
 from flockenv.behaviours import Alignment, Cohesion, Separation
 from flockenv.crew import threads, use_threads
+from flockenv.divergence import SimulationDiverged
 from flockenv.effects.base import Effect, Me, Other, ties
 from flockenv.group import Group
+from flockenv.integrators import RK4
 from flockenv.scene import Scene
 from flockenv.space import Plane, Torus
 from flockenv.spawn import Spawn
@@ -209,6 +211,56 @@ def test_a_law_of_those_elsewhere_is_the_law(row: Any, dimension: int) -> None:
         me = Me(0.0, drawn(), drawn(), drawn(), 1.0, 0.3, 2.0, 4.0, drawn(), 0.0, drawn(), 0, drawn(), 1.3, ())
         one, other = both(p, me, Other(1.0, offset, square, drawn(), 0.3, drawn(), 1.0, ()))
         assert one == other
+
+
+VANISHING = [row for row in EFFECTS if row.effect.vanishes]
+
+
+@pytest.mark.parametrize("row", VANISHING, ids=lambda row: row.name)
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_a_law_that_vanishes_says_nothing_of_who_is_infinitely_far(row: Any, dimension: int) -> None:
+    """Wherever he is: so is he told of whom nobody sees."""
+    effect = next(e for e in scene_under(row, dimension).parts.effects if e.kind == row.effect.kind)
+    laws = vars(sys.modules[type(effect).__module__])
+    whole, elsewhere = laws[effect.pair_law], laws[effect.apart_law or effect.pair_law]
+    numbers, rng = effect.parameters(), np.random.default_rng(0)
+    p = namedtuple("P", numbers)(**numbers)  # type: ignore[misc]
+
+    @njit(error_model="numpy")
+    def both(p: Any, me: Any, other: Any) -> Any:
+        return whole(p, me, other), elsewhere(p, me, other)
+
+    def drawn() -> tuple[float, ...]:
+        return tuple(rng.normal(size=dimension).tolist())
+
+    for scale in (0.0, 1e-20, 1.0, 1e20):
+        offset = tuple(scale * x for x in drawn())
+        me = Me(0.0, drawn(), drawn(), drawn(), 1.0, 0.3, 2.0, 4.0, drawn(), 0.0, drawn(), 0, drawn(), 1.3, ())
+        for said in both(p, me, Other(1.0, offset, np.inf, drawn(), 0.3, drawn(), 1.0, ())):
+            assert not any(said)
+
+
+def test_who_is_nowhere_is_named_though_others_see_him() -> None:
+    """Laws that vanish make no number of him; where a method asks several times they are told whom they are about."""
+    scene, state = crowd(40, 2, "float64", False)
+    state.x[0, 0, 7] = np.nan
+    with pytest.raises(SimulationDiverged, match="agent 7"):
+        scene.step(state)
+    assert scene.parts.trusts
+    several = scene.model_copy(update={"integrator": RK4()})
+    assert not several.parts.trusts
+    with pytest.raises(SimulationDiverged, match="agent 7"):
+        several.step(state)
+
+
+def test_equal_sights_are_counted_once() -> None:
+    """Alignment and cohesion within one radius; and each by itself within another."""
+    far = Cohesion(weight=0.2, radius=2.5)
+    for rules, many in (((RULES[1], RULES[2]), 2), ((RULES[1], far.model_copy(update={"radius": 2})), 1)):
+        scene, state = crowd(10, 2, "float64", False, *rules)
+        assert len(scene.parts.averaged) == many
+        each = [crowd(10, 2, "float64", False, rule)[0].acceleration(state) for rule in rules]
+        np.testing.assert_allclose(scene.acceleration(state), sum(each), atol=1e-12)
 
 
 def test_laws_that_know_only_one_form_are_met_as_ever() -> None:

@@ -23,13 +23,14 @@ __all__ = ["Alignment", "Cohesion", "Separation"]
 @law
 def separation_pair(p: Any, me: Me, other: Other) -> Vec:
     """One push."""
-    return steering.separate(other.offset, sub(me.tie, other.tie))
+    apart = other.square > like(other.square, others.ONE_PLACE)
+    return select(apart, separation_apart(p, me, other), sub(me.tie, other.tie))
 
 
 @law
 def separation_apart(p: Any, me: Me, other: Other) -> Vec:
     """The same where the two are not in one place."""
-    return others.push_off(other.offset)
+    return others.push_off(other.offset, other.square)
 
 
 @law
@@ -40,8 +41,8 @@ def separation(p: Any, me: Me, sums: Vec) -> Vec:
 
 @law
 def alignment_pair(p: Any, me: Me, other: Other) -> Vec:
-    """One velocity, and one more neighbour."""
-    return other.vel + (like(other.square, 1.0),)  # noqa: RUF005  # numba joins tuples, but does not unpack them
+    """One velocity."""
+    return other.vel
 
 
 @law
@@ -66,8 +67,8 @@ def alignment(p: Any, me: Me, sums: Vec) -> Vec:
 
 @law
 def cohesion_pair(p: Any, me: Me, other: Other) -> Vec:
-    """One offset, and one more neighbour."""
-    return other.offset + (like(other.square, 1.0),)  # noqa: RUF005
+    """One offset."""
+    return other.offset
 
 
 @law
@@ -116,6 +117,7 @@ dt: 0.02
     pair_law: ClassVar[str | None] = "separation_pair"
     apart_law: ClassVar[str | None] = "separation_apart"
     finish_law: ClassVar[str | None] = "separation"
+    vanishes: ClassVar[bool] = True
 
     @property
     def conserves_momentum(self) -> bool:  # type: ignore[override]  # a rule with a view cone is not mutual
@@ -141,10 +143,11 @@ dt: 0.02
 """
     pair_law: ClassVar[str | None] = "alignment_pair"
     finish_law: ClassVar[str | None] = "alignment"
+    averages: ClassVar[bool] = True
 
     def sums(self, dimension: int) -> int:
-        """A vector and a count."""
-        return dimension + 1
+        """A vector."""
+        return dimension
 
 
 class Cohesion(_FlockRule):
@@ -161,7 +164,8 @@ dt: 0.02
 """
     pair_law: ClassVar[str | None] = "cohesion_pair"
     finish_law: ClassVar[str | None] = "cohesion"
+    averages: ClassVar[bool] = True
 
     def sums(self, dimension: int) -> int:
-        """A vector and a count."""
-        return dimension + 1
+        """A vector."""
+        return dimension

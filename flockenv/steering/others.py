@@ -102,9 +102,8 @@ def evade(offset: Vec, velocity: Vec, pursuer_velocity: Vec, max_speed: float, t
 
 
 @law
-def push_off(offset: Vec) -> Vec:
-    """One neighbour's push where the two are not in one place, 1/m: see `separate`."""
-    square = dot(offset, offset)
+def push_off(offset: Vec, square: float) -> Vec:
+    """One neighbour's push where the two are not in one place, 1/m: see `separate`. Their distance squared is known."""
     return scale(offset, like(square, -1.0) / square)
 
 
@@ -116,7 +115,7 @@ def separate(offset: Vec, tie: Vec) -> Vec:
     """
     square = dot(offset, offset)
     apart = square > like(square, ONE_PLACE)
-    return select(apart, push_off(offset), tie)
+    return select(apart, push_off(offset, square), tie)
 
 
 @law

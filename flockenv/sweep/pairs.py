@@ -51,7 +51,7 @@ def _clear(parts: Parts) -> list[str]:
     """Write how a block's running numbers begin."""
     slot = Slots(parts)
     zeros = [f"{s} = 0" for k, e in parts.pairs if not e.pair_start for s in slot.all(f"c{k}_")]
-    zeros += [f"{s} = 0" for s in slot.all("here")]
+    zeros += [f"{s} = 0" for s in (*slot.all("here"), *slot.all("many"))]
     folds = [(k, slot.all(f"c{k}_")) for k, e in parts.pairs if e.pair_start]
     if folds:
         zeros += [me_of(parts, parts.fields), *_nearest_images(parts)]
@@ -140,6 +140,8 @@ def _meet(parts: Parts, touch: bool, apart: bool = False) -> list[str]:
     apart: nobody whom it counts for is in one place with it.
     """
     laws = [(k, e) for k, e in parts.pairs if e.contact == touch]
+    vanish = [effect.vanishes and parts.trusts for effect in parts.effects]
+    laws.sort(key=lambda law: vanish[law[0]])  # registers: others need one less while the first are worked out
     asked = dict.fromkeys(parts.sight_of(effect) for _, effect in laws)
     slot, lines = Slots(parts), _ahead(parts) if laws and not touch else []
     for q, sight in enumerate(parts.sights):
@@ -147,6 +149,10 @@ def _meet(parts: Parts, touch: bool, apart: bool = False) -> list[str]:
             continue
         cut = f" & (square <= {slot(f'near{q}_{sight.nearest - 1}')})" if sight.nearest else ""
         lines.append(f"seen{q} = ({_seen(parts, q)}){cut}" if sight.occluded else f"seen{q} = {_seen(parts, q)}{cut}")
+    for q in parts.averaged if not touch else []:
+        lines.append(f"{slot(f'many{q}_0')} = tallied({slot(f'many{q}_0')}, seen{q})")
+    for q in dict.fromkeys(parts.sights.index(parts.sight_of(effect)) for k, effect in laws if vanish[k]):
+        lines.append(f"it{q} = Other(aj, to, square if seen{q} else like(square, np.inf), vj, rj, tj, mj, nj)")
     for k, effect in laws:
         q, slots = parts.sights.index(parts.sight_of(effect)), slot.all(f"c{k}_")
         if effect.pair_start:
@@ -154,10 +160,11 @@ def _meet(parts: Parts, touch: bool, apart: bool = False) -> list[str]:
             lines += [f"{s} = says[{j}] if seen{q} else {s}" for j, s in enumerate(slots)]
             continue
         law = "apart_law" if apart and effect.apart_law else "pair_law"
-        lines.append(f"says = {law}_{k}(p{k}, me, it)")
-        # A sum of a choice: of a choice between sums LLVM makes a masked store, and the sum stays in memory. The other
-        # choice is -0, which x + -0 leaves as it is for every x: so this becomes one masked addition.
-        lines += [f"{s} += says[{j}] if seen{q} else o" for j, s in enumerate(slots)]
+        lines.append(f"says = {law}_{k}(p{k}, me, {f'it{q}' if vanish[k] else 'it'})")
+        # A sum of a choice: of a choice between sums LLVM makes a masked store, and sums stay in memory. Where there
+        # are masks the other choice is -0, which x + -0 leaves as it is for every x: one masked addition. Elsewhere it
+        # is 0, which LLVM knows how to mask; sums begin with 0 and so are never -0.
+        lines += [f"{s} += says[{j}]{'' if vanish[k] else f' if seen{q} else o'}" for j, s in enumerate(slots)]
     return lines
 
 
@@ -167,7 +174,11 @@ def _finish(parts: Parts) -> list[str]:
     lines = [me_of(parts, parts.fields), *_nearest_images(parts)] + [f"{name} = zero(me.pos)" for name in parts.targets]
     for k, _ in parts.pairs:
         to = parts.pair_target(k)
-        lines.append(f"{to} = add({to}, finish_law_{k}({given(parts, k)}, me, ({', '.join(slot.all(f'c{k}_'))},)))")
+        sums = slot.all(f"c{k}_")
+        if parts.effects[k].averages:
+            many = f"many{parts.sights.index(parts.sight_of(parts.effects[k]))}_0"
+            sums.append(f"like(reach, tally_of({slot(many)}))")
+        lines.append(f"{to} = add({to}, finish_law_{k}({given(parts, k)}, me, ({', '.join(sums)},)))")
     return lines + [f"{slot(f'g{name}{j}')} = {name}[{j}]" for name in parts.targets for j in range(d)]
 
 
@@ -229,7 +240,7 @@ def meet_range(
             "j, last = np.uint64(ranges[r, 0]), np.uint64(ranges[r, 1])",
             "while j < last:",
             *indented_lines(_candidate(parts, fields), 4),
-            "    own, o = np.int32(j - block), like(reach, -0.0)",
+            f"    own, o = np.int32(j - block), like(reach, {'-0.0' if parts.masks else '0.0'})",
             *["    touch = False"] * bool(near),
             *indented_lines(over_lanes(offset, [*lines, *some]), 4),
             *["    if touch:"] * bool(near),

@@ -75,6 +75,8 @@ class Parts:
     """Obstacles that are not in the state: the source depends on their forms, and on whether any of them moves."""
     circles: int = 0
     """How many obstacles come before them."""
+    stepped: bool = True
+    """Is it steps that are made? Else accelerations are asked for, wherever somebody is, or is not."""
     touching: float = field(default=math.inf, compare=False)
     """m, the radii of the two that are widest, and a little more: who is further away is in nobody's contact."""
     tables: tuple[NDArray[np.float64], ...] = field(default=(), compare=False)
@@ -187,6 +189,20 @@ class Parts:
         readers = [e for _, e in self.pairs if "tie" in _names(e, _OF_PAIRS)]
         sums = not any(e.pair_start or e.contact for _, e in self.pairs)
         return sums and bool(readers) and all(e.apart_law for e in readers)
+
+    @property
+    def trusts(self) -> bool:
+        """Is everybody somewhere, at a finite place, whenever forces are asked for?
+
+        Where a step asks once, of places that were looked at after the step before. Then laws that vanish are not asked
+        whom they are about: 0 times a way that is no number would be none either.
+        """
+        return self.stepped and self.integrator.evaluations == 1
+
+    @functools.cached_property
+    def averaged(self) -> list[int]:
+        """The sights of which it is counted who is in them."""
+        return sorted({self.sights.index(self.sight_of(e)) for _, e in self.pairs if e.averages})
 
     @property
     def reach(self) -> float:
@@ -405,6 +421,7 @@ class Parts:
         d, look = self.dimension, self.look or Look(0.0)
         runs = [(f"c{k}_", e.sums(d)) for k, e in self.pairs]
         runs += [(f"near{q}_", sight.nearest or 0) for q, sight in enumerate(self.sights)]
+        runs += [(f"many{q}_", 1) for q in self.averaged]
         runs += [(f"o{k}_", e.folded(d) if e.obstacle_start else 0) for k, e in enumerate(self.effects)]
         runs += [(f"g{name}", d) for name in self.targets] + [
             ("bond", d * bool(self.bonded)),

@@ -5,6 +5,8 @@ Laws are imported from where they were written; only the integrator's `advance` 
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 from flockenv.sweep.accelerate import accelerate
 from flockenv.sweep.far import tree_imports
 from flockenv.sweep.handed import trimmed
@@ -38,6 +40,7 @@ def scene_source(parts: Parts, more: str = "") -> str:
 
 def field_source(parts: Parts) -> str:
     """Return the source of `field`: accelerations at given instants, and nothing that moves."""
+    parts = replace(parts, stepped=False)
     d, w = parts.dimension, parts.width
     names = ", ".join(type(e).__name__ for e in parts.effects) or "no effects"
     chapters = [
@@ -87,7 +90,7 @@ def _imports(parts: Parts) -> str:
         "from flockenv.effects.base import Far, Me, Other, in_view",
         "from flockenv.inlining import Whole",
         "from flockenv.kernels import ask_for, copy_lanes, finite, kernel, like, unaliased, wait_for_team",
-        *(["from flockenv.kernels import tallied, tally_of"] * parts.parting),
+        *(["from flockenv.kernels import tallied, tally_of"] if parts.parting or parts.averaged else []),
         "from flockenv.neighbours import candidates, count_cells, order_records, row_of",
         f"from flockenv.space import {parts.space.offset_law} as offset_to, {parts.space.confine_law} as confine",
         *([f"from flockenv.space import {parts.space.bounce_law} as bounce"] if parts.bounces else []),

@@ -136,6 +136,10 @@ def step_world(
     if first_bad < n:
         if rank == 0:
             {restored}
+        for i in range({"n" if parts.trusts else "0"}):  # who was nowhere before is whom it comes from
+            for k in range({d}):
+                if alive[b, i] and not finite(x_[k, b, i]):
+                    return i
         return first_bad
     out_of_blocks(pos, x_, b, n, first, end)
     out_of_blocks(vel, v_, b, n, first, end)
