@@ -161,9 +161,8 @@ def _meet(parts: Parts, touch: bool, apart: bool = False) -> list[str]:
             continue
         law = "apart_law" if apart and effect.apart_law else "pair_law"
         lines.append(f"says = {law}_{k}(p{k}, me, {f'it{q}' if vanish[k] else 'it'})")
-        # A sum of a choice: of a choice between sums LLVM makes a masked store, and sums stay in memory. Where there
-        # are masks the other choice is -0, which x + -0 leaves as it is for every x: one masked addition. Elsewhere it
-        # is 0, which LLVM knows how to mask; sums begin with 0 and so are never -0.
+        # A sum of a choice: of a choice between sums LLVM makes a masked store, and the sum stays in memory. The other
+        # choice is -0, which x + -0 leaves as it is for every x: so this becomes one masked addition.
         lines += [f"{s} += says[{j}]{'' if vanish[k] else f' if seen{q} else o'}" for j, s in enumerate(slots)]
     return lines
 
@@ -240,7 +239,7 @@ def meet_range(
             "j, last = np.uint64(ranges[r, 0]), np.uint64(ranges[r, 1])",
             "while j < last:",
             *indented_lines(_candidate(parts, fields), 4),
-            f"    own, o = np.int32(j - block), like(reach, {'-0.0' if parts.masks else '0.0'})",
+            "    own, o = np.int32(j - block), like(reach, -0.0)",
             *["    touch = False"] * bool(near),
             *indented_lines(over_lanes(offset, [*lines, *some]), 4),
             *["    if touch:"] * bool(near),
