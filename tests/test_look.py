@@ -75,7 +75,10 @@ CROWDS = (crowd, lattice, ring, heap, steppes)
 
 @pytest.mark.parametrize("kind", ["float32", "float64"])
 @pytest.mark.parametrize("make", CROWDS)
-@pytest.mark.parametrize(("agents", "neighbours"), [(3, 2), (7, 6), (16, 6), (17, 6), (25, 6), (33, 6), (64, 6)])
+@pytest.mark.parametrize(
+    ("agents", "neighbours"),
+    [pytest.param(3, 2, marks=pytest.mark.slow), (7, 6), (16, 6), (17, 6), (25, 6), (33, 6), (64, 6)],
+)
 def test_the_nearest_are_those_that_a_sort_finds(agents: int, neighbours: int, make: Any, kind: str) -> None:
     world = flock(agents, neighbours, kind)
     world.reset(0)
@@ -110,6 +113,7 @@ def test_around_the_edge_of_a_periodic_box_the_lists_are_the_same() -> None:
     assert (across[0][1:] >= across[0][:-1]).all()
 
 
+@pytest.mark.slow
 def test_the_absent_are_in_nobodys_list() -> None:
     """In a kernel that keeps keys when everybody is there."""
     world = World(Bottleneck(dtype="float32"))

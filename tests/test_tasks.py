@@ -763,7 +763,7 @@ def test_scripted_flockmates_flock() -> None:
 
 
 @pytest.mark.parametrize("dtype", ["float32", "float64"])
-@pytest.mark.parametrize("agents", [1, 17, 33])
+@pytest.mark.parametrize("agents", [pytest.param(1, marks=pytest.mark.slow), 17, 33])
 def test_what_lies_beyond_the_last_agent_is_nobodys_business(agents: int, dtype: str) -> None:
     """Where flocks are shown side by side arrays go on; what is there makes no difference."""
     told = []
