@@ -14,11 +14,11 @@ from flockenv.sweep.look import ABREAST, merged
 from flockenv.tasks import Bottleneck, Flock
 from flockenv.world import World
 
-SIGHT, MIDDLE = 6.0, 20.0
+SIGHT, MIDDLE = 6.1, 20.0  # the last bits of its square are not zeros
 
 
 def flock(agents: int, neighbours: int, kind: str) -> World:
-    return World(Flock(agents=agents, neighbours=neighbours, obstacle_count=0, dtype=kind))
+    return World(Flock(agents=agents, neighbours=neighbours, obstacle_count=0, sight=SIGHT, dtype=kind))
 
 
 def found(world: World, places: Any) -> tuple[Any, Any, Any]:
@@ -64,13 +64,22 @@ def heap(n: int, rng: np.random.Generator) -> Any:
     return MIDDLE + rng.integers(0, 2, (n, 1)) * np.ones(2)
 
 
+def edge(n: int, rng: np.random.Generator) -> Any:
+    """All others stand around the first at the edge of his sight, a little nearer or farther in the last bits."""
+    angle = rng.uniform(0, 2 * np.pi, n)
+    radius = SIGHT * (1 + 1.2e-7 * rng.integers(-4, 5, n))
+    places = MIDDLE + radius[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    places[0] = MIDDLE
+    return places
+
+
 def steppes(n: int, rng: np.random.Generator) -> Any:
     """Nobody sees anybody, but for a pair."""
     places = 7.0 * np.stack(np.divmod(np.arange(n), 5), axis=1)[:, ::-1] % 35 + 2
     return places if n > 25 else np.concatenate([places[:-1], places[:1] + 1])
 
 
-CROWDS = (crowd, lattice, ring, heap, steppes)
+CROWDS = (crowd, lattice, ring, heap, edge, steppes)
 
 
 @pytest.mark.parametrize("kind", ["float32", "float64"])

@@ -253,6 +253,15 @@ def test_who_is_nowhere_is_named_though_others_see_him() -> None:
         several.step(state)
 
 
+def test_who_falls_in_a_call_of_many_steps_is_named_though_others_follow() -> None:
+    """By the kernel itself: a task has nobody who makes the steps again, one by one."""
+    scene, state = crowd(40, 2, "float64", False, RULES[0])
+    assert scene.parts.spreads
+    state.v[1, 0, 7] = np.nan
+    for steps in (1, 2, 5):
+        assert scene._advance(state.copy(), np.zeros((2, 0, 0)), steps)[:2] == (0, 7)
+
+
 def test_equal_sights_are_counted_once() -> None:
     """Alignment and cohesion within one radius; and each by itself within another."""
     far = Cohesion(weight=0.2, radius=2.5)

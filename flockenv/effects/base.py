@@ -41,7 +41,7 @@ An effect is of one or more of three forms, each a law for one agent:
 `p` holds the effect's `parameters()` by name, and, if it is `tabled`, an array of numbers as `p.table`: the points of a
 path, the values of a grid. `me` and `other` are the records below. Laws live in the effect's module.
 A pair law says nothing of who is seen: it is evaluated for every candidate, and what it says of those outside the
-effect's `sight` (of agents themselves too) is dropped; or, if it `vanishes`, they are infinitely far for it.
+effect's `sight` (of agents themselves too) is dropped; or, if it `vanishes`, `other.square` is infinite in steps.
 
 Pair laws read the fields of `me` and `other` by name (`me.vel`), never by place (`me[2]`): the sweep sorts what some
 law names, itself or in a law that it calls, and every other field is a stand-in without meaning.
@@ -226,7 +226,10 @@ class Effect(Record):
     apart_law: ClassVar[str | None] = None
     finish_law: ClassVar[str | None] = None
     vanishes: ClassVar[bool] = False
-    """Does its pair law say nothing, zeros, where `other.square` is infinite? Then it is told so of who is not seen."""
+    """Does its pair law say nothing, zeros, where `other.square` is infinite, wherever `other.offset` leads?
+
+    Then steps that ask for forces once tell it so of who is not seen; where he is stays true.
+    """
     averages: ClassVar[bool] = False
     """Is its finish_law handed, after its sums, how many are in sight? They are counted once for equal sights."""
     obstacle_start: ClassVar[str | None] = None

@@ -192,16 +192,24 @@ class Parts:
 
     @property
     def trusts(self) -> bool:
-        """Is everybody somewhere, at a finite place, whenever forces are asked for?
+        """Is everybody somewhere, at a finite place, whenever forces are asked for, unless a step has failed already?
 
-        Where a step asks once, of places that were looked at after the step before. Then laws that vanish are not asked
-        whom they are about: 0 times a way that is no number would be none either.
+        Where steps ask once each. Then laws that vanish are not asked whom they are about. 0 times a way that is no
+        number is none either, so whoever meets one who is nowhere is nowhere after that step, too: who was first is
+        looked for step by step (`step_world`).
         """
         return self.stepped and self.integrator.evaluations == 1
 
+    @property
+    def spreads(self) -> bool:
+        """Does it spread at once to all who meet him that somebody is nowhere?"""
+        return self.trusts and any(effect.vanishes for effect in self.effects)
+
     @functools.cached_property
     def averaged(self) -> list[int]:
-        """The sights of which it is counted who is in them."""
+        """The sights of which it is counted who is in them (not of contacts: few candidates are asked for those)."""
+        if any(effect.averages and effect.contact for effect in self.effects):
+            raise TypeError("an effect with `contact` counts nobody: it cannot have `averages`")
         return sorted({self.sights.index(self.sight_of(e)) for _, e in self.pairs if e.averages})
 
     @property

@@ -94,9 +94,10 @@ def step_world(
     x_, v_, {parts.frame_argument}alive, tick, key, obstacle_x, obstacle_radius, work, params, dt, count, b, rank, team,
     {SHARED},
 ):
-    """Advance this thread's part of world b by `count` steps; return the first agent that is not finite, or -1.
+    """Advance this thread's part of world b by `count` steps; return an agent that is not finite, or -1.
 
-    A world in which somebody is not stays as it was, whole.
+    It is the lowest of those who are not at the end of the call, or, where that spreads, after the first step that
+    failed. A world in which somebody is not stays as it was, whole.
     """
     n = x_.shape[2]
     blocks = (n + {parts.width - 1}) // {parts.width}
@@ -119,21 +120,25 @@ def step_world(
 {indented(_parameters(parts), 4)}
     for l in range(np.uint64({parts.width})):
         {bad} = far
+    nobody = np.int64(n * (count + 1))
+    failed = nobody
     for step_ in range(count):
         time = like(dt, (begun + step_) * np.float64(dt))
-{indented(_advance(parts), 8)}
+{indented([*_advance(parts), *_noted(parts)], 8)}
 {indented(go_home(parts), 4)}
     worst = far
     for lane in range({parts.width}):  # one after the other: no loop over lanes
         l = np.uint64(lane)
         worst = min(worst, {bad})
-    tally[team + rank] = np.int64(worst) if worst < far else n  # who counts may still be reading the first half
+    # who counts may still be reading the first half
+    tally[team + rank] = {"failed" if parts.spreads else "np.int64(worst) if worst < far else nobody"}
     wait_for_team(sync, team)
-    first_bad = n
+    first_bad = nobody
     for r in range(team):
         first_bad = min(first_bad, tally[team + r])
     wait_for_team(sync, team)  # before anybody counts again
-    if first_bad < n:
+    if first_bad < nobody:
+        first_bad %= n
         if rank == 0:
             {restored}
         for i in range({"n" if parts.trusts else "0"}):  # who was nowhere before is whom it comes from
@@ -146,6 +151,22 @@ def step_world(
 {indented([*kept_frame(parts, from_state=False), *kept_inner(parts, from_state=False)], 4)}
     return -1
 '''
+
+
+def _noted(parts: Parts) -> list[str]:
+    """Write how it is noted after which step somebody was nowhere first, and who, where that spreads from him."""
+    if not parts.spreads:
+        return []
+    bad = Slots(parts)("bad")
+    return [
+        "fallen = np.int32(0)",
+        f"for l in range(np.uint64({parts.width})):",
+        f"    fallen += np.int32(1) if {bad} < far else np.int32(0)",
+        "if fallen > np.int32(0) and failed == nobody:",
+        f"    for lane in range({parts.width}):",
+        "        l = np.uint64(lane)",
+        f"        failed = min(failed, np.int64(step_ * n) + np.int64(min({bad}, like(dt, n))))",
+    ]
 
 
 def _confine(parts: Parts) -> list[str]:
