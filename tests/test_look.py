@@ -67,7 +67,7 @@ def heap(n: int, rng: np.random.Generator) -> Any:
 def edge(n: int, rng: np.random.Generator) -> Any:
     """All others stand around the first at the edge of his sight, a little nearer or farther in the last bits."""
     angle = rng.uniform(0, 2 * np.pi, n)
-    radius = SIGHT * (1 + 1.2e-7 * rng.integers(-4, 5, n))
+    radius = SIGHT * (1 + 1.2e-7 * rng.choice([-4, -3, -2, -1, 1, 2, 3, 4], n))
     places = MIDDLE + radius[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
     places[0] = MIDDLE
     return places
