@@ -361,6 +361,7 @@ def test_metrics_of_one_world_are_those_of_all(row: TaskRow) -> None:
             world.metrics(nobody)
 
 
+@pytest.mark.slow
 def test_metrics_are_doubles_in_a_world_of_single_precision() -> None:
     world = World(Crossing(dtype="float32"))
     world.steps[:] = 7
@@ -519,6 +520,7 @@ def test_actions_beyond_the_bounds_are_the_bounds(row: TaskRow) -> None:
         assert_same(end, ends[0])
 
 
+@pytest.mark.slow
 def test_single_precision_takes_actions_as_they_are_or_rounded() -> None:
     """Of doubles beyond its range, too, which are beyond the bounds, not infinite; what is infinite is refused."""
     task = Pursuit(dtype="float32")
