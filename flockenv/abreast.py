@@ -343,15 +343,9 @@ def _turned_square(
             for r in (r for r in range(SQUARE) if not r & s):
                 pair = numbers[r], numbers[r + s]
                 numbers[r], numbers[r + s] = (builder.shuffle_vector(*pair, mask) for mask in masks)
-        rows, count = arguments[3], arguments[3].type
-        with builder.if_else(builder.icmp_unsigned(">=", rows, count(SQUARE))) as (whole, part):
-            with whole:
-                for k in range(SQUARE):
-                    builder.store(numbers[k], line(targets, k, *arguments[1:3]), align=4)
-            with part:
-                for k in range(SQUARE - 1):
-                    with builder.if_then(builder.icmp_unsigned(">", rows, count(k))):
-                        builder.store(numbers[k], line(targets, k, *arguments[1:3]), align=4)
+        for k in range(SQUARE):
+            with builder.if_then(builder.icmp_unsigned(">", arguments[3], ir.Constant(arguments[3].type, k))):
+                builder.store(numbers[k], line(targets, k, *arguments[1:3]), align=4)
         return context.get_dummy_value()
 
     return types.void(to, types.uint64, types.uint64, types.uint64, source, types.uint64, types.uint64), generate

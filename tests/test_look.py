@@ -10,7 +10,7 @@ from numba import njit
 
 from flockenv.abreast import key_of, key_read, key_written, ordered, same_key, tag_of
 from flockenv.kernels import kernel
-from flockenv.sweep.look import ABREAST, merged
+from flockenv.sweep.look import AT_ONCE, merged
 from flockenv.tasks import Bottleneck, Flock
 from flockenv.world import World
 
@@ -183,7 +183,7 @@ def test_the_nearest_stay_in_a_list_and_in_order(length: int) -> None:
     for most in (3, 1000):
         kept, every = [most] * length, [most] * length
         for _ in range(40):
-            come = rng.integers(0, most, ABREAST).tolist()
+            come = rng.integers(0, most, AT_ONCE).tolist()
             names = {f"come{k}": key for k, key in enumerate(come)} | {"kept": kept}
             exec(text, {"ordered": lambda *pair: sorted(pair), "key_read": int, "key_written": int}, names)  # noqa: S102
             every = sorted(every + come)

@@ -249,7 +249,7 @@ for name, task, before, after, action, terms, observation, counted, told in pick
     module.reward(p, before, after._replace(alive=before.alive), action, found)
     numbers = np.zeros(len(task.measures))
     module.ended(p, before, after._replace(alive=after.alive.copy()), numbers, np.zeros(len(terms), bool))
-    module.measure(p, before, after, np.zeros(len(task.measures)))
+    module.measure(p, before, after, numbers)
     Measures, metrics = namedtuple("Measures", task.measures), np.full(len(task.metric_names), np.nan)
     for array in counted[:2]:
         array.flags.writeable = False

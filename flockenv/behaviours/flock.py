@@ -23,8 +23,7 @@ __all__ = ["Alignment", "Cohesion", "Separation"]
 @law
 def separation_pair(p: Any, me: Me, other: Other) -> Vec:
     """One push."""
-    apart = other.square > like(other.square, others.ONE_PLACE)
-    return select(apart, separation_apart(p, me, other), sub(me.tie, other.tie))
+    return others.part(other.offset, other.square, sub(me.tie, other.tie))
 
 
 @law

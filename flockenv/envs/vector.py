@@ -224,7 +224,7 @@ class WorldsEnv(VectorEnv[Rows, Rows, Rows]):
         """
         info: Info = {}
         told, anew = self._told(), self._nobody if anew is None else anew
-        begin = anew is not self._nobody and bool(anew.any())
+        begin = bool(anew.any())
         if not begin and not told.any():
             return info
         columns, lacks = self._columns(result)

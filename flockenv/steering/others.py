@@ -21,6 +21,7 @@ __all__ = [
     "keep_station",
     "offset_pursue",
     "opensteer_time",
+    "part",
     "passing_point",
     "pursue",
     "push_off",
@@ -113,9 +114,13 @@ def separate(offset: Vec, tie: Vec) -> Vec:
 
     `tie` is the direction to take where the two coincide, a unit vector that is opposite for the other one.
     """
-    square = dot(offset, offset)
-    apart = square > like(square, ONE_PLACE)
-    return select(apart, push_off(offset, square), tie)
+    return part(offset, dot(offset, offset), tie)
+
+
+@law
+def part(offset: Vec, square: float, tie: Vec) -> Vec:
+    """The same of somebody whose distance squared is told, m^2: where it is infinite, nothing."""
+    return select(square > like(square, ONE_PLACE), push_off(offset, square), tie)
 
 
 @law

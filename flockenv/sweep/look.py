@@ -10,12 +10,12 @@ from flockenv.sweep.parts import SMALL_STRIDE, Parts, sorted_at
 from flockenv.sweep.query import listed, listed_at, query, walk
 from flockenv.sweep.text import SHARED, Slots, indented, indented_lines, lanes_of, tuple_of
 
-__all__ = ["ABREAST", "KEYS", "look_source", "merged"]
+__all__ = ["AT_ONCE", "KEYS", "look_source", "merged"]
 
 KEYS = "key_of, key_read, key_written, ordered, pick, same_key, tag_of"
 """What is called where lists of the nearest are kept as keys."""
 
-ABREAST = 4
+AT_ONCE = 4
 """So many candidates at once are put into lists of keys."""
 
 
@@ -87,7 +87,7 @@ def _tags(parts: Parts) -> list[str]:
         "    room *= 2",
         "tags = np.int32(room - 1)",
         "edge = key_of(within, np.int32(0), tags)",
-        f"for j in range(np.uint64(n), np.uint64(n + {ABREAST - 1})):",
+        f"for j in range(np.uint64(n), np.uint64(n + {AT_ONCE - 1})):",
         f"    {sorted_at(parts.seen_fields.index('x0'), 'j')} = np.inf",
     ]
 
@@ -106,7 +106,7 @@ def _keyed(parts: Parts) -> list[str]:
         "if sure:",
         f"    for l in range(np.uint64({w})):",
         *(f"        {place} = key_written(nobody)" for place in keys),
-        f"    for j in range(np.uint64(0), np.uint64(n), np.uint64({ABREAST})):",
+        f"    for j in range(np.uint64(0), np.uint64(n), np.uint64({AT_ONCE})):",
         f"        for l in range(np.uint64({w})):",
         *indented_lines(_met(parts, keys), 12),
         "    doubt = False",
@@ -144,7 +144,7 @@ def _met(parts: Parts, keys: list[str]) -> list[str]:
     """Write how the candidates from j on come into the list of a lane."""
     row = [sorted_at(parts.seen_fields.index(f"x{k}"), "(j + np.uint64(#))") for k in range(parts.dimension)]
     lines = [me_of(parts, parts.seen_fields), "mine = number[block + l]"]
-    for c in range(ABREAST):
+    for c in range(AT_ONCE):
         there = ", ".join(place.replace("#", str(c)) for place in row)
         lines += [
             f"to, tag = {offset_of(parts, f'({there})')}, number[j + np.uint64({c})]",
@@ -164,7 +164,7 @@ def merged(keys: list[str]) -> list[str]:
     many = len(keys)
     lines = [_in_order(f"come{a}", f"come{b}") for a, b in ((0, 1), (2, 3), (0, 2), (1, 3), (1, 2))]
     lines += [f"list{k} = key_read({place})" for k, place in enumerate(keys)]
-    lines += [f"list{many - 1 - c} = ordered(list{many - 1 - c}, come{c})[0]" for c in range(min(ABREAST, many))]
+    lines += [f"list{many - 1 - c} = ordered(list{many - 1 - c}, come{c})[0]" for c in range(min(AT_ONCE, many))]
     length = 1 << (many - 1).bit_length()  # as if as many as are missing of that were nearer than everybody
     half, missing = length // 2, length - many
     while half:
