@@ -59,7 +59,3 @@ class Recycler:
             return np.ndarray(shape, dtype, *memory)
 
         return make
-
-    def empty(self, shape: tuple[int, ...], dtype: np.dtype[Any]) -> NDArray[Any]:
-        """Return such an array."""
-        return self.maker(shape, dtype)()

@@ -16,8 +16,13 @@ def address(array):
     return array.__array_interface__["data"][0]
 
 
+def maker_of(recycler):
+    """Return what makes arrays of any shape and type."""
+    return lambda shape, dtype: recycler.maker(shape, dtype)()
+
+
 def test_what_was_let_go_of_is_used_again():
-    make = Recycler().empty
+    make = maker_of(Recycler())
     first = make((3, 4), F4)
     second = make((3, 4), F4)
     places = {address(first), address(second)}
@@ -31,7 +36,7 @@ def test_what_was_let_go_of_is_used_again():
 
 @pytest.mark.parametrize("line", [1, 16, 64, 4096])
 def test_arrays_begin_with_a_line(line):
-    make = Recycler(keep=2, line=line).empty
+    make = maker_of(Recycler(keep=2, line=line))
     for shape in ((0,), (1,), (3, 5), (1000,)):
         held = [make(shape, F4) for _ in range(4)]
         again = {address(array) for array in held[:2]}
@@ -58,7 +63,7 @@ HOLDERS = {
 
 @pytest.mark.parametrize("hold", HOLDERS.values(), ids=HOLDERS)
 def test_whoever_holds_any_of_it_keeps_it(hold):
-    make = Recycler(keep=2).empty
+    make = maker_of(Recycler(keep=2))
     array = make((3, 4), F4)
     place = address(array)
     held = hold(array)
@@ -72,17 +77,17 @@ def test_whoever_holds_any_of_it_keeps_it(hold):
 
 def test_only_so_many_are_kept():
     recycler = Recycler(keep=3)
-    many = [recycler.empty((2,), F4) for _ in range(8)]
+    many = [recycler.maker((2,), F4)() for _ in range(8)]
     places = [address(array) for array in many]
     assert len(set(places)) == 8
     assert [len(kept) for kept in recycler._kept.values()] == [3]
     del many
-    again = [recycler.empty((2,), F4) for _ in range(3)]
+    again = [recycler.maker((2,), F4)() for _ in range(3)]
     assert {address(array) for array in again} == set(places[:3])
 
 
 def test_shapes_and_types_are_apart():
-    make = Recycler().empty
+    make = maker_of(Recycler())
     shapes = [((6,), F4), ((2, 3), F4), ((6,), np.dtype(np.int32)), ((6,), np.dtype(bool))]
     for shape, dtype in [*shapes, *shapes[::-1]]:
         array = make(shape, dtype)
@@ -92,7 +97,7 @@ def test_shapes_and_types_are_apart():
 
 
 def test_what_a_user_makes_of_an_array_does_not_outlive_it():
-    make = Recycler(keep=1).empty
+    make = maker_of(Recycler(keep=1))
     places = set()
     for _ in range(3):
         array = make((6,), F4)
@@ -104,6 +109,6 @@ def test_what_a_user_makes_of_an_array_does_not_outlive_it():
 
 
 def test_an_array_pickles_as_any_other():
-    array = Recycler().empty((2, 3), F4)
+    array = Recycler().maker((2, 3), F4)()
     array[:] = 4
     np.testing.assert_array_equal(pickle.loads(pickle.dumps(array)), array)

@@ -11,8 +11,10 @@ from typing import Any
 import numpy as np
 import pytest
 
+from flockenv.crew import threads, use_threads
 from flockenv.kernels import settled
 from flockenv.noise import key_of, keys_of
+from flockenv.scene import WORTH_SHARING
 from flockenv.tasks import Crossing, Flock, Obstacles, Pursuit
 from flockenv.tasks.base import task_source
 from flockenv.world import AT_HAND, PAST, Step, World, _portions
@@ -480,6 +482,24 @@ def test_an_action_that_is_no_number_is_refused_by_name_and_moves_nobody(
     assert_same(everything(world), kept)
     for a in actions[1:]:  # and it goes on as if nothing had been asked
         np.testing.assert_array_equal(world.step(a).observation, other.step(a).observation)
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+@pytest.mark.parametrize("place", [(0, 0, 0), (199, 23, 1)])
+def test_so_it_is_where_threads_share_the_worlds(value: float, place: tuple[int, int, int]) -> None:
+    """All actions are looked at before any thread moves anybody."""
+    world, before = World(Flock(), 200), threads()
+    assert world.worlds * world.agents >= WORTH_SHARING
+    world.reset(2)
+    actions, kept = np.zeros((200, 24, 2)), everything(world)
+    actions[place] = value
+    use_threads(2)
+    try:
+        with pytest.raises(ValueError, match=f"action {place[2]} of boid_{place[1]} in world {place[0]} is"):
+            world.step(actions)
+    finally:
+        use_threads(before)
+    assert_same(everything(world), kept)
 
 
 @EVERY
