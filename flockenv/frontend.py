@@ -22,6 +22,7 @@ from numba.core import (
     inline_closurecall,
     ir,
     postproc,
+    ssa,
     targetconfig,
     transforms,
     typed_passes,
@@ -263,6 +264,26 @@ def _if_new(refresh: Any) -> Any:
     return refreshed
 
 
+def _where_it_is(slowly: Any) -> Any:
+    """Rewrite the blocks that name a variable: numba goes through every statement of a function for each variable."""
+
+    def names(block: Any) -> frozenset[str]:
+        known = vars(block).get("_flockenv_names")
+        if known is None or known[0] is not block.body:
+            found = frozenset(variable.name for statement in block.body for variable in statement.list_vars())
+            known = block._flockenv_names = block.body, found
+        return known[1]  # type: ignore[no-any-return]
+
+    def rewritten(blocks: Any, states: Any, handler: Any) -> Any:
+        name = states["varname"]
+        return {
+            label: slowly({label: block}, states, handler)[label] if name in names(block) else block
+            for label, block in blocks.items()
+        }
+
+    return rewritten
+
+
 TRICKS = (
     Trick(functions.BaseFunction, "get_call_type", _known_calls, (
         Known(functions.BaseFunction, "get_call_type", "6559c167bfc0"),
@@ -288,6 +309,17 @@ TRICKS = (
     )),
     Trick(ir.Inst, "_rec_list_vars", _variables, (Known(ir.Inst, "_rec_list_vars", "054700e9100b"),)),
     Trick(postproc.PostProcessor, "run", _when_asked, (Known(postproc.PostProcessor, "run", "e1a8e77d6f17"),)),
+    Trick(ssa, "_run_block_rewrite", _where_it_is, (
+        Known(ssa, "_run_block_rewrite", "d17efdbed570"),
+        Known(ssa, "_run_ssa_block_pass", "b48d590f81cc"),
+        Known(ssa, "_fresh_vars", "4a4d13bc0ec5"),
+        Known(ssa, "_fix_ssa_vars", "3f183045a535"),
+        Known(ssa._FreshVarHandler, "on_assign", "922c4f980745"),
+        Known(ssa._FreshVarHandler, "on_other", "565e6211fbcb"),
+        Known(ssa._FixSSAVars, "on_assign", "af50633e775a"),
+        Known(ssa._FixSSAVars, "on_other", "a17f1fff547c"),
+        Known(ssa._FixSSAVars, "_fix_var", "9735dd01ed8f"),
+    )),
     Trick(base.BaseContext, "refresh", _if_new, (
         Known(base.BaseContext, "refresh", "83e8f5cc63a7"),
         Known(base.BaseContext, "install_registry", "bdaf4e9db8fe"),

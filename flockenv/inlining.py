@@ -26,6 +26,7 @@ from numba import _dynfunc  # type: ignore[attr-defined]  # compiled
 from numba.core import analysis, compiler, compiler_machinery, ir, lowering, typed_passes
 
 from flockenv.frontend import lighter, spared
+from flockenv.lowering import Brief, BriefPart, insert_part, is_brief
 
 __all__ = ["Inlined", "Whole"]
 
@@ -142,6 +143,10 @@ class _LanesStay(_Lower):  # type: ignore[misc]
             way_back.set_metadata("llvm.loop", name)
 
 
+class _BriefLanesStay(_LanesStay, BriefPart):
+    """The same in fewer words."""
+
+
 def _lanes(code: Any, blocks: Any, header: Any) -> int:
     """Return how often a loop goes round that is over `range(np.uint64(a number))`; 0 of any other loop."""
     block = blocks[header]
@@ -175,7 +180,7 @@ class _Lowering(_Native):  # type: ignore[misc]
     @property
     def lowering_class(self) -> Any:
         """Which one lowers."""
-        return _LanesStay
+        return _BriefLanesStay if is_brief() else _LanesStay
 
     def run_pass(self, state: Any) -> bool:
         """Lower, and register the function for its callers."""
@@ -191,23 +196,35 @@ class _Lowering(_Native):  # type: ignore[misc]
         # callers find a function by an object of its own; called from Python, this one says what it is
         name = lowered.fndesc.qualname.split(".")[-1]
         stub = _dynfunc.make_function(lowered.fndesc.lookup_module(), name, "", _refusal(), lowered.env, (library,))
-        state.targetctx.insert_user_function(stub, lowered.fndesc, [library])
+        insert = insert_part if is_brief() else type(state.targetctx).insert_user_function
+        insert(state.targetctx, stub, lowered.fndesc, (library,))
         state["cr"] = lowered._replace(cfunc=stub)
         return True
+
+
+@_register(mutates_CFG=True, analysis_only=False)
+class _Entry(_Native):  # type: ignore[misc]
+    """Lowering of an entry point."""
+
+    _name = "lowering_of_an_entry"
+
+    @property
+    def lowering_class(self) -> Any:
+        """Which one lowers."""
+        return Brief if is_brief() else _Lower
 
 
 class Whole(_Compiler):  # type: ignore[misc]
     """numba's pipeline, less what frontend spares it: how an entry point is compiled."""
 
+    _lowering = _Entry
+
     def define_pipelines(self) -> list[Any]:
         """Return the passes."""
         passes = _Passes.define_nopython_pipeline(self.state)
-        passes.passes = self._chosen(spared(passes.passes))
+        passes.passes = [(self._lowering if p is _Native else p, text) for p, text in spared(passes.passes)]
         passes.finalize()
         return [passes]
-
-    def _chosen(self, passes: list[Any]) -> list[Any]:
-        return passes
 
     def _compile_core(self) -> Any:
         with lighter(), _short_loops():
@@ -215,7 +232,6 @@ class Whole(_Compiler):  # type: ignore[misc]
 
 
 class Inlined(Whole):
-    """The same with that lowering."""
+    """The same without machine code."""
 
-    def _chosen(self, passes: list[Any]) -> list[Any]:
-        return [(_Lowering if p is _Native else p, text) for p, text in passes]
+    _lowering = _Lowering

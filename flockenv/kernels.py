@@ -34,6 +34,7 @@ from flockenv import (
     compilation,  # noqa: F401  # tells how long compiling takes
     frontend,
     inlining,
+    lowering,
     processor,
 )
 from flockenv.inlining import Inlined
@@ -353,7 +354,7 @@ def laws_digest() -> str:
     An edit to one means new files, never stale machine code. Nothing of the machine is in it: results are the same.
     """
     digest = hashlib.sha256(f"{numba.__version__} {sys.version_info[:2]}".encode())
-    how = [Path(str(module.__file__)) for module in (sys.modules[__name__], inlining, frontend)]
+    how = [Path(str(module.__file__)) for module in (sys.modules[__name__], inlining, frontend, lowering)]
     for path in sorted(Path(__file__).parent.rglob("*.py")):
         text = path.read_bytes()
         if b"from flockenv.kernels import" in text or path in how:

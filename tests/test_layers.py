@@ -26,6 +26,7 @@ LAYERS = (
         "compilation",
         "inlining",
         "frontend",
+        "lowering",
         "turns",
         "startup",
         "processor",

@@ -1,0 +1,368 @@
+"""numba's lowering in fewer words: what it tells LLVM of arrays, loops and calls, less what LLVM takes away again.
+
+Half of the time that a kernel took to compile went by in writing LLVM's text, in reading it and in taking away what it
+says twice: numba stores all fields of an array for each number that is read from it, and takes a namedtuple of twenty
+arrays apart into two hundred arguments for each call, which the function that is called puts together again. Here a
+number is read from where the array's data are, a part of an array is made of the numbers that differ, a loop by ones
+divides nothing, and a function that is only ever inlined takes a namedtuple as it is. Flock in float64 says 33,000
+instructions where it said 86,000; the machine code is what it was.
+
+Where the functions of numba that this relies on read otherwise (another numba), it is left out; see `frontend`.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Sequence
+from typing import Any
+
+from llvmlite import ir as llvm  # type: ignore[import-untyped]
+from numba.core import callconv, cgutils, imputils, ir, lowering, types
+from numba.core.datamodel import models
+from numba.cpython import rangeobj
+from numba.np import arrayobj
+
+from flockenv.frontend import Known, reads_as_known
+
+__all__ = ["READS", "Brief", "BriefPart", "insert_part", "is_brief"]
+
+# numba is untyped
+_Lower: Any = lowering.Lower
+_Convention: Any = callconv.CPUCallConv
+_arrays: Any = arrayobj
+_code: Any = cgutils
+_Tuple: Any = types.BaseTuple
+
+LOOPS = ("getiter", "iternext", "pair_first", "pair_second")
+
+START_STOP_STEP = 3
+"""Numbers of a range."""
+
+READS = (
+    Known(_Lower, "storevar", "16d897dd729a"),
+    Known(_Lower, "delvar", "45cd88aeddd8"),
+    Known(_Lower, "lower_getitem", "76f8c6ed4f7e"),
+    Known(_Lower, "lower_setitem", "84ed9f0254ea"),
+    Known(_Lower, "lower_expr", "581164cc7697"),
+    Known(_Lower, "_lower_call_normal", "ff84f88a6d07"),
+    Known(_Lower, "pre_block", "1046a20a6c65"),
+    Known(lowering.BaseLower, "setup_function", "c346418a1cf3"),
+    Known(lowering.BaseLower, "extract_function_arguments", "9f22441a3786"),
+    Known(_Convention, "get_function_type", "7b4264fd7561"),
+    Known(_Convention, "decorate_function", "40a0fcb5401f"),
+    Known(_Convention, "call_function", "63b21494a809"),
+    Known(_Convention, "return_status_propagate", "9af41fdd6e4e"),
+    Known(imputils, "user_function", "38735fa51cb4"),
+    Known(rangeobj, "make_range_impl", "3b198b25a32e"),
+    Known(arrayobj, "basic_indexing", "6000a5433cca"),
+    Known(arrayobj, "make_view", "cff36d1e408f"),
+    Known(arrayobj, "fix_integer_index", "05fc2c98f472"),
+    Known(models.ArrayModel, "__init__", "cbe7f8d3a4e8"),
+)
+"""What is replaced, and what the replacements take from elsewhere."""
+
+
+@functools.cache
+def is_brief() -> bool:
+    """Is this the numba that all of it was tried with?"""
+    return reads_as_known(READS)
+
+
+class Brief(_Lower):  # type: ignore[misc]
+    """Lowering of a function that allocates nothing."""
+
+    def storevar(self, value: Any, name: str, argidx: Any = None) -> None:
+        """Store a value: what was there holds no references that would have to be counted."""
+        self._alloca_var(name, self.typeof(name))
+        if self.context.enable_nrt or self._disable_sroa_like_opt:
+            super().storevar(value, name, argidx)
+        elif name in self._singly_assigned_vars:
+            self._blk_local_varmap[name] = value
+        else:
+            self.builder.store(value, self.getvar(name))
+
+    def delvar(self, name: str) -> None:
+        """Forget a variable, or nothing."""
+        if self.context.enable_nrt or self._disable_sroa_like_opt:
+            super().delvar(name)
+        elif name not in self._blk_local_varmap:
+            self._singly_assigned_vars.discard(name)
+            self._alloca_var(name, self.typeof(name))
+
+    def lower_getitem(self, resty: Any, expr: Any, value: Any, index: Any, signature: Any) -> Any:
+        """Read a number of an array where it lies, or look at a part of it; all else as numba does."""
+        kind = self.typeof(value.name)
+        places = self._places(kind, index)
+        if places is None or not (resty == kind.dtype or isinstance(resty, types.Array)):
+            return super().lower_getitem(resty, expr, value, index, signature)
+        return self._view(kind, resty, self.loadvar(value.name), places, index)
+
+    def lower_setitem(self, target_var: Any, index_var: Any, value_var: Any, signature: Any) -> Any:
+        """Write a number of an array where it lies; all else as numba does."""
+        kind, given = self.typeof(target_var.name), self.typeof(value_var.name)
+        places = self._places(kind, index_var) if isinstance(given, (types.Number, types.Boolean)) else None
+        if places is None or len(places) < kind.ndim or any(isinstance(place, slice) for place in places):
+            return super().lower_setitem(target_var, index_var, value_var, signature)
+        value = self.context.cast(self.builder, self.loadvar(value_var.name), given, signature.args[2])
+        value = self.context.cast(self.builder, value, signature.args[2], kind.dtype)
+        array = self.loadvar(target_var.name)
+        where = self._address(kind, array, [each for each, _ in self._spans(kind, array, places, index_var)])
+        _arrays.store_item(self.context, self.builder, kind, value, where)
+        return None
+
+    def _places(self, kind: Any, index: Any) -> tuple[Any, ...] | None:
+        """Return what picks a part of an array, axis by axis: types of whole numbers, and slices that are written down.
+
+        None where it is anything else.
+        """
+        given: Any = self.typeof(index.name)
+        if not isinstance(kind, types.Array) or kind.layout not in "CA":
+            return None
+        if self.context.enable_nrt or self.context.enable_boundscheck:
+            return None
+        if not isinstance(kind.dtype, (types.Number, types.Boolean)):
+            return None
+        each = given.types if isinstance(given, _Tuple) else (given,)
+        places = tuple(
+            self._slice(index, k, len(each)) if isinstance(g, types.SliceType) else g for k, g in enumerate(each)
+        )
+        known = all(isinstance(place, (types.Integer, slice)) for place in places)
+        return places if known and 0 < len(places) <= kind.ndim else None
+
+    def _slice(self, index: Any, place: int, many: int) -> slice | None:
+        """Return a slice that is written down, without a step, from the beginning on; None if it is another."""
+        known = self._known(index)
+        if isinstance(known, tuple):
+            known = known[place]
+        elif isinstance(known, ir.Expr) and known.op == "build_tuple":
+            known = self._known(known.items[place])
+        elif many > 1:
+            return None
+        if isinstance(known, ir.Expr) and known.op == "call" and self.typeof(known.func.name).typing_key is slice:
+            known = slice(*(self._known(argument) for argument in known.args))
+        if not isinstance(known, slice) or known.step is not None:
+            return None
+        ends = (known.start, known.stop)
+        return known if all(end is None or (isinstance(end, int) and end >= 0) for end in ends) else None
+
+    def _known(self, variable: Any) -> Any:
+        """Return the value of a variable that is written down, or what makes it; itself if that differs."""
+        try:
+            made = self.func_ir.get_definition(variable)
+        except KeyError:
+            return variable
+        return made.value if isinstance(made, (ir.Const, ir.Global, ir.FreeVar)) else made
+
+    def _view(self, kind: Any, result: Any, array: Any, places: tuple[Any, ...], index: Any) -> Any:
+        """Return a number of an array, or a part of it as an array."""
+        builder = self.builder
+        spans = self._spans(kind, array, places, index)
+        spans += [
+            (None, builder.extract_value(self._part(kind, array, "shape"), k)) for k in range(len(spans), kind.ndim)
+        ]
+        where = self._address(kind, array, [first for first, _ in spans])
+        if result == kind.dtype:
+            return _arrays.load_item(self.context, builder, kind, where)
+        strides = self._part(kind, array, "strides")
+        sizes = [size for _, size in spans if size is not None]
+        steps = [builder.extract_value(strides, axis) for axis, (_, size) in enumerate(spans) if size is not None]
+        parts = {name: self._part(kind, array, name) for name in ("meminfo", "parent", "itemsize")}
+        view, model = self.context.get_value_type(result), self.context.data_model_manager[result]
+        parts |= {"nitems": functools.reduce(builder.mul, sizes), "data": where}
+        for name, numbers in (("shape", sizes), ("strides", steps)):
+            parts[name] = _struct(builder, view.elements[model.get_field_position(name)], numbers)
+        return _struct(builder, view, [parts[name] for name in sorted(parts, key=model.get_field_position)])
+
+    def _part(self, kind: Any, array: Any, name: str) -> Any:
+        return self.builder.extract_value(array, self.context.data_model_manager[kind].get_field_position(name))
+
+    def _spans(self, kind: Any, array: Any, places: tuple[Any, ...], index: Any) -> list[tuple[Any, Any]]:
+        """Return for each place where it begins, None at zero, and how much of that axis stays, None if one number."""
+        context, builder, found = self.context, self.builder, []
+        for axis, place in enumerate(places):
+
+            def size(axis: int = axis) -> Any:
+                return builder.extract_value(self._part(kind, array, "shape"), axis)
+
+            if isinstance(place, slice):
+                found.append(_within(builder, size(), place.start or 0, place.stop))
+                continue
+            given = self.loadvar(index.name)
+            at = (
+                given
+                if not isinstance(self.typeof(index.name), types.BaseTuple)
+                else builder.extract_value(given, axis)
+            )
+            at = context.cast(builder, at, place, types.intp if place.signed else types.uintp)
+            if place.signed:  # negative ones count from the end
+                negative = builder.icmp_signed("<", at, at.type(0))
+                at = builder.select(negative, builder.add(at, size()), at)
+            found.append((at, None))
+        return found
+
+    def _address(self, kind: Any, array: Any, firsts: list[Any]) -> Any:
+        """Return where in memory a number of an array lies; None among its indices is a zero."""
+        builder, data = self.builder, self._part(kind, array, "data")
+        name = "shape" if kind.layout == "C" else "strides"
+        numbers = self._part(kind, array, name) if kind.layout != "C" or len(firsts) > 1 else None
+        at: Any = None
+        for axis, first in enumerate(firsts):
+            if kind.layout == "C":
+                if axis > 0 and at is not None:
+                    at = builder.mul(at, builder.extract_value(numbers, axis))
+                step = first
+            else:
+                step = None if first is None else builder.mul(builder.extract_value(numbers, axis), first)
+            if step is not None:
+                at = step if at is None else builder.add(at, step)
+        if at is None:
+            return data
+        return builder.gep(data, [at]) if kind.layout == "C" else _code.pointer_add(builder, data, at)
+
+    def lower_expr(self, resty: Any, expr: Any) -> Any:
+        """Go through the whole numbers from one to another in few words; all else as numba does."""
+        kind = self.typeof(expr.value.name) if expr.op in LOOPS else None
+        if isinstance(kind, types.RangeType) and expr.op == "getiter" and self._by_ones(expr.value):
+            return self._begun(kind, self.loadvar(expr.value.name))
+        if isinstance(kind, types.RangeIteratorType) and expr.op == "iternext":
+            return self._next(resty, self.loadvar(expr.value.name))
+        if isinstance(kind, types.Pair) and not self.context.enable_nrt:
+            place = ("pair_first", "pair_second").index(expr.op)
+            return self.builder.extract_value(self.loadvar(expr.value.name), place)
+        return super().lower_expr(resty, expr)
+
+    def _by_ones(self, variable: Any) -> bool:
+        """Is it what `range` made of one number, or of two?"""
+        try:
+            call = self.func_ir.get_definition(variable)
+            return (
+                self.typeof(call.func.name).typing_key is range and len(call.args) < START_STOP_STEP and not call.vararg
+            )
+        except (AttributeError, KeyError):
+            return False
+
+    def _begun(self, kind: Any, numbers: Any) -> Any:
+        """Return where a loop is that has yet to begin: which number is next, the end, the step, how many are left."""
+        builder = self.builder
+        start, stop, step = (builder.extract_value(numbers, place) for place in range(START_STOP_STEP))
+        with builder.goto_entry_block():
+            following, left = builder.alloca(start.type), builder.alloca(start.type)
+        builder.store(start, following)
+        many = builder.sub(stop, start)
+        some = builder.icmp_signed(">", many, many.type(0))
+        with builder.if_else(some) as (then, otherwise):
+            with then:
+                builder.store(many, left)
+            with otherwise:
+                builder.store(many.type(0), left)
+        loop = self.context.get_value_type(kind.iterator_type)
+        return _struct(builder, loop, (following, stop, step, left))
+
+    def _next(self, pair: Any, loop: Any) -> Any:
+        """Return the next number, if there is one, and whether there is one."""
+        builder = self.builder
+        following, _, step, left = (builder.extract_value(loop, place) for place in range(len(loop.type)))
+        many = builder.load(left)
+        some = builder.icmp_signed(">", many, many.type(0))
+        with builder.goto_entry_block():
+            found = builder.alloca(many.type)
+            builder.store(many.type(0), found)
+        with builder.if_then(some):
+            number = builder.load(following)
+            builder.store(number, found)
+            builder.store(builder.sub(many, many.type(1), flags=["nsw"]), left)
+            builder.store(builder.add(number, step), following)
+        return _struct(builder, self.context.get_value_type(pair), (builder.load(found), some))
+
+    def _lower_call_normal(self, fnty: Any, expr: Any, signature: Any) -> Any:
+        """Make a range; call all else as numba does."""
+        if getattr(fnty, "typing_key", None) is not range or len(signature.args) >= START_STOP_STEP:
+            return super()._lower_call_normal(fnty, expr, signature)
+        *start, stop = self.fold_call_args(fnty, signature, expr.args, expr.vararg, expr.kws)
+        kind = self.context.get_value_type(signature.return_type)
+        return _struct(self.builder, kind, (*(start or [stop.type(0)]), stop, stop.type(1)))
+
+
+def _struct(builder: Any, kind: Any, parts: Sequence[Any]) -> Any:
+    whole = llvm.Constant(kind, llvm.Undefined)
+    for place, part in enumerate(parts):
+        whole = builder.insert_value(whole, part, place)
+    return whole
+
+
+def _within(builder: Any, size: Any, start: int, stop: int | None) -> tuple[Any, Any]:
+    """Return where a slice of an axis begins, None at zero, and how long it is."""
+
+    def least(number: int) -> Any:
+        return builder.select(builder.icmp_signed("<", size, size.type(number)), size, size.type(number))
+
+    end = size if stop is None else least(stop)
+    if start == 0:
+        return None, end
+    first = least(start)
+    long = builder.sub(end, first)
+    return first, builder.select(builder.icmp_signed("<", long, long.type(0)), long.type(0), long)
+
+
+class BriefPart(Brief):
+    """Lowering of a function that is only ever inlined."""
+
+    def setup_function(self, fndesc: Any) -> None:
+        """Begin it."""
+        self.function = _declared(self.context, self.module, fndesc)
+        self.entry_block = self.function.append_basic_block("entry")
+        self.builder = llvm.IRBuilder(self.entry_block)
+        self.call_helper = self.call_conv.init_call_helper(self.builder)
+
+    def extract_function_arguments(self) -> Any:
+        """Take arguments as they are."""
+        self.fnargs = list(self.call_conv.get_arguments(self.function))
+        return self.fnargs
+
+
+def _declared(context: Any, module: Any, fndesc: Any) -> Any:
+    """Declare it as numba would, but for its arguments."""
+    convention = context.call_conv
+    known = convention.get_function_type(fndesc.restype, ())
+    arguments = [context.get_value_type(kind) for kind in fndesc.argtypes]
+    function = _code.get_or_insert_function(
+        module, llvm.FunctionType(known.return_type, [*known.args, *arguments]), fndesc.mangled_name
+    )
+    for argument, name in zip(function.args, ("retptr", "excinfo", *fndesc.args), strict=False):
+        argument.name = name
+    for argument in function.args[: len(known.args)]:
+        argument.add_attribute("captures(none)")
+        argument.add_attribute("noalias")
+    if fndesc.inline:
+        function.attributes.add("alwaysinline")
+    return function
+
+
+def insert_part(context: Any, function: Any, fndesc: Any, libraries: tuple[Any, ...]) -> None:
+    """Let callers find it, as numba's `insert_user_function` does for what takes its arguments apart."""
+
+    def call(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        convention = context.call_conv
+        called = _declared(context, builder.module, fndesc)
+        result_type = convention.get_return_type(fndesc.restype).pointee
+        plain = not isinstance(fndesc.restype, types.Optional) and not hasattr(builder, "_in_try_block")
+        if plain:  # whatever it raises, its caller raises
+            with builder.goto_entry_block():
+                result = builder.alloca(result_type)
+            code = builder.call(called, [result, convention._get_excinfo_argument(builder.function), *args])
+            with _code.if_unlikely(builder, builder.icmp_signed("!=", code, callconv.RETCODE_OK)):
+                builder.ret(code)
+            return context.get_returned_value(builder, fndesc.restype, builder.load(result))
+        result = _code.alloca_once(builder, result_type)
+        error = _code.alloca_once(builder, llvm.PointerType(callconv.excinfo_t), name="excinfo")
+        code = builder.call(called, [result, error, *args])
+        status = convention._get_return_status(builder, code, builder.load(error))
+        with _code.if_unlikely(builder, status.is_error):
+            convention.return_status_propagate(builder, status)
+        value = context.get_returned_value(builder, fndesc.restype, builder.load(result))
+        fix: Any = imputils.fix_returning_optional
+        return fix(context, builder, sig, status, value)
+
+    call.signature = fndesc.argtypes  # type: ignore[attr-defined]
+    call.libs = libraries  # type: ignore[attr-defined]
+    context._defns[function].append(call, call.signature)  # type: ignore[attr-defined]

@@ -1,0 +1,241 @@
+"""Arrays, loops and calls, told to LLVM in fewer words: what comes out is what numba makes, and what numpy says."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numba
+import numpy as np
+import pytest
+
+from flockenv import frontend, lowering
+from flockenv.inlining import Whole
+from flockenv.kernels import kernel
+
+PLACES = {
+    1: ["i", "u", "-i", "0", "-1", "k", ":", ":0", ":2", "2:", "1:3", "5:2", "9:", ":99", "i:", ":-1", "::2"],
+    2: [
+        "i, j", "u, i", "-i, u", "0, i", "k, u", ":, i", "i, :", "i", "u", "0", ":", ":0", "1:", ":2, 1:3", "0, :",
+        ":, u", "1:, -1", "..., i", "i, j:",
+    ],
+    3: ["i, u, i", ":, i", "i, j", ":, :, i", "i", "i, :, u", ":0", "1:, i, :2", ":, 0", "0, 1, 2", "0, 1", ":, 1:, i"],
+}  # fmt: skip
+"""Indices by the dimensions of the array; the last ones of a row are left to numba."""
+
+ARRAYS = {
+    "contiguous": np.arange(7.0),
+    "strided": np.arange(14.0)[::2],
+    "of_whole_numbers": np.arange(6, dtype=np.int32),
+    "table": np.arange(12.0).reshape(3, 4),
+    "every_second_column": np.arange(24.0).reshape(3, 8)[:, ::2],
+    "of_single_precision": np.arange(12, dtype=np.float32).reshape(3, 4),
+    "box": np.arange(24.0).reshape(2, 3, 4),
+    "of_flags": np.arange(24).reshape(2, 3, 4) > 5,
+    "box_without_its_middle": np.arange(40.0).reshape(2, 5, 4)[:, ::2],
+}
+
+REPORTS = {
+    0: """
+    out[{n}, 0] = r
+""",
+    1: """
+    for q in range(r.shape[0]):
+        out[{n}, 4 + q] = r[q]
+""",
+    2: """
+    for q in range(r.shape[0]):
+        for w in range(r.shape[1]):
+            out[{n}, 4 + 9 * q + w] = r[q, w]
+""",
+    3: """
+    for q in range(r.shape[0]):
+        for w in range(r.shape[1]):
+            for z in range(r.shape[2]):
+                out[{n}, 4 + 81 * q + 9 * w + z] = r[q, w, z]
+""",
+}
+"""What is written down of a part of an array, by its dimensions."""
+
+
+def compiled_whole(function: Callable[..., Any]) -> Any:
+    """Return an entry point."""
+    options: Any = {"pipeline_class": Whole, "error_model": "numpy", "_nrt": False}
+    return numba.njit(**options)(function)
+
+
+def looking_at(array: Any) -> Callable[..., None]:
+    """Return a function that looks at all of those parts of an array, and writes down what it sees."""
+    text = "def looking(a, i, j, k, u, out):\n"
+    for n, places in enumerate(PLACES[array.ndim]):
+        dimension = np.ndim(eval(f"a[{places}]", {"a": array, "i": 1, "j": 1, "k": np.int32(1), "u": np.uint64(1)}))  # noqa: S307
+        text += f"    r = a[{places}]\n"
+        if dimension:
+            for k, known in enumerate(("size", "shape[-1]", "strides[0]", "itemsize")):
+                text += f"    out[{n}, {k}] = r.{known}\n"
+        text += REPORTS[dimension].format(n=n)
+    made: dict[str, Any] = {}
+    exec(text, made)  # noqa: S102
+    looking: Callable[..., None] = made["looking"]
+    return looking
+
+
+@pytest.mark.parametrize("array", ARRAYS.values(), ids=ARRAYS)
+def test_parts_of_arrays_are_where_numpy_says(array: Any) -> None:
+    looking = looking_at(array)
+    compiled = compiled_whole(looking)
+    for i, j in ((1, 1), (0, 2), (-1, 0)):
+        expected, seen = np.full((2, len(PLACES[array.ndim]), 200), np.nan)
+        looking(array, i, j, np.int32(-i), np.uint64(1), expected)
+        compiled(array, i, j, np.int32(-i), np.uint64(1), seen)
+        np.testing.assert_array_equal(seen, expected)
+
+
+def writing(line: Any, table: Any, flags: Any, i: int, u: Any) -> None:
+    line[i] = 1
+    line[-1] = 2.5
+    line[u] = flags[0]
+    table[i, u] = 3
+    table[-1, -1] = line[0] > 0
+    table[0] = 7
+    table[1, 1:] = 8
+    flags[u] = True
+    flags[i - 1] = table[0, 0] > 100
+
+
+def test_numbers_are_written_where_numpy_writes_them() -> None:
+    compiled = compiled_whole(writing)
+    for kind in (np.float32, np.float64):
+        for step in (1, 2):
+            given: list[Any] = [
+                np.zeros(4 * step, kind)[::step],
+                np.zeros((3, 4 * step), kind)[:, ::step],
+                np.zeros(4, bool),
+            ]
+            expected = [array.copy() for array in given]
+            writing(expected[0], expected[1], expected[2], 1, np.uint64(2))
+            compiled(*given, 1, np.uint64(2))
+            for array, wanted in zip(given, expected, strict=True):
+                np.testing.assert_array_equal(array, wanted)
+
+
+def looping(out: Any, low: int, high: int, u: Any) -> int:
+    n = 0
+    for i in range(high):
+        out[n] = i
+        n += 1
+    for i in range(low, high):
+        out[n] = i
+        n += 1
+    for i in range(high, low, -2):
+        out[n] = i
+        n += 1
+    for v in range(u):
+        out[n] = v
+        n += 1
+    for v in range(np.uint64(2), u):
+        for i in range(low if v > np.uint64(3) else high):
+            if i == 4:
+                break
+            out[n] = i
+            n += 1
+        else:
+            out[n] = -100
+            n += 1
+    several = range(low, high)
+    for i in several:
+        for k in several:
+            out[n] = i + k
+            n += 1
+    return n + len(several)
+
+
+@pytest.mark.parametrize(("low", "high", "u"), [(0, 5, 6), (2, 2, 2), (-3, 3, 5), (4, 1, 0), (-5, -8, 1)])
+def test_loops_go_where_python_goes(low: int, high: int, u: int) -> None:
+    compiled = compiled_whole(looping)
+    expected, seen = np.full((2, 400), np.nan)
+    assert compiled(seen, low, high, np.uint64(u)) == looping(expected, low, high, u)
+    np.testing.assert_array_equal(seen, expected)
+
+
+class Crowd(NamedTuple):
+    """A namedtuple of arrays, numbers and another tuple."""
+
+    x: Any
+    alive: Any
+    many: int
+    more: tuple[Any, float, bool]
+
+
+@kernel
+def shifted(crowd: Crowd, by: tuple[float, float], loud: bool) -> tuple[Crowd, float]:
+    """Give back what was taken, and a number."""
+    total = 0.0
+    for i in range(crowd.many):
+        if crowd.alive[i] and not loud:
+            crowd.x[0, i] += by[0] * crowd.more[1]
+            total += crowd.more[0][i]
+    return crowd, total if crowd.more[2] else by[1]
+
+
+@kernel
+def either(k: int, x: Any) -> float | None:
+    """Give back nothing, or a number."""
+    if k > 1:
+        return float(x[0, k])
+    return None
+
+
+@kernel
+def refuses(k: int) -> int:
+    """Raise an error of some numbers."""
+    if k > 2:
+        raise ValueError("more than two")
+    return k + 1
+
+
+def calling(x: Any, alive: Any, heights: Any, k: int) -> tuple[float, float, int]:
+    crowd, total = shifted(Crowd(x, alive, 3, (heights, 0.5, True)), (1.0, 9.0), False)
+    again, other = shifted(Crowd(crowd.x, alive, 2, (heights, 2.0, False)), (1.0, 9.0), k > 0)
+    found = either(k, again.x)
+    return total + other, -1.0 if found is None else found, refuses(k)
+
+
+def test_parts_take_namedtuples_and_give_them_back() -> None:
+    compiled = compiled_whole(calling)
+    for k in (0, 1, 2):
+        x, alive, heights = np.arange(8.0).reshape(2, 4), np.array([True, False, True, True]), np.array([5.0, 6, 7, 8])
+        assert compiled(x, alive, heights, k) == (12.0 + 9.0, [-1.0, -1.0, 2.5][k], k + 1)
+        np.testing.assert_array_equal(x[0], [0.5 + (k == 0) * 2, 1, 2.5, 3])
+
+
+def test_whoever_calls_a_part_that_raises_raises_what_it_does() -> None:
+    compiled = compiled_whole(calling)
+    with pytest.raises(ValueError, match="more than two"):
+        compiled(np.zeros((2, 4)), np.ones(4, bool), np.ones(4), 3)
+
+
+def test_where_references_are_counted_numba_does_it_all() -> None:
+    def tail(x: Any) -> Any:
+        kept = x[1:]
+        for k in range(2):
+            kept = np.zeros(5)[k:] + kept[0]
+        return kept, x[:2]
+
+    compiled: Any = numba.njit(tail, pipeline_class=Whole)
+    for _ in range(100):
+        first, second = compiled(np.arange(4.0))
+        np.testing.assert_array_equal(first, [1, 1, 1, 1])
+        np.testing.assert_array_equal(second, [0, 1])
+
+
+def test_another_numba_is_left_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert lowering.is_brief()
+    monkeypatch.setattr(frontend, "digest", lambda owner, name: "")
+    lowering.is_brief.cache_clear()
+    try:
+        assert not lowering.is_brief()
+        test_parts_of_arrays_are_where_numpy_says(ARRAYS["table"])
+        test_parts_take_namedtuples_and_give_them_back()
+    finally:
+        lowering.is_brief.cache_clear()
