@@ -6,9 +6,10 @@ holds, and its return is the sum over steps of the mean reward of its learners. 
 
 from __future__ import annotations
 
+import functools
 import hashlib
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from statistics import NormalDist
 from time import perf_counter
@@ -42,6 +43,9 @@ _BLOCKS: Mapping[str, int] = {"training": TRAINING, "tuning": TUNING, "evaluatio
 
 RESAMPLES = 10_000
 """Bootstrap resamples: the ends of an interval then move by about 1 % of its width from one generator to another."""
+
+DRAWN_AT_ONCE = 4_000_000
+"""Numbers of worlds that a bootstrap holds at a time: 32 MB."""
 
 LATENCY_CALLS = 101
 """Single rows asked for to find the median time of one decision."""
@@ -315,12 +319,26 @@ def bootstrap(
     x = np.asarray(values, np.float64)
     if x.ndim != 1 or len(x) < 2 or not np.isfinite(x).all():
         raise ValueError(f"an interval needs at least two worlds and finite scores, not {len(np.atleast_1d(x))} worlds")
-    estimate, generator = _STATISTICS[statistic], np.random.default_rng(seed)
-    chunk = max(1, 4_000_000 // len(x))  # resamples that fit into 32 MB
-    counts = [min(chunk, resamples - done) for done in range(0, resamples, chunk)]
-    drawn = np.concatenate([estimate(x[generator.integers(len(x), size=(n, len(x)))]) for n in counts])
+    estimate = _STATISTICS[statistic]
+    drawn = np.concatenate([estimate(x[worlds]) for worlds in _resampled(len(x), resamples, seed)])
     low, high = np.quantile(drawn, (0.025, 0.975))
     return Interval(float(estimate(x[None])[0]), float(low), float(high))
+
+
+def _resampled(worlds: int, resamples: int, seed: int) -> Iterator[NDArray[np.int64]]:
+    """Yield which worlds are drawn, some resamples at a time, (n, worlds): the same for whoever asks."""
+    some = max(1, DRAWN_AT_ONCE // worlds)
+    if resamples <= some:
+        yield _drawn(worlds, resamples, seed)
+        return
+    generator = np.random.default_rng(seed)
+    for done in range(0, resamples, some):
+        yield generator.integers(worlds, size=(min(some, resamples - done), worlds))
+
+
+@functools.lru_cache(maxsize=1)  # all players of a task are resampled alike
+def _drawn(worlds: int, resamples: int, seed: int) -> NDArray[np.int64]:
+    return np.random.default_rng(seed).integers(worlds, size=(resamples, worlds))
 
 
 def proportion(scores: ArrayLike) -> Interval:

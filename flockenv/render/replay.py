@@ -221,12 +221,13 @@ def _headings(shot: Snapshot) -> NDArray[np.uint8]:
 def _scenery(shots: Sequence[Snapshot]) -> list[dict[str, Any]]:
     """Return the obstacles and marks, once for every frame from which on they are others than before."""
     scenes: list[dict[str, Any]] = []
+    told: dict[Mark, dict[str, Any]] = {}  # by the very mark: one that stays is told once
     for k, shot in enumerate(shots):
         stones = np.column_stack([shot.obstacle_centre[:, :2], shot.obstacle_radius]).tolist()
         scene = {
             "stones": [[_short(x, 6) for x in stone] for stone in stones],
             "walls": [[[_short(x, 6) for x in corner] for corner in wall.tolist()] for wall in shot.outlines],
-            "marks": [_mark(mark) for mark in shot.marks],
+            "marks": [told.get(mark) or told.setdefault(mark, _mark(mark)) for mark in shot.marks],
         }
         if not scenes or scene != {name: scenes[-1][name] for name in scene}:
             scenes.append({"from": k, **scene})

@@ -338,5 +338,10 @@ class PathFollow(Task):
 
     def marks(self, state: State, memory: NDArray[np.float64], world: int) -> tuple[Mark, ...]:
         """The track: a disc of its width at every corner."""
-        corners = memory[: 2 * POINTS, world, 0].reshape(2, POINTS).T
-        return tuple(Mark("way", corner, np.zeros(2), self.half_width) for corner in corners)
+        return _discs(memory[: 2 * POINTS, world, 0].tobytes(), self.half_width)
+
+
+@functools.lru_cache(maxsize=64)
+def _discs(corners: bytes, radius: float) -> tuple[Mark, ...]:
+    """Return the discs of a track, the same ones while it is the same: a picture asks for them at every instant."""
+    return tuple(Mark("way", corner, np.zeros(2), radius) for corner in np.frombuffer(corners).reshape(2, -1).T)
