@@ -314,11 +314,13 @@ def bootstrap(
     how often the interval holds the truth on a skewed distribution.
 
     Raises:
-        ValueError: fewer than two values, or one that is not finite.
+        ValueError: fewer than two values, one that is not finite, or no resamples.
     """
     x = np.asarray(values, np.float64)
     if x.ndim != 1 or len(x) < 2 or not np.isfinite(x).all():
         raise ValueError(f"an interval needs at least two worlds and finite scores, not {len(np.atleast_1d(x))} worlds")
+    if resamples < 1:
+        raise ValueError(f"resamples = {resamples}: an interval needs at least one")
     estimate = _STATISTICS[statistic]
     drawn = np.concatenate([estimate(x[worlds]) for worlds in _resampled(len(x), resamples, seed)])
     low, high = np.quantile(drawn, (0.025, 0.975))
@@ -338,7 +340,9 @@ def _resampled(worlds: int, resamples: int, seed: int) -> Iterator[NDArray[np.in
 
 @functools.lru_cache(maxsize=1)  # all players of a task are resampled alike
 def _drawn(worlds: int, resamples: int, seed: int) -> NDArray[np.int64]:
-    return np.random.default_rng(seed).integers(worlds, size=(resamples, worlds))
+    drawn = np.random.default_rng(seed).integers(worlds, size=(resamples, worlds))
+    drawn.flags.writeable = False
+    return drawn
 
 
 def proportion(scores: ArrayLike) -> Interval:

@@ -310,6 +310,7 @@ TRICKS = (
     Trick(ir.Inst, "_rec_list_vars", _variables, (Known(ir.Inst, "_rec_list_vars", "054700e9100b"),)),
     Trick(postproc.PostProcessor, "run", _when_asked, (Known(postproc.PostProcessor, "run", "e1a8e77d6f17"),)),
     Trick(ssa, "_run_block_rewrite", _where_it_is, (
+        Known(ssa, "_run_ssa", "c497422bcf04"),
         Known(ssa, "_run_block_rewrite", "d17efdbed570"),
         Known(ssa, "_run_ssa_block_pass", "b48d590f81cc"),
         Known(ssa, "_fresh_vars", "4a4d13bc0ec5"),

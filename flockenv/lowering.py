@@ -17,9 +17,9 @@ from collections.abc import Sequence
 from typing import Any
 
 from llvmlite import ir as llvm  # type: ignore[import-untyped]
-from numba.core import callconv, cgutils, imputils, ir, lowering, types
+from numba.core import base, callconv, cgutils, imputils, ir, lowering, types
 from numba.core.datamodel import models
-from numba.cpython import rangeobj
+from numba.cpython import rangeobj, slicing
 from numba.np import arrayobj
 
 from flockenv.frontend import Known, reads_as_known
@@ -44,20 +44,38 @@ READS = (
     Known(_Lower, "lower_getitem", "76f8c6ed4f7e"),
     Known(_Lower, "lower_setitem", "84ed9f0254ea"),
     Known(_Lower, "lower_expr", "581164cc7697"),
+    Known(_Lower, "lower_inst", "e479506025a2"),
     Known(_Lower, "_lower_call_normal", "ff84f88a6d07"),
+    Known(_Lower, "_lower_call_RecursiveCall", "e524c8215ce3"),
+    Known(_Lower, "fold_call_args", "c60d73f5e902"),
     Known(_Lower, "pre_block", "1046a20a6c65"),
+    Known(_Lower, "loadvar", "dc1f6093a614"),
+    Known(_Lower, "_alloca_var", "754db57f46d1"),
+    Known(_Lower, "_find_singly_assigned_variable", "64279ab677bd"),
     Known(lowering.BaseLower, "setup_function", "c346418a1cf3"),
     Known(lowering.BaseLower, "extract_function_arguments", "9f22441a3786"),
+    Known(base.BaseContext, "declare_function", "27a68dc93976"),
     Known(_Convention, "get_function_type", "7b4264fd7561"),
     Known(_Convention, "decorate_function", "40a0fcb5401f"),
     Known(_Convention, "call_function", "63b21494a809"),
     Known(_Convention, "return_status_propagate", "9af41fdd6e4e"),
+    Known(_Convention, "check_try_status", "b2d609fe391b"),
+    Known(_Convention, "_get_return_status", "6b2ffbd96fb5"),
     Known(imputils, "user_function", "38735fa51cb4"),
     Known(rangeobj, "make_range_impl", "3b198b25a32e"),
+    Known(slicing, "fix_slice", "d25bf3efcb56"),
+    Known(slicing, "get_slice_length", "e2acd9d22919"),
+    Known(slicing, "fix_stride", "f438b3e7fee0"),
+    Known(cgutils, "get_item_pointer2", "7b168f0b301f"),
     Known(arrayobj, "basic_indexing", "6000a5433cca"),
+    Known(arrayobj, "setitem_array", "fb4c1ebc03a9"),
     Known(arrayobj, "make_view", "cff36d1e408f"),
+    Known(arrayobj, "populate_array", "e86886c14bfc"),
     Known(arrayobj, "fix_integer_index", "05fc2c98f472"),
     Known(models.ArrayModel, "__init__", "cbe7f8d3a4e8"),
+    Known(models.PairModel, "__init__", "ec2b0a14e74e"),
+    Known(models.RangeModel, "__init__", "4f349fad5728"),
+    Known(models.RangeIteratorType, "__init__", "65c87b5a27d1"),
 )
 """What is replaced, and what the replacements take from elsewhere."""
 
@@ -69,7 +87,7 @@ def is_brief() -> bool:
 
 
 class Brief(_Lower):  # type: ignore[misc]
-    """Lowering of a function that allocates nothing."""
+    """Lowering of a function; where references are counted, numba does what counts them."""
 
     def storevar(self, value: Any, name: str, argidx: Any = None) -> None:
         """Store a value: what was there holds no references that would have to be counted."""
@@ -138,12 +156,18 @@ class Brief(_Lower):  # type: ignore[misc]
             known = self._known(known.items[place])
         elif many > 1:
             return None
-        if isinstance(known, ir.Expr) and known.op == "call" and self.typeof(known.func.name).typing_key is slice:
+        if self._calls(known, slice) and not known.vararg:
             known = slice(*(self._known(argument) for argument in known.args))
         if not isinstance(known, slice) or known.step is not None:
             return None
-        ends = (known.start, known.stop)
-        return known if all(end is None or (isinstance(end, int) and end >= 0) for end in ends) else None
+        ends = [end for end in (known.start, known.stop) if end is not None]
+        return known if all(type(end) is int and 0 <= end <= types.intp.maxval for end in ends) else None
+
+    def _calls(self, made: Any, function: Any) -> bool:
+        """Is what makes a variable a call of that function of Python's?"""
+        if not isinstance(made, ir.Expr) or made.op != "call":
+            return False
+        return getattr(self.typeof(made.func.name), "typing_key", None) is function
 
     def _known(self, variable: Any) -> Any:
         """Return the value of a variable that is written down, or what makes it; itself if that differs."""
@@ -156,10 +180,7 @@ class Brief(_Lower):  # type: ignore[misc]
     def _view(self, kind: Any, result: Any, array: Any, places: tuple[Any, ...], index: Any) -> Any:
         """Return a number of an array, or a part of it as an array."""
         builder = self.builder
-        spans = self._spans(kind, array, places, index)
-        spans += [
-            (None, builder.extract_value(self._part(kind, array, "shape"), k)) for k in range(len(spans), kind.ndim)
-        ]
+        spans = self._spans(kind, array, (*places, *[slice(None)] * (kind.ndim - len(places))), index)
         where = self._address(kind, array, [first for first, _ in spans])
         if result == kind.dtype:
             return _arrays.load_item(self.context, builder, kind, where)
@@ -187,12 +208,9 @@ class Brief(_Lower):  # type: ignore[misc]
             if isinstance(place, slice):
                 found.append(_within(builder, size(), place.start or 0, place.stop))
                 continue
-            given = self.loadvar(index.name)
-            at = (
-                given
-                if not isinstance(self.typeof(index.name), types.BaseTuple)
-                else builder.extract_value(given, axis)
-            )
+            at = self.loadvar(index.name)
+            if isinstance(self.typeof(index.name), types.BaseTuple):
+                at = builder.extract_value(at, axis)
             at = context.cast(builder, at, place, types.intp if place.signed else types.uintp)
             if place.signed:  # negative ones count from the end
                 negative = builder.icmp_signed("<", at, at.type(0))
@@ -233,13 +251,8 @@ class Brief(_Lower):  # type: ignore[misc]
 
     def _by_ones(self, variable: Any) -> bool:
         """Is it what `range` made of one number, or of two?"""
-        try:
-            call = self.func_ir.get_definition(variable)
-            return (
-                self.typeof(call.func.name).typing_key is range and len(call.args) < START_STOP_STEP and not call.vararg
-            )
-        except (AttributeError, KeyError):
-            return False
+        call = self._known(variable)
+        return self._calls(call, range) and len(call.args) < START_STOP_STEP and not call.vararg
 
     def _begun(self, kind: Any, numbers: Any) -> Any:
         """Return where a loop is that has yet to begin: which number is next, the end, the step, how many are left."""
@@ -298,17 +311,30 @@ def _within(builder: Any, size: Any, start: int, stop: int | None) -> tuple[Any,
 
     end = size if stop is None else least(stop)
     if start == 0:
-        return None, end
+        return None, end  # which is the size itself of what is looked at whole
     first = least(start)
     long = builder.sub(end, first)
     return first, builder.select(builder.icmp_signed("<", long, long.type(0)), long.type(0), long)
 
 
+def _takes_whole(fndesc: Any) -> bool:
+    """May a function take its arguments as they are?
+
+    Not if it has defaults that nobody gave, which are no values, nor if it calls itself, which numba does in its own
+    way.
+    """
+    left_out = any(isinstance(kind, types.Omitted) for kind in fndesc.argtypes)
+    return not left_out and not any(isinstance(kind, types.RecursiveCall) for kind in fndesc.typemap.values())
+
+
 class BriefPart(Brief):
-    """Lowering of a function that is only ever inlined."""
+    """Lowering of a function that compiled code alone calls."""
 
     def setup_function(self, fndesc: Any) -> None:
         """Begin it."""
+        if not _takes_whole(fndesc):
+            super().setup_function(fndesc)
+            return
         self.function = _declared(self.context, self.module, fndesc)
         self.entry_block = self.function.append_basic_block("entry")
         self.builder = llvm.IRBuilder(self.entry_block)
@@ -316,6 +342,8 @@ class BriefPart(Brief):
 
     def extract_function_arguments(self) -> Any:
         """Take arguments as they are."""
+        if not _takes_whole(self.fndesc):
+            return super().extract_function_arguments()
         self.fnargs = list(self.call_conv.get_arguments(self.function))
         return self.fnargs
 
@@ -340,28 +368,30 @@ def _declared(context: Any, module: Any, fndesc: Any) -> Any:
 
 def insert_part(context: Any, function: Any, fndesc: Any, libraries: tuple[Any, ...]) -> None:
     """Let callers find it, as numba's `insert_user_function` does for what takes its arguments apart."""
+    if not _takes_whole(fndesc):
+        context.insert_user_function(function, fndesc, libraries)
+        return
 
     def call(context: Any, builder: Any, sig: Any, args: Any) -> Any:
         convention = context.call_conv
         called = _declared(context, builder.module, fndesc)
-        result_type = convention.get_return_type(fndesc.restype).pointee
-        plain = not isinstance(fndesc.restype, types.Optional) and not hasattr(builder, "_in_try_block")
-        if plain:  # whatever it raises, its caller raises
-            with builder.goto_entry_block():
-                result = builder.alloca(result_type)
-            code = builder.call(called, [result, convention._get_excinfo_argument(builder.function), *args])
-            with _code.if_unlikely(builder, builder.icmp_signed("!=", code, callconv.RETCODE_OK)):
-                builder.ret(code)
-            return context.get_returned_value(builder, fndesc.restype, builder.load(result))
-        result = _code.alloca_once(builder, result_type)
-        error = _code.alloca_once(builder, llvm.PointerType(callconv.excinfo_t), name="excinfo")
+        error_type = llvm.PointerType(callconv.excinfo_t)
+        with builder.goto_entry_block():
+            result = builder.alloca(convention.get_return_type(fndesc.restype).pointee)
+            error = builder.alloca(error_type)
+        builder.store(error_type(None), error)
         code = builder.call(called, [result, error, *args])
-        status = convention._get_return_status(builder, code, builder.load(error))
-        with _code.if_unlikely(builder, status.is_error):
-            convention.return_status_propagate(builder, status)
-        value = context.get_returned_value(builder, fndesc.restype, builder.load(result))
-        fix: Any = imputils.fix_returning_optional
-        return fix(context, builder, sig, status, value)
+        if isinstance(fndesc.restype, types.Optional) or hasattr(builder, "_in_try_block"):
+            status = convention._get_return_status(builder, code, builder.load(error))
+            with _code.if_unlikely(builder, status.is_error):
+                convention.return_status_propagate(builder, status)
+            value = context.get_returned_value(builder, fndesc.restype, builder.load(result))
+            fix: Any = imputils.fix_returning_optional
+            return fix(context, builder, sig, status, value)
+        with _code.if_unlikely(builder, builder.icmp_signed("!=", code, callconv.RETCODE_OK)):
+            builder.store(builder.load(error), convention._get_excinfo_argument(builder.function))
+            builder.ret(code)  # what it raises, its caller raises
+        return context.get_returned_value(builder, fndesc.restype, builder.load(result))
 
     call.signature = fndesc.argtypes  # type: ignore[attr-defined]
     call.libs = libraries  # type: ignore[attr-defined]

@@ -69,7 +69,7 @@ def test_behind_what_a_learner_sees_stands_what_only_its_critic_is_shown() -> No
     assert any(any(which) and not all(which) for which in ends) and len(shares) > 2
 
 
-@pytest.mark.parametrize("task", [Flock(agents=4), Herd(sheep=5, dogs=2)], ids=lambda task: task.name)
+@pytest.mark.parametrize("task", [Flock(agents=7), Herd(sheep=5, dogs=2)], ids=lambda task: task.name)
 def test_whoever_learns_alone_or_with_others_has_a_critic(task: Task) -> None:
     central = CentralVecEnv(task, 2)
     rows = central.reset()

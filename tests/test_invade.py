@@ -64,7 +64,7 @@ def test_one_plays_alone_in_its_seat_and_is_paid_until_it_is_out(theirs: float) 
 def test_one_of_many_changes_what_the_others_meet() -> None:
     field = {"calm": lambda task: Steady(0.0), "wild": lambda task: RandomPolicy(2, 0)}
     told: list[int] = []
-    flock = Flock(agents=3, horizon=10)
+    flock = Flock(agents=7, horizon=10)
     payoffs = invasion.invade(flock, field, WORLDS, advance=lambda: told.append(1))  # type: ignore[arg-type]
     assert len(told) == 4 and payoffs.players == ("calm", "wild")
     assert not np.array_equal(payoffs.of["calm", "calm"].returns, payoffs.of["calm", "wild"].returns)

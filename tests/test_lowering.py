@@ -229,6 +229,88 @@ def test_where_references_are_counted_numba_does_it_all() -> None:
         np.testing.assert_array_equal(second, [0, 1])
 
 
+def sliced(x: Any, t: Any, out: Any) -> None:
+    for n, part in enumerate((x[first_two()], x[slice(*t)], x[True:], x[:FLAG], x[: np.uint64(2**64 - 1)])):
+        out[n] = part.size
+
+
+FLAG = True
+
+
+@kernel
+def first_two() -> slice:
+    """Return a slice."""
+    return slice(0, 2)
+
+
+def test_what_is_no_slice_of_whole_numbers_is_left_to_numba() -> None:
+    compiled, seen = compiled_whole(sliced), np.zeros(5)
+    compiled(np.arange(5.0), (1, 4), seen)
+    np.testing.assert_array_equal(seen[:4], [2, 3, 4, 1])
+    theirs = numba.njit(error_model="numpy")(lambda x: x[:18446744073709551615].size)
+    ours = compiled_whole(lambda x: x[:18446744073709551615].size)
+    assert ours(np.arange(5.0)) == theirs(np.arange(5.0))
+
+
+@kernel
+def next_but(k: int, most: int = 9) -> int:
+    """Raise an error of some numbers; one argument may be left out."""
+    if k > most:
+        raise ValueError("more")
+    return k + 1
+
+
+@kernel
+def soothed(k: int) -> int:
+    """Make a number of an error."""
+    r = 0
+    try:
+        r = next_but(k)
+    except Exception:  # numba knows no other
+        r = -1000
+    return r
+
+
+@kernel
+def troubled(k: int) -> int:
+    """Raise an error of one."""
+    if k == 1:
+        raise ValueError("one")
+    return soothed(k)
+
+
+def soothing(n: int) -> int:
+    s = 0
+    for i in range(n):
+        try:
+            s += troubled(i)
+        except Exception:
+            s += 100
+    return s
+
+
+def test_an_error_that_was_caught_is_forgotten() -> None:
+    compiled = compiled_whole(soothing)
+    assert compiled(5) == 1 + 100 + 3 + 4 + 5
+    assert compiled(11) == 1 + 100 + sum(range(3, 11)) - 1000
+
+
+@kernel
+def halved(x: Any, n: int, odd: bool) -> float:
+    """Call itself with an array and a flag."""
+    if n < 1:
+        return 1.0 if odd else 0.0
+    return float(x[n]) + halved(x, n - 1, not odd) / 2
+
+
+def test_a_part_that_calls_itself() -> None:
+    def entry(x: Any, n: int, odd: bool) -> float:
+        return float(halved(x, n, odd))
+
+    for odd in (True, False):
+        assert compiled_whole(entry)(np.arange(5.0), 4, odd) == 4 + 3 / 2 + 2 / 4 + 1 / 8 + odd / 16
+
+
 def test_another_numba_is_left_alone(monkeypatch: pytest.MonkeyPatch) -> None:
     assert lowering.is_brief()
     monkeypatch.setattr(frontend, "digest", lambda owner, name: "")
@@ -236,6 +318,12 @@ def test_another_numba_is_left_alone(monkeypatch: pytest.MonkeyPatch) -> None:
     try:
         assert not lowering.is_brief()
         test_parts_of_arrays_are_where_numpy_says(ARRAYS["table"])
-        test_parts_take_namedtuples_and_give_them_back()
+        part: Any = kernel(lambda crowd, by: (crowd.x[0, 1] + by[1], crowd.more[2]))  # compiled here for the first time
+
+        def entry(x: Any, alive: Any) -> tuple[float, bool]:
+            moved: tuple[float, bool] = part(Crowd(x, alive, 3, (x, 0.5, True)), (1.0, 9.0))
+            return moved
+
+        assert compiled_whole(entry)(np.arange(8.0).reshape(2, 4), np.ones(4, bool)) == (10.0, True)
     finally:
         lowering.is_brief.cache_clear()

@@ -214,6 +214,9 @@ def test_a_picture_shows_the_track() -> None:
     assert [mark.kind for mark in shot.marks] == ["way"] * POINTS
     np.testing.assert_allclose([mark.at for mark in shot.marks], corners(world))
     assert world.snapshot().marks is shot.marks  # made once while the track is the same
+    single = World(PathFollow(dtype="float32"), 1)
+    single.reset(3)
+    np.testing.assert_allclose([mark.at for mark in single.snapshot().marks], corners(single), rtol=1e-6)
     with_track, without = draw(shot, 300), draw(dataclasses.replace(shot, marks=()), 300)
     share = (with_track != without).any(axis=2).mean()
     _, size = ways(corners(world))

@@ -43,7 +43,7 @@ class Clock:
 
 
 def flock(worlds=3, **options):
-    return WorldVecEnv(Flock(agents=5, learners=4), worlds, **{"time_limit": 10, **options})
+    return WorldVecEnv(Flock(agents=7, learners=4), worlds, **{"time_limit": 10, **options})
 
 
 def rows(env, steps, seed=0):

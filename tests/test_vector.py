@@ -157,7 +157,7 @@ def of(info, rows):
 @pytest.mark.parametrize("learners", [1, 3])
 def test_who_asks_for_ends_is_told_of_ends_alone(mode, learners):
     """Of those that end in other steps than others: what is told of a row is what is told of it otherwise."""
-    options = {"autoreset_mode": mode, "max_episode_steps": 9, "agents": 5, "learners": learners}
+    options = {"autoreset_mode": mode, "max_episode_steps": 9, "agents": 7, "learners": learners}
     envs, twin = (gymnasium.make_vec("flockenv/Flock-v0", 4 * learners, infos=i, **options) for i in ("ends", "steps"))
     for each in (envs, twin):
         each.reset(seed=2)
@@ -242,13 +242,13 @@ def test_a_copy_goes_on_as_the_original_would(clone):
 
 
 def crowd(worlds=3, learners=4, **options):
-    return gymnasium.make_vec("flockenv/Flock-v0", worlds * learners, agents=5, learners=learners, **options)
+    return gymnasium.make_vec("flockenv/Flock-v0", worlds * learners, agents=7, learners=learners, **options)
 
 
 @pytest.mark.parametrize("mode", MODES)
 def test_rows_are_learners_of_worlds(mode):
     """Everything that is told of row i is what a World says of learner i % L of world i // L, over several episodes."""
-    envs, world = crowd(max_episode_steps=12, autoreset_mode=mode), World(Flock(agents=5, learners=4), 3, time_limit=12)
+    envs, world = crowd(max_episode_steps=12, autoreset_mode=mode), World(Flock(agents=7, learners=4), 3, time_limit=12)
     assert envs.num_envs == 12
     np.testing.assert_array_equal(envs.reset(seed=9)[0], world.reset(9).reshape(12, -1))
     # Worlds that end one after another.

@@ -338,7 +338,7 @@ class PathFollow(Task):
 
     def marks(self, state: State, memory: NDArray[np.float64], world: int) -> tuple[Mark, ...]:
         """The track: a disc of its width at every corner."""
-        return _discs(memory[: 2 * POINTS, world, 0].tobytes(), self.half_width)
+        return _discs(np.asarray(memory[: 2 * POINTS, world, 0], np.float64).tobytes(), self.half_width)
 
 
 @functools.lru_cache(maxsize=64)
