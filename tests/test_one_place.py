@@ -156,6 +156,7 @@ def test_who_is_nowhere_is_asked_without_a_warning_and_is_nobodys_neighbour(plac
     np.testing.assert_allclose(found, expected_, atol=1e-9 * np.abs(expected_).max())
 
 
+@pytest.mark.slow
 def test_two_threads_and_a_view_cone_change_nothing() -> None:
     scene, state = crowd(700, 2, "float64", True, Separation(weight=1, radius=1.5, fov=200), drawn=SIZE)
     state.x[:, 0, 100:130] = state.x[:, 0, 100:101]
@@ -240,6 +241,7 @@ def test_a_law_that_vanishes_says_nothing_of_who_is_infinitely_far(row: Any, dim
             assert not any(said)
 
 
+@pytest.mark.slow
 def test_who_is_nowhere_is_named_though_others_see_him() -> None:
     """Laws that vanish make no number of him; where a method asks several times they are told whom they are about."""
     scene, state = crowd(40, 2, "float64", False)

@@ -82,7 +82,6 @@ CASES: dict[str, Callable[[], dict[str, Any]]] = {
     },
     **{f"task {name}": lambda name=name: played(TASKS[name]()) for name in ("bottleneck", "school")},  # type: ignore[misc]
 }
-QUICK = {"few"}
 
 
 def write(case: str, path: str) -> None:
@@ -90,7 +89,8 @@ def write(case: str, path: str) -> None:
     np.savez(path, **CASES[case](), register=processor.REGISTER)
 
 
-@pytest.mark.parametrize("case", [pytest.param(c, marks=() if c in QUICK else pytest.mark.slow) for c in CASES])
+@pytest.mark.slow
+@pytest.mark.parametrize("case", CASES)
 def test_results_are_the_same_in_long_registers_and_in_short_ones(case: str, tmp_path: Path) -> None:
     found = []
     for size in ("64", "32"):

@@ -762,7 +762,7 @@ def test_scripted_flockmates_flock() -> None:
     assert polarisation.mean() > 0.8
 
 
-@pytest.mark.parametrize("dtype", ["float32", "float64"])
+@pytest.mark.parametrize("dtype", [pytest.param("float32", marks=pytest.mark.slow), "float64"])
 @pytest.mark.parametrize("agents", [pytest.param(1, marks=pytest.mark.slow), 17, 33])
 def test_what_lies_beyond_the_last_agent_is_nobodys_business(agents: int, dtype: str) -> None:
     """Where flocks are shown side by side arrays go on; what is there makes no difference."""
