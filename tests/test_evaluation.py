@@ -305,6 +305,8 @@ def test_bootstrap_repeats_with_its_seed_and_not_otherwise() -> None:
     x = np.random.default_rng(2).normal(size=50)
     assert bootstrap(x) == bootstrap(x)
     assert bootstrap(x, seed=1) != bootstrap(x)
+    with pytest.raises(ValueError, match="resamples = 0"):
+        bootstrap(x, resamples=0)
 
 
 def test_bootstrap_in_chunks_is_a_bootstrap() -> None:

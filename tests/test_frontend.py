@@ -13,7 +13,7 @@ import pytest
 from llvmlite.binding import get_host_cpu_features
 from numba import config
 
-from flockenv import frontend
+from flockenv import frontend, lowering
 from flockenv.inlining import Whole
 from flockenv.kernels import law, load, unaliased
 from flockenv.sweep.source import scene_source
@@ -33,6 +33,8 @@ def test_every_replacement_applies_to_the_numba_it_was_tried_with() -> None:
     frontend._replacements.cache_clear()
     assert len(frontend._replacements()) == len(frontend.TRICKS)
     assert len(frontend._places()) == len(frontend.SPARED)
+    lowering.is_brief.cache_clear()
+    assert lowering.is_brief()
     before = now()
     with frontend.lighter():
         assert all(new is not old for new, old in zip(now(), before, strict=True))
