@@ -282,7 +282,7 @@ class Scene(Record):
         real = 8 if self.dtype == "float64" else 4
         d, parts = self.dimension, self.parts
         reals = 2 * d + 5  # positions, velocities, bodies
-        reals += 4 * d + max(parts.integrator.stages, 1) * d + 6  # blocks of them, the drive, the stages
+        reals += 4 * d + parts.stages * d + 6  # blocks of them, the drive, the stages
         whole = 1
         if parts.sweeps:
             reals += d * (len(parts.targets) + 1)

@@ -46,7 +46,7 @@ class Workspace:
         real: dict[str, int | tuple[int, ...]] = {
             **dict.fromkeys(("pos", "vel", "want"), padded * d),
             "origin": padded * d * (2 if parts.bounces else 1),
-            "stages": (max(parts.integrator.stages, 1), padded * d),
+            "stages": (parts.stages, padded * d),
             **dict.fromkeys(("mass", "radius", "max_speed", "max_force", "living", "ident"), padded),
             "tie": padded * d if "t0" in parts.fields else 1,
             "pulled": padded * d if parts.pulls else 1,

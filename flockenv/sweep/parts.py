@@ -333,6 +333,20 @@ class Parts:
         names = ("s", "f", *(f"w{k}_" for k in self.wishes), *(f"n{k}_" for k, _ in self.pairs))
         return [name for name in names if name in found]
 
+    @property
+    def in_place(self) -> bool:
+        """Does an agent's acceleration come where it was written what it feels from others, in one vector?
+
+        Where the method asks once: nobody reads that again. It is memory that is at hand, and less of it.
+        """
+        once = self.integrator.evaluations == self.integrator.stages == 1
+        return once and len(self.targets) == 1 and self.targets[0][0] != "n"
+
+    @property
+    def stages(self) -> int:
+        """Rows of coordinates that the method needs as scratch of its own."""
+        return 0 if self.in_place else max(self.integrator.stages, 1)
+
     @functools.cached_property
     def fields(self) -> list[str]:
         """What is sorted of each agent: what the pair laws read, found from the names in their code."""

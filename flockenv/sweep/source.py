@@ -15,7 +15,7 @@ from flockenv.sweep.method import method, method_imports
 from flockenv.sweep.obstacles import blocked, obstacle_imports
 from flockenv.sweep.parts import LAWS, Parts
 from flockenv.sweep.step import begin, copies, kept_frame, kept_inner, step, step_world
-from flockenv.sweep.text import CONTEXT, SHARED, frame_views, indented
+from flockenv.sweep.text import CONTEXT, SHARED, frame_views, indented, stages_of
 
 __all__ = ["field_source", "scene_source"]
 
@@ -73,8 +73,8 @@ def field(
         else:
             want[: end * {d * w}] = 0
         context = ({CONTEXT})
-        accelerate((context, first, end), pos, vel, times[b], stages[0])
-        out_of_blocks(stages[0], acc, b, n, first, end)
+        accelerate((context, first, end), pos, vel, times[b], {stages_of(parts)}[0])
+        out_of_blocks({stages_of(parts)}[0], acc, b, n, first, end)
         {"out_of_blocks(carrying, flow, b, n, first, end)" if parts.flows else "pass"}
 ''',
     ]  # fmt: skip

@@ -23,6 +23,7 @@ from flockenv.sweep.text import (
     lane,
     lanes_of,
     nearest_images,
+    stages_of,
     tuple_of,
 )
 
@@ -200,7 +201,7 @@ def _advance(parts: Parts) -> list[str]:
         f"for begin in range(first, end, {PART}):",
         f"    until = min(begin + {PART}, end)",
         *indented_lines(_remember(parts, "begin", "until"), 4),
-        f"    advance((context, begin, until), pos, vel, {flow}, time, dt, stages, begin * {size}, until * {size})",
+        f"    advance((context, begin, until), pos, vel, {flow}, time, dt, {stages_of(parts)}, begin * {size}, until * {size})",
         *indented_lines(_bound(parts, "begin", "until"), 4),
     ]
 

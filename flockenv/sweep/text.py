@@ -14,7 +14,7 @@ from flockenv.sweep.parts import Parts
 
 __all__ = [
     "CONTEXT", "SHARED", "Slots", "alone", "copied", "frame_views", "given", "indented", "indented_lines", "inner_of",
-    "lane", "lanes_of", "nearest_image", "nearest_images", "needed", "place_of", "tuple_of",
+    "lane", "lanes_of", "nearest_image", "nearest_images", "needed", "place_of", "stages_of", "tuple_of",
 ]  # fmt: skip
 
 _READ = (
@@ -49,6 +49,11 @@ def place_of(parts: Parts, rows: int) -> str:
     """Write where the first of `rows` numbers of agent i lies in an array of blocks; the next is a width further."""
     w = parts.width
     return f"(i // np.uint64({w})) * np.uint64({rows * w}) + i % np.uint64({w})"
+
+
+def stages_of(parts: Parts) -> str:
+    """Write the rows of coordinates that the method has as scratch."""
+    return "(felt,)" if parts.in_place else "stages"
 
 
 def inner_of(parts: Parts, i: str) -> str:
