@@ -228,16 +228,19 @@ def count_cells(
 
 
 @kernel
-def _key(records: Any, ident: Any, at: Any) -> Any:
+def _key(records: Any, cell: Ints, ident: Any, at: Any) -> Any:
     """Return cell and number of the agent whose record begins at `at`, in one whole number that is in their order."""
-    return np.int64(records[at]) * np.int64(2**32) + np.int64(ident[np.uint64(records[at + np.uint64(1)])])
+    place = np.uint64(records[at])
+    return np.int64(cell[place]) * np.int64(2**32) + np.int64(ident[place])
 
 
 @kernel
-def order_records(records: Any, ident: Any, length: int, first: int, end: int, late: Ints) -> None:
+def order_records(
+    records: Any, cell: Ints, ident: Any, length: int, first: int, end: int, late: Ints
+) -> None:  # fmt: skip
     """Put the records [first, end), so long and in the order of their cells, in the order of numbers within each.
 
-    Records begin with their cell and their place, and ident has the numbers by place. Most are where they belong: who
+    Records begin with their place; cell and ident have cells and numbers by place. Most are where they belong: who
     comes after somebody he should precede is listed first, without a branch, which would often be guessed wrong.
     Records are asked for some way ahead: they are written, but they have left the nearest caches since. late: room for
     that list.
@@ -245,31 +248,31 @@ def order_records(records: Any, ident: Any, length: int, first: int, end: int, l
     if first >= end:
         return
     size, count, last = np.uint64(length), np.uint64(0), np.uint64(end)
-    before = _key(records, ident, np.uint64(first) * size)
+    before = _key(records, cell, ident, np.uint64(first) * size)
     for k in range(np.uint64(first) + np.uint64(1), last):
         ask_for(records, (k + np.uint64(AHEAD)) * size)
-        key = _key(records, ident, k * size)
+        key = _key(records, cell, ident, k * size)
         late[count] = np.int32(k)
         count += np.uint64(1) if key < before else np.uint64(0)
         before = key
     for m in range(count):
-        _settle(records, ident, size, np.uint64(first), last, np.uint64(late[m]))
+        _settle(records, cell, ident, size, np.uint64(first), last, np.uint64(late[m]))
 
 
 @kernel
-def _settle(records: Any, ident: Any, size: Any, first: Any, end: Any, k: Any) -> None:
+def _settle(records: Any, cell: Ints, ident: Any, size: Any, first: Any, end: Any, k: Any) -> None:
     """Bring record k back to where it belongs, and those behind it, until one is there already."""
-    later = _key(records, ident, k * size - size) > _key(records, ident, k * size)
+    later = _key(records, cell, ident, k * size - size) > _key(records, cell, ident, k * size)
     while later:
         at = k * size
-        key = _key(records, ident, at)
+        key = _key(records, cell, ident, at)
         while later:
             for m in range(at, at + size):
                 records[m - size], records[m] = records[m], records[m - size]
             at -= size
-            later = at > first * size and _key(records, ident, at - size) > key
+            later = at > first * size and _key(records, cell, ident, at - size) > key
         k += np.uint64(1)
-        later = k < end and _key(records, ident, k * size - size) > _key(records, ident, k * size)
+        later = k < end and _key(records, cell, ident, k * size - size) > _key(records, cell, ident, k * size)
 
 
 @kernel

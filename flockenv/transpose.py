@@ -70,11 +70,11 @@ def _put_records(
 ) -> Any:  # fmt: skip
     """Write the records of `width` agents from `first` on, each to the next place of its cell; count those places on.
 
-    A record is its cell, its agent, and a number out of each of the sources, where those of all these agents lie side
+    A record is its agent, and a number out of each of the sources, where those of all these agents lie side
     by side from a place on. cell: int32, -1 for who has none: his is written to place `spare`, behind all others.
     offset: int32, the next place of each cell. Everything lies in one piece.
     """
-    wide, many = written(width, "width"), 2 + sources.count
+    wide, many = written(width, "width"), 1 + sources.count
     size = _whole(many)
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
@@ -87,7 +87,6 @@ def _put_records(
 
         def rows(begin: int) -> Iterator[Any]:
             here = builder.add(arguments[5], word(begin))
-            yield builder.sitofp(builder.load(_pointer(builder, cells, here, several), align=4), vector)
             agent = builder.insert_element(ir.Constant(several, ir.Undefined), builder.trunc(here, whole), whole(0))
             agents = builder.shuffle_vector(agent, agent, _mask([0] * side))
             yield builder.sitofp(builder.add(agents, _mask(list(range(side)))), vector)
@@ -173,10 +172,10 @@ put_lines: Any = intrinsic(_put_lines)
 def _out_of_records(typing_context: Any, numbers: Any, places: Any, at: Any, width: Any, records: Any) -> Any:
     """Read the records `at` and on of `width` agents, number by number, each from its place of `numbers` on.
 
-    Of a record, its cell goes nowhere; there is a place for its agent, and for every number behind. Behind the last
-    record there must be room for another, up to the next power of two of its length.
+    There is a place for its agent, and for every number behind. Behind the last record there must be room for another,
+    up to the next power of two of its length.
     """
-    wide, many = written(width, "width"), 1 + places.count
+    wide, many = written(width, "width"), places.count
     size = _whole(many)
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
@@ -200,7 +199,7 @@ def _out_of_records(typing_context: Any, numbers: Any, places: Any, at: Any, wid
                     both = _mask(list(range(2 * parts[0].type.count)))
                     parts = [builder.shuffle_vector(*parts[j : j + 2], both) for j in range(0, len(parts), 2)]
                 flat.append(parts[0])
-            for k, row in enumerate(_restored(builder, flat)[1:many]):
+            for k, row in enumerate(_restored(builder, flat)[:many]):
                 place = builder.add(builder.extract_value(arguments[1], k), word(first))
                 builder.store(row, _pointer(builder, to, place, vector), align=itemsize)
         return context.get_dummy_value()

@@ -37,8 +37,8 @@ def pairs(parts: Parts) -> list[str]:
         "if rank == 0:",
         "    work[b, 1] += 1",
         *["    work[b, 3] += n * obstacle_radius.shape[1]" for _, e in parts.pairs if e.joined],
-        *query(parts, parts.fields, parts.confines),
-        *walk(parts, parts.fields, [*_clear(parts), *_select_nearest(parts), *_sum_up(parts)]),
+        *query(parts, parts.sorted_fields, parts.confines),
+        *walk(parts, parts.sorted_fields, [*_clear(parts), *_select_nearest(parts), *_sum_up(parts)]),
         "tally[rank] = met",
         "wait_for_team(sync, team)  # what is felt was written by others",
         "if rank == 0:",
@@ -54,7 +54,7 @@ def _clear(parts: Parts) -> list[str]:
     zeros += [f"{s} = 0" for s in (*slot.all("here"), *slot.all("many"))]
     folds = [(k, slot.all(f"c{k}_")) for k, e in parts.pairs if e.pair_start]
     if folds:
-        zeros += [me_of(parts, parts.fields), *_nearest_images(parts)]
+        zeros += [me_of(parts, parts.sorted_fields), *_nearest_images(parts)]
     for k, slots in folds:
         zeros.append(f"found_ = pair_start_{k}({given(parts, k)}, me)")
         zeros += _obstacles(parts, k) if parts.effects[k].joined else []
@@ -91,7 +91,7 @@ def _select_nearest(parts: Parts) -> list[str]:
         for j in range(count):
             place = slot(f"near{q}_{j}")
             keep += [f"near = {place}", f"{place} = far if far < near else near", "far = near if far < near else far"]
-    return ["for r in range(found):", *indented_lines(meet_range(parts, parts.fields, keep), 4)]
+    return ["for r in range(found):", *indented_lines(meet_range(parts, parts.sorted_fields, keep), 4)]
 
 
 def _sum_up(parts: Parts) -> list[str]:
@@ -108,7 +108,7 @@ def _sum_up(parts: Parts) -> list[str]:
     return [
         "for r in range(found):",
         "    met += (ranges[r, 1] - ranges[r, 0]) * (upto - at)",
-        *indented_lines(meet_range(parts, parts.fields, [*meet, *counted], _meet(parts, True), where), 4),
+        *indented_lines(meet_range(parts, parts.sorted_fields, [*meet, *counted], _meet(parts, True), where), 4),
         *(_meet_in_one_place(parts) if parts.parting else []),
         f"for l in range(np.uint64({parts.width})):",
         indented(_finish(parts), 4),
@@ -130,7 +130,7 @@ def _meet_in_one_place(parts: Parts) -> list[str]:
         f"    crowded |= tally_of({Slots(parts)('here0')}) > np.int32(1)",
         "if crowded:",
         "    for r in range(found):",
-        *indented_lines(meet_range(parts, parts.fields, _meet(parts, False), where=TOGETHER), 8),
+        *indented_lines(meet_range(parts, parts.sorted_fields, _meet(parts, False), where=TOGETHER), 8),
     ]
 
 
@@ -170,7 +170,7 @@ def _meet(parts: Parts, touch: bool, apart: bool = False) -> list[str]:
 def _finish(parts: Parts) -> list[str]:
     """Write what a block's sums come to."""
     slot, d = Slots(parts), parts.dimension
-    lines = [me_of(parts, parts.fields), *_nearest_images(parts)] + [f"{name} = zero(me.pos)" for name in parts.targets]
+    lines = [me_of(parts, parts.sorted_fields), *_nearest_images(parts)] + [f"{name} = zero(me.pos)" for name in parts.targets]
     for k, _ in parts.pairs:
         to = parts.pair_target(k)
         sums = slot.all(f"c{k}_")
@@ -214,16 +214,17 @@ def meet_range(
 ) -> list[str]:  # fmt: skip
     """Write the loop over the candidates of range r; `touch` is for those whom some lane may touch.
 
-    where: who counts at all. Only around the edge of a periodic box are images sought. exact: squares are worked out in
+    where: who counts at all; of those in one place ties are read. Only around the edge of a periodic box are images sought. exact: squares are worked out in
     other places, too.
     """
     square = "exact_dot(to, to)" if exact or any(s.nearest for s in parts.sights) else "dot(to, to)"
     wrapped, plain = offset_of(parts, "xj"), "sub(xj, me.pos)"
 
+    own_tie = _tie(parts, "own_tie", listed(parts)) if where == TOGETHER else []
     near = [q for q, sight in enumerate(parts.sights) if touch and sight in _touching(parts)]
 
     def over_lanes(offset: str, each: list[str]) -> list[str]:
-        met = [me_of(parts, fields), f"to = {offset}", f"square = {square}", f"other = {where}"]
+        met = [*own_tie, me_of(parts, fields, "own_tie" if own_tie else ""), f"to = {offset}", f"square = {square}", f"other = {where}"]
         if not parts.masks:  # oneself is far away: compared once, and not for every sight
             met.append("gap = square if other else like(square, np.inf)")
         return [
@@ -238,7 +239,7 @@ def meet_range(
         return [
             "j, last = np.uint64(ranges[r, 0]), np.uint64(ranges[r, 1])",
             "while j < last:",
-            *indented_lines(_candidate(parts, fields), 4),
+            *indented_lines(_candidate(parts, fields, where == TOGETHER), 4),
             "    own, o = np.int32(j - block), like(reach, -0.0)",
             *["    touch = False"] * bool(near),
             *indented_lines(over_lanes(offset, [*lines, *some]), 4),
@@ -264,8 +265,19 @@ def _touching(parts: Parts) -> set[Sight]:
     return {parts.sight_of(effect) for _, effect in parts.pairs if effect.contact}
 
 
-def _candidate(parts: Parts, fields: list[str]) -> list[str]:
-    """Write candidate j as the laws see it: from its record, or in a small scene from the rows that blocks read too."""
+def _tie(parts: Parts, name: str, who: str) -> list[str]:
+    """Write the tie of agent `who` where ties are seldom looked at: they lie by number; nothing if they are at hand."""
+    if parts.fields == parts.sorted_fields:
+        return []
+    ties = ", ".join(f"tie[place + np.uint64({k * parts.width})]" for k in range(parts.dimension))
+    return [f"i = np.uint64(ident[{who}])", f"place = {place_of(parts, parts.dimension)}", f"{name} = ({ties})"]
+
+
+def _candidate(parts: Parts, fields: list[str], tied: bool = False) -> list[str]:
+    """Write candidate j as the laws see it: from its record, or in a small scene from the rows that blocks read too.
+
+    tied: its tie is read, wherever that lies.
+    """
     row, record = {f: k for k, f in enumerate(fields)}, record_of(fields)
 
     def number(name: str) -> str:
@@ -283,6 +295,7 @@ def _candidate(parts: Parts, fields: list[str]) -> list[str]:
         f"xj = {vector('x')}",
         f"vj, tj, aj, rj = {vector('v')}, {vector('t')}, {scalar['who']}, {scalar['radius']}",
         f"mj, nj = {scalar['mass']}, {_inner(parts, row, number)}",
+        *(_tie(parts, "tj", f"np.uint64({number('place')})") if tied else []),
     ]
 
 
@@ -293,8 +306,11 @@ def _inner(parts: Parts, row: Mapping[str, int], number: Callable[[str], str]) -
     return f"Inner({', '.join(number(f'inner{k}') for k in range(len(parts.inner)))})"
 
 
-def me_of(parts: Parts, fields: list[str]) -> str:
-    """Write the agent in lane l of a block as the laws see it; what no law reads is left out."""
+def me_of(parts: Parts, fields: list[str], tie: str = "") -> str:
+    """Write the agent in lane l of a block as the laws see it; what no law reads is left out.
+
+    tie: a name of its tie, if that is not read where the other numbers are.
+    """
     row, slot = {f: k for k, f in enumerate(fields)}, Slots(parts)
 
     def number(name: str) -> str:
@@ -312,4 +328,4 @@ def me_of(parts: Parts, fields: list[str]) -> str:
     nothing = f"zero({vector('x')})"
     aim = vector("a") if "a0" in row else nothing
     wishes = f"{aim}, {number('desired_speed')}, {_inner(parts, row, number)}"
-    return f"me = Me({number('who')}, {vectors}, {numbers}, {vector('t')}, time, {nothing}, drawn, {wishes})"
+    return f"me = Me({number('who')}, {vectors}, {numbers}, {tie or vector('t')}, time, {nothing}, drawn, {wishes})"

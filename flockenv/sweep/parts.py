@@ -362,6 +362,12 @@ class Parts:
         rows += [name for name in ("who", "radius", "mass", "max_speed", "max_force", "desired_speed") if name in names]
         return rows + [f"inner{k}" for k in range(len(self.inner)) if "inner" in names]
 
+    @functools.cached_property
+    def sorted_fields(self) -> list[str]:
+        """Those of them that lie side by side in scratch, or in records: ties that are seldom looked at do not."""
+        seldom = self.sorts and self.parting
+        return [name for name in self.fields if not (seldom and name[0] == "t")]
+
     @property
     def seen_fields(self) -> list[str]:
         """What is sorted of each agent to find the nearest."""
@@ -370,12 +376,12 @@ class Parts:
     @property
     def rows(self) -> int:
         """Rows of numbers of agents that are listed, or are the block's own, that scratch must have."""
-        return max(len(self.fields) if self.pairs else 0, self.dimension if self.look else 0, 1)
+        return max(len(self.sorted_fields) if self.pairs else 0, self.dimension if self.look else 0, 1)
 
     @property
     def numbers(self) -> int:
         """Numbers of a record that scratch must have."""
-        kinds = [self.fields] * bool(self.pairs) + [self.seen_fields] * bool(self.look)
+        kinds = [self.sorted_fields] * bool(self.pairs) + [self.seen_fields] * bool(self.look)
         return max((len(record_of(fields)) for fields in kinds), default=1)
 
     @property
@@ -426,7 +432,7 @@ class Parts:
     @property
     def luggage(self) -> list[str]:
         """What an agent carries along then: an array, and the axis of a vector."""
-        vectors = ["pos", "vel", "want", *self.frame_vectors, *(["tie"] if "t0" in self.fields else [])]
+        vectors = ["pos", "vel", "want", *self.frame_vectors, *(["tie"] if "t0" in self.sorted_fields else [])]
         vector = [f"{name} {k}" for name in vectors for k in range(self.dimension)]
         inner = (f"inner{k}" for k in range(len(self.inner)))
         return [*vector, "mass", "radius", "max_speed", "max_force", *self.frame_numbers, *inner, "ident"]
@@ -473,7 +479,7 @@ def sorted_at(row: int, place: str) -> str:
 
 def record_of(fields: list[str]) -> list[str]:
     """Return what is written of an agent when it is put into its cell; headings follow from velocities."""
-    return ["cell", "place"] + [f for f in fields if f[0] != "h"]
+    return ["place"] + [f for f in fields if f[0] != "h"]
 
 
 def view_of(fov: float) -> float:

@@ -106,7 +106,6 @@ def _enter(parts: Parts, fields: list[str]) -> list[str]:
     each = [
         f"records[at * np.uint64({len(record)}) + np.uint64({j})] = {_value(parts, f, 'place')}"
         for j, f in enumerate(record)
-        if f != "cell"
     ]
     return [
         "if rank == 0:",
@@ -134,7 +133,7 @@ def _sort(parts: Parts, fields: list[str], inside: bool) -> list[str]:
     """Write how agents are put into their cells: as whole records, so that each is one distant place in memory."""
     d, w, record = parts.dimension, parts.width, record_of(fields)
     wraps = parts.space.periodic and not inside
-    lanes = [_lanes(parts, f, wraps) for f in record[2:]]
+    lanes = [_lanes(parts, f, wraps) for f in record[1:]]
     sources, places = (", ".join(each) for each in zip(*lanes, strict=True))
     return [
         "for block in range(np.uint64(first), np.uint64(end)):",
@@ -151,7 +150,7 @@ def _sort(parts: Parts, fields: list[str], inside: bool) -> list[str]:
         "    rows = shape[1] * shape[2]",
         "    for line in range(rows * rank // team, rows * (rank + 1) // team):  # a row at a time stays in the cache",
         "        mine, beyond = np.int64(start[line * nx]), np.int64(start[(line + 1) * nx])",
-        f"        order_records(records, ident, {len(record)}, mine, beyond, offset[rank])",
+        f"        order_records(records, cell, ident, {len(record)}, mine, beyond, offset[rank])",
     ]
 
 
@@ -181,7 +180,7 @@ def _take(parts: Parts, fields: list[str]) -> list[str]:
         return []
     w, slot = parts.width, Slots(parts)
     mine = {f: slot(f"mine{k}") for k, f in enumerate(fields)}
-    places = [parts.slots["home0"], *(parts.slots[f"mine{fields.index(f)}"] for f in record_of(fields)[2:])]
+    places = [parts.slots["home0"], *(parts.slots[f"mine{fields.index(f)}"] for f in record_of(fields)[1:])]
     return [
         f"out_of_records(lanes, ({', '.join(f'np.uint64({k * w})' for k in places)},), block, {w}, records)",
         *([f"for l in range(np.uint64({w})):"] if "h0" in fields else []),
