@@ -18,8 +18,8 @@ from flockenv.kernels import ask_for, kernel, wait_for_team
 from flockenv.space import torus_confine
 
 __all__ = [
-    "AHEAD", "DISTANT", "FEWEST_AGENTS", "FINEST", "HANDFUL", "MAX_RANGES", "WORTH_ARRANGING", "candidates", "count_cells",
-    "grid_of", "order_records", "row_of",
+    "AHEAD", "DISTANT", "FEWEST_AGENTS", "FINEST", "HANDFUL", "MAX_RANGES", "WORTH_ARRANGING", "candidates",
+    "count_cells", "grid_of", "order_records", "row_of",
 ]  # fmt: skip
 
 MAX_RANGES = 27

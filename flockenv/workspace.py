@@ -22,6 +22,9 @@ __all__ = ["Workspace"]
 HUGE = 2**21
 """Bytes of a large page."""
 
+ALL = 2**64 - 1
+"""A mask that leaves every place as it is."""
+
 GAP = 5 * LINE
 """Bytes between two arrays of scratch."""
 
@@ -31,7 +34,7 @@ class Workspace:
     """Scratch of a team of threads that step one world: what a step writes and nobody reads afterwards."""
 
     arrays: dict[str, NDArray[Any]]
-    own: tuple[dict[str, NDArray[Any]], ...]  # lanes and ranges of each thread
+    own: tuple[dict[str, NDArray[Any]], ...]  # lanes, ranges and spread of each thread
     _given: dict[tuple[int, str], tuple[NDArray[Any], ...]] = field(default_factory=dict)
 
     @classmethod
@@ -85,7 +88,10 @@ class Workspace:
         arrays["number"] = np.arange(SMALL_STRIDE, dtype=np.int32)
         arrays |= {"bond_place": table.place, "bond_number": table.number, "bond_start": table.start}
         lanes = {"lanes": (len(parts.slots) * width, np.dtype(dtype))}
-        own = tuple(_zeros(lanes) | {"ranges": np.zeros((MAX_RANGES, 3), np.int64)} for _ in range(team))
+        own = tuple(
+            _zeros(lanes) | {"ranges": np.zeros((MAX_RANGES, 3), np.int64), "spread": _spread(body, width)}
+            for _ in range(team)
+        )
         return cls(arrays, own)
 
     def of(self, rank: int, names: str) -> tuple[NDArray[Any], ...]:
@@ -94,6 +100,16 @@ class Workspace:
             arrays = self.arrays | self.own[rank]
             self._given[rank, names] = tuple(arrays[name] for name in names.split(", "))
         return self._given[rank, names]
+
+
+def _spread(body: Body, width: int) -> NDArray[np.uint64]:
+    """Return what place of a body's numbers, and of what is asked of agents, is masked with: 0 if all have the same.
+
+    What all have in common is read where the first block has it.
+    """
+    numbers = (body.mass, body.radius, body.max_speed, body.max_force)
+    alike = len(body.mass) >= width and all((number == number[0]).all() for number in numbers)
+    return np.array([0 if alike else ALL, ALL], np.uint64)
 
 
 def _zeros(wanted: Mapping[str, tuple[int | tuple[int, ...], np.dtype[Any]]]) -> dict[str, NDArray[Any]]:

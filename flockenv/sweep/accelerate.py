@@ -24,6 +24,7 @@ from flockenv.sweep.text import (
     lanes_of,
     nearest_images,
     needed,
+    of_all,
     tuple_of,
 )
 
@@ -33,14 +34,15 @@ __all__ = ["accelerate", "felt_as", "parameters"]
 def accelerate(parts: Parts) -> str:
     """Return the source of `accelerate`: pair laws first, then each agent by itself, block after block."""
     d = parts.dimension
-    me = ["i = row + l", f"x, v = {lanes_of(parts, 'pos')}, {lanes_of(parts, 'vel')}", f"me = {alone(parts)}"]
+    here = f"x, v = {lanes_of(parts, 'pos')}, {lanes_of(parts, 'vel')}"
+    me = ["i = row + l", here, f"me = {alone(parts, one='one + l')}"]
     read = [*frame_views(parts), *parameters(parts)]
     sensing = [*_aim(parts), *pairs(parts), *far(parts), *bonds(parts)]
     folding = obstacles(parts, me, lambda k: felt_as(parts, f"n{k}_"))
     responding = [
         *me,
         "o = zero(x)",
-        f"s, f = {lanes_of(parts, 'want')}, o",
+        f"s, f = {lanes_of(parts, 'want').replace('base', 'wish')}, o",
         *(f"{parts.target(k)} = o" for k in parts.wishes),
         *nearest_images(parts, list(enumerate(parts.effects))),
         *_medium(parts),
@@ -68,13 +70,15 @@ def respond(around, pos, vel, time, acc):
 {indented(needed(read, [*folding, *responding, *_carry(parts)]), 4)}
     for block in range(np.uint64(first_), np.uint64(end_)):
         base, row = block * np.uint64({d * parts.width}), block * np.uint64({parts.width})
+{indented(of_all(parts), 8)}
 {indented(folding, 8)}
         for l in range(np.uint64({parts.width})):
 {indented(responding, 12)}
-            s = limit(s, max_force[i])
+            s = limit(s, max_force[one + l])
             # a choice, not a factor of 0: a law may be infinite where the dead, what is held in place (by an infinite
             # mass) and the lanes beyond the last agent lie
-            here, share = (living[i] > o[0]) & (mass[i] < like(o[0], np.inf)), like(o[0], 1.0) / mass[i]
+            here = (living[live + l] > o[0]) & (mass[one + l] < like(o[0], np.inf))
+            share = like(o[0], 1.0) / mass[one + l]
 {indented([f"{lane(parts, 'acc', k)} = (s[{k}] + f[{k}]) * share if here else o[{k}]" for k in range(d)], 12)}
 {indented(_carry(parts), 12)}
 
@@ -146,7 +150,7 @@ def _medium(parts: Parts) -> list[str]:
     return [
         "m = o",
         *media,
-        f"me = {alone(parts, medium='m')}",
+        f"me = {alone(parts, medium='m', one='one + l')}",
     ]
 
 
@@ -170,7 +174,7 @@ def _own(parts: Parts) -> list[str]:
         if effect.own_law is not None:
             still = effect.linear_drag is not None and parts.integrator.splits_drag
             if still:  # what is left of -c (v - u): the method adds -c v
-                lines.append(f"rest = {alone(parts, medium='me.medium', vel='o', heading='o')}")
+                lines.append(f"rest = {alone(parts, medium='me.medium', vel='o', heading='o', one='one + l')}")
             lines.append(f"{to} = add({to}, own_law_{k}({given(parts, k)}, {'rest' if still else 'me'}))")
         if effect.obstacle_start is not None:
             lines.append(f"{to} = add({to}, obstacle_finish_{k}(p{k}, me, ({', '.join(slot.all(f'o{k}_'))},)))")

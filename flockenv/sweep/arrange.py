@@ -12,7 +12,7 @@ from __future__ import annotations
 from flockenv.neighbours import HANDFUL, WORTH_ARRANGING
 from flockenv.sweep.parts import Parts
 from flockenv.sweep.query import counted
-from flockenv.sweep.text import indented, place_of
+from flockenv.sweep.text import indented, indented_lines, place_of
 
 __all__ = ["go_home", "move_in"]
 
@@ -48,7 +48,6 @@ def _carry(parts: Parts, to: list[str]) -> list[str]:
     luggage = [field.partition(" ") for field in parts.luggage]  # an array, and of vectors which axis
     sources = "".join(f"{name}, " for name, _, _ in luggage)
     places = "".join(f"base + np.uint64({int(axis) * w}), " if axis else "row, " for _, _, axis in luggage)
-    unpacked = (f"{name}[place + np.uint64({int(axis) * w})]" if axis else f"{name}[i]" for name, _, axis in luggage)
     return [
         "for block in range(np.uint64(first), np.uint64(end)):",
         f"    base, row = block * np.uint64({d * w}), block * np.uint64({w})",
@@ -58,5 +57,16 @@ def _carry(parts: Parts, to: list[str]) -> list[str]:
         "wait_for_team(sync, team)",
         f"for i in range(np.uint64(first * {w}), np.uint64(min(end * {w}, n))):",
         f"    place = {place_of(parts, d)}",
-        *(f"    {mine} = luggage[i * np.uint64({count}) + np.uint64({k})]" for k, mine in enumerate(unpacked)),
+        *indented_lines(_unpacked(parts, luggage), 4),
     ]
+
+
+def _unpacked(parts: Parts, luggage: list[tuple[str, str, str]]) -> list[str]:
+    """Write how agent i unpacks: all but what everybody has in common, which lies where it lay."""
+    common = {**dict.fromkeys(("mass", "radius", "max_speed", "max_force"), 0), "want": 1}
+    own: dict[int | None, list[str]] = {None: [], 0: [], 1: []}
+    for k, (name, _, axis) in enumerate(luggage):
+        to = f"{name}[place + np.uint64({int(axis) * parts.width})]" if axis else f"{name}[i]"
+        own[common.get(name)].append(f"{to} = luggage[i * np.uint64({parts.luggage_size}) + np.uint64({k})]")
+    kinds = [[f"if spread[{k}] > np.uint64(0):", *indented_lines(own[k], 4)] for k in (0, 1)]
+    return [*own[None], *kinds[0], *kinds[1]]

@@ -12,7 +12,7 @@ from collections.abc import Callable, Mapping
 from flockenv.effects.base import Sight
 from flockenv.steering.others import ONE_PLACE
 from flockenv.sweep.parts import Parts, record_of, sorted_at
-from flockenv.sweep.query import listed, query, walk
+from flockenv.sweep.query import listed, listed_at, query, walk
 from flockenv.sweep.text import Slots, copied, given, indented, indented_lines, nearest_image, place_of, tuple_of
 
 __all__ = ["me_of", "meet_range", "offset_of", "pairs"]
@@ -170,7 +170,8 @@ def _meet(parts: Parts, touch: bool, apart: bool = False) -> list[str]:
 def _finish(parts: Parts) -> list[str]:
     """Write what a block's sums come to."""
     slot, d = Slots(parts), parts.dimension
-    lines = [me_of(parts, parts.sorted_fields), *_nearest_images(parts)] + [f"{name} = zero(me.pos)" for name in parts.targets]
+    lines = [me_of(parts, parts.sorted_fields), *_nearest_images(parts)]
+    lines += [f"{name} = zero(me.pos)" for name in parts.targets]
     for k, _ in parts.pairs:
         to = parts.pair_target(k)
         sums = slot.all(f"c{k}_")
@@ -214,8 +215,8 @@ def meet_range(
 ) -> list[str]:  # fmt: skip
     """Write the loop over the candidates of range r; `touch` is for those whom some lane may touch.
 
-    where: who counts at all; of those in one place ties are read. Only around the edge of a periodic box are images sought. exact: squares are worked out in
-    other places, too.
+    where: who counts at all; of those in one place ties are read. Only around the edge of a periodic box are images
+    sought. exact: squares are worked out in other places, too.
     """
     square = "exact_dot(to, to)" if exact or any(s.nearest for s in parts.sights) else "dot(to, to)"
     wrapped, plain = offset_of(parts, "xj"), "sub(xj, me.pos)"
@@ -224,7 +225,13 @@ def meet_range(
     near = [q for q, sight in enumerate(parts.sights) if touch and sight in _touching(parts)]
 
     def over_lanes(offset: str, each: list[str]) -> list[str]:
-        met = [*own_tie, me_of(parts, fields, "own_tie" if own_tie else ""), f"to = {offset}", f"square = {square}", f"other = {where}"]
+        met = [
+            *own_tie,
+            me_of(parts, fields, "own_tie" if own_tie else ""),
+            f"to = {offset}",
+            f"square = {square}",
+            f"other = {where}",
+        ]
         if not parts.masks:  # oneself is far away: compared once, and not for every sight
             met.append("gap = square if other else like(square, np.inf)")
         return [
@@ -295,7 +302,7 @@ def _candidate(parts: Parts, fields: list[str], tied: bool = False) -> list[str]
         f"xj = {vector('x')}",
         f"vj, tj, aj, rj = {vector('v')}, {vector('t')}, {scalar['who']}, {scalar['radius']}",
         f"mj, nj = {scalar['mass']}, {_inner(parts, row, number)}",
-        *(_tie(parts, "tj", f"np.uint64({number('place')})") if tied else []),
+        *(_tie(parts, "tj", listed_at(parts, fields).replace("#", "j")) if tied else []),
     ]
 
 

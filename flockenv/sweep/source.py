@@ -15,7 +15,7 @@ from flockenv.sweep.method import method, method_imports
 from flockenv.sweep.obstacles import blocked, obstacle_imports
 from flockenv.sweep.parts import LAWS, Parts
 from flockenv.sweep.step import begin, copies, kept_frame, kept_inner, step, step_world
-from flockenv.sweep.text import CONTEXT, SHARED, frame_views, indented, stages_of
+from flockenv.sweep.text import CONTEXT, SHARED, asked, frame_views, indented, stages_of
 
 __all__ = ["field_source", "scene_source"]
 
@@ -68,10 +68,7 @@ def field(
         into_blocks(pos, x, b, n, first, end)
         into_blocks(vel, v, b, n, first, end)
 {indented([*frame_views(parts), *kept_frame(parts, from_state=True), *kept_inner(parts, from_state=True)], 8)}
-        if drive.shape[1] > 0:
-            into_blocks(want, drive, b, n, first, end)
-        else:
-            want[: end * {d * w}] = 0
+{indented(asked(parts), 8)}
         context = ({CONTEXT})
         accelerate((context, first, end), pos, vel, times[b], {stages_of(parts)}[0])
         out_of_blocks({stages_of(parts)}[0], acc, b, n, first, end)

@@ -15,6 +15,7 @@ from flockenv.sweep.text import (
     SHARED,
     Slots,
     alone,
+    asked,
     copied,
     frame_views,
     given,
@@ -23,6 +24,7 @@ from flockenv.sweep.text import (
     lane,
     lanes_of,
     nearest_images,
+    of_all,
     stages_of,
     tuple_of,
 )
@@ -191,8 +193,9 @@ def _advance(parts: Parts) -> list[str]:
     what it feels to where it comes: after `sense`, nobody reads what others write.
     """
     size, flow = parts.dimension * parts.width, "carrying" if parts.flows else "()"
+    rows = stages_of(parts)
     if parts.integrator.evaluations != 1:
-        advance = f"advance((context, first, end), pos, vel, {flow}, time, dt, stages, first * {size}, end * {size})"
+        advance = f"advance((context, first, end), pos, vel, {flow}, time, dt, {rows}, first * {size}, end * {size})"
         told = ["sense(context, pos, vel, time)"] * (parts.inner != () and parts.integrator.solves)
         return [*_count(parts), *told, *_remember(parts, "first", "end"), advance, *_bound(parts, "first", "end")]
     return [
@@ -201,7 +204,7 @@ def _advance(parts: Parts) -> list[str]:
         f"for begin in range(first, end, {PART}):",
         f"    until = min(begin + {PART}, end)",
         *indented_lines(_remember(parts, "begin", "until"), 4),
-        f"    advance((context, begin, until), pos, vel, {flow}, time, dt, {stages_of(parts)}, begin * {size}, until * {size})",
+        f"    advance((context, begin, until), pos, vel, {flow}, time, dt, {rows}, begin * {size}, until * {size})",
         *indented_lines(_bound(parts, "begin", "until"), 4),
     ]
 
@@ -241,6 +244,7 @@ def _bound(parts: Parts, first: str, end: str) -> list[str]:
         f"for block in range(np.uint64({first}), np.uint64({end})):",
         f"    base, row = block * np.uint64({parts.dimension * parts.width}), block * np.uint64({parts.width})",
         f"    past = base - np.uint64(({first} - first) * {parts.dimension * parts.width})",
+        *indented_lines(of_all(parts), 4),
         f"    for l in range(np.uint64({parts.width})):",
         "        i = row + l",
         f"        was, x, v = {_before(parts, 'origin')}, {lanes_of(parts, 'pos')}, {lanes_of(parts, 'vel')}",
@@ -249,7 +253,7 @@ def _bound(parts: Parts, first: str, end: str) -> list[str]:
         f"        {bad} = where if where < {bad} else {bad}",
         *indented_lines(_turn(parts), 8),
         "        # nobody moves faster than max_speed, whatever a method makes of the velocity within the step",
-        "        x = add(was, scale(limit(sub(x, was), max_speed[i] * dt), living[i]))",
+        "        x = add(was, scale(limit(sub(x, was), max_speed[one + l] * dt), living[live + l]))",
         *indented_lines([*_stay_inside(parts), *_face(parts)], 8),
         *(
             "        " + "; ".join(f"{lane(parts, array, k)} = {now}[{k}]" for array, now in stored)
@@ -314,14 +318,14 @@ def _before(parts: Parts, array: str) -> str:
 
 def _stay_inside(parts: Parts) -> list[str]:
     """Write how agent i is kept to the space: put back into it, or bounced off its walls."""
-    limited = "scale(limit(v, max_speed[i]), living[i])"
+    limited = "scale(limit(v, max_speed[one + l]), living[live + l])"
     if not parts.bounces:
-        return [f"x, v = confine(size, radius[i], x, {limited})"]
+        return [f"x, v = confine(size, radius[one + l], x, {limited})"]
     restitution = f"params[{parts.last_numbers('space')}]"
-    before = f"scale({_before(parts, 'earlier')}, living[i])"
+    before = f"scale({_before(parts, 'earlier')}, living[live + l])"
     return [
-        f"x, v = bounce(size, radius[i], {restitution}, dt, was, {before}, x, {limited})",
-        "v = limit(v, max_speed[i])",
+        f"x, v = bounce(size, radius[one + l], {restitution}, dt, was, {before}, x, {limited})",
+        "v = limit(v, max_speed[one + l])",
     ]
 
 
@@ -415,7 +419,6 @@ def begin(x, v, {parts.frame_argument}key, tick, params, dt, fresh, {SHARED}):
 
 def step(parts: Parts) -> str:
     """Return the source of `step`, the entry point: some worlds, one after another."""
-    d = parts.dimension
     return f'''
 @njit(cache=True, **FAST)
 def step(
@@ -433,10 +436,7 @@ def step(
     first, end = blocks * rank // team, blocks * (rank + 1) // team
     broken, who = -1, -1
     for b in range(from_world, to_world):
-        if drive.shape[1] > 0:
-            into_blocks(want, drive, b, n, first, end)
-        else:
-            want[first * {d * parts.width} : end * {d * parts.width}] = 0
+{indented(asked(parts), 8)}
         bad = step_world(
             x, v, {parts.frame_argument}alive, tick, key, obstacle_x, obstacle_radius, work, params, dt, count,
             b, rank, team, {SHARED},

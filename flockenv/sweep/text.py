@@ -13,17 +13,18 @@ from flockenv.effects.base import Effect
 from flockenv.sweep.parts import Parts
 
 __all__ = [
-    "CONTEXT", "SHARED", "Slots", "alone", "copied", "frame_views", "given", "indented", "indented_lines", "inner_of",
-    "lane", "lanes_of", "nearest_image", "nearest_images", "needed", "place_of", "stages_of", "tuple_of",
+    "CONTEXT", "SHARED", "Slots", "alone", "asked", "copied", "frame_views", "given", "indented", "indented_lines",
+    "inner_of", "lane", "lanes_of", "nearest_image", "nearest_images", "needed", "of_all", "place_of", "stages_of",
+    "tuple_of",
 ]  # fmt: skip
 
 _READ = (
     "mass, radius, max_speed, max_force, living, ident, want, felt, pulled, carrying, frame, sorted_, records, "
     "luggage, order, cell, start, offset, bounds, tally, sync, tie, bond_place, bond_number, bond_start, tree_key, "
-    "tree_place, tree_digit, tree_leaf, tree_node, tree_near, number, lanes, ranges"
+    "tree_place, tree_digit, tree_leaf, tree_node, tree_near, number, lanes, ranges, spread"
 )
 SHARED = f"pos, vel, origin, stages, {_READ}"
-"""Scratch of one world in progress, in order; see workspace.Workspace. The last two belong to one thread. Of these
+"""Scratch of one world in progress, in order; see workspace.Workspace. The last three belong to one thread. Of these
 and the next, a source keeps what it names (`handed.trimmed`)."""
 
 CONTEXT = f"obstacle_x, obstacle_radius, work, params, key, b, n, present, arranged, first, end, rank, team, {_READ}"
@@ -51,6 +52,35 @@ def place_of(parts: Parts, rows: int) -> str:
     return f"(i // np.uint64({w})) * np.uint64({rows * w}) + i % np.uint64({w})"
 
 
+def of_all(parts: Parts) -> list[str]:
+    """Write where block `block` has its bodies (`one`), who lives (`live`), and what its agents are to do (`wish`).
+
+    In a large world what all have in common is read where the first block has it: large worlds wait for memory.
+    """
+    if not parts.arranges:
+        return ["one, live, wish = row, row, base"]
+    whole = f"present == n and (block + np.uint64(1)) * np.uint64({parts.width}) <= np.uint64(n)"
+    return [
+        "one, wish = row & spread[0], base & spread[1]",
+        f"live = np.uint64(0) if {whole} else row",
+    ]
+
+
+def asked(parts: Parts) -> list[str]:
+    """Write how what is asked of the agents of world b, if anything, comes into blocks."""
+    size = parts.dimension * parts.width
+    nothing = [f"want[first * {size} : end * {size}] = 0"]
+    if parts.arranges:
+        nothing = [f"want[:{size}] = 0", "spread[1] = np.uint64(0)"]
+    return [
+        "if drive.shape[1] > 0:",
+        "    into_blocks(want, drive, b, n, first, end)",
+        *["    spread[1] = ~np.uint64(0)"] * parts.arranges,
+        "else:",
+        *indented_lines(nothing, 4),
+    ]
+
+
 def stages_of(parts: Parts) -> str:
     """Write the rows of coordinates that the method has as scratch."""
     return "(felt,)" if parts.in_place else "stages"
@@ -61,11 +91,16 @@ def inner_of(parts: Parts, i: str) -> str:
     return f"Inner({', '.join(f'inner{k}[{i}]' for k in range(len(parts.inner)))})" if parts.inner else "()"
 
 
-def alone(parts: Parts, medium: str = "zero(x)", vel: str = "v", heading: str = "", aim: str = "") -> str:
-    """Write agent i, at x, as the laws of one agent see it: no tie, there is nobody to part from."""
+def alone(
+    parts: Parts, medium: str = "zero(x)", vel: str = "v", heading: str = "", aim: str = "", one: str = "i"
+) -> str:  # fmt: skip
+    """Write agent i, at x, as the laws of one agent see it: no tie, there is nobody to part from.
+
+    one: where its body lies.
+    """
     aim = aim or (lanes_of(parts, "aiming") if parts.aims else "zero(x)")
     wished = "desired_speed[i]" if "desired_speed" in parts.frame_numbers else "like(x[0], 0.0)"
-    body = "mass[i], radius[i], max_speed[i], max_force[i]"
+    body = f"mass[{one}], radius[{one}], max_speed[{one}], max_force[{one}]"
     heading = heading or (lanes_of(parts, "facing") if parts.oriented else "unit(v)")
     more = f"{aim}, {wished}, {inner_of(parts, 'i')}"
     return f"Me(ident[i], x, {vel}, {heading}, {body}, zero(x), time, {medium}, key[b], {more})"
