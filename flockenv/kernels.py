@@ -285,9 +285,16 @@ if numba.config.DISABLE_JIT:  # type: ignore[attr-defined]  # laws run in plain 
 
 
 def _tallied(typing_context: Any, number: Any, flag: Any) -> Any:
-    """Return a number whose bits are a count, 0 at the start, with one more counted if the flag is up."""
+    """Return a number that counts, 0 at the start, with one more counted if the flag is up; `tally_of` reads it.
+
+    With AVX-512 it is the number itself: to add 1 under a mask is one instruction. Elsewhere its bits are a whole
+    number, from which what was compared is taken away as it is: -1 where the flag is up.
+    """
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        real = arguments[0].type
+        if processor.REGISTER == LINE:
+            return builder.fadd(arguments[0], builder.select(arguments[1], real(1.0), real(-0.0)))
         whole = ir.IntType(8 * context.get_abi_sizeof(arguments[0].type))
         more = builder.zext(arguments[1], whole)
         return builder.bitcast(builder.add(builder.bitcast(arguments[0], whole), more), arguments[0].type)
@@ -296,14 +303,16 @@ def _tallied(typing_context: Any, number: Any, flag: Any) -> Any:
 
 
 def _tally(typing_context: Any, number: Any) -> Any:
-    """Return how many were counted there."""
+    """Return how many were counted there, as a number."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        whole = ir.IntType(8 * context.get_abi_sizeof(arguments[0].type))
+        if processor.REGISTER == LINE:
+            return arguments[0]
+        real, whole = arguments[0].type, ir.IntType(8 * context.get_abi_sizeof(arguments[0].type))
         counted = builder.bitcast(arguments[0], whole)
-        return builder.trunc(counted, ir.IntType(32)) if whole.width > 32 else counted
+        return builder.sitofp(builder.trunc(counted, ir.IntType(32)) if whole.width > 32 else counted, real)
 
-    return types.int32(number), generate
+    return number(number), generate
 
 
 tallied: Any = intrinsic(_tallied)

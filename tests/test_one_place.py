@@ -180,7 +180,7 @@ def test_a_block_counts_anew_who_is_in_its_places() -> None:
     text = "\n".join(pairs(parts))
     assert (
         text.index(f"{count} = 0")
-        < text.index(f"{count} = tallied({count}, not other)")
+        < text.index(f"{count} = tallied({count}, other)")
         < text.index(f"tally_of({count})")
     )
 

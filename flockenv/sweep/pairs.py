@@ -104,7 +104,7 @@ def _sum_up(parts: Parts) -> list[str]:
         for j, name in enumerate(names)
     ]
     meet, where = _meet(parts, False, parts.parting), ELSEWHERE if parts.parting else SELF
-    counted = [f"{slot('here0')} = tallied({slot('here0')}, not other)"] if parts.parting else []
+    counted = [f"{slot('here0')} = tallied({slot('here0')}, other)"] if parts.parting else []
     return [
         "for r in range(found):",
         "    met += (ranges[r, 1] - ranges[r, 0]) * (upto - at)",
@@ -125,9 +125,12 @@ def _sum_up(parts: Parts) -> list[str]:
 def _meet_in_one_place(parts: Parts) -> list[str]:
     """Write how a block meets who is in one place with some of its agents: seldom anybody but each himself."""
     return [
-        "crowded = False",
+        "others = -1",
+        "for r in range(found):",
+        "    others += ranges[r, 1] - ranges[r, 0]",
+        "crowded, all_of_them = False, like(reach, others)",
         f"for l in range(np.uint64({parts.width})):",
-        f"    crowded |= tally_of({Slots(parts)('here0')}) > np.int32(1)",
+        f"    crowded |= tally_of({Slots(parts)('here0')}) < all_of_them",
         "if crowded:",
         "    for r in range(found):",
         *indented_lines(meet_range(parts, parts.sorted_fields, _meet(parts, False), where=TOGETHER), 8),
@@ -177,7 +180,7 @@ def _finish(parts: Parts) -> list[str]:
         sums = slot.all(f"c{k}_")
         if parts.effects[k].averages:
             many = f"many{parts.sights.index(parts.sight_of(parts.effects[k]))}_0"
-            sums.append(f"like(reach, tally_of({slot(many)}))")
+            sums.append(f"tally_of({slot(many)})")
         lines.append(f"{to} = add({to}, finish_law_{k}({given(parts, k)}, me, ({', '.join(sums)},)))")
     return lines + [f"{slot(f'g{name}{j}')} = {name}[{j}]" for name in parts.targets for j in range(d)]
 
