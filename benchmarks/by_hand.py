@@ -2,8 +2,8 @@
 
 2-D, torus, semi-implicit Euler, brute force; the arguments, the checks and the limits are those of a scene. They have
 the form that is fast (agents side by side in the lanes of a vector register, sums in a small scratch array, unsigned
-indices, no aliasing; neighbours are counted in whole numbers, those in one place by a branch), and each knows nothing
-but its own mix.
+indices, no aliasing; -0 added for who is not seen, which is an addition under a mask; neighbours counted by such
+additions too, with AVX2 in whole numbers; those in one place by a branch), and each knows nothing but its own mix.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from numba import njit
 
 from flockenv.effects.base import ties
 from flockenv.inlining import Inlined, Whole
-from flockenv.kernels import like, unaliased
+from flockenv.kernels import LINE, like, unaliased
 from flockenv.processor import REGISTER
 from flockenv.scene import Scene
 from flockenv.state import State
@@ -102,9 +102,9 @@ def _together(width):
 
     @njit(**PARTS)
     def together(now, sums, counts, number, n, first, three, p):
-        crowded = False
+        crowded, others = False, like(counts[0], n - 1)
         for lane in range(np.uint64(width)):
-            crowded |= counts[at[2] + lane] > 1
+            crowded |= counts[at[2] + lane] < others
         if crowded:
             for j in range(np.uint64(n)):
                 for lane in range(np.uint64(width)):
@@ -135,6 +135,7 @@ def _three(width):
     def wish(now, sums, counts, number, n, blocks, p):
         size, apart, agree, near, w_apart, w_agree, w_near = p[0], p[1], p[2], p[3], p[4], p[5], p[6]
         zero, one, inverse = like(size, 0.0), like(size, 1.0), like(size, 1.0) / size
+        none, up, stay = like(size, -0.0), like(counts[0], 1.0), like(counts[0], -0.0)
         for block in range(blocks):
             first = np.uint64(block * width)
             for k in range(np.uint64(8 * width)):
@@ -152,13 +153,13 @@ def _three(width):
                     with_me, by_me = seen & (square < agree), seen & (square < near)
                     sums[at[0] + lane] += dx * share
                     sums[at[1] + lane] += dy * share
-                    sums[at[2] + lane] += ux if with_me else zero
-                    sums[at[3] + lane] += uy if with_me else zero
-                    counts[at[0] + lane] += 1 if with_me else 0
-                    sums[at[5] + lane] += dx if by_me else zero
-                    sums[at[6] + lane] += dy if by_me else zero
-                    counts[at[1] + lane] += 1 if by_me else 0
-                    counts[at[2] + lane] += 0 if seen else 1
+                    sums[at[2] + lane] += ux if with_me else none
+                    sums[at[3] + lane] += uy if with_me else none
+                    counts[at[0] + lane] += up if with_me else stay
+                    sums[at[5] + lane] += dx if by_me else none
+                    sums[at[6] + lane] += dy if by_me else none
+                    counts[at[1] + lane] += up if by_me else stay
+                    counts[at[2] + lane] += up if seen else stay
             together(now, sums, counts, number, n, first, True, p)
             for lane in range(np.uint64(width)):
                 i = first + lane
@@ -182,6 +183,7 @@ def _two(width):
     def wish(now, sums, counts, number, n, blocks, p):
         size, apart, near, w_apart, w_near = p[0], p[1], p[3], p[4], p[6]
         zero, one, inverse = like(size, 0.0), like(size, 1.0), like(size, 1.0) / size
+        none, up, stay = like(size, -0.0), like(counts[0], 1.0), like(counts[0], -0.0)
         for block in range(blocks):
             first = np.uint64(block * width)
             for k in range(np.uint64(5 * width)):
@@ -199,10 +201,10 @@ def _two(width):
                     by_me = seen & (square < near)
                     sums[at[0] + lane] += dx * share
                     sums[at[1] + lane] += dy * share
-                    sums[at[2] + lane] += dx if by_me else zero
-                    sums[at[3] + lane] += dy if by_me else zero
-                    counts[at[1] + lane] += 1 if by_me else 0
-                    counts[at[2] + lane] += 0 if seen else 1
+                    sums[at[2] + lane] += dx if by_me else none
+                    sums[at[3] + lane] += dy if by_me else none
+                    counts[at[1] + lane] += up if by_me else stay
+                    counts[at[2] + lane] += up if seen else stay
             together(now, sums, counts, number, n, first, False, p)
             for lane in range(np.uint64(width)):
                 i = first + lane
@@ -222,6 +224,7 @@ def _seeing(width):
     def wish(now, sums, counts, number, n, blocks, p):
         size, apart, agree, near, w_apart, w_agree, w_near, view = p[0], p[1], p[2], p[3], p[4], p[5], p[6], p[7]
         zero, one, inverse = like(size, 0.0), like(size, 1.0), like(size, 1.0) / size
+        none, up, stay = like(size, -0.0), like(counts[0], 1.0), like(counts[0], -0.0)
         for block in range(blocks):
             first = np.uint64(block * width)
             for k in range(np.uint64(8 * width)):
@@ -248,13 +251,13 @@ def _seeing(width):
                     with_me, by_me = seen & (square < agree), seen & (square < near)
                     sums[at[0] + lane] += dx * share
                     sums[at[1] + lane] += dy * share
-                    sums[at[2] + lane] += ux if with_me else zero
-                    sums[at[3] + lane] += uy if with_me else zero
-                    counts[at[0] + lane] += 1 if with_me else 0
-                    sums[at[5] + lane] += dx if by_me else zero
-                    sums[at[6] + lane] += dy if by_me else zero
-                    counts[at[1] + lane] += 1 if by_me else 0
-                    counts[at[2] + lane] += 0 if alone else 1
+                    sums[at[2] + lane] += ux if with_me else none
+                    sums[at[3] + lane] += uy if with_me else none
+                    counts[at[0] + lane] += up if with_me else stay
+                    sums[at[5] + lane] += dx if by_me else none
+                    sums[at[6] + lane] += dy if by_me else none
+                    counts[at[1] + lane] += up if by_me else stay
+                    counts[at[2] + lane] += up if alone else stay
             together(now, sums, counts, number, n, first, True, p)
             for lane in range(np.uint64(width)):
                 i = first + lane
@@ -318,9 +321,10 @@ def by_hand(mix: str, scene: Scene, state: State, steps: int) -> Callable[[], ob
     body[:, : scene.agents] = scene.body.mass, scene.body.max_speed, scene.body.max_force
     now, want, sums = (np.zeros(shape, real) for shape in ((ROWS, padded), (2, padded), (10 * width,)))
     now[7:, : scene.agents] = ties(scene.agents, 2).T
+    counts = np.zeros(3 * width, real if REGISTER == LINE else f"i{real.itemsize}")
     arguments = (
         state.x, state.v, state.alive, np.zeros((2, 0, 0), real), body, state.work, np.array(numbers, real),
-        real.type(scene.dt), steps, now, want, sums, np.zeros(3 * width, f"i{real.itemsize}"),
+        real.type(scene.dt), steps, now, want, sums, counts,
         np.arange(width, dtype=np.int32),
     )  # fmt: skip
     kernel = _kernel(mix, width)

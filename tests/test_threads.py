@@ -205,6 +205,41 @@ def test_a_world_that_was_put_in_order_may_shrink_until_there_is_no_grid() -> No
     assert_same(scene.step(start, steps=2), scene.step(scene.step(start)))
 
 
+@pytest.mark.parametrize("absent", [(), (5_000,), (0, WORTH_ARRANGING)])
+def test_what_all_have_in_common_is_nobodys_own(absent: tuple[int, ...]) -> None:
+    """A large world reads bodies that are alike, who lives, and that nothing is asked, where its first block has it."""
+    most = WORTH_ARRANGING + 2  # and one more: the last block is not full
+    group = Group(count=most, max_speed=1e3, max_force=1e6, spawn=Spawn(low=(0, 0), high=(130.0, 130.0)))
+    laws = {"effects": (Separation(weight=1e-3, radius=1.0),), "dt": 0.02}
+    rng, ends = np.random.default_rng(4), []
+    places, drive = rng.uniform(0, 130, (2, 1, most + 1)), rng.normal(size=(1, most + 1, 2))
+    for strength in (1e6, 2e6):  # nobody reaches either: the other body makes no difference
+        scene = Scene(groups=(group, group.model_copy(update={"count": 1, "max_force": strength})), **laws)
+        state = scene.start(1)
+        state.x[...] = places
+        state.alive[0, list(absent)] = False
+        for asked in (None, drive, None):  # what was asked for is forgotten
+            state = scene.step(state, drive=asked, steps=2)
+            once = scene.step(scene.step(state, drive=asked), drive=asked)
+            assert_same(scene.step(state, drive=asked, steps=2), once)
+        ends.append(state)
+        driven, alone = scene.step(state, drive=drive, steps=2), scene.step(state, steps=2)
+        assert_same(alone, scene.step(state, drive=np.zeros_like(drive), steps=2))
+        assert not np.array_equal(alone.x, driven.x)
+    assert_same(*ends)
+
+
+def test_a_body_of_another_kind_counts_in_a_large_world() -> None:
+    group = Group(count=WORTH_ARRANGING, max_force=1e6, spawn=Spawn(low=(0, 0), high=(130.0, 130.0)))
+    heavy = Group(count=1, max_force=1e6, mass=4.0, spawn=Spawn(low=(500, 0), high=(501, 1)))
+    scene = Scene(groups=(group, heavy), effects=(Separation(weight=1e-3, radius=1.0),), dt=0.02)
+    start = scene.start(1)
+    start.v[...] = 0.0
+    drive = np.zeros(start.shape)
+    drive[0, -1] = 3.0, -2.0
+    np.testing.assert_allclose(scene.step(start, drive=drive).vel[0, -1], 0.02 * drive[0, -1] / 4.0, rtol=1e-15)
+
+
 @pytest.mark.slow
 def test_nan_in_a_world_that_was_put_in_order_names_the_agent_by_its_number() -> None:
     scene, start = crowded(NAMED["torus_single"].make(WORTH_ARRANGING, 140.0))

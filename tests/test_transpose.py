@@ -15,9 +15,9 @@ WIDTHS = [("float32", 16), ("float32", 8), ("float64", 8), ("float64", 4), ("flo
 
 def compiled(length: int, width: int) -> Any:
     """Return both as functions of arrays, for records of that length."""
-    numbers = range(length - 2)
+    numbers = range(length - 1)
     sources, places = "lanes, " * len(numbers), "".join(f"np.uint64(at + {k * width}), " for k in numbers)
-    taken = "".join(f"np.uint64(at + {k * width}), " for k in range(-1, length - 2))
+    taken = "".join(f"np.uint64(at + {k * width}), " for k in range(-1, length - 1))
     made: dict[str, Any] = {"np": np, "put_records": put_records, "out_of_records": out_of_records}
     exec(  # noqa: S102  # how many sources there are is a type's
         "def put(records, lanes, at, cell, first, offset, spare):\n"
@@ -35,7 +35,7 @@ def compiled(length: int, width: int) -> Any:
 def test_records_are_transposed_lanes(dtype: str, width: int, length: int) -> None:
     put, take = compiled(length, width)
     rng, n, rows = np.random.default_rng(length), 3 * width, 1 << (length - 1).bit_length()
-    lanes = rng.random(length * width).astype(dtype)  # two rows that are none of theirs, then numbers
+    lanes = rng.random((length + 1) * width).astype(dtype)  # two rows that are none of theirs, then numbers
     cell, begin = rng.integers(-1, 4, n).astype(np.int32), np.arange(4, dtype=np.int32) * (n // 4)
     cell[width + 1] = -1  # whose record comes to the spare place
     records = np.full((n + 1) * length + rows, -7, dtype)
@@ -43,17 +43,17 @@ def test_records_are_transposed_lanes(dtype: str, width: int, length: int) -> No
     put(records, lanes, 2 * width, cell, width, offset, n)
     for lane, c in enumerate(cell[width : 2 * width]):  # the second block
         if c >= 0:
-            expected[begin[c]] = [c, width + lane, *lanes.reshape(length, width)[2:, lane]]
+            expected[begin[c]] = [width + lane, *lanes.reshape(-1, width)[2:, lane]]
             begin[c] += 1
     np.testing.assert_array_equal(records[: n * length].reshape(n, length), expected)
     np.testing.assert_array_equal(records[(n + 1) * length :], -7)  # behind the spare place nothing is written
     np.testing.assert_array_equal(offset, begin)
     records = rng.random(len(records)).astype(dtype)
     several = records[3 * length : (3 + width) * length].reshape(width, length)
-    several[:, 1] = rng.integers(0, 2**24, width)
+    several[:, 0] = rng.integers(0, 2**24, width)
     before = lanes.copy()
     take(lanes, 2 * width, 3, records)
-    np.testing.assert_array_equal(lanes.reshape(length, width)[1:], several[:, 1:].T)  # the agent, and its numbers
+    np.testing.assert_array_equal(lanes.reshape(-1, width)[1:], several.T)  # the agent, and its numbers
     np.testing.assert_array_equal(lanes[:width], before[:width])
 
 
