@@ -2,9 +2,9 @@
 
 What numba is told of it counts (NUMBA_CPU_NAME, NUMBA_CPU_FEATURES, NUMBA_ENABLE_AVX), as far as it is written there:
 what follows from a processor's name alone is not seen. FLOCKENV_REGISTER=32 or 64 says how many bytes lie side by side,
-for whoever wants to know what another processor does. Results are the same bits on every one that fuses multiplications
-with additions: lanes do not know of each other. (How many pairs were met, `State.work`, follows from how many lanes
-there are.)
+for whoever wants to know what another size does. Results are the same bits in either on one processor: lanes do not
+know of each other. (How many pairs were met, `State.work`, follows from how many lanes there are.) On a processor with
+other instructions they mostly are, too, but need not be: of a sum of products LLVM fuses which one it likes.
 """
 
 from __future__ import annotations

@@ -18,13 +18,13 @@ from flockenv.sweep.text import (
     alone,
     frame_views,
     given,
+    in_common,
     indented,
     indented_lines,
     lane,
     lanes_of,
     nearest_images,
     needed,
-    of_all,
     tuple_of,
 )
 
@@ -70,7 +70,7 @@ def respond(around, pos, vel, time, acc):
 {indented(needed(read, [*folding, *responding, *_carry(parts)]), 4)}
     for block in range(np.uint64(first_), np.uint64(end_)):
         base, row = block * np.uint64({d * parts.width}), block * np.uint64({parts.width})
-{indented(of_all(parts), 8)}
+{indented(in_common(parts), 8)}
 {indented(folding, 8)}
         for l in range(np.uint64({parts.width})):
 {indented(responding, 12)}

@@ -133,5 +133,6 @@ def _meet(parts: Parts, e: int, k: int, effect: Effect, sums: list[str]) -> list
         indented(others, 8),
         f"        says = bond_law_{k}(p{k}, me, ({', '.join(f'it{q}' for q in range(p))},), ({numbers},))",
         f"        whole = {' & '.join(f'(living[who{q}] > zero(x)[0])' for q in range(p))}  # the dead hold nobody",
-        indented([f"{s} += says[{j}] if whole else like(x[0], -0.0)" for j, s in enumerate(sums)], 8),
+        # of a sum of products each form of the loop would fuse another one, and bits would depend on the processor
+        indented([f"{s} = exact_sum({s}, says[{j}] if whole else like(x[0], -0.0))" for j, s in enumerate(sums)], 8),
     ]

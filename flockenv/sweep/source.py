@@ -93,7 +93,7 @@ def _imports(parts: Parts) -> str:
         *([f"from flockenv.space import {parts.space.bounce_law} as bounce"] if parts.bounces else []),
         "from flockenv.noise import normal as standard_normal",
         *(["from flockenv.transpose import out_of_records, put_lines, put_records"] * (parts.sweeps and parts.sorts)),
-        "from flockenv.vec import add, dot, exact_dot, limit, norm, scale, select, sub, unit, zero",
+        "from flockenv.vec import add, dot, exact_dot, exact_sum, limit, norm, scale, select, sub, unit, zero",
         *(["from flockenv.vehicle import faced, held, leant, raised, turned"] if parts.oriented else []),
         *([f"from flockenv.abreast import {KEYS}"] * parts.keyed),
         *tree_imports(parts),

@@ -13,9 +13,9 @@ from flockenv.effects.base import Effect
 from flockenv.sweep.parts import Parts
 
 __all__ = [
-    "CONTEXT", "SHARED", "Slots", "alone", "asked", "copied", "frame_views", "given", "indented", "indented_lines",
-    "inner_of", "lane", "lanes_of", "nearest_image", "nearest_images", "needed", "of_all", "place_of", "stages_of",
-    "tuple_of",
+    "CONTEXT", "SHARED", "Slots", "alone", "asked", "copied", "frame_views", "given", "in_common", "indented",
+    "indented_lines", "inner_of", "lane", "lanes_of", "nearest_image", "nearest_images", "needed", "place_of",
+    "stages_of", "tuple_of",
 ]  # fmt: skip
 
 _READ = (
@@ -52,7 +52,7 @@ def place_of(parts: Parts, rows: int) -> str:
     return f"(i // np.uint64({w})) * np.uint64({rows * w}) + i % np.uint64({w})"
 
 
-def of_all(parts: Parts) -> list[str]:
+def in_common(parts: Parts) -> list[str]:
     """Write where block `block` has its bodies (`one`), who lives (`live`), and what its agents are to do (`wish`).
 
     In a large world what all have in common is read where the first block has it: large worlds wait for memory.
