@@ -288,8 +288,11 @@ def test_steer_is_yaml_and_back(arbitration: Arbitration) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("dtype", "dimension"), [("float32", 2), ("float64", 3)])
-@ALL
+@pytest.mark.parametrize(
+    ("arbitration", "dtype", "dimension"),
+    [(a, *(("float32", 2), ("float64", 3))[k % 2]) for k, a in enumerate(catalogue.ARBITRATIONS)],  # laws: in both
+    ids=lambda value: getattr(value, "kind", value),
+)
 def test_every_arbitration_steers_a_scene(arbitration: Arbitration, dtype: str, dimension: int) -> None:
     """The kernel does what the law says, wherever agents are, on top of each other at rest too."""
     change: dict[str, Any] = {"dtype": dtype, "dimension": dimension, "space": Torus(size=(9.0,) * dimension)}

@@ -68,7 +68,6 @@ def played(task: Task, decisions: int = 12) -> dict[str, Any]:
 CASES: dict[str, Callable[[], dict[str, Any]]] = {
     "few": lambda: stepped(flock(37, "float32", fov=270), 7),
     "many": lambda: stepped(flock(900, "float32", nearest=4), 7),
-    "many doubles": lambda: stepped(flock(900, "float64"), 7),
     "so many that they move house": lambda: stepped(flock(20_003, "float32"), 3),
     "groups met as one, and neighbours": lambda: stepped(heavy(3000, Separation(weight=1, radius=0.5)), 2),
     "Flock": lambda: played(Flock(agents=24, dtype="float32")),
@@ -78,7 +77,7 @@ CASES: dict[str, Callable[[], dict[str, Any]]] = {
     },
     **{
         f"{name}.yaml": lambda name=name: stepped(load_scene(CONFIGS / f"{name}.yaml"), 5)  # type: ignore[misc]
-        for name in ("cloth", "crowd_bottleneck", "fish")
+        for name in ("cloth",)
     },
     **{f"task {name}": lambda name=name: played(TASKS[name]()) for name in ("bottleneck", "school")},  # type: ignore[misc]
 }
