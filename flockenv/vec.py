@@ -22,6 +22,7 @@ __all__ = [
     "lateral",
     "limit",
     "norm",
+    "opposite",
     "perpendicular",
     "planar",
     "scale",
@@ -95,6 +96,15 @@ def select(condition: bool, a: Vec, b: Vec) -> Vec:
     else:
         first = (a[0] if condition else b[0], a[1] if condition else b[1], a[2] if condition else b[2])
         return first + _pair(condition, a[3], a[4], b[3], b[4])
+
+
+@law
+def opposite(a: Vec) -> Vec:
+    """Return -a."""
+    if len(a) == 2:
+        return (-a[0], -a[1])
+    else:
+        return (-a[0], -a[1], -a[2])
 
 
 @law

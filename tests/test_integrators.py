@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from flockenv.behaviours import Separation
 from flockenv.integrators import RK4, ExplicitEuler, Heun, Integrator, Midpoint, SemiImplicitEuler, VelocityVerlet
 from flockenv.integrators.base import Alone
 from flockenv.scene import Group, Scene
@@ -252,6 +253,27 @@ def test_stage_arrays_are_as_many_as_are_used() -> None:
         stages = np.full((row.method.stages + 2, 6), 7.0)
         row.method.advance().py_func(spring, alone(row), np.ones(6), np.ones(6), (), 0.0, 0.1, stages, 0, 6)
         assert (stages[row.method.stages :] == 7).all()
+
+
+@pytest.mark.parametrize("row", [row for row in INTEGRATORS if row.method.asks_first], ids=lambda row: row.name)
+def test_who_asks_first_leaves_its_row_alone_until_then(row: IntegratorRow) -> None:
+    """In a scene what it is asked for is made of may lie there."""
+    stages, asked = np.full((1, 6), 7.0), []
+
+    def law(context: Any, pos: Array, vel: Array, time: float, out: Array) -> None:
+        asked.append((out == 7).all() and np.shares_memory(out, stages))
+        out[:] = -pos
+
+    row.method.advance().py_func(law, alone(row), np.ones(6), np.ones(6), (), 0.0, 0.1, stages, 0, 6)
+    assert asked == [True]
+
+
+@pytest.mark.parametrize("row", INTEGRATORS, ids=lambda row: row.name)
+def test_accelerations_come_in_place_of_what_is_felt_for_those_alone(row: IntegratorRow) -> None:
+    group = Group(count=3, spawn=Spawn(low=(0, 0), high=(1, 1)))
+    scene = Scene(groups=(group,), effects=(Separation(weight=1, radius=1),), integrator=row.method)
+    assert scene.parts.in_place == row.method.asks_first
+    assert (scene.parts.stages == 0) == row.method.asks_first
 
 
 @METHODS

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections import namedtuple
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -23,7 +24,7 @@ from flockenv.spawn import Spawn
 from flockenv.state import State
 from flockenv.steering.others import ONE_PLACE
 from flockenv.sweep.pairs import pairs
-from tests.catalogue import EFFECTS, scene_under
+from tests.catalogue import EFFECTS, scene_under, users_module
 
 RULES = (Separation(weight=1.5, radius=1.5), Alignment(weight=0.6, radius=2), Cohesion(weight=0.2, radius=2.5))
 SIZE = 20.0
@@ -136,6 +137,55 @@ def test_steps_in_one_call_are_calls_of_one_where_many_are_in_one_place(count: i
     assert np.unique(state.x[:, 0, 100:130], axis=1).shape[1] == 30
     np.testing.assert_array_equal(one.x, state.x)
     np.testing.assert_array_equal(one.v, state.v)
+
+
+def test_what_lies_in_records_beyond_the_last_agent_is_nobodys_business() -> None:
+    """Lanes of a block that is not full hold it: no place in memory is looked up by it."""
+    scene, state = crowd(700, 2, "float64", True, drawn=SIZE)
+    state.x[:, 0, [50, 51]] = SIZE - 1e-3  # in the last cell of all
+    state.alive[0, 600:] = False
+    expected_ = scene.acceleration(state)
+    scene._workspaces(1, 1)[0].arrays["records"][:] = 1e12
+    np.testing.assert_array_equal(scene.acceleration(state), expected_)
+
+
+TIED = """
+from typing import ClassVar, Literal
+from flockenv.behaviours import Separation
+from flockenv.kernels import law
+from flockenv.steering import others
+from flockenv.vec import add, sub
+
+
+@law
+def pushed(p, me, other):
+    return others.part(other.offset, other.square, sub(me.tie, other.tie))
+
+
+@law
+def pushed_apart(p, me, other):
+    return others.push_off(other.offset, other.square)
+
+
+@law
+def ended(p, me, sums):
+    return add(sums, me.tie)
+
+
+class Tied(Separation):
+    kind: Literal["tied"] = "tied"
+    pair_law: ClassVar[str | None] = "pushed"
+    apart_law: ClassVar[str | None] = "pushed_apart"
+    finish_law: ClassVar[str | None] = "ended"
+    vanishes: ClassVar[bool] = False
+"""
+
+
+def test_who_reads_ties_of_others_than_those_in_one_place_has_them_at_hand(tmp_path: Path) -> None:
+    with users_module(tmp_path, TIED, "tied_laws") as laws:
+        scene, _ = crowd(700, 2, "float64", True, laws.Tied(weight=1.0, radius=1.0))
+        assert not scene.parts.parting
+        assert {"t0", "t1"} <= set(scene.parts.sorted_fields)
 
 
 def test_who_is_outside_of_the_box_is_where_his_image_is() -> None:

@@ -9,7 +9,8 @@ An effect is of one or more of three forms, each a law for one agent:
   the force they make; all pair laws of a scene share one sweep. With a `pair_start(p, me) -> acc` it is a fold instead,
   `pair_law(p, me, other, acc) -> acc`, over those in sight, in no order that it may rely on. A law that reads ties may
   have another form, `apart_law(p, me, other) -> sums`, the same where the two are not in one place (steering.others'
-  ONE_PLACE): if all of a scene that read them have, and all are sums, ties are read of those in one place alone;
+  ONE_PLACE): if all of a scene that read them have, by `pair_law` alone, and all are sums, ties are read of those in
+  one place alone;
 * `far_law(p, me, other) -> force`: of everybody else, however far, of whom groups far away are met as one; `other` is
   a `Far`, and of `me` it may read pos and mass alone; `p.opening` says how large such a group may look;
 * `bond_law(p, me, others, numbers) -> force`: of one of the bonds that the effect's `bonds` lists, each between an

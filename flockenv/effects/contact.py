@@ -73,7 +73,7 @@ def touching(p: Any, me: Me) -> float:
 
 
 @law
-def in_common(p: Any, me: Me, acc: Vec) -> Vec:
+def of_all(p: Any, me: Me, acc: Vec) -> Vec:
     """All of them at once."""
     return acc
 
@@ -152,7 +152,7 @@ class ObstacleContact(_Solid):
     kind: Literal["obstacle_contact"] = "obstacle_contact"
     obstacle_start: ClassVar[str | None] = "untouched"
     obstacle_law: ClassVar[str | None] = "pushed_out"
-    obstacle_finish: ClassVar[str | None] = "in_common"
+    obstacle_finish: ClassVar[str | None] = "of_all"
     obstacle_reach: ClassVar[str | None] = "touching"
 
     def folded(self, dimension: int) -> int:

@@ -108,6 +108,9 @@ class Integrator(Record):
     """Rows of coordinates it needs as scratch."""
     evaluations: ClassVar[int]
     """Evaluations of the force per step; at least so many where a method chooses steps of its own."""
+    asks_first: ClassVar[bool] = False
+    """Does it have one row, and leave it alone until what it asks for is written there? Then an acceleration may come
+    in the place of what it is made of, and there is no other row."""
     adaptive: ClassVar[bool] = False
     """Does it choose steps of its own within dt? It looks at a whole world then, and threads do not share one."""
     splits_drag: ClassVar[bool] = False

@@ -33,3 +33,4 @@ class ExplicitEuler(Integrator):
     order_with_drag: ClassVar[int] = 1
     stages: ClassVar[int] = 1
     evaluations: ClassVar[int] = 1
+    asks_first: ClassVar[bool] = True

@@ -6,7 +6,7 @@ import numpy as np
 
 from flockenv.kernels import Vec, law, like
 from flockenv.steering.goals import arrive, flee, in_frame, match_velocity, seek
-from flockenv.vec import add, axis, dot, lateral, limit, norm, perpendicular, scale, select, sub, unit, zero
+from flockenv.vec import add, axis, dot, lateral, limit, norm, opposite, perpendicular, scale, select, sub, unit, zero
 
 __all__ = [
     "align",
@@ -105,7 +105,7 @@ def evade(offset: Vec, velocity: Vec, pursuer_velocity: Vec, max_speed: float, t
 @law
 def push_off(offset: Vec, square: float) -> Vec:
     """One neighbour's push where the two are not in one place, 1/m: see `separate`. Their distance squared is known."""
-    return scale(offset, like(square, -1.0) / square)
+    return opposite(scale(offset, like(square, 1.0) / square))  # of who is infinitely far 0: a mask, and no choice
 
 
 @law

@@ -224,7 +224,8 @@ def meet_range(
     square = "exact_dot(to, to)" if exact or any(s.nearest for s in parts.sights) else "dot(to, to)"
     wrapped, plain = offset_of(parts, "xj"), "sub(xj, me.pos)"
 
-    own_tie = _tie(parts, "own_tie", listed(parts)) if where == TOGETHER else []
+    mine = f"{listed(parts)} if block + l < np.uint64(upto) else np.uint64(0)"  # lanes beyond hold what lay there
+    own_tie = _tie(parts, "own_tie", mine) if where == TOGETHER else []
     near = [q for q, sight in enumerate(parts.sights) if touch and sight in _touching(parts)]
 
     def over_lanes(offset: str, each: list[str]) -> list[str]:

@@ -188,7 +188,8 @@ class Parts:
         """
         readers = [e for _, e in self.pairs if "tie" in _names(e, _OF_PAIRS)]
         sums = not any(e.pair_start or e.contact for _, e in self.pairs)
-        return sums and bool(readers) and all(e.apart_law for e in readers)
+        others = any("tie" in _names(e, ("apart_law", "finish_law")) for e in readers)
+        return sums and bool(readers) and all(e.apart_law for e in readers) and not others
 
     @property
     def trusts(self) -> bool:
@@ -337,9 +338,11 @@ class Parts:
     def in_place(self) -> bool:
         """Does an agent's acceleration come where it was written what it feels from others, in one vector?
 
-        Where the method asks once: nobody reads that again. It is memory that is at hand, and less of it.
+        Where the method asks once, and has written nothing there: nobody reads it again. It is memory that is at hand,
+        and less of it.
         """
-        once = self.integrator.evaluations == self.integrator.stages == 1
+        method = self.integrator
+        once = method.asks_first and method.evaluations == method.stages == 1
         return once and len(self.targets) == 1 and self.targets[0][0] != "n"
 
     @property
