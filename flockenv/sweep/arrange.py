@@ -47,7 +47,7 @@ def _carry(parts: Parts, to: list[str]) -> list[str]:
     d, w, count = parts.dimension, parts.width, parts.luggage_size
     luggage = [field.partition(" ") for field in parts.luggage]  # an array, and of vectors which axis
     sources = "".join(f"{name}, " for name, _, _ in luggage)
-    places = "".join(f"base + np.uint64({int(axis) * w}), " if axis else "row, " for _, _, axis in luggage)
+    places = "".join(_place(name, axis, w) for name, _, axis in luggage)
     return [
         "for block in range(np.uint64(first), np.uint64(end)):",
         f"    base, row = block * np.uint64({d * w}), block * np.uint64({w})",
@@ -61,12 +61,21 @@ def _carry(parts: Parts, to: list[str]) -> list[str]:
     ]
 
 
+_COMMON = {**dict.fromkeys(("mass", "radius", "max_speed", "max_force"), 0), "want": 1}
+"""What all may have in common, and by which mask it is read then, see `text.in_common`."""
+
+
+def _place(name: str, axis: str, width: int) -> str:
+    """Write where a number of a block's agents lies in an array, in the first block if all have it in common."""
+    mask = f" & spread[{_COMMON[name]}]" if name in _COMMON else ""
+    return f"(base{mask}) + np.uint64({int(axis) * width}), " if axis else f"row{mask}, "
+
+
 def _unpacked(parts: Parts, luggage: list[tuple[str, str, str]]) -> list[str]:
     """Write how agent i unpacks: all but what everybody has in common, which lies where it lay."""
-    common = {**dict.fromkeys(("mass", "radius", "max_speed", "max_force"), 0), "want": 1}
     own: dict[int | None, list[str]] = {None: [], 0: [], 1: []}
     for k, (name, _, axis) in enumerate(luggage):
         to = f"{name}[place + np.uint64({int(axis) * parts.width})]" if axis else f"{name}[i]"
-        own[common.get(name)].append(f"{to} = luggage[i * np.uint64({parts.luggage_size}) + np.uint64({k})]")
+        own[_COMMON.get(name)].append(f"{to} = luggage[i * np.uint64({parts.luggage_size}) + np.uint64({k})]")
     kinds = [[f"if spread[{k}] > np.uint64(0):", *indented_lines(own[k], 4)] for k in (0, 1)]
     return [*own[None], *kinds[0], *kinds[1]]
