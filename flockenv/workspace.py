@@ -88,8 +88,9 @@ class Workspace:
         arrays["number"] = np.arange(SMALL_STRIDE, dtype=np.int32)
         arrays |= {"bond_place": table.place, "bond_number": table.number, "bond_start": table.start}
         lanes = {"lanes": (len(parts.slots) * width, np.dtype(dtype))}
+        spread = _spread(body, width)
         own = tuple(
-            _zeros(lanes) | {"ranges": np.zeros((MAX_RANGES, 3), np.int64), "spread": _spread(body, width)}
+            _zeros(lanes) | {"ranges": np.zeros((MAX_RANGES, 3), np.int64), "spread": spread.copy()}
             for _ in range(team)
         )
         return cls(arrays, own)

@@ -42,7 +42,7 @@ def accelerate(parts: Parts) -> str:
     responding = [
         *me,
         "o = zero(x)",
-        f"s, f = {lanes_of(parts, 'want').replace('base', 'wish')}, o",
+        f"s, f = {lanes_of(parts, 'want', 'wish')}, o",
         *(f"{parts.target(k)} = o" for k in parts.wishes),
         *nearest_images(parts, list(enumerate(parts.effects))),
         *_medium(parts),

@@ -16,6 +16,9 @@ from flockenv.sweep.text import indented, indented_lines, place_of
 
 __all__ = ["go_home", "move_in"]
 
+_COMMON = {**dict.fromkeys(("mass", "radius", "max_speed", "max_force"), 0), "want": 1}
+"""What all may have in common, and by which mask it is read then, see `text.in_common`."""
+
 
 def move_in(parts: Parts) -> list[str]:
     """Write how agents move to where their handfuls of cells come, if that is worth it; sets `arranged`."""
@@ -59,10 +62,6 @@ def _carry(parts: Parts, to: list[str]) -> list[str]:
         f"    place = {place_of(parts, d)}",
         *indented_lines(_unpacked(parts, luggage), 4),
     ]
-
-
-_COMMON = {**dict.fromkeys(("mass", "radius", "max_speed", "max_force"), 0), "want": 1}
-"""What all may have in common, and by which mask it is read then, see `text.in_common`."""
 
 
 def _place(name: str, axis: str, width: int) -> str:

@@ -247,7 +247,7 @@ def _bound(parts: Parts, first: str, end: str) -> list[str]:
         *indented_lines(in_common(parts), 4),
         f"    for l in range(np.uint64({parts.width})):",
         "        i = row + l",
-        f"        was, x, v = {_before(parts, 'origin')}, {lanes_of(parts, 'pos')}, {lanes_of(parts, 'vel')}",
+        f"        was, x, v = {lanes_of(parts, 'origin', 'past')}, {lanes_of(parts, 'pos')}, {lanes_of(parts, 'vel')}",
         *indented_lines(_kick(parts), 8),
         "        where = far if finite(dot(x, x) + dot(v, v)) else ident[i]",
         f"        {bad} = where if where < {bad} else {bad}",
@@ -311,18 +311,13 @@ def _remember(parts: Parts, first: str, end: str) -> list[str]:
     ]
 
 
-def _before(parts: Parts, array: str) -> str:
-    """Write a vector of lane l as it was kept before the step."""
-    return lanes_of(parts, array).replace("base", "past")
-
-
 def _stay_inside(parts: Parts) -> list[str]:
     """Write how agent i is kept to the space: put back into it, or bounced off its walls."""
     limited = "scale(limit(v, max_speed[one + l]), living[live + l])"
     if not parts.bounces:
         return [f"x, v = confine(size, radius[one + l], x, {limited})"]
     restitution = f"params[{parts.last_numbers('space')}]"
-    before = f"scale({_before(parts, 'earlier')}, living[live + l])"
+    before = f"scale({lanes_of(parts, 'earlier', 'past')}, living[live + l])"
     return [
         f"x, v = bounce(size, radius[one + l], {restitution}, dt, was, {before}, x, {limited})",
         "v = limit(v, max_speed[one + l])",

@@ -36,14 +36,14 @@ def tuple_of(template: str, dimension: int) -> str:
     return "(" + ", ".join(template.replace("#", str(k)) for k in range(dimension)) + ",)"
 
 
-def lane(parts: Parts, array: str, k: int) -> str:
+def lane(parts: Parts, array: str, k: int, base: str = "base") -> str:
     """Write coordinate k of lane l of the block that begins at `base`."""
-    return f"{array}[base + np.uint64({k * parts.width}) + l]"
+    return f"{array}[{base} + np.uint64({k * parts.width}) + l]"
 
 
-def lanes_of(parts: Parts, array: str) -> str:
+def lanes_of(parts: Parts, array: str, base: str = "base") -> str:
     """Write all coordinates of lane l of the block that begins at `base`, as a tuple."""
-    return "(" + ", ".join(lane(parts, array, k) for k in range(parts.dimension)) + ")"
+    return "(" + ", ".join(lane(parts, array, k, base) for k in range(parts.dimension)) + ")"
 
 
 def place_of(parts: Parts, rows: int) -> str:
