@@ -17,6 +17,7 @@ import numpy as np
 from numba import njit
 
 from flockenv.effects.base import ties
+from flockenv.elementary import nearest_whole
 from flockenv.inlining import Inlined, Whole
 from flockenv.kernels import LINE, like, unaliased
 from flockenv.processor import REGISTER
@@ -33,7 +34,7 @@ ROWS = 9  # of scratch: x, y, vx, vy, the wish, who lives, and where to from som
 
 @njit(**PARTS)
 def _image(d, size, inverse):
-    return d - size * np.floor(d * inverse + like(d, 0.5))
+    return d - size * nearest_whole(d * inverse)
 
 
 @njit(**PARTS)

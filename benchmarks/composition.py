@@ -74,10 +74,13 @@ def _summed(bench: Bench, results: Sequence[Result]) -> None:
     cost = {r.name: [1e9 / rate for rate in r.rates] for r in results}
     beyond = {name: [a - b for a, b in zip(cost[name], cost["no effect"], strict=False)] for name in cost}
     saved = [sum(beyond[name][k] for name in NAMES) / beyond["all three"][k] for k in range(rounds)]
+    alone = [sum(cost[name][k] for name in NAMES) / len(NAMES) for k in range(rounds)]
+    times = statistics.median(cost["all three"][k] / alone[k] for k in range(rounds))
     said = ", ".join(f"{name} {number(statistics.median(beyond[name]))}" for name in (*NAMES, "all three"))
     bench.note(
         f"{results[0].race}: without effects {number(statistics.median(cost['no effect']))} ns per agent and step; "
-        f"beyond that {said}. One by one they cost {number(statistics.median(saved))} times what they cost together."
+        f"beyond that {said}. One by one they cost {number(statistics.median(saved))} times what they cost together. "
+        f"With all it costs {number(times)} times what a scene of one rule does (the mean of the three)."
     )
 
 

@@ -45,6 +45,7 @@ static void *scratch(int slot, size_t bytes) {
 #endif
 #define SQRT sqrtf
 #define FLOOR floorf
+#define ONES 0x1.8p23f /* its last digit counts ones */
 #define D 2
 #define NAME(x) JOINED(x, _f32_2d)
 #include "limit_kernel.h"
@@ -62,6 +63,7 @@ static void *scratch(int slot, size_t bytes) {
 #undef INTEGER
 #undef SQRT
 #undef FLOOR
+#undef ONES
 
 #define REAL double
 #define SUFFIX pd
@@ -74,6 +76,7 @@ static void *scratch(int slot, size_t bytes) {
 #endif
 #define SQRT sqrt
 #define FLOOR floor
+#define ONES 0x1.8p52
 #define D 2
 #define NAME(x) JOINED(x, _f64_2d)
 #include "limit_kernel.h"

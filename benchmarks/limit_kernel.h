@@ -60,7 +60,7 @@ static inline void NAME(meet)(NAME(sums) *s, const NAME(block) *me, const REAL *
     VEC d[D], square;
     for (int k = 0; k < D; k++) {
         d[k] = ALL(xj[k]) - me->x[k];
-        if (image) d[k] -= p->size * NAME(whole)(d[k] * (1 / p->size) + (REAL)0.5);
+        if (image) d[k] -= p->size * (d[k] * (1 / p->size) + ONES - ONES); /* to the nearest whole number of boxes */
         square = k ? square + d[k] * d[k] : d[k] * d[k];
     }
     NAME(mask) agree = LESS(square, ALL(p->agree * p->agree)), near = LESS(square, ALL(p->near * p->near));

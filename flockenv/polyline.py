@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from flockenv.elementary import nearest_whole
 from flockenv.kernels import Vec, entry, kernel, law, like
 from flockenv.space import Plane, Space
 from flockenv.vec import add, dot, scale, select, zero
@@ -52,7 +53,7 @@ def _short(table: Table, d: Vec, k: int) -> float:
     """Return coordinate k of an offset, the shortest way around a torus of that edge."""
     edge = table[2 + k]
     around = like(edge, 1.0) / edge if edge > like(edge, 0.0) else like(edge, 0.0)
-    return d[k] - edge * np.floor(d[k] * around + like(edge, 0.5))  # type: ignore[no-any-return]
+    return d[k] - edge * nearest_whole(d[k] * around)  # type: ignore[no-any-return]
 
 
 @law

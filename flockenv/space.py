@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydantic import Field
 
+from flockenv.elementary import nearest_whole
 from flockenv.kernels import Vec, finite, law, like
 from flockenv.records import Record
 from flockenv.vec import sub
@@ -35,12 +36,15 @@ def plane_offset(size: Vec, a: Vec, b: Vec) -> Vec:
 @law
 def _shortest(d: float, length: float) -> float:
     # times the reciprocal, which is the same for all pairs: a division each would double the cost of a sweep
-    return d - length * np.floor(d * (like(d, 1.0) / length) + like(d, 0.5))  # type: ignore[no-any-return]
+    return d - length * nearest_whole(d * (like(d, 1.0) / length))
 
 
 @law
 def torus_offset(size: Vec, a: Vec, b: Vec) -> Vec:
-    """Return the shortest way from a to b (minimum image), right for any distance."""
+    """Return the shortest way from a to b (minimum image), from however many boxes away.
+
+    Two that are half a box apart are so in opposite directions, each seen from the other.
+    """
     if len(a) == 2:
         return (_shortest(b[0] - a[0], size[0]), _shortest(b[1] - a[1], size[1]))
     else:
@@ -240,7 +244,7 @@ class Torus(Space):
     def displacement(self, a: ArrayLike, b: ArrayLike) -> Floats:
         """Return the shortest way from a to b, (..., D) m."""
         d, size = super().displacement(a, b), np.asarray(self.size)
-        return np.asarray(d - size * np.floor(d / size + 0.5))
+        return np.asarray(d - size * np.rint(d / size))
 
     def wrap(self, x: ArrayLike) -> Floats:
         """Return positions in [0, size)."""

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from numba import njit
 
 from flockenv import steering
 from flockenv.behaviours import (
@@ -26,7 +27,7 @@ from flockenv.behaviours import (
 )
 from flockenv.config import ConfigError, dump_scene, load_scene, schema
 from flockenv.effects import Contact, Course, Effect, Goal, ObstacleContact
-from flockenv.elementary import atan2, exp
+from flockenv.elementary import atan2, exp, nearest_whole
 from flockenv.integrators import ExplicitEuler, SemiImplicitEuler
 from flockenv.presets import ALIASES, PRESETS, preset
 from flockenv.rows import rows
@@ -108,6 +109,28 @@ def test_exp_and_atan2_are_as_accurate_as_they_say() -> None:
     assert np.abs(rows(atan2)(y, x) - np.arctan2(y, x)).max() < 5e-16
     corners = [(0, 0), (0, -1), (1, 0), (-1, 0), (0, 1)]
     assert np.allclose([rows(atan2)(*np.array(c, float)) for c in corners], [np.arctan2(*c) for c in corners], atol=0)
+
+
+@njit(error_model="numpy", fastmath={"contract"})
+def _rounded(x: Any, factor: Any, out: Any) -> None:
+    for i in range(len(x)):
+        out[i] = nearest_whole(x[i] * factor)
+
+
+@pytest.mark.parametrize(("dtype", "digits"), [(np.float32, 22), (np.float64, 51)])
+def test_the_nearest_whole_number_is_the_even_one_of_two(dtype: Any, digits: int) -> None:
+    most = 2.0**digits
+    halves = np.r_[-1000.5:1001, most - 2.5, most - 1.5, -most + 1.5]
+    near = np.nextafter(halves.astype(dtype), dtype(0)), np.nextafter(halves.astype(dtype), dtype(np.inf))
+    x = np.r_[halves, *near, 0.0, -0.0, np.random.default_rng(0).normal(0, most / 8, 1000)].astype(dtype)
+    found = np.empty_like(x)
+    _rounded(x, dtype(1), found)
+    np.testing.assert_array_equal(found, np.rint(x))
+    np.testing.assert_array_equal([nearest_whole.py_func(number) for number in x], np.rint(x))  # in plain Python, too
+    _rounded(x[: len(halves) - 3], dtype(2), found)  # of a product, which may be fused with what rounds it
+    np.testing.assert_array_equal(found[: len(halves) - 3], 2 * x[: len(halves) - 3])
+    _rounded(np.array([np.nan, np.inf, -np.inf], dtype), dtype(1), found)
+    np.testing.assert_array_equal(found[:3], [np.nan, np.inf, -np.inf])
 
 
 @pytest.mark.parametrize("dimension", [2, 3])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from typing import Any
 
 import numpy as np
@@ -71,6 +72,18 @@ def test_the_shortest_way_is_shortest_from_any_distance(times: float) -> None:
     shortest = np.take_along_axis(expected[:, 0], np.abs(expected[:, 0]).argmin(axis=0)[None], axis=0)[0]
     np.testing.assert_allclose(space.displacement(a, b), shortest, atol=1e-9)
     np.testing.assert_allclose(rows(space_module.torus_offset)(space.size, a, b), shortest, atol=1e-9)
+
+
+@DIMENSIONS
+def test_who_is_half_a_box_away_is_so_in_opposite_directions(dimension: int) -> None:
+    """Else two that push each other off would push the same way."""
+    space = SPACES["torus"][dimension]
+    half = np.asarray(space.size) / 2  # type: ignore[attr-defined]
+    for ways in (space.displacement, functools.partial(rows(space_module.torus_offset), space.extent(dimension))):
+        for times in (-5, -3, -1, 1, 3, 5):
+            way, back = (np.asarray(ways(times * a, times * b)) for a, b in ((0 * half, half), (half, 0 * half)))
+            np.testing.assert_array_equal(way, -back)
+            np.testing.assert_array_equal(np.abs(way), half)
 
 
 @DIMENSIONS

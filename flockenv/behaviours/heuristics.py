@@ -13,6 +13,7 @@ from pydantic import Field
 
 from flockenv import steering
 from flockenv.effects.base import Effect, Me, Other, Sight, all_masses, demand_group
+from flockenv.elementary import nearest_whole
 from flockenv.kernels import OPTIONS, Vec, law, like, stacked
 from flockenv.shapes.chain import segment_hit, segment_share
 from flockenv.vec import add, dot, norm, scale, select, sub, unit, zero
@@ -131,8 +132,8 @@ def until_a_wall(p: Any, me: Me, way: Vec, reach: float) -> float:
         a, b = (p.table[at], p.table[at + 1]), (p.table[at + 2], p.table[at + 3])
         wide, high = p.table[0], p.table[1]
         x, y = me.pos[0] - half * (a[0] + b[0]), me.pos[1] - half * (a[1] + b[1])
-        x = wide * np.floor(x / wide + half) if wide > o else o
-        y = high * np.floor(y / high + half) if high > o else o
+        x = wide * nearest_whole(x / wide) if wide > o else o
+        y = high * nearest_whole(y / high) if high > o else o
         spot, room = sub(me.pos, (x, y)), me.radius + p.table[at + 4]
         off = sub(spot, add(a, scale(sub(b, a), segment_share(spot, a, b))))
         leaves = (dot(off, off) < room * room) & (dot(off, way) >= o)

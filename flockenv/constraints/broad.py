@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from flockenv.elementary import nearest_whole
 from flockenv.kernels import Vec, kernel, law
 from flockenv.neighbours import candidates, count_cells, row_of
 from flockenv.vec import dot, sub
@@ -44,7 +45,7 @@ def loaded(size: Vec, array: Any, b: int, i: int) -> Vec:
 
 @law
 def _shift(d: float, period: float) -> float:
-    return d - period * np.floor(d / period + 0.5) if period > 0.0 else d
+    return d - period * nearest_whole(d / period) if period > 0.0 else d
 
 
 @law

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from flockenv.constraints.base import Constraint, Settler
+from flockenv.elementary import nearest_whole
 from flockenv.kernels import entry, finite, kernel, like
 from flockenv.networks import EDGE
 from flockenv.space import Torus
@@ -70,7 +71,7 @@ def _to(x: Any, b: int, i: int, j: int, period: Any, way: Any) -> float:
     for k in range(x.shape[0]):
         d = x[k, b, j] - x[k, b, i]
         if period[k] > 0:
-            d -= period[k] * np.floor(d / period[k] + like(d, 0.5))
+            d -= period[k] * nearest_whole(d / period[k])
         way[k] = d
         square += d * d
     return np.sqrt(square)  # type: ignore[no-any-return]

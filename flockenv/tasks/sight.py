@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from flockenv.elementary import nearest_whole
 from flockenv.kernels import Vec, kernel, like
 from flockenv.shapes import ray_hit
 from flockenv.tasks.layout import Slot
@@ -28,9 +29,9 @@ def clip(x: float) -> float:
 def offset(a: float, b: float, size: float) -> float:
     """Return b - a, the shortest way around a periodic axis of this size (0 = not periodic)."""
     d = b - a
-    o, one, half = like(d, 0.0), like(d, 1.0), like(d, 0.5)
+    o, one = like(d, 0.0), like(d, 1.0)
     around = one / like(d, size) if size > o else o  # the same for all pairs: the division leaves the loop
-    return d - like(d, size) * np.floor(d * around + half)  # type: ignore[no-any-return]  # numpy's floor of a float is one
+    return d - like(d, size) * nearest_whole(d * around)
 
 
 @kernel
