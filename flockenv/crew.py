@@ -1,7 +1,8 @@
 """Threads for compiled code: how many there are, and how a piece of work is given to all of them.
 
 One thread unless asked for more: waiting threads spin, and where another process has the second core that costs more
-than it brings. `use_threads(2)`, or FLOCKENV_THREADS=2 in the environment. Results do not depend on the number.
+than it brings. `use_threads(2)`, or FLOCKENV_THREADS=2 in the environment. Results do not depend on the number. Work is
+shared where that is sooner done (`Pace`): it is handed over in 20 microseconds, or, on a virtual machine, in 100.
 
 On Linux the other threads keep off the core of the thread that shares its work: woken after a pause, they are put there
 often, and two halves of the work are then done one after the other.
@@ -13,13 +14,32 @@ import contextlib
 import ctypes
 import os
 import queue
+import statistics
 import threading
 from collections.abc import Callable, Sequence
-from typing import Any
+from time import perf_counter
+from typing import Any, TypeVar
 
-__all__ = ["share", "threads", "use_threads"]
+__all__ = ["Pace", "share", "threads", "use_threads"]
+
+T = TypeVar("T")
 
 _MOST = 256
+
+QUICKEST = 1e-8
+"""s that a step of an agent takes at least, until it is known better."""
+
+WAITING = 4e-5
+"""s that a team of threads loses with each step of a world: they wait for each other, and for what others wrote."""
+
+TRIALS = 15
+"""How often nothing is shared, to see how long that takes."""
+
+LONGEST = 3e-4
+"""s: handing work over takes no longer, whatever else the cores were doing when that was tried."""
+
+DOUBTED = 64
+"""Where sharing spares little, one thread does every so many-th piece of work, to see how long it takes by now."""
 
 
 class _Crew:
@@ -126,6 +146,52 @@ def share(jobs: Sequence[Callable[[], Any]]) -> list[Any]:
         if error is not None:
             raise error
     return [first, *(result for result, _ in rest)]
+
+
+def _tried() -> float:
+    """Return how long it takes to hand nothing over, and to have the answer, s."""
+    took = []
+    for _ in range(TRIALS):
+        began = perf_counter()
+        share([int, int])
+        took.append(perf_counter() - began)
+    return min(statistics.median(took), LONGEST)
+
+
+_toll: float | None = None
+
+
+class Pace:
+    """How long one thread takes for pieces of work of one kind, in steps of agents: are they sooner done by several?
+
+    Learned from what one thread took; of the first piece nothing is, for it may have been compiled. So it is known
+    after two, but what is large at any pace is shared at once. To hand work over takes twice as long as was tried:
+    between two pieces threads fall asleep, and cores.
+    """
+
+    def __init__(self) -> None:
+        self.each, self._done, self._shared = 0.0, 0, 0
+
+    def worth(self, work: int, count: int, waits: int = 0) -> bool:
+        """Are so many steps of agents sooner done by `count` threads? waits: of which they make how many together."""
+        global _toll
+        if _toll is None:
+            _toll = _tried()
+        spared, cost = max(self.each, QUICKEST) * work * (1 - 1 / count), 2 * _toll + waits * WAITING
+        if spared <= cost:
+            return False
+        self._shared += 1
+        return self._shared % DOUBTED != 0 or spared > 4 * cost
+
+    def alone(self, work: int, job: Callable[[], T]) -> T:
+        """Do so many steps of agents in this thread, and learn from it how long they take; return what the job does."""
+        began = perf_counter()
+        result = job()
+        seconds = perf_counter() - began
+        self._done += 1
+        if self._done > 1 and work > 0:
+            self.each += (seconds / work - self.each) * (1.0 if self.each == 0 else 0.25)
+        return result
 
 
 def _from_environment() -> None:

@@ -18,8 +18,8 @@ from flockenv.kernels import ask_for, kernel, wait_for_team
 from flockenv.space import torus_confine
 
 __all__ = [
-    "AHEAD", "DISTANT", "FEWEST_AGENTS", "FINEST", "HANDFUL", "MAX_RANGES", "WORTH_ARRANGING", "candidates",
-    "count_cells", "grid_of", "order_records", "row_of",
+    "AHEAD", "DISTANT", "FEWEST_AGENTS", "FEWEST_ARRANGED", "FINEST", "HANDFUL", "MAX_RANGES", "STEPS_ARRANGED",
+    "WORTH_ARRANGING", "candidates", "count_cells", "grid_of", "order_records", "row_of",
 ]  # fmt: skip
 
 MAX_RANGES = 27
@@ -30,6 +30,12 @@ FEWEST_AGENTS = 96
 
 WORTH_ARRANGING = 2**14
 """Agents from which on a call of several steps puts them in order first: fewer lie in the nearest caches anyway."""
+
+FEWEST_ARRANGED = 2**12
+"""Agents from which on a team of threads does so: else threads write into the same lines of memory, in turns."""
+
+STEPS_ARRANGED = 5
+"""Steps of a call that it takes for that."""
 
 DISTANT = 2**13
 """Agents from which on the places of records are asked for in good time: fewer lie in the nearest caches anyway."""

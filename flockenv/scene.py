@@ -23,7 +23,7 @@ from pydantic import Field, WrapValidator, model_validator
 from flockenv import state as states
 from flockenv.appearance import Appearance
 from flockenv.constraints import CONSTRAINTS, Collisions, Constraint, Settler
-from flockenv.crew import share, threads
+from flockenv.crew import Pace, share, threads
 from flockenv.divergence import SimulationDiverged
 from flockenv.effects import EFFECTS, Effect
 from flockenv.effects.base import all_masses
@@ -32,7 +32,7 @@ from flockenv.implicit import coupling_of, solve_steps
 from flockenv.integrators import INTEGRATORS, Adaptive, ImplicitEuler, Integrator, SemiImplicitEuler
 from flockenv.integrators.newton import Coupling
 from flockenv.kernels import load
-from flockenv.neighbours import FEWEST_AGENTS, WORTH_ARRANGING
+from flockenv.neighbours import FEWEST_AGENTS, FEWEST_ARRANGED
 from flockenv.networks import EDGE
 from flockenv.noise import MASK, key_of
 from flockenv.placing import cells_of, place_groups
@@ -53,8 +53,8 @@ from flockenv.workspace import Workspace
 
 __all__ = ["Group", "Scene"]
 
-WORTH_SHARING = 4096
-"""Agent-steps below which a second thread costs more than it brings: handing work over takes about 20 us."""
+FEWEST_TOGETHER = 128
+"""Agents of a world below which threads do not share it."""
 
 EXACT = 2**24
 """Whole numbers, and so numbers of agents, that float32 tells apart."""
@@ -295,7 +295,7 @@ class Scene(Record):
             numbers = tree_sizes(self.agents, parts.width, d, 1)
             reals += -(-sum(numbers.values()) // self.agents)
             whole += 24
-        if parts.arranges and self.agents >= WORTH_ARRANGING:
+        if parts.arranges and self.agents >= FEWEST_ARRANGED:
             reals += parts.luggage_size
         if self.constraints or self.population:
             reals += 4 * d + sum(constraint.numbers(self) for constraint in self.constraints)
@@ -572,7 +572,8 @@ class Scene(Record):
     def _mended(self, x0: Floats, v0: Floats, state: State) -> list[tuple[int, int]]:
         """Mend a step that began at x0, v0, constraint after constraint; return every (world, agent) not finite."""
         worlds, agents, _ = state.shape
-        crew = min(threads() if worlds * agents >= WORTH_SHARING else 1, worlds)
+        crew, work, pace = min(threads(), worlds), worlds * agents, self._pace("mending")
+        crew = crew if crew > 1 and pace.worth(work, crew) else 1
         settlers = self._settlers(crew)
 
         def settle(k: int) -> list[tuple[int, int]]:
@@ -580,7 +581,7 @@ class Scene(Record):
             return [bad for each in settlers[k] if (bad := each(x0, v0, state, *part))[0] >= 0]
 
         if crew == 1:
-            return settle(0)
+            return pace.alone(work, functools.partial(settle, 0))
         return [bad for found in share([functools.partial(settle, k) for k in range(crew)]) for bad in found]
 
     def _settlers(self, count: int) -> list[list[Settler]]:
@@ -598,17 +599,17 @@ class Scene(Record):
         """
         worlds, agents, _ = state.shape
         move, scratch = self._kernels.step, self._kernels.SCRATCH
-        crew = threads() if worlds * agents * steps >= WORTH_SHARING else 1
-        alone = self.integrator.adaptive or self.integrator.solves  # what was solved for lies in one thread's scratch
-        team = crew if worlds < crew and agents >= WORTH_SHARING and not alone else 1
-        crew = crew if team > 1 else min(crew, worlds)
+        crew, team = self._divided(worlds, agents, steps) if threads() > 1 else (1, 1)
         arrays = (
             state.x, state.v, *state.carried, state.alive, state.tick, state.key, state.obstacle_x,
             state.obstacle_radius, state.work, drive, self._params, self._dt, steps,
         )  # fmt: skip
         if crew == 1:
             only = self._workspaces(1, 1)[0]
-            return move(*arrays, 0, worlds, 0, 1, *only.of(0, scratch))  # type: ignore[no-any-return]
+            whole = functools.partial(move, *arrays, 0, worlds, 0, 1, *only.of(0, scratch))
+            if threads() > 1:
+                return self._pace("moving").alone(worlds * agents * steps, whole)  # type: ignore[no-any-return]
+            return whole()  # type: ignore[no-any-return]
         spaces = self._workspaces(crew // team, team)
         spaces[0].arrays["sync"][:] = 0
         found = share([
@@ -620,6 +621,18 @@ class Scene(Record):
         ])  # fmt: skip
         bad = [(world, agent) for world, agent in found if world >= 0]
         return min(bad, default=(-1, -1))
+
+    def _divided(self, worlds: int, agents: int, steps: int) -> tuple[int, int]:
+        """Return how many threads step so many worlds, and how many of them each world together: where it is worth it.
+
+        Under a method that solves equations, what was solved for lies in one thread's scratch.
+        """
+        crew, work, pace = threads(), worlds * agents * steps, self._pace("moving")
+        together = not (self.integrator.adaptive or self.integrator.solves) and agents >= FEWEST_TOGETHER
+        if worlds < crew and together and pace.worth(work, crew, worlds * steps):
+            return crew, crew
+        apart = min(crew, worlds)
+        return (apart if apart > 1 and pace.worth(work, apart) else 1), 1
 
     def _check(self, state: State, steps: int) -> None:
         """Refuse what the kernel would not notice: it trusts the sizes of its arrays."""
@@ -680,6 +693,11 @@ class Scene(Record):
         while len(found) < count:
             found.append(Workspace.allocate(self.parts, self.body, self.table, team))
         return found
+
+    def _pace(self, what: str) -> Pace:
+        """Return how fast one thread does what it does here, as far as it is known to the thread that asks."""
+        paces: dict[str, Pace] = vars(self._threads).setdefault("paces", {})
+        return paces.get(what) or paces.setdefault(what, Pace())
 
     @functools.cached_property
     def _threads(self) -> threading.local:

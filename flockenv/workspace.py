@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from flockenv.effects.base import ties
 from flockenv.kernels import LINE
-from flockenv.neighbours import MAX_RANGES, WORTH_ARRANGING
+from flockenv.neighbours import FEWEST_ARRANGED, MAX_RANGES
 from flockenv.state import Body
 from flockenv.sweep import SMALL_STRIDE, Parts, Table
 from flockenv.tree import BUCKETS, LEVELS, tree_sizes
@@ -44,7 +44,7 @@ class Workspace:
         width = parts.width
         padded = -(-agents // width) * width
         sorts = parts.sweeps and parts.sorts
-        carried = agents if parts.arranges and agents >= WORTH_ARRANGING else 1
+        carried = agents if parts.arranges and agents >= FEWEST_ARRANGED else 1
         swept, cells = padded if parts.sweeps else 1, agents if sorts else 1
         real: dict[str, int | tuple[int, ...]] = {
             **dict.fromkeys(("pos", "vel", "want"), padded * d),

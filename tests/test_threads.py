@@ -28,7 +28,7 @@ from flockenv.crew import share, threads, use_threads
 from flockenv.effects import Drag
 from flockenv.integrators import ImplicitEuler
 from flockenv.kernels import cache_folder
-from flockenv.neighbours import WORTH_ARRANGING
+from flockenv.neighbours import FEWEST_ARRANGED, STEPS_ARRANGED, WORTH_ARRANGING
 from flockenv.scene import Group, Scene
 from flockenv.space import Box
 from flockenv.spawn import Spawn
@@ -190,6 +190,20 @@ def test_a_call_of_many_steps_is_many_calls_of_one(name: str) -> None:
     assert not np.array_equal(np.argsort(start.x[0, 0]), np.argsort(expected.x[0, 0]))  # they changed places
 
 
+def test_a_team_puts_fewer_agents_in_order_than_one_thread() -> None:
+    scene = NAMED["torus_single"].make(FEWEST_ARRANGED, 70.0)
+    start = scene.start(3)
+    start.x[...] = np.random.default_rng(1).permuted(start.x, axis=2)
+    expected = scene.step(start, steps=STEPS_ARRANGED)
+    for team, count in ((2, STEPS_ARRANGED - 1), (2, STEPS_ARRANGED), (3, STEPS_ARRANGED)):
+        use_threads(team)
+        found = scene.step(start, steps=count)
+        luggage = scene._workspaces(1, team)[0].arrays["luggage"]
+        assert luggage.any() == (count == STEPS_ARRANGED)
+        assert_same(scene.step(found, steps=STEPS_ARRANGED - count), expected)
+    assert not scene._workspaces(1, 1)[0].arrays["luggage"].any()
+
+
 def scene_is_flat(name: str) -> bool:
     return NAMED[name].dimension == 2
 
@@ -278,22 +292,69 @@ def test_more_threads_than_there_is_work_for_do_no_harm() -> None:
 @pytest.mark.parametrize("count", [33, 300])
 def test_worlds_divided_among_threads_are_the_same_worlds(variant: Variant, count: int, shared: list[int]) -> None:
     scene = variant.make(count, 20.0)
-    steps = 1 + scenes.WORTH_SHARING // (7 * count)
     start = started(scene, worlds=7)
-    expected = scene.run(start, steps)
-    for threads_used in (2, 3, 8):
+    expected = scene.run(start, 4)
+    for threads_used in (2, 3, 7):
         use_threads(threads_used)
-        assert_same(scene.run(start, steps), expected)
+        assert_same(scene.run(start, 4), expected)
     assert shared == [2, 3, 7]
 
 
-def test_little_work_is_not_shared(shared: list[int]) -> None:
+def test_work_is_shared_where_it_is_sooner_done(shared: list[int], monkeypatch: pytest.MonkeyPatch) -> None:
+    """By what is known: at first that of many steps of many agents, then what one thread took longer for."""
+    monkeypatch.setattr(crew, "_toll", 1e-3)
+    monkeypatch.setattr(crew, "WAITING", 1e-4)
     use_threads(2)
+    for agents, worlds, waits in ((64, 8, 0), (640, 1, 1)):
+        shared.clear()
+        scene = NAMED["torus"].make(agents, 60.0)
+        start = scene.start(0, worlds=worlds)
+        for _ in range(5):
+            scene.run(start, 1)
+        assert shared == []
+        scene._pace("moving").each = 2.1 * (2e-3 + 1e-4 * waits) / (agents * worlds)  # s; two spare half of it
+        scene.run(start, 1)
+        assert shared == [2]
+        scene._pace("moving").each *= 0.9
+        scene.run(start, 1)
+        assert shared == [2]
+    shared.clear()
     scene = NAMED["torus"].make(64, 20.0)
-    scene.run(scene.start(0, worlds=8), 1)
-    assert shared == []
-    scene.run(scene.start(0, worlds=8), 8)
+    scene.run(scene.start(0, worlds=8), 1000)  # half a million at 10 ns each, whoever they are
     assert shared == [2]
+
+
+def test_a_pace_is_learned_from_all_but_the_first_piece(monkeypatch: pytest.MonkeyPatch) -> None:
+    now = iter([0.0, 9.0, 10.0, 10.4, 20.0, 20.8])  # s: begun and done, three times
+    monkeypatch.setattr(crew, "perf_counter", now.__next__)
+    pace = crew.Pace()
+    assert pace.alone(100, lambda: "compiled") == "compiled"
+    assert pace.each == 0
+    pace.alone(100, lambda: None)
+    assert pace.each == pytest.approx(4e-3)
+    pace.alone(100, lambda: None)
+    assert pace.each == pytest.approx(5e-3)  # three parts of what was known, one of what was seen: 8e-3
+
+
+def test_who_spares_little_is_looked_at_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Scenes change: every so often one thread does it, and its pace is learned anew."""
+    monkeypatch.setattr(crew, "_toll", 1e-4)
+    pace = crew.Pace()
+    pace.each = 6e-4  # s; of which two threads spare half, and 2e-4 is lost
+    assert [pace.worth(1, 2) for _ in range(2 * crew.DOUBTED)].count(False) == 2
+    pace.each = 6e-3
+    assert all(pace.worth(1, 2) for _ in range(2 * crew.DOUBTED))
+    assert not pace.worth(0, 2)
+
+
+def test_how_long_it_takes_to_share_is_tried_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(crew, "_toll", None)
+    asked = []
+    monkeypatch.setattr(crew, "share", lambda jobs: asked.append(len(jobs)))
+    for _ in range(2):
+        crew.Pace().worth(1, 2)
+    assert asked == [2] * crew.TRIALS
+    assert crew._toll is not None and 0 < crew._toll <= crew.LONGEST
 
 
 # --- a number that is none, found by any thread -----------------------------------------------------------------------

@@ -14,7 +14,6 @@ import pytest
 from flockenv.crew import threads, use_threads
 from flockenv.kernels import settled
 from flockenv.noise import key_of, keys_of
-from flockenv.scene import WORTH_SHARING
 from flockenv.tasks import Crossing, Flock, Obstacles, Pursuit
 from flockenv.tasks.base import task_source
 from flockenv.world import AT_HAND, PAST, Step, World, _portions
@@ -491,7 +490,6 @@ def test_an_action_that_is_no_number_is_refused_by_name_and_moves_nobody(
 def test_so_it_is_where_threads_share_the_worlds(value: float, place: tuple[int, int, int]) -> None:
     """All actions are looked at before any thread moves anybody."""
     world, before = World(Flock(), 200), threads()
-    assert world.worlds * world.agents >= WORTH_SHARING
     world.reset(2)
     actions, kept = np.zeros((200, 24, 2)), everything(world)
     actions[place] = value

@@ -9,7 +9,7 @@ agents are met in the order of their numbers all the same.
 
 from __future__ import annotations
 
-from flockenv.neighbours import HANDFUL, WORTH_ARRANGING
+from flockenv.neighbours import FEWEST_ARRANGED, HANDFUL, STEPS_ARRANGED, WORTH_ARRANGING
 from flockenv.sweep.parts import Parts
 from flockenv.sweep.query import counted
 from flockenv.sweep.text import indented, indented_lines, place_of
@@ -27,7 +27,8 @@ def move_in(parts: Parts) -> list[str]:
     to = ["c = np.uint64(cell[i])", "cell[i] = offset[rank, c]", "offset[rank, c] += 1"]
     return [
         "arranged = False",
-        f"if count > 1 and n >= {WORTH_ARRANGING} and present == n:",
+        f"least = {FEWEST_ARRANGED} if team > 1 and count >= {STEPS_ARRANGED} else {WORTH_ARRANGING}",
+        "if count > 1 and n >= least and present == n:",
         f"    shape = {counted(parts, parts.confines, HANDFUL)}",
         "    arranged = shape[0] > 0",
         "if arranged:",
