@@ -20,6 +20,7 @@ from flockenv.effects.base import ties
 from flockenv.elementary import nearest_whole
 from flockenv.inlining import Inlined, Whole
 from flockenv.kernels import LINE, like, unaliased
+from flockenv.lines import zeros
 from flockenv.processor import REGISTER
 from flockenv.scene import Scene
 from flockenv.state import State
@@ -318,11 +319,12 @@ def by_hand(mix: str, scene: Scene, state: State, steps: int) -> Callable[[], ob
     cosine = math.cos(math.radians(scene.effects[0].sight.fov) / 2)
     numbers = [scene.space.extent(2)[0], *(r.radius**2 if r else 0 for r in found)]
     numbers += [*(r.weight if r else 0 for r in found), cosine * abs(cosine)]
-    body = np.ones((3, padded), real)
+    body = zeros((3, padded), real)
+    body[...] = 1
     body[:, : scene.agents] = scene.body.mass, scene.body.max_speed, scene.body.max_force
-    now, want, sums = (np.zeros(shape, real) for shape in ((ROWS, padded), (2, padded), (10 * width,)))
+    now, want, sums = (zeros(shape, real) for shape in ((ROWS, padded), (2, padded), (10 * width,)))
     now[7:, : scene.agents] = ties(scene.agents, 2).T
-    counts = np.zeros(3 * width, real if REGISTER == LINE else f"i{real.itemsize}")
+    counts = zeros(3 * width, real if REGISTER == LINE else f"i{real.itemsize}")
     arguments = (
         state.x, state.v, state.alive, np.zeros((2, 0, 0), real), body, state.work, np.array(numbers, real),
         real.type(scene.dt), steps, now, want, sums, counts,
