@@ -2,7 +2,8 @@
 
 One thread unless asked for more: waiting threads spin, and where another process has the second core that costs more
 than it brings. `use_threads(2)`, or FLOCKENV_THREADS=2 in the environment. Results do not depend on the number. Work is
-shared where that is sooner done (`Pace`): it is handed over in 20 microseconds, or, on a virtual machine, in 100.
+shared where that is sooner done (`Choice`): to hand it over takes 20 microseconds, or, on a virtual machine, 100. More
+threads than there are cores wait for each other in vain: there are never more at work.
 
 On Linux the other threads keep off the core of the thread that shares its work: woken after a pause, they are put there
 often, and two halves of the work are then done one after the other.
@@ -12,34 +13,31 @@ from __future__ import annotations
 
 import contextlib
 import ctypes
+import math
 import os
 import queue
-import statistics
 import threading
 from collections.abc import Callable, Sequence
 from time import perf_counter
 from typing import Any, TypeVar
 
-__all__ = ["Pace", "share", "threads", "use_threads"]
+__all__ = ["Choice", "Choices", "at_work", "share", "threads", "use_threads"]
 
 T = TypeVar("T")
 
 _MOST = 256
 
-QUICKEST = 1e-8
-"""s that a step of an agent takes at least, until it is known better."""
+SHORTEST = 4e-5
+"""s: what one thread has done by then is not shared; to hand it over takes 20 microseconds, on some machines 100."""
 
-WAITING = 4e-5
-"""s that a team of threads loses with each step of a world: they wait for each other, and for what others wrote."""
+LARGEST = 500_000
+"""Steps of agents, each of which takes some 10 ns at least: so much work is always shared."""
 
-TRIALS = 15
-"""How often nothing is shared, to see how long that takes."""
+AGAIN, SELDOM = 64, 4096
+"""After so many pieces of work what was slower is tried again; each time that it still is, after twice as many."""
 
-LONGEST = 3e-4
-"""s: handing work over takes no longer, whatever else the cores were doing when that was tried."""
-
-DOUBTED = 64
-"""Where sharing spares little, one thread does every so many-th piece of work, to see how long it takes by now."""
+RISE = 1.25
+"""Who is held up by something else once is not thought that much slower: only this much, at most."""
 
 
 class _Crew:
@@ -103,12 +101,18 @@ def _work(desk: queue.SimpleQueue[Any]) -> None:
 
 
 _count = 1
+_cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 _crew: _Crew | None = None
 
 
 def threads() -> int:
     """Return how many threads a step may use."""
     return _count
+
+
+def at_work() -> int:
+    """Return how many threads it does use, where that is sooner done: as many as this process has cores, at most."""
+    return min(_count, _cores)
 
 
 def use_threads(count: int) -> None:
@@ -148,50 +152,57 @@ def share(jobs: Sequence[Callable[[], Any]]) -> list[Any]:
     return [first, *(result for result, _ in rest)]
 
 
-def _tried() -> float:
-    """Return how long it takes to hand nothing over, and to have the answer, s."""
-    took = []
-    for _ in range(TRIALS):
-        began = perf_counter()
-        share([int, int])
-        took.append(perf_counter() - began)
-    return min(statistics.median(took), LONGEST)
+class Choice:
+    """Is work of one kind and size sooner done by one thread or by several? Both are tried, and, seldom, tried again.
 
-
-_toll: float | None = None
-
-
-class Pace:
-    """How long one thread takes for pieces of work of one kind, in steps of agents: are they sooner done by several?
-
-    Learned from what one thread took; of the first piece nothing is, for it may have been compiled. So it is known
-    after two, but what is large at any pace is shared at once. To hand work over takes twice as long as was tried:
-    between two pieces threads fall asleep, and cores.
+    Of either the first piece does not count: kernels are compiled in it, or threads are made. What is sooner done
+    depends on how the system wakes threads and on what else its cores do, so it is not worked out but seen.
     """
 
+    always = False  # share everything: tests do, which are about results
+
     def __init__(self) -> None:
-        self.each, self._done, self._shared = 0.0, 0, 0
+        self.took = [math.inf, math.inf]  # s, by one thread and by several
+        self._done = [0, 0]
+        self._pieces, self._next, self._pause = 0, AGAIN, AGAIN
 
-    def worth(self, work: int, count: int, waits: int = 0) -> bool:
-        """Are so many steps of agents sooner done by `count` threads? waits: of which they make how many together."""
-        global _toll
-        if _toll is None:
-            _toll = _tried()
-        spared, cost = max(self.each, QUICKEST) * work * (1 - 1 / count), 2 * _toll + waits * WAITING
-        if spared <= cost:
-            return False
-        self._shared += 1
-        return self._shared % DOUBTED != 0 or spared > 4 * cost
+    def several(self, work: int) -> bool:
+        """Are several threads to do the next piece of work, so many steps of agents?"""
+        if self.always or work >= LARGEST:
+            return True
+        for k in (0, 1):
+            if self._done[k] < 2:
+                return k == 1 and self.took[0] >= SHORTEST
+        best = self.took[1] < self.took[0]
+        self._pieces += 1
+        if self._pieces < self._next:
+            return best
+        self._next = self._pieces + self._pause
+        self._pause = min(2 * self._pause, SELDOM)
+        return not best and self.took[0] >= SHORTEST
 
-    def alone(self, work: int, job: Callable[[], T]) -> T:
-        """Do so many steps of agents in this thread, and learn from it how long they take; return what the job does."""
+    def made(self, work: int, alone: Callable[[], T], shared: Callable[[], T]) -> T:
+        """Do a piece of work in one of two ways, and remember how long it took; return what it returns."""
+        k = int(self.several(work))
         began = perf_counter()
-        result = job()
+        result = (alone, shared)[k]()
         seconds = perf_counter() - began
-        self._done += 1
-        if self._done > 1 and work > 0:
-            self.each += (seconds / work - self.each) * (1.0 if self.each == 0 else 0.25)
+        best = self.took[1] < self.took[0]
+        self._done[k] += 1
+        if self._done[k] > 1:
+            self.took[k] = min(seconds, RISE * self.took[k])
+        if (self.took[1] < self.took[0]) != best:
+            self._pause = AGAIN
         return result
+
+
+class Choices(dict[tuple[Any, ...], Choice]):
+    """A choice for each kind of work, and for each size, up to a factor of two."""
+
+    def of(self, kind: str, work: int, count: int) -> Choice:
+        """Return that of so many steps of agents and so many threads."""
+        key = kind, work.bit_length(), count
+        return self.get(key) or self.setdefault(key, Choice())
 
 
 def _from_environment() -> None:

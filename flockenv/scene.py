@@ -23,7 +23,7 @@ from pydantic import Field, WrapValidator, model_validator
 from flockenv import state as states
 from flockenv.appearance import Appearance
 from flockenv.constraints import CONSTRAINTS, Collisions, Constraint, Settler
-from flockenv.crew import Pace, share, threads
+from flockenv.crew import Choices, at_work, share
 from flockenv.divergence import SimulationDiverged
 from flockenv.effects import EFFECTS, Effect
 from flockenv.effects.base import all_masses
@@ -54,7 +54,7 @@ from flockenv.workspace import Workspace
 __all__ = ["Group", "Scene"]
 
 FEWEST_TOGETHER = 128
-"""Agents of a world below which threads do not share it."""
+"""Agents of a world from which on threads may share it: 8 blocks, or more."""
 
 EXACT = 2**24
 """Whole numbers, and so numbers of agents, that float32 tells apart."""
@@ -572,17 +572,20 @@ class Scene(Record):
     def _mended(self, x0: Floats, v0: Floats, state: State) -> list[tuple[int, int]]:
         """Mend a step that began at x0, v0, constraint after constraint; return every (world, agent) not finite."""
         worlds, agents, _ = state.shape
-        crew, work, pace = min(threads(), worlds), worlds * agents, self._pace("mending")
-        crew = crew if crew > 1 and pace.worth(work, crew) else 1
-        settlers = self._settlers(crew)
+        crew, work = min(at_work(), worlds), worlds * agents
 
-        def settle(k: int) -> list[tuple[int, int]]:
-            part = worlds * k // crew, worlds * (k + 1) // crew
-            return [bad for each in settlers[k] if (bad := each(x0, v0, state, *part))[0] >= 0]
+        def settle(settlers: list[Settler], first: int, end: int) -> list[tuple[int, int]]:
+            return [bad for each in settlers if (bad := each(x0, v0, state, first, end))[0] >= 0]
 
-        if crew == 1:
-            return pace.alone(work, functools.partial(settle, 0))
-        return [bad for found in share([functools.partial(settle, k) for k in range(crew)]) for bad in found]
+        def alone() -> list[tuple[int, int]]:
+            return settle(self._settlers(1)[0], 0, worlds)
+
+        def shared() -> list[tuple[int, int]]:
+            bounds = [worlds * k // crew for k in range(crew + 1)]
+            parts = zip(self._settlers(crew), bounds[:-1], bounds[1:], strict=False)
+            return [bad for found in share([functools.partial(settle, *part) for part in parts]) for bad in found]
+
+        return alone() if crew <= 1 else self._choices.of("mending", work, crew).made(work, alone, shared)
 
     def _settlers(self, count: int) -> list[list[Settler]]:
         """Return what mends steps, for so many threads: each has scratch of its own."""
@@ -599,40 +602,40 @@ class Scene(Record):
         """
         worlds, agents, _ = state.shape
         move, scratch = self._kernels.step, self._kernels.SCRATCH
-        crew, team = self._divided(worlds, agents, steps) if threads() > 1 else (1, 1)
         arrays = (
             state.x, state.v, *state.carried, state.alive, state.tick, state.key, state.obstacle_x,
             state.obstacle_radius, state.work, drive, self._params, self._dt, steps,
         )  # fmt: skip
-        if crew == 1:
-            only = self._workspaces(1, 1)[0]
-            whole = functools.partial(move, *arrays, 0, worlds, 0, 1, *only.of(0, scratch))
-            if threads() > 1:
-                return self._pace("moving").alone(worlds * agents * steps, whole)  # type: ignore[no-any-return]
-            return whole()  # type: ignore[no-any-return]
-        spaces = self._workspaces(crew // team, team)
-        spaces[0].arrays["sync"][:] = 0
-        found = share([
-            functools.partial(
-                move, *arrays, *((0, worlds) if team > 1 else (worlds * k // crew, worlds * (k + 1) // crew)),
-                k % team, team, *spaces[k // team].of(k % team, scratch),
-            )
-            for k in range(crew)
-        ])  # fmt: skip
-        bad = [(world, agent) for world, agent in found if world >= 0]
-        return min(bad, default=(-1, -1))
 
-    def _divided(self, worlds: int, agents: int, steps: int) -> tuple[int, int]:
-        """Return how many threads step so many worlds, and how many of them each world together: where it is worth it.
+        crew, team = self._divided(worlds, agents)
+
+        def alone() -> tuple[int, int]:
+            return move(*arrays, 0, worlds, 0, 1, *self._workspaces(1, 1)[0].of(0, scratch))  # type: ignore[no-any-return]
+
+        def shared() -> tuple[int, int]:
+            spaces = self._workspaces(crew // team, team)
+            spaces[0].arrays["sync"][:] = 0
+            parts = [(0, worlds) if team > 1 else (worlds * k // crew, worlds * (k + 1) // crew) for k in range(crew)]
+            found = share([
+                functools.partial(move, *arrays, *parts[k], k % team, team, *spaces[k // team].of(k % team, scratch))
+                for k in range(crew)
+            ])  # fmt: skip
+            return min([bad for bad in found if bad[0] >= 0], default=(-1, -1))
+
+        if crew <= 1:
+            return alone()
+        work = worlds * agents * steps
+        choice = self._choices.of("together" if team > 1 else "apart", work, crew)
+        return choice.made(work, alone, shared)
+
+    def _divided(self, worlds: int, agents: int) -> tuple[int, int]:
+        """Return how many threads may step so many worlds, and how many of them each world together.
 
         Under a method that solves equations, what was solved for lies in one thread's scratch.
         """
-        crew, work, pace = threads(), worlds * agents * steps, self._pace("moving")
-        together = not (self.integrator.adaptive or self.integrator.solves) and agents >= FEWEST_TOGETHER
-        if worlds < crew and together and pace.worth(work, crew, worlds * steps):
-            return crew, crew
-        apart = min(crew, worlds)
-        return (apart if apart > 1 and pace.worth(work, apart) else 1), 1
+        crew, solves = at_work(), self.integrator.adaptive or self.integrator.solves
+        together = worlds < crew and agents >= FEWEST_TOGETHER and not solves
+        return (crew, crew) if together else (min(crew, worlds), 1)
 
     def _check(self, state: State, steps: int) -> None:
         """Refuse what the kernel would not notice: it trusts the sizes of its arrays."""
@@ -694,10 +697,11 @@ class Scene(Record):
             found.append(Workspace.allocate(self.parts, self.body, self.table, team))
         return found
 
-    def _pace(self, what: str) -> Pace:
-        """Return how fast one thread does what it does here, as far as it is known to the thread that asks."""
-        paces: dict[str, Pace] = vars(self._threads).setdefault("paces", {})
-        return paces.get(what) or paces.setdefault(what, Pace())
+    @property
+    def _choices(self) -> Choices:
+        """What is known of how work is sooner done here, to the thread that asks."""
+        found: Choices = vars(self._threads).setdefault("choices", Choices())
+        return found
 
     @functools.cached_property
     def _threads(self) -> threading.local:

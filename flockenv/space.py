@@ -41,7 +41,7 @@ def _shortest(d: float, length: float) -> float:
 
 @law
 def torus_offset(size: Vec, a: Vec, b: Vec) -> Vec:
-    """Return the shortest way from a to b (minimum image), from however many boxes away.
+    """Return the shortest way from a to b (minimum image), from as many boxes away as numbers tell places apart.
 
     Two that are half a box apart are so in opposite directions, each seen from the other.
     """

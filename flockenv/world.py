@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from flockenv import state as states
 from flockenv.abreast import PAIR, apart
-from flockenv.crew import Pace, share, threads
+from flockenv.crew import Choices, at_work, share
 from flockenv.kernels import LINE, load, settled
 from flockenv.lines import zeros
 from flockenv.noise import MASK, keys_of
@@ -131,7 +131,7 @@ class World:
         )  # fmt: skip
         self._counted = (self.steps, np.array(numbers[1], float), self._last, self._sums)
         self._alone = np.empty((len(task.metric_names), 1))  # metrics of one world
-        self._scratch, self._pace = [self._allocate()], Pace()
+        self._scratch, self._choices = [self._allocate()], Choices()
         self._hire()
 
     def _hire(self) -> None:
@@ -169,7 +169,7 @@ class World:
     def __getstate__(self) -> dict[str, Any]:
         """Pickle what cannot be made anew."""
         made = (
-            "_kernel", "_enter", "_tell", "_actions", "_always", "_scratch", "_pace", "_calls", "_counted", "_alone",
+            "_kernel", "_enter", "_tell", "_actions", "_always", "_scratch", "_choices", "_calls", "_counted", "_alone",
             "_shapes", "_dtypes", "_everywhere", "_untold", "_fresh", "_past",
         )  # fmt: skip
         return {name: value for name, value in vars(self).items() if name not in made}
@@ -283,17 +283,25 @@ class World:
 
         everyone: are all observed where only some begin, and told their terms? Return who is not finite, or (-1, -1).
         """
-        crew, work = min(threads(), busy), busy * self.agents * self.task.substeps
-        crew = crew if crew > 1 and self._pace.worth(work, crew) else 1
+        crew, work = min(at_work(), busy), busy * self.agents * self.task.substeps
+        whole = acting, mask, everyone, acting, 0, self.worlds, actions, limit, *told
+        if crew <= 1:
+            return self._calls[0](*whole)
+
+        def shared() -> tuple[int, int]:
+            return self._shared(crew, acting, mask, everyone, limit, told, actions)
+
+        choice = self._choices.of("deciding" if acting else "beginning", work, crew)
+        return choice.made(work, functools.partial(self._calls[0], *whole), shared)
+
+    def _shared(
+        self, crew: int, acting: bool, mask: NDArray[np.bool_], everyone: bool, limit: int,
+        told: tuple[NDArray[Any], ...], actions: NDArray[Any],
+    ) -> tuple[int, int]:  # fmt: skip
+        """Do what `_play` does by so many threads."""
         if crew > len(self._scratch):
             self._scratch += [self._allocate() for _ in range(crew - len(self._scratch))]
             self._hire()
-
-        if crew == 1:
-            given = acting, mask, everyone, acting, 0, self.worlds, actions, limit, *told
-            if acting and threads() > 1:
-                return self._pace.alone(work, functools.partial(self._calls[0], *given))
-            return self._calls[0](*given)
         if acting and self._calls[0](True, mask, everyone, True, 0, 0, actions, limit, *told)[0] == REFUSED:
             return REFUSED, 0  # nobody moves before all were looked at
         portions = iter(_portions(self.worlds, crew))  # whoever is done takes the next

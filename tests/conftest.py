@@ -21,8 +21,8 @@ hypothesis.settings.register_profile("flockenv", derandomize=True, deadline=None
 hypothesis.settings.load_profile("flockenv")
 
 
-# Where a test asks for threads they share all work, however little: how soon it is done is not what is tested.
-crew.WAITING, crew._toll = 0.0, 0.0
+# Where a test asks for threads all of them share all work, however little: how soon it is done is not what is tested.
+crew.Choice.always, crew._cores = True, 64
 
 
 RARE = {

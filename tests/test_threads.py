@@ -33,6 +33,8 @@ from flockenv.scene import Group, Scene
 from flockenv.space import Box
 from flockenv.spawn import Spawn
 from flockenv.state import State
+from flockenv.tasks import Flock
+from flockenv.world import World
 from tests.catalogue import VARIANTS, Variant
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -166,6 +168,19 @@ def test_a_team_goes_through_the_worlds_of_a_small_batch_of_large_ones(shared: l
         assert shared == [parts]
 
 
+@pytest.mark.parametrize("name", ["torus", "box"])
+@pytest.mark.parametrize("count", [scenes.FEWEST_TOGETHER, 333])
+def test_a_team_of_many_takes_the_step_of_few_agents(name: str, count: int, shared: list[int]) -> None:
+    """Some of them have no block, or no row of cells, of their own."""
+    scene = NAMED[name].make(count, 20.0)
+    start = started(scene)
+    expected = scene.run(start, 5)
+    for team in (2, 3, 9):
+        use_threads(team)
+        assert_same(scene.run(start, 5), expected)
+    assert shared == [2, 3, 9]
+
+
 def crowded(scene: Scene) -> tuple[Scene, State]:
     """The same with bodies of two kinds, mixed up in space, large enough to be put in order during a call."""
     half = scene.groups[0].model_copy(update={"count": WORTH_ARRANGING // 2 + 3})
@@ -294,67 +309,111 @@ def test_worlds_divided_among_threads_are_the_same_worlds(variant: Variant, coun
     scene = variant.make(count, 20.0)
     start = started(scene, worlds=7)
     expected = scene.run(start, 4)
-    for threads_used in (2, 3, 7):
+    for threads_used in (2, 3, 7, 8):
         use_threads(threads_used)
         assert_same(scene.run(start, 4), expected)
-    assert shared == [2, 3, 7]
+    assert shared == [2, 3, 7, 8 if count >= scenes.FEWEST_TOGETHER else 7]  # worlds apart, or a team of 8
 
 
-def test_work_is_shared_where_it_is_sooner_done(shared: list[int], monkeypatch: pytest.MonkeyPatch) -> None:
-    """By what is known: at first that of many steps of many agents, then what one thread took longer for."""
-    monkeypatch.setattr(crew, "_toll", 1e-3)
-    monkeypatch.setattr(crew, "WAITING", 1e-4)
+class Clock:
+    """Says how late it is, which is as late as is told."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.now, self.by = 0.0, [""]
+        monkeypatch.setattr(crew, "perf_counter", lambda: self.now)
+        monkeypatch.setattr(crew.Choice, "always", False)
+
+    def done(self, choice: crew.Choice, alone: float, shared: float, pieces: int, work: int = 1) -> str:
+        """By whom so many pieces are done, a letter each, if these are the seconds that they take."""
+        by = []
+
+        def way(letter: str, seconds: float) -> Callable[[], None]:
+            def job() -> None:
+                by.append(letter)
+                self.now += seconds
+
+            return job
+
+        for _ in range(pieces):
+            choice.made(work, way("a", alone), way("s", shared))
+        return "".join(by)
+
+
+def test_both_ways_are_tried_and_the_sooner_one_is_kept(monkeypatch: pytest.MonkeyPatch) -> None:
+    clock = Clock(monkeypatch)
+    assert clock.done(crew.Choice(), 1.0, 0.6, 10) == "aass" + 6 * "s"
+    assert clock.done(crew.Choice(), 1.0, 1.2, 10) == "aass" + 6 * "a"
+    assert clock.done(crew.Choice(), crew.SHORTEST / 2, 0.0, 200) == 200 * "a"  # too short to share
+    assert clock.done(crew.Choice(), 0.0, 9.0, 5, work=crew.LARGEST) == 5 * "s"  # too long to try
+
+
+def test_what_was_slower_is_tried_again_ever_more_seldom(monkeypatch: pytest.MonkeyPatch) -> None:
+    clock = Clock(monkeypatch)
+    by = clock.done(crew.Choice(), 1.0, 1.2, 20_000)[4:]
+    tried = [k for k, letter in enumerate(by) if letter == "s"]
+    assert np.diff(tried)[:4].tolist() == [crew.AGAIN, 2 * crew.AGAIN, 4 * crew.AGAIN, 8 * crew.AGAIN]
+    assert np.diff(tried).max() == crew.SELDOM
+
+
+@pytest.mark.parametrize("sooner", [0, 1])
+def test_nothing_that_happens_once_decides_for_ever(sooner: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Somebody is held up, or what is sooner done changes."""
+    clock, choice, wanted = Clock(monkeypatch), crew.Choice(), "as"[sooner]
+    usual, late = (0.5, 1.0) if sooner == 0 else (1.0, 0.5), 100.0
+    clock.done(choice, *usual, 100)
+    for held_up in ((late, usual[1]), (usual[0], late)):
+        clock.done(choice, *held_up, 1)
+        assert clock.done(choice, *usual, 3 * crew.AGAIN).count(wanted) > 3 * crew.AGAIN - 5
+    clock.done(choice, *usual[::-1], 2 * crew.SELDOM)
+    assert clock.done(choice, *usual[::-1], 100).count(wanted) < 5
+    first_late = crew.Choice()
+    clock.done(first_late, late, late, 4)
+    assert clock.done(first_late, *usual, 4 * crew.AGAIN)[-crew.AGAIN // 2 :].count(wanted) > crew.AGAIN // 2 - 3
+
+
+def test_a_piece_that_failed_is_nothing_to_go_by(monkeypatch: pytest.MonkeyPatch) -> None:
+    clock, choice = Clock(monkeypatch), crew.Choice()
+    clock.done(choice, 1.0, 0.6, 10)
+    before = list(choice.took)
+
+    def interrupted() -> None:
+        clock.now += 50
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        choice.made(1, interrupted, interrupted)
+    assert choice.took == before
+
+
+def test_scenes_and_worlds_keep_to_what_is_sooner_done(shared: list[int], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(crew.Choice, "always", False)
     use_threads(2)
-    for agents, worlds, waits in ((64, 8, 0), (640, 1, 1)):
+    scene = NAMED["torus"].make(640, 60.0)
+    start = scene.start(0)
+    expected = scene.run(start, 1)
+    assert shared == []
+    choice = scene._choices.of("together", 640, 2)
+    for took, by in (([1.0, 0.5], [2]), ([0.5, 1.0], [])):
+        choice._done, choice.took = [2, 2], took
         shared.clear()
-        scene = NAMED["torus"].make(agents, 60.0)
-        start = scene.start(0, worlds=worlds)
-        for _ in range(5):
-            scene.run(start, 1)
-        assert shared == []
-        scene._pace("moving").each = 2.1 * (2e-3 + 1e-4 * waits) / (agents * worlds)  # s; two spare half of it
+        assert_same(scene.run(start, 1), expected)
+        assert shared == by
+    world = World(Flock(), 200)
+    world.reset(0)
+    world.step(np.zeros((200, 24, 2)))
+    assert [kind for kind, *_ in world._choices] == ["beginning", "deciding"]
+
+
+def test_there_are_never_more_at_work_than_there_are_cores(shared: list[int], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(crew, "_cores", 3)
+    scene = NAMED["torus"].make(33, 20.0)
+    start = scene.start(0, worlds=7)
+    for asked, work in ((2, [2]), (8, [3]), (1, [])):
+        shared.clear()
+        use_threads(asked)
         scene.run(start, 1)
-        assert shared == [2]
-        scene._pace("moving").each *= 0.9
-        scene.run(start, 1)
-        assert shared == [2]
-    shared.clear()
-    scene = NAMED["torus"].make(64, 20.0)
-    scene.run(scene.start(0, worlds=8), 1000)  # half a million at 10 ns each, whoever they are
-    assert shared == [2]
-
-
-def test_a_pace_is_learned_from_all_but_the_first_piece(monkeypatch: pytest.MonkeyPatch) -> None:
-    now = iter([0.0, 9.0, 10.0, 10.4, 20.0, 20.8])  # s: begun and done, three times
-    monkeypatch.setattr(crew, "perf_counter", now.__next__)
-    pace = crew.Pace()
-    assert pace.alone(100, lambda: "compiled") == "compiled"
-    assert pace.each == 0
-    pace.alone(100, lambda: None)
-    assert pace.each == pytest.approx(4e-3)
-    pace.alone(100, lambda: None)
-    assert pace.each == pytest.approx(5e-3)  # three parts of what was known, one of what was seen: 8e-3
-
-
-def test_who_spares_little_is_looked_at_again(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Scenes change: every so often one thread does it, and its pace is learned anew."""
-    monkeypatch.setattr(crew, "_toll", 1e-4)
-    pace = crew.Pace()
-    pace.each = 6e-4  # s; of which two threads spare half, and 2e-4 is lost
-    assert [pace.worth(1, 2) for _ in range(2 * crew.DOUBTED)].count(False) == 2
-    pace.each = 6e-3
-    assert all(pace.worth(1, 2) for _ in range(2 * crew.DOUBTED))
-    assert not pace.worth(0, 2)
-
-
-def test_how_long_it_takes_to_share_is_tried_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(crew, "_toll", None)
-    asked = []
-    monkeypatch.setattr(crew, "share", lambda jobs: asked.append(len(jobs)))
-    for _ in range(2):
-        crew.Pace().worth(1, 2)
-    assert asked == [2] * crew.TRIALS
-    assert crew._toll is not None and 0 < crew._toll <= crew.LONGEST
+        assert shared == work
+        assert threads() == asked
 
 
 # --- a number that is none, found by any thread -----------------------------------------------------------------------

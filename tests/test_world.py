@@ -499,6 +499,7 @@ def test_so_it_is_where_threads_share_the_worlds(value: float, place: tuple[int,
             world.step(actions)
     finally:
         use_threads(before)
+    assert len(world._scratch) == 2  # they did share them
     assert_same(everything(world), kept)
 
 
