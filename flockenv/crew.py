@@ -33,6 +33,9 @@ SHORTEST = 4e-5
 LARGEST = 500_000
 """Steps of agents, each of which takes some 10 ns at least: so much work is always shared."""
 
+TRIAL = 3
+"""Pieces of work by which a way to do it is judged: the best of all but the first."""
+
 AGAIN, SELDOM = 64, 4096
 """After so many pieces of work what was slower is tried again; each time that it still is, after twice as many."""
 
@@ -155,31 +158,35 @@ def share(jobs: Sequence[Callable[[], Any]]) -> list[Any]:
 class Choice:
     """Is work of one kind and size sooner done by one thread or by several? Both are tried, and, seldom, tried again.
 
-    Of either the first piece does not count: kernels are compiled in it, or threads are made. What is sooner done
-    depends on how the system wakes threads and on what else its cores do, so it is not worked out but seen.
+    What is sooner done depends on how the system wakes threads and on what else its cores do, so it is not worked out
+    but seen. The first piece of a trial does not count: kernels are compiled in it, threads made, or woken.
     """
 
     always = False  # share everything: tests do, which are about results
 
     def __init__(self) -> None:
         self.took = [math.inf, math.inf]  # s, by one thread and by several
-        self._done = [0, 0]
-        self._pieces, self._next, self._pause = 0, AGAIN, AGAIN
+        self._tried, self._left, self._least = 0, TRIAL, math.inf  # which way, how many pieces yet, and their best
+        self._wait, self._pause = 0, AGAIN
+
+    @property
+    def best(self) -> int:
+        """What is sooner done, as far as is known: 0 by one thread, 1 by several."""
+        return int(self.took[1] < self.took[0])
 
     def several(self, work: int) -> bool:
         """Are several threads to do the next piece of work, so many steps of agents?"""
         if self.always or work >= LARGEST:
             return True
-        for k in (0, 1):
-            if self._done[k] < 2:
-                return k == 1 and self.took[0] >= SHORTEST
-        best = self.took[1] < self.took[0]
-        self._pieces += 1
-        if self._pieces < self._next:
-            return best
-        self._next = self._pieces + self._pause
-        self._pause = min(2 * self._pause, SELDOM)
-        return not best and self.took[0] >= SHORTEST
+        if not self._left:
+            if self._wait > 0:
+                self._wait -= 1
+                return bool(self.best)
+            self._try(1 - self.best)
+        if self._tried and self.took[0] < SHORTEST:
+            self._left, self._wait = 0, self._pause
+            return False
+        return bool(self._tried)
 
     def made(self, work: int, alone: Callable[[], T], shared: Callable[[], T]) -> T:
         """Do a piece of work in one of two ways, and remember how long it took; return what it returns."""
@@ -187,13 +194,27 @@ class Choice:
         began = perf_counter()
         result = (alone, shared)[k]()
         seconds = perf_counter() - began
-        best = self.took[1] < self.took[0]
-        self._done[k] += 1
-        if self._done[k] > 1:
+        if not self._left or k != self._tried:
             self.took[k] = min(seconds, RISE * self.took[k])
-        if (self.took[1] < self.took[0]) != best:
-            self._pause = AGAIN
+            return result
+        self._left -= 1
+        if self._left < TRIAL - 1:
+            self._least = min(self._least, seconds)
+        if not self._left:
+            self._judge()
         return result
+
+    def _try(self, way: int) -> None:
+        self._tried, self._left, self._least = way, TRIAL, math.inf
+
+    def _judge(self) -> None:
+        """Take over what a trial has shown; try the other way if it never was, else wait."""
+        before, self.took[self._tried] = self.best, self._least
+        if self.took[1] == math.inf:
+            self._try(1)
+        else:
+            self._pause = AGAIN if self.best != before else min(2 * self._pause, SELDOM)
+            self._wait = self._pause
 
 
 class Choices(dict[tuple[Any, ...], Choice]):
