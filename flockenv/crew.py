@@ -31,7 +31,7 @@ SHORTEST = 4e-5
 """s: what one thread has done by then is not shared; to hand it over takes 20 microseconds, on some machines 100."""
 
 LARGEST = 500_000
-"""Steps of agents, each of which takes some 10 ns at least: so much work is always shared."""
+"""Steps of agents, each of which takes some 10 ns at least: so much work is surely sooner done by several threads."""
 
 TRIAL = 3
 """Pieces of work by which a way to do it is judged: the best of all but the first."""
@@ -174,10 +174,8 @@ class Choice:
         """What is sooner done, as far as is known: 0 by one thread, 1 by several."""
         return int(self.took[1] < self.took[0])
 
-    def several(self, work: int) -> bool:
-        """Are several threads to do the next piece of work, so many steps of agents?"""
-        if self.always or work >= LARGEST:
-            return True
+    def several(self) -> bool:
+        """Are several threads to do the next piece of work?"""
         if not self._left:
             if self._wait > 0:
                 self._wait -= 1
@@ -188,9 +186,14 @@ class Choice:
             return False
         return bool(self._tried)
 
-    def made(self, work: int, alone: Callable[[], T], shared: Callable[[], T]) -> T:
-        """Do a piece of work in one of two ways, and remember how long it took; return what it returns."""
-        k = int(self.several(work))
+    def made(self, alone: Callable[[], T], shared: Callable[[], T], surely: bool = False) -> T:
+        """Do a piece of work in one of two ways, and remember how long it took; return what it returns.
+
+        surely: shared it is sooner done, and it is so large that it is never tried otherwise.
+        """
+        if surely or self.always:
+            return shared()
+        k = int(self.several())
         began = perf_counter()
         result = (alone, shared)[k]()
         seconds = perf_counter() - began

@@ -23,7 +23,7 @@ from pydantic import Field, WrapValidator, model_validator
 from flockenv import state as states
 from flockenv.appearance import Appearance
 from flockenv.constraints import CONSTRAINTS, Collisions, Constraint, Settler
-from flockenv.crew import Choices, at_work, share
+from flockenv.crew import LARGEST, Choices, at_work, share
 from flockenv.divergence import SimulationDiverged
 from flockenv.effects import EFFECTS, Effect
 from flockenv.effects.base import all_masses
@@ -53,8 +53,8 @@ from flockenv.workspace import Workspace
 
 __all__ = ["Group", "Scene"]
 
-FEWEST_TOGETHER = 128
-"""Agents of a world from which on threads may share it: 8 blocks, or more."""
+FEWEST_TOGETHER, SURELY_TOGETHER = 128, 4096
+"""Agents of a world from which on threads may share it (8 blocks, or more), and surely do in long calls."""
 
 EXACT = 2**24
 """Whole numbers, and so numbers of agents, that float32 tells apart."""
@@ -585,7 +585,7 @@ class Scene(Record):
             parts = zip(self._settlers(crew), bounds[:-1], bounds[1:], strict=False)
             return [bad for found in share([functools.partial(settle, *part) for part in parts]) for bad in found]
 
-        return alone() if crew <= 1 else self._choices.of("mending", work, crew).made(work, alone, shared)
+        return alone() if crew <= 1 else self._choices.of("mending", work, crew).made(alone, shared, work >= LARGEST)
 
     def _settlers(self, count: int) -> list[list[Settler]]:
         """Return what mends steps, for so many threads: each has scratch of its own."""
@@ -606,11 +606,13 @@ class Scene(Record):
             state.x, state.v, *state.carried, state.alive, state.tick, state.key, state.obstacle_x,
             state.obstacle_radius, state.work, drive, self._params, self._dt, steps,
         )  # fmt: skip
-
         crew, team = self._divided(worlds, agents)
 
         def alone() -> tuple[int, int]:
             return move(*arrays, 0, worlds, 0, 1, *self._workspaces(1, 1)[0].of(0, scratch))  # type: ignore[no-any-return]
+
+        if crew <= 1:
+            return alone()
 
         def shared() -> tuple[int, int]:
             spaces = self._workspaces(crew // team, team)
@@ -622,11 +624,9 @@ class Scene(Record):
             ])  # fmt: skip
             return min([bad for bad in found if bad[0] >= 0], default=(-1, -1))
 
-        if crew <= 1:
-            return alone()
         work = worlds * agents * steps
-        choice = self._choices.of("together" if team > 1 else "apart", work, crew)
-        return choice.made(work, alone, shared)
+        surely = work >= LARGEST and (team == 1 or agents >= SURELY_TOGETHER)
+        return self._choices.of("together" if team > 1 else "apart", work, crew).made(alone, shared, surely)
 
     def _divided(self, worlds: int, agents: int) -> tuple[int, int]:
         """Return how many threads may step so many worlds, and how many of them each world together.

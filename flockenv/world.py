@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from flockenv import state as states
 from flockenv.abreast import PAIR, apart
-from flockenv.crew import Choices, at_work, share
+from flockenv.crew import LARGEST, Choices, at_work, share
 from flockenv.kernels import LINE, load, settled
 from flockenv.lines import zeros
 from flockenv.noise import MASK, keys_of
@@ -292,7 +292,7 @@ class World:
             return self._shared(crew, acting, mask, everyone, limit, told, actions)
 
         choice = self._choices.of("deciding" if acting else "beginning", work, crew)
-        return choice.made(work, functools.partial(self._calls[0], *whole), shared)
+        return choice.made(functools.partial(self._calls[0], *whole), shared, work >= LARGEST)
 
     def _shared(
         self, crew: int, acting: bool, mask: NDArray[np.bool_], everyone: bool, limit: int,

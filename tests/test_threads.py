@@ -323,7 +323,7 @@ class Clock:
         monkeypatch.setattr(crew, "perf_counter", lambda: self.now)
         monkeypatch.setattr(crew.Choice, "always", False)
 
-    def done(self, choice: crew.Choice, alone: float, shared: float, pieces: int, work: int = 1) -> str:
+    def done(self, choice: crew.Choice, alone: float, shared: float, pieces: int, surely: bool = False) -> str:
         """By whom so many pieces are done, a letter each, if these are the seconds that they take."""
         by = []
 
@@ -335,7 +335,7 @@ class Clock:
             return job
 
         for _ in range(pieces):
-            choice.made(work, way("a", alone), way("s", shared))
+            choice.made(way("a", alone), way("s", shared), surely)
         return "".join(by)
 
 
@@ -344,7 +344,7 @@ def test_both_ways_are_tried_and_the_sooner_one_is_kept(monkeypatch: pytest.Monk
     assert clock.done(crew.Choice(), 1.0, 0.6, 10) == "aaasss" + 4 * "s"
     assert clock.done(crew.Choice(), 1.0, 1.2, 10) == "aaasss" + 4 * "a"
     assert clock.done(crew.Choice(), crew.SHORTEST / 2, 0.0, 200) == 200 * "a"  # too short to share
-    assert clock.done(crew.Choice(), 0.0, 9.0, 5, work=crew.LARGEST) == 5 * "s"  # too long to try
+    assert clock.done(crew.Choice(), 0.0, 9.0, 5, surely=True) == 5 * "s"  # too long to try
 
 
 def test_what_was_slower_is_tried_again_ever_more_seldom(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -383,7 +383,7 @@ def test_a_piece_that_failed_is_nothing_to_go_by(monkeypatch: pytest.MonkeyPatch
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        choice.made(1, interrupted, interrupted)
+        choice.made(interrupted, interrupted)
     assert choice.took == before
 
 
@@ -404,6 +404,21 @@ def test_scenes_and_worlds_keep_to_what_is_sooner_done(shared: list[int], monkey
     world.reset(0)
     world.step(np.zeros((200, 24, 2)))
     assert [kind for kind, *_ in world._choices] == ["beginning", "deciding"]
+
+
+@pytest.mark.parametrize(("count", "worlds", "surely"), [(640, 1, False), (640, 2, True), (4096, 1, True)])
+def test_long_calls_are_shared_at_once_where_threads_seldom_wait_for_each_other(
+    count: int, worlds: int, surely: bool, shared: list[int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Worlds apart, or one of many agents; whether a team on few is sooner done must have been seen."""
+    monkeypatch.setattr(crew.Choice, "always", False)
+    use_threads(2)
+    scene = NAMED["torus"].make(count, 60.0)
+    start, steps = scene.start(0, worlds=worlds), 1 + scenes.LARGEST // (count * worlds)
+    scene.run(start, steps - 2)
+    assert shared == []
+    scene.run(start, steps)
+    assert shared == [2] * surely
 
 
 def test_there_are_never_more_at_work_than_there_are_cores(shared: list[int], monkeypatch: pytest.MonkeyPatch) -> None:
