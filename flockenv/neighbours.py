@@ -18,8 +18,9 @@ from flockenv.kernels import ask_for, kernel, wait_for_team
 from flockenv.space import torus_confine
 
 __all__ = [
-    "AHEAD", "DISTANT", "FEWEST_AGENTS", "FEWEST_ARRANGED", "FINEST", "HANDFUL", "MAX_RANGES", "STEPS_ARRANGED",
-    "WORTH_ARRANGING", "candidates", "count_cells", "grid_of", "order_records", "row_of",
+    "AHEAD", "DISTANT", "FEWEST_AGENTS", "FEWEST_ARRANGED", "FINEST", "MAX_RANGES", "STEPS_ARRANGED",
+    "WORTH_ARRANGING", "begin_cells", "candidates", "cell_of", "count_cells", "divided", "grid_of", "order_records",
+    "row_of",
 ]  # fmt: skip
 
 MAX_RANGES = 27
@@ -39,10 +40,6 @@ STEPS_ARRANGED = 5
 
 DISTANT = 2**13
 """Agents from which on the places of records are asked for in good time: fewer lie in the nearest caches anyway."""
-
-HANDFUL = 16
-"""Agents that lie by number, not by cell, where a world is put in order: of those who then change cells about half as
-many come out of turn, and what is near in space is near in memory all the same. 8 and 32 are hardly slower."""
 
 AHEAD = 48
 """Records that are asked for before their turn comes; from 16 to 64 makes no difference."""
@@ -155,6 +152,36 @@ def _part(x: float, low: float, pace: float, count: int) -> Any:
 
 
 @kernel
+def divided(
+    pos: Any, living: Any, first: int, end: int, lanes: int, rank: int, team: int, sync: Any, bounds: Any, size: Any,
+    reach: float, periodic: bool, capacity: int,
+) -> tuple[tuple[int, int, int, int], Any, Any]:  # fmt: skip
+    """Return the cells as `grid_of` does, the corner of the region they divide, and cells per metre of each axis."""
+    low, lengths = region(pos, living, first, end, lanes, rank, team, sync, bounds, size, periodic)
+    shape = grid_of(lengths, capacity, reach, periodic)
+    if len(size) == 2:
+        return shape, low, (shape[0] / lengths[0], shape[1] / lengths[1])
+    else:
+        return shape, low, (shape[0] / lengths[0], shape[1] / lengths[1], shape[2] / lengths[len(size) - 1])
+
+
+@kernel
+def cell_of(pos: Any, at: Any, lanes: Any, low: Any, pace: Any, size: Any, wraps: bool, shape: Any) -> tuple[Any, ...]:
+    """Return the cell along each of three axes of the agent whose coordinates lie from `at` on, so many lanes apart."""
+    if len(size) == 2:
+        x: Any = (pos[at], pos[at + lanes])
+    else:
+        x = (pos[at], pos[at + lanes], pos[at + lanes + lanes])
+    if wraps:  # as it is sorted: -1e-17 is 0 there, and with a cell at the other end would miss neighbours
+        x, _ = torus_confine(size, size[0], x, x)
+    if len(size) == 2:
+        third: Any = np.int64(0)
+    else:
+        third = _part(x[len(size) - 1], low[len(size) - 1], pace[len(size) - 1], shape[2])
+    return _part(x[0], low[0], pace[0], shape[0]), _part(x[1], low[1], pace[1], shape[1]), third
+
+
+@kernel
 def _find_cells(
     pos: Any, living: Any, first: int, end: int, lanes: int, low: Any, pace: Any, size: Any, wraps: bool, shape: Any,
     cell: Ints,
@@ -163,62 +190,46 @@ def _find_cells(
     d, w = np.uint64(len(size)), np.uint64(lanes)
     for block in range(np.uint64(first), np.uint64(end)):
         for l in range(w):  # noqa: E741  # a lane
-            at = block * d * w + l
-            if len(size) == 2:
-                x: Any = (pos[at], pos[at + w])
-            else:
-                x = (pos[at], pos[at + w], pos[at + w + w])
-            if wraps:  # as it is sorted: -1e-17 is 0 there, and with a cell at the other end would miss neighbours
-                x, _ = torus_confine(size, size[0], x, x)
-            if len(size) == 2:
-                index: Any = np.int64(0)
-            else:
-                index = _part(x[len(size) - 1], low[len(size) - 1], pace[len(size) - 1], shape[2])
-            index = index * shape[1] + _part(x[1], low[1], pace[1], shape[1])
-            index = index * shape[0] + _part(x[0], low[0], pace[0], shape[0])
+            x, y, z = cell_of(pos, block * d * w + l, w, low, pace, size, wraps, shape)
+            index = (z * shape[1] + y) * shape[0] + x
             cell[block * w + l] = np.int32(index) if living[block * w + l] > 0 else np.int32(-1)
-
-
-@kernel
-def _join(cell: Ints, first: int, end: int, many: int) -> None:
-    """Let so many consecutive cells count as one, for these agents."""
-    for i in range(np.uint64(first), np.uint64(end)):
-        cell[i] = np.int32(cell[i] // many)  # -1 stays -1
 
 
 @kernel
 def count_cells(
     pos: Any, living: Any, first: int, end: int, lanes: int, rank: int, team: int, sync: Any, bounds: Any, size: Any,
-    reach: float, periodic: bool, wraps: bool, capacity: int, handful: int, cell: Ints, start: Ints, offset: Ints,
+    reach: float, periodic: bool, wraps: bool, capacity: int, cell: Ints, start: Ints, offset: Ints,
 ) -> tuple[int, int, int, int]:  # fmt: skip
     """Find the cell of every agent, and where in sorted order each cell begins; return the cells as grid_of does.
 
     pos: blocks of (D, lanes) m, to be brought into a periodic box first if it `wraps`; living (agents, padded) 0 or 1;
-    [first, end): this thread's blocks; capacity: most cells; handful: 0, or how many agents are to share a cell in the
-    mean: as many consecutive cells as that takes count as one in all that is written (`candidates` reads cells alone).
+    [first, end): this thread's blocks; capacity: most cells.
     Writes cell (agents, padded), -1 for the dead; start (capacity + 1,): first sorted agent of each cell;
     offset (team, capacity): where this thread puts its next agent of each cell. Returns zeros for brute force.
     """
-    low, lengths = region(pos, living, first, end, lanes, rank, team, sync, bounds, size, periodic)
-    shape = grid_of(lengths, capacity, reach, periodic)
+    shape, low, pace = divided(
+        pos, living, first, end, lanes, rank, team, sync, bounds, size, reach, periodic, capacity
+    )
     cells = shape[0] * shape[1] * shape[2]
     if cells == 0:
         return shape
     for c in range(cells):
         offset[rank, c] = 0
-    if len(size) == 2:
-        pace: Any = (shape[0] / lengths[0], shape[1] / lengths[1])
-    else:
-        pace = (shape[0] / lengths[0], shape[1] / lengths[1], shape[2] / lengths[len(size) - 1])
     _find_cells(pos, living, first, end, lanes, low, pace, size, wraps, shape, cell)
-    if handful > 0:
-        many = max(1, handful * cells // capacity)
-        _join(cell, first * lanes, end * lanes, many)
-        cells = (cells - 1) // many + 1
     for i in range(first * lanes, end * lanes):
         c = cell[i]
         if c >= 0:
             offset[rank, c] += 1
+    begin_cells(rank, team, sync, cells, start, offset)
+    return shape
+
+
+@kernel
+def begin_cells(rank: int, team: int, sync: Any, cells: int, start: Ints, offset: Ints) -> None:
+    """Write where in sorted order each cell begins, and in `offset` each thread's part of it, of which it has the size.
+
+    For all threads of a team at once: all have counted when it begins, and all are told when it ends.
+    """
     wait_for_team(sync, team)
     if rank == 0:
         total = 0
@@ -230,7 +241,6 @@ def count_cells(
                 total += here
         start[cells] = total
     wait_for_team(sync, team)
-    return shape
 
 
 @kernel

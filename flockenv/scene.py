@@ -297,6 +297,7 @@ class Scene(Record):
             whole += 24
         if parts.arranges and self.agents >= FEWEST_ARRANGED:
             reals += parts.luggage_size
+            whole += 6 * parts.homely  # strangers, and 32 bytes for a block of 16
         if self.constraints or self.population:
             reals += 4 * d + sum(constraint.numbers(self) for constraint in self.constraints)
         if self.population:

@@ -15,6 +15,7 @@ from flockenv.kernels import LINE
 from flockenv.neighbours import FEWEST_ARRANGED, MAX_RANGES
 from flockenv.state import Body
 from flockenv.sweep import SMALL_STRIDE, Parts, Table
+from flockenv.tiles import HOME
 from flockenv.tree import BUCKETS, LEVELS, tree_sizes
 
 __all__ = ["Workspace"]
@@ -66,6 +67,8 @@ class Workspace:
             "cell": (padded if sorts else 1,),
             "start": (cells + 1,),
             "offset": (team, cells),
+            "homes": (padded // width * HOME if parts.homely and carried > 1 else 1,),
+            "strangers": (padded + 1 if parts.homely and carried > 1 else 1,),
             "tree_place": (2 * padded if parts.treed else 1,),
         }
         wanted: dict[str, Any] = {name: (shape, np.dtype(dtype)) for name, shape in real.items()}

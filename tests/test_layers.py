@@ -33,7 +33,7 @@ LAYERS = (
     },
     {"records", "vec", "elementary", "noise", "kernels", "targets", "abreast", "lines", "transpose"},
     {"state", "space", "steering", "arbitration", "vehicle", "appearance", "spread", "urges"},
-    {"neighbours", "shapes", "grid", "eikonal", "orca", "polyline", "rows", "networks", "elements", "tree"},
+    {"neighbours", "tiles", "shapes", "grid", "eikonal", "orca", "polyline", "rows", "networks", "elements", "tree"},
     {"effects", "integrators", "constraints", "population", "spawn", "sweep", "stability", "rounding", "ways"},
     {"behaviours"},
     {"steer", "presets", "group", "placing"},

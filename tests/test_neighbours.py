@@ -16,6 +16,7 @@ from flockenv.scene import Group, Scene
 from flockenv.space import Box, Space, Torus
 from flockenv.spawn import Spawn
 from flockenv.state import State
+from flockenv.tiles import TILE, count_tiles
 from tests.catalogue import NEAREST, NEAREST_MANY, VARIANTS, Array, Variant, everything, scene_of
 
 DT = 2.0**-10
@@ -244,20 +245,20 @@ def test_a_query_writes_into_its_own_arrays_only(size: Any, dimension: int, abse
         pos[at : at + dimension * lanes : lanes] = x[i]
     lengths = {"cell": blocks * lanes, "start": n + 1, "offset": n}
 
-    def counted(periodic: bool, handful: int) -> tuple[Any, Array]:
+    def counted(periodic: bool, kernel: Any = count_cells) -> tuple[Any, Array]:
         whole = {name: np.full(length + guard, -7, np.int32) for name, length in lengths.items()}
         cell, start, offset = (whole[name][:length] for name, length in lengths.items())
         box = tuple(float(edge) for edge in size[:dimension])
-        shape = entry(count_cells)(
+        shape = entry(kernel)(
             pos, living, 0, blocks, lanes, 0, 1, np.zeros(8, np.int64), np.zeros((1, 6)), box, 0.4, periodic,
-            periodic, n, handful, cell, start, offset[None],
+            periodic, n, cell, start, offset[None],
         )  # fmt: skip
         for name, length in lengths.items():
             assert (whole[name][length:] == -7).all(), f"{name} is too short for {shape} cells"
         cells = math.prod(shape[:3])
         if cells:
-            many = max(1, handful * cells // n)
-            cells = -(-cells // many)
+            if kernel is count_tiles:
+                cells = int(cell.max()) + 1
             sizes = np.bincount(cell[cell >= 0], minlength=cells)
             np.testing.assert_array_equal(np.diff(start[: cells + 1]), sizes)
             np.testing.assert_array_equal(offset[:cells], start[:cells])
@@ -266,14 +267,17 @@ def test_a_query_writes_into_its_own_arrays_only(size: Any, dimension: int, abse
         return shape, cell
 
     for periodic in (False, True):
-        shape, cell = counted(periodic, handful=0)
+        shape, cell = counted(periodic)
         cells = math.prod(shape[:3])
         assert cells <= n
-        for handful in (1, 16, 10**6):  # consecutive cells count as one, as many as so many agents take
-            again, joined = counted(periodic, handful)
-            assert again == shape
-            if cells:
-                np.testing.assert_array_equal(joined, cell // max(1, handful * cells // n))
+        again, tile = counted(periodic, count_tiles)
+        assert again == shape
+        if cells:
+            nx, ny, nz, fine = shape
+            edge = max(1, int(np.power(TILE * cells / n / fine, 1 / 2 if nz == 1 else 1 / 3) + 0.5))
+            along, up = -(-nx // (edge * fine)), -(-ny // edge)
+            x, y, z = cell % nx // (edge * fine), cell // nx % ny // edge, cell // nx // ny // edge
+            np.testing.assert_array_equal(tile, np.where(cell < 0, -1, (z * up + y) * along + x))
 
 
 @pytest.mark.parametrize(

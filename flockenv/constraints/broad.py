@@ -100,7 +100,7 @@ def nearby(
     common = _common_reach(living, radius, reach, n, grid)
     present = _mark(living, radius, reach, n, common, grid)
     shape = count_cells(
-        at.reshape(-1), grid, 0, n, 1, 0, 1, sync, bounds, period, 2.0 * common, periodic, periodic, n, 0, cell, start,
+        at.reshape(-1), grid, 0, n, 1, 0, 1, sync, bounds, period, 2.0 * common, periodic, periodic, n, cell, start,
         offset,
     )  # fmt: skip
     cells = shape[0] * shape[1] * shape[2]

@@ -2,14 +2,14 @@
 
 Agents are numbered by whoever made the scene, and neighbours by number lie anywhere in space: sorting them by cell is
 one distant place in memory per agent and step. So at the beginning of a call all that is known of an agent moves to
-where its cell comes, roughly: a handful of cells at a time, by number within. Each step then sorts what is nearly
+where its tile of cells comes, by number within (`flockenv.tiles`). Each step then sorts what is nearly
 sorted; and at the end everybody goes home. `ident` says who is where in between. Sums do not notice: within a cell
 agents are met in the order of their numbers all the same.
 """
 
 from __future__ import annotations
 
-from flockenv.neighbours import FEWEST_ARRANGED, HANDFUL, STEPS_ARRANGED, WORTH_ARRANGING
+from flockenv.neighbours import FEWEST_ARRANGED, STEPS_ARRANGED, WORTH_ARRANGING
 from flockenv.sweep.parts import Parts
 from flockenv.sweep.query import counted
 from flockenv.sweep.text import indented, indented_lines, place_of
@@ -21,7 +21,7 @@ _COMMON = {**dict.fromkeys(("mass", "radius", "max_speed", "max_force"), 0), "wa
 
 
 def move_in(parts: Parts) -> list[str]:
-    """Write how agents move to where their handfuls of cells come, if that is worth it; sets `arranged`."""
+    """Write how agents move to where their tiles come, if that is worth it; sets `arranged`."""
     if not parts.arranges:
         return ["arranged = False"]
     to = ["c = np.uint64(cell[i])", "cell[i] = offset[rank, c]", "offset[rank, c] += 1"]
@@ -29,10 +29,11 @@ def move_in(parts: Parts) -> list[str]:
         "arranged = False",
         f"least = {FEWEST_ARRANGED} if team > 1 and count >= {STEPS_ARRANGED} else {WORTH_ARRANGING}",
         "if count > 1 and n >= least and present == n:",
-        f"    shape = {counted(parts, parts.confines, HANDFUL)}",
+        f"    shape = {counted(parts, 'count_tiles', parts.confines)}",
         "    arranged = shape[0] > 0",
         "if arranged:",
         indented(_carry(parts, to), 4),
+        *([f"    find_homes(first, end, {parts.width}, n, shape, start, homes)"] if parts.homely else []),
     ]
 
 

@@ -404,6 +404,11 @@ class Parts:
         return self.sorts and bool(self.pairs) and not self.pulls
 
     @property
+    def homely(self) -> bool:
+        """Is it noted then who has left the place where he began? Only where cells are the same in every step."""
+        return self.arranges and self.space.periodic
+
+    @property
     def frame_vectors(self) -> list[str]:
         """The vectors of an agent's frame: where it faces, and in space which way is up."""
         return ["facing", "above"][: self.dimension - 1] if self.oriented else []

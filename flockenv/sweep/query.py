@@ -11,6 +11,7 @@ from __future__ import annotations
 from flockenv.neighbours import DISTANT
 from flockenv.sweep.parts import SMALL_STRIDE, Parts, record_of, sorted_at
 from flockenv.sweep.text import Slots, copied, indented, indented_lines, lanes_of, place_of
+from flockenv.tiles import FAR_FROM_HOME
 
 __all__ = ["counted", "listed", "listed_at", "query", "walk"]
 
@@ -22,7 +23,7 @@ def query(parts: Parts, fields: list[str], inside: bool = False) -> list[str]:
     return [
         f"periodic, shape = {parts.space.periodic}, (0, 0, 0, 0)",
         "wait_for_team(sync, team)  # positions are everybody's",
-        *([f"shape = {counted(parts, inside)}"] if parts.sorts else []),
+        *(_counted(parts, inside) if parts.sorts else []),
         "nx = shape[0]",
         "if nx == 0:",
         indented(_enter(parts, fields) if parts.sorts else _fill(parts, fields), 4),
@@ -31,12 +32,21 @@ def query(parts: Parts, fields: list[str], inside: bool = False) -> list[str]:
     ]
 
 
-def counted(parts: Parts, inside: bool, handful: int = 0) -> str:
+def counted(parts: Parts, kernel: str, inside: bool, more: str = "") -> str:
     """Write how many cells there are per axis, once every agent's has been found; see `count_cells`."""
     return (
-        f"count_cells(pos, living, first, end, {parts.width}, rank, team, sync, bounds, size, reach, "
-        f"{parts.space.periodic}, {parts.space.periodic and not inside}, n, {handful}, cell, start, offset)"
+        f"{kernel}(pos, living, first, end, {parts.width}, rank, team, sync, bounds, size, reach, "
+        f"{parts.space.periodic}, {parts.space.periodic and not inside}, n, {more}cell, start, offset)"
     )
+
+
+def _counted(parts: Parts, inside: bool) -> list[str]:
+    """Write how agents are counted in the cells, and strangers listed where agents lie in tiles."""
+    plain = f"shape = {counted(parts, 'count_cells', inside)}"
+    if not parts.homely:
+        return [plain]
+    listed = f"shape = {counted(parts, 'count_from_home', inside, 'homes, strangers, tally, ')}"
+    return ["if arranged:", f"    {listed}", "else:", f"    {plain}"]
 
 
 def listed(parts: Parts) -> str:
@@ -147,10 +157,34 @@ def _sort(parts: Parts, fields: list[str], inside: bool) -> list[str]:
         f"    put_records(records, ({sources},), ({places},), {w}, cell, row, offset[rank], np.uint64(n))",
         "if arranged:  # agents came in the order of their places, and are to be in the order of their numbers",
         "    wait_for_team(sync, team)",
-        "    rows = shape[1] * shape[2]",
-        "    for line in range(rows * rank // team, rows * (rank + 1) // team):  # a row at a time stays in the cache",
-        "        mine, beyond = np.int64(start[line * nx]), np.int64(start[(line + 1) * nx])",
-        f"        order_records(records, cell, ident, {len(record)}, mine, beyond, offset[rank])",
+        *indented_lines(_ordered(parts, len(record)), 4),
+    ]
+
+
+def _ordered(parts: Parts, length: int) -> list[str]:
+    """Write how records are put in the order of numbers within each cell, of a world that lies in order."""
+    every = [
+        "rows = shape[1] * shape[2]",
+        "for line in range(rows * rank // team, rows * (rank + 1) // team):  # a row at a time stays in the cache",
+        "    mine, beyond = np.int64(start[line * nx]), np.int64(start[(line + 1) * nx])",
+        f"    order_records(records, cell, ident, {length}, mine, beyond, offset[rank])",
+    ]
+    if not parts.homely:
+        return every
+    mine = f"first * {parts.width}"
+    return [
+        "away = np.int64(0)",
+        "for r in range(team):",
+        "    away += tally[team + r]",
+        f"if away * {FAR_FROM_HOME} > n:",
+        *indented_lines(every, 4),
+        "else:",
+        f"    till = {mine} + tally[team + rank]",
+        f"    order_cells(records, {length}, ident, start, offset, rank, strangers, {mine}, till)",
+        "    if team > 1:",
+        "        cells = nx * shape[1] * shape[2]",
+        "        mine, beyond = cells * rank // team, cells * (rank + 1) // team",
+        f"        order_shared(records, {length}, ident, start, offset, team, mine, beyond)",
     ]
 
 

@@ -89,6 +89,7 @@ def _imports(parts: Parts) -> str:
         "from flockenv.kernels import ask_for, copy_lanes, finite, kernel, like, unaliased, wait_for_team",
         *(["from flockenv.kernels import tallied, tally_of"] if parts.parting or parts.averaged else []),
         "from flockenv.neighbours import candidates, count_cells, order_records, row_of",
+        "from flockenv.tiles import count_from_home, count_tiles, find_homes, order_cells, order_shared",
         f"from flockenv.space import {parts.space.offset_law} as offset_to, {parts.space.confine_law} as confine",
         *([f"from flockenv.space import {parts.space.bounce_law} as bounce"] if parts.bounces else []),
         "from flockenv.noise import normal as standard_normal",

@@ -20,8 +20,8 @@ __all__ = [
 
 _READ = (
     "mass, radius, max_speed, max_force, living, ident, want, felt, pulled, carrying, frame, sorted_, records, "
-    "luggage, order, cell, start, offset, bounds, tally, sync, tie, bond_place, bond_number, bond_start, tree_key, "
-    "tree_place, tree_digit, tree_leaf, tree_node, tree_near, number, lanes, ranges, spread"
+    "luggage, order, cell, start, offset, homes, strangers, bounds, tally, sync, tie, bond_place, bond_number, "
+    "bond_start, tree_key, tree_place, tree_digit, tree_leaf, tree_node, tree_near, number, lanes, ranges, spread"
 )
 SHARED = f"pos, vel, origin, stages, {_READ}"
 """Scratch of one world in progress, in order; see workspace.Workspace. The last three belong to one thread. Of these

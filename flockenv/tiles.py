@@ -1,0 +1,209 @@
+"""Tiles: where the agents of a large world lie in memory while it is in order, and who has left the one he began in.
+
+A tile is a square (in 3-D a cube) of some hundred agents, made of whole cells. Within a tile agents lie by number. So
+of those who are still where they began all cells are in order as they are put there: what remains is to order the few
+cells that somebody from elsewhere came to.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from flockenv.kernels import ask_for, kernel
+from flockenv.neighbours import Ints, begin_cells, cell_of, divided
+
+__all__ = [
+    "FAR_FROM_HOME", "HOME", "TILE", "count_from_home", "count_tiles", "find_homes", "order_cells", "order_shared",
+]  # fmt: skip
+
+TILE = 256
+"""Agents of a tile in the mean."""
+
+HOME = 8
+"""Numbers that say of a block where its agents are at home, see `find_homes`."""
+
+FAR_FROM_HOME = 4
+"""If more than one agent out of so many has left his tile, all records are looked through instead of their cells."""
+
+PART = 64
+"""Blocks whose cells are found and counted together: they stay in the nearest cache in between. And cells together."""
+
+AHEAD = 8
+"""Cells that are asked for before their turn comes."""
+
+_AWAY = 2**30  # added to the cell of who is not in his own tile, between two passes over a part
+
+
+@kernel
+def _edge(shape: Any, capacity: int) -> int:
+    """Return how many reaches long a tile is."""
+    cells = float(shape[0]) * float(shape[1]) * float(shape[2])
+    volume = TILE * cells / capacity / shape[3]
+    return max(1, int((np.sqrt(volume) if shape[2] == 1 else np.cbrt(volume)) + 0.5))
+
+
+@kernel
+def _tiles(shape: Any, edge: int) -> tuple[int, int, int]:
+    """Return how many tiles there are along each axis."""
+    return (shape[0] - 1) // (edge * shape[3]) + 1, (shape[1] - 1) // edge + 1, (shape[2] - 1) // edge + 1
+
+
+@kernel
+def count_tiles(
+    pos: Any, living: Any, first: int, end: int, lanes: int, rank: int, team: int, sync: Any, bounds: Any, size: Any,
+    reach: float, periodic: bool, wraps: bool, capacity: int, cell: Ints, start: Ints, offset: Ints,
+) -> tuple[int, int, int, int]:  # fmt: skip
+    """Do as `count_cells` does, with tiles in place of cells; return the cells of which they are made."""
+    shape, low, pace = divided(
+        pos, living, first, end, lanes, rank, team, sync, bounds, size, reach, periodic, capacity
+    )
+    if shape[0] == 0:
+        return shape
+    edge, d, w = _edge(shape, capacity), np.uint64(len(size)), np.uint64(lanes)
+    along, up, deep = _tiles(shape, edge)
+    row, rows = 1.0 / (edge * shape[3]), 1.0 / edge
+    for c in range(along * up * deep):
+        offset[rank, c] = 0
+    for block in range(np.uint64(first), np.uint64(end)):
+        for l in range(w):  # noqa: E741  # a lane
+            x, y, z = cell_of(pos, block * d * w + l, w, low, pace, size, wraps, shape)
+            # a product, not a division, which would be one by one: half a cell on, it is never close to a whole number
+            x, y, z = np.int64((x + 0.5) * row), np.int64((y + 0.5) * rows), np.int64((z + 0.5) * rows)
+            index = (z * up + y) * along + x
+            cell[block * w + l] = np.int32(index) if living[block * w + l] > 0 else np.int32(-1)
+    for i in range(first * lanes, end * lanes):
+        c = cell[i]
+        if c >= 0:
+            offset[rank, c] += 1
+    begin_cells(rank, team, sync, along * up * deep, start, offset)
+    return shape
+
+
+@kernel
+def find_homes(first: int, end: int, lanes: int, n: int, shape: Any, start: Ints, homes: Ints) -> None:
+    """Write in which tile the agents of these blocks are at home, once all lie there; start: where each tile begins.
+
+    homes (blocks * HOME,): how many agents are at home in the first of two tiles, the lowest cell of that one along
+    each of three axes, and of the other. A block of more tiles has none: each of its agents counts as a stranger.
+    """
+    edge = _edge(shape, n)
+    along, up, _ = _tiles(shape, edge)
+    tile = 0
+    for block in range(first, end):
+        begin, last, at = block * lanes, min(block * lanes + lanes, n) - 1, block * HOME
+        while start[tile + 1] <= begin:
+            tile += 1
+        other = tile
+        while start[other + 1] <= last:
+            other += 1
+        few = start[other] <= start[tile + 1]  # nobody in between
+        homes[at] = start[tile + 1] - begin
+        for k in range(2):
+            t = other if k > 0 else tile
+            homes[at + 1 + 3 * k] = (t % along) * edge * shape[3] if few else -_AWAY
+            homes[at + 2 + 3 * k] = (t // along) % up * edge
+            homes[at + 3 + 3 * k] = (t // along) // up * edge
+
+
+@kernel
+def count_from_home(
+    pos: Any, living: Any, first: int, end: int, lanes: int, rank: int, team: int, sync: Any, bounds: Any, size: Any,
+    reach: float, periodic: bool, wraps: bool, capacity: int, homes: Ints, strangers: Ints, tally: Any, cell: Ints,
+    start: Ints, offset: Ints,
+) -> tuple[int, int, int, int]:  # fmt: skip
+    """Do as `count_cells` does where all `capacity` agents live and lie in tiles, and list who is not in his own.
+
+    The cells such agents are in are written to `strangers` (agents, padded), from this thread's first agent on; how
+    many, to tally[team + rank].
+    """
+    shape, low, pace = divided(
+        pos, living, first, end, lanes, rank, team, sync, bounds, size, reach, periodic, capacity
+    )
+    cells = shape[0] * shape[1] * shape[2]
+    if cells == 0:
+        return shape
+    for c in range(cells):
+        offset[rank, c] = 0
+    up = np.int64(_edge(shape, capacity))
+    across, away = up * shape[3], np.uint64(first * lanes)
+    d, w, none = np.uint64(len(size)), np.uint64(lanes), np.int64(0)
+    for begin in range(first, end, PART):
+        until = min(begin + PART, end)
+        for block in range(np.uint64(begin), np.uint64(until)):
+            at = block * np.uint64(HOME)
+            first_of_two = np.uint64(homes[at])
+            x0, y0, z0 = _corner(homes, at + np.uint64(1))
+            x1, y1, z1 = _corner(homes, at + np.uint64(4))
+            for l in range(w):  # noqa: E741  # a lane
+                x, y, z = cell_of(pos, block * d * w + l, w, low, pace, size, wraps, shape)
+                index = (z * shape[1] + y) * shape[0] + x
+                one = l < first_of_two
+                dx, dy, dz = x - (x0 if one else x1), y - (y0 if one else y1), z - (z0 if one else z1)
+                home = (dx >= none) & (dx < across) & (dy >= none) & (dy < up) & (dz >= none) & (dz < up)
+                index = index if home else index + np.int64(_AWAY)
+                cell[block * w + l] = np.int32(index) if block * w + l < np.uint64(capacity) else np.int32(-1)
+        for i in range(np.uint64(begin * lanes), np.uint64(until * lanes)):
+            c = cell[i]
+            stranger = c >= np.int32(_AWAY)
+            c -= np.int32(_AWAY) if stranger else np.int32(0)
+            cell[i] = c
+            strangers[away] = c
+            away += np.uint64(1) if stranger else np.uint64(0)
+            if c >= 0:
+                offset[rank, c] += 1
+    tally[team + rank] = np.int64(away) - first * lanes
+    begin_cells(rank, team, sync, cells, start, offset)
+    return shape
+
+
+@kernel
+def _corner(homes: Ints, at: Any) -> tuple[Any, Any, Any]:
+    """Return the lowest cell of a tile along each axis."""
+    return np.int64(homes[at]), np.int64(homes[at + np.uint64(1)]), np.int64(homes[at + np.uint64(2)])
+
+
+@kernel
+def order_cells(
+    records: Any, length: int, ident: Any, start: Ints, offset: Ints, rank: int, listed: Ints, begin: int, end: int
+) -> None:
+    """Put the records of the cells listed[begin:end] in the order of numbers, where only this thread has put some.
+
+    Records are so long and begin with their place; ident has numbers by place; offset says where each thread stopped.
+    """
+    size, last, before = np.uint64(length), np.uint64(end), max(rank - 1, 0)
+    for m in range(np.uint64(begin), last):
+        ask_for(records, np.uint64(start[listed[min(m + np.uint64(AHEAD), last - np.uint64(1))]]) * size)
+        c = np.uint64(listed[m])
+        first, beyond = start[c], start[c + np.uint64(1)]
+        alone = (offset[rank, c] == beyond) & ((rank == 0) | (offset[before, c] == first))
+        _order(records, size, ident, np.uint64(first), np.uint64(beyond if alone else first))
+
+
+@kernel
+def order_shared(
+    records: Any, length: int, ident: Any, start: Ints, offset: Ints, team: int, first: int, end: int
+) -> None:
+    """Do so for those of the cells [first, end) to which several threads have put agents."""
+    size = np.uint64(length)
+    for r in range(team - 1):
+        for begin in range(first, end, PART):  # seldom is one among so many: all are asked at once
+            until, shared = min(begin + PART, end), np.int32(0)
+            for c in range(np.uint64(begin), np.uint64(until)):
+                shared |= np.int32((start[c] < offset[r, c]) & (offset[r, c] < start[c + np.uint64(1)]))
+            for c in range(np.uint64(begin), np.uint64(until if shared > 0 else begin)):
+                if start[c] < offset[r, c] < start[c + np.uint64(1)]:
+                    _order(records, size, ident, np.uint64(start[c]), np.uint64(start[c + np.uint64(1)]))
+
+
+@kernel
+def _order(records: Any, size: Any, ident: Any, first: Any, end: Any) -> None:
+    """Put the records [first, end) in the order of numbers: most are where they belong."""
+    for k in range(first + np.uint64(1), end):
+        at, least = k * size, first * size
+        who = ident[np.uint64(records[at])]
+        while at > least and ident[np.uint64(records[at - size])] > who:
+            for m in range(at, at + size):
+                records[m - size], records[m] = records[m], records[m - size]
+            at -= size

@@ -1,0 +1,69 @@
+"""Tiles: who has left the one he began in is listed, and the cells such agents came to are put in order."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from flockenv.kernels import entry
+from flockenv.neighbours import count_cells
+from flockenv.tiles import HOME, count_from_home, count_tiles, find_homes, order_cells
+
+LANES, AGENTS = 16, 5003
+
+
+def in_blocks(x: Any) -> Any:
+    """Positions (N, D) as kernels have them: blocks of (D, LANES)."""
+    n, d = x.shape
+    padded = np.zeros((-(-n // LANES) * LANES, d), x.dtype)
+    padded[:n] = x
+    return padded.reshape(-1, LANES, d).transpose(0, 2, 1).reshape(-1).copy()
+
+
+@pytest.mark.parametrize("stride", [0.0, 0.2, 3.0, 100.0])  # m, at most, that agents have moved since
+@pytest.mark.parametrize("empty", [0.0, 0.8])  # of the box: blocks of many tiles lie there
+@pytest.mark.parametrize("size", [(70.0, 50.0), (17.0, 15.0, 16.0)])
+def test_cells_to_which_strangers_came_are_put_in_order(size: Any, empty: float, stride: float) -> None:
+    rng = np.random.default_rng(7)
+    n, d, blocks = AGENTS, len(size), -(-AGENTS // LANES)
+    x = rng.uniform(0, size, (n, d)).astype(np.float32)
+    few = rng.random(n) < 0.97
+    x[few, 0] *= 1 - empty
+    living = np.r_[np.ones(n), np.zeros(blocks * LANES - n)].astype(np.float32)
+
+    def counted(kernel: Any, at: Any, *more: Any) -> tuple[Any, Any, Any]:
+        cell, start = np.zeros(blocks * LANES, np.int32), np.zeros(n + 1, np.int32)
+        shape = entry(kernel)(
+            in_blocks(at), living, 0, blocks, LANES, 0, 1, np.zeros(8, np.int64), np.zeros((1, 6)), size, 2.0, True,
+            True, n, *more, cell, start, np.zeros((1, n), np.int32),
+        )  # fmt: skip
+        return shape, cell[:n], start
+
+    shape, tile, start = counted(count_tiles, x)
+    assert shape[0] > 0
+    ident = np.argsort(tile, kind="stable")
+    home = tile[ident]
+    homes, strangers = np.zeros(blocks * HOME, np.int32), np.full(n + 1, -7, np.int32)
+    entry(find_homes)(0, blocks, LANES, n, shape, start, homes)
+    moved = ((x[ident] + rng.uniform(-stride, stride, (n, d))) % size).astype(np.float32)
+    tally = np.zeros(2, np.int64)
+    again, cell, start = counted(count_from_home, moved, homes, strangers, tally)
+    plain, expected, begins = counted(count_cells, moved)
+    assert shape == again == plain
+    np.testing.assert_array_equal(cell, expected)
+    np.testing.assert_array_equal(start, begins)
+    many = [len(set(home[k : k + LANES])) > 2 for k in range(0, n, LANES)]  # such a block is nobody's home
+    away = (counted(count_tiles, moved)[1] != home) | np.repeat(many, LANES)[:n]
+    assert any(many) == (empty > 0)
+    np.testing.assert_array_equal(strangers[: tally[1]], cell[away])
+
+    place = np.argsort(cell, kind="stable")  # as agents are put into their cells
+    numbers = ident.astype(np.float32)
+    records = np.column_stack([place, place + 0.5, -place]).astype(np.float32)
+    ends = start[1:][None].copy()
+    flat = records.reshape(-1).copy()
+    entry(order_cells)(flat, 3, numbers, start, ends, 0, strangers, 0, int(tally[1]))
+    np.testing.assert_array_equal(flat.reshape(n, 3), records[np.lexsort((ident[place], cell[place]))])
+    assert (flat != records.reshape(-1)).any() == (stride > 0)
