@@ -20,7 +20,7 @@ from flockenv.space import torus_confine
 __all__ = [
     "AHEAD", "DISTANT", "FEWEST_AGENTS", "FEWEST_ARRANGED", "FINEST", "MAX_RANGES", "STEPS_ARRANGED",
     "WORTH_ARRANGING", "begin_cells", "candidates", "cell_of", "count_cells", "divided", "grid_of", "order_records",
-    "row_of",
+    "row_of", "tally_cells",
 ]  # fmt: skip
 
 MAX_RANGES = 27
@@ -213,15 +213,21 @@ def count_cells(
     cells = shape[0] * shape[1] * shape[2]
     if cells == 0:
         return shape
+    _find_cells(pos, living, first, end, lanes, low, pace, size, wraps, shape, cell)
+    tally_cells(cell, first * lanes, end * lanes, rank, cells, offset)
+    begin_cells(rank, team, sync, cells, start, offset)
+    return shape
+
+
+@kernel
+def tally_cells(cell: Ints, first: int, end: int, rank: int, cells: int, offset: Ints) -> None:
+    """Write how many of the agents [first, end) are in each cell."""
     for c in range(cells):
         offset[rank, c] = 0
-    _find_cells(pos, living, first, end, lanes, low, pace, size, wraps, shape, cell)
-    for i in range(first * lanes, end * lanes):
+    for i in range(first, end):
         c = cell[i]
         if c >= 0:
             offset[rank, c] += 1
-    begin_cells(rank, team, sync, cells, start, offset)
-    return shape
 
 
 @kernel

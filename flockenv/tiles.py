@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from flockenv.kernels import ask_for, kernel
-from flockenv.neighbours import Ints, begin_cells, cell_of, divided
+from flockenv.neighbours import Ints, begin_cells, cell_of, divided, tally_cells
 
 __all__ = [
     "FAR_FROM_HOME", "HOME", "TILE", "count_from_home", "count_tiles", "find_homes", "order_cells", "order_shared",
@@ -22,18 +22,21 @@ TILE = 256
 """Agents of a tile in the mean."""
 
 HOME = 8
-"""Numbers that say of a block where its agents are at home, see `find_homes`."""
+"""Numbers that say of a block where its agents are at home, see `find_homes`; the last of them says nothing."""
 
 FAR_FROM_HOME = 4
 """If more than one agent out of so many has left his tile, all records are looked through instead of their cells."""
 
 PART = 64
-"""Blocks whose cells are found and counted together: they stay in the nearest cache in between. And cells together."""
+"""Blocks whose cells are found and counted together: they stay in the nearest cache in between."""
+
+BATCH = 64
+"""Cells that are asked together whether several threads have put agents there."""
 
 AHEAD = 8
 """Cells that are asked for before their turn comes."""
 
-_AWAY = 2**30  # added to the cell of who is not in his own tile, between two passes over a part
+_AWAY = 2**30  # more than any cell: added to that of who is not in his own tile, between two passes over a part
 
 
 @kernel
@@ -64,8 +67,6 @@ def count_tiles(
     edge, d, w = _edge(shape, capacity), np.uint64(len(size)), np.uint64(lanes)
     along, up, deep = _tiles(shape, edge)
     row, rows = 1.0 / (edge * shape[3]), 1.0 / edge
-    for c in range(along * up * deep):
-        offset[rank, c] = 0
     for block in range(np.uint64(first), np.uint64(end)):
         for l in range(w):  # noqa: E741  # a lane
             x, y, z = cell_of(pos, block * d * w + l, w, low, pace, size, wraps, shape)
@@ -73,10 +74,7 @@ def count_tiles(
             x, y, z = np.int64((x + 0.5) * row), np.int64((y + 0.5) * rows), np.int64((z + 0.5) * rows)
             index = (z * up + y) * along + x
             cell[block * w + l] = np.int32(index) if living[block * w + l] > 0 else np.int32(-1)
-    for i in range(first * lanes, end * lanes):
-        c = cell[i]
-        if c >= 0:
-            offset[rank, c] += 1
+    tally_cells(cell, first * lanes, end * lanes, rank, along * up * deep, offset)
     begin_cells(rank, team, sync, along * up * deep, start, offset)
     return shape
 
@@ -188,8 +186,8 @@ def order_shared(
     """Do so for those of the cells [first, end) to which several threads have put agents."""
     size = np.uint64(length)
     for r in range(team - 1):
-        for begin in range(first, end, PART):  # seldom is one among so many: all are asked at once
-            until, shared = min(begin + PART, end), np.int32(0)
+        for begin in range(first, end, BATCH):  # seldom is one among so many: all are asked at once
+            until, shared = min(begin + BATCH, end), np.int32(0)
             for c in range(np.uint64(begin), np.uint64(until)):
                 shared |= np.int32((start[c] < offset[r, c]) & (offset[r, c] < start[c + np.uint64(1)]))
             for c in range(np.uint64(begin), np.uint64(until if shared > 0 else begin)):

@@ -46,6 +46,7 @@ class Workspace:
         padded = -(-agents // width) * width
         sorts = parts.sweeps and parts.sorts
         carried = agents if parts.arranges and agents >= FEWEST_ARRANGED else 1
+        tiled = padded if parts.homely and carried > 1 else 0
         swept, cells = padded if parts.sweeps else 1, agents if sorts else 1
         real: dict[str, int | tuple[int, ...]] = {
             **dict.fromkeys(("pos", "vel", "want"), padded * d),
@@ -67,8 +68,8 @@ class Workspace:
             "cell": (padded if sorts else 1,),
             "start": (cells + 1,),
             "offset": (team, cells),
-            "homes": (padded // width * HOME if parts.homely and carried > 1 else 1,),
-            "strangers": (padded + 1 if parts.homely and carried > 1 else 1,),
+            "homes": (tiled // width * HOME + 1,),
+            "strangers": (tiled + 1,),
             "tree_place": (2 * padded if parts.treed else 1,),
         }
         wanted: dict[str, Any] = {name: (shape, np.dtype(dtype)) for name, shape in real.items()}

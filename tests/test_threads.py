@@ -23,14 +23,14 @@ import pytest
 import flockenv
 import flockenv.scene as scenes
 from flockenv import crew
-from flockenv.behaviours import Separation
+from flockenv.behaviours import Alignment, Separation
 from flockenv.crew import share, threads, use_threads
 from flockenv.effects import Drag
 from flockenv.integrators import ImplicitEuler
 from flockenv.kernels import cache_folder
 from flockenv.neighbours import FEWEST_ARRANGED, STEPS_ARRANGED, WORTH_ARRANGING
 from flockenv.scene import Group, Scene
-from flockenv.space import Box
+from flockenv.space import Box, Torus
 from flockenv.spawn import Spawn
 from flockenv.state import State
 from flockenv.tasks import Flock
@@ -313,6 +313,25 @@ def test_worlds_divided_among_threads_are_the_same_worlds(variant: Variant, coun
         use_threads(threads_used)
         assert_same(scene.run(start, 4), expected)
     assert shared == [2, 3, 7, 8 if count >= scenes.FEWEST_TOGETHER else 7]  # worlds apart, or a team of 8
+
+
+@pytest.mark.parametrize("used", [1, 3])
+def test_a_long_call_gives_the_bits_of_short_ones_however_many_have_left_their_tiles(used: int) -> None:
+    """3 m/s for 2 s, in tiles of 14 m: few have left at the beginning, more than a quarter at the end."""
+    use_threads(used)
+    scene = Scene(
+        dimension=2, space=Torus(size=(117.0, 117.0)), dt=0.05, dtype="float32",
+        effects=(Separation(weight=0.1, radius=1.0), Alignment(weight=0.1, radius=2.0)),
+        groups=(Group(count=WORTH_ARRANGING + 3, max_speed=3.0, spawn=Spawn(speed=(3.0, 3.0))),),
+    )  # fmt: skip
+    one_by_one = start = scene.start(5)
+    for _ in range(40):
+        one_by_one = scene.step(one_by_one)
+    way = np.abs((one_by_one.x - start.x + 58.5) % 117 - 58.5)
+    assert (way / 14).sum(axis=0).mean() > 0.3  # the chance that an edge of his tile was in the way
+    at_once = scene.step(start, steps=40)
+    np.testing.assert_array_equal(at_once.x, one_by_one.x)
+    np.testing.assert_array_equal(at_once.v, one_by_one.v)
 
 
 class Clock:

@@ -37,7 +37,7 @@ def pairs(parts: Parts) -> list[str]:
         "if rank == 0:",
         "    work[b, 1] += 1",
         *["    work[b, 3] += n * obstacle_radius.shape[1]" for _, e in parts.pairs if e.joined],
-        *query(parts, parts.sorted_fields, parts.confines),
+        *query(parts, parts.sorted_fields, parts.confines, parts.arranges),
         *walk(parts, parts.sorted_fields, [*_clear(parts), *_select_nearest(parts), *_sum_up(parts)]),
         "tally[rank] = met",
         "wait_for_team(sync, team)  # what is felt was written by others",

@@ -18,16 +18,19 @@ __all__ = ["counted", "listed", "listed_at", "query", "walk"]
 _ARRAYS = {"x": "pos", "v": "vel", "t": "tie", "d": "facing", "a": "aiming"}
 
 
-def query(parts: Parts, fields: list[str], inside: bool = False) -> list[str]:
-    """Write how the living are sorted, with these fields of each; `inside`: nobody is outside of a periodic box."""
+def query(parts: Parts, fields: list[str], inside: bool = False, may_lie: bool = False) -> list[str]:
+    """Write how the living are sorted, with these fields of each.
+
+    inside: nobody is outside of a periodic box; may_lie: agents may lie in order, `arranged`, and not by number.
+    """
     return [
         f"periodic, shape = {parts.space.periodic}, (0, 0, 0, 0)",
         "wait_for_team(sync, team)  # positions are everybody's",
-        *(_counted(parts, inside) if parts.sorts else []),
+        *(_counted(parts, inside, may_lie and parts.homely) if parts.sorts else []),
         "nx = shape[0]",
         "if nx == 0:",
         indented(_enter(parts, fields) if parts.sorts else _fill(parts, fields), 4),
-        *(["else:", indented(_sort(parts, fields, inside), 4)] if parts.sorts else []),
+        *(["else:", indented(_sort(parts, fields, inside, may_lie), 4)] if parts.sorts else []),
         "wait_for_team(sync, team)",
     ]
 
@@ -40,10 +43,10 @@ def counted(parts: Parts, kernel: str, inside: bool, more: str = "") -> str:
     )
 
 
-def _counted(parts: Parts, inside: bool) -> list[str]:
+def _counted(parts: Parts, inside: bool, homely: bool) -> list[str]:
     """Write how agents are counted in the cells, and strangers listed where agents lie in tiles."""
     plain = f"shape = {counted(parts, 'count_cells', inside)}"
-    if not parts.homely:
+    if not homely:
         return [plain]
     listed = f"shape = {counted(parts, 'count_from_home', inside, 'homes, strangers, tally, ')}"
     return ["if arranged:", f"    {listed}", "else:", f"    {plain}"]
@@ -139,7 +142,7 @@ def _one_by_one(parts: Parts, who: str, lines: list[str]) -> list[str]:
     ]
 
 
-def _sort(parts: Parts, fields: list[str], inside: bool) -> list[str]:
+def _sort(parts: Parts, fields: list[str], inside: bool, may_lie: bool) -> list[str]:
     """Write how agents are put into their cells: as whole records, so that each is one distant place in memory."""
     d, w, record = parts.dimension, parts.width, record_of(fields)
     wraps = parts.space.periodic and not inside
@@ -155,10 +158,13 @@ def _sort(parts: Parts, fields: list[str], inside: bool) -> list[str]:
         f"            ask_for(records, there * np.uint64({len(record)}))",
         *(_confined(parts) if wraps else []),
         f"    put_records(records, ({sources},), ({places},), {w}, cell, row, offset[rank], np.uint64(n))",
-        "if arranged:  # agents came in the order of their places, and are to be in the order of their numbers",
-        "    wait_for_team(sync, team)",
-        *indented_lines(_ordered(parts, len(record)), 4),
+        *(_in_turn(parts, len(record)) if may_lie else []),
     ]
+
+
+def _in_turn(parts: Parts, length: int) -> list[str]:
+    """Write how records that came in the order of places come in the order of numbers."""
+    return ["if arranged:", "    wait_for_team(sync, team)", *indented_lines(_ordered(parts, length), 4)]
 
 
 def _ordered(parts: Parts, length: int) -> list[str]:
