@@ -48,6 +48,7 @@ from flockenv.stability import check_contact, check_dt, check_lookahead
 from flockenv.state import Body, Floats, State
 from flockenv.steer import EVERY_EFFECT
 from flockenv.sweep import Parts, Table, field_source, flattened, pack, scene_source
+from flockenv.tiles import HOME
 from flockenv.tree import MOST_DIRECT, tree_sizes
 from flockenv.workspace import Workspace
 
@@ -297,7 +298,7 @@ class Scene(Record):
             whole += 24
         if parts.arranges and self.agents >= FEWEST_ARRANGED:
             reals += parts.luggage_size
-            whole += 6 * parts.homely  # strangers, and 32 bytes for a block of 16
+            whole += (4 + 4 * HOME // parts.width) * parts.homely  # strangers, and where each block is at home
         if self.constraints or self.population:
             reals += 4 * d + sum(constraint.numbers(self) for constraint in self.constraints)
         if self.population:

@@ -1,8 +1,8 @@
 """Tiles: where the agents of a large world lie in memory while it is in order, and who has left the one he began in.
 
-A tile is a square (in 3-D a cube) of some hundred agents, made of whole cells. Within a tile agents lie by number. So
-of those who are still where they began all cells are in order as they are put there: what remains is to order the few
-cells that somebody from elsewhere came to.
+A tile is a square (in 3-D a cube) of some 250 agents, made of whole cells. Within a tile agents lie by number. So of
+those who are still where they began all cells are in order as they are put there: what remains is to order the few
+cells that somebody from elsewhere came to, and those to which several threads put agents.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ _AWAY = 2**30  # more than any cell: added to that of who is not in his own tile
 
 @kernel
 def _edge(shape: Any, capacity: int) -> int:
-    """Return how many reaches long a tile is."""
+    """Return how many rows of cells wide a tile is."""
     cells = float(shape[0]) * float(shape[1]) * float(shape[2])
     volume = TILE * cells / capacity / shape[3]
     return max(1, int((np.sqrt(volume) if shape[2] == 1 else np.cbrt(volume)) + 0.5))
@@ -168,7 +168,8 @@ def order_cells(
 ) -> None:
     """Put the records of the cells listed[begin:end] in the order of numbers, where only this thread has put some.
 
-    Records are so long and begin with their place; ident has numbers by place; offset says where each thread stopped.
+    Records are so long and begin with their place; ident has numbers by place; offset says where each thread stopped,
+    and afterwards -1 for a cell that is in order: it is listed once for each stranger in it.
     """
     size, last, before = np.uint64(length), np.uint64(end), max(rank - 1, 0)
     for m in range(np.uint64(begin), last):
@@ -177,6 +178,7 @@ def order_cells(
         first, beyond = start[c], start[c + np.uint64(1)]
         alone = (offset[rank, c] == beyond) & ((rank == 0) | (offset[before, c] == first))
         _order(records, size, ident, np.uint64(first), np.uint64(beyond if alone else first))
+        offset[rank, c] = np.int32(-1) if alone else offset[rank, c]
 
 
 @kernel

@@ -497,14 +497,20 @@ def test_memory_is_what_a_scene_says_before_it_takes_any(variant: Variant, count
     assert taken(scene) <= said + fixed
 
 
-def test_a_million_agents_fit_into_a_gigabyte() -> None:
-    million = Group(count=1_000_000, spawn=Spawn(low=(0, 0), high=(900, 900)))
+@pytest.mark.parametrize("dtype", ["float32", "float64"])
+@pytest.mark.parametrize("space", [Plane(), Torus(size=(900, 900))])  # tiles are written down on a torus alone
+def test_a_million_agents_fit_into_a_gigabyte(space: Space, dtype: str) -> None:
     rules = (Separation(weight=1, radius=1), Alignment(weight=1, radius=2), Cohesion(weight=1, radius=2))
-    scene = scene_of(*rules, dtype="float32", groups=(million,))
-    assert scene.bytes_per_world() < 1e9
-    few = scene.model_copy(update={"groups": (million.model_copy(update={"count": 20_000}),)})
-    assert scene.bytes_per_world() == 50 * few.bytes_per_world()  # so that what holds for them holds for a million
-    assert few.bytes_per_world() == pytest.approx(taken(few), rel=0.01)
+
+    def of(count: int) -> Scene:
+        group = Group(count=count, spawn=Spawn(low=(0, 0), high=(900, 900)))
+        return scene_of(*rules, dtype=dtype, space=space, groups=(group,))
+
+    assert of(1_000_000).bytes_per_world() < 1e9
+    few, many = of(8192), of(16384)
+    more = many.bytes_per_world() - few.bytes_per_world()
+    assert of(1_000_000).bytes_per_world() == more * 1_000_000 // 8192  # what holds for them holds for a million
+    assert more == taken(many) - taken(few)
 
 
 def test_a_scene_of_gravity_alone_takes_memory_for_nothing_else() -> None:

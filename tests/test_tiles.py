@@ -9,7 +9,7 @@ import pytest
 
 from flockenv.kernels import entry
 from flockenv.neighbours import count_cells
-from flockenv.tiles import HOME, count_from_home, count_tiles, find_homes, order_cells
+from flockenv.tiles import HOME, TILE, count_from_home, count_tiles, find_homes, order_cells
 
 LANES, AGENTS = 16, 5003
 
@@ -42,7 +42,13 @@ def test_cells_to_which_strangers_came_are_put_in_order(size: Any, empty: float,
         return shape, cell[:n], start
 
     shape, tile, start = counted(count_tiles, x)
-    assert shape[0] > 0
+    nx, ny, nz, fine = shape
+    edge = max(1, round((TILE * nx * ny * nz / n / fine) ** (1 / (2 if nz == 1 else 3))))
+    along, up = -(-nx // (edge * fine)), -(-ny // edge)
+    assert min(along, up) > 1
+    whose = counted(count_cells, x)[1]
+    x_of, y_of, z_of = whose % nx // (edge * fine), whose // nx % ny // edge, whose // nx // ny // edge
+    np.testing.assert_array_equal(tile, (z_of * up + y_of) * along + x_of)
     ident = np.argsort(tile, kind="stable")
     home = tile[ident]
     homes, strangers = np.zeros(blocks * HOME, np.int32), np.full(n + 1, -7, np.int32)
