@@ -31,8 +31,8 @@ from flockenv.sweep.text import (
 
 __all__ = ["begin", "copies", "kept_frame", "kept_inner", "step", "step_world"]
 
-PART = 64
-"""Blocks that are advanced together: what they take fits into the nearest caches."""
+PART = 8
+"""Blocks that are advanced together: what they take stays in the nearest cache."""
 
 
 def copies(parts: Parts) -> str:
