@@ -73,3 +73,4 @@ def test_cells_to_which_strangers_came_are_put_in_order(size: Any, empty: float,
     entry(order_cells)(flat, 3, numbers, start, ends, 0, strangers, 0, int(tally[1]))
     np.testing.assert_array_equal(flat.reshape(n, 3), records[np.lexsort((ident[place], cell[place]))])
     assert (flat != records.reshape(-1)).any() == (stride > 0)
+    assert (ends[0, strangers[: tally[1]]] == -1).all()  # each once, however many strangers are in it
