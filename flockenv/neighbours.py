@@ -238,10 +238,13 @@ def begin_cells(rank: int, team: int, sync: Any, cells: int, start: Ints, offset
     """
     wait_for_team(sync, team)
     if rank == 0:
-        total = 0
-        for c in range(cells):
+        total = np.int32(0)
+        for c in range(np.uint64(cells)):
             start[c] = total
-            for r in range(team):
+            here = offset[0, c]
+            offset[0, c] = total
+            total += here
+            for r in range(1, team):
                 here = offset[r, c]
                 offset[r, c] = total
                 total += here

@@ -283,14 +283,14 @@ class Scene(Record):
         real = 8 if self.dtype == "float64" else 4
         d, parts = self.dimension, self.parts
         reals = 2 * d + 5  # positions, velocities, bodies
-        reals += 4 * d + parts.stages * d + 6  # blocks of them, the drive, the stages
+        reals += 3 * d + parts.aside + parts.integrator.stages * d + 6  # blocks of them, the drive, the stages
         whole = 1
         if parts.sweeps:
             reals += d * (len(parts.targets) + 1)
             whole += 3 * 4 if parts.sorts else 4
         if parts.sweeps and parts.sorts:
             reals += parts.numbers
-        reals += d * (parts.pulls + parts.flows + parts.bounces)
+        reals += d * (parts.pulls + parts.flows)
         reals += parts.frame_rows + len(parts.inner) + parts.framed
         if parts.treed:
             numbers = tree_sizes(self.agents, parts.width, d, 1)

@@ -33,8 +33,14 @@ PART = 64
 BATCH = 64
 """Cells that are asked together whether several threads have put agents there."""
 
-AHEAD = 8
-"""Cells that are asked for before their turn comes."""
+AHEAD = (48, 24, 8)
+"""So many cells on it is asked where one begins, then for its first record, then for the numbers of its agents."""
+
+FEW = 8
+"""Agents of a cell whose numbers are asked for: a clump of thousands is listed once for each of them."""
+
+ASKED = 16
+"""So many blocks on it is asked for positions."""
 
 _AWAY = 2**30  # more than any cell: added to that of who is not in his own tile, between two passes over a part
 
@@ -130,7 +136,10 @@ def count_from_home(
     for begin in range(first, end, PART):
         until = min(begin + PART, end)
         for block in range(np.uint64(begin), np.uint64(until)):
-            at = block * np.uint64(HOME)
+            at, later = block * np.uint64(HOME), block + np.uint64(ASKED)
+            for k in range(d):
+                ask_for(pos, (later * d + k) * w)
+            ask_for(cell, later * w)
             first_of_two = np.uint64(homes[at])
             x0, y0, z0 = _corner(homes, at + np.uint64(1))
             x1, y1, z1 = _corner(homes, at + np.uint64(4))
@@ -172,13 +181,26 @@ def order_cells(
     and afterwards -1 for a cell that is in order: it is listed once for each stranger in it.
     """
     size, last, before = np.uint64(length), np.uint64(end), max(rank - 1, 0)
+    mine = np.uint64(rank * offset.shape[1])
     for m in range(np.uint64(begin), last):
-        ask_for(records, np.uint64(start[listed[min(m + np.uint64(AHEAD), last - np.uint64(1))]]) * size)
+        c = _later(listed, m, AHEAD[0], last)
+        ask_for(start, c)
+        ask_for(offset, mine + c)
+        ask_for(records, np.uint64(start[_later(listed, m, AHEAD[1], last)]) * size)
+        c = _later(listed, m, AHEAD[2], last)
+        for k in range(np.uint64(start[c]), np.uint64(min(start[c + np.uint64(1)], start[c] + FEW))):
+            ask_for(ident, np.uint64(records[k * size]))
         c = np.uint64(listed[m])
         first, beyond = start[c], start[c + np.uint64(1)]
         alone = (offset[rank, c] == beyond) & ((rank == 0) | (offset[before, c] == first))
         _order(records, size, ident, np.uint64(first), np.uint64(beyond if alone else first))
         offset[rank, c] = np.int32(-1) if alone else offset[rank, c]
+
+
+@kernel
+def _later(listed: Ints, m: Any, ahead: int, end: Any) -> Any:
+    """Return the cell whose turn comes so much later, or the last one."""
+    return np.uint64(listed[min(m + np.uint64(ahead), end - np.uint64(1))])
 
 
 @kernel

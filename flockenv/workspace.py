@@ -50,8 +50,8 @@ class Workspace:
         swept, cells = padded if parts.sweeps else 1, agents if sorts else 1
         real: dict[str, int | tuple[int, ...]] = {
             **dict.fromkeys(("pos", "vel", "want"), padded * d),
-            "origin": padded * d * (2 if parts.bounces else 1),
-            "stages": (parts.stages, padded * d),
+            "aside": padded * parts.aside,
+            "stages": (parts.integrator.stages, padded * d),
             **dict.fromkeys(("mass", "radius", "max_speed", "max_force", "living", "ident"), padded),
             "tie": padded * d if "t0" in parts.fields else 1,
             "pulled": padded * d if parts.pulls else 1,

@@ -142,4 +142,4 @@ def test_no_part_of_a_kernel_is_compiled_twice(tmp_path: Any, monkeypatch: pytes
     scene.step(scene.start(seed=1))
     own = {name: f for name, f in vars(module).items() if getattr(f, "__module__", "") == module.__name__}
     twice = [name for name, f in own.items() if len(getattr(f, "signatures", ())) > 1]
-    assert "advance" in own and not twice
+    assert "sense" in own and not twice

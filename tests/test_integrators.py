@@ -16,6 +16,7 @@ import pytest
 from flockenv.behaviours import Separation
 from flockenv.integrators import RK4, ExplicitEuler, Heun, Integrator, Midpoint, SemiImplicitEuler, VelocityVerlet
 from flockenv.integrators.base import Alone
+from flockenv.integrators.one_stage import OneStage
 from flockenv.scene import Group, Scene
 from flockenv.spawn import Spawn
 from flockenv.state import blank
@@ -247,36 +248,30 @@ def test_a_law_never_knows_which_method_integrates_it(row: IntegratorRow) -> Non
     np.testing.assert_array_equal(state.vel, V0)
 
 
-def test_stage_arrays_are_as_many_as_are_used() -> None:
+IN_ROWS = pytest.mark.parametrize(
+    "row", [row for row in INTEGRATORS if not isinstance(row.method, OneStage)], ids=lambda row: row.name
+)
+"""Methods that work over rows of coordinates, with rows of their own."""
+
+
+@IN_ROWS
+def test_stage_arrays_are_as_many_as_are_used(row: IntegratorRow) -> None:
     """With fewer than it declares a method would write into another's scratch: a guard behind them stays untouched."""
-    for row in INTEGRATORS:
-        stages = np.full((row.method.stages + 2, 6), 7.0)
-        row.method.advance().py_func(spring, alone(row), np.ones(6), np.ones(6), (), 0.0, 0.1, stages, 0, 6)
-        assert (stages[row.method.stages :] == 7).all()
-
-
-@pytest.mark.parametrize("row", [row for row in INTEGRATORS if row.method.asks_first], ids=lambda row: row.name)
-def test_who_asks_first_leaves_its_row_alone_until_then(row: IntegratorRow) -> None:
-    """In a scene what it is asked for is made of may lie there."""
-    stages, asked = np.full((1, 6), 7.0), []
-
-    def law(context: Any, pos: Array, vel: Array, time: float, out: Array) -> None:
-        asked.append((out == 7).all() and np.shares_memory(out, stages))
-        out[:] = -pos
-
-    row.method.advance().py_func(law, alone(row), np.ones(6), np.ones(6), (), 0.0, 0.1, stages, 0, 6)
-    assert asked == [True]
+    stages = np.full((row.method.stages + 2, 6), 7.0)
+    row.method.advance().py_func(spring, alone(row), np.ones(6), np.ones(6), (), 0.0, 0.1, stages, 0, 6)
+    assert (stages[row.method.stages :] == 7).all()
 
 
 @pytest.mark.parametrize("row", INTEGRATORS, ids=lambda row: row.name)
-def test_accelerations_come_in_place_of_what_is_felt_for_those_alone(row: IntegratorRow) -> None:
+def test_one_stage_needs_no_row_of_scratch(row: IntegratorRow) -> None:
     group = Group(count=3, spawn=Spawn(low=(0, 0), high=(1, 1)))
     scene = Scene(groups=(group,), effects=(Separation(weight=1, radius=1),), integrator=row.method)
-    assert scene.parts.in_place == row.method.asks_first
-    assert (scene.parts.stages == 0) == row.method.asks_first
+    once = row.method.evaluations == 1
+    assert scene.parts.one_stage == once
+    assert (scene._workspaces(1, 1)[0].arrays["stages"].size == 0) == once
 
 
-@METHODS
+@IN_ROWS
 def test_of_a_team_each_writes_his_own_part_alone(row: IntegratorRow) -> None:
     """Threads that share a world share its rows: what one leaves of [first, end) or writes beyond it is a race."""
     rng = np.random.default_rng(0)

@@ -520,7 +520,7 @@ def test_a_scene_of_gravity_alone_takes_memory_for_nothing_else() -> None:
     few, many = (Workspace.allocate(s.parts, s.body, s.table).arrays for s in scenes)
     growing = {name for name in few if many[name].size > few[name].size}
     body = {"mass", "radius", "max_speed", "max_force", "living", "ident"}
-    assert growing == {"pos", "vel", "origin", "stages", "want"} | body
+    assert growing == {"pos", "vel", "aside", "want"} | body
     handed = set(scenes[0]._kernels.SCRATCH.split(", "))
     assert growing < handed < growing | {"frame", "tally", "sync", "lanes"}  # of agents, threads, and who is not finite
     start = scenes[0].start(0)

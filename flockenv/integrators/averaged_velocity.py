@@ -2,36 +2,24 @@
 
 from __future__ import annotations
 
-from typing import Any, ClassVar, Literal
+from typing import ClassVar, Literal
 
-import numpy as np
-
-from flockenv.integrators.base import Integrator, carried
+from flockenv.integrators.one_stage import OneStage
 from flockenv.kernels import kernel, like
 
 __all__ = ["AveragedVelocity"]
 
 
 @kernel
-def advance(
-    acceleration: Any, context: Any, pos: Any, vel: Any, flow: Any, time: float, dt: float, stages: Any, first: int,
-    end: int,
-) -> None:  # fmt: skip
-    """x += h (v + v')/2 with v' = v + h a: exact under a constant force."""
-    a, half = stages[0], like(dt, 0.5)
-    acceleration(context, pos, vel, time, a)
-    for i in range(np.uint64(first), np.uint64(end)):
-        old = vel[i]
-        vel[i] = old + dt * a[i]
-        pos[i] = carried(pos[i] + dt * half * (old + vel[i]), dt, flow, i)
+def move(x: float, v: float, a: float, dt: float) -> tuple[float, float]:
+    """Return x and v after x += h (v + v')/2 with v' = v + h a: exact under a constant force."""
+    new = v + dt * a
+    return x + dt * like(dt, 0.5) * (v + new), new
 
 
-class AveragedVelocity(Integrator):
+class AveragedVelocity(OneStage):
     """Averaged-velocity step, order 1, one evaluation; exact under a constant force, pumps energy into oscillations."""
 
     kind: Literal["averaged_velocity"] = "averaged_velocity"
     order: ClassVar[int] = 1
     order_with_drag: ClassVar[int] = 1
-    stages: ClassVar[int] = 1
-    evaluations: ClassVar[int] = 1
-    asks_first: ClassVar[bool] = True

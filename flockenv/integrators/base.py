@@ -1,6 +1,7 @@
 """Integrator: (acceleration, state, dt) -> state. A law never knows which method integrates it.
 
-Each method is one file with `advance(acceleration, context, pos, vel, flow, time, dt, stages, first, end)`: over the
+Each method is one file, with a formula (`one_stage.py`), or with
+`advance(acceleration, context, pos, vel, flow, time, dt, stages, first, end)`: over the
 coordinates of one world in one row, in place. Of these it writes [first, end) alone, because several threads may share
 a world, each with a part of its own; `acceleration(context, pos, vel, time, out)` reads everybody's positions, and
 waits until all threads have come so far. `flow` holds the velocity with which the medium carries everybody, as of the
@@ -108,9 +109,6 @@ class Integrator(Record):
     """Rows of coordinates it needs as scratch."""
     evaluations: ClassVar[int]
     """Evaluations of the force per step; at least so many where a method chooses steps of its own."""
-    asks_first: ClassVar[bool] = False
-    """Does it have one row, and leave it alone until what it asks for is written there? Then an acceleration may come
-    in the place of what it is made of, and there is no other row."""
     adaptive: ClassVar[bool] = False
     """Does it choose steps of its own within dt? It looks at a whole world then, and threads do not share one."""
     splits_drag: ClassVar[bool] = False

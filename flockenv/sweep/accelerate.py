@@ -2,7 +2,8 @@
 
 Pair laws come first, in one sweep (`sense`), and leave what they came to in `felt`, by agent; laws about everybody, and
 bonds, in `pulled`. Then each block adds what an agent wants or feels by itself, and a fold over the obstacles
-(`respond`); what it wants is bounded by max_force.
+(`responses`); what it wants is bounded by max_force. A method of one stage goes on from there in the same
+pass (`step`); `accelerate` is for all others, and for who asks for accelerations alone.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ from flockenv.sweep.text import (
     alone,
     frame_views,
     given,
+    in_blocks,
     in_common,
     indented,
     indented_lines,
@@ -28,17 +30,34 @@ from flockenv.sweep.text import (
     tuple_of,
 )
 
-__all__ = ["accelerate", "felt_as", "parameters"]
+__all__ = ["accelerate", "felt_as", "parameters", "responses", "sense"]
 
 
-def accelerate(parts: Parts) -> str:
-    """Return the source of `accelerate`: pair laws first, then each agent by itself, block after block."""
+def sense(parts: Parts) -> str:
+    """Return the source of `sense`: what is felt from others."""
+    sensing = [*_aim(parts), *pairs(parts), *far(parts), *bonds(parts)]
+    return f'''
+
+@kernel
+def sense(context, pos, vel, time):
+    """Write what this thread's agents of one world feel from others, at this instant, whatever law it is by."""
+    {CONTEXT} = context
+{indented(needed([*frame_views(parts), *parameters(parts)], sensing), 4)}
+    if rank == 0:
+        work[b, 0] += 1
+{indented(sensing, 4)}
+'''
+
+
+def responses(parts: Parts, told: list[str]) -> list[str]:
+    """Write how each agent of a block responds, once all is sensed.
+
+    told: to whom it is told what acceleration `a` agent i, in lane l, has. With what velocity the medium carries it, if
+    it does, is in `carrying`.
+    """
     d = parts.dimension
     here = f"x, v = {lanes_of(parts, 'pos')}, {lanes_of(parts, 'vel')}"
     me = ["i = row + l", here, f"me = {alone(parts, one='one + l')}"]
-    read = [*frame_views(parts), *parameters(parts)]
-    sensing = [*_aim(parts), *pairs(parts), *far(parts), *bonds(parts)]
-    folding = obstacles(parts, me, lambda k: felt_as(parts, f"n{k}_"))
     responding = [
         *me,
         "o = zero(x)",
@@ -49,45 +68,35 @@ def accelerate(parts: Parts) -> str:
         *_own(parts),
         *_felt(parts),
         *_reconcile(parts),
+        "s = limit(s, max_force[one + l])",
+        "# a choice, not a factor of 0: a law may be infinite where the dead, what is held in place (by an infinite",
+        "# mass) and the lanes beyond the last agent lie",
+        "here = (living[live + l] > o[0]) & (mass[one + l] < like(o[0], np.inf))",
+        "share = like(o[0], 1.0) / mass[one + l]",
+        f"a = ({', '.join(f'(s[{k}] + f[{k}]) * share if here else o[{k}]' for k in range(d))})",
+        *told,
+        *_carry(parts),
     ]
+    return [
+        *in_common(parts),
+        *obstacles(parts, me, lambda k: felt_as(parts, f"n{k}_")),
+        f"for l in range(np.uint64({parts.width})):",
+        *indented_lines(responding, 4),
+    ]
+
+
+def accelerate(parts: Parts) -> str:
+    """Return the source of `accelerate`: pair laws first, then each agent by itself, block after block."""
+    responding = responses(parts, [f"{lane(parts, 'acc', k)} = a[{k}]" for k in range(parts.dimension)])
     return f'''
 
 @kernel
-def sense(context, pos, vel, time):
-    """Write what this thread's agents of one world feel from others, at this instant, whatever law it is by."""
+def accelerate(context, pos, vel, time, acc):
+    """Write the acceleration of this thread's agents, m/s^2."""
     {CONTEXT} = context
-{indented(needed(read, sensing), 4)}
-    if rank == 0:
-        work[b, 0] += 1
-{indented(sensing, 4)}
-
-
-@kernel
-def respond(around, pos, vel, time, acc):
-    """Acceleration of the agents of some of this thread's blocks, m/s^2, once all is sensed."""
-    context, first_, end_ = around
-    {CONTEXT} = context
-{indented(needed(read, [*folding, *responding, *_carry(parts)]), 4)}
-    for block in range(np.uint64(first_), np.uint64(end_)):
-        base, row = block * np.uint64({d * parts.width}), block * np.uint64({parts.width})
-{indented(in_common(parts), 8)}
-{indented(folding, 8)}
-        for l in range(np.uint64({parts.width})):
-{indented(responding, 12)}
-            s = limit(s, max_force[one + l])
-            # a choice, not a factor of 0: a law may be infinite where the dead, what is held in place (by an infinite
-            # mass) and the lanes beyond the last agent lie
-            here = (living[live + l] > o[0]) & (mass[one + l] < like(o[0], np.inf))
-            share = like(o[0], 1.0) / mass[one + l]
-{indented([f"{lane(parts, 'acc', k)} = (s[{k}] + f[{k}]) * share if here else o[{k}]" for k in range(d)], 12)}
-{indented(_carry(parts), 12)}
-
-
-@kernel
-def accelerate(around, pos, vel, time, acc):
-    """Sense and respond."""
-    sense(around[0], pos, vel, time)
-    respond(around, pos, vel, time, acc)
+{indented(needed([*frame_views(parts), *parameters(parts)], responding), 4)}
+    sense(context, pos, vel, time)
+{indented(in_blocks(parts, "first", "end", responding), 4)}
 '''
 
 

@@ -16,6 +16,9 @@ from flockenv.sweep.text import indented, indented_lines, place_of
 
 __all__ = ["go_home", "move_in"]
 
+AHEAD = 64
+"""So many agents on it is asked for what has been packed."""
+
 _COMMON = {**dict.fromkeys(("mass", "radius", "max_speed", "max_force"), 0), "want": 1}
 """What all may have in common, and by which mask it is read then, see `text.in_common`."""
 
@@ -62,6 +65,7 @@ def _carry(parts: Parts, to: list[str]) -> list[str]:
         "wait_for_team(sync, team)",
         f"for i in range(np.uint64(first * {w}), np.uint64(min(end * {w}, n))):",
         f"    place = {place_of(parts, d)}",
+        f"    ask_for(luggage, (i + np.uint64({AHEAD})) * np.uint64({count}))",
         *indented_lines(_unpacked(parts, luggage), 4),
     ]
 

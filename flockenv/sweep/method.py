@@ -14,7 +14,9 @@ __all__ = ["method", "method_imports"]
 
 
 def method_imports(parts: Parts) -> str:
-    """Import what the integrator's `advance` calls in its own module."""
+    """Import the integrator's `move`, or what its `advance` calls in its own module."""
+    if parts.one_stage:
+        return f"from {type(parts.integrator).__module__} import move"
     python = parts.integrator.advance().py_func
     names = [name for name in python.__code__.co_names if name in python.__globals__]
     names = [name for name in names if name not in PROVIDED and name not in (*dir(builtins), "np")]
@@ -24,18 +26,16 @@ def method_imports(parts: Parts) -> str:
 def method(parts: Parts) -> str:
     """Return the text of the integrator's `advance` with this scene's `accelerate` in the place of its argument.
 
-    A method that asks once begins with the frozen present: `step_world` has had it sensed, and it needs the response
-    alone. (numba can pass a compiled function as an argument, but does not cache a function that does.)
+    (numba can pass a compiled function as an argument, but does not cache a function that does.)
     """
     python = parts.integrator.advance().py_func
     text = inspect.getsource(python)
     text = text[text.index("def advance(") :].replace("acceleration: Any, ", "", 1)
     for annotation in (": Any", ": float", ": int"):
         text = text.replace(annotation, "")
-    law = "respond" if parts.integrator.evaluations == 1 else "accelerate"
     writers = {"damping": _damping, "settings": _settings, "largest": _largest, "counted": _counted}
     asked = [writers[name](parts) for name in sorted(PROVIDED & set(python.__code__.co_names))]
-    return "".join(asked) + "\n@kernel\n" + text.replace("acceleration(", f"{law}(")
+    return "".join(asked) + "\n@kernel\n" + text.replace("acceleration(", "accelerate(")
 
 
 def _settings(parts: Parts) -> str:
@@ -43,9 +43,9 @@ def _settings(parts: Parts) -> str:
     count, at = len(parts.integrator.settings()), parts.last_numbers("method")
     return f'''
 @kernel
-def settings(around):
+def settings(context):
     """The numbers of the method."""
-    {CONTEXT} = around[0]
+    {CONTEXT} = context
     return ({"".join(f"params[{at + k}], " for k in range(count))})
 
 
@@ -58,9 +58,9 @@ def _damping(parts: Parts) -> str:
     d, w = parts.dimension, parts.width
     return f'''
 @kernel
-def damping(around, rate, begin, until):
+def damping(context, rate, begin, until):
     """The sum of all linear drags of every coordinate, 1/s."""
-    {CONTEXT} = around[0]
+    {CONTEXT} = context
 {indented(needed(parameters(parts), rates), 4)}
     c = {" + ".join(rates) or "like(mass[0], 0.0)"}
     for block in range(np.uint64(begin // {d * w}), np.uint64(until // {d * w})):
@@ -78,7 +78,7 @@ def _largest(parts: Parts) -> str:
     d, w = parts.dimension, parts.width
     return f'''
 @kernel
-def largest(around, squares, begin, until):
+def largest(context, squares, begin, until):
     """The largest sum of an agent's coordinates, NaN if one is, and where the first of that agent lies."""
     worst, where = like(squares[0], -1.0), np.uint64(begin)
     for block in range(np.uint64(begin // {d * w}), np.uint64(until // {d * w})):
@@ -98,9 +98,9 @@ def _counted(parts: Parts) -> str:
     """Write how steps are counted."""
     return f'''
 @kernel
-def counted(around, accepted, rejected):
+def counted(context, accepted, rejected):
     """Count steps of the method's own."""
-    {CONTEXT} = around[0]
+    {CONTEXT} = context
     work[b, {SUBSTEPS}] += accepted
     work[b, {SUBSTEPS + 1}] += rejected
 

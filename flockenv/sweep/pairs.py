@@ -221,21 +221,15 @@ def meet_range(
     where: who counts at all; of those in one place ties are read. Only around the edge of a periodic box are images
     sought. exact: squares are worked out in other places, too.
     """
-    square = "exact_dot(to, to)" if exact or any(s.nearest for s in parts.sights) else "dot(to, to)"
+    dot = "exact_dot" if exact or any(s.nearest for s in parts.sights) else "dot"
     wrapped, plain = offset_of(parts, "xj"), "sub(xj, me.pos)"
 
     mine = f"{listed(parts)} if block + l < np.uint64(upto) else np.uint64(0)"  # lanes beyond hold what lay there
     own_tie = _tie(parts, "own_tie", mine) if where == TOGETHER else []
     near = [q for q, sight in enumerate(parts.sights) if touch and sight in _touching(parts)]
 
-    def over_lanes(offset: str, each: list[str]) -> list[str]:
-        met = [
-            *own_tie,
-            me_of(parts, fields, "own_tie" if own_tie else ""),
-            f"to = {offset}",
-            f"square = {square}",
-            f"other = {where}",
-        ]
+    def over_lanes(way: list[str], each: list[str]) -> list[str]:
+        met = [*own_tie, me_of(parts, fields, "own_tie" if own_tie else ""), *way, f"other = {where}"]
         if not parts.masks:  # oneself is far away: compared once, and not for every sight
             met.append("gap = square if other else like(square, np.inf)")
         return [
@@ -245,20 +239,42 @@ def meet_range(
             indented(each, 4),
         ]
 
+    def loop_ahead(offset: str) -> list[str]:
+        *to, square = Slots(parts).all("next")
+        onward = [me_of(parts, fields), f"onward = {offset}", f"further = {dot}(onward, onward)"]
+        kept = [*(f"{name} = onward[{k}]" for k, name in enumerate(to)), f"{square} = further"]
+        found = [f"to = ({', '.join(to)})", f"square = {square}"]
+        following = "xn" + _candidate(parts, fields)[0].removeprefix("xj")
+        return [
+            "j, last = np.uint64(ranges[r, 0]), np.uint64(ranges[r, 1])",
+            following,
+            f"for l in range(np.uint64({parts.width})):",
+            *indented_lines([*onward, *kept], 4),
+            "while j < last:",
+            *indented_lines(_candidate(parts, fields), 4),
+            "    own, o = np.int32(j - block), like(reach, -0.0)",
+            "    j += np.uint64(1)",
+            f"    {following}  # behind the last one whatever lies there, which nobody looks at",
+            *indented_lines(over_lanes([*onward, *found], [*lines, *kept]), 4),
+        ]
+
     def loop(offset: str) -> list[str]:
         some = [f"touch |= other & (square < within{q})" for q in near]
+        way = [f"to = {offset}", f"square = {dot}(to, to)"]
         return [
             "j, last = np.uint64(ranges[r, 0]), np.uint64(ranges[r, 1])",
             "while j < last:",
             *indented_lines(_candidate(parts, fields, where == TOGETHER), 4),
             "    own, o = np.int32(j - block), like(reach, -0.0)",
             *["    touch = False"] * bool(near),
-            *indented_lines(over_lanes(offset, [*lines, *some]), 4),
+            *indented_lines(over_lanes(way, [*lines, *some]), 4),
             *["    if touch:"] * bool(near),
-            *indented_lines(over_lanes(offset, touch) if touch and near else [], 8),
+            *indented_lines(over_lanes(way, touch) if touch and near else [], 8),
             "    j += np.uint64(1)",
         ]
 
+    if parts.looks_ahead and where == ELSEWHERE and not near:
+        return loop_ahead(offset_of(parts, "xn"))
     if not parts.space.periodic:
         return loop(plain)
     if not parts.sorts or where == TOGETHER:  # what comes seldom has one form: the nearest image of who is near is he

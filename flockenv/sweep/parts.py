@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from flockenv import processor
 from flockenv.effects.base import Effect, Sight
 from flockenv.integrators.base import Integrator
+from flockenv.integrators.one_stage import OneStage
 from flockenv.kernels import LINE
 from flockenv.shapes import packed
 from flockenv.space import Space
@@ -192,6 +193,14 @@ class Parts:
         return sums and bool(readers) and all(e.apart_law for e in readers) and not others
 
     @property
+    def looks_ahead(self) -> bool:
+        """Is it worked out how far the next candidate is while one is met, so that more is under way at a time?
+
+        In small scenes, where a block meets all candidates in a row, of several laws, where there are registers enough.
+        """
+        return self.parting and self.masks and not self.sorts and self.dimension == 2 and len(self.pairs) > 1
+
+    @property
     def trusts(self) -> bool:
         """Is everybody somewhere, at a finite place, whenever forces are asked for, unless a step has failed already?
 
@@ -199,7 +208,7 @@ class Parts:
         number is none either, so whoever meets one who is nowhere is nowhere after that step, too: who was first is
         looked for step by step (`step_world`).
         """
-        return self.stepped and self.integrator.evaluations == 1
+        return self.stepped and self.one_stage
 
     @property
     def spreads(self) -> bool:
@@ -335,20 +344,14 @@ class Parts:
         return [name for name in names if name in found]
 
     @property
-    def in_place(self) -> bool:
-        """Does an agent's acceleration come where it was written what it feels from others, in one vector?
-
-        Where the method asks once, and has written nothing there: nobody reads it again. It is memory that is at hand,
-        and less of it.
-        """
-        method = self.integrator
-        once = method.asks_first and method.evaluations == method.stages == 1
-        return once and len(self.targets) == 1 and self.targets[0][0] != "n"
+    def one_stage(self) -> bool:
+        """Does the method ask once, and then move every coordinate by itself?"""
+        return isinstance(self.integrator, OneStage)
 
     @property
-    def stages(self) -> int:
-        """Rows of coordinates that the method needs as scratch of its own."""
-        return 0 if self.in_place else max(self.integrator.stages, 1)
+    def aside(self) -> int:
+        """Numbers of every agent that are put aside: accelerations, or where it was, and how fast if bodies bounce."""
+        return self.dimension * (2 if self.bounces and not self.one_stage else 1)
 
     @functools.cached_property
     def fields(self) -> list[str]:
@@ -393,7 +396,7 @@ class Parts:
 
         Only where accelerations are asked for at the frozen present: a stage of a method may lie outside.
         """
-        return self.space.periodic and self.arranges and self.integrator.evaluations == 1
+        return self.space.periodic and self.arranges and self.one_stage
 
     @property
     def arranges(self) -> bool:
@@ -464,6 +467,7 @@ class Parts:
             ("far", d * bool(self.far)),
         ]
         runs += [("reach", int(bool(self.bounded))), ("here", int(self.parting))]
+        runs += [("next", (d + 1) * self.looks_ahead)]
         runs += [("square", look.agents + self.keyed), ("place", look.agents)]
         runs += [("gap", look.obstacles), ("which", look.obstacles)]
         if self.sweeps and self.sorts:

@@ -15,6 +15,9 @@ from flockenv.tiles import FAR_FROM_HOME
 
 __all__ = ["counted", "listed", "listed_at", "query", "walk"]
 
+AHEAD = 8
+"""So many blocks on it is asked for the places of records."""
+
 _ARRAYS = {"x": "pos", "v": "vel", "t": "tie", "d": "facing", "a": "aiming"}
 
 
@@ -152,7 +155,7 @@ def _sort(parts: Parts, fields: list[str], inside: bool, may_lie: bool) -> list[
         "for block in range(np.uint64(first), np.uint64(end)):",
         f"    base, row = block * np.uint64({d * w}), block * np.uint64({w})",
         f"    if n >= {DISTANT}:  # a distant place for each: asked for in good time",
-        f"        later = np.uint64(min(block + np.uint64(2), np.uint64(end - 1)) * np.uint64({w}))",
+        f"        later = np.uint64(min(block + np.uint64({AHEAD}), np.uint64(end - 1)) * np.uint64({w}))",
         f"        for l in range(np.uint64({w})):",
         "            there = np.uint64(offset[rank, np.uint64(max(cell[later + l], np.int32(0)))])",
         f"            ask_for(records, there * np.uint64({len(record)}))",

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from flockenv.sweep.accelerate import accelerate
+from flockenv.sweep.accelerate import accelerate, sense
 from flockenv.sweep.far import tree_imports
 from flockenv.sweep.handed import trimmed
 from flockenv.sweep.look import KEYS
@@ -15,7 +15,7 @@ from flockenv.sweep.method import method, method_imports
 from flockenv.sweep.obstacles import blocked, obstacle_imports
 from flockenv.sweep.parts import LAWS, Parts
 from flockenv.sweep.step import begin, copies, kept_frame, kept_inner, step, step_world
-from flockenv.sweep.text import CONTEXT, SHARED, asked, frame_views, indented, stages_of
+from flockenv.sweep.text import CONTEXT, SHARED, asked, frame_views, indented
 
 __all__ = ["field_source", "scene_source"]
 
@@ -29,8 +29,8 @@ def scene_source(parts: Parts, more: str = "") -> str:
         _imports(parts),
         *(_parameter_tuple(parts, k) for k in range(len(parts.effects))),
         blocked(parts),
-        accelerate(parts),
-        method(parts),
+        sense(parts),
+        *([] if parts.one_stage else [accelerate(parts), method(parts)]),
         copies(parts) + step_world(parts),
         begin(parts),
         step(parts) + more,
@@ -48,6 +48,7 @@ def field_source(parts: Parts) -> str:
         _imports(parts),
         *(_parameter_tuple(parts, k) for k in range(len(parts.effects))),
         blocked(parts),
+        sense(parts),
         accelerate(parts),
         copies(parts),
         f'''
@@ -70,8 +71,8 @@ def field(
 {indented([*frame_views(parts), *kept_frame(parts, from_state=True), *kept_inner(parts, from_state=True)], 8)}
 {indented(asked(parts), 8)}
         context = ({CONTEXT})
-        accelerate((context, first, end), pos, vel, times[b], {stages_of(parts)}[0])
-        out_of_blocks({stages_of(parts)}[0], acc, b, n, first, end)
+        accelerate(context, pos, vel, times[b], aside)
+        out_of_blocks(aside, acc, b, n, first, end)
         {"out_of_blocks(carrying, flow, b, n, first, end)" if parts.flows else "pass"}
 ''',
     ]  # fmt: skip

@@ -7,7 +7,7 @@ world together, each the agents of its own blocks.
 from __future__ import annotations
 
 from flockenv.state import COUNTED_BY_KERNELS
-from flockenv.sweep.accelerate import felt_as, parameters
+from flockenv.sweep.accelerate import felt_as, parameters, responses
 from flockenv.sweep.arrange import go_home, move_in
 from flockenv.sweep.parts import Parts
 from flockenv.sweep.text import (
@@ -19,20 +19,25 @@ from flockenv.sweep.text import (
     copied,
     frame_views,
     given,
+    in_blocks,
     in_common,
     indented,
     indented_lines,
     lane,
     lanes_of,
     nearest_images,
-    stages_of,
+    needed,
     tuple_of,
 )
 
 __all__ = ["begin", "copies", "kept_frame", "kept_inner", "step", "step_world"]
 
+
 PART = 8
-"""Blocks that are advanced together: what they take stays in the nearest cache."""
+"""Blocks that are advanced together."""
+
+AHEAD = 16
+"""So many blocks on it is asked for what agents are moved by, in large worlds: several arrays are read side by side."""
 
 
 def copies(parts: Parts) -> str:
@@ -88,8 +93,8 @@ def kept_inner(parts: Parts, from_state: bool) -> list[str]:
 
 def step_world(parts: Parts) -> str:
     """Return the source of `step_world`: steps of one world, or of one thread's part of it."""
-    d = parts.dimension
-    bad = Slots(parts)("bad")
+    d, bad = parts.dimension, Slots(parts)("bad")
+    arriving, stepping = [*_confine(parts), *move_in(parts)], _advance(parts)
     kept = "(" + ", ".join(f"work[b, {k}]" for k in range(COUNTED_BY_KERNELS)) + ")"
     restored = "; ".join(f"work[b, {k}] = counted_[{k}]" for k in range(COUNTED_BY_KERNELS))
     return f'''@kernel
@@ -105,7 +110,6 @@ def step_world(
     n = x_.shape[2]
     blocks = (n + {parts.width - 1}) // {parts.width}
     first, end = blocks * rank // team, blocks * (rank + 1) // team
-    size, reach = {tuple_of("params[#]", d)}, params[{d}]
     present = np.int64(0)  # not a literal: laws would be typed for it too, and compiled twice
     for i in range(n):
         present += alive[b, i]
@@ -114,27 +118,25 @@ def step_world(
     into_blocks(pos, x_, b, n, first, end)
     into_blocks(vel, v_, b, n, first, end)
 {indented([*frame_views(parts), *kept_frame(parts, from_state=True), *kept_inner(parts, from_state=True)], 4)}
-{indented(_confine(parts), 4)}
-{indented(move_in(parts), 4)}
+{indented(needed(parameters(parts), [*arriving, *stepping]), 4)}
+{indented(arriving, 4)}
     context = ({CONTEXT})
-    far, begun = like(dt, np.inf), tick[b]
-    {"earlier = origin[len(pos):]" if parts.bounces else "pass"}
+    well, begun = like(dt, np.inf), tick[b]
     counted_ = {kept}
-{indented(_parameters(parts), 4)}
     for l in range(np.uint64({parts.width})):
-        {bad} = far
+        {bad} = well
     nobody = np.int64(n * (count + 1))
     failed = nobody
     for step_ in range(count):
         time = like(dt, (begun + step_) * np.float64(dt))
-{indented([*_advance(parts), *_noted(parts)], 8)}
+{indented([*stepping, *_noted(parts)], 8)}
 {indented(go_home(parts), 4)}
-    worst = far
+    worst = well
     for lane in range({parts.width}):  # one after the other: no loop over lanes
         l = np.uint64(lane)
         worst = min(worst, {bad})
     # who counts may still be reading the first half
-    tally[team + rank] = {"failed" if parts.spreads else "np.int64(worst) if worst < far else nobody"}
+    tally[team + rank] = {"failed" if parts.spreads else "np.int64(worst) if worst < well else nobody"}
     wait_for_team(sync, team)
     first_bad = nobody
     for r in range(team):
@@ -164,7 +166,7 @@ def _noted(parts: Parts) -> list[str]:
     return [
         "fallen = np.int32(0)",
         f"for l in range(np.uint64({parts.width})):",
-        f"    fallen += np.int32(1) if {bad} < far else np.int32(0)",
+        f"    fallen += np.int32(1) if {bad} < well else np.int32(0)",
         "if fallen > np.int32(0) and failed == nobody:",
         f"    for lane in range({parts.width}):",
         "        l = np.uint64(lane)",
@@ -187,25 +189,56 @@ def _confine(parts: Parts) -> list[str]:
 
 
 def _advance(parts: Parts) -> list[str]:
-    """Write one step of this thread's agents.
-
-    A method that asks for accelerations once runs through them part after part, each of which stays in the cache from
-    what it feels to where it comes: after `sense`, nobody reads what others write.
-    """
+    """Write one step of this thread's agents."""
+    if parts.one_stage:
+        return [*_count(parts), "sense(context, pos, vel, time)", *_in_two_loops(parts)]
     size, flow = parts.dimension * parts.width, "carrying" if parts.flows else "()"
-    rows = stages_of(parts)
-    if parts.integrator.evaluations != 1:
-        advance = f"advance((context, first, end), pos, vel, {flow}, time, dt, {rows}, first * {size}, end * {size})"
-        told = ["sense(context, pos, vel, time)"] * (parts.inner != () and parts.integrator.solves)
-        return [*_count(parts), *told, *_remember(parts, "first", "end"), advance, *_bound(parts, "first", "end")]
+    told = ["sense(context, pos, vel, time)"] * (parts.inner != () and parts.integrator.solves)
+    advance = f"advance(context, pos, vel, {flow}, time, dt, stages, first * {size}, end * {size})"
+    moved = [
+        f"was, x, v = {lanes_of(parts, 'aside')}, {lanes_of(parts, 'pos')}, {lanes_of(parts, 'vel')}",
+        *[f"earlier = {lanes_of(parts, 'aside[len(pos):]')}"] * parts.bounces,
+    ]
+    return [*_count(parts), *told, *_remember(parts), advance, *in_blocks(parts, "first", "end", _bound(parts, moved))]
+
+
+def _in_two_loops(parts: Parts) -> list[str]:
+    """Write how agents are moved by a method of one stage, once all is sensed: nobody reads what others write.
+
+    A part after the other, which stays in the nearest cache, and of which accelerations are put aside. In one loop,
+    from what is felt to where that leads, too few agents would be under way at a time.
+    """
+    d, w = parts.dimension, parts.width
+    past = f"past = base - np.uint64((begin - first) * {d * w})"  # each thread at a place of its own
+    told = [f"{lane(parts, 'aside', k, 'past')} = a[{k}]" for k in range(d)]
+    moved = [
+        f"x, v, a = {lanes_of(parts, 'pos')}, {lanes_of(parts, 'vel')}, {lanes_of(parts, 'aside', 'past')}",
+        "was, earlier = x, v",
+        *(f"x{k}, v{k} = move(x[{k}], v[{k}], a[{k}], dt)" for k in range(d)),
+        f"x, v = {tuple_of('x#', d)}, {tuple_of('v#', d)}",
+        *[f"x = add(x, scale({lanes_of(parts, 'carrying')}, dt))"] * parts.flows,
+    ]
+    respond = in_blocks(parts, "begin", "until", [past, *_ahead(parts), *responses(parts, told)])
+    move = in_blocks(parts, "begin", "until", [past, *_bound(parts, moved)])
     return [
-        *_count(parts),
-        "sense(context, pos, vel, time)",
         f"for begin in range(first, end, {PART}):",
         f"    until = min(begin + {PART}, end)",
-        *indented_lines(_remember(parts, "begin", "until"), 4),
-        f"    advance((context, begin, until), pos, vel, {flow}, time, dt, {rows}, begin * {size}, until * {size})",
-        *indented_lines(_bound(parts, "begin", "until"), 4),
+        *indented_lines([*respond, *move], 4),
+    ]
+
+
+def _ahead(parts: Parts) -> list[str]:
+    """Write how what comes next is asked for, in large worlds."""
+    if not parts.sorts:
+        return []
+    rows = {"pos": parts.dimension, "vel": parts.dimension, "felt": parts.dimension * len(parts.targets), "ident": 1}
+    return [
+        f"ahead = block + np.uint64({AHEAD})",
+        *(
+            f"ask_for({array}, ahead * np.uint64({many * parts.width}) + np.uint64({k * parts.width}))"
+            for array, many in rows.items()
+            for k in range(many)
+        ),
     ]
 
 
@@ -236,30 +269,28 @@ def _count(parts: Parts) -> list[str]:
     ]
 
 
-def _bound(parts: Parts, first: str, end: str) -> list[str]:
-    """Write what happens to the agents of some blocks after the method: limits, the space, and who is not finite."""
+def _bound(parts: Parts, moved: list[str]) -> list[str]:
+    """Write what happens to the agents of a block after the method: limits, the space, and who is not finite.
+
+    moved: where agent i was, with velocity `earlier`, and x and v to which the method has brought it.
+    """
     bad = Slots(parts)("bad")
-    stored = (("pos", "x"), ("vel", "v"))
+    bounding = [
+        *_kick(parts),
+        "where = well if finite(dot(x, x) + dot(v, v)) else ident[i]",
+        f"{bad} = where if where < {bad} else {bad}",
+        *_turn(parts),
+        "# nobody moves faster than max_speed, whatever a method makes of the velocity within the step",
+        "x = add(was, scale(limit(sub(x, was), max_speed[one + l] * dt), living[live + l]))",
+        *_stay_inside(parts),
+        *_face(parts),
+        *(f"{lane(parts, 'pos', k)}, {lane(parts, 'vel', k)} = x[{k}], v[{k}]" for k in range(parts.dimension)),
+        *_keep(parts),
+    ]
     return [
-        f"for block in range(np.uint64({first}), np.uint64({end})):",
-        f"    base, row = block * np.uint64({parts.dimension * parts.width}), block * np.uint64({parts.width})",
-        f"    past = base - np.uint64(({first} - first) * {parts.dimension * parts.width})",
-        *indented_lines(in_common(parts), 4),
-        f"    for l in range(np.uint64({parts.width})):",
-        "        i = row + l",
-        f"        was, x, v = {lanes_of(parts, 'origin', 'past')}, {lanes_of(parts, 'pos')}, {lanes_of(parts, 'vel')}",
-        *indented_lines(_kick(parts), 8),
-        "        where = far if finite(dot(x, x) + dot(v, v)) else ident[i]",
-        f"        {bad} = where if where < {bad} else {bad}",
-        *indented_lines(_turn(parts), 8),
-        "        # nobody moves faster than max_speed, whatever a method makes of the velocity within the step",
-        "        x = add(was, scale(limit(sub(x, was), max_speed[one + l] * dt), living[live + l]))",
-        *indented_lines([*_stay_inside(parts), *_face(parts)], 8),
-        *(
-            "        " + "; ".join(f"{lane(parts, array, k)} = {now}[{k}]" for array, now in stored)
-            for k in range(parts.dimension)
-        ),
-        *indented_lines(_keep(parts), 8),
+        *in_common(parts),
+        f"for l in range(np.uint64({parts.width})):",
+        *indented_lines(["i = row + l", *moved, *bounding], 4),
     ]
 
 
@@ -297,17 +328,13 @@ def _face(parts: Parts) -> list[str]:
     return lines + [f"{lane(parts, 'above', k)} = up[{k}]" for k in range(parts.dimension)]
 
 
-def _remember(parts: Parts, first: str, end: str) -> list[str]:
-    """Write how positions before the step are kept, where bodies bounce velocities too.
-
-    A part after the other, each at the same place, which stays in the nearest cache.
-    """
+def _remember(parts: Parts) -> list[str]:
+    """Write how positions before the step are kept, where bodies bounce velocities too."""
     size = parts.dimension * parts.width
     return [
-        f"past = np.uint64(({first} - first) * {size})",
-        f"for i in range(np.uint64({first} * {size}), np.uint64({end} * {size})):",
-        "    origin[i - past] = pos[i]",
-        *(["    earlier[i - past] = vel[i]"] if parts.bounces else []),
+        f"for i in range(np.uint64(first * {size}), np.uint64(end * {size})):",
+        "    aside[i] = pos[i]",
+        *["    aside[np.uint64(len(pos)) + i] = vel[i]"] * parts.bounces,
     ]
 
 
@@ -317,16 +344,11 @@ def _stay_inside(parts: Parts) -> list[str]:
     if not parts.bounces:
         return [f"x, v = confine(size, radius[one + l], x, {limited})"]
     restitution = f"params[{parts.last_numbers('space')}]"
-    before = f"scale({lanes_of(parts, 'earlier', 'past')}, living[live + l])"
     return [
-        f"x, v = bounce(size, radius[one + l], {restitution}, dt, was, {before}, x, {limited})",
+        "earlier = scale(earlier, living[live + l])",
+        f"x, v = bounce(size, radius[one + l], {restitution}, dt, was, earlier, x, {limited})",
         "v = limit(v, max_speed[one + l])",
     ]
-
-
-def _parameters(parts: Parts) -> list[str]:
-    """Write how the numbers are read where laws are asked once per step."""
-    return parameters(parts) if parts.inner or any(e.kick_law for e in parts.effects) else []
 
 
 def _kick(parts: Parts) -> list[str]:
@@ -360,7 +382,7 @@ def _keep(parts: Parts) -> list[str]:
     return [
         *lines,
         *(f"now{j} = {value}" for j, value in enumerate(now)),
-        f"where = far if finite({' + '.join(f'now{j}' for j in range(len(now)))}) else ident[i]",
+        f"where = well if finite({' + '.join(f'now{j}' for j in range(len(now)))}) else ident[i]",
         f"{bad} = where if where < {bad} else {bad}",
         *(f"inner{j}[i] = now{j} if living[i] > like(dt, 0.0) else me.inner.{n}" for j, n in enumerate(parts.inner)),
     ]

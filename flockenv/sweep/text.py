@@ -13,9 +13,9 @@ from flockenv.effects.base import Effect
 from flockenv.sweep.parts import Parts
 
 __all__ = [
-    "CONTEXT", "SHARED", "Slots", "alone", "asked", "copied", "frame_views", "given", "in_common", "indented",
-    "indented_lines", "inner_of", "lane", "lanes_of", "nearest_image", "nearest_images", "needed", "place_of",
-    "stages_of", "tuple_of",
+    "CONTEXT", "SHARED", "Slots", "alone", "asked", "copied", "frame_views", "given", "in_blocks", "in_common",
+    "indented", "indented_lines", "inner_of", "lane", "lanes_of", "nearest_image", "nearest_images", "needed",
+    "place_of", "tuple_of",
 ]  # fmt: skip
 
 _READ = (
@@ -23,7 +23,7 @@ _READ = (
     "luggage, order, cell, start, offset, homes, strangers, bounds, tally, sync, tie, bond_place, bond_number, "
     "bond_start, tree_key, tree_place, tree_digit, tree_leaf, tree_node, tree_near, number, lanes, ranges, spread"
 )
-SHARED = f"pos, vel, origin, stages, {_READ}"
+SHARED = f"pos, vel, aside, stages, {_READ}"
 """Scratch of one world in progress, in order; see workspace.Workspace. The last three belong to one thread. Of these
 and the next, a source keeps what it names (`handed.trimmed`)."""
 
@@ -66,6 +66,16 @@ def in_common(parts: Parts) -> list[str]:
     ]
 
 
+def in_blocks(parts: Parts, first: str, end: str, lines: list[str]) -> list[str]:
+    """Write what is done in the blocks [first, end): of each, vectors lie from `base` on, and numbers from `row` on."""
+    w = parts.width
+    return [
+        f"for block in range(np.uint64({first}), np.uint64({end})):",
+        f"    base, row = block * np.uint64({parts.dimension * w}), block * np.uint64({w})",
+        *indented_lines(lines, 4),
+    ]
+
+
 def asked(parts: Parts) -> list[str]:
     """Write how what is asked of the agents of world b, if anything, comes into blocks."""
     size = parts.dimension * parts.width
@@ -79,11 +89,6 @@ def asked(parts: Parts) -> list[str]:
         "else:",
         *indented_lines(nothing, 4),
     ]
-
-
-def stages_of(parts: Parts) -> str:
-    """Write the rows of coordinates that the method has as scratch."""
-    return "(felt,)" if parts.in_place else "stages"
 
 
 def inner_of(parts: Parts, i: str) -> str:
