@@ -1,12 +1,12 @@
 """Integrator: (acceleration, state, dt) -> state. A law never knows which method integrates it.
 
-Each method is one file, with a formula (`one_stage.py`), or with
-`advance(acceleration, context, pos, vel, flow, time, dt, stages, first, end)`: over the
-coordinates of one world in one row, in place. Of these it writes [first, end) alone, because several threads may share
-a world, each with a part of its own; `acceleration(context, pos, vel, time, out)` reads everybody's positions, and
-waits until all threads have come so far. `flow` holds the velocity with which the medium carries everybody, as of the
-last acceleration; it is empty, and costs nothing, where nothing flows. Compiled, `advance` is a part of a scene's
-kernel; with Python functions for the laws the very same source runs in Python, which is how its order is measured.
+Each method is one file. A method of one stage is a formula (`one_stage.py`); any other is
+`advance(acceleration, context, pos, vel, flow, time, dt, stages, first, end)`: over the coordinates of one world in one
+row, in place. Of these it writes [first, end) alone, because several threads may share a world, each with a part of its
+own; `acceleration(context, pos, vel, time, out)` reads everybody's positions, and waits until all threads have come so
+far. `flow` holds the velocity with which the medium carries everybody, as of the last acceleration; it is empty, and
+costs nothing, where nothing flows. Compiled, either is a part of a scene's kernel; with Python functions for the laws
+the very same source runs in Python, which is how its order is measured.
 """
 
 from __future__ import annotations

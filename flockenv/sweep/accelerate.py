@@ -2,8 +2,8 @@
 
 Pair laws come first, in one sweep (`sense`), and leave what they came to in `felt`, by agent; laws about everybody, and
 bonds, in `pulled`. Then each block adds what an agent wants or feels by itself, and a fold over the obstacles
-(`responses`); what it wants is bounded by max_force. A method of one stage goes on from there in the same
-pass (`step`); `accelerate` is for all others, and for who asks for accelerations alone.
+(`responses`); what it wants is bounded by max_force. By a method of one stage `step` goes on from there, part after
+part; `accelerate` is for all others, and for who asks for accelerations alone.
 """
 
 from __future__ import annotations
