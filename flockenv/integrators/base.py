@@ -11,6 +11,7 @@ the very same source runs in Python, which is how its order is measured.
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any, ClassVar, NamedTuple
@@ -128,11 +129,14 @@ class Integrator(Record):
         return tuple(float(getattr(self, name)) for name in type(self).model_fields if name != "kind")
 
     @classmethod
+    def compiled(cls, name: str) -> Any:
+        """Return what the method's module has compiled under this name."""
+        return vars(sys.modules[cls.__module__])[name]
+
+    @classmethod
     def advance(cls) -> Any:
         """Return the compiled `advance` of the method's module."""
-        import sys
-
-        return vars(sys.modules[cls.__module__])["advance"]
+        return cls.compiled("advance")
 
     def __call__(
         self,

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from typing import Any, ClassVar
 
 from flockenv.integrators.base import Integrator
@@ -20,7 +19,7 @@ class OneStage(Integrator):
     @classmethod
     def move(cls) -> Any:
         """Return the compiled `move` of the method's module."""
-        return vars(sys.modules[cls.__module__])["move"]
+        return cls.compiled("move")
 
     def _step(
         self, law: Any, context: Any, x: Floats, v: Floats, flow: Any, time: float, dt: float, stages: Floats

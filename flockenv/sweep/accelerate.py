@@ -137,18 +137,16 @@ def _aim(parts: Parts) -> list[str]:
     effects = [(k, e) for k, e in enumerate(parts.effects) if e.aim_law is not None]
     if not effects:
         return []
-    d, w = parts.dimension, parts.width
-    return [
-        "for block in range(np.uint64(first), np.uint64(end)):",
-        f"    base, row = block * np.uint64({d * w}), block * np.uint64({w})",
-        f"    for l in range(np.uint64({w})):",
-        f"        i, x, v = row + l, {lanes_of(parts, 'pos')}, {lanes_of(parts, 'vel')}",
-        f"        me, e = {alone(parts, aim='zero(x)')}, zero(x)",
-        *indented_lines(nearest_images(parts, effects), 8),
-        *(f"        e = add(e, aim_law_{k}({given(parts, k)}, me))" for k, _ in effects),
-        "        e = limit(e, like(x[0], 1.0))",
-        *(f"        {lane(parts, 'aiming', k)} = e[{k}]" for k in range(d)),
+    aiming = [
+        f"i, x, v = row + l, {lanes_of(parts, 'pos')}, {lanes_of(parts, 'vel')}",
+        f"me, e = {alone(parts, aim='zero(x)')}, zero(x)",
+        *nearest_images(parts, effects),
+        *(f"e = add(e, aim_law_{k}({given(parts, k)}, me))" for k, _ in effects),
+        "e = limit(e, like(x[0], 1.0))",
+        *(f"{lane(parts, 'aiming', k)} = e[{k}]" for k in range(parts.dimension)),
     ]
+    each = [f"for l in range(np.uint64({parts.width})):", *indented_lines(aiming, 4)]
+    return in_blocks(parts, "first", "end", each)
 
 
 def _medium(parts: Parts) -> list[str]:

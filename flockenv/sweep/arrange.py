@@ -12,7 +12,7 @@ from __future__ import annotations
 from flockenv.neighbours import FEWEST_ARRANGED, STEPS_ARRANGED, WORTH_ARRANGING
 from flockenv.sweep.parts import Parts
 from flockenv.sweep.query import counted
-from flockenv.sweep.text import indented, indented_lines, place_of
+from flockenv.sweep.text import in_blocks, indented, indented_lines, place_of
 
 __all__ = ["go_home", "move_in"]
 
@@ -56,12 +56,13 @@ def _carry(parts: Parts, to: list[str]) -> list[str]:
     luggage = [field.partition(" ") for field in parts.luggage]  # an array, and of vectors which axis
     sources = "".join(f"{name}, " for name, _, _ in luggage)
     places = "".join(_place(name, axis, w) for name, _, axis in luggage)
+    packing = [
+        f"for i in range(row, min(row + np.uint64({w}), np.uint64(n))):",
+        *indented_lines(to, 4),
+        f"put_lines(luggage, ({sources}), ({places}), {w}, cell, row, {count}, np.uint64(n))",
+    ]
     return [
-        "for block in range(np.uint64(first), np.uint64(end)):",
-        f"    base, row = block * np.uint64({d * w}), block * np.uint64({w})",
-        f"    for i in range(row, min(row + np.uint64({w}), np.uint64(n))):",
-        indented(to, 8),
-        f"    put_lines(luggage, ({sources}), ({places}), {w}, cell, row, {count}, np.uint64(n))",
+        *in_blocks(parts, "first", "end", packing),
         "wait_for_team(sync, team)",
         f"for i in range(np.uint64(first * {w}), np.uint64(min(end * {w}, n))):",
         f"    place = {place_of(parts, d)}",

@@ -226,37 +226,8 @@ def meet_range(
 
     mine = f"{listed(parts)} if block + l < np.uint64(upto) else np.uint64(0)"  # lanes beyond hold what lay there
     own_tie = _tie(parts, "own_tie", mine) if where == TOGETHER else []
+    me = [*own_tie, me_of(parts, fields, "own_tie" if own_tie else "")]
     near = [q for q, sight in enumerate(parts.sights) if touch and sight in _touching(parts)]
-
-    def over_lanes(way: list[str], each: list[str]) -> list[str]:
-        met = [*own_tie, me_of(parts, fields, "own_tie" if own_tie else ""), *way, f"other = {where}"]
-        if not parts.masks:  # oneself is far away: compared once, and not for every sight
-            met.append("gap = square if other else like(square, np.inf)")
-        return [
-            f"for l in range(np.uint64({parts.width})):",
-            indented(met, 4),
-            "    it = Other(aj, to, square, vj, rj, tj, mj, nj)",
-            indented(each, 4),
-        ]
-
-    def loop_ahead(offset: str) -> list[str]:
-        *to, square = Slots(parts).all("next")
-        onward = [me_of(parts, fields), f"onward = {offset}", f"further = {dot}(onward, onward)"]
-        kept = [*(f"{name} = onward[{k}]" for k, name in enumerate(to)), f"{square} = further"]
-        found = [f"to = ({', '.join(to)})", f"square = {square}"]
-        following = "xn" + _candidate(parts, fields)[0].removeprefix("xj")
-        return [
-            "j, last = np.uint64(ranges[r, 0]), np.uint64(ranges[r, 1])",
-            following,
-            f"for l in range(np.uint64({parts.width})):",
-            *indented_lines([*onward, *kept], 4),
-            "while j < last:",
-            *indented_lines(_candidate(parts, fields), 4),
-            "    own, o = np.int32(j - block), like(reach, -0.0)",
-            "    j += np.uint64(1)",
-            f"    {following}  # behind the last one whatever lies there, which nobody looks at",
-            *indented_lines(over_lanes([*onward, *found], [*lines, *kept]), 4),
-        ]
 
     def loop(offset: str) -> list[str]:
         some = [f"touch |= other & (square < within{q})" for q in near]
@@ -267,19 +238,53 @@ def meet_range(
             *indented_lines(_candidate(parts, fields, where == TOGETHER), 4),
             "    own, o = np.int32(j - block), like(reach, -0.0)",
             *["    touch = False"] * bool(near),
-            *indented_lines(over_lanes(way, [*lines, *some]), 4),
+            *indented_lines(_over_lanes(parts, me, way, where, [*lines, *some]), 4),
             *["    if touch:"] * bool(near),
-            *indented_lines(over_lanes(way, touch) if touch and near else [], 8),
+            *indented_lines(_over_lanes(parts, me, way, where, touch) if touch and near else [], 8),
             "    j += np.uint64(1)",
         ]
 
-    if parts.looks_ahead and where == ELSEWHERE and not near:
-        return loop_ahead(offset_of(parts, "xn"))
+    if parts.looks_ahead and where == ELSEWHERE:
+        return _loop_ahead(parts, fields, dot, lines)
     if not parts.space.periodic:
         return loop(plain)
     if not parts.sorts or where == TOGETHER:  # what comes seldom has one form: the nearest image of who is near is he
         return loop(wrapped)
     return ["if ranges[r, 2] > 0:", *indented_lines(loop(wrapped), 4), "else:", *indented_lines(loop(plain), 4)]
+
+
+def _over_lanes(parts: Parts, me: list[str], way: list[str], where: str, each: list[str]) -> list[str]:
+    """Write what the lanes do with a candidate: `me`, the way to it, whether it counts, and what follows from that."""
+    met = [*me, *way, f"other = {where}"]
+    if not parts.masks:  # oneself is far away: compared once, and not for every sight
+        met.append("gap = square if other else like(square, np.inf)")
+    lanes = [*met, "it = Other(aj, to, square, vj, rj, tj, mj, nj)", *each]
+    return [f"for l in range(np.uint64({parts.width})):", *indented_lines(lanes, 4)]
+
+
+def _loop_ahead(parts: Parts, fields: list[str], dot: str, lines: list[str]) -> list[str]:
+    """Write the loop over the candidates of range r that works out how far the next one is while it meets one.
+
+    Behind the last one lies some other number: a row has room for more, and nobody looks at how far that is.
+    """
+    *to, square = Slots(parts).all("next")
+    me = [me_of(parts, fields)]
+    following = f"xn = ({', '.join(sorted_at(fields.index(f'x{k}'), 'j') for k in range(parts.dimension))})"
+    onward = [f"onward = {offset_of(parts, 'xn')}", f"further = {dot}(onward, onward)"]
+    kept = [*(f"{name} = onward[{k}]" for k, name in enumerate(to)), f"{square} = further"]
+    now = [f"to = ({', '.join(to)})", f"square = {square}"]
+    return [
+        "j, last = np.uint64(ranges[r, 0]), np.uint64(ranges[r, 1])",
+        following,
+        f"for l in range(np.uint64({parts.width})):",
+        *indented_lines([*me, *onward, *kept], 4),
+        "while j < last:",
+        *indented_lines(_candidate(parts, fields), 4),
+        "    own, o = np.int32(j - block), like(reach, -0.0)",
+        "    j += np.uint64(1)",
+        f"    {following}",
+        *indented_lines(_over_lanes(parts, me, [*onward, *now], ELSEWHERE, [*lines, *kept]), 4),
+    ]
 
 
 def offset_of(parts: Parts, place: str) -> str:

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from flockenv.neighbours import DISTANT
 from flockenv.sweep.parts import SMALL_STRIDE, Parts, record_of, sorted_at
-from flockenv.sweep.text import Slots, copied, indented, indented_lines, lanes_of, place_of
+from flockenv.sweep.text import Slots, copied, in_blocks, indented, indented_lines, lanes_of, place_of
 from flockenv.tiles import FAR_FROM_HOME
 
 __all__ = ["counted", "listed", "listed_at", "query", "walk"]
@@ -147,20 +147,21 @@ def _one_by_one(parts: Parts, who: str, lines: list[str]) -> list[str]:
 
 def _sort(parts: Parts, fields: list[str], inside: bool, may_lie: bool) -> list[str]:
     """Write how agents are put into their cells: as whole records, so that each is one distant place in memory."""
-    d, w, record = parts.dimension, parts.width, record_of(fields)
+    w, record = parts.width, record_of(fields)
     wraps = parts.space.periodic and not inside
     lanes = [_lanes(parts, f, wraps) for f in record[1:]]
     sources, places = (", ".join(each) for each in zip(*lanes, strict=True))
-    return [
-        "for block in range(np.uint64(first), np.uint64(end)):",
-        f"    base, row = block * np.uint64({d * w}), block * np.uint64({w})",
-        f"    if n >= {DISTANT}:  # a distant place for each: asked for in good time",
-        f"        later = np.uint64(min(block + np.uint64({AHEAD}), np.uint64(end - 1)) * np.uint64({w}))",
-        f"        for l in range(np.uint64({w})):",
-        "            there = np.uint64(offset[rank, np.uint64(max(cell[later + l], np.int32(0)))])",
-        f"            ask_for(records, there * np.uint64({len(record)}))",
+    putting = [
+        f"if n >= {DISTANT}:  # a distant place for each: asked for in good time",
+        f"    later = np.uint64(min(block + np.uint64({AHEAD}), np.uint64(end - 1)) * np.uint64({w}))",
+        f"    for l in range(np.uint64({w})):",
+        "        there = np.uint64(offset[rank, np.uint64(max(cell[later + l], np.int32(0)))])",
+        f"        ask_for(records, there * np.uint64({len(record)}))",
         *(_confined(parts) if wraps else []),
-        f"    put_records(records, ({sources},), ({places},), {w}, cell, row, offset[rank], np.uint64(n))",
+        f"put_records(records, ({sources},), ({places},), {w}, cell, row, offset[rank], np.uint64(n))",
+    ]
+    return [
+        *in_blocks(parts, "first", "end", putting),
         *(_in_turn(parts, len(record)) if may_lie else []),
     ]
 
@@ -211,9 +212,9 @@ def _confined(parts: Parts) -> list[str]:
     """Write where the agents of a block are that a stage of a method may have brought out of a periodic box."""
     x, slot = lanes_of(parts, "pos"), Slots(parts)
     return [
-        f"    for l in range(np.uint64({parts.width})):",
-        f"        inside, _ = confine(size, radius[row + l], {x}, {x})",
-        *(f"        {slot(f'inside{k}')} = inside[{k}]" for k in range(parts.dimension)),
+        f"for l in range(np.uint64({parts.width})):",
+        f"    inside, _ = confine(size, radius[row + l], {x}, {x})",
+        *(f"    {slot(f'inside{k}')} = inside[{k}]" for k in range(parts.dimension)),
     ]
 
 

@@ -178,14 +178,13 @@ def _confine(parts: Parts) -> list[str]:
     """Write how everybody is brought into a periodic box, where steps rely on it."""
     if not parts.confines:
         return []
-    return [
-        "for block in range(np.uint64(first), np.uint64(end)):",
-        f"    base, row = block * np.uint64({parts.dimension * parts.width}), block * np.uint64({parts.width})",
-        f"    for l in range(np.uint64({parts.width})):",
-        f"        x, v = {lanes_of(parts, 'pos')}, {lanes_of(parts, 'vel')}",
-        "        x, v = confine(size, radius[row + l], x, v)",
-        indented([f"{lane(parts, 'pos', k)} = x[{k}]" for k in range(parts.dimension)], 8),
+    confining = [
+        f"for l in range(np.uint64({parts.width})):",
+        f"    x, v = {lanes_of(parts, 'pos')}, {lanes_of(parts, 'vel')}",
+        "    x, v = confine(size, radius[row + l], x, v)",
+        *(f"    {lane(parts, 'pos', k)} = x[{k}]" for k in range(parts.dimension)),
     ]
+    return in_blocks(parts, "first", "end", confining)
 
 
 def _advance(parts: Parts) -> list[str]:
@@ -213,7 +212,7 @@ def _in_two_loops(parts: Parts) -> list[str]:
     told = [f"{lane(parts, 'aside', k, 'past')} = a[{k}]" for k in range(d)]
     moved = [
         f"x, v, a = {lanes_of(parts, 'pos')}, {lanes_of(parts, 'vel')}, {lanes_of(parts, 'aside', 'past')}",
-        "was, earlier = x, v",
+        f"was{', earlier' * parts.bounces} = x{', v' * parts.bounces}",
         *(f"x{k}, v{k} = move(x[{k}], v[{k}], a[{k}], dt)" for k in range(d)),
         f"x, v = {tuple_of('x#', d)}, {tuple_of('v#', d)}",
         *[f"x = add(x, scale({lanes_of(parts, 'carrying')}, dt))"] * parts.flows,
