@@ -1,7 +1,9 @@
-"""How far every place is from a goal around obstacles: |grad u| = 1 on a grid, solved once by fast sweeping.
+"""How far every place is from a goal around obstacles: |grad u| = 1 on a grid, second order in the spacing.
 
-A global controller: agents follow -grad u, local steering does the rest. Zhao, "A fast sweeping method for Eikonal
-equations" (Math. Comp. 2005); first order in the spacing.
+A global controller: agents follow -grad u, local steering does the rest. Fast sweeping (Zhao, "A fast sweeping method
+for Eikonal equations", Math. Comp. 2005) finds the first-order solution, and with it the order in which a front reaches
+the points; one pass in that order takes one-sided differences of second order (Sethian, "Fast marching methods", SIAM
+Review 1999, section 3.1).
 """
 
 from __future__ import annotations
@@ -20,13 +22,15 @@ from flockenv.shapes import Shape
 from flockenv.shapes.table import nearest
 from flockenv.targets import Target
 
-__all__ = ["Start", "distances_around", "free_part", "way_table"]
+__all__ = ["NO_WAY", "Start", "distances_around", "free_part", "way_table"]
 
 Floats = NDArray[np.float64]
 ROUNDS = 200
 """Most rounds of sweeps: each goes around one more corner than the one before."""
 NEAR = 4.0
 """Spacings from the goal within which distances are straight lines, where these are free."""
+NO_WAY = 1e30
+"""m, the length that a table holds where no way leads: finite, so that it can be interpolated in float32 too."""
 
 
 @kernel
@@ -70,6 +74,48 @@ def _sweep(u: Any, free: Any, h: float) -> float:
     return changed
 
 
+@kernel
+def _upwind(u: Any, done: Any, at: int, stride: int, place: int, count: int) -> tuple[float, float, float]:
+    """Return the smaller final neighbour of point `at` along one axis, and its one-sided difference as (t, w).
+
+    The difference squared is w ((x - t) / h)^2: w = 9/4 where two points upwind are final and increase towards `at`,
+    else 1; w = 0 and t = inf where no neighbour is final. place: the index along this axis, of `count`.
+    """
+    near, side, beyond = np.inf, 0, False
+    if place > 0 and done[at - stride]:
+        near, side, beyond = u[at - stride], -stride, place > 1
+    if place < count - 1 and done[at + stride] and u[at + stride] < near:
+        near, side, beyond = u[at + stride], stride, place < count - 2
+    if beyond and done[at + 2 * side] and u[at + 2 * side] <= near:
+        return near, (4 * near - u[at + 2 * side]) / 3, 2.25
+    return near, near, 1.0 if near < np.inf else 0.0
+
+
+@kernel
+def _second_order(u: Any, done: Any, order: Any, shape: Any, h: float) -> None:
+    """Write the second-order distance of every point of `order` in turn; u, done: flat grids of this shape."""
+    _, ny, nz = shape
+    for at in order:
+        i, j, k = at // (ny * nz), at // nz % ny, at % nz
+        a = _upwind(u, done, at, ny * nz, i, shape[0])
+        b = _upwind(u, done, at, nz, j, ny)
+        c = _upwind(u, done, at, 1, k, nz)
+        a, b = (a, b) if a[0] < b[0] else (b, a)
+        b, c = (b, c) if b[0] < c[0] else (c, b)
+        a, b = (a, b) if a[0] < b[0] else (b, a)
+        w, wt, wtt = 0.0, 0.0, -h * h
+        x = np.inf
+        for near, t, weight in (a, b, c):
+            if near >= x:
+                break
+            w, wt, wtt = w + weight, wt + weight * t, wtt + weight * t * t
+            root = wt * wt - w * wtt
+            if root < 0 or wt + math.sqrt(root) < w * near:  # upwind of this neighbour: it has no part in x
+                break
+            x = (wt + math.sqrt(root)) / w
+        u[at], done[at] = x, True
+
+
 def distances_around(free: NDArray[np.bool_], spacing: float, begin: Floats) -> Floats:
     """Return how far each point of a grid is from the goal through free ones, m; inf where no way leads.
 
@@ -77,10 +123,15 @@ def distances_around(free: NDArray[np.bool_], spacing: float, begin: Floats) -> 
     """
     shape = (*free.shape, 1, 1)[:3]
     u = np.where(free, begin, np.inf).reshape(shape).astype(np.float64)
-    kept = np.ascontiguousarray((free & ~np.isfinite(begin)).reshape(shape))
+    open_ = np.ascontiguousarray((free & ~np.isfinite(begin)).reshape(shape))
     for _ in range(ROUNDS):
-        if entry(_sweep)(u, kept, spacing) <= 1e-9 * spacing:
+        if entry(_sweep)(u, open_, spacing) <= 1e-9 * spacing:
             break
+    flat = u.reshape(-1)
+    done = np.isfinite(flat) & ~open_.reshape(-1)
+    order = np.flatnonzero(np.isfinite(flat) & ~done)
+    order = order[np.argsort(flat[order], kind="stable")]
+    entry(_second_order)(flat, done, order, np.array(shape), spacing)
     return u.reshape(free.shape)
 
 
@@ -116,10 +167,13 @@ def way_table(
 ) -> Floats:  # fmt: skip
     """Return the ways to the nearest of some targets as a grid (see grid.py): the length, m, and the first direction.
 
-    The way of a body's centre that keeps `clearance` from all shapes. Where no way leads, in an obstacle too, the
-    direction is away from the nearest surface; beside an obstacle the way is as long as from the nearest point that is
-    clear of it, and from there; farther from those as long as the longest. ValueError, in one line, if a target
-    is not free or outside the grid, which its name begins with, or if from one of `starts` no way leads to any.
+    The way of a body's centre that keeps `clearance` from all shapes. Beside an obstacle and in it the direction is
+    away from the nearest surface, and the length that of the nearest clear point and the distance to it. Where no way
+    leads the length is NO_WAY; from a point that is clear of all obstacles the direction is zero then.
+
+    Raises:
+        ValueError: one line that begins with the target's name if a target is not free or is outside the grid; or if
+            no way leads to any target from one of `starts`.
     """
     found = ground(tuple(shapes), tuple(map(float, low)), tuple(map(float, high)), spacing)
     begin, towards = np.full(found.gap.shape, np.inf), np.zeros_like(found.points)
@@ -138,17 +192,20 @@ def way_table(
             )
     way = np.where(near[..., None], towards, -_slopes(u, spacing))
     size = np.linalg.norm(way, axis=-1, keepdims=True)
-    way = np.where(reached[..., None], way / np.where(size > 0, size, 1), found.out)
-    length = _lengths_beside(u, reached, spacing, clearance)
+    way = np.where(reached[..., None], way / np.where(size > 0, size, 1), np.where(free[..., None], 0.0, found.out))
+    length = _lengths_beside(u, reached, free, spacing, clearance)
     return packed(np.concatenate([length[..., None], way], axis=-1), found.low, spacing)
 
 
-def _lengths_beside(u: Floats, reached: NDArray[np.bool_], spacing: float, clearance: float) -> Floats:
-    """Return lengths everywhere: whoever is pushed against a wall is still as near to his target as he is."""
-    from scipy.ndimage import distance_transform_edt  # here: who looks for no way need not wait for it
+def _lengths_beside(
+    u: Floats, reached: NDArray[np.bool_], free: NDArray[np.bool_], spacing: float, clearance: float
+) -> Floats:
+    """Return lengths everywhere, m: an agent that is pushed against a wall is about as near to its target as before."""
+    from scipy.ndimage import distance_transform_edt  # here: a scene without ways need not wait for it
 
     far, place = distance_transform_edt(~reached, sampling=spacing, return_indices=True)
-    return np.asarray(np.where(far <= clearance + 2 * spacing, u[tuple(place)] + far, u[reached].max()))
+    beside = reached | (~free & (far <= clearance + 2 * spacing))
+    return np.asarray(np.where(beside, u[tuple(place)] + far, NO_WAY))
 
 
 def free_part(
@@ -227,17 +284,19 @@ def _nearest_surface(shapes: Sequence[Shape], points: Floats) -> tuple[Floats, F
 
 
 def _slopes(u: Floats, spacing: float) -> Floats:
-    """Return the gradient towards the smaller neighbour along each axis (upwind): no number crosses an obstacle."""
+    """Return the gradient, (..., D), by one-sided differences towards the smaller neighbour along each axis.
+
+    Second order where the next point on that side is no larger than the neighbour. No number crosses an obstacle.
+    """
     found = []
     for axis in range(u.ndim):
-        ahead, behind = np.full_like(u, np.inf), np.full_like(u, np.inf)
-        a: list[Any] = [slice(None)] * u.ndim
-        b: list[Any] = [slice(None)] * u.ndim
-        a[axis], b[axis] = slice(1, None), slice(None, -1)
-        ahead[tuple(b)], behind[tuple(a)] = u[tuple(a)], u[tuple(b)]
-        least = np.minimum(ahead, behind)
-        down = np.isfinite(u) & (least < u)
-        slope = np.where(down, u - np.where(down, least, 0), 0)
-        slope = np.where(down, slope, 0.0) / spacing
-        found.append(np.where(ahead < behind, -slope, slope))
+        padded = np.pad(u, [(2, 2) if k == axis else (0, 0) for k in range(u.ndim)], constant_values=np.inf)
+        near2, near1, far1, far2 = (np.take(padded, np.arange(k, k + u.shape[axis]), axis) for k in (0, 1, 3, 4))
+        ahead = far1 < near1
+        first, second = np.where(ahead, far1, near1), np.where(ahead, far2, near2)
+        down = np.isfinite(u) & (first < u)
+        here, one = np.where(down, u, 0.0), np.where(down, first, 0.0)
+        two = np.where(down & (second <= first), second, 2 * one - here)
+        slope = (3 * here - 4 * one + two) / (2 * spacing)
+        found.append(np.where(ahead, -slope, slope))
     return np.stack(found, axis=-1)

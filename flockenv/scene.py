@@ -405,6 +405,8 @@ class Scene(Record):
         place_groups(self, state, self._cells)
         beget(self, state)
         self._begin(state, np.ones_like(state.alive))
+        for effect in self.effects:
+            effect.check_start(self, state)
         return state
 
     def _begin(self, state: State, fresh: NDArray[np.bool_]) -> None:

@@ -111,6 +111,11 @@ class Steer(Effect):
             except ValueError as error:
                 raise ValueError(f"behaviours[{k}].{error}") from None
 
+    def check_start(self, scene: Any, state: Any) -> None:
+        """Let each of its behaviours warn of what the first instant shows."""
+        for behaviour in self.behaviours:
+            behaviour.check_start(scene, state)
+
     def calls_for(self) -> tuple[str, ...]:
         """What any of its behaviours calls for."""
         return tuple(dict.fromkeys(what for behaviour in self.behaviours for what in behaviour.calls_for()))

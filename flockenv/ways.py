@@ -5,22 +5,31 @@ One grid (eikonal.way_table) serves everybody who goes to the same targets; laws
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from flockenv.eikonal import Start, free_part, way_table
-from flockenv.grid import MOST_POINTS, covers, sample, sample_vector
+from flockenv.eikonal import NO_WAY, Start, free_part, way_table
+from flockenv.grid import MOST_POINTS, covers, sample, sample_vector, sampled
 from flockenv.kernels import Vec, law
+from flockenv.population import Emitter
 from flockenv.space import Torus
 from flockenv.targets import Target, to_any
 from flockenv.vec import norm, select, unit
 
-__all__ = ["check_ways", "region", "starts_of", "towards", "way_ahead", "way_block", "ways_to"]
+__all__ = [
+    "NoWayWarning", "check_ways", "lengths_on", "region", "starts_of", "towards", "warn_cut_off", "way_ahead",
+    "way_block", "ways_to",
+]  # fmt: skip
 
 Floats = NDArray[np.float64]
+
+
+class NoWayWarning(UserWarning):
+    """Agents begin where no way leads to their target."""
 
 
 @law
@@ -65,14 +74,37 @@ def region(scene: Any, targets: Sequence[Target], margin: float) -> tuple[Floats
 
 
 def starts_of(scene: Any, which: int | None) -> list[Start]:
-    """Return where those of a group begin, or those of all; of a network, or of those who are born later, nothing."""
+    """Return the boxes in which agents of a group begin or are born, of all groups for None; of a network, none."""
     size = getattr(scene.space, "size", None)
     found = []
     for k, group in enumerate(scene.groups):
         low, high = group.spawn.low or (0.0,) * scene.dimension, group.spawn.high or size
         if which in (None, k) and group.network is None and scene.living[k] and high is not None:
             found.append(Start(f"groups[{k}]", np.array(low, float), np.array(high, float)))
+    for k, member in enumerate(scene.population):
+        if isinstance(member, Emitter) and which in (None, member.group):
+            places = np.asarray(member.place.extremes, float)
+            found.append(Start(f"population[{k}]", places.min(axis=0), places.max(axis=0)))
     return found
+
+
+def lengths_on(grid: Floats, points: ArrayLike) -> Floats:
+    """Return the lengths of the ways from points (..., D), (...) m: inf where no way leads; outside, as at the edge."""
+    found = sampled(grid, points)[..., 0]
+    return np.asarray(np.where(found > NO_WAY * 1e-12, np.inf, found))  # also between points with a way and without
+
+
+def warn_cut_off(name: str, lost: NDArray[np.bool_], state: Any) -> None:
+    """Warn of the living agents of a state from which no way leads to the targets of an effect; lost: (B, N)."""
+    lost = lost & np.asarray(state.alive, bool)
+    if lost.any():
+        world, agent = (int(k) for k in np.argwhere(lost)[0])
+        place = ", ".join(f"{x:.3g}" for x in state.pos[world, agent])
+        warnings.warn(
+            f"{name}: no way leads there from where {lost.sum()} of {state.alive.sum()} agents begin (the first: agent "
+            f"{agent} of world {world} at ({place}) m); they stay where they are",
+            NoWayWarning, 2,
+        )  # fmt: skip
 
 
 def ways_to(

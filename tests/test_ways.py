@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
+import warnings
 from typing import Any
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from flockenv.behaviours import Driving, LineUp, UnalignedAvoidance
+from flockenv.behaviours import Driving, FollowWay, LineUp, UnalignedAvoidance
 from flockenv.crew import use_threads
 from flockenv.effects import Door, Journey, Routes, Stage, Way
 from flockenv.eikonal import ground
@@ -22,6 +23,7 @@ from flockenv.spawn import Spawn
 from flockenv.spread import Spread
 from flockenv.steer import Steer
 from flockenv.targets import Target
+from flockenv.ways import NoWayWarning
 
 Array = NDArray[np.float64]
 
@@ -90,6 +92,72 @@ def test_a_thousand_places_of_a_plan_are_asked_for_once() -> None:
     stages = tuple(Stage(at=target.at, radius=0.3) for target in targets)
     Scene(groups=(walkers(2, (1, 1), (9, 5)),), obstacles=ROOM, effects=(Journey(stages=stages),))
     assert ground.cache_info().misses == 1
+
+
+def test_an_agent_that_no_way_leads_from_is_warned_of_and_stands_still() -> None:
+    """A wall across the box, an agent on each side of it, the target on the right."""
+    wall = Wall(vertices=((6, 0), (6, 8)), radius=0.1)
+    way = Way(targets=(Target(at=(11, 4)),), spacing=0.1)
+    scene = Scene(
+        space=Box(size=(12, 8)), groups=(walkers(2, (0.5, 0.5), (11, 7)),), obstacles=(wall,),
+        effects=(way, Driving(tau=0.5)), dt=0.01,
+    )  # fmt: skip
+    with pytest.warns(NoWayWarning, match=r"targets\[0\]: no way leads there from where \d+ of 8 agents") as told:
+        state = scene.start(0, 4)
+    assert f"where {(state.pos[..., 0] < 6).sum()} of 8" in str(told[0].message)
+    np.testing.assert_array_equal(way.lengths(scene, [(3.0, 4.0), (9.0, 4.0), (5.6, 1)]) == np.inf, [True, False, True])
+    assert way.lengths(scene, [9.0, 4.0]) == pytest.approx(2, abs=0.01)
+    state = state.worlds([0]).with_motion([[[3.0, 4.0], [9.0, 4.0]]], np.zeros((1, 2, 2)))
+    end = scene.run(state, 1000)
+    np.testing.assert_array_equal(end.pos[0, 0], (3, 4))
+    np.testing.assert_allclose(end.pos[0, 1], (11, 4), atol=0.3)
+
+
+def cut_off(effect: Any, count: int = 4, **more: Any) -> Scene:
+    """A scene with a closed cell of 3 x 6 m on the left, in which some of the agents begin."""
+    wall = Wall(vertices=((3, 0), (3, 6)), radius=0.1)
+    return Scene(
+        space=Box(size=(10, 6)), groups=(walkers(count, (1, 1), (9, 5)),), obstacles=(wall,),
+        effects=(effect, Driving()), **more,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("effect", "name"),
+    [
+        (Way(targets=(Target(at=(9, 1)), Target(at=(9, 5)))), r"targets\[0\] or targets\[1\]"),
+        (Journey(stages=(Stage(at=(5, 3), radius=0.3), Stage(at=(9, 3), radius=0.3))), r"stages\[0\] or stages\[1\]"),
+        (Routes(doors=(Door(ends=((10, 1), (10, 2))), Door(ends=((10, 4), (10, 5))))), r"doors\[0\] or doors\[1\]"),
+        (Steer(behaviours=(FollowWay(weight=50, target=(9, 3), speed=1.0),)), "target"),
+    ],
+)
+def test_every_effect_with_ways_counts_the_agents_that_are_cut_off(effect: Any, name: str) -> None:
+    with pytest.warns(NoWayWarning, match=rf"{name}: no way leads there from where \d+ of 40 agents begin") as told:
+        state = cut_off(effect).start(0, 10)
+    count = (state.pos[..., 0] < 3).sum()
+    assert f"where {count} of 40" in str(told[0].message)
+
+
+def test_one_door_that_can_be_reached_is_enough_and_each_stage_of_a_journey_is_needed() -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        cut_off(Way(targets=(Target(at=(1, 3)), Target(at=(9, 3))))).start(0, 10)
+        cut_off(Routes(doors=(Door(ends=((0, 1), (0, 2))), Door(ends=((10, 4), (10, 5)))))).start(0, 10)
+    stages = Stage(at=(2, 3), radius=0.3), Stage(at=(9, 3), radius=0.3)
+    with pytest.warns(NoWayWarning, match="40 of 40 agents"):
+        cut_off(Journey(stages=stages)).start(0, 10)
+
+
+def test_an_emitter_that_no_way_leads_from_is_refused() -> None:
+    born = (Emitter(group=0, place=Point(at=(1.5, 3.0)), rate=1.0),)
+    with pytest.raises(ValueError, match=r"targets\[0\] = \(9.0, 3.0\): no way leads there from population\[0\]"):
+        cut_off(Way(targets=(Target(at=(9, 3)),)), population=born)
+    with pytest.raises(ValueError, match=r"target = \(1.0, 3.0\): no way leads there from groups\[0\]"):
+        Scene(
+            space=Box(size=(10, 6)), groups=(walkers(2, (5, 1), (9, 5)),), dt=0.02,
+            obstacles=(Wall(vertices=((3, 0), (3, 6)), radius=0.1),),
+            effects=(Steer(behaviours=(FollowWay(weight=50, target=(1, 3), speed=1.0),)),),
+        )  # fmt: skip
 
 
 # --- journeys ---------------------------------------------------------------------------------------------------------

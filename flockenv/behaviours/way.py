@@ -8,12 +8,12 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from flockenv.behaviours.base import Moving, top_speed
+from flockenv.behaviours.base import Moving, steered_groups, top_speed
 from flockenv.effects.base import Me, Vector
 from flockenv.kernels import Vec, law, like
 from flockenv.targets import Target
 from flockenv.vec import norm, scale, sub
-from flockenv.ways import check_ways, region, way_ahead, ways_to
+from flockenv.ways import check_ways, lengths_on, region, starts_of, warn_cut_off, way_ahead, ways_to
 
 __all__ = ["FollowWay"]
 
@@ -72,7 +72,15 @@ effects:
     def table(self, scene: Any) -> NDArray[np.float64]:
         """The grid of ways."""
         corners = region(scene, self._given[0], self.margin)
-        return ways_to(scene, *self._given, corners, self.spacing, self.clearance)
+        starts = [start for k in steered_groups(self, scene) for start in starts_of(scene, k)]
+        return ways_to(scene, *self._given, corners, self.spacing, self.clearance, starts)
+
+    def check_start(self, scene: Any, state: Any) -> None:
+        """Warn of agents that begin where no way leads to the target."""
+        lost = np.isinf(lengths_on(scene.table_of(self), state.pos))
+        for k in set(range(len(scene.groups))) - set(steered_groups(self, scene)):
+            lost[:, scene.starts[k] : scene.starts[k + 1]] = False
+        warn_cut_off(self._given[1][0], lost, state)
 
     def check(self, scene: Any) -> None:
         """Refuse a torus, obstacles that move, a grid too large, and a target that is in an obstacle."""

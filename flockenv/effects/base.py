@@ -390,6 +390,9 @@ class Effect(Record):
         if self.sight is not None:
             demand_group("group", self.sight.group, scene.groups)
 
+    def check_start(self, scene: Any, state: Any) -> None:
+        """Warn of what only the first instant of a scene shows: where its agents begin."""
+
     def parameters(self) -> dict[str, float | Vec]:
         """The numbers and vectors its laws are given, by name; what is none, or a word, is no number."""
         fields = {name: getattr(self, name) for name in type(self).model_fields if name != "kind"}

@@ -131,6 +131,7 @@ class Journey(Around):
         default="stay", description="after the last: stay there, go straight on, or begin again"
     )
     slow_radius: float = Field(default=0.5, gt=0, description="m, over which one slows down before one stays or waits")
+    needs_all: ClassVar[bool] = True
     aim_law: ClassVar[str | None] = "journey_aim"
     begin_law: ClassVar[str | None] = "journey_begun"
     keep_law: ClassVar[str | None] = "journey_kept"
@@ -162,6 +163,12 @@ class Journey(Around):
             for k, stage in enumerate(self.stages)
         ]
         return np.concatenate([np.ravel(rows), waits.ravel(), *blocks])
+
+    def grids(self, scene: Any) -> list[NDArray[np.float64]]:
+        """Return the grid of ways to each stage that agents go around obstacles to."""
+        table, size = scene.table_of(self), HEAD + row_size(2)
+        blocks = [int(table[k * size]) for k, stage in enumerate(self.stages) if stage.around]
+        return [table[at + 2 + row_size(2) :] for at in blocks]
 
     def slowing(self, k: int) -> float:
         """Return over how many metres one slows down before stage k."""

@@ -12,6 +12,7 @@ from flockenv.effects.aims import about
 from flockenv.effects.base import Me
 from flockenv.effects.journey import onwards, place_kept
 from flockenv.effects.way import Around
+from flockenv.eikonal import NO_WAY
 from flockenv.kernels import Vec, law, like
 from flockenv.targets import Target, passed, row_size
 from flockenv.vec import scale, sub, unit, zero
@@ -185,8 +186,14 @@ class Routes(Around):
         begin = 1 + len(self.doors) * (HEAD + row_size(2))
         at = begin + np.cumsum([0, *map(len, blocks)])
         rows = [[float(a), self.flow * d.room, *d.row] for a, d in zip(at[:-1], self.doors, strict=True)]
-        longest = max(float(block[2 + row_size(2) + 6 :: 3].max()) for block in blocks)
+        lengths = np.concatenate([block[2 + row_size(2) + 6 :: 3] for block in blocks])
+        longest = float(lengths[lengths < NO_WAY].max())
         return np.concatenate([[max(longest, self.spacing) / (BINS - 1)], np.ravel(rows), *blocks])
+
+    def grids(self, scene: Any) -> list[NDArray[np.float64]]:
+        """Return the grid of ways to each door."""
+        table, size = scene.table_of(self), HEAD + row_size(2)
+        return [table[int(table[1 + k * size]) + 2 + row_size(2) :] for k in range(len(self.doors))]
 
     def check(self, scene: Any) -> None:
         """Refuse space, a torus, and those who do not say how fast they would like to go."""

@@ -10,11 +10,10 @@ from pydantic import Field
 
 from flockenv.effects.aims import Aim, about
 from flockenv.effects.base import Me
-from flockenv.grid import sampled
 from flockenv.kernels import Vec, law, like
 from flockenv.targets import Target, row_size
 from flockenv.vec import scale, select, zero
-from flockenv.ways import check_ways, region, starts_of, towards, way_block
+from flockenv.ways import check_ways, lengths_on, region, starts_of, towards, warn_cut_off, way_block
 
 __all__ = ["Around", "Way", "slowed"]
 
@@ -39,6 +38,8 @@ class Around(Aim):
     spacing: float = Field(default=0.2, gt=0, description="m, between points of the grid")
     margin: float = Field(default=3.0, gt=0, description="m of grid around all that there is, where there is no box")
     tabled: ClassVar[bool] = True
+    needs_all: ClassVar[bool] = False
+    """True if an agent visits all of its targets, False if one of them is enough."""
 
     def ways(self, scene: Any, targets: tuple[Target, ...], names: tuple[str, ...]) -> NDArray[np.float64]:
         """Return the block of ways to the nearest of some targets; see flockenv.ways."""
@@ -58,6 +59,20 @@ class Around(Aim):
             _alone(self, scene)
         check_ways(scene, self.kind, *self.goals, self.margin, self.spacing, self.clearance)
         scene.table_of(self)
+
+    def grids(self, scene: Any) -> list[NDArray[np.float64]]:
+        """Return the grids of ways, one for each target or set of targets that agents are led to."""
+        raise TypeError(f"{type(self).__name__} has no grids of ways")
+
+    def check_start(self, scene: Any, state: Any) -> None:
+        """Warn of agents that begin where no way leads to any target, or to a stage of a journey."""
+        first, end = (int(k) for k in self.members(scene.starts).values())
+        lengths = np.array([lengths_on(grid, state.pos[:, first:end]) for grid in self.grids(scene)])
+        if not len(lengths):
+            return
+        lost = np.zeros(state.alive.shape, bool)
+        lost[:, first:end] = np.isinf(lengths).any(axis=0) if self.needs_all else np.isinf(lengths).all(axis=0)
+        warn_cut_off(" or ".join(self.goals[1]), lost, state)
 
 
 def _alone(effect: Aim, scene: Any) -> None:
@@ -98,6 +113,9 @@ class Way(Around):
         return self.ways(scene, *self.goals)
 
     def lengths(self, scene: Any, points: ArrayLike) -> NDArray[np.float64]:
-        """Return how long the way from places (..., D) is, (...) m; on the grid, and at its edge outside of it."""
-        grid = scene.table_of(self)[2 + len(self.targets) * row_size(scene.dimension) :]
-        return np.asarray(sampled(grid, points)[..., 0])
+        """Return the way's length from points (..., D), (...) m; inf where no way leads, outside as at the edge."""
+        return lengths_on(self.grids(scene)[0], points)
+
+    def grids(self, scene: Any) -> list[NDArray[np.float64]]:
+        """Return the one grid of ways to the nearest target."""
+        return [scene.table_of(self)[2 + len(self.targets) * row_size(scene.dimension) :]]
