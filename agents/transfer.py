@@ -70,7 +70,7 @@ app = typer.Typer(add_completion=False, rich_markup_mode=None, pretty_exceptions
 
 @app.command()
 def main(
-    tasks: Annotated[list[str] | None, typer.Argument(metavar="[TASK...]", help="Tasks; all if left out.")] = None,
+    tasks: Annotated[list[str] | None, typer.Argument(metavar="TASK", help="Tasks; all if left out.")] = None,
     players: Annotated[list[str] | None, typer.Option(help="Players, as in agents.compare.")] = None,
     methods: Annotated[
         list[str] | None, typer.Option(help="Kinds of integrators, with :float32 if so. [" + ",".join(METHODS) + "]")

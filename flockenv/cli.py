@@ -58,14 +58,29 @@ FPS, MOST_FPS = 25.0, 50.0  # of a scene's GIF; viewers slow down beyond 50
 TRAIL = 25  # instants that a PNG shows behind everybody
 RECORDED_EVERY = 0.1  # s, rounded to whole steps
 
+
+def _task_or_file(incomplete: str) -> list[str]:
+    """Return the tasks, and the scene files and folders beside them, that a word may go on to (shell completion)."""
+    from flockenv.envs.registration import HORIZONS
+
+    tasks = (re.sub(r"(?<!^)(?=[A-Z])", "_", name).lower() for name in HORIZONS)
+    here = Path(incomplete).parent if "/" in incomplete else Path()
+    found = sorted(here.iterdir()) if here.is_dir() else []
+    files = [f"{p}/" if p.is_dir() else str(p) for p in found if p.is_dir() or p.suffix in (".yaml", ".yml")]
+    return [word for word in (*tasks, *files) if word.startswith(incomplete)]
+
+
 app = typer.Typer(
     help="Steering agents: hand-written rules and learned policies in the same worlds.",
     no_args_is_help=True,
+    rich_markup_mode="markdown",  # in "rich" what stands in brackets is taken for a style, and vanishes
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
 
-SceneFile = Annotated[str, typer.Argument(metavar="SCENE.yaml", help="A scene; see `flockenv schema` and configs/.")]
+SceneFile = Annotated[
+    str, typer.Argument(metavar="SCENE.yaml", help="A scene, - for standard input; see `flockenv schema` and configs/.")
+]
 Duration = Annotated[float, typer.Option(metavar="S", help="Simulated time in seconds, a whole multiple of dt.")]
 
 
@@ -168,7 +183,8 @@ def run(
         str | None, typer.Option(metavar="X.npz", help="Write the trajectory there, and a summary to X.json.")
     ] = None,
     every: Annotated[
-        float | None, typer.Option(metavar="S", help="Time between recorded instants in seconds [default: about 0.1]")
+        float | None,
+        typer.Option(metavar="S", help="Time between recorded instants in seconds.", show_default="about 0.1"),
     ] = None,
     force: Force = False,
 ) -> None:
@@ -198,7 +214,12 @@ def run(
 @app.command()
 def render(
     what: Annotated[
-        str, typer.Argument(metavar="SCENE.yaml|TASK", help="A scene file, or a task from `flockenv list`.")
+        str,
+        typer.Argument(
+            metavar="SCENE.yaml|TASK",
+            help="A scene file, or a task from `flockenv list`.",
+            autocompletion=_task_or_file,
+        ),
     ],
     out: Annotated[str, typer.Option(metavar="X.gif|X.png|X.html", help="What to write; a PNG shows the end.")],
     player: Annotated[
@@ -206,7 +227,8 @@ def render(
     ] = "random",
     seed: Seed = 0,
     duration: Annotated[
-        float | None, typer.Option(metavar="S", help="Simulated seconds of a scene [default: 10]; a task plays on.")
+        float | None,
+        typer.Option(metavar="S", help="Simulated seconds of a scene; a task plays to its end.", show_default="10"),
     ] = None,
     size: Annotated[int, typer.Option(min=64, max=4096, help="Width of a picture in pixels.")] = 600,
     force: Force = False,
@@ -239,11 +261,11 @@ def explain(scene: SceneFile) -> None:
     with progress_bar("compiling and timing", len(loaded.effects) + 2, "variants") as progress:
         found = explanation.explain(loaded, progress=progress)
     console = new_console()
-    rows = [(str(row.effect), ", ".join(row.calls_for) or "nothing", f"{row.cost:.3g}") for row in found.rows]
-    rows.append(("what several of them share", "", f"{found.shared:.3g}"))
+    rows = [(row.name, ", ".join(row.calls_for) or "nothing", str(row.cost)) for row in found.rows]
+    rows.append(("what several of them share", "", str(found.shared)))
     rows.append((found.remains, "", f"{found.rest:.3g}"))
     title = f"One step of {loaded.agents:,} agents: {found.step:.3g} us"
-    show_table(console, title, rows, ("effect", "calls for", "costs us/step"))
+    show_table(console, title, rows, ("effect", "calls for", "costs us/step [95 % interval]"))
     counted = (f"{number:g} {name.replace('_', ' ')}" for name, number in found.work.items())
     console.print(f"Per step: {', '.join(counted)}")
     console.print(f"Largest stable step: {found.largest_step}")
@@ -264,7 +286,13 @@ app.command()(validate)
 @app.command()
 def warmup(
     what: Annotated[
-        list[str] | None, typer.Argument(metavar="[TASK|SCENE.yaml]...", help="What to compile [default: every task].")
+        list[str] | None,
+        typer.Argument(
+            metavar="TASK|SCENE.yaml",
+            help="What to compile.",
+            show_default="every task",
+            autocompletion=_task_or_file,
+        ),
     ] = None,
     dtype: Annotated[
         str | None, typer.Option(metavar="float32|float64", help="Precision instead of their own.")

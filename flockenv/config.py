@@ -10,6 +10,7 @@ import functools
 import json
 import math
 import re
+import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from decimal import Decimal
 from pathlib import Path
@@ -76,8 +77,8 @@ def schema(model: type[BaseModel] = Scene) -> dict[str, Any]:
 def load(source: str | Path, model: type[M]) -> M:
     """Return the `model` that a YAML file or text describes.
 
-    A Path names a file; so does a str, unless it holds a line break, a `: ` or a `{`: then it is the text itself.
-    Raises ConfigError, one line per mistake, before anything is built.
+    A Path names a file or a pipe, `-` standard input; so does a str, unless it holds a line break, a `: ` or a `{`:
+    then it is the text itself. Raises ConfigError, one line per mistake, before anything is built.
     """
     name, text = _read(source)
     reader = _Reader(name, text)
@@ -165,10 +166,12 @@ def _read(source: str | Path) -> tuple[str, str]:
     """Return a name for messages, and the text."""
     if isinstance(source, str) and re.search(r"\n|: |\{|:$", source):
         return "text", source.removeprefix("\ufeff")
+    if str(source) == "-":
+        return "standard input", _decode("standard input", sys.stdin.buffer.read(MAX_BYTES + 1))
     path = Path(source)
     name = repr(str(source))[1:-1]
     try:
-        if not path.is_file():
+        if not (path.is_file() or path.is_fifo()):  # a shell's <(...) is a pipe
             raise ConfigError(f"{name}: no such file{_nearest_file(path)}")
         with path.open("rb") as file:
             content = file.read(MAX_BYTES + 1)

@@ -6,8 +6,10 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from time import perf_counter
+from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from flockenv.effects import EFFECTS, Effect
 from flockenv.grants import Grants
@@ -15,11 +17,31 @@ from flockenv.scene import Scene
 from flockenv.stability import Suggestion, suggest_dt
 from flockenv.state import WORK, State
 
-__all__ = ["Explanation", "Row", "explain"]
+__all__ = ["Cost", "Explanation", "Row", "explain"]
 
-ROUNDS = 7
+ROUNDS = 15
 INSTANTS, BETWEEN = 20, 10  # at which shares are looked at, and the steps between two
 TIMED = 0.01  # s per measurement: long against the clock, short against a change of the processor's speed
+
+
+class Cost(NamedTuple):
+    """A difference of measured times, us per step: the median over rounds and its 95 % interval."""
+
+    median: float
+    low: float
+    high: float
+
+    @classmethod
+    def of(cls, differences: NDArray[np.float64]) -> Cost:
+        """Return the median of the differences of each round, with the exact interval of order statistics."""
+        from scipy.stats import quantile_test  # here: a command that times nothing need not wait for it
+
+        interval = quantile_test(differences, p=0.5).confidence_interval(0.95)
+        return cls(float(np.median(differences)), float(interval.low), float(interval.high))
+
+    def __str__(self) -> str:
+        level = " level" if self.low <= 0 <= self.high else ""
+        return f"{self.median:.3g} [{self.low:.3g}, {self.high:.3g}]{level}"
 
 
 @dataclass(frozen=True)
@@ -28,7 +50,14 @@ class Row:
 
     effect: Effect
     calls_for: tuple[str, ...]  # in words; empty = nothing but the agent itself
-    cost: float  # us per step that the scene would save without it; what it shares with others is not in it
+    cost: Cost  # that the scene would save without it; what it shares with others is not in it
+
+    @property
+    def name(self) -> str:
+        """Its kind, and the fields that are not at their defaults."""
+        usual = {name: f.get_default(call_default_factory=True) for name, f in type(self.effect).model_fields.items()}
+        given = {name: getattr(self.effect, name) for name in usual if name != "kind"}
+        return f"{self.effect.kind}({', '.join(f'{k}={v}' for k, v in given.items() if v != usual[k])})"
 
 
 @dataclass(frozen=True)
@@ -39,15 +68,11 @@ class Explanation:
     rows: tuple[Row, ...]
     step: float  # us, a whole step
     rest: float  # us, a step without any effect: integrator, limits, confinement, constraints, population
+    shared: Cost  # that no single effect could save: the query and the sweep that several share
     work: dict[str, float]  # per step, see state.WORK
     left_out: tuple[str, ...]  # one line each
     stable: Suggestion  # the largest stable step
     shares: tuple[tuple[str, str, float], ...] = ()  # of each Steer's behaviours: which, and the mean share granted
-
-    @property
-    def shared(self) -> float:
-        """Us per step that no single effect could save: the query and the sweep that several share."""
-        return max(0.0, self.step - self.rest - sum(row.cost for row in self.rows))
 
     @property
     def remains(self) -> str:
@@ -72,8 +97,9 @@ def explain(
 ) -> Explanation:
     """Measure a scene from a state on (default: its start with seed 0), one effect left out at a time.
 
-    All variants are timed in turn, several rounds, and the shortest time of each counts: a disturbance hits all of them
-    or is not counted. `progress` is called with the number of variants that are ready; each may have to be compiled.
+    All variants are timed in turn, ROUNDS times. A cost is the median over the rounds of the difference within a round,
+    with its 95 % interval: a disturbance that lasts hits both sides. `progress` is called with the number of variants
+    that are ready; each may have to be compiled.
     """
     state = scene.start(0) if state is None else state
     effects = scene.effects
@@ -82,39 +108,33 @@ def explain(
     for done, kept in enumerate(variants):
         progress(done)
         timers.append(_Timer(scene.with_effects(*kept), state))
-    for _ in range(ROUNDS):
-        for timer in timers:
-            timer.measure()
-    whole, *without, bare = (timer.best for timer in timers)
-    rows = tuple(
-        Row(effect, _calls(scene, k), max(0.0, whole - less))
-        for k, (effect, less) in enumerate(zip(effects, without, strict=True))
-    )
+    times = np.array([[timer.measure() for timer in timers] for _ in range(ROUNDS)])  # (rounds, variants) us
+    whole, bare = times[:, :1], times[:, -1]
+    saved = whole - times[:, 1:-1]
+    rows = tuple(Row(effect, _calls(scene, k), Cost.of(saved[:, k])) for k, effect in enumerate(effects))
+    shared = Cost.of(whole[:, 0] - bare - saved.sum(axis=1))
     return Explanation(
-        scene, rows, whole, bare, _work(scene, state), _left_out(scene), suggest_dt(scene), _shares(scene, state)
-    )
+        scene, rows, float(np.median(whole)), float(np.median(bare)), shared, _work(scene, state), _left_out(scene),
+        suggest_dt(scene), _shares(scene, state),
+    )  # fmt: skip
 
 
 class _Timer:
-    """The shortest time per step of a scene, in us."""
+    """Times the steps of a scene from one state on, so many at a time that the clock is no matter."""
 
     def __init__(self, scene: Scene, state: State) -> None:
         self._scene, self._state, self._scratch = scene, state, state.copy()
-        self._steps, self.best = 1, math.inf
+        self._steps = 1
         self.measure()  # compiles
-        self.best = math.inf
-        while self.measure() < TIMED:
+        while self.measure() * self._steps * state.shape[0] < 1e6 * TIMED:
             self._steps *= 2
-        self.best = math.inf
 
     def measure(self) -> float:
-        """Run once and return how long it took, s."""
+        """Run once and return the time per step of one world, us."""
         self._scratch.copy_from(self._state)
         began = perf_counter()
         self._scene.step(self._scratch, out=self._scratch, steps=self._steps)
-        took = perf_counter() - began
-        self.best = min(self.best, 1e6 * took / self._steps / self._state.shape[0])
-        return took
+        return 1e6 * (perf_counter() - began) / self._steps / self._state.shape[0]
 
 
 def _calls(scene: Scene, k: int) -> tuple[str, ...]:

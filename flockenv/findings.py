@@ -17,7 +17,7 @@ from pydantic import Field
 
 from flockenv.divergence import SimulationDiverged
 from flockenv.records import Record
-from flockenv.refusals import nearest, shown
+from flockenv.refusals import nearest_few, shown
 
 __all__ = ["VERDICTS", "Case", "Finding", "Results", "Value", "Verdict", "cases_named", "run", "trials"]
 
@@ -128,7 +128,7 @@ def cases_named(cases: Sequence[Case], names: Sequence[str]) -> tuple[Case, ...]
     known = {case.name for case in cases} | {case.name.split()[0] for case in cases}
     for name in names:
         if name not in known:
-            raise ValueError(f"case {shown(name)}: unknown{nearest(name, known)}; {', '.join(sorted(known))}")
+            raise ValueError(f"case {shown(name)}: unknown{nearest_few(name, known)}")
     return tuple(c for c in cases if not names or c.name in names or c.name.split()[0] in names)
 
 

@@ -51,14 +51,19 @@ def measure(
     ] = None,
     area: Annotated[
         str | None,
-        typer.Option(metavar="X0,Y0,X1,Y1", help="Two corners of an area, or all of them [default: a box or torus]."),
+        typer.Option(
+            metavar="X0,Y0,X1,Y1", help="Two corners of an area, or all of them.", show_default="a box or torus"
+        ),
     ] = None,
     walkable: Annotated[
         str | None,
-        typer.Option(metavar="X,Y,X,Y,...", help="Where cells end, as the area [default: the region, less obstacles]."),
+        typer.Option(
+            metavar="X,Y,X,Y,...", help="Where cells end, as the area.", show_default="the region, less obstacles"
+        ),
     ] = None,
     every: Annotated[
-        float | None, typer.Option(metavar="S", help="Time between recorded instants in seconds [default: about 0.1].")
+        float | None,
+        typer.Option(metavar="S", help="Time between recorded instants in seconds.", show_default="about 0.1"),
     ] = None,
     seed: Seed = 0,
     seeds: Annotated[int, typer.Option(min=1, max=10_000, help="So many runs, from this seed on.")] = 1,

@@ -15,7 +15,7 @@ from typing import Any
 from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails
 
-__all__ = ["KeyPath", "Refusal", "key_path", "nearest", "refusals", "shown", "steps_of"]
+__all__ = ["KeyPath", "Refusal", "key_path", "nearest", "nearest_few", "refusals", "shown", "steps_of"]
 
 KeyPath = tuple[str | int, ...]
 """Where a value stands: ("effects", 1, "radius") is effects[1].radius."""
@@ -23,6 +23,7 @@ KeyPath = tuple[str | int, ...]
 Schema = dict[str, Any]
 
 MANY = 30  # names that are listed beside one that is near
+FEW = 10  # names that are all listed
 MOST = 100  # errors that are looked at: a file with more is broken in one way, not in a hundred
 
 
@@ -74,9 +75,18 @@ def nearest(word: str, allowed: Iterable[str]) -> str:
     return "".join(f", did you mean `{name}`?" for name in _close(word, allowed))
 
 
-def _close(word: str, allowed: Iterable[str]) -> list[str]:
+def nearest_few(word: str, allowed: Iterable[str]) -> str:
+    """Return the allowed names, or the few nearest to `word` where there are many: '; the nearest of 130: a, b'."""
+    names = sorted(allowed)
+    if len(names) <= FEW:
+        return f"; allowed: {', '.join(names)}"
+    return f"; the nearest of {len(names)}: {', '.join(_close(word, names, FEW // 2, 0.0))}"
+
+
+def _close(word: str, allowed: Iterable[str], most: int = 1, least: float = 0.6) -> list[str]:
+    """Return at most so many names, the most similar first, each of a similarity of at least `least`."""
     names = {name.lower(): name for name in allowed}
-    return [names[name] for name in difflib.get_close_matches(word[:200].lower(), names, n=1, cutoff=0.6)]
+    return [names[name] for name in difflib.get_close_matches(word[:200].lower(), names, n=most, cutoff=least)]
 
 
 def key_path(path: KeyPath) -> str:

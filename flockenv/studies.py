@@ -24,15 +24,20 @@ __all__ = ["accuracy", "experiment", "gallery", "stored", "stress", "try_all", "
 
 
 def accuracy(
-    scene: Annotated[str | None, typer.Argument(metavar="[SCENE.yaml]", help="A scene; none with --suite.")] = None,
+    scene: Annotated[str | None, typer.Argument(metavar="SCENE.yaml", help="A scene; none with --suite.")] = None,
     suite: Annotated[bool, typer.Option("--suite", help="Measure the built-in problems instead.")] = False,
-    problems: Annotated[str, typer.Option(metavar="A,B", help="Of the suite these alone [default: all of them].")] = "",
+    problems: Annotated[
+        str, typer.Option(metavar="A,B", help="Of the suite these alone.", show_default="all of them")
+    ] = "",
     seconds: Annotated[
-        float | None, typer.Option(metavar="S", help="Simulated time of a scene in seconds [default: 1].")
+        float | None, typer.Option(metavar="S", help="Simulated time of a scene in seconds.", show_default="1")
     ] = None,
-    methods: Annotated[str, typer.Option(metavar="A,B", help="Integrators [default: all explicit ones].")] = "",
+    methods: Annotated[str, typer.Option(metavar="A,B", help="Integrators.", show_default="all explicit ones")] = "",
     steps: Annotated[
-        str, typer.Option(metavar="N,M", help="In how many steps a scene is taken to its end [default: around its dt].")
+        str,
+        typer.Option(
+            metavar="N,M", help="In how many steps a scene is taken to its end.", show_default="around its dt"
+        ),
     ] = "",
     dts: Annotated[str, typer.Option(metavar="S,S", help="The same, by the length of a step in seconds.")] = "",
     tolerance: Annotated[
@@ -183,7 +188,7 @@ def _numbers(option: str, text: str) -> list[float]:
 
 def stress(
     cases: Annotated[str, typer.Option(metavar="A,B", help="Of the hard cases these alone, such as N14.")] = "",
-    methods: Annotated[str, typer.Option(metavar="A,B", help="Integrators [default: all].")] = "",
+    methods: Annotated[str, typer.Option(metavar="A,B", help="Integrators.", show_default="all")] = "",
     out: Annotated[
         str | None,
         typer.Option(

@@ -20,10 +20,12 @@ __all__ = ["validate"]
 
 def validate(
     cases: Annotated[
-        list[str] | None, typer.Argument(metavar="[CASE]...", help="Names, or first words of them [default: all].")
+        list[str] | None,
+        typer.Argument(metavar="CASE", help="Names, or first words of them.", show_default="all"),
     ] = None,
     preset: Annotated[
-        list[str] | None, typer.Option(metavar="NAME", help="Published models; may be given again [default: all].")
+        list[str] | None,
+        typer.Option(metavar="NAME", help="Published models; may be given again.", show_default="all"),
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print the findings as JSON instead of tables.")] = False,
     out: Annotated[

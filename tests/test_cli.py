@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import typer
 from PIL import Image
 from typer.testing import CliRunner
 
@@ -19,7 +20,7 @@ from flockenv.cli import app, main
 from flockenv.config import load_scene, schema
 from flockenv.effects import EFFECTS
 from flockenv.effects.springs import Springs
-from flockenv.explanation import Explanation
+from flockenv.explanation import Cost, Explanation
 from flockenv.integrators import INTEGRATORS, ImplicitEuler, Integrator
 from flockenv.networks import Rope
 from flockenv.scene import Group, Scene
@@ -86,10 +87,46 @@ def test_schema_is_json_and_the_one_of_scenes(capsys: pytest.CaptureFixture[str]
         "schema",
     ],
 )
-def test_every_command_has_a_page_of_help(command: str) -> None:
+def test_every_command_has_a_page_of_help_that_shows_every_word(command: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Defaults in words, brackets and all: what a style would swallow is missed here."""
+    monkeypatch.setenv("TERMINAL_WIDTH", "500")
+    monkeypatch.setattr("typer.rich_utils.MAX_WIDTH", 500)
     done = CliRunner().invoke(app, [command, "--help"])
     assert done.exit_code == 0
     assert "Usage:" in done.stdout
+    shown = " ".join(done.stdout.split())
+    for parameter in typer.main.get_command(app).commands[command].params:  # type: ignore[attr-defined]
+        assert " ".join((parameter.help or "").replace("`", "").split()) in shown
+        if isinstance(parameter.show_default, str):
+            assert f"[default: ({parameter.show_default})]" in shown
+
+
+def test_no_help_says_a_default_in_brackets_of_its_own() -> None:
+    """Those that typer shows are of one form."""
+    for command in typer.main.get_command(app).commands.values():  # type: ignore[attr-defined]
+        assert not [p.name for p in command.params if "[default" in (p.help or "")]
+
+
+@pytest.mark.parametrize(
+    ("words", "expected"),
+    [("render pur", ["pursuit"]), ("warmup path", ["path_follow"]), ("render ti", ["tiny.yaml"]), ("render zz", [])],
+)
+def test_the_shell_completes_tasks_and_scene_files(words: str, expected: list[str]) -> None:
+    Path("notes.txt").touch()
+    done = subprocess.run(
+        [sys.executable, "-c", "from flockenv.cli import app; app(prog_name='flockenv')"],
+        env={**ENVIRONMENT, "_FLOCKENV_COMPLETE": "complete_bash", "COMP_WORDS": f"_ {words}", "COMP_CWORD": "2"},
+        capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert done.stdout.split() == expected
+
+
+@pytest.mark.parametrize("command", ["stress --cases N999", "validate riema9"])
+def test_an_unknown_case_is_told_the_nearest_few(command: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(command.split()) == 2
+    said = capsys.readouterr().err
+    assert re.search(r"unknown; the nearest of \d+: (.*, ){4}.*$", said)
+    assert len(said) < 200
 
 
 def test_the_version(capsys: pytest.CaptureFixture[str]) -> None:
@@ -258,19 +295,31 @@ def test_a_task_under_a_player_of_ones_own() -> None:
 
 # --- explain ----------------------------------------------------------------------------------------------------------
 
+COST = r"-?[\d.e+-]+ \[-?[\d.e+-]+, -?[\d.e+-]+\]( level)? *"
+"""A measured difference of times, with its interval."""
+
+
+def test_a_cost_is_a_median_with_its_interval_and_is_level_where_that_holds_zero() -> None:
+    clear, level = Cost.of(np.arange(1.0, 16.0)), Cost.of(np.arange(-7.0, 8.0))
+    assert str(clear) == "8 [4, 12]"  # ranks 4 and 12 of 15: 96.5 % of all medians lie between (binomial)
+    assert str(level) == "0 [-4, 4] level"
+    disturbed = np.arange(1.0, 16.0)
+    disturbed[-1] = 1e6  # one round in which something else ran
+    assert Cost.of(disturbed) == clear
+
 
 @pytest.mark.slow
 def test_explain_says_what_is_called_for_and_what_was_left_out(capsys: pytest.CaptureFixture[str]) -> None:
     Path("flock.yaml").write_text(FLOCK)
     assert main(["explain", "flock.yaml"]) == 0
     asked = capsys.readouterr().out
-    assert re.search(r"^Separation\(.*\) +neighbour query within 2 m +[\d.]+ *$", asked, re.MULTILINE)
+    assert re.search(rf"^separation\(.*radius=2.0\) +neighbour query within 2 m +{COST}$", asked, re.MULTILINE)
     assert "Per step: 1 evaluations, 1 neighbour queries" in asked
     assert "neighbour query: no effect" not in asked
 
     assert main(["explain", "tiny.yaml"]) == 0
     unasked = capsys.readouterr().out
-    assert re.search(r"^Drag\(kind='drag', rate=0.5\) +nothing +[\d.]+ *$", unasked, re.MULTILINE)
+    assert re.search(rf"^drag\(rate=0.5\) +nothing +{COST}$", unasked, re.MULTILINE)
     assert "1 evaluations, 0 neighbour queries, 0 pairs, 0 obstacle tests" in unasked
     assert "neighbour query: no effect asks who is near whom" in unasked
     assert "pass over obstacles (0): no effect asks for them" in unasked
@@ -281,7 +330,7 @@ def test_explain_says_what_is_called_for_and_what_was_left_out(capsys: pytest.Ca
 
 def test_explain_says_who_sets_the_largest_step() -> None:
     def said(scene: Scene) -> str:
-        return Explanation(scene, (), 0.0, 0.0, {}, (), suggest_dt(scene)).largest_step
+        return Explanation(scene, (), 0.0, 0.0, Cost(0, 0, 0), {}, (), suggest_dt(scene)).largest_step
 
     rope = Rope(links=4, length=4, pinned=("start",))
     scene = Scene(groups=(Group(network=rope),), effects=(Springs(stiffness=100),), dt=0.02)

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import io
 import json
 import math
+import os
 import warnings
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -360,6 +362,20 @@ def test_a_file_that_is_not_there_is_refused_with_the_nearest(tmp_path: Path) ->
     assert refusal("a\0b") == "a\\x00b: no such file"
     assert refusal("a\nb.yaml", Anything).startswith("text: a list or a word")  # a line break: text, not a name
     assert refusal("x" * 300).endswith("x: cannot be read: File name too long")
+
+
+def test_a_scene_may_come_from_a_pipe_or_from_standard_input(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("sys.stdin", io.TextIOWrapper(io.BytesIO(GOOD.encode())))
+    assert load_scene("-") == load_scene(GOOD)
+    monkeypatch.setattr("sys.stdin", io.TextIOWrapper(io.BytesIO(b"dt: fast")))
+    assert refusal("-").startswith("standard input:")
+    reading, writing = os.pipe()
+    with os.fdopen(writing, "w") as pipe:
+        pipe.write(GOOD)
+    try:
+        assert load_scene(Path(f"/dev/fd/{reading}")) == load_scene(GOOD)
+    finally:
+        os.close(reading)
 
 
 @pytest.mark.parametrize(
