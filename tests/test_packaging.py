@@ -8,6 +8,7 @@ import re
 import shutil
 import subprocess
 import sys
+import tarfile
 import tomllib
 import zipfile
 from email.message import Message
@@ -38,6 +39,31 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return built
 
 
+FOLDERS = (".ci", "agents", "benchmarks", "configs", "docs", "flockenv", "tests")
+FILES = (
+    "CHANGELOG.md", "CITATION.cff", "CONTRIBUTING.md", "LICENSE", "MANIFEST.in", "README.md", "pyproject.toml",
+    ".gitignore", ".pre-commit-config.yaml",
+)  # fmt: skip
+"""What the repository holds."""
+
+
+@pytest.fixture(scope="module")
+def sdist(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The source distribution of a copy of the repository, unpacked."""
+    source, target = tmp_path_factory.mktemp("repository"), tmp_path_factory.mktemp("sdist")
+    for name in FILES:
+        shutil.copy(ROOT / name, source)
+    for name in FOLDERS:
+        shutil.copytree(ROOT / name, source / name, ignore=shutil.ignore_patterns("__pycache__"))
+    build = f"from setuptools import build_meta; build_meta.build_sdist({str(target)!r})"
+    done = subprocess.run([sys.executable, "-c", build], cwd=source, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    (built,) = target.glob("*.tar.gz")
+    with tarfile.open(built) as archive:
+        archive.extractall(target, filter="data")
+    return target / built.name.removesuffix(".tar.gz")
+
+
 @pytest.fixture(scope="module")
 def metadata(wheel: Path) -> Message:
     with zipfile.ZipFile(wheel) as archive:
@@ -53,6 +79,36 @@ def test_the_wheel_ships_flockenv_alone(wheel: Path) -> None:
     data = {"flockenv/py.typed", "flockenv/render/replay.html"}
     assert {name for name in names if name.startswith("flockenv/")} == sources | data
     assert any(name.endswith("licenses/LICENSE") for name in names)
+
+
+def test_the_sdist_is_the_repository(sdist: Path) -> None:
+    made = {"PKG-INFO", "setup.cfg"}
+    files = {path.relative_to(sdist).as_posix() for path in sdist.rglob("*") if path.is_file()}
+    kept = {
+        path.relative_to(ROOT).as_posix()
+        for name in FOLDERS
+        for path in (ROOT / name).rglob("*")
+        if path.is_file() and "__pycache__" not in path.parts
+    }
+    assert {name for name in files - made if ".egg-info/" not in name} == kept | set(FILES)
+    if (ROOT / ".git").exists():
+        tracked = subprocess.run(["git", "ls-files"], cwd=ROOT, capture_output=True, text=True, check=True).stdout
+        assert set(tracked.split("\n")) - {""} <= kept | set(FILES)
+
+
+@pytest.mark.slow
+def test_the_tests_of_the_sdist_are_all_found_and_run(sdist: Path) -> None:
+    """Nothing that a test file imports or opens at its top is missing, with nothing of this checkout on the path."""
+
+    def tested(*options: str) -> str:
+        command = [sys.executable, "-m", "pytest", "-q", "-n", "0", "-p", "no:cacheprovider", *options]
+        environment = {k: v for k, v in os.environ.items() if k != "PYTHONPATH"}
+        done = subprocess.run(command, cwd=sdist, env=environment, capture_output=True, text=True, check=False)
+        assert done.returncode == 0, done.stdout[-2000:]
+        return done.stdout
+
+    assert "error" not in tested("--collect-only").splitlines()[-1]
+    assert " passed" in tested("tests/test_config.py", "tests/test_readme.py")
 
 
 def test_the_environment_needs_no_torch(metadata: Message) -> None:
