@@ -247,7 +247,7 @@ def render(
     else:
         raise ValueError(f"{shown(what)}: no such task{nearest(what, TASKS)} ({', '.join(TASKS)}), nor a .yaml file")
     path.parent.mkdir(parents=True, exist_ok=True)
-    _write_picture(path, panel, what, fps, size)
+    _write_picture(path, panel, what if what in TASKS else Path(what).stem, fps, size)
     new_console().print(f"{relative(path)}: {path.stat().st_size:,} bytes, {panel.snapshots[-1].time:g} s")
 
 
@@ -392,7 +392,7 @@ def _film(file: str, duration: float, seed: int) -> tuple[Panel, float]:
     if trajectory.stopped == "interrupted":
         raise KeyboardInterrupt
     snapshots = list(trajectory.snapshots(title=Path(file).stem))
-    return Panel("", snapshots, [0.0] * len(snapshots), trajectory.stopped), 1.0 / (every * scene.dt)
+    return Panel("", snapshots, None, trajectory.stopped), 1.0 / (every * scene.dt)
 
 
 def _episode(task: Task, player: str, seed: int) -> tuple[Panel, float]:

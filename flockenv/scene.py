@@ -275,8 +275,13 @@ class Scene(Record):
 
     @property
     def roles(self) -> tuple[str, ...]:
-        """What each agent is called, (N,)."""
-        return tuple(group.role for group in self.groups for _ in range(group.size))
+        """What each agent is called, (N,): groups of plain agents are "agent", "agent 2" to "agent 4", and again."""
+        plain, names = 0, []
+        for group in self.groups:
+            number = plain % 4 + 1
+            plain += group.role == "agent"
+            names.append(f"agent {number}" if group.role == "agent" and number > 1 else group.role)
+        return tuple(name for name, group in zip(names, self.groups, strict=True) for _ in range(group.size))
 
     def bytes_per_world(self) -> int:
         """Memory of a state and its scratch, in bytes, counted before anything is allocated."""

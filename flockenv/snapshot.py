@@ -16,7 +16,9 @@ __all__ = ["KINDS", "ROLES", "Floats", "Mark", "Snapshot"]
 
 Floats = NDArray[np.float64]
 
-ROLES: Final = ("pursuer", "evader", "learner", "flockmate", "agent")
+ROLES: Final = (
+    "pursuer", "evader", "learner", "learner 2", "flockmate", "agent", "agent 2", "agent 3", "agent 4"
+)  # fmt: skip
 KINDS: Final = ("goal", "heading", "way")
 
 

@@ -375,7 +375,7 @@ class World:
         return Snapshot(
             time=float(s.time[world]), pos=s.pos[world], vel=s.vel[world], alive=s.alive[world],
             heading=s.heading[world] if len(s.frame) else None,
-            radius=np.asarray(self.task.scene.body.radius, np.float64), roles=self.task.scene.roles,
+            radius=np.asarray(self.task.scene.body.radius, np.float64), roles=self.task.roles(s, self._memory, world),
             obstacle_centre=s.obstacles.centre[world], obstacle_radius=s.obstacle_radius[world],
             marks=self.task.marks(s, self._memory, world),
             low=np.array(low, np.float64), high=np.array(high, np.float64),

@@ -166,3 +166,12 @@ def test_what_it_cannot_be_is_refused_in_one_line(fields: dict[str, Any], said: 
         Corridor(**fields)
     assert said in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+def test_pictures_tell_the_two_directions_apart() -> None:
+    world = world_of(Corridor(people=8, learners=6), seed=3)
+    moved = world.snapshot()
+    east = np.array(world.memory[0, 0] > 0)
+    assert 0 < east.sum() < 8
+    assert [name.endswith("2") for name in moved.roles] == (~east).tolist()
+    assert [name.removesuffix(" 2") for name in moved.roles] == ["learner"] * 6 + ["agent"] * 2

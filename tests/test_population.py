@@ -609,7 +609,7 @@ def test_colours_tell_ages_and_trails_end_with_their_owner(tmp_path: Path) -> No
     red, blue = (np.nonzero((picture[..., k] > 200) & (picture[..., 2 - k] < 60))[1] for k in (0, 2))
     assert red.max() < blue.min()  # the young are red, and near where they are born
     page = tmp_path / "replay.html"
-    write_replay(page, [ReplayGroup("jet", [Panel("", shots, [0.0] * len(shots), "")])], "jet")
+    write_replay(page, [ReplayGroup("jet", [Panel("", shots, None, "")])], "jet")
     text = page.read_text()
     assert '"fresh":' in text
     assert '"looks":[{"form":"point"' in text

@@ -573,6 +573,19 @@ def test_a_scene_shows_the_edges_of_its_networks() -> None:
     assert seen.tied.tolist() == [False] * 3 + [True] * 6
 
 
+def test_groups_of_a_scene_are_told_apart() -> None:
+    kinds = [{}, {"role": "pursuer"}, {}, {}, {}, {}]
+    groups = tuple(SceneGroup(count=2, spawn=Spawn(low=(0, 0), high=(9, 9)), **kind) for kind in kinds)
+    shown = Scene(groups=groups).snapshot(Scene(groups=groups).start(0)).roles
+    assert shown[::2] == ("agent", "pursuer", "agent 2", "agent 3", "agent 4", "agent")
+    assert len({ROLE_COLOURS[role] for role in ROLES}) == len(ROLES)
+
+
+def test_a_replay_of_a_scene_shows_no_return(tmp_path: Path) -> None:
+    page = written(tmp_path / "r.html", [Group("boids", [Panel("", run(3), None, "")])])
+    assert page.data["groups"][0]["panels"][0]["reward"] is None
+
+
 def test_a_replay_keeps_scenery_only_when_it_changes(tmp_path: Path) -> None:
     there = (Mark("goal", [1.0, 2.0], [0.0, 0.0], 0.5),)
     here = (Mark("heading", [0.0, 0.0], [3.0, 4.0], 0.0),)

@@ -12,8 +12,12 @@ ROLE_COLOURS: Final[dict[str, tuple[str, str]]] = {
     "pursuer": ("#d55e00", "#f0803c"),
     "evader": ("#0072b2", "#4fb0e8"),
     "learner": ("#e08a00", "#f2ae3d"),
+    "learner 2": ("#8a4fa3", "#c08ad6"),
     "flockmate": ("#3b9bd6", "#6cbcf0"),
     "agent": ("#52637a", "#a5b3c6"),
+    "agent 2": ("#b4568f", "#e08fc0"),
+    "agent 3": ("#8c7a00", "#d9c63a"),
+    "agent 4": ("#1f8a8a", "#5cc7c7"),
 }
 
 #: how much of the colour of goals is in a way's

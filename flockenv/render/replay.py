@@ -44,13 +44,14 @@ class Panel:
     """What one player did: a picture of the replay.
 
     player: its name. snapshots: one per frame, times strictly increasing, the same agents, obstacles may move.
-    reward: the return accumulated up to each snapshot. outcome: what to say when it has ended, "captured at 6.2 s".
+    reward: the return accumulated up to each snapshot; None where nothing is paid, then no return is shown.
+    outcome: what to say when it has ended, "captured at 6.2 s".
     Raises ValueError or TypeError, in one line that names the player, on anything else.
     """
 
     player: str
     snapshots: Sequence[Snapshot]
-    reward: Sequence[float]
+    reward: Sequence[float] | None
     outcome: str
 
     def __post_init__(self) -> None:
@@ -58,16 +59,11 @@ class Panel:
             if not isinstance(getattr(self, name), str):
                 raise TypeError(f"Panel.{name}: must be a str, got {type(getattr(self, name)).__name__}")
         object.__setattr__(self, "snapshots", tuple(self.snapshots))
-        object.__setattr__(self, "reward", tuple(float(r) for r in self.reward))
         shots, who = self.snapshots, f"panel {self.player!r}"
         if not shots:
             raise ValueError(f"{who}: must have at least one snapshot, got none")
-        if len(self.reward) != len(shots):
-            raise ValueError(f"{who}: must have one reward per snapshot ({len(shots)}), got {len(self.reward)}")
-        if not all(map(math.isfinite, self.reward)):
-            raise ValueError(
-                f"{who}: rewards must be finite, got {next(r for r in self.reward if not math.isfinite(r))}"
-            )
+        if self.reward is not None:
+            object.__setattr__(self, "reward", _returns(who, self.reward, len(shots)))
         for k, (shot, last) in enumerate(zip(shots[1:], shots[:-1], strict=True), 1):
             if shot.time <= last.time:
                 raise ValueError(
@@ -75,6 +71,16 @@ class Panel:
                 )
             if not _alike(shot, shots[0]):
                 raise ValueError(f"{who}: snapshot {k} must have the agents, roles, bonds and region of snapshot 0")
+
+
+def _returns(panel: str, reward: Sequence[float], shots: int) -> tuple[float, ...]:
+    """Return the rewards of a panel as floats; ValueError unless there is a finite one per snapshot."""
+    found = tuple(float(r) for r in reward)
+    if len(found) != shots:
+        raise ValueError(f"{panel}: must have one reward per snapshot ({shots}), got {len(found)}")
+    if not all(map(math.isfinite, found)):
+        raise ValueError(f"{panel}: rewards must be finite, got {next(r for r in found if not math.isfinite(r))}")
+    return found
 
 
 @dataclass(frozen=True, eq=False)
@@ -148,7 +154,7 @@ def _panel(panel: Panel) -> dict[str, Any]:
         "player": panel.player,
         "outcome": panel.outcome,
         "time": [_short(shot.time, 9) for shot in shots],
-        "reward": [_short(r, 6) for r in panel.reward],
+        "reward": None if panel.reward is None else [_short(r, 6) for r in panel.reward],
         "low": first.low.tolist(),
         "high": first.high.tolist(),
         "periodic": first.periodic,

@@ -207,6 +207,10 @@ class Task(Record):
         """Return what a picture should point out."""
         return ()
 
+    def roles(self, state: State, memory: NDArray[np.float64], world: int) -> tuple[str, ...]:
+        """Return what each agent of a world is called in pictures, (N,) of snapshot.ROLES; the same all episode."""
+        return self.scene.roles
+
     def view(self, state: State, world: int) -> tuple[tuple[float, ...], tuple[float, ...]]:
         """Return the region that a picture shows, m."""
         d = self.scene.dimension

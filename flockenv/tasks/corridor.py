@@ -7,6 +7,7 @@ import math
 from typing import Any, ClassVar
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from flockenv import steering
@@ -316,6 +317,11 @@ class Corridor(Task):
         """A force in the frame of one's way."""
         meaning = "force (along one's way, to its left) / max_force, shortened to length 1"
         return Layout((Slot("force", (2,), self.max_force, "N", meaning),))
+
+    def roles(self, state: State, memory: NDArray[np.float64], world: int) -> tuple[str, ...]:
+        """Walkers of the two directions have two names, and colours."""
+        names = zip(self.scene.roles, memory[0, world] < 0, strict=True)
+        return tuple(f"{role} 2" if back else role for role, back in names)
 
     def view(self, state: State, world: int) -> tuple[tuple[float, ...], tuple[float, ...]]:
         """The corridor."""
