@@ -1,11 +1,10 @@
-"""Everybody in the same worlds: `python -m agents.compare` plays all tasks with all players and says who won by what.
+"""All players in the same worlds: `python -m agents.compare` plays all tasks and compares the returns.
 
 Writes results.json, table.md, comparison.png and replay.html. Needs no torch: learned policies run in numpy.
 """
 
 from __future__ import annotations
 
-import functools
 import os
 import platform
 import re
@@ -26,25 +25,23 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 import flockenv
 from agents import report
-from agents.experiment import CONFIGS, WEIGHTS, Experiment, load_experiment
+from agents.experiment import CONFIGS, Experiment, load_experiment
 from agents.processes import Tell, side_by_side
-from agents.reynolds import PLAYERS as OTHERS
-from agents.reynolds import player as hand_written
 from flockenv.evaluation import WORLDS_PER_SEED, Episodes, rollout, task_digest, worlds_for
 from flockenv.outputs import checked_path
-from flockenv.policy import MlpPolicy, Policy, RandomPolicy, load_player
+from flockenv.players import NAMES, load_player, other_tasks
+from flockenv.players.files import SUFFIXES, PlayerError
+from flockenv.players.rules import tuned
+from flockenv.policy import Policy
 from flockenv.refusals import nearest, shown
 from flockenv.tasks import TASKS, Task
 
 __all__ = [
-    "Player", "app", "blaming", "compare", "deliver", "experiment_of", "field_of", "folder_of", "known_players", "pick",
-    "provenance", "split", "write_text",
+    "Player", "app", "blaming", "compare", "deliver", "experiment_of", "field_of", "folder_of", "pick", "provenance",
+     "split", "write_text",
 ]  # fmt: skip
 
 ROOT = Path(__file__).resolve().parent.parent
-PLAYERS = ("random", "textbook", *OTHERS, "reynolds", "ppo")
-"""From the least to the most that is claimed: a pair is always the later minus the earlier, "ppo - reynolds"."""
-
 WORLDS, SMOKE_WORLDS = 256, 16
 RESAMPLES, SMOKE_RESAMPLES = 10_000, 1_000
 TOLD_EVERY = 0.1  # s, between news of one player's progress from another process
@@ -70,39 +67,15 @@ class Player:
     @classmethod
     def of(cls, spec: str) -> Player:
         """Name a file by its stem; ValueError for a stem that is fit for no table."""
-        name = Path(spec).stem if Path(spec).suffix in (".py", ".safetensors", ".zip") else spec
+        name = Path(spec).stem if Path(spec).suffix.lower() in SUFFIXES else spec
         if not NAME.fullmatch(name):
             raise ValueError(f"--players {shown(spec)}: a name is up to 40 letters, digits and _ . + -")
         return cls(spec, name)
 
-    def policy(self, task: Task, known: Mapping[str, Callable[[Task], Policy]], trust_pickle: bool = False) -> Policy:
+    def policy(self, task: Task, seed: int, trust_pickle: bool = False) -> Policy:
         """Return it, ready to play a task; ValueError: one line that names it."""
         with blaming(self.name, task, ValueError):  # those of load_player name the player themselves
-            return load_player(self.spec, task, known, trust_pickle)
-
-
-def known_players(seed: int) -> dict[str, Callable[[Task], Policy]]:
-    """Return the players that have a name, each as task -> policy."""
-    return {
-        "random": lambda task: RandomPolicy(task.action_layout.size, seed),
-        "textbook": lambda task: _reynolds(task, textbook=True),
-        "reynolds": lambda task: _reynolds(task, textbook=False),
-        "ppo": lambda task: _learned(task, seed),
-        **{name: functools.partial(_reynolds, textbook=True, name=name) for name in OTHERS},
-    }
-
-
-def _reynolds(task: Task, textbook: bool, name: str = "reynolds") -> Policy:
-    policy: Policy = hand_written(task, textbook=textbook, name=name)
-    return policy
-
-
-def _learned(task: Task, seed: int) -> Policy:
-    path = WEIGHTS / f"{task.name}.safetensors"
-    if not path.is_file():
-        command = f"python -m agents.ppo configs/{task.name}.yaml"
-        raise ValueError(f"player 'ppo' has no weights for task {task.name!r}; this trains them: {command}")
-    return MlpPolicy.load(path, task, seed)
+            return load_player(self.spec, task, seed, trust_pickle)
 
 
 def compare(
@@ -124,15 +97,15 @@ def compare(
     """
     began = perf_counter()
     first = worlds_for("evaluation", seed, worlds)
-    known = known_players(seed)
     plays: dict[str, dict[str, Policy]] = {task.name: {} for task in tasks}
     for task, player in product(tasks, players):
         if _sits_out(player, task, tasks):
             continue
-        plays[task.name][player.name] = player.policy(task, known, trust_pickle)
+        plays[task.name][player.name] = player.policy(task, seed, trust_pickle)
     alone = next((name for name, playing in plays.items() if not playing), None)
     if alone is not None:
-        raise ValueError(f"task {alone!r}: nobody plays it; in other tasks alone: {', '.join(OTHERS)}")
+        names = ", ".join(player.name for player in players)
+        raise ValueError(f"task {alone!r}: no player for it; in other tasks alone: {names}")
     jobs = [
         _Job(
             task,
@@ -160,15 +133,14 @@ def compare(
 
 
 def usual_players(tasks: Sequence[Task]) -> list[str]:
-    """Return who plays if nobody is asked for: everybody with a name who knows one of the tasks."""
-    known = {task.name for task in tasks}
-    return [name for name in PLAYERS if name not in OTHERS or known & OTHERS[name].keys()]
+    """Return the default players: all that have a name and are written for one of the tasks."""
+    return [name for name in NAMES if any(not other_tasks(name, task.name) for task in tasks)]
 
 
 def _sits_out(player: Player, task: Task, tasks: Sequence[Task]) -> bool:
-    """Is it a hand-written player for other tasks that are played here?"""
-    of = OTHERS.get(player.spec)
-    return of is not None and task.name not in of and any(other.name in of for other in tasks)
+    """True if it is a hand-written player of other tasks, one of which is played here."""
+    of = other_tasks(player.spec, task.name)
+    return any(other.name in of for other in tasks)
 
 
 @dataclass(frozen=True)
@@ -210,8 +182,7 @@ def _work(job: _Job, tell: Tell) -> Played:
             tell(*news)
 
     tell(job.task.name, job.players[0].name, 0, job.task.horizon)  # somebody is at it, though he may compile first
-    known = known_players(job.seed)
-    policies = {player.name: player.policy(job.task, known, job.trust_pickle) for player in job.players}
+    policies = {player.name: player.policy(job.task, job.seed, job.trust_pickle) for player in job.players}
     return _play(job, policies, advance)
 
 
@@ -231,12 +202,17 @@ def _play(job: _Job, policies: Mapping[str, Policy], advance: Advance) -> Played
 
 @contextmanager
 def blaming(player: str, task: Task, *clear: type[Exception]) -> Iterator[None]:
-    """Say of an error in somebody's player whose it is and in which task, unless it is one of the clear ones."""
+    """Name the player and the task in an error that its `predict` raises, or its actions cause, unless it is `clear`.
+
+    A PlayerError names the file already; the task is added.
+    """
     try:
         yield
+    except clear:
+        raise
+    except PlayerError as error:
+        raise PlayerError(f"{error} (task {task.name!r})") from error
     except Exception as error:
-        if isinstance(error, clear):
-            raise
         raise ValueError(f"player {player!r}, task {task.name!r}: {type(error).__name__}: {error}") from error
 
 
@@ -246,9 +222,9 @@ def _costs(task: Task, policies: Mapping[str, Policy]) -> dict[str, report.Resul
     for name, policy in policies.items():
         card = getattr(policy, "card", None) or {}
         costs[name] = {key: card[key] for key in ("wall_time_s", "steps") if key in card}
-    steps = experiment_of(task.name).reynolds.found.get("agent_steps")
-    if steps and "reynolds" in policies:
-        costs["reynolds"] = {"of": "tuning", "steps": round(steps)}
+    steps = tuned(task.name).found.get("agent_steps")
+    if steps and "rules" in policies:
+        costs["rules"] = {"of": "tuning", "steps": round(steps)}
     return costs
 
 
@@ -290,7 +266,7 @@ def main(
     tasks: Annotated[list[str] | None, typer.Option(help="Tasks, by comma or repeated; all if left out.")] = None,
     players: Annotated[
         list[str] | None,
-        typer.Option(help=f"Players: {', '.join(PLAYERS)}, a .py file with a predict, or a .safetensors."),
+        typer.Option(help=f"Players: {', '.join(NAMES)}, a .py file with a predict, or a .safetensors."),
     ] = None,
     worlds: Annotated[int | None, typer.Option(help=f"Worlds per task, the same for everyone. [{WORLDS}]")] = None,
     seed: Annotated[int, typer.Option(help="Which evaluation worlds, 0 to 999.")] = 0,
@@ -354,7 +330,7 @@ def field_of(specs: Sequence[str]) -> list[Player]:
     twice = next((name for name in names if names.count(name) > 1), None)
     if twice:
         raise ValueError(f"--players: two players are called {twice!r}; rename a file")
-    return sorted(field, key=lambda player: PLAYERS.index(player.spec) if player.spec in PLAYERS else len(PLAYERS))
+    return sorted(field, key=lambda player: NAMES.index(player.spec) if player.spec in NAMES else len(NAMES))
 
 
 @contextmanager

@@ -19,6 +19,7 @@ from rich.console import Console
 
 from agents.experiment import Experiment, PpoSettings, load_experiment, one_line_errors
 from flockenv.outputs import checked_file, replacing
+from flockenv.players.rules import tuned
 from flockenv.render.chart import COLOURS, FAINT, GRID, INK
 
 if TYPE_CHECKING:
@@ -71,7 +72,7 @@ def learned(experiment: Experiment, name: str, runs: Path) -> Curve:
 
 def measured(experiment: Experiment, runs: Path) -> Numbers:
     """Return what there is to show of a task, once all of its settings are trained."""
-    rules = experiment.reynolds.found.get("tuning_mean")
+    rules = tuned(experiment.task).found.get("tuning_mean")
     rows = {}
     for name, p in experiment.settings().items():
         curve = learned(experiment, name, runs)

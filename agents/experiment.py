@@ -1,4 +1,4 @@
-"""An experiment: what configs/<task>.yaml says: how PPO trains on a task, and what the search found for the rules."""
+"""An experiment: what configs/<task>.yaml says: how PPO trains on a task, and how its rules are tuned."""
 
 from __future__ import annotations
 
@@ -19,12 +19,10 @@ from flockenv.refusals import key_path, refusals
 from flockenv.tasks import TASKS, Task
 
 __all__ = [
-    "AS_CONFIGURED", "CONFIGS", "WEIGHTS", "Experiment", "PpoSettings", "ReynoldsSettings", "load_experiment",
-    "one_line_errors",
+    "AS_CONFIGURED", "CONFIGS", "Experiment", "PpoSettings", "SearchSettings", "load_experiment", "one_line_errors",
 ]  # fmt: skip
 
 CONFIGS = Path(__file__).resolve().parent.parent / "configs"
-WEIGHTS = Path(__file__).resolve().parent / "weights"
 
 AS_CONFIGURED = "as configured"
 """What a config's own settings are called beside others."""
@@ -69,20 +67,12 @@ class PpoSettings(Record):
 
 
 class SearchSettings(Record):
-    """The budget of the search over the rules' parameters, and what it came to."""
+    """The budget of the search over the rules' parameters."""
 
     candidates: int = Field(default=256, ge=2, description="parameter sets drawn at random in the first round")
     worlds: int = Field(default=96, ge=2, description="tuning worlds per candidate, doubled each round")
     rounds: int = Field(default=5, ge=1, description="successive halvings, each with refinements around the best")
     seed: int = Field(default=0, ge=0, lt=1000, description="of the search")
-
-
-class ReynoldsSettings(Record):
-    """The hand-written player's tuned parameters, and the search that found them."""
-
-    search: SearchSettings = Field(default_factory=SearchSettings)
-    rules: dict[str, float] = Field(default_factory=dict, description="what the search found; written by agents.tune")
-    found: dict[str, float] = Field(default_factory=dict, description="budget spent and scores; written by agents.tune")
 
 
 class Experiment(Record):
@@ -94,7 +84,7 @@ class Experiment(Record):
     curves: dict[str, dict[str, Any]] = Field(
         default_factory=dict, description="other settings of PPO to compare it with, by name: what differs"
     )
-    reynolds: ReynoldsSettings = Field(default_factory=ReynoldsSettings)
+    search: SearchSettings = Field(default_factory=SearchSettings)
 
     @model_validator(mode="after")
     def _curves_are_settings(self) -> Experiment:

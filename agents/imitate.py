@@ -18,9 +18,9 @@ from rich.progress import Progress
 
 from agents.experiment import Experiment, load_experiment, one_line_errors
 from agents.ppo import build, on_threads, score, tensors_of
-from agents.reynolds import player
 from agents.teach import WORLDS, teach
 from flockenv.evaluation import rollout, worlds_for
+from flockenv.players.rules import player
 
 __all__ = ["Imitation", "app", "imitate"]
 

@@ -22,10 +22,10 @@ from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
 
-from agents.compare import blaming, field_of, known_players, split
+from agents.compare import blaming, field_of, split
 from agents.experiment import load_experiment, one_line_errors
-from agents.reynolds import PLAYERS as OTHERS
 from flockenv.evaluation import Episodes, Interval, bootstrap, compare, rollout, worlds_for
+from flockenv.players import NAMES, other_tasks
 from flockenv.policy import Policy
 from flockenv.snapshot import Snapshot
 from flockenv.tasks import Task
@@ -167,7 +167,7 @@ def table_of(payoffs: Payoffs) -> Table:
 def main(
     configs: Annotated[list[Path], typer.Argument(help="experiments, such as configs/school.yaml")],
     players: Annotated[
-        list[str] | None, typer.Option(help="by comma or repeated; [reynolds, ppo, and others written for the task]")
+        list[str] | None, typer.Option(help="by comma or repeated; [rules, ppo, and others written for the task]")
     ] = None,
     worlds: Annotated[int, typer.Option(min=2, help="evaluation worlds")] = WORLDS,
     seed: Annotated[int, typer.Option(min=0, max=999, help="which of them")] = 0,
@@ -178,8 +178,7 @@ def main(
     """Say who gains by playing otherwise than all others of a world."""
     with one_line_errors():
         tasks = [load_experiment(config).build() for config in configs]
-        known = known_players(seed)
-        fields = [_makers(task, split(players), known, trust_pickle) for task in tasks]
+        fields = [_makers(task, split(players), seed, trust_pickle) for task in tasks]
         out = Console(highlight=False)
         if not out.is_terminal:
             out = Console(highlight=False, width=200)  # a pipe has no width
@@ -193,13 +192,11 @@ def main(
                 out.print(found.verdict(*pair), markup=False)
 
 
-def _makers(
-    task: Task, asked: Sequence[str], known: Mapping[str, Callable[[Task], Policy]], trust_pickle: bool
-) -> dict[str, Callable[[Task], Policy]]:
-    """Return how each player of a task is made, by name; whoever cannot be had is refused before anything is played."""
-    specs = asked or [*(name for name, of in OTHERS.items() if task.name in of), "reynolds", "ppo"]
+def _makers(task: Task, asked: Sequence[str], seed: int, trust_pickle: bool) -> dict[str, Callable[[Task], Policy]]:
+    """Return how each player of a task is made, by name; one that cannot be made is refused before any episode."""
+    specs = asked or [name for name in NAMES if name not in ("random", "textbook") and not other_tasks(name, task.name)]
     makers = {
-        player.name: functools.partial(player.policy, known=known, trust_pickle=trust_pickle)
+        player.name: functools.partial(player.policy, seed=seed, trust_pickle=trust_pickle)
         for player in field_of(specs)
     }
     for make in makers.values():

@@ -30,11 +30,12 @@ from stable_baselines3.common.vec_env import VecEnvWrapper
 
 from agents.central import CentralPolicy, CentralVecEnv
 from agents.credit import CaringBuffer
-from agents.experiment import WEIGHTS, Experiment, PpoSettings, load_experiment, one_line_errors
-from agents.reynolds import as_dict, player
+from agents.experiment import Experiment, PpoSettings, load_experiment, one_line_errors
 from agents.teach import teach
 from flockenv.crew import threads, use_threads
 from flockenv.evaluation import rollout, worlds_for
+from flockenv.players import WEIGHTS
+from flockenv.players.rules import as_dict, player
 from flockenv.policy import MlpPolicy, save_policy
 from flockenv.refusals import KeyPath, key_path, shown
 from flockenv.sb3 import WorldVecEnv
@@ -355,7 +356,7 @@ def export(run: Run, path: Path) -> None:
 @app.command()
 def main(
     config: Annotated[Path, typer.Argument(help="an experiment, such as configs/pursuit.yaml")],
-    out: Annotated[Path | None, typer.Option(help="default: agents/weights/TASK.safetensors")] = None,
+    out: Annotated[Path | None, typer.Option(help="default: flockenv/players/weights/TASK.safetensors")] = None,
     runs: Annotated[Path, typer.Option(help="folder of checkpoints")] = Path("runs"),
     go_on: Annotated[bool, typer.Option("--resume", help="go on from the last checkpoint")] = False,
     tensorboard: Annotated[str | None, typer.Option(help="folder of TensorBoard logs")] = None,

@@ -86,12 +86,12 @@ def _number(value: float) -> float | None:
 def verdict(task: str, results: Results) -> str:
     """Return a sentence: who is ahead by how much in the same worlds, and what each of the two cost.
 
-    It is about ppo and reynolds where both played, else about the two players with the best means.
+    It is about ppo and rules where both played, else about the two players with the best means.
     """
     players = results["players"]
     if len(players) < 2:
         return f"{task}: one player alone, nobody to compare with."
-    names = ("ppo", "reynolds")
+    names = ("ppo", "rules")
     if not players.keys() >= set(names):
         names = tuple(sorted(players, key=lambda name: -players[name]["mean"])[:2])
     key = next(key for key in results["pairs"] if set(key.split(" - ")) == set(names))

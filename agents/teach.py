@@ -8,8 +8,8 @@ import numpy as np
 import torch
 from stable_baselines3 import PPO
 
-from agents.reynolds import Reynolds
 from flockenv.evaluation import worlds_for
+from flockenv.players.rules import RulesPlayer
 from flockenv.tasks import Task
 from flockenv.world import World
 
@@ -22,7 +22,7 @@ WORLDS, ROUNDS = 96, 4
 
 
 def shown(
-    task: Task, rules: Reynolds, worlds: int, who: Answers | None = None, first: int = 0
+    task: Task, rules: RulesPlayer, worlds: int, who: Answers | None = None, first: int = 0
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Return what was seen in one episode of each of so many training worlds, (rows, size), and what rules answer.
 
@@ -47,7 +47,7 @@ def shown(
 
 
 def teach(
-    model: PPO, task: Task, rules: Reynolds, updates: int, worlds: int = WORLDS,
+    model: PPO, task: Task, rules: RulesPlayer, updates: int, worlds: int = WORLDS,
     advance: Callable[[int], None] = lambda n: None,
 ) -> tuple[int, float]:  # fmt: skip
     """Teach PPO's actor what rules answer, by so many gradient steps of 2,048 rows in four rounds.

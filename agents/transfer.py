@@ -23,7 +23,6 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 from agents import report, transfer_report
 from agents.compare import (
-    PLAYERS,
     deliver,
     experiment_of,
     field_of,
@@ -48,6 +47,7 @@ from agents.transfer_cells import (
 from agents.transfer_report import Setting
 from flockenv.evaluation import WORLDS_PER_SEED, worlds_for
 from flockenv.integrators import INTEGRATORS
+from flockenv.players import NAMES
 from flockenv.refusals import nearest, shown
 from flockenv.tasks import TASKS, Task
 
@@ -96,7 +96,7 @@ def main(
         _check("--workers", workers, 1, 64)
         worlds_for("evaluation", seed, worlds)
         chosen = [experiment_of(name).build() for name in pick("TASK", split(tasks) or list(TASKS), TASKS)]
-        field = tuple(field_of(split(players) or list(PLAYERS)))
+        field = tuple(field_of(split(players) or list(NAMES)))
         solvers, steps = _solvers(split(methods) or list(METHODS)), _substeps(split(substeps), SUBSTEPS)
         plans = [
             Plan(task, _settings(task, solvers, steps), field, worlds, seed, rounds, trust_pickle) for task in chosen

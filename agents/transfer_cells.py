@@ -16,12 +16,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from agents.compare import Player, blaming, known_players
+from agents.compare import Player, blaming
 from agents.transfer_report import Cell, Clock, Setting
 from flockenv.evaluation import rollout, task_digest, worlds_for
 from flockenv.integrators import RK4
 from flockenv.kernels import load
 from flockenv.outputs import replacing
+from flockenv.players import NAMES
 from flockenv.policy import Policy
 from flockenv.tasks import Task
 from flockenv.tasks.base import task_source
@@ -70,7 +71,7 @@ class Plan:
 
     def policy(self, player: Player, task: Task) -> Policy:
         """Return a player that has decided nothing yet."""
-        return player.policy(task, known_players(self.seed), self.trust_pickle)
+        return player.policy(task, self.seed, self.trust_pickle)
 
 
 Job = tuple[Plan, tuple[Setting, ...]]
@@ -110,7 +111,7 @@ def _kernel(task: Task) -> str:
 
 def _print(player: Player, plan: Plan) -> str:
     """Return what tells a player from itself after a change: its file, or its code, parameters and weights."""
-    known = player.spec in known_players(plan.seed)
+    known = player.spec in NAMES
     return _print_of_known(player, plan) if known else hashlib.sha256(Path(player.spec).read_bytes()).hexdigest()
 
 

@@ -2,25 +2,25 @@
 
 A plain search: random parameter sets and the textbook's, played on tuning worlds; the best quarter goes on to twice
 as many worlds, each joined by a small change of itself, for a few rounds. What it found, and the agent-steps that it
-spent, go into the config; the default budget is of the order of what learning has.
+spent, go into flockenv/players/tuned/TASK.json; the default budget is of the order of what learning has.
 """
 
 from __future__ import annotations
 
-import os
+import json
 from dataclasses import fields
 from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
 import typer
-import yaml
 from rich.console import Console
 from rich.progress import Progress
 
 from agents.experiment import Experiment, load_experiment, one_line_errors
-from agents.reynolds import RULES, Reynolds, as_dict
 from flockenv.evaluation import rollout, worlds_for
+from flockenv.outputs import replacing
+from flockenv.players.rules import RULES, TUNED, RulesPlayer, as_dict
 from flockenv.tasks import Task
 
 __all__ = ["RANGES", "app", "search"]
@@ -82,7 +82,7 @@ RANGES: dict[str, dict[str, tuple[float, float]]] = {
 
 def search(experiment: Experiment, advance: Any = lambda steps: None) -> tuple[dict[str, float], dict[str, float]]:
     """Return the best parameters, and what was spent and scored."""
-    task, s = experiment.build(), experiment.reynolds.search
+    task, s = experiment.build(), experiment.search
     rng = np.random.default_rng(s.seed)
     ranges, textbook = RANGES[task.name], as_dict(RULES[task.name][1]())
     assert set(ranges) == {f.name for f in fields(RULES[task.name][1])}, "every parameter has a range"
@@ -125,35 +125,37 @@ def _score(task: Task, values: dict[str, float], worlds: int, seed: int) -> tupl
 
     The mean, as in the paired differences of the comparison: a disaster in one world out of ten must count.
     """
-    episodes = rollout(task, Reynolds(task, RULES[task.name][1](**values)), worlds, worlds_for("tuning", seed, worlds))
+    episodes = rollout(
+        task, RulesPlayer(task, RULES[task.name][1](**values)), worlds, worlds_for("tuning", seed, worlds)
+    )
     return float(np.mean(episodes.returns)), int(np.sum(episodes.lengths) * task.learners)
 
 
-def write(path: Path, rules: dict[str, float], found: dict[str, float]) -> None:
-    """Put the result into the config, keeping every other line and comment as it is."""
-    text = path.read_text(encoding="utf-8")
-    config = yaml.safe_load(text)
-    budget = {k: v for k, v in (config.get("reynolds") or {}).items() if k == "search"}
-    block = {"reynolds": {**budget, "rules": rules, "found": found}}
-    head = text.split("\nreynolds:")[0].rstrip("\n")
-    temporary = path.with_suffix(".tmp")
-    temporary.write_text(f"{head}\n{yaml.safe_dump(block, sort_keys=False)}", encoding="utf-8")
-    os.replace(temporary, path)
+def write(path: Path, task: str, parameters: dict[str, float], found: dict[str, float]) -> None:
+    """Write what the search found for a task, whole or not at all."""
+    content = {"task": task, "parameters": parameters, "found": found}
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with replacing(path) as file:
+        file.write((json.dumps(content, indent=2, allow_nan=False) + "\n").encode())
 
 
 @app.command()
-def main(config: Annotated[Path, typer.Argument(help="an experiment, such as configs/pursuit.yaml")]) -> None:
-    """Search the rules' parameters and write what was found into the config."""
+def main(
+    config: Annotated[Path, typer.Argument(help="an experiment, such as configs/pursuit.yaml")],
+    out: Annotated[Path | None, typer.Option(help="default: flockenv/players/tuned/TASK.json")] = None,
+) -> None:
+    """Search the rules' parameters and write what was found."""
     with one_line_errors():
         experiment = load_experiment(config)
         task = experiment.build()
-    s = experiment.reynolds.search
+    s = experiment.search
     with Progress(console=console) as progress:
         bar = progress.add_task(f"{task.name}: parameter sets", total=_plays(s.candidates, s.rounds))
         rules, found = search(experiment, lambda n: progress.advance(bar, n))
-    write(config, rules, found)
+    target = out or TUNED / f"{task.name}.json"
+    write(target, task.name, rules, found)
     gained = f"mean return {found['textbook_mean']:.3f} (textbook) -> {found['tuning_mean']:.3f}"
-    console.print(f"{task.name}: {gained}, {found['agent_steps']:,.0f} agent-steps")
+    console.print(f"{target}: {gained}, {found['agent_steps']:,.0f} agent-steps")
 
 
 if __name__ == "__main__":

@@ -22,6 +22,7 @@ import typer
 
 import flockenv
 from flockenv.measuring import measure
+from flockenv.players import NAMES
 from flockenv.refusals import nearest, shown
 from flockenv.studies import accuracy, experiment, gallery, stress
 from flockenv.terminal import (
@@ -223,7 +224,8 @@ def render(
     ],
     out: Annotated[str, typer.Option(metavar="X.gif|X.png|X.html", help="What to write; a PNG shows the end.")],
     player: Annotated[
-        str, typer.Option(metavar="FILE", help="Who plays a task: `random`, a .safetensors file or a .py file.")
+        str,
+        typer.Option(metavar="NAME|FILE", help=f"Player of a task: {', '.join(NAMES)}, a .safetensors or a .py file."),
     ] = "random",
     seed: Seed = 0,
     duration: Annotated[
@@ -398,10 +400,10 @@ def _film(file: str, duration: float, seed: int) -> tuple[Panel, float]:
 def _episode(task: Task, player: str, seed: int) -> tuple[Panel, float]:
     """Return one episode as something to draw, and its frames per second."""
     from flockenv.evaluation import rollout
-    from flockenv.policy import RandomPolicy, load_player
+    from flockenv.players import load_player
     from flockenv.render import Panel
 
-    policy = load_player(player, task, {"random": lambda task: RandomPolicy(task.action_layout.size, seed)})
+    policy = load_player(player, task, seed)
     with progress_bar("playing", task.horizon, "decisions") as progress:
         episode = rollout(task, policy, 1, seed, record=0, progress=lambda done, most: progress(done))
     assert episode.recording is not None  # asked for with record=0

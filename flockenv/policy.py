@@ -8,12 +8,8 @@ numpy alone.
 from __future__ import annotations
 
 import hashlib
-import importlib
-import importlib.util
-import inspect
 import json
 import os
-import sys
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
@@ -22,12 +18,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flockenv.outputs import replacing
-from flockenv.refusals import nearest
+from flockenv.refusals import nearest, shown_path
 
 if TYPE_CHECKING:
     from flockenv.tasks import Task
 
-__all__ = ["ACTIVATIONS", "MlpPolicy", "Policy", "RandomPolicy", "load_player", "save_policy"]
+__all__ = ["ACTIVATIONS", "MlpPolicy", "Policy", "RandomPolicy", "save_policy"]
 
 Observation = NDArray[Any] | dict[str, NDArray[Any]]
 State = tuple[NDArray[Any], ...]
@@ -47,7 +43,7 @@ LARGEST_CARD, LARGEST_WEIGHTS = 8 << 20, 256 << 20
 
 @runtime_checkable
 class Policy(Protocol):
-    """Letter for letter Stable-Baselines3's predict(), so that a Reynolds player and a PPO model are used alike."""
+    """Letter for letter Stable-Baselines3's predict(), so that hand-written rules and a PPO model are used alike."""
 
     def predict(
         self,
@@ -135,7 +131,7 @@ class MlpPolicy:
             policy = cls(_read_tensors(path, card), card, seed)
             _check_sizes(policy, task)
         except ValueError as error:
-            raise ValueError(f"policy {_shown(path)}: {error}") from None
+            raise ValueError(f"policy {shown_path(path)}: {error}") from None
         return policy
 
     def predict(
@@ -184,7 +180,7 @@ def save_policy(path: str | os.PathLike[str], tensors: Mapping[str, NDArray[Any]
 
     path = Path(path)
     if path.suffix != ".safetensors":
-        raise ValueError(f"policy {_shown(path)}: the file name must end in .safetensors")
+        raise ValueError(f"policy {shown_path(path)}: the file name must end in .safetensors")
     tensors = {name: np.ascontiguousarray(tensor) for name, tensor in tensors.items()}
     policy = MlpPolicy(tensors, card)
     data = save(tensors)
@@ -196,114 +192,14 @@ def save_policy(path: str | os.PathLike[str], tensors: Mapping[str, NDArray[Any]
     }
     for key in derived.keys() & card.keys() - {"sha256"}:
         if card[key] != derived[key]:
-            raise ValueError(f"policy {_shown(path)}: card: {key} = {card[key]!r}, the weights say {derived[key]!r}")
+            raise ValueError(
+                f"policy {shown_path(path)}: card: {key} = {card[key]!r}, the weights say {derived[key]!r}"
+            )
     text = json.dumps({**card, **derived}, indent=2, allow_nan=False) + "\n"
     path.parent.mkdir(parents=True, exist_ok=True)
     for target, content in ((path, data), (path.with_suffix(".json"), text.encode())):
         with replacing(target) as file:
             file.write(content)
-
-
-def load_player(
-    spec: str | os.PathLike[str],
-    task: Task,
-    known: Mapping[str, Callable[[Task], Policy]] | None = None,
-    trust_pickle: bool = False,
-) -> Policy:
-    """Return the policy that a name or a file stands for, ready to play this task.
-
-    Args:
-        spec: a name out of `known`; or a `.safetensors` file with its card; or a `.py` file, which is executed and
-            offers `player(task)`, a class `Player` or a function `predict` (SB3's four arguments, or the observation
-            alone); or, with `trust_pickle`, a Stable-Baselines3 `.zip`.
-        task: whom it will play.
-        known: name -> how to make that player.
-        trust_pickle: read zips too. Loading one executes whatever code is stored in it.
-
-    Raises:
-        ValueError: one line: no such player (with the nearest name), a file that cannot be used, or one not trusted.
-    """
-    known = known or {}
-    name = os.fspath(spec)
-    if name in known:
-        return known[name](task)
-    loader = {".safetensors": MlpPolicy.load, ".py": _load_python, ".zip": _load_zip}.get(Path(name).suffix.lower())
-    if loader is None:
-        hint = f"unknown{nearest(name[:200], known)}; allowed: {_listed(known)}, or a .safetensors or .py file"
-        raise ValueError(f"player {_shown(name)}: {hint}")
-    if loader is _load_zip and not trust_pickle:
-        raise ValueError(
-            f"player {_shown(name)}: loading a Stable-Baselines3 zip executes the code stored in it; "
-            "if the file is your own, pass --trust-pickle (trust_pickle=True)"
-        )
-    if not os.path.isfile(name):  # Path.is_file raises for a name that no file can have
-        raise ValueError(f"player {_shown(name)}: no such file")
-    return loader(Path(name), task)
-
-
-def _load_zip(path: Path, task: Task) -> Policy:
-    # by name: stable-baselines3 and torch are looked for only here, and sb3.py is a layer above this file
-    policy: Policy = importlib.import_module("flockenv.sb3").load_sb3_zip(path)
-    return policy
-
-
-def _load_python(path: Path, task: Task) -> Policy:
-    """Execute a player file and take what it offers, the most specific first."""
-    module = _execute(path)
-    player: Any
-    if hasattr(module, "player"):
-        player = module.player(task)
-    elif hasattr(module, "Player"):
-        player = module.Player(task) if _takes(module.Player, 1) else module.Player()
-    elif hasattr(module, "predict"):
-        player = _FunctionPolicy(module.predict)
-    else:
-        raise ValueError(f"player {_shown(path)}: needs a function predict or player(task), or a class Player")
-    if not callable(getattr(player, "predict", None)):
-        raise ValueError(f"player {_shown(path)}: what it made, a {type(player).__name__}, has no predict()")
-    return player  # type: ignore[no-any-return]
-
-
-def _execute(path: Path) -> Any:
-    """Import a file under a name of its own, so that two players of the same file name do not meet."""
-    name = f"flockenv_player_{hashlib.sha256(str(path.resolve()).encode()).hexdigest()[:16]}"
-    spec = importlib.util.spec_from_file_location(name, path)
-    if spec is None or spec.loader is None:
-        raise ValueError(f"player {_shown(path)}: not a Python file")
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[name] = module  # dataclasses and pickle look a class's module up there
-    try:
-        spec.loader.exec_module(module)
-    except Exception as error:
-        del sys.modules[name]
-        raise ValueError(f"player {_shown(path)}: {type(error).__name__} while loading it: {error}") from error
-    return module
-
-
-class _FunctionPolicy:
-    """A bare function as a policy: SB3's four arguments and a pair back, or the observation in and the action out."""
-
-    def __init__(self, function: Callable[..., Any]) -> None:
-        self._function, self._whole = function, _takes(function, 4)
-
-    def predict(
-        self,
-        observation: Observation,
-        state: State | None = None,
-        episode_start: NDArray[Any] | None = None,
-        deterministic: bool = False,
-    ) -> tuple[NDArray[Any], State | None]:
-        arguments = (observation, state, episode_start, deterministic) if self._whole else (observation,)
-        answer = self._function(*arguments)
-        return answer if isinstance(answer, tuple) else (np.asarray(answer, np.float32), state)
-
-
-def _takes(function: Callable[..., Any], count: int) -> bool:
-    try:
-        inspect.signature(function).bind(*[None] * count)
-    except (TypeError, ValueError):
-        return False
-    return True
 
 
 def _read_card(path: Path) -> dict[str, Any]:
@@ -405,12 +301,6 @@ def _seeded(seed: int | None) -> tuple[int, np.random.Generator]:
     if seed is None:
         seed = int(np.random.SeedSequence().generate_state(1, np.uint64)[0])
     return seed, np.random.default_rng(seed)
-
-
-def _shown(path: str | os.PathLike[str]) -> str:
-    """Return a path fit for one line of a terminal: quoted, control characters escaped, not too long."""
-    text = repr(os.fspath(path))
-    return text if len(text) <= 300 else f"{text[:150]}...{text[-100:]}"
 
 
 def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:

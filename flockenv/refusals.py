@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import difflib
 import functools
+import os
 import re
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
@@ -15,7 +16,7 @@ from typing import Any
 from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails
 
-__all__ = ["KeyPath", "Refusal", "key_path", "nearest", "nearest_few", "refusals", "shown", "steps_of"]
+__all__ = ["KeyPath", "Refusal", "key_path", "nearest", "nearest_few", "refusals", "shown", "shown_path", "steps_of"]
 
 KeyPath = tuple[str | int, ...]
 """Where a value stands: ("effects", 1, "radius") is effects[1].radius."""
@@ -111,6 +112,12 @@ def shown(value: object) -> str:
     """Return a value as one short printable line."""
     text = repr(value)
     return text if len(text) <= 60 else text[:50] + f"... ({len(text)} characters)"
+
+
+def shown_path(path: str | os.PathLike[str]) -> str:
+    """Return a path as one printable line of a bounded length: quoted, control characters escaped."""
+    text = repr(os.fspath(path))
+    return text if len(text) <= 300 else f"{text[:150]}...{text[-100:]}"
 
 
 def _path_in(data: object, detail: ErrorDetails) -> KeyPath:

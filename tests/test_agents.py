@@ -17,13 +17,14 @@ from typer.testing import CliRunner
 
 from agents import tune
 from agents.credit import CaringBuffer
-from agents.experiment import AS_CONFIGURED, CONFIGS, WEIGHTS, Experiment, PpoSettings, load_experiment
+from agents.experiment import AS_CONFIGURED, CONFIGS, Experiment, PpoSettings, load_experiment
 from agents.imitate import imitate
 from agents.ppo import ForLearning
-from agents.reynolds import RULES, as_dict, player, tuned
 from agents.teach import shown
 from flockenv.crew import threads
 from flockenv.evaluation import compare, rollout, worlds_for
+from flockenv.players import WEIGHTS
+from flockenv.players.rules import RULES, Tuned, as_dict, player, tuned
 from flockenv.policy import MlpPolicy, RandomPolicy
 from flockenv.sb3 import WorldVecEnv
 from flockenv.tasks import TASKS, School, Task
@@ -43,7 +44,7 @@ def test_both_hand_written_players_are_far_above_random(name: str) -> None:
         (True, 1 if name == "crowd_nav" else 3),
         (False, 10),
     ):  # the text goes too fast for a narrow track, and into a crowd that does not see it; whoever tunes it does not
-        rules = rollout(task, player(task, textbook=textbook), 12, first)
+        rules = rollout(task, player(task, "textbook" if textbook else "rules"), 12, first)
         assert compare(rules, random).difference.low > margin
 
 
@@ -65,7 +66,7 @@ def test_the_shipped_policy_is_far_above_random_and_its_card_is_complete(name: s
 def test_the_page_says_when_the_rules_were_passed(name: str) -> None:
     """In the words of the policy's card, and of what the search found."""
     card = json.loads((WEIGHTS / f"{name}.json").read_text(encoding="utf-8"))
-    rules = load_experiment(CONFIGS / f"{name}.yaml").reynolds.found["tuning_mean"]
+    rules = tuned(name).found["tuning_mean"]
     past = next((point for point in card["curve"] if point["mean"] > rules), None)
     cells = (
         [f"{past['mean']:.2f}", f"{past['seconds']:.0f}", f"{past['steps'] / 1e6:.1f} M"] if past else ["never", "", ""]
@@ -101,24 +102,26 @@ def test_every_parameter_of_the_rules_has_a_range_around_its_textbook_value() ->
             )  # the text has no such limit
 
 
-def test_the_tuned_parameters_are_those_of_the_config_and_beat_the_textbook_there() -> None:
+def test_tuned_rules_have_every_parameter_and_beat_the_textbook_on_tuning_worlds() -> None:
     for name in TASKS:
-        found = load_experiment(CONFIGS / f"{name}.yaml").reynolds
-        assert tuned(name) == found.rules
-        assert found.found["tuning_mean"] > found.found["textbook_mean"]
+        record = tuned(name)
+        assert record.parameters == as_dict(player(TASKS[name]()).rules)
+        assert record.found["tuning_mean"] > record.found["textbook_mean"]
 
 
-def test_the_search_writes_its_result_and_keeps_the_rest_of_the_file(tmp_path: Path) -> None:
+def test_what_the_search_found_is_what_rules_play_by(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    search = {"candidates": 4, "worlds": 2, "rounds": 2}
     config = tmp_path / "pursuit.yaml"
-    config.write_text("# a comment\ntask: pursuit\nppo:\n  steps: 5  # few\n", encoding="utf-8")
-    experiment = Experiment(task="pursuit", reynolds={"search": {"candidates": 4, "worlds": 2, "rounds": 2}})
-    rules, found = tune.search(experiment)
-    tune.write(config, rules, found)
-    text = config.read_text(encoding="utf-8")
-    assert text.startswith("# a comment\ntask: pursuit\nppo:\n  steps: 5  # few\n")
-    assert yaml.safe_load(text)["reynolds"]["rules"] == rules
+    config.write_text(yaml.safe_dump({"task": "pursuit", "search": search}), encoding="utf-8")
+    monkeypatch.setattr(tune, "TUNED", tmp_path / "tuned")
+    monkeypatch.setattr("flockenv.players.rules.TUNED", tmp_path / "tuned")
+    assert tuned("pursuit") == Tuned(), "no search yet"
+    result = CliRunner().invoke(tune.app, [str(config)])
+    assert result.exit_code == 0, result.output
+    rules, found = tune.search(load_experiment(config))
+    assert tuned("pursuit") == Tuned(rules, found), "the same seed finds the same"
+    assert as_dict(player(TASKS["pursuit"]()).rules) == rules
     assert found["agent_steps"] > 0 and found["tuning_mean"] >= found["textbook_mean"]
-    assert tune.search(experiment) == (rules, found), "the same seed finds the same"
 
 
 PURSUIT = Experiment(task="pursuit", ppo={**TINY, "steps": 1024})
@@ -194,7 +197,6 @@ def _curves(folder: Path, code: int = 0, **changes: Any) -> str:
         "task": "pursuit",
         "ppo": {**TINY, "steps": 512},
         "curves": {"two epochs": {"epochs": 2}},
-        "reynolds": {"found": {"tuning_mean": -100.0}},
     }
     config = folder / "pursuit.yaml"
     config.write_text(yaml.safe_dump({**settings, **changes}), encoding="utf-8")
@@ -211,6 +213,7 @@ def test_curves_train_every_setting_once_and_draw_them(tmp_path: Path, monkeypat
 
     experiment = Experiment(task="pursuit", ppo={**TINY, "steps": 512}, curves={"two epochs": {"epochs": 2}})
     interrupt(experiment, tmp_path / "runs" / "pursuit" / AS_CONFIGURED)
+    monkeypatch.setattr("agents.curves.tuned", lambda task: Tuned({}, {"tuning_mean": -100.0}))
     said = _curves(tmp_path)
     assert "pursuit, as configured: 1 epoch, minibatch 64, rate 0.002: goes on after 256 steps\n" in said
     assert "pursuit, two epochs: 2 epochs, minibatch 64, rate 0.002: begins\n" in said
@@ -275,7 +278,7 @@ def test_the_stored_curves_are_of_the_settings_in_the_configs() -> None:
     assert stored.keys() == {name for name in TASKS if load_experiment(CONFIGS / f"{name}.yaml").curves}
     for name, numbers in stored.items():
         experiment = load_experiment(CONFIGS / f"{name}.yaml")
-        assert numbers["rules"] == experiment.reynolds.found["tuning_mean"]
+        assert numbers["rules"] == tuned(name).found["tuning_mean"]
         kept = {setting: PpoSettings(**{**row["ppo"], "threads": 2}) for setting, row in numbers["settings"].items()}
         assert kept == {setting: p.model_copy(update={"threads": 2}) for setting, p in experiment.settings().items()}
 

@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from agents import reynolds
-from agents.experiment import WEIGHTS
 from flockenv.evaluation import rollout, worlds_for
+from flockenv.players import WEIGHTS
+from flockenv.players.rules import player
 from flockenv.policy import MlpPolicy, RandomPolicy
 from flockenv.tasks import Bottleneck
 from flockenv.world import World
@@ -170,8 +170,8 @@ def test_who_queues_gets_everybody_out_unhurt_and_who_pushes_hurts() -> None:
     task, first = Bottleneck(together=True), worlds_for("tuning", 7, 12)
     players = {
         "random": RandomPolicy(2, 0),
-        "force": reynolds.player(task, textbook=True),
-        "queueing": reynolds.player(task, name="queueing"),
+        "force": player(task, name="textbook"),
+        "queueing": player(task, name="queueing"),
         "ppo": MlpPolicy.load(WEIGHTS / "bottleneck.safetensors", task),
     }
     episodes = {name: rollout(task, player, 12, first) for name, player in players.items()}

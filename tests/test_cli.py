@@ -289,6 +289,9 @@ def test_a_task_under_a_player_of_ones_own() -> None:
     )
     assert main(["render", "pursuit", "--player", "still.py", "--size", "96", "--out", "p.png"]) == 0
     assert main(["render", "pursuit", "--seed", "3", "--out", "p.html"]) == 0
+    for name in ("rules", "ppo"):
+        assert main(["render", "pursuit", "--player", name, "--out", f"{name}.html"]) == 0
+        assert f'"player":"{name}"' in Path(f"{name}.html").read_text().replace('": "', '":"')
     with Image.open("p.png") as png:
         assert png.size[0] == 96
 
@@ -461,6 +464,9 @@ def test_an_interrupted_stress_keeps_what_was_found(
         ("render tiny.yaml --out x.gfi", "--out 'x.gfi': must end in .gif or .png or .html, did you mean `.gif`?"),
         ("render pursiut --out x.gif", "'pursiut': no such task, did you mean `pursuit`? ("),
         ("render pursuit --out x.gif --player nobody", "player 'nobody': unknown"),
+        ("render pursuit --out x.gif --player rule", "player 'rule': unknown, did you mean `rules`?"),
+        ("render pursuit --out x.gif --player reynolds", "player 'reynolds': is called 'rules'"),
+        ("render pursuit --out x.gif --player orca", "there is no hand-written player 'orca' for 'pursuit'"),
         ("render pursuit --out x.gif --player no.safetensors", "player 'no.safetensors': no such file"),
         ("render pursuit --out x.gif --duration 3", "--duration = 3: goes with a scene"),
         ("render tiny.yaml --out x.gif --size 1", "Invalid value for '--size'"),

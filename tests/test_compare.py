@@ -86,11 +86,11 @@ def made_up_results(scores: dict[str, Any], costs: dict[str, Any] | None = None)
 
 def test_results_hold_what_the_issue_names() -> None:
     luck = np.random.default_rng(0).normal(size=40)
-    results = made_up_results({"random": luck - 5, "reynolds": luck, "ppo": luck + 1})
-    assert list(results["players"]) == ["random", "reynolds", "ppo"]
-    assert list(results["pairs"]) == ["ppo - reynolds", "ppo - random", "reynolds - random"]
+    results = made_up_results({"random": luck - 5, "rules": luck, "ppo": luck + 1})
+    assert list(results["players"]) == ["random", "rules", "ppo"]
+    assert list(results["pairs"]) == ["ppo - rules", "ppo - random", "rules - random"]
     assert {"iqm", "ci_low", "ci_high", "success_rate", "worlds"} <= results["players"]["ppo"].keys()
-    pair = results["pairs"]["ppo - reynolds"]
+    pair = results["pairs"]["ppo - rules"]
     assert {"difference", "ci_low", "ci_high"} <= pair.keys()
     assert (pair["difference"], pair["ci_low"], pair["ci_high"]) == pytest.approx((1, 1, 1))
     assert pair["probability_better"] == 1
@@ -99,7 +99,7 @@ def test_results_hold_what_the_issue_names() -> None:
     assert results["players"]["ppo"]["worlds"] == 40
     assert results["players"]["ppo"]["metrics"]["time_to_goal"] == {"mean": 2.0, "worlds": int((luck + 1 > 0).sum())}
     assert results["players"]["random"]["metrics"]["time_to_goal"] == {"mean": None, "worlds": 0}
-    assert results["players"]["reynolds"]["returns"] == pytest.approx(list(luck))
+    assert results["players"]["rules"]["returns"] == pytest.approx(list(luck))
 
 
 def test_results_are_strict_json_with_a_line_per_list() -> None:
@@ -112,29 +112,29 @@ def test_results_are_strict_json_with_a_line_per_list() -> None:
 
 def test_the_sentence_says_who_won_by_what_and_what_it_cost() -> None:
     luck = np.linspace(-1, 1, 101)
-    costs = {"ppo": {"wall_time_s": 252, "steps": 1_000_000}, "reynolds": {"of": "tuning", "steps": 950}}
-    ahead = made_up_results({"random": luck - 9, "reynolds": luck, "ppo": luck + 0.5}, costs)["verdict"]
+    costs = {"ppo": {"wall_time_s": 252, "steps": 1_000_000}, "rules": {"of": "tuning", "steps": 950}}
+    ahead = made_up_results({"random": luck - 9, "rules": luck, "ppo": luck + 0.5}, costs)["verdict"]
     assert ahead.startswith(
-        "toy: ppo beats reynolds by 0.500 [0.500, 0.500] per world and scores higher in 100 % [96, 100]"
+        "toy: ppo beats rules by 0.500 [0.500, 0.500] per world and scores higher in 100 % [96, 100]"
     )
     assert "success 75% against 50%" in ahead.replace("74%", "75%")
     assert "ppo cost 4.2 min and 1.0 M agent-steps of training, then 1.5 µs per decision; " in ahead
-    assert "; reynolds cost 950 agent-steps of tuning, then 1.5 µs per decision." in ahead
+    assert "; rules cost 950 agent-steps of tuning, then 1.5 µs per decision." in ahead
 
 
 def test_the_sentence_does_not_hide_that_rules_win_or_that_nobody_does() -> None:
     rng = np.random.default_rng(0)
     luck, noise = np.linspace(-1, 1, 101), 0.1 * rng.normal(size=101)
-    behind = made_up_results({"reynolds": luck, "ppo": luck - 0.5 + noise})
-    assert behind["pairs"]["ppo - reynolds"]["difference"] < 0
-    found = re.match(r"toy: reynolds beats ppo by (\S+) \[(\S+), (\S+)\] per world", behind["verdict"])
+    behind = made_up_results({"rules": luck, "ppo": luck - 0.5 + noise})
+    assert behind["pairs"]["ppo - rules"]["difference"] < 0
+    found = re.match(r"toy: rules beats ppo by (\S+) \[(\S+), (\S+)\] per world", behind["verdict"])
     assert found
     value, low, high = map(float, found.groups())
     assert 0 < low < value < high
-    assert value == pytest.approx(-behind["pairs"]["ppo - reynolds"]["difference"], abs=0.005)
-    assert low == pytest.approx(-behind["pairs"]["ppo - reynolds"]["ci_high"], abs=0.005)
-    level = made_up_results({"reynolds": luck, "ppo": luck + noise - noise.mean() + 1e-4})["verdict"]
-    assert level.startswith("toy: ppo and reynolds are level: difference 0.000")
+    assert value == pytest.approx(-behind["pairs"]["ppo - rules"]["difference"], abs=0.005)
+    assert low == pytest.approx(-behind["pairs"]["ppo - rules"]["ci_high"], abs=0.005)
+    level = made_up_results({"rules": luck, "ppo": luck + noise - noise.mean() + 1e-4})["verdict"]
+    assert level.startswith("toy: ppo and rules are level: difference 0.000")
 
 
 @pytest.fixture
@@ -149,7 +149,7 @@ def test_side_by_side_everything_is_the_same_and_progress_is_told(
     side_by_side: None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     tasks = [TASKS["pursuit"](), TASKS["obstacles"]()]
-    field = comparison.field_of(["random", "reynolds"])
+    field = comparison.field_of(["random", "rules"])
     told: list[tuple[str, str, int, int]] = []
     both, films = comparison.compare(tasks, field, 2, resamples=100, advance=lambda *news: told.append(news))
     monkeypatch.setattr(comparison.os, "cpu_count", lambda: 1)
@@ -163,14 +163,17 @@ def test_side_by_side_everything_is_the_same_and_progress_is_told(
             assert {key: other[key] for key in same} == {key: numbers[key] for key in same}
             assert films[name][who].recording is not None
     assert {(task, player) for task, player, _, _ in told} == {
-        (task, player) for task in ("pursuit", "obstacles") for player in ("random", "reynolds")
+        (task, player) for task in ("pursuit", "obstacles") for player in ("random", "rules")
     }
 
 
 def test_side_by_side_a_player_that_fails_is_named(side_by_side: None) -> None:
     Path("odd.py").write_text("def predict(observation):\n    raise RuntimeError('no idea')\n")
     line = run("--tasks", "pursuit,obstacles", "--players", "odd.py", "--worlds", "2", code=2).stderr
-    assert "player 'odd', task 'pursuit': RuntimeError: no idea" in line and not Path("results").exists()
+    assert (
+        "player 'odd.py': RuntimeError in predict, line 2: no idea (task 'pursuit')" in line
+        and not Path("results").exists()
+    )
 
 
 def test_side_by_side_the_first_failure_ends_all_that_was_to_come(
@@ -182,7 +185,7 @@ def test_side_by_side_the_first_failure_ends_all_that_was_to_come(
     Path("odd.py").write_text("def predict(observation):\n    raise RuntimeError('no idea')\n")
     names = ",".join(TASKS)
     line = run("--tasks", names, "--players", "odd.py", "--worlds", "2", code=2).stderr
-    assert line.strip().endswith("RuntimeError: no idea") and not died
+    assert line.strip().endswith("RuntimeError in predict, line 2: no idea (task 'bottleneck')") and not died
     assert not multiprocessing.active_children()
 
 
@@ -226,7 +229,7 @@ def _has_members(group: int) -> bool:
 @pytest.mark.slow
 def test_ctrl_c_ends_every_process() -> None:
     """The signal goes to the whole group, as from a terminal; those who play for others say nothing of it."""
-    command = [sys.executable, "-m", "agents.compare", "--tasks", "pursuit,obstacles", "--players", "random,reynolds"]
+    command = [sys.executable, "-m", "agents.compare", "--tasks", "pursuit,obstacles", "--players", "random,rules"]
     process = subprocess.Popen(
         [*command, "--out", str(Path.cwd() / "out")], cwd=ROOT, text=True, stderr=subprocess.PIPE,
         stdout=subprocess.DEVNULL, start_new_session=True, preexec_fn=_hears_interrupts,
@@ -246,8 +249,8 @@ def test_ctrl_c_ends_every_process() -> None:
 
 def test_without_ppo_the_two_best_are_compared_and_one_alone_is_not() -> None:
     luck = np.linspace(-1, 1, 101)
-    three = made_up_results({"random": luck, "textbook": luck + 3, "reynolds": luck + 2})["verdict"]
-    assert three.startswith("toy: textbook beats reynolds by 1.000")
+    three = made_up_results({"random": luck, "textbook": luck + 3, "rules": luck + 2})["verdict"]
+    assert three.startswith("toy: textbook beats rules by 1.000")
     assert made_up_results({"ppo": luck})["verdict"] == "toy: one player alone, nobody to compare with."
 
 
@@ -287,7 +290,7 @@ def test_tables_fit_a_terminal_and_show_no_markup() -> None:
 
 def columns() -> list[Column]:
     luck = np.random.default_rng(0).normal(size=50)
-    scores = {"random": luck - 5, "reynolds": luck, "$mine_": luck + 0.5}
+    scores = {"random": luck - 5, "rules": luck, "$mine_": luck + 0.5}
     episodes = {name: made_up(x) for name, x in scores.items()}
     return [report.column("toy", report.task_results("d", episodes, {}, 200, 0), episodes)]
 
@@ -296,14 +299,14 @@ def test_the_picture_shows_the_intervals_where_they_are() -> None:
     [column] = columns()
     figure = draw_chart([column], "Title", "note")
     scores, success, pairs = figure.axes
-    assert [label.get_text() for label in scores.get_yticklabels()] == ["random", "reynolds", "$mine_"]
-    assert [label.get_text() for label in pairs.get_yticklabels()] == ["$mine_ - reynolds"]
+    assert [label.get_text() for label in scores.get_yticklabels()] == ["random", "rules", "$mine_"]
+    assert [label.get_text() for label in pairs.get_yticklabels()] == ["$mine_ - rules"]
     drawn = {tuple(line.get_xdata()) for axes in (scores, success, pairs) for line in axes.lines}
     for row in column.rows:
         for interval in (row.score, row.success):
             assert (interval.low, interval.high) in drawn
             assert (interval.value,) in drawn
-    interval = column.pairs["$mine_ - reynolds"]
+    interval = column.pairs["$mine_ - rules"]
     assert (interval.low, interval.high) in drawn
     low, high = scores.get_xlim()
     assert all(low < row.score.low <= row.score.high < high for row in column.rows)
@@ -366,8 +369,8 @@ def test_the_same_seed_gives_the_same_scores_and_another_one_others() -> None:
 
 def test_players_are_ordered_by_what_they_claim_however_they_are_given() -> None:
     Path("mine.py").write_text(STILL)
-    field = comparison.field_of(["mine.py", "ppo", "random", "reynolds", "textbook", "ppo"])
-    assert [player.name for player in field] == ["random", "textbook", "reynolds", "ppo", "mine"]
+    field = comparison.field_of(["mine.py", "ppo", "random", "rules", "textbook", "ppo"])
+    assert [player.name for player in field] == ["random", "textbook", "rules", "ppo", "mine"]
 
 
 def test_weights_of_ones_own_play_under_the_name_of_their_file() -> None:
@@ -386,15 +389,18 @@ def test_weights_of_ones_own_play_under_the_name_of_their_file() -> None:
     ("arguments", "message"),
     [
         (("--tasks", "pursiut"), f"--tasks 'pursiut': unknown, did you mean `pursuit`?; allowed: {', '.join(TASKS)}"),
-        (("--players", "reynold"), "player 'reynold': unknown, did you mean `reynolds`?"),
+        (("--players", "rule"), "player 'rule': unknown, did you mean `rules`?"),
         (("--players", "no.py"), "player 'no.py': no such file"),
         (("--players", "<script>.py"), "--players '<script>.py': a name is up to 40"),
         (("--players", "a - b.py"), "a name is up to 40"),
         (("--players", "\x1b[2J"), "a name is up to 40"),
         (("--players", "still.py,sub/still.py"), "two players are called 'still'"),
         (("--players", "model.zip"), "executes the code stored in it"),
-        (("--players", "broken.py"), "player 'broken.py': ZeroDivisionError while loading it"),
-        (("--players", "late.py"), "player 'late', task 'bottleneck': KeyError: 'no'"),
+        (
+            ("--players", "broken.py"),
+            "player 'broken.py': ZeroDivisionError while loading it, line 1: ",
+        ),
+        (("--players", "late.py"), "player 'late.py': KeyError in player, line 2: 'no'"),
         (("--worlds", "1"), "--worlds 1: must be from 2"),
         (("--worlds", "0"), "--worlds 0: must be from 2"),
         (("--worlds", "1000000000"), "--worlds 1000000000: must be from 2 to 1000000"),
@@ -426,7 +432,7 @@ def test_bad_requests_are_refused_in_one_line(
 
 
 def test_missing_weights_name_the_command_that_trains_them(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(comparison, "WEIGHTS", Path("nowhere"))
+    monkeypatch.setattr("flockenv.players.WEIGHTS", Path("nowhere"))
     line = refused("--players", "random,ppo", "--tasks", "flock")
     assert "no weights for task 'flock'" in line
     assert line.endswith("python -m agents.ppo configs/flock.yaml")
@@ -434,13 +440,19 @@ def test_missing_weights_name_the_command_that_trains_them(monkeypatch: pytest.M
 
 def test_a_player_that_fails_is_named_and_nothing_is_written() -> None:
     for name, source, message in (
-        ("bad", "def predict(o):\n    return o[:, 10**6]", "IndexError"),
-        ("wide", "def predict(o):\n    return o", "ValueError: policy: actions of shape"),
-        ("nan", "def predict(o):\n    return float('nan') * o[:, :2]", "ValueError"),
+        ("bad", "def predict(o):\n    return o[:, 10**6]", "IndexError in predict, line 2: "),
+        ("wide", "def predict(o):\n    return o", "ValueError in predict: actions of shape"),
+        (
+            "nan",
+            "def predict(o):\n    return float('nan') * o[:, :2]",
+            "ValueError in predict: an action is ",
+        ),
+        ("quits", "def predict(o):\n    exit(3)", "SystemExit in predict, line 2: 3"),
     ):
         Path(f"{name}.py").write_text(source)
         result = run("--tasks", "pursuit", "--players", f"{name}.py", "--worlds", "2", code=2)
-        assert f"player '{name}', task 'pursuit': {message}" in result.stderr
+        assert f"compare: player '{name}.py': {message}" in result.stderr
+        assert result.stderr.endswith("(task 'pursuit')\n")
         assert not Path("results").exists()
 
 
@@ -481,16 +493,16 @@ def test_what_a_player_cost_comes_from_its_card_or_from_the_search_that_tuned_it
 ) -> None:
     task = TASKS["pursuit"]()
     policies: dict[str, Any] = {
-        "reynolds": SimpleNamespace(),
+        "rules": SimpleNamespace(),
         "ppo": SimpleNamespace(card={"wall_time_s": 2.5, "steps": 3, "secret": 1}),
         "mine": SimpleNamespace(),
     }
-    monkeypatch.setattr(comparison, "CONFIGS", elsewhere)
+    monkeypatch.setattr("flockenv.players.rules.TUNED", elsewhere)
     ppo = {"wall_time_s": 2.5, "steps": 3}
-    assert comparison._costs(task, policies) == {"reynolds": {}, "ppo": ppo, "mine": {}}
-    Path("pursuit.yaml").write_text("task: pursuit\nreynolds: {found: {agent_steps: 1200.0}}")
-    tuned = {"of": "tuning", "steps": 1200}
-    assert comparison._costs(task, policies) == {"reynolds": tuned, "ppo": ppo, "mine": {}}
+    assert comparison._costs(task, policies) == {"rules": {}, "ppo": ppo, "mine": {}}
+    Path("pursuit.json").write_text('{"task": "pursuit", "parameters": {}, "found": {"agent_steps": 1200.0}}')
+    spent = {"of": "tuning", "steps": 1200}
+    assert comparison._costs(task, policies) == {"rules": spent, "ppo": ppo, "mine": {}}
 
 
 def test_the_task_is_the_one_that_its_config_describes(elsewhere: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -522,19 +534,19 @@ assert result.exit_code == 0, result.output
 
 @pytest.mark.slow
 def test_comparing_needs_no_torch() -> None:
-    arguments = ["--players", "random,textbook,reynolds", "--worlds", "2", "--smoke", "--out", str(Path.cwd() / "out")]
+    arguments = ["--players", "random,textbook,rules", "--worlds", "2", "--smoke", "--out", str(Path.cwd() / "out")]
     subprocess.run([sys.executable, "-c", NO_TORCH, *arguments], check=True, cwd=ROOT)
 
 
 def test_a_hand_written_player_of_some_tasks_sits_out_the_others() -> None:
     crossing, flock = TASKS["crossing"](), TASKS["flock"]()
-    assert comparison.usual_players([crossing]) == ["random", "textbook", "orca", "reynolds", "ppo"]
-    assert comparison.usual_players([flock]) == ["random", "textbook", "reynolds", "ppo"]
+    assert comparison.usual_players([crossing]) == ["random", "textbook", "orca", "rules", "ppo"]
+    assert comparison.usual_players([flock]) == ["random", "textbook", "rules", "ppo"]
     orca, chance = comparison.Player.of("orca"), comparison.Player.of("random")
     assert comparison._sits_out(orca, flock, [crossing, flock])
     assert not comparison._sits_out(orca, crossing, [crossing, flock])
     assert not comparison._sits_out(chance, flock, [crossing, flock])
     with pytest.raises(ValueError, match="no hand-written player 'orca' for 'flock'; there is one for: crossing"):
         comparison.compare([flock], [orca], 2)
-    with pytest.raises(ValueError, match="task 'flock': nobody plays it; in other tasks alone: orca"):
+    with pytest.raises(ValueError, match="task 'flock': no player for it; in other tasks alone: orca"):
         comparison.compare([crossing, flock], [orca], 2)

@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from agents import reynolds
-from agents.experiment import WEIGHTS
 from flockenv.evaluation import rollout, worlds_for
+from flockenv.players import WEIGHTS
+from flockenv.players.rules import player
 from flockenv.policy import MlpPolicy, RandomPolicy
 from flockenv.tasks import Corridor
 from flockenv.world import World
@@ -133,8 +133,8 @@ def test_players_keep_lanes_and_random_ones_do_not() -> None:
     task, first = Corridor(), worlds_for("tuning", 7, 12)
     players = {
         "random": RandomPolicy(2, 0),
-        "force": reynolds.player(task, textbook=True),
-        "orca": reynolds.player(task, name="orca"),
+        "force": player(task, name="textbook"),
+        "orca": player(task, name="orca"),
         "ppo": MlpPolicy.load(WEIGHTS / "corridor.safetensors", task),
     }
     episodes = {name: rollout(task, player, 12, first) for name, player in players.items()}

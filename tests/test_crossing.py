@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from agents import reynolds
 from flockenv.evaluation import rollout, worlds_for
+from flockenv.players.rules import player
 from flockenv.tasks import Crossing, Flock
 from flockenv.world import World
 from tests.test_tasks import act, paid, place, random_actions, world_of
@@ -132,11 +132,11 @@ def test_scripted_walkers_cross_without_a_touch() -> None:
 
 def test_hand_written_walkers_arrive_and_orca_touches_nobody() -> None:
     task = Crossing()
-    orca = rollout(task, reynolds.player(task, name="orca"), 16, worlds_for("tuning", 0, 16))
-    rules = rollout(task, reynolds.player(task, textbook=True), 16, worlds_for("tuning", 0, 16))
+    orca = rollout(task, player(task, name="orca"), 16, worlds_for("tuning", 0, 16))
+    rules = rollout(task, player(task, name="textbook"), 16, worlds_for("tuning", 0, 16))
     for played in (orca, rules):
         assert played.metrics["arrived"].min() == 1
     assert orca.metrics["collisions"].max() == 0
     assert rules.metrics["collisions"].mean() < 0.3
     with pytest.raises(ValueError, match="no hand-written player 'orca' for 'flock'; there is one for: crossing"):
-        reynolds.player(Flock(), name="orca")
+        player(Flock(), name="orca")

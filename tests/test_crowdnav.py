@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from agents import reynolds
-from agents.experiment import WEIGHTS
 from flockenv.evaluation import rollout, worlds_for
+from flockenv.players import WEIGHTS
+from flockenv.players.rules import player
 from flockenv.policy import MlpPolicy
 from flockenv.tasks import CrowdNav
 from flockenv.world import World
@@ -172,9 +172,9 @@ def test_orca_and_the_shipped_policy_get_through_and_social_force_does_not() -> 
     """The crowd makes no way: who counts on that, as a pedestrian does, is run into."""
     task, first = CrowdNav(), worlds_for("tuning", 7, 48)
     players = {
-        "force": reynolds.player(task, textbook=True),
-        "heuristics": reynolds.player(task, name="heuristics"),
-        "orca": reynolds.player(task, name="orca"),
+        "force": player(task, name="textbook"),
+        "heuristics": player(task, name="heuristics"),
+        "orca": player(task, name="orca"),
         "ppo": MlpPolicy.load(WEIGHTS / "crowd_nav.safetensors", task),
     }
     success = {name: rollout(task, player, 48, first).success.mean() for name, player in players.items()}

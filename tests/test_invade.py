@@ -126,9 +126,9 @@ def test_what_cannot_be_played_is_refused_in_one_line(arguments: list[str], mess
     [
         (
             "return np.zeros((len(observation), 2 + (len(observation) > 2))), None",
-            "mine among mine', task 'school': ValueError: others' actions have shape (14, 3), must be (14, 2)",
+            "mine.py': ValueError in predict: actions of shape (14, 3), must be (14, 2) (task 'school')",
         ),
-        ("return observation[:, 10_000], None", "IndexError: "),
+        ("return observation[:, 10_000], None", "IndexError in predict, line 3: "),
     ],
 )
 def test_somebody_who_fails_among_others_is_named(tmp_path: Path, code: str, message: str) -> None:
@@ -141,9 +141,7 @@ def test_somebody_who_fails_among_others_is_named(tmp_path: Path, code: str, mes
 
 
 def test_it_prints_a_table_and_a_sentence_for_each_pair() -> None:
-    result = CliRunner().invoke(
-        invasion.app, ["configs/school.yaml", "--players", "textbook,reynolds", "--worlds", "8"]
-    )
+    result = CliRunner().invoke(invasion.app, ["configs/school.yaml", "--players", "textbook,rules", "--worlds", "8"])
     assert result.exit_code == 0, result.output
     assert "school: mean return of one who plays the row, among those who play the column" in result.stdout
-    assert "reynolds among textbook: " in result.stdout and "textbook among reynolds: " in result.stdout
+    assert "rules among textbook: " in result.stdout and "textbook among rules: " in result.stdout

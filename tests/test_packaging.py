@@ -16,6 +16,8 @@ from pathlib import Path
 
 import pytest
 
+from flockenv.tasks import TASKS
+
 ROOT = Path(__file__).resolve().parent.parent
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 README_TEST = (
@@ -76,8 +78,10 @@ def test_the_wheel_ships_flockenv_alone(wheel: Path) -> None:
     tops = {name.split("/")[0] for name in names}
     assert tops == {"flockenv", f"flockenv-{PROJECT['version']}.dist-info"}
     sources = {path.relative_to(ROOT).as_posix() for path in (ROOT / "flockenv").rglob("*.py")}
-    data = {"flockenv/py.typed", "flockenv/render/replay.html"}
-    assert {name for name in names if name.startswith("flockenv/")} == sources | data
+    files = {f"players/weights/{task}.{suffix}" for task in TASKS for suffix in ("json", "safetensors")}
+    files |= {f"players/tuned/{task}.json" for task in TASKS} | {"py.typed", "render/replay.html"}
+    assert {name for name in names if name.startswith("flockenv/")} == sources | {f"flockenv/{f}" for f in files}
+    assert wheel.stat().st_size < 5_000_000
     assert any(name.endswith("licenses/LICENSE") for name in names)
 
 
@@ -130,6 +134,10 @@ def test_the_wheel_works_alone(wheel: Path, tmp_path: Path) -> None:
         "import flockenv, gymnasium, pettingzoo, importlib.resources as r; from flockenv.cli import main;"
         "assert gymnasium.spec('flockenv/Pursuit-v0') and 'flockenv/Flock-v0' in pettingzoo.parallel_registry;"
         "assert '__DATA__' in (r.files('flockenv.render') / 'replay.html').read_text();"
+        "from flockenv.players import load_player; from flockenv.tasks import Pursuit; import numpy as np;"
+        "task = Pursuit(); rows = np.zeros((1, task.layout.size), np.float32);"
+        "assert all(load_player(name, task).predict(rows)[0].shape == (1, 2) for name in ('rules', 'textbook', 'ppo'));"
+        "assert load_player('rules', task).rules != load_player('textbook', task).rules;"
         "assert main(['list']) == 0; print(flockenv.__file__)"
     )
     env = {**os.environ, "PYTHONPATH": str(tmp_path / "site"), "PYTHONSAFEPATH": "1"}

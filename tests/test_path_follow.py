@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from agents.reynolds import PathFollowRules, Reynolds
 from flockenv import polyline
 from flockenv.evaluation import rollout
+from flockenv.players.rules import PathFollowRules, RulesPlayer
 from flockenv.render.picture import draw
 from flockenv.tasks import PathFollow
 from flockenv.tasks.path_follow import POINTS
@@ -121,7 +121,7 @@ def test_what_it_gains_is_how_far_it_came_along_the_track() -> None:
     """A whole episode against the lengths that flockenv.polyline finds; a lap, and no less, is a success."""
     world = world_of()
     track = polyline.pieces(corners(world).tolist(), closed=True)
-    length, player = track[1], Reynolds(TASK, CAREFUL)
+    length, player = track[1], RulesPlayer(TASK, CAREFUL)
     s, gone = polyline.projected(track, world.state.pos[0, 0])[0], 0.0
     observation = world.reset(3)
     for _ in range(TASK.horizon):
@@ -243,7 +243,7 @@ def test_what_it_cannot_be_is_refused_in_one_line(change: dict[str, Any], said: 
 
 
 def test_who_brakes_before_bends_stays_on_the_track_and_the_textbook_flies_off() -> None:
-    found = {name: rollout(TASK, Reynolds(TASK, rules), 32, 7) for name, rules in (
+    found = {name: rollout(TASK, RulesPlayer(TASK, rules), 32, 7) for name, rules in (
         ("careful", CAREFUL), ("textbook", PathFollowRules()))}  # fmt: skip
     assert found["careful"].success.all()
     assert found["careful"].metrics["off_track"].max() < 0.02

@@ -514,7 +514,7 @@ def run(frames: int = 5, agents: int = 3, dimension: int = 2, **fields: Any) -> 
     return [shot(pos[k], vel[k], time=0.1 * k, **given) for k in range(frames)]
 
 
-def panel(snapshots: list[Snapshot], player: str = "reynolds") -> Panel:
+def panel(snapshots: list[Snapshot], player: str = "rules") -> Panel:
     return Panel(player, snapshots, np.linspace(0.0, 1.0, len(snapshots)), "captured at 6.2 s")
 
 

@@ -21,8 +21,8 @@ from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecCheckNan, VecMonitor
 
-from agents import reynolds
 from flockenv.envs.registration import SINGLE
+from flockenv.players.rules import player
 from flockenv.sb3 import NOTHING, WorldVecEnv, load_sb3_zip
 from flockenv.tasks import TASKS, Flock, Pursuit, School
 from flockenv.world import World
@@ -72,15 +72,15 @@ def test_ppo_trains_on_the_id():
 def test_evaluate_policy_takes_the_reynolds_player(env_id):
     env = make_vec_env(env_id, 2, seed=1, env_kwargs={})
     task = env.get_attr("task")[0]
-    returns, lengths = evaluate_policy(reynolds.player(task), env, n_eval_episodes=4, return_episode_rewards=True)
+    returns, lengths = evaluate_policy(player(task), env, n_eval_episodes=4, return_episode_rewards=True)
     assert len(returns) == len(lengths) == 4
     again, _ = evaluate_policy(
-        reynolds.player(task), make_vec_env(env_id, 2, seed=1), n_eval_episodes=4, return_episode_rewards=True
+        player(task), make_vec_env(env_id, 2, seed=1), n_eval_episodes=4, return_episode_rewards=True
     )
     assert returns == again
     native = VecMonitor(WorldVecEnv(task, 2))
     native.seed(1)
-    ours, our_lengths = evaluate_policy(reynolds.player(task), native, n_eval_episodes=4, return_episode_rewards=True)
+    ours, our_lengths = evaluate_policy(player(task), native, n_eval_episodes=4, return_episode_rewards=True)
     assert sorted(our_lengths) == sorted(lengths)
     np.testing.assert_allclose(sorted(ours), sorted(returns), rtol=1e-4)
 

@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from agents.reynolds import player
 from flockenv import urges
 from flockenv.arbitration import Intentions
 from flockenv.behaviours import Evade, Forage, Separation, Shadow, Wander
@@ -15,6 +14,7 @@ from flockenv.crew import use_threads
 from flockenv.effects import Fear, Grazing, Intention, Libido, Metabolism, Predation
 from flockenv.evaluation import rollout, worlds_for
 from flockenv.grants import granted, reconcile
+from flockenv.players.rules import player
 from flockenv.population import Threshold
 from flockenv.rows import rows
 from flockenv.scene import Group, Scene
@@ -361,7 +361,7 @@ def test_a_fish_sees_what_is_there_but_not_behind_itself() -> None:
 
 def test_the_hand_written_player_flees_remembers_and_beats_random() -> None:
     task = School()
-    rules = player(task, textbook=True)
+    rules = player(task, name="textbook")
     empty = {slot.name: np.zeros((2, *slot.shape)) for slot in task.layout.slots}
     empty |= {"to_low": np.full((2, 2), 12.0), "to_high": np.full((2, 2), 12.0), "velocity": np.full((2, 2), 0.1)}
 
@@ -386,7 +386,7 @@ def test_the_hand_written_player_flees_remembers_and_beats_random() -> None:
             return np.random.default_rng(7).uniform(-1, 1, (len(seen), 2)), state
 
     short, seed = School(horizon=200), worlds_for("tuning", 1, 16)
-    ours, theirs = (rollout(short, each, 16, seed) for each in (player(short, textbook=True), Anyhow()))  # type: ignore[arg-type]
+    ours, theirs = (rollout(short, each, 16, seed) for each in (player(short, name="textbook"), Anyhow()))  # type: ignore[arg-type]
     assert np.mean(ours.returns - theirs.returns) > 3
     assert ours.metrics["survived"].mean() > theirs.metrics["survived"].mean() + 0.2
 

@@ -79,15 +79,15 @@ def test_every_number_of_steps_fits_into_a_decision(control_dt: float) -> None:
 
 @pytest.mark.slow
 def test_the_trained_setting_scores_what_the_comparison_says_bit_for_bit_and_again_the_same() -> None:
-    run(*TINY, *TRAINED, "--players", "random,reynolds,ppo")
+    run(*TINY, *TRAINED, "--players", "random,rules,ppo")
     task = TASKS["pursuit"]()
-    field = comparison.field_of(["random", "reynolds", "ppo"])
+    field = comparison.field_of(["random", "rules", "ppo"])
     said, _ = comparison.compare([task], field, worlds=3, resamples=100)
     plan = Plan(task, (Setting.trained(task),), tuple(field), 3, 0, 2)
     for (_, name), cell in transfer_cells.played(plan).items():
         assert cell.returns.tolist() == said["tasks"]["pursuit"]["players"][name]["returns"]
     about = results()["tasks"]["pursuit"]
-    assert about["again"] == {"random": 0.0, "reynolds": 0.0, "ppo": 0.0}
+    assert about["again"] == {"random": 0.0, "rules": 0.0, "ppo": 0.0}
     [setting] = about["settings"].values()
     assert [setting["players"]["ppo"][key] for key in ("difference", "ci_low", "ci_high")] == [0, 0, 0]
     assert results()["world_seeds"]["first"] == said["world_seeds"]["first"]
@@ -95,7 +95,7 @@ def test_the_trained_setting_scores_what_the_comparison_says_bit_for_bit_and_aga
 
 @pytest.mark.slow
 def test_methods_of_second_order_err_less_and_the_costs_are_told() -> None:
-    run(*TINY, "--players", "reynolds", "--methods", "semi_implicit_euler,midpoint", "--substeps", "1,4")
+    run(*TINY, "--players", "rules", "--methods", "semi_implicit_euler,midpoint", "--substeps", "1,4")
     found = results()["tasks"]["pursuit"]["settings"]
     assert next(iter(found)) == "semi_implicit_euler /2"
     assert len(found) == 5
@@ -103,17 +103,17 @@ def test_methods_of_second_order_err_less_and_the_costs_are_told() -> None:
     assert errors["semi_implicit_euler /1"] > 3 * errors["semi_implicit_euler /4"] > 10 * errors["midpoint /4"]
     assert found["midpoint /4"]["evaluations_per_s"] == pytest.approx(2 * 4 / 0.1)
     assert all(0 < about["us_low"] <= about["us_per_s"] <= about["us_high"] for about in found.values())
-    differences = {name: about["players"]["reynolds"]["difference"] for name, about in found.items()}
+    differences = {name: about["players"]["rules"]["difference"] for name, about in found.items()}
     assert differences.pop("semi_implicit_euler /2") == 0
     assert all(differences.values())
 
 
 @pytest.mark.slow
 def test_float32_plays_the_same_worlds() -> None:
-    run(*TINY, "--players", "reynolds", "--methods", "semi_implicit_euler:float32", "--substeps", "2")
+    run(*TINY, "--players", "rules", "--methods", "semi_implicit_euler:float32", "--substeps", "2")
     other = results()["tasks"]["pursuit"]["settings"]["semi_implicit_euler float32 /2"]
     assert other["dtype"] == "float32"
-    assert 0 < abs(other["players"]["reynolds"]["difference"]) < 0.5
+    assert 0 < abs(other["players"]["rules"]["difference"]) < 0.5
 
 
 # --- what is kept
@@ -123,7 +123,7 @@ def test_float32_plays_the_same_worlds() -> None:
 def test_the_same_command_goes_on_after_an_interruption_and_plays_nothing_twice(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    asked = (*TINY, "--players", "random,reynolds", "--methods", "semi_implicit_euler", "--substeps", "1,2")
+    asked = (*TINY, "--players", "random,rules", "--methods", "semi_implicit_euler", "--substeps", "1,2")
     cells = 2 * 2 + 2  # settings times players, and the trained setting again
     first = Counted(monkeypatch, stop_at=4)
     result = run(*asked, code=130)
@@ -170,7 +170,7 @@ def test_a_player_that_has_changed_plays_anew(monkeypatch: pytest.MonkeyPatch) -
 
 @pytest.mark.slow
 def test_two_processes_find_what_one_finds() -> None:
-    asked = ("--players", "random,reynolds", "--methods", "semi_implicit_euler,midpoint", "--substeps", "2")
+    asked = ("--players", "random,rules", "--methods", "semi_implicit_euler,midpoint", "--substeps", "2")
     run(*TINY, *asked)
     alone = {path.name: path.read_bytes() for path in KEPT.rglob("*.json") if "clock" not in path.name}
     for path in KEPT.rglob("*.json"):
@@ -191,8 +191,8 @@ def made_up(policy: Any, error_mm: tuple[float, float] = (80.0, 0.5), *rounds: t
     scores = {
         (settings[0], "random"): LUCK,
         (settings[1], "random"): LUCK,
-        (settings[0], "reynolds"): LUCK + 9,
-        (settings[1], "reynolds"): LUCK + 9,
+        (settings[0], "rules"): LUCK + 9,
+        (settings[1], "rules"): LUCK + 9,
         (settings[0], "ppo"): LUCK + 10,
         (settings[1], "ppo"): np.asarray(policy),
     }
@@ -200,7 +200,7 @@ def made_up(policy: Any, error_mm: tuple[float, float] = (80.0, 0.5), *rounds: t
     names = [setting.name for setting in settings]
     seconds = [dict(zip(names, times, strict=True)) for times in rounds or ((1.0, 3.0),)]
     clock = Clock(seconds, dict(zip(names, error_mm, strict=True)))
-    again = {name: cells[settings[0], name] for name in ("random", "reynolds", "ppo")}
+    again = {name: cells[settings[0], name] for name in ("random", "rules", "ppo")}
     return transfer_report.task_results(task, settings, cells, clock, again, 500, 0)
 
 
@@ -210,7 +210,7 @@ def test_the_sentence_says_what_survives_and_what_accuracy_costs() -> None:
     assert said.startswith("pursuit: ppo survives every setting: in its worst setting (rk4, dt 0.025 s) it loses 0.2")
     assert "keeps 98 % of its lead over random" in said
     assert "solved to 0.5 mm (rk4, dt 0.025 s; trained: 80 mm) it loses 0.2" in said
-    assert "and is ahead of reynolds (0.8" in said
+    assert "and is ahead of rules (0.8" in said
     assert said.endswith("(rk4, dt 0.025 s: 0.5 mm) costs 3.00 times the time; no other has less error.")
 
 
@@ -218,7 +218,7 @@ def test_the_sentence_does_not_hide_that_a_policy_fails_or_that_nothing_is_known
     lost = made_up(LUCK + 2)
     assert "ppo does not survive every setting: " in lost["verdict"]
     assert "it loses 8.000 [8.000, 8.000]" in lost["verdict"]
-    assert "is behind reynolds (-7" in lost["verdict"]
+    assert "is behind rules (-7" in lost["verdict"]
     assert "success 0% against 100%" in lost["verdict"]
     noise = np.random.default_rng(1).normal(size=60)
     level = made_up(LUCK + 10 + noise - noise.mean() - 1e-3)["verdict"]
@@ -268,7 +268,7 @@ def test_the_picture_is_centred_on_the_trained_setting() -> None:
 
 @pytest.mark.slow
 def test_all_files_come_out_of_one_run() -> None:
-    result = run(*TINY, *TRAINED, "--players", "random,reynolds", "--out", "here/out")
+    result = run(*TINY, *TRAINED, "--players", "random,rules", "--out", "here/out")
     assert sorted(path.name for path in Path("here/out").iterdir()) == FILES
     assert results("here/out")["tasks"]["pursuit"]["verdict"] in " ".join(result.stdout.split())
     assert Path("here/out/transfer.png").read_bytes()[:8] == b"\x89PNG\r\n\x1a\n"
@@ -278,7 +278,7 @@ def test_all_files_come_out_of_one_run() -> None:
     ("arguments", "message"),
     [
         (("pursiut",), "TASK 'pursiut': unknown, did you mean `pursuit`?"),
-        (("--players", "reynold"), "player 'reynold': unknown, did you mean `reynolds`?"),
+        (("--players", "rule"), "player 'rule': unknown, did you mean `rules`?"),
         (("--players", "no.py"), "player 'no.py': no such file"),
         (("--methods", "rk44"), "--methods 'rk44': no method of a task, did you mean `rk4`?; allowed: "),
         (("--methods", "rk4:float16"), "--methods 'rk4:float16': the precision must be float64 or float32"),

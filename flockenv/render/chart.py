@@ -26,7 +26,7 @@ COLOURS = ("#D55E00", "#0072B2", "#E69F00", "#009E73", "#CC79A7", "#56B4E9")
 ABREAST = 4
 """Tasks beside each other, at most: more go below."""
 
-FIXED = {"random": "#8a929c", "textbook": "#E69F00", "reynolds": "#0072B2", "ppo": "#D55E00"}
+FIXED = {"random": "#8a929c", "textbook": "#E69F00", "rules": "#0072B2", "ppo": "#D55E00"}
 
 
 @dataclass(frozen=True, eq=False)

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from flockenv import steering
 from flockenv.rows import rows
@@ -30,7 +31,7 @@ class BottleneckRules:
     walls: float = 2000.0  # A of walls, N
 
 
-def bottleneck(see: Any, task: Bottleneck, p: BottleneckRules) -> np.ndarray:
+def bottleneck(see: Any, task: Bottleneck, p: BottleneckRules) -> NDArray[np.float64]:
     """Drive to the door, and be pushed off by others and by walls, exponentially."""
     drive = 80.0 * (p.speed * task.max_speed * _to_opening(see, task) - see.velocity) / p.tau
     tie = np.array([1.0, 0.0])
@@ -41,15 +42,17 @@ def bottleneck(see: Any, task: Bottleneck, p: BottleneckRules) -> np.ndarray:
         np.stack([0.0 * x, -see.to_sides[:, 0]], axis=-1), np.stack([0.0 * x, see.to_sides[:, 1]], axis=-1),
     ]  # fmt: skip
     off = p.walls * repulsion(np.stack(points, axis=1), tie, _PERSON, p.decay)
-    return drive + push.sum(axis=1) + off.sum(axis=1)
+    force: NDArray[np.float64] = drive + push.sum(axis=1) + off.sum(axis=1)
+    return force
 
 
-def _to_opening(see: Any, task: Bottleneck) -> np.ndarray:
+def _to_opening(see: Any, task: Bottleneck) -> NDArray[np.float64]:
     """Return the unit vectors to the nearest place of the door where a body fits; straight on before it."""
     half = max(task.width / 2 - 1.2 * _PERSON, 0.0)
     aside = see.door[:, 1] - np.clip(see.door[:, 1], -half, half)
     way = np.stack([np.maximum(see.door[:, 0], 0.0) + 0.1, aside], axis=-1)
-    return way / np.linalg.norm(way, axis=-1)[:, None]
+    direction: NDArray[np.float64] = way / np.linalg.norm(way, axis=-1)[:, None]
+    return direction
 
 
 @dataclass(frozen=True)
@@ -63,7 +66,7 @@ class QueueingRules:
     radius: float = 0.8  # m, between centres, within which it acts
 
 
-def queueing(see: Any, task: Bottleneck, p: QueueingRules) -> np.ndarray:
+def queueing(see: Any, task: Bottleneck, p: QueueingRules) -> NDArray[np.float64]:
     """Go to the door as fast as the gap ahead allows, and keep a little apart."""
     way, present = _to_opening(see, task), see.neighbour_present > 0
     others = see.velocity[:, None] + see.neighbour_velocity
@@ -71,7 +74,8 @@ def queueing(see: Any, task: Bottleneck, p: QueueingRules) -> np.ndarray:
     gap = np.where(present, gap, np.inf).min(axis=1).clip(max=1e3)
     near = present & (np.linalg.norm(see.neighbours, axis=-1) < p.radius)
     push = p.apart * np.sum(separate(see.neighbours, np.array([1.0, 0.0])) * near[..., None], axis=1)
-    return 80.0 * p.gain * queue(way, see.velocity, gap, task.max_speed, p.headway) + push
+    force: NDArray[np.float64] = 80.0 * p.gain * queue(way, see.velocity, gap, task.max_speed, p.headway) + push
+    return force
 
 
 _PERSON = 0.25

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from flockenv import steering
 from flockenv.rows import rows
@@ -28,7 +29,7 @@ class PursuitRules:
     slow_radius: float = 0.01  # m, arrive instead of seek: brake within this distance of the predicted place
 
 
-def pursuit(see: Any, task: Pursuit, p: PursuitRules) -> np.ndarray:
+def pursuit(see: Any, task: Pursuit, p: PursuitRules) -> NDArray[np.float64]:
     """Pursue the nearest opponent (Reynolds 1999) with a bounded exact predictor."""
     offset, quarry = see.opponents[:, 0], see.opponent_velocity[:, 0]
     top = task.pursuer_speed

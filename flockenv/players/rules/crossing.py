@@ -6,9 +6,10 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from agents.reynolds.keep_clear import keep_clear
 from flockenv import arbitration, steering
+from flockenv.players.rules.keep_clear import keep_clear
 from flockenv.rows import rows
 from flockenv.tasks import Crossing
 
@@ -36,7 +37,7 @@ class CrossingRules:
     slow_radius: float = 0.8  # m, slow down within this of the goal
 
 
-def crossing(see: Any, task: Crossing, p: CrossingRules) -> np.ndarray:
+def crossing(see: Any, task: Crossing, p: CrossingRules) -> NDArray[np.float64]:
     """Unaligned collision avoidance (Reynolds 1999), then arrive; vectors are (along the course, to its left)."""
     own = see.velocity[:, None]
     others = own + see.neighbour_velocity
@@ -65,7 +66,7 @@ class OrcaRules:
     slow_radius: float = 1.0  # m, slow down within this of the goal
 
 
-def orca_crossing(see: Any, task: Crossing, p: OrcaRules) -> np.ndarray:
+def orca_crossing(see: Any, task: Crossing, p: OrcaRules) -> NDArray[np.float64]:
     """Optimal reciprocal collision avoidance (van den Berg et al. 2011) on the way to the goal."""
     still = np.zeros_like(see.goal)
     wish = arrive(see.goal, still, task.max_speed, p.slow_radius)

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from flockenv import arbitration, steering
 from flockenv.rows import rows
@@ -35,7 +36,7 @@ class FlockRules:
     blend: float = 0.0  # 0: allocate in order; 1: sum up
 
 
-def flock(see: Any, task: Flock, p: FlockRules) -> np.ndarray:
+def flock(see: Any, task: Flock, p: FlockRules) -> NDArray[np.float64]:
     """Avoid, separate, align, cohere, follow the heading; vectors are (along the heading, to its left)."""
     speed = np.linalg.norm(see.velocity, axis=-1)
     forward = see.velocity / np.maximum(speed, 1e-9)[:, None]
@@ -56,4 +57,5 @@ def flock(see: Any, task: Flock, p: FlockRules) -> np.ndarray:
     course = p.course * (np.array([task.cruise, 0.0]) - see.velocity)
     ordered = allocate(np.stack([evasion, push, match, centre, course], axis=1), task.max_force)
     summed = evasion + push + match + centre + course
-    return (1.0 - p.blend) * ordered + p.blend * summed
+    force: NDArray[np.float64] = (1.0 - p.blend) * ordered + p.blend * summed
+    return force

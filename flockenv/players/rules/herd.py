@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from flockenv import arbitration, steering
 from flockenv.rows import rows
@@ -35,7 +36,7 @@ class HerdRules:
     apart: float = 4.0  # N, away from other dogs, in proportion to nearness within 10 m
 
 
-def herd(see: Any, task: Herd, p: HerdRules) -> np.ndarray:
+def herd(see: Any, task: Herd, p: HerdRules) -> NDArray[np.float64]:
     """Go behind who strays, or behind all of them, and stand still near a sheep; vectors are (along, left)."""
     r, n, top = task.apart_distance, task.sheep, task.dog_speed
     together, driving = p.together * r * n ** (2 / 3), p.driving * r * n**0.5

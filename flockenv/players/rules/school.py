@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from flockenv import arbitration, steering, urges
 from flockenv.grants import reconcile
@@ -48,7 +49,9 @@ class SchoolRules:
 _WHEN = arbitration.Intentions(when=("avoid", "avoid", "escape", "school", "eat", "wander"))
 
 
-def school(see: Any, task: School, p: SchoolRules, before: Any, begins: Any) -> tuple[np.ndarray, np.ndarray]:
+def school(
+    see: Any, task: School, p: SchoolRules, before: Any, begins: Any
+) -> tuple[NDArray[np.floating], NDArray[np.float64]]:
     """Choose a state from hunger and fear, with hysteresis, and hear its behaviours; return that state too, (R,)."""
     count, top, ahead = len(see.velocity), task.fish_speed, np.array([1.0, 0.0])
     known = before is not None and np.shape(before) == (count,)

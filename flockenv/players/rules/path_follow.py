@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from flockenv import steering
 from flockenv.rows import rows
@@ -31,7 +32,7 @@ class PathFollowRules:
     gain: float = 5.0  # kg/s, a change of velocity is asked for within 1/gain seconds
 
 
-def path_follow(see: Any, task: PathFollow, p: PathFollowRules) -> np.ndarray:
+def path_follow(see: Any, task: PathFollow, p: PathFollowRules) -> NDArray[np.float64]:
     """Follow the path (Reynolds 1999), at a speed that the bends ahead allow; vectors are (along the track, left)."""
     row, step = np.arange(len(see.left)), task.spacing / _FINE
     spine = np.concatenate([np.stack([0.0 * see.left, -see.left], axis=-1)[:, None], see.points], axis=1)
@@ -50,7 +51,8 @@ def path_follow(see: Any, task: PathFollow, p: PathFollowRules) -> np.ndarray:
     target = fine[row, np.minimum(np.round(ahead / step), task.ahead * _FINE - 1).astype(int)]
     wish = p.gain * follow_path(gap[row, then] - p.tube * task.half_width, gained, target, see.velocity, top)
     slower = -p.brake * (np.maximum(speed - top, 0.0) / np.maximum(speed, 1e-9))[:, None] * see.velocity
-    return slower + wish
+    force: NDArray[np.float64] = slower + wish
+    return force
 
 
 _FINE = 5

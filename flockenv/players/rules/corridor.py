@@ -6,9 +6,10 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from agents.reynolds.keep_clear import keep_clear
 from flockenv import steering
+from flockenv.players.rules.keep_clear import keep_clear
 from flockenv.rows import rows
 from flockenv.tasks import Corridor
 
@@ -35,7 +36,7 @@ class CorridorRules:
     wall_decay: float = 0.1  # b, m
 
 
-def corridor(see: Any, task: Corridor, p: CorridorRules) -> np.ndarray:
+def corridor(see: Any, task: Corridor, p: CorridorRules) -> NDArray[np.float64]:
     """Drive at the desired speed, off others and off walls; vectors are (along one's way, to its left)."""
     own = see.velocity[:, None]
     wish = sidestep(
@@ -43,15 +44,16 @@ def corridor(see: Any, task: Corridor, p: CorridorRules) -> np.ndarray:
         p.forward, p.bias,
     )  # fmt: skip
     push = p.strength * np.sum(wish * see.neighbour_present[..., None], axis=1)
-    return (_ahead(see) - see.velocity) / p.tau + push + _off_walls(see, p.walls, p.wall_decay)
+    force: NDArray[np.float64] = (_ahead(see) - see.velocity) / p.tau + push + _off_walls(see, p.walls, p.wall_decay)
+    return force
 
 
-def _ahead(see: Any) -> np.ndarray:
+def _ahead(see: Any) -> NDArray[np.float64]:
     """Return the velocities that are wanted, m/s."""
     return np.stack([see.desired_speed, 0.0 * see.desired_speed], axis=-1)
 
 
-def _off_walls(see: Any, strength: float, decay: float) -> np.ndarray:
+def _off_walls(see: Any, strength: float, decay: float) -> NDArray[np.float64]:
     """Return the push off both walls, a exp(-d / b), d from the body's centre."""
     push = strength * (np.exp(-see.walls[:, 1] / decay) - np.exp(-see.walls[:, 0] / decay))
     return np.stack([0.0 * push, push], axis=-1)
@@ -67,6 +69,6 @@ class CorridorOrcaRules:
     gain: float = 10.0  # kg/s: within a decision
 
 
-def orca_corridor(see: Any, task: Corridor, p: CorridorOrcaRules) -> np.ndarray:
+def orca_corridor(see: Any, task: Corridor, p: CorridorOrcaRules) -> NDArray[np.float64]:
     """Optimal reciprocal collision avoidance (van den Berg et al. 2011) along the corridor; walls are no neighbours."""
     return keep_clear(see, task, p, _ahead(see), _PERSON, _PERSON, 0.5) + _off_walls(see, 3.0, 0.1)

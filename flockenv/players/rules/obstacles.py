@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from flockenv import arbitration, steering
 from flockenv.rows import rows
@@ -33,7 +34,7 @@ class ObstaclesRules:
     push: float = 0.0  # N m, repulsion from the nearest surfaces (1/gap), a force field for close quarters
 
 
-def obstacles(see: Any, task: Obstacles, p: ObstaclesRules) -> np.ndarray:
+def obstacles(see: Any, task: Obstacles, p: ObstaclesRules) -> NDArray[np.float64]:
     """Steer to avoid what the straight path touches first (Reynolds 1999), then seek; allocation as in 1987."""
     speed = np.linalg.norm(see.velocity, axis=-1)
     goal_way = see.goal / np.maximum(np.linalg.norm(see.goal, axis=-1), 1e-9)[:, None]

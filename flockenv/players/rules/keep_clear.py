@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from flockenv.orca import orca
 from flockenv.rows import rows
@@ -14,7 +15,9 @@ __all__ = ["keep_clear"]
 clear = rows(orca)
 
 
-def keep_clear(see: Any, task: Any, p: Any, wish: np.ndarray, radius: float, others: float, share: float) -> np.ndarray:
+def keep_clear(
+    see: Any, task: Any, p: Any, wish: NDArray[np.float64], radius: float, others: float, share: float
+) -> NDArray[np.float64]:
     """Return the force towards the velocity (van den Berg et al. 2011) nearest to `wish`, (rows, 2) m/s, that is free.
 
     radius: of one's body, m; others: of those who are seen; share: of the change that is one's own. `p` says for how
@@ -27,4 +30,5 @@ def keep_clear(see: Any, task: Any, p: Any, wish: np.ndarray, radius: float, oth
     change = clear(
         see.velocity, wish, radius, task.max_speed, p.horizon, task.control_dt, p.turn, seen.reshape(len(seen), -1)
     )
-    return p.gain * change
+    force: NDArray[np.float64] = p.gain * change
+    return force

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from flockenv import arbitration, shapes, steering
 from flockenv.rows import rows
@@ -41,7 +42,7 @@ class EvadeRules:
     hide: float = 3.0  # kg/s, towards the hiding place
 
 
-def evade(see: Any, task: Evade, p: EvadeRules) -> np.ndarray:
+def evade(see: Any, task: Evade, p: EvadeRules) -> NDArray[np.float64]:
     """Avoid, contain, evade, hide: allocation in that order (Reynolds 1987)."""
     top, row = task.evader_speed, np.arange(len(see.velocity))
     speed = np.linalg.norm(see.velocity, axis=-1)
@@ -71,11 +72,12 @@ def evade(see: Any, task: Evade, p: EvadeRules) -> np.ndarray:
     return allocate(np.stack([aside, inside, away, hidden], axis=1), task.evader_force)
 
 
-def _watchers(places: np.ndarray, see: Any) -> np.ndarray:
+def _watchers(places: NDArray[np.float64], see: Any) -> NDArray[np.float64]:
     """Return how many pursuers have no cover between themselves and each of the places (R, K)."""
     ways = places[:, :, None] - see.pursuers[:, None]
     length = np.linalg.norm(ways, axis=-1)
     stones = (see.cover[:, None, :] - see.pursuers[:, :, None])[:, None]
     hit = ray_hit(stones, (ways / np.maximum(length, 1e-9)[..., None])[..., None, :], see.cover_radius[:, None, None])
     hit = np.where(see.cover_radius[:, None, None] > 0, hit, np.inf)
-    return np.sum(hit.min(axis=-1) > length, axis=-1)
+    count: NDArray[np.float64] = np.sum(hit.min(axis=-1) > length, axis=-1)
+    return count

@@ -6,9 +6,10 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from agents.reynolds.keep_clear import keep_clear
 from flockenv import steering
+from flockenv.players.rules.keep_clear import keep_clear
 from flockenv.rows import rows
 from flockenv.tasks import CrowdNav
 
@@ -33,7 +34,7 @@ class CrowdNavRules:
     bias: float = 0.005  # eps, 1/m, to the right
 
 
-def crowd_nav(see: Any, task: CrowdNav, p: CrowdNavRules) -> np.ndarray:
+def crowd_nav(see: Any, task: CrowdNav, p: CrowdNavRules) -> NDArray[np.float64]:
     """Drive to the goal, slow down before others and pass them on one side; vectors are (along the course, left)."""
     own = see.velocity[:, None]
     wish = sidestep(
@@ -42,7 +43,8 @@ def crowd_nav(see: Any, task: CrowdNav, p: CrowdNavRules) -> np.ndarray:
     )  # fmt: skip
     way = see.goal / np.maximum(np.linalg.norm(see.goal, axis=-1), 1e-9)[:, None]
     push = p.strength * np.sum(wish * see.neighbour_present[..., None], axis=1)
-    return (p.speed * task.max_speed * way - see.velocity) / p.tau + push
+    force: NDArray[np.float64] = (p.speed * task.max_speed * way - see.velocity) / p.tau + push
+    return force
 
 
 @dataclass(frozen=True)
@@ -56,7 +58,7 @@ class RobotOrcaRules:
     share: float = 1.0  # of the change that is its own where it is not seen; a half where it is
 
 
-def orca_crowd_nav(see: Any, task: CrowdNav, p: RobotOrcaRules) -> np.ndarray:
+def orca_crowd_nav(see: Any, task: CrowdNav, p: RobotOrcaRules) -> NDArray[np.float64]:
     """Optimal reciprocal collision avoidance (van den Berg et al. 2011) on the way to the goal."""
     wish = seek(see.goal, np.zeros_like(see.goal), task.max_speed)
     return keep_clear(see, task, p, wish, _ROBOT, _PEDESTRIAN, 0.5 if task.visible else p.share)
@@ -72,7 +74,7 @@ class HeuristicsRules:
     margin: float = 0.0  # m, clearance
 
 
-def heuristics_crowd_nav(see: Any, task: CrowdNav, p: HeuristicsRules) -> np.ndarray:
+def heuristics_crowd_nav(see: Any, task: CrowdNav, p: HeuristicsRules) -> NDArray[np.float64]:
     """Look where the way is free, and go no faster than is safe (Moussaid, Helbing and Theraulaz 2011)."""
     aim = see.goal / np.maximum(np.linalg.norm(see.goal, axis=-1), 1e-9)[:, None]
     speed = np.linalg.norm(see.velocity, axis=-1)[:, None]
@@ -90,7 +92,8 @@ def heuristics_crowd_nav(see: Any, task: CrowdNav, p: HeuristicsRules) -> np.nda
     left = p.reach**2 + free**2 - 2.0 * p.reach * free * np.sum(ways * aim[:, None], axis=-1)
     row, best = np.arange(len(left)), np.argmin(left, axis=1)
     safe = np.minimum(task.max_speed, now[row, best] / p.tau)[:, None]
-    return (safe * ways[row, best] - see.velocity) / p.tau
+    force: NDArray[np.float64] = (safe * ways[row, best] - see.velocity) / p.tau
+    return force
 
 
 _ROBOT, _PEDESTRIAN = 0.3, 0.25

@@ -1,0 +1,181 @@
+"""Players from files: weights with their card, a Python file, or a zip of Stable-Baselines3.
+
+A Python file offers one of these; if it offers several, the first counts:
+
+* a function `player(task)` that returns a player;
+* a class `Player`, which is built with the task, or with nothing;
+* a function `predict`.
+
+A player is an object with a method `predict`. Every `predict` takes SB3's four arguments (observation, state,
+episode_start, deterministic) and returns (actions, state), or takes the observations alone and returns actions.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import importlib
+import importlib.util
+import inspect
+import os
+import sys
+import traceback
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flockenv.policy import MlpPolicy, Observation, Policy, State
+from flockenv.refusals import shown_path
+
+if TYPE_CHECKING:
+    from flockenv.tasks import Task
+
+__all__ = ["SUFFIXES", "FilePlayer", "PlayerError", "load_file"]
+
+SUFFIXES = (".safetensors", ".py", ".zip")
+
+WANTED = (
+    "a player file has a function player(task) or a class Player, whose player has predict(observation, state, "
+    "episode_start, deterministic) or predict(observation), or such a function predict"
+)
+
+
+class PlayerError(ValueError):
+    """A player's own code failed, or is no player; one line that names its file."""
+
+
+def load_file(name: str, task: Task, seed: int = 0, trust_pickle: bool = False) -> Policy:
+    """Return the player of a file whose name ends with one of SUFFIXES; ValueError in one line if there is none."""
+    suffix = Path(name).suffix.lower()
+    if suffix == ".zip" and not trust_pickle:
+        raise ValueError(
+            f"player {shown_path(name)}: loading a Stable-Baselines3 zip executes the code stored in it; "
+            "if the file is your own, pass --trust-pickle (trust_pickle=True)"
+        )
+    if not os.path.isfile(name):  # Path.is_file raises for a name that no file can have
+        raise ValueError(f"player {shown_path(name)}: no such file")
+    if suffix == ".safetensors":
+        return MlpPolicy.load(name, task, seed)
+    return _load_python(Path(name), task) if suffix == ".py" else _load_zip(Path(name))
+
+
+def _load_zip(path: Path) -> Policy:
+    # by name: stable-baselines3 and torch are looked for only here, and sb3.py is a layer above this file
+    policy: Policy = importlib.import_module("flockenv.sb3").load_sb3_zip(path, trust_pickle=True)
+    return policy
+
+
+def _load_python(path: Path, task: Task) -> FilePlayer:
+    """Execute a player file and take what it offers."""
+    module = _guarded(path, "while loading it", _execute, path)
+    kinds = [name for name in ("player", "Player", "predict") if hasattr(module, name)]
+    if not kinds:
+        raise PlayerError(f"player {shown_path(path)}: offers none of player, Player, predict; {WANTED}")
+    kind, offer = kinds[0], getattr(module, kinds[0])
+    if not callable(offer):
+        raise PlayerError(f"player {shown_path(path)}: {kind} is {_article(offer)}, not a function; {WANTED}")
+    if kind == "predict":
+        return FilePlayer(path, kind, offer, task.action_layout.size)
+    arguments = (task,) if kind == "player" or _takes(offer, 1) else ()
+    if not _takes(offer, len(arguments)):
+        raise PlayerError(f"player {shown_path(path)}: {kind} cannot be called with {_listed(arguments)}; {WANTED}")
+    made = _guarded(path, f"in {kind}", offer, *arguments)
+    if isinstance(made, type) or not callable(getattr(made, "predict", None)):
+        raise PlayerError(f"player {shown_path(path)}: {kind} made {_article(made)} without a predict(); {WANTED}")
+    return FilePlayer(path, f"{type(made).__name__}.predict", made.predict, task.action_layout.size)
+
+
+def _execute(path: Path) -> Any:
+    """Import a file under a name of its own, so that two players of the same file name stay apart."""
+    name = f"flockenv_player_{hashlib.sha256(str(path.resolve()).encode()).hexdigest()[:16]}"
+    spec = importlib.util.spec_from_file_location(name, path)
+    if spec is None or spec.loader is None:
+        raise ImportError("not a Python file")
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[name] = module  # dataclasses and pickle look a class's module up there
+    try:
+        spec.loader.exec_module(module)
+    except BaseException:
+        del sys.modules[name]
+        raise
+    return module
+
+
+class FilePlayer:
+    """The `predict` of a player file: SB3's four arguments and a pair back, or observations in and actions out.
+
+    Whatever its code raises, SystemExit too, is a PlayerError: one line with the file, the line in it and the error.
+    So are actions of another shape, and such that are not finite.
+    """
+
+    def __init__(self, path: Path, name: str, function: Callable[..., Any], action_size: int) -> None:
+        self.path, self._name, self._function, self._whole = path, name, function, _takes(function, 4)
+        self._action_size = action_size
+        if not self._whole and not _takes(function, 1):
+            raise PlayerError(
+                f"player {shown_path(path)}: {name} takes neither four arguments nor the observation alone; {WANTED}"
+            )
+
+    def predict(
+        self,
+        observation: Observation,
+        state: State | None = None,
+        episode_start: NDArray[Any] | None = None,
+        deterministic: bool = False,
+    ) -> tuple[NDArray[Any], State | None]:
+        """Return the file's actions for observations, (R, O) -> (R, A), and its state."""
+        arguments = (observation, state, episode_start, deterministic) if self._whole else (observation,)
+        answer = _guarded(self.path, f"in {self._name}", self._answer, state, arguments)
+        return answer[0], answer[1]
+
+    def _answer(self, state: State | None, arguments: tuple[Any, ...]) -> tuple[NDArray[Any], State | None]:
+        answer = self._function(*arguments)
+        if isinstance(answer, tuple) and len(answer) != 2:
+            raise TypeError(f"returned {len(answer)} values, must be actions, or (actions, state)")
+        actions, state = answer if isinstance(answer, tuple) else (np.asarray(answer, np.float32), state)
+        actions, wanted = np.asarray(actions), (*np.shape(arguments[0])[:-1], self._action_size)
+        if actions.shape != wanted:
+            raise ValueError(f"actions of shape {actions.shape}, must be {wanted}")
+        if not np.isfinite(actions).all():
+            raise ValueError("an action is not finite")
+        return actions, state
+
+
+def _guarded(path: Path, where: str, function: Callable[..., Any], *arguments: Any) -> Any:
+    """Call code of a player file; what it raises becomes one line that names the file."""
+    try:
+        return function(*arguments)
+    except (Exception, SystemExit) as error:
+        said = f"{type(error).__name__} {where}{_line_in(path, error)}"
+        text = " ".join(str(error).split())
+        raise PlayerError(f"player {shown_path(path)}: {said}{': ' + text if text else ''}") from error
+
+
+def _line_in(path: Path, error: BaseException) -> str:
+    """Return ", line N" of the file where an error came from, if it came from there."""
+    frames = traceback.extract_tb(error.__traceback__)
+    own = [frame.lineno for frame in frames if os.path.abspath(frame.filename) == os.path.abspath(path)]
+    return f", line {own[-1]}" if own else ""
+
+
+def _takes(function: Callable[..., Any], count: int) -> bool:
+    """Return True if a function can be called with so many arguments; a built-in one, which keeps it secret, can."""
+    try:
+        signature = inspect.signature(function)
+    except (TypeError, ValueError):
+        return True
+    try:
+        signature.bind(*[None] * count)
+    except TypeError:
+        return False
+    return True
+
+
+def _article(value: object) -> str:
+    return f"the class {value.__name__}" if isinstance(value, type) else f"an object of type {type(value).__name__}"
+
+
+def _listed(arguments: tuple[Any, ...]) -> str:
+    return "the task" if arguments else "the task, nor without arguments"

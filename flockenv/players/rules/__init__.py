@@ -1,0 +1,142 @@
+"""The hand-written players: a file per task, made of the laws that the simulator itself steers by.
+
+Each sees the learner's observation and nothing else, and its force has the same limits. Three kinds of names:
+
+* `textbook`: published parameters, the defaults in the files;
+* `rules`: the same functions with the parameters that a search found (`python -m agents.tune`), in ../tuned/TASK.json;
+* `orca`, `heuristics`, `queueing`: other functions, of some tasks each, with published parameters.
+
+    from flockenv.players.rules import player
+    action, _ = player(task).predict(observation)
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flockenv.players.rules.bottleneck import BottleneckRules, QueueingRules, bottleneck, queueing
+from flockenv.players.rules.corridor import CorridorOrcaRules, CorridorRules, corridor, orca_corridor
+from flockenv.players.rules.crossing import CrossingRules, OrcaRules, crossing, orca_crossing
+from flockenv.players.rules.crowd_nav import (
+    CrowdNavRules,
+    HeuristicsRules,
+    RobotOrcaRules,
+    crowd_nav,
+    heuristics_crowd_nav,
+    orca_crowd_nav,
+)
+from flockenv.players.rules.evade import EvadeRules, evade
+from flockenv.players.rules.flock import FlockRules, flock
+from flockenv.players.rules.herd import HerdRules, herd
+from flockenv.players.rules.obstacles import ObstaclesRules, obstacles
+from flockenv.players.rules.path_follow import PathFollowRules, path_follow
+from flockenv.players.rules.pursuit import PursuitRules, pursuit
+from flockenv.players.rules.school import SchoolRules, school
+from flockenv.tasks import Task
+
+__all__ = ["PLAYERS", "RULES", "TUNED", "RulesPlayer", "Tuned", "as_dict", "player", "tuned"]
+
+TUNED = Path(__file__).resolve().parent.parent / "tuned"
+"""Folder of what the search found, a file per task."""
+
+RULES: dict[str, tuple[Callable[..., Any], type]] = {
+    "pursuit": (pursuit, PursuitRules),
+    "obstacles": (obstacles, ObstaclesRules),
+    "evade": (evade, EvadeRules),
+    "flock": (flock, FlockRules),
+    "crossing": (crossing, CrossingRules),
+    "herd": (herd, HerdRules),
+    "path_follow": (path_follow, PathFollowRules),
+    "school": (school, SchoolRules),
+    "crowd_nav": (crowd_nav, CrowdNavRules),
+    "bottleneck": (bottleneck, BottleneckRules),
+    "corridor": (corridor, CorridorRules),
+}
+"""What `textbook` and `rules` do in each task, and the record of their parameters."""
+
+PLAYERS: dict[str, dict[str, tuple[Callable[..., Any], type]]] = {
+    "textbook": RULES,
+    "orca": {
+        "crossing": (orca_crossing, OrcaRules),
+        "crowd_nav": (orca_crowd_nav, RobotOrcaRules),
+        "corridor": (orca_corridor, CorridorOrcaRules),
+    },
+    "heuristics": {"crowd_nav": (heuristics_crowd_nav, HeuristicsRules)},
+    "queueing": {"bottleneck": (queueing, QueueingRules)},
+    "rules": RULES,
+}
+"""What each hand-written player does, by its name and the task's."""
+
+REMEMBERING = (school,)
+"""Functions that keep a number per row from one decision to the next."""
+
+
+@dataclass(frozen=True)
+class RulesPlayer:
+    """A hand-written player: SB3's `predict` around one of the functions above."""
+
+    task: Task
+    rules: Any
+    name: str = "rules"
+
+    def predict(
+        self, observation: Any, state: Any = None, episode_start: Any = None, deterministic: bool = True
+    ) -> tuple[NDArray[np.float32], Any]:
+        """Return actions (R, A) float32 for observation rows (R, O), or (A,) for one row (O,)."""
+        seen = np.asarray(observation)
+        steer = PLAYERS[self.name][self.task.name][0]
+        see = self.task.layout.unpack(np.atleast_2d(seen))
+        if steer in REMEMBERING:
+            begins = False if episode_start is None else np.atleast_1d(episode_start)
+            force, state = steer(see, self.task, self.rules, state, begins)
+        else:
+            force = steer(see, self.task, self.rules)
+        strongest = self.task.action_layout.slots[0].scale
+        share = force / strongest
+        length = np.maximum(np.linalg.norm(share, axis=-1, keepdims=True), 1.0)
+        action = (share / length).astype(np.float32)
+        return (action[0] if seen.ndim == 1 else action), state
+
+    def with_rules(self, values: Mapping[str, float]) -> RulesPlayer:
+        """Return the same player with other parameters."""
+        return replace(self, rules=replace(self.rules, **values))
+
+
+@dataclass(frozen=True)
+class Tuned:
+    """The parameters that a search found for a task, and what the search spent and scored."""
+
+    parameters: dict[str, float] = field(default_factory=dict)
+    found: dict[str, float] = field(default_factory=dict)  # agent_steps, tuning_mean, tuning_worlds, textbook_mean
+
+
+def tuned(name: str) -> Tuned:
+    """Return what the search found for a task; an empty record if there was no search yet."""
+    path = TUNED / f"{name}.json"
+    if not path.is_file():
+        return Tuned()
+    content = json.loads(path.read_text(encoding="utf-8"))
+    return Tuned(content["parameters"], content["found"])
+
+
+def player(task: Task, name: str = "rules") -> RulesPlayer:
+    """Return a hand-written player of a task by name; ValueError if there is none of that name for it."""
+    known = PLAYERS[name]
+    if task.name not in known:
+        raise ValueError(
+            f"there is no hand-written player {name!r} for {task.name!r}; there is one for: {', '.join(known)}"
+        )
+    found = tuned(task.name).parameters if name == "rules" else {}
+    return RulesPlayer(task, replace(known[task.name][1](), **found), name)
+
+
+def as_dict(rules: Any) -> dict[str, float]:
+    """Return parameters by name."""
+    return {name: float(value) for name, value in asdict(rules).items()}
