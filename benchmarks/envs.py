@@ -23,12 +23,13 @@ import flockenv  # noqa: F401  # registers the environments
 from benchmarks.floors import Machine, machine, of_decisions
 from benchmarks.measure import Bench, Contestant, Floor, Out, Quick, Result, Rounds, command_line, number
 from flockenv.crew import use_threads
+from flockenv.envs.registration import id_of
 from flockenv.tasks import TASKS, Flock, Task
 from flockenv.world import World
 
 __all__ = ["TASK_IDS"]
 
-TASK_IDS = {name: f"flockenv/{name.capitalize()}-v0" for name in ("pursuit", "obstacles", "flock")}
+TASK_IDS = {name: id_of(name.capitalize()) for name in ("pursuit", "obstacles", "flock")}
 DRAWS = 16  # sets of random actions, used in turn
 WORLDS = 1024
 LEARNERS = 32  # of a flock, in the largest race

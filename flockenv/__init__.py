@@ -4,7 +4,7 @@ Importing it registers the environments with Gymnasium and PettingZoo::
 
     gymnasium.make("flockenv/Pursuit-v0")
     gymnasium.make_vec("flockenv/Obstacles-v0", num_envs=64)
-    pettingzoo.make("parallel", "flockenv/Flock-v0")
+    pettingzoo.make("parallel", "flockenv/Flock-v1")
 
 The rest loads when it is asked for: neither torch nor matplotlib nor numba is imported before.
 """

@@ -60,7 +60,7 @@ ENVIRONMENT = {**os.environ, "PYTHONPATH": str(ROOT)}
 def test_list_names_everything_there_is_with_its_sentence() -> None:
     done = CliRunner().invoke(app, ["list"])
     assert done.exit_code == 0
-    names = [*TASKS, *EFFECTS, *INTEGRATORS, "plane", "torus", "box", "flockenv/Flock-v0", "flockenv/Pursuit-v0"]
+    names = [*TASKS, *EFFECTS, *INTEGRATORS, "plane", "torus", "box", "flockenv/Flock-v1", "flockenv/Pursuit-v0"]
     for name in names:
         assert re.search(rf"^{re.escape(name)} +\S+", done.stdout, re.MULTILINE), name
     assert "F = -c (v - u)" in done.stdout

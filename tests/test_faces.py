@@ -8,6 +8,7 @@ import pettingzoo
 import pytest
 
 from flockenv.envs.face import ByAgent, named
+from flockenv.envs.registration import id_of
 from flockenv.sb3 import WorldVecEnv
 from flockenv.tasks import Bottleneck, Corridor, Crossing, CrowdNav, Evade, Flock, Herd, Obstacles, Pursuit, School
 from flockenv.world import World
@@ -135,7 +136,7 @@ def through_turns(env_id, parameters, actions):
 @pytest.mark.parametrize("name", ALONE)
 def test_one_learner_through_every_face(name):
     task, parameters = ALONE[name]
-    env_id, actions = f"flockenv/{name}-v0", sequence(task)
+    env_id, actions = id_of(name), sequence(task)
     expected = through_world(task, actions)
     assert sum(isinstance(entry, bytes) for entry in expected[0]) >= 3  # several episodes
     assert through_gymnasium(env_id, parameters, actions) == expected
@@ -155,9 +156,9 @@ def test_many_learners_through_every_face_that_takes_them():
     parameters, actions = {"agents": 7, "learners": 5}, sequence(task)
     expected = through_world(task, actions)
     assert through_sb3(task, actions) == expected
-    assert through_vector("flockenv/Flock-v0", parameters, actions) == expected
-    assert through_parallel("flockenv/Flock-v0", parameters, actions) == expected
-    assert through_turns("flockenv/Flock-v0", parameters, actions) == expected
+    assert through_vector("flockenv/Flock-v1", parameters, actions) == expected
+    assert through_parallel("flockenv/Flock-v1", parameters, actions) == expected
+    assert through_turns("flockenv/Flock-v1", parameters, actions) == expected
 
 
 @pytest.mark.parametrize(
@@ -166,7 +167,7 @@ def test_many_learners_through_every_face_that_takes_them():
     ids=["pursuit", "school"],
 )
 def test_a_game_in_which_agents_leave(task, parameters):
-    actions, env_id = sequence(task), f"flockenv/{type(task).__name__}-v0"
+    actions, env_id = sequence(task), id_of(type(task).__name__)
     parallel = through_parallel(env_id, parameters, actions)
     assert parallel == through_turns(env_id, parameters, actions)
     for log, whole in zip(parallel, through_world(task, actions), strict=True):

@@ -21,7 +21,8 @@ from gymnasium.error import NameNotFound, ResetNeeded
 from gymnasium.utils.env_checker import check_env
 
 import flockenv
-from flockenv.envs.registration import HORIZONS, PARALLEL, SINGLE
+from flockenv.envs import single
+from flockenv.envs.registration import HORIZONS, PARALLEL, SINGLE, VERSIONS
 from flockenv.envs.single import PursuitEnv
 from flockenv.tasks import TASKS
 
@@ -246,7 +247,7 @@ def test_a_thousand_steps_replay_in_another_process():
 
 
 def test_another_seed_or_action_is_another_episode():
-    env = gymnasium.make("flockenv/Flock-v0")
+    env = gymnasium.make("flockenv/Flock-v1")
     rows = actions(env, 10)
     assert play(env, rows, seed=1) != play(env, rows, seed=2)
     assert play(env, rows, seed=1) != play(env, -rows, seed=1)
@@ -284,9 +285,9 @@ def test_a_copy_goes_on_as_the_original_would(clone, mode):
 
 
 def test_two_interleaved_envs_do_not_disturb_each_other():
-    envs = [gymnasium.make(env_id, max_episode_steps=30) for env_id in ("flockenv/Flock-v0", "flockenv/Flock-v0")]
+    envs = [gymnasium.make(env_id, max_episode_steps=30) for env_id in ("flockenv/Flock-v1", "flockenv/Flock-v1")]
     rows = [actions(env, 80, seed) for seed, env in enumerate(envs)]
-    alone = [play(gymnasium.make("flockenv/Flock-v0", max_episode_steps=30), rows[k], seed=k) for k in range(2)]
+    alone = [play(gymnasium.make("flockenv/Flock-v1", max_episode_steps=30), rows[k], seed=k) for k in range(2)]
     together = [play(env, [], seed=k) for k, env in enumerate(envs)]
     for t in range(80):
         for k, env in enumerate(envs):
@@ -422,7 +423,7 @@ def test_there_is_one_name_for_the_time_limit():
 
 def test_several_learners_are_sent_to_the_faces_that_can():
     with pytest.raises(ValueError, match=r"make_vec.*pettingzoo\.make.*WorldVecEnv"):
-        gymnasium.make("flockenv/Flock-v0", learners=3)
+        gymnasium.make("flockenv/Flock-v1", learners=3)
 
 
 def test_step_and_render_want_an_episode():
@@ -455,7 +456,7 @@ def test_no_step_after_the_end():
 
 
 def test_pictures_are_fresh_and_without_a_window():
-    env = gymnasium.make("flockenv/Flock-v0", render_mode="rgb_array")
+    env = gymnasium.make("flockenv/Flock-v1", render_mode="rgb_array")
     env.reset(seed=0)
     first = env.render()
     assert first.dtype == np.uint8
@@ -468,7 +469,7 @@ def test_pictures_are_fresh_and_without_a_window():
 
 
 def test_rendering_without_a_mode_warns_as_gymnasium_does():
-    env = gymnasium.make("flockenv/Flock-v0", disable_env_checker=True).unwrapped
+    env = gymnasium.make("flockenv/Flock-v1", disable_env_checker=True).unwrapped
     env.reset(seed=0)
     with pytest.warns(UserWarning, match="render mode"):
         assert env.render() is None
@@ -479,3 +480,20 @@ def test_frames_per_second_play_in_real_time(env_id):
     env = gymnasium.make(env_id)
     assert env.metadata["render_fps"] == round(1 / env.unwrapped.task.control_dt)
     assert set(env.metadata["render_modes"]) == {"rgb_array", "human"}
+
+
+@pytest.mark.filterwarnings("ignore:.*out of date:DeprecationWarning")
+@pytest.mark.parametrize("name", sorted(VERSIONS))
+def test_a_former_version_is_refused_by_the_name_of_the_new_one(name: str) -> None:
+    for make in (gymnasium.make, gymnasium.make_vec):
+        with pytest.raises(gymnasium.error.DeprecatedEnv, match=rf"Please use `flockenv/{name}-v{VERSIONS[name]}`"):
+            make(f"flockenv/{name}-v{VERSIONS[name] - 1}")
+
+
+@pytest.mark.parametrize("env_id", SINGLE)
+def test_an_environment_says_what_every_version_changed(env_id: str) -> None:
+    name, _, version = env_id.removeprefix("flockenv/").partition("-v")
+    page = getattr(single, f"{name}Env").__doc__
+    told = re.findall(r"^v(\d+): ", page.partition("## Version history")[2], re.MULTILINE)
+    assert told == [str(v) for v in range(int(version), -1, -1)]
+    assert f'`gymnasium.make("{env_id}")`' in page

@@ -132,7 +132,7 @@ def test_the_wheel_works_alone(wheel: Path, tmp_path: Path) -> None:
         archive.extractall(tmp_path / "site")
     code = (
         "import flockenv, gymnasium, pettingzoo, importlib.resources as r; from flockenv.cli import main;"
-        "assert gymnasium.spec('flockenv/Pursuit-v0') and 'flockenv/Flock-v0' in pettingzoo.parallel_registry;"
+        "assert gymnasium.spec('flockenv/Pursuit-v0') and 'flockenv/Flock-v1' in pettingzoo.parallel_registry;"
         "assert '__DATA__' in (r.files('flockenv.render') / 'replay.html').read_text();"
         "from flockenv.players import load_player; from flockenv.tasks import Pursuit; import numpy as np;"
         "task = Pursuit(); rows = np.zeros((1, task.layout.size), np.float32);"

@@ -12,7 +12,8 @@ import pytest
 from gymnasium.error import ResetNeeded
 from gymnasium.utils.env_checker import data_equivalence
 
-from flockenv.envs import crossing_v0, face, flock_v0, pursuit_v0, school_v0
+from flockenv.envs import crossing_v0, face, flock_v1, pursuit_v0, school_v0
+from flockenv.envs.registration import VERSIONS
 
 with warnings.catch_warnings():
     warnings.simplefilter("ignore", DeprecationWarning)  # on import it loads its own example the deprecated way
@@ -26,8 +27,8 @@ with warnings.catch_warnings():
         state_test,
     )
 
-MODULES = (crossing_v0, flock_v0, pursuit_v0, school_v0)
-CROSSING, FLOCK = "flockenv/Crossing-v0", "flockenv/Flock-v0"
+MODULES = (crossing_v0, flock_v1, pursuit_v0, school_v0)
+CROSSING, FLOCK = "flockenv/Crossing-v0", "flockenv/Flock-v1"
 PURSUIT, SCHOOL = "flockenv/Pursuit-v0", "flockenv/School-v0"
 IDS = (CROSSING, FLOCK, PURSUIT, SCHOOL)
 SMALL = {CROSSING: {"agents": 5}, FLOCK: {"agents": 6}, PURSUIT: {}, SCHOOL: {"metabolism": 0.2}}
@@ -417,3 +418,21 @@ def test_the_library_s_copies_warn_about_nothing():
             ours, theirs = here.step(actions), there_and_back.step(actions)
             assert data_equivalence(ours[0], theirs[0], exact=True)
             assert ours[1] == dict(theirs[1])
+
+
+def test_a_former_version_is_refused_by_the_name_of_the_new_one() -> None:
+    from flockenv import envs
+
+    for name, version in VERSIONS.items():
+        for kind in ("parallel", "aec"):
+            with pytest.raises(
+                Exception, match=f"v{version - 1} for .*{name}.* not found. Available version: v{version}"
+            ):
+                pettingzoo.make(kind, f"flockenv/{name}-v{version - 1}")
+        module = getattr(envs, f"{name.lower()}_v{version - 1}")
+        for make in (module.env, module.parallel_env):
+            with pytest.raises(ImportError, match=f"use {name.lower()}_v{version} instead"):
+                make()
+    for never in ("flock_v9", "nothing_v0", "flock_vx"):
+        with pytest.raises(AttributeError, match=never):
+            getattr(envs, never)

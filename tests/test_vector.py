@@ -26,9 +26,9 @@ EASY = {
     "flockenv/PathFollow-v0": {"lost_distance": 1.5, "max_force": 2.5},
     "flockenv/School-v0": {"start_hunger": 0.6, "metabolism": 0.15},
     "flockenv/Bottleneck-v0": {"people": 4, "room": 2.0, "clear": 0.0, "width": 1.8},
-    "flockenv/Corridor-v0": {},  # nor there
+    "flockenv/Corridor-v1": {},  # nor there
     "flockenv/CrowdNav-v0": {"goal_radius": 11.8},
-    "flockenv/Flock-v0": {},  # nobody ever terminates there
+    "flockenv/Flock-v1": {},  # nobody ever terminates there
 }
 """Parameters under which random actions sometimes end an episode, and the clock ends the others."""
 
@@ -129,7 +129,7 @@ def test_time_limit_is_the_id_s_unless_said_otherwise():
 
 
 def test_the_end_of_an_episode_is_in_the_infos():
-    envs = gymnasium.make_vec("flockenv/Flock-v0", 3, max_episode_steps=5)
+    envs = gymnasium.make_vec("flockenv/Flock-v1", 3, max_episode_steps=5)
     envs.reset(seed=0)
     for row in rows(envs, 5):
         observation, _, _, truncated, info = envs.step(row)
@@ -158,7 +158,7 @@ def of(info, rows):
 def test_who_asks_for_ends_is_told_of_ends_alone(mode, learners):
     """Of those that end in other steps than others: what is told of a row is what is told of it otherwise."""
     options = {"autoreset_mode": mode, "max_episode_steps": 9, "agents": 7, "learners": learners}
-    envs, twin = (gymnasium.make_vec("flockenv/Flock-v0", 4 * learners, infos=i, **options) for i in ("ends", "steps"))
+    envs, twin = (gymnasium.make_vec("flockenv/Flock-v1", 4 * learners, infos=i, **options) for i in ("ends", "steps"))
     for each in (envs, twin):
         each.reset(seed=2)
         each.world.steps[1:3] = 4  # some are ahead
@@ -192,7 +192,7 @@ SAME_STEP = pytest.param(
 
 @pytest.mark.parametrize("mode", [SAME_STEP, AutoresetMode.NEXT_STEP])
 def test_gymnasium_s_wrappers_work_on_it(mode):
-    envs = gymnasium.make_vec("flockenv/Flock-v0", 3, max_episode_steps=10, autoreset_mode=mode)
+    envs = gymnasium.make_vec("flockenv/Flock-v1", 3, max_episode_steps=10, autoreset_mode=mode)
     envs = DictInfoToList(RecordEpisodeStatistics(envs))
     envs.reset(seed=0)
     total, seen = np.zeros(3), []
@@ -242,7 +242,7 @@ def test_a_copy_goes_on_as_the_original_would(clone):
 
 
 def crowd(worlds=3, learners=4, **options):
-    return gymnasium.make_vec("flockenv/Flock-v0", worlds * learners, agents=7, learners=learners, **options)
+    return gymnasium.make_vec("flockenv/Flock-v1", worlds * learners, agents=7, learners=learners, **options)
 
 
 @pytest.mark.parametrize("mode", MODES)
@@ -320,11 +320,11 @@ def test_a_capture_ends_all_rows_of_its_world():
 def test_numbers_of_rows_that_do_not_fill_worlds_are_refused():
     for count, said in ((100, "96 or 128"), (5, "the nearest: 32$"), (33, "32 or 64"), (-5, "the nearest: 32$")):
         with pytest.raises(ValueError, match=rf"^num_envs: {count} rows [^\n]*{said}"):
-            gymnasium.make_vec("flockenv/Flock-v0", count, agents=32, learners=32)
+            gymnasium.make_vec("flockenv/Flock-v1", count, agents=32, learners=32)
     for count in (0, -32, 2.5, "many"):
         with pytest.raises(ValueError, match=r"^worlds is [^\n]*$"):
-            gymnasium.make_vec("flockenv/Flock-v0", count, agents=32, learners=32)
-    assert gymnasium.make_vec("flockenv/Flock-v0", 64, agents=32, learners=32).world.worlds == 2
+            gymnasium.make_vec("flockenv/Flock-v1", count, agents=32, learners=32)
+    assert gymnasium.make_vec("flockenv/Flock-v1", 64, agents=32, learners=32).world.worlds == 2
 
 
 def test_learners_that_leave_one_by_one_are_sent_elsewhere():
@@ -391,7 +391,7 @@ def test_gymnasium_s_wrappers_work_on_several_learners():
 
 
 def test_seeds_may_be_a_number_or_one_per_world_or_nothing():
-    envs = gymnasium.make_vec("flockenv/Flock-v0", 3)
+    envs = gymnasium.make_vec("flockenv/Flock-v1", 3)
     by_number = envs.reset(seed=5)
     by_list = envs.reset(seed=[5, 6, 7])
     assert data_equivalence(by_number, by_list, exact=True)
@@ -400,7 +400,7 @@ def test_seeds_may_be_a_number_or_one_per_world_or_nothing():
     mixed = envs.reset(seed=[None, 6, None])[0]
     np.testing.assert_array_equal(mixed[[0, 2]], second[[0, 2]])
     np.testing.assert_array_equal(mixed[1], by_number[0][1])
-    drawn = gymnasium.make_vec("flockenv/Flock-v0", 3)
+    drawn = gymnasium.make_vec("flockenv/Flock-v1", 3)
     observation, info = drawn.reset()
     assert data_equivalence(envs.reset(seed=info["seed"].tolist())[0], observation, exact=True)
     assert len(set(info["seed"].tolist())) == 3
@@ -408,7 +408,7 @@ def test_seeds_may_be_a_number_or_one_per_world_or_nothing():
 
 def test_a_masked_reset_leaves_the_others_alone():
     options = {"autoreset_mode": AutoresetMode.DISABLED}
-    envs, twin = (gymnasium.make_vec("flockenv/Flock-v0", 3, **options) for _ in range(2))
+    envs, twin = (gymnasium.make_vec("flockenv/Flock-v1", 3, **options) for _ in range(2))
     actions = rows(envs, 10)
     envs.reset(seed=0), twin.reset(seed=0)
     for row in actions[:4]:
@@ -427,7 +427,7 @@ def test_a_masked_reset_leaves_the_others_alone():
 
 
 def test_worlds_that_ended_want_a_reset_when_nobody_resets_them():
-    envs = gymnasium.make_vec("flockenv/Flock-v0", 2, max_episode_steps=2, autoreset_mode=AutoresetMode.DISABLED)
+    envs = gymnasium.make_vec("flockenv/Flock-v1", 2, max_episode_steps=2, autoreset_mode=AutoresetMode.DISABLED)
     envs.reset(seed=0)
     row = np.zeros(envs.action_space.shape)
     envs.step(row)
@@ -439,7 +439,7 @@ def test_worlds_that_ended_want_a_reset_when_nobody_resets_them():
 
 
 def test_actions_of_worlds_that_rest_are_not_read():
-    envs = gymnasium.make_vec("flockenv/Flock-v0", 2, max_episode_steps=2, autoreset_mode=AutoresetMode.NEXT_STEP)
+    envs = gymnasium.make_vec("flockenv/Flock-v1", 2, max_episode_steps=2, autoreset_mode=AutoresetMode.NEXT_STEP)
     envs.reset(seed=0)
     row = np.zeros(envs.action_space.shape)
     envs.step(row), envs.step(row)
@@ -460,14 +460,14 @@ def test_actions_of_worlds_that_rest_are_not_read():
     ids=["list", "int", "short", "empty"],
 )
 def test_bad_masks_are_refused(mask):
-    envs = gymnasium.make_vec("flockenv/Flock-v0", 2)
+    envs = gymnasium.make_vec("flockenv/Flock-v1", 2)
     envs.reset(seed=0)
     with pytest.raises(ValueError, match="reset_mask"):
         envs.reset(options={"reset_mask": mask})
 
 
 def test_the_first_reset_begins_every_world():
-    envs = gymnasium.make_vec("flockenv/Flock-v0", 2)
+    envs = gymnasium.make_vec("flockenv/Flock-v1", 2)
     with pytest.raises(ValueError, match="first reset"):
         envs.reset(options={"reset_mask": np.array([True, False])})
 
@@ -477,11 +477,11 @@ def test_the_first_reset_begins_every_world():
 )
 def test_bad_seeds_are_refused(seed, kind):
     with pytest.raises(kind, match="seed"):
-        gymnasium.make_vec("flockenv/Flock-v0", 2).reset(seed=seed)
+        gymnasium.make_vec("flockenv/Flock-v1", 2).reset(seed=seed)
 
 
 def test_bad_options_actions_and_modes_are_refused():
-    envs = gymnasium.make_vec("flockenv/Flock-v0", 2)
+    envs = gymnasium.make_vec("flockenv/Flock-v1", 2)
     with pytest.raises(ValueError, match="`reset_mask`"):
         envs.reset(options={"reset_maks": np.array([True, False])})
     with pytest.raises(ResetNeeded, match="reset"):
@@ -494,19 +494,19 @@ def test_bad_options_actions_and_modes_are_refused():
     with pytest.raises(ValueError, match="shape"):
         envs.step(bad[0])
     with pytest.raises(ValueError, match="render_mode"):
-        gymnasium.make_vec("flockenv/Flock-v0", 2, render_mode="human")
+        gymnasium.make_vec("flockenv/Flock-v1", 2, render_mode="human")
     with pytest.raises(ValueError, match="`SameStep`"):
-        gymnasium.make_vec("flockenv/Flock-v0", 2, autoreset_mode="samestep")
+        gymnasium.make_vec("flockenv/Flock-v1", 2, autoreset_mode="samestep")
     with pytest.raises(ValueError, match="infos: 'end' is unknown, did you mean `ends`"):
-        gymnasium.make_vec("flockenv/Flock-v0", 2, infos="end")
+        gymnasium.make_vec("flockenv/Flock-v1", 2, infos="end")
     with pytest.raises(ValueError, match="worlds"):
-        gymnasium.make_vec("flockenv/Flock-v0", 0)
+        gymnasium.make_vec("flockenv/Flock-v1", 0)
     envs.close()
     envs.close()
 
 
 def test_one_picture_per_world():
-    envs = gymnasium.make_vec("flockenv/Flock-v0", 2, render_mode="rgb_array")
+    envs = gymnasium.make_vec("flockenv/Flock-v1", 2, render_mode="rgb_array")
     envs.reset(seed=0)
     first, second = envs.render()
     assert first.shape == second.shape

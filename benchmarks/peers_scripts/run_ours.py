@@ -99,7 +99,7 @@ def _batch(world: Any, rng: Any, does: str) -> Case:
 
 def flock_parallel(threads: int) -> Case:
     """The Flock task as a PettingZoo parallel environment."""
-    from flockenv.envs.flock_v0 import parallel_env
+    from flockenv.envs.flock_v1 import parallel_env
 
     env = parallel_env(max_cycles=HORIZON, agents=3, obstacle_count=3)
     size = env.task.layout.size

@@ -7,6 +7,7 @@ from collections.abc import Iterable, Sequence
 
 import numpy as np
 
+from flockenv.envs.registration import id_of
 from flockenv.tasks import Layout, Task
 
 __all__ = ["page"]
@@ -19,7 +20,7 @@ def page(summary: str, task: Task, name: str, history: str) -> str:
     """
     parts = [
         inspect.cleandoc(summary),
-        _facts(task, f"flockenv/{name}-v0"),
+        _facts(task, id_of(name)),
         "## Description\n\n" + inspect.cleandoc(type(task).__doc__ or ""),
         "## Action space\n\n" + _layout(task.action_layout),
         "## Observation space\n\n" + _layout(task.layout),

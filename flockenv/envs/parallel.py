@@ -25,6 +25,7 @@ from flockenv.envs.face import (
     observation_space,
     render_fps,
 )
+from flockenv.envs.registration import VERSIONS
 from flockenv.refusals import nearest
 from flockenv.tasks import Bottleneck, Corridor, Crossing, Flock, Herd, Pursuit, School, Task
 from flockenv.world import Step, World
@@ -56,7 +57,7 @@ class WorldParallelEnv(ParallelEnv[str, Rows, Rows]):  # type: ignore[misc]  # p
     def __init__(self, max_cycles: int | None = None, render_mode: str | None = None, **parameters: Any) -> None:
         self.task = build(self.task_type, {**self.fixed, **parameters}, limit="max_cycles")
         self.metadata = {
-            "name": f"{self.task.name}_v0",
+            "name": f"{self.task.name}_v{VERSIONS.get(type(self.task).__name__, 0)}",
             "render_modes": list(RENDER_MODES),
             "render_fps": render_fps(self.task),
             "is_parallelizable": True,

@@ -7,7 +7,7 @@ from typing import Any, Literal
 import gymnasium
 import pettingzoo
 
-__all__ = ["HORIZONS", "PARALLEL", "SINGLE", "register_all"]
+__all__ = ["HORIZONS", "PARALLEL", "SINGLE", "VERSIONS", "id_of", "register_all"]
 
 HORIZONS = {
     "Pursuit": 300,
@@ -24,17 +24,21 @@ HORIZONS = {
 }
 """Time limit of an episode in control steps, by name: `Task.horizon`, repeated here so that no task is imported."""
 
-SINGLE = tuple(f"flockenv/{name}-v0" for name in HORIZONS)
-"""Ids for gymnasium.make and gymnasium.make_vec: one learner, everybody else is scripted."""
+VERSIONS = {"Corridor": 1, "Flock": 1}
+"""Versions of environments whose results have moved, by name; all others are 0. Each class's `history` says why."""
+
+
+def id_of(name: str) -> str:
+    """Return the id of an environment: flockenv/Pursuit-v0 for "Pursuit"."""
+    return f"flockenv/{name}-v{VERSIONS.get(name, 0)}"
+
+
+SINGLE = tuple(id_of(name) for name in HORIZONS)
+"""Ids for gymnasium.make and gymnasium.make_vec: one learner, all other agents are scripted."""
 
 PARALLEL = {
-    "flockenv/Bottleneck-v0": "bottleneck_v0",
-    "flockenv/Corridor-v0": "corridor_v0",
-    "flockenv/Crossing-v0": "crossing_v0",
-    "flockenv/Flock-v0": "flock_v0",
-    "flockenv/Herd-v0": "herd_v0",
-    "flockenv/Pursuit-v0": "pursuit_v0",
-    "flockenv/School-v0": "school_v0",
+    id_of(name): f"{name.lower()}_v{VERSIONS.get(name, 0)}"
+    for name in ("Bottleneck", "Corridor", "Crossing", "Flock", "Herd", "Pursuit", "School")
 }
 """Ids for pettingzoo.make("parallel" or "aec", ...), and the module in flockenv.envs that builds each."""
 
@@ -42,9 +46,9 @@ PARALLEL = {
 def register_all() -> None:
     """Tell Gymnasium and PettingZoo about every environment; what is there already stays."""
     for name, horizon in HORIZONS.items():
-        _register_single(f"flockenv/{name}-v0", name, horizon)
+        _register_single(id_of(name), name, horizon)
     for env_id, module in PARALLEL.items():
-        horizon = HORIZONS[env_id.removeprefix("flockenv/").removesuffix("-v0")]
+        horizon = HORIZONS[env_id.removeprefix("flockenv/").partition("-v")[0]]
         _register_many("parallel", env_id, f"flockenv.envs.{module}:parallel_env", horizon)
         _register_many("aec", env_id, f"flockenv.envs.{module}:env", horizon)
 

@@ -176,7 +176,10 @@ class FlockEnv(SingleEnv):
 
     task_type = Flock
     fixed: ClassVar[dict[str, Any]] = {"learners": 1}
-    history = "v0: first version (flockenv 0.1.0)."
+    history = (
+        "v1: success is judged over the episode (`settling`, `lasting`), not at its last instant; metrics `held` and "
+        "`success_at_end`.\n\nv0: first version (flockenv 0.1.0)."
+    )
 
 
 class CrossingEnv(SingleEnv):
@@ -221,7 +224,10 @@ class CorridorEnv(SingleEnv):
 
     task_type = Corridor
     fixed: ClassVar[dict[str, Any]] = {"learners": 1}
-    history = "v0: first version (flockenv 0.2.0)."
+    history = (
+        "v1: success is judged over the episode (`settling`, `lasting`), not at its last instant; metrics `held` and "
+        "`success_at_end`.\n\nv0: first version (flockenv 0.2.0)."
+    )
 
 
 class BottleneckEnv(SingleEnv):

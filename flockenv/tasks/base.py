@@ -9,7 +9,9 @@ over one world:
 * `reward(p, before, after, action, terms)` writes the named terms (L, K), each of which lies in one piece, and nothing
   else, as a test checks;
 * `ended(p, before, after, numbers, over) -> success` writes which learners are over (L,), may take agents out of
-  `after.alive`, and says whether the aim is reached; of the `measures` (Q,) it may write those that it needs itself;
+  `after.alive`, and returns whether the aim is reached; of the `measures` (Q,) it may write those that it needs itself;
+  of a task with a `lasting_aim`, it returns whether the aim holds now, and success is what `lasts` in tasks/lasting.py
+  returns of the sums of the measures;
 * `measure(p, before, after, numbers)` comes next and writes the others: what this step adds to the `measures`;
 * `metrics(p, sums, last, steps, numbers)` writes the domain metrics of an episode so far, in the order of
   `metric_names`, from the sums of the measures over its steps and from their last values, by name (sums.path, say), and
@@ -99,6 +101,8 @@ class Task(Record):
     """Numbers kept per agent between steps."""
     keeps: ClassVar[bool] = False
     """Has it a kernel `keep`?"""
+    lasting_aim: ClassVar[bool] = False
+    """True if success is judged over the episode, by tasks/lasting.py, and not at one instant."""
 
     control_dt: float = Field(default=0.1, gt=0, description="s, one decision; a whole multiple of dt")
     dt: float = Field(default=0.05, gt=0, description="s, one physics step")
@@ -252,6 +256,7 @@ def task_source(task: Task) -> str:
     fetch_sums = "\n".join(indented_lines([*sums, "fetch(payment[b], 0, 1)"], 12)) if task.abreast else ""
     widen, show = _lanes(task) if task.abreast else ("rounded, wide = over.shape[1], now", "pass")
     optional = [*["keep"] * task.keeps, *["abreast"] * (task.abreast > 0)]
+    lasting = f"success[b] = lasts(p, {_measures(task, 'sums')})" if task.lasting_aim else "pass"
     begin_inner = f"begin_inner(x, v, {task.parts.frame_argument}key, tick, params, dt, alive, b, {SHARED})"
     worlds = (
         f"x, v, {task.parts.frame_argument}alive, tick, obstacle_x, obstacle_radius, work, key, memory, steps, params, "
@@ -263,6 +268,7 @@ from flockenv.abreast import columns, in_one_row, into_rows, packed, take
 from flockenv.lines import fetch, pour, settle
 from flockenv.tasks.base import Frame
 from flockenv.vehicle import face
+{"from flockenv.tasks.lasting import lasts" if task.lasting_aim else ""}
 from {type(task).__module__} import {", ".join([*_KERNELS, *optional])}
 
 P = namedtuple("P", {" ".join(names)!r})
@@ -366,6 +372,7 @@ def play(
             late[b] = steps[b] >= limit
             for k in range(sums.shape[1]):
                 sums[b, k] += measured[b, k]
+            {lasting}
             for i in range(over.shape[1]):
                 if mortal and over[b, i]:
                     alive[b, i] = False

@@ -21,7 +21,8 @@ from flockenv.space import Torus
 from flockenv.spawn import Spawn
 from flockenv.state import State
 from flockenv.sweep import Look
-from flockenv.tasks.base import Frame, Task
+from flockenv.tasks.base import Frame
+from flockenv.tasks.lasting import MEASURES, METRICS, LastingTask, judge, tell_lasting
 from flockenv.tasks.layout import Layout, Slot
 from flockenv.tasks.sight import neighbour_slots, offset, put, put_crowding, put_neighbour, turned, velocity_of
 from flockenv.vec import add, norm, scale, sub
@@ -144,13 +145,15 @@ def _order(p: Any, frame: Frame) -> float:
 
 @kernel
 def ended(p: Any, before: Frame, after: Frame, numbers: Any, over: Any) -> bool:
-    """Never over before the time limit. The aim holds now if learners get along, and do not touch."""
+    """Never over before the time limit. The aim holds now if learners keep to their speeds, and do not touch."""
     n = over.shape[0]
     share, touches = 0.0, 0.0
     for i in range(n):
         share += _suited(after, i)
         touches += _touches(after, i)
-    return bool(share > p.aim * n and touches == 0.0)
+    holds = bool(share > p.aim * n and touches == 0.0)
+    judge(p, after.step, holds, numbers, 4)
+    return holds
 
 
 @kernel
@@ -175,7 +178,8 @@ def measure(p: Any, before: Frame, after: Frame, numbers: Any) -> None:
 
 @kernel
 def metrics(p: Any, sums: Any, last: Any, steps: int, numbers: Any) -> None:
-    """Speed along the way over the desired one; touches that began; lane order in the second half, none before."""
+    """Speed along the way over the desired one; touches that began; lane order in the second half only; the aim."""
+    tell_lasting(sums, last, steps, numbers, 3)
     numbers[0] = sums.share / max(steps, 1)
     numbers[1] = sums.touches
     if sums.late > 0:
@@ -206,19 +210,22 @@ def observe(p: Any, frame: Frame, rows: Any) -> None:
             row[np.uint64(5 + 6 * slots + s)] = 1.0
 
 
-class Corridor(Task):
+class Corridor(LastingTask):
     """Two streams of people walk in one corridor, against each other, for ever: along it, the world is a ring.
 
     Everybody has a desired speed of his own, N(1.34, 0.26) m/s, and is paid for getting along so fast, no faster.
     Nobody is stopped by a touch; it costs as long as it lasts. Walls are solid. All learn, with one policy (those who
     do not walk by the forces of Moussaid et al. 2009), and see everything in the frame of their own way; so what looks
-    like keeping right, or lanes, is their doing. Nobody terminates.
+    like keeping right, or lanes, is their doing. No agent terminates.
+
+    The aim holds while the mean over learners of 1 - |speed along one's way / desired speed - 1| is above `aim`, and no
+    learner touches another. Success: it holds in the share `lasting` of the decisions after `settling` s.
     """
 
     name: ClassVar[str] = "corridor"
     terms: ClassVar[tuple[str, ...]] = ("along", "touch", "effort")
-    metric_names: ClassVar[tuple[str, ...]] = ("speed", "collisions", "lane_order")
-    measures: ClassVar[tuple[str, ...]] = ("share", "touches", "order", "late")
+    metric_names: ClassVar[tuple[str, ...]] = ("speed", "collisions", "lane_order", *METRICS)
+    measures: ClassVar[tuple[str, ...]] = ("share", "touches", "order", "late", *MEASURES)
     memory: ClassVar[int] = 2
 
     people: int = Field(default=24, ge=2, le=1000, description="how many walk, half of them each way")
@@ -237,7 +244,7 @@ class Corridor(Task):
     sight: float = Field(default=4.0, gt=0, description="m, others are seen within this")
     neighbours: int = Field(default=8, ge=1, le=32, description="how many others are seen, nearest first")
     near: float = Field(default=0.75, gt=0, description="m between bodies, within which closeness is seen")
-    aim: float = Field(default=0.9, ge=0, le=1, description="how near the desired speeds is success: 1 = at them")
+    aim: float = Field(default=0.9, ge=0, le=1, description="how near the desired speeds the aim is: 1 = at them")
     along_reward: float = Field(default=1.0, ge=0, description="per s at the desired speed; less by what is missed")
     touch_cost: float = Field(default=5.0, ge=0, description="per s and person touched")
     effort_cost: float = Field(default=0.1, ge=0, description="per s at full force")

@@ -19,7 +19,8 @@ from flockenv.snapshot import Mark
 from flockenv.space import Torus
 from flockenv.state import State
 from flockenv.sweep import Look
-from flockenv.tasks.base import Frame, Task
+from flockenv.tasks.base import Frame
+from flockenv.tasks.lasting import MEASURES, METRICS, LastingTask, judge, tell_lasting
 from flockenv.tasks.layout import Layout, Slot
 from flockenv.tasks.sight import block_ways, compass, offset, turned
 from flockenv.vec import norm, scale, sub, unit
@@ -192,9 +193,11 @@ def reward(p: Any, before: Frame, after: Frame, action: Any, terms: Any) -> None
 
 @kernel
 def ended(p: Any, before: Frame, after: Frame, numbers: Any, over: Any) -> bool:
-    """Never over before the time limit. The aim holds now if the flock is aligned, under way, and nobody touches."""
+    """Never over before the time limit. The aim holds now if the flock is aligned, under way, and no agent touches."""
     polarisation, along = numbers[0], numbers[3] = _order(after)
-    return polarisation > 0.9 and along > 0.8 * p.cruise and not _anybody_touches(after)
+    holds = polarisation > 0.9 and along > 0.8 * p.cruise and not _anybody_touches(after)
+    judge(p, after.step, holds, numbers, 4)
+    return holds
 
 
 _ZEROS = (0.0,) * SIDE
@@ -247,8 +250,9 @@ def measure(p: Any, before: Frame, after: Frame, numbers: Any) -> None:
 
 @kernel
 def metrics(p: Any, sums: Any, last: Any, steps: int, numbers: Any) -> None:
-    """Means over the episode: polarisation, nearest neighbour [m], speed along [m/s]; touches that began."""
+    """Means over the episode: polarisation, nearest neighbour [m], speed along [m/s]; touches that began; the aim."""
     n = max(steps, 1)
+    tell_lasting(sums, last, steps, numbers, 4)
     numbers[0], numbers[1] = sums.polarisation / n, sums.nearest / n
     numbers[2], numbers[3] = sums.touches, sums.along / n
 
@@ -392,17 +396,26 @@ def observe(p: Any, frame: Frame, rows: Any) -> None:
             block_ways(row, ways, int(p.rays), frame.table, to, heading, rho + frame.radius[i], p.sight)
 
 
-class Flock(Task):
+class Flock(LastingTask):
     """N learners with one shared policy (or one among scripted flockmates) travel along a heading as a flock.
 
     They start as a loose crowd moving anyhow in a periodic field with round obstacles. Everything an agent sees is
-    relative to itself and turned into the frame of the heading. Nobody dies; what is bad costs as long as it lasts.
+    relative to itself and turned into the frame of the heading. No agent dies; what is bad costs as long as it lasts.
+
+    The aim holds while the polarisation is above 0.9, the mean speed along the heading above 0.8 `cruise`, and no agent
+    touches another or an obstacle. Success: it holds in the share `lasting` of the decisions after `settling` s.
     """
 
     name: ClassVar[str] = "flock"
     terms: ClassVar[tuple[str, ...]] = ("progress", "alignment", "spacing", "together", "touch", "obstacle")
-    metric_names: ClassVar[tuple[str, ...]] = ("polarisation", "nearest_neighbour", "collisions", "speed_along")
-    measures: ClassVar[tuple[str, ...]] = ("polarisation", "nearest", "touches", "along")
+    metric_names: ClassVar[tuple[str, ...]] = (
+        "polarisation",
+        "nearest_neighbour",
+        "collisions",
+        "speed_along",
+        *METRICS,
+    )
+    measures: ClassVar[tuple[str, ...]] = ("polarisation", "nearest", "touches", "along", *MEASURES)
     counts: ClassVar[tuple[str, ...]] = ("neighbours", "listed", "obstacles_seen", "rays")
     memory: ClassVar[int] = 2
 

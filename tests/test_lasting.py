@@ -1,0 +1,119 @@
+"""Success in tasks that only the time limit ends: the aim must last, and the last instant decides nothing by itself."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+
+from flockenv.players import load_player
+from flockenv.tasks import TASKS, Corridor, Flock, Task
+from flockenv.tasks.lasting import LastingTask
+from flockenv.world import World
+
+WORLDS = 12
+LASTING = tuple(kind for kind in TASKS.values() if issubclass(kind, LastingTask))
+SKILLED = {"flock": "rules", "corridor": "ppo"}
+
+Played = dict[str, Any]
+
+
+def play(
+    task: Task, skilled: Callable[[int], bool] = lambda k: True, each: Callable[[World], Any] | None = None
+) -> Played:
+    """Play one episode, skilled in some decisions and at random in the others; return what was told when."""
+    players = {True: load_player(SKILLED[task.name], task), False: load_player("random", task)}
+    world = World(task, WORLDS, task.horizon)
+    seen = world.reset(5)
+    success, now, held, seen_of = [], [], [], []
+    for k in range(task.horizon):
+        rows = seen.reshape(-1, seen.shape[-1])
+        action, _ = players[skilled(k)].predict(rows, None, np.full(len(rows), k == 0), True)
+        step = world.step(action.reshape(WORLDS, task.learners, -1))
+        seen, told = step.observation.copy(), world.measure()
+        success.append(step.success.copy())
+        now.append(told["success_at_end"])
+        held.append(told["held"])
+        seen_of.append(each(world) if each is not None else None)
+    return {"success": np.array(success), "now": np.array(now) == 1, "held": np.array(held), "each": seen_of}
+
+
+def polarised(world: World) -> np.ndarray:
+    """Return whether every flock is aligned and under way: the aim of Flock, but for touches."""
+    v = world.state.vel  # (B, N, 2) m/s
+    course = v / np.linalg.norm(v, axis=-1, keepdims=True)
+    order = np.linalg.norm(course.mean(axis=1), axis=-1)
+    along = (v * np.swapaxes(world.memory, 1, 2)).sum(axis=-1).mean(axis=-1)
+    return np.asarray((order > 0.9) & (along > 0.8 * world.task.cruise))
+
+
+def test_the_tasks_without_an_end_of_their_own_are_these() -> None:
+    assert set(LASTING) == {Corridor, Flock}
+
+
+@pytest.mark.parametrize("kind", LASTING)
+@pytest.mark.parametrize(("settling", "lasting"), [(5.0, 0.9), (0.0, 0.5), (2.0, 1.0), (0.25, 0.96)])
+def test_success_is_the_share_of_the_settled_decisions_in_which_the_aim_holds(
+    kind: type[LastingTask], settling: float, lasting: float
+) -> None:
+    task = kind(horizon=80, settling=settling, lasting=lasting)
+    told = play(task)
+    first = int(np.ceil(settling / task.control_dt - 1e-9))
+    share = np.cumsum(told["now"][first:], axis=0) / np.arange(1, 81 - first)[:, None]
+    np.testing.assert_allclose(told["held"][first:], share, atol=1e-12)
+    assert np.isnan(told["held"][:first]).all()
+    np.testing.assert_array_equal(told["success"][first:], share >= lasting - 1e-9)
+    assert not told["success"][:first].any()
+
+
+def test_the_aim_of_a_flock_is_alignment_under_way_without_a_touch() -> None:
+    told = play(Flock(agents=8, obstacle_count=0, horizon=60), each=polarised)
+    missing = np.array(told["each"]) & ~told["now"]
+    assert not (told["now"] & ~np.array(told["each"])).any()
+    assert missing.mean() < 0.02, "touches alone make the difference, and rules hardly touch"
+    assert told["now"].any() and not told["now"].all()
+
+
+@pytest.mark.parametrize("kind", LASTING)
+def test_the_last_instant_decides_nothing_by_itself(kind: type[LastingTask]) -> None:
+    """Skilled until the last moment, and then lost; lost for most of the time, and then skilled."""
+    task = kind(horizon=150)
+    lost = play(task, lambda k: k < 146)
+    assert not lost["now"][-1].any() or kind is Flock, "four random decisions break the desired speeds"
+    assert lost["success"][-1].mean() > 0.7
+    late = play(task, lambda k: k >= 120)
+    assert late["now"][-1].mean() > 0.7
+    assert not late["success"][-1].any()
+
+
+@pytest.mark.parametrize("kind", LASTING)
+def test_an_episode_that_ends_before_agents_settle_is_no_success(kind: type[LastingTask]) -> None:
+    task = kind(horizon=20, settling=2.0)
+    told = play(task)
+    assert not told["success"].any() and np.isnan(told["held"]).all()
+    assert told["now"][-1].any()
+
+
+@pytest.mark.parametrize("kind", LASTING)
+@pytest.mark.parametrize(
+    ("field", "value"), [("settling", -1.0), ("settling", float("nan")), ("lasting", 0.0), ("lasting", 1.5)]
+)
+def test_a_share_or_time_out_of_range_is_refused(kind: type[LastingTask], field: str, value: float) -> None:
+    with pytest.raises(ValueError, match=field):
+        kind(**{field: value})
+
+
+@pytest.mark.parametrize("kind", LASTING)
+def test_both_precisions_judge_the_same_decisions(kind: type[LastingTask]) -> None:
+    counted = []
+    for dtype in ("float64", "float32"):
+        world = World(kind(dtype=dtype, settling=0.7, horizon=30), 1, 30)
+        world.reset(0)
+        for k in range(30):
+            world.step(np.zeros((1, world.learners, 2)))
+            if "held" in world.metrics():
+                counted.append(k)
+                break
+    assert counted == [7, 7]
