@@ -10,6 +10,7 @@ import platform
 import re
 import subprocess
 import tempfile
+import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -32,7 +33,7 @@ from flockenv.outputs import checked_path
 from flockenv.players import NAMES, load_player, other_tasks
 from flockenv.players.files import SUFFIXES, PlayerError
 from flockenv.players.rules import tuned
-from flockenv.policy import Policy
+from flockenv.policy import OtherTaskWarning, Policy
 from flockenv.refusals import nearest, shown
 from flockenv.tasks import TASKS, Task
 
@@ -74,7 +75,8 @@ class Player:
 
     def policy(self, task: Task, seed: int, trust_pickle: bool = False) -> Policy:
         """Return it, ready to play a task; ValueError: one line that names it."""
-        with blaming(self.name, task, ValueError):  # those of load_player name the player themselves
+        with blaming(self.name, task, ValueError), warnings.catch_warnings():
+            warnings.simplefilter("ignore", OtherTaskWarning)  # the results say what differs
             return load_player(self.spec, task, seed, trust_pickle)
 
 
@@ -197,7 +199,8 @@ def _play(job: _Job, policies: Mapping[str, Policy], advance: Advance) -> Played
         with blaming(name, task):
             episodes[name] = rollout(task, policy, job.worlds, job.first, record=RECORDED, progress=progress)
     costs = _costs(task, policies)
-    return episodes, report.task_results(task_digest(task), episodes, costs, job.resamples, job.seed)
+    differences = {name: getattr(policy, "differences", ()) for name, policy in policies.items()}
+    return episodes, report.task_results(task_digest(task), episodes, costs, job.resamples, job.seed, differences)
 
 
 @contextmanager
@@ -433,8 +436,10 @@ def _show(results: report.Results, folder: Path) -> None:
         console = Console(highlight=False, width=160)  # a pipe has no width; 80 would break every cell
     for task, about in results["tasks"].items():
         console.print(*report.player_tables(task, about))
-    for about in results["tasks"].values():
+    for task, about in results["tasks"].items():
         console.print(about["verdict"], markup=False)
+        for line in report.differences(task, about):
+            console.print(line, markup=False)
     console.print(f"\n{results['wall_time_s']:.0f} s; {', '.join(FILES)} are in {folder}", markup=False)
 
 

@@ -199,8 +199,9 @@ def _makers(task: Task, asked: Sequence[str], seed: int, trust_pickle: bool) -> 
         player.name: functools.partial(player.policy, seed=seed, trust_pickle=trust_pickle)
         for player in field_of(specs)
     }
-    for make in makers.values():
-        make(task)
+    for name, make in makers.items():
+        for phrase in getattr(make(task), "differences", ()):
+            console.print(f"{task.name}: {name}: {phrase}", markup=False)
     return makers
 
 

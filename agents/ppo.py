@@ -36,10 +36,10 @@ from flockenv.crew import threads, use_threads
 from flockenv.evaluation import rollout, worlds_for
 from flockenv.players import WEIGHTS
 from flockenv.players.rules import as_dict, player
-from flockenv.policy import MlpPolicy, save_policy
+from flockenv.policy import MlpPolicy, describe, save_policy
 from flockenv.refusals import KeyPath, key_path, shown
 from flockenv.sb3 import WorldVecEnv
-from flockenv.tasks import Task
+from flockenv.tasks import TASKS, Task
 from flockenv.world import World
 
 __all__ = ["OtherRecipe", "app", "checkpointed", "on_threads", "tensors_of", "train"]
@@ -338,7 +338,8 @@ def export(run: Run, path: Path) -> None:
     """Write the best policy with its recipe: everything that is needed to make it again."""
     recipe = run.recipe
     card = {
-        **{key: recipe[key] for key in ("task", "arguments", "layout", "rules") if key in recipe},
+        **describe(TASKS[recipe["task"]](**recipe["arguments"])),
+        **({"rules": recipe["rules"]} if "rules" in recipe else {}),
         "activation": recipe["ppo"]["activation"],
         "algorithm": "PPO (stable-baselines3)",
         "recipe": {"command": f"python -m agents.ppo configs/{recipe['task']}.yaml", "ppo": recipe["ppo"]},

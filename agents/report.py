@@ -7,6 +7,7 @@ import math
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import combinations
+from types import MappingProxyType
 from typing import Any
 
 from rich import box
@@ -17,8 +18,8 @@ from flockenv.evaluation import Comparison, Episodes, Interval, compare, summari
 from flockenv.render.chart import Column, Row
 
 __all__ = [
-    "column", "grid", "interval_fields", "interval_text", "json_text", "markdown", "number_text", "player_tables",
-    "table_of", "task_results", "verdict",
+    "column", "differences", "grid", "interval_fields", "interval_text", "json_text", "markdown", "number_text",
+    "player_tables", "table_of", "task_results", "verdict",
 ]  # fmt: skip
 
 Results = dict[str, Any]
@@ -28,20 +29,31 @@ Return: the mean reward of a world's learners, summed over its episode; higher i
 worlds, and no player was trained or tuned on one of them. IQM (the mean without the best and the worst quarter of the
 worlds), mean and differences: 95 % percentile bootstrap over worlds; success and "scores higher" (ties count half):
 95 % Wilson. A difference is the mean over worlds, so rare disasters count in it, unlike in the IQM. There is one
-trained policy per task: the intervals speak of the luck of worlds, not of the luck of training, which hand-written
-players have none of. µs: per decision, all worlds at once / one row alone (medians; in a large comparison other cores
-play other tasks meanwhile)."""
+trained policy per task and one search per task tuned its rules: the intervals are of the luck of worlds, not of the
+luck of training or of that search. µs: per decision, all worlds at once / one row alone (medians; in a large comparison
+other cores play other tasks meanwhile)."""
 
 
 def task_results(
-    digest: str, episodes: Mapping[str, Episodes], costs: Mapping[str, Results], resamples: int, seed: int
+    digest: str,
+    episodes: Mapping[str, Episodes],
+    costs: Mapping[str, Results],
+    resamples: int,
+    seed: int,
+    differences: Mapping[str, Sequence[str]] = MappingProxyType({}),
 ) -> Results:
-    """Return everything about one task as plain data: players in order, and each pair, the later minus the earlier."""
+    """Return everything about one task as plain data: players in order, and each pair, the later minus the earlier.
+
+    differences: by player, what differs between the task and the one that it was trained on.
+    """
     pairs = {
         f"{later} - {earlier}": _pair(compare(episodes[later], episodes[earlier], resamples, seed))
         for earlier, later in reversed(list(combinations(episodes, 2)))
     }
-    players = {name: _player(played, costs.get(name, {}), resamples, seed) for name, played in episodes.items()}
+    players = {
+        name: {**_player(played, costs.get(name, {}), resamples, seed), "differs": list(differences.get(name, ()))}
+        for name, played in episodes.items()
+    }
     first = next(iter(episodes.values()))
     results = {"digest": digest, "horizon": first.horizon, "players": players, "pairs": pairs}
     return {**results, "verdict": verdict(first.task, results)}
@@ -106,6 +118,13 @@ def verdict(task: str, results: Results) -> str:
     else:
         claim = f"{first} and {second} are level: difference {gap} per world, {first} scores higher in {wins}; {rates}."
     return f"{task}: {claim} {_costs(first, players[first])}; {_costs(second, players[second])}."
+
+
+def differences(task: str, results: Results) -> Iterator[str]:
+    """Yield a line for each player that was trained on a task with other arguments or scales."""
+    for name, player in results["players"].items():
+        if player["differs"]:
+            yield f"{task}: {name} plays another task than it was trained on: {'; '.join(player['differs'])}."
 
 
 def _reversed(pair: Results) -> Results:
@@ -205,7 +224,7 @@ def markdown(results: Results) -> str:
     seeds = f"{results['world_seeds']['first']} to {results['world_seeds']['last']}"
     parts = ["# Hand-written steering against learning", f"{results['worlds']} worlds per task, seeds {seeds}."]
     for task, about in results["tasks"].items():
-        parts += [f"## {task}", about["verdict"], grid(*player_cells(about))]
+        parts += [f"## {task}", about["verdict"], *differences(task, about), grid(*player_cells(about))]
         parts += [grid(*pair_cells(about))] if about["pairs"] else []
     versions = ", ".join(f"{name} {version}" for name, version in results["versions"].items())
     return "\n\n".join([*parts, "---", NOTES, f"Made with {versions}.\n"])

@@ -1,8 +1,11 @@
 """Policies: whatever turns rows of observations into rows of actions, hand-written or learned, behind SB3's predict().
 
 A learned policy is two files that hold no code: `X.safetensors` (the actor's weights) and `X.json` beside it (the card:
-activation, sizes, digest of the observation layout, SHA-256 of the weights, and how the weights came about). It runs in
-numpy alone.
+activation, sizes, the task, its arguments, the slots of its rows, SHA-256 of the weights, and how they came about).
+It runs in numpy alone.
+
+A policy plays any task whose rows have the slots of its card: the same names, shapes and units in the same order. Other
+arguments (more agents, say) and other scales, by which a number means another quantity, are allowed and said.
 """
 
 from __future__ import annotations
@@ -10,7 +13,9 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+import warnings
 from collections.abc import Callable, Mapping
+from itertools import zip_longest
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
@@ -18,12 +23,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flockenv.outputs import replacing
-from flockenv.refusals import nearest, shown_path
+from flockenv.refusals import nearest, shown, shown_path
 
 if TYPE_CHECKING:
-    from flockenv.tasks import Task
+    from flockenv.tasks import Layout, Task
 
-__all__ = ["ACTIVATIONS", "MlpPolicy", "Policy", "RandomPolicy", "save_policy"]
+__all__ = ["ACTIVATIONS", "MlpPolicy", "OtherTaskWarning", "Policy", "RandomPolicy", "describe", "save_policy"]
 
 Observation = NDArray[Any] | dict[str, NDArray[Any]]
 State = tuple[NDArray[Any], ...]
@@ -31,6 +36,8 @@ Floats = NDArray[np.float32]
 Layer = tuple[Floats, Floats]
 
 CARD_VERSION = 1
+MOST_SAID = 6
+"""Differences from a card that a warning lists."""
 ONE_THREAD = 2**18
 """Multiplications per matrix product up to which OpenBLAS stays on one thread (its interface/gemm.c).
 
@@ -39,6 +46,10 @@ cores their waiting for each other was measured to cost two hundred times the pr
 
 LARGEST_CARD, LARGEST_WEIGHTS = 8 << 20, 256 << 20
 """Bytes: what is bigger is no policy of ours, and is not read."""
+
+
+class OtherTaskWarning(UserWarning):
+    """A policy is to play a task with other arguments or scales than the one that it was trained on."""
 
 
 @runtime_checkable
@@ -113,6 +124,8 @@ class MlpPolicy:
         self.observation_size = int([*self._hidden, self._head][0][0].shape[0])
         self.action_size = int(self._head[1].shape[0])
         self.seed, self._generator = _seeded(seed)
+        self.differences: tuple[str, ...] = ()
+        """What differs between the task that it plays and the one that it was trained on, a phrase each."""
 
     def __repr__(self) -> str:
         sizes = [self.observation_size, *(len(bias) for _, bias in self._hidden), self.action_size]
@@ -122,16 +135,24 @@ class MlpPolicy:
     def load(cls, path: str | os.PathLike[str], task: Task | None = None, seed: int | None = 0) -> MlpPolicy:
         """Read `X.safetensors` and the card beside it; with a task, check that the policy sees what the task shows.
 
+        Warns with OtherTaskWarning, in one line, where the task has other arguments or scales than the card's;
+        `differences` lists them all.
+
         Raises:
-            ValueError: one line, for a missing, truncated, altered or foreign file or one made for another layout.
+            ValueError: one line, for a missing, truncated, altered or foreign file or one made for other slots.
         """
         path = Path(path)
         try:
             card = _read_card(path.with_suffix(".json"))
             policy = cls(_read_tensors(path, card), card, seed)
-            _check_sizes(policy, task)
+            _check_sizes(policy)
+            policy.differences = () if task is None else _differences(card, task)
         except ValueError as error:
             raise ValueError(f"policy {shown_path(path)}: {error}") from None
+        if policy.differences:
+            said, more = policy.differences[:MOST_SAID], len(policy.differences) - MOST_SAID
+            text = "; ".join([*said, *([f"and {more} more"] if more > 0 else [])])
+            warnings.warn(f"policy {shown_path(path)}: {text}", OtherTaskWarning, stacklevel=2)
         return policy
 
     def predict(
@@ -169,9 +190,9 @@ def save_policy(path: str | os.PathLike[str], tensors: Mapping[str, NDArray[Any]
     Args:
         path: ends in .safetensors; the card gets the same name ending in .json.
         tensors: as MlpPolicy takes them, float32.
-        card: `activation` is needed; `layout` (the digest of the task's observation layout) is what a later load checks
-            against the task; `task`, `steps`, `wall_time_s` and all else is for people. `version`, `sha256`,
-            `observation_size` and `action_size` are filled in.
+        card: `activation` is needed; what `describe` returns of the task is what a later load checks against the task;
+            `steps`, `wall_time_s` and all else is for people. `version`, `sha256`, `observation_size` and
+            `action_size` are filled in.
 
     Raises:
         ValueError: for anything that MlpPolicy.load would refuse; nothing is written then.
@@ -240,22 +261,86 @@ def _read(path: Path, largest: int) -> bytes:
         raise ValueError(f"{path.name!r} cannot be read: {error.strerror}") from None
 
 
-def _check_sizes(policy: MlpPolicy, task: Task | None) -> None:
-    """Compare what the weights are with what the card says and what the task shows."""
-    sizes = {"observation_size": policy.observation_size, "action_size": policy.action_size}
-    for key, size in sizes.items():
+def _check_sizes(policy: MlpPolicy) -> None:
+    """Compare what the weights are with what the card says."""
+    for key, size in {"observation_size": policy.observation_size, "action_size": policy.action_size}.items():
         if policy.card[key] != size:
             raise ValueError(f"the card says {key} = {policy.card[key]!r}, the weights are for {size}")
-    if task is None:
-        return
-    wanted = {"observation_size": task.layout.size, "action_size": task.action_layout.size}
+
+
+def describe(task: Task) -> dict[str, Any]:
+    """Return what a card says of the task that a policy is trained on: name, arguments, and the slots of its rows."""
+    return {
+        "task": task.name,
+        "arguments": task.model_dump(mode="json"),
+        "layout": task.layout.digest,
+        "observation": _slots(task.layout),
+        "action": _slots(task.action_layout),
+    }
+
+
+def _slots(layout: Layout) -> list[dict[str, Any]]:
+    return [
+        {"name": s.name, "shape": list(s.shape), "scale": float(s.scale), "unit": s.unit, "low": float(s.low)}
+        for s in layout.slots
+    ]
+
+
+def _differences(card: Mapping[str, Any], task: Task) -> tuple[str, ...]:
+    """Return what differs between a card and a task, a phrase each; ValueError where the slots do not fit."""
+    if "observation" not in card:
+        return _differences_of_digest(card, task)
+    found = []
+    for kind, layout in (("observation", task.layout), ("action", task.action_layout)):
+        for trained, here in zip_longest(_slots_of(card, kind), _slots(layout)):
+            if trained is None or here is None or any(trained[key] != here[key] for key in ("name", "shape", "unit")):
+                raise ValueError(f"made for {kind} {_slot(trained)}, task {task.name!r} has {_slot(here)} there")
+            found += [
+                f"{kind} {here['name']} has {key} {here[key]:g} {here['unit']}, trained with {trained[key]:g}"
+                for key in ("scale", "low")
+                if trained[key] != here[key]
+            ]
+    if card.get("task") != task.name:
+        return (f"plays task {task.name!r}, trained on {card.get('task')!r}", *found)
+    now = task.model_dump(mode="json")
+    trained_on = card["arguments"] if isinstance(card.get("arguments"), dict) else {}
+    changed = [key for key in now if key in trained_on and trained_on[key] != now[key]]
+    return (*(f"{key} = {shown(now[key])}, trained with {shown(trained_on[key])}" for key in changed), *found)
+
+
+def _differences_of_digest(card: Mapping[str, Any], task: Task) -> tuple[str, ...]:
+    """Return what differs between a card that lists no slots, but has a digest of them, and a task."""
+    sizes = {"observation_size": task.layout.size, "action_size": task.action_layout.size}
     for key, size in sizes.items():
-        if wanted[key] != size:
-            raise ValueError(f"made for {key} = {size}, task {task.name!r} has {wanted[key]}")
-    if policy.card.get("layout") != task.layout.digest:
-        raise ValueError(
-            f"made for observation layout {policy.card.get('layout')!r}, task {task.name!r} has {task.layout.digest!r}"
-        )
+        if card[key] != size:
+            raise ValueError(f"made for {key} = {card[key]}, task {task.name!r} has {size}")
+    if card.get("layout") != task.layout.digest:
+        digests = f"{card.get('layout')!r}, task {task.name!r} has {task.layout.digest!r}"
+        raise ValueError(f"made for observation layout {digests}, and the card does not list its slots")
+    return ("the card does not list the arguments of its task",)
+
+
+_SLOT_TYPES: Mapping[str, type | tuple[type, ...]] = {
+    "name": str, "shape": list, "scale": (int, float), "unit": str, "low": (int, float),
+}  # fmt: skip
+
+
+def _slots_of(card: Mapping[str, Any], kind: str) -> list[dict[str, Any]]:
+    """Return the slots that a card lists; ValueError if it lists anything else."""
+    slots = card.get(kind)
+    if not isinstance(slots, list) or not all(isinstance(slot, dict) for slot in slots):
+        raise ValueError(f"the card's {kind!r} is {shown(slots)}, must be a list of slots")
+    for slot in slots:
+        wrong = next((key for key, kinds in _SLOT_TYPES.items() if not isinstance(slot.get(key), kinds)), None)
+        if wrong is not None:
+            raise ValueError(f"the card's {kind!r} has a slot whose {wrong!r} is {shown(slot.get(wrong))}")
+    return slots
+
+
+def _slot(slot: Mapping[str, Any] | None) -> str:
+    if slot is None:
+        return "nothing"
+    return f"{shown(slot['name'])} of shape {shown(tuple(slot['shape']))} in {shown(slot['unit'])}"
 
 
 def _layers(tensors: Mapping[str, NDArray[Any]]) -> tuple[list[Layer], Layer]:

@@ -59,6 +59,7 @@ def test_the_shipped_policy_is_far_above_random_and_its_card_is_complete(name: s
     recipe = load_experiment(CONFIGS / f"{name}.yaml").ppo.model_dump(mode="json")
     assert card["recipe"]["ppo"] == recipe, "the config beside the weights is the one that made them"
     assert card["recipe"]["command"] == f"python -m agents.ppo configs/{name}.yaml"
+    assert card["arguments"].items() <= task.model_dump(mode="json").items(), "it plays the task that it was trained on"
     assert card["wall_time_s"] < 600 and card["curve"][-1]["mean"] > card["curve"][0]["mean"]
 
 

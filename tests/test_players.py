@@ -23,6 +23,7 @@ TASK: Any = SimpleNamespace(name="toy", layout=SimpleNamespace(size=5), action_l
 # --- by name
 
 
+@pytest.mark.filterwarnings("ignore:.*together = False, trained with True")
 @pytest.mark.parametrize("name", sorted(TASKS))
 def test_every_name_plays_every_task_that_it_is_written_for(name: str) -> None:
     task = TASKS[name]()

@@ -14,7 +14,8 @@ import numpy as np
 import pytest
 from safetensors.numpy import save
 
-from flockenv.policy import MlpPolicy, Policy, RandomPolicy, save_policy
+from flockenv.policy import MlpPolicy, OtherTaskWarning, Policy, RandomPolicy, describe, save_policy
+from flockenv.tasks import TASKS, Corridor, Crossing, Flock, Pursuit, Task
 
 TASK: Any = SimpleNamespace(
     name="toy", layout=SimpleNamespace(size=5, digest="abc"), action_layout=SimpleNamespace(size=2)
@@ -171,6 +172,7 @@ def test_importing_and_using_a_policy_needs_no_torch() -> None:
 # --- files
 
 
+@pytest.mark.filterwarnings("ignore:.*does not list the arguments")
 def test_what_was_saved_is_loaded(saved: Path) -> None:
     policy = MlpPolicy.load(saved, TASK)
     rows = np.random.default_rng(0).normal(size=(9, 5)).astype(np.float32)
@@ -185,6 +187,7 @@ def test_what_was_saved_is_loaded(saved: Path) -> None:
     save_policy(saved, tensors(), policy.card)  # a card that was read can be written again
 
 
+@pytest.mark.filterwarnings("ignore:.*does not list the arguments")
 def test_a_network_without_hidden_layers_is_a_network(tmp_path: Path) -> None:
     save_policy(tmp_path / "linear.safetensors", tensors((5, 2)), CARD)
     assert MlpPolicy.load(tmp_path / "linear.safetensors", TASK).predict(np.ones(5))[0].shape == (2,)
@@ -318,3 +321,111 @@ def test_a_failed_save_leaves_the_old_policy(saved: Path, monkeypatch: pytest.Mo
     with pytest.raises(OSError, match="No space left"):
         save_policy(saved, tensors(seed=1), CARD)
     assert {path.name: path.read_bytes() for path in saved.parent.iterdir()} == before
+
+
+# --- the task of a card, and the task that is played
+
+
+def kept(folder: Path, task: Task, **changes: Any) -> Path:
+    """Save a policy that answers with zeros, and is trained on `task` by its card."""
+    inputs, outputs = task.layout.size, task.action_layout.size
+    zeros = {"action.weight": np.zeros((outputs, inputs), np.float32), "action.bias": np.zeros(outputs, np.float32)}
+    path = folder / "own.safetensors"
+    card = {"activation": "tanh", **describe(task), **changes}
+    save_policy(path, {**zeros, "log_std": np.zeros(outputs, np.float32)}, card)
+    return path
+
+
+@pytest.mark.parametrize("kind", TASKS.values(), ids=TASKS)
+def test_a_policy_plays_the_task_of_its_card_without_a_word(tmp_path: Path, kind: type[Task]) -> None:
+    assert MlpPolicy.load(kept(tmp_path, kind()), kind()).differences == ()
+
+
+@pytest.mark.parametrize(
+    ("trained", "played", "said"),
+    [
+        (Crossing(), Crossing(agents=24), ("agents = 24, trained with 12", "learners = 24, trained with 12")),
+        (Corridor(people=12), Corridor(people=12, dt=0.025), ("dt = 0.025, trained with 0.05",)),
+        (
+            Crossing(),
+            Crossing(max_speed=1.5),
+            ("max_speed = 1.5, trained with 2.0", "observation velocity has scale 1.5 m/s, trained with 2"),
+        ),
+        (
+            Crossing(),
+            Crossing(max_force=9.0),
+            ("max_force = 9.0, trained with 5.0", "action force has scale 9 N, "),
+        ),
+    ],
+)
+def test_other_arguments_and_scales_are_allowed_and_said(
+    tmp_path: Path, trained: Task, played: Task, said: tuple[str, ...]
+) -> None:
+    path = kept(tmp_path, trained)
+    with pytest.warns(OtherTaskWarning) as caught:
+        policy = MlpPolicy.load(path, played)
+    assert len(caught) == 1 and "\n" not in str(caught[0].message)
+    assert str(caught[0].message).startswith(f"policy {str(path)!r}: ")
+    for phrase in said:
+        assert any(found.startswith(phrase) for found in policy.differences), policy.differences
+        assert phrase in str(caught[0].message)
+    action, _ = policy.predict(np.zeros((3, played.layout.size), np.float32))
+    assert action.shape == (3, played.action_layout.size)
+
+
+@pytest.mark.parametrize(
+    ("trained", "played", "said"),
+    [
+        (
+            Crossing(),
+            Crossing(neighbours=4),
+            r"made for observation 'neighbours' of shape \(6, 2\) in 'm', task",
+        ),
+        (
+            Crossing(),
+            Corridor(),
+            "made for observation 'goal' .* task 'corridor' has 'desired_speed' of",
+        ),
+        (Flock(rays=6), Flock(), r"of shape \(6,\) in '.*', task 'flock' has '.*' of shape \(16,\)"),
+    ],
+)
+def test_other_slots_are_refused_by_the_first_that_differs(
+    tmp_path: Path, trained: Task, played: Task, said: str
+) -> None:
+    with pytest.raises(ValueError, match=said) as caught:
+        MlpPolicy.load(kept(tmp_path, trained), played)
+    assert "\n" not in str(caught.value)
+
+
+def test_many_differences_are_a_line_and_all_of_them_are_kept(tmp_path: Path) -> None:
+    changed = Pursuit(evader_force=4.0, capture_distance=0.7, horizon=200, size=25.0, dt=0.025, control_dt=0.05)
+    with pytest.warns(OtherTaskWarning, match="; and .* more$"):
+        policy = MlpPolicy.load(kept(tmp_path, Pursuit()), changed)
+    assert len(policy.differences) > 6
+
+
+def test_a_card_without_slots_fits_its_own_digest_alone(tmp_path: Path) -> None:
+    path = kept(tmp_path, Pursuit())
+    rewrite(path, observation=None, action=None)
+    with pytest.warns(OtherTaskWarning, match="the card does not list the arguments of its task"):
+        MlpPolicy.load(path, Pursuit())
+    with pytest.raises(ValueError, match="and the card does not list its slots"):
+        MlpPolicy.load(path, Pursuit(size=30.0))
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"observation": 3}, "the card's 'observation' is 3, must be a list of slots"),
+        ({"observation": [3]}, r"the card's 'observation' is \[3\], must be a list of slots"),
+        ({"action": "all"}, "the card's 'action' is 'all', must be a list of slots"),
+        ({"action": None}, "the card's 'action' is None, must be a list of slots"),
+        ({"observation": [{"name": "x"}]}, "the card's 'observation' has a slot whose 'shape' is None"),
+        ({"observation": []}, "made for observation nothing, task 'pursuit' has"),
+    ],
+)
+def test_a_card_with_broken_slots_is_refused(tmp_path: Path, change: dict[str, Any], said: str) -> None:
+    path = kept(tmp_path, Pursuit())
+    rewrite(path, **change)
+    with pytest.raises(ValueError, match=said):
+        MlpPolicy.load(path, Pursuit())
