@@ -550,3 +550,21 @@ def test_a_hand_written_player_of_some_tasks_sits_out_the_others() -> None:
         comparison.compare([flock], [orca], 2)
     with pytest.raises(ValueError, match="task 'flock': no player for it; in other tasks alone: orca"):
         comparison.compare([crossing, flock], [orca], 2)
+
+
+def test_a_policy_that_plays_another_task_than_it_was_trained_on_is_told_of(
+    elsewhere: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(comparison, "CONFIGS", elsewhere)
+    Path("crossing.yaml").write_text("task: crossing\narguments: {agents: 16, horizon: 5}")
+    said = run("--tasks", "crossing", "--players", "random,ppo", "--worlds", "2", "--smoke").stdout
+    line = (
+        "crossing: ppo plays another task than it was trained on: horizon = 5, trained with 200; agents = 16, trained"
+    )
+    assert line in " ".join(said.split())
+    players = json.loads(Path("results/results.json").read_text())["tasks"]["crossing"]["players"]
+    assert players["random"]["differs"] == []
+    assert "agents = 16, trained with 12" in players["ppo"]["differs"]
+    assert line in Path("results/table.md").read_text()
+    Path("crossing.yaml").write_text("task: crossing\narguments: {neighbours: 4}")
+    assert "made for observation 'neighbours' of shape (6, 2)" in refused("--tasks", "crossing", "--players", "ppo")

@@ -5,8 +5,13 @@ from __future__ import annotations
 import json
 import re
 from pathlib import Path
+from typing import Any
 
 import pytest
+from typer.testing import CliRunner
+
+from agents import publish
+from flockenv.tasks import TASKS
 
 ROOT = Path(__file__).parent.parent
 README = (ROOT / "README.md").read_text(encoding="utf-8")
@@ -25,8 +30,41 @@ def test_every_file_it_points_to_exists() -> None:
         assert (ROOT / target).exists(), target
 
 
-def test_its_results_are_those_of_the_stored_run() -> None:
+def test_its_tables_are_those_of_the_stored_run() -> None:
+    """If this fails: `python -m agents.compare && python -m agents.publish` makes both anew."""
     results = json.loads((ROOT / "docs" / "results.json").read_text(encoding="utf-8"))
+    assert publish.BLOCK.findall(README) == [publish.tables(results)]
+    assert results["tasks"].keys() == TASKS.keys()
     for task in results["tasks"].values():
         for player in task["players"].values():
             assert f"{player['iqm']:.2f} [{player['ci_low']:.2f}, {player['ci_high']:.2f}]" in README
+
+
+def test_a_comparison_is_published_as_it_is_and_a_quick_or_partial_one_never(tmp_path: Path) -> None:
+    results = json.loads((ROOT / "docs" / "results.json").read_text(encoding="utf-8"))
+    folder, root = tmp_path / "results", tmp_path / "checkout"
+    (root / "docs").mkdir(parents=True)
+    folder.mkdir()
+    readme = publish.BLOCK.sub("old\n", README)
+    (root / "README.md").write_text(readme, encoding="utf-8")
+    (folder / "comparison.png").write_bytes(b"a picture")
+
+    def published(results: dict[str, Any] | None) -> Any:
+        if results is not None:
+            (folder / "results.json").write_text(json.dumps(results), encoding="utf-8")
+        return CliRunner().invoke(publish.app, [str(folder), "--root", str(root)])
+
+    without = {**results, "tasks": {name: task for name, task in results["tasks"].items() if name != "herd"}}
+    for given, said in (
+        (None, "no such file; `python -m agents.compare` writes it"),
+        ({**results, "smoke": True}, "a quick look (--smoke) is not for the documents"),
+        (without, "a part of a comparison, without herd, is not for the documents"),
+    ):
+        refused = published(given)
+        assert refused.exit_code == 2 and said in refused.stderr and refused.stderr.count("\n") == 1
+        assert (root / "README.md").read_text(encoding="utf-8") == readme and not any((root / "docs").iterdir())
+    done = published(results)
+    assert done.exit_code == 0, done.output
+    assert (root / "README.md").read_text(encoding="utf-8") == README
+    assert (root / "docs" / "results.json").read_bytes() == (folder / "results.json").read_bytes()
+    assert (root / "docs" / "comparison.png").read_bytes() == b"a picture"

@@ -1,0 +1,103 @@
+"""Put a comparison into the documents: `python -m agents.compare && python -m agents.publish`.
+
+Copies results.json and comparison.png into docs/ and writes README's tables, so that all of them are of one run.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from agents.compare import ROOT
+from agents.experiment import one_line_errors
+from agents.report import Results, grid
+from flockenv.outputs import replacing
+from flockenv.tasks import TASKS
+
+__all__ = ["BLOCK", "app", "tables"]
+
+BLOCK = re.compile(r"(?<=<!-- python -m agents\.publish -->\n).*?(?=<!-- end -->)", re.DOTALL)
+"""What README has between its two marks."""
+
+SHOWN = ("random", "textbook", "rules", "ppo")
+"""Players with a column of their own; the others, of some tasks each, have a table below."""
+
+app = typer.Typer(add_completion=False, rich_markup_mode=None, pretty_exceptions_enable=False)
+
+
+def tables(results: Results) -> str:
+    """Return README's two tables: the players of every task, and those of some tasks."""
+    header = ["task", *(f"`{name}`" for name in SHOWN), "`ppo` - `rules`, in the same worlds"]
+    rows = [
+        [task, *(_score(about["players"][name]) for name in SHOWN), _lead(about["pairs"]["ppo - rules"])]
+        for task, about in results["tasks"].items()
+    ]
+    others = list(_others(results))
+    return (
+        f"{grid(header, rows)}\n\n{grid(['task', 'player', 'score', '`ppo` - player, in the same worlds'], others)}\n"
+    )
+
+
+def _others(results: Results) -> Iterator[list[str]]:
+    for task, about in results["tasks"].items():
+        for name, player in about["players"].items():
+            if name not in SHOWN:
+                yield [task, f"`{name}`", _score(player), _lead(about["pairs"][f"ppo - {name}"])]
+
+
+def _score(player: Results) -> str:
+    """Return the interquartile mean with its interval, and the success rate where it is not 100 %."""
+    rate = f"{player['success_rate']:.0%}"
+    score = f"{player['iqm']:.2f} [{player['ci_low']:.2f}, {player['ci_high']:.2f}]"
+    return score if rate == "100%" else f"{score}, {rate}"
+
+
+def _lead(pair: Results) -> str:
+    difference = f"{pair['difference']:+.2f} [{pair['ci_low']:+.2f}, {pair['ci_high']:+.2f}]"
+    return f"{difference}, higher in {pair['probability_better']:.0%}"
+
+
+def _checked(folder: Path) -> Results:
+    """Read a comparison; ValueError unless it is a whole one: all tasks, the usual players, not a quick look."""
+    file = folder / "results.json"
+    if not file.is_file():
+        raise ValueError(f"{file}: no such file; `python -m agents.compare` writes it")
+    results: Results = json.loads(file.read_text(encoding="utf-8"))
+    missing = [task for task in TASKS if task not in results["tasks"]] + [
+        n for n in SHOWN if n not in results["players"]
+    ]
+    if results["smoke"] or missing:
+        what = "a quick look (--smoke)" if results["smoke"] else f"a part of a comparison, without {missing[0]},"
+        raise ValueError(f"{file}: {what} is not for the documents")
+    return results
+
+
+@app.command()
+def main(
+    folder: Annotated[Path, typer.Argument(help="where `python -m agents.compare` wrote its files")] = Path("results"),
+    root: Annotated[Path, typer.Option(help="the checkout whose documents are written")] = ROOT,
+) -> None:
+    """Copy a comparison's results and picture into docs/, and write README's tables."""
+    with one_line_errors():
+        results = _checked(folder)
+        readme = (root / "README.md").read_text(encoding="utf-8")
+        if len(BLOCK.findall(readme)) != 1:
+            raise ValueError(f"{root / 'README.md'}: must have one place for the tables, between its two marks")
+        files = {name: (folder / name).read_bytes() for name in ("results.json", "comparison.png")}
+        text = BLOCK.sub(lambda _: tables(results), readme)
+        for path, content in (
+            *((root / "docs" / name, content) for name, content in files.items()),
+            (root / "README.md", text.encode()),
+        ):
+            with replacing(path) as file:
+                file.write(content)
+            typer.echo(f"{path}: written")
+
+
+if __name__ == "__main__":
+    app()
