@@ -177,6 +177,7 @@ def test_a_python_file_that_is_no_player_is_refused_when_it_is_loaded(tmp_path: 
     [
         ("return observation[0, 99]", "IndexError in predict, line 2: index 99 is out of bounds"),
         ("exit(3)", "SystemExit in predict, line 2: 3"),
+        ("exit()", "SystemExit in predict, line 2"),
         ("raise ValueError('two\\nlines')", "ValueError in predict, line 2: two lines"),
         ("return observation", "ValueError in predict: actions of shape (3, 5), must be (3, 2)"),
         ("return None", "ValueError in predict: actions of shape (), must be (3, 2)"),
@@ -192,7 +193,7 @@ def test_a_player_that_fails_while_it_plays_is_one_line_that_names_its_file(
     player = load_player(path, TASK)
     with pytest.raises(ValueError, match="player") as caught:
         player.predict(np.zeros((3, 5), np.float32))
-    assert str(caught.value).startswith(f"player {os.fspath(path)!r}: {said}")
+    assert str(caught.value).startswith(f"player {os.fspath(path)!r}: {said}") and "None" not in str(caught.value)
 
 
 def test_ctrl_c_in_a_player_file_stays_ctrl_c(tmp_path: Path) -> None:

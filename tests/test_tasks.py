@@ -768,7 +768,7 @@ def test_what_lies_beyond_the_last_agent_is_nobodys_business(agents: int, dtype:
     """Where flocks are shown side by side arrays go on; what is there makes no difference."""
     told = []
     for beyond in (0.0, np.nan):
-        world = world_of(Flock(agents=agents, dtype=dtype), worlds=3)
+        world = world_of(Flock(agents=agents, dtype=dtype, settling=0.0), worlds=3)
         own, *near = world._scratch[0][1][-4:-1]
         near.append(world._scratch[0][2][len(NEAR.split(", "))])
         said = []

@@ -149,7 +149,7 @@ def _guarded(path: Path, where: str, function: Callable[..., Any], *arguments: A
         return function(*arguments)
     except (Exception, SystemExit) as error:
         said = f"{type(error).__name__} {where}{_line_in(path, error)}"
-        text = " ".join(str(error).split())
+        text = " ".join(str(error).split()) if error.args != (None,) else ""  # exit() without a code
         raise PlayerError(f"player {shown_path(path)}: {said}{': ' + text if text else ''}") from error
 
 
