@@ -13,6 +13,8 @@ from flockenv.tasks import TASKS, Corridor, Flock, Task
 from flockenv.tasks.lasting import LastingTask
 from flockenv.world import World
 
+pytestmark = pytest.mark.filterwarnings("ignore::flockenv.policy.OtherTaskWarning")
+
 WORLDS = 12
 LASTING = tuple(kind for kind in TASKS.values() if issubclass(kind, LastingTask))
 SKILLED = {"flock": "rules", "corridor": "ppo"}
