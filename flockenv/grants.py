@@ -206,7 +206,7 @@ P = namedtuple("P", {" ".join(names) or "nothing"!r})
 {f'Inner = namedtuple("Inner", {" ".join(recalled)!r})' if recalled else ""}
 
 
-@njit(cache=True, fastmath={{"contract"}}, error_model="numpy", nogil=True, pipeline_class=Whole)
+@njit(fastmath={{"contract"}}, error_model="numpy", nogil=True, pipeline_class=Whole)
 def over(wishes, max_force, time, key, who, heading, numbers, kept, force, share):
     p = P({", ".join(values) or "numbers[0]"})
     o = max_force.dtype.type(0)

@@ -3,7 +3,7 @@
 Closures over compiled functions never hit numba's disk cache, and a cached function does not notice when a law it calls
 has changed. So nothing is cached but generated files: one readable source per combination of laws, in the cache folder,
 whose name is a digest of its own text and of flockenv's sources. A second process compiles nothing; an edited law
-compiles anew, always.
+compiles anew, always. What is read from the cache folder was verified (`private_folder`, `checked_store`).
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ import functools
 import hashlib
 import importlib.util
 import inspect
+import marshal
 import math
 import os
 import re
@@ -19,7 +20,7 @@ import sys
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
-from types import ModuleType
+from types import CodeType, ModuleType
 from typing import Any, TypeVar, cast
 
 import numba
@@ -37,7 +38,10 @@ from flockenv import (
     lowering,
     processor,
 )
-from flockenv.inlining import Inlined
+from flockenv.checked_store import Store
+from flockenv.inlining import Inlined, Whole
+from flockenv.machine_code import MachineCode
+from flockenv.private_folder import first_private, prepared
 from flockenv.startup import numba_before_scipy
 from flockenv.turns import OneAtATime
 
@@ -339,21 +343,23 @@ def wait_for_team(sync: Any, team: int) -> None:
 
 
 def cache_folder() -> Path:
-    """Return the folder of generated sources and their machine code; FLOCKENV_CACHE names another one.
+    """Return the folder of generated sources and their machine code, checked; FLOCKENV_CACHE names another one.
 
-    Falls back to a folder under the system's temporary one where the home folder cannot be written.
+    Falls back to a folder under the system's temporary one where the home folder cannot be written or is not private.
+
+    Raises:
+        OSError: the folder that FLOCKENV_CACHE names can be changed by other users, or none can be written.
     """
     named = os.environ.get("FLOCKENV_CACHE")
-    home = os.environ.get("XDG_CACHE_HOME") or os.environ.get("LOCALAPPDATA") or os.path.expanduser("~/.cache")
-    fallback = Path(tempfile.gettempdir()) / f"flockenv-{os.getuid() if hasattr(os, 'getuid') else 'cache'}"
-    for folder in [Path(named)] if named else [Path(home) / "flockenv", fallback]:
+    if named:
         try:
-            folder.mkdir(parents=True, exist_ok=True)
-            if os.access(folder, os.W_OK):
-                return folder
-        except OSError:
-            continue
-    raise OSError(f"no folder for compiled kernels can be written (tried {named or home}); set FLOCKENV_CACHE")
+            return prepared(Path(named))
+        except OSError as error:
+            reason = error.strerror or error
+            raise type(error)(f"FLOCKENV_CACHE = {named}: refused for compiled kernels: {reason}") from error
+    home = os.environ.get("XDG_CACHE_HOME") or os.environ.get("LOCALAPPDATA") or os.path.expanduser("~/.cache")
+    user = os.geteuid() if hasattr(os, "geteuid") else "cache"
+    return first_private(Path(home) / "flockenv", Path(tempfile.gettempdir()), f"flockenv-{user}")
 
 
 @functools.cache
@@ -390,32 +396,44 @@ def _other_laws(source: str) -> str:
 
 @functools.lru_cache(maxsize=512)
 def load(name: str, source: str) -> ModuleType:
-    """Import a generated source, writing it first if this text was never seen; `name` is a readable prefix.
+    """Import a generated source and find the machine code of its entry points; `name` is a readable prefix.
 
-    The file is written beside its final place and renamed, so that two processes may race.
+    What runs is compiled from `source`, or comes from the checked store; the readable file beside it is never run.
     """
     numba_before_scipy()
     told = f"{source}{laws_digest()}{_other_laws(source)}{processor.REGISTER}"
     digest = hashlib.sha256(told.encode()).hexdigest()[:20]
-    folder = cache_folder()
-    path = folder / f"{name}_{digest}.py"
-    if not path.exists():
-        handle, temporary = tempfile.mkstemp(dir=folder, suffix=".tmp")
-        with os.fdopen(handle, "w", encoding="utf-8") as stream:
-            stream.write(source)
-        os.replace(temporary, path)
+    store = Store(cache_folder())
+    path = store.folder / f"{name}_{digest}.py"
+    store.write_text(path.name, source)
     qualified = f"flockenv_generated.{path.stem}"
     spec = importlib.util.spec_from_file_location(qualified, path)
-    assert spec is not None and spec.loader is not None
+    assert spec is not None
     module = importlib.util.module_from_spec(spec)
     sys.modules[qualified] = module
-    spec.loader.exec_module(module)
-    locks = folder / "locks"
-    locks.mkdir(exist_ok=True)
-    for function in vars(module).values():
-        if hasattr(function, "py_func") and function.py_func.__module__ == qualified:  # an entry point, of this file
-            function._cache = OneAtATime(function._cache, locks / f"{path.stem}_{function.__name__}.lock")
+    exec(_code(store, path, source), vars(module))  # noqa: S102  # made of `source`, by flockenv
+    locks = prepared(store.folder / "locks")
+    for function in _entry_points(module):
+        kept = f"{path.stem}.{function.__name__}"
+        function._cache = OneAtATime(MachineCode(store, kept), locks / f"{kept}.lock")
     return module
+
+
+def _entry_points(module: ModuleType) -> list[Any]:
+    """Return the functions of a generated module that become machine code; the laws in it are parts of these."""
+    own = (v for v in vars(module).values() if getattr(v, "__module__", None) == module.__name__)
+    return [v for v in own if hasattr(v, "py_func") and v._compiler.pipeline_class is Whole]
+
+
+def _code(store: Store, path: Path, source: str) -> CodeType:
+    """Return a source compiled to Python's bytecode, which is kept: it takes 10 to 30 ms for each source."""
+    kept = f"{path.stem}.{sys.implementation.cache_tag}-{sys.flags.optimize}.code"
+    data = store.read(kept)
+    code: CodeType | None = None if data is None else marshal.loads(data)  # noqa: S302  # its digest was verified
+    if code is None or code.co_filename != str(path):  # the folder was moved
+        code = compile(source, path, "exec")
+        store.write(kept, marshal.dumps(code))
+    return code
 
 
 def settled(function: Any) -> Callable[..., Any]:
@@ -439,7 +457,7 @@ from flockenv.inlining import Whole
 from {python.__module__} import {python.__name__} as inner
 
 
-@njit(cache=True, error_model="numpy", nogil=True, _nrt=False, pipeline_class=Whole)
+@njit(error_model="numpy", nogil=True, _nrt=False, pipeline_class=Whole)
 def outer({names}):
     return inner({names})
 '''

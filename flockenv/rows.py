@@ -74,7 +74,7 @@ from flockenv.inlining import Whole
 from {module} import {name}
 
 
-@njit(cache=True, error_model="numpy", nogil=True, pipeline_class=Whole)
+@njit(error_model="numpy", nogil=True, pipeline_class=Whole)
 def over({", ".join(taken)}, out):
     for r in range(out.shape[0]):
         s = {name}({values})

@@ -83,14 +83,14 @@ from flockenv.inlining import Whole
 from {FORMS[form]} import hit_{form}, nearest_{form}
 
 
-@njit(cache=True, error_model="numpy", nogil=True, pipeline_class=Whole)
+@njit(error_model="numpy", nogil=True, pipeline_class=Whole)
 def nearest(table, points, gap, normal):
     for r in range(points.shape[0]):
         gap[r], n = nearest_{form}(table, 0, ({x}))
         {store}
 
 
-@njit(cache=True, error_model="numpy", nogil=True, pipeline_class=Whole)
+@njit(error_model="numpy", nogil=True, pipeline_class=Whole)
 def hits(table, points, ways, clearance, distance):
     for r in range(points.shape[0]):
         distance[r] = hit_{form}(table, 0, ({x}), ({way}), clearance[r])

@@ -52,7 +52,7 @@ def field_source(parts: Parts) -> str:
         accelerate(parts),
         copies(parts),
         f'''
-@njit(cache=True, **FAST)
+@njit(**FAST)
 def field(
     x, v, {parts.frame_argument}alive, key, obstacle_x, obstacle_radius, work, drive, params, times, acc, flow,
     {SHARED},

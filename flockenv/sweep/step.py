@@ -423,7 +423,7 @@ def begin_inner(x_, v_, {parts.frame_argument}key, tick, params, dt, fresh, b, {
 {indented(lines, 16)}
 
 
-@njit(cache=True, **FAST)
+@njit(**FAST)
 def begin(x, v, {parts.frame_argument}key, tick, params, dt, fresh, {SHARED}):
     """Write what goes on inside those of all worlds who are `fresh`, (B, N)."""
     unaliased()
@@ -436,7 +436,7 @@ def begin(x, v, {parts.frame_argument}key, tick, params, dt, fresh, {SHARED}):
 def step(parts: Parts) -> str:
     """Return the source of `step`, the entry point: some worlds, one after another."""
     return f'''
-@njit(cache=True, **FAST)
+@njit(**FAST)
 def step(
     x, v, {parts.frame_argument}alive, tick, key, obstacle_x, obstacle_radius, work, drive, params, dt, count,
     from_world, to_world, rank, team, {SHARED},

@@ -275,7 +275,7 @@ P = namedtuple("P", {" ".join(names)!r})
 Measures = namedtuple("Measures", {" ".join(task.measures)!r})
 
 
-@njit(cache=True, **FAST)
+@njit(**FAST)
 def tell(steps, numbers, last, sums, first, told):
     """Write the metrics of so many worlds, (K, B), from the first on; NaN: no value. Numbers are P's, as doubles."""
     unaliased()
@@ -286,7 +286,7 @@ def tell(steps, numbers, last, sums, first, told):
         metrics(p, {_measures(task, "sums")}, {_measures(task, "last")}, steps[b], told[:, k])
 
 
-@njit(cache=True, **FAST)
+@njit(**FAST)
 def play(
     {worlds}, dt, count, mortal, past, measured, sums, paid,
     canvas, force, x0, v0, alive0, decided, earned, {wide_ones}{NEAR}, near_pos, {SHARED},

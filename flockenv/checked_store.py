@@ -1,0 +1,107 @@
+"""Named pieces of data in a private folder that are found whole, or not at all.
+
+A file begins with a digest of its name and of all that follows. One that was emptied, cut, or in which a bit has
+changed, is never returned: one line on stderr says so, and it is replaced when its data is written again. Data goes to
+a new file, is forced onto the disk, and is renamed into its place, so that no process ever reads half of it.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import os
+import tempfile
+from pathlib import Path
+
+from flockenv.private_folder import read_private, say_once
+
+__all__ = ["Store", "replace_file"]
+
+HEAD = b"flockenv 1\n"
+"""What a file begins with; another number for another form."""
+
+
+class Store:
+    """Data by name, a file each, in a folder that `private_folder.prepared` has returned."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+
+    def read(self, name: str) -> bytes | None:
+        """Return the data of this name, or None if there is none, or not as it was written."""
+        found = self._found(name)
+        if found is None:
+            return None
+        size = len(HEAD) + hashlib.sha256().digest_size
+        data = found[size:]
+        if found[:size] != _head(name, data):
+            self._say_damaged(name)
+            return None
+        return data
+
+    def write(self, name: str, data: bytes) -> None:
+        """Keep data under this name; where it cannot be written, one line on stderr says why."""
+        self._keep(name, _head(name, data) + data)
+
+    def write_text(self, name: str, text: str) -> None:
+        """Keep a text as it is, for people to read; one that was changed is replaced, and one line says so."""
+        wanted, found = text.encode(), self._found(name)
+        if found != wanted:
+            if found is not None:
+                self._say_damaged(name)
+            self._keep(name, wanted)
+
+    def _found(self, name: str) -> bytes | None:
+        """Return what a file contains; None if it is missing, or cannot be trusted or read, which one line says."""
+        path = self.folder / name
+        try:
+            return read_private(path)
+        except FileNotFoundError:
+            return None
+        except OSError as error:
+            say_once(f"{error if error.strerror is None else f'{path}: {error.strerror}'}; made anew")
+            return None
+
+    def _say_damaged(self, name: str) -> None:
+        say_once(f"{self.folder / name}: damaged; made anew")
+
+    def _keep(self, name: str, data: bytes) -> None:
+        """Write a file, or say why it could not be written: nothing but the next start's time depends on it."""
+        try:
+            replace_file(self.folder / name, data)
+        except OSError as error:
+            why = f"({error.strerror or error}); the next process compiles them again"
+            say_once(f"{self.folder}: compiled kernels cannot be kept {why}")
+
+
+def _head(name: str, data: bytes) -> bytes:
+    return HEAD + hashlib.sha256(b"%d " % len(name.encode()) + name.encode() + data).digest()
+
+
+def replace_file(path: Path, data: bytes) -> None:
+    """Write a file (mode 0600) that is there as a whole or not at all, also after a power cut."""
+    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=".", suffix=".tmp")
+    try:
+        with os.fdopen(handle, "wb") as stream:
+            stream.write(data)
+            stream.flush()
+            os.fsync(handle)
+        os.replace(temporary, path)
+    except BaseException:
+        with contextlib.suppress(OSError):
+            os.unlink(temporary)
+        raise
+    _force_names(path.parent)
+
+
+def _force_names(folder: Path) -> None:
+    """Force a folder's list of names onto the disk, where a system can do that."""
+    if os.name != "posix":
+        return
+    handle = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    except OSError:  # some network disks cannot
+        pass
+    finally:
+        os.close(handle)

@@ -1,0 +1,55 @@
+"""Machine code of kernels in a checked store: what numba's own disk cache does, for files that are verified first.
+
+numba's cache unpickles what it finds, and unpickling runs code. This one has numba's methods and one file for every
+combination of argument types and processor. A file is unpickled after its owner and its digest were verified.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import pickle
+import warnings
+from typing import Any
+
+import llvmlite  # type: ignore[import-untyped]
+from numba.core.compiler import CompileResult
+from numba.core.errors import NumbaWarning
+from numba.core.serialize import dumps
+
+from flockenv.checked_store import Store
+
+__all__ = ["MachineCode"]
+
+
+class MachineCode:
+    """A function's compiled forms in a store, under a name that says all that its source depends on."""
+
+    def __init__(self, store: Store, name: str) -> None:
+        self._store, self._name = store, name
+        self.cache_path = str(store.folder)
+
+    def load_overload(self, signature: Any, context: Any) -> Any:
+        """Return the compiled form for these argument types and this processor; None if there is none."""
+        context.refresh()
+        data = self._store.read(self._file(signature, context.codegen()))
+        if data is None:
+            return None
+        kept_signature, parts = pickle.loads(data)  # noqa: S301  # its owner and its digest were verified
+        rebuild: Any = CompileResult._rebuild
+        return rebuild(context, *parts) if kept_signature == signature else None
+
+    def save_overload(self, signature: Any, compiled: Any) -> None:
+        """Keep a compiled form, unless it holds addresses that are right in this process alone."""
+        if compiled.library.has_dynamic_globals or any(not loop.can_cache for loop in compiled.lifted):
+            said = f"{self._name}: holds addresses, so every process compiles it anew"
+            warnings.warn(said, NumbaWarning, stacklevel=2)
+            return
+        pickled: Any = dumps
+        self._store.write(self._file(signature, compiled.codegen), pickled((signature, compiled._reduce())))
+
+    def flush(self) -> None:
+        """Do nothing: what numba compiles again is written over what was there."""
+
+    def _file(self, signature: Any, codegen: Any) -> str:
+        told = repr((signature, codegen.magic_tuple(), llvmlite.__version__))
+        return f"{self._name}.{hashlib.sha256(told.encode()).hexdigest()[:20]}.nbc"

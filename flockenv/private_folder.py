@@ -1,0 +1,187 @@
+"""Folders and files that nobody but this user, or the system's administrator, can change.
+
+Kernels are code: what is read from their folder runs. So the folder is checked before anything is read from it: it is a
+folder and no link, it belongs to this user, no other user can write to it, and no other user can rename or replace any
+of the folders above it. Files are checked after they have been opened, so that none is exchanged in between. Windows
+keeps one temporary folder per user and has no such modes: nothing is checked there.
+"""
+
+from __future__ import annotations
+
+import os
+import stat
+import sys
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+
+__all__ = ["NotPrivateError", "first_private", "prepared", "read_private", "say_once"]
+
+CHECKED = hasattr(os, "geteuid")
+"""True if this system has owners and modes to check."""
+
+_said: set[str] = set()
+
+
+class NotPrivateError(PermissionError):
+    """A folder or file that another user owns or can change; the message is one line."""
+
+
+def say_once(line: str) -> None:
+    """Write one line to stderr, the first time that this process says it."""
+    if line not in _said and sys.stderr is not None:
+        _said.add(line)
+        print(f"flockenv: {line}", file=sys.stderr, flush=True)
+
+
+def prepared(folder: Path) -> Path:
+    """Return a folder that only this user can change; make it (mode 0700) if it is missing.
+
+    Raises:
+        NotPrivateError: the folder, or one above it, is a link or belongs to another user or can be changed by one.
+        OSError: it cannot be made, or not be written.
+    """
+    _make(folder)
+    for place in _way_to(folder):
+        _check_above(place)
+    check_folder(folder)
+    if not os.access(folder, os.W_OK):
+        raise PermissionError(f"{folder}: cannot be written")
+    return folder
+
+
+def check_folder(folder: Path) -> None:
+    """Raise NotPrivateError unless it is a folder, no link, that belongs to this user and no other user can write."""
+    _check(os.lstat(folder), folder, stat.S_ISDIR, "a folder")
+
+
+def read_private(path: Path) -> bytes:
+    """Return what a plain file contains that belongs to this user and that no other user can write.
+
+    It is checked as it was opened: links are not followed, and a pipe is not waited for.
+
+    Raises:
+        NotPrivateError: it is something else.
+        FileNotFoundError: there is none.
+    """
+    flags = [getattr(os, name, 0) for name in ("O_NOFOLLOW", "O_NONBLOCK", "O_CLOEXEC", "O_BINARY")]
+    try:
+        handle = os.open(path, os.O_RDONLY | sum(flags))
+    except OSError as error:
+        if os.path.islink(path):
+            raise NotPrivateError(f"{path}: is a link, must be a plain file") from error
+        raise
+    try:
+        _check(os.fstat(handle), path, stat.S_ISREG, "a plain file")
+        with open(handle, "rb", closefd=False) as stream:
+            return stream.read()
+    finally:
+        os.close(handle)
+
+
+def first_private(home: Path, temporary: Path, name: str) -> Path:
+    """Return the first of these folders that only this user can change: home, temporary/name, a new one beside it.
+
+    A folder that fails its check is passed over, and one line on stderr says why. The new one is called name-XXXXXXXX;
+    later processes find it again.
+
+    Raises:
+        OSError: none of them can be made.
+    """
+    fallback, wrong = temporary / name, []
+    for find, folder in ((prepared, home), (prepared, fallback), (_beside, fallback)):
+        try:
+            found = find(folder)
+        except NotPrivateError as error:
+            wrong.append(str(error))
+        except OSError:
+            continue
+        else:
+            if wrong:
+                say_once(f"{'; '.join(wrong)}; compiled kernels are kept in {found} (FLOCKENV_CACHE names another)")
+            return found
+    raise OSError("; ".join([f"no folder for compiled kernels (tried {home} and {fallback})", *wrong]))
+
+
+def _beside(folder: Path) -> Path:
+    """Return a private folder of the same name and -XXXXXXXX beside one: one that is there, or a new one."""
+    for place in _way_to(folder):
+        _check_above(place)
+    for other in sorted(folder.parent.glob(f"{folder.name}-*")):
+        try:
+            return prepared(other)
+        except OSError:  # of another user
+            continue
+    return prepared(Path(tempfile.mkdtemp(prefix=f"{folder.name}-", dir=folder.parent)))
+
+
+def _make(folder: Path) -> None:
+    """Make a folder for this user alone; missing folders above it can be read by others, but not written."""
+    if not os.path.lexists(folder):
+        for above in reversed(folder.absolute().parents):
+            if not above.exists():
+                above.mkdir(mode=0o755, exist_ok=True)
+        folder.mkdir(mode=0o700, exist_ok=True)
+
+
+def _way_to(folder: Path) -> Iterator[Path]:
+    """Yield every folder and every link that is passed on the way to a folder, without the folder itself."""
+    at, left = Path(folder.absolute().anchor), list(reversed(folder.absolute().parts[1:]))
+    while left:
+        yield at
+        step = at / left.pop()
+        if left and step.is_symlink():
+            yield step
+            target = Path(os.readlink(step))
+            at = Path(target.anchor) if target.is_absolute() else at
+            left += reversed(target.parts[1:] if target.is_absolute() else target.parts)
+        else:
+            at = at.parent if step.name == ".." else step
+
+
+def _check_above(place: Path) -> None:
+    """Raise NotPrivateError if another user can rename or replace what lies in this folder, or replace this link."""
+    if not CHECKED:
+        return
+    found = os.lstat(place)
+    trusted = {0, os.geteuid(), os.stat("/").st_uid}  # the last: a container may show its administrator by a number
+    if found.st_uid not in trusted:
+        raise NotPrivateError(f"{place}: belongs to user {found.st_uid}, who could exchange what lies in it")
+    if not stat.S_ISLNK(found.st_mode) and _others_write(found) and not found.st_mode & stat.S_ISVTX:
+        raise NotPrivateError(f"{place}: other users can exchange what lies in it (mode {_mode(found)}); chmod go-w it")
+
+
+def _check(found: os.stat_result, path: Path, is_kind: object, kind: str) -> None:
+    """Raise NotPrivateError unless it is of this kind, belongs to this user, and no other user can write it."""
+    if stat.S_ISLNK(found.st_mode):
+        raise NotPrivateError(f"{path}: is a link, must be {kind}")
+    if not is_kind(found.st_mode):  # type: ignore[operator]
+        raise NotPrivateError(f"{path}: must be {kind}")
+    if not CHECKED:
+        return
+    if found.st_uid != os.geteuid():
+        raise NotPrivateError(f"{path}: belongs to user {found.st_uid}, must belong to user {os.geteuid()}")
+    if _others_write(found):
+        raise NotPrivateError(f"{path}: other users can write it (mode {_mode(found)}); chmod go-w it")
+
+
+def _others_write(found: os.stat_result) -> bool:
+    """True if users other than its owner can write it; root's group and a group of this user alone do not count."""
+    mode = found.st_mode
+    return bool(mode & stat.S_IWOTH) or (bool(mode & stat.S_IWGRP) and not _of_one(found.st_gid))
+
+
+def _of_one(group: int) -> bool:
+    """True if a group is root's, or holds this user alone and has their name, as many systems make one for each."""
+    import grp  # here: Windows has neither
+    import pwd
+
+    try:
+        me, members = pwd.getpwuid(os.geteuid()), grp.getgrgid(group)
+    except KeyError:
+        return group == 0
+    return group == 0 or (group == me.pw_gid and members.gr_name == me.pw_name and set(members.gr_mem) <= {me.pw_name})
+
+
+def _mode(found: os.stat_result) -> str:
+    return f"{stat.S_IMODE(found.st_mode):04o}"

@@ -1,0 +1,164 @@
+"""A kernel file that was emptied, cut, or in which a bit has changed is noticed, said once, and made anew."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from flockenv.checked_store import Store, replace_file
+from flockenv.private_folder import prepared
+
+USE = """
+import numpy as np
+from flockenv.rows import rows
+from flockenv.steering import seek
+print(rows(seek)(np.ones((3, 2)), np.zeros((3, 2)), 2.0).tobytes().hex())
+"""
+
+SCENE = '''
+from flockenv.config import load_scene
+scene = load_scene("""
+dimension: 2
+space: {kind: torus, size: [9, 9]}
+groups: [{count: 3}]
+effects: [{kind: drag, rate: 1}]
+dt: 0.1
+""")
+print(scene.run(scene.start(0), 5).pos.tobytes().hex())
+'''
+
+
+def run(folder: Path, code: str = USE) -> subprocess.CompletedProcess[str]:
+    environment = {**os.environ, "FLOCKENV_CACHE": str(folder)}
+    return subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, timeout=300)
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
+    """A folder in which all is well, and what a process says that uses it."""
+    folder = tmp_path_factory.mktemp("whole") / "cache"
+    done = run(folder)
+    assert (done.returncode, done.stderr) == (0, "")
+    return folder, done.stdout
+
+
+def flipped(at: float) -> Callable[[bytes], bytes]:
+    """Change the lowest bit of the byte that lies there, as a share of all."""
+
+    def flip(data: bytes) -> bytes:
+        changed = bytearray(data)
+        changed[int(at * (len(data) - 1))] ^= 1
+        return bytes(changed)
+
+    return flip
+
+
+DAMAGE: dict[str, Callable[[bytes], bytes]] = {
+    "emptied": lambda data: b"",
+    "cut to one byte": lambda data: data[:1],
+    "cut in the middle": lambda data: data[: len(data) // 2],
+    "its end is zeros": lambda data: data[: len(data) // 2] + bytes(len(data) - len(data) // 2),
+    "longer": lambda data: data + b"\0",
+    "a bit flipped at the beginning": flipped(0),
+    "a bit flipped in the middle": flipped(0.5),
+    "a bit flipped at the end": flipped(1),
+}
+
+
+@pytest.mark.parametrize("how", ["emptied", "cut in the middle", "a bit flipped in the middle"])
+@pytest.mark.parametrize("kind", ["py", "code", "nbc"])
+def test_a_damaged_file_costs_one_line_and_one_compilation(
+    kind: str, how: str, whole: tuple[Path, str], tmp_path: Path
+) -> None:
+    folder = Path(shutil.copytree(whole[0], tmp_path / "cache"))
+    run(folder)  # bytecode knows where its source lies
+    (path,) = folder.glob(f"*.{kind}")
+    before = path.read_bytes()
+    path.write_bytes(DAMAGE[how](before))
+    first, second = run(folder), run(folder)
+    assert (first.returncode, first.stdout) == (0, whole[1])
+    assert first.stderr == f"flockenv: {path}: damaged; made anew\n"
+    assert (second.returncode, second.stdout, second.stderr) == (0, whole[1], "")
+    assert len(path.read_bytes()) > len(before) / 2
+
+
+@pytest.mark.slow
+def test_a_scene_goes_on_where_every_file_is_damaged(tmp_path: Path) -> None:
+    folder = tmp_path / "cache"
+    before = run(folder, SCENE)
+    files = [path for path in folder.iterdir() if path.is_file()]
+    for k, path in enumerate(files):
+        path.write_bytes(flipped(k / len(files))(path.read_bytes()))
+    first, second = run(folder, SCENE), run(folder, SCENE)
+    assert (first.returncode, first.stdout) == (0, before.stdout)
+    assert sorted(first.stderr.splitlines()) == sorted(f"flockenv: {path}: damaged; made anew" for path in files)
+    assert (second.returncode, second.stdout, second.stderr) == (0, before.stdout, "")
+
+
+@pytest.fixture
+def store(tmp_path: Path) -> Store:
+    store = Store(prepared(tmp_path / "store"))
+    store.write("name", bytes(range(256)) * 3)
+    return store
+
+
+@pytest.mark.parametrize("damage", DAMAGE.values(), ids=DAMAGE.keys())
+def test_damaged_data_is_never_returned(
+    damage: Callable[[bytes], bytes], store: Store, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = store.folder / "name"
+    path.write_bytes(damage(path.read_bytes()))
+    assert store.read("name") is None and store.read("name") is None
+    assert capsys.readouterr().err == f"flockenv: {path}: damaged; made anew\n"
+    store.write("name", b"new")
+    assert store.read("name") == b"new"
+
+
+def test_no_bit_and_no_cut_goes_unnoticed(store: Store) -> None:
+    path = store.folder / "name"
+    data = path.read_bytes()
+    for at in range(len(data)):
+        path.write_bytes(data[:at])
+        assert store.read("name") is None
+    for bit in range(0, 8 * len(data), 11):
+        changed = bytearray(data)
+        changed[bit // 8] ^= 1 << bit % 8
+        path.write_bytes(changed)
+        assert store.read("name") is None
+    path.write_bytes(data)
+    assert store.read("name") == bytes(range(256)) * 3
+
+
+def test_data_is_found_under_its_own_name_alone(store: Store) -> None:
+    shutil.copy(store.folder / "name", store.folder / "other")
+    assert store.read("other") is None
+    assert store.read("missing") is None
+
+
+def test_a_full_disk_is_said_once_and_nothing_is_left(
+    store: Store, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def full(handle: int) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", full)
+    for name in ("name", "other"):
+        store.write(name, b"new")
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1 and "No space left on device" in said and str(store.folder) in said
+    assert [path.name for path in store.folder.iterdir()] == ["name"]
+    assert store.read("name") == bytes(range(256)) * 3
+
+
+def test_a_file_is_replaced_as_a_whole_or_stays(tmp_path: Path) -> None:
+    path = tmp_path / "file"
+    replace_file(path, b"old")
+    with pytest.raises(TypeError):
+        replace_file(path, "text")  # type: ignore[arg-type]
+    assert path.read_bytes() == b"old" and list(tmp_path.iterdir()) == [path]

@@ -1,0 +1,200 @@
+"""Kernels are code: nothing is run from a folder or a file that another user can change."""
+
+from __future__ import annotations
+
+import os
+import stat
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from flockenv.checked_store import Store
+from flockenv.private_folder import NotPrivateError, first_private, prepared, read_private
+
+pytestmark = pytest.mark.skipif(not hasattr(os, "geteuid"), reason="no owners and modes here")
+as_root = pytest.mark.skipif(getattr(os, "geteuid", lambda: 1)() != 0, reason="only root can act as two users")
+
+STRANGER, VICTIM = 54321, 54322
+"""Numbers of users that no system gives away."""
+
+USE = """
+import numpy as np
+from flockenv.rows import rows
+from flockenv.steering import seek
+print(rows(seek)(np.ones((3, 2)), np.zeros((3, 2)), 2.0).tolist())
+"""
+
+FOLDER_AS_VICTIM = f"""
+import os
+from flockenv.kernels import cache_folder
+os.setgid({VICTIM})
+os.setuid({VICTIM})
+found = cache_folder()
+print(found, oct(os.lstat(found).st_mode & 0o7777), os.lstat(found).st_uid)
+"""
+
+
+def run(code: str, **variables: str) -> subprocess.CompletedProcess[str]:
+    environment = {k: v for k, v in os.environ.items() if k not in ("FLOCKENV_CACHE", "XDG_CACHE_HOME")}
+    return subprocess.run(
+        [sys.executable, "-c", code], env={**environment, **variables}, capture_output=True, text=True, timeout=300
+    )
+
+
+def world_writable(folder: Path) -> None:
+    folder.mkdir()
+    folder.chmod(0o777)
+
+
+def of_a_stranger(folder: Path) -> None:
+    folder.mkdir(mode=0o755)
+    os.chown(folder, STRANGER, STRANGER)
+
+
+def a_link(folder: Path) -> None:
+    real = folder.with_name("real")
+    real.mkdir(mode=0o700)
+    folder.symlink_to(real)
+
+
+def a_file(folder: Path) -> None:
+    folder.write_text("")
+
+
+BAD: list[object] = [world_writable, a_link, a_file, pytest.param(of_a_stranger, marks=as_root)]
+
+
+@pytest.mark.parametrize("make", BAD)
+def test_a_folder_that_others_can_change_is_refused_in_one_line(make: Callable[[Path], None], tmp_path: Path) -> None:
+    folder = tmp_path / "cache"
+    make(folder)
+    with pytest.raises(NotPrivateError, match=r"\A[^\n]*cache: .*\Z"):
+        prepared(folder)
+
+
+@pytest.mark.parametrize("make", BAD)
+def test_one_that_is_named_is_refused_and_nothing_in_it_runs(make: Callable[[Path], None], tmp_path: Path) -> None:
+    folder = tmp_path / "cache"
+    make(folder)
+    done = run(USE, FLOCKENV_CACHE=str(folder))
+    assert done.returncode == 1 and done.stdout == ""
+    assert f"FLOCKENV_CACHE = {folder}" in done.stderr.splitlines()[-1]
+    assert make is a_file or not list(folder.iterdir())
+
+
+@pytest.mark.parametrize(("mode", "allowed"), [(0o777, False), (0o1777, True), (0o755, True)])
+def test_folders_above_it_may_be_shared_if_they_are_sticky(mode: int, allowed: bool, tmp_path: Path) -> None:
+    above = tmp_path / "above"
+    above.mkdir()
+    above.chmod(mode)
+    if allowed:
+        assert stat.S_IMODE(prepared(above / "cache").stat().st_mode) == 0o700
+    else:
+        with pytest.raises(NotPrivateError, match=r"above: other users can exchange.*0777"):
+            prepared(above / "cache")
+
+
+@as_root
+def test_a_folder_above_it_that_belongs_to_another_user_is_refused(tmp_path: Path) -> None:
+    of_a_stranger(tmp_path / "above")
+    with pytest.raises(NotPrivateError, match=f"above: belongs to user {STRANGER}"):
+        prepared(tmp_path / "above" / "cache")
+
+
+def test_folders_behind_a_link_on_the_way_are_looked_at_too(tmp_path: Path) -> None:
+    world_writable(tmp_path / "open")
+    (tmp_path / "open" / "home").mkdir(mode=0o700)
+    (tmp_path / "way").symlink_to(tmp_path / "open" / "home")
+    with pytest.raises(NotPrivateError, match="open: other users can exchange"):
+        prepared(tmp_path / "way" / "cache")
+    (tmp_path / "open").chmod(0o755)
+    assert prepared(tmp_path / "way" / "cache").is_dir()
+
+
+def test_folders_that_are_made_are_private_under_any_umask(tmp_path: Path) -> None:
+    before = os.umask(0)
+    try:
+        made = prepared(tmp_path / "new" / "deeper" / "cache")
+        Store(made).write("a", b"data")
+    finally:
+        os.umask(before)
+    modes = [stat.S_IMODE(path.stat().st_mode) for path in (tmp_path / "new", made, made / "a")]
+    assert modes == [0o755, 0o700, 0o600]
+
+
+def linked(path: Path) -> None:
+    (path.parent / "other").write_text("data")
+    path.symlink_to(path.parent / "other")
+
+
+def shared(path: Path) -> None:
+    path.write_text("data")
+    path.chmod(0o666)
+
+
+def strange(path: Path) -> None:
+    path.write_text("data")
+    os.chown(path, STRANGER, STRANGER)
+
+
+def pipe(path: Path) -> None:
+    os.mkfifo(path)
+
+
+@pytest.mark.parametrize("make", [linked, shared, pipe, Path.mkdir, pytest.param(strange, marks=as_root)])
+def test_only_plain_files_of_this_user_are_read(make: Callable[[Path], None], tmp_path: Path) -> None:
+    make(tmp_path / "file")
+    with pytest.raises(NotPrivateError, match="file: "):
+        read_private(tmp_path / "file")
+
+
+def planted(tmp_path: Path, folder: Path) -> Path:
+    """Put what a process has compiled into a folder, with one line more in the source; return what that line writes."""
+    own, marker = tmp_path / "own", tmp_path / "marker"
+    assert run(USE, FLOCKENV_CACHE=str(own)).returncode == 0
+    for source in own.glob("*.py"):
+        (folder / source.name).write_text(f"open({str(marker)!r}, 'w').close()\n{source.read_text()}")
+        (folder / source.name).chmod(0o644)
+    return marker
+
+
+@pytest.mark.parametrize("make", [world_writable, a_link, pytest.param(of_a_stranger, marks=as_root)])
+def test_what_was_planted_in_the_temporary_folder_does_not_run(make: Callable[[Path], None], tmp_path: Path) -> None:
+    temporary = tmp_path / "tmp"
+    temporary.mkdir()
+    temporary.chmod(0o1777)
+    folder = temporary / f"flockenv-{os.geteuid()}"
+    make(folder)
+    marker = planted(tmp_path, folder)
+    first, second = (run(USE, HOME="/dev/null", TMPDIR=str(temporary)) for _ in range(2))
+    assert not marker.exists()
+    assert first.returncode == 0 and first.stdout == second.stdout
+    for done in (first, second):
+        assert len(done.stderr.splitlines()) == 1 and str(folder) in done.stderr
+    fresh = [each for each in temporary.iterdir() if each.name.startswith(folder.name + "-")]
+    assert len(fresh) == 1 and stat.S_IMODE(fresh[0].lstat().st_mode) == 0o700  # the second process found the first's
+
+
+@as_root
+def test_a_user_is_not_given_the_folders_of_another(tmp_path_factory: pytest.TempPathFactory) -> None:
+    with_root = tmp_path_factory.mktemp("shared")
+    for above in (with_root, with_root.parent, with_root.parent.parent):
+        above.chmod(above.stat().st_mode | 0o055)
+    with_root.chmod(0o1777)
+    for name in (f"flockenv-{VICTIM}", f"flockenv-{VICTIM}-0000"):
+        of_a_stranger(with_root / name)
+    first, second = (run(FOLDER_AS_VICTIM, HOME="/dev/null", TMPDIR=str(with_root)) for _ in range(2))
+    found, mode, owner = first.stdout.split()
+    assert first.stdout == second.stdout
+    assert (mode, owner) == ("0o700", str(VICTIM))
+    assert Path(found).parent == with_root and not found.endswith((f"-{VICTIM}", "-0000"))
+
+
+def test_without_any_private_folder_one_line_says_why(tmp_path: Path) -> None:
+    tmp_path.chmod(0o777)
+    with pytest.raises(OSError, match=r"\Ano folder for compiled kernels .*other users can exchange[^\n]*\Z"):
+        first_private(tmp_path / "home" / "flockenv", tmp_path, "flockenv-1")
+    assert not list(tmp_path.glob("flockenv-1-*"))
