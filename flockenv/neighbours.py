@@ -4,6 +4,10 @@ A query sorts the living agents by cell where that pays, and answers with contig
 neighbour list is ever built: a sweep meets every candidate of a range, and keeps those in sight. Brute force is the
 query with one range. Several threads may share one query: each counts and places its own agents, and the order that
 results (by cell, then by number) does not depend on how many they are.
+
+In a space that has no edges the cells divide the bounding box of the agents. One agent far away stretches them until
+all others share one. Where that has happened the cells are folded instead: they are as wide as the reach, there is no
+end to them, and they share a fixed number of places in memory, as the cells of a torus do (`_folded`).
 """
 
 from __future__ import annotations
@@ -47,6 +51,14 @@ AHEAD = 48
 FINEST = 3
 """Cells along x that a reach spans at most: a row is cut finely, so that a block meets few agents out of its reach."""
 
+CROWDED = 8
+"""Stretched cells are folded if so many agents share one, in the mean over agents; 2 do if they are spread evenly."""
+
+FOLDED_ROWS = 4
+"""Rows of folded cells along each further axis: at least 3, so that a row and its two neighbours are three."""
+
+_FARTHEST = 2.0**40  # cells from the origin: up to there rounding is less than the margin, and integers suffice
+
 _MARGIN = 1.001  # cells are this much wider than the reach, so that rounding never hides a neighbour
 
 Ints = NDArray[np.int32]
@@ -73,14 +85,14 @@ def _fit(cells: Any, count: int) -> tuple[int, int, int]:
 
 @kernel
 def _along(length: float, reach: float) -> int:
-    return int(min(max(1.0, math.floor(length / (reach * _MARGIN))), 2.0**20))
+    return int(min(max(1.0, length / (reach * _MARGIN)), 2.0**20))  # bounded first: 1e100 m are no integer of cells
 
 
 @kernel
-def grid_of(lengths: Any, count: int, reach: float, periodic: bool) -> tuple[int, int, int, int]:
+def grid_of(lengths: Any, count: int, reach: float, periodic: bool) -> tuple[int, int, int, int, int]:
     """Choose how many cells each axis gets, at most `count` in all, and how many of them a reach spans along x.
 
-    Zeros where brute force is as good.
+    The last number is 0: these cells are not folded. All are zeros where brute force is as good.
     """
     fine, nx, ny, nz = FINEST, _along(lengths[0], reach / FINEST), _along(lengths[1], reach), 1
     if len(lengths) == 3:
@@ -94,7 +106,7 @@ def grid_of(lengths: Any, count: int, reach: float, periodic: bool) -> tuple[int
         min(wide, ny) < 3 or (len(lengths) == 3 and nz < 3)
     )  # a row and its image would be the same row
     least = 36 if len(lengths) == 2 else 108
-    return (0, 0, 0, 0) if few or wide * ny * nz < least else (nx, ny, nz, fine)
+    return (0, 0, 0, 0, 0) if few or wide * ny * nz < least else (nx, ny, nz, fine, 0)
 
 
 @kernel
@@ -155,7 +167,7 @@ def _part(x: float, low: float, pace: float, count: int) -> Any:
 def divided(
     pos: Any, living: Any, first: int, end: int, lanes: int, rank: int, team: int, sync: Any, bounds: Any, size: Any,
     reach: float, periodic: bool, capacity: int,
-) -> tuple[tuple[int, int, int, int], Any, Any]:  # fmt: skip
+) -> tuple[tuple[int, int, int, int, int], Any, Any]:  # fmt: skip
     """Return the cells as `grid_of` does, the corner of the region they divide, and cells per metre of each axis."""
     low, lengths = region(pos, living, first, end, lanes, rank, team, sync, bounds, size, periodic)
     shape = grid_of(lengths, capacity, reach, periodic)
@@ -199,7 +211,7 @@ def _find_cells(
 def count_cells(
     pos: Any, living: Any, first: int, end: int, lanes: int, rank: int, team: int, sync: Any, bounds: Any, size: Any,
     reach: float, periodic: bool, wraps: bool, capacity: int, cell: Ints, start: Ints, offset: Ints,
-) -> tuple[int, int, int, int]:  # fmt: skip
+) -> tuple[int, int, int, int, int]:  # fmt: skip
     """Find the cell of every agent, and where in sorted order each cell begins; return the cells as grid_of does.
 
     pos: blocks of (D, lanes) m, to be brought into a periodic box first if it `wraps`; living (agents, padded) 0 or 1;
@@ -214,6 +226,78 @@ def count_cells(
     if cells == 0:
         return shape
     _find_cells(pos, living, first, end, lanes, low, pace, size, wraps, shape, cell)
+    tally_cells(cell, first * lanes, end * lanes, rank, cells, offset)
+    begin_cells(rank, team, sync, cells, start, offset)
+    if periodic or not crowded(shape, pace, reach, start):
+        return shape
+    return count_folded(pos, living, first, end, lanes, rank, team, sync, size, reach, capacity, cell, start, offset)
+
+
+@kernel
+def crowded(shape: Any, pace: Any, reach: float, start: Ints) -> bool:
+    """True if cells are much wider than the reach, and many agents share one; pace: cells per metre of each axis."""
+    stretched = 1.0
+    for k in range(len(pace)):
+        stretched *= max(1.0, 1.0 / (pace[k] * reach))
+    if stretched < 2.0:
+        return False
+    cells = np.uint64(shape[0] * shape[1] * shape[2])
+    shared = 0.0
+    for c in range(cells):
+        here = np.float64(start[c + np.uint64(1)] - start[c])
+        shared += here * here
+    return bool(shared > CROWDED * np.float64(start[cells]))
+
+
+@kernel
+def _folded(capacity: int, d: int) -> tuple[int, int, int, int, int]:
+    """Return the shape of folded cells, at most `capacity` in all; its last number is more than 0.
+
+    The cell (x, y, z) of an endless lattice lies in row (y mod ny, z mod nz), at x + fold (y div ny) + twist (z div nz)
+    modulo nx. So neighbours of a cell are found where they would be if every cell had a place of its own; what else
+    lies there is far away, and out of reach. The shifts are irrational parts of a row (the golden ratio; in space,
+    powers of the plastic number), so that a flock of whatever outline covers the places evenly.
+    """
+    nz = FOLDED_ROWS if d == 3 else 1
+    nx = max(1, capacity // (FOLDED_ROWS * nz))
+    return nx, FOLDED_ROWS, nz, 1, max(1, int(nx * (0.5698402909980532 if d == 3 else 0.6180339887498949)))
+
+
+@kernel
+def _twist(shape: Any) -> Any:
+    """Return how far a row is shifted for every turn along the third axis."""
+    return np.int64(shape[0] * 0.7548776662466927)
+
+
+@kernel
+def _lattice(x: float, pace: float) -> Any:
+    """Return in which cell of an endless lattice a coordinate lies."""
+    return np.int64(math.floor(min(max(np.float64(x) * pace, -_FARTHEST), _FARTHEST)))
+
+
+@kernel
+def count_folded(
+    pos: Any, living: Any, first: int, end: int, lanes: int, rank: int, team: int, sync: Any, size: Any, reach: float,
+    capacity: int, cell: Ints, start: Ints, offset: Ints,
+) -> tuple[int, int, int, int, int]:  # fmt: skip
+    """Do as `count_cells` does with folded cells."""
+    d, w, pace = np.uint64(len(size)), np.uint64(lanes), 1.0 / (reach * _MARGIN)
+    shape = _folded(capacity, len(size))
+    for block in range(np.uint64(first), np.uint64(end)):
+        for l in range(w):  # noqa: E741  # a lane
+            at = block * d * w + l
+            x, y, z = _lattice(pos[at], pace), _lattice(pos[at + w], pace), np.int64(0)
+            if len(size) == 3:
+                z = _lattice(pos[at + w + w], pace)
+            row, deep = y % shape[1], z % shape[2]
+            turns, layers = (
+                ((y - row) // shape[1]) % shape[0],
+                ((z - deep) // shape[2]) % shape[0],
+            )  # products stay small
+            x = (x + shape[4] * turns + _twist(shape) * layers) % shape[0]
+            index = (deep * shape[1] + row) * shape[0] + x
+            cell[block * w + l] = np.int32(index) if living[block * w + l] > 0 else np.int32(-1)
+    cells = shape[0] * shape[1] * shape[2]
     tally_cells(cell, first * lanes, end * lanes, rank, cells, offset)
     begin_cells(rank, team, sync, cells, start, offset)
     return shape
@@ -317,7 +401,7 @@ def candidates(
     `at` is a cell at or before that of `first`, from where the search begins. Returns how many ranges there are, and
     the cell of `first`. A range is `wrapped` if it lies around the edge of a periodic box.
     """
-    nx, ny, nz, fine = shape
+    nx, ny, nz, fine, fold = shape
     while start[at + 1] <= first:
         at += 1
     last = at
@@ -330,6 +414,13 @@ def candidates(
         for dy in range(-1, 2):
             yy, zz = y + dy, z + dz
             around = yy < 0 or yy >= ny or zz < 0 or zz >= nz
+            if fold > 0:
+                shift = fold * (yy // ny) + _twist(shape) * (zz // nz)
+                yy, zz, begin = yy % ny, zz % nz, (west + shift) % nx
+                found = _row_ranges(
+                    (zz * ny + yy) * nx, begin, begin + east - west, nx, start, True, False, ranges, found
+                )
+                continue
             if periodic:
                 yy, zz = (yy + ny) % ny, (zz + nz) % nz
             elif around:

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from flockenv.kernels import ask_for, kernel
-from flockenv.neighbours import Ints, begin_cells, cell_of, divided, tally_cells
+from flockenv.neighbours import Ints, begin_cells, cell_of, count_folded, crowded, divided, tally_cells
 
 __all__ = [
     "FAR_FROM_HOME", "HOME", "TILE", "count_from_home", "count_tiles", "find_homes", "order_cells", "order_shared",
@@ -63,7 +63,7 @@ def _tiles(shape: Any, edge: int) -> tuple[int, int, int]:
 def count_tiles(
     pos: Any, living: Any, first: int, end: int, lanes: int, rank: int, team: int, sync: Any, bounds: Any, size: Any,
     reach: float, periodic: bool, wraps: bool, capacity: int, cell: Ints, start: Ints, offset: Ints,
-) -> tuple[int, int, int, int]:  # fmt: skip
+) -> tuple[int, int, int, int, int]:  # fmt: skip
     """Do as `count_cells` does, with tiles in place of cells; return the cells of which they are made."""
     shape, low, pace = divided(
         pos, living, first, end, lanes, rank, team, sync, bounds, size, reach, periodic, capacity
@@ -116,7 +116,7 @@ def count_from_home(
     pos: Any, living: Any, first: int, end: int, lanes: int, rank: int, team: int, sync: Any, bounds: Any, size: Any,
     reach: float, periodic: bool, wraps: bool, capacity: int, homes: Ints, strangers: Ints, tally: Any, cell: Ints,
     start: Ints, offset: Ints,
-) -> tuple[int, int, int, int]:  # fmt: skip
+) -> tuple[int, int, int, int, int]:  # fmt: skip
     """Do as `count_cells` does where all `capacity` agents live and lie in tiles, and list who is not in his own.
 
     The cells such agents are in are written to `strangers` (agents, padded), from this thread's first agent on; how
@@ -162,7 +162,10 @@ def count_from_home(
                 offset[rank, c] += 1
     tally[team + rank] = np.int64(away) - first * lanes
     begin_cells(rank, team, sync, cells, start, offset)
-    return shape
+    if periodic or not crowded(shape, pace, reach, start):
+        return shape
+    tally[team + rank] = (end - first) * lanes  # folded cells are no parts of tiles
+    return count_folded(pos, living, first, end, lanes, rank, team, sync, size, reach, capacity, cell, start, offset)
 
 
 @kernel

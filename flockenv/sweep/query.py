@@ -27,7 +27,7 @@ def query(parts: Parts, fields: list[str], inside: bool = False, may_lie: bool =
     inside: nobody is outside of a periodic box; may_lie: agents may lie in order, `arranged`, and not by number.
     """
     return [
-        f"periodic, shape = {parts.space.periodic}, (0, 0, 0, 0)",
+        f"periodic, shape = {parts.space.periodic}, (0, 0, 0, 0, 0)",
         "wait_for_team(sync, team)  # positions are everybody's",
         *(_counted(parts, inside, may_lie and parts.homely) if parts.sorts else []),
         "nx = shape[0]",
