@@ -5,10 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import Any, ClassVar, Self
 
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel, ConfigDict, ValidationError, model_validator
 from pydantic._internal._model_construction import ModelMetaclass  # it has no public name
 from pydantic_core import PydanticCustomError
 
+from flockenv.magnitudes import check_numbers
 from flockenv.refusals import refusals
 
 __all__ = ["Record", "in_tuples", "keep"]
@@ -76,6 +77,15 @@ class Record(BaseModel, metaclass=_OneLine):
         super().__pydantic_init_subclass__(**options)
         written = vars(cls).get("__annotations__", {})
         written.update(dict.fromkeys(written.keys() & cls.__class_vars__, ClassVar))
+
+    @model_validator(mode="after")
+    def _representable(self) -> Self:
+        """Refuse numbers so large or small that what laws make of them is none; records in it have looked already."""
+        for name in type(self).model_fields:
+            value = getattr(self, name)
+            if isinstance(value, (float, tuple)):
+                check_numbers(value, "float64", name)
+        return self
 
     def __str__(self) -> str:
         return repr(self)

@@ -48,15 +48,22 @@ def refusals(error: ValidationError, model: type[BaseModel], data: object) -> li
     schema = _schema_of(model)
     found: dict[KeyPath, ErrorDetails] = {}
     for detail in error.errors(include_url=False)[:MOST]:
-        found.setdefault(_path_in(data, detail), detail)
+        path = _path_in(data, detail)
+        if path not in found or (_other_member(found[path]) and not _other_member(detail)):
+            found[path] = detail
     blocks = {path[:k] for path in found for k in range(len(path))}
     meant = {_meant(path, schema, data) for path, detail in found.items() if detail["type"] == "extra_forbidden"}
     echoes = {"missing": meant, "too_short": blocks}
     return [
         Refusal(path, _line(path, detail, schema, data))
         for path, detail in found.items()
-        if path not in echoes.get(detail["type"], ())
+        if path not in echoes.get(detail["type"], blocks if _other_member(detail) else ())
     ]
+
+
+def _other_member(detail: ErrorDetails) -> bool:
+    """True if a value is of another type: of a union, the member that it was not meant for says so."""
+    return detail["type"] in ("float_type", "int_type", "string_type", "bool_type")
 
 
 @functools.cache

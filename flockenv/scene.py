@@ -32,6 +32,7 @@ from flockenv.implicit import coupling_of, solve_steps
 from flockenv.integrators import INTEGRATORS, Adaptive, ImplicitEuler, Integrator, SemiImplicitEuler
 from flockenv.integrators.newton import Coupling
 from flockenv.kernels import load
+from flockenv.magnitudes import check_numbers
 from flockenv.neighbours import FEWEST_AGENTS, FEWEST_ARRANGED
 from flockenv.networks import EDGE
 from flockenv.noise import MASK, key_of
@@ -131,6 +132,9 @@ class Scene(Record):
     def _consistent(self) -> Scene:
         """Refuse what no single field can know: dimensions that differ, a reach around the torus, too much memory."""
         self._check_dimensions()
+        check_places(self)
+        if self.dtype == "float32":  # float64's bounds each record has checked for itself
+            check_numbers(self, "float32")
         listed: dict[str, tuple[Effect | Constraint | Member, ...]] = {
             "effects": self.effects, "constraints": self.constraints, "population": self.population,
         }  # fmt: skip
@@ -152,7 +156,6 @@ class Scene(Record):
                 f"GiB, {int(MEMORY_LIMIT / each):,} agents, are allowed"
             )
         self._cells  # noqa: B018  # refuses groups that have no room
-        check_places(self)
         check_dt(self)
         check_contact(self)
         check_lookahead(self)

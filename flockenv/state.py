@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from flockenv.kernels import entry
 from flockenv.lines import zeros
+from flockenv.magnitudes import check_array
 from flockenv.vehicle import face
 
 __all__ = ["COUNTED_BY_KERNELS", "WORK", "Body", "Floats", "Obstacles", "State"]
@@ -170,7 +171,9 @@ class State:
             getattr(self, name)[at] = getattr(other, name)[at]
 
     def with_motion(self, pos: ArrayLike, vel: ArrayLike) -> State:
-        """Return a copy with other positions and velocities, each (B, N, D); refuses other shapes and NaN.
+        """Return a copy with other positions and velocities, each (B, N, D); refuses other shapes, and NaN.
+
+        So it does numbers that are too large to be squared (flockenv.magnitudes).
 
         Where headings are kept, who moves faces along his new velocity.
         """
@@ -179,8 +182,7 @@ class State:
             array = np.asarray(given, float)
             if array.shape != self.shape:
                 raise ValueError(f"{name} has shape {array.shape}, but the state has (B, N, D) = {self.shape}")
-            if not np.isfinite(array).all():
-                raise ValueError(f"{name} holds NaN or infinity at (world, agent, axis) {tuple(_first_bad(array))}")
+            check_array(name, array, target.dtype.name)
             target[...] = array
         new.face()
         return new
@@ -218,10 +220,6 @@ _ARRAYS = (
     "x", "v", "alive", "tick", "key", "obstacle_x", "obstacle_radius", "work", "frame", "inner", "identity", "born",
     "dies",
 )  # fmt: skip
-
-
-def _first_bad(array: Floats) -> list[int]:
-    return [int(k) for k in np.argwhere(~np.isfinite(array))[0]]
 
 
 def blank(

@@ -262,13 +262,6 @@ def test_nobody_leaves_and_nothing_becomes_no_number(dtype: str, widest: int, dt
         assert (state.pos <= 3).all()
 
 
-def test_a_force_too_large_for_its_square_leaves_somebody_at_a_wall() -> None:
-    scene = hall((0.0, -1e308), dt=1e-160)
-    end = scene.step(at(scene, (1.5, 2.0), (0, -1)))
-    assert end.pos[0, 0, 1] in (0, 3)
-    np.testing.assert_array_equal(end.vel[0, 0], (0, 0))
-
-
 def test_who_comes_back_to_the_wall_at_the_end_of_a_step_is_not_rounded_out_of_the_box() -> None:
     rng = np.random.default_rng(2)
     scene = hall(count=2000)

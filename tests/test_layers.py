@@ -30,6 +30,7 @@ LAYERS = (
         "turns",
         "startup",
         "private_folder",
+        "magnitudes",
         "checked_store",
         "machine_code",
         "processor",

@@ -168,8 +168,8 @@ def test_interrupted_it_shows_what_there_is(
 
 @pytest.mark.slow
 def test_a_run_that_ends_early_is_measured_until_then(capsys: pytest.CaptureFixture[str]) -> None:
-    """An attraction of 1e300 N throws somebody out of all numbers."""
-    Path("bad.yaml").write_text(STREAMS.replace("dt:", "effects: [{kind: gravity, acceleration: [1e308, 0]}]\ndt:"))
+    """Such a drag turns every velocity round, and makes it larger, until it is no number."""
+    Path("bad.yaml").write_text(STREAMS.replace("dt:", "effects: [{kind: quadratic_drag, rate: 1.0e+60}]\ndt:"))
     assert main(["measure", "bad.yaml", "--time", "2"]) == 1
     captured = capsys.readouterr()
     assert "what there is until then is shown" in captured.err

@@ -460,14 +460,14 @@ def test_the_worst_agent_of_a_world_sets_its_steps(kind: type[Integrator], jump:
 
 @ADAPTIVE
 def test_who_has_no_finite_force_is_named_and_the_world_stays(kind: type[Integrator], tether: Any) -> None:
-    scene = Scene(groups=(Group(count=20, spawn=HERE),), effects=(tether(stiffness=1e308),), integrator=kind(), dt=0.1)
+    scene = Scene(groups=(Group(count=20, spawn=HERE),), effects=(tether(stiffness=1e100),), integrator=kind(), dt=0.1)
     start = scene.start(0, worlds=2)
     start.x[...], start.v[...] = 0.0, 0.0
-    start.x[0, 1, 17] = 1e3  # its force is infinite
+    start.x[0, 1, 17] = 1e250  # its force is infinite
     with pytest.raises(SimulationDiverged) as caught:
         scene.step(start, out=start)
     assert (caught.value.world, caught.value.agent, caught.value.effect) == (1, 17, "users_tether")
-    assert start.x[0, 1, 17] == 1e3
+    assert start.x[0, 1, 17] == 1e250
     np.testing.assert_array_equal(start.tick, [1, 0])
     np.testing.assert_array_equal(start.work[1], 0)
 

@@ -1,0 +1,70 @@
+"""How large and how small a number may be: such that what laws make of it is a number, too.
+
+Laws multiply: an energy is a mass and two speeds, a force of a spring a stiffness and a length. And they divide: by a
+mass, by the square of a distance. So a product of three numbers must not overflow, nor the reciprocal of a square. Both
+bounds follow from the largest number M of a precision, as powers of ten: its cube root, 1e102 and 1e12, and the
+reciprocal of its square root, 1e-154 and 1e-19 (float64 and float32). 0 is always in range; whether it makes sense is
+said where it is read. Places and velocities, which a simulation itself makes large, may be as large as squares allow:
+1e154 and 1e19.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel
+
+__all__ = ["bounds", "check_array", "check_numbers"]
+
+
+def bounds(precision: str) -> tuple[float, float]:
+    """Return the least and the largest size of a number other than 0, in "float64" or "float32"."""
+    digits = math.log10(float(np.finfo(precision).max))
+    return 10.0 ** -math.floor(digits / 2), 10.0 ** math.floor(digits / 3)
+
+
+BOUNDS = {precision: bounds(precision) for precision in ("float64", "float32")}
+
+
+def said(precision: str) -> str:
+    """Return what is allowed, as a part of a message."""
+    least, most = BOUNDS[precision]
+    more = "; use dtype = float64" if precision == "float32" else ""
+    return f"{precision} computes with numbers from {least:g} to {most:g} in size, and 0{more}"
+
+
+def outliers(value: Any, precision: str, path: str = "") -> Iterator[tuple[str, float]]:
+    """Yield where each number lies that is out of bounds, and the number: in records, tuples and lists however deep."""
+    if isinstance(value, float):
+        least, most = BOUNDS[precision]
+        if value != 0 and not least <= abs(value) <= most:
+            yield path, value
+    elif isinstance(value, (tuple, list)):
+        for k, each in enumerate(value):
+            yield from outliers(each, precision, f"{path}[{k}]")
+    elif isinstance(value, BaseModel):
+        for name in type(value).model_fields:
+            yield from outliers(getattr(value, name), precision, f"{path}.{name}".lstrip("."))
+
+
+def check_numbers(value: Any, precision: str, path: str = "") -> None:
+    """Raise ValueError if a number in it is out of bounds; the message begins with its place."""
+    for place, number in outliers(value, precision, path):
+        raise ValueError(f"{place} = {number:g}: {said(precision)}")
+
+
+def check_array(name: str, array: NDArray[np.float64], precision: str) -> None:
+    """Refuse an array of places or velocities that holds NaN, infinity, or a number too large to be squared."""
+    most = 1 / BOUNDS[precision][0]
+    wrong = ~(np.abs(array) <= most)
+    if wrong.any():
+        at = tuple(int(k) for k in np.argwhere(wrong)[0])
+        found = array[at]
+        what = f"{found:g}" if np.isfinite(found) else "NaN or infinity"
+        raise ValueError(
+            f"{name} holds {what} at (world, agent, axis) {at}; {precision} computes with at most {most:g}"
+        )
