@@ -12,7 +12,7 @@ import os
 import stat
 import sys
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 __all__ = ["NotPrivateError", "first_private", "prepared", "read_private", "say_once"]
@@ -151,11 +151,11 @@ def _check_above(place: Path) -> None:
         raise NotPrivateError(f"{place}: other users can exchange what lies in it (mode {_mode(found)}); chmod go-w it")
 
 
-def _check(found: os.stat_result, path: Path, is_kind: object, kind: str) -> None:
+def _check(found: os.stat_result, path: Path, is_kind: Callable[[int], bool], kind: str) -> None:
     """Raise NotPrivateError unless it is of this kind, belongs to this user, and no other user can write it."""
     if stat.S_ISLNK(found.st_mode):
         raise NotPrivateError(f"{path}: is a link, must be {kind}")
-    if not is_kind(found.st_mode):  # type: ignore[operator]
+    if not is_kind(found.st_mode):
         raise NotPrivateError(f"{path}: must be {kind}")
     if not CHECKED:
         return
