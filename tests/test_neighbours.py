@@ -273,7 +273,7 @@ def test_a_query_writes_into_its_own_arrays_only(size: Any, dimension: int, abse
         again, tile = counted(periodic, count_tiles)
         assert again == shape
         if cells:
-            nx, ny, nz, fine = shape
+            nx, ny, nz, fine, _ = shape
             edge = max(1, int(np.power(TILE * cells / n / fine, 1 / 2 if nz == 1 else 1 / 3) + 0.5))
             along, up = -(-nx // (edge * fine)), -(-ny // edge)
             x, y, z = cell % nx // (edge * fine), cell // nx % ny // edge, cell // nx // ny // edge

@@ -42,7 +42,7 @@ def test_cells_to_which_strangers_came_are_put_in_order(size: Any, empty: float,
         return shape, cell[:n], start
 
     shape, tile, start = counted(count_tiles, x)
-    nx, ny, nz, fine = shape
+    nx, ny, nz, fine, _ = shape
     edge = max(1, round((TILE * nx * ny * nz / n / fine) ** (1 / (2 if nz == 1 else 3))))
     along, up = -(-nx // (edge * fine)), -(-ny // edge)
     assert min(along, up) > 1
