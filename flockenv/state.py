@@ -24,12 +24,12 @@ Floats = NDArray[np.floating[Any]]
 
 WORK = (
     "evaluations", "neighbour_queries", "pairs", "obstacle_tests", "substeps", "rejected_steps", "newton_iterations",
-    "linear_iterations", "impacts", "unsolved", "births", "deaths", "births_refused",
+    "linear_iterations", "impacts", "unsolved", "stopped", "births", "deaths", "births_refused",
 )  # fmt: skip
 """What is counted in State.work: force evaluations, neighbour queries, candidate pairs met, agent-obstacle tests; and,
 by methods that choose their own steps, those accepted and rejected; by methods that solve, their iterations; by
-collisions, impacts, and those that were cut short or left unsolved; of a population, who was born, who died, and who
-was due but found no free slot."""
+collisions, impacts, those that were cut short or left unsolved, and bodies that stopped within a step; of a population,
+births, deaths, and births for which there was no free slot."""
 
 COUNTED_BY_KERNELS = 8
 """How many of these the kernel of a scene counts: the first."""

@@ -15,7 +15,7 @@ from flockenv.kernels import Vec, kernel, law
 from flockenv.neighbours import candidates, count_cells, row_of
 from flockenv.vec import dot, sub
 
-__all__ = ["image", "loaded", "nearby", "vector", "write"]
+__all__ = ["image", "led", "loaded", "near", "nearby", "vector", "write"]
 
 
 @law
@@ -55,6 +55,13 @@ def image(period: Vec, d: Vec) -> Vec:
         return (_shift(d[0], period[0]), _shift(d[1], period[1]))
     else:
         return (_shift(d[0], period[0]), _shift(d[1], period[1]), _shift(d[2], period[2]))
+
+
+@law
+def led(period: Vec, apart: Vec, guess: Vec) -> Vec:
+    """Return how far a step has led a body to a place `apart` from where it was: the image nearest to a guess."""
+    off = sub(apart, guess)
+    return sub(apart, sub(off, image(period, off)))
 
 
 @kernel

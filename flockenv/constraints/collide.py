@@ -6,34 +6,32 @@ from typing import Any
 
 import numpy as np
 
-from flockenv.constraints.broad import image, loaded, nearby, vector, write
+from flockenv.constraints.bodies import DEEP, STOPPED, Bodies, Meetings, Rules, Things, link, take_off, widened
+from flockenv.constraints.broad import image, led, loaded, nearby, vector, write
 from flockenv.constraints.contacts import NEARLY, Contacts, Ends, gather, impacts, part, press
-from flockenv.constraints.events import Bodies, Meetings, Rules, Things, link, play, take_off
+from flockenv.constraints.events import play, together
 from flockenv.constraints.impact import along, surface
+from flockenv.constraints.sweep import may_pass, stop_on_the_way
 from flockenv.kernels import Vec, kernel
 from flockenv.shapes.head import bound_of, shift_of
 from flockenv.vec import add, axis, dot, norm, scale, sub, zero
 
 __all__ = ["COUNTED", "collide"]
 
-COUNTED = 5
-"""Numbers that a call reports: world, agent, meetings in all, impacts, and what was cut short or left unsolved."""
+COUNTED = 6
+"""Numbers that a call reports: world, agent, meetings in all, impacts, what was left unsolved, bodies that stopped."""
 
 UNSOLVED = 0.1
-"""Part of the velocity that a step adds with which somebody may still go into somebody else."""
+"""Part of the velocity that a step adds with which a body may still go into another."""
 
-DEEP = 0.05
-"""Part of a radius by which two may still overlap."""
+ROUNDS = 8
+"""How often those that touch are gathered anew, where moving bodies apart has led them into others."""
+
+DEEPEST = 0.25
+"""Part of a radius by which two may overlap after the single pass of `project`."""
 
 EXACT = 8 * 2.0**-52
 """Rounding of a coordinate, times how large it is."""
-
-
-@kernel
-def _led(period: Vec, apart: Vec, guess: Vec) -> Vec:
-    """Return how far a step has led somebody to a place `apart` from where he was: the image nearest to a guess."""
-    off = sub(apart, guess)
-    return sub(apart, sub(off, image(period, off)))
 
 
 @kernel
@@ -61,7 +59,7 @@ def _board(
         write(before, i, was)
         write(ends.pos, i, done)
         write(ends.vel, i, now)
-        moved = _led(period, sub(done, begun), scale(add(was, now), 0.5 * seconds))
+        moved = led(period, sub(done, begun), scale(add(was, now), 0.5 * seconds))
         take_off(period, bodies, i, seconds, moved, was, now)
         if bodies.living[i] > 0 and bodies.light[i] > 0.0:
             for k in range(len(period)):
@@ -73,8 +71,8 @@ def _board(
 
 @kernel
 def _with_obstacles(
-    period: Vec, bodies: Bodies, meetings: Meetings, things: Things, at: Any, seconds: float, touch: float, ahead: bool,
-    count: int,
+    period: Vec, bodies: Bodies, meetings: Meetings, things: Things, at: Any, reach: Any, seconds: float, touch: float,
+    ahead: bool, count: int,
 ) -> int:  # fmt: skip
     """Add who may touch which obstacle: within the step, or at its end; return how many there are."""
     capacity = meetings.who.shape[0]
@@ -90,7 +88,7 @@ def _with_obstacles(
         for i in range(bodies.living.shape[0]):
             if bodies.living[i] > 0 and bodies.light[i] > 0.0:
                 y = image(period, sub(vector(period, at, i), place))
-                room = bodies.radius[i] + touch + way + (bodies.reach[i] if ahead else NEARLY * bodies.radius[i])
+                room = bodies.radius[i] + touch + way + reach[i]
                 off, far = sub(y, middle), radius + room
                 if bounded and not dot(off, off) <= far * far:
                     continue  # it is not even near the circle or sphere around it
@@ -125,6 +123,7 @@ def collide(
     bodies: Bodies, meetings: Meetings, things: Things, contacts: Contacts, ends: Ends, before: Any, reach: Any,
     grid: Any, order: Any, cell: Any, start: Any, offset: Any, bounds: Any, sync: Any, ranges: Any, rules: Rules,
     in_time: bool, once: bool, rounds: int, spread: float, first: int, end: int, work: Any, at_work: int, report: Any,
+    lost: Any,
 ) -> int:  # fmt: skip
     """Mend the steps of worlds [first, end) that led from x0, v0 to x, v (D, B, N), in place.
 
@@ -133,39 +132,41 @@ def collide(
     that there was no room for, with the number of its meetings in report[2]: nothing of it is written; else -1.
     """
     scratch = (grid, order, cell, start, offset, bounds, sync, ranges)
-    report[0], report[1], report[3], report[4] = -1, -1, 0, 0
+    report[0], report[1], report[3], report[4], report[5] = -1, -1, 0, 0, 0
+    for k in range(lost.shape[0]):
+        lost[k] = 0.0
     for b in range(first, end):
-        impacts_before, unsolved_before = report[3], report[4]
+        impacts_before, unsolved_before, stopped_before = report[3], report[4], lost[2]
         far, fast, hard, mean = _board(period, x0, v0, x, v, alive, b, bodies, ends, before, rules.seconds)
         if not (far < np.inf and fast < np.inf):
             continue
         began = (tick[b] - 1) * rules.seconds
         _obstacles(period, things, obstacle_x, obstacle_radius, b, began, tick[b] * rules.seconds)
         told = Rules(
-            rules.seconds, rules.restitution, rules.friction, rules.sticky, rules.most, rules.anew,
-            rules.touch + EXACT * far, rules.pairs,
+            rules.seconds, rules.restitution, rules.friction, rules.sticky, rules.most, rules.again,
+            rules.touch + EXACT * far, rules.pairs, not in_time,
         )  # fmt: skip
-        count = _meetings(period, bodies, meetings, things, ends, told, reach, in_time, scratch)
+        passing = not in_time and may_pass(period, bodies, things, ends, rules.seconds, False)
+        ahead = in_time or passing or not once
+        count = _meetings(period, bodies, meetings, things, ends, told, reach, ahead, not in_time, scratch)
         if in_time and count <= meetings.who.shape[0]:
-            count = _fly(period, bodies, meetings, things, ends, told, before, count, report)
+            count = _fly(period, bodies, meetings, things, ends, told, before, count, report, lost)
+        if count <= meetings.who.shape[0]:
+            if in_time and _goes_round(period, fast * rules.seconds):
+                report[4] += 1
+            mean = scale(mean, -1.0 / norm(mean)) if norm(mean) > 1e-9 * hard * x.shape[2] else axis(mean, 0)
+            count = _at_the_end(
+                period, bodies, meetings, things, contacts, ends, before, reach, told, in_time, once, passing, rounds,
+                fast, hard, mean, spread, count, scratch, lost, report,
+            )  # fmt: skip
         report[2] = count
         if count > meetings.who.shape[0]:
+            report[3], report[4], lost[2] = impacts_before, unsolved_before, stopped_before
             return b
-        if in_time and _goes_round(period, fast * rules.seconds):
-            report[4] += 1
-        mean = scale(mean, -1.0 / norm(mean)) if norm(mean) > 1e-9 * hard * x.shape[2] else axis(mean, 0)
-        slow = 1e-3 * hard * rules.seconds + 1e-12 * fast
-        touching = gather(
-            period, bodies, meetings, things, ends, contacts, rules.seconds, mean, told.touch, slow, in_time, count
-        )
-        if touching > 0:
-            _at_once(
-                period, bodies, things, contacts, ends, before, told, in_time, once, rounds, fast, hard, spread,
-                touching, report,
-            )  # fmt: skip
         work[b, 1] += 1 if rules.pairs else 0
         work[b, at_work] += report[3] - impacts_before
         work[b, at_work + 1] += report[4] - unsolved_before
+        work[b, at_work + 2] += np.int64(lost[2] - stopped_before)
         bad = _leave(period, x, v, b, ends, bodies)
         if bad >= 0 and report[0] < 0:
             report[0], report[1] = b, bad
@@ -175,20 +176,26 @@ def collide(
 @kernel
 def _meetings(
     period: Vec, bodies: Bodies, meetings: Meetings, things: Things, ends: Ends, rules: Rules, reach: Any,
-    in_time: bool, scratch: Any,
+    ahead: bool, nearly: bool, scratch: Any,
 ) -> int:  # fmt: skip
-    """Find who may meet what within the step, or nearly touches at its end; return how many, room for them or not."""
+    """Find what may meet within the step (ahead), or touches at its end; return how many, room for them or not.
+
+    nearly: True if two count that are a tenth of their radii apart.
+    """
     grid, order, cell, start, offset, bounds, sync, ranges = scratch
     n, count = bodies.living.shape[0], 0
-    where = bodies.start if in_time else ends.pos
+    where = bodies.start if ahead else ends.pos
+    if ahead:
+        _reach_further(bodies)
     for i in range(n):
-        reach[i] = bodies.reach[i] if in_time else rules.touch + NEARLY * bodies.radius[i]
+        bodies.first[i] = -1
+        reach[i] = (bodies.reach[i] if ahead else 0.0) + (rules.touch + NEARLY * bodies.radius[i] if nearly else 0.0)
     if rules.pairs:
         count = nearby(
             period, where, bodies.living, bodies.radius, reach, n, grid, order, cell, start, offset, bounds, sync,
             ranges, meetings.who, meetings.other,
         )  # fmt: skip
-    count = _with_obstacles(period, bodies, meetings, things, where, rules.seconds, rules.touch, in_time, count)
+    count = _with_obstacles(period, bodies, meetings, things, where, reach, rules.seconds, rules.touch, ahead, count)
     if count <= meetings.who.shape[0]:
         for c in range(count):
             link(bodies, meetings, c)
@@ -196,12 +203,24 @@ def _meetings(
 
 
 @kernel
+def _reach_further(bodies: Bodies) -> None:
+    """Let all bodies reach further than they go, so that few that are hit come where they were not expected."""
+    total, present = 0.0, 0
+    for i in range(bodies.living.shape[0]):
+        if bodies.living[i] > 0:
+            total, present = total + bodies.reach[i], present + 1
+    for i in range(bodies.living.shape[0]):
+        bodies.reach[i] = max(1.25 * bodies.reach[i], 1.5 * total / max(present, 1))
+
+
+@kernel
 def _fly(
     period: Vec, bodies: Bodies, meetings: Meetings, things: Things, ends: Ends, rules: Rules, before: Any, count: int,
-    report: Any,
+    report: Any, lost: Any,
 ) -> int:  # fmt: skip
-    """Let everybody fly through the step; return how many meetings there are, room for them or not."""
-    some, cut, count = play(period, bodies, meetings, things, rules, count, before)
+    """Move all bodies through the step; return how many meetings there are, room for them or not."""
+    together(period, bodies, meetings, things, rules, count, before)
+    some, cut, count = play(period, bodies, meetings, things, rules, count, lost)
     if count <= meetings.who.shape[0]:
         report[3] += some
         report[4] += cut
@@ -217,40 +236,148 @@ def _land(period: Vec, bodies: Bodies, ends: Ends, i: int, seconds: float) -> No
     left = seconds - bodies.since[i]
     v, a = vector(period, bodies.vel, i), vector(period, bodies.acc, i)
     write(ends.pos, i, along(vector(period, bodies.at, i), v, a, left))
-    write(ends.vel, i, add(add(v, scale(a, left)), vector(period, bodies.excess, i)))
+    now = zero(v) if bodies.moved[i] == STOPPED else add(v, scale(a, left))
+    write(ends.vel, i, add(now, vector(period, bodies.excess, i)))
 
 
 @kernel
-def _at_once(
-    period: Vec, bodies: Bodies, things: Things, contacts: Contacts, ends: Ends, before: Any, rules: Rules,
-    in_time: bool, once: bool, rounds: int, fast: float, hard: float, spread: float, count: int, report: Any,
-) -> None:  # fmt: skip
-    """Change velocities until nobody goes into anybody, and places until nobody overlaps; report if somebody does."""
-    passes, seconds, n = 1 if once else rounds, rules.seconds, bodies.living.shape[0]
+def _at_the_end(
+    period: Vec, bodies: Bodies, meetings: Meetings, things: Things, contacts: Contacts, ends: Ends, before: Any,
+    reach: Any, rules: Rules, in_time: bool, once: bool, passing: bool, rounds: int, fast: float, hard: float, up: Vec,
+    spread: float, count: int, scratch: Any, lost: Any, report: Any,
+) -> int:  # fmt: skip
+    """Solve all contacts of the step's end, velocities, then places; return how many meetings there are.
+
+    up: against the mean acceleration.
+    """
     least = 1e-12 * fast
-    gain = 1e-6 * hard * seconds + least
+    slow, gain = 1e-3 * hard * rules.seconds + least, 1e-6 * hard * rules.seconds + least
+    left, deep = 0.0, 0.0
+    touching = gather(
+        period, bodies, meetings, things, ends, contacts, rules.seconds, up, rules.touch, slow,
+        rules.restitution, in_time, passing, count,
+    )  # fmt: skip
+    if touching > 0:
+        left = _velocities(
+            period, bodies, things, contacts, ends, before, rules, in_time, once, rounds, hard, least, gain, touching,
+            report,
+        )  # fmt: skip
+    turned = touching > 0 and not in_time and not once and _moved_far(period, bodies, ends)
+    again = passing or (turned and may_pass(period, bodies, things, ends, rules.seconds, True))
+    if again:
+        count = stop_on_the_way(period, bodies, meetings, things, ends, rules, count, lost)
+    elif turned:
+        count = _wider(period, bodies, meetings, things, ends, rules, count)
+    if (touching > 0 or again) and count <= meetings.who.shape[0]:
+        count, deep = _places(
+            period, bodies, meetings, things, contacts, ends, reach, rules, once, again or turned, rounds, up, spread,
+            touching, count, scratch,
+        )  # fmt: skip
+    limit = DEEP * _widest(bodies) + 1e3 * rules.touch
+    unsolved = left > UNSOLVED * hard * rules.seconds + 1e3 * gain or deep > limit
+    report[4] += 1 if unsolved and not once else 0
+    return count
+
+
+@kernel
+def _velocities(
+    period: Vec, bodies: Bodies, things: Things, contacts: Contacts, ends: Ends, before: Any, rules: Rules,
+    in_time: bool, once: bool, rounds: int, hard: float, least: float, gain: float, count: int, report: Any,
+) -> float:  # fmt: skip
+    """Change velocities until no body goes into another; return the last pass's fastest change, m/s."""
+    passes, seconds, n = 1 if once else rounds, rules.seconds, bodies.living.shape[0]
     if not in_time:
         for i in range(n):  # what the step has added comes after the impacts; what is slower than it does not bounce
             write(bodies.vel, i, vector(period, ends.vel, i))
             write(bodies.acc, i, sub(vector(period, ends.vel, i), vector(period, before, i)))
-        report[3] += impacts(
+        done, left = impacts(
             period, bodies, things, contacts, before, rules.restitution, rules.friction, rules.sticky, passes,
             hard * seconds + least, count,
         )  # fmt: skip
+        report[3] += done
+        report[4] += 1 if left > 0 else 0
         for i in range(n):
             write(ends.vel, i, add(vector(period, before, i), vector(period, bodies.acc, i)))
-    left = press(period, bodies, things, contacts, ends.vel, rules.friction, rules.sticky, passes, gain, count)
+    worst = press(period, bodies, things, contacts, ends.vel, rules.friction, rules.sticky, passes, gain, count)
     if not in_time and not once:
-        for i in range(n):  # whom contacts have changed goes from where he was as fast as he is now, under every method
+        for i in range(n):
+            write(bodies.at, i, vector(period, ends.pos, i))
+        for i in range(n):  # what contacts have changed goes from its start as fast as it is now, under every method
             now = vector(period, ends.vel, i)
             more = sub(now, vector(period, bodies.vel, i))
             if dot(more, more) > 0.0:
                 write(ends.pos, i, add(vector(period, bodies.start, i), scale(now, seconds)))
-    deep, widest = part(period, bodies, things, ends, seconds, passes, rules.touch, spread, contacts, count), 0.0
-    for i in range(n):
+    return float(worst)
+
+
+@kernel
+def _places(
+    period: Vec, bodies: Bodies, meetings: Meetings, things: Things, contacts: Contacts, ends: Ends, reach: Any,
+    rules: Rules, once: bool, anew: bool, rounds: int, up: Vec, spread: float, touching: int, count: int, scratch: Any,
+) -> tuple[int, float]:  # fmt: skip
+    """Move apart those that overlap; return how many meetings there are, and the last pass's farthest move, m.
+
+    anew: True if bodies have moved since those that touch were gathered. That is done again, too, where bodies are
+    moved so far that they may overlap others; two that part slowly on purpose are moved once.
+    """
+    deep = 0.0
+    for turn in range(ROUNDS):
+        if turn > 0:
+            count = _meetings(period, bodies, meetings, things, ends, rules, reach, False, True, scratch)
+        if count > meetings.who.shape[0]:
+            return count, deep
+        if turn > 0 or anew:
+            touching = gather(
+                period, bodies, meetings, things, ends, contacts, rules.seconds, up, rules.touch, 0.0,
+                rules.restitution, False, False, count,
+            )  # fmt: skip
+        for i in range(bodies.living.shape[0]):
+            write(bodies.at, i, vector(period, ends.pos, i))
+        deep = part(
+            period, bodies, things, ends, rules.seconds, 1 if once else rounds, rules.touch, spread, contacts, touching
+        )
+        if once and deep > DEEPEST * _widest(bodies):
+            deep = part(period, bodies, things, ends, rules.seconds, rounds, rules.touch, spread, contacts, touching)
+        if once or spread < np.inf or not _moved_far(period, bodies, ends):
+            break
+    return count, deep
+
+
+@kernel
+def _wider(
+    period: Vec, bodies: Bodies, meetings: Meetings, things: Things, ends: Ends, rules: Rules, count: int
+) -> int:
+    """Add meetings of bodies that impacts made so fast that they end in what they were not near; return how many."""
+    for i in range(bodies.living.shape[0]):
+        moved = sub(vector(period, ends.pos, i), vector(period, bodies.start, i))
+        moved = led(period, moved, scale(vector(period, ends.vel, i), rules.seconds))
+        far = norm(moved) > bodies.reach[i] + NEARLY * bodies.radius[i]
+        if far and bodies.living[i] > 0 and bodies.light[i] > 0.0:
+            bodies.since[i] = 0.0
+            write(bodies.at, i, vector(period, bodies.start, i))
+            write(bodies.vel, i, scale(moved, 1.0 / rules.seconds))
+            write(bodies.acc, i, zero(period))
+            count = widened(period, bodies, meetings, things, rules, i, 0.0, count)
+    return count
+
+
+@kernel
+def _widest(bodies: Bodies) -> float:
+    """Return the largest radius, m."""
+    widest = 0.0
+    for i in range(bodies.living.shape[0]):
         widest = max(widest, bodies.radius[i])
-    if not once and (left > UNSOLVED * hard * seconds + 1e3 * gain or deep > DEEP * widest + 1e3 * rules.touch):
-        report[4] += 1
+    return float(widest)
+
+
+@kernel
+def _moved_far(period: Vec, bodies: Bodies, ends: Ends) -> bool:
+    """True if a body was moved so far from bodies.at that it may overlap one that it was not near by DEEP."""
+    for i in range(bodies.living.shape[0]):
+        d = sub(vector(period, ends.pos, i), vector(period, bodies.at, i))
+        if bodies.living[i] > 0 and norm(d) > 0.5 * DEEP * bodies.radius[i]:
+            return True
+    return False
 
 
 @kernel

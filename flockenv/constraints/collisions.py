@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from flockenv.constraints.base import Constraint, Settler
+from flockenv.constraints.bodies import Bodies, Meetings, Rules, Things
 from flockenv.constraints.collide import COUNTED, collide
 from flockenv.constraints.contacts import Contacts, Ends
-from flockenv.constraints.events import Bodies, Meetings, Rules, Things
 from flockenv.constraints.impact import POINT
 from flockenv.effects.base import ties
 from flockenv.kernels import entry
@@ -25,29 +25,31 @@ __all__ = ["Collisions", "UnsolvedContactsWarning"]
 
 
 class UnsolvedContactsWarning(RuntimeWarning):
-    """More impacts in a step than are allowed, contacts that passes have not solved, too long a way round a torus."""
+    """More impacts in a step than are allowed, contacts that passes have not solved, too long a path round a torus."""
 
 
 class Collisions(Constraint):
     """Bodies are solid: discs or balls that do not go through obstacles, the walls of a box, or each other.
 
-    Where within a step somebody meets something is found on the parabola that the method has made of the step, exactly
-    under constant forces, for bodies of any speed. What happens then is a matter of `response`:
+    Within a step, the moment of an impact is found on the parabola that the method has made of the step, exactly under
+    constant forces, for bodies of any speed. The responses:
 
-    - "earliest": the earliest impact of all happens, those two go on from there, their further ways are looked at anew,
-      and so on; nothing is missed, and an elastic ball keeps its energy.
-    - "back_up": everybody goes back to his first impact with others, responds, and flies on; what further way he then
-      has is looked at with obstacles only.
-    - "impulses": nothing happens within the step; at its end all who touch give each other impulses, in passes, until
-      nobody goes into anybody. For heaps and crowds; who is fast and small may pass through what is thin.
-    - "project": one such pass, and who is inside is put on the surface. The cheapest, and no more than that: it loses
-      energy at every impact, and friction holds nobody in place.
+    - "earliest": the earliest impact of all happens, both bodies go on from there, their further paths are searched
+      anew, and so on; nothing is missed, and an elastic ball keeps its energy.
+    - "back_up": the same with at most ten impacts of the same two bodies in a step, whatever `most` is.
+    - "impulses": at the end of a step all bodies in touch exchange impulses, in passes, until none goes into another.
+      For heaps and crowds. A body whose path leads into something stops there, and has its impact in the next step.
+    - "project": one such pass, and a body inside something is put on the surface. The cheapest; it loses energy at
+      every impact, and friction holds no body in place.
 
-    All end with passes over who is near then, so that none of them overlap; who is moved further than a tenth of his
-    radius by them may end in somebody who was not near (docs/collisions.md says when: steps of 1/400 s help heaps that
-    a wall drives). Restitution e is speed after over speed before, across the surface; friction is Coulomb's. A ball
-    dropped from h bounces to e^2 h, and is at rest after sqrt(2 h / g) (1 + e) / (1 - e); a body sticks on an incline
-    up to tan(angle) = friction. Bodies do not spin.
+    No body passes another under any response. Where the impacts of a step run out, the two bodies stop: they keep
+    their velocities and do not move for the rest of the step, and what runs into them stops, too. So time is lost, and
+    neither energy nor momentum; "stopped" counts such bodies, and a warning says how much time. Two that meet slower
+    than a step's acceleration changes velocity come to rest instead; the warning says how much energy that took.
+
+    All responses end with passes over bodies that are near, so that none overlap. Restitution e is speed after over
+    speed before, across the surface; friction is Coulomb's. A ball dropped from h bounces to e^2 h, and is at rest
+    after sqrt(2 h / g) (1 + e) / (1 - e); a body sticks on an incline up to tan(angle) = friction. Bodies do not spin.
     """
 
     kind: Literal["collisions"] = "collisions"
@@ -59,13 +61,15 @@ class Collisions(Constraint):
     restitution: float = Field(default=0.5, ge=0, le=1, description="e: 0 = soft, 1 = elastic")
     friction: float = Field(default=0.0, ge=0, description="Coulomb's coefficient, along surfaces")
     sticky: bool = Field(default=False, description="do those stay together who touch (glue)?")
-    most: int = Field(default=100, ge=1, description="impacts of the same two in one step; then they rest")
+    most: int = Field(default=100, ge=1, description="impacts of the same two in one step; then they stop")
     passes: int = Field(default=200, ge=1, description="passes over all contacts at the end of a step")
     part_speed: float | None = Field(
         default=None, gt=0, description="m/s, how fast those who overlap are moved apart; none = at once"
     )
     capacity: ClassVar[int] = 4
     """Meetings per agent that there is room for at first."""
+    again: ClassVar[int] = 10
+    """Impacts of the same two bodies in one step under `back_up`."""
 
     def check(self, scene: Any) -> None:
         """Refuse what cannot be right: twice the same constraint, and bodies as wide as a periodic box."""
@@ -105,7 +109,7 @@ class _Settler:
         self.bodies = Bodies(
             start=start, at=at, vel=vel, acc=acc, free=free, excess=excess, since=np.zeros(n), reach=np.zeros(n),
             radius=np.asarray(body.radius, np.float64), light=light, living=np.zeros(n, np.int64),
-            moved=np.zeros(n, np.int64), first=np.full(n, -1),
+            moved=np.zeros(n, np.int64), leans=np.zeros(n, np.int64), first=np.full(n, -1),
         )  # fmt: skip
         self.ends = Ends(np.zeros((n, d)), np.zeros((n, d)), ties(n, d))
         self.before, self.reach = np.zeros((n, d)), np.zeros(n)
@@ -114,7 +118,7 @@ class _Settler:
             np.zeros((1, n), np.int32), np.zeros((1, 6)), np.zeros(8, np.int64), np.zeros((MAX_RANGES, 3), np.int64),
         )  # fmt: skip
         self.things = self._things()
-        self.report = np.zeros(COUNTED, np.int64)
+        self.report, self.lost = np.zeros(COUNTED, np.int64), np.zeros(4)
         self._make_room(record.capacity * n + 64)
 
     def _make_room(self, places: int) -> None:
@@ -126,7 +130,8 @@ class _Settler:
 
         self.meetings = Meetings(
             who=whole(places), other=whole(places), time=np.zeros(places), hits=whole(places), closed=whole(places),
-            following=whole(2, places), listed=whole(places), active=whole(places), todo=whole(2 * places),
+            deep=np.zeros(places), following=whole(2, places), listed=whole(places), active=whole(places),
+            todo=whole(2 * places),
         )  # fmt: skip
         self.contacts = Contacts(
             who=whole(places), other=whole(places), normal=np.zeros((places, d)), allowed=np.zeros(places),
@@ -170,20 +175,22 @@ class _Settler:
         """Mend the steps of some worlds."""
         r = self.record
         rules = Rules(
-            self.scene.dt, r.restitution, r.friction, r.sticky, r.most, r.response == "earliest", 1e-12, r.agents
-        )
+            self.scene.dt, r.restitution, r.friction, r.sticky, r.most,
+            min(r.again, r.most) if r.response == "back_up" else r.most, 1e-12, r.agents, False,
+        )  # fmt: skip
         circles = slice(None) if r.obstacles else slice(0, 0)
         spread = np.inf if r.part_speed is None else r.part_speed * self.scene.dt
-        bad, unsolved = (-1, -1), 0
+        bad, unsolved, lost = (-1, -1), 0, np.zeros(4)
         while first < end:
             short = entry(collide)(
                 self.period, x0, v0, state.x, state.v, state.alive, state.tick, state.obstacle_x[:, :, circles],
                 state.obstacle_radius[:, circles], self.bodies, self.meetings, self.things, self.contacts, self.ends,
                 self.before, self.reach, *self.query, rules, r.response in ("earliest", "back_up"),
                 r.response == "project", r.passes, spread, first, end, state.work, WORK.index("impacts"), self.report,
+                self.lost,
             )  # fmt: skip
             world, agent, needed = (int(k) for k in self.report[:3])
-            unsolved += int(self.report[4])
+            unsolved, lost = unsolved + int(self.report[4]), lost + self.lost
             bad = (world, agent) if bad[0] < 0 else bad
             if short < 0:
                 break
@@ -191,10 +198,21 @@ class _Settler:
             self._make_room(2 * needed)
         if unsolved and not self.told:
             self.told = True
-            far = ", or somebody went further than a quarter of the torus" if self.period[0] > 0 else ""
-            warnings.warn(
-                f"constraints: collisions: in a step {unsolved} impacts or worlds with contacts were not solved within "
-                f"most = {r.most} and passes = {r.passes}{far}",
-                UnsolvedContactsWarning, stacklevel=2,
-            )  # fmt: skip
+            warnings.warn(self._unsolved(unsolved, lost), UnsolvedContactsWarning, stacklevel=2)
         return bad
+
+    def _unsolved(self, unsolved: int, lost: NDArray[np.float64]) -> str:
+        """Return what a warning says of a step: lost are s, J and bodies, see events.play."""
+        r, seconds, joules, stopped = self.record, float(lost[0]), float(lost[1]), float(lost[2])
+        said = (
+            f"constraints: collisions: in a step {unsolved} impacts or worlds with contacts were not solved within "
+            f"most = {r.most} and passes = {r.passes}"
+        )
+        if self.period[0] > 0:
+            said += ", or a body went further than a quarter of the torus"
+        if stopped > 0:
+            early = seconds / stopped
+            said += f"; {stopped:.0f} bodies stopped {early:.3g} s before its end, and keep their velocities"
+        if joules > 0:
+            said += f"; {joules:.3g} J lost by bodies that came to rest"
+        return said

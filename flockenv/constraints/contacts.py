@@ -12,8 +12,8 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
+from flockenv.constraints.bodies import RESTS, Bodies, Meetings, Things, gained, width
 from flockenv.constraints.broad import image, vector, write
-from flockenv.constraints.events import Bodies, Meetings, Things
 from flockenv.constraints.impact import bounced, surface
 from flockenv.kernels import Vec, kernel
 from flockenv.vec import add, axis, dot, norm, scale, select, sub, unit, zero
@@ -51,12 +51,15 @@ class Ends(NamedTuple):
 
 @kernel
 def _normal(
-    period: Vec, bodies: Bodies, things: Things, ends: Ends, seconds: float, i: int, j: int
+    period: Vec, bodies: Bodies, things: Things, pos: Any, ends: Ends, seconds: float, i: int, j: int
 ) -> tuple[float, Vec]:
-    """Return the gap of a body and another, or an obstacle, at the end of a step, m, and the normal to the body."""
-    x = vector(period, ends.pos, i)
+    """Return the gap of a body and another, or an obstacle, m, and the normal to the body.
+
+    pos (N, D) m: places `seconds` after the beginning of the step.
+    """
+    x = vector(period, pos, i)
     if j >= 0:
-        d = image(period, sub(x, vector(period, ends.pos, j)))
+        d = image(period, sub(x, vector(period, pos, j)))
         far = norm(d)
         aside = unit(sub(vector(period, ends.tie, i), vector(period, ends.tie, j)))
         aside = select(dot(aside, aside) > 0.0, aside, axis(d, 0))
@@ -77,27 +80,37 @@ def _seen(period: Vec, things: Things, vel: Any, i: int, j: int) -> Vec:
 @kernel
 def gather(
     period: Vec, bodies: Bodies, meetings: Meetings, things: Things, ends: Ends, contacts: Contacts, seconds: float,
-    up: Vec, touch: float, slow: float, in_time: bool, count: int,
+    up: Vec, touch: float, slow: float, restitution: float, in_time: bool, passing: bool, count: int,
 ) -> int:  # fmt: skip
     """Find which meetings touch at the end, or nearly do; return how many, in the order of their height.
 
-    Those who are still to meet, and go into each other faster than `slow` m/s, have their impact in the next step.
+    in_time: True if impacts of the step are done. Two that are still to meet have their impact in the next step, but
+    for bodies in a heap: those that are nearly in touch, and approach slower than the step's acceleration has made
+    them, rest. For others it is `slow` m/s.
+    passing: True if bodies may pass what they touch at the beginning; then that is where they touch.
     """
     found = 0
     for c in range(count):
         i, j = meetings.who[c], meetings.other[c]
-        gap, n = _normal(period, bodies, things, ends, seconds, i, j)
-        width = bodies.radius[i] if j < 0 else min(bodies.radius[i], bodies.radius[j])
-        if gap <= max(touch, NEARLY * width):
+        margin = max(touch, NEARLY * width(bodies, i, j))
+        gap, n = _normal(period, bodies, things, ends.pos, ends, seconds, i, j)
+        begun, first, passed = gap, n, False
+        if passing:
+            begun, first = _normal(period, bodies, things, bodies.start, ends, 0.0, i, j)
+            passed = begun <= margin and (gap < -margin or dot(n, first) < 0.5)
+            n = select(passed, first, n)
+        if gap <= margin or passed:
             contacts.who[found], contacts.other[found] = i, j
             w = -dot(_seen(period, things, ends.vel, i, j), n)
-            later = in_time and (gap > touch or (meetings.closed[c] != 1 and w > slow))
-            contacts.open[found] = 1 if later else 0
-            contacts.allowed[found] = 0.0
+            heap = restitution < 1.0 if j >= 0 else bodies.leans[i] > 0
+            later = w > gained(period, bodies, i, j) * seconds if heap else gap > touch or w > slow
+            resting = gap <= touch and meetings.closed[c] == RESTS
+            contacts.open[found] = 1 if in_time and later and not resting else 0
+            contacts.allowed[found] = max(gap, 0.0) / seconds if gap > touch else 0.0
             if not in_time:
                 going = _moved(period, bodies, ends, i)
                 going = sub(going, _moved(period, bodies, ends, j) if j >= 0 else _drifted(period, things, j, seconds))
-                contacts.allowed[found] = max(gap - dot(going, n), 0.0) / seconds
+                contacts.allowed[found] = max(begun if passed else gap - dot(going, n), 0.0) / seconds
             write(contacts.normal, found, n)
             middle = sub(vector(period, ends.pos, i), scale(n, bodies.radius[i]))
             contacts.rank[found] = dot(middle, up)
@@ -159,12 +172,13 @@ def _ease(bodies: Bodies, i: int, j: int) -> float:
 def impacts(
     period: Vec, bodies: Bodies, things: Things, contacts: Contacts, vel: Any, restitution: float, friction: float,
     sticky: bool, rounds: int, slow: float, count: int,
-) -> int:  # fmt: skip
-    """Let those who go into each other at velocities (N, D) bounce, until nobody does; return how many impacts.
+) -> tuple[int, int]:  # fmt: skip
+    """Let those that go into each other at velocities (N, D) bounce, until none does; return impacts, and those left.
 
-    slow: m/s, approach that is none. After `rounds` passes what is left is left.
+    slow: m/s, approach that is none. Impacts that are left after `rounds` > 1 passes are those of the next step: their
+    contacts are open, so that nothing takes their energy.
     """
-    done = 0
+    done, left = 0, 0
     for turn in range(rounds):
         some = 0
         for k in range(count):
@@ -179,8 +193,14 @@ def impacts(
                 some += 1
         done += some
         if some == 0:
-            break
-    return done
+            return done, 0
+    if rounds > 1:
+        for c in range(count):
+            w = -dot(_seen(period, things, vel, contacts.who[c], contacts.other[c]), vector(period, contacts.normal, c))
+            if w > slow + contacts.allowed[c]:
+                contacts.open[c] = 1
+                left += 1
+    return done, left
 
 
 @kernel
@@ -273,7 +293,11 @@ def part(
     period: Vec, bodies: Bodies, things: Things, ends: Ends, seconds: float, rounds: int, touch: float, most: float,
     contacts: Contacts, count: int,
 ) -> float:  # fmt: skip
-    """Move apart those who overlap at the end, each two by at most `most` m; return the last pass's farthest move."""
+    """Move apart those that overlap at the end, each two by at most `most` m; return the last pass's farthest move.
+
+    The lighter of two moves further. Between a heavy body and a wall that would take as many passes as the masses'
+    ratio is large: in the second half of the passes all masses count the same.
+    """
     for c in range(count):
         contacts.push[c] = 0.0
     worst = 0.0
@@ -282,16 +306,24 @@ def part(
         for k in range(count):
             c = contacts.order[k if turn % 2 == 0 else count - 1 - k]
             i, j = contacts.who[c], contacts.other[c]
-            ease = _ease(bodies, i, j)
-            gap, n = _normal(period, bodies, things, ends, seconds, i, j)
-            if gap < 0.0 and ease > 0.0:
+            gap, n = _normal(period, bodies, things, ends.pos, ends, seconds, i, j)
+            if gap < 0.0 and _ease(bodies, i, j) > 0.0:
                 far = min(-gap, most - contacts.push[c])
                 contacts.push[c] += far
-                way = scale(n, far / ease)
-                write(ends.pos, i, add(vector(period, ends.pos, i), scale(way, bodies.light[i])))
+                share = _share(bodies, i, j, 2 * turn >= rounds and turn > 0)
+                write(ends.pos, i, add(vector(period, ends.pos, i), scale(n, far * share)))
                 if j >= 0:
-                    write(ends.pos, j, sub(vector(period, ends.pos, j), scale(way, bodies.light[j])))
+                    write(ends.pos, j, sub(vector(period, ends.pos, j), scale(n, far * (1.0 - share))))
                 worst = max(worst, far)
         if worst <= touch:
             break
     return worst
+
+
+@kernel
+def _share(bodies: Bodies, i: int, j: int, alike: bool) -> float:
+    """Return the part of a move that body i makes, of both; alike: True if masses do not count."""
+    one, two = bodies.light[i], bodies.light[j] if j >= 0 else 0.0
+    if alike and one > 0.0 and two > 0.0:
+        return 0.5
+    return float(one / (one + two))

@@ -17,7 +17,8 @@ from flockenv.shapes.round import ray_hit
 from flockenv.vec import add, axis, dot, norm, scale, select, sub, unit
 
 __all__ = [
-    "POINT", "along", "bounced", "ends_here", "first_impact", "flight", "rubbed", "surface",
+    "POINT", "along", "bounced", "ends_here", "first_impact", "flight", "hops_in_touch", "rubbed",
+    "surface",
 ]  # fmt: skip
 
 POINT = -1
@@ -70,13 +71,13 @@ def flight(dt: float, moved: Vec, before: Vec, after: Vec) -> tuple[Vec, Vec, Ve
 def _starts(w: float, a: float, far: float, touch: float) -> float:
     """Return from when on a body that touches already may touch anew: 0 = now, inf = never.
 
-    w, a: how fast it leaves, and is accelerated, along the normal. What takes it in by less than it counts as touching
-    is rounding.
+    w, a: how fast it leaves, and is accelerated, along the normal. What takes it in by less than half of `touch` until
+    `far` is rounding: no impact, however often a body that slides would be said to hop.
     """
     fall = -a if a < 0.0 else 0.0
-    if w <= 0.0:
-        return 0.0 if (0.5 * fall * far - w) * far > 0.5 * touch else np.inf
-    return w / fall if 2.0 * w < fall * far else np.inf  # the top of its hop
+    if not (0.5 * fall * far - w) * far > 0.5 * touch:
+        return np.inf
+    return w / fall if w > 0.0 else 0.0  # the top of its hop, or now
 
 
 @routine
@@ -89,6 +90,8 @@ def first_impact(table: Any, at: int, y: Vec, v: Vec, a: Vec, far: float, room: 
     """
     gap, n = surface(table, at, y)
     if gap - room > touch:
+        if gap - room > (norm(v) + 0.5 * norm(a) * far) * far + touch:
+            return np.inf  # it does not come that far
         return _followed(table, at, y, v, a, 0.0, far, room, room, touch)
     top = _starts(dot(v, n), dot(a, n), far, touch)
     if top <= 0.0:
@@ -173,6 +176,12 @@ def rubbed(side: Vec, most: float) -> Vec:
     """Return a velocity along a surface, less `most` m/s; nothing if that is more than there is."""
     speed = norm(side)
     return scale(side, 1.0 - most / speed if speed > most else 0.0)
+
+
+@law
+def hops_in_touch(w: float, push: float, touch: float) -> bool:
+    """True if a body that comes at w, m/s, would hop no higher than `touch`, m, under an acceleration `push` < 0."""
+    return push < 0.0 and w * w <= -2.0 * push * touch
 
 
 @law

@@ -1,0 +1,313 @@
+"""Solid bodies never pass each other, in any response; and no energy appears or vanishes where impacts run out."""
+
+from __future__ import annotations
+
+import itertools
+import math
+import warnings
+from typing import Any
+
+import numpy as np
+import pytest
+
+from flockenv.constraints import Collisions
+from flockenv.constraints.collisions import UnsolvedContactsWarning
+from flockenv.effects import Gravity
+from flockenv.integrators import VelocityVerlet
+from flockenv.scene import Group, Scene
+from flockenv.shapes import Block, Capsule, HalfSpace, Wall
+from flockenv.space import Box, Plane, Space
+from flockenv.spawn import Spawn
+from flockenv.state import Floats, State
+
+pytestmark = pytest.mark.filterwarnings("ignore::flockenv.constraints.collisions.UnsolvedContactsWarning")
+
+IN_TIME = ("earliest", "back_up")
+EXACT = (*IN_TIME, "impulses")
+ALL = (*EXACT, "project")
+R, G = 0.1, 9.81
+
+
+def scene(
+    masses: Any, response: str, *, e: float = 1.0, dt: float = 0.001, pull: float = 0.0, dimension: int = 2,
+    radius: float = R, obstacles: Any = (), space: Space | None = None, dtype: str = "float64", **rules: Any,
+) -> Scene:  # fmt: skip
+    """Return balls of these masses, which are pulled down the second axis."""
+    spawn = Spawn(low=(0,) * dimension, high=(1,) * dimension)
+    down = (0.0, -pull, 0.0)[:dimension]
+    return Scene(
+        dimension=dimension, groups=tuple(Group(count=1, mass=float(m), radius=radius, spawn=spawn) for m in masses),
+        effects=(Gravity(acceleration=down),), obstacles=tuple(obstacles), space=space or Plane(), dt=dt, dtype=dtype,
+        integrator=VelocityVerlet(),
+        constraints=(Collisions(response=response, restitution=e, **rules),),
+    )  # fmt: skip
+
+
+def line(of: Scene, x: Any, v: Any) -> State:
+    """Return bodies on the first axis at x, m, with velocities v, m/s."""
+    pos, vel = np.zeros((2, 1, len(x), of.dimension))
+    pos[0, :, 0], vel[0, :, 0] = x, v
+    return of.start(0).with_motion(pos, vel)
+
+
+def gaps(state: State, radius: float = R) -> Floats:
+    """Return what is free between neighbours on the first axis, in the order of their numbers, m."""
+    return np.diff(np.asarray(state.pos[0, :, 0], float)) - 2 * radius
+
+
+def kinetic(of: Scene, state: State) -> float:
+    return float((of.body.mass[:, None] * np.asarray(state.vel[0], float) ** 2).sum() / 2)
+
+
+def billiard(masses: Any, x: Any, v: Any, seconds: float) -> tuple[Floats, int]:
+    """Return velocities of two elastic balls before a wall at x = 0 after some time, and the impacts: by events."""
+    (m, n), (x, y), (v, w), done = masses, map(float, x), map(float, v), 0
+    while True:
+        wall = (x - R) / -v if v < 0 else math.inf
+        pair = (y - x - 2 * R) / (v - w) if v > w else math.inf
+        t = min(wall, pair)
+        if t > seconds:
+            return np.array([v, w]), done
+        x, y, seconds, done = x + v * t, y + w * t, seconds - t, done + 1
+        if wall < pair:
+            v = -v
+        else:
+            v, w = ((m - n) * v + 2 * n * w) / (m + n), ((n - m) * w + 2 * m * v) / (m + n)
+
+
+# --- a light body between a heavy one and a wall: a thousand impacts in a few steps -----------------------------------
+
+SQUEEZED = [
+    ((1, 1e6), (1.1, 2.3), (0, -1), 12.0),
+    ((1, 1e4), (1.1, 2.3), (0, -1), 12.0),
+    ((1e4, 1), (1.1, 2.3), (0, -50), 1.0),
+    ((1e4, 1), (1.1, 2.3), (1, -3), 3.0),
+    ((3, 7), (0.6, 1.3), (-2, -1), 3.0),
+]
+
+
+@pytest.mark.parametrize("response", ALL)
+@pytest.mark.parametrize(("masses", "x", "v", "seconds"), SQUEEZED)
+def test_a_body_between_another_and_a_wall_stays_there(
+    response: str, masses: Any, x: Any, v: Any, seconds: float
+) -> None:
+    of = scene(masses, response, obstacles=(HalfSpace(point=(0.0, 0.0), direction=(1.0, 0.0)),))
+    state = line(of, x, v)
+    first = last = kinetic(of, state)
+    for _ in range(round(seconds / of.dt)):
+        state = of.step(state)
+        now = kinetic(of, state)
+        assert min(gaps(state)[0], state.pos[0, 0, 0] - R) > -(0.05 if response in EXACT else 0.3) * R
+        assert now <= last * (1 + 1e-10)
+        last = now
+    if response in EXACT:
+        assert last == pytest.approx(first, rel=1e-11)
+    if response in IN_TIME:
+        velocities, impacts = billiard(masses, x, v, seconds)
+        np.testing.assert_allclose(state.vel[0, :, 0], velocities, rtol=1e-9, atol=1e-6)
+        assert state.counted("impacts") == impacts
+
+
+def test_a_million_times_the_mass_makes_3141_impacts() -> None:
+    """Digits of pi (Galperin 2003)."""
+    assert billiard((1, 1e6), (1.1, 2.3), (0, -1), 12.0)[1] == 3141
+
+
+@pytest.mark.parametrize("dtype", ["float64", "float32"])
+@pytest.mark.parametrize("response", EXACT)
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_five_in_a_row_between_walls_keep_their_order_and_energy(response: str, dimension: int, dtype: str) -> None:
+    size = (2.0, 1.0, 1.0)[:dimension]
+    of = scene(
+        [1, 1e4, 0.1, 10, 1], response, dimension=dimension, dtype=dtype, space=Box(size=size, restitution=1.0), dt=0.01
+    )
+    state = line(of, (0.2, 0.6, 1.0, 1.4, 1.8), (9, -2, 0, 1, -5))
+    state = state.with_motion(state.pos + np.array([0.0, 0.5, 0.5][:dimension]), state.vel)
+    first, rounding = kinetic(of, state), 1e-11 if dtype == "float64" else 1e-4
+    for _ in range(400):
+        state = of.step(state)
+        assert gaps(state).min() > -0.05 * R
+        assert state.pos[0, :, 0].min() > R - 0.05 * R and state.pos[0, :, 0].max() < 2.0 - R + 0.05 * R
+        assert kinetic(of, state) == pytest.approx(first, rel=rounding)
+
+
+@pytest.mark.parametrize("most", [1, 3])
+@pytest.mark.parametrize("response", IN_TIME)
+def test_where_impacts_run_out_bodies_stop_and_keep_momentum_and_energy(response: str, most: int) -> None:
+    masses = np.array([1000.0, 1, 1, 1, 1000])
+    of = scene(masses, response, dt=0.05, most=most)
+    state = line(of, (-0.5, -0.28, 0, 0.28, 0.5), (4, 0, 0, 0, -4))
+    first, momentum = kinetic(of, state), masses @ state.vel[0, :, 0]
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always", UnsolvedContactsWarning)
+        for _ in range(200):
+            state = of.step(state)
+            assert gaps(state).min() > -1e-9
+            assert kinetic(of, state) == pytest.approx(first, rel=1e-11)
+            assert masses @ state.vel[0, :, 0] == pytest.approx(momentum, abs=1e-8)
+    assert state.counted("stopped") > 0
+    (told,) = [str(w.message) for w in caught]
+    assert "bodies stopped" in told and "keep their velocities" in told
+
+
+def test_energy_that_is_lost_at_the_limit_is_told() -> None:
+    """One disc comes to lie on another, which lies on the floor, slower than gravity makes it within a step."""
+    floor = (HalfSpace(point=(0.0, 0.0), direction=(0.0, 1.0)),)
+    of = scene([1, 1], "earliest", dt=0.005, pull=G, obstacles=floor, most=1)
+    state = of.start(0).with_motion([[[0.0, R], [0.0, 3 * R]]], [[[0.0, 0.0], [0.0, -0.02]]])
+    with pytest.warns(UnsolvedContactsWarning, match=r"most = 1 and .*; [\d.e-]+ J lost by bodies that came to rest"):
+        of.run(state, 5)
+
+
+# --- whatever is fast or thin ---------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("response", ALL)
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_what_moves_many_times_its_width_in_a_step_passes_nothing(response: str, dimension: int) -> None:
+    """Bullets of 3.3 m a step at a row of discs at rest, and at a wall as thin as they come."""
+    thin = Capsule(start=(9.0, -5.0), end=(9.0, 5.0), radius=0.01)
+    block = Block(centre=(9.05,) + (0.0,) * (dimension - 1), size=(0.1,) + (10.0,) * (dimension - 1))
+    for phase in range(8):
+        of = scene(
+            [1, 2, 3, 4],
+            response,
+            e=0.5,
+            dt=1 / 60,
+            dimension=dimension,
+            obstacles=(thin if dimension == 2 else block,),
+        )
+        state = line(of, (-2 - 0.41 * phase, 0, 0.9, 3.7), (200, 0, 0, 0))
+        for _ in range(60):
+            state = of.step(state)
+            assert gaps(state).min() > -(0.06 if response in EXACT else 0.5) * R
+            assert state.pos[0, 3, 0] < 9.0
+        assert np.isfinite(state.vel).all() and state.counted("impacts") > 0
+
+
+@pytest.mark.parametrize("response", ALL)
+def test_a_thin_wall_that_comes_fast_leaves_no_body_behind(response: str) -> None:
+    wall = Wall(vertices=((-1.0, -5.0), (-1.0, 5.0)), velocity=(50.0, 0.0))  # .83 m a step
+    of = scene([1, 1], response, e=0.5, dt=1 / 60, obstacles=(wall,))
+    for phase in range(8):
+        state = line(of, (0.1 * phase, 0.1 * phase + 0.6), (0, 0))
+        for k in range(20):
+            state = of.step(state)
+            assert state.pos[0, 0, 0] > -1 + 50 * (k + 1) / 60
+            assert gaps(state).min() > -0.5 * R
+        assert (state.vel[0, :, 0] > 40).all()
+
+
+@pytest.mark.parametrize("response", ALL)
+@pytest.mark.parametrize("mass", [1.0, 1e4])
+def test_what_a_wall_pushes_against_others_stays_between(response: str, mass: float) -> None:
+    """A row that begins in touch, and a wall that pushes it at 2 m/s."""
+    wall = Wall(vertices=((-R, -5.0), (-R, 5.0)), velocity=(2.0, 0.0))
+    of = scene([1, mass, 1], response, e=0.0, dt=0.005, obstacles=(wall,))
+    state = line(of, (0.0, 0.2, 0.4), (0, 0, 0))
+    for k in range(200):
+        state = of.step(state)
+        assert gaps(state).min() > -(0.05 if response in EXACT else 0.3) * R
+        assert state.pos[0, 0, 0] > -R + 0.01 * (k + 1)
+
+
+@pytest.mark.parametrize("response", EXACT)
+def test_what_rests_on_another_is_not_driven_through_it(response: str) -> None:
+    """A ball lies on one that lies on the floor; a heavy one hits it from above, in steps that are long for that."""
+    floor = (HalfSpace(point=(0.0, 0.0), direction=(0.0, 1.0)),)
+    for dt, speed in itertools.product((0.01, 0.05), (1.0, 40.0)):
+        of = scene([1, 1, 1e4], response, e=0.3, dt=dt, pull=G, obstacles=floor)
+        pos = np.array([[[0.0, R], [0.0, 3 * R], [0.0, 5 * R + 1.5 * speed * dt]]])
+        state = of.start(0).with_motion(pos, [[[0, 0], [0, 0], [0, -speed]]])
+        for _ in range(100):
+            state = of.step(state)
+            heights = state.pos[0, :, 1]
+            assert min(heights[0] - R, (np.diff(heights) - 2 * R).min()) > -0.06 * R
+
+
+@pytest.mark.parametrize("response", IN_TIME)
+@pytest.mark.parametrize(("speed", "friction", "e"), [(1, 0, 0.5), (1, 0.3, 0.5), (3, 0, 0), (1, 0, 1)])
+def test_a_ball_slides_over_collinear_pieces_of_a_wall(response: str, speed: float, friction: float, e: float) -> None:
+    wall = Wall(vertices=((-5.0, 0.0), (0.0, 0.0), (1.0, 0.0), (5.0, 0.0)))
+    of = scene([1], response, e=e, dt=0.01, pull=G, friction=friction, obstacles=(wall,))
+    state = of.start(0).with_motion([[[-1.03, R]]], [[[speed, 0.0]]])
+    end = of.run(state, 200)
+    assert end.counted("unsolved") == 0 and end.counted("stopped") == 0
+    way = 2.0 * speed if not friction else speed**2 / (2 * friction * G)
+    np.testing.assert_allclose(end.pos[0, 0], [-1.03 + way, R], rtol=0, atol=1e-2 if friction else 1e-9)
+
+
+# --- heaps ------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("response", EXACT)
+@pytest.mark.parametrize(
+    ("count", "e", "friction", "dt"),
+    [(3, 0.5, 0.3, 0.005), (3, 0.2, 0.3, 0.005), (3, 0.8, 0.3, 0.005), (3, 0.5, 0.0, 0.005), (3, 0.5, 0.3, 0.001),
+     (3, 0.0, 0.3, 0.005), (4, 0.5, 0.3, 0.005), (6, 0.5, 0.3, 0.005), (11, 0.5, 0.3, 0.005)],
+)  # fmt: skip
+def test_bodies_that_lean_on_each_other_come_to_rest(
+    response: str, count: int, e: float, friction: float, dt: float
+) -> None:
+    """Discs between two walls, each on the one below and on a wall: 7 s, in which speed g t would be 69 m/s."""
+    size = (0.5, 5.0)
+    of = scene(
+        [1] * count, response, e=e, dt=dt, pull=G, radius=0.15, friction=friction, space=Box(size=size, restitution=e)
+    )
+    k = np.arange(count)
+    pos = np.stack([np.where(k % 2, 0.35, 0.15), 0.16 + 0.34 * k], axis=1)
+    state = of.start(0).with_motion(pos[None], np.zeros((1, count, 2)))
+    for step in range(round(7 / dt / 10)):
+        state = of.run(state, 10)
+        assert overlap(state.pos[0], 0.15, size) < 0.01 * 0.15
+        if step * 10 * dt > 5:
+            assert np.linalg.norm(state.vel[0], axis=1).max() <= G * dt
+    assert (np.diff(state.pos[0, :, 1]) > 0).all(), "they lie as they fell"
+
+
+def overlap(pos: Floats, radius: float, size: Any) -> float:
+    """Return how far any two overlap at most, or one and a wall of a box, m."""
+    pos = np.asarray(pos, float)
+    apart = np.linalg.norm(pos[:, None] - pos[None], axis=-1) + 9 * np.eye(len(pos))
+    walls = min(pos.min(), (np.array(size) - pos).min())
+    return float(max(2 * radius - apart.min(), radius - walls))
+
+
+# --- anything ---------------------------------------------------------------------------------------------------------
+
+
+def passes(before: Floats, after: Floats, room: float) -> bool:
+    """True if a pair is on the other side of each other, having come nearer than half of what they need."""
+    a, b = (x[:, None] - x[None] for x in (np.asarray(before, float), np.asarray(after, float)))
+    way = b - a
+    share = np.clip(-(a * way).sum(-1) / np.maximum((way**2).sum(-1), 1e-300), 0, 1)
+    nearest = np.linalg.norm(a + share[..., None] * way, axis=-1) + 9 * np.eye(len(before))
+    return bool(((nearest < room / 2) & ((a * b).sum(-1) < 0)).any())
+
+
+@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("response", ALL)
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_in_no_scene_do_bodies_overlap_pass_or_gain_energy(response: str, dimension: int, seed: int) -> None:
+    """Random masses, restitution, friction, pull, speed and step, in a box."""
+    rng = np.random.default_rng(100 * dimension + seed)
+    count, e = 24, float(rng.choice([0.0, 0.4, 0.8, 1.0]))
+    pull, dt = float(rng.choice([0.0, G])), float(rng.choice([0.002, 0.01]))
+    size = (1.6, 1.6, 1.6)[:dimension]
+    of = scene(
+        10.0 ** rng.uniform(-1, 2, count), response, e=e, dt=dt, pull=pull, dimension=dimension,
+        friction=float(rng.choice([0.0, 0.5])), space=Box(size=size, restitution=e),
+    )  # fmt: skip
+    grid = np.stack(np.meshgrid(*[np.arange(5)] * dimension), -1).reshape(-1, dimension)
+    pos = 0.2 + 0.3 * grid[rng.choice(len(grid), count, replace=False)]
+    vel = rng.normal(size=pos.shape) * rng.choice([1.0, 5.0])
+    state = of.start(0).with_motion(pos[None], vel[None])
+    mass, last = of.body.mass, np.inf
+    for _ in range(200):
+        before, state = state.pos[0].copy(), of.step(state)
+        assert overlap(state.pos[0], R, size) < (0.06 if response in EXACT else 0.9) * R
+        assert not passes(before, state.pos[0], 2 * R)
+        now = kinetic(of, state) + float((mass * pull * state.pos[0, :, 1]).sum())
+        lift = float(mass.sum()) * pull * (0.01 if response in EXACT else 0.3) * R  # what is moved apart may rise
+        assert now <= last * (1 + 1e-9) + lift
+        last = now
