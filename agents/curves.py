@@ -17,8 +17,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from rich.console import Console
 
+from agents.checkpoint import CheckpointError
 from agents.experiment import Experiment, PpoSettings, load_experiment, one_line_errors
-from flockenv.outputs import checked_file, replacing
+from flockenv.outputs import check_room, checked_file, checked_path, replacing
 from flockenv.players.rules import tuned
 from flockenv.render.chart import COLOURS, FAINT, GRID, INK
 
@@ -29,6 +30,9 @@ __all__ = ["app", "draw"]
 
 app = typer.Typer(add_completion=False, rich_markup_mode=None, pretty_exceptions_enable=False)
 console = Console(stderr=True, soft_wrap=True)
+
+ROOM = 2**20
+"""Bytes that a picture has at most."""
 
 Curve = list[dict[str, float]]
 Numbers = Mapping[str, Any]
@@ -55,13 +59,14 @@ def label(name: str, p: PpoSettings) -> str:
 def learned(experiment: Experiment, name: str, runs: Path) -> Curve:
     """Return the curve of one setting: read where training is finished, else trained to the end."""
     from agents import ppo  # with torch
+    from agents.run import OtherRecipe, checkpointed
 
     p = experiment.settings()[name]
     wanted, folder = experiment.model_copy(update={"ppo": p}), runs / experiment.task / name
     run, how = None, "begins"
     try:
-        run = ppo.checkpointed(wanted, folder)
-    except ppo.OtherRecipe as other:
+        run = checkpointed(wanted, folder)
+    except OtherRecipe as other:
         how = f"begins anew ({other})"
     if run is None or run.steps < p.steps:
         how = f"goes on after {run.steps:,} steps" if run is not None else how
@@ -132,9 +137,12 @@ def main(
     """Train several settings of each task, and draw their learning curves side by side."""
     with one_line_errors():
         picture = checked_file(out, (".png",), force=True)
+        folder = checked_path(str(runs), "--runs")
         experiments = experiments_of(configs)
+        check_room(picture, ROOM)
     try:
-        tasks = {task: measured(experiment, runs) for task, experiment in experiments.items()}
+        with one_line_errors((CheckpointError, OSError, FloatingPointError)):
+            tasks = {task: measured(experiment, folder) for task, experiment in experiments.items()}
     except KeyboardInterrupt:
         console.print(f"interrupted; what is trained stays in {runs}, the same command goes on", highlight=False)
         raise typer.Exit(130) from None

@@ -124,10 +124,13 @@ def load_experiment(path: str | Path) -> Experiment:
 
 
 @contextmanager
-def one_line_errors() -> Iterator[None]:
-    """End a command with status 2 and one line, however narrow the terminal, where its input is refused."""
+def one_line_errors(kinds: tuple[type[Exception], ...] = (ValueError, OSError)) -> Iterator[None]:
+    """End a command with status 2 and one line, however narrow the terminal, where its input is refused.
+
+    kinds: the exceptions that say so.
+    """
     try:
         yield
-    except (ValueError, OSError) as error:
+    except kinds as error:
         typer.echo(f"error: {error}", err=True)
         raise typer.Exit(2) from None

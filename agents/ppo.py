@@ -2,19 +2,20 @@
 
 Reads top to bottom: settings -> worlds -> model -> learn -> export. Every so often the policy of the moment plays the
 tuning worlds in numpy; that is the learning curve, and the best one is what is exported, as safetensors with a card
-that holds the recipe. Ctrl-C keeps a checkpoint, `--resume` goes on from it, if the recipe is still the same.
+that holds the recipe. After each point of the curve, and on Ctrl-C, a checkpoint is written (agents/checkpoint.py) of
+the moment at which the last rollout began; `--resume` goes on from it, if the recipe is still the same. A training that
+was resumed under the same versions on the same machine has the same weights as one that was not, bit for bit.
 """
 
 from __future__ import annotations
 
-import json
 import os
 import platform
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
-from importlib.metadata import version
+from dataclasses import replace
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -29,20 +30,25 @@ from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.vec_env import VecEnvWrapper
 
 from agents.central import CentralPolicy, CentralVecEnv
+from agents.checkpoint import CheckpointError, claimed, path_in
 from agents.credit import CaringBuffer
+from agents.divergence import LearningDiverged, check_answers, check_model, check_step
 from agents.experiment import Experiment, PpoSettings, load_experiment, one_line_errors
+from agents.run import Run, checkpoint, checkpointed, expected_bytes, recipe_of
 from agents.teach import teach
+from agents.training_state import capture, restore, surroundings
 from flockenv.crew import threads, use_threads
 from flockenv.evaluation import rollout, worlds_for
+from flockenv.outputs import check_room, checked_file, checked_path
 from flockenv.players import WEIGHTS
-from flockenv.players.rules import as_dict, player
+from flockenv.players.rules import player
 from flockenv.policy import MlpPolicy, describe, save_policy
-from flockenv.refusals import KeyPath, key_path, shown
 from flockenv.sb3 import WorldVecEnv
 from flockenv.tasks import TASKS, Task
+from flockenv.terminal import DIVERGED, INTERRUPTED
 from flockenv.world import World
 
-__all__ = ["OtherRecipe", "app", "checkpointed", "on_threads", "tensors_of", "train"]
+__all__ = ["app", "build", "export", "on_threads", "score", "tensors_of", "train"]
 
 app = typer.Typer(add_completion=False, rich_markup_mode=None, pretty_exceptions_enable=False)
 console = Console(stderr=True)
@@ -80,39 +86,21 @@ class ForLearning(VecEnvWrapper):
 
     def step_wait(self) -> Any:
         """Act for `hold` decisions of the world, and scale what is paid."""
-        observation, reward, done, infos = self.venv.step_wait()
+        observation, reward, done, infos = self._decided()
         for _ in range(self.hold - 1):
             self.venv.step_async(self.actions)
-            observation, more, over, told = self.venv.step_wait()
+            observation, more, over, told = self._decided()
             reward += np.where(done, 0.0, more)
             if any(told[:: self.venv.world.learners]):  # all rows of a world are told of its end
                 infos = [before or new for before, new in zip(infos, told, strict=True)]
             done = done | over
         return observation, reward * self.scale, done, infos
 
-
-class OtherRecipe(ValueError):  # noqa: N818  # whoever begins anew then has seen no error
-    """A checkpoint is of another recipe than the one to train by."""
-
-
-def recipe_of(experiment: Experiment) -> dict[str, Any]:
-    """Return all that training depends on: with another value anywhere it is another training."""
-    task, told = experiment.build(), experiment.model_dump(mode="json", include={"task", "arguments", "ppo"})
-    if experiment.ppo.taught:
-        told["rules"] = as_dict(player(task).rules)  # who taught it
-    return {**told, "layout": task.layout.digest}
-
-
-@dataclass
-class Run:
-    """What training has come to so far; all that a checkpoint holds beside the network."""
-
-    recipe: dict[str, Any]
-    steps: int = 0
-    wall: float = 0.0  # s, with what teaching took
-    curve: list[dict[str, float]] = field(default_factory=list)
-    best: float = -np.inf
-    tensors: dict[str, np.ndarray] = field(default_factory=dict)
+    def _decided(self) -> Any:
+        """Return what one decision of the world brought; LearningDiverged if a number of it is not finite."""
+        world: World = self.venv.world
+        before = world.steps.copy()
+        return check_step(world.task, self.venv.step_wait(), before)
 
 
 def tensors_of(model: PPO) -> dict[str, np.ndarray]:
@@ -195,9 +183,29 @@ class Watch(BaseCallback):
         self.task, self.p, self.run, self.folder, self.progress = task, p, run, folder, progress
         self.bar = progress.add_task(task.name, total=p.steps, completed=run.steps, score="")
         self.since, self.before = time.perf_counter(), run.wall
+        self.kept: Run | None = None  # as it was when the last rollout began
+        self.due = True
 
     def _on_step(self) -> bool:
         return True
+
+    def _on_rollout_start(self) -> None:
+        check_model(self.model)
+        self._keep()
+        if self.due:
+            self.save()
+
+    def _keep(self) -> None:
+        """Remember this moment: whatever comes before the next one, training can go on from here."""
+        self.run.wall = self.before + time.perf_counter() - self.since
+        self.run.state = capture(self.model)
+        self.kept = replace(self.run, curve=list(self.run.curve))
+
+    def save(self) -> None:
+        """Write a checkpoint of the moment that is remembered, if there is one."""
+        if self.kept is not None:
+            checkpoint(self.folder, self.kept)
+        self.due = False
 
     def _on_rollout_end(self) -> None:
         self.run.steps = self.num_timesteps * self.p.hold
@@ -211,72 +219,37 @@ class Watch(BaseCallback):
             self.point()
 
     def point(self) -> None:
-        """Measure the policy of the moment, keep it if it is the best so far, and write a checkpoint."""
+        """Measure the policy of the moment, and keep it if it is the best so far; a checkpoint is due then."""
         self.run.wall = self.before + time.perf_counter() - self.since
         self.run.steps = self.num_timesteps * self.p.hold
         tensors = tensors_of(self.model)
-        result, success = score(self.task, self.p, tensors)
+        try:
+            result, success = score(self.task, self.p, tensors)
+        except ValueError as error:  # it names the world
+            raise LearningDiverged(f"on the tuning worlds: {error}") from error
         seconds = round(self.run.wall, 1)
         self.run.curve.append({"steps": self.run.steps, "seconds": seconds, "mean": result, "success": success})
-        if result > self.run.best:
+        if self.run.best is None or result > self.run.best:
             self.run.best, self.run.tensors = result, tensors
         self.progress.update(self.bar, score=f"{result:.2f}, success {success:.0%}, best {self.run.best:.2f}")
         line = f"{self.run.steps:>12,} steps {seconds:7.1f} s  mean {result:8.3f}  success {success:.3f}"
         self.progress.console.print(line)
-        checkpoint(self.folder, self.model, self.run)
+        self.due = True
 
-
-def checkpoint(folder: Path, model: PPO, run: Run) -> None:
-    """Write the run so far; each file is either the old one or the whole new one."""
-    folder.mkdir(parents=True, exist_ok=True)
-    torch.save(model.policy.state_dict(), folder / "policy.tmp")
-    torch.save(model.policy.optimizer.state_dict(), folder / "optimizer.tmp")
-    np.savez(folder / "best.tmp.npz", **run.tensors)
-    notes = {name: value for name, value in vars(run).items() if name != "tensors"}
-    (folder / "run.tmp").write_text(json.dumps(notes), encoding="utf-8")
-    finals = {
-        "policy.tmp": "policy.pt",
-        "optimizer.tmp": "optimizer.pt",
-        "best.tmp.npz": "best.npz",
-        "run.tmp": "run.json",
-    }
-    for name, final in finals.items():
-        os.replace(folder / name, folder / final)
-
-
-def checkpointed(experiment: Experiment, folder: Path) -> Run | None:
-    """Return the run whose checkpoint lies in a folder, if there is one; OtherRecipe if it is not of this experiment.
-
-    No file of a checkpoint can execute code.
-    """
-    path = folder / "run.json"
-    if not path.exists():
-        return None
-    notes = json.loads(path.read_text(encoding="utf-8"))
-    kept, wanted = dict(_numbers(notes.get("recipe", {}))), dict(_numbers(recipe_of(experiment)))
-    for key in {**wanted, **kept}:
-        if kept.get(key) != wanted.get(key):
-            has, asked = (shown(of[key]) if key in of else "nothing" for of in (kept, wanted))
-            raise OtherRecipe(f"{key} = {asked}: the checkpoint in {folder} is of another recipe, with {has}")
-    with np.load(folder / "best.npz", allow_pickle=False) as best:
-        return Run(**notes, tensors={name: best[name] for name in best.files})
+    def finish(self) -> None:
+        """Measure the last policy, and write the last checkpoint."""
+        check_model(self.model)
+        self.point()
+        self._keep()
+        self.save()
 
 
 def _kept(experiment: Experiment, folder: Path) -> bool:
-    """Is there something to go on from?"""
+    """Return True if there is a checkpoint to go on from."""
     try:
         return checkpointed(experiment, folder) is not None
-    except OtherRecipe:
+    except CheckpointError:
         return False
-
-
-def _numbers(block: dict[str, Any], path: KeyPath = ()) -> Iterator[tuple[str, Any]]:
-    """Yield every value of nested blocks by its key path."""
-    for key, value in block.items():
-        if isinstance(value, dict):
-            yield from _numbers(value, (*path, key))
-        else:
-            yield key_path((*path, key)), value
 
 
 def _teach(model: PPO, task: Task, p: PpoSettings) -> float:
@@ -291,29 +264,43 @@ def _teach(model: PPO, task: Task, p: PpoSettings) -> float:
 
 
 def resume(folder: Path, model: PPO, run: Run, p: PpoSettings) -> None:
-    """Read a checkpoint's networks back into the model."""
-    model.policy.load_state_dict(torch.load(folder / "policy.pt", weights_only=True))
-    model.policy.optimizer.load_state_dict(torch.load(folder / "optimizer.pt", weights_only=True))
-    model.num_timesteps = run.steps // p.hold
+    """Put a model where the run of a checkpoint was, and say what it goes on under if that is not what was before."""
+    restore(model, run.state, run.steps // p.hold, folder)
+    now, before = surroundings(model.get_env().get_attr("task", 0)[0]), dict(run.surroundings)
+    for earlier in run.resumed:
+        before |= earlier["surroundings"]
+    if others := {name: value for name, value in now.items() if before.get(name) != value}:
+        run.resumed.append({"steps": run.steps, "surroundings": others})
+        said = ", ".join(f"{name} {value} after {before.get(name, 'nothing')}" for name, value in others.items())
+        said = f"resumed under {said}: weights may differ from those of an uninterrupted training"
+        console.print(said, markup=False, highlight=False, soft_wrap=True)
 
 
 def train(experiment: Experiment, folder: Path, go_on: bool = False, tensorboard: str | None = None) -> Run:
     """Train to the end of the budget, or until Ctrl-C; return what came of it.
 
-    go_on: from the folder's checkpoint, if there is one; a finished one is returned as it is. OtherRecipe if it is not
-    of this experiment: weights that two recipes made have none.
+    go_on: from the folder's checkpoint, if there is one; a finished one is returned as it is.
+
+    Raises:
+        OtherRecipe: the checkpoint is not of this experiment; weights that two recipes made have none.
+        CheckpointError: it is damaged, or another training holds the folder.
+        FloatingPointError: learning or a world diverged; the checkpoint is of the last moment before that.
     """
-    task, p = experiment.build(), experiment.ppo
-    run = checkpointed(experiment, folder) if go_on else None
-    if run is not None and run.steps >= p.steps:
-        return run
+    with claimed(folder):
+        run = checkpointed(experiment, folder) if go_on else None
+        if run is not None and run.steps >= experiment.ppo.steps:
+            return run
+        return _train(experiment, folder, run, tensorboard)
+
+
+def _train(experiment: Experiment, folder: Path, run: Run | None, tensorboard: str | None) -> Run:
+    task, p, anew = experiment.build(), experiment.ppo, run is None
     model = build(task, p, tensorboard)
     if run is not None:
         resume(folder, model, run, p)
     else:
-        run = Run(recipe_of(experiment))
+        run = Run(recipe_of(experiment), surroundings(model.get_env().get_attr("task", 0)[0]))
         run.wall = _teach(model, task, p)
-        (folder / "run.json").unlink(missing_ok=True)  # what is there is overwritten file by file
     columns = (
         TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TimeRemainingColumn(),
         TextColumn("{task.fields[score]}"),
@@ -321,17 +308,29 @@ def train(experiment: Experiment, folder: Path, go_on: bool = False, tensorboard
     with on_threads(p.threads), Progress(*columns, console=console) as progress:
         watch = Watch(task, p, run, folder, progress)
         try:
-            model.learn(
-                -(-(p.steps - run.steps) // p.hold),
-                callback=watch,
-                reset_num_timesteps=run.steps == 0,
-                log_interval=None,
-            )
-            watch.point()
-        except KeyboardInterrupt:
-            watch.point()
+            with _named_divergence(model):
+                model.learn(
+                    -(-(p.steps - run.steps) // p.hold),
+                    callback=watch,
+                    reset_num_timesteps=anew,
+                    log_interval=None if tensorboard is None else 1,
+                )
+                watch.finish()
+        except (KeyboardInterrupt, FloatingPointError):
+            watch.save()
             raise
     return run
+
+
+@contextmanager
+def _named_divergence(model: PPO) -> Iterator[None]:
+    """Raise LearningDiverged where torch refuses to draw actions from what a network that diverged answers."""
+    try:
+        yield
+    except ValueError:
+        check_model(model)
+        check_answers(model)
+        raise
 
 
 def export(run: Run, path: Path) -> None:
@@ -349,7 +348,8 @@ def export(run: Run, path: Path) -> None:
         "tuning_mean": run.best,
         "curve": run.curve,
         "machine": f"{platform.machine()}, {os.cpu_count()} cores",
-        "versions": {name: version(name) for name in ("stable-baselines3", "torch", "numpy", "gymnasium")},
+        "versions": run.surroundings,
+        **({"resumed": run.resumed} if run.resumed else {}),
     }
     save_policy(path, run.tensors, card)
 
@@ -369,19 +369,47 @@ def main(
         experiment = load_experiment(config)
         changes = {k: v for k, v in (("steps", steps), ("seed", seed)) if v is not None}
         experiment = experiment.model_copy(update={"ppo": PpoSettings(**{**experiment.ppo.model_dump(), **changes})})
-        task = experiment.build()
-        if go_on:
-            checkpointed(experiment, runs / task.name)  # of another recipe: refused before anything is built
-    target = out or WEIGHTS / f"{task.name}.safetensors"
-    try:
-        run = train(experiment, runs / task.name, go_on, tensorboard)
-    except KeyboardInterrupt:
-        kept = f"checkpoint in {runs / task.name}, go on with --resume"
-        console.print(f"interrupted; {kept if _kept(experiment, runs / task.name) else 'nothing was learnt yet'}")
-        raise typer.Exit(130) from None
-    export(run, target)
+        name = experiment.build().name
+        target = WEIGHTS / f"{name}.safetensors" if out is None else checked_file(str(out), (".safetensors",), True)
+        folder = checked_path(str(runs / name), "--runs")
+        _check_outputs(experiment, target, folder, tensorboard)
+    with one_line_errors((CheckpointError, OSError)):
+        try:
+            run = train(experiment, folder, go_on, tensorboard)
+        except KeyboardInterrupt:
+            kept = f"checkpoint in {runs / name}, go on with --resume"
+            console.print(f"interrupted; {kept if _kept(experiment, folder) else 'nothing was learnt yet'}")
+            raise typer.Exit(INTERRUPTED) from None
+        except FloatingPointError as error:
+            typer.echo(f"error: {error}; {_last_good(experiment, folder, target)}", err=True)
+            raise typer.Exit(DIVERGED) from None
+        export(run, target)
     best = f"mean return {run.best:.3f} on the tuning worlds"
     console.print(f"{target}: {best} after {run.steps:,} steps, {run.wall:.0f} s")
+
+
+def _check_outputs(experiment: Experiment, target: Path, folder: Path, tensorboard: str | None) -> None:
+    """Refuse, before anything is made, what cannot be written in the end; ValueError or OSError in one line."""
+    if target.with_suffix(".json").is_dir():
+        raise ValueError(f"--out {str(target)!r}: its card, {target.with_suffix('.json').name!r}, is a folder")
+    for path in (target, path_in(folder)):
+        check_room(path, expected_bytes(experiment))
+    if tensorboard is not None:
+        checked_path(tensorboard, "--tensorboard")
+        if find_spec("tensorboard") is None:
+            raise ValueError("--tensorboard: the package tensorboard is not installed")
+
+
+def _last_good(experiment: Experiment, folder: Path, target: Path) -> str:
+    """Export the best policy of a training that diverged, if there is one; return what was kept, and where."""
+    run = checkpointed(experiment, folder)
+    if run is None:
+        return "nothing was learnt before"
+    kept = f"kept: the checkpoint of {run.steps:,} steps in {folder}"
+    if run.best is None:
+        return kept
+    export(run, target)
+    return f"{kept}, and the best policy so far (mean return {run.best:.3f}) in {target}"
 
 
 if __name__ == "__main__":

@@ -13,7 +13,7 @@ from typing import BinaryIO
 
 from flockenv.refusals import nearest
 
-__all__ = ["checked_file", "checked_path", "replacing"]
+__all__ = ["check_room", "checked_file", "checked_path", "replacing"]
 
 LONGEST_NAME, LONGEST_PATH = 200, 1000
 
@@ -81,6 +81,21 @@ def _place(path: Path) -> str:
 
 def _shown(text: str) -> str:
     return repr(text) if len(text) <= 200 else f"{text[:80]!r}... ({len(text)} characters)"
+
+
+def check_room(path: Path, size: int) -> None:
+    """Raise OSError, in one line, if a file of so many bytes cannot be written at `path` now.
+
+    It is tried with a file without a name, in the nearest folder above that exists; nothing is left behind.
+    """
+    target = path.resolve()
+    folder = next(place for place in target.parents if place.exists())
+    try:
+        with tempfile.TemporaryFile(dir=folder) as file:
+            if hasattr(os, "posix_fallocate"):
+                os.posix_fallocate(file.fileno(), 0, size)
+    except OSError as error:
+        raise type(error)(f"cannot write {str(path)!r} ({size:,} bytes): {error.strerror}") from None
 
 
 @contextmanager

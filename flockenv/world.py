@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import copy
+import dataclasses
 import functools
 import math
 import secrets
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Final, Literal, NamedTuple, NoReturn
 
 import numpy as np
@@ -244,6 +245,36 @@ class World:
     def seeds(self) -> tuple[int, ...]:
         """The seed of each world; empty before the first reset."""
         return () if self._seeds is None else tuple(self._seeds.tolist())
+
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        """Return everything that changes while worlds go on, by name, as views; RuntimeError before the first reset.
+
+        Copies of them and the task are enough to go on from here: see `restore`.
+        """
+        if self._seeds is None:
+            raise RuntimeError("arrays before the first reset: call reset() first")
+        state = {each.name: getattr(self.state, each.name) for each in dataclasses.fields(State) if each.name != "dt"}
+        mine = {
+            "steps": self.steps, "paid": self._paid, "memory": self._memory, "sums": self._sums, "last": self._last,
+            "seeds": self._seeds, "episodes": self._episodes,
+        }  # fmt: skip
+        return {**{f"state.{name}": array for name, array in state.items()}, **mine}
+
+    def restore(self, arrays: Mapping[str, NDArray[Any]]) -> None:
+        """Go on from what `arrays` returned of worlds of the same task, as many; the next step is theirs, bit for bit.
+
+        Raises ValueError that names the array which is missing, unknown, or of another shape or type, before any is
+        written; RuntimeError before the first reset.
+        """
+        mine = self.arrays()
+        if odd := sorted(mine.keys() ^ arrays.keys()):
+            raise ValueError(f"arrays: {odd[0]!r} is {'missing' if odd[0] in mine else 'unknown'}")
+        for name, array in arrays.items():
+            if (array.shape, array.dtype) != (mine[name].shape, mine[name].dtype):
+                expected = f"{mine[name].shape} of {mine[name].dtype}"
+                raise ValueError(f"arrays: {name!r} is {array.shape} of {array.dtype}, expected {expected}")
+        for name, array in arrays.items():
+            mine[name][...] = array
 
     @property
     def memory(self) -> NDArray[Any]:

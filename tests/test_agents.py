@@ -20,6 +20,7 @@ from agents.credit import CaringBuffer
 from agents.experiment import AS_CONFIGURED, CONFIGS, Experiment, PpoSettings, load_experiment
 from agents.imitate import imitate
 from agents.ppo import ForLearning
+from agents.run import checkpointed, recipe_of
 from agents.teach import shown
 from flockenv.crew import threads
 from flockenv.evaluation import compare, rollout, worlds_for
@@ -29,10 +30,9 @@ from flockenv.policy import MlpPolicy, RandomPolicy
 from flockenv.sb3 import WorldVecEnv
 from flockenv.tasks import TASKS, School, Task
 from flockenv.world import World
-from tests.training import interrupt
+from tests.training import PURSUIT, TINY, interrupt
 
 ROOT = CONFIGS.parent
-TINY = {"worlds": 16, "rollout": 16, "minibatch": 64, "epochs": 1, "evaluate_every": 512, "evaluate_worlds": 4}
 
 
 @pytest.mark.parametrize("name", sorted(TASKS))
@@ -125,9 +125,6 @@ def test_what_the_search_found_is_what_rules_play_by(tmp_path: Path, monkeypatch
     assert found["agent_steps"] > 0 and found["tuning_mean"] >= found["textbook_mean"]
 
 
-PURSUIT = Experiment(task="pursuit", ppo={**TINY, "steps": 1024})
-
-
 @pytest.mark.slow
 def test_training_is_repeatable_and_exports(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     from agents import ppo
@@ -157,7 +154,7 @@ def test_training_that_was_interrupted_goes_on_and_a_finished_one_is_left_alone(
     from agents import ppo
 
     interrupt(PURSUIT, tmp_path)
-    begun = ppo.checkpointed(PURSUIT, tmp_path)
+    begun = checkpointed(PURSUIT, tmp_path)
     assert begun is not None and 0 < begun.steps < 1024
     run = ppo.train(PURSUIT, tmp_path, go_on=True)
     assert run.steps >= 1024 and run.curve[: len(begun.curve)] == begun.curve
@@ -298,7 +295,7 @@ def test_training_leaves_the_number_of_threads_as_it_was(tmp_path: Path, monkeyp
     before = torch.get_num_threads(), threads()
     monkeypatch.setattr(ppo, "checkpoint", interrupted)
     with pytest.raises(KeyboardInterrupt):
-        ppo.train(PURSUIT.model_copy(update={"ppo": PpoSettings(**TINY, threads=3)}), tmp_path)
+        ppo.train(PURSUIT.model_copy(update={"ppo": PpoSettings(**{**TINY, "threads": 3})}), tmp_path)
     assert inside[0] == (3, 3)
     assert (torch.get_num_threads(), threads()) == before
 
@@ -387,7 +384,7 @@ def test_a_rollout_that_goes_beyond_the_budget_does_not_learn_backwards() -> Non
     from agents import ppo
 
     task = HUNGRY
-    model = ppo.build(task, PpoSettings(**TINY, steps=1, threads=1), None)
+    model = ppo.build(task, PpoSettings(**TINY, steps=1), None)
     assert model.lr_schedule(1.0) == pytest.approx(2e-3) and model.lr_schedule(0.0) == pytest.approx(2e-4)
     assert model.lr_schedule(-5.0) == pytest.approx(1e-4)
 
@@ -426,7 +423,7 @@ def test_who_cares_is_credited_with_what_becomes_of_the_others_of_his_world(care
 def test_held_actions_count_as_the_decisions_that_they_are(tmp_path: Path) -> None:
     from agents import ppo
 
-    settings = PpoSettings(**{**TINY, "steps": 1536, "evaluate_every": 768, "threads": 1, "hold": 3})
+    settings = PpoSettings(**{**TINY, "steps": 1536, "evaluate_every": 768, "hold": 3})
     whole = ppo.train(Experiment(task="pursuit", ppo=settings), tmp_path / "run")
     rows = settings.worlds * settings.rollout * 3
     assert [point["steps"] % rows for point in whole.curve] == [0] * len(whole.curve)
@@ -438,11 +435,9 @@ def test_a_taught_actor_waits_for_its_critic(tmp_path: Path) -> None:
     from agents import ppo
 
     def weights(**changes: Any) -> Any:
-        settings = {**TINY, "steps": 1024, "threads": 1, "taught": 5, **changes}
+        settings = {**TINY, "steps": 1024, "taught": 5, **changes}
         experiment = Experiment(task="pursuit", ppo=PpoSettings(**settings))
-        ppo.train(experiment, tmp_path / "run")
-        state = ppo.torch.load(tmp_path / "run" / "policy.pt", weights_only=True)
-        return {name: tensor.numpy() for name, tensor in state.items()}
+        return ppo.train(experiment, tmp_path / "run").state["policy"]
 
     waits, faster, learns = weights(critic_first=1024), weights(critic_first=1024, learning_rate=0.01), weights()
     untaught, thaws = weights(critic_first=1024, taught=0), weights(critic_first=512)
@@ -461,12 +456,11 @@ def test_a_run_that_is_taught_remembers_its_teacher_and_its_time(tmp_path: Path)
 
     taught = Experiment(task="pursuit", ppo=PpoSettings(**TINY, steps=1024, taught=5, critic_first=1024))
     interrupt(taught, tmp_path)  # when it had been taught
-    begun = ppo.checkpointed(taught, tmp_path)
+    begun = checkpointed(taught, tmp_path)
     assert begun is not None and begun.recipe["rules"] == as_dict(player(taught.build()).rules)
-    assert "rules" not in ppo.recipe_of(PURSUIT)
-    kept = ppo.torch.load(tmp_path / "policy.pt", weights_only=True)
-    ppo.train(taught, tmp_path, go_on=True)  # not taught again, and still the critic's turn
-    found = ppo.torch.load(tmp_path / "policy.pt", weights_only=True)
+    assert "rules" not in recipe_of(PURSUIT)
+    kept = begun.state["policy"]
+    found = ppo.train(taught, tmp_path, go_on=True).state["policy"]  # not taught again, and still the critic's turn
     for name in ("action_net.weight", "mlp_extractor.policy_net.0.weight", "log_std"):
         np.testing.assert_array_equal(found[name], kept[name])
     assert not np.array_equal(found["value_net.weight"], kept["value_net.weight"])
@@ -489,7 +483,7 @@ def test_ctrl_c_while_it_is_taught_claims_no_checkpoint_and_loses_none(
     monkeypatch.setattr(ppo, "teach", interrupted)
     result = CliRunner().invoke(ppo.app, [str(tmp_path / "p.yaml"), "--runs", str(tmp_path / "runs")])
     assert result.exit_code == 130 and "nothing was learnt yet" in result.stderr
-    assert ppo.checkpointed(PURSUIT, tmp_path / "runs" / "pursuit") is not None
+    assert checkpointed(PURSUIT, tmp_path / "runs" / "pursuit") is not None
 
 
 def test_rows_are_shown_until_an_episode_is_over() -> None:

@@ -10,6 +10,7 @@ import torch
 from agents import ppo
 from agents.central import CentralVecEnv
 from agents.experiment import Experiment, PpoSettings
+from agents.run import OtherRecipe, checkpointed
 from flockenv.policy import MlpPolicy
 from flockenv.sb3 import WorldVecEnv
 from flockenv.tasks import Flock, Herd, School, Task
@@ -103,34 +104,23 @@ def test_an_actor_is_blind_to_what_its_critic_sees_and_is_what_is_exported() -> 
     np.testing.assert_allclose(answers, np.clip(acts[0], -1, 1), rtol=1e-5, atol=1e-6)
 
 
-def test_what_a_central_critic_and_held_actions_came_to_goes_on_after_an_interruption(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_a_central_critic_and_held_actions_came_to_goes_on_after_an_interruption(tmp_path: Path) -> None:
     """Decisions are counted on, the networks are those of before, and it is still only the critic that learns."""
     update = 4 * 3 * 16 * 3
     changes = {"taught": 3, "critic_first": 4 * update, "hold": 3, "steps": 3 * update, "evaluate_every": update}
     experiment = settings(**changes)
     interrupt(experiment, tmp_path)
-    begun = ppo.checkpointed(experiment, tmp_path)
+    begun = checkpointed(experiment, tmp_path)
     assert begun is not None and begun.steps == update
-    kept = torch.load(tmp_path / "policy.pt", weights_only=True)
-    counted, resume = [], ppo.resume
-
-    def watched(folder: Path, model: Any, *given: Any) -> None:
-        resume(folder, model, *given)
-        counted.append(model.num_timesteps)
-
-    monkeypatch.setattr(ppo, "resume", watched)
+    kept = begun.state["policy"]
     run = ppo.train(experiment, tmp_path, go_on=True)
-    assert counted == [update // 3] and run.steps == 3 * update
-    assert [point["steps"] for point in run.curve] == [update, update, 2 * update, 3 * update, 3 * update]
-    found = torch.load(tmp_path / "policy.pt", weights_only=True)
+    assert [point["steps"] for point in run.curve] == [update, 2 * update, 3 * update, 3 * update]
+    found = run.state["policy"]
     for name in ("action_net.weight", "mlp_extractor.policy_net.0.weight", "log_std"):
         np.testing.assert_array_equal(found[name], kept[name])
     assert not np.array_equal(found["value_net.weight"], kept["value_net.weight"])
     thawed = ppo.train(settings(**{**changes, "critic_first": update}), tmp_path / "other")
     assert thawed.steps == 3 * update
-    found = torch.load(tmp_path / "other" / "policy.pt", weights_only=True)
-    assert not np.array_equal(found["action_net.weight"], kept["action_net.weight"])
-    with pytest.raises(ppo.OtherRecipe, match=r"central_critic = False: the checkpoint in .* with True"):
+    assert not np.array_equal(thawed.state["policy"]["action_net.weight"], kept["action_net.weight"])
+    with pytest.raises(OtherRecipe, match=r"central_critic = False: the checkpoint in .* with True"):
         ppo.train(settings(**changes, central_critic=False), tmp_path, go_on=True)

@@ -9,20 +9,38 @@ import pytest
 
 from agents.experiment import Experiment
 
-__all__ = ["interrupt"]
+__all__ = ["PURSUIT", "SCHOOL", "TINY", "interrupt"]
+
+TINY: dict[str, Any] = {
+    "worlds": 16, "rollout": 16, "minibatch": 64, "epochs": 1, "threads": 1, "evaluate_every": 512,
+    "evaluate_worlds": 4,
+}  # fmt: skip
+PURSUIT = Experiment(task="pursuit", ppo={**TINY, "steps": 1024})
+SCHOOL = Experiment(
+    task="school",
+    arguments={"fish": 3, "patches": 2, "horizon": 20},
+    ppo={
+        **TINY, "steps": 2304, "worlds": 4, "hidden": (8, 8), "evaluate_every": 576, "hold": 3,
+        "central_critic": True, "care": 1.0, "taught": 3, "critic_first": 600, "stagger": True,
+    },
+)  # fmt: skip
+"""Everything of training that has a memory of its own."""
 
 
-def interrupt(experiment: Experiment, folder: Path) -> None:
-    """Train, and press Ctrl-C at the first point of the curve."""
+def interrupt(experiment: Experiment, folder: Path, points: int = 1) -> None:
+    """Train, and press Ctrl-C where the point of the curve after so many is to be measured."""
     from agents import ppo  # with torch
 
-    write = ppo.checkpoint
+    measure, measured = ppo.score, 0
 
-    def interrupted(*given: Any) -> None:
-        write(*given)
-        raise KeyboardInterrupt
+    def interrupted(*given: Any) -> tuple[float, float]:
+        nonlocal measured
+        if measured == points:
+            raise KeyboardInterrupt
+        measured += 1
+        return measure(*given)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(ppo, "checkpoint", interrupted)
+        patch.setattr(ppo, "score", interrupted)
         with pytest.raises(KeyboardInterrupt):
             ppo.train(experiment, folder)

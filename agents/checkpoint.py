@@ -1,0 +1,194 @@
+"""A checkpoint of a training: one file, FOLDER/checkpoint.safetensors, that holds all of it or is the one before.
+
+The file is safetensors: a header in JSON, then numbers. Nothing in it is executed, and nothing is compressed. A tensor
+is called PART/NAME; a part that is JSON is one tensor of bytes, PART/json. What the parts are is for agents.ppo to say.
+The header's metadata hold `format` and `sha256`, the digest of every part: over names, types, shapes and bytes. `times`
+is the part that holds what the clock showed, and the only one that `digest` leaves out: two trainings that are the same
+bit for bit have checkpoints of the same digest.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+from filelock import FileLock, Timeout
+from numpy.typing import NDArray
+from pydantic import ValidationError
+from safetensors import SafetensorError, safe_open
+from safetensors.numpy import save
+
+from flockenv.outputs import replacing
+from flockenv.records import Record
+from flockenv.refusals import refusals, shown
+
+__all__ = [
+    "FILE", "TIMES", "CheckpointError", "Damaged", "InUse", "Parts", "as_json", "claimed", "digest", "from_json",
+    "path_in", "read", "write",
+]  # fmt: skip
+
+FILE, TIMES, JSON = "checkpoint.safetensors", "times", "json"
+FORMAT = "flockenv checkpoint 1"
+BEFORE = ("run.json", "policy.pt", "optimizer.pt", "best.npz")
+"""The files of the format before this one: four that could be of different moments."""
+
+Tensors = dict[str, NDArray[Any]]
+Parts = dict[str, Tensors]
+R = TypeVar("R", bound=Record)
+
+
+class CheckpointError(ValueError):
+    """A checkpoint that training cannot go on from."""
+
+
+class Damaged(CheckpointError):  # noqa: N818  # the state of a file
+    """A checkpoint that is not what was written, or not a checkpoint of this training."""
+
+    def __init__(self, folder: Path, why: str) -> None:
+        super().__init__(f"the checkpoint in {folder} is damaged: {why}")
+
+
+class InUse(CheckpointError):  # noqa: N818  # the state of a folder
+    """Another training holds the folder."""
+
+
+def path_in(folder: Path) -> Path:
+    """Return the checkpoint file of a folder."""
+    return folder / FILE
+
+
+@contextmanager
+def claimed(folder: Path) -> Iterator[None]:
+    """Hold a folder, made if it is not there; InUse at once if another training holds it, in any process.
+
+    What a killed process left half-written is removed; the lock of a killed process is free.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    lock = FileLock(folder / "training.lock")
+    try:
+        lock.acquire(blocking=False)
+    except Timeout:
+        raise InUse(f"{folder} is in use by another training: wait for its end, or choose another --runs") from None
+    try:
+        for left in folder.glob(f".{FILE}.*.part"):
+            left.unlink()
+        yield
+    finally:
+        lock.release()
+
+
+# --- writing ----------------------------------------------------------------------------------------------------------
+
+
+def as_json(content: Any) -> Tensors:
+    """Return a part that holds JSON."""
+    return {JSON: np.frombuffer(json.dumps(content, allow_nan=False).encode(), np.uint8)}
+
+
+def write(folder: Path, parts: Parts) -> None:
+    """Write a checkpoint, which takes the place of the one before when all of it is on the disk."""
+    digests = {part: _digest(tensors) for part, tensors in parts.items()}
+    tensors = {f"{part}/{name}": np.asarray(t, order="C") for part, named in parts.items() for name, t in named.items()}
+    data = save(tensors, {"format": FORMAT, "sha256": json.dumps(digests)})
+    with replacing(path_in(folder)) as file:
+        file.write(data)
+
+
+def digest(parts: Parts) -> str:
+    """Return the SHA-256 of all that a checkpoint holds, but for the part `times`."""
+    each = [f"{part} {_digest(tensors)}" for part, tensors in sorted(parts.items()) if part != TIMES]
+    return hashlib.sha256("\n".join(each).encode()).hexdigest()
+
+
+def _digest(tensors: Mapping[str, NDArray[Any]]) -> str:
+    total = hashlib.sha256()
+    for name, tensor in sorted(tensors.items()):
+        total.update(f"{name} {tensor.dtype.str} {tensor.shape}\n".encode())
+        total.update(tensor.tobytes())
+    return total.hexdigest()
+
+
+# --- reading ----------------------------------------------------------------------------------------------------------
+
+
+def read(folder: Path, largest: int) -> Parts | None:
+    """Return the parts of a folder's checkpoint, each with the digest that was recorded; None if there is none.
+
+    largest: bytes; a larger file is not read.
+
+    Raises:
+        Damaged: it names the part, or says what is wrong with the file.
+        CheckpointError: the files are in the format before this one.
+    """
+    path = path_in(folder)
+    if not path.exists():
+        if any((folder / name).exists() for name in BEFORE):
+            raise CheckpointError(f"the checkpoint in {folder} is in an older format: start anew without --resume")
+        return None
+    try:
+        if not path.is_file():
+            raise Damaged(folder, f"{FILE} is not a file")
+        if (size := path.stat().st_size) > largest:
+            raise Damaged(folder, f"{FILE} has {size:,} bytes, one of this training has at most {largest:,}")
+        with safe_open(path, "numpy") as file:
+            recorded, parts = _recorded(file.metadata() or {}, folder), _parts(file, folder)
+    except (SafetensorError, OSError, TypeError, KeyError) as error:
+        raise Damaged(folder, f"{FILE}: {' '.join(str(error).split())}") from None
+    _compare(parts, recorded, folder)
+    return parts
+
+
+def _recorded(metadata: Mapping[str, str], folder: Path) -> dict[str, str]:
+    """Return the digests that a header names."""
+    if metadata.get("format") != FORMAT:
+        raise Damaged(folder, f"header: format = {shown(metadata.get('format'))}, must be {FORMAT!r}")
+    try:
+        digests = json.loads(metadata.get("sha256", ""))
+    except (ValueError, RecursionError):
+        digests = None
+    if not isinstance(digests, dict) or not all(isinstance(value, str) for value in digests.values()):
+        raise Damaged(folder, "header: sha256 must be an object, a digest for each part")
+    return digests
+
+
+def _parts(file: Any, folder: Path) -> Parts:
+    parts: Parts = {}
+    for name in file.keys():  # noqa: SIM118  # not a dictionary
+        part, slash, rest = name.partition("/")
+        if not slash or not rest:
+            raise Damaged(folder, f"header: {shown(name)} is not the name of a tensor, PART/NAME")
+        parts.setdefault(part, {})[rest] = file.get_tensor(name)
+    return parts
+
+
+def _compare(parts: Parts, recorded: Mapping[str, str], folder: Path) -> None:
+    """Refuse a part that is missing, unknown, or not what its digest was taken of; one without tensors is there."""
+    for part in sorted({*recorded, *parts}):
+        if part not in recorded:
+            raise Damaged(folder, f"{part}: a part without a recorded SHA-256")
+        if _digest(parts.setdefault(part, {})) != recorded[part]:
+            raise Damaged(folder, f"{part}: its SHA-256 is not the recorded one")
+
+
+def from_json(kind: type[R], parts: Parts, part: str, folder: Path) -> R:
+    """Return the record that a part holds in JSON, read strictly; Damaged, with the key, if it is not of that kind."""
+    tensors = parts.get(part, {})
+    if tensors.keys() != {JSON} or tensors[JSON].dtype != np.uint8:
+        raise Damaged(folder, f"{part}: must be one tensor of bytes, {part}/{JSON}")
+    try:
+        data = json.loads(tensors[JSON].tobytes(), parse_constant=_constant)
+        return kind.model_validate_json(tensors[JSON].tobytes(), strict=True)
+    except ValidationError as error:
+        raise Damaged(folder, f"{part}: {next(iter(refusals(error, kind, data)), 'not what it must be')}") from None
+    except (ValueError, RecursionError) as error:
+        raise Damaged(folder, f"{part}: is not JSON: {' '.join(str(error).split())}") from None
+
+
+def _constant(text: str) -> float:
+    raise ValueError(f"{text} is not a number of JSON's" if math.isnan(float(text)) else f"{text} is not finite")

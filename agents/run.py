@@ -1,0 +1,168 @@
+"""A run of training: what it has come to so far, kept in a checkpoint and read from it, checked."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from pydantic import Field
+
+from agents import checkpoint as files
+from agents.checkpoint import CheckpointError, Parts
+from agents.experiment import Experiment
+from flockenv.players.rules import as_dict, player
+from flockenv.policy import MlpPolicy
+from flockenv.records import Record
+from flockenv.refusals import KeyPath, key_path, shown
+
+__all__ = ["OtherRecipe", "Run", "checkpoint", "checkpointed", "expected_bytes", "recipe_of"]
+
+STATE = ("policy", "optimizer", "worlds", "rollout", "random")
+"""The parts of a checkpoint that are the model's, see agents.training_state."""
+
+PARTS = (*STATE, "best", "notes", files.TIMES)
+"""All of them: the actor of the best policy so far, what is said in words, and what the clock showed."""
+
+
+class OtherRecipe(CheckpointError):  # noqa: N818  # not an error for a caller that starts anew then
+    """A checkpoint is of another recipe than the one to train by."""
+
+
+def recipe_of(experiment: Experiment) -> dict[str, Any]:
+    """Return all that training depends on: with another value anywhere it is another training."""
+    task, told = experiment.build(), experiment.model_dump(mode="json", include={"task", "arguments", "ppo"})
+    if experiment.ppo.taught:
+        told["rules"] = as_dict(player(task).rules)  # who taught it
+    return {**told, "layout": task.layout.digest}
+
+
+@dataclass
+class Run:
+    """What training has come to so far; all that a checkpoint holds."""
+
+    recipe: dict[str, Any]
+    surroundings: dict[str, str]  # what it ran under when it was started
+    resumed: list[dict[str, Any]] = field(default_factory=list)  # under what else it went on, and from which step
+    steps: int = 0
+    wall: float = 0.0  # s, with what teaching took
+    curve: list[dict[str, float]] = field(default_factory=list)
+    best: float | None = None
+    tensors: dict[str, np.ndarray] = field(default_factory=dict)
+    state: Parts = field(default_factory=dict)  # of the model, see agents.training_state
+
+
+class Point(Record):
+    """A point of the learning curve, as a checkpoint holds it; when it was is in Times."""
+
+    steps: int = Field(ge=0, description="agent-steps so far")
+    mean: float = Field(description="mean return on the tuning worlds")
+    success: float = Field(ge=0, le=1, description="share of them that were a success")
+
+
+class Resumption(Record):
+    """A resumption under other versions, or on another machine, than before."""
+
+    steps: int = Field(ge=0, description="agent-steps until then")
+    surroundings: dict[str, str] = Field(description="what was not as before")
+
+
+class Notes(Record):
+    """What a checkpoint says in words and numbers beside its arrays."""
+
+    recipe: dict[str, Any] = Field(description="all that training depends on")
+    surroundings: dict[str, str] = Field(description="what it ran under when it was started")
+    resumed: tuple[Resumption, ...] = Field(description="resumptions under something else")
+    steps: int = Field(ge=0, description="agent-steps so far")
+    best: float | None = Field(description="mean return of the best policy so far")
+    curve: tuple[Point, ...] = Field(description="the learning curve")
+
+
+class Times(Record):
+    """What the clock showed: no other part of a checkpoint depends on it."""
+
+    wall: float = Field(ge=0, description="s, with what teaching took")
+    seconds: tuple[float, ...] = Field(description="of each point of the curve")
+
+
+def checkpoint(folder: Path, run: Run) -> None:
+    """Write the run so far."""
+    notes = {name: getattr(run, name) for name in Notes.model_fields}
+    curve = [{name: point[name] for name in Point.model_fields} for point in run.curve]
+    times = {"wall": run.wall, "seconds": [point["seconds"] for point in run.curve]}
+    words = {"notes": files.as_json({**notes, "curve": curve}), files.TIMES: files.as_json(times)}
+    files.write(folder, {**run.state, "best": run.tensors, **words})
+
+
+def checkpointed(experiment: Experiment, folder: Path) -> Run | None:
+    """Return the run whose checkpoint lies in a folder, if there is one.
+
+    Raises:
+        OtherRecipe: it is not of this experiment.
+        CheckpointError: it is damaged, or in an older format.
+    """
+    parts = files.read(folder, 16 * expected_bytes(experiment) + 2**26)
+    if parts is None:
+        return None
+    for part in PARTS:
+        if part not in parts:
+            raise files.Damaged(folder, f"{part}: is missing")
+    if others := sorted(parts.keys() - set(PARTS)):
+        raise files.Damaged(folder, f"{others[0]}: is no part of a checkpoint")
+    notes, times = files.from_json(Notes, parts, "notes", folder), files.from_json(Times, parts, files.TIMES, folder)
+    _compare(notes.recipe, recipe_of(experiment), folder)
+    best = parts["best"]
+    if fault := _fault(notes, times, best, experiment):
+        raise files.Damaged(folder, fault)
+    told = notes.model_dump(mode="json")
+    seconds = [{"seconds": value} for value in times.seconds]
+    told["curve"] = [{"steps": p["steps"], **s, **p} for p, s in zip(told["curve"], seconds, strict=True)]
+    return Run(**told, wall=times.wall, tensors=best, state={part: parts[part] for part in STATE})
+
+
+def expected_bytes(experiment: Experiment) -> int:
+    """Return about how many bytes a checkpoint of an experiment has: of worlds, networks and their moments."""
+    task, p = experiment.build(), experiment.ppo
+    sizes = (task.layout.size, *p.hidden, task.action_layout.size)
+    weights = 24 * sum(a * b for a, b in pairwise(sizes))  # of two networks: themselves, and two moments, float32
+    return p.worlds * (task.scene.bytes_per_world() + 4 * task.learners * task.layout.size) + weights + 2**20
+
+
+def _compare(kept: dict[str, Any], wanted: dict[str, Any], folder: Path) -> None:
+    """Raise OtherRecipe, with the first key, if two recipes differ."""
+    of_kept, of_wanted = dict(_numbers(kept)), dict(_numbers(wanted))
+    for key in {**of_wanted, **of_kept}:
+        if of_kept.get(key) != of_wanted.get(key):
+            has, asked = (shown(of[key]) if key in of else "nothing" for of in (of_kept, of_wanted))
+            raise OtherRecipe(f"{key} = {asked}: the checkpoint in {folder} is of another recipe, with {has}")
+
+
+def _fault(notes: Notes, times: Times, best: dict[str, np.ndarray], experiment: Experiment) -> str:
+    """Return what of a checkpoint contradicts the rest of it, '' if nothing."""
+    reached = [point.steps for point in notes.curve]
+    if reached != sorted(reached) or any(steps > notes.steps for steps in reached):
+        return f"notes: curve goes to {max(reached):,} steps in an order that {notes.steps:,} steps cannot have had"
+    if len(times.seconds) != len(reached):
+        return f"times: {len(times.seconds)} times for {len(reached)} points of the curve"
+    if notes.best != max((point.mean for point in notes.curve), default=None):
+        return f"notes: best = {notes.best} is not the best of the curve"
+    if best or reached:
+        try:
+            policy = MlpPolicy(best, {"activation": experiment.ppo.activation})
+        except (ValueError, KeyError) as error:
+            return f"best: {error}"
+        if policy.observation_size != experiment.build().layout.size:
+            return f"best: a policy of {policy.observation_size} numbers"
+    return ""
+
+
+def _numbers(block: dict[str, Any], path: KeyPath = ()) -> Iterator[tuple[str, Any]]:
+    """Yield every value of nested blocks by its key path."""
+    for key, value in block.items():
+        if isinstance(value, dict):
+            yield from _numbers(value, (*path, key))
+        else:
+            yield key_path((*path, key)), value

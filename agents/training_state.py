@@ -1,0 +1,152 @@
+"""All that the next rollout and the next update of a model depend on, as arrays, and a model put back into it.
+
+It is taken where a rollout begins: the buffer is empty then, and actions, rewards and gradients of before are of no
+more use. Randomness of the worlds is a function of (seed, world, step, agent), so their counters stand for it.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import platform
+import random
+from collections.abc import Mapping, Sequence
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from stable_baselines3 import PPO
+
+from agents.checkpoint import JSON, Damaged, Parts, Tensors, as_json
+from flockenv.accuracy.measure import machine
+from flockenv.kernels import load
+from flockenv.tasks import Task
+from flockenv.tasks.base import task_source
+from flockenv.world import World
+
+__all__ = ["capture", "restore", "surroundings"]
+
+PACKAGES = ("flockenv", "numpy", "numba", "gymnasium", "stable-baselines3", "torch")
+MOMENTS = ("exp_avg", "exp_avg_sq", "step")
+"""What Adam keeps of each parameter that has had a gradient."""
+
+POSITIONS = ("state.x", "state.v")
+"""What must be finite of worlds: a lifetime, or a measure that does not apply yet, may be infinite or NaN."""
+
+
+def capture(model: PPO) -> Parts:
+    """Return copies of all that training goes on from, by part; to be called where a rollout begins."""
+    assert isinstance(model._last_obs, np.ndarray) and model._last_episode_starts is not None
+    return {
+        "policy": {name: _copied(tensor) for name, tensor in model.policy.state_dict().items()},
+        "optimizer": {
+            f"{index}.{name}": _copied(moments[name])
+            for index, moments in model.policy.optimizer.state_dict()["state"].items()
+            for name in MOMENTS
+        },
+        "worlds": {name: array.copy() for name, array in _world(model).arrays().items()},
+        "rollout": {"observation": model._last_obs.copy(), "starts": model._last_episode_starts.astype(np.bool_)},
+        "random": {"torch": torch.get_rng_state().numpy().copy(), **as_json(_generators(model))},
+    }
+
+
+def restore(model: PPO, parts: Parts, steps: int, folder: Path) -> None:
+    """Put a model, built by the same recipe, where another one was captured after so many steps of its rows.
+
+    Raises:
+        Damaged: it names the part that does not fit this model, and says why.
+    """
+    assert model.env is not None
+    model._last_obs = model.env.reset()  # type: ignore[assignment]
+    model._last_episode_starts = np.ones(model.n_envs, np.bool_)
+    fresh = capture(model)
+    fresh["optimizer"] = _optimizer_like(model, parts.get("optimizer", {}))
+    for part, wanted in fresh.items():
+        finite = POSITIONS if part == "worlds" else tuple(wanted)
+        if fault := _fault(parts.get(part, {}), wanted, finite):
+            raise Damaged(folder, f"{part}: {fault}")
+    try:
+        _put(model, parts)
+    except (ValueError, TypeError, KeyError, RuntimeError, RecursionError) as error:
+        raise Damaged(folder, f"random: {' '.join(str(error).split())}") from None
+    model.num_timesteps = steps
+
+
+def _world(model: PPO) -> World:
+    assert model.env is not None
+    world: World = model.env.get_attr("world", 0)[0]
+    return world
+
+
+def _copied(tensor: torch.Tensor) -> NDArray[Any]:
+    return tensor.detach().cpu().numpy().copy()
+
+
+def _optimizer_like(model: PPO, kept: Tensors) -> Tensors:
+    """Return moments such as a checkpoint's should be: of each parameter that it names, all of them or none."""
+    fresh: Tensors = {}
+    for index, parameter in enumerate(model.policy.parameters()):
+        if any(name.startswith(f"{index}.") for name in kept):
+            like = parameter.detach().numpy()
+            fresh |= {f"{index}.exp_avg": like, f"{index}.exp_avg_sq": like, f"{index}.step": np.zeros((), np.float32)}
+    return fresh
+
+
+def _fault(kept: Tensors, wanted: Tensors, finite: Sequence[str]) -> str:
+    """Return the first thing that makes tensors unfit to stand where others do, '' if nothing."""
+    if odd := sorted(kept.keys() ^ wanted.keys()):
+        return f"{odd[0]} is {'missing' if odd[0] in wanted else 'unknown'}"
+    for name, like in wanted.items():
+        array = kept[name]
+        if array.dtype != like.dtype or (array.shape != like.shape and name != JSON):
+            return f"{name} is {array.dtype} of shape {array.shape}, must be {like.dtype} of shape {like.shape}"
+        if name in finite and not np.isfinite(array).all():
+            return f"{name} holds {array[~np.isfinite(array)].flat[0]}"
+    return ""
+
+
+def _put(model: PPO, parts: Parts) -> None:
+    """Write what a checkpoint holds into a model that it fits; the generators last, since building draws numbers."""
+    policy, optimizer, moments = model.policy, model.policy.optimizer, parts["optimizer"]
+    policy.load_state_dict({name: torch.from_numpy(array) for name, array in parts["policy"].items()})
+    indices = sorted({int(name.split(".")[0]) for name in moments})
+    state = {k: {name: torch.from_numpy(moments[f"{k}.{name}"].copy()) for name in MOMENTS} for k in indices}
+    optimizer.load_state_dict({"state": state, "param_groups": optimizer.state_dict()["param_groups"]})
+    _world(model).restore(parts["worlds"])
+    model._last_obs, model._last_episode_starts = parts["rollout"]["observation"], parts["rollout"]["starts"]
+    _seed_generators(model, json.loads(parts["random"][JSON].tobytes()))
+    torch.set_rng_state(torch.from_numpy(parts["random"]["torch"]))
+
+
+def _generators(model: PPO) -> dict[str, Any]:
+    """Return the states of what SB3 seeds beside torch: Python's generator, numpy's, and the action space's."""
+    numpy = dict(np.random.get_state(legacy=False))  # noqa: NPY002  # SB3 draws minibatches from it
+    numpy["state"] = {**numpy["state"], "key": numpy["state"]["key"].tolist()}
+    return {"python": random.getstate(), "numpy": numpy, "actions": model.action_space.np_random.bit_generator.state}
+
+
+def _seed_generators(model: PPO, states: Mapping[str, Any]) -> None:
+    kind, numbers, rest = states["python"]
+    numpy = {**states["numpy"], "state": {**states["numpy"]["state"]}}
+    numpy["state"]["key"] = np.array(numpy["state"]["key"], np.uint32)
+    random.setstate((kind, tuple(numbers), rest))
+    np.random.set_state(numpy)  # noqa: NPY002
+    model.action_space.np_random.bit_generator.state = states["actions"]
+
+
+# --- what the same bits depend on beside the recipe -------------------------------------------------------------------
+
+
+def surroundings(task: Task) -> dict[str, str]:
+    """Return what training ran under, by name: versions, the machine, and the source of the task's kernel."""
+    processor = f"{machine().cpu}, {os.cpu_count()} cores, torch uses {torch.backends.cpu.get_cpu_capability()}"
+    return {
+        **{name: version(name) for name in PACKAGES},
+        "python": platform.python_version(),
+        "system": f"{platform.system()} {platform.machine()}",
+        "processor": processor,
+        "kernel": load(f"task_{task.name}", task_source(task)).__name__,
+    }

@@ -1,0 +1,588 @@
+"""Checkpoints: a resumed training is the uninterrupted one, bit for bit; a damaged file is refused in one line."""
+
+from __future__ import annotations
+
+import json
+import os
+import pickle
+import resource
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+import yaml
+from safetensors.numpy import save
+from typer.testing import CliRunner
+
+from agents import checkpoint as files
+from agents import ppo
+from agents.checkpoint import FILE, Damaged, InUse, Parts, claimed, digest
+from agents.divergence import LearningDiverged
+from agents.experiment import CONFIGS, Experiment
+from agents.run import checkpointed
+from flockenv.outputs import check_room
+from flockenv.policy import MlpPolicy
+from flockenv.sb3 import WorldVecEnv
+from flockenv.world import World
+from tests.training import PURSUIT, SCHOOL, TINY, interrupt
+
+LARGEST = 2**26
+TWO_THREADS = PURSUIT.model_copy(update={"ppo": PURSUIT.ppo.model_copy(update={"threads": 2})})
+
+
+def parts_in(folder: Path) -> Parts:
+    parts = files.read(folder, LARGEST)
+    assert parts is not None
+    return parts
+
+
+def same_training(one: Path, other: Path) -> None:
+    """Compare all that two trainings left, but for what the clock showed."""
+    mine, its = parts_in(one), parts_in(other)
+    for part, name in [(p, name) for p, tensors in mine.items() if p != files.TIMES for name in tensors]:
+        np.testing.assert_array_equal(mine[part][name], its[part][name], f"{part}/{name}")
+    assert digest(mine) == digest(its)
+
+
+# --- resumed = uninterrupted ------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Callable[[Experiment], Path]:
+    """Return the folder of a training that nothing interrupted."""
+    trained: dict[str, Path] = {}
+
+    def of(experiment: Experiment) -> Path:
+        key = repr(experiment)
+        if key not in trained:
+            trained[key] = tmp_path_factory.mktemp("whole")
+            ppo.train(experiment, trained[key])
+        return trained[key]
+
+    return of
+
+
+@pytest.mark.parametrize(
+    ("experiment", "points"),
+    [
+        *(pytest.param(PURSUIT, k, id=f"pursuit-{k}") for k in range(4)),
+        *(pytest.param(SCHOOL, k, id=f"school-{k}") for k in range(4)),
+        pytest.param(TWO_THREADS, 1, id="two threads", marks=pytest.mark.slow),
+    ],
+)
+def test_a_resumed_training_is_the_uninterrupted_one(
+    tmp_path: Path, whole: Callable[[Experiment], Path], experiment: Experiment, points: int
+) -> None:
+    interrupt(experiment, tmp_path, points)
+    begun = checkpointed(experiment, tmp_path)
+    assert begun is not None and begun.steps < experiment.ppo.steps and len(begun.curve) <= points
+    run = ppo.train(experiment, tmp_path, go_on=True)
+    same_training(tmp_path, whole(experiment))
+    assert run.resumed == []
+
+
+@pytest.mark.parametrize(
+    ("owner", "name", "call"),
+    [(torch.optim.Adam, "step", 9), (World, "step", 40), (WorldVecEnv, "step_wait", 17), (files, "write", 2)],
+    ids=["in an update", "while a world acts", "in a rollout", "before a checkpoint is written"],
+)
+def test_ctrl_c_at_any_moment_goes_on_from_the_last_rollout(
+    tmp_path: Path, whole: Callable[[Experiment], Path], owner: Any, name: str, call: int
+) -> None:
+    original, calls = getattr(owner, name), 0
+
+    def interrupted(*given: Any, **named: Any) -> Any:
+        nonlocal calls
+        calls += 1
+        if calls == call:
+            raise KeyboardInterrupt
+        return original(*given, **named)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(owner, name, interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            ppo.train(PURSUIT, tmp_path)
+    ppo.train(PURSUIT, tmp_path, go_on=True)
+    same_training(tmp_path, whole(PURSUIT))
+
+
+def test_a_training_may_be_resumed_again_and_again(tmp_path: Path, whole: Callable[[Experiment], Path]) -> None:
+    measure, at = ppo.score, 0
+
+    def interrupted(*given: Any) -> tuple[float, float]:
+        nonlocal at
+        at += 1
+        if at % 2:
+            raise KeyboardInterrupt
+        return measure(*given)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(ppo, "score", interrupted)
+        for _ in range(8):
+            with pytest.raises(KeyboardInterrupt):
+                ppo.train(PURSUIT, tmp_path, go_on=True)
+    ppo.train(PURSUIT, tmp_path, go_on=True)
+    same_training(tmp_path, whole(PURSUIT))
+
+
+@pytest.mark.slow
+def test_killed_trainings_end_as_if_they_had_never_been_killed() -> None:
+    command = [sys.executable, "-m", "benchmarks.kills", "--times", "20"]
+    done = subprocess.run(command, cwd=CONFIGS.parent, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "20 kills" in done.stdout and "0 ended otherwise, 0 resumptions were refused" in done.stdout
+
+
+def test_worlds_go_on_from_their_arrays_bit_for_bit() -> None:
+    task = SCHOOL.build()
+    one, other = World(task, 3, task.horizon), World(task, 3, task.horizon)
+    with pytest.raises(RuntimeError, match="before the first reset"):
+        one.arrays()
+    one.reset(5), other.reset(70)
+    rng = np.random.default_rng(0)
+    actions = rng.uniform(-1, 1, (12, 3, task.learners, 2))
+    for action in actions[:5]:
+        ended = one.step(action).ended
+        one.reset(mask=ended)
+    kept = {name: array.copy() for name, array in one.arrays().items()}
+    other.restore(kept)
+    for action in actions[5:]:
+        for mine, its in zip(one.step(action), other.step(action), strict=True):
+            np.testing.assert_array_equal(mine, its)
+        np.testing.assert_array_equal(one.reset(), other.reset())
+    for wrong, said in (
+        ({**kept, "spin": kept["steps"]}, "'spin' is unknown"),
+        ({k: v for k, v in kept.items() if k != "paid"}, "'paid' is missing"),
+        ({**kept, "steps": kept["steps"][:2]}, r"'steps' is \(2,\) of int64, expected \(3,\) of int64"),
+        ({**kept, "state.x": kept["state.x"].astype(np.float16)}, r"'state.x' is .* of float16, expected"),
+    ):
+        with pytest.raises(ValueError, match=said):
+            other.restore(wrong)
+
+
+# --- damaged files ----------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def begun(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a folder with a checkpoint, and a config of its training."""
+    folder = tmp_path_factory.mktemp("begun")
+    interrupt(PURSUIT, folder / "runs" / "pursuit", 2)
+    settings = {"task": "pursuit", "ppo": {**TINY, "steps": 1024}}
+    (folder / "pursuit.yaml").write_text(yaml.safe_dump(settings), encoding="utf-8")
+    return folder
+
+
+@pytest.fixture
+def copied(tmp_path: Path, begun: Path) -> Path:
+    shutil.copytree(begun, tmp_path, dirs_exist_ok=True)
+    return tmp_path
+
+
+def command(folder: Path, *more: str) -> Any:
+    given = [str(folder / "pursuit.yaml"), "--runs", str(folder / "runs"), "--out", str(folder / "p.safetensors")]
+    return CliRunner().invoke(ppo.app, [*given, *more])
+
+
+def refused(folder: Path, said: str) -> None:
+    """Resume what must be refused in one line that says so; nothing is made, and nothing changed."""
+    path = folder / "runs" / "pursuit" / FILE
+    before = path.read_bytes() if path.is_file() and path.stat().st_size < LARGEST else None
+    result = command(folder, "--resume")
+    assert result.exit_code == 2, (result.output, result.exception)
+    assert result.stderr.startswith(f"error: the checkpoint in {path.parent} is damaged: "), result.stderr
+    assert said in result.stderr and result.stderr.count("\n") == 1 and len(result.stderr) < 600
+    assert before is None or path.read_bytes() == before
+    assert {path.name for path in folder.iterdir()} == {"pursuit.yaml", "runs"}
+
+
+def changed(change: Callable[[Parts], Any]) -> Callable[[Path], None]:
+    """Return what writes a checkpoint anew, with true digests, after a change."""
+
+    def write(folder: Path) -> None:
+        parts = parts_in(folder)
+        change(parts)
+        files.write(folder, parts)
+
+    return write
+
+
+def noted(**changes: Any) -> Callable[[Path], None]:
+    """Return what changes the notes of a checkpoint; None takes a key away."""
+
+    def change(parts: Parts) -> None:
+        notes = {**json.loads(parts["notes"]["json"].tobytes()), **changes}
+        text = json.dumps({key: value for key, value in notes.items() if value != "gone"})
+        parts["notes"] = {"json": np.frombuffer(text.encode(), np.uint8)}
+
+    return changed(change)
+
+
+def bytes_in(content: Callable[[bytes], bytes]) -> Callable[[Path], None]:
+    return lambda folder: (folder / FILE).write_bytes(content((folder / FILE).read_bytes()))  # type: ignore[func-returns-value]
+
+
+def as_bytes(text: str) -> dict[str, Any]:
+    return {"json": np.frombuffer(text.encode(), np.uint8)}
+
+
+def tensor(part: str, name: str, value: Callable[[Any], Any]) -> Callable[[Path], None]:
+    def change(parts: Parts) -> None:
+        parts[part][name] = value(parts[part][name].copy())
+
+    return changed(change)
+
+
+def with_nan(array: Any) -> Any:
+    array.flat[3] = np.nan
+    return array
+
+
+def sparse(folder: Path) -> None:
+    os.truncate(folder / FILE, 5 * 2**29)
+
+
+def a_folder(folder: Path) -> None:
+    (folder / FILE).unlink()
+    (folder / FILE).mkdir()
+
+
+def foreign(folder: Path) -> None:
+    (folder / FILE).write_bytes(save({"x": np.zeros(3)}, {"format": "pt"}))
+
+
+def pickled(folder: Path) -> None:
+    (folder / FILE).write_bytes(pickle.dumps({"steps": 3}))
+
+
+DAMAGES: dict[str, tuple[Callable[[Path], Any], str]] = {
+    "empty": (bytes_in(lambda data: b""), f"{FILE}: "),
+    "cut by a byte": (bytes_in(lambda data: data[:-1]), f"{FILE}: "),
+    "cut in the header": (bytes_in(lambda data: data[:100]), f"{FILE}: "),
+    "a byte more": (bytes_in(lambda data: data + b"\0"), f"{FILE}: "),
+    "twice": (bytes_in(lambda data: data + data), f"{FILE}: "),
+    "zeros": (bytes_in(lambda data: bytes(len(data))), f"{FILE}: "),
+    "a pickle": (pickled, f"{FILE}: "),
+    "JSON": (bytes_in(lambda data: b'["a", "list"]'), f"{FILE}: "),
+    "of something else": (foreign, "header: format = 'pt', must be 'flockenv checkpoint 1'"),
+    "a folder": (a_folder, f"{FILE} is not a file"),
+    "2.5 GiB": (sparse, f"{FILE} has 2,684,354,560 bytes, one of this training has at most"),
+    "a part more": (changed(lambda parts: parts.update(more={"x": np.zeros(3)})), "more: is no part of a checkpoint"),
+    "no optimizer": (changed(lambda parts: parts.pop("optimizer")), "optimizer: is missing"),
+    "no notes": (changed(lambda parts: parts.pop("notes")), "notes: "),
+    "steps -5": (noted(steps=-5), "notes: steps = -5: must be a whole number >= 0"),
+    "steps in words": (noted(steps="many"), "notes: steps = 'many': must be a whole number >= 0"),
+    "a key more": (noted(lucky=7), "notes: lucky = 7: unknown key"),
+    "a key less": (noted(curve="gone"), "notes: curve: missing; needed is a list"),
+    "fewer steps": (noted(steps=256), "notes: curve goes to 512 steps"),
+    "another best": (noted(best=1e6), "notes: best = 1000000.0 is not the best of the curve"),
+    "notes are a list": (changed(lambda parts: parts.update(notes=as_bytes("[1, 2]"))), "notes: "),
+    "notes are NaN": (changed(lambda parts: parts.update(notes=as_bytes("NaN"))), "notes: is not JSON: NaN"),
+    "notes are no text": (changed(lambda parts: parts.update(notes=as_bytes("\x80[" * 9999))), "notes: is not JSON"),
+    "notes are numbers": (changed(lambda parts: parts.update(notes={"json": np.zeros(3)})), "notes: must be one"),
+    "no times": (changed(lambda parts: parts.update(times=as_bytes('{"wall": 1, "seconds": []}'))), "times: 0 times"),
+    "NaN policy": (tensor("policy", "action_net.weight", with_nan), "policy: action_net.weight holds nan"),
+    "NaN best": (tensor("best", "action.weight", with_nan), "best: tensor 'action.weight' holds NaN"),
+    "NaN moments": (tensor("optimizer", "3.exp_avg", with_nan), "optimizer: 3.exp_avg holds nan"),
+    "NaN position": (tensor("worlds", "state.x", with_nan), "worlds: state.x holds nan"),
+    "doubles": (tensor("policy", "log_std", lambda a: a.astype(float)), "policy: log_std is float64 of shape (2,)"),
+    "fewer worlds": (tensor("worlds", "steps", lambda a: a[:-1]), "worlds: steps is int64 of shape (15,)"),
+    "a moment less": (changed(lambda parts: parts["optimizer"].pop("3.step")), "optimizer: 3.step is missing"),
+    "a moment more": (
+        changed(lambda parts: parts["optimizer"].update({"99.step": np.zeros(())})), "optimizer: 99.step is unknown",
+    ),
+    "a tensor more": (changed(lambda parts: parts["rollout"].update(x=np.zeros(2))), "rollout: x is unknown"),
+    "torch's generator": (tensor("random", "torch", lambda a: a[:-9]), "random: torch is uint8 of shape"),
+    "no generators": (changed(lambda parts: parts["random"].update(as_bytes("{}"))), "random: "),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", DAMAGES)
+def test_a_damaged_checkpoint_is_named_in_one_line(copied: Path, name: str) -> None:
+    damage, said = DAMAGES[name]
+    damage(copied / "runs" / "pursuit")
+    refused(copied, said)
+
+
+def test_every_flipped_bit_is_found(copied: Path) -> None:
+    """Tried in every seventh byte of the header and in 300 bytes of tensors, whose part is named."""
+    folder = copied / "runs" / "pursuit"
+    data = bytearray((folder / FILE).read_bytes())
+    header = 8 + int.from_bytes(data[:8], "little")
+    rng, named = np.random.default_rng(0), set()
+    for at in [*range(0, header, 7), *rng.choice(np.arange(header, len(data)), 300, replace=False).tolist()]:
+        bit = 1 << int(rng.integers(8))
+        data[at] ^= bit
+        (folder / FILE).write_bytes(data)
+        with pytest.raises(Damaged) as caught:
+            files.read(folder, LARGEST)
+        data[at] ^= bit
+        text = str(caught.value)
+        assert text.isprintable() and len(text) < 500
+        if at >= header:
+            assert text.endswith(": its SHA-256 is not the recorded one"), text
+            named.add(text.split(": ")[1])
+    (folder / FILE).write_bytes(data)
+    assert named >= {"policy", "optimizer", "worlds", "rollout", "random", "best"}
+    assert files.read(folder, LARGEST) is not None
+
+
+@pytest.mark.parametrize("name", ["run.json", "policy.pt"])
+def test_a_checkpoint_of_the_format_before_is_refused_in_one_line(copied: Path, name: str) -> None:
+    folder = copied / "runs" / "pursuit"
+    (folder / FILE).unlink()
+    (folder / name).write_bytes(b"{}")
+    result = command(copied, "--resume")
+    said = f"error: the checkpoint in {folder} is in an older format: start anew without --resume\n"
+    assert (result.exit_code, result.stderr) == (2, said)
+
+
+def test_a_checkpoint_runs_no_code_and_is_no_pickle(copied: Path) -> None:
+    data = (copied / "runs" / "pursuit" / FILE).read_bytes()
+    header = json.loads(data[8 : 8 + int.from_bytes(data[:8], "little")])
+    kinds = {entry["dtype"] for name, entry in header.items() if name != "__metadata__"}
+    assert kinds <= {"F32", "F64", "I64", "U64", "U8", "BOOL"}
+    assert sorted(path.name for path in (copied / "runs" / "pursuit").iterdir()) == [FILE, "training.lock"]
+
+
+# --- one training a folder --------------------------------------------------------------------------------------------
+
+
+def test_a_second_training_in_a_folder_says_so_at_once(copied: Path) -> None:
+    folder = copied / "runs" / "pursuit"
+    before = (folder / FILE).read_bytes()
+    with claimed(folder):
+        for more in ((), ("--resume",)):
+            result = command(copied, *more)
+            said = f"error: {folder} is in use by another training: wait for its end, or choose another --runs\n"
+            assert (result.exit_code, result.stderr) == (2, said)
+        with pytest.raises(InUse):
+            ppo.train(PURSUIT, folder)
+    assert (folder / FILE).read_bytes() == before and not (copied / "p.safetensors").exists()
+    with claimed(folder):
+        pass
+
+
+def test_a_lock_is_seen_from_another_process_and_freed_by_its_end(copied: Path) -> None:
+    folder = copied / "runs" / "pursuit"
+    code = f"""
+from pathlib import Path
+from agents.checkpoint import claimed
+with claimed(Path({str(folder)!r})):
+    print("held", flush=True)
+    input()
+"""
+    holder = subprocess.Popen(
+        [sys.executable, "-c", code], cwd=CONFIGS.parent, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    )
+    with holder:
+        assert holder.stdout is not None and holder.stdout.readline() == "held\n"
+        with pytest.raises(InUse, match="in use by another training"), claimed(folder):
+            pass
+        holder.kill()
+    with claimed(folder):
+        pass
+
+
+def test_what_a_killed_training_left_half_written_is_removed(copied: Path) -> None:
+    folder = copied / "runs" / "pursuit"
+    half = folder / f".{FILE}.4711.part"
+    half.write_bytes(b"half")
+    with claimed(folder):
+        assert not half.exists() and (folder / FILE).exists()
+
+
+# --- what is written is tried before ----------------------------------------------------------------------------------
+
+
+def untouched(folder: Path, result: Any, said: str) -> None:
+    assert result.exit_code == 2, (result.output, result.exception)
+    assert result.stderr.startswith("error: ") and said in result.stderr and result.stderr.count("\n") == 1
+    assert [path.name for path in folder.iterdir()] == ["pursuit.yaml"]
+
+
+@pytest.fixture
+def fresh(tmp_path: Path, begun: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Return a folder with a config alone; nothing is to be built."""
+    shutil.copy(begun / "pursuit.yaml", tmp_path)
+
+    def build(*_: Any) -> None:
+        raise AssertionError("nothing is to be built")
+
+    monkeypatch.setattr(ppo, "build", build)
+    return tmp_path
+
+
+@pytest.mark.parametrize(
+    ("option", "value", "said"),
+    [
+        ("--out", "{}/w.bin", "w.bin': must end in .safetensors"),
+        ("--out", "{}/w", "w': must end in .safetensors"),
+        ("--out", "../../../elsewhere.safetensors", "--out '../../../elsewhere.safetensors': must not go up with '..'"),
+        ("--out", "/proc/w.safetensors", "--out '/proc/w.safetensors': must lie below"),
+        ("--out", "{}/pursuit.yaml/w.safetensors", "pursuit.yaml' is not a folder"),
+        ("--runs", "../elsewhere", "--runs '../elsewhere/pursuit': must not go up with '..'"),
+        ("--runs", "/proc/runs", "--runs '/proc/runs/pursuit': must lie below"),
+        ("--runs", "{}/pursuit.yaml", "pursuit.yaml' is not a folder"),
+        ("--tensorboard", "/proc/logs", "--tensorboard '/proc/logs': must lie below"),
+    ],
+)
+def test_what_cannot_be_written_is_refused_before_training(fresh: Path, option: str, value: str, said: str) -> None:
+    untouched(fresh, command(fresh, option, value.format(fresh)), said)
+
+
+def test_a_card_that_cannot_be_written_is_refused_before_training(fresh: Path) -> None:
+    (fresh / "p.json").mkdir()
+    result = command(fresh)
+    assert result.exit_code == 2 and "its card, 'p.json', is a folder" in result.stderr
+
+
+@pytest.mark.parametrize("place", ["w.safetensors", "runs"])
+def test_a_read_only_disk_is_refused_before_training(
+    fresh: Path, monkeypatch: pytest.MonkeyPatch, place: str
+) -> None:  # fmt: skip
+    closed = fresh / "closed"
+    closed.mkdir()
+    access = os.access
+    monkeypatch.setattr(os, "access", lambda path, mode: not str(path).startswith(str(closed)) and access(path, mode))
+    option = "--runs" if place == "runs" else "--out"
+    result = command(fresh, option, str(closed / place))
+    assert result.exit_code == 2 and "cannot be written to" in result.stderr and result.stderr.count("\n") == 1
+    assert not any(closed.iterdir())
+
+
+def test_a_disk_without_room_is_refused_before_training(fresh: Path) -> None:
+    """Files may not be so long for a moment: what a full disk answers, too, is found by trying."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (2**10, before[1]))
+    try:
+        result = command(fresh)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    untouched(fresh, result, "cannot write")
+
+
+def test_room_is_tried_where_a_file_will_be_and_nothing_is_left(tmp_path: Path) -> None:
+    check_room(tmp_path / "deep" / "down" / "x", 2**20)
+    with pytest.raises(OSError, match=r"cannot write '.*x' \([\d,]+ bytes\): ") as caught:
+        check_room(tmp_path / "deep" / "x", 2**60)
+    assert "\n" not in str(caught.value) and not any(tmp_path.iterdir())
+
+
+# --- NaN --------------------------------------------------------------------------------------------------------------
+
+
+def spoilt(monkeypatch: pytest.MonkeyPatch, call: int, quantity: str, row: int, column: int) -> None:
+    """Put a NaN into what a step of all worlds tells, once."""
+    original, calls = WorldVecEnv.step_wait, 0
+
+    def step_wait(self: WorldVecEnv) -> Any:
+        nonlocal calls
+        seen, reward, done, infos = original(self)
+        calls += 1
+        if calls == call and quantity == "reward":
+            reward[row] = np.nan
+        elif calls == call:
+            seen[row, column] = np.inf
+        return seen, reward, done, infos
+
+    monkeypatch.setattr(WorldVecEnv, "step_wait", step_wait)
+
+
+NAN = [
+    ("reward", 0, "world 11, pursuer_0: reward, is nan after decision 41 of its episode"),
+    ("observation", 0, "world 11, pursuer_0: observation, {slot}, is inf after decision 41 of its episode"),
+]
+
+
+@pytest.mark.parametrize(("quantity", "column", "said"), NAN)
+def test_a_number_that_is_not_finite_is_named_and_the_last_good_policy_kept(
+    copied: Path, monkeypatch: pytest.MonkeyPatch, quantity: str, column: int, said: str
+) -> None:
+    """In the third rollout: two points of the curve are measured, and the checkpoint is of where it began."""
+    shutil.rmtree(copied / "runs")
+    spoilt(monkeypatch, 2 * 16 + 9, quantity, 11, column)
+    result = command(copied)
+    slot = PURSUIT.build().layout.slots[0].name
+    folder, target = copied / "runs" / "pursuit", copied / "p.safetensors"
+    assert result.exit_code == 1, (result.output, result.exception)
+    lines = [line for line in result.stderr.splitlines() if line.startswith("error: ")]
+    kept = f"kept: the checkpoint of 512 steps in {folder}, and the best policy so far (mean return "
+    assert len(lines) == 1 and said.format(slot=slot) in lines[0] and kept in lines[0]
+    run = checkpointed(PURSUIT, folder)
+    assert run is not None and run.steps == 512 and len(run.curve) == 2
+    assert MlpPolicy.load(target, PURSUIT.build()).card["tuning_mean"] == run.best
+
+
+def test_a_nan_before_anything_was_learned_is_named(copied: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    shutil.rmtree(copied / "runs")
+    spoilt(monkeypatch, 1, "reward", 0, 0)
+    result = command(copied)
+    assert result.exit_code == 1 and "world 0, pursuer_0: reward, is nan after decision 1" in result.stderr
+    assert "kept: the checkpoint of 0 steps" in result.stderr and not (copied / "p.safetensors").exists()
+
+
+def test_a_reward_that_is_not_finite_in_a_tuning_world_is_named(
+    copied: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:  # fmt: skip
+    step = World.step
+
+    def spoils(self: World, *given: Any, **named: Any) -> Any:
+        result = step(self, *given, **named)
+        if self.worlds == 4:  # where the curve is measured
+            result.reward[2] = np.nan
+        return result
+
+    monkeypatch.setattr(World, "step", spoils)
+    result = command(copied, "--resume")
+    assert result.exit_code == 1 and "error: on the tuning worlds: world 2: its reward is nan" in result.stderr
+    assert "and the best policy so far" in result.stderr and (copied / "p.safetensors").exists()
+
+
+@pytest.mark.parametrize("experiment", [PURSUIT, SCHOOL], ids=["pursuit", "school"])
+def test_learning_that_diverges_is_named(tmp_path: Path, experiment: Experiment) -> None:
+    settings = experiment.ppo.model_copy(update={"learning_rate": 1e30, "taught": 0, "critic_first": 0})
+    with pytest.raises(LearningDiverged, match=r"largest weight is \d.*e\+\d+|weights of the network") as caught:
+        ppo.train(experiment.model_copy(update={"ppo": settings}), tmp_path)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.filterwarnings("ignore:overflow:RuntimeWarning")
+@pytest.mark.parametrize(
+    ("scale", "said"),
+    [(1e38, "weights of the network, .*; the largest return of the .*e\\+"), (1e39, "advantages of the .* hold -inf")],
+)
+def test_a_loss_that_is_not_finite_is_named(tmp_path: Path, scale: float, said: str) -> None:
+    huge = PURSUIT.ppo.model_copy(update={"reward_scale": scale})
+    with pytest.raises(LearningDiverged, match=said):
+        ppo.train(PURSUIT.model_copy(update={"ppo": huge}), tmp_path)
+
+
+# --- versions ---------------------------------------------------------------------------------------------------------
+
+
+def test_other_versions_are_said_and_stand_in_the_card(copied: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    begun, real = checkpointed(PURSUIT, copied / "runs" / "pursuit"), ppo.surroundings
+    monkeypatch.setattr(ppo, "surroundings", lambda task: {**real(task), "torch": "9.1.0", "numpy": "3.0.0"})
+    result = command(copied, "--resume")
+    assert result.exit_code == 0, result.output
+    torch_now, numpy_now = torch.__version__, np.__version__
+    said = " ".join(result.stderr.split())
+    assert f"numpy 3.0.0 after {numpy_now}, torch 9.1.0 after {torch_now}: weights may differ from those of an" in said
+    card = json.loads((copied / "p.json").read_text(encoding="utf-8"))
+    assert card["versions"]["torch"] == torch_now
+    assert card["versions"].keys() >= {"flockenv", "python", "numpy", "stable-baselines3", "system", "processor"}
+    others = {"numpy": "3.0.0", "torch": "9.1.0"}
+    assert begun is not None and card["resumed"] == [{"steps": begun.steps, "surroundings": others}]
+
+
+def test_the_same_versions_are_not_worth_a_word(copied: Path) -> None:
+    result = command(copied, "--resume")
+    assert result.exit_code == 0 and "resumed" not in result.stderr
+    assert "resumed" not in json.loads((copied / "p.json").read_text(encoding="utf-8"))
