@@ -6,12 +6,12 @@ import functools
 import hashlib
 import inspect
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
 from time import perf_counter
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,6 +40,7 @@ REFERENCE = 64
 KEPT = Path("runs/transfer")
 
 Actions = list[NDArray[Any]]
+Kept = TypeVar("Kept", Cell, Clock)
 
 
 @dataclass(frozen=True)
@@ -129,12 +130,36 @@ def _keep(path: Path, content: Any) -> None:
         file.write(json.dumps(content, allow_nan=False).encode())
 
 
+def _kept(path: Path, of_json: Callable[[Any], Kept]) -> Kept:
+    """Return what a file keeps; ValueError, in one line that names it, if it is not what was written there."""
+    try:
+        return of_json(json.loads(path.read_text(encoding="utf-8")))
+    except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+        why = " ".join(str(error).split())
+        raise ValueError(f"{path} is damaged: {why}; without it the same command makes it anew") from None
+
+
+def _cell_of(content: Any, worlds: int) -> Cell:
+    cell = Cell.of_json(content)
+    if cell.returns.shape != (worlds,) or cell.success.shape != (worlds,) or not np.isfinite(cell.returns).all():
+        raise ValueError(f"must hold a finite return and a success of each of {worlds} worlds")
+    return cell
+
+
+def _clock_of(content: Any) -> Clock:
+    clock = Clock(**content)
+    numbers = [value for times in [*clock.rounds, clock.error_mm] for value in times.values()]
+    if not np.isfinite(np.array(numbers, float)).all():
+        raise ValueError("must hold finite times and errors")
+    return clock
+
+
 def _cell(plan: Plan, setting: Setting, player: Player, prefix: str = "") -> Cell:
     """Return a cell as it is kept, played first if it is not."""
     path = cell_path(plan, setting, player, prefix)
     if not path.is_file():
         _keep(path, play(plan, setting, player).to_json())
-    return Cell.of_json(json.loads(path.read_text(encoding="utf-8")))
+    return _kept(path, functools.partial(_cell_of, worlds=plan.worlds))
 
 
 def play_missing(job: Job) -> tuple[str, int]:
@@ -210,7 +235,7 @@ def _clock_path(plan: Plan) -> Path:
 
 def _kept_clock(plan: Plan) -> Clock:
     path = _clock_path(plan)
-    return Clock(**json.loads(path.read_text(encoding="utf-8"))) if path.is_file() else Clock()
+    return _kept(path, _clock_of) if path.is_file() else Clock()
 
 
 def _actions(plan: Plan) -> Actions:

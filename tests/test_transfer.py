@@ -154,6 +154,33 @@ def test_more_rounds_are_added_to_those_that_are_kept() -> None:
     assert len(rounds) == 3
 
 
+DAMAGED = [
+    ("reynolds-*.json", ""),
+    ("reynolds-*.json", '{"returns": [1.0, 2.0'),
+    ("reynolds-*.json", '{"returns": [1.0, 2.0], "success": [true, true]}'),
+    ("reynolds-*.json", '{"returns": [1.0, 2.0, NaN], "success": [true, true, true]}'),
+    ("reynolds-*.json", '{"success": [true, true, true]}'),
+    ("reynolds-*.json", "[1, 2]"),
+    ("clock-*.json", '{"rounds": [{"a": "b"}], "error_mm": {}}'),
+    ("clock-*.json", '{"rounds": [], "error": {}}'),
+    ("clock-*.json", "\x00"),
+]
+
+
+def test_a_kept_file_that_is_damaged_is_named_in_one_line() -> None:
+    asked = (*TINY, *TRAINED, "--players", "reynolds")
+    run(*asked)
+    for name, content in DAMAGED:
+        [path] = KEPT.rglob(name)
+        before = path.read_bytes()
+        path.write_text(content, encoding="utf-8")
+        said = run(*asked, code=2).stderr
+        assert said.startswith(f"transfer: {path} is damaged: ") and said.count("\n") == 1, said
+        path.write_bytes(before)
+    path.unlink()
+    run(*asked)
+
+
 @pytest.mark.slow
 def test_a_player_that_has_changed_plays_anew(monkeypatch: pytest.MonkeyPatch) -> None:
     counted = Counted(monkeypatch)
