@@ -86,12 +86,14 @@ class ForLearning(VecEnvWrapper):
 
     def step_wait(self) -> Any:
         """Act for `hold` decisions of the world, and scale what is paid."""
+        absent = ~self.venv.present
         observation, reward, done, infos = self._decided()
+        done |= absent  # nothing that is learned of a row without a learner reaches into its next episode
         for _ in range(self.hold - 1):
             self.venv.step_async(self.actions)
             observation, more, over, told = self._decided()
             reward += np.where(done, 0.0, more)
-            if any(told[:: self.venv.world.learners]):  # all rows of a world are told of its end
+            if any(told):  # a world has ended, or a learner has left
                 infos = [before or new for before, new in zip(infos, told, strict=True)]
             done = done | over
         return observation, reward * self.scale, done, infos

@@ -6,17 +6,20 @@ torch's threads from spinning where the worlds' would run (docs/performance.md, 
 
 from __future__ import annotations
 
+import copy
 import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
+import gymnasium
 import numpy as np
 from gymnasium import Wrapper
 from gymnasium.error import ResetNeeded
+from gymnasium.utils import seeding
 from numpy.typing import NDArray
 from stable_baselines3 import PPO
-from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.vec_env import VecEnv, VecMonitor
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices
 
 from flockenv.envs.face import (
@@ -28,16 +31,20 @@ from flockenv.envs.face import (
     named,
     observation_space,
     render_fps,
+    reward_keys,
     together,
 )
+from flockenv.envs.registration import HORIZONS, id_of
 from flockenv.world import Step, World
 
 if TYPE_CHECKING:
+    from gymnasium.envs.registration import EnvSpec
     from stable_baselines3.common.base_class import BaseAlgorithm
+    from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
 
     from flockenv.tasks import Task
 
-__all__ = ["WorldVecEnv", "load_sb3_zip"]
+__all__ = ["WorldMonitor", "WorldVecEnv", "load_sb3_zip"]
 
 Info = dict[str, Any]
 
@@ -64,22 +71,30 @@ class WorldVecEnv(VecEnv):
     """B worlds with L learners each as B * L rows of one shared policy; row i is learner i % L of world i // L.
 
     A world that ended begins anew in the same step. The infos of its rows then hold `terminal_observation`,
-    `TimeLimit.truncated` (so that PPO bootstraps time limits and not deaths), `is_success`, `terms` (sums over the
-    episode), and the metrics of the world; all other infos are one empty dictionary that refuses to be written.
+    `TimeLimit.truncated` (so that PPO bootstraps time limits and not deaths), `is_success`, `reward/NAME` (each reward
+    term, summed over the episode), and the metrics of the world; all other infos are one empty dictionary that refuses
+    to be written.
 
     Seeds: `seed(s)` gives world k the seed s + k at the next reset; a world goes on with the next episodes of its seed.
+    The next reset also seeds `np_random` by s, from which wrappers draw; worlds draw nothing from it.
+
+    Stable-Baselines3's `EvalCallback` and `evaluate_policy` ask for a monitor: wrap this in `WorldMonitor`.
 
     Args:
         task: of which all learners of a world end together, unless `leaving`.
         worlds: B.
         time_limit: decisions after which a world is truncated; None = the task's own horizon.
         render_mode: "rgb_array" (world 0) or None.
-        leaving: let learners end one by one. A row is done when its learner is; until its world begins anew it is paid
-            nothing and is done in every step, so that nothing that is learned of it reaches across.
+        leaving: let learners end one by one. A row is done once, when its learner leaves, and the info of that step
+            holds its `terminal_observation` and reward terms; what is of the world stands in the infos of the rows
+            that end with it. Until the world begins anew, `present` is False for the row, its reward is 0 and its
+            actions are not read. It is not done again when the world begins anew: `present` is True from then on.
 
     Raises:
         ValueError: the task's learners end one by one, for which a row has no meaning after its end, and not `leaving`.
     """
+
+    metadata: dict[str, Any]
 
     def __init__(
         self, task: Task, worlds: int = 1, time_limit: int | None = None, render_mode: str | None = None,
@@ -89,9 +104,19 @@ class WorldVecEnv(VecEnv):
         self.world = World(task, worlds, time_limit=task.horizon if time_limit is None else time_limit)
         self.render_mode = render_mode
         self._screen = Screen(render_mode, render_fps(task), modes=("rgb_array",))
+        self._reward_keys = reward_keys(task)
         self._actions: NDArray[Any] | None = None
         self._running = False
+        self._present = np.ones((self.world.worlds, task.learners), np.bool_)
+        self.spec = _spec(task, self.world.time_limit)
+        self.np_random = seeding.np_random()[0]
         super().__init__(worlds * task.learners, observation_space(task), action_space(task))
+        self.metadata["render_fps"] = render_fps(task)
+
+    @property
+    def present(self) -> NDArray[np.bool_]:
+        """(B L,): True for a row whose learner acts in the next step, False for one whose learner has left."""
+        return self._present.reshape(-1).copy()
 
     def seed(self, seed: int | None = None) -> Sequence[int | None]:
         """Give world k the seed s + k at the next reset; None draws s. Returns the seed of every row."""
@@ -105,7 +130,11 @@ class WorldVecEnv(VecEnv):
         for options in self._options:
             checked_options(options)
         seeds = [seed for seed in self._seeds[:: self.task.learners] if seed is not None]
-        observation = self.world.reset(seeds=seeds if len(seeds) == self.world.worlds else None)
+        seeded = len(seeds) == self.world.worlds
+        observation = self.world.reset(seeds=seeds if seeded else None)
+        if seeded:
+            self.np_random = seeding.np_random(seeds[0])[0]
+        self._present[:] = True
         self.reset_infos = [{"seed": seed} for seed in self.world.seeds for _ in range(self.task.learners)]
         self._running = True
         self._reset_seeds()
@@ -130,31 +159,37 @@ class WorldVecEnv(VecEnv):
         if actions is None:
             raise ResetNeeded("step_wait: there are no actions; call step_async(actions) first")
         result = self.world.step(actions, terms="ends")
-        ended = result.truncated | result.terminated.all(axis=1)
+        ended = result.ended
+        done = (ended[:, None] | result.terminated) & self._present
         infos: list[Info] = [NOTHING] * self.num_envs
+        if done.any():
+            self._tell(infos, result, done)
         if ended.any():
-            self._tell(infos, result, np.flatnonzero(ended))
             self.world.reset(mask=ended, into=result.observation)
-        done = (ended[:, None] | result.terminated).reshape(-1)
-        return self._rows(result.observation), result.reward.reshape(-1), done, infos
+        self._present = (self._present & ~done) | ended[:, None]
+        return self._rows(result.observation), result.reward.reshape(-1), done.reshape(-1), infos
 
-    def _tell(self, infos: list[Info], result: Step, worlds: NDArray[np.intp]) -> None:
-        """Write how the episodes that end in this step ended; the only loop over rows."""
-        learners, of_world = self.task.learners, self._ends(result, worlds)
-        rows = (worlds[:, None] * learners + np.arange(learners)).ravel().tolist()
-        paid = named(self.task.terms, self.world.paid[worlds].reshape(len(rows), -1))
-        seen, over = self._rows(result.observation[worlds], worlds), result.terminated.reshape(-1).tolist()
-        for k, (row, terms, last) in enumerate(zip(rows, paid, seen, strict=True)):
-            infos[row] = info = of_world[k // learners].copy()
-            info["terms"], info["terminal_observation"] = terms, last
-            info["TimeLimit.truncated"] = bool(result.truncated[row // learners]) and not over[row]
+    def _tell(self, infos: list[Info], result: Step, done: NDArray[np.bool_]) -> None:
+        """Write how the episodes of the rows that are done ended, done (B, L); the only loop over rows."""
+        worlds, each = np.flatnonzero(done.any(axis=1)), self.task.learners
+        of_world = self._ends(result, np.flatnonzero(result.ended))
+        picked = done[worlds].reshape(-1)
+        rows = np.flatnonzero(done).tolist()
+        paid = named(self._reward_keys, self.world.paid[worlds].reshape(len(picked), -1)[picked])
+        seen, over = self._rows(result.observation[worlds], worlds)[picked], result.terminated[done].tolist()
+        for row, info, last, terminated in zip(rows, paid, seen, over, strict=True):
+            infos[row] = info
+            info["terminal_observation"] = last
+            info["TimeLimit.truncated"] = not terminated  # what else ends an episode is the time limit
+            info |= of_world.get(row // each, {})
 
-    def _ends(self, result: Step, worlds: NDArray[np.intp]) -> list[Info]:
-        """Return what all rows of a world are told of its end, for each of these worlds."""
+    def _ends(self, result: Step, worlds: NDArray[np.intp]) -> dict[int, Info]:
+        """Return what the infos of all rows of a world say of its end, by world."""
         columns = {name: column[worlds].tolist() for name, column in self.world.measure().items()}
         columns["is_success"] = result.success[worlds].tolist()
         ends = (dict(zip(columns, values, strict=True)) for values in zip(*columns.values(), strict=True))
-        return [{name: value for name, value in end.items() if value == value} for end in ends]  # NaN: no value
+        known = ({name: value for name, value in end.items() if value == value} for end in ends)  # NaN: no value
+        return dict(zip(worlds.tolist(), known, strict=True))
 
     def _rows(self, observation: NDArray[np.float32], worlds: Any = slice(None)) -> NDArray[np.float32]:
         """Return a row for each learner of these worlds, (B, L, O); one who shows more than that does it here."""
@@ -200,6 +235,41 @@ class WorldVecEnv(VecEnv):
 
     def _picked(self, indices: VecEnvIndices) -> list[int]:
         return list(self._get_indices(indices))
+
+
+def _spec(task: Task, time_limit: int | None) -> EnvSpec | None:
+    """Return the spec with which `gymnasium.make_vec` makes the same worlds; None for a task without an id."""
+    name = type(task).__name__
+    if name not in HORIZONS:
+        return None
+    spec = copy.deepcopy(gymnasium.spec(id_of(name)))
+    spec.max_episode_steps = time_limit
+    for name, field in type(task).model_fields.items():
+        value = getattr(task, name)
+        if name != "horizon" and (name == "learners" or value != field.get_default(call_default_factory=True)):
+            spec.kwargs[name] = value  # learners always: the default of an id is 1, that of a task is all
+    return spec
+
+
+class WorldMonitor(VecMonitor):
+    """VecMonitor over a WorldVecEnv: the length of an episode is the number of steps in which its learner acted.
+
+    VecMonitor alone counts also the steps for which the row of a learner that has left waits for its world to end.
+    Where all learners of a world end together, both count the same.
+
+    Args:
+        venv: a WorldVecEnv.
+        filename, info_keywords: those of VecMonitor.
+    """
+
+    venv: WorldVecEnv
+
+    def step_wait(self) -> VecEnvStepReturn:
+        """Act; the infos of rows that are done hold `episode`: return `r`, length `l` and time `t` in s."""
+        waiting = ~self.venv.present
+        outcome = super().step_wait()
+        self.episode_lengths[waiting] = 0
+        return outcome
 
 
 def load_sb3_zip(

@@ -361,7 +361,7 @@ def test_an_action_that_is_held_is_paid_what_its_decisions_are_paid_until_an_epi
     for _ in range(30):
         actions = rng.uniform(-1, 1, (6, 2))
         seen, reward, done, infos = held.step(actions)
-        sums, over = np.zeros(6), np.zeros(6, np.bool_)
+        sums, over = np.zeros(6), ~each.present
         told: list[dict[str, Any]] = [{}] * 6
         for _ in range(hold):
             last, paid, ended, news = each.step(actions)

@@ -55,7 +55,7 @@ def test_behind_what_a_learner_sees_stands_what_only_its_critic_is_shown() -> No
         seen = step.observation.copy()
         for row in range(9):
             b, i = divmod(row, 3)
-            if step.ended[b]:
+            if done[row]:
                 last = infos[row]["terminal_observation"]
                 np.testing.assert_array_equal(last[:size], others[row]["terminal_observation"])
                 np.testing.assert_allclose(last, [*seen[b, i].tolist(), *besides(lone, seen, b)], rtol=1e-6, atol=1e-6)

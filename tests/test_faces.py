@@ -6,6 +6,7 @@ import gymnasium
 import numpy as np
 import pettingzoo
 import pytest
+from gymnasium.vector import AutoresetMode
 
 from flockenv.envs.face import ByAgent, named
 from flockenv.envs.registration import id_of
@@ -68,7 +69,9 @@ def through_gymnasium(env_id, parameters, actions):
 
 def through_vector(env_id, parameters, actions):
     learners = actions.shape[1]
-    envs = gymnasium.make_vec(env_id, 3 * learners, max_episode_steps=LIMIT, **parameters)
+    envs = gymnasium.make_vec(
+        env_id, 3 * learners, max_episode_steps=LIMIT, autoreset_mode=AutoresetMode.SAME_STEP, **parameters
+    )
     mine = range(learners, 2 * learners)
     first = envs.reset(seed=SEED - 1)[0]
     logs = [[first[k].tobytes()] for k in mine]
@@ -186,4 +189,4 @@ def test_numbers_are_told_by_whatever_names_they_have(names):
     expected = [dict(zip(map(str, names), row, strict=True)) for row in rows.tolist()]
     assert list(named(names, rows)) == expected
     infos = ByAgent(names, ["x", "y", "z"]).of(rows, [0.0] * 3, [False] * 3, False, rows.T.tolist(), True)[-1]
-    assert infos == {who: {"terms": its, "is_success": True} for who, its in zip("xyz", expected, strict=True)}
+    assert infos == {agent: {**its, "is_success": True} for agent, its in zip("xyz", expected, strict=True)}

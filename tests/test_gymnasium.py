@@ -22,7 +22,7 @@ from gymnasium.utils.env_checker import check_env
 
 import flockenv
 from flockenv.envs import single
-from flockenv.envs.registration import HORIZONS, PARALLEL, SINGLE, VERSIONS
+from flockenv.envs.registration import HORIZONS, PARALLEL, SINGLE, VERSIONS, id_of
 from flockenv.envs.single import PursuitEnv
 from flockenv.tasks import TASKS
 
@@ -55,6 +55,11 @@ def play(env, rows, seed=None):
         if terminated or truncated:
             log.append(env.reset()[0].tobytes())
     return log
+
+
+def rewards_of(info):
+    """Return the reward terms of an info by their names in the task."""
+    return {key.removeprefix("reward/"): value for key, value in info.items() if key.startswith("reward/")}
 
 
 def digest(env_id, steps=1000):
@@ -102,6 +107,10 @@ def test_every_task_has_an_id():
     assert sorted(re.sub(r"(?<!^)([A-Z])", r"_\1", name).lower() for name in HORIZONS) == sorted(TASKS)
 
 
+def test_a_task_knows_its_id_if_it_has_one():
+    assert sorted(id_of(task.__name__) for task in TASKS.values()) == sorted(SINGLE)
+
+
 def test_importing_twice_registers_once():
     before = dict(gymnasium.registry)
     importlib.reload(flockenv)  # a second registration would warn, and warnings are errors here
@@ -147,7 +156,7 @@ def test_public_names_load_on_demand():
 def test_the_docstring_is_the_page_of_the_environment(env_id):
     env = gymnasium.make(env_id).unwrapped
     page = type(env).__doc__
-    for section in ("Description", "Action space", "Observation space", "Rewards", "Episode end", "Arguments"):
+    for section in ("Description", "Action space", "Observation space", "Rewards", "Infos", "Episode end", "Arguments"):
         assert f"## {section}" in page
     for layout in (env.task.layout, env.task.action_layout):
         for index, name, unit, meaning in layout.table():
@@ -156,6 +165,10 @@ def test_the_docstring_is_the_page_of_the_environment(env_id):
             assert f"| {unit} |" in line
     for name in (*env.task.terms, *env.task.metric_names, *(set(type(env.task).model_fields) - {"horizon"})):
         assert f"`{name}`" in page
+    env.reset()
+    assert all(f"`{key}`" in page for key in env.step(env.action_space.sample())[4])
+    assert f'`gymnasium.make("flockenv:{env_id}")`' in page
+    assert "`AutoresetMode.NEXT_STEP`" in page
     assert f"({env.observation_space.shape[0]},)" in page
     assert f"{env.task.horizon} decisions" in page
 
@@ -184,8 +197,9 @@ def test_types_and_spaces_hold_at_every_step(env_id):
         assert type(terminated) is bool
         assert type(truncated) is bool
         assert type(info["is_success"]) is bool
-        assert sum(info["terms"].values()) == pytest.approx(reward, abs=1e-12)
-        assert tuple(info["terms"]) == env.unwrapped.task.terms
+        assert sum(rewards_of(info).values()) == pytest.approx(reward, abs=1e-12)
+        assert tuple(rewards_of(info)) == env.unwrapped.task.terms
+        assert all(type(value) in (float, bool) for value in info.values())
         if terminated or truncated:
             env.reset()
 
@@ -213,7 +227,8 @@ def test_an_episode_ends_by_the_clock_with_metrics(env_id):
         _, _, terminated, truncated, info = env.step(np.zeros(env.action_space.shape, np.float32))
         assert not terminated
         assert truncated is (t == 4)
-    assert set(info) - {"terms", "is_success"} <= set(env.unwrapped.task.metric_names)
+    rewards = {f"reward/{name}" for name in rewards_of(info)}
+    assert set(info) - rewards - {"is_success"} <= set(env.unwrapped.task.metric_names)
     assert set(info) & set(env.unwrapped.task.metric_names)
     assert all(type(info[name]) is float for name in set(info) & set(env.unwrapped.task.metric_names))
 
@@ -282,6 +297,29 @@ def test_a_copy_goes_on_as_the_original_would(clone, mode):
 
 
 # --- several at once -----------------------------------------------------------------------------------------------
+
+
+def test_random_numbers_of_wrappers_follow_the_seed():
+    """In every form; and a reset without a seed goes on with them."""
+    forms = {
+        "single": gymnasium.make("flockenv/Pursuit-v0").unwrapped,
+        "vector": gymnasium.make_vec("flockenv/Pursuit-v0", num_envs=2),
+        "parallel": pettingzoo.make("parallel", "flockenv/Pursuit-v0"),
+        "aec": pettingzoo.make("aec", "flockenv/Pursuit-v0"),
+    }
+    drawn = {}
+    for name, env in forms.items():
+        env.reset(seed=5)
+        first = env.np_random.integers(2**40, size=3).tolist()
+        assert env.unwrapped.np_random is env.np_random
+        env.reset()
+        assert env.np_random.integers(2**40, size=3).tolist() != first
+        env.reset(seed=5)
+        drawn[name] = env.np_random.integers(2**40, size=3).tolist()
+        assert drawn[name] == first
+        env.reset(seed=6)
+        assert env.np_random.integers(2**40, size=3).tolist() != first
+    assert len(set(map(tuple, drawn.values()))) == 1
 
 
 def test_two_interleaved_envs_do_not_disturb_each_other():
@@ -403,9 +441,30 @@ def test_actions_beyond_the_box_are_clipped():
 def test_an_unknown_id_and_an_unknown_parameter_are_named():
     with pytest.raises(NameNotFound, match="Pursuit"):
         gymnasium.make("flockenv/Pursiut-v0")
-    with pytest.raises(ValueError, match="`pursuers`") as error:
+    with pytest.raises(
+        TypeError, match="got an unexpected keyword argument 'pursuer', did you mean `pursuers`"
+    ) as error:
         gymnasium.make("flockenv/Pursuit-v0", pursuer=2)
     one_line(error)
+
+
+@pytest.mark.parametrize(
+    ("name", "meant"),
+    [("frameskip", ""), ("rendermode", ", did you mean `render_mode`"), ("max_forc", ", did you mean")],
+)
+@pytest.mark.parametrize("form", ["single", "native", "sync", "parallel", "aec"])
+def test_an_unknown_argument_is_a_type_error_in_python_s_own_words(form, name, meant):
+    """TorchRL's GymEnv passes `frameskip`, and goes on without it if it reads these words."""
+    made = {
+        "single": lambda **given: gymnasium.make("flockenv/Pursuit-v0", **given),
+        "native": lambda **given: gymnasium.make_vec("flockenv/Pursuit-v0", num_envs=2, **given),
+        "sync": lambda **given: gymnasium.make_vec("flockenv/Pursuit-v0", 2, vectorization_mode="sync", **given),
+        "parallel": lambda **given: pettingzoo.make("parallel", "flockenv/Pursuit-v0", **given),
+        "aec": lambda **given: pettingzoo.make("aec", "flockenv/Pursuit-v0", **given),
+    }[form]
+    with pytest.raises(TypeError, match=f"got an unexpected keyword argument '{name}'{meant}") as error:
+        made(**{name: 1})
+    assert "evaders" in one_line(error)  # among what is allowed
 
 
 def test_a_bad_value_and_a_bad_mode_are_named():
@@ -417,7 +476,7 @@ def test_a_bad_value_and_a_bad_mode_are_named():
 
 
 def test_there_is_one_name_for_the_time_limit():
-    with pytest.raises(ValueError, match="max_episode_steps"):
+    with pytest.raises(TypeError, match="unexpected keyword argument 'horizon': the time limit is `max_episode_steps`"):
         gymnasium.make("flockenv/Pursuit-v0", horizon=9)
 
 

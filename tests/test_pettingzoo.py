@@ -13,7 +13,7 @@ from gymnasium.error import ResetNeeded
 from gymnasium.utils.env_checker import data_equivalence
 
 from flockenv.envs import crossing_v0, face, flock_v1, pursuit_v0, school_v0
-from flockenv.envs.registration import VERSIONS
+from flockenv.envs.registration import PARALLEL, VERSIONS
 
 with warnings.catch_warnings():
     warnings.simplefilter("ignore", DeprecationWarning)  # on import it loads its own example the deprecated way
@@ -123,8 +123,10 @@ def test_every_observation_and_every_state_is_in_its_space(env_id):
         assert all(type(value) is float for value in rewards.values())
         assert all(type(value) is bool for value in (*terminated.values(), *truncated.values()))
         for name, info in infos.items():
-            assert tuple(info["terms"]) == env.task.terms
-            assert sum(info["terms"].values()) == pytest.approx(rewards[name], abs=1e-12)
+            terms = {key: value for key, value in info.items() if key.startswith("reward/")}
+            assert tuple(terms) == tuple(f"reward/{term}" for term in env.task.terms)
+            assert sum(terms.values()) == pytest.approx(rewards[name], abs=1e-12)
+            assert all(type(value) in (float, bool) for value in info.values())
         assert env.state() in env.state_space
         states.append(env.state())
         if not env.agents:
@@ -165,6 +167,43 @@ def test_names_and_spaces_stay_the_same_objects(env_id):
         assert env.action_space(name) is env.action_space(name)
     with pytest.raises(ValueError, match=f"`{env.possible_agents[1]}`"):
         env.action_space(env.possible_agents[1] + "x")
+
+
+@pytest.mark.parametrize("kind", ["parallel", "aec"])
+@pytest.mark.parametrize("env_id", PARALLEL)
+def test_spaces_of_all_agents_are_there_before_the_first_reset(env_id, kind):
+    env = pettingzoo.make(kind, env_id)
+    for several, one in (
+        (env.observation_spaces, env.observation_space), (env.action_spaces, env.action_space)
+    ):  # fmt: skip
+        assert list(several) == env.possible_agents
+        assert all(several[agent] is one(agent) for agent in env.possible_agents)
+
+
+@pytest.mark.parametrize("env_id", PARALLEL)
+def test_nobody_left_is_a_step_of_nobody(env_id):
+    """PettingZoo's own loops and SuperSuit's black_death go on with {} when all agents have left."""
+    env = pettingzoo.make("parallel", env_id, max_cycles=3)
+    with pytest.raises(ResetNeeded, match="reset"):
+        env.step({})
+    env.reset(seed=0)
+    with pytest.raises(ValueError, match=f"'{env.agents[0]}' has none"):
+        env.step({})
+    for _ in range(3):
+        last = {agent: env.action_space(agent).sample() for agent in env.agents}
+        env.step(last)
+    assert not env.agents
+    state = env.state()
+    for _ in range(2):
+        assert env.step({}) == ({}, {}, {}, {}, {})
+    np.testing.assert_array_equal(env.state(), state)
+    with pytest.raises(ResetNeeded, match="reset"):
+        env.step(last)
+    env.reset()
+    env.step({agent: env.action_space(agent).sample() for agent in env.agents})
+    env.close()
+    with pytest.raises(ResetNeeded, match="reset"):
+        env.step({})
 
 
 def still(env):
@@ -244,8 +283,6 @@ def test_at_the_time_limit_everybody_is_truncated():
     assert not any(terminated.values())
     assert env.agents == []
     assert all(set(info) & set(env.task.metric_names) for info in infos.values())
-    with pytest.raises(ResetNeeded, match="reset"):
-        env.step({})
     env.reset()
     assert env.agents == env.possible_agents
 
@@ -261,7 +298,7 @@ def test_dictionaries_by_agent_are_the_same_written_out_or_not(monkeypatch, agen
         told = face.ByAgent(terms, agents).of(seen, paid, over, True, earned, False)
         assert [list(each) for each in told] == [list(agents)] * 5
         for i, agent in enumerate(agents):
-            info = {"terms": {term: earned[k][i] for k, term in enumerate(terms)}, "is_success": False}
+            info = {**{term: earned[k][i] for k, term in enumerate(terms)}, "is_success": False}
             np.testing.assert_array_equal(told[0][agent], seen[i])
             assert [each[agent] for each in told[1:]] == [paid[i], over[i], True, info]
     face._by_agent.cache_clear()
@@ -359,21 +396,21 @@ def test_bad_seeds_are_refused(seed, kind):
         env.reset(seed=seed)
 
 
-def test_an_unseeded_reset_tells_its_seed():
-    env = make(FLOCK)
+def test_the_world_tells_the_seed_of_an_unseeded_reset():
+    env, other = make(FLOCK), make(FLOCK)
     observations, infos = env.reset()
-    again, _ = make(FLOCK).reset(seed=infos["boid_0"]["seed"])
+    assert infos == {agent: {} for agent in env.agents}  # TorchRL takes the keys of these for all there are
+    again, _ = make(FLOCK).reset(seed=env.world.seeds[0])
     assert data_equivalence(observations, again, exact=True)
-    assert make(FLOCK).reset()[1]["boid_0"]["seed"] != infos["boid_0"]["seed"]
+    other.reset()
+    assert other.world.seeds != env.world.seeds
 
 
 def test_bad_options_parameters_and_limits_are_refused():
     env = make(FLOCK)
     with pytest.raises(ValueError, match="'bogus'"):
         env.reset(options={"bogus": 1})
-    with pytest.raises(ValueError, match="`agents`"):
-        pettingzoo.make("parallel", FLOCK, agnets=3)
-    with pytest.raises(ValueError, match="max_cycles"):
+    with pytest.raises(TypeError, match="max_cycles"):
         make(FLOCK, horizon=9)
     for limit in (0, -5):
         with pytest.raises(ValueError, match="time_limit"):

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import gymnasium
 import numpy as np
+import pettingzoo
 import pytest
 import torch
 from gymnasium.error import ResetNeeded
@@ -23,8 +24,8 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecCheckNan, VecMonito
 
 from flockenv.envs.registration import SINGLE
 from flockenv.players.rules import player
-from flockenv.sb3 import NOTHING, WorldVecEnv, load_sb3_zip
-from flockenv.tasks import TASKS, Flock, Pursuit, School
+from flockenv.sb3 import NOTHING, WorldMonitor, WorldVecEnv, load_sb3_zip
+from flockenv.tasks import TASKS, Bottleneck, Flock, Pursuit, School
 from flockenv.world import World
 
 torch.set_num_threads(1)
@@ -104,7 +105,9 @@ def test_it_is_sb3_s_own_vecenv_of_singles(name):
         for k in np.flatnonzero(ours[2]):
             mine, other = ours[3][k], theirs[3][k]
             np.testing.assert_array_equal(mine["terminal_observation"], other["terminal_observation"])
-            for key in set(mine) & set(other) - {"terms", "terminal_observation"}:
+            sums = {key for key in mine if key.startswith("reward/")}  # over the episode, where theirs are of the step
+            assert sums <= set(other)
+            for key in set(mine) & set(other) - sums - {"terminal_observation"}:
                 assert mine[key] == other[key], key
             assert {"TimeLimit.truncated", "is_success"} <= set(mine) & set(other)
 
@@ -144,7 +147,7 @@ def check_end(infos, step, metrics, sums):
         np.testing.assert_array_equal(info["terminal_observation"], step.observation[k // 4, k % 4])
         assert info["TimeLimit.truncated"] is True
         assert info["is_success"] is bool(step.success[k // 4])
-        assert sum(info["terms"].values()) == pytest.approx(sums[k // 4, k % 4])
+        assert sum(value for key, value in info.items() if key.startswith("reward/")) == pytest.approx(sums.flat[k])
         assert all(info[name] == column[k // 4] for name, column in metrics.items() if not np.isnan(column[k // 4]))
 
 
@@ -167,8 +170,7 @@ def test_infos_that_tell_something_are_never_shared():
     assert len({id(infos) for infos in seen}) == len(seen)
     last = [info["terminal_observation"] for info in dicts]
     assert not any(np.shares_memory(a, b) for a, b in itertools.pairwise(last))
-    terms = [info["terms"] for info in dicts if info]
-    assert len({id(term) for term in terms}) == len(terms) == 2 * env.num_envs
+    assert len(dicts) == 2 * env.num_envs
 
 
 WRITES = {
@@ -260,7 +262,7 @@ def test_who_leaves_one_by_one_is_refused():
         WorldVecEnv(Pursuit(pursuers=3, evaders=2, sides="both"))
 
 
-def test_who_leaves_is_done_and_paid_nothing_until_the_world_begins_anew():
+def test_a_row_whose_learner_left_is_paid_nothing_until_the_world_begins_anew():
     task = School(metabolism=0.1, start_hunger=0.6)
     env, world = WorldVecEnv(task, 3, time_limit=60, leaving=True), World(task, 3, time_limit=60)
     env.seed(2)
@@ -271,13 +273,98 @@ def test_who_leaves_is_done_and_paid_nothing_until_the_world_begins_anew():
         _, reward, done, infos = env.step(action)
         step = world.step(action.reshape(3, 8, -1))
         assert not reward.reshape(3, 8)[gone].any()
-        np.testing.assert_array_equal(done.reshape(3, 8), step.terminated | step.ended[:, None])
+        np.testing.assert_array_equal(done.reshape(3, 8), (step.terminated | step.ended[:, None]) & ~gone)
         gone = step.terminated & ~step.ended[:, None]
-        for k in np.flatnonzero(np.repeat(step.ended, 8)):
+        for k in np.flatnonzero(done):
             assert infos[k]["TimeLimit.truncated"] == (step.truncated[k // 8] and not step.terminated.flat[k])
         begun += step.ended.sum()
         world.reset(mask=step.ended)
     assert begun >= 3
+
+
+ROOM = Bottleneck(people=8)
+
+
+def played(env, steps):
+    """Yield what comes back in each step of the tuned rules, and which rows had a learner before it."""
+    rules, state, first = player(env.task), None, np.ones(env.num_envs, bool)
+    seen = env.reset()
+    for _ in range(steps):
+        actions, state = rules.predict(seen, state, first)
+        before = env.present
+        seen, reward, first, infos = env.step(actions)
+        yield before, reward, first, infos
+
+
+def test_a_row_is_done_once_and_tells_how_it_ended():
+    """Each learner ends once in each episode of its world, with its last observation and the sums of its terms."""
+    env = WorldVecEnv(ROOM, 2, leaving=True)
+    env.seed(3)
+    ends, sums, early = np.zeros(16, int), np.zeros(16), 0
+    for present, reward, done, infos in played(env, 330):
+        sums += reward
+        assert not reward[~present].any()
+        assert not done[~present].any()
+        for row in np.flatnonzero(done):
+            assert infos[row]["terminal_observation"] in env.observation_space
+            paid = sum(value for key, value in infos[row].items() if key.startswith("reward/"))
+            assert paid == pytest.approx(sums[row])
+            sums[row], ends[row] = 0, ends[row] + 1
+            early += not env.present[row]
+        assert all(bool(info) == over for info, over in zip(infos, done.tolist(), strict=True))
+        begun = np.repeat(env.world.steps == 0, 8)
+        np.testing.assert_array_equal(env.present, present & ~done | begun)
+        assert np.ptp(ends.reshape(2, 8)[env.world.steps == 0], axis=-1).sum() == 0  # all of a world, equally often
+    assert early > 10
+    assert ends.min() >= 2
+
+
+def one_by_one(task, seed, episodes):
+    """Return what each agent of PettingZoo's form is paid by the tuned rules in an episode, and for how long."""
+    env = pettingzoo.make("parallel", "flockenv/Bottleneck-v0", people=task.people)
+    rules, returns, lengths = player(task), [], []
+    for episode in range(episodes):
+        seen, state, first = env.reset(seed=None if episode else seed)[0], None, np.ones(task.learners, bool)
+        everyone, index = np.stack([*seen.values()]), {agent: i for i, agent in enumerate(env.possible_agents)}
+        paid, stayed = np.zeros(task.learners), np.zeros(task.learners, int)
+        while env.agents:
+            for agent, row in seen.items():
+                everyone[index[agent]] = row
+            actions, state = rules.predict(everyone, state, first)
+            first = np.zeros(task.learners, bool)
+            seen, reward, *_ = env.step({agent: actions[index[agent]] for agent in env.agents})
+            for agent in reward:
+                paid[index[agent]] += reward[agent]
+                stayed[index[agent]] += 1
+        returns += paid.tolist()
+        lengths += stayed.tolist()
+    return returns, lengths
+
+
+@pytest.mark.parametrize("monitor", [WorldMonitor, VecMonitor])
+def test_monitors_count_one_episode_for_each_learner(monitor):
+    """What it is paid, and (by our monitor) for how long it is there, as PettingZoo's form has it."""
+    worlds = WorldVecEnv(ROOM, 2, leaving=True)
+    worlds.seed(3)
+    counted = evaluate_policy(player(ROOM), monitor(worlds), 32, return_episode_rewards=True)
+    expected = [a + b for a, b in zip(one_by_one(ROOM, 3, 2), one_by_one(ROOM, 4, 2), strict=True)]
+    np.testing.assert_allclose(sorted(counted[0]), sorted(expected[0]), rtol=1e-5)
+    if monitor is WorldMonitor:
+        assert sorted(counted[1]) == sorted(expected[1])
+
+
+@pytest.mark.parametrize("monitor", [WorldMonitor, lambda env: WorldMonitor(VecCheckNan(env))])
+def test_where_all_end_together_our_monitor_is_sb3_s(monitor):
+    ours, theirs = monitor(flock(worlds=2)), VecMonitor(flock(worlds=2))
+    for env in (ours, theirs):
+        env.seed(5)
+        env.reset()
+    for row in rows(ours, 25):
+        a, b = ours.step(row)[3], theirs.step(row)[3]
+        for one, other in zip(a, b, strict=True):
+            assert [one.get("episode", {}).get(key) for key in "rl"] == [
+                other.get("episode", {}).get(key) for key in "rl"
+            ]
 
 
 @pytest.mark.parametrize("clone", [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))])
@@ -308,6 +395,34 @@ def test_attributes_and_methods():
     assert env.env_is_wrapped(Monitor) == [False] * 12
     env.reset()
     assert env.reset_infos == [{"seed": 3 + k // 4} for k in range(12)]
+
+
+@pytest.mark.parametrize("task", [Pursuit(control_dt=0.25), Flock(agents=7, learners=4)], ids=["pursuit", "flock"])
+def test_metadata_tells_how_fast_frames_play_in_real_time(task):
+    assert WorldVecEnv(task, 2, render_mode="rgb_array").metadata["render_fps"] == round(1 / task.control_dt)
+    assert WorldVecEnv(task, 2).metadata["render_fps"] == round(1 / task.control_dt)
+
+
+@pytest.mark.parametrize("task", [Pursuit(), Flock(agents=7, learners=4), Pursuit(pursuers=2, capture_distance=1.5)])
+def test_its_spec_makes_the_same_worlds(task):
+    env = WorldVecEnv(task, 2, time_limit=9)
+    spec = env.get_attr("spec")[0]
+    again = gymnasium.make_vec(spec, num_envs=env.num_envs)
+    assert again.task == task
+    assert again.world.time_limit == 9
+    assert VecMonitor(env).venv.spec.id == spec.id
+
+
+def test_random_numbers_of_wrappers_follow_the_seed():
+    env = flock()
+    env.seed(5)
+    env.reset()
+    first = env.get_attr("np_random")[0].integers(2**40, size=3).tolist()
+    env.reset()
+    assert env.np_random.integers(2**40, size=3).tolist() != first
+    env.seed(5)
+    env.reset()
+    assert env.np_random.integers(2**40, size=3).tolist() == first
 
 
 def test_bad_input():

@@ -10,7 +10,18 @@ import pytest
 from gymnasium.error import ResetNeeded
 from gymnasium.utils.env_checker import data_equivalence
 from gymnasium.vector import AutoresetMode
-from gymnasium.wrappers.vector import DictInfoToList, RecordEpisodeStatistics
+from gymnasium.wrappers.vector import (
+    ClipAction,
+    ClipReward,
+    DictInfoToList,
+    DtypeObservation,
+    FlattenObservation,
+    NormalizeObservation,
+    NormalizeReward,
+    RecordEpisodeStatistics,
+    RescaleAction,
+    RescaleObservation,
+)
 
 from flockenv.envs.registration import HORIZONS, SINGLE
 from flockenv.tasks import Flock, Pursuit
@@ -63,6 +74,64 @@ def test_it_is_gymnasium_s_own_vector_of_singles(env_id, mode):
     native.close()
     assert ends[1] > 0
     assert (ends[0] > 0) == bool(EASY[env_id])
+
+
+@pytest.mark.parametrize("env_id", SINGLE)
+def test_the_default_begins_anew_when_gymnasium_s_does(env_id):
+    """In the step after the end, which ignores the actions, pays nothing and ends nothing."""
+    native = gymnasium.make_vec(env_id, 2, max_episode_steps=3)
+    loop = gymnasium.make_vec(env_id, 2, max_episode_steps=3, vectorization_mode="sync")
+    assert native.metadata["autoreset_mode"] is loop.metadata["autoreset_mode"] is AutoresetMode.NEXT_STEP
+    native.reset(seed=4), loop.reset(seed=4)
+    for t, row in enumerate(rows(native, 9)):
+        ours, theirs = native.step(row), loop.step(row)
+        assert data_equivalence(ours, theirs, exact=True)
+        if t == 3:
+            assert not ours[1].any() and not ours[2].any() and not ours[3].any()
+            assert list(ours[4]) == ["seed", "_seed"]
+
+
+WRAPPERS = {
+    "ClipAction": ClipAction,
+    "ClipReward": lambda envs: ClipReward(envs, -0.1, 0.1),
+    "DtypeObservation": lambda envs: DtypeObservation(envs, np.float64),
+    "FlattenObservation": FlattenObservation,
+    "NormalizeObservation": NormalizeObservation,
+    "NormalizeReward": NormalizeReward,
+    "RecordEpisodeStatistics": RecordEpisodeStatistics,
+    "RescaleAction": lambda envs: RescaleAction(envs, -2.0, 2.0),
+    "RescaleObservation": lambda envs: RescaleObservation(envs, np.float32(0), np.float32(1)),
+    "CleanRL's": lambda envs: NormalizeReward(NormalizeObservation(ClipAction(RecordEpisodeStatistics(envs)))),
+}
+"""Wrappers of gymnasium for vector environments."""
+
+
+@pytest.mark.parametrize("name", WRAPPERS)
+def test_a_wrapper_sees_in_it_what_it_sees_in_gymnasium_s_own(name):
+    options = {"max_episode_steps": 7, "capture_distance": 6.0}
+    native = WRAPPERS[name](gymnasium.make_vec("flockenv/Pursuit-v0", num_envs=4, **options))
+    loop = WRAPPERS[name](gymnasium.make_vec("flockenv/Pursuit-v0", 4, vectorization_mode="sync", **options))
+    np.testing.assert_array_equal(native.reset(seed=3)[0], loop.reset(seed=3)[0])
+    ends = 0
+    for row in rows(native, 30):
+        ours, theirs = native.step(row), loop.step(row)
+        for a, b in zip(ours[:4], theirs[:4], strict=True):
+            np.testing.assert_array_equal(a, b)
+        assert ours[4].keys() == theirs[4].keys()
+        for key in ("r", "l"):
+            np.testing.assert_array_equal(*(each[4].get("episode", {}).get(key) for each in (ours, theirs)))
+        ends += (ours[2] | ours[3]).sum()
+    assert ends > 8
+
+
+@pytest.mark.parametrize("name", WRAPPERS)
+def test_a_wrapper_takes_several_learners_in_each_world(name):
+    envs = WRAPPERS[name](crowd(max_episode_steps=5))
+    assert envs.reset(seed=3)[0].shape == (12, *envs.single_observation_space.shape)
+    for t, row in enumerate(rows(envs, 13)):
+        observation, _, terminated, truncated, _ = envs.step(row)
+        assert np.isfinite(observation).all()
+        np.testing.assert_array_equal(terminated | truncated, np.full(12, t % 6 == 4))  # 5 steps, then one to begin
 
 
 @pytest.mark.parametrize("mode", MODES)
@@ -129,7 +198,7 @@ def test_time_limit_is_the_id_s_unless_said_otherwise():
 
 
 def test_the_end_of_an_episode_is_in_the_infos():
-    envs = gymnasium.make_vec("flockenv/Flock-v1", 3, max_episode_steps=5)
+    envs = gymnasium.make_vec("flockenv/Flock-v1", 3, max_episode_steps=5, autoreset_mode=AutoresetMode.SAME_STEP)
     envs.reset(seed=0)
     for row in rows(envs, 5):
         observation, _, _, truncated, info = envs.step(row)
@@ -137,7 +206,7 @@ def test_the_end_of_an_episode_is_in_the_infos():
     assert info["_final_obs"].all()
     assert not any(np.array_equal(info["final_obs"][k], observation[k]) for k in range(3))
     assert info["final_info"]["_is_success"].all()
-    assert "terms" not in info
+    assert not any(name.startswith("reward/") for name in info)
     np.testing.assert_array_equal(info["seed"], [0, 1, 2])
 
 
@@ -258,7 +327,8 @@ def test_rows_are_learners_of_worlds(mode):
         observation, reward, terminated, truncated, info = envs.step(row)
         step = world.step(np.where(np.repeat(resting, 4)[:, None], 0, row).reshape(3, 4, -1))
         ended = step.truncated & ~resting
-        told, keys = world.measure(), ("terms", "is_success", *world.task.metric_names)
+        rewards = [f"reward/{name}" for name in Flock.terms]
+        told, keys = world.measure(), (*rewards, "is_success", *world.task.metric_names)
         last = step.observation.copy()
         ends += ended.sum()
         anew = ended if mode is AutoresetMode.SAME_STEP else resting
@@ -294,17 +364,16 @@ def check_rows(info, keys, step, told, worlds):
     assert [key for key in keys if key in info] == (list(keys) if worlds.any() else [])
     for key in keys if worlds.any() else ():
         np.testing.assert_array_equal(info[f"_{key}"], here)
-        if key == "terms":
-            for j, name in enumerate(Flock.terms):
-                np.testing.assert_array_equal(info[key][name], np.where(here, step.terms[..., j].reshape(12), 0))
-                np.testing.assert_array_equal(info[key][f"_{name}"], here)
+        if key.startswith("reward/"):
+            column = step.terms[..., Flock.terms.index(key.removeprefix("reward/"))].reshape(12)
         else:
-            column = step.success if key == "is_success" else told[key]
-            np.testing.assert_array_equal(info[key], np.where(here, np.repeat(column, 4), 0))
+            column = np.repeat(step.success if key == "is_success" else told[key], 4)
+        np.testing.assert_array_equal(info[key], np.where(here, column, 0))
 
 
 def test_a_capture_ends_all_rows_of_its_world():
-    envs = gymnasium.make_vec("flockenv/Pursuit-v0", 16, pursuers=2, capture_distance=3.0)
+    options = {"pursuers": 2, "capture_distance": 3.0, "autoreset_mode": AutoresetMode.SAME_STEP}
+    envs = gymnasium.make_vec("flockenv/Pursuit-v0", 16, **options)
     envs.reset(seed=0)
     ends = 0
     for row in rows(envs, 60):

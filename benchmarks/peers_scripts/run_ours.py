@@ -35,7 +35,9 @@ def flock_vector(threads: int) -> Case:
 
     use_threads(threads)
     agents, rows = 32, WORLDS * 32
-    env = FlockVectorEnv(rows, HORIZON, infos="ends", agents=agents, learners=agents, dtype="float32")
+    env = FlockVectorEnv(
+        rows, HORIZON, autoreset_mode="SameStep", infos="ends", agents=agents, learners=agents, dtype="float32"
+    )
     env.reset(seed=0)
     actions = cycle(np.random.default_rng(0).uniform(-1, 1, (DRAWS, rows, 2)).astype(np.float32))
     task = env.task

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
+from gymnasium.spaces import Box
 from pettingzoo import AECEnv
 from pettingzoo.utils.conversions import parallel_to_aec_wrapper
 from pettingzoo.utils.wrappers import BaseWrapper, OrderEnforcingWrapper
@@ -15,7 +17,26 @@ __all__ = ["by_turns"]
 
 
 class _Checked(BaseWrapper):  # type: ignore[misc]  # pettingzoo ships no types
-    """Refuses a bad action on its agent's turn, and not when the last agent of the round moves."""
+    """Refuses a bad action on its agent's turn, and not when the last agent of the round moves.
+
+    It also shows what PettingZoo's conversion hides behind a deprecation warning (the dictionaries of spaces) or does
+    not pass on (`np_random`).
+    """
+
+    @property
+    def observation_spaces(self) -> dict[str, Box]:
+        """The space of each agent's observations, by agent."""
+        return self.unwrapped.observation_spaces  # type: ignore[no-any-return]
+
+    @property
+    def action_spaces(self) -> dict[str, Box]:
+        """The space of each agent's actions, by agent."""
+        return self.unwrapped.action_spaces  # type: ignore[no-any-return]
+
+    @property
+    def np_random(self) -> np.random.Generator:
+        """The random numbers of wrappers, seeded by `reset(seed=s)`."""
+        return self.unwrapped.np_random  # type: ignore[no-any-return]
 
     def step(self, action: Rows | None) -> None:
         if action is not None:

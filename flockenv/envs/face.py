@@ -32,6 +32,7 @@ __all__ = [
     "named",
     "observation_space",
     "render_fps",
+    "reward_keys",
     "together",
 ]
 
@@ -43,14 +44,21 @@ SEEDS = 2**63
 """Seeds are 0 ... 2**63 - 1, so that they fit the int64 arrays of a vector env's infos."""
 
 
-def build(task_type: type[Task], parameters: Mapping[str, Any], limit: str) -> Task:
+def build(task_type: type[Task], parameters: Mapping[str, Any], limit: str, own: Sequence[str] = ()) -> Task:
     """Make a task from the keyword arguments of a face.
 
-    limit: what this face calls its time limit. The task's own `horizon` is refused: two limits could disagree.
+    limit: the face's name for its time limit. The task's own `horizon` is refused: two limits could disagree.
+    own: the other arguments of the face, which a misspelt name may have meant.
+
+    Raises TypeError for an unknown name, with Python's own words: TorchRL and others look for them.
     """
-    if "horizon" in parameters:
-        raise ValueError(
-            f"{task_type.__name__}: horizon = {parameters['horizon']!r}: the time limit is called `{limit}` here"
+    allowed = [*(name for name in task_type.model_fields if name != "horizon"), *own]
+    unknown = next((name for name in parameters if name not in allowed), None)
+    if unknown is not None:
+        reason = f": the time limit is `{limit}` here" if unknown == "horizon" else nearest(unknown, allowed)
+        raise TypeError(
+            f"{task_type.__name__}() got an unexpected keyword argument {unknown!r}{reason}; "
+            f"allowed: {', '.join(allowed)}"
         )
     return task_type(**parameters)
 
@@ -73,6 +81,14 @@ def observation_space(task: Task) -> Box:
 def action_space(task: Task) -> Box:
     """Return the space of one learner's action, (A,) float32 in [-1, 1]."""
     return Box(-1.0, 1.0, (task.action_layout.size,), np.float32)
+
+
+def reward_keys(task: Task) -> tuple[str, ...]:
+    """Return the key of each reward term in an info: `reward/` and its name.
+
+    Infos are flat: many clients turn each value into a tensor, and loggers group by the part before the slash.
+    """
+    return tuple(f"reward/{name}" for name in task.terms)
 
 
 def named(names: Sequence[str], rows: Rows) -> Iterator[dict[str, float]]:
@@ -99,16 +115,16 @@ def _display(names: Iterable[str], values: Iterable[str]) -> str:
 class ByAgent:
     """Makes the dictionaries of a step, in which every agent has a name; `of` does it.
 
-    `of(seen, paid, over, late, terms, success)` takes observations (L, O), rewards and terminations as lists of L, the
-    truncation of all, each of the K reward terms as a list of L, and whether it is a success. It returns observations,
-    rewards, terminations, truncations and infos by agent.
+    `keys` are those of the reward terms in an info. `of(seen, paid, over, late, terms, success)` takes observations
+    (L, O), rewards and terminations as lists of L, the truncation of all, each of the K reward terms as a list of L,
+    and whether it is a success. It returns observations, rewards, terminations, truncations and infos by agent.
 
     Of up to DISPLAYED agents it is written out, a display for each dictionary: those are made in one piece, and take
     three quarters of the time.
     """
 
-    def __init__(self, terms: Sequence[str], agents: Sequence[str]) -> None:
-        self._about = tuple(terms), tuple(agents)
+    def __init__(self, keys: Sequence[str], agents: Sequence[str]) -> None:
+        self._about = tuple(keys), tuple(agents)
         self.of: Callable[..., tuple[dict[str, Any], ...]] = _by_agent(*self._about)
 
     def __reduce__(self) -> tuple[type[ByAgent], tuple[tuple[str, ...], tuple[str, ...]]]:
@@ -116,20 +132,20 @@ class ByAgent:
 
 
 @functools.lru_cache(64)
-def _by_agent(terms: tuple[str, ...], agents: tuple[str, ...]) -> Callable[..., tuple[dict[str, Any], ...]]:
+def _by_agent(keys: tuple[str, ...], agents: tuple[str, ...]) -> Callable[..., tuple[dict[str, Any], ...]]:
     def info(numbers: Iterable[str]) -> str:
-        return f"{{'terms': {_display(terms, numbers)}, 'is_success': success}}"
+        return _display((*keys, "is_success"), (*numbers, "success"))
 
     if len(agents) <= DISPLAYED:
         many = range(len(agents))
-        lists = {"s": "seen", "r": "paid", "o": "over"} | {f"t{k}_": f"terms[{k}]" for k in range(len(terms))}
+        lists = {"s": "seen", "r": "paid", "o": "over"} | {f"t{k}_": f"terms[{k}]" for k in range(len(keys))}
         each = {one: [f"{one}{i}" for i in many] for one in lists}
         lines = [f"{', '.join(each[one])}, = {several}" for one, several in lists.items()]
-        infos = [info(each[f"t{k}_"][i] for k in range(len(terms))) for i in many]
+        infos = [info(each[f"t{k}_"][i] for k in range(len(keys))) for i in many]
         shown = (each["s"], each["r"], each["o"], ["late"] * len(agents), infos)
         lines += [f"return {', '.join(_display(agents, values) for values in shown)}"]
     else:
-        numbers = [f"n{k}" for k in range(len(terms))]
+        numbers = [f"n{k}" for k in range(len(keys))]
         told = f"{{agent: {info(numbers)} for agent, {', '.join(numbers)} in zip(agents, *terms, strict=True)}}"
         several = ", ".join(f"dict(zip(agents, {what}, strict=True))" for what in ("seen", "paid", "over"))
         lines = [f"return {several}, dict.fromkeys(agents, late), {told}"]

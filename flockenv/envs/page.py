@@ -7,6 +7,7 @@ from collections.abc import Iterable, Sequence
 
 import numpy as np
 
+from flockenv.envs.face import reward_keys
 from flockenv.envs.registration import id_of
 from flockenv.tasks import Layout, Task
 
@@ -25,6 +26,7 @@ def page(summary: str, task: Task, name: str, history: str) -> str:
         "## Action space\n\n" + _layout(task.action_layout),
         "## Observation space\n\n" + _layout(task.layout),
         "## Rewards\n\n" + _rewards(task),
+        "## Infos\n\n" + _infos(task),
         "## Episode end\n\n" + _end(task),
         "## Arguments\n\n" + _arguments(task),
         "## Version history\n\n" + history,
@@ -33,23 +35,37 @@ def page(summary: str, task: Task, name: str, history: str) -> str:
 
 
 def _rewards(task: Task) -> str:
-    terms, metrics = (", ".join(f"`{name}`" for name in names) for names in (task.terms, task.metric_names))
-    return (
-        f"The reward is the sum of these terms, and `info['terms']` holds each of them: {terms}. `info['is_success']` "
-        f"says whether the aim is reached so far; metrics of the episode so far, where they have a value: {metrics}."
-    )
+    return f"The reward is the sum of these terms: {_quoted(task.terms)}."
+
+
+def _infos(task: Task) -> str:
+    rows = [
+        (_quoted(reward_keys(task)), "each term of the reward of this step"),
+        ("`is_success`", "True if the aim is reached so far"),
+        (_quoted(task.metric_names), "metrics of the episode so far, where they have a value"),
+        ("`seed`", "the seed of the world, in the info of a reset and nowhere else"),
+    ]
+    return "Infos are flat: each value is one number or truth value.\n\n" + _table(("key", "value"), rows)
+
+
+def _quoted(names: Sequence[str]) -> str:
+    return ", ".join(f"`{name}`" for name in names)
 
 
 def _end(task: Task) -> str:
     return (
         f"Termination: see the description. Truncation: after {task.horizon} decisions "
-        f"({task.horizon * task.control_dt:g} s), unless `max_episode_steps` says otherwise."
+        f"({task.horizon * task.control_dt:g} s), unless `max_episode_steps` says otherwise.\n\n"
+        "`gymnasium.make_vec` begins a world anew in the step after its end, as gymnasium does by default "
+        "(`AutoresetMode.NEXT_STEP`): that step does not read the action, and returns the first observation, reward 0 "
+        'and no end. `autoreset_mode="SameStep"` begins it in the step that ends it, `"Disabled"` never.'
     )
 
 
 def _facts(task: Task, env_id: str) -> str:
     rows = [
         ("Make", f'`gymnasium.make("{env_id}")`'),
+        ("In another process", f'`gymnasium.make("flockenv:{env_id}")`, which imports flockenv first'),
         ("Action space", f"`Box(-1, 1, ({task.action_layout.size},), float32)`"),
         ("Observation space", f"`Box({_range(task.layout)}, ({task.layout.size},), float32)`"),
         ("One decision", f"{task.control_dt:g} s"),

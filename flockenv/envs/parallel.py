@@ -9,6 +9,7 @@ from typing import Any, ClassVar, NoReturn
 
 import numpy as np
 from gymnasium.spaces import Box
+from gymnasium.utils import seeding
 from numpy.typing import NDArray
 from pettingzoo import ParallelEnv
 
@@ -24,6 +25,7 @@ from flockenv.envs.face import (
     checked_seed,
     observation_space,
     render_fps,
+    reward_keys,
 )
 from flockenv.envs.registration import VERSIONS
 from flockenv.refusals import nearest
@@ -42,7 +44,10 @@ class WorldParallelEnv(ParallelEnv[str, Rows, Rows]):  # type: ignore[misc]  # p
     """One world whose learners are PettingZoo agents; `task` and `world` give access to the arrays inside.
 
     An agent that ends (captured, say) appears in the dictionaries of that step and then leaves `agents`. At the time
-    limit everybody who is still there is truncated, also who terminates in the same step. Seeds are as in SingleEnv.
+    limit all agents that are left are truncated, also those that terminate in the same step. When none is left,
+    `step({})` returns five empty dictionaries. Seeds are as in SingleEnv.
+
+    `reset(seed=s)` also seeds `np_random`, from which wrappers draw; the world itself draws nothing from it.
 
     Args:
         max_cycles: steps after which the world is truncated; None = the task's own horizon.
@@ -55,7 +60,9 @@ class WorldParallelEnv(ParallelEnv[str, Rows, Rows]):  # type: ignore[misc]  # p
     """Parameters with another default than the task's own."""
 
     def __init__(self, max_cycles: int | None = None, render_mode: str | None = None, **parameters: Any) -> None:
-        self.task = build(self.task_type, {**self.fixed, **parameters}, limit="max_cycles")
+        self.task = build(
+            self.task_type, {**self.fixed, **parameters}, limit="max_cycles", own=("max_cycles", "render_mode")
+        )
         self.metadata = {
             "name": f"{self.task.name}_v{VERSIONS.get(type(self.task).__name__, 0)}",
             "render_modes": list(RENDER_MODES),
@@ -66,10 +73,12 @@ class WorldParallelEnv(ParallelEnv[str, Rows, Rows]):  # type: ignore[misc]  # p
         self.possible_agents = list(self.task.agent_names)
         self.world = World(self.task, time_limit=self.task.horizon if max_cycles is None else max_cycles)
         self._screen = Screen(render_mode, render_fps(self.task))
-        self._observation_spaces = {name: observation_space(self.task) for name in self.possible_agents}
-        self._action_spaces = {name: action_space(self.task) for name in self.possible_agents}
-        self._by_agent = ByAgent(self.task.terms, self.possible_agents)
+        self.observation_spaces = {name: observation_space(self.task) for name in self.possible_agents}
+        self.action_spaces = {name: action_space(self.task) for name in self.possible_agents}
+        self.np_random = seeding.np_random()[0]
+        self._by_agent = ByAgent(reward_keys(self.task), self.possible_agents)
         self._live: dict[str, int] = {}
+        self._running = False
 
     @property
     def max_cycles(self) -> int:
@@ -89,36 +98,45 @@ class WorldParallelEnv(ParallelEnv[str, Rows, Rows]):  # type: ignore[misc]  # p
 
     def observation_space(self, agent: str) -> Box:
         """Return the space of an agent's observations, the same object each time."""
-        return self._observation_spaces[self._known(agent)]
+        return self.observation_spaces[self._known(agent)]
 
     def action_space(self, agent: str) -> Box:
         """Return the space of an agent's actions, the same object each time."""
-        return self._action_spaces[self._known(agent)]
+        return self.action_spaces[self._known(agent)]
 
     def _known(self, agent: str) -> str:
-        if agent not in self._action_spaces:
+        if agent not in self.action_spaces:
             raise ValueError(f"agent: {agent!r} is unknown{nearest(str(agent), self.possible_agents)}")
         return agent
 
     def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Named, dict[str, Named]]:
-        """Begin an episode; return observations, (O,) float32 each, and infos with the seed, by agent."""
+        """Begin an episode; return observations, (O,) float32 each, and infos, which are empty, by agent.
+
+        The seed is `world.seeds[0]`. It is not in the infos, because TorchRL takes the keys of these for all there are.
+        """
         seed = checked_seed(seed)
         # PettingZoo's own test suite resets every environment with {"options": 1}; nothing else is let through.
         checked_options(options, ("options",))
         observation = self.world.reset(seeds=seed)[0]
-        self._live = {name: i for i, name in enumerate(self.possible_agents)}
+        if seed is not None:
+            self.np_random = seeding.np_random(seed)[0]
+        self._running, self._live = True, {name: i for i, name in enumerate(self.possible_agents)}
         self._show()
         seen = dict(zip(self._live, observation, strict=True))
-        return seen, {name: {"seed": self.world.seeds[0]} for name in self._live}
+        return seen, {name: {} for name in self._live}
 
     def step(
         self, actions: Mapping[str, Rows]
     ) -> tuple[Named, dict[str, float], dict[str, bool], dict[str, bool], dict[str, Named]]:
         """Act for one control_dt; needs an action, (A,), clipped to [-1, 1], from every agent in `agents`.
 
+        When no agent is left, an empty dictionary is the right one, and five empty ones come back.
+
         Raises ValueError, before anything moves, that names the agent whose action is missing, is not asked for, has
-        another shape or holds NaN; ResetNeeded when nobody is left.
+        another shape or holds NaN; ResetNeeded before the first reset, or for actions when no agent is left.
         """
+        if self._running and not self._live and len(actions) == 0:
+            return {}, {}, {}, {}, {}
         begun(bool(self._live), "step")
         result = self._step(actions)
         present, truncated, terminated = self._live, result.truncated.item(), result.terminated[0].tolist()
@@ -216,7 +234,7 @@ class WorldParallelEnv(ParallelEnv[str, Rows, Rows]):  # type: ignore[misc]  # p
 
     def close(self) -> None:
         """Close the window and end the episode; may be called twice, and reset() begins anew."""
-        self._live = {}
+        self._running, self._live = False, {}
         self._screen.close()
 
 

@@ -21,6 +21,7 @@ from flockenv.envs.face import (
     checked_seed,
     observation_space,
     render_fps,
+    reward_keys,
 )
 from flockenv.envs.page import page
 from flockenv.tasks import (
@@ -58,7 +59,7 @@ __all__ = [
 
 def one_learner(task_type: type[Task], parameters: dict[str, Any]) -> Task:
     """Make the task of a face that has one action per world; ValueError if several agents would learn."""
-    task = build(task_type, parameters, limit="max_episode_steps")
+    task = build(task_type, parameters, limit="max_episode_steps", own=("render_mode",))
     if task.learners != 1:
         raise ValueError(
             f"{task_type.__name__}: {task.learners} learners; a Gymnasium environment has 1: for more use "
@@ -94,6 +95,7 @@ class SingleEnv(gymnasium.Env[Rows, Rows]):
         self.observation_space = observation_space(self.task)
         self.action_space = action_space(self.task)
         self.world = World(self.task)
+        self._reward_keys = reward_keys(self.task)
         self._running = False
 
     def reset(
@@ -129,8 +131,8 @@ class SingleEnv(gymnasium.Env[Rows, Rows]):
         return row[None, None]
 
     def _info(self, result: Step) -> dict[str, Any]:
-        terms = dict(zip(self.task.terms, result.terms[0, 0].tolist(), strict=True))
-        return {"terms": terms, "is_success": result.success.item(), **self.world.metrics()}
+        rewards = dict(zip(self._reward_keys, result.terms[0, 0].tolist(), strict=True))
+        return {**rewards, "is_success": result.success.item(), **self.world.metrics()}
 
     def _show(self) -> None:
         if self.render_mode == "human":

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from types import MappingProxyType
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar, Final, Literal
 
 import numpy as np
 from gymnasium import logger
@@ -28,6 +28,7 @@ from flockenv.envs.face import (
     checked_seed,
     observation_space,
     render_fps,
+    reward_keys,
     together,
 )
 from flockenv.refusals import nearest
@@ -64,6 +65,8 @@ __all__ = [
 
 Mask = NDArray[np.bool_]
 Info = dict[str, Any]
+OWN: Final = ("num_envs", "max_episode_steps", "autoreset_mode", "render_mode", "infos")
+"""Arguments of WorldsEnv that are not the task's."""
 INFOS = ("steps", "ends")
 NONE = -1
 """Stands for "no seed" in a column of seeds."""
@@ -78,8 +81,10 @@ class WorldsEnv(VectorEnv[Rows, Rows, Rows]):
     Args:
         num_envs: B L, how many rows; a whole number of worlds.
         max_episode_steps: decisions after which a world is truncated; None = never (make_vec passes the id's own).
-        autoreset_mode: when a world that ended begins anew: in the same step (default; `info["final_obs"]` and
-            `info["final_info"]` hold the end), in the next step, or never (`reset(options={"reset_mask": mask})`).
+        autoreset_mode: when a world that ended begins anew. "NextStep" (default, as gymnasium's own): the next step
+            is its reset: it does not read the actions of the world's rows, and returns their first observations,
+            reward 0 and no end. "SameStep": in the step that ends it; `info["final_obs"]` and `info["final_info"]`
+            hold the end. "Disabled": only by `reset(options={"reset_mask": mask})`.
         render_mode: "rgb_array" or None.
         infos: "steps" tells of every row after every step, as single environments do; "ends" only of episodes that
             end, how they ended, and of those that begin, their seeds: faster with many rows.
@@ -93,7 +98,7 @@ class WorldsEnv(VectorEnv[Rows, Rows, Rows]):
         self,
         num_envs: int = 1,
         max_episode_steps: int | None = None,
-        autoreset_mode: str | AutoresetMode = AutoresetMode.SAME_STEP,
+        autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
         render_mode: str | None = None,
         infos: Literal["steps", "ends"] = "steps",
         **parameters: Any,
@@ -101,7 +106,7 @@ class WorldsEnv(VectorEnv[Rows, Rows, Rows]):
         if infos not in INFOS:
             raise ValueError(f"infos: {infos!r} is unknown{nearest(str(infos), INFOS)}; allowed: {', '.join(INFOS)}")
         self.infos: Literal["steps", "ends"] = infos
-        self.task = together(build(self.task_type, {**self.fixed, **parameters}, limit="max_episode_steps"))
+        self.task = together(build(self.task_type, {**self.fixed, **parameters}, "max_episode_steps", OWN))
         self.autoreset_mode = _autoreset(autoreset_mode)
         self._screen = Screen(render_mode, render_fps(self.task), modes=("rgb_array",))
         self.render_mode = render_mode
@@ -116,6 +121,7 @@ class WorldsEnv(VectorEnv[Rows, Rows, Rows]):
         self.single_action_space = action_space(self.task)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
+        self._reward_keys = reward_keys(self.task)
         self._seeds = np.full(self.world.worlds, NONE, np.int64)
         self._nobody = np.zeros(self.world.worlds, np.bool_)
         self._ended = self._nobody
@@ -134,7 +140,7 @@ class WorldsEnv(VectorEnv[Rows, Rows, Rows]):
         seeds = self._seed_column(seed)
         mask = self._reset_mask(checked_options(options, ("reset_mask",)))
         super().reset(seed=int(seeds[0]) if seeds[0] != NONE else None)
-        if (self._seeds == NONE).any():
+        if ((seeds == NONE) & (self._seeds == NONE)).any():
             drawn = self.np_random.integers(SEEDS - len(seeds)) + np.arange(len(seeds))
             seeds = np.where(seeds == NONE, drawn, seeds)
         observation = self._begin(mask, seeds)
@@ -201,8 +207,8 @@ class WorldsEnv(VectorEnv[Rows, Rows, Rows]):
     def step(self, actions: Rows) -> tuple[NDArray[np.float32], Rows, Mask, Mask, Info]:
         """Act for one control_dt in every world; actions are (B L, A), clipped to [-1, 1].
 
-        Raises ValueError that names the world on NaN or another shape; ResetNeeded for a world that ended, if worlds
-        do not begin anew by themselves.
+        Raises ValueError that names the world on NaN or another shape; ResetNeeded for a world that ended, if
+        `autoreset_mode` is "Disabled".
         """
         begun(self._running, "step")
         resting = self._resting()
@@ -270,8 +276,7 @@ class WorldsEnv(VectorEnv[Rows, Rows, Rows]):
 
     def _columns(self, result: Step) -> tuple[Info, dict[str, Mask]]:
         """Return what is told of every row, and of which rows a metric has no value yet (and zero in its place)."""
-        terms = {name: result.terms[..., k].reshape(-1) for k, name in enumerate(self.task.terms)}
-        columns: Info = {"terms": terms}
+        columns: Info = {key: result.terms[..., k].reshape(-1) for k, key in enumerate(self._reward_keys)}
         columns["is_success"] = self._rows(result.success)
         lacks = {}
         for name, column in self.world.measure().items():
@@ -327,12 +332,8 @@ def _put(info: Info, columns: Mapping[str, Any], mask: Mask, lacks: Mapping[str,
     """Enter columns, with the rows that they speak of; a column that speaks of none is left out."""
     for name, column in columns.items():
         here = mask & ~lacks[name] if name in lacks else mask.copy()
-        value: Any = column
-        if isinstance(column, Mapping):
-            value = {}
-            _put(value, column, mask)
         if here.any():
-            info[name], info[f"_{name}"] = value, here
+            info[name], info[f"_{name}"] = column, here
 
 
 def _put_final(info: Info, seen: NDArray[np.float32], columns: Info, mask: Mask, lacks: Mapping[str, Mask]) -> None:
@@ -348,23 +349,16 @@ def _put_final(info: Info, seen: NDArray[np.float32], columns: Info, mask: Mask,
 
 def _only(columns: Mapping[str, Any], rows: NDArray[np.intp]) -> Info:
     """Return new columns: zeros but in these rows."""
-    new: Info = {}
-    for name, column in columns.items():
-        if isinstance(column, Mapping):
-            new[name] = _only(column, rows)
-        else:
-            new[name] = np.zeros_like(column)
-            new[name][rows] = column[rows]
+    new = {name: np.zeros_like(column) for name, column in columns.items()}
+    for name, column in new.items():
+        column[rows] = columns[name][rows]
     return new
 
 
 def _blank(columns: Mapping[str, Any], rows: NDArray[np.intp]) -> None:
     """Write zeros into these rows."""
     for column in columns.values():
-        if isinstance(column, Mapping):
-            _blank(column, rows)
-        else:
-            column[rows] = 0
+        column[rows] = 0
 
 
 class PursuitVectorEnv(WorldsEnv):
