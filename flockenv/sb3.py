@@ -164,9 +164,9 @@ class WorldVecEnv(VecEnv):
         infos: list[Info] = [NOTHING] * self.num_envs
         if done.any():
             self._tell(infos, result, done)
+            self._present = (self._present & ~done) | ended[:, None]
         if ended.any():
             self.world.reset(mask=ended, into=result.observation)
-        self._present = (self._present & ~done) | ended[:, None]
         return self._rows(result.observation), result.reward.reshape(-1), done.reshape(-1), infos
 
     def _tell(self, infos: list[Info], result: Step, done: NDArray[np.bool_]) -> None:

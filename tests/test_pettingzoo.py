@@ -197,8 +197,9 @@ def test_nobody_left_is_a_step_of_nobody(env_id):
     for _ in range(2):
         assert env.step({}) == ({}, {}, {}, {}, {})
     np.testing.assert_array_equal(env.state(), state)
-    with pytest.raises(ResetNeeded, match="reset"):
-        env.step(last)
+    for actions in (last, None, [], np.zeros(0)):
+        with pytest.raises(ResetNeeded, match="reset"):
+            env.step(actions)
     env.reset()
     env.step({agent: env.action_space(agent).sample() for agent in env.agents})
     env.close()

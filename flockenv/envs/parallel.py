@@ -47,6 +47,9 @@ class WorldParallelEnv(ParallelEnv[str, Rows, Rows]):  # type: ignore[misc]  # p
     limit all agents that are left are truncated, also those that terminate in the same step. When none is left,
     `step({})` returns five empty dictionaries. Seeds are as in SingleEnv.
 
+    Infos are flat: `reward/NAME` (each term of the reward of this step), `is_success`, and metrics in the step that
+    ends the episode.
+
     `reset(seed=s)` also seeds `np_random`, from which wrappers draw; the world itself draws nothing from it.
 
     Args:
@@ -135,7 +138,7 @@ class WorldParallelEnv(ParallelEnv[str, Rows, Rows]):  # type: ignore[misc]  # p
         Raises ValueError, before anything moves, that names the agent whose action is missing, is not asked for, has
         another shape or holds NaN; ResetNeeded before the first reset, or for actions when no agent is left.
         """
-        if self._running and not self._live and len(actions) == 0:
+        if self._running and not self._live and isinstance(actions, dict) and not actions:
             return {}, {}, {}, {}, {}
         begun(bool(self._live), "step")
         result = self._step(actions)
