@@ -19,8 +19,8 @@ import flockenv  # noqa: F401  # registers the ids
 def drawn(envs, seen, over):
     """Return random actions by agent; NaN for one that has left.
 
-    AgileRL shows NaN of such an agent, but not in the step in which it leaves, after which its own loops still act for
-    it; our environments refuse that, as PettingZoo's contract has it.
+    AgileRL shows NaN of such an agent, but not yet in the step in which it leaves; an action for it after that step is
+    refused, as PettingZoo's contract has it.
     """
     gone = np.stack([np.isnan(rows).all(axis=1) for rows in seen.values()]) | (over == 1)
     gone &= (over == 0).any(axis=0)  # where none goes on, a new episode has begun

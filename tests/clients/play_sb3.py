@@ -24,8 +24,7 @@ with row("stable-baselines3", "SAC, id", IDS[0]):
     SAC("MlpPolicy", IDS[0], train_freq=100, gradient_steps=10).learn(STEPS)
 
 for env_id, task in zip(IDS, (Pursuit(), Crossing(), Bottleneck()), strict=True):
-    with row("stable-baselines3", f"PPO, WorldVecEnv, {task.learners} learners", env_id):
+    with row("stable-baselines3", "PPO, WorldMonitor(WorldVecEnv), all learners", env_id):
         worlds = WorldMonitor(WorldVecEnv(task, worlds=4, leaving=not task.ends_together))
         model = PPO("MlpPolicy", VecNormalize(worlds), n_steps=100, batch_size=200, n_epochs=2)
         model.learn(STEPS)
-        assert not task.learners > 1 or model.ep_info_buffer is not None
