@@ -292,6 +292,8 @@ def train(experiment: Experiment, folder: Path, go_on: bool = False, tensorboard
         run = checkpointed(experiment, folder) if go_on else None
         if run is not None and run.steps >= experiment.ppo.steps:
             return run
+        if go_on and run is None:
+            console.print(f"no checkpoint in {folder}: starts anew", markup=False, highlight=False, soft_wrap=True)
         return _train(experiment, folder, run, tensorboard)
 
 

@@ -343,6 +343,12 @@ def test_a_checkpoint_of_the_format_before_is_refused_in_one_line(copied: Path, 
     assert (result.exit_code, result.stderr) == (2, said)
 
 
+def test_to_resume_without_a_checkpoint_starts_anew_and_says_so(fresh: Path) -> None:
+    result = command(fresh, "--resume")
+    assert result.stderr == f"no checkpoint in {fresh / 'runs' / 'pursuit'}: starts anew\n"
+    assert isinstance(result.exception, AssertionError)  # of the fixture: it was to be built
+
+
 def test_a_checkpoint_runs_no_code_and_is_no_pickle(copied: Path) -> None:
     data = (copied / "runs" / "pursuit" / FILE).read_bytes()
     header = json.loads(data[8 : 8 + int.from_bytes(data[:8], "little")])
