@@ -20,6 +20,7 @@ from flockenv.behaviours import (
     Seek,
     Whiskers,
 )
+from flockenv.constraints import Collisions
 from flockenv.eikonal import way_table
 from flockenv.grid import sampled
 from flockenv.scene import Group, Scene
@@ -300,6 +301,32 @@ def test_nobody_leaves(within: Shape) -> None:
         state = made.run(state, 5)
         worst = max(worst, float(within.gap(state.pos[0]).max()))
     assert worst < 0, "a centre came through the wall"
+
+
+def stand_out(dt: float, seconds: float, walls: bool = False) -> float:
+    """Return how far 40 bodies of radius 0.2 m stand out of ROOM at most, m."""
+    made = contained(ROOM, (4, 3), (2, 0), count=40).model_copy(update={"dt": dt})
+    if walls:
+        room = ROOM.model_copy(update={"hollow": True})
+        fields = {"groups": made.groups, "effects": made.effects, "dt": dt}
+        made = Scene(**fields, obstacles=(room,), constraints=(Collisions(restitution=0),))
+    state, worst = made.start(0), -np.inf
+    for _ in range(round(seconds / dt)):
+        state = made.step(state)
+        worst = max(worst, float(ROOM.gap(state.pos[0]).max()) + 0.2)
+    return worst
+
+
+@pytest.mark.slow
+def test_bodies_stand_out_by_less_the_shorter_the_step() -> None:
+    coarse, fine = stand_out(0.04, 20), stand_out(0.005, 20)
+    assert 0 < coarse < 2 * 0.04 * 0.6  # max_speed dt / 2, and a little
+    assert fine < coarse / 4
+
+
+@pytest.mark.slow
+def test_no_body_stands_out_of_a_hollow_obstacle_with_collisions() -> None:
+    assert stand_out(0.02, 20, walls=True) < 1e-6
 
 
 def test_from_outside_it_comes_straight_back() -> None:

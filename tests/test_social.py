@@ -362,6 +362,31 @@ def test_a_wall_is_the_same_however_it_is_cut() -> None:
     assert np.abs(want).max() > 0.5
 
 
+@pytest.mark.parametrize(
+    "vertices",
+    [
+        ((0, 0), (2, 0), (2, 0), (4, 0), (4, 3)),
+        ((0, 0), (2, 0), (2, 0), (2, 0), (4, 0), (4, 3)),
+        ((0, 0), (4, 0), (4, 0), (4, 3)),
+        ((0, 0), (0, 0), (4, 0), (4, 3), (4, 3)),
+        ((0, 0), (2, 0), (2, 1e-9), (4, 0), (4, 3)),
+    ],
+    ids=["inside a side", "three times", "at a corner", "at both ends", "almost"],
+)
+def test_a_vertex_given_twice_adds_nothing(vertices: tuple[tuple[float, float], ...]) -> None:
+    points = ((2.0, 0.4), (2.05, 0.3), (3.7, 0.3), (4.2, -0.2), (-0.2, 0.1), (4.2, 3.3))
+    want = off_walls((Wall(vertices=((0, 0), (4, 0), (4, 3))),), *points)
+    assert np.allclose(off_walls((Wall(vertices=vertices),), *points), want, rtol=1e-8)
+    beside = (Wall(vertices=vertices), Wall(vertices=((4, 3), (6, 3))))  # joined at an end that is given twice
+    one = (Wall(vertices=((0, 0), (4, 0), (4, 3), (6, 3))),)
+    assert np.allclose(off_walls(beside, *points), off_walls(one, *points), rtol=1e-8)
+
+
+def test_two_walls_that_lie_on_each_other_both_act() -> None:
+    wall = Wall(vertices=((0, 0), (4, 0)))
+    assert np.allclose(off_walls((wall, wall), (2.0, 0.5)), 2 * off_walls((wall,), (2.0, 0.5)))
+
+
 def test_a_room_is_its_walls() -> None:
     points = ((0.4, 0.6), (2.0, 1.5), (3.7, 2.9), (3.9, 0.1))
     corners = ((0, 0), (4, 0), (4, 3), (0, 3))

@@ -149,12 +149,16 @@ def _relative(table: Any, x: Vec) -> Vec:
 class Contain(Moving):
     """Stay within a shape: zero while the place `time` seconds ahead is inside it, else along the wall met there.
 
-    The inward normal's part across the heading steers; head-on it has none, so it brakes and keeps right. Whoever is
-    outside heads straight back in. Reynolds 1999, containment.
+    The inward normal's part across the heading steers; head-on it has none, so it brakes and keeps right. From outside
+    an agent heads straight back in. Reynolds 1999, containment.
+
+    A steering force is no wall: where agents turn along the surface their bodies come through it by about half of the
+    way of a step, max_speed dt / 2, and by a little at corners; and further if `weight` or max_force is too small to
+    turn in `time`, or others push. What must never leave needs a hollow obstacle and `collisions`.
     """
 
     kind: Literal["contain"] = "contain"
-    within: AnyShape = Field(description="a circle (or sphere), a block, a polygon; the body stays inside it whole")
+    within: AnyShape = Field(description="a circle (or sphere), a block, a polygon; the whole body is kept inside")
     time: float = Field(default=1.0, gt=0, description="s, how far ahead it looks")
     tabled: ClassVar[bool] = True
     demo: ClassVar[str | None] = """

@@ -10,17 +10,30 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["area", "around", "band", "behind", "crossing", "hull", "silhouette", "strips", "width"]
+__all__ = ["area", "around", "band", "behind", "crossing", "distinct", "hull", "silhouette", "strips", "width"]
 
 Floats = NDArray[np.float64]
 ROUND = 48
 """Corners of a circle in a picture."""
+
+SHORTEST = 1e-6
+"""Of a line's size: a piece that is shorter has no direction in single precision."""
 
 
 def area(vertices: Floats) -> float:
     """Return the area of a polygon (n, 2), positive if it runs counter-clockwise."""
     x, y = vertices.T
     return float(0.5 * (x * np.roll(y, -1) - np.roll(x, -1) * y).sum())
+
+
+def distinct(vertices: Floats) -> Floats:
+    """Return the vertices (n, D) of a line without those that lie where the one before lies."""
+    shortest = SHORTEST * float(np.linalg.norm(np.ptp(vertices, axis=0)))
+    kept = [0]
+    for k in range(1, len(vertices)):
+        if np.linalg.norm(vertices[k] - vertices[kept[-1]]) > shortest:
+            kept.append(k)
+    return np.asarray(vertices[kept])
 
 
 def crossing(vertices: Floats) -> tuple[int, int] | None:

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, NamedTuple,
 
 import numpy as np
 from numpy.typing import ArrayLike
-from pydantic import Field, WrapValidator, model_validator
+from pydantic import Field, WrapValidator, field_validator, model_validator
 
 from flockenv.grid import MOST_POINTS, packed, points_of
 from flockenv.records import Record, in_tuples, keep
@@ -238,7 +238,10 @@ class Circle(Closed):
 
 
 class Wall(Shape):
-    """A line through some points, `radius` thick on each side: walls, and in 3-D tubes."""
+    """A line through some points, `radius` thick on each side: walls, and in 3-D tubes.
+
+    Pieces of length 0 (a vertex given twice) add nothing.
+    """
 
     kind: Literal["wall"] = "wall"
     vertices: tuple[Point, ...] = Field(min_length=2, max_length=1024, description="m, from end to end")
@@ -265,8 +268,8 @@ class Wall(Shape):
 
     @property
     def corners(self) -> tuple[Floats, float]:
-        """Its vertices and half its thickness."""
-        return np.array(self.vertices), self.radius
+        """Its vertices, each once, and half its thickness."""
+        return outlines.distinct(np.array(self.vertices)), self.radius
 
     @property
     def extremes(self) -> Floats:
@@ -275,8 +278,8 @@ class Wall(Shape):
 
     def row(self, dimension: int) -> Sequence[float]:
         """An open chain."""
-        around = np.array(self.vertices) - self.anchor
-        return [float(len(self.vertices)), self.radius, 0.0, *around.ravel().tolist()]
+        around = self.corners[0] - self.anchor
+        return [float(len(around)), self.radius, 0.0, *around.ravel().tolist()]
 
     def polygons(self, low: Floats, high: Floats) -> list[Floats]:
         """A capsule around each part."""
@@ -339,16 +342,29 @@ class Capsule(Closed):
 
 
 class Polygon(Closed):
-    """A solid of the plane, convex or concave; its edges do not cross."""
+    """A solid of the plane, convex or concave; its edges do not cross.
+
+    A ring that repeats its first vertex at the end (GeoJSON, WKT, shapely's `exterior.coords`) is the same polygon.
+    """
 
     kind: Literal["polygon"] = "polygon"
     vertices: tuple[Annotated[tuple[float, ...], Field(min_length=2, max_length=2)], ...] = Field(
         min_length=3, max_length=1024, description="m, in either sense"
     )
 
+    @field_validator("vertices")
+    @classmethod
+    def _opened(cls, vertices: tuple[Point, ...]) -> tuple[Point, ...]:
+        """Leave out the last vertex of a closed ring."""
+        return vertices[:-1] if len(vertices) > 3 and vertices[0] == vertices[-1] else vertices
+
     @model_validator(mode="after")
     def _simple(self) -> Polygon:
-        """Refuse edges that cross or touch, and what has no area."""
+        """Refuse a vertex given twice, edges that cross or touch, and what has no area."""
+        first: dict[Point, int] = {}
+        for k, vertex in enumerate(self.vertices):
+            if first.setdefault(vertex, k) != k:
+                raise ValueError(f"vertices[{k}] = {vertex}: is where vertices[{first[vertex]}] is; leave it out")
         crossing = outlines.crossing(np.array(self.vertices))
         if crossing is not None:
             raise ValueError(f"vertices: the edges from vertices {crossing[0]} and {crossing[1]} cross or touch")
