@@ -36,9 +36,18 @@ effects:
 
 @law
 def nothing(p: Any, me: Me) -> Vec:
-    """No threat yet: at infinity."""
+    """No threat yet: at infinity; no side."""
     o, far = like(me.who, 0.0), like(me.who, np.inf)
-    return (far, o) + zero(me.pos)  # noqa: RUF005  # numba joins tuples, but does not unpack them
+    return (far, o) + zero(me.pos) + zero(me.pos)  # noqa: RUF005  # numba joins tuples, but does not unpack them
+
+
+@law
+def _kept(acc: Vec) -> Vec:
+    """Return all but the side, which is found when the obstacle is."""
+    if len(acc) == 6:
+        return (acc[0], acc[1], acc[2], acc[3])
+    else:
+        return (acc[0], acc[1], acc[2], acc[3], acc[4])
 
 
 @law
@@ -49,12 +58,12 @@ def straight_on(p: Any, me: Me, k: int) -> tuple[Vec, float]:
 
 @law
 def nearest_threat(p: Any, me: Me, other: Obstacle, acc: Vec) -> Vec:
-    """Keep the obstacle that the straight path touches first: (distance, clearance, offset)."""
+    """Keep the obstacle that the straight path touches first: (distance, clearance, offset, no side yet)."""
     far = like(me.who, np.inf)
     distance = other.hit if other.hit <= norm(me.vel) * p.horizon else far
     # who overlaps it already wants out, however the sum of the radii is rounded
     clearance = me.radius + other.radius + p.margin if other.hit > like(me.who, 0.0) else far
-    return select(distance < acc[0], (distance, clearance) + other.offset, acc)  # noqa: RUF005
+    return select(distance < acc[0], (distance, clearance) + other.offset, _kept(acc)) + zero(me.pos)  # noqa: RUF005
 
 
 @law
@@ -64,22 +73,34 @@ def in_time(p: Any, me: Me) -> float:
 
 
 @law
-def around(p: Any, me: Me, acc: Vec) -> Vec:
-    """F = w (1 m/s) sideways, away from the threat's centre."""
-    offset: Vec
-    if len(acc) == 4:
-        offset = (acc[2], acc[3])
+def _sides(acc: Vec) -> tuple[Vec, Vec]:
+    """Return the offset of the threat, and the side of its nearest edge."""
+    if len(acc) == 6:
+        return (acc[2], acc[3]), (acc[4], acc[5])
     else:
-        offset = (acc[2], acc[3], acc[4])
-    wish = steering.avoid(me.heading, offset, acc[1], like(me.who, 1.0))
+        return (acc[2], acc[3], acc[4]), (acc[5], acc[6], acc[7])
+
+
+@law
+def around(p: Any, me: Me, acc: Vec) -> Vec:
+    """F = w (1 m/s) sideways, to the nearest edge; without one away from the threat's centre."""
+    e = like(me.who, 1.0)
+    offset, aside = _sides(acc)
+    away = steering.avoid(me.heading, offset, acc[1], e)
+    # away from a circle's centre is to its nearest edge: where both are one but for rounding it stays what it was
+    other = (dot(aside, aside) > like(e, 0.0)) & (dot(aside, away) < like(e, 1 - 1e-5))
+    wish = select(other, aside, away)
     return scale(select(acc[0] < like(me.who, np.inf), wish, zero(me.pos)), p.weight)
 
 
 class AvoidObstacles(Effect):
     """Steer sideways around the obstacle that the straight path would touch first within `horizon` seconds.
 
-    Along the side of the surface's normal where the body would touch it: of a circle that is away from its centre. An
-    obstacle that moves is avoided where it is, as if it stood still.
+    Towards the edge of its silhouette that is nearest to the point of impact (Reynolds 1988): of a circle that is away
+    from its centre; dead ahead of a middle an agent keeps right. An edge is where the body passes, with a radius to
+    spare beyond it: walls that are joined, or leave a gap that is too narrow, are one obstacle. What has no edge (a
+    half-space, a room) is avoided along the side of its normal. In space the edges to the sides of the shadow that the
+    obstacle casts across the heading are compared. An obstacle that moves is avoided where it is, as if it stood still.
     """
 
     kind: Literal["avoid_obstacles"] = "avoid_obstacles"
@@ -92,6 +113,7 @@ class AvoidObstacles(Effect):
     obstacle_law: ClassVar[str | None] = "nearest_threat"
     obstacle_finish: ClassVar[str | None] = "around"
     obstacle_reach: ClassVar[str | None] = "in_time"
+    obstacle_edges: ClassVar[bool] = True
     demo: ClassVar[str | None] = AVOIDING
 
     def lookahead(self, speed: float) -> float:
@@ -99,8 +121,8 @@ class AvoidObstacles(Effect):
         return speed * self.horizon
 
     def folded(self, dimension: int) -> int:
-        """Distance, clearance and offset of the nearest threat."""
-        return 2 + dimension
+        """Distance, clearance and offset of the nearest threat, and the side of its nearest edge."""
+        return 2 + 2 * dimension
 
 
 # --- whiskers ---------------------------------------------------------------------------------------------------------
@@ -128,16 +150,22 @@ def _across(heading: Vec, right: Vec, k: int) -> Vec:
 @law
 def no_whisker(p: Any, me: Me) -> Vec:
     """Nothing touched."""
-    return (like(me.who, 0.0),) + zero(me.pos)  # noqa: RUF005
+    o, far = like(me.who, 0.0), like(me.who, np.inf)
+    return (far, o) + zero(me.pos) + zero(me.pos)  # noqa: RUF005
 
 
 @law
 def deepest_whisker(p: Any, me: Me, other: Obstacle, acc: Vec) -> Vec:
-    """Keep what a whisker reaches into deepest: (the share of it that is inside, the normal where it enters)."""
+    """Keep what a whisker reaches into deepest.
+
+    (How far ahead it is if that is the middle one, the share that is inside, the normal where it enters, no side yet.)
+    """
     o, e = like(me.who, 0.0), like(me.who, 1.0)
     length = norm(me.vel) * p.horizon
     share = e - other.hit / length if (other.hit < length) & (length > o) else o
-    return select(share > acc[0], (share,) + other.normal, acc)  # noqa: RUF005
+    middle = dot(other.ray, me.heading) > like(e, 1 - 1e-6)
+    ahead = other.hit if middle else like(e, np.inf)
+    return select(share > acc[1], (ahead, share) + other.normal, _kept(acc)) + zero(me.pos)  # noqa: RUF005
 
 
 @law
@@ -148,20 +176,22 @@ def whiskers_end(p: Any, me: Me) -> float:
 
 @law
 def along_normal(p: Any, me: Me, acc: Vec) -> Vec:
-    """F = w (share inside) (n + unit(lateral n)): n alone would mostly brake; head-on the side is the right."""
-    normal: Vec
-    if len(acc) == 3:
-        normal = (acc[1], acc[2])
-    else:
-        normal = (acc[1], acc[2], acc[3])
+    """F = w (share inside) (n + side): n alone would mostly brake.
+
+    The side is that of the nearest edge of what is ahead; without one unit(lateral n), and head-on the right.
+    """
+    normal, edge = _sides(acc)
     aside = lateral(normal, me.heading)
     headon = dot(aside, aside) < like(me.who, 1e-6)
     side = select(headon, perpendicular(me.heading), unit(aside))
-    return scale(add(normal, side), p.weight * acc[0])
+    side = select(dot(edge, edge) > like(me.who, 0.0), edge, side)
+    return scale(add(normal, side), p.weight * acc[1])
 
 
 class Whiskers(Effect):
     """Feel ahead and to the sides; turn away from, and brake before, what a whisker reaches into, by how deep it does.
+
+    Before what the middle one reaches into deepest, towards the nearest edge of its silhouette, as `avoid_obstacles`.
 
     Three whiskers in the plane, five in space, `horizon` times the speed long. Buckland 2005, "wall avoidance": there a
     whisker has the length of a line and the body no size; here it is what the body would touch.
@@ -177,6 +207,7 @@ class Whiskers(Effect):
     obstacle_law: ClassVar[str | None] = "deepest_whisker"
     obstacle_finish: ClassVar[str | None] = "along_normal"
     obstacle_reach: ClassVar[str | None] = "whiskers_end"
+    obstacle_edges: ClassVar[bool] = True
     demo: ClassVar[str | None] = AVOIDING.replace("avoid_obstacles, weight: 8", "whiskers, weight: 20")
 
     def rays(self, dimension: int) -> int:
@@ -184,8 +215,8 @@ class Whiskers(Effect):
         return 2 * dimension - 1
 
     def folded(self, dimension: int) -> int:
-        """A share and a normal."""
-        return 1 + dimension
+        """How far ahead, a share, a normal and a side."""
+        return 2 + 2 * dimension
 
 
 # --- a force field ----------------------------------------------------------------------------------------------------

@@ -29,15 +29,19 @@ An effect is of one or more of three forms, each a law for one agent:
   `p.counted`: how many of the living it was for each when the step began. One pass over all agents per step;
 * `obstacle_start(p, me)`, `obstacle_law(p, me, other, acc) -> acc`, `obstacle_finish(p, me, acc) -> force`: a fold over
   the obstacles, of whatever shape: `other` is an `Obstacle`. With an `obstacle_ray(p, me, k) -> (direction, margin)` it
-  meets each obstacle for each of its rays, k = 0, 1, ...: where the agent's body, `margin` wider, would touch it
-  first if it went along the unit vector `direction`. With an `obstacle_from(p, me) -> offset` it is met as from that
-  place, so far from the agent, instead of from where the agent is. With an `obstacle_reach(p, me) -> m` it says that
-  its law leaves acc as it is wherever the surface is farther than this from the agent: long shapes that lie beyond are
-  not looked at. With `obstacle_pieces` it meets walls, polygons and rooms side after side: each by its nearest place,
-  a corner once, see shapes/chain.py. Of an effect with a pair law too, `finish_law` gives
-  no force but what it has found out about others, a vector that is told to `obstacle_start(p, me, told)` (hide). With
-  no start of its own it meets circles alone, goes before a fold over neighbours and hands over to it, so that both are
-  judged together (orca).
+  meets each obstacle for each of its rays, k = 0, 1, ...: where the agent's body, `margin` wider, would touch it first
+  if it went along the unit vector `direction`. With an `obstacle_from(p, me) -> offset` it is met as from that place,
+  so far from the agent, instead of from where the agent is. With an `obstacle_reach(p, me) -> m` it says that its law
+  leaves acc as it is wherever the surface is farther than this from the agent: shapes that lie beyond are not looked
+  at. A law that casts rays and has a reach leaves acc as it is, too, wherever no ray touches within that reach. With
+  `obstacle_pieces` it meets walls, polygons and rooms side after side: each by its nearest place, a corner once, see
+  shapes/chain.py. With `obstacle_edges` the first number of acc is how far ahead along ray 0 the body touches
+  something, or inf, and the last D, which the law leaves 0, are then filled with the unit vector across the ray to the
+  side where the silhouette edge of what is touched is nearest to the impact, of all that is one to the body
+  (sweep/around.py); they stay 0 where there is none, or it overlaps already. Of an effect with a pair law too,
+  `finish_law` gives no force but what it has found out about others, a vector that is told to `obstacle_start(p, me,
+  told)` (hide). With no start of its own it meets circles alone, goes before a fold over neighbours and hands over to
+  it, so that both are judged together (orca).
 
 `p` holds the effect's `parameters()` by name, and, if it is `tabled`, an array of numbers as `p.table`: the points of a
 path, the values of a grid. `me` and `other` are the records below. Laws live in the effect's module.
@@ -239,6 +243,8 @@ class Effect(Record):
     obstacle_ray: ClassVar[str | None] = None
     obstacle_from: ClassVar[str | None] = None
     obstacle_reach: ClassVar[str | None] = None
+    obstacle_edges: ClassVar[bool] = False
+    """True if an agent that has something ahead is told on which side its nearest silhouette edge is."""
     obstacle_pieces: ClassVar[bool] = False
     """Are walls, polygons and rooms met side after side, each by its nearest place, instead of by one place?"""
     linear_drag: ClassVar[str | None] = None

@@ -3,6 +3,10 @@ the other shapes: what is not round, moves, or is hollow. These are met where th
 
 A law meets circles as they are, and of any other shape one point (`effects.base.Obstacle`): the nearest of its surface,
 or, where the law casts a ray, the one that it touches first. Nothing is written if no law asks for obstacles.
+
+Where there are many shapes of a form, each agent meets those that a tree says may lie within reach (shapes/tree.py), in
+the order in which they are listed; that is where the others, which a law leaves alone, would have been met too: so
+results are the same bits.
 """
 
 from __future__ import annotations
@@ -10,15 +14,19 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from flockenv.shapes import FORMS
+from flockenv.shapes.tree import MOST_FOUND, node_length
 from flockenv.sweep.parts import Parts
 from flockenv.sweep.text import Slots, indented, indented_lines, tuple_of
 
-__all__ = ["blocked", "obstacle_imports", "obstacles"]
+__all__ = ["CIRCLE", "blocked", "each_row", "near_rows", "obstacle_imports", "obstacles", "place_of_row"]
 
 CIRCLE = "circle"
 
 PIECED = ("chain", "hollow_chain", "hollow_block")
 """Forms that a law may meet piece by piece: side after side."""
+
+LOOSE = 1 + 1e-6
+"""Factor of a reach, so that single precision loses nothing that a law would have met."""
 
 SHORT = 1 - 1e-6
 """Share of the way to a surface on which nothing may stand, if it is to be seen: not the surface itself."""
@@ -38,6 +46,9 @@ def obstacle_imports(parts: Parts) -> list[str]:
     ]
     forms = [(form, module) for form, module in FORMS.items() if form in parts.shaped[1]]
     lines += [f"from {module} import hit_{form}, nearest_{form}" for form, module in forms]
+    if parts.trees:
+        lines.append("from flockenv.shapes.tree import keep_in_order, meets_box, row_of_node")
+        lines.append("from flockenv.shapes.head import vector_at")
     cut = [(form, module) for form, module in forms if form in PIECED and any(e.obstacle_pieces for e in parts.effects)]
     return lines + [f"from {module} import piece_{form}, pieces_{form}" for form, module in cut]
 
@@ -56,7 +67,7 @@ def obstacles(parts: Parts, me: list[str], found_out: Callable[[int], str]) -> l
         told = f", {found_out(k)}" if parts.effects[k].pair_law else ""
         starts.append(f"found = obstacle_start_{k}(p{k}, me{told})")
         starts += [f"{s} = found[{j}]" for j, s in enumerate(slots)]
-    if parts.bounded:
+    if parts.bounded or parts.looked_up:
         starts.append(f"seen = obstacle_reach_{asking[0][0]}(p{asking[0][0]}, me)")
         starts += [f"seen = max(seen, obstacle_reach_{k}(p{k}, me))" for k, _ in asking[1:]]
         starts.append(f"{slot('reach0')} = seen")
@@ -80,15 +91,84 @@ def obstacles(parts: Parts, me: list[str], found_out: Callable[[int], str]) -> l
             within = "if dot(beside, beside) < seen * seen:"
             bound = [f"beside, seen = outside_box(params, at_, y), {slot('reach0')}"]
             met = [*bound, within, *indented_lines(met, 4)]
-        met = [*me, "y = offset_to(size, place, x)", *met]
+        met = ["y = offset_to(size, place, x)", *met]
+        if form in parts.looked_up:
+            lines += _looked_up(parts, form, me, met, [k for k, _ in asking])
+        else:
+            lines += _in_turn(parts, form, me, met)
+    return lines + _asides(parts, asking, me)
+
+
+def _in_turn(parts: Parts, form: str, me: list[str], met: list[str]) -> list[str]:
+    """Write how all agents of a block, side by side, meet every shape of a form."""
+    return [
+        f"at_ = {form}_at",
+        f"for m in range({form}_count):",
+        *indented_lines(_placed(parts), 4),
+        f"    for l in range(np.uint64({parts.width})):",
+        *indented_lines([*me, *met], 8),
+        "    at_ += np.int64(params[at_])",
+    ]
+
+
+def _looked_up(parts: Parts, form: str, me: list[str], met: list[str], asking: list[int]) -> list[str]:
+    """Write how each agent of a block meets the shapes of a form that may lie within reach, in order."""
+    first = Slots(parts).first("found0")
+    return [
+        f"for l in range(np.uint64({parts.width})):",
+        *indented_lines([*me, *_within_reach(parts, asking)], 4),
+        f"    many = near_{form}(params, size, {form}_tree, middle, around, lanes, np.int64({first}))",
+        f"    at_ = {form}_at",
+        f"    for m in range(many if many >= 0 else {form}_count):",
+        f"        at_ = {form}_at + np.int64(lanes[{first} + np.uint64(m)]) if many >= 0 else at_",
+        *indented_lines([*_placed(parts), *met], 8),
+        "        at_ += np.int64(params[at_])",
+    ]
+
+
+def _within_reach(parts: Parts, asking: list[int]) -> list[str]:
+    """Write the box in which something may matter to agent i: around all rays, if laws cast them, or around it."""
+    d = parts.dimension
+    lines = [f"seen = {Slots(parts)('reach0')} * like(x[0], {LOOSE!r})"]
+    if not all(parts.effects[k].obstacle_ray for k in asking):
+        return [*lines, f"middle, around = x, {tuple_of('seen', d)}"]
+    lines.append("low, high, wide = zero(x), zero(x), like(seen, 0.0)")
+    for k in asking:
+        for j in range(parts.effects[k].rays(d)):
+            lines += [
+                f"ray, margin = obstacle_ray_{k}(p{k}, me, {j})",
+                f"low = {tuple_of('min(low[#], seen * ray[#])', d)}",
+                f"high = {tuple_of('max(high[#], seen * ray[#])', d)}",
+                "wide = max(wide, me.radius + margin)",
+            ]
+    return [
+        *lines,
+        f"wide, half = wide * like(wide, {LOOSE!r}), like(wide, 0.5)",
+        "middle = add(x, scale(add(low, high), half))",
+        f"around = {tuple_of('(high[#] - low[#]) * half + wide', d)}",
+    ]
+
+
+def _placed(parts: Parts) -> list[str]:
+    """Write where the shape at `at_` is, and how fast it moves."""
+    return [f"place = {tuple_of('params[at_ + 2 + #]', parts.dimension)}", *_moved(parts)]
+
+
+def _asides(parts: Parts, asking: list[tuple[int, list[str]]], me: list[str]) -> list[str]:
+    """Write the side on which each agent goes around what is in its way, for the laws that ask: see around.py."""
+    lines: list[str] = []
+    for k, slots in asking:
+        if not parts.effects[k].obstacle_edges:
+            continue
+        world = "obstacle_x, obstacle_radius, params, size, b, time"
         lines += [
-            f"at_ = {form}_at",
-            f"for m in range({form}_count):",
-            f"    place = {tuple_of('params[at_ + 2 + #]', d)}",
-            *_moved(parts),
-            f"    for l in range(np.uint64({w})):",
-            indented(met, 8),
-            "    at_ += np.int64(params[at_])",
+            f"for l in range(np.uint64({parts.width})):",
+            f"    impact = {slots[0]}",
+            "    if impact > 0 and impact < like(impact, np.inf):",
+            *indented_lines(me, 8),
+            f"        ray, margin = obstacle_ray_{k}(p{k}, me, 0)",
+            f"        edgeward = aside_of({world}, x, ray, me.radius + margin, impact)",
+            *(f"        {s} = edgeward[{j}]" for j, s in enumerate(slots[-parts.dimension :])),
         ]
     return lines
 
@@ -97,8 +177,8 @@ def _moved(parts: Parts) -> list[str]:
     """Write where a shape is at this instant, and how fast it moves."""
     if not parts.moving:
         return []
-    velocity = "    glide = velocity_of(params, at_, time, place)"
-    return [velocity, "    place = add(place, shift_of(params, at_, time, place))"]
+    velocity = "glide = velocity_of(params, at_, time, place)"
+    return [velocity, "place = add(place, shift_of(params, at_, time, place))"]
 
 
 def _meet(parts: Parts, asking: list[tuple[int, list[str]]], form: str) -> list[str]:
@@ -196,7 +276,7 @@ def _touched(form: str, k: int, j: int, vel: str) -> list[str]:
     ]
 
 
-def _place(parts: Parts) -> str:
+def place_of_row(parts: Parts) -> str:
     """Write where the anchor of the shape at `at_` is."""
     place = tuple_of("params[at_ + 2 + #]", parts.dimension)
     return f"add({place}, shift_of(params, at_, time, x))" if parts.moving else place
@@ -213,6 +293,63 @@ def _touched_side(form: str) -> str:
     return f"side = {found} if (hit > like(gap, 0.0)) & (hit < like(gap, np.inf)) else out"
 
 
+def each_row(parts: Parts, form: str, middle: str, reach: str, met: list[str], box: list[str]) -> list[str]:
+    """Write a loop over the shapes of a form, at `at_`: all, or of a tree those that come within `reach` of `middle`.
+
+    box: how these two are worked out, which is done anew at each node. In no order that may be relied on.
+    """
+    at, count, tree = (f"np.int64(params[{place}])" for place in parts.places_of(form))
+    if form not in parts.trees:
+        return [
+            f"at_ = {at}",
+            f"for m in range({count}):",
+            *indented_lines(met, 4),
+            "    at_ += np.int64(params[at_])",
+        ]
+    return [
+        f"node = {tree} + 1",
+        "end = node + np.int64(params[node - 1])",
+        "begin = node",
+        "while node < end:",
+        *indented_lines(box, 4),
+        f"    if meets_box(params, node, offset_to(size, {middle}, vector_at(params, node + 2, {middle})), {reach}):",
+        "        at_ = row_of_node(params, node)",
+        f"        node += {node_length(parts.dimension)}",
+        "        if at_ >= 0:",
+        f"            at_ += {at}",
+        *indented_lines(met, 12),
+        "    else:",
+        "        node = begin + np.int64(params[node])",
+    ]
+
+
+def near_rows(parts: Parts) -> str:
+    """Return the source of `near_FORM` for each form that agents look up: the rows that may lie within reach."""
+    return "".join(
+        f'''
+
+@kernel
+def near_{form}(params, size, tree, x, reach, found, first):
+    """List the rows that may lie within `reach` of x, in order, from `first` on; return how many, -1 if too many."""
+    count, node = 0, tree + 1
+    begin, end = node, node + np.int64(params[tree])
+    while node < end:
+        if meets_box(params, node, offset_to(size, x, vector_at(params, node + 2, x)), reach):
+            row = row_of_node(params, node)
+            node += {node_length(parts.dimension)}
+            if row >= 0:
+                if count == {MOST_FOUND}:
+                    return -1
+                keep_in_order(found, first, count, row)
+                count += 1
+        else:
+            node = begin + np.int64(params[node])
+    return count
+'''
+        for form in parts.looked_up
+    )
+
+
 def blocked(parts: Parts) -> str:
     """Return the source of `blocked`: does an obstacle hide what is at `to` from x? Empty if nobody asks."""
     if not parts.occludes:
@@ -225,16 +362,14 @@ def blocked(parts: Parts) -> str:
         "    if rho > 0:",
         f"        found |= stands_between(offset_to(size, x, {tuple_of('obstacle_x[#, b, m]', d)}), rho, to)",
     ]
-    at = d + 1
     for form in parts.shaped[1]:
-        lines += [
-            f"at_ = np.int64(params[{at}])",
-            f"for m in range(np.int64(params[{at + 1}])):",
-            f"    y = offset_to(size, {_place(parts)}, x)",
-            f"    found |= hit_{form}(params, at_, y, unit(to), like(to[0], 0.0)) < norm(to)",
-            "    at_ += np.int64(params[at_])",
-        ]
-        at += 2
+        hides = f"hit_{form}(params, at_, y, unit(to), like(to[0], 0.0)) < norm(to)"
+        met = [f"y = offset_to(size, {place_of_row(parts)}, x)", f"found |= {hides}"]
+        if form in parts.trees:
+            lines.append("half = scale(to, like(to[0], 0.5))")
+            lines.append(f"middle, reach = add(x, half), {tuple_of('abs(half[#])', d)}")
+            met = [*met, "if found:", "    return found"]
+        lines += each_row(parts, form, "middle", "reach", met, [])
     return f'''
 @kernel
 def blocked(obstacle_x, obstacle_radius, params, size, b, {"time, " if parts.moving else ""}x, to):

@@ -24,6 +24,7 @@ from flockenv.integrators.base import Integrator
 from flockenv.integrators.one_stage import OneStage
 from flockenv.kernels import LINE
 from flockenv.shapes import packed
+from flockenv.shapes.tree import FEWEST_ROWS, MOST_FOUND, tree_of
 from flockenv.space import Space
 
 __all__ = ["LAWS", "SMALL_STRIDE", "Look", "Parts", "flattened", "record_of", "sorted_at", "view_of"]
@@ -31,6 +32,8 @@ __all__ = ["LAWS", "SMALL_STRIDE", "Look", "Parts", "flattened", "record_of", "s
 SMALL_STRIDE = 128
 """Places in a row of sorted agents where there are too few to be sorted by cell: their blocks, and one more."""
 
+MOST_NUMBERS = 2**24
+"""Numbers of a form's rows up to which single precision knows where each begins."""
 
 LAWS = (
     "own_law", "medium_law", "flow_law", "far_law", "bond_law", "kick_law", "aim_law", "begin_law", "keep_law",
@@ -131,9 +134,49 @@ class Parts:
         Those whose laws go from edge to edge, or from place to place. Blocks and half-spaces are met by lanes side by
         side, which would go through all of the law anyhow: there it was no faster, with rays or without.
         """
+        return tuple(form for form in ("chain", "distance_field") if form in self.shaped[1]) if self.reaches else ()
+
+    @property
+    def reaches(self) -> bool:
+        """True if all folds over obstacles say how far they reach."""
         folds = [e for e in self.effects if e.obstacle_start is not None]
-        asked = bool(folds) and all(e.obstacle_reach is not None for e in folds)
-        return tuple(form for form in ("chain", "distance_field") if form in self.shaped[1]) if asked else ()
+        return bool(folds) and all(e.obstacle_reach is not None for e in folds)
+
+    @functools.cached_property
+    def trees(self) -> dict[str, NDArray[np.float64]]:
+        """Trees over the shapes of each form of which there are many, and which have an end: see shapes/tree.py."""
+        table, forms = self.shaped
+        period = np.array(self.space.extent(self.dimension)) if self.space.periodic else None
+        found = {}
+        for form, (begin, count) in forms.items():
+            if count >= FEWEST_ROWS and form in ("chain", "block", "distance_field"):
+                mine = [shape for shape in self.shapes if shape.form == form]
+                lengths = [int(table[begin])]
+                while len(lengths) < count:
+                    lengths.append(int(table[begin + sum(lengths)]))
+                rows = np.cumsum([0, *lengths[:-1]]).tolist()
+                if rows[-1] < MOST_NUMBERS:
+                    found[form] = tree_of(mine, rows, period)
+        return found
+
+    @property
+    def looked_up(self) -> tuple[str, ...]:
+        """The forms of which folds meet those shapes alone that a tree says may lie within reach."""
+        return tuple(self.trees) if self.reaches else ()
+
+    @property
+    def goes_around(self) -> bool:
+        """True if any effect goes around what is in its way by the nearest edge."""
+        return any(e.obstacle_start is not None and e.obstacle_edges for e in self.effects)
+
+    def places_of(self, form: str) -> tuple[int, int, int]:
+        """Return where in `parameters` a form's first row, how many there are, and its tree if it has one are told."""
+        at = self.dimension + 1
+        for each in self.shaped[1]:
+            if each == form:
+                break
+            at += 2 + (each in self.trees)
+        return at, at + 1, at + 2
 
     @property
     def meets_obstacles(self) -> bool:
@@ -233,12 +276,17 @@ class Parts:
         For each table there are two: where it begins, and where it ends.
         """
         shapes, forms = self.shaped
-        bounds, tables = [], iter(np.cumsum([len(shapes), *map(len, self.tables)]).tolist())
+        ends = np.cumsum([len(shapes), *map(len, self.trees.values())]).tolist()
+        trees = dict(zip(self.trees, ends, strict=False))
+        bounds, tables = [], iter(np.cumsum([ends[-1], *map(len, self.tables)]).tolist())
         begin = next(tables)
         values = [*self.space.extent(self.dimension), self.reach]
-        for where, count in forms.values():
+        for form, (where, count) in forms.items():
             bounds.append((len(values), where))
             values += [0.0, float(count)]
+            if form in trees:
+                bounds.append((len(values), trees[form]))
+                values.append(0.0)
         for sight in self.sights:
             values += [sight.radius**2, view_of(sight.fov)]
             if sight.group is not None:
@@ -267,7 +315,9 @@ class Parts:
 
     def given(self) -> NDArray[Any]:
         """Return `parameters()` and the tables behind them, in the scene's precision: what the kernel is handed."""
-        return np.concatenate([self.parameters(), self.shaped[0], *self.tables]).astype(self.dtype)
+        return np.concatenate([self.parameters(), self.shaped[0], *self.trees.values(), *self.tables]).astype(
+            self.dtype
+        )
 
     def numbers_of(self, effect: Effect) -> dict[str, Any]:
         """Return the numbers and vectors that the laws of an effect are given, by name."""
@@ -466,7 +516,8 @@ class Parts:
             ("bond", d * bool(self.bonded)),
             ("far", d * bool(self.far)),
         ]
-        runs += [("reach", int(bool(self.bounded))), ("here", int(self.parting))]
+        runs += [("found", -(-MOST_FOUND // self.width) * bool(self.looked_up))]
+        runs += [("reach", int(bool(self.bounded or self.looked_up))), ("here", int(self.parting))]
         runs += [("next", (d + 1) * self.looks_ahead)]
         runs += [("square", look.agents + self.keyed), ("place", look.agents)]
         runs += [("gap", look.obstacles), ("which", look.obstacles)]

@@ -1,0 +1,199 @@
+"""The way around what is in an agent's way: `aside_of`, the side of the nearest silhouette edge (Reynolds 1988).
+
+What is passed is an obstacle as the body sees it. Where another obstacle leaves no room beside an edge, a body's radius
+beyond it, the two are one, and the edge of the other is looked for on the same side: so joined walls, and gaps that are
+too narrow, have no edge in between. Written only where an effect has `obstacle_edges`.
+"""
+
+from __future__ import annotations
+
+from flockenv.shapes import FORMS
+from flockenv.sweep.obstacles import each_row, place_of_row
+from flockenv.sweep.parts import Parts
+from flockenv.sweep.text import indented, indented_lines, tuple_of
+
+__all__ = ["around", "around_imports"]
+
+FOLLOWED = 8
+"""Obstacles in a row, edge to edge, that are taken for one; of more there is no edge on that side."""
+
+ALL_AROUND = 6.0
+"""rad: what must be turned by more to be passed is all around."""
+
+JUST = 1 - 1e-3
+"""Share of its clearance that a body keeps when it is tried whether it passes an edge: beside it touches nothing."""
+
+NEARER = 1 - 1e-5
+"""Share of its distance by which an edge must be nearer than another one to be preferred: so rounding picks no side."""
+
+SPINES = {"chain": "spine_chain(params, row, y, ray)", "block": "spine_block(params, row, y, ray)"}
+
+
+def around_imports(parts: Parts) -> list[str]:
+    """Write what `aside_of` is made of."""
+    if not parts.goes_around:
+        return []
+    names = ["disc_edge", "near_way", *(f"edge_{form}" for form in parts.shaped[1])]
+    names += [f"spine_{form}" for form in parts.shaped[1] if form in SPINES and parts.dimension == 3]
+    return [
+        "from flockenv.kernels import routine",
+        f"from flockenv.shapes.silhouette import {', '.join(names)}",
+        "from flockenv.vec import cross, lateral, perpendicular",
+    ]
+
+
+def around(parts: Parts) -> str:
+    """Return the source of `aside_of` and what it calls; empty if no effect goes around anything."""
+    if not parts.goes_around:
+        return ""
+    return _first_hit(parts) + _edge(parts) + _edge_beyond(parts) + _aside_of(parts)
+
+
+_WORLD = "obstacle_x, obstacle_radius, params, size, b, time"
+
+
+def _first_hit(parts: Parts) -> str:
+    """Write what a body touches first along a ray; of what is touched at once, what is listed first."""
+    lines = [
+        "best, form, row = most, -2, -1",
+        "for m in range(obstacle_radius.shape[1]):",
+        "    rho = obstacle_radius[b, m]",
+        "    if rho > 0:",
+        f"        to = offset_to(size, x, {tuple_of('obstacle_x[#, b, m]', parts.dimension)})",
+        "        here = threat(ray, to, room + rho, like(room, np.inf))",
+        "        if here < best:",
+        "            best, form, row = here, -1, m",
+    ]
+    half = "scale(ray, best * like(best, 0.5))"
+    for number, form in enumerate(FORMS):
+        if form not in parts.shaped[1]:
+            continue
+        met = [
+            f"y = offset_to(size, {place_of_row(parts)}, x)",
+            "if near_way(params, at_, y, ray, room, best):",
+            f"    here = hit_{form}(params, at_, y, ray, room)",
+            f"    if here < best or (here == best and form == {number} and at_ < row):",
+            f"        best, form, row = here, {number}, at_",
+        ]
+        # of a tree, what lies within the box around the way as far as it is free
+        lines += each_row(parts, form, "middle", "reach", met, [f"middle, reach = box_of_way(x, {half}, room)"])
+    return f'''
+
+@kernel
+def box_of_way(x, half, room):
+    """Return the box around a body on its way: the middle, and half the edges."""
+    return add(x, half), {_absolute(parts)}
+
+
+@routine
+def first_hit({_WORLD}, x, ray, room, most):
+    """Return how far a body of radius `room` comes along a ray, m, and the form and row of what it touches there.
+
+    At most `most`: form -2 if it touches nothing before. Of a circle of the state: form -1, and its number.
+    """
+{indented(indented_lines(lines, 0), 4)}
+    return best, form, row
+'''
+
+
+def _absolute(parts: Parts) -> str:
+    """Write the half edges of the box around a way and a body: |half| and its radius along each axis."""
+    return "(" + ", ".join(f"abs(half[{k}]) + room" for k in range(parts.dimension)) + ")"
+
+
+def _edge(parts: Parts) -> str:
+    """Write the choice of the law of an edge, by the form of what is in the way."""
+    lines = [
+        "if form == -1:",
+        f"    to = offset_to(size, x, {tuple_of('obstacle_x[#, b, row]', parts.dimension)})",
+        "    return disc_edge(to, ray, side, room + obstacle_radius[b, row])",
+        "at_ = row",
+        *([f"y = offset_to(size, {place_of_row(parts)}, x)"] if parts.shaped[1] else []),
+    ]
+    for number, form in enumerate(FORMS):
+        if form in parts.shaped[1]:
+            lines += [f"if form == {number}:", f"    return edge_{form}(params, row, y, ray, side, room)"]
+    return f'''
+
+@routine
+def edge({_WORLD}, form, row, x, ray, side, room):
+    """Return the edge of an obstacle in the way: by what angle a ray must be turned to pass it, and how far that is."""
+{indented(indented_lines(lines, 0), 4)}
+    return like(room, np.inf), like(room, np.inf)
+'''
+
+
+def _edge_beyond(parts: Parts) -> str:
+    """Write how the edge to one side is found where a body passes."""
+    return f'''
+
+@routine
+def edge_beyond({_WORLD}, form, row, hit, x, ray, side, room, most):
+    """Return how far from the impact the nearest place is where a body passes on a side, m; inf if beyond `most`."""
+    far = like(room, np.inf)
+    spot, way, across, turned_by = scale(ray, hit), ray, side, like(room, 0.0)
+    for _ in range({FOLLOWED}):
+        turn, reach = edge({_WORLD}, form, row, x, way, across, room)
+        turned_by += turn
+        if not (turned_by < like(room, {ALL_AROUND})) or reach == far:
+            return far
+        c, s = np.cos(turn), np.sin(turn)
+        way, across = add(scale(way, c), scale(across, s)), sub(scale(across, c), scale(way, s))
+        beyond = norm(sub(scale(way, reach), spot))
+        if not (beyond < most):
+            return far
+        hit, form, row = first_hit({_WORLD}, x, way, room * like(room, {JUST!r}), reach + room)
+        if form == -2:
+            return beyond
+    return far
+'''
+
+
+def _aside_of(parts: Parts) -> str:
+    """Write how the sides are compared: in the plane both, in space the normal's and those along and across a spine."""
+    lines = [
+        f"hit, form, row = first_hit({_WORLD}, x, ray, room, ahead + room)",
+        "best, found, right = like(room, np.inf), zero(x), perpendicular(ray)",
+        "if form == -2 or hit <= like(room, 0.0):",
+        "    return found",
+        "out, spine = right, right",
+        "if form == -1:",
+        f"    out = touched_normal(offset_to(size, x, {tuple_of('obstacle_x[#, b, row]', parts.dimension)}), ray, hit)",
+        "at_ = row",
+        *([f"y = offset_to(size, {place_of_row(parts)}, x)"] if parts.shaped[1] else []),
+    ]
+    for number, form in enumerate(FORMS):
+        if form in parts.shaped[1]:
+            lines += [
+                f"if form == {number}:",
+                f"    out = nearest_{form}(params, row, touched_spot(y, ray, hit, room))[1]",
+                *([f"    spine = {SPINES[form]}"] if form in SPINES and parts.dimension == 3 else []),
+            ]
+    lines += [
+        "out = lateral(out, ray)",
+        "own = select(dot(out, out) > like(room, 1e-10), unit(out), right)",
+    ]
+    if parts.dimension == 3:
+        lines += [
+            "spine = lateral(spine, ray)",
+            "spine = select(dot(spine, spine) > like(room, 1e-10), unit(spine), right)",
+        ]
+    sides = "own, scale(own, -e)" if parts.dimension == 2 else "own, spine, scale(spine, -e), across, scale(across, -e)"
+    lines += [
+        "e = like(room, 1.0)",
+        *(["across = cross(ray, spine)"] if parts.dimension == 3 else []),
+        f"for side in ({sides}):",
+        f"    far = edge_beyond({_WORLD}, form, row, hit, x, ray, side, room, best * like(room, {NEARER!r}))",
+        "    best, found = (far, side) if far < best else (best, found)",
+    ]
+    return f'''
+
+@routine
+def aside_of({_WORLD}, x, ray, room, ahead):
+    """Return the unit vector across a ray to the side where the edge of what is `ahead` m off is nearest to the impact.
+
+    0 if nothing is in the way, the body overlaps it already, or it has no edge where the body passes.
+    """
+{indented(indented_lines(lines, 0), 4)}
+    return found
+'''

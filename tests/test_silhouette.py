@@ -1,0 +1,153 @@
+"""Steering to avoid aims beyond the silhouette edge nearest to the impact: every shape, both sides, plane and space."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+
+from flockenv.arbitration import Priority
+from flockenv.behaviours import AvoidObstacles, Seek, Whiskers
+from flockenv.constraints import Collisions
+from flockenv.scene import Group, Scene
+from flockenv.shapes import Block, Capsule, Circle, DistanceField, HalfSpace, Polygon, Shape, Wall
+from flockenv.spawn import Spawn
+from flockenv.steer import Steer
+
+BLOCK = Block(centre=(6, -4.75), size=(0.5, 10.5))
+
+# what ends at y = 0.5, and elsewhere 10 m away
+LONG: dict[str, tuple[Shape, ...]] = {
+    "block": (BLOCK,),
+    "wall": (Wall(vertices=((6, -10), (6, -3), (6, 0.5))),),
+    "joined walls": (Wall(vertices=((6, -10), (6, -1))), Wall(vertices=((6, 0.5), (6, -1)))),
+    "polygon": (Polygon(vertices=((5.75, -10), (6.25, -10), (6.25, 0.5), (5.75, 0.5))),),
+    "capsule": (Capsule(start=(6, -10), end=(6, 0.3), radius=0.2),),
+    "circles": tuple(Circle(centre=(6, 0.1 - 0.6 * k), radius=0.4) for k in range(7)),
+    "field": (DistanceField(low=(5, -11), high=(7, 2), spacing=0.1, shapes=(BLOCK,)),),
+    "on a floor": (BLOCK, HalfSpace(point=(0, -2), direction=(0, 1))),
+    "narrow gap": (Wall(vertices=((6, 0.5), (6, -0.6))), Wall(vertices=((6, -0.9), (6, -9)))),
+    "moving": (BLOCK.model_copy(update={"velocity": (0.0, 0.01)}),),
+}
+HIGH = Block(centre=(6, -4.75, 0), size=(0.5, 10.5, 12))
+LONG_3: dict[str, tuple[Shape, ...]] = {
+    "block": (HIGH,),
+    "capsule across": (Capsule(start=(6, -10, 0), end=(6, 0.3, 0), radius=0.9),),
+    "capsule upright": (Capsule(start=(6, -0.3, -9), end=(6, -0.3, 9), radius=0.7),),
+    "sphere": (Circle(centre=(6, -0.5, 0), radius=1.0),),
+    "bricks": tuple(Block(centre=(6, y, z), size=(0.5, 1, 1)) for y in (-3, -2, -1, 0) for z in (-2, -1, 0, 1, 2)),
+    "field": (DistanceField(low=(5, -11, -7), high=(7, 2, 7), spacing=0.25, shapes=(HIGH,)),),
+}
+
+
+def trip(obstacles: tuple[Shape, ...], behaviour: Any = None, y: float = 0.0, d: int = 2) -> tuple[float, float, Any]:
+    """Return length (m) and time (s) of the way to a target 14 m ahead of (0, y), and where it passes x = 6 m."""
+    start, heading, target = ((0.0, y, 0.0)[:d], (1.0, 0.0, 0.0)[:d], (14.0, 0.0, 0.0)[:d])
+    spawn = Spawn(low=start, high=start, speed=(2, 2), heading=heading)
+    steer = Steer(
+        arbitration=Priority(), behaviours=(behaviour or AvoidObstacles(weight=8), Seek(weight=2, target=target))
+    )
+    scene = Scene(
+        dimension=d, groups=(Group(count=1, radius=0.2, max_speed=2, max_force=10, spawn=spawn),), effects=(steer,),
+        obstacles=obstacles, constraints=(Collisions(restitution=0),), dt=0.02,
+    )  # fmt: skip
+    state, places = scene.start(0), [np.array(start)]
+    while len(places) < 600 and np.linalg.norm(places[-1] - target) > 0.4:
+        state = scene.step(state)
+        places.append(state.pos[0, 0].copy())
+    way = np.array(places)
+    length = float(np.linalg.norm(np.diff(way, axis=0), axis=1).sum())
+    return length, (len(way) - 1) * scene.dt, way[np.argmax(way[:, 0] > 6)]
+
+
+def mirrored(shape: Shape) -> Shape:
+    """Return a shape with the sign of y turned."""
+    changed: dict[str, Any] = {}
+    for name in ("centre", "start", "end", "velocity", "point", "direction"):
+        value = getattr(shape, name, None)
+        if value is not None:
+            changed[name] = (value[0], -value[1])
+    if hasattr(shape, "vertices"):
+        changed["vertices"] = tuple((x, -y) for x, y in shape.vertices)
+    if isinstance(shape, DistanceField):
+        changed = {"low": (5, -2), "high": (7, 11), "shapes": tuple(map(mirrored, shape.shapes))}
+    return type(shape)(**{**{n: getattr(shape, n) for n in type(shape).model_fields}, **changed})
+
+
+quick = ("block", "wall", "joined walls")
+
+
+@pytest.mark.parametrize("name", [pytest.param(n, marks=[] if n in quick else pytest.mark.slow) for n in LONG])
+def test_it_goes_over_the_near_edge_on_whichever_side_that_is(name: str) -> None:
+    length, time, there = trip(LONG[name])
+    assert length < 14.2 and time < 7.5  # 25.7 m and 36.8 s by the far edge
+    other, _, opposite = trip(tuple(map(mirrored, LONG[name])))
+    assert there[1] > 0.5 and opposite[1] < -0.5
+    # head on neither side is favoured by the law; the seek and contacts that follow are the same but for rounding
+    assert other == pytest.approx(length, abs=0.15)
+    for y in (-0.2, 0.2):
+        assert trip(LONG[name], y=y)[0] < 14.2
+
+
+@pytest.mark.parametrize("name", [pytest.param(n, marks=[] if n == "block" else pytest.mark.slow) for n in LONG_3])
+def test_in_space_it_goes_over_the_near_edge(name: str) -> None:
+    length, time, _ = trip(LONG_3[name], d=3)
+    assert length < 14.2 and time < 7.5
+
+
+@pytest.mark.slow
+def test_whiskers_go_over_the_near_edge() -> None:
+    assert trip(LONG["block"], Whiskers(weight=8))[0] < 14.5
+
+
+def first_force(obstacles: tuple[Shape, ...], heading: tuple[float, float], at: tuple[float, float] = (0, 0)) -> Any:
+    """Return what an agent of 2 m/s is made to do by them, N."""
+    spawn = Spawn(low=at, high=at, speed=(2, 2), heading=heading)
+    scene = Scene(
+        groups=(Group(count=1, radius=0.2, spawn=spawn),), effects=(AvoidObstacles(weight=8, horizon=3),),
+        obstacles=obstacles, dt=0.02,
+    )  # fmt: skip
+    return scene.acceleration(scene.start(0))[0, 0]
+
+
+@pytest.mark.parametrize("turn", [0.0, 30.0, 133.0])
+def test_turning_the_world_turns_the_side(turn: float) -> None:
+    c, s = math.cos(math.radians(turn)), math.sin(math.radians(turn))
+    block = Block(centre=(4 * c + 3 * s, 4 * s - 3 * c), size=(0.5, 7), turn=turn)  # its near edge is to the left
+    np.testing.assert_allclose(first_force((block,), (c, s)), [-8 * s, 8 * c], atol=1e-9)
+
+
+def test_dead_ahead_of_a_middle_it_keeps_right_and_a_hair_beside_it_to_the_near_side() -> None:
+    for block in (Block(centre=(4, 0), size=(0.5, 6)), Block(centre=(4, 0), size=(3, 0.5))):
+        np.testing.assert_allclose(first_force((block,), (1, 0)), [0, -8], atol=1e-9)
+        np.testing.assert_allclose(first_force((block,), (1, 0), (0, 0.01)), [0, 8], atol=1e-9)
+        np.testing.assert_allclose(first_force((block,), (1, 0), (0, -0.01)), [0, -8], atol=1e-9)
+
+
+def test_a_pocket_is_left_by_its_nearer_end() -> None:
+    """A U that opens to the left; its upper arm is 2 m long, its lower one 9 m."""
+    pocket = Wall(vertices=((2, 1.5), (4, 1.5), (4, -1.5), (-5, -1.5)))
+    np.testing.assert_allclose(first_force((pocket,), (1, 0)), [0, 8], atol=1e-9)
+    upside_down = Wall(vertices=tuple((x, -y) for x, y in pocket.vertices))
+    np.testing.assert_allclose(first_force((upside_down,), (1, 0)), [0, -8], atol=1e-9)
+
+
+def test_without_an_edge_it_goes_along_the_side_of_the_normal() -> None:
+    slope = HalfSpace(point=(4, 0), direction=(-1, 0.1))
+    room = Block(centre=(0, 0), size=(8, 8), turn=-5, hollow=True)
+    for shape in (slope, room):
+        np.testing.assert_allclose(np.abs(first_force((shape,), (1, 0))), [0, 8], atol=1e-9)
+    np.testing.assert_allclose(first_force((slope,), (1, 0)), [0, 8], atol=1e-9)
+
+
+@pytest.mark.slow
+def test_it_comes_through_a_door_and_not_through_one_that_is_too_narrow() -> None:
+    def wall(width: float) -> tuple[Shape, ...]:
+        low = Wall(vertices=((6, -9), (6, 0.3)))
+        return low, Wall(vertices=((6, 0.3 + width), (6, 4)))
+
+    assert 0.3 < trip(wall(0.9))[2][1] < 1.2
+    length, _, there = trip(wall(0.3))
+    assert there[1] > 4 and length < 18
