@@ -142,6 +142,13 @@ def test_without_an_edge_it_goes_along_the_side_of_the_normal() -> None:
     np.testing.assert_allclose(first_force((slope,), (1, 0)), [0, 8], atol=1e-9)
 
 
+def test_too_near_to_turn_to_the_edge_it_goes_along_the_side_of_the_normal() -> None:
+    """Its turns have a radius of m v^2 / F = 0.5 m; to come around to the near edge takes 0.85 m of depth."""
+    wall, slanted, force = Wall(vertices=((2, -20), (2, 1))), (math.sqrt(0.5), -math.sqrt(0.5)), 8 * math.sqrt(0.5)
+    np.testing.assert_allclose(first_force((wall,), slanted, (1.2, 0)), [-force, -force], atol=1e-9)
+    np.testing.assert_allclose(first_force((wall,), slanted, (0, 2)), [force, force], atol=1e-9)
+
+
 @pytest.mark.slow
 def test_it_comes_through_a_door_and_not_through_one_that_is_too_narrow() -> None:
     def wall(width: float) -> tuple[Shape, ...]:

@@ -14,7 +14,7 @@ from pydantic import Field
 from flockenv import steering
 from flockenv.effects.base import Effect, Me, Obstacle
 from flockenv.kernels import Vec, law, like
-from flockenv.vec import add, cross, dot, lateral, norm, perpendicular, scale, select, unit, zero
+from flockenv.vec import add, cross, dot, lateral, norm, perpendicular, scale, select, sub, unit, zero
 
 __all__ = ["AvoidObstacles", "ForceField", "Whiskers"]
 
@@ -82,13 +82,30 @@ def _sides(acc: Vec) -> tuple[Vec, Vec]:
 
 
 @law
+def _turns_in_time(p: Any, me: Me, normal: Vec, aside: Vec, hit: float) -> bool:
+    """Return whether it can turn aside before it comes to the surface, at the radius m v^2 / F of its turns.
+
+    Along the normal's side it always tries; to the other it first turns towards the surface, which takes a depth of
+    R (1 + sin a), where a is the angle between its heading and the normal.
+    """
+    o, e = like(hit, 0.0), like(hit, 1.0)
+    force = p.weight if p.weight < me.max_force else me.max_force
+    ahead = -dot(normal, me.heading)
+    across = e - ahead * ahead
+    depth = me.mass * dot(me.vel, me.vel) * (e + np.sqrt(across if across > o else o))
+    return (dot(aside, normal) > like(hit, -1e-5)) | (hit * ahead * force > depth)
+
+
+@law
 def around(p: Any, me: Me, acc: Vec) -> Vec:
-    """F = w (1 m/s) sideways, to the nearest edge; without one away from the threat's centre."""
+    """F = w (1 m/s) sideways, to the nearest edge; without one, or too near to turn there, along the normal's side."""
     e = like(me.who, 1.0)
     offset, aside = _sides(acc)
     away = steering.avoid(me.heading, offset, acc[1], e)
+    some = dot(aside, aside) > like(e, 0.0)
+    normal = scale(sub(scale(me.heading, acc[0] if some else like(e, 0.0)), offset), e / acc[1])
     # away from a circle's centre is to its nearest edge: where both are one but for rounding it stays what it was
-    other = (dot(aside, aside) > like(e, 0.0)) & (dot(aside, away) < like(e, 1 - 1e-5))
+    other = some & (dot(aside, away) < like(e, 1 - 1e-5)) & _turns_in_time(p, me, normal, aside, acc[0])
     wish = select(other, aside, away)
     return scale(select(acc[0] < like(me.who, np.inf), wish, zero(me.pos)), p.weight)
 
@@ -99,8 +116,9 @@ class AvoidObstacles(Effect):
     Towards the edge of its silhouette that is nearest to the point of impact (Reynolds 1988): of a circle that is away
     from its centre; dead ahead of a middle an agent keeps right. An edge is where the body passes, with a radius to
     spare beyond it: walls that are joined, or leave a gap that is too narrow, are one obstacle. What has no edge (a
-    half-space, a room) is avoided along the side of its normal. In space the edges to the sides of the shadow that the
-    obstacle casts across the heading are compared. An obstacle that moves is avoided where it is, as if it stood still.
+    half-space, a room), or is too near for a turn to that edge at a radius of m v^2 / F, is avoided along the side of
+    its normal. In space the edges to the sides of the shadow that the obstacle casts across the heading are compared.
+    An obstacle that moves is avoided where it is, as if it stood still.
     """
 
     kind: Literal["avoid_obstacles"] = "avoid_obstacles"

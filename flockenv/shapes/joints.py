@@ -62,30 +62,46 @@ def _touching(place: Floats, pieces: Floats, period: Floats | None) -> tuple[boo
     return False, np.asarray(away / length[k] if length[k] > 0 else away)
 
 
-def _end(place: Floats, own: int, pieces: Sequence[Floats | None], skip: int, period: Floats | None) -> list[float]:
-    """Return what an end of chain `own` is, and the way along the piece that shares it; `skip`: its own piece."""
-    code, way = FREE, np.zeros(len(place))
-    for k, others in enumerate(pieces):
-        if others is None:
-            continue
-        rest = np.delete(others, skip, axis=0) if k == own else others
-        inside, along = _touching(place, rest, period) if len(rest) else (False, None)
-        if inside or (along is not None and (k < own or (k == own and skip > 0))):
-            return [NEVER, *np.zeros(len(place))]
-        if along is not None:
-            code, way = SHARED, along
-    return [code, *way]
+class _Outlines:
+    """The pieces of the outlines of all shapes, and the boxes that they lie in, so that few are looked at."""
+
+    def __init__(self, shapes: Sequence[Any], period: Floats | None) -> None:
+        self.period, self.pieces = period, [_lines(shape) for shape in shapes]
+        self.straight = [k for k, pieces in enumerate(self.pieces) if pieces is not None]
+        boxes = [pieces.reshape(-1, 2) for pieces in self.pieces if pieces is not None]
+        low = np.array([box.min(axis=0) for box in boxes]).reshape(-1, 2)
+        high = np.array([box.max(axis=0) for box in boxes]).reshape(-1, 2)
+        self.middle, self.half = (low + high) / 2, (high - low) / 2 + 2 * NEAR
+
+    def near(self, place: Floats) -> list[tuple[int, Floats]]:
+        """Return the shapes that a place may lie on, in order, and their pieces."""
+        within = (np.abs(_nearest(place, self.middle, self.period)) <= self.half).all(axis=1)
+        found = [self.straight[k] for k in np.flatnonzero(within)]
+        return [(k, pieces) for k in found if (pieces := self.pieces[k]) is not None]
+
+    def end(self, place: Floats, own: int, skip: int) -> list[float]:
+        """Return what an end of chain `own` is, and the way along the piece that shares it; `skip`: its own piece."""
+        code, way = FREE, np.zeros(len(place))
+        for k, others in self.near(place):
+            rest = np.delete(others, skip, axis=0) if k == own else others
+            inside, along = _touching(place, rest, self.period) if len(rest) else (False, None)
+            if inside or (along is not None and (k < own or (k == own and skip > 0))):
+                return [NEVER, *np.zeros(len(place))]
+            if along is not None:
+                code, way = SHARED, along
+        return [code, *way]
 
 
-def joints(shapes: Sequence[Any], k: int, period: Floats | None = None) -> list[float]:
-    """Return what the first and the last end of the open chain `shapes[k]` are: a code, and a way (D), each.
+def joints(shapes: Sequence[Any], chains: Sequence[int], period: Floats | None = None) -> dict[int, list[float]]:
+    """Return what the first and the last end of the open `chains` among the shapes are: a code, and a way (D), each.
 
     period: the edges of a torus, m. Of two chains that share an end the one that is listed first has it.
     """
-    dimension = shapes[k].dimension
-    mine = _lines(shapes[k])
-    if mine is None:
-        return [FREE, *np.zeros(dimension)] * 2
-    pieces = [_lines(shape) for shape in shapes]
-    first = _end(mine[0, 0], k, pieces, 0, period)
-    return first + _end(mine[-1, 1], k, pieces, len(mine) - 1, period)
+    outlines, found = _Outlines(shapes, period), {}
+    for k in chains:
+        mine = outlines.pieces[k]
+        if mine is None:
+            found[k] = [FREE, *np.zeros(shapes[k].dimension)] * 2
+        else:
+            found[k] = outlines.end(mine[0, 0], k, 0) + outlines.end(mine[-1, 1], k, len(mine) - 1)
+    return found

@@ -47,14 +47,14 @@ def packed(
     rows: list[Floats] = []
     where: dict[str, tuple[int, int]] = {}
     at = 0
+    chains = [k for k, shape in enumerate(shapes) if shape.form == "chain" and not shape.row(dimension)[2]]
+    ends = joints(shapes, chains, period) if chains else {}
     for number, form in enumerate(FORMS):
         mine = [(first + k, shape) for k, shape in enumerate(shapes) if shape.form == form]
         if mine:
             where[form] = (at, len(mine))
         for who, shape in mine:
-            body = list(shape.row(dimension))
-            if form == "chain" and not body[2]:
-                body += joints(shapes, who - first, period)
+            body = [*shape.row(dimension), *ends.get(who - first, ())]
             row = np.concatenate([[0.0, who], _head(shape, number), body])
             row[0] = len(row)
             rows.append(row)
