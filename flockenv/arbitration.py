@@ -165,6 +165,8 @@ class Arbitration(Record):
 
     kind: str
     law: ClassVar[str]
+    exclusive: ClassVar[bool] = False
+    """True if one behaviour at a time has what it asks for, and the others have nothing."""
     recalls: ClassVar[tuple[str, ...]] = ()
     """Names of the numbers inside agents that its law reads as me.inner.NAME, and that some effect keeps."""
 
@@ -212,6 +214,7 @@ class Priority(Arbitration):
     kind: Literal["priority"] = "priority"
     threshold: float = Field(default=1e-3, ge=0, description="N, a wish that is no longer asks for nothing")
     law: ClassVar[str] = "first_wish"
+    exclusive: ClassVar[bool] = True
 
 
 @law
@@ -242,6 +245,7 @@ class Dithering(Arbitration):
     period: float = Field(default=0.1, gt=0, description="s, how long a draw lasts")
     threshold: float = Field(default=1e-3, ge=0, description="N, a wish that is no longer asks for nothing")
     law: ClassVar[str] = "dithered"
+    exclusive: ClassVar[bool] = True
 
     def parameters(self, wishes: int) -> dict[str, float | Vec]:
         """A probability for each wish."""
@@ -300,6 +304,7 @@ class RoundRobin(Arbitration):
     kind: Literal["round_robin"] = "round_robin"
     period: float = Field(default=0.05, gt=0, description="s, how long a turn lasts")
     law: ClassVar[str] = "in_turn"
+    exclusive: ClassVar[bool] = True
 
 
 @law

@@ -85,6 +85,8 @@ class Explanation:
     def largest_step(self) -> str:
         """The largest stable step in words, beside the step that is made."""
         found, made = self.stable, f"dt = {self.scene.dt:g} s"
+        if found.dt == 0:
+            return f"none is stable with {self.scene.integrator.kind} ({found.effect} at agent {found.agent}), {made}"
         if math.isfinite(found.dt):
             return f"{found.dt:.3g} s ({found.effect}, agent {found.agent}), {made}"
         if found.frequency or found.damping:

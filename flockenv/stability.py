@@ -1,7 +1,9 @@
 """The largest step that is stable, for a method and for a scene: measured on the method, from the effects' stiffness.
 
-Nothing here is a table of methods: each is asked what one step of its own makes of a damped oscillator
-x'' = -w^2 x - 2 zeta w x', and stable is what does not grow.
+Nothing here is a table of methods: one step of each is applied to a damped oscillator x'' = -w^2 x - 2 zeta w x', and
+stable is what does not grow. A method whose region of stability touches the imaginary axis at 0 alone (explicit Euler,
+averaged velocity, midpoint, Heun) has no stable step for an undamped oscillator: its limit is 0, and a warning says how
+slowly it grows, which is for the reader to judge (of the two-stage methods as (h w)^4 / 8 in a step).
 """
 
 from __future__ import annotations
@@ -38,8 +40,11 @@ __all__ = [
 
 Floats = NDArray[np.float64]
 
-GROWTH = 1e-6
-"""Of the amplitude in one step that still counts as stable: it takes a million steps to be seen."""
+ROUNDING = 1e-11
+"""Growth of the amplitude in one step that is rounding: no method here grows so slowly at any h w of NEAR."""
+
+NEAR = (0.05, 0.1, 0.2)
+"""The h w at which a method shows whether it grows near 0: as (h w)^2 or (h w)^4, of which rounding is far below."""
 
 CERTAIN = 2.5
 """Times the limit beyond which a scene is refused: bounds of frequency are less than that above the truth.
@@ -49,9 +54,12 @@ sum k / (D m), of a bound of 2 sum k / m; and sqrt(2 D) <= 2.45.
 """
 
 WEAK = 0.1
-"""The h w and h c below which a limit is no use: under such a method oscillations grow at every step, but slowly."""
+"""The h w and h c below which a limit is no use: with so little damping such a method is stable in tiny steps alone."""
 
-SMALLEST, LARGEST, POINTS = 1e-4, 1e3, 200  # h w that are looked at
+STEADY = "semi_implicit_euler, velocity_verlet or rk4"
+"""What has stable steps for undamped oscillations."""
+
+SMALLEST, LARGEST, POINTS = 1e-7, 1e3, 300  # h w that are looked at
 ROUNDS = 3  # of closing in on where it becomes unstable
 FASTEST = 32
 """Different oscillators of a scene that are looked at."""
@@ -83,7 +91,7 @@ class LookaheadWarning(UserWarning):
 class Suggestion(NamedTuple):
     """The largest stable step of a scene, and what sets it."""
 
-    dt: float  # s; inf if nothing in the scene sets a limit
+    dt: float  # s; inf if nothing in the scene sets a limit, 0 if no step is stable
     effect: str | None  # kind of the effect that is the stiffest
     agent: int | None  # whom it acts on
     frequency: float  # rad/s, of the fastest oscillation (a bound)
@@ -118,9 +126,14 @@ def growth(method: Integrator, y: Floats, zeta: float, told: float = 0.0) -> Flo
 
 @functools.lru_cache(maxsize=1024)
 def limit(method: Integrator, zeta: float, told: float = 0.0) -> float:
-    """Return the largest stable h w, for damping as shares of what is critical (see amplification); inf = any."""
+    """Return the largest stable h w, for damping as shares of what is critical (see amplification).
+
+    inf = any; 0 = none, where nothing damps and the method grows however small h w is.
+    """
     if method.solves or method.adaptive:
         return math.inf
+    if zeta <= 0 and told <= 0 and (growth(method, np.array(NEAR), 0.0) > 1 + ROUNDING).all():
+        return 0.0
     return _first_unstable(lambda y: growth(method, y, zeta, told))
 
 
@@ -142,7 +155,7 @@ def _first_unstable(grown: Callable[[Floats], Floats]) -> float:
     """Return the least number at which an amplitude is more after a step than before it."""
     y = np.geomspace(SMALLEST, LARGEST, POINTS)
     for _ in range(ROUNDS):
-        grows = grown(y) > 1 + GROWTH
+        grows = grown(y) > 1 + ROUNDING
         if not grows.any():
             return math.inf
         first = int(np.argmax(grows))
@@ -173,7 +186,11 @@ def suggest_dt(scene: Scene) -> Suggestion:
     length for one.
     Source: numerics.md 2.2 P02, 3.1, 3.3.
     """
-    found = _found(scene)
+    return _suggested(scene, _found(scene))
+
+
+def _suggested(scene: Scene, found: list[tuple[Effect, _Rates]]) -> Suggestion:
+    """Return the largest step that is stable under some effects of a scene."""
     if not found:
         return Suggestion(math.inf, None, None, 0.0, 0.0)
     whole = _Rates(*(sum(rates[k] for _, rates in found) + np.zeros(scene.agents) for k in range(3)))
@@ -181,13 +198,18 @@ def suggest_dt(scene: Scene) -> Suggestion:
     if not math.isfinite(dt):
         most = (float(np.sqrt(whole.square.max())), float((whole.damping + whole.told).max()))
         return Suggestion(math.inf, None, None, *most)
-    alone = [(_limit_of(scene.integrator, *rates.of(agent)), kind) for kind, rates in found]
+    alone = [(*_urgency(scene.integrator, *rates.of(agent)), effect.kind) for effect, rates in found]
     square, damping, told = whole.of(agent)
-    return Suggestion(dt, min(alone)[1], agent, math.sqrt(square), damping + told)
+    return Suggestion(dt, min(alone)[-1], agent, math.sqrt(square), damping + told)
 
 
-def _found(scene: Scene) -> list[tuple[str, _Rates]]:
-    """Return the kinds of those effects that know how stiff they are, and how stiff that is."""
+def _urgency(method: Integrator, square: float, damping: float, told: float) -> tuple[float, float]:
+    """Return the largest stable step of one oscillator, and minus its rates: of those without one the fastest leads."""
+    return _limit_of(method, square, damping, told), -max(math.sqrt(square), damping + told)
+
+
+def _found(scene: Scene) -> list[tuple[Effect, _Rates]]:
+    """Return those effects that know how stiff they are, and how stiff that is."""
     out = []
     for k, effect in enumerate(scene.effects):
         acting = effect if scene.obstacles else effect.in_the_open()
@@ -199,7 +221,7 @@ def _found(scene: Scene) -> list[tuple[str, _Rates]]:
             square, damping = found
             none = np.zeros(len(damping))
             own = scene.integrator.splits_drag and effect.linear_drag is not None
-            out.append((effect.kind, _Rates(square, none, damping) if own else _Rates(square, damping, none)))
+            out.append((effect, _Rates(square, none, damping) if own else _Rates(square, damping, none)))
     return out
 
 
@@ -210,7 +232,8 @@ def _tightest(method: Integrator, rates: _Rates) -> tuple[float, int]:
     kinds, among = np.unique(table[begins], axis=0, return_index=True)
     first = begins[among]
     fastest = np.argsort(np.maximum(np.sqrt(kinds[:, 0]), kinds[:, 1]), kind="stable")[-FASTEST:]
-    return min((_limit_of(method, *map(float, kinds[k])), int(first[k])) for k in fastest)
+    dt, _, agent = min((*_urgency(method, *map(float, kinds[k])), int(first[k])) for k in fastest)
+    return dt, agent
 
 
 def _limit_of(method: Integrator, square: float, damping: float, told: float) -> float:
@@ -226,24 +249,42 @@ def _limit_of(method: Integrator, square: float, damping: float, told: float) ->
 
 
 def check_dt(scene: Scene) -> None:
-    """Warn where dt is beyond the largest stable step, naming limit and effect; refuse where it must blow up."""
+    """Warn where dt is beyond the largest stable step, naming limit and effect; refuse where it must blow up.
+
+    Behaviours that act now and then, or within bounds, do not make it blow up: see `Effect.always`.
+    """
     found = suggest_dt(scene)
     if scene.dt <= found.dt:
         return
+    always = _suggested(scene, [(effect, rates) for effect, rates in _found(scene) if effect.always])
+    if scene.dt > CERTAIN * always.dt and _blows_up(scene, always):
+        raise ValueError(_too_long(scene, always))
+    warnings.warn(_too_long(scene, found), UnstableStepWarning, stacklevel=2)
+
+
+def _too_long(scene: Scene, found: Suggestion) -> str:
+    """Say which step is stable, and what sets it, in one line."""
     kind, text = scene.integrator.kind, f"{found.frequency:.4g} rad/s, {found.damping:.4g} 1/s at agent {found.agent}"
-    weak = found.dt * max(found.frequency, found.damping) < WEAK
-    if weak or found.dt < 1e-2 * scene.dt:
+    if found.dt == 0:
+        limit_text = (
+            f"no step is stable, for nothing damps it (at this one the amplitude grows e-fold in "
+            f"{_growing(scene, found):.3g} s), so take another integrator ({STEADY}), or add damping"
+        )
+    elif found.dt * max(found.frequency, found.damping) < WEAK or found.dt < 1e-2 * scene.dt:
         limit_text = f"at most {found.dt:.3g} s is stable, so take another integrator"
     else:
         limit_text = f"at most {found.dt:.4g} s is stable"
-    message = f"dt = {scene.dt:g} s: {kind} with {found.effect} ({text}): {limit_text}"
-    if scene.dt > CERTAIN * found.dt and _blows_up(scene, found):
-        raise ValueError(message)
-    warnings.warn(message, UnstableStepWarning, stacklevel=2)
+    return f"dt = {scene.dt:g} s: {kind} with {found.effect} ({text}): {limit_text}"
+
+
+def _growing(scene: Scene, found: Suggestion) -> float:
+    """Return the time in which an undamped oscillation grows e-fold at the scene's dt, s; inf if rounding hides it."""
+    rate = math.log(float(growth(scene.integrator, np.array([scene.dt * found.frequency]), 0.0)[0]))
+    return scene.dt / rate if rate > 0 else math.inf
 
 
 def _blows_up(scene: Scene, found: Suggestion) -> bool:
-    """Would an amplitude grow a hundredfold within a hundred steps, even if all rates are far below their bounds?"""
+    """True if an amplitude grows a hundredfold within a hundred steps, even if all rates are far below their bounds."""
     y = np.array([scene.dt * found.frequency / CERTAIN])
     if found.damping > 1e4 * found.frequency:
         return True  # nothing but drag, of which nothing is a bound
@@ -301,6 +342,8 @@ def _what_comes_of_it(scene: Scene, frequency: float, agent: int) -> str:
     most = _limit_of(method, frequency**2, sum(damping for _, damping, _ in rates), sum(told for _, _, told in rates))
     back = float(growth(method, np.array([y]), 0.0)[0]) ** (math.pi / y)
     text = f"; at this dt {back:.3g} times as fast as they went in" if abs(math.log(back)) > math.log(OFF) else ""
+    if most == 0:
+        return text + "; bodies that stay in it do not come to rest, whatever dt is"
     return text + (f"; bodies that stay in it do not come to rest above {most:.3g} s" if scene.dt > most else "")
 
 

@@ -82,7 +82,10 @@ class Steer(Effect):
         return {"first": float(first), "end": float(end)}
 
     def rates(self, groups: Sequence[Any], dimension: int) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
-        """The sum of those of its behaviours that know theirs, for those whom it steers: as if all had all they ask."""
+        """The sum of those of its behaviours that know theirs, of the agents that it steers: each has all it asks.
+
+        Of an arbitration that grants one behaviour at a time the largest of them.
+        """
         found = [each for behaviour in self.behaviours if (each := behaviour.rates(groups, dimension)) is not None]
         if not found:
             return None
@@ -90,8 +93,14 @@ class Steer(Effect):
         ends = self.members(starts)
         mine = np.arange(starts[-1])
         mine = (mine >= ends["first"]) & (mine < ends["end"])
-        square, damping = (np.where(mine, sum(each[k] for each in found), 0.0) for k in range(2))
+        joined = np.max if self.arbitration.exclusive else np.sum
+        square, damping = (np.where(mine, joined([each[k] for each in found], axis=0), 0.0) for k in range(2))
         return square, damping
+
+    @property
+    def always(self) -> bool:  # type: ignore[override]  # it follows from its behaviours
+        """True if all of its behaviours act all the time."""
+        return all(behaviour.always for behaviour in self.behaviours)
 
     def in_the_open(self) -> Effect | None:
         """Return it with those of its behaviours that act where there are no obstacles."""

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import math
 import warnings
+from collections.abc import Sequence
 from typing import Any, ClassVar
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field
 
-from flockenv.effects.base import Effect, Me, Other, Sight, demand_group
+from flockenv.effects.base import Effect, Me, Other, Sight, all_masses, demand_group
 from flockenv.kernels import Vec, law, like
 from flockenv.stability import LookaheadWarning
 
@@ -17,6 +19,7 @@ __all__ = [
     "AboutNearest",
     "Behaviour",
     "Moving",
+    "gains",
     "nearest_one",
     "seen_one",
     "steered_groups",
@@ -64,17 +67,36 @@ def steered_groups(effect: Effect, scene: Any) -> list[int]:
     return sorted(found)
 
 
+def gains(weight: float, groups: Sequence[Any], dimension: int) -> NDArray[np.float64]:
+    """Return weight / mass of every agent, (N,); 0 where one is held in place, or its max_force is 0."""
+    free = np.repeat([group.max_force != 0 for group in groups], [group.size for group in groups])
+    return np.where(free, weight / all_masses(groups, dimension), 0.0)
+
+
 class Behaviour(Effect):
-    """What an agent wants, F = weight x S: S is the change of velocity that a law of `flockenv.steering` asks for."""
+    """What an agent wants, F = weight x S: S is the change of velocity that a law of `flockenv.steering` asks for.
+
+    S contains -v, so weight / m is a damping: beyond 2 m / weight (of the Eulers) a step turns the velocity over. That
+    is about forces below max_force; a large weight under a small max_force is bang-bang control, whose velocity
+    chatters by max_force dt / m.
+    """
 
     weight: float = Field(ge=0, description="kg/s, force per change of velocity that is asked for")
     steering: ClassVar[bool] = True
+    always: ClassVar[bool] = False
+    copies: ClassVar[bool] = False
+    """True if it takes on the velocity of an agent that may take on its own: together twice as fast."""
     unlimited: ClassVar[tuple[str, ...]] = ()
     """Names of the fields of which none means without limit."""
 
     def parameters(self) -> dict[str, float | Vec]:
         """Return its numbers; what has no limit is infinite."""
         return {**dict.fromkeys(self.unlimited, math.inf), **super().parameters()}
+
+    def rates(self, groups: Sequence[Any], dimension: int) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
+        """No oscillation, and damping of weight / m."""
+        damping = gains(self.weight * (2.0 if self.copies else 1.0), groups, dimension)
+        return np.zeros(len(damping)), damping
 
     def check(self, scene: Any) -> None:
         """Refuse a group that is not there, by the name under which it was given."""
@@ -88,6 +110,8 @@ class Moving(Behaviour):
 
     speed: float | None = Field(default=None, gt=0, description="m/s, how fast at most; none = its max_speed")
     unlimited: ClassVar[tuple[str, ...]] = ("speed",)
+    steepness: ClassVar[float] = 1.0
+    """By how much steeper than V / slow_radius the speed that it asks for changes across its way."""
 
     @property
     def limit(self) -> float:
@@ -98,6 +122,15 @@ class Moving(Behaviour):
     def ramp(self) -> float | None:
         """Over how many metres it slows down to stop; none if it does not."""
         return getattr(self, "slow_radius", None)
+
+    def rates(self, groups: Sequence[Any], dimension: int) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
+        """Damping of weight / m; where it slows down, at V over slow_radius, w^2 = weight V / (m slow_radius)."""
+        found = super().rates(groups, dimension)
+        if found is None or not self.ramp:
+            return found
+        top = np.minimum(self.limit, np.concatenate([group.max_speeds for group in groups]))
+        slope = self.steepness * np.where(np.isfinite(top), top, 0.0) / self.ramp
+        return found[0] + gains(self.weight, groups, dimension) * slope, found[1]
 
     def check(self, scene: Any) -> None:
         """Refuse those who may be infinitely fast; warn of a ramp that is too short to stop on."""

@@ -174,6 +174,7 @@ class Shadow(Predicting):
     distance: float = Field(ge=0, description="m, within which it only matches speed and heading")
     band: float = Field(default=1.0, gt=0, description="m, from there on it pursues more and more")
     finish_law: ClassVar[str | None] = "shadowed"
+    copies: ClassVar[bool] = True
     demo: ClassVar[str | None] = """
 groups:
   - {count: 4, max_speed: 2, max_force: 10, role: pursuer, spawn: {low: [-8, -4], high: [-6, 4]}}
@@ -194,6 +195,7 @@ class MatchVelocity(AboutNearest):
 
     kind: Literal["match_velocity"] = "match_velocity"
     finish_law: ClassVar[str | None] = "matched"
+    copies: ClassVar[bool] = True
     demo: ClassVar[str | None] = """
 groups:
   - {count: 5, max_speed: 2, max_force: 4, spawn: {low: [-6, -4], high: [-5, 4], speed: [0, 1]}}

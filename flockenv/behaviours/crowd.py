@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, ClassVar, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field
 
 from flockenv import steering
-from flockenv.behaviours.base import Behaviour, Moving, top_speed
+from flockenv.behaviours.base import Behaviour, Moving, gains, top_speed
 from flockenv.behaviours.wander import wandered
 from flockenv.effects.base import Me, Other, Sight, Vector
 from flockenv.kernels import Vec, law, like
@@ -91,6 +93,9 @@ effects:
         """As far as it comes within the horizon, and as it sees."""
         return min(speed * self.horizon, self.radius)
 
+    def rates(self, groups: Sequence[Any], dimension: int) -> None:
+        """None: it pushes aside with one and the same force."""
+
     def sums(self, dimension: int) -> int:
         """A time and a direction."""
         return 1 + dimension
@@ -165,6 +170,11 @@ effects:
         """Where to, how fast, how close: who is seen is the sweep's business."""
         names = ("weight", "headway", "margin")
         return {"target": self.target, "speed": self.limit, **{name: float(getattr(self, name)) for name in names}}
+
+    def rates(self, groups: Sequence[Any], dimension: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Damping of weight / m; while a gap closes, w^2 = weight / (m headway)."""
+        gain = gains(self.weight, groups, dimension)
+        return gain / self.headway, gain
 
     def sums(self, dimension: int) -> int:
         """The way and the gap."""

@@ -32,6 +32,7 @@ class Driving(Behaviour):
     kind: Literal["driving"] = "driving"
     weight: float = Field(default=1.0, ge=0, description="a factor, 1 as published")
     tau: float = Field(default=0.5, gt=0, description="s, relaxation time")
+    always: ClassVar[bool] = True
     own_law: ClassVar[str | None] = "driving"
     demo: ClassVar[str | None] = """
 dt: 0.05
@@ -137,6 +138,11 @@ effects:
         """How fast it adapts, how close it comes."""
         tau = self.tau / self.weight if self.weight else np.inf
         return {"tau": tau, "headway": self.headway, "margin": self.margin}
+
+    def rates(self, groups: Any, dimension: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Damping of 1 / tau; while a gap closes, w^2 = 1 / (tau headway)."""
+        damping = np.full(len(all_masses(groups, dimension)), self.weight / self.tau)
+        return damping / self.headway, damping
 
     def sums(self, dimension: int) -> int:
         """The gap."""

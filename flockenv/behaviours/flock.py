@@ -7,11 +7,15 @@ and sees all around.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, ClassVar, Literal
 
+import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field
 
 from flockenv import steering
+from flockenv.behaviours.base import gains
 from flockenv.effects.base import Effect, Me, Other, Sight
 from flockenv.kernels import Vec, law, like
 from flockenv.steering import others
@@ -81,6 +85,7 @@ class _FlockRule(Effect):
     """What the three rules have in common."""
 
     steering: ClassVar[bool] = True
+    always: ClassVar[bool] = False
 
     weight: float
     radius: float = Field(gt=0, description="m, neighbours are nearer than this")
@@ -144,6 +149,11 @@ dt: 0.02
     finish_law: ClassVar[str | None] = "alignment"
     averages: ClassVar[bool] = True
 
+    def rates(self, groups: Sequence[Any], dimension: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """No oscillation; two that see each other alone take on each other's velocity at 2 w / m."""
+        damping = gains(2 * self.weight, groups, dimension)
+        return np.zeros(len(damping)), damping
+
     def sums(self, dimension: int) -> int:
         """A vector."""
         return dimension
@@ -164,6 +174,11 @@ dt: 0.02
     pair_law: ClassVar[str | None] = "cohesion_pair"
     finish_law: ClassVar[str | None] = "cohesion"
     averages: ClassVar[bool] = True
+
+    def rates(self, groups: Sequence[Any], dimension: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """w^2 = 2 w / m of two that see each other alone; nothing damps it."""
+        square = gains(2 * self.weight, groups, dimension)
+        return square, np.zeros(len(square))
 
     def sums(self, dimension: int) -> int:
         """A vector."""

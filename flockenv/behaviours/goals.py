@@ -128,6 +128,7 @@ class Dock(_ToTarget):
     width: float = Field(gt=0, description="m, within which of the axis it flies on along it")
     slow_radius: float = Field(gt=0, description="m, within which it slows down")
     own_law: ClassVar[str | None] = "docked"
+    steepness: ClassVar[float] = 4.0  # it aims at the axis half-way to the place, and where it turns in 3.2 were found
     demo: ClassVar[str | None] = """
 groups:
   - {count: 5, max_speed: 2, max_force: 6, spawn: {low: [-6, -5], high: [-2, 5], speed: [0, 1]}}

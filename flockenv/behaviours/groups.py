@@ -7,11 +7,12 @@ from collections.abc import Sequence
 from typing import Any, ClassVar, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field
 
 from flockenv import steering
 from flockenv.behaviours.social import Social, size_of
-from flockenv.effects.base import Effect, Me, Other, Sight, Vector
+from flockenv.effects.base import Effect, Me, Other, Sight, Vector, all_masses
 from flockenv.elementary import exp
 from flockenv.kernels import Vec, law, like
 from flockenv.steering.others import ONE_PLACE
@@ -184,6 +185,7 @@ class WalkingGroup(Effect):
     fov: float = Field(default=180.0, gt=0, le=360, description="degrees, full angle that is seen without turning")
     radius: float = Field(default=20.0, gt=0, description="m, whoever is further away is lost")
     steering: ClassVar[bool] = True
+    always: ClassVar[bool] = False
     strengths: ClassVar[tuple[str, ...]] = ("gaze", "cohesion", "repulsion")
     pair_law: ClassVar[str | None] = "of_the_party"
     finish_law: ClassVar[str | None] = "as_a_party"
@@ -211,6 +213,12 @@ effects:
         """The first agent of the group, and the first after it."""
         first, end = (0, starts[-1]) if self.group is None else starts[self.group : self.group + 2]
         return {"first": float(first), "end": float(end)}
+
+    def rates(self, groups: Sequence[Any], dimension: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """No oscillation, and damping of beta1 times the largest turn of a head, pi less half of the field of view."""
+        most = self.gaze * (math.pi - math.radians(self.fov) / 2)
+        damping = np.where(np.isfinite(all_masses(groups, dimension)), most, 0.0)
+        return np.zeros(len(damping)), damping
 
     def sums(self, dimension: int) -> int:
         """How many others, where, and away from those who are too near."""

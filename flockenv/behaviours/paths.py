@@ -6,6 +6,7 @@ A path is a tube: straight pieces, its spine, and a radius. Who will still be in
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
@@ -13,7 +14,7 @@ from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from flockenv import grid, polyline, steering
-from flockenv.behaviours.base import Behaviour, Moving, top_speed
+from flockenv.behaviours.base import Behaviour, Moving, gains, top_speed
 from flockenv.effects.base import Me, Vector
 from flockenv.kernels import Vec, law, like
 from flockenv.vec import add, norm, scale, select, sub, zero
@@ -233,6 +234,13 @@ effects:
     def parameters(self) -> dict[str, float | Vec]:
         """All but the grid, which is in the table."""
         return {"weight": self.weight, "centre": tuple(map(float, self.centre)), "time": self.time}
+
+    def rates(self, groups: Sequence[Any], dimension: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Of a field whose slopes add up to at most s: w^2 = weight s / m, damping of weight (1 + s time) / m."""
+        field = np.reshape(self.velocities, (*self.counts, -1))
+        slope = sum(np.linalg.norm(np.diff(field, axis=k), axis=-1).max() for k in range(len(self.counts)))
+        gain, slope = gains(self.weight, groups, dimension), slope / self.spacing
+        return gain * slope, gain * (1 + slope * self.time)
 
     def table(self, scene: Any) -> NDArray[np.float64]:
         """The grid."""

@@ -259,6 +259,9 @@ class Effect(Record):
     """Names of the parameters that are points: on a torus all but bonds and obstacles see the nearest images."""
     heads_for: ClassVar[bool] = True
     """Are its places what a behaviour heads for? Pictures show them."""
+    always: ClassVar[bool] = True
+    """True if its `rates` are those of a force that acts all the time and has no bounds: far beyond its limit a step
+    must blow up, and is refused. Where it is False a step beyond the limit is warned of."""
     contact: ClassVar[bool] = False
     """Are its `rates` those of a contact, which is over after half of an oscillation?"""
     strengths: ClassVar[tuple[str, ...]] = ("weight",)

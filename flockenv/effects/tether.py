@@ -79,6 +79,11 @@ class Swing(_Centred):
     own_law: ClassVar[str | None] = "swing"
     strengths: ClassVar[tuple[str, ...]] = ("strength",)
 
+    def rates(self, groups: Sequence[Any], dimension: int) -> tuple[Floats, Floats]:
+        """w^2 = s / (m l), where it hangs; nothing damps it."""
+        square = self.strength / self.length / all_masses(groups, dimension)
+        return square, np.zeros(len(square))
+
     def potential(self, groups: Sequence[Any], state: State, offset: Any) -> Floats:
         """Sum of s l (1 - cos((x - c) / l)) over all agents and axes, (B,) J."""
         angles = offset(self.centre, state.pos) / self.length
