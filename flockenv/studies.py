@@ -14,8 +14,11 @@ from flockenv.refusals import shown
 from flockenv.terminal import INTERRUPTED, EarlyEnd, Force, Seed, new_console, progress_bar, relative, show_table
 
 if TYPE_CHECKING:
+    from rich.console import Console
+
     from flockenv.accuracy import Problem, Report
     from flockenv.findings import Results
+    from flockenv.integrators import Integrator
     from flockenv.records import Record
 
     Run = Callable[[Results | None, Callable[[int], None], Callable[[Results], None]], Results]
@@ -24,13 +27,13 @@ __all__ = ["accuracy", "experiment", "gallery", "stored", "stress", "try_all", "
 
 
 def accuracy(
-    scene: Annotated[str | None, typer.Argument(metavar="SCENE.yaml", help="A scene; none with --suite.")] = None,
+    scenes: Annotated[list[str] | None, typer.Argument(metavar="SCENE.yaml", help="Scenes; none with --suite.")] = None,
     suite: Annotated[bool, typer.Option("--suite", help="Measure the built-in problems instead.")] = False,
     problems: Annotated[
         str, typer.Option(metavar="A,B", help="Of the suite these alone.", show_default="all of them")
     ] = "",
     seconds: Annotated[
-        float | None, typer.Option(metavar="S", help="Simulated time of a scene in seconds.", show_default="1")
+        float | None, typer.Option(metavar="S", help="Simulated time of a scene in seconds.", show_default="about 1")
     ] = None,
     methods: Annotated[str, typer.Option(metavar="A,B", help="Integrators.", show_default="all explicit ones")] = "",
     steps: Annotated[
@@ -44,6 +47,12 @@ def accuracy(
         str, typer.Option(metavar="M,M", help="Errors in metres to find the cheapest way to.")
     ] = "1e-2,1e-4,1e-6",
     repetitions: Annotated[int, typer.Option(min=0, max=1000, help="Runs whose median is the wall time.")] = 20,
+    finer: Annotated[
+        int | None,
+        typer.Option(
+            metavar="N", min=4, help="Steps of a reference of own steps for each of the finest [default: up to 64]."
+        ),
+    ] = None,
     seed: Seed = 0,
     out: Annotated[
         str | None, typer.Option(metavar="X.json|X.png", help="Write the numbers; a picture has X.json beside it.")
@@ -51,11 +60,11 @@ def accuracy(
     force: Force = False,
 ) -> None:
     """Show what accuracy costs: how far each integrator ends from the truth in which steps, beside its time."""
-    from flockenv.accuracy import Results, measure, problems_named, table, usual_methods
+    from flockenv.accuracy import Results, problems_named, usual_methods
     from flockenv.integrators import methods_named
     from flockenv.outputs import checked_file
 
-    if suite == (scene is not None):
+    if suite == bool(scenes):
         raise ValueError("accuracy: needs a SCENE.yaml or --suite, one of them")
     aimed = _numbers("--tolerance", tolerance)
     if suite and (seconds is not None or steps or dts):
@@ -66,25 +75,75 @@ def accuracy(
     if path is not None and path.suffix.lower() == ".png":
         checked_file(str(path.with_suffix(".json")), [".json"], force)
     chosen = methods_named(_words(methods)) if methods else usual_methods()
-    todo = problems_named(_words(problems)) if suite else [_problem(str(scene), seconds, steps, dts, seed)]
-    console, reports = new_console(), []
+    if suite:
+        todo: list[Callable[[], Problem]] = [
+            functools.partial(_same, each) for each in problems_named(_words(problems))
+        ]
+    else:
+        todo = [functools.partial(_problem, file, seconds, steps, dts, seed) for file in scenes or ()]
+    console = new_console()
+    reports, refused = _measured(todo, [] if suite else list(scenes or ()), chosen, repetitions, finer, aimed, console)
+    if path is not None and reports:
+        _write(path, Results(reports=tuple(reports)), functools.partial(_draw_precision, reports))
+        console.print(f"{len(reports)} problems in {relative(path)}")
+    if len(reports) + refused < len(todo) or (reports and reports[-1].stopped):
+        raise EarlyEnd("interrupted; what was done is shown", INTERRUPTED)
+    if not reports:
+        raise ValueError("accuracy: none of these scenes has a reference; each line says why")
+
+
+def _measured(
+    todo: Sequence[Callable[[], Problem]], files: Sequence[str], methods: Sequence[Integrator], repetitions: int,
+    finer: int | None, tolerances: Sequence[float], console: Console,
+) -> tuple[list[Report], int]:  # fmt: skip
+    """Measure problem after problem and show each; return the reports, and how many scenes have none.
+
+    Of several scenes those without a reference are a line each; the only one raises its ValueError.
+    """
+    from flockenv.accuracy import measure
+
+    reports: list[Report] = []
+    refused = 0
     try:
-        for problem in todo:
-            with progress_bar(f"measuring {problem.name}", 100, "%") as progress:
-                reports.append(measure(problem, chosen, repetitions, progress=progress))
-            show_table(console, reports[-1].title, ([line] for line in table.headlines(reports[-1])), [""])
-            show_table(console, "", table.rows(reports[-1], aimed), table.columns(aimed))
-            show_table(console, "The cheapest", ([line] for line in table.best(reports[-1], aimed)), [""])
+        for k, problem in enumerate(todo):
+            try:
+                made = problem()
+                with progress_bar(f"measuring {made.name}", 100, "%") as progress:
+                    reports.append(measure(made, methods, repetitions, finer=finer, progress=progress))
+            except ValueError as error:
+                if len(files) < 2:
+                    raise
+                refused += 1
+                first, *more = str(error).splitlines()
+                where = "" if first.startswith(files[k]) else f"{files[k]}: "
+                console.print(f"{where}{first}{f' (and {len(more)} more)' if more else ''}\n", soft_wrap=True)
+                continue
+            _show_accuracy(console, reports[-1], tolerances)
             if reports[-1].stopped:
                 break
     except KeyboardInterrupt:
         if not reports:
             raise
-    if path is not None and reports:
-        _write(path, Results(reports=tuple(reports)), functools.partial(_draw_precision, reports))
-        console.print(f"{len(reports)} problems in {relative(path)}")
-    if len(reports) < len(todo) or reports[-1].stopped:
-        raise EarlyEnd("interrupted; what was done is shown", INTERRUPTED)
+    return reports, refused
+
+
+def _show_accuracy(console: Console, report: Report, tolerances: Sequence[float]) -> None:
+    """Print one report: what it is measured against, errors, what each tolerance costs, the cheapest."""
+    from flockenv.accuracy import table
+
+    show_table(console, report.title, ([line] for line in table.headlines(report)), [""])
+    heads, rows = table.errors(report)
+    if rows:
+        title = (
+            f"Error at the end, m, \u00b1 {report.reference_error:.0e} of the reference (? = not clearly above that)"
+        )
+        show_table(console, title, rows, heads)
+    show_table(console, "Cost", table.rows(report, tolerances), table.columns(tolerances))
+    show_table(console, "The cheapest", ([line] for line in table.best(report, tolerances)), [""])
+
+
+def _same(problem: Problem) -> Problem:
+    return problem
 
 
 def _problem(file: str, seconds: float | None, steps: str, dts: str, seed: int) -> Problem:
@@ -93,7 +152,8 @@ def _problem(file: str, seconds: float | None, steps: str, dts: str, seed: int) 
     from flockenv.config import load_scene
     from flockenv.trajectory import whole_steps
 
-    loaded, horizon = load_scene(Path(file)), 1.0 if seconds is None else seconds
+    loaded = load_scene(Path(file))
+    horizon = max(1, round(1.0 / loaded.dt)) * loaded.dt if seconds is None else seconds
     if steps and dts:
         raise ValueError("--steps and --dts: say the same in two ways; give one of them")
     if steps:

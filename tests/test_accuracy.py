@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from flockenv.accuracy import SUITE, Problem, Report, Results, measure, problems_named, usual_methods
+from flockenv.accuracy import SUITE, Problem, Report, Results, chaos, measure, problems_named, usual_methods
 from flockenv.accuracy import problem as problems
 from flockenv.accuracy import reference as references
 from flockenv.accuracy.results import Curve, Point, measured_order
@@ -143,11 +143,11 @@ def test_references_agree_with_each_other() -> None:
     known = one("damped")
     exact = references.find_reference(known)
     scipy = references.find_reference(replace(known, exact=None))
-    own = references._by_own_steps(known, 64, "asked for")
+    own = references.own_steps(known, 64)
     assert [r.kind for r in (exact, scipy, own)] == ["closed form", "DOP853", "own steps"]
     for other in (scipy, own):
-        assert np.abs(exact.pos - other.pos).max() < 1e-11
-        assert np.abs(exact.vel - other.vel).max() < 1e-11
+        assert np.abs(exact.path.pos - other.path.pos).max() < 1e-11
+        assert np.abs(exact.path.vel - other.path.vel).max() < 1e-11
         assert other.error < 1e-10
 
 
@@ -157,7 +157,7 @@ def test_scipy_sees_the_time_and_the_flow() -> None:
         known = one(name)
         scipy = references.find_reference(replace(known, exact=None))
         assert scipy.kind == "DOP853"
-        assert np.abs(references.find_reference(known).pos - scipy.pos).max() < 1e-10
+        assert np.abs(references.find_reference(known).path.pos - scipy.path.pos).max() < 1e-10
 
 
 def test_a_limit_that_does_not_act_leaves_the_better_reference() -> None:
@@ -168,12 +168,12 @@ def test_a_limit_that_does_not_act_leaves_the_better_reference() -> None:
 @pytest.mark.slow
 def test_growth_is_that_of_the_law() -> None:
     """Near the top a pendulum falls as exp(2 pi t), and so does a difference."""
-    found = references.find_sensitivity(swinging(math.pi, 1.5))
+    found = chaos.find_sensitivity(swinging(math.pi, 1.5))
     half = math.exp(2 * math.pi * 1.5) / math.sqrt(8)  # of cosh, and of a change along one of two axes
     assert found.growth == pytest.approx(
         half, rel=1.01 / (2 * math.pi)
     )  # sinh / 2 pi of the velocity's, of either sign
-    assert references.find_sensitivity(one("damped")).growth < 2
+    assert chaos.find_sensitivity(one("damped")).growth < 2
 
 
 @pytest.mark.slow

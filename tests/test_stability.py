@@ -379,9 +379,9 @@ def test_a_warning_names_step_method_effect_agent_and_limit() -> None:
 @pytest.mark.parametrize("method", [ExplicitEuler(), AveragedVelocity(), Midpoint(), Heun()], ids=lambda m: m.kind)
 def test_who_grows_at_every_step_is_told_to_take_another(method: Integrator) -> None:
     tether = Tether(centre=O2, stiffness=1.0)
-    with pytest.warns(UnstableStepWarning, match="no step is stable.*so take another integrator"):
+    with pytest.warns(UnstableStepWarning, match=r"no step is stable.*so take another integrator"):
         body(tether, method=method, dt=0.1)
-    with pytest.raises(ValueError, match="no step is stable.*so take another integrator"):
+    with pytest.raises(ValueError, match=r"no step is stable.*so take another integrator"):
         body(tether, method=method, dt=3.0)
     with pytest.warns(UnstableStepWarning) as caught:  # enough damping, and there is an honest limit
         body(Tether(centre=O2, stiffness=1.0, damping=1.0), method=method, dt=1.01 * limit(method, 0.5))

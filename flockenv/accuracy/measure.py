@@ -15,8 +15,10 @@ from time import perf_counter
 
 import numpy as np
 
-from flockenv.accuracy.problem import Floats, Problem, largest
-from flockenv.accuracy.reference import FINER, Reference, find_reference, find_sensitivity
+from flockenv.accuracy.chaos import find_sensitivity
+from flockenv.accuracy.paths import Path, farthest, largest, unmatched
+from flockenv.accuracy.problem import Problem
+from flockenv.accuracy.reference import COARSE, LEAST_FINER, Reference, find_reference
 from flockenv.accuracy.results import Curve, Machine, Point, Report, measured_order
 from flockenv.integrators import INTEGRATORS, Integrator
 from flockenv.scene import Scene
@@ -34,8 +36,8 @@ DEAREST = 4
 TRUSTED = 4.0
 """Errors of fewer times the reference's own are not trusted."""
 
-COARSE = 0.1
-"""Errors of more than this share of how far agents go are no approximation."""
+TOLERANCE_WITHIN = 1e-8
+"""What an adaptive method is asked for where something acts after each step: its steps are then given, like others'."""
 
 
 @dataclass(eq=False)
@@ -50,27 +52,31 @@ class _Trial:
     point: Point | None = None
 
     def compare(self, reference: Reference) -> None:
-        """Run from instant to instant, and find out how far from the reference."""
+        """Run from instant to instant, and measure how far from the reference."""
         try:
             path = self.problem.path(self.method, self.steps)
         except ArithmeticError:  # it diverges, or equations were not solved
             self.point = self._point(self.steps * self.method.evaluations, {})
             return
-        off = self.problem.apart(path.pos, reference.pos)
+        off = self.problem.apart(path, reference.path)
+        last = off[-1][~np.isnan(off[-1])]
         errors = {
-            "error": largest(off[-1]),
-            "rms": float(np.sqrt((off[-1] ** 2).mean())),
-            "along": largest(off),
-            "energy": _energy_off(self.problem, path.pos, path.vel, reference),
-            "momentum": _momentum_off(self.problem, path.vel, reference),
+            "error": largest(last),
+            "rms": float(np.sqrt((last**2).mean())) if len(last) else float("nan"),
+            "along": farthest(off),
+            "energy": _energy_off(self.problem, path, reference.path),
+            "momentum": _momentum_off(self.problem, path, reference.path),
         }
-        self.point = self._point(path.evaluations, {k: v for k, v in errors.items() if np.isfinite(v)})
+        self.point = self._point(
+            path.counted("evaluations"), {k: v for k, v in errors.items() if np.isfinite(v)},
+            unmatched(path, reference.path), path.counted("unsolved"),
+        )  # fmt: skip
 
-    def _point(self, evaluations: int, errors: dict[str, float]) -> Point:
+    def _point(self, evaluations: int, errors: dict[str, float], unmatched: int = 0, unsolved: int = 0) -> Point:
         names = ("error", "rms", "along", "energy", "momentum")
         return Point(
-            steps=self.steps, dt=self.problem.seconds / self.steps, tolerance=self.tolerance,
-            evaluations=evaluations, seconds=None, **{name: errors.get(name) for name in names},
+            steps=self.steps, dt=self.problem.seconds / self.steps, tolerance=self.tolerance, evaluations=evaluations,
+            seconds=None, unmatched=unmatched, unsolved=unsolved, **{name: errors.get(name) for name in names},
         )  # fmt: skip
 
     def clock(self) -> None:
@@ -102,20 +108,21 @@ def measure(
     problem: Problem,
     methods: Sequence[Integrator] | None = None,
     repetitions: int = REPETITIONS,
-    finer: int = FINER,
+    finer: int | None = None,
     progress: Callable[[int], None] = lambda percent: None,
 ) -> Report:
     """Return how far off each method ends in each number of steps, and what it costs.
 
     methods: instances, none = all that `usual_methods` names. repetitions: how often the wall time of each point is
     taken, all of them in turn; compiling is over by then; 0 = not at all. finer: how much finer than the finest steps
-    those of a reference of our own are. progress is called with percents. A KeyboardInterrupt ends it early: what was
-    done is returned, and `stopped` says so.
-    Raises ValueError, in one line, for a horizon so long that nobody could tell (see find_sensitivity).
+    a reference of own steps is (see reference.own_steps). progress is called with percents. A KeyboardInterrupt ends
+    it early: what was done is returned, and `stopped` says so.
+    Raises ValueError, in one line, where there is no reference: a scene that is chaotic over its horizon (see
+    chaos.find_sensitivity), or that does not settle on one path (see reference.own_steps).
     """
     chosen = usual_methods() if methods is None else tuple(methods)
-    if repetitions < 0 or finer < 2:
-        raise ValueError(f"repetitions = {repetitions} must be at least 0, finer = {finer} at least 2")
+    if repetitions < 0 or (finer is not None and (finer < LEAST_FINER or finer % LEAST_FINER)):
+        raise ValueError(f"repetitions = {repetitions} must be >= 0, finer = {finer} a multiple of {LEAST_FINER}")
     sensitivity, reference = find_sensitivity(problem), find_reference(problem, finer)
     trials = [_Trial(problem, *setting) for method in chosen for setting in _settings(problem, method)]
     stopped, all_ = "", max(1, len(trials) * (1 + repetitions))
@@ -127,20 +134,21 @@ def measure(
         _clock([trial for trial in trials if trial.good], repetitions, progress)
     except KeyboardInterrupt:
         stopped = "interrupted"
-    reach = largest(problem.apart(reference.pos, problem.start.pos[0].astype(np.float64)))
     floor = max(TRUSTED * reference.error, sensitivity.error)
     return Report(
         name=problem.name, title=problem.title or problem.name, agents=problem.scene.agents, seconds=problem.seconds,
         dtype=problem.scene.dtype, reference=reference.kind, reference_error=reference.error, note=reference.note,
-        growth=sensitivity.growth, floor=floor, reach=reach,
+        growth=sensitivity.growth, rate=sensitivity.rate, floor=floor, reach=reference.reach,
         energy=problem.energies, repetitions=repetitions,
-        machine=machine(), curves=tuple(_curves(trials, floor, COARSE * reach)), stopped=stopped,
+        machine=machine(), curves=tuple(_curves(trials, floor, COARSE * reference.reach)), stopped=stopped,
     )  # fmt: skip
 
 
 def _settings(problem: Problem, method: Integrator) -> list[tuple[Integrator, int, float | None]]:
     """Return the settings of a method: numbers of steps, or tolerances of one that chooses its steps itself."""
-    if not method.adaptive:
+    if method.adaptive and problem.after_steps:
+        method = method.model_copy(update={"tolerance": TOLERANCE_WITHIN})
+    if not method.adaptive or problem.after_steps:
         return [(method, steps, None) for steps in problem.steps]
     few = len(problem.times)
     return [(method.model_copy(update={"tolerance": t}), few, t) for t in TOLERANCES]
@@ -178,26 +186,29 @@ def _curves(trials: Sequence[_Trial], least: float, most: float) -> list[Curve]:
         if not mine:
             continue
         points = tuple(trial.timed for trial in mine)
-        order, used = (None, 0) if mine[0].method.adaptive else measured_order(points, least, most)
+        chosen = mine[0].tolerance is not None
+        order, used = (None, 0) if chosen else measured_order(points, least, most)
         declared = min(mine[0].method.order, mine[0].method.order_with_drag)
         curves.append(Curve(method=kind, declared=declared, points=points, order=order, used=used))
     return curves
 
 
-def _energy_off(problem: Problem, pos: Floats, vel: Floats, reference: Reference) -> float:
+def _energy_off(problem: Problem, path: Path, reference: Path) -> float:
     """Return by how much the energy is off at worst, in parts of the largest kinetic energy of the reference."""
-    off = largest(np.abs(problem.energy(pos, vel) - problem.energy(reference.pos, reference.vel)))
+    if path.who is not None:
+        return float("nan")
+    off = largest(np.abs(problem.energy(path.pos, path.vel) - problem.energy(reference.pos, reference.vel)))
     scale = largest(problem.kinetic(reference.vel))
     return off / scale if scale > 0 else float("nan")
 
 
-def _momentum_off(problem: Problem, vel: Floats, reference: Reference) -> float:
+def _momentum_off(problem: Problem, path: Path, reference: Path) -> float:
     """Return by how much a momentum that is kept has changed at worst, in parts of the sum of its sizes."""
     if not problem.conserves_momentum:
         return float("nan")
     before = problem.momentum(problem.start.vel[0].astype(np.float64))
     carried = largest(problem.impulse(reference.vel))
-    off = largest(np.linalg.norm(problem.momentum(vel) - before, axis=-1))
+    off = largest(np.linalg.norm(problem.momentum(path.vel) - before, axis=-1))
     return off / carried if carried > 0 else float("nan")
 
 

@@ -9,17 +9,20 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from flockenv.accuracy.paths import Floats, Path, apart
+from flockenv.constraints import Collisions, UnmetWarning
+from flockenv.constraints.collisions import UnsolvedContactsWarning
 from flockenv.effects import Effect
-from flockenv.integrators import Integrator
+from flockenv.integrators import RK4, Integrator
+from flockenv.population import Crowding, Decay
 from flockenv.scene import Scene
-from flockenv.stability import UnstableStepWarning
+from flockenv.stability import CoarseContactWarning, UnstableStepWarning, suggest_dt
 from flockenv.state import State, blank
 
-__all__ = ["Exact", "Floats", "Path", "Problem", "largest"]
+__all__ = ["Exact", "Problem"]
 
-Floats = NDArray[np.float64]
 Exact = Callable[[float], tuple[ArrayLike, ArrayLike]]
 """t, s -> positions (N, D) m and velocities (N, D) m/s, in closed form."""
 
@@ -27,13 +30,11 @@ INSTANTS = 16
 """At most so many instants, equally apart and the last at the end, at which a run is compared with its reference."""
 
 
-@dataclass(frozen=True, eq=False)
-class Path:
-    """Where a run was at some instants."""
+FINER = 64
+"""The finest steps of a reference of own steps, in parts of the finest that are measured."""
 
-    pos: Floats  # (K, N, D) m
-    vel: Floats  # (K, N, D) m/s
-    evaluations: int  # of the force
+BY_DT = (UnstableStepWarning, CoarseContactWarning, UnsolvedContactsWarning, UnmetWarning)
+"""Warnings about steps that are too long: a measurement takes such steps on purpose."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,7 +64,8 @@ class Problem:
         """Return the problem of a scene from its start with a seed, or from positions and velocities, (N, D) each.
 
         Raises ValueError, in one line, for what no method can be measured on: seconds or steps that lead nowhere,
-        float32 (its rounding hides what a method does) and random kicks (no step is small enough for two runs to meet).
+        float32 (its rounding hides what a method does), draws of every step (runs in steps of two lengths have no
+        path in common), and laws that are maps of one step.
         """
         if not (math.isfinite(seconds) and seconds > 0):
             raise ValueError(f"seconds = {seconds!r}: must be a finite number of seconds > 0")
@@ -72,15 +74,13 @@ class Problem:
             raise ValueError(f"steps = {tuple(steps)}: must be whole numbers of at least 1, and one at least")
         if scene.dtype != "float64":
             raise ValueError(f"dtype = {scene.dtype}: its rounding would hide what a method does; use float64")
-        for k, effect in enumerate(scene.effects):
-            if effect.kick_law is not None:
-                raise ValueError(
-                    f"effects[{k}] {effect.kind}: kicks at random, so there is no one path to come close to"
-                )
+        _refuse_draws(scene)
         start = scene.start(seed)
         if motion is not None:
             start = start.with_motion(*(np.asarray(array, float)[None] for array in motion))
-        return cls(name, title, scene, start, float(seconds), tuple(sorted(set(steps))), exact)
+        problem = cls(name, title, scene, start, float(seconds), tuple(sorted(set(steps))), exact)
+        problem.ready(RK4(), FINER * problem.steps[-1])
+        return problem
 
     @property
     def times(self) -> Floats:
@@ -95,6 +95,27 @@ class Problem:
         mass = self.scene.body.mass.astype(np.float64)
         return np.where(np.isfinite(mass), mass, 0.0)
 
+    @property
+    def after_steps(self) -> str:
+        """What acts between steps, so that no method knows of it, in words; "" if nothing does."""
+        scene, parts = self.scene, self.scene.parts
+        found = [constraint.kind for constraint in scene.constraints]
+        found += ["births and deaths"] if scene.population else []
+        found += ["numbers inside agents"] if parts.inner else []
+        found += ["headings that turn"] if parts.frame_rows else []
+        return ", ".join(found)
+
+    @property
+    def by_events(self) -> Problem:
+        """The same problem with every impact found in the order of time, where its own response comes to that."""
+        constraints = tuple(
+            each.model_copy(update={"response": "earliest"})
+            if isinstance(each, Collisions) and each.response in ("back_up", "project")
+            else each
+            for each in self.scene.constraints
+        )
+        return replace(self, scene=self.scene.model_copy(update={"constraints": constraints}))
+
     def ready(self, method: Integrator, steps: int) -> tuple[Scene, State]:
         """Return the scene advanced by a method in so many steps, and its start.
 
@@ -102,27 +123,51 @@ class Problem:
         """
         dt = self.seconds / steps
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore", UnstableStepWarning)
+            for kind in BY_DT:
+                warnings.simplefilter("ignore", kind)
             return self.scene.model_copy(update={"integrator": method, "dt": dt}), replace(self.start, dt=dt)
 
+    def stable(self, method: Integrator, most: int) -> int:
+        """Return the least power of 2 by which the finest steps must be divided for a method to be stable.
+
+        Raises ValueError, in one line, if that is more than `most`.
+        """
+        limit = suggest_dt(self.ready(method, most * self.steps[-1])[0]).dt
+        finest, times = self.seconds / self.steps[-1], 1
+        while finest / times > limit:
+            times *= 2
+            if times > most:
+                raise ValueError(
+                    f"the finest steps that were asked for, {finest:.3g} s, are too long: {method.kind}, which finds "
+                    f"the reference, is stable up to {limit:.3g} s in this scene"
+                )
+        return times
+
     def path(self, method: Integrator, steps: int, start: State | None = None) -> Path:
-        """Run, and return where everybody was at the instants; raises FloatingPointError where it diverges."""
+        """Run, and return where every agent was at the instants; raises FloatingPointError where it diverges."""
         try:
             scene, state = self.ready(method, steps)
         except ValueError as error:  # it would
             raise FloatingPointError(str(error)) from None
         state = replace(start, dt=scene.dt) if start is not None else state
-        before, each = state.counted("evaluations"), steps // len(self.times)
-        pos, vel = [], []
-        for _ in self.times:
-            state = scene.step(state, steps=each)
-            pos.append(state.pos[0])
-            vel.append(state.vel[0])
-        return Path(np.array(pos), np.array(vel), state.counted("evaluations") - before)
+        before, each = state.work.sum(axis=0), steps // len(self.times)
+        pos, vel, who = [], [], []
+        with warnings.catch_warnings():
+            for kind in BY_DT:
+                warnings.simplefilter("ignore", kind)
+            for _ in self.times:
+                state = scene.step(state, steps=each)
+                pos.append(state.pos[0])
+                vel.append(state.vel[0])
+                who.append(np.where(state.alive[0], state.identity[0], -1) if scene.population else None)
+        return Path(
+            np.array(pos), np.array(vel), np.array(who) if scene.population else None,
+            state.work.sum(axis=0) - before,
+        )  # fmt: skip
 
-    def apart(self, pos: Floats, other: Floats) -> Floats:
-        """Return how far everybody is from where another path has him, (..., N) m, the shortest way."""
-        return np.asarray(np.linalg.norm(self.scene.space.displacement(pos, other), axis=-1))
+    def apart(self, path: Path, other: Path) -> Floats:
+        """Return how far every agent is from where another path has it, (K, N) m; see `paths.apart`."""
+        return apart(path, other, self.scene.space.displacement)
 
     def energy(self, pos: Floats, vel: Floats) -> Floats:
         """Return kinetic energy, and what potential energy the effects know of, at instants (K, N, D), (K,) J."""
@@ -158,13 +203,18 @@ class Problem:
     @property
     def energies(self) -> str:
         """What `energy` sums up, in words."""
+        if self.scene.population:
+            return "not compared: agents are born and die"
         kinds = [effect.kind for effect in self._with_potential]
         return f"kinetic and potential ({', '.join(kinds)})" if kinds else "kinetic"
 
     @property
     def conserves_momentum(self) -> bool:
-        """Is momentum kept, but for errors: do all effects keep it, and neither a wall nor a limit takes it?"""
+        """True if momentum is kept, but for errors: by all effects, and no wall, limit, birth or death changes it."""
         body = self.scene.body
+        walled = any(isinstance(each, Collisions) and each.obstacles for each in self.scene.constraints)
+        if self.scene.population or (walled and self.scene.obstacles):
+            return False
         held = np.isinf(body.mass).any() or np.isfinite(body.max_speed).any()
         free = not held and self.scene.space.kind != "box"
         asks = any(effect.steering for effect in self.scene.effects)
@@ -172,6 +222,17 @@ class Problem:
         return free and all(effect.conserves_momentum for effect in self.scene.effects)
 
 
-def largest(values: Floats) -> float:
-    """Return the largest of some numbers; NaN if one is NaN."""
-    return float(np.max(values)) if np.size(values) else math.nan
+def _refuse_draws(scene: Scene) -> None:
+    """Refuse what is drawn anew in every step: two lengths of a step draw different numbers."""
+    for k, effect in enumerate(scene.effects):
+        if any(each.kick_law is not None for each in (effect, *effect.wishes)):
+            raise ValueError(
+                f"effects[{k}] {effect.kind}: kicks at random, so there is no one path to come close to; only averages "
+                "over many runs could be compared (weak error), which this does not measure"
+            )
+    for k, member in enumerate(scene.population):
+        if isinstance(member, Decay) or (isinstance(member, Crowding) and member.rate is not None):
+            raise ValueError(
+                f"population[{k}] {member.kind}: agents die by draws of every step, so in steps of another length "
+                "others die; only averages over many runs could be compared (weak error), which this does not measure"
+            )

@@ -1,196 +1,150 @@
-"""Where a scene truly goes: a closed form, scipy's DOP853 on its laws, or what ever finer steps of its own tend to.
+"""Where a scene truly goes: the best reference that obeys all of the scene, and how wrong it may be.
 
-DOP853 (Hairer, Norsett, Wanner: Solving Ordinary Differential Equations I, II.10) has order 8, and gets over jumps of a
-force in steps of nearly nothing. It is run at two tolerances: by how much the two differ is how wrong it is taken to
-be. What it cannot see is what a scene does after each step: a speed limit, a wall. Where these act, and where it gives
-up, the reference is the scene's own step with RK4, much finer than anything that is measured, and a run half as fine
-says how good it is.
+In this order: a closed form, where the problem has one; scipy's DOP853 on the scene's laws, where nothing acts between
+its steps; else the scene's own steps, with its constraints, births and deaths, much finer than anything that is
+measured. Impacts are found in the order of time then (`response: earliest`). How wrong own steps are is estimated after
+Richardson: three runs, each in twice as many steps as the one before, give the order in which they close in on a limit.
+Source: Roache 1998, Verification and Validation in Computational Science and Engineering, ch. 5 (grid convergence).
 """
 
 from __future__ import annotations
 
+import itertools
 import math
 from dataclasses import dataclass
 
 import numpy as np
 
-from flockenv.accuracy.problem import Floats, Path, Problem, largest
+from flockenv.accuracy.dop853 import NotSmoothError, integrated_twice
+from flockenv.accuracy.paths import Floats, Path, farthest, reach
+from flockenv.accuracy.problem import FINER, Problem
+from flockenv.constraints import Collisions
 from flockenv.integrators import RK4
 
-__all__ = ["FINER", "PERTURBATION", "Reference", "Sensitivity", "find_reference", "find_sensitivity"]
+__all__ = ["COARSE", "LEAST_FINER", "Reference", "find_reference", "own_steps"]
 
-TIGHT, LOOSE = 1e-13, 1e-12
-"""rtol = atol of the two runs of DOP853."""
+LEAST_FINER = 4
+"""The finest steps of a reference of own steps, in parts of the finest that are measured, at least."""
 
-AGREED = 1e-8
-"""As a share of how far agents go: DOP853's two runs must not differ by more."""
+MOST_WORK = 100_000_000
+"""Steps of agents in the finest run of such a reference: of more, it is less fine."""
 
-MOST_EVALUATIONS = 50_000
-"""Of DOP853, before it is said not to converge."""
+BETWEEN_STEPS = 500
+"""Agents whose step takes about as long as what a scene does between two steps, if something acts there."""
 
-FINER = 64
-"""The finest steps of a reference of our own, in parts of the finest that are measured."""
+COARSE = 0.1
+"""Errors of more than this share of how far agents go are no approximation."""
 
-PERTURBATION = 1e-12
-"""m and m/s, or parts of the largest coordinate: how much a start is changed, to see what becomes of it."""
+ROUNDING, ROUNDING_STEP = 1e-12, 1e-16
+"""m, or parts of how far agents go: runs that part by less, or by less for each of their steps, differ by rounding."""
 
-MOST_GROWTH = 1e8
-"""How often larger it may become before the horizon is refused: 1e-12 m are 0.1 mm then."""
+SETTLED = 0.5
+"""The order from which on three runs are taken to close in on a limit."""
 
 
 @dataclass(frozen=True, eq=False)
 class Reference:
-    """Where everybody is at the instants of a problem."""
+    """Where every agent is at the instants of a problem."""
 
-    kind: str  # "closed form", "DOP853" or "own steps"
-    pos: Floats  # (K, N, D) m
-    vel: Floats  # (K, N, D) m/s
+    kind: str  # "closed form", "DOP853", "event-exact steps" or "own steps"
+    path: Path
     error: float  # m, how wrong it may be at any instant
-    note: str = ""  # why it is no better one
+    reach: float  # m, how far the farthest agent goes
+    note: str = ""  # how it was found, and why it is no better one
 
 
-@dataclass(frozen=True)
-class Sensitivity:
-    """What becomes of a change of the start."""
+def find_reference(problem: Problem, finer: int | None = None) -> Reference:
+    """Return the best reference there is.
 
-    growth: float  # how often larger the change is where it is largest
-    error: float  # m, what it has become then
-
-
-class _NotSmoothError(Exception):
-    """DOP853 cannot follow this scene; the text says why."""
-
-
-def find_reference(problem: Problem, finer: int = FINER) -> Reference:
-    """Return the best reference there is; raises ValueError if a scene diverges even in the finest steps."""
+    finer: see `own_steps`. Raises ValueError, in one line, where there is none: the scene diverges even in the finest
+    steps, or does not settle on one path.
+    """
     if problem.exact is not None:
         pos, vel = zip(*(problem.exact(t) for t in problem.times), strict=True)
-        return Reference("closed form", np.array(pos, float), np.array(vel, float), 0.0)
+        path = Path(np.array(pos, float), np.array(vel, float))
+        return Reference("closed form", path, 0.0, _reach(problem, path))
     try:
-        return _by_scipy(problem)
-    except _NotSmoothError as reason:
-        return _by_own_steps(problem, finer, str(reason))
+        path, error, note = integrated_twice(problem)
+    except NotSmoothError as reason:
+        return own_steps(problem, finer, str(reason))
+    return Reference("DOP853", path, error, _reach(problem, path), note)
 
 
-# --- DOP853 -----------------------------------------------------------------------------------------------------------
+def own_steps(problem: Problem, finer: int | None = None, reason: str = "") -> Reference:
+    """Return the reference of the whole scene in steps of its own with RK4.
+
+    finer: how much finer than the finest steps that are measured, a multiple of 4; none = 64, or as much as keeps to
+    MOST_WORK. Raises ValueError, in one line, where it diverges, or no longer knows where agents are.
+    """
+    fine = problem.by_events
+    many = max(affordable(problem) if finer is None else finer, LEAST_FINER * problem.stable(RK4(), FINER))
+    steps = problem.steps[-1] * many
+    try:
+        runs = [fine.path(RK4(), steps // k) for k in (4, 2, 1)]
+    except FloatingPointError as fault:
+        raise ValueError(f"no reference: {reason}; and in steps of its own: {fault}") from None
+    off = [problem.apart(finer_one, coarser) for coarser, finer_one in itertools.pairwise(runs)]
+    path, gone = runs[-1], _reach(problem, runs[-1])
+    before, last = (farthest(each) for each in off)
+    order, error = _closing_in(before, last, max(ROUNDING, ROUNDING_STEP * steps) * max(1.0, gone))
+    _refuse_unsettled(problem, steps, off[1], error, gone)
+    exactly = any(isinstance(each, Collisions) and each.response == "earliest" for each in fine.scene.constraints)
+    note = f"{reason}; " if reason else ""
+    note += f"RK4 in {steps:,} steps, dt/{many} of the finest; {_told(order, last)}"
+    if exactly:
+        note += "; impacts in the order of time"
+    if unsolved := path.counted("unsolved"):
+        note += f"; {unsolved:,} contacts unsolved"
+    if refused := path.counted("births_refused"):
+        note += f"; {refused:,} births found no free slot, so which agents are born depends on the step"
+    return Reference("event-exact steps" if exactly else "own steps", path, error, gone, note)
 
 
-def _by_scipy(problem: Problem) -> Reference:
-    tight, loose = _integrated(problem, TIGHT), _integrated(problem, LOOSE)
-    apart = largest(problem.apart(tight.pos, loose.pos))
-    gone = largest(problem.apart(tight.pos, problem.start.pos[0]))
-    if not apart <= AGREED * max(gone, AGREED):
-        raise _NotSmoothError(
-            f"DOP853 does not converge: at rtol {TIGHT:g} and {LOOSE:g} its paths are {apart:.1e} m apart"
-        )
-    return Reference(
-        "DOP853", tight.pos, tight.vel, apart, f"rtol = atol = {TIGHT:g}, {tight.evaluations:,} evaluations"
+def affordable(problem: Problem) -> int:
+    """Return how much finer than the finest measured steps a reference is that keeps to MOST_WORK."""
+    ends = problem.scene.constraints or problem.scene.population
+    work = (problem.scene.agents + (BETWEEN_STEPS if ends else 0)) * problem.steps[-1]
+    finer = FINER
+    while finer > LEAST_FINER and work * finer > MOST_WORK:
+        finer //= 2
+    return finer
+
+
+def _closing_in(before: float, last: float, rounding: float) -> tuple[float | None, float]:
+    """Return the order in which three runs close in on a limit, and how wrong the finest is, m, by how far they part.
+
+    Richardson: with order q the finest is last / (2^q - 1) off. An order above 1 is not relied upon, where forces jump
+    and bodies hit; without an order the larger distance is the best that can be said.
+    """
+    if not min(before, last) > rounding:
+        return None, max(before, last)
+    order = math.log2(before / last)
+    return order, last / (2 ** min(order, 1.0) - 1) if order >= SETTLED else max(before, last)
+
+
+def _told(order: float | None, last: float) -> str:
+    """Say how a reference closes in on a limit."""
+    if order is None:
+        return f"{last:.1e} m from half as many, which is rounding"
+    settles = f"order {order:.1f}" if order >= SETTLED else f"no order ({order:.1f}): a path that jumps"
+    return f"{last:.1e} m from half as many, {settles}"
+
+
+def _refuse_unsettled(problem: Problem, steps: int, off: Floats, error: float, gone: float) -> None:
+    """Refuse a scene that ends somewhere else in other steps, however short; the line names a horizon."""
+    if math.isnan(error):
+        raise ValueError(f"seconds = {problem.seconds:g}: no agent lives at any instant at which runs are compared")
+    if error <= COARSE * gone or error == 0:
+        return
+    by_instant = np.maximum.accumulate(np.nan_to_num(off).max(axis=1))
+    kept = problem.times[by_instant <= 1e-2 * gone]
+    advice = f"try --seconds {kept[-1]:.3g}" if len(kept) else "try a shorter horizon, or shorter steps"
+    raise ValueError(
+        f"no reference over {problem.seconds:g} s: RK4 in {steps:,} steps and in half as many end "
+        f"{by_instant[-1]:.1e} m apart, of {gone:.1e} m that the farthest agent goes (a jump is met on one path and "
+        f"missed on the other, and what follows differs); {advice}"
     )
 
 
-def _integrated(problem: Problem, tolerance: float) -> Path:
-    """Integrate x' = v + flow, v' = a from instant to instant."""
-    from scipy.integrate import solve_ivp
-
-    laws = _Laws(problem)
-    y = np.concatenate([problem.start.pos[0].ravel(), problem.start.vel[0].ravel()]).astype(np.float64)
-    now, rows = 0.0, []
-    for until in problem.times:
-        done = solve_ivp(laws, (now, until), y, method="DOP853", rtol=tolerance, atol=tolerance)
-        if not done.success:
-            raise _NotSmoothError(
-                f"DOP853 does not converge: {done.message.lower().rstrip('.')} at t = {done.t[-1]:g} s"
-            )
-        laws.refuse_limits(done.t, done.y)
-        now, y = until, done.y[:, -1]
-        rows.append(y)
-    _, n, d = problem.start.shape
-    both = np.array(rows).reshape(len(rows), 2, n, d)
-    return Path(both[:, 0], both[:, 1], laws.evaluations)
-
-
-class _Laws:
-    """y = (positions, velocities) in one row -> its derivative, by the compiled laws of a scene."""
-
-    def __init__(self, problem: Problem) -> None:
-        self._scene, self._state, self.evaluations = problem.scene, problem.start.copy(), 0
-
-    def __call__(self, t: float, y: Floats) -> Floats:
-        self.evaluations += 1
-        if self.evaluations > MOST_EVALUATIONS:
-            raise _NotSmoothError(f"DOP853 does not converge: t = {t:g} s after {MOST_EVALUATIONS:,} evaluations")
-        pos, vel = self._split(y)
-        self._state.pos[0], self._state.vel[0] = self._scene.space.wrap(pos), vel
-        acc, flow = self._scene.rates(self._state, times=[t])
-        moved = vel if flow is None else vel + flow[0]
-        return np.concatenate([moved.ravel(), acc[0].ravel()])
-
-    def _split(self, y: Floats) -> tuple[Floats, Floats]:
-        _, n, d = self._state.shape
-        both = y.reshape(2, n, d)
-        return both[0], both[1]
-
-    def refuse_limits(self, times: Floats, rows: Floats) -> None:
-        """Raise if a limit that a scene keeps after each step would have acted: DOP853 knows nothing of them."""
-        body, space = self._scene.body, self._scene.space
-        limited = bool(np.isfinite(body.max_speed).any())
-        if not limited and space.kind != "box":
-            return
-        for t, row in zip(times, rows.T, strict=True):
-            pos, _ = self._split(row)
-            if space.kind == "box":
-                extent, radius = np.array(space.extent(pos.shape[1])), body.radius[:, None]
-                if ((pos < radius) | (pos > extent - radius)).any():
-                    raise _NotSmoothError(f"a wall is met at t = {t:.3g} s, and is kept to after each step")
-            if limited:
-                derivative = self(t, row)
-                speeds = (np.linalg.norm(self._split(part)[k], axis=-1) for part, k in ((row, 1), (derivative, 0)))
-                if any((speed > body.max_speed * (1 + 1e-9)).any() for speed in speeds):
-                    raise _NotSmoothError(
-                        f"the speed limit is reached at t = {t:.3g} s, and is kept to after each step"
-                    )
-
-
-# --- the scene's own steps --------------------------------------------------------------------------------------------
-
-
-def _by_own_steps(problem: Problem, finer: int, reason: str) -> Reference:
-    steps = problem.steps[-1] * finer
-    try:
-        fine, coarse = problem.path(RK4(), steps), problem.path(RK4(), steps // 2)
-    except FloatingPointError as error:
-        raise ValueError(f"no reference: {reason}; and in steps of its own: {error}") from None
-    apart = largest(problem.apart(fine.pos, coarse.pos))
-    note = f"{reason}; RK4 in {steps:,} steps, {apart:.1e} m from half as many"
-    return Reference("own steps", fine.pos, fine.vel, apart, note)
-
-
-# --- chaos ------------------------------------------------------------------------------------------------------------
-
-
-def find_sensitivity(problem: Problem) -> Sensitivity:
-    """Return what becomes of a tiny change of the start until the end.
-
-    Raises ValueError if it grows so much that no two computers could agree where anybody is; the line names a horizon.
-    """
-    start = problem.start
-    shift = PERTURBATION * max(1.0, float(np.abs(start.pos).max()))
-    rng = np.random.default_rng(0)
-    change = rng.choice([-1.0, 1.0], size=(2, *start.shape)) / math.sqrt(start.shape[2])
-    other = start.with_motion(start.pos + shift * change[0], start.vel + shift * change[1])
-    steps = problem.steps[-1]
-    try:
-        paths = [problem.path(RK4(), steps, begin) for begin in (start, other)]
-    except FloatingPointError as error:
-        raise ValueError(
-            f"the finest steps that were asked for, {problem.seconds / steps:g} s, are too long: {error}"
-        ) from None
-    growth = np.maximum.accumulate(problem.apart(paths[0].pos, paths[1].pos).max(axis=1)) / shift
-    if not growth[-1] <= MOST_GROWTH:
-        kept = problem.times[growth <= 1e-2 * MOST_GROWTH]
-        advice = f"try {kept[-1]:.3g} s" if len(kept) else "try a shorter one"
-        raise ValueError(
-            f"seconds = {problem.seconds:g}: too long a horizon, a difference of {shift:.0e} m at the start grows "
-            f"{growth[-1]:.1e}-fold until the end, whatever the method; {advice}"
-        )
-    return Sensitivity(float(growth[-1]), float(growth[-1] * shift))
+def _reach(problem: Problem, path: Path) -> float:
+    return reach(path, problem.start.pos[0], problem.scene.space.displacement)

@@ -58,6 +58,10 @@ class Point(Record):
     """By how much the momentum has changed at worst, in parts of the sum of its sizes; none where it is not kept."""
     seconds: float | None
     """Wall time of the whole run, the median of several; none = not measured."""
+    unmatched: int = 0
+    """Agents that live in this run or in the reference alone, at the instant at which they are most."""
+    unsolved: int = 0
+    """Contacts that collisions left unsolved, see State.work."""
 
     def cost(self, by: Cost) -> float | None:
         """Return what it costs."""
@@ -141,6 +145,8 @@ class Report(Record):
     note: str
     growth: float
     """How often larger a tiny difference at the start has become by the end."""
+    rate: float = 0.0
+    """1/s, at which it grew on average: of a chaotic scene its largest Lyapunov exponent, over this horizon."""
     floor: float
     """m, errors below are rounding or the reference's own."""
     reach: float
@@ -152,6 +158,10 @@ class Report(Record):
     curves: tuple[Curve, ...]
     stopped: str = ""
     """Why it ended before its time."""
+
+    def trusts(self, point: Point) -> bool:
+        """True if an error is clearly above what the reference itself may be wrong by."""
+        return point.error is not None and point.error > self.floor
 
     def curve(self, method: str) -> Curve:
         """Return the curve of a method; raises ValueError, with the nearest name, if it was not measured."""

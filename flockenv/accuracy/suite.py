@@ -10,11 +10,15 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from flockenv.accuracy.problem import Exact, Floats, Problem
+from flockenv.accuracy.paths import Floats
+from flockenv.accuracy.problem import Exact, Problem
 from flockenv.behaviours import Alignment, Cohesion, Separation
+from flockenv.constraints import Collisions, Rods
 from flockenv.effects import Attraction, Carried, Drag, Effect, Gravity, QuadraticDrag, Swing, Tether, Uniform, Vortex
+from flockenv.networks import Rope
 from flockenv.refusals import nearest, shown
 from flockenv.scene import Group, Scene
+from flockenv.shapes import HalfSpace
 from flockenv.space import Torus
 from flockenv.spawn import Spawn
 
@@ -162,6 +166,49 @@ def tracer() -> Problem:
     return _one_body("tracer", "Tracer in a vortex, 1.7 turns", effects, 1.7 * 2 * math.pi / turn, powers(5, 16), exact)
 
 
+# --- impacts and rods -------------------------------------------------------------------------------------------------
+
+
+def bounces() -> Problem:
+    """A ball of 0.1 m falls from 1 m and bounces with e = 0.8: impacts after 0.428, 1.114, 1.662, 2.101 s and so on."""
+    drop, elastic, radius = 0.9, 0.8, 0.1
+
+    def exact(t: float) -> tuple[Floats, Floats]:
+        left, up = t - math.sqrt(2 * drop / GRAVITY), math.sqrt(2 * drop * GRAVITY)
+        if left < 0:
+            return _rows(0.0, radius + drop - GRAVITY * t * t / 2), _rows(0.0, -GRAVITY * t)
+        up *= elastic
+        while left > 2 * up / GRAVITY:
+            left, up = left - 2 * up / GRAVITY, elastic * up
+        return _rows(0.0, radius + up * left - GRAVITY * left * left / 2), _rows(0.0, up - GRAVITY * left)
+
+    scene = Scene(
+        groups=(Group(count=1, radius=radius, spawn=Spawn(low=(0, 1), high=(0, 1))),), effects=(Gravity(),),
+        obstacles=(HalfSpace(point=ORIGIN, direction=(0.0, 1.0)),), constraints=(Collisions(restitution=elastic),),
+    )  # fmt: skip
+    return Problem.of(
+        scene, 1.9, powers(4, 12), name="bounces", title="Ball on a floor, 3 impacts", motion=exact(0.0), exact=exact
+    )
+
+
+def rod() -> Problem:
+    """A bob on a rod of 1 m, released level: sin(angle / 2) = k cd(w t, k), k = sin 45 degrees, w^2 = g / l."""
+    w, k = math.sqrt(GRAVITY), math.sqrt(0.5)
+
+    def exact(t: float) -> tuple[Floats, Floats]:
+        from scipy.special import ellipj
+
+        sn, cn, dn, _ = ellipj(w * t, k * k)
+        angle, rate = 2 * math.asin(k * cn / dn), -2 * k * math.sqrt(1 - k * k) * w * sn / dn
+        c, s = math.cos(angle), math.sin(angle)
+        return np.array([[0.0, 0.0], [s, -c]]), np.array([[0.0, 0.0], [c * rate, s * rate]])
+
+    rope = Rope(links=1, start=ORIGIN, end=(1.0, 0.0), pinned=("start",))
+    scene = Scene(groups=(Group(network=rope),), effects=(Gravity(),), constraints=(Rods(group=0),))
+    title = "Pendulum on a rod, 1.3 periods"
+    return Problem.of(scene, 3.1, powers(6, 14), name="rod", title=title, motion=exact(0.0), exact=exact)
+
+
 # --- flocks -----------------------------------------------------------------------------------------------------------
 
 
@@ -203,6 +250,8 @@ SUITE: dict[str, Callable[[], Problem]] = {
     "projectile": projectile,
     "quadratic_fall": quadratic_fall,
     "tracer": tracer,
+    "bounces": bounces,
+    "rod": rod,
     "boids": boids,
     "boids_cone": boids_cone,
     "boids_limit": boids_limit,

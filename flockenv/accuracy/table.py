@@ -4,12 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from flockenv.accuracy.results import HALVINGS, Choice, Cost, Curve, Report
+from flockenv.accuracy.results import HALVINGS, Choice, Cost, Curve, Point, Report
 
-__all__ = ["COLUMNS", "best", "columns", "headlines", "rows"]
+__all__ = ["COLUMNS", "best", "columns", "errors", "headlines", "rows"]
 
 COLUMNS = ("method", "order", "declared")
 DRIFTS = ("energy off", "momentum off")
+
+SENSITIVE = 100.0
+"""Growth of a tiny difference from which on a table says how fast that is."""
 
 
 def headlines(report: Report) -> list[str]:
@@ -19,11 +22,51 @@ def headlines(report: Report) -> list[str]:
     lines = [
         f"{report.agents:,} agents, {report.seconds:g} s, {report.dtype}; the farthest goes {report.reach:.3g} m",
         f"errors against: {report.reference}" + (f" ({report.note})" if report.note else ""),
-        f"a tiny difference at the start grows {report.growth:.2g}-fold: errors below {report.floor:.1e} m say nothing",
+        f"off by itself: {_wrong(report)}; errors below {report.floor:.1e} m are not trusted",
+        f"a tiny difference at the start grows {report.growth:.2g}-fold{_rate(report)}",
         f"energy: {report.energy}",
         f"times: {times} on {report.machine.cpu}, {report.machine.cores} cores{load}",
     ]
+    points = [point for curve in report.curves for point in curve.points]
+    if most := max((point.unmatched for point in points), default=0):
+        lines.append(f"agents are compared by identity; up to {most:,} live in a run or in the reference alone")
+    if most := max((point.unsolved for point in points), default=0):
+        lines.append(f"collisions: up to {most:,} contacts unsolved in a run")
     return lines + ([f"{report.stopped}: what was done until then is shown"] if report.stopped else [])
+
+
+def _wrong(report: Report) -> str:
+    """Return how wrong the reference may be, in words."""
+    return f"about {report.reference_error:.1e} m" if report.reference_error > 0 else "nothing"
+
+
+def _rate(report: Report) -> str:
+    """Say how fast a difference grows, where that is fast enough to matter."""
+    return f" (e-fold in {1 / report.rate:.2g} s)" if report.growth > SENSITIVE else ""
+
+
+def errors(report: Report) -> tuple[tuple[str, ...], list[list[str]]]:
+    """Return heads and rows of the errors at the end, m, of every method in every number of steps.
+
+    ? = not clearly above what the reference itself may be off by. Methods that
+    choose their steps by tolerance are left out.
+    """
+    steps = sorted({p.steps for c in report.curves for p in c.points if p.tolerance is None})
+    found = []
+    for curve in report.curves:
+        points = {p.steps: p for p in curve.points if p.tolerance is None}
+        if points:
+            found.append([curve.method, *(_error(points.get(n), report) for n in steps)])
+    return ("method", *(f"{n:,} steps" for n in steps)), found
+
+
+def _error(point: Point | None, report: Report) -> str:
+    """Return one error as text, and whether it can be trusted."""
+    if point is None:
+        return ""
+    if point.error is None:
+        return "diverges"
+    return f"{point.error:.1e}" + ("" if report.trusts(point) else " ?")
 
 
 def columns(tolerances: Sequence[float]) -> tuple[str, ...]:

@@ -28,6 +28,9 @@ DECADES = 13
 """The picture shows at most so many below the largest error."""
 
 
+SENSITIVE = 100.0
+"""Growth of a tiny difference from which on a panel says so."""
+
 LABEL = 0.035
 """Share of a panel's height that a number at the end of a line takes."""
 
@@ -45,7 +48,8 @@ def draw_precision(reports: Sequence[Report]) -> Figure:
     """Return the picture: per problem errors at the end against wall time, below them against force evaluations.
 
     The number at the end of a line is the order that was measured; grey slopes show what orders 1, 2 and 4 would look
-    like; below the grey edge errors are rounding.
+    like. Hollow points are not clearly above the reference's own error, whose size is below the title; the grey band
+    begins where errors are not trusted. Of one problem alone the legend says the orders too.
 
     Raises:
         ValueError: nothing to draw.
@@ -69,7 +73,7 @@ def draw_precision(reports: Sequence[Report]) -> Figure:
                 _panel(axes, bands[row // 2][column], by, styles)
             else:
                 axes.set_axis_off()
-    _legend(figure, styles)
+    _legend(figure, styles, reports)
     figure.supxlabel(_note(reports), x=0.01, ha="left", fontsize=9, color=FAINT)
     return figure
 
@@ -91,13 +95,17 @@ def _panel(axes: Axes, report: Report, by: Cost, styles: dict[str, dict[str, Any
     low = max(report.floor / 3, high * 10.0**-DECADES, _least(report) / 3)
     axes.set_ylim(low, high)
     for curve in report.curves:
-        _line(axes, curve, by, styles[curve.method])
+        _line(axes, curve, by, styles[curve.method], report.floor, low)
     axes.axhspan(low, max(low, report.floor), color=GRID, zorder=0, linewidth=0)
     if by == "evaluations":
         _slopes(axes, report, low, high)
         _orders(axes, report, styles, low, high)
     else:
-        axes.set_title(report.title, loc="left", fontsize=13, fontweight="bold", color=INK, pad=8)
+        axes.set_title(report.title, loc="left", fontsize=13, fontweight="bold", color=INK, pad=22)
+        axes.annotate(
+            _against(report), (0, 1), (0, 6), xycoords="axes fraction", textcoords="offset points", fontsize=9.5,
+            color=FAINT,
+        )  # fmt: skip
     axes.set_xlabel(AXES[by], fontsize=10.5, color=INK)
     axes.set_ylabel("error at the end, m", fontsize=10.5, color=INK)
     axes.yaxis.set_major_locator(LogLocator(numticks=8))
@@ -111,7 +119,7 @@ def _panel(axes: Axes, report: Report, by: Cost, styles: dict[str, dict[str, Any
 
 def _shown(curve: Curve, by: Cost) -> list[tuple[float, float]]:
     """Return (cost, error) of what has both."""
-    return [(cost, p.error) for p in curve.points if (cost := p.cost(by)) is not None and p.error]
+    return [(cost, p.error) for p in curve.points if (cost := p.cost(by)) is not None and p.error is not None]
 
 
 def _least(report: Report) -> float:
@@ -120,10 +128,22 @@ def _least(report: Report) -> float:
     return min(errors, default=report.reach)
 
 
-def _line(axes: Axes, curve: Curve, by: Cost, style: dict[str, Any]) -> None:
-    shown = _shown(curve, by)
+def _against(report: Report) -> str:
+    """Return what errors are measured against, how wrong that may be, and how fast a difference grows, in a line."""
+    wrong = "" if report.reference_error == 0 else f", \u00b1 {report.reference_error:.0e} m"
+    grows = f"; differences grow {report.growth:.0e}-fold" if report.growth > SENSITIVE else ""
+    return f"against {report.reference}{wrong}{grows}"
+
+
+def _line(axes: Axes, curve: Curve, by: Cost, style: dict[str, Any], floor: float, low: float) -> None:
+    """Draw a curve; what lies below the picture is on its lower edge."""
+    shown = [(cost, max(error, low)) for cost, error in _shown(curve, by)]
     if shown:
         axes.plot(*zip(*shown, strict=True), markersize=5, linewidth=1.8, zorder=3, **style)
+    doubtful = [(cost, error) for cost, error in shown if error <= floor]
+    if doubtful:
+        hollow = {**style, "linestyle": "none", "markerfacecolor": "white"}
+        axes.plot(*zip(*doubtful, strict=True), markersize=5, zorder=3, clip_on=False, **hollow)
 
 
 def _orders(axes: Axes, report: Report, styles: dict[str, dict[str, Any]], low: float, high: float) -> None:
@@ -160,17 +180,26 @@ def _slopes(axes: Axes, report: Report, low: float, high: float) -> None:
         )  # fmt: skip
 
 
-def _legend(figure: Figure, styles: dict[str, dict[str, Any]]) -> None:
+def _legend(figure: Figure, styles: dict[str, dict[str, Any]], reports: Sequence[Report]) -> None:
     from matplotlib.lines import Line2D
 
+    orders = {curve.method: _order(curve, reports[0]) for curve in reports[0].curves} if len(reports) == 1 else {}
     handles = [
-        Line2D([], [], markersize=6, linewidth=2, label=name.replace("_", " "), **style)
+        Line2D([], [], markersize=6, linewidth=2, label=name.replace("_", " ") + orders.get(name, ""), **style)
         for name, style in styles.items()
     ]
     figure.legend(
-        handles=handles, loc="outside upper left", ncols=5, frameon=False, fontsize=11.5, labelcolor=INK,
-        handlelength=2.6, columnspacing=1.6,
+        handles=handles, loc="outside upper left", ncols=4 if orders else 5, frameon=False, fontsize=11.5,
+        labelcolor=INK, handlelength=2.6, columnspacing=1.6,
     )  # fmt: skip
+
+
+def _order(curve: Curve, report: Report) -> str:
+    """Return the measured order as the legend says it, "exact" of a method whose errors are all too small to trust."""
+    if curve.order is not None:
+        return f" ({curve.order:.1f})"
+    arrived = [point for point in curve.points if point.error is not None]
+    return " (exact)" if arrived and not any(report.trusts(point) for point in arrived) else ""
 
 
 def _note(reports: Sequence[Report]) -> str:
@@ -178,6 +207,6 @@ def _note(reports: Sequence[Report]) -> str:
     load = "" if first.machine.load is None else f", load {first.machine.load:.1f} on {first.machine.cores} cores"
     times = f"median of {first.repetitions} runs" if first.repetitions else "no times taken"
     return (
-        f"{first.machine.cpu}{load}; {times}; {first.dtype}. Number at a line's end: measured order. "
-        "Grey band: rounding, or the reference's own error."
+        f"{first.machine.cpu}{load}; {times}; {first.dtype}. Number at a line's end: measured order.\n"
+        "Grey band and hollow points: not clearly above rounding and the reference's own error."
     )

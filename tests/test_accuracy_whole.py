@@ -1,0 +1,274 @@
+"""What accuracy costs in whole scenes: references obey constraints, births and deaths, and know how wrong they are."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from flockenv.accuracy import Problem, Report, Results, measure, problems_named
+from flockenv.accuracy.paths import Path as Way
+from flockenv.accuracy.paths import apart, reach, unmatched
+from flockenv.accuracy.reference import _closing_in, find_reference, own_steps
+from flockenv.accuracy.table import errors, headlines
+from flockenv.cli import main
+from flockenv.config import load_scene
+from flockenv.integrators import methods_named
+from flockenv.render.precision import draw_precision
+
+BALL = """\
+dimension: 2
+space: {kind: plane}
+groups: [{count: 1, mass: 1, radius: 0.1, spawn: {low: [0, 1], high: [0, 1]}}]
+obstacles: [{kind: half_space, point: [0, 0], direction: [0, 1]}]
+effects: [{kind: gravity}]
+constraints: [{kind: collisions, restitution: 0.8}]
+dt: 0.02
+"""
+ROD = """\
+groups:
+  - network: {kind: rope, links: 1, start: [0, 0], end: [1, 0], pinned: [start]}
+    mass: 1
+    radius: 0.05
+effects: [{kind: gravity}]
+constraints: [{kind: rods, group: 0}]
+dt: 0.01
+"""
+EMITTER = """\
+groups: [{count: 60, mass: 1, radius: 0.05}]
+effects: [{kind: gravity}, {kind: drag, rate: 0.5}]
+population:
+  - {kind: emitter, place: {kind: point, at: [0, 0]}, rate: 37, speed: [5, 6], direction: [0, 1], spread: 20}
+  - {kind: leaving, low: [-9, -0.1], high: [9, 9]}
+dt: 0.025
+"""
+AGEING = """\
+groups: [{count: 40, alive: 8, mass: 1, radius: 0.05, spawn: {low: [0, 0], high: [4, 4], speed: [1, 2]}}]
+effects: [{kind: tether, centre: [2, 2], stiffness: 4}]
+population:
+  - {kind: ageing, lifetime: 0.62}
+  - {kind: emitter, place: {kind: point, at: [2, 1]}, rate: 9.3, speed: [1, 1]}
+dt: 0.025
+"""
+FEW = methods_named(["semi_implicit_euler", "velocity_verlet", "rk4"])
+
+
+def of(text: str, seconds: float, steps: tuple[int, ...], **more: Any) -> Problem:
+    return Problem.of(load_scene(text), seconds, steps, **more)
+
+
+def bounced(t: float, height: float, e: float) -> float:
+    """How high above the floor a ball is that was dropped from a height."""
+    g, up = 9.81, math.sqrt(2 * 9.81 * height)
+    fall = math.sqrt(2 * height / g)
+    if t < fall:
+        return height - g * t * t / 2
+    t, up = t - fall, e * up
+    while t > 2 * up / g:
+        t, up = t - 2 * up / g, e * up
+    return up * t - g * t * t / 2
+
+
+# --- references -------------------------------------------------------------------------------------------------------
+
+
+def test_a_ball_bounces_off_the_floor_in_its_reference_too() -> None:
+    """In free fall it would be 3.9 m below the floor after a second."""
+    problem = of(BALL, 1.0, (50, 100, 200))
+    found = find_reference(problem)
+    assert found.kind == "event-exact steps"
+    for t, (_, height) in zip(problem.times, found.path.pos[:, 0], strict=True):
+        assert height == pytest.approx(0.1 + bounced(t, 0.9, 0.8), abs=1e-9)
+    assert found.reach < 0.9
+    assert found.error < 1e-9
+
+
+@pytest.mark.slow
+def test_order_1_and_rounding_are_told_apart_on_the_bouncing_ball() -> None:
+    """Under constant gravity an event is found exactly on the parabola: all but the Eulers are exact in any step."""
+    report = measure(of(BALL, 1.0, (50, 100, 200, 400)), FEW, repetitions=0)
+    euler = report.curve("semi_implicit_euler")
+    assert euler.order == pytest.approx(1, abs=0.05)
+    assert all(report.trusts(point) for point in euler.points)
+    for kind in ("velocity_verlet", "rk4"):
+        assert not any(report.trusts(point) for point in report.curve(kind).points)
+        assert max(point.error or 0.0 for point in report.curve(kind).points) < 1e-9
+    assert any("event-exact" in line and "collisions" in line for line in headlines(report))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["bounces", "rod"])
+def test_closed_forms_agree_with_the_scenes_own_steps(name: str) -> None:
+    known = problems_named([name])[0]
+    exact, own = find_reference(known), own_steps(known, 16)
+    assert exact.kind == "closed form"
+    assert exact.error == 0
+    off = np.abs(known.apart(exact.path, own.path)).max()
+    assert off <= max(own.error, 1e-9)
+
+
+@pytest.mark.slow
+def test_a_pendulum_on_a_rod_swings_in_its_reference() -> None:
+    """By the closed form of the suite: released level it is back there after one period, K(1/2) sqrt(l/g) 4."""
+    report = measure(of(ROD, 0.8, (40, 80, 160, 320)), FEW, repetitions=0)
+    assert report.reference == "own steps"
+    assert "rods" in report.note
+    assert report.reach < 2.01  # in free fall 3.1 m
+    assert report.curve("rk4").order == pytest.approx(2, abs=0.3)
+
+
+@pytest.mark.slow
+def test_newtons_cradle_has_a_reference_of_the_whole_scene() -> None:
+    problem = Problem.of(load_scene(Path("configs/newtons_cradle.yaml")), 0.6, (600, 1200), name="cradle")
+    report = measure(problem, methods_named(["velocity_verlet"]), repetitions=0, finer=8)
+    assert report.reference == "event-exact steps"
+    assert 0.1 < report.reach < 1.5  # 1.8 m in free fall
+    assert all(point.error is not None and point.error < 0.02 for point in report.curves[0].points)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("text", [EMITTER, AGEING], ids=["emitter", "ageing"])
+def test_agents_are_compared_by_identity_where_they_are_born_and_die(text: str) -> None:
+    report = measure(of(text, 1.0, (80, 160, 320, 640)), FEW, repetitions=0)
+    assert report.reference == "own steps"
+    assert "births and deaths" in report.note
+    assert report.energy.startswith("not compared")
+    for curve in report.curves:
+        assert curve.order == pytest.approx(1, abs=0.35), curve.method  # the step of a birth is no method's
+        assert all(point.error is not None and point.error < 0.3 for point in curve.points)
+        assert all(point.unmatched <= 4 for point in curve.points)
+
+
+def test_paths_are_matched_by_identity_and_not_by_slot() -> None:
+    one = Way(np.array([[[0.0, 0], [5.0, 0], [9.0, 9]]]), np.zeros((1, 3, 2)), np.array([[7, 8, -1]]))
+    two = Way(np.array([[[5.0, 1], [0.5, 0], [3.0, 3]]]), np.zeros((1, 3, 2)), np.array([[8, 7, 11]]))
+    minus = np.subtract
+    np.testing.assert_array_equal(apart(one, two, minus), [[0.5, 1.0, np.nan]])
+    assert unmatched(one, two) == 1
+    later = Way(np.concatenate([one.pos, one.pos + 2]), np.zeros((2, 3, 2)), np.array([[7, 8, -1], [8, -1, 7]]))
+    assert reach(later, np.zeros((3, 2)), minus) == pytest.approx(math.hypot(11, 11))
+
+
+def test_the_reference_says_by_richardson_how_wrong_it_is() -> None:
+    for order in (1.0, 2.0, 4.0):
+        ends = [0.3 * 0.5 ** (order * k) for k in range(4)]  # of steps h, h/2, h/4, h/8
+        found, error = _closing_in(ends[0] - ends[1], ends[1] - ends[2], 1e-15)
+        assert found == pytest.approx(order)
+        assert error >= ends[2]
+        if order == 1:
+            assert error == pytest.approx(ends[2])
+    assert _closing_in(1e-3, 2e-3, 1e-12)[1] == 2e-3  # it does not close in: the larger of the two
+    assert _closing_in(1e-14, 3e-14, 1e-12) == (None, 3e-14)  # rounding
+
+
+# --- refusals ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.slow
+def test_a_chaotic_scene_says_so_and_how_long_it_can_be_compared() -> None:
+    """Balls in a box that hit each other: every impact multiplies a difference by its way over the radius."""
+    balls = """\
+space: {kind: box, size: [3, 3], restitution: 1}
+groups: [{count: 20, radius: 0.15, spawn: {low: [0, 0], high: [3, 3], spacing: 0.6, jitter: 0.1, speed: [4, 4]}}]
+constraints: [{kind: collisions, restitution: 1}]
+dt: 0.02
+"""
+    with pytest.raises(ValueError, match=r"chaotic.*e-fold in [\d.]+ s.*try [\d.]+ s") as caught:
+        measure(of(balls, 6.0, (300, 600)), FEW, repetitions=0)
+    assert "\n" not in str(caught.value)
+    shorter = float(str(caught.value).split("try ")[1].split(" s")[0])
+    assert 0 < shorter < 6
+    steps = round(shorter / 0.02)
+    report = measure(of(balls, shorter, (steps, 2 * steps)), FEW[1:2], repetitions=0, finer=4)
+    assert report.rate > 0.5
+
+
+@pytest.mark.parametrize(
+    ("more", "text"),
+    [
+        ("effects: [{kind: fluctuation, strength: 1}]", r"effects\[0\] fluctuation: kicks at random.*weak error"),
+        ("population: [{kind: decay, rate: 1}]", r"population\[0\] decay: agents die by draws of every step.*weak"),
+        (
+            "population: [{kind: crowding, radius: 1, most: 2, rate: 1}]",
+            r"population\[0\] crowding: agents die by draws of every step",
+        ),
+    ],
+)
+def test_what_is_drawn_in_every_step_has_one_line_that_says_so(more: str, text: str) -> None:
+    with pytest.raises(ValueError, match=text) as caught:
+        of(f"groups: [{{count: 3, spawn: {{low: [0, 0], high: [1, 1]}}}}]\n{more}\n", 1.0, (8, 16))
+    assert "\n" not in str(caught.value)
+
+
+def test_a_map_of_one_step_has_one_line_that_says_so() -> None:
+    with pytest.raises(ValueError, match="vicsek: is a map from step to step") as caught:
+        Problem.of(load_scene(Path("configs/vicsek.yaml")), 4.0, (4, 8))
+    assert "\n" not in str(caught.value)
+
+
+# --- what is shown ----------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def ball() -> Report:
+    return measure(of(BALL, 0.5, (25, 50, 100, 200)), methods_named(["semi_implicit_euler", "rk4"]), repetitions=0)
+
+
+def test_errors_that_cannot_be_trusted_are_marked(ball: Report) -> None:
+    heads, rows = errors(ball)
+    assert heads == ("method", "25 steps", "50 steps", "100 steps", "200 steps")
+    euler, rk4 = rows
+    assert not any(cell.endswith("?") for cell in euler[1:])
+    assert all(cell.endswith("?") for cell in rk4[1:])
+    figure = draw_precision([ball])
+    hollow = [line for line in figure.axes[1].lines if line.get_markerfacecolor() == "white"]
+    assert len(hollow) == 1
+    assert any("event-exact steps" in text.get_text() for axes in figure.axes for text in axes.texts)
+    assert any("(1.0)" in text.get_text() for text in figure.legends[0].get_texts())
+
+
+@pytest.mark.slow
+def test_several_scenes_on_the_command_line_are_a_report_or_a_line_each(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("ball.yaml").write_text(BALL)
+    Path("kicked.yaml").write_text(BALL.replace("{kind: gravity}", "{kind: fluctuation, strength: 1}"))
+    asked = "--seconds 0.4 --methods rk4 --steps 20,40 --repetitions 0 --out all.json".split()
+    assert main(["accuracy", "ball.yaml", "kicked.yaml", *asked]) == 0
+    out = capsys.readouterr().out
+    assert "against: event-exact steps" in out
+    assert out.count("kicked.yaml: effects[0] fluctuation: kicks at random") == 1
+    assert [r.name for r in Results.model_validate_json(Path("all.json").read_text()).reports] == ["ball"]
+    assert main(["accuracy", "kicked.yaml", *asked[:-2]]) == 2
+    assert capsys.readouterr().err.count("\n") == 1
+
+
+SHIPPED = [
+    path
+    for path in sorted([*Path("configs").glob("*.yaml"), *Path("configs/crowds").glob("*.yaml")])
+    if "\ngroups:" in path.read_text()
+]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("path", SHIPPED, ids=lambda path: path.stem)
+def test_every_scene_that_is_shipped_has_a_reference_or_a_line_that_says_why_not(path: Path) -> None:
+    """Over four of its own steps, which is no measurement: that all of them are gone through, and told, is."""
+    scene = load_scene(path)
+    try:
+        problem = Problem.of(scene, 4 * scene.dt, (4, 8), name=path.stem)
+        report = measure(problem, methods_named(["rk4"]), repetitions=0, finer=4)
+    except ValueError as reason:
+        assert "\n" not in str(reason)
+        assert any(
+            word in str(reason) for word in ("at random", "map from step", "chaotic", "no reference", "too long")
+        )
+        return
+    acts = problem.after_steps
+    assert report.reference in (("event-exact steps", "own steps") if acts else ("DOP853", "own steps"))
+    assert all(word in report.note for word in acts.split(", ") if word)
+    draw_precision([report])
