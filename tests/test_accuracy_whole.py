@@ -162,6 +162,8 @@ def test_the_reference_says_by_richardson_how_wrong_it_is() -> None:
             assert error == pytest.approx(ends[2])
     assert _closing_in(1e-3, 2e-3, 1e-12)[1] == 2e-3  # it does not close in: the larger of the two
     assert _closing_in(1e-14, 3e-14, 1e-12) == (None, 3e-14)  # rounding
+    assert _closing_in(0.0, 1e-3, 1e-12)[1] == 1e-3  # a jump that the finest run alone meets
+    assert _closing_in(1e-3, 0.0, 1e-12) == (None, 1e-3)
 
 
 # --- refusals ---------------------------------------------------------------------------------------------------------
@@ -228,6 +230,17 @@ def test_errors_that_cannot_be_trusted_are_marked(ball: Report) -> None:
     assert len(hollow) == 1
     assert any("event-exact steps" in text.get_text() for axes in figure.axes for text in axes.texts)
     assert any("(1.0)" in text.get_text() for text in figure.legends[0].get_texts())
+
+
+def test_a_picture_says_where_no_method_arrives(ball: Report) -> None:
+    nowhere = [
+        curve.model_copy(
+            update={"points": tuple(p.model_copy(update={"error": None}) for p in curve.points), "order": None}
+        )
+        for curve in ball.curves
+    ]
+    figure = draw_precision([ball, ball.model_copy(update={"curves": tuple(nowhere)})])
+    assert "no method arrives in these steps" in [text.get_text() for text in figure.axes[3].texts]
 
 
 @pytest.mark.slow

@@ -14,6 +14,7 @@ from flockenv.behaviours import Separation
 from flockenv.config import load_scene
 from flockenv.divergence import SimulationDiverged
 from flockenv.effects import AngularSprings, Drag, Effect, Elastic, Gravity, Springs, Tether
+from flockenv.explanation import explain
 from flockenv.integrators import (
     RK4,
     AdaptiveRK4,
@@ -162,6 +163,14 @@ def test_an_undamped_spring_is_told_of_no_stable_step_and_how_fast_it_grows(meth
     end = scene.run(start, steps)
     amplitude = math.sqrt(float((end.pos**2).sum() + (end.vel**2).sum() / 9))
     assert math.log(amplitude) == pytest.approx(steps * scene.dt / seconds, rel=0.2)
+
+
+def test_explain_says_that_no_step_is_stable() -> None:
+    tether = Tether(centre=O2, stiffness=18.0)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UnstableStepWarning)
+        found = explain(body(tether, method=ExplicitEuler(), dt=0.01, mass=2.0))
+        assert found.largest_step == "none is stable with explicit_euler (tether at agent 0), dt = 0.01 s"
 
 
 def test_methods_with_an_interval_are_told_it_as_before() -> None:

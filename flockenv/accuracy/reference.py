@@ -89,15 +89,18 @@ def own_steps(problem: Problem, finer: int | None = None, reason: str = "") -> R
     order, error = _closing_in(before, last, max(ROUNDING, ROUNDING_STEP * steps) * max(1.0, gone))
     _refuse_unsettled(problem, steps, off[1], error, gone)
     exactly = any(isinstance(each, Collisions) and each.response == "earliest" for each in fine.scene.constraints)
-    note = f"{reason}; " if reason else ""
-    note += f"RK4 in {steps:,} steps, dt/{many} of the finest; {_told(order, last)}"
-    if exactly:
-        note += "; impacts in the order of time"
-    if unsolved := path.counted("unsolved"):
-        note += f"; {unsolved:,} contacts unsolved"
-    if refused := path.counted("births_refused"):
-        note += f"; {refused:,} births found no free slot, so which agents are born depends on the step"
+    found = [reason, f"RK4 in {steps:,} steps, dt/{many} of the finest", _told(order, last)]
+    found += ["impacts in the order of time"] if exactly else []
+    note = "; ".join(each for each in found + _left_over(path) if each)
     return Reference("event-exact steps" if exactly else "own steps", path, error, gone, note)
+
+
+def _left_over(path: Path) -> list[str]:
+    """Say what a run did not do as its scene asks: contacts left unsolved, births without a free slot."""
+    unsolved, refused = path.counted("unsolved"), path.counted("births_refused")
+    found = [f"{unsolved:,} contacts unsolved"] if unsolved else []
+    slots = f"{refused:,} births found no free slot, so which agents are born depends on the step"
+    return found + ([slots] if refused else [])
 
 
 def affordable(problem: Problem) -> int:
@@ -116,9 +119,9 @@ def _closing_in(before: float, last: float, rounding: float) -> tuple[float | No
     Richardson: with order q the finest is last / (2^q - 1) off. An order above 1 is not relied upon, where forces jump
     and bodies hit; without an order the larger distance is the best that can be said.
     """
-    if not min(before, last) > rounding:
+    if not last > rounding:
         return None, max(before, last)
-    order = math.log2(before / last)
+    order = math.log2(max(before, rounding) / last)
     return order, last / (2 ** min(order, 1.0) - 1) if order >= SETTLED else max(before, last)
 
 

@@ -165,6 +165,11 @@ def _orders(axes: Axes, report: Report, styles: dict[str, dict[str, Any]], low: 
 def _slopes(axes: Axes, report: Report, low: float, high: float) -> None:
     """Draw what orders 1, 2 and 4 look like, from one corner."""
     costs = [x for curve in report.curves for x, _ in _shown(curve, "evaluations")]
+    if not costs:
+        axes.annotate(
+            "no method arrives in these steps", (0.5, 0.5), xycoords="axes fraction", ha="center", color=FAINT
+        )
+        return
     left, right = min(costs), max(costs)
     corner = math.sqrt(high * report.reach) if report.reach > 0 else high
     axes.set_xlim(left / 1.5, right * 3)
