@@ -9,7 +9,6 @@ import os
 import platform
 import re
 import subprocess
-import tempfile
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -29,13 +28,15 @@ from agents import report
 from agents.experiment import CONFIGS, Experiment, load_experiment
 from agents.processes import Tell, side_by_side
 from flockenv.evaluation import WORLDS_PER_SEED, Episodes, rollout, task_digest, worlds_for
-from flockenv.outputs import checked_path
+from flockenv.interrupts import held, unfinished
+from flockenv.outputs import checked_path, made
 from flockenv.players import NAMES, load_player, other_tasks
 from flockenv.players.files import SUFFIXES, PlayerError
 from flockenv.players.rules import tuned
 from flockenv.policy import OtherTaskWarning, Policy
 from flockenv.refusals import nearest, shown
 from flockenv.tasks import TASKS, Task
+from flockenv.terminal import one_line, program, shown_progress
 
 __all__ = [
     "Player", "app", "blaming", "compare", "deliver", "experiment_of", "field_of", "folder_of", "pick", "provenance",
@@ -215,7 +216,7 @@ def blaming(player: str, task: Task, *clear: type[Exception]) -> Iterator[None]:
         raise
     except PlayerError as error:
         raise PlayerError(f"{error} (task {task.name!r})") from error
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         raise ValueError(f"player {player!r}, task {task.name!r}: {type(error).__name__}: {error}") from error
 
 
@@ -281,7 +282,7 @@ def main(
     debug: Annotated[bool, typer.Option("--debug", help="Show where an error came from.")] = False,
 ) -> None:
     """Play all tasks with all players in the same worlds, and say who won by what."""
-    try:
+    with one_line("compare", "interrupted, nothing written", debug):
         folder = folder_of(out)
         chosen = [experiment_of(name).build() for name in pick("--tasks", split(tasks) or list(TASKS), TASKS)]
         field = field_of(split(players) or usual_players(chosen))
@@ -293,14 +294,6 @@ def main(
             results, episodes = compare(chosen, field, count, seed, resamples, trust_pickle, advance)
         results["smoke"] = smoke
         deliver(folder, _files(results, episodes))
-    except (ValueError, TypeError, OSError) as error:
-        if debug:
-            raise
-        typer.echo(f"compare: {' '.join(str(error).split())}", err=True)
-        raise typer.Exit(2) from None
-    except KeyboardInterrupt:
-        typer.echo("compare: interrupted, nothing written", err=True)
-        raise typer.Exit(130) from None
     _show(results, folder)
 
 
@@ -341,7 +334,7 @@ def _bars(tasks: Sequence[Task], players: int) -> Iterator[Advance]:
     """Show a bar per task on a terminal, and a line per player and task anywhere else."""
     console = Console(stderr=True)
     columns = (TextColumn("{task.description:<24}"), BarColumn(40), TimeElapsedColumn())
-    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as progress:
+    with shown_progress(Progress(*columns, console=console, transient=True)) as progress:
         bars = {task.name: progress.add_task(task.name, total=players * task.horizon, start=False) for task in tasks}
         played: dict[str, list[str]] = {task.name: [] for task in tasks}
 
@@ -382,19 +375,13 @@ def deliver(folder: Path, writers: Mapping[str, Callable[[Path], None]]) -> None
     Raises:
         OSError, or what a writer raises: then the folder is as it was.
     """
-    made = [path for path in (folder, *folder.parents) if not path.exists()]
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(dir=folder, prefix=".partial-") as partial:
-            for name, write in writers.items():
-                write(Path(partial, name))
+    with made(folder), unfinished(folder / f".partial-{os.getpid()}") as partial:
+        Path(partial).mkdir()
+        for name, write in writers.items():
+            write(Path(partial, name))
+        with held():
             for name in writers:
                 Path(partial, name).replace(folder / name)
-    except BaseException:
-        for path in made:
-            if path.is_dir() and not any(path.iterdir()):
-                path.rmdir()
-        raise
 
 
 def write_text(path: Path, text: str) -> None:
@@ -444,4 +431,4 @@ def _show(results: report.Results, folder: Path) -> None:
 
 
 if __name__ == "__main__":
-    app()
+    program("compare", app, "interrupted, nothing written")

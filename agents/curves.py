@@ -17,11 +17,11 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from rich.console import Console
 
-from agents.checkpoint import CheckpointError
 from agents.experiment import Experiment, PpoSettings, load_experiment, one_line_errors
 from flockenv.outputs import check_room, checked_file, checked_path, replacing
 from flockenv.players.rules import tuned
 from flockenv.render.chart import COLOURS, FAINT, GRID, INK
+from flockenv.terminal import one_line, program
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -140,12 +140,9 @@ def main(
         folder = checked_path(str(runs), "--runs")
         experiments = experiments_of(configs)
         check_room(picture, ROOM)
-    try:
-        with one_line_errors((CheckpointError, OSError, FloatingPointError)):
-            tasks = {task: measured(experiment, folder) for task, experiment in experiments.items()}
-    except KeyboardInterrupt:
-        console.print(f"interrupted; what is trained stays in {runs}, the same command goes on", highlight=False)
-        raise typer.Exit(130) from None
+    stays = f"interrupted; what is trained stays in {runs}, the same command goes on"
+    with one_line("curves", stays), one_line_errors((FloatingPointError,)):
+        tasks = {task: measured(experiment, folder) for task, experiment in experiments.items()}
     picture.parent.mkdir(parents=True, exist_ok=True)
     draw(picture, tasks)
     with replacing(picture.with_suffix(".json")) as file:
@@ -159,4 +156,4 @@ def main(
 
 
 if __name__ == "__main__":
-    app()
+    program("curves", app)

@@ -124,7 +124,7 @@ def load_experiment(path: str | Path) -> Experiment:
 
 
 @contextmanager
-def one_line_errors(kinds: tuple[type[Exception], ...] = (ValueError, OSError)) -> Iterator[None]:
+def one_line_errors(kinds: tuple[type[Exception], ...] = (ValueError, OSError, MemoryError)) -> Iterator[None]:
     """End a command with status 2 and one line, however narrow the terminal, where its input is refused.
 
     kinds: the exceptions that say so.
@@ -132,5 +132,5 @@ def one_line_errors(kinds: tuple[type[Exception], ...] = (ValueError, OSError)) 
     try:
         yield
     except kinds as error:
-        typer.echo(f"error: {error}", err=True)
+        typer.echo(f"error: {error or 'not enough memory'}", err=True)
         raise typer.Exit(2) from None

@@ -21,6 +21,7 @@ from agents.ppo import build, on_threads, score, tensors_of
 from agents.teach import WORLDS, teach
 from flockenv.evaluation import rollout, worlds_for
 from flockenv.players.rules import player
+from flockenv.terminal import program, shown_progress
 
 __all__ = ["Imitation", "app", "imitate"]
 
@@ -64,7 +65,7 @@ def main(
     with one_line_errors():
         experiment = load_experiment(config)
         name = experiment.build().name
-    with Progress(console=console) as progress:
+    with shown_progress(Progress(console=console)) as progress:
         bar = progress.add_task(f"{name}: gradient steps", total=updates)
         found = imitate(experiment, worlds, updates, lambda n: progress.advance(bar, n))
     console.print(
@@ -74,4 +75,4 @@ def main(
 
 
 if __name__ == "__main__":
-    app()
+    program("imitate", app)

@@ -29,6 +29,7 @@ from flockenv.players import NAMES, other_tasks
 from flockenv.policy import Policy
 from flockenv.snapshot import Snapshot
 from flockenv.tasks import Task
+from flockenv.terminal import program, shown_progress
 from flockenv.world import Step, World
 
 __all__ = ["Among", "Payoffs", "app", "invade"]
@@ -183,7 +184,7 @@ def main(
         if not out.is_terminal:
             out = Console(highlight=False, width=200)  # a pipe has no width
         for task, field in zip(tasks, fields, strict=True):
-            with Progress(console=console, transient=True) as progress:
+            with shown_progress(Progress(console=console, transient=True)) as progress:
                 bar = progress.add_task(task.name, total=len(field) ** 2)
                 found = invade(task, field, worlds, seed, lambda: progress.advance(bar))  # noqa: B023  # called at once
             out.print(f"{task.name}: mean return of one who plays the row, among those who play the column")
@@ -206,4 +207,4 @@ def _makers(task: Task, asked: Sequence[str], seed: int, trust_pickle: bool) -> 
 
 
 if __name__ == "__main__":
-    app()
+    program("invade", app)

@@ -37,6 +37,7 @@ from agents.experiment import Experiment, PpoSettings, load_experiment, one_line
 from agents.run import Run, checkpoint, checkpointed, expected_bytes, recipe_of
 from agents.teach import teach
 from agents.training_state import capture, restore, surroundings
+from flockenv import interrupts
 from flockenv.crew import threads, use_threads
 from flockenv.evaluation import rollout, worlds_for
 from flockenv.outputs import check_room, checked_file, checked_path
@@ -45,7 +46,7 @@ from flockenv.players.rules import player
 from flockenv.policy import MlpPolicy, describe, save_policy
 from flockenv.sb3 import WorldVecEnv
 from flockenv.tasks import TASKS, Task
-from flockenv.terminal import DIVERGED, INTERRUPTED
+from flockenv.terminal import DIVERGED, program, shown_progress
 from flockenv.world import World
 
 __all__ = ["app", "build", "export", "on_threads", "score", "tensors_of", "train"]
@@ -259,7 +260,7 @@ def _teach(model: PPO, task: Task, p: PpoSettings) -> float:
     if p.taught == 0:
         return 0.0
     began = time.perf_counter()
-    with on_threads(p.threads), Progress(console=console, transient=True) as progress:
+    with on_threads(p.threads), shown_progress(Progress(console=console, transient=True)) as progress:
         bar = progress.add_task(f"{task.name}: is taught", total=p.taught)
         teach(model, task, player(task), p.taught, advance=lambda n: progress.advance(bar, n))
     return time.perf_counter() - began
@@ -309,7 +310,7 @@ def _train(experiment: Experiment, folder: Path, run: Run | None, tensorboard: s
         TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TimeRemainingColumn(),
         TextColumn("{task.fields[score]}"),
     )  # fmt: skip
-    with on_threads(p.threads), Progress(*columns, console=console) as progress:
+    with on_threads(p.threads), shown_progress(Progress(*columns, console=console)) as progress:
         watch = Watch(task, p, run, folder, progress)
         try:
             with _named_divergence(model):
@@ -377,13 +378,14 @@ def main(
         target = WEIGHTS / f"{name}.safetensors" if out is None else checked_file(str(out), (".safetensors",), True)
         folder = checked_path(str(runs / name), "--runs")
         _check_outputs(experiment, target, folder, tensorboard)
-    with one_line_errors((CheckpointError, OSError)):
+    with one_line_errors((CheckpointError, OSError, MemoryError)):
         try:
             run = train(experiment, folder, go_on, tensorboard)
         except KeyboardInterrupt:
             kept = f"checkpoint in {runs / name}, go on with --resume"
+            interrupts.said()
             console.print(f"interrupted; {kept if _kept(experiment, folder) else 'nothing was learnt yet'}")
-            raise typer.Exit(INTERRUPTED) from None
+            raise typer.Exit(interrupts.code()) from None
         except FloatingPointError as error:
             typer.echo(f"error: {error}; {_last_good(experiment, folder, target)}", err=True)
             raise typer.Exit(DIVERGED) from None
@@ -417,4 +419,4 @@ def _last_good(experiment: Experiment, folder: Path, target: Path) -> str:
 
 
 if __name__ == "__main__":
-    app()
+    program("ppo", app)

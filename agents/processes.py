@@ -1,4 +1,4 @@
-"""The same work on many things, side by side: a few processes take one after another, and tell how far they are."""
+"""The same work on many things, side by side: a few processes take one after another, and end with their parent."""
 
 from __future__ import annotations
 
@@ -8,11 +8,14 @@ import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Future, ProcessPoolExecutor, wait
 from contextlib import contextmanager
-from multiprocessing import active_children, get_context
+from multiprocessing import active_children, get_context, parent_process, resource_tracker
 from multiprocessing.connection import Connection
+from multiprocessing.connection import wait as wait_for
 from typing import Any, TypeVar
 
-__all__ = ["Tell", "quietly", "side_by_side"]
+from flockenv import interrupts
+
+__all__ = ["Tell", "serve", "side_by_side", "starting"]
 
 Job = TypeVar("Job")
 Done = TypeVar("Done")
@@ -32,15 +35,18 @@ def side_by_side(work: Callable[[Job, Tell], Done], jobs: Sequence[Job], process
 
     Raises:
         OSError: a process was ended from outside.
-        Exception: the first that `work` or `tell` raises. Then, and on Ctrl-C, nobody works on.
+        Exception: the first that `work` or `tell` raises. The other processes end then, and when this one ends, however
+            it ends.
     """
     context = get_context("spawn")
+    if os.name == "posix":
+        _start_tracker()
     with _heard(context, tell) as (mouth, turn, trouble):
         others, workers = active_children(), []
         at_work: list[Future[Done]] = []
         with ProcessPoolExecutor(processes, context, _begin, (mouth, turn)) as pool:
             try:
-                with _interrupts_held():
+                with starting():
                     at_work += [pool.submit(_work, work, job) for job in jobs]
                     workers += [process for process in active_children() if process not in others]
                 for working in at_work:
@@ -94,16 +100,30 @@ def _heard(context: Any, tell: Tell) -> Iterator[tuple[Connection, Any, Future[N
 
 
 @contextmanager
-def _interrupts_held() -> Iterator[None]:
-    """Let whoever is started now never hear of Ctrl-C, where the system can: what this thread holds back, he does."""
-    if not hasattr(signal, "pthread_sigmask"):
+def starting() -> Iterator[None]:
+    """Start processes that end with this one and do not see Ctrl-C: they inherit what this thread blocks."""
+    os.environ[interrupts.PARENT] = str(os.getpid())
+    if os.name != "posix":
         yield
         return
+    _start_tracker()  # it unblocks signals, so it must be there before they are blocked
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         yield
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+def _start_tracker() -> None:
+    """Start the process that removes semaphores which others leave behind, one that does so without a warning."""
+    before = os.environ.get("PYTHONWARNINGS")
+    os.environ["PYTHONWARNINGS"] = "ignore"
+    try:
+        resource_tracker.ensure_running()
+    finally:
+        del os.environ["PYTHONWARNINGS"]
+        if before is not None:
+            os.environ["PYTHONWARNINGS"] = before
 
 
 _tell: Tell
@@ -119,13 +139,22 @@ def _begin(mouth: Connection, turn: Any) -> None:
             mouth.send(news)
 
     _tell = tell
-    quietly()
+    serve()
 
 
-def quietly() -> None:
-    """Leave Ctrl-C, and what is said about compiling, to the process that people talk to."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+def serve() -> None:
+    """Make this process one that works for its parent: Ctrl-C is the parent's to handle, and it ends when that ends."""
+    interrupts.serve()
     os.environ["FLOCKENV_QUIET"] = "1"
+    parent = parent_process()
+    if parent is not None:
+        threading.Thread(target=_follow, args=(parent.sentinel,), daemon=True).start()
+
+
+def _follow(sentinel: int) -> None:
+    """End this process when its parent has ended; a sentinel is ready then, even after SIGKILL."""
+    wait_for([sentinel])
+    os.kill(os.getpid(), signal.SIGTERM)
 
 
 def _work(work: Callable[[Job, Tell], Done], job: Job) -> Done:

@@ -32,7 +32,7 @@ from agents.compare import (
     split,
     write_text,
 )
-from agents.processes import quietly
+from agents.processes import serve, starting
 from agents.transfer_cells import (
     KEPT,
     Plan,
@@ -50,6 +50,7 @@ from flockenv.integrators import INTEGRATORS
 from flockenv.players import NAMES
 from flockenv.refusals import nearest, shown
 from flockenv.tasks import TASKS, Task
+from flockenv.terminal import one_line, program, shown_progress
 
 __all__ = ["app"]
 
@@ -58,6 +59,8 @@ METHODS = ("semi_implicit_euler", "explicit_euler", "midpoint", "velocity_verlet
 SUBSTEPS = (1, 2, 4, 8)
 MOST_SUBSTEPS = 1000
 FILES = ("transfer.json", "transfer.md", "transfer.png")
+
+STOPPED = f"interrupted; what was played is in {KEPT}, and the same command goes on"
 
 Advance = Callable[[str, int], None]
 """Told what has been done, and how many cells or clocks that was."""
@@ -89,7 +92,7 @@ def main(
     debug: Annotated[bool, typer.Option("--debug", help="Show where an error came from.")] = False,
 ) -> None:
     """Play the same worlds solved better and worse, and say what that does to each policy and what it costs."""
-    try:
+    with one_line("transfer", STOPPED, debug):
         folder = folder_of(out)
         _check("--worlds", worlds, 2, WORLDS_PER_SEED)
         _check("--rounds", rounds, 1, 1000)
@@ -107,14 +110,6 @@ def main(
             "transfer.md": lambda path: write_text(path, transfer_report.markdown(results)),
             "transfer.png": lambda path: _draw(path, results),
         })  # fmt: skip
-    except (ValueError, TypeError, OSError) as error:
-        if debug:
-            raise
-        typer.echo(f"transfer: {' '.join(str(error).split())}", err=True)
-        raise typer.Exit(2) from None
-    except KeyboardInterrupt:
-        typer.echo(f"transfer: interrupted; what was played is in {KEPT}, and the same command goes on", err=True)
-        raise typer.Exit(130) from None
     transfer_report.show(results)
     typer.echo(f"{results['wall_time_s']:.0f} s; {', '.join(FILES)} are in {folder}")
 
@@ -193,7 +188,9 @@ def _crew(processes: int, work: Sequence[Any]) -> Iterator[Callable[[Any, Iterab
         yield map
         return
     count = min(processes, len(work))
-    with get_context("spawn").Pool(count, quietly, maxtasksperchild=1 if processes == 1 else None) as pool:
+    with starting():
+        pool = get_context("spawn").Pool(count, serve, maxtasksperchild=1 if processes == 1 else None)
+    with pool:
         yield pool.imap_unordered
 
 
@@ -202,7 +199,7 @@ def _bar(steps: int) -> Iterator[Advance]:
     """Show one bar on a terminal, and a line per kernel and per round anywhere else."""
     console = Console(stderr=True)
     columns = (TextColumn("{task.description:<44}"), BarColumn(30), TimeElapsedColumn())
-    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as progress:
+    with shown_progress(Progress(*columns, console=console, transient=True)) as progress:
         bar = progress.add_task("compiling and playing", total=steps)
 
         def advance(what: str, done: int) -> None:
@@ -220,4 +217,4 @@ def _draw(path: Path, results: report.Results) -> None:
 
 
 if __name__ == "__main__":
-    app()
+    program("transfer", app, STOPPED)

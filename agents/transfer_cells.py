@@ -21,7 +21,7 @@ from agents.transfer_report import Cell, Clock, Setting
 from flockenv.evaluation import rollout, task_digest, worlds_for
 from flockenv.integrators import RK4
 from flockenv.kernels import load
-from flockenv.outputs import replacing
+from flockenv.outputs import made, replacing
 from flockenv.players import NAMES
 from flockenv.policy import Policy
 from flockenv.tasks import Task
@@ -125,8 +125,7 @@ def _print_of_known(player: Player, plan: Plan) -> str:
 
 
 def _keep(path: Path, content: Any) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with replacing(path) as file:
+    with made(path.parent), replacing(path) as file:
         file.write(json.dumps(content, allow_nan=False).encode())
 
 

@@ -22,6 +22,7 @@ from flockenv.evaluation import rollout, worlds_for
 from flockenv.outputs import replacing
 from flockenv.players.rules import RULES, TUNED, RulesPlayer, as_dict
 from flockenv.tasks import Task
+from flockenv.terminal import program, shown_progress
 
 __all__ = ["RANGES", "app", "search"]
 
@@ -149,7 +150,7 @@ def main(
         experiment = load_experiment(config)
         task = experiment.build()
     s = experiment.search
-    with Progress(console=console) as progress:
+    with shown_progress(Progress(console=console)) as progress:
         bar = progress.add_task(f"{task.name}: parameter sets", total=_plays(s.candidates, s.rounds))
         rules, found = search(experiment, lambda n: progress.advance(bar, n))
     target = out or TUNED / f"{task.name}.json"
@@ -159,4 +160,4 @@ def main(
 
 
 if __name__ == "__main__":
-    app()
+    program("tune", app, "interrupted, nothing written")

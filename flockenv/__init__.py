@@ -14,7 +14,11 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING, Any
 
-from flockenv.envs.registration import register_all
+from flockenv import interrupts
+
+interrupts.begin_early()  # a command: before Gymnasium is imported, which takes a third of a second
+
+from flockenv.envs.registration import register_all  # noqa: E402  # see above
 
 if TYPE_CHECKING:
     from flockenv.scene import Scene

@@ -21,23 +21,25 @@ from typing import TYPE_CHECKING, Annotated, Any, get_args
 import typer
 
 import flockenv
+from flockenv import interrupts
 from flockenv.measuring import measure
 from flockenv.players import NAMES
 from flockenv.refusals import nearest, shown
 from flockenv.studies import accuracy, experiment, gallery, stress
 from flockenv.terminal import (
-    BAD_INPUT,
     DIVERGED,
     INTERRUPTED,
     OK,
     EarlyEnd,
     Force,
     Seed,
+    complain,
+    flush_output,
     new_console,
-    printable,
     progress_bar,
     relative,
     show_table,
+    verdict,
 )  # fmt: skip
 from flockenv.validating import validate
 
@@ -88,34 +90,43 @@ Duration = Annotated[float, typer.Option(metavar="S", help="Simulated time in se
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run a command line and return its exit code: 0, 1 (a run went wrong), 2 (bad input), 130 (interrupted).
 
-    `--debug`, anywhere, shows tracebacks instead of one line.
+    `--debug`, anywhere, shows tracebacks instead of one line. Without arguments it is the program and handles signals.
     """
-    words = list(sys.argv[1:] if arguments is None else arguments)
+    if arguments is not None:
+        return _run(list(arguments))
+    with interrupts.running("flockenv"):
+        code = _run(sys.argv[1:])
+    if code == interrupts.code():
+        interrupts.leave(code)
+    return code
+
+
+def _run(words: Sequence[str]) -> int:
     debug = "--debug" in words
     try:
         with warnings.catch_warnings():
             warnings.showwarning = _warn
             code = app([w for w in words if w != "--debug"], prog_name="flockenv", standalone_mode=False)
+        flush_output()
         # typer turns a KeyboardInterrupt into this code without a word
-        return _complain("interrupted", INTERRUPTED) if code == INTERRUPTED else int(code or OK)
+        return _interrupted() if code == INTERRUPTED else int(code or OK)
     except (typer.Abort, KeyboardInterrupt):
-        return _complain("interrupted", INTERRUPTED)
+        return _interrupted()
     except EarlyEnd as end:
-        return _complain(str(end), end.code)
+        return _interrupted(str(end)) if end.code == INTERRUPTED else _complain(str(end), end.code)
     except Exception as error:
         if debug:
             raise
-        return _complain(*_verdict(error))
+        return _complain(*verdict(error))
 
 
-def _verdict(error: Exception) -> tuple[str, int]:
-    """Return what to say about an error, and the exit code."""
-    usage = getattr(error, "format_message", None)  # typer's own complaints about the command line
-    if usage is not None:
-        return usage() or "no command given; see flockenv --help", BAD_INPUT
-    if isinstance(error, (ValueError, OSError, ImportError)):
-        return str(error), BAD_INPUT
-    return f"{type(error).__name__}: {error} (a fault of flockenv's; --debug shows where)", DIVERGED
+def _interrupted(text: str = "") -> int:
+    """Say that a signal ended the command, with what was kept if anything was; return the exit code."""
+    if text:
+        interrupts.say(text)
+    if line := interrupts.said():
+        print(line, file=sys.stderr)
+    return interrupts.code()
 
 
 def _warn(message: Warning | str, *place: object, **more: object) -> None:
@@ -124,8 +135,7 @@ def _warn(message: Warning | str, *place: object, **more: object) -> None:
 
 
 def _complain(text: str, code: int) -> int:
-    for line in text.splitlines():
-        print(f"flockenv: {printable(line)}", file=sys.stderr)
+    complain("flockenv", text)
     return code
 
 
@@ -236,7 +246,7 @@ def render(
     force: Force = False,
 ) -> None:
     """Draw a scene, or an episode of a task under some player, as GIF, PNG or HTML replay."""
-    from flockenv.outputs import checked_file
+    from flockenv.outputs import checked_file, made
     from flockenv.tasks import TASKS
 
     path = checked_file(out, PICTURES, force)
@@ -248,8 +258,8 @@ def render(
         panel, fps = _film(what, 10.0 if duration is None else duration, seed)
     else:
         raise ValueError(f"{shown(what)}: no such task{nearest(what, TASKS)} ({', '.join(TASKS)}), nor a .yaml file")
-    path.parent.mkdir(parents=True, exist_ok=True)
-    _write_picture(path, panel, what if what in TASKS else Path(what).stem, fps, size)
+    with made(path.parent):
+        _write_picture(path, panel, what if what in TASKS else Path(what).stem, fps, size)
     new_console().print(f"{relative(path)}: {path.stat().st_size:,} bytes, {panel.snapshots[-1].time:g} s")
 
 
@@ -363,7 +373,7 @@ def _sentence(kind: type) -> str:
 def _recorded(scene: Scene, seed: int, steps: int, every: int) -> Trajectory:
     from flockenv.trajectory import record
 
-    with progress_bar("simulating", steps, "steps") as progress:
+    with progress_bar("simulating", steps, "steps", f"placing {scene.agents:,} agents, compiling") as progress:
         return record(scene, seed, steps, every, progress)
 
 
@@ -374,7 +384,9 @@ def _show_measures(console: Console, trajectory: Trajectory) -> None:
         return f"{value:.4g}" if math.isfinite(value) else "-"
 
     scene, time = trajectory.scene, float(trajectory.last.time[0])
-    rows = [(name, text(a), text(b), MEASURES[name]) for name, (a, b) in trajectory.measures().items()]
+    with progress_bar("measuring", 1, "runs", f"measuring {scene.agents:,} agents"):
+        measured = trajectory.measures()
+    rows = [(name, text(a), text(b), MEASURES[name]) for name, (a, b) in measured.items()]
     title = f"{scene.agents:,} agents, {int(trajectory.step[-1]):,} steps of {scene.dt:g} s, seed {trajectory.seed}"
     show_table(console, title, rows, ("measure", "t = 0 s", f"t = {time:g} s", "unit"))
     work = {"neighbour queries": "neighbour_queries", "candidate pairs": "pairs", "obstacle tests": "obstacle_tests"}

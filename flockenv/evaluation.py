@@ -186,6 +186,17 @@ def rollout(
     )
 
 
+class _staying:  # noqa: N801  # a context manager without the cost of a generator: it is inside the clock
+    """Refuse a policy that ends the process."""
+
+    def __enter__(self) -> None:
+        pass
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: object) -> None:
+        if isinstance(error, SystemExit):
+            raise ValueError(f"policy: ends the process, exit({error.code!r}), instead of an action") from None
+
+
 class _Pilot:
     """Asks the policy for everybody's action, carries its state along and times it: predict() and nothing around it."""
 
@@ -199,7 +210,8 @@ class _Pilot:
         rows = observation.reshape(-1, observation.shape[-1])
         starts = np.full(len(rows), not self._times)
         began = perf_counter()
-        action, self._state = self._policy.predict(rows, self._state, starts, self._deterministic)
+        with _staying():
+            action, self._state = self._policy.predict(rows, self._state, starts, self._deterministic)
         self._times.append(1e6 * (perf_counter() - began) / len(rows))
         action = np.asarray(action)
         if action.shape != (len(rows), action_size):
@@ -273,7 +285,8 @@ def _latency(policy: Policy, row: NDArray[np.float32], deterministic: bool) -> f
     times = []
     for _ in range(LATENCY_CALLS):
         began = perf_counter()
-        policy.predict(row, None, np.ones(1, np.bool_), deterministic)
+        with _staying():
+            policy.predict(row, None, np.ones(1, np.bool_), deterministic)
         times.append(perf_counter() - began)
     return 1e6 * float(np.median(times))
 

@@ -245,10 +245,9 @@ def _summary(
 
 
 def _write_numbers(path: Path, summary: dict[str, Any]) -> None:
-    from flockenv.outputs import replacing
+    from flockenv.outputs import made, replacing
 
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with replacing(path) as file:
+    with made(path.parent), replacing(path) as file:
         file.write((json.dumps(summary, indent=1, allow_nan=False) + os.linesep).encode())
     new_console().print(f"numbers in {relative(path)}")
 

@@ -7,13 +7,14 @@ import re
 import tempfile
 import unicodedata
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import BinaryIO
 
+from flockenv import interrupts
 from flockenv.refusals import nearest
 
-__all__ = ["check_room", "checked_file", "checked_path", "replacing"]
+__all__ = ["check_room", "checked_file", "checked_path", "made", "replacing"]
 
 LONGEST_NAME, LONGEST_PATH = 200, 1000
 
@@ -114,14 +115,24 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
         raise FileNotFoundError(f"cannot write {str(target)!r}: there is no folder {str(target.parent)!r}")
     part = target.with_name(f".{target.name[:100]}.{os.getpid()}.part")
     try:
-        with part.open("wb") as file:
-            yield file
-            file.flush()
-            os.fsync(file.fileno())
-        part.replace(target)
+        with interrupts.unfinished(part):
+            with part.open("wb") as file:
+                yield file
+                file.flush()
+                os.fsync(file.fileno())
+            part.replace(target)
     except OSError as error:
-        if error.filename not in (str(part), str(target)):
+        if error.filename not in (None, str(part), str(target)):  # writing to a file that is open names none: no room
             raise
-        raise type(error)(f"cannot write {str(target)!r}: {error.strerror}") from None
-    finally:
-        part.unlink(missing_ok=True)
+        raise type(error)(f"cannot write {str(target)!r}: {error.strerror or error}") from None
+
+
+@contextmanager
+def made(folder: Path) -> Iterator[None]:
+    """Make a folder and those above it; if a block ends early, those that are empty then are removed again."""
+    new = [path for path in (folder, *folder.parents) if not path.exists()]
+    with ExitStack() as stack:
+        for path in reversed(new):
+            stack.enter_context(interrupts.unfinished(path, if_empty=True))
+        folder.mkdir(parents=True, exist_ok=True)
+        yield

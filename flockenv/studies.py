@@ -176,10 +176,9 @@ def _write(path: Path, numbers: Record, draw: Callable[[Path], None]) -> None:
 
 def write_numbers(path: Path, numbers: Record) -> None:
     """Write numbers as JSON: whole or not at all, whatever a path ends in."""
-    from flockenv.outputs import replacing
+    from flockenv.outputs import made, replacing
 
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with replacing(path.with_suffix(".json")) as file:
+    with made(path.parent), replacing(path.with_suffix(".json")) as file:
         file.write((numbers.model_dump_json(indent=1) + "\n").encode())
 
 

@@ -1,24 +1,35 @@
-"""What every command shares: exit codes, options, where tables go, bars while it works, an end before its time."""
+"""What every command shares: exit codes, options, where tables go, progress while it works, one line where it ends."""
 
 from __future__ import annotations
 
+import os
+import sys
+import threading
+import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from flockenv import interrupts
+
 if TYPE_CHECKING:
     from rich.console import Console
+    from rich.progress import Progress, Task
 
 __all__ = [
-    "BAD_INPUT", "DIVERGED", "INTERRUPTED", "OK", "EarlyEnd", "Force", "Seed", "new_console", "printable",
-    "progress_bar", "relative", "show_table",
+    "BAD_INPUT", "DIVERGED", "INTERRUPTED", "OK", "EarlyEnd", "Force", "Seed", "complain", "flush_output",
+    "in_words", "new_console", "one_line", "printable", "program", "progress_bar", "relative", "show_table",
+    "shown_progress", "verdict",
 ]  # fmt: skip
 
 OK, DIVERGED, BAD_INPUT, INTERRUPTED = 0, 1, 2, 130
 MOST_SEED = 2**63 - 1
+
+FIRST, OFTEN = 3.0, 10.0
+"""s until the first line about progress where stderr is not a terminal, and between two of them."""
 
 Seed = Annotated[int, typer.Option(min=0, max=MOST_SEED, help="Which world: the same seed is the same run.")]
 Force = Annotated[bool, typer.Option("--force", help="Overwrite files that exist.")]
@@ -30,6 +41,91 @@ class EarlyEnd(Exception):  # noqa: N818  # not an error: what was done is kept 
     def __init__(self, text: str, code: int) -> None:
         super().__init__(text)
         self.code = code
+
+
+def complain(name: str, text: str) -> None:
+    """Write lines to stderr, each with the name of the command in front."""
+    for line in text.splitlines():
+        print(f"{name}: {printable(line)}", file=sys.stderr)
+
+
+def verdict(error: Exception) -> tuple[str, int]:
+    """Return what is said of an error in a command, and the exit code."""
+    usage = getattr(error, "format_message", None)  # typer's own complaints about the command line
+    if usage is not None:
+        return usage() or "no command given; see flockenv --help", BAD_INPUT
+    if isinstance(error, MemoryError):
+        return f"not enough memory: {_first_line(error) or 'less is needed with fewer agents or worlds'}", BAD_INPUT
+    if isinstance(error, OSError) and error.strerror:
+        return _os_text(error), BAD_INPUT
+    if isinstance(error, (ValueError, OSError, ImportError)):
+        return str(error), BAD_INPUT
+    return f"{type(error).__name__}: {error} (a fault of flockenv's; --debug shows where)", DIVERGED
+
+
+def _os_text(error: OSError) -> str:
+    """Return what the system refused, and of which file; an error that names none is tried again on stdout."""
+    if error.filename is not None:
+        return f"{error.filename}: {error.strerror}"
+    try:
+        print()
+        flush_output()
+    except OSError:
+        return f"standard output: {error.strerror}"
+    return str(error.strerror)
+
+
+def _first_line(error: Exception) -> str:
+    return next(iter(str(error).splitlines()), "")
+
+
+@contextmanager
+def one_line(name: str, interrupted: str = "interrupted", debug: bool = False) -> Iterator[None]:
+    """End a command with one line on stderr and an exit code where its input is refused or a signal interrupts it.
+
+    interrupted: what is said of an interrupt. debug: errors are raised as they are.
+    """
+    interrupts.say(interrupted)
+    try:
+        yield
+    except KeyboardInterrupt:
+        complain(name, interrupted)
+        interrupts.said()
+        raise typer.Exit(interrupts.code()) from None
+    except (ValueError, TypeError, OSError, MemoryError) as error:
+        if debug:
+            raise
+        text, code = verdict(error) if isinstance(error, (OSError, MemoryError)) else (str(error), BAD_INPUT)
+        complain(name, " ".join(text.split()))
+        raise typer.Exit(code) from None
+
+
+def program(name: str, app: typer.Typer, interrupted: str = "interrupted") -> None:
+    """Run an app as the program that this process is, and end the process with its exit code.
+
+    interrupted: what is said of an interrupt, unless the command itself says something else.
+    """
+    interrupts.say(interrupted)
+    with interrupts.running(name):
+        try:
+            app()
+        except SystemExit as end:
+            if end.code not in (INTERRUPTED, interrupts.code()):
+                raise
+            if line := interrupts.said():  # typer turns a KeyboardInterrupt into this code without a word
+                print(line, file=sys.stderr)
+            interrupts.leave(interrupts.code())
+
+
+def flush_output() -> None:
+    """Write out what stdout holds; OSError that names it where that fails. A reader that has gone is no error."""
+    try:
+        sys.stdout.flush()
+    except OSError as error:
+        with suppress(OSError, ValueError):  # what it holds is written at the end of the process, and must not fail
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        if not isinstance(error, BrokenPipeError):
+            raise OSError(f"standard output: {error.strerror}") from None
 
 
 def printable(text: str) -> str:
@@ -66,15 +162,82 @@ def relative(path: Path) -> str:
 
 
 @contextmanager
-def progress_bar(title: str, total: int, unit: str) -> Iterator[Callable[[int], None]]:
-    """Show a bar on stderr while a command works; only where somebody watches."""
+def progress_bar(title: str, total: int, unit: str, first: str = "compiling") -> Iterator[Callable[[int], None]]:
+    """Show on stderr how far a command is, and how long the rest takes; `first` is what it does before the work."""
     from rich.console import Console
-    from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
-    console = Console(stderr=True)
-    columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.completed}/{task.total} " + unit))
-    with Progress(
-        *columns, TimeRemainingColumn(), console=console, transient=True, disable=not console.is_terminal
-    ) as bar:
-        task = bar.add_task("compiling", total=total)
-        yield lambda done: bar.update(task, completed=done, description=title)
+    columns = (
+        TextColumn("{task.description}"), BarColumn(), TextColumn("{task.completed}/{task.total} " + unit),
+        TimeElapsedColumn(), TextColumn("{task.fields[left]}"),
+    )  # fmt: skip
+    with shown_progress(Progress(*columns, console=Console(stderr=True), transient=True)) as bar:
+        task = bar.add_task(first, total=total, left="")
+        clock = _Clock()
+
+        def update(done: int) -> None:
+            bar.update(task, completed=done, description=title, left=clock.left(done, total))
+
+        yield update
+
+
+class _Clock:
+    """How long the rest takes, by what was done since the first news: compiling before that does not count."""
+
+    def __init__(self) -> None:
+        self._since: tuple[float, int] | None = None
+
+    def left(self, done: int, total: float) -> str:
+        """Return it in words, "" as long as nothing has been done."""
+        now = time.monotonic()
+        if self._since is None:
+            self._since = now, done
+        began, first = self._since
+        if done <= first or done >= total:
+            return ""
+        return f"about {in_words((now - began) * (total - done) / (done - first))} left"
+
+
+def in_words(seconds: float) -> str:
+    """Return a length of time in its largest fitting unit: 40 s, 3 min, 5 h, 12 days, 2,000 years."""
+    for unit, size, most in (("s", 1.0, 90.0), ("min", 60.0, 5400.0), ("h", 3600.0, 172800.0)):
+        if seconds < most:
+            return f"{seconds / size:.0f} {unit}"
+    days = seconds / 86400
+    return f"{days:,.0f} days" if days < 730 else f"{days / 365.25:,.0f} years"
+
+
+@contextmanager
+def shown_progress(progress: Progress) -> Iterator[Progress]:
+    """Show bars on a terminal; on anything else a line on stderr after FIRST seconds and every OFTEN seconds then."""
+    if progress.console.is_terminal:
+        with progress:
+            yield progress
+        return
+    progress.disable = True
+    done = threading.Event()
+    teller = threading.Thread(target=_tell, args=(progress, done), daemon=True)
+    teller.start()
+    try:
+        yield progress
+    finally:
+        done.set()
+
+
+def _tell(progress: Progress, done: threading.Event) -> None:
+    """Write a line about each bar that is at work, until all is done."""
+    wait = FIRST
+    while not done.wait(wait):
+        wait = OFTEN
+        for task in progress.tasks:
+            if task.started and not task.finished:
+                print(_told(task), file=sys.stderr, flush=True)
+
+
+def _told(task: Task) -> str:
+    """Return one line about a bar: what is done, how much of it, since when, and how long the rest takes."""
+    share = f" {100 * task.completed / task.total:.3g} %" if task.total and task.completed else ""
+    more = [f"{in_words(task.elapsed or 0.0)} so far", *(str(text) for text in task.fields.values() if text)]
+    if "left" not in task.fields and task.completed and task.time_remaining is not None:
+        more.append(f"about {in_words(task.time_remaining)} left")
+    return f"{task.description}:{share} ({', '.join(more)})"

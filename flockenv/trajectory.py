@@ -6,6 +6,7 @@ import json
 import math
 import os
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import chain
 from pathlib import Path
@@ -17,7 +18,7 @@ from numpy.typing import NDArray
 
 from flockenv.config import dump_scene
 from flockenv.measures import measure
-from flockenv.outputs import replacing
+from flockenv.outputs import made, replacing
 from flockenv.scene import Scene
 from flockenv.snapshot import Snapshot
 from flockenv.space import Plane
@@ -60,7 +61,8 @@ class Trajectory:
 
     def measures(self) -> dict[str, tuple[float, float]]:
         """Return every domain measure at the start and at the end."""
-        start, end = measure(self.scene, self.first), measure(self.scene, self.last)
+        start = measure(self.scene, self.first)
+        end = start if self.last is self.first else measure(self.scene, self.last)
         return {name: (start[name], end[name]) for name in start}
 
     def snapshots(self, title: str = "") -> Iterator[Snapshot]:
@@ -102,10 +104,9 @@ class Trajectory:
         there is a population; shown (T, N), where pictures show what goes on inside. None needs pickle. Missing folders
         are made.
         """
-        path.parent.mkdir(parents=True, exist_ok=True)
         kept = {"heading": self.heading, "identity": self.identity, "born": self.born, "shown": self.shown}
         more: dict[str, Any] = {name: array for name, array in kept.items() if array is not None}
-        with replacing(path) as file:
+        with made(path.parent), replacing(path) as file:
             np.savez(
                 file, time=self.step * self.scene.dt, pos=self.pos, vel=self.vel, alive=self.alive,
                 radius=self.scene.body.radius, seed=np.uint64(self.seed), scene=np.array(dump_scene(self.scene)),
@@ -131,7 +132,7 @@ def record(
     piece = max(1, PATIENCE // scene.agents)
     stopped, began = "", perf_counter()
     try:
-        last = scene.run(first, 0)  # compiles what is not in the cache
+        _compile(scene, first, steps)
         began = perf_counter()
         progress(0)
         for until in chain(range(0, steps, every), [steps]):
@@ -152,6 +153,13 @@ def record(
         None if film.heading is None else film.heading[:n], None if film.identity is None else film.identity[:n],
         None if film.born is None else film.born[:n], None if film.shown is None else film.shown[:n],
     )  # fmt: skip
+
+
+def _compile(scene: Scene, first: State, steps: int) -> None:
+    """Compile, or read from the cache, what a run needs: by a first step whose result nobody sees."""
+    if steps > 0:
+        with suppress(FloatingPointError):  # the run itself says so
+            scene.run(first, 1)
 
 
 @dataclass(frozen=True, eq=False)

@@ -7,7 +7,9 @@ import os
 import re
 import subprocess
 import sys
+import time
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -16,6 +18,7 @@ from PIL import Image
 from typer.testing import CliRunner
 
 import flockenv.stress
+from flockenv import terminal
 from flockenv.cli import app, main
 from flockenv.config import load_scene, schema
 from flockenv.effects import EFFECTS
@@ -196,6 +199,21 @@ def test_a_scene_without_neighbour_effects_makes_no_query_and_one_with_them_one_
     assert "; 20 neighbour queries, " in capsys.readouterr().out
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("more", ["", "constraints: [{kind: collisions}]\n"], ids=["plain", "collisions"])
+def test_the_clock_of_a_run_begins_when_everything_is_compiled(more: str, tmp_path: Path) -> None:
+    """Otherwise the first run of a scene shows the speed of the compiler."""
+    Path("new.yaml").write_text(TINY + more)
+    code = (
+        "from pathlib import Path; from flockenv.compilation import compiled; from flockenv.config import load_scene;"
+        "from flockenv.trajectory import record; seen = [];"
+        "record(load_scene(Path('new.yaml')), 0, 50, 10, lambda done: seen.append(len(compiled())));"
+        "assert seen[0] == seen[-1] == len(compiled()) > 0, seen"
+    )
+    fresh = {**ENVIRONMENT, "FLOCKENV_CACHE": str(tmp_path / "cache")}
+    subprocess.run([sys.executable, "-c", code], env=fresh, check=True)
+
+
 def test_a_run_that_diverges_says_so_and_keeps_what_was_done(capsys: pytest.CaptureFixture[str]) -> None:
     wild = TINY.replace("kind: drag, rate: 0.5", "kind: quadratic_drag, rate: 1e6")
     wild = wild.replace("torus, size: [9, 9]", "plane").replace("spawn: {", "spawn: {low: [0, 0], high: [9, 9], ")
@@ -256,6 +274,55 @@ def test_an_interrupted_picture_is_not_written(moment: str, tmp_path: Path) -> N
     done = interrupted(moment, "render", "tiny.yaml", "--duration", "10", "--out", "t.gif")
     assert (done.returncode, done.stderr) == (130, "flockenv: interrupted\n")
     assert [p.name for p in tmp_path.iterdir()] == ["tiny.yaml"]
+
+
+# --- how far it is ----------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def often(monkeypatch: pytest.MonkeyPatch) -> None:
+    """News about progress come every 20 ms."""
+    monkeypatch.setattr(terminal, "FIRST", 0.02)
+    monkeypatch.setattr(terminal, "OFTEN", 0.02)
+
+
+@pytest.mark.usefixtures("often")
+def test_a_pipe_is_told_how_far_a_command_is(capsys: pytest.CaptureFixture[str]) -> None:
+    with terminal.progress_bar("working", 10**14, "steps", "placing agents") as progress:
+        time.sleep(0.1)
+        progress(0)
+        time.sleep(0.02)
+        progress(10)
+        time.sleep(0.1)
+        progress(10**14)
+    waiting, working = (
+        r"placing agents: \(0 s so far\)",
+        r"working: 1e-11 % \(0 s so far, about [\d,]+ years left\)",
+    )
+    said = capsys.readouterr().err
+    assert re.fullmatch(rf"({waiting}\n)+(working: \(0 s so far\)\n)*({working}\n)+", said), said
+
+
+def test_a_quick_command_says_nothing_of_its_progress(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["run", "tiny.yaml", "--duration", "0.1"]) == 0
+    assert capsys.readouterr().err == ""
+
+
+@pytest.mark.usefixtures("often")
+@pytest.mark.parametrize("command", [["measure", "--time", "40"], ["run", "--duration", "4000"]], ids=lambda c: c[0])
+def test_long_commands_say_how_far_they_are(command: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    name, *options = command
+    assert main([name, "tiny.yaml", *options]) == 0
+    assert " so far" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("seconds", "words"),
+    [(0, "0 s"), (89, "89 s"), (91, "2 min"), (5399, "90 min"), (5401, "2 h"), (172799, "48 h"), (172801, "2 days"),
+     (7e7, "2 years"), (1e12, "31,688 years")],
+)  # fmt: skip
+def test_a_length_of_time_in_words(seconds: float, words: str) -> None:
+    assert terminal.in_words(seconds) == words
 
 
 # --- render -----------------------------------------------------------------------------------------------------------
@@ -529,6 +596,53 @@ def test_a_fault_of_ours_is_called_one(monkeypatch: pytest.MonkeyPatch, capsys: 
     monkeypatch.setattr("flockenv.config.load_scene", broken)
     assert main(["run", "tiny.yaml"]) == 1
     assert capsys.readouterr().err == "flockenv: KeyError: 'pos' (a fault of flockenv's; --debug shows where)\n"
+
+
+def test_too_little_memory_is_no_fault_of_ours(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def short(text: str) -> Any:
+        def load(source: object) -> None:
+            raise MemoryError(text) if text else MemoryError
+
+        return load
+
+    for text, said in (
+        ("Unable to allocate 3. GiB for an array", "not enough memory: Unable to allocate 3. GiB for an array"),
+        ("", "not enough memory: less is needed with fewer agents or worlds"),
+    ):
+        monkeypatch.setattr("flockenv.config.load_scene", short(text))
+        assert main(["run", "tiny.yaml"]) == 2
+        assert capsys.readouterr().err == f"flockenv: {said}\n"
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs a device that is always full")
+@pytest.mark.parametrize(
+    "command", [("list",), ("schema",), ("run", "tiny.yaml", "--duration", "0.1")], ids=lambda c: c[0]
+)
+def test_a_full_disk_behind_standard_output_is_named(command: tuple[str, ...]) -> None:
+    with open("/dev/full", "w") as full:
+        done = subprocess.run(process(*command), env=ENVIRONMENT, stdout=full, stderr=subprocess.PIPE, text=True)
+    assert (done.returncode, done.stderr) == (2, "flockenv: standard output: No space left on device\n")
+
+
+@pytest.mark.parametrize("name", ["t.npz", "t.gif", "t.png", "t.html"])
+def test_a_full_disk_is_one_line_that_names_the_file_and_leaves_nothing(name: str, tmp_path: Path) -> None:
+    """A limit on the size of files stands for the disk."""
+    command = "run" if name.endswith("npz") else "render"
+    code = (
+        "import resource, sys; from flockenv.cli import main\n"
+        "import flockenv.outputs, matplotlib.font_manager\n"
+        "resource.setrlimit(resource.RLIMIT_FSIZE, (200, 200)); sys.exit(main())"
+    )
+    arguments = (command, "tiny.yaml", "--duration", "0.2", "--out", f"deep/{name}")
+    assert main([*arguments[:-1], name]) == 0  # compiles; a kernel is larger than the disk
+    os.remove(name)
+    Path("t.json").unlink(missing_ok=True)
+    done = subprocess.run([sys.executable, "-c", code, *arguments], env=ENVIRONMENT, capture_output=True, text=True)
+    assert done.returncode == 2, done.stderr
+    assert re.fullmatch(rf"flockenv: cannot write '\S*deep/{re.escape(name)}': File too large\n", done.stderr)
+    assert [path.name for path in tmp_path.iterdir()] == ["tiny.yaml"]
 
 
 def test_nothing_at_all_shows_the_help(capsys: pytest.CaptureFixture[str]) -> None:

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from flockenv.config import dump_scene
 from flockenv.findings import Case
-from flockenv.outputs import replacing
+from flockenv.outputs import made, replacing
 from flockenv.validation import alone, corridors, doors
 from flockenv.validation.case import quietly
 from flockenv.validation.walk import Scenes
@@ -37,10 +37,9 @@ def write_scenes(folder: Path, cases: Sequence[Case], presets: Sequence[str], fo
     if there and not force:
         raise ValueError(f"--scenes: {there[0].name} exists already in {there[0].parent}; --force overwrites it")
     for path, case, name, built in todo:
-        path.parent.mkdir(parents=True, exist_ok=True)
         with quietly():
             text = dump_scene(built(name), [name], brief=True)
-        with replacing(path) as file:
+        with made(path.parent), replacing(path) as file:
             file.write(f"{_head(case, path)}{text}".encode())
     return [path for path, *_ in todo]
 

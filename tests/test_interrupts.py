@@ -1,0 +1,231 @@
+"""Signals: a command ends in one line, its processes end with it, and nothing half-written is left behind."""
+
+from __future__ import annotations
+
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parent.parent
+ENVIRONMENT = {**os.environ, "PYTHONPATH": str(ROOT)}
+
+pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="looks into /proc")
+
+SCENE = """\
+space: {kind: torus, size: [9, 9]}
+groups: [{count: 4, spawn: {speed: [1, 2]}}]
+effects: [{kind: drag, rate: 0.5}]
+dt: 0.01
+"""
+
+COMMAND = """\
+import sys, time
+from flockenv import interrupts
+from flockenv.outputs import made, replacing
+from pathlib import Path
+interrupts.begin("toy")
+print("ready", flush=True)
+{body}
+"""
+
+
+def start(*command: str, folder: Path) -> subprocess.Popen[str]:
+    """Start a process that has a group of its own and hears of signals, however the tests were started."""
+
+    def hear() -> None:
+        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+            signal.signal(number, signal.default_int_handler if number == signal.SIGINT else signal.SIG_DFL)
+
+    return subprocess.Popen(
+        [sys.executable, *command], cwd=folder, env=ENVIRONMENT, text=True, stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE, start_new_session=True, preexec_fn=hear,
+    )  # fmt: skip
+
+
+def toy(body: str, folder: Path) -> subprocess.Popen[str]:
+    """Start a command of a few lines, and wait until it handles signals."""
+    process = start("-c", COMMAND.format(body=body), folder=folder)
+    assert process.stdout is not None and process.stdout.readline() == "ready\n"
+    time.sleep(0.1)
+    return process
+
+
+def handles_signals(process: subprocess.Popen[str]) -> bool:
+    """True if a process handles SIGTERM: Python itself does not."""
+    status = Path(f"/proc/{process.pid}/status").read_text()
+    caught = re.search(r"^SigCgt:\s*(\w+)", status, re.MULTILINE)
+    return caught is not None and bool(int(caught[1], 16) >> (signal.SIGTERM - 1) & 1)
+
+
+def lives(pid: int) -> bool:
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0] != "Z"
+    except OSError:
+        return False
+
+
+# --- one line, at every moment
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP], ids=lambda number: number.name)
+@pytest.mark.parametrize(
+    "command",
+    [
+        (str(Path(sys.executable).with_name("flockenv")), "list"),
+        ("-m", "agents.compare", "--smoke"),
+        ("-m", "agents.tune", "pursuit.yaml"),
+    ],
+    ids=["flockenv", "compare", "tune"],
+)
+def test_a_command_that_is_still_importing_ends_in_one_line(
+    command: tuple[str, ...], number: signal.Signals, tmp_path: Path
+) -> None:
+    process = start(*command, folder=tmp_path)
+    while not handles_signals(process):
+        assert process.poll() is None
+        time.sleep(0.005)
+    os.killpg(process.pid, number)
+    out, said = process.communicate(timeout=60)
+    assert process.returncode == 128 + number, said
+    assert re.fullmatch(r"\w+: (interrupted|terminated).*\n", said)
+    assert (out, list(tmp_path.iterdir())) == ("", [])
+
+
+PLACES = {
+    "a line of ours": "with interrupts.running('toy'):\n    time.sleep(60)",
+    "a package that is not to be left": """\
+import pickle
+class Slow:
+    def __reduce__(self): time.sleep(60)
+with interrupts.running('toy'):
+    pickle._dumps(Slow())""",
+    "machine code": """\
+import numba
+count = numba.njit(nogil=True)(lambda n: sum([k % 7 for k in range(n)]))
+count(1)
+with interrupts.running('toy'):
+    print('go', flush=True)
+    count(10**13)""",
+}
+"""Where the main thread may be when a signal arrives."""
+
+
+@pytest.mark.parametrize("body", PLACES.values(), ids=PLACES)
+def test_a_command_ends_wherever_it_is(body: str, tmp_path: Path) -> None:
+    process = toy(body, tmp_path)
+    if "go" in body:
+        assert process.stdout is not None and process.stdout.readline() == "go\n"
+    process.send_signal(signal.SIGINT)
+    _, said = process.communicate(timeout=60)
+    if process.returncode == 130:
+        assert said == "toy: interrupted\n"
+    else:  # its own line was interrupted, and it says what it makes of that: here, nothing
+        assert said.splitlines()[-1] == "KeyboardInterrupt" and body.endswith("    time.sleep(60)")
+
+
+def test_a_second_interrupt_ends_what_the_first_one_began(tmp_path: Path) -> None:
+    slow = "with interrupts.running('toy'):\n    try:\n        time.sleep(60)\n    finally:\n        time.sleep(60)"
+    process = toy(slow, tmp_path)
+    for _ in range(2):
+        process.send_signal(signal.SIGINT)
+        time.sleep(0.5)
+    _, said = process.communicate(timeout=60)
+    assert (process.returncode, said) == (130, "toy: interrupted\n")
+
+
+def test_two_signals_of_one_press_are_one(tmp_path: Path) -> None:
+    """A terminal and a wrapper such as `uv run` both pass Ctrl-C on."""
+    keeps = "with interrupts.running('toy'):\n    try:\n        time.sleep(60)\n    except KeyboardInterrupt:\n"
+    process = toy(keeps + "        time.sleep(0.6)\n        print('kept', flush=True)", tmp_path)
+    for _ in range(2):
+        process.send_signal(signal.SIGINT)
+        time.sleep(0.1)
+    out, said = process.communicate(timeout=60)
+    assert (process.returncode, out, said) == (0, "kept\n", "")
+
+
+def test_a_command_under_nohup_goes_on_without_a_terminal(tmp_path: Path) -> None:
+    ignoring = "import signal; signal.signal(signal.SIGHUP, signal.SIG_IGN)\n"
+    process = start("-c", ignoring + COMMAND.format(body="time.sleep(1)"), folder=tmp_path)
+    assert process.stdout is not None and process.stdout.readline() == "ready\n"
+    process.send_signal(signal.SIGHUP)
+    assert process.communicate(timeout=60)[1] == "" and process.returncode == 0
+
+
+def test_importing_flockenv_leaves_a_users_signals_alone() -> None:
+    code = "import signal, flockenv, agents; assert signal.getsignal(signal.SIGINT) is signal.default_int_handler"
+    process = start("-c", code, folder=ROOT)
+    assert process.communicate(timeout=60)[1] == ""
+
+
+# --- nothing half-written
+
+
+@pytest.mark.parametrize("running", [True, False], ids=["running", "before it runs"])
+def test_what_is_half_written_is_removed(running: bool, tmp_path: Path) -> None:
+    (tmp_path / "old.json").write_text("old")
+    write = (
+        "with made(Path('new/deep')), replacing('new/deep/x.json') as one, replacing('old.json') as two:\n"
+        "    one.write(b'{'), two.write(b'{'), one.flush(), two.flush()\n"
+        "    print(len(list(Path('.').rglob('*.part'))), flush=True)\n    time.sleep(60)"
+    )
+    process = toy(
+        "with interrupts.running('toy'):\n    " + write.replace("\n", "\n    ") if running else write, tmp_path
+    )
+    assert process.stdout is not None and process.stdout.readline() == "2\n"
+    process.send_signal(signal.SIGINT)
+    process.communicate(timeout=60)
+    assert [path.name for path in tmp_path.rglob("*")] == ["old.json"]
+    assert (tmp_path / "old.json").read_text() == "old"
+
+
+def test_a_held_section_happens_whole(tmp_path: Path) -> None:
+    body = "with interrupts.held():\n    time.sleep(1.5)\n    Path('all').write_text('there')\ntime.sleep(60)"
+    process = toy(f"with interrupts.running('toy'):\n    {body.replace(chr(10), chr(10) + '    ')}", tmp_path)
+    process.send_signal(signal.SIGINT)
+    process.communicate(timeout=60)
+    assert process.returncode != 0 and (tmp_path / "all").read_text() == "there"
+
+
+# --- processes end with their parent
+
+WORK = """\
+import os, time
+from agents.processes import side_by_side
+
+def work(job, tell):
+    tell(os.getpid())
+    {doing}
+
+def told(pid):
+    print(pid, flush=True)
+
+if __name__ == "__main__":
+    list(side_by_side(work, [1, 2], 2, told))
+"""
+
+
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM], ids=lambda number: number.name)
+@pytest.mark.parametrize(
+    "doing", ["time.sleep(60)", "sum(k for k in range(10**12))"], ids=["waiting", "working"]
+)  # fmt: skip
+def test_processes_end_with_their_parent_however_it_ends(number: signal.Signals, doing: str, tmp_path: Path) -> None:
+    (tmp_path / "parent.py").write_text(WORK.format(doing=doing))
+    process = start("parent.py", folder=tmp_path)
+    assert process.stdout is not None
+    workers = [int(process.stdout.readline()) for _ in range(2)]
+    assert all(lives(pid) for pid in workers)
+    process.send_signal(number)
+    process.wait(timeout=60)
+    until = time.monotonic() + 5
+    while any(lives(pid) for pid in workers):
+        assert time.monotonic() < until, "a worker lives on"
+        time.sleep(0.05)
+    _, said = process.communicate(timeout=60)
+    assert "Traceback" not in said and "leaked" not in said
