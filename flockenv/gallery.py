@@ -35,6 +35,8 @@ def shown(behaviour: type[Effect]) -> Trajectory:
     scene = load_scene(behaviour.demo)
     steps = round(behaviour.demo_time / scene.dt)
     run = record(scene, 0, steps, max(1, steps // INSTANTS))
+    if run.stopped == "interrupted":
+        raise KeyboardInterrupt
     if run.stopped:
         raise ValueError(f"{kind}: its demo stops: {run.stopped}")
     return run

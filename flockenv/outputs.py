@@ -122,9 +122,9 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
                 os.fsync(file.fileno())
             part.replace(target)
     except OSError as error:
-        if error.filename not in (None, str(part), str(target)):  # writing to a file that is open names none: no room
+        if error.errno is None or error.filename not in (None, str(part), str(target)):  # an open file is not named
             raise
-        raise type(error)(f"cannot write {str(target)!r}: {error.strerror or error}") from None
+        raise type(error)(f"cannot write {str(target)!r}: {error.strerror}") from None
 
 
 @contextmanager

@@ -238,7 +238,7 @@ from flockenv import cli
 signal.signal(signal.SIGINT, signal.default_int_handler)  # a test run in the background ignores them, for all below
 
 @contextlib.contextmanager
-def progress(title, total, unit):
+def progress(title, total, unit, first=""):
     def show(done):
         if title == {moment!r} and done > 2:
             os.kill(os.getpid(), signal.SIGINT)
