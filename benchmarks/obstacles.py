@@ -27,7 +27,7 @@ APART = 5.0  # m, between obstacles
 FEWEST = 10  # obstacles that the plane has room for: with fewer, the same agents are in the same plane
 
 
-def among(count: int, kind: str = "block", dtype: str = "float32") -> Scene:
+def among(count: int, kind: str = "block", dtype: str = "float64") -> Scene:
     """Return agents among so many obstacles, in the plane, that lie near the points of a square lattice."""
     side, rows = APART * math.sqrt(max(count, FEWEST)), math.ceil(math.sqrt(count))
     rng = np.random.default_rng(1)
@@ -51,7 +51,7 @@ def among(count: int, kind: str = "block", dtype: str = "float32") -> Scene:
 
 def main(
     kind: Annotated[Literal["block", "capsule", "circle"], typer.Option(help="What the obstacles are.")] = "block",
-    dtype: Annotated[Literal["float32", "float64"], typer.Option(help="Precision of the scene.")] = "float32",
+    dtype: Annotated[Literal["float32", "float64"], typer.Option(help="Precision of the scene.")] = "float64",
     quick: Quick = False,
     rounds: Rounds = None,
     out: Out = None,

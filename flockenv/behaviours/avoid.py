@@ -93,7 +93,8 @@ def _turns_in_time(p: Any, me: Me, normal: Vec, aside: Vec, hit: float) -> bool:
     ahead = -dot(normal, me.heading)
     across = e - ahead * ahead
     depth = me.mass * dot(me.vel, me.vel) * (e + np.sqrt(across if across > o else o))
-    return (dot(aside, normal) > like(hit, -1e-5)) | (hit * ahead * force > depth)
+    in_time: bool = (dot(aside, normal) > like(hit, -1e-5)) | (hit * ahead * force > depth)
+    return in_time
 
 
 @law

@@ -46,7 +46,7 @@ def around(parts: Parts) -> str:
     """Return the source of `aside_of` and what it calls; empty if no effect goes around anything."""
     if not parts.goes_around:
         return ""
-    return _first_hit(parts) + _edge(parts) + _edge_beyond(parts) + _aside_of(parts)
+    return _row_ahead(parts) + _first_hit(parts) + _edge(parts) + _edge_beyond(parts) + _aside_of(parts)
 
 
 _WORLD = "obstacle_x, obstacle_radius, params, size, b, time"
@@ -93,6 +93,32 @@ def first_hit({_WORLD}, x, ray, room, most):
     """
 {indented(indented_lines(lines, 0), 4)}
     return best, form, row
+'''
+
+
+def _row_ahead(parts: Parts) -> str:
+    """Write where the row of an obstacle is that an agent remembers by its form and its place in that."""
+    lines: list[str] = []
+    for number, form in enumerate(FORMS):
+        if form not in parts.shaped[1]:
+            continue
+        at = f"np.int64(params[{parts.places_of(form)[0]}])"
+        lines.append(f"if form == {number}:")
+        if form in parts.looked_up:
+            lines.append(f"    return {at} + place")
+        else:
+            lines += [
+                f"    row = {at}",
+                "    for _ in range(place):",
+                "        row += np.int64(params[row])",
+                "    return row",
+            ]
+    return f'''
+
+@kernel
+def row_ahead(params, form, place):
+    """Return where the row of an obstacle begins, or the number of a circle of the state."""
+{indented([*lines, "return place"], 4)}
 '''
 
 
@@ -152,10 +178,9 @@ def edge_beyond({_WORLD}, form, row, hit, x, ray, side, room, most):
 def _aside_of(parts: Parts) -> str:
     """Write how the sides are compared: in the plane both, in space the normal's and those along and across a spine."""
     lines = [
-        f"hit, form, row = first_hit({_WORLD}, x, ray, room, ahead + room)",
+        "hit, form, place = known",
         "best, found, right = like(room, np.inf), zero(x), perpendicular(ray)",
-        "if form == -2 or hit <= like(room, 0.0):",
-        "    return found",
+        "row = row_ahead(params, form, place)",
         "out, spine = right, right",
         "if form == -1:",
         f"    out = touched_normal(offset_to(size, x, {tuple_of('obstacle_x[#, b, row]', parts.dimension)}), ray, hit)",
@@ -189,10 +214,10 @@ def _aside_of(parts: Parts) -> str:
     return f'''
 
 @routine
-def aside_of({_WORLD}, x, ray, room, ahead):
-    """Return the unit vector across a ray to the side where the edge of what is `ahead` m off is nearest to the impact.
+def aside_of({_WORLD}, x, ray, room, known):
+    """Return the unit vector across a ray to the side where the edge of what is ahead is nearest to the impact.
 
-    0 if nothing is in the way, the body overlaps it already, or it has no edge where the body passes.
+    0 if it has no edge where the body passes. known: how far ahead it is, m, its form, and its place in that.
     """
 {indented(indented_lines(lines, 0), 4)}
     return found

@@ -49,6 +49,7 @@ def obstacle_imports(parts: Parts) -> list[str]:
     if parts.trees:
         lines.append("from flockenv.shapes.tree import keep_in_order, meets_box, row_of_node")
         lines.append("from flockenv.shapes.head import vector_at")
+        lines.append("from flockenv.shapes.silhouette import near_way")
     cut = [(form, module) for form, module in forms if form in PIECED and any(e.obstacle_pieces for e in parts.effects)]
     return lines + [f"from {module} import piece_{form}, pieces_{form}" for form, module in cut]
 
@@ -91,6 +92,8 @@ def obstacles(parts: Parts, me: list[str], found_out: Callable[[int], str]) -> l
             within = "if dot(beside, beside) < seen * seen:"
             bound = [f"beside, seen = outside_box(params, at_, y), {slot('reach0')}"]
             met = [*bound, within, *indented_lines(met, 4)]
+        if form in parts.looked_up and parts.only_rays:
+            met = _near_a_ray(parts, [k for k, _ in asking], met)
         met = ["y = offset_to(size, place, x)", *met]
         if form in parts.looked_up:
             lines += _looked_up(parts, form, me, met, [k for k, _ in asking])
@@ -126,11 +129,21 @@ def _looked_up(parts: Parts, form: str, me: list[str], met: list[str], asking: l
     ]
 
 
+def _near_a_ray(parts: Parts, asking: list[int], met: list[str]) -> list[str]:
+    """Write that a shape is met only if a ray, as far as laws reach, comes into the circle or sphere around it."""
+    lines = ["touched = False"]
+    for k in asking:
+        for j in range(parts.effects[k].rays(parts.dimension)):
+            lines.append(f"ray, margin = obstacle_ray_{k}(p{k}, me, {j})")
+            lines.append("touched |= near_way(params, at_, y, ray, me.radius + margin, seen)")
+    return [*lines, "if touched:", *indented_lines(met, 4)]
+
+
 def _within_reach(parts: Parts, asking: list[int]) -> list[str]:
     """Write the box in which something may matter to agent i: around all rays, if laws cast them, or around it."""
     d = parts.dimension
     lines = [f"seen = {Slots(parts)('reach0')} * like(x[0], {LOOSE!r})"]
-    if not all(parts.effects[k].obstacle_ray for k in asking):
+    if not parts.only_rays:
         return [*lines, f"middle, around = x, {tuple_of('seen', d)}"]
     lines.append("low, high, wide = zero(x), zero(x), like(seen, 0.0)")
     for k in asking:
@@ -161,13 +174,15 @@ def _asides(parts: Parts, asking: list[tuple[int, list[str]]], me: list[str]) ->
         if not parts.effects[k].obstacle_edges:
             continue
         world = "obstacle_x, obstacle_radius, params, size, b, time"
+        which, row = Slots(parts).all(f"ahead{k}_")
         lines += [
             f"for l in range(np.uint64({parts.width})):",
             f"    impact = {slots[0]}",
             "    if impact > 0 and impact < like(impact, np.inf):",
             *indented_lines(me, 8),
             f"        ray, margin = obstacle_ray_{k}(p{k}, me, 0)",
-            f"        edgeward = aside_of({world}, x, ray, me.radius + margin, impact)",
+            f"        known = impact, np.int64({which}), np.int64({row})",
+            f"        edgeward = aside_of({world}, x, ray, me.radius + margin, known)",
             *(f"        {s} = edgeward[{j}]" for j, s in enumerate(slots[-parts.dimension :])),
         ]
     return lines
@@ -194,8 +209,25 @@ def _meet(parts: Parts, asking: list[tuple[int, list[str]]], form: str) -> list[
                 continue
             lines += _touched(form, k, j, vel) if effect.obstacle_ray else _near(form, from_, vel)
             lines.append(f"found = obstacle_law_{k}(p{k}, me, it, ({', '.join(slots)},))")
+            if effect.obstacle_edges:
+                lines += _remembered(parts, k, form, slots[0])
             lines += _kept(slots, _seen(parts, "it.gap", "it.normal") if effect.occluded_obstacles else "")
     return lines
+
+
+def _remembered(parts: Parts, k: int, form: str, ahead: str) -> list[str]:
+    """Write down which obstacle is ahead, where the law keeps another one than before.
+
+    By its form, and its place among those, or of a form with a tree by how far its row lies behind the first.
+    """
+    which, row = Slots(parts).all(f"ahead{k}_")
+    number = -1 if form == CIRCLE else list(FORMS).index(form)
+    place = f"at_ - {form}_at" if form in parts.looked_up else "m"
+    return [
+        f"another = found[0] != {ahead}",
+        f"{which} = like(found[0], {number}) if another else {which}",
+        f"{row} = like(found[0], {place}) if another else {row}",
+    ]
 
 
 def _kept(slots: list[str], when: str) -> list[str]:
@@ -296,7 +328,7 @@ def _touched_side(form: str) -> str:
 def each_row(parts: Parts, form: str, middle: str, reach: str, met: list[str], box: list[str]) -> list[str]:
     """Write a loop over the shapes of a form, at `at_`: all, or of a tree those that come within `reach` of `middle`.
 
-    box: how these two are worked out, which is done anew at each node. In no order that may be relied on.
+    box: how these two are worked out, which is done anew behind each shape. In no order that may be relied on.
     """
     at, count, tree = (f"np.int64(params[{place}])" for place in parts.places_of(form))
     if form not in parts.trees:
@@ -310,14 +342,14 @@ def each_row(parts: Parts, form: str, middle: str, reach: str, met: list[str], b
         f"node = {tree} + 1",
         "end = node + np.int64(params[node - 1])",
         "begin = node",
+        *box,
         "while node < end:",
-        *indented_lines(box, 4),
         f"    if meets_box(params, node, offset_to(size, {middle}, vector_at(params, node + 2, {middle})), {reach}):",
         "        at_ = row_of_node(params, node)",
         f"        node += {node_length(parts.dimension)}",
         "        if at_ >= 0:",
         f"            at_ += {at}",
-        *indented_lines(met, 12),
+        *indented_lines([*met, *box], 12),
         "    else:",
         "        node = begin + np.int64(params[node])",
     ]

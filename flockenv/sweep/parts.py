@@ -165,6 +165,11 @@ class Parts:
         return tuple(self.trees) if self.reaches else ()
 
     @property
+    def only_rays(self) -> bool:
+        """True if all folds over obstacles cast rays."""
+        return all(e.obstacle_ray is not None for e in self.effects if e.obstacle_start is not None)
+
+    @property
     def goes_around(self) -> bool:
         """True if any effect goes around what is in its way by the nearest edge."""
         return any(e.obstacle_start is not None and e.obstacle_edges for e in self.effects)
@@ -516,6 +521,8 @@ class Parts:
             ("bond", d * bool(self.bonded)),
             ("far", d * bool(self.far)),
         ]
+        edges = [k for k, e in enumerate(self.effects) if e.obstacle_start and e.obstacle_edges]
+        runs += [(f"ahead{k}_", 2) for k in edges]
         runs += [("found", -(-MOST_FOUND // self.width) * bool(self.looked_up))]
         runs += [("reach", int(bool(self.bounded or self.looked_up))), ("here", int(self.parting))]
         runs += [("next", (d + 1) * self.looks_ahead)]
