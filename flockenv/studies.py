@@ -50,7 +50,10 @@ def accuracy(
     finer: Annotated[
         int | None,
         typer.Option(
-            metavar="N", min=4, help="Steps of a reference of own steps for each of the finest [default: up to 64]."
+            metavar="N",
+            min=4,
+            help="Steps of a reference of own steps for each of the finest.",
+            show_default="up to 64",
         ),
     ] = None,
     seed: Seed = 0,

@@ -264,8 +264,9 @@ def b23_out_of_turn(tmp_path: Path) -> None:
     env.reset(seed=0)
     env.step(still(env))
     assert env.agents == []
+    assert env.step({}) == ({}, {}, {}, {}, {})  # as PettingZoo's own
     with pytest.raises(ResetNeeded, match="reset"):
-        env.step({})
+        env.step({env.possible_agents[0]: np.zeros(2)})
     closed = single()
     closed.reset(seed=0)
     closed.close()

@@ -121,6 +121,7 @@ def test_a_command_ends_wherever_it_is(body: str, tmp_path: Path) -> None:
     process = toy(body, tmp_path)
     if "go" in body:
         assert process.stdout is not None and process.stdout.readline() == "go\n"
+        time.sleep(0.5)  # from the line that says so into the next
     process.send_signal(signal.SIGINT)
     _, said = process.communicate(timeout=60)
     if process.returncode == 130:

@@ -416,6 +416,10 @@ FEW = pytest.mark.parametrize(
 )
 
 
+ONE_LONG_STEP = pytest.mark.filterwarnings("ignore::flockenv.stability.UnstableStepWarning")
+"""A step of 1 s shows an acceleration; nothing goes on from there."""
+
+
 def one_at_a_time(variant: Variant, count: int, edge: float) -> list[tuple[Any, Scene]]:
     """Every rule of a variant, and a scene in which the others are there and weigh nothing; a step of 1 s, no limits.
 
@@ -457,6 +461,7 @@ def assert_few_as_expected(variant: Variant, x: Array, edge: float, hair: float 
     return after
 
 
+@ONE_LONG_STEP
 @pytest.mark.parametrize("count", [1, 2, 5, 40, 95, 96, 1500])
 @FEW
 def test_the_nearest_few_are_the_oracle_s(variant: Variant, count: int) -> None:
@@ -468,6 +473,7 @@ def test_the_nearest_few_are_the_oracle_s(variant: Variant, count: int) -> None:
         assert after.counted("pairs") < 0.8 * count**2
 
 
+@ONE_LONG_STEP
 @FEW
 @pytest.mark.parametrize("share", [0.4, 1.0])
 def test_whoever_is_exactly_as_far_as_the_last_counts_too(variant: Variant, share: float) -> None:
@@ -485,6 +491,7 @@ def test_whoever_is_exactly_as_far_as_the_last_counts_too(variant: Variant, shar
     assert_few_as_expected(variant, x, float(side), hair=0.0)
 
 
+@ONE_LONG_STEP
 @FEW
 def test_the_nearest_few_are_found_among_the_living(variant: Variant) -> None:
     living = np.random.default_rng(3).random(500) < 0.6

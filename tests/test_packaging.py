@@ -193,7 +193,7 @@ def test_the_top_level_is_what_contributors_are_told() -> None:
     done = subprocess.run(["git", "ls-files"], cwd=ROOT, capture_output=True, text=True, check=False)
     tops = {line.split("/")[0] for line in done.stdout.splitlines()}
     allowed = {
-        *("pyproject.toml", "README.md", "LICENSE", "CHANGELOG.md", "CONTRIBUTING.md", "CITATION.cff"),
+        *("pyproject.toml", "README.md", "LICENSE", "CHANGELOG.md", "CONTRIBUTING.md", "CITATION.cff", "MANIFEST.in"),
         *("flockenv", "agents", "configs", "tests", "docs", "benchmarks"),
     }
     assert {top for top in tops if not top.startswith(".")} <= allowed

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import os
+import shutil
 import stat
 import subprocess
 import sys
+import tempfile
 from collections.abc import Callable
 from pathlib import Path
 
@@ -179,10 +181,9 @@ def test_what_was_planted_in_the_temporary_folder_does_not_run(make: Callable[[P
 
 
 @as_root
-def test_a_user_is_not_given_the_folders_of_another(tmp_path_factory: pytest.TempPathFactory) -> None:
-    with_root = tmp_path_factory.mktemp("shared")
-    for above in (with_root, with_root.parent, with_root.parent.parent):
-        above.chmod(above.stat().st_mode | 0o055)
+def test_a_user_is_not_given_the_folders_of_another(request: pytest.FixtureRequest) -> None:
+    with_root = Path(tempfile.mkdtemp())  # that of pytest is closed to others
+    request.addfinalizer(lambda: shutil.rmtree(with_root))
     with_root.chmod(0o1777)
     for name in (f"flockenv-{VICTIM}", f"flockenv-{VICTIM}-0000"):
         of_a_stranger(with_root / name)

@@ -155,12 +155,12 @@ def test_more_rounds_are_added_to_those_that_are_kept() -> None:
 
 
 DAMAGED = [
-    ("reynolds-*.json", ""),
-    ("reynolds-*.json", '{"returns": [1.0, 2.0'),
-    ("reynolds-*.json", '{"returns": [1.0, 2.0], "success": [true, true]}'),
-    ("reynolds-*.json", '{"returns": [1.0, 2.0, NaN], "success": [true, true, true]}'),
-    ("reynolds-*.json", '{"success": [true, true, true]}'),
-    ("reynolds-*.json", "[1, 2]"),
+    ("rules-*.json", ""),
+    ("rules-*.json", '{"returns": [1.0, 2.0'),
+    ("rules-*.json", '{"returns": [1.0, 2.0], "success": [true, true]}'),
+    ("rules-*.json", '{"returns": [1.0, 2.0, NaN], "success": [true, true, true]}'),
+    ("rules-*.json", '{"success": [true, true, true]}'),
+    ("rules-*.json", "[1, 2]"),
     ("clock-*.json", '{"rounds": [{"a": "b"}], "error_mm": {}}'),
     ("clock-*.json", '{"rounds": [], "error": {}}'),
     ("clock-*.json", "\x00"),
@@ -168,7 +168,7 @@ DAMAGED = [
 
 
 def test_a_kept_file_that_is_damaged_is_named_in_one_line() -> None:
-    asked = (*TINY, *TRAINED, "--players", "reynolds")
+    asked = (*TINY, *TRAINED, "--players", "rules")
     run(*asked)
     for name, content in DAMAGED:
         [path] = KEPT.rglob(name)
