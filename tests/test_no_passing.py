@@ -304,10 +304,12 @@ def test_in_no_scene_do_bodies_overlap_pass_or_gain_energy(response: str, dimens
     state = of.start(0).with_motion(pos[None], vel[None])
     mass, last = of.body.mass, np.inf
     for _ in range(200):
-        before, state = state.pos[0].copy(), of.step(state)
-        assert overlap(state.pos[0], R, size) < (0.06 if response in EXACT else 0.9) * R
+        before, before_v, state = state.pos[0].copy(), state.vel[0].copy(), of.step(state)
+        assert overlap(state.pos[0], R, size) < (0.06 if response in EXACT else 1.2) * R
         assert not passes(before, state.pos[0], 2 * R)
         now = kinetic(of, state) + float((mass * pull * state.pos[0, :, 1]).sum())
         lift = float(mass.sum()) * pull * (0.01 if response in EXACT else 0.3) * R  # what is moved apart may rise
+        if response not in IN_TIME:  # an impact at the end of a step is up to a step of falling off
+            lift += float((mass * pull * dt * np.linalg.norm(before_v, axis=1)).sum())
         assert now <= last * (1 + 1e-9) + lift
         last = now

@@ -90,7 +90,11 @@ def _common_reach(living: Any, radius: Any, reach: Any, n: int, many: Any) -> fl
     while k < 63 and seen + many[k] < 0.98 * present:
         seen += many[k]
         k += 1
-    return 2.0 ** (k + 1 - 32)
+    limit, widest = 2.0 ** (k + 1 - 32), 0.0
+    for i in range(n):
+        ball = radius[i] + reach[i]
+        widest = max(widest, ball if living[i] > 0 and ball <= limit else 0.0)
+    return 1.000001 * widest if widest > 0.0 else limit  # cells no larger than they must be
 
 
 @kernel

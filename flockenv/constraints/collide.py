@@ -28,7 +28,10 @@ ROUNDS = 8
 """How often those that touch are gathered anew, where moving bodies apart has led them into others."""
 
 DEEPEST = 0.25
-"""Part of a radius by which two may overlap after the single pass of `project`."""
+"""Part of a radius by which two may overlap after the single pass of `project`, before it makes more of them."""
+
+CROWDED = 0.5
+"""Part of its radius by which a body is moved so far that `project` looks for its new neighbours, too."""
 
 EXACT = 8 * 2.0**-52
 """Rounding of a coordinate, times how large it is."""
@@ -262,7 +265,7 @@ def _at_the_end(
             period, bodies, things, contacts, ends, before, rules, in_time, once, rounds, hard, least, gain, touching,
             report,
         )  # fmt: skip
-    turned = touching > 0 and not in_time and not once and _moved_far(period, bodies, ends)
+    turned = touching > 0 and not in_time and not once and _moved_far(period, bodies, ends, 0.5 * DEEP)
     again = passing or (turned and may_pass(period, bodies, things, ends, rules.seconds, True))
     if again:
         count = stop_on_the_way(period, bodies, meetings, things, ends, rules, count, lost)
@@ -320,9 +323,10 @@ def _places(
     anew: True if bodies have moved since those that touch were gathered. That is done again, too, where bodies are
     moved so far that they may overlap others; two that part slowly on purpose are moved once.
     """
-    deep = 0.0
+    deep, elsewhere = 0.0, False
     for turn in range(ROUNDS):
-        if turn > 0:
+        if turn > 0 and (elsewhere or _beyond(period, bodies, ends, reach)):
+            elsewhere = True
             count = _meetings(period, bodies, meetings, things, ends, rules, reach, False, True, scratch)
         if count > meetings.who.shape[0]:
             return count, deep
@@ -338,9 +342,19 @@ def _places(
         )
         if once and deep > DEEPEST * _widest(bodies):
             deep = part(period, bodies, things, ends, rules.seconds, rounds, rules.touch, spread, contacts, touching)
-        if once or spread < np.inf or not _moved_far(period, bodies, ends):
+        if spread < np.inf or not _moved_far(period, bodies, ends, CROWDED if once else 0.5 * DEEP):
             break
     return count, deep
+
+
+@kernel
+def _beyond(period: Vec, bodies: Bodies, ends: Ends, reach: Any) -> bool:
+    """True if a body is further from where it began than meetings were listed for."""
+    for i in range(bodies.living.shape[0]):
+        moved = image(period, sub(vector(period, ends.pos, i), vector(period, bodies.start, i)))
+        if bodies.living[i] > 0 and norm(moved) > max(reach[i], bodies.reach[i]):
+            return True
+    return False
 
 
 @kernel
@@ -371,11 +385,11 @@ def _widest(bodies: Bodies) -> float:
 
 
 @kernel
-def _moved_far(period: Vec, bodies: Bodies, ends: Ends) -> bool:
-    """True if a body was moved so far from bodies.at that it may overlap one that it was not near by DEEP."""
+def _moved_far(period: Vec, bodies: Bodies, ends: Ends, share: float) -> bool:
+    """True if a body was moved from bodies.at by more than this part of its radius: it may now overlap another."""
     for i in range(bodies.living.shape[0]):
         d = sub(vector(period, ends.pos, i), vector(period, bodies.at, i))
-        if bodies.living[i] > 0 and norm(d) > 0.5 * DEEP * bodies.radius[i]:
+        if bodies.living[i] > 0 and norm(d) > share * bodies.radius[i]:
             return True
     return False
 

@@ -93,6 +93,8 @@ def gather(
     for c in range(count):
         i, j = meetings.who[c], meetings.other[c]
         margin = max(touch, NEARLY * width(bodies, i, j))
+        if j >= 0 and not passing and _far_apart(period, bodies, ends, i, j, margin):
+            continue
         gap, n = _normal(period, bodies, things, ends.pos, ends, seconds, i, j)
         begun, first, passed = gap, n, False
         if passing:
@@ -118,6 +120,14 @@ def gather(
             found += 1
     _sort(contacts.rank, contacts.order, found)
     return found
+
+
+@kernel
+def _far_apart(period: Vec, bodies: Bodies, ends: Ends, i: int, j: int, margin: float) -> bool:
+    """True if two bodies are further apart than a margin at the end of a step, m: without a square root."""
+    d = image(period, sub(vector(period, ends.pos, i), vector(period, ends.pos, j)))
+    room = 1.000001 * (bodies.radius[i] + bodies.radius[j] + margin)
+    return bool(dot(d, d) > room * room)
 
 
 @kernel
