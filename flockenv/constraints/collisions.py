@@ -36,13 +36,13 @@ class Collisions(Constraint):
 
     - "earliest": the earliest impact of all happens, both bodies go on from there, their further paths are searched
       anew, and so on; nothing is missed, and an elastic ball keeps its energy.
-    - "back_up": the same with at most ten impacts of the same two bodies in a step, whatever `most` is.
+    - "back_up": the same with at most 30 impacts of the same two bodies in a step, whatever `most` is.
     - "impulses": at the end of a step all bodies in touch exchange impulses, in passes, until none goes into another.
       For heaps and crowds. A body whose path leads into something stops there, and has its impact in the next step.
     - "project": one such pass, and a body inside something is put on the surface. The cheapest; it loses energy at
-      every impact, and friction holds no body in place.
+      every impact, friction holds no body in place, and light ones may be thrown past others in a heavy crowd.
 
-    No body passes another under any response. Where the impacts of a step run out, the two bodies stop: they keep
+    Else no body passes another. Where the impacts of a step run out, the two bodies stop: they keep
     their velocities and do not move for the rest of the step, and what runs into them stops, too. So time is lost, and
     neither energy nor momentum; "stopped" counts such bodies, and a warning says how much time. Two that meet slower
     than a step's acceleration changes velocity come to rest instead; the warning says how much energy that took.
@@ -68,7 +68,7 @@ class Collisions(Constraint):
     )
     capacity: ClassVar[int] = 4
     """Meetings per agent that there is room for at first."""
-    again: ClassVar[int] = 10
+    again: ClassVar[int] = 30
     """Impacts of the same two bodies in one step under `back_up`."""
 
     def check(self, scene: Any) -> None:

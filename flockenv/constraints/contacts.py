@@ -18,7 +18,7 @@ from flockenv.constraints.impact import bounced, surface
 from flockenv.kernels import Vec, kernel
 from flockenv.vec import add, axis, dot, norm, scale, select, sub, unit, zero
 
-__all__ = ["NEARLY", "Contacts", "Ends", "gather", "impacts", "part", "press"]
+__all__ = ["NEARLY", "Contacts", "Ends", "deepest", "gather", "impacts", "part", "press"]
 
 
 NEARLY = 0.1
@@ -101,7 +101,7 @@ def gather(
             begun, first = _normal(period, bodies, things, bodies.start, ends, 0.0, i, j)
             passed = begun <= margin and (gap < -margin or dot(n, first) < 0.5)
             n = select(passed, first, n)
-        if gap <= margin or passed:
+        if (gap <= margin and not (passing and gap < -margin)) or passed:  # what came from afar stops on the way
             contacts.who[found], contacts.other[found] = i, j
             w = -dot(_seen(period, things, ends.vel, i, j), n)
             heap = restitution < 1.0 if j >= 0 else bodies.leans[i] > 0
@@ -328,6 +328,18 @@ def part(
         if worst <= touch:
             break
     return worst
+
+
+@kernel
+def deepest(
+    period: Vec, bodies: Bodies, things: Things, ends: Ends, seconds: float, contacts: Contacts, count: int
+) -> float:
+    """Return how far two overlap at most at the end of a step, m."""
+    deep = 0.0
+    for c in range(count):
+        gap, _ = _normal(period, bodies, things, ends.pos, ends, seconds, contacts.who[c], contacts.other[c])
+        deep = max(deep, -gap)
+    return deep
 
 
 @kernel

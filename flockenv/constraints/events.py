@@ -198,7 +198,7 @@ def _hit_anew(period: Vec, bodies: Bodies, meetings: Meetings, things: Things, r
     At most so often that a step has an end.
     """
     i, j = meetings.who[c], meetings.other[c]
-    if rules.sticky or meetings.hits[c] >= ANEW * (rules.most + 1):
+    if meetings.hits[c] >= ANEW * (rules.most + 1):
         return False
     y, v, _ = relative(period, bodies, things, i, j, t)
     row, _ = met(bodies, things, i, j)

@@ -87,7 +87,10 @@ def stop_on_the_way(
         y, _, _ = relative(period, bodies, things, i, j, 0.0)
         row, room = met(bodies, things, i, j)
         begun = surface(things.table, row, y)[0] - room
-        meetings.deep[c] = DEEP * width(bodies, i, j) + 10.0 * rules.touch + max(-begun, 0.0)
+        # two that begin near each other rest, and are parted by little; what comes from afar stops at the surface, or
+        # it would be lifted out of it
+        near = max(DEEP * width(bodies, i, j) - max(begun, 0.0), 0.0)
+        meetings.deep[c] = near + 10.0 * rules.touch + max(-begun, 0.0)
     _, _, count = play(period, bodies, meetings, things, rules, count, lost)
     if count <= meetings.who.shape[0]:
         for i in range(n):
