@@ -11,7 +11,7 @@ import warnings
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from time import perf_counter
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 from pydantic import Field
 
@@ -67,6 +67,8 @@ class Case:
 class Finding(Record):
     """What one case came to under one method or model."""
 
+    simulated: ClassVar[bool] = False
+
     case: str
     title: str
     under: str = Field(description="the method, or the model")
@@ -85,6 +87,8 @@ class Finding(Record):
 
 class Results(Record):
     """All that was found, and by which sources."""
+
+    simulated: ClassVar[bool] = False
 
     findings: tuple[Finding, ...]
     sources: str = Field(default="", description="fingerprint of the sources that it hangs by")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 from itertools import takewhile
-from typing import Literal
+from typing import ClassVar, Literal
 
 import numpy as np
 
@@ -37,6 +37,8 @@ class Machine(Record):
 
 class Point(Record):
     """One method in one setting, taken from the start to the end; what has no number is none."""
+
+    simulated: ClassVar[bool] = False
 
     steps: int
     """Calls of the method."""
@@ -71,6 +73,8 @@ class Point(Record):
 class Choice(Record):
     """A setting that keeps to a tolerance, and what it costs."""
 
+    simulated: ClassVar[bool] = False
+
     method: str
     dt: float
     tolerance: float | None
@@ -84,6 +88,8 @@ class Choice(Record):
 
 class Curve(Record):
     """A method, from its cheapest point to its dearest."""
+
+    simulated: ClassVar[bool] = False
 
     method: str
     declared: int
@@ -132,6 +138,8 @@ class Curve(Record):
 
 class Report(Record):
     """One problem, all methods."""
+
+    simulated: ClassVar[bool] = False
 
     name: str
     title: str
@@ -187,6 +195,8 @@ class Report(Record):
 
 class Results(Record):
     """Reports as they lie in a file."""
+
+    simulated: ClassVar[bool] = False
 
     format: Literal[1] = FORMAT  # type: ignore[assignment]
     reports: tuple[Report, ...]

@@ -6,7 +6,7 @@ import hashlib
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 from pydantic import Field
@@ -44,6 +44,8 @@ class Experiment:
 class Cell(Record):
     """The numbers of one case under one variant."""
 
+    simulated: ClassVar[bool] = False
+
     case: str
     variant: str
     numbers: dict[str, float | None] = Field(description="by column; none has no value")
@@ -51,6 +53,8 @@ class Cell(Record):
 
 class Results(Record):
     """All that was measured, and by which sources."""
+
+    simulated: ClassVar[bool] = False
 
     experiment: str
     title: str
