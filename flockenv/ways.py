@@ -15,7 +15,6 @@ from numpy.typing import ArrayLike, NDArray
 from flockenv.eikonal import NO_WAY, Start, free_part, way_table
 from flockenv.grid import MOST_POINTS, covers, sample, sample_vector, sampled
 from flockenv.kernels import Vec, law
-from flockenv.population import Emitter
 from flockenv.space import Torus
 from flockenv.targets import Target, to_any
 from flockenv.vec import norm, select, unit
@@ -81,8 +80,9 @@ def starts_of(scene: Any, which: int | None) -> list[Start]:
         low, high = group.spawn.low or (0.0,) * scene.dimension, group.spawn.high or size
         if which in (None, k) and group.network is None and scene.living[k] and high is not None:
             found.append(Start(f"groups[{k}]", np.array(low, float), np.array(high, float)))
+    wanted = range(len(scene.groups)) if which is None else (which,)
     for k, member in enumerate(scene.population):
-        if isinstance(member, Emitter) and which in (None, member.group):
+        if any(map(member.feeds, wanted)):
             places = np.asarray(member.place.extremes, float)
             found.append(Start(f"population[{k}]", places.min(axis=0), places.max(axis=0)))
     return found

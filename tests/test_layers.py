@@ -236,3 +236,23 @@ def test_the_simulator_needs_no_torch() -> None:
     )
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=False)
     assert done.stdout == "loaded\n", done.stderr
+
+
+FIRST = """
+import os, sys, numba, numpy, pydantic
+for name in sys.argv[1:]:
+    if (child := os.fork()) == 0:
+        sys.stderr = open(os.devnull, "w")
+        __import__(name)
+        os._exit(0)
+    if os.waitpid(child, 0)[1]:
+        print(name)
+"""
+
+
+@pytest.mark.slow
+def test_every_module_can_be_the_first_to_be_imported() -> None:
+    files = [path.relative_to(ROOT).with_suffix("") for path in sorted((ROOT / "flockenv").rglob("*.py"))]
+    names = [".".join(path.parts).removesuffix(".__init__") for path in files if path.name != "__main__"]
+    run = subprocess.run([sys.executable, "-c", FIRST, *names], cwd=ROOT, text=True, stdout=subprocess.PIPE, check=True)
+    assert run.stdout == "", "these can't"

@@ -7,12 +7,14 @@ from typing import Any
 
 import numpy as np
 import pytest
+from numba import njit
 
 from flockenv.arbitration import Priority
 from flockenv.behaviours import AvoidObstacles, Seek, Whiskers
 from flockenv.constraints import Collisions
 from flockenv.scene import Group, Scene
 from flockenv.shapes import Block, Capsule, Circle, DistanceField, HalfSpace, Polygon, Shape, Wall
+from flockenv.shapes.silhouette import sphere_edge
 from flockenv.spawn import Spawn
 from flockenv.steer import Steer
 
@@ -102,12 +104,12 @@ def test_whiskers_go_over_the_near_edge() -> None:
     assert trip(LONG["block"], Whiskers(weight=8))[0] < 14.5
 
 
-def first_force(obstacles: tuple[Shape, ...], heading: tuple[float, float], at: tuple[float, float] = (0, 0)) -> Any:
+def first_force(obstacles: tuple[Shape, ...], heading: tuple[float, ...], at: tuple[float, ...] = (0, 0)) -> Any:
     """Return what an agent of 2 m/s is made to do by them, N."""
     spawn = Spawn(low=at, high=at, speed=(2, 2), heading=heading)
     scene = Scene(
-        groups=(Group(count=1, radius=0.2, spawn=spawn),), effects=(AvoidObstacles(weight=8, horizon=3),),
-        obstacles=obstacles, dt=0.02,
+        dimension=len(at), groups=(Group(count=1, radius=0.2, spawn=spawn),),
+        effects=(AvoidObstacles(weight=8, horizon=3),), obstacles=obstacles, dt=0.02,
     )  # fmt: skip
     return scene.acceleration(scene.start(0))[0, 0]
 
@@ -124,6 +126,39 @@ def test_dead_ahead_of_a_middle_it_keeps_right_and_a_hair_beside_it_to_the_near_
         np.testing.assert_allclose(first_force((block,), (1, 0)), [0, -8], atol=1e-9)
         np.testing.assert_allclose(first_force((block,), (1, 0), (0, 0.01)), [0, 8], atol=1e-9)
         np.testing.assert_allclose(first_force((block,), (1, 0), (0, -0.01)), [0, -8], atol=1e-9)
+
+
+@pytest.mark.parametrize("distance", [1.4, 3.0])
+def test_in_space_it_turns_away_from_the_middle_of_a_sphere(distance: float) -> None:
+    """Near or far: to other sides the turn is longer, as long as nothing is in the way on this one."""
+    for around in (0.3, 1.2, 2.9, 4.4):
+        side = np.array([0, math.cos(around), math.sin(around)])
+        ball = Circle(centre=(distance, *(-0.9 * side[1:])), radius=1.0)
+        np.testing.assert_allclose(first_force((ball,), (1, 0, 0), (0, 0, 0)), 8 * side, atol=1e-9)
+
+
+def test_in_space_it_passes_a_sphere_on_the_side_away_from_what_blocks_the_nearest_one() -> None:
+    """The near side is up, where a ball blocks it, a little to the left; the same in the mirror, to the right."""
+    ball = Circle(centre=(3, 0, -0.1), radius=1.0)
+    for left in (1, -1):
+        force = first_force((ball, Circle(centre=(3.2, 0.3 * left, 2.0), radius=1.2)), (1, 0, 0), (0, 0, 0))
+        np.testing.assert_allclose(force, [0, -8 * left, 0], atol=1e-9)
+
+
+@njit
+def edge_of_sphere(to: Any, ray: Any, side: Any, room: float) -> tuple[float, float]:
+    return sphere_edge(to, ray, side, room)
+
+
+def test_the_edge_of_a_sphere_is_where_a_turned_ray_touches_it() -> None:
+    rng = np.random.default_rng(0)
+    for _ in range(50):
+        ray, side = np.linalg.qr(rng.normal(size=(3, 2)))[0].T
+        room, off, ahead = 1.3, rng.uniform(0, 1.2), rng.uniform(1.4, 6)
+        to = ahead * ray + off * (u := np.cross(ray, side) * 0.6 + 0.8 * side) / np.linalg.norm(u)
+        turn, reach = edge_of_sphere(tuple(to), tuple(ray), tuple(side), room)
+        way = np.cos(turn) * ray + np.sin(turn) * side
+        assert to @ way == pytest.approx(reach) and np.linalg.norm(to - reach * way) == pytest.approx(room)
 
 
 def test_a_pocket_is_left_by_its_nearer_end() -> None:

@@ -118,8 +118,9 @@ class AvoidObstacles(Effect):
     from its centre; dead ahead of a middle an agent keeps right. An edge is where the body passes, with a radius to
     spare beyond it: walls that are joined, or leave a gap that is too narrow, are one obstacle. What has no edge (a
     half-space, a room), or is too near for a turn to that edge at a radius of m v^2 / F, is avoided along the side of
-    its normal. In space the edges to the sides of the shadow that the obstacle casts across the heading are compared.
-    An obstacle that moves is avoided where it is, as if it stood still.
+    its normal. In space the edges on five sides are compared: of the normal, and along and across the obstacle's own
+    axis; of a sphere, which has none, away from what blocks the side of the normal and across that. An obstacle that
+    moves is avoided where it is, as if it stood still.
     """
 
     kind: Literal["avoid_obstacles"] = "avoid_obstacles"

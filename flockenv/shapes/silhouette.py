@@ -6,8 +6,9 @@ it keeps clear. It returns by what angle (rad, 0 to 2 pi and more) the ray must 
 just passes the shape, and how far along the turned ray it is beside it then (m). Both are infinite if the shape has no
 edge there: a half-space is passed at infinity, a room never.
 
-In space, turned rays lie in the plane of `ray` and `side`, and it is the shadow of the shape on that plane that is
-passed. Reynolds 1988, "Not Bumping Into Things".
+In space, turned rays lie in the plane of `ray` and `side`. Of a sphere the edge is exact; of a chain or block it is the
+shadow on that plane that is passed, which has no edge for a body that stands beside the shape and in its shadow.
+Reynolds 1988, "Not Bumping Into Things".
 """
 
 from __future__ import annotations
@@ -26,8 +27,8 @@ from flockenv.shapes.hollow import hit_hollow_distance_field
 from flockenv.vec import add, axis, dot, scale, sub
 
 __all__ = [
-    "disc_edge", "edge_block", "edge_chain", "edge_distance_field", "edge_half_space", "edge_hollow_block",
-    "edge_hollow_chain", "edge_hollow_distance_field", "near_way", "spine_block", "spine_chain",
+    "edge_block", "edge_chain", "edge_distance_field", "edge_half_space", "edge_hollow_block",
+    "edge_hollow_chain", "edge_hollow_distance_field", "near_way", "sphere_edge", "spine_block", "spine_chain",
 ]  # fmt: skip
 
 FAN = 24
@@ -47,8 +48,10 @@ def _bearing(to: Vec, ray: Vec, side: Vec) -> float:
 @law
 def _beside(to: Vec, ray: Vec, side: Vec, room: float) -> tuple[float, float]:
     """Return the angle between the middle of a disc of radius `room` and its tangent, rad, and how far that touches."""
-    along, across = dot(to, ray), dot(to, side)
-    square, o = along * along + across * across - room * room, like(room, 0.0)
+    along, across, o = dot(to, ray), dot(to, side), like(room, 0.0)
+    square = along * along + across * across - room * room
+    if len(to) == 3 and square <= o and dot(to, to) > room * room:
+        return like(room, np.inf), o  # in its shadow, but not in it
     reach = np.sqrt(square if square > o else o)
     return atan2(room, reach), reach
 
@@ -66,10 +69,24 @@ def near_way(table: Any, at: int, x: Vec, ray: Vec, room: float, length: float) 
 
 
 @law
-def disc_edge(to: Vec, ray: Vec, side: Vec, room: float) -> tuple[float, float]:
-    """Return the edge of a circle or sphere whose centre is at `to`, m; room: both radii and what is kept clear."""
+def _disc_edge(to: Vec, ray: Vec, side: Vec, room: float) -> tuple[float, float]:
+    """Return the edge of the shadow of a circle or sphere whose centre is at `to`, m; room: as of a sphere's edge."""
     half, reach = _beside(to, ray, side, room)
     return _bearing(to, ray, side) + half, reach
+
+
+@law
+def sphere_edge(to: Vec, ray: Vec, side: Vec, room: float) -> tuple[float, float]:
+    """Return the edge of a circle or sphere whose centre is at `to`, m; room: both radii and what is kept clear.
+
+    Of a sphere by the circle in which the plane of `ray` and `side` cuts it: tangents to both are equally long.
+    """
+    if len(to) == 2:
+        return _disc_edge(to, ray, side, room)
+    along, across, o = dot(to, ray), dot(to, side), like(room, 0.0)
+    square, wide = dot(to, to) - room * room, room * room - dot(to, to) + along * along + across * across
+    reach = np.sqrt(square if square > o else o)
+    return _bearing(to, ray, side) + atan2(np.sqrt(wide if wide > o else o), reach), reach
 
 
 @law
@@ -81,11 +98,13 @@ def edge_chain(table: Any, at: int, x: Vec, ray: Vec, side: Vec, room: float) ->
     body = body_of(at, x)
     count: Any = np.int64(table[body])
     room = room + table[body + 1]
+    if count == 1:
+        return sphere_edge(sub(vertex(table, at, 0, x), x), ray, side, room)
     closed = table[body + 2] > like(room, 0.0)
     j: Any = _touched_piece(table, at, x, ray, room)
     a, b = sub(vertex(table, at, j, x), x), sub(vertex(table, at, (j + 1) % count, x), x)
-    turn, reach = disc_edge(a, ray, side, room)
-    other, far = disc_edge(b, ray, side, room)
+    turn, reach = _disc_edge(a, ray, side, room)
+    other, far = _disc_edge(b, ray, side, room)
     turn, reach = (turn, reach) if turn >= other else (other, far)
     at_a, at_b = _bearing(a, ray, side), _bearing(b, ray, side)
     onward = closed | (at_b >= at_a)
@@ -126,9 +145,9 @@ def edge_block(table: Any, at: int, x: Vec, ray: Vec, side: Vec, room: float) ->
     for corner in range(2 ** len(x)):
         u, v = h[0] if corner & 1 else -h[0], h[1] if corner & 2 else -h[1]
         if len(x) == 2:
-            angle, far = disc_edge(sub((u, v), y), ahead, across, room)
+            angle, far = _disc_edge(sub((u, v), y), ahead, across, room)
         else:
-            angle, far = disc_edge(sub((u, v, h[2] if corner & 4 else -h[2]), y), ahead, across, room)
+            angle, far = _disc_edge(sub((u, v, h[2] if corner & 4 else -h[2]), y), ahead, across, room)
         turn, reach = (angle, far) if angle > turn else (turn, reach)
     return turn, reach
 

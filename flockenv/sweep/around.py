@@ -33,7 +33,7 @@ def around_imports(parts: Parts) -> list[str]:
     """Write what `aside_of` is made of."""
     if not parts.goes_around:
         return []
-    names = ["disc_edge", "near_way", *(f"edge_{form}" for form in parts.shaped[1])]
+    names = ["sphere_edge", "near_way", *(f"edge_{form}" for form in parts.shaped[1])]
     names += [f"spine_{form}" for form in parts.shaped[1] if form in SPINES and parts.dimension == 3]
     return [
         "from flockenv.kernels import routine",
@@ -46,7 +46,7 @@ def around(parts: Parts) -> str:
     """Return the source of `aside_of` and what it calls; empty if no effect goes around anything."""
     if not parts.goes_around:
         return ""
-    return _row_ahead(parts) + _first_hit(parts) + _edge(parts) + _edge_beyond(parts) + _aside_of(parts)
+    return "".join(write(parts) for write in (_row_ahead, _first_hit, _edge, _normal, _edge_beyond, _aside_of))
 
 
 _WORLD = "obstacle_x, obstacle_radius, params, size, b, time"
@@ -132,7 +132,7 @@ def _edge(parts: Parts) -> str:
     lines = [
         "if form == -1:",
         f"    to = offset_to(size, x, {tuple_of('obstacle_x[#, b, row]', parts.dimension)})",
-        "    return disc_edge(to, ray, side, room + obstacle_radius[b, row])",
+        "    return sphere_edge(to, ray, side, room + obstacle_radius[b, row])",
         "at_ = row",
         *([f"y = offset_to(size, {place_of_row(parts)}, x)"] if parts.shaped[1] else []),
     ]
@@ -149,41 +149,12 @@ def edge({_WORLD}, form, row, x, ray, side, room):
 '''
 
 
-def _edge_beyond(parts: Parts) -> str:
-    """Write how the edge to one side is found where a body passes."""
-    return f'''
-
-@routine
-def edge_beyond({_WORLD}, form, row, hit, x, ray, side, room, most):
-    """Return how far from the impact the nearest place is where a body passes on a side, m; inf if beyond `most`."""
-    far = like(room, np.inf)
-    spot, way, across, turned_by = scale(ray, hit), ray, side, like(room, 0.0)
-    for _ in range({FOLLOWED}):
-        turn, reach = edge({_WORLD}, form, row, x, way, across, room)
-        turned_by += turn
-        if not (turned_by < like(room, {ALL_AROUND})) or reach == far:
-            return far
-        c, s = np.cos(turn), np.sin(turn)
-        way, across = add(scale(way, c), scale(across, s)), sub(scale(across, c), scale(way, s))
-        beyond = norm(sub(scale(way, reach), spot))
-        if not (beyond < most):
-            return far
-        hit, form, row = first_hit({_WORLD}, x, way, room * like(room, {JUST!r}), reach + room)
-        if form == -2:
-            return beyond
-    return far
-'''
-
-
-def _aside_of(parts: Parts) -> str:
-    """Write how the sides are compared: in the plane both, in space the normal's and those along and across a spine."""
+def _normal(parts: Parts) -> str:
+    """Write which way the surface faces that a body touches, by the form of what it touches."""
+    circle = f"offset_to(size, x, {tuple_of('obstacle_x[#, b, row]', parts.dimension)})"
     lines = [
-        "hit, form, place = known",
-        "best, found, right = like(room, np.inf), zero(x), perpendicular(ray)",
-        "row = row_ahead(params, form, place)",
-        "out, spine = right, right",
         "if form == -1:",
-        f"    out = touched_normal(offset_to(size, x, {tuple_of('obstacle_x[#, b, row]', parts.dimension)}), ray, hit)",
+        f"    return touched_normal({circle}, ray, hit)",
         "at_ = row",
         *([f"y = offset_to(size, {place_of_row(parts)}, x)"] if parts.shaped[1] else []),
     ]
@@ -191,24 +162,63 @@ def _aside_of(parts: Parts) -> str:
         if form in parts.shaped[1]:
             lines += [
                 f"if form == {number}:",
-                f"    out = nearest_{form}(params, row, touched_spot(y, ray, hit, room))[1]",
-                *([f"    spine = {SPINES[form]}"] if form in SPINES and parts.dimension == 3 else []),
+                f"    return nearest_{form}(params, row, touched_spot(y, ray, hit, room))[1]",
             ]
-    lines += [
-        "out = lateral(out, ray)",
+    return f'''
+
+@routine
+def normal_hit({_WORLD}, form, row, x, ray, hit, room):
+    """Return the outward unit normal of an obstacle where a body touches it, `hit` m along a ray."""
+{indented(indented_lines(lines, 0), 4)}
+    return zero(x)
+'''
+
+
+def _edge_beyond(parts: Parts) -> str:
+    """Write how the edge to one side is found where a body passes; in space also what it first finds there instead."""
+    facing = f"normal_hit({_WORLD}, form, row, x, way, hit, room)" if parts.dimension == 3 else "off"
+    return f'''
+
+@routine
+def edge_beyond({_WORLD}, form, row, hit, x, ray, side, room, most):
+    """Return how far from the impact the nearest place is where a body passes on a side, m; inf if beyond `most`.
+
+    In space also the normal of the obstacle that is first found in the way on that side; else 0.
+    """
+    far, off, first = like(room, np.inf), zero(x), True
+    spot, way, across, turned_by = scale(ray, hit), ray, side, like(room, 0.0)
+    for _ in range({FOLLOWED}):
+        turn, reach = edge({_WORLD}, form, row, x, way, across, room)
+        turned_by += turn
+        if not (turned_by < like(room, {ALL_AROUND})) or reach == far:
+            return far, off
+        c, s = np.cos(turn), np.sin(turn)
+        way, across = add(scale(way, c), scale(across, s)), sub(scale(across, c), scale(way, s))
+        beyond = norm(sub(scale(way, reach), spot))
+        if not (beyond < most):
+            return far, off
+        hit, form, row = first_hit({_WORLD}, x, way, room * like(room, {JUST!r}), reach + room)
+        if form == -2:
+            return beyond, off
+        if first:
+            off, first = {facing}, False
+    return far, off
+'''
+
+
+def _aside_of(parts: Parts) -> str:
+    """Write how the sides are compared: in the plane both, in space the normal's and those along and across an axis."""
+    sides = "scale(own, -e)," if parts.dimension == 2 else "ax, scale(ax, -e), across, scale(across, -e)"
+    lines = [
+        "hit, form, place = known",
+        "row, e, right = row_ahead(params, form, place), like(room, 1.0), perpendicular(ray)",
+        f"out = lateral(normal_hit({_WORLD}, form, row, x, ray, hit, room), ray)",
         "own = select(dot(out, out) > like(room, 1e-10), unit(out), right)",
-    ]
-    if parts.dimension == 3:
-        lines += [
-            "spine = lateral(spine, ray)",
-            "spine = select(dot(spine, spine) > like(room, 1e-10), unit(spine), right)",
-        ]
-    sides = "own, scale(own, -e)" if parts.dimension == 2 else "own, spine, scale(spine, -e), across, scale(across, -e)"
-    lines += [
-        "e = like(room, 1.0)",
-        *(["across = cross(ray, spine)"] if parts.dimension == 3 else []),
+        f"best, off = edge_beyond({_WORLD}, form, row, hit, x, ray, own, room, like(room, np.inf))",
+        "found = own if best < like(room, np.inf) else zero(x)",
+        *(_axis(parts) if parts.dimension == 3 else []),
         f"for side in ({sides}):",
-        f"    far = edge_beyond({_WORLD}, form, row, hit, x, ray, side, room, best * like(room, {NEARER!r}))",
+        f"    far = edge_beyond({_WORLD}, form, row, hit, x, ray, side, room, best * like(room, {NEARER!r}))[0]",
         "    best, found = (far, side) if far < best else (best, found)",
     ]
     return f'''
@@ -222,3 +232,23 @@ def aside_of({_WORLD}, x, ray, room, known):
 {indented(indented_lines(lines, 0), 4)}
     return found
 '''
+
+
+def _axis(parts: Parts) -> list[str]:
+    """Write along and across what else is looked in space: an obstacle's own axis, or away from what blocked its side.
+
+    So no axis of the coordinates is preferred, and the mirrored scene has the mirrored way.
+    """
+    own = [form for form in SPINES if form in parts.shaped[1]]
+    lines = ["ax, at_ = zero(x), row", *([f"y = offset_to(size, {place_of_row(parts)}, x)"] if own else [])]
+    for form in own:
+        lines += [f"if form == {list(FORMS).index(form)}:", f"    ax = lateral({SPINES[form]}, ray)"]
+    return [
+        *lines,
+        "if dot(ax, ax) <= like(room, 1e-10):",
+        "    ax = lateral(lateral(off, ray), own)",
+        "if dot(ax, ax) <= like(room, 1e-10):",
+        "    ax = cross(ray, own)",
+        "ax = unit(ax)",
+        "across = cross(ray, ax)",
+    ]
