@@ -11,12 +11,12 @@ import warnings
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from time import perf_counter
-from typing import Any, ClassVar, Literal
+from typing import Any, Literal
 
 from pydantic import Field
 
 from flockenv.divergence import SimulationDiverged
-from flockenv.records import Record
+from flockenv.records import ResultRecord
 from flockenv.refusals import nearest_few, shown
 
 __all__ = ["VERDICTS", "Case", "Finding", "Results", "Value", "Verdict", "cases_named", "run", "trials"]
@@ -64,10 +64,8 @@ class Case:
         return not self.only or name in self.only
 
 
-class Finding(Record):
+class Finding(ResultRecord):
     """What one case came to under one method or model."""
-
-    simulated: ClassVar[bool] = False
 
     case: str
     title: str
@@ -85,10 +83,8 @@ class Finding(Record):
         return f"{number}{MARKS.get(self.verdict, self.verdict)}".strip() or "-"
 
 
-class Results(Record):
+class Results(ResultRecord):
     """All that was found, and by which sources."""
-
-    simulated: ClassVar[bool] = False
 
     findings: tuple[Finding, ...]
     sources: str = Field(default="", description="fingerprint of the sources that it hangs by")

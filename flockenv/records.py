@@ -12,7 +12,7 @@ from pydantic_core import PydanticCustomError
 from flockenv.magnitudes import check_numbers
 from flockenv.refusals import refusals
 
-__all__ = ["Record", "in_tuples", "keep"]
+__all__ = ["Record", "ResultRecord", "in_tuples", "keep"]
 
 _NUMBERS = (float, int, float | None, int | None)
 
@@ -78,13 +78,10 @@ class Record(BaseModel, metaclass=_OneLine):
         written = vars(cls).get("__annotations__", {})
         written.update(dict.fromkeys(written.keys() & cls.__class_vars__, ClassVar))
 
-    simulated: ClassVar[bool] = True
-    """False for a record of results, whose numbers no law reads: a speed may have decayed to 1e-217 m/s."""
-
     @model_validator(mode="after")
     def _representable(self) -> Self:
         """Refuse numbers so large or small that what laws make of them is none; records in it have looked already."""
-        for name in type(self).model_fields if self.simulated else ():
+        for name in type(self).model_fields:
             value = getattr(self, name)
             if isinstance(value, (float, tuple)):
                 check_numbers(value, "float64", name)
@@ -117,3 +114,12 @@ class Record(BaseModel, metaclass=_OneLine):
         kept = super().__getstate__()
         kept["__dict__"] = {k: v for k, v in kept["__dict__"].items() if k in type(self).model_fields}
         return kept
+
+
+class ResultRecord(Record):
+    """A record of what was computed: its numbers may have any finite size, as no law reads them."""
+
+    @model_validator(mode="after")
+    def _representable(self) -> Self:
+        """Accept every number: a speed may have decayed to 1e-217 m/s."""
+        return self

@@ -5,11 +5,11 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 from itertools import takewhile
-from typing import ClassVar, Literal
+from typing import Literal
 
 import numpy as np
 
-from flockenv.records import Record
+from flockenv.records import Record, ResultRecord
 from flockenv.refusals import nearest, shown
 
 __all__ = ["COSTS", "FORMAT", "Choice", "Cost", "Curve", "Machine", "Point", "Report", "Results"]
@@ -35,10 +35,8 @@ class Machine(Record):
     """Processes that wanted to run meanwhile, on average over a minute; none where the system does not count."""
 
 
-class Point(Record):
+class Point(ResultRecord):
     """One method in one setting, taken from the start to the end; what has no number is none."""
-
-    simulated: ClassVar[bool] = False
 
     steps: int
     """Calls of the method."""
@@ -70,10 +68,8 @@ class Point(Record):
         return self.seconds if by == "seconds" else float(self.evaluations)
 
 
-class Choice(Record):
+class Choice(ResultRecord):
     """A setting that keeps to a tolerance, and what it costs."""
-
-    simulated: ClassVar[bool] = False
 
     method: str
     dt: float
@@ -86,10 +82,8 @@ class Choice(Record):
     """Does it lie between two measured points?"""
 
 
-class Curve(Record):
+class Curve(ResultRecord):
     """A method, from its cheapest point to its dearest."""
-
-    simulated: ClassVar[bool] = False
 
     method: str
     declared: int
@@ -136,10 +130,8 @@ class Curve(Record):
         )  # fmt: skip
 
 
-class Report(Record):
+class Report(ResultRecord):
     """One problem, all methods."""
-
-    simulated: ClassVar[bool] = False
 
     name: str
     title: str
@@ -193,10 +185,8 @@ class Report(Record):
         return min(found, key=lambda choice: choice.cost, default=None)
 
 
-class Results(Record):
+class Results(ResultRecord):
     """Reports as they lie in a file."""
-
-    simulated: ClassVar[bool] = False
 
     format: Literal[1] = FORMAT  # type: ignore[assignment]
     reports: tuple[Report, ...]

@@ -6,13 +6,13 @@ import hashlib
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import ClassVar, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from pydantic import Field
 
 from flockenv.kernels import laws_digest
-from flockenv.records import Record
+from flockenv.records import ResultRecord
 from flockenv.scene import Scene
 from flockenv.state import Floats, State
 
@@ -41,20 +41,16 @@ class Experiment:
     curve: tuple[str, str] | None = None  # names of axes: cases are numbers, and the first column is drawn over them
 
 
-class Cell(Record):
+class Cell(ResultRecord):
     """The numbers of one case under one variant."""
-
-    simulated: ClassVar[bool] = False
 
     case: str
     variant: str
     numbers: dict[str, float | None] = Field(description="by column; none has no value")
 
 
-class Results(Record):
+class Results(ResultRecord):
     """All that was measured, and by which sources."""
-
-    simulated: ClassVar[bool] = False
 
     experiment: str
     title: str
