@@ -25,8 +25,6 @@ from flockenv.targets import Target
 __all__ = ["NO_WAY", "Start", "distances_around", "free_part", "way_table"]
 
 Floats = NDArray[np.float64]
-ROUNDS = 200
-"""Most rounds of sweeps: each goes around one more corner than the one before."""
 NEAR = 4.0
 """Spacings from the goal within which distances are straight lines, where these are free."""
 NO_WAY = 1e30
@@ -124,9 +122,8 @@ def distances_around(free: NDArray[np.bool_], spacing: float, begin: Floats) -> 
     shape = (*free.shape, 1, 1)[:3]
     u = np.where(free, begin, np.inf).reshape(shape).astype(np.float64)
     open_ = np.ascontiguousarray((free & ~np.isfinite(begin)).reshape(shape))
-    for _ in range(ROUNDS):
-        if entry(_sweep)(u, open_, spacing) <= 1e-9 * spacing:
-            break
+    while entry(_sweep)(u, open_, spacing) > 1e-9 * spacing:
+        pass  # each round goes around one more corner than the one before, and no length grows
     flat = u.reshape(-1)
     done = np.isfinite(flat) & ~open_.reshape(-1)
     order = np.flatnonzero(np.isfinite(flat) & ~done)

@@ -37,23 +37,26 @@ def said(precision: str) -> str:
     return f"{precision} computes with numbers from {least:g} to {most:g} in size, and 0{more}"
 
 
-def outliers(value: Any, precision: str, path: str = "") -> Iterator[tuple[str, float]]:
-    """Yield where each number lies that is out of bounds, and the number: in records, tuples and lists however deep."""
+def outliers(value: Any, precision: str, path: str = "", into_records: bool = True) -> Iterator[tuple[str, float]]:
+    """Yield the place of each number that is out of bounds, and the number: in tuples, lists and records at any depth.
+
+    into_records: False leaves out the numbers of records.
+    """
     if isinstance(value, float):
         least, most = BOUNDS[precision]
         if value != 0 and not least <= abs(value) <= most:
             yield path, value
     elif isinstance(value, (tuple, list)):
         for k, each in enumerate(value):
-            yield from outliers(each, precision, f"{path}[{k}]")
-    elif isinstance(value, BaseModel):
+            yield from outliers(each, precision, f"{path}[{k}]", into_records)
+    elif into_records and isinstance(value, BaseModel):
         for name in type(value).model_fields:
             yield from outliers(getattr(value, name), precision, f"{path}.{name}".lstrip("."))
 
 
-def check_numbers(value: Any, precision: str, path: str = "") -> None:
-    """Raise ValueError if a number in it is out of bounds; the message begins with its place."""
-    for place, number in outliers(value, precision, path):
+def check_numbers(value: Any, precision: str, path: str = "", into_records: bool = True) -> None:
+    """Raise ValueError if a number in it is out of bounds; the message begins with its place; see `outliers`."""
+    for place, number in outliers(value, precision, path, into_records):
         raise ValueError(f"{place} = {number:g}: {said(precision)}")
 
 

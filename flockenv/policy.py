@@ -304,8 +304,10 @@ def _differences(card: Mapping[str, Any], task: Task) -> tuple[str, ...]:
         return (f"plays task {task.name!r}, trained on {card.get('task')!r}", *found)
     now = task.model_dump(mode="json")
     trained_on = card["arguments"] if isinstance(card.get("arguments"), dict) else {}
-    changed = [key for key in now if key in trained_on and trained_on[key] != now[key]]
-    return (*(f"{key} = {shown(now[key])}, trained with {shown(trained_on[key])}" for key in changed), *found)
+    usual = type(task).model_construct().model_dump(mode="json")
+    trained = {key: trained_on.get(key, usual.get(key)) for key in now}  # a card may be older than an argument
+    changed = [key for key in now if trained[key] != now[key]]
+    return (*(f"{key} = {shown(now[key])}, trained with {shown(trained[key])}" for key in changed), *found)
 
 
 def _differences_of_digest(card: Mapping[str, Any], task: Task) -> tuple[str, ...]:

@@ -80,11 +80,11 @@ class Record(BaseModel, metaclass=_OneLine):
 
     @model_validator(mode="after")
     def _representable(self) -> Self:
-        """Refuse numbers so large or small that what laws make of them is none; records in it have looked already."""
+        """Refuse numbers so large or small that laws overflow with them; records in it were checked when made."""
         for name in type(self).model_fields:
             value = getattr(self, name)
             if isinstance(value, (float, tuple)):
-                check_numbers(value, "float64", name)
+                check_numbers(value, "float64", name, into_records=False)
         return self
 
     def __str__(self) -> str:

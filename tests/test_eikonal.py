@@ -102,3 +102,15 @@ def test_all_connected_points_are_reached_and_no_distance_takes_a_short_cut() ->
     pieces, _ = ndimage.label(free)
     np.testing.assert_array_equal(there, pieces == pieces[60, 60])
     assert (found - by_air)[there].min() > -0.05
+
+
+def test_a_maze_of_many_turns_is_followed_to_its_end() -> None:
+    """1,000 corridors one point wide: a round of sweeps goes around two corners of it."""
+    corridors = 1000
+    free = np.zeros((2 * corridors + 1, 5), bool)
+    free[1::2, 1:4] = True
+    free[2 * np.arange(1, corridors), np.where(np.arange(1, corridors) % 2, 3, 1)] = True
+    begin = np.where(np.arange(free.size).reshape(free.shape) == 6, 0.0, np.inf)
+    found = distances_around(free, 1.0, begin)
+    assert np.isfinite(found[free]).all()
+    assert 3 * (corridors - 1) < found[free].max() < 4 * corridors

@@ -397,6 +397,17 @@ def test_other_slots_are_refused_by_the_first_that_differs(
     assert "\n" not in str(caught.value)
 
 
+def test_an_argument_that_a_card_lacks_was_its_default(tmp_path: Path) -> None:
+    path = kept(tmp_path, Corridor())
+    card = json.loads(path.with_suffix(".json").read_text())
+    del card["arguments"]["settling"]
+    path.with_suffix(".json").write_text(json.dumps(card))
+    assert MlpPolicy.load(path, Corridor()).differences == ()
+    with pytest.warns(OtherTaskWarning):
+        policy = MlpPolicy.load(path, Corridor(settling=7.0))
+    assert policy.differences == (f"settling = 7.0, trained with {Corridor().settling}",)
+
+
 def test_many_differences_are_a_line_and_all_of_them_are_kept(tmp_path: Path) -> None:
     changed = Pursuit(evader_force=4.0, capture_distance=0.7, horizon=200, size=25.0, dt=0.025, control_dt=0.05)
     with pytest.warns(OtherTaskWarning, match="; and .* more$"):

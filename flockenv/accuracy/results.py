@@ -22,6 +22,9 @@ COSTS: dict[Cost, str] = {"seconds": "wall time, s", "evaluations": "force evalu
 HALVINGS = 5
 """An order is measured over the finest so many halvings that are neither coarse nor drowned in rounding."""
 
+SENSITIVE = 100.0
+"""Growth of a tiny difference at the start beyond which a report counts as sensitive."""
+
 FEWEST = 4
 """Points of which an order is told at all."""
 
@@ -158,6 +161,11 @@ class Report(ResultRecord):
     curves: tuple[Curve, ...]
     stopped: str = ""
     """Why it ended before its time."""
+
+    @property
+    def sensitive(self) -> bool:
+        """True if a tiny difference at the start grows at least a hundredfold."""
+        return self.growth > SENSITIVE
 
     def trusts(self, point: Point) -> bool:
         """True if an error is clearly above what the reference itself may be wrong by."""

@@ -11,9 +11,6 @@ __all__ = ["COLUMNS", "best", "columns", "errors", "headlines", "rows"]
 COLUMNS = ("method", "order", "declared")
 DRIFTS = ("energy off", "momentum off")
 
-SENSITIVE = 100.0
-"""Growth of a tiny difference from which on a table says how fast that is."""
-
 
 def headlines(report: Report) -> list[str]:
     """Return what a reader must know before the table, a line each."""
@@ -42,7 +39,7 @@ def _wrong(report: Report) -> str:
 
 def _rate(report: Report) -> str:
     """Say how fast a difference grows, where that is fast enough to matter."""
-    return f" (e-fold in {1 / report.rate:.2g} s)" if report.growth > SENSITIVE else ""
+    return f" (e-fold in {1 / report.rate:.2g} s)" if report.sensitive and report.rate > 0 else ""
 
 
 def errors(report: Report) -> tuple[tuple[str, ...], list[list[str]]]:

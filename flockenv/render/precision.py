@@ -28,9 +28,6 @@ DECADES = 13
 """The picture shows at most so many below the largest error."""
 
 
-SENSITIVE = 100.0
-"""Growth of a tiny difference from which on a panel says so."""
-
 LABEL = 0.035
 """Share of a panel's height that a number at the end of a line takes."""
 
@@ -131,7 +128,7 @@ def _least(report: Report) -> float:
 def _against(report: Report) -> str:
     """Return what errors are measured against, how wrong that may be, and how fast a difference grows, in a line."""
     wrong = "" if report.reference_error == 0 else f", \u00b1 {report.reference_error:.0e} m"
-    grows = f"; differences grow {report.growth:.0e}-fold" if report.growth > SENSITIVE else ""
+    grows = f"; differences grow {report.growth:.0e}-fold" if report.sensitive else ""
     return f"against {report.reference}{wrong}{grows}"
 
 
