@@ -114,13 +114,13 @@ def around(p: Any, me: Me, acc: Vec) -> Vec:
 class AvoidObstacles(Effect):
     """Steer sideways around the obstacle that the straight path would touch first within `horizon` seconds.
 
-    Towards the edge of its silhouette that is nearest to the point of impact (Reynolds 1988): of a circle that is away
-    from its centre; dead ahead of a middle an agent keeps right. An edge is where the body passes, with a radius to
-    spare beyond it: walls that are joined, or leave a gap that is too narrow, are one obstacle. What has no edge (a
-    half-space, a room), or is too near for a turn to that edge at a radius of m v^2 / F, is avoided along the side of
-    its normal. In space the edges on five sides are compared: of the normal, and along and across the obstacle's own
-    axis; of a sphere, which has none, away from what blocks the side of the normal and across that. An obstacle that
-    moves is avoided where it is, as if it stood still.
+    The force points towards the edge of the obstacle's silhouette that is nearest to the point of impact (Reynolds
+    1988): away from a circle's centre; dead ahead of its middle, to the right. An edge is where the body passes with a
+    radius to spare: walls that are joined, or leave a gap that is too narrow, are one obstacle. An obstacle that has no
+    edge (a half-space, a room), or is too near for a turn to that edge at a radius of m v^2 / F, is avoided along the
+    side of its normal. In space the edges on five sides are compared: the side of the normal, and both directions along
+    and across the obstacle's own axis. A sphere has no axis; for it, they lie away from what blocks the side of the
+    normal, and across that. An obstacle that moves is avoided where it is, as if it stood still.
     """
 
     kind: Literal["avoid_obstacles"] = "avoid_obstacles"
@@ -211,7 +211,7 @@ def along_normal(p: Any, me: Me, acc: Vec) -> Vec:
 class Whiskers(Effect):
     """Feel ahead and to the sides; turn away from, and brake before, what a whisker reaches into, by how deep it does.
 
-    Before what the middle one reaches into deepest, towards the nearest edge of its silhouette, as `avoid_obstacles`.
+    If the middle one reaches in deepest, turn towards the nearest edge of the silhouette, as `avoid_obstacles` does.
 
     Three whiskers in the plane, five in space, `horizon` times the speed long. Buckland 2005, "wall avoidance": there a
     whisker has the length of a line and the body no size; here it is what the body would touch.

@@ -50,10 +50,10 @@ class ObstacleRepulsion(Push):
     Helbing and Molnar 1995: -grad U0 exp(-d / R), so A = U0 / R in m/s^2, B = R, `bodies: false`. Helbing, Farkas and
     Vicsek 2000: A in N, with bodies. Summed over sides: of walls, polygons and rooms every straight side acts by the
     foot of the perpendicular on it, and a corner where it is nearest to all sides that meet there, once; so a wall is
-    the same however it is cut, and where walls that stand still are joined. Two obstacles that lie on each other (a
-    wall given twice, rooms with a common side) both act. What is round, thick or a grid acts by its nearest place. With
-    `occluded`, nothing acts through a wall. Where a body is inside something solid, the way out is that of its nearest
-    place, and the force goes on growing.
+    the same however it is cut, and where walls that stand still are joined. If two obstacles lie on each other (a
+    wall given twice, rooms with a common side), both act. What is round, thick or a grid acts by its nearest point.
+    With `occluded`, nothing acts through a wall. If a body is inside something solid, the force points out through the
+    nearest point, and goes on growing.
     """
 
     kind: Literal["obstacle_repulsion"] = "obstacle_repulsion"

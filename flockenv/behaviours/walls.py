@@ -149,12 +149,12 @@ def _relative(table: Any, x: Vec) -> Vec:
 class Contain(Moving):
     """Stay within a shape: zero while the place `time` seconds ahead is inside it, else along the wall met there.
 
-    The inward normal's part across the heading steers; head-on it has none, so it brakes and keeps right. From outside
-    an agent heads straight back in. Reynolds 1999, containment.
+    The inward normal's part across the heading steers; head-on there is none, so the agent brakes and keeps right. From
+    outside, an agent heads straight back in. Reynolds 1999, containment.
 
-    A steering force is no wall: where agents turn along the surface their bodies come through it by about half of the
-    way of a step, max_speed dt / 2, and by a little at corners; and further if `weight` or max_force is too small to
-    turn in `time`, or others push. What must never leave needs a hollow obstacle and `collisions`.
+    A steering force is no wall. Where agents turn along the surface, their bodies cross it by about half the length of
+    a step, max_speed dt / 2, and by a little at corners; they cross it further if `weight` or max_force is too small to
+    turn within `time`, or if others push. Agents that must never leave need a hollow obstacle and `collisions`.
     """
 
     kind: Literal["contain"] = "contain"
