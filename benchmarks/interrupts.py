@@ -3,8 +3,9 @@
 Each run is a process group of its own in an empty folder, with a kernel cache that is warm or empty. It gets SIGINT (a
 tenth SIGTERM) at a random moment: the whole group, as from a terminal, or the command alone; a tenth get it twice. What
 is counted must be 0: tracebacks, other words than the one line, wrong exit codes, processes that are still there 5 s
-later, temporary files and files that cannot be read. Runs whose signal arrived before Python had reached the first line
-of flockenv are told apart: nothing of flockenv's can handle that. POSIX with /proc (Linux).
+later, temporary files and files that cannot be read. Runs in which SIGTERM was neither blocked nor handled when the
+signal was sent, by /proc/PID/status, are counted apart, with how they ended: Python was starting, and had not run the
+first statements of flockenv. POSIX with /proc (Linux).
 """
 
 from __future__ import annotations
@@ -66,7 +67,8 @@ class Outcome:
 
     command: str
     at: float  # s
-    early: bool  # before the first line of flockenv
+    early: bool  # before flockenv blocked or handled signals
+    code: int
     faults: tuple[str, ...]
     said: str
 
@@ -88,7 +90,7 @@ def interrupted(
     if process.poll() is not None:
         process.communicate()
         return None
-    early = not _handles(process.pid, signal.SIGTERM)
+    early = not _guarded(process.pid, signal.SIGTERM)
     sent = time.monotonic()
     for _ in range(1 + twice):
         (os.killpg if group else os.kill)(process.pid, number)
@@ -111,7 +113,7 @@ def interrupted(
     if process.returncode != 128 + number:
         faults.append(f"exit code {process.returncode}")
     faults += [*_faults_of(said), *_leftovers(folder, cache)]
-    return Outcome(command, at, early, tuple(faults), said)
+    return Outcome(command, at, early, process.returncode, tuple(faults), said)
 
 
 def _hear() -> None:
@@ -119,11 +121,19 @@ def _hear() -> None:
         signal.signal(number, signal.default_int_handler if number == signal.SIGINT else signal.SIG_DFL)
 
 
-def _handles(pid: int, number: int) -> bool:
-    """True if a process has a handler of its own for a signal."""
-    status = Path(f"/proc/{pid}/status").read_text()
-    caught = re.search(r"^SigCgt:\s*(\w+)", status, re.MULTILINE)
-    return caught is not None and bool(int(caught[1], 16) >> (number - 1) & 1)
+def _guarded(pid: int, number: int) -> bool:
+    """True if a process blocks a signal or has a handler for it."""
+    masks = re.findall(r"^Sig(?:Blk|Cgt):\s*(\w+)", Path(f"/proc/{pid}/status").read_text(), re.MULTILINE)
+    return any(int(mask, 16) >> (number - 1) & 1 for mask in masks)
+
+
+def _ending(outcome: Outcome) -> str:
+    """Return how a run ended whose signal arrived while Python was starting."""
+    if not outcome.faults:
+        return "one line of flockenv's"  # the first statement ran between the look into /proc and the signal
+    if "Traceback" in outcome.said or "Fatal Python error" in outcome.said:
+        return "traceback of Python's"
+    return "killed without a word" if outcome.code < 0 and not outcome.said else f"exit code {outcome.code}"
 
 
 def _lives(group: int) -> bool:
@@ -189,8 +199,8 @@ def main(
     counted = [outcome for outcome in outcomes if not outcome.early]
     faults = Counter(fault.split(":")[0] for outcome in counted for fault in outcome.faults)
     print(f"{len(counted)} interrupts of {len(names)} commands: {dict(faults) or 'nothing went wrong'}")
-    early = Counter(fault.split(":")[0] for outcome in outcomes if outcome.early for fault in outcome.faults)
-    print(f"{len(outcomes) - len(counted)} before the first line of flockenv: {dict(early) or 'nothing went wrong'}")
+    early = Counter(_ending(outcome) for outcome in outcomes if outcome.early)
+    print(f"{early.total()} while Python was starting, before flockenv blocks or handles signals: {dict(early)}")
 
 
 if __name__ == "__main__":

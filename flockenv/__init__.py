@@ -9,14 +9,15 @@ Importing it registers the environments with Gymnasium and PettingZoo::
 The rest loads when it is asked for: neither torch nor matplotlib nor numba is imported before.
 """
 
-from __future__ import annotations
+# Signals first: in a command, `early` blocks them until `interrupts` handles them, before anything else is imported.
+# Gymnasium alone takes a third of a second.
+from flockenv import early, interrupts  # isort: skip
 
-import importlib
-from typing import TYPE_CHECKING, Any
+interrupts.begin_early()
+early.release()
 
-from flockenv import interrupts
-
-interrupts.begin_early()  # a command: before Gymnasium is imported, which takes a third of a second
+import importlib  # noqa: E402  # see above
+from typing import TYPE_CHECKING, Any  # noqa: E402  # see above
 
 from flockenv.envs.registration import register_all  # noqa: E402  # see above
 

@@ -12,7 +12,6 @@ This module imports nothing that takes time, so that it is in force before Gymna
 from __future__ import annotations
 
 import _thread
-import atexit
 import os
 import select
 import signal
@@ -21,6 +20,8 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from types import FrameType
+
+from flockenv import early
 
 __all__ = ["begin", "begin_early", "clean", "code", "held", "leave", "running", "said", "say", "serve", "unfinished"]
 
@@ -64,23 +65,21 @@ class _Asked:
     again = False  # the next signal is sent by _watch
 
 
+_ending = _thread.RLock()
+"""Held by the thread that ends the process, from its decision on; any other thread waits until the process is gone."""
+
 _unfinished: dict[str, bool] = {}
 """Files and folders that are half-written, in the order in which they were made; True: removed only if empty."""
 
 
 def begin_early() -> None:
     """Handle signals from here on if this process is a command of flockenv or agents; else leave it as it is."""
-    words, program = sys.orig_argv, sys.argv[:1]
-    if "--multiprocessing-fork" in words:
+    if "--multiprocessing-fork" in sys.orig_argv:
         if os.environ.get(PARENT) == str(os.getppid()):
             serve()
             _thread.start_new_thread(_follow, (os.getppid(),))
-    elif program == ["-m"] and "-m" in words[:-1]:  # Python is still looking for the module that it is to run
-        module = words[words.index("-m") + 1]
-        if module.split(".")[0] == "agents":
-            begin(module.rpartition(".")[2])
-    elif program and os.path.basename(program[0]).split(".")[0].removesuffix("-script") == "flockenv":
-        begin("flockenv")
+    elif name := early.command():
+        begin(name)
 
 
 def begin(name: str) -> None:
@@ -94,17 +93,21 @@ def begin(name: str) -> None:
         os.set_blocking(written, False)
         signal.set_wakeup_fd(written, warn_on_full_buffer=False)
         _thread.start_new_thread(_watch, (arrived,))
-        atexit.register(_ignore)  # the first that is registered is the last that is run
     for which in SIGNALS:
         number = getattr(signal, which)
         if signal.getsignal(number) is not signal.SIG_IGN:
             signal.signal(number, _handle)
 
 
-def _ignore() -> None:
-    """Ignore signals from here on: all is done, and Python takes itself down."""
-    for which in SIGNALS:
-        signal.signal(getattr(signal, which), signal.SIG_IGN)
+def _finish() -> None:
+    """Ignore signals from here on: the command has done its work, and its exit code is that of the work.
+
+    While Python shuts down, a thread that ends the process would write its line but not set the exit code.
+    """
+    if _Asked.main:
+        for which in SIGNALS:
+            signal.signal(getattr(signal, which), signal.SIG_IGN)
+        _ending.acquire()  # never released
 
 
 def leave(code: int) -> None:
@@ -135,14 +138,15 @@ def _follow(parent: int) -> None:
 
 @contextmanager
 def running(name: str) -> Iterator[None]:
-    """Handle signals while a command runs; nothing half-written is left at its end, and later signals end all."""
+    """Handle signals while a command runs; nothing half-written is left at its end, and later signals are ignored."""
     begin(name)
     _Asked.running = True
     try:
         yield
     finally:
-        _Asked.running = False
         clean()
+        _Asked.running = False
+        _finish()
 
 
 @contextmanager
@@ -272,6 +276,7 @@ def _watch(signals: int) -> None:
 
 def _end(number: int) -> None:
     """Remove what is half-written, say one line and end the process, without anything that Python does at its end."""
+    _ending.acquire()
     clean()
     if _thread.get_ident() == _Asked.main:
         with suppress(BaseException):  # closed, full, or in the middle of being written to

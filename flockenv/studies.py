@@ -10,8 +10,19 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from flockenv import interrupts
 from flockenv.refusals import shown
-from flockenv.terminal import INTERRUPTED, EarlyEnd, Force, Seed, new_console, progress_bar, relative, show_table
+from flockenv.terminal import (
+    INTERRUPTED,
+    EarlyEnd,
+    Force,
+    Seed,
+    flush_output,
+    new_console,
+    progress_bar,
+    relative,
+    show_table,
+)  # fmt: skip
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -24,6 +35,9 @@ if TYPE_CHECKING:
     Run = Callable[[Results | None, Callable[[int], None], Callable[[Results], None]], Results]
 
 __all__ = ["accuracy", "experiment", "gallery", "stored", "stress", "try_all", "write_numbers"]
+
+INTERRUPTED_LATER = "interrupted; what was done is shown"
+"""What an interrupt comes to once the first problem has been measured."""
 
 
 def accuracy(
@@ -85,22 +99,30 @@ def accuracy(
     else:
         todo = [functools.partial(_problem, file, seconds, steps, dts, seed) for file in scenes or ()]
     console = new_console()
-    reports, refused = _measured(todo, [] if suite else list(scenes or ()), chosen, repetitions, finer, aimed, console)
+    files = [] if suite else list(scenes or ())
+
+    def keep(reports: Sequence[Report]) -> None:
+        if path is not None:
+            write_numbers(path, Results(reports=tuple(reports)))
+
+    reports, refused = _measured(todo, files, chosen, repetitions, finer, aimed, console, keep)
     if path is not None and reports:
-        _write(path, Results(reports=tuple(reports)), functools.partial(_draw_precision, reports))
+        if path.suffix.lower() == ".png":
+            _draw_precision(reports, path)
         console.print(f"{len(reports)} problems in {relative(path)}")
     if len(reports) + refused < len(todo) or (reports and reports[-1].stopped):
-        raise EarlyEnd("interrupted; what was done is shown", INTERRUPTED)
+        raise EarlyEnd(INTERRUPTED_LATER, INTERRUPTED)
     if not reports:
         raise ValueError("accuracy: none of these scenes has a reference; each line says why")
 
 
 def _measured(
     todo: Sequence[Callable[[], Problem]], files: Sequence[str], methods: Sequence[Integrator], repetitions: int,
-    finer: int | None, tolerances: Sequence[float], console: Console,
+    finer: int | None, tolerances: Sequence[float], console: Console, keep: Callable[[Sequence[Report]], None],
 ) -> tuple[list[Report], int]:  # fmt: skip
-    """Measure problem after problem and show each; return the reports, and how many scenes have none.
+    """Measure problem after problem, keep and show each; return the reports, and how many scenes have none.
 
+    keep: called with all reports after each problem; an interrupt during compilation ends the process and loses none.
     Of several scenes those without a reference are a line each; the only one raises its ValueError.
     """
     from flockenv.accuracy import measure
@@ -121,12 +143,16 @@ def _measured(
                 where = "" if first.startswith(files[k]) else f"{files[k]}: "
                 console.print(f"{where}{first}{f' (and {len(more)} more)' if more else ''}\n", soft_wrap=True)
                 continue
+            keep(reports)
             _show_accuracy(console, reports[-1], tolerances)
+            flush_output()
+            interrupts.say(INTERRUPTED_LATER)
             if reports[-1].stopped:
                 break
     except KeyboardInterrupt:
         if not reports:
             raise
+        keep(reports)
     return reports, refused
 
 

@@ -500,6 +500,24 @@ def test_ctrl_c_on_the_command_line_keeps_the_problems_that_are_done(
     assert report.name == "damped"
 
 
+def test_problems_that_are_done_are_written_before_the_next_one_begins(
+    in_a_folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A signal during compilation ends the process: what is written only at the end would be lost."""
+    kept: list[list[str]] = []
+
+    def watched(problem: Problem, methods: Any, repetitions: int, **more: Any) -> Report:
+        file = Path("new/a.json")
+        known = Results.model_validate_json(file.read_text()).reports if file.exists() else ()
+        kept.append([report.name for report in known])
+        return measure(problem, methods, repetitions)
+
+    monkeypatch.setattr("flockenv.accuracy.measure", watched)
+    asked = ["accuracy", "--suite", "--problems", "damped,oscillator", "--methods", "rk4", "--repetitions", "0"]
+    assert main([*asked, "--out", "new/a.json"]) == 0
+    assert kept == [[], ["damped"]]
+
+
 def test_times_are_whole_parts_of_every_run() -> None:
     scene = sprung(1.0, 1.0).scene
     for steps, instants in (((8, 16), 8), ((10, 25), 5), ((7,), 7), ((34,), 2), ((256, 512), 16)):

@@ -17,6 +17,7 @@ ROOT = Path(__file__).resolve().parent.parent
 
 LAYERS = (
     {
+        "early",
         "interrupts",
         "divergence",
         "terminal",
@@ -62,7 +63,7 @@ LAYERS = (
     {"agents"},
     {"tests"},
 )
-"""A module may import its own layer and those above it in this list (shared/DESIGN.md, "Who may import whom")."""
+"""A module may import its own layer and those above it in this list."""
 
 ONLY_IN = {
     "torch": {"sb3", "agents", "tests"},

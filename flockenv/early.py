@@ -1,0 +1,39 @@
+"""The first lines of a command: signals are blocked here until `flockenv.interrupts` handles them.
+
+What handles them takes milliseconds to import. This module imports nothing that Python has not loaded by itself, and
+has no `from __future__ import annotations`, which is a file too.
+"""
+
+import _signal  # type: ignore[import-not-found]  # built in; `signal` imports enum first
+import os
+import sys
+
+__all__ = ["command", "release"]
+
+
+def command() -> str:
+    """Return the name of the command of flockenv or agents that this process is, "" if it is none."""
+    words, program = sys.orig_argv, sys.argv[:1]
+    if program == ["-m"] and "-m" in words[:-1]:  # Python has not found the module yet that it is to run
+        package, _, module = words[words.index("-m") + 1].rpartition(".")
+        return module if package.split(".")[0] == "agents" else ""
+    script = os.path.basename(program[0]).split(".")[0].removesuffix("-script") if program else ""
+    return script if script == "flockenv" else ""
+
+
+def _block() -> set[int] | None:
+    """Block the signals of a command; return those that were blocked before, None if nothing was changed."""
+    if os.name != "posix" or not command():
+        return None
+    return set(_signal.pthread_sigmask(_signal.SIG_BLOCK, (_signal.SIGINT, _signal.SIGTERM, _signal.SIGHUP)))
+
+
+_before = _block()
+
+
+def release() -> None:
+    """Deliver signals again, with those that have arrived meanwhile, as before this module was imported."""
+    global _before
+    if _before is not None:
+        _before, mask = None, _before
+        _signal.pthread_sigmask(_signal.SIG_SETMASK, mask)
