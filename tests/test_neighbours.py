@@ -567,3 +567,19 @@ def test_records_come_in_the_order_of_numbers_within_each_cell(cells: int, share
     order(flat, by_place, ident, length, first, end, late)
     np.testing.assert_array_equal(flat.reshape(count, length), expected)
     assert late[-1] == -7
+
+
+@pytest.mark.parametrize("dtype", ["float32", "float64"])
+@pytest.mark.parametrize("fov", [60, 180, 270, 350])
+def test_the_edge_of_a_field_of_view_is_in_it_in_every_direction(fov: float, dtype: str) -> None:
+    """Neighbours exactly on the edge are seen, those a little outside it are not, in both precisions."""
+    scene = scene_with((Alignment(weight=1, radius=3, fov=fov),), None, 2, 2).model_copy(update={"dtype": dtype})
+    start, seen = scene.start(0), []
+    for course in np.linspace(0, 2 * np.pi, 61):
+        for off in (0.0, -1e-4, 1e-4):  # rad, outwards
+            side = course + math.radians(fov / 2) + off
+            x, v = np.zeros((2, 2)), np.array([[np.cos(course), np.sin(course)], [0.0, 0.0]])
+            x[1] = 2 * np.cos(side), 2 * np.sin(side)
+            moved = scene.step(start.with_motion(x[None], v[None])).vel[0, 0]
+            seen.append(bool(np.linalg.norm(moved - v[0].astype(dtype)) > 1e-2 * DT))
+    assert seen == [True, True, False] * 61

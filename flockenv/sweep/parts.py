@@ -293,7 +293,7 @@ class Parts:
                 bounds.append((len(values), trees[form]))
                 values.append(0.0)
         for sight in self.sights:
-            values += [sight.radius**2, view_of(sight.fov)]
+            values += [sight.radius**2, view_of(sight.fov, self.dtype)]
             if sight.group is not None:
                 values += self.starts[sight.group : sight.group + 2]
         left = self.counters
@@ -552,9 +552,17 @@ def record_of(fields: list[str]) -> list[str]:
     return ["place"] + [f for f in fields if f[0] != "h"]
 
 
-def view_of(fov: float) -> float:
-    """Return cos(fov / 2) |cos(fov / 2)|, what `in_view` compares; fov in degrees."""
-    cosine = math.cos(math.radians(fov) / 2.0)
+EDGE = 8
+"""Rounding errors by which a field of view is wider: as many as a heading, an offset and their product have."""
+
+
+def view_of(fov: float, dtype: str) -> float:
+    """Return c |c|, what `in_view` compares, with c = cos(fov / 2); fov in degrees.
+
+    The edge belongs to the field of view in either precision, since c is less by EDGE machine epsilons: with 180
+    degrees a neighbour exactly abeam is in view, whatever the heading is.
+    """
+    cosine = math.cos(math.radians(fov) / 2.0) - EDGE * float(np.finfo(dtype).eps)
     return cosine * abs(cosine)
 
 
