@@ -11,10 +11,11 @@ The rest loads when it is asked for: neither torch nor matplotlib nor numba is i
 
 # Signals first: in a command, `early` blocks them until `interrupts` handles them, before anything else is imported.
 # Gymnasium alone takes a third of a second.
-from flockenv import early, interrupts  # isort: skip
+from flockenv import early, interrupts, memory  # isort: skip
 
 interrupts.begin_early()
 early.release()
+memory.require(early.command())  # before the first library that needs much of it
 
 import importlib  # noqa: E402  # see above
 from typing import TYPE_CHECKING, Any  # noqa: E402  # see above

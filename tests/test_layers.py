@@ -19,6 +19,7 @@ LAYERS = (
     {
         "early",
         "interrupts",
+        "memory",
         "divergence",
         "terminal",
         "refusals",
