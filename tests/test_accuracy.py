@@ -500,6 +500,20 @@ def test_ctrl_c_on_the_command_line_keeps_the_problems_that_are_done(
     assert report.name == "damped"
 
 
+def test_ctrl_c_before_any_run_has_arrived_is_one_line(
+    in_a_folder: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def impatient(problem: Problem, methods: Any, repetitions: int, **more: Any) -> Report:
+        return measure(problem, methods, repetitions, progress=_Stop(0))
+
+    monkeypatch.setattr("flockenv.accuracy.measure", impatient)
+    asked = ["accuracy", "--suite", "--problems", "damped", "--methods", "rk4", "--repetitions", "0"]
+    assert main([*asked, "--out", "a.png"]) == 130
+    text = capsys.readouterr()
+    assert text.out == "" and text.err.splitlines()[-1] == "flockenv: interrupted"
+    assert not list(Path().glob("a.*"))
+
+
 def test_problems_that_are_done_are_written_before_the_next_one_begins(
     in_a_folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

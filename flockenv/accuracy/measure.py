@@ -116,7 +116,7 @@ def measure(
     methods: instances, none = all that `usual_methods` names. repetitions: how often the wall time of each point is
     taken, all of them in turn; compiling is over by then; 0 = not at all. finer: how much finer than the finest steps
     a reference of own steps is (see reference.own_steps). progress is called with percents. A KeyboardInterrupt ends
-    it early: what was done is returned, and `stopped` says so.
+    it early: what was done is returned, and `stopped` says so; it is raised on if no run has arrived by then.
     Raises ValueError, in one line, where there is no reference: a scene that is chaotic over its horizon (see
     chaos.find_sensitivity), or that does not settle on one path (see reference.own_steps).
     """
@@ -133,6 +133,8 @@ def measure(
                 trial.compare(reference)
         _clock([trial for trial in trials if trial.good], repetitions, progress)
     except KeyboardInterrupt:
+        if not any(trial.good for trial in trials):
+            raise
         stopped = "interrupted"
     floor = max(TRUSTED * reference.error, sensitivity.error)
     return Report(
