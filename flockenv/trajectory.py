@@ -59,10 +59,16 @@ class Trajectory:
         """Agent-steps per second of wall time; NaN for a run without steps."""
         return self.scene.agents * int(self.step[-1]) / self.wall if self.step[-1] and self.wall > 0 else math.nan
 
-    def measures(self) -> dict[str, tuple[float, float]]:
-        """Return every domain measure at the start and at the end."""
-        start = measure(self.scene, self.first)
-        end = start if self.last is self.first else measure(self.scene, self.last)
+    def measures(self, progress: Callable[[int], None] = lambda done: None) -> dict[str, tuple[float, float]]:
+        """Return every domain measure at the start and at the end.
+
+        progress: called with the number of agents measured, out of twice those of the scene.
+        """
+        agents = self.scene.agents
+        start = measure(self.scene, self.first, progress=progress)
+        progress(agents)
+        same = self.last is self.first
+        end = start if same else measure(self.scene, self.last, progress=lambda done: progress(agents + done))
         return {name: (start[name], end[name]) for name in start}
 
     def snapshots(self, title: str = "") -> Iterator[Snapshot]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 
 from flockenv.measures.order import nearest_distances, polarisation
@@ -21,18 +23,23 @@ MEASURES = {
 """Names and units of what `measure` returns."""
 
 
-def measure(scene: Scene, state: State, world: int = 0) -> dict[str, float]:
-    """Return the measures of one world by name; NaN where one has no meaning (spacing of a single agent)."""
+def measure(
+    scene: Scene, state: State, world: int = 0, progress: Callable[[int], None] = lambda done: None
+) -> dict[str, float]:
+    """Return the measures of one world by name; NaN where one has no meaning (spacing of a single agent).
+
+    progress: called with the number of agents whose nearest neighbour has been found.
+    """
     with np.errstate(over="ignore", invalid="ignore"):  # a run that is about to diverge may be looked at, too
-        return _measure(scene, state, world)
+        return _measure(scene, state, world, progress)
 
 
-def _measure(scene: Scene, state: State, world: int) -> dict[str, float]:
+def _measure(scene: Scene, state: State, world: int, progress: Callable[[int], None]) -> dict[str, float]:
     alive = state.alive[world]
     pos, vel = (np.asarray(a[world][alive], np.float64) for a in (state.pos, state.vel))
     radius = np.asarray(scene.body.radius, np.float64)[alive]
     speed = np.linalg.norm(vel, axis=1)
-    nearest, who = nearest_distances(pos, scene.space)
+    nearest, who = nearest_distances(pos, scene.space, progress)
     touching = nearest < radius + radius[who]
     for centre, size in zip(state.obstacles.centre[world], state.obstacles.radius[world], strict=True):
         touching |= (size > 0) & (np.linalg.norm(scene.space.displacement(pos, centre), axis=1) < radius + size)

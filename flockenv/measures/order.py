@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.sparse import coo_array
@@ -15,6 +17,9 @@ __all__ = [
 ]  # fmt: skip
 
 Floats = NDArray[np.float64]
+
+AT_A_TIME = 2**18
+"""Points that are looked for between two calls of `progress`."""
 
 FARTHEST = 1e150
 """m: the square of a longer way is no number any more."""
@@ -89,19 +94,27 @@ def components(pos: Floats, reach: float, space: Space) -> int:
     return int(connected_components(graph, directed=False, return_labels=False)) if len(pos) else 0
 
 
-def nearest_distances(pos: Floats, space: Space) -> tuple[Floats, NDArray[np.intp]]:
-    """Return for each of (N, D) points, m, the distance to its nearest neighbour, m, and who that is.
+def nearest_distances(
+    pos: Floats, space: Space, progress: Callable[[int], None] = lambda done: None
+) -> tuple[Floats, NDArray[np.intp]]:
+    """Return for each of (N, D) points, m, the distance to its nearest neighbour, m, and which point that is.
 
     A lone point, or one further out than squares can be taken, is infinitely far from its nearest neighbour, itself.
+    progress: called with the number of points done.
     """
     distance, nearest = np.full(len(pos), np.inf), np.arange(len(pos))
     here = np.flatnonzero((np.abs(pos) < FARTHEST).all(axis=1))
     if len(here) < 2:
         return distance, nearest
     inside = space.wrap(pos[here])
-    found, who = cKDTree(inside, boxsize=space.size if isinstance(space, Torus) else None).query(inside, k=2)
-    # Of two points in one place each may be found first: whoever is not me is my neighbour.
-    rows = np.arange(len(here))
-    column = np.where(who[:, 0] == rows, 1, 0)
-    distance[here], nearest[here] = found[rows, column], here[who[rows, column]]
+    tree = cKDTree(inside, boxsize=space.size if isinstance(space, Torus) else None)
+    # In the order of the tree's leaves, successive points need the same nodes, which are in the caches then.
+    for first in range(0, len(here), AT_A_TIME):
+        progress(first)
+        rows = np.asarray(tree.indices[first : first + AT_A_TIME])
+        found, which = tree.query(inside[rows], k=2)
+        # Of two points in one place each may be found first: the neighbour is the one that is not the point itself.
+        column = np.where(which[:, 0] == rows, 1, 0)
+        k = np.arange(len(rows))
+        distance[here[rows]], nearest[here[rows]] = found[k, column], here[which[k, column]]
     return distance, nearest
