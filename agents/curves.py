@@ -136,7 +136,7 @@ def main(
 ) -> None:
     """Train several settings of each task, and draw their learning curves side by side."""
     with one_line_errors():
-        picture = checked_file(out, (".png",), force=True)
+        picture = checked_file(out, (".png",), force=True, beside=".json")
         folder = checked_path(str(runs), "--runs")
         experiments = experiments_of(configs)
         check_room(picture, ROOM)

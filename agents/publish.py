@@ -18,6 +18,7 @@ from agents.experiment import one_line_errors
 from agents.report import Results, grid
 from flockenv.outputs import replacing
 from flockenv.tasks import TASKS
+from flockenv.terminal import program
 
 __all__ = ["BLOCK", "app", "tables"]
 
@@ -100,4 +101,4 @@ def main(
 
 
 if __name__ == "__main__":
-    app()
+    program("publish", app)

@@ -19,12 +19,15 @@ from rich.progress import Progress
 
 from agents.experiment import Experiment, load_experiment, one_line_errors
 from flockenv.evaluation import rollout, worlds_for
-from flockenv.outputs import replacing
+from flockenv.outputs import check_room, checked_file, replacing
 from flockenv.players.rules import RULES, TUNED, RulesPlayer, as_dict
 from flockenv.tasks import Task
 from flockenv.terminal import program, shown_progress
 
 __all__ = ["RANGES", "app", "search"]
+
+ROOM = 2**16
+"""Bytes, more than what was found takes."""
 
 app = typer.Typer(add_completion=False, rich_markup_mode=None, pretty_exceptions_enable=False)
 console = Console(stderr=True)
@@ -149,11 +152,12 @@ def main(
     with one_line_errors():
         experiment = load_experiment(config)
         task = experiment.build()
+        target = TUNED / f"{task.name}.json" if out is None else checked_file(str(out), (".json",), force=True)
+        check_room(target, ROOM)
     s = experiment.search
     with shown_progress(Progress(console=console)) as progress:
         bar = progress.add_task(f"{task.name}: parameter sets", total=_plays(s.candidates, s.rounds))
         rules, found = search(experiment, lambda n: progress.advance(bar, n))
-    target = out or TUNED / f"{task.name}.json"
     write(target, task.name, rules, found)
     gained = f"mean return {found['textbook_mean']:.3f} (textbook) -> {found['tuning_mean']:.3f}"
     console.print(f"{target}: {gained}, {found['agent_steps']:,.0f} agent-steps")

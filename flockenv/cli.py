@@ -205,9 +205,7 @@ def run(
     from flockenv.trajectory import whole_steps
 
     loaded = load_scene(Path(scene))
-    path = checked_file(out, [".npz"], force) if out is not None else None
-    if path is not None:
-        checked_file(str(path.with_suffix(".json")), [".json"], force)
+    path = checked_file(out, [".npz"], force, beside=".json") if out is not None else None
     steps = whole_steps("--duration", duration, loaded.dt)
     usual = max(1, round(RECORDED_EVERY / loaded.dt))
     stride = usual if every is None else whole_steps("--every", every, loaded.dt, 1)
@@ -235,7 +233,9 @@ def render(
     out: Annotated[str, typer.Option(metavar="X.gif|X.png|X.html", help="What to write; a PNG shows the end.")],
     player: Annotated[
         str,
-        typer.Option(metavar="NAME|FILE", help=f"Player of a task: {', '.join(NAMES)}, a .safetensors or a .py file."),
+        typer.Option(
+            metavar="NAME|FILE", help=f"Player of a task: {', '.join(NAMES)}, or a file (.safetensors, .py, .zip)."
+        ),
     ] = "random",
     seed: Seed = 0,
     duration: Annotated[
@@ -243,6 +243,9 @@ def render(
         typer.Option(metavar="S", help="Simulated seconds of a scene; a task plays to its end.", show_default="10"),
     ] = None,
     size: Annotated[int, typer.Option(min=64, max=4096, help="Width of a picture in pixels.")] = 600,
+    trust_pickle: Annotated[
+        bool, typer.Option("--trust-pickle", help="Load Stable-Baselines3 zips too: executes the code in them.")
+    ] = False,
     force: Force = False,
 ) -> None:
     """Draw a scene, or an episode of a task under some player, as GIF, PNG or HTML replay."""
@@ -253,7 +256,7 @@ def render(
     if what in TASKS:
         if duration is not None:
             raise ValueError(f"--duration = {duration:g}: goes with a scene; an episode of a task ends by itself")
-        panel, fps = _episode(TASKS[what](), player, seed)
+        panel, fps = _episode(TASKS[what](), player, seed, trust_pickle)
     elif what.endswith((".yaml", ".yml")) or Path(what).exists():
         panel, fps = _film(what, 10.0 if duration is None else duration, seed)
     else:
@@ -384,8 +387,9 @@ def _show_measures(console: Console, trajectory: Trajectory) -> None:
         return f"{value:.4g}" if math.isfinite(value) else "-"
 
     scene, time = trajectory.scene, float(trajectory.last.time[0])
-    with progress_bar("measuring", 1, "runs", f"measuring {scene.agents:,} agents"):
-        measured = trajectory.measures()
+    instants = 1 if trajectory.last is trajectory.first else 2
+    with progress_bar("measuring", instants * scene.agents, "agents", f"measuring {scene.agents:,} agents") as progress:
+        measured = trajectory.measures(progress)
     rows = [(name, text(a), text(b), MEASURES[name]) for name, (a, b) in measured.items()]
     title = f"{scene.agents:,} agents, {int(trajectory.step[-1]):,} steps of {scene.dt:g} s, seed {trajectory.seed}"
     show_table(console, title, rows, ("measure", "t = 0 s", f"t = {time:g} s", "unit"))
@@ -409,13 +413,13 @@ def _film(file: str, duration: float, seed: int) -> tuple[Panel, float]:
     return Panel("", snapshots, None, trajectory.stopped), 1.0 / (every * scene.dt)
 
 
-def _episode(task: Task, player: str, seed: int) -> tuple[Panel, float]:
+def _episode(task: Task, player: str, seed: int, trust_pickle: bool) -> tuple[Panel, float]:
     """Return one episode as something to draw, and its frames per second."""
     from flockenv.evaluation import rollout
     from flockenv.players import load_player
     from flockenv.render import Panel
 
-    policy = load_player(player, task, seed)
+    policy = load_player(player, task, seed, trust_pickle)
     with progress_bar("playing", task.horizon, "decisions") as progress:
         episode = rollout(task, policy, 1, seed, record=0, progress=lambda done, most: progress(done))
     assert episode.recording is not None  # asked for with record=0

@@ -37,8 +37,12 @@ def checked_path(text: str, option: str = "--out") -> Path:
     return Path(text).resolve()
 
 
-def checked_file(text: str, suffixes: Sequence[str], force: bool = False, option: str = "--out") -> Path:
+def checked_file(
+    text: str, suffixes: Sequence[str], force: bool = False, option: str = "--out", beside: str | None = None
+) -> Path:
     """Return the absolute path of a file that may be written, and whose name ends in one of `suffixes`.
+
+    beside: the suffix of a second file that is written with it, checked in the same way; "" for a folder.
 
     Raises:
         ValueError: as `checked_path`; or another suffix; or the file is there already and `force` is not given.
@@ -51,6 +55,11 @@ def checked_file(text: str, suffixes: Sequence[str], force: bool = False, option
         raise ValueError(f"{option} {_shown(text)}: is a folder")
     if path.exists() and not force:
         raise ValueError(f"{option} {_shown(text)}: exists already; --force overwrites it")
+    if beside == "":
+        if path.with_suffix("").exists() and not path.with_suffix("").is_dir():
+            raise ValueError(f"{option} {_shown(text)}: {path.stem!r} beside it is a file, must be a folder")
+    elif beside is not None and beside != suffix:
+        checked_file(str(path.with_suffix(beside)), [beside], force, option)
     return path
 
 

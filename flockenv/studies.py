@@ -88,9 +88,7 @@ def accuracy(
         raise ValueError("--suite: has horizons and steps of its own; --seconds, --steps and --dts go with a scene")
     if problems and not suite:
         raise ValueError("--problems: goes with --suite")
-    path = checked_file(out, [".json", ".png"], force) if out is not None else None
-    if path is not None and path.suffix.lower() == ".png":
-        checked_file(str(path.with_suffix(".json")), [".json"], force)
+    path = checked_file(out, [".json", ".png"], force, beside=".json") if out is not None else None
     chosen = methods_named(_words(methods)) if methods else usual_methods()
     if suite:
         todo: list[Callable[[], Problem]] = [
@@ -291,7 +289,7 @@ def stress(
     from flockenv.outputs import checked_file
     from flockenv.stress import CASES, cases_named, fingerprint, run, trials, usual_methods
 
-    path = checked_file(out, [".json", ".png"], True) if out is not None else None
+    path = checked_file(out, [".json", ".png"], True, beside=".json") if out is not None else None
     todo = cases_named(CASES, _words(cases))
     under = methods_named(_words(methods)) if methods else usual_methods()
     kinds = [method.kind for method in under]
@@ -324,9 +322,7 @@ def experiment(
     from flockenv.render.curves import write_order
     from flockenv.render.trials import write_trials
 
-    path = checked_file(out, [".json", ".png"], force) if out is not None else None
-    if path is not None and path.suffix.lower() == ".png":
-        checked_file(str(path.with_suffix(".json")), [".json"], force)
+    path = checked_file(out, [".json", ".png"], force, beside=".json") if out is not None else None
     chosen = load_plan(Path(plan)).experiment()
     with progress_bar(chosen.title, len(chosen.cases) * len(chosen.variants), "trials") as advance:
         results, trials = run(chosen, advance)
@@ -349,7 +345,7 @@ def gallery(
     from flockenv.gallery import write_gallery
     from flockenv.outputs import checked_file
 
-    path = checked_file(out, [".md"], force)
+    path = checked_file(out, [".md"], force, beside="")
     with progress_bar("drawing", len(BEHAVIOURS), "behaviours") as advance:
         many = write_gallery(path, progress=advance)
     new_console().print(f"{many} behaviours in {relative(path)}")

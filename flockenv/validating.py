@@ -40,7 +40,9 @@ def validate(
     from flockenv.outputs import checked_file
     from flockenv.validation import CASES, cases_named, fingerprint, presets_named, run, trials
 
-    path = checked_file(out, [".json", ".md"], True) if out is not None else None
+    path = checked_file(out, [".json", ".md"], True, beside=".json") if out is not None else None
+    if path is not None and path.suffix.lower() == ".md":
+        checked_file(str(path), [".md"], True, beside="")  # of pictures
     todo, under = cases_named(CASES, cases or []), presets_named(preset or [])
     if scenes is not None:
         _write_scenes(scenes, force, todo, under)

@@ -125,6 +125,22 @@ def test_what_the_search_found_is_what_rules_play_by(tmp_path: Path, monkeypatch
     assert found["agent_steps"] > 0 and found["tuning_mean"] >= found["textbook_mean"]
 
 
+@pytest.mark.parametrize(
+    ("out", "fault"),
+    [("/proc/none/x.json", "must lie below"), ("file/x.json", "is not a folder"), ("x.yaml", "must end in .json"),
+     ("../x.json", "must not go up")],
+)  # fmt: skip
+def test_a_search_is_refused_where_its_findings_cannot_be_written(
+    out: str, fault: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("file").write_text("mine")
+    Path("pursuit.yaml").write_text("{task: pursuit}", encoding="utf-8")
+    monkeypatch.setattr(tune, "search", lambda *_: pytest.fail("searched before --out was checked"))
+    result = CliRunner().invoke(tune.app, ["pursuit.yaml", "--out", out])
+    assert result.exit_code == 2 and result.output.count("\n") == 1 and fault in result.output
+
+
 @pytest.mark.slow
 def test_training_is_repeatable_and_exports(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     from agents import ppo

@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
+import io
 import json
 import os
 import re
 import subprocess
 import sys
+import threading
 import time
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 import typer
 from PIL import Image
+from rich.progress import Progress
 from typer.testing import CliRunner
 
 import flockenv.stress
@@ -26,6 +30,7 @@ from flockenv.effects.springs import Springs
 from flockenv.explanation import Cost, Explanation
 from flockenv.integrators import INTEGRATORS, ImplicitEuler, Integrator
 from flockenv.networks import Rope
+from flockenv.policy import Policy, RandomPolicy
 from flockenv.scene import Group, Scene
 from flockenv.stability import suggest_dt
 from flockenv.stress import Case, Value
@@ -288,19 +293,29 @@ def often(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.usefixtures("often")
 def test_a_pipe_is_told_how_far_a_command_is(capsys: pytest.CaptureFixture[str]) -> None:
+    said = ""
+
+    def until(word: str) -> None:
+        nonlocal said
+        last = time.monotonic() + 60
+        while word not in said:
+            assert time.monotonic() < last, said
+            time.sleep(0.01)
+            said += capsys.readouterr().err
+
     with terminal.progress_bar("working", 10**14, "steps", "placing agents") as progress:
-        time.sleep(0.1)
+        until("placing agents: (")
         progress(0)
         time.sleep(0.02)
         progress(10)
-        time.sleep(0.1)
+        until("years left")
         progress(10**14)
+    said += capsys.readouterr().err
     waiting, working = (
-        r"placing agents: \(0 s so far\)",
-        r"working: 1e-11 % \(0 s so far, about [\d,]+ years left\)",
+        r"placing agents: \(\d+ s so far\)",
+        r"working: 1e-11 % \(\d+ s so far, about [\d,]+ years left\)",
     )
-    said = capsys.readouterr().err
-    assert re.fullmatch(rf"({waiting}\n)+(working: \(0 s so far\)\n)*({working}\n)+", said), said
+    assert re.fullmatch(rf"({waiting}\n)+(working: \(\d+ s so far\)\n)*({working}\n)+", said), said
 
 
 def test_a_quick_command_says_nothing_of_its_progress(capsys: pytest.CaptureFixture[str]) -> None:
@@ -308,12 +323,35 @@ def test_a_quick_command_says_nothing_of_its_progress(capsys: pytest.CaptureFixt
     assert capsys.readouterr().err == ""
 
 
+class News(io.StringIO):
+    """What is written to stderr; `arrived` is set once it says how far a command is."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.arrived = threading.Event()
+
+    def write(self, text: str) -> int:
+        count = super().write(text)
+        if " so far" in self.getvalue():
+            self.arrived.set()
+        return count
+
+
 @pytest.mark.usefixtures("often")
-@pytest.mark.parametrize("command", [["measure", "--time", "40"], ["run", "--duration", "100000"]], ids=lambda c: c[0])
-def test_long_commands_say_how_far_they_are(command: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+@pytest.mark.parametrize("command", [["measure", "--time", "0.1"], ["run", "--duration", "0.1"]], ids=lambda c: c[0])
+def test_long_commands_say_how_far_they_are(command: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whatever the speed of the machine: the command waits in its first news of progress until a line is written."""
+    news, update = News(), Progress.update
+
+    def wait(bars: Progress, *given: Any, **more: Any) -> None:
+        update(bars, *given, **more)
+        assert news.arrived.wait(60)
+
+    monkeypatch.setattr(sys, "stderr", news)
+    monkeypatch.setattr(Progress, "update", wait)
     name, *options = command
     assert main([name, "tiny.yaml", *options]) == 0
-    assert " so far" in capsys.readouterr().err
+    assert re.search(r"^\S.*: .*\(\d+ s so far.*\)$", news.getvalue(), re.MULTILINE)
 
 
 @pytest.mark.parametrize(
@@ -361,6 +399,20 @@ def test_a_task_under_a_player_of_ones_own() -> None:
         assert f'"player":"{name}"' in Path(f"{name}.html").read_text().replace('": "', '":"')
     with Image.open("p.png") as png:
         assert png.size[0] == 96
+
+
+def test_a_zip_is_a_player_only_where_it_is_trusted(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def load(path: Path, trust_pickle: bool) -> Policy:
+        assert trust_pickle
+        return RandomPolicy(2, 0)
+
+    monkeypatch.setitem(sys.modules, "flockenv.sb3", SimpleNamespace(load_sb3_zip=load))  # without torch
+    Path("mine.zip").write_bytes(b"")
+    asked = ["render", "pursuit", "--player", "mine.zip", "--out", "p.html"]
+    assert main(asked) == 2 and "pass --trust-pickle" in capsys.readouterr().err
+    assert main([*asked, "--trust-pickle"]) == 0 and Path("p.html").exists()
 
 
 # --- explain ----------------------------------------------------------------------------------------------------------

@@ -7,7 +7,9 @@ import tempfile
 from pathlib import Path
 
 import pytest
+from typer.main import get_command
 
+from flockenv.cli import app, main
 from flockenv.outputs import checked_file, checked_path
 
 
@@ -100,3 +102,60 @@ def test_the_suffix_is_one_of_those_that_are_written() -> None:
         checked_file("x.gfi", [".gif", ".png"], option="--to")
     with pytest.raises(ValueError, match=r"--out 'x': must end in \.gif$"):
         checked_file("x", [".gif"])
+
+
+def test_what_is_written_beside_a_file_is_refused_with_it() -> None:
+    Path("numbers.json").write_text("mine")
+    for name in ("numbers.png", "numbers.json"):
+        with pytest.raises(ValueError, match=r"numbers\.json': exists already"):
+            checked_file(name, [".png", ".json"], beside=".json")
+        assert checked_file(name, [".png", ".json"], force=True, beside=".json").name == name
+    Path("folder.json").mkdir()
+    with pytest.raises(ValueError, match=r"folder\.json': is a folder"):
+        checked_file("folder.png", [".png"], force=True, beside=".json")
+
+
+def test_a_folder_of_pictures_beside_a_page_is_no_file() -> None:
+    assert checked_file("page.md", [".md"], beside="").name == "page.md"
+    Path("page").mkdir()
+    assert checked_file("page.md", [".md"], beside="").name == "page.md"
+    Path("other").write_text("mine")
+    with pytest.raises(ValueError, match=r"--out 'other\.md': 'other' beside it is a file, must be a folder"):
+        checked_file("other.md", [".md"], force=True, beside="")
+
+
+WRITING = {
+    "run": (["run", "tiny.yaml", "--out"], "x.npz"),
+    "render": (["render", "tiny.yaml", "--out"], "x.gif"),
+    "render a task": (["render", "pursuit", "--out"], "x.html"),
+    "measure": (["measure", "tiny.yaml", "--json"], "x.json"),
+    "measure pictures": (["measure", "tiny.yaml", "--out"], "x"),
+    "accuracy": (["accuracy", "--suite", "--out"], "x.png"),
+    "stress": (["stress", "--out"], "x.json"),
+    "experiment": (["experiment", "none.yaml", "--out"], "x.png"),
+    "gallery": (["gallery", "--out"], "x.md"),
+    "validate": (["validate", "--out"], "x.md"),
+    "validate scenes": (["validate", "--scenes"], "x"),
+}
+
+
+@pytest.mark.parametrize(("words", "name"), WRITING.values(), ids=WRITING)
+@pytest.mark.parametrize(
+    ("folder", "fault"),
+    [("/proc/none/", "must lie below"), ("tiny.yaml/", "is not a folder"), ("a/../", "must not go up")],
+)
+def test_a_place_that_cannot_be_written_is_refused_at_once(
+    words: list[str], name: str, folder: str, fault: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    Path("tiny.yaml").write_text("space: {kind: torus, size: [9, 9]}\ngroups: [{count: 2}]\ndt: 0.01\n")
+    before = sorted(Path().iterdir())
+    assert main([*words, folder + name]) == 2
+    said = capsys.readouterr()
+    assert said.out == "" and said.err.count("\n") == 1 and fault in said.err
+    assert sorted(Path().iterdir()) == before
+
+
+def test_every_command_that_writes_is_tried_above() -> None:
+    commands = getattr(get_command(app), "commands", {})
+    writing = {name for name, command in commands.items() if any("--out" in p.opts for p in command.params)}
+    assert writing == {words[0] for words, _ in WRITING.values()}

@@ -11,7 +11,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+import typer
+from typer.main import get_command
 
+from agents import compare, invade, transfer
+from flockenv import cli
 from flockenv.players import NAMES, WEIGHTS, load_player, other_tasks
 from flockenv.players.rules import PLAYERS
 from flockenv.policy import MlpPolicy
@@ -225,3 +229,13 @@ def test_a_zip_is_opened_only_when_trusted(tmp_path: Path) -> None:
     rows = np.zeros((2, Pursuit().layout.size), np.float32)
     action, _ = load_player(path, Pursuit(), trust_pickle=True).predict(rows, deterministic=True)
     np.testing.assert_array_equal(action, model.predict(rows, deterministic=True)[0])
+
+
+@pytest.mark.parametrize(
+    "app", [cli.app, compare.app, invade.app, transfer.app], ids=["flockenv", "compare", "invade", "transfer"]
+)
+def test_every_command_with_players_can_be_told_to_trust_their_zips(app: typer.Typer) -> None:
+    commands = getattr(get_command(app), "commands", {"": get_command(app)})
+    options = [{option for p in command.params for option in p.opts} for command in commands.values()]
+    playing = [each for each in options if each & {"--player", "--players"}]
+    assert playing and all("--trust-pickle" in each for each in playing)
