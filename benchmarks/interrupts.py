@@ -131,7 +131,7 @@ def _ending(outcome: Outcome) -> str:
     """Return how a run ended whose signal arrived while Python was starting."""
     if not outcome.faults:
         return "one line of flockenv's"  # the first statement ran between the look into /proc and the signal
-    if "Traceback" in outcome.said or "Fatal Python error" in outcome.said:
+    if re.search(r"Traceback|Fatal Python error|^KeyboardInterrupt$", outcome.said, re.MULTILINE):
         return "traceback of Python's"
     return "killed without a word" if outcome.code < 0 and not outcome.said else f"exit code {outcome.code}"
 
@@ -193,7 +193,7 @@ def main(
                 continue
             outcomes.append(outcome)
             progress(len(outcomes))
-            if outcome.faults and not outcome.early:
+            if outcome.faults and (not outcome.early or _ending(outcome).startswith("exit")):
                 how = f"{number.name} at {at:.2f} s, group {group}, twice {twice}, cold {empty}"
                 print(f"{command}, {how}: {', '.join(outcome.faults)}\n{outcome.said}", flush=True)
     counted = [outcome for outcome in outcomes if not outcome.early]

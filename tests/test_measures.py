@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from flockenv.measures import MEASURES, measure, nearest_distances, polarisation
+from flockenv.measures import MEASURES, measure, nearest_distances, order, polarisation
 from flockenv.scene import Group, Scene
 from flockenv.shapes import Circle
 from flockenv.space import Box, Plane, Space, Torus
@@ -48,6 +48,15 @@ def test_the_nearest_is_the_nearest_of_all_pairs(points: list[tuple[float, float
     assert distance == pytest.approx(ways.min(axis=1), abs=1e-12)
     assert (who != np.arange(len(pos))).all()
     assert ways[np.arange(len(pos)), who] == pytest.approx(distance, abs=1e-12)
+
+
+def test_the_nearest_are_found_piece_by_piece_with_news_of_each(monkeypatch: pytest.MonkeyPatch) -> None:
+    pos, space, news = np.random.default_rng(0).uniform(0, 10, (100, 2)), Torus(size=(10, 12)), list[int]()
+    whole = nearest_distances(pos, space)
+    monkeypatch.setattr(order, "AT_A_TIME", 30)
+    pieces = nearest_distances(pos, space, news.append)
+    assert all((a == b).all() for a, b in zip(whole, pieces, strict=True))
+    assert news == [0, 30, 60, 90]
 
 
 def test_the_nearest_around_the_corner_of_a_torus() -> None:
