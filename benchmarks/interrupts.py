@@ -46,8 +46,8 @@ COMMANDS: dict[str, tuple[str, ...]] = {
     "render": (*FLOCKENV, "render", f"{SCENES}/boids.yaml", "--duration", "20", "--out", "a/x.gif"),
     "accuracy": (*FLOCKENV, "accuracy", "--suite", "--out", "accuracy.png"),
     "stress": (*FLOCKENV, "stress", "--out", "stress.json"),
-    "compare": ("-m", "agents.compare", "--tasks", "pursuit,obstacles", "--players", "random,reynolds"),
-    "transfer": ("-m", "agents.transfer", "pursuit", "--players", "random,reynolds", "--worlds", "16"),
+    "compare": ("-m", "agents.compare", "--tasks", "pursuit,obstacles", "--players", "random,rules"),
+    "transfer": ("-m", "agents.transfer", "pursuit", "--players", "random,rules", "--worlds", "16"),
     "tune": ("-m", "agents.tune", "pursuit.yaml"),
     "ppo": ("-m", "agents.ppo", "pursuit.yaml", "--out", "w.safetensors", "--runs", "runs"),
 }
@@ -90,7 +90,8 @@ def interrupted(
     if process.poll() is not None:
         process.communicate()
         return None
-    early = not _guarded(process.pid, signal.SIGTERM)
+    early = not _in(process.pid, signal.SIGTERM, "Blk|Cgt|Ign")
+    done = _in(process.pid, number, "Ign")  # the command ignores signals once it has done its work
     sent = time.monotonic()
     for _ in range(1 + twice):
         (os.killpg if group else os.kill)(process.pid, number)
@@ -108,7 +109,7 @@ def interrupted(
     if _lives(process.pid):
         faults.append("orphan")
         os.killpg(process.pid, signal.SIGKILL)
-    if process.returncode == 0 and not said and time.monotonic() - sent < LATE:
+    if process.returncode == 0 and not said and (done or time.monotonic() - sent < LATE):
         return None
     if process.returncode != 128 + number:
         faults.append(f"exit code {process.returncode}")
@@ -121,9 +122,9 @@ def _hear() -> None:
         signal.signal(number, signal.default_int_handler if number == signal.SIGINT else signal.SIG_DFL)
 
 
-def _guarded(pid: int, number: int) -> bool:
-    """True if a process blocks a signal or has a handler for it."""
-    masks = re.findall(r"^Sig(?:Blk|Cgt):\s*(\w+)", Path(f"/proc/{pid}/status").read_text(), re.MULTILINE)
+def _in(pid: int, number: int, names: str) -> bool:
+    """True if a signal is in one of a process's masks, named as in /proc/PID/status: Blk|Cgt|Ign."""
+    masks = re.findall(rf"^Sig(?:{names}):\s*(\w+)", Path(f"/proc/{pid}/status").read_text(), re.MULTILINE)
     return any(int(mask, 16) >> (number - 1) & 1 for mask in masks)
 
 
