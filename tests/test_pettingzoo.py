@@ -377,6 +377,68 @@ def test_by_turns_a_bad_action_is_refused_on_its_own_turn():
     env.step(np.zeros(2))
 
 
+@pytest.mark.parametrize("bad", [None, np.zeros(3), 0.0, "left", {"x": 1}])
+def test_by_turns_an_agent_that_acts_needs_an_action(bad):
+    env = make(FLOCK, "aec")
+    env.reset(seed=0)
+    env.step(np.zeros(2))
+    refused(env, bad, "'boid_1'")
+    assert env.agent_selection == "boid_1"
+    env.step(np.zeros(2))
+
+
+def after_an_end(env_id):
+    """The turn-based form at the turn of an agent that has ended; with the time limit, all of them have."""
+    env = make(env_id, "aec", max_cycles=3)
+    env.reset(seed=0)
+    while not (env.terminations[env.agent_selection] or env.truncations[env.agent_selection]):
+        env.step(np.zeros(2))
+    return env
+
+
+@pytest.mark.parametrize("env_id", IDS)
+@pytest.mark.parametrize("bad", [np.zeros(2), np.array([np.nan, 0.0]), 0.0, "left"])
+def test_by_turns_an_agent_that_has_ended_takes_none_and_nothing_else(env_id, bad):
+    env = after_an_end(env_id)
+    agent, others = env.agent_selection, [*env.agents]
+    refused(env, bad, repr(agent), "None")
+    assert env.agent_selection == agent
+    assert env.agents == others
+    env.step(None)
+    assert agent not in env.agents
+
+
+def test_by_turns_an_unknown_agent_is_not_observed():
+    env = after_an_end(FLOCK)
+    for agent, reason in (("boid_00", "did you mean"), (None, "is unknown"), (0, "is unknown")):
+        with pytest.raises(ValueError, match=f"{agent!r} .*{reason}"):
+            env.observe(agent)
+    assert env.observation_space("boid_1").contains(env.observe("boid_1"))
+
+
+def round_of_turns(env):
+    """Each agent's turn until the world has moved: None from those that have ended, no steering from the others."""
+    steps = env.unwrapped.world.steps.copy()
+    while env.agents and env.unwrapped.world.steps == steps:
+        agent = env.agent_selection
+        env.step(None if env.terminations[agent] or env.truncations[agent] else np.zeros(2))
+
+
+def test_by_turns_an_agent_that_has_left_is_not_observed_after_the_next_step_of_the_world():
+    env, gone = make(PURSUIT, "aec", capture_distance=6.0), []
+    for seed in range(50):  # until in a first step just one of the two is within reach
+        env.reset(seed=seed)
+        round_of_turns(env)
+        gone = [agent for agent, over in env.terminations.items() if over]
+        if len(gone) == 1:
+            break
+    assert env.observation_space(gone[0]).contains(env.observe(gone[0]))
+    round_of_turns(env)
+    assert gone[0] not in env.agents
+    with pytest.raises(ValueError, match=f"^observe: agent '{gone[0]}' has left the game$"):
+        env.observe(gone[0])
+
+
 def test_actions_beyond_the_box_are_clipped_without_a_word():
     observations = []
     for big in (1.0, 5.0, 1e300):

@@ -38,9 +38,24 @@ class _Checked(BaseWrapper):  # type: ignore[misc]  # pettingzoo ships no types
         """The random numbers of wrappers, seeded by `reset(seed=s)`."""
         return self.unwrapped.np_random  # type: ignore[no-any-return]
 
+    def observe(self, agent: str) -> Rows:
+        """Return the last observation of an agent, (O,) float32.
+
+        Raises ValueError for an unknown agent, and for one that left before the last step of the world.
+        """
+        try:
+            return self.env.observe(agent)  # type: ignore[no-any-return]
+        except KeyError:
+            self.env.observation_space(agent)  # ValueError if it is unknown
+            raise ValueError(f"observe: agent {agent!r} has left the game") from None
+
     def step(self, action: Rows | None) -> None:
-        if action is not None:
-            self.env.unwrapped.checked_action(self.agent_selection, action)
+        """Pass the action of the agent whose turn it is: (A,), or None from an agent that has ended."""
+        agent = self.agent_selection
+        if not (self.terminations[agent] or self.truncations[agent]):
+            self.unwrapped.checked_action(agent, action)
+        elif action is not None:
+            raise ValueError(f"actions: agent {agent!r} has ended, so that its action must be None")
         self.env.step(action)
 
     def __str__(self) -> str:

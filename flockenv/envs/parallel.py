@@ -192,13 +192,15 @@ class WorldParallelEnv(ParallelEnv[str, Rows, Rows]):  # type: ignore[misc]  # p
         lacking = next(name for name in self._live if name not in actions)
         raise ValueError(f"actions: agent {lacking!r} has none")
 
-    def checked_action(self, agent: str, action: Rows) -> Rows:
+    def checked_action(self, agent: str, action: Rows | None) -> Rows:
         """Return an action as an array, (A,); ValueError that names the agent on NaN, infinity or another shape."""
         size = self.task.action_layout.size
         try:
             row = np.asarray(action, np.float64)
         except (TypeError, ValueError):
-            raise ValueError(f"actions: agent {agent!r} has {action!r}, must be {size} numbers") from None
+            row = None
+        if row is None or action is None:  # numpy makes NaN of None
+            raise ValueError(f"actions: agent {agent!r} has {action!r}, must be {size} numbers")
         if row.shape != (size,):
             raise ValueError(f"actions: agent {agent!r} has shape {row.shape}, must be ({size},)")
         if not np.isfinite(row).all():
