@@ -224,10 +224,44 @@ def test_who_is_captured_leaves_and_the_others_play_on():
     assert not any(outcome[3].values())
     assert not any(info["is_success"] for info in outcome[4].values())
     assert env.agents == [name for name in env.possible_agents if name not in gone]
-    with pytest.raises(ValueError, match=rf"{gone[0]}.*has left"):
-        env.step({**still(env), gone[0]: np.zeros(2)})
     outcome = env.step(still(env))
     assert all(set(part) == set(env.possible_agents) - set(gone) for part in outcome)
+
+
+def without_one(**options):
+    """Pursuit after a first step in which just one of the two evaders was captured, and its name."""
+    env = make(PURSUIT, capture_distance=6.0, **options)
+    for seed in range(50):
+        env.reset(seed=seed)
+        env.step(still(env))
+        gone = [name for name in env.possible_agents if name not in env.agents]
+        if len(gone) == 1:
+            break
+    return env, gone[0]
+
+
+@pytest.mark.parametrize("place", ["first", "last"])
+@pytest.mark.parametrize("ignored", [np.ones(2), np.full(2, np.nan), np.zeros(3), None, "left"])
+def test_actions_of_agents_that_have_left_are_ignored(place, ignored):
+    """As by PettingZoo's conversion; TorchRL passes them until the episode ends, AgileRL for one more step."""
+    env, gone = without_one()
+    twin = copy.deepcopy(env)
+    rng = np.random.default_rng(0)
+    while env.agents:
+        actions = some(env, rng)
+        more = {gone: ignored, **actions} if place == "first" else {**actions, gone: ignored}
+        assert data_equivalence(twin.step(more), env.step(actions), exact=True)
+        assert twin.agents == env.agents
+
+
+def test_actions_of_agents_that_have_left_stand_for_no_other():
+    env, gone = without_one()
+    for lacking in env.agents:
+        refused(env, {**still(env), gone: np.zeros(2)} | {lacking: np.zeros(3)}, repr(lacking))
+        given = {name: np.zeros(2) for name in env.possible_agents if name != lacking}
+        refused(env, given, repr(lacking), "has none")
+    refused(env, {**still(env), gone: np.zeros(2), gone + "x": np.zeros(2)}, repr(gone + "x"), "is unknown")
+    assert gone not in env.step({**still(env), gone: np.zeros(2)})[0]
 
 
 def test_everybody_ends_once_and_nobody_comes_back():

@@ -133,9 +133,10 @@ class WorldParallelEnv(ParallelEnv[str, Rows, Rows]):  # type: ignore[misc]  # p
     ) -> tuple[Named, dict[str, float], dict[str, bool], dict[str, bool], dict[str, Named]]:
         """Act for one control_dt; needs an action, (A,), clipped to [-1, 1], from every agent in `agents`.
 
-        When no agent is left, an empty dictionary is the right one, and five empty ones come back.
+        Actions of agents that have left are ignored, as PettingZoo's conversion to this form does: TorchRL and AgileRL
+        pass them. When no agent is left, an empty dictionary is needed, and five empty ones are returned.
 
-        Raises ValueError, before anything moves, that names the agent whose action is missing, is not asked for, has
+        Raises ValueError, before anything moves, that names the agent that is unknown or whose action is missing, has
         another shape or holds NaN; ResetNeeded before the first reset, or for actions when no agent is left.
         """
         if self._running and not self._live and isinstance(actions, dict) and not actions:
@@ -164,7 +165,7 @@ class WorldParallelEnv(ParallelEnv[str, Rows, Rows]):  # type: ignore[misc]  # p
             raise TypeError(f"actions: {type(actions).__name__}, must be a dictionary from agent to action")
         if [*actions] == [*self._live]:  # in our order, as most hand them in
             given = [*actions.values()]
-        elif actions.keys() == self._live.keys():
+        elif self._live.keys() <= actions.keys() <= self.action_spaces.keys():
             given = [actions[name] for name in self._live]
         else:
             self._refuse_names(actions)
@@ -186,9 +187,8 @@ class WorldParallelEnv(ParallelEnv[str, Rows, Rows]):  # type: ignore[misc]  # p
 
     def _refuse_names(self, actions: Mapping[str, Rows]) -> NoReturn:
         for name in actions:
-            if name not in self._live:
-                reason = "has left the game" if name in self.possible_agents else "is unknown"
-                raise ValueError(f"actions: agent {name!r} {reason}{nearest(str(name), self._live)}")
+            if name not in self.action_spaces:
+                raise ValueError(f"actions: agent {name!r} is unknown{nearest(str(name), self._live)}")
         lacking = next(name for name in self._live if name not in actions)
         raise ValueError(f"actions: agent {lacking!r} has none")
 
