@@ -7,10 +7,13 @@ from __future__ import annotations
 
 import importlib
 import re
+import sys
 from importlib.util import find_spec
+from pathlib import Path
 
 import pytest
 
+from tests.clients import __main__ as runner
 from tests.clients.__main__ import CLIENTS, HERE, ROOT, head
 
 PAGE = (ROOT / "docs" / "clients.md").read_text(encoding="utf-8")
@@ -43,6 +46,46 @@ def test_the_code_on_the_page_runs_where_its_library_is_here(title: str, code: s
     if lacking:
         pytest.skip(f"not installed: {', '.join(lacking)}")
     exec(program, {})  # noqa: S102  # that is the point
+
+
+PLAYED = """
+import json
+print("what a client prints")
+for env, lines in (("A-v0", 0), ("B-v0", 0), ("B-v0", 2)):
+    print(json.dumps({"client": "x 1.0", "what": "all", "env": env, "lines": lines, "steps": 1000, "seconds": 0.1}))
+"""
+TABLE = """\
+| client | what | lines | B-v0 | A-v0 |
+| --- | --- | --- | --- | --- |
+| x 1.0 | all | 0 | 1,000 | 1,000 |
+| x 1.0 | all | 2 | 1,000 |  |
+"""
+
+
+@pytest.mark.parametrize(("end", "code"), [("", 0), ("raise SystemExit(3)", 3), ("import a_package_not_here", 1)])
+def test_what_was_played_before_a_script_fails_is_in_the_log(
+    end: str, code: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """With --python beside the folder that the command is run in, as it is typed."""
+    (tmp_path / "play_x.py").write_text(PLAYED + end, encoding="utf-8")
+    (tmp_path / "python").symlink_to(sys.executable)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(runner, "HERE", tmp_path)
+    monkeypatch.setattr(runner, "CLIENTS", ["x"])
+    monkeypatch.setattr(sys, "argv", ["tests.clients", "x", "--python", "python"])
+    if code:
+        with pytest.raises(SystemExit, match=f"^x: .*play_x.py 10000 ended with {code}$"):
+            runner.main()
+    else:
+        runner.main()
+    assert capfd.readouterr().out == TABLE
+
+
+def test_what_is_built_for_a_client_is_the_package_and_nothing_is_left_here(tmp_path: Path) -> None:
+    copy = runner.source(tmp_path / "source")
+    packages = {path.relative_to(ROOT) for path in (ROOT / "flockenv").rglob("*.py")}
+    assert packages == {path.relative_to(copy) for path in copy.rglob("*.py")}
+    assert (copy / "pyproject.toml").read_bytes() == (ROOT / "pyproject.toml").read_bytes()
 
 
 def test_no_test_run_collects_the_scripts() -> None:

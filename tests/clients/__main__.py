@@ -8,11 +8,13 @@ from __future__ import annotations
 import argparse
 import json
 import re
+import shutil
 import subprocess
 import sys
 import tempfile
 import tomllib
 import venv
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -29,33 +31,44 @@ def head(client: str) -> dict[str, Any]:
     return tomllib.loads("".join(line[2:] for line in lines[1].splitlines(keepends=True)))
 
 
+def source(folder: Path) -> Path:
+    """Return a copy of what the package is built from: pip would leave build/ and egg-info in the repository."""
+    shutil.copytree(ROOT / "flockenv", folder / "flockenv", ignore=shutil.ignore_patterns("__pycache__"))
+    for name in ("pyproject.toml", "README.md", "LICENSE"):
+        shutil.copy(ROOT / name, folder)
+    return folder
+
+
 def installed(client: str, folder: Path) -> Path:
     """Return the Python of a new virtual environment that has what the script needs, and flockenv."""
-    venv.create(folder, with_pip=True)
-    python = folder / ("Scripts/python.exe" if sys.platform == "win32" else "bin/python")
+    venv.create(folder / "venv", with_pip=True)
+    python = folder / "venv" / ("Scripts/python.exe" if sys.platform == "win32" else "bin/python")
     needs = head(client)
     constraints = needs.get("tool", {}).get("flockenv", {}).get("constraints")
     limits = ["-c", str(ROOT / constraints)] if constraints else []
-    subprocess.run([python, "-m", "pip", "install", "-q", *limits, str(ROOT), *needs["dependencies"]], check=True)
+    packages = [str(source(folder / "source")), *needs["dependencies"]]
+    subprocess.run([python, "-m", "pip", "install", "-q", *limits, *packages], check=True)
     return python
 
 
-def play(client: str, python: Path, steps: int) -> list[dict[str, Any]]:
-    """Return the rows that a script prints, one line of JSON each; RuntimeError if it fails."""
+def play(client: str, python: Path, steps: int) -> Iterator[dict[str, Any]]:
+    """Yield the rows that a script prints, a line of JSON each, as they come; RuntimeError at its end if it failed."""
     command = [str(python), str(HERE / f"play_{client}.py"), str(steps)]
-    done = subprocess.run(command, cwd=tempfile.gettempdir(), stdout=subprocess.PIPE, text=True, check=False)
-    if done.returncode:
-        raise RuntimeError(f"{client}: {' '.join(command)} ended with {done.returncode}")
-    return [json.loads(line) for line in done.stdout.splitlines() if line.startswith('{"client"')]
+    with subprocess.Popen(command, cwd=tempfile.gettempdir(), stdout=subprocess.PIPE, text=True) as script:
+        assert script.stdout
+        yield from (json.loads(line) for line in script.stdout if line.startswith('{"client"'))
+    if script.returncode:
+        raise RuntimeError(f"{' '.join(command)} ended with {script.returncode}")
 
 
 def table(rows: list[dict[str, Any]]) -> str:
     """Return the log: what each client played, and how many steps of each environment."""
     envs = sorted({row["env"] for row in rows}, reverse=True)
     lines = [["client", "what", "lines", *envs], ["---"] * (3 + len(envs))]
-    for client, what, count in dict.fromkeys((row["client"], row["what"], row["lines"]) for row in rows):
-        steps = {row["env"]: f"{row['steps']:,}" for row in rows if (row["client"], row["what"]) == (client, what)}
-        lines.append([client, what, str(count), *(steps.get(env, "") for env in envs)])
+    for kind in dict.fromkeys((row["client"], row["what"], str(row["lines"])) for row in rows):
+        same = [row for row in rows if (row["client"], row["what"], str(row["lines"])) == kind]
+        steps = {row["env"]: f"{row['steps']:,}" for row in same}
+        lines.append([*kind, *(steps.get(env, "") for env in envs)])
     return "\n".join(f"| {' | '.join(cells)} |" for cells in lines)
 
 
@@ -66,6 +79,7 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=10_000, help="of each environment (default: 10000)")
     parser.add_argument("--python", type=Path, help="a Python that has the client and flockenv: nothing is installed")
     asked = parser.parse_args()
+    python = asked.python and asked.python.absolute()  # scripts run in another folder; a link is the environment's own
     unknown = [name for name in asked.clients if name not in CLIENTS]
     if unknown:
         parser.error(f"{unknown[0]!r} is unknown; allowed: {', '.join(CLIENTS)}")
@@ -73,8 +87,10 @@ def main() -> None:
     for client in asked.clients:
         with tempfile.TemporaryDirectory() as folder:
             try:
-                rows += play(client, asked.python or installed(client, Path(folder)), asked.steps)
-            except (RuntimeError, subprocess.CalledProcessError) as error:
+                for row in play(client, python or installed(client, Path(folder)), asked.steps):
+                    print("{client}, {what}, {env}: {steps:,} steps in {seconds} s".format(**row), file=sys.stderr)
+                    rows.append(row)
+            except (OSError, RuntimeError, subprocess.CalledProcessError) as error:
                 failed.append(f"{client}: {error}")
     print(table(rows))
     if failed:
