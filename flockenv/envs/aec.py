@@ -51,12 +51,13 @@ class _Checked(BaseWrapper):  # type: ignore[misc]  # pettingzoo ships no types
 
     def step(self, action: Rows | None) -> None:
         """Pass the action of the agent whose turn it is: (A,), or None from an agent that has ended."""
-        agent = self.agent_selection
-        if not (self.terminations[agent] or self.truncations[agent]):
-            self.unwrapped.checked_action(agent, action)
+        turns = self.env  # its plain attributes: the properties of this wrapper would make each turn slower
+        agent = turns.agent_selection
+        if not (turns.terminations[agent] or turns.truncations[agent]):
+            turns.unwrapped.checked_action(agent, action)
         elif action is not None:
             raise ValueError(f"actions: agent {agent!r} has ended, so that its action must be None")
-        self.env.step(action)
+        turns.step(action)
 
     def __str__(self) -> str:
         return str(self.env)
