@@ -3,7 +3,7 @@
 # [tool.flockenv]
 # constraints = "configs/constraints.txt"
 # ///
-"""Stable-Baselines3: PPO by id, and over every learner of many worlds at once."""
+"""Stable-Baselines3: PPO and SAC by id, and PPO over every learner of many worlds at once."""
 
 from row import IDS, STEPS, row
 from stable_baselines3 import PPO, SAC
@@ -19,9 +19,8 @@ for env_id in IDS:
         model = PPO("MlpPolicy", env_id, n_steps=500, batch_size=100, n_epochs=2)
         model.learn(STEPS)
         evaluate_policy(model, model.get_env(), n_eval_episodes=2)
-
-with row("stable-baselines3", "SAC, id", IDS[0]):
-    SAC("MlpPolicy", IDS[0], train_freq=100, gradient_steps=10).learn(STEPS)
+    with row("stable-baselines3", "SAC, id", env_id):
+        SAC("MlpPolicy", env_id, train_freq=100, gradient_steps=10).learn(STEPS)
 
 for env_id, task in zip(IDS, (Pursuit(), Crossing(), Bottleneck()), strict=True):
     with row("stable-baselines3", "PPO, WorldMonitor(WorldVecEnv), all learners", env_id):
