@@ -108,8 +108,8 @@ def parameters(parts: Parts) -> list[str]:
     for form in parts.shaped[1]:
         lines.append(f"{form}_at, {form}_count = np.int64(params[{at}]), np.int64(params[{at + 1}])")
         at += 2
-        if form in parts.trees:
-            lines.append(f"{form}_tree = np.int64(params[{at}])")
+        if form in parts.cells:
+            lines.append(f"{form}_cells = np.int64(params[{at}])")
             at += 1
     for q, sight in enumerate(parts.sights):
         lines.append(f"within{q}, view{q} = params[{at}], params[{at + 1}]")

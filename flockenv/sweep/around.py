@@ -75,7 +75,7 @@ def _first_hit(parts: Parts) -> str:
             f"    if here < best or (here == best and form == {number} and at_ < row):",
             f"        best, form, row = here, {number}, at_",
         ]
-        # of a tree, what lies within the box around the way as far as it is free
+        # of a grid, what lies within the box around the way as far as it is free
         lines += each_row(parts, form, "middle", "reach", met, [f"middle, reach = box_of_way(x, {half}, room)"])
     return f'''
 

@@ -4,7 +4,7 @@ the other shapes: what is not round, moves, or is hollow. These are met where th
 A law meets circles as they are, and of any other shape one point (`effects.base.Obstacle`): the nearest of its surface,
 or, where the law casts a ray, the one that it touches first. Nothing is written if no law asks for obstacles.
 
-Where there are many shapes of a form, each agent meets those that a tree says may lie within reach (shapes/tree.py), in
+Where there are many shapes of a form, each agent meets those that may lie within reach by a grid (shapes/cells.py), in
 the order in which they are listed; that is where the others, which a law leaves alone, would have been met too: so
 results are the same bits.
 """
@@ -14,7 +14,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from flockenv.shapes import FORMS
-from flockenv.shapes.tree import MOST_FOUND, node_length
+from flockenv.shapes.cells import MOST_FOUND, entry_length
 from flockenv.sweep.parts import Parts
 from flockenv.sweep.text import Slots, indented, indented_lines, tuple_of
 
@@ -46,8 +46,9 @@ def obstacle_imports(parts: Parts) -> list[str]:
     ]
     forms = [(form, module) for form, module in FORMS.items() if form in parts.shaped[1]]
     lines += [f"from {module} import hit_{form}, nearest_{form}" for form, module in forms]
-    if parts.trees:
-        lines.append("from flockenv.shapes.tree import keep_in_order, meets_box, row_of_node")
+    if parts.cells:
+        names = "count_of, keep_in_order, list_of, meets_box, row_listed, span_of"
+        lines.append(f"from flockenv.shapes.cells import {names}")
         lines.append("from flockenv.shapes.head import vector_at")
         lines.append("from flockenv.shapes.silhouette import near_way")
     cut = [(form, module) for form, module in forms if form in PIECED and any(e.obstacle_pieces for e in parts.effects)]
@@ -120,7 +121,7 @@ def _looked_up(parts: Parts, form: str, me: list[str], met: list[str], asking: l
     return [
         f"for l in range(np.uint64({parts.width})):",
         *indented_lines([*me, *_within_reach(parts, asking)], 4),
-        f"    many = near_{form}(params, size, {form}_tree, middle, around, lanes, np.int64({first}))",
+        f"    many = near_{form}(params, size, {form}_cells, middle, around, lanes, np.int64({first}))",
         f"    at_ = {form}_at",
         f"    for m in range(many if many >= 0 else {form}_count):",
         f"        at_ = {form}_at + np.int64(lanes[{first} + np.uint64(m)]) if many >= 0 else at_",
@@ -218,7 +219,7 @@ def _meet(parts: Parts, asking: list[tuple[int, list[str]]], form: str) -> list[
 def _remembered(parts: Parts, k: int, form: str, ahead: str) -> list[str]:
     """Write down which obstacle is ahead, where the law keeps another one than before.
 
-    By its form, and its place among those, or of a form with a tree by how far its row lies behind the first.
+    By its form, and its place among those, or of a form with a grid by how far its row lies behind the first.
     """
     which, row = Slots(parts).all(f"ahead{k}_")
     number = -1 if form == CIRCLE else list(FORMS).index(form)
@@ -326,56 +327,51 @@ def _touched_side(form: str) -> str:
 
 
 def each_row(parts: Parts, form: str, middle: str, reach: str, met: list[str], box: list[str]) -> list[str]:
-    """Write a loop over the shapes of a form, at `at_`: all, or of a tree those that come within `reach` of `middle`.
+    """Write a loop over the shapes of a form, at `at_`: all, or those that a grid says come within `reach` of `middle`.
 
-    box: how these two are worked out, which is done anew behind each shape. In no order that may be relied on.
+    box: how these two are worked out, which is done anew behind each shape. Some may be met twice, and in no order that
+    may be relied on.
     """
-    at, count, tree = (f"np.int64(params[{place}])" for place in parts.places_of(form))
-    if form not in parts.trees:
+    at, count, cells = (f"np.int64(params[{place}])" for place in parts.places_of(form))
+    if form not in parts.cells:
         return [
             f"at_ = {at}",
             f"for m in range({count}):",
             *indented_lines(met, 4),
             "    at_ += np.int64(params[at_])",
         ]
+    met = [f"at_ = {at} + row_listed(params, entry)", *met, *box]
+    return [f"cells = {cells}", *box, *_listed(parts, middle, reach, met)]
+
+
+def _listed(parts: Parts, middle: str, reach: str, met: list[str]) -> list[str]:
+    """Write a loop over what the grid at `cells` lists, at `entry`, where it comes within `reach` of `middle`."""
+    to = f"offset_to(size, {middle}, vector_at(params, entry + 1, {middle}))"
     return [
-        f"node = {tree} + 1",
-        "end = node + np.int64(params[node - 1])",
-        "begin = node",
-        *box,
-        "while node < end:",
-        f"    if meets_box(params, node, offset_to(size, {middle}, vector_at(params, node + 2, {middle})), {reach}):",
-        "        at_ = row_of_node(params, node)",
-        f"        node += {node_length(parts.dimension)}",
-        "        if at_ >= 0:",
-        f"            at_ += {at}",
-        *indented_lines([*met, *box], 12),
-        "    else:",
-        "        node = begin + np.int64(params[node])",
+        f"span = span_of(params, cells, {middle}, {reach})",
+        "for k in range(count_of(span)):",
+        f"    begin, end = list_of(params, cells, {middle}, span, k)",
+        f"    for entry in range(begin, end, {entry_length(parts.dimension)}):",
+        f"        if meets_box(params, entry, {to}, {reach}):",
+        *indented_lines(met, 12),
     ]
 
 
 def near_rows(parts: Parts) -> str:
     """Return the source of `near_FORM` for each form that agents look up: the rows that may lie within reach."""
+    met = [
+        f"if count == {MOST_FOUND}:",
+        "    return -1",
+        "count = keep_in_order(found, first, count, row_listed(params, entry))",
+    ]
     return "".join(
         f'''
 
 @kernel
-def near_{form}(params, size, tree, x, reach, found, first):
+def near_{form}(params, size, cells, x, reach, found, first):
     """List the rows that may lie within `reach` of x, in order, from `first` on; return how many, -1 if too many."""
-    count, node = 0, tree + 1
-    begin, end = node, node + np.int64(params[tree])
-    while node < end:
-        if meets_box(params, node, offset_to(size, x, vector_at(params, node + 2, x)), reach):
-            row = row_of_node(params, node)
-            node += {node_length(parts.dimension)}
-            if row >= 0:
-                if count == {MOST_FOUND}:
-                    return -1
-                keep_in_order(found, first, count, row)
-                count += 1
-        else:
-            node = begin + np.int64(params[node])
+    count = 0
+{indented(_listed(parts, "x", "reach", met), 4)}
     return count
 '''
         for form in parts.looked_up
@@ -397,7 +393,7 @@ def blocked(parts: Parts) -> str:
     for form in parts.shaped[1]:
         hides = f"hit_{form}(params, at_, y, unit(to), like(to[0], 0.0)) < norm(to)"
         met = [f"y = offset_to(size, {place_of_row(parts)}, x)", f"found |= {hides}"]
-        if form in parts.trees:
+        if form in parts.cells:
             lines.append("half = scale(to, like(to[0], 0.5))")
             lines.append(f"middle, reach = add(x, half), {tuple_of('abs(half[#])', d)}")
             met = [*met, "if found:", "    return found"]

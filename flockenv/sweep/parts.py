@@ -24,7 +24,7 @@ from flockenv.integrators.base import Integrator
 from flockenv.integrators.one_stage import OneStage
 from flockenv.kernels import LINE
 from flockenv.shapes import packed
-from flockenv.shapes.tree import FEWEST_ROWS, MOST_FOUND, tree_of
+from flockenv.shapes.cells import FEWEST_ROWS, MOST_FOUND, cells_of
 from flockenv.space import Space
 
 __all__ = ["LAWS", "SMALL_STRIDE", "Look", "Parts", "flattened", "record_of", "sorted_at", "view_of"]
@@ -143,8 +143,8 @@ class Parts:
         return bool(folds) and all(e.obstacle_reach is not None for e in folds)
 
     @functools.cached_property
-    def trees(self) -> dict[str, NDArray[np.float64]]:
-        """Trees over the shapes of each form of which there are many, and which have an end: see shapes/tree.py."""
+    def cells(self) -> dict[str, NDArray[np.float64]]:
+        """Grids over the shapes of each form of which there are many, and which have an end: see shapes/cells.py."""
         table, forms = self.shaped
         period = np.array(self.space.extent(self.dimension)) if self.space.periodic else None
         found = {}
@@ -156,13 +156,13 @@ class Parts:
                     lengths.append(int(table[begin + sum(lengths)]))
                 rows = np.cumsum([0, *lengths[:-1]]).tolist()
                 if rows[-1] < MOST_NUMBERS:
-                    found[form] = tree_of(mine, rows, period)
+                    found[form] = cells_of(mine, rows, period)
         return found
 
     @property
     def looked_up(self) -> tuple[str, ...]:
-        """The forms of which folds meet those shapes alone that a tree says may lie within reach."""
-        return tuple(self.trees) if self.reaches else ()
+        """The forms of which folds meet those shapes alone that a grid says may lie within reach."""
+        return tuple(self.cells) if self.reaches else ()
 
     @property
     def only_rays(self) -> bool:
@@ -175,12 +175,12 @@ class Parts:
         return any(e.obstacle_start is not None and e.obstacle_edges for e in self.effects)
 
     def places_of(self, form: str) -> tuple[int, int, int]:
-        """Return where in `parameters` a form's first row, how many there are, and its tree if it has one are told."""
+        """Return where in `parameters` a form's first row, how many there are, and its grid if it has one are told."""
         at = self.dimension + 1
         for each in self.shaped[1]:
             if each == form:
                 break
-            at += 2 + (each in self.trees)
+            at += 2 + (each in self.cells)
         return at, at + 1, at + 2
 
     @property
@@ -281,16 +281,16 @@ class Parts:
         For each table there are two: where it begins, and where it ends.
         """
         shapes, forms = self.shaped
-        ends = np.cumsum([len(shapes), *map(len, self.trees.values())]).tolist()
-        trees = dict(zip(self.trees, ends, strict=False))
+        ends = np.cumsum([len(shapes), *map(len, self.cells.values())]).tolist()
+        cells = dict(zip(self.cells, ends, strict=False))
         bounds, tables = [], iter(np.cumsum([ends[-1], *map(len, self.tables)]).tolist())
         begin = next(tables)
         values = [*self.space.extent(self.dimension), self.reach]
         for form, (where, count) in forms.items():
             bounds.append((len(values), where))
             values += [0.0, float(count)]
-            if form in trees:
-                bounds.append((len(values), trees[form]))
+            if form in cells:
+                bounds.append((len(values), cells[form]))
                 values.append(0.0)
         for sight in self.sights:
             values += [sight.radius**2, view_of(sight.fov, self.dtype)]
@@ -320,7 +320,7 @@ class Parts:
 
     def given(self) -> NDArray[Any]:
         """Return `parameters()` and the tables behind them, in the scene's precision: what the kernel is handed."""
-        return np.concatenate([self.parameters(), self.shaped[0], *self.trees.values(), *self.tables]).astype(
+        return np.concatenate([self.parameters(), self.shaped[0], *self.cells.values(), *self.tables]).astype(
             self.dtype
         )
 

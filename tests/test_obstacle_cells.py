@@ -1,4 +1,4 @@
-"""Many obstacles: those that a tree rules out change nothing, to the last bit."""
+"""Many obstacles: those that a grid rules out change nothing, to the last bit."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ EFFECTS: dict[str, tuple[Effect, ...]] = {
 
 
 def crowded(dimension: int, moving: bool) -> tuple[Shape, ...]:
-    """Return 60 blocks and 60 capsules all over a square, and 80 blocks more in one corner of it."""
+    """Return 60 blocks and 60 capsules all over a square, 80 blocks in a corner, and long walls."""
     rng = np.random.default_rng(3)
     places = [*rng.uniform(0, SIDE, (120, dimension)), *rng.uniform(0, 3, (80, dimension))]
     made: list[Shape] = []
@@ -43,6 +43,10 @@ def crowded(dimension: int, moving: bool) -> tuple[Shape, ...]:
         else:
             size = tuple(rng.uniform(0.2, 1, dimension).tolist())
             made.append(Block(centre=at, size=size, turn=float(rng.uniform(0, 90)), **motion))
+    far = (0.0,) * (dimension - 2)
+    for reach in (6.0, 12.0, 18.0):  # in a few cells, and in many
+        made.append(Capsule(start=(1.0, 2.0, *far), end=(1.0 + reach, 2.0 + reach / 2, *far), radius=0.1))
+        made.append(Block(centre=(SIDE - 1, reach / 2, *far), size=(0.5, reach, *(1.0 for _ in far)), turn=10.0))
     return tuple(made)
 
 
@@ -66,11 +70,12 @@ def ends(space: Any, effects: tuple[Effect, ...], dimension: int, dtype: str, mo
     [
         ("rays", Plane(), 2, "float64", True),
         ("all around", Torus(size=(SIDE, SIDE)), 2, "float32", True),
+        ("rays", Torus(size=(SIDE, SIDE)), 2, "float32", False),
         pytest.param("hidden", Box(size=(SIDE, SIDE)), 2, "float64", False, marks=pytest.mark.slow),
         pytest.param("rays", Torus(size=(SIDE,) * 3), 3, "float32", False, marks=pytest.mark.slow),
     ],
 )
-def test_a_tree_moves_no_bit(
+def test_a_grid_moves_no_bit(
     name: str, space: Any, dimension: int, dtype: str, moving: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     found = ends(space, EFFECTS[name], dimension, dtype, moving)

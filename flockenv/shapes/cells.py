@@ -1,0 +1,202 @@
+"""A grid of cells over the rows of one form, so that a law meets only the shapes that may be near.
+
+It is made once, of the shapes of a scene, about as many cells as shapes. A shape is listed in every cell that its box
+lies in, so that what is near a place is in the few cells around it, however many shapes there are. Shapes that move,
+and those in more than MOST_CELLS, are in a list of their own, the last, which is looked through always.
+
+In order: the lower corner of the grid (D, m), cells per metre (D), how many there are along each axis (D), 1 if it
+closes on itself (a torus), else 0; where the list of each cell begins, of all but the last axis by axis, and where the
+last ends; the lists. What is listed is how far behind the first row of its form the shape's row lies, the middle of its
+box (D, m) and half the edges (D, m). See Ericson 2005, "Real-Time Collision Detection", 7.1.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flockenv.kernels import Vec, kernel, law, like
+from flockenv.shapes.head import vector_at
+
+__all__ = [
+    "FEWEST_ROWS", "MOST_FOUND", "cells_of", "count_of", "entry_length", "keep_in_order", "list_of", "meets_box",
+    "row_listed", "span_of",
+]  # fmt: skip
+
+Floats = NDArray[np.float64]
+
+FEWEST_ROWS = 16
+"""Fewer shapes of a form are met one after the other by agents side by side, which is sooner done."""
+
+MOST_FOUND = 64
+"""If more shapes are near an agent than this, it meets all of the form: they need not be put in order."""
+
+MOST_CELLS = 64
+"""Shapes that lie in more cells are in the list that is looked through always."""
+
+LOOSE = 1e-6
+"""Boxes are larger by this share of their coordinates: single precision rounds by 6e-8."""
+
+BESIDE = 1e-3
+"""Share of a cell by which a box beside it counts as in it: single precision rounds the place in a grid, too."""
+
+
+def entry_length(dimension: int) -> int:
+    """Return how many numbers a listed shape has."""
+    return 1 + 2 * dimension
+
+
+def cells_of(shapes: Sequence[Any], rows: Sequence[int], period: Floats | None = None) -> Floats:
+    """Return the cells of some shapes of one form, as a table.
+
+    rows: how far behind the first row the row of each begins, ascending. period: the edges of a torus, m.
+    """
+    middle = np.array([shape.bound.centre for shape in shapes])
+    half = np.array([np.full(len(m), np.inf) if s.moves else s.bound.half for s, m in zip(shapes, middle, strict=True)])
+    away = np.abs(middle).max(axis=1, keepdims=True) + (0.0 if period is None else float(period.max()))
+    half = half * (1 + LOOSE) + LOOSE * away
+    low, rate, many = _grid(middle, half, period)
+    lists: list[list[list[float]]] = [[] for _ in range(int(many.prod()) + 1)]
+    for row, m, h in zip(rows, middle, half, strict=True):
+        for cell in _cells(m, h, low, rate, many, period is not None):
+            lists[cell].append([float(row), *m.tolist(), *h.tolist()])
+    head = np.concatenate([low, rate, many, [0.0 if period is None else 1.0]])
+    begins = np.cumsum([0, *map(len, lists)]) * entry_length(middle.shape[1]) + len(head) + len(lists) + 1
+    return np.concatenate([head, begins, np.array(list(itertools.chain(*lists))).ravel()])
+
+
+def _grid(middle: Floats, half: Floats, period: Floats | None) -> tuple[Floats, Floats, NDArray[np.int64]]:
+    """Return the lower corner of a grid, cells per metre and how many there are along each axis."""
+    still, d = np.isfinite(half).all(axis=1), middle.shape[1]
+    if period is not None:
+        low, width = np.zeros(d), period
+    elif still.any():
+        low = (middle - half)[still].min(axis=0)
+        width = (middle + half)[still].max(axis=0) - low
+    else:
+        low, width = np.zeros(d), np.ones(d)
+    width = np.maximum(width, max(float(width.max()), 1e-9) / len(middle))  # of what lies in a line, not too many cells
+    edge = (width.prod() / len(middle)) ** (1 / d)
+    many = np.maximum(np.floor(width / edge), 1).astype(np.int64)
+    return low, many / width, many
+
+
+def _cells(m: Floats, h: Floats, low: Floats, rate: Floats, many: NDArray[np.int64], closes: bool) -> list[int]:
+    """Return the cells that a box lies in; the list after the last of them if these are too many."""
+    last = [int(many.prod())]
+    if not np.isfinite(h).all():
+        return last
+    begin = np.floor((m - h - low) * rate - BESIDE).astype(np.int64)
+    end = np.floor((m + h - low) * rate + BESIDE).astype(np.int64) + 1
+    if closes:
+        begin, end = np.where(end - begin < many, begin, 0), np.where(end - begin < many, end, many)
+    else:
+        begin, end = np.clip(begin, 0, many), np.clip(end, 0, many)
+    if (end - begin).prod() > MOST_CELLS:
+        return last
+    axes = [np.arange(a, b) % n for a, b, n in zip(begin, end, many, strict=True)]
+    return [int(np.ravel_multi_index(cell, tuple(many))) for cell in itertools.product(*axes)]
+
+
+@law
+def _span(table: Any, at: int, d: int, middle: float, reach: float, closes: bool) -> tuple[int, int]:
+    """Return the first cell that a box lies in along an axis, whose numbers are at `at`, and in how many it lies.
+
+    Never a cell that there is not, wherever the box is.
+    """
+    low, rate, many = table[at], table[at + d], table[at + 2 * d]
+    o, e = like(middle, 0.0), like(middle, 1.0)
+    begin, end = np.floor((middle - reach - low) * rate), np.floor((middle + reach - low) * rate) + e
+    if closes:
+        turns = np.floor(begin / many) * many
+        begin, end = (begin - turns, end - turns) if end - begin < many else (o, many)
+    else:
+        begin, end = begin if begin > o else o, end if end < many else many
+    most: Any = np.int64(many)
+    first: Any = np.int64(begin)
+    past: Any = np.int64(end)
+    first = first if first >= 0 else 0  # what is no number becomes the least of all
+    last = first + most if closes else most
+    past = past if past <= last else last
+    return first, (past - first if past > first else 0)
+
+
+@law
+def span_of(table: Any, at: int, middle: Vec, reach: Vec) -> tuple[tuple[int, int], ...]:
+    """Return in which cells a box lies, per axis: the first, and how many. middle, reach: of the box, m."""
+    d = len(middle)
+    closes = table[at + 3 * d] > like(middle[0], 0.0)
+    x = _span(table, at, d, middle[0], reach[0], closes)
+    y = _span(table, at + 1, d, middle[1], reach[1], closes)
+    if len(middle) == 2:
+        return (x, y)
+    else:
+        return (x, y, _span(table, at + 2, d, middle[2], reach[2], closes))
+
+
+@law
+def count_of(span: tuple[tuple[int, int], ...]) -> int:
+    """Return how many lists a box has to be compared with: of its cells, and that of what is in no cell."""
+    if len(span) == 2:
+        return span[0][1] * span[1][1] + 1
+    else:
+        return span[0][1] * span[1][1] * span[2][1] + 1
+
+
+@law
+def list_of(table: Any, at: int, x: Vec, span: tuple[tuple[int, int], ...], k: int) -> tuple[int, int]:
+    """Return where the k-th list begins and ends; the first is that of what is in no cell."""
+    d = len(x)
+    cell: Any = 0
+    left: Any = k - 1
+    if len(x) == 2:
+        along: Any = (left // span[1][1], left % span[1][1]) if k > 0 else (0, 0)
+    else:
+        rest = left // span[2][1] if k > 0 else 0
+        along = (
+            rest // span[1][1] if k > 0 else 0,
+            rest % span[1][1] if k > 0 else 0,
+            left % span[2][1] if k > 0 else 0,
+        )
+    last: Any = 1
+    for axis in range(d):
+        many = np.int64(table[at + 2 * d + axis])
+        here = span[axis][0] + along[axis]
+        cell = cell * many + (here - many if here >= many else here)
+        last *= many
+    begins = at + 3 * d + 1 + (cell if k > 0 else last)
+    return at + np.int64(table[begins]), at + np.int64(table[begins + 1])  # type: ignore[return-value]
+
+
+@law
+def meets_box(table: Any, entry: int, to: Vec, reach: Vec) -> bool:
+    """Return whether a box is within `reach` (m, per axis) of a place; `to` leads from there to its middle."""
+    half = vector_at(table, entry + 1 + len(to), to)
+    near = (abs(to[0]) <= half[0] + reach[0]) & (abs(to[1]) <= half[1] + reach[1])
+    if len(to) == 3:
+        near &= abs(to[2]) <= half[2] + reach[2]
+    return near
+
+
+@law
+def row_listed(table: Any, entry: int) -> int:
+    """Return how far behind the first row its row lies."""
+    return np.int64(table[entry])  # type: ignore[return-value]  # a whole number, to numba an int
+
+
+@kernel
+def keep_in_order(found: Any, first: int, count: int, row: int) -> int:
+    """Put a row among the `count` from `first` on, ascending, if it is new; return how many there are then."""
+    place = first + count
+    while place > first and found[place - 1] > row:
+        place -= 1
+    if place > first and found[place - 1] == row:
+        return count
+    for j in range(first + count, place, -1):
+        found[j] = found[j - 1]
+    found[place] = row
+    return count + 1
