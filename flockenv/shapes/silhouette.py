@@ -160,48 +160,35 @@ def edge_half_space(table: Any, at: int, x: Vec, ray: Vec, side: Vec, room: floa
 
 
 @law
-def _nowhere(room: float) -> tuple[float, float]:
+def edge_hollow(table: Any, at: int, x: Vec, ray: Vec, side: Vec, room: float) -> tuple[float, float]:
+    """Return that a room has no edge: it is all around."""
     return like(room, np.inf), like(room, np.inf)
 
 
-@law
-def edge_hollow_chain(table: Any, at: int, x: Vec, ray: Vec, side: Vec, room: float) -> tuple[float, float]:
-    """Return that a room has no edge: it is all around."""
-    return _nowhere(room)
+edge_hollow_chain = edge_hollow_block = edge_hollow
 
 
-@law
-def edge_hollow_block(table: Any, at: int, x: Vec, ray: Vec, side: Vec, room: float) -> tuple[float, float]:
-    """Return that a room has no edge: it is all around."""
-    return _nowhere(room)
+def _edge_by_fan(hit: Any) -> Any:
+    """Return the law of an edge of what can only be asked how far a ray goes: `hit(table, at, x, ray, room)`."""
+
+    @law
+    def edge(table: Any, at: int, x: Vec, ray: Vec, side: Vec, room: float) -> tuple[float, float]:
+        """Return the first of a fan of rays that goes twice as far as the one before it, or for ever."""
+        turn, before = like(room, 0.0), hit(table, at, x, ray, room)
+        step, two = like(room, np.pi / FAN), like(room, 2.0)
+        for _ in range(FAN):
+            turn += step
+            here = hit(table, at, x, add(scale(ray, np.cos(turn)), scale(side, np.sin(turn))), room)
+            if here > two * (before + room):
+                return turn, before
+            before = here
+        return like(room, np.inf), like(room, np.inf)
+
+    return edge
 
 
-@law
-def edge_distance_field(table: Any, at: int, x: Vec, ray: Vec, side: Vec, room: float) -> tuple[float, float]:
-    """Return the first of a fan of rays that goes twice as far as the one before it, or for ever."""
-    turn, before = like(room, 0.0), hit_distance_field(table, at, x, ray, room)
-    step, two = like(room, np.pi / FAN), like(room, 2.0)
-    for _ in range(FAN):
-        turn += step
-        here = hit_distance_field(table, at, x, add(scale(ray, np.cos(turn)), scale(side, np.sin(turn))), room)
-        if here > two * (before + room):
-            return turn, before
-        before = here
-    return _nowhere(room)
-
-
-@law
-def edge_hollow_distance_field(table: Any, at: int, x: Vec, ray: Vec, side: Vec, room: float) -> tuple[float, float]:
-    """Return the first of a fan of rays that goes twice as far as the one before it, or for ever."""
-    turn, before = like(room, 0.0), hit_hollow_distance_field(table, at, x, ray, room)
-    step, two = like(room, np.pi / FAN), like(room, 2.0)
-    for _ in range(FAN):
-        turn += step
-        here = hit_hollow_distance_field(table, at, x, add(scale(ray, np.cos(turn)), scale(side, np.sin(turn))), room)
-        if here > two * (before + room):
-            return turn, before
-        before = here
-    return _nowhere(room)
+edge_distance_field = _edge_by_fan(hit_distance_field)
+edge_hollow_distance_field = _edge_by_fan(hit_hollow_distance_field)
 
 
 # --- in which directions edges are looked for in space ----------------------------------------------------------------
