@@ -33,7 +33,7 @@ SMALL_STRIDE = 128
 """Places in a row of sorted agents where there are too few to be sorted by cell: their blocks, and one more."""
 
 MOST_NUMBERS = 2**24
-"""Numbers of a form's rows up to which single precision knows where each begins."""
+"""Numbers of a form's rows, and of the grid over them, up to which single precision counts them exactly."""
 
 LAWS = (
     "own_law", "medium_law", "flow_law", "far_law", "bond_law", "kick_law", "aim_law", "begin_law", "keep_law",
@@ -155,8 +155,9 @@ class Parts:
                 while len(lengths) < count:
                     lengths.append(int(table[begin + sum(lengths)]))
                 rows = np.cumsum([0, *lengths[:-1]]).tolist()
-                if rows[-1] < MOST_NUMBERS:
-                    found[form] = cells_of(mine, rows, period)
+                grid = cells_of(mine, rows, period)
+                if max(rows[-1], len(grid)) < MOST_NUMBERS:
+                    found[form] = grid
         return found
 
     @property
