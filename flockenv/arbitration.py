@@ -19,7 +19,7 @@ import numpy as np
 from numba.extending import overload
 from pydantic import Field
 
-from flockenv.kernels import OPTIONS, Vec, law, like, replaced
+from flockenv.kernels import OPTIONS, Law, Vec, law, like, replaced
 from flockenv.noise import uniform
 from flockenv.records import Record
 from flockenv.urges import INTENTIONS
@@ -161,10 +161,10 @@ def allocate_running(wishes: Wishes, budget: float) -> Vec:
 
 
 class Arbitration(Record):
-    """How wishes are reconciled; `law` names a law (p, me, wishes) -> (force, shares) of this record's module."""
+    """How wishes are reconciled; `law` is a law (p, me, wishes) -> (force, shares)."""
 
     kind: str
-    law: ClassVar[str]
+    law: ClassVar[Law]
     exclusive: ClassVar[bool] = False
     """True if one behaviour at a time has what it asks for, and the others have nothing."""
     recalls: ClassVar[tuple[str, ...]] = ()
@@ -198,7 +198,7 @@ class Blend(Arbitration):
     """
 
     kind: Literal["blend"] = "blend"
-    law: ClassVar[str] = "blend_wishes"
+    law: ClassVar[Law] = blend_wishes
 
 
 @law
@@ -213,7 +213,7 @@ class Priority(Arbitration):
 
     kind: Literal["priority"] = "priority"
     threshold: float = Field(default=1e-3, ge=0, description="N, a wish that is no longer asks for nothing")
-    law: ClassVar[str] = "first_wish"
+    law: ClassVar[Law] = first_wish
     exclusive: ClassVar[bool] = True
 
 
@@ -244,7 +244,7 @@ class Dithering(Arbitration):
     )
     period: float = Field(default=0.1, gt=0, description="s, how long a draw lasts")
     threshold: float = Field(default=1e-3, ge=0, description="N, a wish that is no longer asks for nothing")
-    law: ClassVar[str] = "dithered"
+    law: ClassVar[Law] = dithered
     exclusive: ClassVar[bool] = True
 
     def parameters(self, wishes: int) -> dict[str, float | Vec]:
@@ -269,7 +269,7 @@ class Allocation(Arbitration):
     """Prioritised acceleration allocation (Reynolds 1987): in order, until their lengths have used up max_force."""
 
     kind: Literal["allocation"] = "allocation"
-    law: ClassVar[str] = "allocated"
+    law: ClassVar[Law] = allocated
 
 
 @law
@@ -283,7 +283,7 @@ class RunningSum(Arbitration):
     """As allocation, but it is the length of the sum so far that uses up max_force (Buckland 2004)."""
 
     kind: Literal["running_sum"] = "running_sum"
-    law: ClassVar[str] = "run_up"
+    law: ClassVar[Law] = run_up
 
 
 @law
@@ -303,7 +303,7 @@ class RoundRobin(Arbitration):
 
     kind: Literal["round_robin"] = "round_robin"
     period: float = Field(default=0.05, gt=0, description="s, how long a turn lasts")
-    law: ClassVar[str] = "in_turn"
+    law: ClassVar[Law] = in_turn
     exclusive: ClassVar[bool] = True
 
 
@@ -377,7 +377,7 @@ class ContextSteering(Arbitration):
     kind: Literal["context"] = "context"
     dangers: int = Field(default=1, ge=0, description="how many behaviours, from the first on, avert a danger")
     directions: int = Field(default=24, ge=4, le=256, description="how many directions are weighed")
-    law: ClassVar[str] = "by_context"
+    law: ClassVar[Law] = by_context
 
 
 @law
@@ -405,7 +405,7 @@ class Intentions(Arbitration):
     when: tuple[Literal["avoid", "escape", "eat", "mate", "school", "wander"], ...] = Field(
         min_length=1, description="when each behaviour is heard; avoid = always"
     )
-    law: ClassVar[str] = "by_intention"
+    law: ClassVar[Law] = by_intention
     recalls: ClassVar[tuple[str, ...]] = ("intention",)
 
     def parameters(self, wishes: int) -> dict[str, float | Vec]:

@@ -49,6 +49,7 @@ __all__ = [
     "FAST",
     "LINE",
     "OPTIONS",
+    "Law",
     "Numbers",
     "Vec",
     "ask_for",
@@ -57,6 +58,7 @@ __all__ = [
     "copy_lanes",
     "entry",
     "finite",
+    "imported",
     "kernel",
     "law",
     "laws_digest",
@@ -75,6 +77,9 @@ __all__ = [
 ]
 
 F = TypeVar("F", bound=Callable[..., Any])
+
+Law = Callable[..., Any]
+"""A law, as records hold it: a function marked `law`, `kernel` or `unfused`."""
 
 Vec = tuple[float, ...]
 """A vector inside a law: a tuple of D floats, D = 2 or 3."""
@@ -392,6 +397,12 @@ def _other_laws(source: str) -> str:
         texts.append(path.read_text(encoding="utf-8") if path.suffix == ".py" else "")
         todo |= {v.py_func.__module__ for v in vars(module).values() if hasattr(v, "py_func")}
     return "".join(texts)
+
+
+def imported(law: Law, name: str) -> str:
+    """Write the import of a law under another name."""
+    python = getattr(law, "py_func", law)
+    return f"from {python.__module__} import {python.__name__} as {name}"
 
 
 @functools.lru_cache(maxsize=512)

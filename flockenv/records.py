@@ -71,6 +71,14 @@ class Record(BaseModel, metaclass=_OneLine):
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, defer_build=True)
 
+    def __init_subclass__(cls, **options: Any) -> None:
+        """Keep functions that class variables hold, such as laws, from becoming methods of the record."""
+        super().__init_subclass__(**options)
+        for name in vars(cls).get("__annotations__", {}):
+            value = vars(cls).get(name)
+            if callable(value) and not isinstance(value, type):
+                setattr(cls, name, staticmethod(value))
+
     @classmethod
     def __pydantic_init_subclass__(cls, **options: Any) -> None:
         """Of what a class variable holds, only types know: pydantic would read it anew for each of its subclasses."""

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from pydantic import Field
 
 from flockenv.elementary import nearest_whole
-from flockenv.kernels import Vec, finite, law, like
+from flockenv.kernels import Law, Vec, finite, law, like
 from flockenv.records import Record
 from flockenv.vec import sub
 
@@ -201,9 +201,9 @@ class Space(Record):
     """Where agents live."""
 
     kind: str
-    offset_law: ClassVar[str]
-    confine_law: ClassVar[str]
-    bounce_law: ClassVar[str | None] = None
+    offset_law: ClassVar[Law]
+    confine_law: ClassVar[Law]
+    bounce_law: ClassVar[Law | None] = None
     periodic: ClassVar[bool] = False
 
     def extent(self, dimension: int) -> tuple[float, ...]:
@@ -228,8 +228,8 @@ class Plane(Space):
     """Unbounded flat space, 2-D or 3-D."""
 
     kind: Literal["plane"] = "plane"
-    offset_law: ClassVar[str] = "plane_offset"
-    confine_law: ClassVar[str] = "plane_confine"
+    offset_law: ClassVar[Law] = plane_offset
+    confine_law: ClassVar[Law] = plane_confine
 
 
 class Torus(Space):
@@ -237,8 +237,8 @@ class Torus(Space):
 
     kind: Literal["torus"] = "torus"
     size: Size = Field(description="m per axis")
-    offset_law: ClassVar[str] = "torus_offset"
-    confine_law: ClassVar[str] = "torus_confine"
+    offset_law: ClassVar[Law] = torus_offset
+    confine_law: ClassVar[Law] = torus_confine
     periodic: ClassVar[bool] = True
 
     def displacement(self, a: ArrayLike, b: ArrayLike) -> Floats:
@@ -268,13 +268,13 @@ class Box(Space):
     restitution: float = Field(
         default=0.0, ge=0, le=1, description="e: 0 = bodies stop at a wall, 1 = they lose nothing"
     )
-    offset_law: ClassVar[str] = "plane_offset"
-    confine_law: ClassVar[str] = "box_confine"
+    offset_law: ClassVar[Law] = plane_offset
+    confine_law: ClassVar[Law] = box_confine
 
     @property
-    def bounce_law(self) -> str | None:  # type: ignore[override]  # nothing of it is compiled where nobody bounces
+    def bounce_law(self) -> Law | None:  # type: ignore[override]  # nothing of it is compiled where nobody bounces
         """The law of walls that give something back."""
-        return "box_bounce" if self.restitution > 0 else None
+        return box_bounce if self.restitution > 0 else None
 
     def numbers(self) -> tuple[float, ...]:
         """The restitution, if there is one."""

@@ -18,7 +18,7 @@ from pydantic import Field, WrapValidator, model_validator
 from flockenv.arbitration import Allocation, AnyArbitration, Arbitration
 from flockenv.behaviours import BEHAVIOURS
 from flockenv.effects.base import EFFECTS, Effect, demand_group
-from flockenv.kernels import Vec
+from flockenv.kernels import Law, Vec
 from flockenv.records import keep
 
 __all__ = ["EVERY_EFFECT", "Steer"]
@@ -58,9 +58,9 @@ class Steer(Effect):
         return self.behaviours
 
     @property
-    def steer_law(self) -> tuple[str, str]:
+    def steer_law(self) -> Law:
         """The arbitration's law."""
-        return type(self.arbitration).__module__, self.arbitration.law
+        return self.arbitration.law
 
     @property
     def recalled(self) -> tuple[str, ...]:

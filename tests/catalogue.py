@@ -754,7 +754,7 @@ import numpy as np
 from pydantic import Field
 
 from flockenv.effects import Effect, Me
-from flockenv.kernels import Vec, law, like
+from flockenv.kernels import Law, Vec, law, like
 from flockenv.vec import add, dot, scale
 
 
@@ -786,7 +786,7 @@ class Tether(Effect):
     sun: float = Field(default=0.0, ge=0, description="N m^2")
     push: float = Field(default=0.0, description="N along each axis, with time")
     weight: float = Field(default=0.0, description="N along each axis")
-    own_law: ClassVar[str | None] = "tether"
+    own_law: ClassVar[Law | None] = tether
 """
 """An effect as a user of the library would write it, in a file of their own."""
 

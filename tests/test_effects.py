@@ -358,7 +358,7 @@ class Well(Effect):
 
     kind: Literal["well"] = "well"
     strength: float = 1.0
-    own_law: ClassVar[str | None] = "well"
+    own_law: ClassVar[Law | None] = well
 """
 
 
@@ -405,8 +405,8 @@ def repulsion(p: Any, me: Me, sums: Vec) -> Vec:
 class Repulsion(Effect):
     kind: Literal["repulsion"] = "repulsion"
     weight: float = 1.0
-    pair_law: ClassVar[str | None] = "pushed"
-    finish_law: ClassVar[str | None] = "repulsion"
+    pair_law: ClassVar[Law | None] = pushed
+    finish_law: ClassVar[Law | None] = repulsion
 
     @property
     def sight(self) -> Sight:

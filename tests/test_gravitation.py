@@ -255,7 +255,7 @@ from typing import Any, ClassVar, Literal
 import numpy as np
 
 from flockenv.effects.base import Bonds, Effect, Me, Other
-from flockenv.kernels import Vec, law
+from flockenv.kernels import Law, Vec, law
 from flockenv.vec import scale
 
 
@@ -266,7 +266,7 @@ def leash(p: Any, me: Me, others: tuple[Other, ...], numbers: Vec) -> Vec:
 
 class Leash(Effect):
     kind: Literal["leash"] = "leash"
-    bond_law: ClassVar[str | None] = "leash"
+    bond_law: ClassVar[Law | None] = leash
 
     def numbers(self, dimension: int) -> int:
         return 1

@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 from flockenv.behaviours import Driving
 from flockenv.crew import use_threads
 from flockenv.effects import Antipode, Course, Effect, Goal, Sight
-from flockenv.kernels import law
+from flockenv.kernels import Law, law
 from flockenv.population import Emitter
 from flockenv.population.places import Point
 from flockenv.scene import Group, Scene
@@ -49,10 +49,10 @@ class Warmth(Effect):
 
     kind: str
     rate: float = 0.5
-    pair_law: ClassVar[str | None] = "warmer"
-    finish_law: ClassVar[str | None] = "all_of_them"
-    begin_law: ClassVar[str | None] = "numbered"
-    keep_law: ClassVar[str | None] = "warmed"
+    pair_law: ClassVar[Law | None] = warmer
+    finish_law: ClassVar[Law | None] = all_of_them
+    begin_law: ClassVar[Law | None] = numbered
+    keep_law: ClassVar[Law | None] = warmed
     keeps: ClassVar[tuple[str, ...]] = ("warmth", "lived")
 
     @property

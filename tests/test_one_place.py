@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from collections import namedtuple
 from pathlib import Path
 from typing import Any
@@ -152,7 +151,7 @@ def test_what_lies_in_records_beyond_the_last_agent_is_nobodys_business() -> Non
 TIED = """
 from typing import ClassVar, Literal
 from flockenv.behaviours import Separation
-from flockenv.kernels import law
+from flockenv.kernels import Law, law
 from flockenv.steering import others
 from flockenv.vec import add, sub
 
@@ -174,9 +173,9 @@ def ended(p, me, sums):
 
 class Tied(Separation):
     kind: Literal["tied"] = "tied"
-    pair_law: ClassVar[str | None] = "pushed"
-    apart_law: ClassVar[str | None] = "pushed_apart"
-    finish_law: ClassVar[str | None] = "ended"
+    pair_law: ClassVar[Law | None] = pushed
+    apart_law: ClassVar[Law | None] = pushed_apart
+    finish_law: ClassVar[Law | None] = ended
     vanishes: ClassVar[bool] = False
 """
 
@@ -245,8 +244,7 @@ WITH_BOTH = [row for row in EFFECTS if row.effect.apart_law is not None]
 def test_a_law_of_those_elsewhere_is_the_law(row: Any, dimension: int) -> None:
     """Whatever ties are."""
     effect = next(e for e in scene_under(row, dimension).parts.effects if e.kind == row.effect.kind)
-    laws = vars(sys.modules[type(effect).__module__])
-    whole, elsewhere = laws[effect.pair_law], laws[effect.apart_law]
+    whole, elsewhere = effect.pair_law, effect.apart_law
     numbers = effect.parameters()
     p, rng = namedtuple("P", numbers)(**numbers), np.random.default_rng(0)  # type: ignore[misc]
 
@@ -274,8 +272,7 @@ VANISHING = [row for row in EFFECTS if row.effect.vanishes]
 def test_a_law_that_vanishes_says_nothing_of_who_is_infinitely_far(row: Any, dimension: int) -> None:
     """Wherever he is: so is he told of whom nobody sees."""
     effect = next(e for e in scene_under(row, dimension).parts.effects if e.kind == row.effect.kind)
-    laws = vars(sys.modules[type(effect).__module__])
-    whole, elsewhere = laws[effect.pair_law], laws[effect.apart_law or effect.pair_law]
+    whole, elsewhere = effect.pair_law, effect.apart_law or effect.pair_law
     numbers, rng = effect.parameters(), np.random.default_rng(0)
     p = namedtuple("P", numbers)(**numbers)  # type: ignore[misc]
 

@@ -23,7 +23,7 @@ from typing import Any, ClassVar, Literal
 import numpy as np
 
 from flockenv.effects import Effect, Me
-from flockenv.kernels import Vec, law
+from flockenv.kernels import Law, Vec, law
 from flockenv.vec import axis, scale
 
 
@@ -41,7 +41,7 @@ class Lookup(Effect):
     values: tuple[float, ...]
     steering: ClassVar[bool] = True
     tabled: ClassVar[bool] = True
-    own_law: ClassVar[str | None] = "looked_up"
+    own_law: ClassVar[Law | None] = looked_up
 
     def parameters(self) -> dict[str, float]:
         return {"weight": self.weight, "along": float(self.along)}

@@ -28,16 +28,22 @@ def plain(threads: int) -> Case:
 
 def another(threads: int) -> Case:
     """The same, once all effects were imported and one more was defined, in another scene used too."""
-    from typing import ClassVar, Literal
+    from typing import Any, ClassVar, Literal
 
     import flockenv.effects
     from benchmarks.scenes import world
     from flockenv.effects import Effect
+    from flockenv.kernels import Law, Vec, law
+    from flockenv.vec import zero
+
+    @law
+    def nowhere(p: Any, me: Any) -> Vec:
+        return zero(me.pos)
 
     class Unasked(Effect):
         kind: Literal["unasked"] = "unasked"
         strength: float = 1.0
-        own_law: ClassVar[str | None] = "nowhere"
+        own_law: ClassVar[Law | None] = nowhere
 
     assert "unasked" in flockenv.effects.EFFECTS
     busy = world("float32").with_effects(*world("float32").effects[:1])

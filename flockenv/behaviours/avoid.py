@@ -13,7 +13,7 @@ from pydantic import Field
 
 from flockenv import steering
 from flockenv.effects.base import Effect, Me, Obstacle
-from flockenv.kernels import Vec, law, like
+from flockenv.kernels import Law, Vec, law, like
 from flockenv.vec import add, cross, dot, lateral, norm, perpendicular, scale, select, sub, unit, zero
 
 __all__ = ["AvoidObstacles", "ForceField", "Whiskers"]
@@ -128,11 +128,11 @@ class AvoidObstacles(Effect):
     horizon: float = Field(default=2.0, gt=0, description="s, how far ahead it looks at the present speed")
     margin: float = Field(default=0.0, ge=0, description="m, clearance beyond both radii")
     steering: ClassVar[bool] = True
-    obstacle_start: ClassVar[str | None] = "nothing"
-    obstacle_ray: ClassVar[str | None] = "straight_on"
-    obstacle_law: ClassVar[str | None] = "nearest_threat"
-    obstacle_finish: ClassVar[str | None] = "around"
-    obstacle_reach: ClassVar[str | None] = "in_time"
+    obstacle_start: ClassVar[Law | None] = nothing
+    obstacle_ray: ClassVar[Law | None] = straight_on
+    obstacle_law: ClassVar[Law | None] = nearest_threat
+    obstacle_finish: ClassVar[Law | None] = around
+    obstacle_reach: ClassVar[Law | None] = in_time
     obstacle_edges: ClassVar[bool] = True
     demo: ClassVar[str | None] = AVOIDING
 
@@ -222,11 +222,11 @@ class Whiskers(Effect):
     horizon: float = Field(default=1.5, gt=0, description="s, how far ahead it feels at the present speed")
     angle: float = Field(default=35.0, gt=0, lt=90, description="degrees between the middle and the other whiskers")
     steering: ClassVar[bool] = True
-    obstacle_start: ClassVar[str | None] = "no_whisker"
-    obstacle_ray: ClassVar[str | None] = "whisker"
-    obstacle_law: ClassVar[str | None] = "deepest_whisker"
-    obstacle_finish: ClassVar[str | None] = "along_normal"
-    obstacle_reach: ClassVar[str | None] = "whiskers_end"
+    obstacle_start: ClassVar[Law | None] = no_whisker
+    obstacle_ray: ClassVar[Law | None] = whisker
+    obstacle_law: ClassVar[Law | None] = deepest_whisker
+    obstacle_finish: ClassVar[Law | None] = along_normal
+    obstacle_reach: ClassVar[Law | None] = whiskers_end
     obstacle_edges: ClassVar[bool] = True
     demo: ClassVar[str | None] = AVOIDING.replace("avoid_obstacles, weight: 8", "whiskers, weight: 20")
 
@@ -282,10 +282,10 @@ class ForceField(Effect):
     range: float = Field(default=3.0, gt=0, description="m between the surfaces, beyond which there is no force")
     nearest: float = Field(default=0.05, gt=0, description="m, nearer counts as this near")
     steering: ClassVar[bool] = True
-    obstacle_start: ClassVar[str | None] = "no_push"
-    obstacle_law: ClassVar[str | None] = "field_push"
-    obstacle_finish: ClassVar[str | None] = "field_force"
-    obstacle_reach: ClassVar[str | None] = "field_end"
+    obstacle_start: ClassVar[Law | None] = no_push
+    obstacle_law: ClassVar[Law | None] = field_push
+    obstacle_finish: ClassVar[Law | None] = field_force
+    obstacle_reach: ClassVar[Law | None] = field_end
     demo: ClassVar[str | None] = AVOIDING.replace("avoid_obstacles, weight: 8", "force_field, weight: 3")
 
     def folded(self, dimension: int) -> int:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from flockenv.effects.base import Effect, Me, Other, Sight, all_masses, demand_group
-from flockenv.kernels import Vec, law, like
+from flockenv.kernels import Law, Vec, law, like
 from flockenv.stability import LookaheadWarning
 
 __all__ = [
@@ -163,7 +163,7 @@ class AboutNearest(Behaviour):
     radius: float = Field(gt=0, description="m, how far it sees")
     fov: float = Field(default=360.0, gt=0, le=360, description="degrees, full angle of the field of view")
     occluded: bool = Field(default=False, description="whom an obstacle hides is not seen")
-    pair_law: ClassVar[str | None] = "nearest_one"
+    pair_law: ClassVar[Law | None] = nearest_one
 
     @property
     def sight(self) -> Sight:

@@ -7,12 +7,12 @@ from typing import Any, ClassVar, Literal
 from pydantic import Field
 
 from flockenv import steering
-from flockenv.behaviours.base import AboutNearest, Moving, nearest_one, seen_one, top_speed
+from flockenv.behaviours.base import AboutNearest, Moving, seen_one, top_speed
 from flockenv.effects.base import Me
-from flockenv.kernels import Vec, law, like
+from flockenv.kernels import Law, Vec, law, like
 from flockenv.vec import norm, scale, select, zero
 
-__all__ = ["PREDICTORS", "Evade", "MatchVelocity", "OffsetPursue", "Predicting", "Pursue", "Shadow", "nearest_one"]
+__all__ = ["PREDICTORS", "Evade", "MatchVelocity", "OffsetPursue", "Predicting", "Pursue", "Shadow"]
 
 PREDICTORS = ("distance", "opensteer", "exact")
 
@@ -111,7 +111,7 @@ class Pursue(Predicting):
     """
 
     kind: Literal["pursue"] = "pursue"
-    finish_law: ClassVar[str | None] = "pursued"
+    finish_law: ClassVar[Law | None] = pursued
     demo: ClassVar[str | None] = """
 groups:
   - {count: 4, max_speed: 2, max_force: 10, role: pursuer, spawn: {low: [-6, -5], high: [-5, -1]}}
@@ -132,7 +132,7 @@ class Evade(Predicting):
     predictor: Literal["distance", "opensteer", "exact"] = Field(
         default="opensteer", description="how far ahead it foresees: factor d / V, d / |v_p|, or until they can meet"
     )
-    finish_law: ClassVar[str | None] = "evaded"
+    finish_law: ClassVar[Law | None] = evaded
     demo: ClassVar[str | None] = """
 groups:
   - {count: 1, max_speed: 1.5, max_force: 4, role: pursuer, spawn: {low: [-6, 0], high: [-6, 0], speed: [1, 1]}}
@@ -148,7 +148,7 @@ class OffsetPursue(Predicting):
 
     kind: Literal["offset_pursue"] = "offset_pursue"
     distance: float = Field(ge=0, description="m, at which it passes")
-    finish_law: ClassVar[str | None] = "passed"
+    finish_law: ClassVar[Law | None] = passed
     demo: ClassVar[str | None] = """
 groups:
   - count: 6
@@ -173,7 +173,7 @@ class Shadow(Predicting):
     kind: Literal["shadow"] = "shadow"
     distance: float = Field(ge=0, description="m, within which it only matches speed and heading")
     band: float = Field(default=1.0, gt=0, description="m, from there on it pursues more and more")
-    finish_law: ClassVar[str | None] = "shadowed"
+    finish_law: ClassVar[Law | None] = shadowed
     copies: ClassVar[bool] = True
     demo: ClassVar[str | None] = """
 groups:
@@ -194,7 +194,7 @@ class MatchVelocity(AboutNearest):
     """Take on the velocity of the nearest of a group: S = v_j - v (Reynolds 1987)."""
 
     kind: Literal["match_velocity"] = "match_velocity"
-    finish_law: ClassVar[str | None] = "matched"
+    finish_law: ClassVar[Law | None] = matched
     copies: ClassVar[bool] = True
     demo: ClassVar[str | None] = """
 groups:

@@ -9,12 +9,12 @@ import numpy as np
 from pydantic import Field
 
 from flockenv import steering
-from flockenv.behaviours.base import AboutNearest, Moving, nearest_one, seen_one, top_speed
+from flockenv.behaviours.base import AboutNearest, Moving, seen_one, top_speed
 from flockenv.effects.base import Me, Other, Sight
-from flockenv.kernels import Vec, law, like
+from flockenv.kernels import Law, Vec, law, like
 from flockenv.vec import norm, scale, select, zero
 
-__all__ = ["FollowLeader", "Formation", "Interpose", "nearest_one"]
+__all__ = ["FollowLeader", "Formation", "Interpose"]
 
 
 @law
@@ -116,7 +116,7 @@ class Formation(AboutNearest, Moving):
     left: float = Field(default=0.0, description="m, to its left; negative = to its right")
     up: float = Field(default=0.0, description="m, above it, in 3-D")
     slow_radius: float = Field(gt=0, description="d_slow, m, from the place, within which it slows down")
-    finish_law: ClassVar[str | None] = "in_formation"
+    finish_law: ClassVar[Law | None] = in_formation
     demo: ClassVar[str | None] = """
 groups:
   - count: 1
@@ -150,7 +150,7 @@ class FollowLeader(AboutNearest, Moving):
     ahead: float = Field(default=2.0, ge=0, description="m, length of the box in front of the leader")
     aside: float = Field(default=0.5, ge=0, description="m, from the leader's way to a side of the box")
     slow_radius: float = Field(gt=0, description="m, from the place, within which it slows down")
-    finish_law: ClassVar[str | None] = "following"
+    finish_law: ClassVar[Law | None] = following
     demo: ClassVar[str | None] = """
 groups:
   - {count: 1, max_speed: 1, role: learner, spawn: {low: [-6, 0], high: [-6, 0], speed: [1, 1], heading: [1, 0]}}
@@ -180,9 +180,9 @@ class Interpose(Moving):
     fov: float = Field(default=360.0, gt=0, le=360, description="degrees, full angle of the field of view")
     share: float = Field(default=0.5, ge=0, le=1, description="of the way from the one to the other")
     slow_radius: float = Field(gt=0, description="m, within which it slows down")
-    pair_start: ClassVar[str | None] = "nobody_yet"
-    pair_law: ClassVar[str | None] = "nearest_two"
-    finish_law: ClassVar[str | None] = "between"
+    pair_start: ClassVar[Law | None] = nobody_yet
+    pair_law: ClassVar[Law | None] = nearest_two
+    finish_law: ClassVar[Law | None] = between
     demo: ClassVar[str | None] = """
 groups:
   - {count: 1, max_speed: 2, max_force: 10, role: learner, spawn: {low: [-4, -4], high: [-4, -4]}}

@@ -13,7 +13,7 @@ from flockenv import steering
 from flockenv.behaviours.base import Behaviour, Moving, gains, top_speed
 from flockenv.behaviours.wander import wandered
 from flockenv.effects.base import Me, Other, Sight, Vector
-from flockenv.kernels import Vec, law, like
+from flockenv.kernels import Law, Vec, law, like
 from flockenv.vec import scale, select, sub, unit, zero
 
 __all__ = ["Explore", "Forage", "Queue", "UnalignedAvoidance"]
@@ -58,9 +58,9 @@ class UnalignedAvoidance(Behaviour):
     horizon: float = Field(default=3.0, gt=0, description="s, how far ahead it looks")
     margin: float = Field(default=0.0, ge=0, description="m, clearance beyond both radii")
     group: int | None = Field(default=None, ge=0, description="to whom it gives way; none = all")
-    pair_start: ClassVar[str | None] = "no_meeting"
-    pair_law: ClassVar[str | None] = "first_meeting"
-    finish_law: ClassVar[str | None] = "giving_way"
+    pair_start: ClassVar[Law | None] = no_meeting
+    pair_law: ClassVar[Law | None] = first_meeting
+    finish_law: ClassVar[Law | None] = giving_way
     demo_time: ClassVar[float] = 7.0
     demo: ClassVar[str | None] = """
 dt: 0.05
@@ -146,9 +146,9 @@ class Queue(Moving):
     radius: float = Field(default=5.0, gt=0, description="m, who is further away holds up nobody")
     group: int | None = Field(default=None, ge=0, description="behind whom it queues; none = all")
     places: ClassVar[tuple[str, ...]] = ("target",)
-    pair_start: ClassVar[str | None] = "free_way"
-    pair_law: ClassVar[str | None] = "held_up"
-    finish_law: ClassVar[str | None] = "queueing"
+    pair_start: ClassVar[Law | None] = free_way
+    pair_law: ClassVar[Law | None] = held_up
+    finish_law: ClassVar[Law | None] = queueing
     demo: ClassVar[str | None] = """
 dt: 0.05
 obstacles: [{centre: [0, 2.7], radius: 2}, {centre: [0, -2.7], radius: 2}]
@@ -222,9 +222,9 @@ class Forage(Moving):
     slow_radius: float = Field(default=0.5, gt=0, description="m, it slows down within this of its food")
     period: float = Field(default=2.0, gt=0, description="s, how long it remembers to which side it turned")
     strength: float = Field(default=1.0, ge=0, description="m aside per m ahead: how far it turns while it wanders")
-    pair_start: ClassVar[str | None] = "no_food"
-    pair_law: ClassVar[str | None] = "nearest_food"
-    finish_law: ClassVar[str | None] = "foraging"
+    pair_start: ClassVar[Law | None] = no_food
+    pair_law: ClassVar[Law | None] = nearest_food
+    finish_law: ClassVar[Law | None] = foraging
     demo_time: ClassVar[float] = 20.0
     demo: ClassVar[str | None] = """
 dt: 0.05
@@ -272,7 +272,7 @@ class Explore(Moving):
     high: Vector = Field(description="m, upper corner of the region")
     track: float = Field(gt=0, description="m, tracks lie at most so far apart; sight of 1.25 tracks misses nothing")
     places: ClassVar[tuple[str, ...]] = ("low", "high")
-    own_law: ClassVar[str | None] = "sweeping"
+    own_law: ClassVar[Law | None] = sweeping
     demo_time: ClassVar[float] = 60.0
     demo: ClassVar[str | None] = """
 dt: 0.05

@@ -11,7 +11,7 @@ from pydantic import Field
 from flockenv import steering
 from flockenv.behaviours.base import Behaviour, steered_groups
 from flockenv.effects.base import Me, Other, Sight, all_masses
-from flockenv.kernels import Vec, law, like
+from flockenv.kernels import Law, Vec, law, like
 from flockenv.vec import dot, norm, scale, sub, unit
 
 __all__ = ["Driving", "LineUp"]
@@ -33,7 +33,7 @@ class Driving(Behaviour):
     weight: float = Field(default=1.0, ge=0, description="a factor, 1 as published")
     tau: float = Field(default=0.5, gt=0, description="s, relaxation time")
     always: ClassVar[bool] = True
-    own_law: ClassVar[str | None] = "driving"
+    own_law: ClassVar[Law | None] = driving
     demo: ClassVar[str | None] = """
 dt: 0.05
 groups:
@@ -114,9 +114,9 @@ class LineUp(Behaviour):
     margin: float = Field(default=0.0, ge=0, description="m, left between bodies that stand in line")
     radius: float = Field(default=3.0, gt=0, description="m, who is further away holds up nobody")
     group: int | None = Field(default=None, ge=0, description="behind whom it waits; none = all")
-    pair_start: ClassVar[str | None] = "nobody_ahead"
-    pair_law: ClassVar[str | None] = "next_ahead"
-    finish_law: ClassVar[str | None] = "lining_up"
+    pair_start: ClassVar[Law | None] = nobody_ahead
+    pair_law: ClassVar[Law | None] = next_ahead
+    finish_law: ClassVar[Law | None] = lining_up
     demo_time: ClassVar[float] = 14.0
     demo: ClassVar[str | None] = """
 dt: 0.05

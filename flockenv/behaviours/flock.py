@@ -17,7 +17,7 @@ from pydantic import Field
 from flockenv import steering
 from flockenv.behaviours.base import gains
 from flockenv.effects.base import Effect, Me, Other, Sight
-from flockenv.kernels import Vec, law, like
+from flockenv.kernels import Law, Vec, law, like
 from flockenv.steering import others
 from flockenv.vec import scale, select, sub, zero
 
@@ -118,9 +118,9 @@ effects:
   - {kind: drag, rate: 1}
 dt: 0.02
 """
-    pair_law: ClassVar[str | None] = "separation_pair"
-    apart_law: ClassVar[str | None] = "separation_apart"
-    finish_law: ClassVar[str | None] = "separation"
+    pair_law: ClassVar[Law | None] = separation_pair
+    apart_law: ClassVar[Law | None] = separation_apart
+    finish_law: ClassVar[Law | None] = separation
     vanishes: ClassVar[bool] = True
 
     @property
@@ -145,8 +145,8 @@ groups: [{count: 14, radius: 0.15, spawn: {low: [0, 0], high: [6, 6], speed: [0.
 effects: [{kind: alignment, weight: 0.7, radius: 5, fov: 300}]
 dt: 0.02
 """
-    pair_law: ClassVar[str | None] = "alignment_pair"
-    finish_law: ClassVar[str | None] = "alignment"
+    pair_law: ClassVar[Law | None] = alignment_pair
+    finish_law: ClassVar[Law | None] = alignment
     averages: ClassVar[bool] = True
 
     def rates(self, groups: Sequence[Any], dimension: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -171,8 +171,8 @@ effects:
   - {kind: drag, rate: 0.4}
 dt: 0.02
 """
-    pair_law: ClassVar[str | None] = "cohesion_pair"
-    finish_law: ClassVar[str | None] = "cohesion"
+    pair_law: ClassVar[Law | None] = cohesion_pair
+    finish_law: ClassVar[Law | None] = cohesion
     averages: ClassVar[bool] = True
 
     def rates(self, groups: Sequence[Any], dimension: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

@@ -10,7 +10,7 @@ from pydantic import Field, model_validator
 from flockenv import steering
 from flockenv.behaviours.base import Behaviour, Moving, top_speed
 from flockenv.effects.base import Me, Vector
-from flockenv.kernels import Vec, law
+from flockenv.kernels import Law, Vec, law
 from flockenv.vec import dot, scale, select, sub, zero
 
 __all__ = ["Arrive", "Dock", "Face", "Flee", "Seek", "TargetSpeed"]
@@ -73,7 +73,7 @@ class Seek(_ToTarget):
     """Head for a place at full speed: S = V unit(T - x) - v (Reynolds 1999's figure; its pseudo-code flees)."""
 
     kind: Literal["seek"] = "seek"
-    own_law: ClassVar[str | None] = "sought"
+    own_law: ClassVar[Law | None] = sought
     demo: ClassVar[str | None] = """
 groups:
   - {count: 6, max_speed: 2, max_force: 4, spawn: {low: [-6, -5], high: [-4, 5], speed: [1, 2]}}
@@ -87,7 +87,7 @@ class Flee(_ToTarget):
 
     kind: Literal["flee"] = "flee"
     radius: float | None = Field(default=None, gt=0, description="m, beyond it asks for nothing; none = everywhere")
-    own_law: ClassVar[str | None] = "fled"
+    own_law: ClassVar[Law | None] = fled
     unlimited: ClassVar[tuple[str, ...]] = ("speed", "radius")
     demo: ClassVar[str | None] = """
 groups:
@@ -105,7 +105,7 @@ class Arrive(_ToTarget):
 
     kind: Literal["arrive"] = "arrive"
     slow_radius: float = Field(gt=0, description="d_slow, m, within which it slows down")
-    own_law: ClassVar[str | None] = "arrived"
+    own_law: ClassVar[Law | None] = arrived
     demo: ClassVar[str | None] = """
 groups:
   - {count: 6, max_speed: 2, max_force: 4, spawn: {low: [-6, -5], high: [-4, 5], speed: [1, 2]}}
@@ -127,7 +127,7 @@ class Dock(_ToTarget):
     gate: float = Field(gt=0, description="m, how far before the place the gate is")
     width: float = Field(gt=0, description="m, within which of the axis it flies on along it")
     slow_radius: float = Field(gt=0, description="m, within which it slows down")
-    own_law: ClassVar[str | None] = "docked"
+    own_law: ClassVar[Law | None] = docked
     steepness: ClassVar[float] = 4.0  # it aims at the axis half-way to the place, and where it turns in 3.2 were found
     demo: ClassVar[str | None] = """
 groups:
@@ -151,7 +151,7 @@ class Face(Behaviour):
 
     kind: Literal["face"] = "face"
     heading: Vector = Field(description="direction, of any length")
-    own_law: ClassVar[str | None] = "faced"
+    own_law: ClassVar[Law | None] = faced
     demo: ClassVar[str | None] = """
 groups:
   - {count: 7, max_speed: 2, spawn: {low: [-6, -5], high: [-4, 5], speed: [1, 2]}}
@@ -170,7 +170,7 @@ class TargetSpeed(Behaviour):
 
     kind: Literal["target_speed"] = "target_speed"
     speed: float = Field(ge=0, description="v_t, m/s")
-    own_law: ClassVar[str | None] = "at_speed"
+    own_law: ClassVar[Law | None] = at_speed
     demo: ClassVar[str | None] = """
 groups:
   - {count: 7, spawn: {low: [-6, -5], high: [-4, 5], speed: [0.2, 2], heading: [1, 0]}}

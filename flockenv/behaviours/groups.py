@@ -14,7 +14,7 @@ from flockenv import steering
 from flockenv.behaviours.social import Social, size_of
 from flockenv.effects.base import Effect, Me, Other, Sight, Vector, all_masses
 from flockenv.elementary import exp
-from flockenv.kernels import Vec, law, like
+from flockenv.kernels import Law, Vec, law, like
 from flockenv.steering.others import ONE_PLACE
 from flockenv.vec import add, limit, norm, scale, select, sub, unit, zero
 
@@ -58,7 +58,7 @@ class Interest(Effect):
     steering: ClassVar[bool] = True
     strengths: ClassVar[tuple[str, ...]] = ("strength", "acceleration")
     places: ClassVar[tuple[str, ...]] = ("target",)
-    own_law: ClassVar[str | None] = "drawn_there"
+    own_law: ClassVar[Law | None] = drawn_there
     demo: ClassVar[str | None] = """
 dt: 0.02
 groups: [{count: 5, mass: 80, radius: 0.25, desired_speed: 1.3, spawn: {low: [-6, -2], high: [-3, 2]}}]
@@ -100,8 +100,8 @@ class Friends(Social):
     decay: float = Field(gt=0, description="B, m, over which the pull falls to 1/e")
     fades: float | None = Field(default=None, gt=0, description="T, s, in which interest falls to 1/e; none = it stays")
     since: float = Field(default=0.0, ge=0, description="t0, s, when it begins")
-    pair_law: ClassVar[str | None] = "drawn_together"
-    finish_law: ClassVar[str | None] = "as_friends"
+    pair_law: ClassVar[Law | None] = drawn_together
+    finish_law: ClassVar[Law | None] = as_friends
     demo: ClassVar[str | None] = """
 dt: 0.02
 groups:
@@ -187,8 +187,8 @@ class WalkingGroup(Effect):
     steering: ClassVar[bool] = True
     always: ClassVar[bool] = False
     strengths: ClassVar[tuple[str, ...]] = ("gaze", "cohesion", "repulsion")
-    pair_law: ClassVar[str | None] = "of_the_party"
-    finish_law: ClassVar[str | None] = "as_a_party"
+    pair_law: ClassVar[Law | None] = of_the_party
+    finish_law: ClassVar[Law | None] = as_a_party
     demo: ClassVar[str | None] = """
 dt: 0.02
 groups: [{count: 9, mass: 80, radius: 0.25, desired_speed: 1.2, spawn: {low: [-6, -4], high: [-3, 4]}}]

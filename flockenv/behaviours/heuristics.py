@@ -14,7 +14,7 @@ from pydantic import Field
 from flockenv import steering
 from flockenv.effects.base import Effect, Me, Other, Sight, all_masses, demand_group
 from flockenv.elementary import nearest_whole
-from flockenv.kernels import OPTIONS, Vec, law, like, stacked
+from flockenv.kernels import OPTIONS, Law, Vec, law, like, stacked
 from flockenv.shapes.chain import segment_hit, segment_share
 from flockenv.vec import add, dot, norm, scale, select, sub, unit, zero
 
@@ -189,10 +189,10 @@ class Heuristics(Effect):
     group: int | None = Field(default=None, ge=0, description="whom it sees; none = all")
     steering: ClassVar[bool] = True
     tabled: ClassVar[bool] = True
-    pair_start: ClassVar[str | None] = "all_free"
-    pair_law: ClassVar[str | None] = "in_the_way"
-    obstacle_law: ClassVar[str | None] = "round_in_the_way"
-    finish_law: ClassVar[str | None] = "chosen_way"
+    pair_start: ClassVar[Law | None] = all_free
+    pair_law: ClassVar[Law | None] = in_the_way
+    obstacle_law: ClassVar[Law | None] = round_in_the_way
+    finish_law: ClassVar[Law | None] = chosen_way
     demo: ClassVar[str | None] = """
 dt: 0.005
 groups:

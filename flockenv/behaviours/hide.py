@@ -8,12 +8,12 @@ import numpy as np
 from pydantic import Field
 
 from flockenv import steering
-from flockenv.behaviours.base import AboutNearest, Moving, nearest_one, seen_one, top_speed
+from flockenv.behaviours.base import AboutNearest, Moving, seen_one, top_speed
 from flockenv.effects.base import Me, Other
-from flockenv.kernels import Vec, law, like
+from flockenv.kernels import Law, Vec, law, like
 from flockenv.vec import add, dot, norm, scale, select, zero
 
-__all__ = ["Hide", "nearest_one"]
+__all__ = ["Hide"]
 
 
 @law
@@ -70,10 +70,10 @@ class Hide(AboutNearest, Moving):
     margin: float = Field(default=0.5, ge=0, description="m, between an obstacle and who hides behind it")
     slow_radius: float = Field(gt=0, description="m, from the place, within which it slows down")
     longest: float = Field(default=0.5, ge=0, description="s, it foresees who seeks no further")
-    finish_law: ClassVar[str | None] = "seeker"
-    obstacle_start: ClassVar[str | None] = "no_place"
-    obstacle_law: ClassVar[str | None] = "nearest_place"
-    obstacle_finish: ClassVar[str | None] = "hidden"
+    finish_law: ClassVar[Law | None] = seeker
+    obstacle_start: ClassVar[Law | None] = no_place
+    obstacle_law: ClassVar[Law | None] = nearest_place
+    obstacle_finish: ClassVar[Law | None] = hidden
     demo: ClassVar[str | None] = """
 groups:
   - {count: 4, max_speed: 2, max_force: 10, role: evader, spawn: {low: [-2, -6], high: [2, -4]}}

@@ -12,7 +12,7 @@ from pydantic import Field
 from flockenv.behaviours.push import Push
 from flockenv.effects.base import Me, Obstacle, all_masses
 from flockenv.elementary import exp
-from flockenv.kernels import Vec, law
+from flockenv.kernels import Law, Vec, law
 from flockenv.vec import add, scale, select, zero
 
 __all__ = ["ObstacleRepulsion"]
@@ -62,10 +62,10 @@ class ObstacleRepulsion(Push):
     radius: float = Field(default=3.0, gt=0, description="m from its centre, beyond which walls do nothing")
     occluded: bool = Field(default=False, description="do only sides push that no other obstacle hides?")
     obstacle_pieces: ClassVar[bool] = True
-    obstacle_start: ClassVar[str | None] = "nowhere"
-    obstacle_law: ClassVar[str | None] = "pushed_off"
-    obstacle_finish: ClassVar[str | None] = "all_sides"
-    obstacle_reach: ClassVar[str | None] = "within"
+    obstacle_start: ClassVar[Law | None] = nowhere
+    obstacle_law: ClassVar[Law | None] = pushed_off
+    obstacle_finish: ClassVar[Law | None] = all_sides
+    obstacle_reach: ClassVar[Law | None] = within
     demo: ClassVar[str | None] = """
 dt: 0.02
 groups:

@@ -11,7 +11,7 @@ from pydantic import Field
 from flockenv import orca, steering
 from flockenv.behaviours.base import Moving, top_speed
 from flockenv.effects.base import Me, Other, Sight, Vector
-from flockenv.kernels import OPTIONS, Vec, law, like
+from flockenv.kernels import OPTIONS, Law, Vec, law, like
 from flockenv.vec import scale, select, sub, zero
 
 __all__ = ["Orca"]
@@ -96,10 +96,10 @@ class Orca(Moving):
     )
     group: int | None = Field(default=None, ge=0, description="whom it avoids; none = all")
     places: ClassVar[tuple[str, ...]] = ("target",)
-    pair_start: ClassVar[str | None] = "nobody"
-    pair_law: ClassVar[str | None] = "near_agent"
-    obstacle_law: ClassVar[str | None] = "near_obstacle"
-    finish_law: ClassVar[str | None] = "reciprocal"
+    pair_start: ClassVar[Law | None] = nobody
+    pair_law: ClassVar[Law | None] = near_agent
+    obstacle_law: ClassVar[Law | None] = near_obstacle
+    finish_law: ClassVar[Law | None] = reciprocal
     demo: ClassVar[str | None] = """
 dt: 0.05
 obstacles: [{centre: [0, 0], radius: 0.6}]

@@ -16,7 +16,7 @@ from pydantic import Field, model_validator
 from flockenv import grid, polyline, steering
 from flockenv.behaviours.base import Behaviour, Moving, gains, top_speed
 from flockenv.effects.base import Me, Vector
-from flockenv.kernels import Vec, law, like
+from flockenv.kernels import Law, Vec, law, like
 from flockenv.vec import add, norm, scale, select, sub, zero
 
 __all__ = ["FollowFlow", "FollowPath", "StayOnPath"]
@@ -148,7 +148,7 @@ class FollowPath(_OnPath):
         default=0.5, ge=0, lt=1, description="share of its speed: who is slower on its way is sent on; 0 = nobody is"
     )
     slow_radius: float = Field(default=0.0, ge=0, description="m, it brakes so far from the end of an open path")
-    own_law: ClassVar[str | None] = "path_followed"
+    own_law: ClassVar[Law | None] = path_followed
     demo: ClassVar[str | None] = """
 groups:
   - {count: 5, max_speed: 2, max_force: 6, spawn: {low: [3, 0], high: [9, 3], speed: [0.5, 1.5]}}
@@ -183,7 +183,7 @@ class StayOnPath(_OnPath):
     """Stay in a path's tube, whichever way: if the place after `time` s is outside, seek the spine beside it."""
 
     kind: Literal["stay_on_path"] = "stay_on_path"
-    own_law: ClassVar[str | None] = "path_kept"
+    own_law: ClassVar[Law | None] = path_kept
     demo: ClassVar[str | None] = """
 groups:
   - {count: 12, max_speed: 2, max_force: 6, spawn: {low: [2, 2], high: [10, 6], speed: [1, 2]}}
@@ -208,7 +208,7 @@ class FollowFlow(Behaviour):
     tabled: ClassVar[bool] = True
     places: ClassVar[tuple[str, ...]] = ("centre",)
     heads_for: ClassVar[bool] = False
-    own_law: ClassVar[str | None] = "flow_followed"
+    own_law: ClassVar[Law | None] = flow_followed
     demo: ClassVar[str | None] = """
 groups:
   - {count: 15, max_speed: 2, max_force: 4, spawn: {low: [1, 1], high: [9, 9]}}

@@ -17,7 +17,7 @@ from flockenv import steering
 from flockenv.behaviours.push import Push
 from flockenv.effects.base import Me, Other, Sight, all_masses, demand_group
 from flockenv.elementary import exp
-from flockenv.kernels import Vec, law, like
+from flockenv.kernels import Law, Vec, law, like
 from flockenv.steering import social
 from flockenv.vec import dot, limit, scale, select, sub, unit
 
@@ -56,7 +56,7 @@ class Social(Push):
     radius: float = Field(gt=0, description="m, who is further away is not looked at")
     group: int | None = Field(default=None, ge=0, description="whom it is about; none = all")
     occluded: bool = Field(default=False, description="whom an obstacle hides does nothing")
-    finish_law: ClassVar[str | None] = "as_felt"
+    finish_law: ClassVar[Law | None] = as_felt
 
     @property
     def sight(self) -> Sight:
@@ -139,8 +139,8 @@ class CircularRepulsion(Social):
     decay: float = Field(gt=0, description="B, m, over which the force falls to 1/e")
     bodies: bool = Field(default=True, description="is the distance that between the surfaces, not the centres?")
     anisotropy: float = Field(default=1.0, ge=0, le=1, description="lambda, how much who is straight behind counts")
-    pair_law: ClassVar[str | None] = "pushed_by_distance"
-    finish_law: ClassVar[str | None] = "weighed_by_view"
+    pair_law: ClassVar[Law | None] = pushed_by_distance
+    finish_law: ClassVar[Law | None] = weighed_by_view
     demo: ClassVar[str | None] = HEAD_ON.replace(
         "FORCE", "{kind: circular_repulsion, strength: 2000, decay: 0.08, radius: 3}"
     )
@@ -192,7 +192,7 @@ class EllipticalRepulsion(Social):
     anisotropy: float = Field(default=1.0, ge=0, le=1, description="lambda, how much who is straight behind counts")
     fov: float = Field(default=360.0, gt=0, le=360, description="degrees, 2 phi, full angle of the field of view")
     outside: float = Field(default=1.0, ge=0, le=1, description="c, how much what pushes from out of view counts")
-    pair_law: ClassVar[str | None] = "pushed_by_ellipse"
+    pair_law: ClassVar[Law | None] = pushed_by_ellipse
     demo: ClassVar[str | None] = HEAD_ON.replace(
         "FORCE", "{kind: elliptical_repulsion, acceleration: 7, decay: 0.3, step: 2, fov: 200, outside: 0.5, radius: 5}"
     )
@@ -236,7 +236,7 @@ class Sidestep(Social):
     angular: float = Field(default=2.0, ge=0, description="n, 1/m, of turning")
     forward: float = Field(default=3.0, ge=0, description="n', 1/m, of slowing down")
     bias: float = Field(default=0.005, ge=0, description="eps, 1/m: to the right")
-    pair_law: ClassVar[str | None] = "stepped_aside"
+    pair_law: ClassVar[Law | None] = stepped_aside
     demo: ClassVar[str | None] = HEAD_ON.replace("FORCE", "{kind: sidestep, acceleration: 4.5, radius: 8}")
 
     def parameters(self) -> dict[str, float | Vec]:

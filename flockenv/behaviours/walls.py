@@ -11,7 +11,7 @@ from pydantic import Field, model_validator
 from flockenv import steering
 from flockenv.behaviours.base import Moving, top_speed
 from flockenv.effects.base import Me, Obstacle
-from flockenv.kernels import Vec, law, like
+from flockenv.kernels import Law, Vec, law, like
 from flockenv.shapes import AnyShape, packed
 from flockenv.shapes.block import nearest_block
 from flockenv.shapes.chain import nearest_chain
@@ -77,11 +77,11 @@ class FollowWall(Moving):
     distance: float = Field(gt=0, description="m, of its centre from the wall")
     time: float = Field(default=0.5, gt=0, description="s, how far ahead it looks")
     range: float = Field(default=5.0, gt=0, description="m, walls further away than this are not seen")
-    obstacle_from: ClassVar[str | None] = "soon"
-    obstacle_start: ClassVar[str | None] = "no_wall"
-    obstacle_law: ClassVar[str | None] = "nearest_wall"
-    obstacle_finish: ClassVar[str | None] = "along_wall"
-    obstacle_reach: ClassVar[str | None] = "walls_seen"
+    obstacle_from: ClassVar[Law | None] = soon
+    obstacle_start: ClassVar[Law | None] = no_wall
+    obstacle_law: ClassVar[Law | None] = nearest_wall
+    obstacle_finish: ClassVar[Law | None] = along_wall
+    obstacle_reach: ClassVar[Law | None] = walls_seen
     demo: ClassVar[str | None] = """
 groups:
 - count: 2
@@ -181,9 +181,9 @@ effects:
         return self
 
     @property
-    def own_law(self) -> str | None:  # type: ignore[override]  # which law it is depends on the shape
+    def own_law(self) -> Law | None:  # type: ignore[override]  # which law it is depends on the shape
         """The law for this form of shape."""
-        return f"contain_{self.within.form}"
+        return contain_block if self.within.form == "block" else contain_chain
 
     def parameters(self) -> dict[str, float | Vec]:
         """The shape is a table."""

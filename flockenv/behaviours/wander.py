@@ -9,7 +9,7 @@ from pydantic import Field
 
 from flockenv import steering
 from flockenv.behaviours.base import Moving, top_speed
-from flockenv.kernels import Vec, law, like
+from flockenv.kernels import Law, Vec, law, like
 from flockenv.noise import smooth, uniform
 from flockenv.vec import add, dot, planar, scale, select, sub
 
@@ -54,7 +54,7 @@ class Wander(Moving):
     kind: Literal["wander"] = "wander"
     strength: float = Field(default=1.0, ge=0, description="m aside per m ahead of the point: 1 = up to 45 degrees")
     period: float = Field(default=1.0, gt=0, description="s, how long it remembers to which side it turned")
-    own_law: ClassVar[str | None] = "wandered"
+    own_law: ClassVar[Law | None] = wandered
     demo: ClassVar[str | None] = """
 groups:
   - {count: 6, max_speed: 1, max_force: 4, spawn: {low: [-1, -1], high: [1, 1], speed: [1, 1]}}

@@ -10,7 +10,7 @@ from pydantic import Field
 
 from flockenv.behaviours.base import Moving, steered_groups, top_speed
 from flockenv.effects.base import Me, Vector
-from flockenv.kernels import Vec, law, like
+from flockenv.kernels import Law, Vec, law, like
 from flockenv.targets import Target
 from flockenv.vec import norm, scale, sub
 from flockenv.ways import check_ways, lengths_on, region, starts_of, warn_cut_off, way_ahead, ways_to
@@ -44,7 +44,7 @@ class FollowWay(Moving):
     slow_radius: float = Field(default=1.0, gt=0, description="m before the target, over which it slows down to stop")
     margin: float = Field(default=3.0, gt=0, description="m of grid around obstacles, target and where agents begin")
     tabled: ClassVar[bool] = True
-    own_law: ClassVar[str | None] = "follow_way"
+    own_law: ClassVar[Law | None] = follow_way
     places: ClassVar[tuple[str, ...]] = ("target",)
     demo: ClassVar[str | None] = """
 groups:

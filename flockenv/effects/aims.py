@@ -8,7 +8,7 @@ from typing import Any, ClassVar, Literal
 from pydantic import Field
 
 from flockenv.effects.base import Effect, Me, Vector, demand_group
-from flockenv.kernels import Vec, law, like
+from flockenv.kernels import Law, Vec, law, like
 from flockenv.vec import norm, scale, select, sub, unit, zero
 
 __all__ = ["Aim", "Antipode", "Course", "Goal", "about", "easing"]
@@ -59,7 +59,7 @@ class Goal(Aim):
     kind: Literal["goal"] = "goal"
     target: Vector = Field(description="m, the place")
     slow_radius: float = Field(default=0.5, gt=0, description="m before it, over which it slows down to stop")
-    aim_law: ClassVar[str | None] = "goal_aim"
+    aim_law: ClassVar[Law | None] = goal_aim
     places: ClassVar[tuple[str, ...]] = ("target",)
 
     def parameters(self) -> dict[str, float | Vec]:
@@ -78,7 +78,7 @@ class Course(Aim):
 
     kind: Literal["course"] = "course"
     direction: Vector = Field(description="the way to go; its length does not matter")
-    aim_law: ClassVar[str | None] = "course_aim"
+    aim_law: ClassVar[Law | None] = course_aim
 
     def parameters(self) -> dict[str, float | Vec]:
         """The way, and how fast."""
@@ -122,9 +122,9 @@ class Antipode(Aim):
     kind: Literal["antipode"] = "antipode"
     centre: Vector = Field(description="m, what everybody crosses")
     slow_radius: float = Field(default=0.5, gt=0, description="m before its place, over which it slows down to stop")
-    aim_law: ClassVar[str | None] = "antipode_aim"
-    begin_law: ClassVar[str | None] = "antipode"
-    keep_law: ClassVar[str | None] = "goal_as_before"
+    aim_law: ClassVar[Law | None] = antipode_aim
+    begin_law: ClassVar[Law | None] = antipode
+    keep_law: ClassVar[Law | None] = goal_as_before
     keeps: ClassVar[tuple[str, ...]] = ("goal_x", "goal_y")
     heads_for: ClassVar[bool] = False
 

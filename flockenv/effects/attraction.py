@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from flockenv.effects.base import Effect, Me, Vector
-from flockenv.kernels import Vec, law, like
+from flockenv.kernels import Law, Vec, law, like
 from flockenv.state import State
 from flockenv.vec import dot, scale, sub
 
@@ -38,7 +38,7 @@ class Attraction(Effect):
     centre: Vector = Field(description="m")
     strength: float = Field(description="k, N m^2; negative: repulsion")
     softening: float = Field(default=0.0, ge=0, description="s, m, nearer than which it no longer grows as 1 / r^2")
-    own_law: ClassVar[str | None] = "attraction"
+    own_law: ClassVar[Law | None] = attraction
     places: ClassVar[tuple[str, ...]] = ("centre",)
     strengths: ClassVar[tuple[str, ...]] = ("strength",)
 

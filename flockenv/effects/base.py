@@ -1,4 +1,4 @@
-"""Effect: what acts on a body. A frozen record that names its laws; a scene composes the laws of its effects.
+"""Effect: what acts on a body. A frozen record that holds its laws; a scene composes the laws of its effects.
 
 An effect is of one or more of three forms, each a law for one agent:
 
@@ -44,7 +44,7 @@ An effect is of one or more of three forms, each a law for one agent:
   it, so that both are judged together (orca).
 
 `p` holds the effect's `parameters()` by name, and, if it is `tabled`, an array of numbers as `p.table`: the points of a
-path, the values of a grid. `me` and `other` are the records below. Laws live in the effect's module.
+path, the values of a grid. `me` and `other` are the records below.
 A pair law says nothing of who is seen: it is evaluated for every candidate, and what it says of those outside the
 effect's `sight` (of agents themselves too) is dropped; or, if it `vanishes`, `other.square` is infinite in steps.
 
@@ -61,7 +61,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from flockenv.kernels import Vec, law, like
+from flockenv.kernels import Law, Vec, law, like
 from flockenv.records import Record
 from flockenv.vec import dot
 
@@ -212,24 +212,24 @@ class Effect(Record):
     kind: str
     steering: ClassVar[bool] = False
     """True if it is something the agent wants (bounded by max_force together with its drive), False for physics."""
-    own_law: ClassVar[str | None] = None
-    medium_law: ClassVar[str | None] = None
-    flow_law: ClassVar[str | None] = None
-    far_law: ClassVar[str | None] = None
-    bond_law: ClassVar[str | None] = None
-    kick_law: ClassVar[str | None] = None
-    aim_law: ClassVar[str | None] = None
-    begin_law: ClassVar[str | None] = None
-    keep_law: ClassVar[str | None] = None
-    count_law: ClassVar[str | None] = None
+    own_law: ClassVar[Law | None] = None
+    medium_law: ClassVar[Law | None] = None
+    flow_law: ClassVar[Law | None] = None
+    far_law: ClassVar[Law | None] = None
+    bond_law: ClassVar[Law | None] = None
+    kick_law: ClassVar[Law | None] = None
+    aim_law: ClassVar[Law | None] = None
+    begin_law: ClassVar[Law | None] = None
+    keep_law: ClassVar[Law | None] = None
+    count_law: ClassVar[Law | None] = None
     keeps: ClassVar[tuple[str, ...]] = ()
     """Names of the numbers that it keeps of every agent, see State.inner."""
     recalls: ClassVar[tuple[str, ...]] = ()
     """Names of those that its laws read and that other effects keep."""
-    pair_start: ClassVar[str | None] = None
-    pair_law: ClassVar[str | None] = None
-    apart_law: ClassVar[str | None] = None
-    finish_law: ClassVar[str | None] = None
+    pair_start: ClassVar[Law | None] = None
+    pair_law: ClassVar[Law | None] = None
+    apart_law: ClassVar[Law | None] = None
+    finish_law: ClassVar[Law | None] = None
     vanishes: ClassVar[bool] = False
     """Does its pair law say nothing, zeros, where `other.square` is infinite, wherever `other.offset` leads?
 
@@ -237,12 +237,12 @@ class Effect(Record):
     """
     averages: ClassVar[bool] = False
     """Is its finish_law handed, after its sums, how many are in sight? They are counted once for equal sights."""
-    obstacle_start: ClassVar[str | None] = None
-    obstacle_law: ClassVar[str | None] = None
-    obstacle_finish: ClassVar[str | None] = None
-    obstacle_ray: ClassVar[str | None] = None
-    obstacle_from: ClassVar[str | None] = None
-    obstacle_reach: ClassVar[str | None] = None
+    obstacle_start: ClassVar[Law | None] = None
+    obstacle_law: ClassVar[Law | None] = None
+    obstacle_finish: ClassVar[Law | None] = None
+    obstacle_ray: ClassVar[Law | None] = None
+    obstacle_from: ClassVar[Law | None] = None
+    obstacle_reach: ClassVar[Law | None] = None
     obstacle_edges: ClassVar[bool] = False
     """True if an agent that has something ahead is told on which side its nearest silhouette edge is."""
     obstacle_pieces: ClassVar[bool] = False
@@ -309,8 +309,8 @@ class Effect(Record):
         return ()
 
     @property
-    def steer_law(self) -> tuple[str, str]:
-        """Module and name of the law (p, me, wishes) -> force by which it reconciles them."""
+    def steer_law(self) -> Law:
+        """The law (p, me, wishes) -> force by which it reconciles them."""
         raise TypeError(f"{type(self).__name__} reconciles no wishes")
 
     @property

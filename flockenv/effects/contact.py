@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from flockenv.effects.base import Effect, Me, Obstacle, Other, Sight, all_masses
-from flockenv.kernels import Vec, law, like
+from flockenv.kernels import Law, Vec, law, like
 from flockenv.steering.others import ONE_PLACE
 from flockenv.vec import add, dot, norm, scale, select, sub, unit, zero
 
@@ -150,10 +150,10 @@ class ObstacleContact(_Solid):
     """
 
     kind: Literal["obstacle_contact"] = "obstacle_contact"
-    obstacle_start: ClassVar[str | None] = "untouched"
-    obstacle_law: ClassVar[str | None] = "pushed_out"
-    obstacle_finish: ClassVar[str | None] = "of_all"
-    obstacle_reach: ClassVar[str | None] = "touching"
+    obstacle_start: ClassVar[Law | None] = untouched
+    obstacle_law: ClassVar[Law | None] = pushed_out
+    obstacle_finish: ClassVar[Law | None] = of_all
+    obstacle_reach: ClassVar[Law | None] = touching
 
     def folded(self, dimension: int) -> int:
         """The force so far."""
@@ -188,8 +188,8 @@ class Contact(_Solid):
     radius: float | None = Field(
         default=None, gt=0, description="m, who is nearer is looked at; none = as far as any two touch"
     )
-    pair_law: ClassVar[str | None] = "pushed_apart"
-    finish_law: ClassVar[str | None] = "contacts"
+    pair_law: ClassVar[Law | None] = pushed_apart
+    finish_law: ClassVar[Law | None] = contacts
     conserves_momentum: ClassVar[bool] = True
 
     @property

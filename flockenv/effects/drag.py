@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from flockenv.effects.base import Effect, Me, all_masses
-from flockenv.kernels import Vec, law
+from flockenv.kernels import Law, Vec, law
 from flockenv.vec import norm, scale, sub
 
 __all__ = ["Drag", "QuadraticDrag"]
@@ -34,7 +34,7 @@ class Drag(Effect):
 
     kind: Literal["drag"] = "drag"
     rate: float = Field(ge=0, description="c, kg/s")
-    own_law: ClassVar[str | None] = "drag"
+    own_law: ClassVar[Law | None] = drag
     strengths: ClassVar[tuple[str, ...]] = ("rate",)
     linear_drag: ClassVar[str | None] = "rate"
 
@@ -52,5 +52,5 @@ class QuadraticDrag(Effect):
 
     kind: Literal["quadratic_drag"] = "quadratic_drag"
     rate: float = Field(ge=0, description="c, kg/m: half of density x cross-section x drag coefficient")
-    own_law: ClassVar[str | None] = "quadratic_drag"
+    own_law: ClassVar[Law | None] = quadratic_drag
     strengths: ClassVar[tuple[str, ...]] = ("rate",)

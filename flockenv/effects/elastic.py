@@ -11,7 +11,7 @@ from pydantic import Field
 
 from flockenv.effects.base import Bonds, Effect, Me, all_masses, network_of
 from flockenv.elements import Material, blocks, stiffness
-from flockenv.kernels import Vec, law
+from flockenv.kernels import Law, Vec, law
 from flockenv.vec import add, scale, sub
 
 if TYPE_CHECKING:
@@ -74,8 +74,8 @@ class Elastic(Effect):
     thickness: float = Field(default=1.0, gt=0, description="m, of triangles")
     alpha: float = Field(default=0.0, ge=0, description="1/s, damping D = alpha M + beta K")
     beta: float = Field(default=0.0, ge=0, description="s")
-    own_law: ClassVar[str | None] = "rayleigh_mass"
-    bond_law: ClassVar[str | None] = "elastic"
+    own_law: ClassVar[Law | None] = rayleigh_mass
+    bond_law: ClassVar[Law | None] = elastic
     strengths: ClassVar[tuple[str, ...]] = ("young", "alpha", "beta")
 
     @property

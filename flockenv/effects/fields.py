@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from flockenv.effects.base import Effect, Me, Vector
-from flockenv.kernels import OPTIONS, Vec, law, like
+from flockenv.kernels import OPTIONS, Law, Vec, law, like
 from flockenv.state import State
 from flockenv.vec import add, dot, lateral, scale, sub, unit
 
@@ -127,19 +127,19 @@ class _Timed(Effect):
 class _Field(_Timed):
     """What pushes agents or moves the medium, as `acts` says: one law for both."""
 
-    formula: ClassVar[str]
+    formula: ClassVar[Law]
     acts: Literal["force", "medium"] = Field(
         default="force", description="what it is: a force, N, or a velocity of the medium, m/s"
     )
     strengths: ClassVar[tuple[str, ...]] = ("strength",)
 
     @property
-    def own_law(self) -> str | None:  # type: ignore[override]  # its law fills one of two slots
+    def own_law(self) -> Law | None:  # type: ignore[override]  # its law fills one of two slots
         """The law, if it is a force."""
         return self.formula if self.acts == "force" else None
 
     @property
-    def medium_law(self) -> str | None:  # type: ignore[override]
+    def medium_law(self) -> Law | None:  # type: ignore[override]
         """The law, if it moves the medium."""
         return self.formula if self.acts == "medium" else None
 
@@ -173,7 +173,7 @@ class Uniform(_Field):
 
     kind: Literal["uniform"] = "uniform"
     strength: Vector = Field(description="N as a force, m/s as a medium, per axis")
-    formula: ClassVar[str] = "uniform"
+    formula: ClassVar[Law] = uniform
 
     def _energy(self, pos: Floats, offset: Any) -> Floats:
         """-F . x."""
@@ -188,7 +188,7 @@ class Source(_Central):
 
     kind: Literal["source"] = "source"
     strength: float = Field(ge=0, description="Phi, N m^2 as a force, m^3/s as a medium")
-    formula: ClassVar[str] = "source"
+    formula: ClassVar[Law] = source
 
     def _energy(self, pos: Floats, offset: Any) -> Floats:
         """What a sink has, and the other sign."""
@@ -203,7 +203,7 @@ class Sink(_Central):
 
     kind: Literal["sink"] = "sink"
     strength: float = Field(ge=0, description="Phi, N m^2 as a force, m^3/s as a medium")
-    formula: ClassVar[str] = "sink"
+    formula: ClassVar[Law] = sink
 
     def _energy(self, pos: Floats, offset: Any) -> Floats:
         """0 in the centre, and at most pi / 2 Phi / sqrt(a)."""
@@ -220,7 +220,7 @@ class Vortex(_Central):
     kind: Literal["vortex"] = "vortex"
     strength: float = Field(description="Phi, N m^2 as a force, m^3/s as a medium; negative: clockwise")
     axis: Vector | None = Field(default=None, description="its direction, in 3-D alone; none = the z axis")
-    formula: ClassVar[str] = "vortex"
+    formula: ClassVar[Law] = vortex
 
     @model_validator(mode="after")
     def _axis_in_space(self) -> Self:
@@ -253,9 +253,9 @@ class Wind(_Timed):
         return self
 
     @property
-    def medium_law(self) -> str | None:  # type: ignore[override]  # gusts are compiled only if there are some
+    def medium_law(self) -> Law | None:  # type: ignore[override]  # gusts are compiled only if there are some
         """With gusts or without."""
-        return "wind" if self.gust is None else "gusty_wind"
+        return wind if self.gust is None else gusty_wind
 
 
 class Carried(Effect):
@@ -267,5 +267,5 @@ class Carried(Effect):
 
     kind: Literal["carried"] = "carried"
     share: float = Field(default=1.0, ge=0, le=1, description="of the medium's velocity; less than 1: they slip")
-    flow_law: ClassVar[str | None] = "carried"
+    flow_law: ClassVar[Law | None] = carried
     strengths: ClassVar[tuple[str, ...]] = ("share",)

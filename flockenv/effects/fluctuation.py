@@ -8,7 +8,7 @@ import numpy as np
 from pydantic import Field
 
 from flockenv.effects.base import Effect, Me
-from flockenv.kernels import Vec, law
+from flockenv.kernels import Law, Vec, law
 from flockenv.vec import scale
 
 __all__ = ["Fluctuation"]
@@ -32,5 +32,5 @@ class Fluctuation(Effect):
 
     kind: Literal["fluctuation"] = "fluctuation"
     strength: float = Field(ge=0, description="s, N s^(1/2)")
-    kick_law: ClassVar[str | None] = "fluctuation"
+    kick_law: ClassVar[Law | None] = fluctuation
     strengths: ClassVar[tuple[str, ...]] = ("strength",)

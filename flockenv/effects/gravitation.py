@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from flockenv.effects.base import Effect, Far, Me, all_masses
-from flockenv.kernels import Vec, law
+from flockenv.kernels import Law, Vec, law
 from flockenv.state import State
 from flockenv.vec import scale
 
@@ -68,7 +68,7 @@ class Gravitation(_Softened):
 
     kind: Literal["gravitation"] = "gravitation"
     constant: float = Field(ge=0, description="G, N m^2/kg^2; in nature 6.674e-11")
-    far_law: ClassVar[str | None] = "gravitation"
+    far_law: ClassVar[Law | None] = gravitation
     strengths: ClassVar[tuple[str, ...]] = ("constant",)
 
     def check(self, scene: Any) -> None:
@@ -90,7 +90,7 @@ class InverseSquare(_Softened):
 
     kind: Literal["inverse_square"] = "inverse_square"
     strength: float = Field(description="k, N m^2; positive attracts, negative repels")
-    far_law: ClassVar[str | None] = "inverse_square"
+    far_law: ClassVar[Law | None] = inverse_square
     weighs_mass: ClassVar[bool] = False
     strengths: ClassVar[tuple[str, ...]] = ("strength",)
 

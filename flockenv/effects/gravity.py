@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from flockenv.effects.base import Effect, Me, Vector, all_masses
-from flockenv.kernels import Vec, law
+from flockenv.kernels import Law, Vec, law
 from flockenv.state import State
 from flockenv.vec import scale
 
@@ -28,7 +28,7 @@ class Gravity(Effect):
 
     kind: Literal["gravity"] = "gravity"
     acceleration: Vector = Field(default=(0.0, -9.81), description="m/s^2, which is N per kg; as many as dimensions")
-    own_law: ClassVar[str | None] = "gravity"
+    own_law: ClassVar[Law | None] = gravity
     strengths: ClassVar[tuple[str, ...]] = ("acceleration",)
 
     def potential(self, groups: Sequence[Any], state: State, offset: Any) -> NDArray[np.float64]:

@@ -11,7 +11,7 @@ from pydantic import Field, model_validator
 from flockenv.effects.aims import about
 from flockenv.effects.base import Me
 from flockenv.effects.way import Around, slowed
-from flockenv.kernels import Vec, law, like
+from flockenv.kernels import Law, Vec, law, like
 from flockenv.spread import Spread, drawn
 from flockenv.targets import Target, passed, row_size, to_target
 from flockenv.vec import norm, scale, select, sub, unit, zero
@@ -132,9 +132,9 @@ class Journey(Around):
     )
     slow_radius: float = Field(default=0.5, gt=0, description="m, over which one slows down before one stays or waits")
     needs_all: ClassVar[bool] = True
-    aim_law: ClassVar[str | None] = "journey_aim"
-    begin_law: ClassVar[str | None] = "journey_begun"
-    keep_law: ClassVar[str | None] = "journey_kept"
+    aim_law: ClassVar[Law | None] = journey_aim
+    begin_law: ClassVar[Law | None] = journey_begun
+    keep_law: ClassVar[Law | None] = journey_kept
     keeps: ClassVar[tuple[str, ...]] = ("stage", "ready", "was_x", "was_y")
 
     @property

@@ -8,7 +8,7 @@ from typing import Any, ClassVar, Literal
 from pydantic import Field
 
 from flockenv.effects.base import Effect, Me, Other, Sight
-from flockenv.kernels import Vec, law, like
+from flockenv.kernels import Law, Vec, law, like
 from flockenv.steering.others import ONE_PLACE
 from flockenv.vec import scale, select, sub, unit
 
@@ -54,8 +54,8 @@ class Pressure(Effect):
     strength: float = Field(ge=0, description="K, N: 3 K or so act at half the distance a, 64 K in one place")
     density: float = Field(gt=0, description="rho, agents per m^2, in 3-D per m^3")
     radius: float = Field(gt=0, description="R, m, neighbours are nearer than this: between 1.1 a and 1.4 a")
-    pair_law: ClassVar[str | None] = "pressure_pair"
-    finish_law: ClassVar[str | None] = "pressure"
+    pair_law: ClassVar[Law | None] = pressure_pair
+    finish_law: ClassVar[Law | None] = pressure
     conserves_momentum: ClassVar[bool] = True
     strengths: ClassVar[tuple[str, ...]] = ("strength",)
 

@@ -13,7 +13,7 @@ from flockenv.effects.base import Me
 from flockenv.effects.journey import onwards, place_kept
 from flockenv.effects.way import Around
 from flockenv.eikonal import NO_WAY
-from flockenv.kernels import Vec, law, like
+from flockenv.kernels import Law, Vec, law, like
 from flockenv.targets import Target, passed, row_size
 from flockenv.vec import scale, sub, unit, zero
 from flockenv.ways import towards
@@ -159,10 +159,10 @@ class Routes(Around):
     flow: float = Field(default=1.9, gt=0, description="1/(m s), how many get through per metre of width")
     period: float = Field(default=2.0, gt=0, description="s, between decisions")
     hysteresis: float = Field(default=0.1, ge=0, lt=1, description="share of its time by which another must be quicker")
-    aim_law: ClassVar[str | None] = "routes_aim"
-    begin_law: ClassVar[str | None] = "routes_begun"
-    keep_law: ClassVar[str | None] = "routes_kept"
-    count_law: ClassVar[str | None] = "at_door"
+    aim_law: ClassVar[Law | None] = routes_aim
+    begin_law: ClassVar[Law | None] = routes_begun
+    keep_law: ClassVar[Law | None] = routes_kept
+    count_law: ClassVar[Law | None] = at_door
     keeps: ClassVar[tuple[str, ...]] = ("door", "left", "ready", "was_x", "was_y")
 
     @property

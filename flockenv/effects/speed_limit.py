@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from flockenv.effects.base import Effect, Me, all_masses
-from flockenv.kernels import Vec, law, like
+from flockenv.kernels import Law, Vec, law, like
 from flockenv.vec import dot, scale
 
 __all__ = ["SpeedLimit"]
@@ -38,7 +38,7 @@ class SpeedLimit(Effect):
     kind: Literal["speed_limit"] = "speed_limit"
     speed: float = Field(gt=0, description="V, m/s")
     strength: float = Field(ge=0, description="B, N, with which it brakes at that speed")
-    own_law: ClassVar[str | None] = "speed_limit"
+    own_law: ClassVar[Law | None] = speed_limit
     strengths: ClassVar[tuple[str, ...]] = ("strength",)
 
     def rates(self, groups: Sequence[Any], dimension: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

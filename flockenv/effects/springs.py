@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from flockenv.effects.base import Bonds, Effect, Me, all_masses, network_of
-from flockenv.kernels import Vec, law, like
+from flockenv.kernels import Law, Vec, law, like
 from flockenv.networks import BEND, SHEAR
 from flockenv.vec import add, axis, dot, norm, scale, select, sub
 
@@ -109,7 +109,7 @@ class Springs(Effect):
     damping: float = Field(default=0.0, ge=0, description="kg/s, along each spring")
     ratio: float = Field(default=0.0, ge=0, description="more damping, as a share of what is critical for each spring")
     rest: float = Field(default=1.0, ge=0, description="rest lengths over those of the network; 0 = no length at all")
-    bond_law: ClassVar[str | None] = "spring"
+    bond_law: ClassVar[Law | None] = spring
     strengths: ClassVar[tuple[str, ...]] = ("stiffness", "shear", "bend", "damping", "ratio")
     conserves_momentum: ClassVar[bool] = True
 
@@ -158,7 +158,7 @@ class AngularSprings(Effect):
     group: int = Field(default=0, ge=0, description="number of the group whose network it acts on")
     stiffness: float = Field(ge=0, description="N m/rad")
     damping: float = Field(default=0.0, ge=0, description="N m s/rad")
-    bond_law: ClassVar[str | None] = "angular_spring"
+    bond_law: ClassVar[Law | None] = angular_spring
     partners: ClassVar[int] = 2
     strengths: ClassVar[tuple[str, ...]] = ("stiffness", "damping")
     conserves_momentum: ClassVar[bool] = True

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from flockenv.effects.base import Effect, Me, Vector, all_masses
-from flockenv.kernels import Vec, law, like
+from flockenv.kernels import Law, Vec, law, like
 from flockenv.state import State
 from flockenv.vec import add, scale, sub, unit
 
@@ -56,7 +56,7 @@ class Tether(_Centred):
     stiffness: float = Field(ge=0, description="k, N/m")
     damping: float = Field(default=0.0, ge=0, description="c, kg/s")
     rest: float = Field(default=0.0, ge=0, description="L, m, where the spring pulls no more")
-    own_law: ClassVar[str | None] = "tether"
+    own_law: ClassVar[Law | None] = tether
     strengths: ClassVar[tuple[str, ...]] = ("stiffness", "damping")
 
     def rates(self, groups: Sequence[Any], dimension: int) -> tuple[Floats, Floats]:
@@ -76,7 +76,7 @@ class Swing(_Centred):
     kind: Literal["swing"] = "swing"
     strength: float = Field(ge=0, description="s, N; of a pendulum in gravity: m g")
     length: float = Field(default=1.0, gt=0, description="l, m")
-    own_law: ClassVar[str | None] = "swing"
+    own_law: ClassVar[Law | None] = swing
     strengths: ClassVar[tuple[str, ...]] = ("strength",)
 
     def rates(self, groups: Sequence[Any], dimension: int) -> tuple[Floats, Floats]:

@@ -15,7 +15,7 @@ from pydantic import Field, model_validator
 
 from flockenv import urges
 from flockenv.effects.base import Effect, Me, Other, Sight, demand_group
-from flockenv.kernels import Vec, law, like
+from flockenv.kernels import Law, Vec, law, like
 from flockenv.noise import uniform
 from flockenv.vec import norm, planar
 
@@ -97,8 +97,8 @@ class Metabolism(_Urge):
     effort: float = Field(default=0.0, ge=0, description="1/s more at max_speed")
     start: float = Field(default=0.3, ge=0, le=1, description="hunger at the start, in the middle")
     spread: float = Field(default=0.0, ge=0, le=1, description="how far it differs from one to the next")
-    begin_law: ClassVar[str | None] = "hungry_from"
-    keep_law: ClassVar[str | None] = "digesting"
+    begin_law: ClassVar[Law | None] = hungry_from
+    keep_law: ClassVar[Law | None] = digesting
     keeps: ClassVar[tuple[str, ...]] = ("hunger",)
     strengths: ClassVar[tuple[str, ...]] = ("rate", "effort")
 
@@ -172,10 +172,10 @@ class Grazing(_Urge):
     capacity: float = Field(default=3.0, gt=0, description="K, units of food in a full patch")
     start: float = Field(default=1.0, gt=0, le=1, description="how full patches begin")
     appetite: float = Field(default=1.0, gt=0, description="units of food that it takes from starved to full")
-    pair_law: ClassVar[str | None] = "at_table"
-    finish_law: ClassVar[str | None] = "told_both"
-    begin_law: ClassVar[str | None] = "food_from"
-    keep_law: ClassVar[str | None] = "grazed"
+    pair_law: ClassVar[Law | None] = at_table
+    finish_law: ClassVar[Law | None] = told_both
+    begin_law: ClassVar[Law | None] = food_from
+    keep_law: ClassVar[Law | None] = grazed
     keeps: ClassVar[tuple[str, ...]] = ("hunger", "food", "eaten")
     strengths: ClassVar[tuple[str, ...]] = ("rate", "growth")
 
@@ -246,10 +246,10 @@ class Predation(_Urge):
     radius: float = Field(gt=0, description="m between centres")
     meal: float = Field(default=0.5, ge=0, le=1, description="hunger that a catch takes away")
     hungry: float = Field(default=0.3, ge=0, le=1, description="who is less hungry catches nobody")
-    pair_law: ClassVar[str | None] = "in_reach"
-    finish_law: ClassVar[str | None] = "told_both"
-    begin_law: ClassVar[str | None] = "not_caught"
-    keep_law: ClassVar[str | None] = "caught"
+    pair_law: ClassVar[Law | None] = in_reach
+    finish_law: ClassVar[Law | None] = told_both
+    begin_law: ClassVar[Law | None] = not_caught
+    keep_law: ClassVar[Law | None] = caught
     keeps: ClassVar[tuple[str, ...]] = ("hunger", "caught")
     strengths: ClassVar[tuple[str, ...]] = ("meal",)
 
@@ -315,10 +315,10 @@ class Fear(_Urge):
     occluded: bool = Field(default=False, description="whom an obstacle hides is not seen")
     span: float = Field(default=2.0, ge=0, description="D0, m, within which fear of one is 1")
     memory: float = Field(default=3.0, gt=0, description="s, over which it falls to 1/e")
-    pair_law: ClassVar[str | None] = "frightened"
-    finish_law: ClassVar[str | None] = "told_one"
-    begin_law: ClassVar[str | None] = "unafraid"
-    keep_law: ClassVar[str | None] = "afraid"
+    pair_law: ClassVar[Law | None] = frightened
+    finish_law: ClassVar[Law | None] = told_one
+    begin_law: ClassVar[Law | None] = unafraid
+    keep_law: ClassVar[Law | None] = afraid
     keeps: ClassVar[tuple[str, ...]] = ("fear",)
     strengths: ClassVar[tuple[str, ...]] = ("span",)
 
@@ -376,10 +376,10 @@ class Libido(_Urge):
     ready: float = Field(default=0.4, ge=0, le=1, description="libido above which one would")
     start: float = Field(default=0.0, ge=0, description="urge at the start, in the middle")
     spread: float = Field(default=0.0, ge=0, description="how far it differs from one to the next")
-    pair_law: ClassVar[str | None] = "willing"
-    finish_law: ClassVar[str | None] = "told_one"
-    begin_law: ClassVar[str | None] = "urge_from"
-    keep_law: ClassVar[str | None] = "mating"
+    pair_law: ClassVar[Law | None] = willing
+    finish_law: ClassVar[Law | None] = told_one
+    begin_law: ClassVar[Law | None] = urge_from
+    keep_law: ClassVar[Law | None] = mating
     keeps: ClassVar[tuple[str, ...]] = ("libido", "mated")
     recalls: ClassVar[tuple[str, ...]] = ("hunger",)
     strengths: ClassVar[tuple[str, ...]] = ("rate",)
@@ -437,8 +437,8 @@ class Intention(_Urge):
     need: float = Field(default=0.5, gt=0, le=1, description="hunger or libido above which one sees to it")
     calm: float = Field(default=0.1, ge=0, description="how much less fear ends either")
     content: float = Field(default=0.3, ge=0, description="how much less hunger or libido ends it")
-    begin_law: ClassVar[str | None] = "no_intention"
-    keep_law: ClassVar[str | None] = "intending"
+    begin_law: ClassVar[Law | None] = no_intention
+    keep_law: ClassVar[Law | None] = intending
     keeps: ClassVar[tuple[str, ...]] = ("intention",)
     recalls: ClassVar[tuple[str, ...]] = ("hunger", "libido", "fear")
     strengths: ClassVar[tuple[str, ...]] = ("calm", "content")

@@ -9,7 +9,7 @@ import numpy as np
 from pydantic import Field
 
 from flockenv.effects.base import Effect, Me, Other, Sight
-from flockenv.kernels import Vec, law, like
+from flockenv.kernels import Law, Vec, law, like
 from flockenv.noise import uniform
 from flockenv.vec import add, dot, scale, select, sub, unit
 
@@ -57,8 +57,8 @@ class Vicsek(Effect):
     noise: float = Field(ge=0, le=2 * math.pi, description="eta, rad, the range of the error: 2 pi = no order at all")
     step: float = Field(default=1.0, gt=0, description="s, the time of one update; dt must be the same")
     share: float = Field(default=1.0, ge=0, le=1, description="of the change that one update makes; 1 = Vicsek's")
-    pair_law: ClassVar[str | None] = "vicsek_pair"
-    finish_law: ClassVar[str | None] = "vicsek"
+    pair_law: ClassVar[Law | None] = vicsek_pair
+    finish_law: ClassVar[Law | None] = vicsek
     strengths: ClassVar[tuple[str, ...]] = ("share",)
 
     @property

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from flockenv.effects.base import Effect, Me, Vector
-from flockenv.kernels import Vec, law
+from flockenv.kernels import Law, Vec, law
 from flockenv.space import Torus
 from flockenv.state import State
 from flockenv.vec import dot, scale, sub, unit
@@ -43,7 +43,7 @@ class WallRepulsion(Effect):
     normal: Vector = Field(description="direction in which it pushes, of any length")
     strength: float = Field(ge=0, description="A, N, at the wall itself")
     decay: float = Field(gt=0, description="B, m, over which the force falls to 1/e")
-    own_law: ClassVar[str | None] = "wall_repulsion"
+    own_law: ClassVar[Law | None] = wall_repulsion
     places: ClassVar[tuple[str, ...]] = ("point",)
     strengths: ClassVar[tuple[str, ...]] = ("strength",)
 

@@ -10,7 +10,7 @@ from pydantic import Field
 
 from flockenv.effects.aims import Aim, about
 from flockenv.effects.base import Me
-from flockenv.kernels import Vec, law, like
+from flockenv.kernels import Law, Vec, law, like
 from flockenv.targets import Target, row_size
 from flockenv.vec import scale, select, zero
 from flockenv.ways import check_ways, lengths_on, region, starts_of, towards, warn_cut_off, way_block
@@ -97,7 +97,7 @@ class Way(Around):
     kind: Literal["way"] = "way"
     targets: tuple[Target, ...] = Field(min_length=1, description="where to: points, doors, boxes")
     slow_radius: float = Field(default=0.0, ge=0, description="m before the target, over which it slows down to stop")
-    aim_law: ClassVar[str | None] = "way_aim"
+    aim_law: ClassVar[Law | None] = way_aim
 
     @property
     def goals(self) -> tuple[tuple[Target, ...], tuple[str, ...]]:

@@ -10,7 +10,6 @@ from __future__ import annotations
 import functools
 import inspect
 import math
-import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
@@ -40,7 +39,7 @@ LAWS = (
     "count_law", "pair_start", "pair_law", "apart_law", "finish_law", "obstacle_start", "obstacle_law",
     "obstacle_finish", "obstacle_ray", "obstacle_from", "obstacle_reach",
 )  # fmt: skip
-"""The slots that an effect may fill with the name of a law."""
+"""The slots that an effect may fill with a law."""
 
 
 class Look(NamedTuple):
@@ -572,13 +571,10 @@ _OF_PAIRS = ("pair_start", "pair_law", "apart_law", "finish_law")
 
 def _names(effect: Effect, slots: Sequence[str]) -> set[str]:
     """Return every name in the code of some of an effect's laws and of the laws that they call."""
-    module = vars(sys.modules[type(effect).__module__])
-    laws = [getattr(effect, slot) for slot in slots]
-    # a law that is missing there is refused where it is imported
-    todo = [module[law] for law in (*laws, effect.obstacle_law if effect.joined else None) if law in module]
+    laws = [*(getattr(effect, slot) for slot in slots), effect.obstacle_law if effect.joined else None]
+    todo: list[Any] = [law for law in laws if law is not None]
     if effect.wishes and slots == LAWS:
-        where, law = effect.steer_law
-        todo.append(getattr(sys.modules[where], law))
+        todo.append(effect.steer_law)
     seen: set[int] = set()
     names: set[str] = set()
     while todo:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+from flockenv.kernels import imported
 from flockenv.sweep.accelerate import accelerate, sense
 from flockenv.sweep.around import around, around_imports
 from flockenv.sweep.far import tree_imports
@@ -96,8 +97,9 @@ def _imports(parts: Parts) -> str:
         *(["from flockenv.kernels import tallied, tally_of"] if parts.parting or parts.averaged else []),
         "from flockenv.neighbours import candidates, count_cells, order_records, row_of",
         "from flockenv.tiles import count_from_home, count_tiles, find_homes, order_cells, order_shared",
-        f"from flockenv.space import {parts.space.offset_law} as offset_to, {parts.space.confine_law} as confine",
-        *([f"from flockenv.space import {parts.space.bounce_law} as bounce"] if parts.bounces else []),
+        imported(parts.space.offset_law, "offset_to"),
+        imported(parts.space.confine_law, "confine"),
+        *([imported(parts.space.bounce_law, "bounce")] if parts.space.bounce_law else []),
         "from flockenv.noise import normal as standard_normal",
         *(["from flockenv.transpose import out_of_records, put_lines, put_records"] * (parts.sweeps and parts.sorts)),
         "from flockenv.vec import add, dot, exact_dot, exact_sum, limit, norm, scale, select, sub, unit, zero",
@@ -110,12 +112,11 @@ def _imports(parts: Parts) -> str:
     ]
     for k, effect in enumerate(parts.effects):
         for slot in LAWS:
-            name = getattr(effect, slot)
-            if name is not None:
-                lines.append(f"from {type(effect).__module__} import {name} as {slot}_{k}")
+            law = getattr(effect, slot)
+            if law is not None:
+                lines.append(imported(law, f"{slot}_{k}"))
         if effect.wishes:
-            module, name = effect.steer_law
-            lines.append(f"from {module} import {name} as steer_law_{k}")
+            lines.append(imported(effect.steer_law, f"steer_law_{k}"))
     if parts.inner:
         lines.append(f'Inner = namedtuple("Inner", {" ".join(parts.inner)!r})')
     options = 'dict(fastmath={"contract"}, error_model="numpy", nogil=True, _nrt=False, pipeline_class=Whole)'
