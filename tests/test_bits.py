@@ -1,0 +1,118 @@
+"""Results stay the same bits: every shipped scene and task against hashes that were stored, on one thread and two.
+
+A change that moves bits on purpose writes them anew, `python -m tests.test_bits`, and says in its commit what moved and
+why. Hashes hold for the processor's instructions that they were made with; elsewhere the tests are skipped.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import json
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numba
+import numpy as np
+import pytest
+
+from flockenv import processor
+from flockenv.config import ConfigError, load_scene
+from flockenv.crew import threads, use_threads
+from flockenv.divergence import SimulationDiverged
+from flockenv.tasks import TASKS
+from flockenv.world import World
+
+pytestmark = pytest.mark.filterwarnings("ignore")  # what scenes warn of is not what is tested here
+ROOT = Path(__file__).resolve().parent.parent
+STORED = Path(__file__).with_name("bits.json")
+STEPS, SLOW_STEPS = 2000, {"configs/cloth.yaml": 300}
+"""Steps of a scene; the cloth's implicit method takes 20 ms for one."""
+WORLDS, DECISIONS = 64, 500
+
+
+def scene_files() -> Iterator[str]:
+    """Every shipped scene, by its path from the root."""
+    for path in sorted((ROOT / "configs").rglob("*.yaml")):
+        try:
+            load_scene(path)
+        except ConfigError:
+            continue  # a training or an experiment
+        yield path.relative_to(ROOT).as_posix()
+
+
+def of_scene(name: str) -> str:
+    """Return the hash of a scene's last state; of one that diverges, of where it was before that call of 50 steps."""
+    scene = load_scene(ROOT / name)
+    state = scene.start(0)
+    with contextlib.suppress(SimulationDiverged):
+        for _ in range(SLOW_STEPS.get(name, STEPS) // 50):
+            state = scene.run(state, 50)
+    return digest(state.x, state.v, state.alive, state.tick)
+
+
+def of_task(name: str) -> str:
+    """Return the hash of all observations and rewards of a task under random actions, and of its last state."""
+    world = World(TASKS[name](), WORLDS)
+    rng, found = np.random.default_rng(0), hashlib.sha256()
+    begin = np.ones(WORLDS, bool)
+    for k in range(DECISIONS):
+        if begin.any():
+            found.update(world.reset(k, mask=begin).tobytes())
+        step = world.step(rng.uniform(-1, 1, (WORLDS, world.learners, world.action_size)))
+        found.update(digest(step.observation, step.reward).encode())
+        begin = step.ended
+    return digest(np.frombuffer(found.digest(), np.uint8), world.state.x, world.state.v)
+
+
+def digest(*arrays: Any) -> str:
+    """Return a hash of arrays, 16 hexadecimal digits."""
+    return hashlib.sha256(b"".join(np.ascontiguousarray(array).tobytes() for array in arrays)).hexdigest()[:16]
+
+
+def machine() -> str:
+    """Return what the bits may hang on beside the code: the processor's instructions and numba's version."""
+    return f"{digest(np.array(sorted(processor.FEATURES)))}, numba {numba.__version__}"
+
+
+def stored() -> dict[str, Any]:
+    found: dict[str, Any] = json.loads(STORED.read_text())
+    return found
+
+
+@pytest.fixture(autouse=True)
+def one_thread_afterwards() -> Iterator[None]:
+    before = threads()
+    yield
+    use_threads(before)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("count", [1, 2])
+@pytest.mark.parametrize("name", sorted(stored()["bits"]))
+def test_bits_are_what_they_were(name: str, count: int) -> None:
+    if machine() != stored()["machine"]:
+        pytest.skip(f"stored on {stored()['machine']}, this is {machine()}")
+    use_threads(count)
+    found = of_task(name) if name in TASKS else of_scene(name)
+    assert found == stored()["bits"][name], "moved on purpose? python -m tests.test_bits"
+
+
+def test_every_shipped_scene_and_task_is_stored() -> None:
+    assert set(stored()["bits"]) == {*scene_files(), *TASKS}
+
+
+def write() -> None:
+    """Store all hashes anew."""
+    use_threads(1)
+    bits = {}
+    for name in [*scene_files(), *TASKS]:
+        bits[name] = of_task(name) if name in TASKS else of_scene(name)
+        sys.stdout.write(f"{name} {bits[name]}\n")
+    STORED.write_text(json.dumps({"machine": machine(), "bits": bits}, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    write()
