@@ -13,14 +13,16 @@ from typing import Any, NamedTuple
 
 from numba.core import event
 
+from flockenv.turns import OneAtATime
+
 __all__ = ["Compiled", "compiled"]
 
 
 class Compiled(NamedTuple):
     """One kernel that this process had to compile."""
 
-    kernel: str  # the generated file's prefix and the function, such as "scene: step"
-    what: str  # first line of the generated file: dimension, space, method, effects
+    kernel: str  # the generated file's prefix, or the module, and the function, such as "scene: step"
+    what: str  # the first line about it: of a scene its dimension, space, method and effects
     seconds: float
 
 
@@ -43,7 +45,8 @@ class _Watch(event.Listener):
         function = _entry_point(event)
         if function is not None:
             self.began[id(event.data["dispatcher"])] = perf_counter()
-            _say(f"flockenv: compiling {_described(function)} (once; kept in {_folder(function)}) ...")
+            folder = _folder(event.data["dispatcher"])
+            _say(f"flockenv: compiling {_described(function)} (once; kept in {folder}) ...")
 
     def on_end(self, event: Any) -> None:
         """Say how long it was."""
@@ -51,29 +54,30 @@ class _Watch(event.Listener):
         began = self.began.pop(id(event.data["dispatcher"]), None)
         if function is not None and began is not None:
             seconds = perf_counter() - began
-            module = sys.modules.get(function.__module__)
-            what = ((module and module.__doc__) or "").split(". Generated")[0]
-            prefix = function.__module__.rsplit(".", 1)[-1].rsplit("_", 1)[0]
-            _done.append(Compiled(f"{prefix}: {function.__name__}", what, seconds))
+            generated = function.__module__.startswith("flockenv_generated.")
+            name = function.__module__.rsplit(".", 1)[-1]
+            prefix = name.rsplit("_", 1)[0] if generated else name
+            _done.append(Compiled(f"{prefix}: {function.__name__}", _described(function), seconds))
             _say(f" {seconds:.1f} s\n")
 
 
 def _entry_point(event: Any) -> Any:
-    """Return the function that an event is about, if it is an entry point of a generated file; else None."""
+    """Return the function that an event is about, if it is an entry point that is kept on the disk; else None."""
     dispatcher = event.data["dispatcher"]
-    function = getattr(dispatcher, "py_func", None)
-    ours = (getattr(function, "__module__", "") or "").startswith("flockenv_generated.")
-    kept = getattr(getattr(dispatcher, "_cache", None), "cache_path", None) is not None
-    return function if ours and kept else None
+    ours = isinstance(getattr(dispatcher, "_cache", None), OneAtATime)
+    return dispatcher.py_func if ours else None
 
 
 def _described(function: Any) -> str:
+    """Return the first line of a generated file, or of what is said of a section's function."""
     module = sys.modules.get(function.__module__)
-    return ((module and module.__doc__) or function.__name__).split(". Generated")[0]
+    generated = function.__module__.startswith("flockenv_generated.")
+    text: str = (module.__doc__ if generated and module is not None else function.__doc__) or function.__name__
+    return text.split(". Generated")[0].split("\n")[0]
 
 
-def _folder(function: Any) -> str:
-    folder: str = os.path.dirname(function.__code__.co_filename)
+def _folder(dispatcher: Any) -> str:
+    folder: str = dispatcher._cache.cache_path
     return folder.replace(os.path.expanduser("~"), "~", 1)
 
 

@@ -14,7 +14,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from flockenv.kernels import Vec, entry, kernel, law, like
+from flockenv.kernels import Vec, kernel, law, like
+from flockenv.section import entry
 
 __all__ = ["MOST_POINTS", "Floats", "Table", "covers", "packed", "points_of", "sample", "sample_vector", "sampled"]
 

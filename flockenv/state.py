@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from flockenv.kernels import entry
 from flockenv.lines import zeros
 from flockenv.magnitudes import check_array
+from flockenv.section import entry
 from flockenv.vehicle import face
 
 __all__ = ["COUNTED_BY_KERNELS", "WORK", "Body", "Floats", "Obstacles", "State"]

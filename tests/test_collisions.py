@@ -21,8 +21,8 @@ from flockenv.crew import use_threads
 from flockenv.effects import Gravity
 from flockenv.explanation import explain
 from flockenv.integrators import RK4, Integrator, SemiImplicitEuler, VelocityVerlet
-from flockenv.kernels import entry
 from flockenv.scene import Group, Scene
+from flockenv.section import entry
 from flockenv.shapes import Block, Circle, HalfSpace, Polygon, Wall
 from flockenv.space import Box, Plane, Space, Torus
 from flockenv.spawn import Spawn

@@ -38,7 +38,7 @@ LAYERS = (
         "machine_code",
         "processor",
     },
-    {"records", "vec", "elementary", "noise", "kernels", "targets", "abreast", "lines", "transpose"},
+    {"records", "vec", "elementary", "noise", "kernels", "section", "targets", "abreast", "lines", "transpose"},
     {"state", "space", "steering", "arbitration", "vehicle", "appearance", "spread", "urges"},
     {"neighbours", "tiles", "shapes", "grid", "eikonal", "orca", "polyline", "rows", "networks", "elements", "tree"},
     {"effects", "integrators", "constraints", "population", "spawn", "sweep", "stability", "rounding", "ways"},

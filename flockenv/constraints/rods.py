@@ -11,8 +11,9 @@ from pydantic import Field, model_validator
 
 from flockenv.constraints.base import Constraint, Settler
 from flockenv.elementary import nearest_whole
-from flockenv.kernels import entry, finite, kernel, like
+from flockenv.kernels import finite, kernel, like
 from flockenv.networks import EDGE
+from flockenv.section import entry
 from flockenv.space import Torus
 from flockenv.state import Floats, State
 

@@ -1,0 +1,91 @@
+"""Entry points made of Python functions: what they depend on is a plan, and machine code is kept under its digest.
+
+A section is a factory: it takes a plan (laws as functions, counts, flags) and returns a function that uses them as free
+variables. numba takes those for constants: it drops the branches that they rule out before it looks at types, and
+inlines the laws. Its own disk cache never finds such a function again, as it pickles what the function holds; here the
+key is written out instead: the plan, the sources of all laws, and the width of registers.
+"""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+from collections.abc import Callable
+from typing import Any
+
+import numba
+
+from flockenv import processor
+from flockenv.checked_store import Store
+from flockenv.inlining import Whole
+from flockenv.kernels import FAST, Vec, cache_folder, kernel, laws_digest, texts_outside
+from flockenv.machine_code import MachineCode
+from flockenv.private_folder import prepared
+from flockenv.startup import numba_before_scipy
+from flockenv.turns import OneAtATime
+
+__all__ = ["entry", "entry_of", "kept", "vector"]
+
+_njit: Any = numba.njit  # numba's stubs do not know `_nrt`
+
+
+def entry_of(make: Callable[..., Callable[..., Any]]) -> Callable[..., Callable[..., Any]]:
+    """Decorate a section whose functions Python calls: `section(*plan)` is an entry point, made once for each plan."""
+
+    @functools.lru_cache(maxsize=512)
+    @functools.wraps(make)
+    def made(*plan: Any) -> Callable[..., Any]:
+        return kept(make(*plan), plan)
+
+    return made
+
+
+@functools.cache
+def entry(kernel: Callable[..., Any]) -> Callable[..., Any]:
+    """Return a kernel as an entry point of its own."""
+    return kept(getattr(kernel, "py_func", kernel))
+
+
+def kept(function: Callable[..., Any], plan: tuple[Any, ...] = ()) -> Callable[..., Any]:
+    """Return a Python function as an entry point: its machine code is read from the checked store, or compiled there.
+
+    plan: all that its free variables are made of: functions, numbers, text, and tuples of those.
+    """
+    if numba.config.DISABLE_JIT:  # type: ignore[attr-defined]  # made from the environment
+        return function
+    numba_before_scipy()
+    name = f"{function.__module__}.{function.__qualname__}"
+    modules = {each.__module__ for each in _functions((function, plan))}
+    told = f"{name}{_described(plan)}{laws_digest()}{texts_outside(modules)}{processor.REGISTER}"
+    digest = hashlib.sha256(told.encode()).hexdigest()[:20]
+    store, kept_as = Store(cache_folder()), f"{function.__name__.strip('_')}_{digest}"
+    compiled = _njit(fastmath=set(FAST), error_model="numpy", nogil=True, _nrt=False, pipeline_class=Whole)(function)
+    compiled._cache = OneAtATime(MachineCode(store, kept_as), prepared(store.folder / "locks") / f"{kept_as}.lock")
+    return compiled  # type: ignore[no-any-return]
+
+
+@functools.cache
+def vector(dimension: int) -> Callable[[Any, int], Vec]:
+    """Return a function that reads a vector of two or three numbers of an array, from a place on."""
+
+    def vector_at(array: Any, at: int) -> Vec:
+        if dimension == 2:
+            return array[at], array[at + 1]
+        return array[at], array[at + 1], array[at + 2]
+
+    return kernel(vector_at)
+
+
+def _functions(part: Any) -> list[Any]:
+    """Return the Python functions in a plan."""
+    if isinstance(part, tuple):
+        return [each for inner in part for each in _functions(inner)]
+    python = getattr(part, "py_func", part)
+    return [python] if callable(python) and not isinstance(python, type) else []
+
+
+def _described(part: Any) -> str:
+    """Write a plan out: functions by their names, everything else as it prints."""
+    if isinstance(part, tuple):
+        return f"({', '.join(map(_described, part))})"
+    return "".join(f"{each.__module__}.{each.__qualname__}" for each in _functions(part)) or repr(part)

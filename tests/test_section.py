@@ -1,0 +1,87 @@
+"""Sections: entry points made of Python functions are found again by what they depend on, and by nothing else."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parent.parent
+
+LAWS = """
+from flockenv.kernels import law
+
+@law
+def doubled(x):
+    return 2 * x
+
+@law
+def squared(x):
+    return x * x
+"""
+
+PROGRAM = """
+import sys
+import numpy as np
+from numba.core import event
+from flockenv.section import entry_of
+import users_laws
+
+@entry_of
+def over(law, times):
+    def each(numbers):
+        for k in range(len(numbers)):
+            for _ in range(times):
+                numbers[k] = law(numbers[k])
+    return each
+
+class Count(event.Listener):
+    compiled = 0
+    def on_start(self, event):
+        self.compiled += 1
+    def on_end(self, event):
+        pass
+
+count = Count()
+event.register("numba:compile", count)
+for law in (users_laws.doubled, users_laws.squared):
+    for times in (1, 2):
+        numbers = np.array([3.0])
+        over(law, times)(numbers)
+        print(numbers[0], end=" ")
+print(count.compiled > 0)
+"""
+
+
+def run(folder: Path, laws: str = LAWS, **environment: str) -> str:
+    """Return what the program prints: a number for each plan, and whether anything was compiled."""
+    (folder / "users_laws.py").write_text(laws)
+    told = {**os.environ, "FLOCKENV_CACHE": str(folder / "cache"), "PYTHONPATH": f"{folder}:{ROOT}", **environment}
+    done = subprocess.run([sys.executable, "-c", PROGRAM], env=told, capture_output=True, text=True, check=True)
+    return done.stdout.strip()
+
+
+def test_each_plan_has_code_of_its_own_that_the_next_process_finds(tmp_path: Path) -> None:
+    assert run(tmp_path) == "6.0 12.0 9.0 81.0 True"
+    assert run(tmp_path) == "6.0 12.0 9.0 81.0 False"
+
+
+def test_an_edited_law_compiles_anew_and_undone_it_is_found_again(tmp_path: Path) -> None:
+    run(tmp_path)
+    assert run(tmp_path, LAWS.replace("2 * x", "5 * x")) == "15.0 75.0 9.0 81.0 True"
+    assert run(tmp_path) == "6.0 12.0 9.0 81.0 False"
+
+
+def test_sections_run_in_plain_python_too(tmp_path: Path) -> None:
+    assert run(tmp_path, NUMBA_DISABLE_JIT="1") == "6.0 12.0 9.0 81.0 False"
+
+
+@pytest.mark.slow
+def test_damaged_code_is_compiled_anew(tmp_path: Path) -> None:
+    run(tmp_path)
+    for path in (tmp_path / "cache").glob("*.nbc"):
+        path.write_bytes(path.read_bytes()[:-9])
+    assert run(tmp_path) == "6.0 12.0 9.0 81.0 True"
