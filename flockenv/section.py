@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import functools
 import hashlib
+from collections import namedtuple
 from collections.abc import Callable
 from typing import Any
 
@@ -24,7 +25,7 @@ from flockenv.private_folder import prepared
 from flockenv.startup import numba_before_scipy
 from flockenv.turns import OneAtATime
 
-__all__ = ["entry", "entry_of", "kept", "vector"]
+__all__ = ["entry", "entry_of", "kept", "record", "several", "vector"]
 
 _njit: Any = numba.njit  # numba's stubs do not know `_nrt`
 
@@ -62,6 +63,32 @@ def kept(function: Callable[..., Any], plan: tuple[Any, ...] = ()) -> Callable[.
     compiled = _njit(fastmath=set(FAST), error_model="numpy", nogil=True, _nrt=False, pipeline_class=Whole)(function)
     compiled._cache = OneAtATime(MachineCode(store, kept_as), prepared(store.folder / "locks") / f"{kept_as}.lock")
     return compiled  # type: ignore[no-any-return]
+
+
+def record(names: tuple[str, ...]) -> Any:
+    """Return the type of a record with these fields; machine code that takes one finds it under its name here."""
+    return __getattr__("__".join(["Record", *(names or ("nothing",))]))
+
+
+def __getattr__(name: str) -> Any:
+    """Make the type of a record whose name lists its fields."""
+    kind, *names = name.split("__")
+    if kind != "Record" or not all(names):
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return globals().setdefault(name, namedtuple(name, names, module=__name__))
+
+
+@functools.cache
+def several(count: int, item: Callable[[Any, int], Any]) -> Callable[[Any], Any]:
+    """Return a function that makes a tuple of `count` items, item(array, 0), item(array, 1), ..."""
+    before, last = several(count - 1, item) if count > 1 else None, count - 1
+
+    def items(array: Any) -> Any:
+        if before is None:
+            return (item(array, last),)
+        return before(array) + (item(array, last),)  # noqa: RUF005  # numba adds tuples, and unpacks none
+
+    return kernel(items)
 
 
 @functools.cache
