@@ -13,11 +13,10 @@ from typing import Any
 import numpy as np
 from llvmlite import ir  # type: ignore[import-untyped]
 from numba.core import cgutils, types
-from numba.extending import intrinsic
 from numba.np import arrayobj
 
 from flockenv import processor
-from flockenv.kernels import LINE, kernel, written
+from flockenv.kernels import LINE, kernel, machine, written
 from flockenv.lines import array_of, in_one_piece
 
 __all__ = [
@@ -79,7 +78,7 @@ def _packed(typing_context: Any, array: Any) -> Any:
     return array(array), generate
 
 
-packed: Any = intrinsic(_packed)
+packed: Any = machine(_packed, lambda array: array)
 
 
 def _in_one_row(typing_context: Any, array: Any) -> Any:
@@ -94,7 +93,7 @@ def _in_one_row(typing_context: Any, array: Any) -> Any:
     return view(array), generate
 
 
-in_one_row: Any = intrinsic(_in_one_row)
+in_one_row: Any = machine(_in_one_row, lambda array: array.reshape(-1))
 
 
 def _columns(typing_context: Any, flat: Any, count: Any, many: Any, distance: Any) -> Any:
@@ -113,7 +112,12 @@ def _columns(typing_context: Any, flat: Any, count: Any, many: Any, distance: An
     return view(flat, count, many, distance), generate
 
 
-columns: Any = intrinsic(_columns)
+def _columns_in_python(flat: Any, count: int, many: int, distance: int) -> Any:
+    step = flat.itemsize
+    return np.lib.stride_tricks.as_strided(flat, (int(count), int(many)), (step, step * int(distance)))
+
+
+columns: Any = machine(_columns, _columns_in_python)
 
 
 def _lookup(builder: Any, vector: Any, size: int) -> tuple[int, Any]:
@@ -222,7 +226,18 @@ def _picks(
     return types.void(*given), generate
 
 
-pick: Any = intrinsic(_picks)
+def _picked_in_python(
+    to: Any, at: Any, beside: Any, table: Any, first: Any, length: Any, many: Any, count: Any, who: Any, place: Any,
+    width: int,
+) -> None:  # fmt: skip
+    named = who.reshape(-1)[int(place) : int(place) + width].astype(np.int64)
+    for r in range(int(many)):
+        row = table.reshape(-1)[int(first) + r * int(length) :]
+        start = int(at) + r * int(beside)
+        to.reshape(-1)[start : start + width] = row[named]
+
+
+pick: Any = machine(_picks, _picked_in_python)
 
 
 # A key: a square, in single precision, whose last bits are a place. Of numbers that are not negative the bits are in
@@ -290,12 +305,16 @@ def _ordered(typing_context: Any, one: Any, other: Any) -> Any:
     return pair(types.uint32, 2)(types.uint32, types.uint32), generate
 
 
-key_of: Any = intrinsic(_key_of)
-key_read: Any = intrinsic(_key_read)
-key_written: Any = intrinsic(_key_written)
-tag_of: Any = intrinsic(_tag_of)
-same_key: Any = intrinsic(_same_key)
-ordered: Any = intrinsic(_ordered)
+def _key_in_python(square: Any, place: Any, tags: Any) -> Any:
+    return (np.float32(square).view(np.uint32) & ~np.uint32(tags)) | np.uint32(place)
+
+
+key_of: Any = machine(_key_of, _key_in_python)
+key_read: Any = machine(_key_read, lambda number: np.float32(number).view(np.uint32))
+key_written: Any = machine(_key_written, lambda key: np.uint32(key).view(np.float32))
+tag_of: Any = machine(_tag_of, lambda key, tags: np.int32(key & np.uint32(tags)))
+same_key: Any = machine(_same_key, lambda one, other, tags: (one | np.uint32(tags)) == (other | np.uint32(tags)))
+ordered: Any = machine(_ordered, lambda one, other: (min(one, other), max(one, other)))
 
 
 @kernel
@@ -351,7 +370,14 @@ def _turned_square(
     return types.void(to, types.uint64, types.uint64, types.uint64, source, types.uint64, types.uint64), generate
 
 
-_turn_square: Any = intrinsic(_turned_square)
+def _turned_in_python(to: Any, at: Any, across: Any, many: Any, source: Any, place: Any, down: Any) -> None:
+    rows, numbers = to.reshape(-1), source.reshape(-1)
+    for i in range(min(int(many), SQUARE)):
+        start, first = int(at) + i * int(across), int(place) + i
+        rows[start : start + SQUARE] = numbers[first : first + SQUARE * int(down) : int(down)][:SQUARE]
+
+
+_turn_square: Any = machine(_turned_square, _turned_in_python)
 
 
 @kernel

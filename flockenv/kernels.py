@@ -47,6 +47,7 @@ from flockenv.turns import OneAtATime
 
 __all__ = [
     "FAST",
+    "IN_PYTHON",
     "LINE",
     "OPTIONS",
     "Law",
@@ -63,6 +64,8 @@ __all__ = [
     "laws_digest",
     "like",
     "load",
+    "machine",
+    "python_of",
     "replaced",
     "settled",
     "shared",
@@ -99,6 +102,11 @@ OPTIONS: Any = {
     "pipeline_class": Inlined,
 }  # fmt: skip
 _njit: Any = numba.njit  # numba's stubs do not know `_nrt`
+
+IN_PYTHON: bool = numba.config.DISABLE_JIT  # type: ignore[attr-defined]  # made from the environment
+"""True with NUMBA_DISABLE_JIT=1: kernels run in plain Python, for a debugger."""
+if IN_PYTHON:
+    np.seterr(all="ignore")  # as machine code does: infinities and NaN are values, unsigned integers wrap
 
 
 def _marked(function: F, **options: Any) -> F:
@@ -160,8 +168,12 @@ def _like(x, constant):  # type: ignore[no-untyped-def]  # numba compares signat
     return lambda x, constant: to(constant)
 
 
-@intrinsic
-def unaliased(typing_context: Any) -> Any:
+def machine(generate: Callable[..., Any], plain: Callable[..., Any]) -> Any:
+    """Return an intrinsic; with NUMBA_DISABLE_JIT=1, which runs kernels in plain Python, what it does there."""
+    return plain if IN_PYTHON else intrinsic(generate)
+
+
+def _unaliased(typing_context: Any) -> Any:
     """Promise, at the top of an entry point, that its array arguments do not overlap (C's `restrict`).
 
     Without it LLVM must assume that a sum it writes may be an input it reads, and keeps both out of registers: a factor
@@ -185,6 +197,9 @@ def unaliased(typing_context: Any) -> Any:
     return types.void(), generate
 
 
+unaliased: Any = machine(_unaliased, lambda: None)
+
+
 def _add_at_once(typing_context: Any, array: Any, amount: Any) -> Any:
     """Add to array[0] in one indivisible step; return what was there before."""
 
@@ -203,7 +218,13 @@ def written(number: Any, name: str) -> int:
     return int(number.literal_value)
 
 
-_fetch_add: Any = intrinsic(_add_at_once)  # Any: to numba's stubs an intrinsic that is called never returns
+def _added_in_python(array: Any, amount: int) -> int:
+    before = int(array[0])
+    array[0] += amount
+    return before
+
+
+_fetch_add: Any = machine(_add_at_once, _added_in_python)  # Any: to numba's stubs a called intrinsic never returns
 
 LINE = 64
 """Bytes of a line of the cache; no vector register is longer."""
@@ -234,7 +255,11 @@ def _copy_lanes(typing_context: Any, to: Any, at: Any, source: Any, place: Any, 
     return types.void(to, types.uint64, source, types.uint64, width), generate
 
 
-copy_lanes: Any = intrinsic(_copy_lanes)
+def _copied_in_python(to: Any, at: Any, source: Any, place: Any, width: int) -> None:
+    to[int(at) : int(at) + width] = source[int(place) : int(place) + width]
+
+
+copy_lanes: Any = machine(_copy_lanes, _copied_in_python)
 
 
 def asked(builder: Any, address: Any) -> None:
@@ -261,7 +286,7 @@ def _ask_for(typing_context: Any, array: Any, place: Any) -> Any:
     return types.void(array, types.uint64), generate
 
 
-ask_for: Any = intrinsic(_ask_for)
+ask_for: Any = machine(_ask_for, lambda array, place: None)
 
 
 def _stacked(typing_context: Any, numbers: Any) -> Any:
@@ -288,9 +313,7 @@ def _stacked(typing_context: Any, numbers: Any) -> Any:
     return array(numbers), generate
 
 
-stacked: Any = intrinsic(_stacked)
-if numba.config.DISABLE_JIT:  # type: ignore[attr-defined]  # laws run in plain Python, too, for whoever debugs them
-    stacked = np.array
+stacked: Any = machine(_stacked, np.array)
 
 
 def _tallied(typing_context: Any, number: Any, flag: Any) -> Any:
@@ -324,8 +347,8 @@ def _tally(typing_context: Any, number: Any) -> Any:
     return number(number), generate
 
 
-tallied: Any = intrinsic(_tallied)
-tally_of: Any = intrinsic(_tally)
+tallied: Any = machine(_tallied, lambda number, flag: number + type(number)(flag))
+tally_of: Any = machine(_tally, lambda number: number)
 
 _PATIENCE = 2000  # rounds of waiting before the core is offered to somebody else
 
@@ -399,9 +422,14 @@ def texts_outside(modules: set[str]) -> str:
     return "".join(texts)
 
 
+def python_of(function: Any) -> Any:
+    """Return the Python function of a law, kernel or entry point."""
+    return getattr(function, "py_func", function)
+
+
 def imported(law: Law, name: str) -> str:
     """Write the import of a law under another name."""
-    python = getattr(law, "py_func", law)
+    python = python_of(law)
     return f"from {python.__module__} import {python.__name__} as {name}"
 
 
@@ -454,5 +482,5 @@ def settled(function: Any) -> Callable[..., Any]:
     For a caller whose arguments have the same types each time, arrays in one piece: nobody asks any more. One that was
     called with several types is returned as it is.
     """
-    compiled = list(function.overloads.values())
+    compiled = list(getattr(function, "overloads", {}).values())
     return compiled[0].entry_point if len(compiled) == 1 else function  # type: ignore[no-any-return]

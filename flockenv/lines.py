@@ -14,11 +14,10 @@ import numpy as np
 from llvmlite import ir  # type: ignore[import-untyped]
 from numba.core import cgutils, types
 from numba.core.errors import TypingError
-from numba.extending import intrinsic
 from numba.np import arrayobj
 from numpy.typing import NDArray
 
-from flockenv.kernels import LINE, asked
+from flockenv.kernels import LINE, asked, machine
 
 __all__ = ["array_of", "fetch", "in_one_piece", "pour", "put_past", "settle", "zeros"]
 
@@ -70,7 +69,7 @@ def _fetch(typing_context: Any, array: Any, part: Any, parts: Any) -> Any:
     return types.void(array, part, parts), generate
 
 
-fetch: Any = intrinsic(_fetch)
+fetch: Any = machine(_fetch, lambda array, part, parts: None)
 
 
 def put_past(builder: Any, vector: Any, place: Any, size: int) -> None:
@@ -116,7 +115,11 @@ def _poured(typing_context: Any, to: Any, at: Any, source: Any) -> Any:
     return types.void(to, types.uint64, source), generate
 
 
-pour: Any = intrinsic(_poured)
+def _poured_in_python(to: Any, at: Any, source: Any) -> None:
+    to.reshape(-1)[int(at) : int(at) + source.size] = source.reshape(-1)
+
+
+pour: Any = machine(_poured, _poured_in_python)
 
 
 def _settled(typing_context: Any) -> Any:
@@ -129,4 +132,4 @@ def _settled(typing_context: Any) -> Any:
     return types.void(), generate
 
 
-settle: Any = intrinsic(_settled)
+settle: Any = machine(_settled, lambda: None)

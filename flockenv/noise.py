@@ -12,7 +12,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from flockenv.kernels import kernel
+from flockenv.kernels import kernel, python_of
 
 __all__ = ["key_of", "keys_of", "normal", "smooth", "uniform"]
 
@@ -69,7 +69,7 @@ def key_of(seed: int, episode: int) -> np.uint64:
 
 def keys_of(seeds: NDArray[np.uint64], episodes: NDArray[np.uint64]) -> NDArray[np.uint64]:
     """Return the keys of many worlds at once."""
-    plain = mix.py_func  # type: ignore[attr-defined]  # numba's; on arrays, whose whole numbers wrap as in a kernel
+    plain = python_of(mix)  # on arrays, whose whole numbers wrap as in a kernel
     return np.asarray(plain(plain(_START, seeds), episodes))
 
 

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from flockenv.kernels import load
+from flockenv.kernels import load, python_of
 
 __all__ = ["rows"]
 
@@ -25,7 +25,7 @@ _RANK = {"Vec": 1, "Numbers": 1, "Wishes": 2, "float": 0}
 @functools.lru_cache(maxsize=256)
 def rows(law: Callable[..., Any]) -> Callable[..., NDArray[np.float64]]:
     """Return the law over arrays; float64 inside. The loop is compiled once per law and shape of vector."""
-    python: Any = getattr(law, "py_func", law)
+    python: Any = python_of(law)
     parameters = inspect.signature(python).parameters
     ranks = tuple(_RANK[str(p.annotation)] for p in parameters.values())
     any_length = {name for name, p in parameters.items() if name == "weights" or str(p.annotation) == "Numbers"}

@@ -19,7 +19,7 @@ import numba
 from flockenv import processor
 from flockenv.checked_store import Store
 from flockenv.inlining import Whole
-from flockenv.kernels import FAST, Vec, cache_folder, kernel, laws_digest, texts_outside
+from flockenv.kernels import FAST, IN_PYTHON, Vec, cache_folder, kernel, laws_digest, python_of, texts_outside
 from flockenv.machine_code import MachineCode
 from flockenv.private_folder import prepared
 from flockenv.startup import numba_before_scipy
@@ -44,7 +44,7 @@ def entry_of(make: Callable[..., Callable[..., Any]]) -> Callable[..., Callable[
 @functools.cache
 def entry(kernel: Callable[..., Any]) -> Callable[..., Any]:
     """Return a kernel as an entry point of its own."""
-    return kept(getattr(kernel, "py_func", kernel))
+    return kept(python_of(kernel))
 
 
 def kept(function: Callable[..., Any], plan: tuple[Any, ...] = ()) -> Callable[..., Any]:
@@ -52,7 +52,7 @@ def kept(function: Callable[..., Any], plan: tuple[Any, ...] = ()) -> Callable[.
 
     plan: all that its free variables are made of: functions, numbers, text, and tuples of those.
     """
-    if numba.config.DISABLE_JIT:  # type: ignore[attr-defined]  # made from the environment
+    if IN_PYTHON:
         return function
     numba_before_scipy()
     name = f"{function.__module__}.{function.__qualname__}"
@@ -107,7 +107,7 @@ def _functions(part: Any) -> list[Any]:
     """Return the Python functions in a plan."""
     if isinstance(part, tuple):
         return [each for inner in part for each in _functions(inner)]
-    python = getattr(part, "py_func", part)
+    python = python_of(part)
     return [python] if callable(python) and not isinstance(python, type) else []
 
 

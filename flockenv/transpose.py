@@ -11,10 +11,9 @@ from typing import Any
 
 from llvmlite import ir  # type: ignore[import-untyped]
 from numba.core import types
-from numba.extending import intrinsic
 
 from flockenv import processor
-from flockenv.kernels import LINE, written
+from flockenv.kernels import LINE, machine, written
 from flockenv.lines import array_of, put_past
 
 __all__ = ["out_of_records", "put_lines", "put_records"]
@@ -121,7 +120,22 @@ def _put_records(
     return types.void(records, sources, numbers, width, cell, types.uint64, offset, types.uint64), generate
 
 
-put_records: Any = intrinsic(_put_records)
+def _records_in_python(
+    records: Any, sources: Any, places: Any, width: int, cell: Any, first: Any, offset: Any, spare: Any
+) -> None:
+    many = 1 + len(sources)
+    for lane in range(width):
+        agent = int(first) + lane
+        c = cell[agent]
+        place = int(spare) if c < 0 else int(offset[c])
+        if c >= 0:
+            offset[c] += 1
+        records[place * many] = agent
+        for k, source in enumerate(sources):
+            records[place * many + 1 + k] = source[int(places[k]) + lane]
+
+
+put_records: Any = machine(_put_records, _records_in_python)
 
 
 def _put_lines(
@@ -166,7 +180,17 @@ def _put_lines(
     return types.void(lines, sources, numbers, width, to, types.uint64, length, types.uint64), generate
 
 
-put_lines: Any = intrinsic(_put_lines)
+def _lines_in_python(
+    lines: Any, sources: Any, places: Any, width: int, to: Any, first: Any, length: int, spare: Any
+) -> None:
+    for lane in range(width):
+        place = to[int(first) + lane]
+        start = (int(spare) if place < 0 else int(place)) * length
+        for k, source in enumerate(sources):
+            lines[start + k] = source[int(places[k]) + lane]
+
+
+put_lines: Any = machine(_put_lines, _lines_in_python)
 
 
 def _out_of_records(typing_context: Any, numbers: Any, places: Any, at: Any, width: Any, records: Any) -> Any:
@@ -208,4 +232,11 @@ def _out_of_records(typing_context: Any, numbers: Any, places: Any, at: Any, wid
     return types.void(numbers, numbered, types.uint64, width, records), generate
 
 
-out_of_records: Any = intrinsic(_out_of_records)
+def _read_in_python(numbers: Any, places: Any, at: Any, width: int, records: Any) -> None:
+    many = len(places)
+    for lane in range(width):
+        for k, place in enumerate(places):
+            numbers[int(place) + lane] = records[(int(at) + lane) * many + k]
+
+
+out_of_records: Any = machine(_out_of_records, _read_in_python)

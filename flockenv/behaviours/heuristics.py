@@ -46,7 +46,13 @@ def nearer(
 
     found: DIRECTIONS distances, that along the aim, and as many again. way: the rightmost direction.
     """
-    raise TypeError("it is a part of kernels")
+    still, one, moving, standing = zero(velocity), like(speed, 1.0), [], []
+    for k in range(DIRECTIONS + 1):
+        ahead = way if k < DIRECTIONS else aim
+        moving.append(steering.collision_distance(ahead, offset, velocity, clearance, speed))
+        standing.append(steering.collision_distance(ahead, offset, still, clearance, one))
+        way = turned_by(way, cosine, sine)
+    return tuple(map(min, (*moving, *standing), found))
 
 
 @overload(nearer, jit_options=OPTIONS)
@@ -77,7 +83,7 @@ def _nearer(found, way, aim, cosine, sine, offset, velocity, clearance, speed): 
 
 def unseen(far: float) -> Vec:
     """Return as many infinite distances as there are."""
-    raise TypeError("it is a part of kernels")
+    return (far,) * (2 * DIRECTIONS + 2)
 
 
 @overload(unseen, jit_options=OPTIONS)

@@ -19,7 +19,17 @@ __all__ = ["Orca"]
 
 def kept(slots: Vec, new: Vec) -> Vec:
     """Return the slots with a new one sorted in by its power distance, |offset|^2 - radius^2; the last drops out."""
-    raise TypeError("it is a part of kernels")
+    size = len(new)
+    listed: Vec = ()
+    for k in range(0, len(slots), size):
+        old = slots[k : k + size]
+        near, far = (new, old) if _power(new) < _power(old) else (old, new)
+        listed, new = (*listed, *near), far
+    return listed
+
+
+def _power(slot: Vec) -> float:
+    return slot[0] * slot[0] + slot[1] * slot[1] - slot[4] * slot[4]
 
 
 @overload(kept, jit_options=OPTIONS)

@@ -20,7 +20,7 @@ import numpy as np
 from numba.core import types
 from numba.extending import overload
 
-from flockenv.kernels import OPTIONS
+from flockenv.kernels import OPTIONS, python_of
 from flockenv.records import Record
 from flockenv.refusals import nearest, shown
 from flockenv.state import WORK, Floats, State
@@ -176,4 +176,4 @@ class Integrator(Record):
         self, law: Any, context: Any, x: Floats, v: Floats, flow: Any, time: float, dt: float, stages: Floats
     ) -> None:
         """Advance one world by `advance`, in Python."""
-        self.advance().py_func(law, context, x, v, flow, time, dt, stages, 0, len(x))
+        python_of(self.advance())(law, context, x, v, flow, time, dt, stages, 0, len(x))

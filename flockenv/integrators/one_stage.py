@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any, ClassVar
 
 from flockenv.integrators.base import Integrator
+from flockenv.kernels import python_of
 from flockenv.state import Floats
 
 __all__ = ["OneStage"]
@@ -26,6 +27,6 @@ class OneStage(Integrator):
     ) -> None:
         """Advance one world by `move`, in Python."""
         law(context, x, v, time, stages[0])
-        x[...], v[...] = self.move().py_func(x, v, stages[0], dt)
+        x[...], v[...] = python_of(self.move())(x, v, stages[0], dt)
         if len(flow):
             x += dt * flow

@@ -6,6 +6,7 @@ import builtins
 import inspect
 
 from flockenv.integrators.base import PROVIDED, SUBSTEPS
+from flockenv.kernels import python_of
 from flockenv.sweep.accelerate import parameters
 from flockenv.sweep.parts import Parts
 from flockenv.sweep.text import CONTEXT, indented, needed
@@ -17,7 +18,7 @@ def method_imports(parts: Parts) -> str:
     """Import the integrator's `move`, or what its `advance` calls in its own module."""
     if parts.one_stage:
         return f"from {type(parts.integrator).__module__} import move"
-    python = parts.integrator.advance().py_func
+    python = python_of(parts.integrator.advance())
     names = [name for name in python.__code__.co_names if name in python.__globals__]
     names = [name for name in names if name not in PROVIDED and name not in (*dir(builtins), "np")]
     return f"from {python.__module__} import {', '.join(names)}" if names else "# the method needs nothing else"
@@ -28,7 +29,7 @@ def method(parts: Parts) -> str:
 
     (numba can pass a compiled function as an argument, but does not cache a function that does.)
     """
-    python = parts.integrator.advance().py_func
+    python = python_of(parts.integrator.advance())
     text = inspect.getsource(python)
     text = text[text.index("def advance(") :].replace("acceleration: Any, ", "", 1)
     for annotation in (": Any", ": float", ": int"):

@@ -1,0 +1,65 @@
+"""Small scenes and tasks, run to their ends and written to a file: by machine code, or in plain Python.
+
+`NUMBA_DISABLE_JIT=1 python -m tests.plain_python ended.npz`; test_plain_python.py compares the two.
+"""
+
+from __future__ import annotations
+
+import sys
+import warnings
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flockenv.config import ConfigError, load_scene
+from flockenv.integrators import INTEGRATORS
+from flockenv.scene import Scene
+from flockenv.tasks import TASKS
+from flockenv.world import World
+from tests.catalogue import EFFECTS, scene_of, scene_under
+
+ROOT = Path(__file__).resolve().parent.parent
+TIES = {
+    "journey, 2-D": "waits end with a step, and points of a way's grid are equally far: the order is rounding's",
+    "path_follow": "begins on a vertex of the path: which piece it is on is rounding's",
+}
+"""Cases that run, and in which rounding decides more than last digits."""
+STEPS, DECISIONS, MOST_AGENTS = 3, 4, 150
+
+
+def cases() -> Iterator[tuple[str, Any]]:
+    """Scenes under each effect and behaviour, by each method, shipped ones (constraints, populations), and tasks."""
+    for row in EFFECTS:
+        for dimension in sorted(row.dimensions):
+            yield f"{row.name}, {dimension}-D", scene_under(row, dimension)
+    drag = next(row.effect for row in EFFECTS if row.name == "drag")
+    for kind, method in INTEGRATORS.items():
+        yield kind, scene_of(drag, dt=0.02, integrator=method())
+    for path in sorted((ROOT / "configs").glob("*.yaml")):
+        try:
+            scene = load_scene(path)
+        except ConfigError:
+            continue
+        if scene.agents <= MOST_AGENTS:
+            yield path.name, scene
+    yield from ((name, kind()) for name, kind in TASKS.items())
+
+
+def ended(case: Any) -> NDArray[np.float64]:
+    """Return where a scene's agents are after a few steps, or all that a task showed after a few decisions."""
+    if isinstance(case, Scene):
+        state = case.run(case.start(3), STEPS)
+        return np.concatenate([state.x.ravel(), state.v.ravel()]).astype(float)
+    world, rng = World(case, 3), np.random.default_rng(0)
+    world.reset(0)
+    steps = [world.step(rng.uniform(-1, 1, (3, world.learners, world.action_size))) for _ in range(DECISIONS)]
+    shown = [each.ravel() for step in steps for each in (step.observation, step.reward)]
+    return np.concatenate([*shown, world.state.x.ravel()]).astype(float)
+
+
+if __name__ == "__main__":
+    warnings.simplefilter("ignore")
+    np.savez(sys.argv[1], **{name: ended(case) for name, case in cases()})
