@@ -287,3 +287,16 @@ def test_processes_end_with_their_parent_however_it_ends(number: signal.Signals,
         time.sleep(0.05)
     _, said = process.communicate(timeout=60)
     assert "Traceback" not in said and "leaked" not in said
+
+
+def test_a_package_called_agents_of_another_program_keeps_its_own_handlers(tmp_path: Path) -> None:
+    package = tmp_path / "agents"
+    package.mkdir()
+    (package / "__init__.py").write_text("import flockenv\n")
+    body = "import time\ntry:\n    print('ready', flush=True); time.sleep(60)\nfinally:\n    print('cleaned up', flush=True)\n"
+    (package / "train.py").write_text(body)
+    process = start("-m", "agents.train", folder=tmp_path)
+    wait_for(process, "ready")
+    process.send_signal(signal.SIGINT)
+    out, err = process.communicate(timeout=60)
+    assert "cleaned up" in out and "KeyboardInterrupt" in err
