@@ -293,8 +293,8 @@ def test_a_package_called_agents_of_another_program_keeps_its_own_handlers(tmp_p
     package = tmp_path / "agents"
     package.mkdir()
     (package / "__init__.py").write_text("import flockenv\n")
-    body = "import time\ntry:\n    print('ready', flush=True); time.sleep(60)\nfinally:\n    print('cleaned up', flush=True)\n"
-    (package / "train.py").write_text(body)
+    waiting = "    print('ready', flush=True)\n    time.sleep(60)\n"
+    (package / "train.py").write_text(f"import time\ntry:\n{waiting}finally:\n    print('cleaned up', flush=True)\n")
     process = start("-m", "agents.train", folder=tmp_path)
     wait_for(process, "ready")
     process.send_signal(signal.SIGINT)
