@@ -199,6 +199,16 @@ def test_a_thin_wall_that_comes_fast_leaves_no_body_behind(response: str) -> Non
 
 
 @pytest.mark.parametrize("response", ALL)
+def test_a_body_sticks_to_a_wall_that_comes_fast(response: str) -> None:
+    """It goes on with the wall, whether the impact is found within the step or at its end."""
+    wall = Wall(vertices=((-1.0, -5.0), (-1.0, 5.0)), velocity=(30.0, 0.0))  # 1.5 m a step
+    of = scene([1], response, e=0.3, dt=0.05, obstacles=(wall,), sticky=True)
+    state = of.run(line(of, (0.0,), (0,)), 10)
+    assert state.vel[0, 0, 0] == pytest.approx(30)
+    assert state.pos[0, 0, 0] == pytest.approx(-1 + 30 * 0.5 + R, abs=0.1 * R)
+
+
+@pytest.mark.parametrize("response", ALL)
 @pytest.mark.parametrize("mass", [1.0, 1e4])
 def test_what_a_wall_pushes_against_others_stays_between(response: str, mass: float) -> None:
     """A row that begins in touch, and a wall that pushes it at 2 m/s."""

@@ -18,8 +18,8 @@ from flockenv.vec import add, axis, dot, norm, scale, sub, zero
 
 __all__ = ["COUNTED", "collide"]
 
-COUNTED = 6
-"""Numbers that a call reports: world, agent, meetings in all, impacts, what was left unsolved, bodies that stopped."""
+COUNTED = 5
+"""Numbers that a call reports: world, agent, meetings in all, impacts, what was left unsolved."""
 
 UNSOLVED = 0.1
 """Part of the velocity that a step adds with which a body may still go into another."""
@@ -135,11 +135,12 @@ def collide(
     that there was no room for, with the number of its meetings in report[2]: nothing of it is written; else -1.
     """
     scratch = (grid, order, cell, start, offset, bounds, sync, ranges)
-    report[0], report[1], report[3], report[4], report[5] = -1, -1, 0, 0, 0
+    report[0], report[1], report[3], report[4] = -1, -1, 0, 0
     for k in range(lost.shape[0]):
         lost[k] = 0.0
     for b in range(first, end):
-        impacts_before, unsolved_before, stopped_before = report[3], report[4], lost[2]
+        impacts_before, unsolved_before = report[3], report[4]
+        seconds_before, joules_before, stopped_before = lost[0], lost[1], lost[2]
         far, fast, hard, mean = _board(period, x0, v0, x, v, alive, b, bodies, ends, before, rules.seconds)
         if not (far < np.inf and fast < np.inf):
             continue
@@ -164,7 +165,8 @@ def collide(
             )  # fmt: skip
         report[2] = count
         if count > meetings.who.shape[0]:
-            report[3], report[4], lost[2] = impacts_before, unsolved_before, stopped_before
+            report[3], report[4] = impacts_before, unsolved_before
+            lost[0], lost[1], lost[2] = seconds_before, joules_before, stopped_before
             return b
         work[b, 1] += 1 if rules.pairs else 0
         work[b, at_work] += report[3] - impacts_before
@@ -393,7 +395,7 @@ def _widest(bodies: Bodies) -> float:
 def _moved_far(period: Vec, bodies: Bodies, ends: Ends, share: float) -> bool:
     """True if a body was moved from bodies.at by more than this part of its radius: it may now overlap another."""
     for i in range(bodies.living.shape[0]):
-        d = sub(vector(period, ends.pos, i), vector(period, bodies.at, i))
+        d = image(period, sub(vector(period, ends.pos, i), vector(period, bodies.at, i)))
         if bodies.living[i] > 0 and norm(d) > share * bodies.radius[i]:
             return True
     return False

@@ -65,14 +65,15 @@ def _stop(period: Vec, bodies: Bodies, rules: Rules, i: int, t: float, lost: Any
 
 @kernel
 def _push(period: Vec, bodies: Bodies, things: Things, rules: Rules, i: int, m: int, n: Vec) -> None:
-    """Move a stopped body out of the way of obstacle m, which comes along n, and let its velocity bounce."""
+    """Move a stopped body out of the way of obstacle m, which comes along n, and let its velocity bounce, or stick."""
     drift, pushed = vector(period, things.drift, m), vector(period, bodies.vel, i)
     into = dot(sub(drift, pushed), n)
     if into <= 0.0 or bodies.light[i] == 0.0:
         return
     write(bodies.vel, i, add(pushed, scale(n, into)))
     seen = sub(vector(period, bodies.excess, i), drift)
-    write(bodies.excess, i, add(drift, bounced(seen, n, things.restitution[m], rules.friction)))
+    after = zero(drift) if rules.sticky else bounced(seen, n, things.restitution[m], rules.friction)
+    write(bodies.excess, i, add(drift, after))
 
 
 @kernel
