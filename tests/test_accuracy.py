@@ -508,6 +508,7 @@ def test_ctrl_c_before_any_run_has_arrived_is_one_line(
 
     monkeypatch.setattr("flockenv.accuracy.measure", impatient)
     monkeypatch.setattr("flockenv.interrupts._Asked.said", False)  # a process says it once, and runs many tests
+    monkeypatch.setattr("flockenv.interrupts._Asked.text", "")
     asked = ["accuracy", "--suite", "--problems", "damped", "--methods", "rk4", "--repetitions", "0"]
     assert main([*asked, "--out", "a.png"]) == 130
     text = capsys.readouterr()
