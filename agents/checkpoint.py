@@ -24,7 +24,7 @@ from pydantic import ValidationError
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save
 
-from flockenv.outputs import replacing
+from flockenv.atomic import remove_leftovers, replacing
 from flockenv.records import Record
 from flockenv.refusals import refusals, shown
 
@@ -76,8 +76,7 @@ def claimed(folder: Path) -> Iterator[None]:
     except Timeout:
         raise InUse(f"{folder} is in use by another training: wait for its end, or choose another --runs") from None
     try:
-        for left in folder.glob(f".{FILE}.*.part"):
-            left.unlink()
+        remove_leftovers(folder)
         yield
     finally:
         lock.release()

@@ -27,9 +27,9 @@ import flockenv
 from agents import report
 from agents.experiment import CONFIGS, Experiment, load_experiment
 from agents.processes import Tell, side_by_side
+from flockenv.atomic import deliver
 from flockenv.evaluation import WORLDS_PER_SEED, Episodes, rollout, task_digest, worlds_for
-from flockenv.interrupts import held, unfinished
-from flockenv.outputs import checked_path, made
+from flockenv.outputs import checked_path
 from flockenv.players import NAMES, load_player, other_tasks
 from flockenv.players.files import SUFFIXES, PlayerError
 from flockenv.players.rules import tuned
@@ -39,7 +39,7 @@ from flockenv.tasks import TASKS, Task
 from flockenv.terminal import one_line, program, shown_progress
 
 __all__ = [
-    "Player", "app", "blaming", "compare", "deliver", "experiment_of", "field_of", "folder_of", "pick", "provenance",
+    "Player", "app", "blaming", "compare", "experiment_of", "field_of", "folder_of", "pick", "provenance",
      "split", "write_text",
 ]  # fmt: skip
 
@@ -363,25 +363,6 @@ def _files(
         lambda path: _replay(path, results, episodes),
     )
     return dict(zip(FILES, writers, strict=True))
-
-
-def deliver(folder: Path, writers: Mapping[str, Callable[[Path], None]]) -> None:
-    """Have every file written beside its place, and when all are whole put them there, each in one move.
-
-    Args:
-        folder: made if it is not there.
-        writers: file name -> writes that file to the path it is given.
-
-    Raises:
-        OSError, or what a writer raises: then the folder is as it was.
-    """
-    with made(folder), unfinished(folder / f".partial-{os.getpid()}") as partial:
-        Path(partial).mkdir()
-        for name, write in writers.items():
-            write(Path(partial, name))
-        with held():
-            for name in writers:
-                Path(partial, name).replace(folder / name)
 
 
 def write_text(path: Path, text: str) -> None:

@@ -18,7 +18,8 @@ import typer
 from rich.console import Console
 
 from agents.experiment import Experiment, PpoSettings, load_experiment, one_line_errors
-from flockenv.outputs import check_room, checked_file, checked_path, replacing
+from flockenv.atomic import deliver, replacing
+from flockenv.outputs import check_room, checked_file, checked_path
 from flockenv.players.rules import tuned
 from flockenv.render.chart import COLOURS, FAINT, GRID, INK
 from flockenv.terminal import one_line, program
@@ -143,10 +144,10 @@ def main(
     stays = f"interrupted; what is trained stays in {runs}, the same command goes on"
     with one_line("curves", stays), one_line_errors((FloatingPointError,)):
         tasks = {task: measured(experiment, folder) for task, experiment in experiments.items()}
-    picture.parent.mkdir(parents=True, exist_ok=True)
-    draw(picture, tasks)
-    with replacing(picture.with_suffix(".json")) as file:
-        file.write(json.dumps(tasks).encode())
+        deliver(picture.parent, {
+            picture.name: lambda path: draw(path, tasks),
+            picture.with_suffix(".json").name: lambda path: path.write_bytes(json.dumps(tasks).encode()),
+        })  # fmt: skip
     for task, numbers in tasks.items():
         for name, row in numbers["settings"].items():
             last, past = row["curve"][-1], row["past_the_rules_s"]

@@ -5,6 +5,7 @@ Copies results.json and comparison.png into docs/ and writes README's tables, so
 
 from __future__ import annotations
 
+import functools
 import json
 import re
 from collections.abc import Iterator
@@ -16,7 +17,7 @@ import typer
 from agents.compare import ROOT
 from agents.experiment import one_line_errors
 from agents.report import Results, grid
-from flockenv.outputs import replacing
+from flockenv.atomic import deliver
 from flockenv.tasks import TASKS
 from flockenv.terminal import program
 
@@ -89,15 +90,15 @@ def main(
         readme = (root / "README.md").read_text(encoding="utf-8")
         if len(BLOCK.findall(readme)) != 1:
             raise ValueError(f"{root / 'README.md'}: must have one place for the tables, between its two marks")
-        files = {name: (folder / name).read_bytes() for name in ("results.json", "comparison.png")}
-        text = BLOCK.sub(lambda _: tables(results), readme)
-        for path, content in (
-            *((root / "docs" / name, content) for name, content in files.items()),
-            (root / "README.md", text.encode()),
-        ):
-            with replacing(path) as file:
-                file.write(content)
-            typer.echo(f"{path}: written")
+        contents = {f"docs/{name}": (folder / name).read_bytes() for name in ("results.json", "comparison.png")}
+        contents["README.md"] = BLOCK.sub(lambda _: tables(results), readme).encode()
+        deliver(root, {name: functools.partial(_write, content) for name, content in contents.items()})
+    for name in contents:
+        typer.echo(f"{root / name}: written")
+
+
+def _write(content: bytes, path: Path) -> None:
+    path.write_bytes(content)
 
 
 if __name__ == "__main__":

@@ -23,7 +23,6 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 from agents import report, transfer_report
 from agents.compare import (
-    deliver,
     experiment_of,
     field_of,
     folder_of,
@@ -45,6 +44,7 @@ from agents.transfer_cells import (
     run_round,
 )
 from agents.transfer_report import Setting
+from flockenv.atomic import deliver
 from flockenv.evaluation import WORLDS_PER_SEED, worlds_for
 from flockenv.integrators import INTEGRATORS
 from flockenv.players import NAMES

@@ -18,10 +18,10 @@ from numpy.typing import NDArray
 
 from agents.compare import Player, blaming
 from agents.transfer_report import Cell, Clock, Setting
+from flockenv.atomic import made, replacing
 from flockenv.evaluation import rollout, task_digest, worlds_for
 from flockenv.integrators import RK4
 from flockenv.kernels import load
-from flockenv.outputs import made, replacing
 from flockenv.players import NAMES
 from flockenv.policy import Policy
 from flockenv.tasks import Task

@@ -23,6 +23,7 @@ import typer
 
 from agents import checkpoint as files
 from agents.experiment import Experiment
+from flockenv.atomic import LEFTOVERS
 
 __all__ = ["Count", "app", "kill_and_resume"]
 
@@ -108,7 +109,7 @@ class Lives:
 
 
 def _being_written(folder: Path) -> bool:
-    return any(folder.glob(f".{files.FILE}.*.part"))
+    return any(folder.glob(LEFTOVERS))
 
 
 def _killed(process: BaseProcess, folder: Path, moment: float, aimed: bool) -> bool:

@@ -1,24 +1,26 @@
 """Named pieces of data in a private folder that are found whole, or not at all.
 
 A file begins with a digest of its name and of all that follows. One that was emptied, cut, or in which a bit has
-changed, is never returned: one line on stderr says so, and it is replaced when its data is written again. Data goes to
-a new file, is forced onto the disk, and is renamed into its place, so that no process ever reads half of it.
+changed, is never returned: one line on stderr says so, and it is replaced when its data is written again. Files are
+written by `flockenv.atomic`, so that no process ever reads half of one.
 """
 
 from __future__ import annotations
 
-import contextlib
+import functools
 import hashlib
-import os
-import tempfile
 from pathlib import Path
 
+from flockenv.atomic import remove_leftovers, replacing
 from flockenv.private_folder import read_private, say_once
 
-__all__ = ["Store", "replace_file"]
+__all__ = ["Store"]
 
 HEAD = b"flockenv 1\n"
 """What a file begins with; another number for another form."""
+
+DAY = 86_400.0
+"""s: no process writes a file for so long; what is older and half-written was left by one that was killed."""
 
 
 class Store:
@@ -26,6 +28,7 @@ class Store:
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
+        _swept(folder)
 
     def read(self, name: str) -> bytes | None:
         """Return the data of this name, or None if there is none, or not as it was written."""
@@ -68,40 +71,18 @@ class Store:
     def _keep(self, name: str, data: bytes) -> None:
         """Write a file, or say why it could not be written: nothing but the next start's time depends on it."""
         try:
-            replace_file(self.folder / name, data)
+            with replacing(self.folder / name, 0o600) as file:
+                file.write(data)
         except OSError as error:
-            why = f"({error.strerror or error}); the next process compiles them again"
-            say_once(f"{self.folder}: compiled kernels cannot be kept {why}")
+            line = f"compiled kernels cannot be kept ({error}); the next process compiles them again"
+            say_once(line, f"{self.folder}: written")
+
+
+@functools.cache
+def _swept(folder: Path) -> None:
+    """Remove what killed processes left half-written in a folder, once per process."""
+    remove_leftovers(folder, DAY)
 
 
 def _head(name: str, data: bytes) -> bytes:
     return HEAD + hashlib.sha256(b"%d " % len(name.encode()) + name.encode() + data).digest()
-
-
-def replace_file(path: Path, data: bytes) -> None:
-    """Write a file (mode 0600) that is there as a whole or not at all, also after a power cut."""
-    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=".", suffix=".tmp")
-    try:
-        with os.fdopen(handle, "wb") as stream:
-            stream.write(data)
-            stream.flush()
-            os.fsync(handle)
-        os.replace(temporary, path)
-    except BaseException:
-        with contextlib.suppress(OSError):
-            os.unlink(temporary)
-        raise
-    _force_names(path.parent)
-
-
-def _force_names(folder: Path) -> None:
-    """Force a folder's list of names onto the disk, where a system can do that."""
-    if os.name != "posix":
-        return
-    handle = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(handle)
-    except OSError:  # some network disks cannot
-        pass
-    finally:
-        os.close(handle)

@@ -249,7 +249,8 @@ def render(
     force: Force = False,
 ) -> None:
     """Draw a scene, or an episode of a task under some player, as GIF, PNG or HTML replay."""
-    from flockenv.outputs import checked_file, made
+    from flockenv.atomic import made
+    from flockenv.outputs import checked_file
     from flockenv.tasks import TASKS
 
     path = checked_file(out, PICTURES, force)

@@ -10,10 +10,10 @@ import sys
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
+from flockenv.atomic import replacing
 from flockenv.behaviours import BEHAVIOURS
 from flockenv.config import load_scene
 from flockenv.effects.base import Effect
-from flockenv.outputs import replacing
 from flockenv.render.gif import write_png
 from flockenv.render.picture import draw
 from flockenv.trajectory import Trajectory, record

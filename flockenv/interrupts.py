@@ -58,7 +58,6 @@ class _Asked:
     said = False  # the line has been written
     main = 0  # the thread that handles signals
     running = False  # the command itself has begun: there may be something to keep
-    held = 0  # sections that must not be left in the middle
     signal = 0
     since = 0.0
     raised = False  # KeyboardInterrupt is on its way, or was caught
@@ -70,6 +69,9 @@ _ending = _thread.RLock()
 
 _unfinished: dict[str, bool] = {}
 """Files and folders that are half-written, in the order in which they were made; True: removed only if empty."""
+
+_held: set[object] = set()
+"""Sections of any thread that must not be left in the middle."""
 
 
 def begin_early() -> None:
@@ -152,11 +154,12 @@ def running(name: str) -> Iterator[None]:
 @contextmanager
 def held() -> Iterator[None]:
     """Let no signal in before the end of a short section that must happen whole, such as renaming several files."""
-    _Asked.held += 1
+    section = object()
+    _held.add(section)  # two threads may count at once: `+= 1` would lose one of them
     try:
         yield
     finally:
-        _Asked.held -= 1
+        _held.discard(section)
 
 
 @contextmanager
@@ -219,7 +222,7 @@ def _handle(number: int, frame: FrameType | None) -> None:
         _Asked.signal, _Asked.since = number, now
     elif not own and now - _Asked.since < ONE_PRESS:
         return
-    if _Asked.held or _is_writing(frame) or (own and _Asked.raised):
+    if _held or _is_writing(frame) or (own and _Asked.raised):
         return
     twice = not own and now - _Asked.since > ONE_PRESS
     if not _Asked.running or _Asked.raised or twice or now - _Asked.since > PATIENCE:
@@ -262,7 +265,7 @@ def _watch(signals: int) -> None:
             continue
         until = time.monotonic() + (2 * PATIENCE if _Asked.running and not known else PATIENCE / 2)
         while known or not _Asked.raised:
-            if time.monotonic() > until and not _Asked.held:
+            if time.monotonic() > until and not _held:
                 _end(_Asked.signal or number)
             time.sleep(AGAIN)
             if not _Asked.raised:

@@ -245,7 +245,7 @@ def _summary(
 
 
 def _write_numbers(path: Path, summary: dict[str, Any]) -> None:
-    from flockenv.outputs import made, replacing
+    from flockenv.atomic import made, replacing
 
     with made(path.parent), replacing(path) as file:
         file.write((json.dumps(summary, indent=1, allow_nan=False) + os.linesep).encode())

@@ -1,4 +1,4 @@
-"""Where a file may be written, checked before the work begins; and how: a file appears whole or not at all."""
+"""Where a file may be written, checked before the work begins."""
 
 from __future__ import annotations
 
@@ -6,15 +6,12 @@ import os
 import re
 import tempfile
 import unicodedata
-from collections.abc import Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from collections.abc import Sequence
 from pathlib import Path
-from typing import BinaryIO
 
-from flockenv import interrupts
 from flockenv.refusals import nearest
 
-__all__ = ["check_room", "checked_file", "checked_path", "made", "replacing"]
+__all__ = ["check_room", "checked_file", "checked_path"]
 
 LONGEST_NAME, LONGEST_PATH = 200, 1000
 
@@ -106,42 +103,3 @@ def check_room(path: Path, size: int) -> None:
                 os.posix_fallocate(file.fileno(), 0, size)
     except OSError as error:
         raise type(error)(f"cannot write {str(path)!r} ({size:,} bytes): {error.strerror}") from None
-
-
-@contextmanager
-def replacing(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
-    """Open a file beside `path` for writing and rename it to `path` at the end; on any error nothing is left behind.
-
-    An existing file is replaced; a link is replaced itself and never followed. The folder must exist.
-    Raises ValueError or OSError, in one line that names the path, before the first byte where that can be known.
-    """
-    target = Path(path)
-    if "\0" in str(target):
-        raise ValueError(f"path: must hold no NUL character, got {str(target)!r}")
-    if not target.name or target.is_dir():
-        raise IsADirectoryError(f"cannot write {str(target)!r}: it is a folder")
-    if not target.parent.is_dir():
-        raise FileNotFoundError(f"cannot write {str(target)!r}: there is no folder {str(target.parent)!r}")
-    part = target.with_name(f".{target.name[:100]}.{os.getpid()}.part")
-    try:
-        with interrupts.unfinished(part):
-            with part.open("wb") as file:
-                yield file
-                file.flush()
-                os.fsync(file.fileno())
-            part.replace(target)
-    except OSError as error:
-        if error.errno is None or error.filename not in (None, str(part), str(target)):  # an open file is not named
-            raise
-        raise type(error)(f"cannot write {str(target)!r}: {error.strerror}") from None
-
-
-@contextmanager
-def made(folder: Path) -> Iterator[None]:
-    """Make a folder and those above it; if a block ends early, those that are empty then are removed again."""
-    new = [path for path in (folder, *folder.parents) if not path.exists()]
-    with ExitStack() as stack:
-        for path in reversed(new):
-            stack.enter_context(interrupts.unfinished(path, if_empty=True))
-        folder.mkdir(parents=True, exist_ok=True)
-        yield

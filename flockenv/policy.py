@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
-from flockenv.outputs import replacing
+from flockenv.atomic import deliver
 from flockenv.refusals import nearest, shown, shown_path
 
 if TYPE_CHECKING:
@@ -185,7 +185,7 @@ class MlpPolicy:
 
 
 def save_policy(path: str | os.PathLike[str], tensors: Mapping[str, NDArray[Any]], card: Mapping[str, Any]) -> None:
-    """Write the weights and the card beside them, each atomically; the card receives what can be derived.
+    """Write the weights and the card beside them, both or neither; the card receives what can be derived.
 
     Args:
         path: ends in .safetensors; the card gets the same name ending in .json.
@@ -217,10 +217,10 @@ def save_policy(path: str | os.PathLike[str], tensors: Mapping[str, NDArray[Any]
                 f"policy {shown_path(path)}: card: {key} = {card[key]!r}, the weights say {derived[key]!r}"
             )
     text = json.dumps({**card, **derived}, indent=2, allow_nan=False) + "\n"
-    path.parent.mkdir(parents=True, exist_ok=True)
-    for target, content in ((path, data), (path.with_suffix(".json"), text.encode())):
-        with replacing(target) as file:
-            file.write(content)
+    deliver(path.parent, {
+        path.name: lambda part: part.write_bytes(data),
+        path.with_suffix(".json").name: lambda part: part.write_bytes(text.encode()),
+    })  # fmt: skip
 
 
 def _read_card(path: Path) -> dict[str, Any]:

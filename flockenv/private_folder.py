@@ -27,10 +27,10 @@ class NotPrivateError(PermissionError):
     """A folder or file that another user owns or can change; the message is one line."""
 
 
-def say_once(line: str) -> None:
-    """Write one line to stderr, the first time that this process says it."""
-    if line not in _said and sys.stderr is not None:
-        _said.add(line)
+def say_once(line: str, about: str = "") -> None:
+    """Write one line to stderr, the first time that this process says it, or says a line `about` the same thing."""
+    if (about or line) not in _said and sys.stderr is not None:
+        _said.add(about or line)
         print(f"flockenv: {line}", file=sys.stderr, flush=True)
 
 

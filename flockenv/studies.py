@@ -195,15 +195,20 @@ def _problem(file: str, seconds: float | None, steps: str, dts: str, seed: int) 
 
 
 def _write(path: Path, numbers: Record, draw: Callable[[Path], None]) -> None:
-    """Write numbers as JSON, and a picture of them if that was asked for."""
-    write_numbers(path, numbers)
+    """Write numbers as JSON, with a picture of them if `path` is that of a picture: both or neither."""
+    from flockenv.atomic import deliver
+
+    writers: dict[str, Callable[[Path], None]] = {
+        path.with_suffix(".json").name: functools.partial(write_numbers, numbers=numbers)
+    }
     if path.suffix.lower() == ".png":
-        draw(path)
+        writers[path.name] = draw
+    deliver(path.parent, writers)
 
 
 def write_numbers(path: Path, numbers: Record) -> None:
     """Write numbers as JSON: whole or not at all, whatever a path ends in."""
-    from flockenv.outputs import made, replacing
+    from flockenv.atomic import made, replacing
 
     with made(path.parent), replacing(path.with_suffix(".json")) as file:
         file.write((numbers.model_dump_json(indent=1) + "\n").encode())

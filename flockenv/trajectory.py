@@ -16,9 +16,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from flockenv.atomic import deliver
 from flockenv.config import dump_scene
 from flockenv.measures import measure
-from flockenv.outputs import made, replacing
 from flockenv.scene import Scene
 from flockenv.snapshot import Snapshot
 from flockenv.space import Plane
@@ -103,25 +103,27 @@ class Trajectory:
         }
 
     def save(self, path: Path) -> Path:
-        """Write X.npz and X.json beside it, each whole or not at all; return the path of the latter.
+        """Write X.npz and X.json beside it, both or neither; return the path of the latter.
 
         Arrays: time (T,) s, pos (T, N, D) m, vel (T, N, D) m/s, alive (T, N), radius (N,) m, seed, and `scene`, the
         YAML text that `load_scene` reads; heading (T, N, D) where headings are kept; identity and born (T, N), s, where
         there is a population; shown (T, N), where pictures show what goes on inside. None needs pickle. Missing folders
         are made.
         """
+        beside = path.with_suffix(".json")
+        summary = json.dumps(self.summary(), indent=2, allow_nan=False) + os.linesep
+        deliver(path.parent, {path.name: self._write, beside.name: lambda part: part.write_bytes(summary.encode())})
+        return beside
+
+    def _write(self, path: Path) -> None:
         kept = {"heading": self.heading, "identity": self.identity, "born": self.born, "shown": self.shown}
         more: dict[str, Any] = {name: array for name, array in kept.items() if array is not None}
-        with made(path.parent), replacing(path) as file:
+        with path.open("wb") as file:
             np.savez(
                 file, time=self.step * self.scene.dt, pos=self.pos, vel=self.vel, alive=self.alive,
                 radius=self.scene.body.radius, seed=np.uint64(self.seed), scene=np.array(dump_scene(self.scene)),
                 **more,
             )  # fmt: skip
-        beside = path.with_suffix(".json")
-        with replacing(beside) as file:
-            file.write((json.dumps(self.summary(), indent=2, allow_nan=False) + os.linesep).encode())
-        return beside
 
 
 def record(

@@ -81,7 +81,7 @@ def _write(path: Path, results: Results) -> None:
     """Write the findings as JSON; of a page that, the page, and its pictures."""
     write_numbers(path, results)
     if path.suffix.lower() == ".md":
-        from flockenv.outputs import replacing
+        from flockenv.atomic import replacing
         from flockenv.render.validation import write_pictures
         from flockenv.validation.page import page
 

@@ -26,6 +26,7 @@ from agents.checkpoint import FILE, Damaged, InUse, Parts, claimed, digest
 from agents.divergence import LearningDiverged
 from agents.experiment import CONFIGS, Experiment
 from agents.run import checkpointed
+from flockenv.atomic import LEFTOVERS
 from flockenv.outputs import check_room
 from flockenv.policy import MlpPolicy
 from flockenv.sb3 import WorldVecEnv
@@ -398,8 +399,9 @@ with claimed(Path({str(folder)!r})):
 
 def test_what_a_killed_training_left_half_written_is_removed(copied: Path) -> None:
     folder = copied / "runs" / "pursuit"
-    half = folder / f".{FILE}.4711.part"
-    half.write_bytes(b"half")
+    half = folder / LEFTOVERS.replace("*", "4711")
+    half.mkdir()
+    (half / "new").write_bytes(b"half")
     with claimed(folder):
         assert not half.exists() and (folder / FILE).exists()
 

@@ -478,23 +478,6 @@ def test_an_interrupt_leaves_nothing_and_says_so(monkeypatch: pytest.MonkeyPatch
     assert not Path("results").exists()
 
 
-def test_files_arrive_all_together_or_not_at_all() -> None:
-    Path("out").mkdir()
-    Path("out/a").write_text("old")
-
-    def fail(_: Path) -> None:
-        raise OSError(28, "No space left on device")
-
-    with pytest.raises(OSError, match="No space"):
-        comparison.deliver(Path("out"), {"a": lambda path: path.write_text("new") and None, "b": fail})
-    assert [(path.name, path.read_text()) for path in Path("out").iterdir()] == [("a", "old")]
-    with pytest.raises(OSError, match="No space"):
-        comparison.deliver(Path("fresh/out"), {"b": fail})
-    assert not Path("fresh").exists()
-    comparison.deliver(Path("fresh/out"), {"a": lambda path: path.write_text("new") and None})
-    assert [(path.name, path.read_text()) for path in Path("fresh/out").iterdir()] == [("a", "new")]
-
-
 def test_what_a_player_cost_comes_from_its_card_or_from_the_search_that_tuned_it(
     elsewhere: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from flockenv.checked_store import Store, replace_file
+from flockenv.checked_store import Store
 from flockenv.private_folder import prepared
 
 USE = """
@@ -154,11 +154,3 @@ def test_a_full_disk_is_said_once_and_nothing_is_left(
     assert said.count("\n") == 1 and "No space left on device" in said and str(store.folder) in said
     assert [path.name for path in store.folder.iterdir()] == ["name"]
     assert store.read("name") == bytes(range(256)) * 3
-
-
-def test_a_file_is_replaced_as_a_whole_or_stays(tmp_path: Path) -> None:
-    path = tmp_path / "file"
-    replace_file(path, b"old")
-    with pytest.raises(TypeError):
-        replace_file(path, "text")  # type: ignore[arg-type]
-    assert path.read_bytes() == b"old" and list(tmp_path.iterdir()) == [path]

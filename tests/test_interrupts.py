@@ -29,7 +29,7 @@ dt: 0.01
 COMMAND = """\
 import os, sys, time
 from flockenv import interrupts
-from flockenv.outputs import made, replacing
+from flockenv.atomic import made, replacing
 from pathlib import Path
 interrupts.begin("toy")
 def say(word):

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from flockenv.atomic import replacing
 from flockenv.measures import JUELICH, Tail, survival, weidmann_flow, weidmann_speed
-from flockenv.outputs import replacing
 from flockenv.render.chart import COLOURS, FAINT, GRID, INK
 
 if TYPE_CHECKING:

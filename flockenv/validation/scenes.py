@@ -8,9 +8,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
+from flockenv.atomic import made, replacing
 from flockenv.config import dump_scene
 from flockenv.findings import Case
-from flockenv.outputs import made, replacing
 from flockenv.validation import alone, corridors, doors
 from flockenv.validation.case import quietly
 from flockenv.validation.walk import Scenes

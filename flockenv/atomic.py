@@ -1,0 +1,200 @@
+"""Files that appear whole or not at all, one alone or several together.
+
+New files are written in a new folder beside their place. Only this user can enter it, and its name is unique, so no
+other writer and no planted link shares a name with them. They are forced onto the disk, and renamed to their place.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import tempfile
+import time
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import ExitStack, contextmanager, suppress
+from pathlib import Path
+from typing import BinaryIO
+
+from flockenv import interrupts
+
+__all__ = ["LEFTOVERS", "deliver", "made", "remove_leftovers", "replacing"]
+
+_PREFIX, _SUFFIX = ".flockenv-", ".part"
+
+LEFTOVERS = f"{_PREFIX}*{_SUFFIX}"
+"""Glob of the folders in which files are written; one that stays belongs to a process that was killed."""
+
+
+@contextmanager
+def replacing(path: str | os.PathLike[str], mode: int = 0o666) -> Iterator[BinaryIO]:
+    """Open a new file for writing and rename it to `path` at the end; on any error nothing is left behind.
+
+    An existing file is replaced; a link is replaced itself and never followed. The folder must exist.
+    mode: permissions of the file; those that the umask names are taken away.
+    Raises ValueError or OSError, in one line that names the path, before the first byte where that can be known.
+    """
+    target = _checked(Path(path))
+    with _named(target), _beside(target.parent) as scratch:
+        part = scratch / "new"
+        with open(part, "xb", opener=lambda name, flags: os.open(name, flags, mode)) as file:
+            yield file
+            file.flush()
+            os.fsync(file.fileno())
+        _rename({target: part})
+
+
+def deliver(folder: Path, writers: Mapping[str, Callable[[Path], object]]) -> None:
+    """Have several files written, and when all are whole put them into their places: all of them or none.
+
+    No signal comes between two of the renames, and if one fails those before it are put back. A process that is killed
+    (SIGKILL, a power cut) between two of them leaves some of the files new and some old, each of them whole.
+
+    Args:
+        folder: made if it is missing.
+        writers: path below the folder -> writes that file at the path that it is passed.
+
+    Raises:
+        ValueError, OSError: in one line that names the file; or what a writer raises. The folder is as it was then; if
+            a file could not be put back, the message names those that are new.
+    """
+    with ExitStack() as stack:
+        targets = {name: _below(folder, name) for name in writers}
+        for place in dict.fromkeys(target.parent for target in targets.values()):
+            stack.enter_context(made(place))
+        with _named(folder):
+            scratch = stack.enter_context(_beside(folder))
+        parts = {target: scratch / name for name, target in targets.items()}
+        for (target, part), write in zip(parts.items(), writers.values(), strict=True):
+            with _named(target, part):
+                part.parent.mkdir(parents=True, exist_ok=True)
+                write(part)
+                _force(part, os.O_RDWR)
+        _rename(parts)
+
+
+@contextmanager
+def made(folder: Path) -> Iterator[None]:
+    """Make a folder and those above it; if a block ends early, those that are empty then are removed again."""
+    new = [path for path in (folder, *folder.parents) if not path.exists()]
+    with ExitStack() as stack:
+        for path in reversed(new):
+            stack.enter_context(interrupts.unfinished(path, if_empty=True))
+        folder.mkdir(parents=True, exist_ok=True)
+        yield
+
+
+def remove_leftovers(folder: Path, age: float = 0.0) -> None:
+    """Remove what killed writers left in a folder that holds files of flockenv alone, if it is at least `age` s old."""
+    latest = time.time() - age
+    with suppress(OSError), os.scandir(folder) as entries:
+        for entry in entries:
+            if entry.name.startswith(".") and entry.name.endswith((_SUFFIX, ".tmp")):
+                with suppress(OSError):  # another process removes it
+                    if entry.stat(follow_symlinks=False).st_mtime <= latest:
+                        _remove(entry)
+
+
+def _remove(entry: os.DirEntry[str]) -> None:
+    if entry.is_dir(follow_symlinks=False):
+        shutil.rmtree(entry.path)
+    else:
+        os.unlink(entry.path)
+
+
+def _below(folder: Path, name: str) -> Path:
+    """Return the path of a file that may be written below a folder, which may be missing."""
+    target = folder / name
+    return _checked(target) if target.parent.exists() else target
+
+
+def _checked(target: Path) -> Path:
+    """Return a path if a file may be renamed to it."""
+    if "\0" in str(target):
+        raise ValueError(f"path: must hold no NUL character, got {str(target)!r}")
+    if not target.name or target.is_dir():
+        raise IsADirectoryError(f"cannot write {str(target)!r}: it is a folder")
+    if not target.parent.is_dir():
+        raise FileNotFoundError(f"cannot write {str(target)!r}: there is no folder {str(target.parent)!r}")
+    return target
+
+
+@contextmanager
+def _beside(folder: Path) -> Iterator[Path]:
+    """Make a new folder in a folder; remove it at the end with all that is in it."""
+    with ExitStack() as stack:
+        with interrupts.held():
+            scratch = tempfile.mkdtemp(_SUFFIX, _PREFIX, folder)
+            stack.enter_context(interrupts.unfinished(scratch))
+        yield Path(scratch)
+
+
+@contextmanager
+def _named(target: Path, part: Path | None = None) -> Iterator[None]:
+    """Name the target in an error of the system about a new file, which has no name or one that nobody knows."""
+    try:
+        yield
+    except OSError as error:
+        if error.errno is not None and (error.filename is None or _PREFIX in str(error.filename)):
+            raise type(error)(f"cannot write {str(target)!r}: {error.strerror}") from None
+        if part is not None and error.errno is None and str(part) in str(error):
+            raise type(error)(str(error).replace(str(part), str(target))) from None
+        raise
+
+
+def _rename(parts: Mapping[Path, Path]) -> None:
+    """Rename files to their targets, target -> file; on any error put back what was there."""
+    with interrupts.held():
+        kept = {target: _kept(target, part) for target, part in parts.items()} if len(parts) > 1 else {}
+        try:
+            for target, part in parts.items():
+                with _named(target):
+                    os.replace(part, target)
+        except BaseException as error:
+            moved = [target for target in kept if not os.path.lexists(parts[target])]
+            new = [repr(str(target)) for target in moved if not _put_back(target, kept[target])]
+            if new:
+                raise OSError(f"{error}; of those written together {', '.join(new)} could not be put back") from error
+            raise
+    _force_names({target.parent for target in parts})
+
+
+def _kept(target: Path, part: Path) -> Path | None:
+    """Give the file at a target a second name beside the new one, and return that; None if there is no file."""
+    if not os.path.lexists(target):
+        return None
+    old = part.with_name(f"{part.name}.old")
+    with _named(target):
+        try:
+            os.link(target, old, follow_symlinks=False)
+        except (OSError, NotImplementedError):  # this disk has no second names, or not of links
+            shutil.copy2(target, old, follow_symlinks=False)
+    return old
+
+
+def _put_back(target: Path, old: Path | None) -> bool:
+    """Return True if what was at a target is there again."""
+    try:
+        if old is None:
+            target.unlink()
+        else:
+            os.replace(old, target)
+    except OSError:
+        return False
+    return True
+
+
+def _force(path: Path, flags: int) -> None:
+    """Force a file onto the disk, or the list of names of a folder."""
+    handle = os.open(path, flags | getattr(os, "O_BINARY", 0))
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)
+
+
+def _force_names(folders: Iterable[Path]) -> None:
+    """Force folders' lists of names onto the disk, where a system can do that."""
+    if os.name == "posix":
+        for folder in folders:
+            with suppress(OSError):  # some network disks cannot
+                _force(folder, os.O_RDONLY)

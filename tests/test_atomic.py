@@ -1,0 +1,295 @@
+"""Files appear whole or not at all, one alone or several together, whatever else goes on meanwhile."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import stat
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import typer
+
+from agents import publish
+from flockenv.atomic import LEFTOVERS, deliver, remove_leftovers, replacing
+from flockenv.checked_store import Store
+from flockenv.group import Group
+from flockenv.policy import save_policy
+from flockenv.private_folder import prepared
+from flockenv.scene import Scene
+from flockenv.space import Torus
+from flockenv.trajectory import record
+
+ROOT = Path(__file__).resolve().parent.parent
+
+
+def files_in(folder: Path) -> dict[str, str]:
+    return {path.relative_to(folder).as_posix(): path.read_text() for path in folder.rglob("*") if path.is_file()}
+
+
+def writes(text: str) -> Callable[[Path], object]:
+    return lambda path: path.write_text(text)
+
+
+def failing(monkeypatch: pytest.MonkeyPatch, error: BaseException, *calls: int) -> None:
+    """Let some of the renames that are to come fail: call k for every k of `calls`, counted from 1."""
+    replace, count = os.replace, [0]
+
+    def replaced(source: Any, target: Any) -> None:
+        count[0] += 1
+        if count[0] in calls:
+            raise error
+        replace(source, target)
+
+    monkeypatch.setattr(os, "replace", replaced)
+
+
+# --- one file
+
+
+def test_a_file_is_replaced_as_a_whole_or_stays(tmp_path: Path) -> None:
+    path = tmp_path / "file"
+    with replacing(path) as file:
+        file.write(b"old")
+    with pytest.raises(TypeError), replacing(path) as file:
+        file.writelines((b"half", "text"))  # type: ignore[arg-type]
+    assert files_in(tmp_path) == {"file": "old"} and list(tmp_path.iterdir()) == [path]
+
+
+@pytest.mark.parametrize("ends", [("1", "2"), ("", "")], ids=["long names", "one target"])
+def test_two_writers_at_once_do_not_write_into_each_others_file(ends: tuple[str, str], tmp_path: Path) -> None:
+    """Names that begin with the same hundred characters, or are the same."""
+    one, other = (tmp_path / f"{'x' * 100}{end}" for end in ends)
+    with replacing(one) as first:
+        first.write(b"first, and longer")
+        with replacing(other) as second:
+            second.write(b"second")
+        assert other.read_text() == "second"
+    assert one.read_text() == "first, and longer"
+    assert len(list(tmp_path.iterdir())) == len({one, other})
+
+
+def test_threads_that_write_one_target_leave_what_one_of_them_wrote(tmp_path: Path) -> None:
+    target, errors = tmp_path / "file", []
+
+    def write(letter: bytes) -> None:
+        try:
+            for _ in range(20):
+                with replacing(target) as file:
+                    for _ in range(50):
+                        file.write(letter * 1000)
+        except OSError as error:
+            errors.append(error)
+
+    threads = [threading.Thread(target=write, args=(letter,)) for letter in (b"a", b"b", b"c")]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert errors == [] and len(target.read_text()) == 50_000 and len(set(target.read_text())) == 1
+
+
+def test_a_planted_link_is_not_followed(tmp_path: Path) -> None:
+    foreign, target = tmp_path / "foreign", tmp_path / "here" / "file"
+    target.parent.mkdir()
+    foreign.write_text("theirs")
+    target.with_name(f".file.{os.getpid()}.part").symlink_to(foreign)
+    target.symlink_to(foreign)
+    with replacing(target) as file:
+        file.write(b"mine")
+    assert foreign.read_text() == "theirs" and target.read_text() == "mine" and not target.is_symlink()
+
+
+@pytest.mark.skipif(os.name == "nt", reason="has no modes")
+@pytest.mark.parametrize(
+    ("mode", "mask", "expected"), [(0o666, 0o022, 0o644), (0o666, 0o077, 0o600), (0o600, 0, 0o600)]
+)
+def test_permissions_are_those_of_any_new_file(mode: int, mask: int, expected: int, tmp_path: Path) -> None:
+    before = os.umask(mask)
+    try:
+        with replacing(tmp_path / "file", mode) as file:
+            file.write(b"x")
+    finally:
+        os.umask(before)
+    assert stat.S_IMODE((tmp_path / "file").stat().st_mode) == expected
+
+
+@pytest.mark.parametrize("name", ["", ".", "gone/file", "a\0b"])
+def test_what_cannot_be_a_file_is_refused_in_one_line(name: str, tmp_path: Path) -> None:
+    with pytest.raises((OSError, ValueError), match=r"cannot write|NUL") as caught, replacing(f"{tmp_path}/{name}"):
+        raise AssertionError("is not to be reached")
+    assert str(caught.value).isprintable() and list(tmp_path.iterdir()) == []
+
+
+# --- several files
+
+
+@pytest.mark.parametrize("error", [OSError(5, "Input/output error"), KeyboardInterrupt()], ids=["disk", "Ctrl-C"])
+@pytest.mark.parametrize("call", [1, 2, 3, 4])
+def test_a_rename_that_fails_leaves_all_files_as_they_were(
+    call: int, error: BaseException, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    deliver(tmp_path, {"a": writes("old a"), "c": writes("old c"), "deep/d": writes("old d")})
+    before = files_in(tmp_path)
+    failing(monkeypatch, error, call)
+    with pytest.raises(type(error), match=f"cannot write '.*{['a', 'b', 'c', 'd'][call - 1]}'|^$"):
+        deliver(tmp_path, {name: writes(f"new {name}") for name in ("a", "b", "c", "deep/d")})
+    assert files_in(tmp_path) == before and not any(tmp_path.rglob(LEFTOVERS))
+
+
+def test_what_could_not_be_put_back_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The third rename fails, and so does the putting back of the first file."""
+    deliver(tmp_path, {name: writes(f"old {name}") for name in "abc"})
+    failing(monkeypatch, OSError(5, "Input/output error"), 3, 4)
+    with pytest.raises(OSError, match=r"cannot write '.*/c': Input/output error; .* '.*/a' could not be put back"):
+        deliver(tmp_path, {name: writes(f"new {name}") for name in "abc"})
+    assert files_in(tmp_path) == {"a": "new a", "b": "old b", "c": "old c"}
+
+
+def test_a_disk_without_second_names_is_put_back_as_well(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def link(*_: Any, **__: Any) -> None:
+        raise OSError(1, "Operation not permitted")
+
+    deliver(tmp_path, {"a": writes("old a"), "b": writes("old b")})
+    (tmp_path / "c").symlink_to("a")
+    monkeypatch.setattr(os, "link", link)
+    failing(monkeypatch, OSError(5, "Input/output error"), 3)
+    with pytest.raises(OSError, match="Input/output error"):
+        deliver(tmp_path, {name: writes(f"new {name}") for name in "cab"})
+    assert files_in(tmp_path) == {"a": "old a", "b": "old b", "c": "old a"} and (tmp_path / "c").is_symlink()
+
+
+def test_a_writer_that_fails_is_named_by_its_file_and_leaves_nothing(tmp_path: Path) -> None:
+    def full(path: Path) -> None:
+        with replacing(path):
+            raise OSError(28, "No space left on device")
+
+    def own(_: Path) -> None:
+        raise ValueError("own words")
+
+    for fail, said in ((full, f"^cannot write '{tmp_path}/new/b': No space left on device$"), (own, "^own words$")):
+        with pytest.raises((OSError, ValueError), match=said):
+            deliver(tmp_path / "new", {"a": writes("a"), "b": fail})
+        assert list(tmp_path.iterdir()) == []
+
+
+def test_a_folder_in_the_place_of_a_file_is_refused_before_a_writer_runs(tmp_path: Path) -> None:
+    (tmp_path / "b").mkdir()
+    with pytest.raises(IsADirectoryError, match=r"cannot write '.*b': it is a folder"):
+        deliver(tmp_path, {"a": lambda path: pytest.fail("is not to be written"), "b": writes("b")})
+
+
+RENAMED = """
+import os, signal
+from flockenv import interrupts
+interrupts.begin("toy")
+replace = os.replace
+def slow(source, target):
+    replace(source, target)
+    os.kill(os.getpid(), signal.SIGINT)
+os.replace = slow
+from pathlib import Path
+from flockenv.atomic import deliver
+with interrupts.running("toy"):
+    deliver(Path("."), {"a": lambda path: path.write_text("new"), "b": lambda path: path.write_text("new")})
+    print("unreached" * (__import__("time").sleep(60) is None))
+"""
+
+
+@pytest.mark.skipif(os.name == "nt", reason="has no such signals")
+def test_a_signal_between_two_renames_waits_until_both_are_done(tmp_path: Path) -> None:
+    done = subprocess.run([sys.executable, "-c", RENAMED], cwd=tmp_path, capture_output=True, text=True, timeout=100)
+    assert done.returncode != 0 and done.stdout == ""
+    assert files_in(tmp_path) == {"a": "new", "b": "new"}
+
+
+def save_a_policy(folder: Path, number: int) -> None:
+    tensors = {"action.weight": np.zeros((1, 2), np.float32), "log_std": np.zeros(1, np.float32)}
+    tensors["action.bias"] = np.full(1, number, np.float32)
+    save_policy(folder / "p.safetensors", tensors, {"activation": "tanh", "steps": number})
+
+
+def save_a_trajectory(folder: Path, number: int) -> None:
+    scene = Scene(space=Torus(size=(9.0, 9.0)), groups=(Group(count=2),), dt=0.01)
+    record(scene, number, 0, 1).save(folder / "t.npz")
+
+
+def publish_a_comparison(folder: Path, number: int) -> None:
+    results = json.loads((ROOT / "docs" / "results.json").read_text(encoding="utf-8"))
+    for name in ("results", "root/docs"):
+        (folder / name).mkdir(parents=True, exist_ok=True)
+    (folder / "results" / "results.json").write_text(json.dumps({**results, "seed": number}))
+    (folder / "results" / "comparison.png").write_bytes(b"%d" % number)
+    marks = f"<!-- python -m agents.publish -->\n{number}<!-- end -->"
+    (folder / "root" / "README.md").write_text(marks)
+    publish.main(folder / "results", folder / "root")
+
+
+WRITTEN_TOGETHER = {"policy": save_a_policy, "trajectory": save_a_trajectory, "comparison": publish_a_comparison}
+
+
+@pytest.mark.parametrize("error", [OSError(5, "Input/output error"), KeyboardInterrupt()], ids=["disk", "Ctrl-C"])
+@pytest.mark.parametrize("save", WRITTEN_TOGETHER.values(), ids=WRITTEN_TOGETHER)
+def test_files_that_belong_together_stay_of_one_moment(
+    save: Callable[[Path, int], None], error: BaseException, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    written = tmp_path / "root" / "docs" if save is publish_a_comparison else tmp_path
+    save(tmp_path, 1)
+    before = {path: path.read_bytes() for path in written.iterdir() if path.is_file()}
+    failing(monkeypatch, error, 2)
+    with pytest.raises((type(error), typer.Exit)):
+        save(tmp_path, 2)
+    assert {path: path.read_bytes() for path in written.iterdir() if path.is_file()} == before
+    monkeypatch.undo()
+    save(tmp_path, 2)
+    assert all(path.read_bytes() != old for path, old in before.items())
+
+
+# --- what killed writers leave
+
+KILLED = """
+import os, signal, sys
+from flockenv.atomic import replacing
+with replacing(sys.argv[1]) as file:
+    file.write(b"half")
+    file.flush()
+    os.kill(os.getpid(), signal.SIGKILL)
+"""
+
+
+def killed(folder: Path) -> Path:
+    """Return what a process leaves in a folder that was killed while it wrote there."""
+    subprocess.run([sys.executable, "-c", KILLED, str(folder / "file")], check=False, timeout=100)
+    (left,) = folder.glob(LEFTOVERS)
+    return left
+
+
+@pytest.mark.skipif(os.name == "nt", reason="has no SIGKILL")
+def test_a_store_removes_what_processes_left_that_were_killed_a_day_ago(tmp_path: Path) -> None:
+    folder = prepared(tmp_path / "store")
+    Store(folder).write("name", b"kept")
+    shutil.copytree(folder, other := prepared(tmp_path / "other"), dirs_exist_ok=True)
+    old, new = killed(other), other / ".abc.tmp"
+    new.write_bytes(b"of a process that writes now")
+    os.utime(old, times=(time.time() - 2 * 86_400,) * 2)
+    assert Store(other).read("name") == b"kept"
+    assert sorted(path.name for path in other.iterdir()) == [".abc.tmp", "name"]
+
+
+def test_leftovers_are_hidden_files_of_a_certain_age_alone(tmp_path: Path) -> None:
+    names = [".flockenv-abc.part", ".x.tmp", ".hidden", "x.tmp", "x.part"]
+    for name in names:
+        (tmp_path / name).write_text("x")
+    remove_leftovers(tmp_path, 3600)
+    assert len(files_in(tmp_path)) == 5
+    remove_leftovers(tmp_path)
+    assert sorted(files_in(tmp_path)) == [".hidden", "x.part", "x.tmp"]
+    remove_leftovers(tmp_path / "gone")
