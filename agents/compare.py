@@ -14,7 +14,6 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib import metadata
-from itertools import product
 from pathlib import Path
 from time import perf_counter
 from typing import Annotated, Any
@@ -29,7 +28,7 @@ from agents.experiment import CONFIGS, Experiment, load_experiment
 from agents.processes import Tell, side_by_side
 from flockenv.atomic import deliver
 from flockenv.evaluation import WORLDS_PER_SEED, Episodes, rollout, task_digest, worlds_for
-from flockenv.outputs import checked_path
+from flockenv.outputs import check_room, checked_file, checked_path
 from flockenv.players import NAMES, load_player, other_tasks
 from flockenv.players.files import SUFFIXES, PlayerError
 from flockenv.players.rules import tuned
@@ -39,8 +38,8 @@ from flockenv.tasks import TASKS, Task
 from flockenv.terminal import one_line, program, shown_progress
 
 __all__ = [
-    "Player", "app", "blaming", "compare", "experiment_of", "field_of", "folder_of", "pick", "provenance",
-     "split", "write_text",
+    "Player", "app", "blaming", "compare", "experiment_of", "field_of", "folder_of", "pick", "players_of", "provenance",
+     "split", "usual_players", "write_text",
 ]  # fmt: skip
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -50,6 +49,8 @@ TOLD_EVERY = 0.1  # s, between news of one player's progress from another proces
 RECORDED = 0  # the world in the replay: the first, not one that somebody picked
 PACKAGES = ("numpy", "scipy", "numba", "gymnasium", "pettingzoo")
 FILES = ("results.json", "table.md", "comparison.png", "replay.html")
+ROOM = 2**24
+"""Bytes, about what all files take."""
 NAME = re.compile(r"\w[\w.+-]{0,39}")
 """A player's name becomes a key, a table cell, a label and a piece of HTML."""
 
@@ -100,26 +101,12 @@ def compare(
     """
     began = perf_counter()
     first = worlds_for("evaluation", seed, worlds)
-    plays: dict[str, dict[str, Policy]] = {task.name: {} for task in tasks}
-    for task, player in product(tasks, players):
-        if _sits_out(player, task, tasks):
-            continue
-        plays[task.name][player.name] = player.policy(task, seed, trust_pickle)
-    alone = next((name for name, playing in plays.items() if not playing), None)
-    if alone is not None:
-        names = ", ".join(player.name for player in players)
-        raise ValueError(f"task {alone!r}: no player for it; in other tasks alone: {names}")
-    jobs = [
-        _Job(
-            task,
-            [player for player in players if player.name in plays[task.name]],
-            worlds,
-            seed,
-            resamples,
-            trust_pickle,
-        )
+    fields = players_of(tasks, players)
+    plays = {
+        task.name: {player.name: player.policy(task, seed, trust_pickle) for player in fields[task.name]}
         for task in tasks
-    ]
+    }
+    jobs = [_Job(task, fields[task.name], worlds, seed, resamples, trust_pickle) for task in tasks]
     played = dict(zip((task.name for task in tasks), _all(jobs, plays, advance), strict=True))
     episodes = {name: each for name, (each, _) in played.items()}
     results: report.Results = {
@@ -138,6 +125,20 @@ def compare(
 def usual_players(tasks: Sequence[Task]) -> list[str]:
     """Return the default players: all that have a name and are written for one of the tasks."""
     return [name for name in NAMES if any(not other_tasks(name, task.name) for task in tasks)]
+
+
+def players_of(tasks: Sequence[Task], players: Sequence[Player]) -> dict[str, list[Player]]:
+    """Return the players of each task by its name: all but hand-written ones of other tasks that are played here.
+
+    Raises:
+        ValueError: a task without a player.
+    """
+    fields = {task.name: [player for player in players if not _sits_out(player, task, tasks)] for task in tasks}
+    for task, field in fields.items():
+        if not field:
+            names = ", ".join(player.name for player in players)
+            raise ValueError(f"task {task!r}: no player for it; in other tasks alone: {names}")
+    return fields
 
 
 def _sits_out(player: Player, task: Task, tasks: Sequence[Task]) -> bool:
@@ -283,7 +284,7 @@ def main(
 ) -> None:
     """Play all tasks with all players in the same worlds, and say who won by what."""
     with one_line("compare", "interrupted, nothing written", debug):
-        folder = folder_of(out)
+        folder = folder_of(out, FILES)
         chosen = [experiment_of(name).build() for name in pick("--tasks", split(tasks) or list(TASKS), TASKS)]
         field = field_of(split(players) or usual_players(chosen))
         count = worlds if worlds is not None else SMOKE_WORLDS if smoke else WORLDS
@@ -297,11 +298,14 @@ def main(
     _show(results, folder)
 
 
-def folder_of(text: str) -> Path:
-    """Return the folder that --out names; ValueError if nothing may be written there."""
+def folder_of(text: str, files: Sequence[str]) -> Path:
+    """Return the folder that --out names; ValueError or OSError if these files cannot be written there."""
     folder = checked_path(text)
     if folder.exists() and not folder.is_dir():
         raise ValueError(f"--out {shown(text)}: is a file, must be a folder")
+    for name in files:
+        checked_file(str(folder / name), (Path(name).suffix,), force=True)
+    check_room(folder / files[0], ROOM)
     return folder
 
 

@@ -11,7 +11,6 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from itertools import product
 from multiprocessing import get_context
 from pathlib import Path
 from time import perf_counter
@@ -27,8 +26,10 @@ from agents.compare import (
     field_of,
     folder_of,
     pick,
+    players_of,
     provenance,
     split,
+    usual_players,
     write_text,
 )
 from agents.processes import serve, starting
@@ -47,7 +48,6 @@ from agents.transfer_report import Setting
 from flockenv.atomic import deliver
 from flockenv.evaluation import WORLDS_PER_SEED, worlds_for
 from flockenv.integrators import INTEGRATORS
-from flockenv.players import NAMES
 from flockenv.refusals import nearest, shown
 from flockenv.tasks import TASKS, Task
 from flockenv.terminal import one_line, program, shown_progress
@@ -93,16 +93,17 @@ def main(
 ) -> None:
     """Play the same worlds solved better and worse, and say what that does to each policy and what it costs."""
     with one_line("transfer", STOPPED, debug):
-        folder = folder_of(out)
+        folder = folder_of(out, FILES)
         _check("--worlds", worlds, 2, WORLDS_PER_SEED)
         _check("--rounds", rounds, 1, 1000)
         _check("--workers", workers, 1, 64)
         worlds_for("evaluation", seed, worlds)
         chosen = [experiment_of(name).build() for name in pick("TASK", split(tasks) or list(TASKS), TASKS)]
-        field = tuple(field_of(split(players) or list(NAMES)))
+        fields = players_of(chosen, field_of(split(players) or usual_players(chosen)))
         solvers, steps = _solvers(split(methods) or list(METHODS)), _substeps(split(substeps), SUBSTEPS)
         plans = [
-            Plan(task, _settings(task, solvers, steps), field, worlds, seed, rounds, trust_pickle) for task in chosen
+            Plan(task, _settings(task, solvers, steps), tuple(fields[task.name]), worlds, seed, rounds, trust_pickle)
+            for task in chosen
         ]
         results = _measured(plans, workers)
         deliver(folder, {
@@ -150,8 +151,9 @@ def _settings(task: Task, solvers: Sequence[tuple[str, str]], substeps: Sequence
 def _measured(plans: Sequence[Plan], workers: int) -> report.Results:
     """Play what is missing, run the clock, and return everything as plain data."""
     began = perf_counter()
-    for plan, player in product(plans, plans[0].players):
-        plan.policy(player, plan.task)  # whoever cannot be had is refused before anybody plays
+    for plan in plans:
+        for player in plan.players:
+            plan.policy(player, plan.task)  # whoever cannot be had is refused before anybody plays
     missing, rounds = [job for plan in plans for job in jobs(plan)], rounds_missing(plans)
     steps = sum(len(settings) * len(plan.players) for plan, settings in missing) + len(rounds) * len(plans)
     with _bar(steps) as advance:
@@ -171,7 +173,7 @@ def _measured(plans: Sequence[Plan], workers: int) -> report.Results:
         "worlds": worlds,
         "world_seeds": {"block": "evaluation", "first": first, "last": first + worlds - 1},
         "bootstrap": {"resamples": RESAMPLES, "seed": seed, "interval": "95 % percentile"},
-        "players": {player.name: player.spec for player in plans[0].players},
+        "players": {player.name: player.spec for plan in plans for player in plan.players},
         "tasks": about,
         **provenance(),
         "wall_time_s": perf_counter() - began,

@@ -37,14 +37,29 @@ def draw_chart(results: Results) -> Figure:
     figure = Figure(figsize=(13.5, 1.5 + 3.7 * len(tasks)), facecolor="white", layout="constrained")
     FigureCanvasAgg(figure)
     grid = figure.subplots(len(tasks), 2, squeeze=False, width_ratios=(1.05, 1.0))
+    colours = _colours(tasks)
     for row, (task, about) in zip(grid, tasks.items(), strict=True):
         _heat(row[0], task, about)
-        _costs(row[1], about)
-    handles, labels = grid[0, 1].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower right", ncols=5, frameon=False, fontsize=9)
-    pilot = list(results["players"])[-1]
-    figure.suptitle(f"What accuracy buys {pilot}", x=0.01, ha="left", fontsize=15, fontweight="bold", color=INK)
+        _costs(row[1], about, colours)
+    shown = {}
+    for axes in grid[:, 1]:
+        handles, labels = axes.get_legend_handles_labels()
+        shown |= dict(zip(labels, handles, strict=True))
+    figure.legend(shown.values(), shown.keys(), loc="outside lower right", ncols=5, frameon=False, fontsize=9)
+    pilots = " and ".join(dict.fromkeys(list(about["again"])[-1] for about in tasks.values()))
+    figure.suptitle(f"What accuracy buys {pilots}", x=0.01, ha="left", fontsize=15, fontweight="bold", color=INK)
     return figure
+
+
+def _shown(results: Results) -> list[str]:
+    """Return the players whose returns are shown: random is too far below."""
+    return [name for name in results["again"] if name != "random"] or list(results["again"])
+
+
+def _colours(tasks: Results) -> dict[str, str]:
+    """Return a colour for each player, the same in every task."""
+    players = dict.fromkeys(name for about in tasks.values() for name in _shown(about) if name not in FIXED)
+    return dict(zip(players, OTHERS * len(players), strict=False)) | FIXED
 
 
 def _solver(about: Results) -> str:
@@ -90,11 +105,9 @@ def _number(axes: Axes, x: int, y: int, player: Results, bound: float, trained: 
         axes.add_patch(Rectangle((x - 0.48, y - 0.47), 0.96, 0.94, fill=False, edgecolor=INK, linewidth=1.6))
 
 
-def _costs(axes: Axes, results: Results) -> None:
-    """Draw everybody's return against the time of a simulated second; random is too far below to be shown."""
-    settings = results["settings"]
-    players = [name for name in results["again"] if name != "random"] or list(results["again"])
-    colours = dict(zip([p for p in players if p not in FIXED], OTHERS * len(players), strict=False)) | FIXED
+def _costs(axes: Axes, results: Results, colours: dict[str, str]) -> None:
+    """Draw the returns against the time of a simulated second."""
+    settings, players = results["settings"], _shown(results)
     solvers = list(dict.fromkeys(_solver(about) for about in settings.values()))
     for k, solver in enumerate(solvers):
         found = sorted((a for a in settings.values() if _solver(a) == solver), key=lambda a: a["substeps"])

@@ -18,7 +18,7 @@ from rich.console import Console
 from rich.progress import Progress
 
 from agents.experiment import Experiment, load_experiment, one_line_errors
-from flockenv.atomic import replacing
+from flockenv.atomic import made, replacing
 from flockenv.evaluation import rollout, worlds_for
 from flockenv.outputs import check_room, checked_file
 from flockenv.players.rules import RULES, TUNED, RulesPlayer, as_dict
@@ -139,8 +139,7 @@ def _score(task: Task, values: dict[str, float], worlds: int, seed: int) -> tupl
 def write(path: Path, task: str, parameters: dict[str, float], found: dict[str, float]) -> None:
     """Write what the search found for a task, whole or not at all."""
     content = {"task": task, "parameters": parameters, "found": found}
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with replacing(path) as file:
+    with made(path.parent), replacing(path) as file:
         file.write((json.dumps(content, indent=2, allow_nan=False) + "\n").encode())
 
 
@@ -159,7 +158,9 @@ def main(
     with shown_progress(Progress(console=console)) as progress:
         bar = progress.add_task(f"{task.name}: parameter sets", total=_plays(s.candidates, s.rounds))
         rules, found = search(experiment, lambda n: progress.advance(bar, n))
-    write(target, task.name, rules, found)
+    console.print(f"{task.name}: found {json.dumps(rules)}", markup=False, highlight=False, soft_wrap=True)
+    with one_line_errors():
+        write(target, task.name, rules, found)
     gained = f"mean return {found['textbook_mean']:.3f} (textbook) -> {found['tuning_mean']:.3f}"
     console.print(f"{target}: {gained}, {found['agent_steps']:,.0f} agent-steps")
 

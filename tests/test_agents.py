@@ -141,6 +141,24 @@ def test_a_search_is_refused_where_its_findings_cannot_be_written(
     assert result.exit_code == 2 and result.output.count("\n") == 1 and fault in result.output
 
 
+def test_a_search_whose_findings_cannot_be_written_in_the_end_says_what_they_are(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(*_: Any) -> None:
+        raise OSError(28, "No space left on device")
+
+    def search(*_: Any) -> Any:
+        monkeypatch.setattr("os.fsync", full)
+        return {"gain": 1.25}, {"textbook_mean": 1.0, "tuning_mean": 2.0, "agent_steps": 9.0}
+
+    monkeypatch.chdir(tmp_path)
+    Path("pursuit.yaml").write_text("{task: pursuit}", encoding="utf-8")
+    monkeypatch.setattr(tune, "search", search)
+    result = CliRunner().invoke(tune.app, ["pursuit.yaml", "--out", "deep/x.json"])
+    assert result.exit_code == 2 and result.stderr.splitlines()[-1].startswith("error: cannot write ")
+    assert '{"gain": 1.25}' in result.stderr and not Path("deep").exists()
+
+
 @pytest.mark.slow
 def test_training_is_repeatable_and_exports(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     from agents import ppo

@@ -415,6 +415,7 @@ def test_weights_of_ones_own_play_under_the_name_of_their_file() -> None:
         (("--out", "still.py"), "--out 'still.py': is a file, must be a folder"),
         (("--out", "still.py/x"), "is not a folder"),
         (("--out", "link"), "--out 'link': must lie below"),
+        (("--out", "taken"), "taken/table.md': is a folder"),
     ],
 )
 def test_bad_requests_are_refused_in_one_line(
@@ -428,6 +429,7 @@ def test_bad_requests_are_refused_in_one_line(
         Path(path).write_text(source)
     monkeypatch.setattr(sys, "dont_write_bytecode", True)
     os.symlink("/etc", "link")
+    Path("taken/table.md").mkdir(parents=True)
     assert message in refused(*arguments)
 
 
@@ -533,9 +535,8 @@ def test_a_hand_written_player_of_some_tasks_sits_out_the_others() -> None:
     assert comparison.usual_players([crossing]) == ["random", "textbook", "orca", "rules", "ppo"]
     assert comparison.usual_players([flock]) == ["random", "textbook", "rules", "ppo"]
     orca, chance = comparison.Player.of("orca"), comparison.Player.of("random")
-    assert comparison._sits_out(orca, flock, [crossing, flock])
-    assert not comparison._sits_out(orca, crossing, [crossing, flock])
-    assert not comparison._sits_out(chance, flock, [crossing, flock])
+    fields = comparison.players_of([crossing, flock], [chance, orca])
+    assert fields == {"crossing": [chance, orca], "flock": [chance]}
     with pytest.raises(ValueError, match="no hand-written player 'orca' for 'flock'; there is one for: crossing"):
         comparison.compare([flock], [orca], 2)
     with pytest.raises(ValueError, match="task 'flock': no player for it; in other tasks alone: orca"):

@@ -290,7 +290,36 @@ def test_the_picture_is_centred_on_the_trained_setting() -> None:
     assert colours[2][2] > colours[2][0], "gains are blue"
 
 
+def test_players_of_one_task_alone_are_in_the_legend_in_a_colour_of_their_own() -> None:
+    tasks = {"pursuit": made_up(LUCK + 10.2)}
+    for name in ("orca", "queueing"):
+        tasks[name] = json.loads(json.dumps(tasks["pursuit"]).replace("rules", name))
+    figure = transfer_chart.draw_chart({"tasks": tasks})
+    [legend] = figure.legends
+    handles = {t.get_text(): h for t, h in zip(legend.get_texts(), legend.legend_handles, strict=True)}
+    assert {"rules", "orca", "queueing", "ppo"} < handles.keys()
+    assert len({handles[name].get_color() for name in ("rules", "orca", "queueing", "ppo")}) == 4
+
+
 # --- the command line
+
+
+def test_the_usual_players_are_those_of_the_tasks_that_are_played(monkeypatch: pytest.MonkeyPatch) -> None:
+    Counted(monkeypatch, stop_at=1)
+    assert transfer.STOPPED in run(*TINY, *TRAINED, code=130).stderr
+
+
+@pytest.mark.slow
+def test_a_hand_written_player_sits_out_the_tasks_that_it_is_not_written_for() -> None:
+    run("crossing", *TINY, *TRAINED, "--players", "random,orca")
+    found = {task: list(about["again"]) for task, about in results()["tasks"].items()}
+    assert found == {"crossing": ["random", "orca"], "pursuit": ["random"]}
+
+
+def test_a_folder_in_the_place_of_a_file_is_refused_before_anything_is_played(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(transfer_cells, "rollout", lambda *_, **__: pytest.fail("something was played"))
+    Path("results/transfer.md").mkdir(parents=True)
+    assert "transfer.md': is a folder" in run(*TINY, code=2).stderr
 
 
 @pytest.mark.slow
