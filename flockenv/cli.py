@@ -35,6 +35,7 @@ from flockenv.terminal import (
     Seed,
     complain,
     flush_output,
+    naming_stdout,
     new_console,
     progress_bar,
     relative,
@@ -104,7 +105,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _run(words: Sequence[str]) -> int:
     debug = "--debug" in words
     try:
-        with warnings.catch_warnings():
+        with warnings.catch_warnings(), naming_stdout():
             warnings.showwarning = _warn
             code = app([w for w in words if w != "--debug"], prog_name="flockenv", standalone_mode=False)
         flush_output()

@@ -54,7 +54,7 @@ class _Asked:
     """What this process has been asked to do, and how far that is."""
 
     name = "flockenv"
-    text = ""  # said of an interrupt instead of what SIGNALS says
+    text = ""  # said of a signal instead of what SIGNALS says
     said = False  # the line has been written
     main = 0  # the thread that handles signals
     running = False  # the command itself has begun: there may be something to keep
@@ -185,7 +185,7 @@ def clean() -> None:
 
 
 def say(text: str) -> None:
-    """Have this said of an interrupt from here on, instead of "interrupted"."""
+    """Have this said of a signal from here on. A leading "interrupted" becomes what that signal is called."""
     _Asked.text, _Asked.said = text, False
 
 
@@ -195,8 +195,9 @@ def said() -> str:
         return ""
     _Asked.said = True
     number = _Asked.signal or signal.SIGINT
-    text = _Asked.text if number == signal.SIGINT else ""
-    return f"{_Asked.name}: {text or SIGNALS[signal.Signals(number).name]}"
+    word, text = SIGNALS[signal.Signals(number).name], _Asked.text or SIGNALS["SIGINT"]
+    kept = text.removeprefix(SIGNALS["SIGINT"])
+    return f"{_Asked.name}: {text if kept == text else word + kept}"
 
 
 def code() -> int:

@@ -7,9 +7,9 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager, nullcontext, redirect_stdout, suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any, TextIO, cast
 
 import typer
 
@@ -21,8 +21,8 @@ if TYPE_CHECKING:
 
 __all__ = [
     "BAD_INPUT", "DIVERGED", "INTERRUPTED", "OK", "EarlyEnd", "Force", "Seed", "complain", "flush_output",
-    "in_words", "new_console", "one_line", "printable", "program", "progress_bar", "relative", "show_table",
-    "shown_progress", "verdict",
+    "in_words", "interruptible", "naming_stdout", "new_console", "one_line", "printable", "program", "progress_bar",
+    "relative", "show_table", "shown_progress", "verdict",
 ]  # fmt: skip
 
 OK, DIVERGED, BAD_INPUT, INTERRUPTED = 0, 1, 2, 130
@@ -64,15 +64,8 @@ def verdict(error: Exception) -> tuple[str, int]:
 
 
 def _os_text(error: OSError) -> str:
-    """Return what the system refused, and of which file; an error that names none is tried again on stdout."""
-    if error.filename is not None:
-        return f"{error.filename}: {error.strerror}"
-    try:
-        print()
-        flush_output()
-    except OSError:
-        return f"standard output: {error.strerror}"
-    return str(error.strerror)
+    """Return what the system refused, and of which file if it is known."""
+    return str(error.strerror) if error.filename is None else f"{error.filename}: {error.strerror}"
 
 
 def _first_line(error: Exception) -> str:
@@ -80,24 +73,35 @@ def _first_line(error: Exception) -> str:
 
 
 @contextmanager
-def one_line(name: str, interrupted: str = "interrupted", debug: bool = False) -> Iterator[None]:
-    """End a command with one line on stderr and an exit code where its input is refused or a signal interrupts it.
+def interruptible(interrupted: str = "interrupted") -> Iterator[None]:
+    """End a command that a signal interrupts with one line on stderr, and the exit code of the signal.
 
-    interrupted: what is said of an interrupt. debug: errors are raised as they are.
+    interrupted: the line; "interrupted" at its beginning becomes what the signal is called.
     """
     interrupts.say(interrupted)
     try:
         yield
     except KeyboardInterrupt:
-        complain(name, interrupted)
-        interrupts.said()
+        if line := interrupts.said():
+            print(printable(line), file=sys.stderr)
         raise typer.Exit(interrupts.code()) from None
-    except (ValueError, TypeError, OSError, MemoryError) as error:
-        if debug:
-            raise
-        text, code = verdict(error) if isinstance(error, (OSError, MemoryError)) else (str(error), BAD_INPUT)
-        complain(name, " ".join(text.split()))
-        raise typer.Exit(code) from None
+
+
+@contextmanager
+def one_line(name: str, interrupted: str = "interrupted", debug: bool = False) -> Iterator[None]:
+    """End a command with one line on stderr and an exit code where its input is refused or a signal interrupts it.
+
+    interrupted: as for `interruptible`. debug: errors are raised as they are.
+    """
+    with interruptible(interrupted), naming_stdout():
+        try:
+            yield
+        except (ValueError, TypeError, OSError, MemoryError) as error:
+            if debug:
+                raise
+            text, code = verdict(error) if isinstance(error, (OSError, MemoryError)) else (str(error), BAD_INPUT)
+            complain(name, " ".join(text.split()))
+            raise typer.Exit(code) from None
 
 
 def program(name: str, app: typer.Typer, interrupted: str = "interrupted") -> None:
@@ -117,15 +121,48 @@ def program(name: str, app: typer.Typer, interrupted: str = "interrupted") -> No
             interrupts.leave(interrupts.code())
 
 
-def flush_output() -> None:
-    """Write out what stdout holds; OSError that names it where that fails. A reader that has gone is no error."""
+class _Output:
+    """Standard output, whose errors name it: the system's own tell no file."""
+
+    def __init__(self, stream: TextIO) -> None:
+        self._stream = stream
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._stream, name)
+
+    def write(self, text: str) -> int:
+        with _named():
+            return self._stream.write(text)
+
+    def flush(self) -> None:
+        with _named():
+            self._stream.flush()
+
+
+@contextmanager
+def _named() -> Iterator[None]:
+    """Name standard output in an error; a reader that has gone keeps its own."""
     try:
-        sys.stdout.flush()
+        yield
     except OSError as error:
         with suppress(OSError, ValueError):  # what it holds is written at the end of the process, and must not fail
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        if not isinstance(error, BrokenPipeError):
-            raise OSError(f"standard output: {error.strerror}") from None
+        if isinstance(error, BrokenPipeError) or error.strerror is None:  # named already
+            raise
+        raise OSError(f"standard output: {error.strerror}") from None
+
+
+@contextmanager
+def naming_stdout() -> Iterator[None]:
+    """Have an error of standard output name it, in all that is printed in a block."""
+    with redirect_stdout(cast("TextIO", _Output(sys.stdout))) if sys.stdout is not None else nullcontext():
+        yield
+
+
+def flush_output() -> None:
+    """Write out what stdout holds; OSError that names it where that fails. A reader that has gone is no error."""
+    with suppress(BrokenPipeError), _named():
+        sys.stdout.flush()
 
 
 def printable(text: str) -> str:

@@ -678,6 +678,19 @@ def test_a_full_disk_behind_standard_output_is_named(command: tuple[str, ...]) -
     assert (done.returncode, done.stderr) == (2, "flockenv: standard output: No space left on device\n")
 
 
+@pytest.mark.parametrize("error", [OSError(28, "No space left on device"), OSError(5, "Input/output error", "x")])
+def test_an_error_of_the_system_leaves_standard_output_empty(
+    error: OSError, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def fail(*_: Any, **__: Any) -> None:
+        raise error
+
+    monkeypatch.setattr("flockenv.config.load_scene", fail)
+    assert main(["explain", "tiny.yaml"]) == 2
+    where = "x: " if error.filename else ""
+    assert capsys.readouterr() == ("", f"flockenv: {where}{error.strerror}\n")
+
+
 @pytest.mark.parametrize("name", ["t.npz", "t.gif", "t.png", "t.html"])
 def test_a_full_disk_is_one_line_that_names_the_file_and_leaves_nothing(name: str, tmp_path: Path) -> None:
     """A limit on the size of files stands for the disk."""

@@ -136,6 +136,36 @@ def test_a_command_ends_wherever_it_is(body: str, tmp_path: Path) -> None:
         assert said.splitlines()[-1] == "KeyboardInterrupt" and "pickle" not in body
 
 
+@pytest.mark.parametrize(
+    ("number", "said"),
+    [
+        (signal.SIGINT, "interrupted, nothing kept"),
+        (signal.SIGTERM, "terminated, nothing kept"),
+        (signal.SIGHUP, "terminated: the terminal was closed, nothing kept"),
+    ],
+    ids=lambda value: getattr(value, "name", ""),
+)
+def test_what_is_said_of_a_command_begins_with_the_signal_that_ended_it(
+    number: signal.Signals, said: str, tmp_path: Path
+) -> None:
+    body = """\
+import typer
+from flockenv.terminal import one_line, program
+app = typer.Typer()
+@app.command()
+def main():
+    with one_line('toy', 'interrupted, nothing kept'):
+        say('ready')
+        while True:
+            time.sleep(0.01)
+sys.argv = ['toy']
+program('toy', app)"""
+    process = toy(body, tmp_path)
+    process.send_signal(number)
+    assert process.communicate(timeout=60)[1] == f"toy: {said}\n"
+    assert process.returncode == 128 + number
+
+
 def test_a_second_interrupt_ends_what_the_first_one_began(tmp_path: Path) -> None:
     slow = """\
 with interrupts.running('toy'):
