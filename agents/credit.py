@@ -25,7 +25,7 @@ class CaringBuffer(RolloutBuffer):
     advantage, before SB3 takes away the mean of a minibatch.
 
     Args:
-        worlds: whose rows these are; `worlds.here`, (rows,) bool, says who was there when the last step began.
+        worlds: whose rows these are; `worlds.acted`, (rows,) bool, True for a row whose learner acted in the last step.
         learners: rows of a world, which lie side by side.
         care: 0: he is himself alone; 1: all of a world are worth the same to him.
     """
@@ -36,18 +36,18 @@ class CaringBuffer(RolloutBuffer):
 
     def reset(self) -> None:
         """Forget the rollout."""
-        self.here = np.ones((self.buffer_size, self.n_envs), np.bool_)
+        self.acted = np.ones((self.buffer_size, self.n_envs), np.bool_)
         super().reset()
 
     def add(self, *args: Any) -> None:
-        """Take a step of all rows, and who was there."""
-        self.here[self.pos] = self.worlds.here
+        """Take a step of all rows, and which of them acted."""
+        self.acted[self.pos] = self.worlds.acted
         super().add(*args)
 
     def compute_returns_and_advantage(self, last_values: torch.Tensor, dones: np.ndarray) -> None:
         """Find everybody's own advantages and returns (what critics learn), and share the advantages."""
         super().compute_returns_and_advantage(last_values, dones)
-        own = np.where(self.here, self.advantages, np.float32(0))
+        own = np.where(self.acted, self.advantages, np.float32(0))
         everybody = own.reshape(self.buffer_size, -1, self.learners).sum(axis=2)
         others = np.repeat(everybody, self.learners, axis=1) - own
-        self.advantages = np.where(self.here, own + np.float32(self.care) * others, np.float32(0))
+        self.advantages = np.where(self.acted, own + np.float32(self.care) * others, np.float32(0))

@@ -12,7 +12,7 @@ from __future__ import annotations
 import os
 import platform
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from importlib.util import find_spec
@@ -27,13 +27,13 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from stable_baselines3 import PPO
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import Logger
-from stable_baselines3.common.vec_env import VecEnvWrapper
 
 from agents.central import CentralPolicy, CentralVecEnv
 from agents.checkpoint import CheckpointError, claimed, path_in
 from agents.credit import CaringBuffer
-from agents.divergence import LearningDiverged, check_answers, check_model, check_step
+from agents.divergence import LearningDiverged, check_answers, check_model
 from agents.experiment import Experiment, PpoSettings, load_experiment, one_line_errors
+from agents.learning_env import ForLearning
 from agents.run import Run, checkpoint, checkpointed, expected_bytes, recipe_of
 from agents.teach import teach
 from agents.training_state import capture, restore, surroundings
@@ -46,64 +46,12 @@ from flockenv.players.rules import player
 from flockenv.policy import MlpPolicy, describe, save_policy
 from flockenv.sb3 import WorldVecEnv
 from flockenv.tasks import TASKS, Task
-from flockenv.terminal import DIVERGED, program, shown_progress
-from flockenv.world import World
+from flockenv.terminal import DIVERGED, interruptible, program, shown_progress
 
 __all__ = ["app", "build", "export", "on_threads", "score", "tensors_of", "train"]
 
 app = typer.Typer(add_completion=False, rich_markup_mode=None, pretty_exceptions_enable=False)
 console = Console(stderr=True)
-
-
-class ForLearning(VecEnvWrapper):
-    """What learning likes: small rewards, actions that tell, and worlds in different phases of their episodes.
-
-    Rewards times a constant keep the value loss near 1, so that clipping gradients does not starve the policy. And
-    where only the time limit ends an episode, worlds that began together would show every update one phase alone;
-    staggered, their first episodes end one after another. What one noisy decision in ten per second changes is lost
-    among the others; `hold` keeps to each for so many, and pays what they are paid together (Mnih et al. 2015). Where
-    an episode ends among them, what the next one is paid until there is another decision is left out.
-    """
-
-    def __init__(self, venv: WorldVecEnv, scale: float, stagger: bool, hold: int = 1) -> None:
-        super().__init__(venv)
-        self.scale, self.stagger, self.hold = scale, stagger, hold
-        self.here = np.ones(venv.num_envs, np.bool_)  # who was there when the last step began
-
-    def reset(self) -> np.ndarray:
-        """Begin; staggered, each world with another part of its first episode behind it."""
-        observation = self.venv.reset()
-        if self.stagger:
-            world: World = self.venv.world
-            world.steps[:] = np.arange(world.worlds) * world.task.horizon // world.worlds
-        return observation
-
-    def step_async(self, actions: np.ndarray) -> None:
-        """Take an action for every row."""
-        world: World = self.venv.world
-        self.here = world.state.alive[:, : world.learners].reshape(-1).copy()
-        self.actions = actions
-        self.venv.step_async(actions)
-
-    def step_wait(self) -> Any:
-        """Act for `hold` decisions of the world, and scale what is paid."""
-        absent = ~self.venv.present
-        observation, reward, done, infos = self._decided()
-        done |= absent  # nothing that is learned of a row without a learner reaches into its next episode
-        for _ in range(self.hold - 1):
-            self.venv.step_async(self.actions)
-            observation, more, over, told = self._decided()
-            reward += np.where(done, 0.0, more)
-            if any(told):  # a world has ended, or a learner has left
-                infos = [before or new for before, new in zip(infos, told, strict=True)]
-            done = done | over
-        return observation, reward * self.scale, done, infos
-
-    def _decided(self) -> Any:
-        """Return what one decision of the world brought; LearningDiverged if a number of it is not finite."""
-        world: World = self.venv.world
-        before = world.steps.copy()
-        return check_step(world.task, self.venv.step_wait(), before)
 
 
 def tensors_of(model: PPO) -> dict[str, np.ndarray]:
@@ -181,9 +129,12 @@ def score(task: Task, p: PpoSettings, tensors: dict[str, np.ndarray]) -> tuple[f
 class Watch(BaseCallback):
     """After each rollout: the progress bar; every so often: a point of the learning curve, and a checkpoint."""
 
-    def __init__(self, task: Task, p: PpoSettings, run: Run, folder: Path, progress: Progress) -> None:
+    def __init__(
+        self, task: Task, p: PpoSettings, run: Run, folder: Path, progress: Progress, saved: Callable[[Run], None]
+    ) -> None:
         super().__init__()
         self.task, self.p, self.run, self.folder, self.progress = task, p, run, folder, progress
+        self.saved = saved
         self.bar = progress.add_task(task.name, total=p.steps, completed=run.steps, score="")
         self.since, self.before = time.perf_counter(), run.wall
         self.kept: Run | None = None  # as it was when the last rollout began
@@ -208,6 +159,7 @@ class Watch(BaseCallback):
         """Write a checkpoint of the moment that is remembered, if there is one."""
         if self.kept is not None:
             checkpoint(self.folder, self.kept)
+            self.saved(self.kept)
         self.due = False
 
     def _on_rollout_end(self) -> None:
@@ -247,14 +199,6 @@ class Watch(BaseCallback):
         self.save()
 
 
-def _kept(experiment: Experiment, folder: Path) -> bool:
-    """Return True if there is a checkpoint to go on from."""
-    try:
-        return checkpointed(experiment, folder) is not None
-    except CheckpointError:
-        return False
-
-
 def _teach(model: PPO, task: Task, p: PpoSettings) -> float:
     """Let the network first learn what the tuned rules answer, if it is to; return the seconds that took."""
     if p.taught == 0:
@@ -279,10 +223,21 @@ def resume(folder: Path, model: PPO, run: Run, p: PpoSettings) -> None:
         console.print(said, markup=False, highlight=False, soft_wrap=True)
 
 
-def train(experiment: Experiment, folder: Path, go_on: bool = False, tensorboard: str | None = None) -> Run:
+def train(
+    experiment: Experiment,
+    folder: Path,
+    go_on: bool = False,
+    tensorboard: str | None = None,
+    saved: Callable[[Run], None] = lambda run: None,
+) -> Run:
     """Train to the end of the budget, or until Ctrl-C; return what came of it.
 
-    go_on: from the folder's checkpoint, if there is one; a finished one is returned as it is.
+    Args:
+        experiment: what is trained, and how.
+        folder: of the checkpoint.
+        go_on: from the folder's checkpoint, if there is one; a finished one is returned as it is.
+        tensorboard: folder of TensorBoard's logs.
+        saved: called with the run of the checkpoint that training goes on from, and of each that it writes.
 
     Raises:
         OtherRecipe: the checkpoint is not of this experiment; weights that two recipes made have none.
@@ -291,14 +246,18 @@ def train(experiment: Experiment, folder: Path, go_on: bool = False, tensorboard
     """
     with claimed(folder):
         run = checkpointed(experiment, folder) if go_on else None
+        if run is not None:
+            saved(replace(run, curve=list(run.curve), resumed=list(run.resumed)))
         if run is not None and run.steps >= experiment.ppo.steps:
             return run
         if go_on and run is None:
             console.print(f"no checkpoint in {folder}: starts anew", markup=False, highlight=False, soft_wrap=True)
-        return _train(experiment, folder, run, tensorboard)
+        return _train(experiment, folder, run, tensorboard, saved)
 
 
-def _train(experiment: Experiment, folder: Path, run: Run | None, tensorboard: str | None) -> Run:
+def _train(
+    experiment: Experiment, folder: Path, run: Run | None, tensorboard: str | None, saved: Callable[[Run], None]
+) -> Run:
     task, p, anew = experiment.build(), experiment.ppo, run is None
     model = build(task, p, tensorboard)
     if run is not None:
@@ -311,7 +270,7 @@ def _train(experiment: Experiment, folder: Path, run: Run | None, tensorboard: s
         TextColumn("{task.fields[score]}"),
     )  # fmt: skip
     with on_threads(p.threads), shown_progress(Progress(*columns, console=console)) as progress:
-        watch = Watch(task, p, run, folder, progress)
+        watch = Watch(task, p, run, folder, progress, saved)
         try:
             with _named_divergence(model):
                 model.learn(
@@ -378,16 +337,16 @@ def main(
         target = WEIGHTS / f"{name}.safetensors" if out is None else checked_file(str(out), (".safetensors",), True)
         folder = checked_path(str(runs / name), "--runs")
         _check_outputs(experiment, target, folder, tensorboard)
-    with one_line_errors((CheckpointError, OSError, MemoryError)):
+    kept: list[Run] = []
+    with interruptible(), one_line_errors((CheckpointError, OSError, MemoryError)):
         try:
-            run = train(experiment, folder, go_on, tensorboard)
+            run = train(experiment, folder, go_on, tensorboard, kept.append)
         except KeyboardInterrupt:
-            kept = f"checkpoint in {runs / name}, go on with --resume"
-            interrupts.said()
-            console.print(f"interrupted; {kept if _kept(experiment, folder) else 'nothing was learnt yet'}")
-            raise typer.Exit(interrupts.code()) from None
+            stays = f"checkpoint in {runs / name}, go on with --resume" if kept else "nothing was learnt yet"
+            interrupts.say(f"interrupted; {stays}")
+            raise
         except FloatingPointError as error:
-            typer.echo(f"error: {error}; {_last_good(experiment, folder, target)}", err=True)
+            typer.echo(f"error: {error}; {_last_good(kept, folder, target)}", err=True)
             raise typer.Exit(DIVERGED) from None
         export(run, target)
     best = f"mean return {run.best:.3f} on the tuning worlds"
@@ -406,15 +365,18 @@ def _check_outputs(experiment: Experiment, target: Path, folder: Path, tensorboa
             raise ValueError("--tensorboard: the package tensorboard is not installed")
 
 
-def _last_good(experiment: Experiment, folder: Path, target: Path) -> str:
-    """Export the best policy of a training that diverged, if there is one; return what was kept, and where."""
-    run = checkpointed(experiment, folder)
-    if run is None:
+def _last_good(saved: Sequence[Run], folder: Path, target: Path) -> str:
+    """Export the best policy of a training that diverged, if it has saved one; return what was kept, and where."""
+    if not saved:
         return "nothing was learnt before"
+    run = saved[-1]
     kept = f"kept: the checkpoint of {run.steps:,} steps in {folder}"
     if run.best is None:
         return kept
-    export(run, target)
+    try:
+        export(run, target)
+    except OSError as error:
+        return f"{kept}; {error}"
     return f"{kept}, and the best policy so far (mean return {run.best:.3f}) in {target}"
 
 

@@ -19,7 +19,7 @@ from agents import tune
 from agents.credit import CaringBuffer
 from agents.experiment import AS_CONFIGURED, CONFIGS, Experiment, PpoSettings, load_experiment
 from agents.imitate import imitate
-from agents.ppo import ForLearning
+from agents.learning_env import ForLearning
 from agents.run import checkpointed, recipe_of
 from agents.teach import shown
 from flockenv.crew import threads

@@ -536,6 +536,32 @@ def test_a_nan_before_anything_was_learned_is_named(copied: Path, monkeypatch: p
     assert "kept: the checkpoint of 0 steps" in result.stderr and not (copied / "p.safetensors").exists()
 
 
+OLDER = {"of the same recipe": 0, "of another recipe": 1, "damaged": 0}
+
+
+@pytest.mark.parametrize("older", OLDER)
+@pytest.mark.parametrize(
+    ("error", "code", "said"),
+    [(LearningDiverged("too far"), 1, "error: too far; nothing was learnt before"),
+     (KeyboardInterrupt(), 130, "interrupted; nothing was learnt yet")],
+    ids=["divergence", "Ctrl-C"],
+)  # fmt: skip
+def test_a_run_that_saved_nothing_does_not_claim_the_checkpoint_of_an_older_one(
+    copied: Path, monkeypatch: pytest.MonkeyPatch, error: BaseException, code: int, said: str, older: str
+) -> None:
+    def build(*_: Any) -> None:
+        raise error
+
+    monkeypatch.setattr(ppo, "build", build)
+    path = copied / "runs" / "pursuit" / FILE
+    if older == "damaged":
+        path.write_bytes(path.read_bytes()[:-1])
+    before = path.read_bytes()
+    result = command(copied, "--seed", str(OLDER[older]))
+    assert result.exit_code == code and said in result.stderr, result.output
+    assert path.read_bytes() == before and not (copied / "p.safetensors").exists()
+
+
 def test_a_reward_that_is_not_finite_in_a_tuning_world_is_named(
     copied: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:  # fmt: skip
