@@ -15,7 +15,7 @@ from typing import Any, TypeVar
 
 from flockenv import interrupts
 
-__all__ = ["Tell", "serve", "side_by_side", "starting"]
+__all__ = ["Tell", "parenting", "serve", "side_by_side", "starting"]
 
 Job = TypeVar("Job")
 Done = TypeVar("Done")
@@ -100,18 +100,32 @@ def _heard(context: Any, tell: Tell) -> Iterator[tuple[Connection, Any, Future[N
 
 
 @contextmanager
-def starting() -> Iterator[None]:
-    """Start processes that end with this one and do not see Ctrl-C: they inherit what this thread blocks."""
+def parenting() -> Iterator[None]:
+    """Let processes that are started in a block know that they are to end with this one."""
+    before = os.environ.get(interrupts.PARENT)
     os.environ[interrupts.PARENT] = str(os.getpid())
-    if os.name != "posix":
-        yield
-        return
-    _start_tracker()  # it unblocks signals, so it must be there before they are blocked
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         yield
     finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+        if before is None:
+            os.environ.pop(interrupts.PARENT, None)
+        else:
+            os.environ[interrupts.PARENT] = before
+
+
+@contextmanager
+def starting() -> Iterator[None]:
+    """Start processes that end with this one and do not see Ctrl-C: they inherit what this thread blocks."""
+    with parenting():
+        if os.name != "posix":
+            yield
+            return
+        _start_tracker()  # it unblocks signals, so it must be there before they are blocked
+        before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+        try:
+            yield
+        finally:
+            signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def _start_tracker() -> None:

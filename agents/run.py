@@ -16,7 +16,7 @@ from agents.checkpoint import CheckpointError, Parts
 from agents.experiment import Experiment
 from flockenv.players.rules import as_dict, player
 from flockenv.policy import MlpPolicy
-from flockenv.records import Record
+from flockenv.records import ResultRecord
 from flockenv.refusals import KeyPath, key_path, shown
 
 __all__ = ["OtherRecipe", "Run", "checkpoint", "checkpointed", "expected_bytes", "recipe_of"]
@@ -55,7 +55,7 @@ class Run:
     state: Parts = field(default_factory=dict)  # of the model, see agents.training_state
 
 
-class Point(Record):
+class Point(ResultRecord):
     """A point of the learning curve, as a checkpoint holds it; when it was is in Times."""
 
     steps: int = Field(ge=0, description="agent-steps so far")
@@ -63,14 +63,14 @@ class Point(Record):
     success: float = Field(ge=0, le=1, description="share of them that were a success")
 
 
-class Resumption(Record):
+class Resumption(ResultRecord):
     """A resumption under other versions, or on another machine, than before."""
 
     steps: int = Field(ge=0, description="agent-steps until then")
     surroundings: dict[str, str] = Field(description="what was not as before")
 
 
-class Notes(Record):
+class Notes(ResultRecord):
     """What a checkpoint says in words and numbers beside its arrays."""
 
     recipe: dict[str, Any] = Field(description="all that training depends on")
@@ -81,7 +81,7 @@ class Notes(Record):
     curve: tuple[Point, ...] = Field(description="the learning curve")
 
 
-class Times(Record):
+class Times(ResultRecord):
     """What the clock showed: no other part of a checkpoint depends on it."""
 
     wall: float = Field(ge=0, description="s, with what teaching took")

@@ -32,7 +32,7 @@ from agents.compare import (
     usual_players,
     write_text,
 )
-from agents.processes import serve, starting
+from agents.processes import parenting, serve, starting
 from agents.transfer_cells import (
     KEPT,
     Plan,
@@ -190,10 +190,11 @@ def _crew(processes: int, work: Sequence[Any]) -> Iterator[Callable[[Any, Iterab
         yield map
         return
     count = min(processes, len(work))
-    with starting():
-        pool = get_context("spawn").Pool(count, serve, maxtasksperchild=1 if processes == 1 else None)
-    with pool:
-        yield pool.imap_unordered
+    with parenting():  # a thread of the pool starts fresh ones later
+        with starting():
+            pool = get_context("spawn").Pool(count, serve, maxtasksperchild=1 if processes == 1 else None)
+        with pool:
+            yield pool.imap_unordered
 
 
 @contextmanager

@@ -25,7 +25,7 @@ from agents import ppo
 from agents.checkpoint import FILE, Damaged, InUse, Parts, claimed, digest
 from agents.divergence import LearningDiverged
 from agents.experiment import CONFIGS, Experiment
-from agents.run import checkpointed
+from agents.run import checkpoint, checkpointed
 from flockenv.atomic import LEFTOVERS
 from flockenv.outputs import check_room
 from flockenv.policy import MlpPolicy
@@ -309,6 +309,16 @@ def test_a_damaged_checkpoint_is_named_in_one_line(copied: Path, name: str) -> N
     damage, said = DAMAGES[name]
     damage(copied / "runs" / "pursuit")
     refused(copied, said)
+
+
+@pytest.mark.parametrize("mean", [1e-160, -1e103, 5e-324, -1.7e308])
+def test_results_of_any_finite_size_are_kept(tmp_path: Path, mean: float) -> None:
+    run = ppo.train(PURSUIT, tmp_path)
+    run.curve = [{**point, "mean": mean, "seconds": 1e-160} for point in run.curve]
+    run.best, run.wall = mean, 1e-160
+    checkpoint(tmp_path, run)
+    again = checkpointed(PURSUIT, tmp_path)
+    assert again is not None and (again.best, again.wall, again.curve) == (mean, 1e-160, run.curve)
 
 
 def test_every_flipped_bit_is_found(copied: Path) -> None:

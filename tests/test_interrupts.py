@@ -8,10 +8,13 @@ import signal
 import subprocess
 import sys
 import time
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
 
+from agents.processes import starting
+from flockenv import interrupts
 from flockenv.interrupts import ONE_PRESS
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -297,6 +300,22 @@ def told(pid):
 if __name__ == "__main__":
     list(side_by_side(work, [1, 2], 2, told))
 """
+
+
+@pytest.mark.parametrize("before", [None, "17"])
+@pytest.mark.parametrize("error", [None, ValueError("a player fails")])
+def test_processes_started_later_are_no_workers(
+    before: str | None, error: Exception | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """One that imports flockenv would ignore Ctrl-C, and end with this process."""
+    monkeypatch.delenv(interrupts.PARENT, raising=False)
+    if before is not None:
+        monkeypatch.setenv(interrupts.PARENT, before)
+    with suppress(ValueError), starting():
+        assert os.environ[interrupts.PARENT] == str(os.getpid())
+        if error:
+            raise error
+    assert os.environ.get(interrupts.PARENT) == before
 
 
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM], ids=lambda number: number.name)

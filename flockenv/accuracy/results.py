@@ -9,7 +9,7 @@ from typing import Literal
 
 import numpy as np
 
-from flockenv.records import Record, ResultRecord
+from flockenv.records import ResultRecord
 from flockenv.refusals import nearest, shown
 
 __all__ = ["COSTS", "FORMAT", "Choice", "Cost", "Curve", "Machine", "Point", "Report", "Results"]
@@ -29,7 +29,7 @@ FEWEST = 4
 """Points of which an order is told at all."""
 
 
-class Machine(Record):
+class Machine(ResultRecord):
     """Where it was measured."""
 
     cpu: str
