@@ -104,6 +104,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _run(words: Sequence[str]) -> int:
     debug = "--debug" in words
+    interrupts.say("")  # what an earlier command of this process kept is no word of this one
     try:
         with warnings.catch_warnings(), naming_stdout():
             warnings.showwarning = _warn

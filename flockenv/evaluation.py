@@ -159,17 +159,7 @@ def rollout(
     latency = _latency(policy, observation[0, :1], deterministic)  # first: what compiles on first use does so here
     pilot, ledger = _Pilot(policy, deterministic), _Ledger(task, worlds)
     film = _Film(world, record)
-    for number in range(1, task.horizon + 1):
-        step = world.step(pilot.act(observation, task.action_layout.size))
-        running = ledger.enter(step, world.measure)
-        film.take(running, ledger.returns)
-        observation = step.observation
-        if progress is not None:
-            progress(number, task.horizon)
-        if ledger.closed:
-            break
-    if not ledger.closed:
-        raise RuntimeError(f"task {task.name!r}: world {int(np.argmax(ledger.running))} goes on after its time limit")
+    _play(task, world, observation, pilot, ledger, film, progress)
     return Episodes(
         task=task.name,
         digest=task_digest(task),
@@ -184,6 +174,23 @@ def rollout(
         latency=latency,
         recording=film.recording,
     )
+
+
+def _play(
+    task: Task, world: Playable, observation: NDArray[np.float32], pilot: _Pilot, ledger: _Ledger, film: _Film,
+    progress: Progress | None,
+) -> None:  # fmt: skip
+    """Step all worlds by the policy's actions until the last episode has ended; RuntimeError if one never does."""
+    for number in range(1, task.horizon + 1):
+        step = world.step(pilot.act(observation, task.action_layout.size))
+        running = ledger.enter(step, world.measure)
+        film.take(running, ledger.returns)
+        observation = step.observation
+        if progress is not None:
+            progress(number, task.horizon)
+        if ledger.closed:
+            return
+    raise RuntimeError(f"task {task.name!r}: world {int(np.argmax(ledger.running))} goes on after its time limit")
 
 
 class _staying:  # noqa: N801  # a context manager without the cost of a generator: it is inside the clock

@@ -74,8 +74,8 @@ def measure(
     """Run a scene and measure its crowd: flow, density, lanes, bursts, clogging, order; table, JSON and pictures."""
     from flockenv.config import load_scene
     from flockenv.outputs import checked_file
-    from flockenv.survey import Asked, combined, survey
-    from flockenv.trajectory import record, whole_steps
+    from flockenv.survey import Asked, combined
+    from flockenv.trajectory import whole_steps
 
     loaded = load_scene(Path(scene))
     numbers = checked_file(json_file, [".json"], force, "--json") if json_file is not None else None
@@ -85,33 +85,47 @@ def measure(
         raise ValueError(f"--skip = {skip:g}: must be >= 0 and less than --time = {time:g}")
     stride = max(1, round(EVERY / loaded.dt)) if every is None else whole_steps("--every", every, loaded.dt, 1)
     asked = Asked(_line(line), _area("--area", area, True), _area("--walkable", walkable, False), skip)
+    found, first = _surveyed(loaded, seed, seeds, steps, stride, asked)
+    means, above = combined(found), _above(found)
+    _show(loaded, found, means, above, first, stride)
+    if numbers is not None:
+        _write_numbers(numbers, _summary(loaded, asked, found, means, above, first, stride))
+    if folder is not None:
+        drawn = _draw(folder, first, found, asked, Path(scene).stem)
+        new_console().print(f"{', '.join(drawn) or 'no pictures'} in {relative(folder)}")
+    stopped = found[-1].stopped or ("interrupted" if len(found) < seeds else "")
+    if stopped:
+        text = f"{stopped}; what there is until then is shown"
+        raise EarlyEnd(text, INTERRUPTED if stopped == "interrupted" else DIVERGED)
+
+
+def _surveyed(
+    scene: Scene, seed: int, seeds: int, steps: int, stride: int, asked: Asked
+) -> tuple[list[Survey], Trajectory]:
+    """Run a scene from several seeds and measure each run; return what was measured, and the first run.
+
+    A run that stops early is the last; KeyboardInterrupt is raised only if nothing has been measured yet.
+    """
+    from flockenv.survey import survey
+    from flockenv.trajectory import record
+
     found: list[Survey] = []
-    shown_run: Trajectory | None = None
-    stopped = ""
+    first: Trajectory | None = None
     try:
         for k in range(seeds):
             title = f"simulating {k + 1}/{seeds}" if seeds > 1 else "simulating"
             with progress_bar(title, steps, "steps") as progress:
-                run = record(loaded, seed + k, steps, stride, progress)
+                run = record(scene, seed + k, steps, stride, progress)
             with progress_bar("measuring", 6, "families") as progress:
                 found.append(survey(run, asked, progress))
-            shown_run, stopped = shown_run or run, found[-1].stopped
-            if stopped:
+            first = first or run
+            if found[-1].stopped:
                 break
     except KeyboardInterrupt:
-        stopped = "interrupted"
-    if shown_run is None:
-        raise KeyboardInterrupt
-    means, above = combined(found), _above(found)
-    _show(loaded, found, means, above, shown_run, stride)
-    if numbers is not None:
-        _write_numbers(numbers, _summary(loaded, asked, found, means, above, shown_run, stride))
-    if folder is not None:
-        drawn = _draw(folder, shown_run, found, asked, Path(scene).stem)
-        new_console().print(f"{', '.join(drawn) or 'no pictures'} in {relative(folder)}")
-    if stopped:
-        text = f"{stopped}; what there is until then is shown"
-        raise EarlyEnd(text, INTERRUPTED if stopped == "interrupted" else DIVERGED)
+        if first is None:
+            raise
+    assert first is not None  # there is at least one seed
+    return found, first
 
 
 PICTURES = ("flow_density.png", "lanes.png", "gaps.png", "space_time.png")

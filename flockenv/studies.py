@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -77,33 +77,17 @@ def accuracy(
     force: Force = False,
 ) -> None:
     """Show what accuracy costs: how far each integrator ends from the truth in which steps, beside its time."""
-    from flockenv.accuracy import Results, problems_named, usual_methods
+    from flockenv.accuracy import usual_methods
     from flockenv.integrators import methods_named
     from flockenv.outputs import checked_file
 
-    if suite == bool(scenes):
-        raise ValueError("accuracy: needs a SCENE.yaml or --suite, one of them")
+    todo = _todo(scenes or (), suite, problems, seconds, steps, dts, seed)
     aimed = _numbers("--tolerance", tolerance)
-    if suite and (seconds is not None or steps or dts):
-        raise ValueError("--suite: has horizons and steps of its own; --seconds, --steps and --dts go with a scene")
-    if problems and not suite:
-        raise ValueError("--problems: goes with --suite")
     path = checked_file(out, [".json", ".png"], force, beside=".json") if out is not None else None
     chosen = methods_named(_words(methods)) if methods else usual_methods()
-    if suite:
-        todo: list[Callable[[], Problem]] = [
-            functools.partial(_same, each) for each in problems_named(_words(problems))
-        ]
-    else:
-        todo = [functools.partial(_problem, file, seconds, steps, dts, seed) for file in scenes or ()]
     console = new_console()
-    files = [] if suite else list(scenes or ())
 
-    def keep(reports: Sequence[Report]) -> None:
-        if path is not None:
-            write_numbers(path, Results(reports=tuple(reports)))
-
-    reports, refused = _measured(todo, files, chosen, repetitions, finer, aimed, console, keep)
+    reports, refused = _measured(todo, chosen, repetitions, finer, aimed, console, functools.partial(_keep, path))
     if path is not None and reports:
         if path.suffix.lower() == ".png":
             _draw_precision(reports, path)
@@ -111,35 +95,57 @@ def accuracy(
     if len(reports) + refused < len(todo) or (reports and reports[-1].stopped):
         raise EarlyEnd(INTERRUPTED_LATER, INTERRUPTED)
     if not reports:
-        raise ValueError("accuracy: none of these scenes has a reference; each line says why")
+        raise ValueError("accuracy: none of these has a reference; each line says why")
+
+
+def _keep(path: Path | None, reports: Sequence[Report]) -> None:
+    from flockenv.accuracy import Results
+
+    if path is not None:
+        write_numbers(path, Results(reports=tuple(reports)))
+
+
+def _todo(
+    scenes: Sequence[str], suite: bool, problems: str, seconds: float | None, steps: str, dts: str, seed: int
+) -> dict[str, Callable[[], Problem]]:
+    """Return how each problem is made, by its name or file; ValueError for options that do not go together."""
+    from flockenv.accuracy import problems_named
+
+    if suite == bool(scenes):
+        raise ValueError("accuracy: needs a SCENE.yaml or --suite, one of them")
+    if suite and (seconds is not None or steps or dts):
+        raise ValueError("--suite: has horizons and steps of its own; --seconds, --steps and --dts go with a scene")
+    if problems and not suite:
+        raise ValueError("--problems: goes with --suite")
+    if suite:
+        return {each.name: functools.partial(_same, each) for each in problems_named(_words(problems))}
+    return {file: functools.partial(_problem, file, seconds, steps, dts, seed) for file in scenes}
 
 
 def _measured(
-    todo: Sequence[Callable[[], Problem]], files: Sequence[str], methods: Sequence[Integrator], repetitions: int,
-    finer: int | None, tolerances: Sequence[float], console: Console, keep: Callable[[Sequence[Report]], None],
+    todo: Mapping[str, Callable[[], Problem]], methods: Sequence[Integrator], repetitions: int, finer: int | None,
+    tolerances: Sequence[float], console: Console, keep: Callable[[Sequence[Report]], None],
 ) -> tuple[list[Report], int]:  # fmt: skip
-    """Measure problem after problem, keep and show each; return the reports, and how many scenes have none.
+    """Measure problem after problem, keep and show each; return the reports, and how many problems have none.
 
     keep: called with all reports after each problem; an interrupt during compilation ends the process and loses none.
-    Of several scenes those without a reference are a line each; the only one raises its ValueError.
+    Of several problems those without a reference are a line each; the only one raises its ValueError.
     """
     from flockenv.accuracy import measure
 
     reports: list[Report] = []
     refused = 0
     try:
-        for k, problem in enumerate(todo):
+        for name, problem in todo.items():
             try:
                 made = problem()
                 with progress_bar(f"measuring {made.name}", 100, "%") as progress:
                     reports.append(measure(made, methods, repetitions, finer=finer, progress=progress))
             except ValueError as error:
-                if len(files) < 2:
+                if len(todo) < 2:
                     raise
                 refused += 1
-                first, *more = str(error).splitlines()
-                where = "" if first.startswith(files[k]) else f"{files[k]}: "
-                console.print(f"{where}{first}{f' (and {len(more)} more)' if more else ''}\n", soft_wrap=True)
+                console.print(f"{_refusal(name, error)}\n", soft_wrap=True)
                 continue
             keep(reports)
             _show_accuracy(console, reports[-1], tolerances)
@@ -152,6 +158,13 @@ def _measured(
             raise
         keep(reports)
     return reports, refused
+
+
+def _refusal(name: str, error: ValueError) -> str:
+    """Return the first line of an error, with the name of the problem in front."""
+    first, *more = str(error).splitlines()
+    where = "" if first.startswith(name) else f"{name}: "
+    return f"{where}{first}{f' (and {len(more)} more)' if more else ''}"
 
 
 def _show_accuracy(console: Console, report: Report, tolerances: Sequence[float]) -> None:

@@ -507,13 +507,31 @@ def test_ctrl_c_before_any_run_has_arrived_is_one_line(
         return measure(problem, methods, repetitions, progress=_Stop(0))
 
     monkeypatch.setattr("flockenv.accuracy.measure", impatient)
-    monkeypatch.setattr("flockenv.interrupts._Asked.said", False)  # a process says it once, and runs many tests
-    monkeypatch.setattr("flockenv.interrupts._Asked.text", "")
     asked = ["accuracy", "--suite", "--problems", "damped", "--methods", "rk4", "--repetitions", "0"]
     assert main([*asked, "--out", "a.png"]) == 130
     text = capsys.readouterr()
     assert text.out == "" and text.err.splitlines()[-1] == "flockenv: interrupted"
     assert not list(Path().glob("a.*"))
+
+
+@pytest.mark.parametrize("bad", ["damped", "oscillator", "kepler"])
+def test_a_problem_without_a_reference_costs_the_others_nothing(
+    bad: str, in_a_folder: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def measured(problem: Problem, methods: Any, repetitions: int, **more: Any) -> Report:
+        if problem.name == bad:
+            raise ValueError("no reference\nfor another reason")
+        return measure(problem, methods, repetitions)
+
+    monkeypatch.setattr("flockenv.accuracy.measure", measured)
+    asked = ["accuracy", "--suite", "--methods", "rk4", "--repetitions", "0", "--out", "a.json", "--problems"]
+    names = ["damped", "oscillator", "kepler"]
+    assert main([*asked, ",".join(names)]) == 0
+    assert f"{bad}: no reference (and 1 more)\n" in capsys.readouterr().out
+    reports = Results.model_validate_json(Path("a.json").read_text()).reports
+    assert [report.name for report in reports] == [name for name in names if name != bad]
+    assert main([*asked, bad, "--force"]) == 2, "the only one is an error"
+    assert capsys.readouterr().err.startswith("flockenv: no reference")
 
 
 def test_problems_that_are_done_are_written_before_the_next_one_begins(
