@@ -12,6 +12,7 @@ from __future__ import annotations
 import os
 import platform
 import time
+from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
@@ -337,7 +338,7 @@ def main(
         target = WEIGHTS / f"{name}.safetensors" if out is None else checked_file(str(out), (".safetensors",), True)
         folder = checked_path(str(runs / name), "--runs")
         _check_outputs(experiment, target, folder, tensorboard)
-    kept: list[Run] = []
+    kept: deque[Run] = deque(maxlen=1)  # the last one alone: a run holds all arrays of the model
     with interruptible(), one_line_errors((CheckpointError, OSError, MemoryError)):
         try:
             run = train(experiment, folder, go_on, tensorboard, kept.append)
