@@ -16,7 +16,7 @@ from numba.core import cgutils, types
 from numba.np import arrayobj
 
 from flockenv import processor
-from flockenv.kernels import LINE, kernel, machine, written
+from flockenv.kernels import LINE, intrinsic_or_python, kernel, written
 from flockenv.lines import array_of, in_one_piece
 
 __all__ = [
@@ -78,7 +78,7 @@ def _packed(typing_context: Any, array: Any) -> Any:
     return array(array), generate
 
 
-packed: Any = machine(_packed, lambda array: array)
+packed: Any = intrinsic_or_python(_packed, lambda array: array)
 
 
 def _in_one_row(typing_context: Any, array: Any) -> Any:
@@ -93,7 +93,7 @@ def _in_one_row(typing_context: Any, array: Any) -> Any:
     return view(array), generate
 
 
-in_one_row: Any = machine(_in_one_row, lambda array: array.reshape(-1))
+in_one_row: Any = intrinsic_or_python(_in_one_row, lambda array: array.reshape(-1))
 
 
 def _columns(typing_context: Any, flat: Any, count: Any, many: Any, distance: Any) -> Any:
@@ -117,7 +117,7 @@ def _columns_in_python(flat: Any, count: int, many: int, distance: int) -> Any:
     return np.lib.stride_tricks.as_strided(flat, (int(count), int(many)), (step, step * int(distance)))
 
 
-columns: Any = machine(_columns, _columns_in_python)
+columns: Any = intrinsic_or_python(_columns, _columns_in_python)
 
 
 def _lookup(builder: Any, vector: Any, size: int) -> tuple[int, Any]:
@@ -237,7 +237,7 @@ def _picked_in_python(
         to.reshape(-1)[start : start + width] = row[named]
 
 
-pick: Any = machine(_picks, _picked_in_python)
+pick: Any = intrinsic_or_python(_picks, _picked_in_python)
 
 
 # A key: a square, in single precision, whose last bits are a place. Of numbers that are not negative the bits are in
@@ -309,12 +309,12 @@ def _key_in_python(square: Any, place: Any, tags: Any) -> Any:
     return (np.float32(square).view(np.uint32) & ~np.uint32(tags)) | np.uint32(place)
 
 
-key_of: Any = machine(_key_of, _key_in_python)
-key_read: Any = machine(_key_read, lambda number: np.float32(number).view(np.uint32))
-key_written: Any = machine(_key_written, lambda key: np.uint32(key).view(np.float32))
-tag_of: Any = machine(_tag_of, lambda key, tags: np.int32(key & np.uint32(tags)))
-same_key: Any = machine(_same_key, lambda one, other, tags: (one | np.uint32(tags)) == (other | np.uint32(tags)))
-ordered: Any = machine(_ordered, lambda one, other: (min(one, other), max(one, other)))
+key_of: Any = intrinsic_or_python(_key_of, _key_in_python)
+key_read: Any = intrinsic_or_python(_key_read, lambda number: np.float32(number).view(np.uint32))
+key_written: Any = intrinsic_or_python(_key_written, lambda key: np.uint32(key).view(np.float32))
+tag_of: Any = intrinsic_or_python(_tag_of, lambda key, tags: np.int32(key & np.uint32(tags)))
+same_key: Any = intrinsic_or_python(_same_key, lambda one, other, tags: (one ^ other) & ~np.uint32(tags) == 0)
+ordered: Any = intrinsic_or_python(_ordered, lambda one, other: (min(one, other), max(one, other)))
 
 
 @kernel
@@ -377,7 +377,7 @@ def _turned_in_python(to: Any, at: Any, across: Any, many: Any, source: Any, pla
         rows[start : start + SQUARE] = numbers[first : first + SQUARE * int(down) : int(down)][:SQUARE]
 
 
-_turn_square: Any = machine(_turned_square, _turned_in_python)
+_turn_square: Any = intrinsic_or_python(_turned_square, _turned_in_python)
 
 
 @kernel

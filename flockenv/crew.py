@@ -106,6 +106,7 @@ def _work(desk: queue.SimpleQueue[Any]) -> None:
 _count = 1
 _cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 _crew: _Crew | None = None
+_in_python = os.environ.get("NUMBA_DISABLE_JIT", "0") not in ("", "0")  # numba itself takes long to import
 
 
 def threads() -> int:
@@ -114,8 +115,11 @@ def threads() -> int:
 
 
 def at_work() -> int:
-    """Return how many threads it does use, where that is sooner done: as many as this process has cores, at most."""
-    return min(_count, _cores)
+    """Return how many threads a step uses if that is faster: at most one per core, and one in plain Python.
+
+    There, counting who has arrived is not one indivisible operation.
+    """
+    return 1 if _in_python else min(_count, _cores)
 
 
 def use_threads(count: int) -> None:

@@ -16,7 +16,7 @@ from llvmlite import ir  # type: ignore[import-untyped]
 from numba.core import types
 from numba.extending import overload
 
-from flockenv.kernels import OPTIONS, law, like, machine
+from flockenv.kernels import OPTIONS, intrinsic_or_python, law, like
 
 __all__ = ["atan2", "exp", "nearest_whole"]
 
@@ -60,7 +60,7 @@ def _power_of_two(typing_context: Any, far: Any) -> Any:
     return far(far), generate
 
 
-_two_to: Any = machine(_power_of_two, lambda far: type(far)(2.0 ** float(far - _ones(far))))
+_two_to: Any = intrinsic_or_python(_power_of_two, lambda far: type(far)(2.0 ** float(far - _ones(far))))
 
 
 def _largest(typing_context: Any, x: Any) -> Any:
@@ -74,7 +74,7 @@ def _largest(typing_context: Any, x: Any) -> Any:
     return x(x), generate
 
 
-_limit_of: Any = machine(_largest, lambda x: like(x, 87.0 if isinstance(x, np.float32) else 708.0))
+_limit_of: Any = intrinsic_or_python(_largest, lambda x: like(x, 87.0 if isinstance(x, np.float32) else 708.0))
 
 
 @law

@@ -1,9 +1,10 @@
 """The one door to compiled code: laws are marked here; an entry point is a generated file, or a section (`section`).
 
-Closures over compiled functions never hit numba's disk cache, and a cached function does not notice when a law it calls
-has changed. So nothing is cached but generated files: one readable source per combination of laws, in the cache folder,
-whose name is a digest of its own text and of flockenv's sources. A second process compiles nothing; an edited law
-compiles anew, always. What is read from the cache folder was verified (`private_folder`, `checked_store`).
+numba's own disk cache never finds a closure again, and does not notice that a law has changed which a cached function
+calls. So machine code is kept under a digest of all that it depends on: of a scene the text of its generated file, one
+readable source per combination of laws; of a section its function and what that holds; of both all sources of laws. A
+second process compiles nothing; an edited law compiles anew, always. What is read from the cache folder was verified
+(`private_folder`, `checked_store`).
 """
 
 from __future__ import annotations
@@ -56,15 +57,15 @@ __all__ = [
     "ask_for",
     "asked",
     "cache_folder",
+    "code_text",
     "copy_lanes",
     "finite",
-    "imported",
+    "intrinsic_or_python",
     "kernel",
     "law",
     "laws_digest",
     "like",
     "load",
-    "machine",
     "python_of",
     "replaced",
     "settled",
@@ -168,7 +169,7 @@ def _like(x, constant):  # type: ignore[no-untyped-def]  # numba compares signat
     return lambda x, constant: to(constant)
 
 
-def machine(generate: Callable[..., Any], plain: Callable[..., Any]) -> Any:
+def intrinsic_or_python(generate: Callable[..., Any], plain: Callable[..., Any]) -> Any:
     """Return an intrinsic; with NUMBA_DISABLE_JIT=1, which runs kernels in plain Python, what it does there."""
     return plain if IN_PYTHON else intrinsic(generate)
 
@@ -197,7 +198,7 @@ def _unaliased(typing_context: Any) -> Any:
     return types.void(), generate
 
 
-unaliased: Any = machine(_unaliased, lambda: None)
+unaliased: Any = intrinsic_or_python(_unaliased, lambda: None)
 
 
 def _add_at_once(typing_context: Any, array: Any, amount: Any) -> Any:
@@ -224,7 +225,7 @@ def _added_in_python(array: Any, amount: int) -> int:
     return before
 
 
-_fetch_add: Any = machine(_add_at_once, _added_in_python)  # Any: to numba's stubs a called intrinsic never returns
+_fetch_add: Any = intrinsic_or_python(_add_at_once, _added_in_python)  # Any: numba's stubs say that it never returns
 
 LINE = 64
 """Bytes of a line of the cache; no vector register is longer."""
@@ -259,7 +260,7 @@ def _copied_in_python(to: Any, at: Any, source: Any, place: Any, width: int) -> 
     to[int(at) : int(at) + width] = source[int(place) : int(place) + width]
 
 
-copy_lanes: Any = machine(_copy_lanes, _copied_in_python)
+copy_lanes: Any = intrinsic_or_python(_copy_lanes, _copied_in_python)
 
 
 def asked(builder: Any, address: Any) -> None:
@@ -286,7 +287,7 @@ def _ask_for(typing_context: Any, array: Any, place: Any) -> Any:
     return types.void(array, types.uint64), generate
 
 
-ask_for: Any = machine(_ask_for, lambda array, place: None)
+ask_for: Any = intrinsic_or_python(_ask_for, lambda array, place: None)
 
 
 def _stacked(typing_context: Any, numbers: Any) -> Any:
@@ -313,7 +314,7 @@ def _stacked(typing_context: Any, numbers: Any) -> Any:
     return array(numbers), generate
 
 
-stacked: Any = machine(_stacked, np.array)
+stacked: Any = intrinsic_or_python(_stacked, np.array)
 
 
 def _tallied(typing_context: Any, number: Any, flag: Any) -> Any:
@@ -347,8 +348,8 @@ def _tally(typing_context: Any, number: Any) -> Any:
     return number(number), generate
 
 
-tallied: Any = machine(_tallied, lambda number, flag: number + type(number)(flag))
-tally_of: Any = machine(_tally, lambda number: number)
+tallied: Any = intrinsic_or_python(_tallied, lambda number, flag: number + type(number)(flag))
+tally_of: Any = intrinsic_or_python(_tally, lambda number: number)
 
 _PATIENCE = 2000  # rounds of waiting before the core is offered to somebody else
 
@@ -416,9 +417,10 @@ def texts_outside(modules: set[str]) -> str:
         module = sys.modules.get(name)
         if module is None or name.split(".")[0] in ("flockenv", "numpy", "numba", "collections", "math"):
             continue
-        path = Path(getattr(module, "__file__", None) or "")
-        texts.append(path.read_text(encoding="utf-8") if path.suffix == ".py" else "")
-        todo |= {v.py_func.__module__ for v in vars(module).values() if hasattr(v, "py_func")}
+        path, laws = Path(getattr(module, "__file__", None) or ""), [v for v in vars(module).values() if _is_law(v)]
+        # a notebook has no file: its functions are as they are now
+        texts.append(path.read_text(encoding="utf-8") if path.suffix == ".py" else "".join(map(code_text, laws)))
+        todo |= {python_of(law).__module__ for law in laws}
     return "".join(texts)
 
 
@@ -427,9 +429,30 @@ def python_of(function: Any) -> Any:
     return getattr(function, "py_func", function)
 
 
-def imported(law: Law, name: str) -> str:
-    """Write the import of a law under another name."""
+def _is_law(value: Any) -> bool:
+    return hasattr(value, "py_func")
+
+
+def code_text(function: Any) -> str:
+    """Return the code of a function as text: the same for the same code, and another one after an edit."""
+
+    def text(code: CodeType) -> str:
+        inner = [text(each) if isinstance(each, CodeType) else each for each in code.co_consts]
+        return repr((code.co_name, code.co_code, code.co_names, inner))
+
+    return text(python_of(function).__code__)
+
+
+def import_line(law: Law, name: str) -> str:
+    """Return the line of Python that imports a law under another name.
+
+    Raises TypeError for a law that its module does not hold under the law's own name: made by another function, a
+    lambda, or replaced since.
+    """
     python = python_of(law)
+    if python_of(getattr(sys.modules.get(python.__module__), python.__name__, None)) is not python:
+        where = f"{python.__module__}.{python.__qualname__}"
+        raise TypeError(f"law {where}: must be a function of its module, which holds it as {python.__name__}")
     return f"from {python.__module__} import {python.__name__} as {name}"
 
 

@@ -17,7 +17,7 @@ from numba.core.errors import TypingError
 from numba.np import arrayobj
 from numpy.typing import NDArray
 
-from flockenv.kernels import LINE, asked, machine
+from flockenv.kernels import LINE, asked, intrinsic_or_python
 
 __all__ = ["array_of", "fetch", "in_one_piece", "pour", "put_past", "settle", "zeros"]
 
@@ -69,7 +69,7 @@ def _fetch(typing_context: Any, array: Any, part: Any, parts: Any) -> Any:
     return types.void(array, part, parts), generate
 
 
-fetch: Any = machine(_fetch, lambda array, part, parts: None)
+fetch: Any = intrinsic_or_python(_fetch, lambda array, part, parts: None)
 
 
 def put_past(builder: Any, vector: Any, place: Any, size: int) -> None:
@@ -119,7 +119,7 @@ def _poured_in_python(to: Any, at: Any, source: Any) -> None:
     to.reshape(-1)[int(at) : int(at) + source.size] = source.reshape(-1)
 
 
-pour: Any = machine(_poured, _poured_in_python)
+pour: Any = intrinsic_or_python(_poured, _poured_in_python)
 
 
 def _settled(typing_context: Any) -> Any:
@@ -132,4 +132,4 @@ def _settled(typing_context: Any) -> Any:
     return types.void(), generate
 
 
-settle: Any = machine(_settled, lambda: None)
+settle: Any = intrinsic_or_python(_settled, lambda: None)

@@ -74,9 +74,10 @@ class Record(BaseModel, metaclass=_OneLine):
     def __init_subclass__(cls, **options: Any) -> None:
         """Keep functions that class variables hold, such as laws, from becoming methods of the record."""
         super().__init_subclass__(**options)
-        for name in vars(cls).get("__annotations__", {}):
+        inherited: set[str] = getattr(cls, "__class_vars__", set())
+        for name in {*vars(cls).get("__annotations__", {}), *inherited}:
             value = vars(cls).get(name)
-            if callable(value) and not isinstance(value, type):
+            if callable(value) and not isinstance(value, (type, staticmethod, classmethod)):
                 setattr(cls, name, staticmethod(value))
 
     @classmethod

@@ -1,9 +1,10 @@
-"""Entry points made of Python functions: what they depend on is a plan, and machine code is kept under its digest.
+"""Sections: entry points made of Python functions, whose machine code is kept under a digest of all that they hold.
 
 A section is a factory: it takes a plan (laws as functions, counts, flags) and returns a function that uses them as free
 variables. numba takes those for constants: it drops the branches that they rule out before it looks at types, and
-inlines the laws. Its own disk cache never finds such a function again, as it pickles what the function holds; here the
-key is written out instead: the plan, the sources of all laws, and the width of registers.
+inlines the laws. Its own disk cache never finds such a function again; here the key is written out instead: the code of
+the function and of all functions that it holds, the numbers that it holds, the sources of all laws, and the width of
+registers.
 """
 
 from __future__ import annotations
@@ -11,21 +12,33 @@ from __future__ import annotations
 import functools
 import hashlib
 from collections import namedtuple
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from types import FunctionType
 from typing import Any
 
 import numba
+import numpy as np
 
 from flockenv import processor
 from flockenv.checked_store import Store
 from flockenv.inlining import Whole
-from flockenv.kernels import FAST, IN_PYTHON, Vec, cache_folder, kernel, laws_digest, python_of, texts_outside
+from flockenv.kernels import (
+    FAST,
+    IN_PYTHON,
+    Vec,
+    cache_folder,
+    code_text,
+    kernel,
+    laws_digest,
+    python_of,
+    texts_outside,
+)
 from flockenv.machine_code import MachineCode
 from flockenv.private_folder import prepared
 from flockenv.startup import numba_before_scipy
 from flockenv.turns import OneAtATime
 
-__all__ = ["entry", "entry_of", "kept", "record", "several", "vector"]
+__all__ = ["entry", "entry_of", "entry_point", "record", "several", "vector"]
 
 _njit: Any = numba.njit  # numba's stubs do not know `_nrt`
 
@@ -33,10 +46,10 @@ _njit: Any = numba.njit  # numba's stubs do not know `_nrt`
 def entry_of(make: Callable[..., Callable[..., Any]]) -> Callable[..., Callable[..., Any]]:
     """Decorate a section whose functions Python calls: `section(*plan)` is an entry point, made once for each plan."""
 
-    @functools.lru_cache(maxsize=512)
+    @functools.lru_cache(maxsize=512, typed=True)
     @functools.wraps(make)
     def made(*plan: Any) -> Callable[..., Any]:
-        return kept(make(*plan), plan)
+        return entry_point(make(*plan))
 
     return made
 
@@ -44,25 +57,49 @@ def entry_of(make: Callable[..., Callable[..., Any]]) -> Callable[..., Callable[
 @functools.cache
 def entry(kernel: Callable[..., Any]) -> Callable[..., Any]:
     """Return a kernel as an entry point of its own."""
-    return kept(python_of(kernel))
+    return entry_point(python_of(kernel))
 
 
-def kept(function: Callable[..., Any], plan: tuple[Any, ...] = ()) -> Callable[..., Any]:
+def entry_point(function: Callable[..., Any]) -> Callable[..., Any]:
     """Return a Python function as an entry point: its machine code is read from the checked store, or compiled there.
 
-    plan: all that its free variables are made of: functions, numbers, text, and tuples of those.
+    It may hold functions, numbers, text, arrays, types, and tuples of those.
     """
     if IN_PYTHON:
         return function
     numba_before_scipy()
-    name = f"{function.__module__}.{function.__qualname__}"
-    modules = {each.__module__ for each in _functions((function, plan))}
-    told = f"{name}{_described(plan)}{laws_digest()}{texts_outside(modules)}{processor.REGISTER}"
+    modules = {each.__module__ for each in _functions(function)}
+    told = f"{_described(function)}{laws_digest()}{texts_outside(modules)}{processor.REGISTER}"
     digest = hashlib.sha256(told.encode()).hexdigest()[:20]
-    store, kept_as = Store(cache_folder()), f"{function.__name__.strip('_')}_{digest}"
+    store, name = Store(cache_folder()), f"{function.__name__.strip('_')}_{digest}"
     compiled = _njit(fastmath=set(FAST), error_model="numpy", nogil=True, _nrt=False, pipeline_class=Whole)(function)
-    compiled._cache = OneAtATime(MachineCode(store, kept_as), prepared(store.folder / "locks") / f"{kept_as}.lock")
+    compiled._cache = OneAtATime(MachineCode(store, name), prepared(store.folder / "locks") / f"{name}.lock")
     return compiled  # type: ignore[no-any-return]
+
+
+def _held(python: FunctionType) -> tuple[Any, ...]:
+    """Return the values of a function's free variables."""
+    return tuple(cell.cell_contents for cell in python.__closure__ or ())
+
+
+def _functions(part: Any) -> Iterator[FunctionType]:
+    """Yield a Python function and all that it holds."""
+    python = python_of(part)
+    if isinstance(python, FunctionType):
+        yield python
+        part = _held(python)
+    for inner in part if isinstance(part, tuple) else ():
+        yield from _functions(inner)
+
+
+def _described(part: Any) -> str:
+    """Write out what machine code depends on: code and what it holds, numbers as they print, arrays by their bytes."""
+    python = python_of(part)
+    if isinstance(python, FunctionType):
+        return f"{python.__module__}.{python.__qualname__} {code_text(python)} {_described(_held(python))}"
+    if isinstance(part, tuple):
+        return f"({', '.join(map(_described, part))})"
+    return f"{part.dtype} {part.shape} {part.tobytes()!r}" if isinstance(part, np.ndarray) else repr(part)
 
 
 def record(names: tuple[str, ...]) -> Any:
@@ -101,18 +138,3 @@ def vector(dimension: int) -> Callable[[Any, int], Vec]:
         return array[at], array[at + 1], array[at + 2]
 
     return kernel(vector_at)
-
-
-def _functions(part: Any) -> list[Any]:
-    """Return the Python functions in a plan."""
-    if isinstance(part, tuple):
-        return [each for inner in part for each in _functions(inner)]
-    python = python_of(part)
-    return [python] if callable(python) and not isinstance(python, type) else []
-
-
-def _described(part: Any) -> str:
-    """Write a plan out: functions by their names, everything else as it prints."""
-    if isinstance(part, tuple):
-        return f"({', '.join(map(_described, part))})"
-    return "".join(f"{each.__module__}.{each.__qualname__}" for each in _functions(part)) or repr(part)

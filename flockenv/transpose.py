@@ -13,7 +13,7 @@ from llvmlite import ir  # type: ignore[import-untyped]
 from numba.core import types
 
 from flockenv import processor
-from flockenv.kernels import LINE, machine, written
+from flockenv.kernels import LINE, intrinsic_or_python, written
 from flockenv.lines import array_of, put_past
 
 __all__ = ["out_of_records", "put_lines", "put_records"]
@@ -135,7 +135,7 @@ def _records_in_python(
             records[place * many + 1 + k] = source[int(places[k]) + lane]
 
 
-put_records: Any = machine(_put_records, _records_in_python)
+put_records: Any = intrinsic_or_python(_put_records, _records_in_python)
 
 
 def _put_lines(
@@ -190,7 +190,7 @@ def _lines_in_python(
             lines[start + k] = source[int(places[k]) + lane]
 
 
-put_lines: Any = machine(_put_lines, _lines_in_python)
+put_lines: Any = intrinsic_or_python(_put_lines, _lines_in_python)
 
 
 def _out_of_records(typing_context: Any, numbers: Any, places: Any, at: Any, width: Any, records: Any) -> Any:
@@ -239,4 +239,4 @@ def _read_in_python(numbers: Any, places: Any, at: Any, width: int, records: Any
             numbers[int(place) + lane] = records[(int(at) + lane) * many + k]
 
 
-out_of_records: Any = machine(_out_of_records, _read_in_python)
+out_of_records: Any = intrinsic_or_python(_out_of_records, _read_in_python)

@@ -618,3 +618,54 @@ def test_max_force_bounds_what_agents_ask_for_and_not_what_acts_on_them(dimensio
     expected = -5 * state.vel
     expected[..., 0] += 3
     np.testing.assert_allclose(forces(pushed, state, drive), expected, rtol=1e-10)
+
+
+# --- laws are functions -----------------------------------------------------------------------------------------------
+
+HELD = """
+from typing import Literal
+
+from flockenv.effects import Drag
+from flockenv.kernels import law
+from flockenv.vec import scale
+
+
+@law
+def pulled(p, me):
+    return scale(me.pos, -p.rate)
+
+
+def pull(strength):
+    @law
+    def made(p, me):
+        return scale(me.pos, -strength * p.rate)
+
+    return made
+
+
+class Pulled(Drag):
+    kind: Literal["pulled_here"] = "pulled_here"
+    own_law = pulled
+
+
+class Made(Drag):
+    kind: Literal["made_here"] = "made_here"
+    own_law = pull(2.0)
+"""
+
+
+def test_a_law_may_be_given_without_an_annotation_and_stays_a_function(tmp_path: Path) -> None:
+    with users_module(tmp_path, HELD, "held_laws") as laws:
+        assert laws.Pulled(rate=1).own_law is laws.pulled
+        scene = scene_of(
+            laws.Pulled(rate=2.0), groups=(Group(count=3, mass=0.5, spawn=Spawn(low=(1, 1), high=(2, 2))),)
+        )
+        start = scene.start(0)
+        np.testing.assert_allclose(scene.acceleration(start), -4 * start.pos, rtol=1e-12)
+
+
+def test_a_law_that_its_module_does_not_hold_by_its_name_is_refused_in_one_line(tmp_path: Path) -> None:
+    with users_module(tmp_path, HELD, "held_laws") as laws:
+        scene = scene_of(laws.Made(rate=1), groups=(Group(count=3, spawn=Spawn(low=(1, 1), high=(2, 2))),))
+        with pytest.raises(TypeError, match=r"^law held_laws\.pull\.<locals>\.made: must be a function of its module"):
+            scene.acceleration(scene.start(0))

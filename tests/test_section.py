@@ -21,6 +21,12 @@ def doubled(x):
 @law
 def squared(x):
     return x * x
+
+def times(k):
+    @law
+    def multiplied(x):
+        return k * x
+    return multiplied
 """
 
 PROGRAM = """
@@ -47,7 +53,7 @@ class Count(event.Listener):
 
 count = Count()
 event.register("numba:compile", count)
-for law in (users_laws.doubled, users_laws.squared):
+for law in (users_laws.doubled, users_laws.squared, users_laws.times(5), users_laws.times(7)):
     for times in (1, 2):
         numbers = np.array([3.0])
         over(law, times)(numbers)
@@ -65,18 +71,38 @@ def run(folder: Path, laws: str = LAWS, **environment: str) -> str:
 
 
 def test_each_plan_has_code_of_its_own_that_the_next_process_finds(tmp_path: Path) -> None:
-    assert run(tmp_path) == "6.0 12.0 9.0 81.0 True"
-    assert run(tmp_path) == "6.0 12.0 9.0 81.0 False"
+    assert run(tmp_path) == "6.0 12.0 9.0 81.0 15.0 75.0 21.0 147.0 True"
+    assert run(tmp_path) == "6.0 12.0 9.0 81.0 15.0 75.0 21.0 147.0 False"
 
 
 def test_an_edited_law_compiles_anew_and_undone_it_is_found_again(tmp_path: Path) -> None:
     run(tmp_path)
-    assert run(tmp_path, LAWS.replace("2 * x", "5 * x")) == "15.0 75.0 9.0 81.0 True"
-    assert run(tmp_path) == "6.0 12.0 9.0 81.0 False"
+    assert run(tmp_path, LAWS.replace("2 * x", "5 * x")) == "15.0 75.0 9.0 81.0 15.0 75.0 21.0 147.0 True"
+    assert run(tmp_path) == "6.0 12.0 9.0 81.0 15.0 75.0 21.0 147.0 False"
 
 
 def test_sections_run_in_plain_python_too(tmp_path: Path) -> None:
-    assert run(tmp_path, NUMBA_DISABLE_JIT="1") == "6.0 12.0 9.0 81.0 False"
+    assert run(tmp_path, NUMBA_DISABLE_JIT="1") == "6.0 12.0 9.0 81.0 15.0 75.0 21.0 147.0 False"
+
+
+def test_an_edited_law_without_a_file_compiles_anew(tmp_path: Path) -> None:
+    """As in a notebook: the module has no source, and the law keeps its name."""
+    imports = "from flockenv.section import entry\nfrom flockenv.kernels import law\n"
+    cell = imports + "@law\ndef f(x): return {} * x\nprint(entry(f)(3.0))"
+    told = {**os.environ, "FLOCKENV_CACHE": str(tmp_path)}
+    for factor in (2, 5, 2):
+        done = subprocess.run(
+            [sys.executable, "-c", cell.format(factor)], cwd=ROOT, env=told, capture_output=True, text=True, check=True
+        )
+        assert done.stdout == f"{3.0 * factor}\n"
+
+
+def test_plain_python_uses_one_thread() -> None:
+    """Whatever is asked for: a team of threads counts in one indivisible operation, which Python has none of."""
+    told = {**os.environ, "NUMBA_DISABLE_JIT": "1", "FLOCKENV_THREADS": "2"}
+    code = "from flockenv.crew import at_work, threads; print(threads(), at_work())"
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, env=told, capture_output=True, text=True, check=True)
+    assert done.stdout == "2 1\n"
 
 
 @pytest.mark.slow
@@ -84,4 +110,4 @@ def test_damaged_code_is_compiled_anew(tmp_path: Path) -> None:
     run(tmp_path)
     for path in (tmp_path / "cache").glob("*.nbc"):
         path.write_bytes(path.read_bytes()[:-9])
-    assert run(tmp_path) == "6.0 12.0 9.0 81.0 True"
+    assert run(tmp_path) == "6.0 12.0 9.0 81.0 15.0 75.0 21.0 147.0 True"

@@ -1,13 +1,13 @@
 """A grid of cells over the rows of one form, so that a law meets only the shapes that may be near.
 
-It is made once, of the shapes of a scene, about as many cells as shapes. A shape is listed in every cell that its box
-lies in, so that what is near a place is in the few cells around it, however many shapes there are. Shapes that move,
-and those in more than MOST_CELLS, are in a list of their own, the last, which is looked through always.
+It is made once per scene and has about as many cells as there are shapes. A shape is listed in every cell that its box
+overlaps, so that the few cells around a place list all shapes near it, however many shapes there are. Shapes that move,
+and those that overlap more than MOST_CELLS cells, are in one more list, the last, which every search goes through.
 
-In order: the lower corner of the grid (D, m), cells per metre (D), how many there are along each axis (D), 1 if it
-closes on itself (a torus), else 0; where the list of each cell begins, of all but the last axis by axis, and where the
-last ends; the lists. What is listed is how far behind the first row of its form the shape's row lies, the middle of its
-box (D, m) and half the edges (D, m). See Ericson 2005, "Real-Time Collision Detection", 7.1.
+The table holds, in order: the lower corner of the grid (D, m), cells per metre (D), the number of cells along each axis
+(D), 1 for a torus and 0 otherwise; the beginning of each list, cells in C order, then the last list, and its end; the
+lists. An entry holds the distance of the shape's row behind the first row of its form, the middle of the shape's box
+(D, m) and half the edges (D, m). See Ericson 2005, "Real-Time Collision Detection", 7.1.
 """
 
 from __future__ import annotations
@@ -30,13 +30,13 @@ __all__ = [
 Floats = NDArray[np.float64]
 
 FEWEST_ROWS = 16
-"""Fewer shapes of a form are met one after the other by agents side by side, which is sooner done."""
+"""With fewer shapes of a form there is no grid: a loop over all of them, for many agents at a time, is faster."""
 
 MOST_FOUND = 64
-"""If more shapes are near an agent than this, it meets all of the form: they need not be put in order."""
+"""An agent that has more shapes near it than this interacts with all of the form, which needs no sorting."""
 
 MOST_CELLS = 64
-"""Shapes that lie in more cells are in the list that is looked through always."""
+"""A shape that overlaps more cells is in the last list."""
 
 LOOSE = 1e-6
 """Boxes are larger by this share of their coordinates: single precision rounds by 6e-8."""
@@ -86,7 +86,7 @@ def _grid(middle: Floats, half: Floats, period: Floats | None) -> tuple[Floats, 
 
 
 def _cells(m: Floats, h: Floats, low: Floats, rate: Floats, many: NDArray[np.int64], closes: bool) -> list[int]:
-    """Return the cells that a box lies in; the list after the last of them if these are too many."""
+    """Return the numbers of the cells that a box overlaps; that of the last list if there are too many."""
     last = [int(many.prod())]
     if not np.isfinite(h).all():
         return last
@@ -104,9 +104,9 @@ def _cells(m: Floats, h: Floats, low: Floats, rate: Floats, many: NDArray[np.int
 
 @law
 def _span(table: Any, at: int, d: int, middle: float, reach: float, closes: bool) -> tuple[int, int]:
-    """Return the first cell that a box lies in along an axis, whose numbers are at `at`, and in how many it lies.
+    """Return the first cell that a box overlaps along an axis, whose numbers are at `at`, and how many it overlaps.
 
-    Never a cell that there is not, wherever the box is.
+    Only cells of the grid are returned, wherever the box is.
     """
     low, rate, many = table[at], table[at + d], table[at + 2 * d]
     o, e = like(middle, 0.0), like(middle, 1.0)
@@ -127,7 +127,7 @@ def _span(table: Any, at: int, d: int, middle: float, reach: float, closes: bool
 
 @law
 def span_of(table: Any, at: int, middle: Vec, reach: Vec) -> tuple[tuple[int, int], ...]:
-    """Return in which cells a box lies, per axis: the first, and how many. middle, reach: of the box, m."""
+    """Return the cells that a box overlaps, per axis: the first, and how many. middle, reach: of the box, m."""
     d = len(middle)
     closes = table[at + 3 * d] > like(middle[0], 0.0)
     x = _span(table, at, d, middle[0], reach[0], closes)
@@ -140,7 +140,7 @@ def span_of(table: Any, at: int, middle: Vec, reach: Vec) -> tuple[tuple[int, in
 
 @law
 def count_of(span: tuple[tuple[int, int], ...]) -> int:
-    """Return how many lists a box has to be compared with: of its cells, and that of what is in no cell."""
+    """Return the number of lists to search for a box: those of its cells, and the last list."""
     if len(span) == 2:
         return span[0][1] * span[1][1] + 1
     else:
@@ -149,7 +149,7 @@ def count_of(span: tuple[tuple[int, int], ...]) -> int:
 
 @law
 def list_of(table: Any, at: int, x: Vec, span: tuple[tuple[int, int], ...], k: int) -> tuple[int, int]:
-    """Return where the k-th list begins and ends; the first is that of what is in no cell."""
+    """Return where the k-th of these lists begins and ends; k = 0 is the last list of the table."""
     d = len(x)
     cell: Any = 0
     left: Any = k - 1

@@ -7,6 +7,7 @@ far from the origin. Rows of one form lie one after another.
 
 from __future__ import annotations
 
+import functools
 import importlib
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -71,6 +72,7 @@ def _head(shape: Any, form: int) -> list[float]:
     return [*shape.anchor, float(form), *middle, *(bound.half * UP), bound.radius * UP, *shape.motion]
 
 
+@functools.cache
 def _law(verb: str, form: str) -> Law:
     """Return the law `nearest_FORM` or `hit_FORM`."""
     law: Law = getattr(importlib.import_module(FORMS[form]), f"{verb}_{form}")

@@ -235,9 +235,10 @@ def aside_of({_WORLD}, x, ray, room, known):
 
 
 def _axis(parts: Parts) -> list[str]:
-    """Write along and across what else is looked in space: an obstacle's own axis, or away from what blocked its side.
+    """Write the axis along and across which edges are searched for in space: `ax` and `across`.
 
-    So no axis of the coordinates is preferred, and the mirrored scene has the mirrored way.
+    It is the obstacle's own, or else leads away from what blocked the side of the normal. So no axis of the coordinates
+    is preferred, and agents of the mirrored scene take the mirrored path.
     """
     own = [form for form in SPINES if form in parts.shaped[1]]
     lines = ["ax, at_ = zero(x), row", *([f"y = offset_to(size, {place_of_row(parts)}, x)"] if own else [])]

@@ -161,7 +161,7 @@ class Parts:
 
     @property
     def looked_up(self) -> tuple[str, ...]:
-        """The forms of which folds meet those shapes alone that a grid says may lie within reach."""
+        """The forms of which folds meet only the shapes that may lie within reach, found by a grid."""
         return tuple(self.cells) if self.reaches else ()
 
     @property
@@ -175,7 +175,7 @@ class Parts:
         return any(e.obstacle_start is not None and e.obstacle_edges for e in self.effects)
 
     def places_of(self, form: str) -> tuple[int, int, int]:
-        """Return where in `parameters` a form's first row, how many there are, and its grid if it has one are told."""
+        """Return the places in `parameters` of a form's first row, of how many rows it has, and of its grid if any."""
         at = self.dimension + 1
         for each in self.shaped[1]:
             if each == form:

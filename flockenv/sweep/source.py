@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from flockenv.kernels import imported
+from flockenv.kernels import import_line
 from flockenv.sweep.accelerate import accelerate, sense
 from flockenv.sweep.around import around, around_imports
 from flockenv.sweep.far import tree_imports
@@ -97,9 +97,9 @@ def _imports(parts: Parts) -> str:
         *(["from flockenv.kernels import tallied, tally_of"] if parts.parting or parts.averaged else []),
         "from flockenv.neighbours import candidates, count_cells, order_records, row_of",
         "from flockenv.tiles import count_from_home, count_tiles, find_homes, order_cells, order_shared",
-        imported(parts.space.offset_law, "offset_to"),
-        imported(parts.space.confine_law, "confine"),
-        *([imported(parts.space.bounce_law, "bounce")] if parts.space.bounce_law else []),
+        import_line(parts.space.offset_law, "offset_to"),
+        import_line(parts.space.confine_law, "confine"),
+        *([import_line(parts.space.bounce_law, "bounce")] if parts.space.bounce_law else []),
         "from flockenv.noise import normal as standard_normal",
         *(["from flockenv.transpose import out_of_records, put_lines, put_records"] * (parts.sweeps and parts.sorts)),
         "from flockenv.vec import add, dot, exact_dot, exact_sum, limit, norm, scale, select, sub, unit, zero",
@@ -114,9 +114,9 @@ def _imports(parts: Parts) -> str:
         for slot in LAWS:
             law = getattr(effect, slot)
             if law is not None:
-                lines.append(imported(law, f"{slot}_{k}"))
+                lines.append(import_line(law, f"{slot}_{k}"))
         if effect.wishes:
-            lines.append(imported(effect.steer_law, f"steer_law_{k}"))
+            lines.append(import_line(effect.steer_law, f"steer_law_{k}"))
     if parts.inner:
         lines.append(f'Inner = namedtuple("Inner", {" ".join(parts.inner)!r})')
     options = 'dict(fastmath={"contract"}, error_model="numpy", nogil=True, _nrt=False, pipeline_class=Whole)'
