@@ -19,9 +19,9 @@ import os
 import re
 import sys
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from types import CodeType, ModuleType
+from types import CodeType, FunctionType, ModuleType
 from typing import Any, TypeVar, cast
 
 import numba
@@ -59,7 +59,9 @@ __all__ = [
     "cache_folder",
     "code_text",
     "copy_lanes",
+    "described",
     "finite",
+    "functions_in",
     "intrinsic_or_python",
     "kernel",
     "law",
@@ -443,6 +445,38 @@ def code_text(function: Any) -> str:
     return text(python_of(function).__code__)
 
 
+def held(python: FunctionType) -> tuple[Any, ...]:
+    """Return the values of a function's free variables."""
+    return tuple(cell.cell_contents for cell in python.__closure__ or ())
+
+
+def functions_in(part: Any) -> Iterator[FunctionType]:
+    """Yield a Python function and all that it holds."""
+    python = python_of(part)
+    if isinstance(python, FunctionType):
+        yield python
+        part = held(python)
+    for inner in part if isinstance(part, tuple) else ():
+        yield from functions_in(inner)
+
+
+def described(part: Any) -> str:
+    """Write out what machine code depends on: code and what it holds, numbers as they print, arrays by their bytes."""
+    python = python_of(part)
+    if isinstance(python, FunctionType):
+        return _described(python)
+    if isinstance(part, tuple):
+        return f"({', '.join(map(described, part))})"
+    return f"{part.dtype} {part.shape} {part.tobytes()!r}" if isinstance(part, np.ndarray) else repr(part)
+
+
+@functools.lru_cache(maxsize=4096)
+def _described(python: FunctionType) -> str:
+    """Write out a function as `described` does, by a digest: what holds it twice stays short."""
+    told = f"{code_text(python)} {described(held(python))}"
+    return f"{python.__module__}.{python.__qualname__} {hashlib.sha256(told.encode()).hexdigest()}"
+
+
 def import_line(law: Law, name: str) -> str:
     """Return the line of Python that imports a law under another name.
 
@@ -457,14 +491,16 @@ def import_line(law: Law, name: str) -> str:
 
 
 @functools.lru_cache(maxsize=512)
-def load(name: str, source: str) -> ModuleType:
+def load(name: str, source: str, sections: tuple[tuple[str, Any], ...] = ()) -> ModuleType:
     """Import a generated source and find the machine code of its entry points; `name` is a readable prefix.
 
     What runs is compiled from `source`, or comes from the checked store; the readable file beside it is never run.
+    sections: functions that it calls, by the name under which it finds them.
     """
     numba_before_scipy()
-    others = texts_outside(set(re.findall(r"^from ([\w.]+) import", source, re.MULTILINE)))
-    told = f"{source}{laws_digest()}{others}{processor.REGISTER}"
+    modules = set(re.findall(r"^from ([\w.]+) import", source, re.MULTILINE))
+    modules |= {each.__module__ for _, made in sections for each in functions_in(made)}
+    told = f"{source}{described(sections)}{laws_digest()}{texts_outside(modules)}{processor.REGISTER}"
     digest = hashlib.sha256(told.encode()).hexdigest()[:20]
     store = Store(cache_folder())
     path = store.folder / f"{name}_{digest}.py"
@@ -473,6 +509,7 @@ def load(name: str, source: str) -> ModuleType:
     spec = importlib.util.spec_from_file_location(qualified, path)
     assert spec is not None
     module = importlib.util.module_from_spec(spec)
+    vars(module).update(sections)
     sys.modules[qualified] = module
     exec(_code(store, path, source), vars(module))  # noqa: S102  # made of `source`, by flockenv
     locks = prepared(store.folder / "locks")

@@ -48,7 +48,7 @@ from flockenv.space import AnySpace, Box, Plane, Torus
 from flockenv.stability import check_contact, check_dt, check_lookahead
 from flockenv.state import Body, Floats, State
 from flockenv.steer import EVERY_EFFECT
-from flockenv.sweep import Parts, Table, field_source, flattened, pack, scene_source
+from flockenv.sweep import Parts, Table, field_source, flattened, pack, scene_source, sections_of
 from flockenv.tiles import HOME
 from flockenv.tree import MOST_DIRECT, tree_sizes
 from flockenv.workspace import Workspace
@@ -695,11 +695,11 @@ class Scene(Record):
     @functools.cached_property
     def _accelerations(self) -> Any:
         plain = dataclasses.replace(self.parts, integrator=SemiImplicitEuler())  # the method makes no difference
-        return load("field", field_source(plain))
+        return load("field", field_source(plain), sections_of(plain))
 
     @functools.cached_property
     def _kernels(self) -> Any:
-        return load("scene", scene_source(self.parts))
+        return load("scene", scene_source(self.parts), sections_of(self.parts))
 
     def _workspaces(self, count: int, team: int) -> list[Workspace]:
         """Return scratch of this thread's own: two threads may step one scene at the same time."""

@@ -12,12 +12,10 @@ from __future__ import annotations
 import functools
 import hashlib
 from collections import namedtuple
-from collections.abc import Callable, Iterator
-from types import FunctionType
+from collections.abc import Callable
 from typing import Any
 
 import numba
-import numpy as np
 
 from flockenv import processor
 from flockenv.checked_store import Store
@@ -27,7 +25,8 @@ from flockenv.kernels import (
     IN_PYTHON,
     Vec,
     cache_folder,
-    code_text,
+    described,
+    functions_in,
     kernel,
     laws_digest,
     python_of,
@@ -38,9 +37,20 @@ from flockenv.private_folder import prepared
 from flockenv.startup import numba_before_scipy
 from flockenv.turns import OneAtATime
 
-__all__ = ["entry", "entry_of", "entry_point", "record", "several", "vector"]
+__all__ = ["entry", "entry_of", "entry_point", "record", "section", "several", "vector"]
 
 _njit: Any = numba.njit  # numba's stubs do not know `_nrt`
+
+
+def section(make: Callable[..., Callable[..., Any]]) -> Callable[..., Callable[..., Any]]:
+    """Decorate a section whose functions kernels call: `section(*plan)` is a part of them, made once for each plan."""
+
+    @functools.lru_cache(maxsize=4096, typed=True)
+    @functools.wraps(make)
+    def made(*plan: Any) -> Callable[..., Any]:
+        return kernel(make(*plan))
+
+    return made
 
 
 def entry_of(make: Callable[..., Callable[..., Any]]) -> Callable[..., Callable[..., Any]]:
@@ -68,38 +78,13 @@ def entry_point(function: Callable[..., Any]) -> Callable[..., Any]:
     if IN_PYTHON:
         return function
     numba_before_scipy()
-    modules = {each.__module__ for each in _functions(function)}
-    told = f"{_described(function)}{laws_digest()}{texts_outside(modules)}{processor.REGISTER}"
+    modules = {each.__module__ for each in functions_in(function)}
+    told = f"{described(function)}{laws_digest()}{texts_outside(modules)}{processor.REGISTER}"
     digest = hashlib.sha256(told.encode()).hexdigest()[:20]
     store, name = Store(cache_folder()), f"{function.__name__.strip('_')}_{digest}"
     compiled = _njit(fastmath=set(FAST), error_model="numpy", nogil=True, _nrt=False, pipeline_class=Whole)(function)
     compiled._cache = OneAtATime(MachineCode(store, name), prepared(store.folder / "locks") / f"{name}.lock")
     return compiled  # type: ignore[no-any-return]
-
-
-def _held(python: FunctionType) -> tuple[Any, ...]:
-    """Return the values of a function's free variables."""
-    return tuple(cell.cell_contents for cell in python.__closure__ or ())
-
-
-def _functions(part: Any) -> Iterator[FunctionType]:
-    """Yield a Python function and all that it holds."""
-    python = python_of(part)
-    if isinstance(python, FunctionType):
-        yield python
-        part = _held(python)
-    for inner in part if isinstance(part, tuple) else ():
-        yield from _functions(inner)
-
-
-def _described(part: Any) -> str:
-    """Write out what machine code depends on: code and what it holds, numbers as they print, arrays by their bytes."""
-    python = python_of(part)
-    if isinstance(python, FunctionType):
-        return f"{python.__module__}.{python.__qualname__} {code_text(python)} {_described(_held(python))}"
-    if isinstance(part, tuple):
-        return f"({', '.join(map(_described, part))})"
-    return f"{part.dtype} {part.shape} {part.tobytes()!r}" if isinstance(part, np.ndarray) else repr(part)
 
 
 def record(names: tuple[str, ...]) -> Any:

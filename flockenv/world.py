@@ -24,7 +24,7 @@ from flockenv.refusals import nearest
 from flockenv.scene import MEMORY_LIMIT
 from flockenv.snapshot import Snapshot
 from flockenv.state import State
-from flockenv.sweep import Look, pack
+from flockenv.sweep import Look, pack, sections_of
 from flockenv.tasks import Task
 from flockenv.tasks.base import REFUSED, task_source
 from flockenv.workspace import Workspace
@@ -105,7 +105,7 @@ class World:
     def _prepare(self) -> None:
         """Make what follows from the task: kernel, scratch, and what every step is given."""
         scene, task, s = self.task.scene, self.task, self.state
-        self._kernel = load(f"task_{task.name}", task_source(task))
+        self._kernel = load(f"task_{task.name}", task_source(task), sections_of(task.parts))
         self._enter, self._tell = self._kernel.play, self._kernel.tell
         b, i, real = self.worlds, self.learners, scene.dtype
         self._actions = zeros((b, i, self.action_size), real)

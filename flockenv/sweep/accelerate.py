@@ -27,10 +27,12 @@ from flockenv.sweep.text import (
     lanes_of,
     nearest_images,
     needed,
-    tuple_of,
 )
 
 __all__ = ["accelerate", "felt_as", "parameters", "responses", "sense"]
+
+
+_FORM_FIELDS = {"at": "at", "count": "many", "cells": "cells"}
 
 
 def sense(parts: Parts) -> str:
@@ -100,39 +102,16 @@ def accelerate(context, pos, vel, time, acc):
 '''
 
 
-def parameters(parts: Parts) -> list[str]:
-    """Write how the numbers are read, in the order of `Parts.parameters`."""
-    d = parts.dimension
-    lines = [f"size = {tuple_of('params[#]', d)}", f"reach = params[{d}]"]
-    at = d + 1
-    for form in parts.shaped[1]:
-        lines.append(f"{form}_at, {form}_count = np.int64(params[{at}]), np.int64(params[{at + 1}])")
-        at += 2
-        if form in parts.cells:
-            lines.append(f"{form}_cells = np.int64(params[{at}])")
-            at += 1
+def parameters(parts: Parts, numbers: str = "numbers_of(params, frame)") -> list[str]:
+    """Write by which names the numbers of a scene are known."""
+    lines = [f"numbers = {numbers}", "size, reach = numbers.size, numbers.reach"]
+    for j, form in enumerate(parts.shaped[1]):
+        lines += [f"{form}_{name} = numbers.forms[{j}].{field}" for name, field in _FORM_FIELDS.items()]
     for q, sight in enumerate(parts.sights):
-        lines.append(f"within{q}, view{q} = params[{at}], params[{at + 1}]")
-        at += 2
+        lines += [f"within{q} = numbers.views[{q}].within", f"view{q} = numbers.views[{q}].cone"]
         if sight.group is not None:
-            lines.append(f"first{q}, end{q} = params[{at}], params[{at + 1}]")
-            at += 2
-    for k, effect in enumerate(parts.effects):
-        values = []
-        for value in parts.numbers_of(effect).values():
-            count = len(value) if isinstance(value, tuple) else 1
-            each = ", ".join(f"params[{at + j}]" for j in range(count))
-            values.append(f"({each},)" if isinstance(value, tuple) else each)
-            at += count
-        if effect.tabled:
-            values.append(f"params[np.int64(params[{at}]) : np.int64(params[{at + 1}])]")
-            at += 2
-        if effect.count_law:
-            begin, end = (f"len(frame) - np.int64(params[{at + j}])" for j in range(2))
-            values.append(f"frame[{begin} : {end}]")
-            at += 2
-        lines.append(f"p{k} = P{k}({', '.join(values) or 'params[0]'})")
-    return lines
+            lines += [f"first{q} = numbers.views[{q}].first", f"end{q} = numbers.views[{q}].end"]
+    return lines + [f"p{k} = numbers.effects[{k}]" for k in range(len(parts.effects))]
 
 
 def _aim(parts: Parts) -> list[str]:

@@ -40,14 +40,13 @@ def method(parts: Parts) -> str:
 
 
 def _settings(parts: Parts) -> str:
-    """Write the method's own numbers: they lie behind those of the effects."""
-    count, at = len(parts.integrator.settings()), parts.last_numbers("method")
+    """Write the method's own numbers."""
     return f'''
 @kernel
 def settings(context):
     """The numbers of the method."""
     {CONTEXT} = context
-    return ({"".join(f"params[{at + k}], " for k in range(count))})
+    return numbers_of(params, frame).method
 
 
 '''

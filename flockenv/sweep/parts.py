@@ -25,6 +25,7 @@ from flockenv.kernels import IN_PYTHON, LINE, python_of
 from flockenv.shapes import packed
 from flockenv.shapes.cells import FEWEST_ROWS, MOST_FOUND, cells_of
 from flockenv.space import Space
+from flockenv.sweep.numbers import NumberPlan, pack_numbers
 
 __all__ = ["LAWS", "SMALL_STRIDE", "Look", "Parts", "flattened", "record_of", "sorted_at", "view_of"]
 
@@ -176,11 +177,7 @@ class Parts:
 
     def places_of(self, form: str) -> tuple[int, int, int]:
         """Return the places in `parameters` of a form's first row, of how many rows it has, and of its grid if any."""
-        at = self.dimension + 1
-        for each in self.shaped[1]:
-            if each == form:
-                break
-            at += 2 + (each in self.cells)
+        at, _ = self.number_plan.forms[list(self.shaped[1]).index(form)]
         return at, at + 1, at + 2
 
     @property
@@ -275,43 +272,18 @@ class Parts:
         """The largest distance at which any law looks for neighbours, m."""
         return max((sight.radius for sight in self.sights), default=0.0)
 
-    def parameters(self) -> list[float]:
-        """Every number that the kernel is given, in the order in which the source reads them; tables come behind.
+    @functools.cached_property
+    def _numbers(self) -> tuple[list[float], NumberPlan]:
+        return pack_numbers(self)
 
-        For each table there are two: where it begins, and where it ends.
-        """
-        shapes, forms = self.shaped
-        ends = np.cumsum([len(shapes), *map(len, self.cells.values())]).tolist()
-        cells = dict(zip(self.cells, ends, strict=False))
-        bounds, tables = [], iter(np.cumsum([ends[-1], *map(len, self.tables)]).tolist())
-        begin = next(tables)
-        values = [*self.space.extent(self.dimension), self.reach]
-        for form, (where, count) in forms.items():
-            bounds.append((len(values), where))
-            values += [0.0, float(count)]
-            if form in cells:
-                bounds.append((len(values), cells[form]))
-                values.append(0.0)
-        for sight in self.sights:
-            values += [sight.radius**2, view_of(sight.fov, self.dtype)]
-            if sight.group is not None:
-                values += self.starts[sight.group : sight.group + 2]
-        left = self.counters
-        for effect in self.effects:
-            for value in self.numbers_of(effect).values():
-                values.extend(value if isinstance(value, tuple) else (value,))
-            if effect.tabled:
-                bounds += [(len(values), begin), (len(values) + 1, begin := next(tables))]
-                values += [0.0, 0.0]
-            if effect.count_law:
-                values += [float(left), float(left - effect.counters)]
-                left -= effect.counters
-        values += self.space.numbers()
-        values += self.integrator.settings()
-        values += [self.look.radius, self.look.radius**2] if self.look else []
-        for place, bound in bounds:
-            values[place] = float(len(values) + bound)
-        return values
+    def parameters(self) -> list[float]:
+        """Every number that the kernel is given; tables come behind."""
+        return self._numbers[0]
+
+    @property
+    def number_plan(self) -> NumberPlan:
+        """Where each of them lies."""
+        return self._numbers[1]
 
     @property
     def count(self) -> int:
@@ -349,12 +321,6 @@ class Parts:
         """Write what the pair law of effect k adds to: the same, or what its fold over the obstacles is told."""
         effect = self.effects[k]
         return f"n{k}_" if effect.obstacle_start is not None or effect.keep_law is not None else self.target(k)
-
-    def last_numbers(self, kind: str) -> int:
-        """Return where in `parameters` the numbers of the "space" begin, or of the "method": they come last but one."""
-        look, method, space = 2 if self.look else 0, len(self.integrator.settings()), len(self.space.numbers())
-        behind = {"method": look + method, "space": look + method + space}
-        return len(self.parameters()) - behind[kind]
 
     @functools.cached_property
     def inner(self) -> tuple[str, ...]:

@@ -16,7 +16,6 @@ from flockenv.sweep.text import (
     Slots,
     alone,
     asked,
-    copied,
     frame_views,
     given,
     in_blocks,
@@ -30,7 +29,7 @@ from flockenv.sweep.text import (
     tuple_of,
 )
 
-__all__ = ["begin", "copies", "kept_frame", "kept_inner", "step", "step_world"]
+__all__ = ["begin", "kept_frame", "kept_inner", "step", "step_world"]
 
 
 PART = 8
@@ -38,37 +37,6 @@ PART = 8
 
 AHEAD = 16
 """So many blocks on it is asked for what agents are moved by, in large worlds: several arrays are read side by side."""
-
-
-def copies(parts: Parts) -> str:
-    """Return the source of `into_blocks` and `out_of_blocks`: from arrays of all worlds to blocks of one, and back."""
-    w = parts.width
-    block, world = ("blocks", "base"), ("array[k, b]", f"np.uint64(block * {w})")
-    into = f"blocks = array[:, b], agents in blocks of {w}; those beyond n are left as they are."
-    return (
-        "\n"
-        + _copy(parts, "into_blocks", into, block, world)
-        + _copy(parts, "out_of_blocks", "array[:, b] = blocks.", world, block)
-    )
-
-
-def _copy(parts: Parts, name: str, title: str, to: tuple[str, str], source: tuple[str, str]) -> str:
-    """Write one of the two: full blocks a vector at a time, then the last."""
-    w = parts.width
-    return f'''@kernel
-def {name}(blocks, array, b, n, first, end):
-    """{title}"""
-    for block in range(first, end):
-        for k in range({parts.dimension}):
-            base = np.uint64(block * {parts.dimension * w} + k * {w})
-            if (block + 1) * {w} <= n:
-{indented([copied(parts, *to, *source)], 16)}
-            else:
-                for l in range(np.uint64(n - block * {w})):
-                    {to[0]}[{to[1]} + l] = {source[0]}[{source[1]} + l]
-
-
-'''
 
 
 def kept_frame(parts: Parts, from_state: bool) -> list[str]:
@@ -342,7 +310,7 @@ def _stay_inside(parts: Parts) -> list[str]:
     limited = "scale(limit(v, max_speed[one + l]), living[live + l])"
     if not parts.bounces:
         return [f"x, v = confine(size, radius[one + l], x, {limited})"]
-    restitution = f"params[{parts.last_numbers('space')}]"
+    restitution = "numbers.space[0]"
     return [
         "earlier = scale(earlier, living[live + l])",
         f"x, v = bounce(size, radius[one + l], {restitution}, dt, was, earlier, x, {limited})",

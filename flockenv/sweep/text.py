@@ -118,12 +118,7 @@ def given(parts: Parts, k: int) -> str:
 
 def nearest_image(parts: Parts, k: int, here: str) -> str:
     """Write the numbers of effect k anew: with the images of its places that are nearest to `here`."""
-    effect = parts.effects[k]
-    values = [
-        f"add({here}, offset_to(size, {here}, p{k}.{name}))" if name in effect.places else f"p{k}.{name}"
-        for name in parts.names_of(effect)
-    ]
-    return f"near{k} = P{k}({', '.join(values)})"
+    return f"near{k} = images_of_{k}(p{k}, size, {here})"
 
 
 def nearest_images(parts: Parts, effects: list[tuple[int, Effect]]) -> list[str]:

@@ -1,0 +1,283 @@
+"""The numbers of a scene: how they are packed into the one array that a kernel is handed, and read there by name.
+
+`pack_numbers` says both at once, the values and where each lies (`NumberPlan`), so that packing and reading cannot
+disagree. Code depends on the plan; the values are arguments, and another value compiles nothing.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+from numba.core import cgutils, types
+from numba.np import arrayobj
+
+from flockenv.kernels import Law, intrinsic_or_python, kernel, written
+from flockenv.section import record, section
+from flockenv.vec import add
+
+if TYPE_CHECKING:
+    from flockenv.sweep.parts import Parts
+
+__all__ = ["Form", "NumberPlan", "Numbers", "View", "images_of", "numbers_of", "pack_numbers", "taken"]
+
+
+class Form(NamedTuple):
+    """Where the rows of a form of shapes begin, how many there are, and where the grid over them begins."""
+
+    at: Any
+    many: Any
+    cells: Any  # 0 of a form without a grid
+
+
+class View(NamedTuple):
+    """How pair laws look around: see effects.base.Sight."""
+
+    within: float  # m^2, radius squared
+    cone: float  # what `in_view` compares
+    first: float  # the agents that are seen at all: those of a group, [first, end); 0 where all are
+    end: float
+
+
+class Numbers(NamedTuple):
+    """Every number of a scene, as its kernels read them."""
+
+    size: tuple[float, ...]  # m, of the space
+    reach: float  # m, the largest distance at which any law looks for neighbours
+    forms: tuple[Form, ...]
+    views: tuple[View, ...]
+    effects: tuple[Any, ...]  # of each effect a record of what its laws are given, by name
+    space: tuple[float, ...]
+    method: tuple[float, ...]
+    look: tuple[float, ...]  # the radius of what a task shows, m, and its square
+
+
+class EffectPlan(NamedTuple):
+    """Where the numbers of an effect lie: of each name whether it is a number, vector, table or counters, and where."""
+
+    names: tuple[str, ...]
+    kinds: tuple[tuple[str, int, int], ...]  # (kind, place, how many numbers)
+
+
+class NumberPlan(NamedTuple):
+    """Where every number of a scene lies."""
+
+    dimension: int
+    forms: tuple[tuple[int, bool], ...]  # (place, has a grid)
+    views: tuple[tuple[int, bool], ...]  # (place, sees one group alone)
+    effects: tuple[EffectPlan, ...]
+    space: tuple[int, int]  # (place, how many)
+    method: tuple[int, int]
+    look: tuple[int, int]
+
+
+def pack_numbers(parts: Parts) -> tuple[list[float], NumberPlan]:
+    """Return every number that a kernel is given, and where each lies; tables come behind them.
+
+    What lies behind (rows of shapes, grids, tables) is known by where it begins, and a table by where it ends, too.
+    """
+    from flockenv.sweep.parts import view_of
+
+    shapes, forms = parts.shaped
+    ends = np.cumsum([len(shapes), *map(len, parts.cells.values())]).tolist()
+    grids = dict(zip(parts.cells, ends, strict=False))
+    tables = iter(np.cumsum([ends[-1], *map(len, parts.tables)]).tolist())
+    begin, behind = next(tables), []  # (place, how far behind all numbers what is meant lies)
+    values: list[float] = [*parts.space.extent(parts.dimension), parts.reach]
+    planned_forms, views, effects = [], [], []
+    for form, (where, count) in forms.items():
+        planned_forms.append((len(values), form in grids))
+        behind.append((len(values), where))
+        values += [0.0, float(count)]
+        if form in grids:
+            behind.append((len(values), grids[form]))
+            values.append(0.0)
+    for sight in parts.sights:
+        views.append((len(values), sight.group is not None))
+        values += [sight.radius**2, view_of(sight.fov, parts.dtype)]
+        if sight.group is not None:
+            values += parts.starts[sight.group : sight.group + 2]
+    left = parts.counters
+    for effect in parts.effects:
+        kinds: list[tuple[str, int, int]] = []
+        for value in parts.numbers_of(effect).values():
+            vector = isinstance(value, tuple)
+            kinds.append(("vector" if vector else "number", len(values), len(value) if vector else 1))
+            values.extend(value if vector else (value,))
+        if effect.tabled:
+            kinds.append(("table", len(values), 2))
+            behind += [(len(values), begin), (len(values) + 1, begin := next(tables))]
+            values += [0.0, 0.0]
+        if effect.count_law:
+            kinds.append(("counters", len(values), 2))
+            values += [float(left), float(left - effect.counters)]
+            left -= effect.counters
+        effects.append(EffectPlan(tuple(parts.names_of(effect)), tuple(kinds)))
+    rest = []
+    for more in (parts.space.numbers(), parts.integrator.settings(), _look_numbers(parts)):
+        rest.append((len(values), len(more)))
+        values += more
+    for place, bound in behind:
+        values[place] = float(len(values) + bound)
+    return values, NumberPlan(parts.dimension, tuple(planned_forms), tuple(views), tuple(effects), *rest)
+
+
+def _look_numbers(parts: Parts) -> list[float]:
+    """Return how far a task looks around, m, and the square of that; nothing if it does not."""
+    return [parts.look.radius, parts.look.radius**2] if parts.look else []
+
+
+def _taken(typing_context: Any, array: Any, place: Any, count: Any) -> Any:
+    """Return `count` numbers of an array, from a place on, as a tuple; both are written down in the source."""
+    wide = written(count, "count")
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        make: Any = arrayobj.make_array
+        number = context.get_data_type(array.dtype)
+        start = builder.gep(make(signature.args[0])(context, builder, arguments[0]).data, [arguments[1]])
+        pointers = (cgutils.gep_inbounds(builder, start, k) for k in range(wide))  # type: ignore[no-untyped-call]
+        size = context.get_abi_sizeof(number)
+        found = [builder.load(pointer, align=size) for pointer in pointers]
+        return context.make_tuple(builder, signature.return_type, found)
+
+    numbers: Any = types.BaseTuple.from_types([array.dtype] * wide)  # type: ignore[no-untyped-call]
+    return numbers(array, types.intp, count), generate
+
+
+taken: Any = intrinsic_or_python(_taken, lambda array, place, count: tuple(array[place : place + count]))
+
+
+@section
+def numbers_of(plan: NumberPlan) -> Callable[[Any, Any], Numbers]:
+    """Make `numbers_of(params, frame)`: all numbers of a scene, read from the arrays that its kernel is handed."""
+    d = plan.dimension
+    forms, views = _all_of(tuple(map(_form, plan.forms))), _all_of(tuple(map(_view, plan.views)))
+    effects = _all_of(tuple(map(_effect, plan.effects)))
+    (space_at, spaces), (method_at, methods), (look_at, looks) = plan.space, plan.method, plan.look
+
+    def read(params: Any, frame: Any) -> Any:
+        return Numbers(
+            taken(params, 0, d),
+            params[d],
+            forms(params, frame),
+            views(params, frame),
+            effects(params, frame),
+            taken(params, space_at, spaces),
+            taken(params, method_at, methods),
+            taken(params, look_at, looks),
+        )
+
+    return read
+
+
+@functools.cache
+def _all_of(readers: tuple[Callable[..., Any], ...]) -> Callable[..., tuple[Any, ...]]:
+    """Return a function that makes a tuple of what each of some functions reads."""
+    if not readers:
+        return kernel(lambda params, frame: ())
+    before, last = _all_of(readers[:-1]), readers[-1]
+
+    def each(params: Any, frame: Any) -> Any:
+        return before(params, frame) + (last(params, frame),)  # noqa: RUF005  # numba adds tuples, and unpacks none
+
+    return kernel(each)
+
+
+@functools.cache
+def _form(place: tuple[int, bool]) -> Callable[..., Form]:
+    at, gridded = place
+
+    def form(params: Any, frame: Any) -> Any:
+        if gridded:
+            return Form(np.int64(params[at]), np.int64(params[at + 1]), np.int64(params[at + 2]))
+        return Form(np.int64(params[at]), np.int64(params[at + 1]), np.int64(0))
+
+    return kernel(form)
+
+
+@functools.cache
+def _view(place: tuple[int, bool]) -> Callable[..., View]:
+    at, grouped = place
+
+    def view(params: Any, frame: Any) -> Any:
+        if grouped:
+            return View(params[at], params[at + 1], params[at + 2], params[at + 3])
+        return View(params[at], params[at + 1], params[at], params[at])
+
+    return kernel(view)
+
+
+@functools.cache
+def _effect(plan: EffectPlan) -> Callable[..., Any]:
+    """Make a function that reads the record of an effect."""
+    kind, values = record(plan.names), _all_in(_runs(plan.kinds or (("number", 0, 1),)))
+
+    def effect(params: Any, frame: Any) -> Any:
+        return kind(*values(params, frame))
+
+    return kernel(effect)
+
+
+def _runs(kinds: tuple[tuple[str, int, int], ...]) -> tuple[tuple[str, int, int], ...]:
+    """Return the same with numbers that follow each other read at once."""
+    runs: list[tuple[str, int, int]] = []
+    for kind, at, count in kinds:
+        if kind == "number" and runs and runs[-1][0] == "number" and sum(runs[-1][1:]) == at:
+            runs[-1] = (kind, runs[-1][1], runs[-1][2] + 1)
+        else:
+            runs.append((kind, at, count))
+    return tuple(runs)
+
+
+@functools.cache
+def _all_in(runs: tuple[tuple[str, int, int], ...]) -> Callable[..., tuple[Any, ...]]:
+    """Make a function that reads what an effect's laws are given, in order."""
+    if len(runs) == 1:
+        return _run(runs[0])
+    before, last = _all_in(runs[:-1]), _run(runs[-1])
+    return kernel(lambda params, frame: before(params, frame) + last(params, frame))
+
+
+@functools.cache
+def _run(run: tuple[str, int, int]) -> Callable[..., tuple[Any, ...]]:
+    kind, at, count = run
+    if kind == "number":
+        return kernel(lambda params, frame: taken(params, at, count))
+    if kind == "vector":
+        return kernel(lambda params, frame: (taken(params, at, count),))
+    if kind == "table":
+        return kernel(lambda params, frame: (params[np.int64(params[at]) : np.int64(params[at + 1])],))
+
+    def counters(params: Any, frame: Any) -> Any:
+        return (frame[len(frame) - np.int64(params[at]) : len(frame) - np.int64(params[at + 1])],)
+
+    return kernel(counters)
+
+
+@section
+def images_of(names: tuple[str, ...], places: tuple[str, ...], offset_to: Law) -> Callable[..., Any]:
+    """Make `images_of(p, size, here)`: the record of an effect with its points where they are nearest to `here`.
+
+    On a torus a point has images; laws see the nearest.
+    """
+    kind, values = record(names), _imaged(tuple(name in places for name in names), offset_to)
+
+    def images(p: Any, size: Any, here: Any) -> Any:
+        return kind(*values(p, size, here))
+
+    return images
+
+
+@functools.cache
+def _imaged(points: tuple[bool, ...], offset_to: Law) -> Callable[..., tuple[Any, ...]]:
+    """Make a function that returns the values of a record, those that are points as seen from somewhere."""
+    *earlier, point = points
+    before, last = _imaged(tuple(earlier), offset_to) if earlier else None, len(earlier)
+
+    def values(p: Any, size: Any, here: Any) -> Any:
+        mine = (add(here, offset_to(size, here, p[last])),) if point else (p[last],)
+        return mine if before is None else before(p, size, here) + mine
+
+    return kernel(values)

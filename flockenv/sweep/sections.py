@@ -1,0 +1,27 @@
+"""The sections of a scene: functions that its generated file calls, made of what its parts say.
+
+Each is made by a section of its own module, from as little of the parts as it depends on.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from flockenv.sweep.blocks import into_blocks, out_of_blocks
+from flockenv.sweep.numbers import images_of, numbers_of
+from flockenv.sweep.parts import Parts
+
+__all__ = ["sections_of"]
+
+
+def sections_of(parts: Parts) -> tuple[tuple[str, Any], ...]:
+    """Return the functions that the generated file of a scene calls, with the names under which it finds them."""
+    made: dict[str, Any] = {
+        "numbers_of": numbers_of(parts.number_plan),
+        "into_blocks": into_blocks(parts.dimension, parts.width),
+        "out_of_blocks": out_of_blocks(parts.dimension, parts.width),
+    }
+    for k, effect in enumerate(parts.effects):
+        if parts.space.periodic and effect.places:
+            made[f"images_of_{k}"] = images_of(tuple(parts.names_of(effect)), effect.places, parts.space.offset_law)
+    return tuple(made.items())
