@@ -33,7 +33,7 @@ from flockenv.integrators import INTEGRATORS, Adaptive, ImplicitEuler, Integrato
 from flockenv.integrators.newton import Coupling
 from flockenv.kernels import load
 from flockenv.magnitudes import check_numbers
-from flockenv.neighbours import FEWEST_AGENTS, FEWEST_ARRANGED
+from flockenv.neighbours import FEWEST_AGENTS
 from flockenv.networks import EDGE
 from flockenv.noise import MASK, key_of
 from flockenv.placing import cells_of, place_groups
@@ -48,9 +48,18 @@ from flockenv.space import AnySpace, Box, Plane, Torus
 from flockenv.stability import check_contact, check_dt, check_lookahead
 from flockenv.state import Body, Floats, State
 from flockenv.steer import EVERY_EFFECT
-from flockenv.sweep import Parts, Table, field_source, flattened, pack, scene_source, sections_of
-from flockenv.tiles import HOME
-from flockenv.tree import MOST_DIRECT, tree_sizes
+from flockenv.sweep import (
+    Parts,
+    Table,
+    field_source,
+    flattened,
+    pack,
+    scene_source,
+    scratch_bytes,
+    scratch_record,
+    sections_of,
+)
+from flockenv.tree import MOST_DIRECT
 from flockenv.workspace import Workspace
 
 __all__ = ["Group", "Scene"]
@@ -290,28 +299,13 @@ class Scene(Record):
         """Memory of a state and its scratch, in bytes, counted before anything is allocated."""
         real = 8 if self.dtype == "float64" else 4
         d, parts = self.dimension, self.parts
-        reals = 2 * d + 5  # positions, velocities, bodies
-        reals += 3 * d + parts.aside + parts.integrator.stages * d + 6  # blocks of them, the drive, the stages
-        whole = 1
-        if parts.sweeps:
-            reals += d * (len(parts.targets) + 1)
-            whole += 3 * 4 if parts.sorts else 4
-        if parts.sweeps and parts.sorts:
-            reals += parts.numbers
-        reals += d * (parts.pulls + parts.flows)
-        reals += parts.frame_rows + len(parts.inner) + parts.framed
-        if parts.treed:
-            numbers = tree_sizes(self.agents, parts.width, d, 1)
-            reals += -(-sum(numbers.values()) // self.agents)
-            whole += 24
-        if parts.arranges and self.agents >= FEWEST_ARRANGED:
-            reals += parts.luggage_size
-            whole += (4 + 4 * HOME // parts.width) * parts.homely  # strangers, and where each block is at home
+        reals, whole = 2 * d + 5, 1  # positions, velocities, bodies; who is alive
+        reals += parts.frame_rows + len(parts.inner)
         if self.constraints or self.population:
             reals += 4 * d + sum(constraint.numbers(self) for constraint in self.constraints)
         if self.population:
             whole += 2 * 3 * 8 + 4 * POPULATION_NUMBERS  # who, since when, until when, and what they were before
-        return self.agents * (reals * real + whole) + parts.counters * real
+        return self.agents * (reals * real + whole) + scratch_bytes(parts, self.agents)
 
     @functools.cached_property
     def body(self) -> Body:
@@ -422,7 +416,7 @@ class Scene(Record):
         if self.parts.inner and fresh.any():
             self._kernels.begin(
                 state.x, state.v, *state.carried, state.key, state.tick, self._params, self._dt, fresh,
-                *self._workspaces(1, 1)[0].of(0, self._kernels.SCRATCH),
+                self._workspaces(1, 1)[0].of(0, self._scratch_kind),
             )  # fmt: skip
 
     def inner(self, state: State, name: str) -> Floats:
@@ -515,7 +509,7 @@ class Scene(Record):
         self._accelerations.field(
             x, state.v, *state.carried, state.alive, state.key, state.obstacle_x, state.obstacle_radius,
             state.work, self._drive(drive, state), self._params, when, acc, flow,
-            *self._workspaces(1, 1)[0].of(0, self._accelerations.SCRATCH),
+            self._workspaces(1, 1)[0].of(0, scratch_record(self._plain_parts)),
         )  # fmt: skip
         return acc.transpose(1, 2, 0), flow.transpose(1, 2, 0) if self.parts.flows else None
 
@@ -613,7 +607,7 @@ class Scene(Record):
         Threads take worlds apart, or, of a large world, its agents.
         """
         worlds, agents, _ = state.shape
-        move, scratch = self._kernels.step, self._kernels.SCRATCH
+        move, kind = self._kernels.step, self._scratch_kind
         arrays = (
             state.x, state.v, *state.carried, state.alive, state.tick, state.key, state.obstacle_x,
             state.obstacle_radius, state.work, drive, self._params, self._dt, steps,
@@ -621,7 +615,7 @@ class Scene(Record):
         crew, team = self._divided(worlds, agents)
 
         def alone() -> tuple[int, int]:
-            return move(*arrays, 0, worlds, 0, 1, *self._workspaces(1, 1)[0].of(0, scratch))  # type: ignore[no-any-return]
+            return move(*arrays, 0, worlds, 0, 1, self._workspaces(1, 1)[0].of(0, kind))  # type: ignore[no-any-return]
 
         if crew <= 1:
             return alone()
@@ -631,7 +625,7 @@ class Scene(Record):
             spaces[0].arrays["sync"][:] = 0
             parts = [(0, worlds) if team > 1 else (worlds * k // crew, worlds * (k + 1) // crew) for k in range(crew)]
             found = share([
-                functools.partial(move, *arrays, *parts[k], k % team, team, *spaces[k // team].of(k % team, scratch))
+                functools.partial(move, *arrays, *parts[k], k % team, team, spaces[k // team].of(k % team, kind))
                 for k in range(crew)
             ])  # fmt: skip
             return min([bad for bad in found if bad[0] >= 0], default=(-1, -1))
@@ -694,8 +688,16 @@ class Scene(Record):
 
     @functools.cached_property
     def _accelerations(self) -> Any:
-        plain = dataclasses.replace(self.parts, integrator=SemiImplicitEuler())  # the method makes no difference
-        return load("field", field_source(plain), sections_of(plain))
+        return load("field", field_source(self._plain_parts), sections_of(self._plain_parts))
+
+    @functools.cached_property
+    def _plain_parts(self) -> Parts:
+        """What accelerations alone are made of: the method makes no difference."""
+        return dataclasses.replace(self.parts, integrator=SemiImplicitEuler())
+
+    @functools.cached_property
+    def _scratch_kind(self) -> Any:
+        return scratch_record(self.parts)
 
     @functools.cached_property
     def _kernels(self) -> Any:

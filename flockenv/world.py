@@ -24,7 +24,7 @@ from flockenv.refusals import nearest
 from flockenv.scene import MEMORY_LIMIT
 from flockenv.snapshot import Snapshot
 from flockenv.state import State
-from flockenv.sweep import Look, pack, sections_of
+from flockenv.sweep import Look, pack, scratch_record, sections_of
 from flockenv.tasks import Task
 from flockenv.tasks.base import REFUSED, task_source
 from flockenv.workspace import Workspace
@@ -165,7 +165,7 @@ class World:
         ] + [zeros((d, look.agents, padded), real)]
         space = Workspace.allocate(task.parts, scene.body, pack(task.parts, n, scene.groups))
         canvas = zeros(self._shapes[0][1:] if self._past else (0, 0), np.float32)
-        return canvas, decision, (*near, *space.of(0, self._kernel.SCRATCH))
+        return canvas, decision, (*near, space.of(0, scratch_record(task.parts)))
 
     def __getstate__(self) -> dict[str, Any]:
         """Pickle what cannot be made anew."""

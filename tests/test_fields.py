@@ -28,7 +28,6 @@ from flockenv.integrators import RK4, SemiImplicitEuler
 from flockenv.scene import Group, Scene
 from flockenv.space import Torus
 from flockenv.spawn import Spawn
-from flockenv.sweep import scene_source
 from tests.catalogue import Array
 
 
@@ -68,9 +67,10 @@ def test_gusts_rise_and_fall_within_a_period() -> None:
 def test_what_is_steady_knows_no_time() -> None:
     steady = scene_of(Source(strength=1, centre=(0, 0), maximum=1), Wind(velocity=(1, 0)))
     swinging = scene_of(Source(strength=1, centre=(0, 0), maximum=1, period=2), Wind(velocity=(1, 0)))
-    assert "period" not in scene_source(steady.parts)
-    assert "gusty" not in scene_source(steady.parts)
-    assert "period" in scene_source(swinging.parts)
+    (source, wind), (swung, _) = steady.parts.number_plan.effects, swinging.parts.number_plan.effects
+    assert "period" not in source.names
+    assert "period" in swung.names
+    assert not any("gust" in name for name in wind.names)
 
 
 # --- media ------------------------------------------------------------------------------------------------------------

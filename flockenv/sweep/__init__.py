@@ -18,12 +18,12 @@ from __future__ import annotations
 
 from flockenv.sweep.bonds import Table, pack
 from flockenv.sweep.look import look_source
-from flockenv.sweep.parts import SMALL_STRIDE, Look, Parts, flattened
+from flockenv.sweep.parts import Look, Parts, flattened
+from flockenv.sweep.scratch import GIVEN, OWN, scratch_bytes, scratch_of, scratch_record
 from flockenv.sweep.sections import sections_of
 from flockenv.sweep.source import field_source, scene_source
-from flockenv.sweep.text import SHARED
 
 __all__ = [
-    "SHARED", "SMALL_STRIDE", "Look", "Parts", "Table", "field_source", "flattened", "look_source", "pack",
-    "scene_source", "sections_of",
+    "GIVEN", "OWN", "Look", "Parts", "Table", "field_source", "flattened", "look_source", "pack", "scene_source",
+    "scratch_bytes", "scratch_of", "scratch_record", "sections_of",
 ]  # fmt: skip

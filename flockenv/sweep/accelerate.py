@@ -10,14 +10,13 @@ from __future__ import annotations
 
 from flockenv.sweep.bonds import bonds
 from flockenv.sweep.far import far
+from flockenv.sweep.handed import OPEN_CONTEXT
 from flockenv.sweep.obstacles import obstacles
 from flockenv.sweep.pairs import pairs
 from flockenv.sweep.parts import Parts
 from flockenv.sweep.text import (
-    CONTEXT,
     Slots,
     alone,
-    frame_views,
     given,
     in_blocks,
     in_common,
@@ -43,8 +42,8 @@ def sense(parts: Parts) -> str:
 @kernel
 def sense(context, pos, vel, time):
     """Write what this thread's agents of one world feel from others, at this instant, whatever law it is by."""
-    {CONTEXT} = context
-{indented(needed([*frame_views(parts), *parameters(parts)], sensing), 4)}
+    {OPEN_CONTEXT}
+{indented(needed(parameters(parts, "context.numbers"), sensing), 4)}
     if rank == 0:
         work[b, 0] += 1
 {indented(sensing, 4)}
@@ -95,14 +94,14 @@ def accelerate(parts: Parts) -> str:
 @kernel
 def accelerate(context, pos, vel, time, acc):
     """Write the acceleration of this thread's agents, m/s^2."""
-    {CONTEXT} = context
-{indented(needed([*frame_views(parts), *parameters(parts)], responding), 4)}
+    {OPEN_CONTEXT}
+{indented(needed(parameters(parts, "context.numbers"), responding), 4)}
     sense(context, pos, vel, time)
 {indented(in_blocks(parts, "first", "end", responding), 4)}
 '''
 
 
-def parameters(parts: Parts, numbers: str = "numbers_of(params, frame)") -> list[str]:
+def parameters(parts: Parts, numbers: str = "numbers_of(params, scratch.counters)") -> list[str]:
     """Write by which names the numbers of a scene are known."""
     lines = [f"numbers = {numbers}", "size, reach = numbers.size, numbers.reach"]
     for j, form in enumerate(parts.shaped[1]):

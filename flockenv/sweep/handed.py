@@ -1,42 +1,56 @@
-"""What the functions of a source are handed: of all the scratch and context there is, what some line of it names.
-
-To machine code an array is seven arguments. Two dozen that nobody reads are a fifth of the time that a small scene
-takes to compile, and are unpacked at every call.
-"""
+"""What the functions of a source are handed: of the records of context and scratch they take out what they name."""
 
 from __future__ import annotations
 
 import re
+from typing import Any, NamedTuple
 
-from flockenv.sweep.text import CONTEXT, SHARED
+from flockenv.sweep.parts import Parts
+from flockenv.sweep.scratch import scratch_of
 
-__all__ = ["trimmed"]
+__all__ = ["OPEN_CONTEXT", "OPEN_SCRATCH", "Context", "opened"]
 
-_NAMES = CONTEXT.split(", ")
-_UNPACKED = re.compile(re.escape(CONTEXT) + r" = (.+)")
+OPEN_CONTEXT, OPEN_SCRATCH = "<from context>", "<from scratch>"
+"""Lines that stand where a function takes out of its context, or of the scratch, what it names."""
 
 
-def trimmed(source: str) -> str:
-    """Return a source that was written as if all were handed to everybody, with what is named alone.
+class Context(NamedTuple):
+    """One world in progress, as what computes accelerations sees it."""
 
-    A function that opens its context takes out of it what it names; the context, and the scratch, are what all of them
-    do. `SCRATCH` says, to whoever calls an entry point, which scratch that is, in order.
-    """
+    obstacle_x: Any  # (D, B, M) m
+    obstacle_radius: Any  # (B, M) m
+    work: Any  # (B, 8) counters
+    params: Any  # the numbers of the scene in one row, with its tables behind them
+    numbers: Any  # the same by name: numbers.Numbers
+    key: Any  # (B,) of random numbers
+    b: Any  # which world
+    n: Any  # how many agents
+    present: Any  # how many of them are alive
+    arranged: Any  # do they lie by tiles, and not by number?
+    first: Any  # this thread's blocks: [first, end)
+    end: Any
+    rank: Any  # which thread of the team that steps this world
+    team: Any  # how many those are
+    scratch: Any  # a record of arrays, see scratch.py
+
+
+def opened(parts: Parts, source: str) -> str:
+    """Return a source in which every function takes out of its records what it names."""
+    scratch = list(scratch_of(parts, parts.width))
     functions = re.split(r"(?=^@)", source, flags=re.MULTILINE)
-    named = [_words(text) if _UNPACKED.search(text) else set() for text in functions]
-    context = [name for name in _NAMES if any(name in words for words in named)]
+    return "".join(_opened(text, scratch) for text in functions)
 
-    def opened(text: str, words: set[str]) -> str:
-        mine = [(name, place) for place, name in enumerate(context) if name in words]
-        return _UNPACKED.sub(lambda m: "; ".join(f"{name} = {m[1]}[{place}]" for name, place in mine), text)
 
-    text = "".join(map(opened, functions, named)).replace(f"({CONTEXT})", f"({', '.join(context)},)")
-    words = _words(text)
-    scratch = ", ".join(name for name in SHARED.split(", ") if name in words)
-    return text.replace(SHARED, scratch) + f'\n\nSCRATCH = "{scratch}"\n'
+def _opened(text: str, scratch: list[str]) -> str:
+    words, arguments = _words(text), set(re.findall(r"\w+", text[text.find("(") : text.find("):")]))
+    arrays = [name for name in scratch if name in words and name not in arguments]
+    shared = [name for name in Context._fields if name in words and name not in arguments and name != "scratch"]
+    from_scratch = [f"{name} = scratch.{name}" for name in arrays]
+    from_context = [f"{name} = context.{name}" for name in [*shared, *["scratch"] * bool(arrays)]]
+    text = text.replace(OPEN_SCRATCH, "; ".join(from_scratch) or "pass")
+    return text.replace(OPEN_CONTEXT, "; ".join([*from_context, *from_scratch]) or "pass")
 
 
 def _words(text: str) -> set[str]:
-    """Return all words of a text's code but those of the lists themselves; a comment needs no array."""
-    code = re.sub(r"#.*", "", text.replace(CONTEXT, "").replace(SHARED, ""))
-    return set(re.findall(r"\w+", code))
+    """Return all words of a text's code; a comment needs no array."""
+    return set(re.findall(r"\w+", re.sub(r"#.*", "", text)))

@@ -5,10 +5,12 @@ It asks the same query as the pair laws, and keeps, for each lane, sorted lists 
 
 from __future__ import annotations
 
+from flockenv.sweep.handed import OPEN_SCRATCH
 from flockenv.sweep.pairs import me_of, meet_range, offset_of
-from flockenv.sweep.parts import SMALL_STRIDE, Parts, sorted_at
+from flockenv.sweep.parts import Parts, sorted_at
 from flockenv.sweep.query import listed, listed_at, query, walk
-from flockenv.sweep.text import SHARED, Slots, indented, indented_lines, lanes_of, tuple_of
+from flockenv.sweep.scratch import SMALL_STRIDE
+from flockenv.sweep.text import Slots, indented, indented_lines, lanes_of, tuple_of
 
 __all__ = ["AT_ONCE", "KEYS", "look_source", "merged"]
 
@@ -23,18 +25,19 @@ def look_source(parts: Parts) -> str:
     """Return the source of `look`: what is near every agent of a world, by the query that pair laws use."""
     if parts.look is None:
         return ""
-    at = len(parts.parameters()) - 2
+    at = parts.number_plan.look[0]
     return f'''
 @kernel
 def look(
     x_, alive, obstacle_x, obstacle_radius, b, params,
-    near_square, near_who, near_count, obstacle_gap, obstacle_who, obstacle_count, near_pos, {SHARED},
+    near_square, near_who, near_count, obstacle_gap, obstacle_who, obstacle_count, near_pos, scratch,
 ):
     """Write, for every agent of world b, the nearest agents (K, N) and obstacles (J, N), and how many (N,).
 
     Where there is none, it is infinitely far, and some number stands there: of agents, one that exists. Returns whether
     it has written where these are, too (D, K, N).
     """
+    {OPEN_SCRATCH}
     n, rank, team = x_.shape[2], 0, 1
     first, end = 0, (n + {parts.width - 1}) // {parts.width}
     size, reach, within = {tuple_of("params[#]", parts.dimension)}, params[{at}], params[{at + 1}]
@@ -130,7 +133,8 @@ def _keyed(parts: Parts) -> list[str]:
         there = ", ".join(f"near_pos[{j}, {k}, block + l]" for j in range(d))
         lines += [
             f"    line, beside = np.uint64({k}) * listed + block, np.uint64({many}) * listed",
-            f"    pick(near_pos, line, beside, sorted_, table, length, np.uint64({d}), agents, near_who, line, {w})",
+            "    rows = sorted_rows",
+            f"    pick(near_pos, line, beside, rows, table, length, np.uint64({d}), agents, near_who, line, {w})",
             f"    for l in range(np.uint64({w})):",
             f"        {me_of(parts, parts.seen_fields)}",
             f"        to = {offset_of(parts, f'({there})')}",

@@ -8,8 +8,9 @@ import inspect
 from flockenv.integrators.base import PROVIDED, SUBSTEPS
 from flockenv.kernels import python_of
 from flockenv.sweep.accelerate import parameters
+from flockenv.sweep.handed import OPEN_CONTEXT
 from flockenv.sweep.parts import Parts
-from flockenv.sweep.text import CONTEXT, indented, needed
+from flockenv.sweep.text import indented, needed
 
 __all__ = ["method", "method_imports"]
 
@@ -34,22 +35,13 @@ def method(parts: Parts) -> str:
     text = text[text.index("def advance(") :].replace("acceleration: Any, ", "", 1)
     for annotation in (": Any", ": float", ": int"):
         text = text.replace(annotation, "")
-    writers = {"damping": _damping, "settings": _settings, "largest": _largest, "counted": _counted}
-    asked = [writers[name](parts) for name in sorted(PROVIDED & set(python.__code__.co_names))]
-    return "".join(asked) + "\n@kernel\n" + text.replace("acceleration(", "accelerate(")
-
-
-def _settings(parts: Parts) -> str:
-    """Write the method's own numbers."""
-    return f'''
-@kernel
-def settings(context):
-    """The numbers of the method."""
-    {CONTEXT} = context
-    return numbers_of(params, frame).method
-
-
-'''
+    writers = {"damping": _damping, "largest": _largest, "counted": _counted}
+    asked = [writers[name](parts) for name in sorted(PROVIDED & set(python.__code__.co_names)) if name in writers]
+    return (
+        "".join(asked)
+        + "\n@kernel\n"
+        + text.replace("acceleration(", "accelerate(").replace("settings(context)", "context.numbers.method")
+    )
 
 
 def _damping(parts: Parts) -> str:
@@ -60,8 +52,8 @@ def _damping(parts: Parts) -> str:
 @kernel
 def damping(context, rate, begin, until):
     """The sum of all linear drags of every coordinate, 1/s."""
-    {CONTEXT} = context
-{indented(needed(parameters(parts), rates), 4)}
+    {OPEN_CONTEXT}
+{indented(needed(parameters(parts, "context.numbers"), rates), 4)}
     c = {" + ".join(rates) or "like(mass[0], 0.0)"}
     for block in range(np.uint64(begin // {d * w}), np.uint64(until // {d * w})):
         base, row = block * np.uint64({d * w}), block * np.uint64({w})
@@ -100,7 +92,7 @@ def _counted(parts: Parts) -> str:
 @kernel
 def counted(context, accepted, rejected):
     """Count steps of the method's own."""
-    {CONTEXT} = context
+    {OPEN_CONTEXT}
     work[b, {SUBSTEPS}] += accepted
     work[b, {SUBSTEPS + 1}] += rejected
 

@@ -151,19 +151,19 @@ taken: Any = intrinsic_or_python(_taken, lambda array, place, count: tuple(array
 
 @section
 def numbers_of(plan: NumberPlan) -> Callable[[Any, Any], Numbers]:
-    """Make `numbers_of(params, frame)`: all numbers of a scene, read from the arrays that its kernel is handed."""
+    """Make `numbers_of(params, counters)`: all numbers of a scene, read from the arrays that its kernel is handed."""
     d = plan.dimension
     forms, views = _all_of(tuple(map(_form, plan.forms))), _all_of(tuple(map(_view, plan.views)))
     effects = _all_of(tuple(map(_effect, plan.effects)))
     (space_at, spaces), (method_at, methods), (look_at, looks) = plan.space, plan.method, plan.look
 
-    def read(params: Any, frame: Any) -> Any:
+    def read(params: Any, counters: Any) -> Any:
         return Numbers(
             taken(params, 0, d),
             params[d],
-            forms(params, frame),
-            views(params, frame),
-            effects(params, frame),
+            forms(params, counters),
+            views(params, counters),
+            effects(params, counters),
             taken(params, space_at, spaces),
             taken(params, method_at, methods),
             taken(params, look_at, looks),
@@ -176,11 +176,11 @@ def numbers_of(plan: NumberPlan) -> Callable[[Any, Any], Numbers]:
 def _all_of(readers: tuple[Callable[..., Any], ...]) -> Callable[..., tuple[Any, ...]]:
     """Return a function that makes a tuple of what each of some functions reads."""
     if not readers:
-        return kernel(lambda params, frame: ())
+        return kernel(lambda params, counters: ())
     before, last = _all_of(readers[:-1]), readers[-1]
 
-    def each(params: Any, frame: Any) -> Any:
-        return before(params, frame) + (last(params, frame),)  # noqa: RUF005  # numba adds tuples, and unpacks none
+    def each(params: Any, counters: Any) -> Any:
+        return before(params, counters) + (last(params, counters),)  # noqa: RUF005  # numba adds tuples, and unpacks none
 
     return kernel(each)
 
@@ -189,7 +189,7 @@ def _all_of(readers: tuple[Callable[..., Any], ...]) -> Callable[..., tuple[Any,
 def _form(place: tuple[int, bool]) -> Callable[..., Form]:
     at, gridded = place
 
-    def form(params: Any, frame: Any) -> Any:
+    def form(params: Any, counters: Any) -> Any:
         if gridded:
             return Form(np.int64(params[at]), np.int64(params[at + 1]), np.int64(params[at + 2]))
         return Form(np.int64(params[at]), np.int64(params[at + 1]), np.int64(0))
@@ -201,7 +201,7 @@ def _form(place: tuple[int, bool]) -> Callable[..., Form]:
 def _view(place: tuple[int, bool]) -> Callable[..., View]:
     at, grouped = place
 
-    def view(params: Any, frame: Any) -> Any:
+    def view(params: Any, counters: Any) -> Any:
         if grouped:
             return View(params[at], params[at + 1], params[at + 2], params[at + 3])
         return View(params[at], params[at + 1], params[at], params[at])
@@ -214,8 +214,8 @@ def _effect(plan: EffectPlan) -> Callable[..., Any]:
     """Make a function that reads the record of an effect."""
     kind, values = record(plan.names), _all_in(_runs(plan.kinds or (("number", 0, 1),)))
 
-    def effect(params: Any, frame: Any) -> Any:
-        return kind(*values(params, frame))
+    def effect(params: Any, counters: Any) -> Any:
+        return kind(*values(params, counters))
 
     return kernel(effect)
 
@@ -237,23 +237,24 @@ def _all_in(runs: tuple[tuple[str, int, int], ...]) -> Callable[..., tuple[Any, 
     if len(runs) == 1:
         return _run(runs[0])
     before, last = _all_in(runs[:-1]), _run(runs[-1])
-    return kernel(lambda params, frame: before(params, frame) + last(params, frame))
+    return kernel(lambda params, counters: before(params, counters) + last(params, counters))
 
 
 @functools.cache
 def _run(run: tuple[str, int, int]) -> Callable[..., tuple[Any, ...]]:
     kind, at, count = run
     if kind == "number":
-        return kernel(lambda params, frame: taken(params, at, count))
+        return kernel(lambda params, counters: taken(params, at, count))
     if kind == "vector":
-        return kernel(lambda params, frame: (taken(params, at, count),))
+        return kernel(lambda params, counters: (taken(params, at, count),))
     if kind == "table":
-        return kernel(lambda params, frame: (params[np.int64(params[at]) : np.int64(params[at + 1])],))
+        return kernel(lambda params, counters: (params[np.int64(params[at]) : np.int64(params[at + 1])],))
 
-    def counters(params: Any, frame: Any) -> Any:
-        return (frame[len(frame) - np.int64(params[at]) : len(frame) - np.int64(params[at + 1])],)
+    def counted(params: Any, counters: Any) -> Any:
+        end = len(counters)
+        return (counters[end - np.int64(params[at]) : end - np.int64(params[at + 1])],)
 
-    return kernel(counters)
+    return kernel(counted)
 
 
 @section

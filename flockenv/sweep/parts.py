@@ -26,11 +26,9 @@ from flockenv.shapes import packed
 from flockenv.shapes.cells import FEWEST_ROWS, MOST_FOUND, cells_of
 from flockenv.space import Space
 from flockenv.sweep.numbers import NumberPlan, pack_numbers
+from flockenv.sweep.scratch import SMALL_STRIDE
 
-__all__ = ["LAWS", "SMALL_STRIDE", "Look", "Parts", "flattened", "record_of", "sorted_at", "view_of"]
-
-SMALL_STRIDE = 128
-"""Places in a row of sorted agents where there are too few to be sorted by cell: their blocks, and one more."""
+__all__ = ["LAWS", "Look", "Parts", "flattened", "record_of", "sorted_at", "view_of"]
 
 MOST_NUMBERS = 2**24
 """Numbers of a form's rows, and of the grid over them, up to which single precision counts them exactly."""
@@ -510,7 +508,7 @@ def sorted_at(row: int, place: str) -> str:
 
     Rows are a constant distance apart, so that a candidate is one address and not one per number.
     """
-    return f"sorted_[np.uint64({row * SMALL_STRIDE}) + {place}]"
+    return f"sorted_rows[np.uint64({row * SMALL_STRIDE}) + {place}]"
 
 
 def record_of(fields: list[str]) -> list[str]:

@@ -9,7 +9,8 @@ sorted blocks.
 from __future__ import annotations
 
 from flockenv.neighbours import DISTANT
-from flockenv.sweep.parts import SMALL_STRIDE, Parts, record_of, sorted_at
+from flockenv.sweep.parts import Parts, record_of, sorted_at
+from flockenv.sweep.scratch import SMALL_STRIDE
 from flockenv.sweep.text import Slots, copied, in_blocks, indented, indented_lines, lanes_of, place_of
 from flockenv.tiles import FAR_FROM_HOME
 
@@ -110,9 +111,9 @@ def _lines(parts: Parts, fields: list[str]) -> list[str]:
         to = f"np.uint64({r * SMALL_STRIDE}) + row"
         if f[1:].isdigit() and f[0] != "h":
             place = f"base + np.uint64({int(f[1:]) * parts.width})"
-            out.append(copied(parts, "sorted_", to, _ARRAYS[f[0]], place))
+            out.append(copied(parts, "sorted_rows", to, _ARRAYS[f[0]], place))
         elif f[0] != "h":
-            out.append(copied(parts, "sorted_", to, "ident" if f == "who" else f, "row"))
+            out.append(copied(parts, "sorted_rows", to, "ident" if f == "who" else f, "row"))
     return out
 
 

@@ -11,13 +11,13 @@ from flockenv.kernels import import_line
 from flockenv.sweep.accelerate import accelerate, sense
 from flockenv.sweep.around import around, around_imports
 from flockenv.sweep.far import tree_imports
-from flockenv.sweep.handed import trimmed
+from flockenv.sweep.handed import OPEN_SCRATCH, Context, opened
 from flockenv.sweep.look import KEYS
 from flockenv.sweep.method import method, method_imports
 from flockenv.sweep.obstacles import blocked, near_rows, obstacle_imports
 from flockenv.sweep.parts import LAWS, Parts
 from flockenv.sweep.step import begin, kept_frame, kept_inner, step, step_world
-from flockenv.sweep.text import CONTEXT, SHARED, asked, frame_views, indented
+from flockenv.sweep.text import asked, indented
 
 __all__ = ["field_source", "scene_source"]
 
@@ -38,7 +38,7 @@ def scene_source(parts: Parts, more: str = "") -> str:
         begin(parts),
         step(parts) + more,
     ]
-    return trimmed("\n".join(chapters))
+    return opened(parts, "\n".join(chapters))
 
 
 def field_source(parts: Parts) -> str:
@@ -58,10 +58,11 @@ def field_source(parts: Parts) -> str:
 @njit(**FAST)
 def field(
     x, v, {parts.frame_argument}alive, key, obstacle_x, obstacle_radius, work, drive, params, times, acc, flow,
-    {SHARED},
+    scratch,
 ):
     """Write acceleration, and the flow that carries everybody if there is one, of all worlds, (D, B, N)."""
     unaliased()
+    {OPEN_SCRATCH}
     n, rank, team, arranged = x.shape[2], 0, 1, False
     first, end = 0, (n + {w - 1}) // {w}
     for b in range(x.shape[1]):
@@ -71,15 +72,17 @@ def field(
             living[i] = alive[b, i]
         into_blocks(pos, x, b, n, first, end)
         into_blocks(vel, v, b, n, first, end)
-{indented([*frame_views(parts), *kept_frame(parts, from_state=True), *kept_inner(parts, from_state=True)], 8)}
+{indented([*kept_frame(parts, from_state=True), *kept_inner(parts, from_state=True)], 8)}
+        asked = b
 {indented(asked(parts), 8)}
-        context = ({CONTEXT})
+        numbers = numbers_of(params, scratch.counters)
+        context = Context({", ".join(Context._fields)})
         accelerate(context, pos, vel, times[b], aside)
         out_of_blocks(aside, acc, b, n, first, end)
         {"out_of_blocks(carrying, flow, b, n, first, end)" if parts.flows else "pass"}
 ''',
     ]  # fmt: skip
-    return trimmed("\n".join(chapters))
+    return opened(parts, "\n".join(chapters))
 
 
 def _imports(parts: Parts) -> str:
@@ -90,6 +93,7 @@ def _imports(parts: Parts) -> str:
         "from numba import njit",
         "from flockenv.effects.base import Far, Me, Other, in_view",
         "from flockenv.inlining import Whole",
+        "from flockenv.sweep.handed import Context",
         "from flockenv.kernels import ask_for, copy_lanes, finite, kernel, like, unaliased, wait_for_team",
         *(["from flockenv.kernels import tallied, tally_of"] if parts.parting or parts.averaged else []),
         "from flockenv.neighbours import candidates, count_cells, order_records, row_of",

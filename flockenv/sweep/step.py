@@ -9,14 +9,12 @@ from __future__ import annotations
 from flockenv.state import COUNTED_BY_KERNELS
 from flockenv.sweep.accelerate import felt_as, parameters, responses
 from flockenv.sweep.arrange import go_home, move_in
+from flockenv.sweep.handed import OPEN_SCRATCH, Context
 from flockenv.sweep.parts import Parts
 from flockenv.sweep.text import (
-    CONTEXT,
-    SHARED,
     Slots,
     alone,
     asked,
-    frame_views,
     given,
     in_blocks,
     in_common,
@@ -67,14 +65,17 @@ def step_world(parts: Parts) -> str:
     restored = "; ".join(f"work[b, {k}] = counted_[{k}]" for k in range(COUNTED_BY_KERNELS))
     return f'''@kernel
 def step_world(
-    x_, v_, {parts.frame_argument}alive, tick, key, obstacle_x, obstacle_radius, work, params, dt, count, b, rank, team,
-    {SHARED},
+    x_, v_, {parts.frame_argument}alive, tick, key, obstacle_x, obstacle_radius, work, drive, asked, params, dt, count,
+    b, rank, team, scratch,
 ):
     """Advance this thread's part of world b by `count` steps; return an agent that is not finite, or -1.
+
+    What is asked of its agents is drive[:, asked], N; nothing if drive is empty.
 
     It is the lowest of those who are not at the end of the call, or, where that spreads, after the first step that
     failed. A world in which somebody is not stays as it was, whole.
     """
+    {OPEN_SCRATCH}
     n = x_.shape[2]
     blocks = (n + {parts.width - 1}) // {parts.width}
     first, end = blocks * rank // team, blocks * (rank + 1) // team
@@ -85,10 +86,11 @@ def step_world(
         living[i] = alive[b, i]
     into_blocks(pos, x_, b, n, first, end)
     into_blocks(vel, v_, b, n, first, end)
-{indented([*frame_views(parts), *kept_frame(parts, from_state=True), *kept_inner(parts, from_state=True)], 4)}
-{indented(needed(parameters(parts), [*arriving, *stepping]), 4)}
+{indented(asked(parts), 4)}
+{indented([*kept_frame(parts, from_state=True), *kept_inner(parts, from_state=True)], 4)}
+{indented(needed(parameters(parts), [*arriving, *stepping, "numbers"]), 4)}
 {indented(arriving, 4)}
-    context = ({CONTEXT})
+    context = Context({", ".join(Context._fields)})
     well, begun = like(dt, np.inf), tick[b]
     counted_ = {kept}
     for l in range(np.uint64({parts.width})):
@@ -122,6 +124,8 @@ def step_world(
     out_of_blocks(pos, x_, b, n, first, end)
     out_of_blocks(vel, v_, b, n, first, end)
 {indented([*kept_frame(parts, from_state=False), *kept_inner(parts, from_state=False)], 4)}
+    if rank == 0:
+        tick[b] += count
     return -1
 '''
 
@@ -373,12 +377,13 @@ def begin(parts: Parts) -> str:
     lines += [f"inner_[{j}, b, i] = {_summed(parts, name, 'me.inner')}" for j, name in enumerate(parts.inner)]
     return f'''
 @kernel
-def begin_inner(x_, v_, {parts.frame_argument}key, tick, params, dt, fresh, b, {SHARED}):
+def begin_inner(x_, v_, {parts.frame_argument}key, tick, params, dt, fresh, b, scratch):
     """Write what goes on inside those of world b who are `fresh`."""
+    {OPEN_SCRATCH}
     n = x_.shape[2]
     first, end = 0, (n + {w - 1}) // {w}
     time = like(dt, tick[b] * np.float64(dt))
-{indented([*frame_views(parts), *parameters(parts)], 4)}
+{indented([*parameters(parts)], 4)}
     into_blocks(pos, x_, b, n, first, end)
     into_blocks(vel, v_, b, n, first, end)
 {indented(kept_frame(parts, from_state=True), 4)}
@@ -392,11 +397,11 @@ def begin_inner(x_, v_, {parts.frame_argument}key, tick, params, dt, fresh, b, {
 
 
 @njit(**FAST)
-def begin(x, v, {parts.frame_argument}key, tick, params, dt, fresh, {SHARED}):
+def begin(x, v, {parts.frame_argument}key, tick, params, dt, fresh, scratch):
     """Write what goes on inside those of all worlds who are `fresh`, (B, N)."""
     unaliased()
     for b in range(x.shape[1]):
-        begin_inner(x, v, {parts.frame_argument}key, tick, params, dt, fresh, b, {SHARED})
+        begin_inner(x, v, {parts.frame_argument}key, tick, params, dt, fresh, b, scratch)
 
 '''
 
@@ -407,7 +412,7 @@ def step(parts: Parts) -> str:
 @njit(**FAST)
 def step(
     x, v, {parts.frame_argument}alive, tick, key, obstacle_x, obstacle_radius, work, drive, params, dt, count,
-    from_world, to_world, rank, team, {SHARED},
+    from_world, to_world, rank, team, scratch,
 ):
     """Advance worlds [from_world, to_world) by `count` steps; return (world, agent) not finite first, or -1s.
 
@@ -415,18 +420,12 @@ def step(
     rank.
     """
     unaliased()
-    n = x.shape[2]
-    blocks = (n + {parts.width - 1}) // {parts.width}
-    first, end = blocks * rank // team, blocks * (rank + 1) // team
     broken, who = -1, -1
-    for b in range(from_world, to_world):
-{indented(asked(parts), 8)}
+    for b in range(from_world, to_world):  # no choice in here: LLVM would copy the step for each of its outcomes
         bad = step_world(
-            x, v, {parts.frame_argument}alive, tick, key, obstacle_x, obstacle_radius, work, params, dt, count,
-            b, rank, team, {SHARED},
+            x, v, {parts.frame_argument}alive, tick, key, obstacle_x, obstacle_radius, work, drive, b, params, dt,
+            count, b, rank, team, scratch,
         )
-        if rank == 0 and bad < 0:
-            tick[b] += count
         if bad >= 0 and broken < 0:
             broken, who = b, bad
     return broken, who

@@ -13,22 +13,10 @@ from flockenv.effects.base import Effect
 from flockenv.sweep.parts import Parts
 
 __all__ = [
-    "CONTEXT", "SHARED", "Slots", "alone", "asked", "copied", "frame_views", "given", "in_blocks", "in_common",
+    "Slots", "alone", "asked", "copied", "given", "in_blocks", "in_common",
     "indented", "indented_lines", "inner_of", "lane", "lanes_of", "nearest_image", "nearest_images", "needed",
     "place_of", "tuple_of",
 ]  # fmt: skip
-
-_READ = (
-    "mass, radius, max_speed, max_force, living, ident, want, felt, pulled, carrying, frame, sorted_, records, "
-    "luggage, order, cell, start, offset, homes, strangers, bounds, tally, sync, tie, bond_place, bond_number, "
-    "bond_start, tree_key, tree_place, tree_digit, tree_leaf, tree_node, tree_near, number, lanes, ranges, spread"
-)
-SHARED = f"pos, vel, aside, stages, {_READ}"
-"""Scratch of one world in progress, in order; see workspace.Workspace. The last three belong to one thread. Of these
-and the next, a source keeps what it names (`handed.trimmed`)."""
-
-CONTEXT = f"obstacle_x, obstacle_radius, work, params, key, b, n, present, arranged, first, end, rank, team, {_READ}"
-"""What an acceleration is given beside positions and velocities, in order."""
 
 
 def tuple_of(template: str, dimension: int) -> str:
@@ -84,7 +72,7 @@ def asked(parts: Parts) -> list[str]:
         nothing = [f"want[:{size}] = 0", "spread[1] = np.uint64(0)"]
     return [
         "if drive.shape[1] > 0:",
-        "    into_blocks(want, drive, b, n, first, end)",
+        "    into_blocks(want, drive, asked, n, first, end)",
         *["    spread[1] = ~np.uint64(0)"] * parts.arranges,
         "else:",
         *indented_lines(nothing, 4),
@@ -124,15 +112,6 @@ def nearest_image(parts: Parts, k: int, here: str) -> str:
 def nearest_images(parts: Parts, effects: list[tuple[int, Effect]]) -> list[str]:
     """Write the numbers of those that know places anew: on a torus, with the images nearest to agent i, at x."""
     return [nearest_image(parts, k, "x") for k, _ in effects if given(parts, k) == f"near{k}"]
-
-
-def frame_views(parts: Parts) -> list[str]:
-    """Write by which names the parts of the scratch `frame` are known: blocks of vectors, and numbers by agent."""
-    blocks = [*parts.frame_vectors, *["aiming"] * parts.aims]
-    numbers = [*parts.frame_numbers, *(f"inner{k}" for k in range(len(parts.inner)))]
-    vectors = [f"{name} = frame[{k} * len(pos) :]" for k, name in enumerate(blocks)]
-    begin, each = f"{len(blocks)} * len(pos)", f"len(pos) // {parts.dimension}"
-    return vectors + [f"{name} = frame[{begin} + {k} * {each} :]" for k, name in enumerate(numbers)]
 
 
 def needed(lines: Sequence[str], body: Sequence[str]) -> list[str]:

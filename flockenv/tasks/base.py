@@ -46,7 +46,8 @@ from flockenv.records import Record
 from flockenv.scene import AnyIntegrator, Scene
 from flockenv.snapshot import Mark
 from flockenv.state import State
-from flockenv.sweep import SHARED, Look, Parts, look_source, scene_source
+from flockenv.sweep import Look, Parts, look_source, scene_source
+from flockenv.sweep.handed import OPEN_SCRATCH
 from flockenv.sweep.text import indented_lines
 from flockenv.tasks.layout import Layout
 
@@ -247,7 +248,7 @@ def task_source(task: Task) -> str:
     _check(task)
     now, empty = _frame(), ", ".join(f"{name}[:0]" for name in NEAR.split(", "))
     then = _frame(x="x0", v="v0", alive="alive0", near=empty)
-    look = f"placed = look(x, alive, obstacle_x, obstacle_radius, b, params, {NEAR}, near_pos, {SHARED})"
+    look = f"placed = look(x, alive, obstacle_x, obstacle_radius, b, params, {NEAR}, near_pos, scratch)"
     size, far = task.action_layout.size, apart(task.learners) if task.abreast else "actions.shape[1]"
     fetches = [f"if not past: fetch(rows[b], {k}, 4)" if task.abreast else "pass" for k in range(4)]
     wide_ones = "own, near_vel, near_radius, beside, " if task.abreast else ""
@@ -257,7 +258,7 @@ def task_source(task: Task) -> str:
     widen, show = _lanes(task) if task.abreast else ("rounded, wide = over.shape[1], now", "pass")
     optional = [*["keep"] * task.keeps, *["abreast"] * (task.abreast > 0)]
     lasting = f"success[b] = lasts(p, {_measures(task, 'sums')})" if task.lasting_aim else "pass"
-    begin_inner = f"begin_inner(x, v, {task.parts.frame_argument}key, tick, params, dt, alive, b, {SHARED})"
+    begin_inner = f"begin_inner(x, v, {task.parts.frame_argument}key, tick, params, dt, alive, b, scratch)"
     worlds = (
         f"x, v, {task.parts.frame_argument}alive, tick, obstacle_x, obstacle_radius, work, key, memory, steps, params, "
         "numbers, table"
@@ -289,7 +290,7 @@ def tell(steps, numbers, last, sums, first, told):
 @njit(**FAST)
 def play(
     {worlds}, dt, count, mortal, past, measured, sums, paid,
-    canvas, force, x0, v0, alive0, decided, earned, {wide_ones}{NEAR}, near_pos, {SHARED},
+    canvas, force, x0, v0, alive0, decided, earned, {wide_ones}{NEAR}, near_pos, scratch,
     acting, mask, everyone, check, from_world, to_world, actions, limit,
     rows, payment, terms, over, late, success, present,
 ):
@@ -302,6 +303,7 @@ def play(
     on the canvas.
     """
     unaliased()
+    {OPEN_SCRATCH}
     x, v, memory, obstacle_x = packed(x), packed(v), packed(memory), packed(obstacle_x)
     {"force = packed(force)" if task.abreast else "pass"}
     action, given, learners = columns(decided, actions.shape[1], {size}, {far}), in_one_row(actions), over.shape[1]
@@ -312,7 +314,6 @@ def play(
         return {REFUSED}, 0
     p = P({_values(task, task.scene.dtype)})
     n = x.shape[2]
-    blocks = (n + {task.parts.width - 1}) // {task.parts.width}
     broken, who = -1, -1
     for b in range(from_world, to_world):
         if not acting and not mask[b] and not everyone:
@@ -340,14 +341,12 @@ def play(
                 over[b, i] = False
             drive(p, {now}, action, force[:, 0])
             {fetches[0]}  # here and there, for it is written at the end
-            into_blocks(want, force, np.int64(0), n, np.int64(0), blocks)
             bad = step_world(
-                x, v, {task.parts.frame_argument}alive, tick, key, obstacle_x, obstacle_radius, work, params, dt,
-                count, b, 0, 1, {SHARED},
+                x, v, {task.parts.frame_argument}alive, tick, key, obstacle_x, obstacle_radius, work, force, 0,
+                params, dt, count, b, 0, 1, scratch,
             )
             if bad >= 0 and broken < 0:
                 broken, who = b, bad
-            tick[b] += count if bad < 0 else 0
             steps[b] += 1
         if acting:
             {fetches[1]}
