@@ -37,7 +37,7 @@ from flockenv.private_folder import prepared
 from flockenv.startup import numba_before_scipy
 from flockenv.turns import OneAtATime
 
-__all__ = ["entry", "entry_of", "entry_point", "record", "section", "several", "vector"]
+__all__ = ["entry", "entry_of", "entry_point", "in_turn", "record", "section", "several", "tuple_from", "vector"]
 
 _njit: Any = numba.njit  # numba's stubs do not know `_nrt`
 
@@ -111,6 +111,35 @@ def several(count: int, item: Callable[[Any, int], Any]) -> Callable[[Any], Any]
         return before(array) + (item(array, last),)  # noqa: RUF005  # numba adds tuples, and unpacks none
 
     return kernel(items)
+
+
+@functools.cache
+def tuple_from(*functions: Callable[..., Any]) -> Callable[..., tuple[Any, ...]]:
+    """Return a function that makes a tuple of what each of some functions returns for its arguments."""
+    if not functions:
+        return kernel(lambda *given: ())
+    before, last = tuple_from(*functions[:-1]) if functions[1:] else None, functions[-1]
+
+    def items(*given: Any) -> Any:
+        if before is None:
+            return (last(*given),)
+        return before(*given) + (last(*given),)  # noqa: RUF005  # numba adds tuples, and unpacks none
+
+    return kernel(items)
+
+
+@functools.cache
+def in_turn(*functions: Callable[..., Any]) -> Callable[..., None]:
+    """Return a function that calls some functions, one after the other, with its arguments."""
+    before, last = in_turn(*functions[:-1]) if functions[1:] else None, functions[-1] if functions else None
+
+    def call(*given: Any) -> None:
+        if before is not None:
+            before(*given)
+        if last is not None:
+            last(*given)
+
+    return kernel(call)
 
 
 @functools.cache

@@ -62,7 +62,8 @@ class Workspace:
     def of(self, rank: int, kind: Any) -> Any:
         """Return what one of the team is given: a record of this kind, which names its arrays."""
         if (rank, kind) not in self._given:
-            arrays = self.arrays | self.own[rank]
+            arrays: dict[str, Any] = self.arrays | self.own[rank]
+            arrays["inner"] = tuple(array for name, array in arrays.items() if name.startswith("inner"))
             self._given[rank, kind] = kind(*(arrays[name] for name in kind._fields))
         return self._given[rank, kind]
 

@@ -120,7 +120,7 @@ def _aim(parts: Parts) -> list[str]:
         return []
     aiming = [
         f"i, x, v = row + l, {lanes_of(parts, 'pos')}, {lanes_of(parts, 'vel')}",
-        f"me, e = {alone(parts, aim='zero(x)')}, zero(x)",
+        f"me, e = {alone(parts, aim=False)}, zero(x)",
         *nearest_images(parts, effects),
         *(f"e = add(e, aim_law_{k}({given(parts, k)}, me))" for k, _ in effects),
         "e = limit(e, like(x[0], 1.0))",
@@ -162,7 +162,7 @@ def _own(parts: Parts) -> list[str]:
         if effect.own_law is not None:
             still = effect.linear_drag is not None and parts.integrator.splits_drag
             if still:  # what is left of -c (v - u): the method adds -c v
-                lines.append(f"rest = {alone(parts, medium='me.medium', vel='o', heading='o', one='one + l')}")
+                lines.append("rest = still(me)")
             lines.append(f"{to} = add({to}, own_law_{k}({given(parts, k)}, {'rest' if still else 'me'}))")
         if effect.obstacle_start is not None:
             lines.append(f"{to} = add({to}, obstacle_finish_{k}(p{k}, me, ({', '.join(slot.all(f'o{k}_'))},)))")

@@ -12,7 +12,7 @@ from __future__ import annotations
 from flockenv.neighbours import FEWEST_ARRANGED, STEPS_ARRANGED, WORTH_ARRANGING
 from flockenv.sweep.parts import Parts
 from flockenv.sweep.query import counted
-from flockenv.sweep.text import in_blocks, indented, indented_lines, place_of
+from flockenv.sweep.text import array_of, in_blocks, indented, indented_lines, place_of
 
 __all__ = ["go_home", "move_in"]
 
@@ -54,7 +54,7 @@ def _carry(parts: Parts, to: list[str]) -> list[str]:
     """
     d, w, count = parts.dimension, parts.width, parts.luggage_size
     luggage = [field.partition(" ") for field in parts.luggage]  # an array, and of vectors which axis
-    sources = "".join(f"{name}, " for name, _, _ in luggage)
+    sources = "".join(f"{array_of(name)}, " for name, _, _ in luggage)
     places = "".join(_place(name, axis, w) for name, _, axis in luggage)
     packing = [
         f"for i in range(row, min(row + np.uint64({w}), np.uint64(n))):",
@@ -81,7 +81,7 @@ def _unpacked(parts: Parts, luggage: list[tuple[str, str, str]]) -> list[str]:
     """Write how agent i unpacks: all but what everybody has in common, which lies where it lay."""
     own: dict[int | None, list[str]] = {None: [], 0: [], 1: []}
     for k, (name, _, axis) in enumerate(luggage):
-        to = f"{name}[place + np.uint64({int(axis) * parts.width})]" if axis else f"{name}[i]"
+        to = f"{name}[place + np.uint64({int(axis) * parts.width})]" if axis else f"{array_of(name)}[i]"
         own[_COMMON.get(name)].append(f"{to} = luggage[i * np.uint64({parts.luggage_size}) + np.uint64({k})]")
     kinds = [[f"if spread[{k}] > np.uint64(0):", *indented_lines(own[k], 4)] for k in (0, 1)]
     return [*own[None], *kinds[0], *kinds[1]]

@@ -36,7 +36,7 @@ class Context(NamedTuple):
 
 def opened(parts: Parts, source: str) -> str:
     """Return a source in which every function takes out of its records what it names."""
-    scratch = list(scratch_of(parts, parts.width))
+    scratch = [name for name in scratch_of(parts, parts.width) if not name.startswith("inner")]
     functions = re.split(r"(?=^@)", source, flags=re.MULTILINE)
     return "".join(_opened(text, scratch) for text in functions)
 
@@ -46,7 +46,7 @@ def _opened(text: str, scratch: list[str]) -> str:
     arrays = [name for name in scratch if name in words and name not in arguments]
     shared = [name for name in Context._fields if name in words and name not in arguments and name != "scratch"]
     from_scratch = [f"{name} = scratch.{name}" for name in arrays]
-    from_context = [f"{name} = context.{name}" for name in [*shared, *["scratch"] * bool(arrays)]]
+    from_context = [f"{name} = context.{name}" for name in [*shared, "scratch"]]
     text = text.replace(OPEN_SCRATCH, "; ".join(from_scratch) or "pass")
     return text.replace(OPEN_CONTEXT, "; ".join([*from_context, *from_scratch]) or "pass")
 

@@ -11,7 +11,7 @@ from __future__ import annotations
 from flockenv.neighbours import DISTANT
 from flockenv.sweep.parts import Parts, record_of, sorted_at
 from flockenv.sweep.scratch import SMALL_STRIDE
-from flockenv.sweep.text import Slots, copied, in_blocks, indented, indented_lines, lanes_of, place_of
+from flockenv.sweep.text import Slots, array_of, copied, in_blocks, indented, indented_lines, lanes_of, place_of
 from flockenv.tiles import FAR_FROM_HOME
 
 __all__ = ["counted", "listed", "listed_at", "query", "walk"]
@@ -74,7 +74,7 @@ def _value(parts: Parts, field: str, place: str) -> str:
     if field[1:].isdigit():
         array = _ARRAYS[field[0]]
         return f"{array}[{place} + np.uint64({int(field[1:]) * parts.width})]"
-    return {"who": "ident[i]", "place": "i"}.get(field, f"{field}[i]")
+    return {"who": "ident[i]", "place": "i"}.get(field, f"{array_of(field)}[i]")
 
 
 def _headings(parts: Parts, numbers: dict[str, str]) -> list[str]:
@@ -113,7 +113,7 @@ def _lines(parts: Parts, fields: list[str]) -> list[str]:
             place = f"base + np.uint64({int(f[1:]) * parts.width})"
             out.append(copied(parts, "sorted_rows", to, _ARRAYS[f[0]], place))
         elif f[0] != "h":
-            out.append(copied(parts, "sorted_rows", to, "ident" if f == "who" else f, "row"))
+            out.append(copied(parts, "sorted_rows", to, "ident" if f == "who" else array_of(f), "row"))
     return out
 
 
@@ -202,7 +202,7 @@ def _ordered(parts: Parts, length: int) -> list[str]:
 def _lanes(parts: Parts, field: str, wraps: bool) -> tuple[str, str]:
     """Write in which array a field of a block's agents lies side by side, and from which place on."""
     if not field[1:].isdigit():
-        return ("ident" if field == "who" else field), "row"
+        return ("ident" if field == "who" else array_of(field)), "row"
     k = int(field[1:])
     if wraps and field[0] == "x":
         return "lanes", f"np.uint64({parts.slots[f'inside{k}'] * parts.width})"

@@ -118,8 +118,9 @@ def _of_trees(parts: Parts, agents: int, team: int) -> dict[str, Array]:
 
 
 def scratch_record(parts: Parts) -> Any:
-    """Return the type of the record in which the kernels of a scene find them."""
-    return record(tuple(scratch_of(parts, parts.width)))
+    """Return the type of the record in which the kernels of a scene find them; `inner` is a tuple of several."""
+    names = [name for name in scratch_of(parts, parts.width) if not name.startswith("inner")]
+    return record((*names, *["inner"] * bool(parts.inner)))
 
 
 def scratch_bytes(parts: Parts, agents: int) -> int:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from typing import Any
 
+from flockenv.sweep.agents import AgentPlan, alone_of, inner_of, still
 from flockenv.sweep.blocks import into_blocks, out_of_blocks
 from flockenv.sweep.numbers import images_of, numbers_of
 from flockenv.sweep.parts import Parts
@@ -21,6 +22,11 @@ def sections_of(parts: Parts) -> tuple[tuple[str, Any], ...]:
         "into_blocks": into_blocks(parts.dimension, parts.width),
         "out_of_blocks": out_of_blocks(parts.dimension, parts.width),
     }
+    agent = AgentPlan(
+        parts.dimension, parts.width, parts.oriented, parts.aims, "desired_speed" in parts.frame_numbers, parts.inner
+    )
+    made["alone"], made["alone_without_aim"] = alone_of(agent), alone_of(agent._replace(aims=False))
+    made["inner_of"], made["still"] = inner_of(parts.inner), still
     for k, effect in enumerate(parts.effects):
         if parts.space.periodic and effect.places:
             made[f"images_of_{k}"] = images_of(tuple(parts.names_of(effect)), effect.places, parts.space.offset_law)

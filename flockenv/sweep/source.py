@@ -88,11 +88,11 @@ def field(
 def _imports(parts: Parts) -> str:
     """Import every law by the slot that it fills, and nothing that is not called for."""
     lines = [
-        "from collections import namedtuple",
         "import numpy as np",
         "from numba import njit",
         "from flockenv.effects.base import Far, Me, Other, in_view",
         "from flockenv.inlining import Whole",
+        "from flockenv.section import record",
         "from flockenv.sweep.handed import Context",
         "from flockenv.kernels import ask_for, copy_lanes, finite, kernel, like, unaliased, wait_for_team",
         *(["from flockenv.kernels import tallied, tally_of"] if parts.parting or parts.averaged else []),
@@ -119,6 +119,6 @@ def _imports(parts: Parts) -> str:
         if effect.wishes:
             lines.append(import_line(effect.steer_law, f"steer_law_{k}"))
     if parts.inner:
-        lines.append(f'Inner = namedtuple("Inner", {" ".join(parts.inner)!r})')
+        lines.append(f"Inner = record({parts.inner!r})")
     options = 'dict(fastmath={"contract"}, error_model="numpy", nogil=True, _nrt=False, pipeline_class=Whole)'
     return "\n".join(lines) + f"\n\nFAST = {options}\n"

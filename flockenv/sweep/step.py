@@ -50,7 +50,7 @@ def kept_inner(parts: Parts, from_state: bool) -> list[str]:
     """Write how inner states come out of the state's array, or go back into it; nothing if nobody has one."""
     if not parts.inner:
         return []
-    pairs = [(f"inner{k}[i]", f"inner_[{k}, b, i]") for k in range(len(parts.inner))]
+    pairs = [(f"scratch.inner[{k}][i]", f"inner_[{k}, b, i]") for k in range(len(parts.inner))]
     return [
         f"for i in range(first * {parts.width}, min(end * {parts.width}, n)):",
         *(f"    {mine} = {kept}" if from_state else f"    {kept} = {mine}" for mine, kept in pairs),
@@ -234,7 +234,7 @@ def _count(parts: Parts) -> list[str]:
         f"        block, l = i // np.uint64({w}), i % np.uint64({w})",
         f"        base = block * np.uint64({d * w})",
         f"        x, v = {lanes_of(parts, 'pos')}, {lanes_of(parts, 'vel')}",
-        f"        me = {alone(parts, aim='zero(x)')}",
+        f"        me = {alone(parts, aim=False)}",
         *indented_lines([*nearest_images(parts, effects), *lines], 8),
         "wait_for_team(sync, team)  # before anybody changes",
     ]
@@ -355,7 +355,10 @@ def _keep(parts: Parts) -> list[str]:
         *(f"now{j} = {value}" for j, value in enumerate(now)),
         f"where = well if finite({' + '.join(f'now{j}' for j in range(len(now)))}) else ident[i]",
         f"{bad} = where if where < {bad} else {bad}",
-        *(f"inner{j}[i] = now{j} if living[i] > like(dt, 0.0) else me.inner.{n}" for j, n in enumerate(parts.inner)),
+        *(
+            f"scratch.inner[{j}][i] = now{j} if living[i] > like(dt, 0.0) else me.inner.{n}"
+            for j, n in enumerate(parts.inner)
+        ),
     ]
 
 
@@ -372,7 +375,7 @@ def begin(parts: Parts) -> str:
     if not parts.inner:
         return ""
     d, w = parts.dimension, parts.width
-    lines = [f"me = {alone(parts, aim='zero(x)')}", *nearest_images(parts, parts.keeping)]
+    lines = [f"me = {alone(parts, aim=False)}", *nearest_images(parts, parts.keeping)]
     lines += [f"says{k} = begin_law_{k}({given(parts, k)}, me)" for k, _ in parts.keeping]
     lines += [f"inner_[{j}, b, i] = {_summed(parts, name, 'me.inner')}" for j, name in enumerate(parts.inner)]
     return f'''
@@ -392,7 +395,7 @@ def begin_inner(x_, v_, {parts.frame_argument}key, tick, params, dt, fresh, b, s
         for l in range(np.uint64({w})):
             i, x, v = row + l, {lanes_of(parts, "pos")}, {lanes_of(parts, "vel")}
             if i < n and fresh[b, i]:
-{indented([f"inner{k}[i] = 0" for k in range(len(parts.inner))], 16)}
+{indented([f"scratch.inner[{k}][i] = 0" for k in range(len(parts.inner))], 16)}
 {indented(lines, 16)}
 
 

@@ -13,7 +13,7 @@ from flockenv.effects.base import Effect
 from flockenv.sweep.parts import Parts
 
 __all__ = [
-    "Slots", "alone", "asked", "copied", "given", "in_blocks", "in_common",
+    "Slots", "alone", "array_of", "asked", "copied", "given", "in_blocks", "in_common",
     "indented", "indented_lines", "inner_of", "lane", "lanes_of", "nearest_image", "nearest_images", "needed",
     "place_of", "tuple_of",
 ]  # fmt: skip
@@ -81,22 +81,21 @@ def asked(parts: Parts) -> list[str]:
 
 def inner_of(parts: Parts, i: str) -> str:
     """Write what goes on inside an agent."""
-    return f"Inner({', '.join(f'inner{k}[{i}]' for k in range(len(parts.inner)))})" if parts.inner else "()"
+    return f"inner_of(scratch, {i})"
 
 
-def alone(
-    parts: Parts, medium: str = "zero(x)", vel: str = "v", heading: str = "", aim: str = "", one: str = "i"
-) -> str:  # fmt: skip
-    """Write agent i, at x, as the laws of one agent see it: no tie, there is nobody to part from.
+def alone(parts: Parts, medium: str = "zero(x)", one: str = "i", aim: bool = True) -> str:
+    """Write agent i, at x with velocity v, as the laws of one agent see it; `one`: where its body lies.
 
-    one: where its body lies.
+    aim: may it be asked where it wants to go?
     """
-    aim = aim or (lanes_of(parts, "aiming") if parts.aims else "zero(x)")
-    wished = "desired_speed[i]" if "desired_speed" in parts.frame_numbers else "like(x[0], 0.0)"
-    body = f"mass[{one}], radius[{one}], max_speed[{one}], max_force[{one}]"
-    heading = heading or (lanes_of(parts, "facing") if parts.oriented else "unit(v)")
-    more = f"{aim}, {wished}, {inner_of(parts, 'i')}"
-    return f"Me(ident[i], x, {vel}, {heading}, {body}, zero(x), time, {medium}, key[b], {more})"
+    function = "alone" if aim or not parts.aims else "alone_without_aim"
+    return f"{function}(scratch, key[b], time, base + l, i, {one}, x, v, {medium})"
+
+
+def array_of(name: str) -> str:
+    """Write the array of numbers of that name: of what goes on inside agents there are several."""
+    return f"scratch.inner[{name.removeprefix('inner')}]" if name.startswith("inner") else name
 
 
 def given(parts: Parts, k: int) -> str:

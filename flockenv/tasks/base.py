@@ -265,6 +265,8 @@ def task_source(task: Task) -> str:
     )
     play = f'''
 
+from collections import namedtuple
+
 from flockenv.abreast import columns, in_one_row, into_rows, packed, take
 from flockenv.lines import fetch, pour, settle
 from flockenv.tasks.base import Frame
