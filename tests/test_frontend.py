@@ -16,6 +16,7 @@ from numba import config
 from flockenv import frontend, lowering
 from flockenv.inlining import Whole
 from flockenv.kernels import law, load, unaliased
+from flockenv.sweep.sections import sections_of
 from flockenv.sweep.source import scene_source
 from flockenv.vec import add, dot, scale
 from tests.catalogue import EFFECTS, scene_under
@@ -137,7 +138,7 @@ def test_closures_comprehensions_and_reductions_are_still_inlined() -> None:
 def test_no_part_of_a_kernel_is_compiled_twice(tmp_path: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("FLOCKENV_CACHE", str(tmp_path))
     scene = scene_under(next(row for row in EFFECTS if row.effect.kind == "drag"), 2)
-    module = load("scene", scene_source(scene.parts) + "\n# compiled here\n")
+    module = load("scene", scene_source(scene.parts) + "\n# compiled here\n", sections_of(scene.parts))
     vars(scene)["_kernels"] = module
     scene.step(scene.start(seed=1))
     own = {name: f for name, f in vars(module).items() if getattr(f, "__module__", "") == module.__name__}
