@@ -8,14 +8,15 @@ from __future__ import annotations
 
 import math
 from itertools import pairwise
-from typing import Any
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 import pytest
 
 from flockenv.behaviours import Separation
 from flockenv.integrators import RK4, ExplicitEuler, Heun, Integrator, Midpoint, SemiImplicitEuler, VelocityVerlet
-from flockenv.integrators.base import Alone
+from flockenv.integrators.base import INTEGRATORS as KINDS
+from flockenv.integrators.base import Alone, Provided
 from flockenv.integrators.one_stage import OneStage
 from flockenv.scene import Group, Scene
 from flockenv.spawn import Spawn
@@ -258,7 +259,7 @@ IN_ROWS = pytest.mark.parametrize(
 def test_stage_arrays_are_as_many_as_are_used(row: IntegratorRow) -> None:
     """With fewer than it declares a method would write into another's scratch: a guard behind them stays untouched."""
     stages = np.full((row.method.stages + 2, 6), 7.0)
-    row.method.advance().py_func(spring, alone(row), np.ones(6), np.ones(6), (), 0.0, 0.1, stages, 0, 6)
+    row.method.advance()(Provided(spring))(alone(row), np.ones(6), np.ones(6), (), 0.0, 0.1, stages, 0, 6)
     assert (stages[row.method.stages :] == 7).all()
 
 
@@ -277,7 +278,7 @@ def test_of_a_team_each_writes_his_own_part_alone(row: IntegratorRow) -> None:
     rng = np.random.default_rng(0)
     start = (*rng.normal(size=(2, 12)), np.full((row.method.stages, 12), 7.0))
     together, apart = [array.copy() for array in start], [array.copy() for array in start]
-    row.method.advance().py_func(spring, alone(row), *together[:2], (), 0.0, 0.1, together[2], 0, 12)
+    row.method.advance()(Provided(spring))(alone(row), *together[:2], (), 0.0, 0.1, together[2], 0, 12)
     for first, end in ((0, 5), (5, 5), (5, 12)):
         if first == end and row.method.adaptive:
             continue  # nobody helps with a world of its: there is no empty part
@@ -286,7 +287,7 @@ def test_of_a_team_each_writes_his_own_part_alone(row: IntegratorRow) -> None:
             out[mine] = -pos[mine]
 
         mine = [array.copy() for array in start]
-        row.method.advance().py_func(law, alone(row), *mine[:2], (), 0.0, 0.1, mine[2], first, end)
+        row.method.advance()(Provided(law))(alone(row), *mine[:2], (), 0.0, 0.1, mine[2], first, end)
         for before, after, whole in zip(start, mine, apart, strict=True):
             np.testing.assert_array_equal(
                 np.delete(after, slice(first, end), -1), np.delete(before, slice(first, end), -1)
@@ -294,6 +295,42 @@ def test_of_a_team_each_writes_his_own_part_alone(row: IntegratorRow) -> None:
             whole[..., first:end] = after[..., first:end]
     for whole, once in zip(apart, together, strict=True):
         np.testing.assert_array_equal(whole, once)
+
+
+TYPED = """
+def advance(provided):
+    acceleration = provided.acceleration
+
+    def advance(context, pos, vel, flow, time, dt, stages, first, end):
+        acceleration(context, pos, vel, time, stages[0])
+        for i in range(np.uint64(first), np.uint64(end)):
+            vel[i] += dt * stages[0, i]
+            pos[i] += dt * vel[i]
+
+    return advance
+"""
+
+
+def test_a_method_that_is_typed_into_a_notebook_runs_in_a_scene_and_in_python(tether: Any) -> None:
+    """It has no file: its code is compiled, not its text. This one is semi-implicit Euler, written over a row."""
+    typed: dict[str, Any] = {"np": np, "__name__": __name__}
+    exec(TYPED, typed)  # noqa: S102  # the lines above
+
+    class Typed(Integrator):
+        kind: Literal["typed"] = "typed"
+        order: ClassVar[int] = 1
+        order_with_drag: ClassVar[int] = 1
+        stages: ClassVar[int] = 1
+        evaluations: ClassVar[int] = 1
+
+        @classmethod
+        def advance(cls) -> Any:
+            return typed["advance"]
+
+    del KINDS["typed"]
+    for way in ("python", "compiled"):
+        ended = [motion(oscillator(tether, way)(method, 0.05, 20)) for method in (Typed(), SemiImplicitEuler())]
+        np.testing.assert_allclose(*ended, rtol=1e-14, atol=0)
 
 
 @pytest.mark.slow

@@ -1,12 +1,12 @@
 """Integrator: (acceleration, state, dt) -> state. A law never knows which method integrates it.
 
-Each method is one file. A method of one stage is a formula (`one_stage.py`); any other is
-`advance(acceleration, context, pos, vel, flow, time, dt, stages, first, end)`: over the coordinates of one world in one
-row, in place. Of these it writes [first, end) alone, because several threads may share a world, each with a part of its
-own; `acceleration(context, pos, vel, time, out)` reads everybody's positions, and waits until all threads have come so
-far. `flow` holds the velocity with which the medium carries everybody, as of the last acceleration; it is empty, and
-costs nothing, where nothing flows. Compiled, either is a part of a scene's kernel; with Python functions for the laws
-the very same source runs in Python, which is how its order is measured.
+Each method is one file. A method of one stage is a formula (`one_stage.py`). Any other is a section,
+`advance(provided)`. It makes `advance(context, pos, vel, flow, time, dt, stages, first, end)`, which calls functions
+that it is provided with, over the coordinates of one world in one row, in place. Of these it writes [first, end) alone,
+because several threads may share a world, each with a part of its own. `flow` holds the velocity with which the medium
+carries all agents, as of the last acceleration; it is empty, and costs nothing, where nothing flows. With compiled
+functions (`sweep/method.py`) it is a part of a scene's kernel; with Python functions the same code runs in Python,
+which is how its order is measured.
 """
 
 from __future__ import annotations
@@ -20,15 +20,17 @@ import numpy as np
 from numba.core import types
 from numba.extending import overload
 
-from flockenv.kernels import OPTIONS, python_of
+from flockenv.kernels import OPTIONS
 from flockenv.records import Record
 from flockenv.refusals import nearest, shown
 from flockenv.state import WORK, Floats, State
 
 __all__ = [
-    "INTEGRATORS", "PROVIDED", "Alone", "Integrator", "carried", "counted", "damping", "largest", "methods_named",
-    "settings",
+    "INTEGRATORS", "SUBSTEPS", "Alone", "Integrator", "Method", "Provided", "carried", "methods_named",
 ]  # fmt: skip
+
+Method = Callable[..., None]
+"""What advances one world, in place: `advance(context, pos, vel, flow, time, dt, stages, first, end)`."""
 
 INTEGRATORS: dict[str, type[Integrator]] = {}
 """Every integrator by its kind; a class registers itself when it is defined."""
@@ -55,36 +57,40 @@ class Alone(NamedTuple):
     work: Any = None  # (8,), the world's row of State.work
 
 
-# What follows asks the world that `advance` is called for. In a scene's kernel functions of these names, which know how
-# its agents lie in memory, take their place (sweep/method.py).
-
-
-def damping(context: Any, rate: Any, first: int, end: int) -> None:
-    """Write c / m, 1/s, of coordinates [first, end): the linear drag that a method with `splits_drag` treats itself."""
+def _damping(context: Any, rate: Any, first: int, end: int) -> None:
     rate[first:end] = context.drag
 
 
-def settings(context: Any) -> tuple[float, ...]:
-    """Return the numbers of the method, in the order of its fields."""
+def _settings(context: Any) -> tuple[float, ...]:
     return tuple(context.settings)
 
 
-def largest(context: Any, squares: Any, first: int, end: int) -> tuple[float, int]:
-    """Return the largest sum of an agent's coordinates, NaN if one is, and where the first of that agent lies."""
+def _largest(context: Any, squares: Any, first: int, end: int) -> tuple[float, int]:
     sums = squares[first:end].reshape(context.dimension, -1).sum(axis=0)
     agent = int(np.argmax(sums))
     return sums[agent], first + agent
 
 
-def counted(context: Any, accepted: int, rejected: int) -> None:
-    """Count steps of the method's own in State.work."""
+def _counted(context: Any, accepted: int, rejected: int) -> None:
     if context.work is not None:
         context.work[SUBSTEPS] += accepted
         context.work[SUBSTEPS + 1] += rejected
 
 
-PROVIDED = frozenset({"damping", "settings", "largest", "counted"})
-"""What a scene's kernel has of its own."""
+class Provided(NamedTuple):
+    """The functions that a method calls: a scene's compiled ones, or by default those of a world `Alone`, in Python."""
+
+    acceleration: Callable[..., None]
+    """(context, pos, vel, time, out): read the positions of all agents, once all threads have written theirs."""
+    settings: Callable[..., tuple[float, ...]] = _settings
+    """(context): the numbers of the method, in the order of its fields."""
+    damping: Callable[..., None] = _damping
+    """(context, rate, first, end): write c / m, 1/s, of coordinates [first, end), for a method with `splits_drag`."""
+    largest: Callable[..., tuple[float, int]] = _largest
+    """(context, squares, first, end): the largest sum of an agent's coordinates, NaN if one is, and its place."""
+    counted: Callable[..., None] = _counted
+    """(context, accepted, rejected): count steps of the method's own in State.work."""
+
 
 SUBSTEPS = WORK.index("substeps")
 """Column of State.work; steps that were rejected are in the next."""
@@ -129,14 +135,14 @@ class Integrator(Record):
         return tuple(float(getattr(self, name)) for name in type(self).model_fields if name != "kind")
 
     @classmethod
-    def compiled(cls, name: str) -> Any:
-        """Return what the method's module has compiled under this name."""
+    def of_module(cls, name: str) -> Any:
+        """Return what the method's module holds under this name."""
         return vars(sys.modules[cls.__module__])[name]
 
     @classmethod
-    def advance(cls) -> Any:
-        """Return the compiled `advance` of the method's module."""
-        return cls.compiled("advance")
+    def advance(cls) -> Callable[[Provided], Method]:
+        """Return the section `advance` of the method's module."""
+        return cls.of_module("advance")  # type: ignore[no-any-return]
 
     def __call__(
         self,
@@ -176,4 +182,4 @@ class Integrator(Record):
         self, law: Any, context: Any, x: Floats, v: Floats, flow: Any, time: float, dt: float, stages: Floats
     ) -> None:
         """Advance one world by `advance`, in Python."""
-        python_of(self.advance())(law, context, x, v, flow, time, dt, stages, 0, len(x))
+        self.advance()(Provided(law))(context, x, v, flow, time, dt, stages, 0, len(x))

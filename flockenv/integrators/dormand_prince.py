@@ -7,9 +7,9 @@ from typing import Any, ClassVar, Literal
 import numpy as np
 
 from flockenv.integrators.adaptive import Adaptive
-from flockenv.integrators.base import counted, largest, settings
+from flockenv.integrators.base import Method, Provided
 from flockenv.integrators.control import add_slopes, begun, copy, judged, misfit, slope_of
-from flockenv.kernels import kernel, like
+from flockenv.kernels import like
 
 __all__ = ["DormandPrince"]
 
@@ -31,39 +31,46 @@ ERRORS = (71 / 57600, 0.0, -71 / 16695, 71 / 1920, -17253 / 339200, 22 / 525, -1
 """The result less that of order 4, in slopes."""
 
 
-@kernel
-def advance(
-    acceleration: Any, context: Any, pos: Any, vel: Any, flow: Any, time: float, dt: float, stages: Any, first: int,
-    end: int,
-) -> None:  # fmt: skip
-    """Seven slopes, of which the last is the first of the next step: rows 2 to 8 of velocities, 9 to 15 of forces."""
-    x, v = stages[0], stages[1]
-    other_x, other_v = stages[3], stages[10]  # the second slope counts neither in the result nor in its error
-    limits = settings(context)
-    clock, known = begun(dt), False
-    while clock.done < dt:
-        h = clock.step
-        for stage in range(7):
-            copy(x, v, pos, vel, first, end)
-            for k in range(stage):
-                add_slopes(x, v, h * like(h, WEIGHTS[stage][k]), stages[2 + k], stages[9 + k], first, end)
-            if stage > 0 or not known:
-                acceleration(context, x, v, time + clock.done + h * like(h, NODES[stage]), stages[9 + stage])
-                slope_of(stages[2 + stage], v, flow, first, end)
-        copy(other_x, other_v, x, v, first, end)
-        for k in range(7):
-            if k != 1:
-                add_slopes(other_x, other_v, -h * like(h, ERRORS[k]), stages[2 + k], stages[9 + k], first, end)
-        misfit(other_x, x, v, other_x, other_v, first, end)
-        square, where = largest(context, other_x, first, end)
-        error, known = np.sqrt(square), True
-        if error <= limits[0]:
-            copy(pos, vel, x, v, first, end)
-            copy(stages[2], stages[9], stages[8], stages[15], first, end)
-        clock = judged(clock, error, limits, dt, 4)
-        if clock.lost:
-            pos[where] = like(dt, np.nan)
-    counted(context, clock.accepted, clock.rejected)
+def advance(provided: Provided) -> Method:
+    """Make `advance`: seven slopes, of which the last is the first of the next step.
+
+    Rows 2 to 8 of the stages are slopes of positions, rows 9 to 15 slopes of velocities.
+    """
+    acceleration, settings = provided.acceleration, provided.settings
+    largest, counted = provided.largest, provided.counted
+
+    def advance(
+        context: Any, pos: Any, vel: Any, flow: Any, time: float, dt: float, stages: Any, first: int, end: int
+    ) -> None:
+        x, v = stages[0], stages[1]
+        other_x, other_v = stages[3], stages[10]  # the second slope counts neither in the result nor in its error
+        limits = settings(context)
+        clock, known = begun(dt), False
+        while clock.done < dt:
+            h = clock.step
+            for stage in range(7):
+                copy(x, v, pos, vel, first, end)
+                for k in range(stage):
+                    add_slopes(x, v, h * like(h, WEIGHTS[stage][k]), stages[2 + k], stages[9 + k], first, end)
+                if stage > 0 or not known:
+                    acceleration(context, x, v, time + clock.done + h * like(h, NODES[stage]), stages[9 + stage])
+                    slope_of(stages[2 + stage], v, flow, first, end)
+            copy(other_x, other_v, x, v, first, end)
+            for k in range(7):
+                if k != 1:
+                    add_slopes(other_x, other_v, -h * like(h, ERRORS[k]), stages[2 + k], stages[9 + k], first, end)
+            misfit(other_x, x, v, other_x, other_v, first, end)
+            square, where = largest(context, other_x, first, end)
+            error, known = np.sqrt(square), True
+            if error <= limits[0]:
+                copy(pos, vel, x, v, first, end)
+                copy(stages[2], stages[9], stages[8], stages[15], first, end)
+            clock = judged(clock, error, limits, dt, 4)
+            if clock.lost:
+                pos[where] = like(dt, np.nan)
+        counted(context, clock.accepted, clock.rejected)
+
+    return advance
 
 
 class DormandPrince(Adaptive):

@@ -6,8 +6,8 @@ from typing import Any, ClassVar, Literal
 
 import numpy as np
 
-from flockenv.integrators.base import Integrator, carried, damping
-from flockenv.kernels import kernel, like, shared
+from flockenv.integrators.base import Integrator, Method, Provided, carried
+from flockenv.kernels import like, shared
 
 __all__ = ["ExponentialDrag", "phi_functions"]
 
@@ -40,32 +40,37 @@ def phi_functions(z: float) -> tuple[float, float, float, float]:
     return np.exp(large), far_first, far_second, far_third
 
 
-@kernel
-def advance(
-    acceleration: Any, context: Any, pos: Any, vel: Any, flow: Any, time: float, dt: float, stages: Any, first: int,
-    end: int,
-) -> None:  # fmt: skip
-    """ETD2RK of Cox and Matthews (2002): exact flow of x' = v, v' = -k v + a, with a first constant, then linear in t.
+def advance(provided: Provided) -> Method:
+    """Make `advance`: ETD2RK of Cox and Matthews (2002).
+
+    The exact flow of x' = v, v' = -k v + a, with a first constant, then linear in t.
 
     What the second evaluation adds, a1 - a0 times h^2 phi3 and h phi2, is split: -a0 at once, +a1 when it is known.
     """
-    a, x, v, rate, half = stages[0], stages[1], stages[2], stages[3], like(dt, 0.5) * dt
-    damping(context, rate, first, end)
-    for i in range(np.uint64(first), np.uint64(end)):
-        x[i], v[i] = pos[i], vel[i]
-    for stage in range(2):
-        acceleration(context, x, v, time if stage == 0 else time + dt, a)
+    acceleration, damping = provided.acceleration, provided.damping
+
+    def advance(
+        context: Any, pos: Any, vel: Any, flow: Any, time: float, dt: float, stages: Any, first: int, end: int
+    ) -> None:
+        a, x, v, rate, half = stages[0], stages[1], stages[2], stages[3], like(dt, 0.5) * dt
+        damping(context, rate, first, end)
         for i in range(np.uint64(first), np.uint64(end)):
-            decay, one, two, three = phi_functions(-rate[i] * dt)
-            if stage == 0:
-                x[i] = pos[i] + dt * (one * v[i] + dt * two * a[i])
-                v[i] = decay * v[i] + dt * one * a[i]
-                pos[i] = carried(x[i] - dt * dt * three * a[i], half, flow, i)
-                vel[i] = v[i] - dt * two * a[i]
-                x[i] = carried(x[i], dt, flow, i)
-            else:
-                pos[i] = carried(pos[i] + dt * dt * three * a[i], half, flow, i)
-                vel[i] += dt * two * a[i]
+            x[i], v[i] = pos[i], vel[i]
+        for stage in range(2):
+            acceleration(context, x, v, time if stage == 0 else time + dt, a)
+            for i in range(np.uint64(first), np.uint64(end)):
+                decay, one, two, three = phi_functions(-rate[i] * dt)
+                if stage == 0:
+                    x[i] = pos[i] + dt * (one * v[i] + dt * two * a[i])
+                    v[i] = decay * v[i] + dt * one * a[i]
+                    pos[i] = carried(x[i] - dt * dt * three * a[i], half, flow, i)
+                    vel[i] = v[i] - dt * two * a[i]
+                    x[i] = carried(x[i], dt, flow, i)
+                else:
+                    pos[i] = carried(pos[i] + dt * dt * three * a[i], half, flow, i)
+                    vel[i] += dt * two * a[i]
+
+    return advance
 
 
 class ExponentialDrag(Integrator):

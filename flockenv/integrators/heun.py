@@ -6,29 +6,32 @@ from typing import Any, ClassVar, Literal
 
 import numpy as np
 
-from flockenv.integrators.base import Integrator, carried
-from flockenv.kernels import kernel, like
+from flockenv.integrators.base import Integrator, Method, Provided, carried
+from flockenv.kernels import like
 
 __all__ = ["Heun"]
 
 
-@kernel
-def advance(
-    acceleration: Any, context: Any, pos: Any, vel: Any, flow: Any, time: float, dt: float, stages: Any, first: int,
-    end: int,
-) -> None:  # fmt: skip
-    """The mean of the slope here and the slope where Euler would get; asked for in one place, see rk4."""
-    a, x, v, half = stages[0], stages[1], stages[2], like(dt, 0.5) * dt
-    for i in range(np.uint64(first), np.uint64(end)):
-        x[i], v[i] = pos[i], vel[i]
-    for stage in range(2):
-        acceleration(context, x, v, time if stage == 0 else time + dt, a)
+def advance(provided: Provided) -> Method:
+    """Make `advance`: the mean of the slope here and the slope where Euler would get; one call, see rk4."""
+    acceleration = provided.acceleration
+
+    def advance(
+        context: Any, pos: Any, vel: Any, flow: Any, time: float, dt: float, stages: Any, first: int, end: int
+    ) -> None:
+        a, x, v, half = stages[0], stages[1], stages[2], like(dt, 0.5) * dt
         for i in range(np.uint64(first), np.uint64(end)):
-            slope = v[i]
-            pos[i] = carried(pos[i] + half * slope, half, flow, i)
-            vel[i] += half * a[i]
-            x[i] = carried(x[i] + dt * slope, dt, flow, i)
-            v[i] += dt * a[i]
+            x[i], v[i] = pos[i], vel[i]
+        for stage in range(2):
+            acceleration(context, x, v, time if stage == 0 else time + dt, a)
+            for i in range(np.uint64(first), np.uint64(end)):
+                slope = v[i]
+                pos[i] = carried(pos[i] + half * slope, half, flow, i)
+                vel[i] += half * a[i]
+                x[i] = carried(x[i] + dt * slope, dt, flow, i)
+                v[i] += dt * a[i]
+
+    return advance
 
 
 class Heun(Integrator):

@@ -6,20 +6,22 @@ from typing import Any, ClassVar, Literal
 
 import numpy as np
 
+from flockenv.integrators.base import Method, Provided
 from flockenv.integrators.implicit import Implicit
-from flockenv.kernels import kernel
 
 __all__ = ["ImplicitEuler"]
 
 
-@kernel
-def advance(
-    acceleration: Any, context: Any, pos: Any, vel: Any, flow: Any, time: float, dt: float, stages: Any, first: int,
-    end: int,
-) -> None:  # fmt: skip
-    """Take over what was solved: positions in the first of the stages, velocities in the second."""
-    for i in range(np.uint64(first), np.uint64(end)):
-        pos[i], vel[i] = stages[0, i], stages[1, i]
+def advance(provided: Provided) -> Method:
+    """Make `advance`: positions are taken over from the first of the stages, velocities from the second."""
+
+    def advance(
+        context: Any, pos: Any, vel: Any, flow: Any, time: float, dt: float, stages: Any, first: int, end: int
+    ) -> None:
+        for i in range(np.uint64(first), np.uint64(end)):
+            pos[i], vel[i] = stages[0, i], stages[1, i]
+
+    return advance
 
 
 class ImplicitEuler(Implicit):

@@ -6,31 +6,34 @@ from typing import Any, ClassVar, Literal
 
 import numpy as np
 
-from flockenv.integrators.base import Integrator, carried
-from flockenv.kernels import kernel, like
+from flockenv.integrators.base import Integrator, Method, Provided, carried
+from flockenv.kernels import like
 
 __all__ = ["Midpoint"]
 
 
-@kernel
-def advance(
-    acceleration: Any, context: Any, pos: Any, vel: Any, flow: Any, time: float, dt: float, stages: Any, first: int,
-    end: int,
-) -> None:  # fmt: skip
-    """The slope half a step ahead, taken for the whole step; asked for in one place, see rk4."""
-    a, x, v, half = stages[0], stages[1], stages[2], like(dt, 0.5) * dt
-    for i in range(np.uint64(first), np.uint64(end)):
-        x[i], v[i] = pos[i], vel[i]
-    for stage in range(2):
-        acceleration(context, x, v, time if stage == 0 else time + half, a)
-        if stage == 0:
-            for i in range(np.uint64(first), np.uint64(end)):
-                x[i] = carried(pos[i] + half * vel[i], half, flow, i)
-                v[i] = vel[i] + half * a[i]
-        else:
-            for i in range(np.uint64(first), np.uint64(end)):
-                pos[i] = carried(pos[i] + dt * v[i], dt, flow, i)
-                vel[i] += dt * a[i]
+def advance(provided: Provided) -> Method:
+    """Make `advance`: the slope half a step ahead, taken for the whole step; one call, see rk4."""
+    acceleration = provided.acceleration
+
+    def advance(
+        context: Any, pos: Any, vel: Any, flow: Any, time: float, dt: float, stages: Any, first: int, end: int
+    ) -> None:
+        a, x, v, half = stages[0], stages[1], stages[2], like(dt, 0.5) * dt
+        for i in range(np.uint64(first), np.uint64(end)):
+            x[i], v[i] = pos[i], vel[i]
+        for stage in range(2):
+            acceleration(context, x, v, time if stage == 0 else time + half, a)
+            if stage == 0:
+                for i in range(np.uint64(first), np.uint64(end)):
+                    x[i] = carried(pos[i] + half * vel[i], half, flow, i)
+                    v[i] = vel[i] + half * a[i]
+            else:
+                for i in range(np.uint64(first), np.uint64(end)):
+                    pos[i] = carried(pos[i] + dt * v[i], dt, flow, i)
+                    vel[i] += dt * a[i]
+
+    return advance
 
 
 class Midpoint(Integrator):

@@ -6,35 +6,38 @@ from typing import Any, ClassVar, Literal
 
 import numpy as np
 
-from flockenv.integrators.base import Integrator, carried
-from flockenv.kernels import kernel, like
+from flockenv.integrators.base import Integrator, Method, Provided, carried
+from flockenv.kernels import like
 
 __all__ = ["RK4"]
 
 
-@kernel
-def advance(
-    acceleration: Any, context: Any, pos: Any, vel: Any, flow: Any, time: float, dt: float, stages: Any, first: int,
-    end: int,
-) -> None:  # fmt: skip
-    """Four slopes, weighted 1, 2, 2, 1, each taken at a stage that the slope before led to.
+def advance(provided: Provided) -> Method:
+    """Make `advance`: four slopes, weighted 1, 2, 2, 1, each taken at a stage that the slope before led to.
 
-    The acceleration is asked for in one place, so that the whole sweep is compiled once and not four times.
+    The acceleration is called in one place, so that the whole sweep is compiled once and not four times.
     """
-    a, x, v, x0, v0 = stages[0], stages[1], stages[2], stages[3], stages[4]
-    for i in range(np.uint64(first), np.uint64(end)):
-        x0[i], v0[i], x[i], v[i] = pos[i], vel[i], pos[i], vel[i]
-    for stage in range(4):
-        weight = dt / 6 if stage == 0 or stage == 3 else dt / 3
-        ahead = dt if stage == 2 else dt / 2
-        when = time + (like(dt, 0.0) if stage == 0 else (dt if stage == 3 else dt / 2))
-        acceleration(context, x, v, when, a)
+    acceleration = provided.acceleration
+
+    def advance(
+        context: Any, pos: Any, vel: Any, flow: Any, time: float, dt: float, stages: Any, first: int, end: int
+    ) -> None:
+        a, x, v, x0, v0 = stages[0], stages[1], stages[2], stages[3], stages[4]
         for i in range(np.uint64(first), np.uint64(end)):
-            slope = v[i]
-            pos[i] = carried(pos[i] + weight * slope, weight, flow, i)
-            vel[i] += weight * a[i]
-            x[i] = carried(x0[i] + ahead * slope, ahead, flow, i)
-            v[i] = v0[i] + ahead * a[i]
+            x0[i], v0[i], x[i], v[i] = pos[i], vel[i], pos[i], vel[i]
+        for stage in range(4):
+            weight = dt / 6 if stage == 0 or stage == 3 else dt / 3
+            ahead = dt if stage == 2 else dt / 2
+            when = time + (like(dt, 0.0) if stage == 0 else (dt if stage == 3 else dt / 2))
+            acceleration(context, x, v, when, a)
+            for i in range(np.uint64(first), np.uint64(end)):
+                slope = v[i]
+                pos[i] = carried(pos[i] + weight * slope, weight, flow, i)
+                vel[i] += weight * a[i]
+                x[i] = carried(x0[i] + ahead * slope, ahead, flow, i)
+                v[i] = v0[i] + ahead * a[i]
+
+    return advance
 
 
 class RK4(Integrator):

@@ -6,34 +6,37 @@ from typing import Any, ClassVar, Literal
 
 import numpy as np
 
-from flockenv.integrators.base import Integrator, carried
-from flockenv.kernels import kernel, like
+from flockenv.integrators.base import Integrator, Method, Provided, carried
+from flockenv.kernels import like
 
 __all__ = ["VelocityVerlet"]
 
 
-@kernel
-def advance(
-    acceleration: Any, context: Any, pos: Any, vel: Any, flow: Any, time: float, dt: float, stages: Any, first: int,
-    end: int,
-) -> None:  # fmt: skip
-    """Half a kick, a drift, half a kick.
+def advance(provided: Provided) -> Method:
+    """Make `advance`: half a kick, a drift, half a kick.
 
     The second force is asked for at a predicted velocity: with the old one drag would make it order 1.
     """
-    a, x, v, half = stages[0], stages[1], stages[2], like(dt, 0.5) * dt
-    for i in range(np.uint64(first), np.uint64(end)):
-        x[i], v[i] = pos[i], vel[i]
-    for stage in range(2):
-        acceleration(context, x, v, time if stage == 0 else time + dt, a)
+    acceleration = provided.acceleration
+
+    def advance(
+        context: Any, pos: Any, vel: Any, flow: Any, time: float, dt: float, stages: Any, first: int, end: int
+    ) -> None:
+        a, x, v, half = stages[0], stages[1], stages[2], like(dt, 0.5) * dt
         for i in range(np.uint64(first), np.uint64(end)):
-            vel[i] += half * a[i]
-            pos[i] = carried(pos[i], half, flow, i)
-        if stage == 0:
+            x[i], v[i] = pos[i], vel[i]
+        for stage in range(2):
+            acceleration(context, x, v, time if stage == 0 else time + dt, a)
             for i in range(np.uint64(first), np.uint64(end)):
-                pos[i] += dt * vel[i]
-                x[i] = carried(pos[i], half, flow, i)
-                v[i] += dt * a[i]
+                vel[i] += half * a[i]
+                pos[i] = carried(pos[i], half, flow, i)
+            if stage == 0:
+                for i in range(np.uint64(first), np.uint64(end)):
+                    pos[i] += dt * vel[i]
+                    x[i] = carried(pos[i], half, flow, i)
+                    v[i] += dt * a[i]
+
+    return advance
 
 
 class VelocityVerlet(Integrator):

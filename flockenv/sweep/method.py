@@ -1,100 +1,119 @@
-"""The integrator's method, copied as text, and what it asks of the scene: its numbers, drags, errors and counts."""
+"""The integrator's method as a section of a scene: its `advance`, with functions that know how agents lie in memory."""
 
 from __future__ import annotations
 
-import builtins
-import inspect
+import functools
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
-from flockenv.integrators.base import PROVIDED, SUBSTEPS
-from flockenv.kernels import python_of
-from flockenv.sweep.accelerate import parameters
-from flockenv.sweep.handed import OPEN_CONTEXT
+import numpy as np
+
+from flockenv.integrators.base import SUBSTEPS, Method, Provided
+from flockenv.kernels import kernel, like
+from flockenv.section import section
 from flockenv.sweep.parts import Parts
-from flockenv.sweep.text import indented, needed
 
-__all__ = ["method", "method_imports"]
-
-
-def method_imports(parts: Parts) -> str:
-    """Import the integrator's `move`, or what its `advance` calls in its own module."""
-    if parts.one_stage:
-        return f"from {type(parts.integrator).__module__} import move"
-    python = python_of(parts.integrator.advance())
-    names = [name for name in python.__code__.co_names if name in python.__globals__]
-    names = [name for name in names if name not in PROVIDED and name not in (*dir(builtins), "np")]
-    return f"from {python.__module__} import {', '.join(names)}" if names else "# the method needs nothing else"
+__all__ = ["MethodPlan", "advance_of", "method_plan"]
 
 
-def method(parts: Parts) -> str:
-    """Return the text of the integrator's `advance` with this scene's `accelerate` in the place of its argument.
+class MethodPlan(NamedTuple):
+    """What the functions that a method is provided with depend on."""
 
-    (numba can pass a compiled function as an argument, but does not cache a function that does.)
+    dimension: int
+    width: int
+    drags: tuple[tuple[int, str], ...]  # (effect, name of its number): linear drags, kg/s
+
+
+def method_plan(parts: Parts) -> MethodPlan:
+    """Return the plan of a scene."""
+    drags = tuple((k, effect.linear_drag) for k, effect in enumerate(parts.effects) if effect.linear_drag)
+    return MethodPlan(parts.dimension, parts.width, drags)
+
+
+@functools.cache
+def advance_of(method: Callable[[Provided], Method], plan: MethodPlan) -> Callable[[Any], Method]:
+    """Make `advance_of(accelerate)`: the compiled `advance` of a method, of a scene with this `accelerate`.
+
+    numba caches no function that is passed a compiled one, so `advance` holds it.
     """
-    python = python_of(parts.integrator.advance())
-    text = inspect.getsource(python)
-    text = text[text.index("def advance(") :].replace("acceleration: Any, ", "", 1)
-    for annotation in (": Any", ": float", ": int"):
-        text = text.replace(annotation, "")
-    writers = {"damping": _damping, "largest": _largest, "counted": _counted}
-    asked = [writers[name](parts) for name in sorted(PROVIDED & set(python.__code__.co_names)) if name in writers]
-    return (
-        "".join(asked)
-        + "\n@kernel\n"
-        + text.replace("acceleration(", "accelerate(").replace("settings(context)", "context.numbers.method")
-    )
+    damping, largest = _damping(plan), _largest(plan.dimension, plan.width)
+
+    def advance_of(accelerate: Any) -> Method:
+        made: Method = kernel(method(Provided(accelerate, _settings, damping, largest, _counted)))
+        return made
+
+    return advance_of
 
 
-def _damping(parts: Parts) -> str:
-    """Write the sum of all linear drags."""
-    rates = [f"p{k}.{e.linear_drag}" for k, e in enumerate(parts.effects) if e.linear_drag]
-    d, w = parts.dimension, parts.width
-    return f'''
 @kernel
-def damping(context, rate, begin, until):
-    """The sum of all linear drags of every coordinate, 1/s."""
-    {OPEN_CONTEXT}
-{indented(needed(parameters(parts, "context.numbers"), rates), 4)}
-    c = {" + ".join(rates) or "like(mass[0], 0.0)"}
-    for block in range(np.uint64(begin // {d * w}), np.uint64(until // {d * w})):
-        base, row = block * np.uint64({d * w}), block * np.uint64({w})
-        for l in range(np.uint64({w})):
-            share = c / mass[row + l]
-{indented([f"rate[base + np.uint64({k * w}) + l] = share" for k in range(d)], 12)}
+def _settings(context: Any) -> Any:
+    """Return the numbers of the method."""
+    return context.numbers.method
 
 
-'''
-
-
-def _largest(parts: Parts) -> str:
-    """Write how the agent is found of whom some squares have the largest sum."""
-    d, w = parts.dimension, parts.width
-    return f'''
 @kernel
-def largest(context, squares, begin, until):
-    """The largest sum of an agent's coordinates, NaN if one is, and where the first of that agent lies."""
-    worst, where = like(squares[0], -1.0), np.uint64(begin)
-    for block in range(np.uint64(begin // {d * w}), np.uint64(until // {d * w})):
-        base = block * np.uint64({d * w})
-        for lane in range({w}):  # one after the other: no loop over lanes
-            l = np.uint64(lane)
-            found = {" + ".join(f"squares[base + np.uint64({k * w}) + l]" for k in range(d))}
-            more = (worst == worst) & ((found > worst) | (found != found))  # the first NaN stays
-            worst, where = found if more else worst, base + l if more else where
-    return worst, where
-
-
-'''
-
-
-def _counted(parts: Parts) -> str:
-    """Write how steps are counted."""
-    return f'''
-@kernel
-def counted(context, accepted, rejected):
+def _counted(context: Any, accepted: Any, rejected: Any) -> None:
     """Count steps of the method's own."""
-    {OPEN_CONTEXT}
-    work[b, {SUBSTEPS}] += accepted
-    work[b, {SUBSTEPS + 1}] += rejected
+    context.work[context.b, SUBSTEPS] += accepted
+    context.work[context.b, SUBSTEPS + 1] += rejected
 
 
-'''
+@section
+def _damping(plan: MethodPlan) -> Callable[..., None]:
+    """Make `damping(context, rate, first, end)`: write the sum of all linear drags of every coordinate, 1/s."""
+    total, dimension, lanes = _drag(plan.drags), plan.dimension, np.uint64(plan.width)
+    size = plan.dimension * plan.width
+
+    def damping(context: Any, rate: Any, first: Any, end: Any) -> None:
+        mass = context.scratch.mass
+        drag = total(context.numbers.effects, mass)
+        for block in range(np.uint64(first // size), np.uint64(end // size)):
+            base, row = block * np.uint64(size), block * lanes
+            for lane in range(lanes):
+                share = drag / mass[row + lane]
+                rate[base + lane] = share
+                rate[base + lanes + lane] = share
+                if dimension == 3:
+                    rate[base + np.uint64(2) * lanes + lane] = share
+
+    return damping
+
+
+@section
+def _drag(drags: tuple[tuple[int, str], ...]) -> Callable[[Any, Any], float]:
+    """Make `drag(effects, mass)`: the sum of linear drags, kg/s, 0 if there is none."""
+    if not drags:
+        return lambda effects, mass: like(mass[0], 0.0)
+    before = _drag(drags[:-1]) if drags[1:] else None
+    k, name = drags[-1]
+
+    def drag(effects: Any, mass: Any) -> Any:
+        if before is None:
+            return getattr(effects[k], name)
+        return before(effects, mass) + getattr(effects[k], name)
+
+    return drag
+
+
+@section
+def _largest(dimension: int, width: int) -> Callable[..., tuple[float, Any]]:
+    """Make `largest(context, squares, first, end)`: the largest sum of an agent's coordinates, and where it lies.
+
+    NaN if one is; the place is that of the agent's first coordinate.
+    """
+    lanes, size = np.uint64(width), dimension * width
+
+    def largest(context: Any, squares: Any, first: Any, end: Any) -> Any:
+        worst, where = like(squares[0], -1.0), np.uint64(first)
+        for block in range(np.uint64(first // size), np.uint64(end // size)):
+            base = block * np.uint64(size)
+            for one in range(width):  # one after the other: no loop over lanes
+                place = base + np.uint64(one)
+                found = squares[place] + squares[place + lanes]
+                if dimension == 3:
+                    found += squares[place + np.uint64(2) * lanes]
+                more = (worst == worst) & ((found > worst) | (found != found))  # the first NaN stays
+                worst, where = found if more else worst, place if more else where
+        return worst, where
+
+    return largest

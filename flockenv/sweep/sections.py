@@ -7,8 +7,10 @@ from __future__ import annotations
 
 from typing import Any
 
+from flockenv.integrators.one_stage import OneStage
 from flockenv.sweep.agents import AgentPlan, alone_of, inner_of, still
 from flockenv.sweep.blocks import into_blocks, out_of_blocks
+from flockenv.sweep.method import advance_of, method_plan
 from flockenv.sweep.numbers import images_of, numbers_of
 from flockenv.sweep.parts import Parts
 
@@ -27,6 +29,10 @@ def sections_of(parts: Parts) -> tuple[tuple[str, Any], ...]:
     )
     made["alone"], made["alone_without_aim"] = alone_of(agent), alone_of(agent._replace(aims=False))
     made["inner_of"], made["still"] = inner_of(parts.inner), still
+    if isinstance(parts.integrator, OneStage):
+        made["move"] = parts.integrator.move()
+    else:
+        made["advance_of"] = advance_of(parts.integrator.advance(), method_plan(parts))
     for k, effect in enumerate(parts.effects):
         if parts.space.periodic and effect.places:
             made[f"images_of_{k}"] = images_of(tuple(parts.names_of(effect)), effect.places, parts.space.offset_law)

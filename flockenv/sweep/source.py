@@ -1,7 +1,4 @@
-"""The whole file of a scene: imports, a record of numbers per effect, `accelerate`, the integrator's method, the step.
-
-Laws are imported from where they were written; only the integrator's `advance` is copied, as text.
-"""
+"""The whole file of a scene: imports, `accelerate`, the step. Laws are imported from where they were written."""
 
 from __future__ import annotations
 
@@ -13,7 +10,6 @@ from flockenv.sweep.around import around, around_imports
 from flockenv.sweep.far import tree_imports
 from flockenv.sweep.handed import OPEN_SCRATCH, Context, opened
 from flockenv.sweep.look import KEYS
-from flockenv.sweep.method import method, method_imports
 from flockenv.sweep.obstacles import blocked, near_rows, obstacle_imports
 from flockenv.sweep.parts import LAWS, Parts
 from flockenv.sweep.step import begin, kept_frame, kept_inner, step, step_world
@@ -33,7 +29,7 @@ def scene_source(parts: Parts, more: str = "") -> str:
         blocked(parts),
         around(parts),
         sense(parts),
-        *([] if parts.one_stage else [accelerate(parts), method(parts)]),
+        *([] if parts.one_stage else [accelerate(parts), "advance = advance_of(accelerate)\n"]),
         step_world(parts),
         begin(parts),
         step(parts) + more,
@@ -109,7 +105,6 @@ def _imports(parts: Parts) -> str:
         *tree_imports(parts),
         *obstacle_imports(parts),
         *around_imports(parts),
-        method_imports(parts),
     ]
     for k, effect in enumerate(parts.effects):
         for slot in LAWS:
