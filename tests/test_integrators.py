@@ -14,7 +14,17 @@ import numpy as np
 import pytest
 
 from flockenv.behaviours import Separation
-from flockenv.integrators import RK4, ExplicitEuler, Heun, Integrator, Midpoint, SemiImplicitEuler, VelocityVerlet
+from flockenv.effects import Drag
+from flockenv.integrators import (
+    RK4,
+    ExplicitEuler,
+    ExponentialDrag,
+    Heun,
+    Integrator,
+    Midpoint,
+    SemiImplicitEuler,
+    VelocityVerlet,
+)
 from flockenv.integrators.base import INTEGRATORS as KINDS
 from flockenv.integrators.base import Alone, Provided
 from flockenv.integrators.one_stage import OneStage
@@ -295,6 +305,16 @@ def test_of_a_team_each_writes_his_own_part_alone(row: IntegratorRow) -> None:
             whole[..., first:end] = after[..., first:end]
     for whole, once in zip(apart, together, strict=True):
         np.testing.assert_array_equal(whole, once)
+
+
+def test_linear_drags_of_several_effects_are_treated_as_their_sum() -> None:
+    """Exactly, and in every dimension: v = v0 exp(-(c + c') dt / m)."""
+    for dimension in (2, 3):
+        group = Group(count=20, mass=2.0, spawn=Spawn(low=(0,) * dimension, high=(9,) * dimension, speed=(1, 2)))
+        drags = Drag(rate=3.0), Drag(rate=1.5)
+        scene = Scene(dimension=dimension, groups=(group,), effects=drags, integrator=ExponentialDrag(), dt=0.7)
+        start = scene.start(0)
+        np.testing.assert_allclose(scene.step(start).vel, start.vel * math.exp(-4.5 * 0.7 / 2.0), rtol=1e-13)
 
 
 TYPED = """

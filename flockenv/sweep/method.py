@@ -21,12 +21,12 @@ class MethodPlan(NamedTuple):
 
     dimension: int
     width: int
-    drags: tuple[tuple[int, str], ...]  # (effect, name of its number): linear drags, kg/s
+    drags: tuple[tuple[int, int], ...]  # linear drags, kg/s: (effect, which of its numbers)
 
 
 def method_plan(parts: Parts) -> MethodPlan:
     """Return the plan of a scene."""
-    drags = tuple((k, effect.linear_drag) for k, effect in enumerate(parts.effects) if effect.linear_drag)
+    drags = tuple((k, parts.names_of(e).index(e.linear_drag)) for k, e in enumerate(parts.effects) if e.linear_drag)
     return MethodPlan(parts.dimension, parts.width, drags)
 
 
@@ -61,15 +61,15 @@ def _counted(context: Any, accepted: Any, rejected: Any) -> None:
 @section
 def _damping(plan: MethodPlan) -> Callable[..., None]:
     """Make `damping(context, rate, first, end)`: write the sum of all linear drags of every coordinate, 1/s."""
-    total, dimension, lanes = _drag(plan.drags), plan.dimension, np.uint64(plan.width)
-    size = plan.dimension * plan.width
+    total, dimension, width = _drag(plan.drags), plan.dimension, plan.width
+    lanes, size = np.uint64(width), dimension * width
 
     def damping(context: Any, rate: Any, first: Any, end: Any) -> None:
         mass = context.scratch.mass
         drag = total(context.numbers.effects, mass)
         for block in range(np.uint64(first // size), np.uint64(end // size)):
             base, row = block * np.uint64(size), block * lanes
-            for lane in range(lanes):
+            for lane in range(np.uint64(width)):
                 share = drag / mass[row + lane]
                 rate[base + lane] = share
                 rate[base + lanes + lane] = share
@@ -80,17 +80,17 @@ def _damping(plan: MethodPlan) -> Callable[..., None]:
 
 
 @section
-def _drag(drags: tuple[tuple[int, str], ...]) -> Callable[[Any, Any], float]:
+def _drag(drags: tuple[tuple[int, int], ...]) -> Callable[[Any, Any], float]:
     """Make `drag(effects, mass)`: the sum of linear drags, kg/s, 0 if there is none."""
     if not drags:
         return lambda effects, mass: like(mass[0], 0.0)
     before = _drag(drags[:-1]) if drags[1:] else None
-    k, name = drags[-1]
+    k, place = drags[-1]
 
     def drag(effects: Any, mass: Any) -> Any:
         if before is None:
-            return getattr(effects[k], name)
-        return before(effects, mass) + getattr(effects[k], name)
+            return effects[k][place]
+        return before(effects, mass) + effects[k][place]
 
     return drag
 
