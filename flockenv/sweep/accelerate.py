@@ -9,7 +9,6 @@ part; `accelerate` is for all others, and for who asks for accelerations alone.
 from __future__ import annotations
 
 from flockenv.sweep.bonds import bonds
-from flockenv.sweep.far import far
 from flockenv.sweep.handed import OPEN_CONTEXT
 from flockenv.sweep.obstacles import obstacles
 from flockenv.sweep.pairs import pairs
@@ -36,7 +35,7 @@ _FORM_FIELDS = {"at": "at", "count": "many", "cells": "cells"}
 
 def sense(parts: Parts) -> str:
     """Return the source of `sense`: what is felt from others."""
-    sensing = [*_aim(parts), *pairs(parts), *far(parts), *bonds(parts)]
+    sensing = [*_aim(parts), *pairs(parts), *["far(context, pos, time)"] * bool(parts.far), *bonds(parts)]
     return f'''
 
 @kernel

@@ -10,6 +10,7 @@ from typing import Any
 from flockenv.integrators.one_stage import OneStage
 from flockenv.sweep.agents import AgentPlan, alone_of, inner_of, still
 from flockenv.sweep.blocks import into_blocks, out_of_blocks
+from flockenv.sweep.far import far_of, far_plan
 from flockenv.sweep.method import advance_of, method_plan
 from flockenv.sweep.numbers import images_of, numbers_of
 from flockenv.sweep.parts import Parts
@@ -29,6 +30,8 @@ def sections_of(parts: Parts) -> tuple[tuple[str, Any], ...]:
     )
     made["alone"], made["alone_without_aim"] = alone_of(agent), alone_of(agent._replace(aims=False))
     made["inner_of"], made["still"] = inner_of(parts.inner), still
+    if parts.far:
+        made["far"] = far_of(far_plan(parts))
     if isinstance(parts.integrator, OneStage):
         made["move"] = parts.integrator.move()
     else:

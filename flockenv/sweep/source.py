@@ -7,7 +7,6 @@ from dataclasses import replace
 from flockenv.kernels import import_line
 from flockenv.sweep.accelerate import accelerate, sense
 from flockenv.sweep.around import around, around_imports
-from flockenv.sweep.far import tree_imports
 from flockenv.sweep.handed import OPEN_SCRATCH, Context, opened
 from flockenv.sweep.look import KEYS
 from flockenv.sweep.obstacles import blocked, near_rows, obstacle_imports
@@ -16,6 +15,9 @@ from flockenv.sweep.step import begin, kept_frame, kept_inner, step, step_world
 from flockenv.sweep.text import asked, indented
 
 __all__ = ["field_source", "scene_source"]
+
+IN_SECTIONS = ("far_law",)
+"""Laws that sections hold: the file of a scene calls them nowhere."""
 
 
 def scene_source(parts: Parts, more: str = "") -> str:
@@ -86,7 +88,7 @@ def _imports(parts: Parts) -> str:
     lines = [
         "import numpy as np",
         "from numba import njit",
-        "from flockenv.effects.base import Far, Me, Other, in_view",
+        "from flockenv.effects.base import Me, Other, in_view",
         "from flockenv.inlining import Whole",
         "from flockenv.section import record",
         "from flockenv.sweep.handed import Context",
@@ -102,14 +104,13 @@ def _imports(parts: Parts) -> str:
         "from flockenv.vec import add, dot, exact_dot, exact_sum, limit, norm, scale, select, sub, unit, zero",
         *(["from flockenv.vehicle import faced, held, leant, raised, turned"] if parts.oriented else []),
         *([f"from flockenv.abreast import {KEYS}"] * parts.keyed),
-        *tree_imports(parts),
         *obstacle_imports(parts),
         *around_imports(parts),
     ]
     for k, effect in enumerate(parts.effects):
         for slot in LAWS:
             law = getattr(effect, slot)
-            if law is not None:
+            if law is not None and slot not in IN_SECTIONS:
                 lines.append(import_line(law, f"{slot}_{k}"))
         if effect.wishes:
             lines.append(import_line(effect.steer_law, f"steer_law_{k}"))
