@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from stable_baselines3 import PPO
 
 from agents.checkpoint import JSON, Damaged, Parts, Tensors, as_json
-from flockenv.accuracy.measure import machine
+from flockenv.accuracy.trials import machine
 from flockenv.kernels import load
 from flockenv.tasks import Task
 from flockenv.tasks.base import task_source

@@ -10,7 +10,8 @@ import pytest
 
 from flockenv import polyline
 from flockenv.evaluation import rollout
-from flockenv.players.rules import PathFollowRules, RulesPlayer
+from flockenv.players.rules import RulesPlayer
+from flockenv.players.rules.path_follow import PathFollowRules
 from flockenv.render.picture import draw
 from flockenv.tasks import PathFollow
 from flockenv.tasks.path_follow import POINTS

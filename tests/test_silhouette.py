@@ -14,7 +14,7 @@ from flockenv.behaviours import AvoidObstacles, Seek, Whiskers
 from flockenv.constraints import Collisions
 from flockenv.scene import Group, Scene
 from flockenv.shapes import Block, Capsule, Circle, DistanceField, HalfSpace, Polygon, Shape, Wall
-from flockenv.shapes.silhouette import sphere_edge
+from flockenv.shapes.edges import sphere_edge
 from flockenv.spawn import Spawn
 from flockenv.steer import Steer
 

@@ -7,10 +7,10 @@ report.cheapest(1e-3, by="seconds")
 
 from __future__ import annotations
 
-from flockenv.accuracy.measure import measure, usual_methods
 from flockenv.accuracy.problem import Problem
 from flockenv.accuracy.results import Choice, Curve, Machine, Point, Report, Results
 from flockenv.accuracy.suite import SUITE, problems_named
+from flockenv.accuracy.trials import measure, usual_methods
 
 __all__ = [
     "SUITE", "Choice", "Curve", "Machine", "Point", "Problem", "Report", "Results", "measure", "problems_named",

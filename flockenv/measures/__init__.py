@@ -6,7 +6,6 @@ means.
 
 from __future__ import annotations
 
-from flockenv.measures.bursts import Bursts, bursts, runs
 from flockenv.measures.chance import Above, Mean, above_null, mean_of_runs
 from flockenv.measures.clogging import Tail, goodness, survival, tail
 from flockenv.measures.density import (
@@ -18,8 +17,8 @@ from flockenv.measures.density import (
     voronoi_density,
     voronoi_speed,
 )
+from flockenv.measures.door_bursts import Bursts, bursts, runs
 from flockenv.measures.evacuation import evacuation_time, last_crossing, leaving_times
-from flockenv.measures.flow import Crossings, Flow, crossings, cumulative, flow, time_gaps
 from flockenv.measures.fundamental import (
     JUELICH,
     diagram,
@@ -32,7 +31,7 @@ from flockenv.measures.fundamental import (
     weidmann_speed,
 )
 from flockenv.measures.instant import MEASURES, measure
-from flockenv.measures.lanes import Lanes, band_index, lane_order, lanes
+from flockenv.measures.lane_formation import Lanes, band_index, lane_order, lanes
 from flockenv.measures.order import (
     cohesion_radius,
     components,
@@ -48,6 +47,7 @@ from flockenv.measures.proportions import (
     overlap_area,
     overlap_proportion,
 )
+from flockenv.measures.throughput import Crossings, Flow, crossings, cumulative, flow, time_gaps
 
 __all__ = [
     "JUELICH", "MEASURES", "Above", "Bursts", "Crossings", "Flow", "Ground", "Lanes", "Mean", "Proportion", "Room",

@@ -7,7 +7,7 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from flockenv.measures.flow import Crossings
+from flockenv.measures.throughput import Crossings
 
 __all__ = ["evacuation_time", "last_crossing", "leaving_times"]
 

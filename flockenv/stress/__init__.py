@@ -19,7 +19,7 @@ from flockenv.stress.crowds import CROWDS
 from flockenv.stress.gatherings import GATHERINGS
 from flockenv.stress.heaps import HEAPS
 from flockenv.stress.impacts import IMPACTS
-from flockenv.stress.run import fingerprint, run, usual_methods
+from flockenv.stress.runner import fingerprint, run, usual_methods
 
 __all__ = [
     "CASES", "VERDICTS", "Case", "Finding", "Results", "Value", "cases_named", "fingerprint", "run", "trials",

@@ -37,7 +37,7 @@ def around_imports(parts: Parts) -> list[str]:
     names += [f"spine_{form}" for form in parts.shaped[1] if form in SPINES and parts.dimension == 3]
     return [
         "from flockenv.kernels import routine",
-        f"from flockenv.shapes.silhouette import {', '.join(names)}",
+        f"from flockenv.shapes.edges import {', '.join(names)}",
         "from flockenv.vec import cross, lateral, perpendicular",
     ]
 

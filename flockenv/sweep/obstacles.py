@@ -50,7 +50,7 @@ def obstacle_imports(parts: Parts) -> list[str]:
         names = "count_of, keep_in_order, list_of, meets_box, row_listed, span_of"
         lines.append(f"from flockenv.shapes.cells import {names}")
         lines.append("from flockenv.shapes.head import vector_at")
-        lines.append("from flockenv.shapes.silhouette import near_way")
+        lines.append("from flockenv.shapes.edges import near_way")
     cut = [(form, module) for form, module in forms if form in PIECED and any(e.obstacle_pieces for e in parts.effects)]
     return lines + [f"from {module} import piece_{form}, pieces_{form}" for form, module in cut]
 

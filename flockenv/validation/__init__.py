@@ -15,7 +15,7 @@ from flockenv.refusals import nearest, shown
 from flockenv.validation.alone import ALONE
 from flockenv.validation.corridors import CORRIDORS
 from flockenv.validation.doors import DOORS
-from flockenv.validation.run import fingerprint, run
+from flockenv.validation.runner import fingerprint, run
 
 __all__ = [
     "CASES", "VALIDATED", "VERDICTS", "Case", "Finding", "Results", "Value", "cases_named", "fingerprint",

@@ -21,24 +21,19 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from flockenv.players.rules.bottleneck import BottleneckRules, QueueingRules, bottleneck, queueing
-from flockenv.players.rules.corridor import CorridorOrcaRules, CorridorRules, corridor, orca_corridor
-from flockenv.players.rules.crossing import CrossingRules, OrcaRules, crossing, orca_crossing
-from flockenv.players.rules.crowd_nav import (
-    CrowdNavRules,
-    HeuristicsRules,
-    RobotOrcaRules,
+from flockenv.players.rules import (
+    bottleneck,
+    corridor,
+    crossing,
     crowd_nav,
-    heuristics_crowd_nav,
-    orca_crowd_nav,
+    evade,
+    flock,
+    herd,
+    obstacles,
+    path_follow,
+    pursuit,
+    school,
 )
-from flockenv.players.rules.evade import EvadeRules, evade
-from flockenv.players.rules.flock import FlockRules, flock
-from flockenv.players.rules.herd import HerdRules, herd
-from flockenv.players.rules.obstacles import ObstaclesRules, obstacles
-from flockenv.players.rules.path_follow import PathFollowRules, path_follow
-from flockenv.players.rules.pursuit import PursuitRules, pursuit
-from flockenv.players.rules.school import SchoolRules, school
 from flockenv.tasks import Task
 
 __all__ = ["PLAYERS", "RULES", "TUNED", "RulesPlayer", "Tuned", "as_dict", "player", "tuned"]
@@ -47,34 +42,34 @@ TUNED = Path(__file__).resolve().parent.parent / "tuned"
 """Folder of what the search found, a file per task."""
 
 RULES: dict[str, tuple[Callable[..., Any], type]] = {
-    "pursuit": (pursuit, PursuitRules),
-    "obstacles": (obstacles, ObstaclesRules),
-    "evade": (evade, EvadeRules),
-    "flock": (flock, FlockRules),
-    "crossing": (crossing, CrossingRules),
-    "herd": (herd, HerdRules),
-    "path_follow": (path_follow, PathFollowRules),
-    "school": (school, SchoolRules),
-    "crowd_nav": (crowd_nav, CrowdNavRules),
-    "bottleneck": (bottleneck, BottleneckRules),
-    "corridor": (corridor, CorridorRules),
+    "pursuit": (pursuit.pursuit, pursuit.PursuitRules),
+    "obstacles": (obstacles.obstacles, obstacles.ObstaclesRules),
+    "evade": (evade.evade, evade.EvadeRules),
+    "flock": (flock.flock, flock.FlockRules),
+    "crossing": (crossing.crossing, crossing.CrossingRules),
+    "herd": (herd.herd, herd.HerdRules),
+    "path_follow": (path_follow.path_follow, path_follow.PathFollowRules),
+    "school": (school.school, school.SchoolRules),
+    "crowd_nav": (crowd_nav.crowd_nav, crowd_nav.CrowdNavRules),
+    "bottleneck": (bottleneck.bottleneck, bottleneck.BottleneckRules),
+    "corridor": (corridor.corridor, corridor.CorridorRules),
 }
 """What `textbook` and `rules` do in each task, and the record of their parameters."""
 
 PLAYERS: dict[str, dict[str, tuple[Callable[..., Any], type]]] = {
     "textbook": RULES,
     "orca": {
-        "crossing": (orca_crossing, OrcaRules),
-        "crowd_nav": (orca_crowd_nav, RobotOrcaRules),
-        "corridor": (orca_corridor, CorridorOrcaRules),
+        "crossing": (crossing.orca_crossing, crossing.OrcaRules),
+        "crowd_nav": (crowd_nav.orca_crowd_nav, crowd_nav.RobotOrcaRules),
+        "corridor": (corridor.orca_corridor, corridor.CorridorOrcaRules),
     },
-    "heuristics": {"crowd_nav": (heuristics_crowd_nav, HeuristicsRules)},
-    "queueing": {"bottleneck": (queueing, QueueingRules)},
+    "heuristics": {"crowd_nav": (crowd_nav.heuristics_crowd_nav, crowd_nav.HeuristicsRules)},
+    "queueing": {"bottleneck": (bottleneck.queueing, bottleneck.QueueingRules)},
     "rules": RULES,
 }
 """What each hand-written player does, by its name and the task's."""
 
-REMEMBERING = (school,)
+REMEMBERING = (school.school,)
 """Functions that keep a number per row from one decision to the next."""
 
 
