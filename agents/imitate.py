@@ -21,7 +21,7 @@ from agents.ppo import build, on_threads, score, tensors_of
 from agents.teach import WORLDS, teach
 from flockenv.evaluation import rollout, worlds_for
 from flockenv.players.rules import player
-from flockenv.terminal import program, shown_progress
+from flockenv.terminal import DIVERGED, program, shown_progress
 
 __all__ = ["Imitation", "app", "imitate"]
 
@@ -42,7 +42,11 @@ class Imitation:
 def imitate(
     experiment: Experiment, worlds: int = WORLDS, updates: int = 6000, advance: Callable[[int], None] = lambda n: None
 ) -> Imitation:
-    """Teach PPO's actor what tuned rules answer, in so many training worlds a round; let both play tuning worlds."""
+    """Teach PPO's actor what tuned rules answer, in so many training worlds a round; let both play tuning worlds.
+
+    Raises:
+        FloatingPointError: learning or a world diverged.
+    """
     task, p = experiment.build(), experiment.ppo
     rules = player(task)
     with on_threads(p.threads):
@@ -65,9 +69,13 @@ def main(
     with one_line_errors():
         experiment = load_experiment(config)
         name = experiment.build().name
-    with shown_progress(Progress(console=console)) as progress:
-        bar = progress.add_task(f"{name}: gradient steps", total=updates)
-        found = imitate(experiment, worlds, updates, lambda n: progress.advance(bar, n))
+    try:
+        with shown_progress(Progress(console=console)) as progress:
+            bar = progress.add_task(f"{name}: gradient steps", total=updates)
+            found = imitate(experiment, worlds, updates, lambda n: progress.advance(bar, n))
+    except FloatingPointError as error:
+        typer.echo(f"error: {error}", err=True)
+        raise typer.Exit(DIVERGED) from None
     console.print(
         f"{name}: mean return {found.rules:.3f} (rules) -> {found.network:.3f} (taught by {found.rows:,} rows; "
         f"{found.missed:.1%} of the answers' variance missed)"

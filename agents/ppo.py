@@ -121,9 +121,17 @@ def build(task: Task, p: PpoSettings, tensorboard: str | None) -> PPO:
 
 
 def score(task: Task, p: PpoSettings, tensors: dict[str, np.ndarray]) -> tuple[float, float]:
-    """Return the mean return and the success rate of a policy, without noise, on the tuning worlds."""
+    """Return the mean return and the success rate of a policy, without noise, on the tuning worlds.
+
+    Raises:
+        LearningDiverged: an answer of the policy, or a reward, is not finite.
+    """
     policy = MlpPolicy(tensors, {"activation": p.activation})
-    episodes = rollout(task, policy, p.evaluate_worlds, worlds_for("tuning", p.seed, p.evaluate_worlds))
+    try:
+        with np.errstate(over="ignore", invalid="ignore"):  # what comes of it is named
+            episodes = rollout(task, policy, p.evaluate_worlds, worlds_for("tuning", p.seed, p.evaluate_worlds))
+    except ValueError as error:  # it names the world
+        raise LearningDiverged(f"on the tuning worlds: {error}") from error
     return float(np.mean(episodes.returns)), float(np.mean(episodes.success))
 
 
@@ -179,10 +187,7 @@ class Watch(BaseCallback):
         self.run.wall = self.before + time.perf_counter() - self.since
         self.run.steps = self.num_timesteps * self.p.hold
         tensors = tensors_of(self.model)
-        try:
-            result, success = score(self.task, self.p, tensors)
-        except ValueError as error:  # it names the world
-            raise LearningDiverged(f"on the tuning worlds: {error}") from error
+        result, success = score(self.task, self.p, tensors)
         seconds = round(self.run.wall, 1)
         self.run.curve.append({"steps": self.run.steps, "seconds": seconds, "mean": result, "success": success})
         if self.run.best is None or result > self.run.best:

@@ -8,6 +8,7 @@ import numpy as np
 import torch
 from stable_baselines3 import PPO
 
+from agents.divergence import LearningDiverged
 from flockenv.evaluation import worlds_for
 from flockenv.players.rules import RulesPlayer
 from flockenv.tasks import Task
@@ -55,10 +56,13 @@ def teach(
     First of what rules meet in so many training worlds, then, round by round, of what the actor meets in as many more.
     Returns how many rows there were, and what is missed in the end: mean square of its answers' errors, over the
     variance of the rules' answers. advance: called with 1 after every gradient step.
+
+    Raises:
+        FloatingPointError: learning or a world diverged; LearningDiverged names the gradient step and the loss.
     """
 
     def answer(rows: torch.Tensor) -> torch.Tensor:
-        return model.policy.get_distribution(rows).mode()
+        return _finite_answers(model, rows)
 
     rows, answers = shown(task, rules, worlds)
     optimiser = torch.optim.Adam(model.policy.parameters(), RATE)
@@ -75,5 +79,28 @@ def teach(
         optimiser.zero_grad()
         loss.backward()
         optimiser.step()
+        _check_weights(model, k + 1, updates, float(loss.detach()))
         advance(1)
     return len(rows), float(loss.detach() / answers.var())
+
+
+def _finite_answers(model: PPO, rows: torch.Tensor) -> torch.Tensor:
+    """Return what the actor answers to rows (R, O), (R, A); LearningDiverged if a number of it is not finite."""
+    try:
+        answers = model.policy.get_distribution(rows).mode()
+    except ValueError:  # torch makes no distribution of NaN
+        answers = torch.full((1,), torch.nan)
+    if not torch.isfinite(answers).all():
+        largest = max(float(tensor.detach().abs().max()) for tensor in model.policy.parameters())
+        raise LearningDiverged(f"the network's answers are not finite: its largest weight is {largest:.3g}")
+    return answers
+
+
+def _check_weights(model: PPO, step: int, updates: int, loss: float) -> None:
+    """Raise LearningDiverged if a weight is not finite after a gradient step."""
+    for name, tensor in model.policy.named_parameters():
+        if not torch.isfinite(tensor).all():
+            raise LearningDiverged(
+                f"weights of the network, {name}, are not finite after gradient step {step} of {updates} of imitation; "
+                f"the loss was {loss:.3g}"
+            )

@@ -15,7 +15,8 @@ import yaml
 from stable_baselines3.common.buffers import RolloutBuffer
 from typer.testing import CliRunner
 
-from agents import tune
+from agents import imitate as imitation
+from agents import teach, tune
 from agents.credit import CaringBuffer
 from agents.experiment import AS_CONFIGURED, CONFIGS, Experiment, PpoSettings, load_experiment
 from agents.imitate import imitate
@@ -356,6 +357,33 @@ def test_a_network_that_is_taught_longer_answers_more_as_the_rules_do() -> None:
     assert little.rules == more.rules and more.rows > 4 * little.rows > 0  # of rounds in which the network acted
     assert more.missed < 0.5 * little.missed
     assert more.network > little.network
+
+
+@pytest.mark.parametrize("rate", [1e19, 1e30], ids=str)
+@pytest.mark.parametrize("updates", [1, 8], ids=str)
+def test_imitation_that_diverges_ends_in_one_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, rate: float, updates: int
+) -> None:
+    monkeypatch.setattr(teach, "RATE", rate)
+    (tmp_path / "p.yaml").write_text(f"task: pursuit\nppo: {json.dumps(TINY)}\n", encoding="utf-8")
+    given = [str(tmp_path / "p.yaml"), "--worlds", "2", "--updates", str(updates)]
+    result = CliRunner().invoke(imitation.app, given)
+    lines = [line for line in result.stderr.splitlines() if line.startswith("error: ")]
+    assert result.exit_code == 1 and len(lines) == 1 and "Traceback" not in result.stderr, result.stderr
+    assert "not finite" in lines[0] or "is nan" in lines[0]
+
+
+def test_a_training_that_diverges_while_it_is_taught_ends_in_one_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from agents import ppo
+
+    monkeypatch.setattr(teach, "RATE", 1e30)
+    (tmp_path / "p.yaml").write_text(f"task: pursuit\nppo: {json.dumps(TINY | {'taught': 5})}\n", encoding="utf-8")
+    given = [str(tmp_path / "p.yaml"), "--runs", str(tmp_path / "runs"), "--out", str(tmp_path / "p.safetensors")]
+    result = CliRunner().invoke(ppo.app, given)
+    assert result.exit_code == 1 and "not finite" in result.stderr and "nothing was learnt before" in result.stderr
+    assert not (tmp_path / "p.safetensors").exists()
 
 
 def test_rules_say_what_they_would_do_where_somebody_else_comes_to() -> None:
