@@ -47,6 +47,9 @@ OBLIQUE = 0.6180339887498949
 CALM = 0.01
 """Part of a radius that what rests falls in a step that is short for it."""
 
+JOLTED = 3
+"""Place in `lost` of the flag that the last impact changed velocities by more than the step does; see `play`."""
+
 
 @kernel
 def together(
@@ -98,11 +101,11 @@ def play(
         meetings.hits[best] += 1
         if _stops_both(bodies, meetings, rules, best):
             halt(period, bodies, meetings, things, rules, best, when, lost)
-            cut, lost[3] = cut + 1, 1.0
+            cut, lost[JOLTED] = cut + 1, 1.0
         else:
             impacts += 1
             cut += _impact(period, bodies, meetings, things, rules, best, when, lost)
-        todo, jolted = 0, lost[3] > 0.0
+        todo, jolted = 0, lost[JOLTED] > 0.0
         for who in (meetings.who[best], meetings.other[best]):
             if who >= 0:
                 count = widened(period, bodies, meetings, things, rules, who, when, count)
@@ -228,7 +231,7 @@ def _impact(
         rests = rests or slow
     cut = over and not rests
     rests = rests or (over and slow)
-    lost[3] = 0.0 if slow else 1.0
+    lost[JOLTED] = 0.0 if slow else 1.0
     change = sub(bounced(v, n, 0.0 if rests else restitution, rules.friction), v)
     if rules.sticky:
         change = scale(v, -1.0)
