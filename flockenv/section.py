@@ -100,15 +100,28 @@ def __getattr__(name: str) -> Any:
     return globals().setdefault(name, namedtuple(name, names, module=__name__))
 
 
-@functools.cache
 def several(count: int, item: Callable[[Any, int], Any]) -> Callable[[Any], Any]:
     """Return a function that makes a tuple of `count` items, item(array, 0), item(array, 1), ..."""
-    before, last = several(count - 1, item) if count > 1 else None, count - 1
+    return _several(0, count, item)
+
+
+@functools.cache
+def _several(first: int, count: int, item: Callable[[Any, int], Any]) -> Callable[[Any], Any]:
+    """Make the items from the first on: up to four, or the two halves, since numba compiles calls within calls."""
+    half, second, third, last = count // 2, first + 1, first + 2, first + count - 1
+    before = _several(first, half, item) if count > 4 else None
+    after = _several(first + half, count - half, item) if count > 4 else None
 
     def items(array: Any) -> Any:
-        if before is None:
-            return (item(array, last),)
-        return before(array) + (item(array, last),)  # noqa: RUF005  # numba adds tuples, and unpacks none
+        if before is not None:
+            return before(array) + after(array)  # type: ignore[misc]  # there are both or none
+        if count == 1:
+            return (item(array, first),)
+        if count == 2:
+            return (item(array, first), item(array, last))
+        if count == 3:
+            return (item(array, first), item(array, second), item(array, last))
+        return (item(array, first), item(array, second), item(array, third), item(array, last))
 
     return kernel(items)
 

@@ -129,6 +129,13 @@ def test_reynolds_budget_and_the_running_sum_differ_on_opposite_wishes() -> None
     np.testing.assert_allclose(rows(allocate_running)(CONFLICT, BUDGET), [(6, 4)])
 
 
+def test_any_number_of_wishes_is_reconciled() -> None:
+    """Each is a function that numba compiles: one within the other, it came to its end at some 30."""
+    force, share = reconciled(Blend(), np.ones((2, 41, 2)), max_force=1e3)
+    np.testing.assert_array_equal(force, np.full((2, 2), 41.0))
+    np.testing.assert_array_equal(share, np.ones((2, 41)))
+
+
 def test_a_blend_of_opposite_wishes_is_nothing() -> None:
     force, share = reconciled(Blend(), CONFLICT[:, :2])
     np.testing.assert_array_equal(force, [(0, 0)])

@@ -14,13 +14,6 @@ import pytest
 from flockenv.checked_store import Store
 from flockenv.private_folder import prepared
 
-USE = """
-import numpy as np
-from flockenv.rows import rows
-from flockenv.steering import seek
-print(rows(seek)(np.ones((3, 2)), np.zeros((3, 2)), 2.0).tobytes().hex())
-"""
-
 SCENE = '''
 from flockenv.config import load_scene
 scene = load_scene("""
@@ -34,9 +27,9 @@ print(scene.run(scene.start(0), 5).pos.tobytes().hex())
 '''
 
 
-def run(folder: Path, code: str = USE) -> subprocess.CompletedProcess[str]:
+def run(folder: Path) -> subprocess.CompletedProcess[str]:
     environment = {**os.environ, "FLOCKENV_CACHE": str(folder)}
-    return subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, timeout=300)
+    return subprocess.run([sys.executable, "-c", SCENE], env=environment, capture_output=True, text=True, timeout=300)
 
 
 @pytest.fixture(scope="module")
@@ -78,7 +71,7 @@ def test_a_damaged_file_costs_one_line_and_one_compilation(
 ) -> None:
     folder = Path(shutil.copytree(whole[0], tmp_path / "cache"))
     run(folder)  # bytecode knows where its source lies
-    (path,) = folder.glob(f"*.{kind}")
+    (path,) = folder.glob(f"scene_*.{kind}")
     before = path.read_bytes()
     path.write_bytes(DAMAGE[how](before))
     first, second = run(folder), run(folder)
@@ -91,11 +84,11 @@ def test_a_damaged_file_costs_one_line_and_one_compilation(
 @pytest.mark.slow
 def test_a_scene_goes_on_where_every_file_is_damaged(tmp_path: Path) -> None:
     folder = tmp_path / "cache"
-    before = run(folder, SCENE)
+    before = run(folder)
     files = [path for path in folder.iterdir() if path.is_file()]
     for k, path in enumerate(files):
         path.write_bytes(flipped(k / len(files))(path.read_bytes()))
-    first, second = run(folder, SCENE), run(folder, SCENE)
+    first, second = run(folder), run(folder)
     assert (first.returncode, first.stdout) == (0, before.stdout)
     assert sorted(first.stderr.splitlines()) == sorted(f"flockenv: {path}: damaged; made anew" for path in files)
     assert (second.returncode, second.stdout, second.stderr) == (0, before.stdout, "")

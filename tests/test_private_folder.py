@@ -22,12 +22,17 @@ as_root = pytest.mark.skipif(getattr(os, "geteuid", lambda: 1)() != 0, reason="o
 STRANGER, VICTIM = 54321, 54322
 """Numbers of users that no system gives away."""
 
-USE = """
-import numpy as np
-from flockenv.rows import rows
-from flockenv.steering import seek
-print(rows(seek)(np.ones((3, 2)), np.zeros((3, 2)), 2.0).tolist())
-"""
+USE = '''
+from flockenv.config import load_scene
+scene = load_scene("""
+dimension: 2
+space: {kind: torus, size: [9, 9]}
+groups: [{count: 3}]
+effects: [{kind: drag, rate: 1}]
+dt: 0.1
+""")
+print(scene.run(scene.start(0), 5).pos.tolist())
+'''
 
 FOLDER_AS_VICTIM = f"""
 import os

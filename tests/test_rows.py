@@ -1,0 +1,83 @@
+"""Laws over rows: whatever module or function a law was made in, and whatever shapes it is given."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from flockenv.kernels import Law, Numbers, Vec, law
+from flockenv.rows import rows
+from flockenv.vec import scale
+
+ROOT = Path(__file__).resolve().parent.parent
+
+NOTEBOOK = """
+import numpy as np
+from flockenv.kernels import law
+from flockenv.rows import rows
+from flockenv.vec import scale
+
+@law
+def stretched(x: "Vec", by: "float") -> "Vec":
+    return scale(x, {factor} * by)
+
+print(rows(stretched)([[1.0, 2.0], [3.0, 4.0]], 10.0).tolist())
+"""
+
+
+def stretching(factor: float) -> Law:
+    """Return a law that its module does not hold under its own name."""
+
+    @law
+    def stretched(x: Vec, by: float) -> Vec:
+        return scale(x, factor * by)
+
+    return stretched
+
+
+@law
+def blended(a: float, weights: Numbers, b: Vec, c: float, d: Vec, e: float) -> float:
+    """Six arguments of every kind."""
+    total = a + c * b[0] + e * d[1]
+    for k in range(len(weights)):
+        total += weights[k]
+    return total
+
+
+def test_laws_made_by_one_function_are_two_laws() -> None:
+    np.testing.assert_array_equal(rows(stretching(2.0))([1.0, 2.0], 10.0), [20.0, 40.0])
+    np.testing.assert_array_equal(rows(stretching(3.0))([1.0, 2.0, 4.0], 10.0), [30.0, 60.0, 120.0])
+
+
+@pytest.mark.parametrize("jit", ["0", "1"])
+def test_a_law_of_a_notebook_runs_and_edited_runs_anew(jit: str, tmp_path: Path) -> None:
+    """As there: its module has no source, and the law keeps its name."""
+    told = {**os.environ, "FLOCKENV_CACHE": str(tmp_path), "NUMBA_DISABLE_JIT": jit}
+    for factor in (2, 5, 2):
+        program = [sys.executable, "-c", NOTEBOOK.format(factor=factor)]
+        done = subprocess.run(program, cwd=ROOT, env=told, capture_output=True, text=True, check=True)
+        assert done.stdout == f"[[{10.0 * factor}, {20.0 * factor}], [{30.0 * factor}, {40.0 * factor}]]\n"
+
+
+@pytest.mark.parametrize("length", [1, 2, 3, 7])
+def test_a_law_takes_many_arguments_and_numbers_of_any_length(length: int) -> None:
+    weights = np.arange(2.0 * length).reshape(2, length)
+    b, d = np.array([[1.0, 2.0], [3.0, 4.0]]), np.array([5.0, 6.0])
+    found = rows(blended)(1.0, weights, b, [10.0, 20.0], d, 100.0)
+    np.testing.assert_array_equal(found, 1 + np.array([10.0, 60.0]) + 600 + weights.sum(axis=1))
+
+
+def unannotated(x: Any, by: float) -> Vec:
+    """Say nothing of x that `rows` can use."""
+    return scale(x, by)
+
+
+def test_a_law_whose_annotations_say_nothing_is_refused_in_one_line() -> None:
+    with pytest.raises(TypeError, match=r"\Aunannotated: x must be annotated as one of Vec, .*got 'Any'\Z"):
+        rows(law(unannotated))
