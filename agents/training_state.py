@@ -22,9 +22,8 @@ from stable_baselines3 import PPO
 
 from agents.checkpoint import JSON, Damaged, Parts, Tensors, as_json
 from flockenv.accuracy.trials import machine
-from flockenv.kernels import load
 from flockenv.tasks import Task
-from flockenv.tasks.base import task_source
+from flockenv.tasks.play import name_of
 from flockenv.world import World
 
 __all__ = ["capture", "restore", "surroundings"]
@@ -148,5 +147,5 @@ def surroundings(task: Task) -> dict[str, str]:
         "python": platform.python_version(),
         "system": f"{platform.system()} {platform.machine()}",
         "processor": processor,
-        "kernel": load(f"task_{task.name}", task_source(task)).__name__,
+        "kernel": name_of(task),
     }

@@ -21,11 +21,10 @@ from agents.transfer_report import Cell, Clock, Setting
 from flockenv.atomic import made, replacing
 from flockenv.evaluation import rollout, task_digest, worlds_for
 from flockenv.integrators import RK4
-from flockenv.kernels import load
 from flockenv.players import NAMES
 from flockenv.policy import Policy
 from flockenv.tasks import Task
-from flockenv.tasks.base import task_source
+from flockenv.tasks.play import name_of
 from flockenv.world import World
 
 __all__ = [
@@ -107,7 +106,7 @@ def _place(task: Task, name: str, about: list[Any]) -> Path:
 @functools.lru_cache(maxsize=512)
 def _kernel(task: Task) -> str:
     """Return the name of a task's compiled code, which holds a digest of every law in it."""
-    return load(f"task_{task.name}", task_source(task)).__name__
+    return name_of(task)
 
 
 def _print(player: Player, plan: Plan) -> str:

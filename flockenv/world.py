@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from flockenv import state as states
 from flockenv.abreast import PAIR, apart
 from flockenv.crew import LARGEST, Choices, at_work, share
-from flockenv.kernels import LINE, load, settled
+from flockenv.kernels import LINE, settled
 from flockenv.lines import zeros
 from flockenv.noise import MASK, keys_of
 from flockenv.recycle import Recycler
@@ -24,9 +24,9 @@ from flockenv.refusals import nearest
 from flockenv.scene import MEMORY_LIMIT
 from flockenv.snapshot import Snapshot
 from flockenv.state import State
-from flockenv.sweep import Look, pack, scratch_record, sections_of
+from flockenv.sweep import Look, pack, scratch_record
 from flockenv.tasks import Task
-from flockenv.tasks.base import REFUSED, task_source
+from flockenv.tasks.play import REFUSED, Decision, Given, Near, Results, Totals, Worlds, play_of, tell_of
 from flockenv.workspace import Workspace
 
 __all__ = ["Step", "World"]
@@ -105,8 +105,8 @@ class World:
     def _prepare(self) -> None:
         """Make what follows from the task: kernel, scratch, and what every step is given."""
         scene, task, s = self.task.scene, self.task, self.state
-        self._kernel = load(f"task_{task.name}", task_source(task), sections_of(task.parts))
-        self._enter, self._tell = self._kernel.play, self._kernel.tell
+        self._entries = play_of(task), tell_of(task)
+        self._enter, self._tell = self._entries
         b, i, real = self.worlds, self.learners, scene.dtype
         self._actions = zeros((b, i, self.action_size), real)
         numbers = (task.parts.given(), list(task.parameters().values()), task.table() or (0.0,))
@@ -124,11 +124,14 @@ class World:
         self._fresh: tuple[Callable[[], NDArray[Any]], ...] = tuple(
             maker(*kind) if size >= RECYCLE else functools.partial(np.empty, *kind) for kind in kinds
         )
+        given = Given(*(np.array(values, real) for values in numbers))
+        worlds = Worlds(
+            s.x, s.v, s.alive, s.tick, s.obstacle_x, s.obstacle_radius, s.work, s.key, self._memory, self.steps,
+            s.carried,
+        )  # fmt: skip
         self._always = (
-            s.x, s.v, *s.carried, s.alive, s.tick, s.obstacle_x, s.obstacle_radius, s.work, s.key, self._memory,
-            self.steps, *(np.array(values, real) for values in numbers),
-            np.dtype(real).type(scene.dt), task.substeps, not task.ends_together, self._past,
-            self._last, self._sums, self._paid,
+            worlds, given, np.dtype(real).type(scene.dt), task.substeps, not task.ends_together, self._past,
+            Totals(self._last, self._sums, self._paid),
         )  # fmt: skip
         self._counted = (self.steps, np.array(numbers[1], float), self._last, self._sums)
         self._alone = np.empty((len(task.metric_names), 1))  # metrics of one world
@@ -138,40 +141,41 @@ class World:
     def _hire(self) -> None:
         """Bind the entry point to what it is given in every call, once for each thread: the scratch is its own."""
         self._calls: list[Callable[..., tuple[int, int]]] = [
-            functools.partial(self._enter, *self._always, canvas, *decision, *rest)
-            for canvas, decision, rest in self._scratch
+            functools.partial(self._enter, *self._always, *scratch) for scratch in self._scratch
         ]
 
-    def _allocate(self) -> tuple[NDArray[np.float32], tuple[NDArray[Any], ...], tuple[NDArray[Any], ...]]:
-        """Return the scratch of one thread: of rows that go past the caches, of a decision, of stepping and looking."""
+    def _allocate(self) -> tuple[Decision, Near, Any]:
+        """Return the scratch of one thread: of a decision, of looking, of stepping."""
         task, scene, n = self.task, self.task.scene, self.agents
         d, real, look = scene.dimension, scene.dtype, task.look or Look(0.0)
         lanes = PAIR if task.abreast else task.parts.width
         padded = -(-n // lanes) * lanes
-        decision: tuple[NDArray[Any], ...] = (
-            zeros((d, 1, n), real), zeros((d, n), real), zeros((d, n), real), zeros(n, np.bool_),
-            zeros(self.action_size * apart(self.learners), real if task.abreast else float),
-            zeros(len(task.terms) * apart(self.learners), real if task.abreast else float),
-        )  # fmt: skip
+        wide: tuple[NDArray[Any], ...] = ()
         if task.abreast:
             beside = zeros(task.abreast * apart(self.learners), np.float32)
             own, vel = (2 * d + 1 + task.memory, padded), (d, look.agents, padded)
-            decision += (zeros(own, real), zeros(vel, real), zeros((1, look.agents, padded), real), beside)
-            decision[-2][:] = scene.body.radius[0]  # all have it, or it is taken
+            wide = (zeros(own, real), zeros(vel, real), zeros((1, look.agents, padded), real), beside)
+            wide[2][:] = scene.body.radius[0]  # all have it, or it is taken
+        decision = Decision(
+            zeros(self._shapes[0][1:] if self._past else (0, 0), np.float32),
+            zeros((d, 1, n), real), zeros((d, n), real), zeros((d, n), real), zeros(n, np.bool_),
+            zeros(self.action_size * apart(self.learners), real if task.abreast else float),
+            zeros(len(task.terms) * apart(self.learners), real if task.abreast else float), wide,
+        )  # fmt: skip
         near = [
             zeros(shape, kind)
             for many in (look.agents, look.obstacles)
             for shape, kind in (((many, padded), real), ((many, padded), np.int32), ((padded,), np.int32))
-        ] + [zeros((d, look.agents, padded), real)]
+        ]
         space = Workspace.allocate(task.parts, scene.body, pack(task.parts, n, scene.groups))
-        canvas = zeros(self._shapes[0][1:] if self._past else (0, 0), np.float32)
-        return canvas, decision, (*near, space.of(0, scratch_record(task.parts)))
+        places = zeros((d, look.agents, padded), real)
+        return decision, Near(*[*near, places]), space.of(0, scratch_record(task.parts))
 
     def __getstate__(self) -> dict[str, Any]:
         """Pickle what cannot be made anew."""
         made = (
-            "_kernel", "_enter", "_tell", "_actions", "_always", "_scratch", "_choices", "_calls", "_counted", "_alone",
-            "_shapes", "_dtypes", "_everywhere", "_untold", "_fresh", "_past",
+            "_entries", "_enter", "_tell", "_actions", "_always", "_scratch", "_choices", "_calls", "_counted",
+            "_alone", "_shapes", "_dtypes", "_everywhere", "_untold", "_fresh", "_past",
         )  # fmt: skip
         return {name: value for name, value in vars(self).items() if name not in made}
 
@@ -209,9 +213,9 @@ class World:
         self._seed(seeds, rows)
         observation: Rows = self._fresh[0]() if into is None else into
         begun = self.worlds if into is None else int(np.count_nonzero(rows))
-        self._play(False, rows, into is None, begun, 0, (observation, *self._untold), self._actions)
-        if self._enter is self._kernel.play:
-            self._enter = settled(self._kernel.play)  # types stay what they were in this call
+        self._play(False, rows, into is None, begun, 0, Results(observation, *self._untold), self._actions)
+        if self._enter is self._entries[0]:
+            self._enter = settled(self._enter)  # types stay what they were in this call
             self._hire()
         for numbers in (self._sums, self._last, self.paid):
             numbers[rows] = 0
@@ -297,7 +301,7 @@ class World:
         if terms not in TERMS:
             raise ValueError(f"terms: {terms!r} is unknown{nearest(str(terms), TERMS)}; allowed: {', '.join(TERMS)}")
         taken = self._taken(actions)
-        rows, reward, earned, over, late, success, present = told = tuple([make() for make in self._fresh])
+        rows, reward, earned, over, late, success, present = told = Results(*[make() for make in self._fresh])
         limit = _NEVER if self.time_limit is None else min(int(self.time_limit), _NEVER)
         world, who = self._play(True, self._everywhere, terms == "steps", self.worlds, limit, told, taken)
         if world == REFUSED:
@@ -308,14 +312,14 @@ class World:
 
     def _play(
         self, acting: bool, mask: NDArray[np.bool_], everyone: bool, busy: int, limit: int,
-        told: tuple[NDArray[Any], ...], actions: NDArray[Any],
+        told: Results, actions: NDArray[Any],
     ) -> tuple[int, int]:  # fmt: skip
         """Let worlds decide, or begin where the mask says so, by several threads if so many `busy` worlds are worth it.
 
         everyone: are all observed where only some begin, and told their terms? Return who is not finite, or (-1, -1).
         """
         crew, work = min(at_work(), busy), busy * self.agents * self.task.substeps
-        whole = acting, mask, everyone, acting, 0, self.worlds, actions, limit, *told
+        whole = acting, mask, everyone, acting, 0, self.worlds, actions, limit, told
         if crew <= 1:
             return self._calls[0](*whole)
 
@@ -327,20 +331,20 @@ class World:
 
     def _shared(
         self, crew: int, acting: bool, mask: NDArray[np.bool_], everyone: bool, limit: int,
-        told: tuple[NDArray[Any], ...], actions: NDArray[Any],
+        told: Results, actions: NDArray[Any],
     ) -> tuple[int, int]:  # fmt: skip
         """Do what `_play` does by so many threads."""
         if crew > len(self._scratch):
             self._scratch += [self._allocate() for _ in range(crew - len(self._scratch))]
             self._hire()
-        if acting and self._calls[0](True, mask, everyone, True, 0, 0, actions, limit, *told)[0] == REFUSED:
+        if acting and self._calls[0](True, mask, everyone, True, 0, 0, actions, limit, told)[0] == REFUSED:
             return REFUSED, 0  # nobody moves before all were looked at
         portions = iter(_portions(self.worlds, crew))  # whoever is done takes the next
 
         def several(k: int) -> tuple[int, int]:
             found, call = [], self._calls[k]
             for first, end in portions:
-                found.append(call(acting, mask, everyone, False, first, end, actions, limit, *told))
+                found.append(call(acting, mask, everyone, False, first, end, actions, limit, told))
             return min((bad for bad in found if bad[0] >= 0), default=(-1, -1))
 
         bad = [found for found in share([functools.partial(several, k) for k in range(crew)]) if found[0] >= 0]
@@ -396,7 +400,7 @@ class World:
     def _tell_of(self, first: int, told: NDArray[np.float64]) -> None:
         """Write the metrics of as many worlds as there is room for, (K, B)."""
         self._tell(*self._counted, first, told)
-        if self._tell is self._kernel.tell:
+        if self._tell is self._entries[1]:
             self._tell = settled(self._tell)
 
     def snapshot(self, world: int = 0) -> Snapshot:

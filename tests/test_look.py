@@ -26,7 +26,7 @@ def found(world: World, places: Any) -> tuple[Any, Any, Any]:
     n = world.agents
     world.state.x[:, 0] = np.asarray(places).T
     world.reset(mask=np.zeros(1, bool))  # nobody begins anew: everybody is looked at
-    square, who, count = world._scratch[0][2][:3]
+    square, who, count = world._scratch[0][1][:3]
     return square[:, :n].copy(), who[:, :n].copy(), count[:n].copy()
 
 
@@ -102,7 +102,7 @@ def test_the_nearest_are_those_that_a_sort_finds(agents: int, neighbours: int, m
         else:  # operations may be fused
             np.testing.assert_allclose(squares, wanted, rtol=1e-14)
         assert (who >= 0).all() and (who < agents).all()
-        assert (places[who.T] == world._scratch[0][2][6][:, :, :agents].T).all()  # where they are is told, too
+        assert (places[who.T] == world._scratch[0][1][6][:, :, :agents].T).all()  # where they are is told, too
         for i in range(agents):  # of those who are equally far, any is nearest, but each once
             listed = who[: count[i], i]
             np.testing.assert_allclose(every[i, listed], wanted[: count[i], i], rtol=0 if kind == "float32" else 1e-14)
@@ -131,7 +131,7 @@ def test_the_absent_are_in_nobodys_list() -> None:
     gone = np.arange(0, world.agents, 3)
     world.state.alive[0, gone] = False
     world.reset(mask=np.zeros(1, bool))
-    who, count = world._scratch[0][2][1:3]
+    who, count = world._scratch[0][1][1:3]
     for i in np.setdiff1d(np.arange(world.agents), gone):
         listed = who[: count[i], i]
         assert i not in listed

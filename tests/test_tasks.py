@@ -17,7 +17,7 @@ import flockenv
 from flockenv.abreast import PAIR
 from flockenv.integrators import RK4, Midpoint, SemiImplicitEuler
 from flockenv.tasks import TASKS, Crossing, Flock, Obstacles, Pursuit, Task, flock
-from flockenv.tasks.base import NEAR, task_source
+from flockenv.tasks.play import name_of
 from flockenv.world import Step, World
 from tests.catalogue import TASKS as ROWS
 from tests.catalogue import TaskRow
@@ -103,11 +103,11 @@ def test_a_task_is_a_value_and_names_what_it_has(row: TaskRow) -> None:
 
 
 def test_a_kernel_knows_what_its_loops_count_to_and_no_other_number() -> None:
-    source = task_source(Flock())
+    made = name_of(Flock())
     for name in ("neighbours", "obstacles_seen", "rays"):
-        assert task_source(Flock(**{name: 5})) != source
-    assert task_source(Flock(agents=5)) != source == task_source(Flock(agents=40))  # 4 others at most are listed
-    assert task_source(Flock(touch_cost=3.0, sight=7.0, obstacle_count=2)) == source
+        assert name_of(Flock(**{name: 5})) != made
+    assert name_of(Flock(agents=5)) != made == name_of(Flock(agents=40))  # 4 others at most are listed
+    assert name_of(Flock(touch_cost=3.0, sight=7.0, obstacle_count=2)) == made
 
 
 @pytest.mark.slow
@@ -133,17 +133,17 @@ def test_what_is_counted_to_is_the_same_written_out_or_given(monkeypatch: pytest
 def test_a_task_without_terms_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(Pursuit, "terms", ())
     with pytest.raises(TypeError, match=r"Pursuit\.terms is empty"):
-        task_source(Pursuit())
+        name_of(Pursuit())
 
 
 def test_a_kernel_without_lanes_is_the_same_for_any_number_of_learners() -> None:
-    assert task_source(Crossing(agents=70, circle=20)) == task_source(Crossing(agents=60, circle=20))
+    assert name_of(Crossing(agents=70, circle=20)) == name_of(Crossing(agents=60, circle=20))
 
 
 def test_a_count_that_is_no_parameter_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(Flock, "counts", ("ray",))
     with pytest.raises(TypeError, match=r"Flock\.counts: 'ray' is none of its parameters: .*rays"):
-        task_source(Flock())
+        name_of(Flock())
 
 
 @EVERY
@@ -154,14 +154,14 @@ def test_a_task_plays_with_the_method_it_is_given_and_shows_the_same_to_policies
     assert task.layout.digest == row.task.layout.digest
     assert task.action_layout.digest == row.task.action_layout.digest
     assert task.parameters() == row.task.parameters()
-    assert task_source(task) != task_source(row.task)
+    assert name_of(task) != name_of(row.task)
 
 
 @pytest.mark.parametrize("names", [("path", "class"), ("_x",), ("pa th",), ("path", "path")])
 def test_measures_that_cannot_be_fields_are_refused(names: tuple[str, ...], monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(Pursuit, "measures", names)
     with pytest.raises(TypeError, match=rf"Pursuit.measures: '{names[-1]}'"):
-        task_source(Pursuit())
+        name_of(Pursuit())
 
 
 @pytest.mark.slow
@@ -269,12 +269,12 @@ def frame(world: World) -> list[Any]:
     s, scene = world.state, world.task.scene
     arrays = [s.x[:, 0], s.v[:, 0], s.alive[0], s.obstacle_x[:, 0], s.obstacle_radius[0], world._memory[:, 0]]
     body = [scene.body.radius, scene.body.max_speed, scene.body.max_force]
-    _, decision, rest = world._scratch[0]  # of the last world looked at
-    near, d = [*rest[: len(NEAR.split(", "))], *[np.zeros(0)] * 3], scene.dimension
+    decision, found, _ = world._scratch[0]  # of the last world looked at
+    near, d = [*found[:-1], *[np.zeros(0)] * 3], scene.dimension
     if world.task.abreast:
-        own, near_vel, near_radius = decision[-4:-1]
+        own, near_vel, near_radius = decision.wide[:3]
         arrays[:2], arrays[5], body[0] = (own[:d], own[d : 2 * d]), own[2 * d + 1 :], own[2 * d]
-        near[-3:] = rest[len(NEAR.split(", "))], near_vel, near_radius[0]
+        near[-3:] = found.pos, near_vel, near_radius[0]
     table = np.array(world.task.table())
     return [*(a.copy() for a in arrays), int(s.key[0]), int(world.steps[0]), *body, *(a.copy() for a in near), table]
 
@@ -769,8 +769,8 @@ def test_what_lies_beyond_the_last_agent_is_nobodys_business(agents: int, dtype:
     told = []
     for beyond in (0.0, np.nan):
         world = world_of(Flock(agents=agents, dtype=dtype, settling=0.0), worlds=3)
-        own, *near = world._scratch[0][1][-4:-1]
-        near.append(world._scratch[0][2][len(NEAR.split(", "))])
+        own, *near = world._scratch[0][0].wide[:3]
+        near.append(world._scratch[0][1].pos)
         said = []
         for actions in random_actions(world, 5):
             for numbers in (own, *near):

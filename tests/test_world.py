@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import inspect
 import pickle
 from concurrent.futures import ThreadPoolExecutor
 from types import SimpleNamespace
@@ -12,10 +13,10 @@ import numpy as np
 import pytest
 
 from flockenv.crew import threads, use_threads
-from flockenv.kernels import settled
+from flockenv.kernels import python_of, settled
 from flockenv.noise import key_of, keys_of
 from flockenv.tasks import Crossing, Flock, Obstacles, Pursuit
-from flockenv.tasks.base import task_source
+from flockenv.tasks.play import play_of
 from flockenv.world import AT_HAND, PAST, Step, World, _portions
 from tests.catalogue import TASKS, TaskRow
 
@@ -139,8 +140,8 @@ def test_what_goes_past_the_caches_is_the_same(row: TaskRow, monkeypatch: pytest
 
 def test_other_threads_see_what_went_past_the_caches() -> None:
     """By a fence at the end; without it results are nearly always the same."""
-    source = task_source(Flock())
-    assert source.index("pour(rows") < source.index("    if past:\n        settle()\n    return")
+    source = inspect.getsource(python_of(play_of(Flock())))
+    assert source.index("show(p") < source.index("        if past:\n            settle()\n        return")
 
 
 def test_only_what_is_large_goes_past_the_caches() -> None:
@@ -281,7 +282,7 @@ def looking(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_a_world_that_was_reset_calls_its_kernel_without_a_look_at_types() -> None:
     world = World(Pursuit(), 2)
     world.reset(1)
-    play = world._kernel.play
+    play = world._entries[0]
     assert world._enter is settled(play) is not play
     again = copy.deepcopy(world)
     assert again._enter is play
@@ -306,7 +307,7 @@ def test_a_mask_may_lie_in_memory_as_it_likes_and_nothing_compiles_anew(first: b
     for strange in (stretched[::2], fixed, mask[::-1].copy()[::-1]):
         np.testing.assert_array_equal(world.reset(mask=strange), other.reset(mask=mask))
         assert_same(everything(world), everything(other))
-    assert len(world._kernel.play.overloads) == 1
+    assert len(world._entries[0].overloads) == 1
 
 
 @EVERY
@@ -392,11 +393,11 @@ def test_time_limits_truncate_and_never_terminate(row: TaskRow) -> None:
     endless = World(row.task)
     endless.reset(3)
     assert not any(endless.step(a).truncated.any() for a in actions_for(endless, 50))
-    compiled = len(endless._kernel.play.overloads)
+    compiled = len(endless._entries[0].overloads)
     for limit in (np.int32(51), 2**70):  # neither compiles anew
         endless.time_limit = limit
         np.testing.assert_array_equal(endless.step(actions_for(endless, 1)[0]).truncated, limit == 51)
-    assert len(endless._kernel.play.overloads) == compiled
+    assert len(endless._entries[0].overloads) == compiled
 
 
 # --- copies -----------------------------------------------------------------------------------------------------------
@@ -586,7 +587,7 @@ def test_whatever_holds_the_numbers_they_are_the_same_numbers() -> None:
     world.step(np.ones((2, 1, 2), np.int64))
     world.step(np.ones((2, 1, 2), bool))
     world.step(np.broadcast_to(0.5, (2, 1, 2)))  # cannot be written
-    assert len(world._kernel.play.overloads) == 1  # and none of them was compiled for
+    assert len(world._entries[0].overloads) == 1  # and none of them was compiled for
 
 
 # --- what a world cannot be -------------------------------------------------------------------------------------------
