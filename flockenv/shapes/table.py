@@ -20,7 +20,7 @@ from flockenv.section import entry_of, vector
 from flockenv.shapes.joints import joints
 from flockenv.vec import sub
 
-__all__ = ["FORMS", "Floats", "hits", "nearest", "packed"]
+__all__ = ["FORMS", "Floats", "hits", "law_of", "nearest", "packed"]
 
 Floats = NDArray[np.float64]
 
@@ -73,8 +73,8 @@ def _head(shape: Any, form: int) -> list[float]:
 
 
 @functools.cache
-def _law(verb: str, form: str) -> Law:
-    """Return the law `nearest_FORM` or `hit_FORM`."""
+def law_of(verb: str, form: str) -> Law:
+    """Return a law of a form, by its verb: `nearest_FORM`, `hit_FORM`, or what else its module has."""
     law: Law = getattr(importlib.import_module(FORMS[form]), f"{verb}_{form}")
     return law
 
@@ -113,7 +113,7 @@ def nearest(shape: Any, points: ArrayLike) -> tuple[Floats, Floats]:
     """Return the distances to the surface of points (..., D), (...) m, and the outward unit normals there (..., D)."""
     flat, lead = _flat(points)
     gap, normal = np.empty(len(flat)), np.empty_like(flat)
-    _nearest_of_points(_law("nearest", shape.form), flat.shape[1])(shape.table, flat, gap, normal)
+    _nearest_of_points(law_of("nearest", shape.form), flat.shape[1])(shape.table, flat, gap, normal)
     return gap.reshape(lead), normal.reshape((*lead, flat.shape[1]))
 
 
@@ -123,5 +123,5 @@ def hits(shape: Any, points: ArrayLike, directions: ArrayLike, clearance: ArrayL
     ways, _ = _flat(np.broadcast_arrays(points, directions)[1])
     room = np.ascontiguousarray(np.broadcast_to(np.asarray(clearance, np.float64), lead)).reshape(-1)
     out = np.empty(len(flat))
-    _hits_along_rays(_law("hit", shape.form), flat.shape[1])(shape.table, flat, ways, room, out)
+    _hits_along_rays(law_of("hit", shape.form), flat.shape[1])(shape.table, flat, ways, room, out)
     return out.reshape(lead)

@@ -2,17 +2,33 @@
 
 What is passed is an obstacle as the body sees it. Where another obstacle leaves no room beside an edge, a body's radius
 beyond it, the two are one, and the edge of the other is looked for on the same side: so joined walls, and gaps that are
-too narrow, have no edge in between. Written only where an effect has `obstacle_edges`.
+too narrow, have no edge in between.
+
+All of it takes the `world`: the circles of the state (obstacle_x, obstacle_radius), params, the size of the space, the
+number of the world, and the time (s). What is touched is known by its form, and the row in `params` where it begins: of
+a circle of the state the form is -1 and the row its number; if nothing is touched the form is -2.
 """
 
 from __future__ import annotations
 
-from flockenv.shapes import FORMS
-from flockenv.sweep.obstacles import each_row, place_of_row
-from flockenv.sweep.parts import Parts
-from flockenv.sweep.text import indented, indented_lines, tuple_of
+import functools
+import importlib
+from collections.abc import Callable
+from typing import Any
 
-__all__ = ["around", "around_imports"]
+import numpy as np
+
+from flockenv.kernels import Law, Vec, kernel, like, routine
+from flockenv.section import section
+from flockenv.shapes.round import touched_normal
+from flockenv.shapes.edges import near_way, sphere_edge
+from flockenv.shapes.table import law_of
+from flockenv.shapes.touch import touched_spot
+from flockenv.steering.around import threat
+from flockenv.sweep.forms import FormPlan, Surroundings, box_of_way, circle_at, each_row, number_of, seen_from
+from flockenv.vec import add, cross, dot, lateral, norm, perpendicular, scale, select, sub, unit, zero
+
+__all__ = ["aside_of"]
 
 FOLLOWED = 8
 """Obstacles in a row, edge to edge, that are taken for one; of more there is no edge on that side."""
@@ -26,230 +42,305 @@ JUST = 1 - 1e-3
 NEARER = 1 - 1e-5
 """Share of its distance by which an edge must be nearer than another one to be preferred: so rounding picks no side."""
 
-SPINES = {"chain": "spine_chain(params, row, y, ray)", "block": "spine_block(params, row, y, ray)"}
+SPINES = ("chain", "block")
+"""Forms that have an axis of their own: `spine_FORM` of shapes/edges.py."""
 
 
-def around_imports(parts: Parts) -> list[str]:
-    """Write what `aside_of` is made of."""
-    if not parts.goes_around:
-        return []
-    names = ["sphere_edge", "near_way", *(f"edge_{form}" for form in parts.shaped[1])]
-    names += [f"spine_{form}" for form in parts.shaped[1] if form in SPINES and parts.dimension == 3]
-    return [
-        "from flockenv.kernels import routine",
-        f"from flockenv.shapes.edges import {', '.join(names)}",
-        "from flockenv.vec import cross, lateral, perpendicular",
-    ]
+def _law(verb: str, form: str) -> Law:
+    """Return the law `edge_FORM` or `spine_FORM` of shapes/edges.py."""
+    law: Law = getattr(importlib.import_module(near_way.__module__), f"{verb}_{form}")
+    return law
 
 
-def around(parts: Parts) -> str:
-    """Return the source of `aside_of` and what it calls; empty if no effect goes around anything."""
-    if not parts.goes_around:
-        return ""
-    return "".join(write(parts) for write in (_row_ahead, _first_hit, _edge, _normal, _edge_beyond, _aside_of))
+# --- what a body touches ----------------------------------------------------------------------------------------------
 
 
-_WORLD = "obstacle_x, obstacle_radius, params, size, b, time"
+@functools.cache
+def first_hit(around: Surroundings) -> Callable[..., tuple[float, int, int]]:
+    """Make `first_hit(world, x, ray, room, most)`: how far a body of radius `room` comes along a ray, m; form and row.
 
-
-def _first_hit(parts: Parts) -> str:
-    """Write what a body touches first along a ray; of what is touched at once, what is listed first."""
-    lines = [
-        "best, form, row = most, -2, -1",
-        "for m in range(obstacle_radius.shape[1]):",
-        "    rho = obstacle_radius[b, m]",
-        "    if rho > 0:",
-        f"        to = offset_to(size, x, {tuple_of('obstacle_x[#, b, m]', parts.dimension)})",
-        "        here = threat(ray, to, room + rho, like(room, np.inf))",
-        "        if here < best:",
-        "            best, form, row = here, -1, m",
-    ]
-    half = "scale(ray, best * like(best, 0.5))"
-    for number, form in enumerate(FORMS):
-        if form not in parts.shaped[1]:
-            continue
-        met = [
-            f"y = offset_to(size, {place_of_row(parts)}, x)",
-            "if near_way(params, at_, y, ray, room, best):",
-            f"    here = hit_{form}(params, at_, y, ray, room)",
-            f"    if here < best or (here == best and form == {number} and at_ < row):",
-            f"        best, form, row = here, {number}, at_",
-        ]
-        # of a grid, what lies within the box around the way as far as it is free
-        lines += each_row(parts, form, "middle", "reach", met, [f"middle, reach = box_of_way(x, {half}, room)"])
-    return f'''
-
-@kernel
-def box_of_way(x, half, room):
-    """Return the box around a body on its way: the middle, and half the edges."""
-    return add(x, half), {_absolute(parts)}
-
-
-@routine
-def first_hit({_WORLD}, x, ray, room, most):
-    """Return how far a body of radius `room` comes along a ray, m, and the form and row of what it touches there.
-
-    At most `most`: form -2 if it touches nothing before. Of a circle of the state: form -1, and its number.
+    At most `most`. Of what is touched at once, what is listed first.
     """
-{indented(indented_lines(lines, 0), 4)}
-    return best, form, row
-'''
+    offset_to, circle, shaped = around.offset_to, circle_at(around.dimension), bool(around.forms)
+    first_row: Any = _first_row(around) if shaped else None
+
+    def first_hit(world: Any, x: Any, ray: Any, room: Any, most: Any) -> Any:
+        obstacle_x, obstacle_radius, params, size, b, time = world
+        best, form, row = most, -2, -1
+        for m in range(obstacle_radius.shape[1]):
+            rho = obstacle_radius[b, m]
+            if rho > 0:
+                to = offset_to(size, x, circle(obstacle_x, b, m))
+                here = threat(ray, to, room + rho, like(room, np.inf))
+                if here < best:
+                    best, form, row = here, -1, m
+        if shaped:
+            return first_row(params, size, (time, x, ray, room), (best, form, row))
+        return best, form, row
+
+    return routine(first_hit)
 
 
-def _row_ahead(parts: Parts) -> str:
-    """Write where the row of an obstacle is that an agent remembers by its form and its place in that."""
-    lines: list[str] = []
-    for number, form in enumerate(FORMS):
-        if form not in parts.shaped[1]:
-            continue
-        at = f"np.int64(params[{parts.places_of(form)[0]}])"
-        lines.append(f"if form == {number}:")
-        if form in parts.looked_up:
-            lines.append(f"    return {at} + place")
-        else:
-            lines += [
-                f"    row = {at}",
-                "    for _ in range(place):",
-                "        row += np.int64(params[row])",
-                "    return row",
-            ]
-    return f'''
+@section
+def _first_row(around: Surroundings) -> Callable[..., tuple[float, int, int]]:
+    """Make `first(params, size, given, state)`: `state` after all shapes; given: (time, x, ray, room)."""
+    first, form = len(around.forms) == 1, around.forms[-1]
+    before: Any = None if first else _first_row(around._replace(forms=around.forms[:-1]))
+    each = each_row(around, form, _touches(around, form), _box_of_way, _never)
 
-@kernel
-def row_ahead(params, form, place):
-    """Return where the row of an obstacle begins, or the number of a circle of the state."""
-{indented([*lines, "return place"], 4)}
-'''
-
-
-def _absolute(parts: Parts) -> str:
-    """Write the half edges of the box around a way and a body: |half| and its radius along each axis."""
-    return "(" + ", ".join(f"abs(half[{k}]) + room" for k in range(parts.dimension)) + ")"
-
-
-def _edge(parts: Parts) -> str:
-    """Write the choice of the law of an edge, by the form of what is in the way."""
-    lines = [
-        "if form == -1:",
-        f"    to = offset_to(size, x, {tuple_of('obstacle_x[#, b, row]', parts.dimension)})",
-        "    return sphere_edge(to, ray, side, room + obstacle_radius[b, row])",
-        "at_ = row",
-        *([f"y = offset_to(size, {place_of_row(parts)}, x)"] if parts.shaped[1] else []),
-    ]
-    for number, form in enumerate(FORMS):
-        if form in parts.shaped[1]:
-            lines += [f"if form == {number}:", f"    return edge_{form}(params, row, y, ray, side, room)"]
-    return f'''
-
-@routine
-def edge({_WORLD}, form, row, x, ray, side, room):
-    """Return the edge of an obstacle in the way: by what angle a ray must be turned to pass it, and how far that is."""
-{indented(indented_lines(lines, 0), 4)}
-    return like(room, np.inf), like(room, np.inf)
-'''
-
-
-def _normal(parts: Parts) -> str:
-    """Write which way the surface faces that a body touches, by the form of what it touches."""
-    circle = f"offset_to(size, x, {tuple_of('obstacle_x[#, b, row]', parts.dimension)})"
-    lines = [
-        "if form == -1:",
-        f"    return touched_normal({circle}, ray, hit)",
-        "at_ = row",
-        *([f"y = offset_to(size, {place_of_row(parts)}, x)"] if parts.shaped[1] else []),
-    ]
-    for number, form in enumerate(FORMS):
-        if form in parts.shaped[1]:
-            lines += [
-                f"if form == {number}:",
-                f"    return nearest_{form}(params, row, touched_spot(y, ray, hit, room))[1]",
-            ]
-    return f'''
-
-@routine
-def normal_hit({_WORLD}, form, row, x, ray, hit, room):
-    """Return the outward unit normal of an obstacle where a body touches it, `hit` m along a ray."""
-{indented(indented_lines(lines, 0), 4)}
-    return zero(x)
-'''
-
-
-def _edge_beyond(parts: Parts) -> str:
-    """Write how the edge to one side is found where a body passes; in space also what it first finds there instead."""
-    facing = f"normal_hit({_WORLD}, form, row, x, way, hit, room)" if parts.dimension == 3 else "off"
-    return f'''
-
-@routine
-def edge_beyond({_WORLD}, form, row, hit, x, ray, side, room, most):
-    """Return how far from the impact the nearest place is where a body passes on a side, m; inf if beyond `most`.
-
-    In space also the normal of the obstacle that is first found in the way on that side; else 0.
-    """
-    far, off, first = like(room, np.inf), zero(x), True
-    spot, way, across, turned_by = scale(ray, hit), ray, side, like(room, 0.0)
-    for _ in range({FOLLOWED}):
-        turn, reach = edge({_WORLD}, form, row, x, way, across, room)
-        turned_by += turn
-        if not (turned_by < like(room, {ALL_AROUND})) or reach == far:
-            return far, off
-        c, s = np.cos(turn), np.sin(turn)
-        way, across = add(scale(way, c), scale(across, s)), sub(scale(across, c), scale(way, s))
-        beyond = norm(sub(scale(way, reach), spot))
-        if not (beyond < most):
-            return far, off
-        hit, form, row = first_hit({_WORLD}, x, way, room * like(room, {JUST!r}), reach + room)
-        if form == -2:
-            return beyond, off
+    def first_row(params: Any, size: Any, given: Any, state: Any) -> Any:
         if first:
-            off, first = {facing}, False
-    return far, off
-'''
+            return each(params, size, given, state)
+        return each(params, size, given, before(params, size, given, state))
+
+    return first_row
 
 
-def _aside_of(parts: Parts) -> str:
-    """Write how the sides are compared: in the plane both, in space the normal's and those along and across an axis."""
-    sides = "scale(own, -e)," if parts.dimension == 2 else "ax, scale(ax, -e), across, scale(across, -e)"
-    lines = [
-        "hit, form, place = known",
-        "row, e, right = row_ahead(params, form, place), like(room, 1.0), perpendicular(ray)",
-        f"out = lateral(normal_hit({_WORLD}, form, row, x, ray, hit, room), ray)",
-        "own = select(dot(out, out) > like(room, 1e-10), unit(out), right)",
-        f"best, off = edge_beyond({_WORLD}, form, row, hit, x, ray, own, room, like(room, np.inf))",
-        "found = own if best < like(room, np.inf) else zero(x)",
-        *(_axis(parts) if parts.dimension == 3 else []),
-        f"for side in ({sides}):",
-        f"    far = edge_beyond({_WORLD}, form, row, hit, x, ray, side, room, best * like(room, {NEARER!r}))[0]",
-        "    best, found = (far, side) if far < best else (best, found)",
-    ]
-    return f'''
+@section
+def _touches(around: Surroundings, form: FormPlan) -> Callable[..., tuple[float, int, int]]:
+    """Make what a loop over rows does with each: keep (how far, form, row) of what is touched first."""
+    seen, hit, number = seen_from(around.offset_to, around.moving), law_of("hit", form.name), number_of(form.name)
 
-@routine
-def aside_of({_WORLD}, x, ray, room, known):
-    """Return the unit vector across a ray to the side where the edge of what is ahead is nearest to the impact.
+    def touches(params: Any, size: Any, at: Any, given: Any, state: Any) -> Any:
+        time, x, ray, room = given
+        best, touched, row = state
+        y = seen(params, size, at, time, x)
+        if near_way(params, at, y, ray, room, best):
+            here = hit(params, at, y, ray, room)
+            if here < best or (here == best and touched == number and at < row):
+                best, touched, row = here, number, at
+        return best, touched, row
 
-    0 if it has no edge where the body passes. known: how far ahead it is, m, its form, and its place in that.
+    return touches
+
+
+@kernel
+def _box_of_way(given: Any, state: Any) -> Any:
+    """Return the box around a body on its way, as far as it is free: the middle, and half the edges."""
+    _, x, ray, room = given
+    return box_of_way(x, scale(ray, state[0] * like(state[0], 0.5)), room)
+
+
+@kernel
+def _never(state: Any) -> Any:
+    """Return that another row may be nearer."""
+    return False
+
+
+@section
+def _row_ahead(forms: tuple[FormPlan, ...]) -> Callable[..., int]:
+    """Make `row(params, form, place)`: where the row of an obstacle begins, or the number of a circle of the state.
+
+    place: which of its form it is; of a form with a grid, how far its row lies behind the first.
     """
-{indented(indented_lines(lines, 0), 4)}
-    return found
-'''
+    some = bool(forms)
+    number, first, gridded = (number_of(forms[0].name), *forms[0][1:]) if forms else (0, 0, False)
+    rest: Any = _row_ahead(forms[1:]) if forms else None
+
+    def row_ahead(params: Any, form: Any, place: Any) -> Any:
+        if some:
+            if form != number:
+                return rest(params, form, place)
+            row = np.int64(params[first])
+            if gridded:
+                return row + place
+            for _ in range(place):
+                row += np.int64(params[row])
+            return row
+        return place
+
+    return row_ahead
 
 
-def _axis(parts: Parts) -> list[str]:
-    """Write the axis along and across which edges are searched for in space: `ax` and `across`.
+# --- its edges --------------------------------------------------------------------------------------------------------
 
-    It is the obstacle's own, or else leads away from what blocked the side of the normal. So no axis of the coordinates
-    is preferred, and agents of the mirrored scene take the mirrored path.
+
+@functools.cache
+def edge(around: Surroundings) -> Callable[..., tuple[float, float]]:
+    """Make `edge(world, form, row, x, ray, side, room)`: by what angle a ray must be turned to pass it, and how far.
+
+    Towards `side`; rad, and m along the turned ray until the body is beside it.
     """
-    own = [form for form in SPINES if form in parts.shaped[1]]
-    lines = ["ax, at_ = zero(x), row", *([f"y = offset_to(size, {place_of_row(parts)}, x)"] if own else [])]
-    for form in own:
-        lines += [f"if form == {list(FORMS).index(form)}:", f"    ax = lateral({SPINES[form]}, ray)"]
-    return [
-        *lines,
-        "if dot(ax, ax) <= like(room, 1e-10):",
-        "    ax = lateral(lateral(off, ray), own)",
-        "if dot(ax, ax) <= like(room, 1e-10):",
-        "    ax = cross(ray, own)",
-        "ax = unit(ax)",
-        "across = cross(ray, ax)",
-    ]
+    offset_to, circle, shaped = around.offset_to, circle_at(around.dimension), bool(around.forms)
+    seen, edge_of = seen_from(around.offset_to, around.moving), _edge_of(tuple(form.name for form in around.forms))
+
+    def edge(world: Any, form: Any, row: Any, x: Any, ray: Any, side: Any, room: Any) -> Any:
+        obstacle_x, obstacle_radius, params, size, b, time = world
+        if form == -1:
+            to = offset_to(size, x, circle(obstacle_x, b, row))
+            return sphere_edge(to, ray, side, room + obstacle_radius[b, row])
+        if shaped:
+            return edge_of(params, form, row, seen(params, size, row, time, x), ray, side, room)
+        return like(room, np.inf), like(room, np.inf)
+
+    return routine(edge)
+
+
+@section
+def _edge_of(forms: tuple[str, ...]) -> Callable[..., tuple[float, float]]:
+    """Make `edge(params, form, row, y, ray, side, room)`: the edge of a shape of one of some forms; else infinity."""
+    some = bool(forms)
+    number = number_of(forms[0]) if forms else 0
+    law: Any = _law("edge", forms[0]) if forms else None
+    rest: Any = _edge_of(forms[1:]) if forms else None
+
+    def edge_of(params: Any, form: Any, row: Any, y: Any, ray: Any, side: Any, room: Any) -> Any:
+        if some:
+            if form == number:
+                return law(params, row, y, ray, side, room)
+            return rest(params, form, row, y, ray, side, room)
+        return like(room, np.inf), like(room, np.inf)
+
+    return edge_of
+
+
+@functools.cache
+def normal_hit(around: Surroundings) -> Callable[..., Vec]:
+    """Make `normal_hit(world, form, row, x, ray, hit, room)`: the outward unit normal where a body touches an obstacle.
+
+    hit: how far along the ray that is, m.
+    """
+    offset_to, circle, shaped = around.offset_to, circle_at(around.dimension), bool(around.forms)
+    seen, normal_of = seen_from(around.offset_to, around.moving), _normal_of(tuple(form.name for form in around.forms))
+
+    def normal_hit(world: Any, form: Any, row: Any, x: Any, ray: Any, hit: Any, room: Any) -> Any:
+        obstacle_x, _, params, size, b, time = world
+        if form == -1:
+            return touched_normal(offset_to(size, x, circle(obstacle_x, b, row)), ray, hit)
+        if shaped:
+            return normal_of(params, form, row, seen(params, size, row, time, x), ray, hit, room)
+        return zero(x)
+
+    return routine(normal_hit)
+
+
+@section
+def _normal_of(forms: tuple[str, ...]) -> Callable[..., Vec]:
+    """Make `normal(params, form, row, y, ray, hit, room)`: the same of a shape of one of some forms; else 0."""
+    some = bool(forms)
+    number = number_of(forms[0]) if forms else 0
+    nearest: Any = law_of("nearest", forms[0]) if forms else None
+    rest: Any = _normal_of(forms[1:]) if forms else None
+
+    def normal_of(params: Any, form: Any, row: Any, y: Any, ray: Any, hit: Any, room: Any) -> Any:
+        if some:
+            if form == number:
+                return nearest(params, row, touched_spot(y, ray, hit, room))[1]
+            return rest(params, form, row, y, ray, hit, room)
+        return zero(y)
+
+    return normal_of
+
+
+@functools.cache
+def edge_beyond(around: Surroundings) -> Callable[..., tuple[float, Vec]]:
+    """Make `edge_beyond(world, form, row, hit, x, ray, side, room, most)`: where a body passes on a side.
+
+    How far from the impact the nearest such place is, m; inf if beyond `most`. In space also the normal of the obstacle
+    that is first found in the way on that side; else 0.
+    """
+    touched, edge_at, space = first_hit(around), edge(around), around.dimension == 3
+    normal_at: Any = normal_hit(around) if space else None
+
+    def edge_beyond(
+        world: Any, form: Any, row: Any, hit: Any, x: Any, ray: Any, side: Any, room: Any, most: Any
+    ) -> Any:
+        far, off, first = like(room, np.inf), zero(x), True
+        spot, way, across, turned_by = scale(ray, hit), ray, side, like(room, 0.0)
+        for _ in range(FOLLOWED):
+            turn, reach = edge_at(world, form, row, x, way, across, room)
+            turned_by += turn
+            if not (turned_by < like(room, ALL_AROUND)) or reach == far:
+                return far, off
+            c, s = np.cos(turn), np.sin(turn)
+            way, across = add(scale(way, c), scale(across, s)), sub(scale(across, c), scale(way, s))
+            beyond = norm(sub(scale(way, reach), spot))
+            if not (beyond < most):
+                return far, off
+            hit, form, row = touched(world, x, way, room * like(room, JUST), reach + room)
+            if form == -2:
+                return beyond, off
+            if space and first:
+                off, first = normal_at(world, form, row, x, way, hit, room), False
+        return far, off
+
+    return routine(edge_beyond)
+
+
+# --- the nearest of them ----------------------------------------------------------------------------------------------
+
+
+@functools.cache
+def aside_of(around: Surroundings) -> Callable[..., Vec]:
+    """Make `aside_of(world, x, ray, room, known)`: the unit vector across a ray to the side of the nearest edge.
+
+    Nearest to the impact; 0 if what is ahead has no edge where the body passes. known: how far ahead it is, m, its
+    form, and its place in that. In the plane both sides are compared, in space the normal's and those along and across
+    an axis.
+    """
+    row_of, normal_at, beyond = _row_ahead(around.forms), normal_hit(around), edge_beyond(around)
+    sides_of = _sides_in_space(around) if around.dimension == 3 else _both_sides
+
+    def aside_of(world: Any, x: Any, ray: Any, room: Any, known: Any) -> Any:
+        hit, form, place = known
+        row, right = row_of(world[2], form, place), perpendicular(ray)
+        out = lateral(normal_at(world, form, row, x, ray, hit, room), ray)
+        own = select(dot(out, out) > like(room, 1e-10), unit(out), right)
+        best, off = beyond(world, form, row, hit, x, ray, own, room, like(room, np.inf))
+        found = own if best < like(room, np.inf) else zero(x)
+        for side in sides_of(world, form, row, x, ray, own, off):
+            far = beyond(world, form, row, hit, x, ray, side, room, best * like(room, NEARER))[0]
+            best, found = (far, side) if far < best else (best, found)
+        return found
+
+    return routine(aside_of)
+
+
+@kernel
+def _both_sides(world: Any, form: Any, row: Any, x: Any, ray: Any, own: Any, off: Any) -> Any:
+    """Return the side that the normal's is not."""
+    return (scale(own, like(x[0], -1.0)),)
+
+
+@section
+def _sides_in_space(around: Surroundings) -> Callable[..., tuple[Vec, ...]]:
+    """Make `sides(world, form, row, x, ray, own, off)`: both sides along and across an axis.
+
+    The axis is the obstacle's own, or else leads away from what blocked the side of the normal. So no axis of the
+    coordinates is preferred, and agents of the mirrored scene take the mirrored path.
+    """
+    forms = tuple(form.name for form in around.forms if form.name in SPINES)
+    some, seen, spine_of = bool(forms), seen_from(around.offset_to, around.moving), _spine_of(forms)
+
+    def sides(world: Any, form: Any, row: Any, x: Any, ray: Any, own: Any, off: Any) -> Any:
+        _, _, params, size, _, time = world
+        ax, e = zero(x), like(x[0], 1.0)
+        if some and form >= 0:
+            ax = lateral(spine_of(params, form, row, seen(params, size, row, time, x), ray), ray)
+        if dot(ax, ax) <= like(e, 1e-10):
+            ax = lateral(lateral(off, ray), own)
+        if dot(ax, ax) <= like(e, 1e-10):
+            ax = cross(ray, own)
+        ax = unit(ax)
+        across = cross(ray, ax)
+        return ax, scale(ax, -e), across, scale(across, -e)
+
+    return sides
+
+
+@section
+def _spine_of(forms: tuple[str, ...]) -> Callable[..., Vec]:
+    """Make `spine(params, form, row, y, ray)`: the axis of a shape of one of some forms; else 0."""
+    some = bool(forms)
+    number = number_of(forms[0]) if forms else 0
+    law: Any = _law("spine", forms[0]) if forms else None
+    rest: Any = _spine_of(forms[1:]) if forms else None
+
+    def spine_of(params: Any, form: Any, row: Any, y: Any, ray: Any) -> Any:
+        if some:
+            if form == number:
+                return law(params, row, y, ray)
+            return rest(params, form, row, y, ray)
+        return zero(y)
+
+    return spine_of

@@ -14,11 +14,10 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from flockenv.shapes import FORMS
-from flockenv.shapes.cells import MOST_FOUND, entry_length
 from flockenv.sweep.parts import Parts
 from flockenv.sweep.text import Slots, indented, indented_lines, tuple_of
 
-__all__ = ["CIRCLE", "blocked", "each_row", "near_rows", "obstacle_imports", "obstacles", "place_of_row"]
+__all__ = ["CIRCLE", "obstacle_imports", "obstacles"]
 
 CIRCLE = "circle"
 
@@ -39,7 +38,7 @@ def obstacle_imports(parts: Parts) -> list[str]:
     asked = ["outside_box"] * bool(parts.bounded) + ["shift_of", "velocity_of"] * parts.moving
     lines = [
         "from flockenv.effects.base import Obstacle",
-        "from flockenv.shapes.round import blocks as stands_between, normal as outward, touched_normal",
+        "from flockenv.shapes.round import normal as outward, touched_normal",
         "from flockenv.shapes.touch import touched_offset, touched_spot",
         "from flockenv.steering.around import threat",
         *([f"from flockenv.shapes.head import {', '.join(asked)}"] if asked else []),
@@ -47,9 +46,6 @@ def obstacle_imports(parts: Parts) -> list[str]:
     forms = [(form, module) for form, module in FORMS.items() if form in parts.shaped[1]]
     lines += [f"from {module} import hit_{form}, nearest_{form}" for form, module in forms]
     if parts.cells:
-        names = "count_of, keep_in_order, list_of, meets_box, row_listed, span_of"
-        lines.append(f"from flockenv.shapes.cells import {names}")
-        lines.append("from flockenv.shapes.head import vector_at")
         lines.append("from flockenv.shapes.edges import near_way")
     cut = [(form, module) for form, module in forms if form in PIECED and any(e.obstacle_pieces for e in parts.effects)]
     return lines + [f"from {module} import piece_{form}, pieces_{form}" for form, module in cut]
@@ -183,7 +179,7 @@ def _asides(parts: Parts, asking: list[tuple[int, list[str]]], me: list[str]) ->
             *indented_lines(me, 8),
             f"        ray, margin = obstacle_ray_{k}(p{k}, me, 0)",
             f"        known = impact, np.int64({which}), np.int64({row})",
-            f"        edgeward = aside_of({world}, x, ray, me.radius + margin, known)",
+            f"        edgeward = aside_of(({world}), x, ray, me.radius + margin, known)",
             *(f"        {s} = edgeward[{j}]" for j, s in enumerate(slots[-parts.dimension :])),
         ]
     return lines
@@ -212,7 +208,7 @@ def _meet(parts: Parts, asking: list[tuple[int, list[str]]], form: str) -> list[
             lines.append(f"found = obstacle_law_{k}(p{k}, me, it, ({', '.join(slots)},))")
             if effect.obstacle_edges:
                 lines += _remembered(parts, k, form, slots[0])
-            lines += _kept(slots, _seen(parts, "it.gap", "it.normal") if effect.occluded_obstacles else "")
+            lines += _kept(slots, _seen("it.gap", "it.normal") if effect.occluded_obstacles else "")
     return lines
 
 
@@ -238,17 +234,16 @@ def _kept(slots: list[str], when: str) -> list[str]:
     return [f"acts = {when}", *(f"{s} = found[{i}] if acts else {s}" for i, s in enumerate(slots))]
 
 
-def _seen(parts: Parts, gap: str, normal: str) -> str:
+def _seen(gap: str, normal: str) -> str:
     """Write whether nothing stands in the way to the place of a surface that is nearest to x."""
-    when = "time, " if parts.moving else ""
     way = f"scale({normal}, -{gap} * like({gap}, {SHORT!r}))"
-    return f"({gap} <= like({gap}, 0.0)) or not blocked(obstacle_x, obstacle_radius, params, size, b, {when}x, {way})"
+    return f"({gap} <= like({gap}, 0.0)) or not blocked(obstacle_x, obstacle_radius, params, size, b, time, x, {way})"
 
 
 def _by_pieces(parts: Parts, k: int, slots: list[str], form: str, vel: str) -> list[str]:
     """Write how a law meets a shape side after side: the nearest place of each that acts by itself."""
     body = f"{vel}, like(far, 0.0), zero(x), far, side, like(far, np.inf), zero(x)"
-    seen = f" and ({_seen(parts, 'far', 'side')})" if parts.effects[k].occluded_obstacles else ""
+    seen = f" and ({_seen('far', 'side')})" if parts.effects[k].occluded_obstacles else ""
     met = [
         "to = touched_offset(zero(x), like(far, 0.0), side, far, far)",
         f"it = Obstacle(params[at_ + 1], to, dot(to, to), {body})",
@@ -309,12 +304,6 @@ def _touched(form: str, k: int, j: int, vel: str) -> list[str]:
     ]
 
 
-def place_of_row(parts: Parts) -> str:
-    """Write where the anchor of the shape at `at_` is."""
-    place = tuple_of("params[at_ + 2 + #]", parts.dimension)
-    return f"add({place}, shift_of(params, at_, time, x))" if parts.moving else place
-
-
 def _touched_side(form: str) -> str:
     """Write the normal where a ray touches; where none does it is that of the nearest place, which is known.
 
@@ -324,84 +313,3 @@ def _touched_side(form: str) -> str:
     if form in ("block", "half_space"):
         return f"side = {found}"
     return f"side = {found} if (hit > like(gap, 0.0)) & (hit < like(gap, np.inf)) else out"
-
-
-def each_row(parts: Parts, form: str, middle: str, reach: str, met: list[str], box: list[str]) -> list[str]:
-    """Write a loop over the shapes of a form, at `at_`: all, or those that a grid says come within `reach` of `middle`.
-
-    box: how these two are worked out, which is done anew behind each shape. Some may be met twice, and in no order that
-    may be relied on.
-    """
-    at, count, cells = (f"np.int64(params[{place}])" for place in parts.places_of(form))
-    if form not in parts.cells:
-        return [
-            f"at_ = {at}",
-            f"for m in range({count}):",
-            *indented_lines(met, 4),
-            "    at_ += np.int64(params[at_])",
-        ]
-    met = [f"at_ = {at} + row_listed(params, entry)", *met, *box]
-    return [f"cells = {cells}", *box, *_listed(parts, middle, reach, met)]
-
-
-def _listed(parts: Parts, middle: str, reach: str, met: list[str]) -> list[str]:
-    """Write a loop over what the grid at `cells` lists, at `entry`, where it comes within `reach` of `middle`."""
-    to = f"offset_to(size, {middle}, vector_at(params, entry + 1, {middle}))"
-    return [
-        f"span = span_of(params, cells, {middle}, {reach})",
-        "for k in range(count_of(span)):",
-        f"    begin, end = list_of(params, cells, {middle}, span, k)",
-        f"    for entry in range(begin, end, {entry_length(parts.dimension)}):",
-        f"        if meets_box(params, entry, {to}, {reach}):",
-        *indented_lines(met, 12),
-    ]
-
-
-def near_rows(parts: Parts) -> str:
-    """Return the source of `near_FORM` for each form that agents look up: the rows that may lie within reach."""
-    met = [
-        f"if count == {MOST_FOUND}:",
-        "    return -1",
-        "count = keep_in_order(found, first, count, row_listed(params, entry))",
-    ]
-    return "".join(
-        f'''
-
-@kernel
-def near_{form}(params, size, cells, x, reach, found, first):
-    """List the rows that may lie within `reach` of x, in order, from `first` on; return how many, -1 if too many."""
-    count = 0
-{indented(_listed(parts, "x", "reach", met), 4)}
-    return count
-'''
-        for form in parts.looked_up
-    )
-
-
-def blocked(parts: Parts) -> str:
-    """Return the source of `blocked`: does an obstacle hide what is at `to` from x? Empty if nobody asks."""
-    if not parts.occludes:
-        return ""
-    d = parts.dimension
-    lines = [
-        "found = False",
-        "for m in range(obstacle_radius.shape[1]):",
-        "    rho = obstacle_radius[b, m]",
-        "    if rho > 0:",
-        f"        found |= stands_between(offset_to(size, x, {tuple_of('obstacle_x[#, b, m]', d)}), rho, to)",
-    ]
-    for form in parts.shaped[1]:
-        hides = f"hit_{form}(params, at_, y, unit(to), like(to[0], 0.0)) < norm(to)"
-        met = [f"y = offset_to(size, {place_of_row(parts)}, x)", f"found |= {hides}"]
-        if form in parts.cells:
-            lines.append("half = scale(to, like(to[0], 0.5))")
-            lines.append(f"middle, reach = add(x, half), {tuple_of('abs(half[#])', d)}")
-            met = [*met, "if found:", "    return found"]
-        lines += each_row(parts, form, "middle", "reach", met, [])
-    return f'''
-@kernel
-def blocked(obstacle_x, obstacle_radius, params, size, b, {"time, " if parts.moving else ""}x, to):
-    """Does an obstacle stand in the straight way to whom is at `to` m?"""
-{indented(indented_lines(lines, 0), 4)}
-    return found
-'''

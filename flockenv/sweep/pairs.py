@@ -194,8 +194,7 @@ def _seen(parts: Parts, q: int) -> str:
     if not sight.occluded:
         return open_
     # whoever is out of sight anyhow is not looked for behind obstacles: here a branch is cheaper than a choice
-    when = "time, " if parts.moving else ""
-    return f"({open_}) and not blocked(obstacle_x, obstacle_radius, params, size, b, {when}me.pos, to)"
+    return f"({open_}) and not blocked(obstacle_x, obstacle_radius, params, size, b, time, me.pos, to)"
 
 
 def _fovs(parts: Parts) -> list[float]:

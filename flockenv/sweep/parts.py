@@ -25,6 +25,7 @@ from flockenv.kernels import IN_PYTHON, LINE, python_of
 from flockenv.shapes import packed
 from flockenv.shapes.cells import FEWEST_ROWS, MOST_FOUND, cells_of
 from flockenv.space import Space
+from flockenv.sweep.forms import FormPlan, Surroundings
 from flockenv.sweep.numbers import NumberPlan, pack_numbers
 from flockenv.sweep.scratch import SMALL_STRIDE
 
@@ -173,10 +174,12 @@ class Parts:
         """True if any effect goes around what is in its way by the nearest edge."""
         return any(e.obstacle_start is not None and e.obstacle_edges for e in self.effects)
 
-    def places_of(self, form: str) -> tuple[int, int, int]:
-        """Return the places in `parameters` of a form's first row, of how many rows it has, and of its grid if any."""
-        at, _ = self.number_plan.forms[list(self.shaped[1]).index(form)]
-        return at, at + 1, at + 2
+    @property
+    def surroundings(self) -> Surroundings:
+        """What code about obstacles depends on."""
+        plans = zip(self.shaped[1], self.number_plan.forms, strict=True)
+        forms = tuple(FormPlan(form, *plan) for form, plan in plans)
+        return Surroundings(self.dimension, self.space.offset_law, self.moving, forms)
 
     @property
     def meets_obstacles(self) -> bool:

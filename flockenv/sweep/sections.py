@@ -9,11 +9,14 @@ from typing import Any
 
 from flockenv.integrators.one_stage import OneStage
 from flockenv.sweep.agents import AgentPlan, alone_of, inner_of, still
+from flockenv.sweep.around import aside_of
 from flockenv.sweep.blocks import into_blocks, out_of_blocks
 from flockenv.sweep.far import far_of, far_plan
 from flockenv.sweep.method import advance_of, method_plan
+from flockenv.sweep.forms import near_rows
 from flockenv.sweep.numbers import images_of, numbers_of
 from flockenv.sweep.parts import Parts
+from flockenv.sweep.visibility import blocked
 
 __all__ = ["sections_of"]
 
@@ -39,4 +42,9 @@ def sections_of(parts: Parts) -> tuple[tuple[str, Any], ...]:
     for k, effect in enumerate(parts.effects):
         if parts.space.periodic and effect.places:
             made[f"images_of_{k}"] = images_of(tuple(parts.names_of(effect)), effect.places, parts.space.offset_law)
+    if parts.occludes:
+        made["blocked"] = blocked(parts.surroundings)
+    if parts.goes_around:
+        made["aside_of"] = aside_of(parts.surroundings)
+    made |= {f"near_{form}": near_rows(parts.space.offset_law, parts.dimension) for form in parts.looked_up}
     return tuple(made.items())

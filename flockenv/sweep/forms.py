@@ -1,0 +1,177 @@
+"""The rows of shapes that a scene's code meets, form by form: where they are, all of them or those that a grid lists.
+
+A row is one of shapes/table.py; `at` is where it begins in `params`. A loop over rows is made of what is done with
+each, and hands a state on from one to the next.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from flockenv.kernels import Law, Vec, kernel, law
+from flockenv.section import section
+from flockenv.shapes.cells import (
+    MOST_FOUND,
+    count_of,
+    entry_length,
+    keep_in_order,
+    list_of,
+    meets_box,
+    row_listed,
+    span_of,
+)
+from flockenv.shapes.head import shift_of, vector_at
+from flockenv.shapes.table import FORMS
+from flockenv.vec import add
+
+__all__ = ["FormPlan", "Surroundings", "box_of_way", "circle_at", "each_row", "near_rows", "number_of", "seen_from"]
+
+
+class FormPlan(NamedTuple):
+    """A form of shapes that a scene has."""
+
+    name: str
+    place: int
+    """Where `params` says where its first row begins; behind that, how many rows it has, and where its grid begins."""
+    gridded: bool
+    """True if a grid of cells lies over its rows, see shapes/cells.py."""
+
+
+class Surroundings(NamedTuple):
+    """What code about the obstacles of a scene depends on."""
+
+    dimension: int
+    offset_to: Law
+    """The shortest way from one place to another, of the space."""
+    moving: bool
+    """True if any shape moves."""
+    forms: tuple[FormPlan, ...]
+
+
+def number_of(form: str) -> int:
+    """Return the number of a form, as rows hold it."""
+    return list(FORMS).index(form)
+
+
+@section
+def circle_at(dimension: int) -> Callable[..., Vec]:
+    """Make `circle(obstacle_x, b, m)`: the centre of circle or sphere m of world b, m."""
+
+    def circle(obstacle_x: Any, b: Any, m: Any) -> Any:
+        if dimension == 2:
+            return obstacle_x[0, b, m], obstacle_x[1, b, m]
+        return obstacle_x[0, b, m], obstacle_x[1, b, m], obstacle_x[2, b, m]
+
+    return circle
+
+
+@section
+def seen_from(offset_to: Law, moving: bool) -> Callable[..., Vec]:
+    """Make `seen(params, size, at, time, x)`: place x from the anchor of the shape at `at`, at this time (s), m."""
+
+    def seen(params: Any, size: Any, at: Any, time: Any, x: Any) -> Any:
+        place = vector_at(params, at + 2, x)
+        if moving:
+            return offset_to(size, add(place, shift_of(params, at, time, x)), x)
+        return offset_to(size, place, x)
+
+    return seen
+
+
+@law
+def box_of_way(x: Vec, half: Vec, room: float) -> tuple[Vec, Vec]:
+    """Return the box around a body of radius `room` on its way from x: the middle, and half the edges, m.
+
+    half: half of the way.
+    """
+    if len(half) == 2:
+        return add(x, half), (abs(half[0]) + room, abs(half[1]) + room)
+    else:
+        return add(x, half), (abs(half[0]) + room, abs(half[1]) + room, abs(half[2]) + room)
+
+
+@section
+def each_row(around: Surroundings, form: FormPlan, meet: Law, box: Law, done: Law) -> Callable[..., Any]:
+    """Make `each(params, size, given, state)`: `state = meet(params, size, at, given, state)` for the rows of a form.
+
+    All rows, in order; of a form with a grid those that it lists in the box `box(given, state)` (the middle, and half
+    the edges along each axis, m), which is worked out anew behind each, until `done(state)`. Some of these may be met
+    twice, and in no order that may be relied on.
+    """
+    place, gridded, of_first = form.place, form.gridded, _of_first(meet)
+    each_listed = _each_listed(around.offset_to, around.dimension, of_first, box, done)
+
+    def each(params: Any, size: Any, given: Any, state: Any) -> Any:
+        at = np.int64(params[place])
+        if gridded:
+            return each_listed(params, size, np.int64(params[place + 2]), at, given, state)
+        for _ in range(np.int64(params[place + 1])):
+            state = meet(params, size, at, given, state)
+            at += np.int64(params[at])
+        return state
+
+    return each
+
+
+@section
+def _of_first(meet: Law) -> Callable[..., Any]:
+    """Make `meet` of a row that is known by how far it lies behind the first one."""
+
+    def meet_listed(params: Any, size: Any, at: Any, row: Any, given: Any, state: Any) -> Any:
+        return meet(params, size, at + row, given, state)
+
+    return meet_listed
+
+
+@section
+def _each_listed(offset_to: Law, dimension: int, meet: Law, box: Law, done: Law) -> Callable[..., Any]:
+    """Make `each(params, size, cells, at, given, state)`: the loop over the rows that the grid at `cells` lists.
+
+    `state = meet(params, size, at, row, given, state)`; row: how far it lies behind the first row of the form.
+    """
+    length = entry_length(dimension)
+
+    def each(params: Any, size: Any, cells: Any, at: Any, given: Any, state: Any) -> Any:
+        middle, reach = box(given, state)
+        span = span_of(params, cells, middle, reach)
+        for k in range(count_of(span)):
+            begin, end = list_of(params, cells, middle, span, k)
+            for entry in range(begin, end, length):
+                if meets_box(params, entry, offset_to(size, middle, vector_at(params, entry + 1, middle)), reach):
+                    state = meet(params, size, at, row_listed(params, entry), given, state)
+                    if done(state):
+                        return state
+                    middle, reach = box(given, state)
+        return state
+
+    return each
+
+
+@section
+def near_rows(offset_to: Law, dimension: int) -> Callable[..., int]:
+    """Make `near(params, size, cells, x, reach, found, first)`: list the rows that may lie within `reach` of x.
+
+    x: a place, m; reach: along each axis, m; cells: where the grid over the rows begins. They are written to `found`
+    from `first` on, ascending, by how far each lies behind the first row of its form. Returns how many; -1 if too many.
+    """
+
+    def box(given: Any, state: Any) -> Any:
+        return given[0], given[1]
+
+    def keep(params: Any, size: Any, at: Any, row: Any, given: Any, count: Any) -> Any:
+        if count == MOST_FOUND:
+            return -1
+        return keep_in_order(given[2], given[3], count, row)
+
+    def full(count: Any) -> Any:
+        return count < 0
+
+    each_listed = _each_listed(offset_to, dimension, kernel(keep), kernel(box), kernel(full))
+
+    def near(params: Any, size: Any, cells: Any, x: Any, reach: Any, found: Any, first: Any) -> Any:
+        return each_listed(params, size, cells, 0, (x, reach, found, first), 0)
+
+    return near
