@@ -20,8 +20,8 @@ import numpy as np
 
 from flockenv.kernels import Law, Vec, kernel, like, routine
 from flockenv.section import section
-from flockenv.shapes.round import touched_normal
 from flockenv.shapes.edges import near_way, sphere_edge
+from flockenv.shapes.round import touched_normal
 from flockenv.shapes.table import law_of
 from flockenv.shapes.touch import touched_spot
 from flockenv.steering.around import threat

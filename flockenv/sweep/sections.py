@@ -12,8 +12,8 @@ from flockenv.sweep.agents import AgentPlan, alone_of, inner_of, still
 from flockenv.sweep.around import aside_of
 from flockenv.sweep.blocks import into_blocks, out_of_blocks
 from flockenv.sweep.far import far_of, far_plan
-from flockenv.sweep.method import advance_of, method_plan
 from flockenv.sweep.forms import near_rows
+from flockenv.sweep.method import advance_of, method_plan
 from flockenv.sweep.numbers import images_of, numbers_of
 from flockenv.sweep.parts import Parts
 from flockenv.sweep.visibility import blocked
