@@ -8,7 +8,6 @@ part; `accelerate` is for all others, and for who asks for accelerations alone.
 
 from __future__ import annotations
 
-from flockenv.sweep.bonds import bonds
 from flockenv.sweep.handed import OPEN_CONTEXT
 from flockenv.sweep.obstacles import obstacles
 from flockenv.sweep.pairs import pairs
@@ -35,7 +34,12 @@ _FORM_FIELDS = {"at": "at", "count": "many", "cells": "cells"}
 
 def sense(parts: Parts) -> str:
     """Return the source of `sense`: what is felt from others."""
-    sensing = [*_aim(parts), *pairs(parts), *["far(context, pos, time)"] * bool(parts.far), *bonds(parts)]
+    sensing = [
+        *_aim(parts),
+        *pairs(parts),
+        *["far(context, pos, time)"] * bool(parts.far),
+        *["bonds(context, pos, vel, time)"] * bool(parts.bonded),
+    ]
     return f'''
 
 @kernel

@@ -1,23 +1,27 @@
-"""Bonds: everybody gathers what acts on him through the bonds that he is in, block after block, lane beside lane.
+"""Bonds: each agent gathers what acts on it through the bonds that it is in, block after block, lane beside lane.
 
 A table has, for each block of agents, as many slots as its most bonded agent has bonds; in a slot each lane has the
-places of its partners and the numbers of its bond, or its own place and zeros (`pack`). So nobody writes what is
+places of its partners and the numbers of its bond, or its own place and zeros (`pack`). So no thread writes what is
 another's, and sums are the same for any number of threads.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import NamedTuple
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from flockenv.effects.base import Bonds, Effect
+from flockenv.effects.base import Bonds, Other
+from flockenv.kernels import Law, like, wait_for_team
+from flockenv.section import section
+from flockenv.sweep.agents import AgentPlan, alone_of, inner_of
+from flockenv.sweep.blocks import numbers_of_lane, vector_of_lane
 from flockenv.sweep.parts import Parts
-from flockenv.sweep.text import Slots, alone, indented, indented_lines, inner_of, lane, lanes_of
+from flockenv.vec import dot, exact_sum, zero
 
-__all__ = ["Table", "bonds", "pack"]
+__all__ = ["BondPlan", "Table", "bond_plan", "bonds_of", "pack"]
 
 
 class Table(NamedTuple):
@@ -78,61 +82,140 @@ def _packed(
     return start.astype(np.int64), places, numbers
 
 
-def bonds(parts: Parts) -> list[str]:
-    """Write how every agent of this thread's blocks gathers what its bonds say; nothing at all if there is none."""
-    if not parts.bonded:
-        return []
-    d, w, slot = parts.dimension, parts.width, Slots(parts)
-    sums = slot.all("bond")
-    lines = [
-        *([] if parts.pairs or parts.far else ["wait_for_team(sync, team)  # positions are everybody's"]),
-        f"size_ = (n + {w - 1}) // {w} + 1",
-        "for block in range(np.uint64(first), np.uint64(end)):",
-        f"    base, row = block * np.uint64({d * w}), block * np.uint64({w})",
-        f"    for l in range(np.uint64({w})):",
-        indented([f"{s} = {lane(parts, 'pulled', j) if parts.far else 0}" for j, s in enumerate(sums)], 8),
-    ]
-    for e, (k, effect) in enumerate(parts.bonded):
-        lines += indented_lines(_meet(parts, e, k, effect, sums), 4)
-    return [
-        *lines,
-        f"    for l in range(np.uint64({w})):",
-        indented([f"{lane(parts, 'pulled', j)} = {s}" for j, s in enumerate(sums)], 8),
-        "wait_for_team(sync, team)  # nobody moves before all have looked",
-    ]
+# --- met by a kernel --------------------------------------------------------------------------------------------------
 
 
-def _meet(parts: Parts, e: int, k: int, effect: Effect, sums: list[str]) -> list[str]:
-    """Write how a block's agents gather from the bonds of one effect."""
-    d, w, p, c = parts.dimension, parts.width, effect.partners, effect.numbers(parts.dimension)
-    total = len(parts.bonded)
+class BondLaw(NamedTuple):
+    """A law of bonds."""
 
-    def vector(array: str, place: str) -> str:
-        return "(" + ", ".join(f"{array}[{place} + np.uint64({j * w})]" for j in range(d)) + ",)"
+    k: int  # which effect it is of
+    law: Law
+    partners: int
+    numbers: int
 
-    others = []
-    for q in range(p):
-        others += [
-            f"at{q} = np.uint64(bond_place[places + np.uint64({q * w}) + l])",
-            f"to{q} = offset_to(size, x, {vector('pos', f'at{q}')})",
-            f"who{q} = at{q} // np.uint64({d * w}) * np.uint64({w}) + at{q} % np.uint64({w})",
-            f"fast{q} = {vector('vel', f'at{q}')}",
-            f"wide{q}, heavy{q}, in{q} = radius[who{q}], mass[who{q}], {inner_of(parts, f'who{q}')}",
-            f"it{q} = Other(like(x[0], who{q}), to{q}, dot(to{q}, to{q}), fast{q}, wide{q}, zero(x), heavy{q}, in{q})",
-        ]
-    numbers = ", ".join(f"bond_number[numbers + np.uint64({j * w}) + l]" for j in range(c))
-    return [
-        f"begin, until = bond_start[{e} * size_ + np.int64(block)], bond_start[{e} * size_ + np.int64(block) + 1]",
-        "for s_ in range(begin, until):",
-        f"    places = np.uint64(bond_start[{total} * size_ + {2 * e}] + s_ * {p * w})",
-        f"    numbers = np.uint64(bond_start[{total} * size_ + {2 * e + 1}] + s_ * {c * w})",
-        f"    for l in range(np.uint64({w})):",
-        "        i = row + l",
-        f"        x, v = {lanes_of(parts, 'pos')}, {lanes_of(parts, 'vel')}",
-        f"        me = {alone(parts)}",
-        indented(others, 8),
-        f"        says = bond_law_{k}(p{k}, me, ({', '.join(f'it{q}' for q in range(p))},), ({numbers},))",
-        f"        whole = {' & '.join(f'(living[who{q}] > zero(x)[0])' for q in range(p))}  # the dead hold nobody",
-        # of a sum of products each form of the loop would fuse another one, and bits would depend on the processor
-        indented([f"{s} = exact_sum({s}, says[{j}] if whole else like(x[0], -0.0))" for j, s in enumerate(sums)], 8),
-    ]
+
+class BondPlan(NamedTuple):
+    """What gathering from bonds depends on."""
+
+    agent: AgentPlan
+    offset_to: Law
+    laws: tuple[BondLaw, ...]  # in the order of the table
+    sums: int  # where in the scratch of lanes the sums of a block begin
+    waits: bool  # has nothing waited yet until all threads have written their positions?
+    adds: bool  # is something in `pulled` already?
+
+
+def bond_plan(parts: Parts, agent: AgentPlan) -> BondPlan:
+    """Return the plan of a scene."""
+    d = parts.dimension
+    laws = tuple(BondLaw(k, e.bond_law, e.partners, e.numbers(d)) for k, e in parts.bonded if e.bond_law is not None)
+    sums, waits = parts.slots["bond0"] * parts.width, not (parts.pairs or parts.far)
+    return BondPlan(agent, parts.space.offset_law, laws, sums, waits, bool(parts.far))
+
+
+@section
+def bonds_of(plan: BondPlan) -> Callable[..., None]:
+    """Make `bonds(context, pos, vel, time)`: write what bonds do to this thread's agents, N, into `pulled`."""
+    gather = _gather(plan, len(plan.laws) - 1)
+    waits, adds = plan.waits, plan.adds
+    count, sums = plan.agent.dimension * plan.agent.width, np.uint64(plan.sums)
+
+    def bonds(context: Any, pos: Any, vel: Any, time: Any) -> None:
+        scratch, numbers, key, n = context.scratch, context.numbers, context.key[context.b], context.n
+        sync, team, lanes, pulled = scratch.sync, context.team, scratch.lanes, scratch.pulled
+        if waits:
+            wait_for_team(sync, team)  # the positions are those of all threads
+        for block in range(np.uint64(context.first), np.uint64(context.end)):
+            base = block * np.uint64(count)
+            for place in range(np.uint64(count)):
+                lanes[sums + place] = pulled[base + place] if adds else like(pulled[0], 0.0)
+            gather(scratch, numbers.effects, numbers.size, pos, vel, time, key, n, block)
+            for place in range(np.uint64(count)):
+                pulled[base + place] = lanes[sums + place]
+        wait_for_team(sync, team)  # no agent moves before all have looked
+
+    return bonds
+
+
+@section
+def _gather(plan: BondPlan, place: int) -> Callable[..., None]:
+    """Make `gather(scratch, effects, size, pos, vel, time, key, n, block)`: add what bonds say to a block's sums.
+
+    Those of an effect, by its place in the table, and of all before it.
+    """
+    before = _gather(plan, place - 1) if place else None
+    k, law, partners, numbers = plan.laws[place]
+    dimension, width = plan.agent.dimension, plan.agent.width
+    vector, alone, partners_of = vector_of_lane(dimension, width), alone_of(plan.agent), _partners(plan, partners)
+    are_alive = _are_alive(dimension, width, partners)
+    numbers_of = numbers_of_lane(numbers, width)
+    keeps, apart, wide = bool(plan.agent.inner), partners * width, numbers * width
+    first_place, total = 2 * place, len(plan.laws)
+    sum_x, sum_y, sum_z = (np.uint64(plan.sums + axis * width) for axis in range(3))
+
+    def gather(
+        scratch: Any, effects: Any, size: Any, pos: Any, vel: Any, time: Any, key: Any, n: Any, block: Any
+    ) -> None:
+        if before is not None:
+            before(scratch, effects, size, pos, vel, time, key, n, block)
+        lanes, start, numbered = scratch.lanes, scratch.bond_start, scratch.bond_number
+        placed, living, kept = scratch.bond_place, scratch.living, scratch if keeps else ()
+        base, row = block * np.uint64(dimension * width), block * np.uint64(width)
+        blocks = (n + (width - 1)) // width + 1
+        for slot in range(start[place * blocks + np.int64(block)], start[place * blocks + np.int64(block) + 1]):
+            places = np.uint64(start[total * blocks + first_place] + slot * apart)
+            first = np.uint64(start[total * blocks + first_place + 1] + slot * wide)
+            for lane in range(np.uint64(width)):
+                i, at = row + lane, base + lane
+                x, v = vector(pos, at), vector(vel, at)
+                me = alone(scratch, key, time, at, i, i, x, v, zero(x))
+                others = partners_of(kept, placed, pos, vel, scratch.radius, scratch.mass, size, x, places + lane)
+                says = law(effects[k], me, others, numbers_of(numbered, first + lane))
+                whole = are_alive(placed, living, places + lane)  # the dead hold no agent
+                # of a sum of products each form of the loop would fuse another one, and bits depend on the processor
+                lanes[sum_x + lane] = exact_sum(lanes[sum_x + lane], says[0] if whole else like(x[0], -0.0))
+                lanes[sum_y + lane] = exact_sum(lanes[sum_y + lane], says[1] if whole else like(x[0], -0.0))
+                if dimension == 3:
+                    lanes[sum_z + lane] = exact_sum(lanes[sum_z + lane], says[2] if whole else like(x[0], -0.0))
+
+    return gather
+
+
+@section
+def _partners(plan: BondPlan, count: int) -> Callable[..., tuple[Other, ...]]:
+    """Make `partners(kept, placed, pos, vel, radius, mass, size, x, place)`: those in a bond with an agent at x.
+
+    place: where `placed` holds the place of the first. kept: scratch, if agents keep numbers inside; else nothing.
+    """
+    before, behind = _partners(plan, count - 1) if count > 1 else None, np.uint64((count - 1) * plan.agent.width)
+    vector, inner, offset_to = vector_of_lane(*plan.agent[:2]), inner_of(plan.agent.inner), plan.offset_to
+    width, size_of_block = np.uint64(plan.agent.width), np.uint64(plan.agent.dimension * plan.agent.width)
+
+    def partners(
+        kept: Any, placed: Any, pos: Any, vel: Any, radius: Any, mass: Any, size: Any, x: Any, place: Any
+    ) -> Any:
+        at = np.uint64(placed[place + behind])
+        i: Any = at // size_of_block * width + at % width
+        to, o = offset_to(size, x, vector(pos, at)), zero(x)
+        other = Other(like(x[0], i), to, dot(to, to), vector(vel, at), radius[i], o, mass[i], inner(kept, i))
+        if before is None:
+            return (other,)
+        return before(kept, placed, pos, vel, radius, mass, size, x, place) + (other,)  # noqa: RUF005  # numba adds
+
+    return partners
+
+
+@section
+def _are_alive(dimension: int, width: int, count: int) -> Callable[..., bool]:
+    """Make `are_alive(places, living, place)`: are all partners of a bond alive?"""
+    before, behind = _are_alive(dimension, width, count - 1) if count > 1 else None, np.uint64((count - 1) * width)
+    lanes, size = np.uint64(width), np.uint64(dimension * width)
+
+    def are_alive(places: Any, living: Any, place: Any) -> Any:
+        at = np.uint64(places[place + behind])
+        alive = living[at // size * lanes + at % lanes] > like(living[0], 0.0)
+        if before is None:
+            return alive
+        return before(places, living, place) & alive
+
+    return are_alive

@@ -11,6 +11,7 @@ from flockenv.integrators.one_stage import OneStage
 from flockenv.sweep.agents import AgentPlan, alone_of, inner_of, still
 from flockenv.sweep.around import aside_of
 from flockenv.sweep.blocks import into_blocks, out_of_blocks
+from flockenv.sweep.bonds import bond_plan, bonds_of
 from flockenv.sweep.far import far_of, far_plan
 from flockenv.sweep.forms import near_rows
 from flockenv.sweep.method import advance_of, method_plan
@@ -35,6 +36,8 @@ def sections_of(parts: Parts) -> tuple[tuple[str, Any], ...]:
     made["inner_of"], made["still"] = inner_of(parts.inner), still
     if parts.far:
         made["far"] = far_of(far_plan(parts))
+    if parts.bonded:
+        made["bonds"] = bonds_of(bond_plan(parts, agent))
     if isinstance(parts.integrator, OneStage):
         made["move"] = parts.integrator.move()
     else:

@@ -15,7 +15,7 @@ from flockenv.sweep.text import asked, indented
 
 __all__ = ["field_source", "scene_source"]
 
-IN_SECTIONS = ("far_law",)
+IN_SECTIONS = ("far_law", "bond_law")
 """Laws that sections hold: the file of a scene calls them nowhere."""
 
 
