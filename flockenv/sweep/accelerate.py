@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from flockenv.sweep.handed import OPEN_CONTEXT
 from flockenv.sweep.obstacles import obstacles
-from flockenv.sweep.pairs import pairs
 from flockenv.sweep.parts import Parts
 from flockenv.sweep.text import (
     Slots,
@@ -36,7 +35,7 @@ def sense(parts: Parts) -> str:
     """Return the source of `sense`: what is felt from others."""
     sensing = [
         *_aim(parts),
-        *pairs(parts),
+        *["meet_neighbours(context, pos, vel, time)"] * bool(parts.pairs),
         *["far(context, pos, time)"] * bool(parts.far),
         *["bonds(context, pos, vel, time)"] * bool(parts.bonded),
     ]

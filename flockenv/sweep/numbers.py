@@ -11,17 +11,16 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-from numba.core import cgutils, types
-from numba.np import arrayobj
 
-from flockenv.kernels import Law, intrinsic_or_python, kernel, written
-from flockenv.section import record, section
+from flockenv.kernels import Law, kernel
+from flockenv.section import joined_from, record, section, tuple_from
+from flockenv.sweep.gather import gather
 from flockenv.vec import add
 
 if TYPE_CHECKING:
     from flockenv.sweep.parts import Parts
 
-__all__ = ["Form", "NumberPlan", "Numbers", "View", "images_of", "numbers_of", "pack_numbers", "taken"]
+__all__ = ["Form", "NumberPlan", "Numbers", "View", "images_of", "numbers_of", "pack_numbers"]
 
 
 class Form(NamedTuple):
@@ -129,60 +128,35 @@ def _look_numbers(parts: Parts) -> list[float]:
     return [parts.look.radius, parts.look.radius**2] if parts.look else []
 
 
-def _taken(typing_context: Any, array: Any, place: Any, count: Any) -> Any:
-    """Return `count` numbers of an array, from a place on, as a tuple; both are written down in the source."""
-    wide = written(count, "count")
-
-    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        make: Any = arrayobj.make_array
-        number = context.get_data_type(array.dtype)
-        start = builder.gep(make(signature.args[0])(context, builder, arguments[0]).data, [arguments[1]])
-        pointers = (cgutils.gep_inbounds(builder, start, k) for k in range(wide))  # type: ignore[no-untyped-call]
-        size = context.get_abi_sizeof(number)
-        found = [builder.load(pointer, align=size) for pointer in pointers]
-        return context.make_tuple(builder, signature.return_type, found)
-
-    numbers: Any = types.BaseTuple.from_types([array.dtype] * wide)  # type: ignore[no-untyped-call]
-    return numbers(array, types.intp, count), generate
-
-
-taken: Any = intrinsic_or_python(_taken, lambda array, place, count: tuple(array[place : place + count]))
-
-
 @section
 def numbers_of(plan: NumberPlan) -> Callable[[Any, Any], Numbers]:
     """Make `numbers_of(params, counters)`: all numbers of a scene, read from the arrays that its kernel is handed."""
-    d = plan.dimension
-    forms, views = _all_of(tuple(map(_form, plan.forms))), _all_of(tuple(map(_view, plan.views)))
-    effects = _all_of(tuple(map(_effect, plan.effects)))
-    (space_at, spaces), (method_at, methods), (look_at, looks) = plan.space, plan.method, plan.look
+    d, size = plan.dimension, tuple(range(plan.dimension))
+    forms, views, effects = _all(_form, plan.forms), _all(_view, plan.views), _all(_effect, plan.effects)
+    space, method, look = (_places(*some) for some in (plan.space, plan.method, plan.look))
 
     def read(params: Any, counters: Any) -> Any:
+        begin = np.uint64(0)
         return Numbers(
-            taken(params, 0, d),
+            gather(params, begin, size),
             params[d],
             forms(params, counters),
             views(params, counters),
             effects(params, counters),
-            taken(params, space_at, spaces),
-            taken(params, method_at, methods),
-            taken(params, look_at, looks),
+            gather(params, begin, space),
+            gather(params, begin, method),
+            gather(params, begin, look),
         )
 
     return read
 
 
-@functools.cache
-def _all_of(readers: tuple[Callable[..., Any], ...]) -> Callable[..., tuple[Any, ...]]:
-    """Return a function that makes a tuple of what each of some functions reads."""
-    if not readers:
-        return kernel(lambda params, counters: ())
-    before, last = _all_of(readers[:-1]), readers[-1]
+def _all(reads: Callable[[Any], Callable[..., Any]], plans: tuple[Any, ...]) -> Callable[..., tuple[Any, ...]]:
+    return tuple_from(*map(reads, plans)) if plans else kernel(lambda params, counters: ())
 
-    def each(params: Any, counters: Any) -> Any:
-        return before(params, counters) + (last(params, counters),)  # noqa: RUF005  # numba adds tuples, and unpacks none
 
-    return kernel(each)
+def _places(first: int, count: int) -> tuple[int, ...]:
+    return tuple(range(first, first + count))
 
 
 @functools.cache
@@ -200,24 +174,19 @@ def _form(place: tuple[int, bool]) -> Callable[..., Form]:
 @functools.cache
 def _view(place: tuple[int, bool]) -> Callable[..., View]:
     at, grouped = place
-
-    def view(params: Any, counters: Any) -> Any:
-        if grouped:
-            return View(params[at], params[at + 1], params[at + 2], params[at + 3])
-        return View(params[at], params[at + 1], params[at], params[at])
-
-    return kernel(view)
+    places = _places(at, 4) if grouped else (at, at + 1, at, at)
+    return kernel(lambda params, counters: View(*gather(params, np.uint64(0), places)))
 
 
 @functools.cache
 def _effect(plan: EffectPlan) -> Callable[..., Any]:
     """Make a function that reads the record of an effect."""
-    kind, values = record(plan.names), _all_in(_runs(plan.kinds or (("number", 0, 1),)))
-
-    def effect(params: Any, counters: Any) -> Any:
-        return kind(*values(params, counters))
-
-    return kernel(effect)
+    kind, runs = record(plan.names), _runs(plan.kinds or (("number", 0, 1),))
+    if len(runs) == 1 and runs[0][0] == "number":
+        places = _places(*runs[0][1:])
+        return kernel(lambda params, counters: kind(*gather(params, np.uint64(0), places)))
+    values = joined_from(*map(_run, runs))
+    return kernel(lambda params, counters: kind(*values(params, counters)))
 
 
 def _runs(kinds: tuple[tuple[str, int, int], ...]) -> tuple[tuple[str, int, int], ...]:
@@ -232,21 +201,13 @@ def _runs(kinds: tuple[tuple[str, int, int], ...]) -> tuple[tuple[str, int, int]
 
 
 @functools.cache
-def _all_in(runs: tuple[tuple[str, int, int], ...]) -> Callable[..., tuple[Any, ...]]:
-    """Make a function that reads what an effect's laws are given, in order."""
-    if len(runs) == 1:
-        return _run(runs[0])
-    before, last = _all_in(runs[:-1]), _run(runs[-1])
-    return kernel(lambda params, counters: before(params, counters) + last(params, counters))
-
-
-@functools.cache
 def _run(run: tuple[str, int, int]) -> Callable[..., tuple[Any, ...]]:
     kind, at, count = run
+    places = _places(at, count)
     if kind == "number":
-        return kernel(lambda params, counters: taken(params, at, count))
+        return kernel(lambda params, counters: gather(params, np.uint64(0), places))
     if kind == "vector":
-        return kernel(lambda params, counters: (taken(params, at, count),))
+        return kernel(lambda params, counters: (gather(params, np.uint64(0), places),))
     if kind == "table":
         return kernel(lambda params, counters: (params[np.int64(params[at]) : np.int64(params[at + 1])],))
 

@@ -14,8 +14,10 @@ from flockenv.sweep.blocks import into_blocks, out_of_blocks
 from flockenv.sweep.bonds import bond_plan, bonds_of
 from flockenv.sweep.far import far_of, far_plan
 from flockenv.sweep.forms import near_rows
+from flockenv.sweep.meeting import meet_neighbours
 from flockenv.sweep.method import advance_of, method_plan
 from flockenv.sweep.numbers import images_of, numbers_of
+from flockenv.sweep.pair_plan import pairs_of
 from flockenv.sweep.parts import Parts
 from flockenv.sweep.visibility import blocked
 
@@ -42,6 +44,8 @@ def sections_of(parts: Parts) -> tuple[tuple[str, Any], ...]:
         made["move"] = parts.integrator.move()
     else:
         made["advance_of"] = advance_of(parts.integrator.advance(), method_plan(parts))
+    if parts.pairs:
+        made["meet_neighbours"] = meet_neighbours(pairs_of(parts))
     for k, effect in enumerate(parts.effects):
         if parts.space.periodic and effect.places:
             made[f"images_of_{k}"] = images_of(tuple(parts.names_of(effect)), effect.places, parts.space.offset_law)

@@ -1,0 +1,104 @@
+"""What the sweep over neighbours depends on: which pair laws there are, how they look around, where their sums lie."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from flockenv.kernels import Law
+from flockenv.sweep.listing import Listing, listing_of
+from flockenv.sweep.numbers import images_of
+from flockenv.sweep.visibility import blocked
+
+if TYPE_CHECKING:
+    from flockenv.sweep.parts import Parts
+
+__all__ = ["PairLaw", "Pairs", "View", "pairs_of"]
+
+
+class View(NamedTuple):
+    """How some pair laws look around."""
+
+    fov: int  # the first sight with the same field of view; -1: all around
+    grouped: bool  # is one group alone seen?
+    occluded: bool  # is whoever an obstacle hides not seen?
+    near: tuple[int, int]  # where the squares of the nearest lie, and how many of them there are; (0, 0): all count
+    counted: int  # where it is counted who is in sight; -1: nowhere
+
+
+class PairLaw(NamedTuple):
+    """An effect with a pair law."""
+
+    k: int  # its number among all effects
+    start: Any  # its laws, or None where it has none
+    pair: Any
+    apart: Any
+    finish: Any
+    joined: Any  # its law of obstacles, of a fold that meets these before neighbours
+    first: int  # where its running numbers lie
+    sums: int
+    sight: int
+    contact: bool
+    vanishes: bool
+    averages: bool
+    images: Any  # None, or what makes its numbers, with the images of its points that are nearest to an agent
+    target: int  # what it adds to
+
+
+class Pairs(NamedTuple):
+    """All that the sweep over neighbours depends on."""
+
+    listing: Listing
+    views: tuple[View, ...]
+    laws: tuple[PairLaw, ...]
+    targets: tuple[int, ...]  # where what each target comes to lies
+    inner: tuple[str, ...]
+    oriented: bool
+    parting: bool  # are those in one place met by themselves?
+    seldom: bool  # are ties not listed, because they are seldom looked at?
+    ahead: bool  # is it worked out how far the next candidate is while one is met?
+    masks: bool  # is what was compared kept in masks, so that it costs nothing to compare once more?
+    offset_to: Law
+    hidden: Callable[..., bool] | None  # does an obstacle hide somebody? see visibility.py
+
+    @property
+    def lanes(self) -> int:
+        """How many agents a block has."""
+        return self.listing.width
+
+    def slots(self, first: int, count: int) -> tuple[int, ...]:
+        """Return where running numbers lie that follow each other."""
+        return tuple(first + k * self.lanes for k in range(count))
+
+
+def pairs_of(parts: Parts) -> Pairs:
+    """Return what the sweep of a scene depends on."""
+    listing = listing_of(parts, parts.sorted_fields, parts.confines, parts.arranges)
+    fovs = [sight.fov for sight in parts.sights]
+    views = tuple(
+        View(
+            fovs.index(sight.fov) if sight.fov < 360 else -1,
+            sight.group is not None,
+            sight.occluded,
+            (int(listing.slot(f"near{q}_0")), sight.nearest) if sight.nearest else (0, 0),
+            int(listing.slot(f"many{q}_0")) if q in parts.averaged else -1,
+        )
+        for q, sight in enumerate(parts.sights)
+    )
+    laws = tuple(
+        PairLaw(
+            k, e.pair_start, e.pair_law, e.apart_law, e.finish_law, e.obstacle_law if e.joined else None,
+            int(listing.slot(f"c{k}_0")), e.sums(parts.dimension), parts.sights.index(parts.sight_of(e)), e.contact,
+            e.vanishes and parts.trusts, e.averages,
+            images_of(tuple(parts.names_of(e)), e.places, parts.space.offset_law)
+            if parts.space.periodic and e.places else None,
+            parts.targets.index(parts.pair_target(k)),
+        )
+        for k, e in parts.pairs
+    )  # fmt: skip
+    targets = tuple(int(listing.slot(f"g{name}0")) for name in parts.targets)
+    return Pairs(
+        listing, views, laws, targets, parts.inner, parts.oriented, parts.parting,
+        parts.fields != parts.sorted_fields, parts.looks_ahead, parts.masks, parts.space.offset_law,
+        blocked(parts.surroundings) if any(view.occluded for view in views) else None,
+    )  # fmt: skip
