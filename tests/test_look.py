@@ -10,7 +10,7 @@ from numba import njit
 
 from flockenv.abreast import key_of, key_read, key_written, ordered, same_key, tag_of
 from flockenv.kernels import kernel
-from flockenv.sweep.look import AT_ONCE, merged
+from flockenv.sweep.nearest import AT_ONCE, exchanges, inserted, merged
 from flockenv.tasks import Bottleneck, Flock
 from flockenv.world import World
 
@@ -176,15 +176,47 @@ def test_keys_are_in_the_order_of_squares_and_know_their_places() -> None:
 
 
 @pytest.mark.parametrize("length", range(2, 34))
-def test_the_nearest_stay_in_a_list_and_in_order(length: int) -> None:
-    """What is merged with it, run in Python: whatever its length, and who comes."""
-    text = "\n".join(merged([f"kept[{k}]" for k in range(length)]))
+def test_exchanges_keep_the_least_in_a_list_and_in_order(length: int) -> None:
+    """Whatever the list's length, and whichever numbers come."""
     rng = np.random.default_rng(length)
     for most in (3, 1000):
         kept, every = [most] * length, [most] * length
         for _ in range(40):
             come = rng.integers(0, most, AT_ONCE).tolist()
-            names = {f"come{k}": key for k, key in enumerate(come)} | {"kept": kept}
-            exec(text, {"ordered": lambda *pair: sorted(pair), "key_read": int, "key_written": int}, names)  # noqa: S102
-            every = sorted(every + come)
+            row = kept + come
+            for one, other in exchanges(length, AT_ONCE):
+                row[one], row[other] = sorted((row[one], row[other]))
+            kept, every = row[:length], sorted(every + come)
             assert kept == every[:length]
+
+
+@pytest.mark.parametrize("length", [2, 7])
+def test_keys_are_merged_into_lists_that_lie_in_scratch(length: int) -> None:
+    """Where float32 may: so keys that are NaN or no normal numbers must come out with the same bits."""
+    call = njit(lambda numbers, come: merged(numbers, come))
+    rng = np.random.default_rng(length)
+    kept = np.full(length, 0xFFFFFFFF, np.uint32)
+    every = kept.tolist()
+    for _ in range(40):
+        come = rng.choice([0, 1, 2**20, 0x7F800000, 0x7FC00000, 0xFF800001, *rng.integers(0, 2**32, 9)], AT_ONCE)
+        kept = np.array(call(tuple(kept.view("f4")), tuple(come.astype(np.uint32))), "f4").view(np.uint32)
+        every = sorted([*every, *come.tolist()])
+        assert kept.tolist() == every[:length]
+
+
+@pytest.mark.parametrize("kind", ["float32", "float64"])
+def test_distances_are_inserted_with_their_places(kind: str) -> None:
+    """NaN and infinitely far ones stay out of a list; of those who are equally far, each is in it once."""
+    call, real = njit(lambda numbers, far, place: inserted(numbers, far, place)), np.dtype(kind).type
+    rng, length = np.random.default_rng(3), 5
+    kept: tuple[Any, ...] = tuple([real(np.inf)] * length + [real(0)] * length)
+    every: dict[int, Any] = {}
+    for place in range(60):
+        far = real(rng.choice([np.nan, np.inf, *rng.integers(0, 30, 6)]))
+        kept = call(kept, far, real(place))
+        if far < np.inf:
+            every[place] = far
+        many = min(len(every), length)
+        assert list(kept[:length]) == sorted(every.values())[:length] + [np.inf] * (length - many)
+        assert [every[int(one)] for one in kept[length : length + many]] == list(kept[:many])
+        assert len(set(kept[length : length + many])) == many

@@ -22,7 +22,8 @@ from flockenv.space import Plane, Torus
 from flockenv.spawn import Spawn
 from flockenv.state import State
 from flockenv.steering.others import ONE_PLACE
-from flockenv.sweep.pairs import pairs
+from flockenv.sweep.pair_plan import pairs_of
+from flockenv.sweep.pair_sums import begin_sums
 from tests.catalogue import EFFECTS, scene_under, users_module
 
 RULES = (Separation(weight=1.5, radius=1.5), Alignment(weight=0.6, radius=2), Cohesion(weight=0.2, radius=2.5))
@@ -228,12 +229,12 @@ def test_two_threads_and_a_view_cone_change_nothing() -> None:
 def test_a_block_counts_anew_who_is_in_its_places() -> None:
     """Else all blocks after the first would go through their candidates twice, and no result would tell."""
     scene, _ = crowd(10, 2, "float64", False)
-    parts = scene.parts
-    count = f"lanes[np.uint64({parts.slots['here0'] * parts.width}) + l]"
-    text = "\n".join(pairs(parts))
-    assert (
-        text.index(f"{count} = 0") < text.index(f"{count} = tallied({count}, other)") < text.index(f"tally_of({count})")
-    )
+    plan = pairs_of(scene.parts)
+    lanes, first = np.full(len(scene.parts.slots) * plan.lanes, 7.0), int(plan.listing.slot("here0"))
+    begin, numbers, block = begin_sums(plan), namedtuple("N", "reach")(1.0), namedtuple("B", "lanes")(lanes)  # type: ignore[call-arg]
+    njit(lambda numbers, block: begin(numbers, (), block))(numbers, block)
+    assert (lanes[first : first + plan.lanes] == 0).all()
+    assert (lanes == 7).any()  # what is no running number of the sweep stays
 
 
 WITH_BOTH = [row for row in EFFECTS if row.effect.apart_law is not None]

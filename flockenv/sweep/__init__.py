@@ -9,21 +9,22 @@ over the lanes has a constant length and constant offsets, and the compiler make
 lie in one small scratch array and stay in vector registers.
 
 The files, as a source is put together: `parts` says what it depends on, `text` holds the smallest pieces of it;
-`query` sorts the agents and walks their blocks, `pairs` lets a block meet its candidates, `far` everybody, `bonds` its
-partners; `accelerate` is the sum of all laws, `method` the integrator, `step` advances worlds by it, `source` is the
-whole file, and `handed` leaves its functions the scratch that they name; `look` is what tasks add to it.
+`listing` sorts the agents and walks their blocks, `meeting` lets a block meet its candidates, `far` everybody, `bonds`
+its partners; `accelerate` is the sum of all laws, `method` the integrator, `step` advances worlds by it, `source` is
+the whole file, and `handed` leaves its functions the scratch that they name; `look` is what tasks add to it.
 """
 
 from __future__ import annotations
 
 from flockenv.sweep.bonds import Table, pack
-from flockenv.sweep.look import look_source
+from flockenv.sweep.look import look_of
+from flockenv.sweep.look_plan import look_plan
 from flockenv.sweep.parts import Look, Parts, flattened
 from flockenv.sweep.scratch import GIVEN, OWN, scratch_bytes, scratch_of, scratch_record
 from flockenv.sweep.sections import sections_of
 from flockenv.sweep.source import field_source, scene_source
 
 __all__ = [
-    "GIVEN", "OWN", "Look", "Parts", "Table", "field_source", "flattened", "look_source", "pack", "scene_source",
-    "scratch_bytes", "scratch_of", "scratch_record", "sections_of",
+    "GIVEN", "OWN", "Look", "Parts", "Table", "field_source", "flattened", "look_of", "look_plan", "pack",
+    "scene_source", "scratch_bytes", "scratch_of", "scratch_record", "sections_of",
 ]  # fmt: skip

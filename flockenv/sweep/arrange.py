@@ -11,7 +11,6 @@ from __future__ import annotations
 
 from flockenv.neighbours import FEWEST_ARRANGED, STEPS_ARRANGED, WORTH_ARRANGING
 from flockenv.sweep.parts import Parts
-from flockenv.sweep.query import counted
 from flockenv.sweep.text import array_of, in_blocks, indented, indented_lines, place_of
 
 __all__ = ["go_home", "move_in"]
@@ -28,11 +27,13 @@ def move_in(parts: Parts) -> list[str]:
     if not parts.arranges:
         return ["arranged = False"]
     to = ["c = np.uint64(cell[i])", "cell[i] = offset[rank, c]", "offset[rank, c] += 1"]
+    periodic, wraps = parts.space.periodic, parts.space.periodic and not parts.confines
+    counted = f"pos, living, first, end, {parts.width}, rank, team, sync, bounds, size, reach"
     return [
         "arranged = False",
         f"least = {FEWEST_ARRANGED} if team > 1 and count >= {STEPS_ARRANGED} else {WORTH_ARRANGING}",
         "if count > 1 and n >= least and present == n:",
-        f"    shape = {counted(parts, 'count_tiles', parts.confines)}",
+        f"    shape = count_tiles({counted}, {periodic}, {wraps}, n, cell, start, offset)",
         "    arranged = shape[0] > 0",
         "if arranged:",
         indented(_carry(parts, to), 4),

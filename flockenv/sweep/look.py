@@ -1,240 +1,250 @@
 """What tasks add: `look` finds who is near every agent of a world, for observations and rewards.
 
-It asks the same query as the pair laws, and keeps, for each lane, sorted lists of the nearest few.
+It lists agents as pair laws do, and keeps, for each lane, sorted lists of the nearest few.
 """
 
 from __future__ import annotations
 
-from flockenv.sweep.handed import OPEN_SCRATCH
-from flockenv.sweep.pairs import me_of, meet_range, offset_of
-from flockenv.sweep.parts import Parts, sorted_at
-from flockenv.sweep.query import listed, listed_at, query, walk
-from flockenv.sweep.scratch import SMALL_STRIDE
-from flockenv.sweep.text import Slots, indented, indented_lines, lanes_of, tuple_of
+from collections.abc import Callable
+from typing import Any
 
-__all__ = ["AT_ONCE", "KEYS", "look_source", "merged"]
+import numpy as np
 
-KEYS = "key_of, key_read, key_written, ordered, pick, same_key, tag_of"
-"""What is called where lists of the nearest are kept as keys."""
+from flockenv.kernels import like
+from flockenv.section import section
+from flockenv.sweep.blocks import into_blocks, vector_of_lane
+from flockenv.sweep.forms import circle_at
+from flockenv.sweep.gather import fill, gather, scatter
+from flockenv.sweep.listing import list_living, walk_blocks
+from flockenv.sweep.look_keys import by_keys_of
+from flockenv.sweep.look_plan import Looking, LookPlan, Nearest, Span
+from flockenv.sweep.nearest import AT_ONCE, inserted
+from flockenv.vec import dot, exact_dot, norm, sub
 
-AT_ONCE = 4
-"""So many candidates at once are put into lists of keys."""
+__all__ = ["look_of"]
 
 
-def look_source(parts: Parts) -> str:
-    """Return the source of `look`: what is near every agent of a world, by the query that pair laws use."""
-    if parts.look is None:
-        return ""
-    at = parts.number_plan.look[0]
-    return f'''
-@kernel
-def look(
-    x_, alive, obstacle_x, obstacle_radius, b, params,
-    near_square, near_who, near_count, obstacle_gap, obstacle_who, obstacle_count, near_pos, scratch,
-):
-    """Write, for every agent of world b, the nearest agents (K, N) and obstacles (J, N), and how many (N,).
+@section
+def look_of(plan: LookPlan) -> Callable[..., bool]:
+    """Make `look(x, alive, obstacle_x, obstacle_radius, b, params, near_square, ..., near_pos, scratch)`.
 
-    Where there is none, it is infinitely far, and some number stands there: of agents, one that exists. Returns whether
+    It writes, for every agent of world b, the nearest agents (K, N) and obstacles (J, N), and how many (N,). Where
+    there is none, it is infinitely far, and some number stands there: of agents, one that exists. It returns whether
     it has written where these are, too (D, K, N).
     """
-    {OPEN_SCRATCH}
-    n, rank, team = x_.shape[2], 0, 1
-    first, end = 0, (n + {parts.width - 1}) // {parts.width}
-    size, reach, within = {tuple_of("params[#]", parts.dimension)}, params[{at}], params[{at + 1}]
-    present, arranged, time, drawn = 0, False, params[0], np.uint64(0)  # nobody asks here what time it is, or draws
-    placed = {parts.keyed}
-    for i in range(n):
-        present += alive[b, i]
-        living[i] = alive[b, i]
-    for i in range(n if present < n else 0):  # who is absent is not asked, and everybody's obstacles are told
-        near_count[i] = 0
-        for k in range(near_square.shape[0]):
-            near_square[k, i] = np.inf
-    into_blocks(pos, x_, b, n, first, end)
-{indented([*_look_at_agents(parts), *_look_at_obstacles(parts)], 4)}
-    return placed
-'''
+    width, at, agents, obstacles = plan.listing.width, plan.at, plan.agents > 0, plan.obstacles > 0
+    axes, into = tuple(range(plan.listing.dimension)), into_blocks(plan.listing.dimension, plan.listing.width)
+    among, around = _among_agents(plan) if agents else None, _among_obstacles(plan) if obstacles else None
+
+    def look(
+        x: Any, alive: Any, obstacle_x: Any, obstacle_radius: Any, b: int, params: Any, near_square: Any, near_who: Any,
+        near_count: Any, obstacle_gap: Any, obstacle_who: Any, obstacle_count: Any, near_pos: Any, scratch: Any,
+    ) -> bool:  # fmt: skip
+        n = x.shape[2]
+        first, end, present = 0, (n + (width - 1)) // width, 0
+        span = Span(gather(params, np.uint64(0), axes), params[at], params[at + 1])
+        for i in range(n):
+            present += alive[b, i]
+            scratch.living[i] = alive[b, i]
+        for i in range(n if present < n else 0):  # who is absent is not asked, and everybody's obstacles are told
+            near_count[i] = 0
+            for k in range(near_square.shape[0]):
+                near_square[k, i] = np.inf
+        into(scratch.pos, x, b, n, first, end)
+        placed = False
+        if agents:
+            near = Nearest(near_square, near_who, near_count, near_pos)
+            placed = among(Looking(span, near, n, present, False, first, end, 0, 1, scratch))  # type: ignore[misc]
+        if obstacles:
+            around(  # type: ignore[misc]
+                obstacle_x, obstacle_radius, b, span, scratch.pos, scratch.lanes, end, obstacle_gap, obstacle_who,
+                obstacle_count,
+            )  # fmt: skip
+        return placed
+
+    return look
 
 
-def _look_at_agents(parts: Parts) -> list[str]:
-    """Write the query, and how every block keeps lists of its nearest agents."""
-    assert parts.look is not None
-    slot, many = Slots(parts), parts.look.agents
-    if not many:
-        return []
-    candidate = "far, place = square if other & (square < within) else like(square, np.inf), like(square, j)"
-    keep = [candidate, *_insert(slot, "square", "place", many)]
-    lanes = f"np.uint64({parts.width})"
-    block = [
-        f"for l in range({lanes}):",
-        *(f"    {slot(f'square{k}')} = np.inf; {slot(f'place{k}')} = 0" for k in range(many)),
-        "for r in range(found):",
-        *indented_lines(meet_range(parts, parts.seen_fields, keep, exact=parts.keyed), 4),
-        "if nx == 0 and present == n:  # sorted by number: the lists lie as the lanes do",
-        *_tell(slot, many, lanes, agent="block + l", who="np.int32(#)"),
-        "else:",
-        *_tell(slot, many, "np.uint64(upto - at)", agent=listed(parts), who=listed_at(parts, parts.seen_fields)),
-    ]
-    if parts.keyed:
-        block = [*_keyed(parts), "if not sure:", *indented_lines(block, 4)]
-    return [*query(parts, parts.seen_fields), *_tags(parts), *walk(parts, parts.seen_fields, block)]
+# --- agents -----------------------------------------------------------------------------------------------------------
 
 
-def _tags(parts: Parts) -> list[str]:
-    """Write what keys need to know before, and candidates after the last one: infinitely far, NaN around a box."""
-    if not parts.keyed:
-        return []
-    return [
-        "nobody, room = np.uint32(0xFFFFFFFF), 1",
-        "while room < n:",
-        "    room *= 2",
-        "tags = np.int32(room - 1)",
-        "edge = key_of(within, np.int32(0), tags)",
-        f"for j in range(np.uint64(n), np.uint64(n + {AT_ONCE - 1})):",
-        f"    {sorted_at(parts.seen_fields.index('x0'), 'j')} = np.inf",
-    ]
+@section
+def _among_agents(plan: LookPlan) -> Callable[[Any], bool]:
+    """Make `among(looking)`: tell the nearest agents of everybody, block by block; it returns as `look` does."""
+    list_all, walk, keyed = list_living(plan.listing), walk_blocks(plan.listing, _block(plan)), plan.keyed
+
+    def among(looking: Any) -> Any:
+        scratch = looking.scratch
+        shape = list_all(looking, scratch.pos, scratch.vel)
+        if keyed:  # candidates after the last one: infinitely far, NaN around a box
+            for j in range(np.uint64(looking.n), np.uint64(looking.n + (AT_ONCE - 1))):
+                scratch.sorted_rows[j] = np.inf
+        unsure = walk(looking, shape, scratch.pos, scratch.vel, looking.numbers.reach)
+        return keyed and unsure == 0
+
+    return among
 
 
-def _keyed(parts: Parts) -> list[str]:
-    """Write how a block keeps lists of keys, one longer than asked for, and tells them if that leaves no doubt.
+@section
+def _block(plan: LookPlan) -> Callable[..., int]:
+    """Make what one block does, as `walk_blocks` calls it; it returns how many blocks were not told by keys: 0 or 1."""
+    sorts, keyed = plan.listing.sorts, plan.keyed
+    by_keys, by_squares, tell = by_keys_of(plan) if keyed else None, _by_squares(plan), _tell(plan)
 
-    Where two neighbours of a list, or one and the edge of sight, differ in less than the bits that are left of a
-    square, all is found in the other way, once more. Squares are worked out anew.
+    def block(
+        looking: Any, shape: Any, block: Any, at: Any, upto: Any, found: Any, pos: Any, vel: Any, time: Any
+    ) -> Any:  # fmt: skip
+        scratch, near, span = looking.scratch, looking.near, looking.numbers
+        everybody, sure = looking.present == looking.n, False
+        if keyed:  # noqa: SIM102  # numba drops the branch by this alone
+            if everybody:
+                sure = by_keys(scratch.sorted_rows, scratch.number, scratch.lanes, near, span, block, looking.n)  # type: ignore[misc]
+        if not sure:
+            if sorts:
+                by_squares(
+                    scratch.lanes, np.uint64(0), scratch.records, scratch.number, scratch.lanes, span, block,
+                    scratch.ranges, found,
+                )  # fmt: skip
+                tell(scratch.records, scratch.lanes, near, block, upto, shape[0] == 0 and everybody)
+            else:
+                by_squares(
+                    scratch.sorted_rows, block, scratch.sorted_rows, scratch.number, scratch.lanes, span, block,
+                    scratch.ranges, found,
+                )  # fmt: skip
+                tell(scratch.order, scratch.lanes, near, block, upto, everybody)
+        return 0 if sure else 1
+
+    return block
+
+
+@section
+def _by_squares(plan: LookPlan) -> Callable[..., None]:
+    """Make `by_squares(mine, first, theirs, number, lanes, span, block, ranges, found)`: keep lists of squares.
+
+    Only around the edge of a periodic box are images sought.
     """
-    assert parts.look is not None
-    slot, many, d, w = Slots(parts), parts.look.agents, parts.dimension, parts.width
-    keys = [slot(f"square{k}") for k in range(many + 1)]
-    lines = [
-        "sure = present == n",
-        "if sure:",
-        f"    for l in range(np.uint64({w})):",
-        *(f"        {place} = key_written(nobody)" for place in keys),
-        f"    for j in range(np.uint64(0), np.uint64(n), np.uint64({AT_ONCE})):",
-        f"        for l in range(np.uint64({w})):",
-        *indented_lines(_met(parts, keys), 12),
-        "    doubt = False",
-        f"    for l in range(np.uint64({w})):",
-        "        i, count = block + l, np.int32(0)",
-        f"        following = key_read({keys[0]})",
-    ]
-    for k in range(many):
-        lines += [
-            f"        key, following = following, key_read({keys[k + 1]})",
-            "        near = key < edge",
-            f"        near_who[{k}, i] = tag_of(key, tags) if near else np.int32(0)",
-            "        count += np.int32(1) if near else np.int32(0)",
-            "        doubt |= (near & same_key(key, following, tags)) | same_key(key, edge, tags)",
-        ]
-    first = parts.seen_fields.index("x0") * SMALL_STRIDE
-    lines += ["        near_count[i] = count", "    sure = not doubt", "placed &= sure", "if sure:"]
-    lines.append("    agents, listed = np.uint64(n), np.uint64(near_who.shape[1])")
-    lines.append(f"    table, length = np.uint64({first}), np.uint64({SMALL_STRIDE})")
-    for k in range(many):
-        there = ", ".join(f"near_pos[{j}, {k}, block + l]" for j in range(d))
-        lines += [
-            f"    line, beside = np.uint64({k}) * listed + block, np.uint64({many}) * listed",
-            "    rows = sorted_rows",
-            f"    pick(near_pos, line, beside, rows, table, length, np.uint64({d}), agents, near_who, line, {w})",
-            f"    for l in range(np.uint64({w})):",
-            f"        {me_of(parts, parts.seen_fields)}",
-            f"        to = {offset_of(parts, f'({there})')}",
-            "        square = exact_dot(to, to)",
-            f"        near_square[{k}, block + l] = square if key_read({keys[k]}) < edge else like(within, np.inf)",
-        ]
-    return lines
+    listing, width = plan.listing, plan.listing.width
+    squares, places = plan.slots("square", plan.agents), plan.slots("place", plan.agents)
+    meet, both = _meet(plan, listing.periodic), listing.periodic and listing.sorts
+    plain = _meet(plan, False) if both else None
+
+    def by_squares(
+        mine: Any, first: Any, theirs: Any, number: Any, lanes: Any, span: Any, block: Any, ranges: Any, found: Any
+    ) -> None:  # fmt: skip
+        for lane in range(np.uint64(width)):
+            fill(lanes, lane, squares, like(span.within, np.inf))
+            fill(lanes, lane, places, like(span.within, 0.0))
+        for r in range(found):
+            j, last = np.uint64(ranges[r, 0]), np.uint64(ranges[r, 1])
+            if plain is not None:
+                if ranges[r, 2] > 0:
+                    meet(mine, first, theirs, number, lanes, span, block, j, last)
+                else:
+                    plain(mine, first, theirs, number, lanes, span, block, j, last)
+            else:
+                meet(mine, first, theirs, number, lanes, span, block, j, last)
+
+    return by_squares
 
 
-def _met(parts: Parts, keys: list[str]) -> list[str]:
-    """Write how the candidates from j on come into the list of a lane."""
-    row = [sorted_at(parts.seen_fields.index(f"x{k}"), "(j + np.uint64(#))") for k in range(parts.dimension)]
-    lines = [me_of(parts, parts.seen_fields), "mine = number[block + l]"]
-    for c in range(AT_ONCE):
-        there = ", ".join(place.replace("#", str(c)) for place in row)
-        lines += [
-            f"to, tag = {offset_of(parts, f'({there})')}, number[j + np.uint64({c})]",
-            f"come{c} = key_of(exact_dot(to, to), tag, tags)",
-            f"come{c} = nobody if tag == mine else come{c}",
-        ]
-    return lines + merged(keys)
+@section
+def _meet(plan: LookPlan, wrapped: bool) -> Callable[..., None]:
+    """Make `meet(mine, first, theirs, number, lanes, span, block, j, last)`: a block meets candidates [j, last)."""
+    listing, width, exact, offset_to = plan.listing, plan.listing.width, plan.exact, plan.offset_to
+    length = np.uint64(listing.length if listing.sorts else 1)
+    place, there = plan.place, listing.listed(listing.axes("x"))
+    slots = plan.slots("square", plan.agents) + plan.slots("place", plan.agents)
+
+    def meet(
+        mine: Any, first: Any, theirs: Any, number: Any, lanes: Any, span: Any, block: Any, j: Any, last: Any
+    ) -> None:  # fmt: skip
+        while j < last:
+            his, own = gather(theirs, j * length, there), np.int32(j - block)
+            for lane in range(np.uint64(width)):
+                here = gather(mine, first + lane, place)
+                to = offset_to(span.size, here, his) if wrapped else sub(his, here)
+                square = exact_dot(to, to) if exact else dot(to, to)
+                seen = (own != number[lane]) & (square < span.within)
+                far = square if seen else like(square, np.inf)
+                scatter(lanes, lane, slots, inserted(gather(lanes, lane, slots), far, like(square, j)))
+            j += np.uint64(1)
+
+    return meet
 
 
-def merged(keys: list[str]) -> list[str]:
-    """Write how the keys come0, come1, ... are put into a list in order, which lies at such places, and stays as long.
+@section
+def _tell(plan: LookPlan) -> Callable[..., None]:
+    """Make `tell(listed, lanes, near, block, upto, by_number)`: write the lists of a block to where its agents look.
 
-    One after the other, into a list of seven, that takes 13 instructions a key, and this 8: they are sorted, the lesser
-    of the list's last and the first of them, and so on, are the nearest, and a row that rises and then falls is in
-    order after as many rounds as its length has bits (Batcher, "Sorting networks and their applications", AFIPS 1968).
+    listed: who is at a place: records, or their order. by_number: the lists lie as the lanes do.
     """
-    many = len(keys)
-    lines = [_in_order(f"come{a}", f"come{b}") for a, b in ((0, 1), (2, 3), (0, 2), (1, 3), (1, 2))]
-    lines += [f"list{k} = key_read({place})" for k, place in enumerate(keys)]
-    lines += [f"list{many - 1 - c} = ordered(list{many - 1 - c}, come{c})[0]" for c in range(min(AT_ONCE, many))]
-    length = 1 << (many - 1).bit_length()  # as if as many as are missing of that were nearer than everybody
-    half, missing = length // 2, length - many
-    while half:
-        firsts = [k for k in range(missing, length) if not k & half]
-        lines += [_in_order(f"list{k - missing}", f"list{k - missing + half}") for k in firsts]
-        half //= 2
-    return lines + [f"{place} = key_written(list{k})" for k, place in enumerate(keys)]
+    listing, width, many = plan.listing, plan.listing.width, plan.agents
+    squares, places, home = listing.slot("square0"), listing.slot("place0"), listing.slot("home0")
+    sorts, length = listing.sorts, np.uint64(listing.length)
+
+    def tell(listed: Any, lanes: Any, near: Any, block: Any, upto: Any, by_number: Any) -> None:
+        if by_number:
+            for lane in range(np.uint64(width)):
+                i, count = block + lane, np.int32(0)
+                for k in range(many):
+                    at = np.uint64(k * width) + lane
+                    square = lanes[squares + at]
+                    near.square[k, i] = square
+                    near.who[k, i] = np.int32(lanes[places + at])
+                    count += np.int32(1) if square < np.inf else np.int32(0)
+                near.count[i] = count
+        else:
+            for lane in range(np.uint64(upto) - block):
+                i, count = np.uint64(lanes[home + lane]) if sorts else np.uint64(listed[block + lane]), np.int32(0)
+                for k in range(many):
+                    at = np.uint64(k * width) + lane
+                    square, place = lanes[squares + at], np.uint64(lanes[places + at])
+                    near.square[k, i] = square
+                    near.who[k, i] = np.int32(listed[place * length]) if sorts else listed[place]
+                    count += np.int32(1) if square < np.inf else np.int32(0)
+                near.count[i] = count
+
+    return tell
 
 
-def _in_order(one: str, other: str) -> str:
-    """Write how two keys change places unless the first is the lesser."""
-    return f"{one}, {other} = ordered({one}, {other})"
+# --- obstacles --------------------------------------------------------------------------------------------------------
 
 
-def _tell(slot: Slots, many: int, lanes: str, agent: str, who: str) -> list[str]:
-    """Write how the lists of so many lanes are told; `who` is the agent at sorted place `#`."""
-    lists = [(k, slot(f"square{k}"), who.replace("#", slot(f"place{k}"))) for k in range(many)]
-    return [
-        f"    for l in range({lanes}):",
-        f"        i, count = {agent}, np.int32(0)",
-        *(f"        near_square[{k}, i] = {square}; near_who[{k}, i] = {name}" for k, square, name in lists),
-        *(f"        count += 1 if {square} < np.inf else 0" for _, square, _ in lists),
-        "        near_count[i] = count",
-    ]
+@section
+def _among_obstacles(plan: LookPlan) -> Callable[..., None]:
+    """Make `around(obstacle_x, obstacle_radius, b, span, pos, lanes, end, gap, who, count)`: tell what is near.
 
+    Those obstacles whose surfaces are nearest, of everybody: how far those are (J, N), which (J, N), how many (N,).
+    """
+    d, width, many, offset_to = plan.listing.dimension, plan.listing.width, plan.obstacles, plan.offset_to
+    vector, circle, size = vector_of_lane(d, width), circle_at(d), d * width
+    gaps, names = plan.slots("gap", many), plan.slots("which", many)
+    gap_at, name_at, slots = plan.listing.slot("gap0"), plan.listing.slot("which0"), gaps + names
 
-def _look_at_obstacles(parts: Parts) -> list[str]:
-    """Write how every block keeps lists of the obstacles whose surfaces are nearest."""
-    assert parts.look is not None
-    slot, many, d = Slots(parts), parts.look.obstacles, parts.dimension
-    if not many:
-        return []
-    return [
-        "for block in range(first, end):",
-        f"    base = np.uint64(block * {d * parts.width})",
-        f"    for l in range(np.uint64({parts.width})):",
-        *(f"        {slot(f'gap{k}')} = np.inf; {slot(f'which{k}')} = 0" for k in range(many)),
-        "    for m in range(obstacle_radius.shape[1]):",
-        f"        rho, centre = obstacle_radius[b, m], {tuple_of('obstacle_x[#, b, m]', d)}",
-        "        limit = reach if rho > 0 else like(reach, -np.inf)  # no branch: lists stay in registers",
-        f"        for l in range(np.uint64({parts.width})):",
-        f"            to = offset_to(size, {lanes_of(parts, 'pos')}, centre)",
-        "            far, place = norm(to) - rho, like(rho, m)",
-        "            far = far if far < limit else like(rho, np.inf)",
-        *indented_lines(_insert(slot, "gap", "which", many), 12),
-        f"    for l in range(np.uint64({parts.width})):",
-        f"        i, count = np.uint64(block * {parts.width}) + l, np.int32(0)",
-        *(
-            f"        obstacle_gap[{k}, i] = {slot(f'gap{k}')}; obstacle_who[{k}, i] = np.int32({slot(f'which{k}')}); "
-            f"count += 1 if {slot(f'gap{k}')} < np.inf else 0"
-            for k in range(many)
-        ),
-        "        obstacle_count[i] = count",
-    ]
+    def around(
+        obstacle_x: Any, obstacle_radius: Any, b: int, span: Any, pos: Any, lanes: Any, end: Any, gap: Any, who: Any,
+        count: Any,
+    ) -> None:  # fmt: skip
+        for block in range(end):
+            base = np.uint64(block * size)
+            for lane in range(np.uint64(width)):
+                fill(lanes, lane, gaps, like(span.reach, np.inf))
+                fill(lanes, lane, names, like(span.reach, 0.0))
+            for m in range(obstacle_radius.shape[1]):
+                rho = obstacle_radius[b, m]
+                centre = circle(obstacle_x, b, m)
+                limit = span.reach if rho > 0 else like(span.reach, -np.inf)  # no branch: lists stay in registers
+                for lane in range(np.uint64(width)):
+                    far = norm(offset_to(span.size, vector(pos, base + lane), centre)) - rho
+                    far = far if far < limit else like(rho, np.inf)
+                    scatter(lanes, lane, slots, inserted(gather(lanes, lane, slots), far, like(rho, m)))
+            for lane in range(np.uint64(width)):
+                i, found = np.uint64(block * width) + lane, np.int32(0)
+                for k in range(many):
+                    at = np.uint64(k * width) + lane
+                    gap[k, i] = lanes[gap_at + at]
+                    who[k, i] = np.int32(lanes[name_at + at])
+                    found += np.int32(1) if lanes[gap_at + at] < np.inf else np.int32(0)
+                count[i] = found
 
-
-def _insert(slot: Slots, near: str, where: str, many: int) -> list[str]:
-    """Write how (far, place) is put into the lanes' lists of the nearest, kept in order."""
-    lines = []
-    for k in range(many):
-        a, b = slot(f"{near}{k}"), slot(f"{where}{k}")
-        lines += [
-            f"near, there = {a}, {b}",
-            "closer = far < near",
-            f"{a} = far if closer else near",
-            f"{b} = place if closer else there",
-            "far, place = near if closer else far, there if closer else place",
-        ]
-    return lines
+    return around

@@ -27,9 +27,8 @@ from flockenv.shapes.cells import FEWEST_ROWS, MOST_FOUND, cells_of
 from flockenv.space import Space
 from flockenv.sweep.forms import FormPlan, Surroundings
 from flockenv.sweep.numbers import NumberPlan, pack_numbers
-from flockenv.sweep.scratch import SMALL_STRIDE
 
-__all__ = ["LAWS", "Look", "Parts", "flattened", "record_of", "sorted_at", "view_of"]
+__all__ = ["LAWS", "Look", "Parts", "flattened", "view_of"]
 
 MOST_NUMBERS = 2**24
 """Numbers of a form's rows, and of the grid over them, up to which single precision counts them exactly."""
@@ -408,9 +407,9 @@ class Parts:
 
     @property
     def numbers(self) -> int:
-        """Numbers of a record that scratch must have."""
+        """Numbers of a record that scratch must have: a place, and all fields but headings."""
         kinds = [self.sorted_fields] * bool(self.pairs) + [self.seen_fields] * bool(self.look)
-        return max((len(record_of(fields)) for fields in kinds), default=1)
+        return 1 + max((sum(name[0] != "h" for name in fields) for fields in kinds), default=0)
 
     @property
     def confines(self) -> bool:
@@ -504,19 +503,6 @@ class Parts:
 def flattened(effects: Sequence[Effect]) -> tuple[Effect, ...]:
     """Return effects with their behaviours, if they have some, before them: each has laws and numbers of its own."""
     return tuple(each for effect in effects for each in (*effect.wishes, effect))
-
-
-def sorted_at(row: int, place: str) -> str:
-    """Write a number of an agent of a small scene, listed at `place`, which is counted without a sign.
-
-    Rows are a constant distance apart, so that a candidate is one address and not one per number.
-    """
-    return f"sorted_rows[np.uint64({row * SMALL_STRIDE}) + {place}]"
-
-
-def record_of(fields: list[str]) -> list[str]:
-    """Return what is written of an agent when it is put into its cell; headings follow from velocities."""
-    return ["place"] + [f for f in fields if f[0] != "h"]
 
 
 EDGE = 8

@@ -7,7 +7,6 @@ from dataclasses import replace
 from flockenv.kernels import import_line
 from flockenv.sweep.accelerate import accelerate, sense
 from flockenv.sweep.handed import OPEN_SCRATCH, Context, opened
-from flockenv.sweep.look import KEYS
 from flockenv.sweep.obstacles import obstacle_imports
 from flockenv.sweep.parts import LAWS, Parts
 from flockenv.sweep.step import begin, kept_frame, kept_inner, step, step_world
@@ -15,12 +14,12 @@ from flockenv.sweep.text import asked, indented
 
 __all__ = ["field_source", "scene_source"]
 
-IN_SECTIONS = ("far_law", "bond_law")
+IN_SECTIONS = ("far_law", "bond_law", "pair_start", "pair_law", "apart_law", "finish_law")
 """Laws that sections hold: the file of a scene calls them nowhere."""
 
 
-def scene_source(parts: Parts, more: str = "") -> str:
-    """Return the source of a scene's kernel: `accelerate` and `step_world` of one world, `step` of all; and more."""
+def scene_source(parts: Parts) -> str:
+    """Return the source of a scene's kernel: `accelerate` and `step_world` of one world, `step` of all."""
     names = ", ".join(type(e).__name__ for e in parts.effects) or "no effects"
     title = f"{parts.dimension}-D {parts.space.kind}, {parts.integrator.kind}; {names}"
     chapters = [
@@ -30,7 +29,7 @@ def scene_source(parts: Parts, more: str = "") -> str:
         *([] if parts.one_stage else [accelerate(parts), "advance = advance_of(accelerate)\n"]),
         step_world(parts),
         begin(parts),
-        step(parts) + more,
+        step(parts),
     ]
     return opened(parts, "\n".join(chapters))
 
@@ -81,22 +80,19 @@ def _imports(parts: Parts) -> str:
     lines = [
         "import numpy as np",
         "from numba import njit",
-        "from flockenv.effects.base import Me, Other, in_view",
+        "from flockenv.effects.base import Other",
         "from flockenv.inlining import Whole",
         "from flockenv.section import record",
         "from flockenv.sweep.handed import Context",
-        "from flockenv.kernels import ask_for, copy_lanes, finite, kernel, like, unaliased, wait_for_team",
-        *(["from flockenv.kernels import tallied, tally_of"] if parts.parting or parts.averaged else []),
-        "from flockenv.neighbours import candidates, count_cells, order_records, row_of",
-        "from flockenv.tiles import count_from_home, count_tiles, find_homes, order_cells, order_shared",
+        "from flockenv.kernels import ask_for, finite, kernel, like, unaliased, wait_for_team",
+        *(["from flockenv.tiles import count_tiles, find_homes"] if parts.arranges else []),
         import_line(parts.space.offset_law, "offset_to"),
         import_line(parts.space.confine_law, "confine"),
         *([import_line(parts.space.bounce_law, "bounce")] if parts.space.bounce_law else []),
         "from flockenv.noise import normal as standard_normal",
-        *(["from flockenv.transpose import out_of_records, put_lines, put_records"] * (parts.sweeps and parts.sorts)),
-        "from flockenv.vec import add, dot, exact_dot, exact_sum, limit, norm, scale, select, sub, unit, zero",
+        *(["from flockenv.transpose import put_lines"] if parts.arranges else []),
+        "from flockenv.vec import add, dot, exact_sum, limit, norm, scale, select, sub, zero",
         *(["from flockenv.vehicle import faced, held, leant, raised, turned"] if parts.oriented else []),
-        *([f"from flockenv.abreast import {KEYS}"] * parts.keyed),
         *obstacle_imports(parts),
     ]
     for k, effect in enumerate(parts.effects):

@@ -13,8 +13,8 @@ from flockenv.effects.base import Effect
 from flockenv.sweep.parts import Parts
 
 __all__ = [
-    "Slots", "alone", "array_of", "asked", "copied", "given", "in_blocks", "in_common",
-    "indented", "indented_lines", "inner_of", "lane", "lanes_of", "nearest_image", "nearest_images", "needed",
+    "Slots", "alone", "array_of", "asked", "given", "in_blocks", "in_common",
+    "indented", "indented_lines", "inner_of", "lane", "lanes_of", "nearest_images", "needed",
     "place_of", "tuple_of",
 ]  # fmt: skip
 
@@ -103,14 +103,9 @@ def given(parts: Parts, k: int) -> str:
     return f"near{k}" if parts.space.periodic and parts.effects[k].places else f"p{k}"
 
 
-def nearest_image(parts: Parts, k: int, here: str) -> str:
-    """Write the numbers of effect k anew: with the images of its places that are nearest to `here`."""
-    return f"near{k} = images_of_{k}(p{k}, size, {here})"
-
-
 def nearest_images(parts: Parts, effects: list[tuple[int, Effect]]) -> list[str]:
     """Write the numbers of those that know places anew: on a torus, with the images nearest to agent i, at x."""
-    return [nearest_image(parts, k, "x") for k, _ in effects if given(parts, k) == f"near{k}"]
+    return [f"near{k} = images_of_{k}(p{k}, size, x)" for k, _ in effects if given(parts, k) == f"near{k}"]
 
 
 def needed(lines: Sequence[str], body: Sequence[str]) -> list[str]:
@@ -123,11 +118,6 @@ def needed(lines: Sequence[str], body: Sequence[str]) -> list[str]:
             kept.insert(0, line)
             read.update(re.findall(r"\w+", value))
     return kept
-
-
-def copied(parts: Parts, to: str, at: str, source: str, place: str) -> str:
-    """Write how a number of all lanes of a block is copied, a vector at a time."""
-    return f"copy_lanes({to}, {at}, {source}, {place}, {parts.width})"
 
 
 def indented(lines: list[str], indent: int) -> str:

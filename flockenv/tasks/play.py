@@ -32,7 +32,7 @@ from flockenv.kernels import (
 )
 from flockenv.lines import fetch, pour, settle
 from flockenv.section import entry_of, record, section
-from flockenv.sweep import look_source, scene_source, sections_of
+from flockenv.sweep import look_of, look_plan, scene_source, sections_of
 from flockenv.tasks.base import Frame, Task
 from flockenv.tasks.lasting import lasts
 from flockenv.vehicle import face
@@ -162,8 +162,7 @@ class Plan(NamedTuple):
 def scene_of(task: Task) -> Any:
     """Return the module of the kernels of a task's scene; TypeError for a task of which no kernel can be made."""
     _check(task)
-    source = scene_source(task.parts, look_source(task.parts))
-    return load(f"task_{task.name}", source, sections_of(task.parts))
+    return load(f"task_{task.name}", scene_source(task.parts), sections_of(task.parts))
 
 
 def play_of(task: Task) -> Callable[..., tuple[int, int]]:
@@ -173,7 +172,7 @@ def play_of(task: Task) -> Callable[..., tuple[int, int]]:
     kernels = Kernels(
         **own, keep=_kernel_of(task, "keep") if task.keeps else None,
         abreast=_kernel_of(task, "abreast") if task.abreast else None, step_world=scene.step_world,
-        look=scene.look if task.look else None, begin_inner=scene.begin_inner if parts.inner else None,
+        look=look_of(look_plan(parts)) if task.look else None, begin_inner=scene.begin_inner if parts.inner else None,
     )  # fmt: skip
     return _play(Plan(
         kernels, tuple(task.parameters()), _counts(task), task.measures, task.lasting_aim, parts.oriented, task.alike,
