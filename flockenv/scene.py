@@ -692,8 +692,8 @@ class Scene(Record):
 
     @functools.cached_property
     def _plain_parts(self) -> Parts:
-        """What accelerations alone are made of: the method makes no difference."""
-        return dataclasses.replace(self.parts, integrator=SemiImplicitEuler())
+        """What accelerations alone are made of: the method makes no difference, and somebody may be nowhere."""
+        return dataclasses.replace(self.parts, integrator=SemiImplicitEuler(), stepped=False)
 
     @functools.cached_property
     def _scratch_kind(self) -> Any:

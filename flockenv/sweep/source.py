@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 from flockenv.kernels import import_line
 from flockenv.sweep.accelerate import accelerate, sense
 from flockenv.sweep.handed import OPEN_SCRATCH, Context, opened
@@ -35,8 +33,7 @@ def scene_source(parts: Parts) -> str:
 
 
 def field_source(parts: Parts) -> str:
-    """Return the source of `field`: accelerations at given instants, and nothing that moves."""
-    parts = replace(parts, stepped=False)
+    """Return the source of `field`: accelerations at given instants, and nothing that moves; of parts not `stepped`."""
     d, w = parts.dimension, parts.width
     names = ", ".join(type(e).__name__ for e in parts.effects) or "no effects"
     chapters = [
