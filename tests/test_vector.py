@@ -31,7 +31,7 @@ MODES = list(AutoresetMode)
 EASY = {
     "flockenv/Pursuit-v0": {"capture_distance": 6.0},
     "flockenv/Obstacles-v0": {"goal_radius": 20.5},
-    "flockenv/Evade-v0": {"capture_distance": 6.0},
+    "flockenv/Evade-v1": {"capture_distance": 6.0},
     "flockenv/Herd-v0": {"pen_radius": 20.5},
     "flockenv/Crossing-v0": {"goal_radius": 11.8},
     "flockenv/PathFollow-v0": {"lost_distance": 1.5, "max_force": 2.5},

@@ -203,7 +203,9 @@ class EvadeEnv(SingleEnv):
     """An evader stays out of the hands of three scripted pursuers among cover."""
 
     task_type = Evade
-    history = "v0: first version (flockenv 0.1.0)."
+    history = (
+        "v1: the forces of the scripted pursuers differ in their last bits.\n\nv0: first version (flockenv 0.1.0)."
+    )
 
 
 class SchoolEnv(SingleEnv):
