@@ -18,13 +18,13 @@ from __future__ import annotations
 
 from flockenv.sweep.bonds import Table, pack
 from flockenv.sweep.look import look_of
-from flockenv.sweep.look_plan import look_plan
+from flockenv.sweep.look_plan import plan_look
 from flockenv.sweep.parts import Look, Parts, flattened
 from flockenv.sweep.scratch import GIVEN, OWN, scratch_bytes, scratch_of, scratch_record
 from flockenv.sweep.sections import sections_of
 from flockenv.sweep.source import field_source, scene_source
 
 __all__ = [
-    "GIVEN", "OWN", "Look", "Parts", "Table", "field_source", "flattened", "look_of", "look_plan", "pack",
+    "GIVEN", "OWN", "Look", "Parts", "Table", "field_source", "flattened", "look_of", "pack", "plan_look",
     "scene_source", "scratch_bytes", "scratch_of", "scratch_record", "sections_of",
 ]  # fmt: skip

@@ -10,7 +10,7 @@ from flockenv.sweep.listing import Listing, listing_of
 if TYPE_CHECKING:
     from flockenv.sweep.parts import Parts
 
-__all__ = ["LookPlan", "Looking", "Nearest", "Span", "look_plan"]
+__all__ = ["LookPlan", "Looking", "Nearest", "Span", "plan_look"]
 
 
 class LookPlan(NamedTuple):
@@ -34,7 +34,7 @@ class LookPlan(NamedTuple):
         return tuple(int(self.listing.slot(f"{name}{k}")) for k in range(count))
 
 
-def look_plan(parts: Parts) -> LookPlan:
+def plan_look(parts: Parts) -> LookPlan:
     """Return what `look` depends on for a task whose parts have a look."""
     look, exact = parts.look, parts.keyed or any(sight.nearest for sight in parts.sights)
     assert look is not None

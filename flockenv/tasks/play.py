@@ -32,7 +32,7 @@ from flockenv.kernels import (
 )
 from flockenv.lines import fetch, pour, settle
 from flockenv.section import entry_of, record, section
-from flockenv.sweep import look_of, look_plan, scene_source, sections_of
+from flockenv.sweep import look_of, plan_look, scene_source, sections_of
 from flockenv.tasks.base import Frame, Task
 from flockenv.tasks.lasting import lasts
 from flockenv.vehicle import face
@@ -172,7 +172,7 @@ def play_of(task: Task) -> Callable[..., tuple[int, int]]:
     kernels = Kernels(
         **own, keep=_kernel_of(task, "keep") if task.keeps else None,
         abreast=_kernel_of(task, "abreast") if task.abreast else None, step_world=scene.step_world,
-        look=look_of(look_plan(parts)) if task.look else None, begin_inner=scene.begin_inner if parts.inner else None,
+        look=look_of(plan_look(parts)) if task.look else None, begin_inner=scene.begin_inner if parts.inner else None,
     )  # fmt: skip
     return _play(Plan(
         kernels, tuple(task.parameters()), _counts(task), task.measures, task.lasting_aim, parts.oriented, task.alike,
