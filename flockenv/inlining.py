@@ -14,6 +14,7 @@ they change.)
 from __future__ import annotations
 
 import functools
+import sys
 import types
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -47,6 +48,9 @@ LONG = 16
 LLVMS = range(15, 23)
 """Versions of LLVM that are known to take the option that says so: one that does not know it ends the process."""
 
+DEEPEST = 6_000
+"""Python's calls within calls, at most, while one of our functions compiles."""
+
 _depth = 0
 
 
@@ -64,6 +68,17 @@ def _short_loops() -> Iterator[None]:
         _depth -= 1
         if known and _depth == 0:
             binding.set_option("flockenv", f"--vectorizer-min-trip-count={LONG}")
+
+
+@contextmanager
+def _deep() -> Iterator[None]:
+    """Let numba compile calls within calls: each of them takes two dozen of Python's, of which 1,000 are allowed."""
+    before = sys.getrecursionlimit()
+    sys.setrecursionlimit(max(before, DEEPEST))
+    try:
+        yield
+    finally:
+        sys.setrecursionlimit(before)
 
 
 @functools.cache
@@ -227,7 +242,7 @@ class Whole(_Compiler):  # type: ignore[misc]
         return [passes]
 
     def _compile_core(self) -> Any:
-        with lighter(), _short_loops():
+        with lighter(), _short_loops(), _deep():
             return super()._compile_core()
 
 

@@ -16,7 +16,7 @@ from numba.core import types
 
 from flockenv.kernels import intrinsic_or_python
 
-__all__ = ["AT_ONCE", "exchanges", "inserted", "merged"]
+__all__ = ["AT_ONCE", "exchanges", "inserted", "kept", "merged"]
 
 AT_ONCE = 4
 """So many keys at once are put into a list."""
@@ -51,6 +51,31 @@ def _inserted_in_python(numbers: tuple[Any, ...], far: Any, place: Any) -> tuple
 
 
 inserted: Any = intrinsic_or_python(_inserted, _inserted_in_python)
+
+
+def _kept(typing_context: Any, numbers: Any, far: Any) -> Any:
+    """Return a list of distances in order into which a distance was put; the farthest falls out."""
+    many = len(numbers)
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        found, come = [builder.extract_value(arguments[0], k) for k in range(many)], arguments[1]
+        for k, near in enumerate(found):
+            closer = builder.fcmp_ordered("<", come, near)
+            found[k], come = builder.select(closer, come, near), builder.select(closer, near, come)
+        return context.make_tuple(builder, signature.return_type, found)
+
+    return numbers(numbers, numbers[0]), generate
+
+
+def _kept_in_python(numbers: tuple[Any, ...], far: Any) -> tuple[Any, ...]:
+    found = list(numbers)
+    for k, near in enumerate(numbers):
+        if far < near:
+            found[k], far = far, near
+    return tuple(found)
+
+
+kept: Any = intrinsic_or_python(_kept, _kept_in_python)
 
 
 def exchanges(many: int, come: int) -> Iterator[tuple[int, int]]:

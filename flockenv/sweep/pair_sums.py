@@ -14,6 +14,7 @@ from flockenv.section import in_turn, section, tuple_from
 from flockenv.sweep.blocks import place_of
 from flockenv.sweep.gather import add_where, chosen, copy_each, fill, gather, picked, scatter
 from flockenv.sweep.listed_agents import agent_listed
+from flockenv.sweep.nearest import kept
 from flockenv.sweep.pair_plan import PairLaw, Pairs
 from flockenv.vec import add, dot, zero
 
@@ -134,27 +135,14 @@ def keep_nearest(plan: Pairs) -> Callable[..., None]:
 
 @section
 def _keep_one(plan: Pairs, q: int) -> Callable[..., None]:
-    see, put = _seen(plan, q, False), _insert(plan.slots(*plan.views[q].near))
+    see, slots = _seen(plan, q, False), plan.slots(*plan.views[q].near)
 
     def keep(numbers: Any, besides: Any, me: Any, it: Any, other: Any, gap: Any, lanes: Any, lane: Any) -> None:
         seen = see(numbers, besides, me, it, other, gap, lanes, lane)
-        put(lanes, lane, it.square if seen else like(it.square, np.inf))
+        square = it.square if seen else like(it.square, np.inf)
+        scatter(lanes, lane, slots, kept(gather(lanes, lane, slots), square))
 
     return keep
-
-
-@functools.cache
-def _insert(places: tuple[int, ...]) -> Callable[..., Any]:
-    """Make `insert(lanes, lane, far)`: put a number into a list in order; return what falls out."""
-    before, at = _insert(places[:-1]) if places[1:] else None, np.uint64(places[-1])
-
-    def insert(lanes: Any, lane: Any, far: Any) -> Any:
-        rest = far if before is None else before(lanes, lane, far)
-        near = lanes[at + lane]
-        lanes[at + lane] = rest if rest < near else near
-        return near if rest < near else rest
-
-    return kernel(insert)
 
 
 # --- how sums begin, and what they come to ----------------------------------------------------------------------------
