@@ -204,9 +204,9 @@ def _over_rows(law: Law, count: int, dimension: int, recalled: tuple[str, ...]) 
         o = max_force.dtype.type(0)
         for r in range(wishes.shape[0]):
             h = direction(heading[r], 0)
-            inner = inner_of(*kept_of(kept[r])) if recalls else ()
+            inner = inner_of(*kept_of(kept[r], 0)) if recalls else ()
             me = Me(who[r], h, h, h, o, o, o, max_force[r], h, time[r], h, key[r], h, o, inner)
-            f, s = law(p, me, wishes_of(wishes[r]))
+            f, s = law(p, me, wishes_of(wishes[r], 0))
             for j in range(dimension):
                 force[r, j] = f[j]
             for k in range(count):

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flockenv.kernels import Law, Vec, kernel, python_of
-from flockenv.section import entry_of
+from flockenv.section import entry_of, several
 
 __all__ = ["rows"]
 
@@ -139,30 +139,9 @@ def _element(tail: tuple[int, ...]) -> Callable[[Any, int], Any]:
         return _item
     if len(tail) == 1 and tail[0] in (2, 3):
         return _vector(tail[0])
-    items = _items(tail[0], _element(tail[1:]))
+    items = several(tail[0], _element(tail[1:]))
 
     def element(array: Any, r: int) -> Any:
         return items(array[r], 0)
 
     return kernel(element)
-
-
-@functools.cache
-def _items(count: int, item: Callable[[Any, int], Any]) -> Callable[[Any, int], tuple[Any, ...]]:
-    """Return a function that makes a tuple of so many items of an array, from a place on: halves, for many."""
-    half = count // 2
-    before = _items(half, item) if count > 4 else None
-    after = _items(count - half, item) if count > 4 else None
-
-    def items(array: Any, at: int) -> tuple[Any, ...]:
-        if before is not None:
-            return before(array, at) + after(array, at + half)  # type: ignore[misc]  # there are both or none
-        if count == 1:
-            return (item(array, at),)
-        if count == 2:
-            return item(array, at), item(array, at + 1)
-        if count == 3:
-            return item(array, at), item(array, at + 1), item(array, at + 2)
-        return item(array, at), item(array, at + 1), item(array, at + 2), item(array, at + 3)
-
-    return kernel(items)

@@ -692,7 +692,7 @@ class Scene(Record):
 
     @functools.cached_property
     def _plain_parts(self) -> Parts:
-        """What accelerations alone are made of: the method makes no difference, and somebody may be nowhere."""
+        """The parts for accelerations alone: the method makes no difference, and agents may be at NaN."""
         return dataclasses.replace(self.parts, integrator=SemiImplicitEuler(), stepped=False)
 
     @functools.cached_property

@@ -114,28 +114,26 @@ def __getattr__(name: str) -> Any:
     return globals().setdefault(name, namedtuple(name, names, module=__name__))
 
 
-def several(count: int, item: Callable[[Any, int], Any]) -> Callable[[Any], Any]:
-    """Return a function that makes a tuple of `count` items, item(array, 0), item(array, 1), ..."""
-    return _several(0, count, item)
-
-
 @functools.cache
-def _several(first: int, count: int, item: Callable[[Any, int], Any]) -> Callable[[Any], Any]:
-    """Make the items from the first on: up to four, or the two halves, since numba compiles calls within calls."""
-    half, second, third, last = count // 2, first + 1, first + 2, first + count - 1
-    before = _several(first, half, item) if count > 4 else None
-    after = _several(first + half, count - half, item) if count > 4 else None
+def several(count: int, item: Callable[[Any, int], Any]) -> Callable[[Any, int], tuple[Any, ...]]:
+    """Return `items(array, at)`: a tuple of `count` items, item(array, at), item(array, at + 1), ...
 
-    def items(array: Any) -> Any:
+    Up to four, or the two halves, since numba compiles calls within calls.
+    """
+    half = count // 2
+    before = several(half, item) if count > 4 else None
+    after = several(count - half, item) if count > 4 else None
+
+    def items(array: Any, at: int) -> tuple[Any, ...]:
         if before is not None:
-            return before(array) + after(array)  # type: ignore[misc]  # there are both or none
+            return before(array, at) + after(array, at + half)  # type: ignore[misc]  # there are both or none
         if count == 1:
-            return (item(array, first),)
+            return (item(array, at),)
         if count == 2:
-            return (item(array, first), item(array, last))
+            return item(array, at), item(array, at + 1)
         if count == 3:
-            return (item(array, first), item(array, second), item(array, last))
-        return (item(array, first), item(array, second), item(array, third), item(array, last))
+            return item(array, at), item(array, at + 1), item(array, at + 2)
+        return item(array, at), item(array, at + 1), item(array, at + 2), item(array, at + 3)
 
     return kernel(items)
 

@@ -26,7 +26,8 @@ from flockenv.snapshot import Snapshot
 from flockenv.state import State
 from flockenv.sweep import Look, pack, scratch_record
 from flockenv.tasks import Task
-from flockenv.tasks.play import REFUSED, Decision, Given, Near, Results, Totals, Worlds, play_of, tell_of
+from flockenv.tasks.play import play_of, tell_of
+from flockenv.tasks.play_plan import REFUSED, Decision, Given, Near, Results, Totals, Worlds
 from flockenv.workspace import Workspace
 
 __all__ = ["Step", "World"]

@@ -136,3 +136,19 @@ def test_what_is_made_of_it_is_vectors() -> None:
     x, y = np.array([0.0, 1, 2, -4, 0, 5, 6, 8]), np.full(8, np.nan)
     compiled(in_lanes)(x, y, 0)
     np.testing.assert_array_equal(y, [0, 1, 0.5, 0.25, 0, 1 / 5, 1 / 6, 1 / 8])
+
+
+def chain(length: int) -> Callable[[float], float]:
+    """Return a kernel that calls a kernel, and so on, as what a scene's effects come to is added up."""
+    before: Any = chain(length - 1) if length > 1 else None
+
+    def add_one(x: float) -> float:
+        return x + 1.0 if before is None else before(x) + 1.0
+
+    return kernel(add_one)
+
+
+def test_calls_within_calls_compile_however_deep() -> None:
+    add_all: Any = chain(60)
+    compiled: Any = numba.njit(lambda x: add_all(x), pipeline_class=Whole)
+    assert compiled(0.5) == 60.5

@@ -9,7 +9,7 @@ over the lanes has a constant length and constant offsets, and the compiler make
 lie in one small scratch array and stay in vector registers.
 
 The files, as a source is put together: `parts` says what it depends on, `text` holds the smallest pieces of it;
-`listing` sorts the agents and walks their blocks, `meeting` lets a block meet its candidates, `far` everybody, `bonds`
+`listing` sorts the agents and walks their blocks, `meeting` lets a block meet its candidates, `far` all agents, `bonds`
 its partners; `accelerate` is the sum of all laws, `method` the integrator, `step` advances worlds by it, `source` is
 the whole file, and `handed` leaves its functions the scratch that they name; `look` is what tasks add to it.
 """

@@ -25,7 +25,8 @@ from flockenv.shapes.round import touched_normal
 from flockenv.shapes.table import law_of
 from flockenv.shapes.touch import touched_spot
 from flockenv.steering.around import threat
-from flockenv.sweep.forms import FormPlan, Surroundings, box_of_way, circle_at, each_row, number_of, seen_from
+from flockenv.sweep.blocks import vector_of
+from flockenv.sweep.forms import FormPlan, Surroundings, box_of_way, each_row, number_of, seen_from
 from flockenv.vec import add, cross, dot, lateral, norm, perpendicular, scale, select, sub, unit, zero
 
 __all__ = ["aside_of"]
@@ -61,7 +62,7 @@ def first_hit(around: Surroundings) -> Callable[..., tuple[float, int, int]]:
 
     At most `most`. Of what is touched at once, what is listed first.
     """
-    offset_to, circle, shaped = around.offset_to, circle_at(around.dimension), bool(around.forms)
+    offset_to, circle, shaped = around.offset_to, vector_of(around.dimension), bool(around.forms)
     first_row: Any = _first_row(around) if shaped else None
 
     def first_hit(world: Any, x: Any, ray: Any, room: Any, most: Any) -> Any:
@@ -161,7 +162,7 @@ def edge(around: Surroundings) -> Callable[..., tuple[float, float]]:
 
     Towards `side`; rad, and m along the turned ray until the body is beside it.
     """
-    offset_to, circle, shaped = around.offset_to, circle_at(around.dimension), bool(around.forms)
+    offset_to, circle, shaped = around.offset_to, vector_of(around.dimension), bool(around.forms)
     seen, edge_of = seen_from(around.offset_to, around.moving), _edge_of(tuple(form.name for form in around.forms))
 
     def edge(world: Any, form: Any, row: Any, x: Any, ray: Any, side: Any, room: Any) -> Any:
@@ -200,7 +201,7 @@ def normal_hit(around: Surroundings) -> Callable[..., Vec]:
 
     hit: how far along the ray that is, m.
     """
-    offset_to, circle, shaped = around.offset_to, circle_at(around.dimension), bool(around.forms)
+    offset_to, circle, shaped = around.offset_to, vector_of(around.dimension), bool(around.forms)
     seen, normal_of = seen_from(around.offset_to, around.moving), _normal_of(tuple(form.name for form in around.forms))
 
     def normal_hit(world: Any, form: Any, row: Any, x: Any, ray: Any, hit: Any, room: Any) -> Any:

@@ -12,43 +12,11 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from llvmlite import ir  # type: ignore[import-untyped]
-from numba.core import types
-from numba.np import arrayobj
 
-from flockenv.kernels import Numbers, Vec, copy_lanes, intrinsic_or_python, written
+from flockenv.kernels import Vec, copy_lanes
 from flockenv.section import section
 
-__all__ = ["into_blocks", "numbers_of_lane", "out_of_blocks", "place_of", "vector_of_lane"]
-
-
-def _apart(typing_context: Any, array: Any, place: Any, step: Any, count: Any) -> Any:
-    """Return `count` numbers of an array, from a place on, each `step` further; both are written down in the source."""
-    many, further = written(count, "count"), written(step, "step")
-
-    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        make: Any = arrayobj.make_array
-        data = make(signature.args[0])(context, builder, arguments[0]).data
-        size, word = context.get_abi_sizeof(context.get_data_type(array.dtype)), ir.IntType(64)
-        places = [builder.add(arguments[1], word(k * further)) for k in range(many)]
-        found = [builder.load(builder.gep(data, [at]), align=size) for at in places]
-        return context.make_tuple(builder, signature.return_type, found)
-
-    numbers: Any = types.BaseTuple.from_types([array.dtype] * many)  # type: ignore[no-untyped-call]
-    return numbers(array, types.uint64, step, count), generate
-
-
-def _apart_in_python(array: Any, place: Any, step: int, count: int) -> Numbers:
-    return tuple(array[int(place) + k * step] for k in range(count))
-
-
-_numbers_apart: Any = intrinsic_or_python(_apart, _apart_in_python)
-
-
-@section
-def numbers_of_lane(count: int, width: int) -> Callable[..., Numbers]:
-    """Make `numbers(blocks, place)`: so many numbers of a lane of an array of blocks, the first of which is there."""
-    return lambda blocks, place: _numbers_apart(blocks, place, width, count)
+__all__ = ["into_blocks", "out_of_blocks", "place_of", "vector_of", "vector_of_lane"]
 
 
 @section
@@ -60,6 +28,18 @@ def vector_of_lane(dimension: int, width: int) -> Callable[..., Vec]:
         if dimension == 2:
             return blocks[place], blocks[place + one]
         return blocks[place], blocks[place + one], blocks[place + two]
+
+    return vector
+
+
+@section
+def vector_of(dimension: int) -> Callable[..., Vec]:
+    """Make `vector(array, b, m)`: the vector at [:, b, m] of an array, as the centre of circle m of world b."""
+
+    def vector(array: Any, b: Any, m: Any) -> Any:
+        if dimension == 2:
+            return array[0, b, m], array[1, b, m]
+        return array[0, b, m], array[1, b, m], array[2, b, m]
 
     return vector
 

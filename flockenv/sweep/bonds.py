@@ -17,7 +17,8 @@ from flockenv.effects.base import Bonds, Other
 from flockenv.kernels import Law, like, wait_for_team
 from flockenv.section import section
 from flockenv.sweep.agents import AgentPlan, alone_of, inner_of
-from flockenv.sweep.blocks import numbers_of_lane, vector_of_lane
+from flockenv.sweep.blocks import vector_of_lane
+from flockenv.sweep.gather import gather
 from flockenv.sweep.parts import Parts
 from flockenv.vec import dot, exact_sum, zero
 
@@ -116,7 +117,7 @@ def bond_plan(parts: Parts, agent: AgentPlan) -> BondPlan:
 @section
 def bonds_of(plan: BondPlan) -> Callable[..., None]:
     """Make `bonds(context, pos, vel, time)`: write what bonds do to this thread's agents, N, into `pulled`."""
-    gather = _gather(plan, len(plan.laws) - 1)
+    add = _add_bonds(plan, len(plan.laws) - 1)
     waits, adds = plan.waits, plan.adds
     count, sums = plan.agent.dimension * plan.agent.width, np.uint64(plan.sums)
 
@@ -129,7 +130,7 @@ def bonds_of(plan: BondPlan) -> Callable[..., None]:
             base = block * np.uint64(count)
             for place in range(np.uint64(count)):
                 lanes[sums + place] = pulled[base + place] if adds else like(pulled[0], 0.0)
-            gather(scratch, numbers.effects, numbers.size, pos, vel, time, key, n, block)
+            add(scratch, numbers.effects, numbers.size, pos, vel, time, key, n, block)
             for place in range(np.uint64(count)):
                 pulled[base + place] = lanes[sums + place]
         wait_for_team(sync, team)  # no agent moves before all have looked
@@ -138,24 +139,22 @@ def bonds_of(plan: BondPlan) -> Callable[..., None]:
 
 
 @section
-def _gather(plan: BondPlan, place: int) -> Callable[..., None]:
-    """Make `gather(scratch, effects, size, pos, vel, time, key, n, block)`: add what bonds say to a block's sums.
+def _add_bonds(plan: BondPlan, place: int) -> Callable[..., None]:
+    """Make `add(scratch, effects, size, pos, vel, time, key, n, block)`: add what bonds say to a block's sums.
 
     Those of an effect, by its place in the table, and of all before it.
     """
-    before = _gather(plan, place - 1) if place else None
+    before = _add_bonds(plan, place - 1) if place else None
     k, law, partners, numbers = plan.laws[place]
     dimension, width = plan.agent.dimension, plan.agent.width
     vector, alone, partners_of = vector_of_lane(dimension, width), alone_of(plan.agent), _partners(plan, partners)
     are_alive = _are_alive(dimension, width, partners)
-    numbers_of = numbers_of_lane(numbers, width)
+    of_bond = tuple(number * width for number in range(numbers))
     keeps, apart, wide = bool(plan.agent.inner), partners * width, numbers * width
     first_place, total = 2 * place, len(plan.laws)
     sum_x, sum_y, sum_z = (np.uint64(plan.sums + axis * width) for axis in range(3))
 
-    def gather(
-        scratch: Any, effects: Any, size: Any, pos: Any, vel: Any, time: Any, key: Any, n: Any, block: Any
-    ) -> None:
+    def add(scratch: Any, effects: Any, size: Any, pos: Any, vel: Any, time: Any, key: Any, n: Any, block: Any) -> None:
         if before is not None:
             before(scratch, effects, size, pos, vel, time, key, n, block)
         lanes, start, numbered = scratch.lanes, scratch.bond_start, scratch.bond_number
@@ -170,7 +169,7 @@ def _gather(plan: BondPlan, place: int) -> Callable[..., None]:
                 x, v = vector(pos, at), vector(vel, at)
                 me = alone(scratch, key, time, at, i, i, x, v, zero(x))
                 others = partners_of(kept, placed, pos, vel, scratch.radius, scratch.mass, size, x, places + lane)
-                says = law(effects[k], me, others, numbers_of(numbered, first + lane))
+                says = law(effects[k], me, others, gather(numbered, first + lane, of_bond))
                 whole = are_alive(placed, living, places + lane)  # the dead hold no agent
                 # of a sum of products each form of the loop would fuse another one, and bits depend on the processor
                 lanes[sum_x + lane] = exact_sum(lanes[sum_x + lane], says[0] if whole else like(x[0], -0.0))
@@ -178,7 +177,7 @@ def _gather(plan: BondPlan, place: int) -> Callable[..., None]:
                 if dimension == 3:
                     lanes[sum_z + lane] = exact_sum(lanes[sum_z + lane], says[2] if whole else like(x[0], -0.0))
 
-    return gather
+    return add
 
 
 @section

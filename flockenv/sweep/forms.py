@@ -27,7 +27,7 @@ from flockenv.shapes.head import shift_of, vector_at
 from flockenv.shapes.table import FORMS
 from flockenv.vec import add
 
-__all__ = ["FormPlan", "Surroundings", "box_of_way", "circle_at", "each_row", "near_rows", "number_of", "seen_from"]
+__all__ = ["FormPlan", "Surroundings", "box_of_way", "each_row", "near_rows", "number_of", "seen_from"]
 
 
 class FormPlan(NamedTuple):
@@ -54,18 +54,6 @@ class Surroundings(NamedTuple):
 def number_of(form: str) -> int:
     """Return the number of a form, as rows hold it."""
     return list(FORMS).index(form)
-
-
-@section
-def circle_at(dimension: int) -> Callable[..., Vec]:
-    """Make `circle(obstacle_x, b, m)`: the centre of circle or sphere m of world b, m."""
-
-    def circle(obstacle_x: Any, b: Any, m: Any) -> Any:
-        if dimension == 2:
-            return obstacle_x[0, b, m], obstacle_x[1, b, m]
-        return obstacle_x[0, b, m], obstacle_x[1, b, m], obstacle_x[2, b, m]
-
-    return circle
 
 
 @section

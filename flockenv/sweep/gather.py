@@ -30,7 +30,7 @@ def _constants(numbers: Any, name: str) -> list[int]:
 
 
 def _pointers(context: Any, builder: Any, kind: Any, array: Any, at: Any, places: list[int]) -> tuple[list[Any], int]:
-    """Return pointers to numbers of an array, each so many places behind `at`, and the size of a number, bytes."""
+    """Return pointers to the numbers of an array at some places behind `at`, and the size of a number, bytes."""
     data, size = array_of(context, builder, kind, array).data, context.get_abi_sizeof(context.get_data_type(kind.dtype))
     return [builder.gep(data, [builder.add(at, _WORD(place))]) for place in places], size
 

@@ -19,7 +19,7 @@ __all__ = ["Besides", "Block", "Candidate", "agent_listed", "candidate_listed", 
 
 
 class Candidate(NamedTuple):
-    """One who is listed, as pair laws see him; what no law reads is 0."""
+    """An agent that is listed, as pair laws see it; what no law reads is 0."""
 
     pos: Any
     vel: Any
@@ -44,7 +44,7 @@ def agent_listed(listing: Listing, inner: tuple[str, ...], oriented: bool) -> Ca
         listing.lanes_of(listing.axes(x)) for x in ("x", "v", "t", "a", "d" if oriented else "h")
     )
     numbers = listing.lanes_of(("who", "mass", "radius", "max_speed", "max_force", "desired_speed"))
-    inside, kind, feels = _inner_fields(listing, inner), record(inner), bool(inner)
+    inside, kind, feels = _inner_fields(inner), record(inner), bool(inner)
     within = listing.lanes_of(inside)
 
     def agent(array: Any, at: Any, time: Any, drawn: Any) -> Any:
@@ -59,16 +59,16 @@ def agent_listed(listing: Listing, inner: tuple[str, ...], oriented: bool) -> Ca
     return agent
 
 
-def _inner_fields(listing: Listing, inner: tuple[str, ...]) -> tuple[str, ...]:
+def _inner_fields(inner: tuple[str, ...]) -> tuple[str, ...]:
     """Return the fields of what goes on inside an agent."""
     return tuple(f"inner{k}" for k in range(len(inner)))
 
 
 @section
 def candidate_listed(listing: Listing, inner: tuple[str, ...]) -> Callable[..., Candidate]:
-    """Make `candidate(array, at)`: one whose record, or place in rows, begins at `at`."""
+    """Make `candidate(array, at)`: the agent whose record, or place in rows, begins at `at`."""
     pos, vel, tie = (listing.listed(listing.axes(letter)) for letter in "xvt")
-    numbers, within = listing.listed(("who", "radius", "mass")), listing.listed(_inner_fields(listing, inner))
+    numbers, within = listing.listed(("who", "radius", "mass")), listing.listed(_inner_fields(inner))
     kind, feels = record(inner), bool(inner)
 
     def candidate(array: Any, at: Any) -> Any:

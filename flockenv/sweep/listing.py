@@ -1,6 +1,6 @@
 """The listing: how the living agents are listed, once per instant, so that neighbours are found side by side.
 
-In a small world, and where a grid would have too few cells, they are listed by number and everybody is a candidate;
+In a small world, and where a grid would have too few cells, they are listed by number and each agent is a candidate;
 else they are sorted by cell. What is listed of each agent are its `fields`: in a small world a row for each (`x0`,
 `x1`, `v0`, ...), else a record for each agent. A team of threads lists together, each its own agents, and each then
 walks through its own share of the blocks of listed agents.
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 __all__ = ["Listing", "list_living", "listing_of", "walk_blocks"]
 
 AHEAD = np.uint64(8)
-"""So many blocks on it is asked for the places of records."""
+"""The places of records are prefetched this many blocks ahead."""
 
 _ARRAYS = {"x": "pos", "v": "vel", "t": "tie", "d": "facing", "a": "aiming", "who": "ident"}
 """The arrays in which fields lie whose names differ."""
@@ -46,9 +46,9 @@ class Listing(NamedTuple):
     sorts: bool  # by cell, where the space has enough of them
     periodic: bool
     fields: tuple[str, ...]
-    inside: bool  # is everybody inside a periodic box already?
+    inside: bool  # are all agents inside a periodic box already?
     tiled: bool  # may agents lie in the order of tiles, and not by number?
-    homely: bool  # is it known then who has left his tile?
+    homely: bool  # is it known then which agents have left their tiles?
     confine: Law
     slots: tuple[tuple[str, int], ...]  # where running numbers of a block lie in the scratch `lanes`, by name
     arrays: tuple[str, ...]  # what there is: `pos` and `vel`, which are handed over; inner states; scratch
@@ -100,9 +100,9 @@ class Listing(NamedTuple):
         return int(self.slot(f"mine{k}")) if self.sorts else k * SMALL_STRIDE
 
     def listed(self, fields: Sequence[str]) -> tuple[int, ...]:
-        """Return where fields of one who is listed lie: in a record, or in the rows that blocks read, too; -1: nowhere.
+        """Return where fields of a candidate lie: in its record, or in the rows that blocks read, too; -1: nowhere.
 
-        Headings are in no record, and nobody asks a candidate for one.
+        Headings are in no record: no law reads that of a candidate.
         """
         if not self.sorts:
             return self.lanes_of(fields)
@@ -138,7 +138,7 @@ def list_living(plan: Listing) -> Callable[..., Any]:
 
     def list_all(context: Any, pos: Any, vel: Any) -> Any:
         scratch, team, rank = context.scratch, context.team, context.rank
-        wait_for_team(scratch.sync, team)  # positions are everybody's
+        wait_for_team(scratch.sync, team)  # the positions are those of all threads
         shape = (0, 0, 0, 0, 0)
         if sorts:
             size, reach = context.numbers.size, context.numbers.reach
@@ -227,7 +227,7 @@ def _enter(plan: Listing) -> Callable[..., None]:
         scratch, n = context.scratch, context.n
         if context.rank == 0:
             sources, records = picked(handed(scratch, pos, vel), scratch, arrays), scratch.records
-            if context.arranged:  # everybody lives, and is not where his number says
+            if context.arranged:  # all agents live, and lie by tile, not by number
                 for place in range(np.uint64(n)):
                     scratch.cell[np.uint64(scratch.ident[place])] = place
             at = np.uint64(0)

@@ -12,8 +12,7 @@ import numpy as np
 
 from flockenv.kernels import like
 from flockenv.section import section
-from flockenv.sweep.blocks import into_blocks, vector_of_lane
-from flockenv.sweep.forms import circle_at
+from flockenv.sweep.blocks import into_blocks, vector_of, vector_of_lane
 from flockenv.sweep.gather import fill, gather, scatter
 from flockenv.sweep.listing import list_living, walk_blocks
 from flockenv.sweep.look_keys import by_keys_of
@@ -46,7 +45,7 @@ def look_of(plan: LookPlan) -> Callable[..., bool]:
         for i in range(n):
             present += alive[b, i]
             scratch.living[i] = alive[b, i]
-        for i in range(n if present < n else 0):  # who is absent is not asked, and everybody's obstacles are told
+        for i in range(n if present < n else 0):  # dead agents are not looked for; obstacles are told to all
             near_count[i] = 0
             for k in range(near_square.shape[0]):
                 near_square[k, i] = np.inf
@@ -70,15 +69,16 @@ def look_of(plan: LookPlan) -> Callable[..., bool]:
 
 @section
 def _among_agents(plan: LookPlan) -> Callable[[Any], bool]:
-    """Make `among(looking)`: tell the nearest agents of everybody, block by block; it returns as `look` does."""
+    """Make `among(looking)`: write the nearest agents of each agent, block by block; it returns as `look` does."""
     list_all, walk, keyed = list_living(plan.listing), walk_blocks(plan.listing, _block(plan)), plan.keyed
+    x_at = np.uint64(max(plan.place[0], 0))
 
     def among(looking: Any) -> Any:
         scratch = looking.scratch
         shape = list_all(looking, scratch.pos, scratch.vel)
         if keyed:  # candidates after the last one: infinitely far, NaN around a box
             for j in range(np.uint64(looking.n), np.uint64(looking.n + (AT_ONCE - 1))):
-                scratch.sorted_rows[j] = np.inf
+                scratch.sorted_rows[x_at + j] = np.inf
         unsure = walk(looking, shape, scratch.pos, scratch.vel, looking.numbers.reach)
         return keyed and unsure == 0
 
@@ -95,9 +95,9 @@ def _block(plan: LookPlan) -> Callable[..., int]:
         looking: Any, shape: Any, block: Any, at: Any, upto: Any, found: Any, pos: Any, vel: Any, time: Any
     ) -> Any:  # fmt: skip
         scratch, near, span = looking.scratch, looking.near, looking.numbers
-        everybody, sure = looking.present == looking.n, False
+        all_alive, sure = looking.present == looking.n, False
         if keyed:  # noqa: SIM102  # numba drops the branch by this alone
-            if everybody:
+            if all_alive:
                 sure = by_keys(scratch.sorted_rows, scratch.number, scratch.lanes, near, span, block, looking.n)  # type: ignore[misc]
         if not sure:
             if sorts:
@@ -105,13 +105,13 @@ def _block(plan: LookPlan) -> Callable[..., int]:
                     scratch.lanes, np.uint64(0), scratch.records, scratch.number, scratch.lanes, span, block,
                     scratch.ranges, found,
                 )  # fmt: skip
-                tell(scratch.records, scratch.lanes, near, block, upto, shape[0] == 0 and everybody)
+                tell(scratch.records, scratch.lanes, near, block, upto, shape[0] == 0 and all_alive)
             else:
                 by_squares(
                     scratch.sorted_rows, block, scratch.sorted_rows, scratch.number, scratch.lanes, span, block,
                     scratch.ranges, found,
                 )  # fmt: skip
-                tell(scratch.order, scratch.lanes, near, block, upto, everybody)
+                tell(scratch.order, scratch.lanes, near, block, upto, all_alive)
         return 0 if sure else 1
 
     return block
@@ -176,7 +176,7 @@ def _meet(plan: LookPlan, wrapped: bool) -> Callable[..., None]:
 def _tell(plan: LookPlan) -> Callable[..., None]:
     """Make `tell(listed, lanes, near, block, upto, by_number)`: write the lists of a block to where its agents look.
 
-    listed: who is at a place: records, or their order. by_number: the lists lie as the lanes do.
+    listed: which agent is at a place: records, or their order. by_number: the lists lie as the lanes do.
     """
     listing, width, many = plan.listing, plan.listing.width, plan.agents
     squares, places, home = listing.slot("square0"), listing.slot("place0"), listing.slot("home0")
@@ -212,12 +212,12 @@ def _tell(plan: LookPlan) -> Callable[..., None]:
 
 @section
 def _among_obstacles(plan: LookPlan) -> Callable[..., None]:
-    """Make `around(obstacle_x, obstacle_radius, b, span, pos, lanes, end, gap, who, count)`: tell what is near.
+    """Make `around(obstacle_x, obstacle_radius, b, span, pos, lanes, end, gap, who, count)`: write the nearest.
 
-    Those obstacles whose surfaces are nearest, of everybody: how far those are (J, N), which (J, N), how many (N,).
+    Of each agent those whose surfaces are nearest: how far these are (J, N), m, which they are (J, N), how many (N,).
     """
     d, width, many, offset_to = plan.listing.dimension, plan.listing.width, plan.obstacles, plan.offset_to
-    vector, circle, size = vector_of_lane(d, width), circle_at(d), d * width
+    vector, circle, size = vector_of_lane(d, width), vector_of(d), d * width
     gaps, names = plan.slots("gap", many), plan.slots("which", many)
     gap_at, name_at, slots = plan.listing.slot("gap0"), plan.listing.slot("which0"), gaps + names
 

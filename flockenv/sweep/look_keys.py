@@ -13,6 +13,7 @@ import numpy as np
 from flockenv.abreast import key_of, key_read, key_written, pick, same_key, tag_of
 from flockenv.kernels import like
 from flockenv.section import section
+from flockenv.sweep.blocks import vector_of
 from flockenv.sweep.gather import fill, gather, scatter
 from flockenv.sweep.look_plan import LookPlan
 from flockenv.sweep.nearest import AT_ONCE, merged
@@ -22,7 +23,7 @@ from flockenv.vec import exact_dot, sub
 __all__ = ["by_keys_of"]
 
 NOBODY = np.uint32(0xFFFFFFFF)
-"""A key that comes after all others."""
+"""A key that comes after those of all agents."""
 
 
 @section
@@ -63,7 +64,7 @@ def by_keys_of(plan: LookPlan) -> Callable[..., bool]:
 
 @section
 def _key(plan: LookPlan) -> Callable[..., Any]:
-    """Make `key(rows, number, j, size, here, mine, tags)`: the key of candidate j, for agent `mine`, who is here."""
+    """Make `key(rows, number, j, size, here, mine, tags)`: the key of candidate j, for agent `mine` at `here`."""
     place, offset_to, periodic = plan.place, plan.offset_to, plan.listing.periodic
 
     def key(rows: Any, number: Any, j: Any, size: Any, here: Any, mine: Any, tags: Any) -> Any:
@@ -77,7 +78,10 @@ def _key(plan: LookPlan) -> Callable[..., Any]:
 
 @section
 def _tell_keys(plan: LookPlan) -> Callable[..., bool]:
-    """Make `tell(lanes, near, block, tags, edge)`: write who is in the lists of a block; is there no doubt of it?"""
+    """Make `tell(lanes, near, block, tags, edge)`: write the lists of a block.
+
+    It returns True if rounding leaves no doubt of them.
+    """
     width, many, squares = plan.listing.width, plan.agents, plan.listing.slot("square0")
 
     def tell(lanes: Any, near: Any, block: Any, tags: Any, edge: Any) -> Any:
@@ -97,28 +101,17 @@ def _tell_keys(plan: LookPlan) -> Callable[..., bool]:
 
 
 @section
-def _listed_at(dimension: int) -> Callable[..., Any]:
-    """Make `place(pos, k, i)`: where number k in the list of agent i is, of all places told (D, K, N)."""
-
-    def listed_at(pos: Any, k: Any, i: Any) -> Any:
-        if dimension == 2:
-            return pos[0, k, i], pos[1, k, i]
-        return pos[0, k, i], pos[1, k, i], pos[2, k, i]
-
-    return listed_at
-
-
-@section
 def _place_them(plan: LookPlan) -> Callable[..., None]:
     """Make `place_them(rows, lanes, near, span, block, n, edge)`: tell where the listed are, and squares, anew."""
     width, many, d, squares = plan.listing.width, plan.agents, plan.listing.dimension, plan.listing.slot("square0")
-    place, offset_to, periodic, listed_at = plan.place, plan.offset_to, plan.listing.periodic, _listed_at(d)
+    first = np.uint64(plan.place[0])
+    place, offset_to, periodic, listed_at = plan.place, plan.offset_to, plan.listing.periodic, vector_of(d)
 
     def place_them(rows: Any, lanes: Any, near: Any, span: Any, block: Any, n: Any, edge: Any) -> None:
         listed, length, axes = np.uint64(near.who.shape[1]), np.uint64(SMALL_STRIDE), np.uint64(d)
         for k in range(many):
             line, beside = np.uint64(k) * listed + block, np.uint64(many) * listed
-            pick(near.pos, line, beside, rows, np.uint64(0), length, axes, np.uint64(n), near.who, line, width)
+            pick(near.pos, line, beside, rows, first, length, axes, np.uint64(n), near.who, line, width)
             for lane in range(np.uint64(width)):
                 i, here = block + lane, gather(rows, block + lane, place)
                 there = listed_at(near.pos, k, i)

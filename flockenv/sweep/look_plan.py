@@ -45,7 +45,7 @@ def plan_look(parts: Parts) -> LookPlan:
 
 
 class Span(NamedTuple):
-    """How far is looked."""
+    """How far agents look."""
 
     size: Any  # m, of the space
     reach: Any  # m
@@ -62,7 +62,7 @@ class Nearest(NamedTuple):
 
 
 class Looking(NamedTuple):
-    """One world in which everybody looks around, as what lists agents and walks through their blocks sees it."""
+    """One world in which agents look around: the fields of a context that listing agents and walking blocks read."""
 
     numbers: Span
     near: Nearest

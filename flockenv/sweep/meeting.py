@@ -26,8 +26,8 @@ from flockenv.vec import dot, exact_dot, sub
 
 __all__ = ["meet_neighbours"]
 
-APART, OTHER, TOGETHER = "in another place", "somebody else", "somebody else in the same place"
-NEAREST, CONTACTS = "somebody else, to find the nearest", "somebody else, whom somebody may touch"
+APART, OTHER, TOGETHER = "in another place", "another agent", "another agent in the same place"
+NEAREST, CONTACTS = "another agent, to find the nearest", "another agent that may be touched"
 """Which candidates a pass over them is about: ties are read of those in one place alone, where laws allow it."""
 
 
@@ -121,7 +121,7 @@ def _one_after_another(plan: Pairs, which: str, wrapped: bool, each: Callable[..
 def _looking_ahead(plan: Pairs, each: Callable[..., None]) -> Callable[..., None]:
     """Make the same for a small world, working out how far the next candidate is while one is met.
 
-    Behind the last one lies some other number: a row has room for more, and nobody looks at how far that is.
+    Behind the last one lies some other number: a row has room for more, and how far that is is never read.
     """
     listing, width, parting = plan.listing, plan.lanes, plan.parting
     agent, candidate = agent_listed(listing, plan.inner, plan.oriented), candidate_listed(listing, plan.inner)
@@ -164,8 +164,8 @@ def _looking_ahead(plan: Pairs, each: Callable[..., None]) -> Callable[..., None
 def _over_ranges(plan: Pairs, which: str, each: Callable[..., None]) -> Callable[..., None]:
     """Make `meet(numbers, besides, block, found)`: a block meets the candidates of all its ranges.
 
-    Only around the edge of a periodic box are images sought; what comes seldom has one form, for the nearest image of
-    one who is near is he himself.
+    Only around the edge of a periodic box are images sought; what comes seldom has one form: the nearest image of an
+    agent that is near is the agent itself.
     """
     listing = plan.listing
     ahead, both = plan.ahead and which == APART, listing.periodic and listing.sorts and which != TOGETHER
@@ -225,7 +225,7 @@ def _block(plan: Pairs) -> Callable[..., int]:
             met += (ranges[r, 1] - ranges[r, 0]) * (upto - at)
             others += ranges[r, 1] - ranges[r, 0]
         meet(numbers, besides, block, found)
-        if together is not None:  # seldom is anybody in one place with another
+        if together is not None:  # seldom are two agents in one place
             crowded, all_of_them = False, like(numbers.reach, others)
             for lane in range(np.uint64(width)):
                 crowded |= tally_of(scratch.lanes[here + lane]) < all_of_them

@@ -19,7 +19,7 @@ from flockenv.kernels import intrinsic_or_python
 __all__ = ["AT_ONCE", "exchanges", "inserted", "kept", "merged"]
 
 AT_ONCE = 4
-"""So many keys at once are put into a list."""
+"""The number of keys that are put into a list at once."""
 
 _tuple_of: Callable[..., Any] = types.BaseTuple.from_types
 
@@ -92,7 +92,7 @@ def exchanges(many: int, come: int) -> Iterator[tuple[int, int]]:
             yield many + a, many + b
     for c in range(min(come, many)):
         yield many - 1 - c, many + c
-    length = 1 << (many - 1).bit_length()  # as if as many as are missing of that were nearer than everybody
+    length = 1 << (many - 1).bit_length()  # as if those that are missing of that were nearer than all
     half, missing = length // 2, length - many
     while half:
         for k in range(missing, length):

@@ -21,9 +21,9 @@ class View(NamedTuple):
 
     fov: int  # the first sight with the same field of view; -1: all around
     grouped: bool  # is one group alone seen?
-    occluded: bool  # is whoever an obstacle hides not seen?
+    occluded: bool  # are agents that an obstacle hides not seen?
     near: tuple[int, int]  # where the squares of the nearest lie, and how many of them there are; (0, 0): all count
-    counted: int  # where it is counted who is in sight; -1: nowhere
+    counted: int  # where the agents in sight are counted; -1: nowhere
 
 
 class PairLaw(NamedTuple):
@@ -59,7 +59,7 @@ class Pairs(NamedTuple):
     ahead: bool  # is it worked out how far the next candidate is while one is met?
     masks: bool  # is what was compared kept in masks, so that it costs nothing to compare once more?
     offset_to: Law
-    hidden: Callable[..., bool] | None  # does an obstacle hide somebody? see visibility.py
+    hidden: Callable[..., bool] | None  # does an obstacle hide an agent? see visibility.py
 
     @property
     def lanes(self) -> int:

@@ -11,7 +11,7 @@ import numpy as np
 from flockenv.effects.base import Other, in_view
 from flockenv.kernels import kernel, like, tallied, tally_of
 from flockenv.section import in_turn, section, tuple_from
-from flockenv.sweep.blocks import place_of
+from flockenv.sweep.blocks import place_of, vector_of
 from flockenv.sweep.gather import add_where, chosen, copy_each, fill, gather, picked, scatter
 from flockenv.sweep.listed_agents import agent_listed
 from flockenv.sweep.nearest import kept
@@ -21,7 +21,7 @@ from flockenv.vec import add, dot, zero
 __all__ = ["add_candidate", "begin_sums", "finish_sums", "keep_nearest", "tell_sums"]
 
 
-# --- who is seen ------------------------------------------------------------------------------------------------------
+# --- sights ---------------------------------------------------------------------------------------------------------
 
 
 @section
@@ -45,7 +45,7 @@ def _seen(plan: Pairs, q: int, cut: bool) -> Callable[..., bool]:
             found = in_view(numbers.views[fov].cone, me.heading, it.offset, square) & found
         if grouped:
             found = found & (it.who >= mine.first) & (it.who < mine.end)
-        if occluded:  # one who is out of sight anyhow is not looked for behind obstacles
+        if occluded:  # an agent out of sight anyhow is not looked for behind obstacles
             obstacle_x, obstacle_radius, params, b = besides.scenery
             found = found and not hidden(
                 obstacle_x, obstacle_radius, params, numbers.size, b, me.time, me.pos, it.offset
@@ -87,7 +87,7 @@ def _adds(plan: Pairs, law: PairLaw, q: int, apart: bool) -> Callable[..., None]
 def add_candidate(plan: Pairs, touch: bool, apart: bool) -> Callable[..., None]:
     """Make `meet(numbers, besides, me, it, other, gap, o, lanes, lane)`: what one candidate adds, by all laws.
 
-    touch: by contacts, or by all others; apart: nobody whom it counts for is in one place with it.
+    touch: by contacts, or by all others; apart: of the agents that it counts for, none is in one place with it.
     """
     laws = [law for law in plan.laws if law.contact == touch]
     laws.sort(key=lambda law: law.vanishes)  # registers: others need one less while the first are worked out
@@ -110,7 +110,7 @@ def add_candidate(plan: Pairs, touch: bool, apart: bool) -> Callable[..., None]:
 
 @functools.cache
 def _count_one(q: int, place: int) -> Callable[..., None]:
-    """Make `count(seen, lanes, lane)`: count who is in a sight of which laws ask how many are in it."""
+    """Make `count(seen, lanes, lane)`: count the candidates in a sight, of which laws read the number."""
     at = np.uint64(place)
 
     def count(seen: Any, lanes: Any, lane: Any) -> None:
@@ -178,7 +178,7 @@ def _start(plan: Pairs, law: PairLaw) -> Callable[..., None]:
     With the obstacles, where it is one fold over these, too: (obstacle_x, obstacle_radius, b).
     """
     begin, joined, offset_to, k, images = law.start, law.joined, plan.offset_to, law.k, law.images
-    slots, imaged, flat = plan.slots(law.first, law.sums), law.images is not None, plan.listing.dimension == 2
+    slots, imaged, centre = plan.slots(law.first, law.sums), law.images is not None, vector_of(plan.listing.dimension)
 
     def start(numbers: Any, obstacles: Any, me: Any, lanes: Any, lane: Any) -> None:
         p = images(numbers.effects[k], numbers.size, me.pos) if imaged else numbers.effects[k]
@@ -188,8 +188,7 @@ def _start(plan: Pairs, law: PairLaw) -> Callable[..., None]:
             for m in range(radius.shape[1]):
                 rho = radius[b, m]
                 if rho > 0:
-                    centre = (x[0, b, m], x[1, b, m]) if flat else (x[0, b, m], x[1, b, m], x[2, b, m])
-                    to = offset_to(numbers.size, me.pos, centre)
+                    to = offset_to(numbers.size, me.pos, centre(x, b, m))
                     it = Other(like(rho, m), to, dot(to, to), zero(to), rho, zero(to), like(rho, np.inf), ())
                     found = joined(p, me, it, found)
         scatter(lanes, lane, slots, found)

@@ -456,12 +456,6 @@ class Parts:
         return self.dimension * len(self.frame_vectors)
 
     @property
-    def framed(self) -> int:
-        """Numbers of an agent in the scratch `frame`: its frame, where it wants to go, of its body, what is inside."""
-        aim = self.dimension * self.aims
-        return self.frame_rows + aim + len(self.frame_numbers) + len(self.inner)
-
-    @property
     def luggage(self) -> list[str]:
         """What an agent carries along then: an array, and the axis of a vector."""
         vectors = ["pos", "vel", "want", *self.frame_vectors, *(["tie"] if "t0" in self.sorted_fields else [])]

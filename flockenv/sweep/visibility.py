@@ -9,7 +9,8 @@ from flockenv.kernels import kernel, like
 from flockenv.section import section
 from flockenv.shapes.round import blocks
 from flockenv.shapes.table import law_of
-from flockenv.sweep.forms import FormPlan, Surroundings, box_of_way, circle_at, each_row, seen_from
+from flockenv.sweep.blocks import vector_of
+from flockenv.sweep.forms import FormPlan, Surroundings, box_of_way, each_row, seen_from
 from flockenv.vec import norm, scale, unit
 
 __all__ = ["blocked"]
@@ -21,7 +22,7 @@ def blocked(around: Surroundings) -> Callable[..., bool]:
 
     It returns True if an obstacle stands in the straight way from place x to what is at the offset `to`, m.
     """
-    offset_to, circle, shaped = around.offset_to, circle_at(around.dimension), bool(around.forms)
+    offset_to, circle, shaped = around.offset_to, vector_of(around.dimension), bool(around.forms)
     hidden: Any = _hidden(around) if shaped else None
 
     def is_blocked(
