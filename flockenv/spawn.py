@@ -17,6 +17,8 @@ from flockenv.shapes import Shape, clear_of
 
 __all__ = ["Spawn", "cells", "direction", "scatter"]
 
+Edge = Annotated[float, Field(gt=0)]
+
 TRIES = 64
 """Places tried per agent before it is put where it overlaps least."""
 
@@ -27,19 +29,23 @@ MOST_CELLS = 10_000_000
 class Spawn(Record):
     """Uniform in a box (default: the whole space), at a speed drawn from a range, in a random or a given direction.
 
-    With `spacing` nobody overlaps: each has a cell of a grid for himself.
+    With `spacing` each agent has a cell of a grid; bodies do not overlap then, unless they are `wider` than cells.
     """
 
     kind: Literal["uniform"] = "uniform"
     low: tuple[float, ...] | None = Field(default=None, description="m, lower corner")
     high: tuple[float, ...] | None = Field(default=None, description="m, upper corner")
-    spacing: float | None = Field(
-        default=None, gt=0,
-        description="m, edge of cells, from `low` on, along the first axis first; each has one that is clear of the "
-        "obstacles, and is in its middle; none = anywhere, whoever else is there",
+    spacing: Edge | tuple[Edge, ...] | None = Field(
+        default=None,
+        description="m, edge of cells, or one edge per axis; from `low` on, along the first axis first; each agent is "
+        "in the middle of a cell that is clear of the obstacles; default: anywhere, also in one another",
     )  # fmt: skip
     jitter: float = Field(
         default=0.0, ge=0, description="m, how far from the middle of its cell at most, along every axis"
+    )
+    wider: bool = Field(
+        default=False,
+        description="may bodies be wider than their cells, and begin a little in their neighbours and in obstacles?",
     )
     speed: tuple[Annotated[float, Field(ge=0)], Annotated[float, Field(ge=0)]] = Field(
         default=(0.0, 0.0), description="m/s, least and most"
@@ -58,6 +64,8 @@ class Spawn(Record):
             raise ValueError(f"low = {self.low}, high = {self.high}: the lower corner comes first")
         if self.jitter and self.spacing is None:
             raise ValueError(f"jitter = {self.jitter:g}: goes with spacing, within whose cells it is")
+        if self.wider and self.spacing is None:
+            raise ValueError("wider = true: goes with spacing, whose cells bodies may be wider than")
         return self
 
 
@@ -69,29 +77,45 @@ def cells(
 
     ValueError that begins with the field's name if bodies of that radius, m, are wider than a cell, or have no room.
     """
-    spacing, dimension = float(spawn.spacing or 0.0), len(low)
-    if spacing < 2 * (radius + spawn.jitter) * (1 - 1e-12):
-        raise ValueError(
-            f"spacing = {spacing:g}: bodies of radius {radius:g} m, up to {spawn.jitter:g} m from the middle, need "
-            f"cells of at least {2 * (radius + spawn.jitter):g} m"
-        )
-    along = [math.floor((b - a) / spacing + 1e-9) for a, b in zip(low, high, strict=True)]
+    dimension, body = len(low), 0.0 if spawn.wider else radius
+    spacing = _edges(spawn, dimension, radius)
+    along = [math.floor((b - a) / edge + 1e-9) for a, b, edge in zip(low, high, spacing, strict=True)]
     total = math.prod(along)
     if total > MOST_CELLS:
-        raise ValueError(f"spacing = {spacing:g}: {total:,} cells; at most {MOST_CELLS:,} are looked through")
+        raise ValueError(f"spacing = {_said(spacing)}: {total:,} cells; at most {MOST_CELLS:,} are looked through")
     found = np.zeros((0, dimension))
     for first in range(0, total, 65_536):
         if len(found) >= count:
             break
         ids = np.unravel_index(np.arange(first, min(first + 65_536, total)), along, order="F")
-        middles = np.array(low, float) + spacing * (np.stack(ids, axis=1) + 0.5)
-        free = clear_of(shapes, middles, period) >= radius + spawn.jitter * math.sqrt(dimension)
+        middles = np.array(low, float) + np.array(spacing) * (np.stack(ids, axis=1) + 0.5)
+        free = clear_of(shapes, middles, period) >= body + spawn.jitter * math.sqrt(dimension)
         found = np.concatenate([found, middles[free]])
     if len(found) < count:
         raise ValueError(
-            f"spacing = {spacing:g}: room for {len(found):,} of {count:,} agents from {tuple(low)} to {tuple(high)}"
+            f"spacing = {_said(spacing)}: room for {len(found):,} of {count:,} agents "
+            f"from {tuple(low)} to {tuple(high)}"
         )
     return found[:count]
+
+
+def _edges(spawn: Spawn, dimension: int, radius: float) -> tuple[float, ...]:
+    """Return the edges of a spawn's cells, (D,) m. ValueError if bodies of that radius, m, are wider than a cell."""
+    given = spawn.spacing if isinstance(spawn.spacing, tuple) else (spawn.spacing or 0.0,) * dimension
+    if len(given) != dimension:
+        raise ValueError(f"spacing = {given}: must be one edge, or one per axis ({dimension})")
+    least = 2 * (radius + spawn.jitter)
+    if not spawn.wider and min(given) < least * (1 - 1e-12):
+        raise ValueError(
+            f"spacing = {_said(given)}: bodies of radius {radius:g} m, up to {spawn.jitter:g} m from the middle, need "
+            f"cells of at least {least:g} m"
+        )
+    return given
+
+
+def _said(spacing: tuple[float, ...]) -> str:
+    """Return edges as a message has them: one, or all if they differ."""
+    return f"{spacing[0]:g}" if len(set(spacing)) == 1 else f"({', '.join(f'{edge:g}' for edge in spacing)})"
 
 
 @kernel

@@ -106,6 +106,20 @@ def test_with_a_spacing_nobody_starts_in_anybody_or_in_an_obstacle(dimension: in
     assert not np.array_equal(pos[0], pos[1])
 
 
+@pytest.mark.parametrize("edges", [0.6, (0.6, 0.5), (0.3, 0.9)])
+def test_bodies_wider_than_their_cells_overlap_by_no_more_than_that(edges: Any) -> None:
+    each = (edges, edges) if isinstance(edges, float) else edges
+    spawn = Spawn(low=(0, 0), high=(6, 3), spacing=edges, jitter=0.01, wider=True)
+    scene = scene_of(groups=(Group(count=20, radius=0.35, spawn=spawn),))
+    pos = scene.start(0, worlds=2).pos
+    cell = np.floor(pos / each)
+    assert len(np.unique(cell[0], axis=0)) == 20
+    assert 0.005 < np.abs(pos - (cell + 0.5) * each).max() <= 0.01
+    assert not np.array_equal(pos[0], pos[1])
+    with pytest.raises(ValueError, match=r"groups\[0\].spawn.spacing = .*radius 0.35 m, up to 0 m from the middle"):
+        scene_of(groups=(Group(count=20, radius=0.35, spawn=Spawn(low=(0, 0), high=(6, 3), spacing=edges)),))
+
+
 # --- steps ------------------------------------------------------------------------------------------------------------
 
 
@@ -404,6 +418,7 @@ BAD_SCENES = [
     ({"groups": (Group(count=3, spawn=Spawn(low=(0, 0), high=(1, 0.4), spacing=0.4)),)}, ["room for 2 of 3 agents"]),
     ({"groups": (Group(count=3, spawn=Spawn(low=(0, 0), high=(1, 1), spacing=0.3, jitter=0.1)),)}, ["at least 0.4 m"]),
     ({"groups": (Group(count=3, radius=0, spawn=Spawn(low=(0, 0), high=(9, 9), spacing=1e-4)),)}, ["8,100,000,000"]),
+    ({"groups": (Group(count=3, spawn=Spawn(low=(0, 0), high=(9, 9), spacing=(1, 1, 1))),)}, ["one per axis (2)"]),
     ({"space": Box(size=(1, 1)), "groups": (Group(count=3, radius=2),)}, ["groups[0].radius = 2", "does not fit"]),
     ({"groups": (Group(count=10**9, spawn=SPAWN),)}, ["1,000,000,000 agents", "GiB", "are allowed"]),
     ({"groups": (Group(count=10**30, spawn=SPAWN),)}, ["GiB"]),
@@ -448,6 +463,7 @@ def test_a_bad_scene_is_refused_in_one_line_before_anything_is_allocated(fields:
         ({"spawn": {"low": (1, 1)}}, "low and high"),
         ({"spawn": {"jitter": 0.1}}, "jitter = 0.1: goes with spacing"),
         ({"spawn": {"spacing": 0}}, "spacing = 0"),
+        ({"spawn": {"wider": True}}, "wider = true: goes with spacing"),
     ],
     ids=str,
 )

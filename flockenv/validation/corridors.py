@@ -20,7 +20,7 @@ from flockenv.shapes import Wall
 from flockenv.space import Torus
 from flockenv.spawn import Spawn
 from flockenv.state import State
-from flockenv.validation.walk import STEPS, Floats, Scenes, nobody, people, scene_of, walked, wall
+from flockenv.validation.walk import SHAKEN, STEPS, Floats, Scenes, filled, nobody, people, scene_of, walked, wall
 
 __all__ = ["CORRIDORS", "SCENES", "endless", "lined_up"]
 
@@ -28,6 +28,9 @@ EDGE = 32.0
 """m, of the torus across the corridor, and its least length: the widest sight of a preset is 15 m."""
 
 WIDTH = 4.0
+ROOMY = 0.8
+"""m^2 per agent; where each has less, cells fill a corridor from wall to wall."""
+
 DENSITIES = (0.5, 1.0, 1.5, 2.0, 2.5, 3.0)
 ALONG = (0.5, 0.75, 1.0, 1.25, 1.5, 1.75)
 """1/m^2, and 1/m in single file."""
@@ -52,10 +55,15 @@ def endless(
     groups = []
     for k, count in enumerate(counts):
         file = half / count  # each has so much of the length, if they walk one behind the other
-        beside = 0.3 if width > 1 else (width - file) / 2  # m, from the walls to where cells begin
+        roomy = half * width / count > ROOMY
+        beside = (0.3 if roomy else 0.0) if width > 1 else (width - file) / 2  # m, from the walls to where cells begin
         low, high = (k * half, middle - width / 2 + beside), ((k + 1) * half, middle + width / 2 - beside)
-        cells = {"spawn": Spawn(low=low, high=high, spacing=file)} if width <= 1 and not dense else {}
-        groups.append(people(name, count, low, high, **cells))
+        begin = {}
+        if width <= 1:
+            begin = {"spawn": Spawn(low=low, high=high, spacing=file, wider=dense, jitter=SHAKEN if dense else 0.0)}
+        elif not roomy:
+            begin = {"spawn": filled(count, low, high, people(name, count, low, high).widest)}
+        groups.append(people(name, count, low, high, **begin))
     if sum(counts) < FEWEST_AGENTS:  # so few and many share a kernel
         groups.append(nobody(name, (half, middle), FEWEST_AGENTS - sum(counts)))
     aims = [Course(group=k, direction=(way, 0)) for k, way in enumerate(ways)]

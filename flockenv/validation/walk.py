@@ -16,7 +16,7 @@ from flockenv.spawn import Spawn
 from flockenv.spread import Spread
 from flockenv.state import State
 
-__all__ = ["STEPS", "WEIDMANN", "Scenes", "Walk", "lane", "nobody", "people", "scene_of", "walked", "wall"]
+__all__ = ["STEPS", "WEIDMANN", "Scenes", "Walk", "filled", "lane", "nobody", "people", "scene_of", "walked", "wall"]
 
 Floats = NDArray[np.float64]
 Scenes = Mapping[str, Mapping[str, Callable[[str], Scene]]]
@@ -29,6 +29,9 @@ STEPS = {"helbing_farkas_vicsek_2000": 0.005, "moussaid_2011": 0.05}
 
 SOLID = ObstacleContact(stiffness=1.2e5)
 """Of walls in models that have no bodies, as Helbing, Farkas and Vicsek 2000 have it: or a crowd is pushed through."""
+
+SHAKEN = 0.01
+"""m, how far those whose bodies are wider than their cells begin from the middles at most, along each axis."""
 
 PATIENCE = 60.0
 """s, after which those who are left are stuck, if nobody came out in that time."""
@@ -63,18 +66,31 @@ def people(name: str, count: int, low: Sequence[float], high: Sequence[float], *
 
 
 def _apart(count: int, low: Sequence[float], high: Sequence[float], widest: float) -> Spawn:
-    """Return the widest grid of cells that has room for so many, each anywhere in the middle of his own.
+    """Return the widest grid of cells that has room for so many, each anywhere in the middle of its own.
 
-    Where bodies are wider than such cells, they begin anywhere, in each other too.
+    Where bodies are wider than such cells, they begin in the middles of the widest cells that there can be.
     """
     wide, deep = (b - a for a, b in zip(low, high, strict=True))
     spacing = np.sqrt(wide * deep / count)
     while int(wide / spacing + 1e-9) * int(deep / spacing + 1e-9) < count:
         spacing *= 0.995
     if spacing < 2 * widest:
-        return Spawn(low=tuple(low), high=tuple(high))
+        return filled(count, low, high, widest)
     jitter = max(0.0, (spacing / 2 - widest) * 0.9)
     return Spawn(low=tuple(low), high=tuple(high), spacing=float(spacing), jitter=float(jitter))
+
+
+def filled(count: int, low: Sequence[float], high: Sequence[float], widest: float) -> Spawn:
+    """Return a grid of so many cells that fills a box, the cells' shorter edges as long as can be.
+
+    Bodies are apart if the cells are as wide as they; else they are up to SHAKEN from the middles of their cells.
+    """
+    wide, deep = (b - a for a, b in zip(low, high, strict=True))
+    fitting = [(wide / -(-count // rows), deep / rows) for rows in range(1, count + 1)]
+    spacing = max(fitting, key=min)
+    room = min(spacing) / 2 - widest
+    jitter = SHAKEN if room < 0 else room / 2
+    return Spawn(low=tuple(low), high=tuple(high), spacing=spacing, jitter=jitter, wider=room < 0)
 
 
 def nobody(name: str, at: tuple[float, float], count: int) -> Group:
