@@ -5,13 +5,14 @@ from __future__ import annotations
 import itertools
 import math
 import warnings
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
 
 from flockenv.constraints import Collisions
 from flockenv.constraints.collisions import UnsolvedContactsWarning
+from flockenv.constraints.ends import RAISED
 from flockenv.effects import Gravity
 from flockenv.integrators import VelocityVerlet
 from flockenv.scene import Group, Scene
@@ -299,13 +300,13 @@ def passes(before: Floats, after: Floats, room: float) -> bool:
 @pytest.mark.parametrize("response", ALL)
 @pytest.mark.parametrize("dimension", [2, 3])
 def test_in_no_scene_do_bodies_overlap_pass_or_gain_energy(response: str, dimension: int, seed: int) -> None:
-    """Random masses (under project within a factor of three), restitution, friction, pull, speed and step, in a box."""
+    """Random masses, restitution, friction, pull, speed and step, in a box."""
     rng = np.random.default_rng(100 * dimension + seed)
     count, e = 24, float(rng.choice([0.0, 0.4, 0.8, 1.0]))
     pull, dt = float(rng.choice([0.0, G])), float(rng.choice([0.002, 0.01]))
     size = (1.6, 1.6, 1.6)[:dimension]
     of = scene(
-        10.0 ** rng.uniform(-1, 2 if response in EXACT else -0.5, count), response, e=e, dt=dt, pull=pull,
+        10.0 ** rng.uniform(-1, 2, count), response, e=e, dt=dt, pull=pull,
         dimension=dimension,
         friction=float(rng.choice([0.0, 0.5])), space=Box(size=size, restitution=e),
     )  # fmt: skip
@@ -316,7 +317,7 @@ def test_in_no_scene_do_bodies_overlap_pass_or_gain_energy(response: str, dimens
     mass, last = of.body.mass, np.inf
     for _ in range(200):
         before, before_v, state = state.pos[0].copy(), state.vel[0].copy(), of.step(state)
-        assert overlap(state.pos[0], R, size) < (0.06 if response in EXACT else 0.6) * R
+        assert overlap(state.pos[0], R, size) < (0.06 if response in EXACT else 0.26) * R
         slow = np.abs(np.concatenate([state.vel[0], before_v])).max() * dt < R  # others may go round within a step
         assert not slow or not passes(before, state.pos[0], 2 * R)
         now = kinetic(of, state) + float((mass * pull * state.pos[0, :, 1]).sum())
@@ -325,3 +326,49 @@ def test_in_no_scene_do_bodies_overlap_pass_or_gain_energy(response: str, dimens
             lift += float((mass * pull * dt * np.linalg.norm(before_v, axis=1)).sum())
         assert now <= last * (1 + 1e-9) + lift
         last = now
+
+
+# --- crowds of very uneven masses ------------------------------------------------------------------------------------
+
+
+def crowd(seed: int, response: str, pull: float = G) -> tuple[Scene, State]:
+    """Return 40 discs of masses 1 to 1,000 that cover half of a box."""
+    rng, count, e = np.random.default_rng(seed), 40, [0.0, 0.4, 0.8, 1.0][seed % 4]
+    size = (1.6, 1.6)
+    of = scene(10.0 ** rng.uniform(0, 3, count), response, e=e, dt=0.01, pull=pull, space=Box(size=size, restitution=e))
+    grid = np.stack(np.meshgrid(np.arange(7), np.arange(7)), -1).reshape(-1, 2)
+    pos = 0.11 + 0.23 * grid[rng.choice(len(grid), count, replace=False)]
+    return of, of.start(0).with_motion(pos[None], rng.normal(size=(1, count, 2)))
+
+
+@pytest.mark.parametrize("response", ["impulses", "project"])
+@pytest.mark.parametrize("seed", range(12))
+def test_heavy_bodies_do_not_throw_light_ones_past_others(response: str, seed: int) -> None:
+    """Passes that part bodies did under `project`."""
+    of, state = crowd(seed, response)
+    for _ in range(200):
+        before, state = state.pos[0].copy(), of.step(state)
+        assert not passes(before, state.pos[0], 2 * R)
+        assert overlap(state.pos[0], R, (1.6, 1.6)) < (0.26 if response == "project" else 0.06) * R
+
+
+@pytest.mark.parametrize("pull", [0.0, G])
+@pytest.mark.parametrize("response", ["impulses", "project"])
+def test_energy_that_moving_bodies_apart_adds_is_counted(response: str, pull: float) -> None:
+    """Without a pull there is none; else no step gains more than is counted, and what a step's falling may be off."""
+    for seed in range(4):
+        of, state = crowd(seed, response, pull)
+        mass, last = of.body.mass, np.inf
+        for _ in range(200):
+            fast, state = np.linalg.norm(state.vel[0], axis=1), of.step(state)
+            now = kinetic(of, state) + float((mass * pull * state.pos[0, :, 1]).sum())
+            (settler,) = cast(Any, of._settlers(1)[0])
+            falling = float((mass * pull * of.dt * fast).sum())
+            assert now <= last * (1 + 1e-9) + settler.lost[RAISED] + falling
+            last = now
+
+
+def test_a_warning_says_how_much_energy_moving_bodies_apart_adds() -> None:
+    of, state = crowd(0, "project")
+    with pytest.warns(UnsolvedContactsWarning, match=r"; up to [\d.e+-]+ J gained by bodies that were moved apart"):
+        of.run(state, 200)

@@ -9,31 +9,25 @@ import numpy as np
 from flockenv.constraints.bodies import STOPPED, Bodies, Meetings, Rules, Things, take_off
 from flockenv.constraints.broad import led, loaded, vector, write
 from flockenv.constraints.contacts import Contacts, Ends
-from flockenv.constraints.ends import settle_ends
+from flockenv.constraints.ends import RAISED, settle_ends
 from flockenv.constraints.events import play, together
 from flockenv.constraints.impact import along
 from flockenv.constraints.listing import list_meetings
-from flockenv.constraints.sweep import may_pass
+from flockenv.constraints.sweep import goes_round, may_pass
 from flockenv.kernels import Vec, kernel
 from flockenv.shapes.head import shift_of
 from flockenv.vec import add, axis, dot, norm, scale, sub, zero
 
-__all__ = ["COUNTED", "collide"]
+__all__ = ["COUNTED", "LOST", "collide"]
 
 COUNTED = 5
 """Numbers that a call reports: world, agent, meetings in all, impacts, what was left unsolved."""
 
+LOST = 5
+"""Numbers in `lost`: what `events.play` adds to, and `ends.RAISED`."""
+
 EXACT = 8 * 2.0**-52
 """Rounding of a coordinate, times how large it is."""
-
-
-@kernel
-def _goes_round(period: Vec, way: float) -> bool:
-    """May two who go so far, m, come to where one is met that is not the nearest image of the other?"""
-    least = np.inf
-    for k in range(len(period)):
-        least = min(least, period[k])
-    return bool(4.0 * way > least > 0.0)
 
 
 @kernel
@@ -99,7 +93,7 @@ def collide(
         lost[k] = 0.0
     for b in range(first, end):
         impacts_before, unsolved_before = report[3], report[4]
-        seconds_before, joules_before, stopped_before = lost[0], lost[1], lost[2]
+        seconds_before, joules_before, stopped_before, raised_before = lost[0], lost[1], lost[2], lost[RAISED]
         far, fast, hard, mean = _board(period, x0, v0, x, v, alive, b, bodies, ends, before, rules.seconds)
         if not (far < np.inf and fast < np.inf):
             continue
@@ -115,17 +109,17 @@ def collide(
         if in_time and count <= meetings.who.shape[0]:
             count = _fly(period, bodies, meetings, things, ends, told, before, count, report, lost)
         if count <= meetings.who.shape[0]:
-            if in_time and _goes_round(period, fast * rules.seconds):
-                report[4] += 1
+            round_about = goes_round(period, fast * rules.seconds)
+            report[4] += 1 if round_about else 0
             mean = scale(mean, -1.0 / norm(mean)) if norm(mean) > 1e-9 * hard * x.shape[2] else axis(mean, 0)
             count = settle_ends(
                 period, bodies, meetings, things, contacts, ends, before, reach, told, in_time, once, passing, rounds,
-                fast, hard, mean, spread, count, scratch, lost, report,
+                fast, hard, mean, spread, round_about, count, scratch, lost, report,
             )  # fmt: skip
         report[2] = count
         if count > meetings.who.shape[0]:
             report[3], report[4] = impacts_before, unsolved_before
-            lost[0], lost[1], lost[2] = seconds_before, joules_before, stopped_before
+            lost[0], lost[1], lost[2], lost[RAISED] = seconds_before, joules_before, stopped_before, raised_before
             return b
         work[b, 1] += 1 if rules.pairs else 0
         work[b, at_work] += report[3] - impacts_before

@@ -11,8 +11,9 @@ from pydantic import Field
 
 from flockenv.constraints.base import Constraint, Settler
 from flockenv.constraints.bodies import Bodies, Meetings, Rules, Things
-from flockenv.constraints.collide import COUNTED, collide
+from flockenv.constraints.collide import COUNTED, LOST, collide
 from flockenv.constraints.contacts import Contacts, Ends
+from flockenv.constraints.ends import RAISED
 from flockenv.constraints.impact import POINT
 from flockenv.effects.base import ties
 from flockenv.neighbours import MAX_RANGES
@@ -40,9 +41,9 @@ class Collisions(Constraint):
     - "impulses": at the end of a step all bodies in touch exchange impulses, in passes, until none goes into another.
       For heaps and crowds. A body whose path leads into something stops there, and has its impact in the next step.
     - "project": one such pass, and a body inside something is put on the surface. The cheapest; it loses energy at
-      every impact, friction holds no body in place, and light ones may be thrown past others in a heavy crowd.
+      every impact, friction holds no body in place, and those that overlap are moved apart even against their weight.
 
-    Else no body passes another. Where the impacts of a step run out, the two bodies stop: they keep
+    No body passes another. Where the impacts of a step run out, the two bodies stop: they keep
     their velocities and do not move for the rest of the step, and what runs into them stops, too. So time is lost, and
     neither energy nor momentum; "stopped" counts such bodies, and a warning says how much time. Two that meet slower
     than a step's acceleration changes velocity come to rest instead; the warning says how much energy that took.
@@ -118,7 +119,7 @@ class _Settler:
             np.zeros((1, n), np.int32), np.zeros((1, 6)), np.zeros(8, np.int64), np.zeros((MAX_RANGES, 3), np.int64),
         )  # fmt: skip
         self.things = self._things()
-        self.report, self.lost = np.zeros(COUNTED, np.int64), np.zeros(4)
+        self.report, self.lost = np.zeros(COUNTED, np.int64), np.zeros(LOST)
         self._make_room(record.capacity * n + 64)
 
     def _make_room(self, places: int) -> None:
@@ -180,7 +181,7 @@ class _Settler:
         )  # fmt: skip
         circles = slice(None) if r.obstacles else slice(0, 0)
         spread = np.inf if r.part_speed is None else r.part_speed * self.scene.dt
-        bad, unsolved, lost = (-1, -1), 0, np.zeros(4)
+        bad, unsolved, lost = (-1, -1), 0, np.zeros(LOST)
         while first < end:
             short = entry(collide)(
                 self.period, x0, v0, state.x, state.v, state.alive, state.tick, state.obstacle_x[:, :, circles],
@@ -202,7 +203,7 @@ class _Settler:
         return bad
 
     def _unsolved(self, unsolved: int, lost: NDArray[np.float64]) -> str:
-        """Return what a warning says of a step: lost are s, J and bodies, see events.play."""
+        """Return what a warning says of a step: lost are s, J and bodies, see events.play, and ends.RAISED."""
         r, seconds, joules, stopped = self.record, float(lost[0]), float(lost[1]), float(lost[2])
         said = (
             f"constraints: collisions: in a step {unsolved} impacts or worlds with contacts were not solved within "
@@ -215,4 +216,6 @@ class _Settler:
             said += f"; {stopped:.0f} bodies stopped {early:.3g} s before its end, and keep their velocities"
         if joules > 0:
             said += f"; {joules:.3g} J lost by bodies that came to rest"
+        if lost[RAISED] > 0:
+            said += f"; up to {lost[RAISED]:.3g} J gained by bodies that were moved apart"
         return said

@@ -332,13 +332,18 @@ def part(
 
 @kernel
 def deepest(
-    period: Vec, bodies: Bodies, things: Things, ends: Ends, seconds: float, contacts: Contacts, count: int
+    period: Vec, bodies: Bodies, things: Things, ends: Ends, seconds: float, who: Any, other: Any, count: int
 ) -> float:
-    """Return how far two overlap at most at the end of a step, m."""
+    """Return how far any two of these pairs overlap at the end of a step, as a part of the smaller radius.
+
+    who, other: (places,) as in Meetings and Contacts.
+    """
     deep = 0.0
     for c in range(count):
-        gap, _ = _normal(period, bodies, things, ends.pos, ends, seconds, contacts.who[c], contacts.other[c])
-        deep = max(deep, -gap)
+        i, j = who[c], other[c]
+        gap, _ = _normal(period, bodies, things, ends.pos, ends, seconds, i, j)
+        if gap < 0.0 and _ease(bodies, i, j) > 0.0:
+            deep = max(deep, -gap / max(width(bodies, i, j), 1e-300))
     return deep
 
 

@@ -8,8 +8,11 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
+
 from flockenv.constraints.bodies import (
     DEEP,
+    GIVEN_UP,
     STOPPED,
     Bodies,
     Meetings,
@@ -28,10 +31,22 @@ from flockenv.constraints.impact import surface
 from flockenv.kernels import Vec, kernel
 from flockenv.vec import norm, scale, sub, zero
 
-__all__ = ["may_pass", "stop_on_the_way"]
+__all__ = ["goes_round", "may_pass", "stop_on_the_way", "take_aim"]
 
 SLOW = 0.75
 """Part of its radius that a body may move in a step without ever being beyond what it touches."""
+
+LOST = 0.5
+"""Part of the smaller radius by which two overlap that are in each other: which is on which side means nothing."""
+
+
+@kernel
+def goes_round(period: Vec, path: float) -> bool:
+    """True if two whose paths are so long, m, may meet where one is not the nearest image of the other."""
+    least = np.inf
+    for k in range(len(period)):
+        least = min(least, period[k])
+    return bool(4.0 * path > least > 0.0)
 
 
 @kernel
@@ -52,6 +67,13 @@ def may_pass(period: Vec, bodies: Bodies, things: Things, ends: Ends, seconds: f
 
 
 @kernel
+def take_aim(period: Vec, bodies: Bodies, ends: Ends, seconds: float) -> None:
+    """Let each body reach as far as the end of its step is from the beginning."""
+    for i in range(bodies.living.shape[0]):
+        bodies.reach[i] = norm(_path(period, bodies, ends, i, seconds))
+
+
+@kernel
 def _path(period: Vec, bodies: Bodies, ends: Ends, i: int, seconds: float) -> Vec:
     """Return the vector from where body i begins the step to where it ends it, m."""
     apart = sub(vector(period, ends.pos, i), vector(period, bodies.start, i))
@@ -60,15 +82,20 @@ def _path(period: Vec, bodies: Bodies, ends: Ends, i: int, seconds: float) -> Ve
 
 @kernel
 def stop_on_the_way(
-    period: Vec, bodies: Bodies, meetings: Meetings, things: Things, ends: Ends, rules: Rules, count: int, lost: Any
-) -> int:
+    period: Vec, bodies: Bodies, meetings: Meetings, things: Things, ends: Ends, rules: Rules, strict: bool, count: int,
+    lost: Any,
+) -> int:  # fmt: skip
     """Stop bodies where their paths lead into something; return how many meetings there are, room for them or not.
 
-    rules.stops must be set. A body that stops keeps the velocity that impacts left it with, less what the step's
-    acceleration would have added on the part of the path that it does not go.
+    rules.stops must be set. strict: True if no two may come to overlap further than they did when the step began, but
+    for DEEP; two of which one began in the other by half of its radius have no order to keep. A body that stops keeps
+    the velocity that impacts left it with, less what the step's acceleration would have added on the part of the path
+    that it does not go.
     """
     n, seconds, known = bodies.living.shape[0], rules.seconds, count
     for i in range(n):
+        if strict and bodies.moved[i] == STOPPED:  # its velocity is already what it is where it stopped
+            write(bodies.free, i, zero(period))
         straight = scale(_path(period, bodies, ends, i, seconds), 1.0 / seconds)
         write(bodies.at, i, vector(period, bodies.start, i))
         write(bodies.vel, i, straight)
@@ -87,6 +114,11 @@ def stop_on_the_way(
         y, _, _ = relative(period, bodies, things, i, j, 0.0)
         row, room = met(bodies, things, i, j)
         begun = surface(things.table, row, y)[0] - room
+        if strict:
+            wide = width(bodies, i, j)
+            meetings.deep[c] = max(DEEP * wide, -begun) + 10.0 * rules.touch
+            meetings.closed[c] = GIVEN_UP if -begun > LOST * wide else 0
+            continue
         # two that begin near each other rest, and are parted by little; what comes from afar stops at the surface, or
         # it would be lifted out of it
         near = max(DEEP * width(bodies, i, j) - max(begun, 0.0), 0.0)
