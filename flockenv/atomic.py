@@ -44,7 +44,7 @@ def replacing(path: str | os.PathLike[str], mode: int = 0o666) -> Iterator[Binar
 
 
 def deliver(folder: Path, writers: Mapping[str, Callable[[Path], object]]) -> None:
-    """Have several files written, and when all are whole put them into their places: all of them or none.
+    """Write several files and, when all are whole, rename them to their places: all of them or none.
 
     No signal comes between two of the renames, and if one fails those before it are put back. A process that is killed
     (SIGKILL, a power cut) between two of them leaves some of the files new and some old, each of them whole.
@@ -130,7 +130,7 @@ def _beside(folder: Path) -> Iterator[Path]:
 
 @contextmanager
 def _named(target: Path, part: Path | None = None) -> Iterator[None]:
-    """Name the target in an error of the system about a new file, which has no name or one that nobody knows."""
+    """Name the target in an error of the system about a new file, which has no name or a temporary one."""
     try:
         yield
     except OSError as error:

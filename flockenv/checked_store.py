@@ -1,8 +1,8 @@
-"""Named pieces of data in a private folder that are found whole, or not at all.
+"""Named pieces of data in a private folder, each read whole or not at all.
 
 A file begins with a digest of its name and of all that follows. One that was emptied, cut, or in which a bit has
-changed, is never returned: one line on stderr says so, and it is replaced when its data is written again. Files are
-written by `flockenv.atomic`, so that no process ever reads half of one.
+changed, is never returned: one line on stderr reports it, and it is replaced when its data is written again. Files
+are written by `flockenv.atomic`, so that no process ever reads half of one.
 """
 
 from __future__ import annotations
@@ -17,10 +17,10 @@ from flockenv.private_folder import read_private, say_once
 __all__ = ["Store"]
 
 HEAD = b"flockenv 1\n"
-"""What a file begins with; another number for another form."""
+"""The first bytes of a file; another number for another format."""
 
 DAY = 86_400.0
-"""s: no process writes a file for so long; what is older and half-written was left by one that was killed."""
+"""s: no process takes this long to write a file; older half-written ones were left by a process that was killed."""
 
 
 class Store:
@@ -31,7 +31,7 @@ class Store:
         _swept(folder)
 
     def read(self, name: str) -> bytes | None:
-        """Return the data of this name, or None if there is none, or not as it was written."""
+        """Return the data of this name, or None if there is none or it has changed since it was written."""
         found = self._found(name)
         if found is None:
             return None
@@ -43,11 +43,11 @@ class Store:
         return data
 
     def write(self, name: str, data: bytes) -> None:
-        """Keep data under this name; where it cannot be written, one line on stderr says why."""
+        """Keep data under this name; if it cannot be written, one line on stderr has the reason."""
         self._keep(name, _head(name, data) + data)
 
     def write_text(self, name: str, text: str) -> None:
-        """Keep a text as it is, for people to read; one that was changed is replaced, and one line says so."""
+        """Keep a text as it is, for people to read; a changed one is replaced, and one line reports it."""
         wanted, found = text.encode(), self._found(name)
         if found != wanted:
             if found is not None:
@@ -55,7 +55,7 @@ class Store:
             self._keep(name, wanted)
 
     def _found(self, name: str) -> bytes | None:
-        """Return what a file contains; None if it is missing, or cannot be trusted or read, which one line says."""
+        """Return a file's content; None if it is missing, or cannot be trusted or read, which one line reports."""
         path = self.folder / name
         try:
             return read_private(path)
@@ -69,7 +69,7 @@ class Store:
         say_once(f"{self.folder / name}: damaged; made anew")
 
     def _keep(self, name: str, data: bytes) -> None:
-        """Write a file, or say why it could not be written: nothing but the next start's time depends on it."""
+        """Write a file, or report why it could not be written: only the next start's time depends on it."""
         try:
             with replacing(self.folder / name, 0o600) as file:
                 file.write(data)

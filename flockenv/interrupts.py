@@ -1,4 +1,4 @@
-"""How a command ends when a signal ends it: one line on stderr, exit code 128 + signal, nothing half-written is left.
+"""Ends of commands by signals: one line on stderr, exit code 128 + signal, nothing half-written is left.
 
 Python raises KeyboardInterrupt wherever the main thread happens to be: in an import, inside numba's compiler, in a
 callback that swallows it and prints a traceback. A command handles its signals itself instead. KeyboardInterrupt is
@@ -26,41 +26,41 @@ from flockenv import early
 __all__ = ["begin", "begin_early", "clean", "code", "held", "leave", "running", "said", "say", "serve", "unfinished"]
 
 PATIENCE = 1.0
-"""Seconds that are waited for a line at which KeyboardInterrupt can be raised."""
+"""Seconds to wait for a line at which KeyboardInterrupt can be raised."""
 
 AGAIN = 0.02
 """Seconds between two looks for such a line."""
 
 ONE_PRESS = 0.3
-"""Signals that arrive within so many seconds are one: a terminal and a wrapper may each send their own."""
+"""Signals within this number of seconds count as one: a terminal and a wrapper may each send their own."""
 
 SIGNALS = {"SIGINT": "interrupted", "SIGTERM": "terminated", "SIGHUP": "terminated: the terminal was closed"}
-"""What is handled, where the system has it, and what is said."""
+"""Signals that are handled, if the system has them, and the words of their line."""
 
 SAFE = {"flockenv", "agents", "__main__", "threading"}
-"""Packages, the first part of a module's name, in whose lines KeyboardInterrupt may be raised."""
+"""Packages, by the first part of a module's name, with lines at which KeyboardInterrupt may be raised."""
 
 CLOSED = {"numba", "llvmlite", "importlib", "_frozen_importlib", "_frozen_importlib_external", "pickle"}
-"""Packages that are left in a state of their own if an exception passes through them."""
+"""Packages that are left in a broken state if an exception passes through them."""
 
 PARENT = "FLOCKENV_PARENT"
 """Variable of the environment with the number of a command's process: processes that it starts are to end with it."""
 
 WRITING = {"_write_atomic", "save_overload", "_save_overload", "_save_index", "_save_data"}
-"""Functions of Python and numba that write a file beside its place and rename it: they are let finish."""
+"""Functions of Python and numba that write a file beside its place and rename it: these run to their end."""
 
 
 class _Asked:
-    """What this process has been asked to do, and how far that is."""
+    """The signal that this process is handling, if any, and the progress of that."""
 
     name = "flockenv"
-    text = ""  # said of a signal instead of what SIGNALS says
+    text = ""  # the words of the line, instead of those of SIGNALS
     said = False  # the line has been written
     main = 0  # the thread that handles signals
-    running = False  # the command itself has begun: there may be something to keep
+    running = False  # the command itself has begun: it may have results to keep
     signal = 0
     since = 0.0
-    raised = False  # KeyboardInterrupt is on its way, or was caught
+    raised = False  # KeyboardInterrupt has been raised; it may have been caught since
     again = False  # the next signal is sent by _watch
 
 
@@ -87,7 +87,7 @@ def begin_early() -> None:
 def begin(name: str) -> None:
     """Handle signals from here on; `name` begins every line. A signal that is ignored, as under nohup, stays so."""
     _Asked.name = name
-    if os.name != "posix":  # Python's own KeyboardInterrupt is all there is
+    if os.name != "posix":  # there is only Python's own KeyboardInterrupt
         return
     if not _Asked.main:
         _Asked.main = _thread.get_ident()
@@ -113,7 +113,7 @@ def _finish() -> None:
 
 
 def leave(code: int) -> None:
-    """End an interrupted process at once: what Python does at its end could be interrupted again."""
+    """End an interrupted process at once: Python's own shutdown could be interrupted again."""
     clean()
     with suppress(OSError, ValueError):
         sys.stdout.flush()
@@ -123,7 +123,7 @@ def leave(code: int) -> None:
 
 
 def serve() -> None:
-    """Let a process that works for a command end by SIGTERM alone, without a word; the command handles the rest."""
+    """Let a process that works for a command end by SIGTERM alone, without output; the command handles the rest."""
     begin(_Asked.name)
     _Asked.said = True
     for which in ("SIGINT", "SIGHUP"):
@@ -153,7 +153,7 @@ def running(name: str) -> Iterator[None]:
 
 @contextmanager
 def held() -> Iterator[None]:
-    """Let no signal in before the end of a short section that must happen whole, such as renaming several files."""
+    """Handle no signal before the end of a short section that must run whole, such as renaming several files."""
     section = object()
     _held.add(section)  # two threads may count at once: `+= 1` would lose one of them
     try:
@@ -185,12 +185,12 @@ def clean() -> None:
 
 
 def say(text: str) -> None:
-    """Have this said of a signal from here on. A leading "interrupted" becomes what that signal is called."""
+    """Set the words of the line about a signal. A leading "interrupted" becomes the signal's own word."""
     _Asked.text, _Asked.said = text, False
 
 
 def said() -> str:
-    """Return the line about the signal that is to be written now, "" if it has been: there is one."""
+    """Return the line about the signal that is to be written now, "" if it has been written."""
     if _Asked.said:
         return ""
     _Asked.said = True
@@ -279,7 +279,7 @@ def _watch(signals: int) -> None:
 
 
 def _end(number: int) -> None:
-    """Remove what is half-written, say one line and end the process, without anything that Python does at its end."""
+    """Remove what is half-written, write one line and end the process, without Python's own shutdown."""
     _ending.acquire()
     clean()
     if _thread.get_ident() == _Asked.main:

@@ -1,4 +1,4 @@
-"""Machine code of kernels in a checked store: what numba's own disk cache does, for files that are verified first.
+"""Machine code of kernels in a checked store: a disk cache as numba's own, but of files that are verified first.
 
 numba's cache unpickles what it finds, and unpickling runs code. This one has numba's methods and one file for every
 combination of argument types and processor. A file is unpickled after its owner and its digest were verified.
@@ -22,14 +22,14 @@ __all__ = ["MachineCode"]
 
 
 class MachineCode:
-    """A function's compiled forms in a store, under a name that says all that its source depends on."""
+    """A function's compiled forms in a store, under a name made of all that its source depends on."""
 
     def __init__(self, store: Store, name: str) -> None:
         self._store, self._name = store, name
         self.cache_path = str(store.folder)
 
     def load_overload(self, signature: Any, context: Any) -> Any:
-        """Return the compiled form for these argument types and this processor; None if there is none."""
+        """Return the compiled form for these argument types and this processor; None if the store has none."""
         context.refresh()
         data = self._store.read(self._file(signature, context.codegen()))
         if data is None:
@@ -48,7 +48,7 @@ class MachineCode:
         self._store.write(self._file(signature, compiled.codegen), pickled((signature, compiled._reduce())))
 
     def flush(self) -> None:
-        """Do nothing: what numba compiles again is written over what was there."""
+        """Do nothing: a function that numba compiles again replaces the stored form."""
 
     def _file(self, signature: Any, codegen: Any) -> str:
         told = repr((signature, codegen.magic_tuple(), llvmlite.__version__))

@@ -1,4 +1,4 @@
-"""`flockenv measure`: a scene is run, once or from several seeds, and what makes sense for it is measured and drawn."""
+"""`flockenv measure`: a scene is run, once or from several seeds; its applicable measures are computed and drawn."""
 
 from __future__ import annotations
 
@@ -34,9 +34,9 @@ __all__ = ["measure"]
 
 FORMAT = 1
 EVERY = 0.1
-"""s, rounded to whole steps: how often positions are kept, unless said otherwise."""
+"""s, rounded to whole steps: the default interval between positions that are kept."""
 CELL = 0.5
-"""m and s: what a cell of the picture of density in time is wide, or more of a long run."""
+"""m and s: the size of a cell of the picture of density in time; larger for a long run."""
 MOST_CELLS = 400
 
 ABOVE_CHANCE = {"lanes": "lanes by chance", "burst length": "burst length by chance"}
@@ -66,7 +66,7 @@ def measure(
         typer.Option(metavar="S", help="Time between recorded instants in seconds.", show_default="about 0.1"),
     ] = None,
     seed: Seed = 0,
-    seeds: Annotated[int, typer.Option(min=1, max=10_000, help="So many runs, from this seed on.")] = 1,
+    seeds: Annotated[int, typer.Option(min=1, max=10_000, help="Number of runs, from this seed on.")] = 1,
     json_file: Annotated[str | None, typer.Option("--json", metavar="X.json", help="Write the numbers.")] = None,
     out: Annotated[str | None, typer.Option(metavar="DIR", help="Write pictures into this folder.")] = None,
     force: Force = False,
@@ -102,7 +102,7 @@ def measure(
 def _surveyed(
     scene: Scene, seed: int, seeds: int, steps: int, stride: int, asked: Asked
 ) -> tuple[list[Survey], Trajectory]:
-    """Run a scene from several seeds and measure each run; return what was measured, and the first run.
+    """Run a scene from several seeds and measure each run; return the surveys, and the first run.
 
     A run that stops early is the last; KeyboardInterrupt is raised only if nothing has been measured yet.
     """
@@ -175,7 +175,7 @@ def _area(option: str, text: str | None, is_convex: bool) -> Any:
 
 
 def _above(found: Sequence[Survey]) -> dict[str, Above]:
-    """Return what is above chance over at least five runs that have it."""
+    """Return the measures that are above chance, each over at least five runs that have it."""
     from flockenv.measures import above_null
 
     out = {}
@@ -222,7 +222,7 @@ def _summary(
     scene: Scene, asked: Asked, found: Sequence[Survey], means: dict[str, Mean], above: dict[str, Above],
     run: Trajectory, stride: int,
 ) -> dict[str, Any]:  # fmt: skip
-    """Return all that was measured, ready for JSON: what has no meaning is null, never NaN."""
+    """Return all measurements, ready for JSON: numbers without a meaning are null, never NaN."""
     from flockenv.survey import UNITS
 
     def plain(value: float) -> float | None:
@@ -267,7 +267,7 @@ def _write_numbers(path: Path, summary: dict[str, Any]) -> None:
 
 
 def _draw(folder: Path, run: Trajectory, found: Sequence[Survey], asked: Asked, name: str) -> list[str]:
-    """Write the pictures that there is something to draw for; return their names."""
+    """Write the pictures that have data; return their names."""
     import numpy as np
 
     from flockenv.measures import goodness, tail

@@ -13,7 +13,7 @@ import sys
 __all__ = ["require"]
 
 LIBRARIES, PER_CORE = 570 * 2**20, 20 * 2**20
-"""Bytes of address space that a command takes: measured on two cores, of which 8 MiB of stack for each BLAS thread."""
+"""Bytes of address space that a command takes: measured on two cores, with 8 MiB of stack for each BLAS thread."""
 
 
 def require(command: str) -> None:

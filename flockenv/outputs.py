@@ -1,4 +1,4 @@
-"""Where a file may be written, checked before the work begins."""
+"""Paths that may be written, checked before the work begins."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ __all__ = ["check_room", "checked_file", "checked_path"]
 LONGEST_NAME, LONGEST_PATH = 200, 1000
 
 _RESERVED = re.compile(r"(con|prn|aux|nul|com\d|lpt\d)(\..*)?", re.IGNORECASE)
-"""Names that Windows keeps for devices: what is called so cannot be copied there."""
+"""Names that Windows reserves for devices: a file of such a name cannot be copied there."""
 
 
 def checked_path(text: str, option: str = "--out") -> Path:
@@ -37,7 +37,7 @@ def checked_path(text: str, option: str = "--out") -> Path:
 def checked_file(
     text: str, suffixes: Sequence[str], force: bool = False, option: str = "--out", beside: str | None = None
 ) -> Path:
-    """Return the absolute path of a file that may be written, and whose name ends in one of `suffixes`.
+    """Return the absolute path of a file that may be written and has one of `suffixes`.
 
     beside: the suffix of a second file that is written with it, checked in the same way; "" for a folder.
 
@@ -61,7 +61,7 @@ def checked_file(
 
 
 def _fault(text: str) -> str:
-    """Return what is wrong with a path as text, '' if nothing."""
+    """Return the fault of a path as text, '' if none."""
     if not text.strip() or any(unicodedata.category(c) in ("Cc", "Cf", "Cs") for c in text):
         return "must be a name without control characters"
     parts = Path(text).parts
@@ -74,7 +74,7 @@ def _fault(text: str) -> str:
 
 
 def _place(path: Path) -> str:
-    """Return why nothing may be written there, '' if it may."""
+    """Return the reason why nothing may be written there, '' if none."""
     target = path.resolve()
     allowed = [Path.cwd().resolve(), Path(tempfile.gettempdir()).resolve()]
     if not any(target.is_relative_to(base) for base in allowed):
@@ -91,7 +91,7 @@ def _shown(text: str) -> str:
 
 
 def check_room(path: Path, size: int) -> None:
-    """Raise OSError, in one line, if a file of so many bytes cannot be written at `path` now.
+    """Raise OSError, in one line, if a file of `size` bytes cannot be written at `path` now.
 
     It is tried with a file without a name, in the nearest folder above that exists; nothing is left behind.
     """

@@ -1,4 +1,4 @@
-"""Where everybody begins: group after group, as their spawns and networks say, clear of what is in the way."""
+"""Initial states: group after group, by their spawns and networks, clear of obstacles."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ __all__ = ["cells_of", "place_groups"]
 Cells = tuple[Floats | None, ...]
 
 ROUNDS = 256
-"""How often who would begin in an obstacle that is no circle is drawn anew."""
+"""Most draws of a place for an agent that would begin in an obstacle that is no circle."""
 
 
 def cells_of(scene: Scene) -> Cells:
-    """Return where those of each group begin that have a cell each, (size, D) m; none for others.
+    """Return the initial cells' middles of groups that have a cell per agent, (size, D) m; none for other groups.
 
     ValueError that names the group and the field if they have no room.
     """
@@ -37,7 +37,7 @@ def cells_of(scene: Scene) -> Cells:
 
 
 def place_groups(scene: Scene, state: State, middles: Cells) -> None:
-    """Write where everybody of a state's first instant is, how fast he moves, where he faces, and who does not live.
+    """Write the first instant of a state: positions, velocities, headings, and which agents live.
 
     middles: those of `cells_of`.
     """
@@ -52,7 +52,7 @@ def place_groups(scene: Scene, state: State, middles: Cells) -> None:
 
 
 def _period(scene: Scene) -> NDArray[np.float64]:
-    """Return the edges of a torus, (D,) m; zeros for what is none."""
+    """Return the edges of a torus, (D,) m; zeros for other spaces."""
     return np.array(scene.space.extent(scene.dimension) if scene.space.periodic else (0.0,) * scene.dimension, float)
 
 
@@ -71,7 +71,7 @@ def _cells(scene: Scene, k: int, group: Group) -> Floats:
 
 
 def _scatter(scene: Scene, state: State, b: int, first: int, group: Group, middles: Floats | None) -> None:
-    """Write where a group begins in one world: anywhere in its box, or each near the middle of its cell."""
+    """Write a group's initial positions in one world: anywhere in its box, or each near the middle of its cell."""
     spawn, d, period = group.spawn, scene.dimension, _period(scene)
     low, high = (np.array(corner, float) for corner in _corners(scene, spawn))
     if middles is not None:
@@ -95,7 +95,7 @@ def _scatter(scene: Scene, state: State, b: int, first: int, group: Group, middl
 
 
 def _tie(scene: Scene, state: State, b: int, first: int, group: Group) -> None:
-    """Write where the particles of a network begin in one world, and how fast they all fly."""
+    """Write initial positions of a network's particles in one world, and their common velocity."""
     assert group.network is not None
     mine = slice(first, first + group.size)
     state.pos[b, mine] = group.network.points(scene.dimension)
@@ -106,7 +106,7 @@ def _tie(scene: Scene, state: State, b: int, first: int, group: Group) -> None:
 
 
 def _bury(scene: Scene, state: State) -> None:
-    """Let those be dead who do not live at the start: nobody, where they may be born."""
+    """Empty the slots of agents that do not live at the start, placed where an emitter may bring them to life."""
     for k, (first, alive) in enumerate(zip(scene.starts, scene.living, strict=False)):
         dead = slice(first + alive, scene.starts[k + 1])
         feeding = [member for member in scene.population if isinstance(member, Emitter) and member.feeds(k)]
@@ -118,7 +118,7 @@ def _bury(scene: Scene, state: State) -> None:
 
 
 def _face(scene: Scene, state: State) -> None:
-    """Write where everybody faces in the beginning: whither he flies, or as his group's heading says."""
+    """Write the initial headings: along the velocity, or the heading of the group."""
     for first, group in zip(scene.starts, scene.groups, strict=False):
         if scene.parts.oriented and group.spawn.heading is not None:
             heading = np.asarray(group.spawn.heading, float)

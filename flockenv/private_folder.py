@@ -1,4 +1,4 @@
-"""Folders and files that nobody but this user, or the system's administrator, can change.
+"""Folders and files that only this user, or the system's administrator, can change.
 
 Kernels are code: what is read from their folder runs. So the folder is checked before anything is read from it: it is a
 folder and no link, it belongs to this user, no other user can write to it, and no other user can rename or replace any
@@ -28,7 +28,7 @@ class NotPrivateError(PermissionError):
 
 
 def say_once(line: str, about: str = "") -> None:
-    """Write one line to stderr, the first time that this process says it, or says a line `about` the same thing."""
+    """Write one line to stderr, if this process has not yet written it, or one `about` the same thing."""
     if (about or line) not in _said and sys.stderr is not None:
         _said.add(about or line)
         print(f"flockenv: {line}", file=sys.stderr, flush=True)
@@ -56,9 +56,9 @@ def check_folder(folder: Path) -> None:
 
 
 def read_private(path: Path) -> bytes:
-    """Return what a plain file contains that belongs to this user and that no other user can write.
+    """Return the content of a plain file that belongs to this user and that no other user can write.
 
-    It is checked as it was opened: links are not followed, and a pipe is not waited for.
+    The open file is checked: links are not followed, and the call does not wait for a pipe.
 
     Raises:
         NotPrivateError: it is something else.
@@ -82,8 +82,8 @@ def read_private(path: Path) -> bytes:
 def first_private(home: Path, temporary: Path, name: str) -> Path:
     """Return the first of these folders that only this user can change: home, temporary/name, a new one beside it.
 
-    A folder that fails its check is passed over, and one line on stderr says why. The new one is called name-XXXXXXXX;
-    later processes find it again.
+    A folder that fails its check is skipped, and one line on stderr has the reason. The new one is called
+    name-XXXXXXXX; later processes find it again.
 
     Raises:
         OSError: none of them can be made.
@@ -104,7 +104,7 @@ def first_private(home: Path, temporary: Path, name: str) -> Path:
 
 
 def _beside(folder: Path) -> Path:
-    """Return a private folder of the same name and -XXXXXXXX beside one: one that is there, or a new one."""
+    """Return a private folder of the same name and -XXXXXXXX beside one: an existing one, or a new one."""
     for place in _way_to(folder):
         _check_above(place)
     for other in sorted(folder.parent.glob(f"{folder.name}-*")):
@@ -125,7 +125,7 @@ def _make(folder: Path) -> None:
 
 
 def _way_to(folder: Path) -> Iterator[Path]:
-    """Yield every folder and every link that is passed on the way to a folder, without the folder itself."""
+    """Yield every folder and every link on the path to a folder, without the folder itself."""
     at, left = Path(folder.absolute().anchor), list(reversed(folder.absolute().parts[1:]))
     while left:
         yield at

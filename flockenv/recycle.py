@@ -1,7 +1,7 @@
-"""Recycler: fresh arrays out of memory that nobody looks at any more.
+"""Recycler: new arrays in memory that nothing refers to any more.
 
-A step hands out megabytes. Above 32 MB (and sooner with other allocators) each fresh array is memory that the system
-has to find, fill with zeros and map; an array that was let go of is at hand, and often still in the processor's cache.
+A step returns megabytes. Above 32 MB (less with other allocators) each new array is memory that the system has to
+find, fill with zeros and map; the memory of a released array is mapped, and often still in the processor's cache.
 """
 
 from __future__ import annotations
@@ -22,30 +22,30 @@ Memory = tuple[NDArray[np.uint8], int]
 
 
 def _holders(kept: list[Memory], k: int) -> int:
-    """Return how many hold a memory, the list included; views and tensors hold the array whose memory they show."""
+    """Return the number of references to a memory, the list's included; views and tensors refer to their base array."""
     return sys.getrefcount(kept[k][0])
 
 
 _NOBODY = _holders([(np.empty(0, np.uint8), 0)], 0)
-"""What is counted when only the list holds it; asked and not written down, for Pythons count differently."""
+"""The count if only the list refers to it; measured, because versions of Python count differently."""
 
 
 class Recycler:
-    """Makes arrays as np.empty does, out of memory that it handed out before and that nobody can see any more.
+    """Makes arrays as np.empty does, in memory that it returned before and that nothing refers to any more.
 
-    Not for several threads at once; whoever has an array may let go of it in any thread.
+    Not for several threads at once; arrays may be released in any thread.
     """
 
     def __init__(self, keep: int = 4, line: int = 1) -> None:
-        """Remember up to `keep` arrays of a shape and type; one more that is asked for is simply new.
+        """Keep up to `keep` arrays of a shape and type; any more are allocated and not kept.
 
-        line: of so many bytes is an address a multiple at which an array begins.
+        line: bytes; arrays begin at addresses that are multiples of it.
         """
         self.keep, self.line = keep, line
         self._kept: dict[Key, list[Memory]] = {}
 
     def maker(self, shape: tuple[int, ...], dtype: np.dtype[Any]) -> Callable[[], NDArray[Any]]:
-        """Return what makes arrays of this shape and type: their content is anything, their memory not their own."""
+        """Return a function that makes arrays of this shape and type: with any content, as views of kept memory."""
         kept = self._kept.setdefault((shape, dtype), [])
 
         def make() -> NDArray[Any]:

@@ -1,4 +1,4 @@
-"""Snapshot: one world at one instant, as plain arrays; all that a picture, a GIF or a replay ever sees."""
+"""Snapshot: one world at one instant, as plain arrays; the whole input of a picture, a GIF or a replay."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ KINDS: Final = ("goal", "heading", "way")
 
 @dataclass(frozen=True, eq=False)
 class Mark:
-    """Something to see that is no body: a goal, a heading that is asked for, a piece of a way.
+    """Something to draw that is no body: a goal, a desired heading, a piece of a way.
 
     kind: "goal" (a disc of `radius` around `at`; `vector` is not read) or "heading" (an arrow that starts at `at` and
     points along `vector`; only its direction counts, and a zero vector draws nothing; `radius` is not read) or "way" (a
@@ -53,13 +53,13 @@ class Snapshot:
 
     time: s. pos (N, D): m. vel (N, D): m/s. alive (N,): bool. radius (N,): m. roles: N names out of ROLES.
     obstacle_centre (M, D), obstacle_radius (M,): m. marks: goals and headings. low, high (D,): the region to show, m.
-    periodic: whether what leaves the region enters it on the far side. title: one line. D = 2 or 3; N and M may be 0.
+    periodic: True if what leaves the region enters it on the far side. title: one line. D = 2 or 3; N and M may be 0.
     outlines: polygons (n, 2), m, of obstacles that are not round, as seen from above.
     bonds (E, 2): int, pairs of agents that a line is drawn between, the shortest way; none by default.
-    heading (N, D): where everybody faces; none by default, and then that is along the velocity.
-    looks: how some are drawn; look (N,): which of these everybody has, -1 = none. age (N,): s, of the living; none by
-    default, and then it is the time. identity (N,): int, who is in each row; none by default, and then always the same.
-    inner (N,): what goes on inside of what one's look is about; none by default.
+    heading (N, D): directions that agents face; default: those of the velocities.
+    looks: appearances; look (N,): the index of each agent's own, -1 = none. age (N,): s, of the living; default: the
+    time. identity (N,): int, the agent in each row; default: the same agents at all times.
+    inner (N,): the inner number of each agent that its look shows; none by default.
     Arrays are private copies and read-only; positions and velocities may hold NaN or inf (a run that diverged can be
     looked at: such bodies are left out), everything else is finite.
     Raises ValueError or TypeError, in one line that names the field, on anything else.
@@ -134,12 +134,12 @@ class Snapshot:
 
     @property
     def aim(self) -> Floats:
-        """Where everybody points, (N, D), of any length; zero where nobody knows."""
+        """The direction in which each agent points, (N, D), of any length; zero if unknown."""
         return self.vel if self.heading is None else self.heading
 
     @property
     def shade(self) -> Floats:
-        """How far along the range of its look everybody is, (N,) from 0 to 1; 0 without one."""
+        """The place of each agent in the range of its look, (N,) from 0 to 1; 0 without one."""
         shade = np.zeros(self.agents)
         age = np.full(self.agents, self.time) if self.age is None else self.age
         with np.errstate(over="ignore", invalid="ignore"):
@@ -150,21 +150,21 @@ class Snapshot:
         return shade
 
     def same(self, other: Snapshot) -> NDArray[np.bool_]:
-        """Whose row holds the same one in another snapshot, (N,) bool."""
+        """True for rows that hold the same agent in another snapshot, (N,) bool."""
         if self.identity is None or other.identity is None:
             return np.ones(self.agents, np.bool_)
         return np.asarray(self.identity == other.identity)
 
     @property
     def tied(self) -> NDArray[np.bool_]:
-        """Who has bonds, (N,) bool: particles of something larger, which are drawn as dots."""
+        """True for agents with bonds, (N,) bool: particles of a network, which are drawn as dots."""
         tied = np.zeros(self.agents, np.bool_)
         tied[self.bonds] = True
         return tied
 
     @property
     def visible(self) -> NDArray[np.bool_]:
-        """Which bodies have a place that can be drawn, (N,) bool: the finite ones."""
+        """True for bodies with a place that can be drawn, (N,) bool: the finite ones."""
         return np.asarray(np.isfinite(self.pos).all(axis=1) & np.isfinite(self.vel).all(axis=1))
 
 

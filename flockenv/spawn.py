@@ -1,4 +1,4 @@
-"""Where agents begin: drawn from the world's key, clear of the obstacles, the same whichever batch the world is in."""
+"""Initial places of agents: drawn from the world's key, clear of obstacles, the same in every batch of worlds."""
 
 from __future__ import annotations
 
@@ -153,8 +153,8 @@ def scatter(
     """Place agents [first, end) of one world: uniform in [low, high), clear of obstacles if 64 tries find room.
 
     pos, vel (D, N); low, high, heading, period, unit (D,); a heading of zeros means a random one; `period` is the
-    size of a periodic box, zeros for none; `unit` is scratch. `tried` (N,) is how many tries are over already, and
-    becomes the number of the one that is kept.
+    size of a periodic box, zeros for none; `unit` is scratch. `tried` (N,): number of tries already made, in; number of
+    the try that is kept, out.
     """
     dimension = pos.shape[0]
     for i in range(first, end):

@@ -1,4 +1,4 @@
-"""What every command shares: exit codes, options, where tables go, progress while it works, one line where it ends."""
+"""Parts of every command: exit codes, options, the console of tables, progress, one line on errors and signals."""
 
 from __future__ import annotations
 
@@ -29,14 +29,14 @@ OK, DIVERGED, BAD_INPUT, INTERRUPTED = 0, 1, 2, 130
 MOST_SEED = 2**63 - 1
 
 FIRST, OFTEN = 3.0, 10.0
-"""s until the first line about progress where stderr is not a terminal, and between two of them."""
+"""s until the first line about progress if stderr is not a terminal, and between two of them."""
 
 Seed = Annotated[int, typer.Option(min=0, max=MOST_SEED, help="Which world: the same seed is the same run.")]
 Force = Annotated[bool, typer.Option("--force", help="Overwrite files that exist.")]
 
 
 class EarlyEnd(Exception):  # noqa: N818  # not an error: what was done is kept and shown
-    """A run that ended before its time, and the exit code that says so."""
+    """A run that ended before its time, and its exit code."""
 
     def __init__(self, text: str, code: int) -> None:
         super().__init__(text)
@@ -50,7 +50,7 @@ def complain(name: str, text: str) -> None:
 
 
 def verdict(error: Exception) -> tuple[str, int]:
-    """Return what is said of an error in a command, and the exit code."""
+    """Return the text for an error in a command, and the exit code."""
     usage = getattr(error, "format_message", None)  # typer's own complaints about the command line
     if usage is not None:
         return usage() or "no command given; see flockenv --help", BAD_INPUT
@@ -64,7 +64,7 @@ def verdict(error: Exception) -> tuple[str, int]:
 
 
 def _os_text(error: OSError) -> str:
-    """Return what the system refused, and of which file if it is known."""
+    """Return the system's reason for an error, with the file if it is known."""
     return str(error.strerror) if error.filename is None else f"{error.filename}: {error.strerror}"
 
 
@@ -76,7 +76,7 @@ def _first_line(error: Exception) -> str:
 def interruptible(interrupted: str = "interrupted") -> Iterator[None]:
     """End a command that a signal interrupts with one line on stderr, and the exit code of the signal.
 
-    interrupted: the line; "interrupted" at its beginning becomes what the signal is called.
+    interrupted: the line; "interrupted" at its beginning becomes the signal's own word.
     """
     interrupts.say(interrupted)
     try:
@@ -89,7 +89,7 @@ def interruptible(interrupted: str = "interrupted") -> Iterator[None]:
 
 @contextmanager
 def one_line(name: str, interrupted: str = "interrupted", debug: bool = False) -> Iterator[None]:
-    """End a command with one line on stderr and an exit code where its input is refused or a signal interrupts it.
+    """End a command with one line on stderr and an exit code if its input is refused or a signal interrupts it.
 
     interrupted: as for `interruptible`. debug: errors are raised as they are.
     """
@@ -107,7 +107,7 @@ def one_line(name: str, interrupted: str = "interrupted", debug: bool = False) -
 def program(name: str, app: typer.Typer, interrupted: str = "interrupted") -> None:
     """Run an app as the program that this process is, and end the process with its exit code.
 
-    interrupted: what is said of an interrupt, unless the command itself says something else.
+    interrupted: the line about an interrupt, unless the command itself sets another.
     """
     interrupts.say(interrupted)
     with interrupts.running(name):
@@ -122,7 +122,7 @@ def program(name: str, app: typer.Typer, interrupted: str = "interrupted") -> No
 
 
 class _Output:
-    """Standard output, whose errors name it: the system's own tell no file."""
+    """Standard output with errors that name it: the system's own name no file."""
 
     def __init__(self, stream: TextIO) -> None:
         self._stream = stream
@@ -141,7 +141,7 @@ class _Output:
 
 @contextmanager
 def _named() -> Iterator[None]:
-    """Name standard output in an error; a reader that has gone keeps its own."""
+    """Name standard output in an error; a broken pipe keeps its own text."""
     try:
         yield
     except OSError as error:
@@ -154,13 +154,13 @@ def _named() -> Iterator[None]:
 
 @contextmanager
 def naming_stdout() -> Iterator[None]:
-    """Have an error of standard output name it, in all that is printed in a block."""
+    """Make errors of standard output name it, for all that is printed in a block."""
     with redirect_stdout(cast("TextIO", _Output(sys.stdout))) if sys.stdout is not None else nullcontext():
         yield
 
 
 def flush_output() -> None:
-    """Write out what stdout holds; OSError that names it where that fails. A reader that has gone is no error."""
+    """Flush stdout; an OSError names it if that fails. A reader that has gone is no error."""
     with suppress(BrokenPipeError), _named():
         sys.stdout.flush()
 
@@ -171,7 +171,7 @@ def printable(text: str) -> str:
 
 
 def new_console() -> Console:
-    """Return where tables go; what is piped is not folded to the 80 columns of a terminal that is not there."""
+    """Return the console of tables; piped output is not folded to the 80 columns of an assumed terminal."""
     from rich.console import Console
 
     console = Console(highlight=False, markup=False)
@@ -193,14 +193,14 @@ def show_table(console: Console, title: str, rows: Iterable[Sequence[str]], colu
 
 
 def relative(path: Path) -> str:
-    """Return a path as seen from here, if it is below."""
+    """Return a path relative to the current folder, if it is below."""
     here = Path.cwd().resolve()
     return str(path.relative_to(here) if path.is_relative_to(here) else path)
 
 
 @contextmanager
 def progress_bar(title: str, total: int, unit: str, first: str = "compiling") -> Iterator[Callable[[int], None]]:
-    """Show on stderr how far a command is, and how long the rest takes; `first` is what it does before the work."""
+    """Show on stderr a command's progress and its remaining time; `first` is the stage before the work."""
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
@@ -219,13 +219,13 @@ def progress_bar(title: str, total: int, unit: str, first: str = "compiling") ->
 
 
 class _Clock:
-    """How long the rest takes, by what was done since the first news: compiling before that does not count."""
+    """Remaining time, by the work since the first report: compiling before that does not count."""
 
     def __init__(self) -> None:
         self._since: tuple[float, int] | None = None
 
     def left(self, done: int, total: float) -> str:
-        """Return it in words, "" as long as nothing has been done."""
+        """Return it in words, "" until some work is done."""
         now = time.monotonic()
         if self._since is None:
             self._since = now, done
@@ -262,7 +262,7 @@ def shown_progress(progress: Progress) -> Iterator[Progress]:
 
 
 def _tell(progress: Progress, done: threading.Event) -> None:
-    """Write a line about each bar that is at work, until all is done."""
+    """Write a line about each active bar, until all is done."""
     wait = FIRST
     while not done.wait(wait):
         wait = OFTEN
@@ -272,7 +272,7 @@ def _tell(progress: Progress, done: threading.Event) -> None:
 
 
 def _told(task: Task) -> str:
-    """Return one line about a bar: what is done, how much of it, since when, and how long the rest takes."""
+    """Return one line about a bar: its task, the share done, the time so far, and the remaining time."""
     share = f" {100 * task.completed / task.total:.3g} %" if task.total and task.completed else ""
     more = [f"{in_words(task.elapsed or 0.0)} so far", *(str(text) for text in task.fields.values() if text)]
     if "left" not in task.fields and task.completed and task.time_remaining is not None:

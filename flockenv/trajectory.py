@@ -49,10 +49,10 @@ class Trajectory:
     last: State
     wall: float  # s, without compiling
     stopped: str  # why it ended before its time; "" if it did not
-    heading: Floats | None = None  # (T, N, D) where everybody faces, of scenes that keep headings
-    identity: NDArray[np.int64] | None = None  # (T, N) who is in each slot, of scenes with a population
-    born: NDArray[np.float64] | None = None  # (T, N) s, since when
-    shown: NDArray[np.float64] | None = None  # (T, N) what goes on inside, of scenes whose pictures show it
+    heading: Floats | None = None  # (T, N, D) directions that agents face, of scenes that keep headings
+    identity: NDArray[np.int64] | None = None  # (T, N) the agent in each slot, of scenes with a population
+    born: NDArray[np.float64] | None = None  # (T, N) s, times of birth
+    shown: NDArray[np.float64] | None = None  # (T, N) inner numbers, of scenes whose pictures show them
 
     @property
     def rate(self) -> float:
@@ -72,7 +72,7 @@ class Trajectory:
         return {name: (start[name], end[name]) for name in start}
 
     def snapshots(self, title: str = "") -> Iterator[Snapshot]:
-        """Return every instant, ready to be drawn, all in one frame: the space, or where anybody ever was."""
+        """Return every instant, ready to be drawn, all in one frame: the space, or the box of all positions."""
         times = (self.step * self.scene.dt).tolist()
         low, high = _region(self.scene, self.pos, self.alive, times)
         start = replace(self.scene.snapshot(self.first, title=title), outlines=self.scene.outlines(low, high, times[0]))
@@ -87,7 +87,7 @@ class Trajectory:
             )  # fmt: skip
 
     def summary(self) -> dict[str, Any]:
-        """Return what is worth knowing without the arrays, ready for JSON: what has no meaning is null, never NaN."""
+        """Return a summary without arrays, ready for JSON: numbers without a meaning are null, never NaN."""
         return {
             "format": FORMAT,
             "scene": self.scene.model_dump(mode="json"),
@@ -107,8 +107,8 @@ class Trajectory:
 
         Arrays: time (T,) s, pos (T, N, D) m, vel (T, N, D) m/s, alive (T, N), radius (N,) m, seed, and `scene`, the
         YAML text that `load_scene` reads; heading (T, N, D) where headings are kept; identity and born (T, N), s, where
-        there is a population; shown (T, N), where pictures show what goes on inside. None needs pickle. Missing folders
-        are made.
+        there is a population; shown (T, N), if pictures show inner numbers. None needs pickle. Missing folders are
+        made.
         """
         beside = path.with_suffix(".json")
         summary = json.dumps(self.summary(), indent=2, allow_nan=False) + os.linesep
@@ -132,7 +132,7 @@ def record(
     """Run a scene for `steps` physics steps and keep an instant every `every` steps, and the last one.
 
     progress is called with the steps done, first with 0 once the scene is compiled. A KeyboardInterrupt, or a position
-    that is no longer finite, ends the run early: what was done until then is returned, and `stopped` says why.
+    that is no longer finite, ends the run early: the instants until then are returned, and `stopped` has the reason.
     Raises ValueError, before anything is computed, if the instants would take more than MEMORY_LIMIT.
     """
     film = _Film.of(scene, _checked_instants(scene, steps, every))
@@ -164,15 +164,15 @@ def record(
 
 
 def _compile(scene: Scene, first: State, steps: int) -> None:
-    """Compile, or read from the cache, what a run needs: by a first step whose result nobody sees."""
+    """Compile, or read from the cache, what a run needs, by a first step whose result is discarded."""
     if steps > 0:
-        with suppress(FloatingPointError):  # the run itself says so
+        with suppress(FloatingPointError):  # the run itself reports it
             scene.run(first, 1)
 
 
 @dataclass(frozen=True, eq=False)
 class _Film:
-    """Room for instants, and those that are there."""
+    """Arrays for all instants of a run, and the number of instants kept."""
 
     pos: Floats
     vel: Floats
@@ -224,7 +224,7 @@ def _checked_instants(scene: Scene, steps: int, every: int) -> int:
 
 
 def whole_steps(name: str, seconds: float, dt: float, least: int = 0) -> int:
-    """Return how many steps of dt a time takes; raises ValueError, with the nearest, if that is no whole number."""
+    """Return how many steps of dt a time takes; raises ValueError, with the nearest, if that is no integer."""
     if not (math.isfinite(seconds) and seconds >= 0):
         raise ValueError(f"{name} = {seconds:g}: must be a finite number of seconds >= {least * dt:g}")
     if seconds / dt > 2**53:
@@ -242,7 +242,7 @@ def _region(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     if not isinstance(scene.space, Plane):
         return np.zeros(scene.dimension), np.array(scene.space.extent(scene.dimension))
-    living = alive[..., None] if scene.population and alive.any() else True  # slots of nobody are nowhere
+    living = alive[..., None] if scene.population and alive.any() else True  # empty slots have no place
     ends = ((np.min, np.inf), (np.max, -np.inf))
     low, high = (np.asarray(end(pos, axis=(0, 1), where=living, initial=far), np.float64) for end, far in ends)
     margin = 1.0 + 0.05 * float((high - low).max())

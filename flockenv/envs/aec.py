@@ -1,4 +1,4 @@
-"""PettingZoo's turn-based form (AEC) of a parallel environment: agents hand in actions one by one, then all act."""
+"""PettingZoo's turn-based form (AEC) of a parallel environment: agents pass actions one by one, then all act."""
 
 from __future__ import annotations
 

@@ -160,7 +160,7 @@ def render_fps(task: Task) -> int:
 
 
 def checked_seed(seed: Any) -> int | None:
-    """Return the seed as an int, or None; TypeError for what is no whole number, ValueError outside 0 ... 2**63 - 1."""
+    """Return the seed as an int, or None; TypeError if it is no integer, ValueError outside 0 ... 2**63 - 1."""
     if seed is None:
         return None
     try:
@@ -200,7 +200,7 @@ class Screen:
     Args:
         mode: "human" (a window), "rgb_array" ((H, W, 3) uint8, headless) or None.
         fps: frames per second of the window.
-        modes: what this face can do.
+        modes: the modes of this face.
     """
 
     def __init__(self, mode: str | None, fps: int, modes: tuple[str, ...] = RENDER_MODES) -> None:
@@ -212,7 +212,7 @@ class Screen:
         self._window: Window | None = None
 
     def show(self, snapshot: Snapshot, mode: str | None = None) -> NDArray[np.uint8] | None:
-        """Draw one instant, in another mode than usual if told so: return the picture, or show it and return None."""
+        """Draw one instant, in `mode` if given: return the picture, or show it and return None."""
         from flockenv.render import Window, draw
 
         mode = mode or self.mode

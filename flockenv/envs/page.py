@@ -15,7 +15,7 @@ __all__ = ["page"]
 
 
 def page(summary: str, task: Task, name: str, history: str) -> str:
-    """Return the page of an environment in Markdown: what it is about, its tables, its arguments, its history.
+    """Return the page of an environment in Markdown: its summary, its tables, its arguments, its history.
 
     The description is the docstring of the task's class; everything else is read from the task.
     """
@@ -79,7 +79,7 @@ def _range(layout: Layout) -> str:
 
 
 def _layout(layout: Layout) -> str:
-    """Return the table of a row of numbers: where each quantity stands, what it means, in which unit, between what."""
+    """Return the table of a row of numbers: place, meaning, unit and bounds of each quantity."""
     rows, start = [], 0
     slots = (slot for slot in layout.slots if slot.size)
     for (index, name, unit, meaning), slot in zip(layout.table(), slots, strict=True):

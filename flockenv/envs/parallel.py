@@ -160,10 +160,10 @@ class WorldParallelEnv(ParallelEnv[str, Rows, Rows]):  # type: ignore[misc]  # p
         return outcome  # type: ignore[return-value]  # five dictionaries
 
     def _step(self, actions: Mapping[str, Rows]) -> Step:
-        """Let the world act; ValueError names the agent that is at fault, asking one by one only if somebody is."""
+        """Let the world act; ValueError names the agent at fault, found one by one only if the block is refused."""
         if not isinstance(actions, Mapping):
             raise TypeError(f"actions: {type(actions).__name__}, must be a dictionary from agent to action")
-        if [*actions] == [*self._live]:  # in our order, as most hand them in
+        if [*actions] == [*self._live]:  # in our order, as most callers pass them
             given = [*actions.values()]
         elif self._live.keys() <= actions.keys() <= self.action_spaces.keys():
             given = [actions[name] for name in self._live]
@@ -177,7 +177,7 @@ class WorldParallelEnv(ParallelEnv[str, Rows, Rows]):  # type: ignore[misc]  # p
             raise
 
     def _rows(self, given: list[Rows]) -> Rows:
-        """Return the actions of all who live as (1, L, A), zeros for who has left."""
+        """Return the actions of all living agents as (1, L, A), with zeros for agents that have left."""
         block, everybody = np.asarray(given), len(self.possible_agents)
         if len(given) == everybody:
             return block[None]
@@ -268,7 +268,7 @@ class FlockParallelEnv(WorldParallelEnv):
 
 
 class PursuitParallelEnv(WorldParallelEnv):
-    """Pursuit as a game of two sides: three pursuers and two evaders, all of them agents; who is captured leaves."""
+    """Pursuit as a game of two sides: three pursuers and two evaders, all of them agents; captured ones leave."""
 
     task_type = Pursuit
     fixed: ClassVar[dict[str, Any]] = {"pursuers": 3, "evaders": 2, "sides": "both"}
@@ -300,6 +300,6 @@ class CorridorParallelEnv(WorldParallelEnv):
 
 
 class BottleneckParallelEnv(WorldParallelEnv):
-    """Everybody leaves a room through one door, all of them agents; who is out leaves (learners=k: the first k are)."""
+    """A crowd leaves a room by one door; all are agents, each until it is out (learners=k: only the first k are)."""
 
     task_type = Bottleneck

@@ -1,4 +1,4 @@
-"""The ids, and where each is built: strings and numbers only, so that importing flockenv imports no simulator."""
+"""Ids, and the module that builds each: strings and numbers only, so that importing flockenv imports no simulator."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ HORIZONS = {
 """Time limit of an episode in control steps, by name: `Task.horizon`, repeated here so that no task is imported."""
 
 VERSIONS = {"Corridor": 1, "Evade": 1, "Flock": 1}
-"""Versions of environments whose results have moved, by name; all others are 0. Each class's `history` says why."""
+"""Versions of environments whose results have changed, by name; all others are 0. Reasons: each class's `history`."""
 
 
 def id_of(name: str) -> str:
@@ -44,7 +44,7 @@ PARALLEL = {
 
 
 def register_all() -> None:
-    """Tell Gymnasium and PettingZoo about every environment; what is there already stays."""
+    """Register every environment with Gymnasium and PettingZoo; existing registrations stay."""
     for name, horizon in HORIZONS.items():
         _register_single(id_of(name), name, horizon)
     for env_id, module in PARALLEL.items():

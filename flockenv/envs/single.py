@@ -72,7 +72,7 @@ class SingleEnv(gymnasium.Env[Rows, Rows]):
     """One world with one learner, as Gymnasium wants it; `task` and `world` give access to the arrays inside.
 
     Seeds: `reset(seed=s)` begins episode 0 of seed s; each later `reset()` begins the next episode of that seed, and a
-    first `reset()` without a seed draws one. `info["seed"]` of a reset says which it was.
+    first `reset()` without a seed draws one. `info["seed"]` of a reset is the seed used.
     """
 
     task_type: ClassVar[type[Task]]
@@ -185,7 +185,7 @@ class FlockEnv(SingleEnv):
 
 
 class CrossingEnv(SingleEnv):
-    """A learner crosses a circle among scripted walkers who keep clear of each other by ORCA, and of him."""
+    """A learner crosses a circle among scripted walkers that keep clear of it and of each other by ORCA."""
 
     task_type = Crossing
     fixed: ClassVar[dict[str, Any]] = {"learners": 1}
@@ -217,7 +217,7 @@ class SchoolEnv(SingleEnv):
 
 
 class CrowdNavEnv(SingleEnv):
-    """A robot crosses a crowd of pedestrians who swap places under a social force, and must touch nobody."""
+    """A robot crosses a crowd of pedestrians that swap places under a social force, and must touch none of them."""
 
     task_type = CrowdNav
     history = "v0: first version (flockenv 0.2.0)."
@@ -235,7 +235,7 @@ class CorridorEnv(SingleEnv):
 
 
 class BottleneckEnv(SingleEnv):
-    """One person leaves a room through a door that scripted others want to leave by too."""
+    """One person leaves a room through a door that scripted others also leave by."""
 
     task_type = Bottleneck
     fixed: ClassVar[dict[str, Any]] = {"learners": 1}

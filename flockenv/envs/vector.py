@@ -1,7 +1,7 @@
 """Gymnasium's vector environments: many worlds in one array program, without subprocesses or a loop over worlds.
 
 They behave as gymnasium's SyncVectorEnv over the single environments does, number for number and info for info (a test
-compares the two), in each of the three ways to begin anew; who asks for infos of ends is told of those alone.
+compares the two), in each of the three autoreset modes; `infos="ends"` reports ends and begins alone.
 """
 
 from __future__ import annotations
@@ -76,7 +76,7 @@ class WorldsEnv(VectorEnv[Rows, Rows, Rows]):
     """B independent worlds with L learners each as B L rows; row i is learner i % L of world i // L.
 
     With one learner a world, row k of seed s is the single environment of seed s + k. With several, which must all end
-    together, rows of one world share its seed, its metrics, its success, and when it ends and begins anew.
+    together, rows of one world share its seed, metrics and success; they end together and begin anew together.
 
     Args:
         num_envs: B L, how many rows; a whole number of worlds.
@@ -86,8 +86,8 @@ class WorldsEnv(VectorEnv[Rows, Rows, Rows]):
             reward 0 and no end. "SameStep": in the step that ends it; `info["final_obs"]` and `info["final_info"]`
             hold the end. "Disabled": only by `reset(options={"reset_mask": mask})`.
         render_mode: "rgb_array" or None.
-        infos: "steps" tells of every row after every step, as single environments do; "ends" only of episodes that
-            end, how they ended, and of those that begin, their seeds: faster with many rows.
+        infos: "steps" reports every row after every step, as single environments do; "ends" only the metrics of
+            episodes that end and the seeds of episodes that begin: faster with many rows.
         parameters: those of the task.
     """
 
@@ -148,7 +148,7 @@ class WorldsEnv(VectorEnv[Rows, Rows, Rows]):
         return observation.reshape(self.num_envs, -1), self._begun(mask)
 
     def _rows(self, column: NDArray[Any]) -> NDArray[Any]:
-        """Return what is so for a world, (B, ...), for each of its rows; always a copy."""
+        """Return the values of worlds, (B, ...), repeated for each of their rows; always a copy."""
         return np.repeat(column, self.task.learners, axis=0)
 
     def _seed_column(self, seed: int | Sequence[int | None] | None) -> NDArray[np.int64]:
@@ -166,7 +166,7 @@ class WorldsEnv(VectorEnv[Rows, Rows, Rows]):
         return self._one_per_world("seed", np.array([NONE if s is None else s for s in given], np.int64))
 
     def _reset_mask(self, options: Mapping[str, Any]) -> Mask:
-        """Return which worlds to begin, (B,)."""
+        """Return the worlds to begin, (B,) bool."""
         if "reset_mask" not in options:
             return np.ones(self.world.worlds, np.bool_)
         mask = options["reset_mask"]
@@ -180,7 +180,7 @@ class WorldsEnv(VectorEnv[Rows, Rows, Rows]):
         return self._one_per_world("options['reset_mask']", mask)
 
     def _one_per_world(self, what: str, column: NDArray[Any]) -> NDArray[Any]:
-        """Return the first of each world's rows; ValueError where another row of that world says something else."""
+        """Return the first of each world's rows; ValueError if another row of that world differs."""
         several = column.reshape(self.world.worlds, self.task.learners)
         differ = several != several[:, :1]
         if differ.any():
@@ -224,9 +224,9 @@ class WorldsEnv(VectorEnv[Rows, Rows, Rows]):
         return observation, reward, terminated.reshape(-1), late, info
 
     def _infos(self, result: Step, anew: Mask | None, final: bool) -> Info:
-        """Tell of every row, or of those that ended; begin the worlds that begin anew, in the result's observations.
+        """Return infos of every row, or of those that ended; begin worlds anew, in the result's observations.
 
-        final: they have just ended, so tell first how.
+        final: the worlds have just ended, so that their last observations and infos are entered first.
         """
         info: Info = {}
         told, anew = self._told(), self._nobody if anew is None else anew
@@ -246,7 +246,7 @@ class WorldsEnv(VectorEnv[Rows, Rows, Rows]):
         return info
 
     def _told(self) -> Mask:
-        """Return of which worlds this step has something to tell."""
+        """Return the worlds that this step's infos report, (B,) bool."""
         return self._ended if self.infos == "ends" else np.ones(self.world.worlds, np.bool_)
 
     def _begun(self, worlds: Mask) -> Info:
@@ -267,7 +267,7 @@ class WorldsEnv(VectorEnv[Rows, Rows, Rows]):
         return None
 
     def _blocks(self, actions: Rows, resting: Mask | None) -> Rows:
-        """Return the actions by world and learner, (B, L, A), with zeros for who rests."""
+        """Return the actions by world and learner, (B, L, A), with zeros for resting worlds."""
         given = np.asarray(actions)
         if given.shape != self.action_space.shape:
             raise ValueError(f"actions: shape {given.shape}, must be {self.action_space.shape}, a row per learner")
@@ -275,7 +275,7 @@ class WorldsEnv(VectorEnv[Rows, Rows, Rows]):
         return blocks if resting is None else np.where(resting[:, None, None], 0.0, blocks)
 
     def _columns(self, result: Step) -> tuple[Info, dict[str, Mask]]:
-        """Return what is told of every row, and of which rows a metric has no value yet (and zero in its place)."""
+        """Return infos as columns over rows, and by column the rows that have no value yet (zero in its place)."""
         columns: Info = {key: result.terms[..., k].reshape(-1) for k, key in enumerate(self._reward_keys)}
         columns["is_success"] = self._rows(result.success)
         lacks = {}
@@ -311,7 +311,7 @@ def _autoreset(mode: str | AutoresetMode) -> AutoresetMode:
 
 
 def _worlds(rows: Any, learners: int) -> int:
-    """Return how many worlds so many rows are; ValueError if their learners do not fill whole worlds."""
+    """Return the number of worlds that these rows make; ValueError if their learners do not fill whole worlds."""
     if learners == 1 or not isinstance(rows, int | np.integer):
         return rows  # type: ignore[no-any-return]  # World refuses what is no number of worlds
     worlds, over = divmod(int(rows), learners)
@@ -329,7 +329,7 @@ def _worlds(rows: Any, learners: int) -> int:
 
 
 def _put(info: Info, columns: Mapping[str, Any], mask: Mask, lacks: Mapping[str, Mask] = MappingProxyType({})) -> None:
-    """Enter columns, with the rows that they speak of; a column that speaks of none is left out."""
+    """Enter columns, with the mask of their rows; a column without rows is left out."""
     for name, column in columns.items():
         here = mask & ~lacks[name] if name in lacks else mask.copy()
         if here.any():
@@ -337,7 +337,7 @@ def _put(info: Info, columns: Mapping[str, Any], mask: Mask, lacks: Mapping[str,
 
 
 def _put_final(info: Info, seen: NDArray[np.float32], columns: Info, mask: Mask, lacks: Mapping[str, Mask]) -> None:
-    """Enter how the rows that ended ended: what they saw last as objects, what is told of them as columns."""
+    """Enter the ends of rows: their last observations as objects, their infos as columns."""
     rows = np.flatnonzero(mask)
     last = np.full(len(mask), None, object)
     last[rows] = np.fromiter(seen.reshape(len(rows), -1), object, len(rows))
@@ -426,7 +426,7 @@ class CorridorVectorEnv(WorldsEnv):
 
 
 class BottleneckVectorEnv(WorldsEnv):
-    """People who leave rooms, one per world, or `learners=` several with `together=True`; see single.BottleneckEnv."""
+    """People leaving rooms, one per world, or `learners=` several with `together=True`; see single.BottleneckEnv."""
 
     task_type = Bottleneck
     fixed: ClassVar[dict[str, Any]] = {"learners": 1}

@@ -68,7 +68,7 @@ def _load_zip(path: Path) -> Policy:
 
 
 def _load_python(path: Path, task: Task) -> FilePlayer:
-    """Execute a player file and take what it offers."""
+    """Execute a player file and return the player that it offers."""
     module = _guarded(path, "while loading it", _execute, path)
     kinds = [name for name in ("player", "Player", "predict") if hasattr(module, name)]
     if not kinds:
@@ -106,8 +106,8 @@ def _execute(path: Path) -> Any:
 class FilePlayer:
     """The `predict` of a player file: SB3's four arguments and a pair back, or observations in and actions out.
 
-    Whatever its code raises, SystemExit too, is a PlayerError: one line with the file, the line in it and the error.
-    So are actions of another shape, and such that are not finite.
+    Any exception of its code, also SystemExit, becomes a PlayerError: one line with the file, the line in it and the
+    error. So do actions of another shape, or that are not finite.
     """
 
     def __init__(self, path: Path, name: str, function: Callable[..., Any], action_size: int) -> None:
@@ -144,7 +144,7 @@ class FilePlayer:
 
 
 def _guarded(path: Path, where: str, function: Callable[..., Any], *arguments: Any) -> Any:
-    """Call code of a player file; what it raises becomes one line that names the file."""
+    """Call code of a player file; an exception becomes one line that names the file."""
     try:
         return function(*arguments)
     except (Exception, SystemExit) as error:
@@ -161,7 +161,7 @@ def _line_in(path: Path, error: BaseException) -> str:
 
 
 def _takes(function: Callable[..., Any], count: int) -> bool:
-    """Return True if a function can be called with so many arguments; a built-in one, which keeps it secret, can."""
+    """True if a function can be called with `count` arguments; true of built-in ones, which have no signature."""
     try:
         signature = inspect.signature(function)
     except (TypeError, ValueError):

@@ -1,9 +1,9 @@
-"""Births of all worlds in one call: who is due, in which slot, where, how fast and for how long.
+"""Births of all worlds in one call: which are due, in which slot, where, how fast and for how long.
 
 A row of `streams` is an emitter's rate, or one of its bursts: the first slot, and the one after the last; from when and
 until when, s; rate, 1/s; how many at once; speed from, to, m/s; spread, rad; 1 if along the normal; direction (3);
 lifetime from, to, s; 1 if born in one place; the kind of its place, and the numbers of that.
-Number k of stream e is somebody new: the agent N + k E + e of a scene of N slots and E streams.
+Number k of stream e is a new agent, of identity N + k E + e in a scene of N slots and E streams.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ PLACE = 17
 
 @kernel
 def due(row: Any, time: float, dt: float) -> int:
-    """Return how many of a stream are born until `time`, s; somebody due at that instant, but for rounding, is."""
+    """Return how many of a stream are born until `time`, s; one that is due at that instant, but for rounding, is."""
     if row[4] == 0.0:
         return int(row[5]) if time + 1e-9 * dt >= row[2] else 0
     expected = row[4] * (min(time, row[3]) - row[2])
@@ -102,7 +102,7 @@ def _on_round(piece: Any, flat: bool, s: float, t: float) -> tuple[Vec, Vec]:
 
 @law
 def _within(piece: Any, spot: Vec) -> bool:
-    """Does a place lie within a part of a line with a thickness, and not at its surface?"""
+    """True if a place lies within a part of a line with a thickness, and not at its surface."""
     line, way = sub(_three(piece, 5), _three(piece, 2)), sub(spot, _three(piece, 2))
     square = dot(line, line)
     share = min(max(dot(line, way) / square, 0.0), 1.0) if square > 0.0 else 0.0
@@ -163,7 +163,7 @@ def _in_clearing(
     x: Any, b: int, row: Any, key: Any, who: int, channel: int, period: Any, grid: Any, start: Any, order: Any,
     born: Any, identity: Any,
 ) -> Vec:  # fmt: skip
-    """Return that of some places of a box that has the fewest of the living around it; of equals the first."""
+    """Return, of some places drawn in a box, the one with the fewest living agents around it; of equals the first."""
     best: Vec = (0.0, 0.0, 0.0)
     fewest = 2**62
     for attempt in range(int(row[PLACE + 7])):
@@ -188,7 +188,7 @@ def _spot(
     d: int, row: Any, pieces: Any, x: Any, b: int, key: Any, who: int, channel: int, period: Any, grid: Any, start: Any,
     order: Any, born: Any, identity: Any,
 ) -> tuple[Vec, Vec]:  # fmt: skip
-    """Return where somebody is born, and whither the direction is: the row's, or the outward normal of a surface."""
+    """Return the place of a birth, and the direction: the row's, or the outward normal of a surface."""
     draws, aim = _draw(key, who, channel), _three(row, 10)
     if row[16] <= 1.0:
         return _in_box(row, (draws[0], draws[0], draws[0])), aim
@@ -210,11 +210,11 @@ def births(
     dies: Any, tick: Any, key: Any, work: Any, radius: Any, dt: float, walls: bool, size: Any, period: Any, first: int,
     end: int, grid: Any, cell: Any, start: Any, order: Any,
 ) -> None:  # fmt: skip
-    """Bring to life who is due in the step that ends now, in worlds [first, end); at the start, who is at once.
+    """Bring to life the agents that are due in the step that ends now, in worlds [first, end); at the start, at once.
 
-    clearing: m, the widest radius within which neighbours are asked for; where nobody asks, grid, cell, start and order
-    are None, and nothing of it is compiled. walls: is the space a box of `size` (3,) m? period (3,) m: 0 where an axis
-    does not repeat.
+    clearing: m, the largest radius within which neighbours are counted; if no place counts any, grid, cell, start and
+    order are None, and nothing of it is compiled. walls: True if the space is a box of `size` (3,) m. period (3,) m: 0
+    where an axis does not repeat.
     """
     n, kinds = x.shape[2], streams.shape[0]
     for b in range(first, end):

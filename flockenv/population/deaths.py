@@ -1,7 +1,7 @@
-"""Deaths of all worlds in one call for each sink: whose time has come, who left, who decays, who is in a drain.
+"""Deaths of all worlds in one call for each sink: by age, on leaving a region, by chance, in a drain, in a crowd.
 
-Each sink decides about everybody who lives when its turn comes, before any of them dies: the order of agents is
-nothing to it.
+Each sink selects among all agents that live when its turn comes, before any of them dies: the result does not depend
+on the order of agents.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ DECAY = 2_000_000
 
 @kernel
 def _die(b: int, i: int, v: Any, alive: Any, work: Any) -> None:
-    """Let an agent die: its slot is free, and keeps where it died and who it was."""
+    """Let an agent die: its slot is free, and keeps the place of death and the identity."""
     alive[b, i] = False
     for k in range(v.shape[0]):
         v[k, b, i] = 0
@@ -37,9 +37,9 @@ def _die(b: int, i: int, v: Any, alive: Any, work: Any) -> None:
 
 @law
 def _chance(rate: float, usual: float, born: float, now: float, dt: float) -> float:
-    """Return with which probability somebody dies since sinks asked last; `usual` is that of a step, 1 - exp(-rate dt).
+    """Return the probability that an agent died since the sinks last acted; `usual`: in a step, 1 - exp(-rate dt).
 
-    Who was born within the step before was not asked then: he has been alive for longer than a step.
+    An agent that was born within the step before was not yet drawn for: it has been alive for longer than a step.
     """
     late = born > now - (2.0 - 1e-6) * dt and born < now - dt
     return 1.0 - math.exp(-rate * (now - born)) if late else usual
@@ -50,7 +50,7 @@ def passing(
     sinks: Any, x: Any, v: Any, alive: Any, identity: Any, born: Any, dies: Any, tick: Any, key: Any, work: Any,
     dt: float, first: int, end: int, channel: int,
 ) -> None:  # fmt: skip
-    """Let those die whose own time has come, then those whom sinks of age, region and chance take; worlds [first, end).
+    """Let agents die at the end of their own lifetime, then by sinks of age, region and chance; worlds [first, end).
 
     sinks: a row each: kind (0 age, 1 region, 2 chance), first slot, the one after the last, numbers.
     """
@@ -83,10 +83,10 @@ def drain(
     table: Any, margin: float, slots: Any, anchor: Vec, period: Vec, x0: Any, x: Any, v: Any, alive: Any, tick: Any,
     work: Any, dt: float, first: int, end: int,
 ) -> None:  # fmt: skip
-    """Let those die who are in a shape, or went through it in the step that began at x0; slots (first, end).
+    """Let agents die that are in a shape, or went through it in the step that began at x0; slots (first, end).
 
     table: the shape's row (see shapes/table.py); anchor, period: (D,) m, the latter 0 where an axis does not repeat.
-    Where the shape moves, ways are as seen from it.
+    If the shape moves, paths are relative to it.
     """
     for b in range(first, end):
         shift = shift_of(table, 0, tick[b] * dt, anchor)
@@ -107,7 +107,7 @@ def crowding(
     row: Any, channel: int, x: Any, v: Any, alive: Any, identity: Any, born: Any, tick: Any, key: Any, work: Any,
     dt: float, period: Any, first: int, end: int, grid: Any, cell: Any, start: Any, order: Any, doomed: Any,
 ) -> None:  # fmt: skip
-    """Let those die who have too many elders around them.
+    """Let agents die that have too many elders around them.
 
     row: kind, first slot, the one after the last, radius [m], how many, rate [1/s]. doomed (N,): scratch.
     """
@@ -134,7 +134,7 @@ def crowding(
 
 @kernel
 def reaching(numbers: Any, level: float, slots: Any, v: Any, alive: Any, work: Any, first: int, end: int) -> None:
-    """Let those die in whom a number, numbers (B, N), has come to a level; slots (first, end)."""
+    """Let agents die whose number, of numbers (B, N), has come to a level; slots (first, end)."""
     for b in range(first, end):
         for i in range(slots[0], slots[1]):
             if alive[b, i] and numbers[b, i] >= level:

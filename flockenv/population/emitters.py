@@ -1,8 +1,8 @@
-"""Emitters: where, when and how fast agents come to life.
+"""Emitters: the places, times and velocities at which agents come to life.
 
-When is a function of time alone: number k of an emitter with a rate is born at start + (k + 1) / rate, whatever dt is,
-and where, how fast and for how long is a function of the world's key and its identity. So another dt, another order or
-another number of threads gives the same births.
+The time of a birth is independent of dt: number k of an emitter with a rate is born at start + (k + 1) / rate. Its
+place, velocity and lifetime are functions of the world's key and its identity. So another dt, another order or another
+number of threads gives the same births.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ Range = tuple[Annotated[float, Field(ge=0)], Annotated[float, Field(ge=0)]]
 
 
 class Burst(Record):
-    """So many at once."""
+    """A number of births at one time."""
 
     time: float = Field(ge=0, description="s since the start")
     count: int = Field(ge=1, le=2**24, description="how many")
@@ -35,7 +35,7 @@ class Burst(Record):
 class Emitter(Member):
     """Brings the dead of a group to life: at a rate, in bursts, or both; of T seconds at a rate, floor(rate T) agents.
 
-    Who is born within a step is moved on by its velocity for the rest of it; forces act from the next step on. If no
+    An agent born within a step moves with its velocity for the rest of it; forces act from the next step on. If no
     slot is free a birth is left out, and counted as refused. Slots begin dead, but for `alive` of the group.
     """
 
@@ -45,7 +45,7 @@ class Emitter(Member):
     rate: float = Field(default=0.0, ge=0, le=MOST_RATE, description="1/s")
     start: float = Field(default=0.0, ge=0, description="s, from when on there is a rate")
     end: float | None = Field(default=None, gt=0, description="s, until when; none = for ever")
-    bursts: tuple[Burst, ...] = Field(default=(), description="so many at once, at these times")
+    bursts: tuple[Burst, ...] = Field(default=(), description="numbers of births at given times")
     together: bool = Field(default=False, description="does each burst begin in one place, drawn for all of it?")
     speed: Range = Field(default=(0.0, 0.0), description="m/s, least and most")
     direction: Vector | None = Field(
@@ -76,11 +76,11 @@ class Emitter(Member):
         return self
 
     def feeds(self, group: int) -> bool:
-        """Does it bring agents of this group to life?"""
+        """True if it brings agents of this group to life."""
         return group == self.group
 
     def check(self, scene: Any) -> None:
-        """Refuse a group that there is not, other dimensions, and speeds beyond the group's limit."""
+        """Refuse a group that does not exist, other dimensions, and speeds beyond the group's limit."""
         demand_group(scene, self.group)
         group = scene.groups[self.group]
         if group.network is not None:

@@ -17,7 +17,7 @@ class Member(Record):
 
     kind: str
     looks_back: ClassVar[bool] = False
-    """Does it ask where everybody was before the step?"""
+    """True if it reads the positions of all agents before the step."""
 
     @classmethod
     def __pydantic_init_subclass__(cls, **kwargs: Any) -> None:
@@ -26,15 +26,15 @@ class Member(Record):
             POPULATION[cls.model_fields["kind"].default] = cls
 
     def check(self, scene: Any) -> None:
-        """Refuse a scene that this does not suit: ValueError that begins with the field's name."""
+        """Refuse a scene that this does not suit: a ValueError that begins with the field's name."""
 
     def feeds(self, group: int) -> bool:
-        """Does it bring agents of this group to life?"""
+        """True if it brings agents of this group to life."""
         return False
 
 
 def demand_group(scene: Any, which: int | None) -> None:
-    """Refuse a group that there is not."""
+    """Refuse a group that does not exist."""
     count = len(scene.groups)
     if which is not None and which >= count:
         known = f"the scene has {count}, counted from 0" if count > 1 else "the scene has one, group 0"
@@ -42,7 +42,7 @@ def demand_group(scene: Any, which: int | None) -> None:
 
 
 def dimensions(scene: Any, **given: tuple[float, ...] | None) -> None:
-    """Refuse a vector that has not as many numbers as the scene has dimensions."""
+    """Refuse a vector whose length is not the scene's number of dimensions."""
     for name, value in given.items():
         if value is not None and len(value) != scene.dimension:
             raise ValueError(f"{name} = {value}: has {len(value)} numbers, but dimension = {scene.dimension}")

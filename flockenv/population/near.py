@@ -1,7 +1,7 @@
-"""How many of the living are near a place: agents of one world counted into cells, for sinks and clearings alone.
+"""Counts of living agents near a place: a cell list of the agents of one world, for sinks and clearings alone.
 
-Effects have a query of their own, over blocks of lanes, before a step; here it is its end, places need not be agents,
-and most scenes never ask.
+Effects have a query of their own, over blocks of lanes, before a step. This one runs at the end of a step, its places
+need not be agents, and most scenes never use it.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ def _inside(p: float, size: float) -> float:
 
 @kernel
 def _bounds(x: Any, alive: Any, b: int, first: int, end: int, period: Any, grid: Any) -> None:
-    """Write where the living of slots [first, end) begin, grid[0], and how far they are spread, grid[1]; (4, 3)."""
+    """Write the lower corner of the living of slots [first, end), grid[0], and their extent, grid[1]; (4, 3)."""
     for k in range(x.shape[0]):
         low, high = math.inf, -math.inf
         for i in range(first, end):
@@ -64,10 +64,10 @@ def sort_living(
     x: Any, alive: Any, b: int, first: int, end: int, reach: float, period: Any, grid: Any, cell: Any, start: Any,
     order: Any,
 ) -> None:  # fmt: skip
-    """List the living of slots [first, end) by cell, `reach` [m] wide and more.
+    """List the living of slots [first, end) by cell, at least `reach` [m] wide.
 
     period (3,): m, 0 where an axis does not repeat. Writes grid (4, 3): corner, edges, cells, cells per metre; order
-    (N,): who they are; start (N + 1,): the first of each cell. cell (N,) is scratch.
+    (N,): their slots; start (N + 1,): the first of each cell. cell (N,) is scratch.
     """
     d = x.shape[0]
     _bounds(x, alive, b, first, end, period, grid)
@@ -115,10 +115,10 @@ def count_near(
     x: Any, b: int, place: Any, reach: float, most: int, period: Any, grid: Any, start: Any, order: Any, born: Any,
     identity: Any, elder_than: int,
 ) -> int:  # fmt: skip
-    """Return how many of the listed are within `reach` of a place (3,), m; it stops counting beyond `most`.
+    """Return how many of the listed agents are within `reach` of a place (3,), m; it stops counting beyond `most`.
 
-    elder_than: a slot, if those alone count that were born before its agent (of two at once, whose identity is less);
-    -1 = everybody.
+    elder_than: a slot, if only agents born before its agent count (of two born at once, the one of lower identity is
+    the elder); -1 = all.
     """
     d, found = x.shape[0], 0
     nx, ny, nz = int(grid[2, 0]), int(grid[2, 1]), int(grid[2, 2])

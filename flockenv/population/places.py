@@ -1,4 +1,4 @@
-"""Where an emitter's agents are born: a point, a line, a disc or ball, a box, the surface of a shape, where few are."""
+"""Places of births: a point, a line, a disc or ball, a box, the surface of a shape, a clearing in a crowd."""
 
 from __future__ import annotations
 
@@ -30,11 +30,11 @@ def in_space(vector: Sequence[float]) -> list[float]:
 
 
 class Place(Record):
-    """Where agents are born, each place of it as often as any other."""
+    """A place of births, uniform over all its points."""
 
     kind: str
     code: ClassVar[int]
-    """By which number kernels know it."""
+    """Number of this kind in kernels."""
 
     @abstractmethod
     def row(self) -> list[float]:
@@ -43,14 +43,14 @@ class Place(Record):
     @property
     @abstractmethod
     def extremes(self) -> Floats:
-        """Places that everything of it lies between, (n, D) m."""
+        """Return points that bound it, (n, D) m."""
 
     def pieces(self) -> Floats:
         """Return the pieces of a surface, (n, 14); see surface.py."""
         return np.zeros((0, 14))
 
     def check(self, scene: Any) -> None:
-        """Refuse a scene that this does not suit: ValueError that begins with the field's name."""
+        """Refuse a scene that this does not suit: a ValueError that begins with the field's name."""
 
 
 class Point(Place):
@@ -61,7 +61,7 @@ class Point(Place):
     at: Vector = Field(description="m")
 
     def row(self) -> list[float]:
-        """Where it is, and where it ends."""
+        """Return the point, twice: as both ends of a segment."""
         return in_space(self.at) * 2
 
     @property
@@ -129,7 +129,7 @@ class Disc(Place):
 
 
 class _Corners(Place):
-    """What lies between two corners."""
+    """The region between two corners."""
 
     low: Vector = Field(description="m, lower corner")
     high: Vector = Field(description="m, upper corner")
@@ -162,7 +162,7 @@ class BoxPlace(_Corners):
 
 
 class Surface(Place):
-    """The surface of a shape; who has no direction flies along its outward normal."""
+    """The surface of a shape; agents without a direction start along its outward normal."""
 
     kind: Literal["surface"] = "surface"
     code: ClassVar[int] = 4
@@ -194,7 +194,7 @@ class Surface(Place):
 
 
 class Clearing(_Corners):
-    """Where few are in a box: of some places that are drawn, the one that has the fewest of the living around it."""
+    """A clearing in a box: of some places drawn at random, the one with the fewest living agents around it."""
 
     kind: Literal["clearing"] = "clearing"
     code: ClassVar[int] = 5
@@ -202,7 +202,7 @@ class Clearing(_Corners):
     candidates: int = Field(default=8, ge=1, le=64, description="places that are drawn for each birth")
 
     def row(self) -> list[float]:
-        """Its corners, how far it looks, how often it draws."""
+        """Its corners, the radius of its count, the number of draws."""
         return [*super().row(), self.radius, float(self.candidates)]
 
 

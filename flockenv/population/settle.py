@@ -22,7 +22,7 @@ from flockenv.state import Floats, State
 __all__ = ["NUMBERS", "beget", "settler"]
 
 NUMBERS = 4
-"""Numbers of scratch per agent: cells, who is in them, who is doomed."""
+"""Numbers of scratch per agent: cells, the agents in them, the agents that are to die."""
 
 WIDTH = PLACE + 8
 """Numbers of a row of streams."""
@@ -33,7 +33,7 @@ Part = Callable[[Floats, State, int, int], None]
 
 @dataclass(frozen=True, eq=False)
 class _Scratch:
-    """What one thread writes and nobody reads afterwards."""
+    """Scratch of one thread, which nothing reads afterwards."""
 
     grid: NDArray[np.float64]  # (4, 3) corner, edges, cells, cells per metre
     cell: NDArray[np.int32]  # (N,)
@@ -49,7 +49,7 @@ class _Scratch:
 
 
 def _sized(scene: Any, there: bool) -> NDArray[np.float64]:
-    """Return the size of the space, (3,) m; zeros where it has none of this kind."""
+    """Return the size of the space, (3,) m; zeros if it has none of this kind."""
     size = np.zeros(3)
     if there:
         size[: scene.dimension] = scene.space.size
@@ -61,7 +61,7 @@ def _period(scene: Any) -> NDArray[np.float64]:
 
 
 def _streams(scene: Any) -> tuple[Floats, Floats, float]:
-    """Return a row per rate and burst, group after group; the pieces of surfaces; and how far clearings look, m."""
+    """Return a row per rate and burst, group after group; surfaces' pieces; the largest radius of clearings, m."""
     emitters = sorted((m for m in scene.population if isinstance(m, Emitter)), key=lambda m: m.group)
     found: list[list[float]] = []
     pieces: list[Floats] = [np.zeros((0, 14))]
@@ -98,7 +98,7 @@ def _births(scene: Any, scratch: _Scratch) -> Part:
 
 
 def _slots(scene: Any, sink: Sink) -> tuple[int, int]:
-    """Return the first slot that a sink looks at, and the one after the last."""
+    """Return the first slot that a sink acts on, and the one after the last."""
     return (0, scene.agents) if sink.group is None else (scene.starts[sink.group], scene.starts[sink.group + 1])
 
 
@@ -153,13 +153,13 @@ def _reaching(scene: Any, sink: Threshold) -> Part:
 
 
 def _asks(scene: Any) -> bool:
-    """Does anybody in a population want to know who is near whom?"""
+    """True if a member of the population counts agents near a place."""
     places = [member.place for member in scene.population if isinstance(member, Emitter)]
     return any(isinstance(m, (Crowding, Clearing)) for m in (*scene.population, *places))
 
 
 def _parts(scene: Any) -> list[Part]:
-    """Return what is done at the end of a step: who has a lifetime and sinks, in the scene's order, then births."""
+    """Return what is done at the end of a step: lifetimes, then sinks in the scene's order, then births."""
     scratch = _Scratch.of(scene.agents, _asks(scene))
     emits = any(isinstance(member, Emitter) for member in scene.population)
     mortal = any(isinstance(m, Emitter) and m.lifetime is not None for m in scene.population)
@@ -183,7 +183,7 @@ def _parts(scene: Any) -> list[Part]:
 
 
 def beget(scene: Any, state: State) -> None:
-    """Bring to life who is born at the very start, in place."""
+    """Bring to life the agents that are born at time 0, in place."""
     if any(isinstance(member, Emitter) for member in scene.population):
         _births(scene, _Scratch.of(scene.agents, _asks(scene)))(state.x, state, 0, state.shape[0])
 

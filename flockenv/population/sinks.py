@@ -1,4 +1,4 @@
-"""Sinks: what lets agents die. Each looks at who lives when its turn comes, and decides about everybody at once."""
+"""Sinks: conditions under which agents die. Each selects among all living agents at once when its turn comes."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ __all__ = ["Ageing", "Crowding", "Decay", "Drain", "Leaving", "Sink", "Threshold
 
 
 class Sink(Member):
-    """What lets agents die, of one group or of all."""
+    """A condition under which agents of one group, or of all, die."""
 
     code: ClassVar[int]
-    """By which number kernels know it."""
+    """Number of this kind in kernels."""
 
     group: int | None = Field(default=None, ge=0, description="number of the group whose agents die; none = of all")
 
@@ -27,7 +27,7 @@ class Sink(Member):
         return []
 
     def check(self, scene: Any) -> None:
-        """Refuse a group that there is not, or whose agents are tied to each other."""
+        """Refuse a group that does not exist, or one whose agents are bound to each other."""
         demand_group(scene, self.group)
         for k, group in enumerate(scene.groups):
             if self.group in (None, k) and group.network is not None:
@@ -35,7 +35,7 @@ class Sink(Member):
 
 
 class Ageing(Sink):
-    """Who is older than a lifetime dies; an emitter may give each agent a lifetime of its own besides."""
+    """Agents older than a lifetime die; an emitter may also give each agent a lifetime of its own."""
 
     kind: Literal["ageing"] = "ageing"
     code: ClassVar[int] = 0
@@ -47,7 +47,7 @@ class Ageing(Sink):
 
 
 class Leaving(Sink):
-    """Who leaves a region dies."""
+    """Agents that leave a region die."""
 
     kind: Literal["leaving"] = "leaving"
     code: ClassVar[int] = 1
@@ -70,7 +70,7 @@ class Leaving(Sink):
 
 
 class Decay(Sink):
-    """Everybody dies at random, with a probability of 1 - exp(-rate t) within any time t, whatever dt is.
+    """Agents die at random, each with a probability of 1 - exp(-rate t) within any time t, independent of dt.
 
     Half of them are left after ln 2 / rate. Draws are of (world, step, identity).
     """
@@ -85,7 +85,7 @@ class Decay(Sink):
 
 
 class Drain(Sink):
-    """Who is in a shape dies, and who went through it in the step: of a region, or at a surface.
+    """Agents die that are in a shape, or that went through it in the step: of a region, or at a surface.
 
     The centre counts; `margin` is how far from the surface is near enough.
     """
@@ -113,10 +113,10 @@ class Drain(Sink):
 
 
 class Crowding(Sink):
-    """Where it is too crowded the youngest die: who has more than `most` elders within a radius.
+    """In a dense crowd the youngest die: agents that have more than `most` elders within a radius.
 
-    Elders are those of the same group (or all) who were born earlier. With a rate, each of the youngest dies at random;
-    without, at once.
+    Elders are agents of the same group (or of all) that were born earlier. With a rate, each of the youngest dies at
+    random; without, at once.
     """
 
     kind: Literal["crowding"] = "crowding"
@@ -140,19 +140,19 @@ class Crowding(Sink):
 
 
 class Threshold(Sink):
-    """Who has come to a level of something that goes on inside him dies: starved at a hunger of 1, caught."""
+    """Agents die whose inner number has come to a level: starved at a hunger of 1, caught."""
 
     kind: Literal["threshold"] = "threshold"
     code: ClassVar[int] = 5
     of: str = Field(min_length=1, description="name of the number, which some effect keeps")
-    level: float = Field(default=1.0, description="at which, or above which, he dies")
+    level: float = Field(default=1.0, description="at which, or above which, the agent dies")
 
     def row(self) -> list[float]:
         """The level."""
         return [self.level]
 
     def check(self, scene: Any) -> None:
-        """Refuse a number that nobody keeps."""
+        """Refuse a number that no effect keeps."""
         super().check(scene)
         if self.of not in scene.parts.inner:
             kept = ", ".join(scene.parts.inner) or "nothing"

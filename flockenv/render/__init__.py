@@ -1,4 +1,4 @@
-"""Pictures of snapshots: pixels, PNG, GIF, a window, an HTML replay; a backend is imported when first asked for.
+"""Pictures of snapshots: pixels, PNG, GIF, a window, an HTML replay; a backend is imported when first needed.
 
 Nothing here opens a display except Window, and `import flockenv.render` imports neither Pillow nor pygame.
 """

@@ -1,4 +1,4 @@
-"""Interval plots: what players scored, how often they succeeded and how far they are apart, one column per task."""
+"""Interval plots: scores, success rates and paired differences of players, one column per task."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ __all__ = ["COLOURS", "FAINT", "GRID", "INK", "Column", "Row", "draw_chart", "wr
 
 INK, FAINT, GRID = "#22272e", "#6b7480", "#e4e7eb"
 COLOURS = ("#D55E00", "#0072B2", "#E69F00", "#009E73", "#CC79A7", "#56B4E9")
-"""Okabe and Ito's palette, which readers with any colour vision tell apart."""
+"""Okabe and Ito's palette, distinct for any colour vision."""
 ABREAST = 4
-"""Tasks beside each other, at most: more go below."""
+"""Most tasks side by side; more go below."""
 
 FIXED = {"random": "#8a929c", "textbook": "#E69F00", "rules": "#0072B2", "ppo": "#D55E00"}
 
@@ -88,7 +88,7 @@ def draw_chart(columns: Sequence[Column], title: str, note: str = "") -> Figure:
 
 
 def _heights(band: Sequence[Column]) -> list[float]:
-    """Return how high the plots of some tasks beside each other are, inches: scores, success, differences if any."""
+    """Return the heights of the plots of tasks side by side, inches: scores, success, differences if any."""
     players, pairs = max(len(c.rows) for c in band), max(len(c.pairs) for c in band)
     return [0.62 * players + 0.5, 0.34 * players + 0.4] + [0.34 * pairs + 0.4] * (pairs > 0)
 
@@ -173,7 +173,7 @@ def _rows(axes: Axes, names: Sequence[str]) -> None:
 
 
 def _plain(axes: Axes) -> None:
-    """Leave of the frame what carries information."""
+    """Keep of the frame only what carries information."""
     for side in ("top", "right", "left"):
         axes.spines[side].set_visible(False)
     axes.spines["bottom"].set_color(GRID)

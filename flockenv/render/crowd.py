@@ -1,4 +1,4 @@
-"""Pictures of what was measured: flow over density, ways in the colours of their lanes, gaps' tail, density in time."""
+"""Pictures of measurements: flow over density, paths in the colours of their lanes, tail of gaps, density in time."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ Floats = NDArray[np.float64]
 
 FORWARD, BACKWARD = COLOURS[0], COLOURS[1]
 MOST_WAYS = 400
-"""So many ways are drawn; of a larger crowd every so manyth."""
+"""Most paths that are drawn; of a larger crowd, paths at equal intervals of the table of agents."""
 MOST_POINTS = 500
-"""So many places of a way are drawn."""
+"""Most points of a path that are drawn."""
 
 
 def write_flow_density(path: str | Path, density: Floats, speed: Floats, title: str) -> None:
@@ -58,9 +58,9 @@ def write_lanes(
     way: NDArray[np.int64], region: tuple[Floats, Floats],
     title: str, solids: Sequence[Floats] = (), line: Floats | None = None, area: Floats | None = None,
 ) -> None:  # fmt: skip
-    """Draw where everybody went, (T, N, 2) m, in the colour of his way (N,), and a dot where he is at the end.
+    """Draw the path of each agent, (T, N, 2) m, in the colour of its direction `way` (N,), and a dot at its end.
 
-    region: corners of what is shown, m; solids: polygons. A way that jumps by half of the region is cut there.
+    region: corners of what is shown, m; solids: polygons. A path that jumps by half of the region is cut there.
     """
     low, high = region
     wide = float(high[0] - low[0])
@@ -94,7 +94,7 @@ def write_lanes(
 def write_gaps(path: str | Path, gaps: Floats, fit: Tail, p: float, title: str) -> None:
     """Draw the survival of gaps (G,), s, both axes logarithmic, with the power law of their tail; needs one gap > 0.
 
-    p: how well the gaps fit it, see `measures.goodness`.
+    p: goodness of that fit, see `measures.goodness`.
     """
     figure = new_figure(5.6, 4.4, title)
     axes = figure.subplots()
@@ -120,7 +120,7 @@ def write_gaps(path: str | Path, gaps: Floats, fit: Tail, p: float, title: str) 
 def write_space_time(
     path: str | Path, time: Floats, place: Floats, density: Floats, title: str, where: float | None = None
 ) -> None:
-    """Draw density (T, X), 1/m^2, over time (T + 1,) s and place along the way (X + 1,) m; `where` a line is marked."""
+    """Draw density (T, X), 1/m^2, over time (T + 1,) s and place along the axis (X + 1,) m; a line at `where`."""
     figure = new_figure(7.6, 4.2, title)
     axes = figure.subplots()
     mesh = axes.pcolormesh(time, place, density.T, cmap="viridis", vmin=0, rasterized=True)
@@ -136,7 +136,7 @@ def write_space_time(
 
 
 def new_figure(wide: float, tall: float, title: str) -> Figure:
-    """Return an empty figure of so many inches with a title."""
+    """Return an empty figure of wide x tall inches with a title."""
     # Figure and not pyplot: no global state, no window, nothing to close
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
@@ -155,7 +155,7 @@ def save(figure: Figure, path: str | Path) -> None:
 
 
 def named(axes: Axes, x: str, y: str) -> None:
-    """Name the axes, and leave of the frame what carries information."""
+    """Name the axes, and keep of the frame only what carries information."""
     axes.set_xlabel(x, fontsize=9, color=FAINT)
     axes.set_ylabel(y, fontsize=9, color=FAINT)
     axes.tick_params(length=0, labelsize=8, labelcolor=INK)

@@ -18,7 +18,7 @@ __all__ = ["write_order"]
 
 
 def write_order(path: str | Path, experiment: Experiment, trials: Mapping[tuple[str, str], Trial]) -> None:
-    """Draw the first column with its deviation, the second; the bound, the third; and what was seen elsewhere."""
+    """Draw the first column with its deviation, the second; the bound, the third; and values of other sources."""
     assert experiment.curve is not None
     value, spread, bound, seen = list(experiment.columns)[:4]
     figure = new_figure(6.0, 4.4, experiment.title)

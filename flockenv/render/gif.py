@@ -110,7 +110,7 @@ def _padded(indexed: Image.Image) -> list[int]:
 
 
 def _opening(width: int, height: int) -> bytes:
-    """Return header, logical screen without a colour table, and the extension that asks to play for ever."""
+    """Return header, logical screen without a colour table, and the extension for an endless loop."""
     screen = struct.pack("<6sHHBBB", b"GIF89a", width, height, 0x70, 0, 0)
     return screen + b"\x21\xff\x0bNETSCAPE2.0\x03\x01\x00\x00\x00"
 

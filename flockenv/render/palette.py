@@ -20,7 +20,7 @@ ROLE_COLOURS: Final[dict[str, tuple[str, str]]] = {
     "agent 4": ("#1f8a8a", "#5cc7c7"),
 }
 
-#: how much of the colour of goals is in a way's
+#: share of the colour of goals in that of ways
 WAY: Final = 0.18
 
 #: part of the picture -> (light, dark)
@@ -49,7 +49,7 @@ BODY_DISC: Final = 0.4
 #: Width of the line of a bond, and the least radius of a dot at its end, as a share of the picture's width.
 BOND: Final = 0.0022
 
-#: The least radius of a point of somebody with a look, as a share of the picture's width.
+#: The least radius of a point of an agent with a look, as a share of the picture's width.
 POINT: Final = 0.0022
 
 #: Corners of the arrow that shows a heading, x along it, in units of its length.

@@ -53,9 +53,9 @@ def draw(
     Agents are darts that point along their velocity, over a disc of their body radius, coloured by role (Okabe-Ito);
     one at rest is a dot. Those with bonds are dots of their radius, behind which bonds are thin lines. 3-D is seen from
     above: what is higher is larger and drawn last.
-    Who has a look is drawn as that says: points, discs or polygons, whose colour may tell age or speed.
-    trails: earlier snapshots of the same world, oldest first; agents without bonds then draw their way behind them, who
-    has a look as long a one as that says. all_trails=False: only those with a look.
+    An agent with a look is drawn by it: points, discs or polygons, whose colour may show age or speed.
+    trails: earlier snapshots of the same world, oldest first; agents without bonds then have their path drawn behind
+    them, those with a look for as long as the look's trail. all_trails=False: only those with a look.
     scale: supersampling, 1 (fast, jagged) to 4. Raises ValueError or TypeError on a size or scale out of range.
     """
     _whole("size", size, _SIZES)
@@ -189,7 +189,7 @@ def _caption(pen: ImageDraw.ImageDraw, view: View, title: str, roles: tuple[str,
 
 
 def _side(view: View) -> float:
-    """Return how far in the caption begins, px: with the world, unless that is a narrow one."""
+    """Return the caption's distance from the left edge, px: that of the world, unless that is narrow."""
     return view.left if view.left < 0.1 * view.width else 0.45 * view.band
 
 
@@ -265,7 +265,7 @@ def _darts(spots: Floats, aim: Floats, reach: Floats) -> Floats:
 
 
 def _bonds(pen: ImageDraw.ImageDraw, view: View, snapshot: Snapshot) -> None:
-    """Draw a line for every bond of which both ends are there, the lowest first; across a seam from either side."""
+    """Draw a line for every bond with both ends there, the lowest first; across a seam from either side."""
     there = snapshot.alive & snapshot.visible
     bonds = snapshot.bonds[there[snapshot.bonds].all(axis=1)]
     if not len(bonds):
@@ -297,7 +297,7 @@ def _bodies(pen: ImageDraw.ImageDraw, view: View, snapshot: Snapshot) -> None:
     aim = _aim(np.where(snapshot.visible[:, None], snapshot.aim, 0.0))
     darts = _darts(spots, aim, 0.94 * reach)
     shades, plain = snapshot.shade, _plain(snapshot)
-    # The lowest first, and crosses over everything: an end must not hide under whoever brought it.
+    # The lowest first, and crosses over everything: a captured agent must not hide under its captor.
     for i in seen[np.argsort(np.where(snapshot.alive, depth, 2.0)[seen], kind="stable")].tolist():
         role, (x, y) = snapshot.roles[i], spots[i].tolist()
         for a, b in view.sightings(x, y, 1.1 * float(reach[i])):
@@ -359,19 +359,19 @@ def _trails(pen: ImageDraw.ImageDraw, view: View, path: Sequence[Snapshot]) -> N
 
 
 def _plain(snapshot: Snapshot) -> NDArray[np.bool_]:
-    """Return who is drawn as his role is, (N,)."""
+    """Return the agents that are drawn by their role, not by a look, (N,) bool."""
     return np.asarray(np.asarray(snapshot.look) < 0)
 
 
 def _steady(view: View, spots: Floats, path: Sequence[Snapshot]) -> NDArray[np.bool_]:
-    """Return who stayed himself from each snapshot to the next, and did not leap across the world, (T - 1, N)."""
+    """Return the slots that keep their agent from each snapshot to the next, without a leap, (T - 1, N) bool."""
     leap = np.abs(np.diff(spots, axis=0)) < JUMP * np.array([view.right - view.left, view.bottom - view.top])
     same = np.stack([old.same(new) for old, new in itertools.pairwise(path)])
     return np.asarray(leap.all(axis=2) & same)
 
 
 def _dressed_trails(pen: ImageDraw.ImageDraw, view: View, path: Sequence[Snapshot]) -> None:
-    """Draw the way behind those whose look says so: as coloured as they were there, fainter towards the past."""
+    """Draw the path behind agents whose look has a trail, in the colours that they had there, fainter with age."""
     now = path[-1]
     spots = view.place(np.stack([old.pos for old in path]))
     there = np.stack([old.alive & old.visible & ~_plain(old) for old in path])
@@ -395,7 +395,7 @@ def _dressed(
     pen: ImageDraw.ImageDraw, view: View, snapshot: Snapshot, i: int, spot: tuple[float, float], aim: Floats,
     shade: float, swell: float,
 ) -> None:  # fmt: skip
-    """Draw somebody as his look says."""
+    """Draw an agent by its look."""
     dress = snapshot.looks[int(np.asarray(snapshot.look)[i])]
     x, y = spot
     reach = dress.sized(shade, float(snapshot.radius[i])) * view.metre * swell

@@ -25,7 +25,7 @@ MARKERS = "osD^vPX<>*hp"
 LINES = ("-", "--")
 AXES: dict[Cost, str] = {"seconds": "wall time of the whole run, s", "evaluations": "force evaluations"}
 DECADES = 13
-"""The picture shows at most so many below the largest error."""
+"""The picture shows at most this number of decades below the largest error."""
 
 
 LABEL = 0.035
@@ -46,7 +46,7 @@ def draw_precision(reports: Sequence[Report]) -> Figure:
 
     The number at the end of a line is the order that was measured; grey slopes show what orders 1, 2 and 4 would look
     like. Hollow points are not clearly above the reference's own error, whose size is below the title; the grey band
-    begins where errors are not trusted. Of one problem alone the legend says the orders too.
+    begins where errors are not trusted. The legend of a single problem also has the orders.
 
     Raises:
         ValueError: nothing to draw.
@@ -115,7 +115,7 @@ def _panel(axes: Axes, report: Report, by: Cost, styles: dict[str, dict[str, Any
 
 
 def _shown(curve: Curve, by: Cost) -> list[tuple[float, float]]:
-    """Return (cost, error) of what has both."""
+    """Return (cost, error) of the points that have both."""
     return [(cost, p.error) for p in curve.points if (cost := p.cost(by)) is not None and p.error is not None]
 
 
@@ -126,7 +126,7 @@ def _least(report: Report) -> float:
 
 
 def _against(report: Report) -> str:
-    """Return what errors are measured against, how wrong that may be, and how fast a difference grows, in a line."""
+    """Return the reference of errors, its own error, and the growth rate of a difference, in a line."""
     wrong = "" if report.reference_error == 0 else f", \u00b1 {report.reference_error:.0e} m"
     grows = f"; differences grow {report.growth:.0e}-fold" if report.sensitive else ""
     return f"against {report.reference}{wrong}{grows}"
@@ -197,7 +197,7 @@ def _legend(figure: Figure, styles: dict[str, dict[str, Any]], reports: Sequence
 
 
 def _order(curve: Curve, report: Report) -> str:
-    """Return the measured order as the legend says it, "exact" of a method whose errors are all too small to trust."""
+    """Return the measured order as the legend has it, "exact" for a method whose errors are all too small to trust."""
     if curve.order is not None:
         return f" ({curve.order:.1f})"
     arrived = [point for point in curve.points if point.error is not None]

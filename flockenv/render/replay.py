@@ -41,11 +41,11 @@ _LOOKS: Final = 16
 
 @dataclass(frozen=True, eq=False)
 class Panel:
-    """What one player did: a picture of the replay.
+    """The episode of one player: a picture of the replay.
 
     player: its name. snapshots: one per frame, times strictly increasing, the same agents, obstacles may move.
     reward: the return accumulated up to each snapshot; None where nothing is paid, then no return is shown.
-    outcome: what to say when it has ended, "captured at 6.2 s".
+    outcome: the text shown at its end, "captured at 6.2 s".
     Raises ValueError or TypeError, in one line that names the player, on anything else.
     """
 
@@ -99,7 +99,7 @@ class Group:
 def write_replay(path: str | os.PathLike[str], groups: Sequence[Group], title: str) -> None:
     """Write the replay of one or several tasks as one self-contained HTML file; it appears whole or not at all.
 
-    The page loads nothing and forbids itself to (Content-Security-Policy); names are shown as text, whatever they are.
+    The page loads nothing, which its Content-Security-Policy also forbids; names are always shown as text.
     Its address takes #task=1, t=4.2 (s) and play or pause, joined by &. Raises ValueError if there is no group.
     """
     if not groups:
@@ -169,7 +169,7 @@ def _panel(panel: Panel) -> dict[str, Any]:
 
 
 def _dress(shots: Sequence[Snapshot]) -> dict[str, Any]:
-    """Return looks, who has which, shades 0..255 and who is new per frame; nothing of it where nobody has any."""
+    """Return looks, the look of each agent, and per frame shades 0..255 and new agents; no key without any."""
     first, found = shots[0], dict[str, Any]()
     if first.looks:
         found["looks"] = [_look(look) for look in first.looks]
@@ -197,7 +197,7 @@ def _look(look: Appearance) -> dict[str, Any]:
 
 
 def _short(value: float, digits: int) -> float:
-    """Return the number with so many significant digits, which is how much of it is written."""
+    """Return the number rounded to the significant digits that are written."""
     return float(f"{value:.{digits}g}")
 
 
@@ -215,7 +215,7 @@ def _positions(shot: Snapshot) -> NDArray[np.uint16]:
 
 
 def _headings(shot: Snapshot) -> NDArray[np.uint8]:
-    """Return (N,) uint8: the direction in x and y where each points, or that the body rests or is not there."""
+    """Return the directions of agents in x and y, (N,) uint8; _RESTING or _ABSENT for the others."""
     vel = np.where(shot.visible[:, None], shot.aim, 0.0)[:, :2]
     turn = np.arctan2(vel[:, 1], vel[:, 0]) / (2.0 * np.pi)
     heading = np.rint(turn * _DIRECTIONS).astype(np.int64) % _DIRECTIONS
@@ -225,9 +225,9 @@ def _headings(shot: Snapshot) -> NDArray[np.uint8]:
 
 
 def _scenery(shots: Sequence[Snapshot]) -> list[dict[str, Any]]:
-    """Return the obstacles and marks, once for every frame from which on they are others than before."""
+    """Return the obstacles and marks, with the frame from which each set holds, once per change."""
     scenes: list[dict[str, Any]] = []
-    told: dict[Mark, dict[str, Any]] = {}  # by the very mark: one that stays is told once
+    told: dict[Mark, dict[str, Any]] = {}  # by the mark: one that stays is converted once
     for k, shot in enumerate(shots):
         stones = np.column_stack([shot.obstacle_centre[:, :2], shot.obstacle_radius]).tolist()
         scene = {

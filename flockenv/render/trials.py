@@ -1,4 +1,4 @@
-"""The picture of an experiment: a row for each case, a column for each variant, and where everybody went."""
+"""The picture of an experiment: a row for each case, a column for each variant, with the paths of all agents."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ def draw_trials(experiment: Experiment, trials: Mapping[tuple[str, str], Trial])
 
 
 def _region(trials: list[Trial]) -> tuple[np.ndarray, np.ndarray]:
-    """Return the corners of where anybody went, with the obstacles, m."""
+    """Return the corners of the region of all paths and obstacles, m."""
     points = [trial.path[..., :2].reshape(-1, 2) for trial in trials]
     points += [np.array([c.centre[:2]]) + s * c.radius for c in trials[0].scene.circles for s in (-1, 1)]
     points += [shape.extremes[:, :2] for shape in trials[0].scene.shapes]

@@ -24,7 +24,7 @@ MARKS = "osD^vP*X"
 
 
 def write_pictures(folder: Path, results: Results) -> list[Path]:
-    """Write every picture there are numbers for into a folder that is there; return their paths."""
+    """Write every picture that has numbers into an existing folder; return their paths."""
     drawn = []
     for name, case, write in (
         ("fundamental_diagram.png", "rimea 4", _write_diagrams),
@@ -92,7 +92,7 @@ def _write_diagrams(path: Path, found: Sequence[Finding]) -> None:
 
 
 def _write_widths(path: Path, found: Sequence[Finding]) -> None:
-    """Draw the flow through a passage by its width, with what was measured and Weidmann's largest flow."""
+    """Draw the flow through a passage by its width, with measurements and Weidmann's largest flow."""
     from flockenv.validation.doors import DATA
 
     figure = new_figure(6.4, 4.4, "Flow through a passage of 5 m, 150 people (RiMEA 12)")
@@ -123,7 +123,7 @@ def _write_widths(path: Path, found: Sequence[Finding]) -> None:
 
 
 def _write_lanes(path: Path, found: Sequence[Finding]) -> None:
-    """Draw one world of each preset at its end, coloured by direction, with the way of the last seconds."""
+    """Draw one world of each preset at its end, coloured by direction, with the paths of the last seconds."""
     figure = new_figure(9.6, 1.05 * len(found) + 0.6, "48 + 48 people in a corridor without ends, after a minute")
     for finding, axes in zip(found, figure.subplots(len(found), 1, squeeze=False).ravel(), strict=True):
         _draw_lanes(axes, finding)
@@ -152,7 +152,7 @@ def _draw_lanes(axes: Axes, finding: Finding) -> None:
 
 
 def _write_haste(path: Path, found: Sequence[Finding]) -> None:
-    """Draw how long a room takes to empty by how fast people would like to go: medians and quartiles."""
+    """Draw the time that a room takes to empty by the desired speed: medians and quartiles."""
     figure = new_figure(5.6, 4.0, "200 people, 15 x 15 m, a door of 1 m")
     axes = figure.subplots()
     for finding in found:

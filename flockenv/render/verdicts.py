@@ -18,7 +18,7 @@ __all__ = ["draw_verdicts", "write_verdicts"]
 FILL: dict[Verdict, str] = {
     "pass": "#b7e0c8", "warned": "#dfeab0", "refused": "#fbe3a6", "fails": "#f3a683", "diverges": "#c9b3e0",
 }  # fmt: skip
-"""Told apart without colour too: each cell says its verdict."""
+"""Colours of verdicts; each cell also has its verdict as text."""
 
 
 def write_verdicts(path: str | Path, results: Results) -> None:

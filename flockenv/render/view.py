@@ -40,7 +40,7 @@ class View:
     band: float
 
     def place(self, points: Floats) -> Floats:
-        """Return the pixels (..., 2) of points (..., D) in m, of which x and y count."""
+        """Return the pixels (..., 2) of points (..., D) in m, by their x and y."""
         low, high = np.array(self.low), np.array(self.high)
         reach = _FARTHEST * (high - low)
         near = np.clip(points[..., :2], low - reach, high + reach)

@@ -1,4 +1,4 @@
-"""Window: frames on a screen, for render_mode="human"; the one part that wants pygame, and only once it is built."""
+"""Window: frames on a screen, for render_mode="human"; the one part that needs pygame, imported when one is made."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class Window:
     """
 
     def __init__(self, title: str = "flockenv") -> None:
-        # Otherwise pygame greets on stdout, in the middle of whatever a program prints there.
+        # Otherwise pygame greets on stdout, in the middle of a program's own output.
         os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
         try:
             import pygame
@@ -37,7 +37,7 @@ class Window:
 
     @property
     def is_open(self) -> bool:
-        """Whether frames are still shown."""
+        """True if frames are still shown."""
         return self._open
 
     def show(self, frame: NDArray[np.uint8], fps: float) -> None:
@@ -62,7 +62,7 @@ class Window:
             self.close()
 
     def close(self) -> None:
-        """Take the window away; again does no harm."""
+        """Close the window; may be called twice."""
         if self._open:
             self._open = False
             self._pygame.display.quit()

@@ -3,10 +3,9 @@
 from flockenv.stress import CASES, run
 results = run(CASES, methods)
 
-Cases are functions from a method to a `Value`; see `bodies`, `bonded`, `crowds`, `contacts`; of bodies that collide
-there is a case for each response, see `impacts`, `heaps`, `gatherings`. What a case raises is a verdict too: a scene
-that is refused because its step must blow up, a simulation that diverges and says so. Nothing ends in NaN without a
-word.
+Cases are functions from a method to a `Value`; see `bodies`, `bonded`, `crowds`, `contacts`; for bodies that collide
+there is a case per response, see `impacts`, `heaps`, `gatherings`. An error that a case raises is also a verdict: a
+scene refused because its step must blow up, a simulation that diverges with a message. No case ends in NaN without one.
 """
 
 from __future__ import annotations

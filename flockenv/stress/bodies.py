@@ -68,7 +68,7 @@ PRINTED: dict[str, Callable[[float, int], tuple[float, float]]] = {
 
 
 def oscillator(method: Integrator) -> Value:
-    """100 periods at 100 steps each: the energy is what the method's formula says, or its own amplification."""
+    """100 periods at 100 steps each: the energy is that of the method's formula, or of its own amplification."""
     y, steps = W / 100, 10_000
     x, v = ended(body(method, 0.01, stiffness=W * W), (1.0, 0.0), O2, steps)
     found = float(v @ v + W * W * x @ x) / W**2
@@ -106,7 +106,7 @@ def _slope(make: Callable[[float], Scene], end: Floats, begin: tuple[Any, Any], 
 def orders(method: Integrator) -> Value:
     """The slope of the error on four problems: damped, forced, a pendulum, a projectile with drag."""
     if method.adaptive:
-        method = method.model_copy(update={"tolerance": 1e30})  # whatever its error is, it takes the step it is given
+        method = method.model_copy(update={"tolerance": 1e30})  # it accepts its step at any error
     zeta, seconds = 0.1, 0.7
     wd = W * math.sqrt(1 - zeta**2)
 
@@ -141,14 +141,14 @@ def orders(method: Integrator) -> Value:
 
 
 def _pendulum(seconds: float) -> Floats:
-    """Return where the pendulum is, by scipy's DOP853."""
+    """Return the pendulum's angle and rate, by scipy's DOP853."""
     law = lambda t, y: [y[1], -9.81 * math.sin(y[0])]  # noqa: E731
     x, v = solve_ivp(law, (0, seconds), [1.0, 0], "DOP853", rtol=1e-13, atol=1e-13).y[:, -1]
     return np.array([x, 0, v, 0])
 
 
 def _projectile(t: float, k: float) -> Floats:
-    """Return where it is with linear drag (numerics.md 3.3)."""
+    """Return position and velocity under linear drag (numerics.md 3.3)."""
     left = math.exp(-k * t)
     return np.array([
         10 * (1 - left) / k, (15 + 9.81 / k) * (1 - left) / k - 9.81 * t / k,
@@ -224,7 +224,7 @@ PHI, MOST, R = 2.0, 5.0, 1.2
 
 
 def tracer(method: Integrator) -> Value:
-    """Ten turns in a vortex, 200 steps each: how far off the circle; explicit Euler spirals as its recursion says."""
+    """Ten turns in a vortex, 200 steps each: the distance from the circle; explicit Euler spirals by its recursion."""
     speed = PHI / (PHI / MOST + R * R)
     dt = 2 * math.pi * R / speed / 200
     effects = (Vortex(strength=PHI, centre=O2, maximum=MOST, acts="medium"), Carried())
@@ -284,9 +284,9 @@ def in_the_centre(method: Integrator) -> Value:
 
 
 def approach(speed: float, tau: float, decay: float) -> Callable[[Integrator], Value]:
-    """Return the trial of Kretz: somebody of 1 kg who wants to walk at `speed` comes to rest before a wall, A = 100 N.
+    """Return the trial of Kretz: an agent of 1 kg with desired speed `speed` comes to rest before a wall, A = 100 N.
 
-    He oscillates if and only if v0 tau / B > 1/4, whatever the step (numerics.md 2.1, P11).
+    It oscillates if and only if v0 tau / B > 1/4, at any step (numerics.md 2.1, P11).
     """
 
     def trial(method: Integrator) -> Value:
@@ -323,7 +323,7 @@ def bounces(method: Integrator) -> Value:
 
 
 def _bounce(method: Integrator, dt: float, height: float) -> tuple[float, float, float]:
-    """Return how far off the total time is, the lowest point and the speed afterwards."""
+    """Return the error of the total time, s, the lowest point, m, and the final speed, m/s."""
     group = (Group(count=1, radius=0.0, spawn=Spawn(low=(0, 0), high=(1, 1))),)
     room = Box(size=(2.0, 50.0), restitution=0.8)
     scene = Scene(space=room, groups=group, effects=(Gravity(),), integrator=method, dt=dt)

@@ -1,4 +1,4 @@
-"""Hard cases of springs: a cloth that grows stiffer, a hanging chain, and how far from the origin numbers hold.
+"""Hard cases of springs: a cloth that grows stiffer, a hanging chain, and a swinging chain far from the origin.
 
 Names, scenes and bounds are those of shared/reference/numerics.md, section 6.2.
 """
@@ -60,7 +60,7 @@ def _energy(scene: Scene, state: State) -> float:
 
 
 def _fallen(scene: Scene, state: State) -> float:
-    """Return the work of gravity since everybody was at height 0, J."""
+    """Return the work of gravity since all particles were at height 0, J."""
     mass = np.where(np.isfinite(scene.body.mass), scene.body.mass, 0.0)
     return float(-G * (mass * state.pos[0, :, 2]).sum())
 

@@ -1,4 +1,4 @@
-"""What hard cases share: a start by hand, and warnings that are asked for."""
+"""Functions that hard cases share: a start by hand, and a collector of expected warnings."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from flockenv.state import State
 __all__ = ["TOO_LONG", "quietly", "started"]
 
 TOO_LONG = (UnstableStepWarning, CoarseContactWarning)
-"""What says that a step is too long."""
+"""Warnings of a step that is too long."""
 
 
 def started(scene: Scene, pos: Any, vel: Any) -> State:
@@ -26,7 +26,7 @@ def started(scene: Scene, pos: Any, vel: Any) -> State:
 
 @contextmanager
 def quietly() -> Iterator[list[warnings.WarningMessage]]:
-    """Collect warnings of steps that are too long where a case goes beyond a limit on purpose; all others pass on."""
+    """Collect warnings of steps that are too long, in cases beyond a limit on purpose; all others are shown."""
     with warnings.catch_warnings(record=True) as caught:
         for kind in TOO_LONG:
             warnings.simplefilter("always", kind)

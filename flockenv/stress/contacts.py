@@ -1,4 +1,4 @@
-"""Hard cases of soft contact: what a spring that is there for a few steps gives back, and who begins inside others.
+"""Hard cases of soft contact: restitution of a spring that acts for a few steps, and bodies that begin inside others.
 
 Names, scenes and bounds are those of shared/reference/numerics.md, sections 2.2 (P17, P27) and 6.2.
 """
@@ -28,9 +28,9 @@ __all__ = ["CONTACTS", "DTS", "Hit", "hits"]
 Floats = NDArray[np.float64]
 
 STIFFNESS, MASS, RADIUS = 1.2e5, 80.0, 0.25  # Helbing, Farkas and Vicsek 2000
-SPEED, PHASES = 1.0, 16  # m/s, of the hit; where in a step it begins
+SPEED, PHASES = 1.0, 16  # m/s, of the hit; phases of the step at which it begins
 DTS = (0.03, 0.02, 0.01, 0.005, 0.002, 0.001, 0.0005)  # s
-FAR = 50.0  # m, where the obstacle is
+FAR = 50.0  # m, the place of the obstacle
 
 
 def solid(method: Integrator, dt: float, count: int = 2, most: float | None = None) -> Scene:
@@ -44,10 +44,10 @@ def solid(method: Integrator, dt: float, count: int = 2, most: float | None = No
 
 
 class Hit(NamedTuple):
-    """What undamped hits gave back in steps of one length."""
+    """Restitution of undamped hits in steps of one length."""
 
     dt: float  # s
-    least: float  # of what they gave back, over the phases of the step; NaN if the scene was refused
+    least: float  # restitution over the phases of the step; NaN if the scene was refused
     largest: float
     told: str  # "", "warned" (of a coarse contact), "refused" or "diverges"
 
@@ -83,10 +83,10 @@ def _given_back(scene: Scene, dt: float, wall: bool) -> Floats:
 
 
 def gives_back(wall: bool) -> Callable[[Integrator], Value]:
-    """Return the trial: wherever nobody was warned, a hit gives back 95 to 105 % of its speed."""
+    """Return the trial: a hit without a warning gives back 95 to 105 % of its speed."""
 
     def trial(method: Integrator) -> Value:
-        edge = 0.999 * contact_limit(method) / math.sqrt(2 * STIFFNESS / MASS)  # where nobody is warned any more
+        edge = 0.999 * contact_limit(method) / math.sqrt(2 * STIFFNESS / MASS)  # the longest step without a warning
         found = [hits(method, dt, wall) for dt in (*DTS, edge)]
         silent = [h for h in found if not h.told]
         off = max((max(abs(h.least - 1), abs(h.largest - 1)) for h in silent), default=0.0)
@@ -105,7 +105,7 @@ MOST = 2.0  # m/s
 def inside_each_other(method: Integrator) -> Value:
     """Two deep inside each other, and 30 in a disc of two bodies' size: each pair parts no faster than `most`.
 
-    In steps of 1.5 ms, of which a contact of a pair lasts 38.
+    In steps of 1.5 ms; a contact of a pair lasts 38 of them.
     """
     dt, worst = 0.0015, 0.0
     with quietly():  # explicit Euler is never stable without damping, and here it does no harm

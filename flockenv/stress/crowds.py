@@ -30,7 +30,7 @@ def flock(method: Integrator, count: int, together: float = 1.0, dt: float = 0.0
 
 def in_one_place(method: Integrator) -> Value:
     """50 agents in one place and 2 in another, at rest: finite, momentum kept, apart within a second."""
-    scene = flock(method, 52, together=0.0)  # who only separates keeps momentum
+    scene = flock(method, 52, together=0.0)  # separation alone conserves momentum
     pos = np.full((52, 2), 10.0)
     pos[50:] = 30.0, 20.0
     end = scene.run(started(scene, pos, np.zeros((52, 2))), 50)
@@ -42,7 +42,7 @@ def in_one_place(method: Integrator) -> Value:
 
 
 def at_rest_and_alone(method: Integrator) -> Value:
-    """Two agents with opposite headings, and one alone at rest: no NaN, and nobody is pushed along +x (N10)."""
+    """Two agents with opposite headings, and one alone at rest: no NaN, and no force along +x (N10)."""
     scene = flock(method, 3)
     start = started(scene, [(10, 10), (11, 10), (30, 30)], [(0, 1.0), (0, -1.0), (0, 0)])
     end = scene.run(start, 50)
@@ -52,7 +52,7 @@ def at_rest_and_alone(method: Integrator) -> Value:
 
 
 def seam(method: Integrator) -> Value:
-    """A pair across the edge moves as in the middle; everybody stays in [0, L), also who is at -1e-17."""
+    """A pair across the edge moves as in the middle; all agents stay in [0, L), also one at -1e-17."""
     scene, rng = flock(method, 12), np.random.default_rng(0)
     pos, vel = rng.uniform(15, 25, (12, 2)), rng.normal(size=(12, 2))
     one = scene.run(started(scene, pos, vel), 60)
@@ -66,7 +66,7 @@ def seam(method: Integrator) -> Value:
     alone = flock(method, 1)
     end = alone.step(started(alone, [(-1e-17, EDGE)], [(0.0, 0.0)]))
     inside &= bool(((end.pos >= 0) & (end.pos < EDGE)).all())
-    bound = method.tolerance if isinstance(method, Adaptive) else 1e-9  # which step is taken hangs by a rounding
+    bound = method.tolerance if isinstance(method, Adaptive) else 1e-9  # the step taken depends on rounding
     return Value(worst, worst <= bound and inside, f"{worst:.1g} m apart; inside: {inside}")
 
 

@@ -1,4 +1,4 @@
-"""Hard cases of solid agents that are on their way: head-on, at a crossing, across a circle; stalls; chaos repeated.
+"""Hard cases of solid agents that steer to goals: head-on, at a crossing, across a circle; stalls; chaos repeated.
 
 Names, scenes and bounds are those of shared/reference/numerics.md, sections 2.2 and 6.2.
 """
@@ -26,16 +26,16 @@ __all__ = ["GATHERINGS"]
 R = 0.25
 WALL = ((-3.0, -0.6), (-3.0, -2.0), (15.0, -2.0), (15.0, -0.6))
 ONE = ("semi_implicit_euler",)
-"""What is asked here hangs by the steering and the response, not by the method: one is tried."""
+"""Results here depend on steering and response, not on the method: one method is tried."""
 
-# --- N11: everybody wants to where somebody comes from ----------------------------------------------------------------
+# --- N11: each agent's goal is the start of another -------------------------------------------------------------------
 
 
 def crossing(count: int, circle: float, seconds: float) -> Callable[[Integrator, Response], Value]:
-    """Return the trial of `count` agents on a circle who want to the opposite place: they pass, and hardly overlap.
+    """Return the trial of `count` agents on a circle with goals at the opposite places: they pass, and hardly overlap.
 
-    They head for their goals, keep out of each other's way (Reynolds' unaligned avoidance, which keeps right of who
-    comes exactly head-on) and are solid. Who is not there in time is told of: a deadlock.
+    They head for their goals, avoid each other (Reynolds' unaligned avoidance, which keeps to the right in an exact
+    head-on encounter) and are solid. Agents that do not arrive in time are reported: a deadlock.
     """
 
     def trial(method: Integrator, response: Response) -> Value:
@@ -65,7 +65,7 @@ def crossing(count: int, circle: float, seconds: float) -> Callable[[Integrator,
     return trial
 
 
-# --- N25: what a field of force does, and what steering does ----------------------------------------------------------
+# --- N25: a field of force against steering ---------------------------------------------------------------------------
 
 
 def stalls(method: Integrator) -> Value:
@@ -84,7 +84,7 @@ def stalls(method: Integrator) -> Value:
 
 
 def along_a_wall(method: Integrator) -> Value:
-    """Parallel to a wall, .4 m beside it: steering to avoid feels nothing across, exactly; a field of force does."""
+    """Parallel to a wall, .4 m beside it: steering to avoid has exactly no force across; a field of force has one."""
     forces = []
     for variant in ("to avoid", "force field"):
         scene = _heading_for((Polygon(vertices=WALL),), variant, method)
@@ -98,7 +98,7 @@ def along_a_wall(method: Integrator) -> Value:
 
 
 def _heading_for(obstacles: tuple[Circle | Polygon, ...], variant: str, method: Integrator) -> Scene:
-    """Return one who heads for a place 12 m ahead and avoids obstacles; configs/experiments/avoidance.yaml has more."""
+    """Return an agent with a goal 12 m ahead that avoids obstacles; see configs/experiments/avoidance.yaml."""
     seek = Seek(weight=4, target=(12, 0))
     steer = Steer(behaviours=(AvoidObstacles(weight=12, horizon=1, margin=0.05), seek), arbitration=Allocation())
     if variant == "force field":
@@ -116,7 +116,7 @@ def _under(scene: Scene, method: Integrator) -> Scene:
 
 
 def chaos(method: Integrator, response: Response) -> Value:
-    """60 discs in a room, 72 worlds: again, and by 4 threads, the same bits; renumbered within 1e-9, till when."""
+    """60 discs in a room, 72 worlds: the same bits again and by 4 threads; renumbered within 1e-9, up to which time."""
     room = Block(centre=(0.0, 0.0), size=(8.0, 8.0), hollow=True)
     scene = solid(method, response, 0.02, count=60, obstacles=(room,), restitution=0.9, pull=(0.0, -1.0))
     rng = np.random.default_rng(0)

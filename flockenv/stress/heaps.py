@@ -32,11 +32,11 @@ ROOM = (
     *SIDES, HalfSpace(point=(0.0, 0.0), direction=(0.0, 1.0)),
     HalfSpace(point=(-2.5, 0.0), direction=(1.0, 0.0)), HalfSpace(point=(2.5, 0.0), direction=(-1.0, 0.0)),
 )  # fmt: skip
-INFLOW = 15.0  # s, after which nobody is let in any more, and energy may not grow
+INFLOW = 15.0  # s, after which no disc is added, and energy may not grow
 
 
 def funnel(method: Integrator, response: Response, seconds: float = 60.0, count: int = 1000) -> Value:
-    """Discs fall into a funnel and through its gate: overlap, who has left through a wall, energy after the inflow."""
+    """Discs fall into a funnel and through its gate: overlap, discs through a wall, energy after the inflow."""
     dt = 1 / 480
     scene = solid(
         method, response, dt, count=count, radius=GRAIN, pull=(0.0, -G), obstacles=ROOM, restitution=0.2, friction=0.3,
@@ -65,7 +65,7 @@ def funnel(method: Integrator, response: Response, seconds: float = 60.0, count:
 
 
 def _lattice(count: int) -> Floats:
-    """Return where they begin, (count, 2) m: rows of 44 above the funnel, every other one shifted, a little off."""
+    """Return starting positions, (count, 2) m: rows of 44 above the funnel, every other one shifted, a little off."""
     k = np.arange(count)
     row, column = k // 44, k % 44
     off = np.random.default_rng(0).uniform(-0.1, 0.1, (count, 2)) * GRAIN
@@ -74,7 +74,7 @@ def _lattice(count: int) -> Floats:
 
 
 def _left(before: Floats, after: Floats) -> bool:
-    """Has anybody crossed the middle of a wall, or a plane, between two instants?"""
+    """True if a disc has crossed the middle of a wall, or a plane, between two instants."""
     out = (np.abs(after[:, 0]) > 2.5) | (after[:, 1] < 0)
     for shape in SIDES:
         corners = np.array(shape.vertices)
@@ -116,7 +116,7 @@ def _pull(degrees: float, friction: float = 0.3) -> float:
 
 
 def _slid(method: Integrator, response: Response, degrees: float, seconds: float) -> float:
-    """Return how far down an incline a body comes that begins at rest on it, m."""
+    """Return the distance that a body slides down an incline from rest, m."""
     angle = math.radians(degrees)
     up = np.array([-math.sin(angle), math.cos(angle)])
     ramp = HalfSpace(point=(0.0, 0.0), direction=(float(up[0]), float(up[1])))
@@ -129,7 +129,7 @@ def _slid(method: Integrator, response: Response, degrees: float, seconds: float
 
 
 def stack(method: Integrator, response: Response) -> Value:
-    """Ten discs one upon the other for 20 s: how far anybody gets from where he was, in radii."""
+    """A stack of ten discs for 20 s: the largest displacement of a disc, in radii."""
     scene = solid(method, response, 0.01, count=10, pull=(0.0, -G), obstacles=(FLOOR,), friction=0.3)
     begin = np.stack([np.zeros(10), R * (1 + 2 * np.arange(10))], axis=1)
     state, far = batch(scene, begin[None], 0.0), 0.0

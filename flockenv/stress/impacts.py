@@ -31,10 +31,10 @@ FLOOR = HalfSpace(point=(0.0, 0.0), direction=(0.0, 1.0))
 def dropped(
     method: Integrator, response: Response, dt: float, e: float, steps: int
 ) -> tuple[Floats, Floats, Floats]:  # fmt: skip
-    """Return heights and velocities of sixteen balls after each step, (K, 16), and from where they fell, (16,) m.
+    """Return heights and velocities of sixteen balls after each step, (K, 16), and their starting heights, (16,) m.
 
-    They begin one step's way apart, so that each hits the floor at another phase of the step. Heights are those of
-    the lowest point.
+    Their starts are spread over one step's path, so that each hits the floor at another phase of the step. Heights
+    are those of the lowest point.
     """
     pull = (0.0, -G)
     scene = solid(method, response, dt, count=PHASES, pull=pull, obstacles=(FLOOR,), restitution=e, agents=False)
@@ -50,8 +50,8 @@ def dropped(
 def apexes(y: Floats) -> Floats:
     """Return the top of each flight of one ball from its heights (K,), m.
 
-    The top of the parabola through the highest of its points and the two beside it: exact, whatever the method calls
-    velocity (flockenv/space.py).
+    The top of the parabola through the highest of its points and the two beside it: exact for any method, since it
+    does not read velocities (flockenv/space.py).
     """
     k = 1 + np.flatnonzero((y[1:-1] > y[:-2]) & (y[1:-1] >= y[2:]))
     bend, slope = y[k - 1] - 2 * y[k] + y[k + 1], (y[k + 1] - y[k - 1]) / 2
@@ -78,10 +78,10 @@ def bouncing(method: Integrator, response: Response) -> Value:
 
 
 def elastic(method: Integrator, response: Response) -> Value:
-    """e = 1, 100 bounces: no top ever above 1.01 h; where impacts are found in time, every top h to 1e-6.
+    """e = 1, 100 bounces: no top above 1.01 h; if impacts are located in time, every top is h to 1e-6.
 
-    20 bounces where each step solves an equation. h is the top of the parabola on which the method lets it begin: half
-    a step's fall off for methods of first order.
+    20 bounces for methods that solve equations. h is the top of the parabola on which the method's first step begins:
+    off by half a step's fall for methods of first order.
     """
     most, least, few, low = 0.0, math.inf, 1000, 0.0
     for dt, seconds in ((0.02, 20.0),) if method.solves else ((0.005, 10.0), (0.02, 96.0)):
@@ -109,7 +109,7 @@ HALF = 10.0
 
 
 def bullets(method: Integrator, response: Response) -> Value:
-    """Discs of R = .1 m at 200 m/s, 3.3 m a step: who comes through, of 16 phases x 8 angles, of each target."""
+    """Discs of R = .1 m at 200 m/s, 3.3 m a step: the number through each target, of 16 phases x 8 angles."""
     wall = Wall(vertices=((0.0, -400.0), (0.0, 400.0)), radius=0.05)
     room = Block(centre=(0.0, 0.0), size=(2 * HALF, 2 * HALF), hollow=True)
     coming = wall.model_copy(update={"velocity": (-50.0, 0.0)})
@@ -130,7 +130,7 @@ def _shots() -> tuple[Floats, Floats]:
 
 
 def _through(method: Integrator, response: Response, wall: Shape, speed: float) -> int:
-    """Return how many get behind a wall that begins at x = 0 and moves at `speed`."""
+    """Return the number of discs that get behind a wall that begins at x = 0 and moves at `speed`, m/s."""
     phase, way = _shots()
     scene = solid(method, response, FRAME, count=len(phase), obstacles=(wall,), restitution=0.5, agents=False)
     begin = -way * (SPEED * FRAME * (1.5 + phase[:, None])) - (0.5, 0.0)
@@ -143,7 +143,7 @@ def _through(method: Integrator, response: Response, wall: Shape, speed: float) 
 
 
 def _out_of(method: Integrator, response: Response, room: Block) -> int:
-    """Return how many leave a square, shot at and near its corner."""
+    """Return the number of discs that leave a square, shot at and near its corner."""
     phase, _ = _shots()
     scene = solid(method, response, FRAME, count=len(phase), obstacles=(room,), restitution=1.0, agents=False)
     angle = np.arctan2(HALF, HALF) + np.repeat(np.linspace(-0.05, 0.05, len(ANGLES)), PHASES)
@@ -157,7 +157,7 @@ def _out_of(method: Integrator, response: Response, room: Block) -> int:
 
 
 def _past_each_other(method: Integrator, response: Response) -> int:
-    """Return how many of two that come head-on, at 400 m/s, get past each other."""
+    """Return the number of pairs, head-on at 400 m/s, that pass each other."""
     scene = solid(method, response, FRAME, masses=(1.0, 1.0), restitution=0.5)
     phase, way = _shots()
     far = way * (SPEED * FRAME * (1.5 + phase[:, None]))
@@ -218,7 +218,7 @@ def uneven(method: Integrator, response: Response) -> Value:
 
 
 def one_place(method: Integrator, response: Response) -> Value:
-    """50 discs in one place, at rest: apart after a second, by themselves in no direction, momentum kept, no blast."""
+    """50 discs in one place, at rest: apart after a second, without a preferred direction, momentum kept, no blast."""
     scene = solid(method, response, 0.02, count=50)
     state, fast = batch(scene, np.zeros((1, 50, 2)), 0.0), 0.0
     for _ in range(50):

@@ -1,4 +1,4 @@
-"""Try hard cases under methods."""
+"""Runs of hard cases under methods."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def usual_methods() -> tuple[Integrator, ...]:
 
 
 def fingerprint() -> str:
-    """Return what tells findings from those of other sources: laws, methods, and the cases themselves."""
+    """Return a digest of the sources that findings depend on: laws, methods, and the cases themselves."""
     here = Path(__file__).parent
     paths = [*here.glob("*.py"), *(here.parent / "integrators").glob("*.py")]
     paths += [here.parent / "implicit.py", here.parent / "stability.py"]
@@ -42,5 +42,5 @@ def run(
     progress: Callable[[int], None] = lambda done: None,
     keep: Callable[[Results], None] = lambda results: None,
 ) -> Results:
-    """Try every case under every method, and return that beside what is known; see `findings.run`."""
+    """Run every case under every method, and return the findings with the known ones; see `findings.run`."""
     return findings.run(cases, {m.kind: m for m in methods}, fingerprint(), known, progress, keep, TOLD)

@@ -1,6 +1,6 @@
 """Scenes of solid discs for hard cases: one set of laws, Gravity alone, so that each method compiles one kernel.
 
-A case is one of a response (flockenv/constraints/collisions.py); the other axis of the table is the method.
+Each case has one response (flockenv/constraints/collisions.py); the other axis of the table is the method.
 """
 
 from __future__ import annotations
@@ -42,14 +42,14 @@ def solid(
 
 
 def batch(scene: Scene, pos: Any, vel: Any) -> State:
-    """Return the start of many worlds, pos and vel (B, N, D) or what broadcasts to that."""
+    """Return the start of many worlds, pos and vel (B, N, D) or broadcast to that, m and m/s."""
     shape = np.broadcast_shapes(np.shape(pos), np.shape(vel), (1, scene.agents, scene.dimension))
     state = scene.start(0, worlds=shape[0])
     return state.with_motion(np.broadcast_to(pos, shape).astype(float), np.broadcast_to(vel, shape).astype(float))
 
 
 def overlap(pos: Floats, radius: float) -> float:
-    """Return how far the two discs of (N, 2) overlap that do most, m; 0 if nobody does."""
+    """Return the deepest overlap of two discs of (N, 2), m; 0 if none overlap."""
     from scipy.spatial import cKDTree
 
     pairs = cKDTree(pos).query_pairs(2 * radius, output_type="ndarray")

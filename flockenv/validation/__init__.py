@@ -1,4 +1,4 @@
-"""Validation: scenes that models of pedestrians are tried in, with every preset, each with a bound, a value, a verdict.
+"""Validation: test scenes of pedestrian models, with every preset; each has a bound, a value and a verdict.
 
 from flockenv.validation import CASES, run
 results = run(CASES, ("helbing_farkas_vicsek_2000",))
@@ -26,7 +26,7 @@ CASES: tuple[Case, ...] = (*ALONE, *CORRIDORS, *DOORS)
 """Every case."""
 
 VALIDATED = tuple(name for name in PRESETS if name != "moussaid_2010_groups")
-"""Every preset that says how everybody walks: the groups of 2010 are its 2009 and what keeps parties together."""
+"""Every preset of a whole model: that of groups, 2010, is the one of 2009 and forces that keep parties together."""
 
 
 def presets_named(names: list[str]) -> tuple[str, ...]:

@@ -1,4 +1,4 @@
-"""Cases of who walks alone: speed in a corridor, the same one turned, speeds of people of all ages.
+"""Cases of people that walk alone: speed in a corridor, the same one turned, speeds of people of all ages.
 
 Names and bounds: shared/reference/numerics.md, sections 1.1 to 1.3 (RiMEA, NIST TN 1822, JuPedSim's tests of Juelich).
 """
@@ -23,11 +23,11 @@ TABLE = ((0.58, 1.61), (1.41, 1.54), (0.68, 1.41), (0.46, 0.76))
 """m/s, from and to: below 30 years, 30 to 50, above, and the handicapped (RiMEA 7, by Weidmann's table)."""
 
 AGES = (13, 13, 12, 12)
-"""How many of each."""
+"""Number of people of each."""
 
 
 def corridor(name: str, speed: float, *, length: float, degrees: float = 0.0, moving: bool = False) -> Scene:
-    """Return one person in a corridor 2 m wide, who goes along it from x = 0, at rest or at his speed."""
+    """Return one person in a corridor 2 m wide that walks along it from x = 0, first at rest or at its speed."""
     turn = np.exp(1j * np.radians(degrees))
 
     def turned(x: float, y: float) -> tuple[float, float]:
@@ -42,7 +42,7 @@ def corridor(name: str, speed: float, *, length: float, degrees: float = 0.0, mo
 
 
 def gated_lane(name: str) -> Scene:
-    """Return one person in a corridor who goes by four gates on the way, one after another."""
+    """Return one person in a corridor that passes four gates, one after another."""
     begin = (0.0, 0.0)
     spawn = Spawn(low=begin, high=begin, speed=(1.0, 1.0), heading=(1.0, 0.0))
     one = people(name, 1, begin, begin, desired_speed=1.0, spawn=spawn)
@@ -51,7 +51,7 @@ def gated_lane(name: str) -> Scene:
 
 
 def free(name: str, spreads: Sequence[Spread], counts: Sequence[int]) -> Scene:
-    """Return some groups who go along x, everybody 20 m from everybody else."""
+    """Return groups that walk along x, each person 20 m from all others."""
     groups, done = [], 0.0
     for spread, count in zip(spreads, counts, strict=True):
         spawn = Spawn(low=(0.0, done), high=(20.0, done + 20.0 * count), spacing=20.0)
@@ -74,11 +74,11 @@ SCENES: Scenes = {
         f"seed {seed}": partial(free, spreads=[Spread(mean=1.2, sd=0.2, seed=seed)], counts=(50,)) for seed in (0, 1)
     },
 }
-"""By case, and by what differs from scene to scene: what builds it of a preset's name."""
+"""Builders of scenes from a preset's name, by case and by the variant of the scene."""
 
 
 def crossing_time(time: Floats, along: Floats, distance: float) -> float:
-    """Return when somebody first was so far, s, between instants (T,); NaN if he never was."""
+    """Return the time at which `along` first reaches a distance, s, between instants (T,); NaN if never."""
     if not (along >= distance).any():
         return float("nan")
     k = int((along >= distance).argmax())
@@ -89,7 +89,7 @@ def crossing_time(time: Floats, along: Floats, distance: float) -> float:
 
 
 def _along(scene: Scene, seconds: float, degrees: float = 0.0) -> tuple[Floats, Floats]:
-    """Return times (T,) and how far along the corridor he is, (T,) m."""
+    """Return times (T,), s, and distances walked along the corridor, (T,) m."""
     run = walked(scene, seconds)
     way = np.array([np.cos(np.radians(degrees)), np.sin(np.radians(degrees))])
     return run.time, run.pos[:, 0, 0] @ way
@@ -117,19 +117,19 @@ def turned(name: str) -> Value:
 
 
 def way_points(name: str) -> Value:
-    """10 m at 1 m/s by four gates on the way, one after another, from 1 m/s on."""
+    """10 m at 1 m/s by four gates, one after another, from 1 m/s on."""
     took = crossing_time(*_along(SCENES["juelich 6"][""](name), 15), 10.0)
     return Value(took, abs(took - 10.0) <= 0.1, f"{took:.3f} s")
 
 
 def _free_speeds(scene: Scene) -> Floats:
-    """Return everybody's speed after 6 s, m/s."""
+    """Return the speed of each person after 6 s, m/s."""
     end = scene.run(scene.start(0), round(6 / scene.dt))
     return np.asarray(np.linalg.norm(end.vel[0], axis=1))
 
 
 def rimea_7(name: str) -> Value:
-    """50 adults, by age: each walks as fast as his age says."""
+    """50 adults: the speed of each is in the range of its age."""
     found = np.split(_free_speeds(SCENES["rimea 7"][""](name)), np.cumsum(AGES)[:-1])
     off = max(max(a - v.min(), v.max() - b, 0.0) for v, (a, b) in zip(found, TABLE, strict=True))
     ranges = ", ".join(f"{v.min():.2f}-{v.max():.2f}" for v in found)
@@ -137,7 +137,7 @@ def rimea_7(name: str) -> Value:
 
 
 def nist_2_4(name: str) -> Value:
-    """100 people whose speeds are normal, 1.2 +- .2 m/s: whether those they walk at are."""
+    """100 people with normal desired speeds, 1.2 +- .2 m/s: a test that their walking speeds are normal."""
     from scipy.stats import kstest  # it looks for torch, and takes half a second
 
     speeds = np.concatenate([_free_speeds(built(name)) for built in SCENES["nist 2.4"].values()])

@@ -1,4 +1,4 @@
-"""What trials of crowds share: they take no notice of how well a step resolves contacts."""
+"""A context that all trials of crowds share: warnings of coarse contacts are ignored."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ __all__ = ["quietly"]
 
 @contextmanager
 def quietly() -> Iterator[None]:
-    """Take no notice of contacts that a step resolves badly: presets come with the step they are used with."""
+    """Ignore warnings of contacts that a step resolves badly: presets have the time step of their papers."""
     with warnings.catch_warnings():
         for kind in (UnstableStepWarning, CoarseContactWarning):
             warnings.simplefilter("ignore", kind)

@@ -47,14 +47,14 @@ def endless(
     name: str, counts: tuple[int, int], length: float = EDGE, width: float = WIDTH, ways: tuple[int, int] = (1, -1),
     dense: bool = False,
 ) -> Scene:  # fmt: skip
-    """Return two groups in a corridor without ends, each going its way along it; dense: with bodies that overlap.
+    """Return two groups in a corridor without ends, each with its direction; dense: with bodies that overlap.
 
     Each begins in a half of its own; `lined_up` mixes them.
     """
     middle, half = EDGE / 2, length / 2
     groups = []
     for k, count in enumerate(counts):
-        file = half / count  # each has so much of the length, if they walk one behind the other
+        file = half / count  # length per person in single file
         roomy = half * width / count > ROOMY
         beside = (0.3 if roomy else 0.0) if width > 1 else (width - file) / 2  # m, from the walls to where cells begin
         low, high = (k * half, middle - width / 2 + beside), ((k + 1) * half, middle + width / 2 - beside)
@@ -84,7 +84,7 @@ def _sides(length: float, middle: float, width: float) -> tuple[Wall, ...]:
 
 
 def lined_up(scene: Scene, length: float, width: float, worlds: int = 1, seed: int = 0) -> State:
-    """Return a start on a grid that fills the corridor, everybody at rest, who is where drawn anew for each world."""
+    """Return a start at rest on a grid that fills the corridor; each world has a permutation of its own."""
     count = sum(scene.living)
     rows = max(1, round(np.sqrt(count * width / length)))
     columns = -(-count // rows)
@@ -100,13 +100,13 @@ def lined_up(scene: Scene, length: float, width: float, worlds: int = 1, seed: i
 
 
 def _flowing(name: str, density: float) -> Scene:
-    """Return a crowd of some density, 1/m^2, all of whom go the same way."""
+    """Return a crowd of some density, 1/m^2, with one direction of walking."""
     count = max(100, round(density * EDGE * WIDTH))
     return endless(name, (count // 2, count - count // 2), count / (density * WIDTH), WIDTH, (1, 1), density > 2)
 
 
 def _in_file(name: str, density: float) -> Scene:
-    """Return people in single file, so many per m."""
+    """Return people in single file, `density` of them per m."""
     count = round(density * EDGE)
     return endless(name, (count // 2, count - count // 2), EDGE, 0.8, (1, 1), density > 1.25)
 
@@ -116,11 +116,11 @@ SCENES: Scenes = {
     "rimea 16": {f"{density:g} per m": partial(_in_file, density=density) for density in ALONG},
     "lanes": {"": partial(endless, counts=(EACH_WAY, EACH_WAY))},
 }
-"""By case, and by what differs from scene to scene: what builds it of a preset's name."""
+"""Builders of scenes from a preset's name, by case and by the variant of the scene."""
 
 
 def rimea_4(name: str) -> Value:
-    """The fundamental diagram: densities of .5 to 3 per m^2, all go the same way, the last 18 of 30 s."""
+    """The fundamental diagram: densities of .5 to 3 per m^2, one direction of walking, the last 18 of 30 s."""
     cloud: dict[str, list[float]] = {"density": [], "speed": []}
     means = []
     for built in SCENES["rimea 4"].values():
@@ -170,7 +170,7 @@ def _listed(values: Floats) -> str:
 
 
 def lanes_of(name: str) -> Value:
-    """48 people each way in a corridor 4 m wide: order above its permutation null, over 20 seeds."""
+    """48 people per direction in a corridor 4 m wide: order above its permutation null, over 20 seeds."""
     scene = SCENES["lanes"][""](name)
     run = walked(scene, LANE_SECONDS, worlds=LANE_SEEDS, every=1.0, begin=lined_up(scene, EDGE, WIDTH, LANE_SEEDS))
     late = run.time > LANE_SECONDS - LANE_LAST

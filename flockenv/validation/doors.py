@@ -1,4 +1,4 @@
-"""Cases of doors, bottlenecks and rooms: how long people take to get out, and by which flow.
+"""Cases of doors, bottlenecks and rooms: times of evacuation, and flows.
 
 Names and bounds: shared/reference/numerics.md, sections 1.1, 1.2 and 4 (RiMEA, NIST TN 1822, measured bottlenecks).
 """
@@ -40,14 +40,14 @@ WIDTHS = tuple(DATA)
 SEEDS = 3
 NERVOUS = "helbing_farkas_vicsek_2000"
 FASTER = (1.0, 1.5, 2.0, 3.0, 5.0)
-"""m/s, desired speeds of those who want out of a room."""
+"""m/s, desired speeds of people that leave a room."""
 
 FASTER_SEEDS = 20
 BURST_SEEDS = 20
 
 
 AGAINST = (0, 10, 50, 100)
-"""How many come against 100 (NIST 2.8)."""
+"""Numbers of people that walk against 100 (NIST 2.8)."""
 
 
 def _room_of_2000(name: str, speed: float) -> Scene:
@@ -75,11 +75,11 @@ SCENES: Scenes = {
     "pressed fixed": {"": partial(_shut, method=SemiImplicitEuler(), dt=0.005)},
     "pressed adaptive": {"": partial(_shut, method=DormandPrince(), dt=0.01)},
 }
-"""By case, and by what differs from scene to scene: what builds it of a preset's name."""
+"""Builders of scenes from a preset's name, by case and by the variant of the scene."""
 
 
 def _through(run: Walk, x: float, half: float, world: int = 0) -> Crossings:
-    """Return who crossed x between y = -half and half; forward is to the right."""
+    """Return the crossings of x between y = -half and half; forward is to the right."""
     return crossings(run.time, run.pos[:, world], [(x, -half), (x, half)], run.alive[:, world])
 
 
@@ -91,13 +91,13 @@ def _density(run: Walk, corners: Sequence[tuple[float, float]], world: int = 0) 
 
 
 def _left(run: Walk, world: int = 0, share: float = 1.0) -> float:
-    """Return when the last was out, s, or the last of a share of all; NaN if somebody of them is still in."""
+    """Return the time at which all were out, s, or a share of all; NaN if some of those are still in."""
     gone = np.sort(run.gone(world)[run.alive[0, world]])  # NaN come last
     return float(gone[math.ceil(share * len(gone)) - 1])
 
 
 def _beyond_walls(scene: Scene, run: Walk) -> int:
-    """Return how often somebody's way from one instant to the next went through a wall."""
+    """Return how many paths from one instant to the next cross a wall."""
     many = 0
     for shape in scene.shapes:
         vertices: Any = getattr(shape, "vertices", ())
@@ -111,7 +111,7 @@ def _beyond_walls(scene: Scene, run: Walk) -> int:
 
 
 def rimea_6(name: str) -> Value:
-    """20 people around a left corner: all out within 60 s, and nobody through a wall."""
+    """20 people around a left corner: all out within 60 s, and none through a wall."""
     scene = SCENES["rimea 6"][""](name)
     run = walked(scene, 90, until=nobody_left)
     took, through = _left(run), _beyond_walls(scene, run)
@@ -121,7 +121,7 @@ def rimea_6(name: str) -> Value:
 
 
 def rimea_15(name: str) -> Value:
-    """A crowd around a corner, and along corridors as long as its inner and its outer way."""
+    """A crowd around a corner, and along corridors as long as its inner and its outer path."""
     times, note = [], ""
     for what, built in SCENES["rimea 15"].items():
         run = walked(built(name), 150, until=nobody_left)
@@ -162,7 +162,7 @@ def rimea_12(name: str) -> Value:
             leave.append(flow(_through(run, 15.0, width / 2, b), width, run.time[-1]).passing)
             ahead.append(float(np.median(_density(run, ((-2.0, -1.0), (0.0, 1.0)), b)[50:300])))
             behind.append(float(np.median(_density(run, ((13.0, -1.0), (15.0, 1.0)), b)[50:300])))
-        found.append(float(np.nan_to_num(np.median(entry))))  # who does not come through is no flow
+        found.append(float(np.nan_to_num(np.median(entry))))  # without people that pass the flow is 0
         jams &= bool(np.median(ahead) > np.median(behind) and np.median(entry) - np.median(leave) >= -0.05)
         stuck, through = int(run.alive[-1].sum()), through + _beyond_walls(scene, run)
         notes.append(
@@ -181,13 +181,13 @@ def rimea_12(name: str) -> Value:
 
 
 def _off(flow_: float, band: tuple[float, float]) -> float:
-    """Return by which share a flow is outside of a band; 0 within."""
+    """Return the excess of a flow over a band as a share of its edge, negative below it; 0 within."""
     low, high = band
     return flow_ / low - 1 if flow_ < low else max(0.0, flow_ / high - 1)
 
 
 def nist_3_1(name: str) -> Value:
-    """23 people in 12 rooms, two exits: who leaves by the one he was told."""
+    """23 people in 12 rooms, two exits: the share that leaves by its assigned exit."""
     scene = SCENES["nist 3.1"][""](name)
     run = walked(scene, 120, until=nobody_left)
     right = np.zeros(23)
@@ -203,21 +203,21 @@ def nist_3_1(name: str) -> Value:
 
 
 def nist_5(name: str) -> tuple[Walk, float]:
-    """Return 100 people who leave a room by a door of 1 m, and how long it took.
+    """Return 100 people that leave a room by a door of 1 m, and the time it took, s.
 
-    The room is 10 x 6 m: into 8 x 5 m, NIST's and IMO's, 100 bodies .7 m across do not go.
+    The room is 10 x 6 m: 8 x 5 m, NIST's and IMO's, has no room for 100 bodies .7 m across.
     """
     run = walked(SCENES["nist 5.1"][""](name), 200, until=nobody_left)
     return run, _left(run)
 
 
 def _out(run: Walk, took: float) -> str:
-    """Return when all were out, or how many are not."""
+    """Return, as text, the time at which all were out, or the number of people still in."""
     return f"out after {took:.1f} s" if np.isfinite(took) else f"{int(run.alive[-1].sum())} stuck"
 
 
 def nist_5_1(name: str) -> Value:
-    """Where it is most crowded: before the door, or beyond it."""
+    """The place of the largest density: before the door, or beyond it."""
     run, took = nist_5(name)
     peaks = [float(_density(run, corners).max()) for corners in (((-1.5, -1.0), (0.0, 1.0)), ((0.0, -0.5), (2.0, 0.5)))]
     note = f"at the door {peaks[0]:.1f}, beyond it {peaks[1]:.1f} per m^2; {_out(run, took)}"
@@ -232,11 +232,11 @@ def nist_5_2(name: str) -> Value:
     return Value(found.passing, None, f"{verdict} IMO's 1.33 /(m s); {_out(run, took)}")
 
 
-# --- both ways --------------------------------------------------------------------------------------------------------
+# --- two directions ---------------------------------------------------------------------------------------------------
 
 
 def nist_2_8(name: str) -> Value:
-    """100 people through a corridor against 0, 10, 50 and 100: how many come through."""
+    """100 people through a corridor against 0, 10, 50 and 100: the number that comes through."""
     done, last = [], []
     for built in SCENES["nist 2.8"].values():
         run = walked(built(name), 400, every=0.5, until=nobody_left)
@@ -249,7 +249,7 @@ def nist_2_8(name: str) -> Value:
 
 
 def door_bursts(name: str) -> Value:
-    """48 people each way through a door of 1 m: bursts longer than those of a coin, over 20 seeds."""
+    """48 people per direction through a door of 1 m: bursts longer than those of a coin, over 20 seeds."""
     scene = SCENES["bursts"][""](name)
     run = walked(scene, 120, worlds=BURST_SEEDS, every=0.2, until=nobody_left)
     found, nulls, through, stuck = [], [], 0, 0
@@ -277,7 +277,7 @@ def door_bursts(name: str) -> Value:
 
 
 def faster_is_slower(name: str) -> Value:
-    """200 people, 15 x 15 m, a door of 1 m: how long they take, by how fast they would like to go."""
+    """200 people, 15 x 15 m, a door of 1 m: the time of evacuation by desired speed."""
     medians, lows, highs, stuck = [], [], [], 0
     for built in SCENES["faster is slower"].values():
         run = walked(built(name), 300, worlds=FASTER_SEEDS, every=0.5, until=nobody_left)
@@ -295,7 +295,7 @@ def faster_is_slower(name: str) -> Value:
 
 
 def pressed(how: str) -> Callable[[str], Value]:
-    """Return the trial of 200 people who push against a shut door for ten minutes: everything stays finite."""
+    """Return the trial of 200 people that push against a shut door for ten minutes: all numbers stay finite."""
 
     def trial(name: str) -> Value:
         scene = SCENES[f"pressed {how}"][""](name)

@@ -1,6 +1,7 @@
-"""Cases of rooms, doors, corners and bottlenecks, and the scenes they are about.
+"""Scenes of rooms, doors, corners and bottlenecks.
 
-All have two groups, each with a way to where it goes, and differ in numbers alone: a preset's kernel is compiled once.
+All have two groups, each with a floor field to its goal, and differ in numbers alone: a preset's kernel is compiled
+once.
 """
 
 from __future__ import annotations
@@ -25,13 +26,13 @@ __all__ = [
 ]  # fmt: skip
 
 CLEARANCE, SPACING = 0.3, 0.1
-"""m: how far from walls ways keep, about a body's radius; and between the points of their grids."""
+"""m: the distance that floor fields keep from walls, about a body's radius; the spacing of their grids."""
 
 Point = tuple[float, float]
 
 
 def beside(*corners: Point) -> Target:
-    """Return a place to go to: a door by its ends, a box by its corners of which neither edge is 0."""
+    """Return a goal: a door by its ends, a box by its corners if neither edge is 0."""
     (x, y), (u, v) = corners
     if x == u or y == v:
         return Target(ends=((x, y), (u, v)))
@@ -39,12 +40,12 @@ def beside(*corners: Point) -> Target:
 
 
 def towards(group: int, *targets: Target, spacing: float = SPACING) -> Way:
-    """Return the aim of a group: the nearest of some places, around all walls."""
+    """Return the floor field of a group, to the nearest of some places around all walls."""
     return Way(group=group, targets=targets, clearance=CLEARANCE, spacing=spacing)
 
 
 def nobody_left(state: State) -> bool:
-    """Is everybody out?"""
+    """True if no agent is left in any world."""
     return not bool(state.alive.any())
 
 
@@ -52,9 +53,9 @@ def _scene(
     name: str, groups: Sequence[Group], ways: Sequence[Sequence[Target]], walls: Sequence[Wall],
     sinks: Sequence[Member], spacing: float = SPACING, **fields: Any,
 ) -> Scene:  # fmt: skip
-    """Return a scene of two groups, each with its way; where there is one, the second is nobody and goes the same way.
+    """Return a scene of two groups, each with its floor field; the second may be one without living agents.
 
-    Nobody is as many as make it a large scene: so few and many share a kernel.
+    That group has as many slots as make the scene a large one: small and large crowds then share a kernel.
     """
     everybody, goals = list(groups), [*ways, ways[0]][:2]
     low = groups[0].spawn.low
@@ -73,9 +74,9 @@ def gated(x: float, low: float, high: float, *doors: tuple[float, float]) -> tup
 
 
 def room(name: str, count: int, size: Point, door: float, speed: Any = None, seed: int = 0, **fields: Any) -> Scene:
-    """Return people in a room whose right wall, at x = 0, has a door in its middle; who is 2 m out is gone.
+    """Return people in a room whose right wall, at x = 0, has a door in its middle; people 2 m outside are removed.
 
-    A door of 0 m is shut: they press against where it is.
+    A door of 0 m is shut: they press against its place.
     """
     wide, high = size[0], size[1] / 2
     walls = (
@@ -89,7 +90,7 @@ def room(name: str, count: int, size: Point, door: float, speed: Any = None, see
 
 
 def bottleneck(name: str, width: float, count: int = 150, long: float = 5.0) -> Scene:
-    """Return two rooms of 10 x 10 m, one full, a passage of some width between, and an exit as wide (RiMEA 12)."""
+    """Return two rooms of 10 x 10 m, one full, a passage of `width` between, and an exit as wide (RiMEA 12)."""
     half, end = width / 2, long + 10.0
     walls = (
         wall((0.0, half), (0.0, 5.0), (-10.0, 5.0), (-10.0, -5.0), (0.0, -5.0), (0.0, -half), (long, -half),
@@ -102,7 +103,7 @@ def bottleneck(name: str, width: float, count: int = 150, long: float = 5.0) -> 
 
 
 def corner(name: str, count: int, width: float, arm: float, begin: float) -> Scene:
-    """Return people in the first metres of a corridor that turns left after an arm; who is through the second is gone.
+    """Return people in the first metres of a corridor that turns left; people at the end of the second arm are removed.
 
     Along x from 0, walls at y = 0 and y = width; then up, to y = width + arm.
     """
@@ -122,7 +123,7 @@ def straight(name: str, count: int, width: float, length: float, begin: float) -
 
 
 def counterflow(name: str, there: int, back: int) -> Scene:
-    """Return two rooms of 10 x 10 m, a corridor of 2 x 10 m between, people who want to the other (NIST 2.8)."""
+    """Return two rooms of 10 x 10 m, a corridor of 2 x 10 m between, people with goals in the other (NIST 2.8)."""
     walls = (
         wall((-5.0, 1.0), (-5.0, 5.0), (-15.0, 5.0), (-15.0, -5.0), (-5.0, -5.0), (-5.0, -1.0), (5.0, -1.0),
              (5.0, -5.0), (15.0, -5.0), (15.0, 5.0), (5.0, 5.0), (5.0, 1.0), (-5.0, 1.0)),
@@ -136,7 +137,7 @@ def counterflow(name: str, there: int, back: int) -> Scene:
 
 
 def door_between(name: str, each: int, door: float) -> Scene:
-    """Return two halves of a room of 16 x 8 m, and people in both who want through a door to the other."""
+    """Return two halves of a room of 16 x 8 m, and people in both that go through a door to the other."""
     walls = (
         wall((-8.0, -4.0), (8.0, -4.0), (8.0, 4.0), (-8.0, 4.0), (-8.0, -4.0)),
         *gated(0.0, -4.0, 4.0, (-door / 2, door / 2)),

@@ -1,4 +1,4 @@
-"""Try crowds in cases, by the preset that moves them."""
+"""Runs of crowds in cases, by preset."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from flockenv.validation.case import quietly
 __all__ = ["fingerprint", "run"]
 
 BESIDE = ("presets.py", "spread.py", "targets.py", "ways.py", "eikonal.py")
-"""What else findings hang by, and holds no laws: models, people, ways."""
+"""Other files that findings depend on, without laws: models, people, floor fields."""
 
 
 def fingerprint() -> str:
-    """Return what tells findings from those of other sources: laws, models, measures and cases."""
+    """Return a digest of the sources that findings depend on: laws, models, measures and cases."""
     here = Path(__file__).parent
     paths = [path for path in here.glob("*.py") if path.stem != "page"]
     paths += [*(here.parent / "measures").glob("*.py"), *(here.parent / name for name in BESIDE)]
@@ -35,6 +35,6 @@ def run(
     progress: Callable[[int], None] = lambda done: None,
     keep: Callable[[Results], None] = lambda results: None,
 ) -> Results:
-    """Try every case with every preset, and return that beside what is known; see `findings.run`."""
+    """Run every case with every preset, and return the findings with the known ones; see `findings.run`."""
     with quietly():
         return findings.run(cases, {name: name for name in presets}, fingerprint(), known, progress, keep)

@@ -1,6 +1,6 @@
 """The scenes of the cases as files: `flockenv validate "rimea 12" --preset moussaid_2009 --scenes configs/crowds`.
 
-They are the ones that are tried; where a trial mixes those who begin in two halves of a corridor, a file does not.
+They are the scenes of the trials, except that a trial mixes two groups that in a file begin in halves of a corridor.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from flockenv.validation.walk import Scenes
 __all__ = ["SCENES", "write_scenes"]
 
 SCENES: Scenes = {**alone.SCENES, **corridors.SCENES, **doors.SCENES, "nist 5.2": doors.SCENES["nist 5.1"]}
-"""By case, and by what differs from scene to scene: what builds it of a preset's name."""
+"""Builders of scenes from a preset's name, by case and by the variant of the scene."""
 
 
 def write_scenes(folder: Path, cases: Sequence[Case], presets: Sequence[str], force: bool = False) -> list[Path]:
@@ -49,6 +49,6 @@ def _inside(folder: Path, presets: Sequence[str], name: str) -> Path:
 
 
 def _head(case: Case, path: Path) -> str:
-    """Return what a file says first: what is demanded of the scene, and how it is looked at."""
+    """Return the head of a file: the bound of the case, and commands to run and see it."""
     about = f"# {case.name}: {case.title}; demanded: {case.bound}."
     return f"{about}\n#   flockenv render {path.name} --duration 30 --out {path.stem}.gif\n"

@@ -1,4 +1,4 @@
-"""People of a preset, scenes they walk in, and what is kept of a run: instants of all its worlds."""
+"""People of a preset, scenes they walk in, and records of runs: instants of all worlds."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ Floats = NDArray[np.float64]
 Scenes = Mapping[str, Mapping[str, Callable[[str], Scene]]]
 
 WEIDMANN = Spread(mean=1.34, sd=0.26, low=0.3)
-"""m/s, how fast pedestrians would like to go (Weidmann 1993): of everybody, unless a case says otherwise."""
+"""m/s, desired speeds of pedestrians (Weidmann 1993), the default of all cases."""
 
 STEPS = {"helbing_farkas_vicsek_2000": 0.005, "moussaid_2011": 0.05}
 """s, one step. Of bodies that rub: 6 cm of two bodies' overlap, kappa d 2 / m < 2 / dt; of all others .02."""
@@ -31,10 +31,10 @@ SOLID = ObstacleContact(stiffness=1.2e5)
 """Of walls in models that have no bodies, as Helbing, Farkas and Vicsek 2000 have it: or a crowd is pushed through."""
 
 SHAKEN = 0.01
-"""m, how far those whose bodies are wider than their cells begin from the middles at most, along each axis."""
+"""m, largest initial distance from a cell's middle, along each axis, of bodies that are wider than their cells."""
 
 PATIENCE = 60.0
-"""s, after which those who are left are stuck, if nobody came out in that time."""
+"""s without an exit, after which the people that are left count as stuck."""
 
 
 class Walk(NamedTuple):
@@ -48,14 +48,14 @@ class Walk(NamedTuple):
     last: State
 
     def gone(self, world: int = 0) -> Floats:
-        """Return when each was there last, (N,) s; NaN of who still is at the end."""
+        """Return the time at which each was last there, (N,) s; NaN if it still is at the end."""
         here = self.alive[:, world]
         last = len(here) - 1 - here[::-1].argmax(axis=0)
         return np.where(here[-1] | ~here.any(axis=0), np.nan, self.time[np.minimum(last + 1, len(here) - 1)])
 
 
 def people(name: str, count: int, low: Sequence[float], high: Sequence[float], **changes: Any) -> Group:
-    """Return a group of people of a preset who begin between two corners, m, at rest and nobody in another.
+    """Return a group of people of a preset that begin between two corners, m, at rest and without overlap.
 
     Masses and radii are the preset's; speeds are Weidmann's, or those that are given.
     """
@@ -66,9 +66,9 @@ def people(name: str, count: int, low: Sequence[float], high: Sequence[float], *
 
 
 def _apart(count: int, low: Sequence[float], high: Sequence[float], widest: float) -> Spawn:
-    """Return the widest grid of cells that has room for so many, each anywhere in the middle of its own.
+    """Return the widest grid of cells with room for `count`, each at a random place in the middle of a cell.
 
-    Where bodies are wider than such cells, they begin in the middles of the widest cells that there can be.
+    If bodies are wider than such cells, they begin in the middles of the widest cells possible.
     """
     wide, deep = (b - a for a, b in zip(low, high, strict=True))
     spacing = np.sqrt(wide * deep / count)
@@ -81,7 +81,7 @@ def _apart(count: int, low: Sequence[float], high: Sequence[float], widest: floa
 
 
 def filled(count: int, low: Sequence[float], high: Sequence[float], widest: float) -> Spawn:
-    """Return a grid of so many cells that fills a box, the cells' shorter edges as long as can be.
+    """Return a grid of `count` cells that fills a box, with the longest shorter edge.
 
     Bodies are apart if the cells are as wide as they; else they are up to SHAKEN from the middles of their cells.
     """
@@ -94,7 +94,7 @@ def filled(count: int, low: Sequence[float], high: Sequence[float], widest: floa
 
 
 def nobody(name: str, at: tuple[float, float], count: int) -> Group:
-    """Return a group of people who do not live."""
+    """Return a group without living people."""
     return people(name, count, at, at, alive=0, spawn=Spawn(low=at, high=at), desired_speed=1.0)
 
 
@@ -109,7 +109,7 @@ def lane(length: float, width: float, begin: float = 0.0) -> tuple[Wall, ...]:
 
 
 def scene_of(name: str, groups: Sequence[Group], aims: Sequence[Effect], **fields: Any) -> Scene:
-    """Return a scene of people of a preset who know where they want to go; bodies do not go through walls."""
+    """Return a scene of people of a preset with these goals; bodies do not pass walls."""
     fields = {"dt": STEPS.get(name, 0.02), **fields}
     model = preset(name)
     solid = () if any(isinstance(effect, ObstacleContact) for effect in model) else (SOLID,)
@@ -120,7 +120,7 @@ def walked(
     scene: Scene, seconds: float, *, seed: int = 0, worlds: int = 1, every: float = 0.1,
     until: Callable[[State], bool] | None = None, begin: State | None = None,
 ) -> Walk:  # fmt: skip
-    """Run a scene for so many seconds and keep an instant every so many; `until` something is so, or all are stuck."""
+    """Run a scene for `seconds` s, with an instant every `every` s; end at `until`, or if all are stuck."""
     state = scene.start(seed, worlds) if begin is None else begin
     stride = max(1, round(every / scene.dt))
     kept, living, since = [state], int(state.alive.sum()), 0.0

@@ -22,17 +22,17 @@ separate = rows(steering.separate)
 
 @dataclass(frozen=True)
 class BottleneckRules:
-    """Textbook: Helbing, Farkas and Vicsek 2000; bodies and walls themselves are the scene's."""
+    """Textbook: Helbing, Farkas and Vicsek 2000; the contact forces of bodies and walls are the scene's."""
 
     tau: float = 0.5  # s, relaxation time
-    speed: float = 1.0  # share of the top speed that is wanted
+    speed: float = 1.0  # desired speed as a share of the top speed
     strength: float = 2000.0  # A, N
     decay: float = 0.08  # B, m
     walls: float = 2000.0  # A of walls, N
 
 
 def bottleneck(see: Any, task: Bottleneck, p: BottleneckRules) -> NDArray[np.float64]:
-    """Drive to the door, and be pushed off by others and by walls, exponentially."""
+    """Drive to the door, repelled by others and by walls, exponentially."""
     drive = 80.0 * (p.speed * task.max_speed * _to_opening(see, task) - see.velocity) / p.tau
     tie = np.array([1.0, 0.0])
     push = p.strength * repulsion(see.neighbours, tie, 2 * _PERSON, p.decay) * see.neighbour_present[..., None]
@@ -79,4 +79,4 @@ def queueing(see: Any, task: Bottleneck, p: QueueingRules) -> NDArray[np.float64
 
 
 _PERSON = 0.25
-"""Radius of somebody in the room, m."""
+"""Radius of a person, m."""

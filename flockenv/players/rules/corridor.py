@@ -37,7 +37,7 @@ class CorridorRules:
 
 
 def corridor(see: Any, task: Corridor, p: CorridorRules) -> NDArray[np.float64]:
-    """Drive at the desired speed, off others and off walls; vectors are (along one's way, to its left)."""
+    """Drive at the desired speed, away from others and from walls; vectors are (along the desired direction, left)."""
     own = see.velocity[:, None]
     wish = sidestep(
         see.neighbours, own, own + see.neighbour_velocity, np.array([1.0, 0.0]), p.importance, p.gamma, p.angular,
@@ -49,7 +49,7 @@ def corridor(see: Any, task: Corridor, p: CorridorRules) -> NDArray[np.float64]:
 
 
 def _ahead(see: Any) -> NDArray[np.float64]:
-    """Return the velocities that are wanted, m/s."""
+    """Return the desired velocities, m/s."""
     return np.stack([see.desired_speed, 0.0 * see.desired_speed], axis=-1)
 
 
@@ -61,11 +61,11 @@ def _off_walls(see: Any, strength: float, decay: float) -> NDArray[np.float64]:
 
 @dataclass(frozen=True)
 class CorridorOrcaRules:
-    """As published, both take half; a wish that is not free is turned right."""
+    """As published, both take half; a desired velocity that is not free is turned right."""
 
-    horizon: float = 2.0  # s, for so long the velocity must be free
+    horizon: float = 2.0  # s, for which the velocity must be free of collisions
     margin: float = 0.05  # m, clearance for what inertia delays
-    turn: float = 0.3  # rad, a wish that is not free is turned right by this
+    turn: float = 0.3  # rad, a desired velocity that is not free is turned right by this
     gain: float = 10.0  # kg/s: within a decision
 
 

@@ -1,4 +1,4 @@
-"""Crossing: give way to whom one would meet first, and go on."""
+"""Crossing: give way to the agent that it would touch first, and go on."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ unaligned_threat = rows(steering.unaligned_threat)
 
 @dataclass(frozen=True)
 class CrossingRules:
-    """Textbook: look three seconds ahead, give way with all the force there is, arrive with the rest."""
+    """Textbook: look three seconds ahead, give way with the whole force, arrive with the rest."""
 
     horizon: float = 3.0  # s, how far ahead a meeting counts
     margin: float = 0.2  # m, clearance beyond the touching distance
@@ -33,7 +33,7 @@ class CrossingRules:
     radius: float = 1.0  # m, neighbours nearer than this push
     apart: float = 0.0  # N m, separation
     gain: float = 2.0  # kg/s towards the goal
-    speed: float = 1.0  # share of the top speed that is wanted
+    speed: float = 1.0  # desired speed as a share of the top speed
     slow_radius: float = 0.8  # m, slow down within this of the goal
 
 
@@ -57,17 +57,17 @@ def crossing(see: Any, task: Crossing, p: CrossingRules) -> NDArray[np.float64]:
 
 @dataclass(frozen=True)
 class OrcaRules:
-    """As published, both take half; a wish that is not free is turned right, or twelve wait for each other."""
+    """As published, both take half; a desired velocity that is not free is turned right, or twelve agents deadlock."""
 
-    horizon: float = 2.0  # s, for so long the velocity must be free
+    horizon: float = 2.0  # s, for which the velocity must be free of collisions
     margin: float = 0.1  # m, clearance for what inertia delays
-    turn: float = 0.3  # rad, a wish that is not free is turned right by this
+    turn: float = 0.3  # rad, a desired velocity that is not free is turned right by this
     gain: float = 10.0  # kg/s: within a decision
     slow_radius: float = 1.0  # m, slow down within this of the goal
 
 
 def orca_crossing(see: Any, task: Crossing, p: OrcaRules) -> NDArray[np.float64]:
-    """Optimal reciprocal collision avoidance (van den Berg et al. 2011) on the way to the goal."""
+    """Optimal reciprocal collision avoidance (van den Berg et al. 2011) towards the goal."""
     still = np.zeros_like(see.goal)
     wish = arrive(see.goal, still, task.max_speed, p.slow_radius)
     return keep_clear(see, task, p, wish, _WALKER, _WALKER, 0.5)

@@ -22,10 +22,10 @@ sidestep = rows(steering.sidestep)
 
 @dataclass(frozen=True)
 class CrowdNavRules:
-    """Textbook: Moussaid et al. 2009, as the pedestrians themselves."""
+    """Textbook: Moussaid et al. 2009, the model of the pedestrians themselves."""
 
     tau: float = 0.54  # s, relaxation time
-    speed: float = 1.0  # share of the top speed that is wanted
+    speed: float = 1.0  # desired speed as a share of the top speed
     strength: float = 4.5  # A, m/s^2
     importance: float = 2.0  # lambda, s/m, of velocities against positions
     gamma: float = 0.35  # s, the range of the force per m/s of what closes in
@@ -49,40 +49,40 @@ def crowd_nav(see: Any, task: CrowdNav, p: CrowdNavRules) -> NDArray[np.float64]
 
 @dataclass(frozen=True)
 class RobotOrcaRules:
-    """As published, but for the share: whom nobody sees must do all there is to do."""
+    """As published, but for the share: a robot that the pedestrians do not see must make the whole change."""
 
-    horizon: float = 2.0  # s, for so long the velocity must be free
+    horizon: float = 2.0  # s, for which the velocity must be free of collisions
     margin: float = 0.1  # m, clearance for what inertia delays
-    turn: float = 0.0  # rad, a wish that is not free is turned right by this
+    turn: float = 0.0  # rad, a desired velocity that is not free is turned right by this
     gain: float = 10.0  # kg/s: within a decision
-    share: float = 1.0  # of the change that is its own where it is not seen; a half where it is
+    share: float = 1.0  # of the change, which the robot makes if it is not seen; one half if it is
 
 
 def orca_crowd_nav(see: Any, task: CrowdNav, p: RobotOrcaRules) -> NDArray[np.float64]:
-    """Optimal reciprocal collision avoidance (van den Berg et al. 2011) on the way to the goal."""
+    """Optimal reciprocal collision avoidance (van den Berg et al. 2011) towards the goal."""
     wish = seek(see.goal, np.zeros_like(see.goal), task.max_speed)
     return keep_clear(see, task, p, wish, _ROBOT, _PEDESTRIAN, 0.5 if task.visible else p.share)
 
 
 @dataclass(frozen=True)
 class HeuristicsRules:
-    """As published; it sees no further than it is shown."""
+    """As published, but for its range of sight, which is the observation's."""
 
-    tau: float = 0.5  # s, relaxation time, and the time that it keeps to what is ahead
+    tau: float = 0.5  # s, relaxation time, and the least time to a collision ahead
     reach: float = 10.0  # d_max, m
-    view: float = 75.0  # degrees to either side of where it goes
+    view: float = 75.0  # degrees to either side of its heading
     margin: float = 0.0  # m, clearance
 
 
 def heuristics_crowd_nav(see: Any, task: CrowdNav, p: HeuristicsRules) -> NDArray[np.float64]:
-    """Look where the way is free, and go no faster than is safe (Moussaid, Helbing and Theraulaz 2011)."""
+    """Take the most direct free direction, no faster than is safe (Moussaid, Helbing and Theraulaz 2011)."""
     aim = see.goal / np.maximum(np.linalg.norm(see.goal, axis=-1), 1e-9)[:, None]
     speed = np.linalg.norm(see.velocity, axis=-1)[:, None]
     gaze = np.where(speed > 0.05, see.velocity / np.maximum(speed, 1e-9), aim)
     turn = np.radians(np.linspace(-p.view, p.view, 31))
     cosine, sine = np.cos(turn), np.sin(turn)
     ways = np.stack([gaze[:, :1] * cosine - gaze[:, 1:] * sine, gaze[:, :1] * sine + gaze[:, 1:] * cosine], axis=-1)
-    ways = np.concatenate([aim[:, None], ways], axis=1)  # the aim first: of what is as good, what it wants
+    ways = np.concatenate([aim[:, None], ways], axis=1)  # the aim first: it is selected of equally good directions
     seen, moving = see.neighbour_present[:, :, None] > 0, see.velocity[:, None] + see.neighbour_velocity
     clearance, one = _ROBOT + _PEDESTRIAN + p.margin, ways[:, None]
     free = collision_distance(one, see.neighbours[:, :, None], moving[:, :, None], clearance, task.max_speed)

@@ -26,7 +26,7 @@ threat = rows(steering.threat)
 
 @dataclass(frozen=True)
 class EvadeRules:
-    """Textbook: evade whoever is near, hide from the nearest otherwise (Reynolds 1999), in order of priority."""
+    """Textbook: evade pursuers that are near, else hide from the nearest (Reynolds 1999), in order of priority."""
 
     horizon: float = 1.0  # s, how far ahead cover counts that is in the way
     avoid: float = 5.0  # kg/s, strength of steering around it
@@ -34,10 +34,10 @@ class EvadeRules:
     alarm: float = 10.0  # m, within which a pursuer is evaded: as far as it sees
     predict: float = 0.5  # s, how far ahead a pursuer is predicted at most
     evade: float = 5.0  # kg/s, strength of an evasion
-    crowd: float = 1.0  # how much farther pursuers count beside the nearest; 0: he alone
+    crowd: float = 1.0  # how much farther pursuers count beside the nearest; 0: the nearest alone
     middle: float = 0.2  # N/m towards the middle of the field while evading
     margin: float = 1.0  # m, behind cover
-    danger: float = 0.0  # m added to the way to a hiding place per m that a pursuer is nearer to it than 10 m
+    danger: float = 0.0  # m added to the distance of a hiding place per m that a pursuer is nearer to it than 10 m
     exposed: float = 0.0  # m added to it for each pursuer that sees that place
     hide: float = 3.0  # kg/s, towards the hiding place
 

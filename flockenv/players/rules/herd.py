@@ -1,4 +1,4 @@
-"""Herd: collect who strays, else drive them all from behind."""
+"""Herd: collect a sheep that strays, else drive all of them from behind."""
 
 from __future__ import annotations
 
@@ -25,19 +25,19 @@ threat = rows(steering.threat)
 class HerdRules:
     """Textbook: Strombom et al. 2014; lengths in units of the distance r_a that sheep keep from each other."""
 
-    together: float = 1.0  # times r_a N^(2/3): who is farther from the centre is collected
-    collecting: float = 1.0  # r_a, behind who is collected
+    together: float = 1.0  # times r_a N^(2/3): a sheep farther from the centre is collected
+    collecting: float = 1.0  # r_a, behind the sheep that is collected
     driving: float = 1.0  # times r_a sqrt(N), behind the centre
     near: float = 3.0  # r_a, to the nearest sheep: slower within this
     slow: float = 0.0  # share of the top speed within it
-    gain: float = 5.0  # kg/s, a change of velocity is asked for within 1/gain seconds
-    around: float = 0.0  # kg/s: keep outside a circle about the flock on the way to the place behind it
+    gain: float = 5.0  # kg/s, force per m/s of the desired change
+    around: float = 0.0  # kg/s: keep outside a circle about the flock on the path to the place behind it
     width: float = 1.0  # of that circle, times the distance of the farthest sheep from the centre
     apart: float = 4.0  # N, away from other dogs, in proportion to nearness within 10 m
 
 
 def herd(see: Any, task: Herd, p: HerdRules) -> NDArray[np.float64]:
-    """Go behind who strays, or behind all of them, and stand still near a sheep; vectors are (along, left)."""
+    """Go behind a sheep that strays, or behind all, and stand still near a sheep; vectors are (along, left)."""
     r, n, top = task.apart_distance, task.sheep, task.dog_speed
     together, driving = p.together * r * n ** (2 / 3), p.driving * r * n**0.5
     place = herd_from(see.centre, see.farthest, see.goal, together, p.collecting * r, driving)

@@ -1,4 +1,4 @@
-"""What the players by ORCA share: the velocity nearest to what one wants that is free of all who are seen."""
+"""The law that players by ORCA share: the velocity nearest to the desired one that is free of all agents in sight."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ clear = rows(orca)
 def keep_clear(
     see: Any, task: Any, p: Any, wish: NDArray[np.float64], radius: float, others: float, share: float
 ) -> NDArray[np.float64]:
-    """Return the force towards the velocity (van den Berg et al. 2011) nearest to `wish`, (rows, 2) m/s, that is free.
+    """Return the force towards the free velocity nearest to `wish`, the desired one, (rows, 2) m/s.
 
-    radius: of one's body, m; others: of those who are seen; share: of the change that is one's own. `p` says for how
-    long it must be free (horizon, s), with which clearance (margin, m), how far a wish that is not free is turned right
-    (turn, rad), and how hard one pushes (gain, kg/s).
+    van den Berg et al. 2011. radius: of the agent's body, m; others: radius of those in sight, m; share: the agent's
+    part of the change. `p` has the time for which the velocity must be free (horizon, s), the clearance (margin, m),
+    the angle by which a desired velocity that is not free is turned right (turn, rad), and the gain, kg/s.
     """
     velocities = see.velocity[:, None] + see.neighbour_velocity
     wide = np.where(see.neighbour_present > 0, others + p.margin, -1.0)[..., None]

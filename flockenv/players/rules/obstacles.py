@@ -22,7 +22,7 @@ threat = rows(steering.threat)
 
 @dataclass(frozen=True)
 class ObstaclesRules:
-    """Textbook: look two seconds ahead, evade with all the force there is, seek with the rest."""
+    """Textbook: look two seconds ahead, evade with the whole force, seek with the rest."""
 
     horizon: float = 2.0  # s, how far ahead a threat counts at the present speed
     margin: float = 0.2  # m, clearance beyond the touching distance
@@ -30,7 +30,7 @@ class ObstaclesRules:
     urgency: float = 0.0  # 0: evade with full strength at any distance; 1: in proportion to nearness
     brake: float = 0.0  # kg/s against the speed, in proportion to nearness
     gain: float = 2.0  # kg/s towards the goal
-    speed: float = 1.0  # share of the top speed that is wanted
+    speed: float = 1.0  # desired speed as a share of the top speed
     push: float = 0.0  # N m, repulsion from the nearest surfaces (1/gap), a force field for close quarters
 
 

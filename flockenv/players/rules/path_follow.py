@@ -19,17 +19,17 @@ follow_path = rows(steering.follow_path)
 
 @dataclass(frozen=True)
 class PathFollowRules:
-    """Textbook: half a second ahead, the whole track is the tube, full speed whatever comes."""
+    """Textbook: half a second ahead, the whole track is the tube, full speed in every bend."""
 
     time: float = 0.5  # s, how far ahead it predicts itself
     lead: float = 0.5  # s, how far ahead at its present speed the point lies that is sought
     tube: float = 1.0  # share of the track's width that is left alone
-    keep: float = 0.5  # share of the speed it wants, below which it is sent on
-    speed: float = 1.0  # share of the top speed that is wanted
-    grip: float = 100.0  # share of all the force there is that a bend may ask for; much = never slows down
+    keep: float = 0.5  # share of the desired speed, below which it speeds up
+    speed: float = 1.0  # desired speed as a share of the top speed
+    grip: float = 100.0  # share of the largest force that a bend may need; a large one = never slows down
     early: float = 1.0  # share of it that braking before a bend counts on
-    brake: float = 0.0  # kg/s against what is too fast
-    gain: float = 5.0  # kg/s, a change of velocity is asked for within 1/gain seconds
+    brake: float = 0.0  # kg/s against the excess of speed
+    gain: float = 5.0  # kg/s, force per m/s of the desired change
 
 
 def path_follow(see: Any, task: PathFollow, p: PathFollowRules) -> NDArray[np.float64]:

@@ -25,7 +25,7 @@ class PursuitRules:
     factor: float = 1.0  # share of the interception time that is looked ahead
     horizon: float = 10.0  # s, never look further ahead than this
     margin: float = 0.3  # m, the quarry will not be nearer to a wall than this
-    gain: float = 5.0  # kg/s, a change of velocity is asked for within 1/gain seconds
+    gain: float = 5.0  # kg/s, force per m/s of the desired change
     slow_radius: float = 0.01  # m, arrive instead of seek: brake within this distance of the predicted place
 
 

@@ -34,12 +34,12 @@ class SchoolRules:
     calm: float = 0.1  # how much less fear ends either
     content: float = 0.3  # how much less hunger ends it
     wall: float = 0.3  # s, how far ahead walls count
-    apart: float = 1.0  # N m, separation from whom it nearly touches
+    apart: float = 1.0  # N m, separation from agents that it nearly touches
     predict: float = 0.5  # s, how far ahead a hunter is predicted at most
     evade: float = 5.0  # kg/s, strength of an evasion
     middle: float = 0.0  # N/m towards the middle of the tank while it flees
     forage: float = 5.0  # kg/s, towards food
-    rich: float = 0.0  # m of way that a full patch is worth more than an empty one
+    rich: float = 0.0  # m of distance that a full patch is worth more than an empty one
     match: float = 2.0  # kg/s, alignment
     centre: float = 1.0  # N/m, cohesion
     pace: float = 0.5  # share of the top speed that it wanders at
@@ -52,14 +52,14 @@ _WHEN = arbitration.Intentions(when=("avoid", "avoid", "escape", "school", "eat"
 def school(
     see: Any, task: School, p: SchoolRules, before: Any, begins: Any
 ) -> tuple[NDArray[np.floating], NDArray[np.float64]]:
-    """Choose a state from hunger and fear, with hysteresis, and hear its behaviours; return that state too, (R,)."""
+    """Select a state from hunger and fear, with hysteresis, and its behaviours; return force and state, (R,)."""
     count, top, ahead = len(see.velocity), task.fish_speed, np.array([1.0, 0.0])
     known = before is not None and np.shape(before) == (count,)
     was = np.where(begins, 0.0, before) if known else np.zeros(count)
     calm, content = min(p.calm, p.school), min(p.content, p.need)
     now = intention(was, see.hunger, 0.0, see.fear, max(p.escape, p.school), p.school, p.need, calm, content)
     hunted = see.hunter_present[:, 0] > 0
-    # in sight there is nobody to flee from, or nothing to eat: go on, and look around
+    # no hunter or no food is in sight: go on, and look around
     some = np.linalg.norm(see.food_bearing, axis=-1) > 0
     now_heard = np.where((now == urges.ESCAPE) & ~hunted, urges.WANDER, now)
     now_heard = np.where((now == urges.EAT) & ~some.any(axis=1), urges.WANDER, now_heard)
