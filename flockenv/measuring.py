@@ -85,6 +85,7 @@ def measure(
         raise ValueError(f"--skip = {skip:g}: must be >= 0 and less than --time = {time:g}")
     stride = max(1, round(EVERY / loaded.dt)) if every is None else whole_steps("--every", every, loaded.dt, 1)
     asked = Asked(_line(line), _area("--area", area, True), _area("--walkable", walkable, False), skip)
+    asked.check(loaded)
     found, first = _surveyed(loaded, seed, seeds, steps, stride, asked)
     means, above = combined(found), _above(found)
     _show(loaded, found, means, above, first, stride)

@@ -85,6 +85,11 @@ class Asked:
     walkable: Floats | None = None  # (n, 2) m; none = found out
     skip: float = 0.0  # s, of the beginning
 
+    def check(self, scene: Scene) -> None:
+        """Refuse a line or an area of a scene in space: ValueError, of one line."""
+        if scene.dimension == 3 and (self.line is not None or self.area is not None or self.walkable is not None):
+            raise ValueError("dimension = 3: lines and areas are of the plane")
+
 
 @dataclass(frozen=True, eq=False)
 class Survey:
@@ -145,8 +150,7 @@ class _Run:
     def of(cls, run: Trajectory, asked: Asked) -> _Run:
         """Return it; ValueError, of one line, for a line or area that is none, or that is asked for in space."""
         scene, time = run.scene, np.asarray(run.step * run.scene.dt, np.float64)
-        if scene.dimension == 3 and (asked.line is not None or asked.area is not None or asked.walkable is not None):
-            raise ValueError("dimension = 3: lines and areas are of the plane")
+        asked.check(scene)
         alive = run.alive & np.isfinite(run.pos).all(axis=2)
         first = min(int(np.searchsorted(time, asked.skip - 1e-9)), len(time) - 1)
         axis = _axis(run, alive, asked.line)

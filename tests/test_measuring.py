@@ -13,6 +13,7 @@ import pytest
 from PIL import Image
 
 import flockenv.survey
+import flockenv.trajectory
 from flockenv.cli import main
 from flockenv.config import load_scene
 from flockenv.survey import UNITS, Asked, survey
@@ -235,6 +236,19 @@ def test_a_mistake_is_one_line_and_writes_nothing(
     assert len(captured.err.splitlines()) == 1
     assert captured.out == ""
     assert sorted(path.name for path in tmp_path.iterdir()) == before
+
+
+@pytest.mark.parametrize("option", ["--line 0,0,1,0", "--area 0,0,1,1", "--walkable 0,0,1,1"])
+def test_lines_and_areas_in_space_are_refused_before_the_run(
+    option: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def started(*arguments: object) -> None:
+        raise AssertionError("the scene is run")
+
+    monkeypatch.setattr(flockenv.trajectory, "record", started)
+    Path("cube.yaml").write_text("dimension: 3\ngroups: [{count: 1, spawn: {low: [0, 0, 0], high: [1, 1, 1]}}]\n")
+    assert main(["measure", "cube.yaml", "--time", "1", *option.split(" ")]) == 2
+    assert capsys.readouterr().err == "flockenv: dimension = 3: lines and areas are of the plane\n"
 
 
 def test_what_is_there_is_overwritten_only_by_force() -> None:
