@@ -2,9 +2,10 @@
 
 Two short trainings take turns: Pursuit as agents.ppo trains by default, and School with everything that has a memory of
 its own (a central critic, care, held actions, teaching, staggered worlds). Each is killed with SIGKILL again and again,
-at moments uniform over its whole life; every third kill waits for the next checkpoint to be written, and comes in the
-middle of that. A training that ends must have exported the weights, and left the checkpoint, of one that was never
-killed: the same SHA-256. Processes are forked from a server that has imported torch, since that takes longest.
+at moments uniform over its whole life, up to eight times; every third kill waits for the next checkpoint to be written,
+and comes in the middle of that. A training that ends must have exported the weights, and left the checkpoint, of one
+that was never killed: the same SHA-256. Processes are forked from a server that has imported torch, since that takes
+longest.
 """
 
 from __future__ import annotations
@@ -44,12 +45,13 @@ TRAININGS = (
 WEIGHTS, REFUSED = "weights.safetensors", "refused.txt"
 LARGEST = 2**26  # bytes of a checkpoint; of these trainings it has a thousandth of that
 POLL = 2e-4  # s, between looks for a checkpoint that is being written
-AIMED = 3  # every so many kills are aimed at one
+AIMED = 3  # one kill in three is aimed at one
+CHAIN = 8  # most kills of one training: on a busy machine hardly any would end, and none would be compared
 
 
 @dataclass
 class Count:
-    """What came of the kills."""
+    """Outcomes of the kills."""
 
     kills: int = 0
     writing: int = 0  # of them, those that left a half-written checkpoint
@@ -126,7 +128,7 @@ def _killed(process: BaseProcess, folder: Path, moment: float, aimed: bool) -> b
 
 
 def kill_and_resume(times: int, seed: int, folder: Path, say: bool = False) -> Count:
-    """Kill trainings so many times, and let each go on to its end; return what came of it."""
+    """Kill trainings `times` times in all, at most CHAIN times each, and let each end; return the counts."""
     lives, rng, count = Lives(), np.random.default_rng(seed), Count()
     known = [_known(lives, experiment, folder / f"whole{k}") for k, experiment in enumerate(TRAININGS)]
     number = 0
@@ -153,11 +155,12 @@ def _chain(
     lives: Lives, experiment: Experiment, folder: Path, seconds: float, expected: str, times: int,
     rng: np.random.Generator, count: Count,
 ) -> None:  # fmt: skip
-    """Let one training live until it ends, killed on the way, and compare what it came to."""
+    """Let one training live until it ends, killed on the way, and compare its digests."""
     folder.mkdir()
+    last = min(times, count.kills + CHAIN)
     while True:
         process, moment = lives.begin(experiment, folder), rng.uniform(0, seconds)
-        if count.kills < times and _killed(process, folder, moment, count.kills % AIMED == 0):
+        if count.kills < last and _killed(process, folder, moment, count.kills % AIMED == 0):
             count.kills += 1
             count.writing += _being_written(folder)
             continue

@@ -26,6 +26,7 @@ from agents.checkpoint import FILE, Damaged, InUse, Parts, claimed, digest
 from agents.divergence import LearningDiverged
 from agents.experiment import CONFIGS, Experiment
 from agents.run import checkpoint, checkpointed
+from benchmarks import kills
 from flockenv.atomic import LEFTOVERS
 from flockenv.outputs import check_room
 from flockenv.policy import MlpPolicy
@@ -138,6 +139,29 @@ def test_killed_trainings_end_as_if_they_had_never_been_killed() -> None:
     done = subprocess.run(command, cwd=CONFIGS.parent, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stdout + done.stderr
     assert "20 kills" in done.stdout and "0 ended otherwise, 0 resumptions were refused" in done.stdout
+
+
+def test_kills_are_spread_over_trainings_that_end(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """On a busy machine a training may be killed each time before it has come any further: one took 151 of 200."""
+
+    class Life:
+        exitcode = 0
+
+        def join(self) -> None:
+            pass
+
+    class Lives:
+        def begin(self, *given: object) -> Life:
+            return Life()
+
+        def whole(self, *given: object) -> tuple[float, str]:
+            return 1.0, "digests"
+
+    monkeypatch.setattr(kills, "Lives", Lives)
+    monkeypatch.setattr(kills, "_killed", lambda *given: True)
+    monkeypatch.setattr(kills, "digests", lambda folder: "digests")
+    count = kills.kill_and_resume(20, 0, tmp_path)
+    assert (count.kills, count.same, count.different, count.refused) == (20, 3, [], [])
 
 
 def test_worlds_go_on_from_their_arrays_bit_for_bit() -> None:
