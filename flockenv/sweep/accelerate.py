@@ -9,7 +9,6 @@ part; `accelerate` is for all others, and for who asks for accelerations alone.
 from __future__ import annotations
 
 from flockenv.sweep.handed import OPEN_CONTEXT
-from flockenv.sweep.obstacles import obstacles
 from flockenv.sweep.parts import Parts
 from flockenv.sweep.text import (
     Slots,
@@ -26,9 +25,6 @@ from flockenv.sweep.text import (
 )
 
 __all__ = ["accelerate", "felt_as", "parameters", "responses", "sense"]
-
-
-_FORM_FIELDS = {"at": "at", "count": "many", "cells": "cells"}
 
 
 def sense(parts: Parts) -> str:
@@ -60,9 +56,10 @@ def responses(parts: Parts, told: list[str]) -> list[str]:
     """
     d = parts.dimension
     here = f"x, v = {lanes_of(parts, 'pos')}, {lanes_of(parts, 'vel')}"
-    me = ["i = row + l", here, f"me = {alone(parts, one='one + l')}"]
     responding = [
-        *me,
+        "i = row + l",
+        here,
+        f"me = {alone(parts, one='one + l')}",
         "o = zero(x)",
         f"s, f = {lanes_of(parts, 'want', 'wish')}, o",
         *(f"{parts.target(k)} = o" for k in parts.wishes),
@@ -82,7 +79,7 @@ def responses(parts: Parts, told: list[str]) -> list[str]:
     ]
     return [
         *in_common(parts),
-        *obstacles(parts, me, lambda k: felt_as(parts, f"n{k}_")),
+        *["meet_obstacles(context, pos, vel, time, block)"] * parts.folds_obstacles,
         f"for l in range(np.uint64({parts.width})):",
         *indented_lines(responding, 4),
     ]
@@ -106,8 +103,6 @@ def accelerate(context, pos, vel, time, acc):
 def parameters(parts: Parts, numbers: str = "numbers_of(params, scratch.counters)") -> list[str]:
     """Write by which names the numbers of a scene are known."""
     lines = [f"numbers = {numbers}", "size, reach = numbers.size, numbers.reach"]
-    for j, form in enumerate(parts.shaped[1]):
-        lines += [f"{form}_{name} = numbers.forms[{j}].{field}" for name, field in _FORM_FIELDS.items()]
     for q, sight in enumerate(parts.sights):
         lines += [f"within{q} = numbers.views[{q}].within", f"view{q} = numbers.views[{q}].cone"]
         if sight.group is not None:

@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from flockenv.kernels import Law, Vec, kernel, like, routine
+from flockenv.kernels import Law, Vec, kernel, law, like, routine
 from flockenv.section import section
 from flockenv.shapes.edges import near_way, sphere_edge
 from flockenv.shapes.round import touched_normal
@@ -26,7 +26,7 @@ from flockenv.shapes.table import law_of
 from flockenv.shapes.touch import touched_spot
 from flockenv.steering.around import threat
 from flockenv.sweep.blocks import vector_of
-from flockenv.sweep.forms import FormPlan, Surroundings, box_of_way, each_row, number_of, seen_from
+from flockenv.sweep.forms import FormPlan, Surroundings, box_of_way, by_form, each_row, number_of, seen_from
 from flockenv.vec import add, cross, dot, lateral, norm, perpendicular, scale, select, sub, unit, zero
 
 __all__ = ["aside_of"]
@@ -47,10 +47,28 @@ SPINES = ("chain", "block")
 """Forms that have an axis of their own: `spine_FORM` of shapes/edges.py."""
 
 
-def _law(verb: str, form: str) -> Law:
-    """Return the law `edge_FORM` or `spine_FORM` of shapes/edges.py."""
-    law: Law = getattr(importlib.import_module(near_way.__module__), f"{verb}_{form}")
-    return law
+def _laws(verb: str, forms: tuple[FormPlan, ...]) -> tuple[tuple[str, Law], ...]:
+    """Return the laws `edge_FORM` or `spine_FORM` of some forms, see shapes/edges.py."""
+    module = importlib.import_module(near_way.__module__)
+    return tuple((form.name, getattr(module, f"{verb}_{form.name}")) for form in forms)
+
+
+@law
+def _no_edge(table: Any, at: int, x: Vec, ray: Vec, side: Vec, room: float) -> tuple[float, float]:
+    """Return that there is no edge: of what is no shape."""
+    return like(room, np.inf), like(room, np.inf)
+
+
+@law
+def _nowhere(table: Any, at: int, x: Vec) -> tuple[float, Vec]:
+    """Return that what is no shape is infinitely far, and has no normal."""
+    return like(x[0], np.inf), zero(x)
+
+
+@law
+def _no_spine(table: Any, at: int, x: Vec, ray: Vec) -> Vec:
+    """Return that a shape has no axis of its own: 0."""
+    return zero(x)
 
 
 # --- what a body touches ----------------------------------------------------------------------------------------------
@@ -163,7 +181,7 @@ def edge(around: Surroundings) -> Callable[..., tuple[float, float]]:
     Towards `side`; rad, and m along the turned ray until the body is beside it.
     """
     offset_to, circle, shaped = around.offset_to, vector_of(around.dimension), bool(around.forms)
-    seen, edge_of = seen_from(around.offset_to, around.moving), _edge_of(tuple(form.name for form in around.forms))
+    seen, edge_of = seen_from(around.offset_to, around.moving), by_form(_laws("edge", around.forms), _no_edge)
 
     def edge(world: Any, form: Any, row: Any, x: Any, ray: Any, side: Any, room: Any) -> Any:
         obstacle_x, obstacle_radius, params, size, b, time = world
@@ -171,28 +189,10 @@ def edge(around: Surroundings) -> Callable[..., tuple[float, float]]:
             to = offset_to(size, x, circle(obstacle_x, b, row))
             return sphere_edge(to, ray, side, room + obstacle_radius[b, row])
         if shaped:
-            return edge_of(params, form, row, seen(params, size, row, time, x), ray, side, room)
+            return edge_of(params, form, row, (seen(params, size, row, time, x), ray, side, room))
         return like(room, np.inf), like(room, np.inf)
 
     return routine(edge)
-
-
-@section
-def _edge_of(forms: tuple[str, ...]) -> Callable[..., tuple[float, float]]:
-    """Make `edge(params, form, row, y, ray, side, room)`: the edge of a shape of one of some forms; else infinity."""
-    some = bool(forms)
-    number = number_of(forms[0]) if forms else 0
-    law: Any = _law("edge", forms[0]) if forms else None
-    rest: Any = _edge_of(forms[1:]) if forms else None
-
-    def edge_of(params: Any, form: Any, row: Any, y: Any, ray: Any, side: Any, room: Any) -> Any:
-        if some:
-            if form == number:
-                return law(params, row, y, ray, side, room)
-            return rest(params, form, row, y, ray, side, room)
-        return like(room, np.inf), like(room, np.inf)
-
-    return edge_of
 
 
 @functools.cache
@@ -202,35 +202,18 @@ def normal_hit(around: Surroundings) -> Callable[..., Vec]:
     hit: how far along the ray that is, m.
     """
     offset_to, circle, shaped = around.offset_to, vector_of(around.dimension), bool(around.forms)
-    seen, normal_of = seen_from(around.offset_to, around.moving), _normal_of(tuple(form.name for form in around.forms))
+    laws = tuple((form.name, law_of("nearest", form.name)) for form in around.forms)
+    seen, nearest = seen_from(around.offset_to, around.moving), by_form(laws, _nowhere)
 
     def normal_hit(world: Any, form: Any, row: Any, x: Any, ray: Any, hit: Any, room: Any) -> Any:
         obstacle_x, _, params, size, b, time = world
         if form == -1:
             return touched_normal(offset_to(size, x, circle(obstacle_x, b, row)), ray, hit)
         if shaped:
-            return normal_of(params, form, row, seen(params, size, row, time, x), ray, hit, room)
+            return nearest(params, form, row, (touched_spot(seen(params, size, row, time, x), ray, hit, room),))[1]
         return zero(x)
 
     return routine(normal_hit)
-
-
-@section
-def _normal_of(forms: tuple[str, ...]) -> Callable[..., Vec]:
-    """Make `normal(params, form, row, y, ray, hit, room)`: the same of a shape of one of some forms; else 0."""
-    some = bool(forms)
-    number = number_of(forms[0]) if forms else 0
-    nearest: Any = law_of("nearest", forms[0]) if forms else None
-    rest: Any = _normal_of(forms[1:]) if forms else None
-
-    def normal_of(params: Any, form: Any, row: Any, y: Any, ray: Any, hit: Any, room: Any) -> Any:
-        if some:
-            if form == number:
-                return nearest(params, row, touched_spot(y, ray, hit, room))[1]
-            return rest(params, form, row, y, ray, hit, room)
-        return zero(y)
-
-    return normal_of
 
 
 @functools.cache
@@ -310,14 +293,14 @@ def _sides_in_space(around: Surroundings) -> Callable[..., tuple[Vec, ...]]:
     The axis is the obstacle's own, or else leads away from what blocked the side of the normal. So no axis of the
     coordinates is preferred, and agents of the mirrored scene take the mirrored path.
     """
-    forms = tuple(form.name for form in around.forms if form.name in SPINES)
-    some, seen, spine_of = bool(forms), seen_from(around.offset_to, around.moving), _spine_of(forms)
+    laws = _laws("spine", tuple(form for form in around.forms if form.name in SPINES))
+    some, seen, spine_of = bool(laws), seen_from(around.offset_to, around.moving), by_form(laws, _no_spine)
 
     def sides(world: Any, form: Any, row: Any, x: Any, ray: Any, own: Any, off: Any) -> Any:
         _, _, params, size, _, time = world
         ax, e = zero(x), like(x[0], 1.0)
         if some and form >= 0:
-            ax = lateral(spine_of(params, form, row, seen(params, size, row, time, x), ray), ray)
+            ax = lateral(spine_of(params, form, row, (seen(params, size, row, time, x), ray)), ray)
         if dot(ax, ax) <= like(e, 1e-10):
             ax = lateral(lateral(off, ray), own)
         if dot(ax, ax) <= like(e, 1e-10):
@@ -327,21 +310,3 @@ def _sides_in_space(around: Surroundings) -> Callable[..., tuple[Vec, ...]]:
         return ax, scale(ax, -e), across, scale(across, -e)
 
     return sides
-
-
-@section
-def _spine_of(forms: tuple[str, ...]) -> Callable[..., Vec]:
-    """Make `spine(params, form, row, y, ray)`: the axis of a shape of one of some forms; else 0."""
-    some = bool(forms)
-    number = number_of(forms[0]) if forms else 0
-    law: Any = _law("spine", forms[0]) if forms else None
-    rest: Any = _spine_of(forms[1:]) if forms else None
-
-    def spine_of(params: Any, form: Any, row: Any, y: Any, ray: Any) -> Any:
-        if some:
-            if form == number:
-                return law(params, row, y, ray)
-            return rest(params, form, row, y, ray)
-        return zero(y)
-
-    return spine_of

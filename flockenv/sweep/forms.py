@@ -27,7 +27,7 @@ from flockenv.shapes.head import shift_of, vector_at
 from flockenv.shapes.table import FORMS
 from flockenv.vec import add
 
-__all__ = ["FormPlan", "Surroundings", "box_of_way", "each_row", "near_rows", "number_of", "seen_from"]
+__all__ = ["FormPlan", "Surroundings", "box_of_way", "by_form", "each_row", "near_rows", "number_of", "seen_from"]
 
 
 class FormPlan(NamedTuple):
@@ -54,6 +54,26 @@ class Surroundings(NamedTuple):
 def number_of(form: str) -> int:
     """Return the number of a form, as rows hold it."""
     return list(FORMS).index(form)
+
+
+@section
+def by_form(laws: tuple[tuple[str, Law], ...], otherwise: Law) -> Callable[..., Any]:
+    """Make `of(params, form, row, given)`: what the law of a shape's form returns for (params, row, *given).
+
+    laws: (form, its law); otherwise: that of a shape of any other form.
+    """
+    some = bool(laws)
+    number, law_of_form = (number_of(laws[0][0]), laws[0][1]) if laws else (0, otherwise)
+    rest: Any = by_form(laws[1:], otherwise) if laws else None
+
+    def of(params: Any, form: Any, row: Any, given: Any) -> Any:
+        if some:
+            if form == number:
+                return law_of_form(params, row, *given)
+            return rest(params, form, row, given)
+        return otherwise(params, row, *given)
+
+    return of
 
 
 @section

@@ -1,9 +1,6 @@
 """Folds over the obstacles, all of them in one pass: circles of the state, which may differ from world to world, then
 the other shapes: what is not round, moves, or is hollow. These are met where they are at the time of the stage.
 
-A law meets circles as they are, and of any other shape one point (`effects.base.Obstacle`): the nearest of its surface,
-or, where the law casts a ray, the one that it touches first. Nothing is written if no law asks for obstacles.
-
 Where there are many shapes of a form, each agent meets those that may lie within reach by a grid (shapes/cells.py), in
 the order in which they are listed; that is where the others, which a law leaves alone, would have been met too: so
 results are the same bits.
@@ -11,305 +8,352 @@ results are the same bits.
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
+from typing import Any
 
-from flockenv.shapes import FORMS
-from flockenv.sweep.parts import Parts
-from flockenv.sweep.text import Slots, indented, indented_lines, tuple_of
+import numpy as np
 
-__all__ = ["CIRCLE", "obstacle_imports", "obstacles"]
+from flockenv.kernels import Vec, kernel, law, like
+from flockenv.section import in_turn, section, vector
+from flockenv.shapes.edges import near_way
+from flockenv.shapes.head import outside_box, shift_of, velocity_of
+from flockenv.shapes.table import law_of
+from flockenv.sweep.agents import AgentPlan, alone_of
+from flockenv.sweep.around import aside_of
+from flockenv.sweep.blocks import vector_of, vector_of_lane
+from flockenv.sweep.folds import meet_circle, meet_shape
+from flockenv.sweep.forms import near_rows
+from flockenv.sweep.gather import scatter
+from flockenv.sweep.obstacle_plan import Fold, Obstacles, Place, Shape
+from flockenv.vec import add, dot, scale, sub, zero
 
-CIRCLE = "circle"
-
-PIECED = ("chain", "hollow_chain", "hollow_block")
-"""Forms that a law may meet piece by piece: side after side."""
+__all__ = ["obstacles_of"]
 
 LOOSE = 1 + 1e-6
 """Factor of a reach, so that single precision loses nothing that a law would have met."""
 
-SHORT = 1 - 1e-6
-"""Share of the way to a surface on which nothing may stand, if it is to be seen: not the surface itself."""
 
+@section
+def obstacles_of(plan: Obstacles) -> Callable[..., None]:
+    """Make `meet_obstacles(context, pos, vel, time, block)`: what one block's folds over the obstacles come to.
 
-def obstacle_imports(parts: Parts) -> list[str]:
-    """Write what folds over obstacles, and who is hidden by them, are made of."""
-    if not parts.meets_obstacles:
-        return []
-    asked = ["outside_box"] * bool(parts.bounded) + ["shift_of", "velocity_of"] * parts.moving
-    lines = [
-        "from flockenv.effects.base import Obstacle",
-        "from flockenv.shapes.round import normal as outward, touched_normal",
-        "from flockenv.shapes.touch import touched_offset, touched_spot",
-        "from flockenv.steering.around import threat",
-        *([f"from flockenv.shapes.head import {', '.join(asked)}"] if asked else []),
-    ]
-    forms = [(form, module) for form, module in FORMS.items() if form in parts.shaped[1]]
-    lines += [f"from {module} import hit_{form}, nearest_{form}" for form, module in forms]
-    if parts.cells:
-        lines.append("from flockenv.shapes.edges import near_way")
-    cut = [(form, module) for form, module in forms if form in PIECED and any(e.obstacle_pieces for e in parts.effects)]
-    return lines + [f"from {module} import piece_{form}, pieces_{form}" for form, module in cut]
-
-
-def obstacles(parts: Parts, me: list[str], found_out: Callable[[int], str]) -> list[str]:
-    """Write the folds over the obstacles; nothing if no law asks for obstacles.
-
-    found_out(k): where what the pair law of effect k has found out about others is.
+    It is written into `lanes`, where the plan says; time, s.
     """
-    slot = Slots(parts)
-    asking = [(k, slot.all(f"o{k}_")) for k, e in enumerate(parts.effects) if e.obstacle_start is not None]
-    if not asking:
-        return []
-    starts = []
-    for k, slots in asking:
-        told = f", {found_out(k)}" if parts.effects[k].pair_law else ""
-        starts.append(f"found = obstacle_start_{k}(p{k}, me{told})")
-        starts += [f"{s} = found[{j}]" for j, s in enumerate(slots)]
-    if parts.bounded or parts.looked_up:
-        starts.append(f"seen = obstacle_reach_{asking[0][0]}(p{asking[0][0]}, me)")
-        starts += [f"seen = max(seen, obstacle_reach_{k}(p{k}, me))" for k, _ in asking[1:]]
-        starts.append(f"{slot('reach0')} = seen")
-    count = " + ".join(["obstacle_radius.shape[1]", *(f"{form}_count" for form in parts.shaped[1])])
-    d, w = parts.dimension, parts.width
-    lines = [
-        "if block == 0:",
-        f"    work[b, 3] += n * ({count})",
-        f"for l in range(np.uint64({w})):",
-        indented(me + starts, 4),
-        "for m in range(obstacle_radius.shape[1]):",
-        "    rho = obstacle_radius[b, m]",
-        "    if rho > 0:",
-        f"        place = {tuple_of('obstacle_x[#, b, m]', d)}",
-        f"        for l in range(np.uint64({w})):",
-        indented([*me, "to = offset_to(size, x, place)", *_meet(parts, asking, CIRCLE)], 12),
-    ]
-    for form in parts.shaped[1]:
-        met = [f"gap, out = nearest_{form}(params, at_, y)", *_meet(parts, asking, form)]
-        if form in parts.bounded:
-            within = "if dot(beside, beside) < seen * seen:"
-            bound = [f"beside, seen = outside_box(params, at_, y), {slot('reach0')}"]
-            met = [*bound, within, *indented_lines(met, 4)]
-        if form in parts.looked_up and parts.only_rays:
-            met = _near_a_ray(parts, [k for k, _ in asking], met)
-        met = ["y = offset_to(size, place, x)", *met]
-        if form in parts.looked_up:
-            lines += _looked_up(parts, form, me, met, [k for k, _ in asking])
+    d, width, arranges = plan.agent.dimension, plan.agent.width, plan.arranges
+    size, wide = np.uint64(d * width), np.uint64(width)
+    forms = (
+        _in_turn(plan, j) if form.name not in plan.looked_up else _looked_up(plan, j)
+        for j, form in enumerate(plan.around.forms)
+    )
+    edges = (_asides(plan, fold) for fold in plan.folds if fold.ahead)
+    passes = in_turn(_starts(plan), _circles(plan), *forms, *edges)
+
+    def meet_obstacles(context: Any, pos: Any, vel: Any, time: Any, block: Any) -> None:
+        base, row = block * size, block * wide
+        one = row & context.scratch.spread[0] if arranges else row
+        passes(context, pos, vel, time, Place(base, row, one))
+
+    return meet_obstacles
+
+
+@section
+def _agent_of(plan: AgentPlan) -> Callable[..., Any]:
+    """Make `agent(scratch, drawn, pos, vel, time, place, lane)`: an agent of a block, as its laws see it."""
+    vector_at, alone = vector_of_lane(plan.dimension, plan.width), alone_of(plan)
+
+    def agent(scratch: Any, drawn: Any, pos: Any, vel: Any, time: Any, place: Any, lane: Any) -> Any:
+        at = place.base + lane
+        x, v = vector_at(pos, at), vector_at(vel, at)
+        return alone(scratch, drawn, time, at, place.row + lane, place.one + lane, x, v, zero(x))
+
+    return agent
+
+
+@functools.cache
+def _world_of(plan: Obstacles) -> Callable[..., Any]:
+    """Make `world(context)`: what is asked of the world in order to know what obstacles hide; nothing if none asks."""
+    if all(fold.hidden is None for fold in plan.folds):
+        return kernel(lambda context: ())
+
+    def world(context: Any) -> Any:
+        return (
+            context.obstacle_x, context.obstacle_radius, context.params, context.numbers.size, context.b
+        )  # fmt: skip
+
+    return kernel(world)
+
+
+# --- how folds begin --------------------------------------------------------------------------------------------------
+
+
+@section
+def _starts(plan: Obstacles) -> Callable[..., None]:
+    """Make how all folds of a block begin, and note how far they look."""
+    width, agent, begin = plan.agent.width, _agent_of(plan.agent), in_turn(*(_start(plan, f) for f in plan.folds))
+    reach, limited = np.uint64(max(plan.reach, 0)), plan.reach >= 0
+    furthest: Any = _furthest(plan.folds) if limited else None
+
+    def starts(context: Any, pos: Any, vel: Any, time: Any, place: Any) -> None:
+        scratch, numbers, drawn = context.scratch, context.numbers, context.key[context.b]
+        lanes = scratch.lanes
+        for lane in range(np.uint64(width)):
+            me = agent(scratch, drawn, pos, vel, time, place, lane)
+            begin(scratch, numbers, me, place.row, lanes, lane)
+            if limited:
+                lanes[reach + lane] = furthest(numbers, me)
+
+    return starts
+
+
+@section
+def _start(plan: Obstacles, fold: Fold) -> Callable[..., None]:
+    """Make `start(scratch, numbers, me, row, lanes, lane)`: how one of them begins."""
+    k, start, slots, told = fold.k, fold.start, fold.slots, fold.told >= 0
+    each, place = np.uint64(plan.felt // plan.agent.width), np.uint64(max(fold.told, 0))
+    vector_at = vector_of_lane(plan.agent.dimension, plan.agent.width)
+
+    def begin(scratch: Any, numbers: Any, me: Any, row: Any, lanes: Any, lane: Any) -> None:
+        if told:
+            others = vector_at(scratch.felt, row * each + place + lane)
+            scatter(lanes, lane, slots, start(numbers.effects[k], me, others))
         else:
-            lines += _in_turn(parts, form, me, met)
-    return lines + _asides(parts, asking, me)
+            scatter(lanes, lane, slots, start(numbers.effects[k], me))
+
+    return begin
 
 
-def _in_turn(parts: Parts, form: str, me: list[str], met: list[str]) -> list[str]:
-    """Write how all agents of a block, side by side, meet every shape of a form."""
-    return [
-        f"at_ = {form}_at",
-        f"for m in range({form}_count):",
-        *indented_lines(_placed(parts), 4),
-        f"    for l in range(np.uint64({parts.width})):",
-        *indented_lines([*me, *met], 8),
-        "    at_ += np.int64(params[at_])",
-    ]
+@functools.cache
+def _furthest(folds: tuple[Fold, ...]) -> Callable[..., float]:
+    """Make `furthest(numbers, me)`: how far the fold looks that looks furthest, m."""
+    before, k, reach = _furthest(folds[:-1]) if folds[1:] else None, folds[-1].k, folds[-1].reach
+
+    def furthest(numbers: Any, me: Any) -> Any:
+        mine = reach(numbers.effects[k], me)
+        return mine if before is None else max(before(numbers, me), mine)
+
+    return kernel(furthest)
 
 
-def _looked_up(parts: Parts, form: str, me: list[str], met: list[str], asking: list[int]) -> list[str]:
-    """Write how each agent of a block meets the shapes of a form that may lie within reach, in order."""
-    first = Slots(parts).first("found0")
-    return [
-        f"for l in range(np.uint64({parts.width})):",
-        *indented_lines([*me, *_within_reach(parts, asking)], 4),
-        f"    many = near_{form}(params, size, {form}_cells, middle, around, lanes, np.int64({first}))",
-        f"    at_ = {form}_at",
-        f"    for m in range(many if many >= 0 else {form}_count):",
-        f"        at_ = {form}_at + np.int64(lanes[{first} + np.uint64(m)]) if many >= 0 else at_",
-        *indented_lines([*_placed(parts), *met], 8),
-        "        at_ += np.int64(params[at_])",
-    ]
+# --- what they meet ---------------------------------------------------------------------------------------------------
 
 
-def _near_a_ray(parts: Parts, asking: list[int], met: list[str]) -> list[str]:
-    """Write that a shape is met only if a ray, as far as laws reach, comes into the circle or sphere around it."""
-    lines = ["touched = False"]
-    for k in asking:
-        for j in range(parts.effects[k].rays(parts.dimension)):
-            lines.append(f"ray, margin = obstacle_ray_{k}(p{k}, me, {j})")
-            lines.append("touched |= near_way(params, at_, y, ray, me.radius + margin, seen)")
-    return [*lines, "if touched:", *indented_lines(met, 4)]
+@section
+def _circles(plan: Obstacles) -> Callable[..., None]:
+    """Make how all agents of a block, side by side, meet every circle of the state."""
+    width, agent, circle = plan.agent.width, _agent_of(plan.agent), vector_of(plan.agent.dimension)
+    offset_to, meet, world_of = plan.around.offset_to, meet_circle(plan.folds), _world_of(plan)
+
+    def circles(context: Any, pos: Any, vel: Any, time: Any, place: Any) -> None:
+        scratch, numbers, b, world = context.scratch, context.numbers, context.b, world_of(context)
+        radius, lanes, drawn = context.obstacle_radius, scratch.lanes, context.key[b]
+        if place.row == 0:
+            context.work[b, 3] += context.n * radius.shape[1]
+        for m in range(radius.shape[1]):
+            rho = radius[b, m]
+            if rho > 0:
+                centre = circle(context.obstacle_x, b, m)
+                for lane in range(np.uint64(width)):
+                    me = agent(scratch, drawn, pos, vel, time, place, lane)
+                    meet(numbers, world, me, offset_to(numbers.size, me.pos, centre), rho, m, lanes, lane)
+
+    return circles
 
 
-def _within_reach(parts: Parts, asking: list[int]) -> list[str]:
-    """Write the box in which something may matter to agent i: around all rays, if laws cast them, or around it."""
-    d = parts.dimension
-    lines = [f"seen = {Slots(parts)('reach0')} * like(x[0], {LOOSE!r})"]
-    if not parts.only_rays:
-        return [*lines, f"middle, around = x, {tuple_of('seen', d)}"]
-    lines.append("low, high, wide = zero(x), zero(x), like(seen, 0.0)")
-    for k in asking:
-        for j in range(parts.effects[k].rays(d)):
-            lines += [
-                f"ray, margin = obstacle_ray_{k}(p{k}, me, {j})",
-                f"low = {tuple_of('min(low[#], seen * ray[#])', d)}",
-                f"high = {tuple_of('max(high[#], seen * ray[#])', d)}",
-                "wide = max(wide, me.radius + margin)",
-            ]
-    return [
-        *lines,
-        f"wide, half = wide * like(wide, {LOOSE!r}), like(wide, 0.5)",
-        "middle = add(x, scale(add(low, high), half))",
-        f"around = {tuple_of('(high[#] - low[#]) * half + wide', d)}",
-    ]
+@section
+def _placed(dimension: int, moving: bool) -> Callable[..., tuple[Vec, Vec]]:
+    """Make `placed(params, at, time)`: where the shape at `at` is at a time (s), m, and how fast it moves, m/s."""
+    vector_at = vector(dimension)
+
+    def placed(params: Any, at: Any, time: Any) -> Any:
+        place = vector_at(params, at + 2)
+        if moving:
+            return add(place, shift_of(params, at, time, place)), velocity_of(params, at, time, place)
+        return place, zero(place)
+
+    return placed
 
 
-def _placed(parts: Parts) -> list[str]:
-    """Write where the shape at `at_` is, and how fast it moves."""
-    return [f"place = {tuple_of('params[at_ + 2 + #]', parts.dimension)}", *_moved(parts)]
+@section
+def _row(plan: Obstacles, form: str) -> Callable[..., None]:
+    """Make `meet(numbers, world, params, me, at, place, where, vel, lanes, lane)`: one agent meets a shape.
 
-
-def _asides(parts: Parts, asking: list[tuple[int, list[str]]], me: list[str]) -> list[str]:
-    """Write the side on which each agent goes around what is in its way, for the laws that ask: see around.py."""
-    lines: list[str] = []
-    for k, slots in asking:
-        if not parts.effects[k].obstacle_edges:
-            continue
-        world = "obstacle_x, obstacle_radius, params, size, b, time"
-        which, row = Slots(parts).all(f"ahead{k}_")
-        lines += [
-            f"for l in range(np.uint64({parts.width})):",
-            f"    impact = {slots[0]}",
-            "    if impact > 0 and impact < like(impact, np.inf):",
-            *indented_lines(me, 8),
-            f"        ray, margin = obstacle_ray_{k}(p{k}, me, 0)",
-            f"        known = impact, np.int64({which}), np.int64({row})",
-            f"        edgeward = aside_of(({world}), x, ray, me.radius + margin, known)",
-            *(f"        {s} = edgeward[{j}]" for j, s in enumerate(slots[-parts.dimension :])),
-        ]
-    return lines
-
-
-def _moved(parts: Parts) -> list[str]:
-    """Write where a shape is at this instant, and how fast it moves."""
-    if not parts.moving:
-        return []
-    velocity = "glide = velocity_of(params, at_, time, place)"
-    return [velocity, "place = add(place, shift_of(params, at_, time, place))"]
-
-
-def _meet(parts: Parts, asking: list[tuple[int, list[str]]], form: str) -> list[str]:
-    """Write how every law that asks meets one obstacle."""
-    lines = []
-    for k, slots in asking:
-        effect = parts.effects[k]
-        for j in range(effect.rays(parts.dimension) if effect.obstacle_ray else 1):
-            vel = "glide" if parts.moving and form != CIRCLE else "zero(x)"
-            from_ = k if effect.obstacle_from else None
-            if effect.obstacle_pieces and form in PIECED:
-                lines += _by_pieces(parts, k, slots, form, vel)
-                continue
-            lines += _touched(form, k, j, vel) if effect.obstacle_ray else _near(form, from_, vel)
-            lines.append(f"found = obstacle_law_{k}(p{k}, me, it, ({', '.join(slots)},))")
-            if effect.obstacle_edges:
-                lines += _remembered(parts, k, form, slots[0])
-            lines += _kept(slots, _seen("it.gap", "it.normal") if effect.occluded_obstacles else "")
-    return lines
-
-
-def _remembered(parts: Parts, k: int, form: str, ahead: str) -> list[str]:
-    """Write down which obstacle is ahead, where the law keeps another one than before.
-
-    By its form, and its place among those, or of a form with a grid by how far its row lies behind the first.
+    It is left alone where it does not come within reach. where: its anchor, m; vel: m/s.
     """
-    which, row = Slots(parts).all(f"ahead{k}_")
-    number = -1 if form == CIRCLE else list(FORMS).index(form)
-    place = f"at_ - {form}_at" if form in parts.looked_up else "m"
-    return [
-        f"another = found[0] != {ahead}",
-        f"{which} = like(found[0], {number}) if another else {which}",
-        f"{row} = like(found[0], {place}) if another else {row}",
-    ]
+    offset_to, nearest, meet = plan.around.offset_to, law_of("nearest", form), meet_shape(plan.folds, form)
+    bounded, picks, reach = (
+        form in plan.bounded,
+        form in plan.looked_up and plan.only_rays,
+        np.uint64(max(plan.reach, 0)),
+    )
+    near_a_ray: Any = _near_a_ray(plan.folds) if picks else None
+
+    def meet_row(
+        numbers: Any, world: Any, params: Any, me: Any, at: Any, place: Any, where: Any, vel: Any, lanes: Any, lane: Any
+    ) -> None:
+        y = offset_to(numbers.size, where, me.pos)
+        if picks:  # noqa: SIM102  # numba drops the branch by this alone
+            if not near_a_ray(numbers, params, at, y, me, lanes[reach + lane] * like(y[0], LOOSE)):
+                return
+        if bounded:
+            beside, seen = outside_box(params, at, y), lanes[reach + lane]
+            if not (dot(beside, beside) < seen * seen):
+                return
+        gap, out = nearest(params, at, y)
+        meet(numbers, world, params, me, Shape(at, place, y, vel, gap, out), lanes, lane)
+
+    return meet_row
 
 
-def _kept(slots: list[str], when: str) -> list[str]:
-    """Write how a fold goes on, always or under a condition."""
-    if not when:
-        return [f"{s} = found[{i}]" for i, s in enumerate(slots)]
-    return [f"acts = {when}", *(f"{s} = found[{i}] if acts else {s}" for i, s in enumerate(slots))]
+@section
+def _in_turn(plan: Obstacles, j: int) -> Callable[..., None]:
+    """Make how all agents of a block, side by side, meet every shape of form j."""
+    width, agent, world_of = plan.agent.width, _agent_of(plan.agent), _world_of(plan)
+    placed, meet = _placed(plan.agent.dimension, plan.around.moving), _row(plan, plan.around.forms[j].name)
+
+    def shapes(context: Any, pos: Any, vel: Any, time: Any, place: Any) -> None:
+        scratch, numbers, b, world = context.scratch, context.numbers, context.b, world_of(context)
+        params, lanes, drawn = context.params, scratch.lanes, context.key[b]
+        at, many = numbers.forms[j].at, numbers.forms[j].many
+        if place.row == 0:
+            context.work[b, 3] += context.n * many
+        for m in range(many):
+            where, glide = placed(params, at, time)
+            for lane in range(np.uint64(width)):
+                me = agent(scratch, drawn, pos, vel, time, place, lane)
+                meet(numbers, world, params, me, at, m, where, glide, lanes, lane)
+            at += np.int64(params[at])
+
+    return shapes
 
 
-def _seen(gap: str, normal: str) -> str:
-    """Write whether nothing stands in the way to the place of a surface that is nearest to x."""
-    way = f"scale({normal}, -{gap} * like({gap}, {SHORT!r}))"
-    return f"({gap} <= like({gap}, 0.0)) or not blocked(obstacle_x, obstacle_radius, params, size, b, time, x, {way})"
+@section
+def _looked_up(plan: Obstacles, j: int) -> Callable[..., None]:
+    """Make how each agent of a block meets the shapes of form j that may lie within reach, in order."""
+    width, agent, world_of = plan.agent.width, _agent_of(plan.agent), _world_of(plan)
+    placed, meet = _placed(plan.agent.dimension, plan.around.moving), _row(plan, plan.around.forms[j].name)
+    near, box = near_rows(plan.around.offset_to, plan.agent.dimension), _box(plan.folds, plan.only_rays)
+    first, reach = plan.found, np.uint64(plan.reach)
+
+    def shapes(context: Any, pos: Any, vel: Any, time: Any, place: Any) -> None:
+        scratch, numbers, b, world = context.scratch, context.numbers, context.b, world_of(context)
+        params, lanes, drawn, mine = context.params, scratch.lanes, context.key[b], numbers.forms[j]
+        if place.row == 0:
+            context.work[b, 3] += context.n * mine.many
+        for lane in range(np.uint64(width)):
+            me = agent(scratch, drawn, pos, vel, time, place, lane)
+            middle, around = box(numbers, me, lanes[reach + lane] * like(me.pos[0], LOOSE))
+            listed = near(params, numbers.size, mine.cells, middle, around, lanes, np.int64(first))
+            at = mine.at
+            for m in range(listed if listed >= 0 else mine.many):
+                at = mine.at + np.int64(lanes[np.uint64(first) + np.uint64(m)]) if listed >= 0 else at
+                where, glide = placed(params, at, time)
+                meet(numbers, world, params, me, at, at - mine.at, where, glide, lanes, lane)
+                at += np.int64(params[at])
+
+    return shapes
 
 
-def _by_pieces(parts: Parts, k: int, slots: list[str], form: str, vel: str) -> list[str]:
-    """Write how a law meets a shape side after side: the nearest place of each that acts by itself."""
-    body = f"{vel}, like(far, 0.0), zero(x), far, side, like(far, np.inf), zero(x)"
-    seen = f" and ({_seen('far', 'side')})" if parts.effects[k].occluded_obstacles else ""
-    met = [
-        "to = touched_offset(zero(x), like(far, 0.0), side, far, far)",
-        f"it = Obstacle(params[at_ + 1], to, dot(to, to), {body})",
-        f"found = obstacle_law_{k}(p{k}, me, it, ({', '.join(slots)},))",
-        *_kept(slots, ""),
-    ]
-    reach = parts.effects[k].obstacle_reach
-    if reach:  # where nothing is near enough its sides are not either
-        return [f"if gap < obstacle_reach_{k}(p{k}, me):", *indented_lines(_each_piece(form, seen, met), 4)]
-    return _each_piece(form, seen, met)
+# --- what may lie within reach ----------------------------------------------------------------------------------------
 
 
-def _each_piece(form: str, seen: str, met: list[str]) -> list[str]:
-    """Write the loop over the sides of a shape."""
-    return [
-        f"for piece in range(pieces_{form}(params, at_, y, gap)):",
-        f"    far, side, acts = piece_{form}(params, at_, piece, y, gap, out)",
-        f"    if acts{seen}:",
-        *indented_lines(met, 8),
-    ]
+@functools.cache
+def _near_a_ray(folds: tuple[Fold, ...]) -> Callable[..., bool]:
+    """Make `near(numbers, params, at, y, me, seen)`: does a ray, up to `seen` m, come into the circle around a shape?
 
-
-def _near(form: str, k: int | None, vel: str) -> list[str]:
-    """Write an obstacle as a law sees it that casts no rays, from where it is or, for effect k, from elsewhere."""
-    if form == CIRCLE:
-        way, from_ = ("to", []) if k is None else ("way", [f"way = sub(to, obstacle_from_{k}(p{k}, me))"])
-        body = f"{way}, dot({way}, {way}), zero(x), rho, zero(x), norm({way}) - rho, outward({way})"
-        return [*from_, f"it = Obstacle(like(rho, m), {body}, like(rho, np.inf), zero(x))"]
-    far, side, from_ = "gap", "out", []
-    if k is not None:
-        far, side = "far", "side"
-        from_ = [f"far, side = nearest_{form}(params, at_, add(y, obstacle_from_{k}(p{k}, me)))"]
-    body = f"{vel}, like({far}, 0.0), zero(x), {far}, {side}, like({far}, np.inf), zero(x)"
-    return [
-        *from_,
-        f"to = touched_offset(zero(x), like({far}, 0.0), {side}, {far}, {far})",
-        f"it = Obstacle(params[at_ + 1], to, dot(to, to), {body})",
-    ]
-
-
-def _touched(form: str, k: int, j: int, vel: str) -> list[str]:
-    """Write an obstacle as a law sees it that casts ray j."""
-    ray = f"ray, margin = obstacle_ray_{k}(p{k}, me, {j})"
-    if form == CIRCLE:
-        body = "to, dot(to, to), zero(x), rho, zero(x)"
-        return [
-            ray,
-            "hit = threat(ray, to, me.radius + rho + margin, like(rho, np.inf))",
-            f"it = Obstacle(like(rho, m), {body}, norm(to) - rho, touched_normal(to, ray, hit), hit, ray)",
-        ]
-    return [
-        ray,
-        "room = me.radius + margin",
-        f"hit = like(gap, 0.0) if gap < room else hit_{form}(params, at_, y, ray, room)",
-        _touched_side(form),
-        "to = touched_offset(ray, hit, side, room, gap)",
-        f"it = Obstacle(params[at_ + 1], to, dot(to, to), {vel}, like(gap, 0.0), zero(x), gap, side, hit, ray)",
-    ]
-
-
-def _touched_side(form: str) -> str:
-    """Write the normal where a ray touches; where none does it is that of the nearest place, which is known.
-
-    Lanes of blocks and half-spaces lie side by side: there a choice costs less than a branch.
+    Or the sphere.
     """
-    found = f"nearest_{form}(params, at_, touched_spot(y, ray, hit, room))[1]"
-    if form in ("block", "half_space"):
-        return f"side = {found}"
-    return f"side = {found} if (hit > like(gap, 0.0)) & (hit < like(gap, np.inf)) else out"
+    before, k, ray_of, rays = _near_a_ray(folds[:-1]) if folds[1:] else None, folds[-1].k, folds[-1].ray, folds[-1].rays
+
+    def near(numbers: Any, params: Any, at: Any, y: Any, me: Any, seen: Any) -> Any:
+        found = False if before is None else before(numbers, params, at, y, me, seen)
+        for j in range(rays):
+            ray, margin = ray_of(numbers.effects[k], me, j)
+            found |= near_way(params, at, y, ray, me.radius + margin, seen)
+        return found
+
+    return kernel(near)
+
+
+@law
+def _alike(x: Vec, length: float) -> Vec:
+    """Return the vector of x's dimension whose coordinates are all `length`."""
+    if len(x) == 2:
+        return (length, length)
+    else:
+        return (length, length, length)
+
+
+@law
+def _grown(low: Vec, high: Vec, spot: Vec) -> tuple[Vec, Vec]:
+    """Return the corners of a box that has grown to hold a place."""
+    a, b = (min(low[0], spot[0]), min(low[1], spot[1])), (max(high[0], spot[0]), max(high[1], spot[1]))
+    if len(low) == 2:
+        return a, b
+    else:
+        return (a[0], a[1], min(low[2], spot[2])), (b[0], b[1], max(high[2], spot[2]))
+
+
+@section
+def _box(folds: tuple[Fold, ...], only_rays: bool) -> Callable[..., tuple[Vec, Vec]]:
+    """Make `box(numbers, me, seen)`: in which something may matter to an agent that looks `seen` m far.
+
+    Around all rays, if laws cast them, or around it: the middle, and half the edges, m.
+    """
+    span: Any = _span(folds) if only_rays else None
+
+    def box(numbers: Any, me: Any, seen: Any) -> Any:
+        x, half = me.pos, like(seen, 0.5)
+        if only_rays:
+            low, high, wide = span(numbers, me, seen)
+            wide = wide * like(wide, LOOSE)
+            room = scale(sub(high, low), half)
+            return add(x, scale(add(low, high), half)), add(room, _alike(x, wide))
+        return x, _alike(x, seen)
+
+    return box
+
+
+@functools.cache
+def _span(folds: tuple[Fold, ...]) -> Callable[..., tuple[Vec, Vec, float]]:
+    """Make `span(numbers, me, seen)`: the corners of the box around all rays, from the agent, m, and the widest body.
+
+    That is the radius of what goes along a ray, and what it keeps clear, m.
+    """
+    before, k, ray_of, rays = _span(folds[:-1]) if folds[1:] else None, folds[-1].k, folds[-1].ray, folds[-1].rays
+
+    def span(numbers: Any, me: Any, seen: Any) -> Any:
+        o = zero(me.pos)
+        low, high, wide = (o, o, like(seen, 0.0)) if before is None else before(numbers, me, seen)
+        for j in range(rays):
+            ray, margin = ray_of(numbers.effects[k], me, j)
+            way, room = scale(ray, seen), me.radius + margin
+            (low, high), wide = _grown(low, high, way), max(wide, room)
+        return low, high, wide
+
+    return kernel(span)
+
+
+# --- the way around ---------------------------------------------------------------------------------------------------
+
+
+@section
+def _asides(plan: Obstacles, fold: Fold) -> Callable[..., None]:
+    """Make on which side each agent goes around what is in its way, for a law that asks: see around.py."""
+    k, ray_of, slots, ahead, width = fold.k, fold.ray, fold.slots, fold.ahead, plan.agent.width
+    agent, aside, sides = _agent_of(plan.agent), aside_of(plan.around), fold.slots[-plan.agent.dimension :]
+    first, which, place_at = np.uint64(slots[0]), np.uint64(ahead[0]), np.uint64(ahead[1])
+
+    def asides(context: Any, pos: Any, vel: Any, time: Any, place: Any) -> None:
+        scratch, numbers, b = context.scratch, context.numbers, context.b
+        lanes, drawn = scratch.lanes, context.key[b]
+        world = context.obstacle_x, context.obstacle_radius, context.params, numbers.size, b, time
+        for lane in range(np.uint64(width)):
+            impact = lanes[first + lane]
+            if impact > 0 and impact < like(impact, np.inf):
+                me = agent(scratch, drawn, pos, vel, time, place, lane)
+                ray, margin = ray_of(numbers.effects[k], me, 0)
+                known = impact, np.int64(lanes[which + lane]), np.int64(lanes[place_at + lane])
+                scatter(lanes, lane, sides, aside(world, me.pos, ray, me.radius + margin, known))
+
+    return asides

@@ -169,9 +169,9 @@ class Parts:
         return all(e.obstacle_ray is not None for e in self.effects if e.obstacle_start is not None)
 
     @property
-    def goes_around(self) -> bool:
-        """True if any effect goes around what is in its way by the nearest edge."""
-        return any(e.obstacle_start is not None and e.obstacle_edges for e in self.effects)
+    def folds_obstacles(self) -> bool:
+        """True if any effect has a fold over the obstacles."""
+        return any(e.obstacle_start is not None for e in self.effects)
 
     @property
     def surroundings(self) -> Surroundings:

@@ -8,18 +8,17 @@ from __future__ import annotations
 from typing import Any
 
 from flockenv.integrators.one_stage import OneStage
-from flockenv.sweep.agents import AgentPlan, alone_of, inner_of, still
-from flockenv.sweep.around import aside_of
+from flockenv.sweep.agents import AgentPlan, alone_of, still
 from flockenv.sweep.blocks import into_blocks, out_of_blocks
 from flockenv.sweep.bonds import bond_plan, bonds_of
 from flockenv.sweep.far import far_of, far_plan
-from flockenv.sweep.forms import near_rows
 from flockenv.sweep.meeting import meet_neighbours
 from flockenv.sweep.method import advance_of, method_plan
 from flockenv.sweep.numbers import images_of, numbers_of
+from flockenv.sweep.obstacle_plan import obstacle_plan
+from flockenv.sweep.obstacles import obstacles_of
 from flockenv.sweep.pair_plan import pairs_of
 from flockenv.sweep.parts import Parts
-from flockenv.sweep.visibility import blocked
 
 __all__ = ["sections_of"]
 
@@ -35,7 +34,7 @@ def sections_of(parts: Parts) -> tuple[tuple[str, Any], ...]:
         parts.dimension, parts.width, parts.oriented, parts.aims, "desired_speed" in parts.frame_numbers, parts.inner
     )
     made["alone"], made["alone_without_aim"] = alone_of(agent), alone_of(agent._replace(aims=False))
-    made["inner_of"], made["still"] = inner_of(parts.inner), still
+    made["still"] = still
     if parts.far:
         made["far"] = far_of(far_plan(parts))
     if parts.bonded:
@@ -49,9 +48,6 @@ def sections_of(parts: Parts) -> tuple[tuple[str, Any], ...]:
     for k, effect in enumerate(parts.effects):
         if parts.space.periodic and effect.places:
             made[f"images_of_{k}"] = images_of(tuple(parts.names_of(effect)), effect.places, parts.space.offset_law)
-    if parts.occludes:
-        made["blocked"] = blocked(parts.surroundings)
-    if parts.goes_around:
-        made["aside_of"] = aside_of(parts.surroundings)
-    made |= {f"near_{form}": near_rows(parts.space.offset_law, parts.dimension) for form in parts.looked_up}
+    if parts.folds_obstacles:
+        made["meet_obstacles"] = obstacles_of(obstacle_plan(parts, agent))
     return tuple(made.items())

@@ -5,14 +5,16 @@ from __future__ import annotations
 from flockenv.kernels import import_line
 from flockenv.sweep.accelerate import accelerate, sense
 from flockenv.sweep.handed import OPEN_SCRATCH, Context, opened
-from flockenv.sweep.obstacles import obstacle_imports
 from flockenv.sweep.parts import LAWS, Parts
 from flockenv.sweep.step import begin, kept_frame, kept_inner, step, step_world
 from flockenv.sweep.text import asked, indented
 
 __all__ = ["field_source", "scene_source"]
 
-IN_SECTIONS = ("far_law", "bond_law", "pair_start", "pair_law", "apart_law", "finish_law")
+IN_SECTIONS = (
+    "far_law", "bond_law", "pair_start", "pair_law", "apart_law", "finish_law", "obstacle_start", "obstacle_law",
+    "obstacle_ray", "obstacle_from", "obstacle_reach",
+)  # fmt: skip
 """Laws that sections hold: the file of a scene calls them nowhere."""
 
 
@@ -90,7 +92,6 @@ def _imports(parts: Parts) -> str:
         *(["from flockenv.transpose import put_lines"] if parts.arranges else []),
         "from flockenv.vec import add, dot, exact_sum, limit, norm, scale, select, sub, zero",
         *(["from flockenv.vehicle import faced, held, leant, raised, turned"] if parts.oriented else []),
-        *obstacle_imports(parts),
     ]
     for k, effect in enumerate(parts.effects):
         for slot in LAWS:

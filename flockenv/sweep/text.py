@@ -14,7 +14,7 @@ from flockenv.sweep.parts import Parts
 
 __all__ = [
     "Slots", "alone", "array_of", "asked", "given", "in_blocks", "in_common",
-    "indented", "indented_lines", "inner_of", "lane", "lanes_of", "nearest_images", "needed",
+    "indented", "indented_lines", "lane", "lanes_of", "nearest_images", "needed",
     "place_of", "tuple_of",
 ]  # fmt: skip
 
@@ -77,11 +77,6 @@ def asked(parts: Parts) -> list[str]:
         "else:",
         *indented_lines(nothing, 4),
     ]
-
-
-def inner_of(parts: Parts, i: str) -> str:
-    """Write what goes on inside an agent."""
-    return f"inner_of(scratch, {i})"
 
 
 def alone(parts: Parts, medium: str = "zero(x)", one: str = "i", aim: bool = True) -> str:
