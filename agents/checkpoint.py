@@ -24,7 +24,7 @@ from pydantic import ValidationError
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save
 
-from flockenv.atomic import remove_leftovers, replacing
+from flockenv.atomic import made, remove_leftovers, replacing
 from flockenv.records import Record
 from flockenv.refusals import refusals, shown
 
@@ -69,17 +69,17 @@ def claimed(folder: Path) -> Iterator[None]:
 
     What a killed process left half-written is removed; the lock of a killed process is free.
     """
-    folder.mkdir(parents=True, exist_ok=True)
-    lock = FileLock(folder / "training.lock")
-    try:
-        lock.acquire(blocking=False)
-    except Timeout:
-        raise InUse(f"{folder} is in use by another training: wait for its end, or choose another --runs") from None
-    try:
-        remove_leftovers(folder)
-        yield
-    finally:
-        lock.release()
+    with made(folder):
+        lock = FileLock(folder / "training.lock")
+        try:
+            lock.acquire(blocking=False)
+        except Timeout:
+            raise InUse(f"{folder} is in use by another training: wait for its end, or choose another --runs") from None
+        try:
+            remove_leftovers(folder)
+            yield
+        finally:
+            lock.release()
 
 
 # --- writing ----------------------------------------------------------------------------------------------------------

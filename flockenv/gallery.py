@@ -10,7 +10,7 @@ import sys
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
-from flockenv.atomic import replacing
+from flockenv.atomic import made, replacing
 from flockenv.behaviours import BEHAVIOURS
 from flockenv.config import load_scene
 from flockenv.effects.base import Effect
@@ -74,11 +74,11 @@ def write_gallery(
 ) -> int:
     """Write the page, and a picture of each behaviour into a folder beside it; return how many there are."""
     folder = path.with_suffix("")
-    folder.mkdir(parents=True, exist_ok=True)
-    for done, (kind, behaviour) in enumerate(behaviours.items()):
-        progress(done)
-        snapshots = list(shown(behaviour).snapshots())
-        write_png(folder / f"{kind}.png", draw(snapshots[-1], SIZE, 3, snapshots))
+    with made(folder):
+        for done, (kind, behaviour) in enumerate(behaviours.items()):
+            progress(done)
+            snapshots = list(shown(behaviour).snapshots())
+            write_png(folder / f"{kind}.png", draw(snapshots[-1], SIZE, 3, snapshots))
     with replacing(path) as file:
         file.write(page(behaviours, folder.name).encode())
     return len(behaviours)

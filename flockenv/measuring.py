@@ -72,6 +72,7 @@ def measure(
     force: Force = False,
 ) -> None:
     """Run a scene and measure its crowd: flow, density, lanes, bursts, clogging, order; table, JSON and pictures."""
+    from flockenv.atomic import made
     from flockenv.config import load_scene
     from flockenv.outputs import checked_file
     from flockenv.survey import Asked, combined
@@ -92,7 +93,8 @@ def measure(
     if numbers is not None:
         _write_numbers(numbers, _summary(loaded, asked, found, means, above, first, stride))
     if folder is not None:
-        drawn = _draw(folder, first, found, asked, Path(scene).stem)
+        with made(folder):
+            drawn = _draw(folder, first, found, asked, Path(scene).stem)
         new_console().print(f"{', '.join(drawn) or 'no pictures'} in {relative(folder)}")
     stopped = found[-1].stopped or ("interrupted" if len(found) < seeds else "")
     if stopped:
@@ -275,7 +277,6 @@ def _draw(folder: Path, run: Trajectory, found: Sequence[Survey], asked: Asked, 
     from flockenv.render.crowd import write_flow_density, write_gaps, write_lanes, write_space_time
     from flockenv.survey import SAMPLES
 
-    folder.mkdir(parents=True, exist_ok=True)
     drawn = []
     density, speed, gaps = (np.concatenate([getattr(s, what) for s in found]) for what in ("density", "speed", "gaps"))
     if np.isfinite(speed).any():

@@ -81,12 +81,12 @@ def _write(path: Path, results: Results) -> None:
     """Write the findings as JSON; of a page that, the page, and its pictures."""
     write_numbers(path, results)
     if path.suffix.lower() == ".md":
-        from flockenv.atomic import replacing
+        from flockenv.atomic import made, replacing
         from flockenv.render.validation import write_pictures
         from flockenv.validation.page import page
 
         folder = path.with_suffix("")
-        folder.mkdir(exist_ok=True)
-        drawn = [picture.stem for picture in write_pictures(folder, results)]
+        with made(folder):
+            drawn = [picture.stem for picture in write_pictures(folder, results)]
         with replacing(path) as file:
             file.write(page(results, folder.name, drawn).encode())

@@ -18,9 +18,11 @@ import numpy as np
 import pytest
 import typer
 
-from agents import publish
+from agents import checkpoint, publish
+from flockenv import gallery, validating
 from flockenv.atomic import LEFTOVERS, deliver, remove_leftovers, replacing
 from flockenv.checked_store import Store
+from flockenv.findings import Results
 from flockenv.group import Group
 from flockenv.policy import save_policy
 from flockenv.private_folder import prepared
@@ -293,3 +295,40 @@ def test_leftovers_are_hidden_files_of_a_certain_age_alone(tmp_path: Path) -> No
     remove_leftovers(tmp_path)
     assert sorted(files_in(tmp_path)) == [".hidden", "x.part", "x.tmp"]
     remove_leftovers(tmp_path / "gone")
+
+
+# --- folders ----------------------------------------------------------------------------------------------------------
+
+
+def _gallery(folder: Path) -> None:
+    gallery.write_gallery(folder / "page.md")
+
+
+def _validation(folder: Path) -> None:
+    folder.mkdir()
+    validating._write(folder / "page.md", Results(findings=()))
+
+
+def _training(folder: Path) -> None:
+    with checkpoint.claimed(folder / "run"):
+        pass
+
+
+@pytest.mark.parametrize(
+    ("first", "write"),
+    [
+        ("flockenv.gallery.shown", _gallery),
+        ("flockenv.render.validation.write_pictures", _validation),
+        ("agents.checkpoint.FileLock", _training),
+    ],
+)
+def test_an_interrupt_before_the_first_file_leaves_no_folder(
+    first: str, write: Callable[[Path], None], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupted(*given: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(first, interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        write(tmp_path / "new")
+    assert [path for path in tmp_path.rglob("*") if path.is_dir() and not any(path.iterdir())] == []

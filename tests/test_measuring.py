@@ -167,6 +167,15 @@ def test_interrupted_it_shows_what_there_is(
     assert (Path("p") / "lanes.png").exists()
 
 
+def test_an_interrupt_before_the_first_picture_leaves_no_folder(monkeypatch: pytest.MonkeyPatch) -> None:
+    def interrupted(*given: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("flockenv.render.crowd.write_flow_density", interrupted)
+    assert main(["measure", "streams.yaml", "--time", "1", "--out", "a/p", *LINE]) == 130
+    assert not Path("a").exists()
+
+
 @pytest.mark.slow
 def test_a_run_that_ends_early_is_measured_until_then(capsys: pytest.CaptureFixture[str]) -> None:
     """Such a drag turns every velocity round, and makes it larger, until it is no number."""
