@@ -50,6 +50,7 @@ if TYPE_CHECKING:
     from flockenv.render import Panel
     from flockenv.scene import Scene
     from flockenv.snapshot import Snapshot
+    from flockenv.state import State
     from flockenv.tasks import Task
     from flockenv.trajectory import Trajectory
 
@@ -259,14 +260,14 @@ def render(
     if what in TASKS:
         if duration is not None:
             raise ValueError(f"--duration = {duration:g}: goes with a scene; an episode of a task ends by itself")
-        panel, fps = _episode(TASKS[what](), player, seed, trust_pickle)
+        (panel, fps), left = _episode(TASKS[what](), player, seed, trust_pickle), ""
     elif what.endswith((".yaml", ".yml")) or Path(what).exists():
-        panel, fps = _film(what, 10.0 if duration is None else duration, seed)
+        panel, fps, left = _film(what, 10.0 if duration is None else duration, seed)
     else:
         raise ValueError(f"{shown(what)}: no such task{nearest(what, TASKS)} ({', '.join(TASKS)}), nor a .yaml file")
     with made(path.parent):
         _write_picture(path, panel, what if what in TASKS else Path(what).stem, fps, size)
-    new_console().print(f"{relative(path)}: {path.stat().st_size:,} bytes, {panel.snapshots[-1].time:g} s")
+    new_console().print(f"{relative(path)}: {path.stat().st_size:,} bytes, {panel.snapshots[-1].time:g} s{left}")
 
 
 @app.command()
@@ -398,11 +399,18 @@ def _show_measures(console: Console, trajectory: Trajectory) -> None:
     show_table(console, title, rows, ("measure", "t = 0 s", f"t = {time:g} s", "unit"))
     work = {"neighbour queries": "neighbour_queries", "candidate pairs": "pairs", "obstacle tests": "obstacle_tests"}
     counted = ", ".join(f"{trajectory.last.counted(name):,} {words}" for words, name in work.items())
+    counted += _unsolved(trajectory.last)
     console.print(f"{text(trajectory.rate / 1e6)} million agent-steps/s ({trajectory.wall:.3g} s); {counted}")
 
 
-def _film(file: str, duration: float, seed: int) -> tuple[Panel, float]:
-    """Return a scene's run as something to draw, and its frames per second."""
+def _unsolved(state: State) -> str:
+    """Return how many contacts a run left unsolved, to be added to a line; nothing if there are none."""
+    count = state.counted("unsolved")
+    return f", {count:,} times contacts left unsolved" if count else ""
+
+
+def _film(file: str, duration: float, seed: int) -> tuple[Panel, float, str]:
+    """Return a scene's run as something to draw, its frames per second, and what it left unsolved."""
     from flockenv.config import load_scene
     from flockenv.render import Panel
     from flockenv.trajectory import whole_steps
@@ -413,7 +421,8 @@ def _film(file: str, duration: float, seed: int) -> tuple[Panel, float]:
     if trajectory.stopped == "interrupted":
         raise KeyboardInterrupt
     snapshots = list(trajectory.snapshots(title=Path(file).stem))
-    return Panel("", snapshots, None, trajectory.stopped), 1.0 / (every * scene.dt)
+    panel = Panel("", snapshots, None, trajectory.stopped)
+    return panel, 1.0 / (every * scene.dt), _unsolved(trajectory.last)
 
 
 def _episode(task: Task, player: str, seed: int, trust_pickle: bool) -> tuple[Panel, float]:

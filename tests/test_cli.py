@@ -194,6 +194,19 @@ def test_every_says_how_often_an_instant_is_kept_and_the_last_always_is() -> Non
 
 
 @pytest.mark.slow
+@pytest.mark.filterwarnings("ignore::flockenv.constraints.collisions.UnsolvedContactsWarning")
+def test_run_and_render_say_how_many_contacts_were_left_unsolved(capsys: pytest.CaptureFixture[str]) -> None:
+    heap = "{count: 25, radius: 0.1, spawn: {low: [0, 0], high: [1.25, 1.25], spacing: 0.25}}"
+    rules = "effects: [{kind: gravity}]\nconstraints: [{kind: collisions, response: impulses, passes: %d}]\ndt: 0.01\n"
+    text = f"dimension: 2\nspace: {{kind: box, size: [1.25, 5]}}\ngroups: [{heap}]\n{rules}"
+    for passes, said in ((2, True), (200, False)):
+        Path("heap.yaml").write_text(text % passes)
+        for command in (["run"], ["render", "--size", "64", "--force", "--out", "h.png"]):
+            assert main([command[0], "heap.yaml", "--duration", "1", *command[1:]]) == 0
+            assert bool(re.search(r", [\d,]+ times contacts left unsolved$", capsys.readouterr().out, re.M)) == said
+
+
+@pytest.mark.slow
 def test_a_scene_without_neighbour_effects_makes_no_query_and_one_with_them_one_per_step(
     capsys: pytest.CaptureFixture[str],
 ) -> None:

@@ -23,8 +23,8 @@ __all__ = ["COUNTED", "LOST", "collide"]
 COUNTED = 5
 """Numbers that a call reports: world, agent, meetings in all, impacts, what was left unsolved."""
 
-LOST = 5
-"""Numbers in `lost`: what `events.play` adds to, and `ends.RAISED`."""
+LOST = 7
+"""Numbers in `lost`: what `events.play` adds to, and those that `ends` names."""
 
 EXACT = 8 * 2.0**-52
 """Rounding of a coordinate, times how large it is."""

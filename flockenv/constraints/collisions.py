@@ -13,7 +13,7 @@ from flockenv.constraints.base import Constraint, Settler
 from flockenv.constraints.bodies import Bodies, Meetings, Rules, Things
 from flockenv.constraints.collide import COUNTED, LOST, collide
 from flockenv.constraints.contacts import Contacts, Ends
-from flockenv.constraints.ends import RAISED
+from flockenv.constraints.ends import LEFT, RAISED, SUNK
 from flockenv.constraints.impact import POINT
 from flockenv.effects.base import ties
 from flockenv.neighbours import MAX_RANGES
@@ -191,7 +191,9 @@ class _Settler:
                 self.lost,
             )  # fmt: skip
             world, agent, needed = (int(k) for k in self.report[:3])
+            most = np.maximum(lost, self.lost)
             unsolved, lost = unsolved + int(self.report[4]), lost + self.lost
+            lost[[LEFT, SUNK]] = most[[LEFT, SUNK]]
             bad = (world, agent) if bad[0] < 0 else bad
             if short < 0:
                 break
@@ -203,7 +205,7 @@ class _Settler:
         return bad
 
     def _unsolved(self, unsolved: int, lost: NDArray[np.float64]) -> str:
-        """Return what a warning says of a step: lost are s, J and bodies, see events.play, and ends.RAISED."""
+        """Return what a warning says of a step: see events.play and ends for what is lost."""
         r, seconds, joules, stopped = self.record, float(lost[0]), float(lost[1]), float(lost[2])
         said = (
             f"constraints: collisions: in a step {unsolved} impacts or worlds with contacts were not solved within "
@@ -218,4 +220,8 @@ class _Settler:
             said += f"; {joules:.3g} J lost by bodies that came to rest"
         if lost[RAISED] > 0:
             said += f"; up to {lost[RAISED]:.3g} J gained by bodies that were moved apart"
+        if lost[LEFT] > 0:
+            said += f"; the last pass still changed velocities, by up to {lost[LEFT]:.2g} m/s"
+        if r.response in ("impulses", "project"):
+            said += f"; the deepest overlap is {lost[SUNK]:.2g} of a radius"
         return said

@@ -31,6 +31,10 @@ DEEPEST = 0.25
 RAISED = 4
 """Place in `lost` of the energy, J, of bodies that were moved apart against the step's acceleration."""
 
+LEFT, SUNK = 5, 6
+"""Places in `lost` of how much is left unsolved in a step, the most of all: the fastest change of velocity of the last
+pass, m/s, and the deepest overlap, as a part of the smaller radius."""
+
 
 @kernel
 def settle_ends(
@@ -44,7 +48,7 @@ def settle_ends(
     """
     least = 1e-12 * fast
     slow, gain = 1e-3 * hard * rules.seconds + least, 1e-6 * hard * rules.seconds + least
-    left, deep = 0.0, 0.0
+    left, deep, unsolved_before = 0.0, 0.0, report[4]
     touching = gather(
         period, bodies, meetings, things, ends, contacts, rules.seconds, up, rules.touch, slow,
         rules.restitution, in_time, passing, count,
@@ -77,7 +81,12 @@ def settle_ends(
             held = lost[2] > stopped
     limit = DEEP * _widest(bodies) + 1e3 * rules.touch
     unsolved = left > UNSOLVED * hard * rules.seconds + 1e3 * gain or deep > limit
-    report[4] += 1 if held or (unsolved and not once) else 0
+    if held or (unsolved and not once):
+        report[4] += 1
+        lost[LEFT] = max(lost[LEFT], 0.0 if once else left)
+    if report[4] > unsolved_before and count <= meetings.who.shape[0]:
+        worst = deepest(period, bodies, things, ends, rules.seconds, meetings.who, meetings.other, count)
+        lost[SUNK] = max(lost[SUNK], worst)
     return count
 
 
