@@ -1,6 +1,6 @@
 """Compilation, seen: how long each kernel took, and a line on the terminal while somebody waits for one.
 
-A kernel is compiled at its first call, once per machine: its code lies in the cache folder from then on (kernels.load).
+A kernel is compiled at its first call, once per machine: its code lies in the cache folder from then on, see section.
 On a terminal a line says what is being compiled and, when it is done, how long that took; FLOCKENV_QUIET=1 silences it.
 """
 
@@ -21,8 +21,8 @@ __all__ = ["Compiled", "compiled"]
 class Compiled(NamedTuple):
     """One kernel that this process had to compile."""
 
-    kernel: str  # the generated file's prefix, or the module, and the function, such as "scene: step"
-    what: str  # the first line about it: of a scene its dimension, space, method and effects
+    kernel: str  # the name of its entry point, such as "scene_step"
+    what: str  # the first line about it: of a scene its dimension, space, effects and method
     seconds: float
 
 
@@ -54,10 +54,7 @@ class _Watch(event.Listener):
         began = self.began.pop(id(event.data["dispatcher"]), None)
         if function is not None and began is not None:
             seconds = perf_counter() - began
-            generated = function.__module__.startswith("flockenv_generated.")
-            name = function.__module__.rsplit(".", 1)[-1]
-            prefix = name.rsplit("_", 1)[0] if generated else name
-            _done.append(Compiled(f"{prefix}: {function.__name__}", _described(function), seconds))
+            _done.append(Compiled(function.__name__, _described(function), seconds))
             _say(f" {seconds:.1f} s\n")
 
 
@@ -69,11 +66,9 @@ def _entry_point(event: Any) -> Any:
 
 
 def _described(function: Any) -> str:
-    """Return the first line of a generated file, or of what is said of a section's function."""
-    module = sys.modules.get(function.__module__)
-    generated = function.__module__.startswith("flockenv_generated.")
-    text: str = (module.__doc__ if generated and module is not None else function.__doc__) or function.__name__
-    return text.split(". Generated")[0].split("\n")[0]
+    """Return the first line of what is said of an entry point."""
+    text: str = function.__doc__ or function.__name__
+    return text.split("\n")[0]
 
 
 def _folder(dispatcher: Any) -> str:

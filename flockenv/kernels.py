@@ -1,27 +1,23 @@
-"""The one door to compiled code: laws are marked here; an entry point is a generated file, or a section (`section`).
+"""The one door to compiled code: laws and kernels are marked here; what Python calls of them is made in `section`.
 
 numba's own disk cache never finds a closure again, and does not notice that a law has changed which a cached function
-calls. So machine code is kept under a digest of all that it depends on: of a scene the text of its generated file, one
-readable source per combination of laws; of a section its function and what that holds; of both all sources of laws. A
-second process compiles nothing; an edited law compiles anew, always. What is read from the cache folder was verified
-(`private_folder`, `checked_store`).
+calls. So machine code is kept under a digest of all that it depends on: the functions of an entry point, what they
+hold, and all sources of laws. A second process compiles nothing; an edited law compiles anew, always. What is read from
+the cache folder was verified (`private_folder`, `checked_store`).
 """
 
 from __future__ import annotations
 
 import functools
 import hashlib
-import importlib.util
 import inspect
-import marshal
 import math
 import os
-import re
 import sys
 import tempfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from types import CodeType, FunctionType, ModuleType
+from types import CodeType, FunctionType
 from typing import Any, TypeVar, cast
 
 import numba
@@ -39,12 +35,8 @@ from flockenv import (
     lowering,
     processor,
 )
-from flockenv.checked_store import Store
-from flockenv.inlining import Inlined, Whole
-from flockenv.machine_code import MachineCode
+from flockenv.inlining import Inlined
 from flockenv.private_folder import first_private, prepared
-from flockenv.startup import numba_before_scipy
-from flockenv.turns import OneAtATime
 
 __all__ = [
     "FAST",
@@ -62,12 +54,12 @@ __all__ = [
     "described",
     "finite",
     "functions_in",
+    "held",
     "intrinsic_or_python",
     "kernel",
     "law",
     "laws_digest",
     "like",
-    "load",
     "python_of",
     "replaced",
     "settled",
@@ -129,7 +121,7 @@ def unfused(function: F) -> F:
 
 
 def kernel(function: F) -> F:
-    """Mark a function over the arrays of one world; compiled as a part of the generated file that calls it."""
+    """Mark a function over the arrays of one world; compiled as a part of the entry point that calls it."""
     return _marked(function)
 
 
@@ -374,7 +366,7 @@ def wait_for_team(sync: Any, team: int) -> None:
 
 
 def cache_folder() -> Path:
-    """Return the folder of generated sources and their machine code, checked; FLOCKENV_CACHE names another one.
+    """Return the folder of machine code, checked; FLOCKENV_CACHE names another one.
 
     Falls back to a folder under the system's temporary one where the home folder cannot be written or is not private.
 
@@ -403,7 +395,8 @@ def laws_digest() -> str:
     how = [Path(str(module.__file__)) for module in (sys.modules[__name__], inlining, frontend, lowering)]
     for path in sorted(Path(__file__).parent.rglob("*.py")):
         text = path.read_bytes()
-        if b"from flockenv.kernels import" in text or b"from flockenv.section import" in text or path in how:
+        told = b"from flockenv.kernels import" in text or b"from flockenv.section import" in text
+        if told or path in how or path.parent.name == "sweep":
             digest.update(text)
     return digest.hexdigest()
 
@@ -475,65 +468,6 @@ def _described(python: FunctionType) -> str:
     """Write out a function as `described` does, by a digest: what holds it twice stays short."""
     told = f"{code_text(python)} {described(held(python))}"
     return f"{python.__module__}.{python.__qualname__} {hashlib.sha256(told.encode()).hexdigest()}"
-
-
-def import_line(law: Law, name: str) -> str:
-    """Return the line of Python that imports a law under another name.
-
-    Raises TypeError for a law that its module does not hold under the law's own name: made by another function, a
-    lambda, or replaced since.
-    """
-    python = python_of(law)
-    if python_of(getattr(sys.modules.get(python.__module__), python.__name__, None)) is not python:
-        where = f"{python.__module__}.{python.__qualname__}"
-        raise TypeError(f"law {where}: must be a function of its module, which holds it as {python.__name__}")
-    return f"from {python.__module__} import {python.__name__} as {name}"
-
-
-@functools.lru_cache(maxsize=512)
-def load(name: str, source: str, sections: tuple[tuple[str, Any], ...] = ()) -> ModuleType:
-    """Import a generated source and find the machine code of its entry points; `name` is a readable prefix.
-
-    What runs is compiled from `source`, or comes from the checked store; the readable file beside it is never run.
-    sections: functions that it calls, by the name under which it finds them.
-    """
-    numba_before_scipy()
-    modules = set(re.findall(r"^from ([\w.]+) import", source, re.MULTILINE))
-    modules |= {each.__module__ for _, made in sections for each in functions_in(made)}
-    told = f"{source}{described(sections)}{laws_digest()}{texts_outside(modules)}{processor.REGISTER}"
-    digest = hashlib.sha256(told.encode()).hexdigest()[:20]
-    store = Store(cache_folder())
-    path = store.folder / f"{name}_{digest}.py"
-    store.write_text(path.name, source)
-    qualified = f"flockenv_generated.{path.stem}"
-    spec = importlib.util.spec_from_file_location(qualified, path)
-    assert spec is not None
-    module = importlib.util.module_from_spec(spec)
-    vars(module).update(sections)
-    sys.modules[qualified] = module
-    exec(_code(store, path, source), vars(module))  # noqa: S102  # made of `source`, by flockenv
-    locks = prepared(store.folder / "locks")
-    for function in _entry_points(module):
-        kept = f"{path.stem}.{function.__name__}"
-        function._cache = OneAtATime(MachineCode(store, kept), locks / f"{kept}.lock")
-    return module
-
-
-def _entry_points(module: ModuleType) -> list[Any]:
-    """Return the functions of a generated module that become machine code; the laws in it are parts of these."""
-    own = (v for v in vars(module).values() if getattr(v, "__module__", None) == module.__name__)
-    return [v for v in own if hasattr(v, "py_func") and v._compiler.pipeline_class is Whole]
-
-
-def _code(store: Store, path: Path, source: str) -> CodeType:
-    """Return a source compiled to Python's bytecode, which is kept: it takes 10 to 30 ms for each source."""
-    kept = f"{path.stem}.{sys.implementation.cache_tag}-{sys.flags.optimize}.code"
-    data = store.read(kept)
-    code: CodeType | None = None if data is None else marshal.loads(data)  # noqa: S302  # its digest was verified
-    if code is None or code.co_filename != str(path):  # the folder was moved
-        code = compile(source, path, "exec")
-        store.write(kept, marshal.dumps(code))
-    return code
 
 
 def settled(function: Any) -> Callable[..., Any]:

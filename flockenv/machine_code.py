@@ -12,6 +12,7 @@ import warnings
 from typing import Any
 
 import llvmlite  # type: ignore[import-untyped]
+from llvmlite import binding
 from numba.core.compiler import CompileResult
 from numba.core.errors import NumbaWarning
 from numba.core.serialize import dumps
@@ -19,6 +20,21 @@ from numba.core.serialize import dumps
 from flockenv.checked_store import Store
 
 __all__ = ["MachineCode"]
+
+
+def _alone(reduced: tuple[Any, ...]) -> tuple[Any, ...]:
+    """Return what numba would keep of an entry point, less what it keeps for functions that call it: nothing does.
+
+    That is the text of all its functions, of which the names of those that Python calls are left, and an environment
+    for each of its parts, which hold no objects of Python's. They were three quarters of a file.
+    """
+    (name, kind, (code, _)), described, *rest, _ = reduced
+    assert kind == "object", f"numba keeps machine code as {kind!r}, expected 'object'"
+    called = described.llvm_func_name, described.llvm_cpython_wrapper_name, described.llvm_cfunc_wrapper_name
+    text = "\n".join(f'define void @"{function}"() {{ ret void }}' for function in called)
+    text += f'\n@"{described.env_name}" = global i8* null'
+    named = bytes(binding.parse_assembly(text).as_bitcode())
+    return ((name, kind, (code, named)), described, *rest, ())
 
 
 class MachineCode:
@@ -45,7 +61,7 @@ class MachineCode:
             warnings.warn(said, NumbaWarning, stacklevel=2)
             return
         pickled: Any = dumps
-        self._store.write(self._file(signature, compiled.codegen), pickled((signature, compiled._reduce())))
+        self._store.write(self._file(signature, compiled.codegen), pickled((signature, _alone(compiled._reduce()))))
 
     def flush(self) -> None:
         """Do nothing: a function that numba compiles again replaces the stored form."""

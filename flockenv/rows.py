@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from flockenv.kernels import Law, Vec, kernel, python_of
 from flockenv.section import entry_of, several
 
-__all__ = ["rows"]
+__all__ = ["loop_of", "rows"]
 
 _RANK = {"Vec": 1, "Numbers": 1, "Wishes": 2, "float": 0}
 
@@ -57,7 +57,7 @@ def rows(law: Law) -> Callable[..., NDArray[np.float64]]:
             raise ValueError(f"{python.__name__}: vectors of {' and of '.join(map(str, sorted(dimensions)))} numbers")
         dimension = max(dimensions, default=0)
         out = np.empty((flat[0].shape[0], dimension) if answer else flat[0].shape[0])
-        _over(law, tails, dimension if answer else 0)(tuple(flat), out)
+        loop_of(law, tails, dimension if answer else 0)(tuple(flat), out)
         return out.reshape((*lead, dimension) if answer else lead)
 
     return over_rows
@@ -73,7 +73,7 @@ def _rank(python: Any, name: str, annotation: Any) -> int:
 
 
 @entry_of
-def _over(law: Law, tails: tuple[tuple[int, ...], ...], dimension: int) -> Callable[..., None]:
+def loop_of(law: Law, tails: tuple[tuple[int, ...], ...], dimension: int) -> Callable[..., None]:
     """Make the loop of one law over rows of arrays (R, *tail), into (R, dimension), or (R,) if that is 0."""
     arguments = _arguments(tails)
 

@@ -13,7 +13,7 @@ import itertools
 import math
 import operator
 import threading
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
@@ -31,7 +31,6 @@ from flockenv.group import Group
 from flockenv.implicit import coupling_of, solve_steps
 from flockenv.integrators import INTEGRATORS, Adaptive, ImplicitEuler, Integrator, SemiImplicitEuler
 from flockenv.integrators.newton import Coupling
-from flockenv.kernels import load
 from flockenv.magnitudes import check_numbers
 from flockenv.neighbours import FEWEST_AGENTS
 from flockenv.networks import EDGE
@@ -51,13 +50,14 @@ from flockenv.steer import EVERY_EFFECT
 from flockenv.sweep import (
     Parts,
     Table,
-    field_source,
+    begin_of,
+    field_of,
     flattened,
     pack,
-    scene_source,
     scratch_bytes,
     scratch_record,
-    sections_of,
+    step_of,
+    worlds_of,
 )
 from flockenv.tree import MOST_DIRECT
 from flockenv.workspace import Workspace
@@ -414,10 +414,8 @@ class Scene(Record):
     def _begin(self, state: State, fresh: NDArray[np.bool_]) -> None:
         """Write what goes on inside those who come into being, (B, N)."""
         if self.parts.inner and fresh.any():
-            self._kernels.begin(
-                state.x, state.v, *state.carried, state.key, state.tick, self._params, self._dt, fresh,
-                self._workspaces(1, 1)[0].of(0, self._scratch_kind),
-            )  # fmt: skip
+            scratch = self._workspaces(1, 1)[0].of(0, self._scratch_kind)
+            self._fill_inner(worlds_of(state), self._params, self._dt, fresh, scratch)
 
     def inner(self, state: State, name: str) -> Floats:
         """Return what goes on inside everybody by name, as a view, (B, N); see `Effect.keeps`."""
@@ -506,9 +504,8 @@ class Scene(Record):
         if self.parts.confines:  # a step begins so; who is asked where he is may be outside of the box
             with np.errstate(invalid="ignore"):  # who is infinitely far has no image, and is nobody's neighbour
                 x = np.ascontiguousarray(self.space.wrap(state.pos).transpose(2, 0, 1), self.dtype)
-        self._accelerations.field(
-            x, state.v, *state.carried, state.alive, state.key, state.obstacle_x, state.obstacle_radius,
-            state.work, self._drive(drive, state), self._params, when, acc, flow,
+        self._accelerate(
+            worlds_of(state)._replace(x=x), self._drive(drive, state), self._params, when, acc, flow,
             self._workspaces(1, 1)[0].of(0, scratch_record(self._plain_parts)),
         )  # fmt: skip
         return acc.transpose(1, 2, 0), flow.transpose(1, 2, 0) if self.parts.flows else None
@@ -607,15 +604,12 @@ class Scene(Record):
         Threads take worlds apart, or, of a large world, its agents.
         """
         worlds, agents, _ = state.shape
-        move, kind = self._kernels.step, self._scratch_kind
-        arrays = (
-            state.x, state.v, *state.carried, state.alive, state.tick, state.key, state.obstacle_x,
-            state.obstacle_radius, state.work, drive, self._params, self._dt, steps,
-        )  # fmt: skip
+        move, kind = self._move, self._scratch_kind
+        arrays = worlds_of(state), drive, self._params, self._dt, steps
         crew, team = self._divided(worlds, agents)
 
         def alone() -> tuple[int, int]:
-            return move(*arrays, 0, worlds, 0, 1, self._workspaces(1, 1)[0].of(0, kind))  # type: ignore[no-any-return]
+            return move(*arrays, 0, worlds, 0, 1, self._workspaces(1, 1)[0].of(0, kind))
 
         if crew <= 1:
             return alone()
@@ -687,10 +681,6 @@ class Scene(Record):
         return np.dtype(self.dtype).type(self.dt)
 
     @functools.cached_property
-    def _accelerations(self) -> Any:
-        return load("field", field_source(self._plain_parts), sections_of(self._plain_parts))
-
-    @functools.cached_property
     def _plain_parts(self) -> Parts:
         """The parts for accelerations alone: the method makes no difference, and agents may be at NaN."""
         return dataclasses.replace(self.parts, integrator=SemiImplicitEuler(), stepped=False)
@@ -700,8 +690,16 @@ class Scene(Record):
         return scratch_record(self.parts)
 
     @functools.cached_property
-    def _kernels(self) -> Any:
-        return load("scene", scene_source(self.parts), sections_of(self.parts))
+    def _accelerate(self) -> Callable[..., None]:
+        return field_of(self._plain_parts)
+
+    @functools.cached_property
+    def _fill_inner(self) -> Callable[..., None]:
+        return begin_of(self.parts)
+
+    @functools.cached_property
+    def _move(self) -> Callable[..., tuple[int, int]]:
+        return step_of(self.parts)
 
     def _workspaces(self, count: int, team: int) -> list[Workspace]:
         """Return scratch of this thread's own: two threads may step one scene at the same time."""

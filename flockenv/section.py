@@ -1,10 +1,10 @@
-"""Sections: entry points made of Python functions, whose machine code is kept under a digest of all that they hold.
+"""Sections: kernels made of Python functions for a plan, whose machine code is kept under a digest of that plan.
 
 A section is a factory: it takes a plan (laws as functions, counts, flags) and returns a function that uses them as free
 variables. numba takes those for constants: it drops the branches that they rule out before it looks at types, and
-inlines the laws. Its own disk cache never finds such a function again; here the key is written out instead: the code of
-the function and of all functions that it holds, the numbers that it holds, the sources of all laws, and the width of
-registers.
+inlines the laws. Its own disk cache never finds such a function again; here the key is written out instead: the plan,
+with the code of every law in it, the sources of all laws and sections, and the width of registers. So where machine
+code is kept, not one function is made.
 """
 
 from __future__ import annotations
@@ -12,8 +12,10 @@ from __future__ import annotations
 import functools
 import hashlib
 import inspect
+import json
 from collections import namedtuple
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numba
@@ -41,9 +43,9 @@ from flockenv.startup import numba_before_scipy
 from flockenv.turns import OneAtATime
 
 __all__ = [
+    "digest_of",
     "entry",
     "entry_of",
-    "entry_point",
     "in_turn",
     "joined_from",
     "record",
@@ -68,37 +70,91 @@ def section(make: Callable[..., Callable[..., Any]]) -> Callable[..., Callable[.
 
 
 def entry_of(make: Callable[..., Callable[..., Any]]) -> Callable[..., Callable[..., Any]]:
-    """Decorate a section whose functions Python calls: `section(*plan)` is an entry point, made once for each plan."""
+    """Decorate a section whose functions Python calls: `section(*plan)` is an entry point, made once for each plan.
+
+    The plan holds laws, numbers, text, arrays, types, and tuples of those. Its functions are made when something is to
+    be compiled, and not where the machine code of an equal plan is kept.
+    """
 
     @functools.lru_cache(maxsize=512, typed=True)
     @functools.wraps(make)
     def made(*plan: Any) -> Callable[..., Any]:
-        return entry_point(make(*plan))
+        return _entry(make, plan)
 
     return made
 
 
 @functools.cache
 def entry(kernel: Callable[..., Any]) -> Callable[..., Any]:
-    """Return a kernel as an entry point of its own."""
-    return entry_point(python_of(kernel))
+    """Return a kernel, or a Python function, as an entry point of its own."""
+    return _entry(python_of, (kernel,))
 
 
-def entry_point(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Return a Python function as an entry point: its machine code is read from the checked store, or compiled there.
+def digest_of(plan: Any) -> str:
+    """Return a digest of all that code made of a plan depends on: laws by their code, numbers as they print."""
+    modules = {each.__module__ for each in functions_in(plan)}
+    told = f"{described(plan)}{laws_digest()}{texts_outside(modules)}"
+    return hashlib.sha256(told.encode()).hexdigest()[:20]
 
-    It may hold functions, numbers, text, arrays, types, and tuples of those.
+
+def _entry(make: Callable[..., Callable[..., Any]], plan: tuple[Any, ...]) -> Callable[..., Any]:
+    """Return the entry point that a factory makes of a plan; its machine code is read from the checked store.
+
+    What must be known of it before it is made, the names of its arguments above all, is kept there, too.
     """
     if IN_PYTHON:
-        return function
+        return make(*plan)
     numba_before_scipy()
-    modules = {each.__module__ for each in functions_in(function)}
-    told = f"{described(function)}{laws_digest()}{texts_outside(modules)}{processor.REGISTER}"
-    digest = hashlib.sha256(told.encode()).hexdigest()[:20]
-    store, name = Store(cache_folder()), f"{function.__name__.strip('_')}_{digest}"
+    digest, store = digest_of((make, plan, processor.REGISTER)), Store(cache_folder())
+    stand_in = _stand_in(store.read(f"{digest}.plan"))
+    function = stand_in or make(*plan)
+    if stand_in is None:
+        store.write(f"{digest}.plan", _told_of(function))
+    name = f"{function.__name__.strip('_')}_{digest}"
     compiled = _njit(fastmath=set(FAST), error_model="numpy", nogil=True, _nrt=False, pipeline_class=Whole)(function)
-    compiled._cache = OneAtATime(MachineCode(store, name), prepared(store.folder / "locks") / f"{name}.lock")
+    lock = prepared(store.folder / "locks") / f"{name}.lock"
+    compiled._cache = _Late(MachineCode(store, name), lock, compiled, make, plan)
+    compiled.made_of = make, plan
     return compiled  # type: ignore[no-any-return]
+
+
+def _told_of(function: Callable[..., Any]) -> bytes:
+    """Return what a stand-in for a function is made of."""
+    parameters = list(inspect.signature(function).parameters)
+    told = (function.__name__, function.__qualname__, function.__module__, function.__doc__, parameters)
+    return json.dumps(told).encode()
+
+
+def _stand_in(told: bytes | None) -> Callable[..., Any] | None:
+    """Return a function that numba takes for the one that has been told of; nothing calls it."""
+    if told is None:
+        return None
+
+    def stand_in() -> None:
+        raise AssertionError("a stand-in is never compiled")
+
+    stand_in.__name__, stand_in.__qualname__, stand_in.__module__, stand_in.__doc__, parameters = json.loads(told)
+    kind = inspect.Parameter.POSITIONAL_OR_KEYWORD
+    stand_in.__signature__ = inspect.Signature([inspect.Parameter(name, kind) for name in parameters])  # type: ignore[attr-defined]
+    return stand_in
+
+
+class _Late(OneAtATime):
+    """The machine code of an entry point, whose function is made where that of its types is not kept."""
+
+    def __init__(
+        self, cache: Any, lock: Path, compiled: Any, make: Callable[..., Callable[..., Any]], plan: tuple[Any, ...]
+    ) -> None:
+        super().__init__(cache, lock)
+        self._compiled, self._make_function, self._plan = compiled, make, plan
+
+    def load_overload(self, signature: Any, context: Any) -> Any:
+        """Return what is kept; None, once there is a function to be compiled, if nothing is."""
+        found = super().load_overload(signature, context)
+        if found is None:
+            function = self._make_function(*self._plan)
+            self._compiled.py_func = self._compiled._compiler.py_func = function
+        return found
 
 
 def record(names: tuple[str, ...]) -> Any:

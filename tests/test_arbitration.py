@@ -33,9 +33,10 @@ from flockenv.scene import Group, Scene
 from flockenv.space import Torus
 from flockenv.spawn import Spawn
 from flockenv.steer import Steer
-from flockenv.sweep import scene_source
+from flockenv.sweep import step_of
 from tests import catalogue
 from tests.catalogue import Array
+from tests.kernels import functions_of
 
 ALL = pytest.mark.parametrize("arbitration", catalogue.ARBITRATIONS, ids=lambda a: a.kind)
 PRECISIONS = pytest.mark.parametrize("dtype", ["float64", pytest.param("float32", marks=pytest.mark.slow)])
@@ -279,11 +280,11 @@ def test_steer_leaves_other_groups_alone_and_grants_what_it_says() -> None:
 def test_what_no_behaviour_asks_for_costs_nothing() -> None:
     """No query without a behaviour that looks around, and no line of Steer's in a scene without one."""
     scene = crowd(Steer(behaviours=(AVOID,)))
-    source = scene_source(scene.parts)
-    assert "count_cells(" not in source
-    assert "pair_law" not in source
-    assert "steer_law" not in scene_source(crowd(AVOID, SEPARATION).parts)
-    assert scene_source(crowd(Drag(rate=1)).parts) == scene_source(crowd(Drag(rate=2)).parts)
+    assert "lanes_meet" in functions_of(crowd(SEPARATION))
+    assert "lanes_meet" not in functions_of(scene)
+    assert "steers" in functions_of(scene)
+    assert "steers" not in functions_of(crowd(AVOID, SEPARATION))
+    assert step_of(crowd(Drag(rate=1)).parts) is step_of(crowd(Drag(rate=2)).parts)
 
 
 @ALL

@@ -9,11 +9,12 @@ import pytest
 
 from flockenv.behaviours import Separation
 from flockenv.effects import ObstacleContact
-from flockenv.kernels import load
 from flockenv.measures import measure
 from flockenv.scene import Group, Scene
+from flockenv.section import entry
 from flockenv.shapes import FORMS, Block, Capsule, Circle, DistanceField, HalfSpace, Polygon, Shape, Sway, Wall, packed
-from flockenv.shapes.head import body_of
+from flockenv.shapes.every import hit_shape, nearest_shape
+from flockenv.shapes.head import body_of, bound_of, shift_of, velocity_of
 from flockenv.space import Torus
 from flockenv.spawn import Spawn
 from flockenv.trajectory import Trajectory
@@ -183,7 +184,7 @@ def test_a_row_says_by_which_laws_it_is_met_what_it_lies_within_and_how_it_moves
     assert at == len(table)
     found = np.empty((len(every), 11))
     x, way = np.array([0.4, 0.3]), np.array([0.6, 0.8])
-    _ask().ask(table, np.array(rows), 1.3, x, way, found)
+    entry(ask)(table, np.array(rows), 1.3, x, way, found)
     for k, (gap, *normal, hit, bx, by, radius, dx, dy, vx, vy) in zip(order, found.tolist(), strict=True):
         shape, place = every[k], np.array(every[k].anchor) + x
         np.testing.assert_allclose((gap, *normal), (shape.gap(place), *shape.normal(place)), atol=1e-12)
@@ -196,17 +197,8 @@ def test_a_row_says_by_which_laws_it_is_met_what_it_lies_within_and_how_it_moves
     assert body_of.py_func(0, (0.0, 0.0)) == 16
 
 
-def _ask() -> Any:
-    return load(
-        "every_shape",
-        '''"""A kernel that reads forms at run time; written by a test; safe to delete."""
-from numba import njit
-from flockenv.shapes.every import hit_shape, nearest_shape
-from flockenv.shapes.head import bound_of, shift_of, velocity_of
-
-
-@njit(cache=True, error_model="numpy")
-def ask(table, rows, time, x, way, found):
+def ask(table: Any, rows: Any, time: float, x: Any, way: Any, found: Any) -> None:
+    """What the functions that read forms at run time say of each row."""
     y, d = (x[0], x[1]), (way[0], way[1])
     for k in range(len(rows)):
         at = rows[k]
@@ -215,11 +207,8 @@ def ask(table, rows, time, x, way, found):
         shift, speed = shift_of(table, at, time, y), velocity_of(table, at, time, y)
         found[k, 0], found[k, 3], found[k, 6] = gap, hit_shape(table, at, y, d, 0.1), radius
         for j in range(2):
-            found[k, 1 + j], found[k, 4 + j], found[k, 7 + j], found[k, 9 + j] = (
-                normal[j], centre[j], shift[j], speed[j]
-            )
-''',
-    )
+            found[k, 1 + j], found[k, 4 + j] = normal[j], centre[j]
+            found[k, 7 + j], found[k, 9 + j] = shift[j], speed[j]
 
 
 # --- pictures ---------------------------------------------------------------------------------------------------------

@@ -11,8 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from flockenv import arbitration, steering
-from flockenv.kernels import load
-from flockenv.rows import rows
+from flockenv.rows import loop_of, rows
 from tests.catalogue import STEERING, Array, Law, mirror, rotation
 
 
@@ -102,44 +101,16 @@ def test_it_is_finite_wherever_it_may_be_asked(row: Law, dimension: int) -> None
         assert np.abs(answer[np.isfinite(answer)]).max() <= 1e13  # a distance of 1e-12 m is never divided by twice
 
 
-def in_single_precision(
-    dimension: int, laws_: list[Law], given_: list[list[Array]], answers: list[Array]
-) -> None:  # fmt: skip
-    """Call some laws over float32 rows, in one compiled loop; answers are stored in float64, so a promotion shows."""
-    lines = []
-    for n, row in enumerate(laws_):
-        values = [
-            "(" + ", ".join(f"given[{n}][{a}][r, {k}]" for k in range(dimension)) + ")"
-            if kind in VECTORS
-            else f"given[{n}][{a}][r]"
-            for a, kind in enumerate(row.takes)
-        ]
-        lines.append(f"s{n} = steering.{row.name}({', '.join(values)})")
-        if row.gives == "vector":
-            lines += [f"answers[{n}][r, {k}] = s{n}[{k}]" for k in range(dimension)]
-        else:
-            lines.append(f"answers[{n}][r] = s{n}")
-    body = "\n        ".join(lines)
-    source = f"""from numba import njit
-from flockenv import steering
-
-
-@njit(cache=True, error_model="numpy")
-def over(given, answers):
-    for r in range(answers[0].shape[0]):
-        {body}
-"""
-    load("single_precision", source).over(tuple(map(tuple, given_)), tuple(answers))
-
-
 @pytest.mark.slow
 @DIMENSIONS
 def test_in_single_precision_they_stay_there_and_stay_accurate(dimension: int) -> None:
     given_ = [[a.astype(np.float32) for a in arguments(row, dimension, 200)] for row in STEERING]
     exact = [rows(row.law)(*g) for row, g in zip(STEERING, given_, strict=True)]
     answers = [np.full_like(e, np.nan) for e in exact]
-    for k in range(0, len(STEERING), 8):  # all in one loop take twice as long to compile
-        in_single_precision(dimension, *(some[k : k + 8] for some in (STEERING, given_, answers)))
+    for row, arrays, answer in zip(STEERING, given_, answers, strict=True):
+        loop_of(row.law, tuple(a.shape[1:] for a in arrays), dimension if row.gives == "vector" else 0)(
+            tuple(arrays), answer
+        )
     for row, answer, expected in zip(STEERING, answers, exact, strict=True):
         assert (answer.astype(np.float32) == answer).all(), f"a constant has made {row.name} float64"
         here = np.isfinite(expected)

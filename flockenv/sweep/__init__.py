@@ -8,23 +8,47 @@ that), and every array of a world lies in blocks: the first coordinates of one, 
 over the lanes has a constant length and constant offsets, and the compiler makes it straight vector code; running sums
 lie in one small scratch array and stay in vector registers.
 
-The files, as a source is put together: `parts` says what it depends on, `text` holds the smallest pieces of it;
-`listing` sorts the agents and walks their blocks, `meeting` lets a block meet its candidates, `far` all agents, `bonds`
-its partners; `accelerate` is the sum of all laws, `method` the integrator, `step` advances worlds by it, `source` is
-the whole file, and `handed` leaves its functions the scratch that they name; `look` is what tasks add to it.
+The files, from the whole to its parts: `entries` are what Python calls; `step` advances a world, by `respond` (what
+all laws say), the integrator's `method` and `move`; `listing` sorts the agents and walks their blocks, `meeting` lets a
+block meet its candidates, `far` all agents, `bonds` its partners, `obstacles` what stands around; `look` is what tasks
+add. `parts` says what follows from which laws there are. Each file holds sections (see `flockenv.section`): a function
+`thing_of(plan)` makes the function `thing`, of as little as it depends on.
 """
 
 from __future__ import annotations
 
 from flockenv.sweep.bonds import Table, pack
+from flockenv.sweep.context import Worlds, worlds_of
+from flockenv.sweep.entries import BeginPlan, begin_inner_of, begin_of, begin_plan, field_of, step_of
 from flockenv.sweep.look import look_of
-from flockenv.sweep.look_plan import plan_look
+from flockenv.sweep.look_plan import LookPlan, plan_look
 from flockenv.sweep.parts import Look, Parts, flattened
 from flockenv.sweep.scratch import GIVEN, OWN, scratch_bytes, scratch_of, scratch_record
-from flockenv.sweep.sections import sections_of
-from flockenv.sweep.source import field_source, scene_source
+from flockenv.sweep.step import StepPlan, step_plan, step_world_of
 
 __all__ = [
-    "GIVEN", "OWN", "Look", "Parts", "Table", "field_source", "flattened", "look_of", "pack", "plan_look",
-    "scene_source", "scratch_bytes", "scratch_of", "scratch_record", "sections_of",
+    "GIVEN",
+    "OWN",
+    "BeginPlan",
+    "Look",
+    "LookPlan",
+    "Parts",
+    "StepPlan",
+    "Table",
+    "Worlds",
+    "begin_inner_of",
+    "begin_of",
+    "begin_plan",
+    "field_of",
+    "flattened",
+    "look_of",
+    "pack",
+    "plan_look",
+    "scratch_bytes",
+    "scratch_of",
+    "scratch_record",
+    "step_of",
+    "step_plan",
+    "step_world_of",
+    "worlds_of",
 ]  # fmt: skip

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from flockenv.effects.base import Me
 from flockenv.kernels import kernel, law, like
@@ -12,7 +12,10 @@ from flockenv.section import record, section, tuple_from
 from flockenv.sweep.blocks import vector_of_lane
 from flockenv.vec import unit, zero
 
-__all__ = ["AgentPlan", "alone_of", "inner_of", "still"]
+if TYPE_CHECKING:
+    from flockenv.sweep.parts import Parts
+
+__all__ = ["AgentPlan", "agent_plan", "alone_of", "inner_of", "still"]
 
 
 class AgentPlan(NamedTuple):
@@ -24,6 +27,12 @@ class AgentPlan(NamedTuple):
     aims: bool = False  # does any effect say where it wants to go?
     paced: bool = False  # does any law ask how fast it would like to go?
     inner: tuple[str, ...] = ()  # names of what goes on inside it
+
+
+def agent_plan(parts: Parts) -> AgentPlan:
+    """Return the plan of a scene."""
+    paced = "desired_speed" in parts.frame_numbers
+    return AgentPlan(parts.dimension, parts.width, parts.oriented, parts.aims, paced, parts.inner)
 
 
 @section

@@ -16,7 +16,10 @@ import numpy as np
 from flockenv.kernels import Vec, copy_lanes
 from flockenv.section import section
 
-__all__ = ["into_blocks", "out_of_blocks", "place_of", "vector_of", "vector_of_lane"]
+__all__ = [
+    "common_places", "handed_of", "into_blocks", "out_of_blocks", "place_of", "put_vector_of", "vector_of",
+    "vector_of_lane",
+]  # fmt: skip
 
 
 @section
@@ -30,6 +33,38 @@ def vector_of_lane(dimension: int, width: int) -> Callable[..., Vec]:
         return blocks[place], blocks[place + one], blocks[place + two]
 
     return vector
+
+
+@section
+def put_vector_of(dimension: int, width: int) -> Callable[..., None]:
+    """Make `put(blocks, place, vector)`: write a vector, its first coordinate at `place` of an array of blocks."""
+    one, two = np.uint64(width), np.uint64(2 * width)
+
+    def put(blocks: Any, place: Any, vector: Any) -> None:
+        blocks[place] = vector[0]
+        blocks[place + one] = vector[1]
+        if dimension == 3:
+            blocks[place + two] = vector[2]
+
+    return put
+
+
+@section
+def common_places(dimension: int, width: int, masked: bool) -> Callable[..., tuple[Any, Any, Any]]:
+    """Make `common(scratch, n, present, block)`: where a block has its bodies, who lives, and what its agents want.
+
+    In a large world what all agents have in common is read where the first block has it: large worlds wait for memory.
+    """
+    size, lanes = np.uint64(dimension * width), np.uint64(width)
+
+    def common(scratch: Any, n: Any, present: Any, block: Any) -> Any:
+        row, base = block * lanes, block * size
+        if masked:
+            whole = present == n and (block + np.uint64(1)) * lanes <= np.uint64(n)
+            return row & scratch.spread[0], np.uint64(0) if whole else row, base & scratch.spread[1]
+        return row, row, base
+
+    return common
 
 
 @section
@@ -92,3 +127,14 @@ def out_of_blocks(dimension: int, width: int) -> Callable[..., None]:
                         array[k, b][np.uint64(block * width) + lane] = blocks[base + lane]
 
     return out
+
+
+@section
+def handed_of(inner: bool) -> Callable[..., Any]:
+    """Make `handed(scratch, pos, vel)`: a tuple of arrays, positions, velocities and, if any, inner states.
+
+    Behind them the arrays of scratch are counted on, see `gather.picked`.
+    """
+    if inner:
+        return lambda scratch, pos, vel: (pos, vel) + scratch.inner  # noqa: RUF005  # numba adds tuples, and unpacks none
+    return lambda scratch, pos, vel: (pos, vel)

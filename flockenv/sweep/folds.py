@@ -19,9 +19,10 @@ from flockenv.shapes.round import normal, touched_normal
 from flockenv.shapes.table import law_of
 from flockenv.shapes.touch import touched_offset, touched_spot
 from flockenv.steering.around import threat
-from flockenv.sweep.forms import number_of
+from flockenv.sweep.forms import Surroundings, number_of
 from flockenv.sweep.gather import chosen, gather, scatter
 from flockenv.sweep.obstacle_plan import Fold
+from flockenv.sweep.visibility import blocked
 from flockenv.vec import add, dot, norm, scale, sub, zero
 
 __all__ = ["meet_circle", "meet_shape"]
@@ -43,10 +44,11 @@ SHORT = 1 - 1e-6
 
 
 @functools.cache
-def _in_sight(hidden: Callable[..., bool] | None) -> Callable[..., bool]:
+def _in_sight(around: Surroundings | None) -> Callable[..., bool]:
     """Make `in_sight(world, me, gap, out)`: does nothing stand in the way to the nearest place of a surface?"""
-    if hidden is None:
+    if around is None:
         return kernel(lambda world, me, gap, out: True)
+    hidden = blocked(around)
 
     def in_sight(world: Any, me: Any, gap: Any, out: Any) -> Any:
         obstacle_x, obstacle_radius, params, size, b = world

@@ -16,7 +16,18 @@ from numba.core import types
 from flockenv.kernels import intrinsic_or_python
 from flockenv.lines import array_of
 
-__all__ = ["add_where", "chosen", "copy_each", "fill", "gather", "gather_each", "picked", "places_each", "scatter"]
+__all__ = [
+    "add_where",
+    "chosen",
+    "copy_each",
+    "fill",
+    "gather",
+    "gather_each",
+    "picked",
+    "places_each",
+    "scatter",
+    "scatter_each",
+]
 
 _tuple_of: Callable[..., Any] = types.BaseTuple.from_types
 _WORD = ir.IntType(64)
@@ -205,6 +216,30 @@ def _gather_each_in_python(arrays: Any, starts: Any, which: Any, further: Any) -
 
 
 gather_each: Any = intrinsic_or_python(_gather_each, _gather_each_in_python)
+
+
+def _scatter_each(typing_context: Any, arrays: Any, starts: Any, which: Any, further: Any, numbers: Any) -> Any:
+    """Write a number of a tuple to each array: to `starts[which[k]] + further[k]` of array k."""
+    chosen_starts, offsets = _constants(which, "which"), _constants(further, "further")
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        for k, (start, offset) in enumerate(zip(chosen_starts, offsets, strict=True)):
+            array, at = (builder.extract_value(arguments[j], n) for j, n in ((0, k), (1, start)))
+            (pointer,), size = _pointers(context, builder, arrays[k], array, at, [offset])
+            value = context.cast(builder, builder.extract_value(arguments[4], k), numbers[k], arrays[k].dtype)
+            builder.store(value, pointer, align=size)
+        return context.get_dummy_value()
+
+    many = types.UniTuple(types.uint64, len(starts))  # type: ignore[no-untyped-call]
+    return types.void(arrays, many, which, further, numbers), generate
+
+
+def _scatter_each_in_python(arrays: Any, starts: Any, which: Any, further: Any, numbers: Any) -> None:
+    for array, start, offset, number in zip(arrays, which, further, numbers, strict=True):
+        array[int(starts[start]) + offset] = number
+
+
+scatter_each: Any = intrinsic_or_python(_scatter_each, _scatter_each_in_python)
 
 
 def _copy_each(

@@ -19,7 +19,7 @@ import numpy as np
 from flockenv.kernels import Law, ask_for, wait_for_team
 from flockenv.neighbours import DISTANT, candidates, count_cells, order_records, row_of
 from flockenv.section import section
-from flockenv.sweep.blocks import place_of
+from flockenv.sweep.blocks import handed_of, place_of
 from flockenv.sweep.gather import copy_each, gather, gather_each, picked, places_each, scatter
 from flockenv.sweep.scratch import SMALL_STRIDE, scratch_record
 from flockenv.tiles import FAR_FROM_HOME, count_from_home, order_cells, order_shared
@@ -173,17 +173,9 @@ def list_living(plan: Listing) -> Callable[..., Any]:
 
 
 @section
-def _handed(inner: bool) -> Callable[..., Any]:
-    """Make `handed(scratch, pos, vel)`: a tuple of arrays; behind them those of scratch are counted on."""
-    if inner:
-        return lambda scratch, pos, vel: (pos, vel) + scratch.inner  # noqa: RUF005  # numba adds tuples, and unpacks none
-    return lambda scratch, pos, vel: (pos, vel)
-
-
-@section
 def _fill(plan: Listing) -> Callable[..., None]:
     """Make `fill(context, pos, vel)`: list the living of a small world by number, a row for each field."""
-    width, headed, handed = plan.width, plan.headed, _handed("inner0" in plan.arrays)
+    width, headed, handed = plan.width, plan.headed, handed_of("inner0" in plan.arrays)
     (arrays, which, further), to = plan.sources(), plan.lanes_of(plan.record)
     velocity, heading = plan.lanes_of(plan.axes("v")), plan.lanes_of(plan.axes("h"))
     size, place_in = plan.dimension * width, place_of(plan.dimension, width)
@@ -219,7 +211,7 @@ def _enter(plan: Listing) -> Callable[..., None]:
     length, place_in, handed = (
         np.uint64(plan.length),
         place_of(plan.dimension, plan.width),
-        _handed("inner0" in plan.arrays),
+        handed_of("inner0" in plan.arrays),
     )
     (arrays, which, further), to = plan.sources(), tuple(range(1, plan.length))
 
@@ -248,7 +240,7 @@ def _sort(plan: Listing) -> Callable[..., None]:
     So each is one distant place in memory, which is asked for in good time.
     """
     d, width, wraps, confine = plan.dimension, plan.width, plan.wraps, plan.confine
-    length, handed = np.uint64(plan.length), _handed("inner0" in plan.arrays)
+    length, handed = np.uint64(plan.length), handed_of("inner0" in plan.arrays)
     arrays, which, further = plan.sources()
     inside = tuple(int(plan.slot("inside0")) + k * width for k in range(d))
     if wraps:  # of these, positions are read where they are written first: in the lanes of this thread

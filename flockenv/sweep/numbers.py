@@ -18,9 +18,10 @@ from flockenv.sweep.gather import gather
 from flockenv.vec import add
 
 if TYPE_CHECKING:
+    from flockenv.effects.base import Effect
     from flockenv.sweep.parts import Parts
 
-__all__ = ["Form", "NumberPlan", "Numbers", "View", "images_of", "numbers_of", "pack_numbers"]
+__all__ = ["Form", "Images", "NumberPlan", "Numbers", "View", "images_in", "images_of", "numbers_of", "pack_numbers"]
 
 
 class Form(NamedTuple):
@@ -218,13 +219,26 @@ def _run(run: tuple[str, int, int]) -> Callable[..., tuple[Any, ...]]:
     return kernel(counted)
 
 
-@section
-def images_of(names: tuple[str, ...], places: tuple[str, ...], offset_to: Law) -> Callable[..., Any]:
-    """Make `images_of(p, size, here)`: the record of an effect with its points where they are nearest to `here`.
+class Images(NamedTuple):
+    """Which numbers of an effect are points: on a torus these have images, and laws see the nearest."""
 
-    On a torus a point has images; laws see the nearest.
-    """
-    kind, values = record(names), _imaged(tuple(name in places for name in names), offset_to)
+    names: tuple[str, ...]
+    points: tuple[str, ...]
+    offset_to: Law
+
+
+def images_in(parts: Parts, effect: Effect) -> Images | None:
+    """Return which numbers of an effect have images in the space of a scene; None if none has."""
+    if not (parts.space.periodic and effect.places):
+        return None
+    return Images(tuple(parts.names_of(effect)), tuple(effect.places), parts.space.offset_law)
+
+
+@section
+def images_of(plan: Images) -> Callable[..., Any]:
+    """Make `images_of(p, size, here)`: the record of an effect with its points where they are nearest to `here`."""
+    kind = record(plan.names)
+    values = _imaged(tuple(name in plan.points for name in plan.names), plan.offset_to)
 
     def images(p: Any, size: Any, here: Any) -> Any:
         return kind(*values(p, size, here))

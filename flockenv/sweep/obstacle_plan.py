@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from flockenv.kernels import Law
 from flockenv.sweep.agents import AgentPlan
 from flockenv.sweep.forms import Surroundings
-from flockenv.sweep.visibility import blocked
 
 if TYPE_CHECKING:
     from flockenv.sweep.parts import Parts
@@ -27,7 +25,7 @@ class Fold(NamedTuple):
     reach: Any
     rays: int
     pieces: bool  # are walls, polygons and rooms met side after side?
-    hidden: Callable[..., bool] | None  # does another obstacle hide one? None: that does not matter
+    hidden: Surroundings | None  # by which obstacles others may be hidden from it; None: that does not matter
     slots: tuple[int, ...]  # where its running numbers lie
     ahead: tuple[int, ...]  # where it is noted which obstacle is ahead, by form and place; nowhere if none asks
     told: int  # where in a block of `felt` lies what its pair law has found out; -1: it has none
@@ -78,7 +76,7 @@ def obstacle_plan(parts: Parts, agent: AgentPlan) -> Obstacles:
         Fold(
             k, e.obstacle_start, e.obstacle_law, e.obstacle_ray, e.obstacle_from, e.obstacle_reach,
             e.rays(d) if e.obstacle_ray is not None else 1, e.obstacle_pieces,
-            blocked(around) if e.occluded_obstacles else None, places(f"o{k}_"),
+            around if e.occluded_obstacles else None, places(f"o{k}_"),
             places(f"ahead{k}_") if e.obstacle_edges else (),
             parts.targets.index(parts.pair_target(k)) * d * width if e.pair_law is not None else -1,
         )

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from flockenv.kernels import Law
+from flockenv.sweep.forms import Surroundings
 from flockenv.sweep.listing import Listing, listing_of
-from flockenv.sweep.numbers import images_of
-from flockenv.sweep.visibility import blocked
+from flockenv.sweep.numbers import Images, images_in
 
 if TYPE_CHECKING:
     from flockenv.sweep.parts import Parts
@@ -41,7 +40,7 @@ class PairLaw(NamedTuple):
     contact: bool
     vanishes: bool
     averages: bool
-    images: Any  # None, or what makes its numbers, with the images of its points that are nearest to an agent
+    images: Images | None
     target: int  # what it adds to
 
 
@@ -59,7 +58,7 @@ class Pairs(NamedTuple):
     ahead: bool  # is it worked out how far the next candidate is while one is met?
     masks: bool  # is what was compared kept in masks, so that it costs nothing to compare once more?
     offset_to: Law
-    hidden: Callable[..., bool] | None  # does an obstacle hide an agent? see visibility.py
+    hidden: Surroundings | None  # by which obstacles agents may be hidden, see visibility.py
 
     @property
     def lanes(self) -> int:
@@ -90,9 +89,7 @@ def pairs_of(parts: Parts) -> Pairs:
             k, e.pair_start, e.pair_law, e.apart_law, e.finish_law, e.obstacle_law if e.joined else None,
             int(listing.slot(f"c{k}_0")), e.sums(parts.dimension), parts.sights.index(parts.sight_of(e)), e.contact,
             e.vanishes and parts.trusts, e.averages,
-            images_of(tuple(parts.names_of(e)), e.places, parts.space.offset_law)
-            if parts.space.periodic and e.places else None,
-            parts.targets.index(parts.pair_target(k)),
+            images_in(parts, e), parts.targets.index(parts.pair_target(k)),
         )
         for k, e in parts.pairs
     )  # fmt: skip
@@ -100,5 +97,5 @@ def pairs_of(parts: Parts) -> Pairs:
     return Pairs(
         listing, views, laws, targets, parts.inner, parts.oriented, parts.parting,
         parts.fields != parts.sorted_fields, parts.looks_ahead, parts.masks, parts.space.offset_law,
-        blocked(parts.surroundings) if any(view.occluded for view in views) else None,
+        parts.surroundings if any(view.occluded for view in views) else None,
     )  # fmt: skip

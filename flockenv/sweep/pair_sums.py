@@ -13,9 +13,11 @@ from flockenv.kernels import kernel, like, tallied, tally_of
 from flockenv.section import in_turn, section, tuple_from
 from flockenv.sweep.blocks import place_of, vector_of
 from flockenv.sweep.gather import add_where, chosen, copy_each, fill, gather, picked, scatter
+from flockenv.sweep.laws import given_of
 from flockenv.sweep.listed_agents import agent_listed
 from flockenv.sweep.nearest import kept
 from flockenv.sweep.pair_plan import PairLaw, Pairs
+from flockenv.sweep.visibility import blocked
 from flockenv.vec import add, dot, zero
 
 __all__ = ["add_candidate", "begin_sums", "finish_sums", "keep_nearest", "tell_sums"]
@@ -31,7 +33,7 @@ def _seen(plan: Pairs, q: int, cut: bool) -> Callable[..., bool]:
     cut: of a topological sight, is it known already how far its nearest are?
     """
     view, masks = plan.views[q], plan.masks
-    hidden: Any = plan.hidden
+    hidden: Any = blocked(plan.hidden) if plan.hidden is not None else None
     fov, grouped, occluded, counts = view.fov, view.grouped, view.occluded, cut and view.near[1] > 0
     last = np.uint64(view.near[0] + max(view.near[1] - 1, 0) * plan.lanes)
 
@@ -177,11 +179,11 @@ def _start(plan: Pairs, law: PairLaw) -> Callable[..., None]:
 
     With the obstacles, where it is one fold over these, too: (obstacle_x, obstacle_radius, b).
     """
-    begin, joined, offset_to, k, images = law.start, law.joined, plan.offset_to, law.k, law.images
-    slots, imaged, centre = plan.slots(law.first, law.sums), law.images is not None, vector_of(plan.listing.dimension)
+    begin, joined, offset_to, given = law.start, law.joined, plan.offset_to, given_of(law.k, law.images)
+    slots, centre = plan.slots(law.first, law.sums), vector_of(plan.listing.dimension)
 
     def start(numbers: Any, obstacles: Any, me: Any, lanes: Any, lane: Any) -> None:
-        p = images(numbers.effects[k], numbers.size, me.pos) if imaged else numbers.effects[k]
+        p = given(numbers, me)
         found = begin(p, me)
         if joined is not None:
             x, radius, b = obstacles
@@ -221,17 +223,11 @@ def _end(plan: Pairs, target: int) -> Callable[..., None]:
 @section
 def _total(plan: Pairs, laws: tuple[PairLaw, ...]) -> Callable[..., Any]:
     before, law = _total(plan, laws[:-1]) if laws[1:] else None, laws[-1]
-    slots, finish, k, images, imaged = (
-        plan.slots(law.first, law.sums),
-        law.finish,
-        law.k,
-        law.images,
-        law.images is not None,
-    )
+    slots, finish, given = plan.slots(law.first, law.sums), law.finish, given_of(law.k, law.images)
     averages, many = law.averages, np.uint64(max(plan.views[law.sight].counted, 0))
 
     def total(numbers: Any, me: Any, lanes: Any, lane: Any) -> Any:
-        p = images(numbers.effects[k], numbers.size, me.pos) if imaged else numbers.effects[k]
+        p = given(numbers, me)
         sums = gather(lanes, lane, slots)
         if averages:
             mine = finish(p, me, sums + (tally_of(lanes[many + lane]),))  # noqa: RUF005

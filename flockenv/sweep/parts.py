@@ -21,7 +21,7 @@ from flockenv import processor
 from flockenv.effects.base import Effect, Sight
 from flockenv.integrators.base import Integrator
 from flockenv.integrators.one_stage import OneStage
-from flockenv.kernels import IN_PYTHON, LINE, python_of
+from flockenv.kernels import IN_PYTHON, LINE, held, python_of
 from flockenv.shapes import packed
 from flockenv.shapes.cells import FEWEST_ROWS, MOST_FOUND, cells_of
 from flockenv.space import Space
@@ -531,6 +531,7 @@ def _names(effect: Effect, slots: Sequence[str]) -> set[str]:
         seen.add(id(python))
         names |= set(python.__code__.co_names)
         called: list[Any] = [python.__globals__.get(name) for name in python.__code__.co_names]
+        called += held(python)
         modules = [m for m in called if inspect.ismodule(m)]
         called += [getattr(m, name, None) for m in modules for name in python.__code__.co_names]
         todo += [f for f in called if hasattr(f, "py_func") or (IN_PYTHON and inspect.isfunction(f))]

@@ -6,430 +6,357 @@ world together, each the agents of its own blocks.
 
 from __future__ import annotations
 
+import functools
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from flockenv.integrators.base import Method, Provided
+from flockenv.kernels import Law, ask_for, finite, kernel, like, wait_for_team
+from flockenv.section import in_turn, section
 from flockenv.state import COUNTED_BY_KERNELS
-from flockenv.sweep.accelerate import felt_as, parameters, responses
-from flockenv.sweep.arrange import go_home, move_in
-from flockenv.sweep.handed import OPEN_SCRATCH, Context
+from flockenv.sweep.agents import AgentPlan, agent_plan, alone_of
+from flockenv.sweep.arrange import ArrangePlan, arrange_plan, go_home_of, move_in_of
+from flockenv.sweep.blocks import vector_of_lane
+from flockenv.sweep.carry import bring_in_of, bring_inside_of, bring_out_of, take_drive_of
+from flockenv.sweep.context import Context
+from flockenv.sweep.gather import gather
+from flockenv.sweep.laws import OneLaw, says_of
+from flockenv.sweep.method import MethodPlan, advance_of, method_plan
+from flockenv.sweep.move import MovePlan, move_of, move_plan
+from flockenv.sweep.numbers import NumberPlan, numbers_of
 from flockenv.sweep.parts import Parts
-from flockenv.sweep.text import (
-    Slots,
-    alone,
-    asked,
-    given,
-    in_blocks,
-    in_common,
-    indented,
-    indented_lines,
-    lane,
-    lanes_of,
-    nearest_images,
-    needed,
-    tuple_of,
+from flockenv.sweep.respond import (
+    ResponsePlan,
+    SensePlan,
+    accelerate_of,
+    respond_of,
+    response_plan,
+    sense_of,
+    sense_plan,
 )
+from flockenv.vec import zero
 
-__all__ = ["begin", "kept_frame", "kept_inner", "step", "step_world"]
-
+__all__ = ["StepPlan", "step_plan", "step_world_of"]
 
 PART = 8
 """Blocks that are advanced together."""
 
 AHEAD = 16
-"""So many blocks on it is asked for what agents are moved by, in large worlds: several arrays are read side by side."""
+"""How many blocks ahead it is asked for what agents are moved by, in large worlds: several arrays are read at once."""
 
 
-def kept_frame(parts: Parts, from_state: bool) -> list[str]:
-    """Write how frames come out of the state's array, or go back into it; nothing if nobody keeps one."""
-    d, way = parts.dimension, "into_blocks" if from_state else "out_of_blocks"
-    return [
-        f"{way}({name}, frame_[{k * d} : {(k + 1) * d}], b, n, first, end)"
-        for k, name in enumerate(parts.frame_vectors)
-    ]
+class StepPlan(NamedTuple):
+    """What a step of a scene depends on."""
+
+    agent: AgentPlan
+    inner: int  # how many numbers each agent has inside
+    numbers: NumberPlan
+    confines: Law | None  # brings agents into a periodic box when a call begins
+    arrange: ArrangePlan | None
+    counts: tuple[tuple[int, OneLaw], ...]  # laws that count agents, with the number of their effects
+    sense: SensePlan
+    response: ResponsePlan
+    move: MovePlan
+    method: tuple[Callable[[Provided], Method], MethodPlan] | None  # of several stages
+    tells: bool  # are inner states told what is sensed at the beginning of a step?
+    asks: tuple[int, ...]  # numbers of a block in `pos`, `vel`, `felt` and `ident`, that are asked for ahead; or none
+    trusts: bool
+    spreads: bool
 
 
-def kept_inner(parts: Parts, from_state: bool) -> list[str]:
-    """Write how inner states come out of the state's array, or go back into it; nothing if nobody has one."""
-    if not parts.inner:
-        return []
-    pairs = [(f"scratch.inner[{k}][i]", f"inner_[{k}, b, i]") for k in range(len(parts.inner))]
-    return [
-        f"for i in range(first * {parts.width}, min(end * {parts.width}, n)):",
-        *(f"    {mine} = {kept}" if from_state else f"    {kept} = {mine}" for mine, kept in pairs),
-    ]
+def step_plan(parts: Parts) -> StepPlan:
+    """Return the plan of a scene."""
+    d, w = parts.dimension, parts.width
+    counts = tuple((k, OneLaw.of(parts, k, "count_law")) for k, e in enumerate(parts.effects) if e.count_law)
+    method = None if parts.one_stage else (parts.integrator.advance(), method_plan(parts))
+    return StepPlan(
+        agent_plan(parts), len(parts.inner), parts.number_plan,
+        parts.space.confine_law if parts.confines else None,
+        arrange_plan(parts) if parts.arranges else None, counts, sense_plan(parts), response_plan(parts),
+        move_plan(parts), method, parts.inner != () and parts.integrator.solves,
+        (d * w, d * w, d * len(parts.targets) * w, w) if parts.sorts else (), parts.trusts, parts.spreads,
+    )  # fmt: skip
 
 
-def step_world(parts: Parts) -> str:
-    """Return the source of `step_world`: steps of one world, or of one thread's part of it."""
-    d, bad = parts.dimension, Slots(parts)("bad")
-    arriving, stepping = [*_confine(parts), *move_in(parts)], _advance(parts)
-    kept = "(" + ", ".join(f"work[b, {k}]" for k in range(COUNTED_BY_KERNELS)) + ")"
-    restored = "; ".join(f"work[b, {k}] = counted_[{k}]" for k in range(COUNTED_BY_KERNELS))
-    return f'''@kernel
-def step_world(
-    x_, v_, {parts.frame_argument}alive, tick, key, obstacle_x, obstacle_radius, work, drive, asked, params, dt, count,
-    b, rank, team, scratch,
-):
-    """Advance this thread's part of world b by `count` steps; return an agent that is not finite, or -1.
-
-    What is asked of its agents is drive[:, asked], N; nothing if drive is empty.
-
-    It is the lowest of those who are not at the end of the call, or, where that spreads, after the first step that
-    failed. A world in which somebody is not stays as it was, whole.
-    """
-    {OPEN_SCRATCH}
-    n = x_.shape[2]
-    blocks = (n + {parts.width - 1}) // {parts.width}
-    first, end = blocks * rank // team, blocks * (rank + 1) // team
-    present = np.int64(0)  # not a literal: laws would be typed for it too, and compiled twice
-    for i in range(n):
-        present += alive[b, i]
-    for i in range(first * {parts.width}, min(end * {parts.width}, n)):
-        living[i] = alive[b, i]
-    into_blocks(pos, x_, b, n, first, end)
-    into_blocks(vel, v_, b, n, first, end)
-{indented(asked(parts), 4)}
-{indented([*kept_frame(parts, from_state=True), *kept_inner(parts, from_state=True)], 4)}
-{indented(needed(parameters(parts), [*arriving, *stepping, "numbers"]), 4)}
-{indented(arriving, 4)}
-    context = Context({", ".join(Context._fields)})
-    well, begun = like(dt, np.inf), tick[b]
-    counted_ = {kept}
-    for l in range(np.uint64({parts.width})):
-        {bad} = well
-    nobody = np.int64(n * (count + 1))
-    failed = nobody
-    for step_ in range(count):
-        time = like(dt, (begun + step_) * np.float64(dt))
-{indented([*stepping, *_noted(parts)], 8)}
-{indented(go_home(parts), 4)}
-    worst = well
-    for lane in range({parts.width}):  # one after the other: no loop over lanes
-        l = np.uint64(lane)
-        worst = min(worst, {bad})
-    # who counts may still be reading the first half
-    tally[team + rank] = {"failed" if parts.spreads else "np.int64(worst) if worst < well else nobody"}
-    wait_for_team(sync, team)
-    first_bad = nobody
-    for r in range(team):
-        first_bad = min(first_bad, tally[team + r])
-    wait_for_team(sync, team)  # before anybody counts again
-    if first_bad < nobody:
-        first_bad %= n
-        if rank == 0:
-            {restored}
-        for i in range({"n" if parts.trusts else "0"}):  # who was nowhere before is whom it comes from
-            for k in range({d}):
-                if alive[b, i] and not finite(x_[k, b, i]):
-                    return i
-        return first_bad
-    out_of_blocks(pos, x_, b, n, first, end)
-    out_of_blocks(vel, v_, b, n, first, end)
-{indented([*kept_frame(parts, from_state=False), *kept_inner(parts, from_state=False)], 4)}
-    if rank == 0:
-        tick[b] += count
-    return -1
-'''
+# --- one step ---------------------------------------------------------------------------------------------------------
 
 
-def _noted(parts: Parts) -> list[str]:
-    """Write how it is noted after which step somebody was nowhere first, and who, where that spreads from him."""
-    if not parts.spreads:
-        return []
-    bad = Slots(parts)("bad")
-    return [
-        "fallen = np.int32(0)",
-        f"for l in range(np.uint64({parts.width})):",
-        f"    fallen += np.int32(1) if {bad} < well else np.int32(0)",
-        "if fallen > np.int32(0) and failed == nobody:",
-        f"    for lane in range({parts.width}):",
-        "        l = np.uint64(lane)",
-        f"        failed = min(failed, np.int64(step_ * n) + np.int64(min({bad}, like(dt, n))))",
-    ]
+@functools.cache
+def _counting(k: int, one: OneLaw) -> Callable[..., None]:
+    """Return `counts(numbers, me, lives)`: count an agent as the law of effect k says."""
+    which_of = says_of(one)
+
+    def counts(numbers: Any, me: Any, lives: Any) -> None:
+        which: Any = np.int64(which_of(numbers, me))
+        if lives and which >= 0 and which < len(numbers.effects[k].counted):
+            numbers.effects[k].counted[which] += like(me.radius, 1.0)
+
+    return kernel(counts)
 
 
-def _confine(parts: Parts) -> list[str]:
-    """Write how everybody is brought into a periodic box, where steps rely on it."""
-    if not parts.confines:
-        return []
-    confining = [
-        f"for l in range(np.uint64({parts.width})):",
-        f"    x, v = {lanes_of(parts, 'pos')}, {lanes_of(parts, 'vel')}",
-        "    x, v = confine(size, radius[row + l], x, v)",
-        *(f"    {lane(parts, 'pos', k)} = x[{k}]" for k in range(parts.dimension)),
-    ]
-    return in_blocks(parts, "first", "end", confining)
+@functools.cache
+def _clearing(k: int) -> Callable[..., None]:
+    def clears(numbers: Any) -> None:
+        numbers.effects[k].counted[:] = 0
+
+    return kernel(clears)
 
 
-def _advance(parts: Parts) -> list[str]:
-    """Write one step of this thread's agents."""
-    if parts.one_stage:
-        return [*_count(parts), "sense(context, pos, vel, time)", *_in_two_loops(parts)]
-    size, flow = parts.dimension * parts.width, "carrying" if parts.flows else "()"
-    told = ["sense(context, pos, vel, time)"] * (parts.inner != () and parts.integrator.solves)
-    advance = f"advance(context, pos, vel, {flow}, time, dt, stages, first * {size}, end * {size})"
-    moved = [
-        f"was, x, v = {lanes_of(parts, 'aside')}, {lanes_of(parts, 'pos')}, {lanes_of(parts, 'vel')}",
-        *[f"earlier = {lanes_of(parts, 'aside[len(pos):]')}"] * parts.bounces,
-    ]
-    return [*_count(parts), *told, *_remember(parts), advance, *in_blocks(parts, "first", "end", _bound(parts, moved))]
+@section
+def _count(agent: AgentPlan, laws: tuple[tuple[int, OneLaw], ...]) -> Callable[..., None]:
+    """Make `count_agents(context, pos, vel, time)`: count all agents of a world, by one thread of the team."""
+    d, width = agent.dimension, agent.width
+    size, lanes, vector = np.uint64(d * width), np.uint64(width), vector_of_lane(d, width)
+    alone = alone_of(agent._replace(aims=False))
+    clear, counts = in_turn(*(_clearing(k) for k, _ in laws)), in_turn(*(_counting(*law) for law in laws))
+
+    def count_agents(context: Any, pos: Any, vel: Any, time: Any) -> None:
+        scratch, numbers, drawn = context.scratch, context.numbers, context.key[context.b]
+        wait_for_team(scratch.sync, context.team)  # what goes on inside agents was written by other threads
+        if context.rank == 0:
+            clear(numbers)
+            for i in range(np.uint64(context.n)):
+                at = (i // lanes) * size + i % lanes
+                x, v = vector(pos, at), vector(vel, at)
+                me = alone(scratch, drawn, time, at, i, i, x, v, zero(x))
+                counts(numbers, me, scratch.living[i] > like(x[0], 0.0))
+        wait_for_team(scratch.sync, context.team)  # before any agent changes
+
+    return count_agents
 
 
-def _in_two_loops(parts: Parts) -> list[str]:
-    """Write how agents are moved by a method of one stage, once all is sensed: nobody reads what others write.
+@functools.cache
+def _asking(many: int, width: int) -> Callable[[Any, Any], None]:
+    """Return `asks(array, block)`: ask for `many` numbers of a block of an array."""
+    places = tuple(range(0, many, width))
+    return kernel(lambda array, block: _ask_all(array, block * np.uint64(many), places))
+
+
+@kernel
+def _ask_all(array: Any, at: Any, places: Any) -> None:
+    for place in places:
+        ask_for(array, at + np.uint64(place))
+
+
+@section
+def _ask_ahead(numbers: tuple[int, ...], width: int) -> Callable[..., None]:
+    """Make `ask_ahead(scratch, pos, vel, block)`: ask for what a later block will be moved by."""
+    (of_pos, of_vel, of_felt, of_ident), felt = (_asking(many, width) for many in numbers), numbers[2] > 0
+
+    def ask_ahead(scratch: Any, pos: Any, vel: Any, block: Any) -> None:
+        ahead = block + np.uint64(AHEAD)
+        of_pos(pos, ahead)
+        of_vel(vel, ahead)
+        if felt:
+            of_felt(scratch.felt, ahead)
+        of_ident(scratch.ident, ahead)
+
+    return ask_ahead
+
+
+@section
+def _in_two_loops(plan: StepPlan) -> Callable[..., None]:
+    """Make what moves agents by a method of one stage, once all is sensed: no agent reads what another writes.
 
     A part after the other, which stays in the nearest cache, and of which accelerations are put aside. In one loop,
     from what is felt to where that leads, too few agents would be under way at a time.
     """
-    d, w = parts.dimension, parts.width
-    past = f"past = base - np.uint64((begin - first) * {d * w})"  # each thread at a place of its own
-    told = [f"{lane(parts, 'aside', k, 'past')} = a[{k}]" for k in range(d)]
-    moved = [
-        f"x, v, a = {lanes_of(parts, 'pos')}, {lanes_of(parts, 'vel')}, {lanes_of(parts, 'aside', 'past')}",
-        f"was{', earlier' * parts.bounces} = x{', v' * parts.bounces}",
-        *(f"x{k}, v{k} = move(x[{k}], v[{k}], a[{k}], dt)" for k in range(d)),
-        f"x, v = {tuple_of('x#', d)}, {tuple_of('v#', d)}",
-        *[f"x = add(x, scale({lanes_of(parts, 'carrying')}, dt))"] * parts.flows,
-    ]
-    respond = in_blocks(parts, "begin", "until", [past, *_ahead(parts), *responses(parts, told)])
-    move = in_blocks(parts, "begin", "until", [past, *_bound(parts, moved)])
-    return [
-        f"for begin in range(first, end, {PART}):",
-        f"    until = min(begin + {PART}, end)",
-        *indented_lines([*respond, *move], 4),
-    ]
+    size = np.uint64(plan.agent.dimension * plan.agent.width)
+    respond, move = respond_of(plan.response), move_of(plan.move)
+    ask_ahead = _ask_ahead(plan.asks, plan.agent.width) if plan.asks else None
+    sense = sense_of(plan.sense)
+
+    def advance(context: Any, pos: Any, vel: Any, time: Any, dt: Any, instant: Any) -> None:
+        aside, first, end = context.scratch.aside, context.first, context.end
+        sense(context, pos, vel, time)
+        for begin in range(first, end, PART):
+            until, before = min(begin + PART, end), np.uint64(begin - first)  # each thread at a place of its own
+            for block in range(np.uint64(begin), np.uint64(until)):
+                if ask_ahead is not None:
+                    ask_ahead(context.scratch, pos, vel, block)
+                respond(context, pos, vel, time, block, aside, (block - before) * size)
+            for block in range(np.uint64(begin), np.uint64(until)):
+                move(context, pos, vel, time, dt, instant, block, (block - before) * size)
+
+    return advance
 
 
-def _ahead(parts: Parts) -> list[str]:
-    """Write how what comes next is asked for, in large worlds."""
-    if not parts.sorts:
-        return []
-    rows = {"pos": parts.dimension, "vel": parts.dimension, "felt": parts.dimension * len(parts.targets), "ident": 1}
-    return [
-        f"ahead = block + np.uint64({AHEAD})",
-        *(
-            f"ask_for({array}, ahead * np.uint64({many * parts.width}) + np.uint64({k * parts.width}))"
-            for array, many in rows.items()
-            for k in range(many)
-        ),
-    ]
+@section
+def _by_method(plan: StepPlan) -> Callable[..., None]:
+    """Make what moves agents by a method of several stages, which asks for accelerations by itself."""
+    assert plan.method is not None
+    count, move, (method, numbers) = plan.agent.dimension * plan.agent.width, move_of(plan.move), plan.method
+    advance_by = advance_of(method, numbers)(accelerate_of(plan.response, plan.sense))
+    flows, bounces, sense = plan.move.flows, plan.move.bounce is not None, sense_of(plan.sense) if plan.tells else None
+
+    def advance(context: Any, pos: Any, vel: Any, time: Any, dt: Any, instant: Any) -> None:
+        scratch, first, end = context.scratch, context.first, context.end
+        if sense is not None:
+            sense(context, pos, vel, time)
+        for i in range(np.uint64(first * count), np.uint64(end * count)):
+            scratch.aside[i] = pos[i]
+            if bounces:
+                scratch.aside[np.uint64(len(pos)) + i] = vel[i]
+        if flows:
+            advance_by(context, pos, vel, scratch.carrying, time, dt, scratch.stages, first * count, end * count)
+        else:
+            advance_by(context, pos, vel, (), time, dt, scratch.stages, first * count, end * count)
+        for block in range(np.uint64(first), np.uint64(end)):
+            move(context, pos, vel, time, dt, instant, block, block * np.uint64(count))
+
+    return advance
 
 
-def _count(parts: Parts) -> list[str]:
-    """Write how all agents of the world are counted at the beginning of a step, by one of the team."""
-    effects = [(k, e) for k, e in enumerate(parts.effects) if e.count_law is not None]
-    if not effects:
-        return []
-    d, w = parts.dimension, parts.width
-    lines = []
-    for k, _ in effects:
-        lines += [
-            f"which = np.int64(count_law_{k}({given(parts, k)}, me))",
-            f"if living[i] > like(dt, 0.0) and which >= 0 and which < len(p{k}.counted):",
-            f"    p{k}.counted[which] += like(dt, 1.0)",
-        ]
-    return [
-        "wait_for_team(sync, team)  # what goes on inside everybody was written by others",
-        "if rank == 0:",
-        *(f"    p{k}.counted[:] = 0" for k, _ in effects),
-        "    for i in range(np.uint64(n)):",
-        f"        block, l = i // np.uint64({w}), i % np.uint64({w})",
-        f"        base = block * np.uint64({d * w})",
-        f"        x, v = {lanes_of(parts, 'pos')}, {lanes_of(parts, 'vel')}",
-        f"        me = {alone(parts, aim=False)}",
-        *indented_lines([*nearest_images(parts, effects), *lines], 8),
-        "wait_for_team(sync, team)  # before anybody changes",
-    ]
+# --- several steps of a world -----------------------------------------------------------------------------------------
 
 
-def _bound(parts: Parts, moved: list[str]) -> list[str]:
-    """Write what happens to the agents of a block after the method: limits, the space, and who is not finite.
+@section
+def _first_bad(bad: int, width: int) -> Callable[..., Any]:
+    """Make `first_bad(lanes, well)`: the lowest number of an agent that is not finite, or `well`."""
+    at = np.uint64(bad)
 
-    moved: where agent i was, with velocity `earlier`, and x and v to which the method has brought it.
+    def first_bad(lanes: Any, well: Any) -> Any:
+        worst = well
+        for lane in range(width):  # one after the other: no loop over lanes
+            worst = min(worst, lanes[at + np.uint64(lane)])
+        return worst
+
+    return first_bad
+
+
+@section
+def _failing(bad: int, width: int) -> Callable[..., Any]:
+    """Make `failing(lanes, well, step, n, failed)`: the step and agent, as one number, of which the first failed."""
+    at, lowest = np.uint64(bad), _first_bad(bad, width)
+
+    def failing(lanes: Any, well: Any, step: Any, n: Any, failed: Any, nobody: Any) -> Any:
+        fallen = np.int32(0)
+        for lane in range(np.uint64(width)):
+            fallen += np.int32(1) if lanes[at + lane] < well else np.int32(0)
+        if fallen > np.int32(0) and failed == nobody:
+            return np.int64(step * n) + np.int64(lowest(lanes, well))
+        return failed
+
+    return failing
+
+
+@section
+def _enter(plan: StepPlan) -> Callable[..., Context]:
+    """Make `enter(worlds, drive, asked, params, count, b, rank, team, scratch)`: bring this thread's part into blocks.
+
+    It returns the context of world b, in order for `count` steps if that is worth it.
     """
-    bad = Slots(parts)("bad")
-    bounding = [
-        *_kick(parts),
-        "where = well if finite(dot(x, x) + dot(v, v)) else ident[i]",
-        f"{bad} = where if where < {bad} else {bad}",
-        *_turn(parts),
-        "# nobody moves faster than max_speed, whatever a method makes of the velocity within the step",
-        "x = add(was, scale(limit(sub(x, was), max_speed[one + l] * dt), living[live + l]))",
-        *_stay_inside(parts),
-        *_face(parts),
-        *(f"{lane(parts, 'pos', k)}, {lane(parts, 'vel', k)} = x[{k}], v[{k}]" for k in range(parts.dimension)),
-        *_keep(parts),
-    ]
-    return [
-        *in_common(parts),
-        f"for l in range(np.uint64({parts.width})):",
-        *indented_lines(["i = row + l", *moved, *bounding], 4),
-    ]
+    agent, d, width, ordered = plan.agent, plan.agent.dimension, plan.agent.width, plan.arrange is not None
+    read, bring_in, take_drive = numbers_of(plan.numbers), bring_in_of(agent), take_drive_of(d, width, ordered)
+    bring_inside = bring_inside_of(agent, plan.confines) if plan.confines is not None else None
+    move_in = move_in_of(plan.arrange) if plan.arrange is not None else None
+
+    def enter(
+        worlds: Any, drive: Any, asked: Any, params: Any, count: Any, b: Any, rank: Any, team: Any, scratch: Any
+    ) -> Any:
+        n, alive = worlds.x.shape[2], worlds.alive
+        blocks = (n + (width - 1)) // width
+        first, end = blocks * rank // team, blocks * (rank + 1) // team
+        present = np.int64(0)  # not a literal: laws would be typed for it too, and compiled twice
+        for i in range(n):
+            present += alive[b, i]
+        for i in range(first * width, min(end * width, n)):
+            scratch.living[i] = alive[b, i]
+        bring_in(worlds, scratch, b, first, end)
+        take_drive(scratch, drive, asked, n, first, end)
+        numbers, arranged = read(params, scratch.counters), False
+        if bring_inside is not None:
+            bring_inside(scratch, numbers.size, first, end)
+        if move_in is not None:
+            arranged = move_in(scratch, numbers, count, (n, present, first, end, rank, team))
+        return Context(
+            worlds.obstacle_x, worlds.obstacle_radius, worlds.work, params, numbers, worlds.key, b, n, present,
+            arranged, first, end, rank, team, scratch,
+        )  # fmt: skip
+
+    return enter
 
 
-def _turn(parts: Parts) -> list[str]:
-    """Write how agent i is kept from turning faster than it can: neither its velocity nor its way in this step does.
+@section
+def step_world_of(plan: StepPlan) -> Callable[..., int]:
+    """Make `step_world(worlds, drive, asked, params, dt, count, b, rank, team, scratch)`.
 
-    What a medium adds to its way is none of its doing.
+    It advances this thread's part of world b by `count` steps, and returns an agent that is not finite, or -1: the
+    lowest of those at the end of the call, or, where that spreads, after the first step that failed. A world in which
+    an agent is not finite stays as it was, whole. What is asked of its agents is drive[:, asked], N; nothing if drive
+    is empty.
     """
-    if not parts.turns:
-        return []
-    way = f"sub(x, add(was, scale({lanes_of(parts, 'carrying')}, dt)))" if parts.flows else "sub(x, was)"
-    return [
-        "most = min(max_turn_rate[i] * dt, like(dt, np.pi))",
-        f"before, way = {lanes_of(parts, 'facing')}, {way}",
-        "there, over = turned(way, before, most)",
-        "x = add(x, sub(held(way, there, over), way))",
-        "ahead, over = turned(v, before, most)",
-        "v = held(v, ahead, over)",
-    ]
+    agent, width, bad = plan.agent, plan.agent.width, np.uint64(plan.move.bad)
+    enter, bring_out, counted = _enter(plan), bring_out_of(agent), tuple(range(COUNTED_BY_KERNELS))
+    count_agents = _count(agent, plan.counts) if plan.counts else None
+    advance = _in_two_loops(plan) if plan.method is None else _by_method(plan)
+    first_bad, failing = _first_bad(plan.move.bad, width), _failing(plan.move.bad, width) if plan.spreads else None
+    go_home = go_home_of(plan.arrange) if plan.arrange is not None else None
+    verdict = _verdict(plan.trusts, agent.dimension)
+
+    def step_world(
+        worlds: Any, drive: Any, asked: Any, params: Any, dt: Any, count: Any, b: Any, rank: Any, team: Any,
+        scratch: Any,
+    ) -> Any:  # fmt: skip
+        context = enter(worlds, drive, asked, params, count, b, rank, team, scratch)
+        n, first, end, pos, vel, lanes = context.n, context.first, context.end, scratch.pos, scratch.vel, scratch.lanes
+        well, begun, before = like(dt, np.inf), worlds.tick[b], gather(worlds.work[b], np.uint64(0), counted)
+        nobody = np.int64(n * (count + 1))
+        failed = nobody
+        for lane in range(np.uint64(width)):
+            lanes[bad + lane] = well
+        for step in range(count):
+            time = like(dt, (begun + step) * np.float64(dt))
+            if count_agents is not None:
+                count_agents(context, pos, vel, time)
+            advance(context, pos, vel, time, dt, begun + step)
+            if failing is not None:
+                failed = failing(lanes, well, step, n, failed, nobody)
+        if go_home is not None:  # noqa: SIM102  # numba drops the branch by this alone
+            if context.arranged:
+                go_home(scratch, (n, context.present, first, end, rank, team))
+        if failing is None:
+            worst = first_bad(lanes, well)
+            failed = np.int64(worst) if worst < well else nobody
+        found = verdict(context, worlds, before, failed, nobody)
+        if found < 0:
+            bring_out(worlds, scratch, b, first, end)
+            if rank == 0:
+                worlds.tick[b] += count
+        return found
+
+    return step_world
 
 
-def _face(parts: Parts) -> list[str]:
-    """Write where agent i faces after the step, and which way is up."""
-    if not parts.oriented:
-        return []
-    # who may not turn as fast as he wants to turns while he stands still, too
-    lines = [f"before = {lanes_of(parts, 'facing')}", f"ahead = faced(v, {'ahead' if parts.turns else 'before'})"]
-    lines += [f"{lane(parts, 'facing', k)} = ahead[{k}]" for k in range(parts.dimension)]
-    if parts.dimension == 2:
-        return lines
-    lines.append(f"up = {lanes_of(parts, 'above')}")
-    if parts.leans:
-        lines.append("up = leant(ahead, before, up, norm(v), dt, banking[i])")
-    lines.append("up = raised(ahead, before, up)")
-    return lines + [f"{lane(parts, 'above', k)} = up[{k}]" for k in range(parts.dimension)]
+@section
+def _verdict(trusts: bool, dimension: int) -> Callable[..., int]:
+    """Make `verdict(context, worlds, before, failed, nobody)`: which agent of a world is not finite, or -1.
 
-
-def _remember(parts: Parts) -> list[str]:
-    """Write how positions before the step are kept, where bodies bounce velocities too."""
-    size = parts.dimension * parts.width
-    return [
-        f"for i in range(np.uint64(first * {size}), np.uint64(end * {size})):",
-        "    aside[i] = pos[i]",
-        *["    aside[np.uint64(len(pos)) + i] = vel[i]"] * parts.bounces,
-    ]
-
-
-def _stay_inside(parts: Parts) -> list[str]:
-    """Write how agent i is kept to the space: put back into it, or bounced off its walls."""
-    limited = "scale(limit(v, max_speed[one + l]), living[live + l])"
-    if not parts.bounces:
-        return [f"x, v = confine(size, radius[one + l], x, {limited})"]
-    restitution = "numbers.space[0]"
-    return [
-        "earlier = scale(earlier, living[live + l])",
-        f"x, v = bounce(size, radius[one + l], {restitution}, dt, was, earlier, x, {limited})",
-        "v = limit(v, max_speed[one + l])",
-    ]
-
-
-def _kick(parts: Parts) -> list[str]:
-    """Write what is added to the velocity of agent i once per step: random numbers of (world, step, agent, effect)."""
-    lines = []
-    for k, effect in enumerate(parts.effects):
-        if effect.kick_law is None:
-            continue
-        gauss = ", ".join(
-            f"like(dt, standard_normal(key[b], begun + step_, np.int64(ident[i]), {8 * k + j}))"
-            for j in range(parts.dimension)
-        )
-        lines += [
-            f"says = kick_law_{k}(p{k}, me, dt, ({gauss},))",
-            "free = (living[i] > like(dt, 0.0)) & (mass[i] < like(dt, np.inf))",
-            "kick = (" + ", ".join(f"says[{j}] if free else like(dt, 0.0)" for j in range(parts.dimension)) + ",)",
-            "x, v = add(x, scale(kick, like(dt, 0.5) * dt)), add(v, kick)  # as if it came in the middle of the step",
-        ]
-    return [f"me = {alone(parts)}", *lines] if lines else []
-
-
-def _keep(parts: Parts) -> list[str]:
-    """Write what goes on inside agent i after the step."""
-    if not parts.inner:
-        return []
-    bad, lines = Slots(parts)("bad"), [f"me = {alone(parts)}", *nearest_images(parts, parts.keeping)]
-    for k, effect in parts.keeping:
-        told = felt_as(parts, f"n{k}_") if effect.pair_law else "zero(x)"
-        lines.append(f"says{k} = keep_law_{k}({given(parts, k)}, me, {told}, dt)")
-    now = [_summed(parts, name, "me.inner") for name in parts.inner]
-    return [
-        *lines,
-        *(f"now{j} = {value}" for j, value in enumerate(now)),
-        f"where = well if finite({' + '.join(f'now{j}' for j in range(len(now)))}) else ident[i]",
-        f"{bad} = where if where < {bad} else {bad}",
-        *(
-            f"scratch.inner[{j}][i] = now{j} if living[i] > like(dt, 0.0) else me.inner.{n}"
-            for j, n in enumerate(parts.inner)
-        ),
-    ]
-
-
-def _summed(parts: Parts, name: str, was: str) -> str:
-    """Write what a number becomes: what the effect that keeps it says, or what was and the changes by several."""
-    says = [f"says{k}[{e.keeps.index(name)}]" for k, e in parts.keeping if name in e.keeps]
-    if len(says) == 1:
-        return says[0]
-    return f"{was}.{name}" + "".join(f" + ({value} - {was}.{name})" for value in says)
-
-
-def begin(parts: Parts) -> str:
-    """Return the source of `begin_inner`, and of the entry point `begin`: what goes on inside who comes into being."""
-    if not parts.inner:
-        return ""
-    d, w = parts.dimension, parts.width
-    lines = [f"me = {alone(parts, aim=False)}", *nearest_images(parts, parts.keeping)]
-    lines += [f"says{k} = begin_law_{k}({given(parts, k)}, me)" for k, _ in parts.keeping]
-    lines += [f"inner_[{j}, b, i] = {_summed(parts, name, 'me.inner')}" for j, name in enumerate(parts.inner)]
-    return f'''
-@kernel
-def begin_inner(x_, v_, {parts.frame_argument}key, tick, params, dt, fresh, b, scratch):
-    """Write what goes on inside those of world b who are `fresh`."""
-    {OPEN_SCRATCH}
-    n = x_.shape[2]
-    first, end = 0, (n + {w - 1}) // {w}
-    time = like(dt, tick[b] * np.float64(dt))
-{indented([*parameters(parts)], 4)}
-    into_blocks(pos, x_, b, n, first, end)
-    into_blocks(vel, v_, b, n, first, end)
-{indented(kept_frame(parts, from_state=True), 4)}
-    for block in range(np.uint64(first), np.uint64(end)):
-        base, row = block * np.uint64({d * w}), block * np.uint64({w})
-        for l in range(np.uint64({w})):
-            i, x, v = row + l, {lanes_of(parts, "pos")}, {lanes_of(parts, "vel")}
-            if i < n and fresh[b, i]:
-{indented([f"scratch.inner[{k}][i] = 0" for k in range(len(parts.inner))], 16)}
-{indented(lines, 16)}
-
-
-@njit(**FAST)
-def begin(x, v, {parts.frame_argument}key, tick, params, dt, fresh, scratch):
-    """Write what goes on inside those of all worlds who are `fresh`, (B, N)."""
-    unaliased()
-    for b in range(x.shape[1]):
-        begin_inner(x, v, {parts.frame_argument}key, tick, params, dt, fresh, b, scratch)
-
-'''
-
-
-def step(parts: Parts) -> str:
-    """Return the source of `step`, the entry point: some worlds, one after another."""
-    return f'''
-@njit(**FAST)
-def step(
-    x, v, {parts.frame_argument}alive, tick, key, obstacle_x, obstacle_radius, work, drive, params, dt, count,
-    from_world, to_world, rank, team, scratch,
-):
-    """Advance worlds [from_world, to_world) by `count` steps; return (world, agent) not finite first, or -1s.
-
-    drive (D, B, N), or (D, 0, N) for none. A team of several threads calls this with the same worlds, each with its
-    rank.
+    What all threads of the team have found counts. Where one is, the counters of the world are what they were `before`.
     """
-    unaliased()
-    broken, who = -1, -1
-    for b in range(from_world, to_world):  # no choice in here: LLVM would copy the step for each of its outcomes
-        bad = step_world(
-            x, v, {parts.frame_argument}alive, tick, key, obstacle_x, obstacle_radius, work, drive, b, params, dt,
-            count, b, rank, team, scratch,
-        )
-        if bad >= 0 and broken < 0:
-            broken, who = b, bad
-    return broken, who
-'''
+
+    def verdict(context: Any, worlds: Any, before: Any, failed: Any, nobody: Any) -> Any:
+        scratch, b, n, rank, team = context.scratch, context.b, context.n, context.rank, context.team
+        # the first half may still be read by threads that count
+        scratch.tally[team + rank] = failed
+        wait_for_team(scratch.sync, team)
+        first_bad = nobody
+        for r in range(team):
+            first_bad = min(first_bad, scratch.tally[team + r])
+        wait_for_team(scratch.sync, team)  # before any thread counts again
+        if first_bad >= nobody:
+            return np.int64(-1)
+        first_bad %= n
+        if rank == 0:
+            for k in range(COUNTED_BY_KERNELS):
+                worlds.work[b, k] = before[k]
+        if trusts:  # an agent that was nowhere before is the one it comes from
+            for i in range(n):
+                for k in range(dimension):
+                    if worlds.alive[b, i] and not finite(worlds.x[k, b, i]):
+                        return np.int64(i)
+        return np.int64(first_bad)
+
+    return verdict

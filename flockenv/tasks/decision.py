@@ -9,9 +9,10 @@ from typing import Any
 import numpy as np
 
 from flockenv.abreast import columns, into_rows, packed, take
-from flockenv.kernels import Law, kernel, like, replaced
+from flockenv.kernels import kernel, like, replaced
 from flockenv.lines import fetch, pour
 from flockenv.section import record, section
+from flockenv.sweep import begin_inner_of, look_of, step_world_of
 from flockenv.sweep.gather import gather
 from flockenv.tasks.base import Frame
 from flockenv.tasks.lasting import lasts
@@ -96,8 +97,8 @@ def frame_before(w: Any, scratch: Any, made: Any, near: Any, table: Any, b: int)
 @section
 def begin_of(plan: Plan) -> Callable[..., None]:
     """Make what begins an episode in world b."""
-    spawn, begin_inner = plan.kernels.spawn, plan.kernels.begin_inner
-    oriented, inner = plan.oriented, begin_inner is not None
+    spawn, inner, oriented = plan.kernels.spawn, plan.kernels.begin, plan.oriented
+    begin_inner = begin_inner_of(inner) if inner is not None else None
 
     def begin(p: Any, w: Any, given: Any, near: Any, scratch: Any, dt: float, b: int) -> None:
         w.tick[b] = 0
@@ -107,38 +108,10 @@ def begin_of(plan: Plan) -> Callable[..., None]:
         spawn(p, frame_of(w, scratch, near, given.table, b))
         if oriented:
             face(w.v, w.carried[0], b, True)
-        if inner:
-            if oriented:
-                begin_inner(  # type: ignore[misc]
-                    w.x, w.v, w.carried[0], w.carried[1], w.key, w.tick, given.params, dt, w.alive, b, scratch
-                )
-            else:
-                begin_inner(w.x, w.v, w.carried[0], w.key, w.tick, given.params, dt, w.alive, b, scratch)  # type: ignore[misc]
+        if begin_inner is not None:
+            begin_inner(w, given.params, dt, w.alive, b, scratch)
 
     return begin
-
-
-@section
-def _advance(step_world: Law, carried: int) -> Callable[..., Any]:
-    """Make what advances world b by `count` steps; returns who is not finite, or -1. carried: frames, inner states."""
-
-    def advance(w: Any, given: Any, force: Any, dt: float, count: int, b: int, scratch: Any) -> Any:
-        if carried == 0:
-            return step_world(
-                w.x, w.v, w.alive, w.tick, w.key, w.obstacle_x, w.obstacle_radius, w.work, force, 0, given.params, dt,
-                count, b, 0, 1, scratch,
-            )  # fmt: skip
-        if carried == 1:
-            return step_world(
-                w.x, w.v, w.carried[0], w.alive, w.tick, w.key, w.obstacle_x, w.obstacle_radius, w.work, force, 0,
-                given.params, dt, count, b, 0, 1, scratch,
-            )  # fmt: skip
-        return step_world(
-            w.x, w.v, w.carried[0], w.carried[1], w.alive, w.tick, w.key, w.obstacle_x, w.obstacle_radius, w.work,
-            force, 0, given.params, dt, count, b, 0, 1, scratch,
-        )  # fmt: skip
-
-    return advance
 
 
 @section
@@ -276,7 +249,7 @@ def _ask_for_sums(terms: int) -> Callable[..., None]:
 def act_of(plan: Plan) -> Callable[..., Any]:
     """Make what lets world b take a decision and go on; returns who is not finite, or -1."""
     decide, ask_for_sums, shows = _decide(plan), _ask_for_sums(plan.terms), plan.abreast > 0
-    advance = _advance(plan.kernels.step_world, plan.oriented + (plan.kernels.begin_inner is not None))
+    step_world = step_world_of(plan.kernels.step)
 
     def act(
         p: Any, w: Any, given: Any, dt: float, count: int, made: Any, now: Any, scratch: Any, listed: Any, action: Any,
@@ -285,7 +258,7 @@ def act_of(plan: Plan) -> Callable[..., Any]:
         decide(p, w, made, now, listed, action, results.over, b)
         if shows and not past:  # here and there, for it is written at the end
             fetch(results.rows[b], 0, 4)
-        bad = advance(w, given, made.force, dt, count, b, scratch)
+        bad = step_world(w, made.force, 0, given.params, dt, count, b, 0, 1, scratch)
         w.steps[b] += 1
         if shows:
             if not past:
@@ -299,7 +272,8 @@ def act_of(plan: Plan) -> Callable[..., Any]:
 @section
 def look_in(plan: Plan) -> Callable[..., bool]:
     """Make what looks around in world b, if the task does; returns whether it has written where the nearest are."""
-    look, looks = plan.kernels.look, plan.kernels.look is not None
+    look = look_of(plan.kernels.look) if plan.kernels.look is not None else None
+    looks = look is not None
 
     def looked(w: Any, given: Any, near: Any, scratch: Any, b: int) -> bool:
         if looks:

@@ -6,7 +6,6 @@ works out metrics from what `play` has counted. Parameters to which loops count 
 
 from __future__ import annotations
 
-import hashlib
 import keyword
 import sys
 from collections.abc import Callable
@@ -17,19 +16,13 @@ import numpy as np
 from flockenv.abreast import apart, columns, in_one_row, packed
 from flockenv.kernels import (
     Law,
-    described,
     finite,
-    functions_in,
     kernel,
-    laws_digest,
-    load,
-    python_of,
-    texts_outside,
     unaliased,
 )
 from flockenv.lines import settle
-from flockenv.section import entry_of
-from flockenv.sweep import look_of, plan_look, scene_source, sections_of
+from flockenv.section import digest_of, entry_of
+from flockenv.sweep import begin_plan, plan_look, step_plan
 from flockenv.tasks.base import Task
 from flockenv.tasks.decision import (
     act_of,
@@ -45,37 +38,34 @@ from flockenv.tasks.decision import (
 )
 from flockenv.tasks.play_plan import REFUSED, Kernels, Plan, Worlds
 
-__all__ = ["name_of", "play_of", "scene_of", "tell_of"]
-
-
-def scene_of(task: Task) -> Any:
-    """Return the module of the kernels of a task's scene; TypeError for a task of which no kernel can be made."""
-    _check(task)
-    return load(f"task_{task.name}", scene_source(task.parts), sections_of(task.parts))
+__all__ = ["name_of", "plan_of", "play_of", "tell_of"]
 
 
 def play_of(task: Task) -> Callable[..., tuple[int, int]]:
     """Return a task's entry point that begins episodes and takes decisions."""
-    scene, parts = scene_of(task), task.parts
+    return _play(plan_of(task))
+
+
+def plan_of(task: Task) -> Plan:
+    """Return all that `play` of a task depends on; TypeError for a task of which no kernel can be made."""
+    _check(task)
+    parts = task.parts
     own = {name: _kernel_of(task, name) for name in ("spawn", "drive", "reward", "ended", "measure", "observe")}
     kernels = Kernels(
         **own, keep=_kernel_of(task, "keep") if task.keeps else None,
-        abreast=_kernel_of(task, "abreast") if task.abreast else None, step_world=scene.step_world,
-        look=look_of(plan_look(parts)) if task.look else None, begin_inner=scene.begin_inner if parts.inner else None,
+        abreast=_kernel_of(task, "abreast") if task.abreast else None, step=step_plan(parts),
+        look=plan_look(parts) if task.look else None, begin=begin_plan(parts),
     )  # fmt: skip
-    return _play(Plan(
+    return Plan(
         kernels, tuple(task.parameters()), _counts(task), task.measures, task.lasting_aim, parts.oriented, task.alike,
         parts.dimension, parts.width, len(task.terms), task.action_layout.size, task.memory, task.abreast,
         apart(task.learners) if task.abreast else 0,
-    ))  # fmt: skip
+    )  # fmt: skip
 
 
 def name_of(task: Task) -> str:
     """Return a name of a task's kernel, which holds a digest of every law in it."""
-    play = python_of(play_of(task))
-    outside = texts_outside({each.__module__ for each in functions_in(play)})
-    digest = hashlib.sha256(f"{described(play)}{laws_digest()}{outside}".encode()).hexdigest()
-    return f"task_{task.name}_{digest[:20]}"
+    return f"task_{task.name}_{digest_of(plan_of(task))}"
 
 
 def tell_of(task: Task) -> Callable[..., None]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 from flockenv.kernels import Law
+from flockenv.sweep import BeginPlan, LookPlan, StepPlan
 
 __all__ = ["REFUSED", "Decision", "Given", "Kernels", "Near", "Plan", "Results", "Totals", "Worlds"]
 
@@ -82,7 +83,7 @@ class Results(NamedTuple):
 
 
 class Kernels(NamedTuple):
-    """The kernels of a task, and those of its scene; None where there is none."""
+    """The kernels of a task, and the plans of those of its scene; None where there is none."""
 
     spawn: Law
     drive: Law
@@ -92,9 +93,9 @@ class Kernels(NamedTuple):
     observe: Law
     keep: Law | None
     abreast: Law | None
-    step_world: Law
-    look: Law | None
-    begin_inner: Law | None
+    step: StepPlan
+    look: LookPlan | None
+    begin: BeginPlan | None
 
 
 class Plan(NamedTuple):

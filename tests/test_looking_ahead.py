@@ -1,0 +1,40 @@
+"""Working out how far the next candidate is while one is met."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from flockenv.behaviours import Alignment, Cohesion, Separation
+from flockenv.integrators import SemiImplicitEuler
+from flockenv.scene import Group, Scene
+from flockenv.space import Plane, Torus
+from flockenv.spawn import Spawn
+from flockenv.sweep import Parts
+
+
+@pytest.mark.skipif(not Parts(2, Plane(), (), SemiImplicitEuler()).masks, reason="only with AVX-512")
+@pytest.mark.parametrize("dtype", ["float32", "float64"])
+@pytest.mark.parametrize("agents", [17, 95])  # from 96 on they are sorted by cell
+def test_working_out_the_next_candidate_early_moves_no_bit(
+    agents: int, dtype: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What lies behind the last one of a row is read, and looked at by nobody; some are dead, two are in one place."""
+    rules = (Separation(weight=1, radius=1, fov=270), Alignment(weight=1, radius=2), Cohesion(weight=1, radius=3))
+    group = Group(count=agents, spawn=Spawn(low=(0, 0), high=(6, 6), speed=(1, 2)))
+
+    def moved(ahead: bool) -> tuple[Any, Any, Any]:
+        scene = Scene(groups=(group,), effects=rules, space=Torus(size=(6, 6)), dtype=dtype)
+        if not ahead:
+            monkeypatch.setattr(Parts, "looks_ahead", False)
+        assert scene.parts.looks_ahead == ahead
+        state = scene.start(0, worlds=2)
+        state.alive[1, ::3] = False
+        state.x[:, 0, 3] = state.x[:, 0, 1]
+        after = scene.step(state, steps=20)
+        return after.pos, after.vel, after.work
+
+    for one, other in zip(moved(ahead=True), moved(ahead=False), strict=True):
+        np.testing.assert_array_equal(one, other)
