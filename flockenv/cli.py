@@ -318,7 +318,7 @@ def warmup(
     ] = None,
 ) -> None:
     """Compile ahead what tasks and scenes need, so that no first step has to wait; show how long each took."""
-    from flockenv.compilation import compiled
+    from flockenv.compilation import compiled, unmatched
     from flockenv.config import load_scene
     from flockenv.tasks import TASKS
 
@@ -346,6 +346,13 @@ def warmup(
             note = f"compiled in {sum(k.seconds for k in new):.1f} s" if new else "was in the cache"
             rows.append((name, note, f"{took:.1f}"))
     show_table(new_console(), "First steps", rows, ("of", "", "s"))
+    if unmatched():
+        import numba
+
+        new_console().print(
+            f"numba {numba.__version__}: compiling takes longer, since flockenv leaves out what was tried with another "
+            f"one: {', '.join(unmatched())}"
+        )
 
 
 def _first_step_of_task(task: Task) -> None:

@@ -13,9 +13,10 @@ from typing import Any, NamedTuple
 
 from numba.core import event
 
+from flockenv import frontend, lowering
 from flockenv.turns import OneAtATime
 
-__all__ = ["Compiled", "compiled"]
+__all__ = ["Compiled", "compiled", "unmatched"]
 
 
 class Compiled(NamedTuple):
@@ -32,6 +33,12 @@ _done: list[Compiled] = []
 def compiled() -> tuple[Compiled, ...]:
     """Return what this process has compiled so far; empty if all of it came from the cache."""
     return tuple(_done)
+
+
+def unmatched() -> tuple[str, ...]:
+    """Return the replacements in numba that are left out because the numba that is installed reads otherwise."""
+    every = [*((each.title, each.reads) for each in (*frontend.TRICKS, *frontend.SPARED)), ("lowering", lowering.READS)]
+    return tuple(title for title, reads in every if not frontend.reads_as_known(reads))
 
 
 class _Watch(event.Listener):

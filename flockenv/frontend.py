@@ -11,6 +11,7 @@ from __future__ import annotations
 import functools
 import hashlib
 import inspect
+import os
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any, NamedTuple
@@ -36,7 +37,10 @@ from numba.core.typing import context as typing_context
 
 from flockenv.startup import nothing_to_collect
 
-__all__ = ["SPARED", "TRICKS", "Spared", "Trick", "lighter", "reads_as_known", "spared"]
+LEFT_OUT = "FLOCKENV_NUMBA_ALONE"
+"""The environment variable that names replacements to leave out, with commas between; `all`: numba works alone."""
+
+__all__ = ["LEFT_OUT", "SPARED", "TRICKS", "Spared", "Trick", "applies", "lighter", "reads_as_known", "spared"]
 
 # numba is untyped
 _canonical: Any = transforms.canonicalize_cfg
@@ -65,6 +69,11 @@ class Trick(NamedTuple):
     make: Callable[[Any], Any]
     reads: tuple[Known, ...]
 
+    @property
+    def title(self) -> str:
+        """What it is called where replacements are listed, or left out."""
+        return f"{self.owner.__name__.rpartition('.')[2]}.{self.name}"
+
 
 def digest(owner: Any, name: str) -> str:
     """Return a digest of the text of `owner.name`; nothing if there is no such function."""
@@ -74,9 +83,16 @@ def digest(owner: Any, name: str) -> str:
         return ""
 
 
+@functools.cache
 def reads_as_known(reads: tuple[Known, ...]) -> bool:
-    """Does every function read as it did where the replacement was tried?"""
+    """Return True if every function reads as it did where a replacement was tried."""
     return all(digest(known.owner, known.name) == known.digest for known in reads)
+
+
+def applies(title: str, reads: tuple[Known, ...]) -> bool:
+    """Return True if a replacement is made: this numba reads as known, and LEFT_OUT does not name it."""
+    left_out = os.environ.get(LEFT_OUT, "").split(",")
+    return reads_as_known(reads) and title not in left_out and "all" not in left_out
 
 
 # --- remembered: which implementation a call of given types has -------------------------------------------------------
@@ -338,7 +354,7 @@ def _replacements() -> tuple[tuple[Any, str, Any, Any], ...]:
     """Return (owner, name, numba's, ours) of all that apply to this numba."""
     found = []
     for trick in TRICKS:
-        if reads_as_known(trick.reads):
+        if applies(trick.title, trick.reads):
             numbas = vars(trick.owner)[trick.name]
             found.append((trick.owner, trick.name, numbas, trick.make(numbas)))
     return tuple(found)
@@ -416,6 +432,11 @@ class Spared(NamedTuple):
     ours: Any
     reads: tuple[Known, ...]
 
+    @property
+    def title(self) -> str:
+        """What it is called where replacements are listed, or left out."""
+        return self.numbas.__name__  # type: ignore[no-any-return]
+
 
 SPARED = (
     Spared(_Closures, ClosuresIfAny, (
@@ -428,7 +449,7 @@ SPARED = (
 
 @functools.cache
 def _places() -> dict[Any, Any]:
-    return {pair.numbas: pair.ours for pair in SPARED if reads_as_known(pair.reads)}
+    return {pair.numbas: pair.ours for pair in SPARED if applies(pair.title, pair.reads)}
 
 
 def spared(passes: list[tuple[Any, str]]) -> list[tuple[Any, str]]:

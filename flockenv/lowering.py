@@ -22,7 +22,7 @@ from numba.core.datamodel import models
 from numba.cpython import rangeobj, slicing
 from numba.np import arrayobj
 
-from flockenv.frontend import Known, reads_as_known
+from flockenv.frontend import Known, applies
 
 __all__ = ["READS", "Brief", "BriefPart", "insert_part", "is_brief"]
 
@@ -82,8 +82,8 @@ READS = (
 
 @functools.cache
 def is_brief() -> bool:
-    """Is this the numba that all of it was tried with?"""
-    return reads_as_known(READS)
+    """Return True if all of it is used: this is the numba that it was tried with, and it is not left out."""
+    return applies("lowering", READS)
 
 
 class Brief(_Lower):  # type: ignore[misc]

@@ -7,6 +7,7 @@ import os
 import re
 import subprocess
 import sys
+from collections.abc import Iterator
 from functools import reduce
 from pathlib import Path
 from typing import Any
@@ -18,6 +19,7 @@ from llvmlite.binding import get_host_cpu_features
 from numba import config
 
 from flockenv import frontend, lowering
+from flockenv.compilation import unmatched
 from flockenv.inlining import Whole
 from flockenv.kernels import law, unaliased
 from flockenv.vec import add, dot, scale
@@ -43,19 +45,45 @@ def test_every_replacement_applies_to_the_numba_it_was_tried_with() -> None:
         assert all(new is not old for new, old in zip(now(), before, strict=True))
 
 
-def test_a_numba_that_reads_otherwise_is_left_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.fixture
+def forgotten() -> Iterator[None]:
+    """What is remembered of which replacements apply is forgotten, before and after."""
+    remembered = (frontend.reads_as_known, frontend._replacements, frontend._places, lowering.is_brief)
+    for function in remembered:
+        function.cache_clear()
+    yield
+    for function in remembered:
+        function.cache_clear()
+
+
+def test_a_numba_that_reads_otherwise_is_left_alone(monkeypatch: pytest.MonkeyPatch, forgotten: None) -> None:
     monkeypatch.setattr(frontend, "digest", lambda owner, name: "")
-    frontend._replacements.cache_clear()
-    frontend._places.cache_clear()
-    try:
-        before = now()
-        with frontend.lighter():
-            assert all(new is old for new, old in zip(now(), before, strict=True))
-        assert frontend.spared([(frontend.SPARED[0].numbas, "")]) == [(frontend.SPARED[0].numbas, "")]
-        assert machine_code(Whole) == machine_code(None)
-    finally:
-        frontend._replacements.cache_clear()
-        frontend._places.cache_clear()
+    before = now()
+    with frontend.lighter():
+        assert all(new is old for new, old in zip(now(), before, strict=True))
+    assert frontend.spared([(frontend.SPARED[0].numbas, "")]) == [(frontend.SPARED[0].numbas, "")]
+    assert machine_code(Whole) == machine_code(None)
+    assert len(unmatched()) == len(frontend.TRICKS) + len(frontend.SPARED) + 1
+
+
+def test_one_that_reads_otherwise_is_named(monkeypatch: pytest.MonkeyPatch, forgotten: None) -> None:
+    trick, digest = frontend.TRICKS[0], frontend.digest
+    monkeypatch.setattr(
+        frontend, "digest", lambda owner, name: "" if (owner, name) == trick.reads[0][:2] else digest(owner, name)
+    )
+    assert unmatched() == (trick.title,)
+
+
+@pytest.mark.parametrize("left_out", ["all", "one"])
+def test_the_environment_leaves_replacements_out(
+    left_out: str, monkeypatch: pytest.MonkeyPatch, forgotten: None
+) -> None:
+    first, *others = (each.title for each in (*frontend.TRICKS, *frontend.SPARED))
+    monkeypatch.setenv(frontend.LEFT_OUT, "all" if left_out == "all" else f"{first},lowering")
+    replaced = len(frontend._replacements()) + len(frontend._places())
+    assert replaced == (0 if left_out == "all" else len(others))
+    assert not lowering.is_brief()
+    assert machine_code(Whole) == machine_code(None)
 
 
 def test_afterwards_everything_is_as_it_was_whatever_happens() -> None:
