@@ -7,6 +7,7 @@ disagree. Code depends on the plan; the values are arguments, and another value 
 from __future__ import annotations
 
 import functools
+import math
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -21,7 +22,18 @@ if TYPE_CHECKING:
     from flockenv.effects.base import Effect
     from flockenv.sweep.parts import Parts
 
-__all__ = ["Form", "Images", "NumberPlan", "Numbers", "View", "images_in", "images_of", "numbers_of", "pack_numbers"]
+__all__ = [
+    "Form",
+    "Images",
+    "NumberPlan",
+    "Numbers",
+    "View",
+    "images_in",
+    "images_of",
+    "numbers_of",
+    "pack_numbers",
+    "view_of",
+]
 
 
 class Form(NamedTuple):
@@ -73,13 +85,25 @@ class NumberPlan(NamedTuple):
     look: tuple[int, int]
 
 
+EDGE = 8
+"""Rounding errors by which a field of view is wider: as many as a heading, an offset and their product have."""
+
+
+def view_of(fov: float, dtype: str) -> float:
+    """Return c |c|, what `in_view` compares, with c = cos(fov / 2); fov in degrees.
+
+    The edge belongs to the field of view in either precision, since c is less by EDGE machine epsilons: with 180
+    degrees a neighbour exactly abeam is in view, whatever the heading is.
+    """
+    cosine = math.cos(math.radians(fov) / 2.0) - EDGE * float(np.finfo(dtype).eps)
+    return cosine * abs(cosine)
+
+
 def pack_numbers(parts: Parts) -> tuple[list[float], NumberPlan]:
     """Return every number that a kernel is given, and where each lies; tables come behind them.
 
     What lies behind (rows of shapes, grids, tables) is known by where it begins, and a table by where it ends, too.
     """
-    from flockenv.sweep.parts import view_of
-
     shapes, forms = parts.shaped
     ends = np.cumsum([len(shapes), *map(len, parts.cells.values())]).tolist()
     grids = dict(zip(parts.cells, ends, strict=False))

@@ -1,14 +1,13 @@
-"""Parts: which laws make up a scene, and what follows from that for its source.
+"""Parts: which laws make up a scene, and what follows from that for its kernel.
 
 Which effects meet neighbours, in how many different ways they look around (`sights`), what is sorted of each agent
 (`fields`: only what some law reads), where each running number lies in the scratch of lanes (`slots`), and the numbers
-that the kernel is given (`parameters`). Everything that writes text asks here, and so does whoever allocates scratch.
+that the kernel is given (`parameters`). Plans of sections are made from parts, and scratch is allocated for them.
 """
 
 from __future__ import annotations
 
 import functools
-import inspect
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -21,24 +20,14 @@ from flockenv import processor
 from flockenv.effects.base import Effect, Sight
 from flockenv.integrators.base import Integrator
 from flockenv.integrators.one_stage import OneStage
-from flockenv.kernels import IN_PYTHON, LINE, held, python_of
-from flockenv.shapes import packed
-from flockenv.shapes.cells import FEWEST_ROWS, MOST_FOUND, cells_of
+from flockenv.kernels import LINE
+from flockenv.shapes.cells import MOST_FOUND
 from flockenv.space import Space
-from flockenv.sweep.forms import FormPlan, Surroundings
+from flockenv.sweep.met_obstacles import MetObstacles
+from flockenv.sweep.names_read import LAWS, OF_PAIRS, names_read
 from flockenv.sweep.numbers import NumberPlan, pack_numbers
 
-__all__ = ["LAWS", "Look", "Parts", "flattened", "view_of"]
-
-MOST_NUMBERS = 2**24
-"""Numbers of a form's rows, and of the grid over them, up to which single precision counts them exactly."""
-
-LAWS = (
-    "own_law", "medium_law", "flow_law", "far_law", "bond_law", "kick_law", "aim_law", "begin_law", "keep_law",
-    "count_law", "pair_start", "pair_law", "apart_law", "finish_law", "obstacle_start", "obstacle_law",
-    "obstacle_finish", "obstacle_ray", "obstacle_from", "obstacle_reach",
-)  # fmt: skip
-"""The slots that an effect may fill with a law."""
+__all__ = ["Look", "Parts", "flattened"]
 
 
 class Look(NamedTuple):
@@ -50,8 +39,8 @@ class Look(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Parts:
-    """Which laws make up a scene: all that the source depends on."""
+class Parts(MetObstacles):
+    """Which laws make up a scene: all that its kernel depends on."""
 
     dimension: int
     space: Space
@@ -60,27 +49,27 @@ class Parts:
     integrator: Integrator
     dtype: str = "float64"
     sorts: bool = True
-    """Are there enough agents to sort them by cell? If not, nothing of that is written."""
+    """True if there are enough agents to sort them by cell; a smaller scene has no code for it."""
     look: Look | None = None
     """What a task shows its agents, found by the same query."""
     crowded: bool = False
-    """Are there enough agents for groups of them to be met as one, where they are far away?"""
+    """True if there are enough agents for groups of them to be met as one, where they are far away."""
     oriented: bool = False
-    """Does anybody keep a heading (and an up vector) of his own?"""
+    """True if agents keep a heading (and an up vector) of their own."""
     turns: bool = False
-    """Is anybody's turn rate limited?"""
+    """True if the turn rate of some agents is limited."""
     leans: bool = False
-    """Does anybody lean into his turns?"""
+    """True if some agents lean into their turns."""
     starts: tuple[int, ...] = ()
-    """The first agent of each group, and one more: numbers alone, the source does not depend on them."""
+    """The first agent of each group, and one more: numbers alone, code does not depend on them."""
     shapes: tuple[Any, ...] = field(default=(), compare=False)
-    """Obstacles that are not in the state: the source depends on their forms, and on whether any of them moves."""
+    """Obstacles that are not in the state: code depends on their forms, and on whether any of them moves."""
     circles: int = 0
     """How many obstacles come before them."""
     stepped: bool = True
-    """Is it steps that are made? Else accelerations are asked for, wherever somebody is, or is not."""
+    """True if steps are made; else accelerations are asked for, also of agents at no finite place."""
     touching: float = field(default=math.inf, compare=False)
-    """m, the radii of the two that are widest, and a little more: who is further away is in nobody's contact."""
+    """m, the radii of the two that are widest, and a little more: agents further apart than that do not touch."""
     tables: tuple[NDArray[np.float64], ...] = field(default=(), compare=False)
     """What the laws of each tabled effect look up, in order: numbers alone, too."""
 
@@ -88,18 +77,18 @@ class Parts:
     def width(self) -> int:
         """Lanes of a block: agents that one vector register holds.
 
-        Where laws meet everybody, sixteen on any processor: a tree is made of blocks, so results follow from it.
+        Where laws meet all agents, sixteen on any processor: a tree is made of blocks, so results follow from it.
         """
         return 16 if self.far else processor.REGISTER // self.itemsize
 
     @property
     def masks(self) -> bool:
-        """Is what was compared kept in masks, beside the registers, so that it costs nothing to compare once more?"""
+        """True if what was compared is kept in masks, beside the registers: it costs nothing to compare once more."""
         return processor.REGISTER == LINE
 
     @property
     def keyed(self) -> bool:
-        """Are lists of the nearest kept as keys? See sweep/look."""
+        """True if lists of the nearest are kept as keys; see sweep/look."""
         return self.look is not None and self.look.agents > 1 and not self.sorts and self.itemsize == 4
 
     @property
@@ -113,91 +102,13 @@ class Parts:
         return [(k, e) for k, e in enumerate(self.effects) if e.pair_law is not None]
 
     @functools.cached_property
-    def shaped(self) -> tuple[NDArray[np.float64], dict[str, tuple[int, int]]]:
-        """The table of shapes that are not in the state, and the forms there are: where each begins, how many."""
-        if not self.meets_obstacles:
-            return np.zeros(0), {}
-        period = np.array(self.space.extent(self.dimension)) if self.space.periodic else None
-        return packed(self.shapes, self.dimension, self.circles, period)
-
-    @property
-    def moving(self) -> bool:
-        """Does any of them move? If not, nothing of that is written."""
-        return any(shape.moves for shape in self.shapes)
-
-    @functools.cached_property
-    def bounded(self) -> tuple[str, ...]:
-        """The forms of shapes that are only looked at where they lie within reach: none if some law asks for all.
-
-        Those whose laws go from edge to edge, or from place to place. Blocks and half-spaces are met by lanes side by
-        side, which would go through all of the law anyhow: there it was no faster, with rays or without.
-        """
-        return tuple(form for form in ("chain", "distance_field") if form in self.shaped[1]) if self.reaches else ()
-
-    @property
-    def reaches(self) -> bool:
-        """True if all folds over obstacles say how far they reach."""
-        folds = [e for e in self.effects if e.obstacle_start is not None]
-        return bool(folds) and all(e.obstacle_reach is not None for e in folds)
-
-    @functools.cached_property
-    def cells(self) -> dict[str, NDArray[np.float64]]:
-        """Grids over the shapes of each form of which there are many, and which have an end: see shapes/cells.py."""
-        table, forms = self.shaped
-        period = np.array(self.space.extent(self.dimension)) if self.space.periodic else None
-        found = {}
-        for form, (begin, count) in forms.items():
-            if count >= FEWEST_ROWS and form in ("chain", "block", "distance_field"):
-                mine = [shape for shape in self.shapes if shape.form == form]
-                lengths = [int(table[begin])]
-                while len(lengths) < count:
-                    lengths.append(int(table[begin + sum(lengths)]))
-                rows = np.cumsum([0, *lengths[:-1]]).tolist()
-                grid = cells_of(mine, rows, period)
-                if max(rows[-1], len(grid)) < MOST_NUMBERS:
-                    found[form] = grid
-        return found
-
-    @property
-    def looked_up(self) -> tuple[str, ...]:
-        """The forms of which folds meet only the shapes that may lie within reach, found by a grid."""
-        return tuple(self.cells) if self.reaches else ()
-
-    @property
-    def only_rays(self) -> bool:
-        """True if all folds over obstacles cast rays."""
-        return all(e.obstacle_ray is not None for e in self.effects if e.obstacle_start is not None)
-
-    @property
-    def folds_obstacles(self) -> bool:
-        """True if any effect has a fold over the obstacles."""
-        return any(e.obstacle_start is not None for e in self.effects)
-
-    @property
-    def surroundings(self) -> Surroundings:
-        """What code about obstacles depends on."""
-        plans = zip(self.shaped[1], self.number_plan.forms, strict=True)
-        forms = tuple(FormPlan(form, *plan) for form, plan in plans)
-        return Surroundings(self.dimension, self.space.offset_law, self.moving, forms)
-
-    @property
-    def meets_obstacles(self) -> bool:
-        """Does any law ask for obstacles, or what is hidden by them?"""
-        return any(e.obstacle_law is not None for e in self.effects) or self.occludes
-
-    @property
-    def occludes(self) -> bool:
-        """Is anybody, or any obstacle, hidden by obstacles?"""
-        return any(sight.occluded for sight in self.sights) or any(e.occluded_obstacles for e in self.effects)
-
-    @functools.cached_property
     def bonded(self) -> list[tuple[int, Effect]]:
         """The effects with a law of bonds, and their numbers."""
         return [(k, e) for k, e in enumerate(self.effects) if e.bond_law is not None]
 
     @functools.cached_property
     def far(self) -> list[tuple[int, Effect]]:
-        """The effects with a law about everybody, and their numbers."""
+        """The effects with a law about all agents, and their numbers."""
         return [(k, e) for k, e in enumerate(self.effects) if e.far_law is not None]
 
     @functools.cached_property
@@ -207,12 +118,12 @@ class Parts:
 
     @property
     def pulls(self) -> bool:
-        """Is anything left in `pulled`?"""
+        """True if some law leaves forces in `pulled`."""
         return bool(self.far or self.bonded)
 
     @property
     def flows(self) -> bool:
-        """Does a medium carry anybody?"""
+        """True if a medium carries agents."""
         return any(e.flow_law is not None for e in self.effects)
 
     @functools.cached_property
@@ -221,25 +132,25 @@ class Parts:
         return list(dict.fromkeys(self.sight_of(e) for _, e in self.pairs))
 
     def sight_of(self, effect: Effect) -> Sight:
-        """Return whom the pair law of an effect sees: of contacts, who can touch."""
+        """Return which agents the pair law of an effect sees: of contacts, those that can touch."""
         sight = effect.sight
         assert sight is not None, f"{type(effect).__name__} has a pair law and no sight"
         return sight._replace(radius=min(sight.radius, self.touching)) if effect.contact else sight
 
     @functools.cached_property
     def parting(self) -> bool:
-        """Are those in one place met by themselves, if there are any, and all others without looking at ties?
+        """True if agents in one place are met by themselves, if there are any, and all others without looking at ties.
 
         Where every law that reads ties has another for those elsewhere, and all that is told is added up.
         """
-        readers = [e for _, e in self.pairs if "tie" in _names(e, _OF_PAIRS)]
+        readers = [e for _, e in self.pairs if "tie" in names_read(e, OF_PAIRS)]
         sums = not any(e.pair_start or e.contact for _, e in self.pairs)
-        others = any("tie" in _names(e, ("apart_law", "finish_law")) for e in readers)
+        others = any("tie" in names_read(e, ("apart_law", "finish_law")) for e in readers)
         return sums and bool(readers) and all(e.apart_law for e in readers) and not others
 
     @property
     def looks_ahead(self) -> bool:
-        """Is it worked out how far the next candidate is while one is met, so that more is under way at a time?
+        """True if it is worked out how far the next candidate is while one is met, so that more is under way at a time.
 
         In small scenes, where a block meets all candidates in a row, of several laws, where there are registers enough.
         """
@@ -247,24 +158,24 @@ class Parts:
 
     @property
     def trusts(self) -> bool:
-        """Is everybody somewhere, at a finite place, whenever forces are asked for, unless a step has failed already?
+        """True if every agent is at a finite place whenever forces are asked for, unless a step has failed already.
 
-        Where steps ask once each. Then laws that vanish are not asked whom they are about. 0 times a way that is no
-        number is none either, so whoever meets one who is nowhere is nowhere after that step, too: who was first is
-        looked for step by step (`step_world`).
+        Where steps ask once each. Then laws that vanish are not asked whom they are about. 0 times a way that is NaN is
+        NaN, so an agent that meets one at NaN is at NaN after that step, too: which was the first is looked for step by
+        step (`step_world`).
         """
         return self.stepped and self.one_stage
 
     @property
     def spreads(self) -> bool:
-        """Does it spread at once to all who meet him that somebody is nowhere?"""
+        """True if NaN spreads at once to all agents that meet the one that has it."""
         return self.trusts and any(effect.vanishes for effect in self.effects)
 
     @functools.cached_property
     def averaged(self) -> list[int]:
-        """The sights of which it is counted who is in them (not of contacts: few candidates are asked for those)."""
+        """The sights of which agents in sight are counted (not of contacts: few candidates are asked for those)."""
         if any(effect.averages and effect.contact for effect in self.effects):
-            raise TypeError("an effect with `contact` counts nobody: it cannot have `averages`")
+            raise TypeError("an effect with `contact` counts no agents: it cannot have `averages`")
         return sorted({self.sights.index(self.sight_of(e)) for _, e in self.pairs if e.averages})
 
     @property
@@ -292,9 +203,8 @@ class Parts:
 
     def given(self) -> NDArray[Any]:
         """Return `parameters()` and the tables behind them, in the scene's precision: what the kernel is handed."""
-        return np.concatenate([self.parameters(), self.shaped[0], *self.cells.values(), *self.tables]).astype(
-            self.dtype
-        )
+        every: list[Any] = [self.parameters(), self.shaped[0], *self.cells.values(), *self.tables]
+        return np.concatenate(every).astype(self.dtype)
 
     def numbers_of(self, effect: Effect) -> dict[str, Any]:
         """Return the numbers and vectors that the laws of an effect are given, by name."""
@@ -314,11 +224,11 @@ class Parts:
         return found
 
     def target(self, k: int) -> str:
-        """Write what effect k adds to: a wish of its own, what agents want, or what acts on them."""
+        """Return what effect k adds to: a wish of its own, what agents want, or what acts on them."""
         return f"w{k}_" if k in self.wishes else "s" if self.effects[k].steering else "f"
 
     def pair_target(self, k: int) -> str:
-        """Write what the pair law of effect k adds to: the same, or what its fold over the obstacles is told."""
+        """Return what the pair law of effect k adds to: the same, or what its fold over the obstacles is told."""
         effect = self.effects[k]
         return f"n{k}_" if effect.obstacle_start is not None or effect.keep_law is not None else self.target(k)
 
@@ -334,27 +244,27 @@ class Parts:
 
     @property
     def counters(self) -> int:
-        """How many counters all effects have; they lie at the end of the scratch `frame`."""
+        """How many counters all effects have; they lie in the scratch `counters`."""
         return sum(effect.counters for effect in self.effects if effect.count_law)
 
     @property
     def aims(self) -> bool:
-        """Does any effect say where agents want to go?"""
+        """True if some effect says where agents want to go."""
         return any(e.aim_law is not None for e in self.effects)
 
     @functools.cached_property
     def read(self) -> set[str]:
         """Every name in the code of all laws."""
-        return set().union(*(_names(e, LAWS) for e in self.effects))
+        return set().union(*(names_read(e, LAWS) for e in self.effects))
 
     @property
     def bounces(self) -> bool:
-        """Do bodies come back from walls?"""
+        """True if bodies bounce off the walls of the space."""
         return self.space.bounce_law is not None
 
     @property
     def sweeps(self) -> bool:
-        """Does anybody ask who is near whom?"""
+        """True if neighbours are looked for."""
         return bool(self.pairs) or (self.look is not None and self.look.agents > 0)
 
     @functools.cached_property
@@ -366,7 +276,7 @@ class Parts:
 
     @property
     def one_stage(self) -> bool:
-        """Does the method ask once, and then move every coordinate by itself?"""
+        """True if the method asks once, and then moves every coordinate by itself."""
         return isinstance(self.integrator, OneStage)
 
     @property
@@ -377,7 +287,7 @@ class Parts:
     @functools.cached_property
     def fields(self) -> list[str]:
         """What is sorted of each agent: what the pair laws read, found from the names in their code."""
-        names = set().union(*(_names(e, _OF_PAIRS) for _, e in self.pairs))
+        names = set().union(*(names_read(e, OF_PAIRS) for _, e in self.pairs))
         if any(sight.fov < 360 for sight in self.sights):
             names.add("heading")
         if any(sight.group is not None for sight in self.sights):
@@ -413,7 +323,7 @@ class Parts:
 
     @property
     def confines(self) -> bool:
-        """Is everybody brought into a periodic box when a call begins, so that no query has to look after it?
+        """True if all agents are brought into a periodic box when a call begins, so that no query has to look after it.
 
         Only where accelerations are asked for at the frozen present: a stage of a method may lie outside.
         """
@@ -421,15 +331,15 @@ class Parts:
 
     @property
     def arranges(self) -> bool:
-        """May agents of a large world be put in order for a while?
+        """True if agents of a large world may be put in order for a while.
 
-        Not where places matter: bonds know their partners by them, and everybody is met in their order.
+        Not where places matter: bonds know their partners by them, and far laws meet all agents in their order.
         """
         return self.sorts and bool(self.pairs) and not self.pulls
 
     @property
     def homely(self) -> bool:
-        """Is it noted then who has left the place where he began? Only where cells are the same in every step."""
+        """True if it is noted then which agents have left their tiles: where cells are the same in every step."""
         return self.arranges and self.space.periodic
 
     @property
@@ -439,16 +349,9 @@ class Parts:
 
     @property
     def frame_numbers(self) -> list[str]:
-        """More numbers of an agent's body, by `Body`'s names, of which not every scene knows."""
-        wanted = {
-            "max_turn_rate": self.turns, "banking": self.leans, "desired_speed": "desired_speed" in self.read,
-        }  # fmt: skip
-        return [name for name, some in wanted.items() if some]
-
-    @property
-    def frame_argument(self) -> str:
-        """The state's arrays of frames and inner states among the arguments of an entry point, where there are some."""
-        return "frame_, " * self.oriented + "inner_, " * bool(self.inner)
+        """More numbers of an agent's body, by `Body`'s names, which not every scene needs."""
+        paced = "desired_speed" in self.read
+        return ["max_turn_rate"] * self.turns + ["banking"] * self.leans + ["desired_speed"] * paced
 
     @property
     def frame_rows(self) -> int:
@@ -457,7 +360,7 @@ class Parts:
 
     @property
     def luggage(self) -> list[str]:
-        """What an agent carries along then: an array, and the axis of a vector."""
+        """What of an agent is carried along then: an array, and the axis of a vector."""
         vectors = ["pos", "vel", "want", *self.frame_vectors, *(["tie"] if "t0" in self.sorted_fields else [])]
         vector = [f"{name} {k}" for name in vectors for k in range(self.dimension)]
         inner = (f"inner{k}" for k in range(len(self.inner)))
@@ -477,10 +380,8 @@ class Parts:
         runs += [(f"near{q}_", sight.nearest or 0) for q, sight in enumerate(self.sights)]
         runs += [(f"many{q}_", 1) for q in self.averaged]
         runs += [(f"o{k}_", e.folded(d) if e.obstacle_start else 0) for k, e in enumerate(self.effects)]
-        runs += [(f"g{name}", d) for name in self.targets] + [
-            ("bond", d * bool(self.bonded)),
-            ("far", d * bool(self.far)),
-        ]
+        runs += [(f"g{name}", d) for name in self.targets]
+        runs += [("bond", d * bool(self.bonded)), ("far", d * bool(self.far))]
         edges = [k for k, e in enumerate(self.effects) if e.obstacle_start and e.obstacle_edges]
         runs += [(f"ahead{k}_", 2) for k in edges]
         runs += [("found", -(-MOST_FOUND // self.width) * bool(self.looked_up))]
@@ -497,42 +398,3 @@ class Parts:
 def flattened(effects: Sequence[Effect]) -> tuple[Effect, ...]:
     """Return effects with their behaviours, if they have some, before them: each has laws and numbers of its own."""
     return tuple(each for effect in effects for each in (*effect.wishes, effect))
-
-
-EDGE = 8
-"""Rounding errors by which a field of view is wider: as many as a heading, an offset and their product have."""
-
-
-def view_of(fov: float, dtype: str) -> float:
-    """Return c |c|, what `in_view` compares, with c = cos(fov / 2); fov in degrees.
-
-    The edge belongs to the field of view in either precision, since c is less by EDGE machine epsilons: with 180
-    degrees a neighbour exactly abeam is in view, whatever the heading is.
-    """
-    cosine = math.cos(math.radians(fov) / 2.0) - EDGE * float(np.finfo(dtype).eps)
-    return cosine * abs(cosine)
-
-
-_OF_PAIRS = ("pair_start", "pair_law", "apart_law", "finish_law")
-
-
-def _names(effect: Effect, slots: Sequence[str]) -> set[str]:
-    """Return every name in the code of some of an effect's laws and of the laws that they call."""
-    laws = [*(getattr(effect, slot) for slot in slots), effect.obstacle_law if effect.joined else None]
-    todo: list[Any] = [law for law in laws if law is not None]
-    if effect.wishes and slots == LAWS:
-        todo.append(effect.steer_law)
-    seen: set[int] = set()
-    names: set[str] = set()
-    while todo:
-        python = python_of(todo.pop())
-        if id(python) in seen:
-            continue
-        seen.add(id(python))
-        names |= set(python.__code__.co_names)
-        called: list[Any] = [python.__globals__.get(name) for name in python.__code__.co_names]
-        called += held(python)
-        modules = [m for m in called if inspect.ismodule(m)]
-        called += [getattr(m, name, None) for m in modules for name in python.__code__.co_names]
-        todo += [f for f in called if hasattr(f, "py_func") or (IN_PYTHON and inspect.isfunction(f))]
-    return names

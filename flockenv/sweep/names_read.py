@@ -1,0 +1,44 @@
+"""Which fields of agents laws read: found from the names in their code, and in that of the laws that they call."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Sequence
+from typing import Any
+
+from flockenv.effects.base import Effect
+from flockenv.kernels import IN_PYTHON, held, python_of
+
+__all__ = ["LAWS", "OF_PAIRS", "names_read"]
+
+LAWS = (
+    "own_law", "medium_law", "flow_law", "far_law", "bond_law", "kick_law", "aim_law", "begin_law", "keep_law",
+    "count_law", "pair_start", "pair_law", "apart_law", "finish_law", "obstacle_start", "obstacle_law",
+    "obstacle_finish", "obstacle_ray", "obstacle_from", "obstacle_reach",
+)  # fmt: skip
+"""The slots that an effect may fill with a law."""
+
+OF_PAIRS = ("pair_start", "pair_law", "apart_law", "finish_law")
+"""Those that are about a neighbour."""
+
+
+def names_read(effect: Effect, slots: Sequence[str]) -> set[str]:
+    """Return every name in the code of some of an effect's laws and of the laws that they call."""
+    laws = [*(getattr(effect, slot) for slot in slots), effect.obstacle_law if effect.joined else None]
+    todo: list[Any] = [law for law in laws if law is not None]
+    if effect.wishes and slots == LAWS:
+        todo.append(effect.steer_law)
+    seen: set[int] = set()
+    names: set[str] = set()
+    while todo:
+        python = python_of(todo.pop())
+        if id(python) in seen:
+            continue
+        seen.add(id(python))
+        names |= set(python.__code__.co_names)
+        called: list[Any] = [python.__globals__.get(name) for name in python.__code__.co_names]
+        called += held(python)
+        modules = [m for m in called if inspect.ismodule(m)]
+        called += [getattr(m, name, None) for m in modules for name in python.__code__.co_names]
+        todo += [f for f in called if hasattr(f, "py_func") or (IN_PYTHON and inspect.isfunction(f))]
+    return names
