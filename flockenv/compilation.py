@@ -1,4 +1,4 @@
-"""Compilation, seen: how long each kernel took, and a line on the terminal while somebody waits for one.
+"""Compilation, seen: how long each kernel took, and a line on the terminal while one is compiled.
 
 A kernel is compiled at its first call, once per machine: its code lies in the cache folder from then on, see section.
 On a terminal a line says what is being compiled and, when it is done, how long that took; FLOCKENV_QUIET=1 silences it.

@@ -1,4 +1,4 @@
-"""numba's front end with less to do: while it compiles our kernels, it does nothing twice and nothing for nobody.
+"""numba's front end with less to do: while it compiles our kernels, it does nothing twice, and nothing in vain.
 
 Four fifths of the time that a kernel takes to compile are numba's Python. The machine code that comes out is the same,
 instruction for instruction. What is replaced here is replaced while one of our functions compiles, under numba's own
@@ -108,7 +108,7 @@ def _memory(function: Any) -> dict[Any, Any]:
 
 
 def _call(context: Any, args: Any, kws: Any) -> tuple[Any, ...]:
-    """Return what a resolution depends on beside the function: types, and the flags of whoever calls."""
+    """Return what a resolution depends on beside the function: types, and the flags of the caller."""
     flags = targetconfig.ConfigStack.top_or_none()  # type: ignore[no-untyped-call]
     return context, tuple(args), tuple(kws.items()) if kws else (), flags
 
@@ -243,7 +243,7 @@ def _variables(slowly: Any) -> Any:
 
 
 def _when_asked(slowly: Any) -> Any:
-    """Leave the lives of variables to whoever asks: numba finds them anew after each of its passes.
+    """Work out the lives of variables only when asked: numba finds them anew after each of its passes.
 
     What is entered into `block_entry_vars` is for generators and for Python's objects, of which kernels have none.
     """

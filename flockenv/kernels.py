@@ -89,7 +89,7 @@ Numbers = tuple[float, ...]
 # division in a vector register is an estimate and a scalar one is exact, so that results depend on how agents are
 # divided among threads; with `reassoc` and `nsz` a NaN check (x - x == 0) folds to True.
 FAST = frozenset({"contract"})
-# _nrt=False: no reference counts. Arrays belong to whoever called the entry point, for as long as it runs; counting
+# _nrt=False: no reference counts. Arrays belong to the caller of the entry point, for as long as it runs; counting
 # every view of them with a locked instruction took nine tenths of the time of a world of 32 agents. So nothing compiled
 # here may allocate (numba says so when it compiles): scratch is an argument.
 OPTIONS: Any = {
@@ -285,7 +285,7 @@ ask_for: Any = intrinsic_or_python(_ask_for, lambda array, place: None)
 
 
 def _stacked(typing_context: Any, numbers: Any) -> Any:
-    """Return the numbers of a tuple as an array that a law may write, for as long as whoever calls it runs.
+    """Return the numbers of a tuple as an array that a law may write, for as long as its caller runs.
 
     It lies on the stack: laws allocate nothing. A law never returns it.
     """
@@ -345,7 +345,7 @@ def _tally(typing_context: Any, number: Any) -> Any:
 tallied: Any = intrinsic_or_python(_tallied, lambda number, flag: number + type(number)(flag))
 tally_of: Any = intrinsic_or_python(_tally, lambda number: number)
 
-_PATIENCE = 2000  # rounds of waiting before the core is offered to somebody else
+_PATIENCE = 2000  # rounds of waiting before the core is offered to other threads
 
 _give_way: Any = numba.njit(lambda: 0)
 if os.name == "posix":
@@ -473,8 +473,8 @@ def _described(python: FunctionType) -> str:
 def settled(function: Any) -> Callable[..., Any]:
     """Return an entry point that was called, without numba's look at the type of every argument: half of a short call.
 
-    For a caller whose arguments have the same types each time, arrays in one piece: nobody asks any more. One that was
-    called with several types is returned as it is.
+    For a caller whose arguments have the same types each time, arrays in one piece: types are not looked at any more.
+    One that was called with several types is returned as it is.
     """
     compiled = list(getattr(function, "overloads", {}).values())
     return compiled[0].entry_point if len(compiled) == 1 else function  # type: ignore[no-any-return]

@@ -39,7 +39,7 @@ def agent_plan(parts: Parts) -> AgentPlan:
 def alone_of(plan: AgentPlan) -> Callable[..., Me]:
     """Make `alone(scratch, drawn, time, place, i, one, x, v, medium)`: agent i as the laws of one agent see it.
 
-    It lies at `place` in arrays of vectors, its body at `one`. There is no tie: nobody is near it to part from.
+    It lies at `place` in arrays of vectors, its body at `one`. It has no tie: that is for pairs in one place.
     """
     vector, inner = vector_of_lane(plan.dimension, plan.width), inner_of(plan.inner)
     oriented, aims, paced = plan.oriented, plan.aims, plan.paced

@@ -1,6 +1,6 @@
-"""A large world is put in order for as long as a call of several steps lasts: who is near in space is near in memory.
+"""A large world is put in order for as long as a call of several steps lasts: near in space is near in memory.
 
-Agents are numbered by whoever made the scene, and neighbours by number lie anywhere in space: sorting them by cell is
+Agents are numbered as the scene lists them, and neighbours by number lie anywhere in space: sorting them by cell is
 one distant place in memory per agent and step. So at the beginning of a call all that is known of an agent moves to
 where its tile of cells comes, by number within (`flockenv.tiles`). Each step then sorts what is nearly sorted; and at
 the end all agents go home. `ident` says which agent is where in between. Sums do not notice: within a cell agents are

@@ -51,7 +51,7 @@ def put_vector_of(dimension: int, width: int) -> Callable[..., None]:
 
 @section
 def common_places(dimension: int, width: int, masked: bool) -> Callable[..., tuple[Any, Any, Any]]:
-    """Make `common(scratch, n, present, block)`: where a block has its bodies, who lives, and what its agents want.
+    """Make `common(scratch, n, present, block)`: where a block has its bodies, lives and wants.
 
     In a large world what all agents have in common is read where the first block has it: large worlds wait for memory.
     """

@@ -72,8 +72,8 @@ def _packed(
     slot = start[agent // width] + np.arange(len(agent)) - np.concatenate([[0], np.cumsum(count)])[agent]
     lane_of = agent % width
 
-    def place_of(who: NDArray[np.int64]) -> NDArray[np.int64]:
-        return (who // width) * (dimension * width) + who % width
+    def place_of(agents: NDArray[np.int64]) -> NDArray[np.int64]:
+        return (agents // width) * (dimension * width) + agents % width
 
     block = np.repeat(np.arange(blocks), np.diff(start))
     places = np.repeat(place_of(block[:, None] * width + np.arange(width))[:, None, :], partner.shape[1], axis=1)

@@ -33,7 +33,7 @@ def step_of(parts: Parts) -> Callable[..., tuple[int, int]]:
 
 
 def _title(parts: Parts) -> str:
-    """Return what a kernel is of, for those who wait until it is compiled."""
+    """Return what a kernel is of: this is shown while it is compiled."""
     effects = ", ".join(type(e).__name__ for e in parts.effects) or "no effects"
     return f"{parts.dimension}-D {parts.space.kind}; {effects}"
 
@@ -52,12 +52,12 @@ def _scene_step(plan: StepPlan, title: str) -> Callable[..., tuple[int, int]]:
         team: int, scratch: Any,
     ) -> tuple[int, int]:  # fmt: skip
         unaliased()
-        broken, who = -1, -1
+        broken, agent = -1, -1
         for b in range(from_world, to_world):  # no choice in here: LLVM would copy the step for each of its outcomes
             bad = step_world(worlds, drive, b, params, dt, count, b, rank, team, scratch)
             if bad >= 0 and broken < 0:
-                broken, who = b, bad
-        return broken, who
+                broken, agent = b, bad
+        return broken, agent
 
     scene_step.__doc__ = title
     return scene_step

@@ -1,4 +1,4 @@
-"""Laws that act on everybody, however far: each agent meets all others, or groups of them where these are far away.
+"""Laws about all agents, however far: each agent meets all others, or groups of them where these are far away.
 
 Few agents, and many where an effect asks for exactness, are met one by one, lane beside lane (`_direct`); many others
 by blocks that walk through a tree (`_walk`, see flockenv.tree). Which of the two depends on the number of agents and

@@ -103,7 +103,7 @@ def _of_tiles(parts: Parts, agents: int) -> dict[str, Array]:
 
 
 def _of_trees(parts: Parts, agents: int, team: int) -> dict[str, Array]:
-    """Return what a tree of agents takes, for laws about everybody."""
+    """Return what a tree of agents takes, for laws about all agents."""
     real, long, width = np.dtype(parts.dtype), np.dtype(np.int64), parts.width
     padded = -(-agents // width) * width
     found: dict[str, Array] = {

@@ -231,11 +231,11 @@ def _failing(bad: int, width: int) -> Callable[..., Any]:
     """Make `failing(lanes, well, step, n, failed)`: the step and agent, as one number, of which the first failed."""
     at, lowest = np.uint64(bad), _first_bad(bad, width)
 
-    def failing(lanes: Any, well: Any, step: Any, n: Any, failed: Any, nobody: Any) -> Any:
+    def failing(lanes: Any, well: Any, step: Any, n: Any, failed: Any, none_failed: Any) -> Any:
         fallen = np.int32(0)
         for lane in range(np.uint64(width)):
             fallen += np.int32(1) if lanes[at + lane] < well else np.int32(0)
-        if fallen > np.int32(0) and failed == nobody:
+        if fallen > np.int32(0) and failed == none_failed:
             return np.int64(step * n) + np.int64(lowest(lanes, well))
         return failed
 
@@ -303,8 +303,8 @@ def step_world_of(plan: StepPlan) -> Callable[..., int]:
         context = enter(worlds, drive, asked, params, count, b, rank, team, scratch)
         n, first, end, pos, vel, lanes = context.n, context.first, context.end, scratch.pos, scratch.vel, scratch.lanes
         well, begun, before = like(dt, np.inf), worlds.tick[b], gather(worlds.work[b], np.uint64(0), counted)
-        nobody = np.int64(n * (count + 1))
-        failed = nobody
+        none_failed = np.int64(n * (count + 1))
+        failed = none_failed
         for lane in range(np.uint64(width)):
             lanes[bad + lane] = well
         for step in range(count):
@@ -313,14 +313,14 @@ def step_world_of(plan: StepPlan) -> Callable[..., int]:
                 count_agents(context, pos, vel, time)
             advance(context, pos, vel, time, dt, begun + step)
             if failing is not None:
-                failed = failing(lanes, well, step, n, failed, nobody)
+                failed = failing(lanes, well, step, n, failed, none_failed)
         if go_home is not None:  # noqa: SIM102  # numba drops the branch by this alone
             if context.arranged:
                 go_home(scratch, (n, context.present, first, end, rank, team))
         if failing is None:
             worst = first_bad(lanes, well)
-            failed = np.int64(worst) if worst < well else nobody
-        found = verdict(context, worlds, before, failed, nobody)
+            failed = np.int64(worst) if worst < well else none_failed
+        found = verdict(context, worlds, before, failed, none_failed)
         if found < 0:
             bring_out(worlds, scratch, b, first, end)
             if rank == 0:
@@ -332,21 +332,21 @@ def step_world_of(plan: StepPlan) -> Callable[..., int]:
 
 @section
 def _verdict(trusts: bool, dimension: int) -> Callable[..., int]:
-    """Make `verdict(context, worlds, before, failed, nobody)`: which agent of a world is not finite, or -1.
+    """Make `verdict(context, worlds, before, failed, none_failed)`: which agent of a world is not finite, or -1.
 
     What all threads of the team have found counts. Where one is, the counters of the world are what they were `before`.
     """
 
-    def verdict(context: Any, worlds: Any, before: Any, failed: Any, nobody: Any) -> Any:
+    def verdict(context: Any, worlds: Any, before: Any, failed: Any, none_failed: Any) -> Any:
         scratch, b, n, rank, team = context.scratch, context.b, context.n, context.rank, context.team
         # the first half may still be read by threads that count
         scratch.tally[team + rank] = failed
         wait_for_team(scratch.sync, team)
-        first_bad = nobody
+        first_bad = none_failed
         for r in range(team):
             first_bad = min(first_bad, scratch.tally[team + r])
         wait_for_team(scratch.sync, team)  # before any thread counts again
-        if first_bad >= nobody:
+        if first_bad >= none_failed:
             return np.int64(-1)
         first_bad %= n
         if rank == 0:
