@@ -53,7 +53,7 @@ class _Watch(event.Listener):
         if function is not None:
             self.began[id(event.data["dispatcher"])] = perf_counter()
             folder = _folder(event.data["dispatcher"])
-            _say(f"flockenv: compiling {_described(function)} (once; kept in {folder}) ...")
+            _say(f"flockenv: compiling {_described(event.data['dispatcher'])} (once; kept in {folder}) ...")
 
     def on_end(self, event: Any) -> None:
         """Say how long it was."""
@@ -61,7 +61,7 @@ class _Watch(event.Listener):
         began = self.began.pop(id(event.data["dispatcher"]), None)
         if function is not None and began is not None:
             seconds = perf_counter() - began
-            _done.append(Compiled(function.__name__, _described(function), seconds))
+            _done.append(Compiled(function.__name__, _described(event.data["dispatcher"]), seconds))
             _say(f" {seconds:.1f} s\n")
 
 
@@ -72,9 +72,9 @@ def _entry_point(event: Any) -> Any:
     return dispatcher.py_func if ours else None
 
 
-def _described(function: Any) -> str:
-    """Return the first line of what is said of an entry point."""
-    text: str = function.__doc__ or function.__name__
+def _described(dispatcher: Any) -> str:
+    """Return the title of an entry point, or the first line of what is said of its function."""
+    text: str = vars(dispatcher).get("title") or dispatcher.py_func.__doc__ or dispatcher.py_func.__name__
     return text.split("\n")[0]
 
 

@@ -62,6 +62,7 @@ __all__ = [
     "like",
     "python_of",
     "replaced",
+    "routine",
     "settled",
     "shared",
     "stacked",
@@ -111,7 +112,10 @@ def _marked(function: F, **options: Any) -> F:
 
 
 def law(function: F) -> F:
-    """Mark a scalar law: branch-free if it can be, inlined into whatever loop calls it, never called on its own."""
+    """Mark a scalar law: branch-free if it can be, inlined into whatever loop calls it, never called on its own.
+
+    For numba the same as `kernel`; the two words tell readers what is physics, and what is a part of the engine.
+    """
     return _marked(function)
 
 
@@ -121,7 +125,7 @@ def unfused(function: F) -> F:
 
 
 def kernel(function: F) -> F:
-    """Mark a function over the arrays of one world; compiled as a part of the entry point that calls it."""
+    """Mark a part of a kernel, that reads and writes arrays or puts laws together; compiled with what calls it."""
     return _marked(function)
 
 
@@ -207,7 +211,7 @@ def _add_at_once(typing_context: Any, array: Any, amount: Any) -> Any:
 
 
 def written(number: Any, name: str) -> int:
-    """Return a number that a source hands over written down; numba tries again with it if it did not hand it over."""
+    """Return an integer that is known while compiling; numba tries again with its value if it did not tell it."""
     if not isinstance(number, types.IntegerLiteral):
         raise numba.TypingError(f"{name}: {number}, must be written as a number")
     return int(number.literal_value)

@@ -51,6 +51,7 @@ __all__ = [
     "record",
     "section",
     "several",
+    "titled",
     "tuple_from",
     "vector",
 ]
@@ -72,7 +73,7 @@ def section(make: Callable[..., Callable[..., Any]]) -> Callable[..., Callable[.
 def entry_of(make: Callable[..., Callable[..., Any]]) -> Callable[..., Callable[..., Any]]:
     """Decorate a section whose functions Python calls: `section(*plan)` is an entry point, made once for each plan.
 
-    The plan holds laws, numbers, text, arrays, types, and tuples of those. Its functions are made when something is to
+    The plan holds laws, numbers, text, types, and tuples of those. Its functions are made when something is to
     be compiled, and not where the machine code of an equal plan is kept.
     """
 
@@ -84,10 +85,16 @@ def entry_of(make: Callable[..., Callable[..., Any]]) -> Callable[..., Callable[
     return made
 
 
+def titled(entry_point: Callable[..., Any], title: str) -> Callable[..., Any]:
+    """Return an entry point that is called by a title while it is compiled; the first one it gets stays."""
+    vars(entry_point).setdefault("title", title)
+    return entry_point
+
+
 @functools.cache
-def entry(kernel: Callable[..., Any]) -> Callable[..., Any]:
+def entry(function: Callable[..., Any]) -> Callable[..., Any]:
     """Return a kernel, or a Python function, as an entry point of its own."""
-    return _entry(python_of, (kernel,))
+    return _entry(python_of, (function,))
 
 
 def digest_of(plan: Any) -> str:
@@ -159,6 +166,9 @@ class _Late(OneAtATime):
 
 def record(names: tuple[str, ...]) -> Any:
     """Return the type of a record with these fields; machine code that takes one finds it under its name here."""
+    wrong = [name for name in names if "__" in name or name.endswith("_")]
+    if wrong:
+        raise ValueError(f"record: {wrong[0]!r} must have no two underscores, and none at its end")
     return __getattr__("__".join(["Record", *(names or ("nothing",))]))
 
 
@@ -210,7 +220,11 @@ def _calls(functions: tuple[Any, ...], joined: bool, plain: Callable[..., Any]) 
         kinds = [typing_context.resolve_value_type(function) for function in functions]
         ways = [typing_context.resolve_function_type(kind, given, {}) for kind in kinds]
         returned: list[Any] = [one for way in ways for one in (way.return_type if joined else [way.return_type])]
-        nothing = types.none in returned
+        silent = [way.return_type == types.none for way in ways]
+        nothing = all(silent)
+        if any(silent) and not nothing:
+            which = python_of(functions[silent.index(True)]).__name__
+            raise numba.TypingError(f"{which} returns nothing, and functions beside it return something")
 
         def generate(context: Any, builder: Any, own: Any, arguments: Any) -> Any:
             found = []

@@ -1,6 +1,6 @@
-"""The sweep: composes the laws of a scene into one small source file, which numba compiles once and keeps.
+"""The sweep: composes the laws of a scene into one kernel of Python functions, which numba compiles once and keeps.
 
-What is written depends only on which laws there are, in which space, dimension and integrator, and which of them see
+What is compiled depends only on which laws there are, in which space, dimension and integrator, and which of them see
 the same neighbours; numbers are arguments. A law that is not listed leaves no trace: no branch, no buffer, no query.
 
 Agents go side by side in blocks, as many as a vector register holds (16 with AVX-512, 8 without, in float64 half of

@@ -1,4 +1,4 @@
-"""What kernels are handed: the worlds of a state, and one world in progress as what computes accelerations sees it."""
+"""What kernels are handed: the worlds of a state, and one world in progress as a step sees it."""
 
 from __future__ import annotations
 
@@ -32,11 +32,11 @@ def worlds_of(state: State) -> Worlds:
 
 
 class Context(NamedTuple):
-    """One world in progress, as what computes accelerations sees it."""
+    """One world in progress, as a step sees it."""
 
     obstacle_x: Any  # (D, B, M) m
     obstacle_radius: Any  # (B, M) m
-    work: Any  # (B, 8) counters
+    work: Any  # (B, W) counters
     params: Any  # the numbers of the scene in one row, with its tables behind them
     numbers: Any  # the same by name: numbers.Numbers
     key: Any  # (B,) of random numbers

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from flockenv.kernels import kernel, like, unaliased
-from flockenv.section import entry_of, in_turn, section
+from flockenv.section import entry_of, in_turn, section, titled
 from flockenv.sweep.agents import alone_of
 from flockenv.sweep.blocks import out_of_blocks, vector_of_lane
 from flockenv.sweep.carry import bring_in_of, take_drive_of
@@ -29,7 +29,7 @@ __all__ = ["BeginPlan", "begin_inner_of", "begin_of", "begin_plan", "field_of", 
 
 def step_of(parts: Parts) -> Callable[..., tuple[int, int]]:
     """Return the entry point `step` of a scene: see `_scene_step`."""
-    return _scene_step(step_plan(parts), f"{_title(parts)}, {parts.integrator.kind}")
+    return titled(_scene_step(step_plan(parts)), f"{_title(parts)}, {parts.integrator.kind}")
 
 
 def _title(parts: Parts) -> str:
@@ -39,7 +39,7 @@ def _title(parts: Parts) -> str:
 
 
 @entry_of
-def _scene_step(plan: StepPlan, title: str) -> Callable[..., tuple[int, int]]:
+def _scene_step(plan: StepPlan) -> Callable[..., tuple[int, int]]:
     """Make `scene_step`: advance worlds [from_world, to_world) by `count` steps.
 
     It returns (world, agent) not finite first, or -1s. drive (D, B, N), or (D, 0, N) for none. A team of several
@@ -59,7 +59,6 @@ def _scene_step(plan: StepPlan, title: str) -> Callable[..., tuple[int, int]]:
                 broken, agent = b, bad
         return broken, agent
 
-    scene_step.__doc__ = title
     return scene_step
 
 
@@ -125,11 +124,11 @@ def begin_of(parts: Parts) -> Callable[..., None]:
     """Return the entry point `begin` of a scene with inner states: see `_scene_begin`."""
     plan = begin_plan(parts)
     assert plan is not None, "a scene in which agents keep nothing"
-    return _scene_begin(plan, f"{_title(parts)}, what goes on inside agents")
+    return titled(_scene_begin(plan), f"{_title(parts)}, inner states")
 
 
 @entry_of
-def _scene_begin(plan: BeginPlan, title: str) -> Callable[..., None]:
+def _scene_begin(plan: BeginPlan) -> Callable[..., None]:
     """Make `scene_begin`: write what goes on inside the agents of all worlds that are `fresh`, (B, N)."""
     begin_inner = begin_inner_of(plan)
 
@@ -138,24 +137,24 @@ def _scene_begin(plan: BeginPlan, title: str) -> Callable[..., None]:
         for b in range(worlds.x.shape[1]):
             begin_inner(worlds, params, dt, fresh, b, scratch)
 
-    scene_begin.__doc__ = title
     return scene_begin
 
 
 def field_of(parts: Parts) -> Callable[..., None]:
     """Return the entry point `field` of parts that are not `stepped`: see `_scene_field`."""
-    return _scene_field(response_plan(parts), sense_plan(parts), parts.number_plan, f"{_title(parts)}, accelerations")
+    made = _scene_field(response_plan(parts), sense_plan(parts), parts.number_plan)
+    return titled(made, f"{_title(parts)}, accelerations")
 
 
 @entry_of
-def _scene_field(plan: ResponsePlan, felt: SensePlan, number_plan: NumberPlan, title: str) -> Callable[..., None]:
+def _scene_field(plan: ResponsePlan, sensed: SensePlan, number_plan: NumberPlan) -> Callable[..., None]:
     """Make `scene_field`: write accelerations at given instants, and the flow that carries agents if there is one.
 
     Of all worlds, (D, B, N); nothing moves.
     """
     agent, d, width = plan.agent, plan.agent.dimension, plan.agent.width
     bring_in, take_drive, out = bring_in_of(agent), take_drive_of(d, width, plan.masked), out_of_blocks(d, width)
-    read, accelerate, flows = numbers_of(number_plan), accelerate_of(plan, felt), bool(plan.flows)
+    read, accelerate, flows = numbers_of(number_plan), accelerate_of(plan, sensed), bool(plan.flows)
 
     def scene_field(worlds: Any, drive: Any, params: Any, times: Any, acc: Any, flow: Any, scratch: Any) -> None:
         unaliased()
@@ -176,5 +175,4 @@ def _scene_field(plan: ResponsePlan, felt: SensePlan, number_plan: NumberPlan, t
             if flows:
                 out(scratch.carrying, flow, b, n, 0, end)
 
-    scene_field.__doc__ = title
     return scene_field

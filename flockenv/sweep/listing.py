@@ -331,15 +331,15 @@ def _take(plan: Listing) -> Callable[..., None]:
 
 @section
 def walk_blocks(plan: Listing, meet: Callable[..., int]) -> Callable[..., int]:
-    """Make `walk(context, shape, pos, vel, time)`: call `meet` for each of this thread's blocks; add up its answers.
+    """Make `walk(context, shape, time)`: call `meet` for each of this thread's blocks; add up its answers.
 
-    It is handed context, shape, block, at, upto, found, pos, vel, time: the block is [at, upto), and `found` ranges of
+    It is handed context, shape, block, at, upto, found, time: the block is [at, upto), and `found` ranges of
     listed agents may be near it: `scratch.ranges`.
     """
     width, sorts, periodic = plan.width, plan.sorts, plan.periodic
     take: Any = _take(plan) if sorts else None
 
-    def walk(context: Any, shape: Any, pos: Any, vel: Any, time: Any) -> Any:
+    def walk(context: Any, shape: Any, time: Any) -> Any:
         scratch, present, rank, team = context.scratch, context.present, context.rank, context.team
         ranges, nx = scratch.ranges, shape[0]
         blocks = (present + width - 1) // width
@@ -368,7 +368,7 @@ def walk_blocks(plan: Listing, meet: Callable[..., int]) -> Callable[..., int]:
                 take(scratch.lanes, scratch.records, np.uint64(at))
             else:
                 ranges[0, 0], ranges[0, 1], ranges[0, 2] = 0, present, 1
-            met += meet(context, shape, np.uint64(at), at, upto, found, pos, vel, time)
+            met += meet(context, shape, np.uint64(at), at, upto, found, time)
             at = upto
         return met
 

@@ -79,7 +79,7 @@ def _among_agents(plan: LookPlan) -> Callable[[Any], bool]:
         if keyed:  # candidates after the last one: infinitely far, NaN around a box
             for j in range(np.uint64(looking.n), np.uint64(looking.n + (AT_ONCE - 1))):
                 scratch.sorted_rows[x_at + j] = np.inf
-        unsure = walk(looking, shape, scratch.pos, scratch.vel, looking.numbers.reach)
+        unsure = walk(looking, shape, looking.numbers.reach)
         return keyed and unsure == 0
 
     return among
@@ -91,9 +91,7 @@ def _block(plan: LookPlan) -> Callable[..., int]:
     sorts, keyed = plan.listing.sorts, plan.keyed
     by_keys, by_squares, tell = by_keys_of(plan) if keyed else None, _by_squares(plan), _tell(plan)
 
-    def block(
-        looking: Any, shape: Any, block: Any, at: Any, upto: Any, found: Any, pos: Any, vel: Any, time: Any
-    ) -> Any:  # fmt: skip
+    def block(looking: Any, shape: Any, block: Any, at: Any, upto: Any, found: Any, time: Any) -> Any:
         scratch, near, span = looking.scratch, looking.near, looking.numbers
         all_alive, sure = looking.present == looking.n, False
         if keyed:  # noqa: SIM102  # numba drops the branch by this alone

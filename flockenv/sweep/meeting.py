@@ -119,7 +119,7 @@ def _one_after_another(plan: Pairs, which: str, wrapped: bool, each: Callable[..
 
 @section
 def _looking_ahead(plan: Pairs, each: Callable[..., None]) -> Callable[..., None]:
-    """Make the same for a small world, working out how far the next candidate is while one is met.
+    """Make `meet(numbers, besides, block, r)` for a small world: the next candidate's distance is worked out early.
 
     Behind the last one lies some other number: a row has room for more, and how far that is is never read.
     """
@@ -199,9 +199,7 @@ def _block(plan: Pairs) -> Callable[..., int]:
     width, here, hides, sorts = plan.lanes, plan.listing.slot("here0"), plan.hidden is not None, plan.listing.sorts
     tied = plan.parting and plan.seldom
 
-    def block_of(
-        context: Any, shape: Any, first: Any, at: Any, upto: Any, found: Any, pos: Any, vel: Any, time: Any
-    ) -> Any:
+    def block_of(context: Any, shape: Any, first: Any, at: Any, upto: Any, found: Any, time: Any) -> Any:
         scratch, numbers, ranges = context.scratch, context.numbers, context.scratch.ranges
         if sorts:
             arrays = scratch.lanes, np.uint64(0), scratch.records
@@ -257,7 +255,7 @@ def meet_neighbours(plan: Pairs) -> Callable[..., None]:
             work[b, 1] += 1
             work[b, 3] += folds * context.n * context.obstacle_radius.shape[1]
         shape = list_all(context, pos, vel)
-        scratch.tally[context.rank] = walk(context, shape, pos, vel, time)
+        scratch.tally[context.rank] = walk(context, shape, time)
         wait_for_team(scratch.sync, context.team)  # what is felt was written by others
         if context.rank == 0:
             for r in range(context.team):

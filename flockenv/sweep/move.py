@@ -19,11 +19,15 @@ from flockenv.sweep.agents import AgentPlan, agent_plan, alone_of
 from flockenv.sweep.blocks import common_places, put_vector_of, vector_of_lane
 from flockenv.sweep.laws import OneLaw, given_of, says_of
 from flockenv.sweep.parts import Parts
-from flockenv.sweep.respond import felt_of, felt_place
+from flockenv.sweep.respond import felt_of
 from flockenv.vec import add, dot, limit, norm, scale, select, sub, zero
 from flockenv.vehicle import faced, held, leant, raised, turned
 
 __all__ = ["InnerPlan", "MovePlan", "begin_agent_of", "inner_plan", "move_of", "move_plan"]
+
+
+CHANNELS = 8
+"""Channels of random numbers of each effect."""
 
 
 class Kept(NamedTuple):
@@ -31,7 +35,7 @@ class Kept(NamedTuple):
 
     begin: OneLaw
     keep: OneLaw
-    felt: int  # where what its pair law has found out lies, see respond.felt_place; -1: it has none
+    felt: int  # where what its pair law has found out lies, see Parts.felt_at; -1: it has none
 
 
 class InnerPlan(NamedTuple):
@@ -47,7 +51,7 @@ class MovePlan(NamedTuple):
     """What moving the agents of a block depends on."""
 
     agent: AgentPlan
-    masked: bool  # may agents have in common what they read?
+    masked: bool  # may what is the same for all agents lie where the first block has it?
     confine: Law
     bounce: Law | None
     turns: bool
@@ -66,7 +70,7 @@ def inner_plan(parts: Parts) -> InnerPlan | None:
     laws = [
         Kept(
             OneLaw.of(parts, k, "begin_law"), OneLaw.of(parts, k, "keep_law"),
-            felt_place(parts, f"n{k}_") if effect.pair_law else -1,
+            parts.felt_at(f"n{k}_") if effect.pair_law else -1,
         )
         for k, effect in parts.keeping
     ]  # fmt: skip
@@ -74,7 +78,7 @@ def inner_plan(parts: Parts) -> InnerPlan | None:
         tuple((j, effect.keeps.index(name)) for j, (_, effect) in enumerate(parts.keeping) if name in effect.keeps)
         for name in parts.inner
     )
-    return InnerPlan(agent_plan(parts), tuple(laws), numbers, parts.dimension * len(parts.targets) * parts.width)
+    return InnerPlan(agent_plan(parts), tuple(laws), numbers, parts.felt_size)
 
 
 def move_plan(parts: Parts) -> MovePlan:
@@ -133,7 +137,7 @@ def _draws(channel: int) -> Callable[..., float]:
 def _kicked(kicks: tuple[tuple[int, Law], ...], dimension: int) -> Callable[..., tuple[Vec, Vec]]:
     """Return `kicked(numbers, me, free, drawn, instant, dt, x, v)`: x and v with what is added once per step."""
     before, (k, law) = _kicked(kicks[:-1], dimension) if kicks[1:] else None, kicks[-1]
-    draws = tuple_from(*(_draws(8 * k + j) for j in range(dimension)))
+    draws = tuple_from(*(_draws(CHANNELS * k + j) for j in range(dimension)))
 
     def kicked(numbers: Any, me: Any, free: Any, drawn: Any, instant: Any, dt: Any, x: Any, v: Any) -> Any:
         if before is not None:
@@ -150,7 +154,7 @@ def _kicked(kicks: tuple[tuple[int, Law], ...], dimension: int) -> Callable[...,
 
 @section
 def _turned(plan: MovePlan) -> Callable[..., Any]:
-    """Make `turn(scratch, i, at, dt, was, x, v)`: x and v of an agent that cannot turn faster than it can, and ahead.
+    """Make `turn(scratch, i, at, dt, was, x, v)`: x, v and heading of an agent that turns by max_turn_rate dt at most.
 
     Neither its velocity nor its way in this step does; what a medium adds to its way is none of its doing.
     """
@@ -196,7 +200,7 @@ def _facing(plan: MovePlan) -> Callable[..., None]:
 
 @functools.cache
 def _becomes(number: int, said: tuple[tuple[int, int], ...]) -> Callable[[Any, Any], float]:
-    """Return `becomes(was, says)`: what a number is, as one law says, or what was and all changes."""
+    """Return `becomes(was, says)`: a number as its only law says, or what it was and what several laws change."""
     if said[1:]:
         return _changed(number, said)
     ((law, place),) = said

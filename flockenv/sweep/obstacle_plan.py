@@ -78,13 +78,13 @@ def obstacle_plan(parts: Parts, agent: AgentPlan) -> Obstacles:
             e.rays(d) if e.obstacle_ray is not None else 1, e.obstacle_pieces,
             around if e.occluded_obstacles else None, places(f"o{k}_"),
             places(f"ahead{k}_") if e.obstacle_edges else (),
-            parts.targets.index(parts.pair_target(k)) * d * width if e.pair_law is not None else -1,
+            parts.felt_at(parts.pair_target(k)) if e.pair_law is not None else -1,
         )
         for k, e in enumerate(parts.effects)
         if e.obstacle_start is not None and e.obstacle_law is not None
     )  # fmt: skip
     return Obstacles(
-        agent, around, folds, parts.arranges, d * len(parts.targets) * width,
+        agent, around, folds, parts.arranges, parts.felt_size,
         slots["reach0"] * width if "reach0" in slots else -1, slots["found0"] * width if "found0" in slots else -1,
         parts.bounded, parts.looked_up, parts.only_rays,
     )  # fmt: skip

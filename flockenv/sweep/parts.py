@@ -275,6 +275,15 @@ class Parts(MetObstacles):
         return [name for name in names if name in found]
 
     @property
+    def felt_size(self) -> int:
+        """How many numbers of a block lie in `felt`: a vector of each agent for each target."""
+        return self.dimension * len(self.targets) * self.width
+
+    def felt_at(self, target: str) -> int:
+        """Return where among those what the pair laws came to for a target lies."""
+        return self.targets.index(target) * self.dimension * self.width
+
+    @property
     def one_stage(self) -> bool:
         """True if the method asks once, and then moves every coordinate by itself."""
         return isinstance(self.integrator, OneStage)

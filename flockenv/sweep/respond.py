@@ -29,7 +29,7 @@ from flockenv.sweep.pair_plan import Pairs, pairs_of
 from flockenv.sweep.parts import Parts
 from flockenv.vec import add, limit, scale, select, zero
 
-__all__ = ["accelerate_of", "felt_of", "felt_place", "respond_of", "response_plan", "sense_of", "sense_plan"]
+__all__ = ["accelerate_of", "felt_of", "respond_of", "response_plan", "sense_of", "sense_plan"]
 
 
 class Added(NamedTuple):
@@ -52,7 +52,7 @@ class ResponsePlan(NamedTuple):
     """What the acceleration of an agent depends on, once all is sensed."""
 
     agent: AgentPlan
-    masked: bool  # may agents have in common what they read?
+    masked: bool  # may what is the same for all agents lie where the first block has it?
     media: tuple[OneLaw, ...]
     flows: tuple[OneLaw, ...]
     added: tuple[Added, ...]
@@ -73,8 +73,9 @@ def response_plan(parts: Parts) -> ResponsePlan:
             added.append((parts.target(k), Added("still" if rests else "own", OneLaw.of(parts, k, "own_law"))))
         if effect.obstacle_start is not None and effect.obstacle_finish is not None:
             slots = tuple(place * parts.width for name, place in parts.slots.items() if name.startswith(f"o{k}_"))
+            # a fold sees no images: its law met obstacles by the shortest way
             added.append((parts.target(k), Added("fold", OneLaw(k, effect.obstacle_finish), slots)))
-    added += [(name, Added("felt", None, (felt_place(parts, name),))) for name in parts.targets if name[0] != "n"]
+    added += [(name, Added("felt", None, (parts.felt_at(name),))) for name in parts.targets if name[0] != "n"]
     added += [("f", Added("pulled"))] * parts.pulls
     mine = [(k, e) for k, e in enumerate(parts.effects) if e.wishes]
     reconciled = tuple(
@@ -86,14 +87,9 @@ def response_plan(parts: Parts) -> ResponsePlan:
         agent_plan(parts), parts.arranges, laws_of(parts, "medium_law"), laws_of(parts, "flow_law"),
         tuple(one for _, one in added),
         tuple(tuple(j for j, (to, _) in enumerate(added) if to == name) for name in targets),
-        reconciled, (steered[0], steered[1]), parts.dimension * len(parts.targets) * parts.width,
+        reconciled, (steered[0], steered[1]), parts.felt_size,
         obstacle_plan(parts, agent_plan(parts)) if parts.folds_obstacles else None,
     )  # fmt: skip
-
-
-def felt_place(parts: Parts, name: str) -> int:
-    """Return where what the pair laws came to for one of their targets lies among the numbers of a block in `felt`."""
-    return parts.targets.index(name) * parts.dimension * parts.width
 
 
 # --- what is felt from others -----------------------------------------------------------------------------------------
@@ -278,9 +274,9 @@ def respond_of(plan: ResponsePlan) -> Callable[..., None]:
 
 
 @section
-def accelerate_of(plan: ResponsePlan, felt: SensePlan) -> Callable[..., None]:
+def accelerate_of(plan: ResponsePlan, sensed: SensePlan) -> Callable[..., None]:
     """Make `accelerate(context, pos, vel, time, out)`: write the acceleration of this thread's agents, m/s^2."""
-    sense, respond, size = sense_of(felt), respond_of(plan), np.uint64(plan.agent.dimension * plan.agent.width)
+    sense, respond, size = sense_of(sensed), respond_of(plan), np.uint64(plan.agent.dimension * plan.agent.width)
 
     def accelerate(context: Any, pos: Any, vel: Any, time: Any, out: Any) -> None:
         sense(context, pos, vel, time)

@@ -59,24 +59,25 @@ class StepPlan(NamedTuple):
     sense: SensePlan
     response: ResponsePlan
     move: MovePlan
-    method: tuple[Callable[[Provided], Method], MethodPlan] | None  # of several stages
+    method: Callable[[Provided], Method] | None  # of several stages
+    method_plan: MethodPlan
     tells: bool  # are inner states told what is sensed at the beginning of a step?
-    asks: tuple[int, ...]  # numbers of a block in `pos`, `vel`, `felt` and `ident`, that are asked for ahead; or none
-    trusts: bool
-    spreads: bool
+    ahead: tuple[int, ...]  # numbers of a block in `pos`, `vel`, `felt` and `ident`, that are asked for ahead; or none
+    trusts: bool  # is every agent at a finite place until a step has failed? see Parts.trusts
+    spreads: bool  # does NaN spread at once to all agents that meet the one that has it?
 
 
 def step_plan(parts: Parts) -> StepPlan:
     """Return the plan of a scene."""
     d, w = parts.dimension, parts.width
     counts = tuple((k, OneLaw.of(parts, k, "count_law")) for k, e in enumerate(parts.effects) if e.count_law)
-    method = None if parts.one_stage else (parts.integrator.advance(), method_plan(parts))
+    method = None if parts.one_stage else parts.integrator.advance()
     return StepPlan(
         agent_plan(parts), len(parts.inner), parts.number_plan,
         parts.space.confine_law if parts.confines else None,
         arrange_plan(parts) if parts.arranges else None, counts, sense_plan(parts), response_plan(parts),
-        move_plan(parts), method, parts.inner != () and parts.integrator.solves,
-        (d * w, d * w, d * len(parts.targets) * w, w) if parts.sorts else (), parts.trusts, parts.spreads,
+        move_plan(parts), method, method_plan(parts), parts.inner != () and parts.integrator.solves,
+        (d * w, d * w, parts.felt_size, w) if parts.sorts else (), parts.trusts, parts.spreads,
     )  # fmt: skip
 
 
@@ -165,7 +166,7 @@ def _in_two_loops(plan: StepPlan) -> Callable[..., None]:
     """
     size = np.uint64(plan.agent.dimension * plan.agent.width)
     respond, move = respond_of(plan.response), move_of(plan.move)
-    ask_ahead = _ask_ahead(plan.asks, plan.agent.width) if plan.asks else None
+    ask_ahead = _ask_ahead(plan.ahead, plan.agent.width) if plan.ahead else None
     sense = sense_of(plan.sense)
 
     def advance(context: Any, pos: Any, vel: Any, time: Any, dt: Any, instant: Any) -> None:
@@ -187,24 +188,24 @@ def _in_two_loops(plan: StepPlan) -> Callable[..., None]:
 def _by_method(plan: StepPlan) -> Callable[..., None]:
     """Make what moves agents by a method of several stages, which asks for accelerations by itself."""
     assert plan.method is not None
-    count, move, (method, numbers) = plan.agent.dimension * plan.agent.width, move_of(plan.move), plan.method
-    advance_by = advance_of(method, numbers)(accelerate_of(plan.response, plan.sense))
+    size, move = plan.agent.dimension * plan.agent.width, move_of(plan.move)
+    advance_by = advance_of(plan.method, plan.method_plan)(accelerate_of(plan.response, plan.sense))
     flows, bounces, sense = plan.move.flows, plan.move.bounce is not None, sense_of(plan.sense) if plan.tells else None
 
     def advance(context: Any, pos: Any, vel: Any, time: Any, dt: Any, instant: Any) -> None:
         scratch, first, end = context.scratch, context.first, context.end
         if sense is not None:
             sense(context, pos, vel, time)
-        for i in range(np.uint64(first * count), np.uint64(end * count)):
+        for i in range(np.uint64(first * size), np.uint64(end * size)):
             scratch.aside[i] = pos[i]
             if bounces:
                 scratch.aside[np.uint64(len(pos)) + i] = vel[i]
         if flows:
-            advance_by(context, pos, vel, scratch.carrying, time, dt, scratch.stages, first * count, end * count)
+            advance_by(context, pos, vel, scratch.carrying, time, dt, scratch.stages, first * size, end * size)
         else:
-            advance_by(context, pos, vel, (), time, dt, scratch.stages, first * count, end * count)
+            advance_by(context, pos, vel, (), time, dt, scratch.stages, first * size, end * size)
         for block in range(np.uint64(first), np.uint64(end)):
-            move(context, pos, vel, time, dt, instant, block, block * np.uint64(count))
+            move(context, pos, vel, time, dt, instant, block, block * np.uint64(size))
 
     return advance
 
@@ -228,7 +229,10 @@ def _first_bad(bad: int, width: int) -> Callable[..., Any]:
 
 @section
 def _failing(bad: int, width: int) -> Callable[..., Any]:
-    """Make `failing(lanes, well, step, n, failed)`: the step and agent, as one number, of which the first failed."""
+    """Make `failing(lanes, well, step, n, failed, none_failed)`: which agent failed first, and in which step.
+
+    As one number, step * n + agent; `none_failed`, n (count + 1), as long as none has.
+    """
     at, lowest = np.uint64(bad), _first_bad(bad, width)
 
     def failing(lanes: Any, well: Any, step: Any, n: Any, failed: Any, none_failed: Any) -> Any:
@@ -283,10 +287,10 @@ def _enter(plan: StepPlan) -> Callable[..., Context]:
 def step_world_of(plan: StepPlan) -> Callable[..., int]:
     """Make `step_world(worlds, drive, asked, params, dt, count, b, rank, team, scratch)`.
 
-    It advances this thread's part of world b by `count` steps, and returns an agent that is not finite, or -1: the
-    lowest of those at the end of the call, or, where that spreads, after the first step that failed. A world in which
-    an agent is not finite stays as it was, whole. What is asked of its agents is drive[:, asked], N; nothing if drive
-    is empty.
+    It advances this thread's part of world b by `count` steps, and returns -1, or an agent that is not finite: the
+    lowest at the end of the call, or, where agents make others not finite (`spreads`), the lowest after the first step
+    that failed. Then nothing of the world is written. What is asked of its agents is drive[:, asked], N; nothing if
+    drive is empty.
     """
     agent, width, bad = plan.agent, plan.agent.width, np.uint64(plan.move.bad)
     enter, bring_out, counted = _enter(plan), bring_out_of(agent), tuple(range(COUNTED_BY_KERNELS))
@@ -342,21 +346,21 @@ def _verdict(trusts: bool, dimension: int) -> Callable[..., int]:
         # the first half may still be read by threads that count
         scratch.tally[team + rank] = failed
         wait_for_team(scratch.sync, team)
-        first_bad = none_failed
+        first = none_failed
         for r in range(team):
-            first_bad = min(first_bad, scratch.tally[team + r])
+            first = min(first, scratch.tally[team + r])
         wait_for_team(scratch.sync, team)  # before any thread counts again
-        if first_bad >= none_failed:
+        if first >= none_failed:
             return np.int64(-1)
-        first_bad %= n
+        agent = first % n
         if rank == 0:
             for k in range(COUNTED_BY_KERNELS):
                 worlds.work[b, k] = before[k]
-        if trusts:  # an agent that was nowhere before is the one it comes from
+        if trusts:  # an agent that was not finite before the call is the one to blame
             for i in range(n):
                 for k in range(dimension):
                     if worlds.alive[b, i] and not finite(worlds.x[k, b, i]):
                         return np.int64(i)
-        return np.int64(first_bad)
+        return np.int64(agent)
 
     return verdict
