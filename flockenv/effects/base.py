@@ -66,12 +66,19 @@ from flockenv.records import Record
 from flockenv.vec import dot
 
 __all__ = [
-    "EFFECTS", "Bonds", "Effect", "Far", "Me", "Obstacle", "Other", "Sight", "Vector", "all_masses", "demand_group",
+    "EFFECTS", "LAWS", "Bonds", "Effect", "Far", "Me", "Obstacle", "Other", "Sight", "Vector", "all_masses", "demand_group",
     "in_view", "network_of", "ties",
 ]  # fmt: skip
 
 Vector = Annotated[tuple[Annotated[float, Field(strict=True)], ...], Field(min_length=2, max_length=3)]
 """A parameter with a direction, or a place: as many numbers as the scene has dimensions."""
+
+LAWS = (
+    "own_law", "medium_law", "flow_law", "far_law", "bond_law", "kick_law", "aim_law", "begin_law", "keep_law",
+    "count_law", "pair_start", "pair_law", "apart_law", "finish_law", "obstacle_start", "obstacle_law",
+    "obstacle_finish", "obstacle_ray", "obstacle_from", "obstacle_reach",
+)  # fmt: skip
+"""The slots that an effect may fill with a law."""
 
 EFFECTS: dict[str, type[Effect]] = {}
 """Every effect by its kind; a class registers itself when it is defined."""

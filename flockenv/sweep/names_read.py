@@ -6,17 +6,10 @@ import inspect
 from collections.abc import Sequence
 from typing import Any
 
-from flockenv.effects.base import Effect
+from flockenv.effects.base import LAWS, Effect
 from flockenv.kernels import IN_PYTHON, held, python_of
 
-__all__ = ["LAWS", "OF_PAIRS", "names_read"]
-
-LAWS = (
-    "own_law", "medium_law", "flow_law", "far_law", "bond_law", "kick_law", "aim_law", "begin_law", "keep_law",
-    "count_law", "pair_start", "pair_law", "apart_law", "finish_law", "obstacle_start", "obstacle_law",
-    "obstacle_finish", "obstacle_ray", "obstacle_from", "obstacle_reach",
-)  # fmt: skip
-"""The slots that an effect may fill with a law."""
+__all__ = ["OF_PAIRS", "names_read"]
 
 OF_PAIRS = ("pair_start", "pair_law", "apart_law", "finish_law")
 """Those that are about a neighbour."""

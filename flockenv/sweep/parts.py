@@ -17,14 +17,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flockenv import processor
-from flockenv.effects.base import Effect, Sight
+from flockenv.effects.base import LAWS, Effect, Sight
 from flockenv.integrators.base import Integrator
 from flockenv.integrators.one_stage import OneStage
 from flockenv.kernels import LINE
 from flockenv.shapes.cells import MOST_FOUND
 from flockenv.space import Space
 from flockenv.sweep.met_obstacles import MetObstacles
-from flockenv.sweep.names_read import LAWS, OF_PAIRS, names_read
+from flockenv.sweep.names_read import OF_PAIRS, names_read
 from flockenv.sweep.numbers import NumberPlan, pack_numbers
 
 __all__ = ["Look", "Parts", "flattened"]
