@@ -26,6 +26,7 @@ from flockenv.behaviours.hide import Hide  # noqa: E402
 from flockenv.behaviours.keep_off import ObstacleRepulsion  # noqa: E402
 from flockenv.behaviours.orca import Orca  # noqa: E402
 from flockenv.behaviours.paths import FollowFlow, FollowPath, StayOnPath  # noqa: E402
+from flockenv.behaviours.shepherd import Shepherd  # noqa: E402
 from flockenv.behaviours.social import CircularRepulsion, EllipticalRepulsion, Sidestep  # noqa: E402
 from flockenv.behaviours.walls import Contain, FollowWall  # noqa: E402
 from flockenv.behaviours.wander import Wander  # noqa: E402
@@ -37,8 +38,8 @@ __all__ = [
     "Driving", "EllipticalRepulsion", "Evade", "Explore", "Face", "Flee", "FollowFlow", "FollowLeader", "FollowPath",
     "FollowWall", "FollowWay", "Forage", "ForceField", "Formation", "Friends", "Heuristics", "Hide", "Interest",
     "Interpose", "LineUp", "MatchVelocity", "ObstacleRepulsion", "OffsetPursue", "Orca", "Pursue", "Queue", "Seek",
-    "Separation", "Shadow", "Sidestep", "StayOnPath", "TargetSpeed", "UnalignedAvoidance", "WalkingGroup", "Wander",
-    "Whiskers",
+    "Separation", "Shadow", "Shepherd", "Sidestep", "StayOnPath", "TargetSpeed", "UnalignedAvoidance", "WalkingGroup",
+    "Wander", "Whiskers",
 ]  # fmt: skip
 
 BEHAVIOURS: dict[str, type[Effect]] = {kind: effect for kind, effect in EFFECTS.items() if effect.steering}

@@ -13,6 +13,8 @@ An effect is of one or more of three forms, each a law for one agent:
   one place alone;
 * `far_law(p, me, other) -> force`: of everybody else, however far, of whom groups far away are met as one; `other` is
   a `Far`, and of `me` it may read pos and mass alone; `p.opening` says how large such a group may look;
+* `group_law(p, me, members) -> force`: of all living agents with numbers from p.first to before p.end, as one:
+  `members` is a `Members`; the effect's `members` says which agents these are;
 * `bond_law(p, me, others, numbers) -> force`: of one of the bonds that the effect's `bonds` lists, each between an
   agent and one or more partners (springs, hinges, finite elements);
 * `kick_law(p, me, seconds, gauss) -> velocity`: added once per step, however often a method asks for forces, with one
@@ -66,16 +68,16 @@ from flockenv.records import Record
 from flockenv.vec import dot
 
 __all__ = [
-    "EFFECTS", "LAWS", "Bonds", "Effect", "Far", "Me", "Obstacle", "Other", "Sight", "Vector", "all_masses", "demand_group",
-    "in_view", "network_of", "ties",
+    "EFFECTS", "LAWS", "Bonds", "Effect", "Far", "Me", "Members", "Obstacle", "Other", "Sight", "Vector", "all_masses",
+    "demand_group", "in_view", "network_of", "ties",
 ]  # fmt: skip
 
 Vector = Annotated[tuple[Annotated[float, Field(strict=True)], ...], Field(min_length=2, max_length=3)]
 """A parameter with a direction, or a place: as many numbers as the scene has dimensions."""
 
 LAWS = (
-    "own_law", "medium_law", "flow_law", "far_law", "bond_law", "kick_law", "aim_law", "begin_law", "keep_law",
-    "count_law", "pair_start", "pair_law", "apart_law", "finish_law", "obstacle_start", "obstacle_law",
+    "own_law", "group_law", "medium_law", "flow_law", "far_law", "bond_law", "kick_law", "aim_law", "begin_law",
+    "keep_law", "count_law", "pair_start", "pair_law", "apart_law", "finish_law", "obstacle_start", "obstacle_law",
     "obstacle_finish", "obstacle_ray", "obstacle_from", "obstacle_reach",
 )  # fmt: skip
 """The slots that an effect may fill with a law."""
@@ -157,6 +159,15 @@ class Sight(NamedTuple):
     occluded: bool = False  # not whom an obstacle hides: none stands in the straight way to his centre
 
 
+class Members(NamedTuple):
+    """All living agents of a group, as an agent sees them."""
+
+    size: float  # how many they are; 0: all that follows is 0, too
+    centre: Vec  # m, the centre of all minus me; on a torus of those images that are nearest to the first of them
+    vel: Vec  # m/s, the mean velocity
+    farthest: Vec  # m, the one that is farthest from the centre minus me; of some that are as far, the first
+
+
 class Bonds(NamedTuple):
     """Who is tied to whom: one row for each agent that a bond acts on, so that everybody gathers what acts on him."""
 
@@ -220,6 +231,7 @@ class Effect(Record):
     steering: ClassVar[bool] = False
     """True if it is something the agent wants (bounded by max_force together with its drive), False for physics."""
     own_law: ClassVar[Law | None] = None
+    group_law: ClassVar[Law | None] = None
     medium_law: ClassVar[Law | None] = None
     flow_law: ClassVar[Law | None] = None
     far_law: ClassVar[Law | None] = None
@@ -423,7 +435,8 @@ class Effect(Record):
         return tuple(
             text
             for text, law in (
-                ("neighbour query", self.pair_law), ("all others", self.far_law), ("bonds", self.bond_law),
+                ("neighbour query", self.pair_law), ("all others", self.far_law),
+                ("a group as one", self.group_law), ("bonds", self.bond_law),
                 ("obstacles", self.obstacle_law or (self.sight and self.sight.occluded)),
                 ("random numbers", self.kick_law),
             )

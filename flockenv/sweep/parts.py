@@ -107,6 +107,11 @@ class Parts(MetObstacles):
         return [(k, e) for k, e in enumerate(self.effects) if e.bond_law is not None]
 
     @functools.cached_property
+    def grouped(self) -> list[tuple[int, Effect]]:
+        """The effects with a law about a group as one, and their numbers."""
+        return [(k, e) for k, e in enumerate(self.effects) if e.group_law is not None]
+
+    @functools.cached_property
     def far(self) -> list[tuple[int, Effect]]:
         """The effects with a law about all agents, and their numbers."""
         return [(k, e) for k, e in enumerate(self.effects) if e.far_law is not None]
@@ -169,7 +174,7 @@ class Parts(MetObstacles):
     @property
     def spreads(self) -> bool:
         """True if NaN spreads at once to all agents that meet the one that has it."""
-        return self.trusts and any(effect.vanishes for effect in self.effects)
+        return self.trusts and (bool(self.grouped) or any(effect.vanishes for effect in self.effects))
 
     @functools.cached_property
     def averaged(self) -> list[int]:
@@ -342,9 +347,9 @@ class Parts(MetObstacles):
     def arranges(self) -> bool:
         """True if agents of a large world may be put in order for a while.
 
-        Not where places matter: bonds know their partners by them, and far laws meet all agents in their order.
+        Not where places matter: bonds know their partners by them, far laws and groups meet agents in their order.
         """
-        return self.sorts and bool(self.pairs) and not self.pulls
+        return self.sorts and bool(self.pairs) and not self.pulls and not self.grouped
 
     @property
     def homely(self) -> bool:
@@ -390,6 +395,7 @@ class Parts(MetObstacles):
         runs += [(f"many{q}_", 1) for q in self.averaged]
         runs += [(f"o{k}_", e.folded(d) if e.obstacle_start else 0) for k, e in enumerate(self.effects)]
         runs += [(f"g{name}", d) for name in self.targets]
+        runs += [(f"group{k}_", 1 + 3 * d) for k, _ in self.grouped]
         runs += [("bond", d * bool(self.bonded)), ("far", d * bool(self.far))]
         edges = [k for k, e in enumerate(self.effects) if e.obstacle_start and e.obstacle_edges]
         runs += [(f"ahead{k}_", 2) for k in edges]

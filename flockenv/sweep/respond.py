@@ -21,7 +21,8 @@ from flockenv.sweep.blocks import common_places, put_vector_of, vector_of_lane
 from flockenv.sweep.bonds import BondPlan, bond_plan, bonds_of
 from flockenv.sweep.far import FarPlan, far_of, far_plan
 from flockenv.sweep.gather import gather, picked
-from flockenv.sweep.laws import OneLaw, laws_of, says_of, sum_of
+from flockenv.sweep.groups import GroupPlan, find_groups_of, group_plan, members_of
+from flockenv.sweep.laws import OneLaw, given_of, laws_of, says_of, sum_of
 from flockenv.sweep.meeting import meet_neighbours
 from flockenv.sweep.obstacle_plan import Obstacles, obstacle_plan
 from flockenv.sweep.obstacles import obstacles_of
@@ -35,7 +36,7 @@ __all__ = ["accelerate_of", "felt_of", "respond_of", "response_plan", "sense_of"
 class Added(NamedTuple):
     """Something that is added to what an agent wants, to what acts on it, or to one of its wishes."""
 
-    kind: str  # "own" law, "still": an own law without its drag, "fold" over obstacles, "felt", "pulled"
+    kind: str  # "own" law, "still": an own law without its drag, "group", "fold" over obstacles, "felt", "pulled"
     law: OneLaw | None = None  # of a fold: what ends it
     places: tuple[int, ...] = ()  # of a fold: its numbers among the lanes; of what is felt: where it lies in a block
 
@@ -61,6 +62,7 @@ class ResponsePlan(NamedTuple):
     steered: tuple[tuple[int, ...], tuple[int, ...]]  # which of those come to: what it wants, what acts on it
     felt: int  # numbers of a block in `felt`
     obstacles: Obstacles | None
+    groups: GroupPlan | None
 
 
 def response_plan(parts: Parts) -> ResponsePlan:
@@ -71,6 +73,8 @@ def response_plan(parts: Parts) -> ResponsePlan:
         if effect.own_law is not None:
             rests = effect.linear_drag is not None and parts.integrator.splits_drag
             added.append((parts.target(k), Added("still" if rests else "own", OneLaw.of(parts, k, "own_law"))))
+        if effect.group_law is not None:
+            added.append((parts.target(k), Added("group", OneLaw.of(parts, k, "group_law"))))
         if effect.obstacle_start is not None and effect.obstacle_finish is not None:
             slots = tuple(place * parts.width for name, place in parts.slots.items() if name.startswith(f"o{k}_"))
             # a fold sees no images: its law met obstacles by the shortest way
@@ -89,6 +93,7 @@ def response_plan(parts: Parts) -> ResponsePlan:
         tuple(tuple(j for j, (to, _) in enumerate(added) if to == name) for name in targets),
         reconciled, (steered[0], steered[1]), parts.felt_size,
         obstacle_plan(parts, agent_plan(parts)) if parts.folds_obstacles else None,
+        group_plan(parts) if parts.grouped else None,
     )  # fmt: skip
 
 
@@ -103,6 +108,7 @@ class SensePlan(NamedTuple):
     pairs: Pairs | None
     far: FarPlan | None
     bonds: BondPlan | None
+    groups: GroupPlan | None
 
 
 def sense_plan(parts: Parts) -> SensePlan:
@@ -113,6 +119,7 @@ def sense_plan(parts: Parts) -> SensePlan:
         pairs_of(parts) if parts.pairs else None,
         far_plan(parts) if parts.far else None,
         bond_plan(parts, agent) if parts.bonded else None,
+        group_plan(parts) if parts.grouped else None,
     )  # fmt: skip
 
 
@@ -123,6 +130,7 @@ def sense_of(plan: SensePlan) -> Callable[..., None]:
     meet = meet_neighbours(plan.pairs) if plan.pairs is not None else None
     far = far_of(plan.far) if plan.far is not None else None
     bonds = bonds_of(plan.bonds) if plan.bonds is not None else None
+    find_groups = find_groups_of(plan.groups) if plan.groups is not None else None
 
     def sense(context: Any, pos: Any, vel: Any, time: Any) -> None:
         if context.rank == 0:
@@ -135,6 +143,8 @@ def sense_of(plan: SensePlan) -> Callable[..., None]:
             far(context, pos, time)
         if bonds is not None:
             bonds(context, pos, vel, time)
+        if find_groups is not None:
+            find_groups(context, pos, vel)
 
     return sense
 
@@ -189,6 +199,15 @@ def _adding(plan: ResponsePlan, added: Added) -> Callable[..., Vec]:
         k, law = one.k, one.law
         return kernel(
             lambda numbers, scratch, me, row, at, lane: law(numbers.effects[k], me, gather(scratch.lanes, lane, places))
+        )
+    if kind == "group":
+        given, law = given_of(one.k, one.images), one.law
+        assert plan.groups is not None
+        members = members_of(plan.groups, next(each for each in plan.groups.laws if each.k == one.k))
+        return kernel(
+            lambda numbers, scratch, me, row, at, lane: law(
+                given(numbers, me), me, members(scratch.lanes, numbers.size, me.pos)
+            )
         )
     says = says_of(one)
     if kind == "still":
