@@ -23,6 +23,10 @@ FAIL = {
 """What fails under every method, as docs/stress.md says."""
 
 
+WARNED = {"N27 project"}  # in one of 54,000 steps of a world, bodies that are held back leave a contact unsolved
+"""What holds its bound, and warns, since bodies are held back that parting would put past others."""
+
+
 def found(name: str, method: Integrator | None = None) -> Finding:
     (finding,) = run((CASE[name],), (method or SemiImplicitEuler(),)).findings
     return finding
@@ -78,4 +82,4 @@ def test_methods_do_what_is_known(method: Integrator, name: str) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("name", [case.name for case in GATHERINGS if case.name != "N11 64 project"])
 def test_gatherings_stay_within_their_bounds(name: str) -> None:
-    assert found(name).verdict == "pass"
+    assert found(name).verdict == ("warned" if name in WARNED else "pass")
