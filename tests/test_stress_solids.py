@@ -23,7 +23,7 @@ FAIL = {
 """What fails under every method, as docs/stress.md says."""
 
 
-WARNED = {"N27 project"}  # in one of 54,000 steps of a world, bodies that are held back leave a contact unsolved
+WARNED = {"N27 project"}  # bodies that are held back leave contacts unsolved in some step
 """What holds its bound, and warns, since bodies are held back that parting would put past others."""
 
 
