@@ -65,6 +65,7 @@ __all__ = [
     "routine",
     "settled",
     "shared",
+    "sources_of_code",
     "stacked",
     "tallied",
     "tally_of",
@@ -389,19 +390,25 @@ def cache_folder() -> Path:
     return first_private(Path(home) / "flockenv", Path(tempfile.gettempdir()), f"flockenv-{user}")
 
 
-@functools.cache
-def laws_digest() -> str:
-    """Digest every source of the package that holds laws, or says how code is made of them.
-
-    An edit to one means new files, never stale machine code. Nothing of the machine is in it: results are the same.
-    """
-    digest = hashlib.sha256(f"{numba.__version__} {sys.version_info[:2]}".encode())
+def sources_of_code() -> Iterator[tuple[Path, bytes]]:
+    """Yield every source of the package that holds laws or records of theirs, or says how code is made of them."""
     how = [Path(str(module.__file__)) for module in (sys.modules[__name__], inlining, frontend, lowering)]
     for path in sorted(Path(__file__).parent.rglob("*.py")):
         text = path.read_bytes()
         told = b"from flockenv.kernels import" in text or b"from flockenv.section import" in text
-        if told or path in how or path.parent.name == "sweep":
-            digest.update(text)
+        if told or path in how or path.parent.name in ("sweep", "tasks"):
+            yield path, text
+
+
+@functools.cache
+def laws_digest() -> str:
+    """Digest `sources_of_code`.
+
+    An edit to one means new files, never stale machine code. Nothing of the machine is in it: results are the same.
+    """
+    digest = hashlib.sha256(f"{numba.__version__} {sys.version_info[:2]}".encode())
+    for _, text in sources_of_code():
+        digest.update(text)
     return digest.hexdigest()
 
 
