@@ -460,7 +460,7 @@ EFFECTS = (
         FollowLeader(weight=2, speed=1.5, group=0, radius=2.5, distance=0.5, headway=0.3, slow_radius=1),
         family="others",
     ),
-    EffectRow(Shepherd(weight=2, speed=1.5, group=0, goal=CENTRE, spacing=0.4, slow_radius=2), family="others"),
+    EffectRow(Shepherd(weight=2, speed=1.5, group=0, goal=CENTRE, spacing=0.4, slow_radius=2)),
     EffectRow(Interpose(weight=2, speed=1.5, group=0, other=0, radius=2.5, slow_radius=1), family="others"),
     EffectRow(Hide(weight=2, speed=1.5, group=0, radius=2.5, slow_radius=1)),
     EffectRow(Whiskers(weight=5, horizon=3), obeys=UPRIGHT, family="around"),  # some are horizontal

@@ -313,6 +313,7 @@ def test_a_part_that_calls_itself() -> None:
 
 def test_another_numba_is_left_alone(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(frontend, "digest", lambda owner, name: "")
+    frontend.reads_as_known.cache_clear()
     lowering.is_brief.cache_clear()
     try:
         assert not lowering.is_brief()
@@ -325,4 +326,6 @@ def test_another_numba_is_left_alone(monkeypatch: pytest.MonkeyPatch) -> None:
 
         assert compiled_whole(entry)(np.arange(8.0).reshape(2, 4), np.ones(4, bool)) == (10.0, True)
     finally:
+        monkeypatch.undo()
+        frontend.reads_as_known.cache_clear()
         lowering.is_brief.cache_clear()

@@ -13,7 +13,7 @@ from flockenv.scene import Group, Scene
 from flockenv.shapes import Block, Capsule, Shape, Sway
 from flockenv.space import Box, Plane, Torus
 from flockenv.spawn import Spawn
-from flockenv.sweep import parts
+from flockenv.sweep import met_obstacles
 
 SIDE = 40.0
 
@@ -79,7 +79,7 @@ def test_a_grid_moves_no_bit(
     name: str, space: Any, dimension: int, dtype: str, moving: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     found = ends(space, EFFECTS[name], dimension, dtype, moving)
-    monkeypatch.setattr(parts, "FEWEST_ROWS", 10**9)  # the loop over all of them, in order
+    monkeypatch.setattr(met_obstacles, "FEWEST_ROWS", 10**9)  # the loop over all of them, in order
     expected = ends(space, EFFECTS[name], dimension, dtype, moving)
     np.testing.assert_array_equal(found[0], expected[0])
     np.testing.assert_array_equal(found[1], expected[1])
