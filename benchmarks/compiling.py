@@ -46,7 +46,7 @@ class Compilation(Contestant):
         return 1
 
     def sample(self, calls: int) -> Sample:
-        """Compile it so many times."""
+        """Compile the scene `calls` times."""
         took = 0.0
         for _ in range(calls):
             with tempfile.TemporaryDirectory() as folder:

@@ -35,12 +35,13 @@ from numba.core.ir_utils import fixup_var_define_in_scope
 from numba.core.types import containers, functions
 from numba.core.typing import context as typing_context
 
+from flockenv.refusals import nearest, shown
 from flockenv.startup import nothing_to_collect
+
+__all__ = ["LEFT_OUT", "SPARED", "TRICKS", "Spared", "Trick", "applies", "lighter", "reads_as_known", "spared"]
 
 LEFT_OUT = "FLOCKENV_NUMBA_ALONE"
 """The environment variable that names replacements to leave out, with commas between; `all`: numba works alone."""
-
-__all__ = ["LEFT_OUT", "SPARED", "TRICKS", "Spared", "Trick", "applies", "lighter", "reads_as_known", "spared"]
 
 # numba is untyped
 _canonical: Any = transforms.canonicalize_cfg
@@ -71,8 +72,10 @@ class Trick(NamedTuple):
 
     @property
     def title(self) -> str:
-        """What it is called where replacements are listed, or left out."""
-        return f"{self.owner.__name__.rpartition('.')[2]}.{self.name}"
+        """What it is called where replacements are listed, or left out: by module, since classes share names."""
+        if inspect.ismodule(self.owner):
+            return f"{self.owner.__name__}.{self.name}".removeprefix("numba.core.")
+        return f"{self.owner.__module__}.{self.owner.__name__}.{self.name}".removeprefix("numba.core.")
 
 
 def digest(owner: Any, name: str) -> str:
@@ -90,8 +93,15 @@ def reads_as_known(reads: tuple[Known, ...]) -> bool:
 
 
 def applies(title: str, reads: tuple[Known, ...]) -> bool:
-    """Return True if a replacement is made: this numba reads as known, and LEFT_OUT does not name it."""
-    left_out = os.environ.get(LEFT_OUT, "").split(",")
+    """Return True if a replacement is made: this numba reads as known, and LEFT_OUT does not name it.
+
+    ValueError for a name in LEFT_OUT that no replacement has.
+    """
+    left_out = [name for name in os.environ.get(LEFT_OUT, "").split(",") if name]
+    allowed = ["all", "lowering", *(each.title for each in (*TRICKS, *SPARED))]
+    for name in left_out:
+        if name not in allowed:
+            raise ValueError(f"{LEFT_OUT}: {shown(name)} is none{nearest(name, allowed)} ({', '.join(allowed)})")
     return reads_as_known(reads) and title not in left_out and "all" not in left_out
 
 

@@ -74,6 +74,16 @@ def test_one_that_reads_otherwise_is_named(monkeypatch: pytest.MonkeyPatch, forg
     assert unmatched() == (trick.title,)
 
 
+def test_each_replacement_has_a_title_of_its_own_and_another_name_is_refused(
+    monkeypatch: pytest.MonkeyPatch, forgotten: None
+) -> None:
+    titles = [each.title for each in (*frontend.TRICKS, *frontend.SPARED)]
+    assert len(set(titles)) == len(titles)
+    monkeypatch.setenv(frontend.LEFT_OUT, "lowring")
+    with pytest.raises(ValueError, match=r"^FLOCKENV_NUMBA_ALONE: 'lowring' is none, did you mean `lowering`"):
+        frontend._replacements()
+
+
 @pytest.mark.parametrize("left_out", ["all", "one"])
 def test_the_environment_leaves_replacements_out(
     left_out: str, monkeypatch: pytest.MonkeyPatch, forgotten: None

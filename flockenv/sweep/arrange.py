@@ -20,7 +20,7 @@ from flockenv.section import section
 from flockenv.sweep.blocks import handed_of, place_of
 from flockenv.sweep.gather import gather, picked, places_each, scatter_each
 from flockenv.sweep.parts import Parts
-from flockenv.sweep.scratch import scratch_record
+from flockenv.sweep.scratch import array_names
 from flockenv.tiles import count_tiles, find_homes
 from flockenv.transpose import put_lines
 
@@ -57,7 +57,7 @@ class ArrangePlan(NamedTuple):
 
 def arrange_plan(parts: Parts) -> ArrangePlan:
     """Return the plan of a scene."""
-    names = ("pos", "vel", *(f"inner{k}" for k in range(len(parts.inner))), *scratch_record(parts)._fields)
+    names = array_names(parts)
     packed = [field.partition(" ") for field in parts.luggage]  # an array, and of vectors which axis
     common = [_COMMON.get(name) for name, _, _ in packed]
     starts = [

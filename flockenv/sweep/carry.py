@@ -33,45 +33,35 @@ def _write_number(number: int) -> Callable[..., None]:
 
 
 @section
+def _between(agent: AgentPlan, inwards: bool) -> Callable[..., None]:
+    """Make `bring(worlds, scratch, b, first, end)`: copy what these blocks of world b carry into scratch, or back."""
+    d, width, oriented, inner = agent.dimension, agent.width, agent.oriented, len(agent.inner)
+    copy, place = (into_blocks if inwards else out_of_blocks)(d, width), int(oriented)
+    copy_numbers = in_turn(*map(_read_number if inwards else _write_number, range(inner)))
+
+    def bring(worlds: Any, scratch: Any, b: Any, first: Any, end: Any) -> None:
+        n = worlds.x.shape[2]
+        copy(scratch.pos, worlds.x, b, n, first, end)
+        copy(scratch.vel, worlds.v, b, n, first, end)
+        if oriented:
+            copy(scratch.facing, worlds.carried[0][:d], b, n, first, end)
+            if d == 3:
+                copy(scratch.above, worlds.carried[0][d:], b, n, first, end)
+        if inner:
+            for i in range(first * width, min(end * width, n)):
+                copy_numbers(scratch.inner, worlds.carried[place], b, i)
+
+    return bring
+
+
 def bring_in_of(agent: AgentPlan) -> Callable[..., None]:
-    """Make `bring_in(worlds, scratch, b, first, end)`: what these blocks of world b carry comes into scratch."""
-    d, width, oriented, inner = agent.dimension, agent.width, agent.oriented, len(agent.inner)
-    into, read, place = into_blocks(d, width), in_turn(*map(_read_number, range(inner))), int(oriented)
-
-    def bring_in(worlds: Any, scratch: Any, b: Any, first: Any, end: Any) -> None:
-        n = worlds.x.shape[2]
-        into(scratch.pos, worlds.x, b, n, first, end)
-        into(scratch.vel, worlds.v, b, n, first, end)
-        if oriented:
-            into(scratch.facing, worlds.carried[0][:d], b, n, first, end)
-            if d == 3:
-                into(scratch.above, worlds.carried[0][d:], b, n, first, end)
-        if inner:
-            for i in range(first * width, min(end * width, n)):
-                read(scratch.inner, worlds.carried[place], b, i)
-
-    return bring_in
+    """Return `bring_in(worlds, scratch, b, first, end)`: what these blocks of world b carry comes into scratch."""
+    return _between(agent, True)
 
 
-@section
 def bring_out_of(agent: AgentPlan) -> Callable[..., None]:
-    """Make `bring_out(worlds, scratch, b, first, end)`: what has become of these blocks of world b goes back."""
-    d, width, oriented, inner = agent.dimension, agent.width, agent.oriented, len(agent.inner)
-    out, write, place = out_of_blocks(d, width), in_turn(*map(_write_number, range(inner))), int(oriented)
-
-    def bring_out(worlds: Any, scratch: Any, b: Any, first: Any, end: Any) -> None:
-        n = worlds.x.shape[2]
-        out(scratch.pos, worlds.x, b, n, first, end)
-        out(scratch.vel, worlds.v, b, n, first, end)
-        if oriented:
-            out(scratch.facing, worlds.carried[0][:d], b, n, first, end)
-            if d == 3:
-                out(scratch.above, worlds.carried[0][d:], b, n, first, end)
-        if inner:
-            for i in range(first * width, min(end * width, n)):
-                write(scratch.inner, worlds.carried[place], b, i)
-
-    return bring_out
+    """Return `bring_out(worlds, scratch, b, first, end)`: what has become of these blocks of world b goes back."""
+    return _between(agent, False)
 
 
 @section

@@ -14,7 +14,7 @@ import numpy as np
 from flockenv.kernels import kernel, like, unaliased
 from flockenv.section import entry_of, in_turn, section, titled
 from flockenv.sweep.agents import alone_of
-from flockenv.sweep.blocks import out_of_blocks, vector_of_lane
+from flockenv.sweep.blocks import out_of_blocks, place_of, vector_of_lane
 from flockenv.sweep.carry import bring_in_of, take_drive_of
 from flockenv.sweep.context import Context
 from flockenv.sweep.move import InnerPlan, begin_agent_of, inner_plan
@@ -84,8 +84,7 @@ def begin_inner_of(plan: BeginPlan) -> Callable[..., None]:
     agent, d, width = plan.inner.agent, plan.inner.agent.dimension, plan.inner.agent.width
     alone, vector, read = alone_of(agent._replace(aims=False)), vector_of_lane(d, width), numbers_of(plan.numbers)
     begin, bring_in = begin_agent_of(plan.inner), bring_in_of(agent._replace(inner=()))
-    size, lanes, place = np.uint64(d * width), np.uint64(width), int(agent.oriented)
-    many = len(agent.inner)
+    place_in, place, many = place_of(d, width), int(agent.oriented), len(agent.inner)
     clear, write = in_turn(*map(_clear_number, range(many))), in_turn(*map(_begin_number, range(many)))
 
     def begin_inner(worlds: Any, params: Any, dt: Any, fresh: Any, b: Any, scratch: Any) -> None:
@@ -95,7 +94,7 @@ def begin_inner_of(plan: BeginPlan) -> Callable[..., None]:
         bring_in(worlds, scratch, b, 0, (n + (width - 1)) // width)
         for i in range(np.uint64(n)):
             if fresh[b, i]:
-                at = (i // lanes) * size + i % lanes
+                at = place_in(i)
                 x, v = vector(scratch.pos, at), vector(scratch.vel, at)
                 clear(scratch.inner, i)
                 me = alone(scratch, worlds.key[b], time, at, i, i, x, v, zero(x))

@@ -21,7 +21,7 @@ from flockenv.neighbours import DISTANT, candidates, count_cells, order_records,
 from flockenv.section import section
 from flockenv.sweep.blocks import handed_of, place_of
 from flockenv.sweep.gather import copy_each, gather, gather_each, picked, places_each, scatter
-from flockenv.sweep.scratch import SMALL_STRIDE, scratch_record
+from flockenv.sweep.scratch import SMALL_STRIDE, array_names
 from flockenv.tiles import FAR_FROM_HOME, count_from_home, order_cells, order_shared
 from flockenv.transpose import out_of_records, put_records
 from flockenv.vec import unit
@@ -119,7 +119,7 @@ def listing_of(parts: Parts, fields: list[str], inside: bool = False, tiled: boo
     return Listing(
         parts.dimension, parts.width, parts.sorts, parts.space.periodic, tuple(fields), inside, tiled,
         tiled and parts.homely, parts.space.confine_law, slots,
-        ("pos", "vel", *(f"inner{k}" for k in range(len(parts.inner))), *scratch_record(parts)._fields),
+        array_names(parts),
     )  # fmt: skip
 
 

@@ -1,4 +1,4 @@
-"""What follows for its obstacles from the parts of a scene: which are met, by whom, and how far laws look for them."""
+"""What follows from the parts of a scene for its obstacles: which forms there are, and which of them laws meet."""
 
 from __future__ import annotations
 

@@ -20,7 +20,7 @@ from flockenv.tree import BUCKETS, LEVELS, tree_sizes
 if TYPE_CHECKING:
     from flockenv.sweep.parts import Parts
 
-__all__ = ["GIVEN", "OWN", "SMALL_STRIDE", "Array", "scratch_bytes", "scratch_of", "scratch_record"]
+__all__ = ["GIVEN", "OWN", "SMALL_STRIDE", "Array", "array_names", "scratch_bytes", "scratch_of", "scratch_record"]
 
 SMALL_STRIDE = 128
 """Places in a row of sorted agents where there are too few to be sorted by cell: their blocks, and one more."""
@@ -121,6 +121,11 @@ def scratch_record(parts: Parts) -> Any:
     """Return the type of the record in which the kernels of a scene find them; `inner` is a tuple of several."""
     names = [name for name in scratch_of(parts, parts.width) if not name.startswith("inner")]
     return record((*names, *["inner"] * bool(parts.inner)))
+
+
+def array_names(parts: Parts) -> tuple[str, ...]:
+    """Return the names of all arrays of a world in progress, in the order of `blocks.handed_of` and of scratch."""
+    return ("pos", "vel", *(f"inner{k}" for k in range(len(parts.inner))), *scratch_record(parts)._fields)
 
 
 def scratch_bytes(parts: Parts, agents: int) -> int:

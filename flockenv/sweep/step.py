@@ -18,11 +18,11 @@ from flockenv.section import in_turn, section
 from flockenv.state import COUNTED_BY_KERNELS
 from flockenv.sweep.agents import AgentPlan, agent_plan, alone_of
 from flockenv.sweep.arrange import ArrangePlan, arrange_plan, go_home_of, move_in_of
-from flockenv.sweep.blocks import vector_of_lane
+from flockenv.sweep.blocks import place_of, vector_of_lane
 from flockenv.sweep.carry import bring_in_of, bring_inside_of, bring_out_of, take_drive_of
 from flockenv.sweep.context import Context
 from flockenv.sweep.gather import gather
-from flockenv.sweep.laws import OneLaw, says_of
+from flockenv.sweep.laws import OneLaw, laws_of, says_of
 from flockenv.sweep.method import MethodPlan, advance_of, method_plan
 from flockenv.sweep.move import MovePlan, move_of, move_plan
 from flockenv.sweep.numbers import NumberPlan, numbers_of
@@ -51,11 +51,10 @@ class StepPlan(NamedTuple):
     """What a step of a scene depends on."""
 
     agent: AgentPlan
-    inner: int  # how many numbers each agent has inside
     numbers: NumberPlan
     confines: Law | None  # brings agents into a periodic box when a call begins
     arrange: ArrangePlan | None
-    counts: tuple[tuple[int, OneLaw], ...]  # laws that count agents, with the number of their effects
+    counts: tuple[OneLaw, ...]  # laws that count agents
     sense: SensePlan
     response: ResponsePlan
     move: MovePlan
@@ -70,12 +69,12 @@ class StepPlan(NamedTuple):
 def step_plan(parts: Parts) -> StepPlan:
     """Return the plan of a scene."""
     d, w = parts.dimension, parts.width
-    counts = tuple((k, OneLaw.of(parts, k, "count_law")) for k, e in enumerate(parts.effects) if e.count_law)
     method = None if parts.one_stage else parts.integrator.advance()
     return StepPlan(
-        agent_plan(parts), len(parts.inner), parts.number_plan,
+        agent_plan(parts), parts.number_plan,
         parts.space.confine_law if parts.confines else None,
-        arrange_plan(parts) if parts.arranges else None, counts, sense_plan(parts), response_plan(parts),
+        arrange_plan(parts) if parts.arranges else None, laws_of(parts, "count_law"), sense_plan(parts),
+        response_plan(parts),
         move_plan(parts), method, method_plan(parts), parts.inner != () and parts.integrator.solves,
         (d * w, d * w, parts.felt_size, w) if parts.sorts else (), parts.trusts, parts.spreads,
     )  # fmt: skip
@@ -85,9 +84,9 @@ def step_plan(parts: Parts) -> StepPlan:
 
 
 @functools.cache
-def _counting(k: int, one: OneLaw) -> Callable[..., None]:
-    """Return `counts(numbers, me, lives)`: count an agent as the law of effect k says."""
-    which_of = says_of(one)
+def _counting(law: OneLaw) -> Callable[..., None]:
+    """Return `counts(numbers, me, lives)`: count an agent as a law says."""
+    which_of, k = says_of(law), law.k
 
     def counts(numbers: Any, me: Any, lives: Any) -> None:
         which: Any = np.int64(which_of(numbers, me))
@@ -106,12 +105,11 @@ def _clearing(k: int) -> Callable[..., None]:
 
 
 @section
-def _count(agent: AgentPlan, laws: tuple[tuple[int, OneLaw], ...]) -> Callable[..., None]:
+def _count(agent: AgentPlan, laws: tuple[OneLaw, ...]) -> Callable[..., None]:
     """Make `count_agents(context, pos, vel, time)`: count all agents of a world, by one thread of the team."""
     d, width = agent.dimension, agent.width
-    size, lanes, vector = np.uint64(d * width), np.uint64(width), vector_of_lane(d, width)
-    alone = alone_of(agent._replace(aims=False))
-    clear, counts = in_turn(*(_clearing(k) for k, _ in laws)), in_turn(*(_counting(*law) for law in laws))
+    place_in, vector, alone = place_of(d, width), vector_of_lane(d, width), alone_of(agent._replace(aims=False))
+    clear, counts = in_turn(*(_clearing(law.k) for law in laws)), in_turn(*map(_counting, laws))
 
     def count_agents(context: Any, pos: Any, vel: Any, time: Any) -> None:
         scratch, numbers, drawn = context.scratch, context.numbers, context.key[context.b]
@@ -119,7 +117,7 @@ def _count(agent: AgentPlan, laws: tuple[tuple[int, OneLaw], ...]) -> Callable[.
         if context.rank == 0:
             clear(numbers)
             for i in range(np.uint64(context.n)):
-                at = (i // lanes) * size + i % lanes
+                at = place_in(i)
                 x, v = vector(pos, at), vector(vel, at)
                 me = alone(scratch, drawn, time, at, i, i, x, v, zero(x))
                 counts(numbers, me, scratch.living[i] > like(x[0], 0.0))
