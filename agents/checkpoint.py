@@ -24,9 +24,9 @@ from pydantic import ValidationError
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save
 
-from flockenv.atomic import made, remove_leftovers, replacing
-from flockenv.records import Record
-from flockenv.refusals import refusals, shown
+from flockenv.core.atomic_files import made, remove_leftovers, replacing
+from flockenv.core.errors import refusals, shown
+from flockenv.core.record import Record
 
 __all__ = [
     "FILE", "TIMES", "CheckpointError", "Damaged", "InUse", "Parts", "as_json", "claimed", "digest", "from_json",

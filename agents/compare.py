@@ -26,14 +26,14 @@ import flockenv
 from agents import report
 from agents.experiment import CONFIGS, Experiment, load_experiment
 from agents.processes import Tell, side_by_side
-from flockenv.atomic import deliver
+from flockenv.core.atomic_files import deliver
+from flockenv.core.errors import nearest, shown
+from flockenv.core.output_paths import check_room, checked_file, checked_path
 from flockenv.evaluation import WORLDS_PER_SEED, Episodes, rollout, task_digest, worlds_for
-from flockenv.outputs import check_room, checked_file, checked_path
 from flockenv.players import NAMES, load_player, other_tasks
 from flockenv.players.files import SUFFIXES, PlayerError
 from flockenv.players.rules import tuned
 from flockenv.policy import OtherTaskWarning, Policy
-from flockenv.refusals import nearest, shown
 from flockenv.tasks import TASKS, Task
 from flockenv.terminal import one_line, program, shown_progress
 

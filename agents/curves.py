@@ -18,8 +18,8 @@ import typer
 from rich.console import Console
 
 from agents.experiment import Experiment, PpoSettings, load_experiment, one_line_errors
-from flockenv.atomic import deliver, replacing
-from flockenv.outputs import check_room, checked_file, checked_path
+from flockenv.core.atomic_files import deliver, replacing
+from flockenv.core.output_paths import check_room, checked_file, checked_path
 from flockenv.players.rules import tuned
 from flockenv.render.chart import COLOURS, FAINT, GRID, INK
 from flockenv.terminal import one_line, program

@@ -14,8 +14,8 @@ import typer
 from pydantic import Field, ValidationError, model_validator
 
 from flockenv.config import load
-from flockenv.records import Record
-from flockenv.refusals import key_path, refusals
+from flockenv.core.errors import key_path, refusals
+from flockenv.core.record import Record
 from flockenv.tasks import TASKS, Task
 
 __all__ = [

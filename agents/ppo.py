@@ -38,10 +38,10 @@ from agents.learning_env import ForLearning
 from agents.run import Run, checkpoint, checkpointed, expected_bytes, recipe_of
 from agents.teach import teach
 from agents.training_state import capture, restore, surroundings
-from flockenv import interrupts
+from flockenv.core import signals
+from flockenv.core.output_paths import check_room, checked_file, checked_path
 from flockenv.crew import threads, use_threads
 from flockenv.evaluation import rollout, worlds_for
-from flockenv.outputs import check_room, checked_file, checked_path
 from flockenv.players import WEIGHTS
 from flockenv.players.rules import player
 from flockenv.policy import MlpPolicy, describe, save_policy
@@ -349,7 +349,7 @@ def main(
             run = train(experiment, folder, go_on, tensorboard, kept.append)
         except KeyboardInterrupt:
             stays = f"checkpoint in {runs / name}, go on with --resume" if kept else "nothing was learnt yet"
-            interrupts.say(f"interrupted; {stays}")
+            signals.say(f"interrupted; {stays}")
             raise
         except FloatingPointError as error:
             typer.echo(f"error: {error}; {_last_good(kept, folder, target)}", err=True)

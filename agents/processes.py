@@ -13,7 +13,7 @@ from multiprocessing.connection import Connection
 from multiprocessing.connection import wait as wait_for
 from typing import Any, TypeVar
 
-from flockenv import interrupts
+from flockenv.core import signals
 
 __all__ = ["Tell", "parenting", "serve", "side_by_side", "starting"]
 
@@ -102,15 +102,15 @@ def _heard(context: Any, tell: Tell) -> Iterator[tuple[Connection, Any, Future[N
 @contextmanager
 def parenting() -> Iterator[None]:
     """Let processes that are started in a block know that they are to end with this one."""
-    before = os.environ.get(interrupts.PARENT)
-    os.environ[interrupts.PARENT] = str(os.getpid())
+    before = os.environ.get(signals.PARENT)
+    os.environ[signals.PARENT] = str(os.getpid())
     try:
         yield
     finally:
         if before is None:
-            os.environ.pop(interrupts.PARENT, None)
+            os.environ.pop(signals.PARENT, None)
         else:
-            os.environ[interrupts.PARENT] = before
+            os.environ[signals.PARENT] = before
 
 
 @contextmanager
@@ -158,7 +158,7 @@ def _begin(mouth: Connection, turn: Any) -> None:
 
 def serve() -> None:
     """Make this process one that works for its parent: Ctrl-C is the parent's to handle, and it ends when that ends."""
-    interrupts.serve()
+    signals.serve()
     os.environ["FLOCKENV_QUIET"] = "1"
     parent = parent_process()
     if parent is not None:

@@ -17,7 +17,7 @@ import typer
 from agents.compare import ROOT
 from agents.experiment import one_line_errors
 from agents.report import Results, grid
-from flockenv.atomic import deliver
+from flockenv.core.atomic_files import deliver
 from flockenv.tasks import TASKS
 from flockenv.terminal import program
 

@@ -14,10 +14,10 @@ from pydantic import Field
 from agents import checkpoint as files
 from agents.checkpoint import CheckpointError, Parts
 from agents.experiment import Experiment
+from flockenv.core.errors import KeyPath, key_path, shown
+from flockenv.core.record import ResultRecord
 from flockenv.players.rules import as_dict, player
 from flockenv.policy import MlpPolicy
-from flockenv.records import ResultRecord
-from flockenv.refusals import KeyPath, key_path, shown
 
 __all__ = ["OtherRecipe", "Run", "checkpoint", "checkpointed", "expected_bytes", "recipe_of"]
 

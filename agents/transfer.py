@@ -45,10 +45,10 @@ from agents.transfer_cells import (
     run_round,
 )
 from agents.transfer_report import Setting
-from flockenv.atomic import deliver
+from flockenv.core.atomic_files import deliver
+from flockenv.core.errors import nearest, shown
 from flockenv.evaluation import WORLDS_PER_SEED, worlds_for
 from flockenv.integrators import INTEGRATORS
-from flockenv.refusals import nearest, shown
 from flockenv.tasks import TASKS, Task
 from flockenv.terminal import one_line, program, shown_progress
 

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from agents.compare import Player, blaming
 from agents.transfer_report import Cell, Clock, Setting
-from flockenv.atomic import made, replacing
+from flockenv.core.atomic_files import made, replacing
 from flockenv.evaluation import rollout, task_digest, worlds_for
 from flockenv.integrators import RK4
 from flockenv.players import NAMES

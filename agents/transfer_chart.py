@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from agents.report import Results
-from flockenv.atomic import replacing
+from flockenv.core.atomic_files import replacing
 from flockenv.render.chart import FAINT, FIXED, GRID, INK
 
 if TYPE_CHECKING:

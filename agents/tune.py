@@ -18,9 +18,9 @@ from rich.console import Console
 from rich.progress import Progress
 
 from agents.experiment import Experiment, load_experiment, one_line_errors
-from flockenv.atomic import made, replacing
+from flockenv.core.atomic_files import made, replacing
+from flockenv.core.output_paths import check_room, checked_file
 from flockenv.evaluation import rollout, worlds_for
-from flockenv.outputs import check_room, checked_file
 from flockenv.players.rules import RULES, TUNED, RulesPlayer, as_dict
 from flockenv.tasks import Task
 from flockenv.terminal import program, shown_progress

@@ -24,7 +24,7 @@ import typer
 
 from agents import checkpoint as files
 from agents.experiment import Experiment
-from flockenv.atomic import LEFTOVERS
+from flockenv.core.atomic_files import LEFTOVERS
 
 __all__ = ["Count", "app", "kill_and_resume"]
 

@@ -36,8 +36,8 @@ from rich.markup import escape
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
-from flockenv.atomic import replacing
-from flockenv.outputs import checked_file
+from flockenv.core.atomic_files import replacing
+from flockenv.core.output_paths import checked_file
 
 __all__ = [
     "Bench", "Contestant", "Floor", "Out", "Plan", "Quick", "Result", "Rounds", "Sample",

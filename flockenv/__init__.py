@@ -9,13 +9,13 @@ Importing it registers the environments with Gymnasium and PettingZoo::
 The rest loads when it is asked for: neither torch nor matplotlib nor numba is imported before.
 """
 
-# Signals first: in a command, `early` blocks them until `interrupts` handles them, before anything else is imported.
-# Gymnasium alone takes a third of a second.
-from flockenv import early, interrupts, memory  # isort: skip
+# Signals first: in a command, `early_signals` blocks them until `signals` handles them, before anything else is
+# imported: Gymnasium alone takes a third of a second.
+from flockenv.core import early_signals, signals, address_space  # isort: skip
 
-interrupts.begin_early()
-early.release()
-memory.require(early.command())  # before the first library that needs much of it
+signals.begin_early()
+early_signals.release()
+address_space.require(early_signals.command())  # before the first library that needs much of it
 
 import importlib  # noqa: E402  # see above
 from typing import TYPE_CHECKING, Any  # noqa: E402  # see above

@@ -19,9 +19,9 @@ import numpy as np
 from numba.extending import overload
 from pydantic import Field
 
+from flockenv.core.record import Record
 from flockenv.kernels import OPTIONS, Law, Vec, law, like, replaced
 from flockenv.noise import uniform
-from flockenv.records import Record
 from flockenv.urges import INTENTIONS
 from flockenv.vec import add, axis, cross, dot, limit, norm, perpendicular, scale, select, unit, zero
 

@@ -2,7 +2,7 @@
 
 A file begins with a digest of its name and of all that follows. One that was emptied, cut, or in which a bit has
 changed, is never returned: one line on stderr reports it, and it is replaced when its data is written again. Files
-are written by `flockenv.atomic`, so that no process ever reads half of one.
+are written by `flockenv.core.atomic_files`, so that no process ever reads half of one.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ import functools
 import hashlib
 from pathlib import Path
 
-from flockenv.atomic import remove_leftovers, replacing
+from flockenv.core.atomic_files import remove_leftovers, replacing
 from flockenv.private_folder import read_private, say_once
 
 __all__ = ["Store"]

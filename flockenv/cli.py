@@ -21,10 +21,10 @@ from typing import TYPE_CHECKING, Annotated, Any, get_args
 import typer
 
 import flockenv
-from flockenv import interrupts
+from flockenv.core import signals
+from flockenv.core.errors import nearest, shown
 from flockenv.measuring import measure
 from flockenv.players import NAMES
-from flockenv.refusals import nearest, shown
 from flockenv.studies import accuracy, experiment, gallery, stress
 from flockenv.terminal import (
     DIVERGED,
@@ -96,16 +96,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """
     if arguments is not None:
         return _run(list(arguments))
-    with interrupts.running("flockenv"):
+    with signals.running("flockenv"):
         code = _run(sys.argv[1:])
-    if code == interrupts.code():
-        interrupts.leave(code)
+    if code == signals.code():
+        signals.leave(code)
     return code
 
 
 def _run(words: Sequence[str]) -> int:
     debug = "--debug" in words
-    interrupts.say("")  # what an earlier command of this process kept is no word of this one
+    signals.say("")  # what an earlier command of this process kept is no word of this one
     try:
         with warnings.catch_warnings(), naming_stdout():
             warnings.showwarning = _warn
@@ -126,10 +126,10 @@ def _run(words: Sequence[str]) -> int:
 def _interrupted(text: str = "") -> int:
     """Say that a signal ended the command, with what was kept if anything was; return the exit code."""
     if text:
-        interrupts.say(text)
-    if line := interrupts.said():
+        signals.say(text)
+    if line := signals.said():
         print(line, file=sys.stderr)
-    return interrupts.code()
+    return signals.code()
 
 
 def _warn(message: Warning | str, *place: object, **more: object) -> None:
@@ -204,7 +204,7 @@ def run(
 ) -> None:
     """Run a scene, show what a biologist would measure, and keep the trajectory if asked to."""
     from flockenv.config import load_scene
-    from flockenv.outputs import checked_file
+    from flockenv.core.output_paths import checked_file
     from flockenv.trajectory import whole_steps
 
     loaded = load_scene(Path(scene))
@@ -252,8 +252,8 @@ def render(
     force: Force = False,
 ) -> None:
     """Draw a scene, or an episode of a task under some player, as GIF, PNG or HTML replay."""
-    from flockenv.atomic import made
-    from flockenv.outputs import checked_file
+    from flockenv.core.atomic_files import made
+    from flockenv.core.output_paths import checked_file
     from flockenv.tasks import TASKS
 
     path = checked_file(out, PICTURES, force)

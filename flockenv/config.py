@@ -20,8 +20,8 @@ from typing import Any, TypeVar
 import yaml
 from pydantic import BaseModel, ValidationError
 
+from flockenv.core.errors import KeyPath, key_path, nearest, refusals, shown, steps_of
 from flockenv.presets import Preset, expanded
-from flockenv.refusals import KeyPath, key_path, nearest, refusals, shown, steps_of
 from flockenv.scene import Scene
 
 __all__ = ["MAX_BYTES", "ConfigError", "dump", "dump_scene", "load", "load_scene", "schema"]

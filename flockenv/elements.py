@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydantic import Field
 
-from flockenv.records import Record
+from flockenv.core.record import Record
 
 __all__ = [
     "Blocks",

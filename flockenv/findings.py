@@ -15,9 +15,9 @@ from typing import Any, Literal
 
 from pydantic import Field
 
+from flockenv.core.errors import nearest_few, shown
+from flockenv.core.record import ResultRecord
 from flockenv.divergence import SimulationDiverged
-from flockenv.records import ResultRecord
-from flockenv.refusals import nearest_few, shown
 
 __all__ = ["VERDICTS", "Case", "Finding", "Results", "Value", "Verdict", "cases_named", "run", "trials"]
 

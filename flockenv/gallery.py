@@ -10,9 +10,9 @@ import sys
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
-from flockenv.atomic import made, replacing
 from flockenv.behaviours import BEHAVIOURS
 from flockenv.config import load_scene
+from flockenv.core.atomic_files import made, replacing
 from flockenv.effects.base import Effect
 from flockenv.render.gif import write_png
 from flockenv.render.picture import draw

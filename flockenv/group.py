@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from pydantic import AfterValidator, Field, model_validator
 
 from flockenv.appearance import Appearance
+from flockenv.core.record import Record
 from flockenv.networks import AnyNetwork
-from flockenv.records import Record
 from flockenv.spawn import Spawn
 from flockenv.spread import Spread, drawn, largest
 

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from flockenv.refusals import shown
+from flockenv.core.errors import shown
 from flockenv.terminal import (
     DIVERGED,
     INTERRUPTED,
@@ -72,9 +72,9 @@ def measure(
     force: Force = False,
 ) -> None:
     """Run a scene and measure its crowd: flow, density, lanes, bursts, clogging, order; table, JSON and pictures."""
-    from flockenv.atomic import made
     from flockenv.config import load_scene
-    from flockenv.outputs import checked_file
+    from flockenv.core.atomic_files import made
+    from flockenv.core.output_paths import checked_file
     from flockenv.survey import Asked, combined
     from flockenv.trajectory import whole_steps
 
@@ -135,7 +135,7 @@ PICTURES = ("flow_density.png", "lanes.png", "gaps.png", "space_time.png")
 
 
 def _checked_folder(text: str, force: bool) -> Path:
-    from flockenv.outputs import checked_file, checked_path
+    from flockenv.core.output_paths import checked_file, checked_path
 
     folder = checked_path(text)
     if folder.exists() and not folder.is_dir():
@@ -262,7 +262,7 @@ def _summary(
 
 
 def _write_numbers(path: Path, summary: dict[str, Any]) -> None:
-    from flockenv.atomic import made, replacing
+    from flockenv.core.atomic_files import made, replacing
 
     with made(path.parent), replacing(path) as file:
         file.write((json.dumps(summary, indent=1, allow_nan=False) + os.linesep).encode())

@@ -16,9 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BeforeValidator, Field, model_validator
 
+from flockenv.core.errors import nearest
+from flockenv.core.record import Record
 from flockenv.elements import contents, flat
-from flockenv.records import Record
-from flockenv.refusals import nearest
 
 __all__ = ["BEND", "EDGE", "MOST", "SHEAR", "AnyNetwork", "Cloth", "Jelly", "Mesh", "Network", "Rope", "Springs"]
 

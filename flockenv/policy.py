@@ -22,8 +22,8 @@ from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
-from flockenv.atomic import deliver
-from flockenv.refusals import nearest, shown, shown_path
+from flockenv.core.atomic_files import deliver
+from flockenv.core.errors import nearest, shown, shown_path
 
 if TYPE_CHECKING:
     from flockenv.tasks import Layout, Task

@@ -24,9 +24,9 @@ from flockenv.behaviours import (
     Sidestep,
     WalkingGroup,
 )
+from flockenv.core.errors import KeyPath, key_path, nearest, refusals, shown, steps_of
+from flockenv.core.record import Record
 from flockenv.effects import Contact, Effect, ObstacleContact
-from flockenv.records import Record
-from flockenv.refusals import KeyPath, key_path, nearest, refusals, shown, steps_of
 from flockenv.spread import Spread
 from flockenv.steer import Steer
 

@@ -23,6 +23,8 @@ from pydantic import Field, WrapValidator, model_validator
 from flockenv import state as states
 from flockenv.appearance import Appearance
 from flockenv.constraints import CONSTRAINTS, Collisions, Constraint, Settler
+from flockenv.core.magnitudes import check_numbers
+from flockenv.core.record import Record, keep
 from flockenv.crew import LARGEST, Choices, at_work, share
 from flockenv.divergence import SimulationDiverged
 from flockenv.effects import EFFECTS, Effect
@@ -31,7 +33,6 @@ from flockenv.group import Group
 from flockenv.implicit import coupling_of, solve_steps
 from flockenv.integrators import INTEGRATORS, Adaptive, ImplicitEuler, Integrator, SemiImplicitEuler
 from flockenv.integrators.newton import Coupling
-from flockenv.magnitudes import check_numbers
 from flockenv.neighbours import FEWEST_AGENTS
 from flockenv.networks import EDGE
 from flockenv.noise import MASK, key_of
@@ -39,7 +40,6 @@ from flockenv.placing import cells_of, place_groups
 from flockenv.population import POPULATION, Emitter, Member, beget
 from flockenv.population import settler as population_settler
 from flockenv.population.settle import NUMBERS as POPULATION_NUMBERS
-from flockenv.records import Record, keep
 from flockenv.rounding import check_places
 from flockenv.shapes import AnyShape, Circle, HalfSpace, Shape
 from flockenv.snapshot import Mark, Snapshot

@@ -13,9 +13,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydantic import Field
 
+from flockenv.core.record import Record
 from flockenv.elementary import nearest_whole
 from flockenv.kernels import Law, Vec, finite, law, like
-from flockenv.records import Record
 from flockenv.vec import sub
 
 __all__ = ["AnySpace", "Box", "Plane", "Space", "Torus"]

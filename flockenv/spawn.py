@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
+from flockenv.core.record import Record
 from flockenv.kernels import kernel
 from flockenv.noise import uniform
-from flockenv.records import Record
 from flockenv.shapes import Shape, clear_of
 
 __all__ = ["Spawn", "cells", "direction", "scatter"]

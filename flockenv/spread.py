@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
-from flockenv.records import Record
+from flockenv.core.record import Record
 
 __all__ = ["Spread", "drawn", "largest"]
 

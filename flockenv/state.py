@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from flockenv.core.magnitudes import check_array
 from flockenv.lines import zeros
-from flockenv.magnitudes import check_array
 from flockenv.section import entry
 from flockenv.vehicle import face
 
@@ -173,7 +173,7 @@ class State:
     def with_motion(self, pos: ArrayLike, vel: ArrayLike) -> State:
         """Return a copy with other positions and velocities, each (B, N, D); refuses other shapes, and NaN.
 
-        So it does numbers that are too large to be squared (flockenv.magnitudes).
+        So it does numbers that are too large to be squared (flockenv.core.magnitudes).
 
         Where headings are kept, who moves faces along his new velocity.
         """

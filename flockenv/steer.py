@@ -17,9 +17,9 @@ from pydantic import Field, WrapValidator, model_validator
 
 from flockenv.arbitration import Allocation, AnyArbitration, Arbitration
 from flockenv.behaviours import BEHAVIOURS
+from flockenv.core.record import keep
 from flockenv.effects.base import EFFECTS, Effect, demand_group
 from flockenv.kernels import Law, Vec
-from flockenv.records import keep
 
 __all__ = ["EVERY_EFFECT", "Steer"]
 

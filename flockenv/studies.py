@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from flockenv import interrupts
-from flockenv.refusals import shown
+from flockenv.core import signals
+from flockenv.core.errors import shown
 from flockenv.terminal import (
     INTERRUPTED,
     EarlyEnd,
@@ -28,9 +28,9 @@ if TYPE_CHECKING:
     from rich.console import Console
 
     from flockenv.accuracy import Problem, Report
+    from flockenv.core.record import Record
     from flockenv.findings import Results
     from flockenv.integrators import Integrator
-    from flockenv.records import Record
 
     Run = Callable[[Results | None, Callable[[int], None], Callable[[Results], None]], Results]
 
@@ -78,8 +78,8 @@ def accuracy(
 ) -> None:
     """Show what accuracy costs: how far each integrator ends from the truth in which steps, beside its time."""
     from flockenv.accuracy import usual_methods
+    from flockenv.core.output_paths import checked_file
     from flockenv.integrators import methods_named
-    from flockenv.outputs import checked_file
 
     todo = _todo(scenes or (), suite, problems, seconds, steps, dts, seed)
     aimed = _numbers("--tolerance", tolerance)
@@ -150,7 +150,7 @@ def _measured(
             keep(reports)
             _show_accuracy(console, reports[-1], tolerances)
             flush_output()
-            interrupts.say(INTERRUPTED_LATER)
+            signals.say(INTERRUPTED_LATER)
             if reports[-1].stopped:
                 break
     except KeyboardInterrupt:
@@ -209,7 +209,7 @@ def _problem(file: str, seconds: float | None, steps: str, dts: str, seed: int) 
 
 def _write(path: Path, numbers: Record, draw: Callable[[Path], None]) -> None:
     """Write numbers as JSON, with a picture of them if `path` is that of a picture: both or neither."""
-    from flockenv.atomic import deliver
+    from flockenv.core.atomic_files import deliver
 
     writers: dict[str, Callable[[Path], None]] = {
         path.with_suffix(".json").name: functools.partial(write_numbers, numbers=numbers)
@@ -221,7 +221,7 @@ def _write(path: Path, numbers: Record, draw: Callable[[Path], None]) -> None:
 
 def write_numbers(path: Path, numbers: Record) -> None:
     """Write numbers as JSON: whole or not at all, whatever a path ends in."""
-    from flockenv.atomic import made, replacing
+    from flockenv.core.atomic_files import made, replacing
 
     with made(path.parent), replacing(path.with_suffix(".json")) as file:
         file.write((numbers.model_dump_json(indent=1) + "\n").encode())
@@ -303,8 +303,8 @@ def stress(
     force: Annotated[bool, typer.Option("--force", help="Begin anew, whatever X.json says.")] = False,
 ) -> None:
     """Try every hard case under every integrator, and show value, bound and verdict of each."""
+    from flockenv.core.output_paths import checked_file
     from flockenv.integrators import methods_named
-    from flockenv.outputs import checked_file
     from flockenv.stress import CASES, cases_named, fingerprint, run, trials, usual_methods
 
     path = checked_file(out, [".json", ".png"], True, beside=".json") if out is not None else None
@@ -335,8 +335,8 @@ def experiment(
     force: Force = False,
 ) -> None:
     """Run an experiment about steering: a table of what was measured, and a picture of where everybody went."""
+    from flockenv.core.output_paths import checked_file
     from flockenv.experiments import load_plan, run
-    from flockenv.outputs import checked_file
     from flockenv.render.curves import write_order
     from flockenv.render.trials import write_trials
 
@@ -360,8 +360,8 @@ def gallery(
 ) -> None:
     """Draw every behaviour in a small scene of its own, and write a page about all of them."""
     from flockenv.behaviours import BEHAVIOURS
+    from flockenv.core.output_paths import checked_file
     from flockenv.gallery import write_gallery
-    from flockenv.outputs import checked_file
 
     path = checked_file(out, [".md"], force, beside="")
     with progress_bar("drawing", len(BEHAVIOURS), "behaviours") as advance:

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any, TextIO, cast
 
 import typer
 
-from flockenv import interrupts
+from flockenv.core import signals
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -78,13 +78,13 @@ def interruptible(interrupted: str = "interrupted") -> Iterator[None]:
 
     interrupted: the line; "interrupted" at its beginning becomes the signal's own word.
     """
-    interrupts.say(interrupted)
+    signals.say(interrupted)
     try:
         yield
     except KeyboardInterrupt:
-        if line := interrupts.said():
+        if line := signals.said():
             print(printable(line), file=sys.stderr)
-        raise typer.Exit(interrupts.code()) from None
+        raise typer.Exit(signals.code()) from None
 
 
 @contextmanager
@@ -109,16 +109,16 @@ def program(name: str, app: typer.Typer, interrupted: str = "interrupted") -> No
 
     interrupted: the line about an interrupt, unless the command itself sets another.
     """
-    interrupts.say(interrupted)
-    with interrupts.running(name):
+    signals.say(interrupted)
+    with signals.running(name):
         try:
             app()
         except SystemExit as end:
-            if end.code not in (INTERRUPTED, interrupts.code()):
+            if end.code not in (INTERRUPTED, signals.code()):
                 raise
-            if line := interrupts.said():  # typer turns a KeyboardInterrupt into this code without a word
+            if line := signals.said():  # typer turns a KeyboardInterrupt into this code without a word
                 print(line, file=sys.stderr)
-            interrupts.leave(interrupts.code())
+            signals.leave(signals.code())
 
 
 class _Output:

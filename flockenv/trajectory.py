@@ -16,8 +16,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from flockenv.atomic import deliver
 from flockenv.config import dump_scene
+from flockenv.core.atomic_files import deliver
 from flockenv.measures import measure
 from flockenv.scene import Scene
 from flockenv.snapshot import Snapshot

@@ -37,7 +37,7 @@ def validate(
     force: Force = False,
 ) -> None:
     """Try published models of pedestrians in the scenes of RiMEA and NIST: value, bound and verdict of each."""
-    from flockenv.outputs import checked_file
+    from flockenv.core.output_paths import checked_file
     from flockenv.validation import CASES, cases_named, fingerprint, presets_named, run, trials
 
     path = checked_file(out, [".json", ".md"], True, beside=".json") if out is not None else None
@@ -69,7 +69,7 @@ def validate(
 
 def _write_scenes(folder: str, force: bool, cases: Sequence[Case], presets: Sequence[str]) -> None:
     """Write the scenes of some cases, and say how many."""
-    from flockenv.outputs import checked_path
+    from flockenv.core.output_paths import checked_path
     from flockenv.validation.scenes import write_scenes
 
     path = checked_path(folder, "--scenes")
@@ -81,7 +81,7 @@ def _write(path: Path, results: Results) -> None:
     """Write the findings as JSON; of a page that, the page, and its pictures."""
     write_numbers(path, results)
     if path.suffix.lower() == ".md":
-        from flockenv.atomic import made, replacing
+        from flockenv.core.atomic_files import made, replacing
         from flockenv.render.validation import write_pictures
         from flockenv.validation.page import page
 

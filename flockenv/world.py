@@ -15,12 +15,12 @@ from numpy.typing import ArrayLike, NDArray
 
 from flockenv import state as states
 from flockenv.abreast import PAIR, apart
+from flockenv.core.errors import nearest
 from flockenv.crew import LARGEST, Choices, at_work, share
 from flockenv.kernels import LINE, settled
 from flockenv.lines import zeros
 from flockenv.noise import MASK, keys_of
 from flockenv.recycle import Recycler
-from flockenv.refusals import nearest
 from flockenv.scene import MEMORY_LIMIT
 from flockenv.snapshot import Snapshot
 from flockenv.state import State

@@ -20,8 +20,8 @@ import typer
 
 from agents import checkpoint, publish
 from flockenv import gallery, validating
-from flockenv.atomic import LEFTOVERS, deliver, remove_leftovers, replacing
 from flockenv.checked_store import Store
+from flockenv.core.atomic_files import LEFTOVERS, deliver, remove_leftovers, replacing
 from flockenv.findings import Results
 from flockenv.group import Group
 from flockenv.policy import save_policy
@@ -191,16 +191,16 @@ def test_a_folder_in_the_place_of_a_file_is_refused_before_a_writer_runs(tmp_pat
 
 RENAMED = """
 import os, signal
-from flockenv import interrupts
-interrupts.begin("toy")
+from flockenv.core import signals
+signals.begin("toy")
 replace = os.replace
 def slow(source, target):
     replace(source, target)
     os.kill(os.getpid(), signal.SIGINT)
 os.replace = slow
 from pathlib import Path
-from flockenv.atomic import deliver
-with interrupts.running("toy"):
+from flockenv.core.atomic_files import deliver
+with signals.running("toy"):
     deliver(Path("."), {"a": lambda path: path.write_text("new"), "b": lambda path: path.write_text("new")})
     print("unreached" * (__import__("time").sleep(60) is None))
 """
@@ -259,7 +259,7 @@ def test_files_that_belong_together_stay_of_one_moment(
 
 KILLED = """
 import os, signal, sys
-from flockenv.atomic import replacing
+from flockenv.core.atomic_files import replacing
 with replacing(sys.argv[1]) as file:
     file.write(b"half")
     file.flush()

@@ -27,8 +27,8 @@ from agents.divergence import LearningDiverged
 from agents.experiment import CONFIGS, Experiment
 from agents.run import checkpoint, checkpointed
 from benchmarks import kills
-from flockenv.atomic import LEFTOVERS
-from flockenv.outputs import check_room
+from flockenv.core.atomic_files import LEFTOVERS
+from flockenv.core.output_paths import check_room
 from flockenv.policy import MlpPolicy
 from flockenv.sb3 import WorldVecEnv
 from flockenv.world import World

@@ -710,7 +710,7 @@ def test_a_full_disk_is_one_line_that_names_the_file_and_leaves_nothing(name: st
     command = "run" if name.endswith("npz") else "render"
     code = (
         "import resource, sys; from flockenv.cli import main\n"
-        "import flockenv.outputs, matplotlib.font_manager\n"
+        "import flockenv.core.output_paths, matplotlib.font_manager\n"
         "resource.setrlimit(resource.RLIMIT_FSIZE, (200, 200)); sys.exit(main())"
     )
     arguments = (command, "tiny.yaml", "--duration", "0.2", "--out", f"deep/{name}")

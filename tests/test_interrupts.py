@@ -14,8 +14,8 @@ from pathlib import Path
 import pytest
 
 from agents.processes import starting
-from flockenv import interrupts
-from flockenv.interrupts import ONE_PRESS
+from flockenv.core import signals
+from flockenv.core.signals import ONE_PRESS
 
 ROOT = Path(__file__).resolve().parent.parent
 ENVIRONMENT = {**os.environ, "PYTHONPATH": str(ROOT)}
@@ -31,10 +31,10 @@ dt: 0.01
 
 COMMAND = """\
 import os, sys, time
-from flockenv import interrupts
-from flockenv.atomic import made, replacing
+from flockenv.core import signals
+from flockenv.core.atomic_files import made, replacing
 from pathlib import Path
-interrupts.begin("toy")
+signals.begin("toy")
 def say(word):
     print(word, flush=True)
 {body}
@@ -107,20 +107,20 @@ def test_a_command_that_is_still_importing_ends_in_one_line(
 
 
 PLACES = {
-    "a line of ours": "with interrupts.running('toy'):\n    say('ready')\n    time.sleep(60)",
+    "a line of ours": "with signals.running('toy'):\n    say('ready')\n    time.sleep(60)",
     "a package that is not to be left": """\
 import pickle
 class Slow:
     def __reduce__(self):
         say('ready')
         time.sleep(60)
-with interrupts.running('toy'):
+with signals.running('toy'):
     pickle._dumps(Slow())""",
     "machine code": """\
 import numba
 count = numba.njit(nogil=True)(lambda n: sum([k % 7 for k in range(n)]))
 count(1)
-with interrupts.running('toy'):
+with signals.running('toy'):
     say('ready')
     count(10**13)""",
 }
@@ -171,7 +171,7 @@ program('toy', app)"""
 
 def test_a_second_interrupt_ends_what_the_first_one_began(tmp_path: Path) -> None:
     slow = """\
-with interrupts.running('toy'):
+with signals.running('toy'):
     try:
         say('ready')
         time.sleep(60)
@@ -190,7 +190,7 @@ with interrupts.running('toy'):
 def test_two_signals_of_one_press_are_one(tmp_path: Path) -> None:
     """A terminal and a wrapper such as `uv run` both pass Ctrl-C on."""
     keeps = """\
-with interrupts.running('toy'):
+with signals.running('toy'):
     try:
         os.kill(os.getpid(), 2)
         time.sleep(60)
@@ -219,7 +219,7 @@ def test_importing_flockenv_leaves_a_users_signals_alone() -> None:
 
 END = """\
 import atexit
-with interrupts.running('toy'):
+with signals.running('toy'):
     pass
 atexit.register(time.sleep, 1.0)
 atexit.register(print, 'done', flush=True)
@@ -244,7 +244,7 @@ class Slow:
         os.kill(os.getpid(), 2)
         time.sleep(0.1)
         return (list, ())
-with interrupts.running('toy'):
+with signals.running('toy'):
     pickle._dumps(Slow())
 say('worked')"""
     process = toy(outruns, tmp_path, "worked")
@@ -262,7 +262,7 @@ def test_what_is_half_written_is_removed(running: bool, tmp_path: Path) -> None:
         "    one.write(b'{'), two.write(b'{'), one.flush(), two.flush()\n"
         "    say(len(list(Path('.').rglob('*.part'))))\n    time.sleep(60)"
     )
-    within = "with interrupts.running('toy'):\n    " + write.replace("\n", "\n    ")
+    within = "with signals.running('toy'):\n    " + write.replace("\n", "\n    ")
     process = toy(within if running else write, tmp_path, "2")
     process.send_signal(signal.SIGINT)
     process.communicate(timeout=60)
@@ -272,7 +272,7 @@ def test_what_is_half_written_is_removed(running: bool, tmp_path: Path) -> None:
 
 def test_a_held_section_happens_whole(tmp_path: Path) -> None:
     body = """\
-with interrupts.running('toy'):
+with signals.running('toy'):
     with interrupts.held():
         say('ready')
         time.sleep(1.5)
@@ -308,14 +308,14 @@ def test_processes_started_later_are_no_workers(
     before: str | None, error: Exception | None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """One that imports flockenv would ignore Ctrl-C, and end with this process."""
-    monkeypatch.delenv(interrupts.PARENT, raising=False)
+    monkeypatch.delenv(signals.PARENT, raising=False)
     if before is not None:
-        monkeypatch.setenv(interrupts.PARENT, before)
+        monkeypatch.setenv(signals.PARENT, before)
     with suppress(ValueError), starting():
-        assert os.environ[interrupts.PARENT] == str(os.getpid())
+        assert os.environ[signals.PARENT] == str(os.getpid())
         if error:
             raise error
-    assert os.environ.get(interrupts.PARENT) == before
+    assert os.environ.get(signals.PARENT) == before
 
 
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM], ids=lambda number: number.name)

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from flockenv.config import ConfigError, load_scene
-from flockenv.magnitudes import BOUNDS
+from flockenv.core.magnitudes import BOUNDS
 from flockenv.scene import Group, Scene
 from flockenv.spawn import Spawn
 from flockenv.spread import Spread

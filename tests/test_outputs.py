@@ -10,7 +10,7 @@ import pytest
 from typer.main import get_command
 
 from flockenv.cli import app, main
-from flockenv.outputs import checked_file, checked_path
+from flockenv.core.output_paths import checked_file, checked_path
 
 
 @pytest.fixture(autouse=True)

@@ -11,7 +11,7 @@ from typing import Any, ClassVar
 
 import pytest
 
-from flockenv.records import Record
+from flockenv.core.record import Record
 from flockenv.startup import import_all, nothing_to_collect
 from flockenv.turns import OneAtATime
 

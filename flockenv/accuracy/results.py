@@ -9,8 +9,8 @@ from typing import Literal
 
 import numpy as np
 
-from flockenv.records import ResultRecord
-from flockenv.refusals import nearest, shown
+from flockenv.core.errors import nearest, shown
+from flockenv.core.record import ResultRecord
 
 __all__ = ["COSTS", "FORMAT", "Choice", "Cost", "Curve", "Machine", "Point", "Report", "Results"]
 

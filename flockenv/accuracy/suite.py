@@ -14,9 +14,9 @@ from flockenv.accuracy.paths import Floats
 from flockenv.accuracy.problem import Exact, Problem
 from flockenv.behaviours import Alignment, Cohesion, Separation
 from flockenv.constraints import Collisions, Rods
+from flockenv.core.errors import nearest, shown
 from flockenv.effects import Attraction, Carried, Drag, Effect, Gravity, QuadraticDrag, Swing, Tether, Uniform, Vortex
 from flockenv.networks import Rope
-from flockenv.refusals import nearest, shown
 from flockenv.scene import Group, Scene
 from flockenv.shapes import HalfSpace
 from flockenv.space import Torus

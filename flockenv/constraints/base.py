@@ -12,7 +12,7 @@ from abc import abstractmethod
 from collections.abc import Callable
 from typing import Any
 
-from flockenv.records import Record
+from flockenv.core.record import Record
 from flockenv.state import Floats, State
 
 __all__ = ["CONSTRAINTS", "Constraint", "Settler"]

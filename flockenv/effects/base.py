@@ -63,8 +63,8 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
+from flockenv.core.record import Record
 from flockenv.kernels import Law, Vec, law, like
-from flockenv.records import Record
 from flockenv.vec import dot
 
 __all__ = [

@@ -12,7 +12,7 @@ from gymnasium.error import ResetNeeded
 from gymnasium.spaces import Box
 from numpy.typing import NDArray
 
-from flockenv.refusals import nearest
+from flockenv.core.errors import nearest
 from flockenv.tasks import Task
 
 if TYPE_CHECKING:

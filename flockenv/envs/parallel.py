@@ -13,6 +13,7 @@ from gymnasium.utils import seeding
 from numpy.typing import NDArray
 from pettingzoo import ParallelEnv
 
+from flockenv.core.errors import nearest
 from flockenv.envs.face import (
     RENDER_MODES,
     ByAgent,
@@ -28,7 +29,6 @@ from flockenv.envs.face import (
     reward_keys,
 )
 from flockenv.envs.registration import VERSIONS
-from flockenv.refusals import nearest
 from flockenv.tasks import Bottleneck, Corridor, Crossing, Flock, Herd, Pursuit, School, Task
 from flockenv.world import Step, World
 

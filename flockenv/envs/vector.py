@@ -17,6 +17,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
+from flockenv.core.errors import nearest
 from flockenv.envs.face import (
     SEEDS,
     Rows,
@@ -31,7 +32,6 @@ from flockenv.envs.face import (
     reward_keys,
     together,
 )
-from flockenv.refusals import nearest
 from flockenv.tasks import (
     Bottleneck,
     Corridor,

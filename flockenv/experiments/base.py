@@ -11,8 +11,8 @@ from typing import NamedTuple
 import numpy as np
 from pydantic import Field
 
+from flockenv.core.record import ResultRecord
 from flockenv.kernels import laws_digest
-from flockenv.records import ResultRecord
 from flockenv.scene import Scene
 from flockenv.state import Floats, State
 

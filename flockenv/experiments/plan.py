@@ -12,9 +12,9 @@ from typing import Literal
 from pydantic import Field, model_validator
 
 from flockenv.behaviours import FollowWay, Seek
+from flockenv.core.record import Record
 from flockenv.effects import Effect
 from flockenv.experiments.base import Experiment
-from flockenv.records import Record
 from flockenv.scene import Scene
 from flockenv.steer import AnyBehaviour, AnyReconciling, Steer
 

@@ -15,12 +15,12 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import Field
 
+from flockenv.core.record import Record
 from flockenv.effects import Vicsek
 from flockenv.experiments.base import Experiment, Trial
 from flockenv.experiments.plan import Plan
 from flockenv.integrators import Integrator, SemiImplicitEuler
 from flockenv.measures import polarisation
-from flockenv.records import Record
 from flockenv.scene import AnyIntegrator, Group, Scene
 from flockenv.space import Torus
 from flockenv.spawn import Spawn

@@ -20,9 +20,9 @@ import numpy as np
 from numba.core import types
 from numba.extending import overload
 
+from flockenv.core.errors import nearest, shown
+from flockenv.core.record import Record
 from flockenv.kernels import OPTIONS
-from flockenv.records import Record
-from flockenv.refusals import nearest, shown
 from flockenv.state import WORK, Floats, State
 
 __all__ = [

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from flockenv.refusals import shown
+from flockenv.core.errors import shown
 from flockenv.shapes.outlines import area, crossing
 
 __all__ = ["Corners", "checked", "contains", "convex", "cut", "rectangle"]

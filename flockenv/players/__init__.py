@@ -18,7 +18,7 @@ import os
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from flockenv.refusals import nearest, shown
+from flockenv.core.errors import nearest, shown
 
 if TYPE_CHECKING:
     from flockenv.policy import Policy

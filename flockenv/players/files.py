@@ -26,8 +26,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from flockenv.core.errors import shown_path
 from flockenv.policy import MlpPolicy, Observation, Policy, State
-from flockenv.refusals import shown_path
 
 if TYPE_CHECKING:
     from flockenv.tasks import Task

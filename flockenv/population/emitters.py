@@ -12,9 +12,9 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, model_validator
 
+from flockenv.core.record import Record
 from flockenv.population.members import Member, demand_group, dimensions
 from flockenv.population.places import AnyPlace, Clearing, Surface, Vector, in_space
-from flockenv.records import Record
 from flockenv.space import Box, Torus
 
 __all__ = ["MOST_RATE", "Burst", "Emitter"]

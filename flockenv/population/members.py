@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any, ClassVar
 
-from flockenv.records import Record
+from flockenv.core.record import Record
 
 __all__ = ["POPULATION", "Member", "demand_group", "dimensions"]
 

@@ -13,9 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, WrapValidator, model_validator
 
+from flockenv.core.record import Record, keep
 from flockenv.population.members import dimensions
 from flockenv.population.surface import pieces
-from flockenv.records import Record, keep
 from flockenv.shapes import AnyShape
 
 __all__ = ["PLACES", "AnyPlace", "BoxPlace", "Clearing", "Disc", "Place", "Point", "Segment", "Surface"]

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from flockenv.atomic import replacing
+from flockenv.core.atomic_files import replacing
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from flockenv.atomic import replacing
+from flockenv.core.atomic_files import replacing
 from flockenv.measures import JUELICH, Tail, survival, weidmann_flow, weidmann_speed
 from flockenv.render.chart import COLOURS, FAINT, GRID, INK
 

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from flockenv.atomic import replacing
+from flockenv.core.atomic_files import replacing
 
 __all__ = ["write_gif", "write_png"]
 

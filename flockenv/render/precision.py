@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from flockenv.atomic import replacing
+from flockenv.core.atomic_files import replacing
 from flockenv.render.chart import COLOURS, FAINT, GRID, INK
 
 if TYPE_CHECKING:

@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flockenv.appearance import Appearance
-from flockenv.atomic import replacing
+from flockenv.core.atomic_files import replacing
 from flockenv.render.palette import ARROW, BODY_DISC, BOND, DART, DART_REACH, JUMP, PAPER, POINT, ROLE_COLOURS, WAY
 from flockenv.snapshot import Floats, Mark, Snapshot
 

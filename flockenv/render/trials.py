@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from flockenv.atomic import replacing
+from flockenv.core.atomic_files import replacing
 from flockenv.render.chart import COLOURS, FAINT, GRID, INK
 
 if TYPE_CHECKING:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from flockenv.atomic import replacing
+from flockenv.core.atomic_files import replacing
 from flockenv.render.chart import INK
 
 if TYPE_CHECKING:

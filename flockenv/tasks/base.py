@@ -39,8 +39,8 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
+from flockenv.core.record import Record
 from flockenv.integrators import INTEGRATORS, SemiImplicitEuler
-from flockenv.records import Record
 from flockenv.scene import AnyIntegrator, Scene
 from flockenv.snapshot import Mark
 from flockenv.state import State

@@ -9,9 +9,9 @@ of presets are the published ones. A miss is a verdict and not an error.
 
 from __future__ import annotations
 
+from flockenv.core.errors import nearest, shown
 from flockenv.findings import VERDICTS, Case, Finding, Results, Value, cases_named, trials
 from flockenv.presets import PRESETS
-from flockenv.refusals import nearest, shown
 from flockenv.validation.alone import ALONE
 from flockenv.validation.corridors import CORRIDORS
 from flockenv.validation.doors import DOORS

@@ -15,7 +15,7 @@ from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import BinaryIO
 
-from flockenv import interrupts
+from flockenv.core import signals
 
 __all__ = ["LEFTOVERS", "deliver", "made", "remove_leftovers", "replacing"]
 
@@ -78,7 +78,7 @@ def made(folder: Path) -> Iterator[None]:
     new = [path for path in (folder, *folder.parents) if not path.exists()]
     with ExitStack() as stack:
         for path in reversed(new):
-            stack.enter_context(interrupts.unfinished(path, if_empty=True))
+            stack.enter_context(signals.unfinished(path, if_empty=True))
         folder.mkdir(parents=True, exist_ok=True)
         yield
 
@@ -122,9 +122,9 @@ def _checked(target: Path) -> Path:
 def _beside(folder: Path) -> Iterator[Path]:
     """Make a new folder in a folder; remove it at the end with all that is in it."""
     with ExitStack() as stack:
-        with interrupts.held():
+        with signals.held():
             scratch = tempfile.mkdtemp(_SUFFIX, _PREFIX, folder)
-            stack.enter_context(interrupts.unfinished(scratch))
+            stack.enter_context(signals.unfinished(scratch))
         yield Path(scratch)
 
 
@@ -143,7 +143,7 @@ def _named(target: Path, part: Path | None = None) -> Iterator[None]:
 
 def _rename(parts: Mapping[Path, Path]) -> None:
     """Rename files to their targets, target -> file; on any error put back what was there."""
-    with interrupts.held():
+    with signals.held():
         kept = {target: _kept(target, part) for target, part in parts.items()} if len(parts) > 1 else {}
         try:
             for target, part in parts.items():

@@ -1,4 +1,4 @@
-"""The first lines of a command: signals are blocked here until `flockenv.interrupts` handles them.
+"""The first lines of a command: signals are blocked here until `flockenv.core.signals` handles them.
 
 What handles them takes milliseconds to import. This module imports nothing that Python has not loaded by itself, and
 has no `from __future__ import annotations`, which is a file too.
@@ -9,6 +9,8 @@ import os
 import sys
 
 __all__ = ["command", "release"]
+
+_PACKAGE = os.path.join(os.path.dirname(os.path.dirname(__file__)), "__init__.py")
 
 
 def command() -> str:
@@ -24,7 +26,7 @@ def command() -> str:
 def _beside(package: str) -> bool:
     """Return True if a package that is being imported lies beside flockenv: other programs have an `agents`, too."""
     file = getattr(sys.modules.get(package), "__file__", None) or ""
-    theirs, ours = (os.path.dirname(os.path.dirname(os.path.realpath(path))) for path in (file, __file__))
+    theirs, ours = (os.path.dirname(os.path.dirname(os.path.realpath(path))) for path in (file, _PACKAGE))
     return theirs == ours
 
 

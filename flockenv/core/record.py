@@ -9,8 +9,8 @@ from pydantic import BaseModel, ConfigDict, ValidationError, model_validator
 from pydantic._internal._model_construction import ModelMetaclass  # it has no public name
 from pydantic_core import PydanticCustomError
 
-from flockenv.magnitudes import check_numbers
-from flockenv.refusals import refusals
+from flockenv.core.errors import refusals
+from flockenv.core.magnitudes import check_numbers
 
 __all__ = ["Record", "ResultRecord", "in_tuples", "keep"]
 

@@ -9,7 +9,7 @@ import unicodedata
 from collections.abc import Sequence
 from pathlib import Path
 
-from flockenv.refusals import nearest
+from flockenv.core.errors import nearest
 
 __all__ = ["check_room", "checked_file", "checked_path"]
 

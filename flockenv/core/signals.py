@@ -21,7 +21,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from types import FrameType
 
-from flockenv import early
+from flockenv.core import early_signals
 
 __all__ = ["begin", "begin_early", "clean", "code", "held", "leave", "running", "said", "say", "serve", "unfinished"]
 
@@ -80,7 +80,7 @@ def begin_early() -> None:
         if os.environ.get(PARENT) == str(os.getppid()):
             serve()
             _thread.start_new_thread(_follow, (os.getppid(),))
-    elif name := early.command():
+    elif name := early_signals.command():
         begin(name)
 
 
