@@ -18,10 +18,11 @@ from numba import njit
 
 from flockenv.effects.base import ties
 from flockenv.elementary import nearest_whole
-from flockenv.inlining import Inlined, Whole
-from flockenv.kernels import LINE, like, unaliased
-from flockenv.lines import zeros
-from flockenv.processor import REGISTER
+from flockenv.jit.cpu import LINE, REGISTER
+from flockenv.jit.decorators import like
+from flockenv.jit.intrinsics import unaliased
+from flockenv.jit.memory import zeros
+from flockenv.jit.pipeline import Inlined, Whole
 from flockenv.scene import Scene
 from flockenv.state import State
 

@@ -1,8 +1,8 @@
 """What each replacement in numba saves of a cold compile: `python -m benchmarks.compiling [SCENE.yaml]`.
 
 New processes, one after another and in turns, compile the step of a scene into an empty cache: with all replacements of
-`flockenv.frontend` and `flockenv.lowering`, without one of them, without any. Measured are seconds of the processor
-from the first call on.
+`flockenv.jit.numba_patches.front_end` and `flockenv.jit.numba_patches.lowering`, without one of them, without any.
+Measured are seconds of the processor from the first call on.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from typing import Annotated
 import typer
 
 from benchmarks.measure import ROOT, Bench, Contestant, Out, Quick, Rounds, Sample, command_line
-from flockenv.frontend import LEFT_OUT, SPARED, TRICKS
+from flockenv.jit.numba_patches.front_end import LEFT_OUT, SPARED, TRICKS
 
 __all__ = ["Compilation"]
 

@@ -21,7 +21,7 @@ from benchmarks.floors import Machine, machine, of_scene
 from benchmarks.measure import Bench, Contestant, Floor, Out, Quick, Result, Rounds, command_line, number
 from benchmarks.peers import PeerError, running
 from benchmarks.scenes import WORLD_RADII, crowd, restarting, rules, stepping, world
-from flockenv.crew import use_threads
+from flockenv.jit.thread_pool import use_threads
 from flockenv.scene import Scene
 from flockenv.state import State
 

@@ -20,8 +20,8 @@ from benchmarks.floors import Machine, machine, of_scene
 from benchmarks.measure import Bench, Contestant, Out, Quick, Rounds, command_line, number
 from benchmarks.peers import CACHE, DONE, SAMPLE, PeerError, python_of, running
 from benchmarks.scenes import stepping
-from flockenv.crew import use_threads
 from flockenv.effects import Course
+from flockenv.jit.thread_pool import use_threads
 from flockenv.presets import PRESETS, preset
 from flockenv.scene import Group, Scene
 from flockenv.space import Torus

@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.measure import Bench, Floor, number
-from flockenv.crew import share
+from flockenv.jit.thread_pool import share
 from flockenv.scene import Scene
 from flockenv.space import Torus
 from flockenv.state import State

@@ -19,8 +19,8 @@ from benchmarks.floors import Machine, compiled, machine, of_scene
 from benchmarks.measure import Bench, Contestant, Out, Quick, Rounds, command_line, number
 from benchmarks.scenes import crowd, restarting, stepping, world
 from flockenv.behaviours import Alignment, Cohesion, Separation
-from flockenv.crew import use_threads
 from flockenv.effects.base import ties
+from flockenv.jit.thread_pool import use_threads
 from flockenv.scene import Scene
 from flockenv.state import State
 

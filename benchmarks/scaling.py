@@ -20,7 +20,7 @@ import typer
 from benchmarks.floors import Machine, machine, of_scene
 from benchmarks.measure import ROOT, Bench, Contestant, Out, Quick, Result, Rounds, command_line, number
 from benchmarks.scenes import crowd, stepping, world
-from flockenv.crew import use_threads
+from flockenv.jit.thread_pool import use_threads
 from flockenv.scene import Scene
 
 __all__ = ["AGENTS", "WORLDS", "grown"]

@@ -20,7 +20,7 @@ from numba.extending import overload
 from pydantic import Field
 
 from flockenv.core.record import Record
-from flockenv.kernels import OPTIONS, Law, Vec, law, like, replaced
+from flockenv.jit.decorators import OPTIONS, Law, Vec, law, like, replaced
 from flockenv.noise import uniform
 from flockenv.urges import INTENTIONS
 from flockenv.vec import add, axis, cross, dot, limit, norm, perpendicular, scale, select, unit, zero

@@ -318,8 +318,8 @@ def warmup(
     ] = None,
 ) -> None:
     """Compile ahead what tasks and scenes need, so that no first step has to wait; show how long each took."""
-    from flockenv.compilation import compiled, unmatched
     from flockenv.config import load_scene
+    from flockenv.jit.progress import compiled, unmatched
     from flockenv.tasks import TASKS
 
     names = what or sorted(TASKS)

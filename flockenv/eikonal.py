@@ -17,8 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flockenv.grid import packed, points_of
-from flockenv.kernels import kernel
-from flockenv.section import entry
+from flockenv.jit.decorators import kernel
+from flockenv.jit.section import entry
 from flockenv.shapes import Shape
 from flockenv.shapes.table import nearest
 from flockenv.targets import Target

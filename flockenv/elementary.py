@@ -16,7 +16,8 @@ from llvmlite import ir  # type: ignore[import-untyped]
 from numba.core import types
 from numba.extending import overload
 
-from flockenv.kernels import OPTIONS, intrinsic_or_python, law, like
+from flockenv.jit.decorators import OPTIONS, law, like
+from flockenv.jit.intrinsics import intrinsic_or_python
 
 __all__ = ["atan2", "exp", "nearest_whole"]
 

@@ -18,9 +18,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from flockenv.arbitration import Arbitration, Shares, Wishes
 from flockenv.effects.base import Me
-from flockenv.kernels import Law, Vec, kernel, law, like
+from flockenv.jit.decorators import Law, Vec, kernel, law, like
+from flockenv.jit.section import entry_of, record, several, vector
 from flockenv.scene import Scene
-from flockenv.section import entry_of, record, several, vector
 from flockenv.state import State
 from flockenv.steer import Steer
 from flockenv.vec import zero

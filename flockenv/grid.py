@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from flockenv.kernels import Vec, kernel, law, like
-from flockenv.section import entry
+from flockenv.jit.decorators import Vec, kernel, law, like
+from flockenv.jit.section import entry
 
 __all__ = ["MOST_POINTS", "Floats", "Table", "covers", "packed", "points_of", "sample", "sample_vector", "sampled"]
 

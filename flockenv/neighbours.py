@@ -18,7 +18,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from flockenv.kernels import ask_for, kernel, wait_for_team
+from flockenv.jit.decorators import kernel
+from flockenv.jit.intrinsics import ask_for, wait_for_team
 from flockenv.space import torus_confine
 
 __all__ = [

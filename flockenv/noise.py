@@ -12,7 +12,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from flockenv.kernels import kernel, python_of
+from flockenv.jit.decorators import kernel, python_of
 
 __all__ = ["key_of", "keys_of", "normal", "smooth", "uniform"]
 

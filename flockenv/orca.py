@@ -14,7 +14,8 @@ from typing import Any
 
 import numpy as np
 
-from flockenv.kernels import Numbers, Vec, law, like, stacked
+from flockenv.jit.decorators import Numbers, Vec, law, like
+from flockenv.jit.intrinsics import stacked
 from flockenv.vec import add, axis, dot, limit, norm, scale, select, sub, unit
 
 __all__ = ["SLOT", "clear", "half_plane", "orca"]

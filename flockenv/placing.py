@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from flockenv.jit.section import entry
 from flockenv.population import Emitter
-from flockenv.section import entry
 from flockenv.shapes import clear_of
 from flockenv.spawn import Spawn, cells, scatter
 from flockenv.state import Floats, State

@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from flockenv.elementary import nearest_whole
-from flockenv.kernels import Vec, kernel, law, like
-from flockenv.section import entry
+from flockenv.jit.decorators import Vec, kernel, law, like
+from flockenv.jit.section import entry
 from flockenv.space import Plane, Space
 from flockenv.vec import add, dot, scale, select, zero
 

@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from flockenv.kernels import Law, Vec, kernel, python_of
-from flockenv.section import entry_of, several
+from flockenv.jit.decorators import Law, Vec, kernel, python_of
+from flockenv.jit.section import entry_of, several
 
 __all__ = ["loop_of", "rows"]
 

@@ -25,7 +25,6 @@ from flockenv.appearance import Appearance
 from flockenv.constraints import CONSTRAINTS, Collisions, Constraint, Settler
 from flockenv.core.magnitudes import check_numbers
 from flockenv.core.record import Record, keep
-from flockenv.crew import LARGEST, Choices, at_work, share
 from flockenv.divergence import SimulationDiverged
 from flockenv.effects import EFFECTS, Effect
 from flockenv.effects.base import all_masses
@@ -33,6 +32,7 @@ from flockenv.group import Group
 from flockenv.implicit import coupling_of, solve_steps
 from flockenv.integrators import INTEGRATORS, Adaptive, ImplicitEuler, Integrator, SemiImplicitEuler
 from flockenv.integrators.newton import Coupling
+from flockenv.jit.thread_pool import LARGEST, Choices, at_work, share
 from flockenv.neighbours import FEWEST_AGENTS
 from flockenv.networks import EDGE
 from flockenv.noise import MASK, key_of

@@ -15,7 +15,7 @@ from pydantic import Field
 
 from flockenv.core.record import Record
 from flockenv.elementary import nearest_whole
-from flockenv.kernels import Law, Vec, finite, law, like
+from flockenv.jit.decorators import Law, Vec, finite, law, like
 from flockenv.vec import sub
 
 __all__ = ["AnySpace", "Box", "Plane", "Space", "Torus"]

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from flockenv.core.record import Record
-from flockenv.kernels import kernel
+from flockenv.jit.decorators import kernel
 from flockenv.noise import uniform
 from flockenv.shapes import Shape, clear_of
 

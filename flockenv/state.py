@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from flockenv.core.magnitudes import check_array
-from flockenv.lines import zeros
-from flockenv.section import entry
+from flockenv.jit.memory import zeros
+from flockenv.jit.section import entry
 from flockenv.vehicle import face
 
 __all__ = ["COUNTED_BY_KERNELS", "WORK", "Body", "Floats", "Obstacles", "State"]

@@ -19,7 +19,7 @@ from flockenv.arbitration import Allocation, AnyArbitration, Arbitration
 from flockenv.behaviours import BEHAVIOURS
 from flockenv.core.record import keep
 from flockenv.effects.base import EFFECTS, Effect, demand_group
-from flockenv.kernels import Law, Vec
+from flockenv.jit.decorators import Law, Vec
 
 __all__ = ["EVERY_EFFECT", "Steer"]
 

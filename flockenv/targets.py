@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 from pydantic import Field, model_validator
 
 from flockenv.core.record import Record
-from flockenv.kernels import Vec, law, like
+from flockenv.jit.decorators import Vec, law, like
 from flockenv.vec import dot, norm, scale, select
 
 __all__ = ["Target", "passed", "row_size", "to_any", "to_target"]

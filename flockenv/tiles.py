@@ -11,7 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from flockenv.kernels import ask_for, kernel
+from flockenv.jit.decorators import kernel
+from flockenv.jit.intrinsics import ask_for
 from flockenv.neighbours import Ints, begin_cells, cell_of, count_folded, crowded, divided, tally_cells
 
 __all__ = [

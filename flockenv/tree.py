@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from flockenv.kernels import kernel
+from flockenv.jit.decorators import kernel
 from flockenv.neighbours import region
 
 __all__ = ["BUCKETS", "LEVELS", "LISTED", "MOST_DIRECT", "gather", "line_up", "tree_sizes", "weigh"]

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from flockenv.kernels import law, like
+from flockenv.jit.decorators import law, like
 
 __all__ = [
     "EAT", "ESCAPE", "INTENTIONS", "MATE", "SCHOOL", "WANDER", "bite", "calmed", "desire", "fright", "hungrier",

@@ -10,7 +10,7 @@ import math
 
 import numpy as np
 
-from flockenv.kernels import Vec, law, like, unfused
+from flockenv.jit.decorators import Vec, law, like, unfused
 
 __all__ = [
     "add",

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from flockenv.kernels import Vec, kernel, law, like
+from flockenv.jit.decorators import Vec, kernel, law, like
 from flockenv.vec import add, axis, cross, dot, lateral, norm, perpendicular, scale, select, unit
 
 __all__ = ["GRAVITY", "SLOWEST", "face", "faced", "held", "leant", "raised", "turned"]

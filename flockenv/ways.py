@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from flockenv.eikonal import NO_WAY, Start, free_part, way_table
 from flockenv.grid import MOST_POINTS, covers, sample, sample_vector, sampled
-from flockenv.kernels import Vec, law
+from flockenv.jit.decorators import Vec, law
 from flockenv.space import Torus
 from flockenv.targets import Target, to_any
 from flockenv.vec import norm, select, unit

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flockenv.effects.base import ties
-from flockenv.kernels import LINE
+from flockenv.jit.cpu import LINE
 from flockenv.state import Body
 from flockenv.sweep import GIVEN, OWN, Parts, Table, scratch_of
 

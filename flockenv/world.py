@@ -14,13 +14,14 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from flockenv import state as states
-from flockenv.abreast import PAIR, apart
 from flockenv.core.errors import nearest
-from flockenv.crew import LARGEST, Choices, at_work, share
-from flockenv.kernels import LINE, settled
-from flockenv.lines import zeros
+from flockenv.jit.buffer_pool import Recycler
+from flockenv.jit.cpu import LINE
+from flockenv.jit.memory import zeros
+from flockenv.jit.section import settled
+from flockenv.jit.simd_rows import PAIR, apart
+from flockenv.jit.thread_pool import LARGEST, Choices, at_work, share
 from flockenv.noise import MASK, keys_of
-from flockenv.recycle import Recycler
 from flockenv.scene import MEMORY_LIMIT
 from flockenv.snapshot import Snapshot
 from flockenv.state import State

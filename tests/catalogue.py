@@ -756,7 +756,7 @@ import numpy as np
 from pydantic import Field
 
 from flockenv.effects import Effect, Me
-from flockenv.kernels import Law, Vec, law, like
+from flockenv.jit.decorators import Law, Vec, law, like
 from flockenv.vec import add, dot, scale
 
 

@@ -9,7 +9,8 @@ from typing import Any
 import hypothesis
 import pytest
 
-from flockenv import crew, terminal
+from flockenv import terminal
+from flockenv.jit import thread_pool
 from tests.catalogue import TETHER, users_module
 
 # Before anything imports pygame: a window is opened, but nowhere.
@@ -22,7 +23,7 @@ hypothesis.settings.load_profile("flockenv")
 
 
 # Where a test asks for threads all of them share all work, however little: how soon it is done is not what is tested.
-crew.Choice.always, crew._cores = True, 64
+thread_pool.Choice.always, thread_pool._cores = True, 64
 
 # Tests compare all of stderr. On a busy machine a kernel compiles for longer than the 3 s after which a line about
 # progress is written; tests of that line set their own times.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from flockenv.kernels import functions_in
+from flockenv.jit.sources import functions_in
 from flockenv.scene import Scene
 from flockenv.sweep import step_of
 

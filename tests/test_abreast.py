@@ -14,8 +14,8 @@ import pytest
 from numba import njit
 from numba.core.errors import TypingError
 
-from flockenv import processor
-from flockenv.abreast import PAIR, SIDE, apart, columns, in_one_row, into_rows, packed, take
+from flockenv.jit import cpu
+from flockenv.jit.simd_rows import PAIR, SIDE, apart, columns, in_one_row, into_rows, packed, take
 
 
 @njit
@@ -112,9 +112,9 @@ def test_what_is_taken_is_what_the_listed_say(count: int, real: str) -> None:
 
 def test_numbers_are_looked_up_in_registers_where_that_can_be() -> None:
     """The register form would vanish unseen: results are the same."""
-    if "avx2" not in processor.FEATURES:
+    if "avx2" not in cpu.FEATURES:
         pytest.skip("machine code is made for a processor that looks nothing up in registers")
-    long = "avx512f" in processor.FEATURES
+    long = "avx512f" in cpu.FEATURES
     kinds = (np.float32, np.float64) if long else (np.float32,)  # AVX2 looks up single precision alone
     for real in kinds:
         room, table = np.zeros((3, 2, PAIR), real), np.zeros((3, PAIR), real)

@@ -23,8 +23,8 @@ from agents.imitate import imitate
 from agents.learning_env import ForLearning
 from agents.run import checkpointed, recipe_of
 from agents.teach import shown
-from flockenv.crew import threads
 from flockenv.evaluation import compare, rollout, worlds_for
+from flockenv.jit.thread_pool import threads
 from flockenv.players import WEIGHTS
 from flockenv.players.rules import RULES, Tuned, as_dict, player, tuned
 from flockenv.policy import MlpPolicy, RandomPolicy

@@ -20,12 +20,12 @@ import typer
 
 from agents import checkpoint, publish
 from flockenv import gallery, validating
-from flockenv.checked_store import Store
 from flockenv.core.atomic_files import LEFTOVERS, deliver, remove_leftovers, replacing
 from flockenv.findings import Results
 from flockenv.group import Group
+from flockenv.jit.checked_store import Store
+from flockenv.jit.private_folder import prepared
 from flockenv.policy import save_policy
-from flockenv.private_folder import prepared
 from flockenv.scene import Scene
 from flockenv.space import Torus
 from flockenv.trajectory import record

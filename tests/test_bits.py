@@ -18,10 +18,10 @@ import numba
 import numpy as np
 import pytest
 
-from flockenv import processor
 from flockenv.config import ConfigError, load_scene
-from flockenv.crew import threads, use_threads
 from flockenv.divergence import SimulationDiverged
+from flockenv.jit import cpu
+from flockenv.jit.thread_pool import threads, use_threads
 from flockenv.tasks import TASKS
 from flockenv.world import World
 
@@ -74,7 +74,7 @@ def digest(*arrays: Any) -> str:
 
 def machine() -> str:
     """Return what the bits may hang on beside the code: the processor's instructions and numba's version."""
-    return f"{digest(np.array(sorted(processor.FEATURES)))}, numba {numba.__version__}"
+    return f"{digest(np.array(sorted(cpu.FEATURES)))}, numba {numba.__version__}"
 
 
 def stored() -> dict[str, Any]:

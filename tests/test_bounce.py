@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from flockenv.crew import use_threads
 from flockenv.effects import Gravity
 from flockenv.integrators import RK4, Integrator, SemiImplicitEuler
+from flockenv.jit.thread_pool import use_threads
 from flockenv.scene import Group, Scene
 from flockenv.space import Box
 from flockenv.spawn import Spawn

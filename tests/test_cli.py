@@ -223,7 +223,7 @@ def test_the_clock_of_a_run_begins_when_everything_is_compiled(more: str, tmp_pa
     """Otherwise the first run of a scene shows the speed of the compiler."""
     Path("new.yaml").write_text(TINY + more)
     code = (
-        "from pathlib import Path; from flockenv.compilation import compiled; from flockenv.config import load_scene;"
+        "from pathlib import Path; from flockenv.jit.progress import compiled; from flockenv.config import load_scene;"
         "from flockenv.trajectory import record; seen = [];"
         "record(load_scene(Path('new.yaml')), 0, 50, 10, lambda done: seen.append(len(compiled())));"
         "assert seen[0] == seen[-1] == len(compiled()) > 0, seen"

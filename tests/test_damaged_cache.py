@@ -11,8 +11,8 @@ from pathlib import Path
 
 import pytest
 
-from flockenv.checked_store import Store
-from flockenv.private_folder import prepared
+from flockenv.jit.checked_store import Store
+from flockenv.jit.private_folder import prepared
 
 SCENE = '''
 from flockenv.config import load_scene

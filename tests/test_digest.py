@@ -9,7 +9,8 @@ from pathlib import Path
 import pytest
 
 from flockenv.effects.base import Far, Me, Members, Obstacle, Other
-from flockenv.kernels import IN_PYTHON, functions_in, sources_of_code
+from flockenv.jit.decorators import IN_PYTHON
+from flockenv.jit.sources import functions_in, sources_of_code
 from flockenv.sweep import Worlds, step_of
 from flockenv.sweep.context import Context
 from flockenv.tasks import TASKS

@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from flockenv.crew import use_threads
 from flockenv.divergence import SimulationDiverged
 from flockenv.effects import Carried, Drag, Gravity, QuadraticDrag, Springs, Tether, Uniform, Vortex, Wind
 from flockenv.integrators import ExponentialDrag, ImplicitEuler, Integrator, SemiImplicitEuler
+from flockenv.jit.thread_pool import use_threads
 from flockenv.networks import Rope
 from flockenv.scene import Group, Scene
 from flockenv.spawn import Spawn

@@ -20,7 +20,7 @@ from flockenv.arbitration import ARBITRATIONS
 from flockenv.behaviours import Separation
 from flockenv.effects import Door, Drag, Stage
 from flockenv.integrators import RK4
-from flockenv.kernels import cache_folder
+from flockenv.jit.cache_folder import cache_folder
 from flockenv.networks import Mesh
 from flockenv.scene import Group, Scene
 from flockenv.shapes import Circle
@@ -344,7 +344,7 @@ from __future__ import annotations
 from typing import Any, ClassVar, Literal
 
 from flockenv.effects import Effect, Me
-from flockenv.kernels import Vec, law
+from flockenv.jit.decorators import Vec, law
 from flockenv.vec import dot, scale
 
 
@@ -388,7 +388,7 @@ from typing import Any, ClassVar, Literal
 
 import soft
 from flockenv.effects import Effect, Me, Other, Sight
-from flockenv.kernels import Vec, law
+from flockenv.jit.decorators import Vec, law
 from flockenv.vec import scale
 
 
@@ -419,7 +419,7 @@ class Repulsion(Effect):
 SOFT = """
 from typing import Any
 
-from flockenv.kernels import Vec, law
+from flockenv.jit.decorators import Vec, law
 from flockenv.vec import scale
 
 
@@ -626,7 +626,7 @@ HELD = """
 from typing import Literal
 
 from flockenv.effects import Drag
-from flockenv.kernels import law
+from flockenv.jit.decorators import law
 from flockenv.vec import add, scale
 
 

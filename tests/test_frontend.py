@@ -18,10 +18,11 @@ import pytest
 from llvmlite.binding import get_host_cpu_features
 from numba import config
 
-from flockenv import frontend, lowering
-from flockenv.compilation import unmatched
-from flockenv.inlining import Whole
-from flockenv.kernels import law, unaliased
+from flockenv.jit.decorators import law
+from flockenv.jit.intrinsics import unaliased
+from flockenv.jit.numba_patches import front_end, lowering
+from flockenv.jit.pipeline import Whole
+from flockenv.jit.progress import unmatched
 from flockenv.vec import add, dot, scale
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -30,25 +31,25 @@ TRIED = "0.68.1"
 
 
 def now() -> list[Any]:
-    return [vars(trick.owner)[trick.name] for trick in frontend.TRICKS]
+    return [vars(trick.owner)[trick.name] for trick in front_end.TRICKS]
 
 
 @pytest.mark.skipif(numba.__version__ != TRIED, reason="replacements were tried with another numba")
 def test_every_replacement_applies_to_the_numba_it_was_tried_with() -> None:
-    frontend._replacements.cache_clear()
-    assert len(frontend._replacements()) == len(frontend.TRICKS)
-    assert len(frontend._places()) == len(frontend.SPARED)
+    front_end._replacements.cache_clear()
+    assert len(front_end._replacements()) == len(front_end.TRICKS)
+    assert len(front_end._places()) == len(front_end.SPARED)
     lowering.is_brief.cache_clear()
     assert lowering.is_brief()
     before = now()
-    with frontend.lighter():
+    with front_end.lighter():
         assert all(new is not old for new, old in zip(now(), before, strict=True))
 
 
 @pytest.fixture
 def forgotten() -> Iterator[None]:
     """What is remembered of which replacements apply is forgotten, before and after."""
-    remembered = (frontend.reads_as_known, frontend._replacements, frontend._places, lowering.is_brief)
+    remembered = (front_end.reads_as_known, front_end._replacements, front_end._places, lowering.is_brief)
     for function in remembered:
         function.cache_clear()
     yield
@@ -57,19 +58,19 @@ def forgotten() -> Iterator[None]:
 
 
 def test_a_numba_that_reads_otherwise_is_left_alone(monkeypatch: pytest.MonkeyPatch, forgotten: None) -> None:
-    monkeypatch.setattr(frontend, "digest", lambda owner, name: "")
+    monkeypatch.setattr(front_end, "digest", lambda owner, name: "")
     before = now()
-    with frontend.lighter():
+    with front_end.lighter():
         assert all(new is old for new, old in zip(now(), before, strict=True))
-    assert frontend.spared([(frontend.SPARED[0].numbas, "")]) == [(frontend.SPARED[0].numbas, "")]
+    assert front_end.spared([(front_end.SPARED[0].numbas, "")]) == [(front_end.SPARED[0].numbas, "")]
     assert machine_code(Whole) == machine_code(None)
-    assert len(unmatched()) == len(frontend.TRICKS) + len(frontend.SPARED) + 1
+    assert len(unmatched()) == len(front_end.TRICKS) + len(front_end.SPARED) + 1
 
 
 def test_one_that_reads_otherwise_is_named(monkeypatch: pytest.MonkeyPatch, forgotten: None) -> None:
-    trick, digest = frontend.TRICKS[0], frontend.digest
+    trick, digest = front_end.TRICKS[0], front_end.digest
     monkeypatch.setattr(
-        frontend, "digest", lambda owner, name: "" if (owner, name) == trick.reads[0][:2] else digest(owner, name)
+        front_end, "digest", lambda owner, name: "" if (owner, name) == trick.reads[0][:2] else digest(owner, name)
     )
     assert unmatched() == (trick.title,)
 
@@ -77,20 +78,20 @@ def test_one_that_reads_otherwise_is_named(monkeypatch: pytest.MonkeyPatch, forg
 def test_each_replacement_has_a_title_of_its_own_and_another_name_is_refused(
     monkeypatch: pytest.MonkeyPatch, forgotten: None
 ) -> None:
-    titles = [each.title for each in (*frontend.TRICKS, *frontend.SPARED)]
+    titles = [each.title for each in (*front_end.TRICKS, *front_end.SPARED)]
     assert len(set(titles)) == len(titles)
-    monkeypatch.setenv(frontend.LEFT_OUT, "lowring")
+    monkeypatch.setenv(front_end.LEFT_OUT, "lowring")
     with pytest.raises(ValueError, match=r"^FLOCKENV_NUMBA_ALONE: 'lowring' is none, did you mean `lowering`"):
-        frontend._replacements()
+        front_end._replacements()
 
 
 @pytest.mark.parametrize("left_out", ["all", "one"])
 def test_the_environment_leaves_replacements_out(
     left_out: str, monkeypatch: pytest.MonkeyPatch, forgotten: None
 ) -> None:
-    first, *others = (each.title for each in (*frontend.TRICKS, *frontend.SPARED))
-    monkeypatch.setenv(frontend.LEFT_OUT, "all" if left_out == "all" else f"{first},lowering")
-    replaced = len(frontend._replacements()) + len(frontend._places())
+    first, *others = (each.title for each in (*front_end.TRICKS, *front_end.SPARED))
+    monkeypatch.setenv(front_end.LEFT_OUT, "all" if left_out == "all" else f"{first},lowering")
+    replaced = len(front_end._replacements()) + len(front_end._places())
     assert replaced == (0 if left_out == "all" else len(others))
     assert not lowering.is_brief()
     assert machine_code(Whole) == machine_code(None)
@@ -177,7 +178,7 @@ def test_closures_comprehensions_and_reductions_are_still_inlined() -> None:
 
 PARTS = """
 from types import FunctionType
-from flockenv.kernels import held, python_of
+from flockenv.jit.sources import held; from flockenv.jit.decorators import python_of
 from tests.catalogue import EFFECTS, scene_under
 
 def dispatchers(part):

@@ -11,10 +11,10 @@ import pytest
 from scipy.spatial import cKDTree
 
 from flockenv.behaviours import Separation
-from flockenv.crew import threads, use_threads
 from flockenv.effects import Effect, Gravitation, InverseSquare
 from flockenv.explanation import explain
 from flockenv.integrators import RK4
+from flockenv.jit.thread_pool import threads, use_threads
 from flockenv.neighbours import WORTH_ARRANGING
 from flockenv.networks import Rope
 from flockenv.scene import Group, Scene
@@ -255,7 +255,7 @@ from typing import Any, ClassVar, Literal
 import numpy as np
 
 from flockenv.effects.base import Bonds, Effect, Me, Other
-from flockenv.kernels import Law, Vec, law
+from flockenv.jit.decorators import Law, Vec, law
 from flockenv.vec import scale
 
 

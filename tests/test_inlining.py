@@ -10,9 +10,10 @@ import numba
 import numpy as np
 import pytest
 
-from flockenv import inlining
-from flockenv.inlining import Whole
-from flockenv.kernels import kernel, unaliased
+from flockenv.jit import pipeline
+from flockenv.jit.decorators import kernel
+from flockenv.jit.intrinsics import unaliased
+from flockenv.jit.pipeline import Whole
 
 LANES = 8
 
@@ -86,13 +87,13 @@ def compiled(part: Callable[..., None]) -> Any:
 def kept(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """What LLVM was told to keep, as it reads then."""
     seen: list[str] = []
-    keep = inlining._LanesStay._keep
+    keep = pipeline._LanesStay._keep
 
     def note(lowering: Any, ways_back: list[Any]) -> None:
         keep(lowering, ways_back)
         seen.append("\n".join(map(str, ways_back)))
 
-    monkeypatch.setattr(inlining._LanesStay, "_keep", note)
+    monkeypatch.setattr(pipeline._LanesStay, "_keep", note)
     return seen
 
 
@@ -110,7 +111,7 @@ def test_a_loop_over_lanes_is_kept(part: Callable[..., None], kept: list[str]) -
 def test_no_other_loop_is(part: Callable[..., None], kept: list[str]) -> None:
     compiled(part)
     assert kept == []
-    assert inlining.FEWEST_LANES <= LANES
+    assert pipeline.FEWEST_LANES <= LANES
 
 
 @pytest.mark.parametrize("part", [written_down, within_another, with_two_ways_back, signed])

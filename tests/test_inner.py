@@ -9,9 +9,9 @@ import pytest
 from scipy.spatial import cKDTree
 
 from flockenv.behaviours import Driving
-from flockenv.crew import use_threads
 from flockenv.effects import Antipode, Course, Effect, Goal, Sight
-from flockenv.kernels import Law, law
+from flockenv.jit.decorators import Law, law
+from flockenv.jit.thread_pool import use_threads
 from flockenv.population import Emitter
 from flockenv.population.places import Point
 from flockenv.scene import Group, Scene

@@ -9,8 +9,8 @@ import pytest
 from numba import njit
 from numba.core.errors import TypingError
 
-from flockenv.kernels import LINE
-from flockenv.lines import fetch, pour, settle, zeros
+from flockenv.jit.cpu import LINE
+from flockenv.jit.memory import fetch, pour, settle, zeros
 
 
 @njit(nogil=True)

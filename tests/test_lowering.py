@@ -9,9 +9,9 @@ import numba
 import numpy as np
 import pytest
 
-from flockenv import frontend, lowering
-from flockenv.inlining import Whole
-from flockenv.kernels import kernel
+from flockenv.jit.decorators import kernel
+from flockenv.jit.numba_patches import front_end, lowering
+from flockenv.jit.pipeline import Whole
 
 PLACES = {
     1: ["i", "u", "-i", "0", "-1", "k", ":", ":0", ":2", "2:", "1:3", "5:2", "9:", ":99", "i:", ":-1", "::2"],
@@ -312,8 +312,8 @@ def test_a_part_that_calls_itself() -> None:
 
 
 def test_another_numba_is_left_alone(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(frontend, "digest", lambda owner, name: "")
-    frontend.reads_as_known.cache_clear()
+    monkeypatch.setattr(front_end, "digest", lambda owner, name: "")
+    front_end.reads_as_known.cache_clear()
     lowering.is_brief.cache_clear()
     try:
         assert not lowering.is_brief()
@@ -327,5 +327,5 @@ def test_another_numba_is_left_alone(monkeypatch: pytest.MonkeyPatch) -> None:
         assert compiled_whole(entry)(np.arange(8.0).reshape(2, 4), np.ones(4, bool)) == (10.0, True)
     finally:
         monkeypatch.undo()
-        frontend.reads_as_known.cache_clear()
+        front_end.reads_as_known.cache_clear()
         lowering.is_brief.cache_clear()

@@ -15,7 +15,6 @@ import numpy as np
 import pytest
 from scipy.special import ellipj, ellipk
 
-from flockenv.crew import use_threads
 from flockenv.divergence import SimulationDiverged
 from flockenv.integrators import (
     RK4,
@@ -30,6 +29,7 @@ from flockenv.integrators import (
 )
 from flockenv.integrators.control import TRIES, Clock, begun, excess, judged
 from flockenv.integrators.exponential_drag import phi_functions
+from flockenv.jit.thread_pool import use_threads
 from flockenv.scene import Group, Scene
 from flockenv.spawn import Spawn
 from flockenv.state import State, blank

@@ -9,9 +9,9 @@ import pytest
 
 from flockenv.behaviours import Separation
 from flockenv.effects import ObstacleContact
+from flockenv.jit.section import entry
 from flockenv.measures import measure
 from flockenv.scene import Group, Scene
-from flockenv.section import entry
 from flockenv.shapes import FORMS, Block, Capsule, Circle, DistanceField, HalfSpace, Polygon, Shape, Sway, Wall, packed
 from flockenv.shapes.every import hit_shape, nearest_shape
 from flockenv.shapes.head import body_of, bound_of, shift_of, velocity_of

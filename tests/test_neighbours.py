@@ -10,9 +10,9 @@ import pytest
 from scipy.spatial import cKDTree
 
 from flockenv.behaviours import Alignment, Cohesion, Separation
+from flockenv.jit.section import entry
 from flockenv.neighbours import count_cells, order_records
 from flockenv.scene import Group, Scene
-from flockenv.section import entry
 from flockenv.space import Box, Space, Torus
 from flockenv.spawn import Spawn
 from flockenv.state import State

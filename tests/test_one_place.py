@@ -11,11 +11,11 @@ import pytest
 from numba import njit
 
 from flockenv.behaviours import Alignment, Cohesion, Separation
-from flockenv.crew import threads, use_threads
 from flockenv.divergence import SimulationDiverged
 from flockenv.effects.base import Effect, Me, Other, ties
 from flockenv.group import Group
 from flockenv.integrators import RK4
+from flockenv.jit.thread_pool import threads, use_threads
 from flockenv.neighbours import WORTH_ARRANGING
 from flockenv.scene import Scene
 from flockenv.space import Plane, Torus
@@ -152,7 +152,7 @@ def test_what_lies_in_records_beyond_the_last_agent_is_nobodys_business() -> Non
 TIED = """
 from typing import ClassVar, Literal
 from flockenv.behaviours import Separation
-from flockenv.kernels import Law, law
+from flockenv.jit.decorators import Law, law
 from flockenv.steering import others
 from flockenv.vec import add, sub
 

@@ -14,10 +14,10 @@ import pytest
 from flockenv.appearance import Appearance
 from flockenv.behaviours import Separation
 from flockenv.config import dump_scene, load_scene
-from flockenv.crew import use_threads
 from flockenv.divergence import SimulationDiverged
 from flockenv.effects import Gravity
 from flockenv.integrators import ImplicitEuler, SemiImplicitEuler
+from flockenv.jit.thread_pool import use_threads
 from flockenv.population import (
     Ageing,
     BoxPlace,

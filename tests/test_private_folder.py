@@ -13,8 +13,8 @@ from pathlib import Path
 
 import pytest
 
-from flockenv.checked_store import Store
-from flockenv.private_folder import NotPrivateError, first_private, prepared, read_private
+from flockenv.jit.checked_store import Store
+from flockenv.jit.private_folder import NotPrivateError, first_private, prepared, read_private
 
 pytestmark = pytest.mark.skipif(not hasattr(os, "geteuid"), reason="no owners and modes here")
 as_root = pytest.mark.skipif(getattr(os, "geteuid", lambda: 1)() != 0, reason="only root can act as two users")
@@ -36,7 +36,7 @@ print(scene.run(scene.start(0), 5).pos.tolist())
 
 FOLDER_AS_VICTIM = f"""
 import os
-from flockenv.kernels import cache_folder
+from flockenv.jit.cache_folder import cache_folder
 os.setgid({VICTIM})
 os.setuid({VICTIM})
 found = cache_folder()

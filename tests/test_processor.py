@@ -15,13 +15,14 @@ import numpy as np
 import pytest
 from llvmlite import binding
 
-from flockenv import inlining, processor
 from flockenv.behaviours import Alignment, Cohesion, Separation
 from flockenv.config import load_scene
 from flockenv.effects import Effect, Gravitation
 from flockenv.group import Group
-from flockenv.inlining import Whole
-from flockenv.kernels import kernel, unaliased
+from flockenv.jit import cpu, pipeline
+from flockenv.jit.decorators import kernel
+from flockenv.jit.intrinsics import unaliased
+from flockenv.jit.pipeline import Whole
 from flockenv.scene import Scene
 from flockenv.space import Plane, Torus
 from flockenv.spawn import Spawn
@@ -85,7 +86,7 @@ CASES: dict[str, Callable[[], dict[str, Any]]] = {
 
 def write(case: str, path: str) -> None:
     """Do what a case is about, in a process of its own, and leave what came of it."""
-    np.savez(path, **CASES[case](), register=processor.REGISTER)
+    np.savez(path, **CASES[case](), register=cpu.REGISTER)
 
 
 @pytest.mark.slow
@@ -126,7 +127,7 @@ def test_another_size_is_refused_by_one_line() -> None:
      ({"NUMBA_CPU_FEATURES": "+avx2,+avx512f"}, "64 True True")],
 )  # fmt: skip
 def test_what_numba_is_told_counts(told: dict[str, str], found: str) -> None:
-    ask = "from flockenv.processor import *; print(REGISTER, *(name in FEATURES for name in ('avx2', 'avx512f')))"
+    ask = "from flockenv.jit.cpu import *; print(REGISTER, *(name in FEATURES for name in ('avx2', 'avx512f')))"
     environment = {name: value for name, value in os.environ.items() if name != "FLOCKENV_REGISTER"} | told
     done = subprocess.run([sys.executable, "-c", ask], env=environment, capture_output=True, text=True)
     assert done.stdout.strip() == found, done.stderr
@@ -161,7 +162,7 @@ def many_sums() -> Callable[..., None]:
     return made["run"]  # type: ignore[no-any-return]
 
 
-@pytest.mark.skipif("avx" not in processor.FEATURES, reason="registers of 16 bytes always lie within a line")
+@pytest.mark.skipif("avx" not in cpu.FEATURES, reason="registers of 16 bytes always lie within a line")
 def test_the_stack_begins_where_a_register_may_lie() -> None:
     """Else what is put there for a while lies across two lines, in one process and not in the next."""
     x, y = np.arange(5, dtype=np.float32), np.ones(656, np.float32)
@@ -178,12 +179,12 @@ def short_loop(x: Any, y: Any) -> None:
             y[k, l] = x[k, l] * x[k, l]
 
 
-@pytest.mark.skipif(binding.llvm_version_info[0] not in inlining.LLVMS, reason="LLVM is not told: see inlining.LLVMS")
+@pytest.mark.skipif(binding.llvm_version_info[0] not in pipeline.LLVMS, reason="LLVM is not told: see pipeline.LLVMS")
 def test_vectors_are_made_of_short_loops(monkeypatch: pytest.MonkeyPatch) -> None:
     """What LLVM is told for that is told while our functions compile, parts within entry points, and taken back."""
     told: list[str] = []
-    tell = inlining.binding.set_option
-    monkeypatch.setattr(inlining.binding, "set_option", lambda name, option: (told.append(option), tell(name, option)))
+    tell = pipeline.binding.set_option
+    monkeypatch.setattr(pipeline.binding, "set_option", lambda name, option: (told.append(option), tell(name, option)))
     x = np.full((5, 8), 3, np.float32)
     y = x.copy()
     left, _ = code(short_loop, x, y, apart=False)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from flockenv.recycle import Recycler
+from flockenv.jit.buffer_pool import Recycler
 
 F4 = np.dtype(np.float32)
 

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from flockenv.kernels import Law, Numbers, Vec, law
+from flockenv.jit.decorators import Law, Numbers, Vec, law
 from flockenv.rows import rows
 from flockenv.vec import scale
 
@@ -19,7 +19,7 @@ ROOT = Path(__file__).resolve().parent.parent
 
 NOTEBOOK = """
 import numpy as np
-from flockenv.kernels import law
+from flockenv.jit.decorators import law
 from flockenv.rows import rows
 from flockenv.vec import scale
 

@@ -18,7 +18,7 @@ import flockenv
 from flockenv.behaviours import Alignment, Cohesion, Separation
 from flockenv.effects import EFFECTS, Drag, Gravity, QuadraticDrag
 from flockenv.integrators import RK4, AdaptiveRK4, SemiImplicitEuler
-from flockenv.kernels import cache_folder
+from flockenv.jit.cache_folder import cache_folder
 from flockenv.neighbours import FEWEST_AGENTS
 from flockenv.scene import Group, Scene
 from flockenv.shapes import Block, Circle

@@ -10,10 +10,10 @@ import pytest
 from flockenv import urges
 from flockenv.arbitration import Intentions
 from flockenv.behaviours import Evade, Forage, Separation, Shadow, Wander
-from flockenv.crew import use_threads
 from flockenv.effects import Fear, Grazing, Intention, Libido, Metabolism, Predation
 from flockenv.evaluation import rollout, worlds_for
 from flockenv.grants import granted, reconcile
+from flockenv.jit.thread_pool import use_threads
 from flockenv.players.rules import player
 from flockenv.population import Threshold
 from flockenv.rows import rows

@@ -12,7 +12,7 @@ import pytest
 ROOT = Path(__file__).resolve().parent.parent
 
 LAWS = """
-from flockenv.kernels import law
+from flockenv.jit.decorators import law
 
 @law
 def doubled(x):
@@ -33,7 +33,7 @@ PROGRAM = """
 import sys
 import numpy as np
 from numba.core import event
-from flockenv.section import entry_of
+from flockenv.jit.section import entry_of
 import users_laws
 
 @entry_of
@@ -87,7 +87,7 @@ def test_sections_run_in_plain_python_too(tmp_path: Path) -> None:
 
 def test_an_edited_law_without_a_file_compiles_anew(tmp_path: Path) -> None:
     """As in a notebook: the module has no source, and the law keeps its name."""
-    imports = "from flockenv.section import entry\nfrom flockenv.kernels import law\n"
+    imports = "from flockenv.jit.section import entry\nfrom flockenv.jit.decorators import law\n"
     cell = imports + "@law\ndef f(x): return {} * x\nprint(entry(f)(3.0))"
     told = {**os.environ, "FLOCKENV_CACHE": str(tmp_path)}
     for factor in (2, 5, 2):
@@ -100,7 +100,7 @@ def test_an_edited_law_without_a_file_compiles_anew(tmp_path: Path) -> None:
 def test_plain_python_uses_one_thread() -> None:
     """Whatever is asked for: a team of threads counts in one indivisible operation, which Python has none of."""
     told = {**os.environ, "NUMBA_DISABLE_JIT": "1", "FLOCKENV_THREADS": "2"}
-    code = "from flockenv.crew import at_work, threads; print(threads(), at_work())"
+    code = "from flockenv.jit.thread_pool import at_work, threads; print(threads(), at_work())"
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, env=told, capture_output=True, text=True, check=True)
     assert done.stdout == "2 1\n"
 

@@ -10,9 +10,9 @@ import yaml
 
 from flockenv import steering
 from flockenv.behaviours import Cohesion, Shepherd
-from flockenv.crew import use_threads
 from flockenv.effects.base import EFFECTS, Effect, Me, Members
-from flockenv.kernels import Law, Vec, law
+from flockenv.jit.decorators import Law, Vec, law
+from flockenv.jit.thread_pool import use_threads
 from flockenv.rows import rows
 from flockenv.scene import Group, Scene
 from flockenv.space import Plane, Torus

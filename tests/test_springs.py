@@ -10,11 +10,11 @@ import pytest
 import scipy.linalg
 
 from flockenv.behaviours import Cohesion, Separation
-from flockenv.crew import use_threads
 from flockenv.effects import AngularSprings, Elastic, Gravity, Springs
 from flockenv.effects.base import all_masses
 from flockenv.elements import Material, freedoms, frequencies, mass, solve_static, stiffness
 from flockenv.integrators import RK4, ImplicitEuler, ImplicitMidpoint
+from flockenv.jit.thread_pool import use_threads
 from flockenv.networks import Cloth, Mesh, Rope
 from flockenv.scene import Group, Scene
 from flockenv.space import Torus

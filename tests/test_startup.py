@@ -12,8 +12,8 @@ from typing import Any, ClassVar
 import pytest
 
 from flockenv.core.record import Record
-from flockenv.startup import import_all, nothing_to_collect
-from flockenv.turns import OneAtATime
+from flockenv.jit.lock import OneAtATime
+from flockenv.jit.startup import import_all, nothing_to_collect
 
 
 @pytest.fixture(autouse=True)
@@ -74,7 +74,7 @@ def test_kernels_are_read_without_linear_algebra_and_whoever_needs_it_has_it() -
     code = """
 import sys, threading
 import numba, numpy as np
-from flockenv.startup import numba_before_scipy
+from flockenv.jit.startup import numba_before_scipy
 line = threading.Barrier(4)
 threads = [threading.Thread(target=lambda: (line.wait(), numba_before_scipy())) for _ in range(4)]
 for thread in threads: thread.start()

@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 from flockenv.config import load_scene
-from flockenv.crew import use_threads
+from flockenv.jit.thread_pool import use_threads
 from flockenv.scene import Scene
 from flockenv.state import State
 

@@ -24,7 +24,7 @@ from typing import Any, ClassVar, Literal
 import numpy as np
 
 from flockenv.effects import Effect, Me
-from flockenv.kernels import Law, Vec, law
+from flockenv.jit.decorators import Law, Vec, law
 from flockenv.vec import axis, scale
 
 

@@ -22,12 +22,12 @@ import pytest
 
 import flockenv
 import flockenv.scene as scenes
-from flockenv import crew
 from flockenv.behaviours import Alignment, Separation
-from flockenv.crew import share, threads, use_threads
 from flockenv.effects import Drag
 from flockenv.integrators import ImplicitEuler
-from flockenv.kernels import cache_folder
+from flockenv.jit import thread_pool
+from flockenv.jit.cache_folder import cache_folder
+from flockenv.jit.thread_pool import share, threads, use_threads
 from flockenv.neighbours import FEWEST_ARRANGED, STEPS_ARRANGED, WORTH_ARRANGING
 from flockenv.scene import Group, Scene
 from flockenv.space import Box, Torus
@@ -339,10 +339,10 @@ class Clock:
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.now = 0.0
-        monkeypatch.setattr(crew, "perf_counter", lambda: self.now)
-        monkeypatch.setattr(crew.Choice, "always", False)
+        monkeypatch.setattr(thread_pool, "perf_counter", lambda: self.now)
+        monkeypatch.setattr(threads.Choice, "always", False)
 
-    def done(self, choice: crew.Choice, alone: float, shared: float, pieces: int, surely: bool = False) -> str:
+    def done(self, choice: threads.Choice, alone: float, shared: float, pieces: int, surely: bool = False) -> str:
         """By whom so many pieces are done, a letter each, if these are the seconds that they take."""
         by = []
 
@@ -360,40 +360,40 @@ class Clock:
 
 def test_both_ways_are_tried_and_the_sooner_one_is_kept(monkeypatch: pytest.MonkeyPatch) -> None:
     clock = Clock(monkeypatch)
-    assert clock.done(crew.Choice(), 1.0, 0.6, 10) == "aaasss" + 4 * "s"
-    assert clock.done(crew.Choice(), 1.0, 1.2, 10) == "aaasss" + 4 * "a"
-    assert clock.done(crew.Choice(), crew.SHORTEST / 2, 0.0, 200) == 200 * "a"  # too short to share
-    assert clock.done(crew.Choice(), 0.0, 9.0, 5, surely=True) == 5 * "s"  # too long to try
+    assert clock.done(threads.Choice(), 1.0, 0.6, 10) == "aaasss" + 4 * "s"
+    assert clock.done(threads.Choice(), 1.0, 1.2, 10) == "aaasss" + 4 * "a"
+    assert clock.done(threads.Choice(), threads.SHORTEST / 2, 0.0, 200) == 200 * "a"  # too short to share
+    assert clock.done(threads.Choice(), 0.0, 9.0, 5, surely=True) == 5 * "s"  # too long to try
 
 
 def test_what_was_slower_is_tried_again_ever_more_seldom(monkeypatch: pytest.MonkeyPatch) -> None:
     clock = Clock(monkeypatch)
-    by = clock.done(crew.Choice(), 1.0, 1.2, 20_000)[2 * crew.TRIAL :]
-    waits = [len(part) for part in by.split(crew.TRIAL * "s")]
-    assert waits[:3] == [2 * crew.AGAIN, 4 * crew.AGAIN, 8 * crew.AGAIN]
-    assert set(waits[6:-1]) == {crew.SELDOM}
+    by = clock.done(threads.Choice(), 1.0, 1.2, 20_000)[2 * threads.TRIAL :]
+    waits = [len(part) for part in by.split(threads.TRIAL * "s")]
+    assert waits[:3] == [2 * threads.AGAIN, 4 * threads.AGAIN, 8 * threads.AGAIN]
+    assert set(waits[6:-1]) == {threads.SELDOM}
 
 
 @pytest.mark.parametrize("sooner", [0, 1])
 def test_nothing_that_happens_once_decides_for_ever(sooner: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """Somebody is held up, or what is sooner done changes."""
-    clock, choice, wanted = Clock(monkeypatch), crew.Choice(), "as"[sooner]
+    clock, choice, wanted = Clock(monkeypatch), threads.Choice(), "as"[sooner]
     usual, late = (0.5, 1.0) if sooner == 0 else (1.0, 0.5), 100.0
     clock.done(choice, *usual, 100)
     for held_up in ((late, usual[1]), (usual[0], late)):
         clock.done(choice, *held_up, 1)
-        assert clock.done(choice, *usual, 3 * crew.AGAIN).count(wanted) >= 3 * crew.AGAIN - crew.TRIAL - 1
-    clock.done(choice, *usual[::-1], 2 * crew.SELDOM)
-    assert clock.done(choice, *usual[::-1], 100).count(wanted) <= crew.TRIAL
-    for held_up in range(2 * crew.TRIAL):  # while it is tried for the first time
-        begun = crew.Choice()
-        for k in range(2 * crew.TRIAL):
+        assert clock.done(choice, *usual, 3 * threads.AGAIN).count(wanted) >= 3 * threads.AGAIN - threads.TRIAL - 1
+    clock.done(choice, *usual[::-1], 2 * threads.SELDOM)
+    assert clock.done(choice, *usual[::-1], 100).count(wanted) <= threads.TRIAL
+    for held_up in range(2 * threads.TRIAL):  # while it is tried for the first time
+        begun = threads.Choice()
+        for k in range(2 * threads.TRIAL):
             clock.done(begun, *((late, late) if k == held_up else usual), 1)
-        assert clock.done(begun, *usual, crew.AGAIN) == crew.AGAIN * wanted
+        assert clock.done(begun, *usual, threads.AGAIN) == threads.AGAIN * wanted
 
 
 def test_a_piece_that_failed_is_nothing_to_go_by(monkeypatch: pytest.MonkeyPatch) -> None:
-    clock, choice = Clock(monkeypatch), crew.Choice()
+    clock, choice = Clock(monkeypatch), threads.Choice()
     clock.done(choice, 1.0, 0.6, 10)
     before = list(choice.took)
 
@@ -407,7 +407,7 @@ def test_a_piece_that_failed_is_nothing_to_go_by(monkeypatch: pytest.MonkeyPatch
 
 
 def test_scenes_and_worlds_keep_to_what_is_sooner_done(shared: list[int], monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(crew.Choice, "always", False)
+    monkeypatch.setattr(threads.Choice, "always", False)
     use_threads(2)
     scene = NAMED["torus"].make(640, 60.0)
     start = scene.start(0)
@@ -430,7 +430,7 @@ def test_long_calls_are_shared_at_once_where_threads_seldom_wait_for_each_other(
     count: int, worlds: int, surely: bool, shared: list[int], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Worlds apart, or one of many agents; whether a team on few is sooner done must have been seen."""
-    monkeypatch.setattr(crew.Choice, "always", False)
+    monkeypatch.setattr(threads.Choice, "always", False)
     use_threads(2)
     scene = NAMED["torus"].make(count, 60.0)
     start, steps = scene.start(0, worlds=worlds), 1 + scenes.LARGEST // (count * worlds)
@@ -441,7 +441,7 @@ def test_long_calls_are_shared_at_once_where_threads_seldom_wait_for_each_other(
 
 
 def test_there_are_never_more_at_work_than_there_are_cores(shared: list[int], monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(crew, "_cores", 3)
+    monkeypatch.setattr(thread_pool, "_cores", 3)
     scene = NAMED["torus"].make(33, 20.0)
     start = scene.start(0, worlds=7)
     for asked, work in ((2, [2]), (8, [3]), (1, [])):
@@ -520,13 +520,13 @@ def test_two_callers_may_step_one_scene_with_two_threads_each(
 def test_callers_whose_jobs_wait_for_each_other_never_wait_for_ever(monkeypatch: pytest.MonkeyPatch) -> None:
     """Nine at once hire a crew, which takes a while: none is left with fewer threads than it has jobs."""
 
-    class Slow(crew._Crew):
+    class Slow(thread_pool._Crew):
         def __init__(self, count: int) -> None:
             super().__init__(count)
             time.sleep(0.02 * (6 - count))  # the smallest comes last, and stays
 
-    monkeypatch.setattr(crew, "_Crew", Slow)
-    monkeypatch.setattr(crew, "_crew", None)
+    monkeypatch.setattr(thread_pool, "_Crew", Slow)
+    monkeypatch.setattr(thread_pool, "_crew", None)
 
     def call(size: int) -> list[int]:
         meeting = threading.Barrier(size)
@@ -573,7 +573,7 @@ def test_a_job_that_fails_fails_the_call_when_all_have_ended() -> None:
 FORK = """
 import os, sys
 import numpy as np
-from flockenv.crew import use_threads
+from flockenv.jit.thread_pool import use_threads
 from tests.catalogue import VARIANTS
 variant = next(v for v in VARIANTS if v.name == "torus_single")
 use_threads(2)
@@ -613,7 +613,7 @@ LINUX = pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="no thre
 @pytest.fixture
 def new_crew(monkeypatch: pytest.MonkeyPatch) -> None:
     """Nobody has worked yet, and where it may run nobody has said."""
-    monkeypatch.setattr(crew, "_crew", None)
+    monkeypatch.setattr(thread_pool, "_crew", None)
 
 
 @pytest.fixture
@@ -627,9 +627,9 @@ def cores(new_crew: None) -> set[int]:
 
 @LINUX
 def test_others_keep_off_the_core_of_who_shares_its_work(cores: set[int], monkeypatch: pytest.MonkeyPatch) -> None:
-    assert crew._here()[0] in cores
+    assert thread_pool._here()[0] in cores
     for core in (*cores, *cores):
-        monkeypatch.setattr(crew, "_asked", lambda core=core: core)  # the caller's own is another one any time
+        monkeypatch.setattr(thread_pool, "_asked", lambda core=core: core)  # the caller's own is another one any time
         assert share([lambda: None, lambda: os.sched_getaffinity(0)])[1] == cores - {core}
     assert os.sched_getaffinity(0) == cores  # the caller's own thread is left alone
 
@@ -651,7 +651,7 @@ def test_who_is_pinned_keeps_its_helpers_there(cores: set[int], monkeypatch: pyt
         for core in cores:
             for allowed in (cores, {core}, cores):
                 os.sched_setaffinity(0, allowed)
-                monkeypatch.setattr(crew, "_asked", lambda core=core: core)
+                monkeypatch.setattr(thread_pool, "_asked", lambda core=core: core)
                 seen.append(share([lambda: None, lambda: os.sched_getaffinity(0)])[1])
         return seen
 
@@ -663,7 +663,7 @@ def test_who_is_pinned_keeps_its_helpers_there(cores: set[int], monkeypatch: pyt
 @LINUX
 def test_fewer_threads_than_before_are_kept_off_again(cores: set[int], monkeypatch: pytest.MonkeyPatch) -> None:
     core = min(cores)
-    monkeypatch.setattr(crew, "_asked", lambda: core)
+    monkeypatch.setattr(thread_pool, "_asked", lambda: core)
     share([lambda: None] * (len(cores) + 2))
     assert share([lambda: None, lambda: os.sched_getaffinity(0)])[1] == cores - {core}
 
@@ -676,7 +676,7 @@ def test_a_system_that_keeps_no_thread_off_a_core_is_served_all_the_same(
     def refuse(*_: Any) -> None:
         raise PermissionError
 
-    monkeypatch.setattr(crew, "_asked", None if forbidden == "to ask" else lambda: 0)
+    monkeypatch.setattr(thread_pool, "_asked", None if forbidden == "to ask" else lambda: 0)
     for name in ("sched_setaffinity", "sched_getaffinity"):
         monkeypatch.setattr(os, name, refuse if forbidden == name else lambda *_: {0, 1}, raising=False)
     assert share([lambda: 1, lambda: 2]) == [1, 2]
@@ -707,14 +707,14 @@ def test_an_environment_that_asks_for_no_number_of_threads_is_refused(
 ) -> None:
     monkeypatch.setenv("FLOCKENV_THREADS", text)
     with pytest.raises(ValueError, match="FLOCKENV_THREADS is") as caught:
-        crew._from_environment()
+        thread_pool._from_environment()
     assert repr(text) in str(caught.value)
     assert "\n" not in str(caught.value)
     assert threads() == 1
 
 
 def test_the_environment_says_how_many_threads() -> None:
-    code = "import flockenv.crew as c; print(c.threads())"
+    code = "import flockenv.jit.thread_pool as c; print(c.threads())"
     assert in_another_process(code).stdout == "1\n"
     assert in_another_process(code, FLOCKENV_THREADS="3").stdout == "3\n"
     refused = in_another_process(code, FLOCKENV_THREADS="many")

@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from flockenv.jit.section import entry
 from flockenv.neighbours import count_cells
-from flockenv.section import entry
 from flockenv.tiles import HOME, TILE, count_from_home, count_tiles, find_homes, order_cells
 
 LANES, AGENTS = 16, 5003

@@ -6,8 +6,8 @@ import numba
 import numpy as np
 import pytest
 
-from flockenv.kernels import LINE
-from flockenv.transpose import out_of_records, put_lines, put_records
+from flockenv.jit.cpu import LINE
+from flockenv.jit.transpose import out_of_records, put_lines, put_records
 
 LENGTHS = [3, 5, 6, 8, 9, 16, 17, 20]
 WIDTHS = [("float32", 16), ("float32", 8), ("float64", 8), ("float64", 4), ("float64", 16)]

@@ -12,10 +12,10 @@ from typing import Any
 import pytest
 from filelock import FileLock, Timeout
 
-from flockenv.turns import OneAtATime
+from flockenv.jit.lock import OneAtATime
 
 MANY = """
-from flockenv.compilation import compiled
+from flockenv.jit.progress import compiled
 from flockenv.effects import Drag
 from flockenv.scene import Group, Scene
 from flockenv.space import Torus

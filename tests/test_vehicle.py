@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 
 from flockenv.behaviours import Alignment, AvoidObstacles, Separation
-from flockenv.crew import threads, use_threads
 from flockenv.effects import Drag, Effect
 from flockenv.integrators import RK4
+from flockenv.jit.thread_pool import threads, use_threads
 from flockenv.scene import Group, Scene
 from flockenv.space import Box, Torus
 from flockenv.spawn import Spawn

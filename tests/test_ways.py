@@ -11,9 +11,9 @@ import pytest
 from numpy.typing import NDArray
 
 from flockenv.behaviours import Driving, FollowWay, LineUp, UnalignedAvoidance
-from flockenv.crew import use_threads
 from flockenv.effects import Door, Journey, Routes, Stage, Way
 from flockenv.eikonal import ground
+from flockenv.jit.thread_pool import use_threads
 from flockenv.population import Drain, Emitter
 from flockenv.population.places import Point
 from flockenv.scene import Group, Scene

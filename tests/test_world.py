@@ -12,8 +12,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from flockenv.crew import threads, use_threads
-from flockenv.kernels import python_of, settled
+from flockenv.jit.decorators import python_of
+from flockenv.jit.section import settled
+from flockenv.jit.thread_pool import threads, use_threads
 from flockenv.noise import key_of, keys_of
 from flockenv.tasks import Crossing, Flock, Obstacles, Pursuit
 from flockenv.tasks.play import play_of

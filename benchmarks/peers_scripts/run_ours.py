@@ -30,8 +30,8 @@ def flock_vector(threads: int) -> Case:
     import numpy as np
 
     from benchmarks.floors import of_decisions
-    from flockenv.crew import use_threads
     from flockenv.envs.vector import FlockVectorEnv
+    from flockenv.jit.thread_pool import use_threads
 
     use_threads(threads)
     agents, rows = 32, WORLDS * 32

@@ -33,7 +33,7 @@ def another(threads: int) -> Case:
     import flockenv.effects
     from benchmarks.scenes import world
     from flockenv.effects import Effect
-    from flockenv.kernels import Law, Vec, law
+    from flockenv.jit.decorators import Law, Vec, law
     from flockenv.vec import zero
 
     @law

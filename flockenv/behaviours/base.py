@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from flockenv.effects.base import Effect, Me, Other, Sight, all_masses, demand_group
-from flockenv.kernels import Law, Vec, law, like
+from flockenv.jit.decorators import Law, Vec, law, like
 from flockenv.stability import LookaheadWarning
 
 __all__ = [

@@ -17,7 +17,7 @@ from pydantic import Field
 from flockenv import steering
 from flockenv.behaviours.base import gains
 from flockenv.effects.base import Effect, Me, Other, Sight
-from flockenv.kernels import Law, Vec, law, like
+from flockenv.jit.decorators import Law, Vec, law, like
 from flockenv.steering import others
 from flockenv.vec import scale, select, sub, zero
 

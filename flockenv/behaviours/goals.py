@@ -10,7 +10,7 @@ from pydantic import Field, model_validator
 from flockenv import steering
 from flockenv.behaviours.base import Behaviour, Moving, top_speed
 from flockenv.effects.base import Me, Vector
-from flockenv.kernels import Law, Vec, law
+from flockenv.jit.decorators import Law, Vec, law
 from flockenv.vec import dot, scale, select, sub, zero
 
 __all__ = ["Arrive", "Dock", "Face", "Flee", "Seek", "TargetSpeed"]

@@ -14,7 +14,7 @@ from flockenv import steering
 from flockenv.behaviours.social import Social, size_of
 from flockenv.effects.base import Effect, Me, Other, Sight, Vector, all_masses
 from flockenv.elementary import exp
-from flockenv.kernels import Law, Vec, law, like
+from flockenv.jit.decorators import Law, Vec, law, like
 from flockenv.steering.others import ONE_PLACE
 from flockenv.vec import add, limit, norm, scale, select, sub, unit, zero
 

@@ -14,7 +14,8 @@ from pydantic import Field
 from flockenv import steering
 from flockenv.effects.base import Effect, Me, Other, Sight, all_masses, demand_group
 from flockenv.elementary import nearest_whole
-from flockenv.kernels import OPTIONS, Law, Vec, law, like, stacked
+from flockenv.jit.decorators import OPTIONS, Law, Vec, law, like
+from flockenv.jit.intrinsics import stacked
 from flockenv.shapes.chain import segment_hit, segment_share
 from flockenv.vec import add, dot, norm, scale, select, sub, unit, zero
 

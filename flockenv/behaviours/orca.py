@@ -11,7 +11,7 @@ from pydantic import Field
 from flockenv import orca, steering
 from flockenv.behaviours.base import Moving, top_speed
 from flockenv.effects.base import Me, Other, Sight, Vector
-from flockenv.kernels import OPTIONS, Law, Vec, law, like
+from flockenv.jit.decorators import OPTIONS, Law, Vec, law, like
 from flockenv.vec import scale, select, sub, zero
 
 __all__ = ["Orca"]

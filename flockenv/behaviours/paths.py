@@ -16,7 +16,7 @@ from pydantic import Field, model_validator
 from flockenv import grid, polyline, steering
 from flockenv.behaviours.base import Behaviour, Moving, gains, top_speed
 from flockenv.effects.base import Me, Vector
-from flockenv.kernels import Law, Vec, law, like
+from flockenv.jit.decorators import Law, Vec, law, like
 from flockenv.vec import add, norm, scale, select, sub, zero
 
 __all__ = ["FollowFlow", "FollowPath", "StayOnPath"]

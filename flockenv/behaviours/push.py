@@ -8,7 +8,7 @@ from typing import ClassVar, Self
 from pydantic import Field, model_validator
 
 from flockenv.effects.base import Effect
-from flockenv.kernels import Vec
+from flockenv.jit.decorators import Vec
 
 __all__ = ["Push"]
 

@@ -11,7 +11,7 @@ from pydantic import Field
 from flockenv import steering
 from flockenv.behaviours.base import Moving, top_speed
 from flockenv.effects.base import Me, Members, Vector
-from flockenv.kernels import Law, Vec, law, like
+from flockenv.jit.decorators import Law, Vec, law, like
 from flockenv.vec import scale, select, sub, zero
 
 __all__ = ["Shepherd"]

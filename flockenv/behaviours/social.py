@@ -17,7 +17,7 @@ from flockenv import steering
 from flockenv.behaviours.push import Push
 from flockenv.effects.base import Me, Other, Sight, all_masses, demand_group
 from flockenv.elementary import exp
-from flockenv.kernels import Law, Vec, law, like
+from flockenv.jit.decorators import Law, Vec, law, like
 from flockenv.steering import social
 from flockenv.vec import dot, limit, scale, select, sub, unit
 

@@ -11,7 +11,7 @@ from pydantic import Field, model_validator
 from flockenv import steering
 from flockenv.behaviours.base import Moving, top_speed
 from flockenv.effects.base import Me, Obstacle
-from flockenv.kernels import Law, Vec, law, like
+from flockenv.jit.decorators import Law, Vec, law, like
 from flockenv.shapes import AnyShape, packed
 from flockenv.shapes.block import nearest_block
 from flockenv.shapes.chain import nearest_chain

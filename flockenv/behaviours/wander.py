@@ -9,7 +9,7 @@ from pydantic import Field
 
 from flockenv import steering
 from flockenv.behaviours.base import Moving, top_speed
-from flockenv.kernels import Law, Vec, law, like
+from flockenv.jit.decorators import Law, Vec, law, like
 from flockenv.noise import smooth, uniform
 from flockenv.vec import add, dot, planar, scale, select, sub
 

@@ -10,7 +10,7 @@ from pydantic import Field
 
 from flockenv.behaviours.base import Moving, steered_groups, top_speed
 from flockenv.effects.base import Me, Vector
-from flockenv.kernels import Law, Vec, law, like
+from flockenv.jit.decorators import Law, Vec, law, like
 from flockenv.targets import Target
 from flockenv.vec import norm, scale, sub
 from flockenv.ways import check_ways, lengths_on, region, starts_of, warn_cut_off, way_ahead, ways_to

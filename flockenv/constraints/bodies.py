@@ -8,7 +8,7 @@ import numpy as np
 
 from flockenv.constraints.broad import image, near, vector, write
 from flockenv.constraints.impact import POINT, along, flight
-from flockenv.kernels import Vec, kernel
+from flockenv.jit.decorators import Vec, kernel
 from flockenv.vec import add, norm, scale, sub
 
 __all__ = [

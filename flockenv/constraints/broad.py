@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from flockenv.elementary import nearest_whole
-from flockenv.kernels import Vec, kernel, law
+from flockenv.jit.decorators import Vec, kernel, law
 from flockenv.neighbours import candidates, count_cells, row_of
 from flockenv.vec import dot, sub
 

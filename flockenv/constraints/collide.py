@@ -14,7 +14,7 @@ from flockenv.constraints.events import play, together
 from flockenv.constraints.impact import along
 from flockenv.constraints.listing import list_meetings
 from flockenv.constraints.sweep import goes_round, may_pass
-from flockenv.kernels import Vec, kernel
+from flockenv.jit.decorators import Vec, kernel
 from flockenv.shapes.head import shift_of
 from flockenv.vec import add, axis, dot, norm, scale, sub, zero
 

@@ -16,8 +16,8 @@ from flockenv.constraints.contacts import Contacts, Ends
 from flockenv.constraints.ends import LEFT, RAISED, SUNK
 from flockenv.constraints.impact import POINT
 from flockenv.effects.base import ties
+from flockenv.jit.section import entry
 from flockenv.neighbours import MAX_RANGES
-from flockenv.section import entry
 from flockenv.shapes import HalfSpace, packed
 from flockenv.space import Box, Torus
 from flockenv.state import WORK, Floats, State

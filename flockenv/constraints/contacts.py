@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 from flockenv.constraints.bodies import RESTS, Bodies, Meetings, Things, gained, width
 from flockenv.constraints.broad import image, vector, write
 from flockenv.constraints.impact import bounced, surface
-from flockenv.kernels import Vec, kernel
+from flockenv.jit.decorators import Vec, kernel
 from flockenv.vec import add, axis, dot, norm, scale, select, sub, unit, zero
 
 __all__ = ["NEARLY", "Contacts", "Ends", "deepest", "gather", "impacts", "part", "press"]

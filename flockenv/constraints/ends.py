@@ -11,7 +11,7 @@ from flockenv.constraints.broad import image, led, vector, write
 from flockenv.constraints.contacts import NEARLY, Contacts, Ends, deepest, gather, impacts, part, press
 from flockenv.constraints.listing import list_meetings
 from flockenv.constraints.sweep import may_pass, stop_on_the_way, take_aim
-from flockenv.kernels import Vec, kernel
+from flockenv.jit.decorators import Vec, kernel
 from flockenv.vec import add, dot, norm, scale, sub, zero
 
 __all__ = ["settle_ends"]

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from flockenv.kernels import Vec, kernel, law, routine
+from flockenv.jit.decorators import Vec, kernel, law, routine
 from flockenv.shapes.every import hit_shape, nearest_shape
 from flockenv.shapes.round import ray_hit
 from flockenv.vec import add, axis, dot, norm, scale, select, sub, unit

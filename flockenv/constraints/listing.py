@@ -8,7 +8,7 @@ from flockenv.constraints.bodies import Bodies, Meetings, Rules, Things, link
 from flockenv.constraints.broad import image, nearby, vector
 from flockenv.constraints.contacts import NEARLY, Ends
 from flockenv.constraints.impact import surface
-from flockenv.kernels import Vec, kernel
+from flockenv.jit.decorators import Vec, kernel
 from flockenv.shapes.head import bound_of
 from flockenv.vec import add, dot, norm, scale, sub, zero
 

@@ -11,9 +11,9 @@ from pydantic import Field, model_validator
 
 from flockenv.constraints.base import Constraint, Settler
 from flockenv.elementary import nearest_whole
-from flockenv.kernels import finite, kernel, like
+from flockenv.jit.decorators import finite, kernel, like
+from flockenv.jit.section import entry
 from flockenv.networks import EDGE
-from flockenv.section import entry
 from flockenv.space import Torus
 from flockenv.state import Floats, State
 

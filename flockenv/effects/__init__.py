@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from flockenv.startup import import_all
+from flockenv.jit.startup import import_all
 
 import_all(__name__, __path__)
 

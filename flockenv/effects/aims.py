@@ -8,7 +8,7 @@ from typing import Any, ClassVar, Literal
 from pydantic import Field
 
 from flockenv.effects.base import Effect, Me, Vector, demand_group
-from flockenv.kernels import Law, Vec, law, like
+from flockenv.jit.decorators import Law, Vec, law, like
 from flockenv.vec import norm, scale, select, sub, unit, zero
 
 __all__ = ["Aim", "Antipode", "Course", "Goal", "about", "easing"]

@@ -64,7 +64,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from flockenv.core.record import Record
-from flockenv.kernels import Law, Vec, law, like
+from flockenv.jit.decorators import Law, Vec, law, like
 from flockenv.vec import dot
 
 __all__ = [

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from flockenv.effects.base import Effect, Me, Obstacle, Other, Sight, all_masses
-from flockenv.kernels import Law, Vec, law, like
+from flockenv.jit.decorators import Law, Vec, law, like
 from flockenv.steering.others import ONE_PLACE
 from flockenv.vec import add, dot, norm, scale, select, sub, unit, zero
 

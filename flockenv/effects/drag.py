@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from flockenv.effects.base import Effect, Me, all_masses
-from flockenv.kernels import Law, Vec, law
+from flockenv.jit.decorators import Law, Vec, law
 from flockenv.vec import norm, scale, sub
 
 __all__ = ["Drag", "QuadraticDrag"]

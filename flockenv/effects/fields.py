@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from flockenv.effects.base import Effect, Me, Vector
-from flockenv.kernels import OPTIONS, Law, Vec, law, like
+from flockenv.jit.decorators import OPTIONS, Law, Vec, law, like
 from flockenv.state import State
 from flockenv.vec import add, dot, lateral, scale, sub, unit
 

@@ -8,7 +8,7 @@ import numpy as np
 from pydantic import Field
 
 from flockenv.effects.base import Effect, Me
-from flockenv.kernels import Law, Vec, law
+from flockenv.jit.decorators import Law, Vec, law
 from flockenv.vec import scale
 
 __all__ = ["Fluctuation"]

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from flockenv.effects.base import Effect, Far, Me, all_masses
-from flockenv.kernels import Law, Vec, law
+from flockenv.jit.decorators import Law, Vec, law
 from flockenv.state import State
 from flockenv.vec import scale
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from flockenv.effects.base import Effect, Me, Vector, all_masses
-from flockenv.kernels import Law, Vec, law
+from flockenv.jit.decorators import Law, Vec, law
 from flockenv.state import State
 from flockenv.vec import scale
 

@@ -11,7 +11,7 @@ from pydantic import Field, model_validator
 from flockenv.effects.aims import about
 from flockenv.effects.base import Me
 from flockenv.effects.way import Around, slowed
-from flockenv.kernels import Law, Vec, law, like
+from flockenv.jit.decorators import Law, Vec, law, like
 from flockenv.spread import Spread, drawn
 from flockenv.targets import Target, passed, row_size, to_target
 from flockenv.vec import norm, scale, select, sub, unit, zero

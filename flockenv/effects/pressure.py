@@ -8,7 +8,7 @@ from typing import Any, ClassVar, Literal
 from pydantic import Field
 
 from flockenv.effects.base import Effect, Me, Other, Sight
-from flockenv.kernels import Law, Vec, law, like
+from flockenv.jit.decorators import Law, Vec, law, like
 from flockenv.steering.others import ONE_PLACE
 from flockenv.vec import scale, select, sub, unit
 

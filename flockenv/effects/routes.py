@@ -13,7 +13,7 @@ from flockenv.effects.base import Me
 from flockenv.effects.journey import onwards, place_kept
 from flockenv.effects.way import Around
 from flockenv.eikonal import NO_WAY
-from flockenv.kernels import Law, Vec, law, like
+from flockenv.jit.decorators import Law, Vec, law, like
 from flockenv.targets import Target, passed, row_size
 from flockenv.vec import scale, sub, unit, zero
 from flockenv.ways import towards

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from flockenv.effects.base import Bonds, Effect, Me, all_masses, network_of
-from flockenv.kernels import Law, Vec, law, like
+from flockenv.jit.decorators import Law, Vec, law, like
 from flockenv.networks import BEND, SHEAR
 from flockenv.vec import add, axis, dot, norm, scale, select, sub
 

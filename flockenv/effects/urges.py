@@ -15,7 +15,7 @@ from pydantic import Field, model_validator
 
 from flockenv import urges
 from flockenv.effects.base import Effect, Me, Other, Sight, demand_group
-from flockenv.kernels import Law, Vec, law, like
+from flockenv.jit.decorators import Law, Vec, law, like
 from flockenv.noise import uniform
 from flockenv.vec import norm, planar
 

@@ -9,7 +9,7 @@ import numpy as np
 from pydantic import Field
 
 from flockenv.effects.base import Effect, Me, Other, Sight
-from flockenv.kernels import Law, Vec, law, like
+from flockenv.jit.decorators import Law, Vec, law, like
 from flockenv.noise import uniform
 from flockenv.vec import add, dot, scale, select, sub, unit
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from flockenv.effects.base import Effect, Me, Vector
-from flockenv.kernels import Law, Vec, law
+from flockenv.jit.decorators import Law, Vec, law
 from flockenv.space import Torus
 from flockenv.state import State
 from flockenv.vec import dot, scale, sub, unit

@@ -12,7 +12,7 @@ import numpy as np
 from pydantic import Field
 
 from flockenv.core.record import ResultRecord
-from flockenv.kernels import laws_digest
+from flockenv.jit.sources import laws_digest
 from flockenv.scene import Scene
 from flockenv.state import Floats, State
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import ClassVar, Literal
 
 from flockenv.integrators.one_stage import OneStage
-from flockenv.kernels import kernel, like
+from flockenv.jit.decorators import kernel, like
 
 __all__ = ["AveragedVelocity"]
 

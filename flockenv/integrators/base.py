@@ -22,7 +22,7 @@ from numba.extending import overload
 
 from flockenv.core.errors import nearest, shown
 from flockenv.core.record import Record
-from flockenv.kernels import OPTIONS
+from flockenv.jit.decorators import OPTIONS
 from flockenv.state import WORK, Floats, State
 
 __all__ = [

@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from flockenv.integrators.base import carried
-from flockenv.kernels import like, shared
+from flockenv.jit.decorators import like, shared
 
 __all__ = ["TRIES", "Clock", "add_slopes", "begun", "copy", "excess", "judged", "misfit", "slope_of"]
 

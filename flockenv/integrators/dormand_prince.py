@@ -9,7 +9,7 @@ import numpy as np
 from flockenv.integrators.adaptive import Adaptive
 from flockenv.integrators.base import Method, Provided
 from flockenv.integrators.control import add_slopes, begun, copy, judged, misfit, slope_of
-from flockenv.kernels import like
+from flockenv.jit.decorators import like
 
 __all__ = ["DormandPrince"]
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any, ClassVar
 
 from flockenv.integrators.base import Integrator
-from flockenv.kernels import python_of
+from flockenv.jit.decorators import python_of
 from flockenv.state import Floats
 
 __all__ = ["OneStage"]

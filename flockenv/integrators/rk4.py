@@ -7,7 +7,7 @@ from typing import Any, ClassVar, Literal
 import numpy as np
 
 from flockenv.integrators.base import Integrator, Method, Provided, carried
-from flockenv.kernels import like
+from flockenv.jit.decorators import like
 
 __all__ = ["RK4"]
 

@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from flockenv.kernels import Vec, kernel, law
+from flockenv.jit.decorators import Vec, kernel, law
 from flockenv.noise import uniform
 from flockenv.population.near import count_near, sort_living
 from flockenv.state import WORK

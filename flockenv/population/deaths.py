@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from flockenv.constraints.broad import image, loaded
-from flockenv.kernels import Vec, kernel, law
+from flockenv.jit.decorators import Vec, kernel, law
 from flockenv.noise import uniform
 from flockenv.population.births import DEATHS
 from flockenv.population.near import count_near, sort_living

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from flockenv.kernels import kernel
+from flockenv.jit.decorators import kernel
 
 __all__ = ["count_near", "sort_living"]
 

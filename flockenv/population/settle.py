@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from flockenv.jit.section import entry
 from flockenv.population.births import PLACE, births
 from flockenv.population.deaths import crowding, drain, passing, reaching
 from flockenv.population.emitters import Emitter
 from flockenv.population.places import Clearing, Surface
 from flockenv.population.sinks import Crowding, Drain, Sink, Threshold
-from flockenv.section import entry
 from flockenv.shapes.table import packed
 from flockenv.space import Box
 from flockenv.state import Floats, State

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from flockenv.kernels import Vec, law, like
+from flockenv.jit.decorators import Vec, law, like
 from flockenv.shapes.chain import segment_hit
 from flockenv.shapes.head import body_of, vector_at
 from flockenv.shapes.round import ray_hit

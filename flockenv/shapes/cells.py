@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from flockenv.kernels import Vec, kernel, law, like
+from flockenv.jit.decorators import Vec, kernel, law, like
 from flockenv.shapes.head import vector_at
 
 __all__ = [

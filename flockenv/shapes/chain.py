@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from flockenv.kernels import Vec, law, like
+from flockenv.jit.decorators import Vec, law, like
 from flockenv.shapes.head import body_of, bound_of, vector_at
 from flockenv.shapes.round import ray_hit
 from flockenv.vec import add, axis, dot, perpendicular, scale, select, sub, unit

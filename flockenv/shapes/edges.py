@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from flockenv.elementary import atan2
-from flockenv.kernels import Vec, law, like
+from flockenv.jit.decorators import Vec, law, like
 from flockenv.shapes.block import half_edges, turned
 from flockenv.shapes.chain import segment_hit, vertex
 from flockenv.shapes.field import hit_distance_field

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from flockenv.kernels import Vec, law
+from flockenv.jit.decorators import Vec, law
 from flockenv.shapes.block import hit_block, hit_half_space, nearest_block, nearest_half_space
 from flockenv.shapes.chain import hit_chain, nearest_chain
 from flockenv.shapes.field import hit_distance_field, nearest_distance_field

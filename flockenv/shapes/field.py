@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from flockenv.grid import sample, sample_vector
-from flockenv.kernels import Vec, law, like
+from flockenv.jit.decorators import Vec, law, like
 from flockenv.shapes.head import body_of
 from flockenv.vec import add, axis, dot, norm, scale, select, sub, unit
 

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from flockenv.grid import sample
-from flockenv.kernels import Vec, law, like
+from flockenv.jit.decorators import Vec, law, like
 from flockenv.shapes.block import half_edges, nearest_block, turned, turned_back
 from flockenv.shapes.chain import crosses, nearest_chain, piece_facing, segment_hit, segment_share, vertex
 from flockenv.shapes.field import STEPS, nearest_distance_field, on_grid

@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from flockenv.kernels import Law
-from flockenv.section import entry_of, vector
+from flockenv.jit.decorators import Law
+from flockenv.jit.section import entry_of, vector
 from flockenv.shapes.joints import joints
 from flockenv.vec import sub
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from flockenv.kernels import Vec, law, like
+from flockenv.jit.decorators import Vec, law, like
 from flockenv.vec import add, scale, sub
 
 __all__ = ["touched_offset", "touched_spot"]

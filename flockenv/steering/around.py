@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from flockenv.kernels import Vec, law, like
+from flockenv.jit.decorators import Vec, law, like
 from flockenv.steering.goals import seek
 from flockenv.vec import dot, lateral, perpendicular, scale, select, sub, unit, zero
 

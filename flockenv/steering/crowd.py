@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from flockenv.kernels import Vec, law, like
+from flockenv.jit.decorators import Vec, law, like
 from flockenv.steering.around import threat
 from flockenv.vec import add, dot, perpendicular, planar, scale, select, sub, unit
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from flockenv.kernels import Vec, law, like
+from flockenv.jit.decorators import Vec, law, like
 from flockenv.vec import add, axis, cross, dot, lateral, norm, perpendicular, scale, select, sub, unit
 
 __all__ = [

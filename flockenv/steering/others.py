@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from flockenv.kernels import Vec, law, like
+from flockenv.jit.decorators import Vec, law, like
 from flockenv.steering.goals import arrive, flee, in_frame, match_velocity, seek
 from flockenv.vec import add, axis, dot, lateral, limit, norm, opposite, perpendicular, scale, select, sub, unit, zero
 

@@ -5,7 +5,7 @@ Where the nearest point of a path lies is geometry (`flockenv.polyline`), and so
 
 from __future__ import annotations
 
-from flockenv.kernels import Vec, law, like
+from flockenv.jit.decorators import Vec, law, like
 from flockenv.steering.goals import seek
 from flockenv.vec import select, sub, zero
 

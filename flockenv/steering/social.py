@@ -13,7 +13,7 @@ from __future__ import annotations
 import numpy as np
 
 from flockenv.elementary import atan2, exp
-from flockenv.kernels import Vec, law, like
+from flockenv.jit.decorators import Vec, law, like
 from flockenv.steering.others import ONE_PLACE
 from flockenv.vec import add, cross, dot, lateral, norm, perpendicular, scale, select, sub, unit
 

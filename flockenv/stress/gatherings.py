@@ -12,9 +12,9 @@ import numpy as np
 from flockenv.arbitration import Allocation, Blend
 from flockenv.behaviours import AvoidObstacles, ForceField, Seek, UnalignedAvoidance
 from flockenv.constraints import Collisions
-from flockenv.crew import threads, use_threads
 from flockenv.findings import Case, Value
 from flockenv.integrators import Integrator
+from flockenv.jit.thread_pool import threads, use_threads
 from flockenv.scene import Group, Scene
 from flockenv.shapes import Block, Circle, Polygon
 from flockenv.spawn import Spawn

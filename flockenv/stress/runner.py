@@ -10,7 +10,7 @@ from flockenv import findings
 from flockenv.constraints.collisions import UnsolvedContactsWarning
 from flockenv.findings import Case, Results
 from flockenv.integrators import INTEGRATORS, Integrator
-from flockenv.kernels import laws_digest
+from flockenv.jit.sources import laws_digest
 from flockenv.stress.case import TOO_LONG
 
 __all__ = ["fingerprint", "run", "usual_methods"]

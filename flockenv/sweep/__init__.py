@@ -8,11 +8,11 @@ that), and every array of a world lies in blocks: the first coordinates of one, 
 over the lanes has a constant length and constant offsets, and the compiler makes it straight vector code; running sums
 lie in one small scratch array and stay in vector registers.
 
-The files, from the whole to its parts: `entries` are what Python calls; `step` advances a world, by `respond` (what
-all laws say), the integrator's `method` and `move`; `listing` sorts the agents and walks their blocks, `meeting` lets a
+The files, from the whole to its parts: `entries` are what Python calls; `step` advances a world, by `respond` (what all
+laws say), the integrator's `method` and `move`; `listing` sorts the agents and walks their blocks, `meeting` lets a
 block meet its candidates, `far` all agents, `bonds` its partners, `obstacles` what stands around; `look` is what tasks
-add. `parts` says what follows from which laws there are. Each file holds sections (see `flockenv.section`): a function
-`thing_of(plan)` makes the function `thing`, of as little as it depends on.
+add. `parts` says what follows from which laws there are. Each file holds sections (see `flockenv.jit.section`): a
+function `thing_of(plan)` makes the function `thing`, of as little as it depends on.
 """
 
 from __future__ import annotations

@@ -7,8 +7,8 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from flockenv.effects.base import Me
-from flockenv.kernels import kernel, law, like
-from flockenv.section import record, section, tuple_from
+from flockenv.jit.decorators import kernel, law, like
+from flockenv.jit.section import record, section, tuple_from
 from flockenv.sweep.blocks import vector_of_lane
 from flockenv.vec import unit, zero
 

@@ -18,8 +18,8 @@ from typing import Any
 
 import numpy as np
 
-from flockenv.kernels import Law, Vec, kernel, law, like, routine
-from flockenv.section import section
+from flockenv.jit.decorators import Law, Vec, kernel, law, like, routine
+from flockenv.jit.section import section
 from flockenv.shapes.edges import near_way, sphere_edge
 from flockenv.shapes.round import touched_normal
 from flockenv.shapes.table import law_of

@@ -14,15 +14,15 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from flockenv.kernels import ask_for, wait_for_team
+from flockenv.jit.intrinsics import ask_for, wait_for_team
+from flockenv.jit.section import section
+from flockenv.jit.transpose import put_lines
 from flockenv.neighbours import FEWEST_ARRANGED, STEPS_ARRANGED, WORTH_ARRANGING
-from flockenv.section import section
 from flockenv.sweep.blocks import handed_of, place_of
 from flockenv.sweep.gather import gather, picked, places_each, scatter_each
 from flockenv.sweep.parts import Parts
 from flockenv.sweep.scratch import array_names
 from flockenv.tiles import count_tiles, find_homes
-from flockenv.transpose import put_lines
 
 __all__ = ["Luggage", "arrange_plan", "go_home_of", "move_in_of"]
 

@@ -13,8 +13,9 @@ from typing import Any
 
 import numpy as np
 
-from flockenv.kernels import Vec, copy_lanes
-from flockenv.section import section
+from flockenv.jit.decorators import Vec
+from flockenv.jit.intrinsics import copy_lanes
+from flockenv.jit.section import section
 
 __all__ = [
     "common_places", "handed_of", "into_blocks", "out_of_blocks", "place_of", "put_vector_of", "vector_of",

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from flockenv.kernels import Law, kernel
-from flockenv.section import in_turn, section
+from flockenv.jit.decorators import Law, kernel
+from flockenv.jit.section import in_turn, section
 from flockenv.sweep.agents import AgentPlan
 from flockenv.sweep.blocks import into_blocks, out_of_blocks, put_vector_of, vector_of_lane
 

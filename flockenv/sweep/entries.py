@@ -11,8 +11,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from flockenv.kernels import kernel, like, unaliased
-from flockenv.section import entry_of, in_turn, section, titled
+from flockenv.jit.decorators import kernel, like
+from flockenv.jit.intrinsics import unaliased
+from flockenv.jit.section import entry_of, in_turn, section, titled
 from flockenv.sweep.agents import alone_of
 from flockenv.sweep.blocks import out_of_blocks, place_of, vector_of_lane
 from flockenv.sweep.carry import bring_in_of, take_drive_of

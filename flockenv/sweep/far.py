@@ -13,8 +13,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from flockenv.effects.base import Far, Me
-from flockenv.kernels import Law, like, wait_for_team
-from flockenv.section import section
+from flockenv.jit.decorators import Law, like
+from flockenv.jit.intrinsics import wait_for_team
+from flockenv.jit.section import section
 from flockenv.sweep.blocks import place_of, vector_of_lane
 from flockenv.sweep.parts import Parts
 from flockenv.tree import BUCKETS, LEVELS, LISTED, gather, line_up, weigh

@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 
 from flockenv.effects.base import Obstacle
-from flockenv.kernels import kernel, like
-from flockenv.section import in_turn, section
+from flockenv.jit.decorators import kernel, like
+from flockenv.jit.section import in_turn, section
 from flockenv.shapes.round import normal, touched_normal
 from flockenv.shapes.table import law_of
 from flockenv.shapes.touch import touched_offset, touched_spot

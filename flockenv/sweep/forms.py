@@ -11,8 +11,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from flockenv.kernels import Law, Vec, kernel, law
-from flockenv.section import section
+from flockenv.jit.decorators import Law, Vec, kernel, law
+from flockenv.jit.section import section
 from flockenv.shapes.cells import (
     MOST_FOUND,
     count_of,

@@ -13,8 +13,8 @@ import numba
 from llvmlite import ir  # type: ignore[import-untyped]
 from numba.core import types
 
-from flockenv.kernels import intrinsic_or_python
-from flockenv.lines import array_of
+from flockenv.jit.intrinsics import intrinsic_or_python
+from flockenv.jit.memory import array_of
 
 __all__ = [
     "add_where",

@@ -12,8 +12,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from flockenv.effects.base import Members
-from flockenv.kernels import Law, finite, kernel, like, wait_for_team
-from flockenv.section import in_turn, section
+from flockenv.jit.decorators import Law, finite, kernel, like
+from flockenv.jit.intrinsics import wait_for_team
+from flockenv.jit.section import in_turn, section
 from flockenv.sweep.blocks import place_of, vector_of_lane
 from flockenv.sweep.gather import gather, scatter
 from flockenv.sweep.parts import Parts

@@ -6,7 +6,7 @@ import functools
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from flockenv.kernels import Law, Vec, kernel
+from flockenv.jit.decorators import Law, Vec, kernel
 from flockenv.sweep.numbers import Images, images_in, images_of
 from flockenv.vec import add
 

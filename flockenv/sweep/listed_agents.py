@@ -8,8 +8,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from flockenv.effects.base import Me
-from flockenv.kernels import kernel
-from flockenv.section import record, section
+from flockenv.jit.decorators import kernel
+from flockenv.jit.section import record, section
 from flockenv.sweep.blocks import place_of
 from flockenv.sweep.gather import gather
 from flockenv.sweep.listing import Listing

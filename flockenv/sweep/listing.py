@@ -16,14 +16,15 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from flockenv.kernels import Law, ask_for, wait_for_team
+from flockenv.jit.decorators import Law
+from flockenv.jit.intrinsics import ask_for, wait_for_team
+from flockenv.jit.section import section
+from flockenv.jit.transpose import out_of_records, put_records
 from flockenv.neighbours import DISTANT, candidates, count_cells, order_records, row_of
-from flockenv.section import section
 from flockenv.sweep.blocks import handed_of, place_of
 from flockenv.sweep.gather import copy_each, gather, gather_each, picked, places_each, scatter
 from flockenv.sweep.scratch import SMALL_STRIDE, array_names
 from flockenv.tiles import FAR_FROM_HOME, count_from_home, order_cells, order_shared
-from flockenv.transpose import out_of_records, put_records
 from flockenv.vec import unit
 
 if TYPE_CHECKING:

@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from flockenv.kernels import like
-from flockenv.section import section
+from flockenv.jit.decorators import like
+from flockenv.jit.section import section
 from flockenv.sweep.blocks import into_blocks, vector_of, vector_of_lane
 from flockenv.sweep.gather import fill, gather, scatter
 from flockenv.sweep.listing import list_living, walk_blocks

@@ -10,9 +10,9 @@ from typing import Any
 
 import numpy as np
 
-from flockenv.abreast import key_of, key_read, key_written, pick, same_key, tag_of
-from flockenv.kernels import like
-from flockenv.section import section
+from flockenv.jit.decorators import like
+from flockenv.jit.section import section
+from flockenv.jit.simd_rows import key_of, key_read, key_written, pick, same_key, tag_of
 from flockenv.sweep.blocks import vector_of
 from flockenv.sweep.gather import fill, gather, scatter
 from flockenv.sweep.look_plan import LookPlan

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from flockenv.kernels import Law
+from flockenv.jit.decorators import Law
 from flockenv.sweep.listing import Listing, listing_of
 
 if TYPE_CHECKING:

@@ -9,8 +9,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from flockenv.integrators.base import SUBSTEPS, Method, Provided
-from flockenv.kernels import kernel, like
-from flockenv.section import section
+from flockenv.jit.decorators import kernel, like
+from flockenv.jit.section import section
 from flockenv.sweep.parts import Parts
 
 __all__ = ["MethodPlan", "advance_of", "method_plan"]

@@ -12,9 +12,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from flockenv.integrators.one_stage import OneStage
-from flockenv.kernels import Law, Vec, finite, kernel, like
+from flockenv.jit.decorators import Law, Vec, finite, kernel, like
+from flockenv.jit.section import in_turn, section, tuple_from
 from flockenv.noise import normal
-from flockenv.section import in_turn, section, tuple_from
 from flockenv.sweep.agents import AgentPlan, agent_plan, alone_of
 from flockenv.sweep.blocks import common_places, put_vector_of, vector_of_lane
 from flockenv.sweep.laws import OneLaw, given_of, says_of

@@ -7,7 +7,8 @@ from collections.abc import Sequence
 from typing import Any
 
 from flockenv.effects.base import LAWS, Effect
-from flockenv.kernels import IN_PYTHON, held, python_of
+from flockenv.jit.decorators import IN_PYTHON, python_of
+from flockenv.jit.sources import held
 
 __all__ = ["OF_PAIRS", "names_read"]
 

@@ -14,7 +14,7 @@ import numpy as np
 from llvmlite import ir  # type: ignore[import-untyped]
 from numba.core import types
 
-from flockenv.kernels import intrinsic_or_python
+from flockenv.jit.intrinsics import intrinsic_or_python
 
 __all__ = ["AT_ONCE", "exchanges", "inserted", "kept", "merged"]
 

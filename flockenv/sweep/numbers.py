@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from flockenv.kernels import Law, kernel
-from flockenv.section import joined_from, record, section, tuple_from
+from flockenv.jit.decorators import Law, kernel
+from flockenv.jit.section import joined_from, record, section, tuple_from
 from flockenv.sweep.gather import gather
 from flockenv.vec import add
 

@@ -14,8 +14,8 @@ from typing import Any
 
 import numpy as np
 
-from flockenv.kernels import Vec, kernel, law, like
-from flockenv.section import in_turn, section, vector
+from flockenv.jit.decorators import Vec, kernel, law, like
+from flockenv.jit.section import in_turn, section, vector
 from flockenv.shapes.edges import near_way
 from flockenv.shapes.head import outside_box, shift_of, velocity_of
 from flockenv.shapes.table import law_of

@@ -9,8 +9,9 @@ from typing import Any
 import numpy as np
 
 from flockenv.effects.base import Other, in_view
-from flockenv.kernels import kernel, like, tallied, tally_of
-from flockenv.section import in_turn, section, tuple_from
+from flockenv.jit.decorators import kernel, like
+from flockenv.jit.intrinsics import tallied, tally_of
+from flockenv.jit.section import in_turn, section, tuple_from
 from flockenv.sweep.blocks import place_of, vector_of
 from flockenv.sweep.gather import add_where, chosen, copy_each, fill, gather, picked, scatter
 from flockenv.sweep.laws import given_of

@@ -16,11 +16,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from flockenv import processor
 from flockenv.effects.base import LAWS, Effect, Sight
 from flockenv.integrators.base import Integrator
 from flockenv.integrators.one_stage import OneStage
-from flockenv.kernels import LINE
+from flockenv.jit import cpu
+from flockenv.jit.cpu import LINE
 from flockenv.shapes.cells import MOST_FOUND
 from flockenv.space import Space
 from flockenv.sweep.met_obstacles import MetObstacles
@@ -79,12 +79,12 @@ class Parts(MetObstacles):
 
         Where laws meet all agents, sixteen on any processor: a tree is made of blocks, so results follow from it.
         """
-        return 16 if self.far else processor.REGISTER // self.itemsize
+        return 16 if self.far else cpu.REGISTER // self.itemsize
 
     @property
     def masks(self) -> bool:
         """True if what was compared is kept in masks, beside the registers: it costs nothing to compare once more."""
-        return processor.REGISTER == LINE
+        return cpu.REGISTER == LINE
 
     @property
     def keyed(self) -> bool:

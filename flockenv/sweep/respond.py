@@ -14,8 +14,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from flockenv.kernels import Law, Vec, kernel, like
-from flockenv.section import section, tuple_from
+from flockenv.jit.decorators import Law, Vec, kernel, like
+from flockenv.jit.section import section, tuple_from
 from flockenv.sweep.agents import AgentPlan, agent_plan, alone_of, still
 from flockenv.sweep.blocks import common_places, put_vector_of, vector_of_lane
 from flockenv.sweep.bonds import BondPlan, bond_plan, bonds_of

@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from flockenv.jit.section import record
 from flockenv.neighbours import FEWEST_ARRANGED, MAX_RANGES
-from flockenv.section import record
 from flockenv.tiles import HOME
 from flockenv.tree import BUCKETS, LEVELS, tree_sizes
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-from flockenv.kernels import kernel, like
-from flockenv.section import section
+from flockenv.jit.decorators import kernel, like
+from flockenv.jit.section import section
 from flockenv.shapes.round import blocks
 from flockenv.shapes.table import law_of
 from flockenv.sweep.blocks import vector_of

@@ -12,7 +12,7 @@ from pydantic import Field, model_validator
 
 from flockenv import steering
 from flockenv.effects import Contact, ObstacleContact
-from flockenv.kernels import kernel, like
+from flockenv.jit.decorators import kernel, like
 from flockenv.noise import uniform
 from flockenv.presets import PRESETS
 from flockenv.scene import Group, Scene

@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from flockenv import orca
-from flockenv.kernels import kernel, like, stacked
+from flockenv.jit.decorators import kernel, like
+from flockenv.jit.intrinsics import stacked
 from flockenv.noise import uniform
 from flockenv.scene import Group, Scene
 from flockenv.snapshot import Mark

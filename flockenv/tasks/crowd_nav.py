@@ -13,7 +13,7 @@ from pydantic import Field, model_validator
 from flockenv.arbitration import Blend
 from flockenv.behaviours.social import Social
 from flockenv.effects.aims import Antipode
-from flockenv.kernels import kernel, like
+from flockenv.jit.decorators import kernel, like
 from flockenv.noise import uniform
 from flockenv.presets import PRESETS
 from flockenv.scene import Group, Scene

@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from flockenv.abreast import columns, into_rows, packed, take
-from flockenv.kernels import kernel, like, replaced
-from flockenv.lines import fetch, pour
-from flockenv.section import record, section
+from flockenv.jit.decorators import kernel, like, replaced
+from flockenv.jit.memory import fetch, pour
+from flockenv.jit.section import record, section
+from flockenv.jit.simd_rows import columns, into_rows, packed, take
 from flockenv.sweep import begin_inner_of, look_of, step_world_of
 from flockenv.sweep.gather import gather
 from flockenv.tasks.base import Frame

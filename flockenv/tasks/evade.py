@@ -10,7 +10,7 @@ from pydantic import Field, model_validator
 
 from flockenv import arbitration, steering
 from flockenv.effects import ObstacleContact
-from flockenv.kernels import Vec, kernel, like
+from flockenv.jit.decorators import Vec, kernel, like
 from flockenv.noise import uniform
 from flockenv.scene import Group, Scene
 from flockenv.shapes import ray_hit

@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from flockenv import arbitration, steering
-from flockenv.abreast import SIDE
-from flockenv.kernels import kernel, like, stacked
+from flockenv.jit.decorators import kernel, like
+from flockenv.jit.intrinsics import stacked
+from flockenv.jit.simd_rows import SIDE
 from flockenv.noise import uniform
 from flockenv.scene import Group, Scene
 from flockenv.snapshot import Mark

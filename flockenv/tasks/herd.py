@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from flockenv import steering
-from flockenv.kernels import Vec, kernel
+from flockenv.jit.decorators import Vec, kernel
 from flockenv.noise import smooth, uniform
 from flockenv.scene import Group, Scene
 from flockenv.snapshot import Mark

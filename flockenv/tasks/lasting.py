@@ -11,7 +11,7 @@ from typing import Any, ClassVar
 
 from pydantic import Field
 
-from flockenv.kernels import kernel
+from flockenv.jit.decorators import kernel
 from flockenv.tasks.base import Task
 
 __all__ = ["MEASURES", "METRICS", "LastingTask", "judge", "lasts", "tell_lasting"]

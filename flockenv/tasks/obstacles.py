@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
-from flockenv.kernels import kernel, like
+from flockenv.jit.decorators import kernel, like
 from flockenv.noise import uniform
 from flockenv.scene import Group, Scene
 from flockenv.snapshot import Mark

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
-from flockenv.kernels import Law
+from flockenv.jit.decorators import Law
 from flockenv.sweep import BeginPlan, LookPlan, StepPlan
 
 __all__ = ["REFUSED", "Decision", "Given", "Kernels", "Near", "Plan", "Results", "Totals", "Worlds"]

@@ -9,7 +9,7 @@ from typing import Any, ClassVar, Literal
 from pydantic import Field
 
 from flockenv import arbitration, steering
-from flockenv.kernels import Vec, kernel
+from flockenv.jit.decorators import Vec, kernel
 from flockenv.noise import uniform
 from flockenv.scene import Group, Scene
 from flockenv.space import Box

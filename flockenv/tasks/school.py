@@ -12,7 +12,7 @@ from pydantic import Field, model_validator
 
 from flockenv import arbitration, steering, urges
 from flockenv.effects.base import in_view
-from flockenv.kernels import Vec, kernel
+from flockenv.jit.decorators import Vec, kernel
 from flockenv.noise import smooth, uniform
 from flockenv.scene import Group, Scene
 from flockenv.snapshot import Mark

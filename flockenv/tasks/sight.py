@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from flockenv.elementary import nearest_whole
-from flockenv.kernels import Vec, kernel, like
+from flockenv.jit.decorators import Vec, kernel, like
 from flockenv.shapes import ray_hit
 from flockenv.tasks.layout import Slot
 from flockenv.vec import dot

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from flockenv import findings
 from flockenv.findings import Case, Results
-from flockenv.kernels import laws_digest
+from flockenv.jit.sources import laws_digest
 from flockenv.validation.case import quietly
 
 __all__ = ["fingerprint", "run"]

@@ -13,8 +13,8 @@ from typing import Any, NamedTuple
 
 from numba.core import event
 
-from flockenv import frontend, lowering
-from flockenv.turns import OneAtATime
+from flockenv.jit.lock import OneAtATime
+from flockenv.jit.numba_patches import front_end, lowering
 
 __all__ = ["Compiled", "compiled", "unmatched"]
 
@@ -37,8 +37,11 @@ def compiled() -> tuple[Compiled, ...]:
 
 def unmatched() -> tuple[str, ...]:
     """Return the replacements in numba that are left out because the numba that is installed reads otherwise."""
-    every = [*((each.title, each.reads) for each in (*frontend.TRICKS, *frontend.SPARED)), ("lowering", lowering.READS)]
-    return tuple(title for title, reads in every if not frontend.reads_as_known(reads))
+    every = [
+        *((each.title, each.reads) for each in (*front_end.TRICKS, *front_end.SPARED)),
+        ("lowering", lowering.READS),
+    ]
+    return tuple(title for title, reads in every if not front_end.reads_as_known(reads))
 
 
 class _Watch(event.Listener):

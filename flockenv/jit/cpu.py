@@ -14,7 +14,10 @@ import os
 import numba
 from numba.core import codegen
 
-__all__ = ["FEATURES", "REGISTER"]
+__all__ = ["FEATURES", "LINE", "REGISTER"]
+
+LINE = 64
+"""Bytes of a line of the cache; no vector register is longer."""
 
 
 def _features() -> frozenset[str]:

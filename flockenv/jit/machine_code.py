@@ -17,7 +17,7 @@ from numba.core.compiler import CompileResult
 from numba.core.errors import NumbaWarning
 from numba.core.serialize import dumps
 
-from flockenv.checked_store import Store
+from flockenv.jit.checked_store import Store
 
 __all__ = ["MachineCode"]
 

@@ -17,7 +17,8 @@ from numba.core.errors import TypingError
 from numba.np import arrayobj
 from numpy.typing import NDArray
 
-from flockenv.kernels import LINE, asked, intrinsic_or_python
+from flockenv.jit.cpu import LINE
+from flockenv.jit.intrinsics import asked, intrinsic_or_python
 
 __all__ = ["array_of", "fetch", "in_one_piece", "pour", "put_past", "settle", "zeros"]
 

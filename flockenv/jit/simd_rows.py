@@ -15,9 +15,11 @@ from llvmlite import ir  # type: ignore[import-untyped]
 from numba.core import cgutils, types
 from numba.np import arrayobj
 
-from flockenv import processor
-from flockenv.kernels import LINE, intrinsic_or_python, kernel, written
-from flockenv.lines import array_of, in_one_piece
+from flockenv.jit import cpu
+from flockenv.jit.cpu import LINE
+from flockenv.jit.decorators import kernel
+from flockenv.jit.intrinsics import intrinsic_or_python, written
+from flockenv.jit.memory import array_of, in_one_piece
 
 __all__ = [
     "PAIR", "SIDE", "apart", "columns", "in_one_row", "into_rows", "key_of", "key_read", "key_written", "ordered",
@@ -30,7 +32,7 @@ SIDE = LINE // 4
 SHORT = 8
 """A table of more registers is not looked up in registers."""
 
-SQUARE = processor.REGISTER // 4
+SQUARE = cpu.REGISTER // 4
 """Single precision numbers in a vector register: squares of as many rows and columns are turned at once."""
 
 PAIR = 2 * SIDE
@@ -127,11 +129,11 @@ def _lookup(builder: Any, vector: Any, size: int) -> tuple[int, Any]:
     """
     declare: Any = cgutils.get_or_insert_function
     index = ir.VectorType(ir.IntType(8 * size), vector.count)
-    if "avx512f" in processor.FEATURES and vector.count * size == 64:
+    if "avx512f" in cpu.FEATURES and vector.count * size == 64:
         name = f"llvm.x86.avx512.vpermi2var.p{'s' if size == 4 else 'd'}.512"
         call = declare(builder.module, ir.FunctionType(vector, [vector, index, vector]), name)
         return 2 * vector.count, lambda named, table: builder.call(call, [table[0], named, table[1]])
-    if "avx2" in processor.FEATURES and (vector.count, size) == (8, 4):
+    if "avx2" in cpu.FEATURES and (vector.count, size) == (8, 4):
         call = declare(builder.module, ir.FunctionType(vector, [vector, index]), "llvm.x86.avx2.permps")
         return vector.count, lambda named, table: builder.call(call, [table[0], named])
     return 0, None
@@ -190,7 +192,7 @@ def _picks(
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         number, word = context.get_data_type(to.dtype), ir.IntType(64)
         size = context.get_abi_sizeof(number)
-        vector = ir.VectorType(number, min(wide, processor.REGISTER // size))
+        vector = ir.VectorType(number, min(wide, cpu.REGISTER // size))
         step, _ = _lookup(builder, vector, size)
         few = builder.icmp_unsigned("<=", arguments[7], word(SHORT * vector.count if step else 0))
         rows: Any = cgutils.for_range_slice
@@ -324,7 +326,7 @@ def take(to: Any, table: Any, who: Any, count: int) -> None:
     N and N' are multiples of PAIR, and whom the lists name beyond the last agent is below `count`, too.
     """
     many, listed, n = np.uint64(to.shape[0]), np.uint64(who.shape[0]), np.uint64(who.shape[1])
-    if np.uint64(count) <= np.uint64(SHORT * processor.REGISTER // 4):
+    if np.uint64(count) <= np.uint64(SHORT * cpu.REGISTER // 4):
         beside, length, agents = listed * n, np.uint64(table.shape[1]), np.uint64(count)
         for i in range(np.uint64(0), listed * n, np.uint64(SIDE)):
             pick(to, i, beside, table, np.uint64(0), length, many, agents, who, i, SIDE)

@@ -36,7 +36,7 @@ from numba.core.types import containers, functions
 from numba.core.typing import context as typing_context
 
 from flockenv.core.errors import nearest, shown
-from flockenv.startup import nothing_to_collect
+from flockenv.jit.startup import nothing_to_collect
 
 __all__ = ["LEFT_OUT", "SPARED", "TRICKS", "Spared", "Trick", "applies", "lighter", "reads_as_known", "spared"]
 

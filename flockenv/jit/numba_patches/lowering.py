@@ -7,7 +7,7 @@ number is read from where the array's data are, a part of an array is made of th
 divides nothing, and a function that is only ever inlined takes a namedtuple as it is. Flock in float64 says 33,000
 instructions where it said 86,000; the machine code is what it was.
 
-Where the functions of numba that this relies on read otherwise (another numba), it is left out; see `frontend`.
+Where the functions of numba that this relies on read otherwise (another numba), it is left out; see `front_end`.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from numba.core.datamodel import models
 from numba.cpython import rangeobj, slicing
 from numba.np import arrayobj
 
-from flockenv.frontend import Known, applies
+from flockenv.jit.numba_patches.front_end import Known, applies
 
 __all__ = ["READS", "Brief", "BriefPart", "insert_part", "is_brief"]
 

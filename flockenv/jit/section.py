@@ -22,25 +22,16 @@ import numba
 from numba.core import types
 from numba.extending import intrinsic
 
-from flockenv import processor
-from flockenv.checked_store import Store
-from flockenv.inlining import Whole
-from flockenv.kernels import (
-    FAST,
-    IN_PYTHON,
-    Vec,
-    cache_folder,
-    described,
-    functions_in,
-    kernel,
-    laws_digest,
-    python_of,
-    texts_outside,
-)
-from flockenv.machine_code import MachineCode
-from flockenv.private_folder import prepared
-from flockenv.startup import numba_before_scipy
-from flockenv.turns import OneAtATime
+from flockenv.jit import cpu
+from flockenv.jit.cache_folder import cache_folder
+from flockenv.jit.checked_store import Store
+from flockenv.jit.decorators import FAST, IN_PYTHON, Vec, kernel, python_of
+from flockenv.jit.lock import OneAtATime
+from flockenv.jit.machine_code import MachineCode
+from flockenv.jit.pipeline import Whole
+from flockenv.jit.private_folder import prepared
+from flockenv.jit.sources import described, functions_in, laws_digest, texts_outside
+from flockenv.jit.startup import numba_before_scipy
 
 __all__ = [
     "digest_of",
@@ -50,6 +41,7 @@ __all__ = [
     "joined_from",
     "record",
     "section",
+    "settled",
     "several",
     "titled",
     "tuple_from",
@@ -85,6 +77,16 @@ def entry_of(make: Callable[..., Callable[..., Any]]) -> Callable[..., Callable[
     return made
 
 
+def settled(function: Any) -> Callable[..., Any]:
+    """Return an entry point that was called, without numba's look at the type of every argument: half of a short call.
+
+    For a caller whose arguments have the same types each time, arrays in one piece: types are not looked at any more.
+    One that was called with several types is returned as it is.
+    """
+    compiled = list(getattr(function, "overloads", {}).values())
+    return compiled[0].entry_point if len(compiled) == 1 else function  # type: ignore[no-any-return]
+
+
 def titled(entry_point: Callable[..., Any], title: str) -> Callable[..., Any]:
     """Return an entry point that is called by a title while it is compiled; the first one it gets stays."""
     vars(entry_point).setdefault("title", title)
@@ -112,7 +114,7 @@ def _entry(make: Callable[..., Callable[..., Any]], plan: tuple[Any, ...]) -> Ca
     if IN_PYTHON:
         return make(*plan)
     numba_before_scipy()
-    digest, store = digest_of((make, plan, processor.REGISTER)), Store(cache_folder())
+    digest, store = digest_of((make, plan, cpu.REGISTER)), Store(cache_folder())
     stand_in = _stand_in(store.read(f"{digest}.plan"))
     function = stand_in or make(*plan)
     if stand_in is None:

@@ -12,7 +12,7 @@ import hashlib
 from pathlib import Path
 
 from flockenv.core.atomic_files import remove_leftovers, replacing
-from flockenv.private_folder import read_private, say_once
+from flockenv.jit.private_folder import read_private, say_once
 
 __all__ = ["Store"]
 

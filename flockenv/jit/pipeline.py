@@ -26,8 +26,8 @@ from llvmlite import ir as llvm
 from numba import _dynfunc  # type: ignore[attr-defined]  # compiled
 from numba.core import analysis, compiler, compiler_machinery, ir, lowering, typed_passes
 
-from flockenv.frontend import lighter, spared
-from flockenv.lowering import Brief, BriefPart, insert_part, is_brief
+from flockenv.jit.numba_patches.front_end import lighter, spared
+from flockenv.jit.numba_patches.lowering import Brief, BriefPart, insert_part, is_brief
 
 __all__ = ["Inlined", "Whole"]
 

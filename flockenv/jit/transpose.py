@@ -12,9 +12,10 @@ from typing import Any
 from llvmlite import ir  # type: ignore[import-untyped]
 from numba.core import types
 
-from flockenv import processor
-from flockenv.kernels import LINE, intrinsic_or_python, written
-from flockenv.lines import array_of, put_past
+from flockenv.jit import cpu
+from flockenv.jit.cpu import LINE
+from flockenv.jit.intrinsics import intrinsic_or_python, written
+from flockenv.jit.memory import array_of, put_past
 
 __all__ = ["out_of_records", "put_lines", "put_records"]
 
@@ -80,7 +81,7 @@ def _put_records(
         to, cells, offsets = (array_of(context, builder, signature.args[k], arguments[k]).data for k in (0, 4, 6))
         array, real = signature.args[1].dtype, context.get_data_type(signature.args[0].dtype)
         itemsize = context.get_abi_sizeof(real)
-        side = min(wide, processor.REGISTER // itemsize)  # lanes of a register
+        side = min(wide, cpu.REGISTER // itemsize)  # lanes of a register
         vector, word, whole = ir.VectorType(real, side), ir.IntType(64), ir.IntType(32)
         several = ir.VectorType(whole, side)
 
@@ -153,7 +154,7 @@ def _put_lines(
         data, where = (array_of(context, builder, signature.args[k], arguments[k]).data for k in (0, 4))
         array, real = signature.args[1].dtype, context.get_data_type(signature.args[0].dtype)
         itemsize = context.get_abi_sizeof(real)
-        side = min(wide, processor.REGISTER // itemsize)
+        side = min(wide, cpu.REGISTER // itemsize)
         size = max(_whole(many), LINE // itemsize)
         vector, word = ir.VectorType(real, side), ir.IntType(64)
 
@@ -206,7 +207,7 @@ def _out_of_records(typing_context: Any, numbers: Any, places: Any, at: Any, wid
         to, source = (array_of(context, builder, signature.args[k], arguments[k]).data for k in (0, 4))
         real, word = context.get_data_type(signature.args[0].dtype), ir.IntType(64)
         itemsize = context.get_abi_sizeof(real)
-        side = min(wide, processor.REGISTER // itemsize)  # lanes of a register
+        side = min(wide, cpu.REGISTER // itemsize)  # lanes of a register
         vector = ir.VectorType(real, side)
 
         def piece(lane: int, done: int, count: int) -> Any:

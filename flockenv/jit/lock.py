@@ -10,7 +10,7 @@ import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from flockenv.startup import nothing_to_collect
+from flockenv.jit.startup import nothing_to_collect
 
 if TYPE_CHECKING:
     from filelock import FileLock

@@ -1,0 +1,33 @@
+"""Where machine code is kept."""
+
+from __future__ import annotations
+
+import os
+import tempfile
+from pathlib import Path
+
+from flockenv.jit.private_folder import first_private, prepared
+
+__all__ = [
+    "cache_folder",
+]
+
+
+def cache_folder() -> Path:
+    """Return the folder of machine code, checked; FLOCKENV_CACHE names another one.
+
+    Falls back to a folder under the system's temporary one where the home folder cannot be written or is not private.
+
+    Raises:
+        OSError: the folder that FLOCKENV_CACHE names can be changed by other users, or none can be written.
+    """
+    named = os.environ.get("FLOCKENV_CACHE")
+    if named:
+        try:
+            return prepared(Path(named))
+        except OSError as error:
+            reason = error.strerror or error
+            raise type(error)(f"FLOCKENV_CACHE = {named}: refused for compiled kernels: {reason}") from error
+    home = os.environ.get("XDG_CACHE_HOME") or os.environ.get("LOCALAPPDATA") or os.path.expanduser("~/.cache")
+    user = os.geteuid() if hasattr(os, "geteuid") else "cache"
+    return first_private(Path(home) / "flockenv", Path(tempfile.gettempdir()), f"flockenv-{user}")

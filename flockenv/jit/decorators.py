@@ -1,0 +1,137 @@
+"""The marks of compiled code: laws, kernels and the few functions that both are written with.
+
+What Python calls of them is made in `section`.
+"""
+
+from __future__ import annotations
+
+import inspect
+import math
+from collections.abc import Callable
+from typing import Any, TypeVar, cast
+
+import numba
+import numpy as np
+from numba.core import types
+from numba.cpython.unsafe.tuple import tuple_setitem
+from numba.extending import overload, register_jitable
+
+from flockenv.jit import progress  # noqa: F401  # shows how long compiling takes
+from flockenv.jit.pipeline import Inlined
+
+__all__ = [
+    "FAST",
+    "IN_PYTHON",
+    "OPTIONS",
+    "Law",
+    "Numbers",
+    "Vec",
+    "finite",
+    "kernel",
+    "law",
+    "like",
+    "python_of",
+    "replaced",
+    "routine",
+    "shared",
+    "unfused",
+]
+
+F = TypeVar("F", bound=Callable[..., Any])
+
+Law = Callable[..., Any]
+"""A law, as records hold it: a function marked `law`, `kernel` or `unfused`."""
+
+Vec = tuple[float, ...]
+"""A vector inside a law: a tuple of D floats, D = 2 or 3."""
+
+Numbers = tuple[float, ...]
+"""As many numbers as there are: a tuple of floats of any length, the same for all agents."""
+
+# Fused multiply-add and nothing else. The rest of fastmath gave no speed here and took much: with `arcp` and `afn` a
+# division in a vector register is an estimate and a scalar one is exact, so that results depend on how agents are
+# divided among threads; with `reassoc` and `nsz` a NaN check (x - x == 0) folds to True.
+FAST = frozenset({"contract"})
+
+# _nrt=False: no reference counts. Arrays belong to the caller of the entry point, for as long as it runs; counting
+# every view of them with a locked instruction took nine tenths of the time of a world of 32 agents. So nothing compiled
+# here may allocate (numba says so when it compiles): scratch is an argument.
+OPTIONS: Any = {
+    "forceinline": True, "fastmath": set(FAST), "error_model": "numpy", "nogil": True, "_nrt": False,
+    "pipeline_class": Inlined,
+}  # fmt: skip
+
+_njit: Any = numba.njit  # numba's stubs do not know `_nrt`
+
+IN_PYTHON: bool = numba.config.DISABLE_JIT  # type: ignore[attr-defined]  # made from the environment
+"""True with NUMBA_DISABLE_JIT=1: kernels run in plain Python, for a debugger."""
+
+if IN_PYTHON:
+    np.seterr(all="ignore")  # as machine code does: infinities and NaN are values, unsigned integers wrap
+
+
+def _marked(function: F, **options: Any) -> F:
+    """Mark a part of kernels. numba asks for its signature twice, which takes longer than all else: it is told."""
+    function.__signature__ = inspect.signature(function)  # type: ignore[attr-defined]
+    return cast(F, _njit(**{**OPTIONS, **options})(function))
+
+
+def law(function: F) -> F:
+    """Mark a scalar law: branch-free if it can be, inlined into whatever loop calls it, never called on its own.
+
+    For numba the same as `kernel`; the two words tell readers what is physics, and what is a part of the engine.
+    """
+    return _marked(function)
+
+
+def unfused(function: F) -> F:
+    """Mark a law that must give the same bits in every loop it is inlined into: no multiply is fused with an add."""
+    return _marked(function, fastmath=False)
+
+
+def kernel(function: F) -> F:
+    """Mark a part of a kernel, that reads and writes arrays or puts laws together; compiled with what calls it."""
+    return _marked(function)
+
+
+def routine(function: F) -> F:
+    """Mark a function that a kernel calls from several places, and that is compiled once for all of them."""
+    return _marked(function, forceinline=False)
+
+
+def shared(function: F) -> F:
+    """Mark a law that Python calls too, as it stands: what a method's `advance` needs, which runs in both."""
+    mark: Any = register_jitable
+    return cast(F, mark(**OPTIONS)(function))
+
+
+def python_of(function: Any) -> Any:
+    """Return the Python function of a law, kernel or entry point."""
+    return getattr(function, "py_func", function)
+
+
+def like(x: float, constant: float) -> float:
+    """Return `constant` in the precision of `x`: a bare 0.5 would turn a float32 law into a float64 one."""
+    return type(x)(constant)
+
+
+@overload(like, jit_options=OPTIONS)
+def _like(x, constant):  # type: ignore[no-untyped-def]  # numba compares signatures, annotations included
+    to = types.float32 if x == types.float32 else types.float64
+    return lambda x, constant: to(constant)
+
+
+def replaced(numbers: tuple[float, ...], k: int, x: float) -> tuple[float, ...]:
+    """Return the numbers with x in place k."""
+    return (*numbers[:k], x, *numbers[k + 1 :])
+
+
+@overload(replaced, jit_options=OPTIONS)
+def _replaced(numbers, k, x):  # type: ignore[no-untyped-def]
+    return lambda numbers, k, x: tuple_setitem(numbers, k, x)  # type: ignore[call-arg]
+
+
+@law
+def finite(x: float) -> bool:
+    """Is x a number, neither NaN nor infinite?"""
+    return abs(x) < like(x, math.inf)

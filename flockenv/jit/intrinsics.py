@@ -1,0 +1,235 @@
+"""Operations that Python has no words for: lanes copied as one vector, prefetches, sums across threads.
+
+Each is an intrinsic of numba, and a plain function where kernels run in Python (NUMBA_DISABLE_JIT=1).
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from typing import Any
+
+import numba
+import numpy as np
+from llvmlite import ir  # type: ignore[import-untyped]
+from numba.core import cgutils, types
+from numba.extending import intrinsic
+from numba.np import arrayobj
+
+from flockenv.jit import cpu
+from flockenv.jit.cpu import LINE
+from flockenv.jit.decorators import IN_PYTHON, kernel
+
+__all__ = [
+    "ask_for",
+    "asked",
+    "copy_lanes",
+    "intrinsic_or_python",
+    "stacked",
+    "tallied",
+    "tally_of",
+    "unaliased",
+    "wait_for_team",
+    "written",
+]
+
+
+def intrinsic_or_python(generate: Callable[..., Any], plain: Callable[..., Any]) -> Any:
+    """Return an intrinsic; with NUMBA_DISABLE_JIT=1, which runs kernels in plain Python, what it does there."""
+    return plain if IN_PYTHON else intrinsic(generate)
+
+
+def written(number: Any, name: str) -> int:
+    """Return an integer that is known while compiling; numba tries again with its value if it did not tell it."""
+    if not isinstance(number, types.IntegerLiteral):
+        raise numba.TypingError(f"{name}: {number}, must be written as a number")
+    return int(number.literal_value)
+
+
+def _unaliased(typing_context: Any) -> Any:
+    """Promise, at the top of an entry point, that its array arguments do not overlap (C's `restrict`).
+
+    Without it LLVM must assume that a sum it writes may be an input it reads, and keeps both out of registers: a factor
+    of three in a sweep. Whoever calls such an entry point keeps the promise; Scene and World do, by allocating.
+
+    Its loops may use the longest registers there are: on most of Intel's processors LLVM would halve them, for the sake
+    of code around them. And its stack begins where a register may lie (LLVM leaves it at 16 bytes): else one that is
+    put there for a while lies across two lines of the cache, in one process and not in the next.
+    """
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        for argument in builder.function.args:
+            if isinstance(argument.type, ir.PointerType) and argument.name.startswith("arg."):
+                argument.add_attribute("noalias")
+        attributes = builder.function.attributes
+        if isinstance(attributes, set):  # written as they stand; but `add` of llvmlite's knows none that has a value
+            set.add(attributes, f'"prefer-vector-width"="{8 * LINE}"')
+            set.add(attributes, '"stackrealign"')
+        return context.get_dummy_value()
+
+    return types.void(), generate
+
+
+unaliased: Any = intrinsic_or_python(_unaliased, lambda: None)
+
+
+def _copy_lanes(typing_context: Any, to: Any, at: Any, source: Any, place: Any, width: Any) -> Any:
+    """Copy `width` numbers, from `place` on, to where `at` is: as one vector, whatever becomes of loops.
+
+    Both arrays have one axis and lie in one piece; places are counted without a sign, and the width is written down.
+    """
+    if to.dtype != source.dtype or (to.layout, source.layout, to.ndim, source.ndim) != ("C", "C", 1, 1):
+        raise numba.TypingError(f"copy_lanes: {source} into {to}, must be one row of the same numbers, in one piece")
+    wide = written(width, "width")
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        make: Any = arrayobj.make_array
+        number = context.get_data_type(signature.args[0].dtype)
+        size = context.get_abi_sizeof(number)
+        vector = ir.VectorType(number, wide).as_pointer()
+
+        def pointer(k: int) -> Any:
+            data = make(signature.args[k])(context, builder, arguments[k]).data
+            return builder.bitcast(builder.gep(data, [arguments[k + 1]]), vector)
+
+        builder.store(builder.load(pointer(2), align=size), pointer(0), align=size)
+        return context.get_dummy_value()
+
+    return types.void(to, types.uint64, source, types.uint64, width), generate
+
+
+def _copied_in_python(to: Any, at: Any, source: Any, place: Any, width: int) -> None:
+    to[int(at) : int(at) + width] = source[int(place) : int(place) + width]
+
+
+copy_lanes: Any = intrinsic_or_python(_copy_lanes, _copied_in_python)
+
+
+def asked(builder: Any, address: Any) -> None:
+    """Generate what asks for the line of memory at an address, to write into it; of no memory it asks for nothing."""
+    byte, flag = ir.IntType(8).as_pointer(), ir.IntType(32)
+    declare: Any = cgutils.get_or_insert_function
+    kind = ir.FunctionType(ir.VoidType(), [byte, flag, flag, flag])
+    prefetch = declare(builder.module, kind, "llvm.prefetch.p0i8")
+    builder.call(prefetch, [builder.bitcast(address, byte), flag(1), flag(3), flag(1)])  # to write; near; data
+
+
+def _ask_for(typing_context: Any, array: Any, place: Any) -> Any:
+    """Ask for the line of memory around array[place], or the place of so many numbers in all, to be written soon.
+
+    Places that are read and written in no order are waited for one after the other; asked for in good time, together.
+    """
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        make: Any = arrayobj.make_array
+        data = make(signature.args[0])(context, builder, arguments[0]).data
+        asked(builder, builder.gep(data, [arguments[1]]))
+        return context.get_dummy_value()
+
+    return types.void(array, types.uint64), generate
+
+
+ask_for: Any = intrinsic_or_python(_ask_for, lambda array, place: None)
+
+
+def _stacked(typing_context: Any, numbers: Any) -> Any:
+    """Return the numbers of a tuple as an array that a law may write, for as long as its caller runs.
+
+    It lies on the stack: laws allocate nothing. A law never returns it.
+    """
+    if not isinstance(numbers, types.UniTuple):
+        raise numba.TypingError(f"stacked: {numbers}, must be a tuple of numbers of one kind")
+    array = types.Array(numbers.dtype, 1, "C")
+    on_stack: Any = cgutils.alloca_once_value
+    fill: Any = arrayobj.populate_array
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        make: Any = arrayobj.make_array
+        number = context.get_data_type(numbers.dtype)
+        place = on_stack(builder, arguments[0])
+        made = make(array)(context, builder)
+        size, count = (context.get_constant(types.intp, n) for n in (context.get_abi_sizeof(number), numbers.count))
+        data = builder.bitcast(place, number.as_pointer())
+        fill(made, data=data, shape=[count], strides=[size], itemsize=size, meminfo=None)
+        return made._getvalue()
+
+    return array(numbers), generate
+
+
+stacked: Any = intrinsic_or_python(_stacked, np.array)
+
+
+def _tallied(typing_context: Any, number: Any, flag: Any) -> Any:
+    """Return a number that counts, 0 at the start, with one more counted if the flag is up; `tally_of` reads it.
+
+    With AVX-512 it is the number itself: to add 1 under a mask is one instruction. Elsewhere its bits are a whole
+    number, from which what was compared is taken away as it is: -1 where the flag is up.
+    """
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        real = arguments[0].type
+        if cpu.REGISTER == LINE:
+            return builder.fadd(arguments[0], builder.select(arguments[1], real(1.0), real(-0.0)))
+        whole = ir.IntType(8 * context.get_abi_sizeof(arguments[0].type))
+        more = builder.zext(arguments[1], whole)
+        return builder.bitcast(builder.add(builder.bitcast(arguments[0], whole), more), arguments[0].type)
+
+    return number(number, types.boolean), generate
+
+
+def _tally(typing_context: Any, number: Any) -> Any:
+    """Return how many were counted there, as a number."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        if cpu.REGISTER == LINE:
+            return arguments[0]
+        real, whole = arguments[0].type, ir.IntType(8 * context.get_abi_sizeof(arguments[0].type))
+        counted = builder.bitcast(arguments[0], whole)
+        return builder.sitofp(builder.trunc(counted, ir.IntType(32)) if whole.width > 32 else counted, real)
+
+    return number(number), generate
+
+
+tallied: Any = intrinsic_or_python(_tallied, lambda number, flag: number + type(number)(flag))
+
+tally_of: Any = intrinsic_or_python(_tally, lambda number: number)
+
+
+def _add_at_once(typing_context: Any, array: Any, amount: Any) -> Any:
+    """Add to array[0] in one indivisible step; return what was there before."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        make: Any = arrayobj.make_array
+        place = make(signature.args[0])(context, builder, arguments[0]).data
+        return builder.atomic_rmw("add", place, arguments[1], "seq_cst")
+
+    return types.int64(array, types.int64), generate
+
+
+def _added_in_python(array: Any, amount: int) -> int:
+    before = int(array[0])
+    array[0] += amount
+    return before
+
+
+_fetch_add: Any = intrinsic_or_python(_add_at_once, _added_in_python)  # Any: numba's stubs say that it never returns
+
+_PATIENCE = 2000  # rounds of waiting before the core is offered to other threads
+
+_give_way: Any = numba.njit(lambda: 0)
+
+if os.name == "posix":
+    _give_way = types.ExternalFunction("sched_yield", types.int32())
+
+
+@kernel
+def wait_for_team(sync: Any, team: int) -> None:
+    """Wait until all `team` threads that work on one world have come here; sync: one int64, 0 at the start."""
+    if team > 1:
+        arrived = _fetch_add(sync, 1) + 1
+        all_here = (arrived + team - 1) // team * team
+        rounds = 0
+        while _fetch_add(sync, 0) < all_here:
+            rounds += 1
+            if rounds > _PATIENCE:
+                _give_way()

@@ -1,0 +1,117 @@
+"""What machine code depends on, written out: the code of functions and what they hold, and the sources of all laws.
+
+numba's own disk cache never finds a closure again, and does not notice that a law has changed which a cached function
+calls. So machine code is kept under a digest of all that is written out here. A second process compiles nothing; an
+edited law compiles anew, always.
+"""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from types import CodeType, FunctionType
+from typing import Any
+
+import numba
+import numpy as np
+
+from flockenv.jit.decorators import python_of
+
+__all__ = [
+    "code_text",
+    "described",
+    "functions_in",
+    "held",
+    "laws_digest",
+    "sources_of_code",
+    "texts_outside",
+]
+
+PACKAGE = Path(__file__).parent.parent
+
+
+def sources_of_code() -> Iterator[tuple[Path, bytes]]:
+    """Yield every source of the package that holds laws or records of theirs, or says how code is made of them."""
+    for path in sorted(PACKAGE.rglob("*.py")):
+        text = path.read_bytes()
+        if b"flockenv.jit" in text or path.relative_to(PACKAGE).parts[0] in ("jit", "engine", "sweep", "tasks"):
+            yield path, text
+
+
+@functools.cache
+def laws_digest() -> str:
+    """Digest `sources_of_code`.
+
+    An edit to one means new files, never stale machine code. Nothing of the machine is in it: results are the same.
+    """
+    digest = hashlib.sha256(f"{numba.__version__} {sys.version_info[:2]}".encode())
+    for _, text in sources_of_code():
+        digest.update(text)
+    return digest.hexdigest()
+
+
+def texts_outside(modules: set[str]) -> str:
+    """Return the text of the modules outside flockenv among these, and of those whose laws they use."""
+    todo = set(modules)
+    done: set[str] = set()
+    texts = []
+    while todo - done:
+        name = min(todo - done)
+        done.add(name)
+        module = sys.modules.get(name)
+        if module is None or name.split(".")[0] in ("flockenv", "numpy", "numba", "collections", "math"):
+            continue
+        path, laws = Path(getattr(module, "__file__", None) or ""), [v for v in vars(module).values() if _is_law(v)]
+        # a notebook has no file: its functions are as they are now
+        texts.append(path.read_text(encoding="utf-8") if path.suffix == ".py" else "".join(map(code_text, laws)))
+        todo |= {python_of(law).__module__ for law in laws}
+    return "".join(texts)
+
+
+def _is_law(value: Any) -> bool:
+    return hasattr(value, "py_func")
+
+
+def code_text(function: Any) -> str:
+    """Return the code of a function as text: the same for the same code, and another one after an edit."""
+
+    def text(code: CodeType) -> str:
+        inner = [text(each) if isinstance(each, CodeType) else each for each in code.co_consts]
+        return repr((code.co_name, code.co_code, code.co_names, inner))
+
+    return text(python_of(function).__code__)
+
+
+def held(python: FunctionType) -> tuple[Any, ...]:
+    """Return the values of a function's free variables."""
+    return tuple(cell.cell_contents for cell in python.__closure__ or ())
+
+
+def functions_in(part: Any) -> Iterator[FunctionType]:
+    """Yield a Python function and all that it holds."""
+    python = python_of(part)
+    if isinstance(python, FunctionType):
+        yield python
+        part = held(python)
+    for inner in part if isinstance(part, tuple) else ():
+        yield from functions_in(inner)
+
+
+def described(part: Any) -> str:
+    """Write out what machine code depends on: code and what it holds, numbers as they print, arrays by their bytes."""
+    python = python_of(part)
+    if isinstance(python, FunctionType):
+        return _described(python)
+    if isinstance(part, tuple):
+        return f"({', '.join(map(described, part))})"
+    return f"{part.dtype} {part.shape} {part.tobytes()!r}" if isinstance(part, np.ndarray) else repr(part)
+
+
+@functools.lru_cache(maxsize=4096)
+def _described(python: FunctionType) -> str:
+    """Write out a function as `described` does, by a digest: what holds it twice stays short."""
+    told = f"{code_text(python)} {described(held(python))}"
+    return f"{python.__module__}.{python.__qualname__} {hashlib.sha256(told.encode()).hexdigest()}"
