@@ -17,12 +17,12 @@ import numpy as np
 from numba import njit
 
 from flockenv.effects.base import ties
-from flockenv.elementary import nearest_whole
 from flockenv.jit.cpu import LINE, REGISTER
 from flockenv.jit.decorators import like
 from flockenv.jit.intrinsics import unaliased
 from flockenv.jit.memory import zeros
 from flockenv.jit.pipeline import Inlined, Whole
+from flockenv.maths.approximations import nearest_whole
 from flockenv.scene import Scene
 from flockenv.state import State
 

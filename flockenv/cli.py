@@ -164,12 +164,12 @@ def listing() -> None:
     import gymnasium
     import pettingzoo
 
-    from flockenv.arbitration import ARBITRATIONS
     from flockenv.behaviours import BEHAVIOURS
     from flockenv.effects import EFFECTS
     from flockenv.integrators import INTEGRATORS
     from flockenv.population import POPULATION
     from flockenv.space import AnySpace
+    from flockenv.steering.arbitration import ARBITRATIONS
     from flockenv.tasks import TASKS
 
     console = new_console()

@@ -16,9 +16,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from flockenv.grid import packed, points_of
 from flockenv.jit.decorators import kernel
 from flockenv.jit.section import entry
+from flockenv.maths.grid import packed, points_of
 from flockenv.shapes import Shape
 from flockenv.shapes.table import nearest
 from flockenv.targets import Target

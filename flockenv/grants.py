@@ -16,14 +16,14 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from flockenv.arbitration import Arbitration, Shares, Wishes
 from flockenv.effects.base import Me
 from flockenv.jit.decorators import Law, Vec, kernel, law, like
 from flockenv.jit.section import entry_of, record, several, vector
+from flockenv.maths.vectors import zero
 from flockenv.scene import Scene
 from flockenv.state import State
 from flockenv.steer import Steer
-from flockenv.vec import zero
+from flockenv.steering.arbitration import Arbitration, Shares, Wishes
 
 __all__ = ["Granted", "Grants", "granted", "reconcile"]
 

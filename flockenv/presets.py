@@ -14,7 +14,6 @@ from typing import Any
 
 from pydantic import Field, ValidationError
 
-from flockenv.arbitration import Blend
 from flockenv.behaviours import (
     CircularRepulsion,
     Driving,
@@ -29,6 +28,7 @@ from flockenv.core.record import Record
 from flockenv.effects import Contact, Effect, ObstacleContact
 from flockenv.spread import Spread
 from flockenv.steer import Steer
+from flockenv.steering.arbitration import Blend
 
 __all__ = ["ALIASES", "PRESETS", "Model", "Preset", "expanded", "preset"]
 

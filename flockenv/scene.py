@@ -33,9 +33,9 @@ from flockenv.implicit import coupling_of, solve_steps
 from flockenv.integrators import INTEGRATORS, Adaptive, ImplicitEuler, Integrator, SemiImplicitEuler
 from flockenv.integrators.newton import Coupling
 from flockenv.jit.thread_pool import LARGEST, Choices, at_work, share
+from flockenv.maths.counter_rng import MASK, key_of
 from flockenv.neighbours import FEWEST_AGENTS
 from flockenv.networks import EDGE
-from flockenv.noise import MASK, key_of
 from flockenv.placing import cells_of, place_groups
 from flockenv.population import POPULATION, Emitter, Member, beget
 from flockenv.population import settler as population_settler

@@ -14,9 +14,9 @@ from numpy.typing import ArrayLike, NDArray
 from pydantic import Field
 
 from flockenv.core.record import Record
-from flockenv.elementary import nearest_whole
 from flockenv.jit.decorators import Law, Vec, finite, law, like
-from flockenv.vec import sub
+from flockenv.maths.approximations import nearest_whole
+from flockenv.maths.vectors import sub
 
 __all__ = ["AnySpace", "Box", "Plane", "Space", "Torus"]
 

@@ -12,7 +12,7 @@ from pydantic import Field, model_validator
 
 from flockenv.core.record import Record
 from flockenv.jit.decorators import kernel
-from flockenv.noise import uniform
+from flockenv.maths.counter_rng import uniform
 from flockenv.shapes import Shape, clear_of
 
 __all__ = ["Spawn", "cells", "direction", "scatter"]

@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from flockenv.core.magnitudes import check_array
 from flockenv.jit.memory import zeros
 from flockenv.jit.section import entry
-from flockenv.vehicle import face
+from flockenv.maths.heading import face
 
 __all__ = ["COUNTED_BY_KERNELS", "WORK", "Body", "Floats", "Obstacles", "State"]
 

@@ -15,11 +15,11 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, WrapValidator, model_validator
 
-from flockenv.arbitration import Allocation, AnyArbitration, Arbitration
 from flockenv.behaviours import BEHAVIOURS
 from flockenv.core.record import keep
 from flockenv.effects.base import EFFECTS, Effect, demand_group
 from flockenv.jit.decorators import Law, Vec
+from flockenv.steering.arbitration import Allocation, AnyArbitration, Arbitration
 
 __all__ = ["EVERY_EFFECT", "Steer"]
 

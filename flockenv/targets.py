@@ -10,7 +10,7 @@ from pydantic import Field, model_validator
 
 from flockenv.core.record import Record
 from flockenv.jit.decorators import Vec, law, like
-from flockenv.vec import dot, norm, scale, select
+from flockenv.maths.vectors import dot, norm, scale, select
 
 __all__ = ["Target", "passed", "row_size", "to_any", "to_target"]
 

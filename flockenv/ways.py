@@ -13,11 +13,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from flockenv.eikonal import NO_WAY, Start, free_part, way_table
-from flockenv.grid import MOST_POINTS, covers, sample, sample_vector, sampled
 from flockenv.jit.decorators import Vec, law
+from flockenv.maths.grid import MOST_POINTS, covers, sample, sample_vector, sampled
+from flockenv.maths.vectors import norm, select, unit
 from flockenv.space import Torus
 from flockenv.targets import Target, to_any
-from flockenv.vec import norm, select, unit
 
 __all__ = [
     "NoWayWarning", "check_ways", "lengths_on", "region", "starts_of", "towards", "warn_cut_off", "way_ahead",

@@ -21,7 +21,7 @@ from flockenv.jit.memory import zeros
 from flockenv.jit.section import settled
 from flockenv.jit.simd_rows import PAIR, apart
 from flockenv.jit.thread_pool import LARGEST, Choices, at_work, share
-from flockenv.noise import MASK, keys_of
+from flockenv.maths.counter_rng import MASK, keys_of
 from flockenv.scene import MEMORY_LIMIT
 from flockenv.snapshot import Snapshot
 from flockenv.state import State

@@ -19,17 +19,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from flockenv import arbitration, steering
-from flockenv.arbitration import (
-    Allocation,
-    Blend,
-    ContextSteering,
-    Dithering,
-    Intentions,
-    Priority,
-    RoundRobin,
-    RunningSum,
-)
+from flockenv import steering
 from flockenv.behaviours import (
     Alignment,
     Arrive,
@@ -139,6 +129,17 @@ from flockenv.shapes import Circle
 from flockenv.space import Box, Plane, Space, Torus
 from flockenv.spawn import Spawn
 from flockenv.steer import Steer
+from flockenv.steering import arbitration
+from flockenv.steering.arbitration import (
+    Allocation,
+    Blend,
+    ContextSteering,
+    Dithering,
+    Intentions,
+    Priority,
+    RoundRobin,
+    RunningSum,
+)
 from flockenv.targets import Target
 from flockenv.tasks import (
     Bottleneck,
@@ -757,7 +758,7 @@ from pydantic import Field
 
 from flockenv.effects import Effect, Me
 from flockenv.jit.decorators import Law, Vec, law, like
-from flockenv.vec import add, dot, scale
+from flockenv.maths.vectors import add, dot, scale
 
 
 @law

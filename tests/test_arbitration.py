@@ -9,7 +9,17 @@ from typing import Any
 import numpy as np
 import pytest
 
-from flockenv.arbitration import (
+from flockenv.behaviours import AvoidObstacles, Separation
+from flockenv.config import dump_scene, load_scene
+from flockenv.effects import Drag, Effect
+from flockenv.explanation import _shares
+from flockenv.grants import granted, reconcile
+from flockenv.maths.counter_rng import key_of
+from flockenv.scene import Group, Scene
+from flockenv.space import Torus
+from flockenv.spawn import Spawn
+from flockenv.steer import Steer
+from flockenv.steering.arbitration import (
     ARBITRATIONS,
     Allocation,
     Arbitration,
@@ -22,17 +32,7 @@ from flockenv.arbitration import (
     allocate,
     allocate_running,
 )
-from flockenv.behaviours import AvoidObstacles, Separation
-from flockenv.config import dump_scene, load_scene
-from flockenv.effects import Drag, Effect
-from flockenv.explanation import _shares
-from flockenv.grants import granted, reconcile
-from flockenv.noise import key_of
-from flockenv.rows import rows
-from flockenv.scene import Group, Scene
-from flockenv.space import Torus
-from flockenv.spawn import Spawn
-from flockenv.steer import Steer
+from flockenv.steering.vectorize import rows
 from flockenv.sweep import step_of
 from tests import catalogue
 from tests.catalogue import Array

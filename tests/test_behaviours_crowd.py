@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from flockenv import steering
-from flockenv.arbitration import Allocation
 from flockenv.behaviours import (
     AvoidObstacles,
     Explore,
@@ -20,12 +19,13 @@ from flockenv.behaviours import (
     StayOnPath,
     UnalignedAvoidance,
 )
-from flockenv.rows import rows
 from flockenv.scene import Group, Scene
 from flockenv.space import Torus
 from flockenv.spawn import Spawn
 from flockenv.state import State
 from flockenv.steer import Steer
+from flockenv.steering.arbitration import Allocation
+from flockenv.steering.vectorize import rows
 from tests.catalogue import Array
 
 threat, give_way = rows(steering.unaligned_threat), rows(steering.give_way)

@@ -22,7 +22,7 @@ from flockenv.behaviours import (
 )
 from flockenv.constraints import Collisions
 from flockenv.eikonal import way_table
-from flockenv.grid import sampled
+from flockenv.maths.grid import sampled
 from flockenv.scene import Group, Scene
 from flockenv.shapes import Block, Capsule, Circle, HalfSpace, Polygon, Shape, Wall
 from flockenv.spawn import Spawn

@@ -8,11 +8,12 @@ from pathlib import Path
 
 import pytest
 
-from flockenv import arbitration, steering
+from flockenv import steering
 from flockenv.effects import EFFECTS
 from flockenv.integrators import INTEGRATORS
 from flockenv.space import Space
 from flockenv.steer import Steer
+from flockenv.steering import arbitration
 from flockenv.tasks import TASKS
 from tests import catalogue
 

@@ -16,7 +16,6 @@ import pytest
 
 import flockenv
 from flockenv import effects as effects_module
-from flockenv.arbitration import ARBITRATIONS
 from flockenv.behaviours import Separation
 from flockenv.effects import Door, Drag, Stage
 from flockenv.integrators import RK4
@@ -27,6 +26,7 @@ from flockenv.shapes import Circle
 from flockenv.space import Plane
 from flockenv.spawn import Spawn
 from flockenv.state import State
+from flockenv.steering.arbitration import ARBITRATIONS
 from flockenv.targets import Target
 from tests.catalogue import (
     AMONG_ALL,
@@ -345,7 +345,7 @@ from typing import Any, ClassVar, Literal
 
 from flockenv.effects import Effect, Me
 from flockenv.jit.decorators import Vec, law
-from flockenv.vec import dot, scale
+from flockenv.maths.vectors import dot, scale
 
 
 @law
@@ -389,7 +389,7 @@ from typing import Any, ClassVar, Literal
 import soft
 from flockenv.effects import Effect, Me, Other, Sight
 from flockenv.jit.decorators import Vec, law
-from flockenv.vec import scale
+from flockenv.maths.vectors import scale
 
 
 @law
@@ -420,7 +420,7 @@ SOFT = """
 from typing import Any
 
 from flockenv.jit.decorators import Vec, law
-from flockenv.vec import scale
+from flockenv.maths.vectors import scale
 
 
 @law
@@ -627,7 +627,7 @@ from typing import Literal
 
 from flockenv.effects import Drag
 from flockenv.jit.decorators import law
-from flockenv.vec import add, scale
+from flockenv.maths.vectors import add, scale
 
 
 @law

@@ -23,7 +23,7 @@ from flockenv.jit.intrinsics import unaliased
 from flockenv.jit.numba_patches import front_end, lowering
 from flockenv.jit.pipeline import Whole
 from flockenv.jit.progress import unmatched
-from flockenv.vec import add, dot, scale
+from flockenv.maths.vectors import add, dot, scale
 
 ROOT = Path(__file__).resolve().parent.parent
 TRIED = "0.68.1"

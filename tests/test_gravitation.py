@@ -256,7 +256,7 @@ import numpy as np
 
 from flockenv.effects.base import Bonds, Effect, Me, Other
 from flockenv.jit.decorators import Law, Vec, law
-from flockenv.vec import scale
+from flockenv.maths.vectors import scale
 
 
 @law

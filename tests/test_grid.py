@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from flockenv.grid import packed, points_of, sampled
+from flockenv.maths.grid import packed, points_of, sampled
 
 LOW, SPACING, COUNTS = (-1.0, 2.0, 0.5), 0.25, (9, 7, 5)
 

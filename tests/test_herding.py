@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from flockenv import steering
-from flockenv.rows import rows
+from flockenv.steering.vectorize import rows
 
 heed, behind, herd_from = rows(steering.heed), rows(steering.behind), rows(steering.herd_from)
 

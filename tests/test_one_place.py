@@ -154,7 +154,7 @@ from typing import ClassVar, Literal
 from flockenv.behaviours import Separation
 from flockenv.jit.decorators import Law, law
 from flockenv.steering import others
-from flockenv.vec import add, sub
+from flockenv.maths.vectors import add, sub
 
 
 @law

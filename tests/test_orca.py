@@ -10,10 +10,10 @@ import pytest
 from numba import njit
 
 from flockenv.behaviours import Orca
-from flockenv.orca import SLOT, half_plane, orca
-from flockenv.rows import rows
 from flockenv.scene import Group, Scene
 from flockenv.spawn import Spawn
+from flockenv.steering.orca import SLOT, half_plane, orca
+from flockenv.steering.vectorize import rows
 from tests.catalogue import Array, rotation
 
 steer = rows(orca)

@@ -12,16 +12,16 @@ import numpy as np
 import pytest
 
 from flockenv.jit.decorators import Law, Numbers, Vec, law
-from flockenv.rows import rows
-from flockenv.vec import scale
+from flockenv.maths.vectors import scale
+from flockenv.steering.vectorize import rows
 
 ROOT = Path(__file__).resolve().parent.parent
 
 NOTEBOOK = """
 import numpy as np
 from flockenv.jit.decorators import law
-from flockenv.rows import rows
-from flockenv.vec import scale
+from flockenv.steering.vectorize import rows
+from flockenv.maths.vectors import scale
 
 @law
 def stretched(x: "Vec", by: "float") -> "Vec":

@@ -7,8 +7,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from flockenv import urges
-from flockenv.arbitration import Intentions
 from flockenv.behaviours import Evade, Forage, Separation, Shadow, Wander
 from flockenv.effects import Fear, Grazing, Intention, Libido, Metabolism, Predation
 from flockenv.evaluation import rollout, worlds_for
@@ -16,11 +14,13 @@ from flockenv.grants import granted, reconcile
 from flockenv.jit.thread_pool import use_threads
 from flockenv.players.rules import player
 from flockenv.population import Threshold
-from flockenv.rows import rows
 from flockenv.scene import Group, Scene
 from flockenv.spawn import Spawn
 from flockenv.state import State
 from flockenv.steer import Steer
+from flockenv.steering import motivation
+from flockenv.steering.arbitration import Intentions
+from flockenv.steering.vectorize import rows
 from flockenv.tasks import School
 from flockenv.tasks.school import CAUGHT, EATEN, FATE, FEAR, FOOD, HUNGER, INTENT
 from flockenv.world import World
@@ -168,7 +168,7 @@ def test_who_is_caught_or_starved_dies_and_feeds_a_hunter_who_then_lets_go() -> 
 
 def test_states_follow_fear_then_needs_and_change_with_hysteresis() -> None:
     """Up and down through every level: a state begins above it, and ends so much below."""
-    law = rows(urges.intention)
+    law = rows(motivation.intention)
 
     def walk(name: str, values: Any, **rest: float) -> list[float]:
         now, found = 0.0, []
@@ -178,7 +178,7 @@ def test_states_follow_fear_then_needs_and_change_with_hysteresis() -> None:
             found.append(now)
         return found
 
-    names = {name: float(k) for k, name in enumerate(urges.INTENTIONS)}
+    names = {name: float(k) for k, name in enumerate(motivation.INTENTIONS)}
     rise, fall = [0.1, 0.2, 0.39, 0.41], [0.35, 0.31, 0.29, 0.1, 0.04]
     expected = ["wander", "school", "school", "escape", "escape", "escape", "school", "school", "wander"]
     assert walk("fear", rise + fall) == [names[name] for name in expected]
@@ -207,8 +207,8 @@ def test_fish_flee_what_they_see_and_not_what_they_do_not() -> None:
     state = placed(scene, [(3, 0), (-3, 0)], [(0, 0)], velocity=(-0.5, 0.0))  # one heads for it, one away from it
     state = scene.run(state, 10)
     intent = scene.inner(state, "intention")[0]
-    assert intent[0] == urges.ESCAPE
-    assert intent[1] == urges.WANDER
+    assert intent[0] == motivation.ESCAPE
+    assert intent[1] == motivation.WANDER
     away = state.vel[0, 0] / np.linalg.norm(state.vel[0, 0])
     assert away[0] > 0.9
     assert np.linalg.norm(state.vel[0, 1]) < 1.05  # it wanders on
@@ -294,7 +294,9 @@ def school(fish: Any, hunter: Any, patches: Any, hunger: float = 0.4, hunting: b
     world.state.pos[:], world.state.vel[:] = places, 0.0
     world._memory[...] = 0.0
     world._memory[HUNGER, :, :9], world._memory[FOOD, :, 9:] = hunger, task.capacity
-    world._memory[HUNGER, :, 8], world._memory[INTENT, :, 8] = (0.9, urges.EAT) if hunting else (0.0, urges.WANDER)
+    world._memory[HUNGER, :, 8], world._memory[INTENT, :, 8] = (
+        (0.9, motivation.EAT) if hunting else (0.0, motivation.WANDER)
+    )
     return world
 
 
@@ -372,14 +374,14 @@ def test_the_hand_written_player_flees_remembers_and_beats_random() -> None:
 
     hunted = {"hunters": (3.0, 0.0), "hunter_bearing": (1.0, 0.0), "hunter_present": 1.0}
     action, state = ask(None, fear=0.5, **hunted)
-    np.testing.assert_array_equal(state, urges.ESCAPE)
+    np.testing.assert_array_equal(state, motivation.ESCAPE)
     assert (action[:, 0] < -0.9).all()
     food = {"food": [(0, 4), (0, 0), (0, 0)], "food_bearing": [(0, 1), (0, 0), (0, 0)]}
     action, state = ask(state, hunger=0.6, **food)
-    np.testing.assert_array_equal(state, urges.EAT)
+    np.testing.assert_array_equal(state, motivation.EAT)
     assert (action[:, 1] > 0.9).all()
-    np.testing.assert_array_equal(ask(state, hunger=0.3, **food)[1], urges.EAT)
-    np.testing.assert_array_equal(ask(None, hunger=0.3, **food)[1], urges.WANDER)
+    np.testing.assert_array_equal(ask(state, hunger=0.3, **food)[1], motivation.EAT)
+    np.testing.assert_array_equal(ask(None, hunger=0.3, **food)[1], motivation.WANDER)
 
     class Anyhow:
         def predict(self, seen: Any, state: Any = None, *_: Any) -> Any:
@@ -398,5 +400,5 @@ def test_scripted_fish_are_their_own_state_machine() -> None:
     for _ in range(200):
         still(world)
         states |= set(world._memory[INTENT, :, 1:8][world.state.alive[:, 1:8]].tolist())
-    assert states == {urges.WANDER, urges.SCHOOL, urges.EAT, urges.ESCAPE}
+    assert states == {motivation.WANDER, motivation.SCHOOL, motivation.EAT, motivation.ESCAPE}
     assert world.state.alive[:, 1:8].mean() > 0.6

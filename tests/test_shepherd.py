@@ -13,11 +13,11 @@ from flockenv.behaviours import Cohesion, Shepherd
 from flockenv.effects.base import EFFECTS, Effect, Me, Members
 from flockenv.jit.decorators import Law, Vec, law
 from flockenv.jit.thread_pool import use_threads
-from flockenv.rows import rows
 from flockenv.scene import Group, Scene
 from flockenv.space import Plane, Torus
 from flockenv.spawn import Spawn
 from flockenv.state import State
+from flockenv.steering.vectorize import rows
 from tests.catalogue import Array
 
 SIDE = 20.0

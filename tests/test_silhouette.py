@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from numba import njit
 
-from flockenv.arbitration import Priority
 from flockenv.behaviours import AvoidObstacles, Seek, Whiskers
 from flockenv.constraints import Collisions
 from flockenv.scene import Group, Scene
@@ -17,6 +16,7 @@ from flockenv.shapes import Block, Capsule, Circle, DistanceField, HalfSpace, Po
 from flockenv.shapes.edges import sphere_edge
 from flockenv.spawn import Spawn
 from flockenv.steer import Steer
+from flockenv.steering.arbitration import Priority
 
 BLOCK = Block(centre=(6, -4.75), size=(0.5, 10.5))
 

@@ -27,16 +27,16 @@ from flockenv.behaviours import (
 )
 from flockenv.config import ConfigError, dump_scene, load_scene, schema
 from flockenv.effects import Contact, Course, Effect, Goal, ObstacleContact
-from flockenv.elementary import atan2, exp, nearest_whole
 from flockenv.integrators import ExplicitEuler, SemiImplicitEuler
+from flockenv.maths.approximations import atan2, exp, nearest_whole
 from flockenv.presets import ALIASES, PRESETS, preset
-from flockenv.rows import rows
 from flockenv.scene import Group, Scene
 from flockenv.shapes import Block, Polygon, Shape, Wall
 from flockenv.space import Torus
 from flockenv.spawn import Spawn
 from flockenv.stability import CoarseContactWarning, UnstableStepWarning, suggest_dt
 from flockenv.steer import Steer
+from flockenv.steering.vectorize import rows
 from tests.catalogue import rotation
 
 Array = Any

@@ -13,10 +13,10 @@ from hypothesis import strategies as st
 from flockenv import space as space_module
 from flockenv.behaviours import Separation
 from flockenv.effects import Drag
-from flockenv.rows import rows
 from flockenv.scene import Group, Scene
 from flockenv.space import Box, Plane, Space, Torus
 from flockenv.spawn import Spawn
+from flockenv.steering.vectorize import rows
 from tests.catalogue import SPACES, everything, scene_of
 
 ROWS = pytest.mark.parametrize("kind", SPACES)

@@ -10,8 +10,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from flockenv import arbitration, steering
-from flockenv.rows import loop_of, rows
+from flockenv import steering
+from flockenv.steering import arbitration
+from flockenv.steering.vectorize import loop_of, rows
 from tests.catalogue import STEERING, Array, Law, mirror, rotation
 
 

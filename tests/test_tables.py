@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from flockenv import scene as scenes
-from flockenv.arbitration import Blend
 from flockenv.scene import Group, Scene
 from flockenv.spawn import Spawn
 from flockenv.steer import Steer
+from flockenv.steering.arbitration import Blend
 from flockenv.sweep import step_of
 from tests.catalogue import users_module
 
@@ -25,7 +25,7 @@ import numpy as np
 
 from flockenv.effects import Effect, Me
 from flockenv.jit.decorators import Law, Vec, law
-from flockenv.vec import axis, scale
+from flockenv.maths.vectors import axis, scale
 
 
 @law

@@ -14,6 +14,7 @@ from flockenv.behaviours import Alignment, AvoidObstacles, Separation
 from flockenv.effects import Drag, Effect
 from flockenv.integrators import RK4
 from flockenv.jit.thread_pool import threads, use_threads
+from flockenv.maths.heading import GRAVITY
 from flockenv.scene import Group, Scene
 from flockenv.space import Box, Torus
 from flockenv.spawn import Spawn
@@ -22,7 +23,6 @@ from flockenv.state import State
 from flockenv.steer import Steer
 from flockenv.tasks import Obstacles
 from flockenv.trajectory import record
-from flockenv.vehicle import GRAVITY
 from flockenv.workspace import Workspace
 from flockenv.world import World
 from tests.catalogue import Array

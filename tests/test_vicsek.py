@@ -13,7 +13,7 @@ from flockenv.effects import Vicsek
 from flockenv.effects.vicsek import CHANNEL
 from flockenv.experiments.vicsek import SEEN, bound, order, scene_of
 from flockenv.integrators import ExplicitEuler, Heun, SemiImplicitEuler
-from flockenv.noise import _mix
+from flockenv.maths.counter_rng import _mix
 from flockenv.scene import Group, Scene
 from flockenv.space import Torus
 from flockenv.spawn import Spawn

@@ -15,7 +15,7 @@ import pytest
 from flockenv.jit.decorators import python_of
 from flockenv.jit.section import settled
 from flockenv.jit.thread_pool import threads, use_threads
-from flockenv.noise import key_of, keys_of
+from flockenv.maths.counter_rng import key_of, keys_of
 from flockenv.tasks import Crossing, Flock, Obstacles, Pursuit
 from flockenv.tasks.play import play_of
 from flockenv.world import AT_HAND, PAST, Step, World, _portions

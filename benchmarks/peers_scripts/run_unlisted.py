@@ -34,7 +34,7 @@ def another(threads: int) -> Case:
     from benchmarks.scenes import world
     from flockenv.effects import Effect
     from flockenv.jit.decorators import Law, Vec, law
-    from flockenv.vec import zero
+    from flockenv.maths.vectors import zero
 
     @law
     def nowhere(p: Any, me: Any) -> Vec:

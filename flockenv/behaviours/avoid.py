@@ -14,7 +14,7 @@ from pydantic import Field
 from flockenv import steering
 from flockenv.effects.base import Effect, Me, Obstacle
 from flockenv.jit.decorators import Law, Vec, law, like
-from flockenv.vec import add, cross, dot, lateral, norm, perpendicular, scale, select, sub, unit, zero
+from flockenv.maths.vectors import add, cross, dot, lateral, norm, perpendicular, scale, select, sub, unit, zero
 
 __all__ = ["AvoidObstacles", "ForceField", "Whiskers"]
 

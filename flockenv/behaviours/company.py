@@ -12,7 +12,7 @@ from flockenv import steering
 from flockenv.behaviours.base import AboutNearest, Moving, seen_one, top_speed
 from flockenv.effects.base import Me, Other, Sight
 from flockenv.jit.decorators import Law, Vec, law, like
-from flockenv.vec import norm, scale, select, zero
+from flockenv.maths.vectors import norm, scale, select, zero
 
 __all__ = ["FollowLeader", "Formation", "Interpose"]
 

@@ -14,7 +14,7 @@ from flockenv.behaviours.base import Behaviour, Moving, gains, top_speed
 from flockenv.behaviours.wander import wandered
 from flockenv.effects.base import Me, Other, Sight, Vector
 from flockenv.jit.decorators import Law, Vec, law, like
-from flockenv.vec import scale, select, sub, unit, zero
+from flockenv.maths.vectors import scale, select, sub, unit, zero
 
 __all__ = ["Explore", "Forage", "Queue", "UnalignedAvoidance"]
 

@@ -12,7 +12,7 @@ from flockenv import steering
 from flockenv.behaviours.base import Behaviour, steered_groups
 from flockenv.effects.base import Me, Other, Sight, all_masses
 from flockenv.jit.decorators import Law, Vec, law, like
-from flockenv.vec import dot, norm, scale, sub, unit
+from flockenv.maths.vectors import dot, norm, scale, sub, unit
 
 __all__ = ["Driving", "LineUp"]
 

@@ -18,8 +18,8 @@ from flockenv import steering
 from flockenv.behaviours.base import gains
 from flockenv.effects.base import Effect, Me, Other, Sight
 from flockenv.jit.decorators import Law, Vec, law, like
+from flockenv.maths.vectors import scale, select, sub, zero
 from flockenv.steering import others
-from flockenv.vec import scale, select, sub, zero
 
 __all__ = ["Alignment", "Cohesion", "Separation"]
 

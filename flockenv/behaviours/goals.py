@@ -11,7 +11,7 @@ from flockenv import steering
 from flockenv.behaviours.base import Behaviour, Moving, top_speed
 from flockenv.effects.base import Me, Vector
 from flockenv.jit.decorators import Law, Vec, law
-from flockenv.vec import dot, scale, select, sub, zero
+from flockenv.maths.vectors import dot, scale, select, sub, zero
 
 __all__ = ["Arrive", "Dock", "Face", "Flee", "Seek", "TargetSpeed"]
 

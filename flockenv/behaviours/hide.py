@@ -11,7 +11,7 @@ from flockenv import steering
 from flockenv.behaviours.base import AboutNearest, Moving, seen_one, top_speed
 from flockenv.effects.base import Me, Other
 from flockenv.jit.decorators import Law, Vec, law, like
-from flockenv.vec import add, dot, norm, scale, select, zero
+from flockenv.maths.vectors import add, dot, norm, scale, select, zero
 
 __all__ = ["Hide"]
 

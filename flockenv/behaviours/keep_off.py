@@ -11,9 +11,9 @@ from pydantic import Field
 
 from flockenv.behaviours.push import Push
 from flockenv.effects.base import Me, Obstacle, all_masses
-from flockenv.elementary import exp
 from flockenv.jit.decorators import Law, Vec, law
-from flockenv.vec import add, scale, select, zero
+from flockenv.maths.approximations import exp
+from flockenv.maths.vectors import add, scale, select, zero
 
 __all__ = ["ObstacleRepulsion"]
 

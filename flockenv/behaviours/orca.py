@@ -8,11 +8,12 @@ import numpy as np
 from numba.extending import overload
 from pydantic import Field
 
-from flockenv import orca, steering
+from flockenv import steering
 from flockenv.behaviours.base import Moving, top_speed
 from flockenv.effects.base import Me, Other, Sight, Vector
 from flockenv.jit.decorators import OPTIONS, Law, Vec, law, like
-from flockenv.vec import scale, select, sub, zero
+from flockenv.maths.vectors import scale, select, sub, zero
+from flockenv.steering import orca
 
 __all__ = ["Orca"]
 

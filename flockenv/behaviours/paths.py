@@ -13,11 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
-from flockenv import grid, polyline, steering
+from flockenv import polyline, steering
 from flockenv.behaviours.base import Behaviour, Moving, gains, top_speed
 from flockenv.effects.base import Me, Vector
 from flockenv.jit.decorators import Law, Vec, law, like
-from flockenv.vec import add, norm, scale, select, sub, zero
+from flockenv.maths import grid
+from flockenv.maths.vectors import add, norm, scale, select, sub, zero
 
 __all__ = ["FollowFlow", "FollowPath", "StayOnPath"]
 

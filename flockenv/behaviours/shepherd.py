@@ -12,7 +12,7 @@ from flockenv import steering
 from flockenv.behaviours.base import Moving, top_speed
 from flockenv.effects.base import Me, Members, Vector
 from flockenv.jit.decorators import Law, Vec, law, like
-from flockenv.vec import scale, select, sub, zero
+from flockenv.maths.vectors import scale, select, sub, zero
 
 __all__ = ["Shepherd"]
 

@@ -16,10 +16,10 @@ from pydantic import Field
 from flockenv import steering
 from flockenv.behaviours.push import Push
 from flockenv.effects.base import Me, Other, Sight, all_masses, demand_group
-from flockenv.elementary import exp
 from flockenv.jit.decorators import Law, Vec, law, like
+from flockenv.maths.approximations import exp
+from flockenv.maths.vectors import dot, limit, scale, select, sub, unit
 from flockenv.steering import social
-from flockenv.vec import dot, limit, scale, select, sub, unit
 
 __all__ = ["CircularRepulsion", "EllipticalRepulsion", "Sidestep", "Social"]
 

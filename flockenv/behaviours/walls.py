@@ -12,11 +12,11 @@ from flockenv import steering
 from flockenv.behaviours.base import Moving, top_speed
 from flockenv.effects.base import Me, Obstacle
 from flockenv.jit.decorators import Law, Vec, law, like
+from flockenv.maths.vectors import add, dot, lateral, norm, perpendicular, scale, select, sub, unit, zero
 from flockenv.shapes import AnyShape, packed
 from flockenv.shapes.block import nearest_block
 from flockenv.shapes.chain import nearest_chain
 from flockenv.space import Torus
-from flockenv.vec import add, dot, lateral, norm, perpendicular, scale, select, sub, unit, zero
 
 __all__ = ["Contain", "FollowWall"]
 

@@ -10,8 +10,8 @@ from pydantic import Field
 from flockenv import steering
 from flockenv.behaviours.base import Moving, top_speed
 from flockenv.jit.decorators import Law, Vec, law, like
-from flockenv.noise import smooth, uniform
-from flockenv.vec import add, dot, planar, scale, select, sub
+from flockenv.maths.counter_rng import smooth, uniform
+from flockenv.maths.vectors import add, dot, planar, scale, select, sub
 
 __all__ = ["Wander"]
 

@@ -9,7 +9,7 @@ import numpy as np
 from flockenv.constraints.broad import image, near, vector, write
 from flockenv.constraints.impact import POINT, along, flight
 from flockenv.jit.decorators import Vec, kernel
-from flockenv.vec import add, norm, scale, sub
+from flockenv.maths.vectors import add, norm, scale, sub
 
 __all__ = [
     "ANEW", "DEEP", "GIVEN_UP", "RESTS", "STOPPED", "Bodies", "Meetings", "Rules", "Things", "gained", "link", "met",

@@ -10,10 +10,10 @@ from typing import Any
 
 import numpy as np
 
-from flockenv.elementary import nearest_whole
 from flockenv.jit.decorators import Vec, kernel, law
+from flockenv.maths.approximations import nearest_whole
+from flockenv.maths.vectors import dot, sub
 from flockenv.neighbours import candidates, count_cells, row_of
-from flockenv.vec import dot, sub
 
 __all__ = ["image", "led", "loaded", "near", "nearby", "vector", "write"]
 

@@ -15,8 +15,8 @@ from flockenv.constraints.impact import along
 from flockenv.constraints.listing import list_meetings
 from flockenv.constraints.sweep import goes_round, may_pass
 from flockenv.jit.decorators import Vec, kernel
+from flockenv.maths.vectors import add, axis, dot, norm, scale, sub, zero
 from flockenv.shapes.head import shift_of
-from flockenv.vec import add, axis, dot, norm, scale, sub, zero
 
 __all__ = ["COUNTED", "LOST", "collide"]
 

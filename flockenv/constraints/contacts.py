@@ -16,7 +16,7 @@ from flockenv.constraints.bodies import RESTS, Bodies, Meetings, Things, gained,
 from flockenv.constraints.broad import image, vector, write
 from flockenv.constraints.impact import bounced, surface
 from flockenv.jit.decorators import Vec, kernel
-from flockenv.vec import add, axis, dot, norm, scale, select, sub, unit, zero
+from flockenv.maths.vectors import add, axis, dot, norm, scale, select, sub, unit, zero
 
 __all__ = ["NEARLY", "Contacts", "Ends", "deepest", "gather", "impacts", "part", "press"]
 

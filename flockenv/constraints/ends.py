@@ -12,7 +12,7 @@ from flockenv.constraints.contacts import NEARLY, Contacts, Ends, deepest, gathe
 from flockenv.constraints.listing import list_meetings
 from flockenv.constraints.sweep import may_pass, stop_on_the_way, take_aim
 from flockenv.jit.decorators import Vec, kernel
-from flockenv.vec import add, dot, norm, scale, sub, zero
+from flockenv.maths.vectors import add, dot, norm, scale, sub, zero
 
 __all__ = ["settle_ends"]
 

@@ -37,7 +37,7 @@ from flockenv.constraints.broad import vector, write
 from flockenv.constraints.impact import bounced, ends_here, first_impact, hops_in_touch, rubbed, surface
 from flockenv.constraints.stops import halt
 from flockenv.jit.decorators import Vec, kernel
-from flockenv.vec import add, dot, scale, sub
+from flockenv.maths.vectors import add, dot, scale, sub
 
 __all__ = ["play", "together"]
 

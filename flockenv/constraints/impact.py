@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 
 from flockenv.jit.decorators import Vec, kernel, law, routine
+from flockenv.maths.vectors import add, axis, dot, norm, scale, select, sub, unit
 from flockenv.shapes.every import hit_shape, nearest_shape
 from flockenv.shapes.round import ray_hit
-from flockenv.vec import add, axis, dot, norm, scale, select, sub, unit
 
 __all__ = [
     "POINT", "along", "bounced", "ends_here", "first_impact", "flight", "hops_in_touch", "rubbed",

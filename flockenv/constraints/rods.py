@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from flockenv.constraints.base import Constraint, Settler
-from flockenv.elementary import nearest_whole
 from flockenv.jit.decorators import finite, kernel, like
 from flockenv.jit.section import entry
+from flockenv.maths.approximations import nearest_whole
 from flockenv.networks import EDGE
 from flockenv.space import Torus
 from flockenv.state import Floats, State

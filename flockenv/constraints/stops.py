@@ -25,7 +25,7 @@ from flockenv.constraints.bodies import (
 from flockenv.constraints.broad import vector, write
 from flockenv.constraints.impact import bounced, surface
 from flockenv.jit.decorators import Vec, kernel
-from flockenv.vec import add, dot, scale, sub, zero
+from flockenv.maths.vectors import add, dot, scale, sub, zero
 
 __all__ = ["halt"]
 

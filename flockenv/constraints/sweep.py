@@ -29,7 +29,7 @@ from flockenv.constraints.contacts import Ends
 from flockenv.constraints.events import play
 from flockenv.constraints.impact import surface
 from flockenv.jit.decorators import Vec, kernel
-from flockenv.vec import norm, scale, sub, zero
+from flockenv.maths.vectors import norm, scale, sub, zero
 
 __all__ = ["goes_round", "may_pass", "stop_on_the_way", "take_aim"]
 

@@ -9,7 +9,7 @@ from pydantic import Field
 
 from flockenv.effects.base import Effect, Me, Vector, demand_group
 from flockenv.jit.decorators import Law, Vec, law, like
-from flockenv.vec import norm, scale, select, sub, unit, zero
+from flockenv.maths.vectors import norm, scale, select, sub, unit, zero
 
 __all__ = ["Aim", "Antipode", "Course", "Goal", "about", "easing"]
 

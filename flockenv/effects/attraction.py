@@ -11,8 +11,8 @@ from pydantic import Field
 
 from flockenv.effects.base import Effect, Me, Vector
 from flockenv.jit.decorators import Law, Vec, law, like
+from flockenv.maths.vectors import dot, scale, sub
 from flockenv.state import State
-from flockenv.vec import dot, scale, sub
 
 __all__ = ["Attraction"]
 

@@ -65,7 +65,7 @@ from pydantic import Field
 
 from flockenv.core.record import Record
 from flockenv.jit.decorators import Law, Vec, law, like
-from flockenv.vec import dot
+from flockenv.maths.vectors import dot
 
 __all__ = [
     "EFFECTS", "LAWS", "Bonds", "Effect", "Far", "Me", "Members", "Obstacle", "Other", "Sight", "Vector", "all_masses",

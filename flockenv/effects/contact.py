@@ -12,8 +12,8 @@ from pydantic import Field
 
 from flockenv.effects.base import Effect, Me, Obstacle, Other, Sight, all_masses
 from flockenv.jit.decorators import Law, Vec, law, like
+from flockenv.maths.vectors import add, dot, norm, scale, select, sub, unit, zero
 from flockenv.steering.others import ONE_PLACE
-from flockenv.vec import add, dot, norm, scale, select, sub, unit, zero
 
 __all__ = ["Contact", "ObstacleContact", "restitution"]
 

@@ -11,7 +11,7 @@ from pydantic import Field
 
 from flockenv.effects.base import Effect, Me, all_masses
 from flockenv.jit.decorators import Law, Vec, law
-from flockenv.vec import norm, scale, sub
+from flockenv.maths.vectors import norm, scale, sub
 
 __all__ = ["Drag", "QuadraticDrag"]
 

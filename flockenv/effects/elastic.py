@@ -12,7 +12,7 @@ from pydantic import Field
 from flockenv.effects.base import Bonds, Effect, Me, all_masses, network_of
 from flockenv.elements import Material, blocks, stiffness
 from flockenv.jit.decorators import Law, Vec, law
-from flockenv.vec import add, scale, sub
+from flockenv.maths.vectors import add, scale, sub
 
 if TYPE_CHECKING:
     from flockenv.state import State

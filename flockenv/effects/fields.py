@@ -23,8 +23,8 @@ from pydantic import Field, model_validator
 
 from flockenv.effects.base import Effect, Me, Vector
 from flockenv.jit.decorators import OPTIONS, Law, Vec, law, like
+from flockenv.maths.vectors import add, dot, lateral, scale, sub, unit
 from flockenv.state import State
-from flockenv.vec import add, dot, lateral, scale, sub, unit
 
 __all__ = ["Carried", "Sink", "Source", "Uniform", "Vortex", "Wind"]
 

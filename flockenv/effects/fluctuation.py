@@ -9,7 +9,7 @@ from pydantic import Field
 
 from flockenv.effects.base import Effect, Me
 from flockenv.jit.decorators import Law, Vec, law
-from flockenv.vec import scale
+from flockenv.maths.vectors import scale
 
 __all__ = ["Fluctuation"]
 

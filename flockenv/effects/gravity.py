@@ -11,8 +11,8 @@ from pydantic import Field
 
 from flockenv.effects.base import Effect, Me, Vector, all_masses
 from flockenv.jit.decorators import Law, Vec, law
+from flockenv.maths.vectors import scale
 from flockenv.state import State
-from flockenv.vec import scale
 
 __all__ = ["Gravity"]
 

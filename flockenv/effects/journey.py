@@ -12,9 +12,9 @@ from flockenv.effects.aims import about
 from flockenv.effects.base import Me
 from flockenv.effects.way import Around, slowed
 from flockenv.jit.decorators import Law, Vec, law, like
+from flockenv.maths.vectors import norm, scale, select, sub, unit, zero
 from flockenv.spread import Spread, drawn
 from flockenv.targets import Target, passed, row_size, to_target
-from flockenv.vec import norm, scale, select, sub, unit, zero
 from flockenv.ways import towards
 
 __all__ = ["Journey", "Stage", "onwards", "place_kept"]

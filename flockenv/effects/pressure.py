@@ -9,8 +9,8 @@ from pydantic import Field
 
 from flockenv.effects.base import Effect, Me, Other, Sight
 from flockenv.jit.decorators import Law, Vec, law, like
+from flockenv.maths.vectors import scale, select, sub, unit
 from flockenv.steering.others import ONE_PLACE
-from flockenv.vec import scale, select, sub, unit
 
 __all__ = ["Pressure"]
 

@@ -11,7 +11,7 @@ from pydantic import Field
 
 from flockenv.effects.base import Effect, Me, all_masses
 from flockenv.jit.decorators import Law, Vec, law, like
-from flockenv.vec import dot, scale
+from flockenv.maths.vectors import dot, scale
 
 __all__ = ["SpeedLimit"]
 

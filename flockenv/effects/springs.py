@@ -15,8 +15,8 @@ from pydantic import Field
 
 from flockenv.effects.base import Bonds, Effect, Me, all_masses, network_of
 from flockenv.jit.decorators import Law, Vec, law, like
+from flockenv.maths.vectors import add, axis, dot, norm, scale, select, sub
 from flockenv.networks import BEND, SHEAR
-from flockenv.vec import add, axis, dot, norm, scale, select, sub
 
 if TYPE_CHECKING:
     from flockenv.state import State

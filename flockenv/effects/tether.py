@@ -11,8 +11,8 @@ from pydantic import Field
 
 from flockenv.effects.base import Effect, Me, Vector, all_masses
 from flockenv.jit.decorators import Law, Vec, law, like
+from flockenv.maths.vectors import add, scale, sub, unit
 from flockenv.state import State
-from flockenv.vec import add, scale, sub, unit
 
 __all__ = ["Swing", "Tether"]
 

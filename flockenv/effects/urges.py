@@ -1,8 +1,9 @@
 """What goes on inside animals: hunger, libido, fear, intentions; food that grows and is eaten, prey that is caught.
 
 None of these is a force. They keep numbers inside agents (`State.inner`), which an arbitration (`intentions`), a sink
-(`threshold`) or a law of yours reads. The formulas, and whose they are, stand in `flockenv.urges`. What passes between
-two agents is gathered from both sides, each from the same instant: what a fish eats is what its food loses.
+(`threshold`) or a law of yours reads. The formulas, and whose they are, stand in `flockenv.steering.motivation`. What
+passes between two agents is gathered from both sides, each from the same instant: what a fish eats is what its food
+loses.
 """
 
 from __future__ import annotations
@@ -13,11 +14,11 @@ from typing import Any, ClassVar, Literal
 import numpy as np
 from pydantic import Field, model_validator
 
-from flockenv import urges
 from flockenv.effects.base import Effect, Me, Other, Sight, demand_group
 from flockenv.jit.decorators import Law, Vec, law, like
-from flockenv.noise import uniform
-from flockenv.vec import norm, planar
+from flockenv.maths.counter_rng import uniform
+from flockenv.maths.vectors import norm, planar
+from flockenv.steering import motivation
 
 __all__ = ["Fear", "Grazing", "Intention", "Libido", "Metabolism", "Predation"]
 
@@ -82,7 +83,7 @@ def digesting(p: Any, me: Me, told: Vec, seconds: float) -> Vec:
     """Time and effort make hungry."""
     o = like(me.max_speed, 0.0)
     pace = norm(me.vel) / me.max_speed if me.max_speed > o else o
-    later = urges.hungrier(me.inner.hunger, p.rate, p.effort, pace, seconds)
+    later = motivation.hungrier(me.inner.hunger, p.rate, p.effort, pace, seconds)
     return (later if _among(me.who, p.first, p.end) else me.inner.hunger,)
 
 
@@ -149,10 +150,10 @@ def grazed(p: Any, me: Me, told: Vec, seconds: float) -> Vec:
     """Who eats gets less hungry; what is eaten of grows, and loses the same."""
     o = like(p.rate, 0.0)
     patch = _among(me.who, p.from_other, p.to_other)
-    taken = urges.bite(told[0], me.inner.hunger, p.rate, seconds)
-    lost = urges.bite(me.inner.food, told[1], p.rate, seconds)
+    taken = motivation.bite(told[0], me.inner.hunger, p.rate, seconds)
+    lost = motivation.bite(me.inner.food, told[1], p.rate, seconds)
     less = me.inner.hunger - taken / p.appetite
-    grown = urges.regrown(me.inner.food, p.growth, p.capacity, seconds) if patch else me.inner.food
+    grown = motivation.regrown(me.inner.food, p.growth, p.capacity, seconds) if patch else me.inner.food
     return (less if less > o else o), grown - lost, me.inner.eaten + taken
 
 
@@ -285,7 +286,7 @@ def unafraid(p: Any, me: Me) -> Vec:
 @law
 def frightened(p: Any, me: Me, other: Other) -> Vec:
     """Fear of one of them."""
-    return (urges.fright(np.sqrt(other.square), p.span),)
+    return (motivation.fright(np.sqrt(other.square), p.span),)
 
 
 @law
@@ -298,7 +299,7 @@ def told_one(p: Any, me: Me, sums: Vec) -> Vec:
 def afraid(p: Any, me: Me, told: Vec, seconds: float) -> Vec:
     """Of all in sight together, at most 1; it fades."""
     one = like(p.span, 1.0)
-    later = urges.calmed(me.inner.fear, told[0] if told[0] < one else one, p.memory, seconds)
+    later = motivation.calmed(me.inner.fear, told[0] if told[0] < one else one, p.memory, seconds)
     return (later if _among(me.who, p.first, p.end) else me.inner.fear,)
 
 
@@ -349,7 +350,7 @@ def urge_from(p: Any, me: Me) -> Vec:
 def willing(p: Any, me: Me, other: Other) -> Vec:
     """One more who would."""
     o, e = like(other.square, 0.0), like(other.square, 1.0)
-    would = urges.desire(other.inner.libido, other.inner.hunger) > p.ready
+    would = motivation.desire(other.inner.libido, other.inner.hunger) > p.ready
     return (e if would & _among(other.who, p.first, p.end) else o,)
 
 
@@ -358,7 +359,7 @@ def mating(p: Any, me: Me, told: Vec, seconds: float) -> Vec:
     """The urge grows; who would, and has somebody near who would, mates, and it begins anew."""
     o, e = like(p.rate, 0.0), like(p.rate, 1.0)
     mine = _among(me.who, p.first, p.end)
-    mates = mine & (told[0] > o) & (urges.desire(me.inner.libido, me.inner.hunger) > p.ready)
+    mates = mine & (told[0] > o) & (motivation.desire(me.inner.libido, me.inner.hunger) > p.ready)
     grown = me.inner.libido + (p.rate * seconds if mine else o)
     return (o if mates else grown), me.inner.mated + (e if mates else o)
 
@@ -410,14 +411,14 @@ class Libido(_Urge):
 @law
 def no_intention(p: Any, me: Me) -> Vec:
     """Everybody begins wandering."""
-    return (like(me.mass, urges.WANDER),)
+    return (like(me.mass, motivation.WANDER),)
 
 
 @law
 def intending(p: Any, me: Me, told: Vec, seconds: float) -> Vec:
     """What follows from what one intends, and hunger, libido and fear."""
-    libido = urges.desire(me.inner.libido, me.inner.hunger)
-    now = urges.intention(
+    libido = motivation.desire(me.inner.libido, me.inner.hunger)
+    now = motivation.intention(
         me.inner.intention, me.inner.hunger, libido, me.inner.fear, p.escape, p.school, p.need, p.calm, p.content
     )
     return (now if _among(me.who, p.first, p.end) else me.inner.intention,)

@@ -10,8 +10,8 @@ from pydantic import Field
 
 from flockenv.effects.base import Effect, Me, Other, Sight
 from flockenv.jit.decorators import Law, Vec, law, like
-from flockenv.noise import uniform
-from flockenv.vec import add, dot, scale, select, sub, unit
+from flockenv.maths.counter_rng import uniform
+from flockenv.maths.vectors import add, dot, scale, select, sub, unit
 
 __all__ = ["Vicsek"]
 

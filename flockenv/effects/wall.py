@@ -12,9 +12,9 @@ from pydantic import Field, model_validator
 
 from flockenv.effects.base import Effect, Me, Vector
 from flockenv.jit.decorators import Law, Vec, law
+from flockenv.maths.vectors import dot, scale, sub, unit
 from flockenv.space import Torus
 from flockenv.state import State
-from flockenv.vec import dot, scale, sub, unit
 
 __all__ = ["WallRepulsion"]
 

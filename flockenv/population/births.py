@@ -12,11 +12,11 @@ import math
 from typing import Any
 
 from flockenv.jit.decorators import Vec, kernel, law
-from flockenv.noise import uniform
+from flockenv.maths.counter_rng import uniform
+from flockenv.maths.heading import face_one
+from flockenv.maths.vectors import add, cross, dot, scale, select, sub, unit
 from flockenv.population.near import count_near, sort_living
 from flockenv.state import WORK
-from flockenv.vec import add, cross, dot, scale, select, sub, unit
-from flockenv.vehicle import face_one
 
 __all__ = ["births", "due"]
 

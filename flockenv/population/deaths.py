@@ -13,12 +13,12 @@ import numpy as np
 
 from flockenv.constraints.broad import image, loaded
 from flockenv.jit.decorators import Vec, kernel, law
-from flockenv.noise import uniform
+from flockenv.maths.counter_rng import uniform
+from flockenv.maths.vectors import add, norm, sub, unit
 from flockenv.population.births import DEATHS
 from flockenv.population.near import count_near, sort_living
 from flockenv.shapes.every import hit_shape, nearest_shape
 from flockenv.shapes.head import shift_of
-from flockenv.vec import add, norm, sub, unit
 
 __all__ = ["crowding", "drain", "passing", "reaching"]
 

@@ -1,7 +1,7 @@
 """Any shape as distances on a grid (a signed distance field): between its points they are interpolated.
 
-A field is a grid (see flockenv/grid.py) relative to the anchor, whose points have 1 + D numbers: the distance to the
-surface (m, negative inside) and its direction, outward.
+A field is a grid (see flockenv/maths/grid.py) relative to the anchor, whose points have 1 + D numbers: the distance to
+the surface (m, negative inside) and its direction, outward.
 """
 
 from __future__ import annotations
@@ -10,10 +10,10 @@ from typing import Any
 
 import numpy as np
 
-from flockenv.grid import sample, sample_vector
 from flockenv.jit.decorators import Vec, law, like
+from flockenv.maths.grid import sample, sample_vector
+from flockenv.maths.vectors import add, axis, dot, norm, scale, select, sub, unit
 from flockenv.shapes.head import body_of
-from flockenv.vec import add, axis, dot, norm, scale, select, sub, unit
 
 __all__ = ["STEPS", "hit_distance_field", "nearest_distance_field", "on_grid"]
 

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from flockenv.jit.decorators import Vec, law, like
-from flockenv.vec import add, scale
+from flockenv.maths.vectors import add, scale
 
 __all__ = ["body_of", "bound_of", "box_of", "form_of", "outside_box", "shift_of", "vector_at", "velocity_of"]
 

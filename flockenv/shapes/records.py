@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike
 from pydantic import Field, WrapValidator, field_validator, model_validator
 
 from flockenv.core.record import Record, in_tuples, keep
-from flockenv.grid import MOST_POINTS, packed, points_of
+from flockenv.maths.grid import MOST_POINTS, packed, points_of
 from flockenv.shapes import outlines, table
 from flockenv.shapes.table import Floats, hits, nearest
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 
 from flockenv.jit.decorators import Vec, law, like
-from flockenv.vec import add, axis, dot, norm, scale, select, sub, unit
+from flockenv.maths.vectors import add, axis, dot, norm, scale, select, sub, unit
 
 __all__ = ["blocks", "gap", "normal", "ray_hit", "silhouette", "touched_normal"]
 

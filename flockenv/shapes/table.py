@@ -17,8 +17,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from flockenv.jit.decorators import Law
 from flockenv.jit.section import entry_of, vector
+from flockenv.maths.vectors import sub
 from flockenv.shapes.joints import joints
-from flockenv.vec import sub
 
 __all__ = ["FORMS", "Floats", "hits", "law_of", "nearest", "packed"]
 

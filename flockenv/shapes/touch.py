@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from flockenv.jit.decorators import Vec, law, like
-from flockenv.vec import add, scale, sub
+from flockenv.maths.vectors import add, scale, sub
 
 __all__ = ["touched_offset", "touched_spot"]
 

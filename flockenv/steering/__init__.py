@@ -3,7 +3,7 @@
 A steering law returns the change of velocity it asks for, S = v_desired - v, in m/s; the caller turns it into a force
 with a gain in kg/s (m/tau makes `seek` Helbing's driving force). `offset` is always other minus self. Laws take tuples
 of D = 2 or 3 floats and are finite for every finite input, at standstill and at zero distance too.
-Over arrays of rows they are called through `flockenv.rows.rows(law)`.
+Over arrays of rows they are called through `flockenv.steering.vectorize.rows(law)`.
 
 Sources: Reynolds, "Flocks, Herds, and Schools" (SIGGRAPH 1987); "Steering Behaviors for Autonomous Characters"
 (GDC 1999). The sign of seek is the paper's figure, not its pseudo-code, which flees.

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from flockenv.jit.decorators import Vec, law, like
+from flockenv.maths.vectors import dot, lateral, perpendicular, scale, select, sub, unit, zero
 from flockenv.steering.goals import seek
-from flockenv.vec import dot, lateral, perpendicular, scale, select, sub, unit, zero
 
 __all__ = ["avoid", "contain", "threat"]
 

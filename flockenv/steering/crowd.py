@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from flockenv.jit.decorators import Vec, law, like
+from flockenv.maths.vectors import add, dot, perpendicular, planar, scale, select, sub, unit
 from flockenv.steering.around import threat
-from flockenv.vec import add, dot, perpendicular, planar, scale, select, sub, unit
 
 __all__ = ["explore", "give_way", "queue", "queue_gap", "unaligned_threat"]
 

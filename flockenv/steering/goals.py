@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from flockenv.jit.decorators import Vec, law, like
-from flockenv.vec import add, axis, cross, dot, lateral, norm, perpendicular, scale, select, sub, unit
+from flockenv.maths.vectors import add, axis, cross, dot, lateral, norm, perpendicular, scale, select, sub, unit
 
 __all__ = [
     "arrive",

@@ -7,7 +7,7 @@ doi 10.1098/rsif.2014.0719), in continuous time: what is a direction there is on
 from __future__ import annotations
 
 from flockenv.jit.decorators import Vec, law
-from flockenv.vec import add, norm, scale, select, sub, unit
+from flockenv.maths.vectors import add, norm, scale, select, sub, unit
 
 __all__ = ["behind", "heed", "herd_from"]
 

@@ -5,8 +5,22 @@ from __future__ import annotations
 import numpy as np
 
 from flockenv.jit.decorators import Vec, law, like
+from flockenv.maths.vectors import (
+    add,
+    axis,
+    dot,
+    lateral,
+    limit,
+    norm,
+    opposite,
+    perpendicular,
+    scale,
+    select,
+    sub,
+    unit,
+    zero,
+)
 from flockenv.steering.goals import arrive, flee, in_frame, match_velocity, seek
-from flockenv.vec import add, axis, dot, lateral, limit, norm, opposite, perpendicular, scale, select, sub, unit, zero
 
 __all__ = [
     "align",

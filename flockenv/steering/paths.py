@@ -1,13 +1,14 @@
 """Along paths and fields: what to ask for once it is known where the path, or how fast the flow, is.
 
-Where the nearest point of a path lies is geometry (`flockenv.polyline`), and so is what a grid says (`flockenv.grid`).
+Where the nearest point of a path lies is geometry (`flockenv.polyline`), and so is what a grid says
+(`flockenv.maths.grid`).
 """
 
 from __future__ import annotations
 
 from flockenv.jit.decorators import Vec, law, like
+from flockenv.maths.vectors import select, sub, zero
 from flockenv.steering.goals import seek
-from flockenv.vec import select, sub, zero
 
 __all__ = ["follow_flow", "follow_path", "stay_on_path"]
 

@@ -12,10 +12,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from flockenv.elementary import atan2, exp
 from flockenv.jit.decorators import Vec, law, like
+from flockenv.maths.approximations import atan2, exp
+from flockenv.maths.vectors import add, cross, dot, lateral, norm, perpendicular, scale, select, sub, unit
 from flockenv.steering.others import ONE_PLACE
-from flockenv.vec import add, cross, dot, lateral, norm, perpendicular, scale, select, sub, unit
 
 __all__ = [
     "apart",

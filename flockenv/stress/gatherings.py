@@ -9,7 +9,6 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from flockenv.arbitration import Allocation, Blend
 from flockenv.behaviours import AvoidObstacles, ForceField, Seek, UnalignedAvoidance
 from flockenv.constraints import Collisions
 from flockenv.findings import Case, Value
@@ -19,6 +18,7 @@ from flockenv.scene import Group, Scene
 from flockenv.shapes import Block, Circle, Polygon
 from flockenv.spawn import Spawn
 from flockenv.steer import Steer
+from flockenv.steering.arbitration import Allocation, Blend
 from flockenv.stress.solids import Response, batch, overlap, per_response, solid
 
 __all__ = ["GATHERINGS"]

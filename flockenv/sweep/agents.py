@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from flockenv.effects.base import Me
 from flockenv.jit.decorators import kernel, law, like
 from flockenv.jit.section import record, section, tuple_from
+from flockenv.maths.vectors import unit, zero
 from flockenv.sweep.blocks import vector_of_lane
-from flockenv.vec import unit, zero
 
 if TYPE_CHECKING:
     from flockenv.sweep.parts import Parts

@@ -17,11 +17,11 @@ from flockenv.effects.base import Bonds, Other
 from flockenv.jit.decorators import Law, like
 from flockenv.jit.intrinsics import wait_for_team
 from flockenv.jit.section import section
+from flockenv.maths.vectors import dot, exact_sum, zero
 from flockenv.sweep.agents import AgentPlan, alone_of, inner_of
 from flockenv.sweep.blocks import vector_of_lane
 from flockenv.sweep.gather import gather
 from flockenv.sweep.parts import Parts
-from flockenv.vec import dot, exact_sum, zero
 
 __all__ = ["BondPlan", "Table", "bond_plan", "bonds_of", "pack"]
 

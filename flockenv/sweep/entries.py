@@ -14,6 +14,7 @@ import numpy as np
 from flockenv.jit.decorators import kernel, like
 from flockenv.jit.intrinsics import unaliased
 from flockenv.jit.section import entry_of, in_turn, section, titled
+from flockenv.maths.vectors import zero
 from flockenv.sweep.agents import alone_of
 from flockenv.sweep.blocks import out_of_blocks, place_of, vector_of_lane
 from flockenv.sweep.carry import bring_in_of, take_drive_of
@@ -23,7 +24,6 @@ from flockenv.sweep.numbers import NumberPlan, numbers_of
 from flockenv.sweep.parts import Parts
 from flockenv.sweep.respond import ResponsePlan, SensePlan, accelerate_of, response_plan, sense_plan
 from flockenv.sweep.step import StepPlan, step_plan, step_world_of
-from flockenv.vec import zero
 
 __all__ = ["BeginPlan", "begin_inner_of", "begin_of", "begin_plan", "field_of", "step_of"]
 

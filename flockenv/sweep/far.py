@@ -16,10 +16,10 @@ from flockenv.effects.base import Far, Me
 from flockenv.jit.decorators import Law, like
 from flockenv.jit.intrinsics import wait_for_team
 from flockenv.jit.section import section
+from flockenv.maths.vectors import dot, sub, zero
 from flockenv.sweep.blocks import place_of, vector_of_lane
 from flockenv.sweep.parts import Parts
 from flockenv.tree import BUCKETS, LEVELS, LISTED, gather, line_up, weigh
-from flockenv.vec import dot, sub, zero
 
 __all__ = ["FarPlan", "far_of", "far_plan"]
 

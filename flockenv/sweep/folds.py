@@ -15,6 +15,7 @@ import numpy as np
 from flockenv.effects.base import Obstacle
 from flockenv.jit.decorators import kernel, like
 from flockenv.jit.section import in_turn, section
+from flockenv.maths.vectors import add, dot, norm, scale, sub, zero
 from flockenv.shapes.round import normal, touched_normal
 from flockenv.shapes.table import law_of
 from flockenv.shapes.touch import touched_offset, touched_spot
@@ -23,7 +24,6 @@ from flockenv.sweep.forms import Surroundings, number_of
 from flockenv.sweep.gather import chosen, gather, scatter
 from flockenv.sweep.obstacle_plan import Fold
 from flockenv.sweep.visibility import blocked
-from flockenv.vec import add, dot, norm, scale, sub, zero
 
 __all__ = ["meet_circle", "meet_shape"]
 

@@ -13,6 +13,7 @@ import numpy as np
 
 from flockenv.jit.decorators import Law, Vec, kernel, law
 from flockenv.jit.section import section
+from flockenv.maths.vectors import add
 from flockenv.shapes.cells import (
     MOST_FOUND,
     count_of,
@@ -25,7 +26,6 @@ from flockenv.shapes.cells import (
 )
 from flockenv.shapes.head import shift_of, vector_at
 from flockenv.shapes.table import FORMS
-from flockenv.vec import add
 
 __all__ = ["FormPlan", "Surroundings", "box_of_way", "by_form", "each_row", "near_rows", "number_of", "seen_from"]
 

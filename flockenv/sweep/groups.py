@@ -15,10 +15,10 @@ from flockenv.effects.base import Members
 from flockenv.jit.decorators import Law, finite, kernel, like
 from flockenv.jit.intrinsics import wait_for_team
 from flockenv.jit.section import in_turn, section
+from flockenv.maths.vectors import add, dot, scale, sub, zero
 from flockenv.sweep.blocks import place_of, vector_of_lane
 from flockenv.sweep.gather import gather, scatter
 from flockenv.sweep.parts import Parts
-from flockenv.vec import add, dot, scale, sub, zero
 
 __all__ = ["GroupLaw", "GroupPlan", "find_groups_of", "group_plan", "members_of"]
 

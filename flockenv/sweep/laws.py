@@ -7,8 +7,8 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from flockenv.jit.decorators import Law, Vec, kernel
+from flockenv.maths.vectors import add
 from flockenv.sweep.numbers import Images, images_in, images_of
-from flockenv.vec import add
 
 if TYPE_CHECKING:
     from flockenv.sweep.parts import Parts

@@ -10,10 +10,10 @@ import numpy as np
 from flockenv.effects.base import Me
 from flockenv.jit.decorators import kernel
 from flockenv.jit.section import record, section
+from flockenv.maths.vectors import zero
 from flockenv.sweep.blocks import place_of
 from flockenv.sweep.gather import gather
 from flockenv.sweep.listing import Listing
-from flockenv.vec import zero
 
 __all__ = ["Besides", "Block", "Candidate", "agent_listed", "candidate_listed", "tie_of", "with_tie"]
 

@@ -12,13 +12,13 @@ import numpy as np
 
 from flockenv.jit.decorators import like
 from flockenv.jit.section import section
+from flockenv.maths.vectors import dot, exact_dot, norm, sub
 from flockenv.sweep.blocks import into_blocks, vector_of, vector_of_lane
 from flockenv.sweep.gather import fill, gather, scatter
 from flockenv.sweep.listing import list_living, walk_blocks
 from flockenv.sweep.look_keys import by_keys_of
 from flockenv.sweep.look_plan import Looking, LookPlan, Nearest, Span
 from flockenv.sweep.nearest import AT_ONCE, inserted
-from flockenv.vec import dot, exact_dot, norm, sub
 
 __all__ = ["look_of"]
 

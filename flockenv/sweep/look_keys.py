@@ -13,12 +13,12 @@ import numpy as np
 from flockenv.jit.decorators import like
 from flockenv.jit.section import section
 from flockenv.jit.simd_rows import key_of, key_read, key_written, pick, same_key, tag_of
+from flockenv.maths.vectors import exact_dot, sub
 from flockenv.sweep.blocks import vector_of
 from flockenv.sweep.gather import fill, gather, scatter
 from flockenv.sweep.look_plan import LookPlan
 from flockenv.sweep.nearest import AT_ONCE, merged
 from flockenv.sweep.scratch import SMALL_STRIDE
-from flockenv.vec import exact_dot, sub
 
 __all__ = ["by_keys_of"]
 

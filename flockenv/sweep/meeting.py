@@ -17,13 +17,13 @@ from flockenv.effects.base import Other
 from flockenv.jit.decorators import kernel, like
 from flockenv.jit.intrinsics import tallied, tally_of, wait_for_team
 from flockenv.jit.section import section
+from flockenv.maths.vectors import dot, exact_dot, sub
 from flockenv.steering.others import ONE_PLACE
 from flockenv.sweep.gather import gather, scatter
 from flockenv.sweep.listed_agents import Besides, Block, Candidate, agent_listed, candidate_listed, tie_of, with_tie
 from flockenv.sweep.listing import list_living, walk_blocks
 from flockenv.sweep.pair_plan import Pairs
 from flockenv.sweep.pair_sums import add_candidate, begin_sums, finish_sums, keep_nearest, tell_sums
-from flockenv.vec import dot, exact_dot, sub
 
 __all__ = ["meet_neighbours"]
 

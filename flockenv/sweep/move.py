@@ -14,14 +14,14 @@ import numpy as np
 from flockenv.integrators.one_stage import OneStage
 from flockenv.jit.decorators import Law, Vec, finite, kernel, like
 from flockenv.jit.section import in_turn, section, tuple_from
-from flockenv.noise import normal
+from flockenv.maths.counter_rng import normal
+from flockenv.maths.heading import faced, held, leant, raised, turned
+from flockenv.maths.vectors import add, dot, limit, norm, scale, select, sub, zero
 from flockenv.sweep.agents import AgentPlan, agent_plan, alone_of
 from flockenv.sweep.blocks import common_places, put_vector_of, vector_of_lane
 from flockenv.sweep.laws import OneLaw, given_of, says_of
 from flockenv.sweep.parts import Parts
 from flockenv.sweep.respond import felt_of
-from flockenv.vec import add, dot, limit, norm, scale, select, sub, zero
-from flockenv.vehicle import faced, held, leant, raised, turned
 
 __all__ = ["InnerPlan", "MovePlan", "begin_agent_of", "inner_plan", "move_of", "move_plan"]
 

@@ -15,8 +15,8 @@ import numpy as np
 
 from flockenv.jit.decorators import Law, kernel
 from flockenv.jit.section import joined_from, record, section, tuple_from
+from flockenv.maths.vectors import add
 from flockenv.sweep.gather import gather
-from flockenv.vec import add
 
 if TYPE_CHECKING:
     from flockenv.effects.base import Effect

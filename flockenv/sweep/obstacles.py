@@ -16,6 +16,7 @@ import numpy as np
 
 from flockenv.jit.decorators import Vec, kernel, law, like
 from flockenv.jit.section import in_turn, section, vector
+from flockenv.maths.vectors import add, dot, scale, sub, zero
 from flockenv.shapes.edges import near_way
 from flockenv.shapes.head import outside_box, shift_of, velocity_of
 from flockenv.shapes.table import law_of
@@ -26,7 +27,6 @@ from flockenv.sweep.folds import meet_circle, meet_shape
 from flockenv.sweep.forms import near_rows
 from flockenv.sweep.gather import scatter
 from flockenv.sweep.obstacle_plan import Fold, Obstacles, Place, Shape
-from flockenv.vec import add, dot, scale, sub, zero
 
 __all__ = ["obstacles_of"]
 

@@ -12,6 +12,7 @@ from flockenv.effects.base import Other, in_view
 from flockenv.jit.decorators import kernel, like
 from flockenv.jit.intrinsics import tallied, tally_of
 from flockenv.jit.section import in_turn, section, tuple_from
+from flockenv.maths.vectors import add, dot, zero
 from flockenv.sweep.blocks import place_of, vector_of
 from flockenv.sweep.gather import add_where, chosen, copy_each, fill, gather, picked, scatter
 from flockenv.sweep.laws import given_of
@@ -19,7 +20,6 @@ from flockenv.sweep.listed_agents import agent_listed
 from flockenv.sweep.nearest import kept
 from flockenv.sweep.pair_plan import PairLaw, Pairs
 from flockenv.sweep.visibility import blocked
-from flockenv.vec import add, dot, zero
 
 __all__ = ["add_candidate", "begin_sums", "finish_sums", "keep_nearest", "tell_sums"]
 

@@ -16,6 +16,7 @@ import numpy as np
 
 from flockenv.jit.decorators import Law, Vec, kernel, like
 from flockenv.jit.section import section, tuple_from
+from flockenv.maths.vectors import add, limit, scale, select, zero
 from flockenv.sweep.agents import AgentPlan, agent_plan, alone_of, still
 from flockenv.sweep.blocks import common_places, put_vector_of, vector_of_lane
 from flockenv.sweep.bonds import BondPlan, bond_plan, bonds_of
@@ -28,7 +29,6 @@ from flockenv.sweep.obstacle_plan import Obstacles, obstacle_plan
 from flockenv.sweep.obstacles import obstacles_of
 from flockenv.sweep.pair_plan import Pairs, pairs_of
 from flockenv.sweep.parts import Parts
-from flockenv.vec import add, limit, scale, select, zero
 
 __all__ = ["accelerate_of", "felt_of", "respond_of", "response_plan", "sense_of", "sense_plan"]
 

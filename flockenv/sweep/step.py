@@ -16,6 +16,7 @@ from flockenv.integrators.base import Method, Provided
 from flockenv.jit.decorators import Law, finite, kernel, like
 from flockenv.jit.intrinsics import ask_for, wait_for_team
 from flockenv.jit.section import in_turn, section
+from flockenv.maths.vectors import zero
 from flockenv.state import COUNTED_BY_KERNELS
 from flockenv.sweep.agents import AgentPlan, agent_plan, alone_of
 from flockenv.sweep.arrange import ArrangePlan, arrange_plan, go_home_of, move_in_of
@@ -37,7 +38,6 @@ from flockenv.sweep.respond import (
     sense_of,
     sense_plan,
 )
-from flockenv.vec import zero
 
 __all__ = ["StepPlan", "step_plan", "step_world_of"]
 

@@ -7,11 +7,11 @@ from typing import Any
 
 from flockenv.jit.decorators import kernel, like
 from flockenv.jit.section import section
+from flockenv.maths.vectors import norm, scale, unit
 from flockenv.shapes.round import blocks
 from flockenv.shapes.table import law_of
 from flockenv.sweep.blocks import vector_of
 from flockenv.sweep.forms import FormPlan, Surroundings, box_of_way, each_row, seen_from
-from flockenv.vec import norm, scale, unit
 
 __all__ = ["blocked"]
 

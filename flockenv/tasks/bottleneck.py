@@ -13,7 +13,8 @@ from pydantic import Field, model_validator
 from flockenv import steering
 from flockenv.effects import Contact, ObstacleContact
 from flockenv.jit.decorators import kernel, like
-from flockenv.noise import uniform
+from flockenv.maths.counter_rng import uniform
+from flockenv.maths.vectors import add, norm, scale, sub, unit
 from flockenv.presets import PRESETS
 from flockenv.scene import Group, Scene
 from flockenv.shapes import Wall
@@ -25,7 +26,6 @@ from flockenv.sweep import Look
 from flockenv.tasks.base import Frame, Task
 from flockenv.tasks.layout import Layout, Slot
 from flockenv.tasks.sight import clip, neighbour_slots, place_of, put, put_crowding, put_neighbour, velocity_of
-from flockenv.vec import add, norm, scale, sub, unit
 
 __all__ = ["Bottleneck"]
 

@@ -13,7 +13,8 @@ from pydantic import Field, model_validator
 from flockenv import steering
 from flockenv.effects import ObstacleContact
 from flockenv.jit.decorators import kernel, like
-from flockenv.noise import normal, uniform
+from flockenv.maths.counter_rng import normal, uniform
+from flockenv.maths.vectors import add, norm, scale, sub
 from flockenv.presets import PRESETS
 from flockenv.scene import Group, Scene
 from flockenv.shapes import Wall
@@ -25,7 +26,6 @@ from flockenv.tasks.base import Frame
 from flockenv.tasks.lasting import MEASURES, METRICS, LastingTask, judge, tell_lasting
 from flockenv.tasks.layout import Layout, Slot
 from flockenv.tasks.sight import neighbour_slots, offset, put, put_crowding, put_neighbour, turned, velocity_of
-from flockenv.vec import add, norm, scale, sub
 
 __all__ = ["Corridor"]
 

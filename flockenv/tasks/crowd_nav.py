@@ -10,11 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
-from flockenv.arbitration import Blend
 from flockenv.behaviours.social import Social
 from flockenv.effects.aims import Antipode
 from flockenv.jit.decorators import kernel, like
-from flockenv.noise import uniform
+from flockenv.maths.counter_rng import uniform
 from flockenv.presets import PRESETS
 from flockenv.scene import Group, Scene
 from flockenv.snapshot import Mark
@@ -22,6 +21,7 @@ from flockenv.space import Plane
 from flockenv.spawn import Spawn
 from flockenv.state import State
 from flockenv.steer import Steer
+from flockenv.steering.arbitration import Blend
 from flockenv.sweep import Look
 from flockenv.tasks.base import Frame, Task
 from flockenv.tasks.layout import Layout, Slot

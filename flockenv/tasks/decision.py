@@ -12,12 +12,12 @@ from flockenv.jit.decorators import kernel, like, replaced
 from flockenv.jit.memory import fetch, pour
 from flockenv.jit.section import record, section
 from flockenv.jit.simd_rows import columns, into_rows, packed, take
+from flockenv.maths.heading import face
 from flockenv.sweep import begin_inner_of, look_of, step_world_of
 from flockenv.sweep.gather import gather
 from flockenv.tasks.base import Frame
 from flockenv.tasks.lasting import lasts
 from flockenv.tasks.play_plan import Plan
-from flockenv.vehicle import face
 
 __all__ = [
     "act_of", "answer_of", "begin_of", "by_name_of", "frame_before", "frame_of", "look_in", "parameters_of", "show_of",

@@ -8,18 +8,19 @@ from typing import Any, ClassVar
 import numpy as np
 from pydantic import Field, model_validator
 
-from flockenv import arbitration, steering
+from flockenv import steering
 from flockenv.effects import ObstacleContact
 from flockenv.jit.decorators import Vec, kernel, like
-from flockenv.noise import uniform
+from flockenv.maths.counter_rng import uniform
+from flockenv.maths.vectors import add, norm, scale, unit
 from flockenv.scene import Group, Scene
 from flockenv.shapes import ray_hit
 from flockenv.space import Box
+from flockenv.steering import arbitration
 from flockenv.sweep import Look
 from flockenv.tasks.base import Frame, Task
 from flockenv.tasks.layout import Layout, Slot
 from flockenv.tasks.sight import block_ways, clip, compass, leaves_gap, velocity_of
-from flockenv.vec import add, norm, scale, unit
 
 __all__ = ["Evade"]
 

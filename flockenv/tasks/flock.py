@@ -10,21 +10,22 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
-from flockenv import arbitration, steering
+from flockenv import steering
 from flockenv.jit.decorators import kernel, like
 from flockenv.jit.intrinsics import stacked
 from flockenv.jit.simd_rows import SIDE
-from flockenv.noise import uniform
+from flockenv.maths.counter_rng import uniform
+from flockenv.maths.vectors import norm, scale, sub, unit
 from flockenv.scene import Group, Scene
 from flockenv.snapshot import Mark
 from flockenv.space import Torus
 from flockenv.state import State
+from flockenv.steering import arbitration
 from flockenv.sweep import Look
 from flockenv.tasks.base import Frame
 from flockenv.tasks.lasting import MEASURES, METRICS, LastingTask, judge, tell_lasting
 from flockenv.tasks.layout import Layout, Slot
 from flockenv.tasks.sight import block_ways, compass, offset, turned
-from flockenv.vec import norm, scale, sub, unit
 
 __all__ = ["Flock"]
 

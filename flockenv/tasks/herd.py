@@ -12,7 +12,8 @@ from pydantic import Field, model_validator
 
 from flockenv import steering
 from flockenv.jit.decorators import Vec, kernel
-from flockenv.noise import smooth, uniform
+from flockenv.maths.counter_rng import smooth, uniform
+from flockenv.maths.vectors import add, norm, scale, sub, unit
 from flockenv.scene import Group, Scene
 from flockenv.snapshot import Mark
 from flockenv.space import Plane
@@ -21,7 +22,6 @@ from flockenv.state import State
 from flockenv.tasks.base import Frame, Task
 from flockenv.tasks.layout import Layout, Slot
 from flockenv.tasks.sight import clip, place_of, velocity_of
-from flockenv.vec import add, norm, scale, sub, unit
 
 __all__ = ["Herd"]
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from flockenv.jit.decorators import kernel, like
-from flockenv.noise import uniform
+from flockenv.maths.counter_rng import uniform
 from flockenv.scene import Group, Scene
 from flockenv.snapshot import Mark
 from flockenv.space import Box

@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from flockenv.jit.decorators import Vec, kernel
-from flockenv.noise import uniform
+from flockenv.maths.counter_rng import uniform
+from flockenv.maths.vectors import dot, norm, sub
 from flockenv.scene import Group, Scene
 from flockenv.snapshot import Mark
 from flockenv.space import Box
@@ -19,7 +20,6 @@ from flockenv.state import State
 from flockenv.tasks.base import Frame, Task
 from flockenv.tasks.layout import Layout, Slot
 from flockenv.tasks.sight import clip
-from flockenv.vec import dot, norm, sub
 
 __all__ = ["PathFollow"]
 

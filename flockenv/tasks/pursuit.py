@@ -8,15 +8,16 @@ from typing import Any, ClassVar, Literal
 
 from pydantic import Field
 
-from flockenv import arbitration, steering
+from flockenv import steering
 from flockenv.jit.decorators import Vec, kernel
-from flockenv.noise import uniform
+from flockenv.maths.counter_rng import uniform
+from flockenv.maths.vectors import scale
 from flockenv.scene import Group, Scene
 from flockenv.space import Box
 from flockenv.spawn import direction
+from flockenv.steering import arbitration
 from flockenv.tasks.base import Frame, Task
 from flockenv.tasks.layout import Layout, Slot
-from flockenv.vec import scale
 
 __all__ = ["Pursuit"]
 

@@ -10,18 +10,19 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
-from flockenv import arbitration, steering, urges
+from flockenv import steering
 from flockenv.effects.base import in_view
 from flockenv.jit.decorators import Vec, kernel
-from flockenv.noise import smooth, uniform
+from flockenv.maths.counter_rng import smooth, uniform
+from flockenv.maths.vectors import add, dot, norm, scale, sub, unit
 from flockenv.scene import Group, Scene
 from flockenv.snapshot import Mark
 from flockenv.space import Box
 from flockenv.state import State
+from flockenv.steering import arbitration, motivation
 from flockenv.tasks.base import Frame, Task
 from flockenv.tasks.layout import Layout, Slot
 from flockenv.tasks.sight import clip, place_of, velocity_of
-from flockenv.vec import add, dot, norm, scale, sub, unit
 
 __all__ = ["School"]
 
@@ -150,16 +151,16 @@ def _fish(p: Any, frame: Frame, i: int) -> Vec:
     """What a scripted fish wants in its state: evade, forage, keep to the school, or wander."""
     velocity, top = velocity_of(frame, i), np.float64(frame.max_speed[i])
     fish, foes, intent = int(p.fish), int(p.fish + p.hunters), frame.memory[INTENT, i]
-    if intent == urges.ESCAPE:
+    if intent == motivation.ESCAPE:
         who, distance = _next_seen(p, frame, i, fish, foes, -1, -1.0)
         if who >= 0:
             ahead = min(distance / p.hunter_speed, 0.5)
             return scale(steering.evade(_to(frame, i, who), velocity, velocity_of(frame, who), top, ahead), _GAIN)
-    if intent == urges.EAT:
+    if intent == motivation.EAT:
         who, _ = _next_seen(p, frame, i, foes, frame.pos.shape[1], -1, -1.0)
         if who >= 0:
             return scale(steering.arrive(_to(frame, i, who), velocity, top, 1.0), _GAIN)
-    if intent == urges.SCHOOL:
+    if intent == motivation.SCHOOL:
         count = 0.0
         centre: Vec = (0.0, 0.0)
         course: Vec = (0.0, 0.0)
@@ -182,7 +183,7 @@ def _hunter(p: Any, frame: Frame, i: int) -> Vec:
         if frame.alive[j] and distance < best:
             best, who = distance, j
     velocity, top = velocity_of(frame, i), np.float64(frame.max_speed[i])
-    if frame.memory[INTENT, i] == urges.EAT and who >= 0:
+    if frame.memory[INTENT, i] == motivation.EAT and who >= 0:
         to, theirs = _to(frame, i, who), velocity_of(frame, who)
         ahead = min(steering.interception_time(to, theirs, top), 1.0)
         return scale(steering.pursue(to, velocity, theirs, top, ahead), _GAIN)
@@ -212,7 +213,7 @@ def keep(p: Any, before: Frame, after: Frame) -> None:
         if before.alive[i]:
             _intend(after, i)
     for j in range(foes, n):
-        grown = urges.regrown(np.float64(after.memory[FOOD, j]), p.growth, p.capacity, p.control_dt)
+        grown = motivation.regrown(np.float64(after.memory[FOOD, j]), p.growth, p.capacity, p.control_dt)
         after.memory[FOOD, j] = grown - after.memory[EATEN, j]
 
 
@@ -222,7 +223,7 @@ def _graze(p: Any, frame: Frame, i: int) -> None:
     hunger = np.float64(frame.memory[HUNGER, i])
     for j in range(int(p.fish + p.hunters), frame.pos.shape[1]):
         if norm(_to(frame, i, j)) < p.reach:
-            taken = urges.bite(np.float64(frame.memory[FOOD, j]), hunger, p.grazing, p.control_dt)
+            taken = motivation.bite(np.float64(frame.memory[FOOD, j]), hunger, p.grazing, p.control_dt)
             frame.memory[EATEN, i] += taken
             frame.memory[EATEN, j] += taken
 
@@ -230,7 +231,7 @@ def _graze(p: Any, frame: Frame, i: int) -> None:
 @kernel
 def _has(p: Any, frame: Frame, j: int, i: int) -> bool:
     """Has hunter j, which hunts, got fish i?"""
-    return bool(frame.memory[INTENT, j] == urges.EAT and norm(_to(frame, j, i)) <= p.capture_distance)
+    return bool(frame.memory[INTENT, j] == motivation.EAT and norm(_to(frame, j, i)) <= p.capture_distance)
 
 
 @kernel
@@ -239,10 +240,12 @@ def _face_hunters(p: Any, frame: Frame, i: int) -> None:
     felt = 0.0
     for j in range(int(p.fish), int(p.fish + p.hunters)):
         if _sees(p, frame, i, j):
-            felt += urges.fright(norm(_to(frame, i, j)), p.fear_distance)
+            felt += motivation.fright(norm(_to(frame, i, j)), p.fear_distance)
         if _has(p, frame, j, i):
             frame.memory[FATE, i] = CAUGHT
-    frame.memory[FEAR, i] = urges.calmed(np.float64(frame.memory[FEAR, i]), min(felt, 1.0), p.fear_memory, p.control_dt)
+    frame.memory[FEAR, i] = motivation.calmed(
+        np.float64(frame.memory[FEAR, i]), min(felt, 1.0), p.fear_memory, p.control_dt
+    )
 
 
 @kernel
@@ -250,7 +253,7 @@ def _intend(frame: Frame, i: int) -> None:
     """What fish or hunter i is up to now."""
     now, hunger = np.float64(frame.memory[INTENT, i]), np.float64(frame.memory[HUNGER, i])
     fear = np.float64(frame.memory[FEAR, i])
-    frame.memory[INTENT, i] = urges.intention(now, hunger, 0.0, fear, _ESCAPE, _SCHOOL, _NEED, _CALM, _CONTENT)
+    frame.memory[INTENT, i] = motivation.intention(now, hunger, 0.0, fear, _ESCAPE, _SCHOOL, _NEED, _CALM, _CONTENT)
 
 
 @kernel
@@ -264,7 +267,7 @@ def _digest(p: Any, frame: Frame, i: int) -> None:
     if hunts:
         for j in range(int(p.fish)):
             less += p.meal if frame.memory[FATE, j] == CAUGHT and _has(p, frame, i, j) else 0.0
-    later = urges.hungrier(hunger, rate, p.effort, pace, p.control_dt)
+    later = motivation.hungrier(hunger, rate, p.effort, pace, p.control_dt)
     frame.memory[HUNGER, i] = max(later - less, 0.0)
     if not hunts and later - less >= 1.0 and frame.memory[FATE, i] == 0.0:
         frame.memory[FATE, i] = STARVED
@@ -379,8 +382,8 @@ class School(Task):
     Hunger grows with time and effort; who swims at a patch eats of it, and it grows again, the faster the less is
     missing. A fish sees 300 degrees. A hunter that is hungry pursues the nearest fish, faster than that, but it turns
     more slowly; fed, it leaves them alone for a while. To be caught or starved ends it for that fish; the others go on.
-    What goes on inside follows Tu and Terzopoulos (1994; see flockenv.urges), and the scripted fish are their state
-    machine: flee, keep to the school, forage, wander.
+    What goes on inside follows Tu and Terzopoulos (1994; see flockenv.steering.motivation), and the scripted fish are
+    their state machine: flee, keep to the school, forage, wander.
     """
 
     name: ClassVar[str] = "school"

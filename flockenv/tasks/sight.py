@@ -7,11 +7,11 @@ from typing import Any
 
 import numpy as np
 
-from flockenv.elementary import nearest_whole
 from flockenv.jit.decorators import Vec, kernel, like
+from flockenv.maths.approximations import nearest_whole
+from flockenv.maths.vectors import dot
 from flockenv.shapes import ray_hit
 from flockenv.tasks.layout import Slot
-from flockenv.vec import dot
 
 __all__ = [
     "block_ways", "clip", "compass", "leaves_gap", "neighbour_slots", "offset", "place_of", "put", "put_crowding",

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from flockenv import steering
 from flockenv.players.rules.keep_clear import keep_clear
-from flockenv.rows import rows
+from flockenv.steering.vectorize import rows
 from flockenv.tasks import Corridor
 
 __all__ = ["CorridorOrcaRules", "CorridorRules", "corridor", "orca_corridor"]

@@ -8,9 +8,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from flockenv import arbitration, steering
+from flockenv import steering
 from flockenv.players.rules.keep_clear import keep_clear
-from flockenv.rows import rows
+from flockenv.steering import arbitration
+from flockenv.steering.vectorize import rows
 from flockenv.tasks import Crossing
 
 __all__ = ["CrossingRules", "OrcaRules", "crossing", "orca_crossing"]

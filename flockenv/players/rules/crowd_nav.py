@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from flockenv import steering
 from flockenv.players.rules.keep_clear import keep_clear
-from flockenv.rows import rows
+from flockenv.steering.vectorize import rows
 from flockenv.tasks import CrowdNav
 
 __all__ = ["CrowdNavRules", "HeuristicsRules", "RobotOrcaRules", "crowd_nav", "heuristics_crowd_nav", "orca_crowd_nav"]

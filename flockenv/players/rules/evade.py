@@ -8,8 +8,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from flockenv import arbitration, shapes, steering
-from flockenv.rows import rows
+from flockenv import shapes, steering
+from flockenv.steering import arbitration
+from flockenv.steering.vectorize import rows
 from flockenv.tasks import Evade
 
 __all__ = ["EvadeRules", "evade"]

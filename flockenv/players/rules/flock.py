@@ -8,8 +8,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from flockenv import arbitration, steering
-from flockenv.rows import rows
+from flockenv import steering
+from flockenv.steering import arbitration
+from flockenv.steering.vectorize import rows
 from flockenv.tasks import Flock
 
 __all__ = ["FlockRules", "flock"]

@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from flockenv.orca import orca
-from flockenv.rows import rows
+from flockenv.steering.orca import orca
+from flockenv.steering.vectorize import rows
 
 __all__ = ["keep_clear"]
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flockenv import steering
-from flockenv.rows import rows
+from flockenv.steering.vectorize import rows
 from flockenv.tasks import Pursuit
 
 __all__ = ["PursuitRules", "pursuit"]

@@ -8,9 +8,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from flockenv import arbitration, steering, urges
+from flockenv import steering
 from flockenv.grants import reconcile
-from flockenv.rows import rows
+from flockenv.steering import arbitration, motivation
+from flockenv.steering.vectorize import rows
 from flockenv.tasks import School
 
 __all__ = ["SchoolRules", "school"]
@@ -19,7 +20,7 @@ align = rows(steering.align)
 arrive = rows(steering.arrive)
 contain = rows(steering.contain)
 evade_from = rows(steering.evade)
-intention = rows(urges.intention)
+intention = rows(motivation.intention)
 separate = rows(steering.separate)
 wander = rows(steering.wander)
 
@@ -61,10 +62,10 @@ def school(
     hunted = see.hunter_present[:, 0] > 0
     # no hunter or no food is in sight: go on, and look around
     some = np.linalg.norm(see.food_bearing, axis=-1) > 0
-    now_heard = np.where((now == urges.ESCAPE) & ~hunted, urges.WANDER, now)
-    now_heard = np.where((now == urges.EAT) & ~some.any(axis=1), urges.WANDER, now_heard)
+    now_heard = np.where((now == motivation.ESCAPE) & ~hunted, motivation.WANDER, now)
+    now_heard = np.where((now == motivation.EAT) & ~some.any(axis=1), motivation.WANDER, now_heard)
     here = see.mate_present
-    now_heard = np.where((now == urges.SCHOOL) & (here.sum(axis=1) == 0), urges.WANDER, now_heard)
+    now_heard = np.where((now == motivation.SCHOOL) & (here.sum(axis=1) == 0), motivation.WANDER, now_heard)
 
     inside = 5.0 * contain(see.to_low - 0.5, see.to_high - 0.5, see.velocity, top, p.wall)
     near = here * (np.linalg.norm(see.mates, axis=-1) < 0.6)

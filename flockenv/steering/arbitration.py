@@ -21,9 +21,9 @@ from pydantic import Field
 
 from flockenv.core.record import Record
 from flockenv.jit.decorators import OPTIONS, Law, Vec, law, like, replaced
-from flockenv.noise import uniform
-from flockenv.urges import INTENTIONS
-from flockenv.vec import add, axis, cross, dot, limit, norm, perpendicular, scale, select, unit, zero
+from flockenv.maths.counter_rng import uniform
+from flockenv.maths.vectors import add, axis, cross, dot, limit, norm, perpendicular, scale, select, unit, zero
+from flockenv.steering.motivation import INTENTIONS
 
 __all__ = [
     "ARBITRATIONS", "Allocation", "AnyArbitration", "Arbitration", "Blend", "ContextSteering", "Dithering",

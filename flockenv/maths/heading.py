@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from flockenv.jit.decorators import Vec, kernel, law, like
-from flockenv.vec import add, axis, cross, dot, lateral, norm, perpendicular, scale, select, unit
+from flockenv.maths.vectors import add, axis, cross, dot, lateral, norm, perpendicular, scale, select, unit
 
 __all__ = ["GRAVITY", "SLOWEST", "face", "faced", "held", "leant", "raised", "turned"]
 

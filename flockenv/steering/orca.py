@@ -16,7 +16,7 @@ import numpy as np
 
 from flockenv.jit.decorators import Numbers, Vec, law, like
 from flockenv.jit.intrinsics import stacked
-from flockenv.vec import add, axis, dot, limit, norm, scale, select, sub, unit
+from flockenv.maths.vectors import add, axis, dot, limit, norm, scale, select, sub, unit
 
 __all__ = ["SLOT", "clear", "half_plane", "orca"]
 
