@@ -17,8 +17,8 @@ from benchmarks.measure import Bench, Contestant, Out, Quick, Rounds, command_li
 from benchmarks.scenes import stepping
 from flockenv.constraints import Collisions
 from flockenv.effects import Gravity
+from flockenv.geometry.space import Box, Torus
 from flockenv.scene import Group, Scene
-from flockenv.space import Box, Torus
 from flockenv.spawn import Spawn
 from flockenv.state import State
 

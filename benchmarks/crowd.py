@@ -21,10 +21,10 @@ from benchmarks.measure import Bench, Contestant, Out, Quick, Rounds, command_li
 from benchmarks.peers import CACHE, DONE, SAMPLE, PeerError, python_of, running
 from benchmarks.scenes import stepping
 from flockenv.effects import Course
+from flockenv.geometry.space import Torus
 from flockenv.jit.thread_pool import use_threads
 from flockenv.presets import PRESETS, preset
 from flockenv.scene import Group, Scene
-from flockenv.space import Torus
 from flockenv.spawn import Spawn
 
 __all__ = ["crowd"]

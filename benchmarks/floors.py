@@ -23,9 +23,9 @@ from typing import Any
 import numpy as np
 
 from benchmarks.measure import Bench, Floor, number
+from flockenv.geometry.space import Torus
 from flockenv.jit.thread_pool import share
 from flockenv.scene import Scene
-from flockenv.space import Torus
 from flockenv.state import State
 from flockenv.tasks import Task
 

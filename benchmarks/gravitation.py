@@ -1,8 +1,8 @@
 """Everybody meets everybody, or groups that are far away: `python -m benchmarks.gravitation`.
 
 The exact sum over all pairs against the tree, at an opening of 0.5, over the number of agents, in flat space and in
-three dimensions. Both run in turns. From the crossover follows flockenv.tree.MOST_DIRECT, up to which a scene sums
-exactly; here the tree is grown for fewer too.
+three dimensions. Both run in turns. From the crossover follows flockenv.geometry.barnes_hut.MOST_DIRECT, up to which a
+scene sums exactly; here the tree is grown for fewer too.
 """
 
 from __future__ import annotations
@@ -16,9 +16,9 @@ from benchmarks.floors import Machine, machine, of_scene
 from benchmarks.measure import Bench, Contestant, Out, Quick, Rounds, command_line, number
 from benchmarks.scenes import stepping
 from flockenv.effects import Gravitation
+from flockenv.geometry.barnes_hut import MOST_DIRECT
 from flockenv.scene import Group, Scene
 from flockenv.spawn import Spawn
-from flockenv.tree import MOST_DIRECT
 
 __all__ = ["AGENTS", "cloud"]
 

@@ -15,8 +15,8 @@ import typer
 from benchmarks.measure import Bench, Contestant, Out, Quick, Rounds, command_line
 from benchmarks.scenes import stepping
 from flockenv.behaviours import AvoidObstacles
+from flockenv.geometry.shapes import Block, Capsule, Circle, Shape
 from flockenv.scene import Group, Scene
-from flockenv.shapes import Block, Capsule, Circle, Shape
 from flockenv.spawn import Spawn
 
 __all__ = ["among"]

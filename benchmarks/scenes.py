@@ -7,8 +7,8 @@ from collections.abc import Callable
 
 from flockenv.behaviours import Alignment, Cohesion, Separation
 from flockenv.effects import Effect
+from flockenv.geometry.space import Torus
 from flockenv.scene import Group, Scene
-from flockenv.space import Torus
 from flockenv.spawn import Spawn
 from flockenv.state import State
 

@@ -16,11 +16,11 @@ import numpy as np
 from flockenv.appearance import Appearance
 from flockenv.behaviours import Driving, LineUp, Separation
 from flockenv.effects import Door, Routes, Way
-from flockenv.eikonal import ground
+from flockenv.geometry.eikonal import ground
+from flockenv.geometry.shapes import Wall
+from flockenv.geometry.space import Box
 from flockenv.render import draw, write_png
 from flockenv.scene import Group, Scene
-from flockenv.shapes import Wall
-from flockenv.space import Box
 from flockenv.spawn import Spawn
 from flockenv.steer import Steer
 

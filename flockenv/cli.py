@@ -166,9 +166,9 @@ def listing() -> None:
 
     from flockenv.behaviours import BEHAVIOURS
     from flockenv.effects import EFFECTS
+    from flockenv.geometry.space import AnySpace
     from flockenv.integrators import INTEGRATORS
     from flockenv.population import POPULATION
-    from flockenv.space import AnySpace
     from flockenv.steering.arbitration import ARBITRATIONS
     from flockenv.tasks import TASKS
 

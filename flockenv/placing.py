@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from flockenv.geometry.shapes import clear_of
 from flockenv.jit.section import entry
 from flockenv.population import Emitter
-from flockenv.shapes import clear_of
 from flockenv.spawn import Spawn, cells, scatter
 from flockenv.state import Floats, State
 

@@ -28,22 +28,23 @@ from flockenv.core.record import Record, keep
 from flockenv.divergence import SimulationDiverged
 from flockenv.effects import EFFECTS, Effect
 from flockenv.effects.base import all_masses
+from flockenv.geometry.barnes_hut import MOST_DIRECT
+from flockenv.geometry.cell_list import FEWEST_AGENTS
+from flockenv.geometry.shapes import AnyShape, Circle, HalfSpace, Shape
+from flockenv.geometry.space import AnySpace, Box, Plane, Torus
 from flockenv.group import Group
 from flockenv.implicit import coupling_of, solve_steps
 from flockenv.integrators import INTEGRATORS, Adaptive, ImplicitEuler, Integrator, SemiImplicitEuler
 from flockenv.integrators.newton import Coupling
 from flockenv.jit.thread_pool import LARGEST, Choices, at_work, share
 from flockenv.maths.counter_rng import MASK, key_of
-from flockenv.neighbours import FEWEST_AGENTS
 from flockenv.networks import EDGE
 from flockenv.placing import cells_of, place_groups
 from flockenv.population import POPULATION, Emitter, Member, beget
 from flockenv.population import settler as population_settler
 from flockenv.population.settle import NUMBERS as POPULATION_NUMBERS
 from flockenv.rounding import check_places
-from flockenv.shapes import AnyShape, Circle, HalfSpace, Shape
 from flockenv.snapshot import Mark, Snapshot
-from flockenv.space import AnySpace, Box, Plane, Torus
 from flockenv.stability import check_contact, check_dt, check_lookahead
 from flockenv.state import Body, Floats, State
 from flockenv.steer import EVERY_EFFECT
@@ -59,7 +60,6 @@ from flockenv.sweep import (
     step_of,
     worlds_of,
 )
-from flockenv.tree import MOST_DIRECT
 from flockenv.workspace import Workspace
 
 __all__ = ["Group", "Scene"]

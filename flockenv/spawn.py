@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from flockenv.core.record import Record
+from flockenv.geometry.shapes import Shape, clear_of
 from flockenv.jit.decorators import kernel
 from flockenv.maths.counter_rng import uniform
-from flockenv.shapes import Shape, clear_of
 
 __all__ = ["Spawn", "cells", "direction", "scatter"]
 

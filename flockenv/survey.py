@@ -11,10 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flockenv import measures as m
+from flockenv.geometry.space import Plane
 from flockenv.measures.polygons import checked, contains, rectangle
 from flockenv.population import Emitter
 from flockenv.scene import Scene
-from flockenv.space import Plane
 from flockenv.trajectory import Trajectory
 
 __all__ = ["UNITS", "Asked", "Survey", "combined", "survey"]

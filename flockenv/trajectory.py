@@ -18,10 +18,10 @@ from numpy.typing import NDArray
 
 from flockenv.config import dump_scene
 from flockenv.core.atomic_files import deliver
+from flockenv.geometry.space import Plane
 from flockenv.measures import measure
 from flockenv.scene import Scene
 from flockenv.snapshot import Snapshot
-from flockenv.space import Plane
 from flockenv.state import WORK, Floats, State
 
 __all__ = ["MEMORY_LIMIT", "Trajectory", "record", "whole_steps"]

@@ -12,12 +12,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from flockenv.eikonal import NO_WAY, Start, free_part, way_table
+from flockenv.geometry.eikonal import NO_WAY, Start, free_part, way_table
+from flockenv.geometry.space import Torus
+from flockenv.geometry.targets import Target, to_any
 from flockenv.jit.decorators import Vec, law
 from flockenv.maths.grid import MOST_POINTS, covers, sample, sample_vector, sampled
 from flockenv.maths.vectors import norm, select, unit
-from flockenv.space import Torus
-from flockenv.targets import Target, to_any
 
 __all__ = [
     "NoWayWarning", "check_ways", "lengths_on", "region", "starts_of", "towards", "warn_cut_off", "way_ahead",

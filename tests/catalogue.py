@@ -108,6 +108,9 @@ from flockenv.effects import (
     Way,
     Wind,
 )
+from flockenv.geometry.shapes import Circle
+from flockenv.geometry.space import Box, Plane, Space, Torus
+from flockenv.geometry.targets import Target
 from flockenv.integrators import (
     RK4,
     AdaptiveRK4,
@@ -125,8 +128,6 @@ from flockenv.integrators import (
 )
 from flockenv.networks import Mesh
 from flockenv.scene import Group, Scene
-from flockenv.shapes import Circle
-from flockenv.space import Box, Plane, Space, Torus
 from flockenv.spawn import Spawn
 from flockenv.steer import Steer
 from flockenv.steering import arbitration
@@ -140,7 +141,6 @@ from flockenv.steering.arbitration import (
     RoundRobin,
     RunningSum,
 )
-from flockenv.targets import Target
 from flockenv.tasks import (
     Bottleneck,
     Corridor,

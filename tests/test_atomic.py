@@ -22,12 +22,12 @@ from agents import checkpoint, publish
 from flockenv import gallery, validating
 from flockenv.core.atomic_files import LEFTOVERS, deliver, remove_leftovers, replacing
 from flockenv.findings import Results
+from flockenv.geometry.space import Torus
 from flockenv.group import Group
 from flockenv.jit.checked_store import Store
 from flockenv.jit.private_folder import prepared
 from flockenv.policy import save_policy
 from flockenv.scene import Scene
-from flockenv.space import Torus
 from flockenv.trajectory import record
 
 ROOT = Path(__file__).resolve().parent.parent

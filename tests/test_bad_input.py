@@ -25,12 +25,12 @@ from flockenv.behaviours import Alignment, Queue, Separation
 from flockenv.cli import main
 from flockenv.config import load_scene
 from flockenv.effects import Drag, Springs
+from flockenv.geometry.shapes import HalfSpace, Polygon
+from flockenv.geometry.space import Box, Torus
 from flockenv.integrators import VelocityVerlet
 from flockenv.measures import measure
 from flockenv.networks import Mesh
 from flockenv.scene import Group, Scene
-from flockenv.shapes import HalfSpace, Polygon
-from flockenv.space import Box, Torus
 from flockenv.spawn import Spawn
 from flockenv.tasks import Pursuit
 from flockenv.world import World

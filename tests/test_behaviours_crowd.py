@@ -19,8 +19,8 @@ from flockenv.behaviours import (
     StayOnPath,
     UnalignedAvoidance,
 )
+from flockenv.geometry.space import Torus
 from flockenv.scene import Group, Scene
-from flockenv.space import Torus
 from flockenv.spawn import Spawn
 from flockenv.state import State
 from flockenv.steer import Steer

@@ -10,12 +10,12 @@ import pytest
 from scipy.linalg import expm
 from scipy.optimize import brentq
 
-from flockenv import polyline
 from flockenv.behaviours import FollowFlow, FollowPath, StayOnPath
 from flockenv.behaviours.crowd import UnalignedAvoidance
 from flockenv.config import load_scene
+from flockenv.geometry import polyline
+from flockenv.geometry.space import Plane, Space, Torus
 from flockenv.scene import Group, Scene
-from flockenv.space import Plane, Space, Torus
 from flockenv.spawn import Spawn
 from flockenv.state import State
 from flockenv.steer import Steer

@@ -21,13 +21,13 @@ from flockenv.behaviours import (
     Whiskers,
 )
 from flockenv.constraints import Collisions
-from flockenv.eikonal import way_table
+from flockenv.geometry.eikonal import way_table
+from flockenv.geometry.shapes import Block, Capsule, Circle, HalfSpace, Polygon, Shape, Wall
+from flockenv.geometry.targets import Target
 from flockenv.maths.grid import sampled
 from flockenv.scene import Group, Scene
-from flockenv.shapes import Block, Capsule, Circle, HalfSpace, Polygon, Shape, Wall
 from flockenv.spawn import Spawn
 from flockenv.steer import Steer
-from flockenv.targets import Target
 
 UNDER = (
     AvoidObstacles(weight=8, horizon=2, margin=0.1),

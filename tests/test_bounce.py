@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from flockenv.effects import Gravity
+from flockenv.geometry.space import Box
 from flockenv.integrators import RK4, Integrator, SemiImplicitEuler
 from flockenv.jit.thread_pool import use_threads
 from flockenv.scene import Group, Scene
-from flockenv.space import Box
 from flockenv.spawn import Spawn
 from flockenv.state import State
 from flockenv.sweep import step_of

@@ -10,8 +10,8 @@ import pytest
 
 from flockenv import steering
 from flockenv.effects import EFFECTS
+from flockenv.geometry.space import Space
 from flockenv.integrators import INTEGRATORS
-from flockenv.space import Space
 from flockenv.steer import Steer
 from flockenv.steering import arbitration
 from flockenv.tasks import TASKS

@@ -19,12 +19,12 @@ from flockenv.constraints.broad import nearby
 from flockenv.constraints.collisions import UnsolvedContactsWarning
 from flockenv.effects import Gravity
 from flockenv.explanation import explain
+from flockenv.geometry.shapes import Block, Circle, HalfSpace, Polygon, Wall
+from flockenv.geometry.space import Box, Plane, Space, Torus
 from flockenv.integrators import RK4, Integrator, SemiImplicitEuler, VelocityVerlet
 from flockenv.jit.section import entry
 from flockenv.jit.thread_pool import use_threads
 from flockenv.scene import Group, Scene
-from flockenv.shapes import Block, Circle, HalfSpace, Polygon, Wall
-from flockenv.space import Box, Plane, Space, Torus
 from flockenv.spawn import Spawn
 from flockenv.state import Floats, State
 

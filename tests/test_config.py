@@ -18,10 +18,10 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from flockenv.config import MAX_BYTES, ConfigError, dump, dump_scene, load, load_scene, schema
 from flockenv.effects import EFFECTS, Drag
+from flockenv.geometry.space import Box, Torus
 from flockenv.integrators import INTEGRATORS, RK4
 from flockenv.presets import preset
 from flockenv.scene import Group, Scene
-from flockenv.space import Box, Torus
 from flockenv.spawn import Spawn
 
 ROOT = Path(__file__).resolve().parent.parent

@@ -13,6 +13,7 @@ from scipy.optimize import brentq
 
 from flockenv.effects import Contact, ObstacleContact
 from flockenv.effects.contact import restitution
+from flockenv.geometry.shapes import Block
 from flockenv.integrators import (
     RK4,
     AdaptiveRK4,
@@ -23,7 +24,6 @@ from flockenv.integrators import (
     SemiImplicitEuler,
 )
 from flockenv.scene import Group, Scene
-from flockenv.shapes import Block
 from flockenv.spawn import Spawn
 from flockenv.stability import CoarseContactWarning, check_contact, contact_limit
 from flockenv.state import State

@@ -18,16 +18,16 @@ import flockenv
 from flockenv import effects as effects_module
 from flockenv.behaviours import Separation
 from flockenv.effects import Door, Drag, Stage
+from flockenv.geometry.shapes import Circle
+from flockenv.geometry.space import Plane
+from flockenv.geometry.targets import Target
 from flockenv.integrators import RK4
 from flockenv.jit.cache_folder import cache_folder
 from flockenv.networks import Mesh
 from flockenv.scene import Group, Scene
-from flockenv.shapes import Circle
-from flockenv.space import Plane
 from flockenv.spawn import Spawn
 from flockenv.state import State
 from flockenv.steering.arbitration import ARBITRATIONS
-from flockenv.targets import Target
 from tests.catalogue import (
     AMONG_ALL,
     EDGE,

@@ -8,7 +8,7 @@ import skfmm
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from flockenv.eikonal import distances_around
+from flockenv.geometry.eikonal import distances_around
 
 Array = NDArray[np.float64]
 

@@ -24,9 +24,9 @@ from flockenv.effects import (
     Vortex,
     Wind,
 )
+from flockenv.geometry.space import Torus
 from flockenv.integrators import RK4, SemiImplicitEuler
 from flockenv.scene import Group, Scene
-from flockenv.space import Torus
 from flockenv.spawn import Spawn
 from tests.catalogue import Array
 

@@ -12,9 +12,9 @@ import pytest
 from flockenv.behaviours import Alignment, Arrive, Cohesion, MatchVelocity, Pursue, Seek
 from flockenv.config import load_scene
 from flockenv.effects import EFFECTS, Effect
+from flockenv.geometry.space import Torus
 from flockenv.integrators import VelocityVerlet
 from flockenv.scene import Group, Scene
-from flockenv.space import Torus
 from flockenv.spawn import Spawn
 from flockenv.stability import UnstableStepWarning, suggest_dt
 from flockenv.state import State

@@ -13,15 +13,15 @@ from scipy.spatial import cKDTree
 from flockenv.behaviours import Separation
 from flockenv.effects import Effect, Gravitation, InverseSquare
 from flockenv.explanation import explain
+from flockenv.geometry.barnes_hut import MOST_DIRECT
+from flockenv.geometry.cell_list import WORTH_ARRANGING
+from flockenv.geometry.space import Torus
 from flockenv.integrators import RK4
 from flockenv.jit.thread_pool import threads, use_threads
-from flockenv.neighbours import WORTH_ARRANGING
 from flockenv.networks import Rope
 from flockenv.scene import Group, Scene
-from flockenv.space import Torus
 from flockenv.spawn import Spawn
 from flockenv.state import State
-from flockenv.tree import MOST_DIRECT
 from tests.catalogue import Array, scene_of, users_module
 
 pytestmark = pytest.mark.slow

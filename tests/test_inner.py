@@ -10,12 +10,12 @@ from scipy.spatial import cKDTree
 
 from flockenv.behaviours import Driving
 from flockenv.effects import Antipode, Course, Effect, Goal, Sight
+from flockenv.geometry.space import Torus
 from flockenv.jit.decorators import Law, law
 from flockenv.jit.thread_pool import use_threads
 from flockenv.population import Emitter
 from flockenv.population.places import Point
 from flockenv.scene import Group, Scene
-from flockenv.space import Torus
 from flockenv.spawn import Spawn
 from flockenv.spread import Spread
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from flockenv.geometry.shapes import Circle
+from flockenv.geometry.space import Box, Torus
 from flockenv.integrators import INTEGRATORS
 from flockenv.scene import Group, Scene
-from flockenv.shapes import Circle
-from flockenv.space import Box, Torus
 from flockenv.spawn import Spawn
 from flockenv.tasks import Pursuit
 from flockenv.world import World

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from flockenv.behaviours import Alignment, Cohesion, Separation
+from flockenv.geometry.space import Plane, Torus
 from flockenv.integrators import SemiImplicitEuler
 from flockenv.scene import Group, Scene
-from flockenv.space import Plane, Torus
 from flockenv.spawn import Spawn
 from flockenv.sweep import Parts
 

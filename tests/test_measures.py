@@ -9,10 +9,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from flockenv.geometry.shapes import Circle
+from flockenv.geometry.space import Box, Plane, Space, Torus
 from flockenv.measures import MEASURES, measure, nearest_distances, order, polarisation
 from flockenv.scene import Group, Scene
-from flockenv.shapes import Circle
-from flockenv.space import Box, Plane, Space, Torus
 from flockenv.spawn import Spawn
 from flockenv.trajectory import whole_steps
 

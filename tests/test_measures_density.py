@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from flockenv.geometry.shapes.outlines import area
 from flockenv.measures import (
     JUELICH,
     classical_density,
@@ -26,7 +27,6 @@ from flockenv.measures import (
     weidmann_speed,
 )
 from flockenv.measures.polygons import contains, rectangle
-from flockenv.shapes.outlines import area
 
 SQUARE = rectangle((0, 0), (10, 10))
 NOTCHED = np.array([(0, 0), (10, 0), (10, 10), (6, 10), (6, 4), (4, 4), (4, 10), (0, 10)], float)  # 100 - 12 m^2

@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from flockenv.geometry.space import Box, Plane, Torus
 from flockenv.measures import (
     above_null,
     band_index,
@@ -25,7 +26,6 @@ from flockenv.measures import (
     overlap_proportion,
     polarisation,
 )
-from flockenv.space import Box, Plane, Torus
 
 # --- lanes ------------------------------------------------------------------------------------------------------------
 

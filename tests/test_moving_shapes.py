@@ -9,13 +9,25 @@ import pytest
 
 from flockenv.behaviours import Separation
 from flockenv.effects import ObstacleContact
+from flockenv.geometry.shapes import (
+    FORMS,
+    Block,
+    Capsule,
+    Circle,
+    DistanceField,
+    HalfSpace,
+    Polygon,
+    Shape,
+    Sway,
+    Wall,
+    packed,
+)
+from flockenv.geometry.shapes.dispatch import hit_shape, nearest_shape
+from flockenv.geometry.shapes.row_header import body_of, bound_of, shift_of, velocity_of
+from flockenv.geometry.space import Torus
 from flockenv.jit.section import entry
 from flockenv.measures import measure
 from flockenv.scene import Group, Scene
-from flockenv.shapes import FORMS, Block, Capsule, Circle, DistanceField, HalfSpace, Polygon, Shape, Sway, Wall, packed
-from flockenv.shapes.every import hit_shape, nearest_shape
-from flockenv.shapes.head import body_of, bound_of, shift_of, velocity_of
-from flockenv.space import Torus
 from flockenv.spawn import Spawn
 from flockenv.trajectory import Trajectory
 

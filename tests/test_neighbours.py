@@ -10,13 +10,13 @@ import pytest
 from scipy.spatial import cKDTree
 
 from flockenv.behaviours import Alignment, Cohesion, Separation
+from flockenv.geometry.cell_list import count_cells, order_records
+from flockenv.geometry.space import Box, Space, Torus
+from flockenv.geometry.spatial_sort import TILE, count_tiles
 from flockenv.jit.section import entry
-from flockenv.neighbours import count_cells, order_records
 from flockenv.scene import Group, Scene
-from flockenv.space import Box, Space, Torus
 from flockenv.spawn import Spawn
 from flockenv.state import State
-from flockenv.tiles import TILE, count_tiles
 from tests.catalogue import NEAREST, NEAREST_MANY, VARIANTS, Array, Variant, everything, scene_of
 
 DT = 2.0**-10

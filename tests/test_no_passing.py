@@ -14,10 +14,10 @@ from flockenv.constraints import Collisions
 from flockenv.constraints.collisions import UnsolvedContactsWarning
 from flockenv.constraints.ends import RAISED
 from flockenv.effects import Gravity
+from flockenv.geometry.shapes import Block, Capsule, HalfSpace, Wall
+from flockenv.geometry.space import Box, Plane, Space
 from flockenv.integrators import VelocityVerlet
 from flockenv.scene import Group, Scene
-from flockenv.shapes import Block, Capsule, HalfSpace, Wall
-from flockenv.space import Box, Plane, Space
 from flockenv.spawn import Spawn
 from flockenv.state import Floats, State
 

@@ -9,9 +9,9 @@ import pytest
 
 from flockenv.behaviours import AvoidObstacles, FollowWall, ForceField, ObstacleRepulsion, Separation, Whiskers
 from flockenv.effects.base import Effect
+from flockenv.geometry.shapes import Block, Capsule, Shape, Sway
+from flockenv.geometry.space import Box, Plane, Torus
 from flockenv.scene import Group, Scene
-from flockenv.shapes import Block, Capsule, Shape, Sway
-from flockenv.space import Box, Plane, Torus
 from flockenv.spawn import Spawn
 from flockenv.sweep import met_obstacles
 

@@ -13,12 +13,12 @@ from numba import njit
 from flockenv.behaviours import Alignment, Cohesion, Separation
 from flockenv.divergence import SimulationDiverged
 from flockenv.effects.base import Effect, Me, Other, ties
+from flockenv.geometry.cell_list import WORTH_ARRANGING
+from flockenv.geometry.space import Plane, Torus
 from flockenv.group import Group
 from flockenv.integrators import RK4
 from flockenv.jit.thread_pool import threads, use_threads
-from flockenv.neighbours import WORTH_ARRANGING
 from flockenv.scene import Scene
-from flockenv.space import Plane, Torus
 from flockenv.spawn import Spawn
 from flockenv.state import State
 from flockenv.steering.others import ONE_PLACE

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from flockenv import polyline
 from flockenv.evaluation import rollout
+from flockenv.geometry import polyline
 from flockenv.players.rules import RulesPlayer
 from flockenv.players.rules.path_follow import PathFollowRules
 from flockenv.render.picture import draw
@@ -119,7 +119,7 @@ def test_points_ahead_are_those_of_the_track_and_bend_as_it_does() -> None:
 
 
 def test_what_it_gains_is_how_far_it_came_along_the_track() -> None:
-    """A whole episode against the lengths that flockenv.polyline finds; a lap, and no less, is a success."""
+    """A whole episode against the lengths that flockenv.geometry.polyline finds; a lap, and no less, is a success."""
     world = world_of()
     track = polyline.pieces(corners(world).tolist(), closed=True)
     length, player = track[1], RulesPlayer(TASK, CAREFUL)

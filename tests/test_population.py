@@ -16,6 +16,8 @@ from flockenv.behaviours import Separation
 from flockenv.config import dump_scene, load_scene
 from flockenv.divergence import SimulationDiverged
 from flockenv.effects import Gravity
+from flockenv.geometry.shapes import Block, Capsule, Circle, HalfSpace, Polygon, Shape, Wall
+from flockenv.geometry.space import Box, Plane, Space, Torus
 from flockenv.integrators import ImplicitEuler, SemiImplicitEuler
 from flockenv.jit.thread_pool import use_threads
 from flockenv.population import (
@@ -38,8 +40,6 @@ from flockenv.render import draw, write_replay
 from flockenv.render.replay import Group as ReplayGroup
 from flockenv.render.replay import Panel
 from flockenv.scene import Group, Scene
-from flockenv.shapes import Block, Capsule, Circle, HalfSpace, Polygon, Shape, Wall
-from flockenv.space import Box, Plane, Space, Torus
 from flockenv.spawn import Spawn
 from flockenv.state import State
 from flockenv.sweep import step_of

@@ -9,8 +9,8 @@ import pytest
 
 from flockenv.behaviours import Separation
 from flockenv.effects import Drag
+from flockenv.geometry.space import Box
 from flockenv.scene import Group, Scene
-from flockenv.space import Box
 from flockenv.spawn import Spawn
 from flockenv.tasks import Pursuit
 

@@ -15,11 +15,11 @@ from scipy.special import ellipk
 from flockenv.config import dump_scene, load_scene
 from flockenv.constraints import Rods, UnmetWarning
 from flockenv.effects import Drag, Gravity
+from flockenv.geometry.space import Torus
 from flockenv.integrators import RK4, ExplicitEuler, ImplicitMidpoint, Integrator, SemiImplicitEuler, VelocityVerlet
 from flockenv.networks import Cloth, Rope
 from flockenv.population import Decay, Emitter, Point
 from flockenv.scene import Group, Scene
-from flockenv.space import Torus
 from flockenv.spawn import Spawn
 from flockenv.state import State
 from tests.catalogue import Array

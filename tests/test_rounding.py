@@ -9,10 +9,10 @@ import pytest
 
 from flockenv.behaviours import Alignment, Cohesion, Separation
 from flockenv.effects import Attraction, Drag, Springs, Tether
+from flockenv.geometry.space import Box, Torus
 from flockenv.networks import Mesh, Rope
 from flockenv.rounding import FARTHEST
 from flockenv.scene import Group, Scene
-from flockenv.space import Box, Torus
 from flockenv.spawn import Spawn
 from flockenv.state import State
 

@@ -17,12 +17,12 @@ import pytest
 import flockenv
 from flockenv.behaviours import Alignment, Cohesion, Separation
 from flockenv.effects import EFFECTS, Drag, Gravity, QuadraticDrag
+from flockenv.geometry.cell_list import FEWEST_AGENTS
+from flockenv.geometry.shapes import Block, Circle
+from flockenv.geometry.space import Box, Plane, Space, Torus
 from flockenv.integrators import RK4, AdaptiveRK4, SemiImplicitEuler
 from flockenv.jit.cache_folder import cache_folder
-from flockenv.neighbours import FEWEST_AGENTS
 from flockenv.scene import Group, Scene
-from flockenv.shapes import Block, Circle
-from flockenv.space import Box, Plane, Space, Torus
 from flockenv.spawn import Spawn
 from flockenv.state import State
 from flockenv.sweep import scratch_of

@@ -13,8 +13,8 @@ from scipy.spatial import cKDTree
 
 from flockenv.config import load_scene
 from flockenv.constraints.collisions import UnsolvedContactsWarning
+from flockenv.geometry.space import Box
 from flockenv.scene import Scene
-from flockenv.space import Box
 from flockenv.state import State
 from tests.catalogue import Array
 

@@ -12,9 +12,20 @@ from flockenv.behaviours.orca import Orca
 from flockenv.behaviours.walls import Contain
 from flockenv.behaviours.way import FollowWay
 from flockenv.config import dump_scene, load_scene
+from flockenv.geometry.shapes import (
+    Block,
+    Capsule,
+    Circle,
+    DistanceField,
+    HalfSpace,
+    Polygon,
+    Shape,
+    Sway,
+    Wall,
+    clear_of,
+)
+from flockenv.geometry.space import Torus
 from flockenv.scene import Group, Scene
-from flockenv.shapes import Block, Capsule, Circle, DistanceField, HalfSpace, Polygon, Shape, Sway, Wall, clear_of
-from flockenv.space import Torus
 from flockenv.spawn import Spawn
 
 rolling = Circle(centre=(1, 1), radius=0.3, velocity=(1, 0))

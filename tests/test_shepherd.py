@@ -11,10 +11,10 @@ import yaml
 from flockenv import steering
 from flockenv.behaviours import Cohesion, Shepherd
 from flockenv.effects.base import EFFECTS, Effect, Me, Members
+from flockenv.geometry.space import Plane, Torus
 from flockenv.jit.decorators import Law, Vec, law
 from flockenv.jit.thread_pool import use_threads
 from flockenv.scene import Group, Scene
-from flockenv.space import Plane, Torus
 from flockenv.spawn import Spawn
 from flockenv.state import State
 from flockenv.steering.vectorize import rows

@@ -11,9 +11,9 @@ from numba import njit
 
 from flockenv.behaviours import AvoidObstacles, Seek, Whiskers
 from flockenv.constraints import Collisions
+from flockenv.geometry.shapes import Block, Capsule, Circle, DistanceField, HalfSpace, Polygon, Shape, Wall
+from flockenv.geometry.shapes.edges import sphere_edge
 from flockenv.scene import Group, Scene
-from flockenv.shapes import Block, Capsule, Circle, DistanceField, HalfSpace, Polygon, Shape, Wall
-from flockenv.shapes.edges import sphere_edge
 from flockenv.spawn import Spawn
 from flockenv.steer import Steer
 from flockenv.steering.arbitration import Priority

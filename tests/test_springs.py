@@ -13,11 +13,11 @@ from flockenv.behaviours import Cohesion, Separation
 from flockenv.effects import AngularSprings, Elastic, Gravity, Springs
 from flockenv.effects.base import all_masses
 from flockenv.elements import Material, freedoms, frequencies, mass, solve_static, stiffness
+from flockenv.geometry.space import Torus
 from flockenv.integrators import RK4, ImplicitEuler, ImplicitMidpoint
 from flockenv.jit.thread_pool import use_threads
 from flockenv.networks import Cloth, Mesh, Rope
 from flockenv.scene import Group, Scene
-from flockenv.space import Torus
 from flockenv.spawn import Spawn
 from flockenv.state import State
 from flockenv.steer import Steer

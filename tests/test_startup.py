@@ -81,7 +81,7 @@ for thread in threads: thread.start()
 for thread in threads: thread.join()
 assert sys.modules["numba.np.linalg"].ensure_blas.__name__ == "ensure_blas"
 from flockenv.scene import Group, Scene
-from flockenv.space import Torus
+from flockenv.geometry.space import Torus
 scene = Scene(space=Torus(size=(9.0, 9.0)), groups=(Group(count=2),))
 scene.step(scene.start(0))
 assert "numba.np.arraymath" in sys.modules and "scipy.linalg" not in sys.modules

@@ -24,13 +24,13 @@ import flockenv
 import flockenv.scene as scenes
 from flockenv.behaviours import Alignment, Separation
 from flockenv.effects import Drag
+from flockenv.geometry.cell_list import FEWEST_ARRANGED, STEPS_ARRANGED, WORTH_ARRANGING
+from flockenv.geometry.space import Box, Torus
 from flockenv.integrators import ImplicitEuler
 from flockenv.jit import thread_pool
 from flockenv.jit.cache_folder import cache_folder
 from flockenv.jit.thread_pool import share, threads, use_threads
-from flockenv.neighbours import FEWEST_ARRANGED, STEPS_ARRANGED, WORTH_ARRANGING
 from flockenv.scene import Group, Scene
-from flockenv.space import Box, Torus
 from flockenv.spawn import Spawn
 from flockenv.state import State
 from flockenv.tasks import Flock

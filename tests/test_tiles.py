@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from flockenv.geometry.cell_list import count_cells
+from flockenv.geometry.spatial_sort import HOME, TILE, count_from_home, count_tiles, find_homes, order_cells
 from flockenv.jit.section import entry
-from flockenv.neighbours import count_cells
-from flockenv.tiles import HOME, TILE, count_from_home, count_tiles, find_homes, order_cells
 
 LANES, AGENTS = 16, 5003
 

@@ -18,7 +18,7 @@ MANY = """
 from flockenv.jit.progress import compiled
 from flockenv.effects import Drag
 from flockenv.scene import Group, Scene
-from flockenv.space import Torus
+from flockenv.geometry.space import Torus
 scene = Scene(space=Torus(size=(9, 9)), groups=(Group(count=3),), effects=(Drag(rate=0.5),))
 scene.step(scene.start(seed=0))
 print(sum(each.kernel == "scene_step" for each in compiled()))

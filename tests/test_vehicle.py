@@ -12,11 +12,11 @@ import pytest
 
 from flockenv.behaviours import Alignment, AvoidObstacles, Separation
 from flockenv.effects import Drag, Effect
+from flockenv.geometry.space import Box, Torus
 from flockenv.integrators import RK4
 from flockenv.jit.thread_pool import threads, use_threads
 from flockenv.maths.heading import GRAVITY
 from flockenv.scene import Group, Scene
-from flockenv.space import Box, Torus
 from flockenv.spawn import Spawn
 from flockenv.stability import LookaheadWarning
 from flockenv.state import State

@@ -12,10 +12,10 @@ from flockenv.config import load_scene
 from flockenv.effects import Vicsek
 from flockenv.effects.vicsek import CHANNEL
 from flockenv.experiments.vicsek import SEEN, bound, order, scene_of
+from flockenv.geometry.space import Torus
 from flockenv.integrators import ExplicitEuler, Heun, SemiImplicitEuler
 from flockenv.maths.counter_rng import _mix
 from flockenv.scene import Group, Scene
-from flockenv.space import Torus
 from flockenv.spawn import Spawn
 from flockenv.state import State
 from tests.catalogue import Array

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from flockenv.effects import Drag, Uniform, WallRepulsion
+from flockenv.geometry.space import Box, Torus
 from flockenv.integrators import RK4
 from flockenv.scene import Group, Scene
-from flockenv.space import Box, Torus
 from flockenv.spawn import Spawn
 
 MASS = 80.0

@@ -12,17 +12,17 @@ from numpy.typing import NDArray
 
 from flockenv.behaviours import Driving, FollowWay, LineUp, UnalignedAvoidance
 from flockenv.effects import Door, Journey, Routes, Stage, Way
-from flockenv.eikonal import ground
+from flockenv.geometry.eikonal import ground
+from flockenv.geometry.shapes import Block, Circle, HalfSpace, Polygon, Wall
+from flockenv.geometry.space import Box
+from flockenv.geometry.targets import Target
 from flockenv.jit.thread_pool import use_threads
 from flockenv.population import Drain, Emitter
 from flockenv.population.places import Point
 from flockenv.scene import Group, Scene
-from flockenv.shapes import Block, Circle, HalfSpace, Polygon, Wall
-from flockenv.space import Box
 from flockenv.spawn import Spawn
 from flockenv.spread import Spread
 from flockenv.steer import Steer
-from flockenv.targets import Target
 from flockenv.ways import NoWayWarning
 
 Array = NDArray[np.float64]

@@ -145,8 +145,8 @@ def boids(agents: int, edge: float, reach: float, apart: float, about: str) -> C
     """One world of boids on a torus, all three rules, through Scene.step in place."""
     from benchmarks.floors import of_scene
     from flockenv.behaviours import Alignment, Cohesion, Separation
+    from flockenv.geometry.space import Torus
     from flockenv.scene import Group, Scene
-    from flockenv.space import Torus
     from flockenv.spawn import Spawn
 
     scene = Scene(
@@ -175,9 +175,9 @@ def like_mesa(agents: int) -> Case:
 def social_corridor(agents: int) -> Case:
     """A crowd under the preset of 2000 in a corridor of 300 m, a person per square metre at first."""
     from flockenv.effects import Course
+    from flockenv.geometry.shapes import Wall
     from flockenv.presets import preset
     from flockenv.scene import Group, Scene
-    from flockenv.shapes import Wall
     from flockenv.spawn import Spawn
 
     wide, long = 32.0, 300.0  # m

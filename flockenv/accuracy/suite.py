@@ -16,10 +16,10 @@ from flockenv.behaviours import Alignment, Cohesion, Separation
 from flockenv.constraints import Collisions, Rods
 from flockenv.core.errors import nearest, shown
 from flockenv.effects import Attraction, Carried, Drag, Effect, Gravity, QuadraticDrag, Swing, Tether, Uniform, Vortex
+from flockenv.geometry.shapes import HalfSpace
+from flockenv.geometry.space import Torus
 from flockenv.networks import Rope
 from flockenv.scene import Group, Scene
-from flockenv.shapes import HalfSpace
-from flockenv.space import Torus
 from flockenv.spawn import Spawn
 
 __all__ = ["SUITE", "problems_named"]

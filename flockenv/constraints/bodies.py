@@ -69,7 +69,7 @@ class Meetings(NamedTuple):
 class Things(NamedTuple):
     """The obstacles of one world; arrays of M rows."""
 
-    table: Any  # their numbers, see flockenv/shapes/table.py
+    table: Any  # their numbers, see flockenv/geometry/shapes/table.py
     row: Any  # (M,) where in the table; impact.POINT = it is round, and `size` says how large
     anchor: Any  # (M, D) m, what its row is relative to, before it has moved
     place: Any  # (M, D) m, where that is at the beginning of the step

@@ -10,10 +10,10 @@ from typing import Any
 
 import numpy as np
 
+from flockenv.geometry.cell_list import candidates, count_cells, row_of
 from flockenv.jit.decorators import Vec, kernel, law
 from flockenv.maths.approximations import nearest_whole
 from flockenv.maths.vectors import dot, sub
-from flockenv.neighbours import candidates, count_cells, row_of
 
 __all__ = ["image", "led", "loaded", "near", "nearby", "vector", "write"]
 

@@ -14,9 +14,9 @@ from flockenv.constraints.events import play, together
 from flockenv.constraints.impact import along
 from flockenv.constraints.listing import list_meetings
 from flockenv.constraints.sweep import goes_round, may_pass
+from flockenv.geometry.shapes.row_header import shift_of
 from flockenv.jit.decorators import Vec, kernel
 from flockenv.maths.vectors import add, axis, dot, norm, scale, sub, zero
-from flockenv.shapes.head import shift_of
 
 __all__ = ["COUNTED", "LOST", "collide"]
 

@@ -16,10 +16,10 @@ from flockenv.constraints.contacts import Contacts, Ends
 from flockenv.constraints.ends import LEFT, RAISED, SUNK
 from flockenv.constraints.impact import POINT
 from flockenv.effects.base import ties
+from flockenv.geometry.cell_list import MAX_RANGES
+from flockenv.geometry.shapes import HalfSpace, packed
+from flockenv.geometry.space import Box, Torus
 from flockenv.jit.section import entry
-from flockenv.neighbours import MAX_RANGES
-from flockenv.shapes import HalfSpace, packed
-from flockenv.space import Box, Torus
 from flockenv.state import WORK, Floats, State
 
 __all__ = ["Collisions", "UnsolvedContactsWarning"]

@@ -1,8 +1,8 @@
 """When a body that flies along a parabola first touches something, and what that does to its velocity.
 
 Laws for one body, relative to what it may touch; lengths in m, times in s. What it may touch is a row of a table of
-shapes (flockenv/shapes/table.py), or a point: two round bodies touch when the centre of one is as far from that of the
-other as both radii together, their `room`.
+shapes (flockenv/geometry/shapes/table.py), or a point: two round bodies touch when the centre of one is as far from
+that of the other as both radii together, their `room`.
 """
 
 from __future__ import annotations
@@ -11,10 +11,10 @@ from typing import Any
 
 import numpy as np
 
+from flockenv.geometry.shapes.dispatch import hit_shape, nearest_shape
+from flockenv.geometry.shapes.round import ray_hit
 from flockenv.jit.decorators import Vec, kernel, law, routine
 from flockenv.maths.vectors import add, axis, dot, norm, scale, select, sub, unit
-from flockenv.shapes.every import hit_shape, nearest_shape
-from flockenv.shapes.round import ray_hit
 
 __all__ = [
     "POINT", "along", "bounced", "ends_here", "first_impact", "flight", "hops_in_touch", "rubbed",
@@ -60,7 +60,7 @@ def flight(dt: float, moved: Vec, before: Vec, after: Vec) -> tuple[Vec, Vec, Ve
 
     The parabola leads `moved` m further in a step over which the method changed velocity from `before` to `after`. A
     method of first order is half a step ahead or behind with its velocity; its points lie on a parabola all the same
-    (flockenv/space.py).
+    (flockenv/geometry/space.py).
     """
     a = scale(sub(after, before), 1.0 / dt)
     excess = sub(sub(after, scale(moved, 1.0 / dt)), scale(a, 0.5 * dt))

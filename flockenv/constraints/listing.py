@@ -8,9 +8,9 @@ from flockenv.constraints.bodies import Bodies, Meetings, Rules, Things, link
 from flockenv.constraints.broad import image, nearby, vector
 from flockenv.constraints.contacts import NEARLY, Ends
 from flockenv.constraints.impact import surface
+from flockenv.geometry.shapes.row_header import bound_of
 from flockenv.jit.decorators import Vec, kernel
 from flockenv.maths.vectors import add, dot, norm, scale, sub, zero
-from flockenv.shapes.head import bound_of
 
 __all__ = ["list_meetings"]
 

@@ -10,11 +10,11 @@ from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from flockenv.constraints.base import Constraint, Settler
+from flockenv.geometry.space import Torus
 from flockenv.jit.decorators import finite, kernel, like
 from flockenv.jit.section import entry
 from flockenv.maths.approximations import nearest_whole
 from flockenv.networks import EDGE
-from flockenv.space import Torus
 from flockenv.state import Floats, State
 
 __all__ = ["Rods", "UnmetWarning", "hold"]

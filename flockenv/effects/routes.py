@@ -12,10 +12,10 @@ from flockenv.effects.aims import about
 from flockenv.effects.base import Me
 from flockenv.effects.journey import onwards, place_kept
 from flockenv.effects.way import Around
-from flockenv.eikonal import NO_WAY
+from flockenv.geometry.eikonal import NO_WAY
+from flockenv.geometry.targets import Target, passed, row_size
 from flockenv.jit.decorators import Law, Vec, law, like
 from flockenv.maths.vectors import scale, sub, unit, zero
-from flockenv.targets import Target, passed, row_size
 from flockenv.ways import towards
 
 __all__ = ["Door", "Routes"]

@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from flockenv.effects.base import Effect, Me, Vector
+from flockenv.geometry.space import Torus
 from flockenv.jit.decorators import Law, Vec, law
 from flockenv.maths.vectors import dot, scale, sub, unit
-from flockenv.space import Torus
 from flockenv.state import State
 
 __all__ = ["WallRepulsion"]

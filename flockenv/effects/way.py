@@ -10,9 +10,9 @@ from pydantic import Field
 
 from flockenv.effects.aims import Aim, about
 from flockenv.effects.base import Me
+from flockenv.geometry.targets import Target, row_size
 from flockenv.jit.decorators import Law, Vec, law, like
 from flockenv.maths.vectors import scale, select, zero
-from flockenv.targets import Target, row_size
 from flockenv.ways import check_ways, lengths_on, region, starts_of, towards, warn_cut_off, way_block
 
 __all__ = ["Around", "Way", "slowed"]

@@ -19,10 +19,10 @@ from flockenv.core.record import Record
 from flockenv.effects import Vicsek
 from flockenv.experiments.base import Experiment, Trial
 from flockenv.experiments.plan import Plan
+from flockenv.geometry.space import Torus
 from flockenv.integrators import Integrator, SemiImplicitEuler
 from flockenv.measures import polarisation
 from flockenv.scene import AnyIntegrator, Group, Scene
-from flockenv.space import Torus
 from flockenv.spawn import Spawn
 
 __all__ = ["SEEN", "Flock", "NoisePlan", "bound", "order", "scene_of"]

@@ -6,9 +6,9 @@ from collections.abc import Callable
 
 import numpy as np
 
+from flockenv.geometry.shapes import clear_of
 from flockenv.measures.order import nearest_distances, polarisation
 from flockenv.scene import Scene
-from flockenv.shapes import clear_of
 from flockenv.state import State
 
 __all__ = ["MEASURES", "measure"]

@@ -10,7 +10,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from flockenv.space import Space, Torus
+from flockenv.geometry.space import Space, Torus
 
 __all__ = [
     "centre", "cohesion_radius", "components", "group_momentum", "milling", "nearest_distances", "polarisation",

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from flockenv.core.errors import shown
-from flockenv.shapes.outlines import area, crossing
+from flockenv.geometry.shapes.outlines import area, crossing
 
 __all__ = ["Corners", "checked", "contains", "convex", "cut", "rectangle"]
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
 
-from flockenv.space import Space, Torus
+from flockenv.geometry.space import Space, Torus
 
 __all__ = ["Proportion", "collision_rate", "oscillation_proportion", "overlap_area", "overlap_proportion", "touching"]
 

@@ -12,13 +12,13 @@ from typing import Any
 import numpy as np
 
 from flockenv.constraints.broad import image, loaded
+from flockenv.geometry.shapes.dispatch import hit_shape, nearest_shape
+from flockenv.geometry.shapes.row_header import shift_of
 from flockenv.jit.decorators import Vec, kernel, law
 from flockenv.maths.counter_rng import uniform
 from flockenv.maths.vectors import add, norm, sub, unit
 from flockenv.population.births import DEATHS
 from flockenv.population.near import count_near, sort_living
-from flockenv.shapes.every import hit_shape, nearest_shape
-from flockenv.shapes.head import shift_of
 
 __all__ = ["crowding", "drain", "passing", "reaching"]
 

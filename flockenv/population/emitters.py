@@ -13,9 +13,9 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, model_validator
 
 from flockenv.core.record import Record
+from flockenv.geometry.space import Box, Torus
 from flockenv.population.members import Member, demand_group, dimensions
 from flockenv.population.places import AnyPlace, Clearing, Surface, Vector, in_space
-from flockenv.space import Box, Torus
 
 __all__ = ["MOST_RATE", "Burst", "Emitter"]
 

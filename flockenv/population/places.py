@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 from pydantic import Field, WrapValidator, model_validator
 
 from flockenv.core.record import Record, keep
+from flockenv.geometry.shapes import AnyShape
 from flockenv.population.members import dimensions
 from flockenv.population.surface import pieces
-from flockenv.shapes import AnyShape
 
 __all__ = ["PLACES", "AnyPlace", "BoxPlace", "Clearing", "Disc", "Place", "Point", "Segment", "Surface"]
 

@@ -6,10 +6,10 @@ from typing import Any, ClassVar, Literal
 
 from pydantic import Field, model_validator
 
+from flockenv.geometry.shapes import AnyShape
+from flockenv.geometry.space import Torus
 from flockenv.population.members import Member, demand_group, dimensions
 from flockenv.population.places import Vector, in_space, ordered
-from flockenv.shapes import AnyShape
-from flockenv.space import Torus
 
 __all__ = ["Ageing", "Crowding", "Decay", "Drain", "Leaving", "Sink", "Threshold"]
 

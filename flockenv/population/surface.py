@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from flockenv.shapes.outlines import area
+from flockenv.geometry.shapes.outlines import area
 
 __all__ = ["COLUMNS", "pieces"]
 

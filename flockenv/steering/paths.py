@@ -1,6 +1,6 @@
 """Along paths and fields: what to ask for once it is known where the path, or how fast the flow, is.
 
-Where the nearest point of a path lies is geometry (`flockenv.polyline`), and so is what a grid says
+Where the nearest point of a path lies is geometry (`flockenv.geometry.polyline`), and so is what a grid says
 (`flockenv.maths.grid`).
 """
 

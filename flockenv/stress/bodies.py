@@ -16,9 +16,9 @@ from scipy.integrate import solve_ivp
 from flockenv.divergence import SimulationDiverged
 from flockenv.effects import Attraction, Carried, Drag, Gravity, Swing, Tether, Uniform, Vortex, WallRepulsion
 from flockenv.findings import Case, Value
+from flockenv.geometry.space import Box
 from flockenv.integrators import Adaptive, Integrator
 from flockenv.scene import Group, Scene
-from flockenv.space import Box
 from flockenv.spawn import Spawn
 from flockenv.stability import amplification, limit
 from flockenv.state import State

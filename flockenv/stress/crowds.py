@@ -9,9 +9,9 @@ import numpy as np
 
 from flockenv.behaviours import Alignment, Cohesion, Separation
 from flockenv.findings import Case, Value
+from flockenv.geometry.space import Torus
 from flockenv.integrators import Adaptive, Integrator
 from flockenv.scene import Group, Scene
-from flockenv.space import Torus
 from flockenv.stress.case import started
 
 __all__ = ["CROWDS"]

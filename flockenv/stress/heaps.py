@@ -11,8 +11,8 @@ import math
 import numpy as np
 
 from flockenv.findings import Value
+from flockenv.geometry.shapes import HalfSpace, Wall
 from flockenv.integrators import Integrator
-from flockenv.shapes import HalfSpace, Wall
 from flockenv.stress.solids import Floats, G, Response, batch, overlap, per_response, solid
 
 __all__ = ["HEAPS", "funnel"]

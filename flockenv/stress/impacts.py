@@ -11,9 +11,9 @@ from collections.abc import Sequence
 import numpy as np
 
 from flockenv.findings import Value
+from flockenv.geometry.shapes import Block, HalfSpace, Shape, Wall
 from flockenv.integrators import Integrator
 from flockenv.scene import Scene
-from flockenv.shapes import Block, HalfSpace, Shape, Wall
 from flockenv.spawn import Spawn
 from flockenv.state import State
 from flockenv.stress.solids import Floats, G, Response, batch, overlap, per_response, solid
@@ -51,7 +51,7 @@ def apexes(y: Floats) -> Floats:
     """Return the top of each flight of one ball from its heights (K,), m.
 
     The top of the parabola through the highest of its points and the two beside it: exact for any method, since it
-    does not read velocities (flockenv/space.py).
+    does not read velocities (flockenv/geometry/space.py).
     """
     k = 1 + np.flatnonzero((y[1:-1] > y[:-2]) & (y[1:-1] >= y[2:]))
     bend, slope = y[k - 1] - 2 * y[k] + y[k + 1], (y[k + 1] - y[k - 1]) / 2

@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 from flockenv.constraints import Collisions
 from flockenv.effects import Gravity
 from flockenv.findings import Case, Value
+from flockenv.geometry.shapes import Shape
 from flockenv.integrators import Integrator
 from flockenv.scene import Group, Scene
-from flockenv.shapes import Shape
 from flockenv.spawn import Spawn
 from flockenv.state import State
 

@@ -18,13 +18,13 @@ from typing import Any
 
 import numpy as np
 
+from flockenv.geometry.shapes.edges import near_way, sphere_edge
+from flockenv.geometry.shapes.ray_hit import touched_spot
+from flockenv.geometry.shapes.round import touched_normal
+from flockenv.geometry.shapes.table import law_of
 from flockenv.jit.decorators import Law, Vec, kernel, law, like, routine
 from flockenv.jit.section import section
 from flockenv.maths.vectors import add, cross, dot, lateral, norm, perpendicular, scale, select, sub, unit, zero
-from flockenv.shapes.edges import near_way, sphere_edge
-from flockenv.shapes.round import touched_normal
-from flockenv.shapes.table import law_of
-from flockenv.shapes.touch import touched_spot
 from flockenv.steering.around import threat
 from flockenv.sweep.blocks import vector_of
 from flockenv.sweep.forms import FormPlan, Surroundings, box_of_way, by_form, each_row, number_of, seen_from

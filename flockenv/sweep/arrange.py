@@ -1,10 +1,10 @@
 """A large world is put in order for as long as a call of several steps lasts: near in space is near in memory.
 
-Agents are numbered as the scene lists them, and neighbours by number lie anywhere in space: sorting them by cell is
-one distant place in memory per agent and step. So at the beginning of a call all that is known of an agent moves to
-where its tile of cells comes, by number within (`flockenv.tiles`). Each step then sorts what is nearly sorted; and at
-the end all agents go home. `ident` says which agent is where in between. Sums do not notice: within a cell agents are
-met in the order of their numbers all the same.
+Agents are numbered as the scene lists them, and neighbours by number lie anywhere in space: sorting them by cell is one
+distant place in memory per agent and step. So at the beginning of a call all that is known of an agent moves to where
+its tile of cells comes, by number within (`flockenv.geometry.spatial_sort`). Each step then sorts what is nearly
+sorted; and at the end all agents go home. `ident` says which agent is where in between. Sums do not notice: within a
+cell agents are met in the order of their numbers all the same.
 """
 
 from __future__ import annotations
@@ -14,15 +14,15 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from flockenv.geometry.cell_list import FEWEST_ARRANGED, STEPS_ARRANGED, WORTH_ARRANGING
+from flockenv.geometry.spatial_sort import count_tiles, find_homes
 from flockenv.jit.intrinsics import ask_for, wait_for_team
 from flockenv.jit.section import section
 from flockenv.jit.transpose import put_lines
-from flockenv.neighbours import FEWEST_ARRANGED, STEPS_ARRANGED, WORTH_ARRANGING
 from flockenv.sweep.blocks import handed_of, place_of
 from flockenv.sweep.gather import gather, picked, places_each, scatter_each
 from flockenv.sweep.parts import Parts
 from flockenv.sweep.scratch import array_names
-from flockenv.tiles import count_tiles, find_homes
 
 __all__ = ["Luggage", "arrange_plan", "go_home_of", "move_in_of"]
 

@@ -1,8 +1,8 @@
 """Laws about all agents, however far: each agent meets all others, or groups of them where these are far away.
 
 Few agents, and many where an effect asks for exactness, are met one by one, lane beside lane (`_direct`); many others
-by blocks that walk through a tree (`_walk`, see flockenv.tree). Which of the two depends on the number of agents and
-the effect's opening alone. What it comes to is left in `pulled`, by agent, where bonds add to it.
+by blocks that walk through a tree (`_walk`, see flockenv.geometry.barnes_hut). Which of the two depends on the number
+of agents and the effect's opening alone. What it comes to is left in `pulled`, by agent, where bonds add to it.
 """
 
 from __future__ import annotations
@@ -13,13 +13,13 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from flockenv.effects.base import Far, Me
+from flockenv.geometry.barnes_hut import BUCKETS, LEVELS, LISTED, gather, line_up, weigh
 from flockenv.jit.decorators import Law, like
 from flockenv.jit.intrinsics import wait_for_team
 from flockenv.jit.section import section
 from flockenv.maths.vectors import dot, sub, zero
 from flockenv.sweep.blocks import place_of, vector_of_lane
 from flockenv.sweep.parts import Parts
-from flockenv.tree import BUCKETS, LEVELS, LISTED, gather, line_up, weigh
 
 __all__ = ["FarPlan", "far_of", "far_plan"]
 

@@ -11,10 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from flockenv.jit.decorators import Law, Vec, kernel, law
-from flockenv.jit.section import section
-from flockenv.maths.vectors import add
-from flockenv.shapes.cells import (
+from flockenv.geometry.shapes.cells import (
     MOST_FOUND,
     count_of,
     entry_length,
@@ -24,8 +21,11 @@ from flockenv.shapes.cells import (
     row_listed,
     span_of,
 )
-from flockenv.shapes.head import shift_of, vector_at
-from flockenv.shapes.table import FORMS
+from flockenv.geometry.shapes.row_header import shift_of, vector_at
+from flockenv.geometry.shapes.table import FORMS
+from flockenv.jit.decorators import Law, Vec, kernel, law
+from flockenv.jit.section import section
+from flockenv.maths.vectors import add
 
 __all__ = ["FormPlan", "Surroundings", "box_of_way", "by_form", "each_row", "near_rows", "number_of", "seen_from"]
 

@@ -16,16 +16,16 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from flockenv.geometry.cell_list import DISTANT, candidates, count_cells, order_records, row_of
+from flockenv.geometry.spatial_sort import FAR_FROM_HOME, count_from_home, order_cells, order_shared
 from flockenv.jit.decorators import Law
 from flockenv.jit.intrinsics import ask_for, wait_for_team
 from flockenv.jit.section import section
 from flockenv.jit.transpose import out_of_records, put_records
 from flockenv.maths.vectors import unit
-from flockenv.neighbours import DISTANT, candidates, count_cells, order_records, row_of
 from flockenv.sweep.blocks import handed_of, place_of
 from flockenv.sweep.gather import copy_each, gather, gather_each, picked, places_each, scatter
 from flockenv.sweep.scratch import SMALL_STRIDE, array_names
-from flockenv.tiles import FAR_FROM_HOME, count_from_home, order_cells, order_shared
 
 if TYPE_CHECKING:
     from flockenv.sweep.parts import Parts

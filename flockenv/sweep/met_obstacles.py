@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flockenv.effects.base import Effect, Sight
-from flockenv.shapes import packed
-from flockenv.shapes.cells import FEWEST_ROWS, cells_of
-from flockenv.space import Space
+from flockenv.geometry.shapes import packed
+from flockenv.geometry.shapes.cells import FEWEST_ROWS, cells_of
+from flockenv.geometry.space import Space
 from flockenv.sweep.forms import FormPlan, Surroundings
 from flockenv.sweep.numbers import NumberPlan
 

@@ -14,12 +14,12 @@ from typing import Any
 
 import numpy as np
 
+from flockenv.geometry.shapes.edges import near_way
+from flockenv.geometry.shapes.row_header import outside_box, shift_of, velocity_of
+from flockenv.geometry.shapes.table import law_of
 from flockenv.jit.decorators import Vec, kernel, law, like
 from flockenv.jit.section import in_turn, section, vector
 from flockenv.maths.vectors import add, dot, scale, sub, zero
-from flockenv.shapes.edges import near_way
-from flockenv.shapes.head import outside_box, shift_of, velocity_of
-from flockenv.shapes.table import law_of
 from flockenv.sweep.agents import AgentPlan, alone_of
 from flockenv.sweep.around import aside_of
 from flockenv.sweep.blocks import vector_of, vector_of_lane

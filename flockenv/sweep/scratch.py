@@ -12,10 +12,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from flockenv.geometry.barnes_hut import BUCKETS, LEVELS, tree_sizes
+from flockenv.geometry.cell_list import FEWEST_ARRANGED, MAX_RANGES
+from flockenv.geometry.spatial_sort import HOME
 from flockenv.jit.section import record
-from flockenv.neighbours import FEWEST_ARRANGED, MAX_RANGES
-from flockenv.tiles import HOME
-from flockenv.tree import BUCKETS, LEVELS, tree_sizes
 
 if TYPE_CHECKING:
     from flockenv.sweep.parts import Parts

@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
+from flockenv.geometry.shapes.round import blocks
+from flockenv.geometry.shapes.table import law_of
 from flockenv.jit.decorators import kernel, like
 from flockenv.jit.section import section
 from flockenv.maths.vectors import norm, scale, unit
-from flockenv.shapes.round import blocks
-from flockenv.shapes.table import law_of
 from flockenv.sweep.blocks import vector_of
 from flockenv.sweep.forms import FormPlan, Surroundings, box_of_way, each_row, seen_from
 

@@ -12,14 +12,14 @@ from pydantic import Field, model_validator
 
 from flockenv import steering
 from flockenv.effects import Contact, ObstacleContact
+from flockenv.geometry.shapes import Wall
+from flockenv.geometry.space import Box
 from flockenv.jit.decorators import kernel, like
 from flockenv.maths.counter_rng import uniform
 from flockenv.maths.vectors import add, norm, scale, sub, unit
 from flockenv.presets import PRESETS
 from flockenv.scene import Group, Scene
-from flockenv.shapes import Wall
 from flockenv.snapshot import Mark
-from flockenv.space import Box
 from flockenv.spawn import Spawn
 from flockenv.state import State
 from flockenv.sweep import Look

@@ -12,13 +12,13 @@ from pydantic import Field, model_validator
 
 from flockenv import steering
 from flockenv.effects import ObstacleContact
+from flockenv.geometry.shapes import Wall
+from flockenv.geometry.space import Torus
 from flockenv.jit.decorators import kernel, like
 from flockenv.maths.counter_rng import normal, uniform
 from flockenv.maths.vectors import add, norm, scale, sub
 from flockenv.presets import PRESETS
 from flockenv.scene import Group, Scene
-from flockenv.shapes import Wall
-from flockenv.space import Torus
 from flockenv.spawn import Spawn
 from flockenv.state import State
 from flockenv.sweep import Look

@@ -10,12 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
+from flockenv.geometry.space import Plane
 from flockenv.jit.decorators import kernel, like
 from flockenv.jit.intrinsics import stacked
 from flockenv.maths.counter_rng import uniform
 from flockenv.scene import Group, Scene
 from flockenv.snapshot import Mark
-from flockenv.space import Plane
 from flockenv.spawn import Spawn
 from flockenv.state import State
 from flockenv.steering import orca

@@ -12,12 +12,12 @@ from pydantic import Field, model_validator
 
 from flockenv.behaviours.social import Social
 from flockenv.effects.aims import Antipode
+from flockenv.geometry.space import Plane
 from flockenv.jit.decorators import kernel, like
 from flockenv.maths.counter_rng import uniform
 from flockenv.presets import PRESETS
 from flockenv.scene import Group, Scene
 from flockenv.snapshot import Mark
-from flockenv.space import Plane
 from flockenv.spawn import Spawn
 from flockenv.state import State
 from flockenv.steer import Steer

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from flockenv import steering
+from flockenv.geometry.space import Torus
 from flockenv.jit.decorators import kernel, like
 from flockenv.jit.intrinsics import stacked
 from flockenv.jit.simd_rows import SIDE
@@ -18,7 +19,6 @@ from flockenv.maths.counter_rng import uniform
 from flockenv.maths.vectors import norm, scale, sub, unit
 from flockenv.scene import Group, Scene
 from flockenv.snapshot import Mark
-from flockenv.space import Torus
 from flockenv.state import State
 from flockenv.steering import arbitration
 from flockenv.sweep import Look

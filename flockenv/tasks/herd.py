@@ -11,12 +11,12 @@ from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from flockenv import steering
+from flockenv.geometry.space import Plane
 from flockenv.jit.decorators import Vec, kernel
 from flockenv.maths.counter_rng import smooth, uniform
 from flockenv.maths.vectors import add, norm, scale, sub, unit
 from flockenv.scene import Group, Scene
 from flockenv.snapshot import Mark
-from flockenv.space import Plane
 from flockenv.spawn import Spawn
 from flockenv.state import State
 from flockenv.tasks.base import Frame, Task

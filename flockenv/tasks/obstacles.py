@@ -10,11 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
+from flockenv.geometry.space import Box
 from flockenv.jit.decorators import kernel, like
 from flockenv.maths.counter_rng import uniform
 from flockenv.scene import Group, Scene
 from flockenv.snapshot import Mark
-from flockenv.space import Box
 from flockenv.state import State
 from flockenv.sweep import Look
 from flockenv.tasks.base import Frame, Task

@@ -10,12 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
+from flockenv.geometry.space import Box
 from flockenv.jit.decorators import Vec, kernel
 from flockenv.maths.counter_rng import uniform
 from flockenv.maths.vectors import dot, norm, sub
 from flockenv.scene import Group, Scene
 from flockenv.snapshot import Mark
-from flockenv.space import Box
 from flockenv.state import State
 from flockenv.tasks.base import Frame, Task
 from flockenv.tasks.layout import Layout, Slot

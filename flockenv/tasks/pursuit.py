@@ -9,11 +9,11 @@ from typing import Any, ClassVar, Literal
 from pydantic import Field
 
 from flockenv import steering
+from flockenv.geometry.space import Box
 from flockenv.jit.decorators import Vec, kernel
 from flockenv.maths.counter_rng import uniform
 from flockenv.maths.vectors import scale
 from flockenv.scene import Group, Scene
-from flockenv.space import Box
 from flockenv.spawn import direction
 from flockenv.steering import arbitration
 from flockenv.tasks.base import Frame, Task

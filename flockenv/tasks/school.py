@@ -12,12 +12,12 @@ from pydantic import Field, model_validator
 
 from flockenv import steering
 from flockenv.effects.base import in_view
+from flockenv.geometry.space import Box
 from flockenv.jit.decorators import Vec, kernel
 from flockenv.maths.counter_rng import smooth, uniform
 from flockenv.maths.vectors import add, dot, norm, scale, sub, unit
 from flockenv.scene import Group, Scene
 from flockenv.snapshot import Mark
-from flockenv.space import Box
 from flockenv.state import State
 from flockenv.steering import arbitration, motivation
 from flockenv.tasks.base import Frame, Task

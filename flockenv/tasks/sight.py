@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 
+from flockenv.geometry.shapes import ray_hit
 from flockenv.jit.decorators import Vec, kernel, like
 from flockenv.maths.approximations import nearest_whole
 from flockenv.maths.vectors import dot
-from flockenv.shapes import ray_hit
 from flockenv.tasks.layout import Slot
 
 __all__ = [

@@ -13,11 +13,11 @@ import numpy as np
 
 from flockenv.effects import Course
 from flockenv.findings import Case, Value
+from flockenv.geometry.cell_list import FEWEST_AGENTS
+from flockenv.geometry.shapes import Wall
+from flockenv.geometry.space import Torus
 from flockenv.measures import above_null, classical_density, lanes, single_file_speed, speed_in_area, weidmann_speed
-from flockenv.neighbours import FEWEST_AGENTS
 from flockenv.scene import Scene
-from flockenv.shapes import Wall
-from flockenv.space import Torus
 from flockenv.spawn import Spawn
 from flockenv.state import State
 from flockenv.validation.walk import SHAKEN, STEPS, Floats, Scenes, filled, nobody, people, scene_of, walked, wall

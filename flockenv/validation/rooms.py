@@ -10,14 +10,14 @@ from collections.abc import Sequence
 from typing import Any
 
 from flockenv.effects import Way
-from flockenv.neighbours import FEWEST_AGENTS
+from flockenv.geometry.cell_list import FEWEST_AGENTS
+from flockenv.geometry.shapes import Wall
+from flockenv.geometry.targets import Target
 from flockenv.population import Leaving
 from flockenv.population.members import Member
 from flockenv.scene import Group, Scene
-from flockenv.shapes import Wall
 from flockenv.spawn import Spawn
 from flockenv.state import State
-from flockenv.targets import Target
 from flockenv.validation.walk import nobody, people, scene_of, wall
 
 __all__ = [

@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flockenv.effects import Effect, ObstacleContact
+from flockenv.geometry.shapes import Wall
 from flockenv.presets import PRESETS, preset
 from flockenv.scene import Group, Scene
-from flockenv.shapes import Wall
 from flockenv.spawn import Spawn
 from flockenv.spread import Spread
 from flockenv.state import State

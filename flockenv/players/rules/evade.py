@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from flockenv import shapes, steering
+from flockenv import steering
+from flockenv.geometry import shapes
 from flockenv.steering import arbitration
 from flockenv.steering.vectorize import rows
 from flockenv.tasks import Evade

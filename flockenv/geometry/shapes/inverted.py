@@ -12,13 +12,13 @@ from typing import Any
 
 import numpy as np
 
+from flockenv.geometry.shapes.block import half_edges, nearest_block, turned, turned_back
+from flockenv.geometry.shapes.chain import crosses, nearest_chain, piece_facing, segment_hit, segment_share, vertex
+from flockenv.geometry.shapes.field import STEPS, nearest_distance_field, on_grid
+from flockenv.geometry.shapes.row_header import body_of
 from flockenv.jit.decorators import Vec, law, like
 from flockenv.maths.grid import sample
 from flockenv.maths.vectors import add, axis, dot, norm, scale, sub, unit
-from flockenv.shapes.block import half_edges, nearest_block, turned, turned_back
-from flockenv.shapes.chain import crosses, nearest_chain, piece_facing, segment_hit, segment_share, vertex
-from flockenv.shapes.field import STEPS, nearest_distance_field, on_grid
-from flockenv.shapes.head import body_of
 
 __all__ = [
     "hit_hollow_block", "hit_hollow_chain", "hit_hollow_distance_field", "nearest_hollow_block", "nearest_hollow_chain",

@@ -11,11 +11,11 @@ from typing import Any
 
 import numpy as np
 
+from flockenv.geometry.shapes.chain import segment_hit
+from flockenv.geometry.shapes.round import ray_hit
+from flockenv.geometry.shapes.row_header import body_of, vector_at
 from flockenv.jit.decorators import Vec, law, like
 from flockenv.maths.vectors import add, axis, dot, norm, scale, select, sub, unit
-from flockenv.shapes.chain import segment_hit
-from flockenv.shapes.head import body_of, vector_at
-from flockenv.shapes.round import ray_hit
 
 __all__ = [
     "box_hit", "box_nearest", "half_edges", "hit_block", "hit_half_space", "nearest_block", "nearest_half_space",

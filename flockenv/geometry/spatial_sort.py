@@ -11,9 +11,9 @@ from typing import Any
 
 import numpy as np
 
+from flockenv.geometry.cell_list import Ints, begin_cells, cell_of, count_folded, crowded, divided, tally_cells
 from flockenv.jit.decorators import kernel
 from flockenv.jit.intrinsics import ask_for
-from flockenv.neighbours import Ints, begin_cells, cell_of, count_folded, crowded, divided, tally_cells
 
 __all__ = [
     "FAR_FROM_HOME", "HOME", "TILE", "count_from_home", "count_tiles", "find_homes", "order_cells", "order_shared",

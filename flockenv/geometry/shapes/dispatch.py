@@ -7,12 +7,10 @@ from __future__ import annotations
 
 from typing import Any
 
-from flockenv.jit.decorators import Vec, law
-from flockenv.shapes.block import hit_block, hit_half_space, nearest_block, nearest_half_space
-from flockenv.shapes.chain import hit_chain, nearest_chain
-from flockenv.shapes.field import hit_distance_field, nearest_distance_field
-from flockenv.shapes.head import form_of
-from flockenv.shapes.hollow import (
+from flockenv.geometry.shapes.block import hit_block, hit_half_space, nearest_block, nearest_half_space
+from flockenv.geometry.shapes.chain import hit_chain, nearest_chain
+from flockenv.geometry.shapes.field import hit_distance_field, nearest_distance_field
+from flockenv.geometry.shapes.inverted import (
     hit_hollow_block,
     hit_hollow_chain,
     hit_hollow_distance_field,
@@ -20,6 +18,8 @@ from flockenv.shapes.hollow import (
     nearest_hollow_chain,
     nearest_hollow_distance_field,
 )
+from flockenv.geometry.shapes.row_header import form_of
+from flockenv.jit.decorators import Vec, law
 
 __all__ = ["hit_shape", "nearest_shape"]
 

@@ -16,12 +16,12 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from flockenv.geometry.shapes import Shape
+from flockenv.geometry.shapes.table import nearest
+from flockenv.geometry.targets import Target
 from flockenv.jit.decorators import kernel
 from flockenv.jit.section import entry
 from flockenv.maths.grid import packed, points_of
-from flockenv.shapes import Shape
-from flockenv.shapes.table import nearest
-from flockenv.targets import Target
 
 __all__ = ["NO_WAY", "Start", "distances_around", "free_part", "way_table"]
 

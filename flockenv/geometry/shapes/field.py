@@ -10,10 +10,10 @@ from typing import Any
 
 import numpy as np
 
+from flockenv.geometry.shapes.row_header import body_of
 from flockenv.jit.decorators import Vec, law, like
 from flockenv.maths.grid import sample, sample_vector
 from flockenv.maths.vectors import add, axis, dot, norm, scale, select, sub, unit
-from flockenv.shapes.head import body_of
 
 __all__ = ["STEPS", "hit_distance_field", "nearest_distance_field", "on_grid"]
 

@@ -19,9 +19,9 @@ from numpy.typing import ArrayLike
 from pydantic import Field, WrapValidator, field_validator, model_validator
 
 from flockenv.core.record import Record, in_tuples, keep
+from flockenv.geometry.shapes import outlines, table
+from flockenv.geometry.shapes.table import Floats, hits, nearest
 from flockenv.maths.grid import MOST_POINTS, packed, points_of
-from flockenv.shapes import outlines, table
-from flockenv.shapes.table import Floats, hits, nearest
 
 __all__ = [
     "SHAPES", "AnyShape", "Block", "Bound", "Capsule", "Circle", "Closed", "DistanceField", "HalfSpace", "Polygon",

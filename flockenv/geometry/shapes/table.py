@@ -15,23 +15,23 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from flockenv.geometry.shapes.joints import joints
 from flockenv.jit.decorators import Law
 from flockenv.jit.section import entry_of, vector
 from flockenv.maths.vectors import sub
-from flockenv.shapes.joints import joints
 
 __all__ = ["FORMS", "Floats", "hits", "law_of", "nearest", "packed"]
 
 Floats = NDArray[np.float64]
 
 FORMS = {
-    "chain": "flockenv.shapes.chain",
-    "block": "flockenv.shapes.block",
-    "half_space": "flockenv.shapes.block",
-    "distance_field": "flockenv.shapes.field",
-    "hollow_chain": "flockenv.shapes.hollow",
-    "hollow_block": "flockenv.shapes.hollow",
-    "hollow_distance_field": "flockenv.shapes.hollow",
+    "chain": "flockenv.geometry.shapes.chain",
+    "block": "flockenv.geometry.shapes.block",
+    "half_space": "flockenv.geometry.shapes.block",
+    "distance_field": "flockenv.geometry.shapes.field",
+    "hollow_chain": "flockenv.geometry.shapes.inverted",
+    "hollow_block": "flockenv.geometry.shapes.inverted",
+    "hollow_distance_field": "flockenv.geometry.shapes.inverted",
 }
 """The forms that rows have, and where their laws `nearest_FORM` and `hit_FORM` are."""
 

@@ -19,8 +19,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from flockenv.geometry.shapes.row_header import vector_at
 from flockenv.jit.decorators import Vec, kernel, law, like
-from flockenv.shapes.head import vector_at
 
 __all__ = [
     "FEWEST_ROWS", "MOST_FOUND", "cells_of", "count_of", "entry_length", "keep_in_order", "list_of", "meets_box",

@@ -17,14 +17,14 @@ from typing import Any
 
 import numpy as np
 
+from flockenv.geometry.shapes.block import half_edges, turned
+from flockenv.geometry.shapes.chain import segment_hit, vertex
+from flockenv.geometry.shapes.field import hit_distance_field
+from flockenv.geometry.shapes.inverted import hit_hollow_distance_field
+from flockenv.geometry.shapes.row_header import body_of, bound_of, vector_at
 from flockenv.jit.decorators import Vec, law, like
 from flockenv.maths.approximations import atan2
 from flockenv.maths.vectors import add, axis, dot, scale, sub
-from flockenv.shapes.block import half_edges, turned
-from flockenv.shapes.chain import segment_hit, vertex
-from flockenv.shapes.field import hit_distance_field
-from flockenv.shapes.head import body_of, bound_of, vector_at
-from flockenv.shapes.hollow import hit_hollow_distance_field
 
 __all__ = [
     "edge_block", "edge_chain", "edge_distance_field", "edge_half_space", "edge_hollow_block",

@@ -18,9 +18,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from flockenv.geometry.space import torus_confine
 from flockenv.jit.decorators import kernel
 from flockenv.jit.intrinsics import ask_for, wait_for_team
-from flockenv.space import torus_confine
 
 __all__ = [
     "AHEAD", "DISTANT", "FEWEST_AGENTS", "FEWEST_ARRANGED", "FINEST", "MAX_RANGES", "STEPS_ARRANGED",

@@ -12,10 +12,10 @@ from typing import Any
 
 import numpy as np
 
+from flockenv.geometry.shapes.round import ray_hit
+from flockenv.geometry.shapes.row_header import body_of, bound_of, vector_at
 from flockenv.jit.decorators import Vec, law, like
 from flockenv.maths.vectors import add, axis, dot, perpendicular, scale, select, sub, unit
-from flockenv.shapes.head import body_of, bound_of, vector_at
-from flockenv.shapes.round import ray_hit
 
 __all__ = [
     "crosses", "end_acts", "hit_chain", "nearest_chain", "piece_chain", "piece_facing", "pieces_chain",

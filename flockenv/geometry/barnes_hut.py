@@ -15,8 +15,8 @@ from typing import Any
 
 import numpy as np
 
+from flockenv.geometry.cell_list import region
 from flockenv.jit.decorators import kernel
-from flockenv.neighbours import region
 
 __all__ = ["BUCKETS", "LEVELS", "LISTED", "MOST_DIRECT", "gather", "line_up", "tree_sizes", "weigh"]
 

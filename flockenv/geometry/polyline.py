@@ -14,11 +14,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from flockenv.geometry.space import Plane, Space
 from flockenv.jit.decorators import Vec, kernel, law, like
 from flockenv.jit.section import entry
 from flockenv.maths.approximations import nearest_whole
 from flockenv.maths.vectors import add, dot, scale, select, zero
-from flockenv.space import Plane, Space
 
 __all__ = ["Floats", "Table", "gained", "nearest", "on_spine", "pieces", "projected", "spine", "to_end"]
 

@@ -7,7 +7,7 @@ in; `head` what laws may ask whatever the form: bounds, and how it moves; `every
 
 from __future__ import annotations
 
-from flockenv.shapes.records import (
+from flockenv.geometry.shapes.records import (
     SHAPES,
     AnyShape,
     Block,
@@ -22,8 +22,8 @@ from flockenv.shapes.records import (
     Wall,
     clear_of,
 )
-from flockenv.shapes.round import blocks, gap, normal, ray_hit, silhouette, touched_normal
-from flockenv.shapes.table import FORMS, packed
+from flockenv.geometry.shapes.round import blocks, gap, normal, ray_hit, silhouette, touched_normal
+from flockenv.geometry.shapes.table import FORMS, packed
 
 __all__ = [
     "FORMS", "SHAPES", "AnyShape", "Block", "Bound", "Capsule", "Circle", "DistanceField", "HalfSpace", "Polygon",

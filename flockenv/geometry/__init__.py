@@ -1,0 +1,1 @@
+"""Space and what stands in it: shapes, targets, polylines, travel times; and how neighbours are found."""
