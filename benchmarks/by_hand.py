@@ -23,8 +23,8 @@ from flockenv.jit.intrinsics import unaliased
 from flockenv.jit.memory import zeros
 from flockenv.jit.pipeline import Inlined, Whole
 from flockenv.maths.approximations import nearest_whole
+from flockenv.model.state import State
 from flockenv.scene import Scene
-from flockenv.state import State
 
 __all__ = ["MIXES", "by_hand"]
 

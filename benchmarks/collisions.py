@@ -18,9 +18,9 @@ from benchmarks.scenes import stepping
 from flockenv.constraints import Collisions
 from flockenv.effects import Gravity
 from flockenv.geometry.space import Box, Torus
+from flockenv.model.spawn import Spawn
+from flockenv.model.state import State
 from flockenv.scene import Group, Scene
-from flockenv.spawn import Spawn
-from flockenv.state import State
 
 __all__ = ["gas", "heap"]
 

@@ -22,8 +22,8 @@ from benchmarks.measure import Bench, Contestant, Floor, Out, Quick, Result, Rou
 from benchmarks.peers import PeerError, running
 from benchmarks.scenes import WORLD_RADII, crowd, restarting, rules, stepping, world
 from flockenv.jit.thread_pool import use_threads
+from flockenv.model.state import State
 from flockenv.scene import Scene
-from flockenv.state import State
 
 __all__ = ["mix_scene"]
 

@@ -23,9 +23,9 @@ from benchmarks.scenes import stepping
 from flockenv.effects import Course
 from flockenv.geometry.space import Torus
 from flockenv.jit.thread_pool import use_threads
+from flockenv.model.spawn import Spawn
 from flockenv.presets import PRESETS, preset
 from flockenv.scene import Group, Scene
-from flockenv.spawn import Spawn
 
 __all__ = ["crowd"]
 

@@ -25,8 +25,8 @@ import numpy as np
 from benchmarks.measure import Bench, Floor, number
 from flockenv.geometry.space import Torus
 from flockenv.jit.thread_pool import share
+from flockenv.model.state import State
 from flockenv.scene import Scene
-from flockenv.state import State
 from flockenv.tasks import Task
 
 __all__ = ["FLAGS", "Machine", "Work", "compiled", "machine", "of_decisions", "of_learning", "of_scene"]

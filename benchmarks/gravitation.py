@@ -17,8 +17,8 @@ from benchmarks.measure import Bench, Contestant, Out, Quick, Rounds, command_li
 from benchmarks.scenes import stepping
 from flockenv.effects import Gravitation
 from flockenv.geometry.barnes_hut import MOST_DIRECT
+from flockenv.model.spawn import Spawn
 from flockenv.scene import Group, Scene
-from flockenv.spawn import Spawn
 
 __all__ = ["AGENTS", "cloud"]
 

@@ -21,8 +21,8 @@ from benchmarks.scenes import crowd, restarting, stepping, world
 from flockenv.behaviours import Alignment, Cohesion, Separation
 from flockenv.effects.base import ties
 from flockenv.jit.thread_pool import use_threads
+from flockenv.model.state import State
 from flockenv.scene import Scene
-from flockenv.state import State
 
 __all__ = ["ROWS", "Reference", "Row", "disagreement"]
 

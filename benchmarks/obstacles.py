@@ -16,8 +16,8 @@ from benchmarks.measure import Bench, Contestant, Out, Quick, Rounds, command_li
 from benchmarks.scenes import stepping
 from flockenv.behaviours import AvoidObstacles
 from flockenv.geometry.shapes import Block, Capsule, Circle, Shape
+from flockenv.model.spawn import Spawn
 from flockenv.scene import Group, Scene
-from flockenv.spawn import Spawn
 
 __all__ = ["among"]
 

@@ -8,9 +8,9 @@ from collections.abc import Callable
 from flockenv.behaviours import Alignment, Cohesion, Separation
 from flockenv.effects import Effect
 from flockenv.geometry.space import Torus
+from flockenv.model.spawn import Spawn
+from flockenv.model.state import State
 from flockenv.scene import Group, Scene
-from flockenv.spawn import Spawn
-from flockenv.state import State
 
 __all__ = ["boids", "crowd", "edge_for", "restarting", "rules", "stepping", "world"]
 

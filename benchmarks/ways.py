@@ -13,15 +13,15 @@ from pathlib import Path
 
 import numpy as np
 
-from flockenv.appearance import Appearance
 from flockenv.behaviours import Driving, LineUp, Separation
 from flockenv.effects import Door, Routes, Way
 from flockenv.geometry.eikonal import ground
 from flockenv.geometry.shapes import Wall
 from flockenv.geometry.space import Box
+from flockenv.model.appearance import Appearance
+from flockenv.model.spawn import Spawn
 from flockenv.render import draw, write_png
 from flockenv.scene import Group, Scene
-from flockenv.spawn import Spawn
 from flockenv.steer import Steer
 
 EXITS = (Door(ends=((59.0, 4.0), (59.0, 6.0))), Door(ends=((1.0, 54.0), (1.0, 56.0))))

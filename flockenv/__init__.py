@@ -23,9 +23,9 @@ from typing import TYPE_CHECKING, Any  # noqa: E402  # see above
 from flockenv.envs.registration import register_all  # noqa: E402  # see above
 
 if TYPE_CHECKING:
+    from flockenv.model.snapshot import Snapshot
+    from flockenv.model.state import Body, State
     from flockenv.scene import Scene
-    from flockenv.snapshot import Snapshot
-    from flockenv.state import Body, State
     from flockenv.tasks import (
         TASKS,
         Bottleneck,

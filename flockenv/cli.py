@@ -47,10 +47,10 @@ from flockenv.validating import validate
 if TYPE_CHECKING:
     from rich.console import Console
 
+    from flockenv.model.snapshot import Snapshot
+    from flockenv.model.state import State
     from flockenv.render import Panel
     from flockenv.scene import Scene
-    from flockenv.snapshot import Snapshot
-    from flockenv.state import State
     from flockenv.tasks import Task
     from flockenv.trajectory import Trajectory
 

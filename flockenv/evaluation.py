@@ -22,7 +22,7 @@ from flockenv.policy import Policy
 from flockenv.world import Step, World
 
 if TYPE_CHECKING:
-    from flockenv.snapshot import Snapshot
+    from flockenv.model.snapshot import Snapshot
     from flockenv.tasks import Task
 
 __all__ = [

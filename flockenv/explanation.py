@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 
 from flockenv.effects import EFFECTS, Effect
 from flockenv.grants import Grants
+from flockenv.model.state import WORK, State
 from flockenv.scene import Scene
 from flockenv.stability import Suggestion, suggest_dt
-from flockenv.state import WORK, State
 
 __all__ = ["Cost", "Explanation", "Row", "explain"]
 

@@ -17,7 +17,7 @@ from pydantic import Field
 
 from flockenv.core.errors import nearest_few, shown
 from flockenv.core.record import ResultRecord
-from flockenv.divergence import SimulationDiverged
+from flockenv.model.divergence import SimulationDiverged
 
 __all__ = ["VERDICTS", "Case", "Finding", "Results", "Value", "Verdict", "cases_named", "run", "trials"]
 

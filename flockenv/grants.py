@@ -20,8 +20,8 @@ from flockenv.effects.base import Me
 from flockenv.jit.decorators import Law, Vec, kernel, law, like
 from flockenv.jit.section import entry_of, record, several, vector
 from flockenv.maths.vectors import zero
+from flockenv.model.state import State
 from flockenv.scene import Scene
-from flockenv.state import State
 from flockenv.steer import Steer
 from flockenv.steering.arbitration import Arbitration, Shares, Wishes
 

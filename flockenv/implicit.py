@@ -13,7 +13,7 @@ import numpy as np
 
 from flockenv.integrators.implicit import Implicit
 from flockenv.integrators.newton import Coupling, Evaluate, NotSolvedError, coupled
-from flockenv.state import WORK, Floats, State
+from flockenv.model.state import WORK, Floats, State
 
 if TYPE_CHECKING:
     from flockenv.scene import Scene

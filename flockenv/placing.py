@@ -10,12 +10,12 @@ from numpy.typing import NDArray
 
 from flockenv.geometry.shapes import clear_of
 from flockenv.jit.section import entry
+from flockenv.model.spawn import Spawn, cells, scatter
+from flockenv.model.state import Floats, State
 from flockenv.population import Emitter
-from flockenv.spawn import Spawn, cells, scatter
-from flockenv.state import Floats, State
 
 if TYPE_CHECKING:
-    from flockenv.group import Group
+    from flockenv.model.group import Group
     from flockenv.scene import Scene
 
 __all__ = ["cells_of", "place_groups"]

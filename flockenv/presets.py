@@ -26,7 +26,7 @@ from flockenv.behaviours import (
 from flockenv.core.errors import KeyPath, key_path, nearest, refusals, shown, steps_of
 from flockenv.core.record import Record
 from flockenv.effects import Contact, Effect, ObstacleContact
-from flockenv.spread import Spread
+from flockenv.model.distribution import Spread
 from flockenv.steer import Steer
 from flockenv.steering.arbitration import Blend
 

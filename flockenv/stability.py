@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flockenv.integrators.base import Integrator
-from flockenv.state import blank
+from flockenv.model.state import blank
 
 if TYPE_CHECKING:
     from flockenv.effects.base import Effect

@@ -20,9 +20,9 @@ from flockenv.config import dump_scene
 from flockenv.core.atomic_files import deliver
 from flockenv.geometry.space import Plane
 from flockenv.measures import measure
+from flockenv.model.snapshot import Snapshot
+from flockenv.model.state import WORK, Floats, State
 from flockenv.scene import Scene
-from flockenv.snapshot import Snapshot
-from flockenv.state import WORK, Floats, State
 
 __all__ = ["MEMORY_LIMIT", "Trajectory", "record", "whole_steps"]
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from flockenv.effects.base import ties
 from flockenv.jit.cpu import LINE
-from flockenv.state import Body
+from flockenv.model.state import Body
 from flockenv.sweep import GIVEN, OWN, Parts, Table, scratch_of
 
 __all__ = ["Workspace"]

@@ -13,7 +13,6 @@ from typing import Any, Final, Literal, NamedTuple, NoReturn
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from flockenv import state as states
 from flockenv.core.errors import nearest
 from flockenv.jit.buffer_pool import Recycler
 from flockenv.jit.cpu import LINE
@@ -22,9 +21,10 @@ from flockenv.jit.section import settled
 from flockenv.jit.simd_rows import PAIR, apart
 from flockenv.jit.thread_pool import LARGEST, Choices, at_work, share
 from flockenv.maths.counter_rng import MASK, keys_of
+from flockenv.model import state as states
+from flockenv.model.snapshot import Snapshot
+from flockenv.model.state import State
 from flockenv.scene import MEMORY_LIMIT
-from flockenv.snapshot import Snapshot
-from flockenv.state import State
 from flockenv.sweep import Look, pack, scratch_record
 from flockenv.tasks import Task
 from flockenv.tasks.play import play_of, tell_of

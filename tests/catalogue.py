@@ -126,9 +126,9 @@ from flockenv.integrators import (
     SemiImplicitEuler,
     VelocityVerlet,
 )
-from flockenv.networks import Mesh
+from flockenv.model.networks import Mesh
+from flockenv.model.spawn import Spawn
 from flockenv.scene import Group, Scene
-from flockenv.spawn import Spawn
 from flockenv.steer import Steer
 from flockenv.steering import arbitration
 from flockenv.steering.arbitration import (

@@ -11,9 +11,9 @@ import pytest
 
 from flockenv.effects import Drag
 from flockenv.integrators import Integrator
+from flockenv.model.spawn import Spawn
+from flockenv.model.state import State, blank
 from flockenv.scene import Group, Scene
-from flockenv.spawn import Spawn
-from flockenv.state import State, blank
 from tests.catalogue import INTEGRATORS, Array
 
 METHODS = pytest.mark.parametrize("row", INTEGRATORS, ids=lambda row: row.name)

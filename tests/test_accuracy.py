@@ -21,9 +21,9 @@ from flockenv.behaviours import Separation
 from flockenv.cli import main
 from flockenv.effects import Effect, Fluctuation, Swing, Tether
 from flockenv.integrators import RK4, Integrator, methods_named
+from flockenv.model.spawn import Spawn
 from flockenv.render.precision import draw_precision, write_precision
 from flockenv.scene import Group, Scene
-from flockenv.spawn import Spawn
 
 ORIGIN = (0.0, 0.0)
 TINY = """\

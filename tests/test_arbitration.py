@@ -16,8 +16,8 @@ from flockenv.explanation import _shares
 from flockenv.geometry.space import Torus
 from flockenv.grants import granted, reconcile
 from flockenv.maths.counter_rng import key_of
+from flockenv.model.spawn import Spawn
 from flockenv.scene import Group, Scene
-from flockenv.spawn import Spawn
 from flockenv.steer import Steer
 from flockenv.steering.arbitration import (
     ARBITRATIONS,

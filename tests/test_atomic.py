@@ -23,9 +23,9 @@ from flockenv import gallery, validating
 from flockenv.core.atomic_files import LEFTOVERS, deliver, remove_leftovers, replacing
 from flockenv.findings import Results
 from flockenv.geometry.space import Torus
-from flockenv.group import Group
 from flockenv.jit.checked_store import Store
 from flockenv.jit.private_folder import prepared
+from flockenv.model.group import Group
 from flockenv.policy import save_policy
 from flockenv.scene import Scene
 from flockenv.trajectory import record

@@ -29,9 +29,9 @@ from flockenv.geometry.shapes import HalfSpace, Polygon
 from flockenv.geometry.space import Box, Torus
 from flockenv.integrators import VelocityVerlet
 from flockenv.measures import measure
-from flockenv.networks import Mesh
+from flockenv.model.networks import Mesh
+from flockenv.model.spawn import Spawn
 from flockenv.scene import Group, Scene
-from flockenv.spawn import Spawn
 from flockenv.tasks import Pursuit
 from flockenv.world import World
 

@@ -20,9 +20,9 @@ from flockenv.behaviours import (
     UnalignedAvoidance,
 )
 from flockenv.geometry.space import Torus
+from flockenv.model.spawn import Spawn
+from flockenv.model.state import State
 from flockenv.scene import Group, Scene
-from flockenv.spawn import Spawn
-from flockenv.state import State
 from flockenv.steer import Steer
 from flockenv.steering.arbitration import Allocation
 from flockenv.steering.vectorize import rows

@@ -32,10 +32,10 @@ from flockenv.behaviours import (
     Wander,
 )
 from flockenv.effects import Effect
+from flockenv.model.spawn import Spawn
+from flockenv.model.state import State
 from flockenv.scene import Group, Scene
-from flockenv.spawn import Spawn
 from flockenv.stability import LookaheadWarning
-from flockenv.state import State
 from flockenv.steer import Steer
 from flockenv.steering.vectorize import rows
 from tests.catalogue import EFFECTS, Array, in_dimension, scene_of

@@ -15,9 +15,9 @@ from flockenv.behaviours.crowd import UnalignedAvoidance
 from flockenv.config import load_scene
 from flockenv.geometry import polyline
 from flockenv.geometry.space import Plane, Space, Torus
+from flockenv.model.spawn import Spawn
+from flockenv.model.state import State
 from flockenv.scene import Group, Scene
-from flockenv.spawn import Spawn
-from flockenv.state import State
 from flockenv.steer import Steer
 from tests.catalogue import Array
 

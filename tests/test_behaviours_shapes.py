@@ -25,8 +25,8 @@ from flockenv.geometry.eikonal import way_table
 from flockenv.geometry.shapes import Block, Capsule, Circle, HalfSpace, Polygon, Shape, Wall
 from flockenv.geometry.targets import Target
 from flockenv.maths.grid import sampled
+from flockenv.model.spawn import Spawn
 from flockenv.scene import Group, Scene
-from flockenv.spawn import Spawn
 from flockenv.steer import Steer
 
 UNDER = (

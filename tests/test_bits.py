@@ -19,9 +19,9 @@ import numpy as np
 import pytest
 
 from flockenv.config import ConfigError, load_scene
-from flockenv.divergence import SimulationDiverged
 from flockenv.jit import cpu
 from flockenv.jit.thread_pool import threads, use_threads
+from flockenv.model.divergence import SimulationDiverged
 from flockenv.tasks import TASKS
 from flockenv.world import World
 

@@ -11,9 +11,9 @@ from flockenv.effects import Gravity
 from flockenv.geometry.space import Box
 from flockenv.integrators import RK4, Integrator, SemiImplicitEuler
 from flockenv.jit.thread_pool import use_threads
+from flockenv.model.spawn import Spawn
+from flockenv.model.state import State
 from flockenv.scene import Group, Scene
-from flockenv.spawn import Spawn
-from flockenv.state import State
 from flockenv.sweep import step_of
 from tests.catalogue import INTEGRATORS, Array, IntegratorRow
 from tests.kernels import functions_of

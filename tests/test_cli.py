@@ -29,7 +29,7 @@ from flockenv.effects import EFFECTS
 from flockenv.effects.springs import Springs
 from flockenv.explanation import Cost, Explanation
 from flockenv.integrators import INTEGRATORS, ImplicitEuler, Integrator
-from flockenv.networks import Rope
+from flockenv.model.networks import Rope
 from flockenv.policy import Policy, RandomPolicy
 from flockenv.scene import Group, Scene
 from flockenv.stability import suggest_dt

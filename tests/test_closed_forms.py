@@ -25,9 +25,9 @@ from flockenv.effects import (
     Vortex,
 )
 from flockenv.integrators import RK4, ExplicitEuler, Integrator, SemiImplicitEuler, VelocityVerlet
+from flockenv.model.spawn import Spawn
+from flockenv.model.state import State
 from flockenv.scene import Group, Scene
-from flockenv.spawn import Spawn
-from flockenv.state import State
 from tests.catalogue import Array
 
 G = 9.81

@@ -24,9 +24,9 @@ from flockenv.geometry.space import Box, Plane, Space, Torus
 from flockenv.integrators import RK4, Integrator, SemiImplicitEuler, VelocityVerlet
 from flockenv.jit.section import entry
 from flockenv.jit.thread_pool import use_threads
+from flockenv.model.spawn import Spawn
+from flockenv.model.state import Floats, State
 from flockenv.scene import Group, Scene
-from flockenv.spawn import Spawn
-from flockenv.state import Floats, State
 
 IN_TIME = ("earliest", "back_up")
 EXACT = (*IN_TIME, "impulses")

@@ -20,9 +20,9 @@ from flockenv.config import MAX_BYTES, ConfigError, dump, dump_scene, load, load
 from flockenv.effects import EFFECTS, Drag
 from flockenv.geometry.space import Box, Torus
 from flockenv.integrators import INTEGRATORS, RK4
+from flockenv.model.spawn import Spawn
 from flockenv.presets import preset
 from flockenv.scene import Group, Scene
-from flockenv.spawn import Spawn
 
 ROOT = Path(__file__).resolve().parent.parent
 SCENES = sorted(p for p in (ROOT / "configs").glob("*.yaml") if "groups:" in p.read_text())

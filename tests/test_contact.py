@@ -23,10 +23,10 @@ from flockenv.integrators import (
     Integrator,
     SemiImplicitEuler,
 )
+from flockenv.model.spawn import Spawn
+from flockenv.model.state import State
 from flockenv.scene import Group, Scene
-from flockenv.spawn import Spawn
 from flockenv.stability import CoarseContactWarning, check_contact, contact_limit
-from flockenv.state import State
 from tests.catalogue import Array
 
 STIFFNESS, MASS, SPEED = 50.0, 2.0, 1.5

@@ -10,15 +10,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from flockenv.divergence import SimulationDiverged
 from flockenv.effects import Carried, Drag, Gravity, QuadraticDrag, Springs, Tether, Uniform, Vortex, Wind
 from flockenv.integrators import ExponentialDrag, ImplicitEuler, Integrator, SemiImplicitEuler
 from flockenv.jit.thread_pool import use_threads
-from flockenv.networks import Rope
+from flockenv.model.divergence import SimulationDiverged
+from flockenv.model.networks import Rope
+from flockenv.model.spawn import Spawn
+from flockenv.model.state import State
 from flockenv.scene import Group, Scene
-from flockenv.spawn import Spawn
 from flockenv.stability import UnstableStepWarning
-from flockenv.state import State
 
 HERE = Spawn(low=(0, 0), high=(4, 4), speed=(0.2, 1.0))
 MOTION = ("x", "v", "tick")  # what was tried in vain is counted as work all the same

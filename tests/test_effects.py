@@ -23,10 +23,10 @@ from flockenv.geometry.space import Plane
 from flockenv.geometry.targets import Target
 from flockenv.integrators import RK4
 from flockenv.jit.cache_folder import cache_folder
-from flockenv.networks import Mesh
+from flockenv.model.networks import Mesh
+from flockenv.model.spawn import Spawn
+from flockenv.model.state import State
 from flockenv.scene import Group, Scene
-from flockenv.spawn import Spawn
-from flockenv.state import State
 from flockenv.steering.arbitration import ARBITRATIONS
 from tests.catalogue import (
     AMONG_ALL,

@@ -10,7 +10,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy import sparse
 
-from flockenv.elements import (
+from flockenv.model.finite_elements import (
     DENSE,
     Material,
     blocks,
@@ -22,7 +22,7 @@ from flockenv.elements import (
     solve_static,
     stiffness,
 )
-from flockenv.networks import Cloth, Jelly, Mesh, Network, Rope
+from flockenv.model.networks import Cloth, Jelly, Mesh, Network, Rope
 
 Floats = NDArray[np.float64]
 
@@ -343,7 +343,7 @@ def test_the_lowest_are_found_though_the_structure_can_move(monkeypatch: pytest.
         still = dimension * (dimension + 1) // 2
         expected = frequencies(K, M)[: still + 5]
         with monkeypatch.context() as patch:
-            patch.setattr("flockenv.elements.DENSE", 20)
+            patch.setattr("flockenv.model.finite_elements.DENSE", 20)
             lowest = frequencies(K, M, count=still + 5)
         assert lowest[:still].tolist() == [0] * still
         np.testing.assert_allclose(lowest, expected, rtol=1e-7)

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 
 from flockenv.integrators import VelocityVerlet
+from flockenv.model.spawn import Spawn
 from flockenv.scene import Group, Scene
-from flockenv.spawn import Spawn
 from tests.catalogue import users_module
 
 ROOT = Path(__file__).resolve().parent.parent

@@ -26,8 +26,8 @@ from flockenv.effects import (
 )
 from flockenv.geometry.space import Torus
 from flockenv.integrators import RK4, SemiImplicitEuler
+from flockenv.model.spawn import Spawn
 from flockenv.scene import Group, Scene
-from flockenv.spawn import Spawn
 from tests.catalogue import Array
 
 

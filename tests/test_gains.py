@@ -14,10 +14,10 @@ from flockenv.config import load_scene
 from flockenv.effects import EFFECTS, Effect
 from flockenv.geometry.space import Torus
 from flockenv.integrators import VelocityVerlet
+from flockenv.model.spawn import Spawn
+from flockenv.model.state import State
 from flockenv.scene import Group, Scene
-from flockenv.spawn import Spawn
 from flockenv.stability import UnstableStepWarning, suggest_dt
-from flockenv.state import State
 from flockenv.steer import Steer
 from tests.catalogue import Array
 

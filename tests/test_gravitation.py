@@ -18,10 +18,10 @@ from flockenv.geometry.cell_list import WORTH_ARRANGING
 from flockenv.geometry.space import Torus
 from flockenv.integrators import RK4
 from flockenv.jit.thread_pool import threads, use_threads
-from flockenv.networks import Rope
+from flockenv.model.networks import Rope
+from flockenv.model.spawn import Spawn
+from flockenv.model.state import State
 from flockenv.scene import Group, Scene
-from flockenv.spawn import Spawn
-from flockenv.state import State
 from tests.catalogue import Array, scene_of, users_module
 
 pytestmark = pytest.mark.slow

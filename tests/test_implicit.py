@@ -9,15 +9,15 @@ import pytest
 from scipy.optimize import root
 
 from flockenv.behaviours import Cohesion, Separation
-from flockenv.divergence import SimulationDiverged
 from flockenv.effects import Carried, Drag, Effect, Gravity, Springs, Vortex
 from flockenv.geometry.space import Torus
 from flockenv.integrators import INTEGRATORS, ImplicitEuler, ImplicitMidpoint
 from flockenv.integrators.newton import Coupling, NotSolvedError, coupled, solve_stage
-from flockenv.networks import Cloth, Rope
+from flockenv.model.divergence import SimulationDiverged
+from flockenv.model.networks import Cloth, Rope
+from flockenv.model.spawn import Spawn
+from flockenv.model.state import State
 from flockenv.scene import Group, Scene
-from flockenv.spawn import Spawn
-from flockenv.state import State
 from tests.catalogue import Array
 
 SOLVERS = pytest.mark.parametrize("way", ["sparse", "free"])

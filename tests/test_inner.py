@@ -13,11 +13,11 @@ from flockenv.effects import Antipode, Course, Effect, Goal, Sight
 from flockenv.geometry.space import Torus
 from flockenv.jit.decorators import Law, law
 from flockenv.jit.thread_pool import use_threads
+from flockenv.model.distribution import Spread
+from flockenv.model.spawn import Spawn
 from flockenv.population import Emitter
 from flockenv.population.places import Point
 from flockenv.scene import Group, Scene
-from flockenv.spawn import Spawn
-from flockenv.spread import Spread
 
 
 @law

@@ -28,9 +28,9 @@ from flockenv.integrators import (
 from flockenv.integrators.base import INTEGRATORS as KINDS
 from flockenv.integrators.base import Alone, Provided
 from flockenv.integrators.one_stage import OneStage
+from flockenv.model.spawn import Spawn
+from flockenv.model.state import blank
 from flockenv.scene import Group, Scene
-from flockenv.spawn import Spawn
-from flockenv.state import blank
 from tests.catalogue import INTEGRATORS, Array, IntegratorRow
 from tests.motion import METHODS, V0, WAYS, X0, Advance, at_start, first_of, motion, order, tethered
 

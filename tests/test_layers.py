@@ -187,7 +187,7 @@ def test_nothing_imports_upwards_and_heavy_packages_stay_in_their_place() -> Non
 @pytest.mark.parametrize(
     ("file", "planted", "fault"),
     [
-        ("flockenv/state.py", "from flockenv.scene import Scene", "state imports scene, which stands above it"),
+        ("flockenv/model/state.py", "from flockenv.scene import Scene", "state imports scene, which stands above it"),
         ("flockenv/scene.py", "from agents import tune", "scene imports agents, which stands above it"),
         ("flockenv/policy.py", "import torch.nn", "torch belongs in agents and sb3 and tests"),
         ("flockenv/policy.py", "def f():\n    import torch", "torch belongs in agents and sb3 and tests"),

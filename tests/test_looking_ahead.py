@@ -10,8 +10,8 @@ import pytest
 from flockenv.behaviours import Alignment, Cohesion, Separation
 from flockenv.geometry.space import Plane, Torus
 from flockenv.integrators import SemiImplicitEuler
+from flockenv.model.spawn import Spawn
 from flockenv.scene import Group, Scene
-from flockenv.spawn import Spawn
 from flockenv.sweep import Parts
 
 

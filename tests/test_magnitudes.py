@@ -11,9 +11,9 @@ import pytest
 
 from flockenv.config import ConfigError, load_scene
 from flockenv.core.magnitudes import BOUNDS
+from flockenv.model.distribution import Spread
+from flockenv.model.spawn import Spawn
 from flockenv.scene import Group, Scene
-from flockenv.spawn import Spawn
-from flockenv.spread import Spread
 
 SCENE = """
 dimension: 2

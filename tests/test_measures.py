@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 from flockenv.geometry.shapes import Circle
 from flockenv.geometry.space import Box, Plane, Space, Torus
 from flockenv.measures import MEASURES, measure, nearest_distances, order, polarisation
+from flockenv.model.spawn import Spawn
 from flockenv.scene import Group, Scene
-from flockenv.spawn import Spawn
 from flockenv.trajectory import whole_steps
 
 

@@ -15,7 +15,6 @@ import numpy as np
 import pytest
 from scipy.special import ellipj, ellipk
 
-from flockenv.divergence import SimulationDiverged
 from flockenv.integrators import (
     RK4,
     AdaptiveRK4,
@@ -30,9 +29,10 @@ from flockenv.integrators import (
 from flockenv.integrators.control import TRIES, Clock, begun, excess, judged
 from flockenv.integrators.exponential_drag import phi_functions
 from flockenv.jit.thread_pool import use_threads
+from flockenv.model.divergence import SimulationDiverged
+from flockenv.model.spawn import Spawn
+from flockenv.model.state import State, blank
 from flockenv.scene import Group, Scene
-from flockenv.spawn import Spawn
-from flockenv.state import State, blank
 from tests.catalogue import INTEGRATORS, Array, IntegratorRow
 from tests.motion import METHODS, V0, WAYS, X0, at_start, first_of, motion, order, tethered
 

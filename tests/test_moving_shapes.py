@@ -27,8 +27,8 @@ from flockenv.geometry.shapes.row_header import body_of, bound_of, shift_of, vel
 from flockenv.geometry.space import Torus
 from flockenv.jit.section import entry
 from flockenv.measures import measure
+from flockenv.model.spawn import Spawn
 from flockenv.scene import Group, Scene
-from flockenv.spawn import Spawn
 from flockenv.trajectory import Trajectory
 
 U = np.array([-0.7, 0.4])

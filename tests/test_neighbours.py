@@ -14,9 +14,9 @@ from flockenv.geometry.cell_list import count_cells, order_records
 from flockenv.geometry.space import Box, Space, Torus
 from flockenv.geometry.spatial_sort import TILE, count_tiles
 from flockenv.jit.section import entry
+from flockenv.model.spawn import Spawn
+from flockenv.model.state import State
 from flockenv.scene import Group, Scene
-from flockenv.spawn import Spawn
-from flockenv.state import State
 from tests.catalogue import NEAREST, NEAREST_MANY, VARIANTS, Array, Variant, everything, scene_of
 
 DT = 2.0**-10

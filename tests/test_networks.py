@@ -10,8 +10,8 @@ import pytest
 from numpy.typing import NDArray
 from pydantic import TypeAdapter
 
-from flockenv.elements import contents
-from flockenv.networks import BEND, EDGE, SHEAR, AnyNetwork, Cloth, Jelly, Mesh, Network, Rope
+from flockenv.model.finite_elements import contents
+from flockenv.model.networks import BEND, EDGE, SHEAR, AnyNetwork, Cloth, Jelly, Mesh, Network, Rope
 
 Floats = NDArray[np.float64]
 

@@ -17,9 +17,9 @@ from flockenv.effects import Gravity
 from flockenv.geometry.shapes import Block, Capsule, HalfSpace, Wall
 from flockenv.geometry.space import Box, Plane, Space
 from flockenv.integrators import VelocityVerlet
+from flockenv.model.spawn import Spawn
+from flockenv.model.state import Floats, State
 from flockenv.scene import Group, Scene
-from flockenv.spawn import Spawn
-from flockenv.state import Floats, State
 
 pytestmark = pytest.mark.filterwarnings("ignore::flockenv.constraints.collisions.UnsolvedContactsWarning")
 

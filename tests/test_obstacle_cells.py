@@ -11,8 +11,8 @@ from flockenv.behaviours import AvoidObstacles, FollowWall, ForceField, Obstacle
 from flockenv.effects.base import Effect
 from flockenv.geometry.shapes import Block, Capsule, Shape, Sway
 from flockenv.geometry.space import Box, Plane, Torus
+from flockenv.model.spawn import Spawn
 from flockenv.scene import Group, Scene
-from flockenv.spawn import Spawn
 from flockenv.sweep import met_obstacles
 
 SIDE = 40.0

@@ -11,16 +11,16 @@ import pytest
 from numba import njit
 
 from flockenv.behaviours import Alignment, Cohesion, Separation
-from flockenv.divergence import SimulationDiverged
 from flockenv.effects.base import Effect, Me, Other, ties
 from flockenv.geometry.cell_list import WORTH_ARRANGING
 from flockenv.geometry.space import Plane, Torus
-from flockenv.group import Group
 from flockenv.integrators import RK4
 from flockenv.jit.thread_pool import threads, use_threads
+from flockenv.model.divergence import SimulationDiverged
+from flockenv.model.group import Group
+from flockenv.model.spawn import Spawn
+from flockenv.model.state import State
 from flockenv.scene import Scene
-from flockenv.spawn import Spawn
-from flockenv.state import State
 from flockenv.steering.others import ONE_PLACE
 from flockenv.sweep.pair_plan import pairs_of
 from flockenv.sweep.pair_sums import begin_sums

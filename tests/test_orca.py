@@ -10,8 +10,8 @@ import pytest
 from numba import njit
 
 from flockenv.behaviours import Orca
+from flockenv.model.spawn import Spawn
 from flockenv.scene import Group, Scene
-from flockenv.spawn import Spawn
 from flockenv.steering.orca import SLOT, half_plane, orca
 from flockenv.steering.vectorize import rows
 from tests.catalogue import Array, rotation

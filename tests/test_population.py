@@ -11,15 +11,17 @@ from typing import Any
 import numpy as np
 import pytest
 
-from flockenv.appearance import Appearance
 from flockenv.behaviours import Separation
 from flockenv.config import dump_scene, load_scene
-from flockenv.divergence import SimulationDiverged
 from flockenv.effects import Gravity
 from flockenv.geometry.shapes import Block, Capsule, Circle, HalfSpace, Polygon, Shape, Wall
 from flockenv.geometry.space import Box, Plane, Space, Torus
 from flockenv.integrators import ImplicitEuler, SemiImplicitEuler
 from flockenv.jit.thread_pool import use_threads
+from flockenv.model.appearance import Appearance
+from flockenv.model.divergence import SimulationDiverged
+from flockenv.model.spawn import Spawn
+from flockenv.model.state import State
 from flockenv.population import (
     Ageing,
     BoxPlace,
@@ -40,8 +42,6 @@ from flockenv.render import draw, write_replay
 from flockenv.render.replay import Group as ReplayGroup
 from flockenv.render.replay import Panel
 from flockenv.scene import Group, Scene
-from flockenv.spawn import Spawn
-from flockenv.state import State
 from flockenv.sweep import step_of
 from flockenv.trajectory import record
 

@@ -19,13 +19,13 @@ from flockenv.behaviours import Alignment, Cohesion, Separation
 from flockenv.config import load_scene
 from flockenv.effects import Effect, Gravitation
 from flockenv.geometry.space import Plane, Torus
-from flockenv.group import Group
 from flockenv.jit import cpu, pipeline
 from flockenv.jit.decorators import kernel
 from flockenv.jit.intrinsics import unaliased
 from flockenv.jit.pipeline import Whole
+from flockenv.model.group import Group
+from flockenv.model.spawn import Spawn
 from flockenv.scene import Scene
-from flockenv.spawn import Spawn
 from flockenv.tasks import TASKS, Flock, Task
 from flockenv.tasks.sight import block_ways, compass
 from flockenv.world import World

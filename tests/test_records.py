@@ -10,8 +10,8 @@ import pytest
 from flockenv.behaviours import Separation
 from flockenv.effects import Drag
 from flockenv.geometry.space import Box
+from flockenv.model.spawn import Spawn
 from flockenv.scene import Group, Scene
-from flockenv.spawn import Spawn
 from flockenv.tasks import Pursuit
 
 SCENE = Scene(space=Box(size=(10, 10)), groups=(Group(count=3),), effects=(Drag(rate=0.5),))

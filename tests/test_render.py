@@ -18,13 +18,13 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from flockenv.networks import Cloth
+from flockenv.model.networks import Cloth
+from flockenv.model.snapshot import ROLES, Mark, Snapshot
+from flockenv.model.spawn import Spawn
 from flockenv.render import Group, Panel, Window, draw, write_gif, write_png, write_replay
 from flockenv.render.palette import ROLE_COLOURS, rgb
 from flockenv.scene import Group as SceneGroup
 from flockenv.scene import Scene
-from flockenv.snapshot import ROLES, Mark, Snapshot
-from flockenv.spawn import Spawn
 
 
 def shot(pos: Any = ((5.0, 5.0),), vel: Any = None, **fields: Any) -> Snapshot:
@@ -305,7 +305,7 @@ def test_importing_the_package_imports_no_backend_and_drawing_needs_no_display()
     program = (
         "import sys, flockenv.render; loaded = lambda *names: [n for n in names if n in sys.modules];"
         "assert not loaded('PIL', 'matplotlib', 'pygame'), loaded('PIL', 'matplotlib', 'pygame');"
-        "from flockenv.render import draw, write_gif, write_replay; from flockenv.snapshot import Snapshot;"
+        "from flockenv.render import draw, write_gif, write_replay; from flockenv.model.snapshot import Snapshot;"
         "draw(Snapshot(0, [[1, 1]], [[1, 0]], [True], [1], ['agent'], [[2, 2]], [1], (), [0, 0], [3, 3], True, 'x'));"
         "assert not loaded('matplotlib', 'pygame', 'torch'), loaded('matplotlib', 'pygame', 'torch')"
     )

@@ -17,11 +17,11 @@ from flockenv.constraints import Rods, UnmetWarning
 from flockenv.effects import Drag, Gravity
 from flockenv.geometry.space import Torus
 from flockenv.integrators import RK4, ExplicitEuler, ImplicitMidpoint, Integrator, SemiImplicitEuler, VelocityVerlet
-from flockenv.networks import Cloth, Rope
+from flockenv.model.networks import Cloth, Rope
+from flockenv.model.spawn import Spawn
+from flockenv.model.state import State
 from flockenv.population import Decay, Emitter, Point
 from flockenv.scene import Group, Scene
-from flockenv.spawn import Spawn
-from flockenv.state import State
 from tests.catalogue import Array
 
 G = 9.81

@@ -10,11 +10,11 @@ import pytest
 from flockenv.behaviours import Alignment, Cohesion, Separation
 from flockenv.effects import Attraction, Drag, Springs, Tether
 from flockenv.geometry.space import Box, Torus
-from flockenv.networks import Mesh, Rope
-from flockenv.rounding import FARTHEST
+from flockenv.model.float_range import FARTHEST
+from flockenv.model.networks import Mesh, Rope
+from flockenv.model.spawn import Spawn
+from flockenv.model.state import State
 from flockenv.scene import Group, Scene
-from flockenv.spawn import Spawn
-from flockenv.state import State
 
 HERE = (Group(count=3, spawn=Spawn(low=(0, 0), high=(1, 1))),)
 FAR = 3e4

@@ -22,9 +22,9 @@ from flockenv.geometry.shapes import Block, Circle
 from flockenv.geometry.space import Box, Plane, Space, Torus
 from flockenv.integrators import RK4, AdaptiveRK4, SemiImplicitEuler
 from flockenv.jit.cache_folder import cache_folder
+from flockenv.model.spawn import Spawn
+from flockenv.model.state import State
 from flockenv.scene import Group, Scene
-from flockenv.spawn import Spawn
-from flockenv.state import State
 from flockenv.sweep import scratch_of
 from flockenv.workspace import Workspace
 from tests.catalogue import INTEGRATORS, TETHER, VARIANTS, Array, Variant, everything, scene_of, users_module

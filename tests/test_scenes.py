@@ -14,8 +14,8 @@ from scipy.spatial import cKDTree
 from flockenv.config import load_scene
 from flockenv.constraints.collisions import UnsolvedContactsWarning
 from flockenv.geometry.space import Box
+from flockenv.model.state import State
 from flockenv.scene import Scene
-from flockenv.state import State
 from tests.catalogue import Array
 
 ROOT = Path(__file__).parent.parent

@@ -12,11 +12,11 @@ from flockenv.effects import Fear, Grazing, Intention, Libido, Metabolism, Preda
 from flockenv.evaluation import rollout, worlds_for
 from flockenv.grants import granted, reconcile
 from flockenv.jit.thread_pool import use_threads
+from flockenv.model.spawn import Spawn
+from flockenv.model.state import State
 from flockenv.players.rules import player
 from flockenv.population import Threshold
 from flockenv.scene import Group, Scene
-from flockenv.spawn import Spawn
-from flockenv.state import State
 from flockenv.steer import Steer
 from flockenv.steering import motivation
 from flockenv.steering.arbitration import Intentions

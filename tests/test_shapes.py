@@ -25,8 +25,8 @@ from flockenv.geometry.shapes import (
     clear_of,
 )
 from flockenv.geometry.space import Torus
+from flockenv.model.spawn import Spawn
 from flockenv.scene import Group, Scene
-from flockenv.spawn import Spawn
 
 rolling = Circle(centre=(1, 1), radius=0.3, velocity=(1, 0))
 L = Polygon(vertices=((0, 0), (3, 0), (3, 1), (1, 1), (1, 3), (0, 3)))

@@ -14,9 +14,9 @@ from flockenv.effects.base import EFFECTS, Effect, Me, Members
 from flockenv.geometry.space import Plane, Torus
 from flockenv.jit.decorators import Law, Vec, law
 from flockenv.jit.thread_pool import use_threads
+from flockenv.model.spawn import Spawn
+from flockenv.model.state import State
 from flockenv.scene import Group, Scene
-from flockenv.spawn import Spawn
-from flockenv.state import State
 from flockenv.steering.vectorize import rows
 from tests.catalogue import Array
 

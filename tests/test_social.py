@@ -31,9 +31,9 @@ from flockenv.geometry.shapes import Block, Polygon, Shape, Wall
 from flockenv.geometry.space import Torus
 from flockenv.integrators import ExplicitEuler, SemiImplicitEuler
 from flockenv.maths.approximations import atan2, exp, nearest_whole
+from flockenv.model.spawn import Spawn
 from flockenv.presets import ALIASES, PRESETS, preset
 from flockenv.scene import Group, Scene
-from flockenv.spawn import Spawn
 from flockenv.stability import CoarseContactWarning, UnstableStepWarning, suggest_dt
 from flockenv.steer import Steer
 from flockenv.steering.vectorize import rows

@@ -14,8 +14,8 @@ from flockenv.behaviours import Separation
 from flockenv.effects import Drag
 from flockenv.geometry import space as space_module
 from flockenv.geometry.space import Box, Plane, Space, Torus
+from flockenv.model.spawn import Spawn
 from flockenv.scene import Group, Scene
-from flockenv.spawn import Spawn
 from flockenv.steering.vectorize import rows
 from tests.catalogue import SPACES, everything, scene_of
 

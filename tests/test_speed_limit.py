@@ -11,9 +11,9 @@ from flockenv.accuracy import Problem, measure
 from flockenv.accuracy.results import Curve
 from flockenv.effects import SpeedLimit, Uniform
 from flockenv.integrators import RK4
+from flockenv.model.spawn import Spawn
+from flockenv.model.state import State
 from flockenv.scene import Group, Scene
-from flockenv.spawn import Spawn
-from flockenv.state import State
 
 V, B, MASS = 1.5, 4.0, 2.0
 PUSH = (2.0, 1.5)  # N, 2.5 together

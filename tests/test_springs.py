@@ -12,14 +12,14 @@ import scipy.linalg
 from flockenv.behaviours import Cohesion, Separation
 from flockenv.effects import AngularSprings, Elastic, Gravity, Springs
 from flockenv.effects.base import all_masses
-from flockenv.elements import Material, freedoms, frequencies, mass, solve_static, stiffness
 from flockenv.geometry.space import Torus
 from flockenv.integrators import RK4, ImplicitEuler, ImplicitMidpoint
 from flockenv.jit.thread_pool import use_threads
-from flockenv.networks import Cloth, Mesh, Rope
+from flockenv.model.finite_elements import Material, freedoms, frequencies, mass, solve_static, stiffness
+from flockenv.model.networks import Cloth, Mesh, Rope
+from flockenv.model.spawn import Spawn
+from flockenv.model.state import State
 from flockenv.scene import Group, Scene
-from flockenv.spawn import Spawn
-from flockenv.state import State
 from flockenv.steer import Steer
 
 DIMENSIONS = pytest.mark.parametrize("dimension", [2, 3])

@@ -12,7 +12,6 @@ import pytest
 
 from flockenv.behaviours import Separation
 from flockenv.config import load_scene
-from flockenv.divergence import SimulationDiverged
 from flockenv.effects import AngularSprings, Drag, Effect, Elastic, Gravity, Springs, Tether
 from flockenv.explanation import explain
 from flockenv.integrators import (
@@ -30,11 +29,12 @@ from flockenv.integrators import (
     SemiImplicitEuler,
     VelocityVerlet,
 )
-from flockenv.networks import Cloth, Jelly, Mesh, Network, Rope
+from flockenv.model.divergence import SimulationDiverged
+from flockenv.model.networks import Cloth, Jelly, Mesh, Network, Rope
+from flockenv.model.spawn import Spawn
+from flockenv.model.state import blank
 from flockenv.scene import Group, Scene
-from flockenv.spawn import Spawn
 from flockenv.stability import UnstableStepWarning, amplification, drag_limit, limit, suggest_dt
-from flockenv.state import blank
 from tests.catalogue import INTEGRATORS, Array
 
 CHAIN = Rope(links=21, length=2.1, pinned=("ends",))  # 20 free masses

@@ -8,7 +8,6 @@ from typing import Any
 
 import pytest
 
-from flockenv.divergence import SimulationDiverged
 from flockenv.integrators import (
     INTEGRATORS,
     RK4,
@@ -22,6 +21,7 @@ from flockenv.integrators import (
     VelocityVerlet,
     methods_named,
 )
+from flockenv.model.divergence import SimulationDiverged
 from flockenv.stability import UnstableStepWarning
 from flockenv.stress import CASES, Case, Finding, Results, Value, cases_named, fingerprint, run, usual_methods
 from flockenv.stress.gatherings import GATHERINGS

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from flockenv.config import load_scene
 from flockenv.jit.thread_pool import use_threads
+from flockenv.model.state import State
 from flockenv.scene import Scene
-from flockenv.state import State
 
 SCENE = """
 dimension: {dimension}

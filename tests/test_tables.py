@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from flockenv import scene as scenes
+from flockenv.model.spawn import Spawn
 from flockenv.scene import Group, Scene
-from flockenv.spawn import Spawn
 from flockenv.steer import Steer
 from flockenv.steering.arbitration import Blend
 from flockenv.sweep import step_of

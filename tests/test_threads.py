@@ -30,9 +30,9 @@ from flockenv.integrators import ImplicitEuler
 from flockenv.jit import thread_pool
 from flockenv.jit.cache_folder import cache_folder
 from flockenv.jit.thread_pool import share, threads, use_threads
+from flockenv.model.spawn import Spawn
+from flockenv.model.state import State
 from flockenv.scene import Group, Scene
-from flockenv.spawn import Spawn
-from flockenv.state import State
 from flockenv.tasks import Flock
 from flockenv.world import World
 from tests.catalogue import VARIANTS, Variant

@@ -16,10 +16,10 @@ from flockenv.geometry.space import Box, Torus
 from flockenv.integrators import RK4
 from flockenv.jit.thread_pool import threads, use_threads
 from flockenv.maths.heading import GRAVITY
+from flockenv.model.spawn import Spawn
+from flockenv.model.state import State
 from flockenv.scene import Group, Scene
-from flockenv.spawn import Spawn
 from flockenv.stability import LookaheadWarning
-from flockenv.state import State
 from flockenv.steer import Steer
 from flockenv.tasks import Obstacles
 from flockenv.trajectory import record

@@ -15,9 +15,9 @@ from flockenv.experiments.vicsek import SEEN, bound, order, scene_of
 from flockenv.geometry.space import Torus
 from flockenv.integrators import ExplicitEuler, Heun, SemiImplicitEuler
 from flockenv.maths.counter_rng import _mix
+from flockenv.model.spawn import Spawn
+from flockenv.model.state import State
 from flockenv.scene import Group, Scene
-from flockenv.spawn import Spawn
-from flockenv.state import State
 from tests.catalogue import Array
 
 ROOT = Path(__file__).resolve().parent.parent

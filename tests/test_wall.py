@@ -10,8 +10,8 @@ import pytest
 from flockenv.effects import Drag, Uniform, WallRepulsion
 from flockenv.geometry.space import Box, Torus
 from flockenv.integrators import RK4
+from flockenv.model.spawn import Spawn
 from flockenv.scene import Group, Scene
-from flockenv.spawn import Spawn
 
 MASS = 80.0
 

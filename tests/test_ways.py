@@ -17,11 +17,11 @@ from flockenv.geometry.shapes import Block, Circle, HalfSpace, Polygon, Wall
 from flockenv.geometry.space import Box
 from flockenv.geometry.targets import Target
 from flockenv.jit.thread_pool import use_threads
+from flockenv.model.distribution import Spread
+from flockenv.model.spawn import Spawn
 from flockenv.population import Drain, Emitter
 from flockenv.population.places import Point
 from flockenv.scene import Group, Scene
-from flockenv.spawn import Spawn
-from flockenv.spread import Spread
 from flockenv.steer import Steer
 from flockenv.ways import NoWayWarning
 

@@ -146,8 +146,8 @@ def boids(agents: int, edge: float, reach: float, apart: float, about: str) -> C
     from benchmarks.floors import of_scene
     from flockenv.behaviours import Alignment, Cohesion, Separation
     from flockenv.geometry.space import Torus
+    from flockenv.model.spawn import Spawn
     from flockenv.scene import Group, Scene
-    from flockenv.spawn import Spawn
 
     scene = Scene(
         space=Torus(size=(edge, edge)),
@@ -176,9 +176,9 @@ def social_corridor(agents: int) -> Case:
     """A crowd under the preset of 2000 in a corridor of 300 m, a person per square metre at first."""
     from flockenv.effects import Course
     from flockenv.geometry.shapes import Wall
+    from flockenv.model.spawn import Spawn
     from flockenv.presets import preset
     from flockenv.scene import Group, Scene
-    from flockenv.spawn import Spawn
 
     wide, long = 32.0, 300.0  # m
     people = Group(
@@ -202,9 +202,9 @@ def social_corridor(agents: int) -> Case:
 def social_field(agents: int) -> Case:
     """A crowd under the preset of 2009 in the open, a person per square metre at first, all the same way."""
     from flockenv.effects import Course
+    from flockenv.model.spawn import Spawn
     from flockenv.presets import preset
     from flockenv.scene import Group, Scene
-    from flockenv.spawn import Spawn
 
     edge = math.sqrt(agents)
     people = Group(

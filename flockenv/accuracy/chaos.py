@@ -10,7 +10,7 @@ import numpy as np
 
 from flockenv.accuracy.problem import FINER, Problem
 from flockenv.integrators import RK4
-from flockenv.state import State
+from flockenv.model.state import State
 
 __all__ = ["PERTURBATION", "Sensitivity", "find_sensitivity"]
 

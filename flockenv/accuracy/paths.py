@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from flockenv.state import WORK
+from flockenv.model.state import WORK
 
 __all__ = ["Floats", "Path", "apart", "farthest", "largest", "reach", "unmatched"]
 

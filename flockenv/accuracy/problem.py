@@ -16,10 +16,10 @@ from flockenv.constraints import Collisions, UnmetWarning
 from flockenv.constraints.collisions import UnsolvedContactsWarning
 from flockenv.effects import Effect
 from flockenv.integrators import RK4, Integrator
+from flockenv.model.state import State, blank
 from flockenv.population import Crowding, Decay
 from flockenv.scene import Scene
 from flockenv.stability import CoarseContactWarning, UnstableStepWarning, suggest_dt
-from flockenv.state import State, blank
 
 __all__ = ["Exact", "Problem"]
 

@@ -18,9 +18,9 @@ from flockenv.core.errors import nearest, shown
 from flockenv.effects import Attraction, Carried, Drag, Effect, Gravity, QuadraticDrag, Swing, Tether, Uniform, Vortex
 from flockenv.geometry.shapes import HalfSpace
 from flockenv.geometry.space import Torus
-from flockenv.networks import Rope
+from flockenv.model.networks import Rope
+from flockenv.model.spawn import Spawn
 from flockenv.scene import Group, Scene
-from flockenv.spawn import Spawn
 
 __all__ = ["SUITE", "problems_named"]
 

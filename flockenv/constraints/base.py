@@ -13,7 +13,7 @@ from collections.abc import Callable
 from typing import Any
 
 from flockenv.core.record import Record
-from flockenv.state import Floats, State
+from flockenv.model.state import Floats, State
 
 __all__ = ["CONSTRAINTS", "Constraint", "Settler"]
 

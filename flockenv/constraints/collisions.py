@@ -20,7 +20,7 @@ from flockenv.geometry.cell_list import MAX_RANGES
 from flockenv.geometry.shapes import HalfSpace, packed
 from flockenv.geometry.space import Box, Torus
 from flockenv.jit.section import entry
-from flockenv.state import WORK, Floats, State
+from flockenv.model.state import WORK, Floats, State
 
 __all__ = ["Collisions", "UnsolvedContactsWarning"]
 

@@ -14,8 +14,8 @@ from flockenv.geometry.space import Torus
 from flockenv.jit.decorators import finite, kernel, like
 from flockenv.jit.section import entry
 from flockenv.maths.approximations import nearest_whole
-from flockenv.networks import EDGE
-from flockenv.state import Floats, State
+from flockenv.model.networks import EDGE
+from flockenv.model.state import Floats, State
 
 __all__ = ["Rods", "UnmetWarning", "hold"]
 

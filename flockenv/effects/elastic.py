@@ -10,12 +10,12 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from flockenv.effects.base import Bonds, Effect, Me, all_masses, network_of
-from flockenv.elements import Material, blocks, stiffness
 from flockenv.jit.decorators import Law, Vec, law
 from flockenv.maths.vectors import add, scale, sub
+from flockenv.model.finite_elements import Material, blocks, stiffness
 
 if TYPE_CHECKING:
-    from flockenv.state import State
+    from flockenv.model.state import State
 
 __all__ = ["Elastic"]
 

@@ -24,7 +24,7 @@ from pydantic import Field, model_validator
 from flockenv.effects.base import Effect, Me, Vector
 from flockenv.jit.decorators import OPTIONS, Law, Vec, law, like
 from flockenv.maths.vectors import add, dot, lateral, scale, sub, unit
-from flockenv.state import State
+from flockenv.model.state import State
 
 __all__ = ["Carried", "Sink", "Source", "Uniform", "Vortex", "Wind"]
 

@@ -18,7 +18,7 @@ from pydantic import Field
 from flockenv.effects.base import Effect, Far, Me, all_masses
 from flockenv.jit.decorators import Law, Vec, law
 from flockenv.maths.vectors import scale
-from flockenv.state import State
+from flockenv.model.state import State
 
 __all__ = ["Gravitation", "InverseSquare"]
 

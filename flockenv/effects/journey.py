@@ -14,7 +14,7 @@ from flockenv.effects.way import Around, slowed
 from flockenv.geometry.targets import Target, passed, row_size, to_target
 from flockenv.jit.decorators import Law, Vec, law, like
 from flockenv.maths.vectors import norm, scale, select, sub, unit, zero
-from flockenv.spread import Spread, drawn
+from flockenv.model.distribution import Spread, drawn
 from flockenv.ways import towards
 
 __all__ = ["Journey", "Stage", "onwards", "place_kept"]

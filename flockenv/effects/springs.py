@@ -16,10 +16,10 @@ from pydantic import Field
 from flockenv.effects.base import Bonds, Effect, Me, all_masses, network_of
 from flockenv.jit.decorators import Law, Vec, law, like
 from flockenv.maths.vectors import add, axis, dot, norm, scale, select, sub
-from flockenv.networks import BEND, SHEAR
+from flockenv.model.networks import BEND, SHEAR
 
 if TYPE_CHECKING:
-    from flockenv.state import State
+    from flockenv.model.state import State
 
 __all__ = ["AngularSprings", "Springs"]
 

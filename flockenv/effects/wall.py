@@ -14,7 +14,7 @@ from flockenv.effects.base import Effect, Me, Vector
 from flockenv.geometry.space import Torus
 from flockenv.jit.decorators import Law, Vec, law
 from flockenv.maths.vectors import dot, scale, sub, unit
-from flockenv.state import State
+from flockenv.model.state import State
 
 __all__ = ["WallRepulsion"]
 

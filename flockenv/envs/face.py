@@ -16,8 +16,8 @@ from flockenv.core.errors import nearest
 from flockenv.tasks import Task
 
 if TYPE_CHECKING:
+    from flockenv.model.snapshot import Snapshot
     from flockenv.render import Window
-    from flockenv.snapshot import Snapshot
 
 __all__ = [
     "RENDER_MODES",

@@ -11,7 +11,7 @@ import numpy as np
 from flockenv.experiments.base import Trial, depth
 from flockenv.experiments.plan import SteerPlan
 from flockenv.grants import Granted, Grants
-from flockenv.state import Floats
+from flockenv.model.state import Floats
 
 __all__ = ["COLUMNS", "SHOWN", "more_columns", "trial"]
 

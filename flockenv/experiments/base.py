@@ -13,8 +13,8 @@ from pydantic import Field
 
 from flockenv.core.record import ResultRecord
 from flockenv.jit.sources import laws_digest
+from flockenv.model.state import Floats, State
 from flockenv.scene import Scene
-from flockenv.state import Floats, State
 
 __all__ = ["Cell", "Experiment", "Results", "Trial", "depth", "run"]
 

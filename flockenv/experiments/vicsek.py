@@ -22,8 +22,8 @@ from flockenv.experiments.plan import Plan
 from flockenv.geometry.space import Torus
 from flockenv.integrators import Integrator, SemiImplicitEuler
 from flockenv.measures import polarisation
+from flockenv.model.spawn import Spawn
 from flockenv.scene import AnyIntegrator, Group, Scene
-from flockenv.spawn import Spawn
 
 __all__ = ["SEEN", "Flock", "NoisePlan", "bound", "order", "scene_of"]
 

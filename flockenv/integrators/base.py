@@ -23,7 +23,7 @@ from numba.extending import overload
 from flockenv.core.errors import nearest, shown
 from flockenv.core.record import Record
 from flockenv.jit.decorators import OPTIONS
-from flockenv.state import WORK, Floats, State
+from flockenv.model.state import WORK, Floats, State
 
 __all__ = [
     "INTEGRATORS", "SUBSTEPS", "Alone", "Integrator", "Method", "Provided", "carried", "methods_named",

@@ -8,7 +8,7 @@ import numpy as np
 
 from flockenv.integrators.base import Integrator
 from flockenv.integrators.newton import Coupling, Evaluate, NotSolvedError, Stage, solve_stage
-from flockenv.state import Floats
+from flockenv.model.state import Floats
 
 __all__ = ["Implicit"]
 

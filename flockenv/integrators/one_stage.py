@@ -6,7 +6,7 @@ from typing import Any, ClassVar
 
 from flockenv.integrators.base import Integrator
 from flockenv.jit.decorators import python_of
-from flockenv.state import Floats
+from flockenv.model.state import Floats
 
 __all__ = ["OneStage"]
 

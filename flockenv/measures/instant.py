@@ -8,8 +8,8 @@ import numpy as np
 
 from flockenv.geometry.shapes import clear_of
 from flockenv.measures.order import nearest_distances, polarisation
+from flockenv.model.state import State
 from flockenv.scene import Scene
-from flockenv.state import State
 
 __all__ = ["MEASURES", "measure"]
 

@@ -15,8 +15,8 @@ from flockenv.jit.decorators import Vec, kernel, law
 from flockenv.maths.counter_rng import uniform
 from flockenv.maths.heading import face_one
 from flockenv.maths.vectors import add, cross, dot, scale, select, sub, unit
+from flockenv.model.state import WORK
 from flockenv.population.near import count_near, sort_living
-from flockenv.state import WORK
 
 __all__ = ["births", "due"]
 

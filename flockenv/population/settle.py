@@ -12,12 +12,12 @@ from numpy.typing import NDArray
 from flockenv.geometry.shapes.table import packed
 from flockenv.geometry.space import Box
 from flockenv.jit.section import entry
+from flockenv.model.state import Floats, State
 from flockenv.population.births import PLACE, births
 from flockenv.population.deaths import crowding, drain, passing, reaching
 from flockenv.population.emitters import Emitter
 from flockenv.population.places import Clearing, Surface
 from flockenv.population.sinks import Crowding, Drain, Sink, Threshold
-from flockenv.state import Floats, State
 
 __all__ = ["NUMBERS", "beget", "settler"]
 

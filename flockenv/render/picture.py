@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
+from flockenv.model.snapshot import Floats, Mark, Snapshot
 from flockenv.render.palette import (
     ARROW,
     BODY_DISC,
@@ -31,7 +32,6 @@ from flockenv.render.palette import (
     rgb,
 )
 from flockenv.render.view import View, look
-from flockenv.snapshot import Floats, Mark, Snapshot
 
 __all__ = ["Pixels", "draw"]
 

@@ -21,10 +21,10 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from flockenv.appearance import Appearance
 from flockenv.core.atomic_files import replacing
+from flockenv.model.appearance import Appearance
+from flockenv.model.snapshot import Floats, Mark, Snapshot
 from flockenv.render.palette import ARROW, BODY_DISC, BOND, DART, DART_REACH, JUMP, PAPER, POINT, ROLE_COLOURS, WAY
-from flockenv.snapshot import Floats, Mark, Snapshot
 
 __all__ = ["Group", "Panel", "write_replay"]
 

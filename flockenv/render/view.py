@@ -8,7 +8,7 @@ from typing import Final
 
 import numpy as np
 
-from flockenv.snapshot import Floats, Snapshot
+from flockenv.model.snapshot import Floats, Snapshot
 
 __all__ = ["View", "look"]
 

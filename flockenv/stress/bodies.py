@@ -13,15 +13,15 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
 
-from flockenv.divergence import SimulationDiverged
 from flockenv.effects import Attraction, Carried, Drag, Gravity, Swing, Tether, Uniform, Vortex, WallRepulsion
 from flockenv.findings import Case, Value
 from flockenv.geometry.space import Box
 from flockenv.integrators import Adaptive, Integrator
+from flockenv.model.divergence import SimulationDiverged
+from flockenv.model.spawn import Spawn
+from flockenv.model.state import State
 from flockenv.scene import Group, Scene
-from flockenv.spawn import Spawn
 from flockenv.stability import amplification, limit
-from flockenv.state import State
 from flockenv.stress.case import quietly, started
 
 __all__ = ["BODIES"]

@@ -12,9 +12,9 @@ import numpy as np
 from flockenv.effects import Gravity, Springs
 from flockenv.findings import Case, Value
 from flockenv.integrators import Integrator
-from flockenv.networks import Cloth, Network, Rope
+from flockenv.model.networks import Cloth, Network, Rope
+from flockenv.model.state import State
 from flockenv.scene import Group, Scene
-from flockenv.state import State
 
 __all__ = ["BONDED"]
 

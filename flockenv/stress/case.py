@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 
+from flockenv.model.state import State
 from flockenv.scene import Scene
 from flockenv.stability import CoarseContactWarning, UnstableStepWarning
-from flockenv.state import State
 
 __all__ = ["TOO_LONG", "quietly", "started"]
 

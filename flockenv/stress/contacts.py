@@ -13,14 +13,14 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from flockenv.divergence import SimulationDiverged
 from flockenv.effects import Contact, ObstacleContact
 from flockenv.findings import Case, Value
 from flockenv.integrators import Integrator
+from flockenv.model.divergence import SimulationDiverged
+from flockenv.model.spawn import Spawn
+from flockenv.model.state import State
 from flockenv.scene import Group, Scene
-from flockenv.spawn import Spawn
 from flockenv.stability import CoarseContactWarning, contact_limit
-from flockenv.state import State
 from flockenv.stress.case import TOO_LONG, quietly, started
 
 __all__ = ["CONTACTS", "DTS", "Hit", "hits"]

@@ -15,8 +15,8 @@ from flockenv.findings import Case, Value
 from flockenv.geometry.shapes import Block, Circle, Polygon
 from flockenv.integrators import Integrator
 from flockenv.jit.thread_pool import threads, use_threads
+from flockenv.model.spawn import Spawn
 from flockenv.scene import Group, Scene
-from flockenv.spawn import Spawn
 from flockenv.steer import Steer
 from flockenv.steering.arbitration import Allocation, Blend
 from flockenv.stress.solids import Response, batch, overlap, per_response, solid

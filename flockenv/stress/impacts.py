@@ -13,9 +13,9 @@ import numpy as np
 from flockenv.findings import Value
 from flockenv.geometry.shapes import Block, HalfSpace, Shape, Wall
 from flockenv.integrators import Integrator
+from flockenv.model.spawn import Spawn
+from flockenv.model.state import State
 from flockenv.scene import Scene
-from flockenv.spawn import Spawn
-from flockenv.state import State
 from flockenv.stress.solids import Floats, G, Response, batch, overlap, per_response, solid
 
 __all__ = ["IMPACTS"]
@@ -251,7 +251,7 @@ def gas(method: Integrator, response: Response, offset: float = 0.0, dtype: str 
 
 
 def far_away(method: Integrator, response: Response) -> Value:
-    """The same gas at 0, 1e4 and 1e7 m for .3 s, in float64; float32 refuses both (flockenv/rounding.py)."""
+    """The same gas at 0, 1e4 and 1e7 m for .3 s, in float64; float32 refuses both (flockenv/model/float_range.py)."""
     place = np.stack(np.meshgrid(np.linspace(-1.2, 1.2, 6), np.linspace(-1.2, 1.2, 4)), axis=-1).reshape(24, 2)
     rng = np.random.default_rng(0)
     place, vel = place + rng.uniform(-0.05, 0.05, place.shape), rng.normal(size=place.shape)

@@ -16,9 +16,9 @@ from flockenv.effects import Gravity
 from flockenv.findings import Case, Value
 from flockenv.geometry.shapes import Shape
 from flockenv.integrators import Integrator
+from flockenv.model.spawn import Spawn
+from flockenv.model.state import State
 from flockenv.scene import Group, Scene
-from flockenv.spawn import Spawn
-from flockenv.state import State
 
 __all__ = ["RESPONSES", "Floats", "G", "Response", "batch", "overlap", "per_response", "solid"]
 

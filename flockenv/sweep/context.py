@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
-from flockenv.state import State
+from flockenv.model.state import State
 
 __all__ = ["Context", "Worlds", "worlds_of"]
 

@@ -17,7 +17,7 @@ from flockenv.jit.decorators import Law, finite, kernel, like
 from flockenv.jit.intrinsics import ask_for, wait_for_team
 from flockenv.jit.section import in_turn, section
 from flockenv.maths.vectors import zero
-from flockenv.state import COUNTED_BY_KERNELS
+from flockenv.model.state import COUNTED_BY_KERNELS
 from flockenv.sweep.agents import AgentPlan, agent_plan, alone_of
 from flockenv.sweep.arrange import ArrangePlan, arrange_plan, go_home_of, move_in_of
 from flockenv.sweep.blocks import place_of, vector_of_lane

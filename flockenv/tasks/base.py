@@ -41,9 +41,9 @@ from pydantic import Field
 
 from flockenv.core.record import Record
 from flockenv.integrators import INTEGRATORS, SemiImplicitEuler
+from flockenv.model.snapshot import Mark
+from flockenv.model.state import State
 from flockenv.scene import AnyIntegrator, Scene
-from flockenv.snapshot import Mark
-from flockenv.state import State
 from flockenv.sweep import Look, Parts
 from flockenv.tasks.layout import Layout
 

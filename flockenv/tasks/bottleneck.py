@@ -17,11 +17,11 @@ from flockenv.geometry.space import Box
 from flockenv.jit.decorators import kernel, like
 from flockenv.maths.counter_rng import uniform
 from flockenv.maths.vectors import add, norm, scale, sub, unit
+from flockenv.model.snapshot import Mark
+from flockenv.model.spawn import Spawn
+from flockenv.model.state import State
 from flockenv.presets import PRESETS
 from flockenv.scene import Group, Scene
-from flockenv.snapshot import Mark
-from flockenv.spawn import Spawn
-from flockenv.state import State
 from flockenv.sweep import Look
 from flockenv.tasks.base import Frame, Task
 from flockenv.tasks.layout import Layout, Slot

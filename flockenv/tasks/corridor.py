@@ -17,10 +17,10 @@ from flockenv.geometry.space import Torus
 from flockenv.jit.decorators import kernel, like
 from flockenv.maths.counter_rng import normal, uniform
 from flockenv.maths.vectors import add, norm, scale, sub
+from flockenv.model.spawn import Spawn
+from flockenv.model.state import State
 from flockenv.presets import PRESETS
 from flockenv.scene import Group, Scene
-from flockenv.spawn import Spawn
-from flockenv.state import State
 from flockenv.sweep import Look
 from flockenv.tasks.base import Frame
 from flockenv.tasks.lasting import MEASURES, METRICS, LastingTask, judge, tell_lasting

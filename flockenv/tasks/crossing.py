@@ -14,10 +14,10 @@ from flockenv.geometry.space import Plane
 from flockenv.jit.decorators import kernel, like
 from flockenv.jit.intrinsics import stacked
 from flockenv.maths.counter_rng import uniform
+from flockenv.model.snapshot import Mark
+from flockenv.model.spawn import Spawn
+from flockenv.model.state import State
 from flockenv.scene import Group, Scene
-from flockenv.snapshot import Mark
-from flockenv.spawn import Spawn
-from flockenv.state import State
 from flockenv.steering import orca
 from flockenv.sweep import Look
 from flockenv.tasks.base import Frame, Task

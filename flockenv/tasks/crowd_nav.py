@@ -15,11 +15,11 @@ from flockenv.effects.aims import Antipode
 from flockenv.geometry.space import Plane
 from flockenv.jit.decorators import kernel, like
 from flockenv.maths.counter_rng import uniform
+from flockenv.model.snapshot import Mark
+from flockenv.model.spawn import Spawn
+from flockenv.model.state import State
 from flockenv.presets import PRESETS
 from flockenv.scene import Group, Scene
-from flockenv.snapshot import Mark
-from flockenv.spawn import Spawn
-from flockenv.state import State
 from flockenv.steer import Steer
 from flockenv.steering.arbitration import Blend
 from flockenv.sweep import Look

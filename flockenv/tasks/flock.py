@@ -17,9 +17,9 @@ from flockenv.jit.intrinsics import stacked
 from flockenv.jit.simd_rows import SIDE
 from flockenv.maths.counter_rng import uniform
 from flockenv.maths.vectors import norm, scale, sub, unit
+from flockenv.model.snapshot import Mark
+from flockenv.model.state import State
 from flockenv.scene import Group, Scene
-from flockenv.snapshot import Mark
-from flockenv.state import State
 from flockenv.steering import arbitration
 from flockenv.sweep import Look
 from flockenv.tasks.base import Frame

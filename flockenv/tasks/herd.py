@@ -15,10 +15,10 @@ from flockenv.geometry.space import Plane
 from flockenv.jit.decorators import Vec, kernel
 from flockenv.maths.counter_rng import smooth, uniform
 from flockenv.maths.vectors import add, norm, scale, sub, unit
+from flockenv.model.snapshot import Mark
+from flockenv.model.spawn import Spawn
+from flockenv.model.state import State
 from flockenv.scene import Group, Scene
-from flockenv.snapshot import Mark
-from flockenv.spawn import Spawn
-from flockenv.state import State
 from flockenv.tasks.base import Frame, Task
 from flockenv.tasks.layout import Layout, Slot
 from flockenv.tasks.sight import clip, place_of, velocity_of

@@ -13,9 +13,9 @@ from pydantic import Field, model_validator
 from flockenv.geometry.space import Box
 from flockenv.jit.decorators import kernel, like
 from flockenv.maths.counter_rng import uniform
+from flockenv.model.snapshot import Mark
+from flockenv.model.state import State
 from flockenv.scene import Group, Scene
-from flockenv.snapshot import Mark
-from flockenv.state import State
 from flockenv.sweep import Look
 from flockenv.tasks.base import Frame, Task
 from flockenv.tasks.layout import Layout, Slot

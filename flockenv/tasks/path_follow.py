@@ -14,9 +14,9 @@ from flockenv.geometry.space import Box
 from flockenv.jit.decorators import Vec, kernel
 from flockenv.maths.counter_rng import uniform
 from flockenv.maths.vectors import dot, norm, sub
+from flockenv.model.snapshot import Mark
+from flockenv.model.state import State
 from flockenv.scene import Group, Scene
-from flockenv.snapshot import Mark
-from flockenv.state import State
 from flockenv.tasks.base import Frame, Task
 from flockenv.tasks.layout import Layout, Slot
 from flockenv.tasks.sight import clip

@@ -13,8 +13,8 @@ from flockenv.geometry.space import Box
 from flockenv.jit.decorators import Vec, kernel
 from flockenv.maths.counter_rng import uniform
 from flockenv.maths.vectors import scale
+from flockenv.model.spawn import direction
 from flockenv.scene import Group, Scene
-from flockenv.spawn import direction
 from flockenv.steering import arbitration
 from flockenv.tasks.base import Frame, Task
 from flockenv.tasks.layout import Layout, Slot

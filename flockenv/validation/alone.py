@@ -12,9 +12,9 @@ import numpy as np
 
 from flockenv.effects import Course, Journey, Stage
 from flockenv.findings import Case, Value
+from flockenv.model.distribution import Spread
+from flockenv.model.spawn import Spawn
 from flockenv.scene import Scene
-from flockenv.spawn import Spawn
-from flockenv.spread import Spread
 from flockenv.validation.walk import Floats, Scenes, lane, people, scene_of, walked, wall
 
 __all__ = ["ALONE", "SCENES", "corridor", "crossing_time"]

@@ -17,9 +17,9 @@ from flockenv.geometry.cell_list import FEWEST_AGENTS
 from flockenv.geometry.shapes import Wall
 from flockenv.geometry.space import Torus
 from flockenv.measures import above_null, classical_density, lanes, single_file_speed, speed_in_area, weidmann_speed
+from flockenv.model.spawn import Spawn
+from flockenv.model.state import State
 from flockenv.scene import Scene
-from flockenv.spawn import Spawn
-from flockenv.state import State
 from flockenv.validation.walk import SHAKEN, STEPS, Floats, Scenes, filled, nobody, people, scene_of, walked, wall
 
 __all__ = ["CORRIDORS", "SCENES", "endless", "lined_up"]

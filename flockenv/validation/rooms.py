@@ -13,11 +13,11 @@ from flockenv.effects import Way
 from flockenv.geometry.cell_list import FEWEST_AGENTS
 from flockenv.geometry.shapes import Wall
 from flockenv.geometry.targets import Target
+from flockenv.model.spawn import Spawn
+from flockenv.model.state import State
 from flockenv.population import Leaving
 from flockenv.population.members import Member
 from flockenv.scene import Group, Scene
-from flockenv.spawn import Spawn
-from flockenv.state import State
 from flockenv.validation.walk import nobody, people, scene_of, wall
 
 __all__ = [

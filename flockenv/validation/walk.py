@@ -10,11 +10,11 @@ from numpy.typing import NDArray
 
 from flockenv.effects import Effect, ObstacleContact
 from flockenv.geometry.shapes import Wall
+from flockenv.model.distribution import Spread
+from flockenv.model.spawn import Spawn
+from flockenv.model.state import State
 from flockenv.presets import PRESETS, preset
 from flockenv.scene import Group, Scene
-from flockenv.spawn import Spawn
-from flockenv.spread import Spread
-from flockenv.state import State
 
 __all__ = ["STEPS", "WEIDMANN", "Scenes", "Walk", "filled", "lane", "nobody", "people", "scene_of", "walked", "wall"]
 

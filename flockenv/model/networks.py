@@ -18,7 +18,7 @@ from pydantic import BeforeValidator, Field, model_validator
 
 from flockenv.core.errors import nearest
 from flockenv.core.record import Record
-from flockenv.elements import contents, flat
+from flockenv.model.finite_elements import contents, flat
 
 __all__ = ["BEND", "EDGE", "MOST", "SHEAR", "AnyNetwork", "Cloth", "Jelly", "Mesh", "Network", "Rope", "Springs"]
 

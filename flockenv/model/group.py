@@ -9,11 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import AfterValidator, Field, model_validator
 
-from flockenv.appearance import Appearance
 from flockenv.core.record import Record
-from flockenv.networks import AnyNetwork
-from flockenv.spawn import Spawn
-from flockenv.spread import Spread, drawn, largest
+from flockenv.model.appearance import Appearance
+from flockenv.model.distribution import Spread, drawn, largest
+from flockenv.model.networks import AnyNetwork
+from flockenv.model.spawn import Spawn
 
 __all__ = ["Group"]
 

@@ -10,7 +10,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from flockenv.appearance import Appearance
+from flockenv.model.appearance import Appearance
 
 __all__ = ["KINDS", "ROLES", "Floats", "Mark", "Snapshot"]
 
