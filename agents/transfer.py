@@ -48,7 +48,7 @@ from agents.transfer_report import Setting
 from flockenv.core.atomic_files import deliver
 from flockenv.core.errors import nearest, shown
 from flockenv.evaluation import WORLDS_PER_SEED, worlds_for
-from flockenv.integrators import INTEGRATORS
+from flockenv.physics.integrators import INTEGRATORS
 from flockenv.tasks import TASKS, Task
 from flockenv.terminal import one_line, program, shown_progress
 

@@ -20,7 +20,7 @@ from agents.compare import Player, blaming
 from agents.transfer_report import Cell, Clock, Setting
 from flockenv.core.atomic_files import made, replacing
 from flockenv.evaluation import rollout, task_digest, worlds_for
-from flockenv.integrators import RK4
+from flockenv.physics.integrators import RK4
 from flockenv.players import NAMES
 from flockenv.policy import Policy
 from flockenv.tasks import Task

@@ -12,7 +12,7 @@ from rich.console import Console
 
 from agents.report import Results, grid, interval_fields, interval_text, number_text, table_of
 from flockenv.evaluation import bootstrap, task_digest
-from flockenv.integrators import INTEGRATORS
+from flockenv.physics.integrators import INTEGRATORS
 from flockenv.tasks import Task
 
 __all__ = ["Cell", "Clock", "Setting", "finest", "frugal", "markdown", "show", "task_results", "verdict"]

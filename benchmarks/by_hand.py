@@ -16,7 +16,6 @@ from typing import Any
 import numpy as np
 from numba import njit
 
-from flockenv.effects.base import ties
 from flockenv.jit.cpu import LINE, REGISTER
 from flockenv.jit.decorators import like
 from flockenv.jit.intrinsics import unaliased
@@ -24,6 +23,7 @@ from flockenv.jit.memory import zeros
 from flockenv.jit.pipeline import Inlined, Whole
 from flockenv.maths.approximations import nearest_whole
 from flockenv.model.state import State
+from flockenv.physics.effects.effect import ties
 from flockenv.scene import Scene
 
 __all__ = ["MIXES", "by_hand"]

@@ -15,11 +15,11 @@ import typer
 from benchmarks.floors import machine, of_scene
 from benchmarks.measure import Bench, Contestant, Out, Quick, Rounds, command_line
 from benchmarks.scenes import stepping
-from flockenv.constraints import Collisions
-from flockenv.effects import Gravity
 from flockenv.geometry.space import Box, Torus
 from flockenv.model.spawn import Spawn
 from flockenv.model.state import State
+from flockenv.physics.constraints import Collisions
+from flockenv.physics.effects import Gravity
 from flockenv.scene import Group, Scene
 
 __all__ = ["gas", "heap"]

@@ -20,10 +20,10 @@ from benchmarks.floors import Machine, machine, of_scene
 from benchmarks.measure import Bench, Contestant, Out, Quick, Rounds, command_line, number
 from benchmarks.peers import CACHE, DONE, SAMPLE, PeerError, python_of, running
 from benchmarks.scenes import stepping
-from flockenv.effects import Course
 from flockenv.geometry.space import Torus
 from flockenv.jit.thread_pool import use_threads
 from flockenv.model.spawn import Spawn
+from flockenv.physics.effects import Course
 from flockenv.presets import PRESETS, preset
 from flockenv.scene import Group, Scene
 

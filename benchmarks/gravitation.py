@@ -15,9 +15,9 @@ import typer
 from benchmarks.floors import Machine, machine, of_scene
 from benchmarks.measure import Bench, Contestant, Out, Quick, Rounds, command_line, number
 from benchmarks.scenes import stepping
-from flockenv.effects import Gravitation
 from flockenv.geometry.barnes_hut import MOST_DIRECT
 from flockenv.model.spawn import Spawn
+from flockenv.physics.effects import Gravitation
 from flockenv.scene import Group, Scene
 
 __all__ = ["AGENTS", "cloud"]

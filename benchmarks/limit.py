@@ -19,9 +19,9 @@ from benchmarks.floors import Machine, compiled, machine, of_scene
 from benchmarks.measure import Bench, Contestant, Out, Quick, Rounds, command_line, number
 from benchmarks.scenes import crowd, restarting, stepping, world
 from flockenv.behaviours import Alignment, Cohesion, Separation
-from flockenv.effects.base import ties
 from flockenv.jit.thread_pool import use_threads
 from flockenv.model.state import State
+from flockenv.physics.effects.effect import ties
 from flockenv.scene import Scene
 
 __all__ = ["ROWS", "Reference", "Row", "disagreement"]

@@ -14,9 +14,9 @@ import typer
 from benchmarks.floors import Machine, machine, of_scene
 from benchmarks.measure import Bench, Contestant, Out, Quick, Rounds, command_line, number
 from benchmarks.scenes import stepping
-from flockenv.effects import Drag, Gravity
 from flockenv.model.state import State
-from flockenv.population import Decay, Disc, Emitter
+from flockenv.physics.effects import Drag, Gravity
+from flockenv.physics.population import Decay, Disc, Emitter
 from flockenv.scene import Group, Scene
 
 __all__ = ["fountain", "settled"]

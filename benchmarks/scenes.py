@@ -6,10 +6,10 @@ import math
 from collections.abc import Callable
 
 from flockenv.behaviours import Alignment, Cohesion, Separation
-from flockenv.effects import Effect
 from flockenv.geometry.space import Torus
 from flockenv.model.spawn import Spawn
 from flockenv.model.state import State
+from flockenv.physics.effects import Effect
 from flockenv.scene import Group, Scene
 
 __all__ = ["boids", "crowd", "edge_for", "restarting", "rules", "stepping", "world"]

@@ -14,12 +14,12 @@ from pathlib import Path
 import numpy as np
 
 from flockenv.behaviours import Driving, LineUp, Separation
-from flockenv.effects import Door, Routes, Way
 from flockenv.geometry.eikonal import ground
 from flockenv.geometry.shapes import Wall
 from flockenv.geometry.space import Box
 from flockenv.model.appearance import Appearance
 from flockenv.model.spawn import Spawn
+from flockenv.physics.effects import Door, Routes, Way
 from flockenv.render import draw, write_png
 from flockenv.scene import Group, Scene
 from flockenv.steer import Steer

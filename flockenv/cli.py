@@ -165,10 +165,10 @@ def listing() -> None:
     import pettingzoo
 
     from flockenv.behaviours import BEHAVIOURS
-    from flockenv.effects import EFFECTS
     from flockenv.geometry.space import AnySpace
-    from flockenv.integrators import INTEGRATORS
-    from flockenv.population import POPULATION
+    from flockenv.physics.effects import EFFECTS
+    from flockenv.physics.integrators import INTEGRATORS
+    from flockenv.physics.population import POPULATION
     from flockenv.steering.arbitration import ARBITRATIONS
     from flockenv.tasks import TASKS
 

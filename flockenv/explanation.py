@@ -11,9 +11,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from flockenv.effects import EFFECTS, Effect
 from flockenv.grants import Grants
 from flockenv.model.state import WORK, State
+from flockenv.physics.effects import EFFECTS, Effect
 from flockenv.scene import Scene
 from flockenv.stability import Suggestion, suggest_dt
 

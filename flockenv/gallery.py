@@ -13,7 +13,7 @@ from pathlib import Path
 from flockenv.behaviours import BEHAVIOURS
 from flockenv.config import load_scene
 from flockenv.core.atomic_files import made, replacing
-from flockenv.effects.base import Effect
+from flockenv.physics.effects.effect import Effect
 from flockenv.render.gif import write_png
 from flockenv.render.picture import draw
 from flockenv.trajectory import Trajectory, record

@@ -1,6 +1,6 @@
 """Steps of a scene by a method that solves equations: who depends on whom, and how the kernel takes over what is found.
 
-The method itself, and Newton's method, know nothing of scenes (flockenv.integrators.implicit and newton).
+The method itself, and Newton's method, know nothing of scenes (flockenv.physics.integrators.implicit and newton).
 """
 
 from __future__ import annotations
@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from flockenv.integrators.implicit import Implicit
-from flockenv.integrators.newton import Coupling, Evaluate, NotSolvedError, coupled
 from flockenv.model.state import WORK, Floats, State
+from flockenv.physics.integrators.implicit import Implicit
+from flockenv.physics.integrators.newton import Coupling, Evaluate, NotSolvedError, coupled
 
 if TYPE_CHECKING:
     from flockenv.scene import Scene

@@ -12,7 +12,7 @@ from flockenv.geometry.shapes import clear_of
 from flockenv.jit.section import entry
 from flockenv.model.spawn import Spawn, cells, scatter
 from flockenv.model.state import Floats, State
-from flockenv.population import Emitter
+from flockenv.physics.population import Emitter
 
 if TYPE_CHECKING:
     from flockenv.model.group import Group

@@ -25,8 +25,8 @@ from flockenv.behaviours import (
 )
 from flockenv.core.errors import KeyPath, key_path, nearest, refusals, shown, steps_of
 from flockenv.core.record import Record
-from flockenv.effects import Contact, Effect, ObstacleContact
 from flockenv.model.distribution import Spread
+from flockenv.physics.effects import Contact, Effect, ObstacleContact
 from flockenv.steer import Steer
 from flockenv.steering.arbitration import Blend
 

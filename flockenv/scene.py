@@ -20,18 +20,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydantic import Field, WrapValidator, model_validator
 
-from flockenv.constraints import CONSTRAINTS, Collisions, Constraint, Settler
 from flockenv.core.magnitudes import check_numbers
 from flockenv.core.record import Record, keep
-from flockenv.effects import EFFECTS, Effect
-from flockenv.effects.base import all_masses
 from flockenv.geometry.barnes_hut import MOST_DIRECT
 from flockenv.geometry.cell_list import FEWEST_AGENTS
 from flockenv.geometry.shapes import AnyShape, Circle, HalfSpace, Shape
 from flockenv.geometry.space import AnySpace, Box, Plane, Torus
 from flockenv.implicit import coupling_of, solve_steps
-from flockenv.integrators import INTEGRATORS, Adaptive, ImplicitEuler, Integrator, SemiImplicitEuler
-from flockenv.integrators.newton import Coupling
 from flockenv.jit.thread_pool import LARGEST, Choices, at_work, share
 from flockenv.maths.counter_rng import MASK, key_of
 from flockenv.model import state as states
@@ -42,10 +37,15 @@ from flockenv.model.group import Group
 from flockenv.model.networks import EDGE
 from flockenv.model.snapshot import Mark, Snapshot
 from flockenv.model.state import Body, Floats, State
+from flockenv.physics.constraints import CONSTRAINTS, Collisions, Constraint, Settler
+from flockenv.physics.effects import EFFECTS, Effect
+from flockenv.physics.effects.effect import all_masses
+from flockenv.physics.integrators import INTEGRATORS, Adaptive, ImplicitEuler, Integrator, SemiImplicitEuler
+from flockenv.physics.integrators.newton import Coupling
+from flockenv.physics.population import POPULATION, Emitter, Member, beget
+from flockenv.physics.population import settler as population_settler
+from flockenv.physics.population.lifecycle import NUMBERS as POPULATION_NUMBERS
 from flockenv.placing import cells_of, place_groups
-from flockenv.population import POPULATION, Emitter, Member, beget
-from flockenv.population import settler as population_settler
-from flockenv.population.settle import NUMBERS as POPULATION_NUMBERS
 from flockenv.stability import check_contact, check_dt, check_lookahead
 from flockenv.steer import EVERY_EFFECT
 from flockenv.sweep import (

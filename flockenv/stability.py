@@ -17,11 +17,11 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from flockenv.integrators.base import Integrator
 from flockenv.model.state import blank
+from flockenv.physics.integrators.integrator import Integrator
 
 if TYPE_CHECKING:
-    from flockenv.effects.base import Effect
+    from flockenv.physics.effects.effect import Effect
     from flockenv.scene import Group, Scene
 
 __all__ = [

@@ -17,8 +17,8 @@ from pydantic import Field, WrapValidator, model_validator
 
 from flockenv.behaviours import BEHAVIOURS
 from flockenv.core.record import keep
-from flockenv.effects.base import EFFECTS, Effect, demand_group
 from flockenv.jit.decorators import Law, Vec
+from flockenv.physics.effects.effect import EFFECTS, Effect, demand_group
 from flockenv.steering.arbitration import Allocation, AnyArbitration, Arbitration
 
 __all__ = ["EVERY_EFFECT", "Steer"]

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from flockenv.accuracy import Problem, Report
     from flockenv.core.record import Record
     from flockenv.findings import Results
-    from flockenv.integrators import Integrator
+    from flockenv.physics.integrators import Integrator
 
     Run = Callable[[Results | None, Callable[[int], None], Callable[[Results], None]], Results]
 
@@ -79,7 +79,7 @@ def accuracy(
     """Show what accuracy costs: how far each integrator ends from the truth in which steps, beside its time."""
     from flockenv.accuracy import usual_methods
     from flockenv.core.output_paths import checked_file
-    from flockenv.integrators import methods_named
+    from flockenv.physics.integrators import methods_named
 
     todo = _todo(scenes or (), suite, problems, seconds, steps, dts, seed)
     aimed = _numbers("--tolerance", tolerance)
@@ -304,7 +304,7 @@ def stress(
 ) -> None:
     """Try every hard case under every integrator, and show value, bound and verdict of each."""
     from flockenv.core.output_paths import checked_file
-    from flockenv.integrators import methods_named
+    from flockenv.physics.integrators import methods_named
     from flockenv.stress import CASES, cases_named, fingerprint, run, trials, usual_methods
 
     path = checked_file(out, [".json", ".png"], True, beside=".json") if out is not None else None

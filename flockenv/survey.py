@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from flockenv import measures as m
 from flockenv.geometry.space import Plane
 from flockenv.measures.polygons import checked, contains, rectangle
-from flockenv.population import Emitter
+from flockenv.physics.population import Emitter
 from flockenv.scene import Scene
 from flockenv.trajectory import Trajectory
 

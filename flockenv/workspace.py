@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from flockenv.effects.base import ties
 from flockenv.jit.cpu import LINE
 from flockenv.model.state import Body
+from flockenv.physics.effects.effect import ties
 from flockenv.sweep import GIVEN, OWN, Parts, Table, scratch_of
 
 __all__ = ["Workspace"]

@@ -66,8 +66,13 @@ from flockenv.behaviours import (
     Wander,
     Whiskers,
 )
-from flockenv.effects import EFFECTS as EFFECT_KINDS
-from flockenv.effects import (
+from flockenv.geometry.shapes import Circle
+from flockenv.geometry.space import Box, Plane, Space, Torus
+from flockenv.geometry.targets import Target
+from flockenv.model.networks import Mesh
+from flockenv.model.spawn import Spawn
+from flockenv.physics.effects import EFFECTS as EFFECT_KINDS
+from flockenv.physics.effects import (
     AngularSprings,
     Antipode,
     Attraction,
@@ -108,10 +113,7 @@ from flockenv.effects import (
     Way,
     Wind,
 )
-from flockenv.geometry.shapes import Circle
-from flockenv.geometry.space import Box, Plane, Space, Torus
-from flockenv.geometry.targets import Target
-from flockenv.integrators import (
+from flockenv.physics.integrators import (
     RK4,
     AdaptiveRK4,
     AveragedVelocity,
@@ -126,8 +128,6 @@ from flockenv.integrators import (
     SemiImplicitEuler,
     VelocityVerlet,
 )
-from flockenv.model.networks import Mesh
-from flockenv.model.spawn import Spawn
 from flockenv.scene import Group, Scene
 from flockenv.steer import Steer
 from flockenv.steering import arbitration
@@ -756,7 +756,7 @@ from typing import Any, ClassVar, Literal
 import numpy as np
 from pydantic import Field
 
-from flockenv.effects import Effect, Me
+from flockenv.physics.effects import Effect, Me
 from flockenv.jit.decorators import Law, Vec, law, like
 from flockenv.maths.vectors import add, dot, scale
 

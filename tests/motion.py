@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from flockenv.effects import Drag
-from flockenv.integrators import Integrator
 from flockenv.model.spawn import Spawn
 from flockenv.model.state import State, blank
+from flockenv.physics.effects import Drag
+from flockenv.physics.integrators import Integrator
 from flockenv.scene import Group, Scene
 from tests.catalogue import INTEGRATORS, Array
 

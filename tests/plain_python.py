@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flockenv.config import ConfigError, load_scene
-from flockenv.integrators import INTEGRATORS
+from flockenv.physics.integrators import INTEGRATORS
 from flockenv.scene import Scene
 from flockenv.tasks import TASKS
 from flockenv.world import World

@@ -19,9 +19,9 @@ from flockenv.accuracy.results import Curve, Point, measured_order
 from flockenv.accuracy.table import best, columns, headlines, rows
 from flockenv.behaviours import Separation
 from flockenv.cli import main
-from flockenv.effects import Effect, Fluctuation, Swing, Tether
-from flockenv.integrators import RK4, Integrator, methods_named
 from flockenv.model.spawn import Spawn
+from flockenv.physics.effects import Effect, Fluctuation, Swing, Tether
+from flockenv.physics.integrators import RK4, Integrator, methods_named
 from flockenv.render.precision import draw_precision, write_precision
 from flockenv.scene import Group, Scene
 

@@ -16,7 +16,7 @@ from flockenv.accuracy.reference import _closing_in, find_reference, own_steps
 from flockenv.accuracy.table import errors, headlines
 from flockenv.cli import main
 from flockenv.config import load_scene
-from flockenv.integrators import methods_named
+from flockenv.physics.integrators import methods_named
 from flockenv.render.precision import draw_precision
 
 BALL = """\

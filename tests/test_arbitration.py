@@ -11,12 +11,12 @@ import pytest
 
 from flockenv.behaviours import AvoidObstacles, Separation
 from flockenv.config import dump_scene, load_scene
-from flockenv.effects import Drag, Effect
 from flockenv.explanation import _shares
 from flockenv.geometry.space import Torus
 from flockenv.grants import granted, reconcile
 from flockenv.maths.counter_rng import key_of
 from flockenv.model.spawn import Spawn
+from flockenv.physics.effects import Drag, Effect
 from flockenv.scene import Group, Scene
 from flockenv.steer import Steer
 from flockenv.steering.arbitration import (

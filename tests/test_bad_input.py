@@ -24,13 +24,13 @@ import flockenv  # noqa: F401  # registers the environments
 from flockenv.behaviours import Alignment, Queue, Separation
 from flockenv.cli import main
 from flockenv.config import load_scene
-from flockenv.effects import Drag, Springs
 from flockenv.geometry.shapes import HalfSpace, Polygon
 from flockenv.geometry.space import Box, Torus
-from flockenv.integrators import VelocityVerlet
 from flockenv.measures import measure
 from flockenv.model.networks import Mesh
 from flockenv.model.spawn import Spawn
+from flockenv.physics.effects import Drag, Springs
+from flockenv.physics.integrators import VelocityVerlet
 from flockenv.scene import Group, Scene
 from flockenv.tasks import Pursuit
 from flockenv.world import World

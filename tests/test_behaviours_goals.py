@@ -31,9 +31,9 @@ from flockenv.behaviours import (
     TargetSpeed,
     Wander,
 )
-from flockenv.effects import Effect
 from flockenv.model.spawn import Spawn
 from flockenv.model.state import State
+from flockenv.physics.effects import Effect
 from flockenv.scene import Group, Scene
 from flockenv.stability import LookaheadWarning
 from flockenv.steer import Steer

@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from flockenv import ways as way_module
 from flockenv.behaviours import (
     AvoidObstacles,
     Cohesion,
@@ -20,12 +19,13 @@ from flockenv.behaviours import (
     Seek,
     Whiskers,
 )
-from flockenv.constraints import Collisions
 from flockenv.geometry.eikonal import way_table
 from flockenv.geometry.shapes import Block, Capsule, Circle, HalfSpace, Polygon, Shape, Wall
 from flockenv.geometry.targets import Target
 from flockenv.maths.grid import sampled
 from flockenv.model.spawn import Spawn
+from flockenv.physics import floor_fields as way_module
+from flockenv.physics.constraints import Collisions
 from flockenv.scene import Group, Scene
 from flockenv.steer import Steer
 
@@ -325,7 +325,9 @@ def test_bodies_stand_out_by_less_the_shorter_the_step() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.filterwarnings("ignore::flockenv.constraints.collisions.UnsolvedContactsWarning")  # in the jam they run to
+@pytest.mark.filterwarnings(
+    "ignore::flockenv.physics.constraints.collisions.UnsolvedContactsWarning"
+)  # in the jam they run to
 def test_no_body_stands_out_of_a_hollow_obstacle_with_collisions() -> None:
     assert stand_out(0.02, 20, walls=True) < 1e-6
 

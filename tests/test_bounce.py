@@ -7,12 +7,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from flockenv.effects import Gravity
 from flockenv.geometry.space import Box
-from flockenv.integrators import RK4, Integrator, SemiImplicitEuler
 from flockenv.jit.thread_pool import use_threads
 from flockenv.model.spawn import Spawn
 from flockenv.model.state import State
+from flockenv.physics.effects import Gravity
+from flockenv.physics.integrators import RK4, Integrator, SemiImplicitEuler
 from flockenv.scene import Group, Scene
 from flockenv.sweep import step_of
 from tests.catalogue import INTEGRATORS, Array, IntegratorRow

@@ -9,9 +9,9 @@ from pathlib import Path
 import pytest
 
 from flockenv import steering
-from flockenv.effects import EFFECTS
 from flockenv.geometry.space import Space
-from flockenv.integrators import INTEGRATORS
+from flockenv.physics.effects import EFFECTS
+from flockenv.physics.integrators import INTEGRATORS
 from flockenv.steer import Steer
 from flockenv.steering import arbitration
 from flockenv.tasks import TASKS

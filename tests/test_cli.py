@@ -25,11 +25,11 @@ import flockenv.stress
 from flockenv import terminal
 from flockenv.cli import app, main
 from flockenv.config import load_scene, schema
-from flockenv.effects import EFFECTS
-from flockenv.effects.springs import Springs
 from flockenv.explanation import Cost, Explanation
-from flockenv.integrators import INTEGRATORS, ImplicitEuler, Integrator
 from flockenv.model.networks import Rope
+from flockenv.physics.effects import EFFECTS
+from flockenv.physics.effects.springs import Springs
+from flockenv.physics.integrators import INTEGRATORS, ImplicitEuler, Integrator
 from flockenv.policy import Policy, RandomPolicy
 from flockenv.scene import Group, Scene
 from flockenv.stability import suggest_dt
@@ -194,7 +194,7 @@ def test_every_says_how_often_an_instant_is_kept_and_the_last_always_is() -> Non
 
 
 @pytest.mark.slow
-@pytest.mark.filterwarnings("ignore::flockenv.constraints.collisions.UnsolvedContactsWarning")
+@pytest.mark.filterwarnings("ignore::flockenv.physics.constraints.collisions.UnsolvedContactsWarning")
 def test_run_and_render_say_how_many_contacts_were_left_unsolved(capsys: pytest.CaptureFixture[str]) -> None:
     heap = "{count: 25, radius: 0.1, spawn: {low: [0, 0], high: [1.25, 1.25], spacing: 0.25}}"
     rules = "effects: [{kind: gravity}]\nconstraints: [{kind: collisions, response: impulses, passes: %d}]\ndt: 0.01\n"

@@ -11,7 +11,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from flockenv.effects import (
+from flockenv.model.spawn import Spawn
+from flockenv.model.state import State
+from flockenv.physics.effects import (
     Attraction,
     Carried,
     Drag,
@@ -24,9 +26,7 @@ from flockenv.effects import (
     Uniform,
     Vortex,
 )
-from flockenv.integrators import RK4, ExplicitEuler, Integrator, SemiImplicitEuler, VelocityVerlet
-from flockenv.model.spawn import Spawn
-from flockenv.model.state import State
+from flockenv.physics.integrators import RK4, ExplicitEuler, Integrator, SemiImplicitEuler, VelocityVerlet
 from flockenv.scene import Group, Scene
 from tests.catalogue import Array
 

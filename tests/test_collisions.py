@@ -14,18 +14,18 @@ import numpy as np
 import pytest
 
 from flockenv.config import dump_scene, load_scene
-from flockenv.constraints import Collisions
-from flockenv.constraints.broad import nearby
-from flockenv.constraints.collisions import UnsolvedContactsWarning
-from flockenv.effects import Gravity
 from flockenv.explanation import explain
 from flockenv.geometry.shapes import Block, Circle, HalfSpace, Polygon, Wall
 from flockenv.geometry.space import Box, Plane, Space, Torus
-from flockenv.integrators import RK4, Integrator, SemiImplicitEuler, VelocityVerlet
 from flockenv.jit.section import entry
 from flockenv.jit.thread_pool import use_threads
 from flockenv.model.spawn import Spawn
 from flockenv.model.state import Floats, State
+from flockenv.physics.constraints import Collisions
+from flockenv.physics.constraints.broad_phase import nearby
+from flockenv.physics.constraints.collisions import UnsolvedContactsWarning
+from flockenv.physics.effects import Gravity
+from flockenv.physics.integrators import RK4, Integrator, SemiImplicitEuler, VelocityVerlet
 from flockenv.scene import Group, Scene
 
 IN_TIME = ("earliest", "back_up")
@@ -354,7 +354,7 @@ def test_worlds_and_threads_do_not_know_of_each_other() -> None:
     np.testing.assert_array_equal(of.run(copy.deepcopy(batch).worlds([77]), 60).v, alone.v)
 
 
-@pytest.mark.filterwarnings("default::flockenv.constraints.collisions.UnsolvedContactsWarning")
+@pytest.mark.filterwarnings("default::flockenv.physics.constraints.collisions.UnsolvedContactsWarning")
 @pytest.mark.parametrize("response", EXACT)
 def test_fifty_in_one_place_part_in_no_preferred_direction(response: str) -> None:
     of = scene([1] * 50, response, e=0.5)

@@ -17,10 +17,10 @@ from hypothesis import strategies as st
 from pydantic import BaseModel, ConfigDict, Field
 
 from flockenv.config import MAX_BYTES, ConfigError, dump, dump_scene, load, load_scene, schema
-from flockenv.effects import EFFECTS, Drag
 from flockenv.geometry.space import Box, Torus
-from flockenv.integrators import INTEGRATORS, RK4
 from flockenv.model.spawn import Spawn
+from flockenv.physics.effects import EFFECTS, Drag
+from flockenv.physics.integrators import INTEGRATORS, RK4
 from flockenv.presets import preset
 from flockenv.scene import Group, Scene
 

@@ -11,10 +11,12 @@ import numpy as np
 import pytest
 from scipy.optimize import brentq
 
-from flockenv.effects import Contact, ObstacleContact
-from flockenv.effects.contact import restitution
 from flockenv.geometry.shapes import Block
-from flockenv.integrators import (
+from flockenv.model.spawn import Spawn
+from flockenv.model.state import State
+from flockenv.physics.effects import Contact, ObstacleContact
+from flockenv.physics.effects.contact import restitution
+from flockenv.physics.integrators import (
     RK4,
     AdaptiveRK4,
     AveragedVelocity,
@@ -23,8 +25,6 @@ from flockenv.integrators import (
     Integrator,
     SemiImplicitEuler,
 )
-from flockenv.model.spawn import Spawn
-from flockenv.model.state import State
 from flockenv.scene import Group, Scene
 from flockenv.stability import CoarseContactWarning, check_contact, contact_limit
 from tests.catalogue import Array

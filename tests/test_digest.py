@@ -8,9 +8,9 @@ from pathlib import Path
 
 import pytest
 
-from flockenv.effects.base import Far, Me, Members, Obstacle, Other
 from flockenv.jit.decorators import IN_PYTHON
 from flockenv.jit.sources import functions_in, sources_of_code
+from flockenv.physics.effects.effect import Far, Me, Members, Obstacle, Other
 from flockenv.sweep import Worlds, step_of
 from flockenv.sweep.context import Context
 from flockenv.tasks import TASKS

@@ -10,13 +10,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from flockenv.effects import Carried, Drag, Gravity, QuadraticDrag, Springs, Tether, Uniform, Vortex, Wind
-from flockenv.integrators import ExponentialDrag, ImplicitEuler, Integrator, SemiImplicitEuler
 from flockenv.jit.thread_pool import use_threads
 from flockenv.model.divergence import SimulationDiverged
 from flockenv.model.networks import Rope
 from flockenv.model.spawn import Spawn
 from flockenv.model.state import State
+from flockenv.physics.effects import Carried, Drag, Gravity, QuadraticDrag, Springs, Tether, Uniform, Vortex, Wind
+from flockenv.physics.integrators import ExponentialDrag, ImplicitEuler, Integrator, SemiImplicitEuler
 from flockenv.scene import Group, Scene
 from flockenv.stability import UnstableStepWarning
 

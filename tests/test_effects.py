@@ -15,17 +15,17 @@ import numpy as np
 import pytest
 
 import flockenv
-from flockenv import effects as effects_module
 from flockenv.behaviours import Separation
-from flockenv.effects import Door, Drag, Stage
 from flockenv.geometry.shapes import Circle
 from flockenv.geometry.space import Plane
 from flockenv.geometry.targets import Target
-from flockenv.integrators import RK4
 from flockenv.jit.cache_folder import cache_folder
 from flockenv.model.networks import Mesh
 from flockenv.model.spawn import Spawn
 from flockenv.model.state import State
+from flockenv.physics import effects as effects_module
+from flockenv.physics.effects import Door, Drag, Stage
+from flockenv.physics.integrators import RK4
 from flockenv.scene import Group, Scene
 from flockenv.steering.arbitration import ARBITRATIONS
 from tests.catalogue import (
@@ -49,9 +49,9 @@ EVERY_ROW = pytest.mark.parametrize("row", EFFECTS, ids=lambda row: row.name)
 
 
 ELSEWHERE = {
-    "flockenv.effects.fields", "flockenv.effects.tether", "flockenv.effects.attraction", "flockenv.effects.urges",
-    "flockenv.effects.aims", "flockenv.effects.way", "flockenv.effects.journey", "flockenv.effects.routes",
-    "flockenv.effects.vicsek",
+    f"flockenv.physics.effects.{name}" for name in (
+        "fields", "tether", "attraction", "motivation", "aims", "floor_field", "waypoints", "exit_choice", "vicsek",
+    )
 }  # fmt: skip
 """Effects of these files have quick tests in files of their own: test_fields.py, test_inner.py, test_ways.py, ..."""
 
@@ -343,7 +343,7 @@ from __future__ import annotations
 
 from typing import Any, ClassVar, Literal
 
-from flockenv.effects import Effect, Me
+from flockenv.physics.effects import Effect, Me
 from flockenv.jit.decorators import Vec, law
 from flockenv.maths.vectors import dot, scale
 
@@ -387,7 +387,7 @@ from __future__ import annotations
 from typing import Any, ClassVar, Literal
 
 import soft
-from flockenv.effects import Effect, Me, Other, Sight
+from flockenv.physics.effects import Effect, Me, Other, Sight
 from flockenv.jit.decorators import Vec, law
 from flockenv.maths.vectors import scale
 
@@ -625,7 +625,7 @@ def test_max_force_bounds_what_agents_ask_for_and_not_what_acts_on_them(dimensio
 HELD = """
 from typing import Literal
 
-from flockenv.effects import Drag
+from flockenv.physics.effects import Drag
 from flockenv.jit.decorators import law
 from flockenv.maths.vectors import add, scale
 

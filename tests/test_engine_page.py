@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from flockenv.integrators import VelocityVerlet
 from flockenv.model.spawn import Spawn
+from flockenv.physics.integrators import VelocityVerlet
 from flockenv.scene import Group, Scene
 from tests.catalogue import users_module
 

@@ -10,7 +10,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from flockenv.effects import (
+from flockenv.geometry.space import Torus
+from flockenv.model.spawn import Spawn
+from flockenv.physics.effects import (
     Attraction,
     Carried,
     Drag,
@@ -24,9 +26,7 @@ from flockenv.effects import (
     Vortex,
     Wind,
 )
-from flockenv.geometry.space import Torus
-from flockenv.integrators import RK4, SemiImplicitEuler
-from flockenv.model.spawn import Spawn
+from flockenv.physics.integrators import RK4, SemiImplicitEuler
 from flockenv.scene import Group, Scene
 from tests.catalogue import Array
 

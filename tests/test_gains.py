@@ -11,11 +11,11 @@ import pytest
 
 from flockenv.behaviours import Alignment, Arrive, Cohesion, MatchVelocity, Pursue, Seek
 from flockenv.config import load_scene
-from flockenv.effects import EFFECTS, Effect
 from flockenv.geometry.space import Torus
-from flockenv.integrators import VelocityVerlet
 from flockenv.model.spawn import Spawn
 from flockenv.model.state import State
+from flockenv.physics.effects import EFFECTS, Effect
+from flockenv.physics.integrators import VelocityVerlet
 from flockenv.scene import Group, Scene
 from flockenv.stability import UnstableStepWarning, suggest_dt
 from flockenv.steer import Steer

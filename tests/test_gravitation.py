@@ -11,16 +11,16 @@ import pytest
 from scipy.spatial import cKDTree
 
 from flockenv.behaviours import Separation
-from flockenv.effects import Effect, Gravitation, InverseSquare
 from flockenv.explanation import explain
 from flockenv.geometry.barnes_hut import MOST_DIRECT
 from flockenv.geometry.cell_list import WORTH_ARRANGING
 from flockenv.geometry.space import Torus
-from flockenv.integrators import RK4
 from flockenv.jit.thread_pool import threads, use_threads
 from flockenv.model.networks import Rope
 from flockenv.model.spawn import Spawn
 from flockenv.model.state import State
+from flockenv.physics.effects import Effect, Gravitation, InverseSquare
+from flockenv.physics.integrators import RK4
 from flockenv.scene import Group, Scene
 from tests.catalogue import Array, scene_of, users_module
 
@@ -254,7 +254,7 @@ from typing import Any, ClassVar, Literal
 
 import numpy as np
 
-from flockenv.effects.base import Bonds, Effect, Me, Other
+from flockenv.physics.effects.effect import Bonds, Effect, Me, Other
 from flockenv.jit.decorators import Law, Vec, law
 from flockenv.maths.vectors import scale
 

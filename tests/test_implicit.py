@@ -9,14 +9,14 @@ import pytest
 from scipy.optimize import root
 
 from flockenv.behaviours import Cohesion, Separation
-from flockenv.effects import Carried, Drag, Effect, Gravity, Springs, Vortex
 from flockenv.geometry.space import Torus
-from flockenv.integrators import INTEGRATORS, ImplicitEuler, ImplicitMidpoint
-from flockenv.integrators.newton import Coupling, NotSolvedError, coupled, solve_stage
 from flockenv.model.divergence import SimulationDiverged
 from flockenv.model.networks import Cloth, Rope
 from flockenv.model.spawn import Spawn
 from flockenv.model.state import State
+from flockenv.physics.effects import Carried, Drag, Effect, Gravity, Springs, Vortex
+from flockenv.physics.integrators import INTEGRATORS, ImplicitEuler, ImplicitMidpoint
+from flockenv.physics.integrators.newton import Coupling, NotSolvedError, coupled, solve_stage
 from flockenv.scene import Group, Scene
 from tests.catalogue import Array
 

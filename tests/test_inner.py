@@ -9,14 +9,14 @@ import pytest
 from scipy.spatial import cKDTree
 
 from flockenv.behaviours import Driving
-from flockenv.effects import Antipode, Course, Effect, Goal, Sight
 from flockenv.geometry.space import Torus
 from flockenv.jit.decorators import Law, law
 from flockenv.jit.thread_pool import use_threads
 from flockenv.model.distribution import Spread
 from flockenv.model.spawn import Spawn
-from flockenv.population import Emitter
-from flockenv.population.places import Point
+from flockenv.physics.effects import Antipode, Course, Effect, Goal, Sight
+from flockenv.physics.population import Emitter
+from flockenv.physics.population.regions import Point
 from flockenv.scene import Group, Scene
 
 

@@ -14,8 +14,10 @@ import numpy as np
 import pytest
 
 from flockenv.behaviours import Separation
-from flockenv.effects import Drag
-from flockenv.integrators import (
+from flockenv.model.spawn import Spawn
+from flockenv.model.state import blank
+from flockenv.physics.effects import Drag
+from flockenv.physics.integrators import (
     RK4,
     ExplicitEuler,
     ExponentialDrag,
@@ -25,11 +27,9 @@ from flockenv.integrators import (
     SemiImplicitEuler,
     VelocityVerlet,
 )
-from flockenv.integrators.base import INTEGRATORS as KINDS
-from flockenv.integrators.base import Alone, Provided
-from flockenv.integrators.one_stage import OneStage
-from flockenv.model.spawn import Spawn
-from flockenv.model.state import blank
+from flockenv.physics.integrators.integrator import INTEGRATORS as KINDS
+from flockenv.physics.integrators.integrator import Alone, Provided
+from flockenv.physics.integrators.single_stage import OneStage
 from flockenv.scene import Group, Scene
 from tests.catalogue import INTEGRATORS, Array, IntegratorRow
 from tests.motion import METHODS, V0, WAYS, X0, Advance, at_start, first_of, motion, order, tethered

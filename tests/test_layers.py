@@ -118,7 +118,7 @@ def _walk(node: ast.AST, file: str, lazy: bool, typing: bool) -> Iterator[Import
 
 
 def part(module: str) -> str:
-    """flockenv.effects.drag -> effects; flockenv/effects/drag.py -> effects; agents.ppo -> agents."""
+    """flockenv.physics.effects.drag -> effects; flockenv/physics/effects/drag.py -> effects; agents.ppo -> agents."""
     steps = module.removesuffix(".py").replace("/", ".").split(".")
     return steps[1] if steps[0] == "flockenv" and len(steps) > 1 else steps[0]
 

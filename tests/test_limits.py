@@ -7,8 +7,8 @@ import pytest
 
 from flockenv.geometry.shapes import Circle
 from flockenv.geometry.space import Box, Torus
-from flockenv.integrators import INTEGRATORS
 from flockenv.model.spawn import Spawn
+from flockenv.physics.integrators import INTEGRATORS
 from flockenv.scene import Group, Scene
 from flockenv.tasks import Pursuit
 from flockenv.world import World

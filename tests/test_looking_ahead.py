@@ -9,8 +9,8 @@ import pytest
 
 from flockenv.behaviours import Alignment, Cohesion, Separation
 from flockenv.geometry.space import Plane, Torus
-from flockenv.integrators import SemiImplicitEuler
 from flockenv.model.spawn import Spawn
+from flockenv.physics.integrators import SemiImplicitEuler
 from flockenv.scene import Group, Scene
 from flockenv.sweep import Parts
 

@@ -15,7 +15,11 @@ import numpy as np
 import pytest
 from scipy.special import ellipj, ellipk
 
-from flockenv.integrators import (
+from flockenv.jit.thread_pool import use_threads
+from flockenv.model.divergence import SimulationDiverged
+from flockenv.model.spawn import Spawn
+from flockenv.model.state import State, blank
+from flockenv.physics.integrators import (
     RK4,
     AdaptiveRK4,
     DormandPrince,
@@ -26,12 +30,8 @@ from flockenv.integrators import (
     SemiImplicitEuler,
     VelocityVerlet,
 )
-from flockenv.integrators.control import TRIES, Clock, begun, excess, judged
-from flockenv.integrators.exponential_drag import phi_functions
-from flockenv.jit.thread_pool import use_threads
-from flockenv.model.divergence import SimulationDiverged
-from flockenv.model.spawn import Spawn
-from flockenv.model.state import State, blank
+from flockenv.physics.integrators.exponential_drag import phi_functions
+from flockenv.physics.integrators.step_size import TRIES, Clock, begun, excess, judged
 from flockenv.scene import Group, Scene
 from tests.catalogue import INTEGRATORS, Array, IntegratorRow
 from tests.motion import METHODS, V0, WAYS, X0, at_start, first_of, motion, order, tethered
@@ -328,7 +328,7 @@ def test_drag_beside_other_forces_keeps_the_order(way: str, tether: Any) -> None
 @pytest.mark.slow
 def test_drag_is_shared_among_agents_by_their_mass(tether: Any) -> None:
     """kappa = c / m of everybody: two drags, 20 agents of two masses."""
-    from flockenv.effects import Drag
+    from flockenv.physics.effects import Drag
 
     groups = tuple(Group(count=10, mass=m, spawn=Spawn(low=(0, 0), high=(1, 1), speed=(1, 2))) for m in (0.5, 4.0))
     scene = Scene(groups=groups, effects=(tether(), Drag(rate=3.0)), integrator=ExponentialDrag(), dt=0.7)

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from flockenv.behaviours import Separation
-from flockenv.effects import ObstacleContact
 from flockenv.geometry.shapes import (
     FORMS,
     Block,
@@ -28,6 +27,7 @@ from flockenv.geometry.space import Torus
 from flockenv.jit.section import entry
 from flockenv.measures import measure
 from flockenv.model.spawn import Spawn
+from flockenv.physics.effects import ObstacleContact
 from flockenv.scene import Group, Scene
 from flockenv.trajectory import Trajectory
 

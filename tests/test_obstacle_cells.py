@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from flockenv.behaviours import AvoidObstacles, FollowWall, ForceField, ObstacleRepulsion, Separation, Whiskers
-from flockenv.effects.base import Effect
 from flockenv.geometry.shapes import Block, Capsule, Shape, Sway
 from flockenv.geometry.space import Box, Plane, Torus
 from flockenv.model.spawn import Spawn
+from flockenv.physics.effects.effect import Effect
 from flockenv.scene import Group, Scene
 from flockenv.sweep import met_obstacles
 

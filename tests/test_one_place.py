@@ -11,15 +11,15 @@ import pytest
 from numba import njit
 
 from flockenv.behaviours import Alignment, Cohesion, Separation
-from flockenv.effects.base import Effect, Me, Other, ties
 from flockenv.geometry.cell_list import WORTH_ARRANGING
 from flockenv.geometry.space import Plane, Torus
-from flockenv.integrators import RK4
 from flockenv.jit.thread_pool import threads, use_threads
 from flockenv.model.divergence import SimulationDiverged
 from flockenv.model.group import Group
 from flockenv.model.spawn import Spawn
 from flockenv.model.state import State
+from flockenv.physics.effects.effect import Effect, Me, Other, ties
+from flockenv.physics.integrators import RK4
 from flockenv.scene import Scene
 from flockenv.steering.others import ONE_PLACE
 from flockenv.sweep.pair_plan import pairs_of

@@ -13,16 +13,16 @@ import pytest
 
 from flockenv.behaviours import Separation
 from flockenv.config import dump_scene, load_scene
-from flockenv.effects import Gravity
 from flockenv.geometry.shapes import Block, Capsule, Circle, HalfSpace, Polygon, Shape, Wall
 from flockenv.geometry.space import Box, Plane, Space, Torus
-from flockenv.integrators import ImplicitEuler, SemiImplicitEuler
 from flockenv.jit.thread_pool import use_threads
 from flockenv.model.appearance import Appearance
 from flockenv.model.divergence import SimulationDiverged
 from flockenv.model.spawn import Spawn
 from flockenv.model.state import State
-from flockenv.population import (
+from flockenv.physics.effects import Gravity
+from flockenv.physics.integrators import ImplicitEuler, SemiImplicitEuler
+from flockenv.physics.population import (
     Ageing,
     BoxPlace,
     Burst,

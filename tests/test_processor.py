@@ -17,7 +17,6 @@ from llvmlite import binding
 
 from flockenv.behaviours import Alignment, Cohesion, Separation
 from flockenv.config import load_scene
-from flockenv.effects import Effect, Gravitation
 from flockenv.geometry.space import Plane, Torus
 from flockenv.jit import cpu, pipeline
 from flockenv.jit.decorators import kernel
@@ -25,6 +24,7 @@ from flockenv.jit.intrinsics import unaliased
 from flockenv.jit.pipeline import Whole
 from flockenv.model.group import Group
 from flockenv.model.spawn import Spawn
+from flockenv.physics.effects import Effect, Gravitation
 from flockenv.scene import Scene
 from flockenv.tasks import TASKS, Flock, Task
 from flockenv.tasks.sight import block_ways, compass

@@ -8,9 +8,9 @@ import pickle
 import pytest
 
 from flockenv.behaviours import Separation
-from flockenv.effects import Drag
 from flockenv.geometry.space import Box
 from flockenv.model.spawn import Spawn
+from flockenv.physics.effects import Drag
 from flockenv.scene import Group, Scene
 from flockenv.tasks import Pursuit
 

@@ -13,14 +13,21 @@ from scipy.integrate import solve_ivp
 from scipy.special import ellipk
 
 from flockenv.config import dump_scene, load_scene
-from flockenv.constraints import Rods, UnmetWarning
-from flockenv.effects import Drag, Gravity
 from flockenv.geometry.space import Torus
-from flockenv.integrators import RK4, ExplicitEuler, ImplicitMidpoint, Integrator, SemiImplicitEuler, VelocityVerlet
 from flockenv.model.networks import Cloth, Rope
 from flockenv.model.spawn import Spawn
 from flockenv.model.state import State
-from flockenv.population import Decay, Emitter, Point
+from flockenv.physics.constraints import Rods, UnmetWarning
+from flockenv.physics.effects import Drag, Gravity
+from flockenv.physics.integrators import (
+    RK4,
+    ExplicitEuler,
+    ImplicitMidpoint,
+    Integrator,
+    SemiImplicitEuler,
+    VelocityVerlet,
+)
+from flockenv.physics.population import Decay, Emitter, Point
 from flockenv.scene import Group, Scene
 from tests.catalogue import Array
 

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 from flockenv.behaviours import Alignment, Cohesion, Separation
-from flockenv.effects import Attraction, Drag, Springs, Tether
 from flockenv.geometry.space import Box, Torus
 from flockenv.model.float_range import FARTHEST
 from flockenv.model.networks import Mesh, Rope
 from flockenv.model.spawn import Spawn
 from flockenv.model.state import State
+from flockenv.physics.effects import Attraction, Drag, Springs, Tether
 from flockenv.scene import Group, Scene
 
 HERE = (Group(count=3, spawn=Spawn(low=(0, 0), high=(1, 1))),)

@@ -16,14 +16,14 @@ import pytest
 
 import flockenv
 from flockenv.behaviours import Alignment, Cohesion, Separation
-from flockenv.effects import EFFECTS, Drag, Gravity, QuadraticDrag
 from flockenv.geometry.cell_list import FEWEST_AGENTS
 from flockenv.geometry.shapes import Block, Circle
 from flockenv.geometry.space import Box, Plane, Space, Torus
-from flockenv.integrators import RK4, AdaptiveRK4, SemiImplicitEuler
 from flockenv.jit.cache_folder import cache_folder
 from flockenv.model.spawn import Spawn
 from flockenv.model.state import State
+from flockenv.physics.effects import EFFECTS, Drag, Gravity, QuadraticDrag
+from flockenv.physics.integrators import RK4, AdaptiveRK4, SemiImplicitEuler
 from flockenv.scene import Group, Scene
 from flockenv.sweep import scratch_of
 from flockenv.workspace import Workspace

@@ -12,9 +12,9 @@ import pytest
 from scipy.spatial import cKDTree
 
 from flockenv.config import load_scene
-from flockenv.constraints.collisions import UnsolvedContactsWarning
 from flockenv.geometry.space import Box
 from flockenv.model.state import State
+from flockenv.physics.constraints.collisions import UnsolvedContactsWarning
 from flockenv.scene import Scene
 from tests.catalogue import Array
 
@@ -34,7 +34,7 @@ SLOW = (
 FAST = pytest.mark.parametrize(
     "name", [pytest.param(name, marks=[pytest.mark.slow] if name in SLOW else []) for name in SECONDS]
 )
-UNSOLVED = "ignore::flockenv.constraints.collisions.UnsolvedContactsWarning"
+UNSOLVED = "ignore::flockenv.physics.constraints.collisions.UnsolvedContactsWarning"
 
 
 def scene_of(name: str) -> Scene:

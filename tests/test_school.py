@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 
 from flockenv.behaviours import Evade, Forage, Separation, Shadow, Wander
-from flockenv.effects import Fear, Grazing, Intention, Libido, Metabolism, Predation
 from flockenv.evaluation import rollout, worlds_for
 from flockenv.grants import granted, reconcile
 from flockenv.jit.thread_pool import use_threads
 from flockenv.model.spawn import Spawn
 from flockenv.model.state import State
+from flockenv.physics.effects import Fear, Grazing, Intention, Libido, Metabolism, Predation
+from flockenv.physics.population import Threshold
 from flockenv.players.rules import player
-from flockenv.population import Threshold
 from flockenv.scene import Group, Scene
 from flockenv.steer import Steer
 from flockenv.steering import motivation

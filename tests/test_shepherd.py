@@ -10,12 +10,12 @@ import yaml
 
 from flockenv import steering
 from flockenv.behaviours import Cohesion, Shepherd
-from flockenv.effects.base import EFFECTS, Effect, Me, Members
 from flockenv.geometry.space import Plane, Torus
 from flockenv.jit.decorators import Law, Vec, law
 from flockenv.jit.thread_pool import use_threads
 from flockenv.model.spawn import Spawn
 from flockenv.model.state import State
+from flockenv.physics.effects.effect import EFFECTS, Effect, Me, Members
 from flockenv.scene import Group, Scene
 from flockenv.steering.vectorize import rows
 from tests.catalogue import Array

@@ -26,12 +26,12 @@ from flockenv.behaviours import (
     WalkingGroup,
 )
 from flockenv.config import ConfigError, dump_scene, load_scene, schema
-from flockenv.effects import Contact, Course, Effect, Goal, ObstacleContact
 from flockenv.geometry.shapes import Block, Polygon, Shape, Wall
 from flockenv.geometry.space import Torus
-from flockenv.integrators import ExplicitEuler, SemiImplicitEuler
 from flockenv.maths.approximations import atan2, exp, nearest_whole
 from flockenv.model.spawn import Spawn
+from flockenv.physics.effects import Contact, Course, Effect, Goal, ObstacleContact
+from flockenv.physics.integrators import ExplicitEuler, SemiImplicitEuler
 from flockenv.presets import ALIASES, PRESETS, preset
 from flockenv.scene import Group, Scene
 from flockenv.stability import CoarseContactWarning, UnstableStepWarning, suggest_dt

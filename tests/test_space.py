@@ -11,10 +11,10 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from flockenv.behaviours import Separation
-from flockenv.effects import Drag
 from flockenv.geometry import space as space_module
 from flockenv.geometry.space import Box, Plane, Space, Torus
 from flockenv.model.spawn import Spawn
+from flockenv.physics.effects import Drag
 from flockenv.scene import Group, Scene
 from flockenv.steering.vectorize import rows
 from tests.catalogue import SPACES, everything, scene_of

@@ -9,10 +9,10 @@ from scipy.optimize import brentq
 
 from flockenv.accuracy import Problem, measure
 from flockenv.accuracy.results import Curve
-from flockenv.effects import SpeedLimit, Uniform
-from flockenv.integrators import RK4
 from flockenv.model.spawn import Spawn
 from flockenv.model.state import State
+from flockenv.physics.effects import SpeedLimit, Uniform
+from flockenv.physics.integrators import RK4
 from flockenv.scene import Group, Scene
 
 V, B, MASS = 1.5, 4.0, 2.0

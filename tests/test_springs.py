@@ -10,15 +10,15 @@ import pytest
 import scipy.linalg
 
 from flockenv.behaviours import Cohesion, Separation
-from flockenv.effects import AngularSprings, Elastic, Gravity, Springs
-from flockenv.effects.base import all_masses
 from flockenv.geometry.space import Torus
-from flockenv.integrators import RK4, ImplicitEuler, ImplicitMidpoint
 from flockenv.jit.thread_pool import use_threads
 from flockenv.model.finite_elements import Material, freedoms, frequencies, mass, solve_static, stiffness
 from flockenv.model.networks import Cloth, Mesh, Rope
 from flockenv.model.spawn import Spawn
 from flockenv.model.state import State
+from flockenv.physics.effects import AngularSprings, Elastic, Gravity, Springs
+from flockenv.physics.effects.effect import all_masses
+from flockenv.physics.integrators import RK4, ImplicitEuler, ImplicitMidpoint
 from flockenv.scene import Group, Scene
 from flockenv.steer import Steer
 

@@ -12,9 +12,13 @@ import pytest
 
 from flockenv.behaviours import Separation
 from flockenv.config import load_scene
-from flockenv.effects import AngularSprings, Drag, Effect, Elastic, Gravity, Springs, Tether
 from flockenv.explanation import explain
-from flockenv.integrators import (
+from flockenv.model.divergence import SimulationDiverged
+from flockenv.model.networks import Cloth, Jelly, Mesh, Network, Rope
+from flockenv.model.spawn import Spawn
+from flockenv.model.state import blank
+from flockenv.physics.effects import AngularSprings, Drag, Effect, Elastic, Gravity, Springs, Tether
+from flockenv.physics.integrators import (
     RK4,
     AdaptiveRK4,
     AveragedVelocity,
@@ -29,10 +33,6 @@ from flockenv.integrators import (
     SemiImplicitEuler,
     VelocityVerlet,
 )
-from flockenv.model.divergence import SimulationDiverged
-from flockenv.model.networks import Cloth, Jelly, Mesh, Network, Rope
-from flockenv.model.spawn import Spawn
-from flockenv.model.state import blank
 from flockenv.scene import Group, Scene
 from flockenv.stability import UnstableStepWarning, amplification, drag_limit, limit, suggest_dt
 from tests.catalogue import INTEGRATORS, Array

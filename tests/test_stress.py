@@ -8,7 +8,8 @@ from typing import Any
 
 import pytest
 
-from flockenv.integrators import (
+from flockenv.model.divergence import SimulationDiverged
+from flockenv.physics.integrators import (
     INTEGRATORS,
     RK4,
     ExplicitEuler,
@@ -21,7 +22,6 @@ from flockenv.integrators import (
     VelocityVerlet,
     methods_named,
 )
-from flockenv.model.divergence import SimulationDiverged
 from flockenv.stability import UnstableStepWarning
 from flockenv.stress import CASES, Case, Finding, Results, Value, cases_named, fingerprint, run, usual_methods
 from flockenv.stress.gatherings import GATHERINGS

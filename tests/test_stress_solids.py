@@ -6,8 +6,8 @@ import warnings
 
 import pytest
 
-from flockenv.constraints.collisions import UnsolvedContactsWarning
-from flockenv.integrators import RK4, Integrator, SemiImplicitEuler, VelocityVerlet
+from flockenv.physics.constraints.collisions import UnsolvedContactsWarning
+from flockenv.physics.integrators import RK4, Integrator, SemiImplicitEuler, VelocityVerlet
 from flockenv.stress import CASES, Case, Finding, Value, run, trials
 from flockenv.stress.gatherings import GATHERINGS
 from flockenv.stress.heaps import HEAPS, funnel

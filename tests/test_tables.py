@@ -23,7 +23,7 @@ from typing import Any, ClassVar, Literal
 
 import numpy as np
 
-from flockenv.effects import Effect, Me
+from flockenv.physics.effects import Effect, Me
 from flockenv.jit.decorators import Law, Vec, law
 from flockenv.maths.vectors import axis, scale
 

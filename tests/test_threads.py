@@ -23,15 +23,15 @@ import pytest
 import flockenv
 import flockenv.scene as scenes
 from flockenv.behaviours import Alignment, Separation
-from flockenv.effects import Drag
 from flockenv.geometry.cell_list import FEWEST_ARRANGED, STEPS_ARRANGED, WORTH_ARRANGING
 from flockenv.geometry.space import Box, Torus
-from flockenv.integrators import ImplicitEuler
 from flockenv.jit import thread_pool
 from flockenv.jit.cache_folder import cache_folder
 from flockenv.jit.thread_pool import share, threads, use_threads
 from flockenv.model.spawn import Spawn
 from flockenv.model.state import State
+from flockenv.physics.effects import Drag
+from flockenv.physics.integrators import ImplicitEuler
 from flockenv.scene import Group, Scene
 from flockenv.tasks import Flock
 from flockenv.world import World

@@ -15,7 +15,7 @@ from agents import compare as comparison
 from agents import transfer, transfer_cells, transfer_chart, transfer_report
 from agents.transfer_cells import KEPT, Plan
 from agents.transfer_report import Cell, Clock, Setting
-from flockenv.integrators import INTEGRATORS, RK4
+from flockenv.physics.integrators import INTEGRATORS, RK4
 from flockenv.tasks import TASKS, Pursuit
 
 FILES = ["transfer.json", "transfer.md", "transfer.png"]

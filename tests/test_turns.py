@@ -16,7 +16,7 @@ from flockenv.jit.lock import OneAtATime
 
 MANY = """
 from flockenv.jit.progress import compiled
-from flockenv.effects import Drag
+from flockenv.physics.effects import Drag
 from flockenv.scene import Group, Scene
 from flockenv.geometry.space import Torus
 scene = Scene(space=Torus(size=(9, 9)), groups=(Group(count=3),), effects=(Drag(rate=0.5),))

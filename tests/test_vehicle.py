@@ -11,13 +11,13 @@ import numpy as np
 import pytest
 
 from flockenv.behaviours import Alignment, AvoidObstacles, Separation
-from flockenv.effects import Drag, Effect
 from flockenv.geometry.space import Box, Torus
-from flockenv.integrators import RK4
 from flockenv.jit.thread_pool import threads, use_threads
 from flockenv.maths.heading import GRAVITY
 from flockenv.model.spawn import Spawn
 from flockenv.model.state import State
+from flockenv.physics.effects import Drag, Effect
+from flockenv.physics.integrators import RK4
 from flockenv.scene import Group, Scene
 from flockenv.stability import LookaheadWarning
 from flockenv.steer import Steer

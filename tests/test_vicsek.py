@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 
 from flockenv.config import load_scene
-from flockenv.effects import Vicsek
-from flockenv.effects.vicsek import CHANNEL
 from flockenv.experiments.vicsek import SEEN, bound, order, scene_of
 from flockenv.geometry.space import Torus
-from flockenv.integrators import ExplicitEuler, Heun, SemiImplicitEuler
 from flockenv.maths.counter_rng import _mix
 from flockenv.model.spawn import Spawn
 from flockenv.model.state import State
+from flockenv.physics.effects import Vicsek
+from flockenv.physics.effects.vicsek import CHANNEL
+from flockenv.physics.integrators import ExplicitEuler, Heun, SemiImplicitEuler
 from flockenv.scene import Group, Scene
 from tests.catalogue import Array
 

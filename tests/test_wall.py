@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from flockenv.effects import Drag, Uniform, WallRepulsion
 from flockenv.geometry.space import Box, Torus
-from flockenv.integrators import RK4
 from flockenv.model.spawn import Spawn
+from flockenv.physics.effects import Drag, Uniform, WallRepulsion
+from flockenv.physics.integrators import RK4
 from flockenv.scene import Group, Scene
 
 MASS = 80.0

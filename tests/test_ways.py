@@ -11,7 +11,6 @@ import pytest
 from numpy.typing import NDArray
 
 from flockenv.behaviours import Driving, FollowWay, LineUp, UnalignedAvoidance
-from flockenv.effects import Door, Journey, Routes, Stage, Way
 from flockenv.geometry.eikonal import ground
 from flockenv.geometry.shapes import Block, Circle, HalfSpace, Polygon, Wall
 from flockenv.geometry.space import Box
@@ -19,11 +18,12 @@ from flockenv.geometry.targets import Target
 from flockenv.jit.thread_pool import use_threads
 from flockenv.model.distribution import Spread
 from flockenv.model.spawn import Spawn
-from flockenv.population import Drain, Emitter
-from flockenv.population.places import Point
+from flockenv.physics.effects import Door, Journey, Routes, Stage, Way
+from flockenv.physics.floor_fields import NoWayWarning
+from flockenv.physics.population import Drain, Emitter
+from flockenv.physics.population.regions import Point
 from flockenv.scene import Group, Scene
 from flockenv.steer import Steer
-from flockenv.ways import NoWayWarning
 
 Array = NDArray[np.float64]
 

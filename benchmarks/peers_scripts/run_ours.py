@@ -174,9 +174,9 @@ def like_mesa(agents: int) -> Case:
 
 def social_corridor(agents: int) -> Case:
     """A crowd under the preset of 2000 in a corridor of 300 m, a person per square metre at first."""
-    from flockenv.effects import Course
     from flockenv.geometry.shapes import Wall
     from flockenv.model.spawn import Spawn
+    from flockenv.physics.effects import Course
     from flockenv.presets import preset
     from flockenv.scene import Group, Scene
 
@@ -201,8 +201,8 @@ def social_corridor(agents: int) -> Case:
 
 def social_field(agents: int) -> Case:
     """A crowd under the preset of 2009 in the open, a person per square metre at first, all the same way."""
-    from flockenv.effects import Course
     from flockenv.model.spawn import Spawn
+    from flockenv.physics.effects import Course
     from flockenv.presets import preset
     from flockenv.scene import Group, Scene
 

@@ -30,11 +30,11 @@ def another(threads: int) -> Case:
     """The same, once all effects were imported and one more was defined, in another scene used too."""
     from typing import Any, ClassVar, Literal
 
-    import flockenv.effects
+    import flockenv.physics.effects
     from benchmarks.scenes import world
-    from flockenv.effects import Effect
     from flockenv.jit.decorators import Law, Vec, law
     from flockenv.maths.vectors import zero
+    from flockenv.physics.effects import Effect
 
     @law
     def nowhere(p: Any, me: Any) -> Vec:
@@ -45,7 +45,7 @@ def another(threads: int) -> Case:
         strength: float = 1.0
         own_law: ClassVar[Law | None] = nowhere
 
-    assert "unasked" in flockenv.effects.EFFECTS
+    assert "unasked" in flockenv.physics.effects.EFFECTS
     busy = world("float32").with_effects(*world("float32").effects[:1])
     busy.step(busy.start(0))
     return plain(threads)

@@ -9,8 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from flockenv.accuracy.problem import FINER, Problem
-from flockenv.integrators import RK4
 from flockenv.model.state import State
+from flockenv.physics.integrators import RK4
 
 __all__ = ["PERTURBATION", "Sensitivity", "find_sensitivity"]
 

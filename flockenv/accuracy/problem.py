@@ -12,12 +12,12 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from flockenv.accuracy.paths import Floats, Path, apart
-from flockenv.constraints import Collisions, UnmetWarning
-from flockenv.constraints.collisions import UnsolvedContactsWarning
-from flockenv.effects import Effect
-from flockenv.integrators import RK4, Integrator
 from flockenv.model.state import State, blank
-from flockenv.population import Crowding, Decay
+from flockenv.physics.constraints import Collisions, UnmetWarning
+from flockenv.physics.constraints.collisions import UnsolvedContactsWarning
+from flockenv.physics.effects import Effect
+from flockenv.physics.integrators import RK4, Integrator
+from flockenv.physics.population import Crowding, Decay
 from flockenv.scene import Scene
 from flockenv.stability import CoarseContactWarning, UnstableStepWarning, suggest_dt
 

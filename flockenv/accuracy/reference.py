@@ -18,8 +18,8 @@ import numpy as np
 from flockenv.accuracy.dop853 import NotSmoothError, integrated_twice
 from flockenv.accuracy.paths import Floats, Path, farthest, reach
 from flockenv.accuracy.problem import FINER, Problem
-from flockenv.constraints import Collisions
-from flockenv.integrators import RK4
+from flockenv.physics.constraints import Collisions
+from flockenv.physics.integrators import RK4
 
 __all__ = ["COARSE", "LEAST_FINER", "Reference", "find_reference", "own_steps"]
 

@@ -13,13 +13,24 @@ import numpy as np
 from flockenv.accuracy.paths import Floats
 from flockenv.accuracy.problem import Exact, Problem
 from flockenv.behaviours import Alignment, Cohesion, Separation
-from flockenv.constraints import Collisions, Rods
 from flockenv.core.errors import nearest, shown
-from flockenv.effects import Attraction, Carried, Drag, Effect, Gravity, QuadraticDrag, Swing, Tether, Uniform, Vortex
 from flockenv.geometry.shapes import HalfSpace
 from flockenv.geometry.space import Torus
 from flockenv.model.networks import Rope
 from flockenv.model.spawn import Spawn
+from flockenv.physics.constraints import Collisions, Rods
+from flockenv.physics.effects import (
+    Attraction,
+    Carried,
+    Drag,
+    Effect,
+    Gravity,
+    QuadraticDrag,
+    Swing,
+    Tether,
+    Uniform,
+    Vortex,
+)
 from flockenv.scene import Group, Scene
 
 __all__ = ["SUITE", "problems_named"]

@@ -20,8 +20,8 @@ from flockenv.accuracy.paths import Path, farthest, largest, unmatched
 from flockenv.accuracy.problem import Problem
 from flockenv.accuracy.reference import COARSE, LEAST_FINER, Reference, find_reference
 from flockenv.accuracy.results import Curve, Machine, Point, Report, measured_order
-from flockenv.integrators import INTEGRATORS, Integrator
 from flockenv.model.state import State
+from flockenv.physics.integrators import INTEGRATORS, Integrator
 from flockenv.scene import Scene
 
 __all__ = ["REPETITIONS", "TOLERANCES", "machine", "measure", "usual_methods"]

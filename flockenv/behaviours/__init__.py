@@ -31,7 +31,7 @@ from flockenv.behaviours.social import CircularRepulsion, EllipticalRepulsion, S
 from flockenv.behaviours.walls import Contain, FollowWall  # noqa: E402
 from flockenv.behaviours.wander import Wander  # noqa: E402
 from flockenv.behaviours.way import FollowWay  # noqa: E402
-from flockenv.effects.base import EFFECTS, Effect  # noqa: E402  # after the folder has been walked
+from flockenv.physics.effects.effect import EFFECTS, Effect  # noqa: E402  # after the folder has been walked
 
 __all__ = [
     "BEHAVIOURS", "Alignment", "Arrive", "AvoidObstacles", "CircularRepulsion", "Cohesion", "Contain", "Dock",

@@ -12,9 +12,9 @@ import numpy as np
 from pydantic import Field
 
 from flockenv import steering
-from flockenv.effects.base import Effect, Me, Obstacle
 from flockenv.jit.decorators import Law, Vec, law, like
 from flockenv.maths.vectors import add, cross, dot, lateral, norm, perpendicular, scale, select, sub, unit, zero
+from flockenv.physics.effects.effect import Effect, Me, Obstacle
 
 __all__ = ["AvoidObstacles", "ForceField", "Whiskers"]
 

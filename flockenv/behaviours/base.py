@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from flockenv.effects.base import Effect, Me, Other, Sight, all_masses, demand_group
 from flockenv.jit.decorators import Law, Vec, law, like
+from flockenv.physics.effects.effect import Effect, Me, Other, Sight, all_masses, demand_group
 from flockenv.stability import LookaheadWarning
 
 __all__ = [

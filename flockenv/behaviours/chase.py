@@ -8,9 +8,9 @@ from pydantic import Field
 
 from flockenv import steering
 from flockenv.behaviours.base import AboutNearest, Moving, seen_one, top_speed
-from flockenv.effects.base import Me
 from flockenv.jit.decorators import Law, Vec, law, like
 from flockenv.maths.vectors import norm, scale, select, zero
+from flockenv.physics.effects.effect import Me
 
 __all__ = ["PREDICTORS", "Evade", "MatchVelocity", "OffsetPursue", "Predicting", "Pursue", "Shadow"]
 

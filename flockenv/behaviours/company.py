@@ -10,9 +10,9 @@ from pydantic import Field
 
 from flockenv import steering
 from flockenv.behaviours.base import AboutNearest, Moving, seen_one, top_speed
-from flockenv.effects.base import Me, Other, Sight
 from flockenv.jit.decorators import Law, Vec, law, like
 from flockenv.maths.vectors import norm, scale, select, zero
+from flockenv.physics.effects.effect import Me, Other, Sight
 
 __all__ = ["FollowLeader", "Formation", "Interpose"]
 

@@ -12,9 +12,9 @@ from pydantic import Field
 from flockenv import steering
 from flockenv.behaviours.base import Behaviour, Moving, gains, top_speed
 from flockenv.behaviours.wander import wandered
-from flockenv.effects.base import Me, Other, Sight, Vector
 from flockenv.jit.decorators import Law, Vec, law, like
 from flockenv.maths.vectors import scale, select, sub, unit, zero
+from flockenv.physics.effects.effect import Me, Other, Sight, Vector
 
 __all__ = ["Explore", "Forage", "Queue", "UnalignedAvoidance"]
 

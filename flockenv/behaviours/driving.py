@@ -10,9 +10,9 @@ from pydantic import Field
 
 from flockenv import steering
 from flockenv.behaviours.base import Behaviour, steered_groups
-from flockenv.effects.base import Me, Other, Sight, all_masses
 from flockenv.jit.decorators import Law, Vec, law, like
 from flockenv.maths.vectors import dot, norm, scale, sub, unit
+from flockenv.physics.effects.effect import Me, Other, Sight, all_masses
 
 __all__ = ["Driving", "LineUp"]
 

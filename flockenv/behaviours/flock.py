@@ -16,9 +16,9 @@ from pydantic import Field
 
 from flockenv import steering
 from flockenv.behaviours.base import gains
-from flockenv.effects.base import Effect, Me, Other, Sight
 from flockenv.jit.decorators import Law, Vec, law, like
 from flockenv.maths.vectors import scale, select, sub, zero
+from flockenv.physics.effects.effect import Effect, Me, Other, Sight
 from flockenv.steering import others
 
 __all__ = ["Alignment", "Cohesion", "Separation"]

@@ -9,9 +9,9 @@ from pydantic import Field, model_validator
 
 from flockenv import steering
 from flockenv.behaviours.base import Behaviour, Moving, top_speed
-from flockenv.effects.base import Me, Vector
 from flockenv.jit.decorators import Law, Vec, law
 from flockenv.maths.vectors import dot, scale, select, sub, zero
+from flockenv.physics.effects.effect import Me, Vector
 
 __all__ = ["Arrive", "Dock", "Face", "Flee", "Seek", "TargetSpeed"]
 

@@ -12,10 +12,10 @@ from pydantic import Field
 
 from flockenv import steering
 from flockenv.behaviours.social import Social, size_of
-from flockenv.effects.base import Effect, Me, Other, Sight, Vector, all_masses
 from flockenv.jit.decorators import Law, Vec, law, like
 from flockenv.maths.approximations import exp
 from flockenv.maths.vectors import add, limit, norm, scale, select, sub, unit, zero
+from flockenv.physics.effects.effect import Effect, Me, Other, Sight, Vector, all_masses
 from flockenv.steering.others import ONE_PLACE
 
 __all__ = ["Friends", "Interest", "WalkingGroup"]

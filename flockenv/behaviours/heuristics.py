@@ -12,12 +12,12 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from flockenv import steering
-from flockenv.effects.base import Effect, Me, Other, Sight, all_masses, demand_group
 from flockenv.geometry.shapes.chain import segment_hit, segment_share
 from flockenv.jit.decorators import OPTIONS, Law, Vec, law, like
 from flockenv.jit.intrinsics import stacked
 from flockenv.maths.approximations import nearest_whole
 from flockenv.maths.vectors import add, dot, norm, scale, select, sub, unit, zero
+from flockenv.physics.effects.effect import Effect, Me, Other, Sight, all_masses, demand_group
 
 __all__ = ["DIRECTIONS", "Heuristics"]
 

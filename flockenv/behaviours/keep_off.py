@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from flockenv.behaviours.push import Push
-from flockenv.effects.base import Me, Obstacle, all_masses
 from flockenv.jit.decorators import Law, Vec, law
 from flockenv.maths.approximations import exp
 from flockenv.maths.vectors import add, scale, select, zero
+from flockenv.physics.effects.effect import Me, Obstacle, all_masses
 
 __all__ = ["ObstacleRepulsion"]
 

@@ -15,11 +15,11 @@ from pydantic import Field, model_validator
 
 from flockenv import steering
 from flockenv.behaviours.base import Behaviour, Moving, gains, top_speed
-from flockenv.effects.base import Me, Vector
 from flockenv.geometry import polyline
 from flockenv.jit.decorators import Law, Vec, law, like
 from flockenv.maths import grid
 from flockenv.maths.vectors import add, norm, scale, select, sub, zero
+from flockenv.physics.effects.effect import Me, Vector
 
 __all__ = ["FollowFlow", "FollowPath", "StayOnPath"]
 

@@ -7,8 +7,8 @@ from typing import ClassVar, Self
 
 from pydantic import Field, model_validator
 
-from flockenv.effects.base import Effect
 from flockenv.jit.decorators import Vec
+from flockenv.physics.effects.effect import Effect
 
 __all__ = ["Push"]
 

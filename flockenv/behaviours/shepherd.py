@@ -10,9 +10,9 @@ from pydantic import Field
 
 from flockenv import steering
 from flockenv.behaviours.base import Moving, top_speed
-from flockenv.effects.base import Me, Members, Vector
 from flockenv.jit.decorators import Law, Vec, law, like
 from flockenv.maths.vectors import scale, select, sub, zero
+from flockenv.physics.effects.effect import Me, Members, Vector
 
 __all__ = ["Shepherd"]
 

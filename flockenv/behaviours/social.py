@@ -15,10 +15,10 @@ from pydantic import Field
 
 from flockenv import steering
 from flockenv.behaviours.push import Push
-from flockenv.effects.base import Me, Other, Sight, all_masses, demand_group
 from flockenv.jit.decorators import Law, Vec, law, like
 from flockenv.maths.approximations import exp
 from flockenv.maths.vectors import dot, limit, scale, select, sub, unit
+from flockenv.physics.effects.effect import Me, Other, Sight, all_masses, demand_group
 from flockenv.steering import social
 
 __all__ = ["CircularRepulsion", "EllipticalRepulsion", "Sidestep", "Social"]

@@ -10,13 +10,13 @@ from pydantic import Field, model_validator
 
 from flockenv import steering
 from flockenv.behaviours.base import Moving, top_speed
-from flockenv.effects.base import Me, Obstacle
 from flockenv.geometry.shapes import AnyShape, packed
 from flockenv.geometry.shapes.block import nearest_block
 from flockenv.geometry.shapes.chain import nearest_chain
 from flockenv.geometry.space import Torus
 from flockenv.jit.decorators import Law, Vec, law, like
 from flockenv.maths.vectors import add, dot, lateral, norm, perpendicular, scale, select, sub, unit, zero
+from flockenv.physics.effects.effect import Me, Obstacle
 
 __all__ = ["Contain", "FollowWall"]
 

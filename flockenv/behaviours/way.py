@@ -9,11 +9,11 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from flockenv.behaviours.base import Moving, steered_groups, top_speed
-from flockenv.effects.base import Me, Vector
 from flockenv.geometry.targets import Target
 from flockenv.jit.decorators import Law, Vec, law, like
 from flockenv.maths.vectors import norm, scale, sub
-from flockenv.ways import check_ways, lengths_on, region, starts_of, warn_cut_off, way_ahead, ways_to
+from flockenv.physics.effects.effect import Me, Vector
+from flockenv.physics.floor_fields import check_ways, lengths_on, region, starts_of, warn_cut_off, way_ahead, ways_to
 
 __all__ = ["FollowWay"]
 

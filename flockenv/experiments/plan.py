@@ -13,8 +13,8 @@ from pydantic import Field, model_validator
 
 from flockenv.behaviours import FollowWay, Seek
 from flockenv.core.record import Record
-from flockenv.effects import Effect
 from flockenv.experiments.base import Experiment
+from flockenv.physics.effects import Effect
 from flockenv.scene import Scene
 from flockenv.steer import AnyBehaviour, AnyReconciling, Steer
 

@@ -16,13 +16,13 @@ import numpy as np
 from pydantic import Field
 
 from flockenv.core.record import Record
-from flockenv.effects import Vicsek
 from flockenv.experiments.base import Experiment, Trial
 from flockenv.experiments.plan import Plan
 from flockenv.geometry.space import Torus
-from flockenv.integrators import Integrator, SemiImplicitEuler
 from flockenv.measures import polarisation
 from flockenv.model.spawn import Spawn
+from flockenv.physics.effects import Vicsek
+from flockenv.physics.integrators import Integrator, SemiImplicitEuler
 from flockenv.scene import AnyIntegrator, Group, Scene
 
 __all__ = ["SEEN", "Flock", "NoisePlan", "bound", "order", "scene_of"]

@@ -13,13 +13,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
 
-from flockenv.effects import Attraction, Carried, Drag, Gravity, Swing, Tether, Uniform, Vortex, WallRepulsion
 from flockenv.findings import Case, Value
 from flockenv.geometry.space import Box
-from flockenv.integrators import Adaptive, Integrator
 from flockenv.model.divergence import SimulationDiverged
 from flockenv.model.spawn import Spawn
 from flockenv.model.state import State
+from flockenv.physics.effects import Attraction, Carried, Drag, Gravity, Swing, Tether, Uniform, Vortex, WallRepulsion
+from flockenv.physics.integrators import Adaptive, Integrator
 from flockenv.scene import Group, Scene
 from flockenv.stability import amplification, limit
 from flockenv.stress.case import quietly, started

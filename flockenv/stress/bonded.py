@@ -9,11 +9,11 @@ from collections.abc import Callable
 
 import numpy as np
 
-from flockenv.effects import Gravity, Springs
 from flockenv.findings import Case, Value
-from flockenv.integrators import Integrator
 from flockenv.model.networks import Cloth, Network, Rope
 from flockenv.model.state import State
+from flockenv.physics.effects import Gravity, Springs
+from flockenv.physics.integrators import Integrator
 from flockenv.scene import Group, Scene
 
 __all__ = ["BONDED"]

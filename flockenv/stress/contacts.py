@@ -13,12 +13,12 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from flockenv.effects import Contact, ObstacleContact
 from flockenv.findings import Case, Value
-from flockenv.integrators import Integrator
 from flockenv.model.divergence import SimulationDiverged
 from flockenv.model.spawn import Spawn
 from flockenv.model.state import State
+from flockenv.physics.effects import Contact, ObstacleContact
+from flockenv.physics.integrators import Integrator
 from flockenv.scene import Group, Scene
 from flockenv.stability import CoarseContactWarning, contact_limit
 from flockenv.stress.case import TOO_LONG, quietly, started

@@ -10,7 +10,7 @@ import numpy as np
 from flockenv.behaviours import Alignment, Cohesion, Separation
 from flockenv.findings import Case, Value
 from flockenv.geometry.space import Torus
-from flockenv.integrators import Adaptive, Integrator
+from flockenv.physics.integrators import Adaptive, Integrator
 from flockenv.scene import Group, Scene
 from flockenv.stress.case import started
 

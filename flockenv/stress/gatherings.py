@@ -10,12 +10,12 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from flockenv.behaviours import AvoidObstacles, ForceField, Seek, UnalignedAvoidance
-from flockenv.constraints import Collisions
 from flockenv.findings import Case, Value
 from flockenv.geometry.shapes import Block, Circle, Polygon
-from flockenv.integrators import Integrator
 from flockenv.jit.thread_pool import threads, use_threads
 from flockenv.model.spawn import Spawn
+from flockenv.physics.constraints import Collisions
+from flockenv.physics.integrators import Integrator
 from flockenv.scene import Group, Scene
 from flockenv.steer import Steer
 from flockenv.steering.arbitration import Allocation, Blend

@@ -12,7 +12,7 @@ import numpy as np
 
 from flockenv.findings import Value
 from flockenv.geometry.shapes import HalfSpace, Wall
-from flockenv.integrators import Integrator
+from flockenv.physics.integrators import Integrator
 from flockenv.stress.solids import Floats, G, Response, batch, overlap, per_response, solid
 
 __all__ = ["HEAPS", "funnel"]

@@ -12,9 +12,9 @@ import numpy as np
 
 from flockenv.findings import Value
 from flockenv.geometry.shapes import Block, HalfSpace, Shape, Wall
-from flockenv.integrators import Integrator
 from flockenv.model.spawn import Spawn
 from flockenv.model.state import State
+from flockenv.physics.integrators import Integrator
 from flockenv.scene import Scene
 from flockenv.stress.solids import Floats, G, Response, batch, overlap, per_response, solid
 

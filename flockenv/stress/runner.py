@@ -7,10 +7,10 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from flockenv import findings
-from flockenv.constraints.collisions import UnsolvedContactsWarning
 from flockenv.findings import Case, Results
-from flockenv.integrators import INTEGRATORS, Integrator
 from flockenv.jit.sources import laws_digest
+from flockenv.physics.constraints.collisions import UnsolvedContactsWarning
+from flockenv.physics.integrators import INTEGRATORS, Integrator
 from flockenv.stress.case import TOO_LONG
 
 __all__ = ["fingerprint", "run", "usual_methods"]

@@ -1,6 +1,6 @@
 """Scenes of solid discs for hard cases: one set of laws, Gravity alone, so that each method compiles one kernel.
 
-Each case has one response (flockenv/constraints/collisions.py); the other axis of the table is the method.
+Each case has one response (flockenv/physics/constraints/collisions.py); the other axis of the table is the method.
 """
 
 from __future__ import annotations
@@ -11,13 +11,13 @@ from typing import Any, Literal, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from flockenv.constraints import Collisions
-from flockenv.effects import Gravity
 from flockenv.findings import Case, Value
 from flockenv.geometry.shapes import Shape
-from flockenv.integrators import Integrator
 from flockenv.model.spawn import Spawn
 from flockenv.model.state import State
+from flockenv.physics.constraints import Collisions
+from flockenv.physics.effects import Gravity
+from flockenv.physics.integrators import Integrator
 from flockenv.scene import Group, Scene
 
 __all__ = ["RESPONSES", "Floats", "G", "Response", "batch", "overlap", "per_response", "solid"]

@@ -6,10 +6,10 @@ import functools
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from flockenv.effects.base import Me
 from flockenv.jit.decorators import kernel, law, like
 from flockenv.jit.section import record, section, tuple_from
 from flockenv.maths.vectors import unit, zero
+from flockenv.physics.effects.effect import Me
 from flockenv.sweep.blocks import vector_of_lane
 
 if TYPE_CHECKING:

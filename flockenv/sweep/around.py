@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from flockenv.geometry.shapes.edges import near_way, sphere_edge
-from flockenv.geometry.shapes.ray_hit import touched_spot
+from flockenv.geometry.shapes.ray_contact import touched_spot
 from flockenv.geometry.shapes.round import touched_normal
 from flockenv.geometry.shapes.table import law_of
 from flockenv.jit.decorators import Law, Vec, kernel, law, like, routine

@@ -13,11 +13,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from flockenv.effects.base import Bonds, Other
 from flockenv.jit.decorators import Law, like
 from flockenv.jit.intrinsics import wait_for_team
 from flockenv.jit.section import section
 from flockenv.maths.vectors import dot, exact_sum, zero
+from flockenv.physics.effects.effect import Bonds, Other
 from flockenv.sweep.agents import AgentPlan, alone_of, inner_of
 from flockenv.sweep.blocks import vector_of_lane
 from flockenv.sweep.gather import gather

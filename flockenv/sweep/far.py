@@ -12,12 +12,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from flockenv.effects.base import Far, Me
 from flockenv.geometry.barnes_hut import BUCKETS, LEVELS, LISTED, gather, line_up, weigh
 from flockenv.jit.decorators import Law, like
 from flockenv.jit.intrinsics import wait_for_team
 from flockenv.jit.section import section
 from flockenv.maths.vectors import dot, sub, zero
+from flockenv.physics.effects.effect import Far, Me
 from flockenv.sweep.blocks import place_of, vector_of_lane
 from flockenv.sweep.parts import Parts
 

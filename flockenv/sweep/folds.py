@@ -12,13 +12,13 @@ from typing import Any
 
 import numpy as np
 
-from flockenv.effects.base import Obstacle
-from flockenv.geometry.shapes.ray_hit import touched_offset, touched_spot
+from flockenv.geometry.shapes.ray_contact import touched_offset, touched_spot
 from flockenv.geometry.shapes.round import normal, touched_normal
 from flockenv.geometry.shapes.table import law_of
 from flockenv.jit.decorators import kernel, like
 from flockenv.jit.section import in_turn, section
 from flockenv.maths.vectors import add, dot, norm, scale, sub, zero
+from flockenv.physics.effects.effect import Obstacle
 from flockenv.steering.around import threat
 from flockenv.sweep.forms import Surroundings, number_of
 from flockenv.sweep.gather import chosen, gather, scatter

@@ -11,11 +11,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from flockenv.effects.base import Members
 from flockenv.jit.decorators import Law, finite, kernel, like
 from flockenv.jit.intrinsics import wait_for_team
 from flockenv.jit.section import in_turn, section
 from flockenv.maths.vectors import add, dot, scale, sub, zero
+from flockenv.physics.effects.effect import Members
 from flockenv.sweep.blocks import place_of, vector_of_lane
 from flockenv.sweep.gather import gather, scatter
 from flockenv.sweep.parts import Parts

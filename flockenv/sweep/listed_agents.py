@@ -7,10 +7,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from flockenv.effects.base import Me
 from flockenv.jit.decorators import kernel
 from flockenv.jit.section import record, section
 from flockenv.maths.vectors import zero
+from flockenv.physics.effects.effect import Me
 from flockenv.sweep.blocks import place_of
 from flockenv.sweep.gather import gather
 from flockenv.sweep.listing import Listing

@@ -13,11 +13,11 @@ from typing import Any
 
 import numpy as np
 
-from flockenv.effects.base import Other
 from flockenv.jit.decorators import kernel, like
 from flockenv.jit.intrinsics import tallied, tally_of, wait_for_team
 from flockenv.jit.section import section
 from flockenv.maths.vectors import dot, exact_dot, sub
+from flockenv.physics.effects.effect import Other
 from flockenv.steering.others import ONE_PLACE
 from flockenv.sweep.gather import gather, scatter
 from flockenv.sweep.listed_agents import Besides, Block, Candidate, agent_listed, candidate_listed, tie_of, with_tie

@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from flockenv.effects.base import Effect, Sight
 from flockenv.geometry.shapes import packed
 from flockenv.geometry.shapes.cells import FEWEST_ROWS, cells_of
 from flockenv.geometry.space import Space
+from flockenv.physics.effects.effect import Effect, Sight
 from flockenv.sweep.forms import FormPlan, Surroundings
 from flockenv.sweep.numbers import NumberPlan
 

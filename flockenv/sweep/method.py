@@ -8,9 +8,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from flockenv.integrators.base import SUBSTEPS, Method, Provided
 from flockenv.jit.decorators import kernel, like
 from flockenv.jit.section import section
+from flockenv.physics.integrators.integrator import SUBSTEPS, Method, Provided
 from flockenv.sweep.parts import Parts
 
 __all__ = ["MethodPlan", "advance_of", "method_plan"]

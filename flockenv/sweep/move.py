@@ -11,12 +11,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from flockenv.integrators.one_stage import OneStage
 from flockenv.jit.decorators import Law, Vec, finite, kernel, like
 from flockenv.jit.section import in_turn, section, tuple_from
 from flockenv.maths.counter_rng import normal
 from flockenv.maths.heading import faced, held, leant, raised, turned
 from flockenv.maths.vectors import add, dot, limit, norm, scale, select, sub, zero
+from flockenv.physics.integrators.single_stage import OneStage
 from flockenv.sweep.agents import AgentPlan, agent_plan, alone_of
 from flockenv.sweep.blocks import common_places, put_vector_of, vector_of_lane
 from flockenv.sweep.laws import OneLaw, given_of, says_of

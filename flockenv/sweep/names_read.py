@@ -6,9 +6,9 @@ import inspect
 from collections.abc import Sequence
 from typing import Any
 
-from flockenv.effects.base import LAWS, Effect
 from flockenv.jit.decorators import IN_PYTHON, python_of
 from flockenv.jit.sources import held
+from flockenv.physics.effects.effect import LAWS, Effect
 
 __all__ = ["OF_PAIRS", "names_read"]
 

@@ -19,7 +19,7 @@ from flockenv.maths.vectors import add
 from flockenv.sweep.gather import gather
 
 if TYPE_CHECKING:
-    from flockenv.effects.base import Effect
+    from flockenv.physics.effects.effect import Effect
     from flockenv.sweep.parts import Parts
 
 __all__ = [

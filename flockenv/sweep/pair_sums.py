@@ -8,11 +8,11 @@ from typing import Any
 
 import numpy as np
 
-from flockenv.effects.base import Other, in_view
 from flockenv.jit.decorators import kernel, like
 from flockenv.jit.intrinsics import tallied, tally_of
 from flockenv.jit.section import in_turn, section, tuple_from
 from flockenv.maths.vectors import add, dot, zero
+from flockenv.physics.effects.effect import Other, in_view
 from flockenv.sweep.blocks import place_of, vector_of
 from flockenv.sweep.gather import add_where, chosen, copy_each, fill, gather, picked, scatter
 from flockenv.sweep.laws import given_of

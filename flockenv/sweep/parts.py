@@ -16,13 +16,13 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from flockenv.effects.base import LAWS, Effect, Sight
 from flockenv.geometry.shapes.cells import MOST_FOUND
 from flockenv.geometry.space import Space
-from flockenv.integrators.base import Integrator
-from flockenv.integrators.one_stage import OneStage
 from flockenv.jit import cpu
 from flockenv.jit.cpu import LINE
+from flockenv.physics.effects.effect import LAWS, Effect, Sight
+from flockenv.physics.integrators.integrator import Integrator
+from flockenv.physics.integrators.single_stage import OneStage
 from flockenv.sweep.met_obstacles import MetObstacles
 from flockenv.sweep.names_read import OF_PAIRS, names_read
 from flockenv.sweep.numbers import NumberPlan, pack_numbers

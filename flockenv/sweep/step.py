@@ -12,12 +12,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from flockenv.integrators.base import Method, Provided
 from flockenv.jit.decorators import Law, finite, kernel, like
 from flockenv.jit.intrinsics import ask_for, wait_for_team
 from flockenv.jit.section import in_turn, section
 from flockenv.maths.vectors import zero
 from flockenv.model.state import COUNTED_BY_KERNELS
+from flockenv.physics.integrators.integrator import Method, Provided
 from flockenv.sweep.agents import AgentPlan, agent_plan, alone_of
 from flockenv.sweep.arrange import ArrangePlan, arrange_plan, go_home_of, move_in_of
 from flockenv.sweep.blocks import place_of, vector_of_lane

@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from flockenv import steering
-from flockenv.effects import Contact, ObstacleContact
 from flockenv.geometry.shapes import Wall
 from flockenv.geometry.space import Box
 from flockenv.jit.decorators import kernel, like
@@ -20,6 +19,7 @@ from flockenv.maths.vectors import add, norm, scale, sub, unit
 from flockenv.model.snapshot import Mark
 from flockenv.model.spawn import Spawn
 from flockenv.model.state import State
+from flockenv.physics.effects import Contact, ObstacleContact
 from flockenv.presets import PRESETS
 from flockenv.scene import Group, Scene
 from flockenv.sweep import Look

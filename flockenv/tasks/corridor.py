@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from flockenv import steering
-from flockenv.effects import ObstacleContact
 from flockenv.geometry.shapes import Wall
 from flockenv.geometry.space import Torus
 from flockenv.jit.decorators import kernel, like
@@ -19,6 +18,7 @@ from flockenv.maths.counter_rng import normal, uniform
 from flockenv.maths.vectors import add, norm, scale, sub
 from flockenv.model.spawn import Spawn
 from flockenv.model.state import State
+from flockenv.physics.effects import ObstacleContact
 from flockenv.presets import PRESETS
 from flockenv.scene import Group, Scene
 from flockenv.sweep import Look

@@ -11,13 +11,13 @@ from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from flockenv.behaviours.social import Social
-from flockenv.effects.aims import Antipode
 from flockenv.geometry.space import Plane
 from flockenv.jit.decorators import kernel, like
 from flockenv.maths.counter_rng import uniform
 from flockenv.model.snapshot import Mark
 from flockenv.model.spawn import Spawn
 from flockenv.model.state import State
+from flockenv.physics.effects.aims import Antipode
 from flockenv.presets import PRESETS
 from flockenv.scene import Group, Scene
 from flockenv.steer import Steer

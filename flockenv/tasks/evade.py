@@ -9,12 +9,12 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from flockenv import steering
-from flockenv.effects import ObstacleContact
 from flockenv.geometry.shapes import ray_hit
 from flockenv.geometry.space import Box
 from flockenv.jit.decorators import Vec, kernel, like
 from flockenv.maths.counter_rng import uniform
 from flockenv.maths.vectors import add, norm, scale, unit
+from flockenv.physics.effects import ObstacleContact
 from flockenv.scene import Group, Scene
 from flockenv.steering import arbitration
 from flockenv.sweep import Look

@@ -11,13 +11,13 @@ from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from flockenv import steering
-from flockenv.effects.base import in_view
 from flockenv.geometry.space import Box
 from flockenv.jit.decorators import Vec, kernel
 from flockenv.maths.counter_rng import smooth, uniform
 from flockenv.maths.vectors import add, dot, norm, scale, sub, unit
 from flockenv.model.snapshot import Mark
 from flockenv.model.state import State
+from flockenv.physics.effects.effect import in_view
 from flockenv.scene import Group, Scene
 from flockenv.steering import arbitration, motivation
 from flockenv.tasks.base import Frame, Task

@@ -10,10 +10,10 @@ from functools import partial
 
 import numpy as np
 
-from flockenv.effects import Course, Journey, Stage
 from flockenv.findings import Case, Value
 from flockenv.model.distribution import Spread
 from flockenv.model.spawn import Spawn
+from flockenv.physics.effects import Course, Journey, Stage
 from flockenv.scene import Scene
 from flockenv.validation.walk import Floats, Scenes, lane, people, scene_of, walked, wall
 

@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 
-from flockenv.effects import Course
 from flockenv.findings import Case, Value
 from flockenv.geometry.cell_list import FEWEST_AGENTS
 from flockenv.geometry.shapes import Wall
@@ -19,6 +18,7 @@ from flockenv.geometry.space import Torus
 from flockenv.measures import above_null, classical_density, lanes, single_file_speed, speed_in_area, weidmann_speed
 from flockenv.model.spawn import Spawn
 from flockenv.model.state import State
+from flockenv.physics.effects import Course
 from flockenv.scene import Scene
 from flockenv.validation.walk import SHAKEN, STEPS, Floats, Scenes, filled, nobody, people, scene_of, walked, wall
 

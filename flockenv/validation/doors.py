@@ -14,9 +14,9 @@ from typing import Any
 import numpy as np
 
 from flockenv.findings import Case, Value
-from flockenv.integrators import DormandPrince, Integrator, SemiImplicitEuler
 from flockenv.measures import Crossings, above_null, bursts, classical_density, crossings, flow
 from flockenv.model.state import State
+from flockenv.physics.integrators import DormandPrince, Integrator, SemiImplicitEuler
 from flockenv.scene import Scene
 from flockenv.validation.rooms import (
     bottleneck,

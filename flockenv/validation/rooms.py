@@ -9,14 +9,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from flockenv.effects import Way
 from flockenv.geometry.cell_list import FEWEST_AGENTS
 from flockenv.geometry.shapes import Wall
 from flockenv.geometry.targets import Target
 from flockenv.model.spawn import Spawn
 from flockenv.model.state import State
-from flockenv.population import Leaving
-from flockenv.population.members import Member
+from flockenv.physics.effects import Way
+from flockenv.physics.population import Leaving
+from flockenv.physics.population.members import Member
 from flockenv.scene import Group, Scene
 from flockenv.validation.walk import nobody, people, scene_of, wall
 

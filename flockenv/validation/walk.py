@@ -8,11 +8,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from flockenv.effects import Effect, ObstacleContact
 from flockenv.geometry.shapes import Wall
 from flockenv.model.distribution import Spread
 from flockenv.model.spawn import Spawn
 from flockenv.model.state import State
+from flockenv.physics.effects import Effect, ObstacleContact
 from flockenv.presets import PRESETS, preset
 from flockenv.scene import Group, Scene
 

@@ -1,0 +1,203 @@
+"""The bodies of one world on their way through a step, what they may meet, and where each is at any time of it."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from flockenv.jit.decorators import Vec, kernel
+from flockenv.maths.vectors import add, norm, scale, sub
+from flockenv.physics.constraints.broad_phase import image, near, vector, write
+from flockenv.physics.constraints.impact import POINT, along, flight
+
+__all__ = [
+    "ANEW", "DEEP", "GIVEN_UP", "RESTS", "STOPPED", "Bodies", "Meetings", "Rules", "Things", "gained", "link", "met",
+    "position", "relative", "take_off", "velocity", "widened", "width",
+]  # fmt: skip
+
+ANEW = 4
+"""How often two bodies may come to rest in one step, and be driven into each other again."""
+
+DEEP = 0.05
+"""Part of a radius by which two bodies may overlap."""
+
+RESTS = 1
+"""Meetings.closed: the two are at rest relative to each other."""
+
+GIVEN_UP = 2
+"""Meetings.closed: the meeting is not searched any more in this step."""
+
+STOPPED = 2
+"""Bodies.moved: the body does not move for the rest of the step, unless an obstacle pushes it."""
+
+
+class Bodies(NamedTuple):
+    """The bodies of one world on their way through a step; arrays of N rows."""
+
+    start: Any  # (N, D) m, at the beginning of the step
+    at: Any  # (N, D) m, at time `since`
+    vel: Any  # (N, D) m/s, then
+    acc: Any  # (N, D) m/s^2, from then on
+    free: Any  # (N, D) m/s^2, where nothing carries it
+    excess: Any  # (N, D) m/s, what the method calls velocity beyond that of the parabola; if stopped, the velocity
+    since: Any  # (N,) s, from the beginning of the step
+    reach: Any  # (N,) m, how far from the start it may come
+    radius: Any  # (N,) m
+    light: Any  # (N,) 1/kg, 0 = held in place
+    living: Any  # (N,) 1 or 0
+    moved: Any  # (N,) 1 if something has happened to it, STOPPED
+    leans: Any  # (N,) 1 if it has come to rest on another body in this step
+    first: Any  # (N,) its last meeting, 2 c + side; -1 = none
+
+
+class Meetings(NamedTuple):
+    """Who may meet what; arrays of as many places as there is room for."""
+
+    who: Any  # a body
+    other: Any  # another body, or -1 - m for obstacle m
+    time: Any  # s, when; inf = never
+    hits: Any  # how often they have
+    closed: Any  # within this step: 0, RESTS or GIVEN_UP
+    deep: Any  # m, how far the two may overlap before they stop
+    following: Any  # (2, places) the next meeting of the same body, as in Bodies.first
+    listed: Any  # 1 = among the active
+    active: Any  # meetings that have a time, and some that have none any more
+    todo: Any  # (2 places,) meetings whose time is to be found
+
+
+class Things(NamedTuple):
+    """The obstacles of one world; arrays of M rows."""
+
+    table: Any  # their numbers, see flockenv/geometry/shapes/table.py
+    row: Any  # (M,) where in the table; impact.POINT = it is round, and `size` says how large
+    anchor: Any  # (M, D) m, what its row is relative to, before it has moved
+    place: Any  # (M, D) m, where that is at the beginning of the step
+    drift: Any  # (M, D) m/s, how fast it moves in this step
+    size: Any  # (M,) m, the radius of what is round, 0 of others; negative = it is not there
+    restitution: Any  # (M,) of its surface
+
+
+class Rules(NamedTuple):
+    """What happens at an impact."""
+
+    seconds: float  # of the step
+    restitution: float
+    friction: float
+    sticky: bool
+    most: int  # impacts of a body and an obstacle in one step
+    again: int  # impacts of the same two bodies in one step
+    touch: float  # m, two that are this near touch
+    pairs: bool  # True if bodies collide with each other
+    stops: bool  # True if there are no impacts, and bodies stop where they meet something
+
+
+@kernel
+def width(bodies: Bodies, i: int, j: int) -> float:
+    """Return the smaller radius of two bodies, or that of a body that meets an obstacle, m."""
+    return float(bodies.radius[i] if j < 0 else min(bodies.radius[i], bodies.radius[j]))
+
+
+@kernel
+def position(period: Vec, bodies: Bodies, i: int, t: float) -> Vec:
+    """Return where body i is at time t of the step, m."""
+    s = t - bodies.since[i]
+    return along(vector(period, bodies.at, i), vector(period, bodies.vel, i), vector(period, bodies.acc, i), s)
+
+
+@kernel
+def velocity(period: Vec, bodies: Bodies, i: int, t: float) -> Vec:
+    """Return the velocity of body i at time t of the step, m/s."""
+    return add(vector(period, bodies.vel, i), scale(vector(period, bodies.acc, i), t - bodies.since[i]))
+
+
+@kernel
+def take_off(period: Vec, bodies: Bodies, i: int, seconds: float, moved: Vec, before: Vec, after: Vec) -> None:
+    """Begin the way of body i through a step that led it `moved` m further and from one velocity to another."""
+    v, a, excess = flight(seconds, moved, before, after)
+    write(bodies.vel, i, v)
+    write(bodies.acc, i, a)
+    write(bodies.free, i, a)
+    write(bodies.excess, i, excess)
+    bodies.since[i] = 0.0
+    bodies.moved[i], bodies.leans[i], bodies.first[i] = 0, 0, -1
+    bodies.reach[i] = (norm(v) + 0.5 * norm(a) * seconds) * seconds
+
+
+@kernel
+def link(bodies: Bodies, meetings: Meetings, c: int) -> None:
+    """Make a new meeting known to those who are part of it."""
+    i, j = meetings.who[c], meetings.other[c]
+    meetings.hits[c], meetings.closed[c], meetings.listed[c], meetings.time[c] = 0, 0, 0, np.inf
+    meetings.deep[c] = 0.0
+    meetings.following[0, c] = bodies.first[i]
+    bodies.first[i] = 2 * c
+    if j >= 0:
+        meetings.following[1, c] = bodies.first[j]
+        bodies.first[j] = 2 * c + 1
+
+
+@kernel
+def relative(period: Vec, bodies: Bodies, things: Things, i: int, j: int, t: float) -> tuple[Vec, Vec, Vec]:
+    """Return place, velocity and acceleration of body i as seen from body j or obstacle -1 - j, at time t."""
+    x, v, a = position(period, bodies, i, t), velocity(period, bodies, i, t), vector(period, bodies.acc, i)
+    if j >= 0:
+        x, v = sub(x, position(period, bodies, j, t)), sub(v, velocity(period, bodies, j, t))
+        a = sub(a, vector(period, bodies.acc, j))
+    else:
+        drift = vector(period, things.drift, -1 - j)
+        x, v = sub(x, add(vector(period, things.place, -1 - j), scale(drift, t))), sub(v, drift)
+    return image(period, x), v, a
+
+
+@kernel
+def met(bodies: Bodies, things: Things, i: int, j: int) -> tuple[int, float]:
+    """Return the row of what body i meets, and how near to it its centre comes."""
+    if j >= 0:
+        return POINT, bodies.radius[i] + bodies.radius[j]
+    return things.row[-1 - j], bodies.radius[i] + things.size[-1 - j]
+
+
+@kernel
+def gained(period: Vec, bodies: Bodies, i: int, j: int) -> float:
+    """Return the larger acceleration of two bodies, or of a body that meets an obstacle, m/s^2."""
+    hard = norm(vector(period, bodies.free, i))
+    return float(max(hard, norm(vector(period, bodies.free, j))) if j >= 0 else hard)
+
+
+@kernel
+def widened(
+    period: Vec, bodies: Bodies, meetings: Meetings, things: Things, rules: Rules, i: int, t: float, count: int
+) -> int:
+    """Add meetings of a body that may now come further than was thought; return how many there are."""
+    d = image(period, sub(position(period, bodies, i, t), vector(period, bodies.start, i)))
+    left = rules.seconds - t
+    v, a = vector(period, bodies.vel, i), vector(period, bodies.acc, i)
+    reach = norm(d) + (norm(v) + 0.5 * norm(a) * left) * left
+    if reach <= bodies.reach[i]:
+        return count
+    bodies.reach[i] = 1.5 * reach
+    for m in range(things.row.shape[0]):
+        if things.size[m] >= 0.0:
+            count = _joined(bodies, meetings, i, -1 - m, count)
+    for j in range(bodies.living.shape[0]):
+        here = rules.pairs and bodies.living[j] > 0 and j != i and bodies.light[i] + bodies.light[j] > 0.0
+        if here and near(period, bodies.start, bodies.radius, bodies.reach, i, j):
+            count = _joined(bodies, meetings, i, j, count)
+    return count
+
+
+@kernel
+def _joined(bodies: Bodies, meetings: Meetings, i: int, j: int, count: int) -> int:
+    """Add the meeting of body i with body j, or obstacle -1 - j, if it is not there yet."""
+    who, other = (i, j) if j < 0 else (min(i, j), max(i, j))
+    place = bodies.first[i]
+    while place >= 0:
+        c = place // 2
+        if meetings.who[c] == who and meetings.other[c] == other:
+            return count
+        place = meetings.following[place % 2, c]
+    if count < meetings.who.shape[0]:
+        meetings.who[count], meetings.other[count] = who, other
+        link(bodies, meetings, count)
+    return count + 1

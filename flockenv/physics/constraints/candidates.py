@@ -1,0 +1,86 @@
+"""The meetings of a step: pairs of bodies, and bodies and obstacles, that may touch within it or touch at its end."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from flockenv.geometry.shapes.row_header import bound_of
+from flockenv.jit.decorators import Vec, kernel
+from flockenv.maths.vectors import add, dot, norm, scale, sub, zero
+from flockenv.physics.constraints.bodies import Bodies, Meetings, Rules, Things, link
+from flockenv.physics.constraints.broad_phase import image, nearby, vector
+from flockenv.physics.constraints.contacts import NEARLY, Ends
+from flockenv.physics.constraints.impact import surface
+
+__all__ = ["list_meetings"]
+
+
+@kernel
+def list_meetings(
+    period: Vec, bodies: Bodies, meetings: Meetings, things: Things, ends: Ends, rules: Rules, reach: Any,
+    ahead: bool, nearly: bool, scratch: Any,
+) -> int:  # fmt: skip
+    """Find what may meet within the step (ahead), or touches at its end; return how many, room for them or not.
+
+    nearly: True if two count that are a tenth of their radii apart.
+    """
+    grid, order, cell, start, offset, bounds, sync, ranges = scratch
+    n, count = bodies.living.shape[0], 0
+    where = bodies.start if ahead else ends.pos
+    if ahead:
+        _reach_further(bodies)
+    for i in range(n):
+        bodies.first[i] = -1
+        reach[i] = (bodies.reach[i] if ahead else 0.0) + (rules.touch + NEARLY * bodies.radius[i] if nearly else 0.0)
+    if rules.pairs:
+        count = nearby(
+            period, where, bodies.living, bodies.radius, reach, n, grid, order, cell, start, offset, bounds, sync,
+            ranges, meetings.who, meetings.other,
+        )  # fmt: skip
+    count = _with_obstacles(period, bodies, meetings, things, where, reach, rules.seconds, rules.touch, ahead, count)
+    if count <= meetings.who.shape[0]:
+        for c in range(count):
+            link(bodies, meetings, c)
+    return count
+
+
+@kernel
+def _reach_further(bodies: Bodies) -> None:
+    """Let all bodies reach further than they go, so that few that are hit come where they were not expected."""
+    total, present = 0.0, 0
+    for i in range(bodies.living.shape[0]):
+        if bodies.living[i] > 0:
+            total, present = total + bodies.reach[i], present + 1
+    for i in range(bodies.living.shape[0]):
+        bodies.reach[i] = max(1.25 * bodies.reach[i], 1.5 * total / max(present, 1))
+
+
+@kernel
+def _with_obstacles(
+    period: Vec, bodies: Bodies, meetings: Meetings, things: Things, at: Any, reach: Any, seconds: float, touch: float,
+    ahead: bool, count: int,
+) -> int:  # fmt: skip
+    """Add who may touch which obstacle: within the step, or at its end; return how many there are."""
+    capacity = meetings.who.shape[0]
+    for m in range(things.row.shape[0]):
+        if things.size[m] < 0.0:
+            continue
+        drift, place = vector(period, things.drift, m), vector(period, things.place, m)
+        place = place if ahead else add(place, scale(drift, seconds))
+        way = norm(drift) * seconds if ahead else 0.0
+        bounded, middle, radius = things.row[m] >= 0, zero(period), things.size[m]
+        if bounded:
+            middle, radius = bound_of(things.table, things.row[m], period)
+        for i in range(bodies.living.shape[0]):
+            if bodies.living[i] > 0 and bodies.light[i] > 0.0:
+                y = image(period, sub(vector(period, at, i), place))
+                room = bodies.radius[i] + touch + way + reach[i]
+                off, far = sub(y, middle), radius + room
+                if bounded and not dot(off, off) <= far * far:
+                    continue  # it is not even near the circle or sphere around it
+                gap, _ = surface(things.table, things.row[m], y)
+                if gap - things.size[m] <= room:
+                    if count < capacity:
+                        meetings.who[count], meetings.other[count] = i, -1 - m
+                    count += 1
+    return count

@@ -1,0 +1,178 @@
+"""One step of many worlds, mended: who may meet whom, impacts in the order of time or all at once, overlaps parted."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from flockenv.geometry.shapes.row_header import shift_of
+from flockenv.jit.decorators import Vec, kernel
+from flockenv.maths.vectors import add, axis, dot, norm, scale, sub, zero
+from flockenv.physics.constraints.bodies import STOPPED, Bodies, Meetings, Rules, Things, take_off
+from flockenv.physics.constraints.broad_phase import led, loaded, vector, write
+from flockenv.physics.constraints.candidates import list_meetings
+from flockenv.physics.constraints.contacts import Contacts, Ends
+from flockenv.physics.constraints.continuous import goes_round, may_pass
+from flockenv.physics.constraints.event_driven import play, together
+from flockenv.physics.constraints.impact import along
+from flockenv.physics.constraints.step_end import RAISED, settle_ends
+
+__all__ = ["COUNTED", "LOST", "collide"]
+
+COUNTED = 5
+"""Numbers that a call reports: world, agent, meetings in all, impacts, what was left unsolved."""
+
+LOST = 7
+"""Numbers in `lost`: what `events.play` adds to, and those that `ends` names."""
+
+EXACT = 8 * 2.0**-52
+"""Rounding of a coordinate, times how large it is."""
+
+
+@kernel
+def _board(
+    period: Vec, x0: Any, v0: Any, x: Any, v: Any, alive: Any, b: int, bodies: Bodies, ends: Ends, before: Any,
+    seconds: float,
+) -> tuple[float, float, float, Vec]:  # fmt: skip
+    """Take all bodies of world b aboard; return their largest coordinate, speed, acceleration, and the mean of that."""
+    far, fast, hard, mean = 0.0, 0.0, 0.0, zero(period)
+    for i in range(x.shape[2]):
+        bodies.living[i] = 1 if alive[b, i] else 0
+        begun, done = loaded(period, x0, b, i), loaded(period, x, b, i)
+        was, now = loaded(period, v0, b, i), loaded(period, v, b, i)
+        write(bodies.start, i, begun)
+        write(bodies.at, i, begun)
+        write(before, i, was)
+        write(ends.pos, i, done)
+        write(ends.vel, i, now)
+        moved = led(period, sub(done, begun), scale(add(was, now), 0.5 * seconds))
+        take_off(period, bodies, i, seconds, moved, was, now)
+        if bodies.living[i] > 0 and bodies.light[i] > 0.0:
+            for k in range(len(period)):
+                far = max(far, abs(begun[k]), abs(done[k]))
+            a = vector(period, bodies.acc, i)
+            fast, hard, mean = max(fast, norm(now), norm(was)), max(hard, norm(a)), add(mean, a)
+    return far, fast, hard, mean
+
+
+@kernel
+def _obstacles(
+    period: Vec, things: Things, obstacle_x: Any, obstacle_radius: Any, b: int, begun: float, ended: float
+) -> None:
+    """Find where the obstacles of world b are, and how they move in this step; its own round ones come first."""
+    for m in range(things.row.shape[0]):
+        if m < obstacle_radius.shape[1]:
+            radius = np.float64(obstacle_radius[b, m])
+            things.size[m] = radius if radius > 0.0 else -1.0
+            write(things.place, m, loaded(period, obstacle_x, b, m))
+        else:
+            here = shift_of(things.table, things.row[m], begun, period)
+            there = shift_of(things.table, things.row[m], ended, period)
+            write(things.place, m, add(vector(period, things.anchor, m), here))
+            write(things.drift, m, scale(sub(there, here), 1.0 / (ended - begun)))
+
+
+@kernel
+def collide(
+    period: Vec, x0: Any, v0: Any, x: Any, v: Any, alive: Any, tick: Any, obstacle_x: Any, obstacle_radius: Any,
+    bodies: Bodies, meetings: Meetings, things: Things, contacts: Contacts, ends: Ends, before: Any, reach: Any,
+    grid: Any, order: Any, cell: Any, start: Any, offset: Any, bounds: Any, sync: Any, ranges: Any, rules: Rules,
+    in_time: bool, once: bool, rounds: int, spread: float, first: int, end: int, work: Any, at_work: int, report: Any,
+    lost: Any,
+) -> int:  # fmt: skip
+    """Mend the steps of worlds [first, end) that led from x0, v0 to x, v (D, B, N), in place.
+
+    period: where a periodic box ends, zeros = nowhere; in_time: impacts within the step, one after another; once: one
+    pass over contacts, and places are not advanced anew; spread: m, how far two are parted at most. Returns the world
+    that there was no room for, with the number of its meetings in report[2]: nothing of it is written; else -1.
+    """
+    scratch = (grid, order, cell, start, offset, bounds, sync, ranges)
+    report[0], report[1], report[3], report[4] = -1, -1, 0, 0
+    for k in range(lost.shape[0]):
+        lost[k] = 0.0
+    for b in range(first, end):
+        impacts_before, unsolved_before = report[3], report[4]
+        seconds_before, joules_before, stopped_before, raised_before = lost[0], lost[1], lost[2], lost[RAISED]
+        far, fast, hard, mean = _board(period, x0, v0, x, v, alive, b, bodies, ends, before, rules.seconds)
+        if not (far < np.inf and fast < np.inf):
+            continue
+        began = (tick[b] - 1) * rules.seconds
+        _obstacles(period, things, obstacle_x, obstacle_radius, b, began, tick[b] * rules.seconds)
+        told = Rules(
+            rules.seconds, rules.restitution, rules.friction, rules.sticky, rules.most, rules.again,
+            rules.touch + EXACT * far, rules.pairs, not in_time,
+        )  # fmt: skip
+        passing = not in_time and may_pass(period, bodies, things, ends, rules.seconds, False)
+        ahead = in_time or passing or not once
+        count = list_meetings(period, bodies, meetings, things, ends, told, reach, ahead, not in_time, scratch)
+        if in_time and count <= meetings.who.shape[0]:
+            count = _fly(period, bodies, meetings, things, ends, told, before, count, report, lost)
+        if count <= meetings.who.shape[0]:
+            round_about = goes_round(period, fast * rules.seconds)
+            report[4] += 1 if round_about else 0
+            mean = scale(mean, -1.0 / norm(mean)) if norm(mean) > 1e-9 * hard * x.shape[2] else axis(mean, 0)
+            count = settle_ends(
+                period, bodies, meetings, things, contacts, ends, before, reach, told, in_time, once, passing, rounds,
+                fast, hard, mean, spread, round_about, count, scratch, lost, report,
+            )  # fmt: skip
+        report[2] = count
+        if count > meetings.who.shape[0]:
+            report[3], report[4] = impacts_before, unsolved_before
+            lost[0], lost[1], lost[2], lost[RAISED] = seconds_before, joules_before, stopped_before, raised_before
+            return b
+        work[b, 1] += 1 if rules.pairs else 0
+        work[b, at_work] += report[3] - impacts_before
+        work[b, at_work + 1] += report[4] - unsolved_before
+        work[b, at_work + 2] += np.int64(lost[2] - stopped_before)
+        bad = _leave(period, x, v, b, ends, bodies)
+        if bad >= 0 and report[0] < 0:
+            report[0], report[1] = b, bad
+    return -1
+
+
+@kernel
+def _fly(
+    period: Vec, bodies: Bodies, meetings: Meetings, things: Things, ends: Ends, rules: Rules, before: Any, count: int,
+    report: Any, lost: Any,
+) -> int:  # fmt: skip
+    """Move all bodies through the step; return how many meetings there are, room for them or not."""
+    together(period, bodies, meetings, things, rules, count, before)
+    some, cut, count = play(period, bodies, meetings, things, rules, count, lost)
+    if count <= meetings.who.shape[0]:
+        report[3] += some
+        report[4] += cut
+        for i in range(bodies.living.shape[0]):
+            if bodies.moved[i] > 0:
+                _land(period, bodies, ends, i, rules.seconds)
+    return count
+
+
+@kernel
+def _land(period: Vec, bodies: Bodies, ends: Ends, i: int, seconds: float) -> None:
+    """Write where and how fast the way of body i ends."""
+    left = seconds - bodies.since[i]
+    v, a = vector(period, bodies.vel, i), vector(period, bodies.acc, i)
+    write(ends.pos, i, along(vector(period, bodies.at, i), v, a, left))
+    now = zero(v) if bodies.moved[i] == STOPPED else add(v, scale(a, left))
+    write(ends.vel, i, add(now, vector(period, bodies.excess, i)))
+
+
+@kernel
+def _leave(period: Vec, x: Any, v: Any, b: int, ends: Ends, bodies: Bodies) -> int:
+    """Write everybody back into the batch; return the first who is nowhere, or -1."""
+    bad = -1
+    for i in range(x.shape[2]):
+        if bodies.living[i] == 0:
+            continue
+        at, now = vector(period, ends.pos, i), vector(period, ends.vel, i)
+        if not dot(at, at) + dot(now, now) < np.inf and bad < 0:
+            bad = i
+        for k in range(len(period)):
+            place = at[k]
+            if period[k] > 0.0 and not 0.0 <= place < period[k]:
+                place = place - period[k] * np.floor(place / period[k])
+                place = 0.0 if place >= period[k] or place < 0.0 else place
+            x[k, b, i] = place
+            v[k, b, i] = now[k]
+    return bad

@@ -1,0 +1,227 @@
+"""Bodies that hit obstacles, walls and each other."""
+
+from __future__ import annotations
+
+import warnings
+from typing import Any, ClassVar, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from flockenv.geometry.cell_list import MAX_RANGES
+from flockenv.geometry.shapes import HalfSpace, packed
+from flockenv.geometry.space import Box, Torus
+from flockenv.jit.section import entry
+from flockenv.model.state import WORK, Floats, State
+from flockenv.physics.constraints.bodies import Bodies, Meetings, Rules, Things
+from flockenv.physics.constraints.collision_step import COUNTED, LOST, collide
+from flockenv.physics.constraints.constraint import Constraint, Settler
+from flockenv.physics.constraints.contacts import Contacts, Ends
+from flockenv.physics.constraints.impact import POINT
+from flockenv.physics.constraints.step_end import LEFT, RAISED, SUNK
+from flockenv.physics.effects.effect import ties
+
+__all__ = ["Collisions", "UnsolvedContactsWarning"]
+
+
+class UnsolvedContactsWarning(RuntimeWarning):
+    """More impacts in a step than are allowed, contacts that passes have not solved, too long a path round a torus."""
+
+
+class Collisions(Constraint):
+    """Bodies are solid: discs or balls that do not go through obstacles, the walls of a box, or each other.
+
+    Within a step, the moment of an impact is found on the parabola that the method has made of the step, exactly under
+    constant forces, for bodies of any speed. The responses:
+
+    - "earliest": the earliest impact of all happens, both bodies go on from there, their further paths are searched
+      anew, and so on; nothing is missed, and an elastic ball keeps its energy.
+    - "back_up": the same with at most 30 impacts of the same two bodies in a step, whatever `most` is.
+    - "impulses": at the end of a step all bodies in touch exchange impulses, in passes, until none goes into another.
+      For heaps and crowds. A body whose path leads into something stops there, and has its impact in the next step.
+    - "project": one such pass, and a body inside something is put on the surface. The cheapest; it loses energy at
+      every impact, friction holds no body in place, and those that overlap are moved apart even against their weight.
+
+    No body passes another. Where the impacts of a step run out, the two bodies stop: they keep
+    their velocities and do not move for the rest of the step, and what runs into them stops, too. So time is lost, and
+    neither energy nor momentum; "stopped" counts such bodies, and a warning says how much time. Two that meet slower
+    than a step's acceleration changes velocity come to rest instead; the warning says how much energy that took.
+
+    All responses end with passes over bodies that are near, so that none overlap. Restitution e is speed after over
+    speed before, across the surface; friction is Coulomb's. A ball dropped from h bounces to e^2 h, and is at rest
+    after sqrt(2 h / g) (1 + e) / (1 - e); a body sticks on an incline up to tan(angle) = friction. Bodies do not spin.
+    """
+
+    kind: Literal["collisions"] = "collisions"
+    response: Literal["earliest", "back_up", "impulses", "project"] = Field(
+        default="earliest", description="what happens at an impact, and when"
+    )
+    agents: bool = Field(default=True, description="do bodies meet each other?")
+    obstacles: bool = Field(default=True, description="do they meet obstacles, and the walls of a box?")
+    restitution: float = Field(default=0.5, ge=0, le=1, description="e: 0 = soft, 1 = elastic")
+    friction: float = Field(default=0.0, ge=0, description="Coulomb's coefficient, along surfaces")
+    sticky: bool = Field(default=False, description="do those stay together who touch (glue)?")
+    most: int = Field(default=100, ge=1, description="impacts of the same two in one step; then they stop")
+    passes: int = Field(default=200, ge=1, description="passes over all contacts at the end of a step")
+    part_speed: float | None = Field(
+        default=None, gt=0, description="m/s, how fast those who overlap are moved apart; none = at once"
+    )
+    capacity: ClassVar[int] = 4
+    """Meetings per agent that there is room for at first."""
+    again: ClassVar[int] = 30
+    """Impacts of the same two bodies in one step under `back_up`."""
+
+    def check(self, scene: Any) -> None:
+        """Refuse what cannot be right: twice the same constraint, and bodies as wide as a periodic box."""
+        if sum(isinstance(other, Collisions) for other in scene.constraints) > 1:
+            raise ValueError("kind = collisions: there is another; a scene has its collisions once")
+        widest = max(group.widest for group in scene.groups)
+        if isinstance(scene.space, Torus) and 4 * widest > min(scene.space.size):
+            raise ValueError(
+                f"kind = collisions: bodies of radius {widest:g} m meet their own images on a torus of size "
+                f"{scene.space.size}; at most a quarter of its shortest edge is allowed"
+            )
+
+    def calls_for(self) -> tuple[str, ...]:
+        """Who is near whom, and obstacles, if they are met."""
+        asked = ("neighbour query", self.agents), ("obstacles", self.obstacles)
+        return tuple(what for what, is_met in asked if is_met)
+
+    def numbers(self, scene: Any) -> int:
+        """Bodies, ends, and room for meetings."""
+        return int(8 * scene.dimension + 12 + self.capacity * (12 + 4 * scene.dimension))
+
+    def settler(self, scene: Any) -> Settler:
+        """Return what mends a step."""
+        return _Settler(self, scene)
+
+
+class _Settler:
+    """Mends steps of one scene, with scratch of its own."""
+
+    def __init__(self, record: Collisions, scene: Any) -> None:
+        n, d = scene.agents, scene.dimension
+        self.record, self.scene, self.told = record, scene, False
+        self.period = tuple(float(s) for s in scene.space.size) if scene.space.periodic else (0.0,) * d
+        start, at, vel, acc, free, excess = (np.zeros((n, d)) for _ in range(6))
+        body = scene.body
+        light = np.where(np.isfinite(body.mass), 1 / np.asarray(body.mass, float), 0.0)
+        self.bodies = Bodies(
+            start=start, at=at, vel=vel, acc=acc, free=free, excess=excess, since=np.zeros(n), reach=np.zeros(n),
+            radius=np.asarray(body.radius, np.float64), light=light, living=np.zeros(n, np.int64),
+            moved=np.zeros(n, np.int64), leans=np.zeros(n, np.int64), first=np.full(n, -1),
+        )  # fmt: skip
+        self.ends = Ends(np.zeros((n, d)), np.zeros((n, d)), ties(n, d))
+        self.before, self.reach = np.zeros((n, d)), np.zeros(n)
+        self.query = (
+            np.zeros(max(n, 64), np.int64), np.zeros(n, np.int32), np.zeros(n, np.int32), np.zeros(n + 1, np.int32),
+            np.zeros((1, n), np.int32), np.zeros((1, 6)), np.zeros(8, np.int64), np.zeros((MAX_RANGES, 3), np.int64),
+        )  # fmt: skip
+        self.things = self._things()
+        self.report, self.lost = np.zeros(COUNTED, np.int64), np.zeros(LOST)
+        self._make_room(record.capacity * n + 64)
+
+    def _make_room(self, places: int) -> None:
+        """Allocate for so many meetings."""
+        d = self.scene.dimension
+
+        def whole(*shape: int) -> NDArray[np.int64]:
+            return np.zeros(shape, np.int64)
+
+        self.meetings = Meetings(
+            who=whole(places), other=whole(places), time=np.zeros(places), hits=whole(places), closed=whole(places),
+            deep=np.zeros(places), following=whole(2, places), listed=whole(places), active=whole(places),
+            todo=whole(2 * places),
+        )  # fmt: skip
+        self.contacts = Contacts(
+            who=whole(places), other=whole(places), normal=np.zeros((places, d)), allowed=np.zeros(places),
+            open=whole(places), push=np.zeros(places), rub=np.zeros((places, d)), was=np.zeros((places, d + 1)),
+            way=np.zeros((places, d + 1)), rank=np.zeros(places), order=whole(places),
+        )  # fmt: skip
+
+    def _things(self) -> Things:
+        """Return the obstacles: round ones, whose places are those of a world, then others, then walls of a box."""
+        scene, d = self.scene, self.scene.dimension
+        shapes, given = list(scene.shapes), self.record.restitution
+        restitution = [given] * (len(scene.circles) + len(shapes))
+        if isinstance(scene.space, Box):
+            for k in range(d):
+                for side in (0, 1):
+                    point = [0.0] * d
+                    point[k] = side * scene.space.size[k]
+                    out = [0.0] * d
+                    out[k] = 1.0 - 2.0 * side
+                    shapes.append(HalfSpace(point=tuple(point), direction=tuple(out)))
+                    restitution.append(scene.space.restitution)
+        if not self.record.obstacles:
+            shapes, restitution = [], []
+        table, where = packed(shapes, d)
+        rows = []
+        for at, count in where.values():
+            for _ in range(count):
+                rows.append(at)
+                at += int(table[at])
+        circles = len(scene.circles) if self.record.obstacles else 0
+        m = circles + len(rows)
+        anchor, elastic = np.zeros((m, d)), np.array(restitution, float)
+        for k, at in enumerate(rows, circles):
+            anchor[k], elastic[k] = table[at + 2 : at + 2 + d], restitution[circles + int(table[at + 1])]
+        return Things(
+            table=np.append(table, 0.0), row=np.array([POINT] * circles + rows, np.int64), anchor=anchor,
+            place=np.zeros((m, d)), drift=np.zeros((m, d)), size=np.zeros(m), restitution=elastic,
+        )  # fmt: skip
+
+    def __call__(self, x0: Floats, v0: Floats, state: State, first: int, end: int) -> tuple[int, int]:
+        """Mend the steps of some worlds."""
+        r = self.record
+        rules = Rules(
+            self.scene.dt, r.restitution, r.friction, r.sticky, r.most,
+            min(r.again, r.most) if r.response == "back_up" else r.most, 1e-12, r.agents, False,
+        )  # fmt: skip
+        circles = slice(None) if r.obstacles else slice(0, 0)
+        spread = np.inf if r.part_speed is None else r.part_speed * self.scene.dt
+        bad, unsolved, lost = (-1, -1), 0, np.zeros(LOST)
+        while first < end:
+            short = entry(collide)(
+                self.period, x0, v0, state.x, state.v, state.alive, state.tick, state.obstacle_x[:, :, circles],
+                state.obstacle_radius[:, circles], self.bodies, self.meetings, self.things, self.contacts, self.ends,
+                self.before, self.reach, *self.query, rules, r.response in ("earliest", "back_up"),
+                r.response == "project", r.passes, spread, first, end, state.work, WORK.index("impacts"), self.report,
+                self.lost,
+            )  # fmt: skip
+            world, agent, needed = (int(k) for k in self.report[:3])
+            most = np.maximum(lost, self.lost)
+            unsolved, lost = unsolved + int(self.report[4]), lost + self.lost
+            lost[[LEFT, SUNK]] = most[[LEFT, SUNK]]
+            bad = (world, agent) if bad[0] < 0 else bad
+            if short < 0:
+                break
+            first = short
+            self._make_room(2 * needed)
+        if unsolved and not self.told:
+            self.told = True
+            warnings.warn(self._unsolved(unsolved, lost), UnsolvedContactsWarning, stacklevel=2)
+        return bad
+
+    def _unsolved(self, unsolved: int, lost: NDArray[np.float64]) -> str:
+        """Return what a warning says of a step: see events.play and ends for what is lost."""
+        r, seconds, joules, stopped = self.record, float(lost[0]), float(lost[1]), float(lost[2])
+        said = (
+            f"constraints: collisions: in a step {unsolved} impacts or worlds with contacts were not solved within "
+            f"most = {r.most} and passes = {r.passes}"
+        )
+        if self.period[0] > 0:
+            said += ", or a body went further than a quarter of the torus"
+        if stopped > 0:
+            early = seconds / stopped
+            said += f"; {stopped:.0f} bodies stopped {early:.3g} s before its end, and keep their velocities"
+        if joules > 0:
+            said += f"; {joules:.3g} J lost by bodies that came to rest"
+        if lost[RAISED] > 0:
+            said += f"; up to {lost[RAISED]:.3g} J gained by bodies that were moved apart"
+        if lost[LEFT] > 0:
+            said += f"; the last pass still changed velocities, by up to {lost[LEFT]:.2g} m/s"
+        if r.response in ("impulses", "project"):
+            said += f"; the deepest overlap is {lost[SUNK]:.2g} of a radius"
+        return said

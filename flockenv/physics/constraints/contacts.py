@@ -1,0 +1,356 @@
+"""Contacts of one world at the end of a step, all at once: impulses until nobody goes into anybody, then places.
+
+Sequential impulses: contact after contact, up and down along the mean acceleration, each as if it were the only one,
+until none is left to do anything. First impacts, with the velocities of before the step, which keep the share e of
+their approach (Guendelman, Bridson and Fedkiw 2003: so what a step's own acceleration adds never bounces, and what lies
+is still); then what the step has added, without any bounce, with impulses that are summed, never pull, and give
+friction its bound. Overlaps that are left are parted, the lighter one further; velocities do not hear of that, so
+nobody is shot away from where he overlapped.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+from flockenv.jit.decorators import Vec, kernel
+from flockenv.maths.vectors import add, axis, dot, norm, scale, select, sub, unit, zero
+from flockenv.physics.constraints.bodies import RESTS, Bodies, Meetings, Things, gained, width
+from flockenv.physics.constraints.broad_phase import image, vector, write
+from flockenv.physics.constraints.impact import bounced, surface
+
+__all__ = ["NEARLY", "Contacts", "Ends", "deepest", "gather", "impacts", "part", "press"]
+
+
+NEARLY = 0.1
+"""Radii by which two are apart at most that may be pushed into each other by others."""
+
+
+class Contacts(NamedTuple):
+    """What touches at the end of a step; arrays of as many places as there is room for."""
+
+    who: Any  # a body
+    other: Any  # another, or -1 - m
+    normal: Any  # (places, D), to the first from the other
+    allowed: Any  # m/s, how fast they may go into each other: until they touch at the end of the step
+    open: Any  # 1 = who go into each other in the next step: nothing to press here
+    push: Any  # kg m/s, given across so far
+    rub: Any  # (places, D) kg m/s, given along so far
+    was: Any  # (places, D + 1) kg m/s, along and across, before a pass
+    way: Any  # (places, D + 1) kg m/s, the direction in which passes go on
+    rank: Any  # m, how far up along the mean acceleration
+    order: Any  # the contacts from below
+
+
+class Ends(NamedTuple):
+    """Where and how fast the bodies of one world are at the end of a step; (N, D) m and m/s."""
+
+    pos: Any
+    vel: Any
+    tie: Any  # unit vectors: two bodies in one place part along the difference of theirs
+
+
+@kernel
+def _normal(
+    period: Vec, bodies: Bodies, things: Things, pos: Any, ends: Ends, seconds: float, i: int, j: int
+) -> tuple[float, Vec]:
+    """Return the gap of a body and another, or an obstacle, m, and the normal to the body.
+
+    pos (N, D) m: places `seconds` after the beginning of the step.
+    """
+    x = vector(period, pos, i)
+    if j >= 0:
+        d = image(period, sub(x, vector(period, pos, j)))
+        far = norm(d)
+        aside = unit(sub(vector(period, ends.tie, i), vector(period, ends.tie, j)))
+        aside = select(dot(aside, aside) > 0.0, aside, axis(d, 0))
+        return far - bodies.radius[i] - bodies.radius[j], select(far > 0.0, unit(d), aside)
+    m = -1 - j
+    place = add(vector(period, things.place, m), scale(vector(period, things.drift, m), seconds))
+    gap, n = surface(things.table, things.row[m], image(period, sub(x, place)))
+    return gap - bodies.radius[i] - things.size[m], n
+
+
+@kernel
+def _seen(period: Vec, things: Things, vel: Any, i: int, j: int) -> Vec:
+    """Return the velocity of a body relative to another, or to an obstacle."""
+    v = vector(period, vel, i)
+    return sub(v, vector(period, vel, j)) if j >= 0 else sub(v, vector(period, things.drift, -1 - j))
+
+
+@kernel
+def gather(
+    period: Vec, bodies: Bodies, meetings: Meetings, things: Things, ends: Ends, contacts: Contacts, seconds: float,
+    up: Vec, touch: float, slow: float, restitution: float, in_time: bool, passing: bool, count: int,
+) -> int:  # fmt: skip
+    """Find which meetings touch at the end, or nearly do; return how many, in the order of their height.
+
+    in_time: True if impacts of the step are done. Two that are still to meet have their impact in the next step, but
+    for bodies in a heap: those that are nearly in touch, and approach slower than the step's acceleration has made
+    them, rest. For others it is `slow` m/s.
+    passing: True if bodies may pass what they touch at the beginning; then that is where they touch.
+    """
+    found = 0
+    for c in range(count):
+        i, j = meetings.who[c], meetings.other[c]
+        margin = max(touch, NEARLY * width(bodies, i, j))
+        if j >= 0 and not passing and _far_apart(period, bodies, ends, i, j, margin):
+            continue
+        gap, n = _normal(period, bodies, things, ends.pos, ends, seconds, i, j)
+        begun, first, passed = gap, n, False
+        if passing:
+            begun, first = _normal(period, bodies, things, bodies.start, ends, 0.0, i, j)
+            passed = begun <= margin and (gap < -margin or dot(n, first) < 0.5)
+            n = select(passed, first, n)
+        if (gap <= margin and not (passing and gap < -margin)) or passed:  # what came from afar stops on the way
+            contacts.who[found], contacts.other[found] = i, j
+            w = -dot(_seen(period, things, ends.vel, i, j), n)
+            heap = restitution < 1.0 if j >= 0 else bodies.leans[i] > 0
+            later = w > gained(period, bodies, i, j) * seconds if heap else gap > touch or w > slow
+            resting = gap <= touch and meetings.closed[c] == RESTS
+            contacts.open[found] = 1 if in_time and later and not resting else 0
+            contacts.allowed[found] = max(gap, 0.0) / seconds if gap > touch else 0.0
+            if not in_time:
+                going = _moved(period, bodies, ends, i)
+                going = sub(going, _moved(period, bodies, ends, j) if j >= 0 else _drifted(period, things, j, seconds))
+                contacts.allowed[found] = max(begun if passed else gap - dot(going, n), 0.0) / seconds
+            write(contacts.normal, found, n)
+            middle = sub(vector(period, ends.pos, i), scale(n, bodies.radius[i]))
+            contacts.rank[found] = dot(middle, up)
+            contacts.order[found] = found
+            found += 1
+    _sort(contacts.rank, contacts.order, found)
+    return found
+
+
+@kernel
+def _far_apart(period: Vec, bodies: Bodies, ends: Ends, i: int, j: int, margin: float) -> bool:
+    """True if two bodies are further apart than a margin at the end of a step, m: without a square root."""
+    d = image(period, sub(vector(period, ends.pos, i), vector(period, ends.pos, j)))
+    room = 1.000001 * (bodies.radius[i] + bodies.radius[j] + margin)
+    return bool(dot(d, d) > room * room)
+
+
+@kernel
+def _moved(period: Vec, bodies: Bodies, ends: Ends, i: int) -> Vec:
+    """Return how far a step has led a body, m."""
+    return image(period, sub(vector(period, ends.pos, i), vector(period, bodies.start, i)))
+
+
+@kernel
+def _drifted(period: Vec, things: Things, j: int, seconds: float) -> Vec:
+    """Return how far obstacle -1 - j moves in a step, m."""
+    return scale(vector(period, things.drift, -1 - j), seconds)
+
+
+@kernel
+def _sort(rank: Any, order: Any, count: int) -> None:
+    """Put [0, count) in the order of their rank: heapsort."""
+    end = count
+    start = count // 2
+    while end > 1:
+        if start > 0:
+            start -= 1
+        else:
+            end -= 1
+            order[end], order[0] = order[0], order[end]
+        root = start
+        while 2 * root + 1 < end:
+            child = 2 * root + 1
+            if child + 1 < end and rank[order[child + 1]] > rank[order[child]]:
+                child += 1
+            if rank[order[root]] >= rank[order[child]]:
+                break
+            order[root], order[child] = order[child], order[root]
+            root = child
+
+
+@kernel
+def _give(period: Vec, bodies: Bodies, vel: Any, i: int, j: int, impulse: Vec) -> None:
+    """Give an impulse to a body, and its opposite to the other."""
+    write(vel, i, add(vector(period, vel, i), scale(impulse, bodies.light[i])))
+    if j >= 0:
+        write(vel, j, sub(vector(period, vel, j), scale(impulse, bodies.light[j])))
+
+
+@kernel
+def _ease(bodies: Bodies, i: int, j: int) -> float:
+    """Return by how much an impulse of 1 kg m/s changes the velocity between two, 1/kg."""
+    return float(bodies.light[i] + (bodies.light[j] if j >= 0 else 0.0))
+
+
+@kernel
+def impacts(
+    period: Vec, bodies: Bodies, things: Things, contacts: Contacts, vel: Any, restitution: float, friction: float,
+    sticky: bool, rounds: int, slow: float, count: int,
+) -> tuple[int, int]:  # fmt: skip
+    """Let those that go into each other at velocities (N, D) bounce, until none does; return impacts, and those left.
+
+    slow: m/s, approach that is none. Impacts that are left after `rounds` > 1 passes are those of the next step: their
+    contacts are open, so that nothing takes their energy.
+    """
+    done, left = 0, 0
+    for turn in range(rounds):
+        some = 0
+        for k in range(count):
+            c = contacts.order[k if turn % 2 == 0 else count - 1 - k]
+            i, j, n = contacts.who[c], contacts.other[c], vector(period, contacts.normal, c)
+            ease = _ease(bodies, i, j)
+            v = _seen(period, things, vel, i, j)
+            if ease > 0.0 and contacts.open[c] == 0 and -dot(v, n) > slow + contacts.allowed[c]:
+                e = restitution if j >= 0 else things.restitution[-1 - j]
+                change = scale(v, -1.0) if sticky else sub(bounced(v, n, e, friction), v)
+                _give(period, bodies, vel, i, j, scale(change, 1.0 / ease))
+                some += 1
+        done += some
+        if some == 0:
+            return done, 0
+    if rounds > 1:
+        for c in range(count):
+            w = -dot(_seen(period, things, vel, contacts.who[c], contacts.other[c]), vector(period, contacts.normal, c))
+            if w > slow + contacts.allowed[c]:
+                contacts.open[c] = 1
+                left += 1
+    return done, left
+
+
+@kernel
+def _press_once(
+    period: Vec, bodies: Bodies, things: Things, contacts: Contacts, vel: Any, friction: float, sticky: bool, up: bool,
+    count: int,
+) -> tuple[float, float]:  # fmt: skip
+    """Pass once over all contacts; return the fastest change of velocity, and the sum of the squares of impulses."""
+    worst, square = 0.0, 0.0
+    for k in range(count):
+        c = contacts.order[k if up else count - 1 - k]
+        i, j, n = contacts.who[c], contacts.other[c], vector(period, contacts.normal, c)
+        ease = _ease(bodies, i, j)
+        if ease == 0.0 or contacts.open[c] > 0:
+            continue
+        v = _seen(period, things, vel, i, j)
+        if sticky:
+            impulse = scale(v, -1.0 / ease)
+            write(contacts.rub, c, add(vector(period, contacts.rub, c), impulse))
+            _give(period, bodies, vel, i, j, impulse)
+            worst = max(worst, norm(v))
+            square += dot(impulse, impulse)
+            continue
+        total = max(contacts.push[c] - (dot(v, n) + contacts.allowed[c]) / ease, 0.0)
+        given = total - contacts.push[c]
+        contacts.push[c] = total
+        impulse = scale(n, given)
+        if friction > 0.0:
+            v = add(v, scale(impulse, ease))
+            before = vector(period, contacts.rub, c)
+            rub = sub(before, scale(sub(v, scale(n, dot(v, n))), 1.0 / ease))
+            size = norm(rub)
+            rub = scale(rub, friction * total / size if size > friction * total else 1.0)
+            write(contacts.rub, c, rub)
+            impulse = add(impulse, sub(rub, before))
+        _give(period, bodies, vel, i, j, impulse)
+        worst = max(worst, norm(impulse) * ease)
+        square += dot(impulse, impulse)
+    return worst, square
+
+
+@kernel
+def press(
+    period: Vec, bodies: Bodies, things: Things, contacts: Contacts, vel: Any, friction: float, sticky: bool,
+    rounds: int, slow: float, count: int,
+) -> float:  # fmt: skip
+    """Stop those who go into each other at velocities (N, D), without a bounce; return the last pass's fastest change.
+
+    The impulse of each contact is summed and never pulls; friction is bounded by what was given across, friction times
+    as much (Coulomb), and stops what it can. Sticky contacts pull as well as push, in every direction. Passes go on
+    along the direction of those before, as conjugate gradients do (Silcowitz, Niebe and Erleben 2010): the weight of a
+    heap is known at its foot after about as many passes as it is high, and not after their square.
+    """
+    for c in range(count):
+        contacts.push[c] = 0.0
+        write(contacts.rub, c, zero(period))
+        for k in range(len(period)):
+            contacts.way[c, k] = 0.0
+        contacts.way[c, len(period)] = 0.0
+    worst, before = 0.0, 0.0
+    for turn in range(rounds):
+        for c in range(count):
+            contacts.was[c, len(period)] = contacts.push[c]
+            for k in range(len(period)):
+                contacts.was[c, k] = contacts.rub[c, k]
+        worst, square = _press_once(period, bodies, things, contacts, vel, friction, sticky, turn % 2 == 0, count)
+        if worst <= slow or turn == rounds - 1:
+            break
+        share = square / before if turn > 0 and square < before else 0.0
+        before = square
+        for c in range(count):
+            for k in range(len(period) + 1):
+                step = share * contacts.way[c, k]
+                done = (contacts.push[c] if k == len(period) else contacts.rub[c, k]) - contacts.was[c, k]
+                contacts.way[c, k] = step + done
+                contacts.was[c, k] = step
+            if share > 0.0 and contacts.open[c] == 0:
+                more = contacts.was[c, len(period)]
+                contacts.push[c] += more
+                impulse = scale(vector(period, contacts.normal, c), more)
+                for k in range(len(period)):
+                    contacts.rub[c, k] += contacts.was[c, k]
+                impulse = add(impulse, vector(period, contacts.was, c))
+                _give(period, bodies, vel, contacts.who[c], contacts.other[c], impulse)
+    return worst
+
+
+@kernel
+def part(
+    period: Vec, bodies: Bodies, things: Things, ends: Ends, seconds: float, rounds: int, touch: float, most: float,
+    contacts: Contacts, count: int,
+) -> float:  # fmt: skip
+    """Move apart those that overlap at the end, each two by at most `most` m; return the last pass's farthest move.
+
+    The lighter of two moves further. Between a heavy body and a wall that would take as many passes as the masses'
+    ratio is large: in the second half of the passes all masses count the same.
+    """
+    for c in range(count):
+        contacts.push[c] = 0.0
+    worst = 0.0
+    for turn in range(rounds):
+        worst = 0.0
+        for k in range(count):
+            c = contacts.order[k if turn % 2 == 0 else count - 1 - k]
+            i, j = contacts.who[c], contacts.other[c]
+            gap, n = _normal(period, bodies, things, ends.pos, ends, seconds, i, j)
+            if gap < 0.0 and _ease(bodies, i, j) > 0.0:
+                far = min(-gap, most - contacts.push[c])
+                contacts.push[c] += far
+                share = _share(bodies, i, j, 2 * turn >= rounds and turn > 0)
+                write(ends.pos, i, add(vector(period, ends.pos, i), scale(n, far * share)))
+                if j >= 0:
+                    write(ends.pos, j, sub(vector(period, ends.pos, j), scale(n, far * (1.0 - share))))
+                worst = max(worst, far)
+        if worst <= touch:
+            break
+    return worst
+
+
+@kernel
+def deepest(
+    period: Vec, bodies: Bodies, things: Things, ends: Ends, seconds: float, who: Any, other: Any, count: int
+) -> float:
+    """Return how far any two of these pairs overlap at the end of a step, as a part of the smaller radius.
+
+    who, other: (places,) as in Meetings and Contacts.
+    """
+    deep = 0.0
+    for c in range(count):
+        i, j = who[c], other[c]
+        gap, _ = _normal(period, bodies, things, ends.pos, ends, seconds, i, j)
+        if gap < 0.0 and _ease(bodies, i, j) > 0.0:
+            deep = max(deep, -gap / max(width(bodies, i, j), 1e-300))
+    return deep
+
+
+@kernel
+def _share(bodies: Bodies, i: int, j: int, alike: bool) -> float:
+    """Return the part of a move that body i makes, of both; alike: True if masses do not count."""
+    one, two = bodies.light[i], bodies.light[j] if j >= 0 else 0.0
+    if alike and one > 0.0 and two > 0.0:
+        return 0.5
+    return float(one / (one + two))

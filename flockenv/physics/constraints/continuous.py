@@ -1,0 +1,140 @@
+"""What responses do that look at the end of a step alone, so that no body goes through another, however fast it is.
+
+Impacts and contacts have changed velocities; now each body goes in a straight line to its place at the end of the step.
+Where it would go into something on that path it stops, in touch with it, and their impact is that of the next step.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from flockenv.jit.decorators import Vec, kernel
+from flockenv.maths.vectors import norm, scale, sub, zero
+from flockenv.physics.constraints.bodies import (
+    DEEP,
+    GIVEN_UP,
+    STOPPED,
+    Bodies,
+    Meetings,
+    Rules,
+    Things,
+    link,
+    met,
+    relative,
+    widened,
+    width,
+)
+from flockenv.physics.constraints.broad_phase import led, vector, write
+from flockenv.physics.constraints.contacts import Ends
+from flockenv.physics.constraints.event_driven import play
+from flockenv.physics.constraints.impact import surface
+
+__all__ = ["goes_round", "may_pass", "stop_on_the_way", "take_aim"]
+
+SLOW = 0.75
+"""Part of its radius that a body may move in a step without ever being beyond what it touches."""
+
+LOST = 0.5
+"""Part of the smaller radius by which two overlap that are in each other: which is on which side means nothing."""
+
+
+@kernel
+def goes_round(period: Vec, path: float) -> bool:
+    """True if two whose paths are so long, m, may meet where one is not the nearest image of the other."""
+    least = np.inf
+    for k in range(len(period)):
+        least = min(least, period[k])
+    return bool(4.0 * path > least > 0.0)
+
+
+@kernel
+def may_pass(period: Vec, bodies: Bodies, things: Things, ends: Ends, seconds: float, turned: bool) -> bool:
+    """True if a body, or an obstacle relative to it, moves so far in the step that one may pass the other.
+
+    turned: True if impacts have changed where bodies go.
+    """
+    drift = 0.0
+    for m in range(things.row.shape[0]):
+        drift = max(drift, norm(vector(period, things.drift, m)) if things.size[m] >= 0.0 else 0.0)
+    for i in range(bodies.living.shape[0]):
+        if bodies.living[i] > 0 and bodies.light[i] > 0.0:
+            moved = norm(_path(period, bodies, ends, i, seconds)) if turned else bodies.reach[i]
+            if moved + drift * seconds > SLOW * bodies.radius[i]:
+                return True
+    return False
+
+
+@kernel
+def take_aim(period: Vec, bodies: Bodies, ends: Ends, seconds: float) -> None:
+    """Let each body reach as far as the end of its step is from the beginning."""
+    for i in range(bodies.living.shape[0]):
+        bodies.reach[i] = norm(_path(period, bodies, ends, i, seconds))
+
+
+@kernel
+def _path(period: Vec, bodies: Bodies, ends: Ends, i: int, seconds: float) -> Vec:
+    """Return the vector from where body i begins the step to where it ends it, m."""
+    apart = sub(vector(period, ends.pos, i), vector(period, bodies.start, i))
+    return led(period, apart, scale(vector(period, ends.vel, i), seconds))
+
+
+@kernel
+def stop_on_the_way(
+    period: Vec, bodies: Bodies, meetings: Meetings, things: Things, ends: Ends, rules: Rules, strict: bool, count: int,
+    lost: Any,
+) -> int:  # fmt: skip
+    """Stop bodies where their paths lead into something; return how many meetings there are, room for them or not.
+
+    rules.stops must be set. strict: True if no two may come to overlap further than they did when the step began, but
+    for DEEP; two of which one began in the other by half of its radius have no order to keep. A body that stops keeps
+    the velocity that impacts left it with, less what the step's acceleration would have added on the part of the path
+    that it does not go.
+    """
+    n, seconds, known = bodies.living.shape[0], rules.seconds, count
+    for i in range(n):
+        if strict and bodies.moved[i] == STOPPED:  # its velocity is already what it is where it stopped
+            write(bodies.free, i, zero(period))
+        straight = scale(_path(period, bodies, ends, i, seconds), 1.0 / seconds)
+        write(bodies.at, i, vector(period, bodies.start, i))
+        write(bodies.vel, i, straight)
+        write(bodies.acc, i, zero(period))
+        write(bodies.excess, i, sub(vector(period, ends.vel, i), straight))
+        bodies.since[i], bodies.moved[i], bodies.first[i] = 0.0, 0, -1
+    for c in range(known):
+        link(bodies, meetings, c)
+    for i in range(n):
+        if bodies.living[i] > 0 and bodies.light[i] > 0.0:
+            count = widened(period, bodies, meetings, things, rules, i, 0.0, count)
+    if count > meetings.who.shape[0]:
+        return count
+    for c in range(count):
+        i, j = meetings.who[c], meetings.other[c]
+        y, _, _ = relative(period, bodies, things, i, j, 0.0)
+        row, room = met(bodies, things, i, j)
+        begun = surface(things.table, row, y)[0] - room
+        if strict:
+            wide = width(bodies, i, j)
+            meetings.deep[c] = max(DEEP * wide, -begun) + 10.0 * rules.touch
+            meetings.closed[c] = GIVEN_UP if -begun > LOST * wide else 0
+            continue
+        # two that begin near each other rest, and are parted by little; what comes from afar stops at the surface, or
+        # it would be lifted out of it
+        near = max(DEEP * width(bodies, i, j) - max(begun, 0.0), 0.0)
+        meetings.deep[c] = near + 10.0 * rules.touch + max(-begun, 0.0)
+    _, _, count = play(period, bodies, meetings, things, rules, count, lost)
+    if count <= meetings.who.shape[0]:
+        for i in range(n):
+            if bodies.moved[i] == STOPPED:
+                _end(period, bodies, ends, i, seconds)
+    return count
+
+
+@kernel
+def _end(period: Vec, bodies: Bodies, ends: Ends, i: int, seconds: float) -> None:
+    """Write where body i stopped, or where an obstacle pushed it, and its velocity."""
+    left = seconds - bodies.since[i]
+    for k in range(len(period)):
+        ends.pos[i, k] = bodies.at[i, k] + bodies.vel[i, k] * left
+        ends.vel[i, k] = bodies.excess[i, k] - bodies.free[i, k] * left

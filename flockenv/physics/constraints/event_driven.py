@@ -1,0 +1,287 @@
+"""Impacts of one world within one step, one after another in the order of time.
+
+Each body flies along the parabola that the method has made of the step. The earliest impact of all is found, both
+bodies respond, and their further paths are searched anew. A ball whose hops get smaller and smaller is at rest at the
+end of the series, if that lies within the step; from then on the surface carries it: what pushes it into the surface
+is cancelled, and friction acts along it.
+
+The number of impacts of one pair in one step is limited. Beyond the limit the two bodies stop (stops.py): they keep
+their velocities and do not move for the rest of the step. So time is lost, and neither energy nor order.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from flockenv.jit.decorators import Vec, kernel
+from flockenv.maths.vectors import add, dot, scale, sub
+from flockenv.physics.constraints.bodies import (
+    ANEW,
+    DEEP,
+    GIVEN_UP,
+    RESTS,
+    STOPPED,
+    Bodies,
+    Meetings,
+    Rules,
+    Things,
+    gained,
+    met,
+    position,
+    relative,
+    velocity,
+    widened,
+    width,
+)
+from flockenv.physics.constraints.broad_phase import vector, write
+from flockenv.physics.constraints.impact import bounced, ends_here, first_impact, hops_in_touch, rubbed, surface
+from flockenv.physics.constraints.stalls import halt
+
+__all__ = ["play", "together"]
+
+OBLIQUE = 0.6180339887498949
+"""An axis in no special direction: coordinates weigh 1, this, and its square."""
+
+CALM = 0.01
+"""Part of a radius that what rests falls in a step that is short for it."""
+
+JOLTED = 3
+"""Place in `lost` of the flag that the last impact changed velocities by more than the step does; see `play`."""
+
+
+@kernel
+def together(
+    period: Vec, bodies: Bodies, meetings: Meetings, things: Things, rules: Rules, count: int, before: Any
+) -> None:
+    """Let bodies that begin in touch begin with their velocities as they are, before (N, D) m/s, for the whole step."""
+    for c in range(count):
+        _together(period, bodies, things, meetings.who[c], meetings.other[c], rules.touch, before)
+
+
+@kernel
+def _together(period: Vec, bodies: Bodies, things: Things, i: int, j: int, touch: float, before: Any) -> None:
+    """Drop the half step by which a method of first order is ahead: it would lead into what is touched, or away."""
+    y, _, _ = relative(period, bodies, things, i, j, 0.0)
+    row, room = met(bodies, things, i, j)
+    if surface(things.table, row, y)[0] - room <= touch:
+        _as_it_is(period, bodies, i, before)
+        if j >= 0:
+            _as_it_is(period, bodies, j, before)
+
+
+@kernel
+def _as_it_is(period: Vec, bodies: Bodies, i: int, before: Any) -> None:
+    write(bodies.vel, i, vector(period, before, i))
+    for k in range(len(period)):
+        bodies.excess[i, k] = 0.0
+
+
+@kernel
+def play(
+    period: Vec, bodies: Bodies, meetings: Meetings, things: Things, rules: Rules, count: int, lost: Any
+) -> tuple[int, int, int]:
+    """Move all bodies of one world through the step; return impacts, how many were cut short, and meetings in all.
+
+    lost: s that stopped bodies did not move for, J that bodies lost that came to rest at the limit, and how many bodies
+    stopped, added to; and 1 if the last impact changed velocities by more than the step does, else 0. More meetings
+    than there is room for: the work is to be done anew.
+    """
+    todo, active, impacts, cut = count, 0, 0, 0
+    for c in range(count):
+        meetings.todo[c] = c
+    while True:
+        for k in range(todo):
+            active = _search(period, bodies, meetings, things, rules, meetings.todo[k], active)
+        best, active = _earliest(period, bodies, meetings, active)
+        if best < 0:
+            return impacts, cut, count
+        when, meetings.time[best] = meetings.time[best], np.inf
+        meetings.hits[best] += 1
+        if _stops_both(bodies, meetings, rules, best):
+            halt(period, bodies, meetings, things, rules, best, when, lost)
+            cut, lost[JOLTED] = cut + 1, 1.0
+        else:
+            impacts += 1
+            cut += _impact(period, bodies, meetings, things, rules, best, when, lost)
+        todo, jolted = 0, lost[JOLTED] > 0.0
+        for who in (meetings.who[best], meetings.other[best]):
+            if who >= 0:
+                count = widened(period, bodies, meetings, things, rules, who, when, count)
+                todo = _again(period, bodies, meetings, things, rules, who, when, jolted, todo)
+        if count > meetings.who.shape[0]:
+            return impacts, cut, count
+
+
+@kernel
+def _stops_both(bodies: Bodies, meetings: Meetings, rules: Rules, c: int) -> bool:
+    """True if a meeting is no impact: one of the two has stopped already, or they rest and would overlap too far."""
+    j = meetings.other[c]
+    stopped = bodies.moved[meetings.who[c]] == STOPPED or (j >= 0 and bodies.moved[j] == STOPPED)
+    return bool(rules.stops or stopped or meetings.closed[c] == RESTS)
+
+
+@kernel
+def _earliest(period: Vec, bodies: Bodies, meetings: Meetings, active: int) -> tuple[int, int]:
+    """Return the earliest meeting, -1 if there is none, and how many are active; those without a time are let go of."""
+    best, k = -1, 0
+    while k < active:
+        c = meetings.active[k]
+        if meetings.time[c] == np.inf:
+            active -= 1
+            meetings.listed[c] = 0
+            meetings.active[k] = meetings.active[active]
+            continue
+        if best < 0 or meetings.time[c] < meetings.time[best]:
+            best = c
+        elif meetings.time[c] == meetings.time[best]:
+            first = _height(period, bodies, meetings, c) < _height(period, bodies, meetings, best)
+            best = c if first else best
+        k += 1
+    return best, active
+
+
+@kernel
+def _height(period: Vec, bodies: Bodies, meetings: Meetings, c: int) -> float:
+    """Return a number by which meetings at the very same time are told apart, whatever the numbers of the bodies."""
+    i, j = meetings.who[c], meetings.other[c]
+    place, out = vector(period, bodies.start, i), 0.0
+    if j >= 0:
+        place = add(place, vector(period, bodies.start, j))
+    for k in range(len(period)):
+        out += place[k] * OBLIQUE**k
+    return out
+
+
+@kernel
+def _search(period: Vec, bodies: Bodies, meetings: Meetings, things: Things, rules: Rules, c: int, active: int) -> int:
+    """Find when a meeting takes place; return how many have a time."""
+    if meetings.closed[c] == GIVEN_UP:
+        return active
+    i, j = meetings.who[c], meetings.other[c]
+    now = bodies.since[i] if j < 0 else max(bodies.since[i], bodies.since[j])
+    y, v, a = relative(period, bodies, things, i, j, now)
+    row, room = met(bodies, things, i, j)
+    room = max(room - meetings.deep[c], 0.0)
+    t = now + first_impact(things.table, row, y, v, a, rules.seconds - now, room, rules.touch)
+    meetings.time[c] = t if t <= rules.seconds else np.inf
+    if meetings.time[c] < np.inf and meetings.listed[c] == 0:
+        meetings.active[active], meetings.listed[c] = c, 1
+        active += 1
+    return active
+
+
+@kernel
+def _again(
+    period: Vec, bodies: Bodies, meetings: Meetings, things: Things, rules: Rules, i: int, t: float, jolted: bool,
+    todo: int,
+) -> int:  # fmt: skip
+    """List the meetings of body i to be searched anew; return how many are listed.
+
+    Two that rest need no search if nothing has jolted them, and the step is too short for them to overlap much.
+    """
+    calm = not jolted and gained(period, bodies, i, -1) * rules.seconds**2 < CALM * bodies.radius[i]
+    place = bodies.first[i]
+    while place >= 0:
+        c = place // 2
+        if jolted and meetings.closed[c] == RESTS and _hit_anew(period, bodies, meetings, things, rules, c, t):
+            meetings.closed[c], meetings.deep[c] = 0, 0.0
+        if not calm or meetings.closed[c] != RESTS:
+            meetings.todo[todo] = c
+            todo += 1
+        place = meetings.following[place % 2, c]
+    return todo
+
+
+@kernel
+def _hit_anew(period: Vec, bodies: Bodies, meetings: Meetings, things: Things, rules: Rules, c: int, t: float) -> bool:
+    """True if a third body has driven two that rest into each other, faster than the step's acceleration does.
+
+    At most so often that a step has an end.
+    """
+    i, j = meetings.who[c], meetings.other[c]
+    if meetings.hits[c] >= ANEW * (rules.most + 1):
+        return False
+    y, v, _ = relative(period, bodies, things, i, j, t)
+    row, _ = met(bodies, things, i, j)
+    _, n = surface(things.table, row, y)
+    return bool(-dot(v, n) > gained(period, bodies, i, j) * rules.seconds)
+
+
+@kernel
+def _impact(
+    period: Vec, bodies: Bodies, meetings: Meetings, things: Things, rules: Rules, c: int, t: float, lost: Any
+) -> int:
+    """Change the velocities of those that meet; return 1 if it is one impact too many, else 0.
+
+    One too many: two that approach slower than the step's acceleration changes velocity are at rest from now on; faster
+    ones respond, and stop.
+    """
+    i, j = meetings.who[c], meetings.other[c]
+    y, v, a = relative(period, bodies, things, i, j, t)
+    row, _ = met(bodies, things, i, j)
+    gap, n = surface(things.table, row, y)
+    left, push, w = rules.seconds - t, dot(a, n), -dot(v, n)
+    restitution = rules.restitution if j >= 0 else things.restitution[-1 - j]
+    over = meetings.hits[c] % ((rules.most if j < 0 else rules.again) + 1) == 0
+    slow = w <= gained(period, bodies, i, j) * rules.seconds
+    rests = rules.sticky or ends_here(max(w, 0.0), push, restitution, left) or hops_in_touch(w, push, rules.touch)
+    if j >= 0 and restitution < 1.0:  # in a heap no body is accelerated into another, and all are pressed together
+        rests = rests or slow
+    cut = over and not rests
+    rests = rests or (over and slow)
+    lost[JOLTED] = 0.0 if slow else 1.0
+    change = sub(bounced(v, n, 0.0 if rests else restitution, rules.friction), v)
+    if rules.sticky:
+        change = scale(v, -1.0)
+    total = bodies.light[i] + (bodies.light[j] if j >= 0 else 0.0)
+    share = bodies.light[i] / total if total > 0.0 else 0.0
+    _go_on(period, bodies, i, t, scale(change, share))
+    if j >= 0:
+        _go_on(period, bodies, j, t, scale(change, share - 1.0 if total > 0.0 else 0.0))
+    if rests and j < 0 and bodies.light[i] > 0.0:
+        _lie(period, bodies, things, rules, i, -1 - j, n, push, left)
+    if cut and not slow:
+        halt(period, bodies, meetings, things, rules, c, t, lost)
+    elif rests and (j >= 0 or over):
+        meetings.closed[c] = RESTS
+        bodies.leans[i] = 1 if j >= 0 else bodies.leans[i]
+        bodies.leans[max(j, 0)] = 1 if j >= 0 else bodies.leans[0]
+        meetings.deep[c] = DEEP * width(bodies, i, j) + max(met(bodies, things, i, j)[1] - gap, 0.0)
+        lost[1] += 0.5 * w * w / total if cut and total > 0.0 else 0.0
+    return 1 if cut else 0
+
+
+@kernel
+def _go_on(period: Vec, bodies: Bodies, i: int, t: float, change: Vec) -> None:
+    """Change the velocity of body i at time t."""
+    x, v = position(period, bodies, i, t), velocity(period, bodies, i, t)
+    write(bodies.at, i, x)
+    write(bodies.vel, i, add(v, change))
+    write(bodies.acc, i, vector(period, bodies.free, i))
+    bodies.since[i] = t
+    bodies.moved[i] = 1
+
+
+@kernel
+def _lie(
+    period: Vec, bodies: Bodies, things: Things, rules: Rules, i: int, m: int, n: Vec, push: float, left: float
+) -> None:
+    """Let obstacle m carry body i for the rest of the step: what pushes it in is cancelled, friction acts along it."""
+    drift, a = vector(period, things.drift, m), vector(period, bodies.acc, i)
+    side = sub(vector(period, bodies.vel, i), drift)
+    if rules.sticky:
+        write(bodies.acc, i, scale(a, 0.0))
+        write(bodies.excess, i, scale(a, 0.0))
+        return
+    into = min(push, 0.0)
+    a = sub(a, scale(n, into))
+    most = rules.friction * -into * left
+    after = rubbed(add(side, scale(a, left)), most) if most > 0.0 else add(side, scale(a, left))
+    excess = vector(period, bodies.excess, i)
+    excess = sub(excess, scale(n, dot(excess, n)))
+    if most > 0.0:  # friction holds the velocity that the method speaks of, too
+        excess = sub(rubbed(add(add(side, scale(a, left)), excess), most), after)
+    write(bodies.excess, i, excess)
+    write(bodies.acc, i, scale(sub(after, side), 1.0 / left) if left > 0.0 else scale(a, 0.0))

@@ -1,0 +1,428 @@
+"""Rods and ropes: pairs of agents whose distance is given, or at most given, at the end of every step."""
+
+from __future__ import annotations
+
+import warnings
+from typing import Annotated, Any, Literal, NamedTuple, Self
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, model_validator
+
+from flockenv.geometry.space import Torus
+from flockenv.jit.decorators import finite, kernel, like
+from flockenv.jit.section import entry
+from flockenv.maths.approximations import nearest_whole
+from flockenv.model.networks import EDGE
+from flockenv.model.state import Floats, State
+from flockenv.physics.constraints.constraint import Constraint, Settler
+
+__all__ = ["Rods", "UnmetWarning", "hold"]
+
+Number = Annotated[int, Field(ge=0, strict=True)]
+Pair = tuple[Number, Number]
+Length = Annotated[float, Field(gt=0, strict=True)]
+
+KNOWN, UNKNOWN = 0.9999, 0.99
+"""By which factor at most Jacobi's iteration is taken to shrink errors: where directions at rest are known, or not."""
+
+POWERS, LEAST = 50, 1e-9
+"""Steps in which that is found, and what rods are taken to resist at least: there may be one too many."""
+
+
+class UnmetWarning(UserWarning):
+    """A rod or rope is not as long as it should be: the sweeps that were allowed did not suffice."""
+
+
+class Ties(NamedTuple):
+    """Who is held to whom, R pairs, in layers of which each has nobody twice."""
+
+    i: NDArray[np.int32]  # (R,)
+    j: NDArray[np.int32]  # (R,)
+    length: NDArray[np.float64]  # (R,) m
+    way: NDArray[np.float64]  # (R, D) from i to j when nothing is strained; 0 = nobody knows
+
+
+class Hold(NamedTuple):
+    """What a kernel is given of R rods: who, how, and scratch."""
+
+    weight: Any  # (N,) 1/kg; 0 of who is held in place
+    i: Any  # (R,)
+    j: Any  # (R,)
+    length: Any  # (R,) m
+    period: Any  # (D,) m, around a torus; 0 = it has none
+    per_dt: float  # 1/s
+    slack: bool
+    tolerance: float
+    most: int
+    rho: float  # see _slowness
+    allowed: Any  # (R,) m, by which a length may be off
+    old: Any  # (R, D) m, from i to j before the step
+    before: Any  # (R,) m, how long that was
+    pull: Any  # (R,) what each rod has done in these sweeps
+    way: Any  # (D,) m, from i to j now
+    along: Any  # (D,) the direction in which it acts, of any length
+    kept: Any  # (2, D, N) where everybody came by the method, and how fast
+
+
+@kernel
+def _to(x: Any, b: int, i: int, j: int, period: Any, way: Any) -> float:
+    """Write the way from agent i to agent j, the shortest around a torus; return how long it is."""
+    square = like(way[0], 0.0)
+    for k in range(x.shape[0]):
+        d = x[k, b, j] - x[k, b, i]
+        if period[k] > 0:
+            d -= period[k] * nearest_whole(d / period[k])
+        way[k] = d
+        square += d * d
+    return np.sqrt(square)  # type: ignore[no-any-return]
+
+
+@kernel
+def _sum(a: Any, b: Any) -> float:
+    """Return a . b."""
+    total = like(a[0], 0.0)
+    for k in range(a.shape[0]):
+        total += a[k] * b[k]
+    return total
+
+
+@kernel
+def _push(x: Any, b: int, rods: Any, r: int, by: float) -> None:
+    """Move both ends of a rod along it, each by its weight: x of one end grows as that of the other falls."""
+    i, j = rods.i[r], rods.j[r]
+    for k in range(x.shape[0]):
+        x[k, b, i] += by * rods.weight[i] * rods.along[k]
+        x[k, b, j] -= by * rods.weight[j] * rods.along[k]
+
+
+@kernel
+def _begin(x0: Any, x: Any, b: int, rods: Any) -> None:
+    """Write how every rod was before the step, and how far off it may be: no length is known better than a place is."""
+    for r in range(rods.i.shape[0]):
+        i, j = rods.i[r], rods.j[r]
+        rods.before[r] = _to(x0, b, i, j, rods.period, rods.old[r])
+        most = like(rods.per_dt, 0.0)
+        for k in range(x.shape[0]):
+            most = max(most, max(abs(x[k, b, i]), abs(x[k, b, j])))
+        rods.allowed[r] = max(rods.tolerance * rods.length[r], most * like(most, 3e-15 if x.itemsize == 8 else 1.5e-6))
+
+
+@kernel
+def _moves(alive: Any, b: int, rods: Any, r: int) -> bool:
+    """Are both ends alive, and can one of them move?"""
+    i, j = rods.i[r], rods.j[r]
+    return alive[b, i] and alive[b, j] and rods.weight[i] + rods.weight[j] > 0  # type: ignore[no-any-return]
+
+
+@kernel
+def _sooner(over: float, rho: float, sweep: int) -> float:
+    """Return by how much the next sweep is over-relaxed: Chebyshev's way from 1 to Young's 2 / (1 + sqrt(1 - rho^2)).
+
+    (Golub and Varga 1961.) Errors do not grow on the way, as they do if one begins with the last.
+    """
+    e = like(rho, 1.0)
+    return e / (e - rho * rho * over * like(rho, 0.5 if sweep == 0 else 0.25))
+
+
+@kernel
+def _aim(rods: Any, r: int) -> float:
+    """Return how long a rod shall be while velocities come to fit: as it was, if that was wrong already."""
+    aim, before, allowed = rods.length[r], rods.before[r], rods.allowed[r]
+    if before > aim + allowed or (before < aim - allowed and not rods.slack):
+        aim = before
+    return aim  # type: ignore[no-any-return]
+
+
+@kernel
+def _turned(rods: Any, r: int, now: float, carry: bool) -> float:
+    """Write along which way a rod acts, and return way . along, > 0.
+
+    The one before the step, if it carries; if it turned too far since, or was in one place, the one it has now.
+    """
+    o = like(now, 0.0)
+    if carry:
+        cosine = _sum(rods.way, rods.old[r])
+        if cosine > like(o, 0.3) * now * rods.before[r]:
+            for k in range(rods.way.shape[0]):
+                rods.along[k] = rods.old[r, k]
+            return cosine
+    for k in range(rods.way.shape[0]):
+        rods.along[k] = rods.way[k]
+    if now > o:
+        return now * now
+    rods.along[0] = rods.length[r]  # both are in one place: any way will do
+    return rods.length[r] * rods.length[r]  # type: ignore[no-any-return]
+
+
+@kernel
+def _longer(x: Any, v: Any, b: int, rods: Any, r: int, over: float, carry: bool) -> tuple[float, bool]:
+    """Move the ends of a rod so that it is as long as it shall be; return by which share it was not, and if it counts.
+
+    With `carry` velocities change by as much as positions did in the step.
+    """
+    o, aim = like(over, 0.0), _aim(rods, r) if carry else rods.length[r]
+    now = _to(x, b, rods.i[r], rods.j[r], rods.period, rods.way)
+    if rods.slack and now <= aim and rods.pull[r] <= o:
+        return o, False
+    cosine, w = _turned(rods, r, now, carry), rods.weight[rods.i[r]] + rods.weight[rods.j[r]]
+    by = over * (now * now - aim * aim) / (like(o, 2.0) * w * cosine)
+    if rods.slack:
+        by = max(by, -rods.pull[r])
+    rods.pull[r] += by
+    _push(x, b, rods, r, by)
+    if carry:
+        _push(v, b, rods, r, by * rods.per_dt)
+    return abs(now - aim) / rods.length[r], abs(now - aim) > like(o, 0.5) * rods.allowed[r]
+
+
+@kernel
+def _stiller(x: Any, v: Any, b: int, rods: Any, r: int, over: float) -> tuple[float, bool]:
+    """Take the velocity along a rod, or what would stretch a taut rope; return its share, and if it counts."""
+    o, allowed = like(over, 0.0), rods.allowed[r]
+    now = _to(x, b, rods.i[r], rods.j[r], rods.period, rods.way)
+    if not now > o or (rods.slack and now < rods.length[r] - like(o, 2.0) * allowed):
+        return o, False
+    rate, w = o, rods.weight[rods.i[r]] + rods.weight[rods.j[r]]
+    for k in range(rods.way.shape[0]):
+        rods.along[k] = rods.way[k] / now
+        rate += rods.along[k] * (v[k, b, rods.j[r]] - v[k, b, rods.i[r]])
+    if rods.slack and rate <= o and rods.pull[r] <= o:
+        return o, False
+    by = over * rate / w
+    if rods.slack:
+        by = max(by, -rods.pull[r])
+    rods.pull[r] += by
+    _push(v, b, rods, r, by)
+    return abs(rate) / (rods.length[r] * rods.per_dt), abs(rate) > like(o, 0.5) * allowed * rods.per_dt
+
+
+@kernel
+def _swept(x: Any, v: Any, alive: Any, b: int, rods: Any, stage: int) -> tuple[int, float]:
+    """Sweep over all rods until they are right, over-relaxed; return the worst one if they are not, and its share.
+
+    Stage 0: lengths, velocities with them; 1: lengths that were wrong before; 2: velocities.
+    """
+    count, o = rods.i.shape[0], like(rods.per_dt, 0.0)
+    for r in range(count):
+        rods.pull[r] = o
+    worst, off, over = -1, o, like(o, 1.0)
+    for sweep in range(rods.most):
+        worst, off = -1, o
+        for r in range(count):
+            if _moves(alive, b, rods, r):
+                if stage < 2:
+                    wrong, counts = _longer(x, v, b, rods, r, over, stage == 0)
+                else:
+                    wrong, counts = _stiller(x, v, b, rods, r, over)
+                if counts and wrong > off:
+                    worst, off = r, wrong
+        if worst < 0:
+            break
+        over = _sooner(over, rods.rho, sweep)
+    return worst, off
+
+
+@kernel
+def _copy(x: Any, v: Any, kept: Any, b: int, keep: bool) -> None:
+    """Keep positions and velocities of world b, or put back what was kept."""
+    for k in range(x.shape[0]):
+        for i in range(x.shape[2]):
+            if keep:
+                kept[0, k, i], kept[1, k, i] = x[k, b, i], v[k, b, i]
+            else:
+                x[k, b, i], v[k, b, i] = kept[0, k, i], kept[1, k, i]
+
+
+@kernel
+def _inside(x: Any, v: Any, b: int, i: int, period: Any) -> bool:
+    """Bring an agent back into a torus; is it where there are numbers?"""
+    sound = True
+    for k in range(x.shape[0]):
+        p = period[k]
+        if p > 0:
+            x[k, b, i] -= p * np.floor(x[k, b, i] / p)
+            if x[k, b, i] >= p:
+                x[k, b, i] = 0
+        sound = sound and finite(x[k, b, i] + v[k, b, i])
+    return sound
+
+
+@kernel
+def hold(x0: Any, x: Any, v: Any, alive: Any, rods: Any, first: int, end: int) -> tuple[int, int, int, float]:
+    """Hold the agents of worlds [first, end) together.
+
+    Where velocities do not come to fit, as they may not in far too long a step, they are left as they were: those that
+    come of sweeps without end would be anything, and so energy is lost and never won.
+    Returns the first (world, agent) not finite, or -1s, and the last rod that is not right, or -1, and by which share.
+    """
+    world, agent, rod, off = -1, -1, -1, like(rods.per_dt, 0.0)
+    for b in range(first, end):
+        _copy(x, v, rods.kept, b, True)
+        _begin(x0, x, b, rods)
+        for stage in range(3):
+            worst, by = _swept(x, v, alive, b, rods, stage)
+            if worst >= 0:
+                rod, off = worst, by
+                if stage == 0:
+                    _copy(x, v, rods.kept, b, False)
+        for r in range(2 * rods.i.shape[0]):
+            i = rods.i[r // 2] if r % 2 == 0 else rods.j[r // 2]
+            if not _inside(x, v, b, i, rods.period) and world < 0:
+                world, agent = b, i
+    return world, agent, rod, off
+
+
+class Rods(Constraint):
+    """Agents keep their distances, as if there were rods without mass between them; or ropes, which may hang slack.
+
+    Each step ends with positions moved along the directions that the rods had before it, velocities with them, and
+    then without any speed along the rods (Ryckaert, Ciccotti and Berendsen 1977; Andersen 1983, RATTLE): momentum is
+    kept, and in gravity no energy is pumped. A rope that is drawn tight loses the speed that would stretch it. Who is
+    held in place is not moved. Distances that are wrong to begin with are mended in the first step, without a speed.
+    A chain of n links takes some 6 n sweeps in a step, and so does a cloth of n x n cells.
+    Rods have the last word: a limit of speed, and the walls of a box, were before them.
+    """
+
+    kind: Literal["rods"] = "rods"
+    group: int | None = Field(default=None, ge=0, description="number of the group along the edges of whose network")
+    pairs: tuple[Pair, ...] = Field(default=(), description="or who to whom, by numbers of agents")
+    lengths: tuple[Length, ...] = Field(default=(), description="m, of the pairs; one for all, or one for each")
+    slack: bool = Field(default=False, description="ropes, not rods: they may come nearer")
+    tolerance: float = Field(default=1e-10, ge=1e-14, le=0.1, description="of a length, or what numbers can tell")
+    most: int = Field(default=5000, ge=1, le=1_000_000, description="sweeps over all in one step; then it warns")
+
+    @model_validator(mode="after")
+    def _one_or_the_other(self) -> Self:
+        """Refuse what is about nobody, or about two things; who is tied to himself; lengths that are too few."""
+        if (self.group is None) == (not self.pairs):
+            raise ValueError("group: give either a group with a network or pairs")
+        if len(self.lengths) not in ((1, len(self.pairs)) if self.pairs else (0,)):
+            allowed = f"1 or {len(self.pairs)}" if self.pairs else "none beside a group"
+            raise ValueError(f"lengths: {len(self.lengths)} of them; {allowed} is allowed")
+        seen: dict[frozenset[int], int] = {}
+        for k, pair in enumerate(self.pairs):
+            if pair[0] == pair[1]:
+                raise ValueError(f"pairs[{k}] = {pair}: two different agents are needed")
+            if seen.setdefault(frozenset(pair), k) != k:
+                raise ValueError(f"pairs[{k}] = {pair}: is pairs[{seen[frozenset(pair)]}] again")
+        return self
+
+    def ties(self, scene: Any) -> Ties:
+        """Return who is held to whom in a scene; ValueError if it has no such network or agents."""
+        d = scene.dimension
+        if self.group is None:
+            i, j = np.array(self.pairs, np.int32).T
+            return _layered(Ties(i, j, np.resize(np.array(self.lengths), len(i)), np.zeros((len(i), d))))
+        if self.group >= len(scene.groups):
+            raise ValueError(f"group = {self.group}: there are {len(scene.groups)} groups, counted from 0")
+        network = scene.groups[self.group].network
+        if network is None:
+            raise ValueError(f"group = {self.group}: has no network; give groups[{self.group}].network")
+        springs, points, first = network.springs(d), network.rest_points(d), scene.starts[self.group]
+        edges = springs.role == EDGE
+        i, j = springs.i[edges], springs.j[edges]
+        return _layered(Ties(i + np.int32(first), j + np.int32(first), springs.rest[edges], points[j] - points[i]))
+
+    def check(self, scene: Any) -> None:
+        """Refuse agents and networks that are not there, newborn ends, and lengths that reach around a torus."""
+        ties = self.ties(scene)
+        most = int(max(ties.i.max(initial=0), ties.j.max(initial=0)))
+        if most >= scene.agents:
+            raise ValueError(f"pairs: there is no agent {most}, they are 0 to {scene.agents - 1}")
+        for k, member in enumerate(scene.population):
+            for agent in np.unique([ties.i, ties.j]):
+                if member.feeds(int(np.searchsorted(scene.starts, agent, "right")) - 1):
+                    raise ValueError(
+                        f"pairs: agent {agent} is of a group that population[{k}] fills: a newborn has no rod"
+                    )
+        if isinstance(scene.space, Torus) and ties.length.max(initial=0.0) > min(scene.space.size) / 2:
+            raise ValueError(
+                f"lengths: {ties.length.max():g} m reaches around the torus; at most half its shortest edge, "
+                f"{min(scene.space.size) / 2:g} m, is allowed"
+            )
+
+    def numbers(self, scene: Any) -> int:
+        """Of each pair what `Hold` lists; and a copy of where everybody is, and how fast."""
+        d = int(scene.dimension)
+        return 2 * d - (-(6 + d) * len(self.ties(scene).i) // int(scene.agents))
+
+    def settler(self, scene: Any) -> Settler:
+        """Return what mends a step, with scratch of its own; it warns once if lengths are not met."""
+        ties, real, d = self.ties(scene), np.dtype(scene.dtype).type, scene.dimension
+        weight = (1 / scene.body.mass).astype(real)  # who is held in place has an infinite mass
+        period = np.array(scene.space.extent(d) if scene.space.periodic else (0.0,) * d, real)
+        length = ties.length.astype(real)
+        rods = Hold(
+            weight, ties.i, ties.j, length, period, real(1 / scene.dt), self.slack,
+            real(self.tolerance), self.most, real(_slowness(ties, weight)), np.zeros_like(length),
+            np.zeros((len(length), d), real), np.zeros_like(length), np.zeros_like(length), np.zeros(d, real),
+            np.zeros(d, real), np.zeros((2, d, scene.agents), real),
+        )  # fmt: skip
+        solve, told = entry(hold), False
+
+        def settle(x0: Floats, v0: Floats, state: State, first: int, end: int) -> tuple[int, int]:
+            nonlocal told
+            world, agent, rod, off = solve(x0, state.x, state.v, state.alive, rods, first, end)
+            if rod >= 0 and world < 0 and not told:
+                told = True
+                warnings.warn(
+                    f"rods: after most = {self.most} sweeps agents {ties.i[rod]} and {ties.j[rod]} were {off:.2g} of "
+                    f"their length off (tolerance = {self.tolerance:g}); their speeds are only damped then, so allow "
+                    "more sweeps, or make shorter steps",
+                    UnmetWarning,
+                    stacklevel=2,
+                )
+            return int(world), int(agent)
+
+        return settle
+
+
+def _layered(ties: Ties) -> Ties:
+    """Return the same in ascending order, layer after layer: the order in which they were given makes no difference.
+
+    In each layer nobody is twice, so that those of a chain, every other one, are Young's ordering.
+    """
+    swap = ties.i > ties.j
+    i, j = np.where(swap, ties.j, ties.i), np.where(swap, ties.i, ties.j)
+    way = np.where(swap[:, None], -ties.way, ties.way)
+    order = np.lexsort((j, i))
+    layer, of = np.zeros(len(i), np.int64), dict[int, set[int]]()
+    for r in order:
+        taken = of.setdefault(int(i[r]), set()) | of.setdefault(int(j[r]), set())
+        layer[r] = next(k for k in range(len(taken) + 1) if k not in taken)
+        of[int(i[r])].add(int(layer[r]))
+        of[int(j[r])].add(int(layer[r]))
+    order = order[np.argsort(layer[order], kind="stable")]
+    return Ties(i[order], j[order], ties.length[order], way[order])
+
+
+def _slowness(ties: Ties, weight: Floats) -> float:
+    """Return rho, by which Jacobi's iteration shrinks what shrinks the least, of everybody at rest.
+
+    1 less the least eigenvalue of what rods do to each other, by inverse iteration. Rods of unknown directions count as
+    if all were in line. A wrong rho makes more sweeps, and no other result.
+    """
+    from scipy import sparse  # here: who simulates without rods need not wait for it
+    from scipy.sparse.linalg import splu
+
+    weight = weight.astype(np.float64)
+    moves = weight[ties.i] + weight[ties.j] > 0
+    way, d = ties.way[moves], ties.way.shape[1]
+    long = np.linalg.norm(way, axis=1)
+    known = bool(long.all())
+    ways = way / long[:, None] if known else np.eye(1, d).repeat(len(way), axis=0)
+    speeds: Any = 0  # along each rod, of what each of its ends does, (R, N D)
+    for ends, sign in ((ties.i[moves], -1.0 if known else 1.0), (ties.j[moves], 1.0)):
+        share = np.sqrt(weight[ends] / (weight[ties.i] + weight[ties.j])[moves])
+        column = ends[:, None] * d + np.arange(d)
+        entries = (sign * share[:, None] * ways).ravel(), (np.repeat(np.arange(len(way)), d), column.ravel())
+        speeds = sparse.csr_array(entries, shape=(len(way), len(weight) * d)) + speeds
+    if not len(way):
+        return 0.0
+    lu = splu((speeds @ speeds.T + LEAST * sparse.eye_array(len(way))).tocsc())
+    said, grown = np.random.default_rng(0).normal(size=len(way)), 1.0
+    for _ in range(POWERS):
+        said = lu.solve(said / np.linalg.norm(said))
+        grown = float(np.linalg.norm(said))
+    return min(max(0.0, 1 - 1 / grown), KNOWN if known else UNKNOWN)

@@ -1,0 +1,250 @@
+"""The end of a step of one world: impulses of all contacts at once, blocked paths, overlaps that are parted."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from flockenv.jit.decorators import Vec, kernel
+from flockenv.maths.vectors import add, dot, norm, scale, sub, zero
+from flockenv.physics.constraints.bodies import DEEP, Bodies, Meetings, Rules, Things, widened
+from flockenv.physics.constraints.broad_phase import image, led, vector, write
+from flockenv.physics.constraints.candidates import list_meetings
+from flockenv.physics.constraints.contacts import NEARLY, Contacts, Ends, deepest, gather, impacts, part, press
+from flockenv.physics.constraints.continuous import may_pass, stop_on_the_way, take_aim
+
+__all__ = ["settle_ends"]
+
+UNSOLVED = 0.1
+"""Part of the velocity that a step adds with which a body may still go into another."""
+
+ROUNDS = 8
+"""How often those that touch are gathered anew, where moving bodies apart has led them into others."""
+
+CROWDED = 0.5
+"""Part of its radius by which a body is moved so far by the single pass of `project` that it makes more of them."""
+
+DEEPEST = 0.25
+"""Part of the smaller radius by which two may overlap after the passes that part them; then bodies are held back."""
+
+RAISED = 4
+"""Place in `lost` of the energy, J, of bodies that were moved apart against the step's acceleration."""
+
+LEFT, SUNK = 5, 6
+"""Places in `lost` of how much is left unsolved in a step, the most of all: the fastest change of velocity of the last
+pass, m/s, and the deepest overlap, as a part of the smaller radius."""
+
+
+@kernel
+def settle_ends(
+    period: Vec, bodies: Bodies, meetings: Meetings, things: Things, contacts: Contacts, ends: Ends, before: Any,
+    reach: Any, rules: Rules, in_time: bool, once: bool, passing: bool, rounds: int, fast: float, hard: float, up: Vec,
+    spread: float, round_about: bool, count: int, scratch: Any, lost: Any, report: Any,
+) -> int:  # fmt: skip
+    """Solve all contacts of the step's end, velocities, then places; return how many meetings there are.
+
+    up: against the mean acceleration; round_about: True if paths on a torus are too long to tell the order of bodies.
+    """
+    least = 1e-12 * fast
+    slow, gain = 1e-3 * hard * rules.seconds + least, 1e-6 * hard * rules.seconds + least
+    left, deep, unsolved_before = 0.0, 0.0, report[4]
+    touching = gather(
+        period, bodies, meetings, things, ends, contacts, rules.seconds, up, rules.touch, slow,
+        rules.restitution, in_time, passing, count,
+    )  # fmt: skip
+    if touching > 0:
+        left = _velocities(
+            period, bodies, things, contacts, ends, before, rules, in_time, once, rounds, hard, least, gain, touching,
+            report,
+        )  # fmt: skip
+    turned = touching > 0 and not in_time and not once and _moved_far(period, bodies, ends, bodies.at, 0.5 * DEEP)
+    again = passing or (turned and may_pass(period, bodies, things, ends, rules.seconds, True))
+    if again:
+        count = stop_on_the_way(period, bodies, meetings, things, ends, rules, False, count, lost)
+    elif turned:
+        count = _wider(period, bodies, meetings, things, ends, rules, count)
+    held = False
+    if (touching > 0 or again) and count <= meetings.who.shape[0]:
+        for i in range(bodies.living.shape[0]):  # velocities before the step are used no more
+            write(before, i, vector(period, ends.pos, i))
+        count, deep, stuck = _places(
+            period, bodies, meetings, things, contacts, ends, reach, rules, once, again or turned, rounds, up, spread,
+            touching, count, scratch,
+        )  # fmt: skip
+        lost[RAISED] += _raised(period, bodies, ends, before)
+        if not in_time and not round_about and count <= meetings.who.shape[0]:
+            stopped = lost[2]
+            count = _hold_back(
+                period, bodies, meetings, things, ends, before, reach, rules, once, stuck, spread, count, scratch, lost
+            )  # fmt: skip
+            held = lost[2] > stopped
+    limit = DEEP * _widest(bodies) + 1e3 * rules.touch
+    unsolved = left > UNSOLVED * hard * rules.seconds + 1e3 * gain or deep > limit
+    if held or (unsolved and not once):
+        report[4] += 1
+        lost[LEFT] = max(lost[LEFT], 0.0 if once else left)
+    if report[4] > unsolved_before and count <= meetings.who.shape[0]:
+        worst = deepest(period, bodies, things, ends, rules.seconds, meetings.who, meetings.other, count)
+        lost[SUNK] = max(lost[SUNK], worst)
+    return count
+
+
+@kernel
+def _hold_back(
+    period: Vec, bodies: Bodies, meetings: Meetings, things: Things, ends: Ends, before: Any, reach: Any, rules: Rules,
+    once: bool, stuck: bool, spread: float, count: int, scratch: Any, lost: Any,
+) -> int:  # fmt: skip
+    """Stop bodies where the straight paths to their parted places lead into something; return how many meetings are.
+
+    before (N, D) m: where they were before they were parted; stuck: True if passes ran out. Passes may throw a light
+    body past a heavy one, or leave it in one where others block it. Bodies begin the step in order, so that what goes
+    no further than the first contact keeps it.
+    """
+    if not stuck and not (once and _moved_far(period, bodies, ends, before, NEARLY)):
+        return count
+    take_aim(period, bodies, ends, rules.seconds)
+    count = list_meetings(period, bodies, meetings, things, ends, rules, reach, True, True, scratch)
+    if count > meetings.who.shape[0]:
+        return count
+    worst = deepest(period, bodies, things, ends, rules.seconds, meetings.who, meetings.other, count)
+    far = spread == np.inf and worst > DEEPEST
+    if far or (once and may_pass(period, bodies, things, ends, rules.seconds, True)):
+        count = stop_on_the_way(period, bodies, meetings, things, ends, rules, True, count, lost)
+    return count
+
+
+@kernel
+def _raised(period: Vec, bodies: Bodies, ends: Ends, before: Any) -> float:
+    """Return the energy, J, that bodies have gained where they were moved from `before` (N, D) m against the step.
+
+    Against its acceleration, that is: times mass, times the move. Bodies that were moved along it do not make up for
+    others, so that this is a bound.
+    """
+    joules = 0.0
+    for i in range(bodies.living.shape[0]):
+        if bodies.living[i] > 0 and bodies.light[i] > 0.0:
+            move = image(period, sub(vector(period, ends.pos, i), vector(period, before, i)))
+            joules += max(-dot(vector(period, bodies.free, i), move), 0.0) / bodies.light[i]
+    return joules
+
+
+@kernel
+def _velocities(
+    period: Vec, bodies: Bodies, things: Things, contacts: Contacts, ends: Ends, before: Any, rules: Rules,
+    in_time: bool, once: bool, rounds: int, hard: float, least: float, gain: float, count: int, report: Any,
+) -> float:  # fmt: skip
+    """Change velocities until no body goes into another; return the last pass's fastest change, m/s."""
+    passes, seconds, n = 1 if once else rounds, rules.seconds, bodies.living.shape[0]
+    if not in_time:
+        for i in range(n):  # what the step has added comes after the impacts; what is slower than it does not bounce
+            write(bodies.vel, i, vector(period, ends.vel, i))
+            write(bodies.acc, i, sub(vector(period, ends.vel, i), vector(period, before, i)))
+        done, left = impacts(
+            period, bodies, things, contacts, before, rules.restitution, rules.friction, rules.sticky, passes,
+            hard * seconds + least, count,
+        )  # fmt: skip
+        report[3] += done
+        report[4] += 1 if left > 0 else 0
+        for i in range(n):
+            write(ends.vel, i, add(vector(period, before, i), vector(period, bodies.acc, i)))
+    worst = press(period, bodies, things, contacts, ends.vel, rules.friction, rules.sticky, passes, gain, count)
+    if not in_time and not once:
+        for i in range(n):
+            write(bodies.at, i, vector(period, ends.pos, i))
+        for i in range(n):  # what contacts have changed goes from its start as fast as it is now, under every method
+            now = vector(period, ends.vel, i)
+            more = sub(now, vector(period, bodies.vel, i))
+            if dot(more, more) > 0.0:
+                write(ends.pos, i, add(vector(period, bodies.start, i), scale(now, seconds)))
+    return float(worst)
+
+
+@kernel
+def _places(
+    period: Vec, bodies: Bodies, meetings: Meetings, things: Things, contacts: Contacts, ends: Ends, reach: Any,
+    rules: Rules, once: bool, anew: bool, rounds: int, up: Vec, spread: float, touching: int, count: int, scratch: Any,
+) -> tuple[int, float, bool]:  # fmt: skip
+    """Move apart those that overlap; return how many meetings there are, the last pass's farthest move, m, and stuck.
+
+    stuck: True if two still overlap by DEEPEST, or bodies were still moved when rounds ran out; not if `spread`, m, is
+    what they part by at most.
+    anew: True if bodies have moved since those that touch were gathered. That is done again, too, where bodies are
+    moved so far that they may overlap others; two that part slowly on purpose are moved once.
+    """
+    deep, elsewhere, settled, done = 0.0, False, False, False
+    for turn in range(ROUNDS):
+        if turn > 0 and (elsewhere or _beyond(period, bodies, ends, reach)):
+            elsewhere = True
+            count = list_meetings(period, bodies, meetings, things, ends, rules, reach, False, True, scratch)
+        if count > meetings.who.shape[0]:
+            return count, deep, False
+        if turn > 0 or anew:
+            touching = gather(
+                period, bodies, meetings, things, ends, contacts, rules.seconds, up, rules.touch, 0.0,
+                rules.restitution, False, False, count,
+            )  # fmt: skip
+        for i in range(bodies.living.shape[0]):
+            write(bodies.at, i, vector(period, ends.pos, i))
+        deep = part(
+            period, bodies, things, ends, rules.seconds, 1 if once else rounds, rules.touch, spread, contacts, touching
+        )
+        crowded = False
+        if once:
+            left = deepest(period, bodies, things, ends, rules.seconds, contacts.who, contacts.other, touching)
+            crowded = left > DEEPEST or _moved_far(period, bodies, ends, bodies.at, CROWDED)
+        if crowded:
+            deep = part(period, bodies, things, ends, rules.seconds, rounds, rules.touch, spread, contacts, touching)
+        done = (once and not crowded) or spread < np.inf
+        settled = not _moved_far(period, bodies, ends, bodies.at, NEARLY if once else 0.5 * DEEP)
+        if done or settled:
+            break
+    left = deepest(period, bodies, things, ends, rules.seconds, contacts.who, contacts.other, touching)
+    return count, deep, spread == np.inf and (left > DEEPEST or not (done or settled))
+
+
+@kernel
+def _beyond(period: Vec, bodies: Bodies, ends: Ends, reach: Any) -> bool:
+    """True if a body is further from where it began than meetings were listed for."""
+    for i in range(bodies.living.shape[0]):
+        moved = image(period, sub(vector(period, ends.pos, i), vector(period, bodies.start, i)))
+        if bodies.living[i] > 0 and norm(moved) > max(reach[i], bodies.reach[i]):
+            return True
+    return False
+
+
+@kernel
+def _wider(
+    period: Vec, bodies: Bodies, meetings: Meetings, things: Things, ends: Ends, rules: Rules, count: int
+) -> int:
+    """Add meetings of bodies that impacts made so fast that they end in what they were not near; return how many."""
+    for i in range(bodies.living.shape[0]):
+        moved = sub(vector(period, ends.pos, i), vector(period, bodies.start, i))
+        moved = led(period, moved, scale(vector(period, ends.vel, i), rules.seconds))
+        far = norm(moved) > bodies.reach[i] + NEARLY * bodies.radius[i]
+        if far and bodies.living[i] > 0 and bodies.light[i] > 0.0:
+            bodies.since[i] = 0.0
+            write(bodies.at, i, vector(period, bodies.start, i))
+            write(bodies.vel, i, scale(moved, 1.0 / rules.seconds))
+            write(bodies.acc, i, zero(period))
+            count = widened(period, bodies, meetings, things, rules, i, 0.0, count)
+    return count
+
+
+@kernel
+def _widest(bodies: Bodies) -> float:
+    """Return the largest radius, m."""
+    widest = 0.0
+    for i in range(bodies.living.shape[0]):
+        widest = max(widest, bodies.radius[i])
+    return float(widest)
+
+
+@kernel
+def _moved_far(period: Vec, bodies: Bodies, ends: Ends, since: Any, share: float) -> bool:
+    """True if a body was moved from its place `since` (N, D) m by more than this part of its radius."""
+    for i in range(bodies.living.shape[0]):
+        d = image(period, sub(vector(period, ends.pos, i), vector(period, since, i)))
+        if bodies.living[i] > 0 and norm(d) > share * bodies.radius[i]:
+            return True
+    return False

@@ -1,0 +1,229 @@
+"""Bodies that are solid but soft: springs, dampers and friction, only while two of them overlap."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any, ClassVar, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from flockenv.jit.decorators import Law, Vec, law, like
+from flockenv.maths.vectors import add, dot, norm, scale, select, sub, unit, zero
+from flockenv.physics.effects.effect import Effect, Me, Obstacle, Other, Sight, all_masses
+from flockenv.steering.others import ONE_PLACE
+
+__all__ = ["Contact", "ObstacleContact", "restitution"]
+
+Floats = NDArray[np.float64]
+
+
+@law
+def pressing(p: Any, overlap: float, parting: float, reduced: float) -> float:
+    """Return the force along the normal, k d - c u with u the speed of parting; not below 0 unless it is adhesive.
+
+    With a fastest speed U of parting k d becomes min(k d, U sqrt(k m)) (1 - u / U).
+    """
+    o, e = like(overlap, 0.0), like(overlap, 1.0)
+    root = np.sqrt(p.stiffness * reduced)
+    push, most = p.stiffness * overlap, root / p.ease
+    push = most if most < push else push  # without a fastest speed `most` is infinite, or no number
+    push = push * max(e - p.ease * max(parting, o), o)
+    force = push - (p.damping + p.ratio * (root + root)) * parting
+    return force if (force > o) | (p.adhesive > o) else o
+
+
+@law
+def rubbing(p: Any, overlap: float, force: float, slip: Vec) -> Vec:
+    """Return the friction -kappa d s against the slip s, not above mu times the force along the normal."""
+    o = like(overlap, 0.0)
+    rate, speed, most = p.friction * overlap, norm(slip), p.grip * max(force, o)
+    slides = (p.grip >= o) & (rate * speed > most)
+    return scale(slip, -(most / speed if slides else rate))
+
+
+@law
+def met(p: Any, normal: Vec, overlap: float, vel: Vec, reduced: float) -> Vec:
+    """Return the force on a body that overlaps another; normal: away from the other; vel: relative to the other."""
+    parting = dot(vel, normal)
+    force = pressing(p, overlap, parting, reduced)
+    slip = sub(vel, scale(normal, parting))
+    said = add(scale(normal, force), rubbing(p, overlap, force, slip))
+    return select(overlap > like(overlap, 0.0), said, zero(vel))
+
+
+@law
+def untouched(p: Any, me: Me) -> Vec:
+    """No force yet."""
+    return zero(me.pos)
+
+
+@law
+def pushed_out(p: Any, me: Me, other: Obstacle, acc: Vec) -> Vec:
+    """Add what one obstacle does; it is held in place."""
+    return add(acc, met(p, other.normal, me.radius - other.gap, sub(me.vel, other.vel), me.mass))
+
+
+@law
+def touching(p: Any, me: Me) -> float:
+    """Its radius."""
+    return me.radius
+
+
+@law
+def of_all(p: Any, me: Me, acc: Vec) -> Vec:
+    """All of them at once."""
+    return acc
+
+
+@law
+def pushed_apart(p: Any, me: Me, other: Other) -> Vec:
+    """What one neighbour does; two in one place part along their ties."""
+    e = like(other.square, 1.0)
+    apart = other.square > like(other.square, ONE_PLACE)
+    normal = unit(select(apart, scale(other.offset, -e), sub(me.tie, other.tie)))
+    overlap = me.radius + other.radius - np.sqrt(other.square)
+    return met(p, normal, overlap, sub(me.vel, other.vel), e / (e / me.mass + e / other.mass))
+
+
+def restitution(ratio: float, adhesive: bool = False) -> float:
+    """Return the share of its speed that a contact damped by a share of what is critical gives back (numerics.md P18).
+
+    Adhesive: it ends where the bodies no longer overlap; otherwise where it would begin to pull, a little earlier.
+    """
+    if not 0 <= ratio < math.inf:
+        raise ValueError(f"ratio is {ratio!r}, must be a number of at least 0")
+    if ratio >= 1:  # nothing swings: the time until the force is 0 is acosh(2 ratio^2 - 1) / root
+        if adhesive:
+            return 0.0
+        root = math.sqrt(ratio**2 - 1)
+        return math.exp(-2.0) if root < 1e-6 else math.exp(-ratio / root * math.acosh(2 * ratio**2 - 1))
+    root = math.sqrt(1 - ratio**2)
+    late = math.pi if adhesive else math.pi - math.atan2(2 * ratio * root, 1 - 2 * ratio**2)
+    return math.exp(-ratio / root * late)
+
+
+class _Solid(Effect):
+    """What contacts have in common."""
+
+    stiffness: float = Field(ge=0, description="k, N/m")
+    damping: float = Field(default=0.0, ge=0, description="c, kg/s")
+    ratio: float = Field(default=0.0, ge=0, description="damping too, as a share of what is critical for the masses")
+    adhesive: bool = Field(default=False, description="may the damper pull, until bodies no longer overlap?")
+    friction: float = Field(default=0.0, ge=0, description="kappa, kg/(m s), against slip, for each metre of overlap")
+    coulomb: float | None = Field(
+        default=None, ge=0, description="mu, most of the normal force that friction may be; none = any"
+    )
+    most: float | None = Field(
+        default=None, gt=0, description="U, m/s, beyond which the spring does not drive bodies apart; none = any"
+    )
+    strengths: ClassVar[tuple[str, ...]] = ("stiffness", "damping", "ratio", "friction")
+    contact: ClassVar[bool] = True
+
+    def parameters(self) -> dict[str, float | Vec]:
+        """Numbers; grip: mu, negative = any; ease: 1 / U."""
+        return {
+            "stiffness": self.stiffness,
+            "damping": self.damping,
+            "ratio": self.ratio,
+            "adhesive": float(self.adhesive),
+            "friction": self.friction,
+            "grip": -1.0 if self.coulomb is None else self.coulomb,
+            "ease": 0.0 if self.most is None else 1 / self.most,
+        }
+
+    def _rates(self, per_mass: Floats) -> tuple[Floats, Floats]:
+        """Return w^2 and damping of contacts of so much 1 / reduced mass, (N,) 1/kg."""
+        square = self.stiffness * per_mass
+        return square, self.damping * per_mass + 2 * self.ratio * np.sqrt(square)
+
+
+class ObstacleContact(_Solid):
+    """A body that overlaps an obstacle by d is pushed out of it, F = max(0, k d - c v.n) n; n leads out.
+
+    The elastic part is the contact force of Helbing, Farkas and Vicsek 2000 (k g(r - d)); it never pulls, unless it is
+    adhesive. Their friction, -kappa d (v . t) t, opposes the slip; it is stable in steps of less than 2 m / (kappa d).
+    A body of mass m that comes at v, relative to the obstacle, goes in by at most v sqrt(m / k). For `most` see
+    `Contact`.
+    """
+
+    kind: Literal["obstacle_contact"] = "obstacle_contact"
+    obstacle_start: ClassVar[Law | None] = untouched
+    obstacle_law: ClassVar[Law | None] = pushed_out
+    obstacle_finish: ClassVar[Law | None] = of_all
+    obstacle_reach: ClassVar[Law | None] = touching
+
+    def folded(self, dimension: int) -> int:
+        """The force so far."""
+        return dimension
+
+    def rates(self, groups: Sequence[Any], dimension: int) -> tuple[Floats, Floats]:
+        """w^2 = k / m, and (c + 2 ratio sqrt(k m)) / m, of a body in one obstacle; friction is not in it."""
+        return self._rates(1 / all_masses(groups, dimension))
+
+
+@law
+def contacts(p: Any, me: Me, sums: Vec) -> Vec:
+    """All of them at once."""
+    return sums
+
+
+class Contact(_Solid):
+    """Two bodies that overlap by d push each other apart, F = max(0, k d - c u) n, and rub, -kappa d s.
+
+    u is their speed of parting along the normal n, s their slip across it. Without damping it is the contact of
+    Helbing, Farkas and Vicsek 2000 (k = 1.2e5 kg/s^2, kappa = 2.4e5 kg/(m s)): k g(2r - d) n + kappa g(2r - d) dv t.
+    With `ratio` a hit gives back the same share of the speed for all masses, `restitution(ratio, adhesive)`. A contact
+    lasts pi sqrt(m / k), m the reduced mass, and wants 30 steps (CoarseContactWarning); friction is stable in steps of
+    less than 2 m / (kappa d). Bodies do not spin: friction takes slip, and angular momentum with it.
+
+    `most` = U keeps those that begin inside each other from flying apart: the spring gives U sqrt(k m) at most, and
+    1 - u / U of that while they part, so that no pair is driven apart faster than U (Hunt and Crossley 1975 damp so).
+    Hits at up to U go in no deeper than where that begins; those at v << U lose v / (3 U) of their speed.
+    """
+
+    kind: Literal["contact"] = "contact"
+    radius: float | None = Field(
+        default=None, gt=0, description="m, who is nearer is looked at; none = as far as any two touch"
+    )
+    pair_law: ClassVar[Law | None] = pushed_apart
+    finish_law: ClassVar[Law | None] = contacts
+    conserves_momentum: ClassVar[bool] = True
+
+    @property
+    def sight(self) -> Sight:
+        """All around."""
+        return Sight(math.inf if self.radius is None else self.radius)  # a scene knows how far two touch
+
+    @property
+    def reach(self) -> float:
+        """How far it is said to look, m; 0 if it is for bodies to say."""
+        return self.radius or 0.0
+
+    def sums(self, dimension: int) -> int:
+        """The force so far."""
+        return dimension
+
+    def check(self, scene: Any) -> None:
+        """Refuse a radius at which two bodies overlap already, and bodies that touch around a torus."""
+        super().check(scene)
+        touch = scene.touching if scene.agents > 1 else 0.0
+        if self.radius is not None and self.radius < touch:
+            raise ValueError(
+                f"radius = {self.radius:g}: two bodies touch at up to {touch:g} m; at least that is allowed"
+            )
+        if scene.space.periodic and touch > min(scene.space.size) / 2:
+            raise ValueError(
+                f"kind = {self.kind}: two bodies touch at up to {touch:g} m; at most half the torus's shortest edge, "
+                f"{min(scene.space.size) / 2:g} m, is allowed"
+            )
+
+    def rates(self, groups: Sequence[Any], dimension: int) -> tuple[Floats, Floats]:
+        """w^2 = k / m, and (c + 2 ratio sqrt(k m)) / m, m the reduced mass with the lightest other; one contact."""
+        mass = all_masses(groups, dimension)
+        if len(mass) == 1:
+            return np.zeros(1), np.zeros(1)
+        light, next_ = np.sort(mass)[:2]
+        return self._rates(np.where(np.isfinite(mass), 1 / mass + 1 / np.where(mass == light, next_, light), 0.0))

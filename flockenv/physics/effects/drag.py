@@ -1,0 +1,56 @@
+"""Drag, linear and quadratic: the medium takes away speed relative to it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, ClassVar, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from flockenv.jit.decorators import Law, Vec, law
+from flockenv.maths.vectors import norm, scale, sub
+from flockenv.physics.effects.effect import Effect, Me, all_masses
+
+__all__ = ["Drag", "QuadraticDrag"]
+
+
+@law
+def drag(p: Any, me: Me) -> Vec:
+    """F = -c (v - u)."""
+    return scale(sub(me.vel, me.medium), -p.rate)
+
+
+@law
+def quadratic_drag(p: Any, me: Me) -> Vec:
+    """F = -c |v - u| (v - u)."""
+    relative = sub(me.vel, me.medium)
+    return scale(relative, -p.rate * norm(relative))
+
+
+class Drag(Effect):
+    """Linear drag, F = -c (v - u) in a medium that moves with u: without other forces v = v0 exp(-c t / m)."""
+
+    kind: Literal["drag"] = "drag"
+    rate: float = Field(ge=0, description="c, kg/s")
+    own_law: ClassVar[Law | None] = drag
+    strengths: ClassVar[tuple[str, ...]] = ("rate",)
+    linear_drag: ClassVar[str | None] = "rate"
+
+    def rates(self, groups: Sequence[Any], dimension: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Nothing swings; c / m."""
+        damping = self.rate / all_masses(groups, dimension)
+        return np.zeros(len(damping)), damping
+
+
+class QuadraticDrag(Effect):
+    """Drag of a body that leaves a wake, F = -c |v - u| (v - u) in a medium that moves with u.
+
+    Under gravity g it falls no faster than v = sqrt(m g / c), which it approaches as v tanh(g t / v).
+    """
+
+    kind: Literal["quadratic_drag"] = "quadratic_drag"
+    rate: float = Field(ge=0, description="c, kg/m: half of density x cross-section x drag coefficient")
+    own_law: ClassVar[Law | None] = quadratic_drag
+    strengths: ClassVar[tuple[str, ...]] = ("rate",)

@@ -1,0 +1,205 @@
+"""Routes: a choice among doors by the time that each is expected to take, walking there and waiting in front of it."""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, model_validator
+
+from flockenv.geometry.eikonal import NO_WAY
+from flockenv.geometry.targets import Target, passed, row_size
+from flockenv.jit.decorators import Law, Vec, law, like
+from flockenv.maths.vectors import scale, sub, unit, zero
+from flockenv.physics.effects.aims import about
+from flockenv.physics.effects.effect import Me
+from flockenv.physics.effects.floor_field import Around
+from flockenv.physics.effects.waypoints import onwards, place_kept
+from flockenv.physics.floor_fields import towards
+
+__all__ = ["Door", "Routes"]
+
+HEAD = 2
+"""Numbers of a door before those of its target: where its block of ways begins; how many per second get through."""
+BINS = 256
+"""Into how many pieces the longest way to a door is cut, to count who is how near."""
+
+
+@law
+def way_to_door(p: Any, me: Me, k: Any) -> tuple[float, Vec]:
+    """Return how long the way to door k is, m, and its first direction."""
+    return towards(p.table[np.int64(p.table[1 + k * np.int64(p.size)]) :], me.pos)
+
+
+@law
+def bin_of(p: Any, length: float) -> float:
+    """Return in which piece of a way a place is, so many m before the door."""
+    last = p.bins - like(length, 1.0)
+    piece = np.floor(length / p.table[0])
+    return piece if piece < last else last  # type: ignore[no-any-return]
+
+
+@law
+def at_door(p: Any, me: Me) -> float:
+    """Count who heads for a door, in the piece of the way in which he is; nobody who has passed his."""
+    door = me.inner.door
+    heading = about(p, me) & (door < p.many)
+    return door * p.bins + bin_of(p, me.inner.left) if heading else like(door, -1.0)
+
+
+@law
+def ahead_at(p: Any, me: Me, k: Any, length: float) -> float:
+    """Return how many head for door k and are nearer to it than me; of those in the same piece of the way, half."""
+    o, e = like(length, 0.0), like(length, 1.0)
+    mine, begin = np.int64(bin_of(p, length)), k * np.int64(p.bins)
+    count = o
+    for j in range(mine):
+        count += p.counted[begin + j]
+    was = np.int64(bin_of(p, me.inner.left))
+    me_too = np.int64(me.inner.door) == k
+    count -= e if me_too and was < mine else o
+    beside: float = p.counted[begin + mine] - (e if me_too and was == mine else o)
+    return count + like(o, 0.5) * beside
+
+
+@law
+def expected(p: Any, me: Me, k: Any, waits: bool) -> float:
+    """Return the time to get through door k, s: the way there, and the queue in front of it."""
+    length, _ = way_to_door(p, me, k)
+    time = length / me.desired_speed
+    if waits:
+        time += ahead_at(p, me, k, length) / p.table[2 + k * np.int64(p.size)]
+    return time
+
+
+@law
+def quickest(p: Any, me: Me, waits: bool) -> tuple[Any, float]:
+    """Return the door that is expected to take the least time, and that time, s; of equals, the first."""
+    best, time = 0, expected(p, me, 0, waits)
+    for k in range(1, np.int64(p.many)):
+        other = expected(p, me, k, waits)
+        if other < time:
+            best, time = k, other
+    return best, time
+
+
+@law
+def routes_begun(p: Any, me: Me) -> Vec:
+    """Towards the nearest door, and a first decision within a period, not with everybody else."""
+    o = like(p.share, 0.0)
+    if not about(p, me):
+        return (o, o, o, me.inner.was_x, me.inner.was_y)
+    door, _ = quickest(p, me, False)
+    left, _ = way_to_door(p, me, door)
+    turn = (me.who + like(o, 1.0)) * like(o, 0.6180339887498949)
+    return (like(o, door), left, me.time + p.period * (turn - np.floor(turn)), me.pos[0], me.pos[1])
+
+
+@law
+def routes_kept(p: Any, me: Me, told: Vec, seconds: float) -> Vec:
+    """Its door, anew once per period; how far that is; when it decides again; where it is."""
+    door, left, ready, was = me.inner.door, me.inner.left, me.inner.ready, place_kept(me)
+    if not about(p, me) or door >= p.many:
+        return (door, left, ready, was[0], was[1])
+    e, now, mine = like(door, 1.0), me.time + seconds, np.int64(door)
+    if passed(p.table, 1 + mine * np.int64(p.size) + 2, was, me.pos):
+        place = onwards(me)
+        return (p.many, like(door, 0.0), ready, place[0], place[1])
+    if now >= ready - like(seconds, 0.01) * seconds:
+        found, time = quickest(p, me, True)
+        if time < (e - p.hysteresis) * expected(p, me, mine, True):
+            mine = np.int64(found)
+        ready += p.period
+    length, _ = way_to_door(p, me, mine)
+    return (like(door, float(mine)), length, ready, me.pos[0], me.pos[1])
+
+
+@law
+def routes_aim(p: Any, me: Me) -> Vec:
+    """Along the way to its door; straight on when it is through."""
+    if not about(p, me):
+        return zero(me.pos)
+    if me.inner.door >= p.many:
+        return scale(unit(sub(me.pos, place_kept(me))), p.share)
+    _, direction = way_to_door(p, me, np.int64(me.inner.door))
+    return scale(direction, p.share)
+
+
+class Door(Target):
+    """A door, and how wide it is for those who queue."""
+
+    width: float | None = Field(default=None, gt=0, description="m; none = from one end to the other")
+
+    @model_validator(mode="after")
+    def _wide(self) -> Door:
+        """Refuse a door of which nobody knows how wide it is."""
+        if self.width is None and self.ends is None:
+            raise ValueError("width = None: a door without ends needs one; give m")
+        return self
+
+    @property
+    def room(self) -> float:
+        """How wide it is, m."""
+        return self.length if self.width is None else self.width
+
+
+class Routes(Around):
+    """Everybody of a group leaves by the door that is expected to take the least time, t = L / v0 + n / (J w).
+
+    L is the way to the door, v0 the desired speed, n how many of the group head for that door and are nearer to it, J
+    the `flow` and w the door's width. One begins with the nearest door and decides anew every `period`, each at times
+    of his own (golden ratio times his number), and changes only for a door that is quicker by `hysteresis`. Everybody
+    is taken to know how many go where: they are counted once per step, to 1/256 of the longest way.
+    `inner(state, "door")` is the number of the door; as many as there are when one is through it, and goes straight on.
+    """
+
+    kind: Literal["routes"] = "routes"
+    doors: tuple[Door, ...] = Field(min_length=1, description="among which one chooses; one alone is assigned")
+    flow: float = Field(default=1.9, gt=0, description="1/(m s), how many get through per metre of width")
+    period: float = Field(default=2.0, gt=0, description="s, between decisions")
+    hysteresis: float = Field(default=0.1, ge=0, lt=1, description="share of its time by which another must be quicker")
+    aim_law: ClassVar[Law | None] = routes_aim
+    begin_law: ClassVar[Law | None] = routes_begun
+    keep_law: ClassVar[Law | None] = routes_kept
+    count_law: ClassVar[Law | None] = at_door
+    keeps: ClassVar[tuple[str, ...]] = ("door", "left", "ready", "was_x", "was_y")
+
+    @property
+    def goals(self) -> tuple[tuple[Target, ...], tuple[str, ...]]:
+        """The doors."""
+        return self.doors, tuple(f"doors[{k}]" for k in range(len(self.doors)))
+
+    @property
+    def counters(self) -> int:
+        """One for each piece of the way to each door."""
+        return BINS * len(self.doors)
+
+    def parameters(self) -> dict[str, float | Vec]:
+        """What the laws read beside the table."""
+        numbers = {name: float(getattr(self, name)) for name in ("share", "period", "hysteresis")}
+        return {**numbers, "many": float(len(self.doors)), "bins": float(BINS), "size": float(HEAD + row_size(2))}
+
+    def table(self, scene: Any) -> NDArray[np.float64]:
+        """How long a piece of a way is, a row for each door, and the ways to each."""
+        blocks = [self.ways(scene, (door,), (name,)) for door, name in zip(*self.goals, strict=True)]
+        begin = 1 + len(self.doors) * (HEAD + row_size(2))
+        at = begin + np.cumsum([0, *map(len, blocks)])
+        rows = [[float(a), self.flow * d.room, *d.row] for a, d in zip(at[:-1], self.doors, strict=True)]
+        lengths = np.concatenate([block[2 + row_size(2) + 6 :: 3] for block in blocks])
+        longest = float(lengths[lengths < NO_WAY].max())
+        return np.concatenate([[max(longest, self.spacing) / (BINS - 1)], np.ravel(rows), *blocks])
+
+    def grids(self, scene: Any) -> list[NDArray[np.float64]]:
+        """Return the grid of ways to each door."""
+        table, size = scene.table_of(self), HEAD + row_size(2)
+        return [table[int(table[1 + k * size]) + 2 + row_size(2) :] for k in range(len(self.doors))]
+
+    def check(self, scene: Any) -> None:
+        """Refuse space, a torus, and those who do not say how fast they would like to go."""
+        if scene.dimension != 2 or scene.space.periodic:
+            raise ValueError(f"kind = {self.kind}: only a plane or a box of dimension 2 is allowed")
+        super().check(scene)
+        for k, group in enumerate(scene.groups):
+            if self.group in (None, k) and group.desired_speed is None:
+                raise ValueError(f"kind = {self.kind}: groups[{k}].desired_speed = None: give m/s")

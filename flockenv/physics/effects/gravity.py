@@ -1,0 +1,38 @@
+"""Uniform gravity."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, ClassVar, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from flockenv.jit.decorators import Law, Vec, law
+from flockenv.maths.vectors import scale
+from flockenv.model.state import State
+from flockenv.physics.effects.effect import Effect, Me, Vector, all_masses
+
+__all__ = ["Gravity"]
+
+
+@law
+def gravity(p: Any, me: Me) -> Vec:
+    """F = m g."""
+    return scale(p.acceleration, me.mass)
+
+
+class Gravity(Effect):
+    """Everybody falls alike, F = m g: without other forces x = x0 + v0 t + g t^2 / 2. What is held in place stays."""
+
+    kind: Literal["gravity"] = "gravity"
+    acceleration: Vector = Field(default=(0.0, -9.81), description="m/s^2, which is N per kg; as many as dimensions")
+    own_law: ClassVar[Law | None] = gravity
+    strengths: ClassVar[tuple[str, ...]] = ("acceleration",)
+
+    def potential(self, groups: Sequence[Any], state: State, offset: Any) -> NDArray[np.float64]:
+        """Sum of -m g . x of all agents that can fall, (B,) J."""
+        mass = all_masses(groups, state.shape[2])
+        fall = np.where(np.isfinite(mass), mass, 0.0)
+        return np.asarray(-(state.pos @ np.array(self.acceleration) * fall).sum(axis=1))

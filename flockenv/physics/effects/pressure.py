@@ -1,0 +1,93 @@
+"""Pressure: agents part where they are crowded and close up where they are not, until their density is a given one."""
+
+from __future__ import annotations
+
+import math
+from typing import Any, ClassVar, Literal
+
+from pydantic import Field
+
+from flockenv.jit.decorators import Law, Vec, law, like
+from flockenv.maths.vectors import scale, select, sub, unit
+from flockenv.physics.effects.effect import Effect, Me, Other, Sight
+from flockenv.steering.others import ONE_PLACE
+
+__all__ = ["Pressure"]
+
+PACKED = 0.64
+"""Share of space that spheres fill when they are poured in and shaken (Scott & Kilgour 1969: 0.637)."""
+
+
+@law
+def pressure_pair(p: Any, me: Me, other: Other) -> Vec:
+    """(a^2 - r^2) / (r^2 + (a/8)^2) (1 - r^2/R^2)^2 away from the neighbour; two in one place part along their ties."""
+    e, square = like(other.square, 1.0), other.square
+    rest = p.flat if len(me.pos) == 2 else p.solid
+    near = e - square / (p.radius * p.radius)
+    push = (rest - square) / (square + rest * like(square, 1 / 64)) * near * near
+    apart = square > like(square, ONE_PLACE)
+    return scale(unit(select(apart, scale(other.offset, -e), sub(me.tie, other.tie))), push)
+
+
+@law
+def pressure(p: Any, me: Me, sums: Vec) -> Vec:
+    """F = strength times the sum."""
+    return scale(sums, p.strength)
+
+
+class Pressure(Effect):
+    """Keep a constant density of agents, by forces between near neighbours that conserve momentum.
+
+    F = K sum of (a^2 - r^2) / (r^2 + (a/8)^2) (1 - r^2/R^2)^2, away from each neighbour nearer than R: they push each
+    other while they are nearer than a, and pull beyond; finite where they meet, smoothly 0 at R. a is the distance of
+    neighbours in the packing of that density that a crowd relaxes to: rho = 2 / (sqrt(3) a^2) in the plane (triangles),
+    0.64 / (pi a^3 / 6) in space (random close packing, which fills 64 %). The force has a potential, so something else
+    must take the energy away (`Drag`), or agents remain a gas. Fewer than fill their space leave holes in it.
+
+    This is not the pressure of smoothed particles: that is a function of both partners' densities, and needs a second
+    sweep over all pairs (Monaghan 1992). A mere sum over pairs has no density of its own in a mean field (its pressure
+    grows with rho^2, whatever the force); here it is the distance a, and the order that agents take up, that keeps it:
+    to some percent.
+    """
+
+    kind: Literal["pressure"] = "pressure"
+    strength: float = Field(ge=0, description="K, N: 3 K or so act at half the distance a, 64 K in one place")
+    density: float = Field(gt=0, description="rho, agents per m^2, in 3-D per m^3")
+    radius: float = Field(gt=0, description="R, m, neighbours are nearer than this: between 1.1 a and 1.4 a")
+    pair_law: ClassVar[Law | None] = pressure_pair
+    finish_law: ClassVar[Law | None] = pressure
+    conserves_momentum: ClassVar[bool] = True
+    strengths: ClassVar[tuple[str, ...]] = ("strength",)
+
+    @property
+    def sight(self) -> Sight:
+        """All around."""
+        return Sight(self.radius)
+
+    def sums(self, dimension: int) -> int:
+        """A vector."""
+        return dimension
+
+    def distance(self, dimension: int) -> float:
+        """Return a, the distance of nearest neighbours at this density, m."""
+        if dimension == 2:
+            return math.sqrt(2 / (math.sqrt(3) * self.density))
+        return math.cbrt(PACKED * 6 / (math.pi * self.density))
+
+    def check(self, scene: Any) -> None:
+        """Refuse a radius that has no room for a pull, or that reaches the neighbours' neighbours."""
+        a = self.distance(scene.dimension)
+        if not 1.1 * a <= self.radius <= 1.4 * a:
+            raise ValueError(
+                f"radius = {self.radius:g}: at this density nearest neighbours are a = {a:.4g} m apart; from 1.1 a = "
+                f"{1.1 * a:.4g} to 1.4 a = {1.4 * a:.4g} m is allowed"
+            )
+
+    def parameters(self) -> dict[str, float | Vec]:
+        """Strength and radius, and a^2 in the plane and in space, of which the law takes one."""
+        return {
+            "strength": self.strength,
+            "radius": self.radius,
+            "flat": self.distance(2) ** 2,
+            "solid": self.distance(3) ** 2,
+        }

@@ -1,0 +1,211 @@
+"""Springs between the particles of a network: along their length, and about their angles.
+
+Rest lengths and angles are those of the network's undeformed shape. What a spring does to its two ends, and a hinge to
+its three particles, sums to nothing.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from flockenv.jit.decorators import Law, Vec, law, like
+from flockenv.maths.vectors import add, axis, dot, norm, scale, select, sub
+from flockenv.model.networks import BEND, SHEAR
+from flockenv.physics.effects.effect import Bonds, Effect, Me, all_masses, network_of
+
+if TYPE_CHECKING:
+    from flockenv.model.state import State
+
+__all__ = ["AngularSprings", "Springs"]
+
+Floats = NDArray[np.float64]
+
+
+@law
+def spring(p: Any, me: Me, others: Any, number: Vec) -> Vec:
+    """F = (k (l - L) + c (v_j - v) . d) d, along the unit vector d to the other end (Witkin & Baraff 1997).
+
+    Two ends in one place part along an axis, whoever has the higher number to its far side.
+    """
+    other, o = others[0], like(number[0], 0.0)
+    length = norm(other.offset)
+    apart = length > o
+    aside = scale(axis(other.offset, 0), like(o, 1.0) if me.who < other.who else like(o, -1.0))
+    along = select(apart, scale(other.offset, like(o, 1.0) / length if apart else o), aside)
+    return scale(along, number[0] * (length - number[2]) + number[1] * dot(sub(other.vel, me.vel), along))
+
+
+@law
+def _turned(a: Vec) -> Vec:
+    """Return a plane vector, a quarter turn to the left."""
+    return (-a[1], a[0])
+
+
+@law
+def _opening(a: Vec, b: Vec) -> tuple[float, Vec, Vec]:
+    """Return the angle from arm a to arm b, and the directions per length in which it grows: d angle / da and / db.
+
+    In the plane it has a sign; in space it is between 0 and pi, and arms in one line open in no direction.
+    """
+    o, e = like(a[0], 0.0), like(a[0], 1.0)
+    aa, bb = dot(a, a), dot(b, b)
+    sound = (aa > o) & (bb > o)
+    per_a, per_b = e / aa if sound else o, e / bb if sound else o
+    if len(a) == 2:
+        angle = np.arctan2(a[0] * b[1] - a[1] * b[0], a[0] * b[0] + a[1] * b[1])
+        return angle, scale(_turned(a), -per_a), scale(_turned(b), per_b)
+    else:
+        across = (a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])
+        sine, cosine = norm(across), dot(a, b)
+        bent = sine > o
+        share = e / sine if bent else o
+        # (b - (a . b / a . a) a) / |a x b| is a unit vector over |a|
+        to_b = scale(sub(b, scale(a, cosine * per_a)), -share)
+        to_a = scale(sub(a, scale(b, cosine * per_b)), -share)
+        return np.arctan2(sine, cosine), to_b, to_a
+
+
+@law
+def _wrapped(angle: float) -> float:
+    """Return an angle in [-pi, pi)."""
+    turn = like(angle, 2 * np.pi)
+    return angle - turn * np.floor(angle / turn + like(angle, 0.5))  # type: ignore[no-any-return]
+
+
+@law
+def angular_spring(p: Any, me: Me, others: Any, number: Vec) -> Vec:
+    """M = -k (angle - rest) - c d angle / dt, as forces on the two ends, and what balances them on the apex."""
+    near, far = others[0], others[1]
+    role, half = number[3], like(number[0], 0.5)
+    first, apex = role < half, (role > half) & (role < like(half, 1.5))
+    # arms and their velocities, from the apex: an end meets the apex first and then the other end
+    back, beyond = scale(near.offset, like(half, -1.0)), sub(far.offset, near.offset)
+    moves, passes = sub(me.vel, near.vel), sub(far.vel, near.vel)
+    a = select(apex, near.offset, select(first, back, beyond))
+    b = select(apex, far.offset, select(first, beyond, back))
+    va = select(apex, sub(near.vel, me.vel), select(first, moves, passes))
+    vb = select(apex, sub(far.vel, me.vel), select(first, passes, moves))
+    angle, grows_a, grows_b = _opening(a, b)
+    rate = dot(grows_a, va) + dot(grows_b, vb)
+    moment = -number[0] * _wrapped(angle - number[2]) - number[1] * rate
+    on_a, on_b = scale(grows_a, moment), scale(grows_b, moment)
+    both = scale(add(on_a, on_b), like(half, -1.0))
+    return select(apex, both, select(first, on_a, on_b))
+
+
+class Springs(Effect):
+    """Damped springs along the edges of a group's network: F = k (l - L) + c dl/dt towards the other end."""
+
+    kind: Literal["springs"] = "springs"
+    group: int = Field(default=0, ge=0, description="number of the group whose network it acts on")
+    stiffness: float = Field(ge=0, description="N/m, of edges")
+    shear: float | None = Field(default=None, ge=0, description="N/m, of springs across cells; none = as edges")
+    bend: float | None = Field(default=None, ge=0, description="N/m, of springs over two edges; none = as edges")
+    damping: float = Field(default=0.0, ge=0, description="kg/s, along each spring")
+    ratio: float = Field(default=0.0, ge=0, description="more damping, as a share of what is critical for each spring")
+    rest: float = Field(default=1.0, ge=0, description="rest lengths over those of the network; 0 = no length at all")
+    bond_law: ClassVar[Law | None] = spring
+    strengths: ClassVar[tuple[str, ...]] = ("stiffness", "shear", "bend", "damping", "ratio")
+    conserves_momentum: ClassVar[bool] = True
+
+    def numbers(self, dimension: int) -> int:
+        """Stiffness, damping, rest length."""
+        return 3
+
+    def parameters(self) -> dict[str, float | Vec]:
+        """None: every spring has numbers of its own."""
+        return {}
+
+    def bonds(self, groups: Sequence[Any], dimension: int) -> Bonds:
+        """Both ends of every spring."""
+        first, network, mass = network_of(groups, self.group, dimension)
+        springs = network.springs(dimension)
+        stiffness = np.full(len(springs.i), self.stiffness)
+        for role, value in ((SHEAR, self.shear), (BEND, self.bend)):
+            if value is not None:
+                stiffness[springs.role == role] = value
+        i, j = springs.i, springs.j
+        reduced = 1 / (1 / mass[i] + 1 / mass[j] + 1e-300)  # kg; two that are held swing not at all
+        damping = self.damping + 2 * self.ratio * np.sqrt(stiffness * np.minimum(reduced, 1e300))
+        number = np.stack([stiffness, damping, self.rest * springs.rest], axis=1)
+        agent, partner = np.concatenate([i, j]) + first, np.concatenate([j, i]) + first
+        return Bonds(agent.astype(np.int32), partner[:, None].astype(np.int32), np.concatenate([number, number]))
+
+    def rates(self, groups: Sequence[Any], dimension: int) -> tuple[Floats, Floats] | None:
+        """Gershgorin: w^2 <= 2 sum k / m, and as much for damping (numerics.md 3.3)."""
+        bonds, mass = self.bonds(groups, dimension), all_masses(groups, dimension)
+        swing, damp = (np.bincount(bonds.agent, bonds.number[:, k], len(mass)) for k in (0, 1))
+        return 2 * swing / mass, 2 * damp / mass
+
+    def potential(self, groups: Sequence[Any], state: State, offset: Any) -> Floats:
+        """Sum of k (l - L)^2 / 2 of all springs, (B,) J."""
+        bonds = self.bonds(groups, state.shape[2])
+        half = len(bonds.agent) // 2
+        i, j, number = bonds.agent[:half], bonds.partner[:half, 0], bonds.number[:half]
+        length = np.linalg.norm(offset(state.pos[:, i], state.pos[:, j]), axis=-1)
+        return np.asarray((0.5 * number[:, 0] * (length - number[:, 2]) ** 2).sum(axis=1))
+
+
+class AngularSprings(Effect):
+    """Damped springs about the hinges of a group's network: a moment k (angle - rest angle) at each apex."""
+
+    kind: Literal["angular_springs"] = "angular_springs"
+    group: int = Field(default=0, ge=0, description="number of the group whose network it acts on")
+    stiffness: float = Field(ge=0, description="N m/rad")
+    damping: float = Field(default=0.0, ge=0, description="N m s/rad")
+    bond_law: ClassVar[Law | None] = angular_spring
+    partners: ClassVar[int] = 2
+    strengths: ClassVar[tuple[str, ...]] = ("stiffness", "damping")
+    conserves_momentum: ClassVar[bool] = True
+
+    def numbers(self, dimension: int) -> int:
+        """Stiffness, damping, rest angle, and which of the three somebody is."""
+        return 4
+
+    def parameters(self) -> dict[str, float | Vec]:
+        """None: every hinge has numbers of its own."""
+        return {}
+
+    def bonds(self, groups: Sequence[Any], dimension: int) -> Bonds:
+        """The first end, the apex and the second end of every hinge."""
+        first, network, _ = network_of(groups, self.group, dimension)
+        hinges, points = network.hinges(dimension), network.rest_points(dimension)
+        a, b = points[hinges[:, 0]] - points[hinges[:, 1]], points[hinges[:, 2]] - points[hinges[:, 1]]
+        rest = _angles(a, b)
+        i, apex, k = (hinges + first).T
+        number = [np.full(len(rest), self.stiffness), np.full(len(rest), self.damping), rest]
+        roles = [np.stack([*number, np.full(len(rest), float(role))], axis=1) for role in range(3)]
+        partner = [np.stack(pair, axis=1) for pair in ((apex, k), (i, k), (apex, i))]
+        return Bonds(np.concatenate([i, apex, k]), np.concatenate(partner).astype(np.int32), np.concatenate(roles))
+
+    def rates(self, groups: Sequence[Any], dimension: int) -> tuple[Floats, Floats] | None:
+        """Of the undeformed shape: row sums of the second derivatives k |d angle/dx| |d angle/dy| of each hinge."""
+        first, network, _ = network_of(groups, self.group, dimension)
+        hinges, points, mass = network.hinges(dimension), network.rest_points(dimension), all_masses(groups, dimension)
+        per_a, per_b = (1 / np.linalg.norm(points[hinges[:, end]] - points[hinges[:, 1]], axis=1) for end in (0, 2))
+        whole = np.stack([per_a, per_a + per_b, per_b]) * 2 * (per_a + per_b)
+        rows = np.bincount((hinges + first).T.ravel(), whole.ravel(), len(mass)) / mass
+        return self.stiffness * rows, self.damping * rows
+
+    def potential(self, groups: Sequence[Any], state: State, offset: Any) -> Floats:
+        """Sum of k (angle - rest)^2 / 2 of all hinges, (B,) J."""
+        bonds = self.bonds(groups, state.shape[2])
+        third = len(bonds.agent) // 3
+        i, apex, k = bonds.agent[:third], bonds.agent[third : 2 * third], bonds.agent[2 * third :]
+        angle = _angles(offset(state.pos[:, apex], state.pos[:, i]), offset(state.pos[:, apex], state.pos[:, k]))
+        off = angle - bonds.number[:third, 2]
+        off -= 2 * np.pi * np.floor(off / (2 * np.pi) + 0.5)
+        return np.asarray((0.5 * bonds.number[:third, 0] * off**2).sum(axis=1))
+
+
+def _angles(a: Floats, b: Floats) -> Floats:
+    """Return the angle from a to b, (..., D): with a sign in the plane, between 0 and pi in space."""
+    along = (a * b).sum(axis=-1)
+    if a.shape[-1] == 2:
+        return np.asarray(np.arctan2(a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0], along))
+    return np.asarray(np.arctan2(np.linalg.norm(np.cross(a, b), axis=-1), along))

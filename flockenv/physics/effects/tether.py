@@ -1,0 +1,90 @@
+"""Springs to a fixed point, and a field of pendulums: forces of one agent by itself that have a potential energy."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, ClassVar, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from flockenv.jit.decorators import Law, Vec, law, like
+from flockenv.maths.vectors import add, scale, sub, unit
+from flockenv.model.state import State
+from flockenv.physics.effects.effect import Effect, Me, Vector, all_masses
+
+__all__ = ["Swing", "Tether"]
+
+Floats = NDArray[np.float64]
+
+
+@law
+def tether(p: Any, me: Me) -> Vec:
+    """F = -k (|d| - L) unit(d) - c v with d from the centre to the agent; no direction, and no force of L, at d = 0."""
+    d = sub(me.pos, p.centre)
+    spring = add(scale(d, -p.stiffness), scale(unit(d), p.stiffness * p.rest))
+    return sub(spring, scale(me.vel, p.damping))
+
+
+@law
+def _sines(a: Vec) -> Vec:
+    """Return the sine of each coordinate."""
+    if len(a) == 2:
+        return (np.sin(a[0]), np.sin(a[1]))
+    else:
+        return (np.sin(a[0]), np.sin(a[1]), np.sin(a[2]))
+
+
+@law
+def swing(p: Any, me: Me) -> Vec:
+    """F = -s sin((x - c) / l) along each axis."""
+    return scale(_sines(scale(sub(me.pos, p.centre), like(p.length, 1.0) / p.length)), -p.strength)
+
+
+class _Centred(Effect):
+    """What forces about a fixed point have in common; on a torus the nearest image of the centre counts."""
+
+    centre: Vector = Field(description="m")
+    places: ClassVar[tuple[str, ...]] = ("centre",)
+
+
+class Tether(_Centred):
+    """A damped spring to a fixed point, F = -k (|d| - L) unit(d) - c v: with L = 0 an oscillator, w^2 = k / m."""
+
+    kind: Literal["tether"] = "tether"
+    stiffness: float = Field(ge=0, description="k, N/m")
+    damping: float = Field(default=0.0, ge=0, description="c, kg/s")
+    rest: float = Field(default=0.0, ge=0, description="L, m, where the spring pulls no more")
+    own_law: ClassVar[Law | None] = tether
+    strengths: ClassVar[tuple[str, ...]] = ("stiffness", "damping")
+
+    def rates(self, groups: Sequence[Any], dimension: int) -> tuple[Floats, Floats]:
+        """w^2 = k / m, and c / m."""
+        mass = all_masses(groups, dimension)
+        return self.stiffness / mass, self.damping / mass
+
+    def potential(self, groups: Sequence[Any], state: State, offset: Any) -> Floats:
+        """Sum of k (|d| - L)^2 / 2 of all agents, (B,) J; what the damper takes is not in it."""
+        stretch = np.linalg.norm(offset(self.centre, state.pos), axis=-1) - self.rest
+        return np.asarray((0.5 * self.stiffness * stretch**2).sum(axis=1))
+
+
+class Swing(_Centred):
+    """A pendulum along each axis, F = -s sin((x - c) / l): the angle is (x - c) / l, w^2 = s / (m l) for small ones."""
+
+    kind: Literal["swing"] = "swing"
+    strength: float = Field(ge=0, description="s, N; of a pendulum in gravity: m g")
+    length: float = Field(default=1.0, gt=0, description="l, m")
+    own_law: ClassVar[Law | None] = swing
+    strengths: ClassVar[tuple[str, ...]] = ("strength",)
+
+    def rates(self, groups: Sequence[Any], dimension: int) -> tuple[Floats, Floats]:
+        """w^2 = s / (m l), where it hangs; nothing damps it."""
+        square = self.strength / self.length / all_masses(groups, dimension)
+        return square, np.zeros(len(square))
+
+    def potential(self, groups: Sequence[Any], state: State, offset: Any) -> Floats:
+        """Sum of s l (1 - cos((x - c) / l)) over all agents and axes, (B,) J."""
+        angles = offset(self.centre, state.pos) / self.length
+        return np.asarray(self.strength * self.length * (1 - np.cos(angles)).sum(axis=(1, 2)))

@@ -1,0 +1,182 @@
+"""Journeys: places to be gone to one after another, each straight or around obstacles, and waited at for a while."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, ClassVar, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, model_validator
+
+from flockenv.geometry.targets import Target, passed, row_size, to_target
+from flockenv.jit.decorators import Law, Vec, law, like
+from flockenv.maths.vectors import norm, scale, select, sub, unit, zero
+from flockenv.model.distribution import Spread, drawn
+from flockenv.physics.effects.aims import about
+from flockenv.physics.effects.effect import Me
+from flockenv.physics.effects.floor_field import Around, slowed
+from flockenv.physics.floor_fields import towards
+
+__all__ = ["Journey", "Stage", "onwards", "place_kept"]
+
+Seconds = Annotated[float, Field(ge=0)] | Spread
+
+PREMOVEMENT = 2
+"""Channel of what is drawn for everybody: Group has 0 and 1; stage k has this one, and k more, and one more."""
+HEAD = 2
+"""Numbers of a stage before those of its target: where its block of ways begins, or -1; over how far one slows down."""
+
+
+@law
+def place_kept(me: Me) -> Vec:
+    """Where it was at the end of the step before."""
+    return me.inner.was_x, me.inner.was_y
+
+
+@law
+def onwards(me: Me) -> Vec:
+    """Return a place a metre behind who goes on as in his last step."""
+    return sub(me.pos, unit(sub(me.pos, place_kept(me))))
+
+
+@law
+def stage_row(p: Any, stage: float) -> Any:
+    """Return where in the table the numbers of a stage begin; of those beyond the last, the last."""
+    last = p.many - like(stage, 1.0)
+    k = np.floor(stage)
+    k = k if k < last else last
+    o = like(stage, 0.0)
+    return np.int64(k if k > o else o) * np.int64(p.size)
+
+
+@law
+def journey_aim(p: Any, me: Me) -> Vec:
+    """To the place of its stage; nowhere before it sets out; straight on when it has passed the last."""
+    stage, o = me.inner.stage, like(p.share, 0.0)
+    row = stage_row(p, stage)
+    straight = to_target(p.table, row + 2, me.pos)
+    block = np.int64(p.table[row])
+    length, direction = norm(straight), unit(straight)
+    if block >= 0:
+        length, direction = towards(p.table[block:], me.pos)
+    e = slowed(direction, length, p.table[row + 1])
+    e = select((stage >= p.many) & (p.leaves > o), unit(sub(me.pos, place_kept(me))), e)
+    return select(about(p, me) & (stage >= o), scale(e, p.share), zero(me.pos))
+
+
+@law
+def journey_begun(p: Any, me: Me) -> Vec:
+    """Before the first stage until it sets out."""
+    o = like(p.share, 0.0)
+    begin = np.int64(p.many) * np.int64(p.size)
+    each = np.int64(p.many) + 1
+    mine = about(p, me)
+    wait = p.table[begin + np.int64(me.who - p.first) * each] if mine else o
+    stage = like(o, -0.5) if wait > o else o
+    return select(mine, (stage, me.time + wait, me.pos[0], me.pos[1]), (o, o, o, o))
+
+
+@law
+def journey_kept(p: Any, me: Me, told: Vec, seconds: float) -> Vec:
+    """Stage k, k + 1/2 while it waits there, and so on; the time until which it waits; where it is."""
+    stage, ready, was = me.inner.stage, me.inner.ready, place_kept(me)
+    before = (stage, ready, was[0], was[1])
+    if not about(p, me) or (stage >= p.many and p.leaves > like(stage, 0.0)):
+        return before
+    half, now = like(stage, 0.5), me.time + seconds
+    on = np.floor(stage) + like(stage, 1.0)
+    waits = stage != np.floor(stage)
+    if waits:
+        over = now >= ready - like(seconds, 0.01) * seconds
+        stage = on if over else stage
+    elif stage < p.many and passed(p.table, stage_row(p, stage) + 2, was, me.pos):
+        each = np.int64(p.many) + 1
+        begin = np.int64(p.many) * np.int64(p.size) + np.int64(me.who - p.first) * each
+        wait = p.table[begin + 1 + np.int64(stage)]
+        ready = now + wait
+        stage = stage + half if wait > like(wait, 0.0) else on
+    ended = stage >= p.many
+    stage = like(stage, 0.0) if ended and p.loops > like(stage, 0.0) else stage
+    place = select(ended & (p.leaves > like(stage, 0.0)), onwards(me), me.pos)
+    return (stage, ready, place[0], place[1])
+
+
+class Stage(Target):
+    """A place on a journey: reached when one is in it (a point: within its radius), or has crossed it (a door)."""
+
+    wait: Seconds = Field(default=0.0, description="s, for how long one stays; or how that is spread")
+    around: bool = Field(default=True, description="by the way around obstacles; else straight")
+
+    @model_validator(mode="after")
+    def _reached(self) -> Stage:
+        """Refuse a point that nobody ever is in."""
+        if self.at is not None and self.radius == 0:
+            raise ValueError("radius = 0: a point is reached within a radius; give m")
+        return self
+
+
+class Journey(Around):
+    """Everybody of a group goes to one place after another, and may wait before it sets out, and at each of them.
+
+    `inner(state, "stage")` is the number of the place that it goes to, from 0; half more while it waits there; -1/2
+    before it sets out; as many as there are when it has been at all. Waiting ends with the first step that begins when
+    the time is over, whatever dt is. Who has passed the last door of a journey that ends with "leave" goes straight on,
+    through a sink if there is one. Stages keep numbers of the plane.
+    """
+
+    kind: Literal["journey"] = "journey"
+    stages: tuple[Stage, ...] = Field(min_length=1, description="where to, one after another")
+    premovement: Seconds = Field(default=0.0, description="s, after which one sets out; or how that is spread")
+    then: Literal["stay", "leave", "loop"] = Field(
+        default="stay", description="after the last: stay there, go straight on, or begin again"
+    )
+    slow_radius: float = Field(default=0.5, gt=0, description="m, over which one slows down before one stays or waits")
+    needs_all: ClassVar[bool] = True
+    aim_law: ClassVar[Law | None] = journey_aim
+    begin_law: ClassVar[Law | None] = journey_begun
+    keep_law: ClassVar[Law | None] = journey_kept
+    keeps: ClassVar[tuple[str, ...]] = ("stage", "ready", "was_x", "was_y")
+
+    @property
+    def goals(self) -> tuple[tuple[Target, ...], tuple[str, ...]]:
+        """The stages that ways lead to."""
+        there = [k for k, stage in enumerate(self.stages) if stage.around]
+        return tuple(self.stages[k] for k in there), tuple(f"stages[{k}]" for k in there)
+
+    def parameters(self) -> dict[str, float | Vec]:
+        """How many stages, what comes then."""
+        ends = {"leaves": float(self.then == "leave"), "loops": float(self.then == "loop")}
+        return {"share": self.share, "many": float(len(self.stages)), "size": float(HEAD + row_size(2)), **ends}
+
+    def table(self, scene: Any) -> NDArray[np.float64]:
+        """A row for each stage, what is drawn for everybody, and the ways to each place, once."""
+        members = self.members(scene.starts)
+        count = int(members["end"] - members["first"])
+        given = [(self.premovement, PREMOVEMENT), *((s.wait, PREMOVEMENT + 1 + k) for k, s in enumerate(self.stages))]
+        waits = np.stack([drawn(value, count, channel) for value, channel in given], axis=1)
+        places = {Target(**stage.place): name for stage, name in zip(*self.goals, strict=True)}
+        blocks = [self.ways(scene, (place,), (name,)) for place, name in places.items()]
+        begin = len(self.stages) * (HEAD + row_size(2)) + waits.size
+        at = dict(zip(places, begin + np.cumsum([0, *map(len, blocks)])[:-1], strict=True))
+        rows = [
+            [float(at[Target(**stage.place)]) if stage.around else -1.0, self.slowing(k), *stage.row]
+            for k, stage in enumerate(self.stages)
+        ]
+        return np.concatenate([np.ravel(rows), waits.ravel(), *blocks])
+
+    def grids(self, scene: Any) -> list[NDArray[np.float64]]:
+        """Return the grid of ways to each stage that agents go around obstacles to."""
+        table, size = scene.table_of(self), HEAD + row_size(2)
+        blocks = [int(table[k * size]) for k, stage in enumerate(self.stages) if stage.around]
+        return [table[at + 2 + row_size(2) :] for at in blocks]
+
+    def slowing(self, k: int) -> float:
+        """Return over how many metres one slows down before stage k."""
+        stays = self.then == "stay" and k == len(self.stages) - 1
+        return self.slow_radius if stays or self.stages[k].wait != 0 else 0.0
+
+    def check(self, scene: Any) -> None:
+        """Refuse space, and a torus."""
+        if scene.dimension != 2 or scene.space.periodic:
+            raise ValueError(f"kind = {self.kind}: only a plane or a box of dimension 2 is allowed")
+        super().check(scene)

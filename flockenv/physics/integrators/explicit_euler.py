@@ -1,0 +1,24 @@
+"""Explicit (forward) Euler, shown for what it is."""
+
+from __future__ import annotations
+
+from typing import ClassVar, Literal
+
+from flockenv.jit.decorators import kernel
+from flockenv.physics.integrators.single_stage import OneStage
+
+__all__ = ["ExplicitEuler"]
+
+
+@kernel
+def move(x: float, v: float, a: float, dt: float) -> tuple[float, float]:
+    """Return x and v after x += h v; v += h a: both from the present."""
+    return x + dt * v, v + dt * a
+
+
+class ExplicitEuler(OneStage):
+    """Explicit Euler, order 1, one evaluation; unstable for every undamped oscillation at every step size."""
+
+    kind: Literal["explicit_euler"] = "explicit_euler"
+    order: ClassVar[int] = 1
+    order_with_drag: ClassVar[int] = 1

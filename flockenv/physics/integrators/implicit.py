@@ -1,0 +1,79 @@
+"""What implicit methods have in common: one stage, solved by Newton's method in Python, and how far it leads."""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar
+
+import numpy as np
+
+from flockenv.model.state import Floats
+from flockenv.physics.integrators.integrator import Integrator
+from flockenv.physics.integrators.newton import Coupling, Evaluate, NotSolvedError, Stage, solve_stage
+
+__all__ = ["Implicit"]
+
+MOST_HALVED = 3
+"""Times that a step may be halved before its world is given up."""
+
+
+class Implicit(Integrator):
+    """A method with one implicit stage, at a share of the step."""
+
+    share: ClassVar[float]
+    """Where in the step the stage lies: 1 = at its end (Euler), 1/2 = in its middle."""
+    stages: ClassVar[int] = 2
+    evaluations: ClassVar[int] = 0  # as many as Newton's method takes; they are counted where it runs
+    solves: ClassVar[bool] = True
+
+    def solve(
+        self, evaluate: Evaluate, x: Floats, v: Floats, time: float, dt: float, dimension: int,
+        coupling: Coupling | None,
+    ) -> Stage:  # fmt: skip
+        """Return positions and velocities one step later, (D N,); newton.NotSolvedError if they are not found.
+
+        A step whose equations Newton's method does not solve is made in two halves, and each of those again if need be:
+        where forces jump there may be no solution for one length of step and one for another.
+        """
+        total, left = Stage(x, v, 0, 0, 0), [(time, dt, 0)]
+        while left:
+            begins, length, halved = left.pop()
+            try:
+                found = self._stage(evaluate, total.x, total.v, begins, length, dimension, coupling)
+            except NotSolvedError:
+                if halved == MOST_HALVED:
+                    raise
+                left += [(begins + length / 2, length / 2, halved + 1), (begins, length / 2, halved + 1)]
+                total = total._replace(rejected=total.rejected + 1)
+                continue
+            total = Stage(
+                found.x, found.v, total.newton + found.newton, total.linear + found.linear, total.substeps + 1,
+                total.rejected,
+            )  # fmt: skip
+        return total
+
+    def _stage(
+        self, evaluate: Evaluate, x: Floats, v: Floats, time: float, dt: float, dimension: int,
+        coupling: Coupling | None,
+    ) -> Stage:  # fmt: skip
+        """Return positions and velocities one step of this length later, by one stage."""
+        h = self.share * dt
+        found = solve_stage(evaluate, x, v, time + h, h, dimension, coupling)
+        if self.share == 1.0:
+            return found
+        far = 1.0 / self.share
+        return found._replace(x=x + far * (found.x - x), v=v + far * (found.v - v))
+
+    def _step(
+        self, law: Any, context: Any, x: Floats, v: Floats, flow: Any, time: float, dt: float, stages: Floats
+    ) -> None:
+        """Advance one world under laws that are Python functions: nothing is known of who depends on whom."""
+
+        def evaluate(pos: Floats, vel: Floats, when: float) -> tuple[Floats, Floats | None]:
+            acc, carrying = np.empty_like(pos), np.empty_like(pos)
+            for row in range(len(pos)):
+                law(context, pos[row], vel[row], when, acc[row])
+                carrying[row] = flow if len(flow) else 0.0
+            return acc, carrying if len(flow) else None
+
+        found = self.solve(evaluate, x.copy(), v.copy(), time, dt, 1, None)
+        x[...], v[...] = found.x, found.v

@@ -1,0 +1,25 @@
+"""Semi-implicit (symplectic) Euler: the velocity first, then the position with the new velocity."""
+
+from __future__ import annotations
+
+from typing import ClassVar, Literal
+
+from flockenv.jit.decorators import kernel
+from flockenv.physics.integrators.single_stage import OneStage
+
+__all__ = ["SemiImplicitEuler"]
+
+
+@kernel
+def move(x: float, v: float, a: float, dt: float) -> tuple[float, float]:
+    """Return x and v after v += h a; x += h v, with the new v."""
+    v = v + dt * a
+    return x + dt * v, v
+
+
+class SemiImplicitEuler(OneStage):
+    """Semi-implicit Euler, order 1, one evaluation; bounded energy while h omega < 2 (Reynolds' own step, 1999)."""
+
+    kind: Literal["semi_implicit_euler"] = "semi_implicit_euler"
+    order: ClassVar[int] = 1
+    order_with_drag: ClassVar[int] = 1

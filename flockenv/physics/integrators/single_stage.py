@@ -1,0 +1,32 @@
+"""What methods of one stage have in common: they ask once, at the present, and move every coordinate by itself."""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar
+
+from flockenv.jit.decorators import python_of
+from flockenv.model.state import Floats
+from flockenv.physics.integrators.integrator import Integrator
+
+__all__ = ["OneStage"]
+
+
+class OneStage(Integrator):
+    """A method that is one formula, `move(x, v, a, dt)`, for where a coordinate and its velocity are a step later."""
+
+    stages: ClassVar[int] = 0
+    evaluations: ClassVar[int] = 1
+
+    @classmethod
+    def move(cls) -> Any:
+        """Return the compiled `move` of the method's module."""
+        return cls.of_module("move")
+
+    def _step(
+        self, law: Any, context: Any, x: Floats, v: Floats, flow: Any, time: float, dt: float, stages: Floats
+    ) -> None:
+        """Advance one world by `move`, in Python."""
+        law(context, x, v, time, stages[0])
+        x[...], v[...] = python_of(self.move())(x, v, stages[0], dt)
+        if len(flow):
+            x += dt * flow

@@ -1,0 +1,18 @@
+"""Populations: births and deaths of agents in a fixed table of slots, some of which hold a living agent.
+
+A group has as many slots as its count says. An emitter brings the dead ones of a group to life, and a sink lets the
+living die; a slot that is used again holds another agent, with an identity and a time of birth of its own.
+"""
+
+from __future__ import annotations
+
+from flockenv.physics.population.emitters import Burst, Emitter
+from flockenv.physics.population.lifecycle import beget, settler
+from flockenv.physics.population.members import POPULATION, Member
+from flockenv.physics.population.regions import PLACES, BoxPlace, Clearing, Disc, Place, Point, Segment, Surface
+from flockenv.physics.population.sinks import Ageing, Crowding, Decay, Drain, Leaving, Threshold
+
+__all__ = [
+    "PLACES", "POPULATION", "Ageing", "BoxPlace", "Burst", "Clearing", "Crowding", "Decay", "Disc", "Drain", "Emitter",
+    "Leaving", "Member", "Place", "Point", "Segment", "Surface", "Threshold", "beget", "settler",
+]  # fmt: skip

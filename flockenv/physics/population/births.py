@@ -1,0 +1,277 @@
+"""Births of all worlds in one call: which are due, in which slot, where, how fast and for how long.
+
+A row of `streams` is an emitter's rate, or one of its bursts: the first slot, and the one after the last; from when and
+until when, s; rate, 1/s; how many at once; speed from, to, m/s; spread, rad; 1 if along the normal; direction (3);
+lifetime from, to, s; 1 if born in one place; the kind of its place, and the numbers of that.
+Number k of stream e is a new agent, of identity N + k E + e in a scene of N slots and E streams.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+from flockenv.jit.decorators import Vec, kernel, law
+from flockenv.maths.counter_rng import uniform
+from flockenv.maths.heading import face_one
+from flockenv.maths.vectors import add, cross, dot, scale, select, sub, unit
+from flockenv.model.state import WORK
+from flockenv.physics.population.occupancy import count_near, sort_living
+
+__all__ = ["births", "due"]
+
+BIRTHS, DEATHS, REFUSED = (WORK.index(name) for name in ("births", "deaths", "births_refused"))
+
+CHANNEL = 3_000_000
+"""First of the channels of a newborn's draws: of speed, lifetime, place and direction, 16 for each try."""
+
+TOGETHER = CHANNEL + 100_000
+"""First of the channels of what all of a burst share."""
+
+TRIES = 64
+"""How often a place of a surface is drawn anew that lies within another part of it."""
+
+PLACE = 17
+"""Where the numbers of a place begin in a row."""
+
+
+@kernel
+def due(row: Any, time: float, dt: float) -> int:
+    """Return how many of a stream are born until `time`, s; one that is due at that instant, but for rounding, is."""
+    if row[4] == 0.0:
+        return int(row[5]) if time + 1e-9 * dt >= row[2] else 0
+    expected = row[4] * (min(time, row[3]) - row[2])
+    return math.floor(expected * (1.0 + 4e-16) + 1e-9) if expected > 0.0 else 0
+
+
+@law
+def _draw(key: Any, who: int, channel: int) -> Vec:
+    """Draw three numbers, each uniform in [0, 1)."""
+    return uniform(key, 0, who, channel), uniform(key, 0, who, channel + 1), uniform(key, 0, who, channel + 2)
+
+
+@law
+def _three(row: Any, at: int) -> Vec:
+    """Return three numbers of a row as a vector."""
+    return row[at], row[at + 1], row[at + 2]
+
+
+@law
+def _across(axis: Vec) -> Vec:
+    """Return a unit vector across a unit vector; within the plane z = 0 if the axis is."""
+    return unit(select(abs(axis[2]) < 0.9, (-axis[1], axis[0], 0.0), (0.0, -axis[2], axis[1])))
+
+
+@law
+def _around(axis: Vec, turn: float) -> Vec:
+    """Return the unit vector across an axis that is turned so far about it, rad."""
+    u = _across(axis)
+    return add(scale(u, math.cos(turn)), scale(cross(axis, u), math.sin(turn)))
+
+
+@law
+def _cone(flat: bool, axis: Vec, spread: float, s: float, t: float) -> Vec:
+    """Return a unit vector within `spread` [rad] of an axis, as often any as any other; s, t uniform in [0, 1)."""
+    angle = spread * (2.0 * s - 1.0)
+    along = math.cos(angle) if flat else 1.0 - s * (1.0 - math.cos(spread))
+    aside = math.sin(angle) if flat else math.sqrt(max(0.0, 1.0 - along * along))
+    return add(scale(axis, along), scale(_around(axis, 0.0 if flat else 2.0 * math.pi * t), aside))
+
+
+@law
+def _on_flat(piece: Any, flat: bool, s: float, t: float) -> tuple[Vec, Vec]:
+    """Return a place of an edge or a face, and the outward normal."""
+    u, v = _three(piece, 5), _three(piece, 8)
+    right = (u[1], -u[0], 0.0)
+    normal = unit(select(flat, right, cross(u, v)))
+    return add(_three(piece, 2), add(scale(u, s), scale(v, t))), scale(normal, piece[11])
+
+
+@law
+def _on_round(piece: Any, flat: bool, s: float, t: float) -> tuple[Vec, Vec]:
+    """Return a place of the side of a tube, or of its ends, and the outward normal there."""
+    a, b = _three(piece, 2), _three(piece, 5)
+    line = sub(b, a)
+    axis = select(dot(line, line) > 0.0, unit(line), (1.0, 0.0, 0.0))
+    turn = (0.0 if t < 0.5 else math.pi) if flat else 2.0 * math.pi * t
+    side = piece[1] == 1.0
+    normal = select(side, _around(axis, turn), _cone(flat, axis, math.pi, s, t))  # each end is half of a ball
+    end = select(dot(axis, normal) > 0.0, b, a)
+    return add(select(side, add(a, scale(line, s)), end), scale(normal, piece[8])), normal
+
+
+@law
+def _within(piece: Any, spot: Vec) -> bool:
+    """True if a place lies within a part of a line with a thickness, and not at its surface."""
+    line, way = sub(_three(piece, 5), _three(piece, 2)), sub(spot, _three(piece, 2))
+    square = dot(line, line)
+    share = min(max(dot(line, way) / square, 0.0), 1.0) if square > 0.0 else 0.0
+    gap = sub(way, scale(line, share))
+    return piece[1] == 1.0 and dot(gap, gap) < piece[8] * piece[8] * (1.0 - 1e-9)  # type: ignore[no-any-return]
+
+
+@kernel
+def _on_surface(flat: bool, row: Any, pieces: Any, key: Any, who: int, channel: int) -> tuple[Vec, Vec]:
+    """Return a place of a surface, and the outward normal there."""
+    first, end = int(row[PLACE]), int(row[PLACE + 1])
+    spot: Vec = (0.0, 0.0, 0.0)
+    normal: Vec = spot
+    for attempt in range(TRIES):
+        draws = _draw(key, who, channel + 16 * attempt)
+        low, high = first, end - 1
+        while low < high:
+            middle = (low + high) // 2
+            beyond = pieces[middle, 0] > pieces[end - 1, 0] * draws[0]
+            low, high = (low, middle) if beyond else (middle + 1, high)
+        piece = pieces[low]
+        if piece[1] == 0.0:
+            spot, normal = _on_flat(piece, flat, draws[1], draws[2])
+        else:
+            spot, normal = _on_round(piece, flat, draws[1], draws[2])
+        hidden = False
+        for other in range(first, end):
+            hidden = hidden or _within(pieces[other], spot)
+        if not hidden:
+            break
+    return spot, normal
+
+
+@law
+def _in_disc(row: Any, flat: bool, draws: Vec) -> Vec:
+    """Return a place of a disc, of a ball, or of a flat disc in space."""
+    axis = _three(row, PLACE + 4)
+    across = dot(axis, axis) > 0.0
+    out = _cone(flat, (1.0, 0.0, 0.0), math.pi, draws[1], draws[2])
+    out = select(across, _around(axis, 2.0 * math.pi * draws[1]), out)
+    share = math.sqrt(draws[0]) if flat or across else draws[0] ** (1.0 / 3.0)
+    return add(_three(row, PLACE), scale(out, row[PLACE + 3] * share))
+
+
+@law
+def _in_box(row: Any, draws: Vec) -> Vec:
+    """Return a place between two corners; with the same share of all three, of a line."""
+    low, high = _three(row, PLACE), _three(row, PLACE + 3)
+    return (
+        low[0] + draws[0] * (high[0] - low[0]),
+        low[1] + draws[1] * (high[1] - low[1]),
+        low[2] + draws[2] * (high[2] - low[2]),
+    )
+
+
+@kernel
+def _in_clearing(
+    x: Any, b: int, row: Any, key: Any, who: int, channel: int, period: Any, grid: Any, start: Any, order: Any,
+    born: Any, identity: Any,
+) -> Vec:  # fmt: skip
+    """Return, of some places drawn in a box, the one with the fewest living agents around it; of equals the first."""
+    best: Vec = (0.0, 0.0, 0.0)
+    fewest = 2**62
+    for attempt in range(int(row[PLACE + 7])):
+        spot = _in_box(row, _draw(key, who, channel + 16 * attempt))
+        near = count_near(x, b, spot, row[PLACE + 6], fewest, period, grid, start, order, born, identity, -1)
+        if near < fewest:
+            best, fewest = spot, near
+    return best
+
+
+@kernel
+def _into_space(walls: bool, period: Any, size: float, radius: float, p: float) -> float:
+    """Return a coordinate within a periodic axis, or between walls."""
+    if period > 0.0:
+        inside = p - period * math.floor(p / period)
+        return 0.0 if inside >= period else inside
+    return min(max(p, radius), size - radius) if walls else p
+
+
+@kernel
+def _spot(
+    d: int, row: Any, pieces: Any, x: Any, b: int, key: Any, who: int, channel: int, period: Any, grid: Any, start: Any,
+    order: Any, born: Any, identity: Any,
+) -> tuple[Vec, Vec]:  # fmt: skip
+    """Return the place of a birth, and the direction: the row's, or the outward normal of a surface."""
+    draws, aim = _draw(key, who, channel), _three(row, 10)
+    if row[16] <= 1.0:
+        return _in_box(row, (draws[0], draws[0], draws[0])), aim
+    if row[16] == 2.0:
+        return _in_disc(row, d == 2, draws), aim
+    if row[16] == 4.0:
+        spot, normal = _on_surface(d == 2, row, pieces, key, who, channel)
+        return spot, select(row[9] == 1.0, normal, aim)
+    spot = _in_box(row, draws)
+    if order is not None:  # noqa: SIM102  # alone, numba leaves the rest away
+        if row[16] == 5.0:
+            spot = _in_clearing(x, b, row, key, who, channel, period, grid, start, order, born, identity)
+    return spot, aim
+
+
+@kernel
+def births(
+    streams: Any, pieces: Any, clearing: float, x: Any, v: Any, frame: Any, alive: Any, identity: Any, born: Any,
+    dies: Any, tick: Any, key: Any, work: Any, radius: Any, dt: float, walls: bool, size: Any, period: Any, first: int,
+    end: int, grid: Any, cell: Any, start: Any, order: Any,
+) -> None:  # fmt: skip
+    """Bring to life the agents that are due in the step that ends now, in worlds [first, end); at the start, at once.
+
+    clearing: m, the largest radius within which neighbours are counted; if no place counts any, grid, cell, start and
+    order are None, and nothing of it is compiled. walls: True if the space is a box of `size` (3,) m. period (3,) m: 0
+    where an axis does not repeat.
+    """
+    n, kinds = x.shape[2], streams.shape[0]
+    for b in range(first, end):
+        sorted_, slot, until = False, 0, -1
+        for e in range(kinds):
+            row = streams[e]
+            before = due(row, (tick[b] - 1) * dt, dt) if tick[b] > 0 else 0
+            after = due(row, tick[b] * dt, dt)
+            if order is not None:  # noqa: SIM102  # alone, numba leaves the rest away
+                if after > before and not sorted_:
+                    sort_living(x, alive, b, 0, n, clearing, period, grid, cell, start, order)
+                    sorted_ = True
+            if until != int(row[1]):  # streams of a group come one after another, and go on where the last one ended
+                slot, until = int(row[0]), int(row[1])
+            slot = _bear(
+                before, after, e, kinds, slot, until, row, pieces, x, v, frame, alive, identity, born, dies,
+                tick[b] * dt, key[b], work, radius, dt, walls, size, period, b, grid, start, order,
+            )  # fmt: skip
+
+
+@kernel
+def _bear(
+    before: int, after: int, stream: int, kinds: int, slot: int, until: int, row: Any, pieces: Any, x: Any, v: Any,
+    frame: Any, alive: Any, identity: Any, born: Any, dies: Any, now: float, key: Any, work: Any, radius: Any,
+    dt: float, walls: bool, size: Any, period: Any, b: int, grid: Any, start: Any, order: Any,
+) -> int:  # fmt: skip
+    """Bring births `before` to `after` of a stream to life, in free slots from `slot` on; return where that ends."""
+    d, n = x.shape[0], x.shape[2]
+    for k in range(before, after):
+        who = n + k * kinds + stream
+        when = row[2] + (k + 1) / row[4] if row[4] > 0.0 else row[2]
+        when = min(max(when, now - dt), now)
+        life = row[13]
+        if life < math.inf:
+            life += (row[14] - row[13]) * uniform(key, 0, who, CHANNEL + 3)
+        if when + life <= now:  # born and dead within the step
+            work[b, BIRTHS] += 1
+            work[b, DEATHS] += 1
+            continue
+        while slot < until and alive[b, slot]:
+            slot += 1
+        if slot >= until:
+            work[b, REFUSED] += after - k
+            break
+        drawn, channel = (n + stream, TOGETHER) if row[15] == 1.0 else (who, CHANNEL + 16)
+        spot, aim = _spot(
+            d, row, pieces, x, b, key, drawn, channel, period, grid, start, order, born, identity
+        )  # fmt: skip
+        draws = _draw(key, who, CHANNEL)
+        vel = scale(_cone(d == 2, aim, row[8], draws[1], draws[2]), row[6] + (row[7] - row[6]) * draws[0])
+        spot = add(spot, scale(vel, now - when))
+        for j in range(d):
+            v[j, b, slot] = vel[j]
+            x[j, b, slot] = _into_space(walls, period[j], size[j], float(radius[slot]), spot[j])
+        alive[b, slot] = True
+        identity[b, slot], born[b, slot], dies[b, slot] = who, when, when + life
+        if frame.shape[0] > 0:
+            face_one(v, frame, b, slot, True)
+        work[b, BIRTHS] += 1
+    return slot

@@ -1,0 +1,128 @@
+"""Emitters: the places, times and velocities at which agents come to life.
+
+The time of a birth is independent of dt: number k of an emitter with a rate is born at start + (k + 1) / rate. Its
+place, velocity and lifetime are functions of the world's key and its identity. So another dt, another order or another
+number of threads gives the same births.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Annotated, Any, Literal
+
+from pydantic import Field, model_validator
+
+from flockenv.core.record import Record
+from flockenv.geometry.space import Box, Torus
+from flockenv.physics.population.members import Member, demand_group, dimensions
+from flockenv.physics.population.regions import AnyPlace, Clearing, Surface, Vector, in_space
+
+__all__ = ["MOST_RATE", "Burst", "Emitter"]
+
+MOST_RATE = 1e9
+"""1/s, births of one emitter: their number stays exact for weeks."""
+
+Range = tuple[Annotated[float, Field(ge=0)], Annotated[float, Field(ge=0)]]
+
+
+class Burst(Record):
+    """A number of births at one time."""
+
+    time: float = Field(ge=0, description="s since the start")
+    count: int = Field(ge=1, le=2**24, description="how many")
+
+
+class Emitter(Member):
+    """Brings the dead of a group to life: at a rate, in bursts, or both; of T seconds at a rate, floor(rate T) agents.
+
+    An agent born within a step moves with its velocity for the rest of it; forces act from the next step on. If no
+    slot is free a birth is left out, and counted as refused. Slots begin dead, but for `alive` of the group.
+    """
+
+    kind: Literal["emitter"] = "emitter"
+    group: int = Field(default=0, ge=0, description="number of the group whose slots it fills")
+    place: AnyPlace = Field(description="where they are born")
+    rate: float = Field(default=0.0, ge=0, le=MOST_RATE, description="1/s")
+    start: float = Field(default=0.0, ge=0, description="s, from when on there is a rate")
+    end: float | None = Field(default=None, gt=0, description="s, until when; none = for ever")
+    bursts: tuple[Burst, ...] = Field(default=(), description="numbers of births at given times")
+    together: bool = Field(default=False, description="does each burst begin in one place, drawn for all of it?")
+    speed: Range = Field(default=(0.0, 0.0), description="m/s, least and most")
+    direction: Vector | None = Field(
+        default=None, description="of the velocity; none = any, or of a surface the outward normal"
+    )
+    spread: float | None = Field(
+        default=None, ge=0, le=180, description="degrees to any side of the direction; none = 0 if there is one"
+    )
+    lifetime: Range | None = Field(default=None, description="s, least and most; none = no limit")
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Emitter:
+        """Refuse ranges that run backwards, and an emitter that never does anything."""
+        for name in ("speed", "lifetime"):
+            value = getattr(self, name)
+            if value is not None and value[0] > value[1]:
+                raise ValueError(f"{name} = {value}: the least comes first")
+        if self.lifetime is not None and not self.lifetime[0] > 0:
+            raise ValueError(f"lifetime = {self.lifetime}: must be more than 0 s")
+        if self.rate == 0 and not self.bursts:
+            raise ValueError("rate = 0: give a rate or bursts, or nobody is ever born")
+        if self.end is not None and self.end <= self.start:
+            raise ValueError(f"end = {self.end:g}: must be after start = {self.start:g} s")
+        if self.direction is not None and not math.hypot(*self.direction) > 0:
+            raise ValueError(f"direction = {self.direction}: a direction, not all 0")
+        if self.spread is not None and self.direction is None and not isinstance(self.place, Surface):
+            raise ValueError(f"spread = {self.spread:g}: goes with a direction, or with a surface")
+        return self
+
+    def feeds(self, group: int) -> bool:
+        """True if it brings agents of this group to life."""
+        return group == self.group
+
+    def check(self, scene: Any) -> None:
+        """Refuse a group that does not exist, other dimensions, and speeds beyond the group's limit."""
+        demand_group(scene, self.group)
+        group = scene.groups[self.group]
+        if group.network is not None:
+            raise ValueError(f"group = {self.group}: is a network, whose particles are not born one by one")
+        dimensions(scene, direction=self.direction)
+        try:
+            self.place.check(scene)
+        except ValueError as error:
+            raise ValueError(f"place.{error}") from None
+        limit = group.fastest
+        if limit is not None and self.speed[1] > limit:
+            raise ValueError(f"speed = {self.speed}: groups[{self.group}].max_speed = {limit:g} m/s is the most")
+        self._check_space(scene, group)
+
+    def _check_space(self, scene: Any, group: Any) -> None:
+        """Refuse births beyond the walls of a box, and neighbours around a torus."""
+        if isinstance(scene.space, Box):
+            ends = self.place.extremes
+            if len(ends) and ((ends < 0).any() or (ends > scene.space.size).any()):
+                raise ValueError(
+                    f"place: reaches from {ends.min(axis=0).tolist()} to {ends.max(axis=0).tolist()} m, beyond the "
+                    f"walls of a box of {list(scene.space.size)} m"
+                )
+        if isinstance(scene.space, Torus) and isinstance(self.place, Clearing):
+            most = min(scene.space.size) / 2
+            if self.place.radius > most:
+                raise ValueError(f"place.radius = {self.place.radius:g}: at most {most:g} m is allowed on this torus")
+
+    def rows(self, first: int, end: int, dimension: int) -> list[list[float]]:
+        """Return a row of numbers for the rate and for each burst, as births.py reads them; slots are [first, end)."""
+        spread = 0.0 if self.direction is not None or isinstance(self.place, Surface) else 180.0
+        spread = math.radians(spread if self.spread is None else self.spread)
+        aim = in_space(self.direction or (1.0,) + (0.0,) * (dimension - 1))
+        length = math.hypot(*aim)
+        lifetime = (math.inf, math.inf) if self.lifetime is None else self.lifetime
+        along_normal = float(self.direction is None and isinstance(self.place, Surface))
+        shared = [*self.speed, spread, along_normal, *(x / length for x in aim), *lifetime]
+        until = math.inf if self.end is None else self.end
+        found = []
+        if self.rate > 0:
+            found.append([first, end, self.start, until, self.rate, 0.0, *shared, 0.0, self.place.code])
+        for burst in self.bursts:
+            together = float(self.together)
+            found.append([first, end, burst.time, burst.time, 0.0, burst.count, *shared, together, self.place.code])
+        return [[float(x) for x in row] + self.place.row() for row in found]

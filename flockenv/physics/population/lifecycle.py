@@ -1,0 +1,200 @@
+"""A scene's population as numbers, and what settles it at the end of every step: first deaths, then births."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flockenv.geometry.shapes.table import packed
+from flockenv.geometry.space import Box
+from flockenv.jit.section import entry
+from flockenv.model.state import Floats, State
+from flockenv.physics.population.births import PLACE, births
+from flockenv.physics.population.deaths import crowding, drain, passing, reaching
+from flockenv.physics.population.emitters import Emitter
+from flockenv.physics.population.regions import Clearing, Surface
+from flockenv.physics.population.sinks import Crowding, Drain, Sink, Threshold
+
+__all__ = ["NUMBERS", "beget", "settler"]
+
+NUMBERS = 4
+"""Numbers of scratch per agent: cells, the agents in them, the agents that are to die."""
+
+WIDTH = PLACE + 8
+"""Numbers of a row of streams."""
+
+Part = Callable[[Floats, State, int, int], None]
+"""part(x0, state, first, end): one sink, or all births, over worlds [first, end)."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Scratch:
+    """Scratch of one thread, which nothing reads afterwards."""
+
+    grid: NDArray[np.float64]  # (4, 3) corner, edges, cells, cells per metre
+    cell: NDArray[np.int32]  # (N,)
+    start: NDArray[np.int32]  # (N + 1,)
+    order: NDArray[np.int32]  # (N,)
+    doomed: NDArray[np.bool_]  # (N,)
+
+    @classmethod
+    def of(cls, agents: int, asks: bool) -> _Scratch:
+        n = agents if asks else 1
+        cell, start, order = (np.zeros(size, np.int32) for size in (n, n + 1, n))
+        return cls(np.zeros((4, 3)), cell, start, order, np.zeros(n, np.bool_))
+
+
+def _sized(scene: Any, there: bool) -> NDArray[np.float64]:
+    """Return the size of the space, (3,) m; zeros if it has none of this kind."""
+    size = np.zeros(3)
+    if there:
+        size[: scene.dimension] = scene.space.size
+    return size
+
+
+def _period(scene: Any) -> NDArray[np.float64]:
+    return _sized(scene, scene.space.periodic)
+
+
+def _streams(scene: Any) -> tuple[Floats, Floats, float]:
+    """Return a row per rate and burst, group after group; surfaces' pieces; the largest radius of clearings, m."""
+    emitters = sorted((m for m in scene.population if isinstance(m, Emitter)), key=lambda m: m.group)
+    found: list[list[float]] = []
+    pieces: list[Floats] = [np.zeros((0, 14))]
+    clearing = 0.0
+    for emitter in emitters:
+        first, end = scene.starts[emitter.group], scene.starts[emitter.group + 1]
+        rows = emitter.rows(first, end, scene.dimension)
+        if isinstance(emitter.place, Surface):
+            at = sum(map(len, pieces))
+            pieces.append(emitter.place.pieces())
+            rows = [[*row, at, at + len(pieces[-1])] for row in rows]
+        if isinstance(emitter.place, Clearing):
+            clearing = max(clearing, emitter.place.radius)
+        found += rows
+    table = np.zeros((len(found), WIDTH))
+    for k, row in enumerate(found):
+        table[k, : len(row)] = row
+    return table, np.concatenate(pieces), clearing
+
+
+def _births(scene: Any, scratch: _Scratch) -> Part:
+    streams, pieces, clearing = _streams(scene)
+    walls, size, period = isinstance(scene.space, Box), _sized(scene, isinstance(scene.space, Box)), _period(scene)
+    kernel, radius, dt = entry(births), scene.body.radius, float(scene.dt)
+    near = (scratch.grid, scratch.cell, scratch.start, scratch.order) if clearing else (None,) * 4
+
+    def part(x0: Floats, s: State, first: int, end: int) -> None:
+        kernel(
+            streams, pieces, clearing, s.x, s.v, s.frame, s.alive, s.identity, s.born, s.dies, s.tick, s.key, s.work,
+            radius, dt, walls, size, period, first, end, *near,
+        )  # fmt: skip
+
+    return part
+
+
+def _slots(scene: Any, sink: Sink) -> tuple[int, int]:
+    """Return the first slot that a sink acts on, and the one after the last."""
+    return (0, scene.agents) if sink.group is None else (scene.starts[sink.group], scene.starts[sink.group + 1])
+
+
+def _passing(scene: Any, sinks: Sequence[Sink], channel: int) -> Part:
+    table = np.zeros((len(sinks), 9))
+    for k, sink in enumerate(sinks):
+        row = [sink.code, *_slots(scene, sink), *sink.row()]
+        table[k, : len(row)] = row
+    kernel, dt = entry(passing), float(scene.dt)
+
+    def part(x0: Floats, s: State, first: int, end: int) -> None:
+        kernel(
+            table, s.x, s.v, s.alive, s.identity, s.born, s.dies, s.tick, s.key, s.work, dt, first, end, channel
+        )  # fmt: skip
+
+    return part
+
+
+def _drain(scene: Any, sink: Drain) -> Part:
+    table, _ = packed([sink.shape], scene.dimension)
+    anchor, slots = tuple(float(a) for a in sink.shape.anchor), _slots(scene, sink)
+    kernel, period, dt = entry(drain), tuple(_period(scene)[: scene.dimension].tolist()), float(scene.dt)
+
+    def part(x0: Floats, s: State, first: int, end: int) -> None:
+        kernel(
+            table, sink.margin, slots, anchor, period, x0, s.x, s.v, s.alive, s.tick, s.work, dt, first, end
+        )  # fmt: skip
+
+    return part
+
+
+def _crowding(scene: Any, sink: Crowding, channel: int, scratch: _Scratch) -> Part:
+    row = np.array([sink.code, *_slots(scene, sink), *sink.row()], np.float64)
+    kernel, period, dt = entry(crowding), _period(scene), float(scene.dt)
+
+    def part(x0: Floats, s: State, first: int, end: int) -> None:
+        kernel(
+            row, channel, s.x, s.v, s.alive, s.identity, s.born, s.tick, s.key, s.work, dt, period, first, end,
+            scratch.grid, scratch.cell, scratch.start, scratch.order, scratch.doomed,
+        )  # fmt: skip
+
+    return part
+
+
+def _reaching(scene: Any, sink: Threshold) -> Part:
+    kernel, slots, which = entry(reaching), _slots(scene, sink), scene.parts.inner.index(sink.of)
+
+    def part(x0: Floats, s: State, first: int, end: int) -> None:
+        kernel(s.inner[which], sink.level, slots, s.v, s.alive, s.work, first, end)
+
+    return part
+
+
+def _asks(scene: Any) -> bool:
+    """True if a member of the population counts agents near a place."""
+    places = [member.place for member in scene.population if isinstance(member, Emitter)]
+    return any(isinstance(m, (Crowding, Clearing)) for m in (*scene.population, *places))
+
+
+def _parts(scene: Any) -> list[Part]:
+    """Return what is done at the end of a step: lifetimes, then sinks in the scene's order, then births."""
+    scratch = _Scratch.of(scene.agents, _asks(scene))
+    emits = any(isinstance(member, Emitter) for member in scene.population)
+    mortal = any(isinstance(m, Emitter) and m.lifetime is not None for m in scene.population)
+    found: list[Part] = []
+    simple: list[Sink] = []
+    sinks = [member for member in scene.population if isinstance(member, Sink)]
+    for k, sink in enumerate([*sinks, None]):
+        if sink is not None and not isinstance(sink, (Drain, Crowding, Threshold)):
+            simple.append(sink)
+            continue
+        if simple or (mortal and k == len(sinks)):
+            found.append(_passing(scene, simple, k - len(simple)))
+            mortal, simple = False, []
+        if isinstance(sink, Drain):
+            found.append(_drain(scene, sink))
+        elif isinstance(sink, Threshold):
+            found.append(_reaching(scene, sink))
+        elif isinstance(sink, Crowding):
+            found.append(_crowding(scene, sink, k, scratch))
+    return [*found, *([_births(scene, scratch)] if emits else [])]
+
+
+def beget(scene: Any, state: State) -> None:
+    """Bring to life the agents that are born at time 0, in place."""
+    if any(isinstance(member, Emitter) for member in scene.population):
+        _births(scene, _Scratch.of(scene.agents, _asks(scene)))(state.x, state, 0, state.shape[0])
+
+
+def settler(scene: Any) -> Callable[[Floats, Floats, State, int, int], tuple[int, int]]:
+    """Return what settles the population of a scene at the end of a step, with scratch of its own."""
+    parts = _parts(scene)
+
+    def settle(x0: Floats, v0: Floats, state: State, first: int, end: int) -> tuple[int, int]:
+        for part in parts:
+            part(x0, state, first, end)
+        return -1, -1
+
+    return settle

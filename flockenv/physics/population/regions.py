@@ -1,0 +1,226 @@
+"""Places of births: a point, a line, a disc or ball, a box, the surface of a shape, a clearing in a crowd."""
+
+from __future__ import annotations
+
+import functools
+import math
+import operator
+from abc import abstractmethod
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, WrapValidator, model_validator
+
+from flockenv.core.record import Record, keep
+from flockenv.geometry.shapes import AnyShape
+from flockenv.physics.population.members import dimensions
+from flockenv.physics.population.surface import pieces
+
+__all__ = ["PLACES", "AnyPlace", "BoxPlace", "Clearing", "Disc", "Place", "Point", "Segment", "Surface"]
+
+Floats = NDArray[np.float64]
+Vector = Annotated[tuple[float, ...], Field(min_length=2, max_length=3)]
+
+
+def in_space(vector: Sequence[float]) -> list[float]:
+    """Return a vector with three numbers: 0 is the third of the plane."""
+    return [*vector, *[0.0] * (3 - len(vector))]
+
+
+class Place(Record):
+    """A place of births, uniform over all its points."""
+
+    kind: str
+    code: ClassVar[int]
+    """Number of this kind in kernels."""
+
+    @abstractmethod
+    def row(self) -> list[float]:
+        """Return its numbers, as births.py reads them."""
+
+    @property
+    @abstractmethod
+    def extremes(self) -> Floats:
+        """Return points that bound it, (n, D) m."""
+
+    def pieces(self) -> Floats:
+        """Return the pieces of a surface, (n, 14); see surface.py."""
+        return np.zeros((0, 14))
+
+    def check(self, scene: Any) -> None:
+        """Refuse a scene that this does not suit: a ValueError that begins with the field's name."""
+
+
+class Point(Place):
+    """One place."""
+
+    kind: Literal["point"] = "point"
+    code: ClassVar[int] = 0
+    at: Vector = Field(description="m")
+
+    def row(self) -> list[float]:
+        """Return the point, twice: as both ends of a segment."""
+        return in_space(self.at) * 2
+
+    @property
+    def extremes(self) -> Floats:
+        """Itself."""
+        return np.array([self.at])
+
+    def check(self, scene: Any) -> None:
+        """Refuse other dimensions."""
+        dimensions(scene, at=self.at)
+
+
+class Segment(Place):
+    """A straight line from start to end."""
+
+    kind: Literal["segment"] = "segment"
+    code: ClassVar[int] = 1
+    start: Vector = Field(description="m")
+    end: Vector = Field(description="m")
+
+    def row(self) -> list[float]:
+        """Its ends."""
+        return in_space(self.start) + in_space(self.end)
+
+    @property
+    def extremes(self) -> Floats:
+        """Its ends."""
+        return np.array([self.start, self.end])
+
+    def check(self, scene: Any) -> None:
+        """Refuse other dimensions."""
+        dimensions(scene, start=self.start, end=self.end)
+
+
+class Disc(Place):
+    """A disc; in 3-D a ball, or with an axis the flat disc across it."""
+
+    kind: Literal["disc"] = "disc"
+    code: ClassVar[int] = 2
+    centre: Vector = Field(description="m")
+    radius: float = Field(gt=0, description="m")
+    axis: Vector | None = Field(default=None, description="in 3-D: what the disc lies across; none = a ball")
+
+    @model_validator(mode="after")
+    def _points_somewhere(self) -> Disc:
+        if self.axis is not None and not math.hypot(*self.axis) > 0:
+            raise ValueError(f"axis = {self.axis}: a direction, not all 0")
+        return self
+
+    def row(self) -> list[float]:
+        """Centre, radius, axis."""
+        length = math.hypot(*self.axis) if self.axis is not None else 1.0
+        return [*in_space(self.centre), self.radius, *(x / length for x in self.axis or (0.0, 0.0, 0.0))]
+
+    @property
+    def extremes(self) -> Floats:
+        """The corners of the box around it."""
+        return np.array(self.centre) + self.radius * np.array([[-1.0], [1.0]])
+
+    def check(self, scene: Any) -> None:
+        """Refuse other dimensions."""
+        dimensions(scene, centre=self.centre, axis=self.axis)
+        if self.axis is not None and scene.dimension == 2:
+            raise ValueError(f"axis = {self.axis}: only in 3-D does a disc lie across something")
+
+
+class _Corners(Place):
+    """The region between two corners."""
+
+    low: Vector = Field(description="m, lower corner")
+    high: Vector = Field(description="m, upper corner")
+
+    @model_validator(mode="after")
+    def _ordered(self) -> _Corners:
+        """Refuse corners that are none."""
+        ordered(self.low, self.high)
+        return self
+
+    def row(self) -> list[float]:
+        """Its corners."""
+        return in_space(self.low) + in_space(self.high)
+
+    @property
+    def extremes(self) -> Floats:
+        """Its corners."""
+        return np.array([self.low, self.high])
+
+    def check(self, scene: Any) -> None:
+        """Refuse other dimensions."""
+        dimensions(scene, low=self.low, high=self.high)
+
+
+class BoxPlace(_Corners):
+    """A box along the axes."""
+
+    kind: Literal["box"] = "box"
+    code: ClassVar[int] = 3
+
+
+class Surface(Place):
+    """The surface of a shape; agents without a direction start along its outward normal."""
+
+    kind: Literal["surface"] = "surface"
+    code: ClassVar[int] = 4
+    shape: AnyShape = Field(description="as obstacles are; it need not be one")
+
+    def row(self) -> list[float]:
+        """Nothing: it is made of pieces."""
+        return []
+
+    @property
+    def extremes(self) -> Floats:
+        """Those of the shape."""
+        return np.asarray(self.shape.extremes)
+
+    def pieces(self) -> Floats:
+        """Return the pieces of the surface."""
+        return pieces(self.shape)
+
+    def check(self, scene: Any) -> None:
+        """Refuse other dimensions, and shapes that move, are hollow, or have no end."""
+        if self.shape.dimension != scene.dimension:
+            raise ValueError(
+                f"shape.kind = {self.shape.kind}: lies in {self.shape.dimension} dimensions, "
+                f"but dimension = {scene.dimension}"
+            )
+        if self.shape.moves:
+            raise ValueError(f"shape.kind = {self.shape.kind}: moves, and births come of what stays where it is")
+        self.pieces()
+
+
+class Clearing(_Corners):
+    """A clearing in a box: of some places drawn at random, the one with the fewest living agents around it."""
+
+    kind: Literal["clearing"] = "clearing"
+    code: ClassVar[int] = 5
+    radius: float = Field(gt=0, description="m, within which neighbours count")
+    candidates: int = Field(default=8, ge=1, le=64, description="places that are drawn for each birth")
+
+    def row(self) -> list[float]:
+        """Its corners, the radius of its count, the number of draws."""
+        return [*super().row(), self.radius, float(self.candidates)]
+
+
+def ordered(low: Sequence[float], high: Sequence[float]) -> None:
+    """Refuse corners that are none."""
+    if len(low) != len(high) or any(a > b for a, b in zip(low, high, strict=True)):
+        raise ValueError(f"low = {low}, high = {high}: the lower corner comes first, with as many numbers")
+
+
+PLACES: dict[str, type[Place]] = {
+    str(place.model_fields["kind"].default): place for place in (Point, Segment, Disc, BoxPlace, Surface, Clearing)
+}
+"""Every place by its kind."""
+
+if TYPE_CHECKING:
+    AnyPlace = Place
+else:
+    AnyPlace = Annotated[
+        Annotated[functools.reduce(operator.or_, PLACES.values()), Field(discriminator="kind")],
+        WrapValidator(keep(Place)),
+    ]

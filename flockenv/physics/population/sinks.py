@@ -1,0 +1,159 @@
+"""Sinks: conditions under which agents die. Each selects among all living agents at once when its turn comes."""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar, Literal
+
+from pydantic import Field, model_validator
+
+from flockenv.geometry.shapes import AnyShape
+from flockenv.geometry.space import Torus
+from flockenv.physics.population.members import Member, demand_group, dimensions
+from flockenv.physics.population.regions import Vector, in_space, ordered
+
+__all__ = ["Ageing", "Crowding", "Decay", "Drain", "Leaving", "Sink", "Threshold"]
+
+
+class Sink(Member):
+    """A condition under which agents of one group, or of all, die."""
+
+    code: ClassVar[int]
+    """Number of this kind in kernels."""
+
+    group: int | None = Field(default=None, ge=0, description="number of the group whose agents die; none = of all")
+
+    def row(self) -> list[float]:
+        """Return its numbers, as deaths.py reads them."""
+        return []
+
+    def check(self, scene: Any) -> None:
+        """Refuse a group that does not exist, or one whose agents are bound to each other."""
+        demand_group(scene, self.group)
+        for k, group in enumerate(scene.groups):
+            if self.group in (None, k) and group.network is not None:
+                raise ValueError(f"group = {self.group}: groups[{k}] is a network, whose particles do not die")
+
+
+class Ageing(Sink):
+    """Agents older than a lifetime die; an emitter may also give each agent a lifetime of its own."""
+
+    kind: Literal["ageing"] = "ageing"
+    code: ClassVar[int] = 0
+    lifetime: float = Field(gt=0, description="s")
+
+    def row(self) -> list[float]:
+        """The lifetime."""
+        return [self.lifetime]
+
+
+class Leaving(Sink):
+    """Agents that leave a region die."""
+
+    kind: Literal["leaving"] = "leaving"
+    code: ClassVar[int] = 1
+    low: Vector = Field(description="m, lower corner of the region")
+    high: Vector = Field(description="m, upper corner of the region")
+
+    @model_validator(mode="after")
+    def _ordered(self) -> Leaving:
+        ordered(self.low, self.high)
+        return self
+
+    def row(self) -> list[float]:
+        """The corners."""
+        return in_space(self.low) + in_space(self.high)
+
+    def check(self, scene: Any) -> None:
+        """Refuse other dimensions."""
+        super().check(scene)
+        dimensions(scene, low=self.low, high=self.high)
+
+
+class Decay(Sink):
+    """Agents die at random, each with a probability of 1 - exp(-rate t) within any time t, independent of dt.
+
+    Half of them are left after ln 2 / rate. Draws are of (world, step, identity).
+    """
+
+    kind: Literal["decay"] = "decay"
+    code: ClassVar[int] = 2
+    rate: float = Field(gt=0, description="1/s")
+
+    def row(self) -> list[float]:
+        """The rate."""
+        return [self.rate]
+
+
+class Drain(Sink):
+    """Agents die that are in a shape, or that went through it in the step: of a region, or at a surface.
+
+    The centre counts; `margin` is how far from the surface is near enough.
+    """
+
+    kind: Literal["drain"] = "drain"
+    code: ClassVar[int] = 3
+    looks_back: ClassVar[bool] = True
+    shape: AnyShape = Field(description="as obstacles are; it need not be one")
+    margin: float = Field(default=0.0, ge=0, description="m")
+
+    def row(self) -> list[float]:
+        """The margin."""
+        return [self.margin]
+
+    def check(self, scene: Any) -> None:
+        """Refuse other dimensions."""
+        super().check(scene)
+        if self.shape.dimension != scene.dimension:
+            raise ValueError(
+                f"shape.kind = {self.shape.kind}: lies in {self.shape.dimension} dimensions, "
+                f"but dimension = {scene.dimension}"
+            )
+        if isinstance(scene.space, Torus) and self.shape.kind == "half_space":
+            raise ValueError("shape.kind = half_space: on a torus a plane has no two sides")
+
+
+class Crowding(Sink):
+    """In a dense crowd the youngest die: agents that have more than `most` elders within a radius.
+
+    Elders are agents of the same group (or of all) that were born earlier. With a rate, each of the youngest dies at
+    random; without, at once.
+    """
+
+    kind: Literal["crowding"] = "crowding"
+    code: ClassVar[int] = 4
+    radius: float = Field(gt=0, description="m")
+    most: int = Field(ge=0, description="elders that one bears within the radius")
+    rate: float | None = Field(default=None, gt=0, description="1/s; none = at once")
+
+    def row(self) -> list[float]:
+        """Radius, how many, rate."""
+        return [self.radius, float(self.most), float("inf") if self.rate is None else self.rate]
+
+    def check(self, scene: Any) -> None:
+        """Refuse a radius around the torus."""
+        super().check(scene)
+        if isinstance(scene.space, Torus) and self.radius > min(scene.space.size) / 2:
+            raise ValueError(
+                f"radius = {self.radius:g}: at most half of the torus's shortest edge, "
+                f"{min(scene.space.size) / 2:g} m, is allowed"
+            )
+
+
+class Threshold(Sink):
+    """Agents die whose inner number has come to a level: starved at a hunger of 1, caught."""
+
+    kind: Literal["threshold"] = "threshold"
+    code: ClassVar[int] = 5
+    of: str = Field(min_length=1, description="name of the number, which some effect keeps")
+    level: float = Field(default=1.0, description="at which, or above which, the agent dies")
+
+    def row(self) -> list[float]:
+        """The level."""
+        return [self.level]
+
+    def check(self, scene: Any) -> None:
+        """Refuse a number that no effect keeps."""
+        super().check(scene)
+        if self.of not in scene.parts.inner:
+            kept = ", ".join(scene.parts.inner) or "nothing"
+            raise ValueError(f"of = {self.of!r}: no effect of this scene keeps it; they keep {kept}")
