@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from flockenv.behaviours import Driving, LineUp, Separation
+from flockenv.behaviours.steer import Steer
 from flockenv.geometry.eikonal import ground
 from flockenv.geometry.shapes import Wall
 from flockenv.geometry.space import Box
@@ -22,7 +23,6 @@ from flockenv.model.spawn import Spawn
 from flockenv.physics.effects import Door, Routes, Way
 from flockenv.render import draw, write_png
 from flockenv.scene import Group, Scene
-from flockenv.steer import Steer
 
 EXITS = (Door(ends=((59.0, 4.0), (59.0, 6.0))), Door(ends=((1.0, 54.0), (1.0, 56.0))))
 COLOURS = ("#d55e00", "#0072b2", "#52637a")

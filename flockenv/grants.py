@@ -16,13 +16,13 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from flockenv.behaviours.steer import Steer
 from flockenv.jit.decorators import Law, Vec, kernel, law, like
 from flockenv.jit.section import entry_of, record, several, vector
 from flockenv.maths.vectors import zero
 from flockenv.model.state import State
 from flockenv.physics.effects.effect import Me
 from flockenv.scene import Scene
-from flockenv.steer import Steer
 from flockenv.steering.arbitration import Arbitration, Shares, Wishes
 
 __all__ = ["Granted", "Grants", "granted", "reconcile"]

@@ -23,11 +23,11 @@ from flockenv.behaviours import (
     Sidestep,
     WalkingGroup,
 )
+from flockenv.behaviours.steer import Steer
 from flockenv.core.errors import KeyPath, key_path, nearest, refusals, shown, steps_of
 from flockenv.core.record import Record
 from flockenv.model.distribution import Spread
 from flockenv.physics.effects import Contact, Effect, ObstacleContact
-from flockenv.steer import Steer
 from flockenv.steering.arbitration import Blend
 
 __all__ = ["ALIASES", "PRESETS", "Model", "Preset", "expanded", "preset"]

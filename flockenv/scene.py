@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydantic import Field, WrapValidator, model_validator
 
+from flockenv.behaviours.steer import EVERY_EFFECT
 from flockenv.core.magnitudes import check_numbers
 from flockenv.core.record import Record, keep
 from flockenv.geometry.barnes_hut import MOST_DIRECT
@@ -47,7 +48,6 @@ from flockenv.physics.population import settler as population_settler
 from flockenv.physics.population.lifecycle import NUMBERS as POPULATION_NUMBERS
 from flockenv.placing import cells_of, place_groups
 from flockenv.stability import check_contact, check_dt, check_lookahead
-from flockenv.steer import EVERY_EFFECT
 from flockenv.sweep import (
     Parts,
     Table,

@@ -66,6 +66,7 @@ from flockenv.behaviours import (
     Wander,
     Whiskers,
 )
+from flockenv.behaviours.steer import Steer
 from flockenv.geometry.shapes import Circle
 from flockenv.geometry.space import Box, Plane, Space, Torus
 from flockenv.geometry.targets import Target
@@ -129,7 +130,6 @@ from flockenv.physics.integrators import (
     VelocityVerlet,
 )
 from flockenv.scene import Group, Scene
-from flockenv.steer import Steer
 from flockenv.steering import arbitration
 from flockenv.steering.arbitration import (
     Allocation,

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from flockenv.behaviours import AvoidObstacles, Separation
+from flockenv.behaviours.steer import Steer
 from flockenv.config import dump_scene, load_scene
 from flockenv.explanation import _shares
 from flockenv.geometry.space import Torus
@@ -18,7 +19,6 @@ from flockenv.maths.counter_rng import key_of
 from flockenv.model.spawn import Spawn
 from flockenv.physics.effects import Drag, Effect
 from flockenv.scene import Group, Scene
-from flockenv.steer import Steer
 from flockenv.steering.arbitration import (
     ARBITRATIONS,
     Allocation,

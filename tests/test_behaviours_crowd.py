@@ -19,11 +19,11 @@ from flockenv.behaviours import (
     StayOnPath,
     UnalignedAvoidance,
 )
+from flockenv.behaviours.steer import Steer
 from flockenv.geometry.space import Torus
 from flockenv.model.spawn import Spawn
 from flockenv.model.state import State
 from flockenv.scene import Group, Scene
-from flockenv.steer import Steer
 from flockenv.steering.arbitration import Allocation
 from flockenv.steering.vectorize import rows
 from tests.catalogue import Array

@@ -31,12 +31,12 @@ from flockenv.behaviours import (
     TargetSpeed,
     Wander,
 )
+from flockenv.behaviours.steer import Steer
 from flockenv.model.spawn import Spawn
 from flockenv.model.state import State
 from flockenv.physics.effects import Effect
 from flockenv.scene import Group, Scene
 from flockenv.stability import LookaheadWarning
-from flockenv.steer import Steer
 from flockenv.steering.vectorize import rows
 from tests.catalogue import EFFECTS, Array, in_dimension, scene_of
 

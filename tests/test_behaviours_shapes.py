@@ -19,6 +19,7 @@ from flockenv.behaviours import (
     Seek,
     Whiskers,
 )
+from flockenv.behaviours.steer import Steer
 from flockenv.geometry.eikonal import way_table
 from flockenv.geometry.shapes import Block, Capsule, Circle, HalfSpace, Polygon, Shape, Wall
 from flockenv.geometry.targets import Target
@@ -27,7 +28,6 @@ from flockenv.model.spawn import Spawn
 from flockenv.physics import floor_fields as way_module
 from flockenv.physics.constraints import Collisions
 from flockenv.scene import Group, Scene
-from flockenv.steer import Steer
 
 UNDER = (
     AvoidObstacles(weight=8, horizon=2, margin=0.1),

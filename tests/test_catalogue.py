@@ -9,10 +9,10 @@ from pathlib import Path
 import pytest
 
 from flockenv import steering
+from flockenv.behaviours.steer import Steer
 from flockenv.geometry.space import Space
 from flockenv.physics.effects import EFFECTS
 from flockenv.physics.integrators import INTEGRATORS
-from flockenv.steer import Steer
 from flockenv.steering import arbitration
 from flockenv.tasks import TASKS
 from tests import catalogue

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from flockenv.behaviours import Evade, Forage, Separation, Shadow, Wander
+from flockenv.behaviours.steer import Steer
 from flockenv.evaluation import rollout, worlds_for
 from flockenv.grants import granted, reconcile
 from flockenv.jit.thread_pool import use_threads
@@ -17,7 +18,6 @@ from flockenv.physics.effects import Fear, Grazing, Intention, Libido, Metabolis
 from flockenv.physics.population import Threshold
 from flockenv.players.rules import player
 from flockenv.scene import Group, Scene
-from flockenv.steer import Steer
 from flockenv.steering import motivation
 from flockenv.steering.arbitration import Intentions
 from flockenv.steering.vectorize import rows

@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from flockenv.behaviours.follow_way import FollowWay
 from flockenv.behaviours.orca import Orca
 from flockenv.behaviours.walls import Contain
-from flockenv.behaviours.way import FollowWay
 from flockenv.config import dump_scene, load_scene
 from flockenv.geometry.shapes import (
     Block,

@@ -10,12 +10,12 @@ import pytest
 from numba import njit
 
 from flockenv.behaviours import AvoidObstacles, Seek, Whiskers
+from flockenv.behaviours.steer import Steer
 from flockenv.geometry.shapes import Block, Capsule, Circle, DistanceField, HalfSpace, Polygon, Shape, Wall
 from flockenv.geometry.shapes.edges import sphere_edge
 from flockenv.model.spawn import Spawn
 from flockenv.physics.constraints import Collisions
 from flockenv.scene import Group, Scene
-from flockenv.steer import Steer
 from flockenv.steering.arbitration import Priority
 
 BLOCK = Block(centre=(6, -4.75), size=(0.5, 10.5))

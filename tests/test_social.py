@@ -25,6 +25,7 @@ from flockenv.behaviours import (
     Sidestep,
     WalkingGroup,
 )
+from flockenv.behaviours.steer import Steer
 from flockenv.config import ConfigError, dump_scene, load_scene, schema
 from flockenv.geometry.shapes import Block, Polygon, Shape, Wall
 from flockenv.geometry.space import Torus
@@ -35,7 +36,6 @@ from flockenv.physics.integrators import ExplicitEuler, SemiImplicitEuler
 from flockenv.presets import ALIASES, PRESETS, preset
 from flockenv.scene import Group, Scene
 from flockenv.stability import CoarseContactWarning, UnstableStepWarning, suggest_dt
-from flockenv.steer import Steer
 from flockenv.steering.vectorize import rows
 from tests.catalogue import rotation
 

@@ -10,6 +10,7 @@ import pytest
 import scipy.linalg
 
 from flockenv.behaviours import Cohesion, Separation
+from flockenv.behaviours.steer import Steer
 from flockenv.geometry.space import Torus
 from flockenv.jit.thread_pool import use_threads
 from flockenv.model.finite_elements import Material, freedoms, frequencies, mass, solve_static, stiffness
@@ -20,7 +21,6 @@ from flockenv.physics.effects import AngularSprings, Elastic, Gravity, Springs
 from flockenv.physics.effects.effect import all_masses
 from flockenv.physics.integrators import RK4, ImplicitEuler, ImplicitMidpoint
 from flockenv.scene import Group, Scene
-from flockenv.steer import Steer
 
 DIMENSIONS = pytest.mark.parametrize("dimension", [2, 3])
 

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from flockenv.behaviours import Alignment, AvoidObstacles, Separation
+from flockenv.behaviours.steer import Steer
 from flockenv.geometry.space import Box, Torus
 from flockenv.jit.thread_pool import threads, use_threads
 from flockenv.maths.heading import GRAVITY
@@ -20,7 +21,6 @@ from flockenv.physics.effects import Drag, Effect
 from flockenv.physics.integrators import RK4
 from flockenv.scene import Group, Scene
 from flockenv.stability import LookaheadWarning
-from flockenv.steer import Steer
 from flockenv.tasks import Obstacles
 from flockenv.trajectory import record
 from flockenv.workspace import Workspace

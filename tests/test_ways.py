@@ -11,6 +11,7 @@ import pytest
 from numpy.typing import NDArray
 
 from flockenv.behaviours import Driving, FollowWay, LineUp, UnalignedAvoidance
+from flockenv.behaviours.steer import Steer
 from flockenv.geometry.eikonal import ground
 from flockenv.geometry.shapes import Block, Circle, HalfSpace, Polygon, Wall
 from flockenv.geometry.space import Box
@@ -23,7 +24,6 @@ from flockenv.physics.floor_fields import NoWayWarning
 from flockenv.physics.population import Drain, Emitter
 from flockenv.physics.population.regions import Point
 from flockenv.scene import Group, Scene
-from flockenv.steer import Steer
 
 Array = NDArray[np.float64]
 

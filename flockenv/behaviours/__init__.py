@@ -14,23 +14,23 @@ from flockenv.jit.startup import import_all
 import_all(__name__, __path__)
 
 from flockenv.behaviours.avoid import AvoidObstacles, ForceField, Whiskers  # noqa: E402
-from flockenv.behaviours.chase import Evade, MatchVelocity, OffsetPursue, Pursue, Shadow  # noqa: E402
-from flockenv.behaviours.company import FollowLeader, Formation, Interpose  # noqa: E402
 from flockenv.behaviours.crowd import Explore, Forage, Queue, UnalignedAvoidance  # noqa: E402
 from flockenv.behaviours.driving import Driving, LineUp  # noqa: E402
 from flockenv.behaviours.flock import Alignment, Cohesion, Separation  # noqa: E402
+from flockenv.behaviours.follow_way import FollowWay  # noqa: E402
+from flockenv.behaviours.formations import FollowLeader, Formation, Interpose  # noqa: E402
 from flockenv.behaviours.goals import Arrive, Dock, Face, Flee, Seek, TargetSpeed  # noqa: E402
 from flockenv.behaviours.groups import Friends, Interest, WalkingGroup  # noqa: E402
 from flockenv.behaviours.heuristics import Heuristics  # noqa: E402
 from flockenv.behaviours.hide import Hide  # noqa: E402
-from flockenv.behaviours.keep_off import ObstacleRepulsion  # noqa: E402
+from flockenv.behaviours.obstacle_repulsion import ObstacleRepulsion  # noqa: E402
 from flockenv.behaviours.orca import Orca  # noqa: E402
 from flockenv.behaviours.paths import FollowFlow, FollowPath, StayOnPath  # noqa: E402
+from flockenv.behaviours.pursue import Evade, MatchVelocity, OffsetPursue, Pursue, Shadow  # noqa: E402
 from flockenv.behaviours.shepherd import Shepherd  # noqa: E402
 from flockenv.behaviours.social import CircularRepulsion, EllipticalRepulsion, Sidestep  # noqa: E402
 from flockenv.behaviours.walls import Contain, FollowWall  # noqa: E402
 from flockenv.behaviours.wander import Wander  # noqa: E402
-from flockenv.behaviours.way import FollowWay  # noqa: E402
 from flockenv.physics.effects.effect import EFFECTS, Effect  # noqa: E402  # after the folder has been walked
 
 __all__ = [

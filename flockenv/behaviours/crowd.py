@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from flockenv import steering
-from flockenv.behaviours.base import Behaviour, Moving, gains, top_speed
+from flockenv.behaviours.behaviour import Behaviour, Moving, gains, top_speed
 from flockenv.behaviours.wander import wandered
 from flockenv.jit.decorators import Law, Vec, law, like
 from flockenv.maths.vectors import scale, select, sub, unit, zero

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from flockenv import steering
-from flockenv.behaviours.base import Behaviour, steered_groups
+from flockenv.behaviours.behaviour import Behaviour, steered_groups
 from flockenv.jit.decorators import Law, Vec, law, like
 from flockenv.maths.vectors import dot, norm, scale, sub, unit
 from flockenv.physics.effects.effect import Me, Other, Sight, all_masses

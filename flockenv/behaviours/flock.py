@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from flockenv import steering
-from flockenv.behaviours.base import gains
+from flockenv.behaviours.behaviour import gains
 from flockenv.jit.decorators import Law, Vec, law, like
 from flockenv.maths.vectors import scale, select, sub, zero
 from flockenv.physics.effects.effect import Effect, Me, Other, Sight

@@ -8,7 +8,7 @@ from typing import Any, ClassVar, Literal, Self
 from pydantic import Field, model_validator
 
 from flockenv import steering
-from flockenv.behaviours.base import Behaviour, Moving, top_speed
+from flockenv.behaviours.behaviour import Behaviour, Moving, top_speed
 from flockenv.jit.decorators import Law, Vec, law
 from flockenv.maths.vectors import dot, scale, select, sub, zero
 from flockenv.physics.effects.effect import Me, Vector

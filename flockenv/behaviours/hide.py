@@ -8,7 +8,7 @@ import numpy as np
 from pydantic import Field
 
 from flockenv import steering
-from flockenv.behaviours.base import AboutNearest, Moving, seen_one, top_speed
+from flockenv.behaviours.behaviour import AboutNearest, Moving, seen_one, top_speed
 from flockenv.jit.decorators import Law, Vec, law, like
 from flockenv.maths.vectors import add, dot, norm, scale, select, zero
 from flockenv.physics.effects.effect import Me, Other

@@ -9,7 +9,7 @@ from numba.extending import overload
 from pydantic import Field
 
 from flockenv import steering
-from flockenv.behaviours.base import Moving, top_speed
+from flockenv.behaviours.behaviour import Moving, top_speed
 from flockenv.jit.decorators import OPTIONS, Law, Vec, law, like
 from flockenv.maths.vectors import scale, select, sub, zero
 from flockenv.physics.effects.effect import Me, Other, Sight, Vector

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from flockenv import steering
-from flockenv.behaviours.base import Behaviour, Moving, gains, top_speed
+from flockenv.behaviours.behaviour import Behaviour, Moving, gains, top_speed
 from flockenv.geometry import polyline
 from flockenv.jit.decorators import Law, Vec, law, like
 from flockenv.maths import grid

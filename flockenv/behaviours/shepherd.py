@@ -9,7 +9,7 @@ import numpy as np
 from pydantic import Field
 
 from flockenv import steering
-from flockenv.behaviours.base import Moving, top_speed
+from flockenv.behaviours.behaviour import Moving, top_speed
 from flockenv.jit.decorators import Law, Vec, law, like
 from flockenv.maths.vectors import scale, select, sub, zero
 from flockenv.physics.effects.effect import Me, Members, Vector

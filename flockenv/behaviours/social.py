@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from flockenv import steering
-from flockenv.behaviours.push import Push
+from flockenv.behaviours.repulsion import Push
 from flockenv.jit.decorators import Law, Vec, law, like
 from flockenv.maths.approximations import exp
 from flockenv.maths.vectors import dot, limit, scale, select, sub, unit

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from flockenv import steering
-from flockenv.behaviours.base import Moving, top_speed
+from flockenv.behaviours.behaviour import Moving, top_speed
 from flockenv.geometry.shapes import AnyShape, packed
 from flockenv.geometry.shapes.block import nearest_block
 from flockenv.geometry.shapes.chain import nearest_chain

@@ -8,7 +8,7 @@ import numpy as np
 from pydantic import Field
 
 from flockenv import steering
-from flockenv.behaviours.base import Moving, top_speed
+from flockenv.behaviours.behaviour import Moving, top_speed
 from flockenv.jit.decorators import Law, Vec, law, like
 from flockenv.maths.counter_rng import smooth, uniform
 from flockenv.maths.vectors import add, dot, planar, scale, select, sub

@@ -12,11 +12,11 @@ from typing import Literal
 from pydantic import Field, model_validator
 
 from flockenv.behaviours import FollowWay, Seek
+from flockenv.behaviours.steer import AnyBehaviour, AnyReconciling, Steer
 from flockenv.core.record import Record
 from flockenv.experiments.base import Experiment
 from flockenv.physics.effects import Effect
 from flockenv.scene import Scene
-from flockenv.steer import AnyBehaviour, AnyReconciling, Steer
 
 __all__ = ["Case", "GlobalWay", "Plan", "SteerPlan", "Variant"]
 

@@ -10,6 +10,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from flockenv.behaviours import AvoidObstacles, ForceField, Seek, UnalignedAvoidance
+from flockenv.behaviours.steer import Steer
 from flockenv.findings import Case, Value
 from flockenv.geometry.shapes import Block, Circle, Polygon
 from flockenv.jit.thread_pool import threads, use_threads
@@ -17,7 +18,6 @@ from flockenv.model.spawn import Spawn
 from flockenv.physics.constraints import Collisions
 from flockenv.physics.integrators import Integrator
 from flockenv.scene import Group, Scene
-from flockenv.steer import Steer
 from flockenv.steering.arbitration import Allocation, Blend
 from flockenv.stress.solids import Response, batch, overlap, per_response, solid
 

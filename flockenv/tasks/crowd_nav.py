@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from flockenv.behaviours.social import Social
+from flockenv.behaviours.steer import Steer
 from flockenv.geometry.space import Plane
 from flockenv.jit.decorators import kernel, like
 from flockenv.maths.counter_rng import uniform
@@ -20,7 +21,6 @@ from flockenv.model.state import State
 from flockenv.physics.effects.aims import Antipode
 from flockenv.presets import PRESETS
 from flockenv.scene import Group, Scene
-from flockenv.steer import Steer
 from flockenv.steering.arbitration import Blend
 from flockenv.sweep import Look
 from flockenv.tasks.base import Frame, Task

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from flockenv.behaviours.base import Moving, steered_groups, top_speed
+from flockenv.behaviours.behaviour import Moving, steered_groups, top_speed
 from flockenv.geometry.targets import Target
 from flockenv.jit.decorators import Law, Vec, law, like
 from flockenv.maths.vectors import norm, scale, sub

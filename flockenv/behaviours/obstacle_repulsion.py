@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from flockenv.behaviours.push import Push
+from flockenv.behaviours.repulsion import Push
 from flockenv.jit.decorators import Law, Vec, law
 from flockenv.maths.approximations import exp
 from flockenv.maths.vectors import add, scale, select, zero

@@ -7,7 +7,7 @@ from typing import Any, ClassVar, Literal
 from pydantic import Field
 
 from flockenv import steering
-from flockenv.behaviours.base import AboutNearest, Moving, seen_one, top_speed
+from flockenv.behaviours.behaviour import AboutNearest, Moving, seen_one, top_speed
 from flockenv.jit.decorators import Law, Vec, law, like
 from flockenv.maths.vectors import norm, scale, select, zero
 from flockenv.physics.effects.effect import Me
