@@ -23,11 +23,24 @@ from pydantic import Field, WrapValidator, model_validator
 from flockenv.behaviours.steer import EVERY_EFFECT
 from flockenv.core.magnitudes import check_numbers
 from flockenv.core.record import Record, keep
+from flockenv.engine import (
+    Parts,
+    Table,
+    begin_of,
+    field_of,
+    flattened,
+    pack,
+    scratch_bytes,
+    scratch_record,
+    step_of,
+    worlds_of,
+)
+from flockenv.engine.implicit_step import coupling_of, solve_steps
+from flockenv.engine.workspace import Workspace
 from flockenv.geometry.barnes_hut import MOST_DIRECT
 from flockenv.geometry.cell_list import FEWEST_AGENTS
 from flockenv.geometry.shapes import AnyShape, Circle, HalfSpace, Shape
 from flockenv.geometry.space import AnySpace, Box, Plane, Torus
-from flockenv.implicit import coupling_of, solve_steps
 from flockenv.jit.thread_pool import LARGEST, Choices, at_work, share
 from flockenv.maths.counter_rng import MASK, key_of
 from flockenv.model import state as states
@@ -48,19 +61,6 @@ from flockenv.physics.population import settler as population_settler
 from flockenv.physics.population.lifecycle import NUMBERS as POPULATION_NUMBERS
 from flockenv.placing import cells_of, place_groups
 from flockenv.stability import check_contact, check_dt, check_lookahead
-from flockenv.sweep import (
-    Parts,
-    Table,
-    begin_of,
-    field_of,
-    flattened,
-    pack,
-    scratch_bytes,
-    scratch_record,
-    step_of,
-    worlds_of,
-)
-from flockenv.workspace import Workspace
 
 __all__ = ["Group", "Scene"]
 

@@ -14,6 +14,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from flockenv.core.errors import nearest
+from flockenv.engine import Look, pack, scratch_record
+from flockenv.engine.workspace import Workspace
 from flockenv.jit.buffer_pool import Recycler
 from flockenv.jit.cpu import LINE
 from flockenv.jit.memory import zeros
@@ -25,11 +27,9 @@ from flockenv.model import state as states
 from flockenv.model.snapshot import Snapshot
 from flockenv.model.state import State
 from flockenv.scene import MEMORY_LIMIT
-from flockenv.sweep import Look, pack, scratch_record
 from flockenv.tasks import Task
 from flockenv.tasks.play import play_of, tell_of
 from flockenv.tasks.play_plan import REFUSED, Decision, Given, Near, Results, Totals, Worlds
-from flockenv.workspace import Workspace
 
 __all__ = ["Step", "World"]
 

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+from flockenv.engine import step_of
 from flockenv.jit.sources import functions_in
 from flockenv.scene import Scene
-from flockenv.sweep import step_of
 
 __all__ = ["functions_of"]
 

@@ -12,6 +12,7 @@ import pytest
 from flockenv.behaviours import AvoidObstacles, Separation
 from flockenv.behaviours.steer import Steer
 from flockenv.config import dump_scene, load_scene
+from flockenv.engine import step_of
 from flockenv.explanation import _shares
 from flockenv.geometry.space import Torus
 from flockenv.grants import granted, reconcile
@@ -33,7 +34,6 @@ from flockenv.steering.arbitration import (
     allocate_running,
 )
 from flockenv.steering.vectorize import rows
-from flockenv.sweep import step_of
 from tests import catalogue
 from tests.catalogue import Array
 from tests.kernels import functions_of

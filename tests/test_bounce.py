@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from flockenv.engine import step_of
 from flockenv.geometry.space import Box
 from flockenv.jit.thread_pool import use_threads
 from flockenv.model.spawn import Spawn
@@ -14,7 +15,6 @@ from flockenv.model.state import State
 from flockenv.physics.effects import Gravity
 from flockenv.physics.integrators import RK4, Integrator, SemiImplicitEuler
 from flockenv.scene import Group, Scene
-from flockenv.sweep import step_of
 from tests.catalogue import INTEGRATORS, Array, IntegratorRow
 from tests.kernels import functions_of
 

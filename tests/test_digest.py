@@ -8,11 +8,11 @@ from pathlib import Path
 
 import pytest
 
+from flockenv.engine import Worlds, step_of
+from flockenv.engine.context import Context
 from flockenv.jit.decorators import IN_PYTHON
 from flockenv.jit.sources import functions_in, sources_of_code
 from flockenv.physics.effects.effect import Far, Me, Members, Obstacle, Other
-from flockenv.sweep import Worlds, step_of
-from flockenv.sweep.context import Context
 from flockenv.tasks import TASKS
 from flockenv.tasks.base import Frame
 from flockenv.tasks.play import play_of

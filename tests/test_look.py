@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from numba import njit
 
+from flockenv.engine.nearest import AT_ONCE, exchanges, inserted, merged
 from flockenv.jit.decorators import kernel
 from flockenv.jit.simd_rows import key_of, key_read, key_written, ordered, same_key, tag_of
-from flockenv.sweep.nearest import AT_ONCE, exchanges, inserted, merged
 from flockenv.tasks import Bottleneck, Flock
 from flockenv.world import World
 

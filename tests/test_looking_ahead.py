@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from flockenv.behaviours import Alignment, Cohesion, Separation
+from flockenv.engine import Parts
 from flockenv.geometry.space import Plane, Torus
 from flockenv.model.spawn import Spawn
 from flockenv.physics.integrators import SemiImplicitEuler
 from flockenv.scene import Group, Scene
-from flockenv.sweep import Parts
 
 
 @pytest.mark.skipif(not Parts(2, Plane(), (), SemiImplicitEuler()).masks, reason="only with AVX-512")

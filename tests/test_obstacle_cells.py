@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 from flockenv.behaviours import AvoidObstacles, FollowWall, ForceField, ObstacleRepulsion, Separation, Whiskers
+from flockenv.engine import obstacle_sets
 from flockenv.geometry.shapes import Block, Capsule, Shape, Sway
 from flockenv.geometry.space import Box, Plane, Torus
 from flockenv.model.spawn import Spawn
 from flockenv.physics.effects.effect import Effect
 from flockenv.scene import Group, Scene
-from flockenv.sweep import met_obstacles
 
 SIDE = 40.0
 

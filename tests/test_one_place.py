@@ -11,6 +11,8 @@ import pytest
 from numba import njit
 
 from flockenv.behaviours import Alignment, Cohesion, Separation
+from flockenv.engine.pair_plan import pairs_of
+from flockenv.engine.pair_sums import begin_sums
 from flockenv.geometry.cell_list import WORTH_ARRANGING
 from flockenv.geometry.space import Plane, Torus
 from flockenv.jit.thread_pool import threads, use_threads
@@ -22,8 +24,6 @@ from flockenv.physics.effects.effect import Effect, Me, Other, ties
 from flockenv.physics.integrators import RK4
 from flockenv.scene import Scene
 from flockenv.steering.others import ONE_PLACE
-from flockenv.sweep.pair_plan import pairs_of
-from flockenv.sweep.pair_sums import begin_sums
 from tests.catalogue import EFFECTS, scene_under, users_module
 
 RULES = (Separation(weight=1.5, radius=1.5), Alignment(weight=0.6, radius=2), Cohesion(weight=0.2, radius=2.5))

@@ -16,6 +16,8 @@ import pytest
 
 import flockenv
 from flockenv.behaviours import Alignment, Cohesion, Separation
+from flockenv.engine import scratch_of
+from flockenv.engine.workspace import Workspace
 from flockenv.geometry.cell_list import FEWEST_AGENTS
 from flockenv.geometry.shapes import Block, Circle
 from flockenv.geometry.space import Box, Plane, Space, Torus
@@ -25,8 +27,6 @@ from flockenv.model.state import State
 from flockenv.physics.effects import EFFECTS, Drag, Gravity, QuadraticDrag
 from flockenv.physics.integrators import RK4, AdaptiveRK4, SemiImplicitEuler
 from flockenv.scene import Group, Scene
-from flockenv.sweep import scratch_of
-from flockenv.workspace import Workspace
 from tests.catalogue import INTEGRATORS, TETHER, VARIANTS, Array, Variant, everything, scene_of, users_module
 
 SPAWN = Spawn(low=(0, 0), high=(10, 10))

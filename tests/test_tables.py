@@ -10,10 +10,10 @@ import pytest
 
 from flockenv import scene as scenes
 from flockenv.behaviours.steer import Steer
+from flockenv.engine import step_of
 from flockenv.model.spawn import Spawn
 from flockenv.scene import Group, Scene
 from flockenv.steering.arbitration import Blend
-from flockenv.sweep import step_of
 from tests.catalogue import users_module
 
 LOOKUP = """

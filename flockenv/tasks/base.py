@@ -40,11 +40,11 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from flockenv.core.record import Record
+from flockenv.engine import Look, Parts
 from flockenv.model.snapshot import Mark
 from flockenv.model.state import State
 from flockenv.physics.integrators import INTEGRATORS, SemiImplicitEuler
 from flockenv.scene import AnyIntegrator, Scene
-from flockenv.sweep import Look, Parts
 from flockenv.tasks.layout import Layout
 
 __all__ = ["TASKS", "Frame", "Task"]

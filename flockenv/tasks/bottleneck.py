@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from flockenv import steering
+from flockenv.engine import Look
 from flockenv.geometry.shapes import Wall
 from flockenv.geometry.space import Box
 from flockenv.jit.decorators import kernel, like
@@ -22,7 +23,6 @@ from flockenv.model.state import State
 from flockenv.physics.effects import Contact, ObstacleContact
 from flockenv.presets import PRESETS
 from flockenv.scene import Group, Scene
-from flockenv.sweep import Look
 from flockenv.tasks.base import Frame, Task
 from flockenv.tasks.layout import Layout, Slot
 from flockenv.tasks.sight import clip, neighbour_slots, place_of, put, put_crowding, put_neighbour, velocity_of

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
+from flockenv.engine import Look
 from flockenv.geometry.space import Plane
 from flockenv.jit.decorators import kernel, like
 from flockenv.jit.intrinsics import stacked
@@ -19,7 +20,6 @@ from flockenv.model.spawn import Spawn
 from flockenv.model.state import State
 from flockenv.scene import Group, Scene
 from flockenv.steering import orca
-from flockenv.sweep import Look
 from flockenv.tasks.base import Frame, Task
 from flockenv.tasks.layout import Layout, Slot
 from flockenv.tasks.sight import neighbour_slots, put, put_neighbour, turned

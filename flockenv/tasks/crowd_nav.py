@@ -12,6 +12,7 @@ from pydantic import Field, model_validator
 
 from flockenv.behaviours.social import Social
 from flockenv.behaviours.steer import Steer
+from flockenv.engine import Look
 from flockenv.geometry.space import Plane
 from flockenv.jit.decorators import kernel, like
 from flockenv.maths.counter_rng import uniform
@@ -22,7 +23,6 @@ from flockenv.physics.effects.aims import Antipode
 from flockenv.presets import PRESETS
 from flockenv.scene import Group, Scene
 from flockenv.steering.arbitration import Blend
-from flockenv.sweep import Look
 from flockenv.tasks.base import Frame, Task
 from flockenv.tasks.layout import Layout, Slot
 from flockenv.tasks.sight import clip, neighbour_slots, put, put_crowding, put_neighbour, turned

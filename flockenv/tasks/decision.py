@@ -8,13 +8,13 @@ from typing import Any
 
 import numpy as np
 
+from flockenv.engine import begin_inner_of, look_of, step_world_of
+from flockenv.engine.lane_access import gather
 from flockenv.jit.decorators import kernel, like, replaced
 from flockenv.jit.memory import fetch, pour
 from flockenv.jit.section import record, section
 from flockenv.jit.simd_rows import columns, into_rows, packed, take
 from flockenv.maths.heading import face
-from flockenv.sweep import begin_inner_of, look_of, step_world_of
-from flockenv.sweep.gather import gather
 from flockenv.tasks.base import Frame
 from flockenv.tasks.lasting import lasts
 from flockenv.tasks.play_plan import Plan

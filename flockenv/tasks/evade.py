@@ -9,6 +9,7 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from flockenv import steering
+from flockenv.engine import Look
 from flockenv.geometry.shapes import ray_hit
 from flockenv.geometry.space import Box
 from flockenv.jit.decorators import Vec, kernel, like
@@ -17,7 +18,6 @@ from flockenv.maths.vectors import add, norm, scale, unit
 from flockenv.physics.effects import ObstacleContact
 from flockenv.scene import Group, Scene
 from flockenv.steering import arbitration
-from flockenv.sweep import Look
 from flockenv.tasks.base import Frame, Task
 from flockenv.tasks.layout import Layout, Slot
 from flockenv.tasks.sight import block_ways, clip, compass, leaves_gap, velocity_of

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from flockenv import steering
+from flockenv.engine import Look
 from flockenv.geometry.space import Torus
 from flockenv.jit.decorators import kernel, like
 from flockenv.jit.intrinsics import stacked
@@ -21,7 +22,6 @@ from flockenv.model.snapshot import Mark
 from flockenv.model.state import State
 from flockenv.scene import Group, Scene
 from flockenv.steering import arbitration
-from flockenv.sweep import Look
 from flockenv.tasks.base import Frame
 from flockenv.tasks.lasting import MEASURES, METRICS, LastingTask, judge, tell_lasting
 from flockenv.tasks.layout import Layout, Slot

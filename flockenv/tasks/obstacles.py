@@ -10,13 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
+from flockenv.engine import Look
 from flockenv.geometry.space import Box
 from flockenv.jit.decorators import kernel, like
 from flockenv.maths.counter_rng import uniform
 from flockenv.model.snapshot import Mark
 from flockenv.model.state import State
 from flockenv.scene import Group, Scene
-from flockenv.sweep import Look
 from flockenv.tasks.base import Frame, Task
 from flockenv.tasks.layout import Layout, Slot
 from flockenv.tasks.sight import block_ways, clip, compass, leaves_gap

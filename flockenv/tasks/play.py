@@ -13,12 +13,12 @@ from typing import Any
 
 import numpy as np
 
+from flockenv.engine import begin_plan, plan_look, step_plan
 from flockenv.jit.decorators import Law, finite, kernel
 from flockenv.jit.intrinsics import unaliased
 from flockenv.jit.memory import settle
 from flockenv.jit.section import digest_of, entry_of
 from flockenv.jit.simd_rows import apart, columns, in_one_row, packed
-from flockenv.sweep import begin_plan, plan_look, step_plan
 from flockenv.tasks.base import Task
 from flockenv.tasks.decision import (
     act_of,

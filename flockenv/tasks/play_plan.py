@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
+from flockenv.engine import BeginPlan, LookPlan, StepPlan
 from flockenv.jit.decorators import Law
-from flockenv.sweep import BeginPlan, LookPlan, StepPlan
 
 __all__ = ["REFUSED", "Decision", "Given", "Kernels", "Near", "Plan", "Results", "Totals", "Worlds"]
 

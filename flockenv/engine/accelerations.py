@@ -1,0 +1,305 @@
+"""The acceleration of every agent of a world: what all laws say, summed and divided by mass.
+
+Pair laws come first, in one sweep (`sense`), and leave what they came to in `felt`, by agent; laws about all agents,
+and bonds, in `pulled`. Then each block adds what its agents want or feel by themselves, and the folds over the
+obstacles (`respond`); what an agent wants is bounded by max_force. By a method of one stage the step goes on from
+there, part after part; `accelerate` is for all others, and where accelerations alone are asked for.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from flockenv.engine.agent_records import AgentPlan, agent_plan, alone_of, still
+from flockenv.engine.blocks import common_places, put_vector_of, vector_of_lane
+from flockenv.engine.bonds import BondPlan, bond_plan, bonds_of
+from flockenv.engine.far_field import FarPlan, far_of, far_plan
+from flockenv.engine.group_laws import GroupPlan, find_groups_of, group_plan, members_of
+from flockenv.engine.kernel_plan import Parts
+from flockenv.engine.lane_access import gather, picked
+from flockenv.engine.law_calls import OneLaw, given_of, laws_of, says_of, sum_of
+from flockenv.engine.obstacle_loop import obstacles_of
+from flockenv.engine.obstacle_plan import Obstacles, obstacle_plan
+from flockenv.engine.pair_loop import meet_neighbours
+from flockenv.engine.pair_plan import Pairs, pairs_of
+from flockenv.jit.decorators import Law, Vec, kernel, like
+from flockenv.jit.section import section, tuple_from
+from flockenv.maths.vectors import add, limit, scale, select, zero
+
+__all__ = ["accelerate_of", "felt_of", "respond_of", "response_plan", "sense_of", "sense_plan"]
+
+
+class Added(NamedTuple):
+    """Something that is added to what an agent wants, to what acts on it, or to one of its wishes."""
+
+    kind: str  # "own" law, "still": an own law without its drag, "group", "fold" over obstacles, "felt", "pulled"
+    law: OneLaw | None = None  # of a fold: what ends it
+    places: tuple[int, ...] = ()  # of a fold: its numbers among the lanes; of what is felt: where it lies in a block
+
+
+class Reconciled(NamedTuple):
+    """An effect that makes one of several wishes."""
+
+    k: int
+    law: Law
+    wishes: tuple[int, ...]
+
+
+class ResponsePlan(NamedTuple):
+    """What the acceleration of an agent depends on, once all is sensed."""
+
+    agent: AgentPlan
+    masked: bool  # may what is the same for all agents lie where the first block has it?
+    media: tuple[OneLaw, ...]
+    flows: tuple[OneLaw, ...]
+    added: tuple[Added, ...]
+    totals: tuple[tuple[int, ...], ...]  # which of them come to: what an agent wants, what acts on it, each wish
+    reconciled: tuple[Reconciled, ...]
+    steered: tuple[tuple[int, ...], tuple[int, ...]]  # which of those come to: what it wants, what acts on it
+    felt: int  # numbers of a block in `felt`
+    obstacles: Obstacles | None
+    groups: GroupPlan | None
+
+
+def response_plan(parts: Parts) -> ResponsePlan:
+    """Return the plan of a scene."""
+    targets, wishes = ["s", "f", *(f"w{k}_" for k in parts.wishes)], list(parts.wishes)
+    added: list[tuple[str, Added]] = []
+    for k, effect in enumerate(parts.effects):
+        if effect.own_law is not None:
+            rests = effect.linear_drag is not None and parts.integrator.splits_drag
+            added.append((parts.target(k), Added("still" if rests else "own", OneLaw.of(parts, k, "own_law"))))
+        if effect.group_law is not None:
+            added.append((parts.target(k), Added("group", OneLaw.of(parts, k, "group_law"))))
+        if effect.obstacle_start is not None and effect.obstacle_finish is not None:
+            slots = tuple(place * parts.width for name, place in parts.slots.items() if name.startswith(f"o{k}_"))
+            # a fold sees no images: its law met obstacles by the shortest way
+            added.append((parts.target(k), Added("fold", OneLaw(k, effect.obstacle_finish), slots)))
+    added += [(name, Added("felt", None, (parts.felt_at(name),))) for name in parts.targets if name[0] != "n"]
+    added += [("f", Added("pulled"))] * parts.pulls
+    mine = [(k, e) for k, e in enumerate(parts.effects) if e.wishes]
+    reconciled = tuple(
+        Reconciled(k, e.steer_law, tuple(j for j, wish in enumerate(wishes) if parts.wishes[wish] == k))
+        for k, e in mine
+    )
+    steered = [tuple(j for j, (k, _) in enumerate(mine) if parts.target(k) == name) for name in ("s", "f")]
+    return ResponsePlan(
+        agent_plan(parts), parts.arranges, laws_of(parts, "medium_law"), laws_of(parts, "flow_law"),
+        tuple(one for _, one in added),
+        tuple(tuple(j for j, (to, _) in enumerate(added) if to == name) for name in targets),
+        reconciled, (steered[0], steered[1]), parts.felt_size,
+        obstacle_plan(parts, agent_plan(parts)) if parts.folds_obstacles else None,
+        group_plan(parts) if parts.grouped else None,
+    )  # fmt: skip
+
+
+# --- what is felt from others -----------------------------------------------------------------------------------------
+
+
+class SensePlan(NamedTuple):
+    """What agents feel from others: what there is of it; None where there is none."""
+
+    agent: AgentPlan
+    aims: tuple[OneLaw, ...]
+    pairs: Pairs | None
+    far: FarPlan | None
+    bonds: BondPlan | None
+    groups: GroupPlan | None
+
+
+def sense_plan(parts: Parts) -> SensePlan:
+    """Return the plan of a scene."""
+    agent = agent_plan(parts)
+    return SensePlan(
+        agent, laws_of(parts, "aim_law"),
+        pairs_of(parts) if parts.pairs else None,
+        far_plan(parts) if parts.far else None,
+        bond_plan(parts, agent) if parts.bonded else None,
+        group_plan(parts) if parts.grouped else None,
+    )  # fmt: skip
+
+
+@section
+def sense_of(plan: SensePlan) -> Callable[..., None]:
+    """Make `sense(context, pos, vel, time)`: write what this thread's agents of one world feel from others."""
+    aim = _aim(plan.agent, plan.aims) if plan.aims else None
+    meet = meet_neighbours(plan.pairs) if plan.pairs is not None else None
+    far = far_of(plan.far) if plan.far is not None else None
+    bonds = bonds_of(plan.bonds) if plan.bonds is not None else None
+    find_groups = find_groups_of(plan.groups) if plan.groups is not None else None
+
+    def sense(context: Any, pos: Any, vel: Any, time: Any) -> None:
+        if context.rank == 0:
+            context.work[context.b, 0] += 1
+        if aim is not None:
+            aim(context, pos, vel, time)
+        if meet is not None:
+            meet(context, pos, vel, time)
+        if far is not None:
+            far(context, pos, time)
+        if bonds is not None:
+            bonds(context, pos, vel, time)
+        if find_groups is not None:
+            find_groups(context, pos, vel)
+
+    return sense
+
+
+@section
+def _aim(agent: AgentPlan, laws: tuple[OneLaw, ...]) -> Callable[..., None]:
+    """Make `aim(context, pos, vel, time)`: write in which direction this thread's agents want to go."""
+    d, width = agent.dimension, agent.width
+    size, vector, put = np.uint64(d * width), vector_of_lane(d, width), put_vector_of(d, width)
+    alone, ways, total = alone_of(agent._replace(aims=False)), tuple_from(*map(says_of, laws)), _sum_all(laws)
+
+    def aim(context: Any, pos: Any, vel: Any, time: Any) -> None:
+        scratch, numbers, drawn = context.scratch, context.numbers, context.key[context.b]
+        for block in range(np.uint64(context.first), np.uint64(context.end)):
+            base, row = block * size, block * np.uint64(width)
+            for lane in range(np.uint64(width)):
+                i, at = row + lane, base + lane
+                x, v = vector(pos, at), vector(vel, at)
+                me = alone(scratch, drawn, time, at, i, i, x, v, zero(x))
+                way = total(zero(x), ways(numbers, me))
+                put(scratch.aiming, at, limit(way, like(x[0], 1.0)))
+
+    return aim
+
+
+def _sum_all(laws: tuple[Any, ...]) -> Callable[[Vec, Any], Vec]:
+    return sum_of(tuple(range(len(laws))))
+
+
+# --- what agents do about it ------------------------------------------------------------------------------------------
+
+
+@functools.cache
+def felt_of(dimension: int, width: int, each: int, place: int) -> Callable[..., Vec]:
+    """Return `felt(scratch, row, lane)`: what pair laws have left an agent in a lane of the block at `row`."""
+    vector, first, rows = vector_of_lane(dimension, width), np.uint64(place), np.uint64(each // width)
+    return kernel(lambda scratch, row, lane: vector(scratch.felt, row * rows + first + lane))
+
+
+@functools.cache
+def _adding(plan: ResponsePlan, added: Added) -> Callable[..., Vec]:
+    """Return `adds(numbers, scratch, me, row, at, lane)`: a vector that is added for an agent."""
+    kind, one, places = added
+    vector = vector_of_lane(plan.agent.dimension, plan.agent.width)
+    if kind == "pulled":
+        return kernel(lambda numbers, scratch, me, row, at, lane: vector(scratch.pulled, at))
+    if kind == "felt":
+        felt = felt_of(plan.agent.dimension, plan.agent.width, plan.felt, *places)
+        return kernel(lambda numbers, scratch, me, row, at, lane: felt(scratch, row, lane))
+    assert one is not None
+    if kind == "fold":
+        k, law = one.k, one.law
+        return kernel(
+            lambda numbers, scratch, me, row, at, lane: law(numbers.effects[k], me, gather(scratch.lanes, lane, places))
+        )
+    if kind == "group":
+        given, law = given_of(one.k, one.images), one.law
+        assert plan.groups is not None
+        members = members_of(plan.groups, next(each for each in plan.groups.laws if each.k == one.k))
+        return kernel(
+            lambda numbers, scratch, me, row, at, lane: law(
+                given(numbers, me), me, members(scratch.lanes, numbers.size, me.pos)
+            )
+        )
+    says = says_of(one)
+    if kind == "still":
+        return kernel(lambda numbers, scratch, me, row, at, lane: says(numbers, still(me)))
+    return kernel(lambda numbers, scratch, me, row, at, lane: says(numbers, me))
+
+
+@section
+def _totals(plan: ResponsePlan) -> Callable[..., Any]:
+    """Make `totals(numbers, scratch, me, wanted, row, at, lane)`: what an agent wants, what acts on it, its wishes."""
+    adding = tuple_from(*(_adding(plan, one) for one in plan.added)) if plan.added else None
+    want, force, *wishes = map(sum_of, plan.totals)
+    wishing: Any = tuple_from(*wishes) if wishes else kernel(lambda start, vectors: ())
+
+    def totals(numbers: Any, scratch: Any, me: Any, wanted: Any, row: Any, at: Any, lane: Any) -> Any:
+        o = zero(me.pos)
+        if adding is None:
+            return wanted, o, ()
+        vectors = adding(numbers, scratch, me, row, at, lane)
+        return want(wanted, vectors), force(o, vectors), wishing(o, vectors)
+
+    return totals
+
+
+@functools.cache
+def _steering(one: Reconciled) -> Callable[..., Vec]:
+    """Return `steers(numbers, me, wishes)`: what an effect makes of its wishes, if it is about this agent."""
+    k, law, places = one
+
+    def steers(numbers: Any, me: Any, wishes: Any) -> Any:
+        p = numbers.effects[k]
+        member = (me.who >= p.first) & (me.who < p.end)
+        return select(member, law(p, me, picked(wishes, (), places))[0], zero(me.pos))
+
+    return kernel(steers)
+
+
+@section
+def respond_of(plan: ResponsePlan) -> Callable[..., None]:
+    """Make `respond(context, pos, vel, time, block, out, to)`: write the accelerations of a block, m/s^2.
+
+    They lie at `to` in an array of vectors; with what velocity the medium carries each agent, if it does, in
+    `carrying`.
+    """
+    agent, d, width = plan.agent, plan.agent.dimension, plan.agent.width
+    size, vector, put = np.uint64(d * width), vector_of_lane(d, width), put_vector_of(d, width)
+    alone, totals, common = alone_of(agent), _totals(plan), common_places(d, width, plan.masked)
+    medium: Any = tuple_from(*map(says_of, plan.media)) if plan.media else None
+    of_medium, of_flow = _sum_all(plan.media), _sum_all(plan.flows)
+    flow: Any = tuple_from(*map(says_of, plan.flows)) if plan.flows else None
+    steering: Any = tuple_from(*map(_steering, plan.reconciled)) if plan.reconciled else None
+    to_want, to_force = map(sum_of, plan.steered)
+    meet_obstacles = obstacles_of(plan.obstacles) if plan.obstacles is not None else None
+
+    def respond(context: Any, pos: Any, vel: Any, time: Any, block: Any, out: Any, to: Any) -> None:
+        scratch, numbers, drawn = context.scratch, context.numbers, context.key[context.b]
+        base, row = block * size, block * np.uint64(width)
+        one, live, wish = common(scratch, context.n, context.present, block)
+        if meet_obstacles is not None:
+            meet_obstacles(context, pos, vel, time, block)
+        for lane in range(np.uint64(width)):
+            i, at = row + lane, base + lane
+            x, v = vector(pos, at), vector(vel, at)
+            o = zero(x)
+            me = alone(scratch, drawn, time, at, i, one + lane, x, v, o)
+            if medium is not None:
+                moves = of_medium(o, medium(numbers, me))
+                me = alone(scratch, drawn, time, at, i, one + lane, x, v, moves)
+            wants, acts, wishes = totals(numbers, scratch, me, vector(scratch.want, wish + lane), row, at, lane)
+            if steering is not None:
+                steered = steering(numbers, me, wishes)
+                wants, acts = to_want(wants, steered), to_force(acts, steered)
+            wants = limit(wants, scratch.max_force[one + lane])
+            # a choice, not a factor of 0: a law may be infinite where the dead, what is held in place (by an infinite
+            # mass) and the lanes beyond the last agent lie
+            here = (scratch.living[live + lane] > o[0]) & (scratch.mass[one + lane] < like(o[0], np.inf))
+            share = like(o[0], 1.0) / scratch.mass[one + lane]
+            put(out, to + lane, select(here, scale(add(wants, acts), share), o))
+            if flow is not None:
+                put(scratch.carrying, at, select(here, of_flow(o, flow(numbers, me)), o))
+
+    return respond
+
+
+@section
+def accelerate_of(plan: ResponsePlan, sensed: SensePlan) -> Callable[..., None]:
+    """Make `accelerate(context, pos, vel, time, out)`: write the acceleration of this thread's agents, m/s^2."""
+    sense, respond, size = sense_of(sensed), respond_of(plan), np.uint64(plan.agent.dimension * plan.agent.width)
+
+    def accelerate(context: Any, pos: Any, vel: Any, time: Any, out: Any) -> None:
+        sense(context, pos, vel, time)
+        for block in range(np.uint64(context.first), np.uint64(context.end)):
+            respond(context, pos, vel, time, block, out, block * size)
+
+    return accelerate

@@ -1,0 +1,98 @@
+"""Agents as the laws of one agent see them: records put together from the scratch of a world."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from flockenv.engine.blocks import vector_of_lane
+from flockenv.jit.decorators import kernel, law, like
+from flockenv.jit.section import record, section, tuple_from
+from flockenv.maths.vectors import unit, zero
+from flockenv.physics.effects.effect import Me
+
+if TYPE_CHECKING:
+    from flockenv.engine.kernel_plan import Parts
+
+__all__ = ["AgentPlan", "agent_plan", "alone_of", "inner_of", "still"]
+
+
+class AgentPlan(NamedTuple):
+    """What of an agent there is to be known."""
+
+    dimension: int
+    width: int
+    oriented: bool = False  # does it keep a heading of its own?
+    aims: bool = False  # does any effect say where it wants to go?
+    paced: bool = False  # does any law ask how fast it would like to go?
+    inner: tuple[str, ...] = ()  # names of what goes on inside it
+
+
+def agent_plan(parts: Parts) -> AgentPlan:
+    """Return the plan of a scene."""
+    paced = "desired_speed" in parts.frame_numbers
+    return AgentPlan(parts.dimension, parts.width, parts.oriented, parts.aims, paced, parts.inner)
+
+
+@section
+def alone_of(plan: AgentPlan) -> Callable[..., Me]:
+    """Make `alone(scratch, drawn, time, place, i, one, x, v, medium)`: agent i as the laws of one agent see it.
+
+    It lies at `place` in arrays of vectors, its body at `one`. It has no tie: that is for pairs in one place.
+    """
+    vector, inner = vector_of_lane(plan.dimension, plan.width), inner_of(plan.inner)
+    oriented, aims, paced = plan.oriented, plan.aims, plan.paced
+
+    def alone(scratch: Any, drawn: Any, time: Any, place: Any, i: Any, one: Any, x: Any, v: Any, medium: Any) -> Any:
+        heading = vector(scratch.facing, place) if oriented else unit(v)
+        aim = vector(scratch.aiming, place) if aims else zero(x)
+        wished = scratch.desired_speed[i] if paced else like(x[0], 0.0)
+        return Me(
+            scratch.ident[i],
+            x,
+            v,
+            heading,
+            scratch.mass[one],
+            scratch.radius[one],
+            scratch.max_speed[one],
+            scratch.max_force[one],
+            zero(x),
+            time,
+            medium,
+            drawn,
+            aim,
+            wished,
+            inner(scratch, i),
+        )
+
+    return alone
+
+
+@law
+def still(me: Me) -> Me:
+    """Return an agent as it is at rest: what of a drag is left for a method that treats the rest of it by itself."""
+    o = zero(me.pos)
+    mass, radius, max_speed, max_force = me.mass, me.radius, me.max_speed, me.max_force
+    return Me(
+        me.who, me.pos, o, o, mass, radius, max_speed, max_force, me.tie, me.time, me.medium, me.key, me.aim,
+        me.desired_speed, me.inner,
+    )  # fmt: skip
+
+
+@section
+def inner_of(names: tuple[str, ...]) -> Callable[..., Any]:
+    """Make `inner(scratch, i)`: what goes on inside agent i, by name."""
+    if not names:
+        return lambda scratch, i: ()
+    kind, values = record(names), tuple_from(*map(_inner_number, range(len(names))))
+
+    def inner(scratch: Any, i: Any) -> Any:
+        return kind(*values(scratch, i))
+
+    return inner
+
+
+@functools.cache
+def _inner_number(k: int) -> Callable[..., float]:
+    return kernel(lambda scratch, i: scratch.inner[k][i])

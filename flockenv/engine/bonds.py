@@ -1,0 +1,221 @@
+"""Bonds: each agent gathers what acts on it through the bonds that it is in, block after block, lane beside lane.
+
+A table has, for each block of agents, as many slots as its most bonded agent has bonds; in a slot each lane has the
+places of its partners and the numbers of its bond, or its own place and zeros (`pack`). So no thread writes what is
+another's, and sums are the same for any number of threads.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flockenv.engine.agent_records import AgentPlan, alone_of, inner_of
+from flockenv.engine.blocks import vector_of_lane
+from flockenv.engine.kernel_plan import Parts
+from flockenv.engine.lane_access import gather
+from flockenv.jit.decorators import Law, like
+from flockenv.jit.intrinsics import wait_for_team
+from flockenv.jit.section import section
+from flockenv.maths.vectors import dot, exact_sum, zero
+from flockenv.physics.effects.effect import Bonds, Other
+
+__all__ = ["BondPlan", "Table", "bond_plan", "bonds_of", "pack"]
+
+
+class Table(NamedTuple):
+    """The bonds of all effects of a scene, as the kernel reads them."""
+
+    place: NDArray[np.int32]  # where the first coordinate of a partner lies; of an unused slot: of the agent itself
+    number: NDArray[np.floating]
+    start: NDArray[
+        np.int64
+    ]  # per effect: the first slot of each block, and one more; then where its part begins, twice
+
+
+def pack(parts: Parts, agents: int, groups: Sequence[object]) -> Table:
+    """Return the table of a scene of so many agents; ValueError, naming the effect, if bonds do not suit it."""
+    w, d = parts.width, parts.dimension
+    blocks = -(-agents // w)
+    places, numbers, starts, bases = [], [], [], []
+    first_place = first_number = 0
+    for k, effect in parts.bonded:
+        try:
+            found = effect.bonds(groups, d)
+        except ValueError as error:
+            listed = k - sum(wish < k for wish in parts.wishes)  # those lie before the effect that reconciles them
+            raise ValueError(f"effects[{listed}].{error}") from None
+        start, place, number = _packed(found, agents, blocks, w, d)
+        starts.append(start)
+        bases += [first_place, first_number]
+        first_place, first_number = first_place + place.size, first_number + number.size
+        places.append(place.ravel())
+        numbers.append(number.ravel())
+    empty: list[NDArray[np.float64]] = [np.zeros(1)]
+    return Table(
+        np.concatenate(places or empty).astype(np.int32),
+        np.concatenate(numbers or empty).astype(parts.dtype),
+        np.concatenate([*starts, np.array(bases, np.int64)] if starts else [np.zeros(1, np.int64)]),
+    )
+
+
+def _packed(
+    bonds: Bonds, agents: int, blocks: int, width: int, dimension: int
+) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:
+    """Return the starts of blocks, places (slots, P, W) and numbers (slots, C, W)."""
+    order = np.argsort(bonds.agent, kind="stable")
+    agent, partner, number = bonds.agent[order].astype(np.int64), bonds.partner[order], bonds.number[order]
+    count = np.bincount(agent, minlength=blocks * width)
+    start = np.concatenate([[0], np.cumsum(count.reshape(blocks, width).max(axis=1, initial=0))])
+    slot = start[agent // width] + np.arange(len(agent)) - np.concatenate([[0], np.cumsum(count)])[agent]
+    lane_of = agent % width
+
+    def place_of(agents: NDArray[np.int64]) -> NDArray[np.int64]:
+        return (agents // width) * (dimension * width) + agents % width
+
+    block = np.repeat(np.arange(blocks), np.diff(start))
+    places = np.repeat(place_of(block[:, None] * width + np.arange(width))[:, None, :], partner.shape[1], axis=1)
+    numbers = np.zeros((int(start[-1]), number.shape[1], width))
+    places[slot, :, lane_of] = place_of(partner.astype(np.int64))
+    numbers[slot, :, lane_of] = number
+    return start.astype(np.int64), places, numbers
+
+
+# --- met by a kernel --------------------------------------------------------------------------------------------------
+
+
+class BondLaw(NamedTuple):
+    """A law of bonds."""
+
+    k: int  # which effect it is of
+    law: Law
+    partners: int
+    numbers: int
+
+
+class BondPlan(NamedTuple):
+    """What gathering from bonds depends on."""
+
+    agent: AgentPlan
+    offset_to: Law
+    laws: tuple[BondLaw, ...]  # in the order of the table
+    sums: int  # where in the scratch of lanes the sums of a block begin
+    waits: bool  # has nothing waited yet until all threads have written their positions?
+    adds: bool  # is something in `pulled` already?
+
+
+def bond_plan(parts: Parts, agent: AgentPlan) -> BondPlan:
+    """Return the plan of a scene."""
+    d = parts.dimension
+    laws = tuple(BondLaw(k, e.bond_law, e.partners, e.numbers(d)) for k, e in parts.bonded if e.bond_law is not None)
+    sums, waits = parts.slots["bond0"] * parts.width, not (parts.pairs or parts.far)
+    return BondPlan(agent, parts.space.offset_law, laws, sums, waits, bool(parts.far))
+
+
+@section
+def bonds_of(plan: BondPlan) -> Callable[..., None]:
+    """Make `bonds(context, pos, vel, time)`: write what bonds do to this thread's agents, N, into `pulled`."""
+    add = _add_bonds(plan, len(plan.laws) - 1)
+    waits, adds = plan.waits, plan.adds
+    count, sums = plan.agent.dimension * plan.agent.width, np.uint64(plan.sums)
+
+    def bonds(context: Any, pos: Any, vel: Any, time: Any) -> None:
+        scratch, numbers, key, n = context.scratch, context.numbers, context.key[context.b], context.n
+        sync, team, lanes, pulled = scratch.sync, context.team, scratch.lanes, scratch.pulled
+        if waits:
+            wait_for_team(sync, team)  # the positions are those of all threads
+        for block in range(np.uint64(context.first), np.uint64(context.end)):
+            base = block * np.uint64(count)
+            for place in range(np.uint64(count)):
+                lanes[sums + place] = pulled[base + place] if adds else like(pulled[0], 0.0)
+            add(scratch, numbers.effects, numbers.size, pos, vel, time, key, n, block)
+            for place in range(np.uint64(count)):
+                pulled[base + place] = lanes[sums + place]
+        wait_for_team(sync, team)  # no agent moves before all have looked
+
+    return bonds
+
+
+@section
+def _add_bonds(plan: BondPlan, place: int) -> Callable[..., None]:
+    """Make `add(scratch, effects, size, pos, vel, time, key, n, block)`: add what bonds say to a block's sums.
+
+    Those of an effect, by its place in the table, and of all before it.
+    """
+    before = _add_bonds(plan, place - 1) if place else None
+    k, law, partners, numbers = plan.laws[place]
+    dimension, width = plan.agent.dimension, plan.agent.width
+    vector, alone, partners_of = vector_of_lane(dimension, width), alone_of(plan.agent), _partners(plan, partners)
+    are_alive = _are_alive(dimension, width, partners)
+    of_bond = tuple(number * width for number in range(numbers))
+    keeps, apart, wide = bool(plan.agent.inner), partners * width, numbers * width
+    first_place, total = 2 * place, len(plan.laws)
+    sum_x, sum_y, sum_z = (np.uint64(plan.sums + axis * width) for axis in range(3))
+
+    def add(scratch: Any, effects: Any, size: Any, pos: Any, vel: Any, time: Any, key: Any, n: Any, block: Any) -> None:
+        if before is not None:
+            before(scratch, effects, size, pos, vel, time, key, n, block)
+        lanes, start, numbered = scratch.lanes, scratch.bond_start, scratch.bond_number
+        placed, living, kept = scratch.bond_place, scratch.living, scratch if keeps else ()
+        base, row = block * np.uint64(dimension * width), block * np.uint64(width)
+        blocks = (n + (width - 1)) // width + 1
+        for slot in range(start[place * blocks + np.int64(block)], start[place * blocks + np.int64(block) + 1]):
+            places = np.uint64(start[total * blocks + first_place] + slot * apart)
+            first = np.uint64(start[total * blocks + first_place + 1] + slot * wide)
+            for lane in range(np.uint64(width)):
+                i, at = row + lane, base + lane
+                x, v = vector(pos, at), vector(vel, at)
+                me = alone(scratch, key, time, at, i, i, x, v, zero(x))
+                others = partners_of(kept, placed, pos, vel, scratch.radius, scratch.mass, size, x, places + lane)
+                says = law(effects[k], me, others, gather(numbered, first + lane, of_bond))
+                whole = are_alive(placed, living, places + lane)  # the dead hold no agent
+                # of a sum of products each form of the loop would fuse another one, and bits depend on the processor
+                lanes[sum_x + lane] = exact_sum(lanes[sum_x + lane], says[0] if whole else like(x[0], -0.0))
+                lanes[sum_y + lane] = exact_sum(lanes[sum_y + lane], says[1] if whole else like(x[0], -0.0))
+                if dimension == 3:
+                    lanes[sum_z + lane] = exact_sum(lanes[sum_z + lane], says[2] if whole else like(x[0], -0.0))
+
+    return add
+
+
+@section
+def _partners(plan: BondPlan, count: int) -> Callable[..., tuple[Other, ...]]:
+    """Make `partners(kept, placed, pos, vel, radius, mass, size, x, place)`: those in a bond with an agent at x.
+
+    place: where `placed` holds the place of the first. kept: scratch, if agents keep numbers inside; else nothing.
+    """
+    before, behind = _partners(plan, count - 1) if count > 1 else None, np.uint64((count - 1) * plan.agent.width)
+    vector, inner, offset_to = vector_of_lane(*plan.agent[:2]), inner_of(plan.agent.inner), plan.offset_to
+    width, size_of_block = np.uint64(plan.agent.width), np.uint64(plan.agent.dimension * plan.agent.width)
+
+    def partners(
+        kept: Any, placed: Any, pos: Any, vel: Any, radius: Any, mass: Any, size: Any, x: Any, place: Any
+    ) -> Any:
+        at = np.uint64(placed[place + behind])
+        i: Any = at // size_of_block * width + at % width
+        to, o = offset_to(size, x, vector(pos, at)), zero(x)
+        other = Other(like(x[0], i), to, dot(to, to), vector(vel, at), radius[i], o, mass[i], inner(kept, i))
+        if before is None:
+            return (other,)
+        return before(kept, placed, pos, vel, radius, mass, size, x, place) + (other,)  # noqa: RUF005  # numba adds
+
+    return partners
+
+
+@section
+def _are_alive(dimension: int, width: int, count: int) -> Callable[..., bool]:
+    """Make `are_alive(places, living, place)`: are all partners of a bond alive?"""
+    before, behind = _are_alive(dimension, width, count - 1) if count > 1 else None, np.uint64((count - 1) * width)
+    lanes, size = np.uint64(width), np.uint64(dimension * width)
+
+    def are_alive(places: Any, living: Any, place: Any) -> Any:
+        at = np.uint64(places[place + behind])
+        alive = living[at // size * lanes + at % lanes] > like(living[0], 0.0)
+        if before is None:
+            return alive
+        return before(places, living, place) & alive
+
+    return are_alive

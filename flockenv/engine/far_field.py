@@ -1,0 +1,224 @@
+"""Laws about all agents, however far: each agent meets all others, or groups of them where these are far away.
+
+Few agents, and many where an effect asks for exactness, are met one by one, lane beside lane (`_direct`); many others
+by blocks that walk through a tree (`_walk`, see flockenv.geometry.barnes_hut). Which of the two depends on the number
+of agents and the effect's opening alone. What it comes to is left in `pulled`, by agent, where bonds add to it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from flockenv.engine.blocks import place_of, vector_of_lane
+from flockenv.engine.kernel_plan import Parts
+from flockenv.geometry.barnes_hut import BUCKETS, LEVELS, LISTED, gather, line_up, weigh
+from flockenv.jit.decorators import Law, like
+from flockenv.jit.intrinsics import wait_for_team
+from flockenv.jit.section import section
+from flockenv.maths.vectors import dot, sub, zero
+from flockenv.physics.effects.effect import Far, Me
+
+__all__ = ["FarPlan", "far_of", "far_plan"]
+
+
+class FarLaw(NamedTuple):
+    """A law about all agents."""
+
+    k: int  # which effect it is of
+    law: Law
+    by_mass: bool  # does it count kilograms, not heads?
+
+
+class FarPlan(NamedTuple):
+    """What meeting all agents depends on."""
+
+    dimension: int
+    width: int
+    sums: int  # where in the scratch of lanes the sums of a block begin
+    direct: tuple[FarLaw, ...]  # of these all agents are met one by one
+    treed: tuple[FarLaw, ...]  # of these groups of them as one
+
+
+def far_plan(parts: Parts) -> FarPlan:
+    """Return the plan of a scene."""
+    laws = {k: FarLaw(k, effect.far_law, effect.weighs_mass) for k, effect in parts.far if effect.far_law is not None}
+    treed = [k for k, _ in parts.treed]
+    direct = tuple(law for k, law in laws.items() if k not in treed)
+    sums = parts.slots["far0"] * parts.width
+    return FarPlan(parts.dimension, parts.width, sums, direct, tuple(laws[k] for k in treed))
+
+
+@section
+def far_of(plan: FarPlan) -> Callable[..., None]:
+    """Make `far(context, pos, time)`: write what all others do to this thread's agents, N, into `pulled`.
+
+    It begins with a wait even where pairs have been met: the positions are those of all threads, and counts have been
+    read then.
+    """
+    direct, walk = _direct(plan) if plan.direct else None, _walk(plan, plan.treed) if plan.treed else None
+    width = plan.width
+
+    def far(context: Any, pos: Any, time: Any) -> None:
+        scratch, numbers, key = context.scratch, context.numbers, context.key[context.b]
+        sync, lanes, living, mass, pulled = scratch.sync, scratch.lanes, scratch.living, scratch.mass, scratch.pulled
+        n, present, rank, team = context.n, context.present, context.rank, context.team
+        wait_for_team(sync, team)
+        met = 0
+        if direct is not None:
+            block_range = context.first, context.end
+            direct(numbers.effects, pos, living, mass, lanes, pulled, block_range, n, time, key)
+            met += present * present
+        if walk is not None:
+            tree = scratch.tree_leaf, scratch.tree_node, scratch.tree_digit, scratch.tree_near, scratch.tree_place
+            leaves, _, digits, _, places = tree
+            if rank == 0:
+                keys, bounds = scratch.tree_key, scratch.bounds
+                line_up(pos, living, mass, n, width, sync, bounds, numbers.size, keys, places, digits, leaves)
+            share = present, rank, team
+            met += walk(numbers.effects, numbers.size, tree, lanes, pulled, sync, scratch.tally, share, time, key)
+        else:
+            wait_for_team(sync, team)  # no agent moves before all have looked
+        if rank == 0:
+            context.work[context.b, 2] += met
+
+    return far
+
+
+# --- what is met ------------------------------------------------------------------------------------------------------
+
+
+@section
+def _meet(plan: FarPlan, laws: tuple[FarLaw, ...], in_tree: bool) -> Callable[..., None]:
+    """Make `meet(effects, lanes, lane, x, m, xj, heavy, time, key)`: add what is at xj to the sums of a lane.
+
+    The lane is that of an agent at x of mass m. `heavy` is the mass that is met, or in a tree the weight of a node.
+    Nothing is added by what is in the very same place, the agent itself above all: there is no direction.
+    """
+    before = _meet(plan, laws[:-1], in_tree) if laws[1:] else None
+    k, law, by_mass = laws[-1]
+    weighs, dimension = by_mass or in_tree, plan.dimension
+    first, second, third = (np.uint64(plan.sums + axis * plan.width) for axis in range(3))
+
+    def meet(effects: Any, lanes: Any, lane: Any, x: Any, m: Any, xj: Any, heavy: Any, time: Any, key: Any) -> None:
+        if before is not None:
+            before(effects, lanes, lane, x, m, xj, heavy, time, key)
+        to = sub(xj, x)
+        square, o, z = dot(to, to), like(m, -0.0), zero(x)
+        there = square > o
+        me = Me(m, x, z, z, m, m, m, m, z, time, z, key, z, m, ())
+        says = law(effects[k], me, Far(to, square, heavy if weighs else like(m, 1.0)))
+        lanes[first + lane] += says[0] if there else o  # a sum of a choice, see pairs
+        lanes[second + lane] += says[1] if there else o
+        if dimension == 3:
+            lanes[third + lane] += says[2] if there else o
+
+    return meet
+
+
+# --- one by one -------------------------------------------------------------------------------------------------------
+
+
+@section
+def _direct(plan: FarPlan) -> Callable[..., None]:
+    """Make `direct(effects, pos, living, mass, lanes, pulled, blocks, n, time, key)`: blocks meet all agents alive.
+
+    All laws at once; blocks: the first, and the end.
+    """
+    dimension, width, sums = plan.dimension, plan.width, np.uint64(plan.sums)
+    meet, vector, place = _meet(plan, plan.direct, False), vector_of_lane(dimension, width), place_of(dimension, width)
+    count = dimension * width
+
+    def direct(
+        effects: Any, pos: Any, living: Any, mass: Any, lanes: Any, pulled: Any, blocks: Any, n: Any, time: Any,
+        key: Any,
+    ) -> None:  # fmt: skip
+        for block in range(np.uint64(blocks[0]), np.uint64(blocks[1])):
+            base, row = block * np.uint64(count), block * np.uint64(width)
+            for lane in range(np.uint64(count)):
+                lanes[sums + lane] = 0
+            for j in range(np.uint64(n)):
+                if living[j] > 0:
+                    xj, heavy = vector(pos, place(j)), mass[j]
+                    for lane in range(np.uint64(width)):
+                        meet(effects, lanes, lane, vector(pos, base + lane), mass[row + lane], xj, heavy, time, key)
+            for lane in range(np.uint64(count)):
+                pulled[base + lane] = lanes[sums + lane]
+
+    return direct
+
+
+# --- by a tree --------------------------------------------------------------------------------------------------------
+
+
+@section
+def _walk(plan: FarPlan, laws: tuple[FarLaw, ...]) -> Callable[..., int]:
+    """Make `walk(effects, size, tree, lanes, pulled, sync, tally, share, time, key)`: sorted blocks walk through trees.
+
+    There is a tree for each of some laws, one after the other: nodes weigh kilograms or heads. share: (agents alive,
+    rank, team), this thread's part of them. Returns, to rank 0, what all threads have met.
+    """
+    before, adds = _walk(plan, laws[:-1]) if laws[1:] else None, bool(plan.direct or laws[1:])
+    dimension, width, sums, (k, _, by_mass) = plan.dimension, plan.width, np.uint64(plan.sums), laws[-1]
+    meet, put, vector = _meet(plan, laws[-1:], True), _put(plan, adds), vector_of_lane(dimension, width)
+    listed, weight = vector_of_lane(dimension, 1), np.uint64(dimension)
+    count, step, room = dimension * width, dimension + 1, LISTED * (dimension + 1)
+
+    def walk(
+        effects: Any, size: Any, tree: Any, lanes: Any, pulled: Any, sync: Any, tally: Any, share: Any, time: Any,
+        key: Any,
+    ) -> int:  # fmt: skip
+        total = 0
+        if before is not None:
+            total += before(effects, size, tree, lanes, pulled, sync, tally, share, time, key)
+        (leaves, nodes, digits, near, places), (present, rank, team) = tree, share
+        if rank == 0:
+            weigh(leaves, present, width, size, by_mass, digits, nodes)
+        wait_for_team(sync, team)  # the tree is that of all threads
+        met, blocks, begin = 0, (present + width - 1) // width, rank * room
+        for block in range(np.uint64(blocks * rank // team), np.uint64(blocks * (rank + 1) // team)):
+            own: Any = np.int64(block)
+            base, held = block * np.uint64(step * width), min(width, present - own * width)
+            for lane in range(np.uint64(count)):
+                lanes[sums + lane] = 0
+            level, node = digits[BUCKETS + LEVELS], 0
+            while level <= digits[BUCKETS + LEVELS]:
+                many, level, node = gather(
+                    leaves, nodes, digits, present, width, size, by_mass, effects[k].opening, own, level, node, near,
+                    begin,
+                )  # fmt: skip
+                met += many * held
+                for j in range(np.uint64(begin), np.uint64(begin + many * step), np.uint64(step)):
+                    xj, heavy = listed(near, j), near[j + weight]
+                    for lane in range(np.uint64(width)):
+                        x, m = vector(leaves, base + lane), leaves[base + np.uint64(count) + lane]
+                        meet(effects, lanes, lane, x, m, xj, heavy, time, key)
+            put(pulled, lanes, places, block * np.uint64(width), held)
+        tally[rank] = met
+        wait_for_team(sync, team)  # what is pulled was written by other threads
+        for r in range(team if rank == 0 else 0):
+            total += tally[r]
+        return total
+
+    return walk
+
+
+@section
+def _put(plan: FarPlan, adds: bool) -> Callable[..., None]:
+    """Make `put(pulled, lanes, places, first, held)`: write, or add, the sums of a block where its `held` agents lie.
+
+    places: which agents they are, from `first` on.
+    """
+    place, dimension = place_of(plan.dimension, plan.width), plan.dimension
+    sums, width = np.uint64(plan.sums), np.uint64(plan.width)
+
+    def put(pulled: Any, lanes: Any, places: Any, first: Any, held: Any) -> None:
+        for lane in range(np.uint64(held)):
+            at = place(np.uint64(places[first + lane]))
+            for axis in range(np.uint64(dimension)):
+                to, found = at + axis * width, lanes[sums + axis * width + lane]
+                pulled[to] = pulled[to] + found if adds else found
+
+    return put

@@ -1,0 +1,415 @@
+"""Parts: which laws make up a scene, and what follows from that for its kernel.
+
+Which effects meet neighbours, in how many different ways they look around (`sights`), what is sorted of each agent
+(`fields`: only what some law reads), where each running number lies in the scratch of lanes (`slots`), and the numbers
+that the kernel is given (`parameters`). Plans of sections are made from parts, and scratch is allocated for them.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flockenv.engine.fields_read import OF_PAIRS, names_read
+from flockenv.engine.obstacle_sets import MetObstacles
+from flockenv.engine.parameters import NumberPlan, pack_numbers
+from flockenv.geometry.shapes.cells import MOST_FOUND
+from flockenv.geometry.space import Space
+from flockenv.jit import cpu
+from flockenv.jit.cpu import LINE
+from flockenv.physics.effects.effect import LAWS, Effect, Sight
+from flockenv.physics.integrators.integrator import Integrator
+from flockenv.physics.integrators.single_stage import OneStage
+
+__all__ = ["Look", "Parts", "flattened"]
+
+
+class Look(NamedTuple):
+    """What is near every agent, for observations and rewards: the nearest few, all around."""
+
+    radius: float  # m
+    agents: int = 0  # so many of the nearest agents
+    obstacles: int = 0  # so many of the obstacles whose surface is nearest
+
+
+@dataclass(frozen=True)
+class Parts(MetObstacles):
+    """Which laws make up a scene: all that its kernel depends on."""
+
+    dimension: int
+    space: Space
+    effects: tuple[Effect, ...]
+    """As `flattened` lists them: behaviours whose wishes are reconciled lie before the effect that does it."""
+    integrator: Integrator
+    dtype: str = "float64"
+    sorts: bool = True
+    """True if there are enough agents to sort them by cell; a smaller scene has no code for it."""
+    look: Look | None = None
+    """What a task shows its agents, found by the same query."""
+    crowded: bool = False
+    """True if there are enough agents for groups of them to be met as one, where they are far away."""
+    oriented: bool = False
+    """True if agents keep a heading (and an up vector) of their own."""
+    turns: bool = False
+    """True if the turn rate of some agents is limited."""
+    leans: bool = False
+    """True if some agents lean into their turns."""
+    starts: tuple[int, ...] = ()
+    """The first agent of each group, and one more: numbers alone, code does not depend on them."""
+    shapes: tuple[Any, ...] = field(default=(), compare=False)
+    """Obstacles that are not in the state: code depends on their forms, and on whether any of them moves."""
+    circles: int = 0
+    """How many obstacles come before them."""
+    stepped: bool = True
+    """True if steps are made; else accelerations are asked for, also of agents at no finite place."""
+    touching: float = field(default=math.inf, compare=False)
+    """m, the radii of the two that are widest, and a little more: agents further apart than that do not touch."""
+    tables: tuple[NDArray[np.float64], ...] = field(default=(), compare=False)
+    """What the laws of each tabled effect look up, in order: numbers alone, too."""
+
+    @functools.cached_property
+    def width(self) -> int:
+        """Lanes of a block: agents that one vector register holds.
+
+        Where laws meet all agents, sixteen on any processor: a tree is made of blocks, so results follow from it.
+        """
+        return 16 if self.far else cpu.REGISTER // self.itemsize
+
+    @property
+    def masks(self) -> bool:
+        """True if what was compared is kept in masks, beside the registers: it costs nothing to compare once more."""
+        return cpu.REGISTER == LINE
+
+    @property
+    def keyed(self) -> bool:
+        """True if lists of the nearest are kept as keys; see sweep/look."""
+        return self.look is not None and self.look.agents > 1 and not self.sorts and self.itemsize == 4
+
+    @property
+    def itemsize(self) -> int:
+        """Bytes of a number."""
+        return int(np.dtype(self.dtype).itemsize)
+
+    @functools.cached_property
+    def pairs(self) -> list[tuple[int, Effect]]:
+        """The effects with a pair law, and their numbers."""
+        return [(k, e) for k, e in enumerate(self.effects) if e.pair_law is not None]
+
+    @functools.cached_property
+    def bonded(self) -> list[tuple[int, Effect]]:
+        """The effects with a law of bonds, and their numbers."""
+        return [(k, e) for k, e in enumerate(self.effects) if e.bond_law is not None]
+
+    @functools.cached_property
+    def grouped(self) -> list[tuple[int, Effect]]:
+        """The effects with a law about a group as one, and their numbers."""
+        return [(k, e) for k, e in enumerate(self.effects) if e.group_law is not None]
+
+    @functools.cached_property
+    def far(self) -> list[tuple[int, Effect]]:
+        """The effects with a law about all agents, and their numbers."""
+        return [(k, e) for k, e in enumerate(self.effects) if e.far_law is not None]
+
+    @functools.cached_property
+    def treed(self) -> list[tuple[int, Effect]]:
+        """Those of them that meet groups as one."""
+        return [(k, e) for k, e in self.far if self.crowded and e.parameters()["opening"] != 0]
+
+    @property
+    def pulls(self) -> bool:
+        """True if some law leaves forces in `pulled`."""
+        return bool(self.far or self.bonded)
+
+    @property
+    def flows(self) -> bool:
+        """True if a medium carries agents."""
+        return any(e.flow_law is not None for e in self.effects)
+
+    @functools.cached_property
+    def sights(self) -> list[Sight]:
+        """The different ways in which pair laws look around; laws that see the same share the test."""
+        return list(dict.fromkeys(self.sight_of(e) for _, e in self.pairs))
+
+    def sight_of(self, effect: Effect) -> Sight:
+        """Return which agents the pair law of an effect sees: of contacts, those that can touch."""
+        sight = effect.sight
+        assert sight is not None, f"{type(effect).__name__} has a pair law and no sight"
+        return sight._replace(radius=min(sight.radius, self.touching)) if effect.contact else sight
+
+    @functools.cached_property
+    def parting(self) -> bool:
+        """True if agents in one place are met by themselves, if there are any, and all others without looking at ties.
+
+        Where every law that reads ties has another for those elsewhere, and all that is told is added up.
+        """
+        readers = [e for _, e in self.pairs if "tie" in names_read(e, OF_PAIRS)]
+        sums = not any(e.pair_start or e.contact for _, e in self.pairs)
+        others = any("tie" in names_read(e, ("apart_law", "finish_law")) for e in readers)
+        return sums and bool(readers) and all(e.apart_law for e in readers) and not others
+
+    @property
+    def looks_ahead(self) -> bool:
+        """True if it is worked out how far the next candidate is while one is met, so that more is under way at a time.
+
+        In small scenes, where a block meets all candidates in a row, of several laws, where there are registers enough.
+        """
+        return self.parting and self.masks and not self.sorts and self.dimension == 2 and len(self.pairs) > 1
+
+    @property
+    def trusts(self) -> bool:
+        """True if every agent is at a finite place whenever forces are asked for, unless a step has failed already.
+
+        Where steps ask once each. Then laws that vanish are not asked whom they are about. 0 times a way that is NaN is
+        NaN, so an agent that meets one at NaN is at NaN after that step, too: which was the first is looked for step by
+        step (`step_world`).
+        """
+        return self.stepped and self.one_stage
+
+    @property
+    def spreads(self) -> bool:
+        """True if NaN spreads at once to all agents that meet the one that has it."""
+        return self.trusts and (bool(self.grouped) or any(effect.vanishes for effect in self.effects))
+
+    @functools.cached_property
+    def averaged(self) -> list[int]:
+        """The sights of which agents in sight are counted (not of contacts: few candidates are asked for those)."""
+        if any(effect.averages and effect.contact for effect in self.effects):
+            raise TypeError("an effect with `contact` counts no agents: it cannot have `averages`")
+        return sorted({self.sights.index(self.sight_of(e)) for _, e in self.pairs if e.averages})
+
+    @property
+    def reach(self) -> float:
+        """The largest distance at which any law looks for neighbours, m."""
+        return max((sight.radius for sight in self.sights), default=0.0)
+
+    @functools.cached_property
+    def _numbers(self) -> tuple[list[float], NumberPlan]:
+        return pack_numbers(self)
+
+    def parameters(self) -> list[float]:
+        """Every number that the kernel is given; tables come behind."""
+        return self._numbers[0]
+
+    @property
+    def number_plan(self) -> NumberPlan:
+        """Where each of them lies."""
+        return self._numbers[1]
+
+    @property
+    def count(self) -> int:
+        """How many numbers the kernel is handed."""
+        return len(self.parameters()) + sum(map(len, self.tables))
+
+    def given(self) -> NDArray[Any]:
+        """Return `parameters()` and the tables behind them, in the scene's precision: what the kernel is handed."""
+        every: list[Any] = [self.parameters(), self.shaped[0], *self.cells.values(), *self.tables]
+        return np.concatenate(every).astype(self.dtype)
+
+    def numbers_of(self, effect: Effect) -> dict[str, Any]:
+        """Return the numbers and vectors that the laws of an effect are given, by name."""
+        return {**effect.parameters(), **effect.members(self.starts)}
+
+    def names_of(self, effect: Effect) -> list[str]:
+        """Return the names under which the laws of an effect find what they are given."""
+        more = ["table"] * effect.tabled + ["counted"] * (effect.count_law is not None)
+        return [*self.numbers_of(effect), *more]
+
+    @functools.cached_property
+    def wishes(self) -> dict[int, int]:
+        """Which effects only wish, and the number of the one that reconciles their wishes."""
+        found: dict[int, int] = {}
+        for k, effect in enumerate(self.effects):
+            found |= dict.fromkeys(range(k - len(effect.wishes), k), k)
+        return found
+
+    def target(self, k: int) -> str:
+        """Return what effect k adds to: a wish of its own, what agents want, or what acts on them."""
+        return f"w{k}_" if k in self.wishes else "s" if self.effects[k].steering else "f"
+
+    def pair_target(self, k: int) -> str:
+        """Return what the pair law of effect k adds to: the same, or what its fold over the obstacles is told."""
+        effect = self.effects[k]
+        return f"n{k}_" if effect.obstacle_start is not None or effect.keep_law is not None else self.target(k)
+
+    @functools.cached_property
+    def inner(self) -> tuple[str, ...]:
+        """Names of what goes on inside every agent: all that some effect keeps."""
+        return tuple(dict.fromkeys(name for effect in self.effects for name in effect.keeps))
+
+    @property
+    def keeping(self) -> list[tuple[int, Effect]]:
+        """The effects that keep some of it, and their numbers."""
+        return [(k, e) for k, e in enumerate(self.effects) if e.keeps]
+
+    @property
+    def counters(self) -> int:
+        """How many counters all effects have; they lie in the scratch `counters`."""
+        return sum(effect.counters for effect in self.effects if effect.count_law)
+
+    @property
+    def aims(self) -> bool:
+        """True if some effect says where agents want to go."""
+        return any(e.aim_law is not None for e in self.effects)
+
+    @functools.cached_property
+    def read(self) -> set[str]:
+        """Every name in the code of all laws."""
+        return set().union(*(names_read(e, LAWS) for e in self.effects))
+
+    @property
+    def bounces(self) -> bool:
+        """True if bodies bounce off the walls of the space."""
+        return self.space.bounce_law is not None
+
+    @property
+    def sweeps(self) -> bool:
+        """True if neighbours are looked for."""
+        return bool(self.pairs) or (self.look is not None and self.look.agents > 0)
+
+    @functools.cached_property
+    def targets(self) -> list[str]:
+        """What pair laws add to: what agents want, what acts on them, wishes, what folds over obstacles are told."""
+        found = {self.pair_target(k) for k, _ in self.pairs}
+        names = ("s", "f", *(f"w{k}_" for k in self.wishes), *(f"n{k}_" for k, _ in self.pairs))
+        return [name for name in names if name in found]
+
+    @property
+    def felt_size(self) -> int:
+        """How many numbers of a block lie in `felt`: a vector of each agent for each target."""
+        return self.dimension * len(self.targets) * self.width
+
+    def felt_at(self, target: str) -> int:
+        """Return where among those what the pair laws came to for a target lies."""
+        return self.targets.index(target) * self.dimension * self.width
+
+    @property
+    def one_stage(self) -> bool:
+        """True if the method asks once, and then moves every coordinate by itself."""
+        return isinstance(self.integrator, OneStage)
+
+    @property
+    def aside(self) -> int:
+        """Numbers of every agent that are put aside: accelerations, or where it was, and how fast if bodies bounce."""
+        return self.dimension * (2 if self.bounces and not self.one_stage else 1)
+
+    @functools.cached_property
+    def fields(self) -> list[str]:
+        """What is sorted of each agent: what the pair laws read, found from the names in their code."""
+        names = set().union(*(names_read(e, OF_PAIRS) for _, e in self.pairs))
+        if any(sight.fov < 360 for sight in self.sights):
+            names.add("heading")
+        if any(sight.group is not None for sight in self.sights):
+            names.add("who")
+        facing = "heading" in names
+        needed = {"x": True, "v": "vel" in names or (facing and not self.oriented)}
+        needed |= {"d" if self.oriented else "h": facing, "t": "tie" in names, "a": self.aims and "aim" in names}
+        rows = [f"{letter}{k}" for letter, need in needed.items() if need for k in range(self.dimension)]
+        rows += [name for name in ("who", "radius", "mass", "max_speed", "max_force", "desired_speed") if name in names]
+        return rows + [f"inner{k}" for k in range(len(self.inner)) if "inner" in names]
+
+    @functools.cached_property
+    def sorted_fields(self) -> list[str]:
+        """Those of them that lie side by side in scratch, or in records: ties that are seldom looked at do not."""
+        seldom = self.sorts and self.parting
+        return [name for name in self.fields if not (seldom and name[0] == "t")]
+
+    @property
+    def seen_fields(self) -> list[str]:
+        """What is sorted of each agent to find the nearest."""
+        return [f"x{k}" for k in range(self.dimension)]
+
+    @property
+    def rows(self) -> int:
+        """Rows of numbers of agents that are listed, or are the block's own, that scratch must have."""
+        return max(len(self.sorted_fields) if self.pairs else 0, self.dimension if self.look else 0, 1)
+
+    @property
+    def numbers(self) -> int:
+        """Numbers of a record that scratch must have: a place, and all fields but headings."""
+        kinds = [self.sorted_fields] * bool(self.pairs) + [self.seen_fields] * bool(self.look)
+        return 1 + max((sum(name[0] != "h" for name in fields) for fields in kinds), default=0)
+
+    @property
+    def confines(self) -> bool:
+        """True if all agents are brought into a periodic box when a call begins, so that no query has to look after it.
+
+        Only where accelerations are asked for at the frozen present: a stage of a method may lie outside.
+        """
+        return self.space.periodic and self.arranges and self.one_stage
+
+    @property
+    def arranges(self) -> bool:
+        """True if agents of a large world may be put in order for a while.
+
+        Not where places matter: bonds know their partners by them, far laws and groups meet agents in their order.
+        """
+        return self.sorts and bool(self.pairs) and not self.pulls and not self.grouped
+
+    @property
+    def homely(self) -> bool:
+        """True if it is noted then which agents have left their tiles: where cells are the same in every step."""
+        return self.arranges and self.space.periodic
+
+    @property
+    def frame_vectors(self) -> list[str]:
+        """The vectors of an agent's frame: where it faces, and in space which way is up."""
+        return ["facing", "above"][: self.dimension - 1] if self.oriented else []
+
+    @property
+    def frame_numbers(self) -> list[str]:
+        """More numbers of an agent's body, by `Body`'s names, which not every scene needs."""
+        paced = "desired_speed" in self.read
+        return ["max_turn_rate"] * self.turns + ["banking"] * self.leans + ["desired_speed"] * paced
+
+    @property
+    def frame_rows(self) -> int:
+        """Coordinates of the vectors of a frame: what a state keeps of each agent."""
+        return self.dimension * len(self.frame_vectors)
+
+    @property
+    def luggage(self) -> list[str]:
+        """What of an agent is carried along then: an array, and the axis of a vector."""
+        vectors = ["pos", "vel", "want", *self.frame_vectors, *(["tie"] if "t0" in self.sorted_fields else [])]
+        vector = [f"{name} {k}" for name in vectors for k in range(self.dimension)]
+        inner = (f"inner{k}" for k in range(len(self.inner)))
+        return [*vector, "mass", "radius", "max_speed", "max_force", *self.frame_numbers, *inner, "ident"]
+
+    @property
+    def luggage_size(self) -> int:
+        """How many numbers that takes, in whole cache lines."""
+        one = LINE // self.itemsize
+        return -(-len(self.luggage) // one) * one
+
+    @functools.cached_property
+    def slots(self) -> dict[str, int]:
+        """Where in the scratch of lanes each running number lies."""
+        d, look = self.dimension, self.look or Look(0.0)
+        runs = [(f"c{k}_", e.sums(d)) for k, e in self.pairs]
+        runs += [(f"near{q}_", sight.nearest or 0) for q, sight in enumerate(self.sights)]
+        runs += [(f"many{q}_", 1) for q in self.averaged]
+        runs += [(f"o{k}_", e.folded(d) if e.obstacle_start else 0) for k, e in enumerate(self.effects)]
+        runs += [(f"g{name}", d) for name in self.targets]
+        runs += [(f"group{k}_", 1 + 3 * d) for k, _ in self.grouped]
+        runs += [("bond", d * bool(self.bonded)), ("far", d * bool(self.far))]
+        edges = [k for k, e in enumerate(self.effects) if e.obstacle_start and e.obstacle_edges]
+        runs += [(f"ahead{k}_", 2) for k in edges]
+        runs += [("found", -(-MOST_FOUND // self.width) * bool(self.looked_up))]
+        runs += [("reach", int(bool(self.bounded or self.looked_up))), ("here", int(self.parting))]
+        runs += [("next", (d + 1) * self.looks_ahead)]
+        runs += [("square", look.agents + self.keyed), ("place", look.agents)]
+        runs += [("gap", look.obstacles), ("which", look.obstacles)]
+        if self.sweeps and self.sorts:
+            runs += [("inside", d * self.space.periodic), ("home", 1), ("mine", self.rows)]
+        names = [f"{name}{j}" for name, many in runs for j in range(many)]
+        return {name: place for place, name in enumerate([*names, "bad"])}
+
+
+def flattened(effects: Sequence[Effect]) -> tuple[Effect, ...]:
+    """Return effects with their behaviours, if they have some, before them: each has laws and numbers of its own."""
+    return tuple(each for effect in effects for each in (*effect.wishes, effect))

@@ -1,0 +1,62 @@
+"""Laws of one agent, as kernels call them: with the numbers of their effects, and sums of what they say."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from flockenv.engine.parameters import Images, images_in, images_of
+from flockenv.jit.decorators import Law, Vec, kernel
+from flockenv.maths.vectors import add
+
+if TYPE_CHECKING:
+    from flockenv.engine.kernel_plan import Parts
+
+__all__ = ["OneLaw", "given_of", "laws_of", "says_of", "sum_of"]
+
+
+class OneLaw(NamedTuple):
+    """A law of one agent."""
+
+    k: int  # which effect it is of
+    law: Law
+    images: Images | None = None
+
+    @classmethod
+    def of(cls, parts: Parts, k: int, slot: str) -> OneLaw:
+        """Return the law that effect k has in a slot."""
+        effect = parts.effects[k]
+        return cls(k, getattr(effect, slot), images_in(parts, effect))
+
+
+def laws_of(parts: Parts, slot: str) -> tuple[OneLaw, ...]:
+    """Return the laws of all effects that have one in a slot, in order."""
+    return tuple(OneLaw.of(parts, k, slot) for k, e in enumerate(parts.effects) if getattr(e, slot) is not None)
+
+
+@functools.cache
+def given_of(k: int, images: Images | None) -> Callable[[Any, Any], Any]:
+    """Return a function `given(numbers, me)`: what the laws of effect k are given, with images nearest to the agent."""
+    if images is None:
+        return kernel(lambda numbers, me: numbers.effects[k])
+    nearest = images_of(images)
+    return kernel(lambda numbers, me: nearest(numbers.effects[k], numbers.size, me.pos))
+
+
+@functools.cache
+def says_of(one: OneLaw) -> Callable[[Any, Any], Any]:
+    """Return a function `says(numbers, me)`: what a law says about an agent."""
+    given, law = given_of(one.k, one.images), one.law
+    return kernel(lambda numbers, me: law(given(numbers, me), me))
+
+
+@functools.cache
+def sum_of(indices: tuple[int, ...]) -> Callable[[Vec, Any], Vec]:
+    """Return a function `total(start, vectors)`: start plus some vectors of a tuple, one after the other."""
+    if not indices:
+        return kernel(lambda start, vectors: start)
+    before, last = sum_of(indices[:-1]), indices[-1]
+    if not indices[1:]:
+        return kernel(lambda start, vectors: add(start, vectors[last]))
+    return kernel(lambda start, vectors: add(before(start, vectors), vectors[last]))

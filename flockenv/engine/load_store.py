@@ -1,0 +1,101 @@
+"""What the agents of a world carry comes into blocks when a call begins, and goes back when it ends."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from flockenv.engine.agent_records import AgentPlan
+from flockenv.engine.blocks import into_blocks, out_of_blocks, put_vector_of, vector_of_lane
+from flockenv.jit.decorators import Law, kernel
+from flockenv.jit.section import in_turn, section
+
+__all__ = ["bring_in_of", "bring_inside_of", "bring_out_of", "take_drive_of"]
+
+
+@functools.cache
+def _read_number(number: int) -> Callable[..., None]:
+    def read(inner: Any, array: Any, b: Any, i: Any) -> None:
+        inner[number][i] = array[number, b, i]
+
+    return kernel(read)
+
+
+@functools.cache
+def _write_number(number: int) -> Callable[..., None]:
+    def write(inner: Any, array: Any, b: Any, i: Any) -> None:
+        array[number, b, i] = inner[number][i]
+
+    return kernel(write)
+
+
+@section
+def _between(agent: AgentPlan, inwards: bool) -> Callable[..., None]:
+    """Make `bring(worlds, scratch, b, first, end)`: copy what these blocks of world b carry into scratch, or back."""
+    d, width, oriented, inner = agent.dimension, agent.width, agent.oriented, len(agent.inner)
+    copy, place = (into_blocks if inwards else out_of_blocks)(d, width), int(oriented)
+    copy_numbers = in_turn(*map(_read_number if inwards else _write_number, range(inner)))
+
+    def bring(worlds: Any, scratch: Any, b: Any, first: Any, end: Any) -> None:
+        n = worlds.x.shape[2]
+        copy(scratch.pos, worlds.x, b, n, first, end)
+        copy(scratch.vel, worlds.v, b, n, first, end)
+        if oriented:
+            copy(scratch.facing, worlds.carried[0][:d], b, n, first, end)
+            if d == 3:
+                copy(scratch.above, worlds.carried[0][d:], b, n, first, end)
+        if inner:
+            for i in range(first * width, min(end * width, n)):
+                copy_numbers(scratch.inner, worlds.carried[place], b, i)
+
+    return bring
+
+
+def bring_in_of(agent: AgentPlan) -> Callable[..., None]:
+    """Return `bring_in(worlds, scratch, b, first, end)`: what these blocks of world b carry comes into scratch."""
+    return _between(agent, True)
+
+
+def bring_out_of(agent: AgentPlan) -> Callable[..., None]:
+    """Return `bring_out(worlds, scratch, b, first, end)`: what has become of these blocks of world b goes back."""
+    return _between(agent, False)
+
+
+@section
+def take_drive_of(dimension: int, width: int, masked: bool) -> Callable[..., None]:
+    """Make `take_drive(scratch, drive, asked, n, first, end)`: what is asked of agents, drive[:, asked], or 0."""
+    into, size = into_blocks(dimension, width), dimension * width
+
+    def take_drive(scratch: Any, drive: Any, asked: Any, n: Any, first: Any, end: Any) -> None:
+        if drive.shape[1] > 0:
+            into(scratch.want, drive, asked, n, first, end)
+            if masked:
+                scratch.spread[1] = ~np.uint64(0)
+        else:
+            if masked:
+                scratch.want[:size] = 0
+                scratch.spread[1] = np.uint64(0)
+            else:
+                scratch.want[first * size : end * size] = 0
+
+    return take_drive
+
+
+@section
+def bring_inside_of(agent: AgentPlan, confine: Law) -> Callable[..., None]:
+    """Make `bring_inside(scratch, size, first, end)`: bring agents into a periodic box, where steps rely on it."""
+    width, count = agent.width, np.uint64(agent.dimension * agent.width)
+    vector, put = vector_of_lane(agent.dimension, width), put_vector_of(agent.dimension, width)
+
+    def bring_inside(scratch: Any, size: Any, first: Any, end: Any) -> None:
+        for block in range(np.uint64(first), np.uint64(end)):
+            base, row = block * count, block * np.uint64(width)
+            for lane in range(np.uint64(width)):
+                x, v = vector(scratch.pos, base + lane), vector(scratch.vel, base + lane)
+                x, v = confine(size, scratch.radius[row + lane], x, v)
+                put(scratch.pos, base + lane, x)
+
+    return bring_inside

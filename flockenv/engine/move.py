@@ -1,0 +1,343 @@
+"""How the agents of a block move once the method has said where to: limits, the space, headings, inner states.
+
+A method of one stage is applied here, too, coordinate by coordinate.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from flockenv.engine.accelerations import felt_of
+from flockenv.engine.agent_records import AgentPlan, agent_plan, alone_of
+from flockenv.engine.blocks import common_places, put_vector_of, vector_of_lane
+from flockenv.engine.kernel_plan import Parts
+from flockenv.engine.law_calls import OneLaw, given_of, says_of
+from flockenv.jit.decorators import Law, Vec, finite, kernel, like
+from flockenv.jit.section import in_turn, section, tuple_from
+from flockenv.maths.counter_rng import normal
+from flockenv.maths.heading import faced, held, leant, raised, turned
+from flockenv.maths.vectors import add, dot, limit, norm, scale, select, sub, zero
+from flockenv.physics.integrators.single_stage import OneStage
+
+__all__ = ["InnerPlan", "MovePlan", "begin_agent_of", "inner_plan", "move_of", "move_plan"]
+
+
+CHANNELS = 8
+"""Channels of random numbers of each effect."""
+
+
+class Kept(NamedTuple):
+    """A law of what goes on inside agents."""
+
+    begin: OneLaw
+    keep: OneLaw
+    felt: int  # where what its pair law has found out lies, see Parts.felt_at; -1: it has none
+
+
+class InnerPlan(NamedTuple):
+    """What changes inside agents depends on."""
+
+    agent: AgentPlan
+    laws: tuple[Kept, ...]
+    numbers: tuple[tuple[tuple[int, int], ...], ...]  # of each number: which laws say it, and as which of theirs
+    felt: int  # numbers of a block in `felt`
+
+
+class MovePlan(NamedTuple):
+    """What moving the agents of a block depends on."""
+
+    agent: AgentPlan
+    masked: bool  # may what is the same for all agents lie where the first block has it?
+    confine: Law
+    bounce: Law | None
+    turns: bool
+    leans: bool
+    flows: bool
+    method: Law | None  # of one stage: where a coordinate and its velocity are a step later
+    kicks: tuple[tuple[int, Law], ...]
+    inner: InnerPlan | None
+    bad: int  # where among the lanes it is noted which agent is not finite
+
+
+def inner_plan(parts: Parts) -> InnerPlan | None:
+    """Return the plan of what goes on inside the agents of a scene, if anything does."""
+    if not parts.inner:
+        return None
+    laws = [
+        Kept(
+            OneLaw.of(parts, k, "begin_law"), OneLaw.of(parts, k, "keep_law"),
+            parts.felt_at(f"n{k}_") if effect.pair_law else -1,
+        )
+        for k, effect in parts.keeping
+    ]  # fmt: skip
+    numbers = tuple(
+        tuple((j, effect.keeps.index(name)) for j, (_, effect) in enumerate(parts.keeping) if name in effect.keeps)
+        for name in parts.inner
+    )
+    return InnerPlan(agent_plan(parts), tuple(laws), numbers, parts.felt_size)
+
+
+def move_plan(parts: Parts) -> MovePlan:
+    """Return the plan of a scene."""
+    kicks = tuple((k, e.kick_law) for k, e in enumerate(parts.effects) if e.kick_law is not None)
+    method = parts.integrator.move() if isinstance(parts.integrator, OneStage) else None
+    space = parts.space
+    return MovePlan(
+        agent_plan(parts), parts.arranges, space.confine_law, space.bounce_law, parts.turns, parts.leans, parts.flows,
+        method, kicks, inner_plan(parts), parts.slots["bad"] * parts.width,
+    )  # fmt: skip
+
+
+# --- where the method leads -------------------------------------------------------------------------------------------
+
+
+@section
+def _moved(plan: MovePlan) -> Callable[..., Any]:
+    """Make `moved(scratch, pos, vel, at, past, dt)`: where an agent was, its velocity, and both as the method has them.
+
+    It lies at `at`; what the method put aside of it, at `past` of `aside`. By a method of one stage that is its
+    acceleration; by any other where it was, and how fast if bodies bounce.
+    """
+    dimension, vector, bounces = plan.agent.dimension, vector_of_lane(*plan.agent[:2]), plan.bounce is not None
+    method, flows = plan.method, plan.flows
+
+    def moved(scratch: Any, pos: Any, vel: Any, at: Any, past: Any, dt: Any) -> Any:
+        x, v = vector(pos, at), vector(vel, at)
+        if method is None:
+            was, earlier = vector(scratch.aside, at), v
+            if bounces:
+                earlier = vector(scratch.aside, np.uint64(len(pos)) + at)
+            return was, earlier, x, v
+        a = vector(scratch.aside, past)
+        x0, v0 = method(x[0], v[0], a[0], dt)
+        x1, v1 = method(x[1], v[1], a[1], dt)
+        there: Any = (x0, x1)
+        fast: Any = (v0, v1)
+        if dimension == 3:
+            x2, v2 = method(x[2], v[2], a[2], dt)
+            there, fast = (x0, x1, x2), (v0, v1, v2)
+        if flows:
+            there = add(there, scale(vector(scratch.carrying, at), dt))
+        return x, v, there, fast
+
+    return moved
+
+
+@functools.cache
+def _draws(channel: int) -> Callable[..., float]:
+    """Return `draws(drawn, instant, i, dt)`: a number of (world, step, agent, channel), as precise as dt."""
+    return kernel(lambda drawn, instant, i, dt: like(dt, normal(drawn, instant, np.int64(i), channel)))  # type: ignore[arg-type]
+
+
+@functools.cache
+def _kicked(kicks: tuple[tuple[int, Law], ...], dimension: int) -> Callable[..., tuple[Vec, Vec]]:
+    """Return `kicked(numbers, me, free, drawn, instant, dt, x, v)`: x and v with what is added once per step."""
+    before, (k, law) = _kicked(kicks[:-1], dimension) if kicks[1:] else None, kicks[-1]
+    draws = tuple_from(*(_draws(CHANNELS * k + j) for j in range(dimension)))
+
+    def kicked(numbers: Any, me: Any, free: Any, drawn: Any, instant: Any, dt: Any, x: Any, v: Any) -> Any:
+        if before is not None:
+            x, v = before(numbers, me, free, drawn, instant, dt, x, v)
+        says = law(numbers.effects[k], me, dt, draws(drawn, instant, me.who, dt))
+        kick = select(free, says, zero(x))
+        return add(x, scale(kick, like(dt, 0.5) * dt)), add(v, kick)  # as if it came in the middle of the step
+
+    return kernel(kicked)
+
+
+# --- headings ---------------------------------------------------------------------------------------------------------
+
+
+@section
+def _turned(plan: MovePlan) -> Callable[..., Any]:
+    """Make `turn(scratch, i, at, dt, was, x, v)`: x, v and heading of an agent that turns by max_turn_rate dt at most.
+
+    Neither its velocity nor its way in this step does; what a medium adds to its way is none of its doing.
+    """
+    vector, flows = vector_of_lane(*plan.agent[:2]), plan.flows
+
+    def turn(scratch: Any, i: Any, at: Any, dt: Any, was: Any, x: Any, v: Any) -> Any:
+        most = min(scratch.max_turn_rate[i] * dt, like(dt, np.pi))
+        before, way = vector(scratch.facing, at), sub(x, was)
+        if flows:
+            way = sub(x, add(was, scale(vector(scratch.carrying, at), dt)))
+        there, over = turned(way, before, most)
+        x = add(x, sub(held(way, there, over), way))
+        ahead, over = turned(v, before, most)
+        return x, held(v, ahead, over), ahead
+
+    return turn
+
+
+@section
+def _facing(plan: MovePlan) -> Callable[..., None]:
+    """Make `face(scratch, i, at, dt, v, ahead)`: write where agent i faces after the step, and which way is up.
+
+    An agent whose turn rate is limited turns while it stands still, too: `ahead` is as far as it has come.
+    """
+    dimension, vector, put = plan.agent.dimension, vector_of_lane(*plan.agent[:2]), put_vector_of(*plan.agent[:2])
+    turns, leans = plan.turns, plan.leans
+
+    def face(scratch: Any, i: Any, at: Any, dt: Any, v: Any, ahead: Any) -> None:
+        before = vector(scratch.facing, at)
+        now = faced(v, ahead) if turns else faced(v, before)
+        put(scratch.facing, at, now)
+        if dimension == 3:
+            up = vector(scratch.above, at)
+            if leans:
+                up = leant(now, before, up, norm(v), dt, scratch.banking[i])
+            put(scratch.above, at, raised(now, before, up))
+
+    return face
+
+
+# --- inner states -----------------------------------------------------------------------------------------------------
+
+
+@functools.cache
+def _becomes(number: int, said: tuple[tuple[int, int], ...]) -> Callable[[Any, Any], float]:
+    """Return `becomes(was, says)`: a number as its only law says, or what it was and what several laws change."""
+    if said[1:]:
+        return _changed(number, said)
+    ((law, place),) = said
+    return kernel(lambda was, says: says[law][place])
+
+
+@functools.cache
+def _changed(number: int, said: tuple[tuple[int, int], ...]) -> Callable[[Any, Any], float]:
+    """Return `changed(was, says)`: what a number was, and the changes to it by several laws."""
+    before, (law, place) = _changed(number, said[:-1]) if said[1:] else None, said[-1]
+    if before is None:
+        return kernel(lambda was, says: was[number] + (says[law][place] - was[number]))
+    return kernel(lambda was, says: before(was, says) + (says[law][place] - was[number]))
+
+
+def _all_become(plan: InnerPlan) -> Callable[..., tuple[float, ...]]:
+    return tuple_from(*(_becomes(number, said) for number, said in enumerate(plan.numbers)))
+
+
+@functools.cache
+def _keeps(plan: InnerPlan, kept: Kept) -> Callable[..., Any]:
+    """Return `keeps(numbers, scratch, me, row, lane, dt)`: what a law says of the numbers that it keeps."""
+    given, law, agent = given_of(kept.keep.k, kept.keep.images), kept.keep.law, plan.agent
+    felt = felt_of(agent.dimension, agent.width, plan.felt, kept.felt) if kept.felt >= 0 else None
+
+    def keeps(numbers: Any, scratch: Any, me: Any, row: Any, lane: Any, dt: Any) -> Any:
+        if felt is not None:
+            return law(given(numbers, me), me, felt(scratch, row, lane), dt)
+        return law(given(numbers, me), me, zero(me.pos), dt)
+
+    return kernel(keeps)
+
+
+@functools.cache
+def _put_number(number: int) -> Callable[..., None]:
+    """Return `put(inner, i, was, now, alive)`: write a number of agent i, of which that of a dead one stays."""
+
+    def put(inner: Any, i: Any, was: Any, now: Any, alive: Any) -> None:
+        inner[number][i] = now[number] if alive else was[number]
+
+    return kernel(put)
+
+
+@functools.cache
+def _all_finite(count: int) -> Callable[[Any], bool]:
+    """Return `sound(now)`: are all numbers finite?"""
+    total = _total(count)
+    return kernel(lambda now: finite(total(now)))
+
+
+@functools.cache
+def _total(count: int) -> Callable[[Any], float]:
+    before, last = _total(count - 1) if count > 1 else None, count - 1
+    if before is None:
+        return kernel(lambda now: now[last])
+    return kernel(lambda now: before(now) + now[last])
+
+
+@section
+def _keep(plan: InnerPlan) -> Callable[..., bool]:
+    """Make `keep(scratch, numbers, me, i, row, lane, dt)`: write what goes on inside agent i; is that a number?"""
+    says, become = tuple_from(*(_keeps(plan, kept) for kept in plan.laws)), _all_become(plan)
+    put, sound = in_turn(*map(_put_number, range(len(plan.numbers)))), _all_finite(len(plan.numbers))
+
+    def keep(scratch: Any, numbers: Any, me: Any, i: Any, row: Any, lane: Any, dt: Any) -> Any:
+        now = become(me.inner, says(numbers, scratch, me, row, lane, dt))
+        put(scratch.inner, i, me.inner, now, scratch.living[i] > like(dt, 0.0))
+        return sound(now)
+
+    return keep
+
+
+@section
+def begin_agent_of(plan: InnerPlan) -> Callable[..., tuple[float, ...]]:
+    """Make `begin(numbers, me)`: what goes on inside an agent that comes into being."""
+    says, become = tuple_from(*(says_of(kept.begin) for kept in plan.laws)), _all_become(plan)
+
+    def begin(numbers: Any, me: Any) -> Any:
+        return become(me.inner, says(numbers, me))
+
+    return begin
+
+
+# --- a block ----------------------------------------------------------------------------------------------------------
+
+
+@section
+def move_of(plan: MovePlan) -> Callable[..., None]:
+    """Make `move(context, pos, vel, time, dt, instant, block, past)`: move the agents of a block.
+
+    past: where what was put aside of them begins, see `_moved`; instant: how many steps the world has made. No agent
+    moves faster than max_speed, whatever a method makes of its velocity within the step. Which one is not finite, the
+    lowest in each lane, is noted.
+    """
+    agent, d, width = plan.agent, plan.agent.dimension, plan.agent.width
+    size, bad, put = np.uint64(d * width), np.uint64(plan.bad), put_vector_of(d, width)
+    alone, common, moved = alone_of(agent), common_places(d, width, plan.masked), _moved(plan)
+    kicked = _kicked(plan.kicks, d) if plan.kicks else None
+    turn = _turned(plan) if plan.turns else None
+    face = _facing(plan) if agent.oriented else None
+    keep = _keep(plan.inner) if plan.inner is not None else None
+    confine, bounce = plan.confine, plan.bounce
+
+    def move(context: Any, pos: Any, vel: Any, time: Any, dt: Any, instant: Any, block: Any, past: Any) -> None:
+        scratch, numbers, drawn = context.scratch, context.numbers, context.key[context.b]
+        lanes, ident, well = scratch.lanes, scratch.ident, like(dt, np.inf)
+        base, row = block * size, block * np.uint64(width)
+        one, live, _ = common(scratch, context.n, context.present, block)
+        for lane in range(np.uint64(width)):
+            i, at = row + lane, base + lane
+            was, earlier, x, v = moved(scratch, pos, vel, at, past + lane, dt)
+            if kicked is not None:
+                me = alone(scratch, drawn, time, at, i, i, x, v, zero(x))
+                free = (scratch.living[i] > like(dt, 0.0)) & (scratch.mass[i] < like(dt, np.inf))
+                x, v = kicked(numbers, me, free, drawn, instant, dt, x, v)
+            where = well if finite(dot(x, x) + dot(v, v)) else ident[i]
+            lanes[bad + lane] = where if where < lanes[bad + lane] else lanes[bad + lane]
+            ahead = x
+            if turn is not None:
+                x, v, ahead = turn(scratch, i, at, dt, was, x, v)
+            fastest, living = scratch.max_speed[one + lane], scratch.living[live + lane]
+            x = add(was, scale(limit(sub(x, was), fastest * dt), living))
+            if bounce is not None:
+                x, v = bounce(
+                    numbers.size, scratch.radius[one + lane], numbers.space[0], dt, was, scale(earlier, living), x,
+                    scale(limit(v, fastest), living),
+                )  # fmt: skip
+                v = limit(v, fastest)
+            else:
+                x, v = confine(numbers.size, scratch.radius[one + lane], x, scale(limit(v, fastest), living))
+            if face is not None:
+                face(scratch, i, at, dt, v, ahead)
+            put(pos, at, x)
+            put(vel, at, v)
+            if keep is not None:
+                me = alone(scratch, drawn, time, at, i, i, x, v, zero(x))
+                where = well if keep(scratch, numbers, me, i, row, lane, dt) else ident[i]
+                lanes[bad + lane] = where if where < lanes[bad + lane] else lanes[bad + lane]
+
+    return move

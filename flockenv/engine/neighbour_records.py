@@ -1,0 +1,112 @@
+"""Agents as pair laws see them: in a lane of a block, or as a candidate whom the block meets."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from flockenv.engine.blocks import place_of
+from flockenv.engine.lane_access import gather
+from flockenv.engine.neighbour_lists import Listing
+from flockenv.jit.decorators import kernel
+from flockenv.jit.section import record, section
+from flockenv.maths.vectors import zero
+from flockenv.physics.effects.effect import Me
+
+__all__ = ["Besides", "Block", "Candidate", "agent_listed", "candidate_listed", "tie_of", "with_tie"]
+
+
+class Candidate(NamedTuple):
+    """An agent that is listed, as pair laws see it; what no law reads is 0."""
+
+    pos: Any
+    vel: Any
+    tie: Any
+    who: Any
+    radius: Any
+    mass: Any
+    inner: Any
+
+
+class Besides(NamedTuple):
+    """What only some scenes look at while agents meet: empty tuples in all others."""
+
+    scenery: Any  # obstacle_x, obstacle_radius, params, world: of sights that obstacles hide
+    ties: Any  # tie, ident, order: of ties that are not listed
+
+
+@section
+def agent_listed(listing: Listing, inner: tuple[str, ...], oriented: bool) -> Callable[..., Me]:
+    """Make `agent(array, at, time, drawn)`: the agent in a lane of a block, as pair laws see it."""
+    pos, vel, tie, aim, heading = (
+        listing.lanes_of(listing.axes(x)) for x in ("x", "v", "t", "a", "d" if oriented else "h")
+    )
+    numbers = listing.lanes_of(("who", "mass", "radius", "max_speed", "max_force", "desired_speed"))
+    inside, kind, feels = _inner_fields(inner), record(inner), bool(inner)
+    within = listing.lanes_of(inside)
+
+    def agent(array: Any, at: Any, time: Any, drawn: Any) -> Any:
+        x = gather(array, at, pos)
+        who, mass, radius, max_speed, max_force, wished = gather(array, at, numbers)
+        return Me(
+            who, x, gather(array, at, vel), gather(array, at, heading), mass, radius, max_speed, max_force,
+            gather(array, at, tie), time, zero(x), drawn, gather(array, at, aim), wished,
+            kind(*gather(array, at, within)) if feels else (),
+        )  # fmt: skip
+
+    return agent
+
+
+def _inner_fields(inner: tuple[str, ...]) -> tuple[str, ...]:
+    """Return the fields of what goes on inside an agent."""
+    return tuple(f"inner{k}" for k in range(len(inner)))
+
+
+@section
+def candidate_listed(listing: Listing, inner: tuple[str, ...]) -> Callable[..., Candidate]:
+    """Make `candidate(array, at)`: the agent whose record, or place in rows, begins at `at`."""
+    pos, vel, tie = (listing.listed(listing.axes(letter)) for letter in "xvt")
+    numbers, within = listing.listed(("who", "radius", "mass")), listing.listed(_inner_fields(inner))
+    kind, feels = record(inner), bool(inner)
+
+    def candidate(array: Any, at: Any) -> Any:
+        who, radius, mass = gather(array, at, numbers)
+        felt = kind(*gather(array, at, within)) if feels else ()
+        return Candidate(
+            gather(array, at, pos), gather(array, at, vel), gather(array, at, tie), who, radius, mass, felt
+        )
+
+    return candidate
+
+
+@kernel
+def with_tie(me: Me, tie: Any) -> Me:
+    """Return an agent with its tie, where that was not listed."""
+    return Me(
+        me.who, me.pos, me.vel, me.heading, me.mass, me.radius, me.max_speed, me.max_force, tie, me.time, me.medium,
+        me.key, me.aim, me.desired_speed, me.inner,
+    )  # fmt: skip
+
+
+@section
+def tie_of(dimension: int, width: int) -> Callable[..., Any]:
+    """Make `tie(ties, i)`: the tie of agent i."""
+    vector, place = tuple(k * width for k in range(dimension)), place_of(dimension, width)
+    return lambda ties, i: gather(ties[0], place(np.uint64(ties[1][i])), vector)
+
+
+class Block(NamedTuple):
+    """A block of listed agents, for whom candidates are met."""
+
+    mine: Any  # what its agents are read from: lanes, or rows
+    first: Any  # where the first lies there
+    theirs: Any  # what candidates are read from: records, or rows
+    lanes: Any  # running numbers
+    number: Any  # (W,) which lane is which
+    at: Any  # the first of its agents, and
+    upto: Any  # one past the last, as they are listed
+    ranges: Any  # (found, 3) its candidates
+    time: Any  # s
+    drawn: Any  # the key of what is drawn at random

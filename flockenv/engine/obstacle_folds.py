@@ -1,0 +1,201 @@
+"""What a fold does with one obstacle: how its law sees it, and what it keeps.
+
+A law meets circles as they are, and of any other shape one point (`effects.base.Obstacle`): the nearest of its surface,
+or, where the law casts a ray, the one that it touches first.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from flockenv.engine.lane_access import chosen, gather, scatter
+from flockenv.engine.obstacle_plan import Fold
+from flockenv.engine.shape_rows import Surroundings, number_of
+from flockenv.engine.visibility import blocked
+from flockenv.geometry.shapes.ray_contact import touched_offset, touched_spot
+from flockenv.geometry.shapes.round import normal, touched_normal
+from flockenv.geometry.shapes.table import law_of
+from flockenv.jit.decorators import kernel, like
+from flockenv.jit.section import in_turn, section
+from flockenv.maths.vectors import add, dot, norm, scale, sub, zero
+from flockenv.physics.effects.effect import Obstacle
+from flockenv.steering.around import threat
+
+__all__ = ["meet_circle", "meet_shape"]
+
+CIRCLE = -1
+"""What is noted as the form of a circle of the state."""
+
+PIECED = ("chain", "hollow_chain", "hollow_block")
+"""Forms that a law may meet piece by piece: side after side."""
+
+SIDE_BY_SIDE = ("block", "half_space")
+"""Forms whose laws have no branches: lanes are one vector there, and a choice costs less than a branch."""
+
+SHORT = 1 - 1e-6
+"""Share of the way to a surface on which nothing may stand, if it is to be seen: not the surface itself."""
+
+
+# --- what is kept -----------------------------------------------------------------------------------------------------
+
+
+@functools.cache
+def _in_sight(around: Surroundings | None) -> Callable[..., bool]:
+    """Make `in_sight(world, me, gap, out)`: does nothing stand in the way to the nearest place of a surface?"""
+    if around is None:
+        return kernel(lambda world, me, gap, out: True)
+    hidden = blocked(around)
+
+    def in_sight(world: Any, me: Any, gap: Any, out: Any) -> Any:
+        obstacle_x, obstacle_radius, params, size, b = world
+        way = scale(out, -gap * like(gap, SHORT))
+        return (gap <= like(gap, 0.0)) or not hidden(obstacle_x, obstacle_radius, params, size, b, me.time, me.pos, way)
+
+    return kernel(in_sight)
+
+
+@section
+def _keeps(fold: Fold) -> Callable[..., None]:
+    """Make `keep(p, world, me, it, form, place, lanes, lane)`: how a fold goes on with an obstacle, as it sees it.
+
+    Where it keeps another number of what is ahead than before, it notes by form and place what that is.
+    """
+    law, slots, ahead, notes = fold.law, fold.slots, fold.ahead, bool(fold.ahead)
+    occluded, in_sight = fold.hidden is not None, _in_sight(fold.hidden)
+
+    def keep(p: Any, world: Any, me: Any, it: Any, form: Any, place: Any, lanes: Any, lane: Any) -> None:
+        was = gather(lanes, lane, slots)
+        found = law(p, me, it, was)
+        if notes:
+            what = like(found[0], form), like(found[0], place)
+            scatter(lanes, lane, ahead, chosen(found[0] != was[0], what, gather(lanes, lane, ahead)))
+        if occluded:
+            scatter(lanes, lane, slots, chosen(in_sight(world, me, it.gap, it.normal), found, was))
+        else:
+            scatter(lanes, lane, slots, found)
+
+    return keep
+
+
+# --- a circle of the state --------------------------------------------------------------------------------------------
+
+
+def meet_circle(folds: tuple[Fold, ...]) -> Callable[..., None]:
+    """Return `meet(numbers, world, me, to, rho, m, lanes, lane)`: all folds meet circle m of the state.
+
+    to: the way to its centre; rho: its radius, m.
+    """
+    return in_turn(*(_circle(fold, j) for fold in folds for j in range(fold.rays)))
+
+
+@section
+def _circle(fold: Fold, j: int) -> Callable[..., None]:
+    """Make the same of one fold, and ray j if it casts rays."""
+    k, ray_of, origin, keep = fold.k, fold.ray, fold.origin, _keeps(fold)
+    cast, elsewhere = fold.ray is not None, fold.origin is not None
+
+    def meet(numbers: Any, world: Any, me: Any, to: Any, rho: Any, m: Any, lanes: Any, lane: Any) -> None:
+        p, o, far = numbers.effects[k], zero(me.pos), like(rho, np.inf)
+        if cast:
+            ray, margin = ray_of(p, me, j)
+            hit = threat(ray, to, me.radius + rho + margin, far)
+            out = touched_normal(to, ray, hit)
+            it = Obstacle(like(rho, m), to, dot(to, to), o, rho, o, norm(to) - rho, out, hit, ray)
+        else:
+            way = sub(to, origin(p, me)) if elsewhere else to
+            it = Obstacle(like(rho, m), way, dot(way, way), o, rho, o, norm(way) - rho, normal(way), far, o)
+        keep(p, world, me, it, CIRCLE, m, lanes, lane)
+
+    return meet
+
+
+# --- any other shape --------------------------------------------------------------------------------------------------
+
+
+def meet_shape(folds: tuple[Fold, ...], form: str) -> Callable[..., None]:
+    """Return `meet(numbers, world, params, me, shape, lanes, lane)`: all folds meet a shape of a form."""
+    pieced = {fold for fold in folds if fold.pieces and form in PIECED}
+    return in_turn(
+        *(
+            _pieces(fold, form) if fold in pieced else _touched(fold, form, j) if fold.ray else _near(fold, form)
+            for fold in folds
+            for j in range(fold.rays)
+        )
+    )
+
+
+@section
+def _near(fold: Fold, form: str) -> Callable[..., None]:
+    """Make what one fold that casts no rays does."""
+    k, origin, keep, number = fold.k, fold.origin, _keeps(fold), number_of(form)
+    elsewhere, nearest = fold.origin is not None, law_of("nearest", form)
+
+    def meet(numbers: Any, world: Any, params: Any, me: Any, shape: Any, lanes: Any, lane: Any) -> None:
+        p, o = numbers.effects[k], zero(me.pos)
+        if elsewhere:
+            gap, out = nearest(params, shape.at, add(shape.y, origin(p, me)))
+        else:
+            gap, out = shape.gap, shape.out
+        to = touched_offset(o, like(gap, 0.0), out, gap, gap)
+        who, none, far = params[shape.at + 1], like(gap, 0.0), like(gap, np.inf)
+        it = Obstacle(who, to, dot(to, to), shape.vel, none, o, gap, out, far, o)
+        keep(p, world, me, it, number, shape.place, lanes, lane)
+
+    return meet
+
+
+@section
+def _touched(fold: Fold, form: str, j: int) -> Callable[..., None]:
+    """Make what one fold does that casts rays, with ray j.
+
+    Where the ray touches nothing the normal is that of the nearest place, which is known.
+    """
+    k, ray_of, keep, number = fold.k, fold.ray, _keeps(fold), number_of(form)
+    nearest, hit_of, chooses = law_of("nearest", form), law_of("hit", form), form in SIDE_BY_SIDE
+
+    def meet(numbers: Any, world: Any, params: Any, me: Any, shape: Any, lanes: Any, lane: Any) -> None:
+        p, at, y, gap = numbers.effects[k], shape.at, shape.y, shape.gap
+        ray, margin = ray_of(p, me, j)
+        room, none = me.radius + margin, like(gap, 0.0)
+        hit = none if gap < room else hit_of(params, at, y, ray, room)
+        if chooses:
+            out = nearest(params, at, touched_spot(y, ray, hit, room))[1]
+        else:
+            touches = (hit > none) & (hit < like(gap, np.inf))
+            out = nearest(params, at, touched_spot(y, ray, hit, room))[1] if touches else shape.out
+        to = touched_offset(ray, hit, out, room, gap)
+        it = Obstacle(params[at + 1], to, dot(to, to), shape.vel, none, zero(me.pos), gap, out, hit, ray)
+        keep(p, world, me, it, number, shape.place, lanes, lane)
+
+    return meet
+
+
+@section
+def _pieces(fold: Fold, form: str) -> Callable[..., None]:
+    """Make what one fold does that meets a shape side after side: the nearest place of each that acts by itself.
+
+    Where nothing is near enough its sides are not either.
+    """
+    k, reach, keep, number = fold.k, fold.reach, _keeps(fold._replace(hidden=None, ahead=())), number_of(form)
+    pieces_of, piece_of, reaches = law_of("pieces", form), law_of("piece", form), fold.reach is not None
+    in_sight = _in_sight(fold.hidden)
+
+    def meet(numbers: Any, world: Any, params: Any, me: Any, shape: Any, lanes: Any, lane: Any) -> None:
+        p, at, y, gap, o = numbers.effects[k], shape.at, shape.y, shape.gap, zero(me.pos)
+        near = gap < reach(p, me) if reaches else True
+        if near:
+            for piece in range(pieces_of(params, at, y, gap)):
+                far, side, acts = piece_of(params, at, piece, y, gap, shape.out)
+                if acts and in_sight(world, me, far, side):
+                    none = like(far, 0.0)
+                    to = touched_offset(o, none, side, far, far)
+                    it = Obstacle(
+                        params[at + 1], to, dot(to, to), shape.vel, none, o, far, side, like(far, np.inf), o
+                    )  # fmt: skip
+                    keep(p, world, me, it, number, shape.place, lanes, lane)
+
+    return meet

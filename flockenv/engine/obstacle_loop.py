@@ -1,0 +1,359 @@
+"""Folds over the obstacles, all of them in one pass: circles of the state, which may differ from world to world, then
+the other shapes: what is not round, moves, or is hollow. These are met where they are at the time of the stage.
+
+Where there are many shapes of a form, each agent meets those that may lie within reach by a grid (shapes/cells.py), in
+the order in which they are listed; that is where the others, which a law leaves alone, would have been met too: so
+results are the same bits.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from flockenv.engine.agent_records import AgentPlan, alone_of
+from flockenv.engine.blocks import vector_of, vector_of_lane
+from flockenv.engine.lane_access import scatter
+from flockenv.engine.obstacle_folds import meet_circle, meet_shape
+from flockenv.engine.obstacle_plan import Fold, Obstacles, Place, Shape
+from flockenv.engine.shape_rows import near_rows
+from flockenv.engine.silhouette import aside_of
+from flockenv.geometry.shapes.edges import near_way
+from flockenv.geometry.shapes.row_header import outside_box, shift_of, velocity_of
+from flockenv.geometry.shapes.table import law_of
+from flockenv.jit.decorators import Vec, kernel, law, like
+from flockenv.jit.section import in_turn, section, vector
+from flockenv.maths.vectors import add, dot, scale, sub, zero
+
+__all__ = ["obstacles_of"]
+
+LOOSE = 1 + 1e-6
+"""Factor of a reach, so that single precision loses nothing that a law would have met."""
+
+
+@section
+def obstacles_of(plan: Obstacles) -> Callable[..., None]:
+    """Make `meet_obstacles(context, pos, vel, time, block)`: what one block's folds over the obstacles come to.
+
+    It is written into `lanes`, where the plan says; time, s.
+    """
+    d, width, arranges = plan.agent.dimension, plan.agent.width, plan.arranges
+    size, wide = np.uint64(d * width), np.uint64(width)
+    forms = (
+        _in_turn(plan, j) if form.name not in plan.looked_up else _looked_up(plan, j)
+        for j, form in enumerate(plan.around.forms)
+    )
+    edges = (_asides(plan, fold) for fold in plan.folds if fold.ahead)
+    passes = in_turn(_starts(plan), _circles(plan), *forms, *edges)
+
+    def meet_obstacles(context: Any, pos: Any, vel: Any, time: Any, block: Any) -> None:
+        base, row = block * size, block * wide
+        one = row & context.scratch.spread[0] if arranges else row
+        passes(context, pos, vel, time, Place(base, row, one))
+
+    return meet_obstacles
+
+
+@section
+def _agent_of(plan: AgentPlan) -> Callable[..., Any]:
+    """Make `agent(scratch, drawn, pos, vel, time, place, lane)`: an agent of a block, as its laws see it."""
+    vector_at, alone = vector_of_lane(plan.dimension, plan.width), alone_of(plan)
+
+    def agent(scratch: Any, drawn: Any, pos: Any, vel: Any, time: Any, place: Any, lane: Any) -> Any:
+        at = place.base + lane
+        x, v = vector_at(pos, at), vector_at(vel, at)
+        return alone(scratch, drawn, time, at, place.row + lane, place.one + lane, x, v, zero(x))
+
+    return agent
+
+
+@functools.cache
+def _world_of(plan: Obstacles) -> Callable[..., Any]:
+    """Make `world(context)`: what is asked of the world in order to know what obstacles hide; nothing if none asks."""
+    if all(fold.hidden is None for fold in plan.folds):
+        return kernel(lambda context: ())
+
+    def world(context: Any) -> Any:
+        return (
+            context.obstacle_x, context.obstacle_radius, context.params, context.numbers.size, context.b
+        )  # fmt: skip
+
+    return kernel(world)
+
+
+# --- how folds begin --------------------------------------------------------------------------------------------------
+
+
+@section
+def _starts(plan: Obstacles) -> Callable[..., None]:
+    """Make how all folds of a block begin, and note how far they look."""
+    width, agent, begin = plan.agent.width, _agent_of(plan.agent), in_turn(*(_start(plan, f) for f in plan.folds))
+    reach, limited = np.uint64(max(plan.reach, 0)), plan.reach >= 0
+    furthest: Any = _furthest(plan.folds) if limited else None
+
+    def starts(context: Any, pos: Any, vel: Any, time: Any, place: Any) -> None:
+        scratch, numbers, drawn = context.scratch, context.numbers, context.key[context.b]
+        lanes = scratch.lanes
+        for lane in range(np.uint64(width)):
+            me = agent(scratch, drawn, pos, vel, time, place, lane)
+            begin(scratch, numbers, me, place.row, lanes, lane)
+            if limited:
+                lanes[reach + lane] = furthest(numbers, me)
+
+    return starts
+
+
+@section
+def _start(plan: Obstacles, fold: Fold) -> Callable[..., None]:
+    """Make `start(scratch, numbers, me, row, lanes, lane)`: how one of them begins."""
+    k, start, slots, told = fold.k, fold.start, fold.slots, fold.told >= 0
+    each, place = np.uint64(plan.felt // plan.agent.width), np.uint64(max(fold.told, 0))
+    vector_at = vector_of_lane(plan.agent.dimension, plan.agent.width)
+
+    def begin(scratch: Any, numbers: Any, me: Any, row: Any, lanes: Any, lane: Any) -> None:
+        if told:
+            others = vector_at(scratch.felt, row * each + place + lane)
+            scatter(lanes, lane, slots, start(numbers.effects[k], me, others))
+        else:
+            scatter(lanes, lane, slots, start(numbers.effects[k], me))
+
+    return begin
+
+
+@functools.cache
+def _furthest(folds: tuple[Fold, ...]) -> Callable[..., float]:
+    """Make `furthest(numbers, me)`: how far the fold looks that looks furthest, m."""
+    before, k, reach = _furthest(folds[:-1]) if folds[1:] else None, folds[-1].k, folds[-1].reach
+
+    def furthest(numbers: Any, me: Any) -> Any:
+        mine = reach(numbers.effects[k], me)
+        return mine if before is None else max(before(numbers, me), mine)
+
+    return kernel(furthest)
+
+
+# --- what they meet ---------------------------------------------------------------------------------------------------
+
+
+@section
+def _circles(plan: Obstacles) -> Callable[..., None]:
+    """Make how all agents of a block, side by side, meet every circle of the state."""
+    width, agent, circle = plan.agent.width, _agent_of(plan.agent), vector_of(plan.agent.dimension)
+    offset_to, meet, world_of = plan.around.offset_to, meet_circle(plan.folds), _world_of(plan)
+
+    def circles(context: Any, pos: Any, vel: Any, time: Any, place: Any) -> None:
+        scratch, numbers, b, world = context.scratch, context.numbers, context.b, world_of(context)
+        radius, lanes, drawn = context.obstacle_radius, scratch.lanes, context.key[b]
+        if place.row == 0:
+            context.work[b, 3] += context.n * radius.shape[1]
+        for m in range(radius.shape[1]):
+            rho = radius[b, m]
+            if rho > 0:
+                centre = circle(context.obstacle_x, b, m)
+                for lane in range(np.uint64(width)):
+                    me = agent(scratch, drawn, pos, vel, time, place, lane)
+                    meet(numbers, world, me, offset_to(numbers.size, me.pos, centre), rho, m, lanes, lane)
+
+    return circles
+
+
+@section
+def _placed(dimension: int, moving: bool) -> Callable[..., tuple[Vec, Vec]]:
+    """Make `placed(params, at, time)`: where the shape at `at` is at a time (s), m, and how fast it moves, m/s."""
+    vector_at = vector(dimension)
+
+    def placed(params: Any, at: Any, time: Any) -> Any:
+        place = vector_at(params, at + 2)
+        if moving:
+            return add(place, shift_of(params, at, time, place)), velocity_of(params, at, time, place)
+        return place, zero(place)
+
+    return placed
+
+
+@section
+def _row(plan: Obstacles, form: str) -> Callable[..., None]:
+    """Make `meet(numbers, world, params, me, at, place, where, vel, lanes, lane)`: one agent meets a shape.
+
+    It is left alone where it does not come within reach. where: its anchor, m; vel: m/s.
+    """
+    offset_to, nearest, meet = plan.around.offset_to, law_of("nearest", form), meet_shape(plan.folds, form)
+    bounded, picks, reach = (
+        form in plan.bounded,
+        form in plan.looked_up and plan.only_rays,
+        np.uint64(max(plan.reach, 0)),
+    )
+    near_a_ray: Any = _near_a_ray(plan.folds) if picks else None
+
+    def meet_row(
+        numbers: Any, world: Any, params: Any, me: Any, at: Any, place: Any, where: Any, vel: Any, lanes: Any, lane: Any
+    ) -> None:
+        y = offset_to(numbers.size, where, me.pos)
+        if picks:  # noqa: SIM102  # numba drops the branch by this alone
+            if not near_a_ray(numbers, params, at, y, me, lanes[reach + lane] * like(y[0], LOOSE)):
+                return
+        if bounded:
+            beside, seen = outside_box(params, at, y), lanes[reach + lane]
+            if not (dot(beside, beside) < seen * seen):
+                return
+        gap, out = nearest(params, at, y)
+        meet(numbers, world, params, me, Shape(at, place, y, vel, gap, out), lanes, lane)
+
+    return meet_row
+
+
+@section
+def _in_turn(plan: Obstacles, j: int) -> Callable[..., None]:
+    """Make how all agents of a block, side by side, meet every shape of form j."""
+    width, agent, world_of = plan.agent.width, _agent_of(plan.agent), _world_of(plan)
+    placed, meet = _placed(plan.agent.dimension, plan.around.moving), _row(plan, plan.around.forms[j].name)
+
+    def shapes(context: Any, pos: Any, vel: Any, time: Any, place: Any) -> None:
+        scratch, numbers, b, world = context.scratch, context.numbers, context.b, world_of(context)
+        params, lanes, drawn = context.params, scratch.lanes, context.key[b]
+        at, many = numbers.forms[j].at, numbers.forms[j].many
+        if place.row == 0:
+            context.work[b, 3] += context.n * many
+        for m in range(many):
+            where, glide = placed(params, at, time)
+            for lane in range(np.uint64(width)):
+                me = agent(scratch, drawn, pos, vel, time, place, lane)
+                meet(numbers, world, params, me, at, m, where, glide, lanes, lane)
+            at += np.int64(params[at])
+
+    return shapes
+
+
+@section
+def _looked_up(plan: Obstacles, j: int) -> Callable[..., None]:
+    """Make how each agent of a block meets the shapes of form j that may lie within reach, in order."""
+    width, agent, world_of = plan.agent.width, _agent_of(plan.agent), _world_of(plan)
+    placed, meet = _placed(plan.agent.dimension, plan.around.moving), _row(plan, plan.around.forms[j].name)
+    near, box = near_rows(plan.around.offset_to, plan.agent.dimension), _box(plan.folds, plan.only_rays)
+    first, reach = plan.found, np.uint64(plan.reach)
+
+    def shapes(context: Any, pos: Any, vel: Any, time: Any, place: Any) -> None:
+        scratch, numbers, b, world = context.scratch, context.numbers, context.b, world_of(context)
+        params, lanes, drawn, mine = context.params, scratch.lanes, context.key[b], numbers.forms[j]
+        if place.row == 0:
+            context.work[b, 3] += context.n * mine.many
+        for lane in range(np.uint64(width)):
+            me = agent(scratch, drawn, pos, vel, time, place, lane)
+            middle, around = box(numbers, me, lanes[reach + lane] * like(me.pos[0], LOOSE))
+            listed = near(params, numbers.size, mine.cells, middle, around, lanes, np.int64(first))
+            at = mine.at
+            for m in range(listed if listed >= 0 else mine.many):
+                at = mine.at + np.int64(lanes[np.uint64(first) + np.uint64(m)]) if listed >= 0 else at
+                where, glide = placed(params, at, time)
+                meet(numbers, world, params, me, at, at - mine.at, where, glide, lanes, lane)
+                at += np.int64(params[at])
+
+    return shapes
+
+
+# --- what may lie within reach ----------------------------------------------------------------------------------------
+
+
+@functools.cache
+def _near_a_ray(folds: tuple[Fold, ...]) -> Callable[..., bool]:
+    """Make `near(numbers, params, at, y, me, seen)`: does a ray, up to `seen` m, come into the circle around a shape?
+
+    Or the sphere.
+    """
+    before, k, ray_of, rays = _near_a_ray(folds[:-1]) if folds[1:] else None, folds[-1].k, folds[-1].ray, folds[-1].rays
+
+    def near(numbers: Any, params: Any, at: Any, y: Any, me: Any, seen: Any) -> Any:
+        found = False if before is None else before(numbers, params, at, y, me, seen)
+        for j in range(rays):
+            ray, margin = ray_of(numbers.effects[k], me, j)
+            found |= near_way(params, at, y, ray, me.radius + margin, seen)
+        return found
+
+    return kernel(near)
+
+
+@law
+def _alike(x: Vec, length: float) -> Vec:
+    """Return the vector of x's dimension whose coordinates are all `length`."""
+    if len(x) == 2:
+        return (length, length)
+    else:
+        return (length, length, length)
+
+
+@law
+def _grown(low: Vec, high: Vec, spot: Vec) -> tuple[Vec, Vec]:
+    """Return the corners of a box that has grown to hold a place."""
+    a, b = (min(low[0], spot[0]), min(low[1], spot[1])), (max(high[0], spot[0]), max(high[1], spot[1]))
+    if len(low) == 2:
+        return a, b
+    else:
+        return (a[0], a[1], min(low[2], spot[2])), (b[0], b[1], max(high[2], spot[2]))
+
+
+@section
+def _box(folds: tuple[Fold, ...], only_rays: bool) -> Callable[..., tuple[Vec, Vec]]:
+    """Make `box(numbers, me, seen)`: in which something may matter to an agent that looks `seen` m far.
+
+    Around all rays, if laws cast them, or around it: the middle, and half the edges, m.
+    """
+    span: Any = _span(folds) if only_rays else None
+
+    def box(numbers: Any, me: Any, seen: Any) -> Any:
+        x, half = me.pos, like(seen, 0.5)
+        if only_rays:
+            low, high, wide = span(numbers, me, seen)
+            wide = wide * like(wide, LOOSE)
+            room = scale(sub(high, low), half)
+            return add(x, scale(add(low, high), half)), add(room, _alike(x, wide))
+        return x, _alike(x, seen)
+
+    return box
+
+
+@functools.cache
+def _span(folds: tuple[Fold, ...]) -> Callable[..., tuple[Vec, Vec, float]]:
+    """Make `span(numbers, me, seen)`: the corners of the box around all rays, from the agent, m, and the widest body.
+
+    That is the radius of what goes along a ray, and what it keeps clear, m.
+    """
+    before, k, ray_of, rays = _span(folds[:-1]) if folds[1:] else None, folds[-1].k, folds[-1].ray, folds[-1].rays
+
+    def span(numbers: Any, me: Any, seen: Any) -> Any:
+        o = zero(me.pos)
+        low, high, wide = (o, o, like(seen, 0.0)) if before is None else before(numbers, me, seen)
+        for j in range(rays):
+            ray, margin = ray_of(numbers.effects[k], me, j)
+            way, room = scale(ray, seen), me.radius + margin
+            (low, high), wide = _grown(low, high, way), max(wide, room)
+        return low, high, wide
+
+    return kernel(span)
+
+
+# --- the way around ---------------------------------------------------------------------------------------------------
+
+
+@section
+def _asides(plan: Obstacles, fold: Fold) -> Callable[..., None]:
+    """Make on which side each agent goes around what is in its way, for a law that asks: see around.py."""
+    k, ray_of, slots, ahead, width = fold.k, fold.ray, fold.slots, fold.ahead, plan.agent.width
+    agent, aside, sides = _agent_of(plan.agent), aside_of(plan.around), fold.slots[-plan.agent.dimension :]
+    first, which, place_at = np.uint64(slots[0]), np.uint64(ahead[0]), np.uint64(ahead[1])
+
+    def asides(context: Any, pos: Any, vel: Any, time: Any, place: Any) -> None:
+        scratch, numbers, b = context.scratch, context.numbers, context.b
+        lanes, drawn = scratch.lanes, context.key[b]
+        world = context.obstacle_x, context.obstacle_radius, context.params, numbers.size, b, time
+        for lane in range(np.uint64(width)):
+            impact = lanes[first + lane]
+            if impact > 0 and impact < like(impact, np.inf):
+                me = agent(scratch, drawn, pos, vel, time, place, lane)
+                ray, margin = ray_of(numbers.effects[k], me, 0)
+                known = impact, np.int64(lanes[which + lane]), np.int64(lanes[place_at + lane])
+                scatter(lanes, lane, sides, aside(world, me.pos, ray, me.radius + margin, known))
+
+    return asides

@@ -1,0 +1,119 @@
+"""What follows from the parts of a scene for its obstacles: which forms there are, and which of them laws meet."""
+
+from __future__ import annotations
+
+import functools
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flockenv.engine.parameters import NumberPlan
+from flockenv.engine.shape_rows import FormPlan, Surroundings
+from flockenv.geometry.shapes import packed
+from flockenv.geometry.shapes.cells import FEWEST_ROWS, cells_of
+from flockenv.geometry.space import Space
+from flockenv.physics.effects.effect import Effect, Sight
+
+__all__ = ["MetObstacles"]
+
+MOST_NUMBERS = 2**24
+"""Numbers of a form's rows, and of the grid over them, up to which single precision counts them exactly."""
+
+
+class MetObstacles:
+    """The part of `Parts` that is about obstacles."""
+
+    dimension: int
+    space: Space
+    effects: tuple[Effect, ...]
+    shapes: tuple[Any, ...]
+    circles: int
+
+    if TYPE_CHECKING:
+
+        @functools.cached_property
+        def sights(self) -> list[Sight]:
+            """See Parts."""
+
+        @property
+        def number_plan(self) -> NumberPlan:
+            """See Parts."""
+
+    @functools.cached_property
+    def shaped(self) -> tuple[NDArray[np.float64], dict[str, tuple[int, int]]]:
+        """The table of shapes that are not in the state, and the forms there are: where each begins, how many."""
+        if not self.meets_obstacles:
+            return np.zeros(0), {}
+        period = np.array(self.space.extent(self.dimension)) if self.space.periodic else None
+        return packed(self.shapes, self.dimension, self.circles, period)
+
+    @property
+    def moving(self) -> bool:
+        """True if any of them moves."""
+        return any(shape.moves for shape in self.shapes)
+
+    @functools.cached_property
+    def bounded(self) -> tuple[str, ...]:
+        """The forms of shapes that are only looked at where they lie within reach: none if some law asks for all.
+
+        Those whose laws go from edge to edge, or from place to place. Blocks and half-spaces are met by lanes side by
+        side, which would go through all of the law anyhow: there it was no faster, with rays or without.
+        """
+        return tuple(form for form in ("chain", "distance_field") if form in self.shaped[1]) if self.reaches else ()
+
+    @property
+    def reaches(self) -> bool:
+        """True if all folds over obstacles say how far they reach."""
+        folds = [e for e in self.effects if e.obstacle_start is not None]
+        return bool(folds) and all(e.obstacle_reach is not None for e in folds)
+
+    @functools.cached_property
+    def cells(self) -> dict[str, NDArray[np.float64]]:
+        """Grids over the shapes of each form of which there are many, and which have an end: see shapes/cells.py."""
+        table, forms = self.shaped
+        period = np.array(self.space.extent(self.dimension)) if self.space.periodic else None
+        found = {}
+        for form, (begin, count) in forms.items():
+            if count >= FEWEST_ROWS and form in ("chain", "block", "distance_field"):
+                mine = [shape for shape in self.shapes if shape.form == form]
+                lengths = [int(table[begin])]
+                while len(lengths) < count:
+                    lengths.append(int(table[begin + sum(lengths)]))
+                rows = np.cumsum([0, *lengths[:-1]]).tolist()
+                grid = cells_of(mine, rows, period)
+                if max(rows[-1], len(grid)) < MOST_NUMBERS:
+                    found[form] = grid
+        return found
+
+    @property
+    def looked_up(self) -> tuple[str, ...]:
+        """The forms of which folds meet only the shapes that may lie within reach, found by a grid."""
+        return tuple(self.cells) if self.reaches else ()
+
+    @property
+    def only_rays(self) -> bool:
+        """True if all folds over obstacles cast rays."""
+        return all(e.obstacle_ray is not None for e in self.effects if e.obstacle_start is not None)
+
+    @property
+    def folds_obstacles(self) -> bool:
+        """True if any effect has a fold over the obstacles."""
+        return any(e.obstacle_start is not None for e in self.effects)
+
+    @property
+    def surroundings(self) -> Surroundings:
+        """What code about obstacles depends on."""
+        plans = zip(self.shaped[1], self.number_plan.forms, strict=True)
+        forms = tuple(FormPlan(form, *plan) for form, plan in plans)
+        return Surroundings(self.dimension, self.space.offset_law, self.moving, forms)
+
+    @property
+    def meets_obstacles(self) -> bool:
+        """True if some law asks for obstacles, or for what is hidden by them."""
+        return any(e.obstacle_law is not None for e in self.effects) or self.occludes
+
+    @property
+    def occludes(self) -> bool:
+        """True if agents, or obstacles, may be hidden by obstacles."""
+        return any(sight.occluded for sight in self.sights) or any(e.occluded_obstacles for e in self.effects)

@@ -1,0 +1,273 @@
+"""The one sweep that all pair laws share: a block of listed agents meets its candidates, lane beside lane.
+
+Every pair law is evaluated for every candidate, and its sums keep what it says of those in sight; but contacts only of
+candidates whom some agent of the block may touch, for these are few. A topological sight needs a pass before that one,
+which finds how far its k nearest are.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from flockenv.engine.lane_access import gather, scatter
+from flockenv.engine.neighbour_lists import list_living, walk_blocks
+from flockenv.engine.neighbour_records import (
+    Besides,
+    Block,
+    Candidate,
+    agent_listed,
+    candidate_listed,
+    tie_of,
+    with_tie,
+)
+from flockenv.engine.pair_plan import Pairs
+from flockenv.engine.pair_sums import add_candidate, begin_sums, finish_sums, keep_nearest, tell_sums
+from flockenv.jit.decorators import kernel, like
+from flockenv.jit.intrinsics import tallied, tally_of, wait_for_team
+from flockenv.jit.section import section
+from flockenv.maths.vectors import dot, exact_dot, sub
+from flockenv.physics.effects.effect import Other
+from flockenv.steering.others import ONE_PLACE
+
+__all__ = ["meet_neighbours"]
+
+APART, OTHER, TOGETHER = "in another place", "another agent", "another agent in the same place"
+NEAREST, CONTACTS = "another agent, to find the nearest", "another agent that may be touched"
+"""Which candidates a pass over them is about: ties are read of those in one place alone, where laws allow it."""
+
+
+@section
+def _over_lanes(plan: Pairs, which: str, wrapped: bool, each: Callable[..., None]) -> Callable[..., bool]:
+    """Make what all lanes of a block do with a candidate; it returns whether some agent may touch it.
+
+    wrapped: are images sought around the edge of a periodic box?
+    """
+    width, parting, masks, sorts = plan.lanes, plan.parting, plan.masks, plan.listing.sorts
+    agent, offset_to = agent_listed(plan.listing, plan.inner, plan.oriented), plan.offset_to
+    exact, periodic = any(view.near[1] for view in plan.views), wrapped
+    together, apart = which == TOGETHER, which == APART
+    contacts = tuple(sorted({law.sight for law in plan.laws if law.contact}))
+    touches, tied = bool(contacts) and which in (APART, OTHER), together and plan.seldom
+    within: Any = _within_any(contacts) if touches else None
+    tie = tie_of(plan.listing.dimension, width)
+    here, home = plan.listing.slot("here0"), plan.listing.slot("home0")
+
+    def lanes_meet(numbers: Any, besides: Any, block: Any, j: Any, it: Any) -> Any:
+        lanes, size = block.lanes, numbers.size
+        own, o, touch = np.int32(j - block.at), like(numbers.reach, -0.0), False
+        for lane in range(np.uint64(width)):
+            me = agent(block.mine, block.first + lane, block.time, block.drawn)
+            if tied:  # lanes beyond the last agent hold what lay there
+                mine = np.uint64(lanes[home + lane]) if sorts else np.uint64(besides.ties[2][block.at + lane])
+                me = with_tie(me, tie(besides.ties, mine if block.at + lane < block.upto else np.uint64(0)))
+            to = offset_to(size, me.pos, it.pos) if periodic else sub(it.pos, me.pos)
+            square = exact_dot(to, to) if exact else dot(to, to)
+            if apart:
+                other = square > like(square, ONE_PLACE)
+            elif together:
+                other = (own != block.number[lane]) & (square <= like(square, ONE_PLACE))
+            else:
+                other = own != block.number[lane]
+            gap = square if masks else (square if other else like(square, np.inf))
+            him = Other(it.who, to, square, it.vel, it.radius, it.tie, it.mass, it.inner)
+            each(numbers, besides, me, him, other, gap, o, lanes, lane)
+            if apart and parting:
+                lanes[here + lane] = tallied(lanes[here + lane], other)
+            if touches:
+                touch |= within(numbers.views, other, square)
+        return touch
+
+    return lanes_meet
+
+
+@functools.cache
+def _within_any(sights: tuple[int, ...]) -> Callable[..., bool]:
+    """Make `within(views, other, square)`: may an agent touch a candidate?"""
+    before, q = _within_any(sights[:-1]) if sights[1:] else None, sights[-1]
+
+    def within(views: Any, other: Any, square: Any) -> Any:
+        mine = other & (square < views[q].within)
+        return mine if before is None else before(views, other, square) | mine
+
+    return kernel(within)
+
+
+@section
+def _one_after_another(plan: Pairs, which: str, wrapped: bool, each: Callable[..., None]) -> Callable[..., None]:
+    """Make `meet(numbers, besides, block, r)`: a block meets the candidates of range r."""
+    candidate, sorts, length = (
+        candidate_listed(plan.listing, plan.inner),
+        plan.listing.sorts,
+        np.uint64(plan.listing.length),
+    )
+    lanes_meet, tied = _over_lanes(plan, which, wrapped, each), which == TOGETHER and plan.seldom
+    tie = tie_of(plan.listing.dimension, plan.lanes)
+    contacts = which in (APART, OTHER) and any(law.contact for law in plan.laws)
+    by_touch = _over_lanes(plan, CONTACTS, wrapped, add_candidate(plan, True, False)) if contacts else None
+
+    def meet(numbers: Any, besides: Any, block: Any, r: Any) -> None:
+        j, last = np.uint64(block.ranges[r, 0]), np.uint64(block.ranges[r, 1])
+        while j < last:
+            at = j * length if sorts else j
+            it = candidate(block.theirs, at)
+            if tied:
+                i = np.uint64(np.int32(block.theirs[at])) if sorts else np.uint64(besides.ties[2][j])
+                it = Candidate(it.pos, it.vel, tie(besides.ties, i), it.who, it.radius, it.mass, it.inner)
+            touch = lanes_meet(numbers, besides, block, j, it)
+            if by_touch is not None:  # noqa: SIM102  # numba drops the branch by this alone
+                if touch:
+                    by_touch(numbers, besides, block, j, it)
+            j += np.uint64(1)
+
+    return meet
+
+
+@section
+def _looking_ahead(plan: Pairs, each: Callable[..., None]) -> Callable[..., None]:
+    """Make `meet(numbers, besides, block, r)` for a small world: the next candidate's distance is worked out early.
+
+    Behind the last one lies some other number: a row has room for more, and how far that is is never read.
+    """
+    listing, width, parting = plan.listing, plan.lanes, plan.parting
+    agent, candidate = agent_listed(listing, plan.inner, plan.oriented), candidate_listed(listing, plan.inner)
+    d, periodic, offset_to = listing.dimension, listing.periodic, plan.offset_to
+    exact = any(view.near[1] for view in plan.views)
+    place, way = listing.listed(listing.axes("x")), plan.slots(int(listing.slot("next0")), d)
+    square_at, here = listing.slot(f"next{d}"), listing.slot("here0")
+
+    def meet(numbers: Any, besides: Any, block: Any, r: Any) -> None:
+        rows, lanes, size = block.theirs, block.lanes, numbers.size
+        o = like(numbers.reach, -0.0)
+        j, last = np.uint64(block.ranges[r, 0]), np.uint64(block.ranges[r, 1])
+        following = gather(rows, j, place)
+        for lane in range(np.uint64(width)):
+            me = agent(rows, block.first + lane, block.time, block.drawn)
+            onward = offset_to(size, me.pos, following) if periodic else sub(following, me.pos)
+            scatter(lanes, lane, way, onward)
+            lanes[square_at + lane] = exact_dot(onward, onward) if exact else dot(onward, onward)
+        while j < last:
+            it = candidate(rows, j)
+            j += np.uint64(1)
+            following = gather(rows, j, place)
+            for lane in range(np.uint64(width)):
+                me = agent(rows, block.first + lane, block.time, block.drawn)
+                onward = offset_to(size, me.pos, following) if periodic else sub(following, me.pos)
+                further = exact_dot(onward, onward) if exact else dot(onward, onward)
+                to, square = gather(lanes, lane, way), lanes[square_at + lane]
+                other = square > like(square, ONE_PLACE)
+                him = Other(it.who, to, square, it.vel, it.radius, it.tie, it.mass, it.inner)
+                each(numbers, besides, me, him, other, square, o, lanes, lane)
+                if parting:
+                    lanes[here + lane] = tallied(lanes[here + lane], other)
+                scatter(lanes, lane, way, onward)
+                lanes[square_at + lane] = further
+
+    return meet
+
+
+@section
+def _over_ranges(plan: Pairs, which: str, each: Callable[..., None]) -> Callable[..., None]:
+    """Make `meet(numbers, besides, block, found)`: a block meets the candidates of all its ranges.
+
+    Only around the edge of a periodic box are images sought; what comes seldom has one form: the nearest image of an
+    agent that is near is the agent itself.
+    """
+    listing = plan.listing
+    ahead, both = plan.ahead and which == APART, listing.periodic and listing.sorts and which != TOGETHER
+    one = _looking_ahead(plan, each) if ahead else _one_after_another(plan, which, listing.periodic, each)
+    plain = _one_after_another(plan, which, False, each) if both else None
+
+    def meet(numbers: Any, besides: Any, block: Any, found: Any) -> None:
+        for r in range(found):
+            if plain is not None:
+                if block.ranges[r, 2] > 0:
+                    one(numbers, besides, block, r)
+                else:
+                    plain(numbers, besides, block, r)
+            else:
+                one(numbers, besides, block, r)
+
+    return meet
+
+
+# --- a block ----------------------------------------------------------------------------------------------------------
+
+
+@section
+def _block(plan: Pairs) -> Callable[..., int]:
+    """Make what one block does: meet its candidates, and tell what comes of it; it returns how many pairs were met."""
+    begin, finish, tell = begin_sums(plan), finish_sums(plan), tell_sums(plan)
+    meet = _over_ranges(plan, APART if plan.parting else OTHER, add_candidate(plan, False, plan.parting))
+    nearest = any(view.near[1] for view in plan.views)
+    select = _over_ranges(plan, NEAREST, keep_nearest(plan)) if nearest else None
+    together = _over_ranges(plan, TOGETHER, add_candidate(plan, False, False)) if plan.parting else None
+    width, here, hides, sorts = plan.lanes, plan.listing.slot("here0"), plan.hidden is not None, plan.listing.sorts
+    tied = plan.parting and plan.seldom
+
+    def block_of(context: Any, shape: Any, first: Any, at: Any, upto: Any, found: Any, time: Any) -> Any:
+        scratch, numbers, ranges = context.scratch, context.numbers, context.scratch.ranges
+        if sorts:
+            arrays = scratch.lanes, np.uint64(0), scratch.records
+        else:
+            arrays = scratch.sorted_rows, first, scratch.sorted_rows
+        mine, begins, theirs = arrays
+        block = Block(
+            mine, begins, theirs, scratch.lanes, scratch.number, first, np.uint64(upto), ranges, time,
+            context.key[context.b],
+        )  # fmt: skip
+        obstacles = context.obstacle_x, context.obstacle_radius, context.b
+        besides = Besides(
+            (context.obstacle_x, context.obstacle_radius, context.params, context.b) if hides else (),
+            (scratch.tie, scratch.ident, scratch.order if not sorts else scratch.cell) if tied else (),
+        )
+        begin(numbers, obstacles, block)
+        if select is not None:
+            select(numbers, besides, block, found)
+        met, others = 0, -1
+        for r in range(found):
+            met += (ranges[r, 1] - ranges[r, 0]) * (upto - at)
+            others += ranges[r, 1] - ranges[r, 0]
+        meet(numbers, besides, block, found)
+        if together is not None:  # seldom are two agents in one place
+            crowded, all_of_them = False, like(numbers.reach, others)
+            for lane in range(np.uint64(width)):
+                crowded |= tally_of(scratch.lanes[here + lane]) < all_of_them
+            if crowded:
+                together(numbers, besides, block, found)
+        finish(numbers, block)
+        by_number = shape[0] == 0 and context.present == context.n
+        if sorts:
+            tell(scratch.felt, scratch.cell, block, by_number and not context.arranged)
+        else:
+            tell(scratch.felt, scratch.order, block, by_number)
+        return met
+
+    return block_of
+
+
+@section
+def meet_neighbours(plan: Pairs) -> Callable[..., None]:
+    """Make `meet(context, pos, vel, time)`: write to `felt` what agents feel from their neighbours at this instant.
+
+    One listing per instant, one sweep for all pair laws. A team of threads shares both.
+    """
+    list_all, walk = list_living(plan.listing), walk_blocks(plan.listing, _block(plan))
+    folds = sum(law.joined is not None for law in plan.laws)
+
+    def meet(context: Any, pos: Any, vel: Any, time: Any) -> None:
+        scratch, work, b = context.scratch, context.work, context.b
+        if context.rank == 0:
+            work[b, 1] += 1
+            work[b, 3] += folds * context.n * context.obstacle_radius.shape[1]
+        shape = list_all(context, pos, vel)
+        scratch.tally[context.rank] = walk(context, shape, time)
+        wait_for_team(scratch.sync, context.team)  # what is felt was written by others
+        if context.rank == 0:
+            for r in range(context.team):
+                work[b, 2] += scratch.tally[r]
+
+    return meet

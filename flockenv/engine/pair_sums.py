@@ -1,0 +1,260 @@
+"""What pair laws add up for the agents of a block: how sums begin, what a candidate adds, and what they come to."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from flockenv.engine.blocks import place_of, vector_of
+from flockenv.engine.lane_access import add_where, chosen, copy_each, fill, gather, picked, scatter
+from flockenv.engine.law_calls import given_of
+from flockenv.engine.nearest import kept
+from flockenv.engine.neighbour_records import agent_listed
+from flockenv.engine.pair_plan import PairLaw, Pairs
+from flockenv.engine.visibility import blocked
+from flockenv.jit.decorators import kernel, like
+from flockenv.jit.intrinsics import tallied, tally_of
+from flockenv.jit.section import in_turn, section, tuple_from
+from flockenv.maths.vectors import add, dot, zero
+from flockenv.physics.effects.effect import Other, in_view
+
+__all__ = ["add_candidate", "begin_sums", "finish_sums", "keep_nearest", "tell_sums"]
+
+
+# --- sights ---------------------------------------------------------------------------------------------------------
+
+
+@section
+def _seen(plan: Pairs, q: int, cut: bool) -> Callable[..., bool]:
+    """Make `seen(numbers, besides, me, it, other, gap, lanes, lane)`: is a candidate in a sight?
+
+    cut: of a topological sight, is it known already how far its nearest are?
+    """
+    view, masks = plan.views[q], plan.masks
+    hidden: Any = blocked(plan.hidden) if plan.hidden is not None else None
+    fov, grouped, occluded, counts = view.fov, view.grouped, view.occluded, cut and view.near[1] > 0
+    last = np.uint64(view.near[0] + max(view.near[1] - 1, 0) * plan.lanes)
+
+    def seen(numbers: Any, besides: Any, me: Any, it: Any, other: Any, gap: Any, lanes: Any, lane: Any) -> Any:
+        mine, square = numbers.views[q], it.square
+        if masks:
+            found = other & (square < mine.within)
+        else:
+            found = gap < mine.within
+        if fov >= 0:
+            found = in_view(numbers.views[fov].cone, me.heading, it.offset, square) & found
+        if grouped:
+            found = found & (it.who >= mine.first) & (it.who < mine.end)
+        if occluded:  # an agent out of sight anyhow is not looked for behind obstacles
+            obstacle_x, obstacle_radius, params, b = besides.scenery
+            found = found and not hidden(
+                obstacle_x, obstacle_radius, params, numbers.size, b, me.time, me.pos, it.offset
+            )
+        if counts:
+            found = found & (square <= lanes[last + lane])
+        return found
+
+    return seen
+
+
+# --- what a candidate adds --------------------------------------------------------------------------------------------
+
+
+@section
+def _adds(plan: Pairs, law: PairLaw, q: int, apart: bool) -> Callable[..., None]:
+    """Make `adds(numbers, me, it, seen, o, lanes, lane)`: what one candidate adds to the running numbers of a law.
+
+    seen: of each sight that is looked at, is it in there? The law has number q of those.
+    """
+    k, folds, vanishes, slots = law.k, law.start is not None, law.vanishes, plan.slots(law.first, law.sums)
+    says_of = law.apart if apart and law.apart is not None else law.pair
+
+    def adds(numbers: Any, me: Any, it: Any, seen: Any, o: Any, lanes: Any, lane: Any) -> None:
+        if folds:
+            was = gather(lanes, lane, slots)
+            scatter(lanes, lane, slots, chosen(seen[q], says_of(numbers.effects[k], me, it, was), was))
+        elif vanishes:
+            square = it.square if seen[q] else like(it.square, np.inf)
+            far = Other(it.who, it.offset, square, it.vel, it.radius, it.tie, it.mass, it.inner)
+            add_where(True, lanes, lane, slots, says_of(numbers.effects[k], me, far), o)
+        else:
+            add_where(seen[q], lanes, lane, slots, says_of(numbers.effects[k], me, it), o)
+
+    return adds
+
+
+@section
+def add_candidate(plan: Pairs, touch: bool, apart: bool) -> Callable[..., None]:
+    """Make `meet(numbers, besides, me, it, other, gap, o, lanes, lane)`: what one candidate adds, by all laws.
+
+    touch: by contacts, or by all others; apart: of the agents that it counts for, none is in one place with it.
+    """
+    laws = [law for law in plan.laws if law.contact == touch]
+    laws.sort(key=lambda law: law.vanishes)  # registers: others need one less while the first are worked out
+    asked = sorted({law.sight for law in laws})
+    see = tuple_from(*(_seen(plan, q, True) for q in asked))
+    add_all = in_turn(*(_adds(plan, law, asked.index(law.sight), apart) for law in laws))
+    counted = [(k, plan.views[q].counted) for k, q in enumerate(asked) if plan.views[q].counted >= 0]
+    count, counts = in_turn(*(_count_one(*each) for each in counted)), bool(counted) and not touch
+    some = bool(laws)
+
+    def meet(numbers: Any, besides: Any, me: Any, it: Any, other: Any, gap: Any, o: Any, lanes: Any, lane: Any) -> None:
+        if some:
+            seen = see(numbers, besides, me, it, other, gap, lanes, lane)
+            if counts:
+                count(seen, lanes, lane)
+            add_all(numbers, me, it, seen, o, lanes, lane)
+
+    return meet
+
+
+@functools.cache
+def _count_one(q: int, place: int) -> Callable[..., None]:
+    """Make `count(seen, lanes, lane)`: count the candidates in a sight, of which laws read the number."""
+    at = np.uint64(place)
+
+    def count(seen: Any, lanes: Any, lane: Any) -> None:
+        lanes[at + lane] = tallied(lanes[at + lane], seen[q])
+
+    return kernel(count)
+
+
+@section
+def keep_nearest(plan: Pairs) -> Callable[..., None]:
+    """Make a pass that keeps, of each topological sight, the squares of its nearest, in order.
+
+    It is called as `add_candidate`'s is.
+    """
+    keep = in_turn(*(_keep_one(plan, q) for q, view in enumerate(plan.views) if view.near[1]))
+
+    def meet(numbers: Any, besides: Any, me: Any, it: Any, other: Any, gap: Any, o: Any, lanes: Any, lane: Any) -> None:
+        keep(numbers, besides, me, it, other, gap, lanes, lane)
+
+    return meet
+
+
+@section
+def _keep_one(plan: Pairs, q: int) -> Callable[..., None]:
+    see, slots = _seen(plan, q, False), plan.slots(*plan.views[q].near)
+
+    def keep(numbers: Any, besides: Any, me: Any, it: Any, other: Any, gap: Any, lanes: Any, lane: Any) -> None:
+        seen = see(numbers, besides, me, it, other, gap, lanes, lane)
+        square = it.square if seen else like(it.square, np.inf)
+        scatter(lanes, lane, slots, kept(gather(lanes, lane, slots), square))
+
+    return keep
+
+
+# --- how sums begin, and what they come to ----------------------------------------------------------------------------
+
+
+@section
+def begin_sums(plan: Pairs) -> Callable[..., None]:
+    """Make `begin(numbers, obstacles, block)`: how the running numbers of a block begin."""
+    listing, width = plan.listing, plan.lanes
+    sums = [slot for law in plan.laws if law.start is None for slot in plan.slots(law.first, law.sums)]
+    sums += [int(listing.slot("here0"))] * plan.parting + [view.counted for view in plan.views if view.counted >= 0]
+    clear, far = tuple(sums), tuple(slot for view in plan.views for slot in plan.slots(*view.near))
+    starts = in_turn(*(_start(plan, law) for law in plan.laws if law.start is not None))
+    folds = any(law.start is not None for law in plan.laws)
+    agent = agent_listed(listing, plan.inner, plan.oriented)
+
+    def begin(numbers: Any, obstacles: Any, block: Any) -> None:
+        o = like(numbers.reach, 0.0)
+        for lane in range(np.uint64(width)):
+            fill(block.lanes, lane, clear, o)
+            if folds:
+                me = agent(block.mine, block.first + lane, block.time, block.drawn)
+                starts(numbers, obstacles, me, block.lanes, lane)
+            fill(block.lanes, lane, far, like(o, np.inf))
+
+    return begin
+
+
+@section
+def _start(plan: Pairs, law: PairLaw) -> Callable[..., None]:
+    """Make `start(numbers, obstacles, me, lanes, lane)`: how a fold begins.
+
+    With the obstacles, where it is one fold over these, too: (obstacle_x, obstacle_radius, b).
+    """
+    begin, joined, offset_to, given = law.start, law.joined, plan.offset_to, given_of(law.k, law.images)
+    slots, centre = plan.slots(law.first, law.sums), vector_of(plan.listing.dimension)
+
+    def start(numbers: Any, obstacles: Any, me: Any, lanes: Any, lane: Any) -> None:
+        p = given(numbers, me)
+        found = begin(p, me)
+        if joined is not None:
+            x, radius, b = obstacles
+            for m in range(radius.shape[1]):
+                rho = radius[b, m]
+                if rho > 0:
+                    to = offset_to(numbers.size, me.pos, centre(x, b, m))
+                    it = Other(like(rho, m), to, dot(to, to), zero(to), rho, zero(to), like(rho, np.inf), ())
+                    found = joined(p, me, it, found)
+        scatter(lanes, lane, slots, found)
+
+    return start
+
+
+@section
+def finish_sums(plan: Pairs) -> Callable[..., None]:
+    """Make `finish(numbers, block)`: what the running numbers of a block come to, by target."""
+    agent, width = agent_listed(plan.listing, plan.inner, plan.oriented), plan.lanes
+    ends = in_turn(*(_end(plan, t) for t in range(len(plan.targets))))
+
+    def finish(numbers: Any, block: Any) -> None:
+        for lane in range(np.uint64(width)):
+            me = agent(block.mine, block.first + lane, block.time, block.drawn)
+            ends(numbers, me, block.lanes, lane)
+
+    return finish
+
+
+@section
+def _end(plan: Pairs, target: int) -> Callable[..., None]:
+    """Make `end(numbers, me, lanes, lane)`: add up what all laws with one target come to."""
+    total = _total(plan, tuple(law for law in plan.laws if law.target == target))
+    slots = plan.slots(plan.targets[target], plan.listing.dimension)
+    return lambda numbers, me, lanes, lane: scatter(lanes, lane, slots, total(numbers, me, lanes, lane))
+
+
+@section
+def _total(plan: Pairs, laws: tuple[PairLaw, ...]) -> Callable[..., Any]:
+    before, law = _total(plan, laws[:-1]) if laws[1:] else None, laws[-1]
+    slots, finish, given = plan.slots(law.first, law.sums), law.finish, given_of(law.k, law.images)
+    averages, many = law.averages, np.uint64(max(plan.views[law.sight].counted, 0))
+
+    def total(numbers: Any, me: Any, lanes: Any, lane: Any) -> Any:
+        p = given(numbers, me)
+        sums = gather(lanes, lane, slots)
+        if averages:
+            mine = finish(p, me, sums + (tally_of(lanes[many + lane]),))  # noqa: RUF005
+        else:
+            mine = finish(p, me, sums)
+        return add(zero(me.pos) if before is None else before(numbers, me, lanes, lane), mine)
+
+    return total
+
+
+@section
+def tell_sums(plan: Pairs) -> Callable[..., None]:
+    """Make `tell(felt, order, block, by_number)`: write what a block feels to where its agents find it."""
+    width, sorts, home = plan.lanes, plan.listing.sorts, plan.listing.slot("home0")
+    slots = tuple(slot for first in plan.targets for slot in plan.slots(first, plan.listing.dimension))
+    rows, first = tuple(k * width for k in range(len(slots))), (0,) * len(slots)
+    whole, place_in = np.uint64(len(slots)), place_of(len(slots), width)
+
+    def tell(felt: Any, order: Any, block: Any, by_number: Any) -> None:
+        lanes, begin = block.lanes, np.uint64(0)
+        if by_number:
+            sources = picked((lanes,), (), first)
+            copy_each(felt, block.at * whole, rows, sources, (begin,), first, slots, width)
+        else:
+            for lane in range(block.upto - block.at):
+                i = np.uint64(lanes[home + lane]) if sorts else np.uint64(order[block.at + lane])
+                scatter(felt, place_in(i), rows, gather(lanes, lane, slots))
+
+    return tell

@@ -1,0 +1,283 @@
+"""The numbers of a scene: how they are packed into the one array that a kernel is handed, and read there by name.
+
+`pack_numbers` says both at once, the values and where each lies (`NumberPlan`), so that packing and reading cannot
+disagree. Code depends on the plan; the values are arguments, and another value compiles nothing.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from flockenv.engine.lane_access import gather
+from flockenv.jit.decorators import Law, kernel
+from flockenv.jit.section import joined_from, record, section, tuple_from
+from flockenv.maths.vectors import add
+
+if TYPE_CHECKING:
+    from flockenv.engine.kernel_plan import Parts
+    from flockenv.physics.effects.effect import Effect
+
+__all__ = [
+    "Form",
+    "Images",
+    "NumberPlan",
+    "Numbers",
+    "View",
+    "images_in",
+    "images_of",
+    "numbers_of",
+    "pack_numbers",
+    "view_of",
+]
+
+
+class Form(NamedTuple):
+    """Where the rows of a form of shapes begin, how many there are, and where the grid over them begins."""
+
+    at: Any
+    many: Any
+    cells: Any  # 0 of a form without a grid
+
+
+class View(NamedTuple):
+    """How pair laws look around: see effects.base.Sight."""
+
+    within: float  # m^2, radius squared
+    cone: float  # what `in_view` compares
+    first: float  # the agents that are seen at all: those of a group, [first, end); 0 where all are
+    end: float
+
+
+class Numbers(NamedTuple):
+    """Every number of a scene, as its kernels read them."""
+
+    size: tuple[float, ...]  # m, of the space
+    reach: float  # m, the largest distance at which any law looks for neighbours
+    forms: tuple[Form, ...]
+    views: tuple[View, ...]
+    effects: tuple[Any, ...]  # of each effect a record of what its laws are given, by name
+    space: tuple[float, ...]
+    method: tuple[float, ...]
+    look: tuple[float, ...]  # the radius of what a task shows, m, and its square
+
+
+class EffectPlan(NamedTuple):
+    """Where the numbers of an effect lie: of each name whether it is a number, vector, table or counters, and where."""
+
+    names: tuple[str, ...]
+    kinds: tuple[tuple[str, int, int], ...]  # (kind, place, how many numbers)
+
+
+class NumberPlan(NamedTuple):
+    """Where every number of a scene lies."""
+
+    dimension: int
+    forms: tuple[tuple[int, bool], ...]  # (place, has a grid)
+    views: tuple[tuple[int, bool], ...]  # (place, sees one group alone)
+    effects: tuple[EffectPlan, ...]
+    space: tuple[int, int]  # (place, how many)
+    method: tuple[int, int]
+    look: tuple[int, int]
+
+
+EDGE = 8
+"""Rounding errors by which a field of view is wider: as many as a heading, an offset and their product have."""
+
+
+def view_of(fov: float, dtype: str) -> float:
+    """Return c |c|, what `in_view` compares, with c = cos(fov / 2); fov in degrees.
+
+    The edge belongs to the field of view in either precision, since c is less by EDGE machine epsilons: with 180
+    degrees a neighbour exactly abeam is in view, whatever the heading is.
+    """
+    cosine = math.cos(math.radians(fov) / 2.0) - EDGE * float(np.finfo(dtype).eps)
+    return cosine * abs(cosine)
+
+
+def pack_numbers(parts: Parts) -> tuple[list[float], NumberPlan]:
+    """Return every number that a kernel is given, and where each lies; tables come behind them.
+
+    What lies behind (rows of shapes, grids, tables) is known by where it begins, and a table by where it ends, too.
+    """
+    shapes, forms = parts.shaped
+    ends = np.cumsum([len(shapes), *map(len, parts.cells.values())]).tolist()
+    grids = dict(zip(parts.cells, ends, strict=False))
+    tables = iter(np.cumsum([ends[-1], *map(len, parts.tables)]).tolist())
+    begin, behind = next(tables), []  # (place, how far behind all numbers what is meant lies)
+    values: list[float] = [*parts.space.extent(parts.dimension), parts.reach]
+    planned_forms, views, effects = [], [], []
+    for form, (where, count) in forms.items():
+        planned_forms.append((len(values), form in grids))
+        behind.append((len(values), where))
+        values += [0.0, float(count)]
+        if form in grids:
+            behind.append((len(values), grids[form]))
+            values.append(0.0)
+    for sight in parts.sights:
+        views.append((len(values), sight.group is not None))
+        values += [sight.radius**2, view_of(sight.fov, parts.dtype)]
+        if sight.group is not None:
+            values += parts.starts[sight.group : sight.group + 2]
+    left = parts.counters
+    for effect in parts.effects:
+        kinds: list[tuple[str, int, int]] = []
+        for value in parts.numbers_of(effect).values():
+            vector = isinstance(value, tuple)
+            kinds.append(("vector" if vector else "number", len(values), len(value) if vector else 1))
+            values.extend(value if vector else (value,))
+        if effect.tabled:
+            kinds.append(("table", len(values), 2))
+            behind += [(len(values), begin), (len(values) + 1, begin := next(tables))]
+            values += [0.0, 0.0]
+        if effect.count_law:
+            kinds.append(("counters", len(values), 2))
+            values += [float(left), float(left - effect.counters)]
+            left -= effect.counters
+        effects.append(EffectPlan(tuple(parts.names_of(effect)), tuple(kinds)))
+    rest = []
+    for more in (parts.space.numbers(), parts.integrator.settings(), _look_numbers(parts)):
+        rest.append((len(values), len(more)))
+        values += more
+    for place, bound in behind:
+        values[place] = float(len(values) + bound)
+    return values, NumberPlan(parts.dimension, tuple(planned_forms), tuple(views), tuple(effects), *rest)
+
+
+def _look_numbers(parts: Parts) -> list[float]:
+    """Return how far a task looks around, m, and the square of that; nothing if it does not."""
+    return [parts.look.radius, parts.look.radius**2] if parts.look else []
+
+
+@section
+def numbers_of(plan: NumberPlan) -> Callable[[Any, Any], Numbers]:
+    """Make `numbers_of(params, counters)`: all numbers of a scene, read from the arrays that its kernel is handed."""
+    d, size = plan.dimension, tuple(range(plan.dimension))
+    forms, views, effects = _all(_form, plan.forms), _all(_view, plan.views), _all(_effect, plan.effects)
+    space, method, look = (_places(*some) for some in (plan.space, plan.method, plan.look))
+
+    def read(params: Any, counters: Any) -> Any:
+        begin = np.uint64(0)
+        return Numbers(
+            gather(params, begin, size),
+            params[d],
+            forms(params, counters),
+            views(params, counters),
+            effects(params, counters),
+            gather(params, begin, space),
+            gather(params, begin, method),
+            gather(params, begin, look),
+        )
+
+    return read
+
+
+def _all(reads: Callable[[Any], Callable[..., Any]], plans: tuple[Any, ...]) -> Callable[..., tuple[Any, ...]]:
+    return tuple_from(*map(reads, plans)) if plans else kernel(lambda params, counters: ())
+
+
+def _places(first: int, count: int) -> tuple[int, ...]:
+    return tuple(range(first, first + count))
+
+
+@functools.cache
+def _form(place: tuple[int, bool]) -> Callable[..., Form]:
+    at, gridded = place
+
+    def form(params: Any, counters: Any) -> Any:
+        if gridded:
+            return Form(np.int64(params[at]), np.int64(params[at + 1]), np.int64(params[at + 2]))
+        return Form(np.int64(params[at]), np.int64(params[at + 1]), np.int64(0))
+
+    return kernel(form)
+
+
+@functools.cache
+def _view(place: tuple[int, bool]) -> Callable[..., View]:
+    at, grouped = place
+    places = _places(at, 4) if grouped else (at, at + 1, at, at)
+    return kernel(lambda params, counters: View(*gather(params, np.uint64(0), places)))
+
+
+@functools.cache
+def _effect(plan: EffectPlan) -> Callable[..., Any]:
+    """Make a function that reads the record of an effect."""
+    kind, runs = record(plan.names), _runs(plan.kinds or (("number", 0, 1),))
+    if len(runs) == 1 and runs[0][0] == "number":
+        places = _places(*runs[0][1:])
+        return kernel(lambda params, counters: kind(*gather(params, np.uint64(0), places)))
+    values = joined_from(*map(_run, runs))
+    return kernel(lambda params, counters: kind(*values(params, counters)))
+
+
+def _runs(kinds: tuple[tuple[str, int, int], ...]) -> tuple[tuple[str, int, int], ...]:
+    """Return the same with numbers that follow each other read at once."""
+    runs: list[tuple[str, int, int]] = []
+    for kind, at, count in kinds:
+        if kind == "number" and runs and runs[-1][0] == "number" and sum(runs[-1][1:]) == at:
+            runs[-1] = (kind, runs[-1][1], runs[-1][2] + 1)
+        else:
+            runs.append((kind, at, count))
+    return tuple(runs)
+
+
+@functools.cache
+def _run(run: tuple[str, int, int]) -> Callable[..., tuple[Any, ...]]:
+    kind, at, count = run
+    places = _places(at, count)
+    if kind == "number":
+        return kernel(lambda params, counters: gather(params, np.uint64(0), places))
+    if kind == "vector":
+        return kernel(lambda params, counters: (gather(params, np.uint64(0), places),))
+    if kind == "table":
+        return kernel(lambda params, counters: (params[np.int64(params[at]) : np.int64(params[at + 1])],))
+
+    def counted(params: Any, counters: Any) -> Any:
+        end = len(counters)
+        return (counters[end - np.int64(params[at]) : end - np.int64(params[at + 1])],)
+
+    return kernel(counted)
+
+
+class Images(NamedTuple):
+    """Which numbers of an effect are points: on a torus these have images, and laws see the nearest."""
+
+    names: tuple[str, ...]
+    points: tuple[str, ...]
+    offset_to: Law
+
+
+def images_in(parts: Parts, effect: Effect) -> Images | None:
+    """Return which numbers of an effect have images in the space of a scene; None if none has."""
+    if not (parts.space.periodic and effect.places):
+        return None
+    return Images(tuple(parts.names_of(effect)), tuple(effect.places), parts.space.offset_law)
+
+
+@section
+def images_of(plan: Images) -> Callable[..., Any]:
+    """Make `images_of(p, size, here)`: the record of an effect with its points where they are nearest to `here`."""
+    kind = record(plan.names)
+    values = _imaged(tuple(name in plan.points for name in plan.names), plan.offset_to)
+
+    def images(p: Any, size: Any, here: Any) -> Any:
+        return kind(*values(p, size, here))
+
+    return images
+
+
+@functools.cache
+def _imaged(points: tuple[bool, ...], offset_to: Law) -> Callable[..., tuple[Any, ...]]:
+    """Make a function that returns the values of a record, those that are points as seen from somewhere."""
+    *earlier, point = points
+    before, last = _imaged(tuple(earlier), offset_to) if earlier else None, len(earlier)
+
+    def values(p: Any, size: Any, here: Any) -> Any:
+        mine = (add(here, offset_to(size, here, p[last])),) if point else (p[last],)
+        return mine if before is None else before(p, size, here) + mine
+
+    return kernel(values)

@@ -1,0 +1,133 @@
+"""The scratch of one world in progress: every array by name, declared once.
+
+Which arrays there are follows from what a scene does; how large they are from how many agents it has. Kernels find them
+by name in one record; allocation and the count of bytes ask here, too. Arrays of vectors and of numbers lie in blocks
+(see blocks.py). Those of `OWN` belong to one thread each; all others to the team that steps a world together.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from flockenv.geometry.barnes_hut import BUCKETS, LEVELS, tree_sizes
+from flockenv.geometry.cell_list import FEWEST_ARRANGED, MAX_RANGES
+from flockenv.geometry.spatial_sort import HOME
+from flockenv.jit.section import record
+
+if TYPE_CHECKING:
+    from flockenv.engine.kernel_plan import Parts
+
+__all__ = ["GIVEN", "OWN", "SMALL_STRIDE", "Array", "array_names", "scratch_bytes", "scratch_of", "scratch_record"]
+
+SMALL_STRIDE = 128
+"""Places in a row of sorted agents where there are too few to be sorted by cell: their blocks, and one more."""
+
+OWN = ("lanes", "ranges", "spread")
+"""What each thread has for itself: running numbers of a block, ranges of candidates, masks of what all share."""
+
+GIVEN = ("bond_place", "bond_number", "bond_start")
+"""Tables of bonds, which a scene has made: handed over with scratch, and only read."""
+
+Array = tuple[tuple[int, ...], Any]
+"""Shape and kind of numbers."""
+
+
+def scratch_of(parts: Parts, agents: int, team: int = 1) -> dict[str, Array]:
+    """Return the arrays that a team of threads takes to step one world, in order; those of `OWN` for one thread."""
+    real, d, width = np.dtype(parts.dtype), parts.dimension, parts.width
+    padded = -(-agents // width) * width
+
+    def vectors(*names: str) -> dict[str, Array]:
+        return dict.fromkeys(names, ((padded * d,), real))
+
+    def numbers(*names: str) -> dict[str, Array]:
+        return dict.fromkeys(names, ((padded,), real))
+
+    found = vectors("pos", "vel", "want")
+    found["aside"] = (padded * parts.aside,), real
+    if not parts.one_stage:
+        found["stages"] = (parts.integrator.stages, padded * d), real
+    found |= numbers("mass", "radius", "max_speed", "max_force", "living", "ident")
+    found |= vectors(*parts.frame_vectors, *["aiming"] * parts.aims, *["carrying"] * parts.flows)
+    found |= vectors(*["tie"] * ("t0" in parts.fields), *["pulled"] * parts.pulls)
+    found |= numbers(*parts.frame_numbers, *(f"inner{k}" for k in range(len(parts.inner))))
+    found["counters"] = (max(parts.counters, 1),), real
+    if parts.sweeps:
+        found |= _of_the_query(parts, agents, team)
+    if parts.arranges:
+        found |= _of_tiles(parts, agents)
+    if parts.treed:
+        found |= _of_trees(parts, agents, team)
+    if parts.bonded:
+        kinds = np.dtype(np.int32), real, np.dtype(np.int64)
+        found |= {name: ((0,), kind) for name, kind in zip(GIVEN, kinds, strict=True)}
+    found |= {"tally": ((2 * team,), np.dtype(np.int64)), "sync": ((8,), np.dtype(np.int64))}
+    return found | {"lanes": ((len(parts.slots) * width,), real)}
+
+
+def _of_the_query(parts: Parts, agents: int, team: int) -> dict[str, Array]:
+    """Return what finding neighbours takes: small worlds are sorted into rows, others into cells, as records."""
+    real, whole, width = np.dtype(parts.dtype), np.dtype(np.int32), parts.width
+    padded = -(-agents // width) * width
+    found: dict[str, Array] = {
+        "felt": ((max(padded * parts.dimension * len(parts.targets), 1),), real),
+        "number": ((SMALL_STRIDE,), whole),
+        "ranges": ((MAX_RANGES, 3), np.dtype(np.int64)),
+    }
+    if not parts.sorts:
+        return found | {"sorted_rows": ((parts.rows * SMALL_STRIDE,), real), "order": ((padded,), whole)}
+    return found | {
+        "records": (((padded + 2 * width) * parts.numbers,), real),
+        "cell": ((padded,), whole),
+        "start": ((agents + 1,), whole),
+        "offset": ((team, agents), whole),
+        "bounds": ((team, 6), np.dtype(np.float64)),
+    }
+
+
+def _of_tiles(parts: Parts, agents: int) -> dict[str, Array]:
+    """Return what putting a large world in order takes."""
+    whole, width = np.dtype(np.int32), parts.width
+    many = agents >= FEWEST_ARRANGED
+    padded = -(-agents // width) * width if many else 0
+    found: dict[str, Array] = {
+        "luggage": (((agents if many else 1) * parts.luggage_size + parts.luggage_size,), np.dtype(parts.dtype)),
+        "spread": ((2,), np.dtype(np.uint64)),
+    }
+    if parts.homely:
+        found |= {"homes": ((padded // width * HOME + 1,), whole), "strangers": ((padded + 1,), whole)}
+    return found
+
+
+def _of_trees(parts: Parts, agents: int, team: int) -> dict[str, Array]:
+    """Return what a tree of agents takes, for laws about all agents."""
+    real, long, width = np.dtype(parts.dtype), np.dtype(np.int64), parts.width
+    padded = -(-agents // width) * width
+    found: dict[str, Array] = {
+        name: ((size,), real) for name, size in tree_sizes(agents, width, parts.dimension, team).items()
+    }
+    return found | {
+        "tree_place": ((2 * padded,), np.dtype(np.int32)),
+        "tree_key": ((2 * padded,), long),
+        "tree_digit": ((BUCKETS + LEVELS + 1,), long),
+        "bounds": ((team, 6), np.dtype(np.float64)),
+    }
+
+
+def scratch_record(parts: Parts) -> Any:
+    """Return the type of the record in which the kernels of a scene find them; `inner` is a tuple of several."""
+    names = [name for name in scratch_of(parts, parts.width) if not name.startswith("inner")]
+    return record((*names, *["inner"] * bool(parts.inner)))
+
+
+def array_names(parts: Parts) -> tuple[str, ...]:
+    """Return the names of all arrays of a world in progress, in the order of `blocks.handed_of` and of scratch."""
+    return ("pos", "vel", *(f"inner{k}" for k in range(len(parts.inner))), *scratch_record(parts)._fields)
+
+
+def scratch_bytes(parts: Parts, agents: int) -> int:
+    """Return how many bytes they take for one thread."""
+    return sum(math.prod(shape) * kind.itemsize for shape, kind in scratch_of(parts, agents).values())

@@ -1,0 +1,312 @@
+"""The way around what is in an agent's way: `aside_of`, the side of the nearest silhouette edge (Reynolds 1988).
+
+What is passed is an obstacle as the body sees it. Where another obstacle leaves no room beside an edge, a body's radius
+beyond it, the two are one, and the edge of the other is looked for on the same side: so joined walls, and gaps that are
+too narrow, have no edge in between.
+
+All of it takes the `world`: the circles of the state (obstacle_x, obstacle_radius), params, the size of the space, the
+number of the world, and the time (s). What is touched is known by its form, and the row in `params` where it begins: of
+a circle of the state the form is -1 and the row its number; if nothing is touched the form is -2.
+"""
+
+from __future__ import annotations
+
+import functools
+import importlib
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from flockenv.engine.blocks import vector_of
+from flockenv.engine.shape_rows import FormPlan, Surroundings, box_of_way, by_form, each_row, number_of, seen_from
+from flockenv.geometry.shapes.edges import near_way, sphere_edge
+from flockenv.geometry.shapes.ray_contact import touched_spot
+from flockenv.geometry.shapes.round import touched_normal
+from flockenv.geometry.shapes.table import law_of
+from flockenv.jit.decorators import Law, Vec, kernel, law, like, routine
+from flockenv.jit.section import section
+from flockenv.maths.vectors import add, cross, dot, lateral, norm, perpendicular, scale, select, sub, unit, zero
+from flockenv.steering.around import threat
+
+__all__ = ["aside_of"]
+
+FOLLOWED = 8
+"""Obstacles in a row, edge to edge, that are taken for one; of more there is no edge on that side."""
+
+ALL_AROUND = 6.0
+"""rad: what must be turned by more to be passed is all around."""
+
+JUST = 1 - 1e-3
+"""Share of its clearance that a body keeps when it is tried whether it passes an edge: beside it touches nothing."""
+
+NEARER = 1 - 1e-5
+"""Share of its distance by which an edge must be nearer than another one to be preferred: so rounding picks no side."""
+
+SPINES = ("chain", "block")
+"""Forms that have an axis of their own: `spine_FORM` of shapes/edges.py."""
+
+
+def _laws(verb: str, forms: tuple[FormPlan, ...]) -> tuple[tuple[str, Law], ...]:
+    """Return the laws `edge_FORM` or `spine_FORM` of some forms, see shapes/edges.py."""
+    module = importlib.import_module(near_way.__module__)
+    return tuple((form.name, getattr(module, f"{verb}_{form.name}")) for form in forms)
+
+
+@law
+def _no_edge(table: Any, at: int, x: Vec, ray: Vec, side: Vec, room: float) -> tuple[float, float]:
+    """Return that there is no edge: of what is no shape."""
+    return like(room, np.inf), like(room, np.inf)
+
+
+@law
+def _nowhere(table: Any, at: int, x: Vec) -> tuple[float, Vec]:
+    """Return that what is no shape is infinitely far, and has no normal."""
+    return like(x[0], np.inf), zero(x)
+
+
+@law
+def _no_spine(table: Any, at: int, x: Vec, ray: Vec) -> Vec:
+    """Return that a shape has no axis of its own: 0."""
+    return zero(x)
+
+
+# --- what a body touches ----------------------------------------------------------------------------------------------
+
+
+@functools.cache
+def first_hit(around: Surroundings) -> Callable[..., tuple[float, int, int]]:
+    """Make `first_hit(world, x, ray, room, most)`: how far a body of radius `room` comes along a ray, m; form and row.
+
+    At most `most`. Of what is touched at once, what is listed first.
+    """
+    offset_to, circle, shaped = around.offset_to, vector_of(around.dimension), bool(around.forms)
+    first_row: Any = _first_row(around) if shaped else None
+
+    def first_hit(world: Any, x: Any, ray: Any, room: Any, most: Any) -> Any:
+        obstacle_x, obstacle_radius, params, size, b, time = world
+        best, form, row = most, -2, -1
+        for m in range(obstacle_radius.shape[1]):
+            rho = obstacle_radius[b, m]
+            if rho > 0:
+                to = offset_to(size, x, circle(obstacle_x, b, m))
+                here = threat(ray, to, room + rho, like(room, np.inf))
+                if here < best:
+                    best, form, row = here, -1, m
+        if shaped:
+            return first_row(params, size, (time, x, ray, room), (best, form, row))
+        return best, form, row
+
+    return routine(first_hit)
+
+
+@section
+def _first_row(around: Surroundings) -> Callable[..., tuple[float, int, int]]:
+    """Make `first(params, size, given, state)`: `state` after all shapes; given: (time, x, ray, room)."""
+    first, form = len(around.forms) == 1, around.forms[-1]
+    before: Any = None if first else _first_row(around._replace(forms=around.forms[:-1]))
+    each = each_row(around, form, _touches(around, form), _box_of_way, _never)
+
+    def first_row(params: Any, size: Any, given: Any, state: Any) -> Any:
+        if first:
+            return each(params, size, given, state)
+        return each(params, size, given, before(params, size, given, state))
+
+    return first_row
+
+
+@section
+def _touches(around: Surroundings, form: FormPlan) -> Callable[..., tuple[float, int, int]]:
+    """Make what a loop over rows does with each: keep (how far, form, row) of what is touched first."""
+    seen, hit, number = seen_from(around.offset_to, around.moving), law_of("hit", form.name), number_of(form.name)
+
+    def touches(params: Any, size: Any, at: Any, given: Any, state: Any) -> Any:
+        time, x, ray, room = given
+        best, touched, row = state
+        y = seen(params, size, at, time, x)
+        if near_way(params, at, y, ray, room, best):
+            here = hit(params, at, y, ray, room)
+            if here < best or (here == best and touched == number and at < row):
+                best, touched, row = here, number, at
+        return best, touched, row
+
+    return touches
+
+
+@kernel
+def _box_of_way(given: Any, state: Any) -> Any:
+    """Return the box around a body on its way, as far as it is free: the middle, and half the edges."""
+    _, x, ray, room = given
+    return box_of_way(x, scale(ray, state[0] * like(state[0], 0.5)), room)
+
+
+@kernel
+def _never(state: Any) -> Any:
+    """Return that another row may be nearer."""
+    return False
+
+
+@section
+def _row_ahead(forms: tuple[FormPlan, ...]) -> Callable[..., int]:
+    """Make `row(params, form, place)`: where the row of an obstacle begins, or the number of a circle of the state.
+
+    place: which of its form it is; of a form with a grid, how far its row lies behind the first.
+    """
+    some = bool(forms)
+    number, first, gridded = (number_of(forms[0].name), *forms[0][1:]) if forms else (0, 0, False)
+    rest: Any = _row_ahead(forms[1:]) if forms else None
+
+    def row_ahead(params: Any, form: Any, place: Any) -> Any:
+        if some:
+            if form != number:
+                return rest(params, form, place)
+            row = np.int64(params[first])
+            if gridded:
+                return row + place
+            for _ in range(place):
+                row += np.int64(params[row])
+            return row
+        return place
+
+    return row_ahead
+
+
+# --- its edges --------------------------------------------------------------------------------------------------------
+
+
+@functools.cache
+def edge(around: Surroundings) -> Callable[..., tuple[float, float]]:
+    """Make `edge(world, form, row, x, ray, side, room)`: by what angle a ray must be turned to pass it, and how far.
+
+    Towards `side`; rad, and m along the turned ray until the body is beside it.
+    """
+    offset_to, circle, shaped = around.offset_to, vector_of(around.dimension), bool(around.forms)
+    seen, edge_of = seen_from(around.offset_to, around.moving), by_form(_laws("edge", around.forms), _no_edge)
+
+    def edge(world: Any, form: Any, row: Any, x: Any, ray: Any, side: Any, room: Any) -> Any:
+        obstacle_x, obstacle_radius, params, size, b, time = world
+        if form == -1:
+            to = offset_to(size, x, circle(obstacle_x, b, row))
+            return sphere_edge(to, ray, side, room + obstacle_radius[b, row])
+        if shaped:
+            return edge_of(params, form, row, (seen(params, size, row, time, x), ray, side, room))
+        return like(room, np.inf), like(room, np.inf)
+
+    return routine(edge)
+
+
+@functools.cache
+def normal_hit(around: Surroundings) -> Callable[..., Vec]:
+    """Make `normal_hit(world, form, row, x, ray, hit, room)`: the outward unit normal where a body touches an obstacle.
+
+    hit: how far along the ray that is, m.
+    """
+    offset_to, circle, shaped = around.offset_to, vector_of(around.dimension), bool(around.forms)
+    laws = tuple((form.name, law_of("nearest", form.name)) for form in around.forms)
+    seen, nearest = seen_from(around.offset_to, around.moving), by_form(laws, _nowhere)
+
+    def normal_hit(world: Any, form: Any, row: Any, x: Any, ray: Any, hit: Any, room: Any) -> Any:
+        obstacle_x, _, params, size, b, time = world
+        if form == -1:
+            return touched_normal(offset_to(size, x, circle(obstacle_x, b, row)), ray, hit)
+        if shaped:
+            return nearest(params, form, row, (touched_spot(seen(params, size, row, time, x), ray, hit, room),))[1]
+        return zero(x)
+
+    return routine(normal_hit)
+
+
+@functools.cache
+def edge_beyond(around: Surroundings) -> Callable[..., tuple[float, Vec]]:
+    """Make `edge_beyond(world, form, row, hit, x, ray, side, room, most)`: where a body passes on a side.
+
+    How far from the impact the nearest such place is, m; inf if beyond `most`. In space also the normal of the obstacle
+    that is first found in the way on that side; else 0.
+    """
+    touched, edge_at, space = first_hit(around), edge(around), around.dimension == 3
+    normal_at: Any = normal_hit(around) if space else None
+
+    def edge_beyond(
+        world: Any, form: Any, row: Any, hit: Any, x: Any, ray: Any, side: Any, room: Any, most: Any
+    ) -> Any:
+        far, off, first = like(room, np.inf), zero(x), True
+        spot, way, across, turned_by = scale(ray, hit), ray, side, like(room, 0.0)
+        for _ in range(FOLLOWED):
+            turn, reach = edge_at(world, form, row, x, way, across, room)
+            turned_by += turn
+            if not (turned_by < like(room, ALL_AROUND)) or reach == far:
+                return far, off
+            c, s = np.cos(turn), np.sin(turn)
+            way, across = add(scale(way, c), scale(across, s)), sub(scale(across, c), scale(way, s))
+            beyond = norm(sub(scale(way, reach), spot))
+            if not (beyond < most):
+                return far, off
+            hit, form, row = touched(world, x, way, room * like(room, JUST), reach + room)
+            if form == -2:
+                return beyond, off
+            if space and first:
+                off, first = normal_at(world, form, row, x, way, hit, room), False
+        return far, off
+
+    return routine(edge_beyond)
+
+
+# --- the nearest of them ----------------------------------------------------------------------------------------------
+
+
+@functools.cache
+def aside_of(around: Surroundings) -> Callable[..., Vec]:
+    """Make `aside_of(world, x, ray, room, known)`: the unit vector across a ray to the side of the nearest edge.
+
+    Nearest to the impact; 0 if what is ahead has no edge where the body passes. known: how far ahead it is, m, its
+    form, and its place in that. In the plane both sides are compared, in space the normal's and those along and across
+    an axis.
+    """
+    row_of, normal_at, beyond = _row_ahead(around.forms), normal_hit(around), edge_beyond(around)
+    sides_of = _sides_in_space(around) if around.dimension == 3 else _both_sides
+
+    def aside_of(world: Any, x: Any, ray: Any, room: Any, known: Any) -> Any:
+        hit, form, place = known
+        row, right = row_of(world[2], form, place), perpendicular(ray)
+        out = lateral(normal_at(world, form, row, x, ray, hit, room), ray)
+        own = select(dot(out, out) > like(room, 1e-10), unit(out), right)
+        best, off = beyond(world, form, row, hit, x, ray, own, room, like(room, np.inf))
+        found = own if best < like(room, np.inf) else zero(x)
+        for side in sides_of(world, form, row, x, ray, own, off):
+            far = beyond(world, form, row, hit, x, ray, side, room, best * like(room, NEARER))[0]
+            best, found = (far, side) if far < best else (best, found)
+        return found
+
+    return routine(aside_of)
+
+
+@kernel
+def _both_sides(world: Any, form: Any, row: Any, x: Any, ray: Any, own: Any, off: Any) -> Any:
+    """Return the side that the normal's is not."""
+    return (scale(own, like(x[0], -1.0)),)
+
+
+@section
+def _sides_in_space(around: Surroundings) -> Callable[..., tuple[Vec, ...]]:
+    """Make `sides(world, form, row, x, ray, own, off)`: both sides along and across an axis.
+
+    The axis is the obstacle's own, or else leads away from what blocked the side of the normal. So no axis of the
+    coordinates is preferred, and agents of the mirrored scene take the mirrored path.
+    """
+    laws = _laws("spine", tuple(form for form in around.forms if form.name in SPINES))
+    some, seen, spine_of = bool(laws), seen_from(around.offset_to, around.moving), by_form(laws, _no_spine)
+
+    def sides(world: Any, form: Any, row: Any, x: Any, ray: Any, own: Any, off: Any) -> Any:
+        _, _, params, size, _, time = world
+        ax, e = zero(x), like(x[0], 1.0)
+        if some and form >= 0:
+            ax = lateral(spine_of(params, form, row, (seen(params, size, row, time, x), ray)), ray)
+        if dot(ax, ax) <= like(e, 1e-10):
+            ax = lateral(lateral(off, ray), own)
+        if dot(ax, ax) <= like(e, 1e-10):
+            ax = cross(ray, own)
+        ax = unit(ax)
+        across = cross(ray, ax)
+        return ax, scale(ax, -e), across, scale(across, -e)
+
+    return sides

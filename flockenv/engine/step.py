@@ -1,0 +1,365 @@
+"""A step: worlds are brought into blocks, advanced by the integrator's method, bounded, and written back.
+
+`step_world` is called by scenes through `step`, and by tasks through their `play`. Several threads may advance one
+world together, each the agents of its own blocks.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from flockenv.engine.accelerations import (
+    ResponsePlan,
+    SensePlan,
+    accelerate_of,
+    respond_of,
+    response_plan,
+    sense_of,
+    sense_plan,
+)
+from flockenv.engine.agent_records import AgentPlan, agent_plan, alone_of
+from flockenv.engine.blocks import place_of, vector_of_lane
+from flockenv.engine.context import Context
+from flockenv.engine.kernel_plan import Parts
+from flockenv.engine.lane_access import gather
+from flockenv.engine.law_calls import OneLaw, laws_of, says_of
+from flockenv.engine.load_store import bring_in_of, bring_inside_of, bring_out_of, take_drive_of
+from flockenv.engine.method import MethodPlan, advance_of, method_plan
+from flockenv.engine.move import MovePlan, move_of, move_plan
+from flockenv.engine.parameters import NumberPlan, numbers_of
+from flockenv.engine.reorder import ArrangePlan, arrange_plan, go_home_of, move_in_of
+from flockenv.jit.decorators import Law, finite, kernel, like
+from flockenv.jit.intrinsics import ask_for, wait_for_team
+from flockenv.jit.section import in_turn, section
+from flockenv.maths.vectors import zero
+from flockenv.model.state import COUNTED_BY_KERNELS
+from flockenv.physics.integrators.integrator import Method, Provided
+
+__all__ = ["StepPlan", "step_plan", "step_world_of"]
+
+PART = 8
+"""Blocks that are advanced together."""
+
+AHEAD = 16
+"""How many blocks ahead it is asked for what agents are moved by, in large worlds: several arrays are read at once."""
+
+
+class StepPlan(NamedTuple):
+    """What a step of a scene depends on."""
+
+    agent: AgentPlan
+    numbers: NumberPlan
+    confines: Law | None  # brings agents into a periodic box when a call begins
+    arrange: ArrangePlan | None
+    counts: tuple[OneLaw, ...]  # laws that count agents
+    sense: SensePlan
+    response: ResponsePlan
+    move: MovePlan
+    method: Callable[[Provided], Method] | None  # of several stages
+    method_plan: MethodPlan
+    tells: bool  # are inner states told what is sensed at the beginning of a step?
+    ahead: tuple[int, ...]  # numbers of a block in `pos`, `vel`, `felt` and `ident`, that are asked for ahead; or none
+    trusts: bool  # is every agent at a finite place until a step has failed? see Parts.trusts
+    spreads: bool  # does NaN spread at once to all agents that meet the one that has it?
+
+
+def step_plan(parts: Parts) -> StepPlan:
+    """Return the plan of a scene."""
+    d, w = parts.dimension, parts.width
+    method = None if parts.one_stage else parts.integrator.advance()
+    return StepPlan(
+        agent_plan(parts), parts.number_plan,
+        parts.space.confine_law if parts.confines else None,
+        arrange_plan(parts) if parts.arranges else None, laws_of(parts, "count_law"), sense_plan(parts),
+        response_plan(parts),
+        move_plan(parts), method, method_plan(parts), parts.inner != () and parts.integrator.solves,
+        (d * w, d * w, parts.felt_size, w) if parts.sorts else (), parts.trusts, parts.spreads,
+    )  # fmt: skip
+
+
+# --- one step ---------------------------------------------------------------------------------------------------------
+
+
+@functools.cache
+def _counting(law: OneLaw) -> Callable[..., None]:
+    """Return `counts(numbers, me, lives)`: count an agent as a law says."""
+    which_of, k = says_of(law), law.k
+
+    def counts(numbers: Any, me: Any, lives: Any) -> None:
+        which: Any = np.int64(which_of(numbers, me))
+        if lives and which >= 0 and which < len(numbers.effects[k].counted):
+            numbers.effects[k].counted[which] += like(me.radius, 1.0)
+
+    return kernel(counts)
+
+
+@functools.cache
+def _clearing(k: int) -> Callable[..., None]:
+    def clears(numbers: Any) -> None:
+        numbers.effects[k].counted[:] = 0
+
+    return kernel(clears)
+
+
+@section
+def _count(agent: AgentPlan, laws: tuple[OneLaw, ...]) -> Callable[..., None]:
+    """Make `count_agents(context, pos, vel, time)`: count all agents of a world, by one thread of the team."""
+    d, width = agent.dimension, agent.width
+    place_in, vector, alone = place_of(d, width), vector_of_lane(d, width), alone_of(agent._replace(aims=False))
+    clear, counts = in_turn(*(_clearing(law.k) for law in laws)), in_turn(*map(_counting, laws))
+
+    def count_agents(context: Any, pos: Any, vel: Any, time: Any) -> None:
+        scratch, numbers, drawn = context.scratch, context.numbers, context.key[context.b]
+        wait_for_team(scratch.sync, context.team)  # what goes on inside agents was written by other threads
+        if context.rank == 0:
+            clear(numbers)
+            for i in range(np.uint64(context.n)):
+                at = place_in(i)
+                x, v = vector(pos, at), vector(vel, at)
+                me = alone(scratch, drawn, time, at, i, i, x, v, zero(x))
+                counts(numbers, me, scratch.living[i] > like(x[0], 0.0))
+        wait_for_team(scratch.sync, context.team)  # before any agent changes
+
+    return count_agents
+
+
+@functools.cache
+def _asking(many: int, width: int) -> Callable[[Any, Any], None]:
+    """Return `asks(array, block)`: ask for `many` numbers of a block of an array."""
+    places = tuple(range(0, many, width))
+    return kernel(lambda array, block: _ask_all(array, block * np.uint64(many), places))
+
+
+@kernel
+def _ask_all(array: Any, at: Any, places: Any) -> None:
+    for place in places:
+        ask_for(array, at + np.uint64(place))
+
+
+@section
+def _ask_ahead(numbers: tuple[int, ...], width: int) -> Callable[..., None]:
+    """Make `ask_ahead(scratch, pos, vel, block)`: ask for what a later block will be moved by."""
+    (of_pos, of_vel, of_felt, of_ident), felt = (_asking(many, width) for many in numbers), numbers[2] > 0
+
+    def ask_ahead(scratch: Any, pos: Any, vel: Any, block: Any) -> None:
+        ahead = block + np.uint64(AHEAD)
+        of_pos(pos, ahead)
+        of_vel(vel, ahead)
+        if felt:
+            of_felt(scratch.felt, ahead)
+        of_ident(scratch.ident, ahead)
+
+    return ask_ahead
+
+
+@section
+def _in_two_loops(plan: StepPlan) -> Callable[..., None]:
+    """Make what moves agents by a method of one stage, once all is sensed: no agent reads what another writes.
+
+    A part after the other, which stays in the nearest cache, and of which accelerations are put aside. In one loop,
+    from what is felt to where that leads, too few agents would be under way at a time.
+    """
+    size = np.uint64(plan.agent.dimension * plan.agent.width)
+    respond, move = respond_of(plan.response), move_of(plan.move)
+    ask_ahead = _ask_ahead(plan.ahead, plan.agent.width) if plan.ahead else None
+    sense = sense_of(plan.sense)
+
+    def advance(context: Any, pos: Any, vel: Any, time: Any, dt: Any, instant: Any) -> None:
+        aside, first, end = context.scratch.aside, context.first, context.end
+        sense(context, pos, vel, time)
+        for begin in range(first, end, PART):
+            until, before = min(begin + PART, end), np.uint64(begin - first)  # each thread at a place of its own
+            for block in range(np.uint64(begin), np.uint64(until)):
+                if ask_ahead is not None:
+                    ask_ahead(context.scratch, pos, vel, block)
+                respond(context, pos, vel, time, block, aside, (block - before) * size)
+            for block in range(np.uint64(begin), np.uint64(until)):
+                move(context, pos, vel, time, dt, instant, block, (block - before) * size)
+
+    return advance
+
+
+@section
+def _by_method(plan: StepPlan) -> Callable[..., None]:
+    """Make what moves agents by a method of several stages, which asks for accelerations by itself."""
+    assert plan.method is not None
+    size, move = plan.agent.dimension * plan.agent.width, move_of(plan.move)
+    advance_by = advance_of(plan.method, plan.method_plan)(accelerate_of(plan.response, plan.sense))
+    flows, bounces, sense = plan.move.flows, plan.move.bounce is not None, sense_of(plan.sense) if plan.tells else None
+
+    def advance(context: Any, pos: Any, vel: Any, time: Any, dt: Any, instant: Any) -> None:
+        scratch, first, end = context.scratch, context.first, context.end
+        if sense is not None:
+            sense(context, pos, vel, time)
+        for i in range(np.uint64(first * size), np.uint64(end * size)):
+            scratch.aside[i] = pos[i]
+            if bounces:
+                scratch.aside[np.uint64(len(pos)) + i] = vel[i]
+        if flows:
+            advance_by(context, pos, vel, scratch.carrying, time, dt, scratch.stages, first * size, end * size)
+        else:
+            advance_by(context, pos, vel, (), time, dt, scratch.stages, first * size, end * size)
+        for block in range(np.uint64(first), np.uint64(end)):
+            move(context, pos, vel, time, dt, instant, block, block * np.uint64(size))
+
+    return advance
+
+
+# --- several steps of a world -----------------------------------------------------------------------------------------
+
+
+@section
+def _first_bad(bad: int, width: int) -> Callable[..., Any]:
+    """Make `first_bad(lanes, well)`: the lowest number of an agent that is not finite, or `well`."""
+    at = np.uint64(bad)
+
+    def first_bad(lanes: Any, well: Any) -> Any:
+        worst = well
+        for lane in range(width):  # one after the other: no loop over lanes
+            worst = min(worst, lanes[at + np.uint64(lane)])
+        return worst
+
+    return first_bad
+
+
+@section
+def _failing(bad: int, width: int) -> Callable[..., Any]:
+    """Make `failing(lanes, well, step, n, failed, none_failed)`: which agent failed first, and in which step.
+
+    As one number, step * n + agent; `none_failed`, n (count + 1), as long as none has.
+    """
+    at, lowest = np.uint64(bad), _first_bad(bad, width)
+
+    def failing(lanes: Any, well: Any, step: Any, n: Any, failed: Any, none_failed: Any) -> Any:
+        fallen = np.int32(0)
+        for lane in range(np.uint64(width)):
+            fallen += np.int32(1) if lanes[at + lane] < well else np.int32(0)
+        if fallen > np.int32(0) and failed == none_failed:
+            return np.int64(step * n) + np.int64(lowest(lanes, well))
+        return failed
+
+    return failing
+
+
+@section
+def _enter(plan: StepPlan) -> Callable[..., Context]:
+    """Make `enter(worlds, drive, asked, params, count, b, rank, team, scratch)`: bring this thread's part into blocks.
+
+    It returns the context of world b, in order for `count` steps if that is worth it.
+    """
+    agent, d, width, ordered = plan.agent, plan.agent.dimension, plan.agent.width, plan.arrange is not None
+    read, bring_in, take_drive = numbers_of(plan.numbers), bring_in_of(agent), take_drive_of(d, width, ordered)
+    bring_inside = bring_inside_of(agent, plan.confines) if plan.confines is not None else None
+    move_in = move_in_of(plan.arrange) if plan.arrange is not None else None
+
+    def enter(
+        worlds: Any, drive: Any, asked: Any, params: Any, count: Any, b: Any, rank: Any, team: Any, scratch: Any
+    ) -> Any:
+        n, alive = worlds.x.shape[2], worlds.alive
+        blocks = (n + (width - 1)) // width
+        first, end = blocks * rank // team, blocks * (rank + 1) // team
+        present = np.int64(0)  # not a literal: laws would be typed for it too, and compiled twice
+        for i in range(n):
+            present += alive[b, i]
+        for i in range(first * width, min(end * width, n)):
+            scratch.living[i] = alive[b, i]
+        bring_in(worlds, scratch, b, first, end)
+        take_drive(scratch, drive, asked, n, first, end)
+        numbers, arranged = read(params, scratch.counters), False
+        if bring_inside is not None:
+            bring_inside(scratch, numbers.size, first, end)
+        if move_in is not None:
+            arranged = move_in(scratch, numbers, count, (n, present, first, end, rank, team))
+        return Context(
+            worlds.obstacle_x, worlds.obstacle_radius, worlds.work, params, numbers, worlds.key, b, n, present,
+            arranged, first, end, rank, team, scratch,
+        )  # fmt: skip
+
+    return enter
+
+
+@section
+def step_world_of(plan: StepPlan) -> Callable[..., int]:
+    """Make `step_world(worlds, drive, asked, params, dt, count, b, rank, team, scratch)`.
+
+    It advances this thread's part of world b by `count` steps, and returns -1, or an agent that is not finite: the
+    lowest at the end of the call, or, where agents make others not finite (`spreads`), the lowest after the first step
+    that failed. Then nothing of the world is written. What is asked of its agents is drive[:, asked], N; nothing if
+    drive is empty.
+    """
+    agent, width, bad = plan.agent, plan.agent.width, np.uint64(plan.move.bad)
+    enter, bring_out, counted = _enter(plan), bring_out_of(agent), tuple(range(COUNTED_BY_KERNELS))
+    count_agents = _count(agent, plan.counts) if plan.counts else None
+    advance = _in_two_loops(plan) if plan.method is None else _by_method(plan)
+    first_bad, failing = _first_bad(plan.move.bad, width), _failing(plan.move.bad, width) if plan.spreads else None
+    go_home = go_home_of(plan.arrange) if plan.arrange is not None else None
+    verdict = _verdict(plan.trusts, agent.dimension)
+
+    def step_world(
+        worlds: Any, drive: Any, asked: Any, params: Any, dt: Any, count: Any, b: Any, rank: Any, team: Any,
+        scratch: Any,
+    ) -> Any:  # fmt: skip
+        context = enter(worlds, drive, asked, params, count, b, rank, team, scratch)
+        n, first, end, pos, vel, lanes = context.n, context.first, context.end, scratch.pos, scratch.vel, scratch.lanes
+        well, begun, before = like(dt, np.inf), worlds.tick[b], gather(worlds.work[b], np.uint64(0), counted)
+        none_failed = np.int64(n * (count + 1))
+        failed = none_failed
+        for lane in range(np.uint64(width)):
+            lanes[bad + lane] = well
+        for step in range(count):
+            time = like(dt, (begun + step) * np.float64(dt))
+            if count_agents is not None:
+                count_agents(context, pos, vel, time)
+            advance(context, pos, vel, time, dt, begun + step)
+            if failing is not None:
+                failed = failing(lanes, well, step, n, failed, none_failed)
+        if go_home is not None:  # noqa: SIM102  # numba drops the branch by this alone
+            if context.arranged:
+                go_home(scratch, (n, context.present, first, end, rank, team))
+        if failing is None:
+            worst = first_bad(lanes, well)
+            failed = np.int64(worst) if worst < well else none_failed
+        found = verdict(context, worlds, before, failed, none_failed)
+        if found < 0:
+            bring_out(worlds, scratch, b, first, end)
+            if rank == 0:
+                worlds.tick[b] += count
+        return found
+
+    return step_world
+
+
+@section
+def _verdict(trusts: bool, dimension: int) -> Callable[..., int]:
+    """Make `verdict(context, worlds, before, failed, none_failed)`: which agent of a world is not finite, or -1.
+
+    What all threads of the team have found counts. Where one is, the counters of the world are what they were `before`.
+    """
+
+    def verdict(context: Any, worlds: Any, before: Any, failed: Any, none_failed: Any) -> Any:
+        scratch, b, n, rank, team = context.scratch, context.b, context.n, context.rank, context.team
+        # the first half may still be read by threads that count
+        scratch.tally[team + rank] = failed
+        wait_for_team(scratch.sync, team)
+        first = none_failed
+        for r in range(team):
+            first = min(first, scratch.tally[team + r])
+        wait_for_team(scratch.sync, team)  # before any thread counts again
+        if first >= none_failed:
+            return np.int64(-1)
+        agent = first % n
+        if rank == 0:
+            for k in range(COUNTED_BY_KERNELS):
+                worlds.work[b, k] = before[k]
+        if trusts:  # an agent that was not finite before the call is the one to blame
+            for i in range(n):
+                for k in range(dimension):
+                    if worlds.alive[b, i] and not finite(worlds.x[k, b, i]):
+                        return np.int64(i)
+        return np.int64(agent)
+
+    return verdict

@@ -1,0 +1,81 @@
+"""What obstacles hide: `blocked`, for laws that see, and meet, only what stands in no obstacle's shadow."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from flockenv.engine.blocks import vector_of
+from flockenv.engine.shape_rows import FormPlan, Surroundings, box_of_way, each_row, seen_from
+from flockenv.geometry.shapes.round import blocks
+from flockenv.geometry.shapes.table import law_of
+from flockenv.jit.decorators import kernel, like
+from flockenv.jit.section import section
+from flockenv.maths.vectors import norm, scale, unit
+
+__all__ = ["blocked"]
+
+
+@section
+def blocked(around: Surroundings) -> Callable[..., bool]:
+    """Make `blocked(obstacle_x, obstacle_radius, params, size, b, time, x, to)`.
+
+    It returns True if an obstacle stands in the straight way from place x to what is at the offset `to`, m.
+    """
+    offset_to, circle, shaped = around.offset_to, vector_of(around.dimension), bool(around.forms)
+    hidden: Any = _hidden(around) if shaped else None
+
+    def is_blocked(
+        obstacle_x: Any, obstacle_radius: Any, params: Any, size: Any, b: Any, time: Any, x: Any, to: Any
+    ) -> Any:
+        found = False
+        for m in range(obstacle_radius.shape[1]):
+            rho = obstacle_radius[b, m]
+            if rho > 0:
+                found |= blocks(offset_to(size, x, circle(obstacle_x, b, m)), rho, to)
+        if shaped:
+            return hidden(params, size, time, x, to, found)
+        return found
+
+    return is_blocked
+
+
+@section
+def _hidden(around: Surroundings) -> Callable[..., bool]:
+    """Make `hidden(params, size, time, x, to, found)`: `found`, or True if a shape stands in the way."""
+    first, form = len(around.forms) == 1, around.forms[-1]
+    before: Any = None if first else _hidden(around._replace(forms=around.forms[:-1]))
+    each = each_row(around, form, _hides(around, form), _box_of_way, _found)
+
+    def hidden(params: Any, size: Any, time: Any, x: Any, to: Any, found: Any) -> Any:
+        if first:
+            return each(params, size, (time, x, to), found)
+        return each(params, size, (time, x, to), before(params, size, time, x, to, found))
+
+    return hidden
+
+
+@section
+def _hides(around: Surroundings, form: FormPlan) -> Callable[..., bool]:
+    """Make what a loop over rows does with each: note if it stands in the way."""
+    seen, hit = seen_from(around.offset_to, around.moving), law_of("hit", form.name)
+
+    def hides(params: Any, size: Any, at: Any, given: Any, found: Any) -> Any:
+        time, x, to = given
+        y = seen(params, size, at, time, x)
+        return found | (hit(params, at, y, unit(to), like(to[0], 0.0)) < norm(to))
+
+    return hides
+
+
+@kernel
+def _box_of_way(given: Any, found: Any) -> Any:
+    """Return the box around the way: the middle, and half the edges."""
+    _, x, to = given
+    return box_of_way(x, scale(to, like(to[0], 0.5)), like(to[0], 0.0))
+
+
+@kernel
+def _found(found: Any) -> Any:
+    """Return whether one is enough."""
+    return found

@@ -1,0 +1,102 @@
+"""Workspace: scratch of those who step one world, counted and allocated before anything moves."""
+
+from __future__ import annotations
+
+import mmap
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flockenv.engine import GIVEN, OWN, Parts, Table, scratch_of
+from flockenv.jit.cpu import LINE
+from flockenv.model.state import Body
+from flockenv.physics.effects.effect import ties
+
+__all__ = ["Workspace"]
+
+HUGE = 2**21
+"""Bytes of a large page."""
+
+ALL = 2**64 - 1
+"""A mask that leaves every place as it is."""
+
+GAP = 5 * LINE
+"""Bytes between two arrays of scratch."""
+
+
+@dataclass(frozen=True)
+class Workspace:
+    """Scratch of a team of threads that step one world: what a step writes and nobody reads afterwards."""
+
+    arrays: dict[str, NDArray[Any]]
+    own: tuple[dict[str, NDArray[Any]], ...]  # lanes, ranges and spread of each thread
+    _given: dict[tuple[int, Any], Any] = field(default_factory=dict)
+
+    @classmethod
+    def allocate(cls, parts: Parts, body: Body, table: Table, team: int = 1) -> Workspace:
+        """Return scratch for the sweep, the query and the integrator: the arrays of sweep.scratch_of."""
+        agents, wanted = len(body.mass), scratch_of(parts, len(body.mass), team)
+        made = _zeros({name: array for name, array in wanted.items() if name not in (*OWN, *GIVEN)})
+        arrays = made | {name: getattr(table, name.removeprefix("bond_")) for name in GIVEN if name in wanted}
+        padded = len(arrays["mass"])
+        for name, pad in (("mass", 1), ("radius", 0), ("max_speed", 1), ("max_force", 1)):
+            arrays[name][:] = pad
+            arrays[name][:agents] = getattr(body, name)
+        for name in parts.frame_numbers:
+            arrays[name][:agents], arrays[name][agents:] = getattr(body, name), 1
+        arrays["ident"][:] = np.arange(padded)
+        if "tie" in arrays:
+            blocks = ties(padded, parts.dimension).reshape(-1, parts.width, parts.dimension).transpose(0, 2, 1)
+            arrays["tie"][:] = blocks.reshape(-1)
+        if "number" in arrays:
+            arrays["number"][:] = np.arange(len(arrays["number"]))
+        own = tuple(_zeros({name: wanted[name] for name in OWN if name in wanted}) for _ in range(team))
+        for each in own:
+            if "spread" in each:
+                each["spread"][:] = _spread(body, parts.width)
+        return cls(arrays, own)
+
+    def of(self, rank: int, kind: Any) -> Any:
+        """Return what one of the team is given: a record of this kind, which names its arrays."""
+        if (rank, kind) not in self._given:
+            arrays: dict[str, Any] = self.arrays | self.own[rank]
+            arrays["inner"] = tuple(array for name, array in arrays.items() if name.startswith("inner"))
+            self._given[rank, kind] = kind(*(arrays[name] for name in kind._fields))
+        return self._given[rank, kind]
+
+
+def _spread(body: Body, width: int) -> NDArray[np.uint64]:
+    """Return what place of a body's numbers, and of what is asked of agents, is masked with: 0 if all have the same.
+
+    What all have in common is read where the first block has it.
+    """
+    numbers = (body.mass, body.radius, body.max_speed, body.max_force)
+    alike = len(body.mass) >= width and all((number == number[0]).all() for number in numbers)
+    return np.array([0 if alike else ALL, ALL], np.uint64)
+
+
+def _zeros(wanted: Mapping[str, tuple[int | tuple[int, ...], np.dtype[Any]]]) -> dict[str, NDArray[Any]]:
+    """Return arrays of zeros in one piece of memory, each beginning on a cache line: no vector is loaded from two.
+
+    Between two there is a gap, or places that are used together would compete for the same few lines of the cache.
+    """
+    sizes = {name: int(np.prod(shape)) * kind.itemsize for name, (shape, kind) in wanted.items()}
+    raw = _memory(sum(sizes.values()) + (len(sizes) + 1) * (LINE + GAP))
+    at, out = -raw.ctypes.data % LINE, {}
+    for name, (shape, kind) in wanted.items():
+        out[name] = raw[at : at + sizes[name]].view(kind).reshape(shape)
+        at += -(-sizes[name] // LINE) * LINE + GAP
+    return out
+
+
+def _memory(size: int) -> NDArray[np.uint8]:
+    """Return zeros; where there are many, and the system has them, on large pages: fewer addresses to look up."""
+    if size < HUGE or not hasattr(mmap, "MADV_HUGEPAGE"):
+        return np.zeros(size, np.uint8)
+    memory = mmap.mmap(-1, size + HUGE, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)
+    memory.madvise(mmap.MADV_HUGEPAGE)
+    raw = np.frombuffer(memory, np.uint8)
+    return raw[-raw.ctypes.data % HUGE :]
