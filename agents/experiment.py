@@ -13,9 +13,9 @@ from typing import Any, Literal
 import typer
 from pydantic import Field, ValidationError, model_validator
 
-from flockenv.config import load
 from flockenv.core.errors import key_path, refusals
 from flockenv.core.record import Record
+from flockenv.scene.yaml_io import load
 from flockenv.tasks import TASKS, Task
 
 __all__ = [

@@ -24,7 +24,7 @@ __all__ = ["Compilation"]
 
 CODE = """
 import sys, time
-from flockenv.config import load_scene
+from flockenv.scene.yaml_io import load_scene
 
 scene = load_scene(sys.argv[1])
 state = scene.start(0)

@@ -24,8 +24,8 @@ from flockenv.geometry.space import Torus
 from flockenv.jit.thread_pool import use_threads
 from flockenv.model.spawn import Spawn
 from flockenv.physics.effects import Course
-from flockenv.presets import PRESETS, preset
 from flockenv.scene import Group, Scene
+from flockenv.scene.presets import PRESETS, preset
 
 __all__ = ["crowd"]
 

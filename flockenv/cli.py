@@ -203,8 +203,8 @@ def run(
     force: Force = False,
 ) -> None:
     """Run a scene, show what a biologist would measure, and keep the trajectory if asked to."""
-    from flockenv.config import load_scene
     from flockenv.core.output_paths import checked_file
+    from flockenv.scene.yaml_io import load_scene
     from flockenv.trajectory import whole_steps
 
     loaded = load_scene(Path(scene))
@@ -274,7 +274,7 @@ def render(
 def explain(scene: SceneFile) -> None:
     """Show the effects of a scene: what each calls for, what it costs per step, and what nobody asked for."""
     from flockenv import explanation
-    from flockenv.config import load_scene
+    from flockenv.scene.yaml_io import load_scene
 
     loaded = load_scene(Path(scene))
     with progress_bar("compiling and timing", len(loaded.effects) + 2, "variants") as progress:
@@ -318,8 +318,8 @@ def warmup(
     ] = None,
 ) -> None:
     """Compile ahead what tasks and scenes need, so that no first step has to wait; show how long each took."""
-    from flockenv.config import load_scene
     from flockenv.jit.progress import compiled, unmatched
+    from flockenv.scene.yaml_io import load_scene
     from flockenv.tasks import TASKS
 
     names = what or sorted(TASKS)
@@ -372,7 +372,7 @@ def _first_step_of_scene(scene: Scene) -> None:
 @app.command()
 def schema() -> None:
     """Print the JSON Schema of a scene, for editors that complete and check YAML."""
-    from flockenv.config import schema as json_schema
+    from flockenv.scene.yaml_io import schema as json_schema
 
     print(json.dumps(json_schema(), indent=2, allow_nan=False))
 
@@ -418,8 +418,8 @@ def _unsolved(state: State) -> str:
 
 def _film(file: str, duration: float, seed: int) -> tuple[Panel, float, str]:
     """Return a scene's run as something to draw, its frames per second, and what it left unsolved."""
-    from flockenv.config import load_scene
     from flockenv.render import Panel
+    from flockenv.scene.yaml_io import load_scene
     from flockenv.trajectory import whole_steps
 
     scene = load_scene(Path(file))

@@ -15,7 +15,7 @@ from flockenv.grants import Grants
 from flockenv.model.state import WORK, State
 from flockenv.physics.effects import EFFECTS, Effect
 from flockenv.scene import Scene
-from flockenv.stability import Suggestion, suggest_dt
+from flockenv.scene.stability import Suggestion, suggest_dt
 
 __all__ = ["Cost", "Explanation", "Row", "explain"]
 

@@ -11,11 +11,11 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 
 from flockenv.behaviours import BEHAVIOURS
-from flockenv.config import load_scene
 from flockenv.core.atomic_files import made, replacing
 from flockenv.physics.effects.effect import Effect
 from flockenv.render.gif import write_png
 from flockenv.render.picture import draw
+from flockenv.scene.yaml_io import load_scene
 from flockenv.trajectory import Trajectory, record
 
 __all__ = ["page", "shown", "write_gallery"]

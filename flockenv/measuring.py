@@ -72,9 +72,9 @@ def measure(
     force: Force = False,
 ) -> None:
     """Run a scene and measure its crowd: flow, density, lanes, bursts, clogging, order; table, JSON and pictures."""
-    from flockenv.config import load_scene
     from flockenv.core.atomic_files import made
     from flockenv.core.output_paths import checked_file
+    from flockenv.scene.yaml_io import load_scene
     from flockenv.survey import Asked, combined
     from flockenv.trajectory import whole_steps
 

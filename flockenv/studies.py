@@ -189,7 +189,7 @@ def _same(problem: Problem) -> Problem:
 def _problem(file: str, seconds: float | None, steps: str, dts: str, seed: int) -> Problem:
     """Return what is to be measured on a scene: by default in steps 4 times as long as its own to 32 times shorter."""
     from flockenv.accuracy import Problem
-    from flockenv.config import load_scene
+    from flockenv.scene.yaml_io import load_scene
     from flockenv.trajectory import whole_steps
 
     loaded = load_scene(Path(file))

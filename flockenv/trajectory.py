@@ -16,13 +16,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from flockenv.config import dump_scene
 from flockenv.core.atomic_files import deliver
 from flockenv.geometry.space import Plane
 from flockenv.measures import measure
 from flockenv.model.snapshot import Snapshot
 from flockenv.model.state import WORK, Floats, State
 from flockenv.scene import Scene
+from flockenv.scene.yaml_io import dump_scene
 
 __all__ = ["MEMORY_LIMIT", "Trajectory", "record", "whole_steps"]
 

@@ -15,9 +15,9 @@ from flockenv.accuracy.paths import apart, reach, unmatched
 from flockenv.accuracy.reference import _closing_in, find_reference, own_steps
 from flockenv.accuracy.table import errors, headlines
 from flockenv.cli import main
-from flockenv.config import load_scene
 from flockenv.physics.integrators import methods_named
 from flockenv.render.precision import draw_precision
+from flockenv.scene.yaml_io import load_scene
 
 BALL = """\
 dimension: 2
@@ -270,8 +270,10 @@ SHIPPED = [
 
 
 @pytest.mark.slow
-@pytest.mark.filterwarnings("ignore::flockenv.stability.CoarseContactWarning")  # steps as published, in configs/crowds
-@pytest.mark.filterwarnings("ignore::flockenv.stability.UnstableStepWarning")
+@pytest.mark.filterwarnings(
+    "ignore::flockenv.scene.stability.CoarseContactWarning"
+)  # steps as published, in configs/crowds
+@pytest.mark.filterwarnings("ignore::flockenv.scene.stability.UnstableStepWarning")
 @pytest.mark.parametrize("path", SHIPPED, ids=lambda path: path.stem)
 def test_every_scene_that_is_shipped_has_a_reference_or_a_line_that_says_why_not(path: Path) -> None:
     """Over four of its own steps, which is no measurement: that all of them are gone through, and told, is."""

@@ -11,7 +11,6 @@ import pytest
 
 from flockenv.behaviours import AvoidObstacles, Separation
 from flockenv.behaviours.steer import Steer
-from flockenv.config import dump_scene, load_scene
 from flockenv.engine import step_of
 from flockenv.explanation import _shares
 from flockenv.geometry.space import Torus
@@ -20,6 +19,7 @@ from flockenv.maths.counter_rng import key_of
 from flockenv.model.spawn import Spawn
 from flockenv.physics.effects import Drag, Effect
 from flockenv.scene import Group, Scene
+from flockenv.scene.yaml_io import dump_scene, load_scene
 from flockenv.steering.arbitration import (
     ARBITRATIONS,
     Allocation,

@@ -23,7 +23,6 @@ from gymnasium.error import ResetNeeded
 import flockenv  # noqa: F401  # registers the environments
 from flockenv.behaviours import Alignment, Queue, Separation
 from flockenv.cli import main
-from flockenv.config import load_scene
 from flockenv.geometry.shapes import HalfSpace, Polygon
 from flockenv.geometry.space import Box, Torus
 from flockenv.measures import measure
@@ -32,6 +31,7 @@ from flockenv.model.spawn import Spawn
 from flockenv.physics.effects import Drag, Springs
 from flockenv.physics.integrators import VelocityVerlet
 from flockenv.scene import Group, Scene
+from flockenv.scene.yaml_io import load_scene
 from flockenv.tasks import Pursuit
 from flockenv.world import World
 

@@ -13,12 +13,12 @@ from scipy.optimize import brentq
 from flockenv.behaviours import FollowFlow, FollowPath, StayOnPath
 from flockenv.behaviours.crowd import UnalignedAvoidance
 from flockenv.behaviours.steer import Steer
-from flockenv.config import load_scene
 from flockenv.geometry import polyline
 from flockenv.geometry.space import Plane, Space, Torus
 from flockenv.model.spawn import Spawn
 from flockenv.model.state import State
 from flockenv.scene import Group, Scene
+from flockenv.scene.yaml_io import load_scene
 from tests.catalogue import Array
 
 NOBODY = Spawn(low=(0.0, 0.0), high=(1.0, 1.0))

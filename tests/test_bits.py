@@ -18,10 +18,10 @@ import numba
 import numpy as np
 import pytest
 
-from flockenv.config import ConfigError, load_scene
 from flockenv.jit import cpu
 from flockenv.jit.thread_pool import threads, use_threads
 from flockenv.model.divergence import SimulationDiverged
+from flockenv.scene.yaml_io import ConfigError, load_scene
 from flockenv.tasks import TASKS
 from flockenv.world import World
 

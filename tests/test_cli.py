@@ -24,7 +24,6 @@ from typer.testing import CliRunner
 import flockenv.stress
 from flockenv import terminal
 from flockenv.cli import app, main
-from flockenv.config import load_scene, schema
 from flockenv.explanation import Cost, Explanation
 from flockenv.model.networks import Rope
 from flockenv.physics.effects import EFFECTS
@@ -32,7 +31,8 @@ from flockenv.physics.effects.springs import Springs
 from flockenv.physics.integrators import INTEGRATORS, ImplicitEuler, Integrator
 from flockenv.policy import Policy, RandomPolicy
 from flockenv.scene import Group, Scene
-from flockenv.stability import suggest_dt
+from flockenv.scene.stability import suggest_dt
+from flockenv.scene.yaml_io import load_scene, schema
 from flockenv.stress import Case, Value
 from flockenv.tasks import TASKS
 
@@ -223,7 +223,8 @@ def test_the_clock_of_a_run_begins_when_everything_is_compiled(more: str, tmp_pa
     """Otherwise the first run of a scene shows the speed of the compiler."""
     Path("new.yaml").write_text(TINY + more)
     code = (
-        "from pathlib import Path; from flockenv.jit.progress import compiled; from flockenv.config import load_scene;"
+        "from pathlib import Path; from flockenv.jit.progress import compiled;"
+        "from flockenv.scene.yaml_io import load_scene;"
         "from flockenv.trajectory import record; seen = [];"
         "record(load_scene(Path('new.yaml')), 0, 50, 10, lambda done: seen.append(len(compiled())));"
         "assert seen[0] == seen[-1] == len(compiled()) > 0, seen"
@@ -658,7 +659,7 @@ def test_a_fault_of_ours_is_called_one(monkeypatch: pytest.MonkeyPatch, capsys: 
     def broken(source: object) -> None:
         raise KeyError("pos")
 
-    monkeypatch.setattr("flockenv.config.load_scene", broken)
+    monkeypatch.setattr("flockenv.scene.yaml_io.load_scene", broken)
     assert main(["run", "tiny.yaml"]) == 1
     assert capsys.readouterr().err == "flockenv: KeyError: 'pos' (a fault of flockenv's; --debug shows where)\n"
 
@@ -676,7 +677,7 @@ def test_too_little_memory_is_no_fault_of_ours(
         ("Unable to allocate 3. GiB for an array", "not enough memory: Unable to allocate 3. GiB for an array"),
         ("", "not enough memory: less is needed with fewer agents or worlds"),
     ):
-        monkeypatch.setattr("flockenv.config.load_scene", short(text))
+        monkeypatch.setattr("flockenv.scene.yaml_io.load_scene", short(text))
         assert main(["run", "tiny.yaml"]) == 2
         assert capsys.readouterr().err == f"flockenv: {said}\n"
 
@@ -698,7 +699,7 @@ def test_an_error_of_the_system_leaves_standard_output_empty(
     def fail(*_: Any, **__: Any) -> None:
         raise error
 
-    monkeypatch.setattr("flockenv.config.load_scene", fail)
+    monkeypatch.setattr("flockenv.scene.yaml_io.load_scene", fail)
     assert main(["explain", "tiny.yaml"]) == 2
     where = "x: " if error.filename else ""
     assert capsys.readouterr() == ("", f"flockenv: {where}{error.strerror}\n")

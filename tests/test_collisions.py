@@ -13,7 +13,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from flockenv.config import dump_scene, load_scene
 from flockenv.explanation import explain
 from flockenv.geometry.shapes import Block, Circle, HalfSpace, Polygon, Wall
 from flockenv.geometry.space import Box, Plane, Space, Torus
@@ -27,6 +26,7 @@ from flockenv.physics.constraints.collisions import UnsolvedContactsWarning
 from flockenv.physics.effects import Gravity
 from flockenv.physics.integrators import RK4, Integrator, SemiImplicitEuler, VelocityVerlet
 from flockenv.scene import Group, Scene
+from flockenv.scene.yaml_io import dump_scene, load_scene
 
 IN_TIME = ("earliest", "back_up")
 EXACT = (*IN_TIME, "impulses")

@@ -16,13 +16,13 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 from pydantic import BaseModel, ConfigDict, Field
 
-from flockenv.config import MAX_BYTES, ConfigError, dump, dump_scene, load, load_scene, schema
 from flockenv.geometry.space import Box, Torus
 from flockenv.model.spawn import Spawn
 from flockenv.physics.effects import EFFECTS, Drag
 from flockenv.physics.integrators import INTEGRATORS, RK4
-from flockenv.presets import preset
 from flockenv.scene import Group, Scene
+from flockenv.scene.presets import preset
+from flockenv.scene.yaml_io import MAX_BYTES, ConfigError, dump, dump_scene, load, load_scene, schema
 
 ROOT = Path(__file__).resolve().parent.parent
 SCENES = sorted(p for p in (ROOT / "configs").glob("*.yaml") if "groups:" in p.read_text())

@@ -26,7 +26,7 @@ from flockenv.physics.integrators import (
     SemiImplicitEuler,
 )
 from flockenv.scene import Group, Scene
-from flockenv.stability import CoarseContactWarning, check_contact, contact_limit
+from flockenv.scene.stability import CoarseContactWarning, check_contact, contact_limit
 from tests.catalogue import Array
 
 STIFFNESS, MASS, SPEED = 50.0, 2.0, 1.5

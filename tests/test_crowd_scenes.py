@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from flockenv.cli import main
-from flockenv.config import load_scene
 from flockenv.render.validation import write_pictures
 from flockenv.scene import Scene
+from flockenv.scene.yaml_io import load_scene
 from flockenv.validation import CASES, VALIDATED, Case, Finding, Results, Value, cases_named, presets_named, run
 from flockenv.validation.alone import corridor, crossing_time
 from flockenv.validation.case import quietly

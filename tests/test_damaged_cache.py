@@ -15,7 +15,7 @@ from flockenv.jit.checked_store import Store
 from flockenv.jit.private_folder import prepared
 
 SCENE = '''
-from flockenv.config import load_scene
+from flockenv.scene.yaml_io import load_scene
 scene = load_scene("""
 dimension: 2
 space: {kind: torus, size: [9, 9]}

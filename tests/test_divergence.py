@@ -18,7 +18,7 @@ from flockenv.model.state import State
 from flockenv.physics.effects import Carried, Drag, Gravity, QuadraticDrag, Springs, Tether, Uniform, Vortex, Wind
 from flockenv.physics.integrators import ExponentialDrag, ImplicitEuler, Integrator, SemiImplicitEuler
 from flockenv.scene import Group, Scene
-from flockenv.stability import UnstableStepWarning
+from flockenv.scene.stability import UnstableStepWarning
 
 HERE = Spawn(low=(0, 0), high=(4, 4), speed=(0.2, 1.0))
 MOTION = ("x", "v", "tick")  # what was tried in vain is counted as work all the same

@@ -10,8 +10,8 @@ from PIL import Image
 
 from flockenv.behaviours import BEHAVIOURS, Separation
 from flockenv.cli import main
-from flockenv.config import load_scene
 from flockenv.gallery import page, shown
+from flockenv.scene.yaml_io import load_scene
 
 DOCS = Path(__file__).resolve().parent.parent / "docs"
 

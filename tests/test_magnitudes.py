@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from flockenv.config import ConfigError, load_scene
 from flockenv.core.magnitudes import BOUNDS
 from flockenv.model.distribution import Spread
 from flockenv.model.spawn import Spawn
 from flockenv.scene import Group, Scene
+from flockenv.scene.yaml_io import ConfigError, load_scene
 
 SCENE = """
 dimension: 2

@@ -79,7 +79,7 @@ def test_a_grid_moves_no_bit(
     name: str, space: Any, dimension: int, dtype: str, moving: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     found = ends(space, EFFECTS[name], dimension, dtype, moving)
-    monkeypatch.setattr(met_obstacles, "FEWEST_ROWS", 10**9)  # the loop over all of them, in order
+    monkeypatch.setattr(obstacle_sets, "FEWEST_ROWS", 10**9)  # the loop over all of them, in order
     expected = ends(space, EFFECTS[name], dimension, dtype, moving)
     np.testing.assert_array_equal(found[0], expected[0])
     np.testing.assert_array_equal(found[1], expected[1])

@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 
 from flockenv.behaviours import Separation
-from flockenv.config import dump_scene, load_scene
 from flockenv.engine import step_of
 from flockenv.geometry.shapes import Block, Capsule, Circle, HalfSpace, Polygon, Shape, Wall
 from flockenv.geometry.space import Box, Plane, Space, Torus
@@ -43,6 +42,7 @@ from flockenv.render import draw, write_replay
 from flockenv.render.replay import Group as ReplayGroup
 from flockenv.render.replay import Panel
 from flockenv.scene import Group, Scene
+from flockenv.scene.yaml_io import dump_scene, load_scene
 from flockenv.trajectory import record
 
 DTS = (0.1, 0.05, 0.02, 1 / 60, 0.0137)

@@ -23,7 +23,7 @@ STRANGER, VICTIM = 54321, 54322
 """Numbers of users that no system gives away."""
 
 USE = '''
-from flockenv.config import load_scene
+from flockenv.scene.yaml_io import load_scene
 scene = load_scene("""
 dimension: 2
 space: {kind: torus, size: [9, 9]}

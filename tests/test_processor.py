@@ -16,7 +16,6 @@ import pytest
 from llvmlite import binding
 
 from flockenv.behaviours import Alignment, Cohesion, Separation
-from flockenv.config import load_scene
 from flockenv.geometry.space import Plane, Torus
 from flockenv.jit import cpu, pipeline
 from flockenv.jit.decorators import kernel
@@ -26,6 +25,7 @@ from flockenv.model.group import Group
 from flockenv.model.spawn import Spawn
 from flockenv.physics.effects import Effect, Gravitation
 from flockenv.scene import Scene
+from flockenv.scene.yaml_io import load_scene
 from flockenv.tasks import TASKS, Flock, Task
 from flockenv.tasks.sight import block_ways, compass
 from flockenv.world import World

@@ -12,7 +12,6 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.special import ellipk
 
-from flockenv.config import dump_scene, load_scene
 from flockenv.geometry.space import Torus
 from flockenv.model.networks import Cloth, Rope
 from flockenv.model.spawn import Spawn
@@ -29,6 +28,7 @@ from flockenv.physics.integrators import (
 )
 from flockenv.physics.population import Decay, Emitter, Point
 from flockenv.scene import Group, Scene
+from flockenv.scene.yaml_io import dump_scene, load_scene
 from tests.catalogue import Array
 
 G = 9.81

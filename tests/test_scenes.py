@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from flockenv.config import load_scene
 from flockenv.geometry.space import Box
 from flockenv.model.state import State
 from flockenv.physics.constraints.collisions import UnsolvedContactsWarning
 from flockenv.scene import Scene
+from flockenv.scene.yaml_io import load_scene
 from tests.catalogue import Array
 
 ROOT = Path(__file__).parent.parent

@@ -11,7 +11,6 @@ import pytest
 from flockenv.behaviours.follow_way import FollowWay
 from flockenv.behaviours.orca import Orca
 from flockenv.behaviours.walls import Contain
-from flockenv.config import dump_scene, load_scene
 from flockenv.geometry.shapes import (
     Block,
     Capsule,
@@ -27,6 +26,7 @@ from flockenv.geometry.shapes import (
 from flockenv.geometry.space import Torus
 from flockenv.model.spawn import Spawn
 from flockenv.scene import Group, Scene
+from flockenv.scene.yaml_io import dump_scene, load_scene
 
 rolling = Circle(centre=(1, 1), radius=0.3, velocity=(1, 0))
 L = Polygon(vertices=((0, 0), (3, 0), (3, 1), (1, 1), (1, 3), (0, 3)))

@@ -22,7 +22,7 @@ from flockenv.physics.integrators import (
     VelocityVerlet,
     methods_named,
 )
-from flockenv.stability import UnstableStepWarning
+from flockenv.scene.stability import UnstableStepWarning
 from flockenv.stress import CASES, Case, Finding, Results, Value, cases_named, fingerprint, run, usual_methods
 from flockenv.stress.gatherings import GATHERINGS
 from flockenv.stress.heaps import HEAPS

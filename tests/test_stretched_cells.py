@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from flockenv.config import load_scene
 from flockenv.jit.thread_pool import use_threads
 from flockenv.model.state import State
 from flockenv.scene import Scene
+from flockenv.scene.yaml_io import load_scene
 
 SCENE = """
 dimension: {dimension}

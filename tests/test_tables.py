@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from flockenv import scene as scenes
 from flockenv.behaviours.steer import Steer
 from flockenv.engine import step_of
 from flockenv.model.spawn import Spawn
 from flockenv.scene import Group, Scene
+from flockenv.scene import scene as scenes
 from flockenv.steering.arbitration import Blend
 from tests.catalogue import users_module
 

@@ -21,7 +21,7 @@ import numpy as np
 import pytest
 
 import flockenv
-import flockenv.scene as scenes
+import flockenv.scene.scene as scenes
 from flockenv.behaviours import Alignment, Separation
 from flockenv.geometry.cell_list import FEWEST_ARRANGED, STEPS_ARRANGED, WORTH_ARRANGING
 from flockenv.geometry.space import Box, Torus

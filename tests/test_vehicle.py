@@ -21,7 +21,7 @@ from flockenv.model.state import State
 from flockenv.physics.effects import Drag, Effect
 from flockenv.physics.integrators import RK4
 from flockenv.scene import Group, Scene
-from flockenv.stability import LookaheadWarning
+from flockenv.scene.stability import LookaheadWarning
 from flockenv.tasks import Obstacles
 from flockenv.trajectory import record
 from flockenv.world import World

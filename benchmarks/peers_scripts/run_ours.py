@@ -177,8 +177,8 @@ def social_corridor(agents: int) -> Case:
     from flockenv.geometry.shapes import Wall
     from flockenv.model.spawn import Spawn
     from flockenv.physics.effects import Course
-    from flockenv.presets import preset
     from flockenv.scene import Group, Scene
+    from flockenv.scene.presets import preset
 
     wide, long = 32.0, 300.0  # m
     people = Group(
@@ -203,8 +203,8 @@ def social_field(agents: int) -> Case:
     """A crowd under the preset of 2009 in the open, a person per square metre at first, all the same way."""
     from flockenv.model.spawn import Spawn
     from flockenv.physics.effects import Course
-    from flockenv.presets import preset
     from flockenv.scene import Group, Scene
+    from flockenv.scene.presets import preset
 
     edge = math.sqrt(agents)
     people = Group(

@@ -19,7 +19,7 @@ from flockenv.physics.effects import Effect
 from flockenv.physics.integrators import RK4, Integrator
 from flockenv.physics.population import Crowding, Decay
 from flockenv.scene import Scene
-from flockenv.stability import CoarseContactWarning, UnstableStepWarning, suggest_dt
+from flockenv.scene.stability import CoarseContactWarning, UnstableStepWarning, suggest_dt
 
 __all__ = ["Exact", "Problem"]
 

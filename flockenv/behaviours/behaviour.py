@@ -13,7 +13,7 @@ from pydantic import Field
 
 from flockenv.jit.decorators import Law, Vec, law, like
 from flockenv.physics.effects.effect import Effect, Me, Other, Sight, all_masses, demand_group
-from flockenv.stability import LookaheadWarning
+from flockenv.scene.stability import LookaheadWarning
 
 __all__ = [
     "AboutNearest",

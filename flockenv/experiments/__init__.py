@@ -10,11 +10,11 @@ from pathlib import Path
 
 from pydantic import BaseModel, ConfigDict
 
-from flockenv.config import ConfigError, load
 from flockenv.core.errors import nearest, shown
 from flockenv.experiments.base import Cell, Experiment, Results, Trial, run
 from flockenv.experiments.plan import Case, Plan, SteerPlan, Variant
 from flockenv.experiments.vicsek import NoisePlan
+from flockenv.scene.yaml_io import ConfigError, load
 
 __all__ = [
     "PLANS",

@@ -31,11 +31,12 @@ def nothing_to_collect() -> Iterator[None]:
             gc.enable()
 
 
-def import_all(package: str, path: Iterable[str]) -> None:
-    """Import every module of a package's folder: what is written there registers itself."""
+def import_all(package: str, path: Iterable[str], but: str = "") -> None:
+    """Import every module of a package's folder, but for one: what is written there registers itself."""
     with nothing_to_collect():
         for module in pkgutil.iter_modules(path):
-            importlib.import_module(f"{package}.{module.name}")
+            if module.name != but:
+                importlib.import_module(f"{package}.{module.name}")
 
 
 def numba_before_scipy() -> None:

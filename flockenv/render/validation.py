@@ -44,13 +44,13 @@ def _short(preset: str) -> str:
 
 
 def _tone(preset: str) -> str:
-    from flockenv.presets import PRESETS
+    from flockenv.scene.presets import PRESETS
 
     return TONES[list(PRESETS).index(preset) % len(TONES)]
 
 
 def _mark(preset: str) -> str:
-    from flockenv.presets import PRESETS
+    from flockenv.scene.presets import PRESETS
 
     return MARKS[list(PRESETS).index(preset) % len(MARKS)]
 

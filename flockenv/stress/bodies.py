@@ -21,7 +21,7 @@ from flockenv.model.state import State
 from flockenv.physics.effects import Attraction, Carried, Drag, Gravity, Swing, Tether, Uniform, Vortex, WallRepulsion
 from flockenv.physics.integrators import Adaptive, Integrator
 from flockenv.scene import Group, Scene
-from flockenv.stability import amplification, limit
+from flockenv.scene.stability import amplification, limit
 from flockenv.stress.case import quietly, started
 
 __all__ = ["BODIES"]

@@ -11,7 +11,7 @@ import numpy as np
 
 from flockenv.model.state import State
 from flockenv.scene import Scene
-from flockenv.stability import CoarseContactWarning, UnstableStepWarning
+from flockenv.scene.stability import CoarseContactWarning, UnstableStepWarning
 
 __all__ = ["TOO_LONG", "quietly", "started"]
 

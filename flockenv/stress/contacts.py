@@ -20,7 +20,7 @@ from flockenv.model.state import State
 from flockenv.physics.effects import Contact, ObstacleContact
 from flockenv.physics.integrators import Integrator
 from flockenv.scene import Group, Scene
-from flockenv.stability import CoarseContactWarning, contact_limit
+from flockenv.scene.stability import CoarseContactWarning, contact_limit
 from flockenv.stress.case import TOO_LONG, quietly, started
 
 __all__ = ["CONTACTS", "DTS", "Hit", "hits"]

@@ -21,8 +21,8 @@ from flockenv.model.snapshot import Mark
 from flockenv.model.spawn import Spawn
 from flockenv.model.state import State
 from flockenv.physics.effects import Contact, ObstacleContact
-from flockenv.presets import PRESETS
 from flockenv.scene import Group, Scene
+from flockenv.scene.presets import PRESETS
 from flockenv.tasks.base import Frame, Task
 from flockenv.tasks.layout import Layout, Slot
 from flockenv.tasks.sight import clip, neighbour_slots, place_of, put, put_crowding, put_neighbour, velocity_of

@@ -20,8 +20,8 @@ from flockenv.maths.vectors import add, norm, scale, sub
 from flockenv.model.spawn import Spawn
 from flockenv.model.state import State
 from flockenv.physics.effects import ObstacleContact
-from flockenv.presets import PRESETS
 from flockenv.scene import Group, Scene
+from flockenv.scene.presets import PRESETS
 from flockenv.tasks.base import Frame
 from flockenv.tasks.lasting import MEASURES, METRICS, LastingTask, judge, tell_lasting
 from flockenv.tasks.layout import Layout, Slot

@@ -20,8 +20,8 @@ from flockenv.model.snapshot import Mark
 from flockenv.model.spawn import Spawn
 from flockenv.model.state import State
 from flockenv.physics.effects.aims import Antipode
-from flockenv.presets import PRESETS
 from flockenv.scene import Group, Scene
+from flockenv.scene.presets import PRESETS
 from flockenv.steering.arbitration import Blend
 from flockenv.tasks.base import Frame, Task
 from flockenv.tasks.layout import Layout, Slot
@@ -33,7 +33,7 @@ Crowd = Literal[
     "moussaid_2009", "helbing_molnar_1995", "johansson_2007_circular", "johansson_2007_elliptical_1",
     "johansson_2007_elliptical_2",
 ]  # fmt: skip
-"""Those of `flockenv.presets` that need no stiff bodies."""
+"""Those of `flockenv.scene.presets` that need no stiff bodies."""
 
 _RADIUS = 0.3  # m, of the robot, as in CrowdNav
 _NOBODY = 1e3  # m, to the nearest where there is nobody
@@ -177,14 +177,14 @@ def observe(p: Any, frame: Frame, rows: Any) -> None:
 class CrowdNav(Task):
     """One robot crosses a circle on which pedestrians swap places, under a social force; it must not touch anybody.
 
-    The crowd is that of Moussaid et al. 2009, desired speeds N(1.29, 0.19) m/s, or another of `flockenv.presets` as
-    published: who has bodies of 0.5 m keeps 0.4 m between centres there in the middle of a circle of 12, while those of
-    1995 and 2007 walk into each other, with 0.1 m and less. By default it does not see the robot (`visible`), as
-    in the tests of CrowdNav (Chen et al. 2019, arXiv 1809.08835), so that nobody makes way and the robot cannot count
-    on it. Everything it sees is relative to itself and turned into the frame of its course, from start to goal.
-    Rewards are those of Chen et al. times 20: success 1, collision -0.25, and -0.5 per s and metre that the nearest is
-    nearer than 0.2 m; a reward of progress and a cost of time, ours, stand for their imitation and their discount. A
-    touch ends it: distances are those between bodies along the way of a decision, not only at its end.
+    The crowd is that of Moussaid et al. 2009, desired speeds N(1.29, 0.19) m/s, or another of `flockenv.scene.presets`
+    as published: who has bodies of 0.5 m keeps 0.4 m between centres there in the middle of a circle of 12, while those
+    of 1995 and 2007 walk into each other, with 0.1 m and less. By default it does not see the robot (`visible`), as in
+    the tests of CrowdNav (Chen et al. 2019, arXiv 1809.08835), so that nobody makes way and the robot cannot count on
+    it. Everything it sees is relative to itself and turned into the frame of its course, from start to goal. Rewards
+    are those of Chen et al. times 20: success 1, collision -0.25, and -0.5 per s and metre that the nearest is nearer
+    than 0.2 m; a reward of progress and a cost of time, ours, stand for their imitation and their discount. A touch
+    ends it: distances are those between bodies along the way of a decision, not only at its end.
     """
 
     name: ClassVar[str] = "crowd_nav"

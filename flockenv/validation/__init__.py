@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from flockenv.core.errors import nearest, shown
 from flockenv.findings import VERDICTS, Case, Finding, Results, Value, cases_named, trials
-from flockenv.presets import PRESETS
+from flockenv.scene.presets import PRESETS
 from flockenv.validation.alone import ALONE
 from flockenv.validation.corridors import CORRIDORS
 from flockenv.validation.doors import DOORS
@@ -31,7 +31,7 @@ VALIDATED = tuple(name for name in PRESETS if name != "moussaid_2010_groups")
 
 def presets_named(names: list[str]) -> tuple[str, ...]:
     """Return the presets of some names, all for none; ValueError with the nearest name for an unknown one."""
-    from flockenv.presets import ALIASES
+    from flockenv.scene.presets import ALIASES
 
     for name in names:
         if name not in PRESETS and name not in ALIASES:

@@ -8,9 +8,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from flockenv.config import dump_scene
 from flockenv.core.atomic_files import made, replacing
 from flockenv.findings import Case
+from flockenv.scene.yaml_io import dump_scene
 from flockenv.validation import alone, corridors, doors
 from flockenv.validation.case import quietly
 from flockenv.validation.walk import Scenes

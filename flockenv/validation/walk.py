@@ -13,8 +13,8 @@ from flockenv.model.distribution import Spread
 from flockenv.model.spawn import Spawn
 from flockenv.model.state import State
 from flockenv.physics.effects import Effect, ObstacleContact
-from flockenv.presets import PRESETS, preset
 from flockenv.scene import Group, Scene
+from flockenv.scene.presets import PRESETS, preset
 
 __all__ = ["STEPS", "WEIDMANN", "Scenes", "Walk", "filled", "lane", "nobody", "people", "scene_of", "walked", "wall"]
 

@@ -21,8 +21,8 @@ import yaml
 from pydantic import BaseModel, ValidationError
 
 from flockenv.core.errors import KeyPath, key_path, nearest, refusals, shown, steps_of
-from flockenv.presets import Preset, expanded
 from flockenv.scene import Scene
+from flockenv.scene.presets import Preset, expanded
 
 __all__ = ["MAX_BYTES", "ConfigError", "dump", "dump_scene", "load", "load_scene", "schema"]
 

@@ -59,8 +59,8 @@ from flockenv.physics.integrators.newton import Coupling
 from flockenv.physics.population import POPULATION, Emitter, Member, beget
 from flockenv.physics.population import settler as population_settler
 from flockenv.physics.population.lifecycle import NUMBERS as POPULATION_NUMBERS
-from flockenv.placing import cells_of, place_groups
-from flockenv.stability import check_contact, check_dt, check_lookahead
+from flockenv.scene.placement import cells_of, place_groups
+from flockenv.scene.stability import check_contact, check_dt, check_lookahead
 
 __all__ = ["Group", "Scene"]
 
