@@ -14,8 +14,8 @@ from flockenv.jit.decorators import IN_PYTHON
 from flockenv.jit.sources import functions_in, sources_of_code
 from flockenv.physics.effects.effect import Far, Me, Members, Obstacle, Other
 from flockenv.tasks import TASKS
-from flockenv.tasks.base import Frame
 from flockenv.tasks.play import play_of
+from flockenv.tasks.task import Frame
 from tests.catalogue import everything
 
 

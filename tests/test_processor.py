@@ -27,7 +27,7 @@ from flockenv.physics.effects import Effect, Gravitation
 from flockenv.scene import Scene
 from flockenv.scene.yaml_io import load_scene
 from flockenv.tasks import TASKS, Flock, Task
-from flockenv.tasks.sight import block_ways, compass
+from flockenv.tasks.observations import block_ways, compass
 from flockenv.world import World
 from tests.catalogue import everything
 

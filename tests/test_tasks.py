@@ -234,7 +234,7 @@ FROZEN = """
 import importlib, pickle, sys
 from collections import namedtuple
 import numpy as np
-from flockenv.tasks.base import Frame
+from flockenv.tasks.task import Frame
 
 for name, task, before, after, action, terms, observation, counted, told in pickle.load(open(sys.argv[1], "rb")):
     module = importlib.import_module(type(task).__module__)

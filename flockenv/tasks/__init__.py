@@ -6,7 +6,6 @@ from flockenv.jit.startup import import_all
 
 import_all(__name__, __path__)
 
-from flockenv.tasks.base import TASKS, Frame, Task  # noqa: E402  # after the folder has been walked
 from flockenv.tasks.bottleneck import Bottleneck  # noqa: E402
 from flockenv.tasks.corridor import Corridor  # noqa: E402
 from flockenv.tasks.crossing import Crossing  # noqa: E402
@@ -19,6 +18,7 @@ from flockenv.tasks.obstacles import Obstacles  # noqa: E402
 from flockenv.tasks.path_follow import PathFollow  # noqa: E402
 from flockenv.tasks.pursuit import Pursuit  # noqa: E402
 from flockenv.tasks.school import School  # noqa: E402
+from flockenv.tasks.task import TASKS, Frame, Task  # noqa: E402  # after the folder has been walked
 
 __all__ = [
     "TASKS",

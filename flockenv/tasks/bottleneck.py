@@ -23,9 +23,9 @@ from flockenv.model.state import State
 from flockenv.physics.effects import Contact, ObstacleContact
 from flockenv.scene import Group, Scene
 from flockenv.scene.presets import PRESETS
-from flockenv.tasks.base import Frame, Task
 from flockenv.tasks.layout import Layout, Slot
-from flockenv.tasks.sight import clip, neighbour_slots, place_of, put, put_crowding, put_neighbour, velocity_of
+from flockenv.tasks.observations import clip, neighbour_slots, place_of, put, put_crowding, put_neighbour, velocity_of
+from flockenv.tasks.task import Frame, Task
 
 __all__ = ["Bottleneck"]
 

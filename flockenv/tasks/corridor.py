@@ -22,10 +22,10 @@ from flockenv.model.state import State
 from flockenv.physics.effects import ObstacleContact
 from flockenv.scene import Group, Scene
 from flockenv.scene.presets import PRESETS
-from flockenv.tasks.base import Frame
 from flockenv.tasks.lasting import MEASURES, METRICS, LastingTask, judge, tell_lasting
 from flockenv.tasks.layout import Layout, Slot
-from flockenv.tasks.sight import neighbour_slots, offset, put, put_crowding, put_neighbour, turned, velocity_of
+from flockenv.tasks.observations import neighbour_slots, offset, put, put_crowding, put_neighbour, turned, velocity_of
+from flockenv.tasks.task import Frame
 
 __all__ = ["Corridor"]
 

@@ -20,9 +20,9 @@ from flockenv.model.spawn import Spawn
 from flockenv.model.state import State
 from flockenv.scene import Group, Scene
 from flockenv.steering import orca
-from flockenv.tasks.base import Frame, Task
 from flockenv.tasks.layout import Layout, Slot
-from flockenv.tasks.sight import neighbour_slots, put, put_neighbour, turned
+from flockenv.tasks.observations import neighbour_slots, put, put_neighbour, turned
+from flockenv.tasks.task import Frame, Task
 
 __all__ = ["Crossing"]
 

@@ -23,9 +23,9 @@ from flockenv.physics.effects.aims import Antipode
 from flockenv.scene import Group, Scene
 from flockenv.scene.presets import PRESETS
 from flockenv.steering.arbitration import Blend
-from flockenv.tasks.base import Frame, Task
 from flockenv.tasks.layout import Layout, Slot
-from flockenv.tasks.sight import clip, neighbour_slots, put, put_crowding, put_neighbour, turned
+from flockenv.tasks.observations import clip, neighbour_slots, put, put_crowding, put_neighbour, turned
+from flockenv.tasks.task import Frame, Task
 
 __all__ = ["CrowdNav"]
 

@@ -15,9 +15,9 @@ from flockenv.jit.memory import fetch, pour
 from flockenv.jit.section import record, section
 from flockenv.jit.simd_rows import columns, into_rows, packed, take
 from flockenv.maths.heading import face
-from flockenv.tasks.base import Frame
 from flockenv.tasks.lasting import lasts
 from flockenv.tasks.play_plan import Plan
+from flockenv.tasks.task import Frame
 
 __all__ = [
     "act_of", "answer_of", "begin_of", "by_name_of", "frame_before", "frame_of", "look_in", "parameters_of", "show_of",

@@ -18,9 +18,9 @@ from flockenv.maths.vectors import add, norm, scale, unit
 from flockenv.physics.effects import ObstacleContact
 from flockenv.scene import Group, Scene
 from flockenv.steering import arbitration
-from flockenv.tasks.base import Frame, Task
 from flockenv.tasks.layout import Layout, Slot
-from flockenv.tasks.sight import block_ways, clip, compass, leaves_gap, velocity_of
+from flockenv.tasks.observations import block_ways, clip, compass, leaves_gap, velocity_of
+from flockenv.tasks.task import Frame, Task
 
 __all__ = ["Evade"]
 

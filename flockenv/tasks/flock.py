@@ -22,10 +22,10 @@ from flockenv.model.snapshot import Mark
 from flockenv.model.state import State
 from flockenv.scene import Group, Scene
 from flockenv.steering import arbitration
-from flockenv.tasks.base import Frame
 from flockenv.tasks.lasting import MEASURES, METRICS, LastingTask, judge, tell_lasting
 from flockenv.tasks.layout import Layout, Slot
-from flockenv.tasks.sight import block_ways, compass, offset, turned
+from flockenv.tasks.observations import block_ways, compass, offset, turned
+from flockenv.tasks.task import Frame
 
 __all__ = ["Flock"]
 

@@ -19,9 +19,9 @@ from flockenv.model.snapshot import Mark
 from flockenv.model.spawn import Spawn
 from flockenv.model.state import State
 from flockenv.scene import Group, Scene
-from flockenv.tasks.base import Frame, Task
 from flockenv.tasks.layout import Layout, Slot
-from flockenv.tasks.sight import clip, place_of, velocity_of
+from flockenv.tasks.observations import clip, place_of, velocity_of
+from flockenv.tasks.task import Frame, Task
 
 __all__ = ["Herd"]
 

@@ -12,7 +12,7 @@ from typing import Any, ClassVar
 from pydantic import Field
 
 from flockenv.jit.decorators import kernel
-from flockenv.tasks.base import Task
+from flockenv.tasks.task import Task
 
 __all__ = ["MEASURES", "METRICS", "LastingTask", "judge", "lasts", "tell_lasting"]
 

@@ -17,9 +17,9 @@ from flockenv.maths.counter_rng import uniform
 from flockenv.model.snapshot import Mark
 from flockenv.model.state import State
 from flockenv.scene import Group, Scene
-from flockenv.tasks.base import Frame, Task
 from flockenv.tasks.layout import Layout, Slot
-from flockenv.tasks.sight import block_ways, clip, compass, leaves_gap
+from flockenv.tasks.observations import block_ways, clip, compass, leaves_gap
+from flockenv.tasks.task import Frame, Task
 
 __all__ = ["Obstacles"]
 

@@ -17,9 +17,9 @@ from flockenv.maths.vectors import dot, norm, sub
 from flockenv.model.snapshot import Mark
 from flockenv.model.state import State
 from flockenv.scene import Group, Scene
-from flockenv.tasks.base import Frame, Task
 from flockenv.tasks.layout import Layout, Slot
-from flockenv.tasks.sight import clip
+from flockenv.tasks.observations import clip
+from flockenv.tasks.task import Frame, Task
 
 __all__ = ["PathFollow"]
 

@@ -19,7 +19,6 @@ from flockenv.jit.intrinsics import unaliased
 from flockenv.jit.memory import settle
 from flockenv.jit.section import digest_of, entry_of
 from flockenv.jit.simd_rows import apart, columns, in_one_row, packed
-from flockenv.tasks.base import Task
 from flockenv.tasks.decision import (
     act_of,
     answer_of,
@@ -33,6 +32,7 @@ from flockenv.tasks.decision import (
     wide_of,
 )
 from flockenv.tasks.play_plan import REFUSED, Kernels, Plan, Worlds
+from flockenv.tasks.task import Task
 
 __all__ = ["name_of", "plan_of", "play_of", "tell_of"]
 

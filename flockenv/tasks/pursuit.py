@@ -16,8 +16,8 @@ from flockenv.maths.vectors import scale
 from flockenv.model.spawn import direction
 from flockenv.scene import Group, Scene
 from flockenv.steering import arbitration
-from flockenv.tasks.base import Frame, Task
 from flockenv.tasks.layout import Layout, Slot
+from flockenv.tasks.task import Frame, Task
 
 __all__ = ["Pursuit"]
 

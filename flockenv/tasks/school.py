@@ -20,9 +20,9 @@ from flockenv.model.state import State
 from flockenv.physics.effects.effect import in_view
 from flockenv.scene import Group, Scene
 from flockenv.steering import arbitration, motivation
-from flockenv.tasks.base import Frame, Task
 from flockenv.tasks.layout import Layout, Slot
-from flockenv.tasks.sight import clip, place_of, velocity_of
+from flockenv.tasks.observations import clip, place_of, velocity_of
+from flockenv.tasks.task import Frame, Task
 
 __all__ = ["School"]
 
