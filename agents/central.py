@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.torch_layers import MlpExtractor
 
-from flockenv.sb3 import WorldVecEnv
+from flockenv.envs.sb3 import WorldVecEnv
 
 __all__ = ["CentralPolicy", "CentralVecEnv"]
 

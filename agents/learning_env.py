@@ -8,8 +8,8 @@ import numpy as np
 from stable_baselines3.common.vec_env import VecEnvWrapper
 
 from agents.divergence import check_step
-from flockenv.sb3 import WorldVecEnv
-from flockenv.world import World
+from flockenv.envs.sb3 import WorldVecEnv
+from flockenv.envs.world import World
 
 __all__ = ["ForLearning"]
 

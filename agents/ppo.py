@@ -40,12 +40,12 @@ from agents.teach import teach
 from agents.training_state import capture, restore, surroundings
 from flockenv.core import signals
 from flockenv.core.output_paths import check_room, checked_file, checked_path
+from flockenv.envs.sb3 import WorldVecEnv
 from flockenv.evaluation import rollout, worlds_for
 from flockenv.jit.thread_pool import threads, use_threads
 from flockenv.players import WEIGHTS
 from flockenv.players.rules import player
 from flockenv.policy import MlpPolicy, describe, save_policy
-from flockenv.sb3 import WorldVecEnv
 from flockenv.tasks import TASKS, Task
 from flockenv.terminal import DIVERGED, interruptible, program, shown_progress
 

@@ -9,10 +9,10 @@ import torch
 from stable_baselines3 import PPO
 
 from agents.divergence import LearningDiverged
+from flockenv.envs.world import World
 from flockenv.evaluation import worlds_for
 from flockenv.players.rules import RulesPlayer
 from flockenv.tasks import Task
-from flockenv.world import World
 
 __all__ = ["shown", "teach"]
 

@@ -22,9 +22,9 @@ from stable_baselines3 import PPO
 
 from agents.checkpoint import JSON, Damaged, Parts, Tensors, as_json
 from flockenv.accuracy.trials import machine
+from flockenv.envs.world import World
 from flockenv.tasks import Task
 from flockenv.tasks.play import name_of
-from flockenv.world import World
 
 __all__ = ["capture", "restore", "surroundings"]
 

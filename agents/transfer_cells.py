@@ -19,13 +19,13 @@ from numpy.typing import NDArray
 from agents.compare import Player, blaming
 from agents.transfer_report import Cell, Clock, Setting
 from flockenv.core.atomic_files import made, replacing
+from flockenv.envs.world import World
 from flockenv.evaluation import rollout, task_digest, worlds_for
 from flockenv.physics.integrators import RK4
 from flockenv.players import NAMES
 from flockenv.policy import Policy
 from flockenv.tasks import Task
 from flockenv.tasks.play import name_of
-from flockenv.world import World
 
 __all__ = [
     "KEPT", "Job", "Plan", "Round", "cell_path", "clocked", "jobs", "play", "play_missing", "played", "played_again",

@@ -1,8 +1,8 @@
 """What a step costs through every face of every task: `python -m benchmarks.envs`.
 
 World.step, gymnasium.make (and the environment inside its wrappers), make_vec, PettingZoo's parallel and AEC forms, and
-flockenv.sb3.WorldVecEnv: one world, 1024 worlds, and 1024 flocks of 32 learners on one thread and on two. Actions are
-drawn before; worlds that are over begin anew, and that is timed too. World.step is what all the others wrap. Beside
+flockenv.envs.sb3.WorldVecEnv: one world, 1024 worlds, and 1024 flocks of 32 learners on one thread and on two. Actions
+are drawn before; worlds that are over begin anew, and that is timed too. World.step is what all the others wrap. Beside
 each face of one world stands an environment of the same spaces that does nothing: what is left is not ours to save.
 """
 
@@ -23,9 +23,9 @@ import flockenv  # noqa: F401  # registers the environments
 from benchmarks.floors import Machine, machine, of_decisions
 from benchmarks.measure import Bench, Contestant, Floor, Out, Quick, Result, Rounds, command_line, number
 from flockenv.envs.registration import id_of
+from flockenv.envs.world import World
 from flockenv.jit.thread_pool import use_threads
 from flockenv.tasks import TASKS, Flock, Task
-from flockenv.world import World
 
 __all__ = ["TASK_IDS"]
 
@@ -157,7 +157,7 @@ class _NobodyActs(pettingzoo.ParallelEnv[str, Any, Any]):
 def _sb3(bench: Bench, task: Task, worlds: int, floor: Floor | None) -> list[Contestant]:
     """Return the face for Stable-Baselines3, if that is installed."""
     try:
-        from flockenv.sb3 import WorldVecEnv
+        from flockenv.envs.sb3 import WorldVecEnv
     except ImportError as error:
         note = f"no WorldVecEnv: {error}"
         if note not in bench.notes:

@@ -23,6 +23,7 @@ from typing import TYPE_CHECKING, Any  # noqa: E402  # see above
 from flockenv.envs.registration import register_all  # noqa: E402  # see above
 
 if TYPE_CHECKING:
+    from flockenv.envs.world import Step, World
     from flockenv.model.snapshot import Snapshot
     from flockenv.model.state import Body, State
     from flockenv.scene import Scene
@@ -41,7 +42,6 @@ if TYPE_CHECKING:
         School,
         Task,
     )
-    from flockenv.world import Step, World
 
 __version__ = "0.1.0"
 

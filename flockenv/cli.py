@@ -358,7 +358,7 @@ def warmup(
 def _first_step_of_task(task: Task) -> None:
     import numpy as np
 
-    from flockenv.world import World
+    from flockenv.envs.world import World
 
     world = World(task)
     world.reset(0)

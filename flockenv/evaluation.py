@@ -18,8 +18,8 @@ from typing import TYPE_CHECKING, Any, Literal, Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from flockenv.envs.world import Step, World
 from flockenv.policy import Policy
-from flockenv.world import Step, World
 
 if TYPE_CHECKING:
     from flockenv.model.snapshot import Snapshot
@@ -113,7 +113,7 @@ class Episodes:
 
 
 class Playable(Protocol):
-    """What a rollout asks of a world: flockenv.world.World is one."""
+    """What a rollout asks of a world: flockenv.envs.world.World is one."""
 
     def reset(self, seeds: int) -> NDArray[np.float32]: ...
     def step(self, actions: NDArray[Any]) -> Step: ...

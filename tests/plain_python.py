@@ -14,11 +14,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from flockenv.envs.world import World
 from flockenv.physics.integrators import INTEGRATORS
 from flockenv.scene import Scene
 from flockenv.scene.yaml_io import ConfigError, load_scene
 from flockenv.tasks import TASKS
-from flockenv.world import World
 from tests.catalogue import EFFECTS, scene_of, scene_under
 
 ROOT = Path(__file__).resolve().parent.parent

@@ -127,7 +127,7 @@ def test_numbers_are_looked_up_in_registers_where_that_can_be() -> None:
 ONE_BY_ONE = """
 import numpy as np
 from flockenv.tasks import Flock
-from flockenv.world import World
+from flockenv.envs.world import World
 world = World(Flock(agents=24, dtype="float32"), 3)
 world.reset(0)
 for actions in np.random.default_rng(0).uniform(-1, 1, (20, 3, 24, 2)):

@@ -23,14 +23,14 @@ from agents.imitate import imitate
 from agents.learning_env import ForLearning
 from agents.run import checkpointed, recipe_of
 from agents.teach import shown
+from flockenv.envs.sb3 import WorldVecEnv
+from flockenv.envs.world import World
 from flockenv.evaluation import compare, rollout, worlds_for
 from flockenv.jit.thread_pool import threads
 from flockenv.players import WEIGHTS
 from flockenv.players.rules import RULES, Tuned, as_dict, player, tuned
 from flockenv.policy import MlpPolicy, RandomPolicy
-from flockenv.sb3 import WorldVecEnv
 from flockenv.tasks import TASKS, School, Task
-from flockenv.world import World
 from tests.training import PURSUIT, TINY, interrupt
 
 ROOT = CONFIGS.parent

@@ -23,6 +23,7 @@ from gymnasium.error import ResetNeeded
 import flockenv  # noqa: F401  # registers the environments
 from flockenv.behaviours import Alignment, Queue, Separation
 from flockenv.cli import main
+from flockenv.envs.world import World
 from flockenv.geometry.shapes import HalfSpace, Polygon
 from flockenv.geometry.space import Box, Torus
 from flockenv.measures import measure
@@ -33,7 +34,6 @@ from flockenv.physics.integrators import VelocityVerlet
 from flockenv.scene import Group, Scene
 from flockenv.scene.yaml_io import load_scene
 from flockenv.tasks import Pursuit
-from flockenv.world import World
 
 SPAWN = Spawn(low=(1, 1), high=(3, 3), speed=(1, 1))
 FLOCK = (Separation(weight=2, radius=2), Alignment(weight=0.1, radius=2))

@@ -18,12 +18,12 @@ import numba
 import numpy as np
 import pytest
 
+from flockenv.envs.world import World
 from flockenv.jit import cpu
 from flockenv.jit.thread_pool import threads, use_threads
 from flockenv.model.divergence import SimulationDiverged
 from flockenv.scene.yaml_io import ConfigError, load_scene
 from flockenv.tasks import TASKS
-from flockenv.world import World
 
 pytestmark = pytest.mark.filterwarnings("ignore")  # what scenes warn of is not what is tested here
 ROOT = Path(__file__).resolve().parent.parent

@@ -11,10 +11,10 @@ from agents import ppo
 from agents.central import CentralVecEnv
 from agents.experiment import Experiment, PpoSettings
 from agents.run import OtherRecipe, checkpointed
+from flockenv.envs.sb3 import WorldVecEnv
+from flockenv.envs.world import World
 from flockenv.policy import MlpPolicy
-from flockenv.sb3 import WorldVecEnv
 from flockenv.tasks import Flock, Herd, School, Task
-from flockenv.world import World
 from tests.training import interrupt
 
 SCHOOL = School(fish=3, hunters=1, patches=2, start_hunger=0.6, metabolism=0.8)  # fish starve one after another

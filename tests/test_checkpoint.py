@@ -29,9 +29,9 @@ from agents.run import checkpoint, checkpointed
 from benchmarks import kills
 from flockenv.core.atomic_files import LEFTOVERS
 from flockenv.core.output_paths import check_room
+from flockenv.envs.sb3 import WorldVecEnv
+from flockenv.envs.world import World
 from flockenv.policy import MlpPolicy
-from flockenv.sb3 import WorldVecEnv
-from flockenv.world import World
 from tests.training import PURSUIT, SCHOOL, TINY, interrupt
 
 LARGEST = 2**26

@@ -422,7 +422,7 @@ def test_a_zip_is_a_player_only_where_it_is_trusted(
         assert trust_pickle
         return RandomPolicy(2, 0)
 
-    monkeypatch.setitem(sys.modules, "flockenv.sb3", SimpleNamespace(load_sb3_zip=load))  # without torch
+    monkeypatch.setitem(sys.modules, "flockenv.envs.sb3", SimpleNamespace(load_sb3_zip=load))  # without torch
     Path("mine.zip").write_bytes(b"")
     asked = ["render", "pursuit", "--player", "mine.zip", "--out", "p.html"]
     assert main(asked) == 2 and "pass --trust-pickle" in capsys.readouterr().err

@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 import pytest
 
+from flockenv.envs.world import World
 from flockenv.evaluation import rollout, worlds_for
 from flockenv.players.rules import player
 from flockenv.tasks import Crossing, Flock
-from flockenv.world import World
 from tests.test_tasks import act, paid, place, random_actions, world_of
 
 

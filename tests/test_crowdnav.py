@@ -7,12 +7,12 @@ from typing import Any
 import numpy as np
 import pytest
 
+from flockenv.envs.world import World
 from flockenv.evaluation import rollout, worlds_for
 from flockenv.players import WEIGHTS
 from flockenv.players.rules import player
 from flockenv.policy import MlpPolicy
 from flockenv.tasks import CrowdNav
-from flockenv.world import World
 from tests.test_tasks import act, paid, place, random_actions, world_of
 
 

@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from flockenv.envs.world import Step, World
 from flockenv.tasks import Evade
-from flockenv.world import Step, World
 
 FAR = (27.0, 27.0)
 

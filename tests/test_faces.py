@@ -8,11 +8,11 @@ import pettingzoo
 import pytest
 from gymnasium.vector import AutoresetMode
 
-from flockenv.envs.face import ByAgent, named
+from flockenv.envs.common import ByAgent, named
 from flockenv.envs.registration import id_of
-from flockenv.sb3 import WorldVecEnv
+from flockenv.envs.sb3 import WorldVecEnv
+from flockenv.envs.world import World
 from flockenv.tasks import Bottleneck, Corridor, Crossing, CrowdNav, Evade, Flock, Herd, Obstacles, Pursuit, School
-from flockenv.world import World
 
 SEED, LIMIT, STEPS = 21, 15, 40
 ALONE = {

@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from flockenv.envs.world import Step, World
 from flockenv.tasks import Herd
-from flockenv.world import Step, World
 
 PEN = np.array([30.0, 30.0])
 

@@ -10,10 +10,10 @@ import pytest
 from typer.testing import CliRunner
 
 from agents import invade as invasion
+from flockenv.envs.world import World
 from flockenv.evaluation import Episodes, rollout, worlds_for
 from flockenv.policy import RandomPolicy
 from flockenv.tasks import Flock, School
-from flockenv.world import World
 
 FISH, WORLDS = 3, 7
 TASK = School(fish=FISH, horizon=60, start_hunger=0.6, metabolism=0.2)  # they starve in time

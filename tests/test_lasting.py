@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 import pytest
 
+from flockenv.envs.world import World
 from flockenv.players import load_player
 from flockenv.tasks import TASKS, Corridor, Flock, Task
 from flockenv.tasks.lasting import LastingTask
-from flockenv.world import World
 
 pytestmark = pytest.mark.filterwarnings("ignore::flockenv.policy.OtherTaskWarning")
 

@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from flockenv.envs.world import World
 from flockenv.geometry.shapes import Circle
 from flockenv.geometry.space import Box, Torus
 from flockenv.model.spawn import Spawn
 from flockenv.physics.integrators import INTEGRATORS
 from flockenv.scene import Group, Scene
 from flockenv.tasks import Pursuit
-from flockenv.world import World
 
 HERE = Spawn(low=(4, 4), high=(5, 5))
 

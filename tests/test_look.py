@@ -9,10 +9,10 @@ import pytest
 from numba import njit
 
 from flockenv.engine.nearest import AT_ONCE, exchanges, inserted, merged
+from flockenv.envs.world import World
 from flockenv.jit.decorators import kernel
 from flockenv.jit.simd_rows import key_of, key_read, key_written, ordered, same_key, tag_of
 from flockenv.tasks import Bottleneck, Flock
-from flockenv.world import World
 
 SIGHT, MIDDLE = 6.1, 20.0  # the last bits of its square are not zeros
 

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from flockenv.envs.world import Step, World
 from flockenv.evaluation import rollout
 from flockenv.geometry import polyline
 from flockenv.players.rules import RulesPlayer
@@ -15,7 +16,6 @@ from flockenv.players.rules.path_follow import PathFollowRules
 from flockenv.render.picture import draw
 from flockenv.tasks import PathFollow
 from flockenv.tasks.path_follow import POINTS
-from flockenv.world import Step, World
 from tests.catalogue import Array
 
 TASK = PathFollow()

@@ -12,7 +12,7 @@ import pytest
 from gymnasium.error import ResetNeeded
 from gymnasium.utils.env_checker import data_equivalence
 
-from flockenv.envs import crossing_v0, face, flock_v1, pursuit_v0, school_v0
+from flockenv.envs import common, crossing_v0, flock_v1, pursuit_v0, school_v0
 from flockenv.envs.registration import PARALLEL, VERSIONS, id_of
 
 with warnings.catch_warnings():
@@ -329,14 +329,14 @@ def test_dictionaries_by_agent_are_the_same_written_out_or_not(monkeypatch, agen
     paid, earned = rng.random(len(agents)).tolist(), rng.random((2, len(agents))).tolist()
     for displayed in (0, 1000):
         monkeypatch.setattr(face, "DISPLAYED", displayed)
-        face._by_agent.cache_clear()
-        told = face.ByAgent(terms, agents).of(seen, paid, over, True, earned, False)
+        common._by_agent.cache_clear()
+        told = common.ByAgent(terms, agents).of(seen, paid, over, True, earned, False)
         assert [list(each) for each in told] == [list(agents)] * 5
         for i, agent in enumerate(agents):
             info = {**{term: earned[k][i] for k, term in enumerate(terms)}, "is_success": False}
             np.testing.assert_array_equal(told[0][agent], seen[i])
             assert [each[agent] for each in told[1:]] == [paid[i], over[i], True, info]
-    face._by_agent.cache_clear()
+    common._by_agent.cache_clear()
 
 
 def test_a_user_who_writes_into_agents_changes_nothing():

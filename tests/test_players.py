@@ -219,7 +219,7 @@ def test_two_files_of_one_name_stay_two_players(tmp_path: Path) -> None:
 
 def test_a_zip_is_opened_only_when_trusted(tmp_path: Path) -> None:
     stable_baselines3 = pytest.importorskip("stable_baselines3")
-    from flockenv.sb3 import WorldVecEnv
+    from flockenv.envs.sb3 import WorldVecEnv
 
     path = tmp_path / "model.zip"
     model = stable_baselines3.PPO("MlpPolicy", WorldVecEnv(Pursuit(), 1), n_steps=2, batch_size=2, device="cpu")

@@ -16,6 +16,7 @@ import pytest
 from llvmlite import binding
 
 from flockenv.behaviours import Alignment, Cohesion, Separation
+from flockenv.envs.world import World
 from flockenv.geometry.space import Plane, Torus
 from flockenv.jit import cpu, pipeline
 from flockenv.jit.decorators import kernel
@@ -28,7 +29,6 @@ from flockenv.scene import Scene
 from flockenv.scene.yaml_io import load_scene
 from flockenv.tasks import TASKS, Flock, Task
 from flockenv.tasks.observations import block_ways, compass
-from flockenv.world import World
 from tests.catalogue import everything
 
 ROOT = Path(__file__).parent.parent

@@ -23,10 +23,10 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecCheckNan, VecMonitor
 
 from flockenv.envs.registration import SINGLE
+from flockenv.envs.sb3 import NOTHING, WorldMonitor, WorldVecEnv, load_sb3_zip
+from flockenv.envs.world import World
 from flockenv.players.rules import player
-from flockenv.sb3 import NOTHING, WorldMonitor, WorldVecEnv, load_sb3_zip
 from flockenv.tasks import TASKS, Bottleneck, Flock, Pursuit, School
-from flockenv.world import World
 
 torch.set_num_threads(1)
 
@@ -208,7 +208,7 @@ def test_copies_of_the_empty_info():
 
 @pytest.mark.parametrize("recycle", [0, 2**62], ids=["recycled", "fresh"])
 def test_no_buffer_is_shared(monkeypatch, recycle):
-    monkeypatch.setattr("flockenv.world.RECYCLE", recycle)
+    monkeypatch.setattr("flockenv.envs.world.RECYCLE", recycle)
     env = flock()
     env.seed(0)
     kept = [env.reset()]

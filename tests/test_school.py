@@ -9,6 +9,7 @@ import pytest
 
 from flockenv.behaviours import Evade, Forage, Separation, Shadow, Wander
 from flockenv.behaviours.steer import Steer
+from flockenv.envs.world import World
 from flockenv.evaluation import rollout, worlds_for
 from flockenv.grants import granted, reconcile
 from flockenv.jit.thread_pool import use_threads
@@ -23,7 +24,6 @@ from flockenv.steering.arbitration import Intentions
 from flockenv.steering.vectorize import rows
 from flockenv.tasks import School
 from flockenv.tasks.school import CAUGHT, EATEN, FATE, FEAR, FOOD, HUNGER, INTENT
-from flockenv.world import World
 
 FISH, HUNTERS, PATCHES = 6, 2, 3
 AWAY = 1e3  # m, where nobody sees anybody

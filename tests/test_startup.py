@@ -64,7 +64,7 @@ def test_a_kernel_is_read_without_looking_for_garbage_and_waited_for_with(tmp_pa
     assert gc.isenabled()
 
 
-@pytest.mark.parametrize("module", ["flockenv.tasks", "flockenv.scene", "flockenv.envs.single", "flockenv.sb3"])
+@pytest.mark.parametrize("module", ["flockenv.tasks", "flockenv.scene", "flockenv.envs.single", "flockenv.envs.sb3"])
 def test_whatever_is_imported_first_python_collects_afterwards(module: str) -> None:
     code = f"import gc, {module}; assert gc.isenabled(); assert 'pursuit' in __import__('flockenv').TASKS"
     subprocess.run([sys.executable, "-c", code], check=True)

@@ -14,11 +14,11 @@ import pytest
 from numba import njit
 
 import flockenv
+from flockenv.envs.world import Step, World
 from flockenv.jit.simd_rows import PAIR
 from flockenv.physics.integrators import RK4, Midpoint, SemiImplicitEuler
 from flockenv.tasks import TASKS, Crossing, Flock, Obstacles, Pursuit, Task, flock
 from flockenv.tasks.play import name_of
-from flockenv.world import Step, World
 from tests.catalogue import TASKS as ROWS
 from tests.catalogue import TaskRow
 

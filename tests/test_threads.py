@@ -23,6 +23,7 @@ import pytest
 import flockenv
 import flockenv.scene.scene as scenes
 from flockenv.behaviours import Alignment, Separation
+from flockenv.envs.world import World
 from flockenv.geometry.cell_list import FEWEST_ARRANGED, STEPS_ARRANGED, WORTH_ARRANGING
 from flockenv.geometry.space import Box, Torus
 from flockenv.jit import thread_pool
@@ -34,7 +35,6 @@ from flockenv.physics.effects import Drag
 from flockenv.physics.integrators import ImplicitEuler
 from flockenv.scene import Group, Scene
 from flockenv.tasks import Flock
-from flockenv.world import World
 from tests.catalogue import VARIANTS, Variant
 
 ROOT = Path(__file__).resolve().parent.parent

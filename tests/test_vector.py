@@ -24,8 +24,8 @@ from gymnasium.wrappers.vector import (
 )
 
 from flockenv.envs.registration import HORIZONS, SINGLE
+from flockenv.envs.world import World
 from flockenv.tasks import Flock, Pursuit
-from flockenv.world import World
 
 MODES = list(AutoresetMode)
 EASY = {
@@ -280,7 +280,7 @@ def test_gymnasium_s_wrappers_work_on_it(mode):
 
 @pytest.mark.parametrize("recycle", [0, 2**62], ids=["recycled", "fresh"])
 def test_no_buffer_is_shared(monkeypatch, recycle):
-    monkeypatch.setattr("flockenv.world.RECYCLE", recycle)
+    monkeypatch.setattr("flockenv.envs.world.RECYCLE", recycle)
     envs = gymnasium.make_vec("flockenv/Obstacles-v0", 4, max_episode_steps=7)
     kept = [envs.reset(seed=0)[0]]
     copies = [kept[0].copy()]

@@ -13,6 +13,7 @@ import pytest
 from flockenv.behaviours import Alignment, AvoidObstacles, Separation
 from flockenv.behaviours.steer import Steer
 from flockenv.engine.workspace import Workspace
+from flockenv.envs.world import World
 from flockenv.geometry.space import Box, Torus
 from flockenv.jit.thread_pool import threads, use_threads
 from flockenv.maths.heading import GRAVITY
@@ -24,7 +25,6 @@ from flockenv.scene import Group, Scene
 from flockenv.scene.stability import LookaheadWarning
 from flockenv.tasks import Obstacles
 from flockenv.trajectory import record
-from flockenv.world import World
 from tests.catalogue import Array
 from tests.kernels import functions_of
 

@@ -12,13 +12,13 @@ from typing import Any
 import numpy as np
 import pytest
 
+from flockenv.envs.world import AT_HAND, PAST, Step, World, _portions
 from flockenv.jit.decorators import python_of
 from flockenv.jit.section import settled
 from flockenv.jit.thread_pool import threads, use_threads
 from flockenv.maths.counter_rng import key_of, keys_of
 from flockenv.tasks import Crossing, Flock, Obstacles, Pursuit
 from flockenv.tasks.play import play_of
-from flockenv.world import AT_HAND, PAST, Step, World, _portions
 from tests.catalogue import TASKS, TaskRow
 
 EVERY = pytest.mark.parametrize("row", TASKS[::-1], ids=lambda row: row.name)
@@ -52,7 +52,7 @@ def fields(step: Step) -> dict[str, Any]:
 @pytest.fixture(params=[False, True], ids=["fresh", "recycled"])
 def recycled(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> bool:
     """Small worlds hand out new memory, large ones use it again; here every size does what the parameter says."""
-    monkeypatch.setattr("flockenv.world.RECYCLE", 0 if request.param else 2**62)
+    monkeypatch.setattr("flockenv.envs.world.RECYCLE", 0 if request.param else 2**62)
     return bool(request.param)
 
 
@@ -125,7 +125,7 @@ def test_nothing_handed_out_is_shared(row: TaskRow, recycled: bool) -> None:
 @pytest.mark.usefixtures("recycled")
 def test_what_goes_past_the_caches_is_the_same(row: TaskRow, monkeypatch: pytest.MonkeyPatch) -> None:
     direct = World(row.task, 5, time_limit=7)
-    monkeypatch.setattr("flockenv.world.PAST", 0)
+    monkeypatch.setattr("flockenv.envs.world.PAST", 0)
     past = World(row.task, 5, time_limit=7)
     assert (direct._past, past._past) == (False, True)
     np.testing.assert_array_equal(past.reset(5), direct.reset(5))
@@ -277,7 +277,7 @@ def test_a_masked_reset_touches_the_masked_worlds_only(row: TaskRow) -> None:
 @pytest.fixture
 def looking(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let numba look at the types of every call, so that it would compile for other ones."""
-    monkeypatch.setattr("flockenv.world.settled", lambda function: function)
+    monkeypatch.setattr("flockenv.envs.world.settled", lambda function: function)
 
 
 def test_a_world_that_was_reset_calls_its_kernel_without_a_look_at_types() -> None:

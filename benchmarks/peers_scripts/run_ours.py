@@ -14,8 +14,8 @@ def flock_batch(agents: int) -> Case:
     """The Flock task in 1024 worlds, every agent a learner, through World.step."""
     import numpy as np
 
+    from flockenv.envs.world import World
     from flockenv.tasks import Flock
-    from flockenv.world import World
 
     task = Flock(agents=agents, obstacle_count=5)
     does = (
@@ -73,8 +73,8 @@ def pursuit_batch(threads: int) -> Case:
     """The Pursuit task in 1024 worlds: three chase one, all four learn, through World.step."""
     import numpy as np
 
+    from flockenv.envs.world import World
     from flockenv.tasks import Pursuit
-    from flockenv.world import World
 
     task = Pursuit(pursuers=3, evaders=1, sides="both")
     does = (

@@ -10,7 +10,7 @@ from pettingzoo import AECEnv
 from pettingzoo.utils.conversions import parallel_to_aec_wrapper
 from pettingzoo.utils.wrappers import BaseWrapper, OrderEnforcingWrapper
 
-from flockenv.envs.face import Rows
+from flockenv.envs.common import Rows
 from flockenv.envs.parallel import WorldParallelEnv
 
 __all__ = ["by_turns"]

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from pettingzoo import ParallelEnv
 
 from flockenv.core.errors import nearest
-from flockenv.envs.face import (
+from flockenv.envs.common import (
     RENDER_MODES,
     ByAgent,
     Rows,
@@ -29,8 +29,8 @@ from flockenv.envs.face import (
     reward_keys,
 )
 from flockenv.envs.registration import VERSIONS
+from flockenv.envs.world import Step, World
 from flockenv.tasks import Bottleneck, Corridor, Crossing, Flock, Herd, Pursuit, School, Task
-from flockenv.world import Step, World
 
 __all__ = [
     "BottleneckParallelEnv", "CorridorParallelEnv", "CrossingParallelEnv", "FlockParallelEnv", "HerdParallelEnv",

@@ -9,7 +9,7 @@ import numpy as np
 from gymnasium import logger
 from numpy.typing import NDArray
 
-from flockenv.envs.face import (
+from flockenv.envs.common import (
     RENDER_MODES,
     SEEDS,
     Rows,
@@ -23,7 +23,8 @@ from flockenv.envs.face import (
     render_fps,
     reward_keys,
 )
-from flockenv.envs.page import page
+from flockenv.envs.docstring import page
+from flockenv.envs.world import Step, World
 from flockenv.tasks import (
     Bottleneck,
     Corridor,
@@ -38,7 +39,6 @@ from flockenv.tasks import (
     School,
     Task,
 )
-from flockenv.world import Step, World
 
 __all__ = [
     "BottleneckEnv",
@@ -63,7 +63,7 @@ def one_learner(task_type: type[Task], parameters: dict[str, Any]) -> Task:
     if task.learners != 1:
         raise ValueError(
             f"{task_type.__name__}: {task.learners} learners; a Gymnasium environment has 1: for more use "
-            "gymnasium.make_vec(...), pettingzoo.make('parallel', ...) or flockenv.sb3.WorldVecEnv"
+            "gymnasium.make_vec(...), pettingzoo.make('parallel', ...) or flockenv.envs.sb3.WorldVecEnv"
         )
     return task
 

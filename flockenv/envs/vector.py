@@ -18,7 +18,7 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
 from flockenv.core.errors import nearest
-from flockenv.envs.face import (
+from flockenv.envs.common import (
     SEEDS,
     Rows,
     Screen,
@@ -32,6 +32,7 @@ from flockenv.envs.face import (
     reward_keys,
     together,
 )
+from flockenv.envs.world import Step, World
 from flockenv.tasks import (
     Bottleneck,
     Corridor,
@@ -46,7 +47,6 @@ from flockenv.tasks import (
     School,
     Task,
 )
-from flockenv.world import Step, World
 
 __all__ = [
     "BottleneckVectorEnv",

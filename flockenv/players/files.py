@@ -63,7 +63,7 @@ def load_file(name: str, task: Task, seed: int = 0, trust_pickle: bool = False) 
 
 def _load_zip(path: Path) -> Policy:
     # by name: stable-baselines3 and torch are looked for only here, and sb3.py is a layer above this file
-    policy: Policy = importlib.import_module("flockenv.sb3").load_sb3_zip(path, trust_pickle=True)
+    policy: Policy = importlib.import_module("flockenv.envs.sb3").load_sb3_zip(path, trust_pickle=True)
     return policy
 
 

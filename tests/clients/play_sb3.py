@@ -11,7 +11,7 @@ from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import VecNormalize
 
 import flockenv  # noqa: F401  # registers the ids
-from flockenv.sb3 import WorldMonitor, WorldVecEnv
+from flockenv.envs.sb3 import WorldMonitor, WorldVecEnv
 from flockenv.tasks import Bottleneck, Crossing, Pursuit
 
 for env_id in IDS:

@@ -22,7 +22,7 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.vec_env import VecEnv, VecMonitor
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices
 
-from flockenv.envs.face import (
+from flockenv.envs.common import (
     Screen,
     action_space,
     begun,
@@ -35,7 +35,7 @@ from flockenv.envs.face import (
     together,
 )
 from flockenv.envs.registration import HORIZONS, id_of
-from flockenv.world import Step, World
+from flockenv.envs.world import Step, World
 
 if TYPE_CHECKING:
     from gymnasium.envs.registration import EnvSpec

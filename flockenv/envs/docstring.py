@@ -7,7 +7,7 @@ from collections.abc import Iterable, Sequence
 
 import numpy as np
 
-from flockenv.envs.face import reward_keys
+from flockenv.envs.common import reward_keys
 from flockenv.envs.registration import id_of
 from flockenv.tasks import Layout, Task
 
