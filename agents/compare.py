@@ -32,8 +32,8 @@ from flockenv.core.output_paths import check_room, checked_file, checked_path
 from flockenv.evaluation import WORLDS_PER_SEED, Episodes, rollout, task_digest, worlds_for
 from flockenv.players import NAMES, load_player, other_tasks
 from flockenv.players.files import SUFFIXES, PlayerError
+from flockenv.players.policy import OtherTaskWarning, Policy
 from flockenv.players.rules import tuned
-from flockenv.policy import OtherTaskWarning, Policy
 from flockenv.tasks import TASKS, Task
 from flockenv.terminal import one_line, program, shown_progress
 

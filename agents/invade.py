@@ -28,7 +28,7 @@ from flockenv.envs.world import Step, World
 from flockenv.evaluation import Episodes, Interval, bootstrap, compare, rollout, worlds_for
 from flockenv.model.snapshot import Snapshot
 from flockenv.players import NAMES, other_tasks
-from flockenv.policy import Policy
+from flockenv.players.policy import Policy
 from flockenv.tasks import Task
 from flockenv.terminal import program, shown_progress
 

@@ -44,8 +44,8 @@ from flockenv.envs.sb3 import WorldVecEnv
 from flockenv.evaluation import rollout, worlds_for
 from flockenv.jit.thread_pool import threads, use_threads
 from flockenv.players import WEIGHTS
+from flockenv.players.policy import MlpPolicy, describe, save_policy
 from flockenv.players.rules import player
-from flockenv.policy import MlpPolicy, describe, save_policy
 from flockenv.tasks import TASKS, Task
 from flockenv.terminal import DIVERGED, interruptible, program, shown_progress
 
@@ -56,7 +56,7 @@ console = Console(stderr=True)
 
 
 def tensors_of(model: PPO) -> dict[str, np.ndarray]:
-    """Return the actor's weights under the names that flockenv.policy reads; the critic stays behind."""
+    """Return the actor's weights under the names that flockenv.players.policy reads; the critic stays behind."""
     tensors = model.policy.state_dict().items()
     state = {name: tensor.detach().cpu().numpy().astype(np.float32) for name, tensor in tensors}
     out = {"log_std": state["log_std"]}

@@ -16,8 +16,8 @@ from agents.checkpoint import CheckpointError, Parts
 from agents.experiment import Experiment
 from flockenv.core.errors import KeyPath, key_path, shown
 from flockenv.core.record import ResultRecord
+from flockenv.players.policy import MlpPolicy
 from flockenv.players.rules import as_dict, player
-from flockenv.policy import MlpPolicy
 
 __all__ = ["OtherRecipe", "Run", "checkpoint", "checkpointed", "expected_bytes", "recipe_of"]
 

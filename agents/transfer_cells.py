@@ -23,7 +23,7 @@ from flockenv.envs.world import World
 from flockenv.evaluation import rollout, task_digest, worlds_for
 from flockenv.physics.integrators import RK4
 from flockenv.players import NAMES
-from flockenv.policy import Policy
+from flockenv.players.policy import Policy
 from flockenv.tasks import Task
 from flockenv.tasks.play import name_of
 

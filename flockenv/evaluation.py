@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from flockenv.envs.world import Step, World
-from flockenv.policy import Policy
+from flockenv.players.policy import Policy
 
 if TYPE_CHECKING:
     from flockenv.model.snapshot import Snapshot

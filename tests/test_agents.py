@@ -28,8 +28,8 @@ from flockenv.envs.world import World
 from flockenv.evaluation import compare, rollout, worlds_for
 from flockenv.jit.thread_pool import threads
 from flockenv.players import WEIGHTS
+from flockenv.players.policy import MlpPolicy, RandomPolicy
 from flockenv.players.rules import RULES, Tuned, as_dict, player, tuned
-from flockenv.policy import MlpPolicy, RandomPolicy
 from flockenv.tasks import TASKS, School, Task
 from tests.training import PURSUIT, TINY, interrupt
 

@@ -26,7 +26,7 @@ from flockenv.geometry.space import Torus
 from flockenv.jit.checked_store import Store
 from flockenv.jit.private_folder import prepared
 from flockenv.model.group import Group
-from flockenv.policy import save_policy
+from flockenv.players.policy import save_policy
 from flockenv.scene import Scene
 from flockenv.trajectory import record
 

@@ -13,7 +13,7 @@ from agents.experiment import Experiment, PpoSettings
 from agents.run import OtherRecipe, checkpointed
 from flockenv.envs.sb3 import WorldVecEnv
 from flockenv.envs.world import World
-from flockenv.policy import MlpPolicy
+from flockenv.players.policy import MlpPolicy
 from flockenv.tasks import Flock, Herd, School, Task
 from tests.training import interrupt
 

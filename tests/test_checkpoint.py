@@ -31,7 +31,7 @@ from flockenv.core.atomic_files import LEFTOVERS
 from flockenv.core.output_paths import check_room
 from flockenv.envs.sb3 import WorldVecEnv
 from flockenv.envs.world import World
-from flockenv.policy import MlpPolicy
+from flockenv.players.policy import MlpPolicy
 from tests.training import PURSUIT, SCHOOL, TINY, interrupt
 
 LARGEST = 2**26

@@ -29,7 +29,7 @@ from flockenv.model.networks import Rope
 from flockenv.physics.effects import EFFECTS
 from flockenv.physics.effects.springs import Springs
 from flockenv.physics.integrators import INTEGRATORS, ImplicitEuler, Integrator
-from flockenv.policy import Policy, RandomPolicy
+from flockenv.players.policy import Policy, RandomPolicy
 from flockenv.scene import Group, Scene
 from flockenv.scene.stability import suggest_dt
 from flockenv.scene.yaml_io import load_scene, schema

@@ -11,8 +11,8 @@ import pytest
 from flockenv.envs.world import World
 from flockenv.evaluation import rollout, worlds_for
 from flockenv.players import WEIGHTS
+from flockenv.players.policy import MlpPolicy, RandomPolicy
 from flockenv.players.rules import player
-from flockenv.policy import MlpPolicy, RandomPolicy
 from flockenv.tasks import Corridor
 from tests.test_tasks import act, paid, place, random_actions, world_of
 

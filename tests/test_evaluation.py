@@ -30,7 +30,7 @@ from flockenv.evaluation import (
     task_digest,
     worlds_for,
 )
-from flockenv.policy import RandomPolicy
+from flockenv.players.policy import RandomPolicy
 from flockenv.tasks import TASKS
 
 

@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 from agents import invade as invasion
 from flockenv.envs.world import World
 from flockenv.evaluation import Episodes, rollout, worlds_for
-from flockenv.policy import RandomPolicy
+from flockenv.players.policy import RandomPolicy
 from flockenv.tasks import Flock, School
 
 FISH, WORLDS = 3, 7

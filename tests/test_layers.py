@@ -189,8 +189,8 @@ def test_nothing_imports_upwards_and_heavy_packages_stay_in_their_place() -> Non
     [
         ("flockenv/model/state.py", "from flockenv.scene import Scene", "state imports scene, which stands above it"),
         ("flockenv/scene/scene.py", "from agents import tune", "scene imports agents, which stands above it"),
-        ("flockenv/policy.py", "import torch.nn", "torch belongs in agents and sb3 and tests"),
-        ("flockenv/policy.py", "def f():\n    import torch", "torch belongs in agents and sb3 and tests"),
+        ("flockenv/players/policy.py", "import torch.nn", "torch belongs in agents and sb3 and tests"),
+        ("flockenv/players/policy.py", "def f():\n    import torch", "torch belongs in agents and sb3 and tests"),
         (
             "flockenv/cli.py",
             "from stable_baselines3 import PPO",

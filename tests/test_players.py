@@ -17,8 +17,8 @@ from typer.main import get_command
 from agents import compare, invade, transfer
 from flockenv import cli
 from flockenv.players import NAMES, WEIGHTS, load_player, other_tasks
+from flockenv.players.policy import MlpPolicy
 from flockenv.players.rules import PLAYERS
-from flockenv.policy import MlpPolicy
 from flockenv.tasks import TASKS, Crossing, Flock, Pursuit, Task
 
 TASK: Any = SimpleNamespace(name="toy", layout=SimpleNamespace(size=5), action_layout=SimpleNamespace(size=2))

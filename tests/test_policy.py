@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from safetensors.numpy import save
 
-from flockenv.policy import MlpPolicy, OtherTaskWarning, Policy, RandomPolicy, describe, save_policy
+from flockenv.players.policy import MlpPolicy, OtherTaskWarning, Policy, RandomPolicy, describe, save_policy
 from flockenv.tasks import TASKS, Corridor, Crossing, Flock, Pursuit, Task
 
 TASK: Any = SimpleNamespace(
@@ -162,7 +162,7 @@ def test_actor_equals_stable_baselines3(activation: str) -> None:
 
 def test_importing_and_using_a_policy_needs_no_torch() -> None:
     code = (
-        "import sys, numpy as np; from flockenv.policy import MlpPolicy, RandomPolicy;"
+        "import sys, numpy as np; from flockenv.players.policy import MlpPolicy, RandomPolicy;"
         "RandomPolicy(2).predict(np.zeros((3, 4)));"
         "bad = {'torch', 'matplotlib', 'stable_baselines3'} & set(sys.modules); assert not bad, bad"
     )

@@ -277,7 +277,7 @@ def load_sb3_zip(
 ) -> BaseAlgorithm:
     """Read a model that Stable-Baselines3 saved, which RUNS CODE from the file (cloudpickle, SB3 #2281).
 
-    Our own policies are safetensors and need none of this: flockenv.policy.MlpPolicy.load.
+    Our own policies are safetensors and need none of this: flockenv.players.policy.MlpPolicy.load.
 
     Raises:
         ValueError: trust_pickle is not True, or there is no such file.

@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING
 from flockenv.core.errors import nearest, shown
 
 if TYPE_CHECKING:
-    from flockenv.policy import Policy
+    from flockenv.players.policy import Policy
     from flockenv.tasks import Task
 
 # Neither the laws nor numba are imported up here: `flockenv render --help` names the players in a fifth of a second.
@@ -66,8 +66,8 @@ def load_player(spec: str | os.PathLike[str], task: Task, seed: int = 0, trust_p
 
 def named_player(name: str, task: Task, seed: int = 0) -> Policy:
     """Return one of NAMES, ready to play a task; ValueError if there is none of that name for it."""
+    from flockenv.players.policy import RandomPolicy
     from flockenv.players.rules import player
-    from flockenv.policy import RandomPolicy
 
     if name == "random":
         return RandomPolicy(task.action_layout.size, seed)
@@ -75,7 +75,7 @@ def named_player(name: str, task: Task, seed: int = 0) -> Policy:
 
 
 def _trained(task: Task, seed: int) -> Policy:
-    from flockenv.policy import MlpPolicy
+    from flockenv.players.policy import MlpPolicy
 
     path = WEIGHTS / f"{task.name}.safetensors"
     if not path.is_file():

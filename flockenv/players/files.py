@@ -27,7 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flockenv.core.errors import shown_path
-from flockenv.policy import MlpPolicy, Observation, Policy, State
+from flockenv.players.policy import MlpPolicy, Observation, Policy, State
 
 if TYPE_CHECKING:
     from flockenv.tasks import Task

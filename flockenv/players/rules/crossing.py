@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flockenv import steering
-from flockenv.players.rules.keep_clear import keep_clear
+from flockenv.players.rules.clearance import keep_clear
 from flockenv.steering import arbitration
 from flockenv.steering.vectorize import rows
 from flockenv.tasks import Crossing
