@@ -375,7 +375,7 @@ def write_text(path: Path, text: str) -> None:
 
 
 def _draw(path: Path, results: report.Results, episodes: Mapping[str, Mapping[str, Episodes]]) -> None:
-    from flockenv.render.chart import write_chart
+    from flockenv.evaluation.plots import write_chart
 
     columns = [report.column(task, about, episodes[task]) for task, about in results["tasks"].items()]
     note = f"{results['worlds']} worlds per task, the same for every player; level differences are grey"

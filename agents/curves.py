@@ -20,8 +20,8 @@ from rich.console import Console
 from agents.experiment import Experiment, PpoSettings, load_experiment, one_line_errors
 from flockenv.core.atomic_files import deliver, replacing
 from flockenv.core.output_paths import check_room, checked_file, checked_path
+from flockenv.evaluation.plots import COLOURS, FAINT, GRID, INK
 from flockenv.players.rules import tuned
-from flockenv.render.chart import COLOURS, FAINT, GRID, INK
 from flockenv.terminal import one_line, program
 
 if TYPE_CHECKING:

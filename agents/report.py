@@ -15,7 +15,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from flockenv.evaluation import Comparison, Episodes, Interval, compare, summarise
-from flockenv.render.chart import Column, Row
+from flockenv.evaluation.plots import Column, Row
 
 __all__ = [
     "column", "differences", "grid", "interval_fields", "interval_text", "json_text", "markdown", "number_text",

@@ -9,7 +9,7 @@ import numpy as np
 
 from agents.report import Results
 from flockenv.core.atomic_files import replacing
-from flockenv.render.chart import FAINT, FIXED, GRID, INK
+from flockenv.evaluation.plots import FAINT, FIXED, GRID, INK
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -25,8 +25,8 @@ from typer.testing import CliRunner
 from agents import compare as comparison
 from agents import report
 from flockenv.evaluation import EVALUATION, Episodes
+from flockenv.evaluation.plots import Column, draw_chart, write_chart
 from flockenv.players.policy import save_policy
-from flockenv.render.chart import Column, draw_chart, write_chart
 from flockenv.tasks import TASKS
 
 ROOT = Path(__file__).resolve().parent.parent

@@ -196,7 +196,7 @@ def test_nothing_imports_upwards_and_heavy_packages_stay_in_their_place() -> Non
             "from stable_baselines3 import PPO",
             "stable_baselines3 belongs in agents and sb3 and tests",
         ),
-        ("flockenv/render/chart.py", "import matplotlib.pyplot", "matplotlib must be imported inside the function"),
+        ("flockenv/evaluation/plots.py", "import matplotlib.pyplot", "matplotlib must be imported inside the function"),
         (
             "flockenv/maths/vectors.py",
             "import flockenv.maths.counter_rng\nimport flockenv",

@@ -328,7 +328,7 @@ def test_dictionaries_by_agent_are_the_same_written_out_or_not(monkeypatch, agen
     seen, over = rng.random((len(agents), 3)), (rng.random(len(agents)) < 0.5).tolist()
     paid, earned = rng.random(len(agents)).tolist(), rng.random((2, len(agents))).tolist()
     for displayed in (0, 1000):
-        monkeypatch.setattr(face, "DISPLAYED", displayed)
+        monkeypatch.setattr(common, "DISPLAYED", displayed)
         common._by_agent.cache_clear()
         told = common.ByAgent(terms, agents).of(seen, paid, over, True, earned, False)
         assert [list(each) for each in told] == [list(agents)] * 5

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flockenv.core.atomic_files import replacing
+from flockenv.evaluation.plots import COLOURS, FAINT, GRID, INK
 from flockenv.measures import JUELICH, Tail, survival, weidmann_flow, weidmann_speed
-from flockenv.render.chart import COLOURS, FAINT, GRID, INK
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from flockenv.render.chart import COLOURS, FAINT, INK
+from flockenv.evaluation.plots import COLOURS, FAINT, INK
 from flockenv.render.crowd import named, new_figure, save
 
 if TYPE_CHECKING:

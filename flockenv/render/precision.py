@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from flockenv.core.atomic_files import replacing
-from flockenv.render.chart import COLOURS, FAINT, GRID, INK
+from flockenv.evaluation.plots import COLOURS, FAINT, GRID, INK
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from flockenv.core.atomic_files import replacing
-from flockenv.render.chart import COLOURS, FAINT, GRID, INK
+from flockenv.evaluation.plots import COLOURS, FAINT, GRID, INK
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from flockenv.evaluation.plots import COLOURS, FAINT, GRID, INK
 from flockenv.measures import weidmann_flow, weidmann_speed
-from flockenv.render.chart import COLOURS, FAINT, GRID, INK
 from flockenv.render.crowd import named, new_figure, save
 
 if TYPE_CHECKING:

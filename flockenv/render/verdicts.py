@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from flockenv.core.atomic_files import replacing
-from flockenv.render.chart import INK
+from flockenv.evaluation.plots import INK
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
