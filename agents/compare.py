@@ -26,16 +26,17 @@ import flockenv
 from agents import report
 from agents.experiment import CONFIGS, Experiment, load_experiment
 from agents.processes import Tell, side_by_side
+from flockenv.cli.terminal import one_line, program, shown_progress
 from flockenv.core.atomic_files import deliver
 from flockenv.core.errors import nearest, shown
 from flockenv.core.output_paths import check_room, checked_file, checked_path
+from flockenv.core.warnings import OtherTaskWarning
 from flockenv.evaluation import WORLDS_PER_SEED, Episodes, rollout, task_digest, worlds_for
 from flockenv.players import NAMES, load_player, other_tasks
 from flockenv.players.files import SUFFIXES, PlayerError
-from flockenv.players.policy import OtherTaskWarning, Policy
+from flockenv.players.policy import Policy
 from flockenv.players.rules import tuned
 from flockenv.tasks import TASKS, Task
-from flockenv.terminal import one_line, program, shown_progress
 
 __all__ = [
     "Player", "app", "blaming", "compare", "experiment_of", "field_of", "folder_of", "pick", "players_of", "provenance",

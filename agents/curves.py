@@ -18,11 +18,11 @@ import typer
 from rich.console import Console
 
 from agents.experiment import Experiment, PpoSettings, load_experiment, one_line_errors
+from flockenv.cli.terminal import one_line, program
 from flockenv.core.atomic_files import deliver, replacing
 from flockenv.core.output_paths import check_room, checked_file, checked_path
 from flockenv.evaluation.plots import COLOURS, FAINT, GRID, INK
 from flockenv.players.rules import tuned
-from flockenv.terminal import one_line, program
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

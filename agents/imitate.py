@@ -19,9 +19,9 @@ from rich.progress import Progress
 from agents.experiment import Experiment, load_experiment, one_line_errors
 from agents.ppo import build, on_threads, score, tensors_of
 from agents.teach import WORLDS, teach
+from flockenv.cli.terminal import DIVERGED, program, shown_progress
 from flockenv.evaluation import rollout, worlds_for
 from flockenv.players.rules import player
-from flockenv.terminal import DIVERGED, program, shown_progress
 
 __all__ = ["Imitation", "app", "imitate"]
 

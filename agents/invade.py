@@ -24,13 +24,13 @@ from rich.table import Table
 
 from agents.compare import blaming, field_of, split
 from agents.experiment import load_experiment, one_line_errors
+from flockenv.cli.terminal import program, shown_progress
 from flockenv.envs.world import Step, World
 from flockenv.evaluation import Episodes, Interval, bootstrap, compare, rollout, worlds_for
 from flockenv.model.snapshot import Snapshot
 from flockenv.players import NAMES, other_tasks
 from flockenv.players.policy import Policy
 from flockenv.tasks import Task
-from flockenv.terminal import program, shown_progress
 
 __all__ = ["Among", "Payoffs", "app", "invade"]
 

@@ -38,6 +38,7 @@ from agents.learning_env import ForLearning
 from agents.run import Run, checkpoint, checkpointed, expected_bytes, recipe_of
 from agents.teach import teach
 from agents.training_state import capture, restore, surroundings
+from flockenv.cli.terminal import DIVERGED, interruptible, program, shown_progress
 from flockenv.core import signals
 from flockenv.core.output_paths import check_room, checked_file, checked_path
 from flockenv.envs.sb3 import WorldVecEnv
@@ -47,7 +48,6 @@ from flockenv.players import WEIGHTS
 from flockenv.players.policy import MlpPolicy, describe, save_policy
 from flockenv.players.rules import player
 from flockenv.tasks import TASKS, Task
-from flockenv.terminal import DIVERGED, interruptible, program, shown_progress
 
 __all__ = ["app", "build", "export", "on_threads", "score", "tensors_of", "train"]
 

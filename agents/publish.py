@@ -17,9 +17,9 @@ import typer
 from agents.compare import ROOT
 from agents.experiment import one_line_errors
 from agents.report import Results, grid
+from flockenv.cli.terminal import program
 from flockenv.core.atomic_files import deliver
 from flockenv.tasks import TASKS
-from flockenv.terminal import program
 
 __all__ = ["BLOCK", "app", "tables"]
 

@@ -45,12 +45,12 @@ from agents.transfer_cells import (
     run_round,
 )
 from agents.transfer_report import Setting
+from flockenv.cli.terminal import one_line, program, shown_progress
 from flockenv.core.atomic_files import deliver
 from flockenv.core.errors import nearest, shown
 from flockenv.evaluation import WORLDS_PER_SEED, worlds_for
 from flockenv.physics.integrators import INTEGRATORS
 from flockenv.tasks import TASKS, Task
-from flockenv.terminal import one_line, program, shown_progress
 
 __all__ = ["app"]
 

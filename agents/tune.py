@@ -18,12 +18,12 @@ from rich.console import Console
 from rich.progress import Progress
 
 from agents.experiment import Experiment, load_experiment, one_line_errors
+from flockenv.cli.terminal import program, shown_progress
 from flockenv.core.atomic_files import made, replacing
 from flockenv.core.output_paths import check_room, checked_file
 from flockenv.evaluation import rollout, worlds_for
 from flockenv.players.rules import RULES, TUNED, RulesPlayer, as_dict
 from flockenv.tasks import Task
-from flockenv.terminal import program, shown_progress
 
 __all__ = ["RANGES", "app", "search"]
 

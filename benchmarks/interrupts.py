@@ -28,7 +28,7 @@ from typing import Annotated
 
 import typer
 
-from flockenv.terminal import program, progress_bar
+from flockenv.cli.terminal import program, progress_bar
 
 __all__ = ["COMMANDS", "Outcome", "interrupted"]
 

@@ -9,7 +9,7 @@ from typing import Any
 import hypothesis
 import pytest
 
-from flockenv import terminal
+from flockenv.cli import terminal
 from flockenv.jit import thread_pool
 from tests.catalogue import TETHER, users_module
 

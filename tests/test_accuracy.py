@@ -18,7 +18,7 @@ from flockenv.accuracy import reference as references
 from flockenv.accuracy.results import Curve, Point, measured_order
 from flockenv.accuracy.table import best, columns, headlines, rows
 from flockenv.behaviours import Separation
-from flockenv.cli import main
+from flockenv.cli.main import main
 from flockenv.model.spawn import Spawn
 from flockenv.physics.effects import Effect, Fluctuation, Swing, Tether
 from flockenv.physics.integrators import RK4, Integrator, methods_named

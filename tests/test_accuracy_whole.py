@@ -14,7 +14,7 @@ from flockenv.accuracy.paths import Path as Way
 from flockenv.accuracy.paths import apart, reach, unmatched
 from flockenv.accuracy.reference import _closing_in, find_reference, own_steps
 from flockenv.accuracy.table import errors, headlines
-from flockenv.cli import main
+from flockenv.cli.main import main
 from flockenv.physics.integrators import methods_named
 from flockenv.render.precision import draw_precision
 from flockenv.scene.yaml_io import load_scene
@@ -271,9 +271,9 @@ SHIPPED = [
 
 @pytest.mark.slow
 @pytest.mark.filterwarnings(
-    "ignore::flockenv.scene.stability.CoarseContactWarning"
+    "ignore::flockenv.core.warnings.CoarseContactWarning"
 )  # steps as published, in configs/crowds
-@pytest.mark.filterwarnings("ignore::flockenv.scene.stability.UnstableStepWarning")
+@pytest.mark.filterwarnings("ignore::flockenv.core.warnings.UnstableStepWarning")
 @pytest.mark.parametrize("path", SHIPPED, ids=lambda path: path.stem)
 def test_every_scene_that_is_shipped_has_a_reference_or_a_line_that_says_why_not(path: Path) -> None:
     """Over four of its own steps, which is no measurement: that all of them are gone through, and told, is."""

@@ -19,7 +19,7 @@ import pytest
 import typer
 
 from agents import checkpoint, publish
-from flockenv import gallery, validating
+from flockenv.cli import gallery, validate
 from flockenv.core.atomic_files import LEFTOVERS, deliver, remove_leftovers, replacing
 from flockenv.findings import Results
 from flockenv.geometry.space import Torus
@@ -306,7 +306,7 @@ def _gallery(folder: Path) -> None:
 
 def _validation(folder: Path) -> None:
     folder.mkdir()
-    validating._write(folder / "page.md", Results(findings=()))
+    validate._write(folder / "page.md", Results(findings=()))
 
 
 def _training(folder: Path) -> None:
@@ -317,7 +317,7 @@ def _training(folder: Path) -> None:
 @pytest.mark.parametrize(
     ("first", "write"),
     [
-        ("flockenv.gallery.shown", _gallery),
+        ("flockenv.cli.gallery.shown", _gallery),
         ("flockenv.render.validation.write_pictures", _validation),
         ("agents.checkpoint.FileLock", _training),
     ],

@@ -22,7 +22,7 @@ from gymnasium.error import ResetNeeded
 
 import flockenv  # noqa: F401  # registers the environments
 from flockenv.behaviours import Alignment, Queue, Separation
-from flockenv.cli import main
+from flockenv.cli.main import main
 from flockenv.envs.world import World
 from flockenv.geometry.shapes import HalfSpace, Polygon
 from flockenv.geometry.space import Box, Torus

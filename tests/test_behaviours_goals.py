@@ -32,11 +32,11 @@ from flockenv.behaviours import (
     Wander,
 )
 from flockenv.behaviours.steer import Steer
+from flockenv.core.warnings import LookaheadWarning
 from flockenv.model.spawn import Spawn
 from flockenv.model.state import State
 from flockenv.physics.effects import Effect
 from flockenv.scene import Group, Scene
-from flockenv.scene.stability import LookaheadWarning
 from flockenv.steering.vectorize import rows
 from tests.catalogue import EFFECTS, Array, in_dimension, scene_of
 

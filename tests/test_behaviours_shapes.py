@@ -325,9 +325,7 @@ def test_bodies_stand_out_by_less_the_shorter_the_step() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.filterwarnings(
-    "ignore::flockenv.physics.constraints.collisions.UnsolvedContactsWarning"
-)  # in the jam they run to
+@pytest.mark.filterwarnings("ignore::flockenv.core.warnings.UnsolvedContactsWarning")  # in the jam they run to
 def test_no_body_stands_out_of_a_hollow_obstacle_with_collisions() -> None:
     assert stand_out(0.02, 20, walls=True) < 1e-6
 

@@ -22,8 +22,8 @@ from rich.progress import Progress
 from typer.testing import CliRunner
 
 import flockenv.stress
-from flockenv import terminal
-from flockenv.cli import app, main
+from flockenv.cli import terminal
+from flockenv.cli.main import app, main
 from flockenv.explanation import Cost, Explanation
 from flockenv.model.networks import Rope
 from flockenv.physics.effects import EFFECTS
@@ -56,7 +56,7 @@ def in_a_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def process(*arguments: str) -> list[str]:
-    return [sys.executable, "-c", "import sys; from flockenv.cli import main; sys.exit(main())", *arguments]
+    return [sys.executable, "-c", "import sys; from flockenv.cli.main import main; sys.exit(main())", *arguments]
 
 
 ENVIRONMENT = {**os.environ, "PYTHONPATH": str(ROOT)}
@@ -122,7 +122,7 @@ def test_no_help_says_a_default_in_brackets_of_its_own() -> None:
 def test_the_shell_completes_tasks_and_scene_files(words: str, expected: list[str]) -> None:
     Path("notes.txt").touch()
     done = subprocess.run(
-        [sys.executable, "-c", "from flockenv.cli import app; app(prog_name='flockenv')"],
+        [sys.executable, "-c", "from flockenv.cli.main import app; app(prog_name='flockenv')"],
         env={**ENVIRONMENT, "_FLOCKENV_COMPLETE": "complete_bash", "COMP_WORDS": f"_ {words}", "COMP_CWORD": "2"},
         capture_output=True, text=True, check=False,
     )  # fmt: skip
@@ -194,7 +194,7 @@ def test_every_says_how_often_an_instant_is_kept_and_the_last_always_is() -> Non
 
 
 @pytest.mark.slow
-@pytest.mark.filterwarnings("ignore::flockenv.physics.constraints.collisions.UnsolvedContactsWarning")
+@pytest.mark.filterwarnings("ignore::flockenv.core.warnings.UnsolvedContactsWarning")
 def test_run_and_render_say_how_many_contacts_were_left_unsolved(capsys: pytest.CaptureFixture[str]) -> None:
     heap = "{count: 25, radius: 0.1, spawn: {low: [0, 0], high: [1.25, 1.25], spacing: 0.25}}"
     rules = "effects: [{kind: gravity}]\nconstraints: [{kind: collisions, response: impulses, passes: %d}]\ndt: 0.01\n"
@@ -252,7 +252,7 @@ def interrupted(moment: str, *arguments: str) -> subprocess.CompletedProcess[str
     """Run a command in a process that gets a real SIGINT once the bar of that name has moved on a little."""
     code = f"""
 import contextlib, os, signal, sys
-from flockenv import cli
+from flockenv.cli.main import main
 
 signal.signal(signal.SIGINT, signal.default_int_handler)  # a test run in the background ignores them, for all below
 
@@ -710,7 +710,7 @@ def test_a_full_disk_is_one_line_that_names_the_file_and_leaves_nothing(name: st
     """A limit on the size of files stands for the disk."""
     command = "run" if name.endswith("npz") else "render"
     code = (
-        "import resource, sys; from flockenv.cli import main\n"
+        "import resource, sys; from flockenv.cli.main import main\n"
         "import flockenv.core.output_paths, matplotlib.font_manager\n"
         "resource.setrlimit(resource.RLIMIT_FSIZE, (200, 200)); sys.exit(main())"
     )
@@ -742,7 +742,7 @@ def test_as_a_program_errors_go_to_stderr_and_the_exit_code_says_so() -> None:
 
 def test_a_reader_that_goes_away_is_no_error() -> None:
     """`flockenv list | head -1`."""
-    command = f"{sys.executable} -c 'import sys; from flockenv.cli import main; sys.exit(main())' list | head -1"
+    command = f"{sys.executable} -c 'import sys; from flockenv.cli.main import main; sys.exit(main())' list | head -1"
     done = subprocess.run(command, shell=True, env=ENVIRONMENT, capture_output=True, text=True, check=True)
     assert (done.stdout, done.stderr) == ("Tasks\n", "")
 

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from flockenv.core.warnings import UnsolvedContactsWarning
 from flockenv.explanation import explain
 from flockenv.geometry.shapes import Block, Circle, HalfSpace, Polygon, Wall
 from flockenv.geometry.space import Box, Plane, Space, Torus
@@ -22,7 +23,6 @@ from flockenv.model.spawn import Spawn
 from flockenv.model.state import Floats, State
 from flockenv.physics.constraints import Collisions
 from flockenv.physics.constraints.broad_phase import nearby
-from flockenv.physics.constraints.collisions import UnsolvedContactsWarning
 from flockenv.physics.effects import Gravity
 from flockenv.physics.integrators import RK4, Integrator, SemiImplicitEuler, VelocityVerlet
 from flockenv.scene import Group, Scene
@@ -354,7 +354,7 @@ def test_worlds_and_threads_do_not_know_of_each_other() -> None:
     np.testing.assert_array_equal(of.run(copy.deepcopy(batch).worlds([77]), 60).v, alone.v)
 
 
-@pytest.mark.filterwarnings("default::flockenv.physics.constraints.collisions.UnsolvedContactsWarning")
+@pytest.mark.filterwarnings("default::flockenv.core.warnings.UnsolvedContactsWarning")
 @pytest.mark.parametrize("response", EXACT)
 def test_fifty_in_one_place_part_in_no_preferred_direction(response: str) -> None:
     of = scene([1] * 50, response, e=0.5)

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from scipy.optimize import brentq
 
+from flockenv.core.warnings import CoarseContactWarning
 from flockenv.geometry.shapes import Block
 from flockenv.model.spawn import Spawn
 from flockenv.model.state import State
@@ -26,7 +27,7 @@ from flockenv.physics.integrators import (
     SemiImplicitEuler,
 )
 from flockenv.scene import Group, Scene
-from flockenv.scene.stability import CoarseContactWarning, check_contact, contact_limit
+from flockenv.scene.stability import check_contact, contact_limit
 from tests.catalogue import Array
 
 STIFFNESS, MASS, SPEED = 50.0, 2.0, 1.5

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from flockenv.cli import main
+from flockenv.cli.main import main
 from flockenv.render.validation import write_pictures
 from flockenv.scene import Scene
 from flockenv.scene.yaml_io import load_scene

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from flockenv.core.warnings import UnstableStepWarning
 from flockenv.jit.thread_pool import use_threads
 from flockenv.model.divergence import SimulationDiverged
 from flockenv.model.networks import Rope
@@ -18,7 +19,6 @@ from flockenv.model.state import State
 from flockenv.physics.effects import Carried, Drag, Gravity, QuadraticDrag, Springs, Tether, Uniform, Vortex, Wind
 from flockenv.physics.integrators import ExponentialDrag, ImplicitEuler, Integrator, SemiImplicitEuler
 from flockenv.scene import Group, Scene
-from flockenv.scene.stability import UnstableStepWarning
 
 HERE = Spawn(low=(0, 0), high=(4, 4), speed=(0.2, 1.0))
 MOTION = ("x", "v", "tick")  # what was tried in vain is counted as work all the same

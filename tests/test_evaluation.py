@@ -29,6 +29,9 @@ from flockenv.evaluation import (
     task_digest,
     worlds_for,
 )
+from flockenv.evaluation import (
+    episodes as module,
+)
 from flockenv.players.policy import RandomPolicy
 from flockenv.tasks import TASKS
 
@@ -133,7 +136,7 @@ def test_a_world_ends_at_the_tasks_horizon() -> None:
 def test_the_policy_sees_all_rows_its_own_state_and_true_starts() -> None:
     policy = Constant()
     rollout(Toy(), policy, 6, 10, make_world=ToyWorld, deterministic=False)  # type: ignore[arg-type]
-    calls = policy.calls[rollout.LATENCY_CALLS :]
+    calls = policy.calls[module.LATENCY_CALLS :]
     assert len(calls) == 4
     for k, (rows, state, starts, deterministic) in enumerate(calls):
         assert rows.shape == (12, 2)
@@ -179,12 +182,12 @@ def test_progress_is_told_after_every_step() -> None:
 
 def test_time_is_taken_inside_predict_alone(monkeypatch: pytest.MonkeyPatch) -> None:
     now = [0.0]
-    monkeypatch.setattr(rollout, "perf_counter", lambda: now[0])
+    monkeypatch.setattr(module, "perf_counter", lambda: now[0])
 
     class Slow(Constant):
         def predict(self, observation: Any, *rest: Any) -> Any:
             now[0] += 3e-6 if len(observation) == 1 else 24e-6
-            now[0] += 1.0 if len(self.calls) in (7, rollout.LATENCY_CALLS + 1) else 0.0  # the machine was elsewhere
+            now[0] += 1.0 if len(self.calls) in (7, module.LATENCY_CALLS + 1) else 0.0  # the machine was elsewhere
             return super().predict(observation, *rest)
 
     class SlowWorld(ToyWorld):
@@ -332,7 +335,7 @@ def test_the_interval_holds_the_truth_as_often_as_it_says() -> None:
 def test_equal_scores_have_an_interval_without_width_or_warning() -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        assert bootstrap([2.5] * 10) == rollout.Interval(2.5, 2.5, 2.5)
+        assert bootstrap([2.5] * 10) == module.Interval(2.5, 2.5, 2.5)
 
 
 @pytest.mark.parametrize("values", [[], [1.0], [1.0, np.nan], [1.0, np.inf], [[1.0, 2.0]]])

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from flockenv.cli import main
+from flockenv.cli.main import main
 from flockenv.experiments import Results, SteerPlan, arbitration, load_plan, run
 from flockenv.scene.yaml_io import ConfigError
 from tests import catalogue

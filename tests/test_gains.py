@@ -11,13 +11,14 @@ import pytest
 
 from flockenv.behaviours import Alignment, Arrive, Cohesion, MatchVelocity, Pursue, Seek
 from flockenv.behaviours.steer import Steer
+from flockenv.core.warnings import UnstableStepWarning
 from flockenv.geometry.space import Torus
 from flockenv.model.spawn import Spawn
 from flockenv.model.state import State
 from flockenv.physics.effects import EFFECTS, Effect
 from flockenv.physics.integrators import VelocityVerlet
 from flockenv.scene import Group, Scene
-from flockenv.scene.stability import UnstableStepWarning, suggest_dt
+from flockenv.scene.stability import suggest_dt
 from flockenv.scene.yaml_io import load_scene
 from tests.catalogue import Array
 

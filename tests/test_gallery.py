@@ -9,8 +9,8 @@ import pytest
 from PIL import Image
 
 from flockenv.behaviours import BEHAVIOURS, Separation
-from flockenv.cli import main
-from flockenv.gallery import page, shown
+from flockenv.cli.gallery import page, shown
+from flockenv.cli.main import main
 from flockenv.scene.yaml_io import load_scene
 
 DOCS = Path(__file__).resolve().parent.parent / "docs"

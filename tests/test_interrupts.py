@@ -153,7 +153,7 @@ def test_what_is_said_of_a_command_begins_with_the_signal_that_ended_it(
 ) -> None:
     body = """\
 import typer
-from flockenv.terminal import one_line, program
+from flockenv.cli.terminal import one_line, program
 app = typer.Typer()
 @app.command()
 def main():

@@ -13,7 +13,7 @@ from flockenv.players import load_player
 from flockenv.tasks import TASKS, Corridor, Flock, Task
 from flockenv.tasks.lasting import LastingTask
 
-pytestmark = pytest.mark.filterwarnings("ignore::flockenv.players.policy.OtherTaskWarning")
+pytestmark = pytest.mark.filterwarnings("ignore::flockenv.core.warnings.OtherTaskWarning")
 
 WORLDS = 12
 LASTING = tuple(kind for kind in TASKS.values() if issubclass(kind, LastingTask))

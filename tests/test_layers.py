@@ -192,7 +192,7 @@ def test_nothing_imports_upwards_and_heavy_packages_stay_in_their_place() -> Non
         ("flockenv/players/policy.py", "import torch.nn", "torch belongs in agents and sb3 and tests"),
         ("flockenv/players/policy.py", "def f():\n    import torch", "torch belongs in agents and sb3 and tests"),
         (
-            "flockenv/cli.py",
+            "flockenv/cli/main.py",
             "from stable_baselines3 import PPO",
             "stable_baselines3 belongs in agents and sb3 and tests",
         ),
@@ -223,8 +223,8 @@ def test_a_planted_fault_is_found(tmp_path: Path, file: str, planted: str, fault
     [
         "import flockenv",
         "import gymnasium, flockenv; gymnasium.spec('flockenv/Pursuit-v0')",
-        "from flockenv.cli import main; assert main(['--help']) == 0",
-        "from flockenv.cli import main; assert main(['run', '--help']) == 0",
+        "from flockenv.cli.main import main; assert main(['--help']) == 0",
+        "from flockenv.cli.main import main; assert main(['run', '--help']) == 0",
     ],
 )
 def test_a_glance_at_the_library_loads_nothing_heavy(statement: str) -> None:

@@ -14,7 +14,7 @@ from PIL import Image
 
 import flockenv.survey
 import flockenv.trajectory
-from flockenv.cli import main
+from flockenv.cli.main import main
 from flockenv.scene.yaml_io import load_scene
 from flockenv.survey import UNITS, Asked, survey
 from flockenv.trajectory import record

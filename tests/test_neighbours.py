@@ -416,7 +416,7 @@ FEW = pytest.mark.parametrize(
 )
 
 
-ONE_LONG_STEP = pytest.mark.filterwarnings("ignore::flockenv.scene.stability.UnstableStepWarning")
+ONE_LONG_STEP = pytest.mark.filterwarnings("ignore::flockenv.core.warnings.UnstableStepWarning")
 """A step of 1 s shows an acceleration; nothing goes on from there."""
 
 

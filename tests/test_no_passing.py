@@ -10,18 +10,18 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
+from flockenv.core.warnings import UnsolvedContactsWarning
 from flockenv.geometry.shapes import Block, Capsule, HalfSpace, Wall
 from flockenv.geometry.space import Box, Plane, Space
 from flockenv.model.spawn import Spawn
 from flockenv.model.state import Floats, State
 from flockenv.physics.constraints import Collisions
-from flockenv.physics.constraints.collisions import UnsolvedContactsWarning
 from flockenv.physics.constraints.step_end import RAISED
 from flockenv.physics.effects import Gravity
 from flockenv.physics.integrators import VelocityVerlet
 from flockenv.scene import Group, Scene
 
-pytestmark = pytest.mark.filterwarnings("ignore::flockenv.physics.constraints.collisions.UnsolvedContactsWarning")
+pytestmark = pytest.mark.filterwarnings("ignore::flockenv.core.warnings.UnsolvedContactsWarning")
 
 IN_TIME = ("earliest", "back_up")
 EXACT = (*IN_TIME, "impulses")

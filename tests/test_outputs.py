@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from typer.main import get_command
 
-from flockenv.cli import app, main
+from flockenv.cli.main import app, main
 from flockenv.core.output_paths import checked_file, checked_path
 
 

@@ -131,7 +131,7 @@ def test_the_wheel_works_alone(wheel: Path, tmp_path: Path) -> None:
     with zipfile.ZipFile(wheel) as archive:
         archive.extractall(tmp_path / "site")
     code = (
-        "import flockenv, gymnasium, pettingzoo, importlib.resources as r; from flockenv.cli import main;"
+        "import flockenv, gymnasium, pettingzoo, importlib.resources as r; from flockenv.cli.main import main;"
         "assert gymnasium.spec('flockenv/Pursuit-v0') and 'flockenv/Flock-v1' in pettingzoo.parallel_registry;"
         "assert '__DATA__' in (r.files('flockenv.render') / 'replay.html').read_text();"
         "from flockenv.players import load_player; from flockenv.tasks import Pursuit; import numpy as np;"

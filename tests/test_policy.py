@@ -14,7 +14,8 @@ import numpy as np
 import pytest
 from safetensors.numpy import save
 
-from flockenv.players.policy import MlpPolicy, OtherTaskWarning, Policy, RandomPolicy, describe, save_policy
+from flockenv.core.warnings import OtherTaskWarning
+from flockenv.players.policy import MlpPolicy, Policy, RandomPolicy, describe, save_policy
 from flockenv.tasks import TASKS, Corridor, Crossing, Flock, Pursuit, Task
 
 TASK: Any = SimpleNamespace(

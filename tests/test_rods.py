@@ -12,11 +12,12 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.special import ellipk
 
+from flockenv.core.warnings import UnmetWarning
 from flockenv.geometry.space import Torus
 from flockenv.model.networks import Cloth, Rope
 from flockenv.model.spawn import Spawn
 from flockenv.model.state import State
-from flockenv.physics.constraints import Rods, UnmetWarning
+from flockenv.physics.constraints import Rods
 from flockenv.physics.effects import Drag, Gravity
 from flockenv.physics.integrators import (
     RK4,

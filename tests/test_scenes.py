@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
+from flockenv.core.warnings import UnsolvedContactsWarning
 from flockenv.geometry.space import Box
 from flockenv.model.state import State
-from flockenv.physics.constraints.collisions import UnsolvedContactsWarning
 from flockenv.scene import Scene
 from flockenv.scene.yaml_io import load_scene
 from tests.catalogue import Array
@@ -34,7 +34,7 @@ SLOW = (
 FAST = pytest.mark.parametrize(
     "name", [pytest.param(name, marks=[pytest.mark.slow] if name in SLOW else []) for name in SECONDS]
 )
-UNSOLVED = "ignore::flockenv.physics.constraints.collisions.UnsolvedContactsWarning"
+UNSOLVED = "ignore::flockenv.core.warnings.UnsolvedContactsWarning"
 
 
 def scene_of(name: str) -> Scene:

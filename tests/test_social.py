@@ -26,6 +26,7 @@ from flockenv.behaviours import (
     WalkingGroup,
 )
 from flockenv.behaviours.steer import Steer
+from flockenv.core.warnings import CoarseContactWarning, UnstableStepWarning
 from flockenv.geometry.shapes import Block, Polygon, Shape, Wall
 from flockenv.geometry.space import Torus
 from flockenv.maths.approximations import atan2, exp, nearest_whole
@@ -34,7 +35,7 @@ from flockenv.physics.effects import Contact, Course, Effect, Goal, ObstacleCont
 from flockenv.physics.integrators import ExplicitEuler, SemiImplicitEuler
 from flockenv.scene import Group, Scene
 from flockenv.scene.presets import ALIASES, PRESETS, preset
-from flockenv.scene.stability import CoarseContactWarning, UnstableStepWarning, suggest_dt
+from flockenv.scene.stability import suggest_dt
 from flockenv.scene.yaml_io import ConfigError, dump_scene, load_scene, schema
 from flockenv.steering.vectorize import rows
 from tests.catalogue import rotation

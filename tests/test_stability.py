@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from flockenv.behaviours import Separation
+from flockenv.core.warnings import UnstableStepWarning
 from flockenv.explanation import explain
 from flockenv.model.divergence import SimulationDiverged
 from flockenv.model.networks import Cloth, Jelly, Mesh, Network, Rope
@@ -33,7 +34,7 @@ from flockenv.physics.integrators import (
     VelocityVerlet,
 )
 from flockenv.scene import Group, Scene
-from flockenv.scene.stability import UnstableStepWarning, amplification, drag_limit, limit, suggest_dt
+from flockenv.scene.stability import amplification, drag_limit, limit, suggest_dt
 from flockenv.scene.yaml_io import load_scene
 from tests.catalogue import INTEGRATORS, Array
 
@@ -357,7 +358,7 @@ def test_who_is_held_has_no_limit() -> None:
 # --- when a scene is made ---------------------------------------------------------------------------------------------
 
 
-@pytest.mark.filterwarnings("ignore::flockenv.scene.stability.UnstableStepWarning")
+@pytest.mark.filterwarnings("ignore::flockenv.core.warnings.UnstableStepWarning")
 def test_scenes_without_stiff_effects_have_no_limit() -> None:
     scene = body(Separation(weight=1.0, radius=1.0), Gravity(acceleration=(0, -9.81)), count=5, dt=100.0)
     assert suggest_dt(scene).dt == math.inf

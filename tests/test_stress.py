@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 
+from flockenv.core.warnings import UnstableStepWarning
 from flockenv.model.divergence import SimulationDiverged
 from flockenv.physics.integrators import (
     INTEGRATORS,
@@ -22,7 +23,6 @@ from flockenv.physics.integrators import (
     VelocityVerlet,
     methods_named,
 )
-from flockenv.scene.stability import UnstableStepWarning
 from flockenv.stress import CASES, Case, Finding, Results, Value, cases_named, fingerprint, run, usual_methods
 from flockenv.stress.gatherings import GATHERINGS
 from flockenv.stress.heaps import HEAPS

@@ -6,7 +6,7 @@ import warnings
 
 import pytest
 
-from flockenv.physics.constraints.collisions import UnsolvedContactsWarning
+from flockenv.core.warnings import UnsolvedContactsWarning
 from flockenv.physics.integrators import RK4, Integrator, SemiImplicitEuler, VelocityVerlet
 from flockenv.stress import CASES, Case, Finding, Value, run, trials
 from flockenv.stress.gatherings import GATHERINGS

@@ -12,6 +12,7 @@ import pytest
 
 from flockenv.behaviours import Alignment, AvoidObstacles, Separation
 from flockenv.behaviours.steer import Steer
+from flockenv.core.warnings import LookaheadWarning
 from flockenv.engine.workspace import Workspace
 from flockenv.envs.world import World
 from flockenv.geometry.space import Box, Torus
@@ -22,7 +23,6 @@ from flockenv.model.state import State
 from flockenv.physics.effects import Drag, Effect
 from flockenv.physics.integrators import RK4
 from flockenv.scene import Group, Scene
-from flockenv.scene.stability import LookaheadWarning
 from flockenv.tasks import Obstacles
 from flockenv.trajectory import record
 from tests.catalogue import Array

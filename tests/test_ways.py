@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from flockenv.behaviours import Driving, FollowWay, LineUp, UnalignedAvoidance
 from flockenv.behaviours.steer import Steer
+from flockenv.core.warnings import NoWayWarning
 from flockenv.geometry.eikonal import ground
 from flockenv.geometry.shapes import Block, Circle, HalfSpace, Polygon, Wall
 from flockenv.geometry.space import Box
@@ -20,7 +21,6 @@ from flockenv.jit.thread_pool import use_threads
 from flockenv.model.distribution import Spread
 from flockenv.model.spawn import Spawn
 from flockenv.physics.effects import Door, Journey, Routes, Stage, Way
-from flockenv.physics.floor_fields import NoWayWarning
 from flockenv.physics.population import Drain, Emitter
 from flockenv.physics.population.regions import Point
 from flockenv.scene import Group, Scene

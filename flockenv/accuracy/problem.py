@@ -12,14 +12,14 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from flockenv.accuracy.paths import Floats, Path, apart
+from flockenv.core.warnings import CoarseContactWarning, UnmetWarning, UnsolvedContactsWarning, UnstableStepWarning
 from flockenv.model.state import State, blank
-from flockenv.physics.constraints import Collisions, UnmetWarning
-from flockenv.physics.constraints.collisions import UnsolvedContactsWarning
+from flockenv.physics.constraints import Collisions
 from flockenv.physics.effects import Effect
 from flockenv.physics.integrators import RK4, Integrator
 from flockenv.physics.population import Crowding, Decay
 from flockenv.scene import Scene
-from flockenv.scene.stability import CoarseContactWarning, UnstableStepWarning, suggest_dt
+from flockenv.scene.stability import suggest_dt
 
 __all__ = ["Exact", "Problem"]
 

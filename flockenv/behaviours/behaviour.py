@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
+from flockenv.core.warnings import LookaheadWarning
 from flockenv.jit.decorators import Law, Vec, law, like
 from flockenv.physics.effects.effect import Effect, Me, Other, Sight, all_masses, demand_group
-from flockenv.scene.stability import LookaheadWarning
 
 __all__ = [
     "AboutNearest",

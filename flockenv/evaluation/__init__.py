@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from flockenv.evaluation.rollout import (
+from flockenv.evaluation.episodes import (
     EVALUATION,
     TRAINING,
     TUNING,

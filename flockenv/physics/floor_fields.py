@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from flockenv.core.warnings import NoWayWarning
 from flockenv.geometry.eikonal import NO_WAY, Start, free_part, way_table
 from flockenv.geometry.space import Torus
 from flockenv.geometry.targets import Target, to_any
@@ -19,16 +20,11 @@ from flockenv.jit.decorators import Vec, law
 from flockenv.maths.grid import MOST_POINTS, covers, sample, sample_vector, sampled
 from flockenv.maths.vectors import norm, select, unit
 
-__all__ = [
-    "NoWayWarning", "check_ways", "lengths_on", "region", "starts_of", "towards", "warn_cut_off", "way_ahead",
+__all__ = [ "check_ways", "lengths_on", "region", "starts_of", "towards", "warn_cut_off", "way_ahead",
     "way_block", "ways_to",
 ]  # fmt: skip
 
 Floats = NDArray[np.float64]
-
-
-class NoWayWarning(UserWarning):
-    """Agents begin where no way leads to their target."""
 
 
 @law

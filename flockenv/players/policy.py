@@ -24,11 +24,12 @@ from numpy.typing import NDArray
 
 from flockenv.core.atomic_files import deliver
 from flockenv.core.errors import nearest, shown, shown_path
+from flockenv.core.warnings import OtherTaskWarning
 
 if TYPE_CHECKING:
     from flockenv.tasks import Layout, Task
 
-__all__ = ["ACTIVATIONS", "MlpPolicy", "OtherTaskWarning", "Policy", "RandomPolicy", "describe", "save_policy"]
+__all__ = ["ACTIVATIONS", "MlpPolicy", "Policy", "RandomPolicy", "describe", "save_policy"]
 
 Observation = NDArray[Any] | dict[str, NDArray[Any]]
 State = tuple[NDArray[Any], ...]
@@ -46,10 +47,6 @@ cores their waiting for each other was measured to cost two hundred times the pr
 
 LARGEST_CARD, LARGEST_WEIGHTS = 8 << 20, 256 << 20
 """Bytes: what is bigger is no policy of ours, and is not read."""
-
-
-class OtherTaskWarning(UserWarning):
-    """A policy is to play a task with other arguments or scales than the one that it was trained on."""
 
 
 @runtime_checkable

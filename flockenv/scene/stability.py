@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from flockenv.core.warnings import CoarseContactWarning, LookaheadWarning, UnstableStepWarning
 from flockenv.model.state import blank
 from flockenv.physics.integrators.integrator import Integrator
 
@@ -25,10 +26,7 @@ if TYPE_CHECKING:
     from flockenv.scene import Group, Scene
 
 __all__ = [
-    "CoarseContactWarning",
-    "LookaheadWarning",
     "Suggestion",
-    "UnstableStepWarning",
     "amplification",
     "check_contact",
     "check_dt",
@@ -65,10 +63,6 @@ FASTEST = 32
 """Different oscillators of a scene that are looked at."""
 
 
-class UnstableStepWarning(UserWarning):
-    """A scene's dt is beyond the largest stable step."""
-
-
 STEPS, STEPS_OF_ITS_OWN = 30, 4
 """That a contact should last: with fewer, how fast a body comes out hangs by where in a step it touched. Under a method
 with steps of its own within dt: or it steps over what has hardly begun (measured at the default tolerance)."""
@@ -78,14 +72,6 @@ OFF = 1.048
 
 BOUNCY = 0.2
 """Damping as a share of what is critical, below which a contact is there to bounce: it gives back half, or more."""
-
-
-class CoarseContactWarning(UserWarning):
-    """A contact is over in so few steps that bodies come out of it faster or slower than its law says."""
-
-
-class LookaheadWarning(UserWarning):
-    """Somebody notices obstacles, or where to slow down, too late to stop there."""
 
 
 class Suggestion(NamedTuple):

@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 
+from flockenv.core.warnings import CoarseContactWarning, UnstableStepWarning
 from flockenv.model.state import State
 from flockenv.scene import Scene
-from flockenv.scene.stability import CoarseContactWarning, UnstableStepWarning
 
 __all__ = ["TOO_LONG", "quietly", "started"]
 

@@ -13,6 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from flockenv.core.warnings import CoarseContactWarning
 from flockenv.findings import Case, Value
 from flockenv.model.divergence import SimulationDiverged
 from flockenv.model.spawn import Spawn
@@ -20,7 +21,7 @@ from flockenv.model.state import State
 from flockenv.physics.effects import Contact, ObstacleContact
 from flockenv.physics.integrators import Integrator
 from flockenv.scene import Group, Scene
-from flockenv.scene.stability import CoarseContactWarning, contact_limit
+from flockenv.scene.stability import contact_limit
 from flockenv.stress.case import TOO_LONG, quietly, started
 
 __all__ = ["CONTACTS", "DTS", "Hit", "hits"]

@@ -7,9 +7,9 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from flockenv import findings
+from flockenv.core.warnings import UnsolvedContactsWarning
 from flockenv.findings import Case, Results
 from flockenv.jit.sources import laws_digest
-from flockenv.physics.constraints.collisions import UnsolvedContactsWarning
 from flockenv.physics.integrators import INTEGRATORS, Integrator
 from flockenv.stress.case import TOO_LONG
 

@@ -6,7 +6,7 @@ import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from flockenv.scene.stability import CoarseContactWarning, UnstableStepWarning
+from flockenv.core.warnings import CoarseContactWarning, UnstableStepWarning
 
 __all__ = ["quietly"]
 

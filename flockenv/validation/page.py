@@ -13,8 +13,8 @@ INTRODUCTION = """# Crowds, validated
 
 Models of pedestrians by name ([presets](../flockenv/scene/presets.py)), in the scenes of RiMEA, NIST TN 1822 and
 JuPedSim's tests, as far as they are flat. Parameters are the published ones and were fixed before these numbers were
-seen; where a model misses, the table shows by how much. `flockenv validate --out docs/crowds.md --force` makes this page, the
-numbers beside it and the pictures; `flockenv validate "rimea 12" --preset helbing_2000` is one cell. The scenes are in
+seen; where a model misses, the table shows by how much. `flockenv validate --out docs/crowds.md --force` makes this
+page, the numbers beside it and the pictures; `flockenv validate "rimea 12" --preset helbing_2000` is one cell. The scenes are in
 [configs/crowds](../configs/crowds), with the preset of 2000; `--preset moussaid_2009 --scenes FOLDER` writes others.
 
 What is ours: paths to goals are found on a grid around all walls (`way`, .3 m clear of them). Walls do not hide

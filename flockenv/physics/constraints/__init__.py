@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from flockenv.core.warnings import UnmetWarning
 from flockenv.jit.startup import import_all
 
 import_all(__name__, __path__)
 
-from flockenv.physics.constraints.collisions import Collisions  # noqa: E402
-from flockenv.physics.constraints.constraint import CONSTRAINTS, Constraint, Settler  # noqa: E402  # after the folder has been walked
-from flockenv.physics.constraints.rods import Rods, UnmetWarning  # noqa: E402
+from flockenv.physics.constraints.collisions import Collisions  # noqa: E402  # after the folder has been walked
+from flockenv.physics.constraints.constraint import CONSTRAINTS, Constraint, Settler  # noqa: E402
+from flockenv.physics.constraints.rods import Rods  # noqa: E402
 
 __all__ = ["CONSTRAINTS", "Collisions", "Constraint", "Rods", "Settler", "UnmetWarning"]

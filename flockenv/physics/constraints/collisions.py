@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
+from flockenv.core.warnings import UnsolvedContactsWarning
 from flockenv.geometry.cell_list import MAX_RANGES
 from flockenv.geometry.shapes import HalfSpace, packed
 from flockenv.geometry.space import Box, Torus
@@ -22,11 +23,9 @@ from flockenv.physics.constraints.impact import POINT
 from flockenv.physics.constraints.step_end import LEFT, RAISED, SUNK
 from flockenv.physics.effects.effect import ties
 
-__all__ = ["Collisions", "UnsolvedContactsWarning"]
-
-
-class UnsolvedContactsWarning(RuntimeWarning):
-    """More impacts in a step than are allowed, contacts that passes have not solved, too long a path round a torus."""
+__all__ = [
+    "Collisions",
+]
 
 
 class Collisions(Constraint):

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
+from flockenv.core.warnings import UnmetWarning
 from flockenv.geometry.space import Torus
 from flockenv.jit.decorators import finite, kernel, like
 from flockenv.jit.section import entry
@@ -17,7 +18,7 @@ from flockenv.model.networks import EDGE
 from flockenv.model.state import Floats, State
 from flockenv.physics.constraints.constraint import Constraint, Settler
 
-__all__ = ["Rods", "UnmetWarning", "hold"]
+__all__ = ["Rods", "hold"]
 
 Number = Annotated[int, Field(ge=0, strict=True)]
 Pair = tuple[Number, Number]
@@ -28,10 +29,6 @@ KNOWN, UNKNOWN = 0.9999, 0.99
 
 POWERS, LEAST = 50, 1e-9
 """Steps in which that is found, and what rods are taken to resist at least: there may be one too many."""
-
-
-class UnmetWarning(UserWarning):
-    """A rod or rope is not as long as it should be: the sweeps that were allowed did not suffice."""
 
 
 class Ties(NamedTuple):

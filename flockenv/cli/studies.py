@@ -10,9 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from flockenv.core import signals
-from flockenv.core.errors import shown
-from flockenv.terminal import (
+from flockenv.cli.terminal import (
     INTERRUPTED,
     EarlyEnd,
     Force,
@@ -22,7 +20,9 @@ from flockenv.terminal import (
     progress_bar,
     relative,
     show_table,
-)  # fmt: skip
+)
+from flockenv.core import signals
+from flockenv.core.errors import shown
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -360,8 +360,8 @@ def gallery(
 ) -> None:
     """Draw every behaviour in a small scene of its own, and write a page about all of them."""
     from flockenv.behaviours import BEHAVIOURS
+    from flockenv.cli.gallery import write_gallery
     from flockenv.core.output_paths import checked_file
-    from flockenv.gallery import write_gallery
 
     path = checked_file(out, [".md"], force, beside="")
     with progress_bar("drawing", len(BEHAVIOURS), "behaviours") as advance:

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from flockenv.studies import stored, try_all, write_numbers
-from flockenv.terminal import INTERRUPTED, EarlyEnd, Force, new_console, relative, show_table
+from flockenv.cli.studies import stored, try_all, write_numbers
+from flockenv.cli.terminal import INTERRUPTED, EarlyEnd, Force, new_console, relative, show_table
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -21,12 +21,9 @@ from typing import TYPE_CHECKING, Annotated, Any, get_args
 import typer
 
 import flockenv
-from flockenv.core import signals
-from flockenv.core.errors import nearest, shown
-from flockenv.measuring import measure
-from flockenv.players import NAMES
-from flockenv.studies import accuracy, experiment, gallery, stress
-from flockenv.terminal import (
+from flockenv.cli.measure import measure
+from flockenv.cli.studies import accuracy, experiment, gallery, stress
+from flockenv.cli.terminal import (
     DIVERGED,
     INTERRUPTED,
     OK,
@@ -41,8 +38,11 @@ from flockenv.terminal import (
     relative,
     show_table,
     verdict,
-)  # fmt: skip
-from flockenv.validating import validate
+)
+from flockenv.cli.validate import validate
+from flockenv.core import signals
+from flockenv.core.errors import nearest, shown
+from flockenv.players import NAMES
 
 if TYPE_CHECKING:
     from rich.console import Console

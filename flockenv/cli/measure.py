@@ -11,8 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from flockenv.core.errors import shown
-from flockenv.terminal import (
+from flockenv.cli.terminal import (
     DIVERGED,
     INTERRUPTED,
     EarlyEnd,
@@ -23,6 +22,7 @@ from flockenv.terminal import (
     relative,
     show_table,
 )
+from flockenv.core.errors import shown
 
 if TYPE_CHECKING:
     from flockenv.measures import Above, Mean

@@ -1,0 +1,1 @@
+"""flockenv on the command line."""
