@@ -21,8 +21,8 @@ from numpy.typing import NDArray
 from stable_baselines3 import PPO
 
 from agents.checkpoint import JSON, Damaged, Parts, Tensors, as_json
-from flockenv.accuracy.trials import machine
 from flockenv.envs.world import World
+from flockenv.studies.accuracy.benchmark import machine
 from flockenv.tasks import Task
 from flockenv.tasks.play import name_of
 

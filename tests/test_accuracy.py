@@ -12,18 +12,18 @@ from typing import Any
 import numpy as np
 import pytest
 
-from flockenv.accuracy import SUITE, Problem, Report, Results, chaos, measure, problems_named, usual_methods
-from flockenv.accuracy import problem as problems
-from flockenv.accuracy import reference as references
-from flockenv.accuracy.results import Curve, Point, measured_order
-from flockenv.accuracy.table import best, columns, headlines, rows
 from flockenv.behaviours import Separation
 from flockenv.cli.main import main
 from flockenv.model.spawn import Spawn
 from flockenv.physics.effects import Effect, Fluctuation, Swing, Tether
 from flockenv.physics.integrators import RK4, Integrator, methods_named
-from flockenv.render.precision import draw_precision, write_precision
 from flockenv.scene import Group, Scene
+from flockenv.studies.accuracy import SUITE, Problem, Report, Results, chaos, measure, problems_named, usual_methods
+from flockenv.studies.accuracy import problem as problems
+from flockenv.studies.accuracy import reference as references
+from flockenv.studies.accuracy.plots import draw_precision, write_precision
+from flockenv.studies.accuracy.results import Curve, Point, measured_order
+from flockenv.studies.accuracy.table import best, columns, headlines, rows
 
 ORIGIN = (0.0, 0.0)
 TINY = """\
@@ -491,7 +491,7 @@ def test_ctrl_c_on_the_command_line_keeps_the_problems_that_are_done(
             raise KeyboardInterrupt
         return measure(problem, methods, repetitions)
 
-    monkeypatch.setattr("flockenv.accuracy.measure", impatient)
+    monkeypatch.setattr("flockenv.studies.accuracy.measure", impatient)
     asked = ["accuracy", "--suite", "--problems", "damped,oscillator", "--methods", "rk4", "--repetitions", "0"]
     assert main([*asked, "--out", "a.json"]) == 130
     text = capsys.readouterr()
@@ -506,7 +506,7 @@ def test_ctrl_c_before_any_run_has_arrived_is_one_line(
     def impatient(problem: Problem, methods: Any, repetitions: int, **more: Any) -> Report:
         return measure(problem, methods, repetitions, progress=_Stop(0))
 
-    monkeypatch.setattr("flockenv.accuracy.measure", impatient)
+    monkeypatch.setattr("flockenv.studies.accuracy.measure", impatient)
     asked = ["accuracy", "--suite", "--problems", "damped", "--methods", "rk4", "--repetitions", "0"]
     assert main([*asked, "--out", "a.png"]) == 130
     text = capsys.readouterr()
@@ -523,7 +523,7 @@ def test_a_problem_without_a_reference_costs_the_others_nothing(
             raise ValueError("no reference\nfor another reason")
         return measure(problem, methods, repetitions)
 
-    monkeypatch.setattr("flockenv.accuracy.measure", measured)
+    monkeypatch.setattr("flockenv.studies.accuracy.measure", measured)
     asked = ["accuracy", "--suite", "--methods", "rk4", "--repetitions", "0", "--out", "a.json", "--problems"]
     names = ["damped", "oscillator", "kepler"]
     assert main([*asked, ",".join(names)]) == 0
@@ -546,7 +546,7 @@ def test_problems_that_are_done_are_written_before_the_next_one_begins(
         kept.append([report.name for report in known])
         return measure(problem, methods, repetitions)
 
-    monkeypatch.setattr("flockenv.accuracy.measure", watched)
+    monkeypatch.setattr("flockenv.studies.accuracy.measure", watched)
     asked = ["accuracy", "--suite", "--problems", "damped,oscillator", "--methods", "rk4", "--repetitions", "0"]
     assert main([*asked, "--out", "new/a.json"]) == 0
     assert kept == [[], ["damped"]]

@@ -9,15 +9,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from flockenv.accuracy import Problem, Report, Results, measure, problems_named
-from flockenv.accuracy.paths import Path as Way
-from flockenv.accuracy.paths import apart, reach, unmatched
-from flockenv.accuracy.reference import _closing_in, find_reference, own_steps
-from flockenv.accuracy.table import errors, headlines
 from flockenv.cli.main import main
 from flockenv.physics.integrators import methods_named
-from flockenv.render.precision import draw_precision
 from flockenv.scene.yaml_io import load_scene
+from flockenv.studies.accuracy import Problem, Report, Results, measure, problems_named
+from flockenv.studies.accuracy.paths import Path as Way
+from flockenv.studies.accuracy.paths import apart, reach, unmatched
+from flockenv.studies.accuracy.plots import draw_precision
+from flockenv.studies.accuracy.reference import _closing_in, find_reference, own_steps
+from flockenv.studies.accuracy.table import errors, headlines
 
 BALL = """\
 dimension: 2

@@ -10,11 +10,10 @@ import numpy as np
 import pytest
 
 from flockenv.behaviours import AvoidObstacles, Separation
+from flockenv.behaviours.reconciliation import reconcile
 from flockenv.behaviours.steer import Steer
 from flockenv.engine import step_of
-from flockenv.explanation import _shares
 from flockenv.geometry.space import Torus
-from flockenv.grants import granted, reconcile
 from flockenv.maths.counter_rng import key_of
 from flockenv.model.spawn import Spawn
 from flockenv.physics.effects import Drag, Effect
@@ -34,6 +33,8 @@ from flockenv.steering.arbitration import (
     allocate_running,
 )
 from flockenv.steering.vectorize import rows
+from flockenv.studies.arbitration_trace import granted
+from flockenv.studies.cost_breakdown import _shares
 from tests import catalogue
 from tests.catalogue import Array
 from tests.kernels import functions_of

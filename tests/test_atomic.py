@@ -21,14 +21,14 @@ import typer
 from agents import checkpoint, publish
 from flockenv.cli import gallery, validate
 from flockenv.core.atomic_files import LEFTOVERS, deliver, remove_leftovers, replacing
-from flockenv.findings import Results
 from flockenv.geometry.space import Torus
 from flockenv.jit.checked_store import Store
 from flockenv.jit.private_folder import prepared
 from flockenv.model.group import Group
 from flockenv.players.policy import save_policy
 from flockenv.scene import Scene
-from flockenv.trajectory import record
+from flockenv.studies.trajectory import record
+from flockenv.studies.trial_log import Results
 
 ROOT = Path(__file__).resolve().parent.parent
 
@@ -318,7 +318,7 @@ def _training(folder: Path) -> None:
     ("first", "write"),
     [
         ("flockenv.cli.gallery.shown", _gallery),
-        ("flockenv.render.validation.write_pictures", _validation),
+        ("flockenv.studies.validation.plots.write_pictures", _validation),
         ("agents.checkpoint.FileLock", _training),
     ],
 )

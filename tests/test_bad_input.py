@@ -26,13 +26,13 @@ from flockenv.cli.main import main
 from flockenv.envs.world import World
 from flockenv.geometry.shapes import HalfSpace, Polygon
 from flockenv.geometry.space import Box, Torus
-from flockenv.measures import measure
 from flockenv.model.networks import Mesh
 from flockenv.model.spawn import Spawn
 from flockenv.physics.effects import Drag, Springs
 from flockenv.physics.integrators import VelocityVerlet
 from flockenv.scene import Group, Scene
 from flockenv.scene.yaml_io import load_scene
+from flockenv.studies.measures import measure
 from flockenv.tasks import Pursuit
 
 SPAWN = Spawn(low=(1, 1), high=(3, 3), speed=(1, 1))

@@ -21,10 +21,9 @@ from PIL import Image
 from rich.progress import Progress
 from typer.testing import CliRunner
 
-import flockenv.stress
+import flockenv.studies.stress
 from flockenv.cli import terminal
 from flockenv.cli.main import app, main
-from flockenv.explanation import Cost, Explanation
 from flockenv.model.networks import Rope
 from flockenv.physics.effects import EFFECTS
 from flockenv.physics.effects.springs import Springs
@@ -33,7 +32,8 @@ from flockenv.players.policy import Policy, RandomPolicy
 from flockenv.scene import Group, Scene
 from flockenv.scene.stability import suggest_dt
 from flockenv.scene.yaml_io import load_scene, schema
-from flockenv.stress import Case, Value
+from flockenv.studies.cost_breakdown import Cost, Explanation
+from flockenv.studies.stress import Case, Value
 from flockenv.tasks import TASKS
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -225,7 +225,7 @@ def test_the_clock_of_a_run_begins_when_everything_is_compiled(more: str, tmp_pa
     code = (
         "from pathlib import Path; from flockenv.jit.progress import compiled;"
         "from flockenv.scene.yaml_io import load_scene;"
-        "from flockenv.trajectory import record; seen = [];"
+        "from flockenv.studies.trajectory import record; seen = [];"
         "record(load_scene(Path('new.yaml')), 0, 50, 10, lambda done: seen.append(len(compiled())));"
         "assert seen[0] == seen[-1] == len(compiled()) > 0, seen"
     )
@@ -501,7 +501,7 @@ def tried(monkeypatch: pytest.MonkeyPatch) -> list[str]:
 
         return Case(name, f"the scene of {name}", "none", trial)
 
-    monkeypatch.setattr("flockenv.stress.CASES", (case("X01", True), case("X02", False)))
+    monkeypatch.setattr("flockenv.studies.stress.CASES", (case("X01", True), case("X02", False)))
     return calls
 
 
@@ -550,8 +550,8 @@ def test_an_interrupted_stress_keeps_what_was_found(
     def interrupted(method: Integrator) -> Value:
         raise KeyboardInterrupt
 
-    first = flockenv.stress.CASES[0]
-    monkeypatch.setattr("flockenv.stress.CASES", (first, Case("X03", "stopped", "none", interrupted)))
+    first = flockenv.studies.stress.CASES[0]
+    monkeypatch.setattr("flockenv.studies.stress.CASES", (first, Case("X03", "stopped", "none", interrupted)))
     assert main(["stress", "--methods", "rk4", "--out", "hard.json"]) == 130
     assert "interrupted; what was done is shown, the same command goes on" in capsys.readouterr().err
     assert [f["case"] for f in json.loads(Path("hard.json").read_text())["findings"]] == ["X01"]

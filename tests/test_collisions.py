@@ -14,7 +14,6 @@ import numpy as np
 import pytest
 
 from flockenv.core.warnings import UnsolvedContactsWarning
-from flockenv.explanation import explain
 from flockenv.geometry.shapes import Block, Circle, HalfSpace, Polygon, Wall
 from flockenv.geometry.space import Box, Plane, Space, Torus
 from flockenv.jit.section import entry
@@ -27,6 +26,7 @@ from flockenv.physics.effects import Gravity
 from flockenv.physics.integrators import RK4, Integrator, SemiImplicitEuler, VelocityVerlet
 from flockenv.scene import Group, Scene
 from flockenv.scene.yaml_io import dump_scene, load_scene
+from flockenv.studies.cost_breakdown import explain
 
 IN_TIME = ("earliest", "back_up")
 EXACT = (*IN_TIME, "impulses")

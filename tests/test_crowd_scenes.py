@@ -10,18 +10,18 @@ import numpy as np
 import pytest
 
 from flockenv.cli.main import main
-from flockenv.render.validation import write_pictures
 from flockenv.scene import Scene
 from flockenv.scene.yaml_io import load_scene
-from flockenv.validation import CASES, VALIDATED, Case, Finding, Results, Value, cases_named, presets_named, run
-from flockenv.validation.alone import corridor, crossing_time
-from flockenv.validation.case import quietly
-from flockenv.validation.corridors import DENSITIES, EACH_WAY
-from flockenv.validation.doors import DATA, _off
-from flockenv.validation.page import page
-from flockenv.validation.rooms import bottleneck, corner, room
-from flockenv.validation.scenes import SCENES
-from flockenv.validation.walk import Walk, walked
+from flockenv.studies.validation import CASES, VALIDATED, Case, Finding, Results, Value, cases_named, presets_named, run
+from flockenv.studies.validation.alone import corridor, crossing_time
+from flockenv.studies.validation.corridors import DENSITIES, EACH_WAY
+from flockenv.studies.validation.doors import DATA, _off
+from flockenv.studies.validation.page import page
+from flockenv.studies.validation.plots import write_pictures
+from flockenv.studies.validation.quiet import quietly
+from flockenv.studies.validation.rooms import bottleneck, corner, room
+from flockenv.studies.validation.scenes import SCENES
+from flockenv.studies.validation.walk import Walk, walked
 
 ROOT = Path(__file__).parent.parent
 NERVOUS = "helbing_farkas_vicsek_2000"
@@ -189,7 +189,7 @@ def test_the_command_writes_a_page_and_goes_on_where_it_was(
         return Value(0.5, False, "half of it")
 
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("flockenv.validation.CASES", (Case("lanes", "made up", "> 1", trial),))
+    monkeypatch.setattr("flockenv.studies.validation.CASES", (Case("lanes", "made up", "> 1", trial),))
     for _ in range(2):
         assert main(["validate", "--preset", "helbing_2000", "--out", "crowds.md"]) == 0
     assert calls == [NERVOUS]

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from flockenv.cli.main import main
-from flockenv.experiments import Results, SteerPlan, arbitration, load_plan, run
 from flockenv.scene.yaml_io import ConfigError
+from flockenv.studies.experiments import Results, SteerPlan, arbitration, load_plan, run
 from tests import catalogue
 
 PLANS = Path(__file__).parent.parent / "configs" / "experiments"

@@ -11,7 +11,6 @@ import pytest
 from scipy.spatial import cKDTree
 
 from flockenv.behaviours import Separation
-from flockenv.explanation import explain
 from flockenv.geometry.barnes_hut import MOST_DIRECT
 from flockenv.geometry.cell_list import WORTH_ARRANGING
 from flockenv.geometry.space import Torus
@@ -22,6 +21,7 @@ from flockenv.model.state import State
 from flockenv.physics.effects import Effect, Gravitation, InverseSquare
 from flockenv.physics.integrators import RK4
 from flockenv.scene import Group, Scene
+from flockenv.studies.cost_breakdown import explain
 from tests.catalogue import Array, scene_of, users_module
 
 pytestmark = pytest.mark.slow

@@ -11,10 +11,10 @@ from hypothesis import strategies as st
 
 from flockenv.geometry.shapes import Circle
 from flockenv.geometry.space import Box, Plane, Space, Torus
-from flockenv.measures import MEASURES, measure, nearest_distances, order, polarisation
 from flockenv.model.spawn import Spawn
 from flockenv.scene import Group, Scene
-from flockenv.trajectory import whole_steps
+from flockenv.studies.measures import MEASURES, measure, nearest_distances, order, polarisation
+from flockenv.studies.trajectory import whole_steps
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from flockenv.geometry.shapes.outlines import area
-from flockenv.measures import (
+from flockenv.studies.measures import (
     JUELICH,
     classical_density,
     diagram,
@@ -26,7 +26,7 @@ from flockenv.measures import (
     weidmann_flow,
     weidmann_speed,
 )
-from flockenv.measures.polygons import contains, rectangle
+from flockenv.studies.measures.polygons import contains, rectangle
 
 SQUARE = rectangle((0, 0), (10, 10))
 NOTCHED = np.array([(0, 0), (10, 0), (10, 10), (6, 10), (6, 4), (4, 4), (4, 10), (0, 10)], float)  # 100 - 12 m^2

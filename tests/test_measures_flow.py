@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from flockenv.measures import (
+from flockenv.studies.measures import (
     Crossings,
     bursts,
     crossings,
@@ -25,7 +25,7 @@ from flockenv.measures import (
     tail,
     time_gaps,
 )
-from flockenv.measures.door_bursts import runs_probability
+from flockenv.studies.measures.door_bursts import runs_probability
 
 UP = ((0.0, -1.0), (0.0, 1.0))
 """A line that is drawn upward: who walks along x crosses it forward."""

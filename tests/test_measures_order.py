@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from flockenv.geometry.space import Box, Plane, Torus
-from flockenv.measures import (
+from flockenv.studies.measures import (
     above_null,
     band_index,
     cohesion_radius,

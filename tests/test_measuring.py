@@ -12,12 +12,12 @@ import numpy as np
 import pytest
 from PIL import Image
 
-import flockenv.survey
-import flockenv.trajectory
+import flockenv.studies.measured_run
+import flockenv.studies.trajectory
 from flockenv.cli.main import main
 from flockenv.scene.yaml_io import load_scene
-from flockenv.survey import UNITS, Asked, survey
-from flockenv.trajectory import record
+from flockenv.studies.measured_run import UNITS, Asked, survey
+from flockenv.studies.trajectory import record
 
 STREAMS = """\
 space: {kind: torus, size: [10, 4]}
@@ -155,7 +155,7 @@ def test_interrupted_it_shows_what_there_is(
     def interrupted(run: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(flockenv.survey, "_lanes", interrupted)
+    monkeypatch.setattr(flockenv.studies.measured_run, "_lanes", interrupted)
     command = ["measure", "streams.yaml", "--time", "2", "--seeds", "3", "--json", "x.json", "--out", "p", *LINE]
     assert main(command) == 130
     captured = capsys.readouterr()
@@ -171,7 +171,7 @@ def test_an_interrupt_before_the_first_picture_leaves_no_folder(monkeypatch: pyt
     def interrupted(*given: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("flockenv.render.crowd.write_flow_density", interrupted)
+    monkeypatch.setattr("flockenv.studies.measures.plots.write_flow_density", interrupted)
     assert main(["measure", "streams.yaml", "--time", "1", "--out", "a/p", *LINE]) == 130
     assert not Path("a").exists()
 
@@ -254,7 +254,7 @@ def test_lines_and_areas_in_space_are_refused_before_the_run(
     def started(*arguments: object) -> None:
         raise AssertionError("the scene is run")
 
-    monkeypatch.setattr(flockenv.trajectory, "record", started)
+    monkeypatch.setattr(flockenv.studies.trajectory, "record", started)
     Path("cube.yaml").write_text("dimension: 3\ngroups: [{count: 1, spawn: {low: [0, 0, 0], high: [1, 1, 1]}}]\n")
     assert main(["measure", "cube.yaml", "--time", "1", *option.split(" ")]) == 2
     assert capsys.readouterr().err == "flockenv: dimension = 3: lines and areas are of the plane\n"

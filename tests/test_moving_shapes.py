@@ -25,11 +25,11 @@ from flockenv.geometry.shapes.dispatch import hit_shape, nearest_shape
 from flockenv.geometry.shapes.row_header import body_of, bound_of, shift_of, velocity_of
 from flockenv.geometry.space import Torus
 from flockenv.jit.section import entry
-from flockenv.measures import measure
 from flockenv.model.spawn import Spawn
 from flockenv.physics.effects import ObstacleContact
 from flockenv.scene import Group, Scene
-from flockenv.trajectory import Trajectory
+from flockenv.studies.measures import measure
+from flockenv.studies.trajectory import Trajectory
 
 U = np.array([-0.7, 0.4])
 SWAY = Sway(amplitude=(0.3, -0.5), period=2.5, phase=0.4)

@@ -43,7 +43,7 @@ from flockenv.render.replay import Group as ReplayGroup
 from flockenv.render.replay import Panel
 from flockenv.scene import Group, Scene
 from flockenv.scene.yaml_io import dump_scene, load_scene
-from flockenv.trajectory import record
+from flockenv.studies.trajectory import record
 
 DTS = (0.1, 0.05, 0.02, 1 / 60, 0.0137)
 ORIGIN = Point(at=(0.0, 0.0))

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from flockenv.behaviours import Evade, Forage, Separation, Shadow, Wander
+from flockenv.behaviours.reconciliation import reconcile
 from flockenv.behaviours.steer import Steer
 from flockenv.envs.world import World
 from flockenv.evaluation import rollout, worlds_for
-from flockenv.grants import granted, reconcile
 from flockenv.jit.thread_pool import use_threads
 from flockenv.model.spawn import Spawn
 from flockenv.model.state import State
@@ -22,6 +22,7 @@ from flockenv.scene import Group, Scene
 from flockenv.steering import motivation
 from flockenv.steering.arbitration import Intentions
 from flockenv.steering.vectorize import rows
+from flockenv.studies.arbitration_trace import granted
 from flockenv.tasks import School
 from flockenv.tasks.school import CAUGHT, EATEN, FATE, FEAR, FOOD, HUNGER, INTENT
 

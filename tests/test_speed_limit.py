@@ -7,13 +7,13 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
 
-from flockenv.accuracy import Problem, measure
-from flockenv.accuracy.results import Curve
 from flockenv.model.spawn import Spawn
 from flockenv.model.state import State
 from flockenv.physics.effects import SpeedLimit, Uniform
 from flockenv.physics.integrators import RK4
 from flockenv.scene import Group, Scene
+from flockenv.studies.accuracy import Problem, measure
+from flockenv.studies.accuracy.results import Curve
 
 V, B, MASS = 1.5, 4.0, 2.0
 PUSH = (2.0, 1.5)  # N, 2.5 together

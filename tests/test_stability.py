@@ -12,7 +12,6 @@ import pytest
 
 from flockenv.behaviours import Separation
 from flockenv.core.warnings import UnstableStepWarning
-from flockenv.explanation import explain
 from flockenv.model.divergence import SimulationDiverged
 from flockenv.model.networks import Cloth, Jelly, Mesh, Network, Rope
 from flockenv.model.spawn import Spawn
@@ -36,6 +35,7 @@ from flockenv.physics.integrators import (
 from flockenv.scene import Group, Scene
 from flockenv.scene.stability import amplification, drag_limit, limit, suggest_dt
 from flockenv.scene.yaml_io import load_scene
+from flockenv.studies.cost_breakdown import explain
 from tests.catalogue import INTEGRATORS, Array
 
 CHAIN = Rope(links=21, length=2.1, pinned=("ends",))  # 20 free masses

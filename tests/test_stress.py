@@ -23,10 +23,10 @@ from flockenv.physics.integrators import (
     VelocityVerlet,
     methods_named,
 )
-from flockenv.stress import CASES, Case, Finding, Results, Value, cases_named, fingerprint, run, usual_methods
-from flockenv.stress.gatherings import GATHERINGS
-from flockenv.stress.heaps import HEAPS
-from flockenv.stress.impacts import IMPACTS
+from flockenv.studies.stress import CASES, Case, Finding, Results, Value, cases_named, fingerprint, run, usual_methods
+from flockenv.studies.stress.gatherings import GATHERINGS
+from flockenv.studies.stress.heaps import HEAPS
+from flockenv.studies.stress.impacts import IMPACTS
 
 pytestmark = pytest.mark.slow
 """Many kernels: where slow tests run."""

@@ -8,10 +8,10 @@ import pytest
 
 from flockenv.core.warnings import UnsolvedContactsWarning
 from flockenv.physics.integrators import RK4, Integrator, SemiImplicitEuler, VelocityVerlet
-from flockenv.stress import CASES, Case, Finding, Value, run, trials
-from flockenv.stress.gatherings import GATHERINGS
-from flockenv.stress.heaps import HEAPS, funnel
-from flockenv.stress.impacts import IMPACTS
+from flockenv.studies.stress import CASES, Case, Finding, Value, run, trials
+from flockenv.studies.stress.gatherings import GATHERINGS
+from flockenv.studies.stress.heaps import HEAPS, funnel
+from flockenv.studies.stress.impacts import IMPACTS
 
 CASE = {case.name: case for case in CASES}
 ONCE = tuple(case.name for case in (*IMPACTS, *HEAPS) if not case.only)

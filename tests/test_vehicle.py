@@ -23,8 +23,8 @@ from flockenv.model.state import State
 from flockenv.physics.effects import Drag, Effect
 from flockenv.physics.integrators import RK4
 from flockenv.scene import Group, Scene
+from flockenv.studies.trajectory import record
 from flockenv.tasks import Obstacles
-from flockenv.trajectory import record
 from tests.catalogue import Array
 from tests.kernels import functions_of
 

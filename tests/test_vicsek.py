@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from flockenv.experiments.vicsek import SEEN, bound, order, scene_of
 from flockenv.geometry.space import Torus
 from flockenv.maths.counter_rng import _mix
 from flockenv.model.spawn import Spawn
@@ -18,6 +17,7 @@ from flockenv.physics.effects.vicsek import CHANNEL
 from flockenv.physics.integrators import ExplicitEuler, Heun, SemiImplicitEuler
 from flockenv.scene import Group, Scene
 from flockenv.scene.yaml_io import load_scene
+from flockenv.studies.experiments.vicsek import SEEN, bound, order, scene_of
 from tests.catalogue import Array
 
 ROOT = Path(__file__).resolve().parent.parent

@@ -16,7 +16,7 @@ from flockenv.physics.effects.effect import Effect
 from flockenv.render.gif import write_png
 from flockenv.render.picture import draw
 from flockenv.scene.yaml_io import load_scene
-from flockenv.trajectory import Trajectory, record
+from flockenv.studies.trajectory import Trajectory, record
 
 __all__ = ["page", "shown", "write_gallery"]
 

@@ -51,8 +51,8 @@ if TYPE_CHECKING:
     from flockenv.model.state import State
     from flockenv.render import Panel
     from flockenv.scene import Scene
+    from flockenv.studies.trajectory import Trajectory
     from flockenv.tasks import Task
-    from flockenv.trajectory import Trajectory
 
 # Nothing that simulates, draws or learns is imported up here: `flockenv --help` answers in a fifth of a second.
 
@@ -205,7 +205,7 @@ def run(
     """Run a scene, show what a biologist would measure, and keep the trajectory if asked to."""
     from flockenv.core.output_paths import checked_file
     from flockenv.scene.yaml_io import load_scene
-    from flockenv.trajectory import whole_steps
+    from flockenv.studies.trajectory import whole_steps
 
     loaded = load_scene(Path(scene))
     path = checked_file(out, [".npz"], force, beside=".json") if out is not None else None
@@ -273,12 +273,12 @@ def render(
 @app.command()
 def explain(scene: SceneFile) -> None:
     """Show the effects of a scene: what each calls for, what it costs per step, and what nobody asked for."""
-    from flockenv import explanation
     from flockenv.scene.yaml_io import load_scene
+    from flockenv.studies import cost_breakdown
 
     loaded = load_scene(Path(scene))
     with progress_bar("compiling and timing", len(loaded.effects) + 2, "variants") as progress:
-        found = explanation.explain(loaded, progress=progress)
+        found = cost_breakdown.explain(loaded, progress=progress)
     console = new_console()
     rows = [(row.name, ", ".join(row.calls_for) or "nothing", str(row.cost)) for row in found.rows]
     rows.append(("what several of them share", "", str(found.shared)))
@@ -385,14 +385,14 @@ def _sentence(kind: type) -> str:
 
 
 def _recorded(scene: Scene, seed: int, steps: int, every: int) -> Trajectory:
-    from flockenv.trajectory import record
+    from flockenv.studies.trajectory import record
 
     with progress_bar("simulating", steps, "steps", f"placing {scene.agents:,} agents, compiling") as progress:
         return record(scene, seed, steps, every, progress)
 
 
 def _show_measures(console: Console, trajectory: Trajectory) -> None:
-    from flockenv.measures import MEASURES
+    from flockenv.studies.measures import MEASURES
 
     def text(value: float) -> str:
         return f"{value:.4g}" if math.isfinite(value) else "-"
@@ -420,7 +420,7 @@ def _film(file: str, duration: float, seed: int) -> tuple[Panel, float, str]:
     """Return a scene's run as something to draw, its frames per second, and what it left unsolved."""
     from flockenv.render import Panel
     from flockenv.scene.yaml_io import load_scene
-    from flockenv.trajectory import whole_steps
+    from flockenv.studies.trajectory import whole_steps
 
     scene = load_scene(Path(file))
     every = max(1, round(1.0 / (FPS * scene.dt)))

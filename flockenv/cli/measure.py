@@ -25,10 +25,10 @@ from flockenv.cli.terminal import (
 from flockenv.core.errors import shown
 
 if TYPE_CHECKING:
-    from flockenv.measures import Above, Mean
     from flockenv.scene import Scene
-    from flockenv.survey import Asked, Survey
-    from flockenv.trajectory import Trajectory
+    from flockenv.studies.measured_run import Asked, Survey
+    from flockenv.studies.measures import Above, Mean
+    from flockenv.studies.trajectory import Trajectory
 
 __all__ = ["measure"]
 
@@ -75,8 +75,8 @@ def measure(
     from flockenv.core.atomic_files import made
     from flockenv.core.output_paths import checked_file
     from flockenv.scene.yaml_io import load_scene
-    from flockenv.survey import Asked, combined
-    from flockenv.trajectory import whole_steps
+    from flockenv.studies.measured_run import Asked, combined
+    from flockenv.studies.trajectory import whole_steps
 
     loaded = load_scene(Path(scene))
     numbers = checked_file(json_file, [".json"], force, "--json") if json_file is not None else None
@@ -109,8 +109,8 @@ def _surveyed(
 
     A run that stops early is the last; KeyboardInterrupt is raised only if nothing has been measured yet.
     """
-    from flockenv.survey import survey
-    from flockenv.trajectory import record
+    from flockenv.studies.measured_run import survey
+    from flockenv.studies.trajectory import record
 
     found: list[Survey] = []
     first: Trajectory | None = None
@@ -169,7 +169,7 @@ def _line(text: str | None) -> Any:
 def _area(option: str, text: str | None, is_convex: bool) -> Any:
     import numpy as np
 
-    from flockenv.measures.polygons import checked, rectangle
+    from flockenv.studies.measures.polygons import checked, rectangle
 
     if text is None:
         return None
@@ -179,7 +179,7 @@ def _area(option: str, text: str | None, is_convex: bool) -> Any:
 
 def _above(found: Sequence[Survey]) -> dict[str, Above]:
     """Return the measures that are above chance, each over at least five runs that have it."""
-    from flockenv.measures import above_null
+    from flockenv.studies.measures import above_null
 
     out = {}
     for name, null in ABOVE_CHANCE.items():
@@ -198,7 +198,7 @@ def _show(
     scene: Scene, found: Sequence[Survey], means: dict[str, Mean], above: dict[str, Above], run: Trajectory, stride: int
 ) -> None:
     """Print the table; of several runs with 95 % intervals of the means."""
-    from flockenv.survey import UNITS
+    from flockenv.studies.measured_run import UNITS
 
     console, many = new_console(), len(found)
     kept = f"positions every {stride * scene.dt:g} s"
@@ -226,7 +226,7 @@ def _summary(
     run: Trajectory, stride: int,
 ) -> dict[str, Any]:  # fmt: skip
     """Return all measurements, ready for JSON: numbers without a meaning are null, never NaN."""
-    from flockenv.survey import UNITS
+    from flockenv.studies.measured_run import UNITS
 
     def plain(value: float) -> float | None:
         return value if math.isfinite(value) else None
@@ -273,9 +273,9 @@ def _draw(folder: Path, run: Trajectory, found: Sequence[Survey], asked: Asked, 
     """Write the pictures that have data; return their names."""
     import numpy as np
 
-    from flockenv.measures import goodness, tail
-    from flockenv.render.crowd import write_flow_density, write_gaps, write_lanes, write_space_time
-    from flockenv.survey import SAMPLES
+    from flockenv.studies.measured_run import SAMPLES
+    from flockenv.studies.measures import goodness, tail
+    from flockenv.studies.measures.plots import write_flow_density, write_gaps, write_lanes, write_space_time
 
     drawn = []
     density, speed, gaps = (np.concatenate([getattr(s, what) for s in found]) for what in ("density", "speed", "gaps"))

@@ -27,10 +27,10 @@ from flockenv.core.errors import shown
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from flockenv.accuracy import Problem, Report
     from flockenv.core.record import Record
-    from flockenv.findings import Results
     from flockenv.physics.integrators import Integrator
+    from flockenv.studies.accuracy import Problem, Report
+    from flockenv.studies.trial_log import Results
 
     Run = Callable[[Results | None, Callable[[int], None], Callable[[Results], None]], Results]
 
@@ -77,9 +77,9 @@ def accuracy(
     force: Force = False,
 ) -> None:
     """Show what accuracy costs: how far each integrator ends from the truth in which steps, beside its time."""
-    from flockenv.accuracy import usual_methods
     from flockenv.core.output_paths import checked_file
     from flockenv.physics.integrators import methods_named
+    from flockenv.studies.accuracy import usual_methods
 
     todo = _todo(scenes or (), suite, problems, seconds, steps, dts, seed)
     aimed = _numbers("--tolerance", tolerance)
@@ -99,7 +99,7 @@ def accuracy(
 
 
 def _keep(path: Path | None, reports: Sequence[Report]) -> None:
-    from flockenv.accuracy import Results
+    from flockenv.studies.accuracy import Results
 
     if path is not None:
         write_numbers(path, Results(reports=tuple(reports)))
@@ -109,7 +109,7 @@ def _todo(
     scenes: Sequence[str], suite: bool, problems: str, seconds: float | None, steps: str, dts: str, seed: int
 ) -> dict[str, Callable[[], Problem]]:
     """Return how each problem is made, by its name or file; ValueError for options that do not go together."""
-    from flockenv.accuracy import problems_named
+    from flockenv.studies.accuracy import problems_named
 
     if suite == bool(scenes):
         raise ValueError("accuracy: needs a SCENE.yaml or --suite, one of them")
@@ -131,7 +131,7 @@ def _measured(
     keep: called with all reports after each problem; an interrupt during compilation ends the process and loses none.
     Of several problems those without a reference are a line each; the only one raises its ValueError.
     """
-    from flockenv.accuracy import measure
+    from flockenv.studies.accuracy import measure
 
     reports: list[Report] = []
     refused = 0
@@ -169,7 +169,7 @@ def _refusal(name: str, error: ValueError) -> str:
 
 def _show_accuracy(console: Console, report: Report, tolerances: Sequence[float]) -> None:
     """Print one report: what it is measured against, errors, what each tolerance costs, the cheapest."""
-    from flockenv.accuracy import table
+    from flockenv.studies.accuracy import table
 
     show_table(console, report.title, ([line] for line in table.headlines(report)), [""])
     heads, rows = table.errors(report)
@@ -188,9 +188,9 @@ def _same(problem: Problem) -> Problem:
 
 def _problem(file: str, seconds: float | None, steps: str, dts: str, seed: int) -> Problem:
     """Return what is to be measured on a scene: by default in steps 4 times as long as its own to 32 times shorter."""
-    from flockenv.accuracy import Problem
     from flockenv.scene.yaml_io import load_scene
-    from flockenv.trajectory import whole_steps
+    from flockenv.studies.accuracy import Problem
+    from flockenv.studies.trajectory import whole_steps
 
     loaded = load_scene(Path(file))
     horizon = max(1, round(1.0 / loaded.dt)) * loaded.dt if seconds is None else seconds
@@ -229,7 +229,7 @@ def write_numbers(path: Path, numbers: Record) -> None:
 
 def stored(path: Path | None, what: str, sources: str) -> Results | None:
     """Return the findings beside a path, none if there are none; ValueError if they are others, or of other sources."""
-    from flockenv.findings import Results
+    from flockenv.studies.trial_log import Results
 
     numbers = None if path is None else path.with_suffix(".json")
     if numbers is None or not numbers.exists():
@@ -264,13 +264,13 @@ def try_all(what: str, count: int, path: Path | None, known: Results | None, run
 
 
 def _draw_precision(reports: Sequence[Report], path: Path) -> None:
-    from flockenv.render.precision import write_precision
+    from flockenv.studies.accuracy.plots import write_precision
 
     write_precision(path, reports)
 
 
 def _draw_verdicts(results: Results, path: Path) -> None:
-    from flockenv.render.verdicts import write_verdicts
+    from flockenv.studies.stress.plots import write_verdicts
 
     write_verdicts(path, results)
 
@@ -305,7 +305,7 @@ def stress(
     """Try every hard case under every integrator, and show value, bound and verdict of each."""
     from flockenv.core.output_paths import checked_file
     from flockenv.physics.integrators import methods_named
-    from flockenv.stress import CASES, cases_named, fingerprint, run, trials, usual_methods
+    from flockenv.studies.stress import CASES, cases_named, fingerprint, run, trials, usual_methods
 
     path = checked_file(out, [".json", ".png"], True, beside=".json") if out is not None else None
     todo = cases_named(CASES, _words(cases))
@@ -336,9 +336,9 @@ def experiment(
 ) -> None:
     """Run an experiment about steering: a table of what was measured, and a picture of where everybody went."""
     from flockenv.core.output_paths import checked_file
-    from flockenv.experiments import load_plan, run
-    from flockenv.render.curves import write_order
-    from flockenv.render.trials import write_trials
+    from flockenv.studies.experiments import load_plan, run
+    from flockenv.studies.experiments.curves import write_order
+    from flockenv.studies.experiments.plots import write_trials
 
     path = checked_file(out, [".json", ".png"], force, beside=".json") if out is not None else None
     chosen = load_plan(Path(plan)).experiment()

@@ -13,7 +13,7 @@ from flockenv.cli.terminal import INTERRUPTED, EarlyEnd, Force, new_console, rel
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from flockenv.findings import Case, Results
+    from flockenv.studies.trial_log import Case, Results
 
 __all__ = ["validate"]
 
@@ -38,7 +38,7 @@ def validate(
 ) -> None:
     """Try published models of pedestrians in the scenes of RiMEA and NIST: value, bound and verdict of each."""
     from flockenv.core.output_paths import checked_file
-    from flockenv.validation import CASES, cases_named, fingerprint, presets_named, run, trials
+    from flockenv.studies.validation import CASES, cases_named, fingerprint, presets_named, run, trials
 
     path = checked_file(out, [".json", ".md"], True, beside=".json") if out is not None else None
     if path is not None and path.suffix.lower() == ".md":
@@ -70,7 +70,7 @@ def validate(
 def _write_scenes(folder: str, force: bool, cases: Sequence[Case], presets: Sequence[str]) -> None:
     """Write the scenes of some cases, and say how many."""
     from flockenv.core.output_paths import checked_path
-    from flockenv.validation.scenes import write_scenes
+    from flockenv.studies.validation.scenes import write_scenes
 
     path = checked_path(folder, "--scenes")
     written = write_scenes(path, cases, presets, force)
@@ -82,8 +82,8 @@ def _write(path: Path, results: Results) -> None:
     write_numbers(path, results)
     if path.suffix.lower() == ".md":
         from flockenv.core.atomic_files import made, replacing
-        from flockenv.render.validation import write_pictures
-        from flockenv.validation.page import page
+        from flockenv.studies.validation.page import page
+        from flockenv.studies.validation.plots import write_pictures
 
         folder = path.with_suffix("")
         with made(folder):

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flockenv import steering
-from flockenv.grants import reconcile
+from flockenv.behaviours.reconciliation import reconcile
 from flockenv.steering import arbitration, motivation
 from flockenv.steering.vectorize import rows
 from flockenv.tasks import School

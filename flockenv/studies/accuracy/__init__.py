@@ -1,0 +1,18 @@
+"""What accuracy costs: how far each method ends from the truth in steps of each length, beside time and evaluations.
+
+from flockenv.studies.accuracy import Problem, measure
+report = measure(Problem.of(scene, seconds=1.0, steps=[16, 32, 64, 128, 256, 512]))
+report.cheapest(1e-3, by="seconds")
+"""
+
+from __future__ import annotations
+
+from flockenv.studies.accuracy.benchmark import measure, usual_methods
+from flockenv.studies.accuracy.problem import Problem
+from flockenv.studies.accuracy.results import Choice, Curve, Machine, Point, Report, Results
+from flockenv.studies.accuracy.suite import SUITE, problems_named
+
+__all__ = [
+    "SUITE", "Choice", "Curve", "Machine", "Point", "Problem", "Report", "Results", "measure", "problems_named",
+    "usual_methods",
+]  # fmt: skip

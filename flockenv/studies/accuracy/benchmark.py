@@ -1,0 +1,230 @@
+"""Every method in every setting on one problem: errors first, then wall times, in rounds over all of them."""
+
+from __future__ import annotations
+
+import gc
+import os
+import platform
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path as File
+from statistics import median
+from time import perf_counter
+
+import numpy as np
+
+from flockenv.model.state import State
+from flockenv.physics.integrators import INTEGRATORS, Integrator
+from flockenv.scene import Scene
+from flockenv.studies.accuracy.chaos import find_sensitivity
+from flockenv.studies.accuracy.paths import Path, farthest, largest, unmatched
+from flockenv.studies.accuracy.problem import Problem
+from flockenv.studies.accuracy.reference import COARSE, LEAST_FINER, Reference, find_reference
+from flockenv.studies.accuracy.results import Curve, Machine, Point, Report, measured_order
+
+__all__ = ["REPETITIONS", "TOLERANCES", "machine", "measure", "usual_methods"]
+
+REPETITIONS = 20
+TOLERANCES = tuple(10.0**-k for k in range(3, 13))
+"""What an adaptive method is asked for: it chooses its steps itself."""
+
+DEAREST = 4
+"""Evaluations per step of the dearest method with fixed steps."""
+
+TRUSTED = 4.0
+"""Errors of fewer times the reference's own are not trusted."""
+
+TOLERANCE_WITHIN = 1e-8
+"""What an adaptive method is asked for where something acts after each step: its steps are then given, like others'."""
+
+
+@dataclass(eq=False)
+class _Trial:
+    """A method in a setting: a scene to run, and what came of it."""
+
+    problem: Problem
+    method: Integrator
+    steps: int
+    tolerance: float | None
+    times: list[float] = field(default_factory=list)
+    point: Point | None = None
+
+    def compare(self, reference: Reference) -> None:
+        """Run from instant to instant, and measure how far from the reference."""
+        try:
+            path = self.problem.path(self.method, self.steps)
+        except ArithmeticError:  # it diverges, or equations were not solved
+            self.point = self._point(self.steps * self.method.evaluations, {})
+            return
+        off = self.problem.apart(path, reference.path)
+        last = off[-1][~np.isnan(off[-1])]
+        errors = {
+            "error": largest(last),
+            "rms": float(np.sqrt((last**2).mean())) if len(last) else float("nan"),
+            "along": farthest(off),
+            "energy": _energy_off(self.problem, path, reference.path),
+            "momentum": _momentum_off(self.problem, path, reference.path),
+        }
+        self.point = self._point(
+            path.counted("evaluations"), {k: v for k, v in errors.items() if np.isfinite(v)},
+            unmatched(path, reference.path), path.counted("unsolved"),
+        )  # fmt: skip
+
+    def _point(self, evaluations: int, errors: dict[str, float], unmatched: int = 0, unsolved: int = 0) -> Point:
+        names = ("error", "rms", "along", "energy", "momentum")
+        return Point(
+            steps=self.steps, dt=self.problem.seconds / self.steps, tolerance=self.tolerance, evaluations=evaluations,
+            seconds=None, unmatched=unmatched, unsolved=unsolved, **{name: errors.get(name) for name in names},
+        )  # fmt: skip
+
+    def clock(self) -> None:
+        """Run as one call, and keep how long it took; one step before it brings the code back into the caches."""
+        scene, start, out = self._ready
+        scene.step(start, out=out)
+        began = perf_counter()
+        scene.step(start, out=out, steps=self.steps)
+        self.times.append(perf_counter() - began)
+
+    @cached_property
+    def _ready(self) -> tuple[Scene, State, State]:
+        scene, start = self.problem.ready(self.method, self.steps)
+        return scene, start, start.copy()
+
+    @property
+    def good(self) -> bool:
+        """Did it arrive?"""
+        return self.point is not None and self.point.error is not None
+
+    @property
+    def timed(self) -> Point:
+        """The point with the median of its times."""
+        assert self.point is not None
+        return self.point.model_copy(update={"seconds": median(self.times)}) if self.times else self.point
+
+
+def measure(
+    problem: Problem,
+    methods: Sequence[Integrator] | None = None,
+    repetitions: int = REPETITIONS,
+    finer: int | None = None,
+    progress: Callable[[int], None] = lambda percent: None,
+) -> Report:
+    """Return how far off each method ends in each number of steps, and what it costs.
+
+    methods: instances, none = all that `usual_methods` names. repetitions: how often the wall time of each point is
+    taken, all of them in turn; compiling is over by then; 0 = not at all. finer: how much finer than the finest steps
+    a reference of own steps is (see reference.own_steps). progress is called with percents. A KeyboardInterrupt ends
+    it early: what was done is returned, and `stopped` says so; it is raised on if no run has arrived by then.
+    Raises ValueError, in one line, where there is no reference: a scene that is chaotic over its horizon (see
+    chaos.find_sensitivity), or that does not settle on one path (see reference.own_steps).
+    """
+    chosen = usual_methods() if methods is None else tuple(methods)
+    if repetitions < 0 or (finer is not None and (finer < LEAST_FINER or finer % LEAST_FINER)):
+        raise ValueError(f"repetitions = {repetitions} must be >= 0, finer = {finer} a multiple of {LEAST_FINER}")
+    sensitivity, reference = find_sensitivity(problem), find_reference(problem, finer)
+    trials = [_Trial(problem, *setting) for method in chosen for setting in _settings(problem, method)]
+    stopped, all_ = "", max(1, len(trials) * (1 + repetitions))
+    try:
+        for done, trial in enumerate(trials):
+            progress(100 * done // all_)
+            if done == 0 or not _worse_than_dear(trials[done - 1], trial):
+                trial.compare(reference)
+        _clock([trial for trial in trials if trial.good], repetitions, progress)
+    except KeyboardInterrupt:
+        if not any(trial.good for trial in trials):
+            raise
+        stopped = "interrupted"
+    floor = max(TRUSTED * reference.error, sensitivity.error)
+    return Report(
+        name=problem.name, title=problem.title or problem.name, agents=problem.scene.agents, seconds=problem.seconds,
+        dtype=problem.scene.dtype, reference=reference.kind, reference_error=reference.error, note=reference.note,
+        growth=sensitivity.growth, rate=sensitivity.rate, floor=floor, reach=reference.reach,
+        energy=problem.energies, repetitions=repetitions,
+        machine=machine(), curves=tuple(_curves(trials, floor, COARSE * reference.reach)), stopped=stopped,
+    )  # fmt: skip
+
+
+def _settings(problem: Problem, method: Integrator) -> list[tuple[Integrator, int, float | None]]:
+    """Return the settings of a method: numbers of steps, or tolerances of one that chooses its steps itself."""
+    if method.adaptive and problem.after_steps:
+        method = method.model_copy(update={"tolerance": TOLERANCE_WITHIN})
+    if not method.adaptive or problem.after_steps:
+        return [(method, steps, None) for steps in problem.steps]
+    few = len(problem.times)
+    return [(method.model_copy(update={"tolerance": t}), few, t) for t in TOLERANCES]
+
+
+def _worse_than_dear(before: _Trial, trial: _Trial) -> bool:
+    """Would a tolerance ask for still more than the one before it, which took more evaluations than any fixed steps?
+
+    Where forces jump to and fro, a method with steps of its own may need as many as one over its tolerance.
+    """
+    if trial.tolerance is None or before.method.kind != trial.method.kind:
+        return False
+    return before.point is None or before.point.evaluations > DEAREST * trial.problem.steps[-1]
+
+
+def _clock(trials: Sequence[_Trial], repetitions: int, progress: Callable[[int], None]) -> None:
+    """Take the time of every trial, round after round: a disturbance of the machine hits all of them."""
+    collecting = gc.isenabled()
+    gc.disable()
+    try:
+        for done in range(repetitions):
+            progress(100 * (1 + done) // (1 + repetitions))
+            for trial in trials:
+                trial.clock()
+    finally:
+        if collecting:
+            gc.enable()
+
+
+def _curves(trials: Sequence[_Trial], least: float, most: float) -> list[Curve]:
+    kinds = dict.fromkeys(trial.method.kind for trial in trials)
+    curves = []
+    for kind in kinds:
+        mine = [trial for trial in trials if trial.method.kind == kind and trial.point is not None]
+        if not mine:
+            continue
+        points = tuple(trial.timed for trial in mine)
+        chosen = mine[0].tolerance is not None
+        order, used = (None, 0) if chosen else measured_order(points, least, most)
+        declared = min(mine[0].method.order, mine[0].method.order_with_drag)
+        curves.append(Curve(method=kind, declared=declared, points=points, order=order, used=used))
+    return curves
+
+
+def _energy_off(problem: Problem, path: Path, reference: Path) -> float:
+    """Return by how much the energy is off at worst, in parts of the largest kinetic energy of the reference."""
+    if path.who is not None:
+        return float("nan")
+    off = largest(np.abs(problem.energy(path.pos, path.vel) - problem.energy(reference.pos, reference.vel)))
+    scale = largest(problem.kinetic(reference.vel))
+    return off / scale if scale > 0 else float("nan")
+
+
+def _momentum_off(problem: Problem, path: Path, reference: Path) -> float:
+    """Return by how much a momentum that is kept has changed at worst, in parts of the sum of its sizes."""
+    if not problem.conserves_momentum:
+        return float("nan")
+    before = problem.momentum(problem.start.vel[0].astype(np.float64))
+    carried = largest(problem.impulse(reference.vel))
+    off = largest(np.linalg.norm(problem.momentum(path.vel) - before, axis=-1))
+    return off / carried if carried > 0 else float("nan")
+
+
+def usual_methods() -> tuple[Integrator, ...]:
+    """Return every method that takes explicit steps, in its usual setting, those of low order first."""
+    kinds = [kind for kind in INTEGRATORS.values() if not kind.solves]
+    return tuple(kind() for kind in sorted(kinds, key=lambda kind: (kind.order, kind.evaluations)))
+
+
+def machine() -> Machine:
+    """Return what times depend on."""
+    cpu = platform.processor()
+    with suppress(OSError):
+        lines = File("/proc/cpuinfo").read_text().splitlines()
+        cpu = next((line.partition(":")[2].strip() for line in lines if line.startswith("model name")), cpu)
+    load = os.getloadavg()[0] if hasattr(os, "getloadavg") else None
+    return Machine(cpu=cpu or platform.machine(), cores=os.cpu_count() or 1, load=load)

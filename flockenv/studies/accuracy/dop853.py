@@ -1,0 +1,104 @@
+"""The path of a scene by scipy's DOP853 on its compiled laws.
+
+DOP853 (Hairer, Norsett, Wanner: Solving Ordinary Differential Equations I, II.10) has order 8, and gets over jumps of a
+force in steps of nearly nothing. It is run at two tolerances: by how much the two differ is how wrong it is taken to
+be. What acts between the steps of a scene it cannot see, and says so.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from flockenv.studies.accuracy.paths import Floats, Path, largest
+from flockenv.studies.accuracy.problem import Problem
+
+__all__ = ["NotSmoothError", "integrated_twice"]
+
+TIGHT, LOOSE = 1e-13, 1e-12
+"""rtol = atol of the two runs of DOP853."""
+
+AGREED = 1e-8
+"""As a share of how far agents go: DOP853's two runs must not differ by more."""
+
+MOST_EVALUATIONS, AT_ONCE = 50_000, 0.1
+"""Of DOP853, before it is said not to converge: of the share at once, and of the rest as it gets on."""
+
+
+class NotSmoothError(Exception):
+    """DOP853 cannot follow this scene; the text says why."""
+
+
+def integrated_twice(problem: Problem) -> tuple[Path, float, str]:
+    """Return the path, its error in m, and how it was found; raises NotSmoothError where DOP853 cannot follow."""
+    if problem.after_steps:
+        raise NotSmoothError(f"DOP853 knows nothing of what acts after each step ({problem.after_steps})")
+    (tight, evaluations), (loose, _) = _integrated(problem, TIGHT), _integrated(problem, LOOSE)
+    apart = largest(problem.apart(tight, loose))
+    gone = largest(problem.apart(tight, Path(problem.start.pos[0], problem.start.vel[0])))
+    if not apart <= AGREED * max(gone, AGREED):
+        raise NotSmoothError(
+            f"DOP853 does not converge: at rtol {TIGHT:g} and {LOOSE:g} its paths are {apart:.1e} m apart"
+        )
+    return tight, apart, f"rtol = atol = {TIGHT:g}, {evaluations:,} evaluations"
+
+
+def _integrated(problem: Problem, tolerance: float) -> tuple[Path, int]:
+    """Integrate x' = v + flow, v' = a from instant to instant; return the path, and how often laws were evaluated."""
+    from scipy.integrate import solve_ivp
+
+    laws = _Laws(problem)
+    y = np.concatenate([problem.start.pos[0].ravel(), problem.start.vel[0].ravel()]).astype(np.float64)
+    now, rows = 0.0, []
+    for until in problem.times:
+        done = solve_ivp(laws, (now, until), y, method="DOP853", rtol=tolerance, atol=tolerance)
+        if not done.success:
+            raise NotSmoothError(
+                f"DOP853 does not converge: {done.message.lower().rstrip('.')} at t = {done.t[-1]:g} s"
+            )
+        laws.refuse_limits(done.t, done.y)
+        now, y = until, done.y[:, -1]
+        rows.append(y)
+    _, n, d = problem.start.shape
+    both = np.array(rows).reshape(len(rows), 2, n, d)
+    return Path(both[:, 0], both[:, 1]), laws.evaluations
+
+
+class _Laws:
+    """y = (positions, velocities) in one row -> its derivative, by the compiled laws of a scene."""
+
+    def __init__(self, problem: Problem) -> None:
+        self._scene, self._state, self._seconds = problem.scene, problem.start.copy(), problem.seconds
+        self.evaluations = 0
+
+    def __call__(self, t: float, y: Floats) -> Floats:
+        self.evaluations += 1
+        if self.evaluations > MOST_EVALUATIONS * (AT_ONCE + (1 - AT_ONCE) * t / self._seconds):
+            raise NotSmoothError(f"DOP853 does not converge: t = {t:.3g} s after {self.evaluations:,} evaluations")
+        pos, vel = self._split(y)
+        self._state.pos[0], self._state.vel[0] = self._scene.space.wrap(pos), vel
+        acc, flow = self._scene.rates(self._state, times=[t])
+        moved = vel if flow is None else vel + flow[0]
+        return np.concatenate([moved.ravel(), acc[0].ravel()])
+
+    def _split(self, y: Floats) -> tuple[Floats, Floats]:
+        _, n, d = self._state.shape
+        both = y.reshape(2, n, d)
+        return both[0], both[1]
+
+    def refuse_limits(self, times: Floats, rows: Floats) -> None:
+        """Raise if a limit that a scene keeps after each step would have acted: DOP853 knows nothing of them."""
+        body, space = self._scene.body, self._scene.space
+        limited = bool(np.isfinite(body.max_speed).any())
+        if not limited and space.kind != "box":
+            return
+        for t, row in zip(times, rows.T, strict=True):
+            pos, _ = self._split(row)
+            if space.kind == "box":
+                extent, radius = np.array(space.extent(pos.shape[1])), body.radius[:, None]
+                if ((pos < radius) | (pos > extent - radius)).any():
+                    raise NotSmoothError(f"a wall is met at t = {t:.3g} s, and is kept to after each step")
+            if limited:
+                derivative = self(t, row)
+                speeds = (np.linalg.norm(self._split(part)[k], axis=-1) for part, k in ((row, 1), (derivative, 0)))
+                if any((speed > body.max_speed * (1 + 1e-9)).any() for speed in speeds):
+                    raise NotSmoothError(f"the speed limit is reached at t = {t:.3g} s, and is kept to after each step")

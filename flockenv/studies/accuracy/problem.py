@@ -1,0 +1,238 @@
+"""Problem: a scene with a start and an end, taken there by any method in any number of steps."""
+
+from __future__ import annotations
+
+import math
+import warnings
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from flockenv.core.warnings import CoarseContactWarning, UnmetWarning, UnsolvedContactsWarning, UnstableStepWarning
+from flockenv.model.state import State, blank
+from flockenv.physics.constraints import Collisions
+from flockenv.physics.effects import Effect
+from flockenv.physics.integrators import RK4, Integrator
+from flockenv.physics.population import Crowding, Decay
+from flockenv.scene import Scene
+from flockenv.scene.stability import suggest_dt
+from flockenv.studies.accuracy.paths import Floats, Path, apart
+
+__all__ = ["Exact", "Problem"]
+
+Exact = Callable[[float], tuple[ArrayLike, ArrayLike]]
+"""t, s -> positions (N, D) m and velocities (N, D) m/s, in closed form."""
+
+INSTANTS = 16
+"""At most so many instants, equally apart and the last at the end, at which a run is compared with its reference."""
+
+
+FINER = 64
+"""The finest steps of a reference of own steps, in parts of the finest that are measured."""
+
+BY_DT = (UnstableStepWarning, CoarseContactWarning, UnsolvedContactsWarning, UnmetWarning)
+"""Warnings about steps that are too long: a measurement takes such steps on purpose."""
+
+
+@dataclass(frozen=True, eq=False)
+class Problem:
+    """A scene, where it starts, for how long it runs, and in which numbers of steps methods are to take it there."""
+
+    name: str
+    title: str
+    scene: Scene
+    start: State  # one world, at time 0
+    seconds: float
+    steps: tuple[int, ...]  # ascending; time step = seconds / steps
+    exact: Exact | None = None
+
+    @classmethod
+    def of(
+        cls,
+        scene: Scene,
+        seconds: float,
+        steps: Sequence[Any],
+        seed: int = 0,
+        name: str = "scene",
+        title: str = "",
+        motion: tuple[ArrayLike, ArrayLike] | None = None,
+        exact: Exact | None = None,
+    ) -> Problem:
+        """Return the problem of a scene from its start with a seed, or from positions and velocities, (N, D) each.
+
+        Raises ValueError, in one line, for what no method can be measured on: seconds or steps that lead nowhere,
+        float32 (its rounding hides what a method does), draws of every step (runs in steps of two lengths have no
+        path in common), and laws that are maps of one step.
+        """
+        if not (math.isfinite(seconds) and seconds > 0):
+            raise ValueError(f"seconds = {seconds!r}: must be a finite number of seconds > 0")
+        wrong = [n for n in steps if not isinstance(n, int) or isinstance(n, bool) or n < 1]
+        if wrong or not steps:
+            raise ValueError(f"steps = {tuple(steps)}: must be whole numbers of at least 1, and one at least")
+        if scene.dtype != "float64":
+            raise ValueError(f"dtype = {scene.dtype}: its rounding would hide what a method does; use float64")
+        _refuse_draws(scene)
+        start = scene.start(seed)
+        if motion is not None:
+            start = start.with_motion(*(np.asarray(array, float)[None] for array in motion))
+        problem = cls(name, title, scene, start, float(seconds), tuple(sorted(set(steps))), exact)
+        problem.ready(RK4(), FINER * problem.steps[-1])
+        return problem
+
+    @property
+    def times(self) -> Floats:
+        """The instants, (K,) s: as many as every number of steps can be divided into."""
+        common = math.gcd(*self.steps)
+        many = max(k for k in range(1, INSTANTS + 1) if common % k == 0)
+        return self.seconds * np.arange(1, many + 1) / many
+
+    @property
+    def _moving(self) -> Floats:
+        """The masses of those who are not held in place, (N,) kg; 0 for them."""
+        mass = self.scene.body.mass.astype(np.float64)
+        return np.where(np.isfinite(mass), mass, 0.0)
+
+    @property
+    def after_steps(self) -> str:
+        """What acts between steps, so that no method knows of it, in words; "" if nothing does."""
+        scene, parts = self.scene, self.scene.parts
+        found = [constraint.kind for constraint in scene.constraints]
+        found += ["births and deaths"] if scene.population else []
+        found += ["numbers inside agents"] if parts.inner else []
+        found += ["headings that turn"] if parts.frame_rows else []
+        return ", ".join(found)
+
+    @property
+    def by_events(self) -> Problem:
+        """The same problem with every impact found in the order of time, where its own response comes to that."""
+        constraints = tuple(
+            each.model_copy(update={"response": "earliest"})
+            if isinstance(each, Collisions) and each.response in ("back_up", "project")
+            else each
+            for each in self.scene.constraints
+        )
+        return replace(self, scene=self.scene.model_copy(update={"constraints": constraints}))
+
+    def ready(self, method: Integrator, steps: int) -> tuple[Scene, State]:
+        """Return the scene advanced by a method in so many steps, and its start.
+
+        Raises ValueError where the scene refuses such steps because they blow up; of less it does not warn.
+        """
+        dt = self.seconds / steps
+        with warnings.catch_warnings():
+            for kind in BY_DT:
+                warnings.simplefilter("ignore", kind)
+            return self.scene.model_copy(update={"integrator": method, "dt": dt}), replace(self.start, dt=dt)
+
+    def stable(self, method: Integrator, most: int) -> int:
+        """Return the least power of 2 by which the finest steps must be divided for a method to be stable.
+
+        Raises ValueError, in one line, if that is more than `most`.
+        """
+        limit = suggest_dt(self.ready(method, most * self.steps[-1])[0]).dt
+        finest, times = self.seconds / self.steps[-1], 1
+        while finest / times > limit:
+            times *= 2
+            if times > most:
+                raise ValueError(
+                    f"the finest steps that were asked for, {finest:.3g} s, are too long: {method.kind}, which finds "
+                    f"the reference, is stable up to {limit:.3g} s in this scene"
+                )
+        return times
+
+    def path(self, method: Integrator, steps: int, start: State | None = None) -> Path:
+        """Run, and return where every agent was at the instants; raises FloatingPointError where it diverges."""
+        try:
+            scene, state = self.ready(method, steps)
+        except ValueError as error:  # it would
+            raise FloatingPointError(str(error)) from None
+        state = replace(start, dt=scene.dt) if start is not None else state
+        before, each = state.work.sum(axis=0), steps // len(self.times)
+        pos, vel, who = [], [], []
+        with warnings.catch_warnings():
+            for kind in BY_DT:
+                warnings.simplefilter("ignore", kind)
+            for _ in self.times:
+                state = scene.step(state, steps=each)
+                pos.append(state.pos[0])
+                vel.append(state.vel[0])
+                who.append(np.where(state.alive[0], state.identity[0], -1) if scene.population else None)
+        return Path(
+            np.array(pos), np.array(vel), np.array(who) if scene.population else None,
+            state.work.sum(axis=0) - before,
+        )  # fmt: skip
+
+    def apart(self, path: Path, other: Path) -> Floats:
+        """Return how far every agent is from where another path has it, (K, N) m; see `paths.apart`."""
+        return apart(path, other, self.scene.space.displacement)
+
+    def energy(self, pos: Floats, vel: Floats) -> Floats:
+        """Return kinetic energy, and what potential energy the effects know of, at instants (K, N, D), (K,) J."""
+        instants, agents, dimension = pos.shape  # a world for every instant
+        state = blank(instants, agents, dimension, 0, self.start.dt).with_motion(pos, vel)
+        total = self.kinetic(vel)
+        for effect in self._with_potential:
+            potential = self._potential(effect, state)
+            total = total if potential is None else total + potential
+        return total
+
+    def _potential(self, effect: Effect, state: State) -> Floats | None:
+        return effect.potential(self.scene.groups, state, self.scene.space.displacement)
+
+    def momentum(self, vel: Floats) -> Floats:
+        """Return the total momentum, (..., D) kg m/s."""
+        return np.asarray((self._moving[:, None] * vel).sum(axis=-2))
+
+    @property
+    def _with_potential(self) -> list[Effect]:
+        """The effects that know their potential energy; none on a torus, where it jumps from image to image."""
+        known = [] if self.scene.space.periodic else self.scene.effects
+        return [effect for effect in known if self._potential(effect, self.start) is not None]
+
+    def impulse(self, vel: Floats) -> Floats:
+        """Return the sum of the sizes of all momenta, (...) kg m/s."""
+        return np.asarray((self._moving * np.linalg.norm(vel, axis=-1)).sum(axis=-1))
+
+    def kinetic(self, vel: Floats) -> Floats:
+        """Return the kinetic energy, (...) J."""
+        return np.asarray(0.5 * (self._moving * (vel**2).sum(axis=-1)).sum(axis=-1))
+
+    @property
+    def energies(self) -> str:
+        """What `energy` sums up, in words."""
+        if self.scene.population:
+            return "not compared: agents are born and die"
+        kinds = [effect.kind for effect in self._with_potential]
+        return f"kinetic and potential ({', '.join(kinds)})" if kinds else "kinetic"
+
+    @property
+    def conserves_momentum(self) -> bool:
+        """True if momentum is kept, but for errors: by all effects, and no wall, limit, birth or death changes it."""
+        body = self.scene.body
+        walled = any(isinstance(each, Collisions) and each.obstacles for each in self.scene.constraints)
+        if self.scene.population or (walled and self.scene.obstacles):
+            return False
+        held = np.isinf(body.mass).any() or np.isfinite(body.max_speed).any()
+        free = not held and self.scene.space.kind != "box"
+        asks = any(effect.steering for effect in self.scene.effects)
+        free = free and not (asks and np.isfinite(body.max_force).any())
+        return free and all(effect.conserves_momentum for effect in self.scene.effects)
+
+
+def _refuse_draws(scene: Scene) -> None:
+    """Refuse what is drawn anew in every step: two lengths of a step draw different numbers."""
+    for k, effect in enumerate(scene.effects):
+        if any(each.kick_law is not None for each in (effect, *effect.wishes)):
+            raise ValueError(
+                f"effects[{k}] {effect.kind}: kicks at random, so there is no one path to come close to; only averages "
+                "over many runs could be compared (weak error), which this does not measure"
+            )
+    for k, member in enumerate(scene.population):
+        if isinstance(member, Decay) or (isinstance(member, Crowding) and member.rate is not None):
+            raise ValueError(
+                f"population[{k}] {member.kind}: agents die by draws of every step, so in steps of another length "
+                "others die; only averages over many runs could be compared (weak error), which this does not measure"
+            )

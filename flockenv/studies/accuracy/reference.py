@@ -1,0 +1,153 @@
+"""Where a scene truly goes: the best reference that obeys all of the scene, and how wrong it may be.
+
+In this order: a closed form, where the problem has one; scipy's DOP853 on the scene's laws, where nothing acts between
+its steps; else the scene's own steps, with its constraints, births and deaths, much finer than anything that is
+measured. Impacts are found in the order of time then (`response: earliest`). How wrong own steps are is estimated after
+Richardson: three runs, each in twice as many steps as the one before, give the order in which they close in on a limit.
+Source: Roache 1998, Verification and Validation in Computational Science and Engineering, ch. 5 (grid convergence).
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from flockenv.physics.constraints import Collisions
+from flockenv.physics.integrators import RK4
+from flockenv.studies.accuracy.dop853 import NotSmoothError, integrated_twice
+from flockenv.studies.accuracy.paths import Floats, Path, farthest, reach
+from flockenv.studies.accuracy.problem import FINER, Problem
+
+__all__ = ["COARSE", "LEAST_FINER", "Reference", "find_reference", "own_steps"]
+
+LEAST_FINER = 4
+"""The finest steps of a reference of own steps, in parts of the finest that are measured, at least."""
+
+MOST_WORK = 100_000_000
+"""Steps of agents in the finest run of such a reference: of more, it is less fine."""
+
+BETWEEN_STEPS = 500
+"""Agents whose step takes about as long as what a scene does between two steps, if something acts there."""
+
+COARSE = 0.1
+"""Errors of more than this share of how far agents go are no approximation."""
+
+ROUNDING, ROUNDING_STEP = 1e-12, 1e-16
+"""m, or parts of how far agents go: runs that part by less, or by less for each of their steps, differ by rounding."""
+
+SETTLED = 0.5
+"""The order from which on three runs are taken to close in on a limit."""
+
+
+@dataclass(frozen=True, eq=False)
+class Reference:
+    """Where every agent is at the instants of a problem."""
+
+    kind: str  # "closed form", "DOP853", "event-exact steps" or "own steps"
+    path: Path
+    error: float  # m, how wrong it may be at any instant
+    reach: float  # m, how far the farthest agent goes
+    note: str = ""  # how it was found, and why it is no better one
+
+
+def find_reference(problem: Problem, finer: int | None = None) -> Reference:
+    """Return the best reference there is.
+
+    finer: see `own_steps`. Raises ValueError, in one line, where there is none: the scene diverges even in the finest
+    steps, or does not settle on one path.
+    """
+    if problem.exact is not None:
+        pos, vel = zip(*(problem.exact(t) for t in problem.times), strict=True)
+        path = Path(np.array(pos, float), np.array(vel, float))
+        return Reference("closed form", path, 0.0, _reach(problem, path))
+    try:
+        path, error, note = integrated_twice(problem)
+    except NotSmoothError as reason:
+        return own_steps(problem, finer, str(reason))
+    return Reference("DOP853", path, error, _reach(problem, path), note)
+
+
+def own_steps(problem: Problem, finer: int | None = None, reason: str = "") -> Reference:
+    """Return the reference of the whole scene in steps of its own with RK4.
+
+    finer: how much finer than the finest steps that are measured, a multiple of 4; none = 64, or as much as keeps to
+    MOST_WORK. Raises ValueError, in one line, where it diverges, or no longer knows where agents are.
+    """
+    fine = problem.by_events
+    many = max(affordable(problem) if finer is None else finer, LEAST_FINER * problem.stable(RK4(), FINER))
+    steps = problem.steps[-1] * many
+    try:
+        runs = [fine.path(RK4(), steps // k) for k in (4, 2, 1)]
+    except FloatingPointError as fault:
+        raise ValueError(f"no reference: {reason}; and in steps of its own: {fault}") from None
+    off = [problem.apart(finer_one, coarser) for coarser, finer_one in itertools.pairwise(runs)]
+    path, gone = runs[-1], _reach(problem, runs[-1])
+    before, last = (farthest(each) for each in off)
+    order, error = _closing_in(before, last, max(ROUNDING, ROUNDING_STEP * steps) * max(1.0, gone))
+    _refuse_unsettled(problem, steps, off[1], error, gone)
+    exactly = any(isinstance(each, Collisions) and each.response == "earliest" for each in fine.scene.constraints)
+    found = [reason, f"RK4 in {steps:,} steps, dt/{many} of the finest", _told(order, last)]
+    found += ["impacts in the order of time"] if exactly else []
+    note = "; ".join(each for each in found + _left_over(path) if each)
+    return Reference("event-exact steps" if exactly else "own steps", path, error, gone, note)
+
+
+def _left_over(path: Path) -> list[str]:
+    """Say what a run did not do as its scene asks: contacts left unsolved, births without a free slot."""
+    unsolved, refused = path.counted("unsolved"), path.counted("births_refused")
+    found = [f"{unsolved:,} contacts unsolved"] if unsolved else []
+    slots = f"{refused:,} births found no free slot, so which agents are born depends on the step"
+    return found + ([slots] if refused else [])
+
+
+def affordable(problem: Problem) -> int:
+    """Return how much finer than the finest measured steps a reference is that keeps to MOST_WORK."""
+    ends = problem.scene.constraints or problem.scene.population
+    work = (problem.scene.agents + (BETWEEN_STEPS if ends else 0)) * problem.steps[-1]
+    finer = FINER
+    while finer > LEAST_FINER and work * finer > MOST_WORK:
+        finer //= 2
+    return finer
+
+
+def _closing_in(before: float, last: float, rounding: float) -> tuple[float | None, float]:
+    """Return the order in which three runs close in on a limit, and how wrong the finest is, m, by how far they part.
+
+    Richardson: with order q the finest is last / (2^q - 1) off. An order above 1 is not relied upon, where forces jump
+    and bodies hit; without an order the larger distance is the best that can be said.
+    """
+    if not last > rounding:
+        return None, max(before, last)
+    order = math.log2(max(before, rounding) / last)
+    return order, last / (2 ** min(order, 1.0) - 1) if order >= SETTLED else max(before, last)
+
+
+def _told(order: float | None, last: float) -> str:
+    """Say how a reference closes in on a limit."""
+    if order is None:
+        return f"{last:.1e} m from half as many, which is rounding"
+    settles = f"order {order:.1f}" if order >= SETTLED else f"no order ({order:.1f}): a path that jumps"
+    return f"{last:.1e} m from half as many, {settles}"
+
+
+def _refuse_unsettled(problem: Problem, steps: int, off: Floats, error: float, gone: float) -> None:
+    """Refuse a scene that ends somewhere else in other steps, however short; the line names a horizon."""
+    if math.isnan(error):
+        raise ValueError(f"seconds = {problem.seconds:g}: no agent lives at any instant at which runs are compared")
+    if error <= COARSE * gone or error == 0:
+        return
+    by_instant = np.maximum.accumulate(np.nan_to_num(off).max(axis=1))
+    kept = problem.times[by_instant <= 1e-2 * gone]
+    advice = f"try --seconds {kept[-1]:.3g}" if len(kept) else "try a shorter horizon, or shorter steps"
+    raise ValueError(
+        f"no reference over {problem.seconds:g} s: RK4 in {steps:,} steps and in half as many end "
+        f"{by_instant[-1]:.1e} m apart, of {gone:.1e} m that the farthest agent goes (a jump is met on one path and "
+        f"missed on the other, and what follows differs); {advice}"
+    )
+
+
+def _reach(problem: Problem, path: Path) -> float:
+    return reach(path, problem.start.pos[0], problem.scene.space.displacement)

@@ -1,0 +1,187 @@
+"""What a scene computes, for whom, at what cost, and what it does not compute because nobody asked for it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from time import perf_counter
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flockenv.model.state import WORK, State
+from flockenv.physics.effects import EFFECTS, Effect
+from flockenv.scene import Scene
+from flockenv.scene.stability import Suggestion, suggest_dt
+from flockenv.studies.arbitration_trace import Grants
+
+__all__ = ["Cost", "Explanation", "Row", "explain"]
+
+ROUNDS = 15
+INSTANTS, BETWEEN = 20, 10  # at which shares are looked at, and the steps between two
+TIMED = 0.01  # s per measurement: long against the clock, short against a change of the processor's speed
+
+
+class Cost(NamedTuple):
+    """A difference of measured times, us per step: the median over rounds and its 95 % interval."""
+
+    median: float
+    low: float
+    high: float
+
+    @classmethod
+    def of(cls, differences: NDArray[np.float64]) -> Cost:
+        """Return the median of the differences of each round, with the exact interval of order statistics."""
+        from scipy.stats import quantile_test  # here: a command that times nothing need not wait for it
+
+        interval = quantile_test(differences, p=0.5).confidence_interval(0.95)
+        return cls(float(np.median(differences)), float(interval.low), float(interval.high))
+
+    def __str__(self) -> str:
+        level = " level" if self.low <= 0 <= self.high else ""
+        return f"{self.median:.3g} [{self.low:.3g}, {self.high:.3g}]{level}"
+
+
+@dataclass(frozen=True)
+class Row:
+    """One effect of a scene."""
+
+    effect: Effect
+    calls_for: tuple[str, ...]  # in words; empty = nothing but the agent itself
+    cost: Cost  # that the scene would save without it; what it shares with others is not in it
+
+    @property
+    def name(self) -> str:
+        """Its kind, and the fields that are not at their defaults."""
+        usual = {name: f.get_default(call_default_factory=True) for name, f in type(self.effect).model_fields.items()}
+        given = {name: getattr(self.effect, name) for name in usual if name != "kind"}
+        return f"{self.effect.kind}({', '.join(f'{k}={v}' for k, v in given.items() if v != usual[k])})"
+
+
+@dataclass(frozen=True)
+class Explanation:
+    """What one step of one world does."""
+
+    scene: Scene
+    rows: tuple[Row, ...]
+    step: float  # us, a whole step
+    rest: float  # us, a step without any effect: integrator, limits, confinement, constraints, population
+    shared: Cost  # that no single effect could save: the query and the sweep that several share
+    work: dict[str, float]  # per step, see state.WORK
+    left_out: tuple[str, ...]  # one line each
+    stable: Suggestion  # the largest stable step
+    shares: tuple[tuple[str, str, float], ...] = ()  # of each Steer's behaviours: which, and the mean share granted
+
+    @property
+    def remains(self) -> str:
+        """What is left of a step without any effect, in words."""
+        scene = self.scene
+        parts = [scene.integrator.kind, "limits", scene.space.kind, *(each.kind for each in scene.constraints)]
+        return ", ".join(parts + ["births and deaths"] * bool(scene.population))
+
+    @property
+    def largest_step(self) -> str:
+        """The largest stable step in words, beside the step that is made."""
+        found, made = self.stable, f"dt = {self.scene.dt:g} s"
+        if found.dt == 0:
+            return f"none is stable with {self.scene.integrator.kind} ({found.effect} at agent {found.agent}), {made}"
+        if math.isfinite(found.dt):
+            return f"{found.dt:.3g} s ({found.effect}, agent {found.agent}), {made}"
+        if found.frequency or found.damping:
+            return f"any is stable with {self.scene.integrator.kind}, {made}"
+        return f"nothing in it sets a limit, unless agents that meet do; {made}"
+
+
+def explain(
+    scene: Scene, state: State | None = None, progress: Callable[[int], None] = lambda done: None
+) -> Explanation:
+    """Measure a scene from a state on (default: its start with seed 0), one effect left out at a time.
+
+    All variants are timed in turn, ROUNDS times. A cost is the median over the rounds of the difference within a round,
+    with its 95 % interval: a disturbance that lasts hits both sides. `progress` is called with the number of variants
+    that are ready; each may have to be compiled.
+    """
+    state = scene.start(0) if state is None else state
+    effects = scene.effects
+    variants = [effects, *(effects[:k] + effects[k + 1 :] for k in range(len(effects))), ()]
+    timers = []
+    for done, kept in enumerate(variants):
+        progress(done)
+        timers.append(_Timer(scene.with_effects(*kept), state))
+    times = np.array([[timer.measure() for timer in timers] for _ in range(ROUNDS)])  # (rounds, variants) us
+    whole, bare = times[:, :1], times[:, -1]
+    saved = whole - times[:, 1:-1]
+    rows = tuple(Row(effect, _calls(scene, k), Cost.of(saved[:, k])) for k, effect in enumerate(effects))
+    shared = Cost.of(whole[:, 0] - bare - saved.sum(axis=1))
+    return Explanation(
+        scene, rows, float(np.median(whole)), float(np.median(bare)), shared, _work(scene, state), _left_out(scene),
+        suggest_dt(scene), _shares(scene, state),
+    )  # fmt: skip
+
+
+class _Timer:
+    """Times the steps of a scene from one state on, so many at a time that the clock is no matter."""
+
+    def __init__(self, scene: Scene, state: State) -> None:
+        self._scene, self._state, self._scratch = scene, state, state.copy()
+        self._steps = 1
+        self.measure()  # compiles
+        while self.measure() * self._steps * state.shape[0] < 1e6 * TIMED:
+            self._steps *= 2
+
+    def measure(self) -> float:
+        """Run once and return the time per step of one world, us."""
+        self._scratch.copy_from(self._state)
+        began = perf_counter()
+        self._scene.step(self._scratch, out=self._scratch, steps=self._steps)
+        return 1e6 * (perf_counter() - began) / self._steps / self._state.shape[0]
+
+
+def _calls(scene: Scene, k: int) -> tuple[str, ...]:
+    effect = scene.effects[k]
+    how = "tree" if (k, effect) in scene.parts.treed else "direct"
+    within = f" within {effect.reach:g} m" if effect.reach else ""
+    more = {"neighbour query": within, "all others": f" ({how})"}
+    return tuple(what + more.get(what, "") for what in effect.calls_for())
+
+
+def _work(scene: Scene, state: State) -> dict[str, float]:
+    after = scene.step(state)
+    return {what: (after.counted(what) - state.counted(what)) / state.shape[0] for what in WORK}
+
+
+def _shares(scene: Scene, state: State) -> tuple[tuple[str, str, float], ...]:
+    """Return the mean share of each wish, while it is one, over INSTANTS of a run from a state on."""
+    if not any(effect.wishes for effect in scene.effects):
+        return ()
+    grants, found = Grants(scene), []
+    for _ in range(INSTANTS):
+        found.append(grants.at(state))
+        state = scene.run(state, BETWEEN)
+    rows = []
+    for one in zip(*found, strict=True):
+        share, asked = np.stack([g.share for g in one]), np.stack([g.asked for g in one])
+        for k, name in enumerate(one[0].names):
+            mean = float(share[..., k][asked[..., k]].mean()) if asked[..., k].any() else math.nan
+            rows.append((f"effects[{one[0].effect}]", name, mean))
+    return tuple(rows)
+
+
+def _left_out(scene: Scene) -> tuple[str, ...]:
+    asked = {what for effect in scene.effects for what in effect.calls_for()}
+    asked |= {what for constraint in scene.constraints for what in constraint.calls_for()}
+    others = sorted(EFFECTS.keys() - {effect.kind for effect in scene.parts.effects})
+    lines = []
+    if "neighbour query" not in asked:
+        lines.append("neighbour query: no effect asks who is near whom")
+    if "obstacles" not in asked:
+        lines.append(f"pass over obstacles ({len(scene.obstacles)}): no effect asks for them")
+    if not scene.constraints:
+        lines.append("collisions, rods: no constraint is listed; bodies pass through each other and through obstacles")
+    if not scene.population:
+        lines.append("births and deaths: nothing in its population")
+    if others:
+        lines.append(f"effects that are not listed: {', '.join(others)}")
+    return tuple(lines)

@@ -1,0 +1,70 @@
+"""How wishes that contradict each other are reconciled: what is run into, and who is heard.
+
+Reynolds 1987: the sum of "left, around the obstacle" and "right, to where the flock is" is straight into it; and in an
+emergency the most pressing wish must not share a bounded force with all others.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from flockenv.model.state import Floats
+from flockenv.studies.arbitration_trace import Granted, Grants
+from flockenv.studies.experiments.experiment import Trial, depth
+from flockenv.studies.experiments.plan import SteerPlan
+
+__all__ = ["COLUMNS", "SHOWN", "more_columns", "trial"]
+
+COLUMNS = {
+    "collisions": "obstacles run into, per agent",
+    "deepest": "m, the deepest that any agent was in an obstacle",
+    "nearer": "m, how much nearer to the goal an agent came",
+    "switches": "1/s, how often another behaviour has the largest part of the force",
+}
+SHOWN = ("collisions", "switches")
+
+
+def more_columns(plan: SteerPlan) -> dict[str, str]:
+    """Return a column for every behaviour that the cases have."""
+    scenes = (plan.scene_of(case, variant) for case in plan.cases for variant in plan.variants)
+    names = dict.fromkeys(wish.kind for scene in scenes for wish in scene.effects[0].wishes)
+    return {f"share {name}": f"of what {name} wishes for, granted on average while it wishes" for name in names}
+
+
+def trial(plan: SteerPlan, case: str, variant: str) -> Trial:
+    """Run one case under one variant, in so many worlds."""
+    scene, target = plan.scene_of(case, variant), np.array(plan.cases[case].target)
+    grants, steps = Grants(scene), round(plan.cases[case].seconds / scene.dt)
+    state = scene.start(plan.seed, worlds=plan.worlds)
+    began = np.linalg.norm(state.pos - target, axis=-1)
+    deep, granted, path = [], [], [state.pos[0].copy()]
+    for _ in range(steps):
+        granted.append(grants.at(state)[0])
+        state = scene.step(state)
+        deep.append(depth(scene, state))
+        path.append(state.pos[0].copy())
+    numbers = _contacts(np.array(deep)) | _grants(granted, scene.dt)
+    nearer = began - np.linalg.norm(state.pos - target, axis=-1)
+    return Trial(numbers | {"nearer": float(nearer.mean())}, scene, np.array(path))
+
+
+def _contacts(depth: Floats) -> dict[str, float]:
+    """Return numbers about obstacles that were run into; depth (T, B, N) m."""
+    inside = depth > 0
+    entered = inside[0].sum() + (inside[1:] & ~inside[:-1]).sum()
+    return {"collisions": float(entered / inside[0].size), "deepest": float(max(depth.max(), 0.0))}
+
+
+def _grants(granted: list[Granted], dt: float) -> dict[str, float]:
+    """Return numbers about who was heard: whose part of the force is the largest, and with which share."""
+    share = np.stack([each.share for each in granted])  # (T, B, N, K)
+    wish = np.stack([np.linalg.norm(each.wish, axis=-1) for each in granted])
+    part = share * wish
+    leader = np.where(part.max(axis=-1) > 0, part.argmax(axis=-1), -1)
+    switches = (leader[1:] != leader[:-1]).sum(axis=0).mean() / ((len(leader) - 1) * dt)
+    names = granted[0].names
+    shares = {
+        f"share {name}": float(share[..., k][wish[..., k] > 0].mean()) if (wish[..., k] > 0).any() else np.nan
+        for k, name in enumerate(names)
+    }
+    return {"switches": float(switches), **shares}

@@ -1,0 +1,64 @@
+"""How obstacles are avoided: who arrives, how soon, by how long a way, and what is run into.
+
+Reynolds 1988, "Not Bumping Into Things": a force field only brakes who comes head-on, and pushes who flies past.
+Steering to avoid does neither, and like everything local is caught in a dead end; there the global way is what helps.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from flockenv.studies.experiments.experiment import Trial, depth
+from flockenv.studies.experiments.plan import SteerPlan
+
+__all__ = ["ARRIVED", "COLUMNS", "SHOWN", "trial"]
+
+ARRIVED = 0.4
+"""m from the target, where an agent has arrived."""
+
+COLUMNS = {
+    "arrived": f"share that came within {ARRIVED:g} m of the target in time",
+    "time": "s until then, of those who did",
+    "path": "length of their way over the straight one",
+    "speed lost": "share of max_speed, on average until then",
+    "collisions": "obstacles run into, per agent",
+    "deepest": "m, the deepest that any agent was in an obstacle",
+}
+SHOWN = ("arrived", "time", "collisions")
+
+
+def trial(plan: SteerPlan, case: str, variant: str) -> Trial:
+    """Run one case under one variant, in so many worlds, until everybody is there or time is over; of the first agent.
+
+    ValueError if nothing limits how fast it is.
+    """
+    scene, target = plan.scene_of(case, variant), np.array(plan.cases[case].target)
+    fastest = float(scene.body.max_speed[0])
+    if not np.isfinite(fastest):
+        raise ValueError(f"cases.{case}.scene.groups[0].max_speed = None: give m/s, of which a share is lost")
+    state = scene.start(plan.seed, worlds=plan.worlds)
+    begin, path, deep, speed = state.pos[:, 0].copy(), [state.pos[:, 0].copy()], [depth(scene, state)[:, 0]], []
+    for _ in range(round(plan.cases[case].seconds / scene.dt)):
+        state = scene.step(state)
+        path.append(state.pos[:, 0].copy())
+        speed.append(np.linalg.norm(state.vel[:, 0], axis=1))
+        deep.append(depth(scene, state)[:, 0])
+    way, within, fast = np.array(path), np.array(deep), np.array(speed)
+    near = np.linalg.norm(way - target, axis=-1) < ARRIVED
+    there = near.any(axis=0)
+    last = np.where(there, near.argmax(axis=0), len(way) - 1)  # (B,) steps until then
+    until = np.arange(len(way))[:, None] <= last
+    moved = np.linalg.norm(np.diff(way, axis=0), axis=-1)
+    length = (moved * until[1:]).sum(axis=0)
+    straight = np.linalg.norm(target - begin, axis=1) - ARRIVED
+    inside = (within > 0) & until
+    lost = 1 - (fast * until[1:]).sum(axis=0) / (fastest * np.maximum(last, 1))
+    numbers = {
+        "arrived": float(there.mean()),
+        "time": float((last * scene.dt)[there].mean()) if there.any() else np.nan,
+        "path": float((length / straight)[there].mean()) if there.any() else np.nan,
+        "speed lost": float(lost.mean()),
+        "collisions": float((inside[0] + (inside[1:] & ~inside[:-1]).sum(axis=0)).mean()),
+        "deepest": float(max(0.0, (within * until).max())),
+    }
+    return Trial(numbers, scene, way[: int(last.max()) + 1, :1])

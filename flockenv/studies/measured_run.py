@@ -1,0 +1,355 @@
+"""A run that is measured: which measures make sense for it, their values, and what pictures of it are drawn from."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flockenv.geometry.space import Plane
+from flockenv.physics.population import Emitter
+from flockenv.scene import Scene
+from flockenv.studies import measures as m
+from flockenv.studies.measures.polygons import checked, contains, rectangle
+from flockenv.studies.trajectory import Trajectory
+
+__all__ = ["UNITS", "Asked", "Survey", "combined", "survey"]
+
+Floats = NDArray[np.float64]
+
+INSTANTS, FEWEST, MOST_CELLS = 200, 10, 400_000
+"""At so many instants of a run, evenly, cells, lanes and order are looked at; at fewer if that is more cells in all."""
+
+MOST_DEALT = 20_000_000
+"""Directions that are dealt out anew, in all, for the null of lanes."""
+
+SAMPLES = 100
+"""So many samples of a power law are drawn, to see whether gaps are of one."""
+
+UNITS = {
+    "agents": "alive, mean",
+    "speed": "m/s, mean",
+    "forward": "crossed the line to its right",
+    "backward": "crossed it to its left",
+    "flow": "1/s, forward less backward",
+    "specific flow": "1/(m s), the same per width of the line",
+    "both ways": "1/(m s), forward and backward added",
+    "passing": "1/s, forward, from the first to the last: J",
+    "time gap": "s, mean between two who go forward",
+    "tail exponent": "alpha of p(gap) ~ gap^-alpha; > 2 flows, <= 2 clogs",
+    "tail error": "its standard error",
+    "tail start": "s, where the power law begins",
+    "tail p": "how often a power law looks less like one; below .1 it is none",
+    "bursts": "runs of crossings one way",
+    "burst length": "crossings in a burst, mean",
+    "burst length by chance": "the same of a coin",
+    "bursts p": "that chance makes so few bursts, or fewer",
+    "out": "of those who began before the line",
+    "95 % out": "s, when 95 % of them were beyond it for good",
+    "all out": "s, when all were",
+    "density counted": "1/m^2 in the area, mean",
+    "density": "1/m^2, by Voronoi cells, mean",
+    "walking speed": "m/s in the area, by Voronoi cells, mean",
+    "density times speed": "1/(m s), mean",
+    "off Weidmann": "m/s, mean, over .5 to 3 per m^2",
+    "off Weidmann, worst": "m/s, of means over .5 per m^2",
+    "in Juelich bins": "share of ug-180's bins that were met within a deviation",
+    "lanes": "Phi, 1 = nobody shares a row with who goes the other way",
+    "lanes by chance": "Phi with directions dealt out anew",
+    "lanes p": "that chance makes as much order",
+    "band index": "Y, the same over wider bands, not squared",
+    "polarisation": "0 to 1: length of the mean heading",
+    "milling": "0 to 1: how far all circle one way",
+    "group momentum": "kg m/s",
+    "nearest neighbour": "m, mean distance of centres",
+    "groups": "of whom each is within reach of another",
+    "overlap": "share of the smaller body, mean over pairs that overlap",
+    "overlapping": "share of agents that overlap another",
+    "collisions": "1/s, how often an agent begins to touch another",
+    "oscillation": "speed backward over desired speed, mean where it is so",
+    "oscillating": "share of agents that move backward",
+}
+"""Every measure, in the order of the table: what its number is."""
+
+
+@dataclass(frozen=True)
+class Asked:
+    """Where and when is measured."""
+
+    line: Floats | None = None  # (2, 2) m
+    area: Floats | None = None  # (n, 2) m; none = the whole space, if it has a size
+    walkable: Floats | None = None  # (n, 2) m; none = found out
+    skip: float = 0.0  # s, of the beginning
+
+    def check(self, scene: Scene) -> None:
+        """Refuse a line or an area of a scene in space: ValueError, of one line."""
+        if scene.dimension == 3 and (self.line is not None or self.area is not None or self.walkable is not None):
+            raise ValueError("dimension = 3: lines and areas are of the plane")
+
+
+@dataclass(frozen=True, eq=False)
+class Survey:
+    """What was measured of a run."""
+
+    values: dict[str, float]  # by names of UNITS; NaN where one has no meaning
+    axis: Floats  # (2,) the way of walking
+    way: NDArray[np.int64]  # (N,) 1 = along it, -1 = against it, 0 = neither
+    stopped: str = ""  # why it ended before its time
+    density: Floats = field(default_factory=lambda: np.zeros(0))  # (S,) 1/m^2, by cells
+    speed: Floats = field(default_factory=lambda: np.zeros(0))  # (S,) m/s
+    gaps: Floats = field(default_factory=lambda: np.zeros(0))  # (G,) s
+
+
+def survey(
+    trajectory: Trajectory, asked: Asked, progress: Callable[[int], None] = lambda done: None
+) -> Survey:  # fmt: skip
+    """Return what was measured of a run, as far as it makes sense for it.
+
+    A KeyboardInterrupt ends it early: what was measured until then is returned, and `stopped` says so.
+    """
+    run = _Run.of(trajectory, asked)
+    found: dict[str, Any] = {}
+    values: dict[str, float] = {}
+    stopped = trajectory.stopped
+    try:
+        for done, part in enumerate((_motion, _flow, _room, _lanes, _order, _bodies)):
+            progress(done)
+            numbers, arrays = part(run)
+            values |= numbers
+            found |= arrays
+    except KeyboardInterrupt:
+        stopped = "interrupted"
+    return Survey({name: values[name] for name in UNITS if name in values}, run.axis, run.way, stopped, **found)
+
+
+Part = tuple[dict[str, float], dict[str, Floats]]
+
+
+@dataclass(frozen=True, eq=False)
+class _Run:
+    """A run as the measures take it: after the skipped time, with a way of walking."""
+
+    scene: Scene
+    asked: Asked
+    time: Floats  # (T,) s, of all instants
+    pos: NDArray[np.floating[Any]]  # (T, N, D)
+    vel: NDArray[np.floating[Any]]
+    alive: NDArray[np.bool_]
+    identity: NDArray[np.int64] | None
+    first: int  # the first instant that counts
+    axis: Floats
+    way: NDArray[np.int64]
+    low: Floats  # corners of the region
+    high: Floats
+
+    @classmethod
+    def of(cls, run: Trajectory, asked: Asked) -> _Run:
+        """Return it; ValueError, of one line, for a line or area that is none, or that is asked for in space."""
+        scene, time = run.scene, np.asarray(run.step * run.scene.dt, np.float64)
+        asked.check(scene)
+        alive = run.alive & np.isfinite(run.pos).all(axis=2)
+        first = min(int(np.searchsorted(time, asked.skip - 1e-9)), len(time) - 1)
+        axis = _axis(run, alive, asked.line)
+        along = np.where(alive, run.vel[..., :2] @ axis, 0.0)[first:].sum(axis=0)
+        shown = next(iter(run.snapshots()))
+        return cls(
+            scene, asked, time, run.pos, run.vel, alive, run.identity, first, axis, np.sign(along).astype(np.int64),
+            np.array(shown.low[:2]), np.array(shown.high[:2]),
+        )  # fmt: skip
+
+    @property
+    def period(self) -> tuple[float, float]:
+        """After how much the world goes on with itself, m."""
+        size = self.scene.space.extent(self.scene.dimension) if self.scene.space.periodic else (0.0, 0.0)
+        return size[0], size[1]
+
+    @property
+    def area(self) -> Floats | None:
+        """What is measured: what was asked for, or a whole space that has a size; none of others."""
+        if self.asked.area is not None or self.scene.dimension == 3:
+            return self.asked.area
+        return None if isinstance(self.scene.space, Plane) else rectangle(self.low, self.high)
+
+    def ground(self) -> m.Ground:
+        """Return where people walk, less obstacles that stand still, and where they are measured."""
+        hollow = [s for s in self.scene.shapes if s.is_hollow and not s.moves]
+        if self.asked.walkable is not None:
+            walk = checked("walkable", self.asked.walkable)
+        elif len(hollow) == 1:
+            walk = checked("walkable", hollow[0].polygons(self.low, self.high)[0])
+        else:
+            walk = rectangle(self.low, self.high)
+        solid = [s for s in self.scene.obstacles if not (s.is_hollow or s.moves)]
+        holes = [polygon for s in solid for polygon in s.polygons(self.low, self.high)]
+        return m.Ground.of(walk, self.area, holes, self.period)
+
+    def instants(self) -> list[int]:
+        """Return so many instants that count, evenly."""
+        most = min(INSTANTS, max(FEWEST, MOST_CELLS // self.scene.agents), len(self.time) - self.first)
+        return sorted({round(float(k)) for k in np.linspace(self.first, len(self.time) - 1, most)})
+
+    def worlds(self) -> Iterator[tuple[Floats, Floats, NDArray[np.bool_]]]:
+        """Return positions and velocities of the living at those instants, and who they are."""
+        for k in self.instants():
+            here = self.alive[k]
+            yield np.asarray(self.pos[k, here], float), np.asarray(self.vel[k, here], float), here
+
+
+def _axis(run: Trajectory, alive: NDArray[np.bool_], line: Floats | None) -> Floats:
+    """Return the way of walking, (2,): across the line, or the direction that most of all movement is along."""
+    if line is not None:
+        along = line[1] - line[0]
+        return np.asarray(np.array([along[1], -along[0]]) / np.hypot(*along))
+    v = np.where(alive[..., None], run.vel[..., :2], 0.0).reshape(-1, 2).astype(float)
+    vectors = np.linalg.eigh(np.nan_to_num(v.T @ v))[1]
+    axis = vectors[:, 1]
+    if not isinstance(run.scene.space, Plane) or np.abs(axis).max() > 0.996:  # 5 degrees
+        axis = np.eye(2)[int(np.abs(axis).argmax())]
+    return np.asarray(axis * (1 if axis[np.abs(axis).argmax()] > 0 else -1))
+
+
+def _mean(values: Sequence[float]) -> float:
+    """Return the mean of those that are numbers; NaN of none."""
+    some = [x for x in values if math.isfinite(x)]
+    return float(np.mean(some)) if some else np.nan
+
+
+def _motion(run: _Run) -> Part:
+    speed = [_mean(np.linalg.norm(vel, axis=1).tolist()) for _, vel, _ in run.worlds()]
+    return {"agents": float(run.alive[run.first :].sum(axis=1).mean()), "speed": _mean(speed)}, {}
+
+
+def _flow(run: _Run) -> Part:
+    """Measure at the line."""
+    if run.asked.line is None:
+        return {}, {}
+    line = run.asked.line
+    every = m.crossings(run.time, run.pos, line, run.alive, run.identity, run.period)
+    late = every.time >= run.time[run.first]
+    found = m.Crossings(*(each[late] for each in every))
+    lasted = float(run.time[-1] - run.time[run.first])
+    values: dict[str, float] = {}
+    if lasted > 0:
+        width = float(np.hypot(*(line[1] - line[0])))
+        through = m.flow(found, width, lasted)
+        names = ("forward", "backward", "flow", "specific flow", "passing")
+        values |= dict(zip(names, map(float, through), strict=True))
+        values["both ways"] = len(found.time) / lasted / width
+    gaps = m.time_gaps(found)
+    fit, burst = m.tail(gaps), m.bursts(found.sign)
+    values |= {
+        "time gap": _mean(gaps.tolist()), "tail exponent": fit.alpha, "tail error": fit.error, "tail start": fit.start,
+        "tail p": m.goodness(gaps, fit, SAMPLES),
+    }  # fmt: skip
+    if {*found.sign.tolist()} == {1, -1}:
+        values |= {
+            "bursts": float(burst.bursts), "burst length": burst.length, "burst length by chance": burst.null_length,
+            "bursts p": burst.p,
+        }  # fmt: skip
+    return values | _evacuation(run, every, line), {"gaps": gaps}
+
+
+def _evacuation(run: _Run, every: m.Crossings, line: Floats) -> dict[str, float]:
+    """Measure when those are out who began before the line; nothing where people are born, or come around again."""
+    if run.scene.space.periodic or any(isinstance(member, Emitter) for member in run.scene.population):
+        return {}
+    along, to = line[1] - line[0], run.pos[0] - line[0]
+    before = (along[0] * to[:, 1] - along[1] * to[:, 0] >= 0) & run.alive[0]
+    if not before.any():
+        return {}
+    left = m.last_crossing(every, run.pos.shape[1])[before]
+    return {
+        "out": float(np.isfinite(left).sum()),
+        "95 % out": m.evacuation_time(left, 0.95),
+        "all out": m.evacuation_time(left),
+    }
+
+
+def _room(run: _Run) -> Part:
+    """Measure density and speed in the area."""
+    area = run.area
+    if area is None:
+        return {}, {}
+    ground, counted, density, speed = run.ground(), [], [], []
+    for pos, vel, _ in run.worlds():
+        room = ground.room(pos)
+        counted.append(float(m.classical_density(pos[None], area)[0]))
+        density.append(m.voronoi_density(room))
+        speed.append(m.voronoi_speed(room, np.linalg.norm(vel, axis=1)))
+    rho, v = np.array(density), np.array(speed)
+    off = m.from_weidmann(rho, v)
+    values = {
+        "density counted": _mean(counted), "density": _mean(density), "walking speed": _mean(speed),
+        "density times speed": _mean((rho * v).tolist()), "off Weidmann": off.mean, "off Weidmann, worst": off.worst,
+        "in Juelich bins": m.in_juelich(rho, v),
+    }  # fmt: skip
+    return values, {"density": rho, "speed": v}
+
+
+def _lanes(run: _Run) -> Part:
+    """Measure lanes, where people go both ways along the axis on the whole."""
+    if run.scene.dimension == 3:
+        return {}, {}
+    at, across = run.instants(), np.array([-run.axis[1], run.axis[0]])
+    pos, alive = np.asarray(run.pos[at], float), run.alive[at]
+    here = alive if run.area is None else alive & contains(checked("area", run.area), pos)
+    seen = here.any(axis=0)
+    both = (run.way[seen] > 0).any() and (run.way[seen] < 0).any()
+    if not both or not _straight(run):
+        return {}, {}
+    y = pos @ across
+    low, high = float(y[here].min()), float(y[here].max())
+    deals = min(400, max(50, MOST_DEALT // y.shape[1]))
+    found = m.lanes(y, run.way, low, high + 1e-9 * (1 + abs(high)), here, deals=deals)
+    return {"lanes": found.order, "lanes by chance": found.null, "lanes p": found.p, "band index": found.bands}, {}
+
+
+def _straight(run: _Run) -> bool:
+    """Do most go along the axis, one way or the other?"""
+    v = np.where(run.alive[..., None], run.vel[..., :2], 0.0)[run.first :]
+    along, whole = np.abs((v @ run.axis).sum(axis=0)).sum(), np.linalg.norm(v, axis=2).sum()
+    return bool(along > 0.5 * whole)
+
+
+def _order(run: _Run) -> Part:
+    space, mass, reach = run.scene.space, np.asarray(run.scene.body.mass, float), run.scene.parts.reach
+    rows: list[tuple[float, ...]] = []
+    for pos, vel, here in run.worlds():
+        near = m.nearest_distances(pos, space)[0]
+        groups = m.components(pos, reach, space) if reach > 0 and len(pos) else np.nan
+        rows.append((
+            m.polarisation(vel), m.milling(pos, vel, space), m.group_momentum(vel, mass[here]), _mean(near.tolist()),
+            groups,
+        ))  # fmt: skip
+    names = ("polarisation", "milling", "group momentum", "nearest neighbour", *(["groups"] if reach > 0 else []))
+    return {name: _mean(column) for name, column in zip(names, zip(*rows, strict=True), strict=False)}, {}
+
+
+def _bodies(run: _Run) -> Part:
+    """Measure what models of people should not do."""
+    radius, space = np.asarray(run.scene.body.radius, float), run.scene.space
+    at = slice(run.first, None)
+    values: dict[str, float] = {}
+    if radius.any():
+        if run.scene.dimension == 2:
+            pos, alive = run.pos[run.instants()], run.alive[run.instants()]
+            found = m.overlap_proportion(pos, radius, space, alive)
+            values |= {"overlap": found.mean, "overlapping": found.share}
+        values["collisions"] = m.collision_rate(run.time[at], run.pos[at], radius, space, run.alive[at])
+    body = run.scene.body  # who does not say how fast he would like to go goes as fast as he may
+    wished = np.asarray(np.where(body.desired_speed > 0, body.desired_speed, body.max_speed), float)
+    if run.scene.dimension == 2 and np.isfinite(wished).all() and _straight(run):
+        desired = (run.way * wished)[:, None] * run.axis
+        back = m.oscillation_proportion(run.vel[at], desired, run.alive[at])
+        values |= {"oscillation": back.mean, "oscillating": back.share}
+    return values, {}
+
+
+def combined(found: Sequence[Survey]) -> dict[str, m.Mean]:
+    """Return every measure's mean over runs, with its 95 % interval."""
+    names = [name for name in UNITS if any(name in each.values for each in found)]
+    return {name: m.mean_of_runs([each.values.get(name, np.nan) for each in found]) for name in names}

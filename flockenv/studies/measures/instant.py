@@ -1,0 +1,55 @@
+"""What people who study flocks and crowds measure on one world at one instant: order, spacing, speed, contact."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from flockenv.geometry.shapes import clear_of
+from flockenv.model.state import State
+from flockenv.scene import Scene
+from flockenv.studies.measures.order import nearest_distances, polarisation
+
+__all__ = ["MEASURES", "measure"]
+
+MEASURES = {
+    "agents": "alive",
+    "speed": "m/s, mean",
+    "polarisation": "0 to 1: length of the mean heading",
+    "nearest_neighbour": "m, mean distance of centres",
+    "contacts": "agents that overlap their nearest neighbour or an obstacle",
+}
+"""Names and units of what `measure` returns."""
+
+
+def measure(
+    scene: Scene, state: State, world: int = 0, progress: Callable[[int], None] = lambda done: None
+) -> dict[str, float]:
+    """Return the measures of one world by name; NaN where one has no meaning (spacing of a single agent).
+
+    progress: called with the number of agents whose nearest neighbour has been found.
+    """
+    with np.errstate(over="ignore", invalid="ignore"):  # a run that is about to diverge may be looked at, too
+        return _measure(scene, state, world, progress)
+
+
+def _measure(scene: Scene, state: State, world: int, progress: Callable[[int], None]) -> dict[str, float]:
+    alive = state.alive[world]
+    pos, vel = (np.asarray(a[world][alive], np.float64) for a in (state.pos, state.vel))
+    radius = np.asarray(scene.body.radius, np.float64)[alive]
+    speed = np.linalg.norm(vel, axis=1)
+    nearest, who = nearest_distances(pos, scene.space, progress)
+    touching = nearest < radius + radius[who]
+    for centre, size in zip(state.obstacles.centre[world], state.obstacles.radius[world], strict=True):
+        touching |= (size > 0) & (np.linalg.norm(scene.space.displacement(pos, centre), axis=1) < radius + size)
+    if scene.shapes:
+        period = np.array(scene.space.extent(scene.dimension) if scene.space.periodic else (0.0,) * scene.dimension)
+        touching |= clear_of(scene.shapes, np.asarray(pos, float), period, float(state.time[world])) < radius
+    return {
+        "agents": float(alive.sum()),
+        "speed": float(speed.mean()) if len(speed) else np.nan,
+        "polarisation": polarisation(vel),
+        "nearest_neighbour": float(nearest.mean()) if len(pos) > 1 else np.nan,
+        "contacts": float(touching.sum()),
+    }

@@ -1,0 +1,98 @@
+"""Hard cases of springs: a cloth that grows stiffer, a hanging chain, and a swinging chain far from the origin.
+
+Names, scenes and bounds are those of shared/reference/numerics.md, section 6.2.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from flockenv.model.networks import Cloth, Network, Rope
+from flockenv.model.state import State
+from flockenv.physics.effects import Gravity, Springs
+from flockenv.physics.integrators import Integrator
+from flockenv.scene import Group, Scene
+from flockenv.studies.trial_log import Case, Value
+
+__all__ = ["BONDED"]
+
+G = 9.81
+FRAME = 1 / 60  # s
+
+
+def hanging(method: Integrator, network: Network, stiffness: float, dt: float, each: float, damping: float) -> Scene:
+    """Return a network in 3-D under gravity: one set of laws for all cases of this file."""
+    effects = (Springs(stiffness=stiffness, damping=damping), Gravity(acceleration=(0.0, 0.0, -G)))
+    group = Group(network=network, mass=each)
+    return Scene(dimension=3, groups=(group,), effects=effects, integrator=method, dt=dt)
+
+
+def cloth(stiffness: float, steps: int = 20) -> Callable[[Integrator], Value]:
+    """Return the trial of a square metre of cloth, 20 x 20, that swings down from its edge at 60 frames a second."""
+
+    def trial(method: Integrator) -> Value:
+        sheet = Cloth(cells=(19, 19), edges=((1, 0, 0), (0, 1, 0)), pinned=("top",))
+        scene = hanging(method, sheet, stiffness, FRAME, each=1 / 400, damping=0.0)
+        state, most = scene.start(0), 0.0
+        for _ in range(steps):
+            state = scene.step(state)
+            most = max(most, _energy(scene, state) / max(_fallen(scene, state), 1e-12))
+        newton, linear = state.counted("newton_iterations"), state.counted("linear_iterations")
+        note = f"energy at most {most:.3g} of the work of gravity"
+        if newton:
+            note += f"; {newton / steps:.3g} iterations of Newton's method and {linear / steps:.3g} solves a step"
+        if state.counted("substeps"):
+            note += f"; {state.counted('substeps') / steps:.4g} steps of its own in each"
+        return Value(most, most <= 1.05, note)
+
+    return trial
+
+
+def _energy(scene: Scene, state: State) -> float:
+    """Return kinetic and elastic energy, J."""
+    springs = scene.effects[0]
+    elastic = springs.potential(scene.groups, state, scene.space.displacement)
+    assert elastic is not None
+    mass = np.where(np.isfinite(scene.body.mass), scene.body.mass, 0.0)
+    return float(elastic[0] + 0.5 * (mass * (state.vel[0] ** 2).sum(axis=1)).sum())
+
+
+def _fallen(scene: Scene, state: State) -> float:
+    """Return the work of gravity since all particles were at height 0, J."""
+    mass = np.where(np.isfinite(scene.body.mass), scene.body.mass, 0.0)
+    return float(-G * (mass * state.pos[0, :, 2]).sum())
+
+
+def chain(method: Integrator) -> Value:
+    """A damped chain of ten links comes to rest at N L + (m g / k) N (N + 1) / 2 = 1.1348875 m."""
+    rope = Rope(links=10, length=1.0, direction=(0, 0, -1), pinned=("start",))
+    dt, steps = (0.05, 400) if method.solves else (0.004, 8000)
+    scene = hanging(method, rope, 400.0, dt, each=0.1, damping=2.0)
+    end = scene.run(scene.start(0), steps)
+    long = float(-end.pos[0, -1, 2])
+    return Value(long, abs(long - 1.1348875) <= 1e-4, f"{long:.7f} m")
+
+
+def far_away(method: Integrator) -> Value:
+    """The same swinging chain at 0, 1e4 and 1e7 m from the origin, in float64."""
+    found = []
+    for offset in (0.0, 1e4, 1e7):
+        start, way = (offset, -offset, offset), (1.0, 0.0, 0.2)
+        rope = Rope(links=10, length=1.0, start=start, direction=way, pinned=("start",))
+        scene = hanging(method, rope, 400.0, 0.004, each=0.1, damping=0.5)
+        end = scene.run(scene.start(0), 100)
+        found.append(end.pos[0] - np.array(start))
+    off = max(float(np.abs(other - found[0]).max()) for other in found[1:])
+    return Value(off, off <= 1e-6, f"{off:.2g} m apart")
+
+
+BONDED = (
+    *(
+        Case(f"N14 {power}", f"cloth, k = 1e{power} N/m", "E <= 1.05 work, or refused", cloth(10.0**power))
+        for power in range(3, 9)
+    ),
+    Case("N15", "hanging chain at rest", "1.1348875 m +- 1e-4", chain),
+    Case("N17", "chain at 0, 1e4, 1e7 m", "1e-6 m", far_away),
+)

@@ -1,0 +1,212 @@
+"""Findings: what cases came to under methods or models, tried one after another, and gone on with where it stopped.
+
+Hard cases of the simulator (`flockenv.studies.stress`) and crowds against guidelines (`flockenv.studies.validation`)
+are tried so. What a case raises is its verdict: a scene that is refused, a simulation that diverges and says so.
+"""
+
+from __future__ import annotations
+
+import math
+import warnings
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass, field
+from time import perf_counter
+from typing import Any, Literal
+
+from pydantic import Field
+
+from flockenv.core.errors import nearest_few, shown
+from flockenv.core.record import ResultRecord
+from flockenv.model.divergence import SimulationDiverged
+
+__all__ = ["VERDICTS", "Case", "Finding", "Results", "Value", "Verdict", "cases_named", "run", "trials"]
+
+Verdict = Literal["pass", "warned", "reported", "refused", "fails", "diverges"]
+
+VERDICTS: dict[Verdict, str] = {
+    "pass": "within the bound",
+    "warned": "within the bound, after a warning: of a step that is too long, of contacts that were not solved",
+    "reported": "there is no bound, only a number",
+    "refused": "the scene was refused, the message says why; of a step that must blow up, the largest that does not",
+    "fails": "beyond the bound: the number is what came of it",
+    "diverges": "no longer finite, and reported: world, agent, step, effect",
+}
+"""What each verdict means."""
+
+MARKS: dict[Verdict, str] = {"pass": "ok", "reported": "", "fails": "FAILS"}
+"""What they are in a table, where it is not their name."""
+
+
+@dataclass(frozen=True)
+class Value:
+    """What a case came to, and whether that is within its bound; none where there is none: it is reported."""
+
+    number: float
+    holds: bool | None
+    note: str = ""
+    series: Mapping[str, Sequence[float]] = field(default_factory=dict)
+    """What pictures are drawn from."""
+
+
+@dataclass(frozen=True)
+class Case:
+    """Something that is tried: its name, what happens in it, what is demanded, and how it is tried under something."""
+
+    name: str
+    title: str
+    bound: str
+    trial: Callable[[Any], Value]
+    only: tuple[str, ...] = ()
+    """Names of those that it is tried under; none = all."""
+
+    def under(self, name: str) -> bool:
+        """Is it tried under this?"""
+        return not self.only or name in self.only
+
+
+class Finding(ResultRecord):
+    """What one case came to under one method or model."""
+
+    case: str
+    title: str
+    under: str = Field(description="the method, or the model")
+    bound: str
+    value: float | None = Field(description="what is bounded; none if it came to no number")
+    verdict: Verdict
+    note: str = ""
+    seconds: float = Field(ge=0, description="s, wall time, compiling included")
+    series: dict[str, tuple[float | None, ...]] = Field(default_factory=dict, description="what pictures show")
+
+    def cell(self, digits: int = 2) -> str:
+        """Return value and verdict, short."""
+        number = "" if self.value is None else f"{self.value:.{digits}g} "
+        return f"{number}{MARKS.get(self.verdict, self.verdict)}".strip() or "-"
+
+
+class Results(ResultRecord):
+    """All that was found, and by which sources."""
+
+    findings: tuple[Finding, ...]
+    sources: str = Field(default="", description="fingerprint of the sources that it hangs by")
+
+    @property
+    def unders(self) -> list[str]:
+        """Names of methods or models, in the order in which they were tried."""
+        return list(dict.fromkeys(f.under for f in self.findings))
+
+    @property
+    def cases(self) -> list[str]:
+        """Names of cases, in order."""
+        return list(dict.fromkeys(f.case for f in self.findings))
+
+    def only(self, cases: Collection[str], unders: Collection[str]) -> Results:
+        """Return what was found in some cases under some methods or models."""
+        found = tuple(f for f in self.findings if f.case in cases and f.under in unders)
+        return self.model_copy(update={"findings": found})
+
+    def at(self, case: str, under: str) -> Finding | None:
+        """Return one finding; none if that was not tried."""
+        return next((f for f in self.findings if (f.case, f.under) == (case, under)), None)
+
+    def rows(self, digits: int = 2) -> list[list[str]]:
+        """Return the table: a row for each case, a column for each method or model."""
+        out = []
+        for case in self.cases:
+            found = [self.at(case, under) for under in self.unders]
+            first = next(f for f in found if f is not None)
+            out.append([case, first.title, first.bound, *(f.cell(digits) if f else "" for f in found)])
+        return out
+
+    def legend(self) -> list[tuple[str, str]]:
+        """Return what the verdicts mean that there are."""
+        there = {f.verdict for f in self.findings}
+        return [(verdict, text) for verdict, text in VERDICTS.items() if verdict in there]
+
+
+def cases_named(cases: Sequence[Case], names: Sequence[str]) -> tuple[Case, ...]:
+    """Return the cases of some names, all for none; a name's first word is enough; ValueError for an unknown one."""
+    known = {case.name for case in cases} | {case.name.split()[0] for case in cases}
+    for name in names:
+        if name not in known:
+            raise ValueError(f"case {shown(name)}: unknown{nearest_few(name, known)}")
+    return tuple(c for c in cases if not names or c.name in names or c.name.split()[0] in names)
+
+
+def trials(cases: Sequence[Case], unders: Collection[str]) -> int:
+    """Return how many trials there are of these cases under these methods or models."""
+    return sum(case.under(name) for case in cases for name in unders)
+
+
+def run(
+    cases: Sequence[Case],
+    unders: Mapping[str, Any],
+    sources: str,
+    known: Results | None = None,
+    progress: Callable[[int], None] = lambda done: None,
+    keep: Callable[[Results], None] = lambda results: None,
+    told: tuple[type[Warning], ...] = (),
+) -> Results:
+    """Try every case under everything by name, and return that beside what is known.
+
+    A case that says what it is tried under is tried under nothing else. `told` are warnings that make a verdict.
+    What is known from the same sources is not tried again, and not lost; of other sources nothing is taken over.
+    `progress` is called with how many are done, `keep` with all there is after each: whoever is interrupted has that.
+    """
+    found = {(f.case, f.under): f for f in known.findings} if known and known.sources == sources else {}
+    place = {case.name: k for k, case in enumerate(cases)}
+
+    def all_() -> Results:
+        ordered = sorted(found.values(), key=lambda f: (place.get(f.case, len(place)), f.case))
+        return Results(findings=tuple(ordered), sources=sources)
+
+    pairs = [(name, case) for name in unders for case in cases if case.under(name)]
+    for done, (name, case) in enumerate(pairs):
+        progress(done)
+        if (case.name, name) not in found:
+            found[case.name, name] = _tried(case, name, unders[name], told)
+            keep(all_())
+    return all_()
+
+
+def _tried(case: Case, name: str, argument: Any, told: tuple[type[Warning], ...]) -> Finding:
+    """Return what one case came to under something."""
+    began, value = perf_counter(), Value(math.nan, False)
+    verdict: Verdict
+    with warnings.catch_warnings(record=bool(told)) as caught:
+        for kind in told:
+            warnings.simplefilter("always", kind)
+        try:
+            value = case.trial(argument)
+        except SimulationDiverged as error:
+            verdict, note = "diverges", str(error)
+        except ValueError as error:
+            verdict, note = "refused", str(error)
+        else:
+            verdict, note = _judged(value), value.note
+    said = next((str(w.message) for w in caught or () if issubclass(w.category, told)), "")
+    return Finding(
+        case=case.name, title=case.title, under=name, bound=case.bound, value=_known(value.number),
+        verdict="warned" if said and verdict == "pass" else verdict,
+        note="; ".join(text for text in (note, said) if text), seconds=perf_counter() - began,
+        series=_rounded(value.series),
+    )  # fmt: skip
+
+
+def _judged(value: Value) -> Verdict:
+    """Return the verdict on what a case came to; what is no number is within no bound, whichever way that is asked."""
+    if value.holds is None:
+        return "reported"
+    return "pass" if value.holds and not math.isnan(value.number) else "fails"
+
+
+def _known(number: float) -> float | None:
+    """Return a number; none for what is no number."""
+    return float(number) if math.isfinite(number) else None
+
+
+def _rounded(series: Mapping[str, Sequence[float]]) -> dict[str, tuple[float | None, ...]]:
+    """Return numbers as they are written: six digits are enough for a picture."""
+    return {
+        name: tuple(None if (x := _known(v)) is None else float(f"{x:.6g}") for v in values)
+        for name, values in series.items()
+    }
