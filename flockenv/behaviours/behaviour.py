@@ -13,6 +13,7 @@ from pydantic import Field
 
 from flockenv.core.warnings import LookaheadWarning
 from flockenv.jit.decorators import Law, Vec, law, like
+from flockenv.model.scene_view import SceneView
 from flockenv.physics.effects.effect import Effect, Me, Other, Sight, all_masses, demand_group
 
 __all__ = [
@@ -56,7 +57,7 @@ def seen_one(sums: Vec) -> tuple[Vec, Vec, bool]:
         return (sums[0] * share, sums[1] * share, sums[2] * share), velocity, count > o
 
 
-def steered_groups(effect: Effect, scene: Any) -> list[int]:
+def steered_groups(effect: Effect, scene: SceneView) -> list[int]:
     """Return the numbers of the groups that a behaviour of a scene steers."""
     found: set[int] = set()
     for each in scene.effects:
@@ -98,7 +99,7 @@ class Behaviour(Effect):
         damping = gains(self.weight * (2.0 if self.copies else 1.0), groups, dimension)
         return np.zeros(len(damping)), damping
 
-    def check(self, scene: Any) -> None:
+    def check(self, scene: SceneView) -> None:
         """Refuse a group that is not there, by the name under which it was given."""
         for name in ("group", "other", "food"):
             demand_group(name, getattr(self, name, None), scene.groups)
@@ -132,7 +133,7 @@ class Moving(Behaviour):
         slope = self.steepness * np.where(np.isfinite(top), top, 0.0) / self.ramp
         return found[0] + gains(self.weight, groups, dimension) * slope, found[1]
 
-    def check(self, scene: Any) -> None:
+    def check(self, scene: SceneView) -> None:
         """Refuse those who may be infinitely fast; warn of a ramp that is too short to stop on."""
         super().check(scene)
         for k in steered_groups(self, scene):

@@ -14,6 +14,7 @@ from flockenv.behaviours.behaviour import Behaviour, Moving, gains, top_speed
 from flockenv.behaviours.wander import wandered
 from flockenv.jit.decorators import Law, Vec, law, like
 from flockenv.maths.vectors import scale, select, sub, unit, zero
+from flockenv.model.scene_view import SceneView
 from flockenv.physics.effects.effect import Me, Other, Sight, Vector
 
 __all__ = ["Explore", "Forage", "Queue", "UnalignedAvoidance"]
@@ -281,7 +282,7 @@ effects:
   - {kind: explore, weight: 5, low: [0, 0], high: [10, 8], speed: 1.2, track: 1.5}
 """
 
-    def check(self, scene: Any) -> None:
+    def check(self, scene: SceneView) -> None:
         """Refuse a region that has no edges or no area, and tracks that are too narrow to turn."""
         super().check(scene)
         if scene.space.periodic:

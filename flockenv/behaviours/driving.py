@@ -12,6 +12,7 @@ from flockenv import steering
 from flockenv.behaviours.behaviour import Behaviour, steered_groups
 from flockenv.jit.decorators import Law, Vec, law, like
 from flockenv.maths.vectors import dot, norm, scale, sub, unit
+from flockenv.model.scene_view import SceneView
 from flockenv.physics.effects.effect import Me, Other, Sight, all_masses
 
 __all__ = ["Driving", "LineUp"]
@@ -53,7 +54,7 @@ effects:
         """The time it takes."""
         return {"tau": self.tau / self.weight if self.weight else np.inf}
 
-    def check(self, scene: Any) -> None:
+    def check(self, scene: SceneView) -> None:
         """Refuse those who do not say how fast they would like to go."""
         super().check(scene)
         _demand_speeds(self, scene)
@@ -64,7 +65,7 @@ effects:
         return np.zeros(n), np.full(n, self.weight / self.tau)
 
 
-def _demand_speeds(effect: Behaviour, scene: Any) -> None:
+def _demand_speeds(effect: Behaviour, scene: SceneView) -> None:
     """Refuse groups that an effect steers and that do not say how fast they would like to go."""
     for k in steered_groups(effect, scene):
         if scene.groups[k].desired_speed is None and scene.groups[k].max_force != 0:
@@ -148,7 +149,7 @@ effects:
         """The gap."""
         return 1
 
-    def check(self, scene: Any) -> None:
+    def check(self, scene: SceneView) -> None:
         """Refuse those who do not say how fast they would like to go."""
         super().check(scene)
         _demand_speeds(self, scene)

@@ -12,6 +12,7 @@ from flockenv.behaviours.behaviour import Moving, steered_groups, top_speed
 from flockenv.geometry.targets import Target
 from flockenv.jit.decorators import Law, Vec, law, like
 from flockenv.maths.vectors import norm, scale, sub
+from flockenv.model.scene_view import SceneView
 from flockenv.physics.effects.effect import Me, Vector
 from flockenv.physics.floor_fields import check_ways, lengths_on, region, starts_of, warn_cut_off, way_ahead, ways_to
 
@@ -69,20 +70,20 @@ effects:
         """Where to, and by which name that was given."""
         return (Target(at=self.target),), ("target",)
 
-    def table(self, scene: Any) -> NDArray[np.float64]:
+    def table(self, scene: SceneView) -> NDArray[np.float64]:
         """The grid of ways."""
         corners = region(scene, self._given[0], self.margin)
         starts = [start for k in steered_groups(self, scene) for start in starts_of(scene, k)]
         return ways_to(scene, *self._given, corners, self.spacing, self.clearance, starts)
 
-    def check_start(self, scene: Any, state: Any) -> None:
+    def check_start(self, scene: SceneView, state: Any) -> None:
         """Warn of agents that begin where no way leads to the target."""
         lost = np.isinf(lengths_on(scene.table_of(self), state.pos))
         for k in set(range(len(scene.groups))) - set(steered_groups(self, scene)):
             lost[:, scene.starts[k] : scene.starts[k + 1]] = False
         warn_cut_off(self._given[1][0], lost, state)
 
-    def check(self, scene: Any) -> None:
+    def check(self, scene: SceneView) -> None:
         """Refuse a torus, obstacles that move, a grid too large, and a target that is in an obstacle."""
         super().check(scene)
         check_ways(scene, self.kind, *self._given, self.margin, self.spacing, self.clearance)

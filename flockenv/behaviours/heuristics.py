@@ -17,6 +17,7 @@ from flockenv.jit.decorators import OPTIONS, Law, Vec, law, like
 from flockenv.jit.intrinsics import stacked
 from flockenv.maths.approximations import nearest_whole
 from flockenv.maths.vectors import add, dot, norm, scale, select, sub, unit, zero
+from flockenv.model.scene_view import SceneView
 from flockenv.physics.effects.effect import Effect, Me, Other, Sight, all_masses, demand_group
 
 __all__ = ["DIRECTIONS", "Heuristics"]
@@ -232,13 +233,13 @@ effects:
             "cosine": math.cos(step), "sine": math.sin(step),
         }  # fmt: skip
 
-    def table(self, scene: Any) -> Floats:
+    def table(self, scene: SceneView) -> Floats:
         """The edges of a torus, and every straight side that stands."""
-        size = scene.space.size if scene.space.periodic else (0.0, 0.0)
+        size = scene.space.extent(2) if scene.space.periodic else (0.0, 0.0)
         sides = [side for shape in scene.shapes for side in _sides(shape)]
         return np.array([*size, *(number for side in sides for number in side)])
 
-    def check(self, scene: Any) -> None:
+    def check(self, scene: SceneView) -> None:
         """Refuse space, obstacles whose sides are not straight or that move, and those without a desired speed."""
         if scene.dimension != 2:
             raise ValueError(f"kind = heuristics: dimension = {scene.dimension}, must be 2")

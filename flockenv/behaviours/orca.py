@@ -12,6 +12,7 @@ from flockenv import steering
 from flockenv.behaviours.behaviour import Moving, top_speed
 from flockenv.jit.decorators import OPTIONS, Law, Vec, law, like
 from flockenv.maths.vectors import scale, select, sub, zero
+from flockenv.model.scene_view import SceneView
 from flockenv.physics.effects.effect import Me, Other, Sight, Vector
 from flockenv.steering import orca
 
@@ -136,7 +137,7 @@ effects:
         """As far as it comes within the horizon, and as it sees."""
         return min(speed * self.horizon, self.radius)
 
-    def check(self, scene: Any) -> None:
+    def check(self, scene: SceneView) -> None:
         """Refuse space."""
         if scene.dimension != 2:
             raise ValueError(f"kind = orca: dimension = {scene.dimension}, must be 2")

@@ -19,6 +19,7 @@ from flockenv.geometry import polyline
 from flockenv.jit.decorators import Law, Vec, law, like
 from flockenv.maths import grid
 from flockenv.maths.vectors import add, norm, scale, select, sub, zero
+from flockenv.model.scene_view import SceneView
 from flockenv.physics.effects.effect import Me, Vector
 
 __all__ = ["FollowFlow", "FollowPath", "StayOnPath"]
@@ -116,18 +117,18 @@ class _OnPath(Moving):
         """All but the path itself, which is in the table."""
         return {"speed": self.limit, "weight": self.weight, "radius": self.radius, "time": self.time}
 
-    def table(self, scene: Any) -> NDArray[np.float64]:
+    def table(self, scene: SceneView) -> NDArray[np.float64]:
         """The path."""
         return polyline.pieces(self.points, self.closed, scene.space)
 
-    def way_shown(self, scene: Any) -> tuple[tuple[Vec, ...], float] | None:
+    def way_shown(self, scene: SceneView) -> tuple[tuple[Vec, ...], float] | None:
         """Its tube: places half a radius apart, at most MOST_PLACES."""
         path = scene.table_of(self)
         count = min(math.ceil(path[1] / (0.5 * self.radius)), MOST_PLACES)
         along = polyline.on_spine(path, np.linspace(0.0, path[1], count + 1), scene.dimension)
         return tuple(map(tuple, scene.space.wrap(along).tolist())), self.radius
 
-    def check(self, scene: Any) -> None:
+    def check(self, scene: SceneView) -> None:
         """Refuse a path of another dimension, or one that a torus makes a point of."""
         if len(self.points[0]) != scene.dimension:
             raise ValueError(f"points[0] = {self.points[0]}: dimension = {scene.dimension}")
@@ -244,7 +245,7 @@ effects:
         gain, slope = gains(self.weight, groups, dimension), slope / self.spacing
         return gain * slope, gain * (1 + slope * self.time)
 
-    def table(self, scene: Any) -> NDArray[np.float64]:
+    def table(self, scene: SceneView) -> NDArray[np.float64]:
         """The grid."""
         low = np.array(self.centre) - self.spacing * (np.array(self.counts) - 1) / 2
         return grid.packed(np.reshape(self.velocities, (*self.counts, -1)), low.tolist(), self.spacing)

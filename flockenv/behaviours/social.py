@@ -18,6 +18,7 @@ from flockenv.behaviours.repulsion import Push
 from flockenv.jit.decorators import Law, Vec, law, like
 from flockenv.maths.approximations import exp
 from flockenv.maths.vectors import dot, limit, scale, select, sub, unit
+from flockenv.model.scene_view import SceneView
 from flockenv.physics.effects.effect import Me, Other, Sight, all_masses, demand_group
 from flockenv.steering import social
 
@@ -67,7 +68,7 @@ class Social(Push):
         """The force so far."""
         return dimension
 
-    def check(self, scene: Any) -> None:
+    def check(self, scene: SceneView) -> None:
         """Refuse a group that is not there."""
         demand_group("group", self.group, scene.groups)
         super().check(scene)

@@ -18,6 +18,7 @@ from pydantic import Field, WrapValidator, model_validator
 from flockenv.behaviours import BEHAVIOURS
 from flockenv.core.record import keep
 from flockenv.jit.decorators import Law, Vec
+from flockenv.model.scene_view import SceneView
 from flockenv.physics.effects.effect import EFFECTS, Effect, demand_group
 from flockenv.steering.arbitration import Allocation, AnyArbitration, Arbitration
 
@@ -111,7 +112,7 @@ class Steer(Effect):
         """Return the same behaviours, all of them idle."""
         return self.model_copy(update={"behaviours": tuple(behaviour.idle() for behaviour in self.behaviours)})
 
-    def check(self, scene: Any) -> None:
+    def check(self, scene: SceneView) -> None:
         """Refuse a group that is not there, and behaviours that do not suit the scene."""
         demand_group("group", self.group, scene.groups)
         for k, behaviour in enumerate(self.behaviours):
@@ -120,7 +121,7 @@ class Steer(Effect):
             except ValueError as error:
                 raise ValueError(f"behaviours[{k}].{error}") from None
 
-    def check_start(self, scene: Any, state: Any) -> None:
+    def check_start(self, scene: SceneView, state: Any) -> None:
         """Let each of its behaviours warn of what the first instant shows."""
         for behaviour in self.behaviours:
             behaviour.check_start(scene, state)

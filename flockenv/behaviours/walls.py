@@ -16,6 +16,7 @@ from flockenv.geometry.shapes.chain import nearest_chain
 from flockenv.geometry.space import Torus
 from flockenv.jit.decorators import Law, Vec, law, like
 from flockenv.maths.vectors import add, dot, lateral, norm, perpendicular, scale, select, sub, unit, zero
+from flockenv.model.scene_view import SceneView
 from flockenv.physics.effects.effect import Me, Obstacle
 
 __all__ = ["Contain", "FollowWall"]
@@ -189,11 +190,11 @@ effects:
         """The shape is a table."""
         return {"speed": self.limit, "weight": self.weight, "time": self.time}
 
-    def table(self, scene: Any) -> NDArray[np.float64]:
+    def table(self, scene: SceneView) -> NDArray[np.float64]:
         """The row of the shape."""
         return packed([self.within], scene.dimension)[0]
 
-    def check(self, scene: Any) -> None:
+    def check(self, scene: SceneView) -> None:
         """Refuse a torus, where there is no outside, and another dimension."""
         super().check(scene)
         if isinstance(scene.space, Torus):

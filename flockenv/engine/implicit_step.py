@@ -7,16 +7,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
+from flockenv.model.scene_view import SceneView
 from flockenv.model.state import WORK, Floats, State
 from flockenv.physics.integrators.implicit import Implicit
 from flockenv.physics.integrators.newton import Coupling, Evaluate, NotSolvedError, coupled
-
-if TYPE_CHECKING:
-    from flockenv.scene import Scene
 
 __all__ = ["coupling_of", "solve_steps"]
 
@@ -28,7 +26,7 @@ MOST_DENSE = 512
 """Coordinates up to which a full matrix of derivatives costs less than GMRES's differences along directions."""
 
 
-def coupling_of(scene: Scene) -> Coupling | None:
+def coupling_of(scene: SceneView) -> Coupling | None:
     """Return who depends on whom; none if agents look around, and are too many for everybody to depend on everybody."""
     if any(e.pair_law or e.far_law for e in scene.parts.effects):
         if scene.agents * scene.dimension > MOST_DENSE:
@@ -45,7 +43,11 @@ def coupling_of(scene: Scene) -> Coupling | None:
 
 
 def solve_steps(
-    scene: Scene, state: State, drive: Floats, steps: int, step: Callable[[State, int, Floats, Floats], tuple[int, int]]
+    scene: SceneView,
+    state: State,
+    drive: Floats,
+    steps: int,
+    step: Callable[[State, int, Floats, Floats], tuple[int, int]],
 ) -> tuple[int, int, str]:
     """Advance every world of a state in place; return the first (world, agent) not finite or not found, and why.
 
@@ -73,7 +75,7 @@ def solve_steps(
 
 
 def _solved(
-    scene: Scene, method: Implicit, alone: State, evaluate: Evaluate,
+    scene: SceneView, method: Implicit, alone: State, evaluate: Evaluate,
     step: Callable[[State, int, Floats, Floats], tuple[int, int]],
 ) -> tuple[int, str]:  # fmt: skip
     """Advance one world by one step; return the agent that is not finite or was not found, or -1, and what happened."""
@@ -103,7 +105,7 @@ def _put(state: State, b: int, alone: State) -> None:
         getattr(state, name)[b] = getattr(alone, name)[0]
 
 
-def _evaluation(scene: Scene, alone: State, drive: Floats) -> Evaluate:
+def _evaluation(scene: SceneView, alone: State, drive: Floats) -> Evaluate:
     """Return the scene's law as Newton's method asks for it: many instants of one world are so many worlds."""
     d, n = scene.dimension, scene.agents
     portion = max(1, MOST_NUMBERS // (d * n))

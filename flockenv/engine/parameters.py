@@ -9,7 +9,7 @@ from __future__ import annotations
 import functools
 import math
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 import numpy as np
 
@@ -19,8 +19,9 @@ from flockenv.jit.section import joined_from, record, section, tuple_from
 from flockenv.maths.vectors import add
 
 if TYPE_CHECKING:
-    from flockenv.engine.kernel_plan import Parts
+    from flockenv.geometry.space import Space
     from flockenv.physics.effects.effect import Effect
+    from flockenv.physics.integrators.integrator import Integrator
 
 __all__ = [
     "Form",
@@ -99,7 +100,69 @@ def view_of(fov: float, dtype: str) -> float:
     return cosine * abs(cosine)
 
 
-def pack_numbers(parts: Parts) -> tuple[list[float], NumberPlan]:
+class Numbered(Protocol):
+    """What is packed: the members of a kernel's plan that hold numbers."""
+
+    @property
+    def dimension(self) -> int:
+        """D."""
+
+    @property
+    def dtype(self) -> str:
+        """The precision of all numbers."""
+
+    @property
+    def space(self) -> Space:
+        """Where agents are."""
+
+    @property
+    def effects(self) -> tuple[Effect, ...]:
+        """What acts on them."""
+
+    @property
+    def integrator(self) -> Integrator:
+        """The method."""
+
+    @property
+    def shaped(self) -> tuple[Any, dict[Any, tuple[int, int]]]:
+        """Rows of shapes, and where those of each form lie."""
+
+    @property
+    def cells(self) -> dict[Any, Any]:
+        """The grids of forms that have one."""
+
+    @property
+    def tables(self) -> tuple[Any, ...]:
+        """What the laws of each tabled effect look up."""
+
+    @property
+    def reach(self) -> float:
+        """The largest reach of a pair law, m."""
+
+    @property
+    def sights(self) -> Any:
+        """The fields of view of pair laws, each once."""
+
+    @property
+    def starts(self) -> tuple[int, ...]:
+        """The first agent of each group, and N."""
+
+    @property
+    def counters(self) -> int:
+        """How many places count what laws report."""
+
+    @property
+    def look(self) -> Any:
+        """What a task shows its agents, if it shows any."""
+
+    def numbers_of(self, effect: Effect) -> dict[str, Any]:
+        """Return the numbers of an effect by name."""
+
+    def names_of(self, effect: Effect) -> Any:
+        """Return the names of the fields that its laws read."""
+
+
+def pack_numbers(parts: Numbered) -> tuple[list[float], NumberPlan]:
     """Return every number that a kernel is given, and where each lies; tables come behind them.
 
     What lies behind (rows of shapes, grids, tables) is known by where it begins, and a table by where it ends, too.
@@ -148,7 +211,7 @@ def pack_numbers(parts: Parts) -> tuple[list[float], NumberPlan]:
     return values, NumberPlan(parts.dimension, tuple(planned_forms), tuple(views), tuple(effects), *rest)
 
 
-def _look_numbers(parts: Parts) -> list[float]:
+def _look_numbers(parts: Numbered) -> list[float]:
     """Return how far a task looks around, m, and the square of that; nothing if it does not."""
     return [parts.look.radius, parts.look.radius**2] if parts.look else []
 
@@ -251,7 +314,7 @@ class Images(NamedTuple):
     offset_to: Law
 
 
-def images_in(parts: Parts, effect: Effect) -> Images | None:
+def images_in(parts: Numbered, effect: Effect) -> Images | None:
     """Return which numbers of an effect have images in the space of a scene; None if none has."""
     if not (parts.space.periodic and effect.places):
         return None

@@ -7,6 +7,8 @@ from typing import Any
 
 import numpy as np
 
+from flockenv.model.scene_view import SceneView
+
 __all__ = ["FARTHEST", "check_places"]
 
 FARTHEST = 10_000.0
@@ -16,7 +18,7 @@ At 32,768 m somebody with 1 m/s does not move at all in steps of 1 ms (numerics.
 """
 
 
-def check_places(scene: Any) -> None:
+def check_places(scene: SceneView) -> None:
     """Refuse a float32 scene with a place beyond FARTHEST; what moves there later is not looked after."""
     if scene.dtype != "float32":
         return
@@ -30,7 +32,7 @@ def check_places(scene: Any) -> None:
             )
 
 
-def _places(scene: Any) -> Iterator[tuple[str, Any]]:
+def _places(scene: SceneView) -> Iterator[tuple[str, Any]]:
     """Every place that a scene names, and its key."""
     yield "space.size", getattr(scene.space, "size", ())
     for k, group in enumerate(scene.groups):

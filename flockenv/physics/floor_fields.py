@@ -19,6 +19,7 @@ from flockenv.geometry.targets import Target, to_any
 from flockenv.jit.decorators import Vec, law
 from flockenv.maths.grid import MOST_POINTS, covers, sample, sample_vector, sampled
 from flockenv.maths.vectors import norm, select, unit
+from flockenv.model.scene_view import SceneView
 
 __all__ = [ "check_ways", "lengths_on", "region", "starts_of", "towards", "warn_cut_off", "way_ahead",
     "way_block", "ways_to",
@@ -51,7 +52,7 @@ def towards(table: Any, x: Vec) -> tuple[float, Vec]:
     return near if close else length, select(close, unit(straight), direction)
 
 
-def region(scene: Any, targets: Sequence[Target], margin: float) -> tuple[Floats, Floats]:
+def region(scene: SceneView, targets: Sequence[Target], margin: float) -> tuple[Floats, Floats]:
     """Return the corners of the grid: a box's own, or all that there is and a margin around it."""
     size = getattr(scene.space, "size", None)
     if size is not None:
@@ -68,7 +69,7 @@ def region(scene: Any, targets: Sequence[Target], margin: float) -> tuple[Floats
     return every.min(axis=0) - margin, every.max(axis=0) + margin
 
 
-def starts_of(scene: Any, which: int | None) -> list[Start]:
+def starts_of(scene: SceneView, which: int | None) -> list[Start]:
     """Return the boxes in which agents of a group begin or are born, of all groups for None; of a network, none."""
     size = getattr(scene.space, "size", None)
     found = []
@@ -104,7 +105,7 @@ def warn_cut_off(name: str, lost: NDArray[np.bool_], state: Any) -> None:
 
 
 def ways_to(
-    scene: Any, targets: Sequence[Target], names: Sequence[str], corners: tuple[Floats, Floats], spacing: float,
+    scene: SceneView, targets: Sequence[Target], names: Sequence[str], corners: tuple[Floats, Floats], spacing: float,
     clearance: float, starts: Sequence[Start] = (),
 ) -> Floats:  # fmt: skip
     """Return the grid of ways to the nearest of some targets."""
@@ -113,7 +114,7 @@ def ways_to(
 
 
 def way_block(
-    scene: Any, targets: Sequence[Target], names: Sequence[str], corners: tuple[Floats, Floats], spacing: float,
+    scene: SceneView, targets: Sequence[Target], names: Sequence[str], corners: tuple[Floats, Floats], spacing: float,
     clearance: float, starts: Sequence[Start] = (),
 ) -> Floats:  # fmt: skip
     """Return what `towards` reads: the targets, as far as somebody can get there, and the grid of ways to them.
@@ -128,7 +129,7 @@ def way_block(
 
 
 def check_ways(
-    scene: Any, kind: str, targets: Sequence[Target], names: Sequence[str], margin: float, spacing: float,
+    scene: SceneView, kind: str, targets: Sequence[Target], names: Sequence[str], margin: float, spacing: float,
     clearance: float,
 ) -> None:  # fmt: skip
     """Refuse what no way can be found for: a torus, obstacles that move, walls that a grid misses, too large a grid."""

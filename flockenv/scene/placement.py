@@ -10,13 +10,13 @@ from numpy.typing import NDArray
 
 from flockenv.geometry.shapes import clear_of
 from flockenv.jit.section import entry
+from flockenv.model.scene_view import SceneView
 from flockenv.model.spawn import Spawn, cells, scatter
 from flockenv.model.state import Floats, State
 from flockenv.physics.population import Emitter
 
 if TYPE_CHECKING:
     from flockenv.model.group import Group
-    from flockenv.scene import Scene
 
 __all__ = ["cells_of", "place_groups"]
 
@@ -26,7 +26,7 @@ ROUNDS = 256
 """Most draws of a place for an agent that would begin in an obstacle that is no circle."""
 
 
-def cells_of(scene: Scene) -> Cells:
+def cells_of(scene: SceneView) -> Cells:
     """Return the initial cells' middles of groups that have a cell per agent, (size, D) m; none for other groups.
 
     ValueError that names the group and the field if they have no room.
@@ -36,7 +36,7 @@ def cells_of(scene: Scene) -> Cells:
     )
 
 
-def place_groups(scene: Scene, state: State, middles: Cells) -> None:
+def place_groups(scene: SceneView, state: State, middles: Cells) -> None:
     """Write the first instant of a state: positions, velocities, headings, and which agents live.
 
     middles: those of `cells_of`.
@@ -51,17 +51,17 @@ def place_groups(scene: Scene, state: State, middles: Cells) -> None:
     _face(scene, state)
 
 
-def _period(scene: Scene) -> NDArray[np.float64]:
+def _period(scene: SceneView) -> NDArray[np.float64]:
     """Return the edges of a torus, (D,) m; zeros for other spaces."""
     return np.array(scene.space.extent(scene.dimension) if scene.space.periodic else (0.0,) * scene.dimension, float)
 
 
-def _corners(scene: Scene, spawn: Spawn) -> tuple[Sequence[float], Sequence[float]]:
+def _corners(scene: SceneView, spawn: Spawn) -> tuple[Sequence[float], Sequence[float]]:
     """Return the box that agents begin in, m."""
     return spawn.low or (0.0,) * scene.dimension, spawn.high or scene.space.extent(scene.dimension)
 
 
-def _cells(scene: Scene, k: int, group: Group) -> Floats:
+def _cells(scene: SceneView, k: int, group: Group) -> Floats:
     """Return the middles of a group's cells, (size, D) m."""
     try:
         box = _corners(scene, group.spawn)
@@ -70,7 +70,7 @@ def _cells(scene: Scene, k: int, group: Group) -> Floats:
         raise ValueError(f"groups[{k}].spawn.{error}") from None
 
 
-def _scatter(scene: Scene, state: State, b: int, first: int, group: Group, middles: Floats | None) -> None:
+def _scatter(scene: SceneView, state: State, b: int, first: int, group: Group, middles: Floats | None) -> None:
     """Write a group's initial positions in one world: anywhere in its box, or each near the middle of its cell."""
     spawn, d, period = group.spawn, scene.dimension, _period(scene)
     low, high = (np.array(corner, float) for corner in _corners(scene, spawn))
@@ -94,7 +94,7 @@ def _scatter(scene: Scene, state: State, b: int, first: int, group: Group, middl
         tried[mine] += inside
 
 
-def _tie(scene: Scene, state: State, b: int, first: int, group: Group) -> None:
+def _tie(scene: SceneView, state: State, b: int, first: int, group: Group) -> None:
     """Write initial positions of a network's particles in one world, and their common velocity."""
     assert group.network is not None
     mine = slice(first, first + group.size)
@@ -105,7 +105,7 @@ def _tie(scene: Scene, state: State, b: int, first: int, group: Group) -> None:
         state.vel[b, first + group.network.pins()] = 0
 
 
-def _bury(scene: Scene, state: State) -> None:
+def _bury(scene: SceneView, state: State) -> None:
     """Empty the slots of agents that do not live at the start, placed where an emitter may bring them to life."""
     for k, (first, alive) in enumerate(zip(scene.starts, scene.living, strict=False)):
         dead = slice(first + alive, scene.starts[k + 1])
@@ -117,7 +117,7 @@ def _bury(scene: Scene, state: State) -> None:
             state.pos[:, dead] = feeding[0].place.extremes.mean(axis=0)
 
 
-def _face(scene: Scene, state: State) -> None:
+def _face(scene: SceneView, state: State) -> None:
     """Write the initial headings: along the velocity, or the heading of the group."""
     for first, group in zip(scene.starts, scene.groups, strict=False):
         if scene.parts.oriented and group.spawn.heading is not None:

@@ -18,12 +18,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flockenv.core.warnings import CoarseContactWarning, LookaheadWarning, UnstableStepWarning
+from flockenv.model.scene_view import SceneView
 from flockenv.model.state import blank
 from flockenv.physics.integrators.integrator import Integrator
 
 if TYPE_CHECKING:
+    from flockenv.model.group import Group
     from flockenv.physics.effects.effect import Effect
-    from flockenv.scene import Group, Scene
 
 __all__ = [
     "Suggestion",
@@ -163,7 +164,7 @@ class _Rates(NamedTuple):
         return float(self.square[agent]), float(self.damping[agent]), float(self.told[agent])
 
 
-def suggest_dt(scene: Scene) -> Suggestion:
+def suggest_dt(scene: SceneView) -> Suggestion:
     """Return the largest stable step of a scene, from its effects' own stiffness, and the effect that sets it.
 
     Stiffness is a bound (Gershgorin's circles for springs), so the limit is on the safe side; what is only stiff in
@@ -175,7 +176,7 @@ def suggest_dt(scene: Scene) -> Suggestion:
     return _suggested(scene, _found(scene))
 
 
-def _suggested(scene: Scene, found: list[tuple[Effect, _Rates]]) -> Suggestion:
+def _suggested(scene: SceneView, found: list[tuple[Effect, _Rates]]) -> Suggestion:
     """Return the largest step that is stable under some effects of a scene."""
     if not found:
         return Suggestion(math.inf, None, None, 0.0, 0.0)
@@ -194,7 +195,7 @@ def _urgency(method: Integrator, square: float, damping: float, told: float) -> 
     return _limit_of(method, square, damping, told), -max(math.sqrt(square), damping + told)
 
 
-def _found(scene: Scene) -> list[tuple[Effect, _Rates]]:
+def _found(scene: SceneView) -> list[tuple[Effect, _Rates]]:
     """Return those effects that know how stiff they are, and how stiff that is."""
     out = []
     for k, effect in enumerate(scene.effects):
@@ -234,7 +235,7 @@ def _limit_of(method: Integrator, square: float, damping: float, told: float) ->
     return limit(method, zeta, own) / frequency
 
 
-def check_dt(scene: Scene) -> None:
+def check_dt(scene: SceneView) -> None:
     """Warn where dt is beyond the largest stable step, naming limit and effect; refuse where it must blow up.
 
     Behaviours that act now and then, or within bounds, do not make it blow up: see `Effect.always`.
@@ -248,7 +249,7 @@ def check_dt(scene: Scene) -> None:
     warnings.warn(_too_long(scene, found), UnstableStepWarning, stacklevel=2)
 
 
-def _too_long(scene: Scene, found: Suggestion) -> str:
+def _too_long(scene: SceneView, found: Suggestion) -> str:
     """Say which step is stable, and what sets it, in one line."""
     kind, text = scene.integrator.kind, f"{found.frequency:.4g} rad/s, {found.damping:.4g} 1/s at agent {found.agent}"
     if found.dt == 0:
@@ -263,13 +264,13 @@ def _too_long(scene: Scene, found: Suggestion) -> str:
     return f"dt = {scene.dt:g} s: {kind} with {found.effect} ({text}): {limit_text}"
 
 
-def _growing(scene: Scene, found: Suggestion) -> float:
+def _growing(scene: SceneView, found: Suggestion) -> float:
     """Return the time in which an undamped oscillation grows e-fold at the scene's dt, s; inf if rounding hides it."""
     rate = math.log(float(growth(scene.integrator, np.array([scene.dt * found.frequency]), 0.0)[0]))
     return scene.dt / rate if rate > 0 else math.inf
 
 
-def _blows_up(scene: Scene, found: Suggestion) -> bool:
+def _blows_up(scene: SceneView, found: Suggestion) -> bool:
     """True if an amplitude grows a hundredfold within a hundred steps, even if all rates are far below their bounds."""
     y = np.array([scene.dt * found.frequency / CERTAIN])
     if found.damping > 1e4 * found.frequency:
@@ -299,7 +300,7 @@ def contact_limit(method: Integrator) -> float:
     return low
 
 
-def check_contact(scene: Scene) -> None:
+def check_contact(scene: SceneView) -> None:
     """Warn where bodies that should bounce are in contact for too few steps, naming the limit, and what comes of it."""
     for k, effect in enumerate(scene.effects):
         acting = effect if scene.obstacles else effect.in_the_open()
@@ -319,7 +320,7 @@ def check_contact(scene: Scene) -> None:
             warnings.warn(message, CoarseContactWarning, stacklevel=2)
 
 
-def _what_comes_of_it(scene: Scene, frequency: float, agent: int) -> str:
+def _what_comes_of_it(scene: SceneView, frequency: float, agent: int) -> str:
     """Say how much faster bodies come out of an undamped contact at this dt, and from where on it is unstable."""
     method, y = scene.integrator, scene.dt * frequency
     if method.adaptive:
@@ -333,7 +334,7 @@ def _what_comes_of_it(scene: Scene, frequency: float, agent: int) -> str:
     return text + (f"; bodies that stay in it do not come to rest above {most:.3g} s" if scene.dt > most else "")
 
 
-def check_lookahead(scene: Scene) -> None:
+def check_lookahead(scene: SceneView) -> None:
     """Warn of those who look ahead less far than it takes them to stop: V^2 m/(2 F), and their radius."""
     for k, effect in enumerate(scene.effects):
         several = [(f"effects[{k}].behaviours[{j}]", each) for j, each in enumerate(effect.wishes)]

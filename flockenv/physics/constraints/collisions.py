@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from typing import Any, ClassVar, Literal
+from typing import ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +14,7 @@ from flockenv.geometry.cell_list import MAX_RANGES
 from flockenv.geometry.shapes import HalfSpace, packed
 from flockenv.geometry.space import Box, Torus
 from flockenv.jit.section import entry
+from flockenv.model.scene_view import SceneView
 from flockenv.model.state import WORK, Floats, State
 from flockenv.physics.constraints.bodies import Bodies, Meetings, Rules, Things
 from flockenv.physics.constraints.collision_step import COUNTED, LOST, collide
@@ -71,15 +72,15 @@ class Collisions(Constraint):
     again: ClassVar[int] = 30
     """Impacts of the same two bodies in one step under `back_up`."""
 
-    def check(self, scene: Any) -> None:
+    def check(self, scene: SceneView) -> None:
         """Refuse what cannot be right: twice the same constraint, and bodies as wide as a periodic box."""
         if sum(isinstance(other, Collisions) for other in scene.constraints) > 1:
             raise ValueError("kind = collisions: there is another; a scene has its collisions once")
         widest = max(group.widest for group in scene.groups)
-        if isinstance(scene.space, Torus) and 4 * widest > min(scene.space.size):
+        if isinstance(scene.space, Torus) and 4 * widest > min(scene.space.extent(scene.dimension)):
             raise ValueError(
                 f"kind = collisions: bodies of radius {widest:g} m meet their own images on a torus of size "
-                f"{scene.space.size}; at most a quarter of its shortest edge is allowed"
+                f"{scene.space.extent(scene.dimension)}; at most a quarter of its shortest edge is allowed"
             )
 
     def calls_for(self) -> tuple[str, ...]:
@@ -87,11 +88,11 @@ class Collisions(Constraint):
         asked = ("neighbour query", self.agents), ("obstacles", self.obstacles)
         return tuple(what for what, is_met in asked if is_met)
 
-    def numbers(self, scene: Any) -> int:
+    def numbers(self, scene: SceneView) -> int:
         """Bodies, ends, and room for meetings."""
         return int(8 * scene.dimension + 12 + self.capacity * (12 + 4 * scene.dimension))
 
-    def settler(self, scene: Any) -> Settler:
+    def settler(self, scene: SceneView) -> Settler:
         """Return what mends a step."""
         return _Settler(self, scene)
 
@@ -99,10 +100,12 @@ class Collisions(Constraint):
 class _Settler:
     """Mends steps of one scene, with scratch of its own."""
 
-    def __init__(self, record: Collisions, scene: Any) -> None:
+    def __init__(self, record: Collisions, scene: SceneView) -> None:
         n, d = scene.agents, scene.dimension
         self.record, self.scene, self.told = record, scene, False
-        self.period = tuple(float(s) for s in scene.space.size) if scene.space.periodic else (0.0,) * d
+        self.period = (
+            tuple(float(s) for s in scene.space.extent(scene.dimension)) if scene.space.periodic else (0.0,) * d
+        )
         start, at, vel, acc, free, excess = (np.zeros((n, d)) for _ in range(6))
         body = scene.body
         light = np.where(np.isfinite(body.mass), 1 / np.asarray(body.mass, float), 0.0)
@@ -148,7 +151,7 @@ class _Settler:
             for k in range(d):
                 for side in (0, 1):
                     point = [0.0] * d
-                    point[k] = side * scene.space.size[k]
+                    point[k] = side * scene.space.extent(scene.dimension)[k]
                     out = [0.0] * d
                     out[k] = 1.0 - 2.0 * side
                     shapes.append(HalfSpace(point=tuple(point), direction=tuple(out)))

@@ -13,6 +13,7 @@ from collections.abc import Callable
 from typing import Any
 
 from flockenv.core.record import Record
+from flockenv.model.scene_view import SceneView
 from flockenv.model.state import Floats, State
 
 __all__ = ["CONSTRAINTS", "Constraint", "Settler"]
@@ -39,17 +40,17 @@ class Constraint(Record):
         if "kind" in vars(cls).get("__annotations__", {}):
             CONSTRAINTS[cls.model_fields["kind"].default] = cls
 
-    def check(self, scene: Any) -> None:
+    def check(self, scene: SceneView) -> None:
         """Refuse a scene that this cannot be demanded of: ValueError that begins with the field's name."""
 
     def calls_for(self) -> tuple[str, ...]:
         """What it makes a scene compute beside itself, in words, as effects say it."""
         return ()
 
-    def numbers(self, scene: Any) -> int:
+    def numbers(self, scene: SceneView) -> int:
         """How many numbers of scratch it takes per agent."""
         return 0
 
     @abstractmethod
-    def settler(self, scene: Any) -> Settler:
+    def settler(self, scene: SceneView) -> Settler:
         """Return what mends a step, with scratch of its own."""

@@ -15,6 +15,7 @@ from flockenv.jit.decorators import finite, kernel, like
 from flockenv.jit.section import entry
 from flockenv.maths.approximations import nearest_whole
 from flockenv.model.networks import EDGE
+from flockenv.model.scene_view import SceneView
 from flockenv.model.state import Floats, State
 from flockenv.physics.constraints.constraint import Constraint, Settler
 
@@ -305,7 +306,7 @@ class Rods(Constraint):
                 raise ValueError(f"pairs[{k}] = {pair}: is pairs[{seen[frozenset(pair)]}] again")
         return self
 
-    def ties(self, scene: Any) -> Ties:
+    def ties(self, scene: SceneView) -> Ties:
         """Return who is held to whom in a scene; ValueError if it has no such network or agents."""
         d = scene.dimension
         if self.group is None:
@@ -321,7 +322,7 @@ class Rods(Constraint):
         i, j = springs.i[edges], springs.j[edges]
         return _layered(Ties(i + np.int32(first), j + np.int32(first), springs.rest[edges], points[j] - points[i]))
 
-    def check(self, scene: Any) -> None:
+    def check(self, scene: SceneView) -> None:
         """Refuse agents and networks that are not there, newborn ends, and lengths that reach around a torus."""
         ties = self.ties(scene)
         most = int(max(ties.i.max(initial=0), ties.j.max(initial=0)))
@@ -339,12 +340,12 @@ class Rods(Constraint):
                 f"{min(scene.space.size) / 2:g} m, is allowed"
             )
 
-    def numbers(self, scene: Any) -> int:
+    def numbers(self, scene: SceneView) -> int:
         """Of each pair what `Hold` lists; and a copy of where everybody is, and how fast."""
         d = int(scene.dimension)
         return 2 * d - (-(6 + d) * len(self.ties(scene).i) // int(scene.agents))
 
-    def settler(self, scene: Any) -> Settler:
+    def settler(self, scene: SceneView) -> Settler:
         """Return what mends a step, with scratch of its own; it warns once if lengths are not met."""
         ties, real, d = self.ties(scene), np.dtype(scene.dtype).type, scene.dimension
         weight = (1 / scene.body.mass).astype(real)  # who is held in place has an infinite mass

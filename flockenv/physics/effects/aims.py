@@ -9,6 +9,7 @@ from pydantic import Field
 
 from flockenv.jit.decorators import Law, Vec, law, like
 from flockenv.maths.vectors import norm, scale, select, sub, unit, zero
+from flockenv.model.scene_view import SceneView
 from flockenv.physics.effects.effect import Effect, Me, Vector, demand_group
 
 __all__ = ["Aim", "Antipode", "Course", "Goal", "about", "easing"]
@@ -41,7 +42,7 @@ class Aim(Effect):
         first, end = (0, starts[-1]) if self.group is None else starts[self.group : self.group + 2]
         return {"first": float(first), "end": float(end)}
 
-    def check(self, scene: Any) -> None:
+    def check(self, scene: SceneView) -> None:
         """Refuse a group that is not there."""
         demand_group("group", self.group, scene.groups)
         super().check(scene)
@@ -84,7 +85,7 @@ class Course(Aim):
         """The way, and how fast."""
         return {"direction": self.direction, "share": self.share}
 
-    def check(self, scene: Any) -> None:
+    def check(self, scene: SceneView) -> None:
         """Refuse a direction of length 0."""
         if not any(self.direction):
             raise ValueError(f"direction = {self.direction}: leads nowhere; give a vector that is not 0")
@@ -132,7 +133,7 @@ class Antipode(Aim):
         """What is crossed."""
         return {"centre": self.centre, "slow_radius": self.slow_radius, "share": self.share}
 
-    def check(self, scene: Any) -> None:
+    def check(self, scene: SceneView) -> None:
         """Refuse a torus, where two ways lead across, and space."""
         super().check(scene)
         if scene.space.periodic or scene.dimension != 2:

@@ -12,6 +12,7 @@ from pydantic import Field
 
 from flockenv.jit.decorators import Law, Vec, law, like
 from flockenv.maths.vectors import add, dot, norm, scale, select, sub, unit, zero
+from flockenv.model.scene_view import SceneView
 from flockenv.physics.effects.effect import Effect, Me, Obstacle, Other, Sight, all_masses
 from flockenv.steering.others import ONE_PLACE
 
@@ -206,7 +207,7 @@ class Contact(_Solid):
         """The force so far."""
         return dimension
 
-    def check(self, scene: Any) -> None:
+    def check(self, scene: SceneView) -> None:
         """Refuse a radius at which two bodies overlap already, and bodies that touch around a torus."""
         super().check(scene)
         touch = scene.touching if scene.agents > 1 else 0.0
@@ -214,10 +215,10 @@ class Contact(_Solid):
             raise ValueError(
                 f"radius = {self.radius:g}: two bodies touch at up to {touch:g} m; at least that is allowed"
             )
-        if scene.space.periodic and touch > min(scene.space.size) / 2:
+        if scene.space.periodic and touch > min(scene.space.extent(scene.dimension)) / 2:
             raise ValueError(
                 f"kind = {self.kind}: two bodies touch at up to {touch:g} m; at most half the torus's shortest edge, "
-                f"{min(scene.space.size) / 2:g} m, is allowed"
+                f"{min(scene.space.extent(scene.dimension)) / 2:g} m, is allowed"
             )
 
     def rates(self, groups: Sequence[Any], dimension: int) -> tuple[Floats, Floats]:

@@ -66,6 +66,7 @@ from pydantic import Field
 from flockenv.core.record import Record
 from flockenv.jit.decorators import Law, Vec, law, like
 from flockenv.maths.vectors import dot
+from flockenv.model.scene_view import SceneView
 
 __all__ = [
     "EFFECTS", "LAWS", "Bonds", "Effect", "Far", "Me", "Members", "Obstacle", "Other", "Sight", "Vector", "all_masses",
@@ -377,14 +378,14 @@ class Effect(Record):
             }
         )
 
-    def table(self, scene: Any) -> NDArray[np.float64]:
+    def table(self, scene: SceneView) -> NDArray[np.float64]:
         """Return the numbers that its laws look up as `p.table`, (T,), T >= 1: as many as the scene calls for.
 
         Asked for when a scene is built, after `check`; they are arguments, another table compiles nothing.
         """
         raise TypeError(f"{type(self).__name__} has no table")
 
-    def way_shown(self, scene: Any) -> tuple[tuple[Vec, ...], float] | None:
+    def way_shown(self, scene: SceneView) -> tuple[tuple[Vec, ...], float] | None:
         """Return the way that it is about, for pictures: places along it, m, and half its width, m; or none."""
         return None
 
@@ -406,7 +407,7 @@ class Effect(Record):
         """
         return None
 
-    def check(self, scene: Any) -> None:
+    def check(self, scene: SceneView) -> None:
         """Refuse, with a ValueError that begins with the name of a field, a scene that does not suit it.
 
         Vectors have the dimension of the scene, and it sees a group that is there: whoever overrides this asks for that
@@ -418,7 +419,7 @@ class Effect(Record):
         if self.sight is not None:
             demand_group("group", self.sight.group, scene.groups)
 
-    def check_start(self, scene: Any, state: Any) -> None:
+    def check_start(self, scene: SceneView, state: Any) -> None:
         """Warn of what only the first instant of a scene shows: where its agents begin."""
 
     def parameters(self) -> dict[str, float | Vec]:

@@ -12,6 +12,7 @@ from flockenv.geometry.eikonal import NO_WAY
 from flockenv.geometry.targets import Target, passed, row_size
 from flockenv.jit.decorators import Law, Vec, law, like
 from flockenv.maths.vectors import scale, sub, unit, zero
+from flockenv.model.scene_view import SceneView
 from flockenv.physics.effects.aims import about
 from flockenv.physics.effects.effect import Me
 from flockenv.physics.effects.floor_field import Around
@@ -180,7 +181,7 @@ class Routes(Around):
         numbers = {name: float(getattr(self, name)) for name in ("share", "period", "hysteresis")}
         return {**numbers, "many": float(len(self.doors)), "bins": float(BINS), "size": float(HEAD + row_size(2))}
 
-    def table(self, scene: Any) -> NDArray[np.float64]:
+    def table(self, scene: SceneView) -> NDArray[np.float64]:
         """How long a piece of a way is, a row for each door, and the ways to each."""
         blocks = [self.ways(scene, (door,), (name,)) for door, name in zip(*self.goals, strict=True)]
         begin = 1 + len(self.doors) * (HEAD + row_size(2))
@@ -190,12 +191,12 @@ class Routes(Around):
         longest = float(lengths[lengths < NO_WAY].max())
         return np.concatenate([[max(longest, self.spacing) / (BINS - 1)], np.ravel(rows), *blocks])
 
-    def grids(self, scene: Any) -> list[NDArray[np.float64]]:
+    def grids(self, scene: SceneView) -> list[NDArray[np.float64]]:
         """Return the grid of ways to each door."""
         table, size = scene.table_of(self), HEAD + row_size(2)
         return [table[int(table[1 + k * size]) + 2 + row_size(2) :] for k in range(len(self.doors))]
 
-    def check(self, scene: Any) -> None:
+    def check(self, scene: SceneView) -> None:
         """Refuse space, a torus, and those who do not say how fast they would like to go."""
         if scene.dimension != 2 or scene.space.periodic:
             raise ValueError(f"kind = {self.kind}: only a plane or a box of dimension 2 is allowed")

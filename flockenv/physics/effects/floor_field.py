@@ -11,6 +11,7 @@ from pydantic import Field
 from flockenv.geometry.targets import Target, row_size
 from flockenv.jit.decorators import Law, Vec, law, like
 from flockenv.maths.vectors import scale, select, zero
+from flockenv.model.scene_view import SceneView
 from flockenv.physics.effects.aims import Aim, about
 from flockenv.physics.effects.effect import Me
 from flockenv.physics.floor_fields import check_ways, lengths_on, region, starts_of, towards, warn_cut_off, way_block
@@ -41,7 +42,7 @@ class Around(Aim):
     needs_all: ClassVar[bool] = False
     """True if an agent visits all of its targets, False if one of them is enough."""
 
-    def ways(self, scene: Any, targets: tuple[Target, ...], names: tuple[str, ...]) -> NDArray[np.float64]:
+    def ways(self, scene: SceneView, targets: tuple[Target, ...], names: tuple[str, ...]) -> NDArray[np.float64]:
         """Return the block of ways to the nearest of some targets; see flockenv.physics.floor_fields."""
         corners = region(scene, self.goals[0], self.margin)
         starts = starts_of(scene, self.group)
@@ -52,7 +53,7 @@ class Around(Aim):
         """All its targets, and how errors name them."""
         raise NotImplementedError
 
-    def check(self, scene: Any) -> None:
+    def check(self, scene: SceneView) -> None:
         """Refuse a torus, obstacles that move, too large a grid, targets in obstacles, or that no way leads to."""
         super().check(scene)
         if self.keeps:
@@ -60,11 +61,11 @@ class Around(Aim):
         check_ways(scene, self.kind, *self.goals, self.margin, self.spacing, self.clearance)
         scene.table_of(self)
 
-    def grids(self, scene: Any) -> list[NDArray[np.float64]]:
+    def grids(self, scene: SceneView) -> list[NDArray[np.float64]]:
         """Return the grids of ways, one for each target or set of targets that agents are led to."""
         raise TypeError(f"{type(self).__name__} has no grids of ways")
 
-    def check_start(self, scene: Any, state: Any) -> None:
+    def check_start(self, scene: SceneView, state: Any) -> None:
         """Warn of agents that begin where no way leads to any target, or to a stage of a journey."""
         first, end = (int(k) for k in self.members(scene.starts).values())
         lengths = np.array([lengths_on(grid, state.pos[:, first:end]) for grid in self.grids(scene)])
@@ -75,7 +76,7 @@ class Around(Aim):
         warn_cut_off(" or ".join(self.goals[1]), lost, state)
 
 
-def _alone(effect: Aim, scene: Any) -> None:
+def _alone(effect: Aim, scene: SceneView) -> None:
     """Refuse another effect that keeps the same numbers of the same agents: changes would add up."""
     first, end = effect.members(scene.starts).values()
     for k, other in enumerate(scene.effects):
@@ -108,14 +109,14 @@ class Way(Around):
         """What the law reads beside the table."""
         return {"slow_radius": self.slow_radius, "share": self.share}
 
-    def table(self, scene: Any) -> NDArray[np.float64]:
+    def table(self, scene: SceneView) -> NDArray[np.float64]:
         """Its targets and the grid of ways to the nearest."""
         return self.ways(scene, *self.goals)
 
-    def lengths(self, scene: Any, points: ArrayLike) -> NDArray[np.float64]:
+    def lengths(self, scene: SceneView, points: ArrayLike) -> NDArray[np.float64]:
         """Return the way's length from points (..., D), (...) m; inf where no way leads, outside as at the edge."""
         return lengths_on(self.grids(scene)[0], points)
 
-    def grids(self, scene: Any) -> list[NDArray[np.float64]]:
+    def grids(self, scene: SceneView) -> list[NDArray[np.float64]]:
         """Return the one grid of ways to the nearest target."""
         return [scene.table_of(self)[2 + len(self.targets) * row_size(scene.dimension) :]]

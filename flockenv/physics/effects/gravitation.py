@@ -17,6 +17,7 @@ from pydantic import Field
 
 from flockenv.jit.decorators import Law, Vec, law
 from flockenv.maths.vectors import scale
+from flockenv.model.scene_view import SceneView
 from flockenv.model.state import State
 from flockenv.physics.effects.effect import Effect, Far, Me, all_masses
 
@@ -71,7 +72,7 @@ class Gravitation(_Softened):
     far_law: ClassVar[Law | None] = gravitation
     strengths: ClassVar[tuple[str, ...]] = ("constant",)
 
-    def check(self, scene: Any) -> None:
+    def check(self, scene: SceneView) -> None:
         """Refuse who would pull infinitely: whoever is held in place by an infinite mass."""
         for k, group in enumerate(scene.groups):
             if not np.isfinite(group.masses(scene.dimension)).all():

@@ -17,6 +17,7 @@ from pydantic import Field, model_validator
 from flockenv.jit.decorators import Law, Vec, law, like
 from flockenv.maths.counter_rng import uniform
 from flockenv.maths.vectors import norm, planar
+from flockenv.model.scene_view import SceneView
 from flockenv.physics.effects.effect import Effect, Me, Other, Sight, demand_group
 from flockenv.steering import motivation
 
@@ -58,7 +59,7 @@ class _Urge(Effect):
             found |= {first: float(low), end: float(high)}
         return found
 
-    def check(self, scene: Any) -> None:
+    def check(self, scene: SceneView) -> None:
         """Refuse groups that are not there."""
         for name in ("group", "other"):
             demand_group(name, getattr(self, name, None), scene.groups)
@@ -193,7 +194,7 @@ class Grazing(_Urge):
         """How fast what grows and is eaten."""
         return self.given("rate", "growth", "capacity", "start", "appetite")
 
-    def check(self, scene: Any) -> None:
+    def check(self, scene: SceneView) -> None:
         """Refuse a step in which all together could eat more than there is, and patches that eat."""
         super().check(scene)
         if self.group in (None, self.other):
@@ -267,7 +268,7 @@ class Predation(_Urge):
         """How much it fills, and who hunts."""
         return self.given("meal", "hungry")
 
-    def check(self, scene: Any) -> None:
+    def check(self, scene: SceneView) -> None:
         """Refuse who hunts itself."""
         super().check(scene)
         if self.group in (None, self.other):

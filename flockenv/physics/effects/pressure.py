@@ -9,6 +9,7 @@ from pydantic import Field
 
 from flockenv.jit.decorators import Law, Vec, law, like
 from flockenv.maths.vectors import scale, select, sub, unit
+from flockenv.model.scene_view import SceneView
 from flockenv.physics.effects.effect import Effect, Me, Other, Sight
 from flockenv.steering.others import ONE_PLACE
 
@@ -74,7 +75,7 @@ class Pressure(Effect):
             return math.sqrt(2 / (math.sqrt(3) * self.density))
         return math.cbrt(PACKED * 6 / (math.pi * self.density))
 
-    def check(self, scene: Any) -> None:
+    def check(self, scene: SceneView) -> None:
         """Refuse a radius that has no room for a pull, or that reaches the neighbours' neighbours."""
         a = self.distance(scene.dimension)
         if not 1.1 * a <= self.radius <= 1.4 * a:

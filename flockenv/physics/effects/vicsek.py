@@ -11,6 +11,7 @@ from pydantic import Field
 from flockenv.jit.decorators import Law, Vec, law, like
 from flockenv.maths.counter_rng import uniform
 from flockenv.maths.vectors import add, dot, scale, select, sub, unit
+from flockenv.model.scene_view import SceneView
 from flockenv.physics.effects.effect import Effect, Me, Other, Sight
 
 __all__ = ["Vicsek"]
@@ -74,7 +75,7 @@ class Vicsek(Effect):
         """Neighbours, and one random number each."""
         return (*super().calls_for(), "random numbers")
 
-    def check(self, scene: Any) -> None:
+    def check(self, scene: SceneView) -> None:
         """Refuse space, and what makes no such map of a step."""
         if scene.dimension != 2:
             raise ValueError(f"kind = vicsek: dimension = {scene.dimension}, must be 2")

@@ -13,6 +13,7 @@ from pydantic import Field, model_validator
 from flockenv.geometry.space import Torus
 from flockenv.jit.decorators import Law, Vec, law
 from flockenv.maths.vectors import dot, scale, sub, unit
+from flockenv.model.scene_view import SceneView
 from flockenv.model.state import State
 from flockenv.physics.effects.effect import Effect, Me, Vector
 
@@ -55,7 +56,7 @@ class WallRepulsion(Effect):
             )
         return self
 
-    def check(self, scene: Any) -> None:
+    def check(self, scene: SceneView) -> None:
         """Refuse a torus too: there the way ahead of a wall leads to where it pushes hardest, behind it."""
         super().check(scene)
         if isinstance(scene.space, Torus):

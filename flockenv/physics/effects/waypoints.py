@@ -12,6 +12,7 @@ from flockenv.geometry.targets import Target, passed, row_size, to_target
 from flockenv.jit.decorators import Law, Vec, law, like
 from flockenv.maths.vectors import norm, scale, select, sub, unit, zero
 from flockenv.model.distribution import Spread, drawn
+from flockenv.model.scene_view import SceneView
 from flockenv.physics.effects.aims import about
 from flockenv.physics.effects.effect import Me
 from flockenv.physics.effects.floor_field import Around, slowed
@@ -148,7 +149,7 @@ class Journey(Around):
         ends = {"leaves": float(self.then == "leave"), "loops": float(self.then == "loop")}
         return {"share": self.share, "many": float(len(self.stages)), "size": float(HEAD + row_size(2)), **ends}
 
-    def table(self, scene: Any) -> NDArray[np.float64]:
+    def table(self, scene: SceneView) -> NDArray[np.float64]:
         """A row for each stage, what is drawn for everybody, and the ways to each place, once."""
         members = self.members(scene.starts)
         count = int(members["end"] - members["first"])
@@ -164,7 +165,7 @@ class Journey(Around):
         ]
         return np.concatenate([np.ravel(rows), waits.ravel(), *blocks])
 
-    def grids(self, scene: Any) -> list[NDArray[np.float64]]:
+    def grids(self, scene: SceneView) -> list[NDArray[np.float64]]:
         """Return the grid of ways to each stage that agents go around obstacles to."""
         table, size = scene.table_of(self), HEAD + row_size(2)
         blocks = [int(table[k * size]) for k, stage in enumerate(self.stages) if stage.around]
@@ -175,7 +176,7 @@ class Journey(Around):
         stays = self.then == "stay" and k == len(self.stages) - 1
         return self.slow_radius if stays or self.stages[k].wait != 0 else 0.0
 
-    def check(self, scene: Any) -> None:
+    def check(self, scene: SceneView) -> None:
         """Refuse space, and a torus."""
         if scene.dimension != 2 or scene.space.periodic:
             raise ValueError(f"kind = {self.kind}: only a plane or a box of dimension 2 is allowed")

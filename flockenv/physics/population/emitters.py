@@ -14,6 +14,7 @@ from pydantic import Field, model_validator
 
 from flockenv.core.record import Record
 from flockenv.geometry.space import Box, Torus
+from flockenv.model.scene_view import SceneView
 from flockenv.physics.population.members import Member, demand_group, dimensions
 from flockenv.physics.population.regions import AnyPlace, Clearing, Surface, Vector, in_space
 
@@ -79,7 +80,7 @@ class Emitter(Member):
         """True if it brings agents of this group to life."""
         return group == self.group
 
-    def check(self, scene: Any) -> None:
+    def check(self, scene: SceneView) -> None:
         """Refuse a group that does not exist, other dimensions, and speeds beyond the group's limit."""
         demand_group(scene, self.group)
         group = scene.groups[self.group]
@@ -95,7 +96,7 @@ class Emitter(Member):
             raise ValueError(f"speed = {self.speed}: groups[{self.group}].max_speed = {limit:g} m/s is the most")
         self._check_space(scene, group)
 
-    def _check_space(self, scene: Any, group: Any) -> None:
+    def _check_space(self, scene: SceneView, group: Any) -> None:
         """Refuse births beyond the walls of a box, and neighbours around a torus."""
         if isinstance(scene.space, Box):
             ends = self.place.extremes

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +11,7 @@ from numpy.typing import NDArray
 from flockenv.geometry.shapes.table import packed
 from flockenv.geometry.space import Box
 from flockenv.jit.section import entry
+from flockenv.model.scene_view import SceneView
 from flockenv.model.state import Floats, State
 from flockenv.physics.population.births import PLACE, births
 from flockenv.physics.population.deaths import crowding, drain, passing, reaching
@@ -48,19 +48,19 @@ class _Scratch:
         return cls(np.zeros((4, 3)), cell, start, order, np.zeros(n, np.bool_))
 
 
-def _sized(scene: Any, there: bool) -> NDArray[np.float64]:
+def _sized(scene: SceneView, there: bool) -> NDArray[np.float64]:
     """Return the size of the space, (3,) m; zeros if it has none of this kind."""
     size = np.zeros(3)
     if there:
-        size[: scene.dimension] = scene.space.size
+        size[: scene.dimension] = scene.space.extent(scene.dimension)
     return size
 
 
-def _period(scene: Any) -> NDArray[np.float64]:
+def _period(scene: SceneView) -> NDArray[np.float64]:
     return _sized(scene, scene.space.periodic)
 
 
-def _streams(scene: Any) -> tuple[Floats, Floats, float]:
+def _streams(scene: SceneView) -> tuple[Floats, Floats, float]:
     """Return a row per rate and burst, group after group; surfaces' pieces; the largest radius of clearings, m."""
     emitters = sorted((m for m in scene.population if isinstance(m, Emitter)), key=lambda m: m.group)
     found: list[list[float]] = []
@@ -82,7 +82,7 @@ def _streams(scene: Any) -> tuple[Floats, Floats, float]:
     return table, np.concatenate(pieces), clearing
 
 
-def _births(scene: Any, scratch: _Scratch) -> Part:
+def _births(scene: SceneView, scratch: _Scratch) -> Part:
     streams, pieces, clearing = _streams(scene)
     walls, size, period = isinstance(scene.space, Box), _sized(scene, isinstance(scene.space, Box)), _period(scene)
     kernel, radius, dt = entry(births), scene.body.radius, float(scene.dt)
@@ -97,12 +97,12 @@ def _births(scene: Any, scratch: _Scratch) -> Part:
     return part
 
 
-def _slots(scene: Any, sink: Sink) -> tuple[int, int]:
+def _slots(scene: SceneView, sink: Sink) -> tuple[int, int]:
     """Return the first slot that a sink acts on, and the one after the last."""
     return (0, scene.agents) if sink.group is None else (scene.starts[sink.group], scene.starts[sink.group + 1])
 
 
-def _passing(scene: Any, sinks: Sequence[Sink], channel: int) -> Part:
+def _passing(scene: SceneView, sinks: Sequence[Sink], channel: int) -> Part:
     table = np.zeros((len(sinks), 9))
     for k, sink in enumerate(sinks):
         row = [sink.code, *_slots(scene, sink), *sink.row()]
@@ -117,7 +117,7 @@ def _passing(scene: Any, sinks: Sequence[Sink], channel: int) -> Part:
     return part
 
 
-def _drain(scene: Any, sink: Drain) -> Part:
+def _drain(scene: SceneView, sink: Drain) -> Part:
     table, _ = packed([sink.shape], scene.dimension)
     anchor, slots = tuple(float(a) for a in sink.shape.anchor), _slots(scene, sink)
     kernel, period, dt = entry(drain), tuple(_period(scene)[: scene.dimension].tolist()), float(scene.dt)
@@ -130,7 +130,7 @@ def _drain(scene: Any, sink: Drain) -> Part:
     return part
 
 
-def _crowding(scene: Any, sink: Crowding, channel: int, scratch: _Scratch) -> Part:
+def _crowding(scene: SceneView, sink: Crowding, channel: int, scratch: _Scratch) -> Part:
     row = np.array([sink.code, *_slots(scene, sink), *sink.row()], np.float64)
     kernel, period, dt = entry(crowding), _period(scene), float(scene.dt)
 
@@ -143,7 +143,7 @@ def _crowding(scene: Any, sink: Crowding, channel: int, scratch: _Scratch) -> Pa
     return part
 
 
-def _reaching(scene: Any, sink: Threshold) -> Part:
+def _reaching(scene: SceneView, sink: Threshold) -> Part:
     kernel, slots, which = entry(reaching), _slots(scene, sink), scene.parts.inner.index(sink.of)
 
     def part(x0: Floats, s: State, first: int, end: int) -> None:
@@ -152,13 +152,13 @@ def _reaching(scene: Any, sink: Threshold) -> Part:
     return part
 
 
-def _asks(scene: Any) -> bool:
+def _asks(scene: SceneView) -> bool:
     """True if a member of the population counts agents near a place."""
     places = [member.place for member in scene.population if isinstance(member, Emitter)]
     return any(isinstance(m, (Crowding, Clearing)) for m in (*scene.population, *places))
 
 
-def _parts(scene: Any) -> list[Part]:
+def _parts(scene: SceneView) -> list[Part]:
     """Return what is done at the end of a step: lifetimes, then sinks in the scene's order, then births."""
     scratch = _Scratch.of(scene.agents, _asks(scene))
     emits = any(isinstance(member, Emitter) for member in scene.population)
@@ -182,13 +182,13 @@ def _parts(scene: Any) -> list[Part]:
     return [*found, *([_births(scene, scratch)] if emits else [])]
 
 
-def beget(scene: Any, state: State) -> None:
+def beget(scene: SceneView, state: State) -> None:
     """Bring to life the agents that are born at time 0, in place."""
     if any(isinstance(member, Emitter) for member in scene.population):
         _births(scene, _Scratch.of(scene.agents, _asks(scene)))(state.x, state, 0, state.shape[0])
 
 
-def settler(scene: Any) -> Callable[[Floats, Floats, State, int, int], tuple[int, int]]:
+def settler(scene: SceneView) -> Callable[[Floats, Floats, State, int, int], tuple[int, int]]:
     """Return what settles the population of a scene at the end of a step, with scratch of its own."""
     parts = _parts(scene)
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any, ClassVar
 
 from flockenv.core.record import Record
+from flockenv.model.scene_view import SceneView
 
 __all__ = ["POPULATION", "Member", "demand_group", "dimensions"]
 
@@ -25,7 +26,7 @@ class Member(Record):
         if "kind" in vars(cls).get("__annotations__", {}):
             POPULATION[cls.model_fields["kind"].default] = cls
 
-    def check(self, scene: Any) -> None:
+    def check(self, scene: SceneView) -> None:
         """Refuse a scene that this does not suit: a ValueError that begins with the field's name."""
 
     def feeds(self, group: int) -> bool:
@@ -33,7 +34,7 @@ class Member(Record):
         return False
 
 
-def demand_group(scene: Any, which: int | None) -> None:
+def demand_group(scene: SceneView, which: int | None) -> None:
     """Refuse a group that does not exist."""
     count = len(scene.groups)
     if which is not None and which >= count:
@@ -41,7 +42,7 @@ def demand_group(scene: Any, which: int | None) -> None:
         raise ValueError(f"group = {which}: {known}; did you mean {count - 1}?")
 
 
-def dimensions(scene: Any, **given: tuple[float, ...] | None) -> None:
+def dimensions(scene: SceneView, **given: tuple[float, ...] | None) -> None:
     """Refuse a vector whose length is not the scene's number of dimensions."""
     for name, value in given.items():
         if value is not None and len(value) != scene.dimension:

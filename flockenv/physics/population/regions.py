@@ -7,7 +7,7 @@ import math
 import operator
 from abc import abstractmethod
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +15,7 @@ from pydantic import Field, WrapValidator, model_validator
 
 from flockenv.core.record import Record, keep
 from flockenv.geometry.shapes import AnyShape
+from flockenv.model.scene_view import SceneView
 from flockenv.physics.population.members import dimensions
 from flockenv.physics.population.surface import pieces
 
@@ -49,7 +50,7 @@ class Place(Record):
         """Return the pieces of a surface, (n, 14); see surface.py."""
         return np.zeros((0, 14))
 
-    def check(self, scene: Any) -> None:
+    def check(self, scene: SceneView) -> None:
         """Refuse a scene that this does not suit: a ValueError that begins with the field's name."""
 
 
@@ -69,7 +70,7 @@ class Point(Place):
         """Itself."""
         return np.array([self.at])
 
-    def check(self, scene: Any) -> None:
+    def check(self, scene: SceneView) -> None:
         """Refuse other dimensions."""
         dimensions(scene, at=self.at)
 
@@ -91,7 +92,7 @@ class Segment(Place):
         """Its ends."""
         return np.array([self.start, self.end])
 
-    def check(self, scene: Any) -> None:
+    def check(self, scene: SceneView) -> None:
         """Refuse other dimensions."""
         dimensions(scene, start=self.start, end=self.end)
 
@@ -121,7 +122,7 @@ class Disc(Place):
         """The corners of the box around it."""
         return np.array(self.centre) + self.radius * np.array([[-1.0], [1.0]])
 
-    def check(self, scene: Any) -> None:
+    def check(self, scene: SceneView) -> None:
         """Refuse other dimensions."""
         dimensions(scene, centre=self.centre, axis=self.axis)
         if self.axis is not None and scene.dimension == 2:
@@ -149,7 +150,7 @@ class _Corners(Place):
         """Its corners."""
         return np.array([self.low, self.high])
 
-    def check(self, scene: Any) -> None:
+    def check(self, scene: SceneView) -> None:
         """Refuse other dimensions."""
         dimensions(scene, low=self.low, high=self.high)
 
@@ -181,7 +182,7 @@ class Surface(Place):
         """Return the pieces of the surface."""
         return pieces(self.shape)
 
-    def check(self, scene: Any) -> None:
+    def check(self, scene: SceneView) -> None:
         """Refuse other dimensions, and shapes that move, are hollow, or have no end."""
         if self.shape.dimension != scene.dimension:
             raise ValueError(

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Any, ClassVar, Literal
+from typing import ClassVar, Literal
 
 from pydantic import Field, model_validator
 
 from flockenv.geometry.shapes import AnyShape
 from flockenv.geometry.space import Torus
+from flockenv.model.scene_view import SceneView
 from flockenv.physics.population.members import Member, demand_group, dimensions
 from flockenv.physics.population.regions import Vector, in_space, ordered
 
@@ -26,7 +27,7 @@ class Sink(Member):
         """Return its numbers, as deaths.py reads them."""
         return []
 
-    def check(self, scene: Any) -> None:
+    def check(self, scene: SceneView) -> None:
         """Refuse a group that does not exist, or one whose agents are bound to each other."""
         demand_group(scene, self.group)
         for k, group in enumerate(scene.groups):
@@ -63,7 +64,7 @@ class Leaving(Sink):
         """The corners."""
         return in_space(self.low) + in_space(self.high)
 
-    def check(self, scene: Any) -> None:
+    def check(self, scene: SceneView) -> None:
         """Refuse other dimensions."""
         super().check(scene)
         dimensions(scene, low=self.low, high=self.high)
@@ -100,7 +101,7 @@ class Drain(Sink):
         """The margin."""
         return [self.margin]
 
-    def check(self, scene: Any) -> None:
+    def check(self, scene: SceneView) -> None:
         """Refuse other dimensions."""
         super().check(scene)
         if self.shape.dimension != scene.dimension:
@@ -129,7 +130,7 @@ class Crowding(Sink):
         """Radius, how many, rate."""
         return [self.radius, float(self.most), float("inf") if self.rate is None else self.rate]
 
-    def check(self, scene: Any) -> None:
+    def check(self, scene: SceneView) -> None:
         """Refuse a radius around the torus."""
         super().check(scene)
         if isinstance(scene.space, Torus) and self.radius > min(scene.space.size) / 2:
@@ -151,7 +152,7 @@ class Threshold(Sink):
         """The level."""
         return [self.level]
 
-    def check(self, scene: Any) -> None:
+    def check(self, scene: SceneView) -> None:
         """Refuse a number that no effect keeps."""
         super().check(scene)
         if self.of not in scene.parts.inner:
