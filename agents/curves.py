@@ -1,4 +1,4 @@
-"""Learning curves of several settings, side by side: `python -m agents.curves configs/obstacles.yaml ...`.
+"""Learning curves of several settings, side by side: `python -m agents.curves configs/training/obstacles.yaml ...`.
 
 A config names settings beside its own (`curves: {name: what differs}`). Each is trained like agents.ppo trains, into
 RUNS/TASK/NAME, one after the other, so that seconds compare; what is finished is not trained again, what was
@@ -131,7 +131,7 @@ def _curves(axes: Axes, task: str, numbers: Numbers) -> None:
 
 @app.command()
 def main(
-    configs: Annotated[list[Path], typer.Argument(help="experiments, such as configs/obstacles.yaml")],
+    configs: Annotated[list[Path], typer.Argument(help="experiments, such as configs/training/obstacles.yaml")],
     out: Annotated[str, typer.Option(help="picture; the numbers go beside it")] = "results/learning.png",
     runs: Annotated[Path, typer.Option(help="folder of checkpoints")] = Path("runs/curves"),
 ) -> None:

@@ -1,4 +1,4 @@
-"""An experiment: what configs/<task>.yaml says: how PPO trains on a task, and how its rules are tuned."""
+"""An experiment: what configs/training/<task>.yaml says: how PPO trains on a task, and how its rules are tuned."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ __all__ = [
     "AS_CONFIGURED", "CONFIGS", "Experiment", "PpoSettings", "SearchSettings", "load_experiment", "one_line_errors",
 ]  # fmt: skip
 
-CONFIGS = Path(__file__).resolve().parent.parent / "configs"
+CONFIGS = Path(__file__).resolve().parent.parent / "configs" / "training"
 
 AS_CONFIGURED = "as configured"
 """What a config's own settings are called beside others."""

@@ -1,4 +1,4 @@
-"""Teach a network to answer as the hand-written player does: `python -m agents.imitate configs/school.yaml`.
+"""Teach a network to answer as the hand-written player does: `python -m agents.imitate configs/training/school.yaml`.
 
 Where a trained policy loses to rules, this tells two reasons apart. The network is PPO's, of the same size, fed with
 the same rows; it is shown what the tuned rules answer in training worlds, and then plays the tuning worlds alone. If it
@@ -59,7 +59,7 @@ def imitate(
 
 @app.command()
 def main(
-    config: Annotated[Path, typer.Argument(help="an experiment, such as configs/school.yaml")],
+    config: Annotated[Path, typer.Argument(help="an experiment, such as configs/training/school.yaml")],
     worlds: Annotated[
         int, typer.Option(min=1, help="training worlds of each of four rounds; rules act in the first")
     ] = WORLDS,

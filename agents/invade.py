@@ -1,4 +1,4 @@
-"""Who gains by playing otherwise than all others? `python -m agents.invade configs/school.yaml`.
+"""Who gains by playing otherwise than all others? `python -m agents.invade configs/training/school.yaml`.
 
 The comparison lets everybody in a world play alike. Here one agent of each world plays one policy, and all others
 another: where a policy does best among those who do not have it, and all are worse off when all have it, no learner
@@ -166,7 +166,7 @@ def table_of(payoffs: Payoffs) -> Table:
 
 @app.command()
 def main(
-    configs: Annotated[list[Path], typer.Argument(help="experiments, such as configs/school.yaml")],
+    configs: Annotated[list[Path], typer.Argument(help="experiments, such as configs/training/school.yaml")],
     players: Annotated[
         list[str] | None, typer.Option(help="by comma or repeated; [rules, ppo, and others written for the task]")
     ] = None,

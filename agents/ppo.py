@@ -1,4 +1,4 @@
-"""Train a policy with Stable-Baselines3's PPO: `python -m agents.ppo configs/pursuit.yaml`.
+"""Train a policy with Stable-Baselines3's PPO: `python -m agents.ppo configs/training/pursuit.yaml`.
 
 Reads top to bottom: settings -> worlds -> model -> learn -> export. Every so often the policy of the moment plays the
 tuning worlds in numpy; that is the learning curve, and the best one is what is exported, as safetensors with a card
@@ -311,7 +311,7 @@ def export(run: Run, path: Path) -> None:
         **({"rules": recipe["rules"]} if "rules" in recipe else {}),
         "activation": recipe["ppo"]["activation"],
         "algorithm": "PPO (stable-baselines3)",
-        "recipe": {"command": f"python -m agents.ppo configs/{recipe['task']}.yaml", "ppo": recipe["ppo"]},
+        "recipe": {"command": f"python -m agents.ppo configs/training/{recipe['task']}.yaml", "ppo": recipe["ppo"]},
         "seed": recipe["ppo"]["seed"],
         "steps": run.steps,
         "wall_time_s": round(run.wall, 1),
@@ -326,7 +326,7 @@ def export(run: Run, path: Path) -> None:
 
 @app.command()
 def main(
-    config: Annotated[Path, typer.Argument(help="an experiment, such as configs/pursuit.yaml")],
+    config: Annotated[Path, typer.Argument(help="an experiment, such as configs/training/pursuit.yaml")],
     out: Annotated[Path | None, typer.Option(help="default: flockenv/players/weights/TASK.safetensors")] = None,
     runs: Annotated[Path, typer.Option(help="folder of checkpoints")] = Path("runs"),
     go_on: Annotated[bool, typer.Option("--resume", help="go on from the last checkpoint")] = False,

@@ -1,4 +1,4 @@
-"""Make the rules as good as they can be: `python -m agents.tune configs/pursuit.yaml`.
+"""Make the rules as good as they can be: `python -m agents.tune configs/training/pursuit.yaml`.
 
 A plain search: random parameter sets and the textbook's, played on tuning worlds; the best quarter goes on to twice
 as many worlds, each joined by a small change of itself, for a few rounds. What it found, and the agent-steps that it
@@ -145,7 +145,7 @@ def write(path: Path, task: str, parameters: dict[str, float], found: dict[str, 
 
 @app.command()
 def main(
-    config: Annotated[Path, typer.Argument(help="an experiment, such as configs/pursuit.yaml")],
+    config: Annotated[Path, typer.Argument(help="an experiment, such as configs/training/pursuit.yaml")],
     out: Annotated[Path | None, typer.Option(help="default: flockenv/players/tuned/TASK.json")] = None,
 ) -> None:
     """Search the rules' parameters and write what was found."""

@@ -22,6 +22,8 @@ from flockenv.jit.numba_patches.front_end import LEFT_OUT, SPARED, TRICKS
 
 __all__ = ["Compilation"]
 
+SCENE = ROOT / "configs" / "scenes" / "boids.yaml"
+
 CODE = """
 import sys, time
 from flockenv.scene.yaml_io import load_scene
@@ -60,7 +62,7 @@ class Compilation(Contestant):
 
 
 def main(
-    scene: Annotated[Path, typer.Argument(metavar="SCENE.yaml", exists=True)] = ROOT / "configs" / "boids.yaml",
+    scene: Annotated[Path, typer.Argument(metavar="SCENE.yaml", exists=True)] = SCENE,
     quick: Quick = False,
     rounds: Rounds = None,
     out: Out = None,

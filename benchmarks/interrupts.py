@@ -33,7 +33,7 @@ from flockenv.cli.terminal import program, progress_bar
 __all__ = ["COMMANDS", "Outcome", "interrupted"]
 
 ROOT = Path(__file__).resolve().parent.parent
-SCENES = ROOT / "configs"
+SCENES = ROOT / "configs" / "scenes"
 PATIENCE, ORPHANED, LATE = 20.0, 5.0, 2.0
 """s until a command that was interrupted counts as hanging, and until a process that is left counts as an orphan; one
 that succeeds so soon after its signal without a word had done its work, and was on its way out."""
@@ -80,7 +80,7 @@ def interrupted(
 
     None if it had ended before, or was just ending. The folder is empty; group: the signal goes to all its processes.
     """
-    (folder / "pursuit.yaml").write_text((SCENES / "pursuit.yaml").read_text())
+    (folder / "pursuit.yaml").write_text((ROOT / "configs" / "training" / "pursuit.yaml").read_text())
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "FLOCKENV_CACHE": str(cache)}
     process = subprocess.Popen(
         [sys.executable, *COMMANDS[command]], cwd=folder, env=environment, text=True, stdout=subprocess.DEVNULL,

@@ -1,9 +1,9 @@
 """Where the time of PPO goes, on real tasks: `python -m benchmarks.training`.
 
-The tasks and settings of configs/*.yaml, built as agents.ppo builds them, and a few settings beside them, among these
-what Stable-Baselines3 has by default. Contestants take turns of some rollouts and updates each; the clock is read
-around env.step, the policy's forward pass, the whole rollout, and, in the update, the loss, the gradient and the
-optimizer. What is left is Stable-Baselines3's own Python: copies, batches, clipping of gradients. Before that, in
+The tasks and settings of configs/training/*.yaml, built as agents.ppo builds them, and a few settings beside them,
+among these what Stable-Baselines3 has by default. Contestants take turns of some rollouts and updates each; the clock
+is read around env.step, the policy's forward pass, the whole rollout, and, in the update, the loss, the gradient and
+the optimizer. What is left is Stable-Baselines3's own Python: copies, batches, clipping of gradients. Before that, in
 processes of their own: a forward pass and a step of many worlds, by how long torch's threads spin (agents/__init__.py).
 """
 

@@ -70,9 +70,9 @@ __all__ = [
 
 _HOME = {
     "Scene": "scene",
-    "Snapshot": "snapshot",
-    "Body": "state",
-    "State": "state",
+    "Snapshot": "model.snapshot",
+    "Body": "model.state",
+    "State": "model.state",
     "TASKS": "tasks",
     "Corridor": "tasks",
     "Bottleneck": "tasks",
@@ -86,8 +86,8 @@ _HOME = {
     "Pursuit": "tasks",
     "School": "tasks",
     "Task": "tasks",
-    "Step": "world",
-    "World": "world",
+    "Step": "envs.world",
+    "World": "envs.world",
 }
 """Which module each public name lives in: it is imported on first use (PEP 562)."""
 

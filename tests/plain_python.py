@@ -38,7 +38,7 @@ def cases() -> Iterator[tuple[str, Any]]:
     drag = next(row.effect for row in EFFECTS if row.name == "drag")
     for kind, method in INTEGRATORS.items():
         yield kind, scene_of(drag, dt=0.02, integrator=method())
-    for path in sorted((ROOT / "configs").glob("*.yaml")):
+    for path in sorted((ROOT / "configs" / "scenes").glob("*.yaml")):
         try:
             scene = load_scene(path)
         except ConfigError:

@@ -122,7 +122,7 @@ def test_a_pendulum_on_a_rod_swings_in_its_reference() -> None:
 
 @pytest.mark.slow
 def test_newtons_cradle_has_a_reference_of_the_whole_scene() -> None:
-    problem = Problem.of(load_scene(Path("configs/newtons_cradle.yaml")), 0.6, (600, 1200), name="cradle")
+    problem = Problem.of(load_scene(Path("configs/scenes/newtons_cradle.yaml")), 0.6, (600, 1200), name="cradle")
     report = measure(problem, methods_named(["velocity_verlet"]), repetitions=0, finer=8)
     assert report.reference == "event-exact steps"
     assert 0.1 < report.reach < 1.5  # 1.8 m in free fall
@@ -207,7 +207,7 @@ def test_what_is_drawn_in_every_step_has_one_line_that_says_so(more: str, text: 
 
 def test_a_map_of_one_step_has_one_line_that_says_so() -> None:
     with pytest.raises(ValueError, match="vicsek: is a map from step to step") as caught:
-        Problem.of(load_scene(Path("configs/vicsek.yaml")), 4.0, (4, 8))
+        Problem.of(load_scene(Path("configs/scenes/vicsek.yaml")), 4.0, (4, 8))
     assert "\n" not in str(caught.value)
 
 

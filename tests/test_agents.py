@@ -33,7 +33,7 @@ from flockenv.players.rules import RULES, Tuned, as_dict, player, tuned
 from flockenv.tasks import TASKS, School, Task
 from tests.training import PURSUIT, TINY, interrupt
 
-ROOT = CONFIGS.parent
+ROOT = CONFIGS.parent.parent
 
 
 @pytest.mark.parametrize("name", sorted(TASKS))
@@ -59,7 +59,7 @@ def test_the_shipped_policy_is_far_above_random_and_its_card_is_complete(name: s
     card = json.loads((WEIGHTS / f"{name}.json").read_text(encoding="utf-8"))
     recipe = load_experiment(CONFIGS / f"{name}.yaml").ppo.model_dump(mode="json")
     assert card["recipe"]["ppo"] == recipe, "the config beside the weights is the one that made them"
-    assert card["recipe"]["command"] == f"python -m agents.ppo configs/{name}.yaml"
+    assert card["recipe"]["command"] == f"python -m agents.ppo configs/training/{name}.yaml"
     assert card["arguments"].items() <= task.model_dump(mode="json").items(), "it plays the task that it was trained on"
     assert card["wall_time_s"] < 600 and card["curve"][-1]["mean"] > card["curve"][0]["mean"]
 
@@ -298,7 +298,7 @@ def test_curves_are_of_one_config_a_task_and_a_picture_is_a_png(tmp_path: Path) 
     for given, said in (
         ([config, config], "another config is of that task"),
         ([config, "--out", str(tmp_path / "x.json")], "must end in .png"),
-        ([str(CONFIGS / "boids.yaml")], "unknown key"),
+        ([str(CONFIGS.parent / "scenes" / "boids.yaml")], "unknown key"),
     ):
         result = CliRunner().invoke(curves.app, given)
         assert result.exit_code == 2 and said in result.stderr

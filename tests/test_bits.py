@@ -28,7 +28,7 @@ from flockenv.tasks import TASKS
 pytestmark = pytest.mark.filterwarnings("ignore")  # what scenes warn of is not what is tested here
 ROOT = Path(__file__).resolve().parent.parent
 STORED = Path(__file__).with_name("bits.json")
-STEPS, SLOW_STEPS = 2000, {"configs/cloth.yaml": 300}
+STEPS, SLOW_STEPS = 2000, {"configs/scenes/cloth.yaml": 300}
 """Steps of a scene; the cloth's implicit method takes 20 ms for one."""
 WORLDS, DECISIONS = 64, 500
 

@@ -34,7 +34,7 @@ def kinds_in(folder: str, attribute: str) -> set[str]:
 def test_every_effect_has_a_row() -> None:
     rows = {row.effect.kind for row in catalogue.EFFECTS}
     ours = {kind for kind, effect in EFFECTS.items() if effect.__module__.startswith("flockenv.")}
-    files = kinds_in("effects", "kind") | kinds_in("behaviours", "kind") | {"steer"}
+    files = kinds_in("physics/effects", "kind") | kinds_in("behaviours", "kind") | {"steer"}
     assert rows == files == ours
 
 
@@ -65,7 +65,7 @@ def test_a_group_that_is_not_there_is_refused_by_its_name(row: catalogue.EffectR
 
 def test_every_integrator_has_a_row() -> None:
     rows = {row.method.kind for row in catalogue.INTEGRATORS}
-    assert rows == kinds_in("integrators", "kind") == set(INTEGRATORS)
+    assert rows == kinds_in("physics/integrators", "kind") == set(INTEGRATORS)
 
 
 def test_every_task_has_a_row() -> None:

@@ -136,7 +136,7 @@ def test_a_training_may_be_resumed_again_and_again(tmp_path: Path, whole: Callab
 @pytest.mark.slow
 def test_killed_trainings_end_as_if_they_had_never_been_killed() -> None:
     command = [sys.executable, "-m", "benchmarks.kills", "--times", "20"]
-    done = subprocess.run(command, cwd=CONFIGS.parent, capture_output=True, text=True, check=False)
+    done = subprocess.run(command, cwd=CONFIGS.parent.parent, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stdout + done.stderr
     assert "20 kills" in done.stdout and "0 ended otherwise, 0 resumptions were refused" in done.stdout
 
@@ -419,8 +419,9 @@ with claimed(Path({str(folder)!r})):
     print("held", flush=True)
     input()
 """
+    root = CONFIGS.parent.parent
     holder = subprocess.Popen(
-        [sys.executable, "-c", code], cwd=CONFIGS.parent, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+        [sys.executable, "-c", code], cwd=root, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
     )
     with holder:
         assert holder.stdout is not None and holder.stdout.readline() == "held\n"

@@ -37,7 +37,7 @@ from flockenv.studies.stress import Case, Value
 from flockenv.tasks import TASKS
 
 ROOT = Path(__file__).resolve().parent.parent
-PARTICLES = str(ROOT / "configs" / "particles.yaml")
+PARTICLES = str(ROOT / "configs" / "scenes" / "particles.yaml")
 
 TINY = """\
 space: {kind: torus, size: [9, 9]}
@@ -252,7 +252,7 @@ def interrupted(moment: str, *arguments: str) -> subprocess.CompletedProcess[str
     """Run a command in a process that gets a real SIGINT once the bar of that name has moved on a little."""
     code = f"""
 import contextlib, os, signal, sys
-from flockenv.cli.main import main
+from flockenv.cli import main
 
 signal.signal(signal.SIGINT, signal.default_int_handler)  # a test run in the background ignores them, for all below
 
@@ -263,8 +263,8 @@ def progress(title, total, unit, first=""):
             os.kill(os.getpid(), signal.SIGINT)
     yield show
 
-cli.progress_bar = progress
-sys.exit(cli.main())
+main.progress_bar = progress
+sys.exit(main.main())
 """
     return subprocess.run(
         [sys.executable, "-c", code, *arguments],

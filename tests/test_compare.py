@@ -437,7 +437,7 @@ def test_missing_weights_name_the_command_that_trains_them(monkeypatch: pytest.M
     monkeypatch.setattr("flockenv.players.WEIGHTS", Path("nowhere"))
     line = refused("--players", "random,ppo", "--tasks", "flock")
     assert "no weights for task 'flock'" in line
-    assert line.endswith("python -m agents.ppo configs/flock.yaml")
+    assert line.endswith("python -m agents.ppo configs/training/flock.yaml")
 
 
 def test_a_player_that_ends_the_process_is_named_and_nothing_is_written() -> None:

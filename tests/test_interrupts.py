@@ -237,7 +237,7 @@ def test_a_signal_that_a_command_outruns_is_forgotten(tmp_path: Path) -> None:
     """The signal arrives where nothing may be raised; the work is done before the process would be ended."""
     outruns = """\
 import atexit, pickle
-interrupts.PATIENCE = 1.5
+signals.PATIENCE = 1.5
 atexit.register(time.sleep, 3.3)
 class Slow:
     def __reduce__(self):
@@ -273,7 +273,7 @@ def test_what_is_half_written_is_removed(running: bool, tmp_path: Path) -> None:
 def test_a_held_section_happens_whole(tmp_path: Path) -> None:
     body = """\
 with signals.running('toy'):
-    with interrupts.held():
+    with signals.held():
         say('ready')
         time.sleep(1.5)
         Path('all').write_text('there')

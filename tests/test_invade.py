@@ -109,9 +109,12 @@ def test_the_verdict_follows_from_the_payoffs(payoffs: invasion.Payoffs, says: s
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["configs/pursuit.yaml"], "task 'pursuit': one learner alone in each world, with nobody to play otherwise"),
-        (["configs/school.yaml", "--players", "ppo,nobody"], "player 'nobody': unknown"),
-        (["configs/school.yaml", "--players", "orca"], "no hand-written player 'orca' for 'school'"),
+        (
+            ["configs/training/pursuit.yaml"],
+            "task 'pursuit': one learner alone in each world, with nobody to play otherwise",
+        ),
+        (["configs/training/school.yaml", "--players", "ppo,nobody"], "player 'nobody': unknown"),
+        (["configs/training/school.yaml", "--players", "orca"], "no hand-written player 'orca' for 'school'"),
         (["configs/no.yaml"], "configs/no.yaml"),
     ],
 )
@@ -134,14 +137,15 @@ def test_what_cannot_be_played_is_refused_in_one_line(arguments: list[str], mess
 def test_somebody_who_fails_among_others_is_named(tmp_path: Path, code: str, message: str) -> None:
     lines = ("import numpy as np", "def predict(observation, state=None, episode_start=None, deterministic=True):")
     (tmp_path / "mine.py").write_text("\n".join((*lines, f"    {code}", "")), encoding="utf-8")
-    arguments = ["configs/school.yaml", "--players", str(tmp_path / "mine.py"), "--worlds", "2"]
+    arguments = ["configs/training/school.yaml", "--players", str(tmp_path / "mine.py"), "--worlds", "2"]
     result = CliRunner().invoke(invasion.app, arguments)
     assert result.exit_code == 2, result.output
     assert message in result.stderr and "mine" in result.stderr and len(result.stderr.strip().splitlines()) == 1
 
 
 def test_it_prints_a_table_and_a_sentence_for_each_pair() -> None:
-    result = CliRunner().invoke(invasion.app, ["configs/school.yaml", "--players", "textbook,rules", "--worlds", "8"])
+    command = ["configs/training/school.yaml", "--players", "textbook,rules", "--worlds", "8"]
+    result = CliRunner().invoke(invasion.app, command)
     assert result.exit_code == 0, result.output
     assert "school: mean return of one who plays the row, among those who play the column" in result.stdout
     assert "rules among textbook: " in result.stdout and "textbook among rules: " in result.stdout

@@ -274,7 +274,7 @@ def test_the_page_of_measures_shows_what_there_is() -> None:
     pictures = re.findall(r"!\[[^\]]*\]\((measures/\w+\.png)\)", page)
     assert len(pictures) == 5
     assert all(1000 < (root / "docs" / name).stat().st_size < 100_000 for name in pictures)
-    scenes = re.findall(r"flockenv measure (configs/\w+\.yaml) ", page)
+    scenes = re.findall(r"flockenv measure (configs/scenes/\w+\.yaml) ", page)
     assert len(scenes) == 2
     for scene in scenes:
         load_scene(root / scene)

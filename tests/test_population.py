@@ -508,7 +508,7 @@ def test_it_goes_into_a_file_and_back() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["fountain", "fireworks"])
 def test_scenes_are_what_they_say(name: str) -> None:
-    loaded = load_scene(Path(__file__).parent.parent / "configs" / f"{name}.yaml")
+    loaded = load_scene(Path(__file__).parent.parent / "configs" / "scenes" / f"{name}.yaml")
     assert load_scene(dump_scene(loaded)) == loaded
     state = loaded.run(loaded.start(0), round(4 / loaded.dt))
     assert state.counted("births") > 300

@@ -32,7 +32,7 @@ from flockenv.tasks.observations import block_ways, compass
 from tests.catalogue import everything
 
 ROOT = Path(__file__).parent.parent
-CONFIGS = ROOT / "configs"
+CONFIGS = ROOT / "configs" / "scenes"
 
 
 def flock(agents: int, dtype: str, **sight: Any) -> Scene:

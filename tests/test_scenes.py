@@ -38,7 +38,7 @@ UNSOLVED = "ignore::flockenv.core.warnings.UnsolvedContactsWarning"
 
 
 def scene_of(name: str) -> Scene:
-    return load_scene(ROOT / "configs" / f"{name}.yaml")
+    return load_scene(ROOT / "configs" / "scenes" / f"{name}.yaml")
 
 
 def overlap(scene: Scene, state: State) -> float:
@@ -135,7 +135,7 @@ def test_where_it_folds_a_rope_or_a_cloth_keeps_off_itself(name: str, seconds: f
 def test_the_page_of_scenes_has_a_picture_and_a_command_for_each() -> None:
     page = (ROOT / "docs" / "scenes.md").read_text()
     for name in (*SECONDS, "fountain", "fireworks"):
-        assert re.search(rf"flockenv render configs/{name}\.yaml .*--out docs/scenes/{name}\.png", page)
+        assert re.search(rf"flockenv render configs/scenes/{name}\.yaml .*--out docs/scenes/{name}\.png", page)
         assert f"scenes/{name}.png" in page
         assert 1000 < (ROOT / "docs" / "scenes" / f"{name}.png").stat().st_size < 150_000
 

@@ -31,7 +31,9 @@ AWAY = 1e3  # m, where nobody sees anybody
 
 
 def tank(mortal: bool = True, **changes: Any) -> Scene:
-    """Fish, hunters and food under all that the scene of configs/fish.yaml knows; one kernel for this whole file."""
+    """Fish, hunters and food under all that the scene of configs/scenes/fish.yaml knows; one kernel for this whole
+    file.
+    """
     given: dict[str, Any] = {
         "hungry": {"rate": 0.02, "effort": 0.01, "start": 0.5, "spread": 0.4},
         "starving": {"rate": 0.0, "start": 0.8},

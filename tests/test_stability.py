@@ -366,7 +366,7 @@ def test_scenes_without_stiff_effects_have_no_limit() -> None:
     assert suggest_dt(body(Tether(centre=O2, stiffness=0.0), Drag(rate=0.0), dt=1e6)).dt == math.inf
 
 
-@pytest.mark.parametrize("path", sorted(Path("configs").glob("*.yaml")), ids=lambda path: path.stem)
+@pytest.mark.parametrize("path", sorted(Path("configs/scenes").glob("*.yaml")), ids=lambda path: path.stem)
 def test_scenes_that_are_shipped_are_neither_refused_nor_warned_of(path: Path) -> None:
     if path.read_text().startswith("# yaml-language-server") and "groups:" in path.read_text():
         scene = load_scene(path)  # a warning is an error here

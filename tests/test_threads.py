@@ -340,9 +340,9 @@ class Clock:
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.now = 0.0
         monkeypatch.setattr(thread_pool, "perf_counter", lambda: self.now)
-        monkeypatch.setattr(threads.Choice, "always", False)
+        monkeypatch.setattr(thread_pool.Choice, "always", False)
 
-    def done(self, choice: threads.Choice, alone: float, shared: float, pieces: int, surely: bool = False) -> str:
+    def done(self, choice: thread_pool.Choice, alone: float, shared: float, pieces: int, surely: bool = False) -> str:
         """By whom so many pieces are done, a letter each, if these are the seconds that they take."""
         by = []
 
@@ -360,40 +360,43 @@ class Clock:
 
 def test_both_ways_are_tried_and_the_sooner_one_is_kept(monkeypatch: pytest.MonkeyPatch) -> None:
     clock = Clock(monkeypatch)
-    assert clock.done(threads.Choice(), 1.0, 0.6, 10) == "aaasss" + 4 * "s"
-    assert clock.done(threads.Choice(), 1.0, 1.2, 10) == "aaasss" + 4 * "a"
-    assert clock.done(threads.Choice(), threads.SHORTEST / 2, 0.0, 200) == 200 * "a"  # too short to share
-    assert clock.done(threads.Choice(), 0.0, 9.0, 5, surely=True) == 5 * "s"  # too long to try
+    assert clock.done(thread_pool.Choice(), 1.0, 0.6, 10) == "aaasss" + 4 * "s"
+    assert clock.done(thread_pool.Choice(), 1.0, 1.2, 10) == "aaasss" + 4 * "a"
+    assert clock.done(thread_pool.Choice(), thread_pool.SHORTEST / 2, 0.0, 200) == 200 * "a"  # too short to share
+    assert clock.done(thread_pool.Choice(), 0.0, 9.0, 5, surely=True) == 5 * "s"  # too long to try
 
 
 def test_what_was_slower_is_tried_again_ever_more_seldom(monkeypatch: pytest.MonkeyPatch) -> None:
     clock = Clock(monkeypatch)
-    by = clock.done(threads.Choice(), 1.0, 1.2, 20_000)[2 * threads.TRIAL :]
-    waits = [len(part) for part in by.split(threads.TRIAL * "s")]
-    assert waits[:3] == [2 * threads.AGAIN, 4 * threads.AGAIN, 8 * threads.AGAIN]
-    assert set(waits[6:-1]) == {threads.SELDOM}
+    by = clock.done(thread_pool.Choice(), 1.0, 1.2, 20_000)[2 * thread_pool.TRIAL :]
+    waits = [len(part) for part in by.split(thread_pool.TRIAL * "s")]
+    assert waits[:3] == [2 * thread_pool.AGAIN, 4 * thread_pool.AGAIN, 8 * thread_pool.AGAIN]
+    assert set(waits[6:-1]) == {thread_pool.SELDOM}
 
 
 @pytest.mark.parametrize("sooner", [0, 1])
 def test_nothing_that_happens_once_decides_for_ever(sooner: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """Somebody is held up, or what is sooner done changes."""
-    clock, choice, wanted = Clock(monkeypatch), threads.Choice(), "as"[sooner]
+    clock, choice, wanted = Clock(monkeypatch), thread_pool.Choice(), "as"[sooner]
     usual, late = (0.5, 1.0) if sooner == 0 else (1.0, 0.5), 100.0
     clock.done(choice, *usual, 100)
     for held_up in ((late, usual[1]), (usual[0], late)):
         clock.done(choice, *held_up, 1)
-        assert clock.done(choice, *usual, 3 * threads.AGAIN).count(wanted) >= 3 * threads.AGAIN - threads.TRIAL - 1
-    clock.done(choice, *usual[::-1], 2 * threads.SELDOM)
-    assert clock.done(choice, *usual[::-1], 100).count(wanted) <= threads.TRIAL
-    for held_up in range(2 * threads.TRIAL):  # while it is tried for the first time
-        begun = threads.Choice()
-        for k in range(2 * threads.TRIAL):
+        assert (
+            clock.done(choice, *usual, 3 * thread_pool.AGAIN).count(wanted)
+            >= 3 * thread_pool.AGAIN - thread_pool.TRIAL - 1
+        )
+    clock.done(choice, *usual[::-1], 2 * thread_pool.SELDOM)
+    assert clock.done(choice, *usual[::-1], 100).count(wanted) <= thread_pool.TRIAL
+    for held_up in range(2 * thread_pool.TRIAL):  # while it is tried for the first time
+        begun = thread_pool.Choice()
+        for k in range(2 * thread_pool.TRIAL):
             clock.done(begun, *((late, late) if k == held_up else usual), 1)
-        assert clock.done(begun, *usual, threads.AGAIN) == threads.AGAIN * wanted
+        assert clock.done(begun, *usual, thread_pool.AGAIN) == thread_pool.AGAIN * wanted
 
 
 def test_a_piece_that_failed_is_nothing_to_go_by(monkeypatch: pytest.MonkeyPatch) -> None:
-    clock, choice = Clock(monkeypatch), threads.Choice()
+    clock, choice = Clock(monkeypatch), thread_pool.Choice()
     clock.done(choice, 1.0, 0.6, 10)
     before = list(choice.took)
 
@@ -407,7 +410,7 @@ def test_a_piece_that_failed_is_nothing_to_go_by(monkeypatch: pytest.MonkeyPatch
 
 
 def test_scenes_and_worlds_keep_to_what_is_sooner_done(shared: list[int], monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(threads.Choice, "always", False)
+    monkeypatch.setattr(thread_pool.Choice, "always", False)
     use_threads(2)
     scene = NAMED["torus"].make(640, 60.0)
     start = scene.start(0)
@@ -430,7 +433,7 @@ def test_long_calls_are_shared_at_once_where_threads_seldom_wait_for_each_other(
     count: int, worlds: int, surely: bool, shared: list[int], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Worlds apart, or one of many agents; whether a team on few is sooner done must have been seen."""
-    monkeypatch.setattr(threads.Choice, "always", False)
+    monkeypatch.setattr(thread_pool.Choice, "always", False)
     use_threads(2)
     scene = NAMED["torus"].make(count, 60.0)
     start, steps = scene.start(0, worlds=worlds), 1 + scenes.LARGEST // (count * worlds)

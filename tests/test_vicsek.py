@@ -29,7 +29,7 @@ def flock(noise: float, count: int = 400, **fields: object) -> Scene:
 
 
 def test_the_scene_of_configs_is_the_experiments() -> None:
-    assert load_scene(ROOT / "configs" / "vicsek.yaml") == scene_of(1.0)
+    assert load_scene(ROOT / "configs" / "scenes" / "vicsek.yaml") == scene_of(1.0)
 
 
 def drawn_for(key: int, step: int, agent: int) -> float:

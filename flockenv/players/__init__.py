@@ -79,7 +79,7 @@ def _trained(task: Task, seed: int) -> Policy:
 
     path = WEIGHTS / f"{task.name}.safetensors"
     if not path.is_file():
-        command = f"python -m agents.ppo configs/{task.name}.yaml"
+        command = f"python -m agents.ppo configs/training/{task.name}.yaml"
         raise ValueError(f"player 'ppo' has no weights for task {task.name!r}; this trains them: {command}")
     return MlpPolicy.load(path, task, seed)
 

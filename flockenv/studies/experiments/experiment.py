@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -12,9 +11,9 @@ import numpy as np
 from pydantic import Field
 
 from flockenv.core.record import ResultRecord
-from flockenv.jit.sources import laws_digest
 from flockenv.model.state import Floats, State
 from flockenv.scene import Scene
+from flockenv.studies.sources import SIMULATOR, fingerprint
 
 __all__ = ["Cell", "Experiment", "Results", "Trial", "depth", "run"]
 
@@ -90,7 +89,7 @@ def run(
         Cell(case=case, variant=variant, numbers=_known(trial.numbers, tuple(experiment.columns)))
         for (case, variant), trial in trials.items()
     )
-    sources = hashlib.sha256(laws_digest().encode()).hexdigest()[:20]
+    sources = fingerprint((*SIMULATOR, "studies/experiments"), but=("plots.py", "curves.py"))
     results = Results(
         experiment=experiment.name, title=experiment.title, cases=dict(experiment.cases),
         columns=dict(experiment.columns), cells=cells, sources=sources,

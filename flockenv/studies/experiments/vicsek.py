@@ -1,10 +1,10 @@
 """Order against noise in Vicsek's flock: the curve of 1995, beside its bound and an independent run.
 
-configs/vicsek.yaml under more and more noise: the order v_a is the length of the mean heading, over time and worlds
-after the flock has settled. Its transition sharpens with the number of agents; at no size is it above
-sin(eta/2) / (eta/2), what errors alone leave of directions that agree, by more than what chance leaves of none.
-Whether positions move with the new velocity (semi_implicit_euler) or, as the paper writes it, with the old one
-(explicit_euler), makes a difference near the transition, though a step is .03 of the reach.
+configs/scenes/vicsek.yaml under more and more noise: the order v_a is the length of the mean heading, over time and
+worlds after the flock has settled. Its transition sharpens with the number of agents; at no size is it above sin(eta/2)
+/ (eta/2), what errors alone leave of directions that agree, by more than what chance leaves of none. Whether positions
+move with the new velocity (semi_implicit_euler) or, as the paper writes it, with the old one (explicit_euler), makes a
+difference near the transition, though a step is .03 of the reach.
 """
 
 from __future__ import annotations

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Callable, Sequence
-from pathlib import Path
 
 from flockenv.core.warnings import UnsolvedContactsWarning
-from flockenv.jit.sources import laws_digest
 from flockenv.physics.integrators import INTEGRATORS, Integrator
-from flockenv.studies import trial_log
+from flockenv.studies import sources, trial_log
+from flockenv.studies.sources import SIMULATOR
 from flockenv.studies.stress.setup import TOO_LONG
 from flockenv.studies.trial_log import Case, Results
 
@@ -25,14 +23,8 @@ def usual_methods() -> tuple[Integrator, ...]:
 
 
 def fingerprint() -> str:
-    """Return a digest of the sources that findings depend on: laws, methods, and the cases themselves."""
-    here = Path(__file__).parent
-    paths = [*here.glob("*.py"), *(here.parent / "integrators").glob("*.py")]
-    paths += [here.parent / "implicit.py", here.parent / "stability.py"]
-    digest = hashlib.sha256(laws_digest().encode())
-    for path in sorted(paths):
-        digest.update(path.read_bytes())
-    return digest.hexdigest()[:20]
+    """Return a digest of the code that findings depend on: the simulator, and the cases themselves."""
+    return sources.fingerprint((*SIMULATOR, "studies/stress"), but=("plots.py",))
 
 
 def run(

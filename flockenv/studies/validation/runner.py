@@ -2,30 +2,19 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Callable, Sequence
-from pathlib import Path
 
-from flockenv.jit.sources import laws_digest
-from flockenv.studies import trial_log
+from flockenv.studies import sources, trial_log
+from flockenv.studies.sources import SIMULATOR
 from flockenv.studies.trial_log import Case, Results
 from flockenv.studies.validation.quiet import quietly
 
 __all__ = ["fingerprint", "run"]
 
-BESIDE = ("presets.py", "spread.py", "targets.py", "ways.py", "eikonal.py")
-"""Other files that findings depend on, without laws: models, people, floor fields."""
-
 
 def fingerprint() -> str:
-    """Return a digest of the sources that findings depend on: laws, models, measures and cases."""
-    here = Path(__file__).parent
-    paths = [path for path in here.glob("*.py") if path.stem != "page"]
-    paths += [*(here.parent / "measures").glob("*.py"), *(here.parent / name for name in BESIDE)]
-    digest = hashlib.sha256(laws_digest().encode())
-    for path in sorted(paths):
-        digest.update(path.read_bytes())
-    return digest.hexdigest()[:20]
+    """Return a digest of the code that findings depend on: the simulator, measures and cases."""
+    return sources.fingerprint((*SIMULATOR, "studies/measures", "studies/validation"), but=("page.py", "plots.py"))
 
 
 def run(
