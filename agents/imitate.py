@@ -16,9 +16,9 @@ import typer
 from rich.console import Console
 from rich.progress import Progress
 
+from agents.dagger import WORLDS, teach
 from agents.experiment import Experiment, load_experiment, one_line_errors
 from agents.ppo import build, on_threads, score, tensors_of
-from agents.teach import WORLDS, teach
 from flockenv.cli.terminal import DIVERGED, program, shown_progress
 from flockenv.evaluation import rollout, worlds_for
 from flockenv.players.rules import player

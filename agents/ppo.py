@@ -29,14 +29,14 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import Logger
 
-from agents.central import CentralPolicy, CentralVecEnv
+from agents.central_critic import CentralPolicy, CentralVecEnv
 from agents.checkpoint import CheckpointError, claimed, path_in
-from agents.credit import CaringBuffer
+from agents.dagger import teach
 from agents.divergence import LearningDiverged, check_answers, check_model
 from agents.experiment import Experiment, PpoSettings, load_experiment, one_line_errors
 from agents.learning_env import ForLearning
 from agents.run import Run, checkpoint, checkpointed, expected_bytes, recipe_of
-from agents.teach import teach
+from agents.team_credit import CaringBuffer
 from agents.training_state import capture, restore, surroundings
 from flockenv.cli.terminal import DIVERGED, interruptible, program, shown_progress
 from flockenv.core import signals

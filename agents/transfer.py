@@ -33,7 +33,7 @@ from agents.compare import (
     write_text,
 )
 from agents.processes import parenting, serve, starting
-from agents.transfer_cells import (
+from agents.transfer_cache import (
     KEPT,
     Plan,
     clocked,

@@ -15,14 +15,14 @@ import yaml
 from stable_baselines3.common.buffers import RolloutBuffer
 from typer.testing import CliRunner
 
+from agents import dagger, tune
 from agents import imitate as imitation
-from agents import teach, tune
-from agents.credit import CaringBuffer
+from agents.dagger import shown
 from agents.experiment import AS_CONFIGURED, CONFIGS, Experiment, PpoSettings, load_experiment
 from agents.imitate import imitate
 from agents.learning_env import ForLearning
 from agents.run import checkpointed, recipe_of
-from agents.teach import shown
+from agents.team_credit import CaringBuffer
 from flockenv.envs.sb3 import WorldVecEnv
 from flockenv.envs.world import World
 from flockenv.evaluation import compare, rollout, worlds_for
@@ -364,7 +364,7 @@ def test_a_network_that_is_taught_longer_answers_more_as_the_rules_do() -> None:
 def test_imitation_that_diverges_ends_in_one_line(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, rate: float, updates: int
 ) -> None:
-    monkeypatch.setattr(teach, "RATE", rate)
+    monkeypatch.setattr(dagger, "RATE", rate)
     (tmp_path / "p.yaml").write_text(f"task: pursuit\nppo: {json.dumps(TINY)}\n", encoding="utf-8")
     given = [str(tmp_path / "p.yaml"), "--worlds", "2", "--updates", str(updates)]
     result = CliRunner().invoke(imitation.app, given)
@@ -378,7 +378,7 @@ def test_a_training_that_diverges_while_it_is_taught_ends_in_one_line(
 ) -> None:
     from agents import ppo
 
-    monkeypatch.setattr(teach, "RATE", 1e30)
+    monkeypatch.setattr(dagger, "RATE", 1e30)
     (tmp_path / "p.yaml").write_text(f"task: pursuit\nppo: {json.dumps(TINY | {'taught': 5})}\n", encoding="utf-8")
     given = [str(tmp_path / "p.yaml"), "--runs", str(tmp_path / "runs"), "--out", str(tmp_path / "p.safetensors")]
     result = CliRunner().invoke(ppo.app, given)

@@ -53,7 +53,7 @@ ELSEWHERE = {
         "fields", "tether", "attraction", "motivation", "aims", "floor_field", "waypoints", "exit_choice", "vicsek",
     )
 }  # fmt: skip
-"""Effects of these files have quick tests in files of their own: test_fields.py, test_inner.py, test_ways.py, ..."""
+"""Effects whose quick tests lie in files of their own: test_fields.py, test_inner.py, test_floor_fields.py, ..."""
 
 
 def among(rows: Iterable[EffectRow]) -> pytest.MarkDecorator:

@@ -1,41 +1,89 @@
-"""Too little memory for what a command loads is one line, whatever library would have failed."""
+"""Lines of memory: what is poured past the caches is what was poured, and nothing beside it is touched."""
 
 from __future__ import annotations
 
-import os
-import subprocess
-import sys
-from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
+from numba import njit
+from numba.core.errors import TypingError
 
-ROOT = Path(__file__).resolve().parent.parent
-
-pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="no other system limits the address space")
-
-COMMANDS = {
-    "flockenv": (str(Path(sys.executable).with_name("flockenv")), "run", "none.yaml"),
-    "tune": ("-m", "agents.tune", "none.yaml"),
-}
+from flockenv.jit.cpu import LINE
+from flockenv.jit.memory import fetch, pour, settle, zeros
 
 
-def limited(megabytes: int, *command: str) -> subprocess.CompletedProcess[str]:
-    def limit() -> None:
-        import resource
-
-        resource.setrlimit(resource.RLIMIT_AS, (megabytes * 10**6,) * 2)
-
-    return subprocess.run(
-        [sys.executable, *command], env={**os.environ, "PYTHONPATH": str(ROOT)}, capture_output=True, text=True,
-        check=False, timeout=120, preexec_fn=limit,
-    )  # fmt: skip
+@njit(nogil=True)
+def poured(to: Any, at: int, source: Any) -> None:
+    """Call it as a kernel does."""
+    pour(to, np.uint64(at), source)
+    settle()
 
 
-@pytest.mark.parametrize("megabytes", [100, 150, 250, 400, 500])
-@pytest.mark.parametrize("name", COMMANDS)
-def test_a_command_without_the_address_space_it_needs_names_memory(name: str, megabytes: int) -> None:
-    done = limited(megabytes, *COMMANDS[name])
-    start = f"{name}: not enough memory: at least "
-    end = f" GB of address space are needed beside Python's own, {megabytes / 1e3:.2g} GB are allowed (ulimit -v)\n"
-    assert done.stderr.startswith(start) and done.stderr.endswith(end), done.stderr
-    assert (done.returncode, done.stdout, done.stderr.count("\n")) == (2, "", 1)
+def aligned(count: int, kind: Any, past: int) -> Any:
+    """Return so many numbers that begin `past` bytes behind the beginning of a line, full of -7."""
+    room = np.empty(count * np.dtype(kind).itemsize + 2 * LINE, np.uint8)
+    start = -room.__array_interface__["data"][0] % LINE + past
+    array = room[start : start + count * np.dtype(kind).itemsize].view(kind)
+    array[:] = -7
+    return array
+
+
+@pytest.mark.parametrize("kind", [np.float32, np.float64])
+@pytest.mark.parametrize("past", [0, 8, 16, 56])
+@pytest.mark.parametrize("count", [0, 1, 7, 8, 15, 16, 17, 31, 33, 64, 1001])
+def test_what_is_poured_arrives_whatever_the_lines_are(count: int, past: int, kind: Any) -> None:
+    source = np.random.default_rng(count).normal(size=count).astype(kind)
+    for at in (0, 1, 5, 16, 19):
+        room = aligned(count + 40, kind, past)
+        poured(room, at, source)
+        np.testing.assert_array_equal(room[at : at + count], source)
+        assert (room[:at] == -7).all() and (room[at + count :] == -7).all()
+
+
+def test_a_table_is_poured_row_after_row() -> None:
+    source = np.arange(12, dtype=np.float32).reshape(4, 3)
+    room = np.zeros((3, 4, 3), np.float32)
+    poured(room, 12, source)
+    np.testing.assert_array_equal(room, [np.zeros((4, 3)), source, np.zeros((4, 3))])
+
+
+def test_numbers_of_another_kind_and_arrays_with_gaps_are_not_compiled_for() -> None:
+    with pytest.raises(TypingError, match="differ"):
+        poured(np.zeros(4), 0, np.zeros(4, np.float32))
+    for to, source in ((np.zeros((4, 4))[:, :2], np.zeros(4)), (np.zeros(4), np.zeros(8)[::2])):
+        with pytest.raises(TypingError, match="one piece"):
+            poured(to, 0, source)
+
+
+def test_whole_lines_go_past_the_caches_and_a_fence_follows() -> None:
+    """Ordinary stores would vanish unseen: results are the same."""
+    poured(np.zeros(40, np.float32), 0, np.zeros(40, np.float32))
+    texts = poured.inspect_llvm().values()
+    assert texts and all("!nontemporal" in text and "fence seq_cst" in text for text in texts)
+
+
+@pytest.mark.parametrize("kind", [np.float32, np.float64, np.int32])
+def test_zeros_begin_where_a_line_does(kind: Any) -> None:
+    kept = []
+    for shape in (0, 1, 7, (3, 5), (2, 0, 4), (100, 33)):
+        array = zeros(shape, kind)
+        assert (array.shape, array.dtype) == (np.zeros(shape).shape, kind)
+        assert array.ctypes.data % LINE == 0 and array.flags.carray and not array.any()
+        array[...] = 1
+        kept.append(array)
+    assert all((array == 1).all() for array in kept)
+
+
+@njit
+def fetched(array: Any, part: int, parts: int) -> None:
+    """Call it as a kernel does."""
+    fetch(array, part, parts)
+
+
+def test_memory_is_asked_for_without_being_touched() -> None:
+    for size in (0, 1, 100):
+        array = np.arange(size, dtype=np.float32)
+        for part in range(4):
+            fetched(array, part, 4)
+        np.testing.assert_array_equal(array, np.arange(size))

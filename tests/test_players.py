@@ -14,7 +14,7 @@ import pytest
 import typer
 from typer.main import get_command
 
-from agents import compare, invade, transfer
+from agents import best_response, compare, transfer
 from flockenv.cli import main
 from flockenv.players import NAMES, WEIGHTS, load_player, other_tasks
 from flockenv.players.policy import MlpPolicy
@@ -232,7 +232,9 @@ def test_a_zip_is_opened_only_when_trusted(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "app", [main.app, compare.app, invade.app, transfer.app], ids=["flockenv", "compare", "invade", "transfer"]
+    "app",
+    [main.app, compare.app, best_response.app, transfer.app],
+    ids=["flockenv", "compare", "best_response", "transfer"],
 )
 def test_every_command_with_players_can_be_told_to_trust_their_zips(app: typer.Typer) -> None:
     commands = getattr(get_command(app), "commands", {"": get_command(app)})

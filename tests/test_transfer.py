@@ -12,8 +12,8 @@ import pytest
 from typer.testing import CliRunner
 
 from agents import compare as comparison
-from agents import transfer, transfer_cells, transfer_chart, transfer_report
-from agents.transfer_cells import KEPT, Plan
+from agents import transfer, transfer_cache, transfer_chart, transfer_report
+from agents.transfer_cache import KEPT, Plan
 from agents.transfer_report import Cell, Clock, Setting
 from flockenv.physics.integrators import INTEGRATORS, RK4
 from flockenv.tasks import TASKS, Pursuit
@@ -44,8 +44,8 @@ class Counted:
     """Stands for rollout, counts the calls, and may be interrupted at one of them."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch, stop_at: int = 0) -> None:
-        self.calls, self.stop_at, self.real = 0, stop_at, transfer_cells.rollout
-        monkeypatch.setattr(transfer_cells, "rollout", self)
+        self.calls, self.stop_at, self.real = 0, stop_at, transfer_cache.rollout
+        monkeypatch.setattr(transfer_cache, "rollout", self)
 
     def __call__(self, *arguments: Any, **options: Any) -> Any:
         self.calls += 1
@@ -84,7 +84,7 @@ def test_the_trained_setting_scores_what_the_comparison_says_bit_for_bit_and_aga
     field = comparison.field_of(["random", "rules", "ppo"])
     said, _ = comparison.compare([task], field, worlds=3, resamples=100)
     plan = Plan(task, (Setting.trained(task),), tuple(field), 3, 0, 2)
-    for (_, name), cell in transfer_cells.played(plan).items():
+    for (_, name), cell in transfer_cache.played(plan).items():
         assert cell.returns.tolist() == said["tasks"]["pursuit"]["players"][name]["returns"]
     about = results()["tasks"]["pursuit"]
     assert about["again"] == {"random": 0.0, "rules": 0.0, "ppo": 0.0}
@@ -130,7 +130,7 @@ def test_the_same_command_goes_on_after_an_interruption_and_plays_nothing_twice(
     assert "interrupted; what was played is in" in result.stderr
     assert len(list(KEPT.rglob("*.json"))) == 3
     assert not Path("results").exists()
-    monkeypatch.setattr(transfer_cells, "rollout", first.real)
+    monkeypatch.setattr(transfer_cache, "rollout", first.real)
     second = Counted(monkeypatch)
     run(*asked)
     assert second.calls == cells - 3
@@ -317,7 +317,7 @@ def test_a_hand_written_player_sits_out_the_tasks_that_it_is_not_written_for() -
 
 
 def test_a_folder_in_the_place_of_a_file_is_refused_before_anything_is_played(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(transfer_cells, "rollout", lambda *_, **__: pytest.fail("something was played"))
+    monkeypatch.setattr(transfer_cache, "rollout", lambda *_, **__: pytest.fail("something was played"))
     Path("results/transfer.md").mkdir(parents=True)
     assert "transfer.md': is a folder" in run(*TINY, code=2).stderr
 
@@ -351,7 +351,7 @@ def test_all_files_come_out_of_one_run() -> None:
 def test_bad_requests_are_refused_in_one_line(
     arguments: tuple[str, ...], message: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(transfer_cells, "rollout", lambda *_, **__: pytest.fail("something was played"))
+    monkeypatch.setattr(transfer_cache, "rollout", lambda *_, **__: pytest.fail("something was played"))
     result = run(*arguments, code=2)
     assert result.stdout == ""
     [line] = result.stderr.splitlines()

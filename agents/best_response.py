@@ -1,4 +1,4 @@
-"""Who gains by playing otherwise than all others? `python -m agents.invade configs/training/school.yaml`.
+"""Who gains by playing otherwise than all others? `python -m agents.best_response configs/training/school.yaml`.
 
 The comparison lets everybody in a world play alike. Here one agent of each world plays one policy, and all others
 another: where a policy does best among those who do not have it, and all are worse off when all have it, no learner
@@ -207,4 +207,4 @@ def _makers(task: Task, asked: Sequence[str], seed: int, trust_pickle: bool) -> 
 
 
 if __name__ == "__main__":
-    program("invade", app)
+    program("best_response", app)

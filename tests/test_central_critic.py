@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from agents import ppo
-from agents.central import CentralVecEnv
+from agents.central_critic import CentralVecEnv
 from agents.experiment import Experiment, PpoSettings
 from agents.run import OtherRecipe, checkpointed
 from flockenv.envs.sb3 import WorldVecEnv

@@ -94,7 +94,7 @@ def write(case: str, path: str) -> None:
 def test_results_are_the_same_in_long_registers_and_in_short_ones(case: str, tmp_path: Path) -> None:
     found = []
     for size in ("64", "32"):
-        ask = f"from tests.test_processor import write; write({case!r}, {str(tmp_path / size)!r})"
+        ask = f"from tests.test_cpu import write; write({case!r}, {str(tmp_path / size)!r})"
         environment = {**os.environ, "FLOCKENV_REGISTER": size}
         done = subprocess.run(
             [sys.executable, "-W", "ignore", "-c", ask], env=environment, cwd=ROOT, capture_output=True, text=True

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from agents import invade as invasion
+from agents import best_response
 from flockenv.envs.world import World
 from flockenv.evaluation import Episodes, rollout, worlds_for
 from flockenv.players.policy import RandomPolicy
@@ -55,7 +55,7 @@ def test_one_plays_alone_in_its_seat_and_is_paid_until_it_is_out(theirs: float) 
         return push.astype(np.float32)
 
     first = worlds_for("evaluation", 0, WORLDS)
-    made = lambda task, worlds, limit: invasion.Among(task, worlds, limit, Steady(theirs))  # noqa: E731
+    made = lambda task, worlds, limit: best_response.Among(task, worlds, limit, Steady(theirs))  # noqa: E731
     alone = rollout(TASK, Steady(0.2), WORLDS, first, make_world=made)
     np.testing.assert_allclose(alone.returns, returns_of_seats(actions), rtol=0, atol=1e-12)
     assert (alone.lengths < TASK.horizon).any()  # somebody was out before the others
@@ -65,16 +65,16 @@ def test_one_of_many_changes_what_the_others_meet() -> None:
     field = {"calm": lambda task: Steady(0.0), "wild": lambda task: RandomPolicy(2, 0)}
     told: list[int] = []
     flock = Flock(agents=7, horizon=10)
-    payoffs = invasion.invade(flock, field, WORLDS, advance=lambda: told.append(1))  # type: ignore[arg-type]
+    payoffs = best_response.invade(flock, field, WORLDS, advance=lambda: told.append(1))  # type: ignore[arg-type]
     assert len(told) == 4 and payoffs.players == ("calm", "wild")
     assert not np.array_equal(payoffs.of["calm", "calm"].returns, payoffs.of["calm", "wild"].returns)
     assert not np.array_equal(payoffs.of["calm", "calm"].returns, payoffs.of["wild", "calm"].returns)
-    again = invasion.invade(flock, field, WORLDS)  # type: ignore[arg-type]
+    again = best_response.invade(flock, field, WORLDS)  # type: ignore[arg-type]
     assert all(np.array_equal(payoffs.of[key].returns, again.of[key].returns) for key in payoffs.of)
-    assert [column.header for column in invasion.table_of(payoffs).columns] == ["", "calm", "wild"]
+    assert [column.header for column in best_response.table_of(payoffs).columns] == ["", "calm", "wild"]
 
 
-def made_up(aa: float, ab: float, ba: float, bb: float, noise: float = 0.1) -> invasion.Payoffs:
+def made_up(aa: float, ab: float, ba: float, bb: float, noise: float = 0.1) -> best_response.Payoffs:
     """Payoffs of `a` among `a`, of `a` among `b`, and so on, with a little luck of worlds."""
     values = {("a", "a"): aa, ("a", "b"): ab, ("b", "a"): ba, ("b", "b"): bb}
     luck = np.random.default_rng(0)
@@ -85,7 +85,7 @@ def made_up(aa: float, ab: float, ba: float, bb: float, noise: float = 0.1) -> i
             "toy", "same", 0, 10, returns, returns > 0, np.full(40, 10), {}, {}, microseconds=1.0, latency=1.0
         )
 
-    return invasion.Payoffs("toy", ("a", "b"), {key: episodes(value) for key, value in values.items()})
+    return best_response.Payoffs("toy", ("a", "b"), {key: episodes(value) for key, value in values.items()})
 
 
 @pytest.mark.parametrize(
@@ -100,7 +100,7 @@ def made_up(aa: float, ab: float, ba: float, bb: float, noise: float = 0.1) -> i
         (made_up(1, 1, 1, 1), "not decided in these worlds"),
     ],
 )
-def test_the_verdict_follows_from_the_payoffs(payoffs: invasion.Payoffs, says: str) -> None:
+def test_the_verdict_follows_from_the_payoffs(payoffs: best_response.Payoffs, says: str) -> None:
     assert payoffs.verdict("a", "b").endswith(says)
     assert payoffs.verdict("b", "a") == payoffs.verdict("a", "b")
     assert payoffs.mean("a", "b").low < payoffs.of["a", "b"].returns.mean() < payoffs.mean("a", "b").high
@@ -119,7 +119,7 @@ def test_the_verdict_follows_from_the_payoffs(payoffs: invasion.Payoffs, says: s
     ],
 )
 def test_what_cannot_be_played_is_refused_in_one_line(arguments: list[str], message: str) -> None:
-    result = CliRunner().invoke(invasion.app, [*arguments, "--worlds", "2"])
+    result = CliRunner().invoke(best_response.app, [*arguments, "--worlds", "2"])
     assert result.exit_code == 2
     assert message in result.stderr and len(result.stderr.strip().splitlines()) == 1
 
@@ -138,14 +138,14 @@ def test_somebody_who_fails_among_others_is_named(tmp_path: Path, code: str, mes
     lines = ("import numpy as np", "def predict(observation, state=None, episode_start=None, deterministic=True):")
     (tmp_path / "mine.py").write_text("\n".join((*lines, f"    {code}", "")), encoding="utf-8")
     arguments = ["configs/training/school.yaml", "--players", str(tmp_path / "mine.py"), "--worlds", "2"]
-    result = CliRunner().invoke(invasion.app, arguments)
+    result = CliRunner().invoke(best_response.app, arguments)
     assert result.exit_code == 2, result.output
     assert message in result.stderr and "mine" in result.stderr and len(result.stderr.strip().splitlines()) == 1
 
 
 def test_it_prints_a_table_and_a_sentence_for_each_pair() -> None:
     command = ["configs/training/school.yaml", "--players", "textbook,rules", "--worlds", "8"]
-    result = CliRunner().invoke(invasion.app, command)
+    result = CliRunner().invoke(best_response.app, command)
     assert result.exit_code == 0, result.output
     assert "school: mean return of one who plays the row, among those who play the column" in result.stdout
     assert "rules among textbook: " in result.stdout and "textbook among rules: " in result.stdout
