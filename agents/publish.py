@@ -1,6 +1,7 @@
 """Put a comparison into the documents: `python -m agents.compare && python -m agents.publish`.
 
-Copies results.json and comparison.png into docs/ and writes README's tables, so that all of them are of one run.
+Copies results.json and comparison.png into docs/, draws docs/summary.png, and writes the tables of README.md and of
+docs/results.md, so that all of them belong to one run.
 """
 
 from __future__ import annotations
@@ -17,14 +18,15 @@ import typer
 from agents.compare import ROOT
 from agents.experiment import one_line_errors
 from agents.report import Results, grid
+from agents.summary_chart import write_summary
 from flockenv.cli.terminal import program
 from flockenv.core.atomic_files import deliver
 from flockenv.tasks import TASKS
 
-__all__ = ["BLOCK", "app", "tables"]
+__all__ = ["BLOCK", "app", "summary", "tables"]
 
 BLOCK = re.compile(r"(?<=<!-- python -m agents\.publish -->\n).*?(?=<!-- end -->)", re.DOTALL)
-"""What README has between its two marks."""
+"""What a page has between its two marks."""
 
 SHOWN = ("random", "textbook", "rules", "ppo")
 """Players with a column of their own; the others, of some tasks each, have a table below."""
@@ -33,7 +35,7 @@ app = typer.Typer(add_completion=False, rich_markup_mode=None, pretty_exceptions
 
 
 def tables(results: Results) -> str:
-    """Return README's two tables: the players of every task, and those of some tasks."""
+    """Return the two tables of docs/results.md: the players of every task, and those of some tasks."""
     header = ["task", *(f"`{name}`" for name in SHOWN), "`ppo` - `rules`, in the same worlds"]
     rows = [
         [task, *(_score(about["players"][name]) for name in SHOWN), _lead(about["pairs"]["ppo - rules"])]
@@ -43,6 +45,30 @@ def tables(results: Results) -> str:
     return (
         f"{grid(header, rows)}\n\n{grid(['task', 'player', 'score', '`ppo` - player, in the same worlds'], others)}\n"
     )
+
+
+def summary(results: Results) -> str:
+    """Return README's table: scores at two digits, and success rates below 100 %."""
+    header = ["task", *(f"`{name}`" for name in SHOWN), "`ppo` - `rules`"]
+    rows = [
+        [task, *(_brief(about["players"][name]) for name in SHOWN), _brief_lead(about["pairs"]["ppo - rules"])]
+        for task, about in results["tasks"].items()
+    ]
+    return f"{grid(header, rows)}\n"
+
+
+def _brief(player: Results) -> str:
+    rate = f"{player['success_rate']:.0%}"
+    return _digits(player["iqm"]) if rate == "100%" else f"{_digits(player['iqm'])}, {rate}"
+
+
+def _brief_lead(pair: Results) -> str:
+    return f"{'+' * (pair['difference'] > 0)}{_digits(pair['difference'])}" if pair["separated"] else "level"
+
+
+def _digits(value: float) -> str:
+    """Return a number at two significant digits, without an exponent."""
+    return f"{float(f'{value:.2g}'):g}"
 
 
 def _others(results: Results) -> Iterator[list[str]]:
@@ -84,17 +110,25 @@ def main(
     folder: Annotated[Path, typer.Argument(help="where `python -m agents.compare` wrote its files")] = Path("results"),
     root: Annotated[Path, typer.Option(help="the checkout whose documents are written")] = ROOT,
 ) -> None:
-    """Copy a comparison's results and picture into docs/, and write README's tables."""
+    """Copy a comparison's results and picture into docs/, draw its summary, and write the tables of the pages."""
     with one_line_errors():
         results = _checked(folder)
-        readme = (root / "README.md").read_text(encoding="utf-8")
-        if len(BLOCK.findall(readme)) != 1:
-            raise ValueError(f"{root / 'README.md'}: must have one place for the tables, between its two marks")
         contents = {f"docs/{name}": (folder / name).read_bytes() for name in ("results.json", "comparison.png")}
-        contents["README.md"] = BLOCK.sub(lambda _: tables(results), readme).encode()
-        deliver(root, {name: functools.partial(_write, content) for name, content in contents.items()})
-    for name in contents:
+        for name, table in (("README.md", summary(results)), ("docs/results.md", tables(results))):
+            contents[name] = _page(root / name, table).encode()
+        writers = {name: functools.partial(_write, content) for name, content in contents.items()}
+        writers["docs/summary.png"] = functools.partial(write_summary, results=results)
+        deliver(root, writers)
+    for name in writers:
         typer.echo(f"{root / name}: written")
+
+
+def _page(path: Path, table: str) -> str:
+    """Return a page with a new table between its two marks."""
+    text = path.read_text(encoding="utf-8")
+    if len(BLOCK.findall(text)) != 1:
+        raise ValueError(f"{path}: must have one place for the tables, between its two marks")
+    return BLOCK.sub(lambda _: table, text)
 
 
 def _write(content: bytes, path: Path) -> None:

@@ -415,6 +415,18 @@ def test_a_task_under_a_player_of_ones_own() -> None:
         assert png.size[0] == 96
 
 
+def test_several_players_of_one_world_are_drawn_side_by_side() -> None:
+    command = ["render", "pursuit", "--player", "rules,textbook", "--size", "192", "--seed", "3"]
+    for out in ("two.png", "two.gif", "two.html"):
+        assert main([*command, "--out", out]) == 0
+    for out in ("two.png", "two.gif"):
+        with Image.open(out) as picture:
+            left, right = (np.asarray(picture.convert("RGB"))[:, part] for part in (slice(96), slice(96, 192)))
+            assert left.shape == right.shape and not np.array_equal(left, right)
+    text = Path("two.html").read_text().replace('": "', '":"')
+    assert '"player":"rules"' in text and '"player":"textbook"' in text
+
+
 def test_a_zip_is_a_player_only_where_it_is_trusted(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

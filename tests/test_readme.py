@@ -15,6 +15,7 @@ from flockenv.tasks import TASKS
 
 ROOT = Path(__file__).parent.parent
 README = (ROOT / "README.md").read_text(encoding="utf-8")
+RESULTS = (ROOT / "docs" / "results.md").read_text(encoding="utf-8")
 
 
 def test_the_ten_lines_run_and_the_player_scores_what_a_player_scores(capsys: pytest.CaptureFixture[str]) -> None:
@@ -33,11 +34,21 @@ def test_every_file_it_points_to_exists() -> None:
 def test_its_tables_are_those_of_the_stored_run() -> None:
     """If this fails: `python -m agents.compare && python -m agents.publish` makes both anew."""
     results = json.loads((ROOT / "docs" / "results.json").read_text(encoding="utf-8"))
-    assert publish.BLOCK.findall(README) == [publish.tables(results)]
+    assert publish.BLOCK.findall(README) == [publish.summary(results)]
+    assert publish.BLOCK.findall(RESULTS) == [publish.tables(results)]
     assert results["tasks"].keys() == TASKS.keys()
     for task in results["tasks"].values():
         for player in task["players"].values():
-            assert f"{player['iqm']:.2f} [{player['ci_low']:.2f}, {player['ci_high']:.2f}]" in README
+            assert f"{player['iqm']:.2f} [{player['ci_low']:.2f}, {player['ci_high']:.2f}]" in RESULTS
+
+
+def test_it_is_short_and_its_tables_are_narrow() -> None:
+    assert len(README.splitlines()) <= 150
+    for table in re.findall(r"(?:^\|.*\n)+", README, re.MULTILINE):
+        assert table.splitlines()[0].count("|") <= 7, "at most six columns"
+    prose = re.sub(r"```.*?```|^\|.*$|^!.*$|\]\([^)]*\)|`[^`]*`", " ", README, flags=re.DOTALL | re.MULTILINE)
+    for sentence in re.split(r"(?<=[.:;?])\s|\n\s*\n|^\* ", prose, flags=re.MULTILINE):
+        assert len(sentence.split()) <= 30, sentence
 
 
 def test_a_comparison_is_published_as_it_is_and_a_quick_or_partial_one_never(tmp_path: Path) -> None:
@@ -47,6 +58,7 @@ def test_a_comparison_is_published_as_it_is_and_a_quick_or_partial_one_never(tmp
     folder.mkdir()
     readme = publish.BLOCK.sub("old\n", README)
     (root / "README.md").write_text(readme, encoding="utf-8")
+    (root / "docs" / "results.md").write_text(publish.BLOCK.sub("old\n", RESULTS), encoding="utf-8")
     (folder / "comparison.png").write_bytes(b"a picture")
 
     def published(results: dict[str, Any] | None) -> Any:
@@ -62,9 +74,12 @@ def test_a_comparison_is_published_as_it_is_and_a_quick_or_partial_one_never(tmp
     ):
         refused = published(given)
         assert refused.exit_code == 2 and said in refused.stderr and refused.stderr.count("\n") == 1
-        assert (root / "README.md").read_text(encoding="utf-8") == readme and not any((root / "docs").iterdir())
+        assert (root / "README.md").read_text(encoding="utf-8") == readme
+        assert [path.name for path in (root / "docs").iterdir()] == ["results.md"]
     done = published(results)
     assert done.exit_code == 0, done.output
     assert (root / "README.md").read_text(encoding="utf-8") == README
+    assert (root / "docs" / "results.md").read_text(encoding="utf-8") == RESULTS
+    assert (root / "docs" / "summary.png").read_bytes().startswith(b"\x89PNG")
     assert (root / "docs" / "results.json").read_bytes() == (folder / "results.json").read_bytes()
     assert (root / "docs" / "comparison.png").read_bytes() == b"a picture"

@@ -7,6 +7,7 @@ Errors are one line on stderr, exit code 2.
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import json
 import math
@@ -237,7 +238,9 @@ def render(
     player: Annotated[
         str,
         typer.Option(
-            metavar="NAME|FILE", help=f"Player of a task: {', '.join(NAMES)}, or a file (.safetensors, .py, .zip)."
+            metavar="NAME|FILE,...",
+            help=f"Player of a task: {', '.join(NAMES)}, or a file (.safetensors, .py, .zip); several play the same "
+            "world, side by side.",
         ),
     ] = "random",
     seed: Seed = 0,
@@ -260,14 +263,16 @@ def render(
     if what in TASKS:
         if duration is not None:
             raise ValueError(f"--duration = {duration:g}: goes with a scene; an episode of a task ends by itself")
-        (panel, fps), left = _episode(TASKS[what](), player, seed, trust_pickle), ""
+        (panels, fps), left = _episodes(TASKS[what](), player.split(","), seed, trust_pickle), ""
     elif what.endswith((".yaml", ".yml")) or Path(what).exists():
         panel, fps, left = _film(what, 10.0 if duration is None else duration, seed)
+        panels = [panel]
     else:
         raise ValueError(f"{shown(what)}: no such task{nearest(what, TASKS)} ({', '.join(TASKS)}), nor a .yaml file")
     with made(path.parent):
-        _write_picture(path, panel, what if what in TASKS else Path(what).stem, fps, size)
-    new_console().print(f"{relative(path)}: {path.stat().st_size:,} bytes, {panel.snapshots[-1].time:g} s{left}")
+        _write_picture(path, panels, what if what in TASKS else Path(what).stem, fps, size)
+    end = max(panel.snapshots[-1].time for panel in panels)
+    new_console().print(f"{relative(path)}: {path.stat().st_size:,} bytes, {end:g} s{left}")
 
 
 @app.command()
@@ -432,40 +437,62 @@ def _film(file: str, duration: float, seed: int) -> tuple[Panel, float, str]:
     return panel, 1.0 / (every * scene.dt), _unsolved(trajectory.last)
 
 
-def _episode(task: Task, player: str, seed: int, trust_pickle: bool) -> tuple[Panel, float]:
-    """Return one episode as something to draw, and its frames per second."""
+def _episodes(task: Task, players: Sequence[str], seed: int, trust_pickle: bool) -> tuple[list[Panel], float]:
+    """Return an episode of the same world per player as something to draw, and frames per second."""
     from flockenv.evaluation import rollout
     from flockenv.players import load_player
     from flockenv.render import Panel
 
-    policy = load_player(player, task, seed, trust_pickle)
-    with progress_bar("playing", task.horizon, "decisions") as progress:
-        episode = rollout(task, policy, 1, seed, record=0, progress=lambda done, most: progress(done))
-    assert episode.recording is not None  # asked for with record=0
-    outcome = "success" if episode.success[0] else "no success"
-    film = episode.recording
-    return Panel(Path(player).stem, film.snapshots, film.returns.tolist(), outcome), 1.0 / task.control_dt
+    policies = [load_player(player, task, seed, trust_pickle) for player in players]
+    panels = []
+    with progress_bar("playing", len(players) * task.horizon, "decisions") as progress:
+        for k, (player, policy) in enumerate(zip(players, policies, strict=True)):
+            before = k * task.horizon
+            episode = rollout(task, policy, 1, seed, record=0, progress=lambda done, most, n=before: progress(n + done))
+            assert episode.recording is not None  # requested with record=0
+            outcome, film = "success" if episode.success[0] else "no success", episode.recording
+            title = Path(player).stem if len(players) > 1 else film.snapshots[0].title
+            shots = [dataclasses.replace(shot, title=title) for shot in film.snapshots]
+            panels.append(Panel(Path(player).stem, shots, film.returns.tolist(), outcome))
+    return panels, 1.0 / task.control_dt
 
 
-def _write_picture(path: Path, panel: Panel, title: str, fps: float, size: int) -> None:
-    from flockenv.render import Group, draw, write_gif, write_png, write_replay
+def _write_picture(path: Path, panels: Sequence[Panel], title: str, fps: float, size: int) -> None:
+    import numpy as np
 
+    from flockenv.render import Group, write_gif, write_png, write_replay
+
+    films = [panel.snapshots for panel in panels]
     if path.suffix.lower() == ".html":
-        write_replay(path, [Group(title, [panel])], title)
+        write_replay(path, [Group(title, list(panels))], title)
     elif path.suffix.lower() == ".png":
-        behind = max(TRAIL, 1 + math.ceil(fps * max((look.trail for look in panel.snapshots[-1].looks), default=0.0)))
-        write_png(path, draw(panel.snapshots[-1], size=size, trails=panel.snapshots[-behind:-1]))
+        write_png(path, np.hstack([_last_frame(film, size // len(films), fps) for film in films]))
     else:
         stride = math.ceil(fps / MOST_FPS)
-        write_gif(path, _frames(panel.snapshots[::stride], size, fps / stride), fps / stride)
+        frames = _frames([film[::stride] for film in films], size // len(films), fps / stride)
+        write_gif(path, frames, fps / stride)
 
 
-def _frames(snapshots: Sequence[Snapshot], size: int, fps: float) -> Iterator[Any]:
-    """Draw every snapshot, with ways behind those whose look has one."""
+def _last_frame(snapshots: Sequence[Snapshot], size: int, fps: float) -> Any:
     from flockenv.render import draw
 
-    behind = math.ceil(fps * max((look.trail for look in snapshots[0].looks), default=0.0))
-    with progress_bar("drawing", len(snapshots), "frames") as progress:
-        for k, snapshot in enumerate(snapshots):
+    behind = max(TRAIL, 1 + math.ceil(fps * max((look.trail for look in snapshots[-1].looks), default=0.0)))
+    return draw(snapshots[-1], size=size, trails=snapshots[-behind:-1])
+
+
+def _frames(films: Sequence[Sequence[Snapshot]], size: int, fps: float) -> Iterator[Any]:
+    """Draw the snapshots of several films side by side; a film that has ended shows its last snapshot."""
+    import numpy as np
+
+    from flockenv.render import draw
+
+    behind = math.ceil(fps * max((look.trail for film in films for look in film[0].looks), default=0.0))
+    count = max(map(len, films))
+    with progress_bar("drawing", count, "frames") as progress:
+        for k in range(count):
             progress(k)
-            yield draw(snapshot, size=size, trails=snapshots[max(0, k - behind) : k], all_trails=False)
+            pictures = []
+            for film in films:
+                at = min(k, len(film) - 1)
+                pictures.append(draw(film[at], size=size, trails=film[max(0, at - behind) : at], all_trails=False))
+            yield np.hstack(pictures)
