@@ -57,7 +57,7 @@ def files() -> Iterator[Path]:
     for folder in FOLDERS:
         yield from sorted((ROOT / folder).rglob("*.py"))
     for folder, pattern in (("docs", "*.md"), ("configs", "**/*.yaml"), (".", "*.md")):
-        yield from sorted(path for path in (ROOT / folder).glob(pattern) if path.name != "CHANGELOG.md")
+        yield from sorted(path for path in (ROOT / folder).glob(pattern) if "history" not in path.parts)
 
 
 def counts() -> dict[str, int]:

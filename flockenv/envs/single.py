@@ -189,7 +189,7 @@ class CrossingEnv(SingleEnv):
 
     task_type = Crossing
     fixed: ClassVar[dict[str, Any]] = {"learners": 1}
-    history = "v0: first version (flockenv 0.2.0)."
+    history = "v0: first version (flockenv 0.1.0)."
 
 
 class HerdEnv(SingleEnv):
@@ -213,14 +213,14 @@ class SchoolEnv(SingleEnv):
 
     task_type = School
     fixed: ClassVar[dict[str, Any]] = {"learners": 1}
-    history = "v0: first version (flockenv 0.2.0)."
+    history = "v0: first version (flockenv 0.1.0)."
 
 
 class CrowdNavEnv(SingleEnv):
     """A robot crosses a crowd of pedestrians that swap places under a social force, and must touch none of them."""
 
     task_type = CrowdNav
-    history = "v0: first version (flockenv 0.2.0)."
+    history = "v0: first version (flockenv 0.1.0)."
 
 
 class CorridorEnv(SingleEnv):
@@ -230,7 +230,7 @@ class CorridorEnv(SingleEnv):
     fixed: ClassVar[dict[str, Any]] = {"learners": 1}
     history = (
         "v1: success is judged over the episode (`settling`, `lasting`), not at its last instant; metrics `held` and "
-        "`success_at_end`.\n\nv0: first version (flockenv 0.2.0)."
+        "`success_at_end`.\n\nv0: first version (flockenv 0.1.0)."
     )
 
 
@@ -239,4 +239,4 @@ class BottleneckEnv(SingleEnv):
 
     task_type = Bottleneck
     fixed: ClassVar[dict[str, Any]] = {"learners": 1}
-    history = "v0: first version (flockenv 0.2.0)."
+    history = "v0: first version (flockenv 0.1.0)."
