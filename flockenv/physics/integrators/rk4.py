@@ -13,9 +13,9 @@ __all__ = ["RK4"]
 
 
 def advance(provided: Provided) -> Method:
-    """Make `advance`: four slopes, weighted 1, 2, 2, 1, each taken at a stage that the slope before led to.
+    """Make `advance`: four slopes, weighted 1, 2, 2, 1, each at a stage reached by the slope before.
 
-    The acceleration is called in one place, so that the whole sweep is compiled once and not four times.
+    The acceleration is called in one place, so that it is compiled once and not four times.
     """
     acceleration = provided.acceleration
 
