@@ -449,7 +449,7 @@ def test_what_cannot_be_is_refused_in_one_line(make: Any, text: str) -> None:
 
 def test_two_journeys_of_one_group_are_refused_and_so_is_a_choice_without_a_speed() -> None:
     groups = (walkers(2, (2, 2), (3, 3)), walkers(2, (2, 2), (3, 3)))
-    with pytest.raises(ValueError, match=r"effects\[0\].group = 0: effects\[1\], a routes, says too where"):
+    with pytest.raises(ValueError, match=r"effects\[0\].group = 0: effects\[1\], a routes, also steers some"):
         Scene(groups=groups, obstacles=ROOM, effects=(THERE, Routes(doors=(DOOR,))))
     slow = Group(count=1, spawn=Spawn(low=(2, 2), high=(3, 3)))
     with pytest.raises(ValueError, match=r"groups\[0\].desired_speed = None: give m/s"):
