@@ -138,18 +138,18 @@ def check_ways(
             raise ValueError(f"{name} = {target.shown}: dimension = {scene.dimension}")
     for k, shape in enumerate(scene.obstacles):
         if shape.moves:
-            raise ValueError(f"kind = {kind}: its way is found once, and obstacles[{k}] moves")
+            raise ValueError(f"kind = {kind}: its path is found once, and obstacles[{k}] moves")
         thick = shape.thickness
         if spacing >= 2 * clearance + thick:
             raise ValueError(
-                f"spacing = {spacing:g}: ways lead through obstacles[{k}], {thick:g} m thick, unless a clearance of "
+                f"spacing = {spacing:g}: paths lead through obstacles[{k}], {thick:g} m thick, unless a clearance of "
                 f"more than {(spacing - thick) / 2:g} m or a spacing of less than {2 * clearance + thick:g} m is given"
                 if clearance or thick
-                else f"clearance = 0: ways lead through obstacles[{k}], a line; more than half of the spacing, "
+                else f"clearance = 0: paths lead through obstacles[{k}], a line; more than half of the spacing, "
                 f"{spacing / 2:g} m, is allowed"
             )
     if isinstance(scene.space, Torus):
-        raise ValueError(f"kind = {kind}: on a torus ways lead around; only a plane or a box is allowed")
+        raise ValueError(f"kind = {kind}: on a torus paths lead around; only a plane or a box is allowed")
     low, high = region(scene, targets, margin)
     points = float(np.prod((high - low) / spacing + 1))
     if points > MOST_POINTS:

@@ -78,7 +78,7 @@ class Course(Aim):
     """Agents of a group head in one direction for ever: along a corridor, around a torus."""
 
     kind: Literal["course"] = "course"
-    direction: Vector = Field(description="of travel; its length does not matter")
+    direction: Vector = Field(description="direction of travel; its length does not matter")
     aim_law: ClassVar[Law | None] = course_aim
 
     def parameters(self) -> dict[str, float | Vec]:

@@ -18,13 +18,13 @@ __all__ = ["Drag", "QuadraticDrag"]
 
 @law
 def drag(p: Any, me: Me) -> Vec:
-    """F = -c (v - u)."""
+    """Return F = -c (v - u)."""
     return scale(sub(me.vel, me.medium), -p.rate)
 
 
 @law
 def quadratic_drag(p: Any, me: Me) -> Vec:
-    """F = -c |v - u| (v - u)."""
+    """Return F = -c |v - u| (v - u)."""
     relative = sub(me.vel, me.medium)
     return scale(relative, -p.rate * norm(relative))
 

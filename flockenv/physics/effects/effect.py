@@ -37,8 +37,8 @@ An effect has one or more of these forms, each a law (a compiled function) for o
   With an `obstacle_from(p, me) -> offset` obstacles are measured from the agent's position + offset.
   With an `obstacle_reach(p, me) -> m` shapes beyond that distance are skipped: the law must return acc unchanged if the
   surface is farther from the agent. A law that casts rays must also return acc unchanged if no ray hits within reach.
-  With `obstacle_pieces` the fold visits walls, polygons and rooms side by side: each by its nearest point, a corner
-  once, see geometry/shapes/chain.py.
+  With `obstacle_pieces` the fold visits each side of walls, polygons and rooms by its nearest point, a corner once (see
+  geometry/shapes/chain.py).
   With `obstacle_edges` the first number of acc is the distance along ray 0 to the first contact, or inf. The last D
   numbers, which the law leaves 0, then receive the unit vector across the ray towards the nearest silhouette edge of
   the obstacle that is hit; obstacles with gaps too narrow for the body count as one (engine/silhouette.py). They stay 0
@@ -104,7 +104,7 @@ class Me(NamedTuple):
     tie: Vec  # a unit vector of its own, see ties(); 0 outside pair laws
     time: float  # s, of the stage that is evaluated
     medium: Vec  # m/s, velocity of the medium here; 0 in pair laws and bonds
-    key: int  # of its world, for random numbers that are functions of time, see noise.py
+    key: int  # of its world, for random numbers that are functions of time, see maths/counter_rng.py
     aim: Vec  # desired direction: a unit vector, shorter to go slower than desired_speed; 0 to stay, or without an aim
     desired_speed: float  # m/s
     inner: Any  # its inner numbers, by name; see `Effect.keeps`
@@ -229,7 +229,7 @@ def network_of(groups: Sequence[Any], which: int, dimension: int) -> tuple[int, 
 
 
 class Effect(Record):
-    """What acts on a body; see the module for the forms of its laws."""
+    """An effect on a body; see the module for the forms of its laws."""
 
     kind: str
     steering: ClassVar[bool] = False
@@ -254,7 +254,7 @@ class Effect(Record):
     apart_law: ClassVar[Law | None] = None
     finish_law: ClassVar[Law | None] = None
     vanishes: ClassVar[bool] = False
-    """True if its pair law returns zeros for an infinite `other.square`, whatever `other.offset` is.
+    """True if its pair law returns zeros for an infinite `other.square` and any `other.offset`.
 
     Steps with one evaluation of the forces then pass it an infinite square for candidates out of sight, and their true
     offset.
@@ -270,7 +270,7 @@ class Effect(Record):
     obstacle_edges: ClassVar[bool] = False
     """True if acc ends with the direction to the nearest silhouette edge of the obstacle ahead; see the module."""
     obstacle_pieces: ClassVar[bool] = False
-    """True if walls, polygons and rooms are visited side by side, each by its nearest point, not by a single point."""
+    """True if each side of walls, polygons and rooms is visited by its nearest point, not the shape by one point."""
     linear_drag: ClassVar[str | None] = None
     """Name of the parameter c, kg/s, of an own_law that is -c (v - medium): a method may integrate it separately."""
     weighs_mass: ClassVar[bool] = True
@@ -280,7 +280,7 @@ class Effect(Record):
     tabled: ClassVar[bool] = False
     """True if its laws look numbers up in its `table`."""
     places: ClassVar[tuple[str, ...]] = ()
-    """Names of the parameters that are points: on a torus all but bonds and obstacles see the nearest images."""
+    """Names of the parameters that are points: on a torus laws other than of bonds and obstacles see nearest images."""
     heads_for: ClassVar[bool] = True
     """True if its places are targets that agents head for. Pictures show them."""
     always: ClassVar[bool] = True
@@ -293,7 +293,7 @@ class Effect(Record):
     conserves_momentum: ClassVar[bool] = False
     """True if the force of i on j is the opposite of the force of j on i."""
     demo: ClassVar[str | None] = None
-    """A small scene that shows it, as YAML; docs/behaviours.md draws the trajectories of its first `demo_time` s."""
+    """A small example scene as YAML; docs/behaviours.md draws the trajectories of its first `demo_time` s."""
     demo_time: ClassVar[float] = 8.0
 
     @classmethod

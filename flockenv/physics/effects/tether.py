@@ -1,4 +1,4 @@
-"""Springs to a fixed point, and a field of pendulums: forces of one agent by itself that have a potential energy."""
+"""Springs to a fixed point, and a field of pendulums: forces of one agent alone, with a potential energy."""
 
 from __future__ import annotations
 

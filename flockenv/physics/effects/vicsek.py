@@ -81,7 +81,7 @@ class Vicsek(Effect):
             raise ValueError(f"kind = vicsek: dimension = {scene.dimension}, must be 2")
         if scene.integrator.kind not in METHODS:
             raise ValueError(
-                f"kind = vicsek: is a map from step to step, integrator.kind = {scene.integrator.kind} asks for a "
+                f"kind = vicsek: is a map from step to step, integrator.kind = {scene.integrator.kind} needs a "
                 f"force; allowed: {', '.join(METHODS)}"
             )
         if abs(scene.dt - self.step) > 1e-12 * self.step:

@@ -45,7 +45,7 @@ def advance(provided: Provided) -> Method:
                     if not (begins and known):
                         ahead = like(dt, 0.0) if stage == 0 else (h if stage == 3 else h / 2)
                         copy(x, v, x0, v0, first, end)
-                        if stage > 0:  # by the slope of the stage before
+                        if stage > 0:  # from the slope of the stage before
                             before = 8 if stage == 1 and part < 2 else 10
                             add_slopes(x, v, ahead, stages[before], stages[before + 1], first, end)
                         acceleration(context, x, v, since + ahead, a)

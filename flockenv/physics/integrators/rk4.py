@@ -41,7 +41,7 @@ def advance(provided: Provided) -> Method:
 
 
 class RK4(Integrator):
-    """Classical Runge-Kutta, order 4, four evaluations; of order 1 where a limit or a view cone makes forces jump."""
+    """Classical Runge-Kutta, order 4, four evaluations; of order 1 if a limit or a view cone makes forces jump."""
 
     kind: Literal["rk4"] = "rk4"
     order: ClassVar[int] = 4
