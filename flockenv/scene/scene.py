@@ -118,7 +118,7 @@ def _demand_one_piece(out: State) -> None:
 
 
 class Scene(Record):
-    """A simulation: agents, space, effects and integrator. Prints, compares, hashes, pickles, reads as YAML."""
+    """A simulation: agents, space, effects and integrator. Prints, compares, hashes, pickles, converts to YAML."""
 
     dimension: Literal[2, 3] = Field(default=2, description="2 or 3")
     space: AnySpace = Field(default_factory=Plane)
