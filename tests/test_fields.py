@@ -259,7 +259,7 @@ GROUPS = (Group(count=1, spawn=Spawn(low=(0, 0), high=(1, 1))),)
         (lambda: Scene(groups=GROUPS, effects=(Pressure(strength=1, density=1, radius=2),)),
          "Scene: effects[0].radius = 2: at this density nearest neighbours are a = 1.075 m apart; from 1.1 a = 1.182"),
         (lambda: Vortex(strength=1, maximum=1, centre=(1, 2, 3), axis=(0, 0, 0)),
-         "Vortex: axis = (0.0, 0.0, 0.0): a direction of three numbers, not all 0, or none for the z axis"),
+         "Vortex: axis = (0.0, 0.0, 0.0): must be three numbers, not all 0, or None for the z axis"),
         (lambda: Uniform(strength=(1, 0), phase=0.5), "Uniform: phase = 0.5: only with a period"),
         (lambda: Wind(velocity=(1, 0), gust=(1, 0)), "Wind: gust and period go together: give both or neither"),
         (lambda: Wind(velocity=(1, 0), period=2), "Wind: gust and period go together: give both or neither"),

@@ -430,7 +430,7 @@ DOOR = Door(ends=LEFT)
             r"targets\[1\] = .*: is at most -0.1 m",
         ),
         (lambda: Way(targets=(Target(at=(1, 2, 3)),)), r"targets\[0\] = \(1.0, 2.0, 3.0\): dimension = 2"),
-        (lambda: Way(targets=(Target(at=(3, 3)),), clearance=0.1, spacing=0.5), "spacing = 0.5: ways lead through"),
+        (lambda: Way(targets=(Target(at=(3, 3)),), clearance=0.1, spacing=0.5), "spacing = 0.5: paths lead through"),
         (lambda: Way(targets=(Target(at=(3, 3)),), group=4), "group = 4: there are 1 groups"),
         (
             lambda: Way(targets=(Target(at=(12, 3)),), clearance=1.0),
@@ -449,7 +449,7 @@ def test_what_cannot_be_is_refused_in_one_line(make: Any, text: str) -> None:
 
 def test_two_journeys_of_one_group_are_refused_and_so_is_a_choice_without_a_speed() -> None:
     groups = (walkers(2, (2, 2), (3, 3)), walkers(2, (2, 2), (3, 3)))
-    with pytest.raises(ValueError, match=r"effects\[0\].group = 0: effects\[1\], a routes, says too where"):
+    with pytest.raises(ValueError, match=r"effects\[0\].group = 0: effects\[1\], a routes, also steers some"):
         Scene(groups=groups, obstacles=ROOM, effects=(THERE, Routes(doors=(DOOR,))))
     slow = Group(count=1, spawn=Spawn(low=(2, 2), high=(3, 3)))
     with pytest.raises(ValueError, match=r"groups\[0\].desired_speed = None: give m/s"):
@@ -466,7 +466,7 @@ def thin(x: float = 5.0, wide: float = 0.05) -> Polygon:
         ((thin(),), 0.0, r"obstacles\[0\], 0.05 m thick, unless a clearance of more than 0.075 m or a spacing of less"),
         ((thin(),), 0.01, "unless a clearance of more than 0.075 m"),
         (tuple(Circle(centre=(5, 0.06 + 0.12 * k), radius=0.06) for k in range(40)), 0.0, "0.12 m thick"),
-        ((Wall(vertices=((5, 0), (5, 5))),), 0.0, r"clearance = 0: ways lead through obstacles\[0\], a line"),
+        ((Wall(vertices=((5, 0), (5, 5))),), 0.0, r"clearance = 0: paths lead through obstacles\[0\], a line"),
         ((Block(centre=(5, 2.5), size=(0.1, 5)),), 0.04, "0.1 m thick"),
     ],
 )

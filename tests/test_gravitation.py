@@ -318,7 +318,7 @@ def test_a_scene_explains_whether_it_grows_a_tree() -> None:
 
 @KINDS
 def test_what_does_not_suit_it_is_refused_in_one_line(kind: str) -> None:
-    with pytest.raises(ValueError, match=rf"effects\[0\].kind = {kind} reaches everybody, .* only a plane or a box"):
+    with pytest.raises(ValueError, match=rf"effects\[0\].kind = {kind} reaches all agents, .* only a plane or a box"):
         scene_of(acting(kind), space=Torus(size=(9, 9)))
     for opening in (-0.1, 1.5, float("nan")):
         with pytest.raises(ValueError, match="opening") as caught:

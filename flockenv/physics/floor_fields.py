@@ -1,6 +1,6 @@
-"""Ways around all obstacles of a scene, for behaviours, aims, journeys and routes: where the grid lies, what it says.
+"""Floor fields: shortest paths around all obstacles of a scene, on a grid, for behaviours, aims, journeys and routes.
 
-One grid (eikonal.way_table) serves everybody who goes to the same targets; laws ask it by `way_ahead`.
+One grid (eikonal.way_table) serves all agents with the same targets; laws read it by `way_ahead`.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ Floats = NDArray[np.float64]
 
 @law
 def way_ahead(table: Any, x: Vec, straight: Vec) -> tuple[float, Vec]:
-    """Return how long the way from x is, m, and its first direction; beyond the grid it is the straight one."""
+    """Return the length of the path from x, m, and its first direction; beyond the grid, those of the straight line."""
     here = covers(table, x)
     length = sample(table, x, 0) if here else norm(straight)
     direction = unit(select(here, sample_vector(table, x, 1), straight))
@@ -39,10 +39,10 @@ def way_ahead(table: Any, x: Vec, straight: Vec) -> tuple[float, Vec]:
 
 @law
 def towards(table: Any, x: Vec) -> tuple[float, Vec]:
-    """Return how long the way to the nearest target of a block is, m, and its first direction; 0 and 0 within it.
+    """Return the length of the path to the nearest target of a block, m, and its first direction; 0 and 0 within it.
 
-    A block (see `way_block`) is how many targets there are, how far away the straight way to them is right, m, a row
-    for each of them, and a grid.
+    A block (see `way_block`) holds the number of targets, the distance within which the straight line to them is free,
+    m, a row for each target, and a grid.
     """
     count, size = np.int64(table[0]), 3 * len(x) + 1
     straight = to_any(table, 2, count, x)
@@ -53,7 +53,7 @@ def towards(table: Any, x: Vec) -> tuple[float, Vec]:
 
 
 def region(scene: SceneView, targets: Sequence[Target], margin: float) -> tuple[Floats, Floats]:
-    """Return the corners of the grid: a box's own, or all that there is and a margin around it."""
+    """Return the corners of the grid: those of the box, or of everything in the scene and a margin around it."""
     size = getattr(scene.space, "size", None)
     if size is not None:
         return np.zeros(scene.dimension), np.array(size, float)
@@ -70,7 +70,7 @@ def region(scene: SceneView, targets: Sequence[Target], margin: float) -> tuple[
 
 
 def starts_of(scene: SceneView, which: int | None) -> list[Start]:
-    """Return the boxes in which agents of a group begin or are born, of all groups for None; of a network, none."""
+    """Return the boxes in which agents of a group (None: all groups) begin or are born; none for networks."""
     size = getattr(scene.space, "size", None)
     found = []
     for k, group in enumerate(scene.groups):
@@ -86,13 +86,13 @@ def starts_of(scene: SceneView, which: int | None) -> list[Start]:
 
 
 def lengths_on(grid: Floats, points: ArrayLike) -> Floats:
-    """Return the lengths of the ways from points (..., D), (...) m: inf where no way leads; outside, as at the edge."""
+    """Return path lengths from points (..., D), (...) m: inf without a path; outside the grid, that of its edge."""
     found = sampled(grid, points)[..., 0]
-    return np.asarray(np.where(found > NO_WAY * 1e-12, np.inf, found))  # also between points with a way and without
+    return np.asarray(np.where(found > NO_WAY * 1e-12, np.inf, found))  # also next to points without a path
 
 
 def warn_cut_off(name: str, lost: NDArray[np.bool_], state: Any) -> None:
-    """Warn of the living agents of a state from which no way leads to the targets of an effect; lost: (B, N)."""
+    """Warn of the living agents of a state without a path to the targets of an effect; lost: (B, N)."""
     lost = lost & np.asarray(state.alive, bool)
     if lost.any():
         world, agent = (int(k) for k in np.argwhere(lost)[0])
@@ -108,7 +108,7 @@ def ways_to(
     scene: SceneView, targets: Sequence[Target], names: Sequence[str], corners: tuple[Floats, Floats], spacing: float,
     clearance: float, starts: Sequence[Start] = (),
 ) -> Floats:  # fmt: skip
-    """Return the grid of ways to the nearest of some targets."""
+    """Return the floor field to the nearest of some targets."""
     low, high = (corner.tolist() for corner in corners)
     return way_table(list(scene.obstacles), targets, low, high, spacing, clearance, names, starts)
 
@@ -117,9 +117,9 @@ def way_block(
     scene: SceneView, targets: Sequence[Target], names: Sequence[str], corners: tuple[Floats, Floats], spacing: float,
     clearance: float, starts: Sequence[Start] = (),
 ) -> Floats:  # fmt: skip
-    """Return what `towards` reads: the targets, as far as somebody can get there, and the grid of ways to them.
+    """Return the block that `towards` reads: the reachable parts of the targets, and the floor field to them.
 
-    Nearer to a target than the nearest obstacle is, and than a cell of the grid, the straight way is taken.
+    At distances from a target below the spacing and below its distance to obstacles, the straight line is taken.
     """
     grid = ways_to(scene, targets, names, corners, spacing, clearance, starts)
     free = [free_part(scene.obstacles, *given, spacing, clearance) for given in zip(targets, names, strict=True)]
@@ -132,24 +132,24 @@ def check_ways(
     scene: SceneView, kind: str, targets: Sequence[Target], names: Sequence[str], margin: float, spacing: float,
     clearance: float,
 ) -> None:  # fmt: skip
-    """Refuse what no way can be found for: a torus, obstacles that move, walls that a grid misses, too large a grid."""
+    """Raise ValueError for a torus, moving obstacles, walls that the grid misses, and too large a grid."""
     for name, target in zip(names, targets, strict=True):
         if target.dimension != scene.dimension:
             raise ValueError(f"{name} = {target.shown}: dimension = {scene.dimension}")
     for k, shape in enumerate(scene.obstacles):
         if shape.moves:
-            raise ValueError(f"kind = {kind}: its way is found once, and obstacles[{k}] moves")
+            raise ValueError(f"kind = {kind}: its path is found once, and obstacles[{k}] moves")
         thick = shape.thickness
         if spacing >= 2 * clearance + thick:
             raise ValueError(
-                f"spacing = {spacing:g}: ways lead through obstacles[{k}], {thick:g} m thick, unless a clearance of "
+                f"spacing = {spacing:g}: paths lead through obstacles[{k}], {thick:g} m thick, unless a clearance of "
                 f"more than {(spacing - thick) / 2:g} m or a spacing of less than {2 * clearance + thick:g} m is given"
                 if clearance or thick
-                else f"clearance = 0: ways lead through obstacles[{k}], a line; more than half of the spacing, "
+                else f"clearance = 0: paths lead through obstacles[{k}], a line; more than half of the spacing, "
                 f"{spacing / 2:g} m, is allowed"
             )
     if isinstance(scene.space, Torus):
-        raise ValueError(f"kind = {kind}: on a torus ways lead around; only a plane or a box is allowed")
+        raise ValueError(f"kind = {kind}: on a torus paths lead around; only a plane or a box is allowed")
     low, high = region(scene, targets, margin)
     points = float(np.prod((high - low) / spacing + 1))
     if points > MOST_POINTS:

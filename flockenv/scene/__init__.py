@@ -1,4 +1,4 @@
-"""Scene: what is simulated, as one record; its checks, where its agents begin, its presets, and YAML."""
+"""Scene: a simulation as one record; its checks, initial state, presets, and YAML."""
 
 from __future__ import annotations
 

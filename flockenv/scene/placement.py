@@ -23,13 +23,13 @@ __all__ = ["cells_of", "place_groups"]
 Cells = tuple[Floats | None, ...]
 
 ROUNDS = 256
-"""Most draws of a place for an agent that would begin in an obstacle that is no circle."""
+"""Most draws of an initial position for an agent that would begin in an obstacle other than a circle."""
 
 
 def cells_of(scene: SceneView) -> Cells:
-    """Return the initial cells' middles of groups that have a cell per agent, (size, D) m; none for other groups.
+    """Return the centres of initial cells of groups with a cell per agent, (size, D) m; None for other groups.
 
-    ValueError that names the group and the field if they have no room.
+    Raise ValueError, naming the group and the field, if there is no room.
     """
     return tuple(
         None if group.spawn.spacing is None else _cells(scene, k, group) for k, group in enumerate(scene.groups)
@@ -37,9 +37,9 @@ def cells_of(scene: SceneView) -> Cells:
 
 
 def place_groups(scene: SceneView, state: State, middles: Cells) -> None:
-    """Write the first instant of a state: positions, velocities, headings, and which agents live.
+    """Write the initial state: positions, velocities, headings, and which agents live.
 
-    middles: those of `cells_of`.
+    middles: the cell centres of `cells_of`.
     """
     for b in range(len(state.key)):
         for first, group, mine in zip(scene.starts, scene.groups, middles, strict=False):
@@ -57,12 +57,12 @@ def _period(scene: SceneView) -> NDArray[np.float64]:
 
 
 def _corners(scene: SceneView, spawn: Spawn) -> tuple[Sequence[float], Sequence[float]]:
-    """Return the box that agents begin in, m."""
+    """Return the corners of the box in which agents begin, m."""
     return spawn.low or (0.0,) * scene.dimension, spawn.high or scene.space.extent(scene.dimension)
 
 
 def _cells(scene: SceneView, k: int, group: Group) -> Floats:
-    """Return the middles of a group's cells, (size, D) m."""
+    """Return the centres of a group's cells, (size, D) m."""
     try:
         box = _corners(scene, group.spawn)
         return cells(group.spawn, *box, group.size, group.widest, scene.obstacles, _period(scene))
@@ -71,14 +71,14 @@ def _cells(scene: SceneView, k: int, group: Group) -> Floats:
 
 
 def _scatter(scene: SceneView, state: State, b: int, first: int, group: Group, middles: Floats | None) -> None:
-    """Write a group's initial positions in one world: anywhere in its box, or each near the middle of its cell."""
+    """Write a group's initial positions in one world: anywhere in its box, or each near the centre of its cell."""
     spawn, d, period = group.spawn, scene.dimension, _period(scene)
     low, high = (np.array(corner, float) for corner in _corners(scene, spawn))
     if middles is not None:
         low, high = np.full(d, -spawn.jitter), np.full(d, spawn.jitter)
     heading = np.array(spawn.heading if spawn.heading is not None else (0.0,) * d, float)
     tried, mine = np.zeros(scene.agents, np.int64), slice(first, first + group.size)
-    looked = 0 if middles is not None else len(scene.circles)  # a cell has been found clear of all of them
+    looked = 0 if middles is not None else len(scene.circles)  # cells are clear of all circles
     for _ in range(ROUNDS if scene.shapes else 1):
         entry(scatter)(
             state.key[b], state.x[:, b], state.v[:, b], scene.body.radius, mine.start, mine.stop, low, high,
@@ -95,7 +95,7 @@ def _scatter(scene: SceneView, state: State, b: int, first: int, group: Group, m
 
 
 def _tie(scene: SceneView, state: State, b: int, first: int, group: Group) -> None:
-    """Write initial positions of a network's particles in one world, and their common velocity."""
+    """Write the initial positions and common velocity of a network's particles in one world."""
     assert group.network is not None
     mine = slice(first, first + group.size)
     state.pos[b, mine] = group.network.points(scene.dimension)
@@ -106,7 +106,7 @@ def _tie(scene: SceneView, state: State, b: int, first: int, group: Group) -> No
 
 
 def _bury(scene: SceneView, state: State) -> None:
-    """Empty the slots of agents that do not live at the start, placed where an emitter may bring them to life."""
+    """Clear the slots of agents that do not live at the start, and place them at their emitter, if any."""
     for k, (first, alive) in enumerate(zip(scene.starts, scene.living, strict=False)):
         dead = slice(first + alive, scene.starts[k + 1])
         feeding = [member for member in scene.population if isinstance(member, Emitter) and member.feeds(k)]

@@ -2,8 +2,8 @@
 
 preset("helbing_farkas_vicsek_2000")  # a tuple of effects; in a file, an item of `effects`: {preset: helbing_2000}
 
-A model says how one walks, not where to: aims (`goal`, `course`, a journey) come beside it. People are the scene's
-groups: `Group(count=100, **PRESETS[name].people)` has the masses, radii and speeds of the paper.
+A model covers locomotion, not destinations: add aims (`goal`, `course`, a journey). Pedestrians are the scene's groups:
+`Group(count=100, **PRESETS[name].people)` has the masses, radii and speeds of the paper.
 """
 
 from __future__ import annotations
@@ -35,22 +35,22 @@ __all__ = ["ALIASES", "PRESETS", "Model", "Preset", "expanded", "preset"]
 
 @dataclass(frozen=True)
 class Model:
-    """A published model: what each wants, what bodies do, who people are, and where the numbers are from."""
+    """A published model: its behaviours, contact forces, pedestrians, and sources."""
 
     source: str
     wishes: Callable[[bool, int | None], tuple[Effect, ...]] = field(repr=False)
-    """(do walls hide? whose wishes, where parties need to know) -> behaviours."""
+    """(True if walls occlude, group for models of walking groups) -> behaviours."""
     bodies: tuple[Effect, ...] = ()
     people: Mapping[str, Any] = field(default_factory=dict)
     """Fields of a `Group`, as the paper has them."""
     symbols: Mapping[str, str] = field(default_factory=dict)
     """The paper's symbols and values."""
     note: str = ""
-    """What is ours, what is recalled and not seen, what the paper leaves open."""
+    """What is ours, what is quoted from memory, and what the paper leaves open."""
 
     @property
     def numbers(self) -> dict[str, float]:
-        """The numbers of what each wants, as kind_field: driving_tau, sidestep_gamma."""
+        """The parameters of the behaviours, as kind_field: driving_tau, sidestep_gamma."""
         wishes = self.wishes(False, None)
         fields = {f"{wish.kind}_{name}": getattr(wish, name) for wish in wishes for name in type(wish).model_fields}
         return {name: value for name, value in fields.items() if isinstance(value, float)}
@@ -110,7 +110,7 @@ PRESETS: dict[str, Model] = {
             "V0": "2.1 m^2/s^2", "sigma": ".3 m", "U0": "10 m^2/s^2", "R": ".2 m", "2 phi": "200 degrees", "c": ".5",
             "dt": "2 s", "tau": ".5 s", "v0": "N(1.34, .26) m/s", "v_max": "1.3 v0",
         },
-        note="v_max is the group's `haste`; the step is v_j dt, of what the other does and not of what he would like",
+        note="v_max is the group's `haste`; the step is v_j dt, with the other's actual velocity, not its desired one",
     ),
     "helbing_farkas_vicsek_2000": Model(
         "Helbing, Farkas, Vicsek, Nature 407:487, 2000",
@@ -167,15 +167,15 @@ PRESETS: dict[str, Model] = {
             "A": "4.5 +- .3 m/s^2", "gamma": ".35 +- .01 s", "n": "2.0 +- .1", "n'": "3.0 +- .7",
             "lambda": "2.0 +- .2 s/m", "tau": ".54 +- .05 s", "v0": "1.29 +- .19 m/s", "a": "3 m/s^2", "b": ".1 m",
         },
-        note="A, tau, v0, the wall's a and b, and the bias eps = .005 are recalled, not seen in the paper",
+        note="A, tau, v0, the wall's a and b, and the bias eps = .005 are quoted from memory, not checked in the paper",
     ),
     "moussaid_2010_groups": Model(
         "Moussaid et al., PLoS ONE 5:e10047, 2010",
         _moussaid_2010,
         people={"mass": 80.0, "radius": 0.25, "desired_speed": Spread(mean=1.29, sd=0.19, low=0.3)},
         symbols={"beta1": "4", "beta2": "3", "beta3": "1", "d0": ".8 m", "N": "3"},
-        note="beta1 to beta3 are recalled (PySocialForce has 4, 3, 1, in older versions 3, 2, 1), and so is d0; the "
-        "forces on everybody else are those of 2009",
+        note="beta1 to beta3 are from memory (PySocialForce has 4, 3, 1, in older versions 3, 2, 1), and so is d0; the "
+        "forces on all others are those of 2009",
     ),
     "moussaid_2011": Model(
         "Moussaid, Helbing, Theraulaz, PNAS 108:6884, 2011",
@@ -208,10 +208,10 @@ def _model(name: str) -> Model:
 
 
 def preset(name: str, group: int | None = None, contacts: bool = True, occluded: bool = False) -> tuple[Effect, ...]:
-    """Return the effects of a published model: what a group wants (none = everybody), and what bodies do.
+    """Return the effects of a published model: the behaviours of a group (None: all groups), and the contact forces.
 
-    Bodies touch each other whoever they belong to: of two presets for two groups give one `contacts=False`. occluded:
-    do walls hide people, and walls? Raises ValueError, of one line, for a name that there is not.
+    Contacts act between all groups: of two presets for two groups give one `contacts=False`. occluded: True if walls
+    hide pedestrians and walls. Raise ValueError, in one line, for an unknown name.
     """
     model = _model(name)
     wishes = model.wishes(occluded, group)
@@ -225,12 +225,12 @@ class Preset(Record):
     """An item of a file's `effects` that stands for the effects of a published model."""
 
     preset: str = Field(description=f"its name: {', '.join(PRESETS)}", json_schema_extra={"enum": [*PRESETS, *ALIASES]})
-    group: int | None = Field(default=None, ge=0, description="whose wishes; none = everybody's")
-    contacts: bool = Field(default=True, description="do bodies touch as the model says? They do so once, for all")
-    occluded: bool = Field(default=False, description="do walls hide people and walls?")
+    group: int | None = Field(default=None, ge=0, description="group of its behaviours (default: all)")
+    contacts: bool = Field(default=True, description="True: the model's contact forces, once for all groups")
+    occluded: bool = Field(default=False, description="True: walls hide pedestrians and walls")
 
     def effects(self) -> tuple[Effect, ...]:
-        """What it stands for."""
+        """Return the effects that it stands for."""
         return preset(self.preset, self.group, self.contacts, self.occluded)
 
 
@@ -238,10 +238,10 @@ class Preset(Record):
 
 
 class Origins(dict[KeyPath, list[int]]):
-    """Where the items of a file's lists of effects come from: for each list, the place of each in the file."""
+    """Origins of the items in expanded lists of effects: for each list, the index of each item in the file."""
 
     def path(self, path: KeyPath) -> KeyPath:
-        """Return where in the file something stands."""
+        """Return the key path in the file."""
         for k in range(1, len(path)):
             step = path[k]
             if path[:k] in self and isinstance(step, int) and step < len(self[path[:k]]):
@@ -249,7 +249,7 @@ class Origins(dict[KeyPath, list[int]]):
         return path
 
     def text(self, text: str) -> str:
-        """Return a message that begins with a key path, with the path in the file."""
+        """Return a message with its leading key path replaced by that in the file."""
         path = steps_of(text)
         for k in range(len(path), 0, -1):
             before, after = key_path(path[:k]), key_path(self.path(path[:k]))
@@ -259,9 +259,10 @@ class Origins(dict[KeyPath, list[int]]):
 
 
 def expanded(data: Any) -> tuple[Any, Origins]:
-    """Return what a file says with every preset in a list of effects replaced by its effects, and where they are from.
+    """Return the data of a file with every preset in a list of effects replaced by its effects, and their origins.
 
-    What two presets say alike of bodies is said once. Raises ValueError that begins with the key path.
+    Contact effects that two presets share are included once. Raise ValueError, beginning with the key path, if their
+    contacts differ.
     """
     origins = Origins()
     return _expanded(data, (), origins), origins
@@ -284,7 +285,7 @@ def _expanded(value: Any, path: KeyPath, origins: Origins) -> Any:
             touching = [each for each in found if each["kind"] in ("contact", "obstacle_contact")]
             if touching and bodies and touching != bodies:
                 raise ValueError(
-                    f"{key_path((*path, k))}.preset = {item['preset']}: its bodies touch otherwise than those of a "
+                    f"{key_path((*path, k))}.preset = {item['preset']}: its contacts differ from those of a "
                     "preset before it; give contacts: false to one of them"
                 )
             found = [each for each in found if each not in bodies]
@@ -295,7 +296,7 @@ def _expanded(value: Any, path: KeyPath, origins: Origins) -> Any:
 
 
 def _read(item: dict[str, Any], path: KeyPath) -> Preset:
-    """Return an item of a file as a preset; ValueError that begins with its key path."""
+    """Return an item of a file as a preset; raise ValueError, beginning with its key path, if it is invalid."""
     try:
         out = Preset.model_validate(item, strict=True)
         _model(out.preset)

@@ -1,4 +1,4 @@
-"""Scene: what is simulated, as one frozen record; and the step, which reads like a table of contents.
+"""Scene: a simulation as one frozen record, and its step.
 
 scene = Scene(space=Torus(size=(40, 40)), groups=(Group(count=300, max_speed=2),), effects=(Separation(...), ...))
 state = scene.start(seed=1)
@@ -65,13 +65,13 @@ from flockenv.scene.stability import check_contact, check_dt, check_lookahead
 __all__ = ["Group", "Scene"]
 
 FEWEST_TOGETHER, SURELY_TOGETHER = 128, 4096
-"""Agents of a world from which on threads may share it (8 blocks, or more), and surely do in long calls."""
+"""Least agents of a world for threads to be allowed to share it (at least 8 blocks), and always in long calls."""
 
 EXACT = 2**24
-"""Whole numbers, and so numbers of agents, that float32 tells apart."""
+"""Largest integer, and so number of agents, up to which float32 is exact."""
 
 MEMORY_LIMIT = 8 * 2**30
-"""Bytes that a state and its scratch may take before a scene is refused."""
+"""Most bytes of a state and its scratch memory; a scene that needs more raises ValueError."""
 
 
 if TYPE_CHECKING:
@@ -99,50 +99,50 @@ else:
 
 
 TURNING = ("max_turn_rate", "banking")
-"""What bodies have only where a group does."""
+"""Numbers that bodies have only if some group sets them."""
 
 
 def _demand_whole(name: str, value: object, least: int, most: int | None = None) -> None:
-    """Refuse what is no whole number from `least` to `most`, True included."""
+    """Raise ValueError unless the value is an integer from `least` to `most`, and not a bool."""
     whole = isinstance(value, (int, np.integer)) and not isinstance(value, bool)
     if not whole or value < least or (most is not None and value > most):  # type: ignore[operator]  # whole is an int
-        allowed = f"from {least} to {most}" if most is not None else f"of at least {least}"
-        raise ValueError(f"{name} is {value!r}, must be a whole number {allowed}")
+        allowed = f"from {least} to {most}" if most is not None else f">= {least}"
+        raise ValueError(f"{name} is {value!r}, must be an integer {allowed}")
 
 
 def _demand_one_piece(out: State) -> None:
-    """Refuse positions and velocities that a kernel cannot write: it counts places from the first."""
+    """Raise ValueError if positions or velocities are not contiguous, as kernels need them."""
     for name, array in (("x", out.x), ("v", out.v)):
         if not array.flags.c_contiguous:
             raise ValueError(f"out.{name} does not lie in one piece (its strides are {array.strides}); use copy()")
 
 
 class Scene(Record):
-    """What is simulated: who, where, under which effects, advanced how. Prints, compares, hashes, pickles, is YAML."""
+    """A simulation: agents, space, effects and integrator. Prints, compares, hashes, pickles, converts to YAML."""
 
     dimension: Literal[2, 3] = Field(default=2, description="2 or 3")
     space: AnySpace = Field(default_factory=Plane)
-    groups: tuple[Group, ...] = Field(min_length=1, description="agents, group after group")
-    effects: tuple[AnyEffect, ...] = Field(default=(), description="what acts on them; nothing else is computed")
+    groups: tuple[Group, ...] = Field(min_length=1, description="groups of agents")
+    effects: tuple[AnyEffect, ...] = Field(default=(), description="effects on agents; nothing else is computed")
     obstacles: tuple[AnyShape, ...] = Field(
         default=(), description="the same in every world; without a kind, with centre and radius, a circle"
     )
     integrator: AnyIntegrator = Field(default_factory=SemiImplicitEuler)
     constraints: tuple[AnyConstraint, ...] = Field(
-        default=(), description="what every step must end with, in this order; nothing else is looked after"
+        default=(), description="constraints enforced at the end of every step, in this order"
     )
     population: tuple[AnyMember, ...] = Field(
-        default=(), description="who dies and who is born at the end of every step: sinks, in this order, and emitters"
+        default=(), description="deaths and births at the end of every step: sinks, in this order, and emitters"
     )
     dt: float = Field(default=0.02, gt=0, description="s, one physics step")
     dtype: Literal["float64", "float32"] = Field(default="float64", description="precision of everything")
 
     @model_validator(mode="after")
     def _consistent(self) -> Scene:
-        """Refuse what no single field can know: dimensions that differ, a reach around the torus, too much memory."""
+        """Check what involves several fields: equal dimensions, reach on a torus, memory; raise ValueError."""
         self._check_dimensions()
         check_places(self)
-        if self.dtype == "float32":  # float64's bounds each record has checked for itself
+        if self.dtype == "float32":  # each record checks the bounds of float64 itself
             check_numbers(self, "float32")
         listed: dict[str, tuple[Effect | Constraint | Member, ...]] = {
             "effects": self.effects, "constraints": self.constraints, "population": self.population,
@@ -164,14 +164,14 @@ class Scene(Record):
                 f"groups: {self.agents:,} agents need about {needed / 2**30:.3g} GiB; at most {MEMORY_LIMIT / 2**30:g} "
                 f"GiB, {int(MEMORY_LIMIT / each):,} agents, are allowed"
             )
-        self._cells  # noqa: B018  # refuses groups that have no room
+        self._cells  # noqa: B018  # raises ValueError for groups without room
         check_dt(self)
         check_contact(self)
         check_lookahead(self)
         return self
 
     def _check_recalled(self) -> None:
-        """Refuse laws that read what nobody keeps."""
+        """Raise ValueError for laws that read inner numbers which no effect keeps."""
         kept = {name for effect in self.effects for each in (*effect.wishes, effect) for name in each.keeps}
         for k, effect in enumerate(self.effects):
             for each in (*effect.wishes, effect):
@@ -192,8 +192,8 @@ class Scene(Record):
             for k, effect in enumerate(self.effects):
                 if effect.far_law:
                     raise ValueError(
-                        f"effects[{k}].kind = {effect.kind} reaches everybody, and on a torus everybody is there "
-                        "infinitely many times; only a plane or a box is allowed"
+                        f"effects[{k}].kind = {effect.kind} reaches all agents, and on a torus each has infinitely "
+                        "many images; only a plane or a box is allowed"
                     )
                 if effect.reach > min(self.space.size) / 2:
                     raise ValueError(
@@ -239,7 +239,7 @@ class Scene(Record):
                 raise ValueError(f"groups[{k}].spawn.low: missing; a plane has no size to spread agents over")
 
     def _check_shape(self, k: int, shape: Shape) -> None:
-        """Refuse, on a torus, what reaches around it: only the nearest image of a shape is met."""
+        """Raise ValueError if a shape reaches around a torus: only its nearest image is used."""
         if not isinstance(self.space, Torus) or shape.in_state:
             return
         if isinstance(shape, HalfSpace):
@@ -258,17 +258,17 @@ class Scene(Record):
 
     @property
     def agents(self) -> int:
-        """N."""
+        """Number of agents, N."""
         return sum(group.size for group in self.groups)
 
     @property
     def starts(self) -> tuple[int, ...]:
-        """The first agent of each group, and N."""
+        """Index of the first agent of each group, and N."""
         return (0, *itertools.accumulate(group.size for group in self.groups))
 
     @functools.cached_property
     def living(self) -> tuple[int, ...]:
-        """How many of each group live at the start: its first ones."""
+        """Number of agents of each group that live at the start: its first ones."""
         fed = (any(member.feeds(k) for member in self.population) for k in range(len(self.groups)))
         return tuple(
             group.alive if group.alive is not None else (0 if by else group.size)
@@ -277,17 +277,17 @@ class Scene(Record):
 
     @functools.cached_property
     def circles(self) -> tuple[Circle, ...]:
-        """The round obstacles that stand still and are solid: they are part of the state."""
+        """The fixed, solid, round obstacles: they are part of the state."""
         return tuple(shape for shape in self.obstacles if isinstance(shape, Circle) and shape.in_state)
 
     @functools.cached_property
     def shapes(self) -> tuple[Shape, ...]:
-        """The other obstacles: they are the same in every world, a function of time."""
+        """The other obstacles: the same in every world, a function of time."""
         return tuple(shape for shape in self.obstacles if not shape.in_state)
 
     @property
     def roles(self) -> tuple[str, ...]:
-        """What each agent is called, (N,): groups of plain agents are "agent", "agent 2" to "agent 4", and again."""
+        """Role of each agent, (N,): groups of plain agents are "agent", "agent 2" to "agent 4", and again."""
         plain, names = 0, []
         for group in self.groups:
             number = plain % 4 + 1
@@ -296,20 +296,20 @@ class Scene(Record):
         return tuple(name for name, group in zip(names, self.groups, strict=True) for _ in range(group.size))
 
     def bytes_per_world(self) -> int:
-        """Memory of a state and its scratch, in bytes, counted before anything is allocated."""
+        """Return the memory of one world's state and its scratch, in bytes, before anything is allocated."""
         real = 8 if self.dtype == "float64" else 4
         d, parts = self.dimension, self.parts
-        reals, whole = 2 * d + 5, 1  # positions, velocities, bodies; who is alive
+        reals, whole = 2 * d + 5, 1  # positions, velocities, bodies; alive flags
         reals += parts.frame_rows + len(parts.inner)
         if self.constraints or self.population:
             reals += 4 * d + sum(constraint.numbers(self) for constraint in self.constraints)
         if self.population:
-            whole += 2 * 3 * 8 + 4 * POPULATION_NUMBERS  # who, since when, until when, and what they were before
+            whole += 2 * 3 * 8 + 4 * POPULATION_NUMBERS  # identity, times, and their values before the step
         return self.agents * (reals * real + whole) + scratch_bytes(parts, self.agents)
 
     @functools.cached_property
     def body(self) -> Body:
-        """The bodies of all groups."""
+        """The bodies of all agents."""
 
         def per_agent(name: str) -> Floats:
             values = [math.inf if getattr(g, name) is None else getattr(g, name) for g in self.groups]
@@ -326,12 +326,12 @@ class Scene(Record):
 
     @functools.cached_property
     def parts(self) -> Parts:
-        """What the kernel is made of."""
+        """The kernel plan: all that the kernel is compiled from."""
         sorts = self.agents >= FEWEST_AGENTS
         crowded = self.agents > MOST_DIRECT
         effects = flattened(self.effects)
         walled = any(isinstance(constraint, Collisions) and constraint.obstacles for constraint in self.constraints)
-        space = Plane() if walled and isinstance(self.space, Box) else self.space  # its walls are obstacles then
+        space = Plane() if walled and isinstance(self.space, Box) else self.space  # its walls are then obstacles
         return Parts(
             self.dimension, space, effects, self.integrator, self.dtype, sorts, crowded=crowded,
             oriented=any(group.keeps_heading for group in self.groups),
@@ -343,11 +343,11 @@ class Scene(Record):
 
     @property
     def touching(self) -> float:
-        """The radii of the two that are widest, m: who are further apart do not touch."""
+        """Sum of the two largest radii, m: agents farther apart do not touch."""
         return sum(sorted(group.widest for group in self.groups for _ in range(min(group.size, 2)))[-2:])
 
     def table_of(self, effect: Effect) -> NDArray[np.float64]:
-        """Return the numbers that the laws of a tabled effect look up: made once, whoever asks first."""
+        """Return the table that the laws of an effect look up; computed at the first call."""
         if effect not in self._tables:
             self._tables[effect] = effect.table(self)
         return self._tables[effect]
@@ -363,7 +363,7 @@ class Scene(Record):
 
     @functools.cached_property
     def edges(self) -> NDArray[np.int32]:
-        """Which agents are tied along the edges of networks, (E, 2): what of them is drawn."""
+        """Pairs of agents along the edges of networks, (E, 2), for drawing."""
         found, first = [np.zeros((0, 2), np.int32)], 0
         for group in self.groups:
             if group.network is not None:
@@ -374,7 +374,7 @@ class Scene(Record):
 
     @functools.cached_property
     def coupling(self) -> Coupling | None:
-        """Who depends on whom, for methods that solve equations; none if that changes from step to step."""
+        """Sparsity of the accelerations, for implicit methods; None if it changes from step to step."""
         return coupling_of(self)
 
     @functools.cached_property
@@ -383,13 +383,13 @@ class Scene(Record):
 
     @functools.cached_property
     def _cells(self) -> tuple[Floats | None, ...]:
-        """Where those of each group begin that have a cell each, (size, D) m; none for others."""
+        """Centres of the initial cells of each group with a cell per agent, (size, D) m; None for others."""
         return cells_of(self)
 
     # --- running ----------------------------------------------------------------------------------------------------
 
     def start(self, seed: int, worlds: int = 1) -> State:
-        """Return the first state: world k is drawn from seed + k, whichever batch it is in."""
+        """Return the initial state: world k is drawn from seed + k, independent of the batch."""
         _demand_whole("seed", seed, 0, MASK)
         _demand_whole("worlds", worlds, 1)
         if self.bytes_per_world() * worlds > MEMORY_LIMIT:
@@ -412,13 +412,13 @@ class Scene(Record):
         return state
 
     def _begin(self, state: State, fresh: NDArray[np.bool_]) -> None:
-        """Write what goes on inside those who come into being, (B, N)."""
+        """Write the initial inner numbers of the agents in `fresh`, (B, N)."""
         if self.parts.inner and fresh.any():
             scratch = self._workspaces(1, 1)[0].of(0, self._scratch_kind)
             self._fill_inner(worlds_of(state), self._params, self._dt, fresh, scratch)
 
     def inner(self, state: State, name: str) -> Floats:
-        """Return what goes on inside everybody by name, as a view, (B, N); see `Effect.keeps`."""
+        """Return an inner number of every agent by name, as a view, (B, N); see `Effect.keeps`."""
         if name not in self.parts.inner:
             raise ValueError(f"{name!r}: no effect keeps it; those of this scene keep {self.parts.inner or 'nothing'}")
         found: Floats = state.inner[self.parts.inner.index(name)]
@@ -427,9 +427,9 @@ class Scene(Record):
     def step(self, state: State, drive: ArrayLike | None = None, out: State | None = None, steps: int = 1) -> State:
         """Advance every world by `steps` physics steps under a constant drive.
 
-        drive: forces asked for, (B, N, D) N, clipped to max_force together with steering effects; none = nobody asks.
-        out: the state to write into (it may be `state` itself: nothing is allocated then); none = a new one.
-        Raises SimulationDiverged, naming world, agent, step and effect, if a position or velocity is no longer finite;
+        drive: driving forces, (B, N, D) N, clipped to max_force together with steering effects; None: no drive.
+        out: the state to write into (with `state` itself nothing is allocated); None: a new state.
+        Raise SimulationDiverged, naming world, agent, step and effect, if a position or velocity is no longer finite;
         that world is left as it was, the others have made their steps.
         """
         self._check(state, steps)
@@ -448,7 +448,7 @@ class Scene(Record):
     def _diverged(
         self, state: State, drive: Floats, world: int, agent: int, steps: int, reason: str
     ) -> SimulationDiverged:
-        """Return what to say about a world that could not make its steps: its last finite instant is found again."""
+        """Return the error for a world that could not make its steps; its last finite state is computed again."""
         alone = state.worlds([world])
         push = drive[:, world : world + 1].copy() if drive.shape[1] else drive
         done = 0
@@ -464,34 +464,34 @@ class Scene(Record):
         return error
 
     def _blamed(self, state: State, agent: int) -> str | None:
-        """Return the kind of the effect that accelerates an agent most, or to no number at all.
+        """Return the kind of the effect that accelerates an agent most, or by a value that is not finite.
 
-        Who is very far or fast is taken to be less so: there an effect that is idle is no number either, 0 x infinity.
+        Positions and velocities are clipped: at very large ones an idle effect is not finite either (0 x infinity).
         """
         found: list[tuple[float, str]] = []
         most = float(np.finfo(self.dtype).max) ** 0.25
         near = dataclasses.replace(state, x=np.clip(state.x, -most, most), v=np.clip(state.v, -most, most))
         for k, effect in enumerate(self.effects):
             others = tuple(e if j == k else e.idle() for j, e in enumerate(self.effects))
-            # nothing is stepped: under a method without a limit no dt is warned of or refused
+            # nothing is stepped: with a method without a limit no dt is warned of or rejected
             alone = self.model_copy(update={"effects": others, "integrator": ImplicitEuler()})
             size = float(np.abs(alone.acceleration(near)[0, agent]).max())
             found.append((size if math.isfinite(size) else math.inf, effect.kind))
         return max(found)[1] if found and max(found)[0] > 0 else None
 
     def acceleration(self, state: State, drive: ArrayLike | None = None) -> Floats:
-        """Return the acceleration of everybody at this instant, (B, N, D) m/s^2; nothing moves.
+        """Return the acceleration of every agent in this state, (B, N, D) m/s^2, without moving it.
 
-        Drag included, whichever method the scene has; forces asked for are bounded as in a step, speeds are not.
+        Drag is included, for any integrator; drives are bounded as in a step, speeds are not.
         """
         return self.rates(state, drive)[0]
 
     def rates(
         self, state: State, drive: ArrayLike | None = None, times: ArrayLike | None = None
     ) -> tuple[Floats, Floats | None]:
-        """Return the acceleration, (B, N, D) m/s^2, and the velocity of a medium that carries everybody, m/s, or none.
+        """Return the acceleration, (B, N, D) m/s^2, and the velocity by which a medium carries agents, m/s, or None.
 
-        times: of each world, (B,) s; none = those of the state.
+        times: of each world, (B,) s; None: those of the state.
         """
         self._check(state, 0)
         b, n, d = state.shape
@@ -501,8 +501,8 @@ class Scene(Record):
         if given.shape not in ((), (b,)) or not np.isfinite(given).all():
             raise ValueError(f"times is {times!r}, must be a finite number for each of {b} worlds, or one for all")
         when, x = np.ascontiguousarray(np.broadcast_to(given, b), self.dtype), state.x
-        if self.parts.confines:  # a step begins so; who is asked where he is may be outside of the box
-            with np.errstate(invalid="ignore"):  # who is infinitely far has no image, and is nobody's neighbour
+        if self.parts.confines:  # as at the start of a step; a given state may be outside the box
+            with np.errstate(invalid="ignore"):  # an infinite position has no image, and is no neighbour
                 x = np.ascontiguousarray(self.space.wrap(state.pos).transpose(2, 0, 1), self.dtype)
         self._accelerate(
             worlds_of(state)._replace(x=x), self._drive(drive, state), self._params, when, acc, flow,
@@ -511,7 +511,7 @@ class Scene(Record):
         return acc.transpose(1, 2, 0), flow.transpose(1, 2, 0) if self.parts.flows else None
 
     def _advance(self, state: State, drive: Floats, steps: int) -> tuple[int, int, str]:
-        """Step in place; return the first (world, agent) that could not, or (-1, -1), and why if numbers are finite."""
+        """Step in place; return the first (world, agent) that failed, or (-1, -1), and why if numbers are finite."""
         if steps == 0:
             return -1, -1, ""
         if self.integrator.solves:
@@ -519,7 +519,7 @@ class Scene(Record):
         return *self._stepped(state, drive, steps), ""
 
     def _take_over(self, state: State, world: int, x: Floats, v: Floats) -> tuple[int, int]:
-        """Let the kernel end a step whose positions and velocities, (D, N), were solved for: limits, space, time."""
+        """Let the kernel finish a step with the solved positions and velocities, (D, N): limits, space, time."""
         width, (_, n) = self.parts.width, x.shape
         stages = self._workspaces(1, 1)[0].arrays["stages"]
         for row, solved in zip(stages, (x, v), strict=True):
@@ -529,12 +529,12 @@ class Scene(Record):
         return self._stepped(state, np.zeros((self.dimension, 0, 0), self.dtype), 1)
 
     def _stepped(self, state: State, drive: Floats, steps: int) -> tuple[int, int]:
-        """Step in place without solving: all steps in one call, or each with its end mended."""
+        """Step in place with the kernel: all steps in one call, or one by one with constraints and population."""
         ends = self.constraints or self.population
         return self._settled(state, drive, steps) if ends else self._moved(state, drive, steps)
 
     def _settled(self, state: State, drive: Floats, steps: int) -> tuple[int, int]:
-        """Step in place and mend the end of each step; a world in which that fails stays as it was, whole."""
+        """Step in place, with constraints and population after each step; a world that fails stays as it was."""
         kept, x0, v0 = self._remembered(state)
         begun, failed = state.tick.copy(), np.zeros(len(state.tick), np.bool_)
         found, births = (-1, -1), bool(self.population and self.parts.inner)
@@ -551,18 +551,18 @@ class Scene(Record):
             found = min([f for f in (moved, *mended) if f[0] >= 0], default=found) if found[0] < 0 else found
             if failed.any():
                 state.put(failed, kept)
-                state.tick[failed] += step + 1  # they take part as if nothing was
+                state.tick[failed] += step + 1  # they go on from the kept state
         if failed.any():
             state.put(failed, kept)
         return found
 
     @functools.cached_property
     def _looks_back(self) -> bool:
-        """Does what a step must end with depend on where it began?"""
+        """True if constraints or population depend on the start of the step."""
         return bool(self.constraints) or any(member.looks_back for member in self.population)
 
     def _remembered(self, state: State) -> tuple[State, Floats, Floats]:
-        """Return a copy of a state, and room for positions and velocities: memory of this thread's own, used again."""
+        """Return a copy of a state, and buffers for positions and velocities: memory of this thread, reused."""
         memory = vars(self._threads)
         sizes = state.shape, state.obstacle_radius.shape
         if memory.get("remembered_sizes") != sizes:
@@ -573,7 +573,7 @@ class Scene(Record):
         return kept, x0, v0
 
     def _mended(self, x0: Floats, v0: Floats, state: State) -> list[tuple[int, int]]:
-        """Mend a step that began at x0, v0, constraint after constraint; return every (world, agent) not finite."""
+        """Apply all constraints to a step that began at x0, v0; return every (world, agent) that is not finite."""
         worlds, agents, _ = state.shape
         crew, work = min(at_work(), worlds), worlds * agents
 
@@ -591,7 +591,7 @@ class Scene(Record):
         return alone() if crew <= 1 else self._choices.of("mending", work, crew).made(alone, shared, work >= LARGEST)
 
     def _settlers(self, count: int) -> list[list[Settler]]:
-        """Return what mends steps, for so many threads: each has scratch of its own."""
+        """Return the constraints and population of `count` threads, each with scratch memory of its own."""
         kept: list[list[Settler]] = vars(self._threads).setdefault("settlers", [])
         while len(kept) < count:
             last = [population_settler(self)] if self.population else []
@@ -599,9 +599,9 @@ class Scene(Record):
         return kept
 
     def _moved(self, state: State, drive: Floats, steps: int) -> tuple[int, int]:
-        """Step in place by the kernel alone, by as many threads as are in use.
+        """Step in place by the kernel alone, on all threads in use.
 
-        Threads take worlds apart, or, of a large world, its agents.
+        Threads divide the worlds, or the agents of a large world.
         """
         worlds, agents, _ = state.shape
         move, kind = self._move, self._scratch_kind
@@ -629,16 +629,16 @@ class Scene(Record):
         return self._choices.of("together" if team > 1 else "apart", work, crew).made(alone, shared, surely)
 
     def _divided(self, worlds: int, agents: int) -> tuple[int, int]:
-        """Return how many threads may step so many worlds, and how many of them each world together.
+        """Return the number of threads that may step these worlds, and the number that share each world.
 
-        Under a method that solves equations, what was solved for lies in one thread's scratch.
+        With an implicit method the solution is in one thread's scratch memory.
         """
         crew, solves = at_work(), self.integrator.adaptive or self.integrator.solves
         together = worlds < crew and agents >= FEWEST_TOGETHER and not solves
         return (crew, crew) if together else (min(crew, worlds), 1)
 
     def _check(self, state: State, steps: int) -> None:
-        """Refuse what the kernel would not notice: it trusts the sizes of its arrays."""
+        """Raise ValueError if the state does not fit the scene: kernels trust the sizes of their arrays."""
         expected = (self.agents, self.dimension, np.dtype(self.dtype))
         if (*state.shape[1:], state.x.dtype) != expected:
             raise ValueError(
@@ -662,7 +662,7 @@ class Scene(Record):
         _demand_whole("steps", steps, 0)
 
     def run(self, state: State, steps: int) -> State:
-        """Return the state `steps` steps later."""
+        """Return the state after `steps` steps."""
         return self.step(state, steps=steps)
 
     def _drive(self, drive: ArrayLike | None, state: State) -> Floats:
@@ -682,7 +682,7 @@ class Scene(Record):
 
     @functools.cached_property
     def _plain_parts(self) -> Parts:
-        """The parts for accelerations alone: the method makes no difference, and agents may be at NaN."""
+        """The kernel plan for accelerations alone: independent of the integrator, and agents may be at NaN."""
         return dataclasses.replace(self.parts, integrator=SemiImplicitEuler(), stepped=False)
 
     @functools.cached_property
@@ -702,7 +702,7 @@ class Scene(Record):
         return step_of(self.parts)
 
     def _workspaces(self, count: int, team: int) -> list[Workspace]:
-        """Return scratch of this thread's own: two threads may step one scene at the same time."""
+        """Return scratch memory of this thread: two threads may step one scene at the same time."""
         kept: dict[int, list[Workspace]] = vars(self._threads).setdefault("workspaces", {})
         found = kept.setdefault(team, [])
         while len(found) < count:
@@ -711,7 +711,7 @@ class Scene(Record):
 
     @property
     def _choices(self) -> Choices:
-        """What is known of how work is sooner done here, to the thread that asks."""
+        """Measurements, by the calling thread, of whether work is faster on one thread or on several."""
         found: Choices = vars(self._threads).setdefault("choices", Choices())
         return found
 
@@ -739,7 +739,7 @@ class Scene(Record):
         )  # fmt: skip
 
     def shown(self, state: State, world: int = 0) -> NDArray[np.float64] | None:
-        """Return the number inside everybody that pictures show, (N,): what his look is about; none if no look is."""
+        """Return the inner number of every agent that pictures show, (N,), set by its appearance; None without one."""
         if not any(look.by == "inner" for look in self.looks):
             return None
         shown = np.zeros(self.agents)
@@ -751,12 +751,12 @@ class Scene(Record):
 
     @property
     def looks(self) -> tuple[Appearance, ...]:
-        """How some groups are drawn."""
+        """Appearances of the groups that have one."""
         return tuple(group.appearance for group in self.groups if group.appearance is not None)
 
     @property
     def look(self) -> NDArray[np.int32]:
-        """Which of `looks` everybody has, (N,); -1 = none."""
+        """Index into `looks` of every agent, (N,); -1: no appearance."""
         dressed = [group.appearance is not None for group in self.groups]
         number = np.where(dressed, np.cumsum(dressed) - 1, -1)
         return np.repeat(number, [group.size for group in self.groups]).astype(np.int32)
@@ -772,25 +772,25 @@ class Scene(Record):
         return tuple(found)
 
     def _shift(self, shape: Shape, time: float) -> Floats:
-        """Return how far a shape is at a time from where its fields say, m; on a torus, to its image in the box."""
+        """Return the displacement of a shape at a time, m; on a torus, to its image in the box."""
         shift = shape.shift(time)
         if not (shape.moves and self.space.periodic):
             return shift
         return np.asarray(self.space.wrap(np.array(shape.anchor) + shift)) - shape.anchor
 
     def _view(self, state: State, world: int) -> tuple[Sequence[float], Sequence[float]]:
-        """Return the region to show: the space, or where everybody is."""
+        """Return the region to show: the space, or the bounds of all agents and obstacles."""
         if not isinstance(self.space, Plane):
             return (0.0,) * self.dimension, self.space.extent(self.dimension)
         pos, living = state.pos[world], state.alive[world]
-        pos = pos[living] if self.population and living.any() else pos  # slots of nobody are nowhere
+        pos = pos[living] if self.population and living.any() else pos  # empty slots have no position
         margin = 1.0 + 0.05 * float(np.ptp(pos, axis=0).max())
         low, high = pos.min(axis=0) - margin, pos.max(axis=0) + margin
         every = np.concatenate([low[None], high[None], *self.extremes(float(state.time[world]))])
         return tuple(every.min(axis=0)), tuple(every.max(axis=0))
 
     def extremes(self, *times: float) -> list[Floats]:
-        """Return places that pictures of some times, s, must show: of shapes, of the ways that behaviours are about."""
+        """Return points that pictures at some times, s, must show: of shapes, emitters, and paths of behaviours."""
         tracks = [np.asarray(track) + side for track, radius in self._tracks for side in (-radius, radius)]
         shown = [shape.extremes + shape.shift(time) for shape in self.shapes for time in times]
         places = [member.place.extremes for member in self.population if isinstance(member, Emitter)]
@@ -798,13 +798,13 @@ class Scene(Record):
 
     @functools.cached_property
     def _tracks(self) -> tuple[tuple[tuple[tuple[float, ...], ...], float], ...]:
-        """The ways that behaviours are about, each once."""
+        """The paths of steering behaviours, each once."""
         ways = dict.fromkeys(effect.way_shown(self) for effect in self.parts.effects if effect.steering)
         return tuple(way for way in ways if way is not None)
 
     @property
     def marks(self) -> tuple[Mark, ...]:
-        """The ways and places that behaviours are about."""
+        """The paths and targets of steering behaviours."""
         still, size = np.zeros(self.dimension), 2 * max(group.widest for group in self.groups)
         wishes = [effect for effect in self.parts.effects if effect.steering]
         places = [getattr(wish, name) for wish in wishes if wish.heads_for for name in wish.places]
@@ -814,5 +814,5 @@ class Scene(Record):
         )
 
     def with_effects(self, *effects: Effect) -> Scene:
-        """Return the same scene under other effects."""
+        """Return the same scene with other effects."""
         return self.model_copy(update={"effects": effects})

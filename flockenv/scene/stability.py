@@ -1,9 +1,9 @@
-"""The largest step that is stable, for a method and for a scene: measured on the method, from the effects' stiffness.
+"""The largest stable step of a method and of a scene: measured on the method, from the effects' stiffness.
 
-Nothing here is a table of methods: one step of each is applied to a damped oscillator x'' = -w^2 x - 2 zeta w x', and
-stable is what does not grow. A method whose region of stability touches the imaginary axis at 0 alone (explicit Euler,
-averaged velocity, midpoint, Heun) has no stable step for an undamped oscillator: its limit is 0, and a warning says how
-slowly it grows, which is for the reader to judge (of the two-stage methods as (h w)^4 / 8 in a step).
+There is no table of methods: one step of a method is applied to a damped oscillator x'' = -w^2 x - 2 zeta w x', and is
+stable if the amplitude does not grow. A method whose region of stability touches the imaginary axis at 0 alone
+(explicit Euler, averaged velocity, midpoint, Heun) has no stable step for an undamped oscillator: its limit is 0, and a
+warning gives the rate of growth, for the user to judge ((h w)^4 / 8 per step for the two-stage methods).
 """
 
 from __future__ import annotations
@@ -40,71 +40,71 @@ __all__ = [
 Floats = NDArray[np.float64]
 
 ROUNDING = 1e-11
-"""Growth of the amplitude in one step that is rounding: no method here grows so slowly at any h w of NEAR."""
+"""Growth of the amplitude per step that may be rounding: no method here grows that slowly at any h w of NEAR."""
 
 NEAR = (0.05, 0.1, 0.2)
-"""The h w at which a method shows whether it grows near 0: as (h w)^2 or (h w)^4, of which rounding is far below."""
+"""The h w at which growth near 0 is tested: it is as (h w)^2 or (h w)^4, far above rounding."""
 
 CERTAIN = 2.5
-"""Times the limit beyond which a scene is refused: bounds of frequency are less than that above the truth.
+"""Multiple of the limit beyond which a scene raises ValueError: bounds of frequency overestimate by a smaller factor.
 
-The fastest oscillation is at least as fast as anybody's while all others rest: by the mean over D axes, w^2 is at least
-sum k / (D m), of a bound of 2 sum k / m; and sqrt(2 D) <= 2.45.
+The fastest oscillation is at least as fast as that of any one agent while all others rest: by the mean over D axes,
+w^2 is at least sum k / (D m), compared to a bound of 2 sum k / m; and sqrt(2 D) <= 2.45.
 """
 
 WEAK = 0.1
-"""The h w and h c below which a limit is no use: with so little damping such a method is stable in tiny steps alone."""
+"""The h w and h c below which a limit is useless: with little damping such a method needs tiny steps."""
 
 STEADY = "semi_implicit_euler, velocity_verlet or rk4"
-"""What has stable steps for undamped oscillations."""
+"""Methods with stable steps for undamped oscillations."""
 
-SMALLEST, LARGEST, POINTS = 1e-7, 1e3, 300  # h w that are looked at
-ROUNDS = 3  # of closing in on where it becomes unstable
+SMALLEST, LARGEST, POINTS = 1e-7, 1e3, 300  # h w that are tested
+ROUNDS = 3  # of refining the limit
 FASTEST = 32
-"""Different oscillators of a scene that are looked at."""
+"""Most different oscillators of a scene that are tested."""
 
 
 STEPS, STEPS_OF_ITS_OWN = 30, 4
-"""That a contact should last: with fewer, how fast a body comes out hangs by where in a step it touched. Under a method
-with steps of its own within dt: or it steps over what has hardly begun (measured at the default tolerance)."""
+"""Least number of steps per contact: with fewer, the speed after it depends on the time of touch within a step. For
+adaptive methods: with fewer, they step over a contact that has just begun (measured at the default tolerance)."""
 
 OFF = 1.048
-"""By which factor a method may change the speed in an undamped contact: 5 %, less what the phase of a step does."""
+"""Factor by which a method may change the speed in an undamped contact: 5 %, less the effect of the phase of a step."""
 
 BOUNCY = 0.2
-"""Damping as a share of what is critical, below which a contact is there to bounce: it gives back half, or more."""
+"""Damping, as a fraction of the critical one, below which a contact counts as bouncing: restitution of at least 1/2."""
 
 
 class Suggestion(NamedTuple):
-    """The largest stable step of a scene, and what sets it."""
+    """The largest stable step of a scene, and the effect that sets it."""
 
     dt: float  # s; inf if nothing in the scene sets a limit, 0 if no step is stable
-    effect: str | None  # kind of the effect that is the stiffest
-    agent: int | None  # whom it acts on
+    effect: str | None  # kind of the stiffest effect
+    agent: int | None  # index of the agent it acts on
     frequency: float  # rad/s, of the fastest oscillation (a bound)
     damping: float  # 1/s, of velocity, there
 
 
 def amplification(method: Integrator, y: Floats, zeta: float, told: float = 0.0) -> Floats:
-    """Return what one step of h = 1 s makes of (x, v), (K, 2, 2), of oscillators with h w = y, (K,).
+    """Return the amplification matrices of (x, v) in one step of h = 1 s, (K, 2, 2), for oscillators of h w = y, (K,).
 
-    zeta, told: damping as shares of what is critical; of the second the method is told, if it treats drag by itself.
+    zeta, told: damping as fractions of critical damping; `told` is passed to a method that integrates drag separately.
     """
     y = np.asarray(y, float)
     state = blank(1, len(y), 2, 0, 1.0)
-    state.x[0], state.v[1] = 1.0, 1.0  # two beginnings side by side: the axes do not know of each other
+    state.x[0], state.v[1] = 1.0, 1.0  # two initial states at once: the axes are independent
     own = told if method.splits_drag else 0.0
     square, drag = (y * y)[:, None], (2 * (zeta + told - own) * y)[:, None]
     after = method(lambda x, v, t: -square * x - drag * v, state, 1.0, drag=np.tile(2 * own * y, 2))
-    return np.stack([after.pos[0], after.vel[0]], axis=1)  # (K, what comes out, what went in)
+    return np.stack([after.pos[0], after.vel[0]], axis=1)  # (K, output, input)
 
 
 def growth(method: Integrator, y: Floats, zeta: float, told: float = 0.0) -> Floats:
-    """Return by what the amplitude is multiplied in one step at worst, (K,): the spectral radius."""
+    """Return the largest factor of the amplitude in one step, (K,): the spectral radius."""
     with np.errstate(all="ignore"):
         matrices = amplification(method, y, zeta, told)
         matrices[~np.isfinite(matrices)] = 1e300
-        # in units in which position and velocity weigh the same
+        # in units in which position and velocity have equal weight
         scaled = matrices * np.stack(
             [np.stack([np.ones_like(y), y], -1), np.stack([1 / y, np.ones_like(y)], -1)], axis=1
         )
@@ -113,9 +113,9 @@ def growth(method: Integrator, y: Floats, zeta: float, told: float = 0.0) -> Flo
 
 @functools.lru_cache(maxsize=1024)
 def limit(method: Integrator, zeta: float, told: float = 0.0) -> float:
-    """Return the largest stable h w, for damping as shares of what is critical (see amplification).
+    """Return the largest stable h w, for damping as fractions of critical damping (see amplification).
 
-    inf = any; 0 = none, where nothing damps and the method grows however small h w is.
+    inf: any h w is stable; 0: none is, as there is no damping and the method grows for arbitrarily small h w.
     """
     if method.solves or method.adaptive:
         return math.inf
@@ -126,7 +126,7 @@ def limit(method: Integrator, zeta: float, told: float = 0.0) -> float:
 
 @functools.lru_cache(maxsize=64)
 def drag_limit(method: Integrator) -> float:
-    """Return the largest stable h c of x'' = -c x', of which the method is not told; inf = any."""
+    """Return the largest stable h c of x'' = -c x', which is not passed to the method as drag; inf: any is stable."""
     if method.solves or method.adaptive:
         return math.inf
 
@@ -139,7 +139,7 @@ def drag_limit(method: Integrator) -> float:
 
 
 def _first_unstable(grown: Callable[[Floats], Floats]) -> float:
-    """Return the least number at which an amplitude is more after a step than before it."""
+    """Return the smallest argument at which the amplitude grows in a step."""
     y = np.geomspace(SMALLEST, LARGEST, POINTS)
     for _ in range(ROUNDS):
         grows = grown(y) > 1 + ROUNDING
@@ -153,31 +153,30 @@ def _first_unstable(grown: Callable[[Floats], Floats]) -> float:
 
 
 class _Rates(NamedTuple):
-    """How stiff everybody is, (N,) each."""
+    """Stiffness of every agent, (N,) each."""
 
     square: Floats  # w^2, 1/s^2
     damping: Floats  # 1/s
-    told: Floats  # 1/s, damping that the method is told of
+    told: Floats  # 1/s, damping that the method integrates separately
 
     def of(self, agent: int) -> tuple[float, float, float]:
-        """Return one agent's."""
+        """Return the rates of one agent."""
         return float(self.square[agent]), float(self.damping[agent]), float(self.told[agent])
 
 
 def suggest_dt(scene: SceneView) -> Suggestion:
-    """Return the largest stable step of a scene, from its effects' own stiffness, and the effect that sets it.
+    """Return the largest stable step of a scene, from the stiffness of its effects, and the effect that sets it.
 
-    Stiffness is a bound (Gershgorin's circles for springs), so the limit is on the safe side; what is only stiff in
-    some states (agents that touch more than one other) is not in it. Damping is a bound too: a method that needs
-    damping to be stable (explicit Euler, Heun, midpoint) may find motions that are damped less, springs across their
-    length for one.
-    Source: numerics.md 2.2 P02, 3.1, 3.3.
+    Stiffness is an upper bound (Gershgorin's circles for springs), so the limit is conservative; stiffness in some
+    states only (agents that touch more than one other) is not included. Damping is an upper bound too: with a method
+    that needs damping to be stable (explicit Euler, Heun, midpoint), less damped motions may be unstable, such as
+    springs across their length.
     """
     return _suggested(scene, _found(scene))
 
 
 def _suggested(scene: SceneView, found: list[tuple[Effect, _Rates]]) -> Suggestion:
-    """Return the largest step that is stable under some effects of a scene."""
+    """Return the largest stable step under some effects of a scene."""
     if not found:
         return Suggestion(math.inf, None, None, 0.0, 0.0)
     whole = _Rates(*(sum(rates[k] for _, rates in found) + np.zeros(scene.agents) for k in range(3)))
@@ -191,12 +190,12 @@ def _suggested(scene: SceneView, found: list[tuple[Effect, _Rates]]) -> Suggesti
 
 
 def _urgency(method: Integrator, square: float, damping: float, told: float) -> tuple[float, float]:
-    """Return the largest stable step of one oscillator, and minus its rates: of those without one the fastest leads."""
+    """Return the largest stable step of one oscillator, and minus its rates: of equal steps the fastest comes first."""
     return _limit_of(method, square, damping, told), -max(math.sqrt(square), damping + told)
 
 
 def _found(scene: SceneView) -> list[tuple[Effect, _Rates]]:
-    """Return those effects that know how stiff they are, and how stiff that is."""
+    """Return the effects with a known stiffness, and their rates."""
     out = []
     for k, effect in enumerate(scene.effects):
         acting = effect if scene.obstacles else effect.in_the_open()
@@ -213,9 +212,9 @@ def _found(scene: SceneView) -> list[tuple[Effect, _Rates]]:
 
 
 def _tightest(method: Integrator, rates: _Rates) -> tuple[float, int]:
-    """Return the least of all agents' limits, s, and whose it is; of very many different ones, among the fastest."""
+    """Return the smallest limit of all agents, s, and the agent; of many different agents the FASTEST are tested."""
     table = np.stack(rates, axis=1)
-    begins = np.flatnonzero(np.r_[True, (table[1:] != table[:-1]).any(axis=1)])  # of agents in a row who are alike
+    begins = np.flatnonzero(np.r_[True, (table[1:] != table[:-1]).any(axis=1)])  # of runs of equal agents
     kinds, among = np.unique(table[begins], axis=0, return_index=True)
     first = begins[among]
     fastest = np.argsort(np.maximum(np.sqrt(kinds[:, 0]), kinds[:, 1]), kind="stable")[-FASTEST:]
@@ -227,18 +226,18 @@ def _limit_of(method: Integrator, square: float, damping: float, told: float) ->
     """Return the largest stable step of one oscillator, s."""
     if square <= 0 and damping <= 0:
         return math.inf
-    if damping > 1e4 * math.sqrt(square):  # nothing but drag: x'' = -c x'
+    if damping > 1e4 * math.sqrt(square):  # drag alone: x'' = -c x'
         return drag_limit(method) / damping
     frequency = math.sqrt(square)
-    # to a few digits, so that agents of nearly the same damping are looked at once
+    # to a few digits, so that agents of nearly the same damping are tested once
     zeta, own = (float(f"{rate / (2 * frequency):.4g}") for rate in (damping, told))
     return limit(method, zeta, own) / frequency
 
 
 def check_dt(scene: SceneView) -> None:
-    """Warn where dt is beyond the largest stable step, naming limit and effect; refuse where it must blow up.
+    """Warn if dt exceeds the largest stable step, naming limit and effect; raise ValueError if it must blow up.
 
-    Behaviours that act now and then, or within bounds, do not make it blow up: see `Effect.always`.
+    Effects that act at times, or with bounded forces, do not make it blow up: see `Effect.always`.
     """
     found = suggest_dt(scene)
     if scene.dt <= found.dt:
@@ -250,7 +249,7 @@ def check_dt(scene: SceneView) -> None:
 
 
 def _too_long(scene: SceneView, found: Suggestion) -> str:
-    """Say which step is stable, and what sets it, in one line."""
+    """Return a line with the largest stable step and what sets it."""
     kind, text = scene.integrator.kind, f"{found.frequency:.4g} rad/s, {found.damping:.4g} 1/s at agent {found.agent}"
     if found.dt == 0:
         limit_text = (
@@ -271,10 +270,10 @@ def _growing(scene: SceneView, found: Suggestion) -> float:
 
 
 def _blows_up(scene: SceneView, found: Suggestion) -> bool:
-    """True if an amplitude grows a hundredfold within a hundred steps, even if all rates are far below their bounds."""
+    """Return True if the amplitude grows a hundredfold in a hundred steps, even with rates far below their bounds."""
     y = np.array([scene.dt * found.frequency / CERTAIN])
     if found.damping > 1e4 * found.frequency:
-        return True  # nothing but drag, of which nothing is a bound
+        return True  # drag alone, whose rates are exact
     zeta = found.damping / (2 * found.frequency)
     slowest = min(growth(scene.integrator, y, *shares)[0] for shares in ((zeta, 0.0), (0.0, zeta)))
     return bool(slowest > 100 ** (1 / 100))
@@ -284,14 +283,14 @@ def _blows_up(scene: SceneView, found: Suggestion) -> bool:
 def contact_limit(method: Integrator) -> float:
     """Return the largest h w at which half an undamped oscillation is resolved.
 
-    At least STEPS steps (numerics.md P17), and the amplitude is the same within OFF: explicit Euler multiplies it by
-    (1 + y^2)^(pi / 2y), implicit Euler divides it, and both take 105 steps for that.
+    Resolved means in at least STEPS steps, and with the same amplitude within OFF: explicit Euler multiplies it by
+    (1 + y^2)^(pi / 2y), implicit Euler divides it, and both need 105 steps.
     """
     if method.adaptive:
         return math.pi / STEPS_OF_ITS_OWN
     low, high = 1e-3, math.pi / STEPS
     for _ in range(ROUNDS):
-        y = np.linspace(low, high, FASTEST)  # few: methods that solve do so in Python
+        y = np.linspace(low, high, FASTEST)  # few: implicit methods run in Python
         off = np.abs(np.log(growth(method, y, 0.0))) * math.pi / y > math.log(OFF)
         if not off.any():
             return high
@@ -301,7 +300,7 @@ def contact_limit(method: Integrator) -> float:
 
 
 def check_contact(scene: SceneView) -> None:
-    """Warn where bodies that should bounce are in contact for too few steps, naming the limit, and what comes of it."""
+    """Warn if contacts of bouncing bodies last too few steps, naming the limit and the consequence."""
     for k, effect in enumerate(scene.effects):
         acting = effect if scene.obstacles else effect.in_the_open()
         found = acting.rates(scene.groups, scene.dimension) if acting is not None and effect.contact else None
@@ -321,7 +320,7 @@ def check_contact(scene: SceneView) -> None:
 
 
 def _what_comes_of_it(scene: SceneView, frequency: float, agent: int) -> str:
-    """Say how much faster bodies come out of an undamped contact at this dt, and from where on it is unstable."""
+    """Return the change of speed in an undamped contact at this dt, and the dt above which it is unstable, in words."""
     method, y = scene.integrator, scene.dt * frequency
     if method.adaptive:
         return ""
@@ -335,7 +334,7 @@ def _what_comes_of_it(scene: SceneView, frequency: float, agent: int) -> str:
 
 
 def check_lookahead(scene: SceneView) -> None:
-    """Warn of those who look ahead less far than it takes them to stop: V^2 m/(2 F), and their radius."""
+    """Warn if a lookahead is shorter than the stopping distance V^2 m/(2 F) plus the radius."""
     for k, effect in enumerate(scene.effects):
         several = [(f"effects[{k}].behaviours[{j}]", each) for j, each in enumerate(effect.wishes)]
         only = getattr(effect, "group", None) if several else None
@@ -346,7 +345,7 @@ def check_lookahead(scene: SceneView) -> None:
 
 
 def _warn_late(name: str, effect: Effect, g: int, group: Group) -> None:
-    """Warn if one group sees too late by one effect; who has no top speed, or no bounds of force, is not judged."""
+    """Warn if one effect detects too late for one group; skipped without a largest speed or force."""
     fastest, strongest = group.fastest, group.max_force
     if fastest is None or not strongest or (sees := effect.lookahead(fastest)) is None:
         return

@@ -1,7 +1,7 @@
-"""YAML <-> Scene: a strict reader that says in one line what is wrong and where, and a writer whose text reads back.
+"""YAML <-> Scene: a strict reader with one-line errors (what and where), and a writer whose text reads back.
 
-The reader takes YAML 1.2's plain words, not 1.1's: `1e-3` is a number, `no` is a word, `010` and `.nan` are refused.
-It builds numbers, words, lists and blocks, and never an object, whatever tag a file carries.
+The reader takes YAML 1.2's plain scalars, not 1.1's: `1e-3` is a number, `no` a string, `010` and `.nan` are errors.
+It builds numbers, strings, lists and mappings, and never an object: tags are errors.
 """
 
 from __future__ import annotations
@@ -28,32 +28,32 @@ __all__ = ["MAX_BYTES", "ConfigError", "dump", "dump_scene", "load", "load_scene
 
 MAX_BYTES = 1_000_000
 MAX_DEPTH = 32
-MAX_LINES = 5  # of one error message: who has more mistakes than this mends these first
+MAX_LINES = 5  # of one error message; the rest is left out
 
 M = TypeVar("M", bound=BaseModel)
 
-_LOADER: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # libyaml where there is one: ten times faster
+_LOADER: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # libyaml if installed: ten times faster
 
 
 class ConfigError(ValueError):
-    """A configuration that cannot be used: one line per mistake, with file, line, key, value and what is allowed."""
+    """An invalid configuration: one line per mistake, with file, line, key, value and what is allowed."""
 
 
 def load_scene(source: str | Path) -> Scene:
-    """Return the scene that a YAML file, or YAML text, describes; see `load`."""
+    """Return the scene of a YAML file or YAML text; see `load`."""
     return load(source, Scene)
 
 
 def dump_scene(scene: Scene, models: Sequence[str] = (), brief: bool = False) -> str:
     """Return the scene as YAML text that reads back as an equal scene.
 
-    models: presets to write by name, where all their effects follow each other in the scene; brief: see `dump`.
+    models: presets to write by name, if all their effects are consecutive in the scene; brief: see `dump`.
     """
     return dump(scene, brief, {"effects": functools.partial(_by_name, scene, models)} if models else {})
 
 
 def _by_name(scene: Scene, models: Sequence[str], effects: list[Any]) -> list[Any]:
-    """Return the effects of a scene as they are written, with those of presets by the preset's name."""
+    """Return the written effects of a scene, with those of presets replaced by the preset's name."""
     out = list(effects)
     for name in models:
         stands_for = Preset(preset=name).effects()
@@ -67,7 +67,7 @@ def _by_name(scene: Scene, models: Sequence[str], effects: list[Any]) -> list[An
 def schema(model: type[BaseModel] = Scene) -> dict[str, Any]:
     """Return the JSON Schema of a model, for editors that complete and check YAML."""
     out = {"$schema": "https://json-schema.org/draft/2020-12/schema", **model.model_json_schema()}
-    if model is Scene:  # a file may name a preset where effects are listed
+    if model is Scene:  # a list of effects in a file may name a preset
         listed = out["properties"]["effects"]
         listed["items"] = {"anyOf": [listed["items"], {"$ref": "#/$defs/Preset"}]}
         out["$defs"]["Preset"] = Preset.model_json_schema()
@@ -75,10 +75,10 @@ def schema(model: type[BaseModel] = Scene) -> dict[str, Any]:
 
 
 def load(source: str | Path, model: type[M]) -> M:
-    """Return the `model` that a YAML file or text describes.
+    """Return the `model` of a YAML file or text.
 
-    A Path names a file or a pipe, `-` standard input; so does a str, unless it holds a line break, a `: ` or a `{`:
-    then it is the text itself. Raises ConfigError, one line per mistake, before anything is built.
+    A Path names a file or a pipe, `-` standard input; so does a str, unless it contains a line break, a `: ` or a `{`:
+    then it is the text itself. Raise ConfigError, one line per mistake, before anything is built.
     """
     name, text = _read(source)
     reader = _Reader(name, text)
@@ -89,7 +89,7 @@ def load(source: str | Path, model: type[M]) -> M:
     except ValueError as error:
         raise ConfigError(f"{name}:{reader.line(steps_of(str(error)))}: {error}") from None
     try:
-        # Through JSON, because strict then takes a list for a tuple and 1 for 1.0, and still no "1" for 1.
+        # Through JSON, because strict mode then takes a list for a tuple and 1 for 1.0, but not "1" for 1.
         return model.model_validate_json(json.dumps(data), strict=True)
     except ValidationError as error:
         wrong = sorted(
@@ -104,11 +104,11 @@ def load(source: str | Path, model: type[M]) -> M:
 def dump(
     record: BaseModel, brief: bool = False, written: Mapping[str, Callable[[Any], Any]] = MappingProxyType({})
 ) -> str:
-    """Return the record as YAML text; raises ConfigError if that text would not read back as an equal record.
+    """Return the record as YAML text; raise ConfigError if that text would not read back as an equal record.
 
-    Every field is written, defaults too, so that a file keeps its meaning when a default changes; `brief`: only what is
-    no default, for people to read. What has no limit (infinity), about which YAML readers disagree, is left out where
-    that is the default. `written` says how else some of its fields are written, by name.
+    Every field is written, also defaults, so that a file keeps its meaning when a default changes; `brief`: only fields
+    that differ from their defaults, to be readable. Infinite defaults are left out, as YAML readers disagree about
+    infinity. `written` maps names of fields to functions that convert their values for writing.
     """
     data = _finite(_brief(record) if brief else record.model_dump())
     text: str = yaml.dump(
@@ -129,7 +129,7 @@ def dump(
 
 
 def _brief(value: Any) -> Any:
-    """Return a record's fields that are no defaults, and what kind it is; so for the records within it."""
+    """Return a record's kind and the fields that differ from their defaults, also in the records within it."""
     if isinstance(value, BaseModel):
         usual = {name: f.get_default(call_default_factory=True) for name, f in type(value).model_fields.items()}
         given = {name: getattr(value, name) for name in usual}
@@ -138,14 +138,14 @@ def _brief(value: Any) -> Any:
 
 
 def _finite(value: Any) -> Any:
-    """Return the value in lists and dicts, without infinite values: `dump` checks that those were defaults."""
+    """Return the value as lists and dicts, without infinite values: `dump` checks that those were defaults."""
     if isinstance(value, dict):
         return {key: _finite(v) for key, v in value.items() if not (isinstance(v, float) and math.isinf(v))}
     return [_finite(v) for v in value] if isinstance(value, (list, tuple)) else value
 
 
 class _Dumper(yaml.SafeDumper):
-    """Writes what `_Reader` reads: quotes every word that `_Reader` would take for something else."""
+    """Writer for `_Reader`: quotes every string that `_Reader` would read as something else."""
 
     def ignore_aliases(self, data: Any) -> bool:
         return True
@@ -207,7 +207,7 @@ _WORDS: dict[str, bool | None] = {"": None, "~": None, "null": None, "true": Tru
 
 
 def _scalar(text: str) -> str | int | float | bool | None:
-    """Return what an unquoted word means; raises ValueError for one that people and YAML readers disagree about."""
+    """Return the value of an unquoted scalar; raise ValueError for an ambiguous one."""
     if text.lower() in _WORDS:
         return _WORDS[text.lower()]
     if re.fullmatch(r"[-+]?\.(inf|nan)", text, re.IGNORECASE):
@@ -232,7 +232,7 @@ def _line(event: yaml.Event) -> int:
 
 
 class _Reader:
-    """Builds the plain data of one YAML document from the parser's events, and remembers the line of every key."""
+    """Reader of one YAML document: builds plain data from the parser's events, and records the line of every key."""
 
     def __init__(self, name: str, text: str) -> None:
         self._name = name
@@ -248,7 +248,7 @@ class _Reader:
         return self._lines[path]
 
     def document(self) -> dict[str, Any]:
-        """Return the document; raises ConfigError unless there is exactly one and it is a block of keys."""
+        """Return the document; raise ConfigError unless there is exactly one and it is a block of keys."""
         next(self._events)  # start of the stream
         first = next(self._events)
         if isinstance(first, yaml.StreamEndEvent):

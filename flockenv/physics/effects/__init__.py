@@ -1,4 +1,4 @@
-"""What acts on a body, a family per file. To add one: write its file here, and a row in tests/catalogue.py."""
+"""Effects on a body, one family per file. To add one: write its file here, and a row in tests/catalogue.py."""
 
 from __future__ import annotations
 

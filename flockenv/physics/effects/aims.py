@@ -1,4 +1,4 @@
-"""Where agents want to go: no force, but the direction e that others read as `me.aim` (driving, social forces)."""
+"""Aims: the desired direction e, not a force; other laws (driving, social forces) read it as `me.aim`."""
 
 from __future__ import annotations
 
@@ -17,76 +17,76 @@ __all__ = ["Aim", "Antipode", "Course", "Goal", "about", "easing"]
 
 @law
 def about(p: Any, me: Me) -> bool:
-    """Is an effect about this agent, one of [p.first, p.end)?"""
+    """Return True if the effect applies to this agent, one of [p.first, p.end)."""
     inside: bool = (me.who >= p.first) & (me.who < p.end)
     return inside
 
 
 @law
 def easing(offset: Vec, slow_radius: float) -> Vec:
-    """Return the direction of an offset, shorter within slow_radius, m: 0 at the place itself."""
+    """Return the direction of an offset, shorter within slow_radius, m: 0 at the target itself."""
     length, one = norm(offset), like(slow_radius, 1.0)
     share = length / slow_radius
     return scale(unit(offset), share if share < one else one)
 
 
 class Aim(Effect):
-    """Where a group wants to go."""
+    """The desired direction of a group."""
 
-    group: int | None = Field(default=None, ge=0, description="whose aim it is; none = everybody's")
-    share: float = Field(default=1.0, ge=0, le=1, description="of the desired speed, with which it is followed")
+    group: int | None = Field(default=None, ge=0, description="group it applies to (default: all)")
+    share: float = Field(default=1.0, ge=0, le=1, description="fraction of the desired speed")
     strengths: ClassVar[tuple[str, ...]] = ("share",)
 
     def members(self, starts: Sequence[int]) -> dict[str, float]:
-        """Whom it is about: [first, end)."""
+        """Return the agents it applies to: [first, end)."""
         first, end = (0, starts[-1]) if self.group is None else starts[self.group : self.group + 2]
         return {"first": float(first), "end": float(end)}
 
     def check(self, scene: SceneView) -> None:
-        """Refuse a group that is not there."""
+        """Raise ValueError if the group does not exist."""
         demand_group("group", self.group, scene.groups)
         super().check(scene)
 
 
 @law
 def goal_aim(p: Any, me: Me) -> Vec:
-    """To the place."""
+    """Return the direction to the target."""
     return select(about(p, me), scale(easing(sub(p.target, me.pos), p.slow_radius), p.share), zero(me.pos))
 
 
 class Goal(Aim):
-    """Everybody of a group wants to get to a place, and slows down over the last `slow_radius`."""
+    """Agents of a group head for a point, and slow down over the last `slow_radius`."""
 
     kind: Literal["goal"] = "goal"
-    target: Vector = Field(description="m, the place")
-    slow_radius: float = Field(default=0.5, gt=0, description="m before it, over which it slows down to stop")
+    target: Vector = Field(description="m, the point")
+    slow_radius: float = Field(default=0.5, gt=0, description="m before the target, over which it slows down to stop")
     aim_law: ClassVar[Law | None] = goal_aim
     places: ClassVar[tuple[str, ...]] = ("target",)
 
     def parameters(self) -> dict[str, float | Vec]:
-        """Where to."""
+        """Return target, slow_radius and share."""
         return {"target": self.target, "slow_radius": self.slow_radius, "share": self.share}
 
 
 @law
 def course_aim(p: Any, me: Me) -> Vec:
-    """That way."""
+    """Return the given direction."""
     return select(about(p, me), scale(unit(p.direction), p.share), zero(me.pos))
 
 
 class Course(Aim):
-    """Everybody of a group wants to go one way, for ever: along a corridor, around a torus."""
+    """Agents of a group head in one direction for ever: along a corridor, around a torus."""
 
     kind: Literal["course"] = "course"
-    direction: Vector = Field(description="the way to go; its length does not matter")
+    direction: Vector = Field(description="direction of travel; its length does not matter")
     aim_law: ClassVar[Law | None] = course_aim
 
     def parameters(self) -> dict[str, float | Vec]:
-        """The way, and how fast."""
+        """Return direction and share."""
         return {"direction": self.direction, "share": self.share}
 
     def check(self, scene: SceneView) -> None:
-        """Refuse a direction of length 0."""
+        """Raise ValueError if the direction has length 0."""
         if not any(self.direction):
             raise ValueError(f"direction = {self.direction}: leads nowhere; give a vector that is not 0")
         super().check(scene)
@@ -94,35 +94,35 @@ class Course(Aim):
 
 @law
 def goal_kept(p: Any, me: Me) -> Vec:
-    """Where it wants to get to."""
+    """Return the agent's stored target."""
     return me.inner.goal_x, me.inner.goal_y
 
 
 @law
 def antipode(p: Any, me: Me) -> Vec:
-    """Across the centre from where it begins."""
+    """Return the point opposite to the initial position, across the centre."""
     across = sub(scale(p.centre, like(me.mass, 2.0)), me.pos)
     return select(about(p, me), across, zero(me.pos))
 
 
 @law
 def goal_as_before(p: Any, me: Me, told: Vec, seconds: float) -> Vec:
-    """It does not change."""
+    """Return the stored target, unchanged."""
     return goal_kept(p, me)
 
 
 @law
 def antipode_aim(p: Any, me: Me) -> Vec:
-    """To the place that it keeps."""
+    """Return the direction to the stored target."""
     return select(about(p, me), scale(easing(sub(goal_kept(p, me), me.pos), p.slow_radius), p.share), zero(me.pos))
 
 
 class Antipode(Aim):
-    """Everybody of a group wants to get across a centre to the place opposite to where it began: a circle swap."""
+    """Agents of a group head across a centre to the point opposite to their initial position: a circle swap."""
 
     kind: Literal["antipode"] = "antipode"
-    centre: Vector = Field(description="m, what everybody crosses")
-    slow_radius: float = Field(default=0.5, gt=0, description="m before its place, over which it slows down to stop")
+    centre: Vector = Field(description="m, the point that all cross")
+    slow_radius: float = Field(default=0.5, gt=0, description="m before the target, over which it slows down to stop")
     aim_law: ClassVar[Law | None] = antipode_aim
     begin_law: ClassVar[Law | None] = antipode
     keep_law: ClassVar[Law | None] = goal_as_before
@@ -130,11 +130,11 @@ class Antipode(Aim):
     heads_for: ClassVar[bool] = False
 
     def parameters(self) -> dict[str, float | Vec]:
-        """What is crossed."""
+        """Return centre, slow_radius and share."""
         return {"centre": self.centre, "slow_radius": self.slow_radius, "share": self.share}
 
     def check(self, scene: SceneView) -> None:
-        """Refuse a torus, where two ways lead across, and space."""
+        """Raise ValueError on a torus, where two paths lead across, and in 3-D."""
         super().check(scene)
         if scene.space.periodic or scene.dimension != 2:
             raise ValueError(

@@ -19,7 +19,7 @@ __all__ = ["Attraction"]
 
 @law
 def attraction(p: Any, me: Me) -> Vec:
-    """F = k d / (|d|^2 + s^2)^(3/2), d = centre - x; 0 in the centre, whatever s is."""
+    """F = k d / (|d|^2 + s^2)^(3/2), d = centre - x; 0 at the centre, for any s."""
     towards = sub(p.centre, me.pos)
     square = dot(towards, towards)
     o, soft = like(square, 0.0), square + p.softening * p.softening
@@ -28,21 +28,21 @@ def attraction(p: Any, me: Me) -> Vec:
 
 
 class Attraction(Effect):
-    """Pull everybody to a point with k / r^2, softened; a negative strength k pushes away.
+    """Attract all agents to a point with k / r^2, softened; a negative strength k repels.
 
     Conserves m v^2 / 2 - k / sqrt(r^2 + s^2), s the softening, and the angular momentum about the centre; with s = 0
-    the orbits of one body are Kepler's. On a torus the nearest image of the centre attracts, and no other.
+    the orbits of one body are Kepler's. On a torus only the nearest image of the centre attracts.
     """
 
     kind: Literal["attraction"] = "attraction"
     centre: Vector = Field(description="m")
     strength: float = Field(description="k, N m^2; negative: repulsion")
-    softening: float = Field(default=0.0, ge=0, description="s, m, nearer than which it no longer grows as 1 / r^2")
+    softening: float = Field(default=0.0, ge=0, description="s, m, distance below which it no longer grows as 1 / r^2")
     own_law: ClassVar[Law | None] = attraction
     places: ClassVar[tuple[str, ...]] = ("centre",)
     strengths: ClassVar[tuple[str, ...]] = ("strength",)
 
     def potential(self, groups: Sequence[Any], state: State, offset: Any) -> NDArray[np.float64]:
-        """Sum of -k / sqrt(r^2 + s^2) of all agents, (B,) J."""
+        """Return the sum of -k / sqrt(r^2 + s^2) over all agents, (B,) J."""
         square = (offset(self.centre, state.pos) ** 2).sum(axis=-1)
         return np.asarray((-self.strength / np.sqrt(square + self.softening**2)).sum(axis=1))

@@ -1,4 +1,4 @@
-"""Bodies that are solid but soft: springs, dampers and friction, only while two of them overlap."""
+"""Contact forces of soft bodies: springs, dampers and friction, only while two bodies overlap."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ Floats = NDArray[np.float64]
 
 @law
 def pressing(p: Any, overlap: float, parting: float, reduced: float) -> float:
-    """Return the force along the normal, k d - c u with u the speed of parting; not below 0 unless it is adhesive.
+    """Return the normal force, k d - c u with u the speed of separation; at least 0 unless adhesive.
 
-    With a fastest speed U of parting k d becomes min(k d, U sqrt(k m)) (1 - u / U).
+    With a largest speed of separation U, k d becomes min(k d, U sqrt(k m)) (1 - u / U).
     """
     o, e = like(overlap, 0.0), like(overlap, 1.0)
     root = np.sqrt(p.stiffness * reduced)
     push, most = p.stiffness * overlap, root / p.ease
-    push = most if most < push else push  # without a fastest speed `most` is infinite, or no number
+    push = most if most < push else push  # without a largest speed `most` is inf or NaN
     push = push * max(e - p.ease * max(parting, o), o)
     force = push - (p.damping + p.ratio * (root + root)) * parting
     return force if (force > o) | (p.adhesive > o) else o
@@ -38,7 +38,7 @@ def pressing(p: Any, overlap: float, parting: float, reduced: float) -> float:
 
 @law
 def rubbing(p: Any, overlap: float, force: float, slip: Vec) -> Vec:
-    """Return the friction -kappa d s against the slip s, not above mu times the force along the normal."""
+    """Return the friction -kappa d s against the slip s, at most mu times the normal force."""
     o = like(overlap, 0.0)
     rate, speed, most = p.friction * overlap, norm(slip), p.grip * max(force, o)
     slides = (p.grip >= o) & (rate * speed > most)
@@ -57,31 +57,31 @@ def met(p: Any, normal: Vec, overlap: float, vel: Vec, reduced: float) -> Vec:
 
 @law
 def untouched(p: Any, me: Me) -> Vec:
-    """No force yet."""
+    """Return no force: the start of the fold."""
     return zero(me.pos)
 
 
 @law
 def pushed_out(p: Any, me: Me, other: Obstacle, acc: Vec) -> Vec:
-    """Add what one obstacle does; it is held in place."""
+    """Add the force of one obstacle, which is held in place."""
     return add(acc, met(p, other.normal, me.radius - other.gap, sub(me.vel, other.vel), me.mass))
 
 
 @law
 def touching(p: Any, me: Me) -> float:
-    """Its radius."""
+    """Return the agent's radius: obstacles farther away do not touch it."""
     return me.radius
 
 
 @law
 def of_all(p: Any, me: Me, acc: Vec) -> Vec:
-    """All of them at once."""
+    """Return the sum over all obstacles."""
     return acc
 
 
 @law
 def pushed_apart(p: Any, me: Me, other: Other) -> Vec:
-    """What one neighbour does; two in one place part along their ties."""
+    """Return the force of one neighbour; two agents in one place part along their ties."""
     e = like(other.square, 1.0)
     apart = other.square > like(other.square, ONE_PLACE)
     normal = unit(select(apart, scale(other.offset, -e), sub(me.tie, other.tie)))
@@ -90,13 +90,14 @@ def pushed_apart(p: Any, me: Me, other: Other) -> Vec:
 
 
 def restitution(ratio: float, adhesive: bool = False) -> float:
-    """Return the share of its speed that a contact damped by a share of what is critical gives back (numerics.md P18).
+    """Return the coefficient of restitution of a contact with damping `ratio`, as a fraction of critical damping.
 
-    Adhesive: it ends where the bodies no longer overlap; otherwise where it would begin to pull, a little earlier.
+    An adhesive contact ends when the bodies no longer overlap; another one when it would begin to pull, a little
+    earlier.
     """
     if not 0 <= ratio < math.inf:
-        raise ValueError(f"ratio is {ratio!r}, must be a number of at least 0")
-    if ratio >= 1:  # nothing swings: the time until the force is 0 is acosh(2 ratio^2 - 1) / root
+        raise ValueError(f"ratio is {ratio!r}, must be a number >= 0")
+    if ratio >= 1:  # no oscillation: the time until the force is 0 is acosh(2 ratio^2 - 1) / root
         if adhesive:
             return 0.0
         root = math.sqrt(ratio**2 - 1)
@@ -107,24 +108,28 @@ def restitution(ratio: float, adhesive: bool = False) -> float:
 
 
 class _Solid(Effect):
-    """What contacts have in common."""
+    """Fields that contacts have in common."""
 
     stiffness: float = Field(ge=0, description="k, N/m")
     damping: float = Field(default=0.0, ge=0, description="c, kg/s")
-    ratio: float = Field(default=0.0, ge=0, description="damping too, as a share of what is critical for the masses")
-    adhesive: bool = Field(default=False, description="may the damper pull, until bodies no longer overlap?")
-    friction: float = Field(default=0.0, ge=0, description="kappa, kg/(m s), against slip, for each metre of overlap")
+    ratio: float = Field(
+        default=0.0, ge=0, description="more damping, as a fraction of the critical one for the masses"
+    )
+    adhesive: bool = Field(default=False, description="True: the damper may pull, until the bodies no longer overlap")
+    friction: float = Field(default=0.0, ge=0, description="kappa, kg/(m s), against slip, per metre of overlap")
     coulomb: float | None = Field(
-        default=None, ge=0, description="mu, most of the normal force that friction may be; none = any"
+        default=None, ge=0, description="mu, largest friction as a fraction of the normal force (default: no limit)"
     )
     most: float | None = Field(
-        default=None, gt=0, description="U, m/s, beyond which the spring does not drive bodies apart; none = any"
+        default=None,
+        gt=0,
+        description="U, m/s, largest speed of separation by the spring (default: no limit)",
     )
     strengths: ClassVar[tuple[str, ...]] = ("stiffness", "damping", "ratio", "friction")
     contact: ClassVar[bool] = True
 
     def parameters(self) -> dict[str, float | Vec]:
-        """Numbers; grip: mu, negative = any; ease: 1 / U."""
+        """Return the fields as numbers; grip: mu, or -1 without a limit; ease: 1 / U, or 0 without a limit."""
         return {
             "stiffness": self.stiffness,
             "damping": self.damping,
@@ -136,17 +141,17 @@ class _Solid(Effect):
         }
 
     def _rates(self, per_mass: Floats) -> tuple[Floats, Floats]:
-        """Return w^2 and damping of contacts of so much 1 / reduced mass, (N,) 1/kg."""
+        """Return w^2 and damping of contacts; per_mass: 1 / reduced mass, (N,) 1/kg."""
         square = self.stiffness * per_mass
         return square, self.damping * per_mass + 2 * self.ratio * np.sqrt(square)
 
 
 class ObstacleContact(_Solid):
-    """A body that overlaps an obstacle by d is pushed out of it, F = max(0, k d - c v.n) n; n leads out.
+    """A body that overlaps an obstacle by d is pushed out, F = max(0, k d - c v.n) n, n the outward normal.
 
-    The elastic part is the contact force of Helbing, Farkas and Vicsek 2000 (k g(r - d)); it never pulls, unless it is
+    The elastic part is the contact force of Helbing, Farkas and Vicsek 2000 (k g(r - d)); it never pulls, unless
     adhesive. Their friction, -kappa d (v . t) t, opposes the slip; it is stable in steps of less than 2 m / (kappa d).
-    A body of mass m that comes at v, relative to the obstacle, goes in by at most v sqrt(m / k). For `most` see
+    A body of mass m with speed v relative to the obstacle penetrates by at most v sqrt(m / k). For `most` see
     `Contact`.
     """
 
@@ -157,37 +162,39 @@ class ObstacleContact(_Solid):
     obstacle_reach: ClassVar[Law | None] = touching
 
     def folded(self, dimension: int) -> int:
-        """The force so far."""
+        """Return D, for the force so far."""
         return dimension
 
     def rates(self, groups: Sequence[Any], dimension: int) -> tuple[Floats, Floats]:
-        """w^2 = k / m, and (c + 2 ratio sqrt(k m)) / m, of a body in one obstacle; friction is not in it."""
+        """Return w^2 = k / m and (c + 2 ratio sqrt(k m)) / m of a body in one obstacle, without friction."""
         return self._rates(1 / all_masses(groups, dimension))
 
 
 @law
 def contacts(p: Any, me: Me, sums: Vec) -> Vec:
-    """All of them at once."""
+    """Return the sum over all neighbours."""
     return sums
 
 
 class Contact(_Solid):
-    """Two bodies that overlap by d push each other apart, F = max(0, k d - c u) n, and rub, -kappa d s.
+    """Two bodies that overlap by d repel each other, F = max(0, k d - c u) n, with friction -kappa d s.
 
-    u is their speed of parting along the normal n, s their slip across it. Without damping it is the contact of
+    u is their speed of separation along the normal n, s their slip across it. Without damping it is the contact of
     Helbing, Farkas and Vicsek 2000 (k = 1.2e5 kg/s^2, kappa = 2.4e5 kg/(m s)): k g(2r - d) n + kappa g(2r - d) dv t.
-    With `ratio` a hit gives back the same share of the speed for all masses, `restitution(ratio, adhesive)`. A contact
-    lasts pi sqrt(m / k), m the reduced mass, and wants 30 steps (CoarseContactWarning); friction is stable in steps of
-    less than 2 m / (kappa d). Bodies do not spin: friction takes slip, and angular momentum with it.
+    With `ratio` the coefficient of restitution is the same for all masses, `restitution(ratio, adhesive)`. A contact
+    lasts pi sqrt(m / k), m the reduced mass, and needs 30 steps (CoarseContactWarning); friction is stable in steps of
+    less than 2 m / (kappa d). Bodies do not spin: friction dissipates slip, and so angular momentum.
 
-    `most` = U keeps those that begin inside each other from flying apart: the spring gives U sqrt(k m) at most, and
-    1 - u / U of that while they part, so that no pair is driven apart faster than U (Hunt and Crossley 1975 damp so).
-    Hits at up to U go in no deeper than where that begins; those at v << U lose v / (3 U) of their speed.
+    `most` = U keeps bodies that begin in overlap from flying apart: the spring force is at most U sqrt(k m), times
+    1 - u / U while they separate, so no pair is driven apart faster than U (damping as in Hunt and Crossley 1975).
+    Impacts at up to U penetrate no deeper than where the limit begins; those at v << U lose v / (3 U) of their speed.
     """
 
     kind: Literal["contact"] = "contact"
     radius: float | None = Field(
-        default=None, gt=0, description="m, who is nearer is looked at; none = as far as any two touch"
+        default=None,
+        gt=0,
+        description="m, candidates are nearer (default: largest distance at which two touch)",
     )
     pair_law: ClassVar[Law | None] = pushed_apart
     finish_law: ClassVar[Law | None] = contacts
@@ -195,20 +202,20 @@ class Contact(_Solid):
 
     @property
     def sight(self) -> Sight:
-        """All around."""
-        return Sight(math.inf if self.radius is None else self.radius)  # a scene knows how far two touch
+        """All directions, within the radius."""
+        return Sight(math.inf if self.radius is None else self.radius)  # see Scene.touching
 
     @property
     def reach(self) -> float:
-        """How far it is said to look, m; 0 if it is for bodies to say."""
+        """The given radius, m; 0 if it depends on the bodies."""
         return self.radius or 0.0
 
     def sums(self, dimension: int) -> int:
-        """The force so far."""
+        """Return D, for the force so far."""
         return dimension
 
     def check(self, scene: SceneView) -> None:
-        """Refuse a radius at which two bodies overlap already, and bodies that touch around a torus."""
+        """Raise ValueError if the radius is too small for two bodies that touch, or they touch around a torus."""
         super().check(scene)
         touch = scene.touching if scene.agents > 1 else 0.0
         if self.radius is not None and self.radius < touch:
@@ -222,7 +229,7 @@ class Contact(_Solid):
             )
 
     def rates(self, groups: Sequence[Any], dimension: int) -> tuple[Floats, Floats]:
-        """w^2 = k / m, and (c + 2 ratio sqrt(k m)) / m, m the reduced mass with the lightest other; one contact."""
+        """Return w^2 = k / m and (c + 2 ratio sqrt(k m)) / m of one contact, m reduced with the lightest other."""
         mass = all_masses(groups, dimension)
         if len(mass) == 1:
             return np.zeros(1), np.zeros(1)

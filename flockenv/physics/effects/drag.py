@@ -1,4 +1,4 @@
-"""Drag, linear and quadratic: the medium takes away speed relative to it."""
+"""Drag, linear and quadratic: a force against the velocity relative to the medium."""
 
 from __future__ import annotations
 
@@ -18,19 +18,19 @@ __all__ = ["Drag", "QuadraticDrag"]
 
 @law
 def drag(p: Any, me: Me) -> Vec:
-    """F = -c (v - u)."""
+    """Return F = -c (v - u)."""
     return scale(sub(me.vel, me.medium), -p.rate)
 
 
 @law
 def quadratic_drag(p: Any, me: Me) -> Vec:
-    """F = -c |v - u| (v - u)."""
+    """Return F = -c |v - u| (v - u)."""
     relative = sub(me.vel, me.medium)
     return scale(relative, -p.rate * norm(relative))
 
 
 class Drag(Effect):
-    """Linear drag, F = -c (v - u) in a medium that moves with u: without other forces v = v0 exp(-c t / m)."""
+    """Linear drag, F = -c (v - u) in a medium of velocity u: without other forces v = v0 exp(-c t / m)."""
 
     kind: Literal["drag"] = "drag"
     rate: float = Field(ge=0, description="c, kg/s")
@@ -39,13 +39,13 @@ class Drag(Effect):
     linear_drag: ClassVar[str | None] = "rate"
 
     def rates(self, groups: Sequence[Any], dimension: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Nothing swings; c / m."""
+        """Return 0, as nothing oscillates, and damping c / m."""
         damping = self.rate / all_masses(groups, dimension)
         return np.zeros(len(damping)), damping
 
 
 class QuadraticDrag(Effect):
-    """Drag of a body that leaves a wake, F = -c |v - u| (v - u) in a medium that moves with u.
+    """Drag of a body that leaves a wake, F = -c |v - u| (v - u) in a medium of velocity u.
 
     Under gravity g it falls no faster than v = sqrt(m g / c), which it approaches as v tanh(g t / v).
     """

@@ -24,7 +24,7 @@ Floats = NDArray[np.float64]
 
 @law
 def rayleigh_mass(p: Any, me: Me) -> Vec:
-    """F = -alpha m v: the part of the damping that goes with the mass."""
+    """F = -alpha m v: the part of the damping proportional to mass."""
     return scale(me.vel, -p.alpha * me.mass)
 
 
@@ -43,7 +43,7 @@ def _stretched(u: Vec, number: Vec) -> Vec:
 
 @law
 def _way(like_this: Vec, number: Vec) -> Vec:
-    """Return the way to the neighbour when nothing is deformed, the last numbers of a bond."""
+    """Return the offset to the neighbour in the undeformed shape, the last numbers of a bond."""
     if len(like_this) == 2:
         return (number[4], number[5])
     else:
@@ -52,9 +52,9 @@ def _way(like_this: Vec, number: Vec) -> Vec:
 
 @law
 def elastic(p: Any, me: Me, others: Any, number: Vec) -> Vec:
-    """F_i = -K_ij ((u_j - u_i) + beta (v_j - v_i)), one neighbour's share of -(K (u + beta v))_i.
+    """F_i = -K_ij ((u_j - u_i) + beta (v_j - v_i)), one neighbour's contribution to -(K (u + beta v))_i.
 
-    Rows of K sum to zero, so that displacements between neighbours are enough.
+    Rows of K sum to zero, so displacements relative to neighbours are enough.
     """
     stretch = sub(others[0].offset, _way(others[0].offset, number))
     return _stretched(add(stretch, scale(sub(others[0].vel, me.vel), p.beta)), number)
@@ -63,13 +63,13 @@ def elastic(p: Any, me: Me, others: Any, number: Vec) -> Vec:
 class Elastic(Effect):
     """Linear finite elements (bars, triangles in plane stress, tetrahedra) of a group's network, Rayleigh damping.
 
-    Right for small displacements: a body that turns far stretches. Masses are those of the group's particles.
+    Valid for small displacements: a large rotation stretches the body. Masses are those of the group's particles.
     """
 
     kind: Literal["elastic"] = "elastic"
     group: int = Field(default=0, ge=0, description="number of the group whose network it acts on")
     young: float = Field(ge=0, description="Pa, Young's modulus")
-    poisson: float = Field(default=0.3, gt=-1, lt=0.5, description="Poisson's ratio; bars have none")
+    poisson: float = Field(default=0.3, gt=-1, lt=0.5, description="Poisson's ratio; unused by bars")
     area: float = Field(default=1.0, gt=0, description="m^2, cross section of bars")
     thickness: float = Field(default=1.0, gt=0, description="m, of triangles")
     alpha: float = Field(default=0.0, ge=0, description="1/s, damping D = alpha M + beta K")
@@ -79,16 +79,16 @@ class Elastic(Effect):
     strengths: ClassVar[tuple[str, ...]] = ("young", "alpha", "beta")
 
     @property
-    def conserves_momentum(self) -> bool:  # type: ignore[override]  # damping that goes with the mass does not
-        """True unless it is held back by something outside."""
+    def conserves_momentum(self) -> bool:  # type: ignore[override]  # damping proportional to mass does not
+        """True without damping proportional to mass, which is an external force."""
         return self.alpha == 0
 
     def numbers(self, dimension: int) -> int:
-        """A block of K, and the way to the neighbour when nothing is deformed."""
+        """Return the size of a block of K and the undeformed offset to the neighbour."""
         return dimension * dimension + dimension
 
     def parameters(self) -> dict[str, float | Vec]:
-        """The two dampings; K is in the bonds."""
+        """Return the two damping coefficients; K is in the bonds."""
         return {"alpha": self.alpha, "beta": self.beta}
 
     def matrix(self, network: Any, dimension: int) -> Any:
@@ -98,7 +98,7 @@ class Elastic(Effect):
         return found if self.young else 0 * found
 
     def bonds(self, groups: Sequence[Any], dimension: int) -> Bonds:
-        """Every pair of neighbours, both ways."""
+        """Return every pair of neighbours, in both directions."""
         first, network, _ = network_of(groups, self.group, dimension)
         near = blocks(self.matrix(network, dimension), network.rest_points(dimension))
         agent = np.repeat(np.arange(len(near.start) - 1), np.diff(near.start)) + first
@@ -106,7 +106,7 @@ class Elastic(Effect):
         return Bonds(agent.astype(np.int32), (near.partner[:, None] + first).astype(np.int32), number)
 
     def rates(self, groups: Sequence[Any], dimension: int) -> tuple[Floats, Floats] | None:
-        """Gershgorin: w^2 <= the largest row sum of |K| / m."""
+        """Return bounds by Gershgorin's circles: w^2 <= the largest row sum of |K| / m."""
         first, network, mass = network_of(groups, self.group, dimension)
         rows = np.asarray(abs(self.matrix(network, dimension)).sum(axis=1)).reshape(-1, dimension).max(axis=1)
         square = np.zeros(len(all_masses(groups, dimension)))
@@ -116,7 +116,7 @@ class Elastic(Effect):
         return square, damped
 
     def potential(self, groups: Sequence[Any], state: State, offset: Any) -> Floats:
-        """u . K u / 2, (B,) J."""
+        """Return u . K u / 2, (B,) J."""
         first, network, mass = network_of(groups, self.group, state.shape[2])
         u = state.pos[:, first : first + len(mass)] - network.rest_points(state.shape[2])
         flat = u.reshape(len(u), -1)

@@ -1,4 +1,4 @@
-"""Routes: a choice among doors by the time that each is expected to take, walking there and waiting in front of it."""
+"""Routes: a choice among doors by the expected time of each, for walking there and waiting in front of it."""
 
 from __future__ import annotations
 
@@ -22,20 +22,20 @@ from flockenv.physics.floor_fields import towards
 __all__ = ["Door", "Routes"]
 
 HEAD = 2
-"""Numbers of a door before those of its target: where its block of ways begins; how many per second get through."""
+"""Numbers of a door before those of its target: where its floor field begins in the table; its capacity, 1/s."""
 BINS = 256
-"""Into how many pieces the longest way to a door is cut, to count who is how near."""
+"""Number of bins of path length to a door, up to the longest, in which agents are counted."""
 
 
 @law
 def way_to_door(p: Any, me: Me, k: Any) -> tuple[float, Vec]:
-    """Return how long the way to door k is, m, and its first direction."""
+    """Return the length of the path to door k, m, and its first direction."""
     return towards(p.table[np.int64(p.table[1 + k * np.int64(p.size)]) :], me.pos)
 
 
 @law
 def bin_of(p: Any, length: float) -> float:
-    """Return in which piece of a way a place is, so many m before the door."""
+    """Return the bin of a path length, m."""
     last = p.bins - like(length, 1.0)
     piece = np.floor(length / p.table[0])
     return piece if piece < last else last  # type: ignore[no-any-return]
@@ -43,7 +43,7 @@ def bin_of(p: Any, length: float) -> float:
 
 @law
 def at_door(p: Any, me: Me) -> float:
-    """Count who heads for a door, in the piece of the way in which he is; nobody who has passed his."""
+    """Return the counter of the agent's door and bin of path length, or -1 if it has passed its door."""
     door = me.inner.door
     heading = about(p, me) & (door < p.many)
     return door * p.bins + bin_of(p, me.inner.left) if heading else like(door, -1.0)
@@ -51,7 +51,7 @@ def at_door(p: Any, me: Me) -> float:
 
 @law
 def ahead_at(p: Any, me: Me, k: Any, length: float) -> float:
-    """Return how many head for door k and are nearer to it than me; of those in the same piece of the way, half."""
+    """Return the number of agents that head for door k and are nearer to it than me; the same bin counts half."""
     o, e = like(length, 0.0), like(length, 1.0)
     mine, begin = np.int64(bin_of(p, length)), k * np.int64(p.bins)
     count = o
@@ -66,7 +66,7 @@ def ahead_at(p: Any, me: Me, k: Any, length: float) -> float:
 
 @law
 def expected(p: Any, me: Me, k: Any, waits: bool) -> float:
-    """Return the time to get through door k, s: the way there, and the queue in front of it."""
+    """Return the time to get through door k, s: the walk there, and, if `waits`, the queue in front of it."""
     length, _ = way_to_door(p, me, k)
     time = length / me.desired_speed
     if waits:
@@ -76,7 +76,7 @@ def expected(p: Any, me: Me, k: Any, waits: bool) -> float:
 
 @law
 def quickest(p: Any, me: Me, waits: bool) -> tuple[Any, float]:
-    """Return the door that is expected to take the least time, and that time, s; of equals, the first."""
+    """Return the door of the shortest expected time, and that time, s; of equals, the first."""
     best, time = 0, expected(p, me, 0, waits)
     for k in range(1, np.int64(p.many)):
         other = expected(p, me, k, waits)
@@ -87,7 +87,7 @@ def quickest(p: Any, me: Me, waits: bool) -> tuple[Any, float]:
 
 @law
 def routes_begun(p: Any, me: Me) -> Vec:
-    """Towards the nearest door, and a first decision within a period, not with everybody else."""
+    """Return the nearest door, and a time of first decision within a period, different for each agent."""
     o = like(p.share, 0.0)
     if not about(p, me):
         return (o, o, o, me.inner.was_x, me.inner.was_y)
@@ -99,7 +99,7 @@ def routes_begun(p: Any, me: Me) -> Vec:
 
 @law
 def routes_kept(p: Any, me: Me, told: Vec, seconds: float) -> Vec:
-    """Its door, anew once per period; how far that is; when it decides again; where it is."""
+    """Return its door (reconsidered once per period), path length, time of next decision, and position."""
     door, left, ready, was = me.inner.door, me.inner.left, me.inner.ready, place_kept(me)
     if not about(p, me) or door >= p.many:
         return (door, left, ready, was[0], was[1])
@@ -118,7 +118,7 @@ def routes_kept(p: Any, me: Me, told: Vec, seconds: float) -> Vec:
 
 @law
 def routes_aim(p: Any, me: Me) -> Vec:
-    """Along the way to its door; straight on when it is through."""
+    """Return the direction of the path to its door, or straight on once it is through."""
     if not about(p, me):
         return zero(me.pos)
     if me.inner.door >= p.many:
@@ -128,38 +128,39 @@ def routes_aim(p: Any, me: Me) -> Vec:
 
 
 class Door(Target):
-    """A door, and how wide it is for those who queue."""
+    """A door, and its width, which sets its capacity."""
 
-    width: float | None = Field(default=None, gt=0, description="m; none = from one end to the other")
+    width: float | None = Field(default=None, gt=0, description="m (default: from one end to the other)")
 
     @model_validator(mode="after")
     def _wide(self) -> Door:
-        """Refuse a door of which nobody knows how wide it is."""
+        """Raise ValueError if the door has neither width nor ends."""
         if self.width is None and self.ends is None:
             raise ValueError("width = None: a door without ends needs one; give m")
         return self
 
     @property
     def room(self) -> float:
-        """How wide it is, m."""
+        """Its width, m."""
         return self.length if self.width is None else self.width
 
 
 class Routes(Around):
-    """Everybody of a group leaves by the door that is expected to take the least time, t = L / v0 + n / (J w).
+    """Agents of a group leave by the door of the shortest expected time, t = L / v0 + n / (J w).
 
-    L is the way to the door, v0 the desired speed, n how many of the group head for that door and are nearer to it, J
-    the `flow` and w the door's width. One begins with the nearest door and decides anew every `period`, each at times
-    of his own (golden ratio times his number), and changes only for a door that is quicker by `hysteresis`. Everybody
-    is taken to know how many go where: they are counted once per step, to 1/256 of the longest way.
-    `inner(state, "door")` is the number of the door; as many as there are when one is through it, and goes straight on.
+    L is the length of the path to the door, v0 the desired speed, n the number of agents of the group that head for
+    that door and are nearer to it, J the `flow` and w the door's width. An agent begins with the nearest door, decides
+    anew every `period`, at times of its own (golden ratio times its index), and changes only to a door that is faster
+    by `hysteresis`. Each agent is assumed to know n for every door: agents are counted once per step, to 1/256 of the
+    longest path. `inner(state, "door")` is the index of the door; it is the number of doors once an agent is through
+    its door, and goes straight on.
     """
 
     kind: Literal["routes"] = "routes"
-    doors: tuple[Door, ...] = Field(min_length=1, description="among which one chooses; one alone is assigned")
-    flow: float = Field(default=1.9, gt=0, description="1/(m s), how many get through per metre of width")
+    doors: tuple[Door, ...] = Field(min_length=1, description="doors to choose from; a single one is assigned")
+    flow: float = Field(default=1.9, gt=0, description="1/(m s), agents that get through per metre of width")
     period: float = Field(default=2.0, gt=0, description="s, between decisions")
-    hysteresis: float = Field(default=0.1, ge=0, lt=1, description="share of its time by which another must be quicker")
+    hysteresis: float = Field(default=0.1, ge=0, lt=1, description="fraction by which another door must be faster")
     aim_law: ClassVar[Law | None] = routes_aim
     begin_law: ClassVar[Law | None] = routes_begun
     keep_law: ClassVar[Law | None] = routes_kept
@@ -173,16 +174,16 @@ class Routes(Around):
 
     @property
     def counters(self) -> int:
-        """One for each piece of the way to each door."""
+        """One for each bin of path length and each door."""
         return BINS * len(self.doors)
 
     def parameters(self) -> dict[str, float | Vec]:
-        """What the laws read beside the table."""
+        """Return the numbers that the laws read besides the table."""
         numbers = {name: float(getattr(self, name)) for name in ("share", "period", "hysteresis")}
         return {**numbers, "many": float(len(self.doors)), "bins": float(BINS), "size": float(HEAD + row_size(2))}
 
     def table(self, scene: SceneView) -> NDArray[np.float64]:
-        """How long a piece of a way is, a row for each door, and the ways to each."""
+        """Return the width of a bin, m, a row for each door, and the floor field of each."""
         blocks = [self.ways(scene, (door,), (name,)) for door, name in zip(*self.goals, strict=True)]
         begin = 1 + len(self.doors) * (HEAD + row_size(2))
         at = begin + np.cumsum([0, *map(len, blocks)])
@@ -192,12 +193,12 @@ class Routes(Around):
         return np.concatenate([[max(longest, self.spacing) / (BINS - 1)], np.ravel(rows), *blocks])
 
     def grids(self, scene: SceneView) -> list[NDArray[np.float64]]:
-        """Return the grid of ways to each door."""
+        """Return the floor field of each door."""
         table, size = scene.table_of(self), HEAD + row_size(2)
         return [table[int(table[1 + k * size]) + 2 + row_size(2) :] for k in range(len(self.doors))]
 
     def check(self, scene: SceneView) -> None:
-        """Refuse space, a torus, and those who do not say how fast they would like to go."""
+        """Raise ValueError in 3-D, on a torus, and for groups without a desired speed."""
         if scene.dimension != 2 or scene.space.periodic:
             raise ValueError(f"kind = {self.kind}: only a plane or a box of dimension 2 is allowed")
         super().check(scene)

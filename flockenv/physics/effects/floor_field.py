@@ -1,4 +1,4 @@
-"""The way around all obstacles as an aim: to a place, or to the nearest of several doors."""
+"""Floor fields as aims: the shortest path around all obstacles to a target, or to the nearest of several doors."""
 
 from __future__ import annotations
 
@@ -21,40 +21,40 @@ __all__ = ["Around", "Way", "slowed"]
 
 @law
 def slowed(direction: Vec, length: float, slow_radius: float) -> Vec:
-    """Return a direction, shorter where less than slow_radius, m, of the way is left."""
+    """Return a direction, shorter if less than slow_radius, m, of the path is left."""
     return scale(direction, length / slow_radius if length < slow_radius else like(length, 1.0))
 
 
 @law
 def way_aim(p: Any, me: Me) -> Vec:
-    """Along the way to whichever target is nearest by it."""
+    """Return the direction of the path to the target with the shortest one."""
     length, direction = towards(p.table, me.pos)
     return select(about(p, me), scale(slowed(direction, length, p.slow_radius), p.share), zero(me.pos))
 
 
 class Around(Aim):
-    """An aim that knows ways around obstacles: they are found once, on a grid, when the scene is built."""
+    """An aim by floor fields: shortest paths around obstacles, computed once, on a grid, when the scene is built."""
 
-    clearance: float = Field(default=0.3, ge=0, description="m, from ways to every obstacle: a body's radius and more")
+    clearance: float = Field(default=0.3, ge=0, description="m, between paths and obstacles: a body's radius or more")
     spacing: float = Field(default=0.2, gt=0, description="m, between points of the grid")
-    margin: float = Field(default=3.0, gt=0, description="m of grid around all that there is, where there is no box")
+    margin: float = Field(default=3.0, gt=0, description="m of grid around the whole scene, if the space is not a box")
     tabled: ClassVar[bool] = True
     needs_all: ClassVar[bool] = False
-    """True if an agent visits all of its targets, False if one of them is enough."""
+    """True if an agent must visit all targets, False if one of them is enough."""
 
     def ways(self, scene: SceneView, targets: tuple[Target, ...], names: tuple[str, ...]) -> NDArray[np.float64]:
-        """Return the block of ways to the nearest of some targets; see flockenv.physics.floor_fields."""
+        """Return the block of the floor field to the nearest target; see flockenv.physics.floor_fields."""
         corners = region(scene, self.goals[0], self.margin)
         starts = starts_of(scene, self.group)
         return way_block(scene, targets, names, corners, self.spacing, self.clearance, starts)
 
     @property
     def goals(self) -> tuple[tuple[Target, ...], tuple[str, ...]]:
-        """All its targets, and how errors name them."""
+        """All its targets, and their names in errors."""
         raise NotImplementedError
 
     def check(self, scene: SceneView) -> None:
-        """Refuse a torus, obstacles that move, too large a grid, targets in obstacles, or that no way leads to."""
+        """Raise ValueError for a torus, moving obstacles, too large a grid, targets in obstacles or out of reach."""
         super().check(scene)
         if self.keeps:
             _alone(self, scene)
@@ -62,11 +62,11 @@ class Around(Aim):
         scene.table_of(self)
 
     def grids(self, scene: SceneView) -> list[NDArray[np.float64]]:
-        """Return the grids of ways, one for each target or set of targets that agents are led to."""
-        raise TypeError(f"{type(self).__name__} has no grids of ways")
+        """Return the floor fields, one for each target or set of alternative targets."""
+        raise TypeError(f"{type(self).__name__} has no floor fields")
 
     def check_start(self, scene: SceneView, state: Any) -> None:
-        """Warn of agents that begin where no way leads to any target, or to a stage of a journey."""
+        """Warn of agents that begin where no path leads to any target, or to a stage of a journey."""
         first, end = (int(k) for k in self.members(scene.starts).values())
         lengths = np.array([lengths_on(grid, state.pos[:, first:end]) for grid in self.grids(scene)])
         if not len(lengths):
@@ -77,26 +77,25 @@ class Around(Aim):
 
 
 def _alone(effect: Aim, scene: SceneView) -> None:
-    """Refuse another effect that keeps the same numbers of the same agents: changes would add up."""
+    """Raise ValueError if another effect keeps the same numbers of the same agents: changes would add up."""
     first, end = effect.members(scene.starts).values()
     for k, other in enumerate(scene.effects):
         if isinstance(other, Around) and other is not effect and set(effect.keeps) & set(other.keeps):
             theirs = other.members(scene.starts)
             if theirs["first"] < end and first < theirs["end"]:
-                raise ValueError(
-                    f"group = {effect.group}: effects[{k}], a {other.kind}, says too where some of them go"
-                )
+                raise ValueError(f"group = {effect.group}: effects[{k}], a {other.kind}, also steers some of them")
 
 
 class Way(Around):
-    """Everybody of a group wants to get to a target around all obstacles, to the nearest if there are several.
+    """Agents of a group head for a target around all obstacles, for the nearest of several.
 
-    The way is downhill its own length, |grad u| = 1 (eikonal equation). Nearest is by the way, not by air. Of a door
-    the part that lies `clearance` from its jambs is the target. Within a box nobody wants to go anywhere.
+    Paths follow the negative gradient of their length u, |grad u| = 1 (eikonal equation). Nearest means by path length,
+    not by straight distance. The target of a door is the part at least `clearance` from its jambs. Within a target box
+    the desired velocity is 0.
     """
 
     kind: Literal["way"] = "way"
-    targets: tuple[Target, ...] = Field(min_length=1, description="where to: points, doors, boxes")
+    targets: tuple[Target, ...] = Field(min_length=1, description="points, doors, boxes")
     slow_radius: float = Field(default=0.0, ge=0, description="m before the target, over which it slows down to stop")
     aim_law: ClassVar[Law | None] = way_aim
 
@@ -106,17 +105,17 @@ class Way(Around):
         return self.targets, tuple(f"targets[{k}]" for k in range(len(self.targets)))
 
     def parameters(self) -> dict[str, float | Vec]:
-        """What the law reads beside the table."""
+        """Return the numbers that the law reads besides the table."""
         return {"slow_radius": self.slow_radius, "share": self.share}
 
     def table(self, scene: SceneView) -> NDArray[np.float64]:
-        """Its targets and the grid of ways to the nearest."""
+        """Return its targets and the floor field to the nearest."""
         return self.ways(scene, *self.goals)
 
     def lengths(self, scene: SceneView, points: ArrayLike) -> NDArray[np.float64]:
-        """Return the way's length from points (..., D), (...) m; inf where no way leads, outside as at the edge."""
+        """Return path lengths from points (..., D), (...) m; inf without a path; outside the grid, that of its edge."""
         return lengths_on(self.grids(scene)[0], points)
 
     def grids(self, scene: SceneView) -> list[NDArray[np.float64]]:
-        """Return the one grid of ways to the nearest target."""
+        """Return the one floor field, to the nearest target."""
         return [scene.table_of(self)[2 + len(self.targets) * row_size(scene.dimension) :]]

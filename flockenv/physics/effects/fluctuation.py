@@ -16,18 +16,18 @@ __all__ = ["Fluctuation"]
 
 @law
 def fluctuation(p: Any, me: Me, seconds: float, gauss: Vec) -> Vec:
-    """dv = s / m sqrt(dt) xi."""
+    """Return dv = s / m sqrt(dt) xi."""
     return scale(gauss, p.strength * np.sqrt(seconds) / me.mass)
 
 
 class Fluctuation(Effect):
     """White noise: m dv = s dW, a kick (s / m) sqrt(dt) xi per step, xi normal in each direction.
 
-    Grows with the root of the step, so that what is seen after a time T does not depend on dt: alone, var v = (s/m)^2 T
-    and var x = (s/m)^2 T^3 / 3 per direction; with Drag of rate c, var v = s^2 / (2 c m) in the long run (Langevin
-    1908), which is k T / m at s^2 = 2 c k T; at the end of a step, just after the kick, var v is larger by a share of
-    c dt / m. A kick is a function of (seed, world, step, agent, place of the effect in
-    the scene's list), drawn once per step however often a method asks for forces.
+    The kick grows with the root of the step, so that statistics after a time T do not depend on dt: alone,
+    var v = (s/m)^2 T and var x = (s/m)^2 T^3 / 3 per direction; with Drag of rate c, var v = s^2 / (2 c m) in the long
+    run (Langevin 1908), which is k T / m at s^2 = 2 c k T; at the end of a step, just after the kick, var v is larger
+    by a fraction c dt / m. A kick is a function of (seed, world, step, agent, index of the effect in the scene), drawn
+    once per step however often a method evaluates forces.
     """
 
     kind: Literal["fluctuation"] = "fluctuation"

@@ -1,9 +1,9 @@
-"""Forces between all agents that fall with the square of the distance: by mass (Newton), and by the pair.
+"""Inverse-square forces between all agents: proportional to the masses (Newton), or equal for every pair.
 
-Both are softened (Plummer 1911): a body is not a point but a cloud of radius `softening`, and nobody is flung away who
-happens to pass through another. Up to a few thousand agents the sum is exact; of more, groups that are far away are met
-as one (Barnes & Hut 1986), unless `opening` is 0. Forces are opposite in every pair; what groups are met as one for is
-momentum, which many then keep to the accuracy of the tree alone.
+Both are softened (Plummer 1911): a body is not a point but a cloud of radius `softening`, so no agent is flung away by
+passing through another. Up to a few thousand agents the sum is exact; for more, far groups are combined into one
+(Barnes & Hut 1986), unless `opening` is 0. Forces are opposite in every pair; with combined groups, momentum is
+conserved only to the accuracy of the tree.
 """
 
 from __future__ import annotations
@@ -33,28 +33,28 @@ def _per_cube(p: Any, other: Far) -> float:
 
 @law
 def gravitation(p: Any, me: Me, other: Far) -> Vec:
-    """F = G m m_j d / (d^2 + eps^2)^(3/2)."""
+    """Return F = G m m_j d / (d^2 + eps^2)^(3/2)."""
     return scale(other.offset, p.constant * me.mass * _per_cube(p, other))
 
 
 @law
 def inverse_square(p: Any, me: Me, other: Far) -> Vec:
-    """F = k d / (d^2 + eps^2)^(3/2)."""
+    """Return F = k d / (d^2 + eps^2)^(3/2)."""
     return scale(other.offset, p.strength * _per_cube(p, other))
 
 
 class _Softened(Effect):
-    """What the two have in common."""
+    """Fields that the two have in common."""
 
-    softening: float = Field(ge=0, description="eps, m; 0 = point masses, which nothing keeps apart")
+    softening: float = Field(ge=0, description="eps, m; 0 = point masses, without a bound of the force")
     opening: float = Field(
         default=0.5, ge=0, le=1,
-        description="theta: agents are met as one if their group is narrower than theta times its distance; 0 = never",
+        description="theta: a group of agents counts as one if narrower than theta times its distance; 0 = never",
     )  # fmt: skip
     conserves_momentum: ClassVar[bool] = True
 
     def _inverse_distances(self, state: State, weight: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Sum of w_i w_j / sqrt(d^2 + eps^2) over all pairs of the living, (B,); who are in one place are no pair."""
+        """Return the sum of w_i w_j / sqrt(d^2 + eps^2) over all living pairs, (B,), except those in one place."""
         pos, weights = state.pos.astype(np.float64), weight * state.alive
         found = np.zeros(len(pos))
         for i in range(pos.shape[1] - 1):
@@ -73,7 +73,7 @@ class Gravitation(_Softened):
     strengths: ClassVar[tuple[str, ...]] = ("constant",)
 
     def check(self, scene: SceneView) -> None:
-        """Refuse who would pull infinitely: whoever is held in place by an infinite mass."""
+        """Raise ValueError if an agent has infinite mass: it would attract infinitely."""
         for k, group in enumerate(scene.groups):
             if not np.isfinite(group.masses(scene.dimension)).all():
                 raise ValueError(
@@ -82,12 +82,12 @@ class Gravitation(_Softened):
                 )
 
     def potential(self, groups: Sequence[Any], state: State, offset: Any) -> NDArray[np.float64]:
-        """Sum of -G m_i m_j / sqrt(d^2 + eps^2) over all pairs, (B,) J."""
+        """Return the sum of -G m_i m_j / sqrt(d^2 + eps^2) over all pairs, (B,) J."""
         return -self.constant * self._inverse_distances(state, all_masses(groups, state.shape[2]))
 
 
 class InverseSquare(_Softened):
-    """Attraction or repulsion of every pair, whatever its masses: F_i = sum of k d / (d^2 + eps^2)^(3/2)."""
+    """Attraction or repulsion of every pair, independent of mass: F_i = sum of k d / (d^2 + eps^2)^(3/2)."""
 
     kind: Literal["inverse_square"] = "inverse_square"
     strength: float = Field(description="k, N m^2; positive attracts, negative repels")
@@ -96,5 +96,5 @@ class InverseSquare(_Softened):
     strengths: ClassVar[tuple[str, ...]] = ("strength",)
 
     def potential(self, groups: Sequence[Any], state: State, offset: Any) -> NDArray[np.float64]:
-        """Sum of -k / sqrt(d^2 + eps^2) over all pairs, (B,) J."""
+        """Return the sum of -k / sqrt(d^2 + eps^2) over all pairs, (B,) J."""
         return -self.strength * self._inverse_distances(state, np.ones(state.shape[1]))

@@ -19,20 +19,20 @@ __all__ = ["Gravity"]
 
 @law
 def gravity(p: Any, me: Me) -> Vec:
-    """F = m g."""
+    """Return F = m g."""
     return scale(p.acceleration, me.mass)
 
 
 class Gravity(Effect):
-    """Everybody falls alike, F = m g: without other forces x = x0 + v0 t + g t^2 / 2. What is held in place stays."""
+    """Uniform gravity, F = m g: without other forces x = x0 + v0 t + g t^2 / 2. Pinned particles stay."""
 
     kind: Literal["gravity"] = "gravity"
-    acceleration: Vector = Field(default=(0.0, -9.81), description="m/s^2, which is N per kg; as many as dimensions")
+    acceleration: Vector = Field(default=(0.0, -9.81), description="m/s^2, or N per kg; one number per dimension")
     own_law: ClassVar[Law | None] = gravity
     strengths: ClassVar[tuple[str, ...]] = ("acceleration",)
 
     def potential(self, groups: Sequence[Any], state: State, offset: Any) -> NDArray[np.float64]:
-        """Sum of -m g . x of all agents that can fall, (B,) J."""
+        """Return the sum of -m g . x over all agents of finite mass, (B,) J."""
         mass = all_masses(groups, state.shape[2])
         fall = np.where(np.isfinite(mass), mass, 0.0)
         return np.asarray(-(state.pos @ np.array(self.acceleration) * fall).sum(axis=1))

@@ -1,9 +1,8 @@
-"""What goes on inside animals: hunger, libido, fear, intentions; food that grows and is eaten, prey that is caught.
+"""Motivation of animals: hunger, libido, fear, intentions; food that grows and is eaten, prey that is caught.
 
-None of these is a force. They keep numbers inside agents (`State.inner`), which an arbitration (`intentions`), a sink
-(`threshold`) or a law of yours reads. The formulas, and whose they are, stand in `flockenv.steering.motivation`. What
-passes between two agents is gathered from both sides, each from the same instant: what a fish eats is what its food
-loses.
+None of these is a force. They keep inner numbers of agents (`State.inner`), which an arbitration (`intentions`), a sink
+(`threshold`) or a law of yours reads. The formulas and their sources are in `flockenv.steering.motivation`. Transfers
+between two agents are computed for both from the same instant: what a fish eats is what its food loses.
 """
 
 from __future__ import annotations
@@ -24,19 +23,19 @@ from flockenv.steering import motivation
 __all__ = ["Fear", "Grazing", "Intention", "Libido", "Metabolism", "Predation"]
 
 CHANNEL = 81_000
-"""Of the draws of what agents begin with."""
+"""RNG channel of initial values."""
 
 
 @law
 def _among(who: float, first: float, end: float) -> bool:
-    """Is an agent one of [first, end)?"""
+    """Return True if an agent is one of [first, end)."""
     inside: bool = (who >= first) & (who < end)
     return inside
 
 
 @law
 def _drawn(p: Any, me: Any, channel: int) -> float:
-    """What it begins with: start, and up to half of `spread` more or less."""
+    """Return its initial value: start, and up to half of `spread` more or less; 0 outside the group."""
     half = like(p.start, 0.5)
     share = like(p.start, uniform(me.key, 0, int(me.who), channel)) - half
     mine = p.start + p.spread * share
@@ -44,14 +43,14 @@ def _drawn(p: Any, me: Any, channel: int) -> float:
 
 
 class _Urge(Effect):
-    """What these effects share: whom they are about."""
+    """Fields that these effects have in common: the groups they apply to."""
 
-    conserves_momentum: ClassVar[bool] = True  # it pushes nobody
+    conserves_momentum: ClassVar[bool] = True  # it exerts no force
 
-    group: int | None = Field(default=None, ge=0, description="who has it; none = everybody")
+    group: int | None = Field(default=None, ge=0, description="group it applies to (default: all)")
 
     def members(self, starts: Sequence[int]) -> dict[str, float]:
-        """Whom it is about, [first, end); and the others, if there are any."""
+        """Return the agents it applies to, [first, end), and those of the other group, if any."""
         found: dict[str, float] = {}
         for name, first, end in (("group", "first", "end"), ("other", "from_other", "to_other")):
             which = getattr(self, name, None)
@@ -60,13 +59,13 @@ class _Urge(Effect):
         return found
 
     def check(self, scene: SceneView) -> None:
-        """Refuse groups that are not there."""
+        """Raise ValueError if a group does not exist."""
         for name in ("group", "other"):
             demand_group(name, getattr(self, name, None), scene.groups)
         super().check(scene)
 
     def given(self, *names: str) -> dict[str, float | Vec]:
-        """Return some fields as the numbers of its laws."""
+        """Return some fields as numbers for its laws."""
         return {name: float(getattr(self, name)) for name in names}
 
 
@@ -75,13 +74,13 @@ class _Urge(Effect):
 
 @law
 def hungry_from(p: Any, me: Me) -> Vec:
-    """How hungry it begins."""
+    """Return the initial hunger."""
     return (_drawn(p, me, CHANNEL),)
 
 
 @law
 def digesting(p: Any, me: Me, told: Vec, seconds: float) -> Vec:
-    """Time and effort make hungry."""
+    """Return the hunger after a step: it grows with time and effort."""
     o = like(me.max_speed, 0.0)
     pace = norm(me.vel) / me.max_speed if me.max_speed > o else o
     later = motivation.hungrier(me.inner.hunger, p.rate, p.effort, pace, seconds)
@@ -97,8 +96,8 @@ class Metabolism(_Urge):
     kind: Literal["metabolism"] = "metabolism"
     rate: float = Field(default=0.02, ge=0, description="1/s, at rest")
     effort: float = Field(default=0.0, ge=0, description="1/s more at max_speed")
-    start: float = Field(default=0.3, ge=0, le=1, description="hunger at the start, in the middle")
-    spread: float = Field(default=0.0, ge=0, le=1, description="how far it differs from one to the next")
+    start: float = Field(default=0.3, ge=0, le=1, description="mean initial hunger")
+    spread: float = Field(default=0.0, ge=0, le=1, description="width of the uniform distribution of initial values")
     begin_law: ClassVar[Law | None] = hungry_from
     keep_law: ClassVar[Law | None] = digesting
     keeps: ClassVar[tuple[str, ...]] = ("hunger",)
@@ -106,17 +105,17 @@ class Metabolism(_Urge):
 
     @model_validator(mode="after")
     def _within(self) -> Metabolism:
-        """Refuse who would begin beyond starved, or fuller than full."""
+        """Raise ValueError if the initial hunger may be outside 0 to 1."""
         _demand_range(self.start, self.spread, 1.0)
         return self
 
     def parameters(self) -> dict[str, float | Vec]:
-        """How fast, and from where."""
+        """Return rates and initial values."""
         return self.given("rate", "effort", "start", "spread")
 
 
 def _demand_range(start: float, spread: float, most: float) -> None:
-    """Refuse a start that spreads beyond 0 to `most`."""
+    """Raise ValueError if start and spread reach outside 0 to `most`."""
     if spread / 2 > min(start, most - start) * (1 + 1e-12):
         raise ValueError(f"spread = {spread:g}: start = {start:g} leaves room for {2 * min(start, most - start):g}")
 
@@ -126,14 +125,14 @@ def _demand_range(start: float, spread: float, most: float) -> None:
 
 @law
 def food_from(p: Any, me: Me) -> Vec:
-    """How much there is of a patch; nobody has eaten."""
+    """Return the initial numbers: a patch's amount of food; nothing eaten yet."""
     o = like(p.capacity, 0.0)
     return o, (p.start * p.capacity if _among(me.who, p.from_other, p.to_other) else o), o
 
 
 @law
 def at_table(p: Any, me: Me, other: Other) -> Vec:
-    """What there is for me, and how hungry those are who eat of me."""
+    """Return the food of a patch in reach, and the hunger of an agent that eats of this patch."""
     o = like(other.square, 0.0)
     eats = _among(me.who, p.first, p.end) & _among(other.who, p.from_other, p.to_other)
     eaten = _among(me.who, p.from_other, p.to_other) & _among(other.who, p.first, p.end)
@@ -142,13 +141,13 @@ def at_table(p: Any, me: Me, other: Other) -> Vec:
 
 @law
 def told_both(p: Any, me: Me, sums: Vec) -> Vec:
-    """Both sums, as a vector."""
+    """Return both sums as a vector."""
     return planar(me.pos, sums[0], sums[1])
 
 
 @law
 def grazed(p: Any, me: Me, told: Vec, seconds: float) -> Vec:
-    """Who eats gets less hungry; what is eaten of grows, and loses the same."""
+    """Return the numbers after a step: eaters get less hungry; patches regrow, and lose what is eaten."""
     o = like(p.rate, 0.0)
     patch = _among(me.who, p.from_other, p.to_other)
     taken = motivation.bite(told[0], me.inner.hunger, p.rate, seconds)
@@ -159,20 +158,20 @@ def grazed(p: Any, me: Me, told: Vec, seconds: float) -> Vec:
 
 
 class Grazing(_Urge):
-    """Food that grows in patches, each an agent of its group, and is eaten by who is within `radius` of one.
+    """Food that grows in patches, each an agent of its group, and is eaten by agents within `radius` of one.
 
-    A patch holds an amount a with da/dt = growth a (1 - a / capacity) minus what is eaten: rate a H of each who is
-    there, H its hunger. Hunger falls by what is eaten over `appetite`. All of it is ours: in Tu and Terzopoulos (1994)
-    food is particles. Amounts are in units of food: `food` of patches, `eaten` by each until now.
+    A patch holds an amount a with da/dt = growth a (1 - a / capacity) minus what is eaten: rate a H by each agent
+    there, H its hunger. Hunger falls by what is eaten over `appetite`. The model is ours: in Tu and Terzopoulos (1994)
+    food is particles. Amounts are in units of food: `food` of a patch, `eaten` by an agent until now.
     """
 
     kind: Literal["grazing"] = "grazing"
     other: int = Field(ge=0, strict=True, description="the group whose agents are patches of food")
-    radius: float = Field(gt=0, description="m, who is nearer to a patch's centre eats of it")
-    rate: float = Field(default=0.5, ge=0, description="1/s, share of a patch that one eats who is starved")
+    radius: float = Field(gt=0, description="m, agents nearer than this to a patch's centre eat of it")
+    rate: float = Field(default=0.5, ge=0, description="1/s, fraction of a patch eaten by a starved agent")
     growth: float = Field(default=0.2, ge=0, description="r, 1/s")
     capacity: float = Field(default=3.0, gt=0, description="K, units of food in a full patch")
-    start: float = Field(default=1.0, gt=0, le=1, description="how full patches begin")
+    start: float = Field(default=1.0, gt=0, le=1, description="initial amount, as a fraction of capacity")
     appetite: float = Field(default=1.0, gt=0, description="units of food that it takes from starved to full")
     pair_law: ClassVar[Law | None] = at_table
     finish_law: ClassVar[Law | None] = told_both
@@ -183,19 +182,19 @@ class Grazing(_Urge):
 
     @property
     def sight(self) -> Sight:
-        """Whoever is near."""
+        """All neighbours within the radius."""
         return Sight(self.radius)
 
     def sums(self, dimension: int) -> int:
-        """Food, and hunger."""
+        """Return 2, for food and hunger."""
         return 2
 
     def parameters(self) -> dict[str, float | Vec]:
-        """How fast what grows and is eaten."""
+        """Return growth, feeding and initial amount."""
         return self.given("rate", "growth", "capacity", "start", "appetite")
 
     def check(self, scene: SceneView) -> None:
-        """Refuse a step in which all together could eat more than there is, and patches that eat."""
+        """Raise ValueError if all together could eat more than a patch in one step, or patches eat."""
         super().check(scene)
         if self.group in (None, self.other):
             raise ValueError(f"group = {self.group}: give the group that eats, another than other = {self.other}")
@@ -209,18 +208,18 @@ class Grazing(_Urge):
             )
 
 
-# --- who is caught ----------------------------------------------------------------------------------------------------
+# --- predation --------------------------------------------------------------------------------------------------------
 
 
 @law
 def not_caught(p: Any, me: Me) -> Vec:
-    """Nobody is caught at the start."""
+    """Return 0 hunger and 0 catches."""
     return like(me.mass, 0.0), like(me.mass, 0.0)
 
 
 @law
 def in_reach(p: Any, me: Me, other: Other) -> Vec:
-    """Who has me, and whom I have: a hunter that is hungry enough."""
+    """Return 1 if the other catches me, and 1 if I catch it: a hunter must be hungry enough."""
     o, e = like(other.square, 0.0), like(other.square, 1.0)
     mine = _among(me.who, p.from_other, p.to_other) & _among(other.who, p.first, p.end)
     prey = _among(me.who, p.first, p.end) & _among(other.who, p.from_other, p.to_other)
@@ -230,24 +229,24 @@ def in_reach(p: Any, me: Me, other: Other) -> Vec:
 
 @law
 def caught(p: Any, me: Me, told: Vec, seconds: float) -> Vec:
-    """Who has caught somebody gets less hungry."""
+    """Return the numbers after a step: each catch reduces the hunger of a hunter, and is counted by its prey."""
     o = like(p.meal, 0.0)
     less = me.inner.hunger - p.meal * told[1]
     return (less if less > o else o), me.inner.caught + told[0]
 
 
 class Predation(_Urge):
-    """Hunters catch whom they come nearer than `radius`, if they are hungry; each catch takes `meal` off their hunger.
+    """Hunters, if hungry, catch prey nearer than `radius`; each catch reduces their hunger by `meal`.
 
-    What it does is counted: `caught`, by how many hunters one has been; a sink `threshold` at 1 makes it deadly. A prey
-    that two catch in one step fills both. Ours.
+    `caught` counts the hunters that have caught an agent; a sink `threshold` at 1 makes a catch deadly. A prey caught
+    by two in one step feeds both. The model is ours.
     """
 
     kind: Literal["predation"] = "predation"
     other: int = Field(ge=0, strict=True, description="the group that is hunted")
     radius: float = Field(gt=0, description="m between centres")
-    meal: float = Field(default=0.5, ge=0, le=1, description="hunger that a catch takes away")
-    hungry: float = Field(default=0.3, ge=0, le=1, description="who is less hungry catches nobody")
+    meal: float = Field(default=0.5, ge=0, le=1, description="reduction of hunger per catch")
+    hungry: float = Field(default=0.3, ge=0, le=1, description="hunger above which a hunter catches prey")
     pair_law: ClassVar[Law | None] = in_reach
     finish_law: ClassVar[Law | None] = told_both
     begin_law: ClassVar[Law | None] = not_caught
@@ -257,19 +256,19 @@ class Predation(_Urge):
 
     @property
     def sight(self) -> Sight:
-        """Whoever is near."""
+        """All neighbours within the radius."""
         return Sight(self.radius)
 
     def sums(self, dimension: int) -> int:
-        """By whom, and whom."""
+        """Return 2: times caught, and catches."""
         return 2
 
     def parameters(self) -> dict[str, float | Vec]:
-        """How much it fills, and who hunts."""
+        """Return meal and hungry."""
         return self.given("meal", "hungry")
 
     def check(self, scene: SceneView) -> None:
-        """Refuse who hunts itself."""
+        """Raise ValueError if a group hunts itself."""
         super().check(scene)
         if self.group in (None, self.other):
             raise ValueError(f"group = {self.group}: give the group that hunts, another than other = {self.other}")
@@ -280,25 +279,25 @@ class Predation(_Urge):
 
 @law
 def unafraid(p: Any, me: Me) -> Vec:
-    """Nobody begins with fear."""
+    """Return 0: no fear at the start."""
     return (like(me.mass, 0.0),)
 
 
 @law
 def frightened(p: Any, me: Me, other: Other) -> Vec:
-    """Fear of one of them."""
+    """Return the fear of one neighbour."""
     return (motivation.fright(np.sqrt(other.square), p.span),)
 
 
 @law
 def told_one(p: Any, me: Me, sums: Vec) -> Vec:
-    """The sum, as a vector."""
+    """Return the sum as a vector."""
     return planar(me.pos, sums[0], like(sums[0], 0.0))
 
 
 @law
 def afraid(p: Any, me: Me, told: Vec, seconds: float) -> Vec:
-    """Of all in sight together, at most 1; it fades."""
+    """Return the fear after a step: of all in sight together, at most 1; it fades."""
     one = like(p.span, 1.0)
     later = motivation.calmed(me.inner.fear, told[0] if told[0] < one else one, p.memory, seconds)
     return (later if _among(me.who, p.first, p.end) else me.inner.fear,)
@@ -307,16 +306,16 @@ def afraid(p: Any, me: Me, told: Vec, seconds: float) -> Vec:
 class Fear(_Urge):
     """Fear of others in sight, F = min(sum of min(span / distance, 1), 1), that fades over `memory` seconds.
 
-    Sight, sum and 1 / distance are Tu and Terzopoulos' (1994; they see 300 degrees); that it fades is ours.
+    Sight, sum and 1 / distance are from Tu and Terzopoulos (1994; a view of 300 degrees); the fading is ours.
     """
 
     kind: Literal["fear"] = "fear"
     other: int = Field(ge=0, strict=True, description="the group that is feared")
-    radius: float = Field(default=10.0, gt=0, description="m, how far it sees")
+    radius: float = Field(default=10.0, gt=0, description="m, radius of sight")
     fov: float = Field(default=300.0, gt=0, le=360, description="degrees, full angle of the field of view")
-    occluded: bool = Field(default=False, description="whom an obstacle hides is not seen")
-    span: float = Field(default=2.0, ge=0, description="D0, m, within which fear of one is 1")
-    memory: float = Field(default=3.0, gt=0, description="s, over which it falls to 1/e")
+    occluded: bool = Field(default=False, description="True: obstacles hide agents")
+    span: float = Field(default=2.0, ge=0, description="D0, m, distance within which the fear of one agent is 1")
+    memory: float = Field(default=3.0, gt=0, description="s, over which fear falls to 1/e")
     pair_law: ClassVar[Law | None] = frightened
     finish_law: ClassVar[Law | None] = told_one
     begin_law: ClassVar[Law | None] = unafraid
@@ -326,15 +325,15 @@ class Fear(_Urge):
 
     @property
     def sight(self) -> Sight:
-        """What it sees of those."""
+        """The feared group, within radius and field of view."""
         return Sight(self.radius, self.fov, group=self.other, occluded=self.occluded)
 
     def sums(self, dimension: int) -> int:
-        """One."""
+        """Return 1, for the fear."""
         return 1
 
     def parameters(self) -> dict[str, float | Vec]:
-        """How near, and for how long."""
+        """Return span and memory."""
         return self.given("span", "memory")
 
 
@@ -343,13 +342,13 @@ class Fear(_Urge):
 
 @law
 def urge_from(p: Any, me: Me) -> Vec:
-    """What it begins with; nobody has mated."""
+    """Return the initial urge, and 0 matings."""
     return _drawn(p, me, CHANNEL + 1), like(p.start, 0.0)
 
 
 @law
 def willing(p: Any, me: Me, other: Other) -> Vec:
-    """One more who would."""
+    """Return 1 if the neighbour is willing, else 0."""
     o, e = like(other.square, 0.0), like(other.square, 1.0)
     would = motivation.desire(other.inner.libido, other.inner.hunger) > p.ready
     return (e if would & _among(other.who, p.first, p.end) else o,)
@@ -357,7 +356,7 @@ def willing(p: Any, me: Me, other: Other) -> Vec:
 
 @law
 def mating(p: Any, me: Me, told: Vec, seconds: float) -> Vec:
-    """The urge grows; who would, and has somebody near who would, mates, and it begins anew."""
+    """Return urge and count after a step: the urge grows; a willing agent near another mates, which resets it."""
     o, e = like(p.rate, 0.0), like(p.rate, 1.0)
     mine = _among(me.who, p.first, p.end)
     mates = mine & (told[0] > o) & (motivation.desire(me.inner.libido, me.inner.hunger) > p.ready)
@@ -366,18 +365,18 @@ def mating(p: Any, me: Me, told: Vec, seconds: float) -> Vec:
 
 
 class Libido(_Urge):
-    """An urge s that grows evenly since the last mating; libido is s (1 - H) (Tu and Terzopoulos 1994).
+    """An urge s that grows linearly since the last mating; libido is s (1 - H) (Tu and Terzopoulos 1994).
 
-    Two mate who come nearer than `radius` while both have a libido above `ready`; `mated` counts. Of three who are all
-    in reach of each other all three do. That, instead of their courtship, is ours; nobody is born of it.
+    Two agents mate if they come nearer than `radius` while both have a libido above `ready`; `mated` counts matings. Of
+    three in reach of each other all three mate. This replaces the paper's courtship and is ours; no agent is born.
     """
 
     kind: Literal["libido"] = "libido"
-    radius: float = Field(gt=0, description="m, at which they mate")
+    radius: float = Field(gt=0, description="m, distance at which agents mate")
     rate: float = Field(default=0.025, ge=0, description="1/s")
-    ready: float = Field(default=0.4, ge=0, le=1, description="libido above which one would")
-    start: float = Field(default=0.0, ge=0, description="urge at the start, in the middle")
-    spread: float = Field(default=0.0, ge=0, description="how far it differs from one to the next")
+    ready: float = Field(default=0.4, ge=0, le=1, description="libido above which an agent is willing")
+    start: float = Field(default=0.0, ge=0, description="mean initial urge")
+    spread: float = Field(default=0.0, ge=0, description="width of the uniform distribution of initial values")
     pair_law: ClassVar[Law | None] = willing
     finish_law: ClassVar[Law | None] = told_one
     begin_law: ClassVar[Law | None] = urge_from
@@ -388,36 +387,36 @@ class Libido(_Urge):
 
     @model_validator(mode="after")
     def _within(self) -> Libido:
-        """Refuse urges below 0."""
+        """Raise ValueError if the initial urge may be below 0."""
         _demand_range(self.start, self.spread, float("inf"))
         return self
 
     @property
     def sight(self) -> Sight:
-        """Whoever is near."""
+        """All neighbours within the radius."""
         return Sight(self.radius)
 
     def sums(self, dimension: int) -> int:
-        """How many."""
+        """Return 1, for the number of willing neighbours."""
         return 1
 
     def parameters(self) -> dict[str, float | Vec]:
-        """How fast, from where, and when."""
+        """Return rate, threshold and initial values."""
         return self.given("rate", "ready", "start", "spread")
 
 
-# --- what it intends --------------------------------------------------------------------------------------------------
+# --- intention --------------------------------------------------------------------------------------------------------
 
 
 @law
 def no_intention(p: Any, me: Me) -> Vec:
-    """Everybody begins wandering."""
+    """Return the initial intention: wander."""
     return (like(me.mass, motivation.WANDER),)
 
 
 @law
 def intending(p: Any, me: Me, told: Vec, seconds: float) -> Vec:
-    """What follows from what one intends, and hunger, libido and fear."""
+    """Return the next intention, from the present one, hunger, libido and fear."""
     libido = motivation.desire(me.inner.libido, me.inner.hunger)
     now = motivation.intention(
         me.inner.intention, me.inner.hunger, libido, me.inner.fear, p.escape, p.school, p.need, p.calm, p.content
@@ -429,16 +428,16 @@ class Intention(_Urge):
     """A finite state machine: escape, school, eat, mate or wander, from hunger, libido and fear, with hysteresis.
 
     Fear above `escape`: flee; above `school`: join the others; else the larger of hunger and libido, if above `need`;
-    else wander (Tu and Terzopoulos 1994). Who is at it goes on until it is `calm` or `content` less, so that nobody
-    dithers; that is ours. An arbitration `intentions` acts on it.
+    else wander (Tu and Terzopoulos 1994). An intention ends only when its level has fallen by `calm` or `content` below
+    the threshold, which avoids dithering; that is ours. An arbitration `intentions` acts on it.
     """
 
     kind: Literal["intention"] = "intention"
-    escape: float = Field(default=0.4, ge=0, le=1, description="fear above which one flees")
-    school: float = Field(default=0.15, gt=0, le=1, description="fear above which one joins the others")
-    need: float = Field(default=0.5, gt=0, le=1, description="hunger or libido above which one sees to it")
-    calm: float = Field(default=0.1, ge=0, description="how much less fear ends either")
-    content: float = Field(default=0.3, ge=0, description="how much less hunger or libido ends it")
+    escape: float = Field(default=0.4, ge=0, le=1, description="fear above which an agent flees")
+    school: float = Field(default=0.15, gt=0, le=1, description="fear above which an agent joins the others")
+    need: float = Field(default=0.5, gt=0, le=1, description="hunger or libido above which an agent acts on it")
+    calm: float = Field(default=0.1, ge=0, description="decrease of fear below the threshold that ends either")
+    content: float = Field(default=0.3, ge=0, description="decrease of the need below the threshold that ends it")
     begin_law: ClassVar[Law | None] = no_intention
     keep_law: ClassVar[Law | None] = intending
     keeps: ClassVar[tuple[str, ...]] = ("intention",)
@@ -447,7 +446,7 @@ class Intention(_Urge):
 
     @model_validator(mode="after")
     def _ordered(self) -> Intention:
-        """Refuse levels that run backwards, and what would never end."""
+        """Raise ValueError if the levels are out of order, or an intention would never end."""
         if self.school > self.escape:
             raise ValueError(f"school = {self.school:g}: must not be above escape = {self.escape:g}")
         if self.calm >= self.school or self.content >= self.need:
@@ -456,5 +455,5 @@ class Intention(_Urge):
         return self
 
     def parameters(self) -> dict[str, float | Vec]:
-        """The levels."""
+        """Return the levels."""
         return self.given("escape", "school", "need", "calm", "content")

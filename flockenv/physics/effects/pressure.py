@@ -1,4 +1,4 @@
-"""Pressure: agents part where they are crowded and close up where they are not, until their density is a given one."""
+"""Pressure: agents separate where they are crowded and close up where not, towards a given density."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from flockenv.steering.others import ONE_PLACE
 __all__ = ["Pressure"]
 
 PACKED = 0.64
-"""Share of space that spheres fill when they are poured in and shaken (Scott & Kilgour 1969: 0.637)."""
+"""Fraction of space filled by spheres that are poured in and shaken (Scott & Kilgour 1969: 0.637)."""
 
 
 @law
 def pressure_pair(p: Any, me: Me, other: Other) -> Vec:
-    """(a^2 - r^2) / (r^2 + (a/8)^2) (1 - r^2/R^2)^2 away from the neighbour; two in one place part along their ties."""
+    """Return (a^2 - r^2) / (r^2 + (a/8)^2) (1 - r^2/R^2)^2 away from a neighbour; in one place along the ties."""
     e, square = like(other.square, 1.0), other.square
     rest = p.flat if len(me.pos) == 2 else p.solid
     near = e - square / (p.radius * p.radius)
@@ -32,29 +32,28 @@ def pressure_pair(p: Any, me: Me, other: Other) -> Vec:
 
 @law
 def pressure(p: Any, me: Me, sums: Vec) -> Vec:
-    """F = strength times the sum."""
+    """Return F = strength times the sum."""
     return scale(sums, p.strength)
 
 
 class Pressure(Effect):
     """Keep a constant density of agents, by forces between near neighbours that conserve momentum.
 
-    F = K sum of (a^2 - r^2) / (r^2 + (a/8)^2) (1 - r^2/R^2)^2, away from each neighbour nearer than R: they push each
-    other while they are nearer than a, and pull beyond; finite where they meet, smoothly 0 at R. a is the distance of
-    neighbours in the packing of that density that a crowd relaxes to: rho = 2 / (sqrt(3) a^2) in the plane (triangles),
-    0.64 / (pi a^3 / 6) in space (random close packing, which fills 64 %). The force has a potential, so something else
-    must take the energy away (`Drag`), or agents remain a gas. Fewer than fill their space leave holes in it.
+    F = K sum of (a^2 - r^2) / (r^2 + (a/8)^2) (1 - r^2/R^2)^2, away from each neighbour nearer than R: repulsion at
+    distances below a, attraction beyond; finite at distance 0, smoothly 0 at R. a is the distance of neighbours in the
+    packing of that density to which a crowd relaxes: rho = 2 / (sqrt(3) a^2) in the plane (triangles),
+    0.64 / (pi a^3 / 6) in space (random close packing, which fills 64 %). The force has a potential, so another effect
+    (`Drag`) must dissipate energy, or agents remain a gas. Too few agents to fill their space leave holes in it.
 
     This is not the pressure of smoothed particles: that is a function of both partners' densities, and needs a second
-    sweep over all pairs (Monaghan 1992). A mere sum over pairs has no density of its own in a mean field (its pressure
-    grows with rho^2, whatever the force); here it is the distance a, and the order that agents take up, that keeps it:
-    to some percent.
+    pass over all pairs (Monaghan 1992). A mere sum over pairs has no preferred density in a mean field (its pressure
+    grows with rho^2 for any force); here the distance a and the order of agents set the density, to a few percent.
     """
 
     kind: Literal["pressure"] = "pressure"
-    strength: float = Field(ge=0, description="K, N: 3 K or so act at half the distance a, 64 K in one place")
+    strength: float = Field(ge=0, description="K, N: about 3 K act at half the distance a, 64 K at distance 0")
     density: float = Field(gt=0, description="rho, agents per m^2, in 3-D per m^3")
-    radius: float = Field(gt=0, description="R, m, neighbours are nearer than this: between 1.1 a and 1.4 a")
+    radius: float = Field(gt=0, description="R, m, of neighbours: between 1.1 a and 1.4 a")
     pair_law: ClassVar[Law | None] = pressure_pair
     finish_law: ClassVar[Law | None] = pressure
     conserves_momentum: ClassVar[bool] = True
@@ -62,11 +61,11 @@ class Pressure(Effect):
 
     @property
     def sight(self) -> Sight:
-        """All around."""
+        """All directions, within the radius."""
         return Sight(self.radius)
 
     def sums(self, dimension: int) -> int:
-        """A vector."""
+        """Return D, for a vector."""
         return dimension
 
     def distance(self, dimension: int) -> float:
@@ -76,7 +75,7 @@ class Pressure(Effect):
         return math.cbrt(PACKED * 6 / (math.pi * self.density))
 
     def check(self, scene: SceneView) -> None:
-        """Refuse a radius that has no room for a pull, or that reaches the neighbours' neighbours."""
+        """Raise ValueError if the radius leaves no attraction, or reaches second neighbours."""
         a = self.distance(scene.dimension)
         if not 1.1 * a <= self.radius <= 1.4 * a:
             raise ValueError(
@@ -85,7 +84,7 @@ class Pressure(Effect):
             )
 
     def parameters(self) -> dict[str, float | Vec]:
-        """Strength and radius, and a^2 in the plane and in space, of which the law takes one."""
+        """Return strength and radius, and a^2 in 2-D and in 3-D, of which the law takes one."""
         return {
             "strength": self.strength,
             "radius": self.radius,

@@ -1,4 +1,4 @@
-"""A speed limit that is a force: smooth, so that every method keeps its order and no step length shows."""
+"""A speed limit as a smooth force: every method keeps its order, and results do not depend on the step length."""
 
 from __future__ import annotations
 
@@ -18,30 +18,30 @@ __all__ = ["SpeedLimit"]
 
 @law
 def speed_limit(p: Any, me: Me) -> Vec:
-    """F = -B 16 s^8 / (15 + s^8) v / V, s = |v| / V."""
+    """Return F = -B 16 s^8 / (15 + s^8) v / V, s = |v| / V."""
     square = dot(me.vel, me.vel) / (p.speed * p.speed)
     fourth = square * square
-    # so written it is 0 at rest and 16 where s^8 is beyond all numbers
+    # in this form it is 0 at rest, and 16 where s^8 overflows
     share = like(square, 16.0) / (like(square, 1.0) + like(square, 15.0) / (fourth * fourth))
     return scale(me.vel, -p.strength / p.speed * share)
 
 
 class SpeedLimit(Effect):
-    """Brake those who come near a speed V, F = -B 16 s^8 / (15 + s^8) v / V with s = |v| / V.
+    """Brake agents that approach a speed V, F = -B 16 s^8 / (15 + s^8) v / V with s = |v| / V.
 
-    It brakes with B at V itself, so whoever is driven by B goes V in the end, by 2 B 1.087 V, by 4 B 1.189 V, by 8 B
-    1.319 V; it takes 14 % of B at .8 V and .2 % at V / 2. For high speeds it is a linear drag, 16 B / V: a bound of all
-    there is, which keeps any step of less than m V / (8 B) from running away. `Group.max_speed` is the hard limit: it
-    holds exactly, and cuts what a step has done, so that with it every method is of order 1 (numerics.md P09).
+    It brakes with B at V itself, so an agent driven by B reaches V in the end, by 2 B 1.087 V, by 4 B 1.189 V, by 8 B
+    1.319 V; it brakes with 14 % of B at .8 V and .2 % at V / 2. For high speeds it is a linear drag, 16 B / V: this
+    bounds its stiffness, so any step of less than m V / (8 B) is stable. `Group.max_speed` is the hard limit: it holds
+    exactly, and clips the result of a step, so that with it every method is of order 1.
     """
 
     kind: Literal["speed_limit"] = "speed_limit"
     speed: float = Field(gt=0, description="V, m/s")
-    strength: float = Field(ge=0, description="B, N, with which it brakes at that speed")
+    strength: float = Field(ge=0, description="B, N, braking force at that speed")
     own_law: ClassVar[Law | None] = speed_limit
     strengths: ClassVar[tuple[str, ...]] = ("strength",)
 
     def rates(self, groups: Sequence[Any], dimension: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Nothing swings; 16 B / (m V), the largest of force over speed."""
+        """Return 0, as nothing oscillates, and damping 16 B / (m V), the largest force over speed."""
         damping = 16 * self.strength / self.speed / all_masses(groups, dimension)
         return np.zeros(len(damping)), damping

@@ -1,7 +1,7 @@
 """Springs between the particles of a network: along their length, and about their angles.
 
-Rest lengths and angles are those of the network's undeformed shape. What a spring does to its two ends, and a hinge to
-its three particles, sums to nothing.
+Rest lengths and angles are those of the network's undeformed shape. The forces of a spring on its two ends, and of a
+hinge on its three particles, sum to zero.
 """
 
 from __future__ import annotations
@@ -28,9 +28,9 @@ Floats = NDArray[np.float64]
 
 @law
 def spring(p: Any, me: Me, others: Any, number: Vec) -> Vec:
-    """F = (k (l - L) + c (v_j - v) . d) d, along the unit vector d to the other end (Witkin & Baraff 1997).
+    """Return F = (k (l - L) + c (v_j - v) . d) d, along the unit vector d to the other end (Witkin & Baraff 1997).
 
-    Two ends in one place part along an axis, whoever has the higher number to its far side.
+    Two ends in one place part along the first axis: the one with the higher index in the positive direction.
     """
     other, o = others[0], like(number[0], 0.0)
     length = norm(other.offset)
@@ -42,15 +42,15 @@ def spring(p: Any, me: Me, others: Any, number: Vec) -> Vec:
 
 @law
 def _turned(a: Vec) -> Vec:
-    """Return a plane vector, a quarter turn to the left."""
+    """Return a 2-D vector turned a quarter to the left."""
     return (-a[1], a[0])
 
 
 @law
 def _opening(a: Vec, b: Vec) -> tuple[float, Vec, Vec]:
-    """Return the angle from arm a to arm b, and the directions per length in which it grows: d angle / da and / db.
+    """Return the angle from arm a to arm b and its gradients, d angle / da and d angle / db.
 
-    In the plane it has a sign; in space it is between 0 and pi, and arms in one line open in no direction.
+    In 2-D the angle has a sign; in 3-D it is between 0 and pi, and the gradients of collinear arms are 0.
     """
     o, e = like(a[0], 0.0), like(a[0], 1.0)
     aa, bb = dot(a, a), dot(b, b)
@@ -79,11 +79,11 @@ def _wrapped(angle: float) -> float:
 
 @law
 def angular_spring(p: Any, me: Me, others: Any, number: Vec) -> Vec:
-    """M = -k (angle - rest) - c d angle / dt, as forces on the two ends, and what balances them on the apex."""
+    """Return M = -k (angle - rest) - c d angle / dt as forces on the two ends, and the reaction on the apex."""
     near, far = others[0], others[1]
     role, half = number[3], like(number[0], 0.5)
     first, apex = role < half, (role > half) & (role < like(half, 1.5))
-    # arms and their velocities, from the apex: an end meets the apex first and then the other end
+    # arms and their velocities, from the apex: an end's first partner is the apex, its second the other end
     back, beyond = scale(near.offset, like(half, -1.0)), sub(far.offset, near.offset)
     moves, passes = sub(me.vel, near.vel), sub(far.vel, near.vel)
     a = select(apex, near.offset, select(first, back, beyond))
@@ -104,25 +104,25 @@ class Springs(Effect):
     kind: Literal["springs"] = "springs"
     group: int = Field(default=0, ge=0, description="number of the group whose network it acts on")
     stiffness: float = Field(ge=0, description="N/m, of edges")
-    shear: float | None = Field(default=None, ge=0, description="N/m, of springs across cells; none = as edges")
-    bend: float | None = Field(default=None, ge=0, description="N/m, of springs over two edges; none = as edges")
+    shear: float | None = Field(default=None, ge=0, description="N/m, of springs across cells (default: as edges)")
+    bend: float | None = Field(default=None, ge=0, description="N/m, of springs over two edges (default: as edges)")
     damping: float = Field(default=0.0, ge=0, description="kg/s, along each spring")
-    ratio: float = Field(default=0.0, ge=0, description="more damping, as a share of what is critical for each spring")
-    rest: float = Field(default=1.0, ge=0, description="rest lengths over those of the network; 0 = no length at all")
+    ratio: float = Field(default=0.0, ge=0, description="more damping, as a fraction of each spring's critical one")
+    rest: float = Field(default=1.0, ge=0, description="rest lengths over those of the network; 0 = rest length 0")
     bond_law: ClassVar[Law | None] = spring
     strengths: ClassVar[tuple[str, ...]] = ("stiffness", "shear", "bend", "damping", "ratio")
     conserves_momentum: ClassVar[bool] = True
 
     def numbers(self, dimension: int) -> int:
-        """Stiffness, damping, rest length."""
+        """Return 3: stiffness, damping, rest length."""
         return 3
 
     def parameters(self) -> dict[str, float | Vec]:
-        """None: every spring has numbers of its own."""
+        """Return no parameters: every spring has numbers of its own."""
         return {}
 
     def bonds(self, groups: Sequence[Any], dimension: int) -> Bonds:
-        """Both ends of every spring."""
+        """Return a row for both ends of every spring."""
         first, network, mass = network_of(groups, self.group, dimension)
         springs = network.springs(dimension)
         stiffness = np.full(len(springs.i), self.stiffness)
@@ -130,20 +130,20 @@ class Springs(Effect):
             if value is not None:
                 stiffness[springs.role == role] = value
         i, j = springs.i, springs.j
-        reduced = 1 / (1 / mass[i] + 1 / mass[j] + 1e-300)  # kg; two that are held swing not at all
+        reduced = 1 / (1 / mass[i] + 1 / mass[j] + 1e-300)  # kg; two pinned ends do not oscillate
         damping = self.damping + 2 * self.ratio * np.sqrt(stiffness * np.minimum(reduced, 1e300))
         number = np.stack([stiffness, damping, self.rest * springs.rest], axis=1)
         agent, partner = np.concatenate([i, j]) + first, np.concatenate([j, i]) + first
         return Bonds(agent.astype(np.int32), partner[:, None].astype(np.int32), np.concatenate([number, number]))
 
     def rates(self, groups: Sequence[Any], dimension: int) -> tuple[Floats, Floats] | None:
-        """Gershgorin: w^2 <= 2 sum k / m, and as much for damping (numerics.md 3.3)."""
+        """Return bounds by Gershgorin's circles: w^2 <= 2 sum k / m, and damping <= 2 sum c / m."""
         bonds, mass = self.bonds(groups, dimension), all_masses(groups, dimension)
         swing, damp = (np.bincount(bonds.agent, bonds.number[:, k], len(mass)) for k in (0, 1))
         return 2 * swing / mass, 2 * damp / mass
 
     def potential(self, groups: Sequence[Any], state: State, offset: Any) -> Floats:
-        """Sum of k (l - L)^2 / 2 of all springs, (B,) J."""
+        """Return the sum of k (l - L)^2 / 2 over all springs, (B,) J."""
         bonds = self.bonds(groups, state.shape[2])
         half = len(bonds.agent) // 2
         i, j, number = bonds.agent[:half], bonds.partner[:half, 0], bonds.number[:half]
@@ -164,15 +164,15 @@ class AngularSprings(Effect):
     conserves_momentum: ClassVar[bool] = True
 
     def numbers(self, dimension: int) -> int:
-        """Stiffness, damping, rest angle, and which of the three somebody is."""
+        """Return 4: stiffness, damping, rest angle, and role (0: first end, 1: apex, 2: second end)."""
         return 4
 
     def parameters(self) -> dict[str, float | Vec]:
-        """None: every hinge has numbers of its own."""
+        """Return no parameters: every hinge has numbers of its own."""
         return {}
 
     def bonds(self, groups: Sequence[Any], dimension: int) -> Bonds:
-        """The first end, the apex and the second end of every hinge."""
+        """Return rows for the first ends, the apexes and the second ends of all hinges."""
         first, network, _ = network_of(groups, self.group, dimension)
         hinges, points = network.hinges(dimension), network.rest_points(dimension)
         a, b = points[hinges[:, 0]] - points[hinges[:, 1]], points[hinges[:, 2]] - points[hinges[:, 1]]
@@ -184,7 +184,7 @@ class AngularSprings(Effect):
         return Bonds(np.concatenate([i, apex, k]), np.concatenate(partner).astype(np.int32), np.concatenate(roles))
 
     def rates(self, groups: Sequence[Any], dimension: int) -> tuple[Floats, Floats] | None:
-        """Of the undeformed shape: row sums of the second derivatives k |d angle/dx| |d angle/dy| of each hinge."""
+        """Return bounds for the undeformed shape: row sums of k |d angle/dx| |d angle/dy| over the hinges."""
         first, network, _ = network_of(groups, self.group, dimension)
         hinges, points, mass = network.hinges(dimension), network.rest_points(dimension), all_masses(groups, dimension)
         per_a, per_b = (1 / np.linalg.norm(points[hinges[:, end]] - points[hinges[:, 1]], axis=1) for end in (0, 2))
@@ -193,7 +193,7 @@ class AngularSprings(Effect):
         return self.stiffness * rows, self.damping * rows
 
     def potential(self, groups: Sequence[Any], state: State, offset: Any) -> Floats:
-        """Sum of k (angle - rest)^2 / 2 of all hinges, (B,) J."""
+        """Return the sum of k (angle - rest)^2 / 2 over all hinges, (B,) J."""
         bonds = self.bonds(groups, state.shape[2])
         third = len(bonds.agent) // 3
         i, apex, k = bonds.agent[:third], bonds.agent[third : 2 * third], bonds.agent[2 * third :]
@@ -204,7 +204,7 @@ class AngularSprings(Effect):
 
 
 def _angles(a: Floats, b: Floats) -> Floats:
-    """Return the angle from a to b, (..., D): with a sign in the plane, between 0 and pi in space."""
+    """Return the angles from a to b, (..., D): with a sign in 2-D, between 0 and pi in 3-D."""
     along = (a * b).sum(axis=-1)
     if a.shape[-1] == 2:
         return np.asarray(np.arctan2(a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0], along))

@@ -1,4 +1,4 @@
-"""Springs to a fixed point, and a field of pendulums: forces of one agent by itself that have a potential energy."""
+"""Springs to a fixed point, and a field of pendulums: forces of one agent alone, with a potential energy."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ Floats = NDArray[np.float64]
 
 @law
 def tether(p: Any, me: Me) -> Vec:
-    """F = -k (|d| - L) unit(d) - c v with d from the centre to the agent; no direction, and no force of L, at d = 0."""
+    """Return F = -k (|d| - L) unit(d) - c v, with d from the centre to the agent; unit(d) is 0 at d = 0."""
     d = sub(me.pos, p.centre)
     spring = add(scale(d, -p.stiffness), scale(unit(d), p.stiffness * p.rest))
     return sub(spring, scale(me.vel, p.damping))
@@ -38,12 +38,12 @@ def _sines(a: Vec) -> Vec:
 
 @law
 def swing(p: Any, me: Me) -> Vec:
-    """F = -s sin((x - c) / l) along each axis."""
+    """Return F = -s sin((x - c) / l) along each axis."""
     return scale(_sines(scale(sub(me.pos, p.centre), like(p.length, 1.0) / p.length)), -p.strength)
 
 
 class _Centred(Effect):
-    """What forces about a fixed point have in common; on a torus the nearest image of the centre counts."""
+    """Fields that forces about a fixed point have in common; on a torus, about its nearest image."""
 
     centre: Vector = Field(description="m")
     places: ClassVar[tuple[str, ...]] = ("centre",)
@@ -55,17 +55,17 @@ class Tether(_Centred):
     kind: Literal["tether"] = "tether"
     stiffness: float = Field(ge=0, description="k, N/m")
     damping: float = Field(default=0.0, ge=0, description="c, kg/s")
-    rest: float = Field(default=0.0, ge=0, description="L, m, where the spring pulls no more")
+    rest: float = Field(default=0.0, ge=0, description="L, m, rest length")
     own_law: ClassVar[Law | None] = tether
     strengths: ClassVar[tuple[str, ...]] = ("stiffness", "damping")
 
     def rates(self, groups: Sequence[Any], dimension: int) -> tuple[Floats, Floats]:
-        """w^2 = k / m, and c / m."""
+        """Return w^2 = k / m, and damping c / m."""
         mass = all_masses(groups, dimension)
         return self.stiffness / mass, self.damping / mass
 
     def potential(self, groups: Sequence[Any], state: State, offset: Any) -> Floats:
-        """Sum of k (|d| - L)^2 / 2 of all agents, (B,) J; what the damper takes is not in it."""
+        """Return the sum of k (|d| - L)^2 / 2 over all agents, (B,) J."""
         stretch = np.linalg.norm(offset(self.centre, state.pos), axis=-1) - self.rest
         return np.asarray((0.5 * self.stiffness * stretch**2).sum(axis=1))
 
@@ -80,11 +80,11 @@ class Swing(_Centred):
     strengths: ClassVar[tuple[str, ...]] = ("strength",)
 
     def rates(self, groups: Sequence[Any], dimension: int) -> tuple[Floats, Floats]:
-        """w^2 = s / (m l), where it hangs; nothing damps it."""
+        """Return w^2 = s / (m l), that of small oscillations, and no damping."""
         square = self.strength / self.length / all_masses(groups, dimension)
         return square, np.zeros(len(square))
 
     def potential(self, groups: Sequence[Any], state: State, offset: Any) -> Floats:
-        """Sum of s l (1 - cos((x - c) / l)) over all agents and axes, (B,) J."""
+        """Return the sum of s l (1 - cos((x - c) / l)) over all agents and axes, (B,) J."""
         angles = offset(self.centre, state.pos) / self.length
         return np.asarray(self.strength * self.length * (1 - np.cos(angles)).sum(axis=(1, 2)))

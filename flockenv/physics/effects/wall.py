@@ -1,4 +1,4 @@
-"""A wall that keeps people away before they touch it: a force that falls exponentially with the distance."""
+"""Repulsion from a wall before contact: a force that falls exponentially with the distance."""
 
 from __future__ import annotations
 
@@ -20,29 +20,29 @@ from flockenv.physics.effects.effect import Effect, Me, Vector
 __all__ = ["WallRepulsion"]
 
 SHORTEST, LONGEST = 1e-15, 1e15
-"""Of a normal: the square of any other is no number of float32."""
+"""Lengths of a normal: the square of any other is 0 or infinite in float32."""
 
 
 @law
 def wall_repulsion(p: Any, me: Me) -> Vec:
-    """F = A exp(-d / B) n."""
+    """Return F = A exp(-d / B) n."""
     n = unit(p.normal)
     return scale(n, p.strength * np.exp(-dot(sub(me.pos, p.point), n) / p.decay))
 
 
 class WallRepulsion(Effect):
-    """A straight wall pushes everybody to the side that its normal n points to, F = A exp(-d / B) n.
+    """A straight wall repels all agents along its normal n, F = A exp(-d / B) n.
 
-    d is the distance from the wall, negative behind it, where the force goes on growing. A body that also wants to walk
-    against it at v0 within a time tau rests at d = B ln(A tau / (m v0)), which it approaches without oscillation if
-    v0 tau / B <= 1/4. Helbing and Molnar 1995 (A = U0 / R, B = R); Helbing, Farkas and Vicsek 2000 without contact
+    d is the distance from the wall, negative behind it, where the force goes on growing. A body driven against it with
+    desired speed v0 and relaxation time tau rests at d = B ln(A tau / (m v0)), which it approaches without oscillation
+    if v0 tau / B <= 1/4. Helbing and Molnar 1995 (A = U0 / R, B = R); Helbing, Farkas and Vicsek 2000 without contact
     (their A times exp(radius / B)); Kretz, arXiv 1507.02566.
     """
 
     kind: Literal["wall_repulsion"] = "wall_repulsion"
     point: Vector = Field(description="m, any point of the wall")
-    normal: Vector = Field(description="direction in which it pushes, of any length")
-    strength: float = Field(ge=0, description="A, N, at the wall itself")
+    normal: Vector = Field(description="direction of the force, of any length")
+    strength: float = Field(ge=0, description="A, N, force at the wall itself")
     decay: float = Field(gt=0, description="B, m, over which the force falls to 1/e")
     own_law: ClassVar[Law | None] = wall_repulsion
     places: ClassVar[tuple[str, ...]] = ("point",)
@@ -52,12 +52,12 @@ class WallRepulsion(Effect):
     def _normal_points_somewhere(self) -> Self:
         if not SHORTEST <= math.hypot(*self.normal) <= LONGEST:
             raise ValueError(
-                f"normal = {self.normal}: a direction, not all 0 (from {SHORTEST:g} to {LONGEST:g} m long)"
+                f"normal = {self.normal}: must be a direction, not all 0 (from {SHORTEST:g} to {LONGEST:g} m long)"
             )
         return self
 
     def check(self, scene: SceneView) -> None:
-        """Refuse a torus too: there the way ahead of a wall leads to where it pushes hardest, behind it."""
+        """Raise ValueError also on a torus: away from the wall leads behind it, where the force is largest."""
         super().check(scene)
         if isinstance(scene.space, Torus):
             raise ValueError(
@@ -65,7 +65,7 @@ class WallRepulsion(Effect):
             )
 
     def potential(self, groups: Sequence[Any], state: State, offset: Any) -> NDArray[np.float64]:
-        """Sum of A B exp(-d / B) of all agents, (B,) J."""
+        """Return the sum of A B exp(-d / B) over all agents, (B,) J."""
         n = np.array(self.normal) / math.hypot(*self.normal)
         distance = offset(self.point, state.pos) @ n
         return np.asarray((self.strength * self.decay * np.exp(-distance / self.decay)).sum(axis=1))

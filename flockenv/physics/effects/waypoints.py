@@ -1,4 +1,4 @@
-"""Journeys: places to be gone to one after another, each straight or around obstacles, and waited at for a while."""
+"""Journeys: targets visited in order, each straight ahead or around obstacles, with a wait at each."""
 
 from __future__ import annotations
 
@@ -23,26 +23,26 @@ __all__ = ["Journey", "Stage", "onwards", "place_kept"]
 Seconds = Annotated[float, Field(ge=0)] | Spread
 
 PREMOVEMENT = 2
-"""Channel of what is drawn for everybody: Group has 0 and 1; stage k has this one, and k more, and one more."""
+"""RNG channel of premovement times. Group uses channels 0 and 1; the waits at stage k use PREMOVEMENT + 1 + k."""
 HEAD = 2
-"""Numbers of a stage before those of its target: where its block of ways begins, or -1; over how far one slows down."""
+"""Numbers of a stage before those of its target: where its floor field begins in the table, or -1; its slow radius."""
 
 
 @law
 def place_kept(me: Me) -> Vec:
-    """Where it was at the end of the step before."""
+    """Return the stored position, that at the end of the step before."""
     return me.inner.was_x, me.inner.was_y
 
 
 @law
 def onwards(me: Me) -> Vec:
-    """Return a place a metre behind who goes on as in his last step."""
+    """Return a point a metre behind the agent, against the direction of its last step."""
     return sub(me.pos, unit(sub(me.pos, place_kept(me))))
 
 
 @law
 def stage_row(p: Any, stage: float) -> Any:
-    """Return where in the table the numbers of a stage begin; of those beyond the last, the last."""
+    """Return where the numbers of a stage begin in the table; beyond the last stage, those of the last."""
     last = p.many - like(stage, 1.0)
     k = np.floor(stage)
     k = k if k < last else last
@@ -52,7 +52,7 @@ def stage_row(p: Any, stage: float) -> Any:
 
 @law
 def journey_aim(p: Any, me: Me) -> Vec:
-    """To the place of its stage; nowhere before it sets out; straight on when it has passed the last."""
+    """Return the direction to the stage; 0 before it sets out; straight on once it has passed the last."""
     stage, o = me.inner.stage, like(p.share, 0.0)
     row = stage_row(p, stage)
     straight = to_target(p.table, row + 2, me.pos)
@@ -67,7 +67,7 @@ def journey_aim(p: Any, me: Me) -> Vec:
 
 @law
 def journey_begun(p: Any, me: Me) -> Vec:
-    """Before the first stage until it sets out."""
+    """Return the initial stage, -1/2 if it waits before it sets out, the end of that wait, and the position."""
     o = like(p.share, 0.0)
     begin = np.int64(p.many) * np.int64(p.size)
     each = np.int64(p.many) + 1
@@ -79,7 +79,7 @@ def journey_begun(p: Any, me: Me) -> Vec:
 
 @law
 def journey_kept(p: Any, me: Me, told: Vec, seconds: float) -> Vec:
-    """Stage k, k + 1/2 while it waits there, and so on; the time until which it waits; where it is."""
+    """Return the stage, k, or k + 1/2 while it waits there; the time until which it waits; and the position."""
     stage, ready, was = me.inner.stage, me.inner.ready, place_kept(me)
     before = (stage, ready, was[0], was[1])
     if not about(p, me) or (stage >= p.many and p.leaves > like(stage, 0.0)):
@@ -103,35 +103,35 @@ def journey_kept(p: Any, me: Me, told: Vec, seconds: float) -> Vec:
 
 
 class Stage(Target):
-    """A place on a journey: reached when one is in it (a point: within its radius), or has crossed it (a door)."""
+    """A stage of a journey: reached when an agent is in it (a point: within its radius), or has crossed it (a door)."""
 
-    wait: Seconds = Field(default=0.0, description="s, for how long one stays; or how that is spread")
-    around: bool = Field(default=True, description="by the way around obstacles; else straight")
+    wait: Seconds = Field(default=0.0, description="s, wait there, or its distribution")
+    around: bool = Field(default=True, description="True: by the path around obstacles; False: straight")
 
     @model_validator(mode="after")
     def _reached(self) -> Stage:
-        """Refuse a point that nobody ever is in."""
+        """Raise ValueError for a point of radius 0, which is never reached."""
         if self.at is not None and self.radius == 0:
             raise ValueError("radius = 0: a point is reached within a radius; give m")
         return self
 
 
 class Journey(Around):
-    """Everybody of a group goes to one place after another, and may wait before it sets out, and at each of them.
+    """Agents of a group visit stages in order, and may wait before they set out, and at each stage.
 
-    `inner(state, "stage")` is the number of the place that it goes to, from 0; half more while it waits there; -1/2
-    before it sets out; as many as there are when it has been at all. Waiting ends with the first step that begins when
-    the time is over, whatever dt is. Who has passed the last door of a journey that ends with "leave" goes straight on,
-    through a sink if there is one. Stages keep numbers of the plane.
+    `inner(state, "stage")` is the index of the stage that an agent heads for, from 0; half more while it waits there;
+    -1/2 before it sets out; the number of stages after the last. A wait ends with the first step that begins after its
+    time is over, for any dt. After the last stage, with then = "leave", an agent goes straight on, through a sink if
+    there is one. In 2-D only.
     """
 
     kind: Literal["journey"] = "journey"
-    stages: tuple[Stage, ...] = Field(min_length=1, description="where to, one after another")
-    premovement: Seconds = Field(default=0.0, description="s, after which one sets out; or how that is spread")
+    stages: tuple[Stage, ...] = Field(min_length=1, description="targets, in this order")
+    premovement: Seconds = Field(default=0.0, description="s, wait before setting out, or its distribution")
     then: Literal["stay", "leave", "loop"] = Field(
         default="stay", description="after the last: stay there, go straight on, or begin again"
     )
-    slow_radius: float = Field(default=0.5, gt=0, description="m, over which one slows down before one stays or waits")
+    slow_radius: float = Field(default=0.5, gt=0, description="m, over which agents slow down before a stop")
     needs_all: ClassVar[bool] = True
     aim_law: ClassVar[Law | None] = journey_aim
     begin_law: ClassVar[Law | None] = journey_begun
@@ -140,17 +140,17 @@ class Journey(Around):
 
     @property
     def goals(self) -> tuple[tuple[Target, ...], tuple[str, ...]]:
-        """The stages that ways lead to."""
+        """The stages that are reached around obstacles."""
         there = [k for k, stage in enumerate(self.stages) if stage.around]
         return tuple(self.stages[k] for k in there), tuple(f"stages[{k}]" for k in there)
 
     def parameters(self) -> dict[str, float | Vec]:
-        """How many stages, what comes then."""
+        """Return the share, the number of stages, the size of a row, and what follows the last stage."""
         ends = {"leaves": float(self.then == "leave"), "loops": float(self.then == "loop")}
         return {"share": self.share, "many": float(len(self.stages)), "size": float(HEAD + row_size(2)), **ends}
 
     def table(self, scene: SceneView) -> NDArray[np.float64]:
-        """A row for each stage, what is drawn for everybody, and the ways to each place, once."""
+        """Return a row for each stage, the waits drawn for each agent, and one floor field per target."""
         members = self.members(scene.starts)
         count = int(members["end"] - members["first"])
         given = [(self.premovement, PREMOVEMENT), *((s.wait, PREMOVEMENT + 1 + k) for k, s in enumerate(self.stages))]
@@ -166,18 +166,18 @@ class Journey(Around):
         return np.concatenate([np.ravel(rows), waits.ravel(), *blocks])
 
     def grids(self, scene: SceneView) -> list[NDArray[np.float64]]:
-        """Return the grid of ways to each stage that agents go around obstacles to."""
+        """Return the floor field of each stage that is reached around obstacles."""
         table, size = scene.table_of(self), HEAD + row_size(2)
         blocks = [int(table[k * size]) for k, stage in enumerate(self.stages) if stage.around]
         return [table[at + 2 + row_size(2) :] for at in blocks]
 
     def slowing(self, k: int) -> float:
-        """Return over how many metres one slows down before stage k."""
+        """Return the distance over which agents slow down before stage k, m."""
         stays = self.then == "stay" and k == len(self.stages) - 1
         return self.slow_radius if stays or self.stages[k].wait != 0 else 0.0
 
     def check(self, scene: SceneView) -> None:
-        """Refuse space, and a torus."""
+        """Raise ValueError in 3-D, and on a torus."""
         if scene.dimension != 2 or scene.space.periodic:
             raise ValueError(f"kind = {self.kind}: only a plane or a box of dimension 2 is allowed")
         super().check(scene)

@@ -1,4 +1,4 @@
-"""How a law is advanced in time, one method per file. To add one: write its file, and a row in tests/catalogue.py."""
+"""Integrators, one method per file. To add one: write its file, and a row in tests/catalogue.py."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What methods with steps of their own have in common: the numbers that their control is given."""
+"""Base of methods with adaptive substeps: the settings of their step-size control."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ __all__ = ["Adaptive"]
 
 
 class Adaptive(Integrator):
-    """A method that chooses steps of its own within dt, see `control`."""
+    """A method that chooses substeps within dt, see `step_size`."""
 
-    tolerance: float = Field(default=1e-4, gt=0, description="error of one step, m and m/s, of the worst agent")
+    tolerance: float = Field(default=1e-4, gt=0, description="error of one substep, m and m/s, of the worst agent")
     least: float = Field(
-        default=0.0, ge=0, description="s, smallest step; a world that needs a smaller one is given up"
+        default=0.0, ge=0, description="s, smallest substep; a world that needs a smaller one is given up"
     )
     most: int = Field(
-        default=100_000, ge=1, description="steps of its own within dt; a world that needs more is given up"
+        default=100_000, ge=1, description="largest number of substeps within dt; a world that needs more is given up"
     )
     adaptive: ClassVar[bool] = True

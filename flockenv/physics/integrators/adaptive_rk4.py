@@ -1,4 +1,4 @@
-"""Runge-Kutta of order 4 with steps of its own: each is made once whole and once in halves, and the halves count."""
+"""Runge-Kutta of order 4 with adaptive substeps by step doubling: the result is that of the two half steps."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ __all__ = ["AdaptiveRK4"]
 def advance(provided: Provided) -> Method:
     """Make `advance`: step doubling.
 
-    The two results are not extrapolated: that would grow every oscillation (numerics.md, P04).
-    The whole step and its first half begin with the same slope, and so does the next try if this one is rejected.
+    The two results are not extrapolated: that would amplify every oscillation.
+    The whole step, its first half, and the next try after a rejection begin with the same slope.
     """
     acceleration, settings = provided.acceleration, provided.settings
     largest, counted = provided.largest, provided.counted
@@ -45,7 +45,7 @@ def advance(provided: Provided) -> Method:
                     if not (begins and known):
                         ahead = like(dt, 0.0) if stage == 0 else (h if stage == 3 else h / 2)
                         copy(x, v, x0, v0, first, end)
-                        if stage > 0:  # by the slope of the stage before
+                        if stage > 0:  # from the slope of the stage before
                             before = 8 if stage == 1 and part < 2 else 10
                             add_slopes(x, v, ahead, stages[before], stages[before + 1], first, end)
                         acceleration(context, x, v, since + ahead, a)
@@ -67,7 +67,7 @@ def advance(provided: Provided) -> Method:
 
 
 class AdaptiveRK4(Adaptive):
-    """Runge-Kutta of order 4 with steps of its own within dt, 11 evaluations each; costs most where forces jump."""
+    """Runge-Kutta of order 4 with adaptive substeps within dt, 11 evaluations each; slowest where forces jump."""
 
     kind: Literal["adaptive_rk4"] = "adaptive_rk4"
     order: ClassVar[int] = 4

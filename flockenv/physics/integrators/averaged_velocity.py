@@ -1,4 +1,4 @@
-"""Euler with the mean of the old and the new velocity: the step of the lectures."""
+"""Euler with the mean of the old and the new velocity."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def move(x: float, v: float, a: float, dt: float) -> tuple[float, float]:
 
 
 class AveragedVelocity(OneStage):
-    """Averaged-velocity step, order 1, one evaluation; exact under a constant force, pumps energy into oscillations."""
+    """Averaged-velocity step, order 1, one evaluation; exact under a constant force, adds energy to oscillations."""
 
     kind: Literal["averaged_velocity"] = "averaged_velocity"
     order: ClassVar[int] = 1

@@ -1,4 +1,4 @@
-"""The method of Dormand and Prince (1980): order 5, with one of order 4 inside it that tells its error."""
+"""The method of Dormand and Prince (1980): order 5, with an embedded one of order 4 for the error."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from flockenv.physics.integrators.step_size import add_slopes, begun, copy, judg
 __all__ = ["DormandPrince"]
 
 NODES = (0.0, 1 / 5, 3 / 10, 4 / 5, 8 / 9, 1.0, 1.0)
-"""When each stage is, in steps."""
+"""Time of each stage, in steps."""
 
 WEIGHTS = (
     (0.0, 0.0, 0.0, 0.0, 0.0, 0.0),
@@ -25,10 +25,10 @@ WEIGHTS = (
     (9017 / 3168, -355 / 33, 46732 / 5247, 49 / 176, -5103 / 18656, 0.0),
     (35 / 384, 0.0, 500 / 1113, 125 / 192, -2187 / 6784, 11 / 84),
 )
-"""What each stage adds of the slopes before it; the last stage is the result."""
+"""Weights of the slopes before each stage; the last stage is the result."""
 
 ERRORS = (71 / 57600, 0.0, -71 / 16695, 71 / 1920, -17253 / 339200, 22 / 525, -1 / 40)
-"""The result less that of order 4, in slopes."""
+"""Weights of the slopes in the result minus that of order 4."""
 
 
 def advance(provided: Provided) -> Method:
@@ -43,7 +43,7 @@ def advance(provided: Provided) -> Method:
         context: Any, pos: Any, vel: Any, flow: Any, time: float, dt: float, stages: Any, first: int, end: int
     ) -> None:
         x, v = stages[0], stages[1]
-        other_x, other_v = stages[3], stages[10]  # the second slope counts neither in the result nor in its error
+        other_x, other_v = stages[3], stages[10]  # the second slope has weight 0 in the result and in its error
         limits = settings(context)
         clock, known = begun(dt), False
         while clock.done < dt:
@@ -74,7 +74,7 @@ def advance(provided: Provided) -> Method:
 
 
 class DormandPrince(Adaptive):
-    """Dormand-Prince 5(4) with steps of its own within dt, 6 evaluations each and one more; for smooth forces."""
+    """Dormand-Prince 5(4) with adaptive substeps within dt, 6 evaluations each and one more; for smooth forces."""
 
     kind: Literal["dormand_prince"] = "dormand_prince"
     order: ClassVar[int] = 5

@@ -1,4 +1,4 @@
-"""Explicit (forward) Euler, shown for what it is."""
+"""Explicit (forward) Euler."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ __all__ = ["ExplicitEuler"]
 
 @kernel
 def move(x: float, v: float, a: float, dt: float) -> tuple[float, float]:
-    """Return x and v after x += h v; v += h a: both from the present."""
+    """Return x and v after x += h v; v += h a, both from the old values."""
     return x + dt * v, v + dt * a
 
 

@@ -13,7 +13,7 @@ __all__ = ["Heun"]
 
 
 def advance(provided: Provided) -> Method:
-    """Make `advance`: the mean of the slope here and the slope where Euler would get; one call, see rk4."""
+    """Make `advance`: the mean of the slope here and the slope after an Euler step; one call, see rk4."""
     acceleration = provided.acceleration
 
     def advance(

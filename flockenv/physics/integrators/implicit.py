@@ -1,4 +1,4 @@
-"""What implicit methods have in common: one stage, solved by Newton's method in Python, and how far it leads."""
+"""Base of implicit methods: one stage, solved by Newton's method in Python, and the step from it."""
 
 from __future__ import annotations
 
@@ -13,26 +13,26 @@ from flockenv.physics.integrators.newton import Coupling, Evaluate, NotSolvedErr
 __all__ = ["Implicit"]
 
 MOST_HALVED = 3
-"""Times that a step may be halved before its world is given up."""
+"""Number of times that a step may be halved before its world is given up."""
 
 
 class Implicit(Integrator):
-    """A method with one implicit stage, at a share of the step."""
+    """A method with one implicit stage, at a fraction `share` of the step."""
 
     share: ClassVar[float]
-    """Where in the step the stage lies: 1 = at its end (Euler), 1/2 = in its middle."""
+    """Time of the stage, in steps: 1 = the end (Euler), 1/2 = the middle."""
     stages: ClassVar[int] = 2
-    evaluations: ClassVar[int] = 0  # as many as Newton's method takes; they are counted where it runs
+    evaluations: ClassVar[int] = 0  # depends on Newton's method, which counts them
     solves: ClassVar[bool] = True
 
     def solve(
         self, evaluate: Evaluate, x: Floats, v: Floats, time: float, dt: float, dimension: int,
         coupling: Coupling | None,
     ) -> Stage:  # fmt: skip
-        """Return positions and velocities one step later, (D N,); newton.NotSolvedError if they are not found.
+        """Return positions and velocities one step later, (D N,); raise newton.NotSolvedError if they are not found.
 
-        A step whose equations Newton's method does not solve is made in two halves, and each of those again if need be:
-        where forces jump there may be no solution for one length of step and one for another.
+        A step whose equations Newton's method does not solve is made in two halves, and each of those again if needed:
+        if forces jump, a solution may exist for one length of step and not for another.
         """
         total, left = Stage(x, v, 0, 0, 0), [(time, dt, 0)]
         while left:
@@ -66,7 +66,7 @@ class Implicit(Integrator):
     def _step(
         self, law: Any, context: Any, x: Floats, v: Floats, flow: Any, time: float, dt: float, stages: Floats
     ) -> None:
-        """Advance one world under laws that are Python functions: nothing is known of who depends on whom."""
+        """Advance one world under laws that are Python functions: the sparsity of the derivatives is unknown."""
 
         def evaluate(pos: Floats, vel: Floats, when: float) -> tuple[Floats, Floats | None]:
             acc, carrying = np.empty_like(pos), np.empty_like(pos)

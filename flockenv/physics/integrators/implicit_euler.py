@@ -1,4 +1,4 @@
-"""Implicit (backward) Euler: stable for every damped motion at every step, and never to be mistaken for accurate."""
+"""Implicit (backward) Euler: stable for every damped motion at every step, but inaccurate."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ __all__ = ["ImplicitEuler"]
 
 
 def advance(provided: Provided) -> Method:
-    """Make `advance`: positions are taken over from the first of the stages, velocities from the second."""
+    """Make `advance`: copy positions from the first row of stages, velocities from the second."""
 
     def advance(
         context: Any, pos: Any, vel: Any, flow: Any, time: float, dt: float, stages: Any, first: int, end: int

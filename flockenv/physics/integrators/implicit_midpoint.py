@@ -1,4 +1,4 @@
-"""Implicit midpoint: half a step of implicit Euler, taken twice as far; it keeps the energy of linear oscillations."""
+"""Implicit midpoint: half a step of implicit Euler, extrapolated to a whole one; conserves linear oscillations."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ __all__ = ["ImplicitMidpoint", "advance"]
 
 
 class ImplicitMidpoint(Implicit):
-    """Implicit midpoint, order 2; symplectic, stable at every step, undamped: what is stiff rings on."""
+    """Implicit midpoint, order 2; symplectic, stable at every step, undamped: stiff modes keep oscillating."""
 
     kind: Literal["implicit_midpoint"] = "implicit_midpoint"
     order: ClassVar[int] = 2

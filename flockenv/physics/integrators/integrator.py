@@ -1,12 +1,12 @@
-"""Integrator: (acceleration, state, dt) -> state. A law never knows which method integrates it.
+"""Integrator: (acceleration, state, dt) -> state. Laws are independent of the method that integrates them.
 
-Each method is one file. A method of one stage is a formula (`one_stage.py`). Any other is a section,
-`advance(provided)`. It makes `advance(context, pos, vel, flow, time, dt, stages, first, end)`, which calls functions
-that it is provided with, over the coordinates of one world in one row, in place. Of these it writes [first, end) alone,
-because several threads may share a world, each with a part of its own. `flow` holds the velocity with which the medium
-carries all agents, as of the last acceleration; it is empty, and costs nothing, where nothing flows. With compiled
-functions (`sweep/method.py`) it is a part of a scene's kernel; with Python functions the same code runs in Python,
-which is how its order is measured.
+Each method is one file. A method of one stage is a formula (`single_stage.py`). Any other is a section,
+`advance(provided)`. It makes `advance(context, pos, vel, flow, time, dt, stages, first, end)`, which calls the provided
+functions and updates, in place, the coordinates of one world, stored in one row. It writes only [first, end), because
+several threads may share a world, each with a range of its own. `flow` holds the velocity with which the medium carries
+all agents, as of the last acceleration; it is empty, and costs nothing, without a flow. With compiled functions
+(`engine/method.py`) it is a part of a scene's kernel; with Python functions the same code runs in Python, which is how
+its order is measured.
 """
 
 from __future__ import annotations
@@ -30,14 +30,14 @@ __all__ = [
 ]  # fmt: skip
 
 Method = Callable[..., None]
-"""What advances one world, in place: `advance(context, pos, vel, flow, time, dt, stages, first, end)`."""
+"""Advances one world in place: `advance(context, pos, vel, flow, time, dt, stages, first, end)`."""
 
 INTEGRATORS: dict[str, type[Integrator]] = {}
 """Every integrator by its kind; a class registers itself when it is defined."""
 
 
 def carried(x: float, seconds: float, flow: Any, i: int) -> float:
-    """Return a coordinate x, carried for some seconds by the medium; x itself where `flow` is empty."""
+    """Return a coordinate x, carried for some seconds by the medium; x itself if `flow` is empty."""
     return float(x + seconds * flow[i]) if len(flow) else x
 
 
@@ -51,7 +51,7 @@ def _carried(x, seconds, flow, i):  # type: ignore[no-untyped-def]  # numba comp
 class Alone(NamedTuple):
     """The context of a world whose laws are Python functions."""
 
-    drag: float | Floats = 0.0  # c / m, 1/s, of all or of each coordinate (D N,)
+    drag: float | Floats = 0.0  # c / m, 1/s, one for all or one per coordinate (D N,)
     settings: tuple[float, ...] = ()  # of the method, see Integrator.settings
     dimension: int = 1
     work: Any = None  # (8,), the world's row of State.work
@@ -81,23 +81,23 @@ class Provided(NamedTuple):
     """The functions that a method calls: a scene's compiled ones, or by default those of a world `Alone`, in Python."""
 
     acceleration: Callable[..., None]
-    """(context, pos, vel, time, out): read the positions of all agents, once all threads have written theirs."""
+    """(context, pos, vel, time, out): compute accelerations, once all threads have written their positions."""
     settings: Callable[..., tuple[float, ...]] = _settings
-    """(context): the numbers of the method, in the order of its fields."""
+    """(context): the settings of the method, in the order of its fields."""
     damping: Callable[..., None] = _damping
     """(context, rate, first, end): write c / m, 1/s, of coordinates [first, end), for a method with `splits_drag`."""
     largest: Callable[..., tuple[float, int]] = _largest
-    """(context, squares, first, end): the largest sum of an agent's coordinates, NaN if one is, and its place."""
+    """(context, squares, first, end): the largest sum over an agent's coordinates, NaN if one is, and its index."""
     counted: Callable[..., None] = _counted
-    """(context, accepted, rejected): count steps of the method's own in State.work."""
+    """(context, accepted, rejected): count substeps in State.work."""
 
 
 SUBSTEPS = WORK.index("substeps")
-"""Column of State.work; steps that were rejected are in the next."""
+"""Column of State.work; rejected substeps are in the next."""
 
 
 def methods_named(names: Sequence[str]) -> tuple[Integrator, ...]:
-    """Return methods by their kinds, each once; ValueError, with the nearest name, for one that is not there."""
+    """Return methods by their kinds, each once; raise ValueError, with the nearest name, for an unknown one."""
     for name in names:
         if name not in INTEGRATORS:
             raise ValueError(f"methods: {shown(name)} is none{nearest(name, INTEGRATORS)} ({', '.join(INTEGRATORS)})")
@@ -113,15 +113,15 @@ class Integrator(Record):
     order_with_drag: ClassVar[int]
     """Order of accuracy for forces that depend on velocity too."""
     stages: ClassVar[int]
-    """Rows of coordinates it needs as scratch."""
+    """Rows of coordinates needed as scratch."""
     evaluations: ClassVar[int]
-    """Evaluations of the force per step; at least so many where a method chooses steps of its own."""
+    """Evaluations of the force per step; for adaptive methods, the least number."""
     adaptive: ClassVar[bool] = False
-    """Does it choose steps of its own within dt? It looks at a whole world then, and threads do not share one."""
+    """True if it chooses substeps within dt. It then needs a whole world, and threads do not share one."""
     splits_drag: ClassVar[bool] = False
-    """Does it treat linear drag by itself, exactly? It is left out of the acceleration then, see `damping`."""
+    """True if it integrates linear drag separately and exactly, which the acceleration then excludes; see `damping`."""
     solves: ClassVar[bool] = False
-    """Does it solve equations (scipy, in Python)? `advance` then only takes over what was found."""
+    """True if it solves equations (scipy, in Python). `advance` then only copies the solution."""
 
     @classmethod
     def __pydantic_init_subclass__(cls, **kwargs: Any) -> None:
@@ -131,12 +131,12 @@ class Integrator(Record):
             INTEGRATORS[kind] = cls
 
     def settings(self) -> tuple[float, ...]:
-        """The numbers that `advance` is given: its fields, in order."""
+        """Return the numbers passed to `advance`: its fields, in order."""
         return tuple(float(getattr(self, name)) for name in type(self).model_fields if name != "kind")
 
     @classmethod
     def of_module(cls, name: str) -> Any:
-        """Return what the method's module holds under this name."""
+        """Return the object of this name in the method's module."""
         return vars(sys.modules[cls.__module__])[name]
 
     @classmethod
@@ -155,8 +155,8 @@ class Integrator(Record):
         """Return the state one step later under laws given as Python functions.
 
         `acceleration(pos, vel, time)` takes and returns (N, D), m, m/s, s, m/s^2; `flow(pos, time)` is the velocity of
-        a medium that carries everybody, (N, D) m/s; `drag` is c / m, 1/s, of all or of each coordinate (D N,), for a
-        method that treats linear drag by itself. Scenes go through Scene.step: this is Python.
+        a medium that carries all agents, (N, D) m/s; `drag` is c / m, 1/s, one for all or one per coordinate (D N,),
+        for a method that integrates linear drag separately. Scenes use the compiled Scene.step instead.
         """
         if not (dt > 0 and np.isfinite(dt)):
             raise ValueError(f"dt is {dt}, must be a positive number of seconds")

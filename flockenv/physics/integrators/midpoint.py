@@ -13,7 +13,7 @@ __all__ = ["Midpoint"]
 
 
 def advance(provided: Provided) -> Method:
-    """Make `advance`: the slope half a step ahead, taken for the whole step; one call, see rk4."""
+    """Make `advance`: the slope half a step ahead, used for the whole step; one call, see rk4."""
     acceleration = provided.acceleration
 
     def advance(

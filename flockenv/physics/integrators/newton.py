@@ -1,8 +1,8 @@
 """Newton's method for the equations of an implicit stage: find w with x = x0 + h w and v = v0 + h a(x, v, t).
 
-With a medium that carries everybody w = v + u(x, t), else w = v. Derivatives are finite differences: along directions
-that GMRES asks for (nothing is known of who depends on whom), or column by column into a sparse matrix, many columns at
-once where agents share no neighbour (Curtis, Powell & Reid 1974, doi 10.1093/imamat/13.1.117), which SuperLU factors.
+With a medium that carries all agents w = v + u(x, t), else w = v. Derivatives are finite differences: along the
+directions of GMRES (if the sparsity is unknown), or column by column into a sparse matrix, many columns at once for
+agents that share no neighbour (Curtis, Powell & Reid 1974, doi 10.1093/imamat/13.1.117), which SuperLU factors.
 Both solvers are scipy's.
 """
 
@@ -20,25 +20,25 @@ __all__ = ["Coupling", "NotSolvedError", "Stage", "coupled", "solve_stage"]
 Rows = NDArray[np.floating[Any]]
 
 Evaluate = Callable[[Rows, Rows, float], tuple[Rows, Rows | None]]
-"""(x, v, time) -> acceleration, and flow or none: of K instants at once, each a row of all coordinates, (K, D N)."""
+"""(x, v, time) -> acceleration, and flow or None: for K instants at once, each a row of all coordinates, (K, D N)."""
 
 MOST_ITERATIONS = 50
 MOST_HALVINGS = 12
 GMRES_TOLERANCE = 1e-4
-"""Of one linear solve, relative: Newton's method makes good what is left."""
+"""Relative tolerance of one linear solve: Newton's method corrects the rest."""
 
 
 class NotSolvedError(ArithmeticError):
-    """Newton's method has not come to an end."""
+    """Newton's method has not converged."""
 
     def __init__(self, reason: str, left: Rows | None = None) -> None:
-        """left: by how much the equations do not hold, (D N,); none = not known."""
+        """left: the residual, (D N,); None if unknown."""
         super().__init__(reason)
-        self.place = None if left is None else int(np.argmax(np.abs(left)))  # the first that is no number, or the worst
+        self.place = None if left is None else int(np.argmax(np.abs(left)))  # the first NaN, or the worst
 
 
 class Stage(NamedTuple):
-    """What was found, and what it took."""
+    """The solution of a stage, and the work it took."""
 
     x: Rows  # (D N,)
     v: Rows  # (D N,)
@@ -50,21 +50,21 @@ class Stage(NamedTuple):
 
 @dataclass(frozen=True)
 class Coupling:
-    """Whose acceleration depends on whom, as a sparse matrix of agents, and which agents share a difference."""
+    """Which agents' accelerations depend on which agents, as a sparse matrix, and a colouring for the differences."""
 
     row: NDArray[np.int64]  # (P,) the agent that is accelerated
-    column: NDArray[np.int64]  # (P,) by where this one is
+    column: NDArray[np.int64]  # (P,) the agent on whose position it depends
     colour: NDArray[np.int64]  # (N,): no agent depends on two of one colour
 
     @property
     def colours(self) -> int:
-        """How many there are."""
+        """Number of colours."""
         return int(self.colour.max(initial=-1)) + 1
 
 
 def coupled(agents: int, first: NDArray[np.integer[Any]], second: NDArray[np.integer[Any]]) -> Coupling:
-    """Return who depends on whom: everybody on himself, and `first` on `second`, (R,) each."""
-    from scipy import sparse  # here: it takes a third of a second to load, and who solves nothing need not wait for it
+    """Return the coupling in which each agent depends on itself, and `first` on `second`, (R,) each."""
+    from scipy import sparse  # here: loading takes a third of a second, needed by implicit methods alone
 
     own = np.arange(agents)
     ones = np.ones(agents + len(first))
@@ -72,7 +72,7 @@ def coupled(agents: int, first: NDArray[np.integer[Any]], second: NDArray[np.int
     depends.sum_duplicates()
     near = (depends.T @ depends).tocsr()
     colour = np.full(agents, -1)
-    for j in range(agents):  # greedy: the first colour that nobody has who meets j in some row
+    for j in range(agents):  # greedy: the first colour of no agent that shares a row with j
         taken = set(colour[near.indices[near.indptr[j] : near.indptr[j + 1]]].tolist())
         colour[j] = next(c for c in range(agents) if c not in taken)
     pairs = depends.tocoo()
@@ -80,7 +80,7 @@ def coupled(agents: int, first: NDArray[np.integer[Any]], second: NDArray[np.int
 
 
 class _Residual:
-    """R(w) = v - v0 - h a(x, v, t), a vector of all coordinates, for one w or several rows of them."""
+    """The residual R(w) = v - v0 - h a(x, v, t), a vector of all coordinates, for one or several rows of w."""
 
     def __init__(self, evaluate: Evaluate, x0: Rows, v0: Rows, time: float, h: float) -> None:
         self.evaluate, self.x0, self.v0, self.time, self.h = evaluate, x0, v0, time, h
@@ -97,12 +97,12 @@ class _Residual:
         return np.asarray(v - self.v0 - self.h * self.evaluate(x, v, self.time)[0])
 
     def stage(self, w: Rows, newton: int, linear: int) -> Stage:
-        """Return what w comes to."""
+        """Return the stage at the solution w."""
         x, v = self.motion(w[None])
         return Stage(x[0], v[0], newton, linear)
 
     def guesses(self) -> Iterator[Rows]:
-        """Return where to begin: everybody goes on as he does; or as the force says that he will."""
+        """Yield initial guesses of w: the present velocity; then the velocity after an explicit step."""
         self.flows = False
         acc, flow = self.evaluate(self.x0[None], self.v0[None], self.time)
         self.flows = flow is not None
@@ -114,10 +114,10 @@ class _Residual:
 def solve_stage(
     evaluate: Evaluate, x0: Rows, v0: Rows, time: float, h: float, dimension: int, coupling: Coupling | None
 ) -> Stage:
-    """Return the stage at `time` of an implicit method with step h; NotSolvedError if Newton's method does not end.
+    """Return the stage at `time` of an implicit method with step h; raise NotSolvedError if Newton's method fails.
 
-    x0, v0: (D N,), one coordinate of all agents after another. Where it begins forces may have no derivative (agents in
-    one place); then it begins anew from where an explicit step leads.
+    x0, v0: (D N,), one coordinate of all agents after another. Forces may have no derivative at the first guess (agents
+    in one place); then the second guess is an explicit step.
     """
     residual = _Residual(evaluate, x0, v0, time, h)
     for w in residual.guesses():
@@ -129,19 +129,19 @@ def solve_stage(
 
 
 class _SingularError(ArithmeticError):
-    """Corrections are nothing although the equations do not hold: derivatives are without bound."""
+    """Corrections vanish although the residual does not: derivatives are unbounded."""
 
 
 def _solved(residual: _Residual, w: Rows, dimension: int, coupling: Coupling | None) -> Stage:
-    """Return what Newton's method comes to from a first guess.
+    """Return the solution of Newton's method from a first guess.
 
-    It ends when a correction is at rounding, relative to the velocities, or stops to shrink there; a correction that
-    does not bring those after it down is halved.
+    It ends when a correction is at rounding, relative to the velocities, or stops shrinking near it; a correction that
+    does not reduce the next one is halved.
     """
     rounding, linear = float(np.finfo(w.dtype).eps), 0
     r = residual(w[None])[0]
     first = float(np.abs(r).max())
-    # what the rounding of positions makes of velocities: far from the origin corrections come to rest there
+    # rounding of positions, as velocities: far from the origin corrections shrink no further
     noise = rounding * float(np.abs(residual.x0).max()) / residual.h
     before = np.inf
     for iteration in range(1, MOST_ITERATIONS + 1):
@@ -169,10 +169,10 @@ def _solved(residual: _Residual, w: Rows, dimension: int, coupling: Coupling | N
 def _searched(
     residual: _Residual, w: Rows, correction: Rows, solve: Callable[[Rows], tuple[Rows, int]]
 ) -> tuple[Rows, Rows, int]:
-    """Return the next w and R: the correction, halved until what is left to correct shrinks.
+    """Return the next w and R, and the linear iterations: the correction is halved until the next one is smaller.
 
-    Corrections are what is compared, by the same derivatives, and not residuals: those of stiff springs say little of
-    how far the solution is (the natural monotonicity test of Deuflhard 2004, section 3.3).
+    Corrections with the same derivatives are compared, not residuals: those of stiff springs say little about the
+    distance from the solution (the natural monotonicity test of Deuflhard 2004, section 3.3).
     """
     share, took, size = 1.0, 0, float(np.linalg.norm(correction))
     for _ in range(MOST_HALVINGS):
@@ -184,11 +184,11 @@ def _searched(
             if float(np.linalg.norm(left)) <= (1 - share / 4) * size:
                 break
         share /= 2
-    return new, r_new, took  # at the least as good as it gets; whether that was enough the next correction tells
+    return new, r_new, took  # the best found; the next correction shows if it is enough
 
 
 def _step_of(w: Rows) -> float:
-    """Return the difference that derivatives are taken over."""
+    """Return the step of the finite differences."""
     return float(np.sqrt(np.finfo(w.dtype).eps)) * max(1.0, float(np.abs(w).max()))
 
 

@@ -13,9 +13,9 @@ __all__ = ["RK4"]
 
 
 def advance(provided: Provided) -> Method:
-    """Make `advance`: four slopes, weighted 1, 2, 2, 1, each taken at a stage that the slope before led to.
+    """Make `advance`: four slopes, weighted 1, 2, 2, 1, each at a stage reached by the slope before.
 
-    The acceleration is called in one place, so that the whole sweep is compiled once and not four times.
+    The acceleration is called in one place, so that it is compiled once and not four times.
     """
     acceleration = provided.acceleration
 
@@ -41,7 +41,7 @@ def advance(provided: Provided) -> Method:
 
 
 class RK4(Integrator):
-    """Classical Runge-Kutta, order 4, four evaluations; of order 1 where a limit or a view cone makes forces jump."""
+    """Classical Runge-Kutta, order 4, four evaluations; of order 1 if a limit or a view cone makes forces jump."""
 
     kind: Literal["rk4"] = "rk4"
     order: ClassVar[int] = 4

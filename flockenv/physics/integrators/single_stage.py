@@ -1,4 +1,4 @@
-"""What methods of one stage have in common: they ask once, at the present, and move every coordinate by itself."""
+"""Base of methods of one stage: one evaluation, at the present, and a formula for each coordinate."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ __all__ = ["OneStage"]
 
 
 class OneStage(Integrator):
-    """A method that is one formula, `move(x, v, a, dt)`, for where a coordinate and its velocity are a step later."""
+    """A method of one formula, `move(x, v, a, dt)`: a coordinate and its velocity one step later."""
 
     stages: ClassVar[int] = 0
     evaluations: ClassVar[int] = 1

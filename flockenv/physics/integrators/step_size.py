@@ -1,15 +1,15 @@
-"""Steps that a method chooses by itself: as long as its error allows, the last one ending where the step ends.
+"""Step-size control: substeps as long as the error allows, the last one ending with the step of the scene.
 
-An error is the distance between two results, of position and velocity together (m and m/s alike), of the agent who is
-worst off; it is absolute, and what rounding alone may make of a coordinate is not counted. The next step is
-h clip(0.9 (tolerance / error)^(1 / (p + 1)), 0.2, 5), after a step that was taken as after one that was not.
+The error is the distance between two results, of position and velocity together (m and m/s alike), of the worst agent;
+it is absolute, and excludes what may be rounding of a coordinate. The next substep is
+h clip(0.9 (tolerance / error)^(1 / (p + 1)), 0.2, 5), after an accepted substep as after a rejected one.
 
-Two rules more are for forces that jump, whose error falls as h and not as h^(p + 1): who is rejected again tries a
-fifth, and as long as the clock has not come to where a rejected step would have ended no step is longer than the one
-before. So a jump costs a rejected step for each factor of 5 between the steps before it and the one that meets it.
+Two more rules are for forces that jump, whose error falls as h and not as h^(p + 1): a second rejection in a row
+reduces the substep to a fifth, and until the clock reaches the end of the last rejected substep no substep is longer
+than the one before. So a jump costs one rejection for each factor of 5 between the substeps before it and across it.
 
-A world is given up, by a coordinate that is not a number, where TRIES steps in a row are not accepted, where a step
-shorter than `least` is called for, where one does not move the clock, and where `most` steps have not come to its end.
+A world is given up, by a NaN coordinate, after TRIES rejections in a row, if a substep shorter than `least` is needed,
+if a substep does not move the clock, and if `most` substeps have not reached the end.
 """
 
 from __future__ import annotations
@@ -24,15 +24,15 @@ from flockenv.physics.integrators.integrator import carried
 __all__ = ["TRIES", "Clock", "add_slopes", "begun", "copy", "excess", "judged", "misfit", "slope_of"]
 
 TRIES = 20
-"""Steps in a row that may be rejected: each is at most a fifth of the one before if nothing else is known."""
+"""Number of rejections in a row at which a world is given up: from the second on, each divides the substep by 5."""
 
 
 class Clock(NamedTuple):
-    """Where a method is within one step of the scene."""
+    """State of the step-size control within one step of the scene."""
 
     done: float  # s, since its beginning
     step: float  # s, to be tried next
-    wary: float  # s, where the last rejected step would have ended
+    wary: float  # s, end of the last rejected substep
     tries: int  # in a row, rejected
     accepted: int
     rejected: int
@@ -41,20 +41,20 @@ class Clock(NamedTuple):
 
 @shared
 def begun(dt: float) -> Clock:
-    """Return the clock at the beginning of a step of the scene: all of it is tried at once."""
+    """Return the clock at the beginning of a step of the scene: the first substep is the whole step."""
     return Clock(like(dt, 0.0), dt, like(dt, 0.0), 0, 0, 0, False)
 
 
 @shared
 def excess(difference: float, size: float, tiny: float) -> float:
-    """Return the square of what a difference is beyond the rounding of a number of that size; NaN stays NaN."""
+    """Return the square of a difference, less the rounding of a number of that size; NaN stays NaN."""
     beyond = abs(difference) - tiny * abs(size)
     return like(beyond, 0.0) if beyond <= like(beyond, 0.0) else beyond * beyond
 
 
 @shared
 def _stretched(error: float, tolerance: float, dt: float, order: int) -> float:
-    """Return how much longer the next step may be: from a fifth, also if the error is NaN, to five times."""
+    """Return the factor of the next substep, from 1/5 (also if the error is NaN) to 5."""
     none = error <= like(dt, 0.0)
     ratio = tolerance / (tolerance if none else error)
     factor = like(dt, 5.0) if none else like(dt, 0.9) * ratio ** (like(dt, 1.0) / like(dt, order + 1))
@@ -63,7 +63,7 @@ def _stretched(error: float, tolerance: float, dt: float, order: int) -> float:
 
 @shared
 def judged(clock: Clock, error: float, limits: tuple[float, ...], dt: float, order: int) -> Clock:
-    """Return the clock after a step with that error, in the sense of the module's text, was tried.
+    """Return the clock after a substep with that error; for the rules see the module.
 
     limits: tolerance, least, most.
     """
@@ -88,21 +88,21 @@ def judged(clock: Clock, error: float, limits: tuple[float, ...], dt: float, ord
 
 @shared
 def copy(to_x: Any, to_v: Any, x: Any, v: Any, first: int, end: int) -> None:
-    """to = (x, v)."""
+    """Copy: to = (x, v)."""
     for i in range(np.uint64(first), np.uint64(end)):
         to_x[i], to_v[i] = x[i], v[i]
 
 
 @shared
 def slope_of(x: Any, v: Any, flow: Any, first: int, end: int) -> None:
-    """Write into x how positions change where velocities are v: what carries is as of the last acceleration."""
+    """Write into x the rate of change of positions: v and the flow, as of the last acceleration."""
     for i in range(np.uint64(first), np.uint64(end)):
         x[i] = carried(v[i], like(v[i], 1.0), flow, i)
 
 
 @shared
 def add_slopes(x: Any, v: Any, weight: float, slope: Any, a: Any, first: int, end: int) -> None:
-    """(x, v) += weight (slope, a)."""
+    """Add: (x, v) += weight (slope, a)."""
     for i in range(np.uint64(first), np.uint64(end)):
         x[i] += weight * slope[i]
         v[i] += weight * a[i]
@@ -110,7 +110,7 @@ def add_slopes(x: Any, v: Any, weight: float, slope: Any, a: Any, first: int, en
 
 @shared
 def misfit(squares: Any, x: Any, v: Any, other_x: Any, other_v: Any, first: int, end: int) -> None:
-    """Write by which square each coordinate of a result is off another, beyond rounding; into other_x if need be."""
+    """Write the squared difference of two results beyond rounding, per coordinate; `squares` may be other_x."""
     tiny = like(x[0], 8 * np.finfo(x.dtype).eps)
     for i in range(np.uint64(first), np.uint64(end)):
         squares[i] = excess(x[i] - other_x[i], x[i], tiny) + excess(v[i] - other_v[i], v[i], tiny)

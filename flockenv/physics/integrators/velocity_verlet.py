@@ -1,4 +1,4 @@
-"""Velocity Verlet, right for forces that depend on velocity too."""
+"""Velocity Verlet, of order 2 also for forces that depend on velocity."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ __all__ = ["VelocityVerlet"]
 def advance(provided: Provided) -> Method:
     """Make `advance`: half a kick, a drift, half a kick.
 
-    The second force is asked for at a predicted velocity: with the old one drag would make it order 1.
+    The second force is evaluated at a predicted velocity: with the old one drag would reduce the order to 1.
     """
     acceleration = provided.acceleration
 
