@@ -1,9 +1,9 @@
-"""numba's front end with less to do: while it compiles our kernels, it does nothing twice, and nothing in vain.
+"""A faster front end of numba: caches and short cuts while it compiles our kernels.
 
-Four fifths of the time that a kernel takes to compile are numba's Python. The machine code that comes out is the same,
-instruction for instruction. What is replaced here is replaced while one of our functions compiles, under numba's own
-lock, and put back afterwards. Each replacement names the functions of numba that it relies on, by digests of their
-text: where one of them reads otherwise (another numba), it is left out, and numba does all of its own work.
+Four fifths of the compile time of a kernel are spent in numba's Python code. The resulting machine code is the same,
+instruction for instruction. The patches are active only while one of our functions compiles, under numba's own lock,
+and are undone afterwards. Each patch lists the functions of numba that it relies on, with digests of their source: if
+one of them differs (another version of numba), the patch is left out and numba works unchanged.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ from flockenv.jit.startup import nothing_to_collect
 __all__ = ["LEFT_OUT", "SPARED", "TRICKS", "Spared", "Trick", "applies", "lighter", "reads_as_known", "spared"]
 
 LEFT_OUT = "FLOCKENV_NUMBA_ALONE"
-"""The environment variable that names replacements to leave out, with commas between; `all`: numba works alone."""
+"""Environment variable with the names of patches to leave out, separated by commas; `all` leaves out every one."""
 
 # numba is untyped
 _canonical: Any = transforms.canonicalize_cfg
@@ -55,7 +55,7 @@ _Rewrites: Any = typed_passes.NopythonRewrites
 
 
 class Known(NamedTuple):
-    """A function of numba, as it reads where a replacement of it was tried."""
+    """A function of numba, with the digest of the source that a patch was tested with."""
 
     owner: Any
     name: str
@@ -63,7 +63,7 @@ class Known(NamedTuple):
 
 
 class Trick(NamedTuple):
-    """A replacement: `owner.name` becomes `make(what was there)`."""
+    """A patch: `owner.name` is replaced by `make(original)`."""
 
     owner: Any
     name: str
@@ -72,14 +72,14 @@ class Trick(NamedTuple):
 
     @property
     def title(self) -> str:
-        """What it is called where replacements are listed, or left out: by module, since classes share names."""
+        """Name of the patch, in lists and in LEFT_OUT: with its module, since classes share names."""
         if inspect.ismodule(self.owner):
             return f"{self.owner.__name__}.{self.name}".removeprefix("numba.core.")
         return f"{self.owner.__module__}.{self.owner.__name__}.{self.name}".removeprefix("numba.core.")
 
 
 def digest(owner: Any, name: str) -> str:
-    """Return a digest of the text of `owner.name`; nothing if there is no such function."""
+    """Return a digest of the source of `owner.name`; "" if there is no such function."""
     try:
         return hashlib.sha256(inspect.getsource(vars(owner)[name]).encode()).hexdigest()[:12]
     except (KeyError, OSError, TypeError):
@@ -88,14 +88,14 @@ def digest(owner: Any, name: str) -> str:
 
 @functools.cache
 def reads_as_known(reads: tuple[Known, ...]) -> bool:
-    """Return True if every function reads as it did where a replacement was tried."""
+    """Return True if the source of every function is the one that the patch was tested with."""
     return all(digest(known.owner, known.name) == known.digest for known in reads)
 
 
 def applies(title: str, reads: tuple[Known, ...]) -> bool:
-    """Return True if a replacement is made: this numba reads as known, and LEFT_OUT does not name it.
+    """Return True if a patch is applied: numba's source is as known, and LEFT_OUT does not contain its title.
 
-    ValueError for a name in LEFT_OUT that no replacement has.
+    Raise ValueError for a name in LEFT_OUT that is not the title of a patch.
     """
     left_out = [name for name in os.environ.get(LEFT_OUT, "").split(",") if name]
     allowed = ["all", "lowering", *(each.title for each in (*TRICKS, *SPARED))]
@@ -105,9 +105,11 @@ def applies(title: str, reads: tuple[Known, ...]) -> bool:
     return reads_as_known(reads) and title not in left_out and "all" not in left_out
 
 
-# --- remembered: which implementation a call of given types has -------------------------------------------------------
+# --- cached: the implementation of a call with given types --------------------------------------------------------------------
 
-_remembered: dict[int, tuple[Any, dict[Any, Any]]] = {}  # by the function type's id; the type itself, so that it stays
+_remembered: dict[
+    int, tuple[Any, dict[Any, Any]]
+] = {}  # by id of the function type; the type itself is stored to keep it alive
 
 
 def _memory(function: Any) -> dict[Any, Any]:
@@ -118,13 +120,13 @@ def _memory(function: Any) -> dict[Any, Any]:
 
 
 def _call(context: Any, args: Any, kws: Any) -> tuple[Any, ...]:
-    """Return what a resolution depends on beside the function: types, and the flags of the caller."""
+    """Return the cache key of a resolution beside the function: argument types, and the flags of the caller."""
     flags = targetconfig.ConfigStack.top_or_none()  # type: ignore[no-untyped-call]
     return context, tuple(args), tuple(kws.items()) if kws else (), flags
 
 
 def _recalled(function: Any, call: tuple[Any, ...]) -> Any:
-    """Return the signature that was found before, None if there was none."""
+    """Return the cached signature, None if there is none."""
     known = _memory(function).get(call)
     if known is None:
         return None
@@ -135,7 +137,7 @@ def _recalled(function: Any, call: tuple[Any, ...]) -> Any:
 
 
 def _known_calls(resolve: Any) -> Any:
-    """Remember what `+` of two numbers is: numba asks dozens of templates, for every `+` and several times over."""
+    """Cache the resolution of operators such as `+`: numba tries dozens of templates, several times for every `+`."""
 
     def get_call_type(self: Any, context: Any, args: Any, kws: Any) -> Any:
         call = _call(context, args, kws)
@@ -150,7 +152,7 @@ def _known_calls(resolve: Any) -> Any:
 
 
 def _known_laws(resolve: Any) -> Any:
-    """Remember the signature of a compiled function for given types, as long as it is there."""
+    """Cache the signature of a compiled function for given types, as long as its compiled form exists."""
 
     def get_call_type(self: Any, context: Any, args: Any, kws: Any) -> Any:
         call = _call(context, args, kws)
@@ -165,7 +167,7 @@ def _known_laws(resolve: Any) -> Any:
 
 
 def _known_first(resolve: Any) -> Any:
-    """Ask what is remembered before anything else, the items of tuples (which have no function) among it."""
+    """Look in the cache first, also for items of tuples, which have no function type."""
     items: dict[Any, Any] = {}
 
     def resolve_function_type(self: Any, function: Any, args: Any, kws: Any) -> Any:
@@ -176,14 +178,17 @@ def _known_first(resolve: Any) -> Any:
             return resolve(self, function, args, kws)
         item = self, id(args[0]), args[1]
         if item not in items:
-            items[item] = resolve(self, function, args, kws), args[0]  # which stays, and its id with it
+            items[item] = (
+                resolve(self, function, args, kws),
+                args[0],
+            )  # stored to keep it alive, so that its id stays valid
         return items[item][0]
 
     return resolve_function_type
 
 
 def _known_plain(find: Any) -> Any:
-    """Remember the type of a tuple without literals."""
+    """Cache the type of a tuple without literals."""
     known: dict[int, tuple[Any, Any]] = {}
 
     def unliteral(self: Any) -> Any:
@@ -194,11 +199,11 @@ def _known_plain(find: Any) -> Any:
     return unliteral
 
 
-# --- cheaper: the same answer, found sooner ---------------------------------------------------------------------------
+# --- cheaper: the same result, computed faster -------------------------------------------------------------------------
 
 
 def _values(_: Any) -> Any:
-    """Return the values of flags: defaults, and what is set."""
+    """Return a faster `values` of flags: the cached defaults, updated with the set values."""
     defaults: dict[Any, dict[str, Any]] = {}
 
     def values(self: Any) -> dict[str, Any]:
@@ -212,7 +217,7 @@ def _values(_: Any) -> Any:
 
 
 def _equal(slowly: Any) -> Any:
-    """Compare flags by what is set first."""
+    """Compare flags by their set values first."""
 
     def equal(self: Any, other: Any) -> Any:
         same = self is other or (type(self) is type(other) and self._values == other._values)
@@ -222,7 +227,7 @@ def _equal(slowly: Any) -> Any:
 
 
 def _hashed(_: Any) -> Any:
-    """Hash flags: numba sorts the names of all options, which are the same for all."""
+    """Hash flags by their class: numba sorts the names of all options, which are the same for all instances."""
     return lambda self: hash(type(self))
 
 
@@ -253,9 +258,9 @@ def _variables(slowly: Any) -> Any:
 
 
 def _when_asked(slowly: Any) -> Any:
-    """Work out the lives of variables only when asked: numba finds them anew after each of its passes.
+    """Compute the lifetimes of variables only on demand: numba computes them after each of its passes.
 
-    What is entered into `block_entry_vars` is for generators and for Python's objects, of which kernels have none.
+    `block_entry_vars` is needed only for generators and Python objects, which kernels do not have.
     """
 
     def run(self: Any, emit_dels: bool = False, extend_lifetimes: bool = False) -> None:
@@ -273,8 +278,8 @@ def _when_asked(slowly: Any) -> Any:
 
 
 def _if_new(refresh: Any) -> Any:
-    """Look for new declarations only if there are some: numba runs through all of them for each function."""
-    seen: dict[int, int] = {}  # by the registries: a target's copies share them
+    """Refresh registries only if there are new declarations: numba goes through all of them for each function."""
+    seen: dict[int, int] = {}  # by id of the registries, which the copies of a target share
 
     def refreshed(self: Any) -> None:
         known = sum(
@@ -291,7 +296,7 @@ def _if_new(refresh: Any) -> Any:
 
 
 def _where_it_is(slowly: Any) -> Any:
-    """Rewrite the blocks that name a variable: numba goes through every statement of a function for each variable."""
+    """Rewrite only blocks that contain a variable: numba goes through every statement of a function for each variable."""
 
     def names(block: Any) -> frozenset[str]:
         known = vars(block).get("_flockenv_names")
@@ -356,12 +361,12 @@ TRICKS = (
         Known(typing_context.BaseContext, "install_registry", "8b38bc0cff80"),
     )),
 )  # fmt: skip
-"""All of them, by the function that each replaces."""
+"""All patches of functions."""
 
 
 @functools.cache
 def _replacements() -> tuple[tuple[Any, str, Any, Any], ...]:
-    """Return (owner, name, numba's, ours) of all that apply to this numba."""
+    """Return (owner, name, original, patch) of all patches that apply to this numba."""
     found = []
     for trick in TRICKS:
         if applies(trick.title, trick.reads):
@@ -375,7 +380,7 @@ _depth = 0
 
 @contextmanager
 def lighter() -> Iterator[None]:
-    """Compile with all that applies, and without looking for garbage: what a kernel leaves behind is 100 MB at most."""
+    """Compile with all patches that apply, and without garbage collection: a kernel leaves at most 100 MB of garbage."""
     global _depth
     with _lock, nothing_to_collect():
         if _depth == 0:
@@ -396,12 +401,12 @@ def lighter() -> Iterator[None]:
 
 @_register(mutates_CFG=True, analysis_only=False)
 class ClosuresIfAny(_Closures):  # type: ignore[misc]
-    """Look for closures, comprehensions, reductions and stencils only where there may be one."""
+    """Pass that inlines closures, comprehensions, reductions and stencils, run only if there may be one."""
 
     _name = "inline_closure_likes_if_any"
 
     def run_pass(self, state: Any) -> bool:
-        """Run numba's pass, or what it ends with."""
+        """Run numba's pass, or only its final steps."""
         if any(_may_be_inlined(statement) for b in state.func_ir.blocks.values() for statement in b.body):
             return bool(super().run_pass(state))
         _Processor(state.func_ir).run()
@@ -423,12 +428,12 @@ _INLINED = ("reduce", "stencil")
 
 @_register(mutates_CFG=True, analysis_only=False)
 class RewritesIfAny(_Rewrites):  # type: ignore[misc]
-    """Look for array expressions and named fields only where there may be one: kernels allocate no arrays."""
+    """Pass that rewrites array expressions and named fields, run only if there may be one: kernels allocate no arrays."""
 
     _name = "nopython_rewrites_if_any"
 
     def run_pass(self, state: Any) -> bool:
-        """Run numba's pass, or nothing."""
+        """Run numba's pass if it may have something to do."""
         kinds = (types.Record, types.StringLiteral, types.DictType, types.LiteralStrKeyDict, types.List)
         if state.flags.nrt or any(isinstance(kind, kinds) for kind in state.typemap.values()):
             return bool(super().run_pass(state))
@@ -436,7 +441,7 @@ class RewritesIfAny(_Rewrites):  # type: ignore[misc]
 
 
 class Spared(NamedTuple):
-    """A pass of numba and what takes its place."""
+    """A pass of numba and its replacement."""
 
     numbas: Any
     ours: Any
@@ -444,7 +449,7 @@ class Spared(NamedTuple):
 
     @property
     def title(self) -> str:
-        """What it is called where replacements are listed, or left out."""
+        """Name of the patch, in lists and in LEFT_OUT."""
         return self.numbas.__name__  # type: ignore[no-any-return]
 
 
@@ -463,5 +468,5 @@ def _places() -> dict[Any, Any]:
 
 
 def spared(passes: list[tuple[Any, str]]) -> list[tuple[Any, str]]:
-    """Return numba's list of passes with ours in their places."""
+    """Return numba's list of passes with the replaced ones exchanged."""
     return [(_places().get(each, each), text) for each, text in passes]
