@@ -1,8 +1,8 @@
 """numba's compiler pipelines: entry points are compiled completely, inlined functions without machine code.
 
-Loops over lanes, `for l in range(np.uint64(16))` with a literal count, remain loops until LLVM vectorises them. It would
-unroll short ones before that, and rarely vectorises the result: for a block of agents in float64 some laws were computed
-lane by lane. For the same reason short loops may be vectorised with a run-time check for overlapping arrays
+Loops over lanes, `for l in range(np.uint64(16))` with a literal count, remain loops until LLVM vectorises them. It
+would unroll short ones before that, and rarely vectorises the result: for a block of agents in float64 some laws were
+computed lane by lane. For the same reason short loops may be vectorised with a run-time check for overlapping arrays
 (`_short_loops`).
 
 numba generates machine code and a Python wrapper for every compiled function, and fully optimises each before its

@@ -105,11 +105,9 @@ def applies(title: str, reads: tuple[Known, ...]) -> bool:
     return reads_as_known(reads) and title not in left_out and "all" not in left_out
 
 
-# --- cached: the implementation of a call with given types --------------------------------------------------------------------
+# --- cached: the implementation of a call with given types ------------------------------------------------------------
 
-_remembered: dict[
-    int, tuple[Any, dict[Any, Any]]
-] = {}  # by id of the function type; the type itself is stored to keep it alive
+_remembered: dict[int, tuple[Any, dict[Any, Any]]] = {}  # by id of the function type, which is stored to keep it alive
 
 
 def _memory(function: Any) -> dict[Any, Any]:
@@ -178,10 +176,7 @@ def _known_first(resolve: Any) -> Any:
             return resolve(self, function, args, kws)
         item = self, id(args[0]), args[1]
         if item not in items:
-            items[item] = (
-                resolve(self, function, args, kws),
-                args[0],
-            )  # stored to keep it alive, so that its id stays valid
+            items[item] = resolve(self, function, args, kws), args[0]  # stored, so that its id stays valid
         return items[item][0]
 
     return resolve_function_type
@@ -199,7 +194,7 @@ def _known_plain(find: Any) -> Any:
     return unliteral
 
 
-# --- cheaper: the same result, computed faster -------------------------------------------------------------------------
+# --- cheaper: the same result, computed faster ------------------------------------------------------------------------
 
 
 def _values(_: Any) -> Any:
@@ -296,7 +291,7 @@ def _if_new(refresh: Any) -> Any:
 
 
 def _where_it_is(slowly: Any) -> Any:
-    """Rewrite only blocks that contain a variable: numba goes through every statement of a function for each variable."""
+    """Rewrite only blocks that contain a variable: numba goes through all statements of a function for each variable."""
 
     def names(block: Any) -> frozenset[str]:
         known = vars(block).get("_flockenv_names")
@@ -380,7 +375,7 @@ _depth = 0
 
 @contextmanager
 def lighter() -> Iterator[None]:
-    """Compile with all patches that apply, and without garbage collection: a kernel leaves at most 100 MB of garbage."""
+    """Compile with all patches that apply, and without garbage collection: a kernel leaves at most 100 MB."""
     global _depth
     with _lock, nothing_to_collect():
         if _depth == 0:
@@ -428,7 +423,7 @@ _INLINED = ("reduce", "stencil")
 
 @_register(mutates_CFG=True, analysis_only=False)
 class RewritesIfAny(_Rewrites):  # type: ignore[misc]
-    """Pass that rewrites array expressions and named fields, run only if there may be one: kernels allocate no arrays."""
+    """Pass that rewrites array expressions and named fields, run only if there may be one: kernels allocate none."""
 
     _name = "nopython_rewrites_if_any"
 

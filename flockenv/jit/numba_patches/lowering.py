@@ -1,11 +1,11 @@
 """A shorter lowering of numba: LLVM code for arrays, loops and calls without what LLVM would remove again.
 
 Half of the compile time of a kernel went into writing LLVM code, parsing it and removing redundancy: numba stores all
-fields of an array for each number that is read from it, and for each call unpacks a namedtuple of twenty arrays into two
-hundred arguments, which the called function packs again. Here a number is read directly from the array's data, a view is
-built only from the fields that differ, a loop with step 1 needs no division, and a function that is only ever inlined
-receives a namedtuple as one argument. Flock in float64 has 33,000 instructions instead of 86,000; the machine code is
-the same.
+fields of an array for each number that is read from it, and for each call unpacks a namedtuple of twenty arrays into
+two hundred arguments, which the called function packs again. Here a number is read directly from the array's data, a
+view is built only from the fields that differ, a loop with step 1 needs no division, and a function that is only ever
+inlined receives a namedtuple as one argument. Flock in float64 has 33,000 instructions instead of 86,000; the machine
+code is the same.
 
 If the functions of numba that this relies on differ (another version), it is left out; see `front_end`.
 """
@@ -198,7 +198,7 @@ class Brief(_Lower):  # type: ignore[misc]
         return self.builder.extract_value(array, self.context.data_model_manager[kind].get_field_position(name))
 
     def _spans(self, kind: Any, array: Any, places: tuple[Any, ...], index: Any) -> list[tuple[Any, Any]]:
-        """Return for each axis (first, size): None as first means 0, None as size an integer index, which drops the axis."""
+        """Return for each axis (first, size); first None means 0, size None an integer index, which drops the axis."""
         context, builder, found = self.context, self.builder, []
         for axis, place in enumerate(places):
 
@@ -238,7 +238,7 @@ class Brief(_Lower):  # type: ignore[misc]
         return builder.gep(data, [at]) if kind.layout == "C" else _code.pointer_add(builder, data, at)
 
     def lower_expr(self, resty: Any, expr: Any) -> Any:
-        """Lower loops over `range` with step 1, and pairs, shortly; leave everything else to numba."""
+        """Lower loops over `range` with step 1, and pairs, to short code; leave everything else to numba."""
         kind = self.typeof(expr.value.name) if expr.op in LOOPS else None
         if isinstance(kind, types.RangeType) and expr.op == "getiter" and self._by_ones(expr.value):
             return self._begun(kind, self.loadvar(expr.value.name))
