@@ -291,7 +291,7 @@ def _if_new(refresh: Any) -> Any:
 
 
 def _where_it_is(slowly: Any) -> Any:
-    """Rewrite only blocks that contain a variable: numba goes through all statements of a function for each variable."""
+    """Rewrite only blocks that contain a variable: numba goes through all of a function's statements for each one."""
 
     def names(block: Any) -> frozenset[str]:
         known = vars(block).get("_flockenv_names")
