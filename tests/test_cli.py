@@ -601,7 +601,7 @@ def test_an_interrupted_stress_keeps_what_was_found(
         ("render pursuit --out x.gif --player reynolds", "player 'reynolds': is called 'rules'"),
         ("render pursuit --out x.gif --player orca", "there is no hand-written player 'orca' for 'pursuit'"),
         ("render pursuit --out x.gif --player no.safetensors", "player 'no.safetensors': no such file"),
-        ("render pursuit --out x.gif --duration 3", "--duration = 3: goes with a scene"),
+        ("render pursuit --out x.gif --duration 3", "--duration = 3: only for scenes"),
         ("render tiny.yaml --out x.gif --size 1", "Invalid value for '--size'"),
         ("explain nothing.yaml", "nothing.yaml: no such file"),
     ],

@@ -40,7 +40,7 @@ def in_tuples(value: Any) -> Any:
 
 
 class _OneLine(ModelMetaclass):
-    """Metaclass that turns pydantic's report into one line if a record is built by hand; files go through config.py."""
+    """Metaclass that turns pydantic's report into one line if a record is built by hand; files go through yaml_io."""
 
     def __call__(cls, *args: Any, **data: Any) -> Any:  # noqa: N805  # the class of a class
         try:
