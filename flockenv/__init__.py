@@ -6,16 +6,16 @@ Importing it registers the environments with Gymnasium and PettingZoo::
     gymnasium.make_vec("flockenv/Obstacles-v0", num_envs=64)
     pettingzoo.make("parallel", "flockenv/Flock-v1")
 
-The rest loads when it is asked for: neither torch nor matplotlib nor numba is imported before.
+Everything else is imported on first use; importing flockenv alone imports neither torch nor matplotlib nor numba.
 """
 
-# Signals first: in a command, `early_signals` blocks them until `signals` handles them, before anything else is
-# imported: Gymnasium alone takes a third of a second.
+# Signals first, as importing Gymnasium alone takes a third of a second: in a command, `early_signals` blocks them until
+# `signals` handles them.
 from flockenv.core import early_signals, signals, address_space  # isort: skip
 
 signals.begin_early()
 early_signals.release()
-address_space.require(early_signals.command())  # before the first library that needs much of it
+address_space.require(early_signals.command())  # before the first library that needs a lot of it
 
 import importlib  # noqa: E402  # see above
 from typing import TYPE_CHECKING, Any  # noqa: E402  # see above
@@ -89,7 +89,7 @@ _HOME = {
     "Step": "envs.world",
     "World": "envs.world",
 }
-"""Which module each public name lives in: it is imported on first use (PEP 562)."""
+"""Public name -> the module that defines it, imported on first use (PEP 562)."""
 
 register_all()
 

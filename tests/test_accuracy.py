@@ -460,11 +460,11 @@ def test_accuracy_of_a_scene_on_the_command_line(in_a_folder: Path, capsys: pyte
 @pytest.mark.parametrize(
     ("arguments", "text"),
     [
-        ("accuracy", "needs a SCENE.yaml or --suite"),
+        ("accuracy", "needs either a SCENE.yaml or --suite"),
         ("accuracy tiny.yaml --suite", "one of them"),
-        ("accuracy --suite --seconds 2", "--suite: has horizons"),
+        ("accuracy --suite --seconds 2", "--suite: has its own horizons"),
         ("accuracy --suite --problems keppler", "did you mean `kepler`"),
-        ("accuracy tiny.yaml --problems kepler", "--problems: goes with --suite"),
+        ("accuracy tiny.yaml --problems kepler", "--problems: needs --suite"),
         ("accuracy tiny.yaml --methods rk44", "did you mean `rk4`"),
         ("accuracy tiny.yaml --steps 8,x", "--steps = '8,x': must be positive numbers"),
         ("accuracy tiny.yaml --steps 8.5", "must be whole numbers"),

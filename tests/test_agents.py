@@ -274,8 +274,8 @@ def test_curves_train_every_setting_once_and_draw_them(tmp_path: Path, monkeypat
     ("curves", "said"),
     [
         ({"two epochs": {"epocs": 2}}, "curves.'two epochs'.epocs = 2: unknown key, did you mean `epochs`? allowed"),
-        ({"none": {"epochs": 0}}, "curves.none.epochs = 0: must be a whole number >= 1 (passes over a rollout)"),
-        ({"text": {"epochs": "2"}}, "curves.text.epochs = '2': must be a whole number >= 1, not text"),
+        ({"none": {"epochs": 0}}, "curves.none.epochs = 0: must be an integer >= 1 (passes over a rollout)"),
+        ({"text": {"epochs": "2"}}, "curves.text.epochs = '2': must be an integer >= 1, not text"),
         ({"../up": {"epochs": 2}}, "curves.'../up': a name is up to 40 letters, digits"),
         ({AS_CONFIGURED: {"epochs": 2}}, "curves.'as configured': that is what the settings under ppo are called"),
     ],

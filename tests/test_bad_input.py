@@ -146,7 +146,7 @@ def b04_nobody_and_one(tmp_path: Path) -> None:
 
 def b05_counts(tmp_path: Path) -> None:
     for text in ("-1", "2.5", "ten"):
-        written("count: 3", f"count: {text}", "groups[0].count = ", "must be a whole number >= 1")
+        written("count: 3", f"count: {text}", "groups[0].count = ", "must be an integer >= 1")
     for text in ("1000000000", "1e30"):
         written("count: 3", f"count: {text}", "groups: 1,000,000,000", "GiB")
 

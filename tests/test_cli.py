@@ -279,7 +279,7 @@ sys.exit(main.main())
 def test_an_interrupted_run_keeps_what_was_done_and_leaves_with_130(tmp_path: Path) -> None:
     done = interrupted("simulating", "run", "tiny.yaml", "--duration", "1e6", "--every", "1000", "--out", "t.npz")
     assert done.returncode == 130, done.stderr
-    assert re.fullmatch(r"flockenv: interrupted; what was done until \S+ s is shown\n", done.stderr)
+    assert re.fullmatch(r"flockenv: interrupted; results until \S+ s are shown\n", done.stderr)
     summary = json.loads(Path("t.json").read_text())
     assert summary["stopped"] == "interrupted"
     assert 0 < summary["steps"] < 1e8
@@ -540,7 +540,7 @@ def test_stress_goes_on_where_it_was_and_loses_nothing(tried: list[str], capsys:
     capsys.readouterr()
     assert main(["stress", "--methods", "rk4", "--out", "hard.json"]) == 2
     assert capsys.readouterr().err == (
-        "flockenv: --out: hard.json holds 3 findings of other sources; --force begins anew\n"
+        "flockenv: --out: hard.json contains 3 findings of other sources; --force starts again\n"
     )
     assert not tried and json.loads(Path("hard.json").read_text()) == kept
     assert main(["stress", "--methods", "rk4", "--cases", "X01", "--out", "hard.json", "--force"]) == 0
@@ -551,7 +551,7 @@ def test_stress_does_not_take_another_file_for_its_own(tried: list[str], capsys:
     Path("mine.json").write_text('{"life": "work"}')
     assert main(["stress", "--out", "mine.json"]) == 2
     assert capsys.readouterr().err == (
-        "flockenv: --out: mine.json holds no findings of hard cases; --force overwrites it\n"
+        "flockenv: --out: mine.json contains no findings of hard cases; --force overwrites it\n"
     )
     assert not tried and Path("mine.json").read_text() == '{"life": "work"}'
 
@@ -565,7 +565,7 @@ def test_an_interrupted_stress_keeps_what_was_found(
     first = flockenv.studies.stress.CASES[0]
     monkeypatch.setattr("flockenv.studies.stress.CASES", (first, Case("X03", "stopped", "none", interrupted)))
     assert main(["stress", "--methods", "rk4", "--out", "hard.json"]) == 130
-    assert "interrupted; what was done is shown, the same command goes on" in capsys.readouterr().err
+    assert "interrupted; results so far are shown, the same command continues" in capsys.readouterr().err
     assert [f["case"] for f in json.loads(Path("hard.json").read_text())["findings"]] == ["X01"]
 
 
@@ -613,7 +613,7 @@ def test_an_interrupted_stress_keeps_what_was_found(
         ("render pursuit --out x.gif --player reynolds", "player 'reynolds': is called 'rules'"),
         ("render pursuit --out x.gif --player orca", "there is no hand-written player 'orca' for 'pursuit'"),
         ("render pursuit --out x.gif --player no.safetensors", "player 'no.safetensors': no such file"),
-        ("render pursuit --out x.gif --duration 3", "--duration = 3: goes with a scene"),
+        ("render pursuit --out x.gif --duration 3", "--duration = 3: only for scenes"),
         ("render tiny.yaml --out x.gif --size 1", "Invalid value for '--size'"),
         ("explain nothing.yaml", "nothing.yaml: no such file"),
     ],
@@ -673,7 +673,7 @@ def test_a_fault_of_ours_is_called_one(monkeypatch: pytest.MonkeyPatch, capsys: 
 
     monkeypatch.setattr("flockenv.scene.yaml_io.load_scene", broken)
     assert main(["run", "tiny.yaml"]) == 1
-    assert capsys.readouterr().err == "flockenv: KeyError: 'pos' (a fault of flockenv's; --debug shows where)\n"
+    assert capsys.readouterr().err == "flockenv: KeyError: 'pos' (a bug in flockenv; --debug shows where)\n"
 
 
 def test_too_little_memory_is_no_fault_of_ours(
@@ -687,7 +687,7 @@ def test_too_little_memory_is_no_fault_of_ours(
 
     for text, said in (
         ("Unable to allocate 3. GiB for an array", "not enough memory: Unable to allocate 3. GiB for an array"),
-        ("", "not enough memory: less is needed with fewer agents or worlds"),
+        ("", "not enough memory: use fewer agents or worlds"),
     ):
         monkeypatch.setattr("flockenv.scene.yaml_io.load_scene", short(text))
         assert main(["run", "tiny.yaml"]) == 2

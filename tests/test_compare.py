@@ -404,7 +404,7 @@ def test_weights_of_ones_own_play_under_the_name_of_their_file() -> None:
         (("--worlds", "1"), "--worlds 1: must be from 2"),
         (("--worlds", "0"), "--worlds 0: must be from 2"),
         (("--worlds", "1000000000"), "--worlds 1000000000: must be from 2 to 1000000"),
-        (("--seed", "-1"), "seed: -1, must be a whole number from 0 to 999"),
+        (("--seed", "-1"), "seed: -1, must be an integer from 0 to 999"),
         (("--seed", "1000"), "seed: 1000, must be"),
         (("--out", "../../x"), "--out '../../x': must not go up"),
         (("--out", "/etc/x"), "--out '/etc/x': must lie below"),

@@ -200,11 +200,11 @@ def test_the_command_writes_a_page_and_goes_on_where_it_was(
     others = Results.model_validate_json(Path("crowds.json").read_text()).model_copy(update={"sources": "others"})
     Path("crowds.json").write_text(others.model_dump_json())
     assert main(["validate", "--preset", "helbing_2000", "--out", "crowds.md"]) == 2
-    assert "crowds.json holds 1 findings of other sources; --force begins anew" in capsys.readouterr().err
+    assert "crowds.json contains 1 findings of other sources; --force starts again" in capsys.readouterr().err
     assert Results.model_validate_json(Path("crowds.json").read_text()) == others
     Path("mine.json").write_text("{}")
     assert main(["validate", "--out", "mine.json"]) == 2
-    assert "holds no findings of crowds" in capsys.readouterr().err
+    assert "contains no findings of crowds" in capsys.readouterr().err
 
 
 def test_when_somebody_was_somewhere_and_when_he_left() -> None:

@@ -203,13 +203,13 @@ def test_time_is_taken_inside_predict_alone(monkeypatch: pytest.MonkeyPatch) -> 
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"worlds": 0}, "worlds: 0, must be a whole number from 1 to 1000000"),
+        ({"worlds": 0}, "worlds: 0, must be an integer from 1 to 1000000"),
         ({"worlds": 10**9}, "worlds: 1000000000, must"),
         ({"worlds": 2.5}, "worlds: 2.5, must"),
         ({"worlds": True}, "worlds: True, must"),
         ({"seed": -1}, "seed: -1, must"),
         ({"seed": "1"}, "seed: '1', must"),
-        ({"record": 6}, "record: 6, must be a whole number from 0 to 5"),
+        ({"record": 6}, "record: 6, must be an integer from 0 to 5"),
         ({"record": -1}, "record: -1, must"),
     ],
 )
@@ -249,7 +249,7 @@ def test_a_world_that_never_ends_is_not_waited_for() -> None:
             step.reward[:], step.terms[:] = 0, 0
             return step
 
-    with pytest.raises(RuntimeError, match="world 1 goes on after its time limit"):
+    with pytest.raises(RuntimeError, match="world 1 continues after its time limit"):
         rollout(Toy(), Constant(), 3, 0, make_world=Endless)  # type: ignore[arg-type]
 
 
@@ -272,7 +272,7 @@ def test_the_blocks_of_seeds_do_not_meet() -> None:
     ("arguments", "message"),
     [
         (("testing", 0, 1), "purpose: 'testing', must be one of training, tuning, evaluation"),
-        (("training", 1000, 1), "seed: 1000, must be a whole number from 0 to 999"),
+        (("training", 1000, 1), "seed: 1000, must be an integer from 0 to 999"),
         (("training", -1, 1), "seed: -1"),
         (("training", 0, 1_000_001), "worlds: 1000001"),
     ],

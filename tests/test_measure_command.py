@@ -159,7 +159,7 @@ def test_interrupted_it_shows_what_there_is(
     command = ["measure", "streams.yaml", "--time", "2", "--seeds", "3", "--json", "x.json", "--out", "p", *LINE]
     assert main(command) == 130
     captured = capsys.readouterr()
-    assert "interrupted; what there is until then is shown" in captured.err
+    assert "interrupted; results until then are shown" in captured.err
     assert "density times speed" in captured.out
     assert "nearest neighbour" not in captured.out
     found = numbers()
@@ -183,7 +183,7 @@ def test_a_run_that_ends_early_is_measured_until_then(capsys: pytest.CaptureFixt
     Path("bad.yaml").write_text(free.replace("dt:", "effects: [{kind: quadratic_drag, rate: 1.0e+60}]\ndt:"))
     assert main(["measure", "bad.yaml", "--time", "2"]) == 1
     captured = capsys.readouterr()
-    assert "what there is until then is shown" in captured.err
+    assert "results until then are shown" in captured.err
     assert "agents " in captured.out
 
 

@@ -308,7 +308,7 @@ def test_springs_of_a_mesh_are_the_edges_of_its_elements_unless_pairs_are_given(
 
 
 @pytest.mark.parametrize(("call", "line"), [
-    (lambda: Rope(links=0, length=1), "Rope: links = 0: must be a whole number >= 1"),
+    (lambda: Rope(links=0, length=1), "Rope: links = 0: must be an integer >= 1"),
     (lambda: Rope(links=True, length=1), "links = True"),
     (lambda: Rope(links=2), "a rope needs an end or a length"),
     (lambda: Rope(links=2, end=(0, 0)), "it is the start, so the rope needs a length"),
@@ -350,7 +350,7 @@ def test_springs_of_a_mesh_are_the_edges_of_its_elements_unless_pairs_are_given(
     (lambda: Mesh(vertices=SQUARE, pairs=((0, 1), (2, 2))), "pairs[1] = (2, 2): the same particle twice"),
     (lambda: Mesh(vertices=SQUARE, pairs=((0, 1), (2, 3), (1, 0))), "pairs[2] = (1, 0): the same as pairs[0]"),
     (lambda: Mesh(vertices=SQUARE, pairs=((0, 4),)), "pairs[0] = (0, 4): there is no such particle, they are 0 to 3"),
-    (lambda: Mesh(vertices=SQUARE, pairs=((0, -1),)), "pairs[0][1] = -1: must be a whole number >= 0"),
+    (lambda: Mesh(vertices=SQUARE, pairs=((0, -1),)), "pairs[0][1] = -1: must be an integer >= 0"),
     (lambda: Mesh(vertices=SQUARE, pairs=((0, 10**30),)), "pairs[0][1] = 1"),
     (lambda: Mesh(vertices=SQUARE, pairs=((0, 1),), rest=(-1,)), "rest[0] = -1"),
     (lambda: Mesh(vertices=SQUARE, pairs=((0, 1),), rest=(1, 1)), "rest: 2 lengths for 1 pairs"),

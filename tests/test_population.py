@@ -527,7 +527,7 @@ ONE = {"kind": "emitter", "place": {"kind": "point", "at": [0, 0]}, "rate": 1.0}
         ({**ONE, "rate": 1e12}, "<= 1000000000.0"),
         ({**ONE, "rate": 0}, "rate = 0: give a rate or bursts"),
         ({**ONE, "group": 2}, r"population\[0\].group = 2: the scene has 2, counted from 0; did you mean 1\?"),
-        ({**ONE, "group": -1}, "group = -1: must be a whole number >= 0"),
+        ({**ONE, "group": -1}, "group = -1: must be an integer >= 0"),
         ({**ONE, "place": {"kind": "pint", "at": [0, 0]}}, "unknown, did you mean `point`"),
         ({**ONE, "place": {"kind": "point", "at": [0, 0, 0]}}, "at = .*has 3 numbers, but dimension = 2"),
         (

@@ -1,1 +1,1 @@
-"""flockenv on the command line."""
+"""The command line of flockenv."""

@@ -1,6 +1,6 @@
-"""The gallery of behaviours: a page that says what each is, with the trajectories of its own small scene.
+"""The gallery of behaviours: a page that describes each, with the trajectories of its own small scene.
 
-Everything on it comes from the behaviours themselves: docstring, fields, `demo`.
+Its content comes from the behaviour classes: docstring, fields, `demo`.
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ SIZE = 360
 """Width of a picture, pixels."""
 
 INSTANTS = 160
-"""How many instants a trajectory is drawn through."""
+"""Approximate number of instants at which a drawn trajectory is sampled."""
 
 
 def shown(behaviour: type[Effect]) -> Trajectory:
-    """Return the run of a behaviour's own scene; ValueError if it has none, or it does not run to its end."""
+    """Return the run of a behaviour's demo scene; ValueError if it has none, or the run stops early."""
     kind = behaviour.model_fields["kind"].default
     if behaviour.demo is None:
         raise ValueError(f"{kind}: has no demo, a small scene that shows it, as YAML")
@@ -43,7 +43,7 @@ def shown(behaviour: type[Effect]) -> Trajectory:
 
 
 def families(behaviours: Mapping[str, type[Effect]]) -> dict[str, list[type[Effect]]]:
-    """Return behaviours by the file that they are in, under the first sentence of its text."""
+    """Return behaviours grouped by module, keyed by the first paragraph of the module's docstring."""
     found: dict[str, list[type[Effect]]] = {}
     for behaviour in behaviours.values():
         text = inspect.getdoc(sys.modules[behaviour.__module__]) or behaviour.__module__
@@ -56,7 +56,7 @@ def page(behaviours: Mapping[str, type[Effect]], pictures: str) -> str:
     lines = [
         "# Behaviours",
         "",
-        "What agents can want, each in a small scene of its own. The behaviours themselves say what is here;",
+        "The behaviours of agents, each in its own small scene. This page is made from their docstrings and fields;",
         "`flockenv gallery --out docs/behaviours.md --force` draws and writes it. A behaviour is listed under",
         "`effects` of a scene, or under `behaviours` of a `steer` effect, whose arbitration reconciles several.",
         "Lines fade towards the past.",
@@ -72,7 +72,7 @@ def page(behaviours: Mapping[str, type[Effect]], pictures: str) -> str:
 def write_gallery(
     path: Path, behaviours: Mapping[str, type[Effect]] = BEHAVIOURS, progress: Callable[[int], None] = lambda done: None
 ) -> int:
-    """Write the page, and a picture of each behaviour into a folder beside it; return how many there are."""
+    """Write the page, and a picture of each behaviour into a folder beside it; return the number of behaviours."""
     folder = path.with_suffix("")
     with made(folder):
         for done, (kind, behaviour) in enumerate(behaviours.items()):
@@ -85,7 +85,7 @@ def write_gallery(
 
 
 def _entry(behaviour: type[Effect], pictures: str) -> list[str]:
-    """Return the lines about one behaviour."""
+    """Return the lines of the page about one behaviour."""
     kind = behaviour.model_fields["kind"].default
     fields = [
         f"| `{name}` | {field.description or ''} | {'' if field.is_required() else _default(field.default)} |"

@@ -1,4 +1,4 @@
-"""flockenv on the command line.
+"""The command line of flockenv.
 
 list | run | measure | render | explain | accuracy | stress | experiment | gallery | validate | warmup | schema
 
@@ -55,18 +55,18 @@ if TYPE_CHECKING:
     from flockenv.studies.trajectory import Trajectory
     from flockenv.tasks import Task
 
-# Nothing that simulates, draws or learns is imported up here: `flockenv --help` answers in a fifth of a second.
+# Nothing that simulates, draws or learns is imported at the top, so that `flockenv --help` takes a fifth of a second.
 
 __all__ = ["app", "main"]
 
 PICTURES = (".gif", ".png", ".html")
 FPS, MOST_FPS = 25.0, 50.0  # of a scene's GIF; viewers slow down beyond 50
-TRAIL = 25  # instants that a PNG shows behind everybody
+TRAIL = 25  # past positions of each agent that a PNG shows
 RECORDED_EVERY = 0.1  # s, rounded to whole steps
 
 
 def _task_or_file(incomplete: str) -> list[str]:
-    """Return the tasks, and the scene files and folders beside them, that a word may go on to (shell completion)."""
+    """Return the tasks, scene files and folders that complete a word (shell completion)."""
     from flockenv.envs.registration import HORIZONS
 
     tasks = (re.sub(r"(?<!^)(?=[A-Z])", "_", name).lower() for name in HORIZONS)
@@ -79,7 +79,7 @@ def _task_or_file(incomplete: str) -> list[str]:
 app = typer.Typer(
     help="Steering agents: hand-written rules and learned policies in the same worlds.",
     no_args_is_help=True,
-    rich_markup_mode="markdown",  # in "rich" what stands in brackets is taken for a style, and vanishes
+    rich_markup_mode="markdown",  # in "rich", text in brackets is taken for a style and vanishes
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
@@ -91,9 +91,10 @@ Duration = Annotated[float, typer.Option(metavar="S", help="Simulated time in se
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run a command line and return its exit code: 0, 1 (a run went wrong), 2 (bad input), 130 (interrupted).
+    """Run a command line and return its exit code: 0, 1 (a run failed), 2 (bad input), 130 (interrupted).
 
-    `--debug`, anywhere, shows tracebacks instead of one line. Without arguments it is the program and handles signals.
+    `--debug`, anywhere, shows tracebacks instead of one line. Without `arguments` it runs sys.argv as the main program
+    and handles signals.
     """
     if arguments is not None:
         return _run(list(arguments))
@@ -106,13 +107,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _run(words: Sequence[str]) -> int:
     debug = "--debug" in words
-    signals.say("")  # what an earlier command of this process kept is no word of this one
+    signals.say("")  # discard the text of an earlier command of this process
     try:
         with warnings.catch_warnings(), naming_stdout():
             warnings.showwarning = _warn
             code = app([w for w in words if w != "--debug"], prog_name="flockenv", standalone_mode=False)
         flush_output()
-        # typer turns a KeyboardInterrupt into this code without a word
+        # typer turns a KeyboardInterrupt into this code without a message
         return _interrupted() if code == INTERRUPTED else int(code or OK)
     except (typer.Abort, KeyboardInterrupt):
         return _interrupted()
@@ -125,7 +126,7 @@ def _run(words: Sequence[str]) -> int:
 
 
 def _interrupted(text: str = "") -> int:
-    """Say that a signal ended the command, with what was kept if anything was; return the exit code."""
+    """Print the line about the signal that ended the command, `text` if given; return the exit code."""
     if text:
         signals.say(text)
     if line := signals.said():
@@ -134,7 +135,7 @@ def _interrupted(text: str = "") -> int:
 
 
 def _warn(message: Warning | str, *place: object, **more: object) -> None:
-    """Say a warning as errors are said, in one line, without the place in our sources."""
+    """Print a warning like an error, in one line, without the line of source code."""
     _complain(f"warning: {message}", OK)
 
 
@@ -151,17 +152,17 @@ def _show_version(asked: bool) -> None:
 
 @app.callback()
 def _options(
-    debug: Annotated[bool, typer.Option("--debug", help="Show a traceback where something goes wrong.")] = False,
+    debug: Annotated[bool, typer.Option("--debug", help="Show a traceback if something goes wrong.")] = False,
     version: Annotated[
         bool, typer.Option("--version", help="Show the version and exit.", is_eager=True, callback=_show_version)
     ] = False,
 ) -> None:
-    """Read the options that every command has; `main` has taken --debug out already."""
+    """Define the options of every command; `main` has already removed --debug."""
 
 
 @app.command("list")
 def listing() -> None:
-    """Show the tasks and their ids, effects, behaviours, integrators, emitters, sinks and spaces, a sentence each."""
+    """List tasks with their ids, effects, behaviours, integrators, emitters, sinks and spaces, with a sentence each."""
     import gymnasium
     import pettingzoo
 
@@ -195,7 +196,7 @@ def run(
     seed: Seed = 0,
     duration: Duration = 10.0,
     out: Annotated[
-        str | None, typer.Option(metavar="X.npz", help="Write the trajectory there, and a summary to X.json.")
+        str | None, typer.Option(metavar="X.npz", help="File for the trajectory; a summary goes to X.json.")
     ] = None,
     every: Annotated[
         float | None,
@@ -203,7 +204,7 @@ def run(
     ] = None,
     force: Force = False,
 ) -> None:
-    """Run a scene, show what a biologist would measure, and keep the trajectory if asked to."""
+    """Run a scene, show measures such as speed and polarisation, and write the trajectory if --out is given."""
     from flockenv.core.output_paths import checked_file
     from flockenv.scene.yaml_io import load_scene
     from flockenv.studies.trajectory import whole_steps
@@ -220,7 +221,7 @@ def run(
         beside = trajectory.save(path)
         console.print(f"{len(trajectory.step)} instants in {relative(path)}, summary in {relative(beside)}")
     if trajectory.stopped:
-        text = f"{trajectory.stopped}; what was done until {trajectory.last.time[0]:g} s is shown"
+        text = f"{trajectory.stopped}; results until {trajectory.last.time[0]:g} s are shown"
         raise EarlyEnd(text, INTERRUPTED if trajectory.stopped == "interrupted" else DIVERGED)
 
 
@@ -234,7 +235,7 @@ def render(
             autocompletion=_task_or_file,
         ),
     ],
-    out: Annotated[str, typer.Option(metavar="X.gif|X.png|X.html", help="What to write; a PNG shows the end.")],
+    out: Annotated[str, typer.Option(metavar="X.gif|X.png|X.html", help="Output file; a PNG shows the end.")],
     player: Annotated[
         str,
         typer.Option(
@@ -250,11 +251,11 @@ def render(
     ] = None,
     size: Annotated[int, typer.Option(min=64, max=4096, help="Width of a picture in pixels.")] = 600,
     trust_pickle: Annotated[
-        bool, typer.Option("--trust-pickle", help="Load Stable-Baselines3 zips too: executes the code in them.")
+        bool, typer.Option("--trust-pickle", help="Also load Stable-Baselines3 zips, which executes the code in them.")
     ] = False,
     force: Force = False,
 ) -> None:
-    """Draw a scene, or an episode of a task under some player, as GIF, PNG or HTML replay."""
+    """Draw a scene, or an episode of a task with a player, as GIF, PNG or HTML replay."""
     from flockenv.core.atomic_files import made
     from flockenv.core.output_paths import checked_file
     from flockenv.tasks import TASKS
@@ -262,7 +263,7 @@ def render(
     path = checked_file(out, PICTURES, force)
     if what in TASKS:
         if duration is not None:
-            raise ValueError(f"--duration = {duration:g}: goes with a scene; an episode of a task ends by itself")
+            raise ValueError(f"--duration = {duration:g}: only for scenes; an episode of a task ends by itself")
         (panels, fps), left = _episodes(TASKS[what](), player.split(","), seed, trust_pickle), ""
     elif what.endswith((".yaml", ".yml")) or Path(what).exists():
         panel, fps, left = _film(what, 10.0 if duration is None else duration, seed)
@@ -277,7 +278,7 @@ def render(
 
 @app.command()
 def explain(scene: SceneFile) -> None:
-    """Show the effects of a scene: what each calls for, what it costs per step, and what nobody asked for."""
+    """Show the effects of a scene: what each one needs, what it costs per step, and which features are left out."""
     from flockenv.scene.yaml_io import load_scene
     from flockenv.studies import cost_breakdown
 
@@ -286,7 +287,7 @@ def explain(scene: SceneFile) -> None:
         found = cost_breakdown.explain(loaded, progress=progress)
     console = new_console()
     rows = [(row.name, ", ".join(row.calls_for) or "nothing", str(row.cost)) for row in found.rows]
-    rows.append(("what several of them share", "", str(found.shared)))
+    rows.append(("shared by several effects", "", str(found.shared)))
     rows.append((found.remains, "", f"{found.rest:.3g}"))
     title = f"One step of {loaded.agents:,} agents: {found.step:.3g} us"
     show_table(console, title, rows, ("effect", "calls for", "costs us/step [95 % interval]"))
@@ -295,8 +296,8 @@ def explain(scene: SceneFile) -> None:
     console.print(f"Largest stable step: {found.largest_step}")
     if found.shares:
         shares = [(k, name, "-" if math.isnan(x) else f"{x:.3g}") for k, name, x in found.shares]
-        show_table(console, "Of what behaviours wish for, granted on average", shares, ("effect", "behaviour", "share"))
-    show_table(console, "Left out, because nobody asked for it", ([line] for line in found.left_out), [""])
+        show_table(console, "Mean share of each behaviour's steering granted", shares, ("effect", "behaviour", "share"))
+    show_table(console, "Left out, because nothing in the scene needs it", ([line] for line in found.left_out), [""])
 
 
 app.command()(measure)
@@ -319,10 +320,10 @@ def warmup(
         ),
     ] = None,
     dtype: Annotated[
-        str | None, typer.Option(metavar="float32|float64", help="Precision instead of their own.")
+        str | None, typer.Option(metavar="float32|float64", help="Precision, instead of that of the task or scene.")
     ] = None,
 ) -> None:
-    """Compile ahead what tasks and scenes need, so that no first step has to wait; show how long each took."""
+    """Compile the kernels of tasks and scenes in advance, so that the first step is fast; show how long each took."""
     from flockenv.jit.progress import compiled, unmatched
     from flockenv.scene.yaml_io import load_scene
     from flockenv.tasks import TASKS
@@ -355,8 +356,8 @@ def warmup(
         import numba
 
         new_console().print(
-            f"numba {numba.__version__}: compiling takes longer, since flockenv leaves out what was tried with another "
-            f"one: {', '.join(unmatched())}"
+            f"numba {numba.__version__}: compiling takes longer, as flockenv leaves out patches that were tested with "
+            f"another version: {', '.join(unmatched())}"
         )
 
 
@@ -376,7 +377,7 @@ def _first_step_of_scene(scene: Scene) -> None:
 
 @app.command()
 def schema() -> None:
-    """Print the JSON Schema of a scene, for editors that complete and check YAML."""
+    """Print the JSON Schema of a scene, for completion and checking of YAML in editors."""
     from flockenv.scene.yaml_io import schema as json_schema
 
     print(json.dumps(json_schema(), indent=2, allow_nan=False))
@@ -416,13 +417,13 @@ def _show_measures(console: Console, trajectory: Trajectory) -> None:
 
 
 def _unsolved(state: State) -> str:
-    """Return how many contacts a run left unsolved, to be added to a line; nothing if there are none."""
+    """Return the number of contacts that a run left unsolved, to be appended to a line; "" if there are none."""
     count = state.counted("unsolved")
     return f", {count:,} times contacts left unsolved" if count else ""
 
 
 def _film(file: str, duration: float, seed: int) -> tuple[Panel, float, str]:
-    """Return a scene's run as something to draw, its frames per second, and what it left unsolved."""
+    """Return the run of a scene as a panel, its frames per second, and the text about unsolved contacts."""
     from flockenv.render import Panel
     from flockenv.scene.yaml_io import load_scene
     from flockenv.studies.trajectory import whole_steps

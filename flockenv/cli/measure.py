@@ -1,4 +1,4 @@
-"""`flockenv measure`: a scene is run, once or from several seeds; its applicable measures are computed and drawn."""
+"""`flockenv measure`: run a scene with one or several seeds; compute and draw the measures that apply to it."""
 
 from __future__ import annotations
 
@@ -34,9 +34,9 @@ __all__ = ["measure"]
 
 FORMAT = 1
 EVERY = 0.1
-"""s, rounded to whole steps: the default interval between positions that are kept."""
+"""s, rounded to whole steps: the default interval between recorded positions."""
 CELL = 0.5
-"""m and s: the size of a cell of the picture of density in time; larger for a long run."""
+"""m and s: cell size of the space-time picture of density; larger for a long run."""
 MOST_CELLS = 400
 
 ABOVE_CHANCE = {"lanes": "lanes by chance", "burst length": "burst length by chance"}
@@ -45,20 +45,24 @@ ABOVE_CHANCE = {"lanes": "lanes by chance", "burst length": "burst length by cha
 def measure(
     scene: Annotated[str, typer.Argument(metavar="SCENE.yaml", help="A scene; see `flockenv schema` and configs/.")],
     time: Annotated[float, typer.Option(metavar="S", help="Simulated time in seconds, a whole multiple of dt.")] = 30.0,
-    skip: Annotated[float, typer.Option(metavar="S", help="Seconds of the beginning that do not count.")] = 0.0,
+    skip: Annotated[float, typer.Option(metavar="S", help="Seconds at the beginning that are left out.")] = 0.0,
     line: Annotated[
         str | None, typer.Option(metavar="X0,Y0,X1,Y1", help="A line in metres; forward is to its right.")
     ] = None,
     area: Annotated[
         str | None,
         typer.Option(
-            metavar="X0,Y0,X1,Y1", help="Two corners of an area, or all of them.", show_default="a box or torus"
+            metavar="X0,Y0,X1,Y1",
+            help="Two corners of an area, or all of its corners.",
+            show_default="a box or torus",
         ),
     ] = None,
     walkable: Annotated[
         str | None,
         typer.Option(
-            metavar="X,Y,X,Y,...", help="Where cells end, as the area.", show_default="the region, less obstacles"
+            metavar="X,Y,X,Y,...",
+            help="Where Voronoi cells end, like the area.",
+            show_default="the region, less obstacles",
         ),
     ] = None,
     every: Annotated[
@@ -98,14 +102,14 @@ def measure(
         new_console().print(f"{', '.join(drawn) or 'no pictures'} in {relative(folder)}")
     stopped = found[-1].stopped or ("interrupted" if len(found) < seeds else "")
     if stopped:
-        text = f"{stopped}; what there is until then is shown"
+        text = f"{stopped}; results until then are shown"
         raise EarlyEnd(text, INTERRUPTED if stopped == "interrupted" else DIVERGED)
 
 
 def _surveyed(
     scene: Scene, seed: int, seeds: int, steps: int, stride: int, asked: Asked
 ) -> tuple[list[Survey], Trajectory]:
-    """Run a scene from several seeds and measure each run; return the surveys, and the first run.
+    """Run a scene with several seeds and measure each run; return the surveys, and the first run.
 
     A run that stops early is the last; KeyboardInterrupt is raised only if nothing has been measured yet.
     """
@@ -178,7 +182,7 @@ def _area(option: str, text: str | None, is_convex: bool) -> Any:
 
 
 def _above(found: Sequence[Survey]) -> dict[str, Above]:
-    """Return the measures that are above chance, each over at least five runs that have it."""
+    """Return the comparison with chance of each measure in ABOVE_CHANCE that at least five runs have."""
     from flockenv.studies.measures import above_null
 
     out = {}
@@ -197,7 +201,7 @@ def _text(value: float) -> str:
 def _show(
     scene: Scene, found: Sequence[Survey], means: dict[str, Mean], above: dict[str, Above], run: Trajectory, stride: int
 ) -> None:
-    """Print the table; of several runs with 95 % intervals of the means."""
+    """Print the table of measures; for several runs, means with 95 % intervals."""
     from flockenv.studies.measured_run import UNITS
 
     console, many = new_console(), len(found)
@@ -225,7 +229,7 @@ def _summary(
     scene: Scene, asked: Asked, found: Sequence[Survey], means: dict[str, Mean], above: dict[str, Above],
     run: Trajectory, stride: int,
 ) -> dict[str, Any]:  # fmt: skip
-    """Return all measurements, ready for JSON: numbers without a meaning are null, never NaN."""
+    """Return all measurements, ready for JSON: undefined numbers are null, never NaN."""
     from flockenv.studies.measured_run import UNITS
 
     def plain(value: float) -> float | None:
@@ -288,7 +292,7 @@ def _draw(folder: Path, run: Trajectory, found: Sequence[Survey], asked: Asked, 
         alive = run.alive & np.isfinite(run.pos).all(axis=2)
         write_lanes(
             folder / PICTURES[1], run.pos, alive, found[0].way, (start.low, start.high),
-            f"{name}: who went where (orange along {_pointing(found[0].axis)}, blue against it)",
+            f"{name}: trajectories (orange along {_pointing(found[0].axis)}, blue against it)",
             solids, asked.line, asked.area,
         )  # fmt: skip
         drawn.append(PICTURES[1])
@@ -300,20 +304,20 @@ def _draw(folder: Path, run: Trajectory, found: Sequence[Survey], asked: Asked, 
     if run.scene.dimension == 2 and len(run.step) > 2:
         time, place, image = _space_time(run, found[0])
         where = None if asked.line is None else float(asked.line.mean(axis=0) @ found[0].axis)
-        write_space_time(folder / PICTURES[3], time, place, image, f"{name}: density along the way", where)
+        write_space_time(folder / PICTURES[3], time, place, image, f"{name}: density along the walking axis", where)
         drawn.append(PICTURES[3])
     return drawn
 
 
 def _pointing(axis: Any) -> str:
-    """Return a direction as text: +x, or by its angle."""
+    """Return a direction as text: +x, +y, -x, -y, or its angle."""
     names = {(1.0, 0.0): "+x", (0.0, 1.0): "+y", (-1.0, 0.0): "-x", (0.0, -1.0): "-y"}
     plain = (float(axis[0]) + 0.0, float(axis[1]) + 0.0)
     return names.get(plain, f"{math.degrees(math.atan2(plain[1], plain[0])):.0f}°")
 
 
 def _space_time(run: Trajectory, found: Survey) -> tuple[Any, Any, Any]:
-    """Return times (T + 1,), places along the axis (X + 1,), and density in each cell between them, (T, X)."""
+    """Return times (T + 1,), positions along the axis (X + 1,), and the density in each cell between them, (T, X)."""
     import numpy as np
 
     alive = run.alive & np.isfinite(run.pos).all(axis=2)

@@ -1,4 +1,4 @@
-"""Commands that measure and show: what accuracy costs, which methods survive hard cases, what behaviours do."""
+"""Commands of studies: accuracy of integrators, hard cases, experiments, gallery of behaviours."""
 
 from __future__ import annotations
 
@@ -36,15 +36,15 @@ if TYPE_CHECKING:
 
 __all__ = ["accuracy", "experiment", "gallery", "stored", "stress", "try_all", "write_numbers"]
 
-INTERRUPTED_LATER = "interrupted; what was done is shown"
-"""What an interrupt comes to once the first problem has been measured."""
+INTERRUPTED_LATER = "interrupted; results so far are shown"
+"""Message about an interrupt after the first problem has been measured."""
 
 
 def accuracy(
-    scenes: Annotated[list[str] | None, typer.Argument(metavar="SCENE.yaml", help="Scenes; none with --suite.")] = None,
+    scenes: Annotated[list[str] | None, typer.Argument(metavar="SCENE.yaml", help="Scenes; not with --suite.")] = None,
     suite: Annotated[bool, typer.Option("--suite", help="Measure the built-in problems instead.")] = False,
     problems: Annotated[
-        str, typer.Option(metavar="A,B", help="Of the suite these alone.", show_default="all of them")
+        str, typer.Option(metavar="A,B", help="Only these problems of the suite.", show_default="all")
     ] = "",
     seconds: Annotated[
         float | None, typer.Option(metavar="S", help="Simulated time of a scene in seconds.", show_default="about 1")
@@ -53,20 +53,20 @@ def accuracy(
     steps: Annotated[
         str,
         typer.Option(
-            metavar="N,M", help="In how many steps a scene is taken to its end.", show_default="around its dt"
+            metavar="N,M", help="Numbers of steps in which a scene is simulated.", show_default="around its dt"
         ),
     ] = "",
-    dts: Annotated[str, typer.Option(metavar="S,S", help="The same, by the length of a step in seconds.")] = "",
+    dts: Annotated[str, typer.Option(metavar="S,S", help="The same, as lengths of a step in seconds.")] = "",
     tolerance: Annotated[
-        str, typer.Option(metavar="M,M", help="Errors in metres to find the cheapest way to.")
+        str, typer.Option(metavar="M,M", help="Errors in metres for which the cheapest method is found.")
     ] = "1e-2,1e-4,1e-6",
-    repetitions: Annotated[int, typer.Option(min=0, max=1000, help="Runs whose median is the wall time.")] = 20,
+    repetitions: Annotated[int, typer.Option(min=0, max=1000, help="Runs; the wall time is their median.")] = 20,
     finer: Annotated[
         int | None,
         typer.Option(
             metavar="N",
             min=4,
-            help="Steps of a reference of own steps for each of the finest.",
+            help="Steps of the reference per step of the finest run.",
             show_default="up to 64",
         ),
     ] = None,
@@ -76,7 +76,7 @@ def accuracy(
     ] = None,
     force: Force = False,
 ) -> None:
-    """Show what accuracy costs: how far each integrator ends from the truth in which steps, beside its time."""
+    """Show the cost of accuracy: the final error of each integrator for each step length, and its time."""
     from flockenv.core.output_paths import checked_file
     from flockenv.physics.integrators import methods_named
     from flockenv.studies.accuracy import usual_methods
@@ -95,7 +95,7 @@ def accuracy(
     if len(reports) + refused < len(todo) or (reports and reports[-1].stopped):
         raise EarlyEnd(INTERRUPTED_LATER, INTERRUPTED)
     if not reports:
-        raise ValueError("accuracy: none of these has a reference; each line says why")
+        raise ValueError("accuracy: no problem has a reference; each line gives the reason")
 
 
 def _keep(path: Path | None, reports: Sequence[Report]) -> None:
@@ -108,15 +108,15 @@ def _keep(path: Path | None, reports: Sequence[Report]) -> None:
 def _todo(
     scenes: Sequence[str], suite: bool, problems: str, seconds: float | None, steps: str, dts: str, seed: int
 ) -> dict[str, Callable[[], Problem]]:
-    """Return how each problem is made, by its name or file; ValueError for options that do not go together."""
+    """Return name or file -> function that makes the problem; ValueError for options that exclude each other."""
     from flockenv.studies.accuracy import problems_named
 
     if suite == bool(scenes):
-        raise ValueError("accuracy: needs a SCENE.yaml or --suite, one of them")
+        raise ValueError("accuracy: needs either a SCENE.yaml or --suite")
     if suite and (seconds is not None or steps or dts):
-        raise ValueError("--suite: has horizons and steps of its own; --seconds, --steps and --dts go with a scene")
+        raise ValueError("--suite: has its own horizons and steps; --seconds, --steps and --dts are for scenes")
     if problems and not suite:
-        raise ValueError("--problems: goes with --suite")
+        raise ValueError("--problems: needs --suite")
     if suite:
         return {each.name: functools.partial(_same, each) for each in problems_named(_words(problems))}
     return {file: functools.partial(_problem, file, seconds, steps, dts, seed) for file in scenes}
@@ -126,10 +126,10 @@ def _measured(
     todo: Mapping[str, Callable[[], Problem]], methods: Sequence[Integrator], repetitions: int, finer: int | None,
     tolerances: Sequence[float], console: Console, keep: Callable[[Sequence[Report]], None],
 ) -> tuple[list[Report], int]:  # fmt: skip
-    """Measure problem after problem, keep and show each; return the reports, and how many problems have none.
+    """Measure problem after problem, store and show each; return the reports, and the number of problems without one.
 
     keep: called with all reports after each problem; an interrupt during compilation ends the process and loses none.
-    Of several problems those without a reference are a line each; the only one raises its ValueError.
+    Of several problems, each one without a reference gives a line; a single problem raises its ValueError.
     """
     from flockenv.studies.accuracy import measure
 
@@ -161,14 +161,14 @@ def _measured(
 
 
 def _refusal(name: str, error: ValueError) -> str:
-    """Return the first line of an error, with the name of the problem in front."""
+    """Return the first line of an error, prefixed by the name of the problem."""
     first, *more = str(error).splitlines()
     where = "" if first.startswith(name) else f"{name}: "
     return f"{where}{first}{f' (and {len(more)} more)' if more else ''}"
 
 
 def _show_accuracy(console: Console, report: Report, tolerances: Sequence[float]) -> None:
-    """Print one report: what it is measured against, errors, what each tolerance costs, the cheapest."""
+    """Print one report: its reference, the errors, the cost of each tolerance, the cheapest method."""
     from flockenv.studies.accuracy import table
 
     show_table(console, report.title, ([line] for line in table.headlines(report)), [""])
@@ -187,7 +187,7 @@ def _same(problem: Problem) -> Problem:
 
 
 def _problem(file: str, seconds: float | None, steps: str, dts: str, seed: int) -> Problem:
-    """Return what is to be measured on a scene: by default in steps 4 times as long as its own to 32 times shorter."""
+    """Return the problem of a scene; by default with 8 step lengths, halved from 4 dt (or 2 dt, or dt) on."""
     from flockenv.scene.yaml_io import load_scene
     from flockenv.studies.accuracy import Problem
     from flockenv.studies.trajectory import whole_steps
@@ -195,7 +195,7 @@ def _problem(file: str, seconds: float | None, steps: str, dts: str, seed: int) 
     loaded = load_scene(Path(file))
     horizon = max(1, round(1.0 / loaded.dt)) * loaded.dt if seconds is None else seconds
     if steps and dts:
-        raise ValueError("--steps and --dts: say the same in two ways; give one of them")
+        raise ValueError("--steps and --dts: both set the steps; give one of them")
     if steps:
         counts = [int(n) if n == int(n) else n for n in _numbers("--steps", steps)]
     elif dts:
@@ -208,7 +208,7 @@ def _problem(file: str, seconds: float | None, steps: str, dts: str, seed: int) 
 
 
 def _write(path: Path, numbers: Record, draw: Callable[[Path], None]) -> None:
-    """Write numbers as JSON, with a picture of them if `path` is that of a picture: both or neither."""
+    """Write results as JSON and, if `path` is a picture, draw them there: both files or neither."""
     from flockenv.core.atomic_files import deliver
 
     writers: dict[str, Callable[[Path], None]] = {
@@ -220,7 +220,7 @@ def _write(path: Path, numbers: Record, draw: Callable[[Path], None]) -> None:
 
 
 def write_numbers(path: Path, numbers: Record) -> None:
-    """Write numbers as JSON: whole or not at all, whatever a path ends in."""
+    """Write results as JSON, completely or not at all, with the suffix of `path` replaced by .json."""
     from flockenv.core.atomic_files import made, replacing
 
     with made(path.parent), replacing(path.with_suffix(".json")) as file:
@@ -228,7 +228,10 @@ def write_numbers(path: Path, numbers: Record) -> None:
 
 
 def stored(path: Path | None, what: str, sources: str) -> Results | None:
-    """Return the findings beside a path, none if there are none; ValueError if they are others, or of other sources."""
+    """Return the findings stored beside a path, None if there are none.
+
+    Raise ValueError if the file has other content, or findings of another version of the sources.
+    """
     from flockenv.studies.trial_log import Results
 
     numbers = None if path is None else path.with_suffix(".json")
@@ -237,15 +240,15 @@ def stored(path: Path | None, what: str, sources: str) -> Results | None:
     try:
         found = Results.model_validate_json(numbers.read_text(encoding="utf-8"))
     except ValueError:
-        raise ValueError(f"--out: {numbers.name} holds no findings of {what}; --force overwrites it") from None
+        raise ValueError(f"--out: {numbers.name} contains no findings of {what}; --force overwrites it") from None
     if found.sources != sources:
         count = len(found.findings)
-        raise ValueError(f"--out: {numbers.name} holds {count} findings of other sources; --force begins anew")
+        raise ValueError(f"--out: {numbers.name} contains {count} findings of other sources; --force starts again")
     return found
 
 
 def try_all(what: str, count: int, path: Path | None, known: Results | None, run: Run) -> tuple[Results, bool]:
-    """Try what is not known yet, and write all there is after every trial; return that, and whether it was stopped."""
+    """Run the trials that are not known yet, and write all results after each; return them, and True if interrupted."""
     found = known
 
     def keep(results: Results) -> None:
@@ -280,29 +283,29 @@ def _words(text: str) -> list[str]:
 
 
 def _numbers(option: str, text: str) -> list[float]:
-    """Return positive numbers written with commas between them."""
+    """Return comma-separated positive numbers; ValueError if the text is anything else."""
     try:
         numbers = [float(word) for word in _words(text)]
     except ValueError:
         numbers = []
     if not numbers or not all(math.isfinite(x) and x > 0 for x in numbers):
-        raise ValueError(f"{option} = {shown(text)}: must be positive numbers with commas between them")
+        raise ValueError(f"{option} = {shown(text)}: must be positive numbers, separated by commas")
     return numbers
 
 
 def stress(
-    cases: Annotated[str, typer.Option(metavar="A,B", help="Of the hard cases these alone, such as N14.")] = "",
+    cases: Annotated[str, typer.Option(metavar="A,B", help="Only these hard cases, such as N14.")] = "",
     methods: Annotated[str, typer.Option(metavar="A,B", help="Integrators.", show_default="all")] = "",
     out: Annotated[
         str | None,
         typer.Option(
             metavar="X.json|X.png",
-            help="Keep the findings; a picture has X.json beside it. What X.json says already is not tried again.",
+            help="Store the findings; a picture has X.json beside it. Findings in X.json are not computed again.",
         ),
     ] = None,
-    force: Annotated[bool, typer.Option("--force", help="Begin anew, whatever X.json says.")] = False,
+    force: Annotated[bool, typer.Option("--force", help="Start again, ignoring X.json.")] = False,
 ) -> None:
-    """Try every hard case under every integrator, and show value, bound and verdict of each."""
+    """Run every hard case with every integrator, and show value, bound and verdict of each."""
     from flockenv.core.output_paths import checked_file
     from flockenv.physics.integrators import methods_named
     from flockenv.studies.stress import CASES, cases_named, fingerprint, run, trials, usual_methods
@@ -317,14 +320,14 @@ def stress(
     console = new_console()
     show_table(console, "Hard cases", asked.rows(), ("case", "scene", "bound", *asked.unders))
     if notes := [(f.case, f.under, f.verdict, f.note) for f in asked.findings if f.verdict != "pass"]:
-        show_table(console, "What is not simply within its bound", notes, ("case", "method", "", ""))
+        show_table(console, "Findings that did not pass", notes, ("case", "method", "", ""))
     show_table(console, "Verdicts", asked.legend())
     if path is not None:
         _write(path, found, functools.partial(_draw_verdicts, found))
         every = trials(CASES, [method.kind for method in usual_methods()])
-        console.print(f"{relative(path)} holds {len(found.findings)} of {every} findings")
+        console.print(f"{relative(path)} contains {len(found.findings)} of {every} findings")
     if stopped:
-        raise EarlyEnd("interrupted; what was done is shown, the same command goes on", INTERRUPTED)
+        raise EarlyEnd("interrupted; results so far are shown, the same command continues", INTERRUPTED)
 
 
 def experiment(
@@ -334,7 +337,7 @@ def experiment(
     ] = None,
     force: Force = False,
 ) -> None:
-    """Run an experiment about steering: a table of what was measured, and a picture of where everybody went."""
+    """Run an experiment about steering; write a table of the measures and a picture of the trajectories."""
     from flockenv.core.output_paths import checked_file
     from flockenv.studies.experiments import load_plan, run
     from flockenv.studies.experiments.curves import write_order
@@ -355,10 +358,10 @@ def experiment(
 
 
 def gallery(
-    out: Annotated[str, typer.Option(metavar="X.md", help="The page; pictures go into a folder X beside it.")],
+    out: Annotated[str, typer.Option(metavar="X.md", help="File of the page; pictures go into a folder X beside it.")],
     force: Force = False,
 ) -> None:
-    """Draw every behaviour in a small scene of its own, and write a page about all of them."""
+    """Draw every behaviour in its own small scene, and write a page about all of them."""
     from flockenv.behaviours import BEHAVIOURS
     from flockenv.cli.gallery import write_gallery
     from flockenv.core.output_paths import checked_file

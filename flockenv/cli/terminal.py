@@ -1,4 +1,4 @@
-"""Parts of every command: exit codes, options, the console of tables, progress, one line on errors and signals."""
+"""Common parts of the commands: exit codes, options, console tables, progress, one-line errors and signals."""
 
 from __future__ import annotations
 
@@ -29,14 +29,14 @@ OK, DIVERGED, BAD_INPUT, INTERRUPTED = 0, 1, 2, 130
 MOST_SEED = 2**63 - 1
 
 FIRST, OFTEN = 3.0, 10.0
-"""s until the first line about progress if stderr is not a terminal, and between two of them."""
+"""s until the first progress line if stderr is not a terminal, and s between two lines."""
 
-Seed = Annotated[int, typer.Option(min=0, max=MOST_SEED, help="Which world: the same seed is the same run.")]
-Force = Annotated[bool, typer.Option("--force", help="Overwrite files that exist.")]
+Seed = Annotated[int, typer.Option(min=0, max=MOST_SEED, help="Seed of the world: the same seed gives the same run.")]
+Force = Annotated[bool, typer.Option("--force", help="Overwrite existing files.")]
 
 
-class EarlyEnd(Exception):  # noqa: N818  # not an error: what was done is kept and shown
-    """A run that ended before its time, and its exit code."""
+class EarlyEnd(Exception):  # noqa: N818  # not an error: the results so far are kept and shown
+    """A run that ended early, with its exit code."""
 
     def __init__(self, text: str, code: int) -> None:
         super().__init__(text)
@@ -44,23 +44,23 @@ class EarlyEnd(Exception):  # noqa: N818  # not an error: what was done is kept 
 
 
 def complain(name: str, text: str) -> None:
-    """Write lines to stderr, each with the name of the command in front."""
+    """Write lines to stderr, each prefixed by the name of the command."""
     for line in text.splitlines():
         print(f"{name}: {printable(line)}", file=sys.stderr)
 
 
 def verdict(error: Exception) -> tuple[str, int]:
     """Return the text for an error in a command, and the exit code."""
-    usage = getattr(error, "format_message", None)  # typer's own complaints about the command line
+    usage = getattr(error, "format_message", None)  # typer's own errors about the command line
     if usage is not None:
         return usage() or "no command given; see flockenv --help", BAD_INPUT
     if isinstance(error, MemoryError):
-        return f"not enough memory: {_first_line(error) or 'less is needed with fewer agents or worlds'}", BAD_INPUT
+        return f"not enough memory: {_first_line(error) or 'use fewer agents or worlds'}", BAD_INPUT
     if isinstance(error, OSError) and error.strerror:
         return _os_text(error), BAD_INPUT
     if isinstance(error, (ValueError, OSError, ImportError)):
         return str(error), BAD_INPUT
-    return f"{type(error).__name__}: {error} (a fault of flockenv's; --debug shows where)", DIVERGED
+    return f"{type(error).__name__}: {error} (a bug in flockenv; --debug shows where)", DIVERGED
 
 
 def _os_text(error: OSError) -> str:
@@ -76,7 +76,7 @@ def _first_line(error: Exception) -> str:
 def interruptible(interrupted: str = "interrupted") -> Iterator[None]:
     """End a command that a signal interrupts with one line on stderr, and the exit code of the signal.
 
-    interrupted: the line; "interrupted" at its beginning becomes the signal's own word.
+    interrupted: the line; a leading "interrupted" is replaced by the signal's own word.
     """
     signals.say(interrupted)
     try:
@@ -89,9 +89,9 @@ def interruptible(interrupted: str = "interrupted") -> Iterator[None]:
 
 @contextmanager
 def one_line(name: str, interrupted: str = "interrupted", debug: bool = False) -> Iterator[None]:
-    """End a command with one line on stderr and an exit code if its input is refused or a signal interrupts it.
+    """End a command with one line on stderr and an exit code if its input is invalid or a signal interrupts it.
 
-    interrupted: as for `interruptible`. debug: errors are raised as they are.
+    interrupted: as for `interruptible`. debug: errors are raised unchanged.
     """
     with interruptible(interrupted), naming_stdout():
         try:
@@ -105,7 +105,7 @@ def one_line(name: str, interrupted: str = "interrupted", debug: bool = False) -
 
 
 def program(name: str, app: typer.Typer, interrupted: str = "interrupted") -> None:
-    """Run an app as the program that this process is, and end the process with its exit code.
+    """Run an app as the main program of this process, and end the process with its exit code.
 
     interrupted: the line about an interrupt, unless the command itself sets another.
     """
@@ -116,13 +116,13 @@ def program(name: str, app: typer.Typer, interrupted: str = "interrupted") -> No
         except SystemExit as end:
             if end.code not in (INTERRUPTED, signals.code()):
                 raise
-            if line := signals.said():  # typer turns a KeyboardInterrupt into this code without a word
+            if line := signals.said():  # typer turns a KeyboardInterrupt into this code without a message
                 print(line, file=sys.stderr)
             signals.leave(signals.code())
 
 
 class _Output:
-    """Standard output with errors that name it: the system's own name no file."""
+    """Standard output whose errors name it: the system's own do not name a file."""
 
     def __init__(self, stream: TextIO) -> None:
         self._stream = stream
@@ -145,33 +145,33 @@ def _named() -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        with suppress(OSError, ValueError):  # what it holds is written at the end of the process, and must not fail
+        with suppress(OSError, ValueError):  # its buffer is flushed at the end of the process, which must not fail
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        if isinstance(error, BrokenPipeError) or error.strerror is None:  # named already
+        if isinstance(error, BrokenPipeError) or error.strerror is None:  # it already has a name
             raise
         raise OSError(f"standard output: {error.strerror}") from None
 
 
 @contextmanager
 def naming_stdout() -> Iterator[None]:
-    """Make errors of standard output name it, for all that is printed in a block."""
+    """Make errors of standard output name it, for everything printed in the block."""
     with redirect_stdout(cast("TextIO", _Output(sys.stdout))) if sys.stdout is not None else nullcontext():
         yield
 
 
 def flush_output() -> None:
-    """Flush stdout; an OSError names it if that fails. A reader that has gone is no error."""
+    """Flush stdout; if that fails, raise an OSError that names it. A closed pipe is no error."""
     with suppress(BrokenPipeError), _named():
         sys.stdout.flush()
 
 
 def printable(text: str) -> str:
-    """Return text without the control characters that would drive a terminal."""
+    """Return text with control characters, which a terminal would interpret, escaped."""
     return "".join(c if c.isprintable() else repr(c)[1:-1] for c in text)
 
 
 def new_console() -> Console:
-    """Return the console of tables; piped output is not folded to the 80 columns of an assumed terminal."""
+    """Return the console for tables; piped output is not folded to the 80 columns of an assumed terminal."""
     from rich.console import Console
 
     console = Console(highlight=False, markup=False)
@@ -179,7 +179,7 @@ def new_console() -> Console:
 
 
 def show_table(console: Console, title: str, rows: Iterable[Sequence[str]], columns: Sequence[str] = ("", "")) -> None:
-    """Print a table under a title; no header if columns have no names."""
+    """Print a table under a title; without a header if no column has a name."""
     from rich.table import Table
 
     console.print(title, style="bold")
@@ -193,14 +193,14 @@ def show_table(console: Console, title: str, rows: Iterable[Sequence[str]], colu
 
 
 def relative(path: Path) -> str:
-    """Return a path relative to the current folder, if it is below."""
+    """Return a path, relative to the current folder if it is below it."""
     here = Path.cwd().resolve()
     return str(path.relative_to(here) if path.is_relative_to(here) else path)
 
 
 @contextmanager
 def progress_bar(title: str, total: int, unit: str, first: str = "compiling") -> Iterator[Callable[[int], None]]:
-    """Show on stderr a command's progress and its remaining time; `first` is the stage before the work."""
+    """Show a command's progress and remaining time on stderr; `first` is the description until the first update."""
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
@@ -219,13 +219,13 @@ def progress_bar(title: str, total: int, unit: str, first: str = "compiling") ->
 
 
 class _Clock:
-    """Remaining time, by the work since the first report: compiling before that does not count."""
+    """Estimate of the remaining time from the work since the first report, which excludes compilation."""
 
     def __init__(self) -> None:
         self._since: tuple[float, int] | None = None
 
     def left(self, done: int, total: float) -> str:
-        """Return it in words, "" until some work is done."""
+        """Return the remaining time in words, "" until some work is done."""
         now = time.monotonic()
         if self._since is None:
             self._since = now, done
@@ -236,7 +236,7 @@ class _Clock:
 
 
 def in_words(seconds: float) -> str:
-    """Return a length of time in its largest fitting unit: 40 s, 3 min, 5 h, 12 days, 2,000 years."""
+    """Return a duration in its largest fitting unit: 40 s, 3 min, 5 h, 12 days, 2,000 years."""
     for unit, size, most in (("s", 1.0, 90.0), ("min", 60.0, 5400.0), ("h", 3600.0, 172800.0)):
         if seconds < most:
             return f"{seconds / size:.0f} {unit}"
@@ -246,7 +246,7 @@ def in_words(seconds: float) -> str:
 
 @contextmanager
 def shown_progress(progress: Progress) -> Iterator[Progress]:
-    """Show bars on a terminal; on anything else a line on stderr after FIRST seconds and every OFTEN seconds then."""
+    """Show bars on a terminal; otherwise write a line to stderr after FIRST seconds and then every OFTEN seconds."""
     if progress.console.is_terminal:
         with progress:
             yield progress
@@ -262,7 +262,7 @@ def shown_progress(progress: Progress) -> Iterator[Progress]:
 
 
 def _tell(progress: Progress, done: threading.Event) -> None:
-    """Write a line about each active bar, until all is done."""
+    """Write a line about each active bar at intervals, until `done` is set."""
     wait = FIRST
     while not done.wait(wait):
         wait = OFTEN
@@ -272,7 +272,7 @@ def _tell(progress: Progress, done: threading.Event) -> None:
 
 
 def _told(task: Task) -> str:
-    """Return one line about a bar: its task, the share done, the time so far, and the remaining time."""
+    """Return one line about a bar: task, percentage done, elapsed time and remaining time."""
     share = f" {100 * task.completed / task.total:.3g} %" if task.total and task.completed else ""
     more = [f"{in_words(task.elapsed or 0.0)} so far", *(str(text) for text in task.fields.values() if text)]
     if "left" not in task.fields and task.completed and task.time_remaining is not None:

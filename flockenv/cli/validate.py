@@ -1,4 +1,4 @@
-"""The command that tries models of pedestrians in the scenes of guidelines: a table, a page, pictures."""
+"""The `validate` command: models of pedestrians in the test scenes of guidelines; table, page and pictures."""
 
 from __future__ import annotations
 
@@ -21,28 +21,30 @@ __all__ = ["validate"]
 def validate(
     cases: Annotated[
         list[str] | None,
-        typer.Argument(metavar="CASE", help="Names, or first words of them.", show_default="all"),
+        typer.Argument(metavar="CASE", help="Names of cases, or their beginnings.", show_default="all"),
     ] = None,
     preset: Annotated[
         list[str] | None,
-        typer.Option(metavar="NAME", help="Published models; may be given again.", show_default="all"),
+        typer.Option(metavar="NAME", help="Published models; may be repeated.", show_default="all"),
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print the findings as JSON instead of tables.")] = False,
     out: Annotated[
-        str | None, typer.Option(metavar="X.md|X.json", help="Write the page, X.json beside it, pictures into X/.")
+        str | None,
+        typer.Option(metavar="X.md|X.json", help="Write a page, X.json beside it, and pictures in X/."),
     ] = None,
     scenes: Annotated[
-        str | None, typer.Option(metavar="FOLDER", help="Write the cases' scenes as YAML into it, and try nothing.")
+        str | None,
+        typer.Option(metavar="FOLDER", help="Only write the cases' scenes, as YAML, into this folder."),
     ] = None,
     force: Force = False,
 ) -> None:
-    """Try published models of pedestrians in the scenes of RiMEA and NIST: value, bound and verdict of each."""
+    """Run published models of pedestrians in the test scenes of RiMEA and NIST: value, bound and verdict of each."""
     from flockenv.core.output_paths import checked_file
     from flockenv.studies.validation import CASES, cases_named, fingerprint, presets_named, run, trials
 
     path = checked_file(out, [".json", ".md"], True, beside=".json") if out is not None else None
     if path is not None and path.suffix.lower() == ".md":
-        checked_file(str(path), [".md"], True, beside="")  # of pictures
+        checked_file(str(path), [".md"], True, beside="")  # the folder of pictures
     todo, under = cases_named(CASES, cases or []), presets_named(preset or [])
     if scenes is not None:
         _write_scenes(scenes, force, todo, under)
@@ -55,30 +57,28 @@ def validate(
     else:
         console = new_console()
         show_table(console, "Crowds", asked.rows(3), ("case", "", "bound", *asked.unders))
-        show_table(
-            console, "What came of each", [(f.case, f.under, f.verdict, f.note) for f in asked.findings], [""] * 4
-        )
+        show_table(console, "Remarks", [(f.case, f.under, f.verdict, f.note) for f in asked.findings], [""] * 4)
         show_table(console, "Verdicts", asked.legend())
     if path is not None:
         _write(path, found)
         if not as_json:
-            new_console().print(f"{relative(path)} holds {len(found.findings)} findings")
+            new_console().print(f"{relative(path)} contains {len(found.findings)} findings")
     if stopped:
-        raise EarlyEnd("interrupted; what was done is shown, the same command goes on", INTERRUPTED)
+        raise EarlyEnd("interrupted; results so far are shown, the same command continues", INTERRUPTED)
 
 
 def _write_scenes(folder: str, force: bool, cases: Sequence[Case], presets: Sequence[str]) -> None:
-    """Write the scenes of some cases, and say how many."""
+    """Write the scenes of some cases as YAML, and print their number."""
     from flockenv.core.output_paths import checked_path
     from flockenv.studies.validation.scenes import write_scenes
 
     path = checked_path(folder, "--scenes")
     written = write_scenes(path, cases, presets, force)
-    new_console().print(f"{relative(path)} holds {len(written)} scenes")
+    new_console().print(f"{relative(path)} contains {len(written)} scenes")
 
 
 def _write(path: Path, results: Results) -> None:
-    """Write the findings as JSON; of a page that, the page, and its pictures."""
+    """Write the findings as JSON; if `path` is a page (.md), also the page and its pictures."""
     write_numbers(path, results)
     if path.suffix.lower() == ".md":
         from flockenv.core.atomic_files import made, replacing

@@ -1,1 +1,1 @@
-"""What everything else rests on, in plain Python: records, errors, files that appear whole, signals."""
+"""The foundations, in plain Python: records, error messages, atomic files, signals."""

@@ -1,7 +1,7 @@
-"""Memory that a command needs before it does anything: too little is one line, not a failure inside a library.
+"""Check of the address space a command needs: too little gives a one-line message, not a failure inside a library.
 
-Where the address space is limited (`ulimit -v`, batch systems), numpy and llvmlite cannot be loaded and raise errors
-that do not mention memory; OpenBLAS never returns from being loaded.
+If the address space is limited (`ulimit -v`, batch systems), numpy and llvmlite fail to load with errors that do not
+mention memory, and loading OpenBLAS never returns.
 """
 
 from __future__ import annotations
@@ -13,11 +13,11 @@ import sys
 __all__ = ["require"]
 
 LIBRARIES, PER_CORE = 570 * 2**20, 20 * 2**20
-"""Bytes of address space that a command takes: measured on two cores, with 8 MiB of stack for each BLAS thread."""
+"""Bytes of address space that a command needs: measured on two cores, with 8 MiB of stack for each BLAS thread."""
 
 
 def require(command: str) -> None:
-    """End a command in one line, with exit code 2, if it cannot be given the address space that its libraries take."""
+    """Exit with code 2 and a one-line message if the address space for the command's libraries is not available."""
     if not command or os.name != "posix":
         return
     needed = LIBRARIES + PER_CORE * (os.cpu_count() or 1)

@@ -1,7 +1,7 @@
-"""Files that appear whole or not at all, one alone or several together.
+"""Atomic writes of one file or of several together: each appears complete or not at all.
 
-New files are written in a new folder beside their place. Only this user can enter it, and its name is unique, so no
-other writer and no planted link shares a name with them. They are forced onto the disk, and renamed to their place.
+New files are written in a new folder beside their target. Only this user can enter it, and its name is unique, so no
+other writer and no planted link can share a name with them. They are synced to the disk, then renamed to their target.
 """
 
 from __future__ import annotations
@@ -22,16 +22,16 @@ __all__ = ["LEFTOVERS", "deliver", "made", "remove_leftovers", "replacing"]
 _PREFIX, _SUFFIX = ".flockenv-", ".part"
 
 LEFTOVERS = f"{_PREFIX}*{_SUFFIX}"
-"""Glob of the folders in which files are written; one that stays belongs to a process that was killed."""
+"""Glob of the temporary folders in which files are written; one that is left over is from a killed process."""
 
 
 @contextmanager
 def replacing(path: str | os.PathLike[str], mode: int = 0o666) -> Iterator[BinaryIO]:
     """Open a new file for writing and rename it to `path` at the end; on any error nothing is left behind.
 
-    An existing file is replaced; a link is replaced itself and never followed. The folder must exist.
-    mode: permissions of the file; those that the umask names are taken away.
-    Raises ValueError or OSError, in one line that names the path, before the first byte where that can be known.
+    An existing file is replaced; a link is itself replaced, never followed. The folder must exist.
+    mode: permissions of the file, restricted by the umask.
+    Raises ValueError or OSError, in one line that names the path; before the first byte is written if possible.
     """
     target = _checked(Path(path))
     with _named(target), _beside(target.parent) as scratch:
@@ -44,18 +44,18 @@ def replacing(path: str | os.PathLike[str], mode: int = 0o666) -> Iterator[Binar
 
 
 def deliver(folder: Path, writers: Mapping[str, Callable[[Path], object]]) -> None:
-    """Write several files and, when all are whole, rename them to their places: all of them or none.
+    """Write several files and, when all are complete, rename them to their targets: all of them or none.
 
-    No signal comes between two of the renames, and if one fails those before it are put back. A process that is killed
-    (SIGKILL, a power cut) between two of them leaves some of the files new and some old, each of them whole.
+    No signal is handled between two renames, and if one fails, the earlier ones are undone. A process that is killed
+    (SIGKILL, a power cut) between two renames leaves some of the files new and some old, each of them complete.
 
     Args:
-        folder: made if it is missing.
-        writers: path below the folder -> writes that file at the path that it is passed.
+        folder: created if it is missing.
+        writers: path below the folder -> function that writes that file at the path it is passed.
 
     Raises:
-        ValueError, OSError: in one line that names the file; or what a writer raises. The folder is as it was then; if
-            a file could not be put back, the message names those that are new.
+        ValueError, OSError: in one line that names the file; or what a writer raises. The folder is then unchanged; if
+            a file could not be restored, the message names those that are new.
     """
     with ExitStack() as stack:
         targets = {name: _below(folder, name) for name in writers}
@@ -74,7 +74,7 @@ def deliver(folder: Path, writers: Mapping[str, Callable[[Path], object]]) -> No
 
 @contextmanager
 def made(folder: Path) -> Iterator[None]:
-    """Make a folder and those above it; if a block ends early, those that are empty then are removed again."""
+    """Create a folder and its parents; if the block raises, the created folders that are empty are removed again."""
     new = [path for path in (folder, *folder.parents) if not path.exists()]
     with ExitStack() as stack:
         for path in reversed(new):
@@ -84,7 +84,7 @@ def made(folder: Path) -> Iterator[None]:
 
 
 def remove_leftovers(folder: Path, age: float = 0.0) -> None:
-    """Remove what killed writers left in a folder that holds files of flockenv alone, if it is at least `age` s old."""
+    """Remove leftovers of killed writers, at least `age` s old, from a folder that contains only files of flockenv."""
     latest = time.time() - age
     with suppress(OSError), os.scandir(folder) as entries:
         for entry in entries:
@@ -108,7 +108,7 @@ def _below(folder: Path, name: str) -> Path:
 
 
 def _checked(target: Path) -> Path:
-    """Return a path if a file may be renamed to it."""
+    """Return the path if a file may be renamed to it; otherwise raise ValueError or OSError."""
     if "\0" in str(target):
         raise ValueError(f"path: must hold no NUL character, got {str(target)!r}")
     if not target.name or target.is_dir():
@@ -120,7 +120,7 @@ def _checked(target: Path) -> Path:
 
 @contextmanager
 def _beside(folder: Path) -> Iterator[Path]:
-    """Make a new folder in a folder; remove it at the end with all that is in it."""
+    """Create a temporary folder in `folder`; remove it with its contents at the end of the block."""
     with ExitStack() as stack:
         with signals.held():
             scratch = tempfile.mkdtemp(_SUFFIX, _PREFIX, folder)
@@ -130,7 +130,7 @@ def _beside(folder: Path) -> Iterator[Path]:
 
 @contextmanager
 def _named(target: Path, part: Path | None = None) -> Iterator[None]:
-    """Name the target in an error of the system about a new file, which has no name or a temporary one."""
+    """Name the target in an OSError about a new file, which has no name or a temporary one."""
     try:
         yield
     except OSError as error:
@@ -142,7 +142,7 @@ def _named(target: Path, part: Path | None = None) -> Iterator[None]:
 
 
 def _rename(parts: Mapping[Path, Path]) -> None:
-    """Rename files to their targets, target -> file; on any error put back what was there."""
+    """Rename files to their targets (`parts`: target -> file); on any error restore the old files."""
     with signals.held():
         kept = {target: _kept(target, part) for target, part in parts.items()} if len(parts) > 1 else {}
         try:
@@ -159,20 +159,20 @@ def _rename(parts: Mapping[Path, Path]) -> None:
 
 
 def _kept(target: Path, part: Path) -> Path | None:
-    """Give the file at a target a second name beside the new one, and return that; None if there is no file."""
+    """Hard-link, or copy, the file at a target to a name beside the new file; return it, None if there is no file."""
     if not os.path.lexists(target):
         return None
     old = part.with_name(f"{part.name}.old")
     with _named(target):
         try:
             os.link(target, old, follow_symlinks=False)
-        except (OSError, NotImplementedError):  # this disk has no second names, or not of links
+        except (OSError, NotImplementedError):  # this file system has no hard links, or none to symbolic links
             shutil.copy2(target, old, follow_symlinks=False)
     return old
 
 
 def _put_back(target: Path, old: Path | None) -> bool:
-    """Return True if what was at a target is there again."""
+    """Restore what was at a target: the file `old`, or no file (None). Return True on success."""
     try:
         if old is None:
             target.unlink()
@@ -184,7 +184,7 @@ def _put_back(target: Path, old: Path | None) -> bool:
 
 
 def _force(path: Path, flags: int) -> None:
-    """Force a file onto the disk, or the list of names of a folder."""
+    """Sync a file, or the entries of a folder, to the disk."""
     handle = os.open(path, flags | getattr(os, "O_BINARY", 0))
     try:
         os.fsync(handle)
@@ -193,8 +193,8 @@ def _force(path: Path, flags: int) -> None:
 
 
 def _force_names(folders: Iterable[Path]) -> None:
-    """Force folders' lists of names onto the disk, where a system can do that."""
+    """Sync the entries of folders to the disk, on systems that can do so."""
     if os.name == "posix":
         for folder in folders:
-            with suppress(OSError):  # some network disks cannot
+            with suppress(OSError):  # some network file systems cannot
                 _force(folder, os.O_RDONLY)

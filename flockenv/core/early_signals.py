@@ -1,7 +1,7 @@
 """The first lines of a command: signals are blocked here until `flockenv.core.signals` handles them.
 
-What handles them takes milliseconds to import. This module imports nothing that Python has not loaded by itself, and
-has no `from __future__ import annotations`, which is a file too.
+`signals` takes milliseconds to import. This module imports only what Python has already loaded by itself, and omits
+`from __future__ import annotations`, as `__future__` is a file too.
 """
 
 import _signal  # type: ignore[import-not-found]  # built in; `signal` imports enum first
@@ -14,9 +14,9 @@ _PACKAGE = os.path.join(os.path.dirname(os.path.dirname(__file__)), "__init__.py
 
 
 def command() -> str:
-    """Return the name of the command of flockenv or agents that this process is, "" if it is none."""
+    """Return the name of the flockenv or agents command that this process runs, "" if it runs none."""
     words, program = sys.orig_argv, sys.argv[:1]
-    if program == ["-m"] and "-m" in words[:-1]:  # Python has not found the module yet that it is to run
+    if program == ["-m"] and "-m" in words[:-1]:  # Python has not located the module to run yet
         package, _, module = words[words.index("-m") + 1].rpartition(".")
         return module if package.split(".")[0] == "agents" and _beside("agents") else ""
     script = os.path.basename(program[0]).split(".")[0].removesuffix("-script") if program else ""
@@ -24,14 +24,14 @@ def command() -> str:
 
 
 def _beside(package: str) -> bool:
-    """Return True if a package that is being imported lies beside flockenv: other programs have an `agents`, too."""
+    """Return True if a package that is being imported lies beside flockenv: other programs also have an `agents`."""
     file = getattr(sys.modules.get(package), "__file__", None) or ""
     theirs, ours = (os.path.dirname(os.path.dirname(os.path.realpath(path))) for path in (file, _PACKAGE))
     return theirs == ours
 
 
 def _block() -> set[int] | None:
-    """Block the signals of a command; return those that were blocked before, None if nothing was changed."""
+    """Block the signals of a command; return the previously blocked ones, None if nothing was changed."""
     if os.name != "posix" or not command():
         return None
     return set(_signal.pthread_sigmask(_signal.SIG_BLOCK, (_signal.SIGINT, _signal.SIGTERM, _signal.SIGHUP)))
@@ -41,7 +41,7 @@ _before = _block()
 
 
 def release() -> None:
-    """Deliver signals again, with those that have arrived meanwhile, as before this module was imported."""
+    """Restore the signal mask from before this module was imported; signals that arrived meanwhile are delivered."""
     global _before
     if _before is not None:
         _before, mask = None, _before

@@ -1,6 +1,6 @@
-"""A pydantic error as one clear line: which key, which value, what is allowed, and the nearest valid name.
+"""A pydantic error as one clear line: the key, the value, what is allowed, and the nearest valid name.
 
-Whoever builds a record from outside data (a YAML file, the keyword arguments of make) says what is wrong through this.
+Used wherever a record is built from outside data: a YAML file, or the keyword arguments of make.
 """
 
 from __future__ import annotations
@@ -19,18 +19,18 @@ from pydantic_core import ErrorDetails
 __all__ = ["KeyPath", "Refusal", "key_path", "nearest", "nearest_few", "refusals", "shown", "shown_path", "steps_of"]
 
 KeyPath = tuple[str | int, ...]
-"""Where a value stands: ("effects", 1, "radius") is effects[1].radius."""
+"""Path to a value: ("effects", 1, "radius") is effects[1].radius."""
 
 Schema = dict[str, Any]
 
-MANY = 30  # names that are listed beside one that is near
-FEW = 10  # names that are all listed
-MOST = 100  # errors that are looked at: a file with more is broken in one way, not in a hundred
+MANY = 30  # most allowed names that are listed beside a suggestion
+FEW = 10  # most names that are listed in full
+MOST = 100  # errors that are examined: a file with more has one mistake, not a hundred
 
 
 @dataclass(frozen=True)
 class Refusal:
-    """One thing that is wrong, and where."""
+    """One mistake and its place."""
 
     path: KeyPath
     text: str  # one line that starts with the key path
@@ -40,10 +40,10 @@ class Refusal:
 
 
 def refusals(error: ValidationError, model: type[BaseModel], data: object) -> list[Refusal]:
-    """Return what pydantic found wrong with `data`, one refusal per mistake, in the order of the fields of `model`.
+    """Return one refusal per mistake that pydantic found in `data`, in the order of the fields of `model`.
 
-    One mistake may be several errors to pydantic: one for each member of a union, one for the key that is missing
-    because it is misspelt, one for a list that is too short without its bad items. The clearest speaks for all.
+    Pydantic may report one mistake as several errors: one for each member of a union, one for the key that is missing
+    because it is misspelt, one for a list that is too short without its bad items. Only the clearest is kept.
     """
     schema = _schema_of(model)
     found: dict[KeyPath, ErrorDetails] = {}
@@ -62,13 +62,13 @@ def refusals(error: ValidationError, model: type[BaseModel], data: object) -> li
 
 
 def _other_member(detail: ErrorDetails) -> bool:
-    """True if a value is of another type: of a union, the member that it was not meant for says so."""
+    """Return True for a type error, which pydantic also reports for each union member that does not fit."""
     return detail["type"] in ("float_type", "int_type", "string_type", "bool_type")
 
 
 @functools.cache
 def _schema_of(model: type[BaseModel]) -> Schema:
-    """Return a model's JSON schema; a quarter of a second of work for a Scene, whose kinds are all known by then."""
+    """Return a model's JSON schema, cached: it takes 0.25 s for a Scene, whose kinds are all registered by then."""
     return model.model_json_schema()
 
 
@@ -79,12 +79,12 @@ def _meant(path: KeyPath, schema: Schema, data: object) -> KeyPath:
 
 
 def nearest(word: str, allowed: Iterable[str]) -> str:
-    """Return ', did you mean `x`?' for the allowed name nearest to `word`, or '' where none is near."""
+    """Return ', did you mean `x`?' for the allowed name nearest to `word`, or '' if none is near."""
     return "".join(f", did you mean `{name}`?" for name in _close(word, allowed))
 
 
 def nearest_few(word: str, allowed: Iterable[str]) -> str:
-    """Return the allowed names, or the few nearest to `word` where there are many: '; the nearest of 130: a, b'."""
+    """Return the allowed names or, if there are many, the few nearest to `word`: '; the nearest of 130: a, b'."""
     names = sorted(allowed)
     if len(names) <= FEW:
         return f"; allowed: {', '.join(names)}"
@@ -92,7 +92,7 @@ def nearest_few(word: str, allowed: Iterable[str]) -> str:
 
 
 def _close(word: str, allowed: Iterable[str], most: int = 1, least: float = 0.6) -> list[str]:
-    """Return at most so many names, the most similar first, each of a similarity of at least `least`."""
+    """Return at most `most` names, the most similar first, each with a similarity ratio of at least `least`."""
     names = {name.lower(): name for name in allowed}
     return [names[name] for name in difflib.get_close_matches(word[:200].lower(), names, n=most, cutoff=least)]
 
@@ -128,7 +128,7 @@ def shown_path(path: str | os.PathLike[str]) -> str:
 
 
 def _path_in(data: object, detail: ErrorDetails) -> KeyPath:
-    """Return the error's place in `data`: pydantic's own, without the union tags that it weaves in."""
+    """Return the error's path in `data`: pydantic's location without the union tags that it inserts."""
     path: list[str | int] = []
     place: Any = data
     for k, step in enumerate(detail["loc"]):
@@ -157,7 +157,7 @@ def _context(detail: ErrorDetails) -> Mapping[str, Any]:
 def _line(path: KeyPath, detail: ErrorDetails, schema: Schema, data: object) -> str:
     place, value = key_path(path), _value(detail)
     reason = _reason(path, detail, schema, data)
-    # Where what is wrong is a whole block, printing it would bury the reason.
+    # Printing a whole block would bury the reason.
     block = isinstance(value, (Mapping, list, tuple)) and detail["type"] != "extra_forbidden"
     if block or detail["type"] in _MISSING:
         return f"{place}: {reason}" if place else reason
@@ -195,7 +195,7 @@ def _reason(path: KeyPath, detail: ErrorDetails, schema: Schema, data: object) -
 
 
 def _hint(value: object, kind: str) -> str:
-    """Return what to write instead, where a slip of notation is likely."""
+    """Return what to write instead, if a slip of notation is likely."""
     if isinstance(value, str) and kind.startswith(("float", "int")):
         return ", not text"
     if isinstance(value, float) and kind.startswith("int") and value.is_integer():
@@ -208,12 +208,12 @@ def _one_line(text: str) -> str:
 
 
 def _keys(path: KeyPath, schema: Schema, data: object) -> list[str]:
-    """Return the keys that are allowed in the block in which `path` stands."""
+    """Return the keys that are allowed in the block that contains `path`."""
     return list(_schema_at(path[:-1], schema, data).get("properties", {}))
 
 
 def _choices(path: KeyPath, detail: ErrorDetails, schema: Schema, data: object) -> list[str]:
-    """Return the words that are allowed at `path`, if it takes one of several words."""
+    """Return the words that are allowed at `path`; [] if it does not take one of a set of words."""
     if detail["type"].startswith("union_tag_"):
         union = _follow(_step_down(path[:-1], schema, data), schema)
         return list(union.get("discriminator", {}).get("mapping", {}))
@@ -222,12 +222,12 @@ def _choices(path: KeyPath, detail: ErrorDetails, schema: Schema, data: object) 
     return [str(word) for word in words]
 
 
-_TYPES = {"number": "a number", "integer": "a whole number", "string": "text", "boolean": "true or false"}
+_TYPES = {"number": "a number", "integer": "an integer", "string": "text", "boolean": "true or false"}
 _BOUNDS = {"exclusiveMinimum": ">", "minimum": ">=", "exclusiveMaximum": "<", "maximum": "<="}
 
 
 def _range(node: Schema) -> str:
-    """Return what a schema node allows in words: 'a number > 0', 'a list of 2 to 3, each a number'."""
+    """Return a description of what a schema node allows: 'a number > 0', 'a list of 2 to 3, each a number'."""
     if "discriminator" in node:
         return f"a block with {node['discriminator']['propertyName']}: {', '.join(node['discriminator']['mapping'])}"
     if node.get("type") == "object":
@@ -247,7 +247,7 @@ def _count(node: Schema) -> str:
 
 
 def _schema_at(path: KeyPath, schema: Schema, data: object) -> Schema:
-    """Return the schema of the place `path` in `data`: the member of a union that the data picks."""
+    """Return the schema at `path`; of a union, the member that `data` selects."""
     place: Any = data
     for step in path:
         place = _child(place, step)
@@ -266,7 +266,7 @@ def _step_down(path: KeyPath, schema: Schema, data: object) -> Schema:
 
 
 def _member(node: Schema, name: str) -> Schema:
-    """Return the schema of one key of a block; of a block with any keys, that of all of them."""
+    """Return the schema of one key of a block; if the block allows any keys, the schema that they share."""
     found: Schema | bool = node.get("properties", {}).get(name, node.get("additionalProperties", {}))
     return found if isinstance(found, dict) else {}
 
@@ -286,7 +286,7 @@ def _child(place: Any, step: str | int) -> object:
 
 
 def _follow(node: Schema, schema: Schema) -> Schema:
-    """Return the node that a $ref points to; the reference's own description stays, it is the field's."""
+    """Return the node that a $ref points to; keys beside the $ref, such as the field's description, take precedence."""
     while "$ref" in node:
         rest = {key: value for key, value in node.items() if key != "$ref"}
         node = {**schema["$defs"][node["$ref"].rsplit("/", 1)[-1]], **rest}
@@ -303,7 +303,7 @@ def _pick(node: Schema, place: object, schema: Schema) -> Schema:
     if tagged and isinstance(place, Mapping):
         name = tagged["mapping"].get(str(place.get(tagged["propertyName"])))
         if name or tagged["propertyName"] in place or not _fits(_follow(chosen, schema), place):
-            chosen = {"$ref": name} if name else {}  # else the first kind, that of a block without one
+            chosen = {"$ref": name} if name else {}  # else the first kind, the default of a block without one
     elif not tagged:
         chosen = next((m for m in members if _fits(_follow(m, schema), place)), chosen)
     own = {key: value for key, value in node.items() if key == "description"}

@@ -1,11 +1,11 @@
-"""How large and how small a number may be: such that what laws make of it is a number, too.
+"""Bounds on the size of numbers, such that laws neither overflow nor divide by zero with them.
 
-Laws multiply: an energy is a mass and two speeds, a force of a spring a stiffness and a length. And they divide: by a
-mass, by the square of a distance. So a product of three numbers must not overflow, nor the reciprocal of a square. Both
-bounds follow from the largest number M of a precision, as powers of ten: its cube root, 1e102 and 1e12, and the
-reciprocal of its square root, 1e-154 and 1e-19 (float64 and float32). 0 is always in range; whether it makes sense is
-said where it is read. Places and velocities, which a simulation itself makes large, may be as large as squares allow:
-1e154 and 1e19.
+Laws multiply: an energy is a mass times two speeds, a spring force a stiffness times a length. They also divide: by a
+mass, by the square of a distance. So neither a product of three numbers nor the reciprocal of a square may overflow.
+Both bounds follow from the largest number M of a precision, as powers of ten: its cube root, 1e102 and 1e12, and the
+reciprocal of its square root, 1e-154 and 1e-19 (float64 and float32). 0 is always in range; the reader of a value
+checks whether 0 makes sense. Positions and velocities, which grow in a simulation, may be as large as their squares
+allow: 1e154 and 1e19.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ __all__ = ["bounds", "check_array", "check_numbers"]
 
 
 def bounds(precision: str) -> tuple[float, float]:
-    """Return the least and the largest size of a number other than 0, in "float64" or "float32"."""
+    """Return the smallest and the largest absolute value of a number other than 0, in "float64" or "float32"."""
     digits = math.log10(float(np.finfo(precision).max))
     return 10.0 ** -math.floor(digits / 2), 10.0 ** math.floor(digits / 3)
 
@@ -31,16 +31,16 @@ BOUNDS = {precision: bounds(precision) for precision in ("float64", "float32")}
 
 
 def said(precision: str) -> str:
-    """Return what is allowed, as a part of a message."""
+    """Return the part of a message that states what is allowed."""
     least, most = BOUNDS[precision]
     more = "; use dtype = float64" if precision == "float32" else ""
     return f"{precision} computes with numbers from {least:g} to {most:g} in size, and 0{more}"
 
 
 def outliers(value: Any, precision: str, path: str = "", into_records: bool = True) -> Iterator[tuple[str, float]]:
-    """Yield the place of each number that is out of bounds, and the number: in tuples, lists and records at any depth.
+    """Yield the path and value of each number that is out of bounds, in tuples, lists and records at any depth.
 
-    into_records: False leaves out the numbers of records.
+    into_records: False skips records.
     """
     if isinstance(value, float):
         least, most = BOUNDS[precision]
@@ -55,13 +55,13 @@ def outliers(value: Any, precision: str, path: str = "", into_records: bool = Tr
 
 
 def check_numbers(value: Any, precision: str, path: str = "", into_records: bool = True) -> None:
-    """Raise ValueError if a number in it is out of bounds; the message begins with its place; see `outliers`."""
+    """Raise ValueError if a number in `value` is out of bounds; the message begins with its path; see `outliers`."""
     for place, number in outliers(value, precision, path, into_records):
         raise ValueError(f"{place} = {number:g}: {said(precision)}")
 
 
 def check_array(name: str, array: NDArray[np.float64], precision: str) -> None:
-    """Refuse an array of places or velocities that holds NaN, infinity, or a number too large to be squared."""
+    """Raise ValueError if positions or velocities contain NaN, infinity, or a number too large to be squared."""
     most = 1 / BOUNDS[precision][0]
     wrong = ~(np.abs(array) <= most)
     if wrong.any():

@@ -1,4 +1,4 @@
-"""Paths that may be written, checked before the work begins."""
+"""Checks of output paths, made before the work begins."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ _RESERVED = re.compile(r"(con|prn|aux|nul|com\d|lpt\d)(\..*)?", re.IGNORECASE)
 
 
 def checked_path(text: str, option: str = "--out") -> Path:
-    """Return the absolute path of a file or folder that may be written; nothing is made or touched.
+    """Return the absolute path of a file or folder that may be written; nothing is created or changed.
 
-    It lies below the current folder or the system's folder for temporary files, links followed, so that a mistyped or
-    foreign path does not land among other people's files.
+    With links resolved, it must lie below the current folder or the system's folder for temporary files, so that a
+    mistyped path does not write among unrelated files.
 
     Raises:
-        ValueError: one line: the option, the path, and what is wrong with it.
+        ValueError: in one line: the option, the path, and what is wrong with it.
     """
     fault = _fault(text) or _place(Path(text))
     if fault:
@@ -42,7 +42,7 @@ def checked_file(
     beside: the suffix of a second file that is written with it, checked in the same way; "" for a folder.
 
     Raises:
-        ValueError: as `checked_path`; or another suffix; or the file is there already and `force` is not given.
+        ValueError: as `checked_path`; for another suffix; if the file exists and `force` is not given.
     """
     path = checked_path(text, option)
     suffix = path.suffix.lower()
@@ -61,7 +61,7 @@ def checked_file(
 
 
 def _fault(text: str) -> str:
-    """Return the fault of a path as text, '' if none."""
+    """Return what is wrong with a path as text, '' if nothing."""
     if not text.strip() or any(unicodedata.category(c) in ("Cc", "Cf", "Cs") for c in text):
         return "must be a name without control characters"
     parts = Path(text).parts
@@ -74,7 +74,7 @@ def _fault(text: str) -> str:
 
 
 def _place(path: Path) -> str:
-    """Return the reason why nothing may be written there, '' if none."""
+    """Return the reason why nothing may be written at a path, '' if there is none."""
     target = path.resolve()
     allowed = [Path.cwd().resolve(), Path(tempfile.gettempdir()).resolve()]
     if not any(target.is_relative_to(base) for base in allowed):
@@ -93,7 +93,7 @@ def _shown(text: str) -> str:
 def check_room(path: Path, size: int) -> None:
     """Raise OSError, in one line, if a file of `size` bytes cannot be written at `path` now.
 
-    It is tried with a file without a name, in the nearest folder above that exists; nothing is left behind.
+    A temporary file of that size is allocated in the nearest existing parent folder and removed again.
     """
     target = path.resolve()
     folder = next(place for place in target.parents if place.exists())

@@ -1,4 +1,4 @@
-"""Record: the frozen, validated, self-describing value that effects, integrators, spaces, scenes and tasks are."""
+"""Record: the frozen, validated, self-describing base class of effects, integrators, spaces, scenes and tasks."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ _NUMBERS = (float, int, float | None, int | None)
 
 
 def keep(*kinds: type) -> Callable[[Any, Any], Any]:
-    """Return a validator that lets a record of these kinds through as it is: somebody else's is as good as ours.
+    """Return a validator that accepts any instance of `kinds` unchanged, also of a class defined outside flockenv.
 
-    Only files need the list of those that there are.
+    Other values, such as blocks of a file, go through pydantic's own validation with its list of known kinds.
     """
 
     def kept(value: Any, handler: Any) -> Any:
@@ -30,9 +30,9 @@ def keep(*kinds: type) -> Callable[[Any, Any], Any]:
 
 
 def in_tuples(value: Any) -> Any:
-    """Return what a file says with tuples in the place of lists, however deep; blocks stay blocks.
+    """Return the content of a file with lists replaced by tuples at every depth; mappings become dicts.
 
-    Strictly read, only JSON's lists are taken for tuples, and pydantic hands Python's to a function like `kept`.
+    Pydantic's strict mode accepts a list as a tuple only from JSON, and a function like `kept` receives Python values.
     """
     if isinstance(value, Mapping):
         return {key: in_tuples(inner) for key, inner in value.items()}
@@ -40,7 +40,7 @@ def in_tuples(value: Any) -> Any:
 
 
 class _OneLine(ModelMetaclass):
-    """Turns pydantic's report into one line where a record is built by hand; files go through config.py."""
+    """Metaclass that turns pydantic's report into one line if a record is built by hand; files go through yaml_io."""
 
     def __call__(cls, *args: Any, **data: Any) -> Any:  # noqa: N805  # the class of a class
         try:
@@ -54,7 +54,7 @@ class _OneLine(ModelMetaclass):
         raise ValueError(f"{cls.__name__}: {text}{more}")
 
     def _refuse_lookalikes(cls, data: dict[str, Any]) -> None:  # noqa: N805
-        """Refuse "1e-3" and True where a number is wanted: pydantic takes both for one. Files are read strictly."""
+        """Raise ValidationError if a number is given as text or bool, which pydantic converts unless it is strict."""
         model: Any = cls
         for name, field in model.model_fields.items():
             value = data.get(name)
@@ -64,15 +64,15 @@ class _OneLine(ModelMetaclass):
 
 
 class Record(BaseModel, metaclass=_OneLine):
-    """A frozen record: prints as its own constructor, compares, hashes, pickles, and becomes a YAML block by itself.
+    """A frozen record: its repr is its constructor call; it compares, hashes, pickles and converts to a YAML block.
 
-    An unknown or invalid field is refused at construction with a ValueError of one line that names it.
+    An unknown or invalid field raises ValueError at construction, with a one-line message that names it.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, defer_build=True)
 
     def __init_subclass__(cls, **options: Any) -> None:
-        """Keep functions that class variables hold, such as laws, from becoming methods of the record."""
+        """Make functions in class variables, such as laws, static methods, so that they are not bound to the record."""
         super().__init_subclass__(**options)
         inherited: set[str] = getattr(cls, "__class_vars__", set())
         for name in {*vars(cls).get("__annotations__", {}), *inherited}:
@@ -82,14 +82,14 @@ class Record(BaseModel, metaclass=_OneLine):
 
     @classmethod
     def __pydantic_init_subclass__(cls, **options: Any) -> None:
-        """Of what a class variable holds, only types know: pydantic would read it anew for each of its subclasses."""
+        """Annotate class variables as plain ClassVar: pydantic evaluates their annotations again for each subclass."""
         super().__pydantic_init_subclass__(**options)
         written = vars(cls).get("__annotations__", {})
         written.update(dict.fromkeys(written.keys() & cls.__class_vars__, ClassVar))
 
     @model_validator(mode="after")
     def _representable(self) -> Self:
-        """Refuse numbers so large or small that laws overflow with them; records in it were checked when made."""
+        """Raise ValueError for numbers so large or small that laws overflow; nested records were checked when made."""
         for name in type(self).model_fields:
             value = getattr(self, name)
             if isinstance(value, (float, tuple)):
@@ -100,33 +100,33 @@ class Record(BaseModel, metaclass=_OneLine):
         return repr(self)
 
     def __eq__(self, other: object) -> bool:
-        """Compare the fields alone: what follows from them may be arrays, and need not be there yet."""
+        """Compare only the fields: cached derived values may be arrays, or not computed yet."""
         return type(self) is type(other) and all(
             getattr(self, name) == getattr(other, name) for name in type(self).model_fields
         )
 
     def model_copy(self, *, update: Mapping[str, Any] | None = None, deep: bool = False) -> Self:
-        """Return the record with some fields changed, checked like a new one; nothing that was derived comes along."""
+        """Return a copy with the fields in `update` changed, validated as a new record, without cached values."""
         fields = {name: getattr(self, name) for name in type(self).model_fields}
         return type(self)(**{**fields, **(update or {})})
 
     def __copy__(self) -> Self:
-        """Return itself: nothing about it can change."""
+        """Return the record itself, as it is immutable."""
         return self
 
     def __deepcopy__(self, memo: dict[int, Any] | None = None) -> Self:
-        """Return itself: nothing about it can change."""
+        """Return the record itself, as it is immutable."""
         return self
 
     def __getstate__(self) -> dict[Any, Any]:
-        """Pickle the fields alone: what follows from them is made anew where it is needed."""
+        """Pickle only the fields: derived values are computed again when needed."""
         kept = super().__getstate__()
         kept["__dict__"] = {k: v for k, v in kept["__dict__"].items() if k in type(self).model_fields}
         return kept
 
 
 class ResultRecord(Record):
-    """A record of what was computed: its numbers may have any finite size, as no law reads them."""
+    """A record of computed results: its numbers may have any finite size, as no law reads them."""
 
     @model_validator(mode="after")
     def _representable(self) -> Self:

@@ -1,12 +1,12 @@
-"""Ends of commands by signals: one line on stderr, exit code 128 + signal, nothing half-written is left.
+"""Signal handling of commands: one line on stderr, exit code 128 + signal, no partly written file is left.
 
 Python raises KeyboardInterrupt wherever the main thread happens to be: in an import, inside numba's compiler, in a
 callback that swallows it and prints a traceback. A command handles its signals itself instead. KeyboardInterrupt is
-raised only while a line of flockenv or agents is being executed, outside of imports and compilation. Where there is no
-such line for PATIENCE seconds, and before the command itself has begun, what is half-written is removed and the process
+raised only while a line of flockenv or agents is being executed, outside of imports and compilation. If no such line
+is reached for PATIENCE seconds, or the command has not started yet, partly written files are removed and the process
 ends.
 
-This module imports nothing that takes time, so that it is in force before Gymnasium, numba and torch are imported.
+This module imports nothing slow, so that it is active before Gymnasium, numba and torch are imported.
 """
 
 from __future__ import annotations
@@ -29,13 +29,13 @@ PATIENCE = 1.0
 """Seconds to wait for a line at which KeyboardInterrupt can be raised."""
 
 AGAIN = 0.02
-"""Seconds between two looks for such a line."""
+"""Seconds between two attempts to raise KeyboardInterrupt."""
 
 ONE_PRESS = 0.3
 """Signals within this number of seconds count as one: a terminal and a wrapper may each send their own."""
 
 SIGNALS = {"SIGINT": "interrupted", "SIGTERM": "terminated", "SIGHUP": "terminated: the terminal was closed"}
-"""Signals that are handled, if the system has them, and the words of their line."""
+"""Handled signals, if the system has them, and the text of their line on stderr."""
 
 SAFE = {"flockenv", "agents", "__main__", "threading"}
 """Packages, by the first part of a module's name, with lines at which KeyboardInterrupt may be raised."""
@@ -44,38 +44,38 @@ CLOSED = {"numba", "llvmlite", "importlib", "_frozen_importlib", "_frozen_import
 """Packages that are left in a broken state if an exception passes through them."""
 
 PARENT = "FLOCKENV_PARENT"
-"""Variable of the environment with the number of a command's process: processes that it starts are to end with it."""
+"""Environment variable with the process id of a command; the processes that it starts end with it."""
 
 WRITING = {"_write_atomic", "save_overload", "_save_overload", "_save_index", "_save_data"}
-"""Functions of Python and numba that write a file beside its place and rename it: these run to their end."""
+"""Functions of Python and numba that write a temporary file and rename it: these are not interrupted."""
 
 
 class _Asked:
-    """The signal that this process is handling, if any, and the progress of that."""
+    """State of the signal that this process is handling, if any."""
 
     name = "flockenv"
-    text = ""  # the words of the line, instead of those of SIGNALS
+    text = ""  # the text of the line, instead of that of SIGNALS
     said = False  # the line has been written
     main = 0  # the thread that handles signals
-    running = False  # the command itself has begun: it may have results to keep
+    running = False  # the command itself has started: it may have results to save
     signal = 0
     since = 0.0
     raised = False  # KeyboardInterrupt has been raised; it may have been caught since
-    again = False  # the next signal is sent by _watch
+    again = False  # the next signal was sent by _watch
 
 
 _ending = _thread.RLock()
-"""Held by the thread that ends the process, from its decision on; any other thread waits until the process is gone."""
+"""Held by the thread that ends the process; any other thread that tries to waits until the process is gone."""
 
 _unfinished: dict[str, bool] = {}
-"""Files and folders that are half-written, in the order in which they were made; True: removed only if empty."""
+"""Files and folders that are not complete yet, in order of creation; True: removed only if empty."""
 
 _held: set[object] = set()
-"""Sections of any thread that must not be left in the middle."""
+"""Sections, in any thread, that must not be interrupted."""
 
 
 def begin_early() -> None:
-    """Handle signals from here on if this process is a command of flockenv or agents; else leave it as it is."""
+    """Start to handle signals if this process is a command of flockenv or agents; otherwise do nothing."""
     if "--multiprocessing-fork" in sys.orig_argv:
         if os.environ.get(PARENT) == str(os.getppid()):
             serve()
@@ -85,9 +85,9 @@ def begin_early() -> None:
 
 
 def begin(name: str) -> None:
-    """Handle signals from here on; `name` begins every line. A signal that is ignored, as under nohup, stays so."""
+    """Start to handle signals; every line begins with `name`. Ignored signals, as under nohup, stay ignored."""
     _Asked.name = name
-    if os.name != "posix":  # there is only Python's own KeyboardInterrupt
+    if os.name != "posix":  # only Python's own KeyboardInterrupt is available
         return
     if not _Asked.main:
         _Asked.main = _thread.get_ident()
@@ -102,7 +102,7 @@ def begin(name: str) -> None:
 
 
 def _finish() -> None:
-    """Ignore signals from here on: the command has done its work, and its exit code is that of the work.
+    """Ignore signals from now on: the command is done, and its exit code is already determined.
 
     While Python shuts down, a thread that ends the process would write its line but not set the exit code.
     """
@@ -123,7 +123,7 @@ def leave(code: int) -> None:
 
 
 def serve() -> None:
-    """Let a process that works for a command end by SIGTERM alone, without output; the command handles the rest."""
+    """Make a worker process of a command end on SIGTERM only, without output; the command handles the other signals."""
     begin(_Asked.name)
     _Asked.said = True
     for which in ("SIGINT", "SIGHUP"):
@@ -132,7 +132,7 @@ def serve() -> None:
 
 
 def _follow(parent: int) -> None:
-    """End this process when its parent has ended, even by SIGKILL: it is another's child then."""
+    """End this process after its parent has ended, even by SIGKILL: its parent process id then changes."""
     while os.getppid() == parent:
         time.sleep(0.25)
     os.kill(os.getpid(), signal.SIGTERM)
@@ -140,7 +140,7 @@ def _follow(parent: int) -> None:
 
 @contextmanager
 def running(name: str) -> Iterator[None]:
-    """Handle signals while a command runs; nothing half-written is left at its end, and later signals are ignored."""
+    """Handle signals while a command runs; at its end remove partly written files and ignore later signals."""
     begin(name)
     _Asked.running = True
     try:
@@ -153,9 +153,9 @@ def running(name: str) -> Iterator[None]:
 
 @contextmanager
 def held() -> Iterator[None]:
-    """Handle no signal before the end of a short section that must run whole, such as renaming several files."""
+    """Defer signals until the end of a short block that must not be interrupted, such as renaming several files."""
     section = object()
-    _held.add(section)  # two threads may count at once: `+= 1` would lose one of them
+    _held.add(section)  # a set, not a counter: `+= 1` from two threads may lose one
     try:
         yield
     finally:
@@ -164,9 +164,9 @@ def held() -> Iterator[None]:
 
 @contextmanager
 def unfinished(path: str | os.PathLike[str], if_empty: bool = False) -> Iterator[str]:
-    """Remove a file or folder at the end of a block, or when a signal ends the process before; yield its full path.
+    """Remove a file or folder at the end of the block or when a signal ends the process; yield its absolute path.
 
-    What is whole by then has been renamed. if_empty: a folder is removed only if nothing is in it.
+    Complete files have been renamed before. if_empty: a folder is removed only if it is empty.
     """
     name = os.path.abspath(path)
     _unfinished[name] = if_empty
@@ -178,19 +178,19 @@ def unfinished(path: str | os.PathLike[str], if_empty: bool = False) -> Iterator
 
 
 def clean() -> None:
-    """Remove everything that is half-written."""
+    """Remove all files and folders that are not complete."""
     for name, if_empty in reversed(list(_unfinished.items())):
         _remove(name, if_empty)
         _unfinished.pop(name, None)
 
 
 def say(text: str) -> None:
-    """Set the words of the line about a signal. A leading "interrupted" becomes the signal's own word."""
+    """Set the text of the line about a signal. A leading "interrupted" is replaced by the signal's own word."""
     _Asked.text, _Asked.said = text, False
 
 
 def said() -> str:
-    """Return the line about the signal that is to be written now, "" if it has been written."""
+    """Return the line about the signal and mark it as written; "" if it was written before."""
     if _Asked.said:
         return ""
     _Asked.said = True
@@ -206,7 +206,7 @@ def code() -> int:
 
 
 def _remove(name: str, if_empty: bool = False) -> None:
-    with suppress(OSError):  # it was renamed, or never made
+    with suppress(OSError):  # it was renamed or never created
         if os.path.isdir(name) and not os.path.islink(name):
             for entry in () if if_empty else os.listdir(name):
                 _remove(os.path.join(name, entry))
@@ -216,7 +216,7 @@ def _remove(name: str, if_empty: bool = False) -> None:
 
 
 def _handle(number: int, frame: FrameType | None) -> None:
-    """Raise KeyboardInterrupt if this is a line where it can be raised; else look again soon, but not for long."""
+    """Raise KeyboardInterrupt if the current line allows it; otherwise return, and end the process after PATIENCE."""
     own, now = _Asked.again, time.monotonic()
     _Asked.again = False
     if not _Asked.signal:
@@ -240,13 +240,13 @@ def _packages(frame: FrameType | None) -> Iterator[str]:
 
 
 def _can_raise(frame: FrameType | None) -> bool:
-    """True if a line of ours is being executed, and nothing that must not be left in the middle is under way."""
+    """Return True if a line of a SAFE package is being executed and no CLOSED package is on the call stack."""
     packages = list(_packages(frame))
     return bool(packages) and packages[0] in SAFE and CLOSED.isdisjoint(packages)
 
 
 def _is_writing(frame: FrameType | None) -> bool:
-    """True if Python or numba is writing a file of its own."""
+    """Return True if Python or numba is writing a file of its own."""
     while frame is not None:
         if frame.f_code.co_name in WRITING:
             return True
@@ -257,12 +257,13 @@ def _is_writing(frame: FrameType | None) -> bool:
 def _watch(signals: int) -> None:
     """Wait for signals, which the system writes to this pipe even while the main thread runs no Python code.
 
-    Then have the main thread look every AGAIN seconds until it is done; end the process if it cannot be reached.
+    Then send the signal to the main thread again every AGAIN seconds until it has raised KeyboardInterrupt; end the
+    process if it does not in time.
     """
-    known = False  # that KeyboardInterrupt has been raised
+    known = False  # KeyboardInterrupt has been raised
     while arrived := os.read(signals, 1):
         number = signal.Signals(arrived[0])
-        if number.name not in SIGNALS:  # another library's
+        if number.name not in SIGNALS:  # a signal of another library
             continue
         until = time.monotonic() + (2 * PATIENCE if _Asked.running and not known else PATIENCE / 2)
         while known or not _Asked.raised:
@@ -274,12 +275,12 @@ def _watch(signals: int) -> None:
                 signal.pthread_kill(_Asked.main, _Asked.signal or number)
         known = True
         time.sleep(ONE_PRESS)
-        while select.select([signals], [], [], 0)[0]:  # those that were sent above, or are the same press of a key
+        while select.select([signals], [], [], 0)[0]:  # signals sent above, or from the same key press
             os.read(signals, 4096)
 
 
 def _end(number: int) -> None:
-    """Remove what is half-written, write one line and end the process, without Python's own shutdown."""
+    """Remove partly written files, write one line and end the process, without Python's own shutdown."""
     _ending.acquire()
     clean()
     if _thread.get_ident() == _Asked.main:
@@ -287,7 +288,7 @@ def _end(number: int) -> None:
             sys.stdout.flush()
     _Asked.signal = number
     line = said()
-    cursor = "\r\x1b[2K\x1b[?25h" if os.isatty(2) else ""  # a bar hides the cursor
+    cursor = "\r\x1b[2K\x1b[?25h" if os.isatty(2) else ""  # a progress bar hides the cursor
     try:
         os.write(2, f"{cursor}{line}\n".encode() if line else b"")
     finally:

@@ -1,4 +1,4 @@
-"""The warnings of a simulation: what is computed all the same, and may not be what was meant."""
+"""Warnings of a simulation: it continues, but the result may not be the intended one."""
 
 from __future__ import annotations
 
@@ -18,24 +18,24 @@ class UnstableStepWarning(UserWarning):
 
 
 class CoarseContactWarning(UserWarning):
-    """A contact is over in so few steps that bodies come out of it faster or slower than its law says."""
+    """A contact lasts so few steps that bodies leave it faster or slower than its law predicts."""
 
 
 class LookaheadWarning(UserWarning):
-    """Somebody notices obstacles, or where to slow down, too late to stop there."""
+    """An agent detects obstacles, or the place where to slow down, too late to stop there."""
 
 
 class UnmetWarning(UserWarning):
-    """A rod or rope is not as long as it should be: the sweeps that were allowed did not suffice."""
+    """A rod or rope does not have its length: the allowed number of sweeps did not suffice."""
 
 
 class UnsolvedContactsWarning(RuntimeWarning):
-    """More impacts in a step than are allowed, contacts that passes have not solved, too long a path round a torus."""
+    """Too many impacts in a step, contacts that the passes did not resolve, or too long a path round a torus."""
 
 
 class NoWayWarning(UserWarning):
-    """Agents begin where no way leads to their target."""
+    """Agents start at positions from which no path leads to their target."""
 
 
 class OtherTaskWarning(UserWarning):
-    """A policy is to play a task with other arguments or scales than the one that it was trained on."""
+    """A policy runs a task with arguments or scales that differ from those it was trained on."""

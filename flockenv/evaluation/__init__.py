@@ -1,4 +1,4 @@
-"""The same worlds for every player, and what may be said about the scores."""
+"""Evaluation of players in the same held-out worlds, and statistics of their scores."""
 
 from __future__ import annotations
 

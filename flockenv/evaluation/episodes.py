@@ -1,7 +1,7 @@
-"""The same worlds for everyone, and what may be said about the scores: intervals, paired differences, who beats whom.
+"""Evaluation of players in the same worlds: rollouts, confidence intervals and paired comparisons.
 
-The unit of analysis is the world: the agents of one world share its luck, so a world counts once however many agents it
-holds, and its return is the sum over steps of the mean reward of its learners. Players are compared world by world.
+The unit of analysis is the world: the agents of one world share its random draws, so a world counts once for any number
+of agents, and its return is the sum over steps of the mean reward of its learners. Players are compared world by world.
 """
 
 from __future__ import annotations
@@ -32,34 +32,34 @@ __all__ = [
 ]  # fmt: skip
 
 TRAINING, TUNING, EVALUATION = 0, 1_000_000_000, 2_000_000_000
-"""Where the seeds of worlds for learning, for tuning hand-written parameters and for the final table begin.
+"""First world seeds of the blocks for learning, for tuning hand-written parameters and for the final evaluation.
 
-Each block holds 1,000 seeds of a million worlds each and ends where the next begins, so that no player has ever met a
-world it is scored on. The seeds people type at an environment (0, 1, 42) lie in the first block."""
+Each block has 1,000 seeds of a million worlds each and ends where the next begins, so that players are evaluated on
+held-out worlds. Seeds that are usual for an environment (0, 1, 42) are in the first block."""
 
 WORLDS_PER_SEED, SEEDS = 1_000_000, 1_000
 Purpose = Literal["training", "tuning", "evaluation"]
 _BLOCKS: Mapping[str, int] = {"training": TRAINING, "tuning": TUNING, "evaluation": EVALUATION}
 
 RESAMPLES = 10_000
-"""Bootstrap resamples: the ends of an interval then move by about 1 % of its width from one generator to another."""
+"""Bootstrap resamples: with this number the ends of an interval vary by about 1 % of its width between generators."""
 
 DRAWN_AT_ONCE = 4_000_000
-"""Numbers of worlds that a bootstrap holds at a time: 32 MB."""
+"""World indices that a bootstrap draws at a time: 32 MB."""
 
 LATENCY_CALLS = 101
-"""Single rows asked for to find the median time of one decision."""
+"""Number of calls with a single row, whose median time is the latency of a decision."""
 
 Floats = NDArray[np.float64]
 Progress = Callable[[int, int], None]
-"""Called after every step with (steps done, the most there can be)."""
+"""Called after every step with (steps done, largest possible number of steps)."""
 
 
 def worlds_for(purpose: Purpose, seed: int = 0, worlds: int = 1) -> int:
-    """Return the seed of the first of `worlds` worlds that nothing else than this purpose and seed uses.
+    """Return the seed of the first of `worlds` worlds that are reserved for this purpose and seed.
 
     Raises:
-        ValueError: unknown purpose, a seed outside [0, 1000) or more worlds than a seed has.
+        ValueError: unknown purpose, a seed outside [0, 1000), or more than a million worlds.
     """
     if purpose not in _BLOCKS:
         raise ValueError(f"purpose: {purpose!r}, must be one of {', '.join(_BLOCKS)}")
@@ -82,7 +82,7 @@ class Interval:
 
 @dataclass(frozen=True, eq=False)
 class Recording:
-    """One world as it was played: an instant at the start and after each control step, and the return so far."""
+    """Recording of one world: a snapshot at the start and after each control step, and the return until then."""
 
     world: int
     snapshots: tuple[Snapshot, ...]
@@ -91,7 +91,7 @@ class Recording:
 
 @dataclass(frozen=True, eq=False)
 class Episodes:
-    """What one policy did in B worlds, one episode in each; arrays are (B,)."""
+    """Results of one policy in B worlds, one episode in each; arrays are (B,)."""
 
     task: str
     digest: str
@@ -101,19 +101,19 @@ class Episodes:
     success: NDArray[np.bool_]
     lengths: NDArray[np.int64]  # control steps
     terms: Mapping[str, Floats]  # reward term -> its share of the return
-    metrics: Mapping[str, Floats]  # NaN where a metric does not apply (the time to a capture that never came)
-    microseconds: float  # per decision, all worlds and learners asked at once, median over steps
-    latency: float  # us for one row asked alone, median
+    metrics: Mapping[str, Floats]  # NaN if a metric does not apply (such as the time to a capture that did not happen)
+    microseconds: float  # per decision, for all worlds and learners at once, median over steps
+    latency: float  # us for a call with a single row, median
     recording: Recording | None = None
 
     @property
     def worlds(self) -> int:
-        """B."""
+        """Number of worlds, B."""
         return len(self.returns)
 
 
 class Playable(Protocol):
-    """What a rollout asks of a world: flockenv.envs.world.World is one."""
+    """Interface of a world in a rollout, which flockenv.envs.world.World implements."""
 
     def reset(self, seeds: int) -> NDArray[np.float32]: ...
     def step(self, actions: NDArray[Any]) -> Step: ...
@@ -132,18 +132,18 @@ def rollout(
     progress: Progress | None = None,
     make_world: Callable[[Task, int, int], Playable] = World,
 ) -> Episodes:
-    """Play one episode in each of the worlds seed, seed + 1, ..., all stepped together, every learner by the policy.
+    """Play one episode in each of the worlds seed, seed + 1, ..., stepped together; the policy controls every learner.
 
-    The policy is asked for (worlds * learners, O) rows at once, a world's learners next to each other. Worlds that have
-    ended are stepped and asked on with the others, so that a policy may keep a state per row, but no longer count.
+    The policy receives (worlds * learners, O) rows at once, with the learners of a world next to each other. Worlds
+    that have ended are still stepped and passed to it, so that a policy may keep a state per row, but no longer count.
 
     Args:
-        task: what is played, for at most `task.horizon` control steps.
-        policy: sees observations and nothing else.
+        task: the task to play, for at most `task.horizon` control steps.
+        policy: receives only observations.
         worlds: B.
-        seed: of the first world; `worlds_for("evaluation", s, B)` keeps clear of those trained and tuned on.
-        record: the index of a world to keep snapshots of.
-        deterministic: handed to predict().
+        seed: of the first world; `worlds_for("evaluation", s, B)` avoids the worlds for training and tuning.
+        record: index of a world to record snapshots of; None: no recording.
+        deterministic: passed to predict().
         progress: see Progress.
         make_world: (task, worlds, time limit) -> the world to play in.
 
@@ -180,7 +180,7 @@ def _play(
     task: Task, world: Playable, observation: NDArray[np.float32], pilot: _Pilot, ledger: _Ledger, film: _Film,
     progress: Progress | None,
 ) -> None:  # fmt: skip
-    """Step all worlds by the policy's actions until the last episode has ended; RuntimeError if one never does."""
+    """Step all worlds with the policy's actions until the last episode has ended; RuntimeError if one does not end."""
     for number in range(1, task.horizon + 1):
         step = world.step(pilot.act(observation, task.action_layout.size))
         running = ledger.enter(step, world.measure)
@@ -190,22 +190,22 @@ def _play(
             progress(number, task.horizon)
         if ledger.closed:
             return
-    raise RuntimeError(f"task {task.name!r}: world {int(np.argmax(ledger.running))} goes on after its time limit")
+    raise RuntimeError(f"task {task.name!r}: world {int(np.argmax(ledger.running))} continues after its time limit")
 
 
-class _staying:  # noqa: N801  # a context manager without the cost of a generator: it is inside the clock
-    """Refuse a policy that ends the process."""
+class _staying:  # noqa: N801  # a class, not a generator, which would cost time inside the timed call
+    """Context manager that turns a policy's SystemExit into a ValueError."""
 
     def __enter__(self) -> None:
         pass
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: object) -> None:
         if isinstance(error, SystemExit):
-            raise ValueError(f"policy: ends the process, exit({error.code!r}), instead of an action") from None
+            raise ValueError(f"policy: calls exit({error.code!r}) instead of returning an action") from None
 
 
 class _Pilot:
-    """Asks the policy for everybody's action, carries its state along and times it: predict() and nothing around it."""
+    """Calls the policy for all learners, keeps its state between calls, and times predict() alone."""
 
     def __init__(self, policy: Policy, deterministic: bool) -> None:
         self._policy, self._deterministic = policy, deterministic
@@ -213,7 +213,7 @@ class _Pilot:
         self._times: list[float] = []  # us per row, one entry per call
 
     def act(self, observation: NDArray[np.float32], action_size: int) -> NDArray[Any]:
-        """(B, L, O) -> (B, L, A)."""
+        """Return the actions (B, L, A) for observations (B, L, O)."""
         rows = observation.reshape(-1, observation.shape[-1])
         starts = np.full(len(rows), not self._times)
         began = perf_counter()
@@ -227,12 +227,12 @@ class _Pilot:
 
     @property
     def microseconds(self) -> float:
-        """Median over calls: what else the machine did in between belongs to nobody's decisions."""
+        """Median time over calls, us per row, which is robust to other load on the machine."""
         return float(np.median(self._times))
 
 
 class _Ledger:
-    """Keeps the accounts of every world until its own episode ends."""
+    """Accumulates returns, lengths and metrics of each world until its episode ends."""
 
     def __init__(self, task: Task, worlds: int) -> None:
         self.returns, self.terms = np.zeros(worlds), np.zeros((worlds, len(task.terms)))
@@ -245,7 +245,7 @@ class _Ledger:
         return not self.running.any()
 
     def enter(self, step: Step, measure: Callable[[], Mapping[str, Floats]]) -> NDArray[np.bool_]:
-        """Add one step and return which worlds it counted for."""
+        """Add one step; return the mask (B,) of the worlds whose episode it belongs to."""
         running, reward = self.running, step.reward.mean(axis=1)
         wrong = running & ~np.isfinite(reward)
         if wrong.any():
@@ -264,7 +264,7 @@ class _Ledger:
 
 @dataclass
 class _Film:
-    """Takes a snapshot of one world after every step that counts for it."""
+    """Records a snapshot of one world after each step of its episode."""
 
     world: Playable
     record: int | None
@@ -288,7 +288,7 @@ class _Film:
 
 
 def _latency(policy: Policy, row: NDArray[np.float32], deterministic: bool) -> float:
-    """Time one decision for one agent, the case of a single robot: median in us."""
+    """Return the median time of a decision for one agent, as on a single robot, in us."""
     times = []
     for _ in range(LATENCY_CALLS):
         began = perf_counter()
@@ -299,22 +299,22 @@ def _latency(policy: Policy, row: NDArray[np.float32], deterministic: bool) -> f
 
 
 def task_digest(task: Task) -> str:
-    """Return a short fingerprint of a task and all its settings: scores of different fingerprints do not compare."""
+    """Return a short digest of a task and all its settings: scores with different digests cannot be compared."""
     return hashlib.sha256(f"{type(task).__name__} {task.model_dump_json()}".encode()).hexdigest()[:16]
 
 
 def iqm(values: ArrayLike) -> float:
-    """Return the interquartile mean: of what is left without the lowest and the highest quarter.
+    """Return the interquartile mean: the mean without the lowest and the highest quarter of the values.
 
-    Source: Agarwal et al. 2021 (arXiv 2108.13264), who recommend it for returns: outliers do not move it, and it uses
-    twice the data that a median does.
+    Agarwal et al. 2021 (arXiv 2108.13264) recommend it for returns: it is robust to outliers, and uses more of the data
+    than a median.
     """
     return float(_iqm_rows(np.asarray(values, np.float64)[None])[0])
 
 
 def _iqm_rows(samples: Floats) -> Floats:
     cut = samples.shape[1] // 4
-    # sorted whole: that is vector code, five times as fast as scipy's trim_mean, which only sets the quarters apart
+    # a full sort is vector code, five times as fast as scipy's trim_mean, which only partitions
     return np.asarray(np.sort(samples, axis=1)[:, cut : samples.shape[1] - cut].mean(axis=1), np.float64)
 
 
@@ -330,11 +330,11 @@ def bootstrap(
 ) -> Interval:
     """Return a statistic of one number per world with its 95 % percentile bootstrap interval.
 
-    Percentile and not BCa: the latter has no answer where all worlds score alike. tests/test_evaluation.py measures
-    how often the interval holds the truth on a skewed distribution.
+    Percentile and not BCa: the latter is undefined if all worlds have the same score. tests/test_evaluation.py measures
+    the coverage of the interval on a skewed distribution.
 
     Raises:
-        ValueError: fewer than two values, one that is not finite, or no resamples.
+        ValueError: fewer than two values, a value that is not finite, or no resamples.
     """
     x = np.asarray(values, np.float64)
     if x.ndim != 1 or len(x) < 2 or not np.isfinite(x).all():
@@ -348,7 +348,7 @@ def bootstrap(
 
 
 def _resampled(worlds: int, resamples: int, seed: int) -> Iterator[NDArray[np.int64]]:
-    """Yield which worlds are drawn, some resamples at a time, (n, worlds): the same for whoever asks."""
+    """Yield the indices of the worlds drawn, (n, worlds), n resamples at a time; they depend only on the arguments."""
     some = max(1, DRAWN_AT_ONCE // worlds)
     if resamples <= some:
         yield _drawn(worlds, resamples, seed)
@@ -358,7 +358,7 @@ def _resampled(worlds: int, resamples: int, seed: int) -> Iterator[NDArray[np.in
         yield generator.integers(worlds, size=(min(some, resamples - done), worlds))
 
 
-@functools.lru_cache(maxsize=1)  # all players of a task are resampled alike
+@functools.lru_cache(maxsize=1)  # all players of a task use the same resamples
 def _drawn(worlds: int, resamples: int, seed: int) -> NDArray[np.int64]:
     drawn = np.random.default_rng(seed).integers(worlds, size=(resamples, worlds))
     drawn.flags.writeable = False
@@ -368,8 +368,8 @@ def _drawn(worlds: int, resamples: int, seed: int) -> NDArray[np.int64]:
 def proportion(scores: ArrayLike) -> Interval:
     """Return the mean of scores in {0, 1/2, 1} with its 95 % Wilson interval.
 
-    Wilson and not bootstrap: resampling 256 successes out of 256 would claim certainty. Halves (ties) have less
-    variance than the formula allows for, so with them the interval is a little too wide, never too narrow.
+    Wilson and not bootstrap: the bootstrap interval of 256 successes in 256 trials has width 0. Halves (ties) have less
+    variance than the formula assumes, so with them the interval is a little too wide, never too narrow.
     Source: Wilson 1927, J. Am. Stat. Assoc. 22, 209.
     """
     x, z = np.asarray(scores, np.float64), NormalDist().inv_cdf(0.975)
@@ -381,12 +381,12 @@ def proportion(scores: ArrayLike) -> Interval:
 
 @dataclass(frozen=True)
 class Summary:
-    """What a table says about one player."""
+    """Statistics of one player, as shown in a table."""
 
     iqm: Interval  # bootstrap
     mean: Interval  # bootstrap
     success: Interval  # Wilson
-    metrics: Mapping[str, tuple[float, int]]  # mean over the worlds where it applies, and their number
+    metrics: Mapping[str, tuple[float, int]]  # mean over the worlds to which it applies, and their number
 
 
 def summarise(episodes: Episodes, resamples: int = RESAMPLES, seed: int = 0) -> Summary:
@@ -406,7 +406,7 @@ def _applicable(values: Floats) -> tuple[float, int]:
 
 @dataclass(frozen=True)
 class Comparison:
-    """The first player against the second in the same worlds; positive and above one half: the first is ahead."""
+    """Comparison of two players in the same worlds; differences > 0 and `better` > 1/2: the first is ahead."""
 
     difference: Interval  # mean of the per-world differences of return, bootstrap
     iqm_difference: Interval  # interquartile mean of the same differences, bootstrap
@@ -415,18 +415,18 @@ class Comparison:
 
     @property
     def separated(self) -> bool:
-        """Whether the interval of the difference keeps clear of zero."""
+        """True if the interval of the difference excludes zero."""
         return self.difference.low > 0 or self.difference.high < 0
 
 
 def compare(first: Episodes, second: Episodes, resamples: int = RESAMPLES, seed: int = 0) -> Comparison:
     """Compare two players world by world.
 
-    `difference` is the mean: it is the difference of the two mean returns, and a disaster in one world out of five
-    weighs in it what it costs; the interquartile mean beside it says what happens in an ordinary world.
+    `difference` is the mean: it equals the difference of the mean returns, and includes the full cost of failures in a
+    few worlds. `iqm_difference`, the interquartile mean, describes typical worlds.
 
     Raises:
-        ValueError: the episodes are not of the same worlds: another task, settings, seed, number or time limit.
+        ValueError: the episodes are not of the same worlds: task, settings, seed, number or time limit differ.
     """
     for name in ("task", "digest", "seed", "worlds", "horizon"):
         a, b = getattr(first, name), getattr(second, name)
@@ -443,4 +443,4 @@ def compare(first: Episodes, second: Episodes, resamples: int = RESAMPLES, seed:
 
 def _whole(name: str, value: object, least: int, most: int) -> None:
     if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or not least <= value <= most:
-        raise ValueError(f"{name}: {value!r}, must be a whole number from {least} to {most}")
+        raise ValueError(f"{name}: {value!r}, must be an integer from {least} to {most}")

@@ -24,14 +24,14 @@ INK, FAINT, GRID = "#22272e", "#6b7480", "#e4e7eb"
 COLOURS = ("#D55E00", "#0072B2", "#E69F00", "#009E73", "#CC79A7", "#56B4E9")
 """Okabe and Ito's palette, distinct for any colour vision."""
 ABREAST = 4
-"""Most tasks side by side; more go below."""
+"""Most tasks side by side; further ones go below."""
 
 FIXED = {"random": "#8a929c", "textbook": "#E69F00", "rules": "#0072B2", "ppo": "#D55E00"}
 
 
 @dataclass(frozen=True, eq=False)
 class Row:
-    """One player: an interval for its score and one for its success rate, and the scores of single worlds behind."""
+    """One player: intervals of its score and its success rate, and the scores of single worlds, drawn behind."""
 
     name: str
     score: Interval
@@ -49,7 +49,7 @@ class Column:
 
 
 def write_chart(path: str | Path, columns: Sequence[Column], title: str, note: str = "") -> None:
-    """Write the plot as a PNG file, whole or not at all; needs no display, and the same numbers give the same bytes."""
+    """Write the plot as a PNG file, atomically and without a display; the same numbers give the same bytes."""
     figure = draw_chart(columns, title, note)
     with replacing(path) as file:
         figure.savefig(file, format="png", dpi=150, metadata={"Software": "flockenv"})
@@ -59,7 +59,7 @@ def draw_chart(columns: Sequence[Column], title: str, note: str = "") -> Figure:
     """Return the plot: per task scores over their worlds, success rates, and differences against a line at zero.
 
     Raises:
-        ValueError: nothing to draw.
+        ValueError: there is no column, or one without rows.
     """
     if not columns or not all(column.rows for column in columns):
         raise ValueError("chart: needs at least one task, and at least one player in each")
@@ -68,7 +68,7 @@ def draw_chart(columns: Sequence[Column], title: str, note: str = "") -> Figure:
     from matplotlib.figure import Figure
     from matplotlib.layout_engine import ConstrainedLayoutEngine
 
-    wide = -(-len(columns) // -(-len(columns) // ABREAST))  # bands of equal width, but for the last
+    wide = -(-len(columns) // -(-len(columns) // ABREAST))  # bands of equal width, except the last
     bands = [columns[k : k + wide] for k in range(0, len(columns), wide)]
     heights = [h for band in bands for h in _heights(band)]
     size = (1.2 + 4.2 * wide, sum(heights) + 0.85 * len(heights) + 1.0)
@@ -94,7 +94,7 @@ def _heights(band: Sequence[Column]) -> list[float]:
 
 
 def _draw_column(plots: Sequence[Axes], column: Column | None, colours: Mapping[str, str]) -> None:
-    """Draw one task, from top to bottom; nothing where the last band has no more."""
+    """Draw one task, from top to bottom; hide the plots if `column` is None, in a last band with fewer tasks."""
     for axes in plots:
         if column is None:
             axes.set_axis_off()
@@ -116,17 +116,17 @@ def _colours(names: Sequence[str]) -> dict[str, str]:
 
 
 def _scores(axes: Axes, column: Column, colours: Mapping[str, str]) -> None:
-    """Draw every world as a faint dot and the interval over them."""
+    """Draw each world as a faint dot, and the interval above them."""
     axes.set_title(column.title, loc="left", fontsize=12.5, fontweight="bold", color=INK, pad=10)
     axes.set_xlabel("return: interquartile mean, 95 % (dots: worlds)")
     for y, row in enumerate(column.rows):
-        # a fixed comb of heights instead of random ones: neighbours in score do not hide each other, bytes repeat
+        # fixed heights instead of random ones: dots of similar scores do not overlap, and the file is reproducible
         heights = y + 0.30 * (np.argsort(np.argsort(row.scores)) * 0.618034 % 1.0 * 2 - 1)
         axes.scatter(row.scores, heights, s=7, color=colours[row.name], alpha=0.22, linewidths=0, zorder=2)
         _interval(axes, y, row.score, colours[row.name], f"{row.score.value:.3g}")
     _rows(axes, [row.name for row in column.rows])
     scores = np.concatenate([row.scores for row in column.rows])
-    low, high = np.quantile(scores, (0.005, 0.995))  # one freak world must not press all intervals together
+    low, high = np.quantile(scores, (0.005, 0.995))  # one outlier must not compress all intervals
     low, high = min([low, *(r.score.low for r in column.rows)]), max([high, *(r.score.high for r in column.rows)])
     margin = 0.05 * (high - low) or 0.5
     axes.set_xlim(low - margin, high + margin)
@@ -173,7 +173,7 @@ def _rows(axes: Axes, names: Sequence[str]) -> None:
 
 
 def _plain(axes: Axes) -> None:
-    """Keep of the frame only what carries information."""
+    """Remove the parts of the frame that carry no information."""
     for side in ("top", "right", "left"):
         axes.spines[side].set_visible(False)
     axes.spines["bottom"].set_color(GRID)

@@ -1,1 +1,1 @@
-"""From Python to machine code: marks, sections, the compiler's pipeline, what is kept on disk, threads, memory."""
+"""From Python to machine code: decorators, sections, compiler pipeline, disk cache, thread pool, memory."""

@@ -1,4 +1,4 @@
-"""Where machine code is kept."""
+"""The folder of cached machine code."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ __all__ = [
 
 
 def cache_folder() -> Path:
-    """Return the folder of machine code, checked; FLOCKENV_CACHE names another one.
+    """Return the checked folder of cached machine code; FLOCKENV_CACHE sets another one.
 
-    Falls back to a folder under the system's temporary one where the home folder cannot be written or is not private.
+    Falls back to a folder under the system's temporary one if the home folder cannot be written or is not private.
 
     Raises:
-        OSError: the folder that FLOCKENV_CACHE names can be changed by other users, or none can be written.
+        OSError: the folder in FLOCKENV_CACHE can be changed by other users, or no folder can be written.
     """
     named = os.environ.get("FLOCKENV_CACHE")
     if named:

@@ -1,8 +1,8 @@
-"""Named pieces of data in a private folder, each read whole or not at all.
+"""Named data in a private folder, verified by a digest when it is read.
 
-A file begins with a digest of its name and of all that follows. One that was emptied, cut, or in which a bit has
-changed, is never returned: one line on stderr reports it, and it is replaced when its data is written again. Files
-are written by `flockenv.core.atomic_files`, so that no process ever reads half of one.
+A file begins with a digest of its name and of all that follows. A file that was emptied, truncated or changed is never
+returned: one line on stderr reports it, and it is replaced when its data is written again. Files are written by
+`flockenv.core.atomic_files`, so that no process ever reads half of one.
 """
 
 from __future__ import annotations
@@ -17,14 +17,14 @@ from flockenv.jit.private_folder import read_private, say_once
 __all__ = ["Store"]
 
 HEAD = b"flockenv 1\n"
-"""The first bytes of a file; another number for another format."""
+"""The first bytes of a file; the number is the version of the format."""
 
 DAY = 86_400.0
-"""s: no process takes this long to write a file; older half-written ones were left by a process that was killed."""
+"""s: no process takes this long to write a file; older incomplete files were left by a killed process."""
 
 
 class Store:
-    """Data by name, a file each, in a folder that `private_folder.prepared` has returned."""
+    """Store of data by name, one file each, in a folder that `private_folder.prepared` returned."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -43,11 +43,11 @@ class Store:
         return data
 
     def write(self, name: str, data: bytes) -> None:
-        """Keep data under this name; if it cannot be written, one line on stderr has the reason."""
+        """Store data under this name; if it cannot be written, report the reason in one line on stderr."""
         self._keep(name, _head(name, data) + data)
 
     def write_text(self, name: str, text: str) -> None:
-        """Keep a text as it is, for people to read; a changed one is replaced, and one line reports it."""
+        """Store a text unchanged, for people to read; a changed file is replaced, and one line reports it."""
         wanted, found = text.encode(), self._found(name)
         if found != wanted:
             if found is not None:
@@ -55,7 +55,7 @@ class Store:
             self._keep(name, wanted)
 
     def _found(self, name: str) -> bytes | None:
-        """Return a file's content; None if it is missing, or cannot be trusted or read, which one line reports."""
+        """Return a file's content; None if it is missing, or not private or not readable, which one line reports."""
         path = self.folder / name
         try:
             return read_private(path)
@@ -69,7 +69,7 @@ class Store:
         say_once(f"{self.folder / name}: damaged; made anew")
 
     def _keep(self, name: str, data: bytes) -> None:
-        """Write a file, or report why it could not be written: only the next start's time depends on it."""
+        """Write a file, or report why it could not be written: only the next process's startup time depends on it."""
         try:
             with replacing(self.folder / name, 0o600) as file:
                 file.write(data)
@@ -80,7 +80,7 @@ class Store:
 
 @functools.cache
 def _swept(folder: Path) -> None:
-    """Remove what killed processes left half-written in a folder, once per process."""
+    """Remove incomplete files of killed processes from a folder, once per process."""
     remove_leftovers(folder, DAY)
 
 

@@ -1,10 +1,10 @@
-"""The processor that machine code is made for: what it can do, and how many numbers lie side by side in it.
+"""The target processor of machine code: its features, and the width of its vector registers.
 
-What numba is told of it counts (NUMBA_CPU_NAME, NUMBA_CPU_FEATURES, NUMBA_ENABLE_AVX), as far as it is written there:
-what follows from a processor's name alone is not seen. FLOCKENV_REGISTER=32 or 64 says how many bytes lie side by side,
-for whoever wants to know what another size does. Results are the same bits in either on one processor: lanes do not
-know of each other. (How many pairs were met, `State.work`, follows from how many lanes there are.) On a processor with
-other instructions they mostly are, too, but need not be: of a sum of products LLVM fuses which one it likes.
+numba's settings (NUMBA_CPU_NAME, NUMBA_CPU_FEATURES, NUMBA_ENABLE_AVX) take precedence, but only features that are
+listed: those implied by a processor's name alone are not detected. FLOCKENV_REGISTER=32 or 64 sets the register width
+in bytes, for experiments. On one processor the results are bit-identical in both widths, as lanes are independent. (The
+number of pairs evaluated, `State.work`, does depend on the number of lanes.) On a processor with other instructions
+they mostly are, but need not be: LLVM chooses which product of a sum it fuses.
 """
 
 from __future__ import annotations
@@ -17,18 +17,18 @@ from numba.core import codegen
 __all__ = ["FEATURES", "LINE", "REGISTER"]
 
 LINE = 64
-"""Bytes of a line of the cache; no vector register is longer."""
+"""Bytes of a cache line; no vector register is longer."""
 
 
 def _features() -> frozenset[str]:
-    """Return what it can do, as LLVM names it."""
+    """Return the processor's features by their names in LLVM."""
     told: str | None = numba.config.CPU_FEATURES  # type: ignore[attr-defined]  # made from the environment
     found: str = codegen.get_host_cpu_features() if told is None else told  # type: ignore[no-untyped-call]
     return frozenset(name[1:] for name in found.split(",") if name.startswith("+"))
 
 
 def _register() -> int:
-    """Return how many bytes lie side by side; ValueError where the environment asks for something else."""
+    """Return the register width in bytes; ValueError if FLOCKENV_REGISTER is neither 32 nor 64 nor empty."""
     told = os.environ.get("FLOCKENV_REGISTER", "")
     if told not in ("", "32", "64"):
         raise ValueError(f"FLOCKENV_REGISTER = {told!r}: must be 32 or 64 (bytes side by side), or nothing")
@@ -36,7 +36,7 @@ def _register() -> int:
 
 
 FEATURES = _features()
-"""What it can do: "avx512f" and "avx2" make a difference here."""
+"""Features of the processor; only "avx512f" and "avx2" make a difference here."""
 
 REGISTER = _register()
-"""Bytes of numbers side by side: a vector register; without AVX-512 one of AVX2, and elsewhere two of 16 bytes."""
+"""Bytes of a vector register: 64 with AVX-512, otherwise 32 (one of AVX2, or two of 16 bytes)."""

@@ -1,6 +1,6 @@
-"""The marks of compiled code: laws, kernels and the few functions that both are written with.
+"""Decorators of compiled code (laws, kernels, ...) and the few helper functions that both are written with.
 
-What Python calls of them is made in `section`.
+Entry points, which Python calls, are made in `section`.
 """
 
 from __future__ import annotations
@@ -46,16 +46,16 @@ Vec = tuple[float, ...]
 """A vector inside a law: a tuple of D floats, D = 2 or 3."""
 
 Numbers = tuple[float, ...]
-"""As many numbers as there are: a tuple of floats of any length, the same for all agents."""
+"""A tuple of floats of any length, the same for all agents."""
 
-# Fused multiply-add and nothing else. The rest of fastmath gave no speed here and took much: with `arcp` and `afn` a
+# Fused multiply-add and nothing else. The rest of fastmath gave no speed here and did harm: with `arcp` and `afn` a
 # division in a vector register is an estimate and a scalar one is exact, so that results depend on how agents are
 # divided among threads; with `reassoc` and `nsz` a NaN check (x - x == 0) folds to True.
 FAST = frozenset({"contract"})
 
-# _nrt=False: no reference counts. Arrays belong to the caller of the entry point, for as long as it runs; counting
-# every view of them with a locked instruction took nine tenths of the time of a world of 32 agents. So nothing compiled
-# here may allocate (numba says so when it compiles): scratch is an argument.
+# _nrt=False: no reference counts. The caller of the entry point owns the arrays while it runs; counting every view of
+# them with a locked instruction took nine tenths of the time of a world of 32 agents. So nothing compiled here may
+# allocate (numba reports it when it compiles): scratch is an argument.
 OPTIONS: Any = {
     "forceinline": True, "fastmath": set(FAST), "error_model": "numpy", "nogil": True, "_nrt": False,
     "pipeline_class": Inlined,
@@ -67,19 +67,19 @@ IN_PYTHON: bool = numba.config.DISABLE_JIT  # type: ignore[attr-defined]  # made
 """True with NUMBA_DISABLE_JIT=1: kernels run in plain Python, for a debugger."""
 
 if IN_PYTHON:
-    np.seterr(all="ignore")  # as machine code does: infinities and NaN are values, unsigned integers wrap
+    np.seterr(all="ignore")  # as in machine code: infinities and NaN are values, unsigned integers wrap
 
 
 def _marked(function: F, **options: Any) -> F:
-    """Mark a part of kernels. numba asks for its signature twice, which takes longer than all else: it is told."""
+    """Compile a part of kernels with numba; its signature is stored, as numba computes it twice, which is slow."""
     function.__signature__ = inspect.signature(function)  # type: ignore[attr-defined]
     return cast(F, _njit(**{**OPTIONS, **options})(function))
 
 
 def law(function: F) -> F:
-    """Mark a scalar law: branch-free if it can be, inlined into whatever loop calls it, never called on its own.
+    """Mark a scalar law: branch-free if possible, inlined into the loop that calls it, never called from Python.
 
-    For numba the same as `kernel`; the two words tell readers what is physics, and what is a part of the engine.
+    For numba it is the same as `kernel`; the two names distinguish physics from engine.
     """
     return _marked(function)
 
@@ -90,17 +90,17 @@ def unfused(function: F) -> F:
 
 
 def kernel(function: F) -> F:
-    """Mark a part of a kernel, that reads and writes arrays or puts laws together; compiled with what calls it."""
+    """Mark a part of a kernel, which reads and writes arrays or combines laws; it is compiled into its callers."""
     return _marked(function)
 
 
 def routine(function: F) -> F:
-    """Mark a function that a kernel calls from several places, and that is compiled once for all of them."""
+    """Mark a function that a kernel calls from several places; it is compiled once and not inlined."""
     return _marked(function, forceinline=False)
 
 
 def shared(function: F) -> F:
-    """Mark a law that Python calls too, as it stands: what a method's `advance` needs, which runs in both."""
+    """Mark a law that Python also calls, as plain Python: a method's `advance`, for example, runs in both."""
     mark: Any = register_jitable
     return cast(F, mark(**OPTIONS)(function))
 
@@ -122,7 +122,7 @@ def _like(x, constant):  # type: ignore[no-untyped-def]  # numba compares signat
 
 
 def replaced(numbers: tuple[float, ...], k: int, x: float) -> tuple[float, ...]:
-    """Return the numbers with x in place k."""
+    """Return the numbers with the k-th replaced by x."""
     return (*numbers[:k], x, *numbers[k + 1 :])
 
 
@@ -133,5 +133,5 @@ def _replaced(numbers, k, x):  # type: ignore[no-untyped-def]
 
 @law
 def finite(x: float) -> bool:
-    """Is x a number, neither NaN nor infinite?"""
+    """Return True if x is neither NaN nor infinite."""
     return abs(x) < like(x, math.inf)

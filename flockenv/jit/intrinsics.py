@@ -1,6 +1,6 @@
-"""Operations that Python has no words for: lanes copied as one vector, prefetches, sums across threads.
+"""Operations that Python cannot express: vector copies, prefetches, atomic sums and barriers of threads.
 
-Each is an intrinsic of numba, and a plain function where kernels run in Python (NUMBA_DISABLE_JIT=1).
+Each is an intrinsic of numba, or a plain function if kernels run in Python (NUMBA_DISABLE_JIT=1).
 """
 
 from __future__ import annotations
@@ -35,26 +35,26 @@ __all__ = [
 
 
 def intrinsic_or_python(generate: Callable[..., Any], plain: Callable[..., Any]) -> Any:
-    """Return an intrinsic; with NUMBA_DISABLE_JIT=1, which runs kernels in plain Python, what it does there."""
+    """Return an intrinsic; with NUMBA_DISABLE_JIT=1, which runs kernels in plain Python, the function `plain`."""
     return plain if IN_PYTHON else intrinsic(generate)
 
 
 def written(number: Any, name: str) -> int:
-    """Return an integer that is known while compiling; numba tries again with its value if it did not tell it."""
+    """Return an integer literal's value; else raise TypingError, after which numba tries again with literal types."""
     if not isinstance(number, types.IntegerLiteral):
         raise numba.TypingError(f"{name}: {number}, must be written as a number")
     return int(number.literal_value)
 
 
 def _unaliased(typing_context: Any) -> Any:
-    """Promise, at the top of an entry point, that its array arguments do not overlap (C's `restrict`).
+    """Declare, at the top of an entry point, that its array arguments do not overlap (C's `restrict`).
 
     Without it LLVM must assume that a sum it writes may be an input it reads, and keeps both out of registers: a factor
-    of three in a sweep. Whoever calls such an entry point keeps the promise; Scene and World do, by allocating.
+    of three in the pair loop. The caller of such an entry point must ensure it; Scene and World do, by allocating.
 
-    Its loops may use the longest registers there are: on most of Intel's processors LLVM would halve them, for the sake
-    of code around them. And its stack begins where a register may lie (LLVM leaves it at 16 bytes): else one that is
-    put there for a while lies across two lines of the cache, in one process and not in the next.
+    The entry point may use the longest vector registers: on most Intel processors LLVM would halve them for the sake of
+    surrounding code. Its stack is aligned for a register (LLVM's default is 16 bytes): otherwise a spilled register
+    lies across two cache lines in some processes and not in others.
     """
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
@@ -62,7 +62,7 @@ def _unaliased(typing_context: Any) -> Any:
             if isinstance(argument.type, ir.PointerType) and argument.name.startswith("arg."):
                 argument.add_attribute("noalias")
         attributes = builder.function.attributes
-        if isinstance(attributes, set):  # written as they stand; but `add` of llvmlite's knows none that has a value
+        if isinstance(attributes, set):  # added verbatim: `add` of llvmlite accepts no attributes with values
             set.add(attributes, f'"prefer-vector-width"="{8 * LINE}"')
             set.add(attributes, '"stackrealign"')
         return context.get_dummy_value()
@@ -74,9 +74,9 @@ unaliased: Any = intrinsic_or_python(_unaliased, lambda: None)
 
 
 def _copy_lanes(typing_context: Any, to: Any, at: Any, source: Any, place: Any, width: Any) -> Any:
-    """Copy `width` numbers, from `place` on, to where `at` is: as one vector, whatever becomes of loops.
+    """Copy `width` numbers from source[place] on to to[at] on, as one vector, independent of loop vectorisation.
 
-    Both arrays have one axis and lie in one piece; places are counted without a sign, and the width is written down.
+    Both arrays have one axis and are contiguous; indices are unsigned, and the width is a literal.
     """
     if to.dtype != source.dtype or (to.layout, source.layout, to.ndim, source.ndim) != ("C", "C", 1, 1):
         raise numba.TypingError(f"copy_lanes: {source} into {to}, must be one row of the same numbers, in one piece")
@@ -106,7 +106,7 @@ copy_lanes: Any = intrinsic_or_python(_copy_lanes, _copied_in_python)
 
 
 def asked(builder: Any, address: Any) -> None:
-    """Generate what asks for the line of memory at an address, to write into it; of no memory it asks for nothing."""
+    """Generate a prefetch, for writing, of the cache line at an address; an invalid address has no effect."""
     byte, flag = ir.IntType(8).as_pointer(), ir.IntType(32)
     declare: Any = cgutils.get_or_insert_function
     kind = ir.FunctionType(ir.VoidType(), [byte, flag, flag, flag])
@@ -115,9 +115,9 @@ def asked(builder: Any, address: Any) -> None:
 
 
 def _ask_for(typing_context: Any, array: Any, place: Any) -> Any:
-    """Ask for the line of memory around array[place], or the place of so many numbers in all, to be written soon.
+    """Prefetch the cache line of array[place], with a flat index, which is written soon.
 
-    Places that are read and written in no order are waited for one after the other; asked for in good time, together.
+    Accesses in random order wait for one line after another; prefetched early, the lines are loaded in parallel.
     """
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
@@ -133,9 +133,9 @@ ask_for: Any = intrinsic_or_python(_ask_for, lambda array, place: None)
 
 
 def _stacked(typing_context: Any, numbers: Any) -> Any:
-    """Return the numbers of a tuple as an array that a law may write, for as long as its caller runs.
+    """Return the numbers of a tuple as an array that a law may write, valid while its caller runs.
 
-    It lies on the stack: laws allocate nothing. A law never returns it.
+    It is on the stack, as laws allocate nothing. A law must not return it.
     """
     if not isinstance(numbers, types.UniTuple):
         raise numba.TypingError(f"stacked: {numbers}, must be a tuple of numbers of one kind")
@@ -160,10 +160,10 @@ stacked: Any = intrinsic_or_python(_stacked, np.array)
 
 
 def _tallied(typing_context: Any, number: Any, flag: Any) -> Any:
-    """Return a number that counts, 0 at the start, with one more counted if the flag is up; `tally_of` reads it.
+    """Return the counter `number`, 0 at the start, incremented if `flag` is set; `tally_of` reads it.
 
-    With AVX-512 it is the number itself: to add 1 under a mask is one instruction. Elsewhere its bits are a whole
-    number, from which what was compared is taken away as it is: -1 where the flag is up.
+    With AVX-512 it is a float: a masked addition of 1 is one instruction. Otherwise its bits are an integer, from which
+    the result of the comparison, -1 if the flag is set, is subtracted directly.
     """
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
@@ -178,7 +178,7 @@ def _tallied(typing_context: Any, number: Any, flag: Any) -> Any:
 
 
 def _tally(typing_context: Any, number: Any) -> Any:
-    """Return how many were counted there, as a number."""
+    """Return the count of a counter of `tallied` as a float."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         if cpu.REGISTER == LINE:
@@ -196,7 +196,7 @@ tally_of: Any = intrinsic_or_python(_tally, lambda number: number)
 
 
 def _add_at_once(typing_context: Any, array: Any, amount: Any) -> Any:
-    """Add to array[0] in one indivisible step; return what was there before."""
+    """Atomically add to array[0]; return its previous value."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         make: Any = arrayobj.make_array
@@ -214,7 +214,7 @@ def _added_in_python(array: Any, amount: int) -> int:
 
 _fetch_add: Any = intrinsic_or_python(_add_at_once, _added_in_python)  # Any: numba's stubs say that it never returns
 
-_PATIENCE = 2000  # rounds of waiting before the core is offered to other threads
+_PATIENCE = 2000  # rounds of spinning before the thread yields its core
 
 _give_way: Any = numba.njit(lambda: 0)
 
@@ -224,7 +224,7 @@ if os.name == "posix":
 
 @kernel
 def wait_for_team(sync: Any, team: int) -> None:
-    """Wait until all `team` threads that work on one world have come here; sync: one int64, 0 at the start."""
+    """Wait until all `team` threads that work on one world arrive (a barrier); sync: one int64, 0 at the start."""
     if team > 1:
         arrived = _fetch_add(sync, 1) + 1
         all_here = (arrived + team - 1) // team * team

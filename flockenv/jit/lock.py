@@ -1,7 +1,7 @@
-"""One process compiles a kernel, the others wait for what it writes: a dozen workers start as fast as one.
+"""Lock of the disk cache: one process compiles a kernel, the others wait, so a dozen workers start as fast as one.
 
-numba lets every process that misses a kernel on the disk compile it. Workers of a vectorised environment, or of a test
-run, all miss the same ones at the same time.
+In numba every process that does not find a kernel on the disk compiles it. Workers of a vectorised environment, or of
+a test run, all miss the same ones at the same time.
 """
 
 from __future__ import annotations
@@ -18,39 +18,39 @@ if TYPE_CHECKING:
 __all__ = ["PATIENCE", "OneAtATime"]
 
 PATIENCE = 120.0
-"""Seconds that somebody else's compilation is waited for; whoever stopped in the middle of one keeps nobody longer."""
+"""Seconds to wait for another process's compilation; a process that stopped while compiling delays others no longer."""
 
 
 class OneAtATime:
-    """A function's cache on the disk, of which one process at a time may have missed an entry."""
+    """A function's disk cache in which only one process at a time compiles a missing entry."""
 
     def __init__(self, cache: Any, lock: Path, patience: float = PATIENCE) -> None:
         self._cache, self._path, self._patience = cache, lock, patience
         self._made: dict[int, FileLock] = {}
 
     def _make(self) -> FileLock:
-        from filelock import FileLock  # here: who only reads need not wait for it
+        from filelock import FileLock  # imported here: a process that only reads the cache does not need it
 
-        # of all threads: numba compiles in one at a time, and the next one may have to let go of what another left
+        # shared by all threads: numba compiles in one at a time, and one may have to release what another left locked
         return FileLock(self._path, timeout=self._patience, thread_local=False)
 
     @property
     def _lock(self) -> FileLock:
-        """The lock as this process has it. One that a fork has inherited is left alone: to drop it might free it."""
+        """The lock object of this process. One inherited by a fork is kept: dropping it might release the lock."""
         if os.getpid() not in self._made:
             self._made[os.getpid()] = self._make()
         return self._made[os.getpid()]
 
     def load_overload(self, signature: Any, context: Any) -> Any:
-        """Return what is on the disk, if need be as soon as another process has written it; None: it is up to you."""
+        """Return the entry on the disk, if necessary once another process has written it; None: the caller compiles."""
         if os.getpid() in self._made:
-            self._lock.release(force=True)  # of a compilation that failed
+            self._lock.release(force=True)  # left by a compilation that failed
         found = self._read(signature, context)
         if found is not None:
             return found
         try:
             self._lock.acquire()
-        except OSError:  # waited for too long, or nothing can be locked here: each compiles for himself
+        except OSError:  # timed out, or locking is impossible here: each process compiles for itself
             return None
         found = self._read(signature, context)
         if found is not None:
@@ -62,7 +62,7 @@ class OneAtATime:
         return self._cache.load_overload(signature, context)
 
     def save_overload(self, signature: Any, compiled: Any) -> None:
-        """Write what was compiled, and let others read it."""
+        """Write the compiled code and release the lock."""
         try:
             self._cache.save_overload(signature, compiled)
         finally:

@@ -1,7 +1,7 @@
-"""Machine code of kernels in a checked store: a disk cache as numba's own, but of files that are verified first.
+"""Machine code of kernels in a checked store: a disk cache like numba's own, but of verified files.
 
 numba's cache unpickles what it finds, and unpickling runs code. This one has numba's methods and one file for every
-combination of argument types and processor. A file is unpickled after its owner and its digest were verified.
+combination of argument types and processor. A file is unpickled only after its owner and its digest were verified.
 """
 
 from __future__ import annotations
@@ -23,10 +23,10 @@ __all__ = ["MachineCode"]
 
 
 def _alone(reduced: tuple[Any, ...]) -> tuple[Any, ...]:
-    """Return what numba would keep of an entry point, less what it keeps for functions that call it: nothing does.
+    """Return numba's reduced form of an entry point without what only compiled callers need, as it has none.
 
-    That is the text of all its functions, of which the names of those that Python calls are left, and an environment
-    for each of its parts, which hold no objects of Python's. They were three quarters of a file.
+    That is the code of all its functions, replaced by empty ones for those that Python calls, and an environment for
+    each of its parts, which contain no Python objects. They were three quarters of a file.
     """
     (name, kind, (code, _)), described, *rest, _ = reduced
     assert kind == "object", f"numba keeps machine code as {kind!r}, expected 'object'"
@@ -38,7 +38,7 @@ def _alone(reduced: tuple[Any, ...]) -> tuple[Any, ...]:
 
 
 class MachineCode:
-    """A function's compiled forms in a store, under a name made of all that its source depends on."""
+    """Compiled forms of a function in a store, under a name that includes the digest of its sources."""
 
     def __init__(self, store: Store, name: str) -> None:
         self._store, self._name = store, name
@@ -55,16 +55,16 @@ class MachineCode:
         return rebuild(context, *parts) if kept_signature == signature else None
 
     def save_overload(self, signature: Any, compiled: Any) -> None:
-        """Keep a compiled form, unless it holds addresses that are right in this process alone."""
+        """Store a compiled form, unless it contains addresses that are valid only in this process."""
         if compiled.library.has_dynamic_globals or any(not loop.can_cache for loop in compiled.lifted):
-            said = f"{self._name}: holds addresses, so every process compiles it anew"
+            said = f"{self._name}: contains addresses, so every process compiles it again"
             warnings.warn(said, NumbaWarning, stacklevel=2)
             return
         pickled: Any = dumps
         self._store.write(self._file(signature, compiled.codegen), pickled((signature, _alone(compiled._reduce()))))
 
     def flush(self) -> None:
-        """Do nothing: a function that numba compiles again replaces the stored form."""
+        """Do nothing: a function that is compiled again replaces the stored form."""
 
     def _file(self, signature: Any, codegen: Any) -> str:
         told = repr((signature, codegen.magic_tuple(), llvmlite.__version__))

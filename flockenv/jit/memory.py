@@ -1,8 +1,8 @@
-"""Lines of memory: asked for in good time, and written past the caches.
+"""Cache lines: prefetches, and streaming stores that bypass the caches.
 
-A store waits for a line of memory that is not at hand, which is then read in vain where all of it is written. So lines
-are asked for before they are written; and where so much is written that it stays in no cache, it is made in scratch,
-which does, and copied past the caches line by line: nothing is read.
+A store to a line that is not in a cache waits until that line is read, in vain if all of it is overwritten. So lines
+are prefetched before they are written. If the output is larger than the caches, it is computed in scratch, which fits,
+and copied by streaming stores line by line, without reading the target.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ __all__ = ["array_of", "fetch", "in_one_piece", "pour", "put_past", "settle", "z
 
 
 def zeros(shape: int | tuple[int, ...], dtype: Any = np.float64) -> NDArray[Any]:
-    """Return zeros that begin where a line does: no vector of theirs lies in two of them, in any process."""
+    """Return zeros aligned to a cache line, so that no vector register is loaded from two lines."""
     kind, count = np.dtype(dtype), math.prod(shape) if isinstance(shape, tuple) else shape
     room = np.zeros(count * kind.itemsize + LINE, np.uint8)
     first = -room.__array_interface__["data"][0] % LINE
@@ -32,22 +32,22 @@ def zeros(shape: int | tuple[int, ...], dtype: Any = np.float64) -> NDArray[Any]
 
 
 def in_one_piece(array: Any) -> None:
-    """Refuse to compile for an array whose numbers need not lie side by side."""
+    """Raise TypingError unless an array type is contiguous (C layout)."""
     if array.layout != "C":
         raise TypingError(f"{array} must lie in one piece")
 
 
 def array_of(context: Any, builder: Any, kind: Any, value: Any = None) -> Any:
-    """Return numba's structure of an array, of this value if there is one."""
+    """Return numba's structure of an array, initialised with `value` if given."""
     make: Any = arrayobj.make_array
     return make(kind)(context, builder, value) if value is not None else make(kind)(context, builder)
 
 
 def _fetch(typing_context: Any, array: Any, part: Any, parts: Any) -> Any:
-    """Ask for the memory of one of so many parts of an array in one piece, which is needed soon.
+    """Prefetch part number `part` of `parts` of a contiguous array that is written soon.
 
-    Rows are written at a stretch, and a store waits for a line of memory that is not at hand. Asked for all at once,
-    they would be waited for just so: what asks has room for a dozen lines.
+    Rows are written in one go, and a store waits for a line that is not in a cache. Prefetching all lines at once would
+    wait likewise: a processor has room for about a dozen outstanding lines.
     """
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
@@ -74,23 +74,23 @@ fetch: Any = intrinsic_or_python(_fetch, lambda array, part, parts: None)
 
 
 def put_past(builder: Any, vector: Any, place: Any, size: int) -> None:
-    """Generate what writes a vector of so many bytes past the caches, to a place whose address is a multiple of that.
+    """Generate a streaming store of a vector of `size` bytes to an address that is a multiple of `size`.
 
-    Whoever writes a line of memory writes all of it, so that nothing is read before.
+    The caller must write whole cache lines, so that none is read before.
     """
     stored = builder.store(vector, place, align=size)
     stored.set_metadata("nontemporal", builder.module.add_metadata([ir.IntType(32)(1)]))
 
 
 def _poured(typing_context: Any, to: Any, at: Any, source: Any) -> Any:
-    """Copy an array into another one, counted through from `at` on, past the caches; both are in one piece.
+    """Copy an array into `to`, from flat index `at` on, by streaming stores; both are contiguous.
 
-    Whole lines go past them, what begins or ends within a line does not. Other threads see all after `settle`.
+    Whole cache lines bypass the caches; a partial line at either end does not. Other threads see all after `settle`.
     """
     in_one_piece(to)
     in_one_piece(source)
     if to.dtype != source.dtype:
-        raise TypingError(f"{source} is poured into {to}: their numbers differ")
+        raise TypingError(f"{source} is copied into {to}: their numbers differ")
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         target, old = (array_of(context, builder, signature.args[k], arguments[k]) for k in (0, 2))
@@ -124,7 +124,7 @@ pour: Any = intrinsic_or_python(_poured, _poured_in_python)
 
 
 def _settled(typing_context: Any) -> Any:
-    """Wait until all that was written, past the caches too, is where other threads see it."""
+    """Wait until all stores, streaming stores included, are visible to other threads."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         builder.fence("seq_cst")

@@ -1,14 +1,13 @@
-"""numba's compiler as our functions use it: entry points whole, and what is only ever inlined without machine code.
+"""numba's compiler pipelines: entry points are compiled completely, inlined functions without machine code.
 
-Loops over lanes, `for l in range(np.uint64(16))` with a number that is written down, stay loops until LLVM comes to
-make vectors of them. It would unroll short ones before, and of what is left it makes vectors seldom: a block of agents
-in float64 had some of its laws once per lane, one after the other. For the same reason short ones count as loops worth
-the question whether arrays overlap (`_short_loops`).
+Loops over lanes, `for l in range(np.uint64(16))` with a literal count, remain loops until LLVM vectorises them. It
+would unroll short ones before that, and rarely vectorises the result: for a block of agents in float64 some laws were
+computed lane by lane. For the same reason short loops may be vectorised with a run-time check for overlapping arrays
+(`_short_loops`).
 
-numba makes machine code, and a wrapper for Python, of every compiled function, and optimises each to the end before it
-optimises its caller. Laws and kernels are parts of an entry point and of nothing else; that work was half of the time a
-scene took to compile. (The steps below are numba's own, less those; they are internals of numba, and tests notice when
-they change.)
+numba generates machine code and a Python wrapper for every compiled function, and fully optimises each before its
+caller. Laws and kernels are only ever parts of an entry point; that work was half of the compile time of a scene. (The
+steps below are numba's own without it; they are internals of numba, and tests detect when they change.)
 """
 
 from __future__ import annotations
@@ -40,23 +39,23 @@ _loops_of: Any = analysis.compute_cfg_from_blocks
 _Value: Any = llvm.values.MDValue
 
 FEWEST_LANES = 4
-"""A loop over fewer is none over lanes."""
+"""Smallest number of iterations of a loop over lanes."""
 
 LONG = 16
-"""LLVM's own measure: of a shorter loop it makes no vectors where it must ask whether arrays overlap."""
+"""LLVM's default: it does not vectorise shorter loops that need a check for overlapping arrays."""
 
 LLVMS = range(15, 23)
-"""Versions of LLVM that are known to take the option that says so: one that does not know it ends the process."""
+"""Versions of LLVM known to have the option for it: any other version ends the process on an unknown option."""
 
 DEEPEST = 6_000
-"""Python's calls within calls, at most, while one of our functions compiles."""
+"""Python's recursion limit while one of our functions compiles."""
 
 _depth = 0
 
 
 @contextmanager
 def _short_loops() -> Iterator[None]:
-    """Have vectors made of short loops, too, while one of our functions compiles: under numba's lock, see `lighter`."""
+    """Vectorise short loops, too, while one of our functions compiles: under numba's lock, see `lighter`."""
     global _depth
     known = binding.llvm_version_info[0] in LLVMS
     if known and _depth == 0:
@@ -72,7 +71,7 @@ def _short_loops() -> Iterator[None]:
 
 @contextmanager
 def _deep() -> Iterator[None]:
-    """Let numba compile calls within calls: each of them takes two dozen of Python's, of which 1,000 are allowed."""
+    """Raise Python's recursion limit: numba needs about 24 Python calls per nested call, and the default is 1,000."""
     before = sys.getrecursionlimit()
     sys.setrecursionlimit(max(before, DEEPEST))
     try:
@@ -83,7 +82,7 @@ def _deep() -> Iterator[None]:
 
 @functools.cache
 def _refusal() -> int:
-    """Return the address of what runs when Python calls one: it takes no arguments, and says so."""
+    """Return the address of the wrapper that runs if Python calls a part of a kernel: it raises TypeError."""
 
     def part_of_a_kernel() -> None:
         raise TypeError("this function is a part of kernels and is not called alone; call its py_func")
@@ -95,7 +94,7 @@ def _refusal() -> int:
 
 
 def _optimise_a_little(library: Any) -> None:
-    """Run the cheap passes only: the caller's are the ones that count."""
+    """Run only the cheap passes: the code is optimised again in the caller."""
     codegen = library._codegen
     passes, builder = codegen._module_pass_manager(
         loop_vectorize=False, slp_vectorize=False, opt=codegen._opt_level, cost="cheap"
@@ -104,17 +103,17 @@ def _optimise_a_little(library: Any) -> None:
 
 
 def _finalise_unmade(library: Any) -> None:
-    """End like numba does, but hand nothing to the engine that makes machine code."""
+    """Finalise a library like numba, but do not add it to the execution engine, which generates machine code."""
     library._finalize_dynamic_globals()
     library._verify_declare_only_symbols()
     library._finalized = True
 
 
 class _LoopId(_Value):  # type: ignore[misc]
-    """What LLVM knows a loop by: metadata that begins with itself, and equals nothing else."""
+    """LLVM's identifier of a loop: distinct metadata whose first operand is itself."""
 
     def descr(self, buf: list[str]) -> None:
-        """Write it."""
+        """Write the metadata as text."""
         parts = ", ".join(part.get_reference() for part in (self, *self.operands))
         buf += (f"distinct !{{ {parts} }}", "\n")
 
@@ -126,10 +125,10 @@ class _LoopId(_Value):  # type: ignore[misc]
 
 
 class _LanesStay(_Lower):  # type: ignore[misc]
-    """Lowering that asks LLVM not to unroll loops over lanes."""
+    """Lowering that disables LLVM's unrolling of loops over lanes."""
 
     def lower_function_body(self) -> Any:
-        """Lower, and mark the ways back to the beginnings of such loops."""
+        """Lower, and mark the back edges of loops over lanes."""
         self._ends: dict[Any, Any] = {}
         entry = super().lower_function_body()
         graph = _loops_of(self.blocks)
@@ -140,12 +139,12 @@ class _LanesStay(_Lower):  # type: ignore[misc]
         return entry
 
     def lower_block(self, block: Any) -> None:
-        """Lower one, and remember where it ended."""
+        """Lower a block, and store the LLVM block where it ends."""
         super().lower_block(block)
         self._ends[next(offset for offset, other in self.blocks.items() if other is block)] = self.builder.basic_block
 
     def _keep(self, ways_back: list[Any]) -> None:
-        """Mark a loop by the branches to where it begins: it is not unrolled; what vectors are made of it may be."""
+        """Mark a loop on its back edges: it is not unrolled, but its vectorised form may be."""
         module = self.module
 
         def said(text: str, *more: Any) -> Any:
@@ -159,13 +158,13 @@ class _LanesStay(_Lower):  # type: ignore[misc]
 
 
 class _BriefLanesStay(_LanesStay, BriefPart):
-    """The same in fewer words."""
+    """The same with shorter LLVM code, see `lowering`."""
 
 
 def _lanes(code: Any, blocks: Any, header: Any) -> int:
-    """Return how often a loop goes round that is over `range(np.uint64(a number))`; 0 of any other loop."""
+    """Return the number of iterations of a loop over `range(np.uint64(literal))`; 0 for any other loop."""
     block = blocks[header]
-    if len(block.body) == 1 and isinstance(block.body[0], ir.Jump):  # numba puts an empty one before
+    if len(block.body) == 1 and isinstance(block.body[0], ir.Jump):  # numba inserts an empty block before it
         block = blocks[block.body[0].target]
     values = [line.value for line in block.body if isinstance(line, ir.Assign) and isinstance(line.value, ir.Expr)]
     try:
@@ -178,7 +177,7 @@ def _lanes(code: Any, blocks: Any, header: Any) -> int:
 
 
 def _called(code: Any, variable: Any, name: str) -> Any:
-    """Return the one argument of the call of that function whose result a variable is; TypeError if it is none."""
+    """Return the only argument of the call of `name` that defines a variable; TypeError if there is no such call."""
     call = code.get_definition(variable)
     function = code.get_definition(call.func)
     if len(call.args) != 1 or name != (function.attr if isinstance(function, ir.Expr) else function.name):
@@ -194,7 +193,7 @@ class _Lowering(_Native):  # type: ignore[misc]
 
     @property
     def lowering_class(self) -> Any:
-        """Which one lowers."""
+        """The class that lowers the function."""
         return _BriefLanesStay if is_brief() else _LanesStay
 
     def run_pass(self, state: Any) -> bool:
@@ -208,7 +207,7 @@ class _Lowering(_Native):  # type: ignore[misc]
         library._finalize_final_module = types.MethodType(_finalise_unmade, library)
         super().run_pass(state)
         lowered = state["cr"]
-        # callers find a function by an object of its own; called from Python, this one says what it is
+        # callers find a function by a function object; if Python calls this one, it raises an error that explains it
         name = lowered.fndesc.qualname.split(".")[-1]
         stub = _dynfunc.make_function(lowered.fndesc.lookup_module(), name, "", _refusal(), lowered.env, (library,))
         insert = insert_part if is_brief() else type(state.targetctx).insert_user_function
@@ -225,17 +224,17 @@ class _Entry(_Native):  # type: ignore[misc]
 
     @property
     def lowering_class(self) -> Any:
-        """Which one lowers."""
+        """The class that lowers the function."""
         return Brief if is_brief() else _Lower
 
 
 class Whole(_Compiler):  # type: ignore[misc]
-    """numba's pipeline, less what frontend spares it: how an entry point is compiled."""
+    """Compiler of entry points: numba's pipeline without the passes that `front_end` skips."""
 
     _lowering = _Entry
 
     def define_pipelines(self) -> list[Any]:
-        """Return the passes."""
+        """Return the pipeline as a list of one pass manager."""
         passes = _Passes.define_nopython_pipeline(self.state)
         passes.passes = [(self._lowering if p is _Native else p, text) for p, text in spared(passes.passes)]
         passes.finalize()
@@ -247,6 +246,6 @@ class Whole(_Compiler):  # type: ignore[misc]
 
 
 class Inlined(Whole):
-    """The same without machine code."""
+    """The same pipeline without machine code, for functions that are inlined."""
 
     _lowering = _Lowering

@@ -1,9 +1,9 @@
 """Folders and files that only this user, or the system's administrator, can change.
 
-Kernels are code: what is read from their folder runs. So the folder is checked before anything is read from it: it is a
-folder and no link, it belongs to this user, no other user can write to it, and no other user can rename or replace any
-of the folders above it. Files are checked after they have been opened, so that none is exchanged in between. Windows
-keeps one temporary folder per user and has no such modes: nothing is checked there.
+Kernels are code: what is read from their folder is executed. So the folder is checked before anything is read from it:
+it must be a folder and no link, it must belong to this user, no other user may write to it, and no other user may
+rename or replace any folder above it. Files are checked after they have been opened, so that none is replaced in
+between. Windows has one temporary folder per user and no such modes: nothing is checked there.
 """
 
 from __future__ import annotations
@@ -28,18 +28,18 @@ class NotPrivateError(PermissionError):
 
 
 def say_once(line: str, about: str = "") -> None:
-    """Write one line to stderr, if this process has not yet written it, or one `about` the same thing."""
+    """Write one line to stderr, unless this process has already written it or one with the same `about`."""
     if (about or line) not in _said and sys.stderr is not None:
         _said.add(about or line)
         print(f"flockenv: {line}", file=sys.stderr, flush=True)
 
 
 def prepared(folder: Path) -> Path:
-    """Return a folder that only this user can change; make it (mode 0700) if it is missing.
+    """Return a folder that only this user can change; create it (mode 0700) if it is missing.
 
     Raises:
-        NotPrivateError: the folder, or one above it, is a link or belongs to another user or can be changed by one.
-        OSError: it cannot be made, or not be written.
+        NotPrivateError: the folder is a link, or it or a parent belongs to another user or can be changed by one.
+        OSError: it cannot be created or written.
     """
     _make(folder)
     for place in _way_to(folder):
@@ -51,7 +51,7 @@ def prepared(folder: Path) -> Path:
 
 
 def check_folder(folder: Path) -> None:
-    """Raise NotPrivateError unless it is a folder, no link, that belongs to this user and no other user can write."""
+    """Raise NotPrivateError unless `folder` is a folder, not a link, owned and writable by this user alone."""
     _check(os.lstat(folder), folder, stat.S_ISDIR, "a folder")
 
 
@@ -61,8 +61,8 @@ def read_private(path: Path) -> bytes:
     The open file is checked: links are not followed, and the call does not wait for a pipe.
 
     Raises:
-        NotPrivateError: it is something else.
-        FileNotFoundError: there is none.
+        NotPrivateError: it is not such a file.
+        FileNotFoundError: there is no file.
     """
     flags = [getattr(os, name, 0) for name in ("O_NOFOLLOW", "O_NONBLOCK", "O_CLOEXEC", "O_BINARY")]
     try:
@@ -82,11 +82,11 @@ def read_private(path: Path) -> bytes:
 def first_private(home: Path, temporary: Path, name: str) -> Path:
     """Return the first of these folders that only this user can change: home, temporary/name, a new one beside it.
 
-    A folder that fails its check is skipped, and one line on stderr has the reason. The new one is called
+    A folder that fails its check is skipped, and one line on stderr reports the reason. The new one is called
     name-XXXXXXXX; later processes find it again.
 
     Raises:
-        OSError: none of them can be made.
+        OSError: none of them can be created.
     """
     fallback, wrong = temporary / name, []
     for find, folder in ((prepared, home), (prepared, fallback), (_beside, fallback)):
@@ -104,19 +104,19 @@ def first_private(home: Path, temporary: Path, name: str) -> Path:
 
 
 def _beside(folder: Path) -> Path:
-    """Return a private folder of the same name and -XXXXXXXX beside one: an existing one, or a new one."""
+    """Return a private folder beside `folder` with -XXXXXXXX appended to its name: an existing one, or a new one."""
     for place in _way_to(folder):
         _check_above(place)
     for other in sorted(folder.parent.glob(f"{folder.name}-*")):
         try:
             return prepared(other)
-        except OSError:  # of another user
+        except OSError:  # it belongs to another user
             continue
     return prepared(Path(tempfile.mkdtemp(prefix=f"{folder.name}-", dir=folder.parent)))
 
 
 def _make(folder: Path) -> None:
-    """Make a folder for this user alone; missing folders above it can be read by others, but not written."""
+    """Create a folder for this user alone; missing parents are created readable, but not writable, for others."""
     if not os.path.lexists(folder):
         for above in reversed(folder.absolute().parents):
             if not above.exists():
@@ -125,7 +125,7 @@ def _make(folder: Path) -> None:
 
 
 def _way_to(folder: Path) -> Iterator[Path]:
-    """Yield every folder and every link on the path to a folder, without the folder itself."""
+    """Yield every folder and every link on the path to a folder, except the folder itself."""
     at, left = Path(folder.absolute().anchor), list(reversed(folder.absolute().parts[1:]))
     while left:
         yield at
@@ -140,19 +140,19 @@ def _way_to(folder: Path) -> Iterator[Path]:
 
 
 def _check_above(place: Path) -> None:
-    """Raise NotPrivateError if another user can rename or replace what lies in this folder, or replace this link."""
+    """Raise NotPrivateError if another user can rename or replace entries of this folder, or replace this link."""
     if not CHECKED:
         return
     found = os.lstat(place)
-    trusted = {0, os.geteuid(), os.stat("/").st_uid}  # the last: a container may show its administrator by a number
+    trusted = {0, os.geteuid(), os.stat("/").st_uid}  # the last: in a container the administrator may have another id
     if found.st_uid not in trusted:
-        raise NotPrivateError(f"{place}: belongs to user {found.st_uid}, who could exchange what lies in it")
+        raise NotPrivateError(f"{place}: belongs to user {found.st_uid}, which could replace its content")
     if not stat.S_ISLNK(found.st_mode) and _others_write(found) and not found.st_mode & stat.S_ISVTX:
         raise NotPrivateError(f"{place}: other users can exchange what lies in it (mode {_mode(found)}); chmod go-w it")
 
 
 def _check(found: os.stat_result, path: Path, is_kind: Callable[[int], bool], kind: str) -> None:
-    """Raise NotPrivateError unless it is of this kind, belongs to this user, and no other user can write it."""
+    """Raise NotPrivateError unless `path` is of this kind, belongs to this user, and no other user can write it."""
     if stat.S_ISLNK(found.st_mode):
         raise NotPrivateError(f"{path}: is a link, must be {kind}")
     if not is_kind(found.st_mode):
@@ -166,13 +166,13 @@ def _check(found: os.stat_result, path: Path, is_kind: Callable[[int], bool], ki
 
 
 def _others_write(found: os.stat_result) -> bool:
-    """True if users other than its owner can write it; root's group and a group of this user alone do not count."""
+    """Return True if users other than the owner can write it; root's group and this user's own group do not count."""
     mode = found.st_mode
     return bool(mode & stat.S_IWOTH) or (bool(mode & stat.S_IWGRP) and not _of_one(found.st_gid))
 
 
 def _of_one(group: int) -> bool:
-    """True if a group is root's, or holds this user alone and has their name, as many systems make one for each."""
+    """Return True if a group is root's, or the private group of this user: same name, and no other member."""
     import grp  # here: Windows has neither
     import pwd
 

@@ -1,7 +1,7 @@
-"""Compilation, seen: how long each kernel took, and a line on the terminal while one is compiled.
+"""Progress of compilation: how long each kernel took, and a line on the terminal while one is compiled.
 
-A kernel is compiled at its first call, once per machine: its code lies in the cache folder from then on, see section.
-On a terminal a line says what is being compiled and, when it is done, how long that took; FLOCKENV_QUIET=1 silences it.
+A kernel is compiled at its first call, once per machine: from then on its code is in the cache folder, see section. On
+a terminal a line names the kernel and, when it is done, the time it took; FLOCKENV_QUIET=1 silences it.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ class Compiled(NamedTuple):
     """One kernel that this process had to compile."""
 
     kernel: str  # the name of its entry point, such as "scene_step"
-    what: str  # the first line about it: of a scene its dimension, space, effects and method
+    what: str  # its title; for a scene: dimension, space, effects and method
     seconds: float
 
 
@@ -31,12 +31,12 @@ _done: list[Compiled] = []
 
 
 def compiled() -> tuple[Compiled, ...]:
-    """Return what this process has compiled so far; empty if all of it came from the cache."""
+    """Return the kernels that this process has compiled so far; empty if all came from the cache."""
     return tuple(_done)
 
 
 def unmatched() -> tuple[str, ...]:
-    """Return the replacements in numba that are left out because the numba that is installed reads otherwise."""
+    """Return the patches of numba that are not applied because the source of the installed numba differs."""
     every = [
         *((each.title, each.reads) for each in (*front_end.TRICKS, *front_end.SPARED)),
         ("lowering", lowering.READS),
@@ -45,13 +45,13 @@ def unmatched() -> tuple[str, ...]:
 
 
 class _Watch(event.Listener):
-    """Notes when numba begins and ends to compile an entry point of ours; the laws inside it are part of it."""
+    """Listener that times numba's compilation of each entry point, which includes the laws inside it."""
 
     def __init__(self) -> None:
         self.began: dict[int, float] = {}
 
     def on_start(self, event: Any) -> None:
-        """Say that a wait begins."""
+        """Store the start time and print the line."""
         function = _entry_point(event)
         if function is not None:
             self.began[id(event.data["dispatcher"])] = perf_counter()
@@ -59,7 +59,7 @@ class _Watch(event.Listener):
             _say(f"flockenv: compiling {_described(event.data['dispatcher'])} (once; kept in {folder}) ...")
 
     def on_end(self, event: Any) -> None:
-        """Say how long it was."""
+        """Record the duration and complete the line."""
         function = _entry_point(event)
         began = self.began.pop(id(event.data["dispatcher"]), None)
         if function is not None and began is not None:
@@ -69,14 +69,14 @@ class _Watch(event.Listener):
 
 
 def _entry_point(event: Any) -> Any:
-    """Return the function that an event is about, if it is an entry point that is kept on the disk; else None."""
+    """Return the function of an event if it is an entry point with a disk cache, otherwise None."""
     dispatcher = event.data["dispatcher"]
     ours = isinstance(getattr(dispatcher, "_cache", None), OneAtATime)
     return dispatcher.py_func if ours else None
 
 
 def _described(dispatcher: Any) -> str:
-    """Return the title of an entry point, or the first line of what is said of its function."""
+    """Return the title of an entry point, or the first line of its docstring, or its name."""
     text: str = vars(dispatcher).get("title") or dispatcher.py_func.__doc__ or dispatcher.py_func.__name__
     return text.split("\n")[0]
 

@@ -1,10 +1,10 @@
-"""Sections: kernels made of Python functions for a plan, whose machine code is kept under a digest of that plan.
+"""Sections: kernels built from Python functions for a kernel plan; machine code is cached by a digest of the plan.
 
 A section is a factory: it takes a plan (laws as functions, counts, flags) and returns a function that uses them as free
-variables. numba takes those for constants: it drops the branches that they rule out before it looks at types, and
-inlines the laws. Its own disk cache never finds such a function again; here the key is written out instead: the plan,
-with the code of every law in it, the sources of all laws and sections, and the width of registers. So where machine
-code is kept, not one function is made.
+variables. numba treats those as constants: it removes the branches that they exclude before type inference, and
+inlines the laws. Its own disk cache never finds such a function again; here the key is explicit instead: the plan, with
+the code of every law in it, the sources of all laws and sections, and the register width. So if the machine code is
+cached, no function is built.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ _njit: Any = numba.njit  # numba's stubs do not know `_nrt`
 
 
 def section(make: Callable[..., Callable[..., Any]]) -> Callable[..., Callable[..., Any]]:
-    """Decorate a section whose functions kernels call: `section(*plan)` is a part of them, made once for each plan."""
+    """Decorate a section whose functions kernels call: `section(*plan)` is a part of them, built once for each plan."""
 
     @functools.lru_cache(maxsize=4096, typed=True)
     @functools.wraps(make)
@@ -63,10 +63,10 @@ def section(make: Callable[..., Callable[..., Any]]) -> Callable[..., Callable[.
 
 
 def entry_of(make: Callable[..., Callable[..., Any]]) -> Callable[..., Callable[..., Any]]:
-    """Decorate a section whose functions Python calls: `section(*plan)` is an entry point, made once for each plan.
+    """Decorate a section whose functions Python calls: `section(*plan)` is an entry point, built once for each plan.
 
-    The plan holds laws, numbers, text, types, and tuples of those. Its functions are made when something is to
-    be compiled, and not where the machine code of an equal plan is kept.
+    The plan contains laws, numbers, text, types, and tuples of those. Its functions are built only to be compiled, not
+    if the machine code of an equal plan is cached.
     """
 
     @functools.lru_cache(maxsize=512, typed=True)
@@ -78,17 +78,17 @@ def entry_of(make: Callable[..., Callable[..., Any]]) -> Callable[..., Callable[
 
 
 def settled(function: Any) -> Callable[..., Any]:
-    """Return an entry point that was called, without numba's look at the type of every argument: half of a short call.
+    """Return a compiled entry point without numba's type dispatch, which takes half of the time of a short call.
 
-    For a caller whose arguments have the same types each time, arrays in one piece: types are not looked at any more.
-    One that was called with several types is returned as it is.
+    The caller must pass the same argument types each time, with contiguous arrays: types are not checked any more. A
+    function that was compiled for several combinations of types is returned unchanged.
     """
     compiled = list(getattr(function, "overloads", {}).values())
     return compiled[0].entry_point if len(compiled) == 1 else function  # type: ignore[no-any-return]
 
 
 def titled(entry_point: Callable[..., Any], title: str) -> Callable[..., Any]:
-    """Return an entry point that is called by a title while it is compiled; the first one it gets stays."""
+    """Return the entry point with the title shown while it compiles; the first title it gets is kept."""
     vars(entry_point).setdefault("title", title)
     return entry_point
 
@@ -100,16 +100,16 @@ def entry(function: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def digest_of(plan: Any) -> str:
-    """Return a digest of all that code made of a plan depends on: laws by their code, numbers as they print."""
+    """Return a digest of all that the code of a plan depends on: laws by their code, numbers by their repr."""
     modules = {each.__module__ for each in functions_in(plan)}
     told = f"{described(plan)}{laws_digest()}{texts_outside(modules)}"
     return hashlib.sha256(told.encode()).hexdigest()[:20]
 
 
 def _entry(make: Callable[..., Callable[..., Any]], plan: tuple[Any, ...]) -> Callable[..., Any]:
-    """Return the entry point that a factory makes of a plan; its machine code is read from the checked store.
+    """Return the entry point that a factory builds from a plan; its machine code is read from the checked store.
 
-    What must be known of it before it is made, the names of its arguments above all, is kept there, too.
+    The store also has what numba needs before the function is built, mainly the names of its arguments.
     """
     if IN_PYTHON:
         return make(*plan)
@@ -128,14 +128,14 @@ def _entry(make: Callable[..., Callable[..., Any]], plan: tuple[Any, ...]) -> Ca
 
 
 def _told_of(function: Callable[..., Any]) -> bytes:
-    """Return what a stand-in for a function is made of."""
+    """Return the data from which a stand-in for a function is built, as JSON."""
     parameters = list(inspect.signature(function).parameters)
     told = (function.__name__, function.__qualname__, function.__module__, function.__doc__, parameters)
     return json.dumps(told).encode()
 
 
 def _stand_in(told: bytes | None) -> Callable[..., Any] | None:
-    """Return a function that numba takes for the one that has been told of; nothing calls it."""
+    """Return a function with the stored name, docstring and parameters, which numba accepts; it is never called."""
     if told is None:
         return None
 
@@ -149,7 +149,7 @@ def _stand_in(told: bytes | None) -> Callable[..., Any] | None:
 
 
 class _Late(OneAtATime):
-    """The machine code of an entry point, whose function is made where that of its types is not kept."""
+    """Machine code of an entry point; its function is built only if the code for its argument types is not cached."""
 
     def __init__(
         self, cache: Any, lock: Path, compiled: Any, make: Callable[..., Callable[..., Any]], plan: tuple[Any, ...]
@@ -158,7 +158,7 @@ class _Late(OneAtATime):
         self._compiled, self._make_function, self._plan = compiled, make, plan
 
     def load_overload(self, signature: Any, context: Any) -> Any:
-        """Return what is kept; None, once there is a function to be compiled, if nothing is."""
+        """Return the cached code; if there is none, build the function to compile and return None."""
         found = super().load_overload(signature, context)
         if found is None:
             function = self._make_function(*self._plan)
@@ -167,7 +167,7 @@ class _Late(OneAtATime):
 
 
 def record(names: tuple[str, ...]) -> Any:
-    """Return the type of a record with these fields; machine code that takes one finds it under its name here."""
+    """Return the namedtuple type with these fields; cached machine code finds it by its name in this module."""
     wrong = [name for name in names if "__" in name or name.endswith("_")]
     if wrong:
         raise ValueError(f"record: {wrong[0]!r} must have no two underscores, and none at its end")
@@ -175,7 +175,7 @@ def record(names: tuple[str, ...]) -> Any:
 
 
 def __getattr__(name: str) -> Any:
-    """Make the type of a record whose name lists its fields."""
+    """Return the namedtuple type whose name lists its fields."""
     kind, *names = name.split("__")
     if kind != "Record" or not all(names):
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
@@ -186,7 +186,7 @@ def __getattr__(name: str) -> Any:
 def several(count: int, item: Callable[[Any, int], Any]) -> Callable[[Any, int], tuple[Any, ...]]:
     """Return `items(array, at)`: a tuple of `count` items, item(array, at), item(array, at + 1), ...
 
-    Up to four, or the two halves, since numba compiles calls within calls.
+    More than four are split into two halves, as numba compiles nested calls.
     """
     half = count // 2
     before = several(half, item) if count > 4 else None
@@ -194,7 +194,7 @@ def several(count: int, item: Callable[[Any, int], Any]) -> Callable[[Any, int],
 
     def items(array: Any, at: int) -> tuple[Any, ...]:
         if before is not None:
-            return before(array, at) + after(array, at + half)  # type: ignore[misc]  # there are both or none
+            return before(array, at) + after(array, at + half)  # type: ignore[misc]  # both are set or neither
         if count == 1:
             return (item(array, at),)
         if count == 2:
@@ -207,10 +207,10 @@ def several(count: int, item: Callable[[Any, int], Any]) -> Callable[[Any, int],
 
 
 def _calls(functions: tuple[Any, ...], joined: bool, plain: Callable[..., Any]) -> Any:
-    """Return what calls some functions with its own arguments, one after the other, and makes one tuple of it all.
+    """Return a function that calls `functions` in turn with its own arguments and returns a tuple of their results.
 
-    joined: each returns a tuple, and those are joined. Nothing comes of functions that return nothing. An intrinsic:
-    a function of numba's own for each of them took half as long to compile as what they call.
+    joined: each returns a tuple, and these are concatenated. If all return None, so does the function. It is an
+    intrinsic: one numba function for each of them took half as long to compile as the functions that they call.
     """
     signature = inspect.signature(python_of(functions[0]))
     plain.__signature__ = signature  # type: ignore[attr-defined]
@@ -243,13 +243,13 @@ def _calls(functions: tuple[Any, ...], joined: bool, plain: Callable[..., Any]) 
     first = inspect.Parameter("typing_context", inspect.Parameter.POSITIONAL_OR_KEYWORD)
     calls.__signature__ = signature.replace(parameters=[first, *signature.parameters.values()])  # type: ignore[attr-defined]
     made: Any = intrinsic(calls)
-    made.py_func = plain  # what it holds is part of what a section is known by
+    made.py_func = plain  # its free variables are part of a section's digest
     return made
 
 
 @functools.cache
 def tuple_from(*functions: Callable[..., Any]) -> Callable[..., tuple[Any, ...]]:
-    """Return a function that makes a tuple of what each of some functions returns for its arguments."""
+    """Return a function that returns the tuple of the results of `functions` for its arguments."""
     if not functions:
         return kernel(lambda *given: ())
     return _calls(functions, False, lambda *given: tuple(function(*given) for function in functions))  # type: ignore[no-any-return]
@@ -257,13 +257,13 @@ def tuple_from(*functions: Callable[..., Any]) -> Callable[..., tuple[Any, ...]]
 
 @functools.cache
 def joined_from(*functions: Callable[..., tuple[Any, ...]]) -> Callable[..., tuple[Any, ...]]:
-    """Return a function that joins the tuples that some functions return for its arguments."""
+    """Return a function that concatenates the tuples that `functions` return for its arguments."""
     return _calls(functions, True, lambda *given: sum((function(*given) for function in functions), ()))  # type: ignore[no-any-return]
 
 
 @functools.cache
 def in_turn(*functions: Callable[..., None]) -> Callable[..., None]:
-    """Return a function that calls some functions, one after the other, with its arguments; they return nothing."""
+    """Return a function that calls `functions` in turn with its arguments; they return None."""
 
     def plain(*given: Any) -> None:
         for function in functions:
@@ -274,7 +274,7 @@ def in_turn(*functions: Callable[..., None]) -> Callable[..., None]:
 
 @functools.cache
 def vector(dimension: int) -> Callable[[Any, int], Vec]:
-    """Return a function that reads a vector of two or three numbers of an array, from a place on."""
+    """Return a function that reads a vector of two or three numbers from an array, from an index on."""
 
     def vector_at(array: Any, at: int) -> Vec:
         if dimension == 2:

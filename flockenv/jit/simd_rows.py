@@ -1,8 +1,8 @@
-"""Agents abreast: the numbers of many agents side by side, in the lanes of vector registers, and rows made of them.
+"""SIMD over agents: numbers of many agents side by side in the lanes of vector registers, and rows made from them.
 
-What an agent sees is handed out as a row, but worked out for a register of agents at a time: a loop over agents whose
-body has no branch becomes vector code, while a loop over one agent's neighbours waits for every guess of how many there
-are. So a task writes columns, one number of all agents after the other, and squares of them are turned into rows.
+An observation is returned as a row per agent, but computed for a register of agents at a time: a loop over agents
+without branches becomes vector code, while a loop over one agent's neighbours pays for every mispredicted count of
+neighbours. So a task writes columns, each one number of all agents, and square blocks of them are transposed into rows.
 """
 
 from __future__ import annotations
@@ -27,29 +27,29 @@ __all__ = [
 ]  # fmt: skip
 
 SIDE = LINE // 4
-"""Single precision numbers in a line, and in the longest vector register: so many agents are shown side by side."""
+"""Single precision numbers in a cache line and in the longest vector register: agents in a block."""
 
 SHORT = 8
-"""A table of more registers is not looked up in registers."""
+"""Most registers of a table that is looked up in registers."""
 
 SQUARE = cpu.REGISTER // 4
-"""Single precision numbers in a vector register: squares of as many rows and columns are turned at once."""
+"""Single precision numbers in a vector register: the side of the square blocks that are transposed."""
 
 PAIR = 2 * SIDE
-"""Agents up to a multiple of which arrays go on that are shown side by side, whoever is there."""
+"""Arrays of agents in lanes are padded to a multiple of this many agents."""
 
 
 def apart(count: int) -> int:
-    """Return how far the columns of so many agents lie apart, in numbers; written into a source, it is a constant.
+    """Return the distance between columns of `count` agents, in numbers; in a kernel it is a constant.
 
-    So that LLVM sees columns that do not overlap, and does not ask. The same for many counts, for each is a kernel of
-    its own; and no power of two, whose multiples share a place in the cache.
+    A constant lets LLVM prove that columns do not overlap, without checks at run time. It is the same for many counts,
+    as each distance needs its own kernel, and no power of two, as those compete for the same cache sets.
     """
     return max(64, 1 << (count - 1).bit_length()) + SIDE
 
 
 def _shown(context: Any, builder: Any, kind: Any, old: Any, shape: Any, strides: Any) -> Any:
-    """Return the memory of an array under another shape."""
+    """Return a view of an array with another shape and strides."""
     fill: Any = arrayobj.populate_array
     new = array_of(context, builder, kind)
     fill(new, data=old.data, shape=shape, strides=strides, itemsize=old.itemsize, meminfo=None)
@@ -62,9 +62,9 @@ def _bytes(context: Any, kind: Any) -> Any:
 
 
 def _packed(typing_context: Any, array: Any) -> Any:
-    """Return an array in one piece with the strides that follow from its shape, of which the last is a constant.
+    """Return a contiguous array with strides computed from its shape, of which the last is a constant.
 
-    A view of one world (D, B, N) -> (D, N) takes its strides from it, and its agents are known to lie side by side.
+    A view of one world, (D, B, N) -> (D, N), derives its strides from it, so LLVM knows that its agents are adjacent.
     """
     in_one_piece(array)
 
@@ -84,7 +84,7 @@ packed: Any = intrinsic_or_python(_packed, lambda array: array)
 
 
 def _in_one_row(typing_context: Any, array: Any) -> Any:
-    """Show an array in one piece as one row of numbers."""
+    """Return a flat view of a contiguous array."""
     in_one_piece(array)
     view = types.Array(array.dtype, 1, "C")
 
@@ -99,7 +99,7 @@ in_one_row: Any = intrinsic_or_python(_in_one_row, lambda array: array.reshape(-
 
 
 def _columns(typing_context: Any, flat: Any, count: Any, many: Any, distance: Any) -> Any:
-    """Show scratch (at least many * distance,) as an array (count, many) whose columns lie in one piece each."""
+    """Return a view (count, many) of scratch (at least many * distance,) whose columns are contiguous."""
     view = types.Array(flat.dtype, 2, "A")
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
@@ -123,9 +123,9 @@ columns: Any = intrinsic_or_python(_columns, _columns_in_python)
 
 
 def _lookup(builder: Any, vector: Any, size: int) -> tuple[int, Any]:
-    """Return how many numbers are looked up at once in registers as long as that, and the instruction; 0 if none can.
+    """Return the size of a table that one instruction looks up, and the call that generates it; (0, None) without one.
 
-    It takes the last bits of who is named, and one register of a table, or two.
+    The instruction takes the low bits of the indices, and one register of the table, or two.
     """
     declare: Any = cgutils.get_or_insert_function
     index = ir.VectorType(ir.IntType(8 * size), vector.count)
@@ -140,7 +140,7 @@ def _lookup(builder: Any, vector: Any, size: int) -> tuple[int, Any]:
 
 
 def _looked_up(builder: Any, part: Any, named: Any, vector: Any, size: int, count: Any) -> Any:
-    """Generate the look-up of those named in a table whose registers `part` reads: all of it, a PAIR at a time."""
+    """Generate the look-up of the indices `named` in a whole table, a PAIR at a time; `part` reads its registers."""
     step, lookup = _lookup(builder, vector, size)
     word = ir.IntType(64)
     named = named if size == 4 else builder.sext(named, ir.VectorType(word, vector.count))
@@ -167,7 +167,7 @@ def _looked_up(builder: Any, part: Any, named: Any, vector: Any, size: int, coun
 
 
 def _read(builder: Any, part: Any, named: Any, vector: Any) -> Any:
-    """Generate what reads those named one by one."""
+    """Generate code that reads the entries of the indices `named` one by one."""
     found = ir.Constant(vector, ir.Undefined)
     for k in range(vector.count):
         here = builder.zext(builder.extract_element(named, ir.IntType(32)(k)), ir.IntType(64))
@@ -179,11 +179,11 @@ def _picks(
     typing_context: Any, to: Any, at: Any, beside: Any, table: Any, first: Any, length: Any, many: Any, count: Any,
     who: Any, place: Any, width: Any,
 ) -> Any:  # fmt: skip
-    """Write what `many` rows of a table of `count` agents say of `width` of them: of those that who[place] and on name.
+    """Gather `width` entries of each of `many` rows of a table of `count` agents, at the indices `who[place]` and on.
 
-    The first row begins at table[first], the next `length` further, and may be read in whole multiples of PAIR; what it
-    says comes to to[at] and on, then `beside` further. All lies in one piece, and places are counted through. Short
-    rows are looked up in registers, where a processor can do that; else agents are read one by one.
+    The first row begins at table[first], the next `length` later, and may be read up to a multiple of PAIR. Its entries
+    are written to to[at] and on, those of the next row `beside` later. All arrays are contiguous, with flat indices.
+    Short rows are looked up in registers, if the processor can do that; otherwise entries are read one by one.
     """
     for array in (to, table, who):
         in_one_piece(array)
@@ -242,13 +242,13 @@ def _picked_in_python(
 pick: Any = intrinsic_or_python(_picks, _picked_in_python)
 
 
-# A key: a square, in single precision, whose last bits are a place. Of numbers that are not negative the bits are in
-# order as integers without a sign, of which a register is compared in half the time; and what is known of one moves
-# with it. NaN comes after all of them.
+# A key: a squared distance, in single precision, whose low bits are replaced by a place (an index). The bits of numbers
+# >= 0 sort like unsigned integers, which are compared in half the time, and the place moves with its square. NaN sorts
+# last.
 
 
 def _key_of(typing_context: Any, square: Any, place: Any, tags: Any) -> Any:
-    """Return the key (uint32) of a float32 square, not negative, and a place; `tags` has all bits that a place may."""
+    """Return the key (uint32) of a float32 square >= 0 and a place; `tags` is the mask of the bits of places."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         bits = builder.bitcast(arguments[0], ir.IntType(32))
@@ -258,7 +258,7 @@ def _key_of(typing_context: Any, square: Any, place: Any, tags: Any) -> Any:
 
 
 def _key_read(typing_context: Any, number: Any) -> Any:
-    """Return the key that lies where a float32 may."""
+    """Return the key whose bits are stored as a float32."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         return builder.bitcast(arguments[0], ir.IntType(32))
@@ -267,7 +267,7 @@ def _key_read(typing_context: Any, number: Any) -> Any:
 
 
 def _key_written(typing_context: Any, key: Any) -> Any:
-    """Return a key as what lies where a float32 may."""
+    """Return the float32 with the bits of a key."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         return builder.bitcast(arguments[0], ir.FloatType())
@@ -285,7 +285,7 @@ def _tag_of(typing_context: Any, key: Any, tags: Any) -> Any:
 
 
 def _same_key(typing_context: Any, one: Any, other: Any, tags: Any) -> Any:
-    """Say whether two keys differ in their places alone: then which square is smaller is not known."""
+    """Return True if two keys differ only in their places: then it is not known which square is smaller."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         one, other, tags = arguments
@@ -295,7 +295,7 @@ def _same_key(typing_context: Any, one: Any, other: Any, tags: Any) -> Any:
 
 
 def _ordered(typing_context: Any, one: Any, other: Any) -> Any:
-    """Return two keys, the lesser one first."""
+    """Return two keys, the smaller one first."""
     pair: Any = types.UniTuple
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
@@ -321,9 +321,9 @@ ordered: Any = intrinsic_or_python(_ordered, lambda one, other: (min(one, other)
 
 @kernel
 def take(to: Any, table: Any, who: Any, count: int) -> None:
-    """Write into to (R, K, N) what the first R rows of a table (.., N') of `count` agents say of those listed, (K, N).
+    """Gather the first R rows of a table (.., N') of `count` agents at the indices `who` (K, N) into to (R, K, N).
 
-    N and N' are multiples of PAIR, and whom the lists name beyond the last agent is below `count`, too.
+    N and N' are multiples of PAIR, and indices beyond the last agent are also below `count`.
     """
     many, listed, n = np.uint64(to.shape[0]), np.uint64(who.shape[0]), np.uint64(who.shape[1])
     if np.uint64(count) <= np.uint64(SHORT * cpu.REGISTER // 4):
@@ -340,9 +340,9 @@ def take(to: Any, table: Any, who: Any, count: int) -> None:
 def _turned_square(
     typing_context: Any, to: Any, at: Any, across: Any, many: Any, source: Any, place: Any, down: Any
 ) -> Any:
-    """Copy a square of numbers turned: column k, from `place` + k * `down`, goes to every `across`-th from `at` + k.
+    """Transpose a square of side SQUARE: column k, from `place` + k * `down`, goes to every `across`-th from `at` + k.
 
-    Its side is SQUARE; the first `many` rows of it are written.
+    Only the first `many` rows of the result are written.
     """
     in_one_piece(to)
     in_one_piece(source)
@@ -357,7 +357,7 @@ def _turned_square(
 
         numbers = [builder.load(line(sources, k, *arguments[5:]), align=4) for k in range(SQUARE)]
         sides = [1 << k for k in range(SQUARE.bit_length() - 1)]
-        for s in sides:  # of four squares of s in one of 2 s, two are swapped
+        for s in sides:  # in each square of side 2 s, swap the two off-diagonal squares of side s
             low = [SQUARE + k - s if k & s else k for k in range(SQUARE)]
             high = [SQUARE + k if k & s else k + s for k in range(SQUARE)]
             masks = [ir.Constant(ir.VectorType(ir.IntType(32), SQUARE), mask) for mask in (low, high)]
@@ -384,9 +384,9 @@ _turn_square: Any = intrinsic_or_python(_turned_square, _turned_in_python)
 
 @kernel
 def into_rows(rows: Any, flat: Any, many: int, distance: int) -> None:
-    """Copy columns, `distance` apart in scratch, into the first `many` numbers of rows (L, O) float32 in one piece.
+    """Copy columns, `distance` apart in scratch, into the first `many` numbers of contiguous rows (L, O) float32.
 
-    Squares at the end of a row overlap with those before them: what is copied twice is the same.
+    The last square of a row may overlap with the one before it: the same numbers are written twice.
     """
     count, size, step = rows.shape[0], np.uint64(rows.shape[1]), np.uint64(distance)
     if many >= SQUARE:

@@ -1,8 +1,8 @@
-"""What machine code depends on, written out: the code of functions and what they hold, and the sources of all laws.
+"""Text of all that machine code depends on: functions with their free variables, and the sources of all laws.
 
-numba's own disk cache never finds a closure again, and does not notice that a law has changed which a cached function
-calls. So machine code is kept under a digest of all that is written out here. A second process compiles nothing; an
-edited law compiles anew, always.
+numba's own disk cache never finds a closure again, and does not notice a change of a law that a cached function calls.
+So machine code is stored under a digest of this text. A second process compiles nothing; an edited law is always
+compiled again.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ PACKAGE = Path(__file__).parent.parent
 
 
 def sources_of_code() -> Iterator[tuple[Path, bytes]]:
-    """Yield every source of the package that holds laws or records of theirs, or says how code is made of them."""
+    """Yield path and content of every source of the package that defines laws or their records, or compiles them."""
     for path in sorted(PACKAGE.rglob("*.py")):
         text = path.read_bytes()
         if b"flockenv.jit" in text or path.relative_to(PACKAGE).parts[0] in ("jit", "engine", "sweep", "tasks"):
@@ -45,7 +45,7 @@ def sources_of_code() -> Iterator[tuple[Path, bytes]]:
 def laws_digest() -> str:
     """Digest `sources_of_code`.
 
-    An edit to one means new files, never stale machine code. Nothing of the machine is in it: results are the same.
+    An edit to a source gives new files, never stale machine code. The digest does not depend on the machine.
     """
     digest = hashlib.sha256(f"{numba.__version__} {sys.version_info[:2]}".encode())
     for _, text in sources_of_code():
@@ -54,7 +54,7 @@ def laws_digest() -> str:
 
 
 def texts_outside(modules: set[str]) -> str:
-    """Return the text of the modules outside flockenv among these, and of those whose laws they use."""
+    """Return the text of those of `modules` that are outside flockenv, and of the modules whose laws they use."""
     todo = set(modules)
     done: set[str] = set()
     texts = []
@@ -65,7 +65,7 @@ def texts_outside(modules: set[str]) -> str:
         if module is None or name.split(".")[0] in ("flockenv", "numpy", "numba", "collections", "math"):
             continue
         path, laws = Path(getattr(module, "__file__", None) or ""), [v for v in vars(module).values() if _is_law(v)]
-        # a notebook has no file: its functions are as they are now
+        # a notebook has no file: the current code of its functions is used
         texts.append(path.read_text(encoding="utf-8") if path.suffix == ".py" else "".join(map(code_text, laws)))
         todo |= {python_of(law).__module__ for law in laws}
     return "".join(texts)
@@ -76,7 +76,7 @@ def _is_law(value: Any) -> bool:
 
 
 def code_text(function: Any) -> str:
-    """Return the code of a function as text: the same for the same code, and another one after an edit."""
+    """Return the byte code of a function as text: the same for the same code, different after an edit."""
 
     def text(code: CodeType) -> str:
         inner = [text(each) if isinstance(each, CodeType) else each for each in code.co_consts]
@@ -91,7 +91,7 @@ def held(python: FunctionType) -> tuple[Any, ...]:
 
 
 def functions_in(part: Any) -> Iterator[FunctionType]:
-    """Yield a Python function and all that it holds."""
+    """Yield a Python function and all functions in its free variables, recursively; likewise for a tuple."""
     python = python_of(part)
     if isinstance(python, FunctionType):
         yield python
@@ -101,7 +101,7 @@ def functions_in(part: Any) -> Iterator[FunctionType]:
 
 
 def described(part: Any) -> str:
-    """Write out what machine code depends on: code and what it holds, numbers as they print, arrays by their bytes."""
+    """Return a part of a plan as text: functions by code and free variables, numbers by repr, arrays by bytes."""
     python = python_of(part)
     if isinstance(python, FunctionType):
         return _described(python)
@@ -112,6 +112,6 @@ def described(part: Any) -> str:
 
 @functools.lru_cache(maxsize=4096)
 def _described(python: FunctionType) -> str:
-    """Write out a function as `described` does, by a digest: what holds it twice stays short."""
+    """Return a function's name and the digest of its code and free variables, which keeps nested text short."""
     told = f"{code_text(python)} {described(held(python))}"
     return f"{python.__module__}.{python.__qualname__} {hashlib.sha256(told.encode()).hexdigest()}"

@@ -1,4 +1,4 @@
-"""What a process does once: it imports folders and reads kernels. Nobody looks for garbage meanwhile, nor for scipy."""
+"""Startup of a process: imports of whole folders and of numba, without garbage collection and without scipy."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ _one_at_a_time = threading.Lock()
 
 @contextlib.contextmanager
 def nothing_to_collect() -> Iterator[None]:
-    """Keep Python from looking for garbage where nearly all that is made stays: it would walk through it repeatedly.
+    """Disable garbage collection in a block whose objects nearly all stay alive, and would be traversed repeatedly.
 
-    It took a seventh of the time until a process's first step.
+    Collection took a seventh of the time until a process's first step.
     """
     collects = gc.isenabled()
     gc.disable()
@@ -32,7 +32,7 @@ def nothing_to_collect() -> Iterator[None]:
 
 
 def import_all(package: str, path: Iterable[str], but: str = "") -> None:
-    """Import every module of a package's folder, but for one: what is written there registers itself."""
+    """Import every module of a package's folder except `but`, so that the classes defined there register themselves."""
     with nothing_to_collect():
         for module in pkgutil.iter_modules(path):
             if module.name != but:
@@ -40,10 +40,10 @@ def import_all(package: str, path: Iterable[str], but: str = "") -> None:
 
 
 def numba_before_scipy() -> None:
-    """Have numba load what it knows of arrays without scipy.linalg, a tenth of the time until a process's first step.
+    """Import numba's array functions without scipy.linalg, which took a tenth of the time until a process's first step.
 
-    It imports scipy.linalg there to see that it can be imported, and does so again where it is used: whoever compiles
-    np.dot has it imported then.
+    numba imports scipy.linalg there only to check that it is available, and imports it again on use: when np.dot is
+    compiled.
     """
     name = "numba.np.arraymath"
     if name in sys.modules:

@@ -1,12 +1,12 @@
-"""Threads for compiled code: how many there are, and how a piece of work is given to all of them.
+"""Thread pool for compiled code: the number of threads, and how work is distributed among them.
 
-One thread unless asked for more: waiting threads spin, and where another process has the second core that costs more
-than it brings. `use_threads(2)`, or FLOCKENV_THREADS=2 in the environment. Results do not depend on the number. Work is
-shared where that is sooner done (`Choice`): to hand it over takes 20 microseconds, or, on a virtual machine, 100. More
-threads than there are cores wait for each other in vain: there are never more at work.
+The default is one thread: waiting threads spin, which costs more than it gains if another process uses the second core.
+Set it by `use_threads(2)`, or FLOCKENV_THREADS=2 in the environment. Results do not depend on the number. Work is
+distributed if that is faster (`Choice`): handing it over takes 20 microseconds, or 100 on a virtual machine. More
+threads than cores would only wait for each other, so there are never more at work.
 
-On Linux the other threads keep off the core of the thread that shares its work: woken after a pause, they are put there
-often, and two halves of the work are then done one after the other.
+On Linux the pool's threads avoid the core of the calling thread: woken after a pause, they are often scheduled there,
+and two halves of the work would then run one after the other.
 """
 
 from __future__ import annotations
@@ -28,23 +28,23 @@ T = TypeVar("T")
 _MOST = 256
 
 SHORTEST = 4e-5
-"""s: what one thread has done by then is not shared; to hand it over takes 20 microseconds, on some machines 100."""
+"""s: shorter work is not distributed, as handing it over takes 20 microseconds, on some machines 100."""
 
 LARGEST = 500_000
-"""Steps of agents, each of which takes some 10 ns at least: so much work is surely sooner done by several threads."""
+"""Agent steps, each of at least some 10 ns: this much work is certainly done faster by several threads."""
 
 TRIAL = 3
-"""Pieces of work by which a way to do it is judged: the best of all but the first."""
+"""Pieces of work in a trial of one alternative; its time is the best of all but the first."""
 
 AGAIN, SELDOM = 64, 4096
-"""After so many pieces of work what was slower is tried again; each time that it still is, after twice as many."""
+"""Pieces of work until the slower alternative is tried again: doubled, up to SELDOM, each time it is still slower."""
 
 RISE = 1.25
-"""Who is held up by something else once is not thought that much slower: only this much, at most."""
+"""Largest factor by which one measurement raises a time, so that a single disturbance counts little."""
 
 
 class _Crew:
-    """Threads that wait for work; made when first needed, and anew in a forked process, which has none of them."""
+    """Pool of threads that wait for work; created when first needed, and again in a forked process, which has none."""
 
     def __init__(self, count: int) -> None:
         self.pid = os.getpid()
@@ -55,7 +55,7 @@ class _Crew:
 
 
 def _how_to_ask() -> Callable[[], int] | None:
-    """Return what says on which core a thread runs, if the system says so and lets threads be kept off one."""
+    """Return the function that returns the current thread's core; None if the system has none, or no affinities."""
     if not hasattr(os, "sched_setaffinity"):
         return None
     try:
@@ -69,7 +69,7 @@ _asked = _how_to_ask()
 
 
 def _here() -> tuple[int, set[int]]:
-    """Return on which core this thread runs, and on which it may; (-1, none) where the system does not say."""
+    """Return the core that this thread runs on, and those that it may run on; (-1, empty set) if unknown."""
     if _asked is not None:
         with contextlib.suppress(OSError):
             return _asked(), os.sched_getaffinity(0)
@@ -77,17 +77,17 @@ def _here() -> tuple[int, set[int]]:
 
 
 class _Place:
-    """Where the thread that makes it may run."""
+    """CPU affinity of the thread that creates it."""
 
     def __init__(self) -> None:
         self.kept: set[int] = set()
 
     def keep_off(self, core: int, cores: set[int], many: int) -> None:
-        """Run on the caller's cores from now on, but not on that one, where `many` threads have one beside it."""
+        """Run on the caller's `cores` from now on, without `core` if at least `many` others are left."""
         others = cores - {core}
         kept = others if len(others) >= many else cores
         if kept and kept != self.kept:
-            with contextlib.suppress(OSError):  # forbidden here: it runs where the system likes
+            with contextlib.suppress(OSError):  # not permitted: the system chooses the core
                 os.sched_setaffinity(0, kept)
             self.kept = kept
 
@@ -110,28 +110,28 @@ _in_python = os.environ.get("NUMBA_DISABLE_JIT", "0") not in ("", "0")  # numba 
 
 
 def threads() -> int:
-    """Return how many threads a step may use."""
+    """Return the number of threads that a step may use."""
     return _count
 
 
 def at_work() -> int:
-    """Return how many threads a step uses if that is faster: at most one per core, and one in plain Python.
+    """Return the number of threads that a step uses if that is faster: at most one per core, and one in plain Python.
 
-    There, counting who has arrived is not one indivisible operation.
+    In plain Python the barrier's counter is not atomic.
     """
     return 1 if _in_python else min(_count, _cores)
 
 
 def use_threads(count: int) -> None:
-    """Let every step from now on use up to `count` threads; ValueError unless it is a whole number from 1 to 256."""
+    """Let every step from now on use up to `count` threads; ValueError unless it is an integer from 1 to 256."""
     global _count
-    if type(count) is not int or not 1 <= count <= _MOST:  # True is no number of threads
-        raise ValueError(f"threads is {count!r}, must be a whole number from 1 to {_MOST}")
+    if type(count) is not int or not 1 <= count <= _MOST:  # True is not a number of threads
+        raise ValueError(f"threads is {count!r}, must be an integer from 1 to {_MOST}")
     _count = count
 
 
 def _crew_of(count: int) -> _Crew:
-    """Return a crew with work for `count` threads; two callers at once may make two, and each keeps to its own."""
+    """Return a pool for `count` threads; two callers at once may create two, and each uses its own."""
     global _crew
     crew = _crew
     if crew is None or crew.pid != os.getpid() or len(crew.desks) < count - 1:
@@ -140,13 +140,13 @@ def _crew_of(count: int) -> _Crew:
 
 
 def share(jobs: Sequence[Callable[[], Any]]) -> list[Any]:
-    """Run some jobs at the same time, the first in this thread; return what each returned, or raise what one raised.
+    """Run jobs in parallel, the first in this thread; return their results, or raise the error of one of them.
 
-    All of them run at once, so they may wait for each other. Returns when all have ended, whatever happens.
+    All of them run at the same time, so they may wait for each other. Returns, or raises, only after all have ended.
     """
-    crew, here = _crew_of(len(jobs)), (*_here(), len(jobs) - 1)  # who is pinned keeps its helpers there
+    crew, here = _crew_of(len(jobs)), (*_here(), len(jobs) - 1)  # a pinned caller keeps the pool's threads on its cores
     done: list[queue.SimpleQueue[Any]] = [queue.SimpleQueue() for _ in jobs[1:]]
-    with crew.lock:  # all desks in one go: two callers whose jobs wait for each other never get in each other's way
+    with crew.lock:  # all queues under one lock: the jobs of two callers, which wait for each other, never interleave
         for desk, job, answer in zip(crew.desks, jobs[1:], done, strict=False):
             desk.put((job, answer, here))
     try:
@@ -160,26 +160,26 @@ def share(jobs: Sequence[Callable[[], Any]]) -> list[Any]:
 
 
 class Choice:
-    """Is work of one kind and size sooner done by one thread or by several? Both are tried, and, seldom, tried again.
+    """Choice between one thread and several for work of one kind and size; both are timed, and rarely timed again.
 
-    What is sooner done depends on how the system wakes threads and on what else its cores do, so it is not worked out
-    but seen. The first piece of a trial does not count: kernels are compiled in it, threads made, or woken.
+    Which is faster depends on how the system wakes threads and on the load of its cores, so it is measured. The first
+    piece of work of a trial does not count: in it kernels are compiled, and threads are created or woken.
     """
 
-    always = False  # share everything: tests do, which are about results
+    always = False  # distribute everything: for tests of results
 
     def __init__(self) -> None:
         self.took = [math.inf, math.inf]  # s, by one thread and by several
-        self._tried, self._left, self._least = 0, TRIAL, math.inf  # which way, how many pieces yet, and their best
+        self._tried, self._left, self._least = 0, TRIAL, math.inf  # alternative on trial, pieces left, best time
         self._wait, self._pause = 0, AGAIN
 
     @property
     def best(self) -> int:
-        """What is sooner done, as far as is known: 0 by one thread, 1 by several."""
+        """The faster alternative as far as is known: 0 one thread, 1 several."""
         return int(self.took[1] < self.took[0])
 
     def several(self) -> bool:
-        """Are several threads to do the next piece of work?"""
+        """Return True if several threads are to do the next piece of work."""
         if not self._left:
             if self._wait > 0:
                 self._wait -= 1
@@ -191,9 +191,9 @@ class Choice:
         return bool(self._tried)
 
     def made(self, alone: Callable[[], T], shared: Callable[[], T], surely: bool = False) -> T:
-        """Do a piece of work in one of two ways, and remember how long it took; return what it returns.
+        """Call `alone` or `shared`, record the time it took, and return its result.
 
-        surely: shared it is sooner done, and it is so large that it is never tried otherwise.
+        surely: the work is so large that `shared` is called without a trial.
         """
         if surely or self.always:
             return shared()
@@ -215,7 +215,7 @@ class Choice:
         self._tried, self._left, self._least = way, TRIAL, math.inf
 
     def _judge(self) -> None:
-        """Take over what a trial has shown; try the other way if it never was, else wait."""
+        """Record the time of a trial; start the other trial if it never ran, otherwise wait."""
         before, self.took[self._tried] = self.best, self._least
         if self.took[1] == math.inf:
             self._try(1)
@@ -225,10 +225,10 @@ class Choice:
 
 
 class Choices(dict[tuple[Any, ...], Choice]):
-    """A choice for each kind of work, and for each size, up to a factor of two."""
+    """A `Choice` for each kind and size of work, with sizes in powers of two, and number of threads."""
 
     def of(self, kind: str, work: int, count: int) -> Choice:
-        """Return that of so many steps of agents and so many threads."""
+        """Return the choice for `work` agent steps and `count` threads."""
         key = kind, work.bit_length(), count
         return self.get(key) or self.setdefault(key, Choice())
 
@@ -236,7 +236,7 @@ class Choices(dict[tuple[Any, ...], Choice]):
 def _from_environment() -> None:
     text = os.environ.get("FLOCKENV_THREADS", "1")
     if not text.isdecimal() or not 1 <= int(text) <= _MOST:
-        raise ValueError(f"FLOCKENV_THREADS is {text!r}, must be a whole number from 1 to {_MOST}")
+        raise ValueError(f"FLOCKENV_THREADS is {text!r}, must be an integer from 1 to {_MOST}")
     use_threads(int(text))
 
 

@@ -1,7 +1,7 @@
-"""Records of agents, written and read a block at a time: lanes of numbers become records by shuffles, and back.
+"""Conversion between records of agents and SIMD lanes, a block of agents at a time, by shuffles.
 
-What is sorted of an agent is one record, so that it is one distant place in memory; what is computed of it lies in
-lanes, a number of many agents side by side.
+Sorting moves one record per agent, so that an agent is one access to distant memory; computations use lanes, which hold
+one number of many agents side by side.
 """
 
 from __future__ import annotations
@@ -24,14 +24,14 @@ _several: Any = types.UniTuple
 
 
 def _whole(length: int) -> int:
-    """Return the next power of two: so many rows are transposed."""
+    """Return the next power of two, the number of rows that are transposed."""
     return 1 << (length - 1).bit_length()
 
 
 def _transposed(builder: Any, rows: Vectors) -> Vectors:
     """Return P vectors of W numbers, both powers of two, as the P numbers of lane 0, then those of lane 1, and so on.
 
-    Laid end to end, the first half riffled with the second: log2 P such shuffles, and every number is where it belongs.
+    Each of log2 P passes interleaves the first half of the vectors, laid end to end, with the second half.
     """
     half, width = len(rows) // 2, rows[0].type.count
     first = [k // 2 + (k % 2) * width for k in range(width)]
@@ -56,7 +56,7 @@ def _mask(places: list[int]) -> Any:
 
 
 def _part(builder: Any, vector: Any, first: int, count: int) -> Any:
-    """Return so many numbers of a vector."""
+    """Return `count` numbers of a vector, from `first` on."""
     return builder.shuffle_vector(vector, vector, _mask([first + k for k in range(count)]))
 
 
@@ -68,11 +68,11 @@ def _put_records(
     typing_context: Any, records: Any, sources: Any, places: Any, width: Any, cell: Any, first: Any, offset: Any,
     spare: Any,
 ) -> Any:  # fmt: skip
-    """Write the records of `width` agents from `first` on, each to the next place of its cell; count those places on.
+    """Write the records of `width` agents from `first` on, each to the next place of its cell, and advance that place.
 
-    A record is its agent, and a number out of each of the sources, where those of all these agents lie side
-    by side from a place on. cell: int32, -1 for who has none: his is written to place `spare`, behind all others.
-    offset: int32, the next place of each cell. Everything lies in one piece.
+    A record is the agent's index and one number from each source; in source k the numbers of these agents lie side by
+    side from `places[k]` on. cell: int32, -1 for an agent without one: its record is written to place `spare`, behind
+    all others. offset: int32, the next place of each cell. All arrays are contiguous.
     """
     wide, many = written(width, "width"), 1 + sources.count
     size = _whole(many)
@@ -100,7 +100,7 @@ def _put_records(
         flat: Vectors = []
         for begin in range(0, wide, side):
             flat += _transposed(builder, list(rows(begin)))
-        starts = []  # all of them before anything is written to where they say: no place is waited for by the next
+        starts = []  # all computed before the records are stored, so that no store delays the next address
         for k in range(wide):
             c = builder.load(builder.gep(cells, [builder.add(arguments[5], word(k))]))
             none = builder.icmp_signed("<", c, whole(0))
@@ -142,11 +142,11 @@ put_records: Any = intrinsic_or_python(_put_records, _records_in_python)
 def _put_lines(
     typing_context: Any, lines: Any, sources: Any, places: Any, width: Any, to: Any, first: Any, length: Any, spare: Any
 ) -> Any:  # fmt: skip
-    """Write the numbers of `width` agents from `first` on, one out of each of the sources, as whole lines of memory.
+    """Write the numbers of `width` agents from `first` on, one from each source, as whole cache lines.
 
-    As `_put_records` does, but a piece is `length` numbers, whole lines that begin where lines do, and it comes to
-    place `to` (int32, counted in pieces; -1 for place `spare`); behind the last source stands anything. Lines go past
-    the caches: each is far from the next, and must not be read before it is written.
+    Like `_put_records`, but a record is `length` numbers, aligned whole cache lines, and is written to place `to`
+    (int32, in records; -1 for place `spare`). The numbers behind that of the last source are undefined. Streaming
+    stores bypass the caches, so that a line, far from the next one, is not read before it is written.
     """
     wide, many, piece = written(width, "width"), sources.count, written(length, "length")
 
@@ -195,10 +195,10 @@ put_lines: Any = intrinsic_or_python(_put_lines, _lines_in_python)
 
 
 def _out_of_records(typing_context: Any, numbers: Any, places: Any, at: Any, width: Any, records: Any) -> Any:
-    """Read the records `at` and on of `width` agents, number by number, each from its place of `numbers` on.
+    """Read the records of `width` agents from record `at` on; write number k of each to `numbers` from `places[k]` on.
 
-    There is a place for its agent, and for every number behind. Behind the last record there must be room for another,
-    up to the next power of two of its length.
+    `places` has one entry for the agent's index and one for each number after it. The array must extend behind the last
+    record, up to the next power of two of a record's length.
     """
     wide, many = written(width, "width"), places.count
     size = _whole(many)
@@ -217,7 +217,7 @@ def _out_of_records(typing_context: Any, numbers: Any, places: Any, at: Any, wid
 
         for first in range(0, wide, side):
             flat = []
-            for k in range(size):  # which numbers come into a register, of one record or of several
+            for k in range(size):  # the numbers in a register come from one record or from several
                 lane, done = divmod(k * side, size)
                 parts = [piece(first + lane + j, done, min(size, side)) for j in range(max(1, side // size))]
                 while len(parts) > 1:

@@ -1,1 +1,1 @@
-"""Numbers in the precision of a kernel: vectors, polynomial approximations, random numbers by counter, grids."""
+"""Mathematics in the precision of a kernel: vectors, polynomial approximations, counter-based random numbers, grids."""

@@ -1,10 +1,10 @@
-"""Rounding, and the exponential and the angle of a vector as polynomials, for lanes side by side.
+"""Rounding, exp and atan2 as polynomials, which vectorise over SIMD lanes.
 
-libm's are calls, one by one; rounding by instruction is two for a register, and a product to be rounded a third.
+Those of libm are scalar calls; the rounding instruction takes two operations per register, and a multiplication before
+it a third.
 
-In float64 `exp` is within 1e-14 of the exact value relative to it and `atan2` within 5e-16 rad; in float32 within
-5e-7 (relative, for |x| < 10; the rounding of x itself counts more beyond) and 3e-7 rad. tests/test_social.py holds
-them to that.
+In float64 the relative error of `exp` is below 1e-14 and the error of `atan2` below 5e-16 rad; in float32 5e-7 (for
+|x| < 10; beyond, the rounding of x itself dominates) and 3e-7 rad. tests/test_social.py checks these bounds.
 """
 
 from __future__ import annotations
@@ -22,11 +22,11 @@ from flockenv.jit.intrinsics import intrinsic_or_python
 __all__ = ["atan2", "exp", "nearest_whole"]
 
 LARGEST = {types.float32: 87.0, types.float64: 708.0}
-"""The x, on either side of 0, up to which e^x is a normal number."""
+"""Largest |x| for which e^x is a normal number."""
 
 
 def _ones(x: Any) -> float:
-    """Return a number whose last digit counts ones: what is added to it is rounded, and stands in its last bits."""
+    """Return a number whose unit in the last place is 1: an x added to it is rounded to an integer, in its low bits."""
     return like(x, 1.5 * 2**23 if isinstance(x, np.float32) else 1.5 * 2**52)
 
 
@@ -38,17 +38,17 @@ def _ones_of(x):  # type: ignore[no-untyped-def]  # numba compares signatures, a
 
 @law
 def nearest_whole(x: float) -> float:
-    """Return the whole number nearest to x, of two the even one: np.rint, and faster.
+    """Return x rounded to the nearest integer, ties to even: a faster np.rint.
 
-    For |x| < 2^22 in float32, 2^51 in float64; beyond it may be one off.
+    Exact for |x| < 2^22 in float32, 2^51 in float64; beyond, it may be off by one.
     """
     return (x + _ones(x)) - _ones(x)
 
 
 def _power_of_two(typing_context: Any, far: Any) -> Any:
-    """Return 2^k, as long as that is a normal number, for a whole number k that was added to `_ones`.
+    """Return 2^k, if that is a normal number, for `far` = `_ones` + k with an integer k.
 
-    k stands in its last bits, as two's complement, and is put where the exponent lies.
+    k is in the low bits of `far`, in two's complement, and is shifted to the exponent.
     """
     if far not in (types.float32, types.float64):
         return None
@@ -65,7 +65,7 @@ _two_to: Any = intrinsic_or_python(_power_of_two, lambda far: type(far)(2.0 ** f
 
 
 def _largest(typing_context: Any, x: Any) -> Any:
-    """Return up to which number e^x is a normal number of x's precision."""
+    """Return the largest x for which e^x is a normal number in the precision of x."""
     if x not in LARGEST:
         return None
 
@@ -80,18 +80,18 @@ _limit_of: Any = intrinsic_or_python(_largest, lambda x: like(x, 87.0 if isinsta
 
 @law
 def exp(x: float) -> float:
-    """Return e^x; 0 where it is below the least normal number, and the same largest number for whatever is beyond.
+    """Return e^x; 0 below the smallest normal number, and constant for x above `LARGEST`.
 
     e^x = 2^k e^r with |r| <= ln 2 / 2, and Taylor's polynomial of degree 11 for e^r.
     """
     most = _limit_of(x)
-    y = most if x > most else x  # a choice that leaves NaN as it is
+    y = most if x > most else x  # a selection that keeps NaN
     y = -most if y < -most else y
     far = y * like(x, 1.4426950408889634) + _ones(x)
     k = far - _ones(x)
-    # ln 2 in two parts, of which the first has so few digits that k times it is exact
+    # ln 2 in two parts; the first has few enough digits that its product with k is exact
     r = (y - k * like(x, 0.693359375)) + k * like(x, 2.12194440054690583e-4)
-    # side by side, not one after the other (Estrin): what waits for what is half as long
+    # Estrin's scheme instead of Horner's: a dependency chain half as long
     r2 = r * r
     r4 = r2 * r2
     low = (like(x, 1.0) + r) + (like(x, 1 / 2) + like(x, 1 / 6) * r) * r2
@@ -103,7 +103,7 @@ def exp(x: float) -> float:
 
 @law
 def _arc(x: float) -> float:
-    """Return atan(x) for |x| <= sqrt(2) - 1: a polynomial through Chebyshev's points."""
+    """Return atan(x) for |x| <= sqrt(2) - 1: a polynomial that interpolates at Chebyshev nodes."""
     z = x * x
     p = like(z, -0.0178023957270003)
     p = p * z + like(z, 0.037962548861582394)
@@ -122,7 +122,7 @@ def _arc(x: float) -> float:
 
 @law
 def atan2(y: float, x: float) -> float:
-    """Return the angle of (x, y) from the x axis, in (-pi, pi]; 0 of the vector 0."""
+    """Return the angle of (x, y) from the x axis, in (-pi, pi]; 0 for the zero vector."""
     o, e = like(x, 0.0), like(x, 1.0)
     wide, high = abs(x), abs(y)
     steep = high > wide

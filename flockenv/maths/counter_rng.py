@@ -1,7 +1,7 @@
-"""Randomness as a function: (key, step, agent, channel) -> number, with no state to share, copy or get out of order.
+"""Counter-based random numbers: a function (key, step, agent, channel) -> number, without state.
 
-A world's key is mixed from its seed and the number of its episode. So row k of a batch draws what that world would
-draw alone, for any number of threads, and a copied world goes on as the original would. The mixer is the finaliser of
+A world's key is mixed from its seed and the number of its episode. So world k of a batch draws the same numbers as it
+would alone, for any number of threads, and a copied world continues like the original. The mixer is the finaliser of
 SplitMix64 (Steele, Lea & Flood 2014, doi 10.1145/2660193.2660195).
 """
 
@@ -27,7 +27,7 @@ MASK = (1 << 64) - 1
 
 @kernel
 def mix(a: np.uint64, b: np.uint64) -> np.uint64:
-    """Fold one more number into a hash."""
+    """Return the hash `a` with the number `b` mixed in."""
     z = (a ^ (b * _GOLDEN)) + _GOLDEN
     z = (z ^ (z >> _30)) * _M1
     z = (z ^ (z >> _27)) * _M2
@@ -36,7 +36,7 @@ def mix(a: np.uint64, b: np.uint64) -> np.uint64:
 
 @kernel
 def uniform(key: np.uint64, step: int, agent: int, channel: int) -> float:
-    """Draw from U[0, 1): the same four numbers give the same draw, for ever."""
+    """Draw from U[0, 1): the same four arguments always give the same number."""
     h = mix(mix(mix(key, np.uint64(step)), np.uint64(agent)), np.uint64(channel))
     return float(h >> _11) * _TO_UNIT
 
@@ -50,10 +50,10 @@ def normal(key: np.uint64, step: int, agent: int, channel: int) -> float:
 
 @kernel
 def smooth(key: np.uint64, time: float, agent: int, channel: int) -> float:
-    """Draw a number in [-1, 1] that changes smoothly with time, of which a unit is as long as it remembers.
+    """Draw a number in [-1, 1] that changes smoothly with time, whose unit is the correlation time.
 
-    Coherent noise, after Perlin (1985): independent draws at whole times, and between them 6 s^5 - 15 s^4 + 10 s^3 of
-    the way. Of a function of time no step can be too long or too short: it is the same walk for every dt.
+    Coherent noise, after Perlin (1985): independent draws at integer times, interpolated between them by the weight
+    6 s^5 - 15 s^4 + 10 s^3. As it is a function of time, the signal is the same for every dt.
     """
     begin = math.floor(time)
     s = time - begin
@@ -63,13 +63,13 @@ def smooth(key: np.uint64, time: float, agent: int, channel: int) -> float:
 
 
 def key_of(seed: int, episode: int) -> np.uint64:
-    """Return the key of a world: plain Python, the same mixing as in the kernels."""
+    """Return the key of a world, by the same mixing as in the kernels, in plain Python."""
     return np.uint64(_mix(_mix(int(_START), seed & MASK), episode & MASK))
 
 
 def keys_of(seeds: NDArray[np.uint64], episodes: NDArray[np.uint64]) -> NDArray[np.uint64]:
     """Return the keys of many worlds at once."""
-    plain = python_of(mix)  # on arrays, whose whole numbers wrap as in a kernel
+    plain = python_of(mix)  # on arrays, whose integers wrap as in a kernel
     return np.asarray(plain(plain(_START, seeds), episodes))
 
 

@@ -1,9 +1,9 @@
-"""Numbers on a regular grid, and what they are in between: fields of velocities, distances and potentials.
+"""Interpolation on a regular grid: fields of velocities, distances and potentials.
 
-A grid is one array (a table), so that a law can be handed it: the lowest corner (D, m), the spacing (m), the count of
-points along each axis (D), how many numbers each point has (K), then these numbers, the last axis fastest. `packed`
-makes one of an array; the laws read it at any place. Where they say nothing else, outside the grid is the nearest
-place on its edge.
+A grid is one array (a table), so that it can be passed to a law: the lowest corner (D, m), the spacing (m), the number
+of points along each axis (D), the number of values per point (K), then these values, the last axis fastest. `packed`
+builds a table from an array; the laws read it at any position. Unless stated otherwise, a position outside the grid is
+clamped to the nearest point on its edge.
 """
 
 from __future__ import annotations
@@ -23,11 +23,11 @@ Floats = NDArray[np.float64]
 Table = Any
 """One axis of numbers, in the precision of the scene."""
 MOST_POINTS = 2**22
-"""Points of a grid that a scene may have: with a distance and a direction each, 100 MB in the plane."""
+"""Most points of a grid in a scene: with a distance and a direction each, 100 MB in 2-D."""
 
 
 def packed(values: ArrayLike, low: Sequence[float], spacing: float) -> Floats:
-    """Return the table of `values` (nx, ny[, nz], K) at low + spacing (i, j[, k]); ValueError if that is no grid."""
+    """Return the table of `values` (nx, ny[, nz], K) at low + spacing (i, j[, k]); ValueError if they form no grid."""
     array = np.asarray(values, np.float64)
     d = len(low)
     if array.ndim != d + 1:
@@ -43,28 +43,28 @@ def packed(values: ArrayLike, low: Sequence[float], spacing: float) -> Floats:
 
 
 def points_of(low: Sequence[float], spacing: float, counts: Sequence[int]) -> Floats:
-    """Return the places of a grid's points, (nx, ny[, nz], D) m."""
+    """Return the positions of a grid's points, (nx, ny[, nz], D) m."""
     axes = [low[k] + spacing * np.arange(counts[k]) for k in range(len(low))]
     return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
 
 
 @law
 def _along(table: Table, x: float, d: int, k: int) -> tuple[Any, float]:
-    """Return the cell along axis k that holds x, and where in it: 0 at its lower edge, 1 at its upper one."""
+    """Return the cell along axis k that contains x, and the position in it: 0 at its lower edge, 1 at its upper."""
     o, e = like(x, 0.0), like(x, 1.0)
     last = table[d + 1 + k] - e
     at = (x - table[k]) / table[d]
-    at = at if at > o else o  # what is no number too
+    at = at if at > o else o  # NaN also becomes 0
     at = at if at < last else last
     cell = np.int64(at)
     most = np.int64(last) - 1
     cell = cell if cell < most else most
-    return cell, at - like(x, cell)  # type: ignore[arg-type,operator]  # a whole number that it makes a float of
+    return cell, at - like(x, cell)  # type: ignore[arg-type,operator]  # an integer that `like` converts to float
 
 
 @law
 def sample(table: Table, x: Vec, k: int) -> float:
-    """Return number k of a grid at x: linear in between along each axis (bilinear, trilinear)."""
+    """Return value k of a grid at x, interpolated linearly along each axis (bilinear, trilinear)."""
     e = like(x[0], 1.0)
     if len(x) == 2:
         i, a = _along(table, x[0], 2, 0)
@@ -92,7 +92,7 @@ def sample(table: Table, x: Vec, k: int) -> float:
 
 @law
 def sample_vector(table: Table, x: Vec, k: int) -> Vec:
-    """Return the vector whose first coordinate is number k of a grid, at x."""
+    """Return the vector of the D values from k on of a grid at x."""
     if len(x) == 2:
         return (sample(table, x, k), sample(table, x, k + 1))
     else:
@@ -106,7 +106,7 @@ def _between(table: Table, x: float, d: int, k: int) -> bool:
 
 @law
 def covers(table: Table, x: Vec) -> bool:
-    """Is x within the grid, its edge included? Nowhere is, if x is no number."""
+    """Return True if x is inside the grid, its edge included; False if x is NaN."""
     if len(x) == 2:
         return _between(table, x[0], 2, 0) & _between(table, x[1], 2, 1)
     else:
@@ -115,7 +115,7 @@ def covers(table: Table, x: Vec) -> bool:
 
 @kernel
 def _over_points(table: Any, points: Any, out: Any) -> None:
-    """Write every number of a grid at every point; points (R, D), out (R, K)."""
+    """Write every value of a grid at every point; points (R, D), out (R, K)."""
     for r in range(points.shape[0]):
         for k in range(out.shape[1]):
             if points.shape[1] == 2:
@@ -125,7 +125,7 @@ def _over_points(table: Any, points: Any, out: Any) -> None:
 
 
 def sampled(table: Floats, points: ArrayLike) -> Floats:
-    """Return what a grid says at points (..., D), (..., K); for Python, not for laws."""
+    """Return the values (..., K) of a grid at points (..., D); for Python, not for laws."""
     where = np.ascontiguousarray(points, np.float64)
     d = where.shape[-1]
     flat = where.reshape(-1, d)

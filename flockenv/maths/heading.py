@@ -1,8 +1,8 @@
-"""The vehicle: where an agent faces and which way it holds its head up, and how fast it can turn.
+"""Orientation of an agent: its heading f, its up vector in 3-D, and the limit on how fast it can turn.
 
-A heading outlives standstill: it follows the velocity while there is one, and stays as it was when there is none. In
-space an agent has an up vector too; side = unit(f x up) is its right hand and up = side x f, so that (side, f, up) is a
-right-handed basis (the pseudo-code of Reynolds 1999 has up = f x side, which is upside down).
+The heading is the direction of the velocity; at standstill it keeps its last value. In 3-D an agent also has an up
+vector; side = unit(f x up) points to its right and up = side x f, so that (side, f, up) is a right-handed basis (the
+pseudo-code of Reynolds 1999 has up = f x side, which is upside down).
 
 Source: Reynolds, "Steering Behaviors for Autonomous Characters" (GDC 1999), "simple vehicle model".
 """
@@ -19,7 +19,7 @@ from flockenv.maths.vectors import add, axis, cross, dot, lateral, norm, perpend
 __all__ = ["GRAVITY", "SLOWEST", "face", "faced", "held", "leant", "raised", "turned"]
 
 SLOWEST = 1e-30
-"""(m/s)^2: what is slower than 1e-15 m/s stands still; in single precision too, that is far from underflow."""
+"""(m/s)^2: below 1e-15 m/s an agent stands still; also in single precision this is far from underflow."""
 
 GRAVITY = 9.81
 """m/s^2, against which an agent leans into its turns."""
@@ -27,19 +27,19 @@ GRAVITY = 9.81
 
 @law
 def faced(velocity: Vec, heading: Vec) -> Vec:
-    """Return where somebody faces who moves so: along the velocity, or as before if there is none."""
+    """Return the heading for a velocity: its direction, or the previous heading at standstill."""
     return select(dot(velocity, velocity) > like(heading[0], SLOWEST), unit(velocity), heading)
 
 
 @law
 def turned(way: Vec, heading: Vec, angle: float) -> tuple[Vec, bool]:
-    """Return the unit vector along `way`, but at most `angle` [rad] from `heading`; and whether it had to be less.
+    """Return the unit vector along `way`, at most `angle` [rad] from `heading`, and True if the turn was limited.
 
-    Exactly behind, the shorter way around is over the right hand (`perpendicular`). Without a way it is the heading.
+    If `way` points exactly backwards, the turn is to the right (`perpendicular`). For a zero `way` it is the heading.
     """
     along, aside = dot(way, heading), lateral(way, heading)
     across, length = norm(aside), norm(way)
-    # an angle and not its cosine: of a small one that is 1 in single precision, and everybody would turn too far
+    # the angle, not its cosine, which is 1 for small angles in single precision, so that agents would turn too far
     over = (np.arctan2(across, along) > angle) & (length > like(length, 0.0))
     known = across > like(across, 1e-6) * length
     bent = scale(select(known, unit(aside), perpendicular(heading)), np.sin(angle))
@@ -49,7 +49,7 @@ def turned(way: Vec, heading: Vec, angle: float) -> tuple[Vec, bool]:
 
 @law
 def held(way: Vec, ahead: Vec, over: bool) -> Vec:
-    """Return what is left of `way` for somebody who had to turn less: its part along `ahead`, none backwards."""
+    """Return `way` or, if the turn was limited (`over`), its component along `ahead`, at least 0."""
     along = dot(way, ahead)
     onward = along if along > like(along, 0.0) else like(along, 0.0)
     return select(over, scale(ahead, onward), way)
@@ -57,10 +57,10 @@ def held(way: Vec, ahead: Vec, over: bool) -> Vec:
 
 @law
 def leant(heading: Vec, before: Vec, up: Vec, speed: float, seconds: float, memory: float) -> Vec:
-    """Return the up vector of somebody who leans into a turn: it follows lateral acceleration + g upwards, in space.
+    """Return the up vector of an agent that banks into a turn, in 3-D: it follows lateral acceleration + g upwards.
 
-    The acceleration is s (f - f_before)/dt across f, that of the path; `memory` [s] is how long up takes to follow,
-    with a share of 1 - exp(-dt/memory) per step, whatever dt is. An infinite one leaves up as it is (Reynolds 1999).
+    The lateral acceleration is s (f - f_before)/dt across f, that of the path. `memory` [s] is the time constant: up
+    moves by the fraction 1 - exp(-dt/memory) per step, for any dt. An infinite one leaves up unchanged (Reynolds 1999).
     """
     share = like(speed, 1.0) - np.exp(-seconds / memory)
     toward = scale(lateral(before, heading), -speed / seconds)
@@ -70,7 +70,7 @@ def leant(heading: Vec, before: Vec, up: Vec, speed: float, seconds: float, memo
 
 @law
 def raised(heading: Vec, before: Vec, up: Vec) -> Vec:
-    """Return the unit vector across `heading` that is nearest to `up`; where that is along it, side stays as it was."""
+    """Return the unit vector perpendicular to `heading` nearest to `up`; if `up` is along it, side is kept."""
     side, old = cross(heading, up), cross(before, up)
     side = select(dot(side, side) > like(up[0], 1e-8), side, old)
     side = select(dot(side, side) > like(up[0], 1e-8), unit(side), perpendicular(heading))
@@ -79,7 +79,7 @@ def raised(heading: Vec, before: Vec, up: Vec) -> Vec:
 
 @kernel
 def face_one(v: Any, frame: Any, b: int, i: int, anew: bool) -> None:
-    """Write where agent i of world b faces, and which way is up; see `face`."""
+    """Write the heading and the up vector of agent i of world b; see `face`."""
     if anew:
         frame[:, b, i] = 0
     if v.shape[0] == 2:
@@ -99,9 +99,9 @@ def face_one(v: Any, frame: Any, b: int, i: int, anew: bool) -> None:
 
 @kernel
 def face(v: Any, frame: Any, b: int, anew: bool) -> None:
-    """Write where the agents of world b face, and which way is up, for these velocities; v (D, B, N), frame (F, B, N).
+    """Write headings and up vectors of the agents of world b for their velocities; v (D, B, N), frame (F, B, N).
 
-    Who stands still faces as he did, or along the x axis if that was nowhere, or all is `anew`; up is the z axis then.
+    At standstill an agent keeps its heading; if it has none yet, or with `anew`, it gets the x axis, and up the z axis.
     """
     for i in range(v.shape[2]):
         face_one(v, frame, b, i, anew)

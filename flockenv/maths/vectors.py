@@ -1,7 +1,7 @@
-"""Vectors as tuples of two or three floats: what laws are written in.
+"""Vectors as tuples of two or three floats, for laws.
 
-numba prunes the branch of the other dimension at compile time, and LLVM keeps the numbers in registers, so that a law
-written with these reads like the textbook and runs like hand-written scalars.
+numba prunes the branch of the other dimension at compile time, and LLVM keeps the numbers in registers, so a law
+written with these reads like the textbook and runs as fast as hand-written scalar code.
 """
 
 from __future__ import annotations
@@ -86,12 +86,12 @@ def _pair(condition: bool, a: float, b: float, c: float, d: float) -> Vec:
 
 @law
 def select(condition: bool, a: Vec, b: Vec) -> Vec:
-    """Return a where the condition holds, else b, without a branch; for tuples of 2 to 5."""
+    """Return a if the condition holds, else b, without a branch; for tuples of 2 to 5."""
     if len(a) == 2:
         return (a[0] if condition else b[0], a[1] if condition else b[1])
     elif len(a) == 3:
         return (a[0] if condition else b[0], a[1] if condition else b[1], a[2] if condition else b[2])
-    elif len(a) == 4:  # spelt out: a law that calls itself is a dangling call once it comes out of numba's disk cache
+    elif len(a) == 4:  # unrolled: a recursive law becomes a dangling call when numba's disk cache loads it
         return _pair(condition, a[0], a[1], b[0], b[1]) + _pair(condition, a[2], a[3], b[2], b[3])
     else:
         first = (a[0] if condition else b[0], a[1] if condition else b[1], a[2] if condition else b[2])
@@ -109,7 +109,7 @@ def opposite(a: Vec) -> Vec:
 
 @law
 def planar(a: Vec, x: float, y: float) -> Vec:
-    """Return (x, y) in a's dimension: with z = 0 in 3-D."""
+    """Return (x, y) in the dimension of a: with z = 0 in 3-D."""
     if len(a) == 2:
         return (x, y)
     else:
@@ -118,7 +118,7 @@ def planar(a: Vec, x: float, y: float) -> Vec:
 
 @unfused
 def exact_dot(a: Vec, b: Vec) -> float:
-    """Return a . b, each operation rounded: the same number wherever it is computed, to compare distances by."""
+    """Return a . b, each operation rounded: the same number wherever it is computed, for comparing distances."""
     if len(a) == 2:
         return a[0] * b[0] + a[1] * b[1]
     else:
@@ -127,7 +127,7 @@ def exact_dot(a: Vec, b: Vec) -> float:
 
 @unfused
 def exact_sum(a: float, b: float) -> float:
-    """Return a + b, rounded by itself: whatever b is made of is the same number wherever it is added up."""
+    """Return a + b, rounded separately: never fused with a product in b, so the same number wherever it is computed."""
     return a + b
 
 
@@ -147,7 +147,7 @@ def unit(a: Vec) -> Vec:
 
 @law
 def limit(a: Vec, longest: float) -> Vec:
-    """Return a, shortened to `longest` where it is longer: trunc(a, M) = a min(1, M/|a|)."""
+    """Return a, shortened to `longest` if it is longer: trunc(a, M) = a min(1, M/|a|)."""
     square = dot(a, a)
     over = square > longest * longest
     return scale(a, longest / np.sqrt(square) if over else like(square, 1.0))
@@ -161,7 +161,7 @@ def cross(a: Vec, b: Vec) -> Vec:
 
 @law
 def lateral(a: Vec, forward: Vec) -> Vec:
-    """Return the part of a across the unit vector `forward`."""
+    """Return the component of a perpendicular to the unit vector `forward`."""
     return sub(a, scale(forward, dot(a, forward)))
 
 
@@ -177,9 +177,9 @@ def axis(a: Vec, k: int) -> Vec:
 
 @law
 def perpendicular(forward: Vec) -> Vec:
-    """Return a unit vector across `forward`: to its right in 2-D, horizontal in 3-D unless it is vertical.
+    """Return a unit vector perpendicular to `forward`: to its right; horizontal in 3-D (the x axis if it is vertical).
 
-    Everybody who must pick a side picks this one, so two agents that meet head-on both keep right.
+    All agents that must choose a side choose this one, so two agents that meet head-on both keep right.
     """
     if len(forward) == 2:
         side: Vec = (forward[1], -forward[0])
@@ -191,7 +191,7 @@ def perpendicular(forward: Vec) -> Vec:
 
 
 def is_vector(value: object, dimension: int) -> bool:
-    """Say whether `value` is a sequence of `dimension` finite numbers; for checks in Python, not in laws."""
+    """Return True if `value` is a sequence of `dimension` finite numbers; for checks in Python, not in laws."""
     return (
         isinstance(value, (tuple, list))
         and len(value) == dimension

@@ -1,1 +1,1 @@
-"""Replacements in numba that make it compile faster; none changes a result, and numba works without any of them."""
+"""Patches of numba that make it compile faster; none changes a result, and each can be left out."""

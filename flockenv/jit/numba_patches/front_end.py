@@ -1,9 +1,9 @@
-"""numba's front end with less to do: while it compiles our kernels, it does nothing twice, and nothing in vain.
+"""A faster front end of numba: caches and short cuts while it compiles our kernels.
 
-Four fifths of the time that a kernel takes to compile are numba's Python. The machine code that comes out is the same,
-instruction for instruction. What is replaced here is replaced while one of our functions compiles, under numba's own
-lock, and put back afterwards. Each replacement names the functions of numba that it relies on, by digests of their
-text: where one of them reads otherwise (another numba), it is left out, and numba does all of its own work.
+Four fifths of the compile time of a kernel are spent in numba's Python code. The resulting machine code is the same,
+instruction for instruction. The patches are active only while one of our functions compiles, under numba's own lock,
+and are undone afterwards. Each patch lists the functions of numba that it relies on, with digests of their source: if
+one of them differs (another version of numba), the patch is left out and numba works unchanged.
 """
 
 from __future__ import annotations
@@ -26,14 +26,11 @@ from numba.core import (
     ssa,
     targetconfig,
     transforms,
-    typed_passes,
-    types,
     untyped_passes,
 )
 from numba.core.compiler_machinery import register_pass
 from numba.core.ir_utils import fixup_var_define_in_scope
-from numba.core.types import containers, functions
-from numba.core.typing import context as typing_context
+from numba.core.types import functions
 
 from flockenv.core.errors import nearest, shown
 from flockenv.jit.startup import nothing_to_collect
@@ -41,7 +38,7 @@ from flockenv.jit.startup import nothing_to_collect
 __all__ = ["LEFT_OUT", "SPARED", "TRICKS", "Spared", "Trick", "applies", "lighter", "reads_as_known", "spared"]
 
 LEFT_OUT = "FLOCKENV_NUMBA_ALONE"
-"""The environment variable that names replacements to leave out, with commas between; `all`: numba works alone."""
+"""Environment variable with the names of patches to leave out, separated by commas; `all` leaves out every one."""
 
 # numba is untyped
 _canonical: Any = transforms.canonicalize_cfg
@@ -50,12 +47,10 @@ _lock: Any = compiler_lock.global_compiler_lock
 _register: Any = register_pass
 _Closures: Any = untyped_passes.InlineClosureLikes
 _Processor: Any = postproc.PostProcessor
-_Tuple: Any = containers.BaseAnonymousTuple
-_Rewrites: Any = typed_passes.NopythonRewrites
 
 
 class Known(NamedTuple):
-    """A function of numba, as it reads where a replacement of it was tried."""
+    """A function of numba, with the digest of the source that a patch was tested with."""
 
     owner: Any
     name: str
@@ -63,7 +58,7 @@ class Known(NamedTuple):
 
 
 class Trick(NamedTuple):
-    """A replacement: `owner.name` becomes `make(what was there)`."""
+    """A patch: `owner.name` is replaced by `make(original)`."""
 
     owner: Any
     name: str
@@ -72,14 +67,14 @@ class Trick(NamedTuple):
 
     @property
     def title(self) -> str:
-        """What it is called where replacements are listed, or left out: by module, since classes share names."""
+        """Name of the patch, in lists and in LEFT_OUT: with its module, since classes share names."""
         if inspect.ismodule(self.owner):
             return f"{self.owner.__name__}.{self.name}".removeprefix("numba.core.")
         return f"{self.owner.__module__}.{self.owner.__name__}.{self.name}".removeprefix("numba.core.")
 
 
 def digest(owner: Any, name: str) -> str:
-    """Return a digest of the text of `owner.name`; nothing if there is no such function."""
+    """Return a digest of the source of `owner.name`; "" if there is no such function."""
     try:
         return hashlib.sha256(inspect.getsource(vars(owner)[name]).encode()).hexdigest()[:12]
     except (KeyError, OSError, TypeError):
@@ -88,14 +83,14 @@ def digest(owner: Any, name: str) -> str:
 
 @functools.cache
 def reads_as_known(reads: tuple[Known, ...]) -> bool:
-    """Return True if every function reads as it did where a replacement was tried."""
+    """Return True if the source of every function is the one that the patch was tested with."""
     return all(digest(known.owner, known.name) == known.digest for known in reads)
 
 
 def applies(title: str, reads: tuple[Known, ...]) -> bool:
-    """Return True if a replacement is made: this numba reads as known, and LEFT_OUT does not name it.
+    """Return True if a patch is applied: numba's source is as known, and LEFT_OUT does not contain its title.
 
-    ValueError for a name in LEFT_OUT that no replacement has.
+    Raise ValueError for a name in LEFT_OUT that is not the title of a patch.
     """
     left_out = [name for name in os.environ.get(LEFT_OUT, "").split(",") if name]
     allowed = ["all", "lowering", *(each.title for each in (*TRICKS, *SPARED))]
@@ -105,9 +100,9 @@ def applies(title: str, reads: tuple[Known, ...]) -> bool:
     return reads_as_known(reads) and title not in left_out and "all" not in left_out
 
 
-# --- remembered: which implementation a call of given types has -------------------------------------------------------
+# --- cached: the implementation of a call with given types ------------------------------------------------------------
 
-_remembered: dict[int, tuple[Any, dict[Any, Any]]] = {}  # by the function type's id; the type itself, so that it stays
+_remembered: dict[int, tuple[Any, dict[Any, Any]]] = {}  # by id of the function type, which is stored to keep it alive
 
 
 def _memory(function: Any) -> dict[Any, Any]:
@@ -118,13 +113,13 @@ def _memory(function: Any) -> dict[Any, Any]:
 
 
 def _call(context: Any, args: Any, kws: Any) -> tuple[Any, ...]:
-    """Return what a resolution depends on beside the function: types, and the flags of the caller."""
+    """Return the cache key of a resolution beside the function: argument types, and the flags of the caller."""
     flags = targetconfig.ConfigStack.top_or_none()  # type: ignore[no-untyped-call]
     return context, tuple(args), tuple(kws.items()) if kws else (), flags
 
 
 def _recalled(function: Any, call: tuple[Any, ...]) -> Any:
-    """Return the signature that was found before, None if there was none."""
+    """Return the cached signature, None if there is none."""
     known = _memory(function).get(call)
     if known is None:
         return None
@@ -135,7 +130,7 @@ def _recalled(function: Any, call: tuple[Any, ...]) -> Any:
 
 
 def _known_calls(resolve: Any) -> Any:
-    """Remember what `+` of two numbers is: numba asks dozens of templates, for every `+` and several times over."""
+    """Cache the resolution of operators such as `+`: numba tries dozens of templates, several times for every `+`."""
 
     def get_call_type(self: Any, context: Any, args: Any, kws: Any) -> Any:
         call = _call(context, args, kws)
@@ -150,7 +145,7 @@ def _known_calls(resolve: Any) -> Any:
 
 
 def _known_laws(resolve: Any) -> Any:
-    """Remember the signature of a compiled function for given types, as long as it is there."""
+    """Cache the signature of a compiled function for given types, as long as its compiled form exists."""
 
     def get_call_type(self: Any, context: Any, args: Any, kws: Any) -> Any:
         call = _call(context, args, kws)
@@ -164,41 +159,11 @@ def _known_laws(resolve: Any) -> Any:
     return get_call_type
 
 
-def _known_first(resolve: Any) -> Any:
-    """Ask what is remembered before anything else, the items of tuples (which have no function) among it."""
-    items: dict[Any, Any] = {}
-
-    def resolve_function_type(self: Any, function: Any, args: Any, kws: Any) -> Any:
-        if isinstance(function, (functions.BaseFunction, functions.Dispatcher)):
-            signature = _recalled(function, _call(self, args, kws))
-            return resolve(self, function, args, kws) if signature is None else signature
-        if function != "static_getitem" or kws or not isinstance(args[0], types.BaseTuple) or type(args[1]) is not int:
-            return resolve(self, function, args, kws)
-        item = self, id(args[0]), args[1]
-        if item not in items:
-            items[item] = resolve(self, function, args, kws), args[0]  # which stays, and its id with it
-        return items[item][0]
-
-    return resolve_function_type
-
-
-def _known_plain(find: Any) -> Any:
-    """Remember the type of a tuple without literals."""
-    known: dict[int, tuple[Any, Any]] = {}
-
-    def unliteral(self: Any) -> Any:
-        if id(self) not in known:
-            known[id(self)] = self, find(self)
-        return known[id(self)][1]
-
-    return unliteral
-
-
-# --- cheaper: the same answer, found sooner ---------------------------------------------------------------------------
+# --- cheaper: the same result, computed faster ------------------------------------------------------------------------
 
 
 def _values(_: Any) -> Any:
-    """Return the values of flags: defaults, and what is set."""
+    """Return a faster `values` of flags: the cached defaults, updated with the set values."""
     defaults: dict[Any, dict[str, Any]] = {}
 
     def values(self: Any) -> dict[str, Any]:
@@ -211,51 +176,10 @@ def _values(_: Any) -> Any:
     return values
 
 
-def _equal(slowly: Any) -> Any:
-    """Compare flags by what is set first."""
-
-    def equal(self: Any, other: Any) -> Any:
-        same = self is other or (type(self) is type(other) and self._values == other._values)
-        return same or slowly(self, other)
-
-    return equal
-
-
-def _hashed(_: Any) -> Any:
-    """Hash flags: numba sorts the names of all options, which are the same for all."""
-    return lambda self: hash(type(self))
-
-
-_PLAIN = frozenset((ir.Loc, ir.Const, ir.Global, ir.FreeVar, ir.Arg, ir.Scope, str, int, float, bool, type(None)))
-
-
-def _variables(slowly: Any) -> Any:
-    """List the variables of a statement by the types of its parts."""
-
-    def rec_list_vars(self: Any, value: Any) -> list[Any]:
-        kind = type(value)
-        if kind is dict:
-            parts = value.values()
-        elif kind in (list, tuple):
-            parts = value
-        else:
-            return slowly(self, value)  # type: ignore[no-any-return]
-        found = []
-        for part in parts:
-            kind = type(part)
-            if kind is ir.Var:
-                found.append(part)
-            elif kind not in _PLAIN:
-                found += rec_list_vars(self, part) if kind in (list, tuple, dict) else slowly(self, part)
-        return found
-
-    return rec_list_vars
-
-
 def _when_asked(slowly: Any) -> Any:
-    """Work out the lives of variables only when asked: numba finds them anew after each of its passes.
+    """Compute the lifetimes of variables only on demand: numba computes them after each of its passes.
 
-    What is entered into `block_entry_vars` is for generators and for Python's objects, of which kernels have none.
+    `block_entry_vars` is needed only for generators and Python objects, which kernels do not have.
     """
 
     def run(self: Any, emit_dels: bool = False, extend_lifetimes: bool = False) -> None:
@@ -273,8 +197,8 @@ def _when_asked(slowly: Any) -> Any:
 
 
 def _if_new(refresh: Any) -> Any:
-    """Look for new declarations only if there are some: numba runs through all of them for each function."""
-    seen: dict[int, int] = {}  # by the registries: a target's copies share them
+    """Refresh registries only if there are new declarations: numba goes through all of them for each function."""
+    seen: dict[int, int] = {}  # by id of the registries, which the copies of a target share
 
     def refreshed(self: Any) -> None:
         known = sum(
@@ -291,7 +215,7 @@ def _if_new(refresh: Any) -> Any:
 
 
 def _where_it_is(slowly: Any) -> Any:
-    """Rewrite the blocks that name a variable: numba goes through every statement of a function for each variable."""
+    """Rewrite only blocks that contain a variable: numba goes through all of a function's statements for each one."""
 
     def names(block: Any) -> frozenset[str]:
         known = vars(block).get("_flockenv_names")
@@ -319,21 +243,10 @@ TRICKS = (
         Known(functions.Dispatcher, "get_call_type", "ae1ef289d128"),
         Known(dispatcher._DispatcherBase, "get_call_template", "f15b62d0e9c0"),
     )),
-    Trick(typing_context.BaseContext, "resolve_function_type", _known_first, (
-        Known(typing_context.BaseContext, "resolve_function_type", "81a6c18964e1"),
-        Known(typing_context.BaseContext, "_resolve_user_function_type", "a0fa2751b7c1"),
-        Known(typing_context.BaseContext, "_resolve_builtin_function_type", "52d7c153a4d1"),
-    )),
-    Trick(_Tuple, "__unliteral__", _known_plain, (Known(_Tuple, "__unliteral__", "0b50cd0611a0"),)),
     Trick(targetconfig.TargetConfig, "values", _values, (
         Known(targetconfig.TargetConfig, "values", "12a29dc810f6"),
         Known(targetconfig._MetaTargetConfig, "__init__", "f2ff91c25728"),
     )),
-    Trick(targetconfig.TargetConfig, "__eq__", _equal, (Known(targetconfig.TargetConfig, "__eq__", "6d8774572d07"),)),
-    Trick(targetconfig.TargetConfig, "__hash__", _hashed, (
-        Known(targetconfig.TargetConfig, "__hash__", "4d15a6c75137"),
-    )),
-    Trick(ir.Inst, "_rec_list_vars", _variables, (Known(ir.Inst, "_rec_list_vars", "054700e9100b"),)),
     Trick(postproc.PostProcessor, "run", _when_asked, (Known(postproc.PostProcessor, "run", "e1a8e77d6f17"),)),
     Trick(ssa, "_run_block_rewrite", _where_it_is, (
         Known(ssa, "_run_ssa", "c497422bcf04"),
@@ -351,17 +264,13 @@ TRICKS = (
         Known(base.BaseContext, "refresh", "83e8f5cc63a7"),
         Known(base.BaseContext, "install_registry", "bdaf4e9db8fe"),
     )),
-    Trick(typing_context.BaseContext, "refresh", _if_new, (
-        Known(typing_context.BaseContext, "refresh", "144078234921"),
-        Known(typing_context.BaseContext, "install_registry", "8b38bc0cff80"),
-    )),
 )  # fmt: skip
-"""All of them, by the function that each replaces."""
+"""All patches of functions."""
 
 
 @functools.cache
 def _replacements() -> tuple[tuple[Any, str, Any, Any], ...]:
-    """Return (owner, name, numba's, ours) of all that apply to this numba."""
+    """Return (owner, name, original, patch) of all patches that apply to this numba."""
     found = []
     for trick in TRICKS:
         if applies(trick.title, trick.reads):
@@ -375,7 +284,7 @@ _depth = 0
 
 @contextmanager
 def lighter() -> Iterator[None]:
-    """Compile with all that applies, and without looking for garbage: what a kernel leaves behind is 100 MB at most."""
+    """Compile with all patches that apply, and without garbage collection: a kernel leaves at most 100 MB."""
     global _depth
     with _lock, nothing_to_collect():
         if _depth == 0:
@@ -396,12 +305,12 @@ def lighter() -> Iterator[None]:
 
 @_register(mutates_CFG=True, analysis_only=False)
 class ClosuresIfAny(_Closures):  # type: ignore[misc]
-    """Look for closures, comprehensions, reductions and stencils only where there may be one."""
+    """Pass that inlines closures, comprehensions, reductions and stencils, run only if there may be one."""
 
     _name = "inline_closure_likes_if_any"
 
     def run_pass(self, state: Any) -> bool:
-        """Run numba's pass, or what it ends with."""
+        """Run numba's pass, or only its final steps."""
         if any(_may_be_inlined(statement) for b in state.func_ir.blocks.values() for statement in b.body):
             return bool(super().run_pass(state))
         _Processor(state.func_ir).run()
@@ -421,22 +330,8 @@ def _may_be_inlined(statement: Any) -> bool:
 _INLINED = ("reduce", "stencil")
 
 
-@_register(mutates_CFG=True, analysis_only=False)
-class RewritesIfAny(_Rewrites):  # type: ignore[misc]
-    """Look for array expressions and named fields only where there may be one: kernels allocate no arrays."""
-
-    _name = "nopython_rewrites_if_any"
-
-    def run_pass(self, state: Any) -> bool:
-        """Run numba's pass, or nothing."""
-        kinds = (types.Record, types.StringLiteral, types.DictType, types.LiteralStrKeyDict, types.List)
-        if state.flags.nrt or any(isinstance(kind, kinds) for kind in state.typemap.values()):
-            return bool(super().run_pass(state))
-        return False
-
-
 class Spared(NamedTuple):
-    """A pass of numba and what takes its place."""
+    """A pass of numba and its replacement."""
 
     numbas: Any
     ours: Any
@@ -444,7 +339,7 @@ class Spared(NamedTuple):
 
     @property
     def title(self) -> str:
-        """What it is called where replacements are listed, or left out."""
+        """Name of the patch, in lists and in LEFT_OUT."""
         return self.numbas.__name__  # type: ignore[no-any-return]
 
 
@@ -453,7 +348,6 @@ SPARED = (
         Known(_Closures, "run_pass", "b61f17f30105"),
         Known(inline_closurecall.InlineClosureCallPass, "run", "d826ba18dd63"),
     )),
-    Spared(_Rewrites, RewritesIfAny, (Known(_Rewrites, "run_pass", "954ea0cf2043"),)),
 )  # fmt: skip
 
 
@@ -463,5 +357,5 @@ def _places() -> dict[Any, Any]:
 
 
 def spared(passes: list[tuple[Any, str]]) -> list[tuple[Any, str]]:
-    """Return numba's list of passes with ours in their places."""
+    """Return numba's list of passes with the replaced ones exchanged."""
     return [(_places().get(each, each), text) for each, text in passes]

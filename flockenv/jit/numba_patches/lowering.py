@@ -1,13 +1,13 @@
-"""numba's lowering in fewer words: what it tells LLVM of arrays, loops and calls, less what LLVM takes away again.
+"""A shorter lowering of numba: LLVM code for arrays, loops and calls without what LLVM would remove again.
 
-Half of the time that a kernel took to compile went by in writing LLVM's text, in reading it and in taking away what it
-says twice: numba stores all fields of an array for each number that is read from it, and takes a namedtuple of twenty
-arrays apart into two hundred arguments for each call, which the function that is called puts together again. Here a
-number is read from where the array's data are, a part of an array is made of the numbers that differ, a loop by ones
-divides nothing, and a function that is only ever inlined takes a namedtuple as it is. Flock in float64 says 33,000
-instructions where it said 86,000; the machine code is what it was.
+Half of the compile time of a kernel went into writing LLVM code, parsing it and removing redundancy: numba stores all
+fields of an array for each number that is read from it, and for each call unpacks a namedtuple of twenty arrays into
+two hundred arguments, which the called function packs again. Here a number is read directly from the array's data, a
+view is built only from the fields that differ, a loop with step 1 needs no division, and a function that is only ever
+inlined receives a namedtuple as one argument. Flock in float64 has 33,000 instructions instead of 86,000; the machine
+code is the same.
 
-Where the functions of numba that this relies on read otherwise (another numba), it is left out; see `front_end`.
+If the functions of numba that this relies on differ (another version), it is left out; see `front_end`.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ _Tuple: Any = types.BaseTuple
 LOOPS = ("getiter", "iternext", "pair_first", "pair_second")
 
 START_STOP_STEP = 3
-"""Numbers of a range."""
+"""Number of fields of a range: start, stop, step."""
 
 READS = (
     Known(_Lower, "storevar", "16d897dd729a"),
@@ -77,20 +77,20 @@ READS = (
     Known(models.RangeModel, "__init__", "4f349fad5728"),
     Known(models.RangeIteratorType, "__init__", "65c87b5a27d1"),
 )
-"""What is replaced, and what the replacements take from elsewhere."""
+"""Functions of numba that are replaced, or that the replacements rely on."""
 
 
 @functools.cache
 def is_brief() -> bool:
-    """Return True if all of it is used: this is the numba that it was tried with, and it is not left out."""
+    """Return True if this lowering is used: numba is as it was tested with, and LEFT_OUT does not exclude it."""
     return applies("lowering", READS)
 
 
 class Brief(_Lower):  # type: ignore[misc]
-    """Lowering of a function; where references are counted, numba does what counts them."""
+    """Lowering of a function; code with reference counting is left to numba."""
 
     def storevar(self, value: Any, name: str, argidx: Any = None) -> None:
-        """Store a value: what was there holds no references that would have to be counted."""
+        """Store a value: without reference counts, the old value needs no decref."""
         self._alloca_var(name, self.typeof(name))
         if self.context.enable_nrt or self._disable_sroa_like_opt:
             super().storevar(value, name, argidx)
@@ -100,7 +100,7 @@ class Brief(_Lower):  # type: ignore[misc]
             self.builder.store(value, self.getvar(name))
 
     def delvar(self, name: str) -> None:
-        """Forget a variable, or nothing."""
+        """Delete a variable, without code for reference counts."""
         if self.context.enable_nrt or self._disable_sroa_like_opt:
             super().delvar(name)
         elif name not in self._blk_local_varmap:
@@ -108,7 +108,7 @@ class Brief(_Lower):  # type: ignore[misc]
             self._alloca_var(name, self.typeof(name))
 
     def lower_getitem(self, resty: Any, expr: Any, value: Any, index: Any, signature: Any) -> Any:
-        """Read a number of an array where it lies, or look at a part of it; all else as numba does."""
+        """Read a number of an array directly, or make a view of a part; leave everything else to numba."""
         kind = self.typeof(value.name)
         places = self._places(kind, index)
         if places is None or not (resty == kind.dtype or isinstance(resty, types.Array)):
@@ -116,7 +116,7 @@ class Brief(_Lower):  # type: ignore[misc]
         return self._view(kind, resty, self.loadvar(value.name), places, index)
 
     def lower_setitem(self, target_var: Any, index_var: Any, value_var: Any, signature: Any) -> Any:
-        """Write a number of an array where it lies; all else as numba does."""
+        """Write a number of an array directly; leave everything else to numba."""
         kind, given = self.typeof(target_var.name), self.typeof(value_var.name)
         places = self._places(kind, index_var) if isinstance(given, (types.Number, types.Boolean)) else None
         if places is None or len(places) < kind.ndim or any(isinstance(place, slice) for place in places):
@@ -129,9 +129,9 @@ class Brief(_Lower):  # type: ignore[misc]
         return None
 
     def _places(self, kind: Any, index: Any) -> tuple[Any, ...] | None:
-        """Return what picks a part of an array, axis by axis: types of whole numbers, and slices that are written down.
+        """Return the index of each axis: the type of an integer, or a slice with literal bounds.
 
-        None where it is anything else.
+        None if the array or the index is of any other kind.
         """
         given: Any = self.typeof(index.name)
         if not isinstance(kind, types.Array) or kind.layout not in "CA":
@@ -148,7 +148,7 @@ class Brief(_Lower):  # type: ignore[misc]
         return places if known and 0 < len(places) <= kind.ndim else None
 
     def _slice(self, index: Any, place: int, many: int) -> slice | None:
-        """Return a slice that is written down, without a step, from the beginning on; None if it is another."""
+        """Return a slice with literal, non-negative bounds and no step; None if it is another."""
         known = self._known(index)
         if isinstance(known, tuple):
             known = known[place]
@@ -164,13 +164,13 @@ class Brief(_Lower):  # type: ignore[misc]
         return known if all(type(end) is int and 0 <= end <= types.intp.maxval for end in ends) else None
 
     def _calls(self, made: Any, function: Any) -> bool:
-        """Is what makes a variable a call of that function of Python's?"""
+        """Return True if the definition of a variable is a call of a Python function."""
         if not isinstance(made, ir.Expr) or made.op != "call":
             return False
         return getattr(self.typeof(made.func.name), "typing_key", None) is function
 
     def _known(self, variable: Any) -> Any:
-        """Return the value of a variable that is written down, or what makes it; itself if that differs."""
+        """Return the constant value of a variable, or its definition; the variable itself if it has several."""
         try:
             made = self.func_ir.get_definition(variable)
         except KeyError:
@@ -178,7 +178,7 @@ class Brief(_Lower):  # type: ignore[misc]
         return made.value if isinstance(made, (ir.Const, ir.Global, ir.FreeVar)) else made
 
     def _view(self, kind: Any, result: Any, array: Any, places: tuple[Any, ...], index: Any) -> Any:
-        """Return a number of an array, or a part of it as an array."""
+        """Return a number of an array, or a view of a part of it."""
         builder = self.builder
         spans = self._spans(kind, array, (*places, *[slice(None)] * (kind.ndim - len(places))), index)
         where = self._address(kind, array, [first for first, _ in spans])
@@ -198,7 +198,7 @@ class Brief(_Lower):  # type: ignore[misc]
         return self.builder.extract_value(array, self.context.data_model_manager[kind].get_field_position(name))
 
     def _spans(self, kind: Any, array: Any, places: tuple[Any, ...], index: Any) -> list[tuple[Any, Any]]:
-        """Return for each place where it begins, None at zero, and how much of that axis stays, None if one number."""
+        """Return for each axis (first, size); first None means 0, size None an integer index, which drops the axis."""
         context, builder, found = self.context, self.builder, []
         for axis, place in enumerate(places):
 
@@ -212,14 +212,14 @@ class Brief(_Lower):  # type: ignore[misc]
             if isinstance(self.typeof(index.name), types.BaseTuple):
                 at = builder.extract_value(at, axis)
             at = context.cast(builder, at, place, types.intp if place.signed else types.uintp)
-            if place.signed:  # negative ones count from the end
+            if place.signed:  # negative indices count from the end
                 negative = builder.icmp_signed("<", at, at.type(0))
                 at = builder.select(negative, builder.add(at, size()), at)
             found.append((at, None))
         return found
 
     def _address(self, kind: Any, array: Any, firsts: list[Any]) -> Any:
-        """Return where in memory a number of an array lies; None among its indices is a zero."""
+        """Return the address of a number of an array; None as an index means 0."""
         builder, data = self.builder, self._part(kind, array, "data")
         name = "shape" if kind.layout == "C" else "strides"
         numbers = self._part(kind, array, name) if kind.layout != "C" or len(firsts) > 1 else None
@@ -238,7 +238,7 @@ class Brief(_Lower):  # type: ignore[misc]
         return builder.gep(data, [at]) if kind.layout == "C" else _code.pointer_add(builder, data, at)
 
     def lower_expr(self, resty: Any, expr: Any) -> Any:
-        """Go through the whole numbers from one to another in few words; all else as numba does."""
+        """Lower loops over `range` with step 1, and pairs, to short code; leave everything else to numba."""
         kind = self.typeof(expr.value.name) if expr.op in LOOPS else None
         if isinstance(kind, types.RangeType) and expr.op == "getiter" and self._by_ones(expr.value):
             return self._begun(kind, self.loadvar(expr.value.name))
@@ -250,12 +250,12 @@ class Brief(_Lower):  # type: ignore[misc]
         return super().lower_expr(resty, expr)
 
     def _by_ones(self, variable: Any) -> bool:
-        """Is it what `range` made of one number, or of two?"""
+        """Return True if a variable is a `range` of one or two arguments, with step 1."""
         call = self._known(variable)
         return self._calls(call, range) and len(call.args) < START_STOP_STEP and not call.vararg
 
     def _begun(self, kind: Any, numbers: Any) -> Any:
-        """Return where a loop is that has yet to begin: which number is next, the end, the step, how many are left."""
+        """Return the iterator of a range: pointer to the next number, end, step, pointer to the count left."""
         builder = self.builder
         start, stop, step = (builder.extract_value(numbers, place) for place in range(START_STOP_STEP))
         with builder.goto_entry_block():
@@ -272,7 +272,7 @@ class Brief(_Lower):  # type: ignore[misc]
         return _struct(builder, loop, (following, stop, step, left))
 
     def _next(self, pair: Any, loop: Any) -> Any:
-        """Return the next number, if there is one, and whether there is one."""
+        """Return the pair (next number, True), or (0, False) at the end."""
         builder = self.builder
         following, _, step, left = (builder.extract_value(loop, place) for place in range(len(loop.type)))
         many = builder.load(left)
@@ -288,7 +288,7 @@ class Brief(_Lower):  # type: ignore[misc]
         return _struct(builder, self.context.get_value_type(pair), (builder.load(found), some))
 
     def _lower_call_normal(self, fnty: Any, expr: Any, signature: Any) -> Any:
-        """Make a range; call all else as numba does."""
+        """Lower a call of `range`; leave every other call to numba."""
         if getattr(fnty, "typing_key", None) is not range or len(signature.args) >= START_STOP_STEP:
             return super()._lower_call_normal(fnty, expr, signature)
         *start, stop = self.fold_call_args(fnty, signature, expr.args, expr.vararg, expr.kws)
@@ -304,34 +304,34 @@ def _struct(builder: Any, kind: Any, parts: Sequence[Any]) -> Any:
 
 
 def _within(builder: Any, size: Any, start: int, stop: int | None) -> tuple[Any, Any]:
-    """Return where a slice of an axis begins, None at zero, and how long it is."""
+    """Return the first index of a slice of an axis, None for 0, and its length."""
 
     def least(number: int) -> Any:
         return builder.select(builder.icmp_signed("<", size, size.type(number)), size, size.type(number))
 
     end = size if stop is None else least(stop)
     if start == 0:
-        return None, end  # which is the size itself of what is looked at whole
+        return None, end  # the size itself for a whole axis
     first = least(start)
     long = builder.sub(end, first)
     return first, builder.select(builder.icmp_signed("<", long, long.type(0)), long.type(0), long)
 
 
 def _takes_whole(fndesc: Any) -> bool:
-    """May a function take its arguments as they are?
+    """Return True if a function can receive its arguments without unpacking.
 
-    Not if it has defaults that nobody gave, which are no values, nor if it calls itself, which numba does in its own
-    way.
+    Not if it has omitted defaults, which have no value, nor if it is recursive, as numba has its own method for such
+    calls.
     """
     left_out = any(isinstance(kind, types.Omitted) for kind in fndesc.argtypes)
     return not left_out and not any(isinstance(kind, types.RecursiveCall) for kind in fndesc.typemap.values())
 
 
 class BriefPart(Brief):
-    """Lowering of a function that compiled code alone calls."""
+    """Lowering of a function that only compiled code calls."""
 
     def setup_function(self, fndesc: Any) -> None:
-        """Begin it."""
+        """Create the function, its entry block and its builder."""
         if not _takes_whole(fndesc):
             super().setup_function(fndesc)
             return
@@ -341,7 +341,7 @@ class BriefPart(Brief):
         self.call_helper = self.call_conv.init_call_helper(self.builder)
 
     def extract_function_arguments(self) -> Any:
-        """Take arguments as they are."""
+        """Use the arguments without packing them."""
         if not _takes_whole(self.fndesc):
             return super().extract_function_arguments()
         self.fnargs = list(self.call_conv.get_arguments(self.function))
@@ -349,7 +349,7 @@ class BriefPart(Brief):
 
 
 def _declared(context: Any, module: Any, fndesc: Any) -> Any:
-    """Declare it as numba would, but for its arguments."""
+    """Declare a function like numba, except that its arguments are not unpacked."""
     convention = context.call_conv
     known = convention.get_function_type(fndesc.restype, ())
     arguments = [context.get_value_type(kind) for kind in fndesc.argtypes]
@@ -367,7 +367,7 @@ def _declared(context: Any, module: Any, fndesc: Any) -> Any:
 
 
 def insert_part(context: Any, function: Any, fndesc: Any, libraries: tuple[Any, ...]) -> None:
-    """Let callers find it, as numba's `insert_user_function` does for what takes its arguments apart."""
+    """Register a function for its callers, like numba's `insert_user_function`, but with arguments not unpacked."""
     if not _takes_whole(fndesc):
         context.insert_user_function(function, fndesc, libraries)
         return
@@ -390,7 +390,7 @@ def insert_part(context: Any, function: Any, fndesc: Any, libraries: tuple[Any, 
             return fix(context, builder, sig, status, value)
         with _code.if_unlikely(builder, builder.icmp_signed("!=", code, callconv.RETCODE_OK)):
             builder.store(builder.load(error), convention._get_excinfo_argument(builder.function))
-            builder.ret(code)  # what it raises, its caller raises
+            builder.ret(code)  # the caller propagates the error
         return context.get_returned_value(builder, fndesc.restype, builder.load(result))
 
     call.signature = fndesc.argtypes  # type: ignore[attr-defined]
