@@ -77,7 +77,7 @@ def gains(weight: float, groups: Sequence[Any], dimension: int) -> NDArray[np.fl
 class Behaviour(Effect):
     """A steering force F = weight x S: S is desired velocity less velocity, by a law of `flockenv.steering`.
 
-    S contains -v, so weight / m is a damping rate: with a step above 2 m / weight, explicit Euler methods are unstable.
+    S contains -v, so weight / m is a damping rate: with a step above 2 m / weight, the Euler methods are unstable.
     That holds for forces below max_force; a large weight under a small max_force is bang-bang control, whose velocity
     chatters by max_force dt / m.
     """

@@ -83,7 +83,7 @@ def nobody_ahead(p: Any, me: Me) -> Vec:
 def next_ahead(p: Any, me: Me, other: Other, acc: Vec) -> Vec:
     """Keep the shortest gap to a slower agent ahead in the direction of the aim.
 
-    Ahead is within 45 degrees, so that two agents whose directions cross do not wait for each other.
+    Ahead is within 45 degrees: two agents whose directions differ by less than 90 degrees never wait for each other.
     """
     way, o = unit(me.aim), like(me.radius, 0.0)
     along = dot(other.offset, way)

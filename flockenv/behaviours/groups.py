@@ -216,7 +216,7 @@ effects:
         return {"first": float(first), "end": float(end)}
 
     def rates(self, groups: Sequence[Any], dimension: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return no oscillation, and damping: beta1 times the largest turn of a head, pi less half the field of view."""
+        """Return no oscillation, and damping beta1 times the largest turn of a head, pi less half the field of view."""
         most = self.gaze * (math.pi - math.radians(self.fov) / 2)
         damping = np.where(np.isfinite(all_masses(groups, dimension)), most, 0.0)
         return np.zeros(len(damping)), damping

@@ -186,7 +186,7 @@ effects:
 
 
 class StayOnPath(_OnPath):
-    """Stay in a path's tube, in either direction: if the position after `time` s is outside, seek the nearest spine."""
+    """Stay in a path's tube, in either direction: seek the nearest spine if the position after `time` s is outside."""
 
     kind: Literal["stay_on_path"] = "stay_on_path"
     own_law: ClassVar[Law | None] = path_kept

@@ -227,9 +227,8 @@ def births(
                 if after > before and not sorted_:
                     sort_living(x, alive, b, 0, n, clearing, period, grid, cell, start, order)
                     sorted_ = True
-            if until != int(
-                row[1]
-            ):  # streams of a group are consecutive, and each continues at the slot where the last one ended
+            # streams of a group are consecutive, and each continues at the slot where the last one ended
+            if until != int(row[1]):
                 slot, until = int(row[0]), int(row[1])
             slot = _bear(
                 before, after, e, kinds, slot, until, row, pieces, x, v, frame, alive, identity, born, dies,
