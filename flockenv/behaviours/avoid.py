@@ -125,7 +125,7 @@ class AvoidObstacles(Effect):
 
     kind: Literal["avoid_obstacles"] = "avoid_obstacles"
     weight: float = Field(ge=0, description="N, steering force of an evasion")
-    horizon: float = Field(default=2.0, gt=0, description="s, how far ahead it looks at the present speed")
+    horizon: float = Field(default=2.0, gt=0, description="s, look-ahead time, at the present speed")
     margin: float = Field(default=0.0, ge=0, description="m, clearance beyond both radii")
     steering: ClassVar[bool] = True
     obstacle_start: ClassVar[Law | None] = nothing

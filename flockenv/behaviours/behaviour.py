@@ -142,7 +142,7 @@ class Moving(Behaviour):
                 continue  # it is not steered
             speeds = [speed for speed in (self.speed, group.fastest) if speed is not None]
             if not speeds:
-                raise ValueError(f"speed = None: groups[{k}].max_speed is none too; give either of them")
+                raise ValueError(f"speed = None: groups[{k}].max_speed is not given either; give one of them")
             if self.ramp is not None and group.max_force is not None:
                 _warn_of_overshoot(self.kind, self.ramp, min(speeds), group)
 

@@ -56,7 +56,7 @@ class UnalignedAvoidance(Behaviour):
     weight: float = Field(ge=0, description="N, steering force of an evasion")
     radius: float = Field(default=10.0, gt=0, description="m, range within which agents count")
     fov: float = Field(default=360.0, gt=0, le=360, description="degrees, full angle of the field of view")
-    horizon: float = Field(default=3.0, gt=0, description="s, how far ahead it looks")
+    horizon: float = Field(default=3.0, gt=0, description="s, look-ahead time")
     margin: float = Field(default=0.0, ge=0, description="m, clearance beyond both radii")
     group: int | None = Field(default=None, ge=0, description="group that it avoids (default: all)")
     pair_start: ClassVar[Law | None] = no_meeting

@@ -103,7 +103,7 @@ class _OnPath(Moving):
     )
     closed: bool = Field(default=False, description="True if the last point is joined to the first")
     radius: float = Field(gt=0, description="m, radius of the tube")
-    time: float = Field(default=0.5, ge=0, description="s, how far ahead it looks")
+    time: float = Field(default=0.5, ge=0, description="s, look-ahead time")
 
     @model_validator(mode="after")
     def _is_a_path(self) -> _OnPath:
@@ -146,7 +146,7 @@ class FollowPath(_OnPath):
     """
 
     kind: Literal["follow_path"] = "follow_path"
-    time: float = Field(default=0.5, gt=0, description="s, how far ahead it looks")
+    time: float = Field(default=0.5, gt=0, description="s, look-ahead time")
     way: Literal[1, -1] = Field(default=1, description="1: in the order of the points; -1: reversed")
     keep: float = Field(
         default=0.5, ge=0, lt=1, description="share of top speed below which an agent is steered on; 0 = never"
@@ -210,7 +210,7 @@ class FollowFlow(Behaviour):
         min_length=2, max_length=3, description="points along each axis"
     )
     velocities: tuple[Vector, ...] = Field(description="m/s, at all points; the last axis varies fastest")
-    time: float = Field(default=0.2, ge=0, description="s, how far ahead it looks")
+    time: float = Field(default=0.2, ge=0, description="s, look-ahead time")
     tabled: ClassVar[bool] = True
     places: ClassVar[tuple[str, ...]] = ("centre",)
     heads_for: ClassVar[bool] = False

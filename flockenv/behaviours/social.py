@@ -212,7 +212,7 @@ class EllipticalRepulsion(Social):
         return self._steepest(self.decay, groups, dimension)
 
 
-# --- by where both go -------------------------------------------------------------------------------------------------
+# --- by both velocities -----------------------------------------------------------------------------------------------
 
 
 @law

@@ -76,7 +76,7 @@ class FollowWall(Moving):
 
     kind: Literal["follow_wall"] = "follow_wall"
     distance: float = Field(gt=0, description="m, from the wall to its centre")
-    time: float = Field(default=0.5, gt=0, description="s, how far ahead it looks")
+    time: float = Field(default=0.5, gt=0, description="s, look-ahead time")
     range: float = Field(default=5.0, gt=0, description="m, range within which walls are seen")
     obstacle_from: ClassVar[Law | None] = soon
     obstacle_start: ClassVar[Law | None] = no_wall
@@ -160,7 +160,7 @@ class Contain(Moving):
 
     kind: Literal["contain"] = "contain"
     within: AnyShape = Field(description="a circle (or sphere), a block, a polygon; the whole body is kept inside")
-    time: float = Field(default=1.0, gt=0, description="s, how far ahead it looks")
+    time: float = Field(default=1.0, gt=0, description="s, look-ahead time")
     tabled: ClassVar[bool] = True
     demo: ClassVar[str | None] = """
 groups:

@@ -23,7 +23,7 @@ ROUNDS = 8
 """Most times that contacts are gathered, if moving bodies apart leads them into others."""
 
 CROWDED = 0.5
-"""Move of a body, as a part of its radius, after whose single pass the response `project` makes more passes."""
+"""Move of a body in the single pass of `project`, as a part of its radius, beyond which more passes are made."""
 
 DEEPEST = 0.25
 """Largest overlap after the passes that separate bodies, as a part of the smaller radius; beyond it, bodies stop."""
